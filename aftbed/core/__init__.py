@@ -1,0 +1,1 @@
+"""The vocabulary: bricks, messages, wire, graph, journal, errors. Pure: no clock, no socket."""

@@ -1,0 +1,42 @@
+"""Error classes by situation: who has to act on it decides the class.
+
+`ConfigError` and `ScriptError` are for the user (exit code 2), `PeerError` is for a frame or a
+message that must not be believed, `AdaptationError` for an adaptation that did not complete,
+`HarnessError` for trouble of the testbed itself (exit code 3, never a pass: G8). A failed `assert`
+is ours: it ends the node, because fail-silence is the fault model.
+"""
+
+import difflib
+from collections.abc import Iterable
+
+
+class AftbedError(Exception):
+    """Base of all errors that aftbed raises on purpose; its text is fit to be shown."""
+
+
+class ConfigError(AftbedError):
+    """The user asked for something that does not exist or is not allowed: exit code 2."""
+
+
+class ScriptError(ConfigError):
+    """An adaptation script that is refused before its first step: exit code 2."""
+
+
+class PeerError(AftbedError):
+    """A peer sent what it may not send. The receiver's state is unchanged."""
+
+
+class AdaptationError(AftbedError):
+    """An adaptation that was rolled back; the graph that was there goes on."""
+
+
+class HarnessError(AftbedError):
+    """The testbed itself is in trouble: the verdict is inconclusive, exit code 3."""
+
+
+def unknown(what: str, found: str, allowed: Iterable[str]) -> ConfigError:
+    """A `ConfigError` that names what was found, the nearest name that exists, and all allowed."""
+    names = sorted(allowed)
+    near = difflib.get_close_matches(found, names, n=1, cutoff=0.5)
+    hint = f"; did you mean {near[0]!r}?" if near else ""
+    return ConfigError(f"unknown {what} {found!r}{hint} (one of: {', '.join(names)})")
