@@ -1,0 +1,130 @@
+"""The graph: which bricks there are, how their ports are linked, and which share a node. As data.
+
+A brick is named by its replica and its part (`a/protocol`), or by its part alone where it belongs to
+no replica (`proxy`). A link is one-way and has two ends, `brick:port`; it is called by the port names
+of the paper (`pxy2pro`, ...). A *standby* link exists and is bound at the replica, while its other end
+is kept by the runtime: the way between the Proxy and the backup.
+"""
+
+from collections import Counter
+from typing import Final
+
+import msgspec
+
+PLACEMENTS: Final = ("process", "replica")
+
+
+class Kind(msgspec.Struct, frozen=True):
+    """What the graph must know of a kind of brick: its ports, and which of them may stay unbound."""
+
+    name: str
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    optional: tuple[str, ...] = ()
+
+
+class BrickSpec(msgspec.Struct, frozen=True):
+    """A brick in the graph: `name` is unique, `kind` names an entry of the catalog."""
+
+    name: str
+    kind: str
+
+    @property
+    def replica(self) -> str | None:
+        """`a` or `b`, or None for a brick outside of the replicas."""
+        head, slash, _ = self.name.partition("/")
+        return head if slash else None
+
+    @property
+    def part(self) -> str:
+        """The name without the replica."""
+        return self.name.rpartition("/")[2]
+
+
+class Link(msgspec.Struct, frozen=True):
+    """A one-way channel from an output port to an input port."""
+
+    source: str
+    source_port: str
+    sink: str
+    sink_port: str
+    standby: bool = False
+
+    @property
+    def name(self) -> str:
+        """As in the paper: the port at its source."""
+        return self.source_port
+
+
+def _ends(link: Link) -> tuple[tuple[str, str, str], tuple[str, str, str]]:
+    """Both ends of `link` as (brick, port, side): one port name may be both an input and an output."""
+    return (link.source, link.source_port, "out"), (link.sink, link.sink_port, "in")
+
+
+class Graph(msgspec.Struct, frozen=True):
+    """`nodes` maps the name of a node to the bricks that it hosts."""
+
+    ftm: str
+    placement: str
+    bricks: tuple[BrickSpec, ...]
+    links: tuple[Link, ...]
+    nodes: dict[str, tuple[str, ...]]
+
+    def brick(self, name: str) -> BrickSpec:
+        """The brick called `name`; KeyError if there is none."""
+        for spec in self.bricks:
+            if spec.name == name:
+                return spec
+        raise KeyError(name)
+
+    def node_of(self, brick: str) -> str:
+        """The node that hosts `brick`; KeyError if there is none."""
+        for node, hosted in self.nodes.items():
+            if brick in hosted:
+                return node
+        raise KeyError(brick)
+
+    def problems(self, kinds: dict[str, Kind]) -> list[str]:
+        """Every reason to refuse this graph, or []."""
+        times = Counter(b.name for b in self.bricks)
+        found = [f"two bricks are called {name}" for name, n in times.items() if n > 1]
+        found += [f"{b.name}: no such kind of brick: {b.kind}" for b in self.bricks if b.kind not in kinds]
+        if found:
+            return found
+        ports = {b.name: kinds[b.kind] for b in self.bricks}
+        return self._link_problems(ports) + self._binding_problems(ports) + self._node_problems()
+
+    def _link_problems(self, ports: dict[str, Kind]) -> list[str]:
+        found = []
+        for link in self.links:
+            for brick, port, side in (
+                (link.source, link.source_port, "outputs"),
+                (link.sink, link.sink_port, "inputs"),
+            ):
+                if brick not in ports:
+                    found.append(f"{link.name}: no brick is called {brick}")
+                elif port not in (ports[brick].outputs if side == "outputs" else ports[brick].inputs):
+                    found.append(f"{link.name}: {brick} has no {side[:-1]} port {port}")
+        return found
+
+    def _binding_problems(self, ports: dict[str, Kind]) -> list[str]:
+        ends = Counter(end for k in self.links if not k.standby for end in _ends(k))
+        standby = {end for k in self.links if k.standby for end in _ends(k)}
+        found = [f"{b}:{p} is bound {n} times" for (b, p, _), n in ends.items() if n > 1]
+        for name, kind in ports.items():
+            wanted = [(name, port, "out") for port in kind.outputs]
+            wanted += [(name, port, "in") for port in kind.inputs]
+            found += [
+                f"{name}:{port} is not bound"
+                for _, port, side in wanted
+                if port not in kind.optional
+                and not ends[name, port, side]
+                and (name, port, side) not in standby
+            ]
+        return found
+
+    def _node_problems(self) -> list[str]:
+        hosted = Counter(brick for bricks in self.nodes.values() for brick in bricks)
+        names = {b.name for b in self.bricks}
+        found = [f"{name} is hosted by {hosted[name]} nodes" for name in sorted(names) if hosted[name] != 1]
+        return found + [f"a node hosts {name}, which is not a brick" for name in sorted(set(hosted) - names)]

@@ -1,0 +1,105 @@
+"""The journal: what each node did, as fixed-size records in a mapping that survives the node.
+
+Layout of a journal file: one header page, then records of 32 bytes, little endian. A record is
+committed by its event code, which is written last; the first record without one ends the journal.
+So a `kill -9` loses at most the record in the making. The header also holds the node's pulse (when
+it was last seen running) and the flag by which the runtime announces control mail.
+
+The client keeps a *dialogue* beside it: every request with its bytes, every reply with its bytes, in
+the order in which they happened. It is what G2 and G3 are judged by.
+"""
+
+import struct
+from collections.abc import Iterator
+from enum import IntEnum
+from typing import Final
+
+import msgspec
+
+from aftbed.core.errors import PeerError
+from aftbed.core.event import BY_CODE, Event
+
+MAGIC: Final = b"AFTBEDJ1"
+HEADER_BYTES: Final = 4096
+PULSE_OFFSET: Final = 8  # u64, monotonic ns
+FLAG_OFFSET: Final = 16  # u8, not 0: control mail waits
+NAME_OFFSET: Final = 64  # u8 length, then UTF-8
+NAME_BYTES_MAX: Final = 120
+
+RECORD: Final = struct.Struct("<QQQII")  # time ns, request id, detail, 0, event code
+ENTRY: Final = struct.Struct("<QQIHH")  # time ns, request id, payload length, epoch, kind
+
+
+class Record(msgspec.Struct, frozen=True):
+    """One event of one node; `t_ns` is monotonic and common to all nodes of a host."""
+
+    t_ns: int
+    event: Event
+    request_id: int
+    detail: int
+    node: str
+
+
+class EntryKind(IntEnum):
+    """What an entry of a dialogue tells."""
+
+    SENT = 1
+    ANSWERED = 2
+    DUPLICATE = 3
+
+
+class Entry(msgspec.Struct, frozen=True):
+    """A request that was sent, or a reply that was delivered, with its bytes."""
+
+    t_ns: int
+    request_id: int
+    epoch: int
+    kind: EntryKind
+    payload: bytes
+
+
+def header(node: str) -> bytes:
+    """The first page of the journal of `node`."""
+    name = node.encode()
+    assert len(name) <= NAME_BYTES_MAX, node
+    page = bytearray(HEADER_BYTES)
+    page[: len(MAGIC)] = MAGIC
+    page[NAME_OFFSET] = len(name)
+    page[NAME_OFFSET + 1 : NAME_OFFSET + 1 + len(name)] = name
+    return bytes(page)
+
+
+def node_name(data: bytes) -> str:
+    """Whose journal this is. Raises PeerError if it is none."""
+    if len(data) < HEADER_BYTES or data[: len(MAGIC)] != MAGIC:
+        raise PeerError(f"not a journal ({len(data)} bytes)")
+    length = data[NAME_OFFSET]
+    return data[NAME_OFFSET + 1 : NAME_OFFSET + 1 + length].decode(errors="replace")
+
+
+def records(data: bytes) -> Iterator[Record]:
+    """The committed records of a journal. Raises PeerError on what is no journal or has no such event."""
+    node = node_name(data)
+    for at in range(HEADER_BYTES, len(data) - RECORD.size + 1, RECORD.size):
+        t_ns, request_id, detail, _, code = RECORD.unpack_from(data, at)
+        if code == 0:
+            return
+        event = BY_CODE.get(code)
+        if event is None:
+            raise PeerError(f"{node}: record at byte {at} has the unknown event code {code}")
+        yield Record(t_ns, event, request_id, detail, node)
+
+
+def entries(data: bytes) -> Iterator[Entry]:
+    """The committed entries of a dialogue. Raises PeerError on a malformed one."""
+    node_name(data)
+    at = HEADER_BYTES
+    while at + ENTRY.size <= len(data):
+        t_ns, request_id, length, epoch, kind = ENTRY.unpack_from(data, at)
+        if kind == 0:
+            return
+        start = at + ENTRY.size
+        if kind not in EntryKind or start + length > len(data):
+            raise PeerError(f"entry at byte {at}: kind {kind}, {length} bytes")
+        yield Entry(t_ns, request_id, epoch, EntryKind(kind), data[start : start + length])
+        at = start + length

@@ -1,0 +1,199 @@
+"""What bricks say to each other, as one closed union of frozen structs.
+
+Every message on the request path carries the `epoch`: the number of the mastership under which it
+was sent. It grows by one at each failover; whoever receives an older one refuses it (G6).
+`Request`s and `Reply`s are opaque bytes inside: the mechanism never looks into them.
+"""
+
+from typing import Final
+
+import msgspec
+
+REQUEST_BYTES_MAX: Final = 16 * 1024
+REPLY_BYTES_MAX: Final = 16 * 1024
+
+
+class Message(msgspec.Struct, frozen=True, array_like=True, gc=False):
+    """Base of all messages: an array on the wire, its tag first."""
+
+
+class Request(Message, frozen=True, array_like=True, gc=False, tag=1):
+    """`payload` for the protected function. Ids start at 1 and grow by 1."""
+
+    epoch: int
+    request_id: int
+    payload: bytes
+
+
+class Reply(Message, frozen=True, array_like=True, gc=False, tag=2):
+    """The answer to request `request_id`, given by replica number `replica` (1 or 2)."""
+
+    epoch: int
+    request_id: int
+    replica: int
+    payload: bytes
+
+
+class CaptureState(Message, frozen=True, array_like=True, gc=False, tag=3):
+    """After asks the Server for its state after exactly request `request_id`."""
+
+    epoch: int
+    request_id: int
+
+
+class StateCaptured(Message, frozen=True, array_like=True, gc=False, tag=4):
+    """The Server's answer to CaptureState."""
+
+    epoch: int
+    request_id: int
+    state: bytes
+
+
+class Checkpoint(Message, frozen=True, array_like=True, gc=False, tag=5):
+    """Primary to backup: the state after `request_id`, and the reply that the client will get."""
+
+    epoch: int
+    request_id: int
+    reply: bytes
+    state: bytes
+
+
+class RestoreState(Message, frozen=True, array_like=True, gc=False, tag=6):
+    """After of the backup hands its Server the state of a checkpoint."""
+
+    epoch: int
+    request_id: int
+    state: bytes
+
+
+class StateRestored(Message, frozen=True, array_like=True, gc=False, tag=7):
+    """The Server's answer to RestoreState."""
+
+    epoch: int
+    request_id: int
+
+
+class StoreReply(Message, frozen=True, array_like=True, gc=False, tag=8):
+    """After of the backup hands its Protocol the reply of an applied checkpoint."""
+
+    epoch: int
+    request_id: int
+    payload: bytes
+
+
+class TakeOver(Message, frozen=True, array_like=True, gc=False, tag=9):
+    """All that came before in this channel is applied: lead, under this epoch."""
+
+    epoch: int
+
+
+class Suspect(Message, frozen=True, array_like=True, gc=False, tag=10):
+    """A Watchdog to Recovery: `node` of this generation of `replica` is dead or hangs."""
+
+    replica: str
+    generation: int
+    node: str
+    cause: str
+    at_ns: int
+
+
+class Promote(Message, frozen=True, array_like=True, gc=False, tag=20):
+    """Runtime to the backup's After: drain the checkpoint channel to its end, then take over."""
+
+    epoch: int
+
+
+class Promoted(Message, frozen=True, array_like=True, gc=False, tag=21):
+    """The backup's Protocol to the runtime: this replica leads now."""
+
+    epoch: int
+
+
+class Rebound(Message, frozen=True, array_like=True, gc=False, tag=22):
+    """Runtime to a brick: `port` now leads elsewhere (`bound`) or nowhere; the epoch from here on."""
+
+    port: str
+    bound: bool
+    epoch: int
+
+
+class ChannelEnded(Message, frozen=True, array_like=True, gc=False, tag=23):
+    """Host to a brick: the port's channel is drained to its end."""
+
+
+class Submit(Message, frozen=True, array_like=True, gc=False, tag=24):
+    """The source of requests to the Client."""
+
+    payload: bytes
+
+
+class Watch(Message, frozen=True, array_like=True, gc=False, tag=25):
+    """Runtime to a Watchdog: these nodes make up this generation of the replica."""
+
+    replica: str
+    generation: int
+    nodes: tuple[str, ...]
+
+
+class NodeDied(Message, frozen=True, array_like=True, gc=False, tag=26):
+    """Host to a Watchdog: the pidfd of a watched node became readable."""
+
+    node: str
+
+
+class Pulses(Message, frozen=True, array_like=True, gc=False, tag=27):
+    """Host to a Watchdog: when each watched node was last seen running (monotonic ns)."""
+
+    seen_ns: dict[str, int]
+
+
+class Situation(Message, frozen=True, array_like=True, gc=False, tag=28):
+    """Runtime to Recovery: who leads, who backs up, which slots are empty. `""` is nobody.
+
+    Sent at the start and after each script, done or `failed`; so a new Recovery needs no memory of
+    the old one.
+    """
+
+    leader: str
+    leader_generation: int
+    backup: str
+    backup_generation: int
+    epoch: int
+    vacant: tuple[str, ...]
+    failed: bool
+
+
+AnyMessage = (
+    Request
+    | Reply
+    | CaptureState
+    | StateCaptured
+    | Checkpoint
+    | RestoreState
+    | StateRestored
+    | StoreReply
+    | TakeOver
+    | Suspect
+    | Promote
+    | Promoted
+    | Rebound
+    | ChannelEnded
+    | Submit
+    | Watch
+    | NodeDied
+    | Pulses
+    | Situation
+)
+
+WireMessage = (
+    Request
+    | Reply
+    | CaptureState
+    | StateCaptured
+    | Checkpoint
+    | RestoreState
+    | StateRestored
+    | StoreReply
+    | TakeOver
+    | Suspect
+)

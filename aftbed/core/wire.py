@@ -1,0 +1,35 @@
+"""Messages to bytes and back: msgspec MessagePack, tagged, typed, limited in size; never pickle.
+
+A packet is one message. What is over the limit, truncated, of an unknown tag or of a wrong type
+raises PeerError; nothing is half decoded.
+"""
+
+from collections.abc import Callable
+from typing import Final
+
+import msgspec
+
+from aftbed.core.errors import PeerError
+from aftbed.core.message import Message, WireMessage
+
+PACKET_BYTES_MAX: Final = 128 * 1024
+
+_encode = msgspec.msgpack.Encoder().encode
+_decode: Callable[[bytes | memoryview], WireMessage] = msgspec.msgpack.Decoder(WireMessage).decode
+
+
+def encode(message: Message) -> bytes:
+    """The packet of `message`; asserts that it keeps the limit (ours to keep, not the peer's)."""
+    data = _encode(message)
+    assert len(data) <= PACKET_BYTES_MAX, f"{type(message).__name__} of {len(data)} bytes"
+    return data
+
+
+def decode(data: bytes | memoryview) -> WireMessage:
+    """The message in `data`. Raises PeerError."""
+    if len(data) > PACKET_BYTES_MAX:
+        raise PeerError(f"packet of {len(data)} bytes, at most {PACKET_BYTES_MAX} are allowed")
+    try:
+        return _decode(data)
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise PeerError(f"not a message ({len(data)} bytes): {error}") from error

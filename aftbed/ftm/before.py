@@ -1,0 +1,28 @@
+"""Before brick of PBR: passes the request on (paper, III-A: PBR does nothing before the computation)."""
+
+from typing import Final
+
+from aftbed.core.brick import Brick, Effect, Note, Send
+from aftbed.core.errors import PeerError
+from aftbed.core.event import Event
+from aftbed.core.message import AnyMessage, Request
+
+_OPEN: Final = ("pro2bfr",)
+
+
+class PassBefore(Brick):
+    """Stateless."""
+
+    def open_ports(self) -> tuple[str, ...]:
+        """Always ready for a request."""
+        return _OPEN
+
+    def quiescent(self) -> bool:
+        """Never holds one."""
+        return True
+
+    def step(self, port: str, msg: AnyMessage, now_ns: int) -> list[Effect]:
+        """Pass a request on."""
+        if not isinstance(msg, Request):
+            raise PeerError(f"{type(msg).__name__} on {port}")
+        return [Note(Event.BEFORE_EXIT, msg.request_id), Send("bfr2prd", msg)]

@@ -1,0 +1,68 @@
+"""The catalog: every kind of brick with its ports, and how to make one.
+
+A mechanism that is written later adds rows here and in `mechanism`, and nothing else.
+"""
+
+from collections.abc import Callable
+from typing import Final
+
+import msgspec
+
+from aftbed.core.application import Application
+from aftbed.core.brick import Brick
+from aftbed.core.graph import Kind
+from aftbed.ftm.after import PbrAfter
+from aftbed.ftm.before import PassBefore
+from aftbed.ftm.client import Client
+from aftbed.ftm.engine import AdaptationEngine
+from aftbed.ftm.proceed import Compute
+from aftbed.ftm.protocol import Protocol
+from aftbed.ftm.proxy import Proxy
+from aftbed.ftm.recovery import Recovery
+from aftbed.ftm.server import Server
+from aftbed.ftm.watchdog import Watchdog
+
+
+class Setting(msgspec.Struct, frozen=True):
+    """What a brick is made for: which replica (1, 2; 0 for none), which epoch, leading or not."""
+
+    replica: int
+    epoch: int
+    leads: bool
+    application: Callable[[], Application]
+
+
+KINDS: Final = {
+    kind.name: kind
+    for kind in (
+        Kind("client", ("pxy2clt",), ("clt2pxy",)),
+        Kind("proxy", ("clt2pxy", "pro2pxy"), ("pxy2pro", "pxy2clt")),
+        Kind("protocol", ("pxy2pro", "aft2pro"), ("pro2bfr", "pro2pxy")),
+        Kind("pass.before", ("pro2bfr",), ("bfr2prd",)),
+        Kind("compute.proceed", ("bfr2prd", "srv2prd"), ("prd2srv", "prd2aft")),
+        Kind("pbr.after", ("prd2aft", "srv2aft", "aft2aft"), ("aft2srv", "aft2pro", "aft2aft"), ("aft2aft",)),
+        Kind("server", ("prd2srv", "aft2srv"), ("srv2prd", "srv2aft"), ("aft2srv", "srv2aft")),
+        Kind("watchdog", (), ("wdg2rec",)),
+        Kind("recovery", ("wdg2rec", "wdg2rec.b"), ()),
+        Kind("engine", (), ()),
+    )
+}
+
+_MAKERS: Final[dict[str, Callable[[Setting], Brick]]] = {
+    "client": lambda s: Client(),
+    "proxy": lambda s: Proxy(),
+    "protocol": lambda s: Protocol(s.replica, s.epoch, s.leads),
+    "pass.before": lambda s: PassBefore(),
+    "compute.proceed": lambda s: Compute(),
+    "pbr.after": lambda s: PbrAfter(s.epoch, s.leads),
+    "server": lambda s: Server(s.application(), s.replica),
+    "watchdog": lambda s: Watchdog(),
+    "recovery": lambda s: Recovery(),
+    "engine": lambda s: AdaptationEngine(),
+}
+assert set(_MAKERS) == set(KINDS), "every kind of brick has a maker"
+
+
+def make(kind: str, setting: Setting) -> Brick:
+    """A new brick of `kind`."""
+    return _MAKERS[kind](setting)

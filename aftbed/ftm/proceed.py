@@ -1,0 +1,44 @@
+"""Proceed brick: has the Server compute, and hands the result to After (paper, III-A)."""
+
+from enum import Enum, auto
+from typing import Final
+
+from aftbed.core.brick import Brick, Effect, Note, Send
+from aftbed.core.errors import PeerError
+from aftbed.core.event import Event
+from aftbed.core.message import AnyMessage, Reply, Request
+
+
+class State(Enum):
+    IDLE = auto()  # no request in progress
+    COMPUTING = auto()  # the Server has it
+
+
+MOVES: Final = {(State.IDLE, Request): State.COMPUTING, (State.COMPUTING, Reply): State.IDLE}
+OPEN: Final = {State.IDLE: ("bfr2prd",), State.COMPUTING: ("srv2prd",)}
+
+
+class Compute(Brick):
+    """One computation per request."""
+
+    def __init__(self) -> None:
+        self.state = State.IDLE
+
+    def open_ports(self) -> tuple[str, ...]:
+        """A request, then its result."""
+        return OPEN[self.state]
+
+    def quiescent(self) -> bool:
+        """Nothing being computed."""
+        return self.state is State.IDLE
+
+    def step(self, port: str, msg: AnyMessage, now_ns: int) -> list[Effect]:
+        """Have it computed, or hand on the result."""
+        state = MOVES.get((self.state, type(msg)))
+        if state is None:
+            raise PeerError(f"{type(msg).__name__} on {port} while {self.state.name}")
+        self.state = state
+        if isinstance(msg, Request):
+            return [Note(Event.PROCEED_ENTER, msg.request_id), Send("prd2srv", msg)]
+        assert isinstance(msg, Reply)
+        return [Send("prd2aft", msg)]

@@ -1,0 +1,146 @@
+"""Recovery: decides what to do about a replica that is dead or hangs, and restores redundancy.
+
+Paper, III-A: the Watchdog's alarm makes Recovery promote the backup. The decision is a function of
+the situation that the runtime reports and of the suspicions against it; so a Recovery that died in
+the middle of a failover is replaced by one that knows as much.
+
+| leader    | backup            | script                          |
+|-----------|-------------------|---------------------------------|
+| suspected | there             | failover: the backup leads      |
+| any       | suspected         | drop backup: the leader alone   |
+| sound     | none, slot vacant | new backup, by state transfer   |
+"""
+
+from typing import Final
+
+from aftbed.core.brick import Brick, Effect, Note, Order
+from aftbed.core.errors import PeerError
+from aftbed.core.event import Event
+from aftbed.core.message import AnyMessage, Rebound, Situation, Suspect
+from aftbed.core.script import (
+    Attach,
+    Bind,
+    Fence,
+    Kill,
+    Promote,
+    Resume,
+    Script,
+    Spawn,
+    Suspend,
+    Transfer,
+    Unbind,
+)
+
+_OPEN: Final = ("wdg2rec", "wdg2rec.b")
+FAILURES_MAX: Final = 5  # scripts for a new backup that may fail in a row before Recovery gives up
+RETRY_NS: Final = 50_000_000
+
+
+def failover(dead: str, backup: str, epoch: int) -> Script:
+    """Fence, drain, promote, attach; the kill comes last, since a fenced replica can do no harm."""
+    return Script(
+        "failover", dead, (), (Fence(dead), Promote(backup, epoch), Attach(backup, epoch), Kill(dead))
+    )
+
+
+def drop_backup(leader: str, backup: str) -> Script:
+    """The leader goes on alone."""
+    return Script(
+        "drop backup", backup, (), (Fence(backup), Unbind(f"{leader}/after", "aft2aft"), Kill(backup))
+    )
+
+
+def new_backup(leader: str, replica: str) -> Script:
+    """State transfer at a quiescent point; all that is slow happens in `prepare`."""
+    return Script(
+        "new backup",
+        replica,
+        (Spawn(replica),),
+        (
+            Suspend(f"{leader}/protocol"),
+            Transfer(f"{leader}/protocol", f"{replica}/protocol"),
+            Transfer(f"{leader}/server", f"{replica}/server"),
+            Bind(f"{leader}/after", "aft2aft", f"{replica}/after"),
+            Resume(f"{leader}/protocol"),
+        ),
+    )
+
+
+def decide(now: Situation, suspects: set[tuple[str, int]]) -> Script | None:
+    """The script that the table of the module asks for, or None."""
+    if not now.leader:
+        return None
+    if now.backup and (now.backup, now.backup_generation) in suspects:
+        return drop_backup(now.leader, now.backup)
+    if (now.leader, now.leader_generation) in suspects:
+        return failover(now.leader, now.backup, now.epoch + 1) if now.backup else None
+    if not now.backup and now.vacant:
+        return new_backup(now.leader, now.vacant[0])
+    return None
+
+
+class Recovery(Brick):
+    """`ordered` is the script that the runtime is executing."""
+
+    def __init__(self) -> None:
+        self.situation: Situation | None = None
+        self.suspects: set[tuple[str, int]] = set()
+        self.ordered: Script | None = None
+        self._failures = 0
+        self._retry_ns: int | None = None
+
+    def open_ports(self) -> tuple[str, ...]:
+        """The alarms of both Watchdogs."""
+        return _OPEN
+
+    def quiescent(self) -> bool:
+        """No script under way."""
+        return self.ordered is None
+
+    def step(self, port: str, msg: AnyMessage, now_ns: int) -> list[Effect]:
+        """Hear an alarm, or how things stand."""
+        if isinstance(msg, Suspect):
+            self.suspects.add((msg.replica, msg.generation))
+            return self._order(now_ns)
+        if isinstance(msg, Situation):
+            return self._heard(msg, now_ns)
+        if isinstance(msg, Rebound):
+            return []
+        raise PeerError(f"{type(msg).__name__} on {port}")
+
+    def _heard(self, msg: Situation, now_ns: int) -> list[Effect]:
+        done, self.ordered, self.situation = self.ordered, None, msg
+        present = {(msg.leader, msg.leader_generation), (msg.backup, msg.backup_generation)}
+        self.suspects &= present
+        self._failures = self._failures + 1 if msg.failed else 0
+        notes: list[Effect] = []
+        if done is not None and not msg.failed:
+            event = Event.BACKUP_READY if done.purpose == "new backup" else Event.RECOVERY_EXIT
+            notes.append(Note(event, detail=msg.epoch))
+        if msg.failed and self._failures < FAILURES_MAX:
+            self._retry_ns = now_ns + RETRY_NS
+        return notes + self._order(now_ns)
+
+    def _order(self, now_ns: int) -> list[Effect]:
+        if self.ordered is not None or self.situation is None:
+            return []
+        script = decide(self.situation, self.suspects)
+        if script is None:
+            return []
+        if script.purpose == "new backup":
+            if self._failures >= FAILURES_MAX or (self._retry_ns is not None and now_ns < self._retry_ns):
+                return []
+            self._retry_ns = None
+            self.ordered = script
+            return [Order(script)]
+        self.ordered = script
+        return [Order(script), Note(Event.RECOVERY_ENTER, detail=self.situation.epoch)]
+
+    def deadline_ns(self) -> int | None:
+        """When to try again after a script that failed."""
+        return self._retry_ns if self.ordered is None else None
+
+    def wake(self, now_ns: int) -> list[Effect]:
+        """Try again."""
+        self._retry_ns = None
+        return self._order(now_ns)
