@@ -10,6 +10,7 @@ import msgspec
 
 from aftbed.core.application import Application
 from aftbed.core.brick import Brick
+from aftbed.core.event import Event
 from aftbed.core.graph import Kind
 from aftbed.ftm.after import PbrAfter
 from aftbed.ftm.before import PassBefore
@@ -61,6 +62,28 @@ _MAKERS: Final[dict[str, Callable[[Setting], Brick]]] = {
     "engine": lambda s: AdaptationEngine(),
 }
 assert set(_MAKERS) == set(KINDS), "every kind of brick has a maker"
+
+EMITTERS: Final = {  # which part emits an event, and whether the backup's does (else the leader's)
+    Event.REQUEST_SENT: ("client", False),
+    Event.REPLY_DELIVERED: ("client", False),
+    Event.REPLY_ACCEPTED: ("proxy", False),
+    Event.REQUEST_RECEIVED: ("protocol", False),
+    Event.REPLY_STORED: ("protocol", False),
+    Event.REPLY_SENT: ("protocol", False),
+    Event.DEDUPE_HIT: ("protocol", False),
+    Event.BEFORE_EXIT: ("before", False),
+    Event.PROCEED_ENTER: ("proceed", False),
+    Event.SERVER_ENTER: ("server", False),
+    Event.SERVER_EXIT: ("server", False),
+    Event.STATE_CAPTURED: ("server", False),
+    Event.CHECKPOINT_SENT: ("after", False),
+    Event.CHECKPOINT_APPLIED: ("after", True),
+    Event.STATE_RESTORED: ("server", True),
+    Event.WATCHDOG_SUSPECT: ("watchdog", False),
+    Event.RECOVERY_ENTER: ("recovery", False),
+    Event.RECOVERY_EXIT: ("recovery", False),
+    Event.BACKUP_READY: ("recovery", False),
+}
 
 
 def make(kind: str, setting: Setting) -> Brick:

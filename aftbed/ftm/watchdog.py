@@ -1,8 +1,8 @@
 """Watchdog: tells Recovery that a node of its replica is dead or hangs. One per replica.
 
 A death comes as a message (the host holds the pidfds). A hang is a node whose pulse is older than a
-deadline. The deadline only counts while this Watchdog itself runs on time: if it was woken late, the
-machine was stalled, and every node gets the whole deadline again. That is what keeps a busy machine
+deadline. The deadline only counts while this Watchdog itself runs on time: if the pulses, which the host hands in
+every `PERIOD_NS`, come late, the machine was stalled, and every node gets the whole deadline again. That is what keeps a busy machine
 from a false failover.
 """
 
@@ -26,7 +26,7 @@ class Watchdog(Brick):
         self.replica, self.generation = "", 0
         self.nodes: tuple[str, ...] = ()
         self.suspect: Suspect | None = None
-        self._next_ns = 0
+        self._last_ns = 0
         self._grace_until_ns = 0
 
     def open_ports(self) -> tuple[str, ...]:
@@ -41,7 +41,7 @@ class Watchdog(Brick):
         """Be told whom to watch, that a node died, or how the pulses are."""
         if isinstance(msg, Watch):
             self.replica, self.generation, self.nodes = msg.replica, msg.generation, msg.nodes
-            self.suspect, self._next_ns = None, now_ns + PERIOD_NS
+            self.suspect, self._last_ns = None, now_ns
             self._grace_until_ns = now_ns + HANG_DEADLINE_NS
             return []
         if isinstance(msg, NodeDied):
@@ -53,8 +53,9 @@ class Watchdog(Brick):
         raise PeerError(f"{type(msg).__name__} on {port}")
 
     def _judge(self, pulses: Pulses, now_ns: int) -> list[Effect]:
-        if now_ns - self._next_ns > LATE_NS_MAX:
+        if now_ns - self._last_ns > PERIOD_NS + LATE_NS_MAX:
             self._grace_until_ns = now_ns + HANG_DEADLINE_NS
+        self._last_ns = now_ns
         if now_ns < self._grace_until_ns:
             return []
         for node in self.nodes:
@@ -70,12 +71,3 @@ class Watchdog(Brick):
             Send("wdg2rec", self.suspect),
             Note(Event.WATCHDOG_SUSPECT, detail=self.generation),
         ]
-
-    def deadline_ns(self) -> int | None:
-        """The next look at the pulses."""
-        return self._next_ns if self.nodes and self.suspect is None else None
-
-    def wake(self, now_ns: int) -> list[Effect]:
-        """The host handed in the pulses just before."""
-        self._next_ns = now_ns + PERIOD_NS
-        return []

@@ -1,0 +1,1 @@
+"""The executive support on real Unix processes."""

@@ -1,0 +1,282 @@
+"""What the supervisor and its processes say to each other, and how descriptors travel with it.
+
+One SEQPACKET pair per process. Each order carries a token; its answer is `Ack` with the same token,
+so an order without an answer is noticed by its deadline. A packet over the limit travels as a memfd.
+"""
+
+import array
+import contextlib
+import os
+import socket
+from collections.abc import Callable
+from typing import Final, Generic, TypeVar
+
+import msgspec
+
+from aftbed.core.errors import PeerError
+from aftbed.core.fault import Act
+from aftbed.core.message import (
+    NodeDied,
+    Promote,
+    Promoted,
+    Pulses,
+    Rebound,
+    Situation,
+    Watch,
+)
+from aftbed.core.script import Script
+from aftbed.core.wire import PACKET_BYTES_MAX
+
+FDS_MAX: Final = 64
+STATE_BYTES_MAX: Final = 64 << 20
+_RIGHTS_BYTES: Final = socket.CMSG_SPACE(FDS_MAX * 4)
+
+Told = Promote | Rebound | Watch | Situation | NodeDied | Pulses
+
+
+class Port(msgspec.Struct, frozen=True):
+    """An end of a channel at a brick: the descriptor is the one at `index` among those that came along."""
+
+    brick: str
+    port: str
+    index: int
+
+
+class Local(msgspec.Struct, frozen=True):
+    """A channel between two bricks of one node."""
+
+    brick: str
+    port: str
+    sink: str
+    sink_port: str
+
+
+class Order(msgspec.Struct, frozen=True, tag=True):
+    """Base of what the supervisor says; `token` comes back in the Ack."""
+
+    token: int
+
+
+class Park(Order, frozen=True):
+    """To a zygote: fork one spare for each descriptor that came along."""
+
+
+class Assign(Order, frozen=True):
+    """To a spare: be this node."""
+
+    node: str
+    journal: str
+    bricks: tuple[tuple[str, str], ...]  # name, kind
+    replica: int
+    epoch: int
+    leads: bool
+    inputs: tuple[Port, ...]
+    outputs: tuple[Port, ...]
+    locals: tuple[Local, ...]
+    cpu: int | None
+    device: str = ""  # see `devices`
+    options: bytes = b""
+    device_fds: int = 0  # how many of the descriptors, at the end, are the device's
+
+
+class Serve(Order, frozen=True):
+    """To a spare: run the service called `service` (the hub, the vehicle) with these options."""
+
+    service: str
+    options: bytes
+
+
+class BindInput(Order, frozen=True):
+    """Read `port` from the descriptor that came along, or from nowhere."""
+
+    brick: str
+    port: str
+
+
+class BindOutput(Order, frozen=True):
+    """Write `port` to the descriptor that came along, or to nowhere; `epoch` is in force from here."""
+
+    brick: str
+    port: str
+    epoch: int
+
+
+class Suspend(Order, frozen=True):
+    """Finish what is inside, take no more, then answer."""
+
+
+class Resume(Order, frozen=True):
+    """Undo Suspend."""
+
+
+class Capture(Order, frozen=True):
+    """Answer with the state of `brick`."""
+
+    brick: str
+
+
+class Restore(Order, frozen=True):
+    """Take over `state`."""
+
+    brick: str
+    state: bytes
+
+
+class Tell(Order, frozen=True):
+    """Have `brick` step with `message` on its control port."""
+
+    brick: str
+    message: Told
+
+
+class WatchNodes(Order, frozen=True):
+    """To the host of a Watchdog: watch the pidfds that came along, and the pulses in these journals."""
+
+    replica: str
+    generation: int
+    nodes: tuple[str, ...]
+    journals: tuple[str, ...]
+
+
+class Arm(Order, frozen=True):
+    """At the `nth` time from now that `event` happens here: do `act` to yourself, or ask for it."""
+
+    fault: int
+    event: str
+    nth: int
+    act: Act
+    itself: bool
+
+
+class Stop(Order, frozen=True):
+    """End yourself."""
+
+
+class Quiet(Order, frozen=True):
+    """To the client's host: hand in no more requests."""
+
+
+class Stats(Order, frozen=True):
+    """Answer with counts, as MessagePack."""
+
+
+class Hello(msgspec.Struct, frozen=True, tag=True):
+    """A spare to the supervisor: alive and parked."""
+
+    pid: int
+
+
+class Ack(msgspec.Struct, frozen=True, tag=True):
+    """The answer to an order; `error` is empty where it was carried out."""
+
+    token: int
+    data: bytes = b""
+    error: str = ""
+
+
+class Said(msgspec.Struct, frozen=True, tag=True):
+    """A brick to the runtime."""
+
+    brick: str
+    message: Promoted
+
+
+class Ordered(msgspec.Struct, frozen=True, tag=True):
+    """Recovery or the Engine to the runtime: execute this."""
+
+    brick: str
+    script: Script
+
+
+class Fired(msgspec.Struct, frozen=True, tag=True):
+    """A host to the runtime: fault `fault` is due now; the host waits for the Ack with token `fault`."""
+
+    fault: int
+
+
+class Report(msgspec.Struct, frozen=True, tag=True):
+    """A service to the runtime: `kind` says what `data` is."""
+
+    kind: str
+    data: bytes
+
+
+ToNode = (
+    Park | Assign | Serve | BindInput | BindOutput | Suspend | Resume | Capture | Restore | Tell
+    | WatchNodes | Arm | Stop | Quiet | Stats | Ack
+)  # fmt: skip
+FromNode = Hello | Ack | Said | Ordered | Fired | Report
+
+decode_order: Callable[[bytes], ToNode] = msgspec.msgpack.Decoder(ToNode).decode
+decode_report: Callable[[bytes], FromNode] = msgspec.msgpack.Decoder(FromNode).decode
+_encode = msgspec.msgpack.Encoder().encode
+Incoming = TypeVar("Incoming")
+_MEMFD: Final = b"\xc1"  # a byte that MessagePack never uses
+
+
+class Line(Generic[Incoming]):
+    """One end of a control pair. Blocking or not as the socket is."""
+
+    def __init__(self, sock: socket.socket, decode: Callable[[bytes], Incoming]) -> None:
+        self.sock, self._decode = sock, decode
+
+    def fileno(self) -> int:
+        """For polling."""
+        return self.sock.fileno()
+
+    def send(self, message: msgspec.Struct, fds: tuple[int, ...] = ()) -> None:
+        """Send one message and descriptors. Raises OSError as sendmsg(2) does."""
+        data = _encode(message)
+        assert len(fds) <= FDS_MAX, f"{len(fds)} descriptors"
+        if len(data) > PACKET_BYTES_MAX:
+            assert len(data) <= STATE_BYTES_MAX and not fds, f"{len(data)} bytes"
+            with open(os.memfd_create("aftbed-state"), "wb") as file:
+                file.write(data)
+                file.flush()
+                self._sendmsg(_MEMFD, (file.fileno(),))
+        else:
+            self._sendmsg(data, fds)
+
+    def _sendmsg(self, data: bytes, fds: tuple[int, ...]) -> None:
+        rights = [(socket.SOL_SOCKET, socket.SCM_RIGHTS, array.array("i", fds))] if fds else []
+        self.sock.sendmsg([data], rights)
+
+    def recv(self) -> tuple[Incoming, list[int]] | None:
+        """The next message with its descriptors; None at the end.
+
+        Raises BlockingIOError where there is none, PeerError on what is not a message (its
+        descriptors are closed).
+        """
+        data, ancillary, flags, _ = self.sock.recvmsg(
+            PACKET_BYTES_MAX, _RIGHTS_BYTES, socket.MSG_CMSG_CLOEXEC
+        )
+        if not data:
+            return None
+        fds = array.array("i")
+        for level, kind, payload in ancillary:
+            if (level, kind) == (socket.SOL_SOCKET, socket.SCM_RIGHTS):
+                fds.frombytes(payload[: len(payload) - len(payload) % fds.itemsize])
+        try:
+            if flags & (socket.MSG_TRUNC | socket.MSG_CTRUNC):
+                raise PeerError(f"truncated control message of {len(data)} bytes, {len(fds)} descriptors")
+            if data == _MEMFD and len(fds) == 1:
+                data = _read_memfd(fds.pop())
+            return self._decode(data), list(fds)
+        except (msgspec.DecodeError, PeerError) as error:
+            for fd in fds:
+                os.close(fd)
+            raise PeerError(f"not a control message ({len(data)} bytes): {error}") from error
+
+    def close(self) -> None:
+        """Close the socket."""
+        with contextlib.suppress(OSError):
+            self.sock.close()
+
+
+def _read_memfd(descriptor: int) -> bytes:
+    with open(descriptor, "rb") as file:
+        size = os.fstat(file.fileno()).st_size
+        if size > STATE_BYTES_MAX:
+            raise PeerError(f"a state of {size} bytes, at most {STATE_BYTES_MAX} are allowed")
+        file.seek(0)
+        return file.read()

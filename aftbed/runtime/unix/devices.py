@@ -1,0 +1,200 @@
+"""Devices: what joins a brick's port to the world outside of the graph.
+
+A brick is pure, so something in its host must hold the pidfds that a Watchdog hears of, and the
+source of requests behind the Client. A device has descriptors to poll, hands in messages for one
+port, and takes what the brick sends to `deliver`.
+"""
+
+import os
+from collections import deque
+from pathlib import Path
+from typing import Final, Protocol
+
+import msgspec
+
+from aftbed.core.event import Event
+from aftbed.core.journal import Entry, EntryKind, entries
+from aftbed.core.message import NodeDied, Pulses, Reply, Request, Submit
+from aftbed.ftm.client import Client
+from aftbed.ftm.watchdog import PERIOD_NS
+from aftbed.runtime.unix.journal import Dialogue, Header
+
+ASK: Final = Event.REQUEST_SENT
+
+
+class Device(Protocol):
+    """`port` is the brick's port that it feeds."""
+
+    port: str
+
+    def fds(self) -> tuple[int, ...]:
+        """Descriptors that make `ready` worth calling when they are readable."""
+        ...
+
+    def ready(self, fd: int, now_ns: int) -> None:
+        """`fd` is readable."""
+        ...
+
+    def take(self, now_ns: int) -> Submit | NodeDied | Pulses | None:
+        """The next message for the brick, or None."""
+        ...
+
+    def accept(self, reply: Reply, now_ns: int) -> None:
+        """What the brick sent to `deliver`."""
+        ...
+
+    def quiet(self) -> None:
+        """Hand in nothing more."""
+        ...
+
+    def deadline_ns(self) -> int | None:
+        """When `take` is worth calling again at the latest."""
+        ...
+
+    def stats(self) -> bytes:
+        """Counts, as MessagePack."""
+        ...
+
+
+class Sensor:
+    """The senses of a Watchdog: pidfds, and the pulses in the journals of its replica."""
+
+    port = "sense"
+
+    def __init__(self) -> None:
+        self._pidfds: dict[int, str] = {}
+        self._headers: dict[str, Header] = {}
+        self._died: deque[str] = deque()
+        self._next_ns = 0
+
+    def watch(self, nodes: tuple[str, ...], journals: tuple[str, ...], pidfds: list[int]) -> None:
+        """Watch these nodes and no others."""
+        self.forget()
+        self._pidfds = dict(zip(pidfds, nodes, strict=True))
+        self._headers = {n: Header(Path(j)) for n, j in zip(nodes, journals, strict=True)}
+
+    def forget(self) -> None:
+        """Watch nobody."""
+        for fd in self._pidfds:
+            os.close(fd)
+        for header in self._headers.values():
+            header.close()
+        self._pidfds, self._headers = {}, {}
+        self._died.clear()
+
+    def fds(self) -> tuple[int, ...]:
+        """One pidfd per watched node that lives."""
+        return tuple(self._pidfds)
+
+    def ready(self, fd: int, now_ns: int) -> None:
+        """A readable pidfd is a dead process; it stays readable, so it goes."""
+        self._died.append(self._pidfds.pop(fd))
+        os.close(fd)
+
+    def take(self, now_ns: int) -> NodeDied | Pulses | None:
+        """Deaths first."""
+        if self._died:
+            return NodeDied(self._died.popleft())
+        if now_ns < self._next_ns or not self._headers:
+            return None
+        self._next_ns = now_ns + PERIOD_NS
+        return Pulses({node: header.pulse_ns() for node, header in self._headers.items()})
+
+    def accept(self, reply: Reply, now_ns: int) -> None:
+        """Nothing is delivered to a sensor."""
+        raise AssertionError("a reply delivered to a Watchdog's sensor")
+
+    def quiet(self) -> None:
+        """Watch nobody any more."""
+        self.forget()
+
+    def deadline_ns(self) -> int | None:
+        """The next look at the pulses."""
+        return self._next_ns if self._headers else None
+
+    def stats(self) -> bytes:
+        """None to give."""
+        return msgspec.msgpack.encode({})
+
+
+def resume_client(client: Client, dialogues: tuple[str, ...]) -> None:
+    """Give a new Client the state that its predecessors' dialogues tell."""
+    history: list[Entry] = []
+    for path in dialogues:
+        history += entries(Path(path).read_bytes())
+    waiting = {e.request_id: Request(0, e.request_id, e.payload) for e in history if e.kind is EntryKind.SENT}
+    next_id = max(waiting, default=0) + 1
+    for entry in history:
+        if entry.kind is EntryKind.ANSWERED:
+            waiting.pop(entry.request_id, None)
+    client.restore(msgspec.msgpack.encode((next_id, list(waiting.values()))))
+
+
+class LoadOptions(msgspec.Struct, frozen=True):
+    """`rate_hz` 0 is a closed loop: the next request follows the reply. Stops after `count`."""
+
+    seed: int
+    count: int
+    rate_hz: float
+    dialogue: str
+    earlier: tuple[str, ...] = ()
+
+
+class Load:
+    """Requests out of a seeded list, in a closed loop or at a fixed rate."""
+
+    port = "submit"
+
+    def __init__(self, client: Client, options: LoadOptions, requests: list[bytes]) -> None:
+        self._client, self._options, self._requests = client, options, requests
+        resume_client(client, options.earlier)
+        self._dialogue = Dialogue(Path(options.dialogue), "client")
+        self._period_ns = round(1e9 / options.rate_hz) if options.rate_hz else 0
+        self._next_ns = 0
+        self._answered = 0
+        self._count = options.count
+
+    def fds(self) -> tuple[int, ...]:
+        """None: the load comes from within."""
+        return ()
+
+    def ready(self, fd: int, now_ns: int) -> None:
+        """Never called."""
+        raise AssertionError(f"no descriptor {fd}")
+
+    def _due(self, now_ns: int) -> bool:
+        if self._client.next_id > self._count:
+            return False
+        return now_ns >= self._next_ns if self._period_ns else not self._client.unanswered
+
+    def take(self, now_ns: int) -> Submit | None:
+        """The next request, if it is due. Written ahead: a successor knows it even if we die now."""
+        if not self._due(now_ns):
+            return None
+        request_id = self._client.next_id
+        payload = self._requests[(request_id - 1) % len(self._requests)]
+        if self._period_ns:
+            self._next_ns = max(self._next_ns or now_ns, now_ns - 10 * self._period_ns) + self._period_ns
+        self._dialogue.write(now_ns, request_id, 0, EntryKind.SENT, payload)
+        return Submit(payload)
+
+    def accept(self, reply: Reply, now_ns: int) -> None:
+        """Keep the reply in the dialogue."""
+        self._answered += 1
+        self._dialogue.write(now_ns, reply.request_id, reply.epoch, EntryKind.ANSWERED, reply.payload)
+
+    def quiet(self) -> None:
+        """The load is at its end now."""
+        self._count = self._client.next_id - 1
+
+    def deadline_ns(self) -> int | None:
+        """When the next request is due."""
+        if not self._period_ns or self._client.next_id > self._count:
+            return None
+        return self._next_ns
+
+    def stats(self) -> bytes:
+        """How far the load is."""
+        sent, waiting = self._client.next_id - 1, len(self._client.unanswered)
+        done = sent >= self._count and not waiting
+        return msgspec.msgpack.encode({"sent": sent, "unanswered": waiting, "done": done})

@@ -1,0 +1,101 @@
+"""The client's device on the bus: frames in, requests to the Client, replies out as AEB_REQ."""
+
+from collections import deque
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from aftbed.core.journal import EntryKind
+from aftbed.core.message import Reply, Submit
+from aftbed.ftm.client import BACKLOG_MAX, Client
+from aftbed.runtime.unix.devices import resume_client
+from aftbed.runtime.unix.journal import Dialogue
+from aftbed.runtime.unix.options import GatewayOptions
+from aftbed.vehicle.bus import BusOptions, open_bus
+from aftbed.vehicle.dbcfile import load_dbc
+from aftbed.vehicle.gateway import BusGateway, Gateway
+from aftbed.vehicle.mapfile import find_map
+from aftbed.vehicle.mapped import MappedGateway
+
+PAYLOADS_MAX: Final = BACKLOG_MAX
+
+
+class GatewayDevice:
+    """See `devices.Device`."""
+
+    port = "submit"
+
+    def __init__(self, client: Client, options: GatewayOptions) -> None:
+        self._client = client
+        resume_client(client, options.earlier)
+        self._dialogue = Dialogue(Path(options.dialogue), "client")
+        self._gateway = _gateway(options)
+        self._bus = open_bus(BusOptions(port=options.port))
+        self._payloads: deque[bytes] = deque()
+        self._t_us = 0
+        self._answered = 0
+        self._overrun = 0
+        self._quiet = False
+
+    def fds(self) -> tuple[int, ...]:
+        """The bus."""
+        return (self._bus.fileno(),)
+
+    def ready(self, fd: int, now_ns: int) -> None:
+        """Take all frames that are there."""
+        for frame in self._bus.drain():
+            self._t_us = max(self._t_us, frame.t_us)
+            payload = self._gateway.on_frame(frame)
+            if payload is None:
+                continue
+            if len(self._payloads) >= PAYLOADS_MAX:
+                self._payloads.popleft()  # the oldest track is worth least
+                self._overrun += 1
+            self._payloads.append(payload)
+
+    def take(self, now_ns: int) -> Submit | None:
+        """The next request. Written ahead: a successor knows it even if we die now."""
+        if not self._payloads or self._quiet:
+            return None
+        payload = self._payloads.popleft()
+        self._dialogue.write(now_ns, self._client.next_id, 0, EntryKind.SENT, payload)
+        return Submit(payload)
+
+    def accept(self, reply: Reply, now_ns: int) -> None:
+        """Out it goes as frames; written behind, so that a reply that nobody got is asked again."""
+        self._answered += 1
+        for frame in self._gateway.on_reply(
+            reply.payload, self._t_us, reply.replica, reply.epoch, self._answered
+        ):
+            self._bus.send(frame)
+        self._dialogue.write(now_ns, reply.request_id, reply.epoch, EntryKind.ANSWERED, reply.payload)
+
+    def quiet(self) -> None:
+        """No more requests."""
+        self._quiet = True
+        self._payloads.clear()
+
+    def deadline_ns(self) -> int | None:
+        """Frames come by themselves."""
+        return None
+
+    def stats(self) -> bytes:
+        """What the gateway believed and refused, and how far the requests are."""
+        counts = self._gateway.counts
+        return msgspec.msgpack.encode(
+            {
+                "sent": self._client.next_id - 1,
+                "unanswered": len(self._client.unanswered) + len(self._payloads),
+                "overrun": self._overrun,
+                "accepted": counts.accepted,
+                "ignored": counts.ignored,
+                "refused": counts.refused,
+            }
+        )
+
+
+def _gateway(options: GatewayOptions) -> BusGateway:
+    if options.map:
+        return MappedGateway(load_dbc(), Path(options.dbc), find_map(options.map))
+    return Gateway(load_dbc())

@@ -1,0 +1,109 @@
+"""Jobs: what takes several round trips, written as a generator, run by one thread without blocking.
+
+A job yields a `Wait`: keys that must be settled, processes that must not die meanwhile, a deadline.
+It is resumed with the values of the keys, or `StepFailed` is thrown into it at that point, so that
+what must be undone stands in an `except` beside what was done.
+"""
+
+import time
+from collections.abc import Callable, Generator
+from typing import Final
+
+import msgspec
+
+STEP_SECONDS_MAX: Final = 2.0
+
+Key = tuple[str, str, int]
+
+
+class StepFailed(Exception):  # noqa: N818 - a situation within a job, never shown as it is
+    """A step was refused, its process died, or its deadline passed."""
+
+
+class Wait(msgspec.Struct, frozen=True):
+    """`involved`: names of processes whose death fails the step."""
+
+    keys: frozenset[Key]
+    involved: frozenset[str] = frozenset()
+    seconds: float = STEP_SECONDS_MAX
+
+
+Steps = Generator[Wait, dict[Key, bytes], None]
+
+
+class _Job:
+    def __init__(self, name: str, steps: Steps, on_end: Callable[[str], None]) -> None:
+        self.name, self.steps, self.on_end = name, steps, on_end
+        self.wait = Wait(frozenset())
+        self.got: dict[Key, bytes] = {}
+        self.deadline_ns = 0
+
+
+class Jobs:
+    """All jobs under way."""
+
+    def __init__(self) -> None:
+        self._jobs: list[_Job] = []
+
+    def __len__(self) -> int:
+        return len(self._jobs)
+
+    def names(self) -> list[str]:
+        """What is under way."""
+        return [job.name for job in self._jobs]
+
+    def start(self, name: str, steps: Steps, on_end: Callable[[str], None]) -> None:
+        """Run `steps`; `on_end` gets the reason of its failure, or `""`."""
+        job = _Job(name, steps, on_end)
+        self._jobs.append(job)
+        self._advance(job, lambda: next(steps))
+
+    def settle(self, key: Key, value: bytes = b"") -> None:
+        """`key` has happened."""
+        for job in list(self._jobs):
+            if key in job.wait.keys and key not in job.got:
+                job.got[key] = value
+                if len(job.got) == len(job.wait.keys):
+                    got = job.got
+                    self._advance(job, lambda j=job, g=got: j.steps.send(g))  # type: ignore[misc]
+
+    def fail(self, key: Key, reason: str) -> None:
+        """`key` will not happen."""
+        self._throw([job for job in self._jobs if key in job.wait.keys], reason)
+
+    def died(self, process: str) -> None:
+        """The process called `process` is dead."""
+        self._throw([job for job in self._jobs if process in job.wait.involved], f"{process} died")
+
+    def expire(self, now_ns: int) -> None:
+        """Fail what is past its deadline."""
+        late = [job for job in self._jobs if now_ns >= job.deadline_ns]
+        for job in late:
+            missing = ", ".join(f"{a} {b}" for a, b, _ in job.wait.keys - job.got.keys())
+            self._throw([job], f"no answer within {job.wait.seconds} s: {missing}")
+
+    def deadline_ns(self) -> int | None:
+        """The earliest deadline."""
+        return min((job.deadline_ns for job in self._jobs), default=None)
+
+    def _throw(self, jobs: list[_Job], reason: str) -> None:
+        for job in jobs:
+            if job in self._jobs:
+                self._advance(job, lambda j=job: j.steps.throw(StepFailed(reason)))  # type: ignore[misc]
+
+    def _advance(self, job: _Job, resume: Callable[[], Wait]) -> None:
+        try:
+            while True:
+                job.wait, job.got = resume(), {}
+                job.deadline_ns = time.monotonic_ns() + round(job.wait.seconds * 1e9)
+                if job.wait.keys:
+                    return
+                resume = lambda: job.steps.send({})  # noqa: E731
+        except StopIteration:
+            self._end(job, "")
+        except StepFailed as failure:
+            self._end(job, str(failure) or "failed")
+
+    def _end(self, job: _Job, reason: str) -> None:
+        self._jobs.remove(job)
+        job.on_end(reason)

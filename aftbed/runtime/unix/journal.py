@@ -1,0 +1,97 @@
+"""Journals as files mapped into memory: the write is a memory write, the kernel keeps the page.
+
+The format is `core.journal`'s. A file grows by a chunk when it is full; up to a limit, beyond which
+a record is dropped and the drop is counted in the header, so that a checker says `unknown` and not
+`pass`.
+"""
+
+import mmap
+import os
+from pathlib import Path
+from typing import Final
+
+from aftbed.core import journal as layout
+from aftbed.core.event import Event
+
+CHUNK_BYTES: Final = 1 << 20
+FILE_BYTES_MAX: Final = 1 << 30
+
+
+def _mapped(path: Path, name: str) -> mmap.mmap:
+    """A new file of one chunk with the header of `name`, mapped."""
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+    try:
+        os.ftruncate(descriptor, CHUNK_BYTES)
+        mapping = mmap.mmap(descriptor, CHUNK_BYTES)
+    finally:
+        os.close(descriptor)
+    mapping[: layout.HEADER_BYTES] = layout.header(name)
+    return mapping
+
+
+def _grow(mapping: mmap.mmap) -> bool:
+    """One chunk more; False at the limit."""
+    if len(mapping) >= FILE_BYTES_MAX:
+        return False
+    mapping.resize(len(mapping) + CHUNK_BYTES)
+    return True
+
+
+class Journal:
+    """The records of one node. `mapping` is public for the pulse and the flag of the header."""
+
+    def __init__(self, path: Path, node: str) -> None:
+        self.mapping = _mapped(path, node)
+        self._at, self._end = layout.HEADER_BYTES, CHUNK_BYTES - layout.RECORD.size
+        self._pack = layout.RECORD.pack_into
+
+    def write(self, now_ns: int, event: Event, request_id: int, detail: int) -> None:
+        """Append a record."""
+        if self._at > self._end:
+            if not _grow(self.mapping):
+                return
+            self._end = len(self.mapping) - layout.RECORD.size
+        self._pack(self.mapping, self._at, now_ns, request_id, detail, 0, event.code)
+        self._at += layout.RECORD.size
+
+
+class Dialogue:
+    """Requests and replies with their bytes, as the client saw them."""
+
+    def __init__(self, path: Path, node: str) -> None:
+        self.mapping = _mapped(path, node)
+        self._at = layout.HEADER_BYTES
+
+    def write(self, now_ns: int, request_id: int, epoch: int, kind: layout.EntryKind, payload: bytes) -> None:
+        """Append an entry; its kind is written last and commits it."""
+        end = self._at + layout.ENTRY.size + len(payload)
+        while end > len(self.mapping):
+            if not _grow(self.mapping):
+                return
+        self.mapping[self._at + layout.ENTRY.size : end] = payload
+        layout.ENTRY.pack_into(self.mapping, self._at, now_ns, request_id, len(payload), epoch, kind)
+        self._at = end
+
+
+class Header:
+    """The header page of another node's journal: its pulse, and the flag that announces control mail."""
+
+    def __init__(self, path: Path) -> None:
+        descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC)
+        try:
+            self._mapping = mmap.mmap(descriptor, layout.HEADER_BYTES)
+        finally:
+            os.close(descriptor)
+
+    def pulse_ns(self) -> int:
+        """When the node was last seen running (monotonic ns), 0 if never."""
+        at = layout.PULSE_OFFSET
+        return int.from_bytes(self._mapping[at : at + 8], "little")
+
+    def announce(self) -> None:
+        """Raise the flag."""
+        self._mapping[layout.FLAG_OFFSET] = 1
+
+    def close(self) -> None:
+        """Unmap."""
+        self._mapping.close()

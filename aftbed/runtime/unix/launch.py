@@ -1,0 +1,208 @@
+"""Starting a run from a command, and being told how it goes.
+
+The command forks the warden and the supervisor before it does anything else that takes memory; the
+supervisor has a session of its own, so a terminal's Ctrl-C reaches the command alone.
+"""
+
+import os
+import select
+import signal
+import socket
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from aftbed import __version__
+from aftbed.core.errors import ConfigError
+from aftbed.core.fault import Fault
+from aftbed.runtime.unix import control, linux, rundir
+from aftbed.runtime.unix.options import LoadRun, RunOptions, Work
+from aftbed.runtime.unix.warden import watch
+
+END_SECONDS_MAX: Final = 8.0
+KILL_SECONDS_MAX: Final = 1.0
+
+
+def bind_hub(port: int) -> socket.socket:
+    """The hub's listening socket on the loopback; `port` 0 is any. Raises ConfigError if it is in use."""
+    sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        sock.bind(("127.0.0.1", port))
+        sock.listen(32)
+    except OSError as error:
+        sock.close()
+        raise ConfigError(
+            f"--bus-port {port}: {error.strerror}; choose another, or 0 for any free one"
+        ) from None
+    return sock
+
+
+class Launched:
+    """A run in progress, seen from its command."""
+
+    def __init__(self, options: RunOptions, listener: socket.socket | None) -> None:
+        self.options = options
+        self.private = Path(options.private)
+        self.record = Path(options.record)
+        self.started_ns = time.monotonic_ns()
+        self._life: list[int] = []
+        self._start(listener)
+        self._reports = iter(self._listen())
+        self.end: dict[str, object] | None = None
+
+    def _start(self, listener: socket.socket | None) -> None:
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        command_end, command_life = os.pipe()
+        supervisor_end, supervisor_life = os.pipe()
+        self._supervisor = os.fork()
+        if self._supervisor == 0:
+            os.setsid()
+            for fd in (command_end, command_life, supervisor_end):
+                os.close(fd)
+            ours.close()
+            self._be_supervisor(theirs)
+        self._pidfd = os.pidfd_open(self._supervisor)
+        theirs.close()
+        os.close(supervisor_life)
+        self._warden = os.fork()
+        if self._warden == 0:
+            os.setsid()
+            os.close(command_life)
+            ours.close()
+            if listener is not None:
+                listener.close()
+            watch(self.private, command_end, supervisor_end, self._pidfd)
+        os.close(command_end)
+        os.close(supervisor_end)
+        self._life = [command_life]
+        self.line = control.Line(ours, control.decode_report)
+
+    def _be_supervisor(self, owner: socket.socket) -> None:
+        """Never returns."""
+        code = 1
+        try:
+            from aftbed.runtime.unix.supervisor import supervise  # noqa: PLC0415 - not for the command
+
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
+            log = os.open(self.record / "processes.log", os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
+            os.dup2(log, 1)
+            os.dup2(log, 2)
+            linux.set_name("aftbed-supervis")
+            supervise(self.options, owner)
+            code = 0
+        except BaseException:  # noqa: BLE001 - the last frame of this process
+            import traceback  # noqa: PLC0415
+
+            traceback.print_exc()
+        finally:
+            os._exit(code)
+
+    @property
+    def supervisor(self) -> int:
+        """Its pid."""
+        return self._supervisor
+
+    def _listen(self) -> Iterator[control.Report]:
+        while True:
+            try:
+                got = self.line.recv()
+            except OSError:
+                return
+            if got is None:
+                return
+            if isinstance(got[0], control.Report):
+                yield got[0]
+
+    def reports(self) -> Iterator[control.Report]:
+        """What the supervisor says, until the run has ended; `end` is set if it ended in order."""
+        for report in self._reports:
+            if report.kind == "finished":
+                self.end = msgspec.json.decode(report.data)
+                return
+            yield report
+
+    def stop(self) -> None:
+        """Ask for the end; reports go on until it is there."""
+        try:
+            self.line.send(control.Stop(0))
+        except OSError:
+            return
+
+    def close(self, *, keep: bool = False) -> None:
+        """Wait for the supervisor's end, kill it if it does not come, and remove the directory."""
+        self.line.close()
+        if not self._pidfd_ready(END_SECONDS_MAX):
+            linux.kill(self._pidfd, signal.SIGKILL)
+            self._pidfd_ready(KILL_SECONDS_MAX)
+        os.waitpid(self._supervisor, 0)
+        os.close(self._pidfd)
+        if keep:
+            return
+        self.remove()
+
+    def remove(self) -> None:
+        """The record has been read: let everything go."""
+        rundir.remove(self.private)
+        for fd in self._life:
+            os.close(fd)
+        self._life = []
+        os.waitpid(self._warden, 0)
+
+    def _pidfd_ready(self, seconds: float) -> bool:
+        poll = select.poll()
+        poll.register(self._pidfd, select.POLLIN)
+        return bool(poll.poll(seconds * 1e3))
+
+
+def launch(options: RunOptions, listener: socket.socket | None) -> Launched:
+    """Start a run. `run.json` is written first: a record says what it is a record of."""
+    about = {"version": __version__, "started_ns": time.monotonic_ns(), **msgspec.to_builtins(options)}
+    for key in ("listener", "private"):
+        about.pop(key)
+    about["load"] = isinstance(options.work, LoadRun)
+    (Path(options.record) / "run.json").write_bytes(msgspec.json.format(msgspec.json.encode(about)))
+    launched = Launched(options, listener)
+    if listener is not None:
+        listener.close()
+    return launched
+
+
+def options_for(
+    *,
+    ftm: str,
+    placement: str,
+    work: Work,
+    seed: int = 0,
+    record: str | None = None,
+    faults: tuple[Fault, ...] = (),
+    pin: bool = True,
+    bus_port: int = 0,
+) -> tuple[RunOptions, socket.socket | None]:
+    """A run directory and, where there is a bus, its socket. Raises ConfigError, leaving nothing."""
+    listener = None if isinstance(work, LoadRun) else bind_hub(bus_port)
+    private = rundir.create()
+    try:
+        directory = rundir.record_directory(record, private)
+    except ConfigError:
+        rundir.remove(private)
+        if listener is not None:
+            listener.close()
+        raise
+    options = RunOptions(
+        run=private.name,
+        private=str(private),
+        record=str(directory),
+        ftm=ftm,
+        placement=placement,
+        seed=seed,
+        work=work,
+        faults=faults,
+        pin=pin,
+        listener=listener.fileno() if listener is not None else -1,
+        port=listener.getsockname()[1] if listener is not None else 0,
+    )
+    return options, listener

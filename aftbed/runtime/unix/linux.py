@@ -1,0 +1,77 @@
+"""The few Linux calls that Python has no word for, and their errors.
+
+`PR_SET_PDEATHSIG` (prctl(2)) ties a process to its parent's life; `PR_SET_CHILD_SUBREAPER` makes the
+supervisor the parent of whatever its descendants leave behind.
+"""
+
+import contextlib
+import ctypes
+import os
+import resource
+import signal
+import time
+from typing import Final
+
+from aftbed.core.errors import HarnessError
+
+PR_SET_PDEATHSIG: Final = 1
+PR_SET_NAME: Final = 15
+PR_SET_CHILD_SUBREAPER: Final = 36
+ADOPTION_SECONDS_MAX: Final = 5.0
+
+_libc: Final = ctypes.CDLL(None, use_errno=True)
+
+
+def _prctl(option: int, argument: int) -> None:
+    if _libc.prctl(option, ctypes.c_ulong(argument), 0, 0, 0) != 0:
+        code = ctypes.get_errno()
+        raise HarnessError(f"prctl({option}, {argument}): {os.strerror(code)}")
+
+
+def die_with(parent: int) -> None:
+    """Have the kernel kill this process when `parent` dies. Ends it now if that happened already.
+
+    Waits to be adopted by `parent` first: the signal is bound to the parent of this moment.
+    """
+    limit = time.monotonic() + ADOPTION_SECONDS_MAX
+    while os.getppid() != parent:
+        if time.monotonic() > limit:
+            os._exit(1)
+        os.sched_yield()
+    _prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:
+        os._exit(1)
+
+
+def become_subreaper() -> None:
+    """Adopt the orphans among this process's descendants."""
+    _prctl(PR_SET_CHILD_SUBREAPER, 1)
+
+
+def set_name(name: str) -> None:
+    """The name that `ps` and `/proc/PID/comm` show (15 bytes)."""
+    buffer = ctypes.create_string_buffer(name.encode()[:15])
+    _libc.prctl(PR_SET_NAME, buffer, 0, 0, 0)
+
+
+def no_core() -> None:
+    """A killed node leaves no core file."""
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+
+
+def kill(pidfd: int, sig: signal.Signals) -> bool:
+    """Signal the very process behind `pidfd`; False if it is gone."""
+    try:
+        signal.pidfd_send_signal(pidfd, sig)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def reap(pid: int) -> int | None:
+    """The exit status of the dead child `pid` (negative: the signal), or None if it is not ours."""
+    with contextlib.suppress(ChildProcessError):
+        got, status = os.waitpid(pid, os.WNOHANG)
+        if got == pid:
+            return os.waitstatus_to_exitcode(status)
+    return None

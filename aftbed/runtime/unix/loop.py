@@ -1,0 +1,61 @@
+"""The supervisor's loop: one thread, one epoll, timers, jobs. Off the request path."""
+
+import heapq
+import itertools
+import select
+import time
+from collections.abc import Callable
+
+from aftbed.runtime.unix.jobs import Jobs
+
+
+class Loop:
+    """Call what is registered for a descriptor when it is readable, and timers when they are due."""
+
+    def __init__(self) -> None:
+        self._epoll = select.epoll()
+        self._readers: dict[int, Callable[[], None]] = {}
+        self._timers: list[tuple[int, int, Callable[[], None]]] = []
+        self._order = itertools.count()
+        self._ended = False
+        self.jobs = Jobs()
+
+    def read(self, fd: int, call: Callable[[], None]) -> None:
+        """Call `call` whenever `fd` is readable or has ended."""
+        self._readers[fd] = call
+        self._epoll.register(fd, select.EPOLLIN)
+
+    def forget(self, fd: int) -> None:
+        """Undo `read`; before the descriptor is closed."""
+        if self._readers.pop(fd, None) is not None:
+            self._epoll.unregister(fd)
+
+    def after(self, seconds: float, call: Callable[[], None]) -> None:
+        """Call `call` once, `seconds` from now."""
+        due = time.monotonic_ns() + round(seconds * 1e9)
+        heapq.heappush(self._timers, (due, next(self._order), call))
+
+    def end(self) -> None:
+        """Let `run` return."""
+        self._ended = True
+
+    def run(self) -> None:
+        """Serve until `end`."""
+        while not self._ended:
+            for fd, _ in self._epoll.poll(self._patience_seconds()):
+                call = self._readers.get(fd)
+                if call is not None:
+                    call()
+            now_ns = time.monotonic_ns()
+            self.jobs.expire(now_ns)
+            while self._timers and self._timers[0][0] <= now_ns:
+                heapq.heappop(self._timers)[2]()
+
+    def _patience_seconds(self) -> float:
+        dues = [self._timers[0][0]] if self._timers else []
+        job = self.jobs.deadline_ns()
+        if job is not None:
+            dues.append(job)
+        if not dues:
+            return 1.0
+        return min(1.0, max(0.0, (min(dues) - time.monotonic_ns()) / 1e9))

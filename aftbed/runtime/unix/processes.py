@@ -1,0 +1,202 @@
+"""The supervisor's processes: zygotes, the spares that they parked, and what spares became.
+
+Everything is found by its own pidfd and its own control line; nothing is ever killed by name.
+"""
+
+import contextlib
+import os
+import signal
+import socket
+from collections import deque
+from collections.abc import Callable, Generator
+from pathlib import Path
+from typing import Final, NoReturn
+
+import msgspec
+
+from aftbed.runtime.unix import control, linux
+from aftbed.runtime.unix.jobs import Key, StepFailed, Wait
+from aftbed.runtime.unix.journal import Header
+from aftbed.runtime.unix.loop import Loop
+from aftbed.runtime.unix.zygote import Become
+from aftbed.runtime.unix.zygote import run as run_zygote
+
+PARK_BATCH: Final = 4  # spares per order: the first of them start while the next are forked
+
+
+class Process:
+    """A child of the supervisor. `kind`: zygote, spare, node or service."""
+
+    def __init__(self, name: str, kind: str, line: control.Line[control.FromNode]) -> None:
+        self.name, self.kind, self.line = name, kind, line
+        self.pid, self.pidfd = 0, -1
+        self.journal: Path | None = None
+        self.header: Header | None = None
+        self.alive = True
+        self.incarnation = 0
+        self.spawned_ns = 0
+
+    def born(self, pid: int) -> None:
+        """The process exists; it cannot be reaped by another, so the pid is its own."""
+        self.pid, self.pidfd = pid, os.pidfd_open(pid)
+
+    def kill(self, sig: signal.Signals = signal.SIGKILL) -> bool:
+        """Signal it; False if it is gone."""
+        return self.pidfd >= 0 and linux.kill(self.pidfd, sig)
+
+    def close(self) -> None:
+        """Let go of all descriptors."""
+        self.alive = False
+        self.line.close()
+        if self.pidfd >= 0:
+            os.close(self.pidfd)
+            self.pidfd = -1
+        if self.header is not None:
+            self.header.close()
+            self.header = None
+
+
+class Nursery:
+    """Two zygotes, and what they park. `on_report` and `on_death` are the supervisor's."""
+
+    def __init__(
+        self,
+        loop: Loop,
+        become: Become,
+        on_report: Callable[[Process, msgspec.Struct], None],
+        on_death: Callable[[Process, int | None], None],
+    ) -> None:
+        self._loop, self._become = loop, become
+        self._on_report, self._on_death = on_report, on_death
+        self.processes: list[Process] = []
+        self.zygotes: dict[str, Process] = {}
+        self.parked: dict[str, deque[Process]] = {}
+        self._unborn: dict[str, list[Process]] = {}
+        self._preloads: dict[str, tuple[str, ...]] = {}
+
+    # -- zygotes ------------------------------------------------------------------------------
+
+    def start_zygote(self, name: str, preload: tuple[str, ...]) -> None:
+        """Fork a zygote from this process."""
+        self._preloads[name] = preload
+        self.parked.setdefault(name, deque())
+        self._unborn[name] = []
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        supervisor, pid = os.getpid(), os.fork()
+        if pid == 0:
+            self._be_zygote(theirs.detach(), supervisor, preload)
+        theirs.close()
+        process = self._adopt(name, "zygote", ours)
+        process.born(pid)
+        self.zygotes[name] = process
+        self._watch(process)
+
+    def _be_zygote(self, descriptor: int, supervisor: int, preload: tuple[str, ...]) -> NoReturn:
+        for sig in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(sig, signal.SIG_DFL)
+        try:
+            run_zygote(descriptor, supervisor, preload, self._become)
+        finally:
+            os._exit(1)
+
+    def restart_zygote(self, name: str) -> None:
+        """After its death: a new one, and the spares that the old one did not get to fork."""
+        wanted = len(self._unborn[name])
+        for process in self._unborn[name]:
+            self._forget(process)
+        self.start_zygote(name, self._preloads[name])
+        self.park(name, wanted)
+
+    # -- spares -------------------------------------------------------------------------------
+
+    def park(self, zygote: str, count: int) -> None:
+        """Have `count` more spares forked."""
+        while count > 0:
+            batch = min(count, PARK_BATCH)
+            pairs = [socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET) for _ in range(batch)]
+            for ours, _ in pairs:
+                self._unborn[zygote].append(self._adopt("spare", "spare", ours))
+            with contextlib.suppress(OSError):  # a dead zygote: its restart asks again
+                fds = tuple(end.fileno() for _, end in pairs)
+                self.zygotes[zygote].line.send(control.Park(0), fds)
+            for _, theirs in pairs:
+                theirs.close()
+            count -= batch
+
+    def spare(self, zygote: str) -> Generator[Wait, dict[Key, bytes], Process]:
+        """A parked spare; waits for one to be forked if there is none."""
+        while True:
+            while not self.parked[zygote]:
+                if not self._unborn[zygote]:
+                    self.park(zygote, 1)
+                yield Wait(frozenset({("spare", zygote, 0)}), seconds=5.0)
+            process = self.parked[zygote].popleft()
+            if process.alive:
+                return process
+
+    def level(self, zygote: str, count: int) -> None:
+        """Have `count` spares parked, in the end."""
+        self.park(zygote, count - len(self.parked[zygote]) - len(self._unborn[zygote]))
+
+    def _adopt(self, name: str, kind: str, sock: socket.socket) -> Process:
+        sock.setblocking(False)
+        process = Process(name, kind, control.Line(sock, control.decode_report))
+        self.processes.append(process)
+        self._loop.read(sock.fileno(), lambda: self._heard(process))
+        return process
+
+    def _watch(self, process: Process) -> None:
+        self._loop.read(process.pidfd, lambda: self._died(process))
+
+    def _heard(self, process: Process) -> None:
+        """Read what the process says; its death is the pidfd's business, not the line's."""
+        while process.alive:
+            try:
+                got = process.line.recv()
+            except BlockingIOError:
+                return
+            except OSError:
+                got = None
+            if got is None:
+                self._loop.forget(process.line.fileno())
+                return
+            message, fds = got
+            assert not fds, f"{process.name} sent descriptors"
+            if isinstance(message, control.Hello) and process.kind == "spare" and not process.pid:
+                self._hello(process, message.pid)
+            elif not isinstance(message, control.Hello):
+                self._on_report(process, message)
+
+    def _hello(self, process: Process, pid: int) -> None:
+        process.born(pid)
+        self._watch(process)
+        for name, unborn in self._unborn.items():
+            if process in unborn:
+                unborn.remove(process)
+                self.parked[name].append(process)
+                self._loop.jobs.settle(("spare", name, 0))
+
+    # -- death --------------------------------------------------------------------------------
+
+    def _died(self, process: Process) -> None:
+        status = linux.reap(process.pid)
+        self._heard(process)  # its last words are still in the line
+        self._forget(process)
+        self._on_death(process, status)
+
+    def _forget(self, process: Process) -> None:
+        if process.pidfd >= 0:
+            self._loop.forget(process.pidfd)
+        self._loop.forget(process.line.fileno())
+        process.close()
+        self.processes.remove(process)
+        for pool in (*self.parked.values(), *self._unborn.values()):
+            if process in pool:
+                pool.remove(process)
+
+    def order(self, process: Process, order: control.ToNode, fds: tuple[int, ...] = ()) -> None:
+        """Send `order`. Raises StepFailed if the process is gone or does not read its line."""
+        try:
+            process.line.send(order, fds)
+        except OSError as error:
+            raise StepFailed(f"{process.name} cannot be reached: {error.strerror}") from None

@@ -1,0 +1,100 @@
+"""Where a run lives: a private directory with its control socket, and the directory of its record.
+
+The private one is `$XDG_RUNTIME_DIR/aftbed/ID` or `/tmp/aftbed-UID/ID`, mode 0700; it goes with the
+run. Without `--record` the record lives, and goes, inside it.
+"""
+
+import os
+import secrets
+import shutil
+import socket
+import stat
+from pathlib import Path
+from typing import Final
+
+from aftbed.core.errors import ConfigError, HarnessError
+
+SOCKET_NAME: Final = "control"
+ID_BYTES: Final = 3
+
+
+def root() -> Path:
+    """The directory of all runs of this user; made if absent. Raises HarnessError if it is not ours."""
+    runtime = os.environ.get("XDG_RUNTIME_DIR")
+    if runtime and Path(runtime).is_dir():
+        path = Path(runtime) / "aftbed"
+    else:
+        path = Path(os.environ.get("TMPDIR") or "/tmp") / f"aftbed-{os.getuid()}"
+    path.mkdir(mode=0o700, exist_ok=True)
+    state = path.lstat()
+    if not stat.S_ISDIR(state.st_mode) or state.st_uid != os.getuid() or state.st_mode & 0o077:
+        raise HarnessError(f"{path}: must be a directory of this user alone (mode 0700); remove it")
+    return path
+
+
+def create() -> Path:
+    """A new private directory; its name is the id of the run."""
+    while True:
+        path = root() / secrets.token_hex(ID_BYTES)
+        try:
+            path.mkdir(mode=0o700)
+        except FileExistsError:
+            continue
+        return path
+
+
+def record_directory(wanted: str | None, private: Path) -> Path:
+    """The directory of the record; raises ConfigError if `wanted` exists or cannot be made."""
+    path = Path(wanted) if wanted else private / "record"
+    try:
+        path.mkdir(parents=True)
+        (path / "journal").mkdir()
+    except FileExistsError:
+        raise ConfigError(f"--record {wanted}: exists already; name a directory that does not") from None
+    except OSError as error:
+        raise ConfigError(f"--record {wanted}: cannot be made: {error.strerror}") from None
+    return path.resolve()
+
+
+def remove(private: Path) -> None:
+    """Remove the private directory of a run that has ended."""
+    shutil.rmtree(private, ignore_errors=True)
+
+
+def live() -> list[str]:
+    """The ids of the runs whose supervisor answers, oldest first."""
+    found = []
+    for path in sorted(root().iterdir(), key=lambda p: p.stat().st_mtime if p.exists() else 0.0):
+        try:
+            connect(path).close()
+        except OSError:
+            continue
+        found.append(path.name)
+    return found
+
+
+def connect(private: Path) -> socket.socket:
+    """A connection to the supervisor of the run in `private`; raises OSError."""
+    sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    try:
+        sock.settimeout(2.0)
+        sock.connect(str(private / SOCKET_NAME))
+    except OSError:
+        sock.close()
+        raise
+    return sock
+
+
+def find(run: str | None) -> Path:
+    """The private directory of run `run`, or of the only one alive. Raises ConfigError."""
+    alive = live()
+    if run is not None:
+        if run not in alive:
+            known = ", ".join(alive) or "none"
+            raise ConfigError(f"--run {run}: no such run is alive (alive: {known})")
+        return root() / run
+    if not alive:
+        raise ConfigError("no run is alive; start one with `aftbed run`")
+    if len(alive) > 1:
+        raise ConfigError(f"{len(alive)} runs are alive: name one with --run (alive: {', '.join(alive)})")
+    return root() / alive[0]

@@ -1,0 +1,124 @@
+"""The processes beside the graph: the hub, the car, the player of logs. Each ends with its control line."""
+
+import os
+import select
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+
+from aftbed.core.errors import HarnessError
+from aftbed.runtime.unix import control
+from aftbed.runtime.unix.options import PlayerOptions, VehicleOptions
+from aftbed.vehicle.hub import HubOptions
+from aftbed.vehicle.hub import serve as serve_hub
+
+
+def serve(line: control.Line[control.ToNode], order: control.Serve, fds: list[int]) -> None:
+    """Run the service that `order` names, until it is done or its line ends."""
+    if order.service == "hub":
+        _hub(line, order, fds)
+    elif order.service == "vehicle":
+        _vehicle(line, msgspec.msgpack.decode(order.options, type=VehicleOptions))
+    else:
+        assert order.service == "player", order.service
+        _player(line, msgspec.msgpack.decode(order.options, type=PlayerOptions))
+
+
+def _hub(line: control.Line[control.ToNode], order: control.Serve, fds: list[int]) -> None:
+    import socket  # noqa: PLC0415 - imported by all others already
+
+    listener, log = fds
+    line.send(control.Report("ready", b""))
+    counts = serve_hub(
+        socket.socket(fileno=listener),
+        log,
+        msgspec.msgpack.decode(order.options, type=HubOptions),
+        line.fileno(),
+    )
+    os.close(log)
+    line.send(control.Report("result", msgspec.json.encode(counts)))
+
+
+def _stopper(line: control.Line[control.ToNode]) -> Callable[[], bool]:
+    """Becomes true when the supervisor says Stop, or is gone."""
+    poll = select.poll()
+    poll.register(line.fileno(), select.POLLIN)
+    stopped = False
+
+    def stop() -> bool:
+        nonlocal stopped
+        stopped = stopped or bool(poll.poll(0))
+        return stopped
+
+    return stop
+
+
+def _wait_for_go(line: control.Line[control.ToNode]) -> bool:
+    """Attached: wait for Resume; False if it is a Stop, or the end."""
+    line.send(control.Report("ready", b""))
+    got = line.recv()
+    return got is not None and isinstance(got[0], control.Resume)
+
+
+def _vehicle(line: control.Line[control.ToNode], options: VehicleOptions) -> None:
+    from aftbed.vehicle.bus import BusOptions  # noqa: PLC0415
+    from aftbed.vehicle.car import CarBuses, DriveOptions, drive  # noqa: PLC0415
+    from aftbed.vehicle.dbcfile import load_dbc  # noqa: PLC0415
+    from aftbed.vehicle.scenario import load_scenario  # noqa: PLC0415
+
+    scenario, codec = load_scenario(options.scenario), load_dbc()
+    buses = CarBuses(BusOptions(port=options.port), lockstep=options.pace is None)
+    if not _wait_for_go(line):
+        return
+    try:
+        result = drive(
+            scenario,
+            codec,
+            buses,
+            msgspec.convert(
+                {"pace": options.pace, "brake_policy": options.brake_policy, "seed": options.seed},
+                DriveOptions,
+            ),
+            report=lambda telemetry: line.send(
+                control.Report("telemetry", msgspec.msgpack.encode(telemetry))
+            ),
+            stop=_stopper(line),
+        )
+    except HarnessError as error:
+        line.send(control.Report("trouble", str(error).encode()))
+        return
+    line.send(control.Report("result", msgspec.json.encode(result)))
+
+
+def _player(line: control.Line[control.ToNode], options: PlayerOptions) -> None:
+    from aftbed.vehicle.bus import BusOptions, open_bus  # noqa: PLC0415
+    from aftbed.vehicle.candump import read_log  # noqa: PLC0415
+    from aftbed.vehicle.dbcfile import load_dbc  # noqa: PLC0415
+    from aftbed.vehicle.mapfile import find_map  # noqa: PLC0415
+    from aftbed.vehicle.mapped import MappedGateway  # noqa: PLC0415
+    from aftbed.vehicle.player import play  # noqa: PLC0415
+
+    gateway = MappedGateway(load_dbc(), Path(options.dbc), find_map(options.map))
+    frames, counts = read_log(Path(options.log))
+    bus = open_bus(BusOptions(port=options.port))
+    if not _wait_for_go(line):
+        return
+    try:
+        result = play(
+            frames,
+            load_dbc(),
+            bus,
+            options.pace,
+            ends_cycle=lambda frame: gateway.on_frame(frame) is not None,
+            stop=_stopper(line),
+        )
+    except HarnessError as error:
+        line.send(control.Report("trouble", str(error).encode()))
+        return
+    line.send(
+        control.Report(
+            "result",
+            msgspec.json.encode({"played": result, "log": counts, "gateway": gateway.counts}),
+        )
+    )

@@ -1,0 +1,424 @@
+"""The supervisor: starts the graph, carries out what Recovery orders, replaces what dies, ends it all.
+
+It has the place of the ROS master in the paper's count of processes, and it is trusted as that one is.
+It is not on the request path: while it sleeps, requests flow. It outlives nobody: its death kills its
+children (`PR_SET_PDEATHSIG`), and the end of its owner's line ends the run.
+"""
+
+import json
+import os
+import signal
+import socket
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from aftbed.core import message, script
+from aftbed.core.errors import AftbedError, ConfigError
+from aftbed.core.event import Event
+from aftbed.ftm.mechanism import build
+from aftbed.runtime import targets
+from aftbed.runtime.unix import ask, control, linux, rundir
+from aftbed.runtime.unix.deployment import BUS, LIGHT, WATCHED_KINDS, Deployment, Keys
+from aftbed.runtime.unix.faults import Faults
+from aftbed.runtime.unix.jobs import StepFailed
+from aftbed.runtime.unix.journal import Journal
+from aftbed.runtime.unix.loop import Loop
+from aftbed.runtime.unix.options import LoadRun, RunOptions
+from aftbed.runtime.unix.part import become
+from aftbed.runtime.unix.processes import Nursery, Process
+from aftbed.runtime.unix.verbs import Executor
+from aftbed.runtime.unix.work import Work
+
+TICK_SECONDS: Final = 0.02
+HANG_NS: Final = 150_000_000  # of what no Watchdog watches; a channel's pulse is 20 ms
+LATE_NS_MAX: Final = 40_000_000
+DRAIN_SECONDS_MAX: Final = 2.0
+STOP_SECONDS_MAX: Final = 1.0
+QUESTIONS_MAX: Final = 16
+BUS_PRELOAD: Final = (
+    "can.interfaces.socketcand",
+    "cantools",
+    "e2e.p11",
+    "aftbed.runtime.unix.gateway",
+    "aftbed.vehicle.car",
+    "aftbed.vehicle.player",
+)
+
+
+class Supervisor:
+    """One run. `owner` is the line to the command; its end is the command's."""
+
+    def __init__(self, options: RunOptions, owner: socket.socket) -> None:
+        self.options = options
+        self.record = Path(options.record)
+        self.started_ns = time.monotonic_ns()
+        self.owner = control.Line(owner, control.decode_order)
+        self.owner.sock.setblocking(False)
+        self.loop = Loop()
+        self.nursery = Nursery(self.loop, become, self._on_report, self._on_death)
+        self.journal = Journal(self.record / "journal" / "supervisor.1.journal", "supervisor")
+        self._events = open(self.record / "events.jsonl", "ab", buffering=0)  # noqa: SIM115 - for the whole run
+        self._ending = ""
+        self._finish_reason = ""
+        self._grace_until_ns = 0
+        self.graph_ms = 0.0
+        self._incomplete: list[str] = []
+        self._questions: dict[int, control.Line[ask.Question]] = {}
+        self._last_tick_ns = 0
+        self._situation_wanted = False
+        graph = build(options.ftm, options.placement)
+        cpus = sorted(os.sched_getaffinity(0))
+        pinned = cpus if options.pin and len(cpus) > 1 else None
+        self.work = Work(options, self.nursery, self.loop, self.tell, self._finish, self._report_owner)
+        self.deployment = Deployment(graph, self.nursery, self.record, self.work.device_of, pinned)
+        self.executor = Executor(self.deployment, self.journal, self.tell)
+        self.faults = Faults(self.deployment, self.loop, self.journal, self.tell)
+
+    # -- life ---------------------------------------------------------------------------------
+
+    def run(self) -> None:
+        """From the first fork to the last reaped process."""
+        linux.become_subreaper()
+        linux.no_core()
+        wants_bus = not isinstance(self.options.work, LoadRun)
+        if wants_bus:
+            self.nursery.start_zygote(BUS, BUS_PRELOAD)
+        self.nursery.start_zygote(LIGHT, ())
+        self.nursery.park(LIGHT, len(self.deployment.graph.nodes) + self._spares() + wants_bus)
+        if wants_bus:
+            self.nursery.park(BUS, 2)
+        self._listen()
+        self.loop.read(self.owner.fileno(), self._on_owner)
+        self.loop.jobs.start("launch", self._launch(), self._launched)
+        self._tick()
+        self.loop.run()
+        self._teardown()
+
+    def _spares(self) -> int:
+        """Enough for a replica and for one node beside it."""
+        slots, nodes = self.deployment.slots.values(), self.deployment.graph.nodes.values()
+        chain = max(sum(set(bricks) <= slot.bricks for bricks in nodes) for slot in slots)
+        return chain + 1 if len(slots) > 1 else 1
+
+    def _launch(self) -> Keys:
+        yield from self.work.before(self.deployment)
+        began_ns = time.monotonic_ns()
+        yield from self.deployment.launch()
+        self.graph_ms = (time.monotonic_ns() - began_ns) / 1e6
+        for fault in self.options.faults:
+            yield from self.faults.arm(fault)
+        yield from self.work.start(self.deployment)
+
+    def _launched(self, failure: str) -> None:
+        if failure:
+            self._finish(f"launch failed: {failure}")
+            return
+        self.tell("started", f"{len(self.deployment.nodes)} nodes in {self.graph_ms:.1f} ms")
+        self._inform_recovery(failed=False)
+
+    def _listen(self) -> None:
+        sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
+        sock.bind(str(Path(self.options.private) / rundir.SOCKET_NAME))
+        sock.listen(QUESTIONS_MAX)
+        self._listener = sock
+        self.loop.read(sock.fileno(), self._accept)
+
+    def _on_owner(self) -> None:
+        try:
+            got = self.owner.recv()
+        except BlockingIOError:
+            return
+        except (OSError, AftbedError):
+            got = None
+        if got is None or isinstance(got[0], control.Stop):
+            self._finish("the command is gone" if got is None else "interrupted")
+            if got is None:
+                self.loop.forget(self.owner.fileno())
+
+    def _report_owner(self, kind: str, data: bytes) -> None:
+        """For the command; dropped where it does not read, since a view must not stop a run."""
+        try:
+            self.owner.send(control.Report(kind, data))
+        except OSError:
+            return
+
+    def tell(self, event: str, text: str) -> None:
+        """A line for people: to the record, and to the command."""
+        t_ms = round((time.monotonic_ns() - self.started_ns) / 1e6, 3)
+        line = json.dumps({"t_ms": t_ms, "event": event, "text": text}).encode()
+        self._events.write(line + b"\n")
+        self._report_owner("event", line)
+
+    # -- the end ------------------------------------------------------------------------------
+
+    def _finish(self, reason: str) -> None:
+        """End the run: let what is unanswered be answered, then stop. `""` is the good end."""
+        if self._ending:
+            return
+        self._ending = reason or "done"
+        self._finish_reason = reason
+        limit_ns = time.monotonic_ns() + round(DRAIN_SECONDS_MAX * 1e9)
+        self.loop.jobs.start("stop", self.work.stop_source(self.deployment), lambda _: None)
+        self._drain(limit_ns)
+
+    def _drain(self, limit_ns: int) -> None:
+        """Wait until all is answered and no script is under way, or the limit is reached."""
+        settled = self.work.settled and not self.executor.busy and not len(self.loop.jobs)
+        if self.owner_gone() or settled or time.monotonic_ns() > limit_ns:
+            if not settled and not self.owner_gone():
+                self._incomplete = self.loop.jobs.names()
+            self.loop.end()
+            return
+        if not len(self.loop.jobs):
+            self.loop.jobs.start("stats", self.work.ask_stats(self.deployment), lambda _: None)
+        self.loop.after(0.005, lambda: self._drain(limit_ns))
+
+    def owner_gone(self) -> bool:
+        """Nobody waits for a verdict."""
+        return self._finish_reason == "the command is gone"
+
+    def _teardown(self) -> None:
+        """Kill what is left, reap it, say how it ended, and leave."""
+        for process in self.nursery.processes:
+            process.kill()
+        limit = time.monotonic() + STOP_SECONDS_MAX
+        while self.nursery.processes and time.monotonic() < limit:
+            for process in list(self.nursery.processes):
+                if not process.pid or linux.reap(process.pid) is not None:
+                    process.close()
+                    self.nursery.processes.remove(process)
+            time.sleep(0.001)  # no event to wait for: a killed process is a matter of a millisecond
+        left = [f"{p.name} ({p.pid})" for p in self.nursery.processes]
+        end = {
+            "reason": self._finish_reason,
+            "ended_ns": time.monotonic_ns(),
+            "seconds": round((time.monotonic_ns() - self.started_ns) / 1e9, 3),
+            "graph_ms": round(self.graph_ms, 3),
+            "left": left,
+            "unfinished": self._incomplete,
+            "leader": self.deployment.leader,
+            "backup": self.deployment.backup,
+            "epoch": self.deployment.epoch,
+            "faults": self.faults.receipts(),
+            **self.work.end(),
+        }
+        (self.record / "end.json").write_text(json.dumps(end))
+        self._report_owner("finished", json.dumps(end).encode())
+
+    # -- what processes say -------------------------------------------------------------------
+
+    def _on_report(self, process: Process, report: msgspec.Struct) -> None:
+        match report:
+            case control.Ack(token, data, error):
+                self.deployment.assigned(process)
+                key = ("ack", process.name, token)
+                if error:
+                    self.tell("refused", f"{process.name}: {error}")
+                    self.loop.jobs.fail(key, f"{process.name}: {error}")
+                else:
+                    self.loop.jobs.settle(key, data)
+            case control.Said(brick, message.Promoted(epoch)):
+                self.loop.jobs.settle(("promoted", brick, epoch))
+            case control.Ordered(_, ordered):
+                self._on_script(ordered)
+            case control.Fired(fault):
+                self.faults.fired(process, fault)
+            case control.Report(kind, data):
+                self.work.on_report(process, kind, data)
+            case _:
+                self.tell("refused", f"{process.name} said {type(report).__name__}")
+
+    def _on_script(self, ordered: script.Script) -> None:
+        if self.executor.busy or self._ending:
+            return  # an earlier Recovery's script is under way; the new one hears how it ended
+        began_ns = time.monotonic_ns()
+        self.tell("script", f"{ordered.purpose} ({ordered.replica})")
+
+        def ended(failure: str) -> None:
+            ms = f"{(time.monotonic_ns() - began_ns) / 1e6:.2f} ms"
+            self.tell("script.failed" if failure else "script.done", f"{ordered.purpose}: {failure or ms}")
+            self._inform_recovery(failed=bool(failure))
+            self.loop.after(0.002, lambda: self._settle_after(ordered))
+
+        self.loop.jobs.start(ordered.purpose, self.executor.execute(ordered), ended)
+
+    def _settle_after(self, ordered: script.Script) -> None:
+        """What can wait until after a script: spares, and faults that are still to come."""
+        if self._ending:
+            return
+        if ordered.purpose == "new backup":
+            self.nursery.level(LIGHT, self._spares())
+        self.loop.jobs.start("rearm", self.faults.rearm(), lambda _: None)
+
+    def _inform_recovery(self, *, failed: bool) -> None:
+        deployment = self.deployment
+        if self.executor.busy or not deployment.lives("recovery") or self._ending:
+            return
+        slots = deployment.slots
+        situation = message.Situation(
+            deployment.leader,
+            slots[deployment.leader].generation if deployment.leader else 0,
+            deployment.backup,
+            slots[deployment.backup].generation if deployment.backup else 0,
+            deployment.epoch,
+            tuple(s.name for s in slots.values() if not s.nodes),
+            failed,
+        )
+        try:
+            deployment.order("recovery", lambda token: control.Tell(token, "recovery", situation))
+        except StepFailed as error:
+            self.tell("refused", str(error))
+
+    # -- deaths and hangs ---------------------------------------------------------------------
+
+    def _on_death(self, process: Process, status: int | None) -> None:
+        self.journal.write(time.monotonic_ns(), Event.NODE_DIED, 0, process.pid)
+        self.loop.jobs.settle(("died", process.name, process.pid))
+        if process.kind == "killed" or self._ending:
+            return
+        how = f"signal {-status}" if status is not None and status < 0 else f"status {status}"
+        self.tell("died", f"{process.name} (pid {process.pid}, {how})")
+        self.loop.jobs.died(process.name)
+        if process.kind == "zygote":
+            self.nursery.restart_zygote(process.name)
+        elif process.kind == "spare":
+            self.nursery.level(LIGHT, self._spares())
+        elif process.kind == "service":
+            self._finish(f"{process.name} died ({how})")
+        elif process.kind == "node" and self._replaceable(process.name):
+            self._replace(process.name)
+
+    def _replaceable(self, node: str) -> bool:
+        bricks = self.deployment.graph.nodes[node]
+        return self.deployment.graph.brick(bricks[0]).kind in WATCHED_KINDS
+
+    def _replace(self, node: str) -> None:
+        began_ns = time.monotonic_ns()
+
+        def ended(failure: str) -> None:
+            ms = (time.monotonic_ns() - began_ns) / 1e6
+            self.tell("replaced", f"{node}: {failure or f'{ms:.2f} ms'}")
+            if failure and not self._ending and not self.deployment.lives(node):
+                self.loop.after(TICK_SECONDS, lambda: self._replace(node))
+            if node == "recovery":
+                self._inform_recovery(failed=False)
+            self.nursery.level(LIGHT, self._spares())
+
+        self.loop.jobs.start(f"replace {node}", self.deployment.respawn(node), ended)
+
+    def _tick(self) -> None:
+        """Look after the pulses of what no Watchdog watches: a node that hangs is killed, and replaced."""
+        now_ns = time.monotonic_ns()
+        late = now_ns - self._last_tick_ns > TICK_SECONDS * 1e9 + LATE_NS_MAX
+        if late:
+            self._grace_until_ns = now_ns + HANG_NS
+        self._last_tick_ns = now_ns
+        if now_ns > self._grace_until_ns and not self._ending:
+            for process in self.nursery.processes:
+                if process.kind == "node" and process.header is not None and self._replaceable(process.name):
+                    pulse_ns = process.header.pulse_ns()
+                    if pulse_ns and now_ns - pulse_ns > HANG_NS:
+                        self.tell("hangs", f"{process.name} (pid {process.pid}): killed, to be replaced")
+                        process.kill(signal.SIGKILL)
+        self.loop.after(TICK_SECONDS, self._tick)
+
+    # -- questions ----------------------------------------------------------------------------
+
+    def _accept(self) -> None:
+        try:
+            sock, _ = self._listener.accept()
+        except OSError:
+            return
+        sock.setblocking(False)
+        if not ask.same_user(sock, os.getuid()) or len(self._questions) >= QUESTIONS_MAX:
+            sock.close()
+            return
+        line = self._questions[sock.fileno()] = control.Line(sock, ask.decode_question)
+        self.loop.read(sock.fileno(), lambda: self._answer(line))
+
+    def _answer(self, line: control.Line[ask.Question]) -> None:
+        try:
+            got = line.recv()
+        except BlockingIOError:
+            return
+        except (OSError, AftbedError):
+            got = None
+        if got is not None:
+            self._reply(got[0], lambda answer: self._send_answer(line, answer))
+            return
+        self.loop.forget(line.fileno())
+        self._questions.pop(line.fileno(), None)
+        line.close()
+
+    def _send_answer(self, line: control.Line[ask.Question], answer: ask.Answer) -> None:
+        try:
+            line.send(answer)
+        except OSError:
+            return
+
+    def _reply(self, question: ask.Question, answer: Callable[[ask.Answer], None]) -> None:
+        try:
+            match question:
+                case ask.Status():
+                    answer(ask.Answer(json.dumps(self.status()).encode()))
+                case ask.Processes():
+                    answer(ask.Answer(json.dumps({"processes": self.processes()}).encode()))
+                case ask.GraphNow():
+                    answer(ask.Answer(msgspec.json.encode(self.deployment.graph)))
+                case ask.Inject(fault):
+                    targets.check(fault, self.deployment.graph)
+                    self.loop.jobs.start(
+                        "inject",
+                        self.faults.arm(fault),
+                        lambda failure: answer(
+                            ask.Answer(json.dumps({"armed": str(fault)}).encode(), error=failure)
+                        ),
+                    )
+                case ask.Stop():
+                    self._finish("stopped")
+                    answer(ask.Answer(b'{"stopping": true}'))
+        except ConfigError as error:
+            answer(ask.Answer(error=str(error)))
+
+    def status(self) -> dict[str, object]:
+        """How the run is, for `aftbed status`."""
+        deployment = self.deployment
+        return {
+            "run": self.options.run,
+            "ftm": self.options.ftm,
+            "placement": self.options.placement,
+            "seconds": round((time.monotonic_ns() - self.started_ns) / 1e9, 2),
+            "leader": deployment.leader,
+            "backup": deployment.backup,
+            "epoch": deployment.epoch,
+            "busy": self.loop.jobs.names(),
+            "record": str(self.record),
+            "port": self.options.port,
+            "vehicle": self.work.telemetry,
+        }
+
+    def processes(self) -> list[dict[str, object]]:
+        """Every process of the run; the nodes and the supervisor are the paper's count."""
+        rows: list[dict[str, object]] = []
+        rows.append({"name": "supervisor", "role": "master", "pid": os.getpid(), "node": True})
+        for node in self.deployment.graph.nodes:
+            process = self.deployment.nodes.get(node)
+            if process is not None and process.alive:
+                role = self.deployment.role_of(node)
+                rows.append({"name": node, "role": role, "pid": process.pid, "node": True})
+        others = [p for p in self.nursery.processes if p.kind in ("zygote", "spare", "service") and p.pid]
+        return rows + [{"name": p.name, "role": p.kind, "pid": p.pid, "node": False} for p in others]
+
+
+def supervise(options: RunOptions, owner: socket.socket) -> None:
+    """Be the supervisor of a run, in a process of its own."""
+    supervisor = Supervisor(options, owner)
+    try:
+        supervisor.run()
+    finally:
+        for process in supervisor.nursery.processes:
+            process.kill()

@@ -1,0 +1,173 @@
+"""The verbs of a script on real processes: each one a generator that waits for its answers.
+
+What a script promises is checked before it runs (`core.script.problems`); here it is carried out, and
+where a step fails, what serves is left serving: whoever is suspended is resumed, a replica that was
+half made is killed.
+"""
+
+import time
+from collections.abc import Callable
+from typing import assert_never
+
+from aftbed.core import message, script
+from aftbed.core.event import Event
+from aftbed.core.graph import Link
+from aftbed.runtime.unix import control
+from aftbed.runtime.unix.deployment import Deployment, Keys
+from aftbed.runtime.unix.jobs import StepFailed, Wait
+from aftbed.runtime.unix.journal import Journal
+
+
+class Executor:
+    """Carries out scripts, one at a time."""
+
+    def __init__(self, deployment: Deployment, journal: Journal, tell: Callable[[str, str], None]) -> None:
+        self._deployment, self._journal, self._tell = deployment, journal, tell
+        self.busy = False
+
+    def execute(self, todo: script.Script) -> Keys:
+        """Prepare, then commit. Raises StepFailed, having undone what hurts."""
+        found = script.problems(todo)
+        if found:
+            raise StepFailed("; ".join(found))
+        self.busy = True
+        held: list[str] = []
+        try:
+            for verb in (*todo.prepare, *todo.commit):
+                yield from self._do(verb)
+                if isinstance(verb, script.Suspend):
+                    held.append(verb.brick)
+                elif isinstance(verb, script.Resume):
+                    held.remove(verb.brick)
+        except StepFailed:
+            self._undo(todo, held)
+            raise
+        finally:
+            self.busy = False
+
+    def _undo(self, todo: script.Script, held: list[str]) -> None:
+        deployment = self._deployment
+        if todo.purpose == "failover":  # the backup failed while it took over: nobody is left
+            for slot in deployment.slots.values():
+                self._kill(slot.name)
+            deployment.leader = deployment.backup = ""
+        if todo.purpose == "new backup" and deployment.backup != todo.replica:
+            self._kill(todo.replica)
+        for brick in held:
+            node = deployment.graph.node_of(brick)
+            if deployment.lives(node):
+                deployment.order(node, control.Resume)
+
+    def _do(self, verb: script.AnyVerb) -> Keys:
+        match verb:
+            case script.Spawn(replica):
+                yield from self._deployment.spawn(self._deployment.slots[replica])
+            case script.Fence(replica):
+                self._fence(replica)
+            case script.Kill(replica):
+                self._kill(replica)
+            case script.Promote(replica, epoch):
+                yield from self._promote(replica, epoch)
+            case script.Attach(replica, epoch):
+                self._attach(replica, epoch)
+            case script.Suspend(brick):
+                yield from self._deployment.ask(self._node(brick), control.Suspend)
+            case script.Resume(brick):
+                yield from self._deployment.ask(self._node(brick), control.Resume)
+            case script.Transfer(source, sink):
+                yield from self._transfer(source, sink)
+            case script.Bind(brick, port, target):
+                yield from self._bind(brick, port, target)
+            case script.Unbind(brick, port):
+                yield from self._unbind(brick, port)
+            case _:
+                assert_never(verb)
+
+    def _node(self, brick: str) -> str:
+        return self._deployment.graph.node_of(brick)
+
+    def _note(self, event: Event, replica: str) -> None:
+        slot = self._deployment.slots[replica]
+        self._journal.write(time.monotonic_ns(), event, 0, slot.generation << 8 | slot.number)
+
+    def _fence(self, replica: str) -> None:
+        deployment = self._deployment
+        slot = deployment.slots[replica]
+        for channel in deployment.channels.touching(slot.bricks):
+            if channel.link.source in slot.bricks:
+                channel.fence()
+            elif "/" in channel.link.source:
+                channel.refuse()  # a leader that waits for a dead backup to read must not wait on
+        if replica == deployment.leader:
+            deployment.leader = ""
+        self._note(Event.REPLICA_FENCED, replica)
+
+    def _kill(self, replica: str) -> None:
+        """The nodes of the slot die; their deaths are reaped later, the slot is free at once."""
+        deployment = self._deployment
+        slot = deployment.slots[replica]
+        for node in slot.nodes:
+            process = deployment.nodes.pop(node, None)
+            if process is not None:
+                process.kind = "killed"
+                process.kill()
+        for channel in deployment.channels.touching(slot.bricks):
+            deployment.channels.drop(channel)
+        slot.nodes = []
+        if deployment.backup == replica:
+            deployment.backup = ""
+
+    def _promote(self, replica: str, epoch: int) -> Keys:
+        deployment = self._deployment
+        slot = deployment.slots[replica]
+        node = self._node(f"{replica}/after")
+        key, _ = deployment.order(
+            node, lambda token: control.Tell(token, f"{replica}/after", message.Promote(epoch))
+        )
+        promoted = ("promoted", f"{replica}/protocol", epoch)
+        yield Wait(frozenset({key, promoted}), frozenset(slot.nodes))
+
+    def _attach(self, replica: str, epoch: int) -> None:
+        """A Proxy that is being replaced needs nothing: the new one is bound to whoever leads."""
+        deployment = self._deployment
+        deployment.leader, deployment.backup, deployment.epoch = replica, "", epoch
+        if deployment.lives("proxy"):
+            for source, port, sink in (
+                (f"{replica}/protocol", "pro2pxy", "proxy"),
+                ("proxy", "pxy2pro", f"{replica}/protocol"),
+            ):
+                channel = deployment.channels.get(source, port, sink)
+                assert channel is not None, port
+                self._hand_to_proxy(channel.link, channel.read.fileno(), channel.write.fileno(), epoch)
+        deployment.pin_beside_leader()
+
+    def _hand_to_proxy(self, link: Link, read: int, write: int, epoch: int) -> None:
+        if link.sink == "proxy":
+            self._deployment.order(
+                "proxy", lambda token: control.BindInput(token, "proxy", link.sink_port), (read,)
+            )
+        else:
+            self._deployment.order(
+                "proxy", lambda token: control.BindOutput(token, "proxy", link.source_port, epoch), (write,)
+            )
+
+    def _transfer(self, source: str, sink: str) -> Keys:
+        state = yield from self._deployment.ask(
+            self._node(source), lambda token: control.Capture(token, source)
+        )
+        yield from self._deployment.ask(self._node(sink), lambda token: control.Restore(token, sink, state))
+
+    def _bind(self, brick: str, port: str, target: str) -> Keys:
+        deployment = self._deployment
+        channel = deployment.channels.renew(Link(brick, port, target, port))
+        if port == "aft2aft":  # from here on `target` holds all that the leader holds
+            deployment.backup = target.partition("/")[0]
+        yield from deployment.all_of(deployment.rebind(channel))
+
+    def _unbind(self, brick: str, port: str) -> Keys:
+        deployment = self._deployment
+        if port == "aft2aft":
+            deployment.backup = ""
+        yield from deployment.ask(
+            self._node(brick), lambda token: control.BindOutput(token, brick, port, deployment.epoch)
+        )

@@ -1,0 +1,158 @@
+"""What makes the requests of a run: a load inside the client, or the car, or a replayed log, on the bus."""
+
+import json
+import os
+import socket
+import time
+from collections.abc import Callable, Generator
+from pathlib import Path
+
+import msgspec
+
+from aftbed.runtime.unix import control
+from aftbed.runtime.unix.deployment import BUS, LIGHT, Deployment, Keys
+from aftbed.runtime.unix.devices import LoadOptions
+from aftbed.runtime.unix.jobs import Key, Wait
+from aftbed.runtime.unix.loop import Loop
+from aftbed.runtime.unix.options import (
+    CarRun,
+    GatewayOptions,
+    LoadRun,
+    PlayerOptions,
+    ReplayRun,
+    RunOptions,
+    VehicleOptions,
+)
+from aftbed.runtime.unix.processes import Nursery, Process
+
+ATTACH_SECONDS_MAX = 10.0
+LOAD_POLL_SECONDS = 0.02
+
+
+class Work:
+    """`settled` turns true when the source is at its end and all is answered."""
+
+    def __init__(
+        self,
+        options: RunOptions,
+        nursery: Nursery,
+        loop: Loop,
+        tell: Callable[[str, str], None],
+        finish: Callable[[str], None],
+        report_owner: Callable[[str, bytes], None],
+    ) -> None:
+        self._options, self._nursery, self._loop = options, nursery, loop
+        self._tell, self._finish, self._report_owner = tell, finish, report_owner
+        self._services: dict[str, Process] = {}
+        self._result: object = None
+        self._stats: dict[str, object] = {}
+        self.telemetry: dict[str, object] | None = None
+        self.settled = False
+
+    def device_of(self, kind: str, incarnation: int) -> tuple[str, bytes]:
+        """The device of a brick of `kind`, and its options."""
+        if kind == "watchdog":
+            return "sensor", b""
+        if kind != "client":
+            return "", b""
+        journal = Path(self._options.record) / "journal"
+        dialogue = str(journal / f"client.{incarnation}.dialogue")
+        earlier = tuple(str(journal / f"client.{i}.dialogue") for i in range(1, incarnation))
+        earlier = tuple(path for path in earlier if Path(path).exists())
+        work = self._options.work
+        if isinstance(work, LoadRun):
+            load = LoadOptions(self._options.seed, work.count, work.rate_hz, dialogue, earlier)
+            return "load", msgspec.msgpack.encode(load)
+        dbc, mapped = (work.dbc, work.map) if isinstance(work, ReplayRun) else ("", "")
+        gateway = GatewayOptions(self._options.port, dialogue, earlier, dbc, mapped)
+        return "gateway", msgspec.msgpack.encode(gateway)
+
+    def before(self, deployment: Deployment) -> Keys:
+        """What must stand before the graph does: the hub."""
+        work = self._options.work
+        if isinstance(work, LoadRun):
+            return
+        flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC
+        log = os.open(Path(self._options.record) / "bus.log", flags, 0o600)
+        options = {"lockstep": work.pace is None, "pace": work.pace or 1.0, "origin_ns": time.monotonic_ns()}
+        yield from self._serve(LIGHT, "hub", msgspec.msgpack.encode(options), (self._options.listener, log))
+        os.close(log)
+        socket.socket(fileno=self._options.listener).close()  # the hub's alone from here on
+
+    def start(self, deployment: Deployment) -> Keys:
+        """The graph stands: let requests come."""
+        work = self._options.work
+        if isinstance(work, LoadRun):
+            self._loop.after(LOAD_POLL_SECONDS, lambda: self._watch_load(deployment))
+            return
+        if isinstance(work, CarRun):
+            name, options = (
+                "vehicle",
+                msgspec.msgpack.encode(
+                    VehicleOptions(
+                        self._options.port, work.scenario, work.pace, work.brake_policy, self._options.seed
+                    )
+                ),
+            )
+        else:
+            name, options = (
+                "player",
+                msgspec.msgpack.encode(
+                    PlayerOptions(self._options.port, work.log, work.dbc, work.map, work.pace)
+                ),
+            )
+        yield from self._serve(BUS, name, options, ())
+        self._nursery.order(self._services[name], control.Resume(0))
+        self._nursery.level(BUS, 1)
+
+    def _serve(
+        self, zygote: str, name: str, options: bytes, fds: tuple[int, ...]
+    ) -> Generator[Wait, dict[Key, bytes], None]:
+        process = yield from self._nursery.spare(zygote)
+        process.name, process.kind = name, "service"
+        self._services[name] = process
+        self._nursery.order(process, control.Serve(0, name, options), fds)
+        yield Wait(frozenset({("ready", name, 0)}), frozenset({name}), ATTACH_SECONDS_MAX)
+
+    def on_report(self, process: Process, kind: str, data: bytes) -> None:
+        """What a service says."""
+        if kind == "ready":
+            self._loop.jobs.settle(("ready", process.name, 0))
+        elif kind == "telemetry":
+            self.telemetry = msgspec.msgpack.decode(data)
+            self._report_owner("telemetry", data)
+        elif kind == "trouble":
+            self._tell("trouble", f"{process.name}: {data.decode()}")
+            self._finish(f"{process.name}: {data.decode()}")
+        elif kind == "result" and process.name in ("vehicle", "player"):
+            self._result = json.loads(data)
+            process.kind = "killed"  # it is done: its death is no event
+            self._finish("")
+
+    def stop_source(self, deployment: Deployment) -> Keys:
+        """No more requests; the car or the player ends with the result so far."""
+        for name in ("vehicle", "player"):
+            process = self._services.get(name)
+            if process is not None and process.alive and process.kind == "service":
+                self._nursery.order(process, control.Stop(0))
+        yield from deployment.ask("client", control.Quiet)
+
+    def _watch_load(self, deployment: Deployment) -> None:
+        def asked(failure: str) -> None:
+            if self._stats.get("done"):
+                self._finish("")
+            else:
+                self._loop.after(LOAD_POLL_SECONDS, lambda: self._watch_load(deployment))
+
+        self._loop.jobs.start("stats", self.ask_stats(deployment), asked)
+
+    def ask_stats(self, deployment: Deployment) -> Keys:
+        """Ask the client how far it is."""
+        data = yield from deployment.ask("client", control.Stats)
+        self._stats = msgspec.msgpack.decode(data)
+        source_is_done = self._result is not None or isinstance(self._options.work, LoadRun)
+        self.settled = source_is_done and not self._stats.get("unanswered", 1)
+
+    def end(self) -> dict[str, object]:
+        """For the record."""
+        return {"result": self._result, "client": self._stats}

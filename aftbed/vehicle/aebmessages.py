@@ -1,0 +1,122 @@
+"""What goes into the protected function and what comes out of it: the payloads of request and reply.
+
+A request is one radar cycle, a reply is one braking demand. Both are MessagePack arrays without field
+names, because they lie on the measured path. To the mechanism that carries them they are opaque bytes;
+whoever opens one checks it here, whole, before anything is done with it.
+"""
+
+from typing import Final
+
+import msgspec
+
+from aftbed.core.errors import PeerError
+
+SLOTS: Final = 16
+COUNTER_COUNT: Final = 15  # E2E profile 11: 0 to 14
+STAGE_NONE, STAGE_WARN, STAGE_PARTIAL, STAGE_FULL = range(4)
+
+T_MS_MAX: Final = 2**40
+SPEED_MAX_MS: Final = 150.0
+RANGE_MAX_M: Final = 1000.0
+DEMAND_MAX_MS2: Final = 12.0
+REQUEST_BYTES_MAX: Final = 1024
+REPLY_BYTES_MAX: Final = 64
+
+
+class AebTarget(msgspec.Struct, array_like=True, frozen=True, forbid_unknown_fields=True, gc=False):
+    """A target in our path: radar slot 0 to 15, range in m, relative speed in m/s (negative: closing)."""
+
+    slot: int
+    range_m: float
+    rel_speed_ms: float
+    new: bool = False
+
+
+class AebInput(msgspec.Struct, array_like=True, frozen=True, forbid_unknown_fields=True, gc=False):
+    """One radar cycle: bus time in ms, ego speed in m/s, the targets in our path.
+
+    Not valid means unknown. An unknown radar is not an empty road, nor an unknown speed a standing car.
+    """
+
+    t_ms: int
+    ego_speed_ms: float
+    ego_valid: bool
+    radar_valid: bool
+    targets: tuple[AebTarget, ...]
+
+
+class AebOutput(msgspec.Struct, array_like=True, frozen=True, forbid_unknown_fields=True, gc=False):
+    """What the brakes are asked for; `ttc_s` and `slot` are those of the worst threat, None without one.
+
+    `counter` is the E2E counter of the frame that this reply becomes. It is part of the function's state, so
+    that a failover neither skips nor repeats one.
+    """
+
+    stage: int
+    deceleration_ms2: float
+    ttc_s: float | None
+    slot: int | None
+    counter: int
+
+
+_encode = msgspec.msgpack.Encoder().encode
+_decode_request = msgspec.msgpack.Decoder(AebInput).decode
+_decode_reply = msgspec.msgpack.Decoder(AebOutput).decode
+
+
+def encode_request(cycle: AebInput) -> bytes:
+    """The payload of one request."""
+    return _encode(cycle)
+
+
+def encode_reply(output: AebOutput) -> bytes:
+    """The payload of one reply."""
+    return _encode(output)
+
+
+def decode_request(request: bytes) -> AebInput:
+    """`request` as a struct. Raises PeerError on anything that is not one radar cycle."""
+    if len(request) > REQUEST_BYTES_MAX:
+        raise PeerError(f"request of {len(request)} bytes, allowed are {REQUEST_BYTES_MAX}")
+    try:
+        cycle = _decode_request(request)
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise PeerError(f"not a radar cycle: {error}") from error
+    # A comparison with NaN is false: written this way round, the ranges refuse it too.
+    if not 0 <= cycle.t_ms <= T_MS_MAX:
+        raise PeerError(f"t_ms {cycle.t_ms}, allowed is 0 to {T_MS_MAX}")
+    if not 0.0 <= cycle.ego_speed_ms <= SPEED_MAX_MS:
+        raise PeerError(f"ego_speed_ms {cycle.ego_speed_ms}, allowed is 0 to {SPEED_MAX_MS}")
+    _check_targets(cycle.targets)
+    return cycle
+
+
+def decode_reply(reply: bytes) -> AebOutput:
+    """`reply` as a struct. Raises PeerError on anything that is not a braking demand."""
+    if len(reply) > REPLY_BYTES_MAX:
+        raise PeerError(f"reply of {len(reply)} bytes, allowed are {REPLY_BYTES_MAX}")
+    try:
+        output = _decode_reply(reply)
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise PeerError(f"not a braking demand: {error}") from error
+    if not (STAGE_NONE <= output.stage <= STAGE_FULL and 0.0 <= output.deceleration_ms2 <= DEMAND_MAX_MS2):
+        raise PeerError(f"stage {output.stage} with {output.deceleration_ms2} m/s2")
+    if not 0 <= output.counter < COUNTER_COUNT:
+        raise PeerError(f"counter {output.counter}, allowed is 0 to {COUNTER_COUNT - 1}")
+    if output.slot is not None and not 0 <= output.slot < SLOTS:
+        raise PeerError(f"slot {output.slot}, allowed is 0 to {SLOTS - 1}")
+    if output.ttc_s is not None and not output.ttc_s >= 0.0:
+        raise PeerError(f"ttc_s {output.ttc_s}, allowed is 0 or more")
+    return output
+
+
+def _check_targets(targets: tuple[AebTarget, ...]) -> None:
+    seen = 0
+    for target in targets:
+        if not 0 <= target.slot < SLOTS or seen >> target.slot & 1:
+            raise PeerError(f"slot {target.slot}, allowed is 0 to {SLOTS - 1}, each once")
+        if not 0.0 <= target.range_m <= RANGE_MAX_M:
+            raise PeerError(f"range_m {target.range_m}, allowed is 0 to {RANGE_MAX_M}")
+        if not -SPEED_MAX_MS <= target.rel_speed_ms <= SPEED_MAX_MS:
+            raise PeerError(f"rel_speed_ms {target.rel_speed_ms}, allowed is +-{SPEED_MAX_MS}")
+        seen |= 1 << target.slot

@@ -1,0 +1,132 @@
+"""The candump log format: one frame in one line, read strictly and written in one form.
+
+    (0000000012.345678) can0 130#0102030405060708
+
+It is what `candump -l` of can-utils writes and what the hub records. A log is evidence, so nothing
+in it is guessed: a line that is not exactly this is refused and counted by its reason, with the
+number of the first line that had it, and changes nothing. A last line without its newline counts
+as torn even where it would parse: `130#01020304` may be all that was written of eight bytes.
+
+Read but not written: the direction (` R` or ` T`) that python-can's logger appends. Refused, being
+no classic CAN data frame with an 11-bit identifier: extended, remote, error and FD frames.
+
+Limits: 256 MiB for a file. Time is compared with the last frame that was accepted, over all
+interfaces, because the interfaces of a log share one clock.
+"""
+
+import io
+import re
+from collections.abc import Iterable, Iterator
+from enum import StrEnum
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from aftbed.core.errors import ConfigError
+from aftbed.vehicle.frame import CAN_ID_MAX, DATA_LENGTH_MAX, Frame
+
+LOG_BYTES_MAX: Final = 256 * 1024 * 1024
+LINE_SHOWN_CHARACTERS_MAX: Final = 60
+EXPECTED: Final = "(SECONDS.MICROSECONDS) INTERFACE ID#HEX, e.g. (0000000012.345678) can0 130#01020304"
+
+_LINE: Final = re.compile(rb"\(([0-9]{1,10})\.([0-9]{6})\) ([!-~]{1,15}) ([!-~]{1,600}?)(?: [RT])?")
+_IDENTIFIER: Final = re.compile(rb"[0-9A-Fa-f]{3}")
+_DATA: Final = re.compile(rb"(?:[0-9A-Fa-f]{2})*")
+
+
+class Refusal(StrEnum):
+    """Why a line was not believed."""
+
+    TORN = "torn last line"
+    SYNTAX = "not a candump line"
+    IDENTIFIER = "not an 11-bit data frame"
+    DATA = "odd, long or non-hexadecimal data"
+    TIME = "time runs backwards"
+
+
+class LogFrame(msgspec.Struct, frozen=True):
+    """A frame of a log, its time in microseconds by the log's own clock, and where it was seen."""
+
+    interface: str
+    frame: Frame
+
+
+class LogCounts(msgspec.Struct):
+    """What became of the lines of a log; `first_line` counts from 1, by reason."""
+
+    lines: int = 0
+    frames: int = 0
+    refused: dict[Refusal, int] = {}
+    first_line: dict[Refusal, int] = {}
+
+    def refuse(self, reason: Refusal, line_number: int) -> None:
+        """Count one refused line."""
+        self.refused[reason] = self.refused.get(reason, 0) + 1
+        self.first_line.setdefault(reason, line_number)
+
+
+def log_line(frame: Frame, interface: str) -> str:
+    """`frame` as one line, newline included."""
+    seconds, micros = divmod(frame.t_us, 1_000_000)
+    return f"({seconds:010d}.{micros:06d}) {interface} {frame.can_id:03X}#{frame.data.hex().upper()}\n"
+
+
+def parse_line(line: bytes) -> LogFrame | Refusal:
+    """The frame in `line` (without its newline), or the reason to refuse it."""
+    match = _LINE.fullmatch(line)
+    if match is None:
+        return Refusal.SYNTAX
+    seconds, micros, interface, text = match.groups()
+    identifier, mark, data = text.partition(b"#")
+    if not mark:
+        return Refusal.SYNTAX
+    if _IDENTIFIER.fullmatch(identifier) is None or int(identifier, 16) > CAN_ID_MAX:
+        return Refusal.IDENTIFIER
+    if data[:1] in (b"R", b"r", b"#"):
+        return Refusal.IDENTIFIER
+    if _DATA.fullmatch(data) is None or len(data) > 2 * DATA_LENGTH_MAX:
+        return Refusal.DATA
+    t_us = int(seconds) * 1_000_000 + int(micros)
+    frame = Frame(t_us, int(identifier, 16), bytes.fromhex(data.decode("ascii")))
+    return LogFrame(interface.decode("ascii"), frame)
+
+
+def parse_lines(lines: Iterable[bytes], counts: LogCounts) -> Iterator[LogFrame]:
+    """The frames of `lines`, each line with its newline as in a file; `counts` is kept up to date."""
+    last_us = 0
+    for line in lines:
+        counts.lines += 1
+        found = parse_line(line[:-1]) if line.endswith(b"\n") else Refusal.TORN
+        if isinstance(found, LogFrame) and found.frame.t_us < last_us:
+            found = Refusal.TIME
+        if isinstance(found, Refusal):
+            counts.refuse(found, counts.lines)
+            continue
+        counts.frames += 1
+        last_us = found.frame.t_us
+        yield found
+
+
+def read_log(path: Path) -> tuple[list[LogFrame], LogCounts]:
+    """All frames of the log at `path`. Raises ConfigError if it cannot be read or has no frame."""
+    try:
+        size_bytes = path.stat().st_size
+        if size_bytes > LOG_BYTES_MAX:
+            raise ConfigError(f"{path}: {size_bytes} bytes, a log may have {LOG_BYTES_MAX}")
+        content = path.read_bytes()
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot read the log: {error.strerror}") from error
+    counts = LogCounts()
+    frames = list(parse_lines(io.BytesIO(content), counts))  # splits at newlines, nowhere else
+    if not frames:
+        raise ConfigError(f"{path}: no line is a CAN frame; {_shown(content)}, expected {EXPECTED}")
+    return frames, counts
+
+
+def _shown(content: bytes) -> str:
+    """The first line of a file, fit for a message."""
+    if not content:
+        return "the file is empty"
+    line = content.splitlines()[0].decode("ascii", "replace")
+    return f"line 1 is {line[:LINE_SHOWN_CHARACTERS_MAX]!r}"

@@ -1,0 +1,207 @@
+"""The two ECUs of the car, without their sockets: frames in, frames out, time from the plant.
+
+The radar sees the plant's truth through seeded noise and quantisation, as one track. The brake ECU
+obeys AEB_REQ only where E2E lets it be believed; a request that is late or not to be believed is
+bridged with the last one for `HOLD_US`, after that a policy decides:
+
+    hold     keep the last request for as long as none comes
+    release  no braking without a request
+    latch    (default) if full braking was being asked for above standstill, brake to standstill, whatever
+             comes in the meantime but a full request; else release
+
+Latch, because a car in emergency braking has, by the last thing that was known, an obstacle ahead: the
+death of the function that saw it does not remove it. A weaker request does not end a latch, since
+a function that has lost its state is back before it has seen the obstacle again.
+
+Both ECUs are stepped once per millisecond of the plant. Frames that fall on the same instant come in
+arbitration order, and RADAR_STATUS is kept 5 ms off the grid of the others: so RADAR_TRACK is the last
+frame of its 10 ms batch, and the request it makes sees the EGO_STATE of the same instant.
+"""
+
+from collections.abc import Mapping
+from enum import IntEnum
+from random import Random
+from typing import Final, Literal
+
+from aftbed.vehicle.dbcfile import Codec
+from aftbed.vehicle.e2e import COUNTER_COUNT, Receiver, Supervision, protect
+from aftbed.vehicle.frame import Frame
+from aftbed.vehicle.plant import Plant
+
+BrakePolicy = Literal["hold", "release", "latch"]
+BRAKE_POLICIES: Final[tuple[BrakePolicy, ...]] = ("hold", "release", "latch")
+
+RANGE_MAX_M: Final = 150.0
+RANGE_NOISE_M: Final = 0.1  # half width of the noise, as for the two below
+SPEED_NOISE_MS: Final = 0.1
+LATERAL_NOISE_M: Final = 0.1
+RADAR_STATUS_OFFSET_US: Final = 5000
+TRACK_ID: Final = 0
+
+HOLD_US: Final = 60_000
+LATE_US: Final = 30_000  # one cycle and a half: from here on a request is missing
+AEB_REQ_TIMEOUT_US: Final = 100_000
+STAGE_FULL: Final = 3
+
+
+class Fallback(IntEnum):
+    """FALLBACK in BRAKE_STATUS: why the brakes do not follow a fresh request."""
+
+    NONE = 0
+    HOLD = 1
+    RELEASE = 2
+    LATCH = 3
+
+
+class Sender:
+    """One cyclic, E2E protected message: when it is due, and its counter."""
+
+    def __init__(self, codec: Codec, name: str, offset_us: int = 0) -> None:
+        self._codec = codec
+        self._name = name
+        self._can_id = codec.can_id(name)
+        self._data_id = codec.data_id(name)
+        self._cycle_us = codec.cycle_us(name)
+        self._offset_us = offset_us
+        self._counter = 0
+
+    def due(self, t_us: int) -> bool:
+        """True if the message's cycle falls on `t_us`."""
+        return t_us % self._cycle_us == self._offset_us
+
+    def frame(self, t_us: int, signals: Mapping[str, float]) -> Frame:
+        """The next frame of this message; CRC and counter are filled in."""
+        data = self._codec.encode(self._name, {"CRC": 0, "COUNTER": 0, **signals})
+        data = protect(data, self._data_id, self._counter)
+        self._counter = (self._counter + 1) % COUNTER_COUNT
+        return Frame(t_us, self._can_id, data)
+
+
+class RadarEcu:
+    """RADAR_TRACK at 0, 20, 40 ms and so on; RADAR_STATUS at 5, 105, 205 ms and so on."""
+
+    def __init__(self, codec: Codec, seed: int) -> None:
+        self._random = Random(seed)
+        self._track = Sender(codec, "RADAR_TRACK")
+        self._status = Sender(codec, "RADAR_STATUS", RADAR_STATUS_OFFSET_US)
+        self._seen = False
+        self._cycle = 0
+
+    def frames(self, plant: Plant) -> list[Frame]:
+        """The frames due at `plant.t_us`. To be called once for each plant step."""
+        if self._track.due(plant.t_us):
+            self._cycle += 1
+            return [self._track.frame(plant.t_us, self._measure(plant))]
+        if self._status.due(plant.t_us):
+            status = {"STATE": 1, "TRACKS": int(self._seen), "CYCLE": self._cycle % 0x10000}
+            return [self._status.frame(plant.t_us, status)]
+        return []
+
+    def _measure(self, plant: Plant) -> dict[str, float]:
+        noise = (self._noise(RANGE_NOISE_M), self._noise(SPEED_NOISE_MS), self._noise(LATERAL_NOISE_M))
+        seen = plant.gap_m is not None and plant.gap_m <= RANGE_MAX_M
+        new, self._seen = seen and not self._seen, seen
+        if plant.gap_m is None or not seen:
+            return _track_signals(False, False, 0.0, 0.0, 0.0)
+        relative_ms = plant.lead_speed_ms - plant.speed_ms
+        return _track_signals(True, new, max(0.0, plant.gap_m + noise[0]), relative_ms + noise[1], noise[2])
+
+    def _noise(self, half_width: float) -> float:
+        """Bell-shaped and bounded: four uniforms, and none of a platform's own log or cos."""
+        return half_width * (sum(self._random.random() for _ in range(4)) - 2.0) / 2.0
+
+
+def _track_signals(
+    valid: bool, new: bool, range_m: float, relative_ms: float, lateral_m: float
+) -> dict[str, float]:
+    return {
+        "VALID": int(valid),
+        "NEW_TRACK": int(new),
+        "TRACK_ID": TRACK_ID,
+        "RANGE": range_m,
+        "RELATIVE_SPEED": max(-100.0, min(100.0, relative_ms)),
+        "LATERAL_OFFSET": lateral_m,
+    }
+
+
+class BrakeEcu:
+    """Follows AEB_REQ; BRAKE_STATUS and EGO_STATE at 0, 10, 20 ms and so on."""
+
+    def __init__(self, codec: Codec, policy: BrakePolicy) -> None:
+        assert policy in BRAKE_POLICIES
+        self.stage = 0
+        self.fallback = Fallback.NONE
+        self.accepted = 0
+        self.refused = 0
+        self._codec = codec
+        self._policy = policy
+        self._aeb_req_id = codec.can_id("AEB_REQ")
+        self._receiver = Receiver(
+            Supervision(codec.data_id("AEB_REQ"), codec.cycle_us("AEB_REQ"), AEB_REQ_TIMEOUT_US)
+        )
+        self._status = Sender(codec, "BRAKE_STATUS")
+        self._ego = Sender(codec, "EGO_STATE")
+        self._request: dict[str, float] | None = None  # the last one believed
+        self._request_us = 0
+        self._demand_ms2 = 0.0
+
+    def on_frame(self, frame: Frame) -> None:
+        """Take any frame off the bus; `frame.t_us` is when it arrived. Ignores all but AEB_REQ."""
+        if frame.can_id != self._aeb_req_id:
+            return
+        status = self._receiver.check(frame.data, frame.t_us)
+        if not self._receiver.usable(status):
+            self.refused += 1
+            return
+        self.accepted += 1
+        self._request, self._request_us = self._codec.decode("AEB_REQ", frame.data), frame.t_us
+
+    def demand_ms2(self, plant: Plant) -> float:
+        """What the brakes are told in this step: m/s2, 0 or more. Call once per plant step."""
+        if self._request is None:
+            return 0.0
+        self._receiver.poll(plant.t_us)
+        self.fallback = self._choose(plant, self._request)
+        if self.fallback is Fallback.RELEASE:
+            self.stage, self._demand_ms2 = 0, 0.0
+        elif self.fallback is not Fallback.LATCH:  # a latch keeps the stage and demand that it began with
+            self.stage, self._demand_ms2 = int(self._request["STAGE"]), self._request["DECELERATION"]
+        return self._demand_ms2
+
+    def frames(self, plant: Plant) -> list[Frame]:
+        """The frames due at `plant.t_us`, in arbitration order. Call once for each plant step."""
+        if not self._status.due(plant.t_us):
+            return []
+        t_us = plant.t_us
+        return [self._status.frame(t_us, self._status_signals(plant)), self._ego.frame(t_us, _motion(plant))]
+
+    def _choose(self, plant: Plant, request: dict[str, float]) -> Fallback:
+        """Fresh request, bridge, or policy."""
+        age_us = plant.t_us - self._request_us
+        full = request["STAGE"] == STAGE_FULL
+        if self.fallback is Fallback.LATCH and not plant.stopped() and not (full and age_us <= LATE_US):
+            return Fallback.LATCH
+        if age_us <= HOLD_US:
+            return Fallback.NONE if age_us <= LATE_US else Fallback.HOLD
+        if self._policy == "hold":
+            return Fallback.HOLD
+        if self._policy == "latch" and full and (self.fallback is Fallback.LATCH or not plant.stopped()):
+            return Fallback.LATCH
+        return Fallback.RELEASE
+
+    def _status_signals(self, plant: Plant) -> dict[str, float]:
+        return {
+            "STAGE_APPLIED": self.stage,
+            "FALLBACK": int(self.fallback),
+            "DECELERATION_ACTUAL": max(0.0, min(20.0, -plant.acceleration_ms2)),
+            "DECELERATION_DEMANDED": self._demand_ms2,
+            "SEQUENCE_FOLLOWED": self._request["SEQUENCE"] if self._request else 0,
+        }
+
+
+def _motion(plant: Plant) -> dict[str, float]:
+    return {
+        "SPEED_VALID": 1,
+        "SPEED": min(65.535, plant.speed_ms),
+        "ACCELERATION": max(-20.0, min(20.0, plant.acceleration_ms2)),
+    }

@@ -1,0 +1,234 @@
+"""The protected function: decides when to brake, and remembers why. This is what a mechanism protects.
+
+One request is one radar cycle: bus time, ego speed, and the targets of the cycle. One reply is what the
+brakes are asked for. In between:
+
+1. **Tracks** (`tracker`). Confirmed after 3 hits, dropped after more misses than a short gap makes.
+2. **Threat** (`threat`). Of all confirmed tracks, the one that takes the most braking.
+3. **Stage.** NONE, WARN, PARTIAL (4 m/s2), FULL. The warning lasts 0.8 s before full braking where there is
+   time (UN R152); where there is none, brakes come first. No stage is left for a lesser one until the
+   ego has stood for `STILL_MS`, or nothing has been a threat for `CLEAR_MS`. Losing sight of an
+   obstacle is not the end of it: where no track is left to show that the threat is gone, the stage
+   outlives it by `LOST_MS`.
+
+The gateway does the lateral selection: what is in a request is in our path.
+
+A request without a valid radar or ego speed is blind and decides nothing: tracks coast, and the stage is
+held, for at most `BLIND_MS`. That a radar cannot be believed must never end a braking.
+Time that runs backwards, or jumps by more than `GAP_MS`, starts all tracks anew: nothing old may brake.
+
+The state is one fixed layout of `STATE_BYTES`, doubles as they are, so that a restored replica goes on
+bit for bit. Only + - * / and comparisons on doubles: the same replies on every machine.
+"""
+
+from random import Random
+from struct import Struct
+from typing import Final
+
+from aftbed.core.application import Application
+from aftbed.core.errors import PeerError
+from aftbed.vehicle.aebmessages import (
+    COUNTER_COUNT,
+    SLOTS,
+    SPEED_MAX_MS,
+    STAGE_FULL,
+    STAGE_NONE,
+    STAGE_PARTIAL,
+    T_MS_MAX,
+    AebInput,
+    AebOutput,
+    AebTarget,
+    decode_request,
+    encode_reply,
+    encode_request,
+)
+from aftbed.vehicle.threat import Threat, worst
+from aftbed.vehicle.tracker import Track
+
+DEMAND_MS2: Final = (0.0, 0.0, 4.0, 9.0)  # by stage; full is more than the tyres give
+GAP_MS: Final = 500
+WARNED_MS: Final = 800
+CLEAR_MS: Final = 100
+LOST_MS: Final = 600
+STILL_MS: Final = 2000
+STILL_SPEED_MS: Final = 0.05
+BLIND_MS: Final = 2000
+TIMER_MAX_MS: Final = 60_000
+
+VERSION: Final = 1
+_HEADER: Final = Struct("<BBBBdqIIII")  # version, counter, stage, started, ego speed, time, four timers
+_TRACKS: Final = Struct("<" + "BBddd" * SLOTS)
+STATE_BYTES: Final = _HEADER.size + _TRACKS.size
+
+
+class AebFunction:
+    """The application. `execute` is the only thing that changes it; see the module's theory."""
+
+    def __init__(self) -> None:
+        self._counter = 0
+        self._stage = STAGE_NONE
+        self._started = False  # while False, `_t_ms` and `_ego_ms` mean nothing
+        self._ego_ms = 0.0  # last valid
+        self._t_ms = 0
+        self._warned_ms = 0  # since the stage left NONE
+        self._clear_ms = 0  # since something was last a threat
+        self._still_ms = 0  # since the ego stood
+        self._blind_ms = 0  # since a request last was not blind
+        self._tracks = [Track() for _ in range(SLOTS)]
+
+    def execute(self, request: bytes) -> bytes:
+        """Decide for one radar cycle. Raises PeerError, with nothing changed, on a bad request."""
+        cycle = decode_request(request)
+        elapsed_ms = self._advance(cycle)
+        self._measure(cycle, elapsed_ms / 1000)
+        threat = worst(self._tracks, self._ego_ms)
+        if _sees(cycle):
+            self._decide(threat, elapsed_ms)
+        elif self._blind_ms > BLIND_MS:
+            self._rest()
+        return encode_reply(self._reply(threat))
+
+    def capture(self) -> bytes:
+        """The whole state, `STATE_BYTES` long."""
+        fields: list[float] = []
+        for track in self._tracks:
+            fields += (track.hits, track.misses, track.range_m, track.speed_ms, track.acceleration_ms2)
+        timers = (self._warned_ms, self._clear_ms, self._still_ms, self._blind_ms)
+        flags = (VERSION, self._counter, self._stage, self._started)
+        return _HEADER.pack(*flags, self._ego_ms, self._t_ms, *timers) + _TRACKS.pack(*fields)
+
+    def restore(self, state: bytes) -> None:
+        """Become what `capture` saw. Raises PeerError, with nothing changed, if `state` is not one."""
+        if len(state) != STATE_BYTES:
+            raise PeerError(f"state of {len(state)} bytes, expected {STATE_BYTES}")
+        version, counter, stage, started, ego_ms, t_ms, *timers = _HEADER.unpack_from(state)
+        if version != VERSION:
+            raise PeerError(f"state of version {version}, expected {VERSION}")
+        if counter >= COUNTER_COUNT or stage > STAGE_FULL or started > 1:
+            raise PeerError(f"state with counter {counter}, stage {stage}, started {started}")
+        if not (0.0 <= ego_ms <= SPEED_MAX_MS and 0 <= t_ms <= T_MS_MAX and max(timers) <= TIMER_MAX_MS):
+            raise PeerError(f"state with ego speed {ego_ms} m/s, time {t_ms} ms, timers {timers} ms")
+        tracks = _unpack_tracks(state)
+        self._counter, self._stage, self._started = counter, stage, bool(started)
+        self._ego_ms, self._t_ms, self._tracks = ego_ms, t_ms, tracks
+        self._warned_ms, self._clear_ms, self._still_ms, self._blind_ms = timers
+
+    def _advance(self, cycle: AebInput) -> int:
+        """Milliseconds since the last request; 0, with all tracks dropped, where that means nothing."""
+        elapsed_ms = cycle.t_ms - self._t_ms
+        if not (self._started and 0 <= elapsed_ms <= GAP_MS):
+            self._tracks = [Track() for _ in range(SLOTS)]
+            elapsed_ms = 0
+        self._t_ms, self._started = cycle.t_ms, True
+        if cycle.ego_valid:
+            self._ego_ms = cycle.ego_speed_ms
+        self._blind_ms = 0 if _sees(cycle) else _later(self._blind_ms, elapsed_ms)
+        return elapsed_ms
+
+    def _measure(self, cycle: AebInput, elapsed_s: float) -> None:
+        """Move all tracks on, and correct those that were seen."""
+        seen = 0
+        if _sees(cycle):
+            for target in cycle.targets:
+                seen |= 1 << target.slot
+                self._tracks[target.slot].hit(target, self._ego_ms, elapsed_s)
+        for slot, track in enumerate(self._tracks):
+            if track.hits and not seen >> slot & 1:
+                track.miss(self._ego_ms, elapsed_s)
+
+    def _decide(self, threat: Threat | None, elapsed_ms: int) -> None:
+        """Raise the stage as the threat asks; end it when the threat is gone, or the ego has stood."""
+        still = self._ego_ms <= STILL_SPEED_MS
+        self._still_ms = _later(self._still_ms, elapsed_ms) if still else 0
+        self._warned_ms = _later(self._warned_ms, elapsed_ms) if self._stage else 0
+        persists = threat is not None and threat.persists()
+        self._clear_ms = 0 if persists else _later(self._clear_ms, elapsed_ms)
+        clear_ms_max = CLEAR_MS if any(track.confirmed() for track in self._tracks) else LOST_MS
+        if self._still_ms > STILL_MS or (not still and self._clear_ms > clear_ms_max):
+            self._rest()
+        elif threat is not None and not still:
+            self._stage = max(self._stage, self._allowed(threat))
+
+    def _allowed(self, threat: Threat) -> int:
+        """The stage that the threat calls for, or less while the warning has not lasted long enough."""
+        stage = threat.stage()
+        if stage == STAGE_FULL and self._warned_ms < WARNED_MS and not threat.pressing():
+            return STAGE_PARTIAL
+        return stage
+
+    def _rest(self) -> None:
+        self._stage, self._warned_ms = STAGE_NONE, 0
+
+    def _reply(self, threat: Threat | None) -> AebOutput:
+        counter = self._counter
+        self._counter = (counter + 1) % COUNTER_COUNT
+        demand_ms2 = DEMAND_MS2[self._stage]
+        if threat is None:
+            return AebOutput(self._stage, demand_ms2, None, None, counter)
+        return AebOutput(self._stage, demand_ms2, threat.ttc_s, threat.slot, counter)
+
+
+def _sees(cycle: AebInput) -> bool:
+    return cycle.ego_valid and cycle.radar_valid
+
+
+def _later(timer_ms: int, elapsed_ms: int) -> int:
+    return min(timer_ms + elapsed_ms, TIMER_MAX_MS)
+
+
+def _unpack_tracks(state: bytes) -> list[Track]:
+    """The tracks of a state. Raises PeerError on values that no execution can reach."""
+    fields = _TRACKS.unpack_from(state, _HEADER.size)
+    tracks = [Track(*fields[start : start + 5]) for start in range(0, len(fields), 5)]
+    for slot, track in enumerate(tracks):
+        if not track.plausible():
+            raise PeerError(f"state with {track} in slot {slot}")
+    return tracks
+
+
+def default_application() -> Application:
+    """A new instance of the function, as every replica starts it."""
+    return AebFunction()
+
+
+SAMPLE_CYCLE_MS: Final = 20
+SAMPLE_LIMIT_MS2: Final = 6.0
+
+
+def sample_requests(seed: int, count: int) -> list[bytes]:
+    """`count` radar cycles of 20 ms for load and benches: approaches to a car ahead, one after the other.
+
+    In each, the ego closes in on a slower or standing car, brakes late and steadily down to its speed,
+    follows for a second, and meets the next one. Nothing is fed back: the same seed gives the same bytes.
+    """
+    random = Random(seed)
+    requests: list[bytes] = []
+    while len(requests) < count:
+        requests += _sample_approach(random, len(requests) * SAMPLE_CYCLE_MS)
+    return requests[:count]
+
+
+def _sample_approach(random: Random, start_ms: int) -> list[bytes]:
+    """One approach, from a random speed and gap to a second of following."""
+    ego_ms, lead_ms = random.uniform(8.0, 17.0), random.choice((0.0, 0.0, random.uniform(2.0, 7.0)))
+    gap_m = random.uniform(3.0, 4.5) * (ego_ms - lead_ms)
+    cycle_s = SAMPLE_CYCLE_MS / 1000
+    requests: list[bytes] = []
+    following = 0
+    while following * SAMPLE_CYCLE_MS < 1000:
+        targets = _sample_targets(random, gap_m, lead_ms - ego_ms, not requests)
+        t_ms = start_ms + len(requests) * SAMPLE_CYCLE_MS
+        requests.append(encode_request(AebInput(t_ms, ego_ms, True, True, targets)))
+        closing_ms = ego_ms - lead_ms
+        gap_m -= closing_ms * cycle_s
+        if closing_ms * closing_ms >= 2.0 * SAMPLE_LIMIT_MS2 * max(0.1, gap_m - 3.0):
+            ego_ms = max(lead_ms, ego_ms - SAMPLE_LIMIT_MS2 * cycle_s)
+        following += closing_ms <= 0.0 or gap_m < 1.0
+    return requests
+
+
+def _sample_targets(random: Random, gap_m: float, rel_ms: float, new: bool) -> tuple[AebTarget, ...]:
+    """The car ahead and, farther away, the one before it, both with a radar's noise."""
+    near = AebTarget(0, max(0.0, gap_m + random.uniform(-0.1, 0.1)), rel_ms + random.uniform(-0.1, 0.1), new)
+    far = AebTarget(1, gap_m + 20.0 + random.uniform(-0.1, 0.1), rel_ms + random.uniform(-0.1, 0.1), new)
+    return (near, far)

@@ -1,0 +1,210 @@
+"""The gateway: frames in, requests out; replies in, frames out. The paper's Client, less its sockets.
+
+Nothing in a frame is believed before its E2E protection is checked. Each RADAR_TRACK makes one
+request, and the reply to it becomes one AEB_REQ: the radar is the clock of the function.
+
+A RADAR_TRACK that is refused is counted, and nothing in it is used. It still makes a request, one that says
+that the radar is not to be believed now; not one with no targets, for "unknown" must never look like
+"the road is empty", which would end a braking. Such a request is made only where the radar's cycle has a
+place for it: a repeated frame, or a flood of bad ones, does not drive the function faster. An EGO_STATE that
+is missing or refused makes the next request say that the ego speed is unknown.
+
+The first frame of a run, or after a silence, only starts the E2E sequence, and is refused too.
+
+The lateral selection is made here: a target farther than `LANE_HALF_M` from the middle of the lane is
+not in our path and not in the request. The function knows range and speed only.
+"""
+
+from typing import Final, Protocol
+
+import msgspec
+
+from aftbed.vehicle.aebmessages import (
+    RANGE_MAX_M,
+    SPEED_MAX_MS,
+    AebInput,
+    AebTarget,
+    decode_reply,
+    encode_request,
+)
+from aftbed.vehicle.dbcfile import Codec
+from aftbed.vehicle.e2e import ChannelState, Receiver, Status, Supervision, protect
+from aftbed.vehicle.frame import Frame
+
+LANE_HALF_M: Final = 1.5  # half a lane, less half of what a car may stick into it without being in our way
+TIMEOUT_CYCLES: Final = 6
+REPLICAS: Final = (1, 2)
+TTC_MAX_S: Final = 40.95  # range of the signal
+BLIND_PART: Final = 0.75  # of a radar cycle must have passed since the last request for a blind one
+
+
+class GatewayCounts(msgspec.Struct):
+    """Frames so far: believed, not for us, and refused, by reason."""
+
+    accepted: int = 0
+    ignored: int = 0
+    refused: dict[str, int] = msgspec.field(default_factory=dict)
+
+    def refuse(self, reason: str) -> None:
+        """Count one refused frame."""
+        self.refused[reason] = self.refused.get(reason, 0) + 1
+
+
+class BusGateway(Protocol):
+    """What the client process needs of a gateway; `Gateway` and `MappedGateway` are two."""
+
+    counts: GatewayCounts
+
+    def on_frame(self, frame: Frame) -> bytes | None:
+        """Judge a frame off the bus. A request payload if it ends a radar cycle, else None."""
+        ...
+
+    def on_reply(self, reply: bytes, t_us: int, replica: int, epoch: int, answered: int) -> list[Frame]:
+        """The frames that the reply becomes, sent at `t_us`. Raises PeerError if it is not a reply."""
+        ...
+
+
+class ReplySender:
+    """The way out, the same for both gateways: FTM_HEARTBEAT_n if one is due, then AEB_REQ."""
+
+    def __init__(self, codec: Codec) -> None:
+        self._codec = codec
+        self._aeb_req_id = codec.can_id("AEB_REQ")
+        self._data_id = codec.data_id("AEB_REQ")
+        self._heartbeats = {replica: f"FTM_HEARTBEAT_{replica}" for replica in REPLICAS}
+        self._heartbeat_cycle_us = codec.cycle_us(self._heartbeats[1])
+        self._heartbeat_us: int | None = None
+
+    def frames(self, reply: bytes, t_us: int, replica: int, epoch: int, answered: int) -> list[Frame]:
+        """See `BusGateway.on_reply`. The E2E counter is the reply's own, so a failover leaves no gap."""
+        assert replica in REPLICAS
+        output = decode_reply(reply)
+        signals = {
+            "CRC": 0,
+            "COUNTER": 0,
+            "STAGE": output.stage,
+            "TTC_VALID": int(output.ttc_s is not None),
+            "DECELERATION": output.deceleration_ms2,
+            "TARGET": output.slot or 0,
+            "TTC": min(output.ttc_s or 0.0, TTC_MAX_S),
+            "SEQUENCE": answered & 0xFFFF,
+        }
+        data = protect(self._codec.encode("AEB_REQ", signals), self._data_id, output.counter)
+        return [*self._heartbeat(t_us, replica, epoch, answered), Frame(t_us, self._aeb_req_id, data)]
+
+    def _heartbeat(self, t_us: int, replica: int, epoch: int, answered: int) -> list[Frame]:
+        if self._heartbeat_us is not None and t_us - self._heartbeat_us < self._heartbeat_cycle_us:
+            return []
+        self._heartbeat_us = t_us
+        name = self._heartbeats[replica]
+        signals = {"REPLICA": replica, "EPOCH": epoch & 0xFFFF, "ANSWERED": answered & 0xFFFF_FFFF}
+        return [Frame(t_us, self._codec.can_id(name), self._codec.encode(name, signals))]
+
+
+def target_of(slot: int, range_m: float, rel_speed_ms: float, new: bool) -> AebTarget | None:
+    """A target, or None if the function would refuse it: no sensor means such a value."""
+    if 0.0 <= range_m <= RANGE_MAX_M and -SPEED_MAX_MS <= rel_speed_ms <= SPEED_MAX_MS:
+        return AebTarget(slot, range_m, rel_speed_ms, new)
+    return None
+
+
+class Gateway:
+    """The gateway on aftbed's own bus: RADAR_TRACK and EGO_STATE in."""
+
+    def __init__(self, codec: Codec) -> None:
+        self.counts = GatewayCounts()
+        self._codec = codec
+        self._sender = ReplySender(codec)
+        self._ego_id, self._ego = codec.can_id("EGO_STATE"), _receiver(codec, "EGO_STATE")
+        self._track_id, self._track = codec.can_id("RADAR_TRACK"), _receiver(codec, "RADAR_TRACK")
+        self._t_us = 0
+        self._ego_us = 0
+        self._ego_speed_ms: float | None = None  # the last one believed
+        self._request_us: int | None = None  # when the last request was made
+        self._blind_after_us = round(BLIND_PART * codec.cycle_us("RADAR_TRACK"))
+
+    def on_frame(self, frame: Frame) -> bytes | None:
+        """See `BusGateway.on_frame`: a request for each RADAR_TRACK that is believed."""
+        if frame.can_id not in (self._ego_id, self._track_id):
+            self.counts.ignored += 1
+            return None
+        if frame.t_us < self._t_us:
+            self.counts.refuse("time")
+            return None
+        if frame.can_id == self._ego_id:
+            self._on_ego(frame)
+            return None
+        return self._on_track(frame)
+
+    def on_reply(self, reply: bytes, t_us: int, replica: int, epoch: int, answered: int) -> list[Frame]:
+        """See `BusGateway.on_reply`."""
+        return self._sender.frames(reply, t_us, replica, epoch, answered)
+
+    def _on_ego(self, frame: Frame) -> None:
+        if self._believed(self._ego, frame):
+            self.counts.accepted += 1
+            signals = self._codec.decode("EGO_STATE", frame.data)
+            self._ego_speed_ms = signals["SPEED"] if signals["SPEED_VALID"] else None
+            self._ego_us = frame.t_us
+
+    def _on_track(self, frame: Frame) -> bytes | None:
+        targets = self._targets(frame)
+        early = self._request_us is not None and frame.t_us - self._request_us < self._blind_after_us
+        if targets is None and early:
+            return None
+        self._request_us = frame.t_us
+        speed_ms, known = self._ego_speed(frame.t_us)
+        return encode_request(
+            AebInput(frame.t_us // 1000, speed_ms, known, targets is not None, targets or ())
+        )
+
+    def _targets(self, frame: Frame) -> tuple[AebTarget, ...] | None:
+        """The targets in our path; None, and counted, if the frame is not to be believed."""
+        if not self._believed(self._track, frame):
+            return None
+        signals = self._codec.decode("RADAR_TRACK", frame.data)
+        slot, new = int(signals["TRACK_ID"]), bool(signals["NEW_TRACK"])
+        target = target_of(slot, signals["RANGE"], signals["RELATIVE_SPEED"], new)
+        if signals["VALID"] and target is None:
+            self.counts.refuse("range")
+            return None
+        self.counts.accepted += 1
+        in_path = signals["VALID"] and abs(signals["LATERAL_OFFSET"]) <= LANE_HALF_M
+        return (target,) if target is not None and in_path else ()
+
+    def _ego_speed(self, t_us: int) -> tuple[float, bool]:
+        """The ego speed, and whether it is to be believed now."""
+        timeout_us = self._ego.supervision.timeout_us
+        if self._ego_speed_ms is None or t_us - self._ego_us > timeout_us:
+            return 0.0, False
+        return self._ego_speed_ms, True
+
+    def _believed(self, receiver: Receiver, frame: Frame) -> bool:
+        """Let E2E judge the frame; count it if it is refused."""
+        self._t_us = frame.t_us
+        status = receiver.check(frame.data, frame.t_us)
+        if receiver.usable(status):
+            return True
+        self.counts.refuse(_reason(receiver, frame, status))
+        return False
+
+
+def _reason(receiver: Receiver, frame: Frame, status: Status) -> str:
+    """Why a frame is refused, in a word."""
+    if len(frame.data) != receiver.supervision.length:
+        return "length"
+    match status:
+        case Status.ERROR:
+            return "checksum"
+        case Status.REPEATED:
+            return "repeated"
+        case Status.WRONGSEQUENCE:
+            return "sequence"
+        case _:
+            assert receiver.state is not ChannelState.VALID
+            return "channel"
+
+
+def _receiver(codec: Codec, name: str) -> Receiver:
+    cycle_us = codec.cycle_us(name)
+    return Receiver(Supervision(codec.data_id(name), cycle_us, TIMEOUT_CYCLES * cycle_us, codec.length(name)))

@@ -1,0 +1,32 @@
+"""What the car tells about itself: live telemetry, and the result of a whole drive.
+
+The plant is the only source of truth here: nothing in these two structs comes off the bus, so a
+frame fault cannot make a collision look like a stop.
+"""
+
+import msgspec
+
+
+class VehicleResult(msgspec.Struct, frozen=True):
+    """A whole drive. `min_gap_m` and `stop_gap_m` are None without a target or without a stop."""
+
+    collision: bool
+    impact_speed_kmh: float | None
+    min_gap_m: float | None
+    stop_gap_m: float | None
+    max_deceleration_ms2: float
+    braked: bool
+
+
+class Telemetry(msgspec.Struct, frozen=True):
+    """One instant of the drive, for the live view. `stage` is the stage that the brakes follow."""
+
+    t_ms: int
+    speed_ms: float
+    gap_m: float | None
+    ttc_s: float | None
+    stage: int
+    deceleration_ms2: float
+    fallback: int
+    frames_accepted: int
+    frames_refused: int
