@@ -12,6 +12,7 @@ from typing import Final
 import msgspec
 
 STEP_SECONDS_MAX: Final = 2.0
+EARLY_MAX: Final = 256
 
 Key = tuple[str, str, int]
 
@@ -44,6 +45,7 @@ class Jobs:
 
     def __init__(self) -> None:
         self._jobs: list[_Job] = []
+        self._early: dict[Key, bytes] = {}  # settled before anybody waited for it
 
     def __len__(self) -> int:
         return len(self._jobs)
@@ -59,13 +61,19 @@ class Jobs:
         self._advance(job, lambda: next(steps))
 
     def settle(self, key: Key, value: bytes = b"") -> None:
-        """`key` has happened."""
+        """`key` has happened. An answer may come before its job gets to wait for it: it is kept."""
+        waited_for = False
         for job in list(self._jobs):
             if key in job.wait.keys and key not in job.got:
+                waited_for = True
                 job.got[key] = value
                 if len(job.got) == len(job.wait.keys):
                     got = job.got
                     self._advance(job, lambda j=job, g=got: j.steps.send(g))  # type: ignore[misc]
+        if not waited_for and key[0] == "ack":
+            self._early[key] = value
+            if len(self._early) > EARLY_MAX:
+                del self._early[next(iter(self._early))]
 
     def fail(self, key: Key, reason: str) -> None:
         """`key` will not happen."""
@@ -94,11 +102,12 @@ class Jobs:
     def _advance(self, job: _Job, resume: Callable[[], Wait]) -> None:
         try:
             while True:
-                job.wait, job.got = resume(), {}
+                job.wait = resume()
+                job.got = {key: self._early.pop(key) for key in job.wait.keys & self._early.keys()}
                 job.deadline_ns = time.monotonic_ns() + round(job.wait.seconds * 1e9)
-                if job.wait.keys:
+                if len(job.got) < len(job.wait.keys):
                     return
-                resume = lambda: job.steps.send({})  # noqa: E731
+                resume = lambda got=job.got: job.steps.send(got)  # type: ignore[misc]  # noqa: E731
         except StopIteration:
             self._end(job, "")
         except StepFailed as failure:
