@@ -58,6 +58,9 @@ class Entry(msgspec.Struct, frozen=True):
     payload: bytes
 
 
+_KINDS: Final = frozenset(EntryKind)
+
+
 def header(node: str) -> bytes:
     """The first page of the journal of `node`."""
     name = node.encode()
@@ -99,7 +102,7 @@ def entries(data: bytes) -> Iterator[Entry]:
         if kind == 0:
             return
         start = at + ENTRY.size
-        if kind not in EntryKind or start + length > len(data):
+        if kind not in _KINDS or start + length > len(data):
             raise PeerError(f"entry at byte {at}: kind {kind}, {length} bytes")
         yield Entry(t_ns, request_id, epoch, EntryKind(kind), data[start : start + length])
         at = start + length

@@ -210,8 +210,12 @@ class HubClock:
         except OSError as error:
             raise HarnessError(f"no CAN hub at {HOST}:{options.port}: {error}") from error
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._expect("< hi >")
-        self._ask(f"< open {options.channel} >")
+        try:
+            self._expect("< hi >")
+            self._ask(f"< open {options.channel} >")
+        except HarnessError:
+            self.close()
+            raise
 
     def set_time(self, t_us: int) -> None:
         """Return when the hub has taken `t_us` as its time. HarnessError if it does not."""

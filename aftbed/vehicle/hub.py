@@ -35,7 +35,7 @@ Limit, said openly: python-can demands that a read gives `< ok >` and nothing be
 first frame may follow at once. Between the two the hub sends one byte as TCP urgent data: a reader
 stops in front of the urgent mark, whatever has been queued behind it, and the byte itself is taken
 out of the stream by the receiving kernel. RFC 6093 advises against urgent data because middleboxes
-spoil it; on the loopback there are none. Through a proxy the mark is lost, the byte is a newline.
+spoil it; the loopback has none. Through a proxy the mark is lost, and the byte is a newline.
 """
 
 import re
@@ -56,6 +56,7 @@ CLIENTS_MAX: Final = 64
 EVENTS_MAX: Final = 32  # in one round; the rest comes in the next
 READ_BYTES_MAX: Final = 4096
 ELEMENT_BYTES_MAX: Final = 128  # the longest legal one has 46
+LAST_FRAMES_S_MAX: Final = 0.1
 OUTPUT_BYTES_MAX: Final = 256 * 1024
 FRAMES_QUEUED_MAX: Final = 256
 LOG_BYTES_MAX: Final = 1024 * 1024 * 1024
@@ -155,18 +156,31 @@ class Hub:
         self._epoll.register(life_fd, select.EPOLLIN)
 
     def run(self) -> HubCounts:
-        """Carry frames until `life_fd` ends."""
-        while True:
-            for fd, events in self._wait():
-                client = self._clients.get(fd)
-                if client is not None:
-                    self._attend(client, events)
-                elif fd == self._life_fd:
-                    if not read(fd, READ_BYTES_MAX):
-                        return self.counts
-                elif fd == self._listener.fileno():
-                    self._accept()
+        """Carry frames until `life_fd` ends, and then those that had been sent by then."""
+        alive = True
+        while alive:
+            alive = self._attend_all(self._wait())
             self._carry()
+        self._epoll.unregister(self._life_fd)
+        self._epoll.unregister(self._listener.fileno())
+        end_s = time.monotonic() + LAST_FRAMES_S_MAX
+        while time.monotonic() < end_s and (events := self._epoll.poll(0, EVENTS_MAX)):
+            self._attend_all(events)
+            self._carry()
+        return self.counts
+
+    def _attend_all(self, events: list[tuple[int, int]]) -> bool:
+        """Serve all who have something; False when the life of the hub has ended."""
+        alive = True
+        for fd, mask in events:
+            client = self._clients.get(fd)
+            if client is not None:
+                self._attend(client, mask)
+            elif fd == self._life_fd:
+                alive = bool(read(fd, READ_BYTES_MAX))
+            elif fd == self._listener.fileno():
+                self._accept()
+        return alive
 
     def close(self) -> None:
         """Hang up on all clients."""

@@ -146,9 +146,8 @@ def _gap_m(path: Path, lead: _Lead, ego_kmh: float) -> float:
     if lead.ttc_s is not None:
         closing_kmh = ego_kmh - lead.speed_kmh
         if closing_kmh <= 0.0:
-            raise ConfigError(
-                f"{path}: lead.ttc_s: found {lead.ttc_s}, but the gap is not closing: give gap_m"
-            )
+            reason = f"found {lead.ttc_s}, allowed is gap_m, because the gap does not close"
+            raise ConfigError(f"{path}: lead.ttc_s: {reason}")
         return lead.ttc_s * closing_kmh / KMH_PER_MS
     assert lead.gap_m is not None
     if lead.gap_m == 0.0:

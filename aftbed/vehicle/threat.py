@@ -18,10 +18,11 @@ MARGIN_M: Final = 1.5  # bumper to bumper, at standstill
 REACTION_S: Final = 0.2  # dead time and lag of the brakes
 LEAD_BRAKING_MS2: Final = 1.0  # a target that brakes less is taken to drive on
 LEAD_BRAKING_MAX_MS2: Final = 10.0  # no car brakes harder; more is noise
-NEAR_M: Final = 0.1
+ROOM_MIN_M: Final = 0.1
 REQUIRED_MAX_MS2: Final = 99.0
 
-THREAT_MS2: Final = 1.0  # less than this ends a braking
+THREAT_MS2: Final = 1.0  # a threat that takes less, and is far, ends a braking
+NEAR_THREAT_M: Final = 15.0  # nearer than this, it is a threat for as long as we move towards it
 WARN_TTC_S: Final = 2.7
 WARN_MS2: Final = 3.0
 PARTIAL_MS2: Final = 5.0
@@ -33,12 +34,14 @@ class Threat(msgspec.Struct, frozen=True, gc=False):
     """The worst of the confirmed tracks."""
 
     slot: int
+    range_m: float
     required_ms2: float
     ttc_s: float | None  # None if the gap is not closing
 
     def persists(self) -> bool:
-        """True if a braking that has begun must go on."""
-        return self.required_ms2 >= THREAT_MS2 or self.stage() != STAGE_NONE
+        """True if a braking that has begun must go on: it ends with our speed, or with the threat."""
+        near = self.ttc_s is not None and self.range_m <= NEAR_THREAT_M
+        return near or self.required_ms2 >= THREAT_MS2 or self.stage() != STAGE_NONE
 
     def pressing(self) -> bool:
         """True if full braking cannot wait for the warning to have lasted."""
@@ -65,14 +68,14 @@ def worst(tracks: Sequence[Track], ego_ms: float) -> Threat | None:
                 slot, most_ms2 = candidate, required_ms2
     if slot < 0:
         return None
-    closing_ms = ego_ms - tracks[slot].speed_ms
-    return Threat(slot, most_ms2, tracks[slot].range_m / closing_ms if closing_ms > 0.0 else None)
+    range_m, closing_ms = tracks[slot].range_m, ego_ms - tracks[slot].speed_ms
+    return Threat(slot, range_m, most_ms2, range_m / closing_ms if closing_ms > 0.0 else None)
 
 
 def required_deceleration_ms2(track: Track, ego_ms: float) -> float:
     """The least constant deceleration, m/s2, that leaves `MARGIN_M`; 0 if no braking is needed."""
     closing_ms = ego_ms - track.speed_ms
-    room_m = max(NEAR_M, track.range_m - MARGIN_M - max(0.0, closing_ms) * REACTION_S)
+    room_m = max(ROOM_MIN_M, track.range_m - MARGIN_M - max(0.0, closing_ms) * REACTION_S)
     if -track.acceleration_ms2 >= LEAD_BRAKING_MS2 and track.speed_ms > 0.0 and ego_ms > 0.0:
         required_ms2 = _behind_a_braking_car_ms2(track, ego_ms, room_m)
     elif closing_ms > 0.0:

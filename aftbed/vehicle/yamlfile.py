@@ -71,6 +71,7 @@ def _explain(reason: str, found: object, shape: type[msgspec.Struct]) -> str:
     """msgspec's reason, in the user's terms."""
     at = _WHERE.search(reason)
     path = at["path"].removeprefix(".") if at else ""
+    reason = reason[: at.start()] if at else reason
     keys = [key for key in re.split(r"[.\[\]]+", path) if key]
     node, allowed = found, inspect.type_info(shape)
     for key in keys:

@@ -132,17 +132,14 @@ class Launched:
         except OSError:
             return
 
-    def close(self, *, keep: bool = False) -> None:
-        """Wait for the supervisor's end, kill it if it does not come, and remove the directory."""
+    def wait(self) -> None:
+        """Wait for the supervisor's end; kill it if that does not come. The record is still there."""
         self.line.close()
         if not self._pidfd_ready(END_SECONDS_MAX):
             linux.kill(self._pidfd, signal.SIGKILL)
             self._pidfd_ready(KILL_SECONDS_MAX)
         os.waitpid(self._supervisor, 0)
         os.close(self._pidfd)
-        if keep:
-            return
-        self.remove()
 
     def remove(self) -> None:
         """The record has been read: let everything go."""

@@ -1,0 +1,5 @@
+"""`python -m aftbed`."""
+
+from aftbed.cli import main
+
+main()

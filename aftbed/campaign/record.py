@@ -1,0 +1,56 @@
+"""A run's record, read back: what `--record DIR` leaves, also after a `kill -9`."""
+
+import json
+from pathlib import Path
+
+import msgspec
+
+from aftbed.core.check import History
+from aftbed.core.errors import ConfigError, PeerError
+from aftbed.core.journal import entries, records
+from aftbed.runtime.unix.options import RunOptions
+
+
+class RunRecord(msgspec.Struct, frozen=True):
+    """`end` is None where the supervisor did not live to write it."""
+
+    path: Path
+    options: RunOptions
+    started_ns: int
+    end: dict[str, object] | None
+    history: History
+
+
+def read_record(path: Path) -> RunRecord:
+    """The record in `path`. Raises ConfigError naming the file that is missing or malformed."""
+    about = _json(path / "run.json")
+    options = msgspec.convert(about | {"private": "", "listener": -1}, RunOptions)
+    folder = path / "journal"
+    try:
+        journals = {
+            p.name.removesuffix(".journal"): list(records(p.read_bytes()))
+            for p in sorted(folder.glob("*.journal"))
+        }
+        dialogue = [
+            e
+            for p in sorted(folder.glob("client.*.dialogue"), key=lambda p: int(p.name.split(".")[1]))
+            for e in entries(p.read_bytes())
+        ]
+    except PeerError as error:
+        raise ConfigError(f"{folder}: {error}") from None
+    end = _json(path / "end.json") if (path / "end.json").exists() else None
+    started = about["started_ns"]
+    assert isinstance(started, int)
+    return RunRecord(path, options, started, end, History(journals, dialogue))
+
+
+def _json(path: Path) -> dict[str, object]:
+    try:
+        found = json.loads(path.read_bytes())
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}; is this the record of a run?") from None
+    except ValueError as error:
+        raise ConfigError(f"{path}: not JSON: {error}") from None
+    if not isinstance(found, dict):
+        raise ConfigError(f"{path}: not a JSON object")
+    return found

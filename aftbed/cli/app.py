@@ -1,0 +1,155 @@
+"""All commands. What a command needs is imported when it runs: `aftbed --help` answers at once."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from aftbed.cli.bench import bench
+
+app = typer.Typer(
+    name="aftbed",
+    help="A testbed for Adaptive Fault Tolerance: a car that goes on braking when its server dies.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+inject = typer.Typer(help="Inject a fault into a live run.", no_args_is_help=True, rich_markup_mode=None)
+app.add_typer(inject, name="inject")
+app.add_typer(bench, name="bench")
+
+Run = Annotated[str | None, typer.Option("--run", help="Id of the run, where several are alive.")]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else.")]
+
+
+@app.command()
+def run(
+    ftm: Annotated[str, typer.Option(help="none or pbr.")] = "pbr",
+    scenario: Annotated[str, typer.Option(help="Name of a scenario, or a YAML file.")] = "ccrs-50",
+    placement: Annotated[str, typer.Option(help="process (one per brick) or replica.")] = "process",
+    pace: Annotated[str, typer.Option(help="real, a factor (4), or max (lockstep).")] = "real",
+    seed: Annotated[int, typer.Option(help="Of all chance in the run.")] = 0,
+    faults: Annotated[
+        list[str] | None, typer.Option("--inject", help='E.g. "crash primary at checkpoint.sent nth 100".')
+    ] = None,
+    brake_policy: Annotated[
+        str, typer.Option(help="Of the brake ECU on lost requests: hold, release or latch.")
+    ] = "latch",
+    record: Annotated[
+        str | None, typer.Option(help="Keep the record of the run in this new directory.")
+    ] = None,
+    replay: Annotated[str | None, typer.Option(help="A candump log to replay instead of a drive.")] = None,
+    dbc: Annotated[str | None, typer.Option(help="The DBC of the replayed log.")] = None,
+    map_file: Annotated[str | None, typer.Option("--map", help="What the log's signals mean.")] = None,
+    load: Annotated[
+        str | None, typer.Option(help="COUNT[@RATE]: synthetic requests (per second) instead of a drive.")
+    ] = None,
+    bus_port: Annotated[int, typer.Option(help="TCP port of the bus on 127.0.0.1; 0 is any free one.")] = 0,
+    pin: Annotated[bool, typer.Option(help="Keep each replica's chain on one core.")] = True,
+    json: Json = False,
+) -> None:
+    """Drive a car at an obstacle, under a fault tolerance mechanism; end with a verdict.
+
+    Exit code: 0 pass, 1 a promise was broken, 2 usage, 3 inconclusive, 130 interrupted and cleaned.
+    """
+    from aftbed.cli import running  # noqa: PLC0415
+
+    asked = running.Asked(
+        ftm=ftm,
+        scenario=scenario,
+        placement=placement,
+        pace=pace,
+        seed=seed,
+        faults=tuple(faults or ()),
+        brake_policy=brake_policy,
+        record=record,
+        replay=replay,
+        dbc=dbc,
+        map_file=map_file,
+        load=load,
+        bus_port=bus_port,
+        pin=pin,
+    )
+    raise typer.Exit(running.run(asked, as_json=json))
+
+
+@app.command()
+def check(
+    record: Annotated[Path, typer.Argument(help="The directory of --record.")],
+    json: Json = False,
+) -> None:
+    """Judge a recorded run again."""
+    from aftbed.campaign.record import read_record  # noqa: PLC0415
+    from aftbed.campaign.verdict import EXIT_CODES, judge  # noqa: PLC0415
+    from aftbed.cli.show import show_verdict  # noqa: PLC0415
+
+    verdict = judge(read_record(record))
+    show_verdict(verdict, as_json=json)
+    raise typer.Exit(EXIT_CODES[verdict.verdict])
+
+
+@app.command()
+def status(run: Run = None, json: Json = False) -> None:
+    """How a live run is."""
+    from aftbed.cli import live  # noqa: PLC0415
+
+    live.status(run, as_json=json)
+
+
+@app.command()
+def ps(run: Run = None, json: Json = False) -> None:
+    """The processes of a live run: name, role, pid, CPU, memory (PSS)."""
+    from aftbed.cli import live  # noqa: PLC0415
+
+    live.ps(run, as_json=json)
+
+
+@app.command()
+def graph(
+    ftm: Annotated[str | None, typer.Option(help="Show this FTM's graph; without it, a live run's.")] = None,
+    placement: Annotated[str, typer.Option(help="With --ftm: process or replica.")] = "process",
+    style: Annotated[str, typer.Option("--format", help="text, dot or mermaid.")] = "text",
+    run: Run = None,
+) -> None:
+    """The bricks, their channels and their nodes."""
+    from aftbed.cli import live  # noqa: PLC0415
+
+    live.graph(run, ftm, placement, style)
+
+
+@app.command()
+def stop(run: Run = None) -> None:
+    """End a live run; its command prints the verdict so far."""
+    from aftbed.cli import live  # noqa: PLC0415
+
+    live.stop(run)
+
+
+At = Annotated[str | None, typer.Option("--at", help="Event to strike at, as checkpoint.sent.")]
+Nth = Annotated[str | None, typer.Option("--nth", help="Which occurrence of the event, counted from now.")]
+After = Annotated[str | None, typer.Option("--after", help="How long from now, as 200ms.")]
+Target = Annotated[str, typer.Argument(help="primary, backup, or a node as `aftbed ps` names it.")]
+
+
+@inject.command()
+def crash(target: Target, at: At = None, nth: Nth = None, after: After = None, run: Run = None) -> None:
+    """SIGKILL the target's processes."""
+    from aftbed.cli import live  # noqa: PLC0415
+
+    live.inject(run, "crash", target, None, at, nth, after)
+
+
+@inject.command()
+def hang(
+    target: Target,
+    duration: Annotated[str | None, typer.Option("--for", help="How long, as 50ms; else for good.")] = None,
+    at: At = None,
+    nth: Nth = None,
+    after: After = None,
+    run: Run = None,
+) -> None:
+    """SIGSTOP the target's processes, and SIGCONT them after a while."""
+    from aftbed.cli import live  # noqa: PLC0415
+
+    live.inject(run, "hang", target, duration, at, nth, after)

@@ -1,0 +1,149 @@
+"""Commands for a live run, from a second terminal."""
+
+import json
+import sys
+from typing import Final
+
+from aftbed.core.errors import unknown
+from aftbed.core.fault import Act
+from aftbed.core.graph import Graph
+from aftbed.ftm.mechanism import build
+from aftbed.inject.words import build as build_fault
+from aftbed.runtime.unix import ask, rundir
+
+FORMATS: Final = ("text", "dot", "mermaid")
+CPU_SAMPLE_SECONDS: Final = 0.2
+
+
+def status(run: str | None, *, as_json: bool) -> None:
+    """Print how the run is."""
+    found = ask.ask(rundir.find(run), ask.Status())
+    if as_json:
+        print(json.dumps(found))
+        return
+    for key, value in found.items():
+        print(f"{key:10} {value}")
+
+
+def ps(run: str | None, *, as_json: bool) -> None:
+    """Print the processes of the run, the nodes first."""
+    found = ask.ask(rundir.find(run), ask.Processes())["processes"]
+    assert isinstance(found, list)
+    rows = measured(found)
+    if as_json:
+        print(json.dumps(rows))
+        return
+    print(f"{'NAME':14} {'ROLE':10} {'PID':>7} {'CPU%':>6} {'PSS MB':>7}")
+    for row in rows:
+        mark = "" if row["node"] else "  (beside)"
+        print(
+            f"{row['name']:14} {row['role']:10} {row['pid']:>7} {row['cpu_percent']:>6.1f}"
+            f" {row['pss_mb']:>7.1f}{mark}"
+        )
+    nodes_mb = [float(str(row["pss_mb"])) for row in rows if row["node"]]
+    print(f"{len(nodes_mb)} processes, {sum(nodes_mb):.1f} MB; {len(rows) - len(nodes_mb)} beside")
+
+
+def measured(rows: list[dict[str, object]]) -> list[dict[str, object]]:
+    """The rows with CPU over a short while, PSS and RSS; those that have gone meanwhile are left out."""
+    import time  # noqa: PLC0415
+
+    import psutil  # noqa: PLC0415 - 15 ms
+
+    alive = []
+    for row in rows:
+        try:
+            process = psutil.Process(int(str(row["pid"])))
+            process.cpu_percent()
+            alive.append((row, process))
+        except psutil.Error:
+            continue
+    time.sleep(CPU_SAMPLE_SECONDS)
+    found = []
+    for row, process in alive:
+        try:
+            memory = process.memory_full_info()
+            found.append(
+                row
+                | {
+                    "cpu_percent": process.cpu_percent(),
+                    "pss_mb": round(memory.pss / 1e6, 2),
+                    "rss_mb": round(memory.rss / 1e6, 2),
+                }
+            )
+        except psutil.Error:
+            continue
+    return found
+
+
+def graph(run: str | None, ftm: str | None, placement: str, style: str) -> None:
+    """Print the graph of an FTM, or of a live run."""
+    import msgspec  # noqa: PLC0415
+
+    if style not in FORMATS:
+        raise unknown("format", style, FORMATS)
+    if ftm is not None:
+        shown = build(ftm, placement)
+    else:
+        shown = msgspec.convert(ask.ask(rundir.find(run), ask.GraphNow()), Graph)
+    print({"text": _text, "dot": _dot, "mermaid": _mermaid}[style](shown))
+
+
+def _text(graph: Graph) -> str:
+    lines = [f"ftm {graph.ftm}, placement {graph.placement}: {len(graph.nodes)} nodes"]
+    for node, bricks in graph.nodes.items():
+        kinds = ", ".join(f"{b} ({graph.brick(b).kind})" for b in bricks)
+        lines.append(f"node {node}: {kinds}")
+    for link in graph.links:
+        standby = "  (standby)" if link.standby else ""
+        lines.append(f"{link.name:8} {link.source} -> {link.sink}{standby}")
+    return "\n".join(lines)
+
+
+def _dot(graph: Graph) -> str:
+    lines = ["digraph aftbed {", "  rankdir=LR; node [shape=box];"]
+    for index, (node, bricks) in enumerate(graph.nodes.items()):
+        inside = " ".join(f'"{b}";' for b in bricks)
+        lines.append(f'  subgraph cluster_{index} {{ label="{node}"; {inside} }}')
+    for link in graph.links:
+        style = ", style=dashed" if link.standby else ""
+        lines.append(f'  "{link.source}" -> "{link.sink}" [label="{link.name}"{style}];')
+    return "\n".join([*lines, "}"])
+
+
+def _mermaid(graph: Graph) -> str:
+    def name(brick: str) -> str:
+        return brick.replace("/", "_")
+
+    lines = ["flowchart LR"]
+    for node, bricks in graph.nodes.items():
+        lines.append(f"  subgraph node_{name(node)}[{node}]")
+        lines += [f"    {name(b)}[{b}]" for b in bricks]
+        lines.append("  end")
+    for link in graph.links:
+        arrow = "-.->" if link.standby else "-->"
+        lines.append(f"  {name(link.source)} {arrow}|{link.name}| {name(link.sink)}")
+    return "\n".join(lines)
+
+
+def stop(run: str | None) -> None:
+    """End the run."""
+    private = rundir.find(run)
+    ask.ask(private, ask.Stop())
+    print(f"run {private.name}: stopping")
+
+
+def inject(
+    run: str | None,
+    act: str,
+    target: str,
+    duration: str | None,
+    event: str | None,
+    nth: str | None,
+    after: str | None,
+) -> None:
+    """Arm a fault in the run, or strike at once."""
+    fault = build_fault(Act(act), target, duration, event, nth, after)
+    private = rundir.find(run)
+    ask.ask(private, ask.Inject(fault))
+    print(f"run {private.name}: {fault}", file=sys.stderr)

@@ -1,0 +1,180 @@
+"""`aftbed run`: checks everything the user asked for, starts the run, shows it, judges it."""
+
+import json
+import os
+import signal
+import sys
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from aftbed.campaign.record import read_record
+from aftbed.campaign.verdict import EXIT_CODES, EXIT_INTERRUPTED, judge
+from aftbed.cli.show import show_verdict
+from aftbed.cli.view import View, open_view
+from aftbed.core.errors import ConfigError, unknown
+from aftbed.core.fault import Fault
+from aftbed.core.graph import Graph
+from aftbed.ftm.mechanism import build
+from aftbed.inject.words import parse
+from aftbed.runtime import targets
+from aftbed.runtime.unix.launch import Launched, launch, options_for
+from aftbed.runtime.unix.options import CarRun, LoadRun, ReplayRun, Work
+
+POLICIES: Final = ("hold", "release", "latch")
+PACE_MIN, PACE_MAX = 0.01, 100.0
+LOAD_MAX: Final = 10_000_000
+RATE_HZ_MAX: Final = 100_000.0
+
+
+class Asked(msgspec.Struct, frozen=True):
+    """The options of `aftbed run` as they were typed."""
+
+    ftm: str
+    scenario: str
+    placement: str
+    pace: str
+    seed: int
+    faults: tuple[str, ...]
+    brake_policy: str
+    record: str | None
+    replay: str | None
+    dbc: str | None
+    map_file: str | None
+    load: str | None
+    bus_port: int
+    pin: bool
+
+
+def run(asked: Asked, *, as_json: bool) -> int:
+    """Run, show, judge; the exit code."""
+    graph = build(asked.ftm, asked.placement)
+    faults = tuple(_fault(text, graph) for text in asked.faults)
+    work = _work(asked)
+    if not 0 <= asked.bus_port <= 65535:
+        raise ConfigError(f"--bus-port {asked.bus_port}: 0 to 65535 are allowed")
+    options, listener = options_for(
+        ftm=asked.ftm,
+        placement=asked.placement,
+        work=work,
+        seed=asked.seed,
+        record=asked.record,
+        faults=faults,
+        pin=asked.pin,
+        bus_port=asked.bus_port,
+    )
+    launched = launch(options, listener)
+    view = open_view(options, quiet=as_json)
+    interrupted = _follow(launched, view)
+    launched.wait()
+    try:
+        verdict = judge(read_record(launched.record))
+        show_verdict(verdict, as_json=as_json)
+        if verdict.verdict == "inconclusive" and not as_json:
+            _show_log(launched.record / "processes.log")
+    finally:
+        launched.remove()
+    return EXIT_INTERRUPTED if interrupted else EXIT_CODES[verdict.verdict]
+
+
+def _fault(text: str, graph: Graph) -> Fault:
+    fault = parse(text)
+    targets.check(fault, graph)
+    return fault
+
+
+def _follow(launched: Launched, view: View) -> bool:
+    """Show what is reported until the end; True if the user broke it off. A second Ctrl-C kills."""
+    interrupted = False
+
+    def interrupt(signum: int, frame: object) -> None:
+        nonlocal interrupted
+        if interrupted:
+            os.kill(launched.supervisor, signal.SIGKILL)
+        interrupted = True
+        launched.stop()
+
+    before = {s: signal.signal(s, interrupt) for s in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        with view:
+            for report in launched.reports():
+                if report.kind == "telemetry":
+                    view.telemetry(report.data)
+                elif report.kind == "event":
+                    view.event(json.loads(report.data))
+    finally:
+        for sig, handler in before.items():
+            signal.signal(sig, handler)
+    return interrupted
+
+
+def _work(asked: Asked) -> Work:
+    given = [n for n, v in (("--replay", asked.replay), ("--load", asked.load)) if v is not None]
+    if len(given) > 1:
+        raise ConfigError("--replay and --load: one of them is allowed")
+    if asked.load is not None:
+        return _load(asked.load)
+    pace = _pace(asked.pace)
+    if asked.replay is not None:
+        return _replay(asked, pace)
+    if asked.dbc is not None or asked.map_file is not None:
+        raise ConfigError("--dbc and --map say what a replayed log means: give --replay LOG too")
+    from aftbed.vehicle.scenario import load_scenario  # noqa: PLC0415 - PyYAML costs 15 ms
+
+    load_scenario(asked.scenario)
+    if asked.brake_policy not in POLICIES:
+        raise unknown("brake policy", asked.brake_policy, POLICIES)
+    scenario = asked.scenario
+    if scenario.endswith((".yaml", ".yml")):
+        scenario = str(Path(scenario).resolve())
+    return CarRun(scenario, pace, asked.brake_policy)
+
+
+def _replay(asked: Asked, pace: float | None) -> ReplayRun:
+    if asked.dbc is None or asked.map_file is None:
+        raise ConfigError("--replay LOG needs --dbc FILE and --map FILE, which say what its frames mean")
+    from aftbed.vehicle.candump import read_log  # noqa: PLC0415
+    from aftbed.vehicle.dbcfile import load_dbc  # noqa: PLC0415
+    from aftbed.vehicle.mapfile import bind, find_map  # noqa: PLC0415
+
+    assert asked.replay is not None
+    bind(find_map(asked.map_file), load_dbc(Path(asked.dbc)))
+    read_log(Path(asked.replay))
+    map_path = find_map(asked.map_file)
+    return ReplayRun(str(Path(asked.replay).resolve()), str(Path(asked.dbc).resolve()), str(map_path), pace)
+
+
+def _pace(text: str) -> float | None:
+    if text == "max":
+        return None
+    if text == "real":
+        return 1.0
+    try:
+        pace = float(text)
+    except ValueError:
+        pace = 0.0
+    if not PACE_MIN <= pace <= PACE_MAX:
+        raise ConfigError(f"--pace {text}: real, max, or a factor from {PACE_MIN} to {PACE_MAX} is allowed")
+    return pace
+
+
+def _load(text: str) -> LoadRun:
+    count, _, rate = text.partition("@")
+    try:
+        load = LoadRun(int(count), float(rate or 0))
+    except ValueError:
+        load = LoadRun(0, 0.0)
+    if not (1 <= load.count <= LOAD_MAX and 0 <= load.rate_hz <= RATE_HZ_MAX):
+        raise ConfigError(
+            f"--load {text}: COUNT or COUNT@RATE is allowed, 1 to {LOAD_MAX} requests,"
+            f" up to {RATE_HZ_MAX:.0f} a second (without a rate: each follows the reply before)"
+        )
+    return load
+
+
+def _show_log(log: Path) -> None:
+    """What the processes printed: the first place to look when the harness is in trouble."""
+    text = log.read_text(errors="replace").strip() if log.exists() else ""
+    if text:
+        print("what the processes printed:\n" + text[-4000:], file=sys.stderr)

@@ -1,0 +1,216 @@
+"""The checkers: what was promised (G1 to G6), judged over the history that a run left behind.
+
+A history is the records of all nodes and the client's dialogue; where it comes from, real processes or
+the simulator, makes no difference. Each checker answers pass, fail or unknown, with its reasons; each
+has a broken history in the tests that it must refuse.
+"""
+
+from collections import defaultdict
+from collections.abc import Iterable
+from typing import Final, Literal
+
+import msgspec
+
+from aftbed.core.application import Application
+from aftbed.core.errors import PeerError
+from aftbed.core.event import Event
+from aftbed.core.journal import Entry, EntryKind, Record
+
+REASONS_MAX: Final = 5
+LATE_NS: Final = 60_000_000  # as long as the brake ECU holds the last request
+
+Finding = Literal["pass", "fail", "unknown"]
+
+
+class History(msgspec.Struct, frozen=True):
+    """`journals` maps the name of each journal to its records, in their order."""
+
+    journals: dict[str, list[Record]]
+    dialogue: list[Entry]
+
+    def events(self, *wanted: Event) -> list[Record]:
+        """The records of these events, of all nodes, by time."""
+        found = [r for records in self.journals.values() for r in records if r.event in wanted]
+        return sorted(found, key=lambda record: record.t_ns)
+
+
+class Check(msgspec.Struct, frozen=True):
+    """The answer of one checker; `reasons` are the first few of what is wrong."""
+
+    finding: Finding
+    reasons: tuple[str, ...] = ()
+
+
+class Requests(msgspec.Struct, frozen=True):
+    """The client's account. `late`: answered after `LATE_NS`; `wrong`: not what the bare server says."""
+
+    sent: int
+    answered: int
+    lost: int
+    duplicated: int
+    late: int
+    wrong: int
+
+
+class Failover(msgspec.Struct, frozen=True):
+    """One change of master. Times count from the fault if that is in the history, else from the alarm.
+
+    `blackout_ms` is the time without service: from when a request waited and nobody could answer it,
+    to the first reply of the new master.
+    """
+
+    epoch: int
+    cause: str
+    detected_ms: float | None
+    fenced_ms: float
+    promoted_ms: float | None
+    recovered_ms: float | None
+    blackout_ms: float | None
+
+
+def _check(reasons: list[str]) -> Check:
+    return Check("fail" if reasons else "pass", tuple(reasons[:REASONS_MAX]))
+
+
+def at_most_once(history: History) -> Check:
+    """G1: within the life of one Server ids only grow, over executions and applied checkpoints alike."""
+    reasons = []
+    for name, records in history.journals.items():
+        last = 0
+        for record in records:
+            if record.event not in (Event.SERVER_EXIT, Event.STATE_RESTORED):
+                continue
+            if record.request_id <= last:
+                reasons.append(f"{name}: request {record.request_id} ({record.event}) after {last}")
+            last = record.request_id
+    return _check(reasons)
+
+
+def exactly_one_answer(history: History) -> Check:
+    """G2: each request sent has one reply."""
+    answers = _answers(history)
+    reasons = [f"request {i}: {len(a)} replies" for i, a in sorted(answers.items()) if len(a) != 1]
+    strays = [r.request_id for r in _client_refusals(history) if r.request_id]
+    reasons += [f"request {i}: one reply too many reached the client" for i in strays]
+    return _check(reasons) if answers else Check("unknown", ("no request was sent",))
+
+
+def one_history(history: History, bare: Application) -> Check:
+    """G3: the replies are those of the bare server over the same requests in the order of ids."""
+    reasons = [f"request {i}: the reply is not the bare server's" for i in wrong_replies(history, bare)]
+    sent = [e.request_id for e in _sent(history)]
+    if sent != list(range(1, len(sent) + 1)):
+        reasons.append("the ids of the requests are not 1, 2, 3, ...")
+    return _check(reasons) if sent else Check("unknown", ("no request was sent",))
+
+
+def one_master(history: History) -> Check:
+    """G6: epochs only grow, each is one replica's, and the last master is fenced before the next."""
+    reasons: list[str] = []
+    masters: dict[int, int] = {}
+    fences = history.events(Event.REPLICA_FENCED)
+    epoch, accepted_ns = 0, 0
+    for record in history.events(Event.REPLY_ACCEPTED):
+        found, replica = record.detail >> 8, record.detail & 0xFF
+        if found < epoch:
+            reasons.append(f"a reply of epoch {found} accepted after one of epoch {epoch}")
+        if masters.setdefault(found, replica) != replica:
+            reasons.append(f"epoch {found}: replies of replicas {masters[found]} and {replica}")
+        if epoch and found > epoch:
+            old = masters[epoch]
+            if not any(f.detail & 0xFF == old and accepted_ns <= f.t_ns <= record.t_ns for f in fences):
+                reasons.append(f"replica {old} was not fenced between epochs {epoch} and {found}")
+        epoch, accepted_ns = max(epoch, found), record.t_ns
+    return _check(reasons) if masters else Check("unknown", ("no reply was accepted",))
+
+
+def wrong_replies(history: History, bare: Application) -> list[int]:
+    """The ids whose reply differs from the bare server's; `bare` is a fresh one."""
+    answers = _answers(history)
+    wrong = []
+    for entry in _sent(history):
+        try:
+            expected = bare.execute(entry.payload)
+        except PeerError:
+            expected = b""
+        if any(a.payload != expected for a in answers[entry.request_id]):
+            wrong.append(entry.request_id)
+    return wrong
+
+
+def requests(history: History, bare: Application) -> Requests:
+    """The client's account of its requests."""
+    answers = _answers(history)
+    sent_ns = {e.request_id: e.t_ns for e in _sent(history)}
+    firsts = {i: min(a.t_ns for a in found) for i, found in answers.items() if found}
+    refused = sum(bool(r.request_id) for r in _client_refusals(history))
+    return Requests(
+        sent=len(sent_ns),
+        answered=len(firsts),
+        lost=len(sent_ns) - len(firsts),
+        duplicated=sum(len(a) > 1 for a in answers.values()) + refused,
+        late=sum(t_ns - sent_ns[i] > LATE_NS for i, t_ns in firsts.items() if i in sent_ns),
+        wrong=len(wrong_replies(history, bare)),
+    )
+
+
+def failovers(history: History) -> list[Failover]:
+    """Each change of master, in order."""
+    accepted = history.events(Event.REPLY_ACCEPTED)
+    firsts: dict[int, int] = {}
+    lasts: dict[int, int] = {}
+    for record in accepted:
+        firsts.setdefault(record.detail >> 8, record.t_ns)
+        lasts[record.detail >> 8] = record.t_ns
+    promotions = history.events(Event.REPLICA_PROMOTED)
+    return [_failover(history, p, firsts, lasts) for p in promotions]
+
+
+def _failover(history: History, promoted: Record, firsts: dict[int, int], lasts: dict[int, int]) -> Failover:
+    fence = _last_before(history.events(Event.REPLICA_FENCED), promoted.t_ns)
+    assert fence is not None, "promoted, and nobody was fenced"
+    alarm = _last_before(history.events(Event.WATCHDOG_SUSPECT), fence.t_ns)
+    epoch = promoted.detail
+    before_ns = max((t for e, t in lasts.items() if e < epoch), default=0)
+    faults = [f for f in history.events(Event.FAULT_APPLIED) if f.t_ns <= (alarm or fence).t_ns]
+    fault = faults[-1] if faults and (alarm or fence).t_ns - faults[-1].t_ns < 10**9 else None
+    start_ns = fault.t_ns if fault else (alarm or fence).t_ns
+    reply_ns = firsts.get(epoch)
+    sent_ns = {e.request_id: e.t_ns for e in _sent(history)}
+    first_id = next((r.request_id for r in history.events(Event.REPLY_ACCEPTED) if r.detail >> 8 == epoch), 0)
+    waiting_ns = max(start_ns, sent_ns.get(first_id, start_ns))
+
+    def ms(t_ns: int | None) -> float | None:
+        return None if t_ns is None else round((t_ns - start_ns) / 1e6, 3)
+
+    return Failover(
+        epoch=epoch,
+        cause="fault" if fault else ("alarm" if alarm else "unknown"),
+        detected_ms=ms(alarm.t_ns) if alarm and fault else None,
+        fenced_ms=ms(fence.t_ns) or 0.0,
+        promoted_ms=ms(promoted.t_ns),
+        recovered_ms=ms(reply_ns),
+        blackout_ms=None if reply_ns is None else round((reply_ns - max(waiting_ns, before_ns)) / 1e6, 3),
+    )
+
+
+def _last_before(records: Iterable[Record], t_ns: int) -> Record | None:
+    return max((r for r in records if r.t_ns <= t_ns), key=lambda r: r.t_ns, default=None)
+
+
+def _sent(history: History) -> list[Entry]:
+    return [e for e in history.dialogue if e.kind is EntryKind.SENT]
+
+
+def _answers(history: History) -> dict[int, list[Entry]]:
+    found: dict[int, list[Entry]] = defaultdict(list)
+    for entry in history.dialogue:
+        if entry.kind is EntryKind.SENT:
+            found[entry.request_id] = found[entry.request_id]
+        elif entry.kind is EntryKind.ANSWERED:
+            found[entry.request_id].append(entry)
+    return found
+
+
+def _client_refusals(history: History) -> list[Record]:
+    return [r for r in history.events(Event.PEER_REFUSED) if r.node == "client"]

@@ -1,0 +1,132 @@
+"""Replay onto a real bus: the log's own times, an answer for each cycle, honest counts."""
+
+import time
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from busharness import TestGateway, running_hub
+
+from aftbed.vehicle import bus as bus_module
+from aftbed.vehicle.bus import open_bus
+from aftbed.vehicle.candump import LogFrame, read_log
+from aftbed.vehicle.dbcfile import Codec, load_dbc
+from aftbed.vehicle.frame import Frame
+from aftbed.vehicle.hub import HubOptions
+from aftbed.vehicle.player import PlayReport, play
+
+CYCLE_END_ID = 0x22F
+START_US = 1_533_198_917_000_181
+
+
+@pytest.fixture(scope="module")
+def codec() -> Codec:
+    return load_dbc()
+
+
+def never() -> bool:
+    return False
+
+
+def log_of(cycles: int, cycle_us: int = 50_000) -> list[LogFrame]:
+    """Radar on can1, three frames in a batch, and the speed on can0 between two batches."""
+    entries = []
+    for n in range(cycles):
+        t_us, data = START_US + n * cycle_us, n.to_bytes(2, "big")
+        entries += [LogFrame("can1", Frame(t_us, can_id, data)) for can_id in (0x210, 0x211, CYCLE_END_ID)]
+        entries.append(LogFrame("can0", Frame(t_us + cycle_us // 2, 0x0B4, data)))
+    return entries
+
+
+class Stop:
+    """Says stop after `count` questions."""
+
+    def __init__(self, count: int) -> None:
+        self.count = count
+
+    def __call__(self) -> bool:
+        self.count -= 1
+        return self.count < 0
+
+
+def run(
+    log: Path,
+    codec: Codec,
+    entries: list[LogFrame],
+    pace: float | None,
+    answers: list[tuple[int, float] | None],
+    stop: Stop | None = None,
+) -> PlayReport:
+    """Play `entries` to a gateway that gives `answers` in turn, the last one for good."""
+    with running_hub(log, HubOptions(lockstep=pace is None, pace=pace or 1.0)) as hub:
+        given = iter(answers)
+        last = answers[-1]
+        with TestGateway(hub.options, codec, lambda _: next(given, last), track_id=CYCLE_END_ID):
+            bus = open_bus(hub.options)
+            try:
+                return play(
+                    entries,
+                    codec,
+                    bus,
+                    pace,
+                    ends_cycle=lambda frame: frame.can_id == CYCLE_END_ID,
+                    stop=stop or never,
+                )
+            finally:
+                bus.close()
+
+
+def test_lockstep_follows_the_stamps_and_waits_for_each_answer(tmp_path: Path, codec: Codec) -> None:
+    logs = [tmp_path / "1.log", tmp_path / "2.log"]
+    entries = log_of(40)
+    for log in logs:
+        report = run(log, codec, entries, None, [(0, 0.0)])
+        assert report == PlayReport(sent=160, cycles=40, answers=40, complete=True)
+        assert not report.braked
+    assert logs[0].read_bytes() == logs[1].read_bytes()
+    played = [entry.frame for entry in read_log(logs[0])[0]]
+    relayed = [frame for frame in played if frame.can_id not in (0x100, 0x701)]
+    assert relayed == [
+        Frame(entry.frame.t_us - START_US, entry.frame.can_id, entry.frame.data) for entry in entries
+    ]
+    for before, frame in pairwise(played):
+        if frame.can_id == 0x100:  # at the time of the frame that it answers
+            assert before.t_us == frame.t_us
+            assert before.can_id in (CYCLE_END_ID, 0x701)
+
+
+@pytest.mark.parametrize(
+    ("answer", "stage_max", "braked"),
+    [((1, 0.0), 1, False), ((2, 4.0), 2, True), ((3, 9.0), 3, True), ((1, 0.5), 1, True)],
+)
+def test_braking_is_noticed(
+    answer: tuple[int, float], stage_max: int, braked: bool, tmp_path: Path, codec: Codec
+) -> None:
+    report = run(tmp_path / "bus.log", codec, log_of(5), None, [(0, 0.0), answer, (0, 0.0)])
+    assert (report.stage_max, report.braked) == (stage_max, braked)
+    assert report.deceleration_ms2_max == pytest.approx(answer[1])
+
+
+def test_missing_answers_are_counted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, codec: Codec) -> None:
+    monkeypatch.setattr(bus_module, "FIRST_ANSWER_S_MAX", 0.2)
+    report = run(tmp_path / "bus.log", codec, log_of(10), None, [(0, 0.0), (0, 0.0), None])
+    assert (report.cycles, report.answers, report.missing_answers, report.sent) == (10, 2, 8, 40)
+
+
+def test_paced_play_keeps_the_times_of_the_log(tmp_path: Path, codec: Codec) -> None:
+    entries = log_of(20)  # 0.975 s
+    before_s = time.monotonic()
+    report = run(tmp_path / "bus.log", codec, entries, 5.0, [(0, 0.0)])
+    assert time.monotonic() - before_s >= 0.975 / 5
+    assert (report.sent, report.answers, report.complete) == (80, 20, True)
+
+
+@pytest.mark.parametrize("pace", [None, 1.0])
+def test_play_can_be_stopped(pace: float | None, tmp_path: Path, codec: Codec) -> None:
+    report = run(tmp_path / "bus.log", codec, log_of(10), pace, [(0, 0.0)], stop=Stop(3))
+    assert not report.complete
+    assert report.sent < 40
+
+
+def test_an_empty_log_is_played(tmp_path: Path, codec: Codec) -> None:
+    assert run(tmp_path / "bus.log", codec, [], None, [(0, 0.0)]) == PlayReport(complete=True)
