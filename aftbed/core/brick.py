@@ -9,6 +9,7 @@ only: mail for the others waits in its channel, where it outlives this node. So 
 time" is not a queue in a brick, it is a closed port.
 """
 
+from enum import Enum
 from typing import Final, Protocol
 
 import msgspec
@@ -20,6 +21,12 @@ from aftbed.core.script import Script
 
 CONTROL: Final = "control"  # the port on which the runtime speaks to a brick
 NO_REQUEST: Final = 0
+
+
+class BrickState(Enum):
+    """Base of the states of bricks: hashed by identity, since tables of moves are looked up on every hop."""
+
+    __hash__ = object.__hash__
 
 
 class Send(msgspec.Struct, frozen=True, gc=False):

@@ -8,10 +8,10 @@ A backup applies one checkpoint at a time: the next waits in the channel, which 
 Told to take over, it drains that channel to its end, and only then lets its Protocol lead.
 """
 
-from enum import Enum, auto
+from enum import auto
 from typing import Final
 
-from aftbed.core.brick import Brick, Effect, Note, Send
+from aftbed.core.brick import Brick, BrickState, Effect, Note, Send
 from aftbed.core.errors import PeerError
 from aftbed.core.event import Event
 from aftbed.core.message import (
@@ -30,7 +30,7 @@ from aftbed.core.message import (
 )
 
 
-class State(Enum):
+class State(BrickState):
     IDLE = auto()  # leading, no request in progress
     CAPTURING = auto()  # leading, reply held, waiting for the Server's state
     STANDBY = auto()  # backup, waiting for a checkpoint

@@ -1,15 +1,15 @@
 """Proceed brick: has the Server compute, and hands the result to After (paper, III-A)."""
 
-from enum import Enum, auto
+from enum import auto
 from typing import Final
 
-from aftbed.core.brick import Brick, Effect, Note, Send
+from aftbed.core.brick import Brick, BrickState, Effect, Note, Send
 from aftbed.core.errors import PeerError
 from aftbed.core.event import Event
 from aftbed.core.message import AnyMessage, Reply, Request
 
 
-class State(Enum):
+class State(BrickState):
     IDLE = auto()  # no request in progress
     COMPUTING = auto()  # the Server has it
 

@@ -6,12 +6,12 @@ the reply in the log. On the backup's side the log is filled by checkpoints; Tak
 the same channel behind the last of them, makes it the leader.
 """
 
-from enum import Enum, auto
+from enum import auto
 from typing import Final
 
 import msgspec
 
-from aftbed.core.brick import CONTROL, Brick, Effect, Note, Send
+from aftbed.core.brick import CONTROL, Brick, BrickState, Effect, Note, Send
 from aftbed.core.errors import PeerError
 from aftbed.core.event import Event
 from aftbed.core.message import AnyMessage, Promoted, Rebound, Reply, Request, StoreReply, TakeOver
@@ -19,7 +19,7 @@ from aftbed.core.message import AnyMessage, Promoted, Rebound, Reply, Request, S
 REPLIES_KEPT: Final = 256  # at least the client's backlog: what can be asked again can be answered again
 
 
-class State(Enum):
+class State(BrickState):
     BACKUP = auto()  # the log is filled by checkpoints; requests wait in their channel
     IDLE = auto()  # leading, no request inside
     BUSY = auto()  # leading, one request admitted

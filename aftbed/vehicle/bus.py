@@ -29,6 +29,7 @@ import socket
 import time
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from typing import TYPE_CHECKING, Final, Literal
 
 import msgspec
@@ -44,6 +45,7 @@ ATTACH_S_MAX: Final = 5.0
 HUB_ANSWER_S_MAX: Final = 3.0
 FIRST_ANSWER_S_MAX: Final = 3.0  # a failover takes a millisecond, a paused laptop seconds
 NEXT_ANSWER_S_MAX: Final = 0.005  # of a function that has just missed one
+GOODBYE_S_MAX: Final = 0.5
 STOP_CHECK_S: Final = 0.05
 OUTSTANDING_MAX: Final = 16
 _SOCKET_NAME: Final = "_SocketCanDaemonBus__socket"
@@ -117,7 +119,9 @@ class Bus:
         self._socket.sendall(f"< aftbed time {t_us} >".encode("ascii"))
 
     def close(self) -> None:
-        """Leave the bus."""
+        """Leave the bus, once the hub has taken all that was sent."""
+        if self._socket is not None:
+            _say_goodbye(self._socket)
         self._bus.shutdown()
 
     def _fill(self) -> None:
@@ -156,6 +160,17 @@ class Bus:
         else:
             t_us = round(message.timestamp * 1e6)
             self._ready.append(Frame(t_us, message.arbitration_id, bytes(message.data)))
+
+
+def _say_goodbye(sock: socket.socket) -> None:
+    """End our direction and read to the end of the other: to close on unread data is a reset, and
+    would take what the hub has not read yet with it."""
+    end_s = time.monotonic() + GOODBYE_S_MAX
+    with suppress(OSError):  # gone already, or too slow to be waited for
+        sock.shutdown(socket.SHUT_WR)
+        sock.settimeout(GOODBYE_S_MAX)
+        while time.monotonic() < end_s and sock.recv(65536):
+            pass
 
 
 def open_bus(options: BusOptions) -> Bus:

@@ -24,18 +24,18 @@ its transmission ends; without one it takes none.
 virtual time that one client, the first that asks for it, sets by `aftbed time`; it never runs
 backwards.
 
-*Order of work.* One thread, no blocking call but the wait for events: relay first, because latency
-is what the bus is measured by, then one `write` to the log before the next frame is taken. So after
-a `kill -9` the log is complete up to the last frame but one, and torn nowhere else than there.
+*Order of work.* One thread that blocks only to wait for events: relay first, because latency is what
+the bus is measured by, then one `write` to the log before the next frame is taken. So a `kill -9`
+costs the log no more than the frame under way.
 
 *Limits.* Nothing that a client does may stop the bus. One who does not read is disconnected when
 256 KiB wait for it; one who sends more than the wire carries is not read until its queue is short.
 
 Limit, said openly: python-can demands that a read gives `< ok >` and nothing behind it, while the
-first frame may follow at once. Between the two the hub sends one byte as TCP urgent data: a reader
-stops in front of the urgent mark, whatever has been queued behind it, and the byte itself is taken
-out of the stream by the receiving kernel. RFC 6093 advises against urgent data because middleboxes
-spoil it; the loopback has none. Through a proxy the mark is lost, and the byte is a newline.
+first frame may follow at once. So the hub sends one byte of TCP urgent data between the two: a reader
+stops in front of the urgent mark, whatever is queued behind it, and the receiving kernel takes the
+byte itself out of the stream. RFC 6093 advises against urgent data because middleboxes spoil it; the
+loopback has none. Through a proxy the mark is lost, and the byte is a newline.
 """
 
 import re
@@ -58,7 +58,7 @@ READ_BYTES_MAX: Final = 4096
 ELEMENT_BYTES_MAX: Final = 128  # the longest legal one has 46
 LAST_FRAMES_S_MAX: Final = 0.1
 OUTPUT_BYTES_MAX: Final = 256 * 1024
-FRAMES_QUEUED_MAX: Final = 256
+FRAMES_QUEUED_MAX: Final = 256  # of one client
 LOG_BYTES_MAX: Final = 1024 * 1024 * 1024
 
 _SEND: Final = re.compile(rb"< send ([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8}) ([0-9]) ((?:[0-9A-Fa-f]{1,2} ){0,8}) ?")
@@ -218,7 +218,7 @@ class Hub:
                 self._deliver(frame, sender)
             if not self._senders:
                 return
-            winner = min(self._senders, key=_first_identifier)
+            winner = min(self._senders, key=lambda client: client.frames[0].can_id)
             self._wire = (winner, self._transmitted(winner.frames.popleft()))
             if not winner.frames:
                 self._senders.remove(winner)
@@ -255,7 +255,7 @@ class Hub:
     def _accept(self) -> None:
         try:
             sock, _ = self._listener.accept()
-        except OSError:  # gone again before it was accepted
+        except OSError:  # gone before it was accepted
             return
         if len(self._clients) >= CLIENTS_MAX:
             self.counts.turned_away += 1
@@ -385,14 +385,10 @@ class Hub:
         self._watch(client)
 
 
-def _first_identifier(client: _Client) -> int:
-    return client.frames[0].can_id
-
-
 def serve(listener: socket.socket, log_fd: int, options: HubOptions, life_fd: int) -> HubCounts:
-    """Run a bus on `listener`, already bound and listening, until `life_fd` reads its end.
+    """Run a bus on `listener`, bound and listening, until `life_fd` reads its end; record on `log_fd`.
 
-    Every frame is recorded on `log_fd`. Raises HarnessError, and OSError, when that fails.
+    Raises HarnessError, or OSError, when a frame cannot be recorded.
     """
     hub = Hub(listener, log_fd, options, life_fd)
     try:

@@ -86,6 +86,7 @@ def synchronised() -> Receiver:
         (protect(bytes(8), ID + 1, 5), Status.ERROR),  # masquerade: right, but another message's
         (frame(5)[:7], Status.ERROR),
         (frame(5) + b"\0", Status.ERROR),
+        (protect(bytes(7), ID, 5), Status.ERROR),  # right, but of another length
         (b"", Status.ERROR),
     ],
 )

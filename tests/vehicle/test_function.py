@@ -283,6 +283,20 @@ def test_an_obstacle_too_near_to_warn_of_is_braked_for_at_once() -> None:
     assert stages == [STAGE_NONE, STAGE_NONE, STAGE_FULL]
 
 
+def test_full_braking_waits_for_the_warning_where_there_is_time() -> None:
+    """Ego at 14 m/s, a standing car with 14 m of room: 7 m/s2 are required at once, and go on to be."""
+    function = AebFunction()
+    outputs = [
+        ask(function, 20 * n, AebTarget(0, 14.0 + 1.5 + 14.0 * 0.2, -EGO_MS, n == 0)) for n in range(3)
+    ]
+    assert outputs[-1].stage == STAGE_PARTIAL
+    for n in range(3, 100):
+        output = ask(function, 20 * n, AebTarget(0, 18.3 + 0.28, -EGO_MS))  # what the filter takes off
+        if output.stage == STAGE_FULL:
+            break
+    assert 20 * (n - 2) == 800
+
+
 def test_the_demand_belongs_to_the_stage() -> None:
     demands = {STAGE_NONE: 0.0, STAGE_WARN: 0.0, STAGE_PARTIAL: 4.0, STAGE_FULL: 9.0}
     function = AebFunction()
@@ -324,13 +338,14 @@ def test_blindness_neither_starts_nor_ends_a_braking_before_its_time(blind: str)
     assert ask(function, t_ms + BLIND_MS + 20, ego=ego, radar=radar).stage == STAGE_NONE
 
 
-@pytest.mark.parametrize("jump_ms", [-1, 501])
-def test_a_jump_in_time_starts_all_tracks_anew(jump_ms: int) -> None:
+@pytest.mark.parametrize(("jump_ms", "kept"), [(-1, False), (0, True), (500, True), (501, False)])
+def test_a_jump_in_time_starts_all_tracks_anew(jump_ms: int, kept: bool) -> None:
     function = AebFunction()
-    far = AebTarget(3, 60.0, -10.0)
     for n in range(5):
-        assert (ask(function, 1000 + 20 * n, far).slot is None) == (n < HITS_CONFIRMED - 1)
-    assert ask(function, 1080 + jump_ms, far).slot is None
+        output = ask(function, 1000 + 20 * n, AebTarget(3, 60.0 - 0.2 * n, -10.0))
+        assert (output.slot is None) == (n < HITS_CONFIRMED - 1)
+    there = AebTarget(3, 59.2 - jump_ms / 100, -10.0)
+    assert (ask(function, 1080 + jump_ms, there).slot is not None) == kept
 
 
 # -- samples

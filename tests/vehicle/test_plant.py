@@ -67,6 +67,23 @@ def test_impact_speed_while_braking_is_that_of_energy() -> None:
     assert plant.result().impact_speed_kmh == pytest.approx(expected_ms * 3.6, rel=0.03)
 
 
+def test_the_gap_changes_by_the_mean_speeds_and_contact_is_interpolated() -> None:
+    """Every step of a drive into a braking car, against the trapezoids worked out here."""
+    plant = run(Plant(PlantSetup(20.0, Lead(30.0, 15.0, LeadBraking(0, 8.0)), friction=0.3)), 1, 9.0)
+    while True:
+        gap_m, ego_ms, lead_ms = plant.gap_m, plant.speed_ms, plant.lead_speed_ms
+        assert gap_m is not None
+        plant.step(9.0)
+        if plant.collided:
+            break
+        closed_m = ((ego_ms + plant.speed_ms) - (lead_ms + plant.lead_speed_ms)) / 2 * 0.001
+        assert plant.gap_m == pytest.approx(gap_m - closed_m, abs=1e-12)
+    part = gap_m / ((ego_ms - lead_ms) * 0.001)  # of the step, before contact
+    impact_ms = ego_ms - lead_ms - part * 0.001 * (0.3 * GRAVITY_MS2 + 0.12 + 0.00027 * ego_ms**2)
+    assert lead_ms == 0.0
+    assert plant.result().impact_speed_kmh == pytest.approx(impact_ms * 3.6, abs=2e-4)
+
+
 def test_a_lead_brakes_with_its_ramp_and_stops() -> None:
     plant = Plant(PlantSetup(10.0, Lead(50.0, 12.0, LeadBraking(1000, 6.0, 500))))
     assert run(plant, 1000, 0.0).lead_speed_ms == 12.0

@@ -47,12 +47,13 @@ class Journal:
 
     def write(self, now_ns: int, event: Event, request_id: int, detail: int) -> None:
         """Append a record."""
-        if self._at > self._end:
+        at = self._at
+        if at > self._end:
             if not _grow(self.mapping):
                 return
             self._end = len(self.mapping) - layout.RECORD.size
-        self._pack(self.mapping, self._at, now_ns, request_id, detail, 0, event.code)
-        self._at += layout.RECORD.size
+        self._pack(self.mapping, at, now_ns, request_id, detail, 0, event.code)
+        self._at = at + layout.RECORD.size
 
 
 class Dialogue:

@@ -1,0 +1,58 @@
+"""Cycle time seen by the client, and the bare ring with as many hops, in turn in the same run."""
+
+import os
+from typing import Final
+
+from aftbed.bench.ring import ring_us
+from aftbed.bench.runs import cycles_us, finish, start
+from aftbed.bench.statistics import quantile, summary
+from aftbed.core.graph import Graph
+from aftbed.ftm.mechanism import build
+from aftbed.runtime.unix.options import LoadRun
+from aftbed.vehicle.function import sample_requests
+
+ROUNDS: Final = 5
+WARM_UP: Final = 200
+
+_PATH: Final = (  # of one request, by brick: what is in between is a hop where the nodes differ
+    "client", "proxy", "protocol", "before", "proceed", "server", "proceed", "after", "server",
+    "after", "protocol", "proxy", "client",
+)  # fmt: skip
+
+
+def hops(graph: Graph) -> int:
+    """How many channels between processes a request and its reply pass."""
+    parts = {b.part: graph.node_of(b.name) for b in graph.bricks if b.replica in (None, "a")}
+    path = [parts[part] for part in _PATH if part in parts]
+    if graph.ftm == "none":
+        path = [parts[part] for part in ("client", "proxy", "server", "proxy", "client")]
+    return sum(a != b for a, b in zip(path, path[1:], strict=False))
+
+
+def bench_cycle(ftm: str, placement: str, count: int, *, pin: bool = True) -> dict[str, object]:
+    """`cycle_us{p50,p95,p99,max}, ring_us{...}, hops, ratio_p50`."""
+    wanted = hops(build(ftm, placement))
+    cpus = sorted(os.sched_getaffinity(0))
+    cpu = cpus[0] if pin and len(cpus) > 1 else None
+    size = sum(map(len, sample_requests(0, 64))) // 64
+    cycles: list[float] = []
+    ring: list[float] = []
+    ratios: list[float] = []
+    for _ in range(ROUNDS):
+        share = -(-count // ROUNDS)
+        bare = ring_us(wanted, size, share, cpu)
+        record = finish(start(ftm, placement, LoadRun(share + WARM_UP, 0.0), pin=pin))
+        ours = cycles_us(record, WARM_UP)
+        ratios.append(quantile(ours, 0.5) / quantile(bare, 0.5))
+        cycles += ours
+        ring += bare
+    return {
+        "ftm": ftm,
+        "placement": placement,
+        "requests": len(cycles),
+        "cycle_us": summary(cycles),
+        "ring_us": summary(ring),
+        "hops": wanted,
+        "ratio_p50": round(quantile(ratios, 0.5), 3),
+        "ratio_rounds": [round(r, 3) for r in ratios],
+    }
