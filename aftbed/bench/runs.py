@@ -8,20 +8,22 @@ from aftbed.runtime.unix.launch import Launched, launch, options_for
 from aftbed.runtime.unix.options import LoadRun
 
 
-def start(ftm: str, placement: str, load: LoadRun, faults: tuple[Fault, ...] = (), pin: bool = True) -> Launched:
+def start(
+    ftm: str, placement: str, load: LoadRun, faults: tuple[Fault, ...] = (), pin: bool = True
+) -> Launched:
     """Start a run under `load`."""
     options, listener = options_for(ftm=ftm, placement=placement, work=load, faults=faults, pin=pin)
     return launch(options, listener)
 
 
-def finish(launched: Launched) -> RunRecord:
+def finish(launched: Launched, ends: tuple[str, ...] = ("",)) -> RunRecord:
     """Follow the run to its end; its record. Raises HarnessError where it did not end well."""
     try:
         for _ in launched.reports():
             pass
         launched.wait()
         record = read_record(launched.record)
-        if record.end is None or record.end.get("reason"):
+        if record.end is None or record.end.get("reason") not in ends:
             reason = "the supervisor died" if record.end is None else record.end.get("reason")
             raise HarnessError(f"a run of the bench ended early: {reason}")
         return record

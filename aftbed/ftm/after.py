@@ -2,7 +2,7 @@
 
 Paper, III-A: After takes the result from Proceed, captures the Server's state, and sends a checkpoint
 to the After of the backup replica; there it is applied. Without a backup (it died, the new one is not
-ready) the primary serves alone and captures nothing.
+ready) the primary serves alone, and the state that it captures goes nowhere.
 
 A backup applies one checkpoint at a time: the next waits in the channel, which outlives the primary.
 Told to take over, it drains that channel to its end, and only then lets its Protocol lead.
@@ -91,8 +91,6 @@ class PbrAfter(Brick):
         return self._take_over()
 
     def _capture(self, msg: Reply) -> list[Effect]:
-        if not self.duplex:
-            return [Send("aft2pro", msg)]
         self.state, self._reply = State.CAPTURING, msg
         return [Send("aft2srv", CaptureState(msg.epoch, msg.request_id))]
 
@@ -101,7 +99,7 @@ class PbrAfter(Brick):
         if msg.request_id != self._reply.request_id:
             raise PeerError(f"state of request {msg.request_id}, expected {self._reply.request_id}")
         reply, self.state, self._reply = self._reply, State.IDLE, None
-        if not self.duplex:  # the backup was lost while the state was captured
+        if not self.duplex:
             return [Send("aft2pro", reply)]
         # A crash between these two leaves a backup that can repeat the reply. Swapped, the client
         # could hold a reply that the backup never knew.

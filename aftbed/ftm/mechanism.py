@@ -58,7 +58,11 @@ def _bare(placement: str) -> Graph:
         Link("a/server", "srv2prd", "proxy", "pro2pxy"),
         Link("proxy", "pxy2clt", "client", "pxy2clt"),
     )
-    bricks = (BrickSpec("client", "client"), BrickSpec("proxy", "proxy"), BrickSpec("a/server", "server"))
+    bricks = (
+        BrickSpec("client", "client"),
+        BrickSpec("proxy", "proxy"),
+        BrickSpec("a/server", "bare.server"),
+    )
     nodes: dict[str, tuple[str, ...]] = {b.name: (b.name,) for b in bricks}
     return Graph("none", placement, bricks, links, nodes)
 

@@ -1,12 +1,14 @@
 """Server: the protected function behind three messages: execute, capture, restore (paper, III-A).
 
-State access is the A of FT/A/R that PBR needs. The function is a stranger: bytes in, bytes out.
+State access is the A of FT/A/R that PBR needs. The function is a stranger: bytes in, bytes out. Under
+a mechanism that captures the state after each request, a leader's Server is open for one thing at a time.
 """
 
+from enum import auto
 from typing import Final
 
 from aftbed.core.application import Application
-from aftbed.core.brick import Brick, Effect, Note, Send
+from aftbed.core.brick import Brick, BrickState, Effect, Note, Send
 from aftbed.core.errors import PeerError
 from aftbed.core.event import Event
 from aftbed.core.message import (
@@ -19,44 +21,64 @@ from aftbed.core.message import (
     StateRestored,
 )
 
-_OPEN: Final = ("prd2srv", "aft2srv")
+
+class State(BrickState):
+    STANDBY = auto()  # of a backup: states to restore, until the first request makes it a leader's
+    READY = auto()  # for a request
+    EXECUTED = auto()  # the state after it will be asked for
+
+
+OPEN: Final[dict[State, tuple[str, ...]]] = {
+    State.STANDBY: ("aft2srv", "prd2srv"),
+    State.READY: ("prd2srv",),
+    State.EXECUTED: ("aft2srv",),
+}
+_MESSAGES: Final = {
+    State.STANDBY: (Request, RestoreState),
+    State.READY: (Request,),
+    State.EXECUTED: (CaptureState,),
+}
 
 
 class Server(Brick):
-    """`replica` (1 or 2) marks whose replies these are."""
+    """`replica` (1 or 2) marks whose replies these are; `captured`: After asks for the state each time."""
 
-    def __init__(self, application: Application, replica: int) -> None:
-        self.application, self.replica = application, replica
+    def __init__(self, application: Application, replica: int, *, leads: bool, captured: bool) -> None:
+        self.application, self.replica, self.captured = application, replica, captured
+        self.state = State.READY if leads else State.STANDBY
 
     def open_ports(self) -> tuple[str, ...]:
-        """Requests and state access, at any time: each is one step."""
-        return _OPEN
+        """By state; see OPEN."""
+        return OPEN[self.state]
 
     def quiescent(self) -> bool:
-        """Between two steps nothing is inside."""
-        return True
+        """Nothing executed whose state is still to be captured."""
+        return self.state is not State.EXECUTED
 
     def step(self, port: str, msg: AnyMessage, now_ns: int) -> list[Effect]:
         """Execute, capture or restore."""
+        if not isinstance(msg, _MESSAGES[self.state]):
+            raise PeerError(f"{type(msg).__name__} on {port} while {self.state.name}")
         if isinstance(msg, Request):
             payload = self.application.execute(msg.payload)
+            self.state = State.EXECUTED if self.captured else State.READY
             return [
                 Note(Event.SERVER_ENTER, msg.request_id),
                 Note(Event.SERVER_EXIT, msg.request_id),
                 Send("srv2prd", Reply(msg.epoch, msg.request_id, self.replica, payload)),
             ]
         if isinstance(msg, CaptureState):
+            self.state = State.READY
             return [
                 Note(Event.STATE_CAPTURED, msg.request_id),
                 Send("srv2aft", StateCaptured(msg.epoch, msg.request_id, self.application.capture())),
             ]
-        if isinstance(msg, RestoreState):
-            self.application.restore(msg.state)
-            return [
-                Note(Event.STATE_RESTORED, msg.request_id),
-                Send("srv2aft", StateRestored(msg.epoch, msg.request_id)),
-            ]
-        raise PeerError(f"{type(msg).__name__} on {port}")
+        assert isinstance(msg, RestoreState)
+        self.application.restore(msg.state)
+        return [
+            Note(Event.STATE_RESTORED, msg.request_id),
+            Send("srv2aft", StateRestored(msg.epoch, msg.request_id)),
+        ]
 
     def capture(self) -> bytes:
         """The function's state."""

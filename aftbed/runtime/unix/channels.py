@@ -24,7 +24,7 @@ class Channel:
         self.link = link
         self.write, self.read = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         for end in (self.write, self.read):
-            set_timeouts(end, PULSE_SECONDS, WRITE_PATIENCE_SECONDS)
+            set_timeouts(end, 0.0, WRITE_PATIENCE_SECONDS)
 
     def fence(self) -> None:
         """No more mail through this channel."""

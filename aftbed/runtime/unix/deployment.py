@@ -70,10 +70,19 @@ class Deployment:
         self.nursery.order(process, make(token), fds)
         if process.header is not None:
             process.header.announce()
+        self._nudge(node)
+        return ("ack", node, token), node
+
+    def _nudge(self, node: str) -> None:
         for brick in self.graph.nodes[node]:
             for channel in self.channels.into(brick):
                 channel.nudge()
-        return ("ack", node, token), node
+
+    def nudge_late(self) -> None:
+        """Nudge again whoever has not looked at its control mail: it may have changed its inputs since."""
+        for node, process in self.nodes.items():
+            if process.alive and process.header is not None and process.header.announced():
+                self._nudge(node)
 
     def ask(
         self, node: str, make: Callable[[int], control.ToNode], fds: tuple[int, ...] = ()

@@ -15,6 +15,7 @@ from aftbed.core.event import Event
 
 CHUNK_BYTES: Final = 1 << 20
 FILE_BYTES_MAX: Final = 1 << 30
+STEP_BYTES_MAX: Final = 8 * layout.RECORD.size  # what the notes of one step take at most
 
 
 def _mapped(path: Path, name: str) -> mmap.mmap:
@@ -38,22 +39,25 @@ def _grow(mapping: mmap.mmap) -> bool:
 
 
 class Journal:
-    """The records of one node. `mapping` is public for the pulse and the flag of the header."""
+    """The records of one node. All is public for the host's hot path, which packs records itself.
+
+    `at` is where the next record goes; beyond `end` the file must grow before another step.
+    """
 
     def __init__(self, path: Path, node: str) -> None:
         self.mapping = _mapped(path, node)
-        self._at, self._end = layout.HEADER_BYTES, CHUNK_BYTES - layout.RECORD.size
+        self.at, self.end = layout.HEADER_BYTES, CHUNK_BYTES - STEP_BYTES_MAX
         self._pack = layout.RECORD.pack_into
 
     def write(self, now_ns: int, event: Event, request_id: int, detail: int) -> None:
         """Append a record."""
-        at = self._at
-        if at > self._end:
+        at = self.at
+        if at > self.end:
             if not _grow(self.mapping):
                 return
-            self._end = len(self.mapping) - layout.RECORD.size
+            self.end = len(self.mapping) - STEP_BYTES_MAX
         self._pack(self.mapping, at, now_ns, request_id, detail, 0, event.code)
-        self._at = at + layout.RECORD.size
+        self.at = at + layout.RECORD.size
 
 
 class Dialogue:
@@ -88,6 +92,10 @@ class Header:
         """When the node was last seen running (monotonic ns), 0 if never."""
         at = layout.PULSE_OFFSET
         return int.from_bytes(self._mapping[at : at + 8], "little")
+
+    def announced(self) -> bool:
+        """Whether the node has yet to see the flag."""
+        return self._mapping[layout.FLAG_OFFSET] != 0
 
     def announce(self) -> None:
         """Raise the flag."""

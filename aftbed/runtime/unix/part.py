@@ -45,6 +45,7 @@ def _build(line: control.Line[control.ToNode], order: control.Assign, fds: list[
         os.sched_setaffinity(0, {order.cpu})
     set_timeouts(line.sock, PULSE_SECONDS, 2.0)
     node = Node(order.node, line, Journal(Path(order.journal), order.node))
+    node.start_pulse()
     setting = Setting(order.replica, order.epoch, order.leads, default_application)
     for name, kind in order.bricks:
         node.add(name, make(kind, setting))

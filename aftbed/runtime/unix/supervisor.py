@@ -317,6 +317,7 @@ class Supervisor:
         if late:
             self._grace_until_ns = now_ns + HANG_NS
         self._last_tick_ns = now_ns
+        self.deployment.nudge_late()
         if now_ns > self._grace_until_ns and not self._ending:
             for process in self.nursery.processes:
                 if process.kind == "node" and process.header is not None and self._replaceable(process.name):

@@ -1,0 +1,71 @@
+"""From SIGKILL of the primary to the next good reply, under a closed-loop load: one request always waits.
+
+Each kill takes the whole replica (all nodes of its chain), as the crash of an ECU would. The next one
+waits until redundancy is back. Times are out of the journals, whose clock is common to all processes.
+"""
+
+import time
+from pathlib import Path
+from typing import Final
+
+from aftbed.bench.runs import finish, start
+from aftbed.bench.statistics import summary
+from aftbed.core.check import failovers
+from aftbed.core.errors import ConfigError, HarnessError
+from aftbed.core.fault import Act, Fault, Trigger
+from aftbed.runtime.unix import ask
+from aftbed.runtime.unix.options import LoadRun
+
+REQUESTS_ENDLESS: Final = 10_000_000
+REDUNDANCY_SECONDS_MAX: Final = 5.0
+POLL_SECONDS: Final = 0.005
+PAUSE_SECONDS: Final = 0.02  # of undisturbed service between two kills
+
+
+def bench_recovery(ftm: str, placement: str, kills: int, *, pin: bool = True) -> dict[str, object]:
+    """`recovery_ms{p50,p99,max}` and its parts: detection, fencing, promotion, first reply."""
+    launched = start(ftm, placement, LoadRun(REQUESTS_ENDLESS, 0.0), pin=pin)
+    try:
+        for _ in range(kills):
+            _wait_for_redundancy(launched.private)
+            ask.ask(launched.private, ask.Inject(Fault(Act.CRASH, "primary", Trigger())))
+        _wait_for_redundancy(launched.private)
+        launched.stop()
+    except BaseException:
+        launched.stop()
+        finish(launched)
+        raise
+    found = failovers(finish(launched, ends=("interrupted",)).history)
+    parts: dict[str, list[float]] = {"detection": [], "fencing": [], "promotion": [], "first_reply": []}
+    recovered = []
+    for f in found:
+        if f.detected_ms is None or f.promoted_ms is None or f.recovered_ms is None:
+            continue
+        recovered.append(f.recovered_ms)
+        parts["detection"].append(f.detected_ms)
+        parts["fencing"].append(f.fenced_ms - f.detected_ms)
+        parts["promotion"].append(f.promoted_ms - f.fenced_ms)
+        parts["first_reply"].append(f.recovered_ms - f.promoted_ms)
+    if len(recovered) < kills:
+        raise HarnessError(f"{kills} kills, but only {len(recovered)} recoveries in the journals")
+    return {
+        "ftm": ftm,
+        "placement": placement,
+        "kills": kills,
+        "recovery_ms": summary(recovered, 3),
+        "parts_ms": {name: summary(values, 3) for name, values in parts.items()},
+    }
+
+
+def _wait_for_redundancy(private: Path) -> None:
+    limit = time.monotonic() + REDUNDANCY_SECONDS_MAX
+    while time.monotonic() < limit:
+        try:
+            status = ask.ask(private, ask.Status())
+        except ConfigError:
+            status = {}  # still starting
+        if status.get("backup") and not status.get("busy"):
+            time.sleep(PAUSE_SECONDS)
+            return
+        time.sleep(POLL_SECONDS)
+    raise HarnessError(f"no redundancy within {REDUNDANCY_SECONDS_MAX} s")

@@ -1,0 +1,27 @@
+"""A tiny protected function: each reply depends on every request so far, so no slip goes unnoticed."""
+
+import zlib
+
+import msgspec
+
+from aftbed.core.errors import PeerError
+
+
+class Counting:
+    """The reply to a request is `number of requests so far : checksum of all of them, in order`."""
+
+    def __init__(self) -> None:
+        self.count, self.sum = 0, 0
+
+    def execute(self, request: bytes) -> bytes:
+        self.count, self.sum = self.count + 1, zlib.crc32(request, self.sum)
+        return b"%d:%08x" % (self.count, self.sum)
+
+    def capture(self) -> bytes:
+        return msgspec.msgpack.encode((self.count, self.sum))
+
+    def restore(self, state: bytes) -> None:
+        try:
+            self.count, self.sum = msgspec.msgpack.decode(state, type=tuple[int, int])
+        except msgspec.DecodeError as error:
+            raise PeerError(f"not a state of Counting: {error}") from error

@@ -1,0 +1,372 @@
+"""The bricks of a graph, run in memory: a queue per channel, one micro-step after the other.
+
+A micro-step is one effect of one brick, one message handed to one brick, or one stage of a script; so a crash
+can be put between any two of them, also between two effects of one step. What may happen next is a list
+of moves; `choose` picks one (the first, for a dialogue that a person reads; a random one, for the rest).
+
+What the runtime does is done too (scripts: see `executive`), in its order: a fenced channel ends after what
+was sent, a brick that writes to it dies, what is suspended takes no mail, mail for a closed port waits.
+"""
+
+from collections import deque
+from collections.abc import Callable
+from typing import Final, NamedTuple
+
+from counting import Counting
+from executive import Executive
+
+from aftbed.core import wire
+from aftbed.core.brick import CONTROL, Brick, Effect, Note, Order, Send
+from aftbed.core.check import History
+from aftbed.core.errors import PeerError
+from aftbed.core.event import Event
+from aftbed.core.graph import Link
+from aftbed.core.journal import Entry, EntryKind, Record
+from aftbed.core.message import (
+    AnyMessage,
+    ChannelEnded,
+    Message,
+    NodeDied,
+    Promoted,
+    Rebound,
+    Reply,
+    Situation,
+    Submit,
+    Suspect,
+    TakeOver,
+    Watch,
+)
+from aftbed.ftm.catalog import Setting, make
+from aftbed.ftm.client import Client
+from aftbed.ftm.mechanism import CHAIN_PARTS, REPLICAS, build
+
+STEPS_MAX: Final = 100_000
+SUPERVISOR: Final = "supervisor"
+
+
+class Channel:
+    """`mail` in its order, each with the number of its sending; `ended`: nothing more will come."""
+
+    def __init__(self, link: Link) -> None:
+        self.link = link
+        self.mail: deque[tuple[int, Message]] = deque()
+        self.ended = False
+
+
+class Host:
+    """One brick with its effects still to be performed, and its ends of channels."""
+
+    def __init__(self, name: str, brick: Brick, journal: str) -> None:
+        self.name, self.brick, self.journal = name, brick, journal
+        self.todo: deque[Effect] = deque()
+        self.inputs: dict[str, Channel] = {}
+        self.outputs: dict[str, Channel] = {}
+        self.suspended = False
+
+
+class Sent(NamedTuple):
+    """One message that was put into a channel."""
+
+    link: str
+    message: Message
+
+    def __str__(self) -> str:
+        match self.message:
+            case Suspect(node=node, cause=cause):
+                about = f"{node} {cause}"
+            case TakeOver(epoch=epoch):
+                about = f"epoch={epoch}"
+            case message:
+                about = str(message.request_id)  # type: ignore[attr-defined]
+        return f"{self.link} {type(self.message).__name__}({about})"
+
+
+Move = tuple[str, str]  # what, of which brick
+Choose = Callable[[list[Move]], Move]
+
+
+def first(moves: list[Move]) -> Move:
+    """The order of a quiet machine."""
+    return moves[0]
+
+
+class World:
+    """A deployed `pbr` graph with its client, in the state after the launch."""
+
+    def __init__(self, choose: Choose = first) -> None:
+        self.graph = build("pbr", "process")
+        self.choose = choose
+        self.hosts: dict[str, Host] = {}
+        self.channels: dict[tuple[str, str, str], Channel] = {}
+        self.leader, self.backup, self.epoch = "a", "b", 1
+        self.generation = {"a": 1, "b": 1}
+        self.vacant: list[str] = []
+        self.now_ns = 0
+        self.journals: dict[str, list[Record]] = {}
+        self.dialogue: list[Entry] = []
+        self.replies: list[Reply] = []
+        self.saying: Callable[[str], None] = lambda what: None  # told of all that happens
+        self.promoted: set[tuple[str, int]] = set()
+        self.dead: deque[str] = deque()  # nodes whose Watchdog does not know yet
+        self.executive = Executive(self)
+        self._lives: dict[str, int] = {}
+        self._steps = 0
+        self._launch()
+
+    # -- deployment ---------------------------------------------------------------------------
+
+    def _launch(self) -> None:
+        for link in self.graph.links:
+            self.renew(link)
+        for spec in self.graph.bricks:
+            self.host(spec.name, leads=spec.replica == "a")
+        for link in self.graph.links:
+            self.connect(link)
+        for replica in REPLICAS:
+            self.watch(replica)
+        self.inform(failed=False)
+        self.run()
+
+    def host(self, name: str, *, leads: bool) -> Host:
+        spec = self.graph.brick(name)
+        number = REPLICAS.index(spec.replica) + 1 if spec.replica else 0
+        self._lives[name] = life = self._lives.get(name, 0) + 1
+        brick = make(spec.kind, Setting(number, self.epoch, leads, Counting))
+        host = self.hosts[name] = Host(name, brick, f"{name}.{life}")
+        self.journals[host.journal] = []
+        return host
+
+    def renew(self, link: Link) -> Channel:
+        channel = self.channels[link.source, link.source_port, link.sink] = Channel(link)
+        return channel
+
+    def channel(self, source: str, port: str, sink: str) -> Channel:
+        return self.channels[source, port, sink]
+
+    def _is_held(self, link: Link) -> bool:
+        """Whether the Proxy's end leads to a replica that does not lead: the runtime keeps it."""
+        ends = (link.source, link.sink)
+        others = [e for e in ends if e != "proxy"]
+        return "proxy" in ends and "/" in others[0] and others[0].partition("/")[0] != self.leader
+
+    def connect(self, link: Link) -> None:
+        """Give both bricks their ends, the reading one first; the writer is told."""
+        channel = self.channel(link.source, link.source_port, link.sink)
+        if link.sink in self.hosts and not (self._is_held(link) and link.sink == "proxy"):
+            self.bind_input(channel)
+        if link.source in self.hosts and not (self._is_held(link) and link.source == "proxy"):
+            self.bind_output(channel, link.source, link.source_port)
+
+    def bind_input(self, channel: Channel) -> None:
+        host = self.between_steps(channel.link.sink)
+        if host is not None:
+            host.inputs[channel.link.sink_port] = channel
+
+    def bind_output(self, channel: Channel | None, name: str, port: str) -> None:
+        """Bind or unbind, and say so to the brick."""
+        host = self.between_steps(name)
+        if host is None:
+            return
+        if channel is None:
+            host.outputs.pop(port, None)
+        else:
+            host.outputs[port] = channel
+        self.tell(name, Rebound(port, channel is not None, self.epoch))
+
+    def between_steps(self, name: str) -> Host | None:
+        """`name` with its effects performed: control mail is served between two steps. None if it is gone."""
+        while name in self.hosts and self.hosts[name].todo:
+            self._perform(self.hosts[name])
+        return self.hosts.get(name)
+
+    def chain(self, replica: str) -> list[str]:
+        """The bricks of `replica` that are there."""
+        return [n for p in CHAIN_PARTS if (n := f"{replica}/{p}") in self.hosts]
+
+    def watch(self, replica: str) -> None:
+        watchdog = f"{replica}/watchdog"
+        if watchdog in self.hosts:
+            nodes = tuple(f"{replica}/{part}" for part in CHAIN_PARTS)
+            self.tell(watchdog, Watch(replica, self.generation[replica], nodes))
+            of_others = [node for node in self.dead if node not in nodes]
+            gone = [] if replica in self.vacant else [node for node in nodes if node not in self.hosts]
+            self.dead = deque(of_others + gone)
+
+    def inform(self, *, failed: bool) -> None:
+        if "recovery" in self.hosts:
+            leads = self.generation.get(self.leader, 0)
+            backs = self.generation.get(self.backup, 0)
+            vacant = tuple(self.vacant)
+            situation = Situation(self.leader, leads, self.backup, backs, self.epoch, vacant, failed)
+            self.tell("recovery", situation)
+
+    # -- what happens to it -------------------------------------------------------------------
+
+    def submit(self, payload: bytes) -> None:
+        """The source of requests hands one in; it is there whether or not the Client takes it now."""
+        client = self.hosts["client"].brick
+        assert isinstance(client, Client) and "submit" in client.open_ports()
+        self._write_down(client.next_id, 0, EntryKind.SENT, payload)
+        self.tell("client", Submit(payload), "submit")
+
+    def crash(self, target: str) -> None:
+        """A brick, or a whole replica, is gone, with what it had still to do."""
+        for name in self.chain(target) if target in REPLICAS else [target]:
+            if name in self.hosts:
+                del self.hosts[name]
+                self.dead.append(name)
+
+    def accuse(self, node: str) -> None:
+        """The Watchdog believes that `node` is dead; it lives, and goes on."""
+        self.dead.append(node)
+
+    def replace(self, name: str) -> None:
+        """A brick of no replica is dead, and another is in its place: fresh channels, no memory."""
+        self.hosts.pop(name, None)
+        links = [c.link for c in self.channels.values() if name in (c.link.source, c.link.sink)]
+        links = [link for link in links if not self._is_held(link)]
+        links.sort(key=lambda link: link.source == "client")  # it asks again: the way back stands
+        for link in links:
+            self.renew(link)
+        self.host(name, leads=False)
+        for link in links:
+            self.connect(link)
+        if name.endswith("/watchdog"):
+            self.watch(name.partition("/")[0])
+        if name == "recovery" and not self.executive.busy:
+            self.inform(failed=False)
+
+    def tell(self, name: str, message: AnyMessage, port: str = CONTROL) -> None:
+        """Have `name` step; its effects are performed later, one by one."""
+        host = self.between_steps(name)
+        if host is None:
+            return
+        try:
+            host.todo.extend(host.brick.step(port, message, self.now_ns))
+        except PeerError as error:
+            self.record(host.journal, Event.PEER_REFUSED, getattr(message, "request_id", 0), 0)
+            if not isinstance(message, Rebound | ChannelEnded):  # told to all, of interest to some
+                self.saying(f"{name} refuses {type(message).__name__}: {error}")
+
+    # -- running ------------------------------------------------------------------------------
+
+    def run(self, stop_after: str = "") -> None:
+        """Step until nothing is left to do, or until the message `stop_after` was put into its channel."""
+        seen: list[str] = []
+        saying = self.saying
+
+        def watch(what: str) -> None:
+            seen.append(what)
+            saying(what)
+
+        self.saying = watch
+        while self.step():
+            if stop_after in seen:
+                break
+        self.saying = saying
+        assert not stop_after or stop_after in seen, f"never happened: {stop_after}"
+
+    def step(self) -> bool:
+        """One micro-step; False if there is none."""
+        self._steps += 1
+        assert self._steps < STEPS_MAX, "no end in sight"
+        self.now_ns += 1000
+        moves = self.moves()
+        if not moves:
+            return self._pass_time()
+        what, name = self.choose(moves)
+        if what == "effect":
+            self._perform(self.hosts[name])
+        elif what == "script":
+            self.executive.go_on(alone=len(moves) == 1)
+        elif what == "death":
+            self._report_death()
+        else:
+            self._deliver(self.hosts[name], what)
+        return True
+
+    def moves(self) -> list[Move]:
+        """All that may happen next: effects, the script (last if it waits), deaths, mail by its age."""
+        found: list[Move] = [("effect", h.name) for h in self.hosts.values() if h.todo]
+        script: list[Move] = [("script", SUPERVISOR)] if self.executive.busy else []
+        if not self.executive.waits:
+            found += script
+        if self.dead:
+            found.append(("death", SUPERVISOR))
+        ready = [
+            (channel.mail[0][0] if channel.mail else self.now_ns, port, host.name)
+            for host in self.hosts.values()
+            if not host.todo and not (host.suspended and host.brick.quiescent())
+            for port, channel in host.inputs.items()
+            if port in host.brick.open_ports() and (channel.mail or channel.ended)
+        ]
+        found += [(port, name) for _, port, name in sorted(ready)]
+        return found + script if self.executive.waits else found
+
+    def _pass_time(self) -> bool:
+        """Nothing else to do: the earliest deadline comes."""
+        due = [(at, h.name) for h in self.hosts.values() if (at := h.brick.deadline_ns()) is not None]
+        if not due:
+            return False
+        self.now_ns, name = max(self.now_ns, min(due)[0]), min(due)[1]
+        host = self.hosts[name]
+        host.todo.extend(host.brick.wake(self.now_ns))
+        return True
+
+    def _deliver(self, host: Host, port: str) -> None:
+        channel = host.inputs[port]
+        if channel.mail:
+            _, message = channel.mail.popleft()
+            self.tell(host.name, wire.decode(wire.encode(message)), port)
+        else:
+            del host.inputs[port]
+            self.tell(host.name, ChannelEnded(), port)
+
+    def _report_death(self) -> None:
+        node = self.dead.popleft()
+        watchdog = f"{node.partition('/')[0]}/watchdog"
+        if watchdog in self.hosts:
+            self.tell(watchdog, NodeDied(node), "sense")
+
+    def _perform(self, host: Host) -> None:
+        effect = host.todo.popleft()
+        match effect:
+            case Note(event, request_id, detail):
+                self.record(host.journal, event, request_id, detail)
+            case Order(ordered):
+                self.executive.order(ordered)
+            case Send(port, message) if port == CONTROL:
+                assert isinstance(message, Promoted)
+                self.promoted.add((host.name, message.epoch))
+                self.saying(f"{host.name} leads, epoch={message.epoch}")
+            case Send("deliver", message):
+                assert isinstance(message, Reply)
+                self.replies.append(message)
+                self._write_down(message.request_id, message.epoch, EntryKind.ANSWERED, message.payload)
+                self.saying(f"deliver Reply({message.request_id})={message.payload.decode()}")
+            case Send(port, message):
+                self._send(host, port, message)
+
+    def _send(self, host: Host, port: str, message: Message) -> None:
+        channel = host.outputs.get(port)
+        if channel is None:
+            return
+        if channel.ended:  # EPIPE: a fenced brick dies
+            self.hosts.pop(host.name)
+            self.saying(f"{host.name} meets its fence and dies")
+            return
+        channel.mail.append((self.now_ns, message))
+        self.saying(str(Sent(port, message)))
+
+    def record(self, journal: str, event: Event, request_id: int, detail: int) -> None:
+        node = journal.rpartition(".")[0]
+        self.journals[journal].append(Record(self.now_ns, event, request_id, detail, node))
+        if event in (Event.DEDUPE_HIT, Event.REPLY_REFUSED):
+            self.saying(f"{event}({request_id})")
+
+    def _write_down(self, request_id: int, epoch: int, kind: EntryKind, payload: bytes) -> None:
+        self.dialogue.append(Entry(self.now_ns, request_id, epoch, kind, payload))
+
+    def history(self) -> History:
+        """What a run of real processes would have recorded."""
+        return History(self.journals, self.dialogue)
