@@ -1,5 +1,6 @@
 """Cycle time seen by the client, and the bare ring with as many hops, in turn in the same run."""
 
+import itertools
 import os
 from typing import Final
 
@@ -26,7 +27,7 @@ def hops(graph: Graph) -> int:
     path = [parts[part] for part in _PATH if part in parts]
     if graph.ftm == "none":
         path = [parts[part] for part in ("client", "proxy", "server", "proxy", "client")]
-    return sum(a != b for a, b in zip(path, path[1:], strict=False))
+    return sum(a != b for a, b in itertools.pairwise(path))
 
 
 def bench_cycle(ftm: str, placement: str, count: int, *, pin: bool = True) -> dict[str, object]:

@@ -1,9 +1,9 @@
 """Watchdog: tells Recovery that a node of its replica is dead or hangs. One per replica.
 
 A death comes as a message (the host holds the pidfds). A hang is a node whose pulse is older than a
-deadline. The deadline only counts while this Watchdog itself runs on time: if the pulses, which the host hands in
-every `PERIOD_NS`, come late, the machine was stalled, and every node gets the whole deadline again. That is what keeps a busy machine
-from a false failover.
+deadline. The deadline only counts while this Watchdog itself runs on time: if the pulses, which the
+host hands in every `PERIOD_NS`, come late, the machine was stalled, and every node gets the whole
+deadline again. That is what keeps a busy machine from a false failover.
 """
 
 from typing import Final

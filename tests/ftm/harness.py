@@ -109,6 +109,7 @@ class World:
         self.promoted: set[tuple[str, int]] = set()
         self.dead: deque[str] = deque()  # nodes whose Watchdog does not know yet
         self.executive = Executive(self)
+        self._accused: set[tuple[str, int]] = set()
         self._lives: dict[str, int] = {}
         self._steps = 0
         self._launch()
@@ -189,7 +190,7 @@ class World:
             nodes = tuple(f"{replica}/{part}" for part in CHAIN_PARTS)
             self.tell(watchdog, Watch(replica, self.generation[replica], nodes))
             of_others = [node for node in self.dead if node not in nodes]
-            gone = [] if replica in self.vacant else [node for node in nodes if node not in self.hosts]
+            gone = [] if replica in self.vacant else [node for node in nodes if not self.seems_alive(node)]
             self.dead = deque(of_others + gone)
 
     def inform(self, *, failed: bool) -> None:
@@ -217,8 +218,13 @@ class World:
                 self.dead.append(name)
 
     def accuse(self, node: str) -> None:
-        """The Watchdog believes that `node` is dead; it lives, and goes on."""
+        """To its Watchdog, also to the next one, `node` seems to be dead; it lives, and goes on."""
+        self._accused.add((node, self.generation[node[0]]))
         self.dead.append(node)
+
+    def seems_alive(self, node: str) -> bool:
+        """What a Watchdog believes of a node of a replica."""
+        return node in self.hosts and (node, self.generation[node[0]]) not in self._accused
 
     def replace(self, name: str) -> None:
         """A brick of no replica is dead, and another is in its place: fresh channels, no memory."""

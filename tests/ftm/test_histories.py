@@ -42,7 +42,6 @@ class Drive:
         self.random, self.count, self.plan = random, count, list(plan)
         self.world = World()
         self.world.choose = random.choice
-        self.accused: set[tuple[str, int]] = set()
 
     def run(self) -> World:
         """Until all is submitted, every fault has happened, and nothing is left to do."""
@@ -75,18 +74,13 @@ class Drive:
             return
         self.plan.pop(0)
         if act == "accuse":
-            self.accused.add((victim, world.generation[victim]))
             world.accuse(f"{victim}/server")
         else:
             world.crash(f"{victim}/{part}" if part else victim)
 
     def _is_sound(self, replica: str) -> bool:
-        world = self.world
-        return (
-            replica in (world.leader, world.backup)
-            and len(world.chain(replica)) == len(CHAIN_PARTS)
-            and (replica, world.generation[replica]) not in self.accused
-        )
+        nodes = [f"{replica}/{part}" for part in CHAIN_PARTS]
+        return replica in (self.world.leader, self.world.backup) and all(map(self.world.seems_alive, nodes))
 
 
 def one_master(history: History) -> list[str]:

@@ -10,8 +10,8 @@ import socket
 from typing import Final
 
 from aftbed.core.graph import Link
+from aftbed.runtime.unix.linux import set_timeouts
 from aftbed.runtime.unix.node import NUDGE, PULSE_SECONDS, WRITE_SECONDS_MAX
-from aftbed.runtime.unix.zygote import set_timeouts
 
 WRITE_PATIENCE_SECONDS: Final = PULSE_SECONDS
 assert WRITE_PATIENCE_SECONDS < WRITE_SECONDS_MAX

@@ -19,6 +19,7 @@ from aftbed.runtime.unix.processes import Nursery, Process
 
 LIGHT: Final = "zygote"
 BUS: Final = "zygote.bus"
+BESIDE_LEADER: Final = ("client", "proxy")
 WATCHED_KINDS: Final = ("client", "proxy", "watchdog", "recovery", "engine")
 
 Keys = Generator[Wait, dict[Key, bytes], None]
@@ -111,6 +112,7 @@ class Deployment:
         yield from self.all_of(sent)
         if len(self.slots) > 1:
             self.backup = REPLICAS[1]
+        self.pin(())
         for slot in self.slots.values():
             slot.nodes = [n for n in self.graph.nodes if set(self.graph.nodes[n]) <= slot.bricks]
             yield from self.watch(slot)
@@ -207,16 +209,25 @@ class Deployment:
             process.header = Header(process.journal)
 
     def cpu_of(self, node: str) -> int | None:
-        """A replica's chain stays on its core; Client and Proxy stay beside the leader."""
-        for slot in self.slots.values():
-            beside = node in ("client", "proxy") and slot.name == self.leader
-            if beside or set(self.graph.nodes[node]) <= slot.bricks:
-                return slot.cpu
-        return None
+        """A replica's chain stays on its core; Client and Proxy stay beside the leader.
 
-    def pin_beside_leader(self) -> None:
-        """After a failover."""
-        for node in ("client", "proxy"):
+        Who watches and recovers stays on the other core: it is idle when the leader dies, while the
+        leader's is busy for a while with taking dead processes down.
+        """
+        leads = self.slots.get(self.leader)
+        for slot in self.slots.values():
+            if set(self.graph.nodes.get(node, ("",))) <= slot.bricks:
+                return slot.cpu
+        if node in BESIDE_LEADER:
+            return leads.cpu if leads else None
+        return next((s.cpu for s in self.slots.values() if s is not leads), None)
+
+    def pin(self, nodes: Iterable[str]) -> None:
+        """Move `nodes`, and this process, to where they belong now that another replica leads."""
+        cpu = self.cpu_of("recovery")
+        if cpu is not None:
+            os.sched_setaffinity(0, {cpu})
+        for node in nodes:
             cpu, process = self.cpu_of(node), self.nodes.get(node)
             if cpu is not None and process is not None and process.alive:
                 os.sched_setaffinity(process.pid, {cpu})

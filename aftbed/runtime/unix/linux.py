@@ -9,6 +9,8 @@ import ctypes
 import os
 import resource
 import signal
+import socket
+import struct
 import time
 from typing import Final
 
@@ -68,6 +70,11 @@ def kill(pidfd: int, sig: signal.Signals) -> bool:
     return True
 
 
+def trim() -> None:
+    """Give memory that is allocated but free back to the kernel: less to copy at a fork, and to unmap."""
+    _libc.malloc_trim(0)
+
+
 def reap(pid: int) -> int | None:
     """The exit status of the dead child `pid` (negative: the signal), or None if it is not ours."""
     with contextlib.suppress(ChildProcessError):
@@ -75,3 +82,10 @@ def reap(pid: int) -> int | None:
         if got == pid:
             return os.waitstatus_to_exitcode(status)
     return None
+
+
+def set_timeouts(sock: socket.socket, receive_seconds: float, send_seconds: float) -> None:
+    """Kernel timeouts, which hold for plain reads and writes of the descriptor too."""
+    for option, seconds in ((socket.SO_RCVTIMEO, receive_seconds), (socket.SO_SNDTIMEO, send_seconds)):
+        value = struct.pack("ll", int(seconds), int(seconds % 1 * 1e6))
+        sock.setsockopt(socket.SOL_SOCKET, option, value)

@@ -14,15 +14,15 @@ class Loop:
 
     def __init__(self) -> None:
         self._epoll = select.epoll()
-        self._readers: dict[int, Callable[[], None]] = {}
+        self._readers: dict[int, tuple[bool, Callable[[], None]]] = {}
         self._timers: list[tuple[int, int, Callable[[], None]]] = []
         self._order = itertools.count()
         self._ended = False
         self.jobs = Jobs()
 
-    def read(self, fd: int, call: Callable[[], None]) -> None:
-        """Call `call` whenever `fd` is readable or has ended."""
-        self._readers[fd] = call
+    def read(self, fd: int, call: Callable[[], None], *, patient: bool = False) -> None:
+        """Call `call` whenever `fd` is readable or has ended; if `patient`, after those that are not."""
+        self._readers[fd] = (patient, call)
         self._epoll.register(fd, select.EPOLLIN)
 
     def forget(self, fd: int) -> None:
@@ -42,10 +42,12 @@ class Loop:
     def run(self) -> None:
         """Serve until `end`."""
         while not self._ended:
-            for fd, _ in self._epoll.poll(self._patience_seconds()):
-                call = self._readers.get(fd)
-                if call is not None:
-                    call()
+            ready = [fd for fd, _ in self._epoll.poll(self._patience_seconds())]
+            for turn in (False, True):
+                for fd in ready:
+                    patient, call = self._readers.get(fd, (None, None))
+                    if call is not None and patient is turn:
+                        call()
             now_ns = time.monotonic_ns()
             self.jobs.expire(now_ns)
             while self._timers and self._timers[0][0] <= now_ns:

@@ -8,8 +8,9 @@ the flag after each wake-up, before it looks at the mail: control is served befo
 
 The pulse is an interval timer's signal: its handler writes the time into the header, but only if it
 interrupted the host and not a brick, so a brick that loops for ever stops the pulse. (A receive timeout
-on the sockets would do too; it costs 0.3 us a hop.) What is read from a channel is handled before anything else is read, so mail is either in
-the kernel, where it outlives this process, or inside a request that the client will ask again.
+on the sockets would do too; it costs 0.3 us a hop.) What is read from a channel is handled before
+anything else is read, so mail is either in the kernel, where it outlives this process, or inside a
+request that the client will ask again.
 """
 
 import os
@@ -32,11 +33,12 @@ from aftbed.core.event import BY_LABEL, Event
 from aftbed.core.fault import Act
 from aftbed.core.journal import FLAG_OFFSET, PULSE_OFFSET, RECORD
 from aftbed.core.message import AnyMessage, ChannelEnded, Message, Promoted, Rebound, Reply, Watch
-from aftbed.runtime.unix import control
+from aftbed.runtime.unix import control, rehearsal
 from aftbed.runtime.unix.devices import Device, Sensor
 from aftbed.runtime.unix.journal import Journal
 
 PULSE_SECONDS: Final = 0.02
+REHEARSAL_MS: Final = 20.0  # of waiting at the start; the whole graph is there by then
 READ_BYTES_MAX: Final = wire.PACKET_BYTES_MAX + 1  # one byte more than is allowed, so that it is noticed
 WRITE_SECONDS_MAX: Final = 2.0
 FAULT_SECONDS_MAX: Final = 5.0
@@ -186,6 +188,7 @@ class Node:
     def run(self) -> NoReturn:
         """Serve until told to stop; a failed assert ends the process (fail-silence)."""
         try:
+            self._rehearse()
             while True:
                 self._turn()
                 if self._hot is not None:
@@ -197,6 +200,16 @@ class Node:
             traceback.print_exc()
             sys.stderr.flush()
             os._exit(EXIT_ASSERT)
+
+    def _rehearse(self) -> None:
+        """Before the first mail, or when it is there."""
+        poll = select.poll()
+        poll.register(self.line.fileno(), select.POLLIN)
+        for hosted in self.hosted.values():
+            for inlet in hosted.inlets.values():
+                poll.register(inlet.fd, select.POLLIN)
+        poll.poll(REHEARSAL_MS)
+        rehearsal.once()
 
     def _turn(self) -> None:
         """Handle one thing, or wait for one."""

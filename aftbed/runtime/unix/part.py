@@ -14,7 +14,6 @@ from aftbed.runtime.unix.devices import Device, Load, LoadOptions, Sensor
 from aftbed.runtime.unix.journal import Journal
 from aftbed.runtime.unix.node import EXIT_ASSERT, PULSE_SECONDS, Node
 from aftbed.runtime.unix.options import GatewayOptions
-from aftbed.runtime.unix.zygote import set_timeouts
 from aftbed.vehicle.function import default_application, sample_requests
 
 LOAD_REQUESTS: Final = 512
@@ -43,7 +42,7 @@ def _build(line: control.Line[control.ToNode], order: control.Assign, fds: list[
     linux.set_name(order.node)
     if order.cpu is not None:
         os.sched_setaffinity(0, {order.cpu})
-    set_timeouts(line.sock, PULSE_SECONDS, 2.0)
+    linux.set_timeouts(line.sock, PULSE_SECONDS, 2.0)
     node = Node(order.node, line, Journal(Path(order.journal), order.node))
     node.start_pulse()
     setting = Setting(order.replica, order.epoch, order.leads, default_application)

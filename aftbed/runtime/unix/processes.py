@@ -10,7 +10,7 @@ import socket
 from collections import deque
 from collections.abc import Callable, Generator
 from pathlib import Path
-from typing import Final, NoReturn
+from typing import Final
 
 import msgspec
 
@@ -18,9 +18,9 @@ from aftbed.runtime.unix import control, linux
 from aftbed.runtime.unix.jobs import Key, StepFailed, Wait
 from aftbed.runtime.unix.journal import Header
 from aftbed.runtime.unix.loop import Loop
-from aftbed.runtime.unix.zygote import Become
-from aftbed.runtime.unix.zygote import run as run_zygote
+from aftbed.runtime.unix.zygote import start as start_zygote
 
+REAP_SECONDS: Final = 0.01
 PARK_BATCH: Final = 4  # spares per order: the first of them start while the next are forked
 
 
@@ -62,11 +62,11 @@ class Nursery:
     def __init__(
         self,
         loop: Loop,
-        become: Become,
         on_report: Callable[[Process, msgspec.Struct], None],
-        on_death: Callable[[Process, int | None], None],
+        on_death: Callable[[Process], None],
     ) -> None:
-        self._loop, self._become = loop, become
+        self._loop = loop
+        self._cpus = sorted(os.sched_getaffinity(0))
         self._on_report, self._on_death = on_report, on_death
         self.processes: list[Process] = []
         self.zygotes: dict[str, Process] = {}
@@ -77,27 +77,16 @@ class Nursery:
     # -- zygotes ------------------------------------------------------------------------------
 
     def start_zygote(self, name: str, preload: tuple[str, ...]) -> None:
-        """Fork a zygote from this process."""
+        """Start a zygote."""
         self._preloads[name] = preload
         self.parked.setdefault(name, deque())
         self._unborn[name] = []
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        supervisor, pid = os.getpid(), os.fork()
-        if pid == 0:
-            self._be_zygote(theirs.detach(), supervisor, preload)
-        theirs.close()
         process = self._adopt(name, "zygote", ours)
-        process.born(pid)
+        process.born(start_zygote(theirs.fileno(), os.getpid(), self._cpus, preload))
+        theirs.close()
         self.zygotes[name] = process
         self._watch(process)
-
-    def _be_zygote(self, descriptor: int, supervisor: int, preload: tuple[str, ...]) -> NoReturn:
-        for sig in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(sig, signal.SIG_DFL)
-        try:
-            run_zygote(descriptor, supervisor, preload, self._become)
-        finally:
-            os._exit(1)
 
     def restart_zygote(self, name: str) -> None:
         """After its death: a new one, and the spares that the old one did not get to fork."""
@@ -146,7 +135,7 @@ class Nursery:
         return process
 
     def _watch(self, process: Process) -> None:
-        self._loop.read(process.pidfd, lambda: self._died(process))
+        self._loop.read(process.pidfd, lambda: self._died(process), patient=True)
 
     def _heard(self, process: Process) -> None:
         """Read what the process says; its death is the pidfd's business, not the line's."""
@@ -179,10 +168,17 @@ class Nursery:
     # -- death --------------------------------------------------------------------------------
 
     def _died(self, process: Process) -> None:
-        status = linux.reap(process.pid)
+        """It can be reaped at leisure: others wait for a failover just now."""
         self._heard(process)  # its last words are still in the line
-        self._forget(process)
-        self._on_death(process, status)
+        self._loop.forget(process.pidfd)
+        process.alive = False
+        self._on_death(process)
+        self._loop.after(REAP_SECONDS, lambda: self._reap(process))
+
+    def _reap(self, process: Process) -> None:
+        if process in self.processes:
+            linux.reap(process.pid)
+            self._forget(process)
 
     def _forget(self, process: Process) -> None:
         if process.pidfd >= 0:

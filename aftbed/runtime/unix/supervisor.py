@@ -28,12 +28,12 @@ from aftbed.runtime.unix.jobs import StepFailed
 from aftbed.runtime.unix.journal import Journal
 from aftbed.runtime.unix.loop import Loop
 from aftbed.runtime.unix.options import LoadRun, RunOptions
-from aftbed.runtime.unix.part import become
 from aftbed.runtime.unix.processes import Nursery, Process
 from aftbed.runtime.unix.verbs import Executor
 from aftbed.runtime.unix.work import Work
 
 TICK_SECONDS: Final = 0.02
+TELL_SECONDS: Final = 0.005
 HANG_NS: Final = 150_000_000  # of what no Watchdog watches; a channel's pulse is 20 ms
 LATE_NS_MAX: Final = 40_000_000
 DRAIN_SECONDS_MAX: Final = 2.0
@@ -59,10 +59,11 @@ class Supervisor:
         self.owner = control.Line(owner, control.decode_order)
         self.owner.sock.setblocking(False)
         self.loop = Loop()
-        self.nursery = Nursery(self.loop, become, self._on_report, self._on_death)
+        self.nursery = Nursery(self.loop, self._on_report, self._on_death)
         self.journal = Journal(self.record / "journal" / "supervisor.1.journal", "supervisor")
         self._events = open(self.record / "events.jsonl", "ab", buffering=0)  # noqa: SIM115 - for the whole run
         self._ending = ""
+        self._told: list[bytes] = []
         self._finish_reason = ""
         self._grace_until_ns = 0
         self.graph_ms = 0.0
@@ -147,11 +148,17 @@ class Supervisor:
             return
 
     def tell(self, event: str, text: str) -> None:
-        """A line for people: to the record, and to the command."""
+        """A line for people: to the record, and to the command. Soon, since a failover does not wait."""
         t_ms = round((time.monotonic_ns() - self.started_ns) / 1e6, 3)
-        line = json.dumps({"t_ms": t_ms, "event": event, "text": text}).encode()
-        self._events.write(line + b"\n")
-        self._report_owner("event", line)
+        self._told.append(json.dumps({"t_ms": t_ms, "event": event, "text": text}).encode())
+        if len(self._told) == 1:
+            self.loop.after(TELL_SECONDS, self._tell_all)
+
+    def _tell_all(self) -> None:
+        told, self._told = self._told, []
+        self._events.write(b"".join(line + b"\n" for line in told))
+        for line in told:
+            self._report_owner("event", line)
 
     # -- the end ------------------------------------------------------------------------------
 
@@ -183,6 +190,7 @@ class Supervisor:
 
     def _teardown(self) -> None:
         """Kill what is left, reap it, say how it ended, and leave."""
+        self._tell_all()
         for process in self.nursery.processes:
             process.kill()
         limit = time.monotonic() + STOP_SECONDS_MAX
@@ -275,20 +283,19 @@ class Supervisor:
 
     # -- deaths and hangs ---------------------------------------------------------------------
 
-    def _on_death(self, process: Process, status: int | None) -> None:
+    def _on_death(self, process: Process) -> None:
         self.journal.write(time.monotonic_ns(), Event.NODE_DIED, 0, process.pid)
         self.loop.jobs.settle(("died", process.name, process.pid))
         if process.kind == "killed" or self._ending:
             return
-        how = f"signal {-status}" if status is not None and status < 0 else f"status {status}"
-        self.tell("died", f"{process.name} (pid {process.pid}, {how})")
+        self.tell("died", f"{process.name} (pid {process.pid})")
         self.loop.jobs.died(process.name)
         if process.kind == "zygote":
             self.nursery.restart_zygote(process.name)
         elif process.kind == "spare":
             self.nursery.level(LIGHT, self._spares())
         elif process.kind == "service":
-            self._finish(f"{process.name} died ({how})")
+            self._finish(f"{process.name} died")
         elif process.kind == "node" and self._replaceable(process.name):
             self._replace(process.name)
 

@@ -13,7 +13,7 @@ from aftbed.core import message, script
 from aftbed.core.event import Event
 from aftbed.core.graph import Link
 from aftbed.runtime.unix import control
-from aftbed.runtime.unix.deployment import Deployment, Keys
+from aftbed.runtime.unix.deployment import BESIDE_LEADER, WATCHED_KINDS, Deployment, Keys
 from aftbed.runtime.unix.jobs import StepFailed, Wait
 from aftbed.runtime.unix.journal import Journal
 
@@ -131,6 +131,7 @@ class Executor:
         """A Proxy that is being replaced needs nothing: the new one is bound to whoever leads."""
         deployment = self._deployment
         deployment.leader, deployment.backup, deployment.epoch = replica, "", epoch
+        deployment.pin(BESIDE_LEADER)
         if deployment.lives("proxy"):
             for source, port, sink in (
                 (f"{replica}/protocol", "pro2pxy", "proxy"),
@@ -139,7 +140,7 @@ class Executor:
                 channel = deployment.channels.get(source, port, sink)
                 assert channel is not None, port
                 self._hand_to_proxy(channel.link, channel.read.fileno(), channel.write.fileno(), epoch)
-        deployment.pin_beside_leader()
+        deployment.pin(b.name for b in deployment.graph.bricks if b.kind in WATCHED_KINDS)
 
     def _hand_to_proxy(self, link: Link, read: int, write: int, epoch: int) -> None:
         if link.sink == "proxy":

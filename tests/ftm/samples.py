@@ -1,0 +1,75 @@
+"""One message of each type, all about request 1 under epoch 1; and looks into a brick from outside."""
+
+import copy
+from typing import Final, get_args
+
+from aftbed.core.brick import Brick, Effect, Note, Send
+from aftbed.core.event import Event
+from aftbed.core.message import (
+    AnyMessage,
+    CaptureState,
+    ChannelEnded,
+    Checkpoint,
+    Message,
+    NodeDied,
+    Promote,
+    Promoted,
+    Pulses,
+    Rebound,
+    Reply,
+    Request,
+    RestoreState,
+    Situation,
+    StateCaptured,
+    StateRestored,
+    StoreReply,
+    Submit,
+    Suspect,
+    TakeOver,
+    Watch,
+)
+
+STATE: Final = b"\x92\x01\x02"  # of `Counting`: one request, checksum 2
+
+SAMPLES: Final[dict[type, AnyMessage]] = {
+    type(message): message
+    for message in (
+        Request(1, 1, b"what"),
+        Reply(1, 1, 1, b"that"),
+        CaptureState(1, 1),
+        StateCaptured(1, 1, STATE),
+        Checkpoint(1, 1, b"that", STATE),
+        RestoreState(1, 1, STATE),
+        StateRestored(1, 1),
+        StoreReply(1, 1, b"that"),
+        TakeOver(2),
+        Suspect("a", 1, "a/after", "crash", 5),
+        Promote(2),
+        Promoted(2),
+        Rebound("elsewhere", True, 1),
+        ChannelEnded(),
+        Submit(b"what"),
+        Watch("a", 1, ("a/after",)),
+        NodeDied("a/after"),
+        Pulses({"a/after": 0}),
+        Situation("a", 1, "b", 1, 1, (), False),
+    )
+}
+assert set(SAMPLES) == set(get_args(AnyMessage)), "one sample of each type"
+
+
+def inspected(brick: Brick) -> dict[str, object]:
+    """All that a brick is, inside and outside, as a value."""
+    inside = {k: copy.deepcopy(v) for k, v in vars(brick).items() if k != "application"}
+    outside = (brick.open_ports(), brick.quiescent(), brick.deadline_ns(), brick.capture())
+    return inside | {"outside": outside}
+
+
+def sends(effects: list[Effect]) -> list[tuple[str, Message]]:
+    """What is put where."""
+    return [(e.port, e.message) for e in effects if isinstance(e, Send)]
+
+
+def notes(effects: list[Effect]) -> list[Event]:
+    """The events, in order."""
+    return [e.event for e in effects if isinstance(e, Note)]
