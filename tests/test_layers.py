@@ -37,8 +37,9 @@ IMPURE_PLACES: Final = (  # where clock, socket, process, file and chance may li
     "aftbed.cli",
 )
 PURE_MODULES: Final = frozenset(  # what the rest may import beside aftbed: neither clock nor I/O nor chance
-    "__future__ abc bisect collections contextlib copy dataclasses difflib enum functools hashlib heapq "
-    "itertools math msgspec operator re statistics string struct textwrap types typing zlib".split()
+    ("__future__", "abc", "bisect", "collections", "contextlib", "copy", "dataclasses", "difflib", "enum")
+    + ("functools", "hashlib", "heapq", "itertools", "math", "msgspec", "operator", "re", "statistics")
+    + ("string", "struct", "textwrap", "types", "typing", "zlib")
 )
 IMPURE_CALLS: Final = frozenset({"open", "input", "print", "exec", "eval", "__import__", "breakpoint"})
 
@@ -170,7 +171,7 @@ def test_a_planted_breach_is_found(module: str, source: str, reason: str) -> Non
     [
         ("aftbed.cli.app", "from aftbed.core import wire\nimport aftbed.campaign.verdict, time"),
         ("aftbed.bench.runs", "from aftbed.campaign.record import read_record"),
-        ("aftbed.runtime.unix.node", "import socket\nfrom aftbed.vehicle.function import default_application"),
+        ("aftbed.runtime.unix.node", "import socket\nfrom aftbed.vehicle.function import AebFunction"),
         ("aftbed.ftm.proxy", "import msgspec\nfrom collections.abc import Callable"),
         ("aftbed.__main__", "from aftbed.cli import main"),
         ("aftbed.runtime.unix.launch", "from aftbed import __version__"),

@@ -1,11 +1,11 @@
 """Golden dialogues: what a person would draw on the whiteboard, run against the bricks.
 
-A file in `tests/golden` holds commands and, behind `>`, all that follows from each: the messages that were put
-into channels, in their order, and what the runtime did. `pytest --rewrite` writes what follows anew; a
-change is committed only when it is understood.
+A file in `tests/golden` holds commands and, behind `>`, all that follows from each: the messages that were
+put into channels, in their order, and what the runtime did. `pytest --rewrite` writes what follows anew;
+a change is committed only when it is understood.
 
     ftm pbr                                  deploy
-    request 1 d=40 [until LINK Message(1)]   the next request, with its payload; run, or stop after that message
+    request 1 d=40 [until LINK Message(1)]   the next request, with its payload; stop after that message
     run [until ...]                          go on
     crash primary|backup|BRICK               it is gone, and whatever it had still to do
     accuse BRICK                             its Watchdog believes so; it lives

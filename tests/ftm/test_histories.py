@@ -1,8 +1,8 @@
 """Random crashes at random points of random interleavings: the promises hold in every history.
 
 The bricks run in memory (see `harness`); between any two micro-steps, also between two effects of one
-step, a replica or one node of it may crash, or be accused while it lives, and whatever belongs to no replica may
-be replaced. One replica is left alone until the other is sound again: that is what G2 presupposes.
+step, a replica or one node of it may crash, or be accused while it lives, and whatever belongs to no
+replica may be replaced. One replica is left alone until the other is sound again: G2 presupposes it.
 """
 
 from random import Random

@@ -142,7 +142,7 @@ def test_a_legal_message_is_taken_and_an_illegal_one_changes_nothing(case: Case,
         moved = case.moves.get((before["state"], kind)) if case.moves else None  # type: ignore[arg-type]
         assert moved is None or vars(brick)["state"] is moved
         return
-    with pytest.raises(PeerError, match=kind.__name__):
+    with pytest.raises(PeerError, match=f"(?i){kind.__name__}"):
         brick.step("port", SAMPLES[kind], 0)
     assert inspected(brick) == before
 
@@ -162,9 +162,7 @@ def test_every_state_is_among_the_cases(name: str, states: type[BrickState]) -> 
     assert covered == set(states)
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda c: c.name)
-def test_a_brick_that_is_open_for_nothing_waits_for_the_runtime(case: Case) -> None:
-    """A closed brick is no deadlock: something that the runtime says opens it."""
-    brick = brought_there(case)
-    if not brick.open_ports():
-        assert case.name in ("Proxy UNBOUND", "AdaptationEngine")
+def test_only_an_unbound_proxy_and_the_engine_are_open_for_nothing() -> None:
+    """A brick that waits for mail which its ports do not let in would wait for ever."""
+    closed = {case.name for case in CASES if not brought_there(case).open_ports()}
+    assert closed == {"Proxy UNBOUND", "AdaptationEngine"}

@@ -112,7 +112,7 @@ class Deployment:
         yield from self.all_of(sent)
         if len(self.slots) > 1:
             self.backup = REPLICAS[1]
-        self.pin(())
+        self.pin_watchers()
         for slot in self.slots.values():
             slot.nodes = [n for n in self.graph.nodes if set(self.graph.nodes[n]) <= slot.bricks]
             yield from self.watch(slot)
@@ -214,7 +214,7 @@ class Deployment:
         Who watches and recovers stays on the other core: it is idle when the leader dies, while the
         leader's is busy for a while with taking dead processes down.
         """
-        leads = self.slots.get(self.leader)
+        leads = self.slots.get(self.leader or self.backup)
         for slot in self.slots.values():
             if set(self.graph.nodes.get(node, ("",))) <= slot.bricks:
                 return slot.cpu
@@ -223,14 +223,18 @@ class Deployment:
         return next((s.cpu for s in self.slots.values() if s is not leads), None)
 
     def pin(self, nodes: Iterable[str]) -> None:
-        """Move `nodes`, and this process, to where they belong now that another replica leads."""
-        cpu = self.cpu_of("recovery")
-        if cpu is not None:
-            os.sched_setaffinity(0, {cpu})
+        """Move `nodes` to where they belong now that another replica leads."""
         for node in nodes:
             cpu, process = self.cpu_of(node), self.nodes.get(node)
             if cpu is not None and process is not None and process.alive:
                 os.sched_setaffinity(process.pid, {cpu})
+
+    def pin_watchers(self) -> None:
+        """Move who watches and recovers, this process included, to the core that does not lead."""
+        cpu = self.cpu_of("recovery")
+        if cpu is not None:
+            os.sched_setaffinity(0, {cpu})
+        self.pin(b.name for b in self.graph.bricks if b.kind in WATCHED_KINDS)
 
     # -- channels -----------------------------------------------------------------------------
 

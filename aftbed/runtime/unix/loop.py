@@ -42,12 +42,13 @@ class Loop:
     def run(self) -> None:
         """Serve until `end`."""
         while not self._ended:
-            ready = [fd for fd, _ in self._epoll.poll(self._patience_seconds())]
+            polled = self._epoll.poll(self._patience_seconds())
+            ready = [(fd, self._readers[fd]) for fd, _ in polled if fd in self._readers]
             for turn in (False, True):
-                for fd in ready:
-                    patient, call = self._readers.get(fd, (None, None))
-                    if call is not None and patient is turn:
-                        call()
+                for fd, reader in ready:
+                    # A call before this one may have closed `fd`, and its number may be another's now.
+                    if reader[0] is turn and self._readers.get(fd) is reader:
+                        reader[1]()
             now_ns = time.monotonic_ns()
             self.jobs.expire(now_ns)
             while self._timers and self._timers[0][0] <= now_ns:

@@ -13,7 +13,7 @@ from aftbed.core import message, script
 from aftbed.core.event import Event
 from aftbed.core.graph import Link
 from aftbed.runtime.unix import control
-from aftbed.runtime.unix.deployment import BESIDE_LEADER, WATCHED_KINDS, Deployment, Keys
+from aftbed.runtime.unix.deployment import BESIDE_LEADER, Deployment, Keys
 from aftbed.runtime.unix.jobs import StepFailed, Wait
 from aftbed.runtime.unix.journal import Journal
 
@@ -93,13 +93,16 @@ class Executor:
     def _fence(self, replica: str) -> None:
         deployment = self._deployment
         slot = deployment.slots[replica]
+        if replica == deployment.leader:
+            # Move Proxy and Client while they sleep: the fence wakes them, and a core that takes dead
+            # processes down neither runs them nor lets them go for some milliseconds.
+            deployment.leader = ""
+            deployment.pin(BESIDE_LEADER)
         for channel in deployment.channels.touching(slot.bricks):
             if channel.link.source in slot.bricks:
                 channel.fence()
             elif "/" in channel.link.source:
                 channel.refuse()  # a leader that waits for a dead backup to read must not wait on
-        if replica == deployment.leader:
-            deployment.leader = ""
         self._note(Event.REPLICA_FENCED, replica)
 
     def _kill(self, replica: str) -> None:
@@ -131,7 +134,6 @@ class Executor:
         """A Proxy that is being replaced needs nothing: the new one is bound to whoever leads."""
         deployment = self._deployment
         deployment.leader, deployment.backup, deployment.epoch = replica, "", epoch
-        deployment.pin(BESIDE_LEADER)
         if deployment.lives("proxy"):
             for source, port, sink in (
                 (f"{replica}/protocol", "pro2pxy", "proxy"),
@@ -140,7 +142,9 @@ class Executor:
                 channel = deployment.channels.get(source, port, sink)
                 assert channel is not None, port
                 self._hand_to_proxy(channel.link, channel.read.fileno(), channel.write.fileno(), epoch)
-        deployment.pin(b.name for b in deployment.graph.bricks if b.kind in WATCHED_KINDS)
+        # The new leader's core is for the first reply now; what is left to do here can wait for the
+        # other one, which is still busy with the dead.
+        deployment.pin_watchers()
 
     def _hand_to_proxy(self, link: Link, read: int, write: int, epoch: int) -> None:
         if link.sink == "proxy":

@@ -1,0 +1,188 @@
+"""Recovery: the table of decisions, scripts that pass their check, one at a time, again after a failure."""
+
+from typing import Final
+
+import pytest
+from samples import notes
+
+from aftbed.core.brick import CONTROL, Effect, Order
+from aftbed.core.event import Event
+from aftbed.core.message import Rebound, Situation, Suspect
+from aftbed.core.script import (
+    Attach,
+    Bind,
+    Fence,
+    Kill,
+    Promote,
+    Resume,
+    Script,
+    Spawn,
+    Suspend,
+    Transfer,
+    problems,
+)
+from aftbed.ftm.recovery import (
+    FAILURES_MAX,
+    RETRY_NS,
+    Recovery,
+    decide,
+    drop_backup,
+    failover,
+    new_backup,
+)
+
+WHOLE: Final = Situation("a", 1, "b", 1, 1, (), False)
+ALONE: Final = Situation("a", 1, "", 0, 1, ("b",), False)
+NOBODY: Final = Situation("", 0, "", 0, 1, ("a", "b"), True)
+
+
+def failed(situation: Situation) -> Situation:
+    return Situation(*(getattr(situation, f) for f in situation.__struct_fields__[:-1]), True)
+
+
+def ordered(effects: list[Effect]) -> list[Script]:
+    return [e.script for e in effects if isinstance(e, Order)]
+
+
+def alarm(replica: str, generation: int = 1) -> Suspect:
+    return Suspect(replica, generation, f"{replica}/server", "crash", 5)
+
+
+@pytest.mark.parametrize(
+    ("situation", "suspects", "script"),
+    [
+        (WHOLE, set(), None),
+        (WHOLE, {("a", 1)}, failover("a", "b", 2)),
+        (WHOLE, {("b", 1)}, drop_backup("a", "b")),
+        (WHOLE, {("a", 1), ("b", 1)}, drop_backup("a", "b")),
+        (WHOLE, {("a", 2)}, None),  # another generation's
+        (ALONE, set(), new_backup("a", "b")),
+        (ALONE, {("a", 1)}, None),  # nobody is left to take over
+        (Situation("a", 1, "", 0, 1, (), False), set(), None),  # the slot is not free yet
+        (Situation("b", 3, "a", 2, 5, (), False), {("b", 3)}, failover("b", "a", 6)),
+        (NOBODY, set(), None),
+    ],
+)
+def test_the_table_of_decisions(
+    situation: Situation, suspects: set[tuple[str, int]], script: Script | None
+) -> None:
+    assert decide(situation, suspects) == script
+
+
+@pytest.mark.parametrize("script", [failover("a", "b", 2), drop_backup("a", "b"), new_backup("a", "b")])
+def test_each_script_passes_its_check(script: Script) -> None:
+    assert problems(script) == []
+
+
+def test_a_failover_fences_before_it_promotes_and_promotes_before_it_attaches() -> None:
+    assert failover("a", "b", 2).commit == (Fence("a"), Promote("b", 2), Attach("b", 2), Kill("a"))
+
+
+def test_a_new_backup_gets_all_state_while_the_leader_is_suspended() -> None:
+    script = new_backup("a", "b")
+    assert script.prepare == (Spawn("b"),)
+    kinds = [type(verb) for verb in script.commit]
+    assert kinds == [Suspend, Transfer, Transfer, Bind, Resume]
+    assert {v.source for v in script.commit if isinstance(v, Transfer)} == {"a/protocol", "a/server"}
+
+
+def test_an_alarm_makes_it_act_and_the_report_ends_it() -> None:
+    brick = Recovery()
+    assert brick.step(CONTROL, WHOLE, 0) == []
+    effects = brick.step("wdg2rec", alarm("a"), 0)
+    assert ordered(effects) == [failover("a", "b", 2)] and notes(effects) == [Event.RECOVERY_ENTER]
+    assert not brick.quiescent()
+    effects = brick.step(CONTROL, Situation("b", 1, "", 0, 2, ("a",), False), 0)
+    assert notes(effects) == [Event.RECOVERY_EXIT]
+    assert ordered(effects) == [new_backup("b", "a")], "redundancy is restored at once"
+    effects = brick.step(CONTROL, Situation("b", 1, "a", 2, 2, (), False), 0)
+    assert notes(effects) == [Event.BACKUP_READY] and ordered(effects) == []
+    assert brick.quiescent()
+
+
+def test_one_script_at_a_time_what_comes_meanwhile_is_remembered() -> None:
+    brick = Recovery()
+    brick.step(CONTROL, ALONE, 0)
+    assert brick.ordered is not None
+    assert ordered(brick.step("wdg2rec", alarm("b", 2), 0)) == []
+    effects = brick.step(CONTROL, Situation("a", 1, "b", 2, 1, (), False), 0)
+    assert ordered(effects) == [drop_backup("a", "b")]
+
+
+def test_an_alarm_against_the_past_is_forgotten() -> None:
+    brick = Recovery()
+    brick.step(CONTROL, WHOLE, 0)
+    assert ordered(brick.step("wdg2rec", alarm("a", 7), 0)) == []
+    brick.step(CONTROL, WHOLE, 0)
+    assert brick.suspects == set()
+
+
+def test_an_alarm_that_comes_before_the_situation_waits_for_it() -> None:
+    brick = Recovery()
+    assert brick.step("wdg2rec", alarm("a"), 0) == []
+    assert ordered(brick.step(CONTROL, WHOLE, 0)) == [failover("a", "b", 2)]
+
+
+def test_a_new_recovery_knows_as_much_as_the_old_one() -> None:
+    """It died in the middle of a failover: the alarm is said again, how things stand is told."""
+    brick = Recovery()
+    assert brick.step(CONTROL, Rebound("wdg2rec", True, 1), 0) == []
+    brick.step("wdg2rec", alarm("a"), 0)
+    effects = brick.step(CONTROL, Situation("b", 1, "", 0, 2, ("a",), False), 0)
+    assert ordered(effects) == [new_backup("b", "a")]
+
+
+def test_a_new_backup_that_failed_is_tried_again_a_while_later() -> None:
+    brick = Recovery()
+    brick.step(CONTROL, ALONE, 0)
+    effects = brick.step(CONTROL, failed(ALONE), 1000)
+    assert effects == []
+    assert brick.deadline_ns() == 1000 + RETRY_NS
+    assert ordered(brick.step("wdg2rec", alarm("b", 9), 1001)) == [], "an alarm is no reason to hurry"
+    assert ordered(brick.wake(1000 + RETRY_NS)) == [new_backup("a", "b")]
+    assert brick.deadline_ns() is None
+
+
+def test_a_failover_does_not_wait_for_the_retry() -> None:
+    brick = Recovery()
+    brick.step(CONTROL, ALONE, 0)
+    brick.step(CONTROL, failed(WHOLE), 1000)
+    assert ordered(brick.step("wdg2rec", alarm("a"), 1001)) == [failover("a", "b", 2)]
+
+
+def test_after_enough_failures_it_gives_up() -> None:
+    brick, now_ns = Recovery(), 0
+    assert len(ordered(brick.step(CONTROL, ALONE, now_ns))) == 1
+    for _ in range(FAILURES_MAX - 1):
+        assert ordered(brick.step(CONTROL, failed(ALONE), now_ns)) == []
+        due_ns = brick.deadline_ns()
+        assert due_ns is not None
+        now_ns = due_ns
+        assert len(ordered(brick.wake(now_ns))) == 1
+    assert ordered(brick.step(CONTROL, failed(ALONE), now_ns)) == []
+    assert brick.deadline_ns() is None
+    assert ordered(brick.step("wdg2rec", alarm("b"), now_ns + 10 * RETRY_NS)) == []
+
+
+def test_a_success_lets_it_try_anew() -> None:
+    brick, now_ns = Recovery(), 0
+    for _ in range(FAILURES_MAX):
+        brick.step(CONTROL, failed(ALONE), now_ns)
+        now_ns += RETRY_NS
+    brick.step(CONTROL, WHOLE, now_ns)
+    brick.step("wdg2rec", alarm("b"), now_ns)
+    assert (
+        len(ordered(brick.step(CONTROL, ALONE, now_ns + RETRY_NS)))
+        + len(ordered(brick.wake(now_ns + RETRY_NS)))
+        == 1
+    )
+
+
+def test_when_all_is_lost_it_does_nothing() -> None:
+    brick = Recovery()
+    brick.step(CONTROL, WHOLE, 0)
+    brick.step("wdg2rec", alarm("a"), 0)
+    assert ordered(brick.step(CONTROL, NOBODY, 0)) == []
+    due_ns = brick.deadline_ns()
+    assert due_ns is not None and ordered(brick.wake(due_ns)) == []
+    assert brick.deadline_ns() is None
