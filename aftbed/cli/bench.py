@@ -1,13 +1,79 @@
+"""`aftbed bench`: every number that the README quotes, with the command that makes it."""
+
+from typing import Annotated, Final
+
 import typer
 
-bench = typer.Typer(help="Measure, beside the bare limit.", no_args_is_help=True, rich_markup_mode=None)
+bench = typer.Typer(
+    help="Measure, each time beside the bare limit.", no_args_is_help=True, rich_markup_mode=None
+)
+REQUESTS_MIN: Final = 5000
+KILLS_MIN: Final = 1
+
+Ftm = Annotated[str, typer.Option(help="none or pbr.")]
+Placement = Annotated[str, typer.Option(help="process or replica.")]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON document.")]
+Pin = Annotated[bool, typer.Option(help="Keep each replica's chain on one core.")]
 
 
 @bench.command()
-def cycle() -> None:
-    """x"""
+def cycle(
+    ftm: Ftm = "pbr",
+    placement: Placement = "process",
+    requests: Annotated[int, typer.Option(min=100, help="After the warm-up.")] = REQUESTS_MIN,
+    pin: Pin = True,
+    json: Json = False,
+) -> None:
+    """Cycle time seen by the client, in turn with a bare ring of as many hops."""
+    from aftbed.bench.cycle import bench_cycle  # noqa: PLC0415
+
+    _print(bench_cycle(ftm, placement, requests, pin=pin), as_json=json)
 
 
 @bench.command()
-def recovery() -> None:
-    """x"""
+def recovery(
+    ftm: Ftm = "pbr",
+    placement: Placement = "process",
+    kills: Annotated[int, typer.Option(min=KILLS_MIN, help="Of the primary.")] = 50,
+    pin: Pin = True,
+    json: Json = False,
+) -> None:
+    """From SIGKILL of the primary to the next good reply, by its parts."""
+    from aftbed.bench.recovery import bench_recovery  # noqa: PLC0415
+    from aftbed.core.errors import ConfigError  # noqa: PLC0415
+
+    if ftm == "none":
+        raise ConfigError("--ftm none: the bare server does not recover; pbr is allowed")
+    _print(bench_recovery(ftm, placement, kills, pin=pin), as_json=json)
+
+
+@bench.command()
+def launch(
+    ftm: Ftm = "pbr",
+    placement: Placement = "process",
+    runs: Annotated[int, typer.Option(min=1)] = 10,
+    json: Json = False,
+) -> None:
+    """From the start of `aftbed run` to the first reply; and the graph alone, from a warm zygote."""
+    from aftbed.bench.launch import bench_launch  # noqa: PLC0415
+
+    _print(bench_launch(ftm, placement, runs), as_json=json)
+
+
+@bench.command()
+def memory(ftm: Ftm = "pbr", placement: Placement = "process", json: Json = False) -> None:
+    """PSS and RSS of the graph's processes, and of all others apart."""
+    from aftbed.bench.memory import bench_memory  # noqa: PLC0415
+
+    _print(bench_memory(ftm, placement), as_json=json)
+
+
+def _print(found: dict[str, object], *, as_json: bool) -> None:
+    import json  # noqa: PLC0415
+
+    if as_json:
+        print(json.dumps(found))
+        return
+    for key, value in found.items():
+        parts = value.items() if isinstance(value, dict) else [("", value)]
+        print(f"{key:14} " + "  ".join(f"{name} {part}".strip() for name, part in parts))

@@ -4,15 +4,17 @@ import json
 import sys
 from typing import Final
 
+import msgspec
+
 from aftbed.core.errors import unknown
 from aftbed.core.fault import Act
 from aftbed.core.graph import Graph
 from aftbed.ftm.mechanism import build
 from aftbed.inject.words import build as build_fault
 from aftbed.runtime.unix import ask, rundir
+from aftbed.runtime.unix.resources import measured
 
 FORMATS: Final = ("text", "dot", "mermaid")
-CPU_SAMPLE_SECONDS: Final = 0.2
 
 
 def status(run: str | None, *, as_json: bool) -> None:
@@ -27,59 +29,20 @@ def status(run: str | None, *, as_json: bool) -> None:
 
 def ps(run: str | None, *, as_json: bool) -> None:
     """Print the processes of the run, the nodes first."""
-    found = ask.ask(rundir.find(run), ask.Processes())["processes"]
-    assert isinstance(found, list)
-    rows = measured(found)
+    rows = measured(ask.processes(rundir.find(run)))
     if as_json:
-        print(json.dumps(rows))
+        print(json.dumps(msgspec.to_builtins(rows)))
         return
     print(f"{'NAME':14} {'ROLE':10} {'PID':>7} {'CPU%':>6} {'PSS MB':>7}")
     for row in rows:
-        mark = "" if row["node"] else "  (beside)"
-        print(
-            f"{row['name']:14} {row['role']:10} {row['pid']:>7} {row['cpu_percent']:>6.1f}"
-            f" {row['pss_mb']:>7.1f}{mark}"
-        )
-    nodes_mb = [float(str(row["pss_mb"])) for row in rows if row["node"]]
+        mark = "" if row.node else "  (beside)"
+        print(f"{row.name:14} {row.role:10} {row.pid:>7} {row.cpu_percent:>6.1f} {row.pss_mb:>7.1f}{mark}")
+    nodes_mb = [row.pss_mb for row in rows if row.node]
     print(f"{len(nodes_mb)} processes, {sum(nodes_mb):.1f} MB; {len(rows) - len(nodes_mb)} beside")
-
-
-def measured(rows: list[dict[str, object]]) -> list[dict[str, object]]:
-    """The rows with CPU over a short while, PSS and RSS; those that have gone meanwhile are left out."""
-    import time  # noqa: PLC0415
-
-    import psutil  # noqa: PLC0415 - 15 ms
-
-    alive = []
-    for row in rows:
-        try:
-            process = psutil.Process(int(str(row["pid"])))
-            process.cpu_percent()
-            alive.append((row, process))
-        except psutil.Error:
-            continue
-    time.sleep(CPU_SAMPLE_SECONDS)
-    found = []
-    for row, process in alive:
-        try:
-            memory = process.memory_full_info()
-            found.append(
-                row
-                | {
-                    "cpu_percent": process.cpu_percent(),
-                    "pss_mb": round(memory.pss / 1e6, 2),
-                    "rss_mb": round(memory.rss / 1e6, 2),
-                }
-            )
-        except psutil.Error:
-            continue
-    return found
 
 
 def graph(run: str | None, ftm: str | None, placement: str, style: str) -> None:
     """Print the graph of an FTM, or of a live run."""
-    import msgspec  # noqa: PLC0415
-
     if style not in FORMATS:
         raise unknown("format", style, FORMATS)
     if ftm is not None:

@@ -11,6 +11,7 @@ import msgspec
 from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.core.fault import Fault
 from aftbed.runtime.unix import control, rundir
+from aftbed.runtime.unix.resources import Row
 
 
 class Status(msgspec.Struct, frozen=True, tag=True):
@@ -51,6 +52,11 @@ def same_user(sock: socket.socket, uid: int) -> bool:
     """Whether the peer's process belongs to `uid` (SO_PEERCRED, unix(7))."""
     raw = sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
     return bool(struct.unpack("3i", raw)[1] == uid)
+
+
+def processes(private: Path) -> list[Row]:
+    """The processes of the run in `private`."""
+    return msgspec.convert(ask(private, Processes())["processes"], list[Row])
 
 
 def ask(private: Path, question: Question) -> dict[str, object]:

@@ -21,6 +21,7 @@ from aftbed.runtime.unix.loop import Loop
 from aftbed.runtime.unix.zygote import start as start_zygote
 
 REAP_SECONDS: Final = 0.01
+SPARE_SECONDS_MAX: Final = 5.0  # a zygote imports first
 PARK_BATCH: Final = 4  # spares per order: the first of them start while the next are forked
 
 
@@ -118,10 +119,15 @@ class Nursery:
             while not self.parked[zygote]:
                 if not self._unborn[zygote]:
                     self.park(zygote, 1)
-                yield Wait(frozenset({("spare", zygote, 0)}), seconds=5.0)
+                yield Wait(frozenset({("spare", zygote, 0)}), seconds=SPARE_SECONDS_MAX)
             process = self.parked[zygote].popleft()
             if process.alive:
                 return process
+
+    def parked_at_least(self, zygote: str, count: int) -> Generator[Wait, dict[Key, bytes], None]:
+        """Wait until `count` spares are parked."""
+        while len(self.parked[zygote]) < count:
+            yield Wait(frozenset({("spare", zygote, 0)}), seconds=SPARE_SECONDS_MAX)
 
     def level(self, zygote: str, count: int) -> None:
         """Have `count` spares parked, in the end."""

@@ -107,6 +107,8 @@ class Supervisor:
 
     def _launch(self) -> Keys:
         yield from self.work.before(self.deployment)
+        for zygote, count in self.work.spares_for(self.deployment).items():
+            yield from self.nursery.parked_at_least(zygote, count)
         began_ns = time.monotonic_ns()
         yield from self.deployment.launch()
         self.graph_ms = (time.monotonic_ns() - began_ns) / 1e6

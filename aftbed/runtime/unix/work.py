@@ -67,6 +67,11 @@ class Work:
         gateway = GatewayOptions(self._options.port, dialogue, earlier, dbc, mapped)
         return "gateway", msgspec.msgpack.encode(gateway)
 
+    def spares_for(self, deployment: Deployment) -> dict[str, int]:
+        """How many spares of each zygote the graph takes."""
+        nodes = len(deployment.graph.nodes)
+        return {LIGHT: nodes} if isinstance(self._options.work, LoadRun) else {LIGHT: nodes - 1, BUS: 1}
+
     def before(self, deployment: Deployment) -> Keys:
         """What must stand before the graph does: the hub."""
         work = self._options.work
