@@ -3,7 +3,8 @@
 Layout of a journal file: one header page, then records of 32 bytes, little endian. A record is
 committed by its event code, which is written last; the first record without one ends the journal.
 So a `kill -9` loses at most the record in the making. The header also holds the node's pulse (when
-it was last seen running) and the flag by which the runtime announces control mail.
+it was last seen running), the flag by which the runtime announces control mail, and a lock that dies
+with the node.
 
 The client keeps a *dialogue* beside it: every request with its bytes, every reply with its bytes, in
 the order in which they happened. It is what G2 and G3 are judged by.
@@ -23,6 +24,7 @@ MAGIC: Final = b"AFTBEDJ1"
 HEADER_BYTES: Final = 4096
 PULSE_OFFSET: Final = 8  # u64, monotonic ns
 FLAG_OFFSET: Final = 16  # u8, not 0: control mail waits
+LIFELINE_OFFSET: Final = 32  # u32, a futex that the node holds
 NAME_OFFSET: Final = 64  # u8 length, then UTF-8
 NAME_BYTES_MAX: Final = 120
 

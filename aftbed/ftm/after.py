@@ -51,6 +51,11 @@ OPEN: Final = {
     State.APPLYING: ("srv2aft",),
 }
 
+# Bound once: a look-up in an enumeration is slow on the hot path.
+_IDLE: Final = State.IDLE
+_CAPTURING: Final = State.CAPTURING
+_SENT: Final = Event.CHECKPOINT_SENT
+
 
 class PbrAfter(Brick):
     """`duplex`: there is a backup to send checkpoints to."""
@@ -73,10 +78,9 @@ class PbrAfter(Brick):
 
     def step(self, port: str, msg: AnyMessage, now_ns: int) -> list[Effect]:
         """Handle one message; see MOVES and, for what the runtime says, `_told`."""
-        if isinstance(msg, Rebound | Promote):
-            return self._told(msg)
-        state = MOVES.get((self.state, type(msg)))
-        if state is None:
+        if (self.state, type(msg)) not in MOVES:
+            if isinstance(msg, (Rebound, Promote)):
+                return self._told(msg)
             raise PeerError(f"{type(msg).__name__} on {port} while {self.state.name}")
         if isinstance(msg, Reply):
             return self._capture(msg)
@@ -91,21 +95,21 @@ class PbrAfter(Brick):
         return self._take_over()
 
     def _capture(self, msg: Reply) -> list[Effect]:
-        self.state, self._reply = State.CAPTURING, msg
+        self.state, self._reply = _CAPTURING, msg
         return [Send("aft2srv", CaptureState(msg.epoch, msg.request_id))]
 
     def _checkpoint_and_reply(self, msg: StateCaptured) -> list[Effect]:
         assert self._reply is not None
         if msg.request_id != self._reply.request_id:
             raise PeerError(f"state of request {msg.request_id}, expected {self._reply.request_id}")
-        reply, self.state, self._reply = self._reply, State.IDLE, None
+        reply, self.state, self._reply = self._reply, _IDLE, None
         if not self.duplex:
             return [Send("aft2pro", reply)]
         # A crash between these two leaves a backup that can repeat the reply. Swapped, the client
         # could hold a reply that the backup never knew.
         return [
             Send("aft2aft", Checkpoint(reply.epoch, reply.request_id, reply.payload, msg.state)),
-            Note(Event.CHECKPOINT_SENT, reply.request_id),
+            Note(_SENT, reply.request_id),
             Send("aft2pro", reply),
         ]
 

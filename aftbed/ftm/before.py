@@ -8,6 +8,7 @@ from aftbed.core.event import Event
 from aftbed.core.message import AnyMessage, Request
 
 _OPEN: Final = ("pro2bfr",)
+_EXIT: Final = Event.BEFORE_EXIT  # bound once: a look-up in an enumeration is slow on the hot path
 
 
 class PassBefore(Brick):
@@ -25,4 +26,4 @@ class PassBefore(Brick):
         """Pass a request on."""
         if not isinstance(msg, Request):
             raise PeerError(f"{type(msg).__name__} on {port}")
-        return [Note(Event.BEFORE_EXIT, msg.request_id), Send("bfr2prd", msg)]
+        return [Note(_EXIT, msg.request_id), Send("bfr2prd", msg)]

@@ -33,6 +33,13 @@ MOVES: Final = {
 }
 OPEN: Final = {State.BACKUP: ("aft2pro",), State.IDLE: ("pxy2pro",), State.BUSY: ("aft2pro",)}
 
+# Bound once: a look-up in an enumeration is slow on the hot path.
+_IDLE: Final = State.IDLE
+_BUSY: Final = State.BUSY
+_RECEIVED: Final = Event.REQUEST_RECEIVED
+_STORED: Final = Event.REPLY_STORED
+_SENT: Final = Event.REPLY_SENT
+
 
 class Protocol(Brick):
     """`log` maps the ids of the last requests to their replies; `last_id` is the newest of them."""
@@ -53,10 +60,10 @@ class Protocol(Brick):
 
     def step(self, port: str, msg: AnyMessage, now_ns: int) -> list[Effect]:
         """Admit, answer out of the log, store, or take over."""
-        if isinstance(msg, Rebound):
-            return []
         state = MOVES.get((self.state, type(msg)))
         if state is None:
+            if isinstance(msg, Rebound):
+                return []
             raise PeerError(f"{type(msg).__name__} on {port} while {self.state.name}")
         if isinstance(msg, Request):
             return self._admit(msg)
@@ -75,8 +82,8 @@ class Protocol(Brick):
         if msg.epoch != self.epoch:
             raise PeerError(f"request {msg.request_id} under epoch {msg.epoch}, expected {self.epoch}")
         if msg.request_id > self.last_id:
-            self.state, self.busy_id = State.BUSY, msg.request_id
-            return [Note(Event.REQUEST_RECEIVED, msg.request_id), Send("pro2bfr", msg)]
+            self.state, self.busy_id = _BUSY, msg.request_id
+            return [Note(_RECEIVED, msg.request_id), Send("pro2bfr", msg)]
         stored = self.log.get(msg.request_id)
         if stored is None:
             raise PeerError(f"request {msg.request_id} is older than the {REPLIES_KEPT} replies kept")
@@ -89,12 +96,8 @@ class Protocol(Brick):
         if msg.request_id != self.busy_id:
             raise PeerError(f"reply to request {msg.request_id}, expected {self.busy_id}")
         self._store(msg.request_id, msg.payload)
-        self.state = State.IDLE
-        return [
-            Note(Event.REPLY_STORED, msg.request_id),
-            Send("pro2pxy", msg),
-            Note(Event.REPLY_SENT, msg.request_id),
-        ]
+        self.state = _IDLE
+        return [Note(_STORED, msg.request_id), Send("pro2pxy", msg), Note(_SENT, msg.request_id)]
 
     def _store(self, request_id: int, payload: bytes) -> None:
         assert request_id > self.last_id, f"reply {request_id} stored after {self.last_id}"

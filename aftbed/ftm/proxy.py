@@ -26,6 +26,11 @@ OPEN: Final[dict[State, tuple[str, ...]]] = {
     State.WAITING: ("pro2pxy",),
 }
 
+# Bound once: a look-up in an enumeration is slow on the hot path.
+_IDLE: Final = State.IDLE
+_WAITING: Final = State.WAITING
+_ACCEPTED: Final = Event.REPLY_ACCEPTED
+
 
 class Proxy(Brick):
     """`waiting` is the request under way; it survives a change of leader, under the new epoch."""
@@ -45,10 +50,10 @@ class Proxy(Brick):
 
     def step(self, port: str, msg: AnyMessage, now_ns: int) -> list[Effect]:
         """Pass a request on, a reply back, or go over to a new leader."""
-        if isinstance(msg, Request) and self.state is State.IDLE:
-            self.state, self.waiting = State.WAITING, Request(self.epoch, msg.request_id, msg.payload)
+        if isinstance(msg, Request) and self.state is _IDLE:
+            self.state, self.waiting = _WAITING, Request(self.epoch, msg.request_id, msg.payload)
             return [Send("pxy2pro", self.waiting)]
-        if isinstance(msg, Reply) and self.state is State.WAITING:
+        if isinstance(msg, Reply) and self.state is _WAITING:
             return self._reply(msg)
         if isinstance(msg, Rebound):
             return self._rebound(msg)
@@ -60,9 +65,9 @@ class Proxy(Brick):
             return [Note(Event.REPLY_REFUSED, reply.request_id, reply.epoch)]
         if reply.request_id != self.waiting.request_id:
             return []  # asked twice, over a failover or by a resending client: answered once
-        self.state, self.waiting = State.IDLE, None
+        self.state, self.waiting = _IDLE, None
         return [
-            Note(Event.REPLY_ACCEPTED, reply.request_id, reply.epoch << 8 | reply.replica),
+            Note(_ACCEPTED, reply.request_id, reply.epoch << 8 | reply.replica),
             Send("pxy2clt", reply),
         ]
 

@@ -39,6 +39,13 @@ _MESSAGES: Final = {
     State.EXECUTED: (CaptureState,),
 }
 
+# Bound once: a look-up in an enumeration is slow on the hot path.
+_READY: Final = State.READY
+_EXECUTED: Final = State.EXECUTED
+_ENTER: Final = Event.SERVER_ENTER
+_EXIT: Final = Event.SERVER_EXIT
+_CAPTURED: Final = Event.STATE_CAPTURED
+
 
 class Server(Brick):
     """`replica` (1 or 2) marks whose replies these are; `captured`: After asks for the state each time."""
@@ -61,16 +68,16 @@ class Server(Brick):
             raise PeerError(f"{type(msg).__name__} on {port} while {self.state.name}")
         if isinstance(msg, Request):
             payload = self.application.execute(msg.payload)
-            self.state = State.EXECUTED if self.captured else State.READY
+            self.state = _EXECUTED if self.captured else _READY
             return [
-                Note(Event.SERVER_ENTER, msg.request_id),
-                Note(Event.SERVER_EXIT, msg.request_id),
+                Note(_ENTER, msg.request_id),
+                Note(_EXIT, msg.request_id),
                 Send("srv2prd", Reply(msg.epoch, msg.request_id, self.replica, payload)),
             ]
         if isinstance(msg, CaptureState):
-            self.state = State.READY
+            self.state = _READY
             return [
-                Note(Event.STATE_CAPTURED, msg.request_id),
+                Note(_CAPTURED, msg.request_id),
                 Send("srv2aft", StateCaptured(msg.epoch, msg.request_id, self.application.capture())),
             ]
         assert isinstance(msg, RestoreState)

@@ -21,6 +21,7 @@ The state is one fixed layout of `STATE_BYTES`, doubles as they are, so that a r
 bit for bit. Only + - * / and comparisons on doubles: the same replies on every machine.
 """
 
+from collections.abc import Set
 from random import Random
 from struct import Struct
 from typing import Final
@@ -43,7 +44,7 @@ from aftbed.vehicle.aebmessages import (
     encode_request,
 )
 from aftbed.vehicle.threat import Threat, worst
-from aftbed.vehicle.tracker import Track
+from aftbed.vehicle.tracker import HITS_CONFIRMED, Track
 
 DEMAND_MS2: Final = (0.0, 0.0, 4.0, 9.0)  # by stage; full is more than the tyres give
 GAP_MS: Final = 500
@@ -57,8 +58,11 @@ TIMER_MAX_MS: Final = 60_000
 
 VERSION: Final = 1
 _HEADER: Final = Struct("<BBBBdqIIII")  # version, counter, stage, started, ego speed, time, four timers
-_TRACKS: Final = Struct("<" + "BBddd" * SLOTS)
-STATE_BYTES: Final = _HEADER.size + _TRACKS.size
+_TRACK: Final = Struct("<BBddd")  # hits, misses, range, speed, acceleration; all zero if the slot is free
+STATE_BYTES: Final = _HEADER.size + _TRACK.size * SLOTS
+_OFFSETS: Final = tuple(range(_HEADER.size, STATE_BYTES, _TRACK.size))  # by slot
+_EMPTY: Final = bytes(STATE_BYTES)
+_FREE: Final = bytes(_TRACK.size)
 
 
 class AebFunction:
@@ -74,28 +78,53 @@ class AebFunction:
         self._clear_ms = 0  # since something was last a threat
         self._still_ms = 0  # since the ego stood
         self._blind_ms = 0  # since a request last was not blind
-        self._tracks = [Track() for _ in range(SLOTS)]
+        self._tracks: dict[int, Track] = {}  # by slot, of the slots that are not free; in no order
 
     def execute(self, request: bytes) -> bytes:
         """Decide for one radar cycle. Raises PeerError, with nothing changed, on a bad request."""
         cycle = decode_request(request)
         elapsed_ms = self._advance(cycle)
-        self._measure(cycle, elapsed_ms / 1000)
-        threat = worst(self._tracks, self._ego_ms)
-        if _sees(cycle):
+        if cycle.ego_valid and cycle.radar_valid:
+            self._blind_ms = 0
+            self._measure(cycle.targets, elapsed_ms / 1000)
+            threat = worst(self._tracks, self._ego_ms)
             self._decide(threat, elapsed_ms)
-        elif self._blind_ms > BLIND_MS:
-            self._rest()
-        return encode_reply(self._reply(threat))
+        else:
+            threat = self._coast(elapsed_ms)
+        counter, stage = self._counter, self._stage
+        self._counter = (counter + 1) % COUNTER_COUNT
+        if threat is None:
+            return encode_reply(AebOutput(stage, DEMAND_MS2[stage], None, None, counter))
+        return encode_reply(AebOutput(stage, DEMAND_MS2[stage], threat.ttc_s, threat.slot, counter))
 
     def capture(self) -> bytes:
         """The whole state, `STATE_BYTES` long."""
-        fields: list[float] = []
-        for track in self._tracks:
-            fields += (track.hits, track.misses, track.range_m, track.speed_ms, track.acceleration_ms2)
-        timers = (self._warned_ms, self._clear_ms, self._still_ms, self._blind_ms)
-        flags = (VERSION, self._counter, self._stage, self._started)
-        return _HEADER.pack(*flags, self._ego_ms, self._t_ms, *timers) + _TRACKS.pack(*fields)
+        state = bytearray(_EMPTY)
+        _HEADER.pack_into(
+            state,
+            0,
+            VERSION,
+            self._counter,
+            self._stage,
+            self._started,
+            self._ego_ms,
+            self._t_ms,
+            self._warned_ms,
+            self._clear_ms,
+            self._still_ms,
+            self._blind_ms,
+        )
+        for slot, track in self._tracks.items():
+            _TRACK.pack_into(
+                state,
+                _OFFSETS[slot],
+                track.hits,
+                track.misses,
+                track.range_m,
+                track.speed_ms,
+                track.acceleration_ms2,
+            )
+        return bytes(state)
 
     def restore(self, state: bytes) -> None:
         """Become what `capture` saw. Raises PeerError, with nothing changed, if `state` is not one."""
@@ -117,41 +146,65 @@ class AebFunction:
         """Milliseconds since the last request; 0, with all tracks dropped, where that means nothing."""
         elapsed_ms = cycle.t_ms - self._t_ms
         if not (self._started and 0 <= elapsed_ms <= GAP_MS):
-            self._tracks = [Track() for _ in range(SLOTS)]
+            self._tracks = {}
             elapsed_ms = 0
         self._t_ms, self._started = cycle.t_ms, True
         if cycle.ego_valid:
             self._ego_ms = cycle.ego_speed_ms
-        self._blind_ms = 0 if _sees(cycle) else _later(self._blind_ms, elapsed_ms)
         return elapsed_ms
 
-    def _measure(self, cycle: AebInput, elapsed_s: float) -> None:
-        """Move all tracks on, and correct those that were seen."""
-        seen = 0
-        if _sees(cycle):
-            for target in cycle.targets:
-                seen |= 1 << target.slot
-                self._tracks[target.slot].hit(target, self._ego_ms, elapsed_s)
-        for slot, track in enumerate(self._tracks):
-            if track.hits and not seen >> slot & 1:
-                track.miss(self._ego_ms, elapsed_s)
+    def _measure(self, targets: tuple[AebTarget, ...], elapsed_s: float) -> None:
+        """Move all tracks on: correct those that were seen, begin those that are new, coast the others."""
+        tracks, ego_ms = self._tracks, self._ego_ms
+        for target in targets:
+            track = tracks.get(target.slot)
+            if track is None:
+                tracks[target.slot] = Track(1, 0, target.range_m, ego_ms + target.rel_speed_ms)
+            else:
+                track.hit(target, ego_ms, elapsed_s)
+        if len(tracks) > len(targets):
+            self._miss({target.slot for target in targets}, elapsed_s)
+
+    def _miss(self, seen: Set[int], elapsed_s: float) -> None:
+        """Coast the tracks that were not seen, and drop those that have not been for too long."""
+        for slot in [slot for slot in self._tracks if slot not in seen]:
+            if not self._tracks[slot].miss(self._ego_ms, elapsed_s):
+                del self._tracks[slot]
+
+    def _coast(self, elapsed_ms: int) -> Threat | None:
+        """A blind cycle: the stage is held, for at most `BLIND_MS`. Returns the threat for the record."""
+        self._blind_ms = _later(self._blind_ms, elapsed_ms)
+        self._miss(frozenset(), elapsed_ms / 1000)
+        if self._blind_ms > BLIND_MS:
+            self._rest()
+        return worst(self._tracks, self._ego_ms)
 
     def _decide(self, threat: Threat | None, elapsed_ms: int) -> None:
         """Raise the stage as the threat asks; end it when the threat is gone, or the ego has stood."""
         still = self._ego_ms <= STILL_SPEED_MS
         self._still_ms = _later(self._still_ms, elapsed_ms) if still else 0
-        self._warned_ms = _later(self._warned_ms, elapsed_ms) if self._stage else 0
-        persists = threat is not None and threat.persists()
-        self._clear_ms = 0 if persists else _later(self._clear_ms, elapsed_ms)
-        clear_ms_max = CLEAR_MS if any(track.confirmed() for track in self._tracks) else LOST_MS
-        if self._still_ms > STILL_MS or (not still and self._clear_ms > clear_ms_max):
+        if self._stage:
+            self._warned_ms = _later(self._warned_ms, elapsed_ms)
+        called = STAGE_NONE if threat is None else threat.stage()
+        if called or (threat is not None and threat.persists()):
+            self._clear_ms = 0
+        else:
+            self._clear_ms = _later(self._clear_ms, elapsed_ms)
+        if self._still_ms > STILL_MS or (not still and self._gone()):
             self._rest()
-        elif threat is not None and not still:
-            self._stage = max(self._stage, self._allowed(threat))
+        elif threat is not None and called > self._stage and not still:
+            self._stage = max(self._stage, self._allowed(called, threat))
 
-    def _allowed(self, threat: Threat) -> int:
+    def _gone(self) -> bool:
+        """True if nothing has been a threat for long enough; longer, where no track is left to show it."""
+        if self._clear_ms <= CLEAR_MS:
+            return False
+        if self._clear_ms > LOST_MS:
+            return True
+        return any(track.hits >= HITS_CONFIRMED for track in self._tracks.values())
+
+    def _allowed(self, stage: int, threat: Threat) -> int:
         """The stage that the threat calls for, or less while the warning has not lasted long enough."""
-        stage = threat.stage()
         if stage == STAGE_FULL and self._warned_ms < WARNED_MS and not threat.pressing():
             return STAGE_PARTIAL
         return stage
@@ -159,30 +212,19 @@ class AebFunction:
     def _rest(self) -> None:
         self._stage, self._warned_ms = STAGE_NONE, 0
 
-    def _reply(self, threat: Threat | None) -> AebOutput:
-        counter = self._counter
-        self._counter = (counter + 1) % COUNTER_COUNT
-        demand_ms2 = DEMAND_MS2[self._stage]
-        if threat is None:
-            return AebOutput(self._stage, demand_ms2, None, None, counter)
-        return AebOutput(self._stage, demand_ms2, threat.ttc_s, threat.slot, counter)
-
-
-def _sees(cycle: AebInput) -> bool:
-    return cycle.ego_valid and cycle.radar_valid
-
 
 def _later(timer_ms: int, elapsed_ms: int) -> int:
     return min(timer_ms + elapsed_ms, TIMER_MAX_MS)
 
 
-def _unpack_tracks(state: bytes) -> list[Track]:
-    """The tracks of a state. Raises PeerError on values that no execution can reach."""
-    fields = _TRACKS.unpack_from(state, _HEADER.size)
-    tracks = [Track(*fields[start : start + 5]) for start in range(0, len(fields), 5)]
-    for slot, track in enumerate(tracks):
-        if not track.plausible():
-            raise PeerError(f"state with {track} in slot {slot}")
+def _unpack_tracks(state: bytes) -> dict[int, Track]:
+    """The tracks of a state, by slot. Raises PeerError on values that no execution can reach."""
+    tracks: dict[int, Track] = {}
+    for slot, offset in enumerate(_OFFSETS):
+        if state[offset : offset + _TRACK.size] != _FREE:
+            tracks[slot] = Track(*_TRACK.unpack_from(state, offset))
+            if not tracks[slot].plausible():
+                raise PeerError(f"state with {tracks[slot]} in slot {slot}")
     return tracks
 
 

@@ -6,13 +6,13 @@ deceleration is the least constant one that leaves `MARGIN_M`, after the time ou
 at 10 km/h it stays small until the last moment, where a warning would come too late.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from typing import Final
 
 import msgspec
 
 from aftbed.vehicle.aebmessages import STAGE_FULL, STAGE_NONE, STAGE_PARTIAL, STAGE_WARN
-from aftbed.vehicle.tracker import Track
+from aftbed.vehicle.tracker import HITS_CONFIRMED, Track
 
 MARGIN_M: Final = 1.5  # bumper to bumper, at standstill
 REACTION_S: Final = 0.2  # dead time and lag of the brakes
@@ -40,8 +40,9 @@ class Threat(msgspec.Struct, frozen=True, gc=False):
 
     def persists(self) -> bool:
         """True if a braking that has begun must go on: it ends with our speed, or with the threat."""
-        near = self.ttc_s is not None and self.range_m <= NEAR_THREAT_M
-        return near or self.required_ms2 >= THREAT_MS2 or self.stage() != STAGE_NONE
+        if self.required_ms2 >= THREAT_MS2:
+            return True
+        return self.ttc_s is not None and (self.range_m <= NEAR_THREAT_M or self.ttc_s <= WARN_TTC_S)
 
     def pressing(self) -> bool:
         """True if full braking cannot wait for the warning to have lasted."""
@@ -58,31 +59,39 @@ class Threat(msgspec.Struct, frozen=True, gc=False):
         return STAGE_NONE
 
 
-def worst(tracks: Sequence[Track], ego_ms: float) -> Threat | None:
-    """The confirmed track that takes the most braking, the lowest slot among equals; None if none does."""
-    slot, most_ms2 = -1, 0.0
-    for candidate, track in enumerate(tracks):
-        if track.confirmed():
+def worst(tracks: Mapping[int, Track], ego_ms: float) -> Threat | None:
+    """The confirmed track, by slot, that takes the most braking; None if none does.
+
+    Of equals it is the lowest slot, in whatever order they come.
+    """
+    worst_slot, most_ms2 = -1, 0.0
+    for slot, track in tracks.items():
+        if track.hits >= HITS_CONFIRMED:
             required_ms2 = required_deceleration_ms2(track, ego_ms)
-            if required_ms2 > most_ms2:
-                slot, most_ms2 = candidate, required_ms2
-    if slot < 0:
+            if required_ms2 > most_ms2 or (required_ms2 == most_ms2 and slot < worst_slot):
+                worst_slot, most_ms2 = slot, required_ms2
+    if worst_slot < 0:
         return None
-    range_m, closing_ms = tracks[slot].range_m, ego_ms - tracks[slot].speed_ms
-    return Threat(slot, range_m, most_ms2, range_m / closing_ms if closing_ms > 0.0 else None)
+    range_m, closing_ms = tracks[worst_slot].range_m, ego_ms - tracks[worst_slot].speed_ms
+    return Threat(worst_slot, range_m, most_ms2, range_m / closing_ms if closing_ms > 0.0 else None)
 
 
 def required_deceleration_ms2(track: Track, ego_ms: float) -> float:
     """The least constant deceleration, m/s2, that leaves `MARGIN_M`; 0 if no braking is needed."""
-    closing_ms = ego_ms - track.speed_ms
-    room_m = max(ROOM_MIN_M, track.range_m - MARGIN_M - max(0.0, closing_ms) * REACTION_S)
-    if -track.acceleration_ms2 >= LEAD_BRAKING_MS2 and track.speed_ms > 0.0 and ego_ms > 0.0:
+    speed_ms = track.speed_ms
+    closing_ms = ego_ms - speed_ms
+    room_m = track.range_m - MARGIN_M
+    if closing_ms > 0.0:
+        room_m -= closing_ms * REACTION_S
+    if room_m < ROOM_MIN_M:
+        room_m = ROOM_MIN_M
+    if -track.acceleration_ms2 >= LEAD_BRAKING_MS2 and speed_ms > 0.0 and ego_ms > 0.0:
         required_ms2 = _behind_a_braking_car_ms2(track, ego_ms, room_m)
     elif closing_ms > 0.0:
         required_ms2 = closing_ms * closing_ms / (2.0 * room_m)
     else:
         return 0.0
-    return min(required_ms2, REQUIRED_MAX_MS2)
+    return required_ms2 if required_ms2 < REQUIRED_MAX_MS2 else REQUIRED_MAX_MS2
 
 
 def _behind_a_braking_car_ms2(track: Track, ego_ms: float, room_m: float) -> float:

@@ -7,11 +7,15 @@ says so.
 
 A measurement that no target can reach from the last one belongs to another target: the track starts anew.
 Every field stays in the ranges below, so whatever the function can capture it can restore.
+
+A request is served between context switches, with cold caches: what counts is how many objects and
+functions it touches. So there are tracks only where there are targets, limits are comparisons and not
+calls of `min` and `max`, and `Track` is a plain class with slots (a msgspec struct takes a slower way to
+each assignment).
 """
 
+from dataclasses import dataclass
 from typing import Final
-
-import msgspec
 
 from aftbed.vehicle.aebmessages import RANGE_MAX_M, SPEED_MAX_MS, AebTarget
 
@@ -30,23 +34,20 @@ GROUND_SPEED_MAX_MS: Final = 2 * SPEED_MAX_MS
 ACCELERATION_MAX_MS2: Final = 50.0
 
 
-class Track(msgspec.Struct, gc=False):
-    """One slot. `hits` 0 means that the slot is free, and then all else is 0 too."""
+@dataclass(slots=True)
+class Track:
+    """The target in one slot. There is none without a hit: a free slot has no track."""
 
-    hits: int = 0
-    misses: int = 0
-    range_m: float = 0.0
-    speed_ms: float = 0.0  # over ground
+    hits: int
+    misses: int
+    range_m: float
+    speed_ms: float  # over ground
     acceleration_ms2: float = 0.0  # over ground
-
-    def confirmed(self) -> bool:
-        """True if the track may be acted on."""
-        return self.hits >= HITS_CONFIRMED
 
     def hit(self, target: AebTarget, ego_ms: float, elapsed_s: float) -> None:
         """Correct the track by a measurement `elapsed_s` after the last, or begin it anew."""
         speed_ms = ego_ms + target.rel_speed_ms
-        if self.hits and not target.new:
+        if not target.new:
             self.predict(ego_ms, elapsed_s)
             off_m = target.range_m - self.range_m
             off_ms = speed_ms - self.speed_ms
@@ -56,39 +57,42 @@ class Track(msgspec.Struct, gc=False):
         self.hits, self.misses = 1, 0
         self.range_m, self.speed_ms, self.acceleration_ms2 = target.range_m, speed_ms, 0.0
 
-    def miss(self, ego_ms: float, elapsed_s: float) -> None:
-        """Coast, or drop the track."""
+    def miss(self, ego_ms: float, elapsed_s: float) -> bool:
+        """Coast. False if the track has to be dropped."""
         self.misses += 1
-        if self.misses > MISSES_MAX:
-            self.hits = self.misses = 0
-            self.range_m = self.speed_ms = self.acceleration_ms2 = 0.0
-        else:
-            self.predict(ego_ms, elapsed_s)
+        self.predict(ego_ms, elapsed_s)
+        return self.misses <= MISSES_MAX
 
     def predict(self, ego_ms: float, elapsed_s: float) -> None:
         """Where the target is now, if nothing changed. A car that brakes does not start backwards."""
-        self.range_m = max(0.0, min(RANGE_MAX_M, self.range_m + (self.speed_ms - ego_ms) * elapsed_s))
-        ahead_ms = self.speed_ms + self.acceleration_ms2 * elapsed_s
-        if ahead_ms < 0.0 < self.speed_ms:
-            ahead_ms = self.acceleration_ms2 = 0.0
-        self.speed_ms = max(-GROUND_SPEED_MAX_MS, min(GROUND_SPEED_MAX_MS, ahead_ms))
+        before_ms = self.speed_ms
+        range_m = self.range_m + (before_ms - ego_ms) * elapsed_s
+        if range_m > RANGE_MAX_M:
+            range_m = RANGE_MAX_M
+        self.range_m = range_m if range_m > 0.0 else 0.0
+        speed_ms = before_ms + self.acceleration_ms2 * elapsed_s
+        if speed_ms < 0.0 < before_ms:
+            speed_ms = self.acceleration_ms2 = 0.0
+        elif not -GROUND_SPEED_MAX_MS <= speed_ms <= GROUND_SPEED_MAX_MS:
+            speed_ms = GROUND_SPEED_MAX_MS if speed_ms > 0.0 else -GROUND_SPEED_MAX_MS
+        self.speed_ms = speed_ms
 
     def _correct(self, off_m: float, off_ms: float) -> None:
         self.range_m += ALPHA * off_m
         self.speed_ms += BETA * off_ms
-        change_ms2 = GAMMA_PER_S * off_ms
-        self.acceleration_ms2 = max(
-            -ACCELERATION_MAX_MS2, min(ACCELERATION_MAX_MS2, self.acceleration_ms2 + change_ms2)
-        )
-        self.hits = min(self.hits + 1, HITS_MAX)
+        speeding_ms2 = self.acceleration_ms2 + GAMMA_PER_S * off_ms
+        if not -ACCELERATION_MAX_MS2 <= speeding_ms2 <= ACCELERATION_MAX_MS2:
+            speeding_ms2 = ACCELERATION_MAX_MS2 if speeding_ms2 > 0.0 else -ACCELERATION_MAX_MS2
+        self.acceleration_ms2 = speeding_ms2
         self.misses = 0
+        if self.hits < HITS_MAX:
+            self.hits += 1
 
     def plausible(self) -> bool:
         """True if an execution can have left the track like this. NaN fails every comparison."""
-        if self.hits == 0:
-            return self == Track()
         return (
-            self.misses <= MISSES_MAX
+            self.hits > 0
+            and self.misses <= MISSES_MAX
             and 0.0 <= self.range_m <= RANGE_MAX_M
             and -GROUND_SPEED_MAX_MS <= self.speed_ms <= GROUND_SPEED_MAX_MS
             and -ACCELERATION_MAX_MS2 <= self.acceleration_ms2 <= ACCELERATION_MAX_MS2

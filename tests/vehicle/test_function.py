@@ -238,7 +238,7 @@ def test_another_target_in_the_slot_starts_anew(other: AebTarget) -> None:
 
 
 def test_a_track_follows_a_moving_target() -> None:
-    track = Track()
+    track = Track(1, 0, 0.0, 0.0)
     for n in range(200):
         track.hit(AebTarget(0, 60.0 - 5.0 * 0.02 * n, -5.0), EGO_MS, 0.02)
     assert track.range_m == pytest.approx(60.0 - 5.0 * 0.02 * 199, abs=0.01)
@@ -246,7 +246,7 @@ def test_a_track_follows_a_moving_target() -> None:
 
 
 def test_a_track_sees_a_car_brake_within_half_a_second() -> None:
-    track = Track()
+    track = Track(1, 0, 0.0, 0.0)
     for n in range(50):
         braked_s = max(0.0, (n - 25) * 0.02)
         track.hit(AebTarget(0, 30.0 - 3.0 * braked_s**2, -6.0 * braked_s), EGO_MS, 0.02)

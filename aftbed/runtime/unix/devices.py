@@ -18,6 +18,7 @@ from aftbed.core.message import NodeDied, Pulses, Reply, Request, Submit
 from aftbed.ftm.client import Client
 from aftbed.ftm.watchdog import PERIOD_NS
 from aftbed.runtime.unix.journal import Dialogue, Header
+from aftbed.runtime.unix.lifeline import Watcher
 
 ASK: Final = Event.REQUEST_SENT
 
@@ -57,13 +58,15 @@ class Device(Protocol):
 
 
 class Sensor:
-    """The senses of a Watchdog: pidfds, and the pulses in the journals of its replica."""
+    """The senses of a Watchdog: lifelines, pidfds, and the pulses in the journals of its replica."""
 
     port = "sense"
 
     def __init__(self) -> None:
         self._pidfds: dict[int, str] = {}
         self._headers: dict[str, Header] = {}
+        self._nodes: tuple[str, ...] = ()
+        self._lifelines: Watcher | None = None
         self._died: deque[str] = deque()
         self._next_ns = 0
 
@@ -72,6 +75,7 @@ class Sensor:
         self.forget()
         self._pidfds = dict(zip(pidfds, nodes, strict=True))
         self._headers = {n: Header(Path(j)) for n, j in zip(nodes, journals, strict=True)}
+        self._nodes, self._lifelines = nodes, Watcher(journals)
 
     def forget(self) -> None:
         """Watch nobody."""
@@ -79,15 +83,21 @@ class Sensor:
             os.close(fd)
         for header in self._headers.values():
             header.close()
-        self._pidfds, self._headers = {}, {}
+        if self._lifelines is not None:
+            self._lifelines.close()
+        self._pidfds, self._headers, self._lifelines = {}, {}, None
         self._died.clear()
 
     def fds(self) -> tuple[int, ...]:
-        """One pidfd per watched node that lives."""
-        return tuple(self._pidfds)
+        """One pidfd per watched node that lives, and all lifelines together."""
+        lifelines = (self._lifelines.fd,) if self._lifelines is not None else ()
+        return (*lifelines, *self._pidfds)
 
     def ready(self, fd: int, now_ns: int) -> None:
         """A readable pidfd is a dead process; it stays readable, so it goes."""
+        if self._lifelines is not None and fd == self._lifelines.fd:
+            self._died += [self._nodes[index] for index in self._lifelines.died()]
+            return
         self._died.append(self._pidfds.pop(fd))
         os.close(fd)
 

@@ -36,6 +36,7 @@ from aftbed.core.message import AnyMessage, ChannelEnded, Message, Promoted, Reb
 from aftbed.runtime.unix import control, rehearsal
 from aftbed.runtime.unix.devices import Device, Sensor
 from aftbed.runtime.unix.journal import Journal
+from aftbed.runtime.unix.lifeline import Held
 
 PULSE_SECONDS: Final = 0.02
 REHEARSAL_MS: Final = 20.0  # of waiting at the start; the whole graph is there by then
@@ -107,6 +108,7 @@ class Node:
         self._plans: dict[tuple[tuple[str, ...], ...], Plan] = {}
         self._hot_inlets: dict[tuple[str, ...], Inlet] = {}
         self._timed = False
+        self.lifeline: Held | None = None  # kept, not used: it is for the kernel to read when we die
         self._hot: Hosted | None = None  # served by the tight loop
         self._suspend_token = 0  # not 0: suspend as soon as quiescent
         self._suspended = False

@@ -12,6 +12,7 @@ from aftbed.ftm.client import Client
 from aftbed.runtime.unix import control, linux
 from aftbed.runtime.unix.devices import Device, Load, LoadOptions, Sensor
 from aftbed.runtime.unix.journal import Journal
+from aftbed.runtime.unix.lifeline import Held
 from aftbed.runtime.unix.node import EXIT_ASSERT, PULSE_SECONDS, Node
 from aftbed.runtime.unix.options import GatewayOptions
 from aftbed.vehicle.function import default_application, sample_requests
@@ -45,6 +46,7 @@ def _build(line: control.Line[control.ToNode], order: control.Assign, fds: list[
     linux.set_timeouts(line.sock, PULSE_SECONDS, 2.0)
     node = Node(order.node, line, Journal(Path(order.journal), order.node))
     node.start_pulse()
+    node.lifeline = Held(Path(order.journal))
     setting = Setting(order.replica, order.epoch, order.leads, default_application)
     for name, kind in order.bricks:
         node.add(name, make(kind, setting))

@@ -34,6 +34,7 @@ from aftbed.runtime.unix.work import Work
 
 TICK_SECONDS: Final = 0.02
 TELL_SECONDS: Final = 0.005
+LOSS_SECONDS: Final = 0.5  # a failover is done long before
 HANG_NS: Final = 150_000_000  # of what no Watchdog watches; a channel's pulse is 20 ms
 LATE_NS_MAX: Final = 40_000_000
 DRAIN_SECONDS_MAX: Final = 2.0
@@ -300,6 +301,20 @@ class Supervisor:
             self._finish(f"{process.name} died")
         elif process.kind == "node" and self._replaceable(process.name):
             self._replace(process.name)
+        else:
+            self.loop.after(LOSS_SECONDS, self._look_for_loss)
+
+    def _look_for_loss(self) -> None:
+        """No replica is left and none will come: say so, and end a load, which would wait for ever."""
+        deployment = self.deployment
+        if self._ending or self.executor.busy or deployment.backup:
+            return
+        slot = deployment.slots.get(deployment.leader)
+        if slot is not None and slot.nodes and all(deployment.lives(node) for node in slot.nodes):
+            return
+        self.tell("lost", "no replica is left: the service is gone")
+        if isinstance(self.options.work, LoadRun):
+            self._finish("")
 
     def _replaceable(self, node: str) -> bool:
         bricks = self.deployment.graph.nodes[node]

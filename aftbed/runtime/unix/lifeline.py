@@ -1,0 +1,151 @@
+"""The lifeline: word of a death half a millisecond before the pidfd has it.
+
+A process that is killed first gives back its memory, page by page, and only then becomes a zombie that
+a pidfd reports. But before the memory goes, the kernel walks the list of robust futexes that the dead
+thread held (set_robust_list(2)), marks each with `FUTEX_OWNER_DIED` and wakes who waits for it. So each
+node holds one, a word in the header of its journal, and each Watchdog's host has a thread that waits
+for the words of its replica, all in one call (futex_waitv(2), Linux 5.16).
+
+No instruction of the dead process runs after that point, so a word is as good as a pidfd; where a kernel
+has no futex_waitv, the pidfds, which are watched all the same, tell it later.
+"""
+
+import ctypes
+import errno
+import mmap
+import os
+import signal
+import threading
+import time
+from pathlib import Path
+from typing import Final
+
+from aftbed.core.journal import HEADER_BYTES, LIFELINE_OFFSET
+
+SYS_SET_ROBUST_LIST: Final = {"x86_64": 273, "aarch64": 99}.get(os.uname().machine, -1)
+SYS_FUTEX_WAITV: Final = 449  # the same number on every architecture
+FUTEX_WAITERS: Final = 0x8000_0000
+FUTEX_OWNER_DIED: Final = 0x4000_0000
+FUTEX2_SIZE_U32: Final = 2  # and not private: the word is shared between processes
+CLOCK_MONOTONIC: Final = 1
+WAIT_SECONDS: Final = 0.25  # then the thread looks whether it is still wanted
+
+_libc: Final = ctypes.CDLL(None, use_errno=True)
+
+
+class _RobustList(ctypes.Structure):
+    _fields_ = (("next", ctypes.c_void_p),)
+
+
+class _RobustListHead(ctypes.Structure):
+    _fields_ = (
+        ("next", ctypes.c_void_p),
+        ("futex_offset", ctypes.c_long),
+        ("pending", ctypes.c_void_p),
+    )
+
+
+class _Waiter(ctypes.Structure):
+    _fields_ = (
+        ("value", ctypes.c_uint64),
+        ("address", ctypes.c_uint64),
+        ("flags", ctypes.c_uint32),
+        ("reserved", ctypes.c_uint32),
+    )
+
+
+class _Timespec(ctypes.Structure):
+    _fields_ = (("seconds", ctypes.c_long), ("nanoseconds", ctypes.c_long))
+
+
+class Word:
+    """The futex in the header of the journal at `path`, mapped by itself: a journal's mapping may move."""
+
+    def __init__(self, path: Path) -> None:
+        descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC)
+        try:
+            self._mapping = mmap.mmap(descriptor, HEADER_BYTES)
+        finally:
+            os.close(descriptor)
+        self._word = ctypes.c_uint32.from_buffer(self._mapping, LIFELINE_OFFSET)
+        self.address = ctypes.addressof(self._word)
+
+    @property
+    def value(self) -> int:
+        """The word as it is now."""
+        return self._word.value
+
+    @value.setter
+    def value(self, value: int) -> None:
+        self._word.value = value
+
+
+class Held:
+    """This thread's word. Keep it: the kernel reads its memory when this thread dies."""
+
+    def __init__(self, path: Path) -> None:
+        self._word = Word(path)
+        self._entry, self._head = _RobustList(), _RobustListHead()
+        self._entry.next = ctypes.addressof(self._head)
+        self._head.next = ctypes.addressof(self._entry)
+        self._head.futex_offset = self._word.address - ctypes.addressof(self._entry)
+        if SYS_SET_ROBUST_LIST < 0:
+            return
+        size = ctypes.c_size_t(ctypes.sizeof(self._head))
+        if _libc.syscall(SYS_SET_ROBUST_LIST, ctypes.byref(self._head), size) == 0:
+            self._word.value = threading.get_native_id() | FUTEX_WAITERS
+
+
+class Watcher:
+    """Writes the index of each holder that dies into a pipe, one byte each; `fd` is its reading end."""
+
+    def __init__(self, paths: tuple[str, ...]) -> None:
+        self.fd, self._pipe = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
+        self._words = [Word(Path(path)) for path in paths]
+        self._wanted = True
+        self._thread = threading.Thread(target=self._watch, name="lifeline", daemon=True)
+        self._thread.start()
+
+    def died(self) -> bytes:
+        """The indices of those that have died since the last call."""
+        try:
+            return os.read(self.fd, 64)
+        except BlockingIOError:
+            return b""
+
+    def close(self) -> None:
+        """Watch no more; the thread ends within `WAIT_SECONDS`."""
+        self._wanted = False
+        os.close(self.fd)
+
+    def _watch(self) -> None:
+        signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())  # they are the main thread's
+        alive = [i for i, word in enumerate(self._words) if word.value]
+        try:
+            while alive and self._wanted:
+                dead = [i for i in alive if self._words[i].value & FUTEX_OWNER_DIED]
+                if dead:
+                    os.write(self._pipe, bytes(dead))
+                    alive = [i for i in alive if i not in dead]
+                elif not self._wait([self._words[i] for i in alive]):
+                    return
+        except BrokenPipeError:
+            return
+        finally:
+            os.close(self._pipe)
+
+    @staticmethod
+    def _wait(words: list[Word]) -> bool:
+        """Until one of `words` changes, or a while has passed; False where the kernel cannot do it."""
+        waiters = (_Waiter * len(words))()
+        for waiter, word in zip(waiters, words, strict=True):
+            value = word.value
+            if value & FUTEX_OWNER_DIED:
+                return True
+            waiter.value, waiter.address, waiter.flags = value, word.address, FUTEX2_SIZE_U32
+        limit_ns = time.monotonic_ns() + round(WAIT_SECONDS * 1e9)
+        limit = _Timespec(limit_ns // 10**9, limit_ns % 10**9)
+        done = _libc.syscall(
+            SYS_FUTEX_WAITV, waiters, len(words), 0, ctypes.byref(limit), ctypes.c_int(CLOCK_MONOTONIC)
+        )
+        return done >= 0 or ctypes.get_errno() in (errno.ETIMEDOUT, errno.EAGAIN, errno.EINTR)
