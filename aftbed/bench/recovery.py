@@ -26,10 +26,11 @@ def bench_recovery(ftm: str, placement: str, kills: int, *, pin: bool = True) ->
     """`recovery_ms{p50,p99,max}` and its parts: detection, fencing, promotion, first reply."""
     launched = start(ftm, placement, LoadRun(REQUESTS_ENDLESS, 0.0), pin=pin)
     try:
-        for epoch in range(1, kills + 1):
-            _wait_for_redundancy(launched.private, epoch)
+        epoch = 0
+        for _ in range(kills):
+            epoch = _wait_for_redundancy(launched.private, epoch)
             ask.ask(launched.private, ask.Inject(Fault(Act.CRASH, "primary", Trigger())))
-        _wait_for_redundancy(launched.private, kills + 1)
+        _wait_for_redundancy(launched.private, epoch)
         launched.stop()
     except BaseException:
         launched.stop()
@@ -57,16 +58,20 @@ def bench_recovery(ftm: str, placement: str, kills: int, *, pin: bool = True) ->
     }
 
 
-def _wait_for_redundancy(private: Path, epoch: int) -> None:
-    """Until two replicas serve under `epoch`: before, a kill may hit a leader that has no backup yet."""
+def _wait_for_redundancy(private: Path, epoch: int) -> int:
+    """Until two replicas serve under a later epoch than `epoch`; which.
+
+    Before, a kill may hit a leader that has no backup yet.
+    """
     limit = time.monotonic() + REDUNDANCY_SECONDS_MAX
     while time.monotonic() < limit:
         try:
             status = ask.ask(private, ask.Status())
         except ConfigError:
             status = {}  # still starting
-        if status.get("epoch") == epoch and status.get("backup") and not status.get("busy"):
+        now = int(str(status.get("epoch", 0)))
+        if now > epoch and status.get("backup") and not status.get("busy"):
             time.sleep(PAUSE_SECONDS)
-            return
+            return now
         time.sleep(POLL_SECONDS)
     raise HarnessError(f"no redundancy within {REDUNDANCY_SECONDS_MAX} s")

@@ -18,7 +18,7 @@ held, for at most `BLIND_MS`. That a radar cannot be believed must never end a b
 Time that runs backwards, or jumps by more than `GAP_MS`, starts all tracks anew: nothing old may brake.
 
 The state is one fixed layout of `STATE_BYTES`, doubles as they are, so that a restored replica goes on
-bit for bit. Only + - * / and comparisons on doubles: the same replies on every machine.
+bit for bit; a slot without a track is zero in it. Only + - * / and comparisons on doubles: the same replies on every machine.
 """
 
 from collections.abc import Set
@@ -162,7 +162,7 @@ class AebFunction:
                 tracks[target.slot] = Track(1, 0, target.range_m, ego_ms + target.rel_speed_ms)
             else:
                 track.hit(target, ego_ms, elapsed_s)
-        if len(tracks) > len(targets):
+        if len(tracks) > len(targets):  # every target has its track by now, and no slot comes twice
             self._miss({target.slot for target in targets}, elapsed_s)
 
     def _miss(self, seen: Set[int], elapsed_s: float) -> None:
@@ -183,17 +183,13 @@ class AebFunction:
         """Raise the stage as the threat asks; end it when the threat is gone, or the ego has stood."""
         still = self._ego_ms <= STILL_SPEED_MS
         self._still_ms = _later(self._still_ms, elapsed_ms) if still else 0
-        if self._stage:
-            self._warned_ms = _later(self._warned_ms, elapsed_ms)
-        called = STAGE_NONE if threat is None else threat.stage()
-        if called or (threat is not None and threat.persists()):
-            self._clear_ms = 0
-        else:
-            self._clear_ms = _later(self._clear_ms, elapsed_ms)
-        if self._still_ms > STILL_MS or (not still and self._gone()):
+        self._warned_ms = _later(self._warned_ms, elapsed_ms) if self._stage else 0
+        persists = threat is not None and threat.persists()
+        self._clear_ms = 0 if persists else _later(self._clear_ms, elapsed_ms)
+        if self._still_ms > STILL_MS or (not (still or persists) and self._gone()):
             self._rest()
-        elif threat is not None and called > self._stage and not still:
-            self._stage = max(self._stage, self._allowed(called, threat))
+        elif threat is not None and persists and not still:
+            self._stage = max(self._stage, self._allowed(threat))
 
     def _gone(self) -> bool:
         """True if nothing has been a threat for long enough; longer, where no track is left to show it."""
@@ -203,8 +199,9 @@ class AebFunction:
             return True
         return any(track.hits >= HITS_CONFIRMED for track in self._tracks.values())
 
-    def _allowed(self, stage: int, threat: Threat) -> int:
+    def _allowed(self, threat: Threat) -> int:
         """The stage that the threat calls for, or less while the warning has not lasted long enough."""
+        stage = threat.stage()
         if stage == STAGE_FULL and self._warned_ms < WARNED_MS and not threat.pressing():
             return STAGE_PARTIAL
         return stage
@@ -214,11 +211,15 @@ class AebFunction:
 
 
 def _later(timer_ms: int, elapsed_ms: int) -> int:
-    return min(timer_ms + elapsed_ms, TIMER_MAX_MS)
+    later_ms = timer_ms + elapsed_ms
+    return later_ms if later_ms < TIMER_MAX_MS else TIMER_MAX_MS
 
 
 def _unpack_tracks(state: bytes) -> dict[int, Track]:
-    """The tracks of a state, by slot. Raises PeerError on values that no execution can reach."""
+    """The tracks of a state, by slot. Raises PeerError on values that no execution can reach.
+
+    A free slot is zero to the bit, or what is captured next would not be this state.
+    """
     tracks: dict[int, Track] = {}
     for slot, offset in enumerate(_OFFSETS):
         if state[offset : offset + _TRACK.size] != _FREE:

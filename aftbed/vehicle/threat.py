@@ -80,11 +80,8 @@ def required_deceleration_ms2(track: Track, ego_ms: float) -> float:
     """The least constant deceleration, m/s2, that leaves `MARGIN_M`; 0 if no braking is needed."""
     speed_ms = track.speed_ms
     closing_ms = ego_ms - speed_ms
-    room_m = track.range_m - MARGIN_M
-    if closing_ms > 0.0:
-        room_m -= closing_ms * REACTION_S
-    if room_m < ROOM_MIN_M:
-        room_m = ROOM_MIN_M
+    free_m = track.range_m - MARGIN_M - (closing_ms * REACTION_S if closing_ms > 0.0 else 0.0)
+    room_m = free_m if free_m > ROOM_MIN_M else ROOM_MIN_M
     if -track.acceleration_ms2 >= LEAD_BRAKING_MS2 and speed_ms > 0.0 and ego_ms > 0.0:
         required_ms2 = _behind_a_braking_car_ms2(track, ego_ms, room_m)
     elif closing_ms > 0.0:

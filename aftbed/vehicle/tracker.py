@@ -67,9 +67,9 @@ class Track:
         """Where the target is now, if nothing changed. A car that brakes does not start backwards."""
         before_ms = self.speed_ms
         range_m = self.range_m + (before_ms - ego_ms) * elapsed_s
-        if range_m > RANGE_MAX_M:
-            range_m = RANGE_MAX_M
-        self.range_m = range_m if range_m > 0.0 else 0.0
+        if not 0.0 < range_m <= RANGE_MAX_M:
+            range_m = RANGE_MAX_M if range_m > 0.0 else 0.0
+        self.range_m = range_m
         speed_ms = before_ms + self.acceleration_ms2 * elapsed_s
         if speed_ms < 0.0 < before_ms:
             speed_ms = self.acceleration_ms2 = 0.0

@@ -136,6 +136,7 @@ class WatchNodes(Order, frozen=True):
     generation: int
     nodes: tuple[str, ...]
     journals: tuple[str, ...]
+    pids: tuple[int, ...]
 
 
 class Arm(Order, frozen=True):

@@ -143,7 +143,12 @@ class Deployment:
         yield from self.ask(
             watchdog,
             lambda token: control.WatchNodes(
-                token, slot.name, slot.generation, tuple(slot.nodes), tuple(str(h.journal) for h in hosts)
+                token,
+                slot.name,
+                slot.generation,
+                tuple(slot.nodes),
+                tuple(str(host.journal) for host in hosts),
+                tuple(host.pid for host in hosts),
             ),
             tuple(host.pidfd for host in hosts),
         )

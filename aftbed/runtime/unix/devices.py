@@ -12,15 +12,15 @@ from typing import Final, Protocol
 
 import msgspec
 
-from aftbed.core.event import Event
 from aftbed.core.journal import Entry, EntryKind, entries
 from aftbed.core.message import NodeDied, Pulses, Reply, Request, Submit
 from aftbed.ftm.client import Client
 from aftbed.ftm.watchdog import PERIOD_NS
+from aftbed.runtime.unix import linux
 from aftbed.runtime.unix.journal import Dialogue, Header
 from aftbed.runtime.unix.lifeline import Watcher
 
-ASK: Final = Event.REQUEST_SENT
+STALE_NS: Final = 35_000_000  # a pulse older than this is looked into; it comes every 20 ms
 
 
 class Device(Protocol):
@@ -67,15 +67,19 @@ class Sensor:
         self._headers: dict[str, Header] = {}
         self._nodes: tuple[str, ...] = ()
         self._lifelines: Watcher | None = None
+        self._starvation: dict[str, linux.Starvation] = {}
         self._died: deque[str] = deque()
         self._next_ns = 0
 
-    def watch(self, nodes: tuple[str, ...], journals: tuple[str, ...], pidfds: list[int]) -> None:
+    def watch(
+        self, nodes: tuple[str, ...], journals: tuple[str, ...], pids: tuple[int, ...], pidfds: list[int]
+    ) -> None:
         """Watch these nodes and no others."""
         self.forget()
         self._pidfds = dict(zip(pidfds, nodes, strict=True))
         self._headers = {n: Header(Path(j)) for n, j in zip(nodes, journals, strict=True)}
         self._nodes, self._lifelines = nodes, Watcher(journals)
+        self._starvation = {n: linux.Starvation(pid) for n, pid in zip(nodes, pids, strict=True)}
 
     def forget(self) -> None:
         """Watch nobody."""
@@ -108,7 +112,16 @@ class Sensor:
         if now_ns < self._next_ns or not self._headers:
             return None
         self._next_ns = now_ns + PERIOD_NS
-        return Pulses({node: header.pulse_ns() for node, header in self._headers.items()})
+        return Pulses({node: self._seen_ns(node, now_ns) for node in self._headers})
+
+    def _seen_ns(self, node: str, now_ns: int) -> int:
+        """The node's pulse; one that is not let run counts as seen now."""
+        pulse_ns, starvation = self._headers[node].pulse_ns(), self._starvation[node]
+        if now_ns - pulse_ns < STALE_NS:
+            starvation.forget()
+        elif starvation.starves(now_ns):
+            return now_ns
+        return pulse_ns
 
     def accept(self, reply: Reply, now_ns: int) -> None:
         """Nothing is delivered to a sensor."""

@@ -12,6 +12,7 @@ import signal
 import socket
 import struct
 import time
+from pathlib import Path
 from typing import Final
 
 from aftbed.core.errors import HarnessError
@@ -73,6 +74,34 @@ def kill(pidfd: int, sig: signal.Signals) -> bool:
 def trim() -> None:
     """Give memory that is allocated but free back to the kernel: less to copy at a fork, and to unmap."""
     _libc.malloc_trim(0)
+
+
+class Starvation:
+    """Tells a process that hangs from one that the machine does not let run.
+
+    The former is stopped, asleep, or burns CPU; the latter is runnable and gets none (proc(5): the
+    state in `stat`, the time on a CPU in `schedstat`).
+    """
+
+    def __init__(self, pid: int) -> None:
+        self._pid = pid
+        self._since_ns, self._cpu_ns = 0, 0
+
+    def forget(self) -> None:
+        """It has shown that it runs."""
+        self._since_ns = 0
+
+    def starves(self, now_ns: int) -> bool:
+        """Asked while it shows nothing: runnable, and mostly without a CPU since it was asked first."""
+        try:
+            stat = Path(f"/proc/{self._pid}/stat").read_text()
+            cpu_ns = int(Path(f"/proc/{self._pid}/schedstat").read_text().split()[0])
+        except (OSError, ValueError, IndexError):
+            return False
+        if self._since_ns == 0:
+            self._since_ns, self._cpu_ns = now_ns, cpu_ns
+        ran_ns, passed_ns = cpu_ns - self._cpu_ns, now_ns - self._since_ns
+        return stat.rpartition(")")[2].split()[0] == "R" and 2 * ran_ns <= passed_ns
 
 
 def reap(pid: int) -> int | None:

@@ -7,7 +7,8 @@ the node's journal and puts a *nudge*, a packet of one byte, into the node's inp
 the flag after each wake-up, before it looks at the mail: control is served before data.
 
 The pulse is an interval timer's signal: its handler writes the time into the header, but only if it
-interrupted the host and not a brick, so a brick that loops for ever stops the pulse. (A receive timeout
+interrupted the host and not a brick, or if the journal has grown since: so a brick that loops for ever
+stops the pulse. (A receive timeout
 on the sockets would do too; it costs 0.3 us a hop.) What is read from a channel is handled before
 anything else is read, so mail is either in the kernel, where it outlives this process, or inside a
 request that the client will ask again.
@@ -108,6 +109,7 @@ class Node:
         self._plans: dict[tuple[tuple[str, ...], ...], Plan] = {}
         self._hot_inlets: dict[tuple[str, ...], Inlet] = {}
         self._timed = False
+        self._pulse_at = 0  # where the journal was at the last pulse
         self.lifeline: Held | None = None  # kept, not used: it is for the kernel to read when we die
         self._hot: Hosted | None = None  # served by the tight loop
         self._suspend_token = 0  # not 0: suspend as soon as quiescent
@@ -179,7 +181,9 @@ class Node:
         self._pulse(_now())
 
     def _on_timer(self, signum: int, frame: FrameType | None) -> None:
-        if frame is not None and frame.f_code.co_filename == __file__:
+        at = self.journal.at
+        if at != self._pulse_at or (frame is not None and frame.f_code.co_filename == __file__):
+            self._pulse_at = at
             self._pulse(_now())
 
     def _pulse(self, now_ns: int) -> None:
@@ -538,6 +542,6 @@ class Node:
 
     def _watch(self, order: control.WatchNodes, fds: list[int]) -> None:
         assert isinstance(self.device, Sensor) and self.device_brick is not None
-        self.device.watch(order.nodes, order.journals, fds)
+        self.device.watch(order.nodes, order.journals, order.pids, fds)
         self._forget_plans()
         self._step(self.device_brick, CONTROL, Watch(order.replica, order.generation, order.nodes))

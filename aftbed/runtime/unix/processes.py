@@ -35,11 +35,22 @@ class Process:
         self.header: Header | None = None
         self.alive = True
         self.incarnation = 0
-        self.spawned_ns = 0
+        self.starvation: linux.Starvation | None = None
 
     def born(self, pid: int) -> None:
         """The process exists; it cannot be reaped by another, so the pid is its own."""
         self.pid, self.pidfd = pid, os.pidfd_open(pid)
+        self.starvation = linux.Starvation(pid)
+
+    def hangs(self, now_ns: int, deadline_ns: int) -> bool:
+        """Whether its pulse is older than `deadline_ns`, though the machine lets it run."""
+        if self.header is None or self.starvation is None:
+            return False
+        pulse_ns = self.header.pulse_ns()
+        if pulse_ns == 0 or now_ns - pulse_ns < deadline_ns // 2:
+            self.starvation.forget()
+            return False
+        return not self.starvation.starves(now_ns) and now_ns - pulse_ns > deadline_ns
 
     def kill(self, sig: signal.Signals = signal.SIGKILL) -> bool:
         """Signal it; False if it is gone."""

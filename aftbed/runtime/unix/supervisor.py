@@ -344,11 +344,10 @@ class Supervisor:
         self.deployment.nudge_late()
         if now_ns > self._grace_until_ns and not self._ending:
             for process in self.nursery.processes:
-                if process.kind == "node" and process.header is not None and self._replaceable(process.name):
-                    pulse_ns = process.header.pulse_ns()
-                    if pulse_ns and now_ns - pulse_ns > HANG_NS:
-                        self.tell("hangs", f"{process.name} (pid {process.pid}): killed, to be replaced")
-                        process.kill(signal.SIGKILL)
+                single = process.kind == "node" and self._replaceable(process.name)
+                if single and process.hangs(now_ns, HANG_NS):
+                    self.tell("hangs", f"{process.name} (pid {process.pid}): killed, to be replaced")
+                    process.kill(signal.SIGKILL)
         self.loop.after(TICK_SECONDS, self._tick)
 
     # -- questions ----------------------------------------------------------------------------
