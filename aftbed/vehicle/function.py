@@ -18,7 +18,8 @@ held, for at most `BLIND_MS`. That a radar cannot be believed must never end a b
 Time that runs backwards, or jumps by more than `GAP_MS`, starts all tracks anew: nothing old may brake.
 
 The state is one fixed layout of `STATE_BYTES`, doubles as they are, so that a restored replica goes on
-bit for bit; a slot without a track is zero in it. Only + - * / and comparisons on doubles: the same replies on every machine.
+bit for bit; a slot without a track is zero in it. Only + - * / and comparisons on doubles: the same
+replies on every machine.
 """
 
 from collections.abc import Set

@@ -197,6 +197,26 @@ def test_a_flipped_bit_is_refused_or_gives_a_function_that_works(bit: int, cycle
     AebFunction().restore(function.capture())
 
 
+@pytest.mark.parametrize("byte", [0x01, 0x80])  # 0x80 at the end of a double is -0.0
+@pytest.mark.parametrize("offset", range(1, 26))
+def test_a_free_slot_is_zero_to_the_bit(offset: int, byte: int) -> None:
+    function, _ = braking()
+    damaged = bytearray(function.capture())
+    damaged[STATE_BYTES - 26 + offset] = byte
+    with pytest.raises(PeerError, match=r"state with Track\(hits=0, .* in slot 15"):
+        function.restore(bytes(damaged))
+
+
+def test_a_state_does_not_tell_in_which_order_its_targets_came() -> None:
+    near = [AebTarget(slot, 30.0 + slot, -EGO_MS) for slot in range(SLOTS)]
+    functions = AebFunction(), AebFunction()
+    for function, seen in zip(functions, (near, near[::-1]), strict=True):
+        for n in range(4):
+            ask(function, 20 * n, *seen)
+    assert functions[0].capture() == functions[1].capture()
+    assert functions[0].capture()[-26] == 4
+
+
 def test_the_transmit_counter_is_state() -> None:
     function = AebFunction()
     counters = [ask(function, t_ms).counter for t_ms in range(0, 400, 20)]
@@ -272,6 +292,13 @@ def test_a_track_sees_a_car_brake_within_half_a_second() -> None:
 )
 def test_required_deceleration(track: Track, required_ms2: float) -> None:
     assert required_deceleration_ms2(track, 20.0) == pytest.approx(required_ms2)
+
+
+def test_of_equal_threats_the_lowest_slot_is_named() -> None:
+    function = AebFunction()
+    for n in range(3):
+        output = ask(function, 20 * n, *(AebTarget(slot, 1.0, -EGO_MS) for slot in (5, 2, 9)))
+    assert output.slot == 2
 
 
 # -- stages

@@ -43,13 +43,13 @@ class Loop:
         """Serve until `end`."""
         while not self._ended:
             polled = self._epoll.poll(self._patience_seconds())
+            now_ns = time.monotonic_ns()  # before the calls: what arrives while they run is not late yet
             ready = [(fd, self._readers[fd]) for fd, _ in polled if fd in self._readers]
             for turn in (False, True):
                 for fd, reader in ready:
                     # A call before this one may have closed `fd`, and its number may be another's now.
                     if reader[0] is turn and self._readers.get(fd) is reader:
                         reader[1]()
-            now_ns = time.monotonic_ns()
             self.jobs.expire(now_ns)
             while self._timers and self._timers[0][0] <= now_ns:
                 heapq.heappop(self._timers)[2]()
