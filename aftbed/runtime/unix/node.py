@@ -8,10 +8,10 @@ the flag after each wake-up, before it looks at the mail: control is served befo
 
 The pulse is an interval timer's signal: its handler writes the time into the header, but only if it
 interrupted the host and not a brick, or if the journal has grown since: so a brick that loops for ever
-stops the pulse. (A receive timeout
-on the sockets would do too; it costs 0.3 us a hop.) What is read from a channel is handled before
-anything else is read, so mail is either in the kernel, where it outlives this process, or inside a
-request that the client will ask again.
+stops the pulse. (A receive timeout on the sockets would do too; it costs 0.3 us a hop.)
+
+What is read from a channel is handled before anything else is read, so mail is either in the kernel,
+where it outlives this process, or inside a request that the client will ask again.
 """
 
 import os
@@ -20,8 +20,6 @@ import signal
 import sys
 import time
 import traceback
-from collections import deque
-from collections.abc import Callable
 from types import FrameType
 from typing import Final, NoReturn
 
@@ -30,14 +28,16 @@ import msgspec
 from aftbed.core import wire
 from aftbed.core.brick import CONTROL, Brick, Effect, Note, Order, Send
 from aftbed.core.errors import PeerError
-from aftbed.core.event import BY_LABEL, Event
+from aftbed.core.event import Event
 from aftbed.core.fault import Act
 from aftbed.core.journal import FLAG_OFFSET, PULSE_OFFSET, RECORD
-from aftbed.core.message import AnyMessage, ChannelEnded, Message, Promoted, Rebound, Reply, Watch
+from aftbed.core.message import AnyMessage, ChannelEnded, Message, Promoted, Rebound, Reply
 from aftbed.runtime.unix import control, rehearsal
 from aftbed.runtime.unix.devices import Device, Sensor
 from aftbed.runtime.unix.journal import Journal
 from aftbed.runtime.unix.lifeline import Held
+from aftbed.runtime.unix.orders import carry_out
+from aftbed.runtime.unix.wiring import Hosted, Inlet, Plan, Wiring
 
 PULSE_SECONDS: Final = 0.02
 REHEARSAL_MS: Final = 20.0  # of waiting at the start; the whole graph is there by then
@@ -58,108 +58,38 @@ _pack = RECORD.pack_into
 RECORD_BYTES: Final = RECORD.size
 
 
-class Inlet:
-    """The reading end of a channel."""
-
-    __slots__ = ("fd", "hosted", "port")
-
-    def __init__(self, hosted: "Hosted", port: str, descriptor: int) -> None:
-        self.hosted, self.port = hosted, port
-        self.fd = descriptor
-
-
-class Hosted:
-    """A brick, its inlets, and where its outputs lead: a descriptor or a function."""
-
-    __slots__ = ("brick", "inlets", "name", "outs")
-
-    def __init__(self, name: str, brick: Brick) -> None:
-        self.name, self.brick = name, brick
-        self.inlets: dict[str, Inlet] = {}
-        self.outs: dict[str, int | Callable[[Message], None]] = {}
-
-
-class Plan:
-    """What to wait for while the same ports are open: a single inlet, or a poll."""
-
-    __slots__ = ("by_fd", "poll", "single")
-
-    def __init__(self, inlets: list[Inlet], others: tuple[int, ...], may_block: bool) -> None:
-        self.single = inlets[0] if may_block and len(inlets) == 1 else None
-        self.by_fd = {inlet.fd: inlet for inlet in inlets}
-        self.poll = select.poll()
-        for fd in (*self.by_fd, *others):
-            self.poll.register(fd, select.POLLIN)
-
-
-def _nowhere(message: Message) -> None:
-    """An unbound output."""
-
-
 class Node:
     """One process of the graph. `run` never returns."""
 
     def __init__(self, name: str, line: control.Line[control.ToNode], journal: Journal) -> None:
         self.name, self.line, self.journal = name, line, journal
-        self.hosted: dict[str, Hosted] = {}
+        self.wiring = Wiring()
         self.device: Device | None = None
         self.device_brick: Hosted | None = None
-        self._fronts: list[Hosted] = []  # bricks that may have inlets
-        self._queue: deque[tuple[Hosted, str, Message]] = deque()
-        self._plans: dict[tuple[tuple[str, ...], ...], Plan] = {}
-        self._hot_inlets: dict[tuple[str, ...], Inlet] = {}
-        self._timed = False
         self._pulse_at = 0  # where the journal was at the last pulse
         self.lifeline: Held | None = None  # kept, not used: it is for the kernel to read when we die
         self._hot: Hosted | None = None  # served by the tight loop
-        self._suspend_token = 0  # not 0: suspend as soon as quiescent
-        self._suspended = False
-        self._armed: dict[Event, control.Arm] = {}
+        self.suspend_token = 0  # not 0: suspend as soon as quiescent
+        self.suspended = False
+        self.armed: dict[Event, control.Arm] = {}
         self._refused = 0
 
     # -- building -----------------------------------------------------------------------------
 
     def add(self, name: str, brick: Brick) -> None:
         """Host `brick`."""
-        hosted = Hosted(name, brick)
+        hosted = self.wiring.add(name, brick)
         hosted.outs[CONTROL] = lambda message: self._say(name, message)
-        self.hosted[name] = hosted
-        self._fronts = list(self.hosted.values())
-        self._timed = any(type(h.brick).deadline_ns is not Brick.deadline_ns for h in self._fronts)
-        self._hot = hosted if len(self.hosted) == 1 and not self._timed else None
-
-    def link_inside(self, local: control.Local) -> None:
-        """A channel between two bricks of this node."""
-        source, sink = self.hosted[local.brick], self.hosted[local.sink]
-        source.outs[local.port] = lambda message: self._queue.append((sink, local.sink_port, message))
-
-    def bind_input(self, brick: str, port: str, descriptor: int | None) -> None:
-        """Read `port` from `descriptor` from now on."""
-        hosted = self.hosted[brick]
-        old = hosted.inlets.pop(port, None)
-        if old is not None:
-            os.close(old.fd)
-        if descriptor is not None:
-            hosted.inlets[port] = Inlet(hosted, port, descriptor)
-        self._fronts = [h for h in self.hosted.values() if h.inlets]
-        self._forget_plans()
-
-    def _forget_plans(self) -> None:
-        self._plans.clear()
-        self._hot_inlets.clear()
+        self._hot = hosted if len(self.wiring.hosted) == 1 and not self.wiring.timed else None
 
     def bind_output(self, brick: str, port: str, descriptor: int | None, epoch: int) -> None:
         """Write `port` to `descriptor` from now on, and tell the brick."""
-        hosted = self.hosted[brick]
-        old = hosted.outs.get(port)
-        hosted.outs[port] = _nowhere if descriptor is None else descriptor
-        if isinstance(old, int):
-            os.close(old)
-        self._step(hosted, CONTROL, Rebound(port, descriptor is not None, epoch))
+        hosted = self.wiring.bind_output(brick, port, descriptor)
+        self.step(hosted, CONTROL, Rebound(port, descriptor is not None, epoch))
 
     def attach(self, device: Device, brick: str) -> None:
         """Join `device` to `brick`."""
-        self.device, self.device_brick = device, self.hosted[brick]
+        self.device, self.device_brick = device, self.wiring.hosted[brick]
         if device.fds() or device.deadline_ns() is not None or isinstance(device, Sensor):
             self._hot = None
         self.device_brick.outs["deliver"] = self._deliver
@@ -211,7 +141,7 @@ class Node:
         """Before the first mail, or when it is there."""
         poll = select.poll()
         poll.register(self.line.fileno(), select.POLLIN)
-        for hosted in self.hosted.values():
+        for hosted in self.wiring.hosted.values():
             for inlet in hosted.inlets.values():
                 poll.register(inlet.fd, select.POLLIN)
         poll.poll(REHEARSAL_MS)
@@ -219,23 +149,24 @@ class Node:
 
     def _turn(self) -> None:
         """Handle one thing, or wait for one."""
-        if self._queue:
-            hosted, port, message = self._queue.popleft()
-            self._step(hosted, port, message)
+        if self.wiring.mail:
+            hosted, port, message = self.wiring.mail.popleft()
+            self.step(hosted, port, message)
             return
-        if self._suspend_token or self._suspended:
-            if self._suspend_token and self._quiescent():
-                self._suspended = True
-                self._ack(self._suspend_token)
-                self._suspend_token = 0
-            if self._suspended:
-                self._wait_control()
+        if self.suspend_token or self.suspended:
+            if self.suspend_token and self.wiring.quiescent():
+                self.suspended = True
+                self.ack(self.suspend_token)
+                self.suspend_token = 0
+            if self.suspended:
+                self._serve_control(wait=True)
                 return
         if self.device is not None and self._from_device(self.device):
             return
-        fronts = self._fronts
-        key = tuple([hosted.brick.open_ports() for hosted in fronts])
-        plan = self._plans.get(key) or self._make_plan(key)
+        fds = self.device.fds() if self.device is not None else ()
+        due = self.device.deadline_ns() if self.device is not None else None
+        may_block = not (self.wiring.timed or fds or due is not None)
+        plan = self.wiring.plan((self.line.fileno(), *fds), may_block=may_block)
         if plan.single is not None:
             self._wait_for(plan.single)
         else:
@@ -246,10 +177,10 @@ class Node:
 
         Returns for whatever is not mail on the one open port: `_turn` knows what to do.
         """
-        brick, outs, inlets, device = hosted.brick, hosted.outs, self._hot_inlets, self.device
+        brick, outs, inlets, device = hosted.brick, hosted.outs, self.wiring.hot_inlets, self.device
         step, open_ports, journal = brick.step, brick.open_ports, self.journal
         mapping = journal.mapping
-        while not (self._suspend_token or self._suspended or self._armed):
+        while not (self.suspend_token or self.suspended or self.armed):
             inlet = inlets.get(open_ports())
             if inlet is None or (device is not None and self._from_device(device)):
                 return
@@ -282,23 +213,6 @@ class Node:
                     at += RECORD_BYTES
             journal.at = at
 
-    def _make_plan(self, key: tuple[tuple[str, ...], ...]) -> Plan:
-        inlets = [
-            hosted.inlets[port]
-            for hosted, ports in zip(self._fronts, key, strict=True)
-            for port in ports
-            if port in hosted.inlets
-        ]
-        fds = self.device.fds() if self.device is not None else ()
-        waits = self._timed or bool(fds)
-        waits = waits or (self.device is not None and self.device.deadline_ns() is not None)
-        plan = Plan(inlets, (self.line.fileno(), *fds), not waits)
-        if not waits:
-            self._plans[key] = plan
-            if plan.single is not None and len(key) == 1:
-                self._hot_inlets[key[0]] = plan.single
-        return plan
-
     def _wait_for(self, inlet: Inlet) -> None:
         """Wait for one packet of `inlet` and handle it."""
         self._packet(inlet, _read(inlet.fd, READ_BYTES_MAX))
@@ -315,13 +229,13 @@ class Node:
             except PeerError:
                 self._refuse(0)
                 return
-            self._step(inlet.hosted, inlet.port, message, raw)
+            self.step(inlet.hosted, inlet.port, message, raw)
 
     def _ended(self, inlet: Inlet) -> None:
         """The channel is drained to its end: nothing more will come from it."""
         if inlet.hosted.inlets.get(inlet.port) is inlet:
-            self.bind_input(inlet.hosted.name, inlet.port, None)
-            self._step(inlet.hosted, inlet.port, ChannelEnded())
+            self.wiring.bind_input(inlet.hosted.name, inlet.port, None)
+            self.step(inlet.hosted, inlet.port, ChannelEnded())
 
     def _poll(self, plan: Plan) -> None:
         """Wait for several things; the control line goes first."""
@@ -341,7 +255,7 @@ class Node:
         self._wake(now_ns)
 
     def _patience_ms(self) -> float:
-        due = [h.brick.deadline_ns() for h in self.hosted.values()] if self._timed else []
+        due = [h.brick.deadline_ns() for h in self.wiring.hosted.values()] if self.wiring.timed else []
         if self.device is not None:
             due.append(self.device.deadline_ns())
         wanted = min((ns for ns in due if ns is not None), default=None)
@@ -351,9 +265,9 @@ class Node:
         return min(limit, max(0.0, (wanted - _now()) / 1e6 + 0.999))
 
     def _wake(self, now_ns: int) -> None:
-        if not self._timed:
+        if not self.wiring.timed:
             return
-        for hosted in list(self.hosted.values()):
+        for hosted in list(self.wiring.hosted.values()):
             due = hosted.brick.deadline_ns()
             if due is not None and now_ns >= due:
                 self._perform(hosted, hosted.brick.wake(now_ns), now_ns, None, None)
@@ -367,14 +281,15 @@ class Node:
         message = device.take(_now())
         if message is None:
             return False
-        self._step(hosted, device.port, message)
+        self.step(hosted, device.port, message)
         return True
 
     # -- steps and effects --------------------------------------------------------------------
 
-    def _step(
+    def step(
         self, hosted: Hosted, port: str, message: AnyMessage | Message, raw: bytes | None = None
     ) -> None:
+        """Have the brick handle `message`, and perform what it asks for."""
         now_ns = _now()
         try:
             effects = hosted.brick.step(port, message, now_ns)  # type: ignore[arg-type]
@@ -409,7 +324,7 @@ class Node:
             elif kind is Note:
                 assert isinstance(effect, Note)
                 self.journal.write(now_ns, effect.event, effect.request_id, effect.detail)
-                if self._armed:
+                if self.armed:
                     self._fire(effect.event)
             else:
                 assert isinstance(effect, Order)
@@ -443,13 +358,13 @@ class Node:
     # -- faults -------------------------------------------------------------------------------
 
     def _fire(self, event: Event) -> None:
-        arm = self._armed.get(event)
+        arm = self.armed.get(event)
         if arm is None:
             return
         if arm.nth > 1:
-            self._armed[event] = msgspec.structs.replace(arm, nth=arm.nth - 1)
+            self.armed[event] = msgspec.structs.replace(arm, nth=arm.nth - 1)
             return
-        del self._armed[event]
+        del self.armed[event]
         self.journal.write(_now(), Event.FAULT_APPLIED, 0, arm.fault)
         if arm.itself:
             os.kill(os.getpid(), signal.SIGKILL if arm.act is Act.CRASH else signal.SIGSTOP)
@@ -462,9 +377,6 @@ class Node:
         raise AssertionError(f"fault {arm.fault} was not applied within {FAULT_SECONDS_MAX} s")
 
     # -- control ------------------------------------------------------------------------------
-
-    def _wait_control(self) -> None:
-        self._serve_control(wait=True)
 
     def _serve_control(self, wait: bool = False, until: int = 0) -> bool:
         """Carry out the orders that wait; with `wait`, for a pulse at most. True if there was any.
@@ -484,7 +396,13 @@ class Node:
             if isinstance(order, control.Ack):
                 served = served or order.token == until
                 continue
-            self._obey(order, fds)
+            try:
+                data = carry_out(self, order, fds)
+            except PeerError as error:
+                self.ack(order.token, error=str(error))
+            else:
+                if data is not None:
+                    self.ack(order.token, data)
             served = served or not until
 
     def _receive(self, wait: bool) -> tuple[control.ToNode, list[int]] | None:
@@ -496,52 +414,6 @@ class Node:
                 self.line.sock.setblocking(True)
         return self.line.recv()
 
-    def _ack(self, token: int, data: bytes = b"", error: str = "") -> None:
+    def ack(self, token: int, data: bytes = b"", error: str = "") -> None:
+        """Answer an order."""
         self.line.send(control.Ack(token, data, error))
-
-    def _obey(self, order: control.ToNode, fds: list[int]) -> None:
-        data = b""
-        try:
-            match order:
-                case control.BindInput(_, brick, port):
-                    self.bind_input(brick, port, fds.pop() if fds else None)
-                case control.BindOutput(_, brick, port, epoch):
-                    self.bind_output(brick, port, fds.pop() if fds else None, epoch)
-                case control.Suspend(token):
-                    self._suspend_token = token
-                    return  # answered when quiescent
-                case control.Resume():
-                    self._suspended, self._suspend_token = False, 0
-                case control.Capture(_, brick):
-                    data = self.hosted[brick].brick.capture()
-                case control.Restore(_, brick, state):
-                    self.hosted[brick].brick.restore(state)
-                case control.Tell(_, brick, message):
-                    self._step(self.hosted[brick], CONTROL, message)
-                case control.WatchNodes():
-                    self._watch(order, fds)
-                case control.Arm():
-                    self._armed[BY_LABEL[order.event]] = order
-                case control.Stats():
-                    data = self.device.stats() if self.device is not None else b""
-                case control.Quiet():
-                    assert self.device is not None
-                    self.device.quiet()
-                case control.Stop():
-                    self._ack(order.token)
-                    os._exit(0)
-                case control.Park() | control.Assign() | control.Serve() | control.Ack():
-                    raise PeerError(f"{type(order).__name__} to a node")
-        except PeerError as error:
-            self._ack(order.token, error=str(error))
-        else:
-            self._ack(order.token, data)
-
-    def _quiescent(self) -> bool:
-        return not self._queue and all(h.brick.quiescent() for h in self.hosted.values())
-
-    def _watch(self, order: control.WatchNodes, fds: list[int]) -> None:
-        assert isinstance(self.device, Sensor) and self.device_brick is not None
-        self.device.watch(order.nodes, order.journals, order.pids, fds)
-        self._forget_plans()
-        self._step(self.device_brick, CONTROL, Watch(order.replica, order.generation, order.nodes))

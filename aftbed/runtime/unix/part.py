@@ -51,12 +51,12 @@ def _build(line: control.Line[control.ToNode], order: control.Assign, fds: list[
     for name, kind in order.bricks:
         node.add(name, make(kind, setting))
     for local in order.locals:
-        node.link_inside(local)
+        node.wiring.link_inside(local)
     if order.device:
         name = order.bricks[0][0]
         node.attach(_device(order, node), name)
     for port in order.inputs:
-        node.bind_input(port.brick, port.port, fds[port.index])
+        node.wiring.bind_input(port.brick, port.port, fds[port.index])
     line.send(control.Ack(order.token))
     for port in order.outputs:
         node.bind_output(port.brick, port.port, fds[port.index], order.epoch)
@@ -66,7 +66,7 @@ def _build(line: control.Line[control.ToNode], order: control.Assign, fds: list[
 def _device(order: control.Assign, node: Node) -> Device:
     if order.device == "sensor":
         return Sensor()
-    client = node.hosted[order.bricks[0][0]].brick
+    client = node.wiring.hosted[order.bricks[0][0]].brick
     assert isinstance(client, Client)
     if order.device == "load":
         options = msgspec.msgpack.decode(order.options, type=LoadOptions)

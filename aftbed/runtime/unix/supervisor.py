@@ -10,18 +10,16 @@ import os
 import signal
 import socket
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
 import msgspec
 
 from aftbed.core import message, script
-from aftbed.core.errors import AftbedError, ConfigError
+from aftbed.core.errors import AftbedError
 from aftbed.core.event import Event
 from aftbed.ftm.mechanism import build
-from aftbed.runtime import targets
-from aftbed.runtime.unix import ask, control, linux, rundir
+from aftbed.runtime.unix import control, linux
 from aftbed.runtime.unix.deployment import BUS, LIGHT, WATCHED_KINDS, Deployment, Keys
 from aftbed.runtime.unix.faults import Faults
 from aftbed.runtime.unix.jobs import StepFailed
@@ -29,6 +27,7 @@ from aftbed.runtime.unix.journal import Journal
 from aftbed.runtime.unix.loop import Loop
 from aftbed.runtime.unix.options import LoadRun, RunOptions
 from aftbed.runtime.unix.processes import Nursery, Process
+from aftbed.runtime.unix.questions import Questions
 from aftbed.runtime.unix.verbs import Executor
 from aftbed.runtime.unix.work import Work
 
@@ -39,7 +38,6 @@ HANG_NS: Final = 150_000_000  # of what no Watchdog watches; a channel's pulse i
 LATE_NS_MAX: Final = 40_000_000
 DRAIN_SECONDS_MAX: Final = 2.0
 STOP_SECONDS_MAX: Final = 1.0
-QUESTIONS_MAX: Final = 16
 BUS_PRELOAD: Final = (
     "can.interfaces.socketcand",
     "cantools",
@@ -69,7 +67,6 @@ class Supervisor:
         self._grace_until_ns = 0
         self.graph_ms = 0.0
         self._incomplete: list[str] = []
-        self._questions: dict[int, control.Line[ask.Question]] = {}
         self._last_tick_ns = 0
         self._situation_wanted = False
         graph = build(options.ftm, options.placement)
@@ -79,6 +76,7 @@ class Supervisor:
         self.deployment = Deployment(graph, self.nursery, self.record, self.work.device_of, pinned)
         self.executor = Executor(self.deployment, self.journal, self.tell)
         self.faults = Faults(self.deployment, self.loop, self.journal, self.tell)
+        self.questions = Questions(options, self.loop, self.deployment, self.faults, self.work, self._finish)
 
     # -- life ---------------------------------------------------------------------------------
 
@@ -93,7 +91,7 @@ class Supervisor:
         self.nursery.park(LIGHT, len(self.deployment.graph.nodes) + self._spares() + wants_bus)
         if wants_bus:
             self.nursery.park(BUS, 2)
-        self._listen()
+        self.questions.listen()
         self.loop.read(self.owner.fileno(), self._on_owner)
         self.loop.jobs.start("launch", self._launch(), self._launched)
         self._tick()
@@ -123,13 +121,6 @@ class Supervisor:
             return
         self.tell("started", f"{len(self.deployment.nodes)} nodes in {self.graph_ms:.1f} ms")
         self._inform_recovery(failed=False)
-
-    def _listen(self) -> None:
-        sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
-        sock.bind(str(Path(self.options.private) / rundir.SOCKET_NAME))
-        sock.listen(QUESTIONS_MAX)
-        self._listener = sock
-        self.loop.read(sock.fileno(), self._accept)
 
     def _on_owner(self) -> None:
         try:
@@ -349,93 +340,6 @@ class Supervisor:
                     self.tell("hangs", f"{process.name} (pid {process.pid}): killed, to be replaced")
                     process.kill(signal.SIGKILL)
         self.loop.after(TICK_SECONDS, self._tick)
-
-    # -- questions ----------------------------------------------------------------------------
-
-    def _accept(self) -> None:
-        try:
-            sock, _ = self._listener.accept()
-        except OSError:
-            return
-        sock.setblocking(False)
-        if not ask.same_user(sock, os.getuid()) or len(self._questions) >= QUESTIONS_MAX:
-            sock.close()
-            return
-        line = self._questions[sock.fileno()] = control.Line(sock, ask.decode_question)
-        self.loop.read(sock.fileno(), lambda: self._answer(line))
-
-    def _answer(self, line: control.Line[ask.Question]) -> None:
-        try:
-            got = line.recv()
-        except BlockingIOError:
-            return
-        except (OSError, AftbedError):
-            got = None
-        if got is not None:
-            self._reply(got[0], lambda answer: self._send_answer(line, answer))
-            return
-        self.loop.forget(line.fileno())
-        self._questions.pop(line.fileno(), None)
-        line.close()
-
-    def _send_answer(self, line: control.Line[ask.Question], answer: ask.Answer) -> None:
-        try:
-            line.send(answer)
-        except OSError:
-            return
-
-    def _reply(self, question: ask.Question, answer: Callable[[ask.Answer], None]) -> None:
-        try:
-            match question:
-                case ask.Status():
-                    answer(ask.Answer(json.dumps(self.status()).encode()))
-                case ask.Processes():
-                    answer(ask.Answer(json.dumps({"processes": self.processes()}).encode()))
-                case ask.GraphNow():
-                    answer(ask.Answer(msgspec.json.encode(self.deployment.graph)))
-                case ask.Inject(fault):
-                    targets.check(fault, self.deployment.graph)
-                    self.loop.jobs.start(
-                        "inject",
-                        self.faults.arm(fault),
-                        lambda failure: answer(
-                            ask.Answer(json.dumps({"armed": str(fault)}).encode(), error=failure)
-                        ),
-                    )
-                case ask.Stop():
-                    self._finish("stopped")
-                    answer(ask.Answer(b'{"stopping": true}'))
-        except ConfigError as error:
-            answer(ask.Answer(error=str(error)))
-
-    def status(self) -> dict[str, object]:
-        """How the run is, for `aftbed status`."""
-        deployment = self.deployment
-        return {
-            "run": self.options.run,
-            "ftm": self.options.ftm,
-            "placement": self.options.placement,
-            "seconds": round((time.monotonic_ns() - self.started_ns) / 1e9, 2),
-            "leader": deployment.leader,
-            "backup": deployment.backup,
-            "epoch": deployment.epoch,
-            "busy": self.loop.jobs.names(),
-            "record": str(self.record),
-            "port": self.options.port,
-            "vehicle": self.work.telemetry,
-        }
-
-    def processes(self) -> list[dict[str, object]]:
-        """Every process of the run; the nodes and the supervisor are the paper's count."""
-        rows: list[dict[str, object]] = []
-        rows.append({"name": "supervisor", "role": "master", "pid": os.getpid(), "node": True})
-        for node in self.deployment.graph.nodes:
-            process = self.deployment.nodes.get(node)
-            if process is not None and process.alive:
-                role = self.deployment.role_of(node)
-                rows.append({"name": node, "role": role, "pid": process.pid, "node": True})
-        others = [p for p in self.nursery.processes if p.kind in ("zygote", "spare", "service") and p.pid]
-        return rows + [{"name": p.name, "role": p.kind, "pid": p.pid, "node": False} for p in others]
 
 
 def supervise(options: RunOptions, owner: socket.socket) -> None:

@@ -1,0 +1,62 @@
+"""The orders that a node takes from the supervisor, each carried out between two steps."""
+
+import os
+from typing import TYPE_CHECKING, assert_never
+
+from aftbed.core.brick import CONTROL
+from aftbed.core.errors import PeerError
+from aftbed.core.event import event_named
+from aftbed.core.message import Watch
+from aftbed.runtime.unix import control
+from aftbed.runtime.unix.devices import Sensor
+
+if TYPE_CHECKING:
+    from aftbed.runtime.unix.node import Node
+
+
+def carry_out(node: "Node", order: control.ToNode, fds: list[int]) -> bytes | None:
+    """Do what `order` says; the data of its Ack, or None where the Ack comes later.
+
+    Raises PeerError where a brick refuses, or the order is not for a node.
+    """
+    wiring = node.wiring
+    match order:
+        case control.BindInput(_, brick, port):
+            wiring.bind_input(brick, port, fds.pop() if fds else None)
+        case control.BindOutput(_, brick, port, epoch):
+            node.bind_output(brick, port, fds.pop() if fds else None, epoch)
+        case control.Suspend(token):
+            node.suspend_token = token
+            return None  # answered when quiescent
+        case control.Resume():
+            node.suspended, node.suspend_token = False, 0
+        case control.Capture(_, brick):
+            return wiring.hosted[brick].brick.capture()
+        case control.Restore(_, brick, state):
+            wiring.hosted[brick].brick.restore(state)
+        case control.Tell(_, brick, message):
+            node.step(wiring.hosted[brick], CONTROL, message)
+        case control.WatchNodes():
+            _watch(node, order, fds)
+        case control.Arm():
+            node.armed[event_named(order.event)] = order
+        case control.Stats():
+            return node.device.stats() if node.device is not None else b""
+        case control.Quiet():
+            assert node.device is not None
+            node.device.quiet()
+        case control.Stop():
+            node.ack(order.token)
+            os._exit(0)
+        case control.Park() | control.Assign() | control.Serve() | control.Ack():
+            raise PeerError(f"{type(order).__name__} to a node")
+        case _:
+            assert_never(order)
+    return b""
+
+
+def _watch(node: "Node", order: control.WatchNodes, fds: list[int]) -> None:
+    assert isinstance(node.device, Sensor) and node.device_brick is not None
+    node.device.watch(order.nodes, order.journals, order.pids, fds)
+    node.wiring.forget_plans()
+    node.step(node.device_brick, CONTROL, Watch(order.replica, order.generation, order.nodes))

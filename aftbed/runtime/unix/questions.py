@@ -1,0 +1,137 @@
+"""What other commands ask of a live run, answered by the supervisor between other things.
+
+Only a process of the same user gets a connection (SO_PEERCRED); what it sends is decoded whole or not
+at all, and a bad packet ends its connection and nothing else.
+"""
+
+import json
+import os
+import socket
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from aftbed.core.errors import AftbedError, ConfigError
+from aftbed.runtime import targets
+from aftbed.runtime.unix import ask, control, rundir
+from aftbed.runtime.unix.deployment import Deployment
+from aftbed.runtime.unix.faults import Faults
+from aftbed.runtime.unix.loop import Loop
+from aftbed.runtime.unix.options import RunOptions
+from aftbed.runtime.unix.resources import Row
+from aftbed.runtime.unix.work import Work
+
+BESIDE: Final = ("zygote", "spare", "service")
+QUESTIONS_MAX: Final = 16  # connections at once
+
+
+class Questions:
+    """The control socket of the run."""
+
+    def __init__(
+        self,
+        options: RunOptions,
+        loop: Loop,
+        deployment: Deployment,
+        faults: Faults,
+        work: Work,
+        finish: Callable[[str], None],
+    ) -> None:
+        self._options, self._loop, self._deployment = options, loop, deployment
+        self._faults, self._work, self._finish = faults, work, finish
+        self._started_ns = time.monotonic_ns()
+        self._lines: dict[int, control.Line[ask.Question]] = {}
+
+    def listen(self) -> None:
+        """Open the socket; from here on the run is found by other commands."""
+        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
+        self._listener.bind(str(Path(self._options.private) / rundir.SOCKET_NAME))
+        self._listener.listen(QUESTIONS_MAX)
+        self._loop.read(self._listener.fileno(), self._accept)
+
+    def _accept(self) -> None:
+        try:
+            sock, _ = self._listener.accept()
+        except OSError:
+            return
+        sock.setblocking(False)
+        if not ask.same_user(sock, os.getuid()) or len(self._lines) >= QUESTIONS_MAX:
+            sock.close()
+            return
+        line = self._lines[sock.fileno()] = control.Line(sock, ask.decode_question)
+        self._loop.read(sock.fileno(), lambda: self._answer(line))
+
+    def _answer(self, line: control.Line[ask.Question]) -> None:
+        try:
+            got = line.recv()
+        except BlockingIOError:
+            return
+        except (OSError, AftbedError):
+            got = None
+        if got is not None:
+            self._reply(got[0], lambda answer: self._send_answer(line, answer))
+            return
+        self._loop.forget(line.fileno())
+        self._lines.pop(line.fileno(), None)
+        line.close()
+
+    def _send_answer(self, line: control.Line[ask.Question], answer: ask.Answer) -> None:
+        try:
+            line.send(answer)
+        except OSError:
+            return
+
+    def _reply(self, question: ask.Question, answer: Callable[[ask.Answer], None]) -> None:
+        try:
+            match question:
+                case ask.Status():
+                    answer(ask.Answer(json.dumps(self.status()).encode()))
+                case ask.Processes():
+                    answer(ask.Answer(msgspec.json.encode({"processes": self.processes()})))
+                case ask.GraphNow():
+                    answer(ask.Answer(msgspec.json.encode(self._deployment.graph)))
+                case ask.Inject(fault):
+                    targets.check(fault, self._deployment.graph)
+                    self._loop.jobs.start(
+                        "inject",
+                        self._faults.arm(fault),
+                        lambda failure: answer(
+                            ask.Answer(json.dumps({"armed": str(fault)}).encode(), error=failure)
+                        ),
+                    )
+                case ask.Stop():
+                    self._finish("stopped")
+                    answer(ask.Answer(b'{"stopping": true}'))
+        except ConfigError as error:
+            answer(ask.Answer(error=str(error)))
+
+    def status(self) -> dict[str, object]:
+        """How the run is, for `aftbed status`."""
+        deployment = self._deployment
+        return {
+            "run": self._options.run,
+            "ftm": self._options.ftm,
+            "placement": self._options.placement,
+            "seconds": round((time.monotonic_ns() - self._started_ns) / 1e9, 2),
+            "leader": deployment.leader,
+            "backup": deployment.backup,
+            "epoch": deployment.epoch,
+            "busy": self._loop.jobs.names(),
+            "record": self._options.record,
+            "port": self._options.port,
+            "vehicle": self._work.telemetry,
+        }
+
+    def processes(self) -> list[Row]:
+        """Every process of the run; the nodes and the supervisor are the paper's count."""
+        deployment = self._deployment
+        rows = [Row("supervisor", "master", os.getpid(), True)]
+        for node in deployment.graph.nodes:
+            process = deployment.nodes.get(node)
+            if process is not None and process.alive:
+                rows.append(Row(node, deployment.role_of(node), process.pid, True))
+        others = [p for p in deployment.nursery.processes if p.kind in BESIDE and p.pid]
+        return rows + [Row(p.name, p.kind, p.pid, False) for p in others]
