@@ -69,6 +69,11 @@ def test_a_record_in_the_making_is_none() -> None:
         assert list(records(torn)) == RECORDS[:1], written
 
 
+def test_the_first_record_without_an_event_ends_the_journal() -> None:
+    gap = bytes(RECORD.size)
+    assert list(records(journal(RECORDS[:1]) + gap + journal(RECORDS[1:])[HEADER_BYTES:])) == RECORDS[:1]
+
+
 def test_a_dialogue_cut_at_any_byte_gives_what_was_whole_or_is_refused() -> None:
     whole = dialogue(ENTRIES)
     ends = [HEADER_BYTES, HEADER_BYTES + ENTRY.size + 4, len(whole)]

@@ -40,7 +40,7 @@ from aftbed.ftm.catalog import Setting, make
 from aftbed.ftm.client import Client
 from aftbed.ftm.mechanism import CHAIN_PARTS, REPLICAS, build
 
-STEPS_MAX: Final = 100_000
+STEPS_MAX: Final = 20_000
 SUPERVISOR: Final = "supervisor"
 
 

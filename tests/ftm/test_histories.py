@@ -10,7 +10,7 @@ from typing import Final
 
 from counting import Counting
 from harness import World
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aftbed.core import check
@@ -55,28 +55,29 @@ class Drive:
             if not self.world.step() and submitted == self.count:
                 if not self.plan:
                     return self.world
-                self._strike()
+                assert self._strike(), "nothing is left to do, and redundancy is not back"
 
-    def _strike(self) -> None:
+    def _strike(self) -> bool:
         """The next fault, if the other replica can bear it; else it waits."""
         act, target = self.plan[0]
         world = self.world
         if act == "replace":
             world.replace(str(target))
             self.plan.pop(0)
-            return
+            return True
         role, part = target if isinstance(target, tuple) else (target, "")
         if not world.leader:
-            return
+            return False
         other = next(r for r in REPLICAS if r != world.leader)
         victim, survivor = (world.leader, other) if role == "leader" else (other, world.leader)
         if not self._is_sound(survivor) or not world.chain(victim):
-            return
+            return False
         self.plan.pop(0)
         if act == "accuse":
             world.accuse(f"{victim}/server")
         else:
             world.crash(f"{victim}/{part}" if part else victim)
+        return True
 
     def _is_sound(self, replica: str) -> bool:
         nodes = [f"{replica}/{part}" for part in CHAIN_PARTS]
@@ -101,6 +102,7 @@ def one_master(history: History) -> list[str]:
     return found
 
 
+@settings(max_examples=4 * settings.default.max_examples)
 @given(seed=st.integers(0, 2**32), count=st.integers(1, 8), plan=faults)
 def test_the_promises_hold_wherever_a_fault_strikes(
     seed: int, count: int, plan: list[tuple[str, object]]

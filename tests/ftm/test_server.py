@@ -1,6 +1,5 @@
 """Before, Proceed, Server: a request goes through once, and its result comes back."""
 
-
 import pytest
 from counting import Counting
 from samples import STATE, inspected, notes, sends
