@@ -11,8 +11,10 @@ import gc
 import importlib
 import os
 import select
+import site
 import socket
 import sys
+from pathlib import Path
 from typing import Final, NoReturn
 
 from aftbed.runtime.unix import control, linux, rehearsal
@@ -27,9 +29,18 @@ def start(descriptor: int, supervisor: int, cpus: list[int], preload: tuple[str,
 
     A fresh one, since all that its parent has ever imported would weigh on every fork and every death.
     """
-    arguments = [sys.executable, "-m", __name__, str(supervisor), ",".join(map(str, cpus)), *preload]
+    arguments = [sys.executable, "-P", "-m", __name__, str(supervisor), ",".join(map(str, cpus)), *preload]
     descriptors = [(os.POSIX_SPAWN_DUP2, descriptor, _CONTROL_FD)]
-    return os.posix_spawn(sys.executable, arguments, os.environ, file_actions=descriptors)
+    return os.posix_spawn(sys.executable, arguments, _environment(), file_actions=descriptors)
+
+
+def _environment() -> dict[str, str]:
+    """Where this very package is found; the working directory is not searched (`-P`)."""
+    home = str(Path(__file__).resolve().parents[3])
+    if home in site.getsitepackages():
+        return dict(os.environ)
+    path = os.environ.get("PYTHONPATH")
+    return os.environ | {"PYTHONPATH": home if path is None else os.pathsep.join((home, path))}
 
 
 def run(supervisor: int, cpus: list[int], preload: tuple[str, ...]) -> NoReturn:
