@@ -101,6 +101,8 @@ def _follow(launched: Launched, view: View) -> bool:
             for report in launched.reports():
                 if report.kind == "telemetry":
                     view.telemetry(report.data)
+                elif report.kind == "cycle":
+                    view.cycle(json.loads(report.data))
                 elif report.kind == "event":
                     view.event(json.loads(report.data))
     finally:

@@ -28,6 +28,7 @@ class View(Protocol):
     ) -> None: ...
     def telemetry(self, data: bytes) -> None: ...
     def event(self, event: dict[str, object]) -> None: ...
+    def cycle(self, cycle_us: float | None) -> None: ...
 
 
 def open_view(options: RunOptions, *, quiet: bool) -> View:
@@ -49,6 +50,9 @@ class QuietView:
         return None
 
     def telemetry(self, data: bytes) -> None:
+        """Not shown."""
+
+    def cycle(self, cycle_us: float | None) -> None:
         """Not shown."""
 
     def event(self, event: dict[str, object]) -> None:
@@ -91,6 +95,7 @@ class LiveView(QuietView):
         self._events: deque[str] = deque(maxlen=EVENTS_SHOWN)
         self._telemetry: Telemetry | None = None
         self._leader = "a leads, b backs up" if options.ftm != "none" else "a alone"
+        self._cycle = ""
         self._live: Live | None = None
 
     def __enter__(self) -> Self:
@@ -110,6 +115,10 @@ class LiveView(QuietView):
         """The newest is shown at the next refresh."""
         self._telemetry = msgspec.msgpack.decode(data, type=Telemetry)
 
+    def cycle(self, cycle_us: float | None) -> None:
+        """From request to reply, at the client."""
+        self._cycle = "" if cycle_us is None else f"    cycle {cycle_us:.0f} us"
+
     def event(self, event: dict[str, object]) -> None:
         """Keep the last ones."""
         self._events.append(f"{event['t_ms']:>10} ms  {event['event']:<13} {event['text']}")
@@ -122,7 +131,7 @@ class LiveView(QuietView):
 
         car = _car(self._telemetry) if self._telemetry else "waiting for the car"
         bar = _bar(self._telemetry.gap_m if self._telemetry else None)
-        lines = [car, bar, f"replicas: {self._leader}", "", *self._events]
+        lines = [car, bar, f"replicas: {self._leader}{self._cycle}", "", *self._events]
         options = self._options
         title = f"aftbed run {options.run}: {options.ftm}, {options.placement}"
         return Panel(

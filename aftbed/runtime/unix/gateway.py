@@ -37,6 +37,8 @@ class GatewayDevice:
         self._answered = 0
         self._overrun = 0
         self._quiet = False
+        self._sent_ns = 0
+        self._cycle_us = 0.0  # of the last request
 
     def fds(self) -> tuple[int, ...]:
         """The bus."""
@@ -60,11 +62,13 @@ class GatewayDevice:
             return None
         payload = self._payloads.popleft()
         self._dialogue.write(now_ns, self._client.next_id, 0, EntryKind.SENT, payload)
+        self._sent_ns = now_ns
         return Submit(payload)
 
     def accept(self, reply: Reply, now_ns: int) -> None:
         """Out it goes as frames; written behind, so that a reply that nobody got is asked again."""
         self._answered += 1
+        self._cycle_us = round((now_ns - self._sent_ns) / 1e3, 1)
         for frame in self._gateway.on_reply(
             reply.payload, self._t_us, reply.replica, reply.epoch, self._answered
         ):
@@ -88,6 +92,7 @@ class GatewayDevice:
                 "sent": self._client.next_id - 1,
                 "unanswered": len(self._client.unanswered) + len(self._payloads),
                 "overrun": self._overrun,
+                "cycle_us": self._cycle_us,
                 "accepted": counts.accepted,
                 "ignored": counts.ignored,
                 "refused": counts.refused,

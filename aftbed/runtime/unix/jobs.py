@@ -13,6 +13,7 @@ import msgspec
 
 STEP_SECONDS_MAX: Final = 2.0
 EARLY_MAX: Final = 256
+STATS_JOB: Final = "stats"
 
 Key = tuple[str, str, int]
 
@@ -51,8 +52,8 @@ class Jobs:
         return len(self._jobs)
 
     def names(self) -> list[str]:
-        """What is under way."""
-        return [job.name for job in self._jobs]
+        """What is under way, but for mere questions."""
+        return [job.name for job in self._jobs if job.name != STATS_JOB]
 
     def start(self, name: str, steps: Steps, on_end: Callable[[str], None]) -> None:
         """Run `steps`; `on_end` gets the reason of its failure, or `""`."""

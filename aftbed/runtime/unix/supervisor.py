@@ -22,7 +22,7 @@ from aftbed.ftm.mechanism import build
 from aftbed.runtime.unix import control, linux
 from aftbed.runtime.unix.deployment import BUS, LIGHT, WATCHED_KINDS, Deployment, Keys
 from aftbed.runtime.unix.faults import Faults
-from aftbed.runtime.unix.jobs import StepFailed
+from aftbed.runtime.unix.jobs import STATS_JOB, StepFailed
 from aftbed.runtime.unix.journal import Journal
 from aftbed.runtime.unix.loop import Loop
 from aftbed.runtime.unix.options import LoadRun, RunOptions
@@ -175,7 +175,7 @@ class Supervisor:
             self.loop.end()
             return
         if not len(self.loop.jobs):
-            self.loop.jobs.start("stats", self.work.ask_stats(self.deployment), lambda _: None)
+            self.loop.jobs.start(STATS_JOB, self.work.ask_stats(self.deployment), lambda _: None)
         self.loop.after(0.005, lambda: self._drain(limit_ns))
 
     def owner_gone(self) -> bool:
@@ -258,6 +258,8 @@ class Supervisor:
 
     def _inform_recovery(self, *, failed: bool) -> None:
         deployment = self.deployment
+        roles = f"{deployment.leader or 'nobody'} leads, {deployment.backup or 'nobody'} backs up"
+        self.tell("roles", f"{roles}, epoch {deployment.epoch}")
         if self.executor.busy or not deployment.lives("recovery") or self._ending:
             return
         slots = deployment.slots

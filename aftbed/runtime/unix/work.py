@@ -6,13 +6,14 @@ import socket
 import time
 from collections.abc import Callable, Generator
 from pathlib import Path
+from typing import Final
 
 import msgspec
 
 from aftbed.runtime.unix import control
 from aftbed.runtime.unix.deployment import BUS, LIGHT, Deployment, Keys
 from aftbed.runtime.unix.devices import LoadOptions
-from aftbed.runtime.unix.jobs import Key, Wait
+from aftbed.runtime.unix.jobs import STATS_JOB, Key, Wait
 from aftbed.runtime.unix.loop import Loop
 from aftbed.runtime.unix.options import (
     CarRun,
@@ -25,8 +26,9 @@ from aftbed.runtime.unix.options import (
 )
 from aftbed.runtime.unix.processes import Nursery, Process
 
-ATTACH_SECONDS_MAX = 10.0
-LOAD_POLL_SECONDS = 0.02
+ATTACH_SECONDS_MAX: Final = 10.0
+LOAD_POLL_SECONDS: Final = 0.02
+CYCLE_EVERY: Final = 10  # telemetries: so often the cycle time is shown
 
 
 class Work:
@@ -48,6 +50,7 @@ class Work:
         self._stats: dict[str, object] = {}
         self.telemetry: dict[str, object] | None = None
         self.settled = False
+        self._telemetries = 0
 
     def device_of(self, kind: str, incarnation: int) -> tuple[str, bytes]:
         """The device of a brick of `kind`, and its options."""
@@ -74,6 +77,7 @@ class Work:
 
     def before(self, deployment: Deployment) -> Keys:
         """What must stand before the graph does: the hub."""
+        self._deployment = deployment
         work = self._options.work
         if isinstance(work, LoadRun):
             return
@@ -126,6 +130,9 @@ class Work:
         elif kind == "telemetry":
             self.telemetry = msgspec.msgpack.decode(data)
             self._report_owner("telemetry", data)
+            self._telemetries += 1
+            if self._telemetries % CYCLE_EVERY == 0:
+                self._loop.jobs.start(STATS_JOB, self.ask_stats(self._deployment), self._report_cycle)
         elif kind == "trouble":
             self._tell("trouble", f"{process.name}: {data.decode()}")
             self._finish(f"{process.name}: {data.decode()}")
@@ -133,6 +140,10 @@ class Work:
             self._result = json.loads(data)
             process.kind = "killed"  # it is done: its death is no event
             self._finish("")
+
+    def _report_cycle(self, failure: str) -> None:
+        if not failure:
+            self._report_owner("cycle", json.dumps(self._stats.get("cycle_us")).encode())
 
     def stop_source(self, deployment: Deployment) -> Keys:
         """No more requests; the car or the player ends with the result so far."""
@@ -149,7 +160,7 @@ class Work:
             else:
                 self._loop.after(LOAD_POLL_SECONDS, lambda: self._watch_load(deployment))
 
-        self._loop.jobs.start("stats", self.ask_stats(deployment), asked)
+        self._loop.jobs.start(STATS_JOB, self.ask_stats(deployment), asked)
 
     def ask_stats(self, deployment: Deployment) -> Keys:
         """Ask the client how far it is."""
