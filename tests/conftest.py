@@ -1,8 +1,8 @@
 """What all tests share: how long hypothesis looks, and how golden files are rewritten.
 
-Profiles: `dev` (default), `ci` (the same examples each time; taken where `CI` is set), `deep` (a night's
-work: `pytest --hypothesis-profile deep`). None has a deadline per example: a busy machine is no failing
-test. A failing example prints the line that repeats it.
+Profiles: `dev` (default), `ci` (the same examples each time; taken where `CI` is set), `deep` (`pytest
+--hypothesis-profile deep`: minutes). None has a deadline per example: a busy machine is no failing test.
+A failing example prints the line that repeats it.
 """
 
 import os
@@ -14,7 +14,7 @@ _SLOW_IS_FINE = (HealthCheck.too_slow,)
 
 settings.register_profile("dev", deadline=None, print_blob=True, suppress_health_check=_SLOW_IS_FINE)
 settings.register_profile("ci", settings.get_profile("dev"), derandomize=True)
-settings.register_profile("deep", settings.get_profile("dev"), max_examples=20_000)
+settings.register_profile("deep", settings.get_profile("dev"), max_examples=5_000)
 settings.load_profile("ci" if os.environ.get("CI") else "dev")
 
 

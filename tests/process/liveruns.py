@@ -1,0 +1,410 @@
+"""Real runs for tests: started, watched, broken, and looked for after their end.
+
+`Started` is a run that this process launched and reads the reports of; `Command` is an `aftbed` of its
+own. Both belong to a `Home`, the XDG_RUNTIME_DIR of one test. Whatever descends from a test carries the
+name of its home in its environment (`/proc/PID/environ`), or is a fork of this process whose pid is
+known; so after a test it can be told, without a name to guess, whether anything of it is left.
+
+Nothing here sleeps to wait: a wait is a poll of a descriptor or of a condition, with a deadline.
+"""
+
+import json
+import os
+import select
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Final, TypeVar
+
+import msgspec
+import pytest
+
+from aftbed.campaign.record import RunRecord, read_record
+from aftbed.campaign.verdict import Verdict, judge
+from aftbed.core.errors import ConfigError
+from aftbed.core.fault import Fault
+from aftbed.core.journal import Entry, EntryKind, entries
+from aftbed.runtime.unix import ask, rundir
+from aftbed.runtime.unix.launch import launch, options_for
+from aftbed.runtime.unix.options import LoadRun, Work
+from aftbed.runtime.unix.resources import Row
+
+WAIT_SECONDS_MAX: Final = 20.0
+RUN_SECONDS_MAX: Final = 60.0
+LOOK_SECONDS: Final = 0.005  # between two looks at what no descriptor tells
+GONE_SECONDS_MAX: Final = 1.0  # G7
+PATIENCE_SECONDS: Final = 5.0  # how long a test waits for what G7 allows a second
+SHARED_MEMORY: Final = Path("/dev/shm")
+
+Found = TypeVar("Found")
+
+
+def until(look: Callable[[], Found], what: str, seconds: float = WAIT_SECONDS_MAX) -> Found:
+    """What `look` returns as soon as that is true. Fails the test at the deadline, saying `what`."""
+    limit = time.monotonic() + seconds
+    while not (found := look()):
+        if time.monotonic() > limit:
+            pytest.fail(f"waited {seconds} s for {what}")
+        time.sleep(LOOK_SECONDS)
+    return found
+
+
+def readable(descriptor: int, seconds: float) -> bool:
+    """Whether `descriptor` becomes readable (or ends) within `seconds`."""
+    poll = select.poll()
+    poll.register(descriptor, select.POLLIN)
+    return bool(poll.poll(max(0.0, seconds) * 1e3))
+
+
+def ended(pid: int, seconds: float = WAIT_SECONDS_MAX) -> bool:
+    """Whether the process `pid` ends within `seconds`; one that is gone has ended."""
+    try:
+        pidfd = os.pidfd_open(pid)
+    except ProcessLookupError:
+        return True
+    try:
+        return readable(pidfd, seconds)
+    finally:
+        os.close(pidfd)
+
+
+class Home:
+    """The XDG_RUNTIME_DIR of one test. Its path is short: a socket's may have 108 bytes."""
+
+    def __init__(self) -> None:
+        self.path = Path(tempfile.mkdtemp(prefix="aft-", dir="/tmp"))
+        self._mark = f"XDG_RUNTIME_DIR={self.path}".encode()
+        self._shared = set(SHARED_MEMORY.iterdir())
+        self.forks: list[int] = []
+
+    def processes(self) -> list[int]:
+        """The pids of what runs in this home, this process aside."""
+        found = [int(p.name) for p in Path("/proc").iterdir() if p.name.isdigit() and self._is_ours(p)]
+        return [pid for pid in found if pid != os.getpid()]
+
+    def _is_ours(self, process: Path) -> bool:
+        try:
+            if int(process.name) in self.forks:
+                return (process / "stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
+            return self._mark in (process / "environ").read_bytes().split(b"\0")
+        except OSError:
+            return False
+
+    def runs(self) -> list[Path]:
+        """The private directories there are, of runs alive or dead."""
+        root = self.path / "aftbed"
+        return list(root.iterdir()) if root.exists() else []
+
+    def left(self) -> list[str]:
+        """Everything that a run would have left behind (G7)."""
+        found = [f"process {pid} ({_comm(pid)})" for pid in self.processes()]
+        found += [f"directory {path}" for path in self.runs()]
+        return found + [f"shared memory {p}" for p in set(SHARED_MEMORY.iterdir()) - self._shared]
+
+    def seconds_to_clean(self) -> float:
+        """How long it takes from now until nothing is left."""
+        began = time.monotonic()
+        until(lambda: not self.left(), f"the end of {self.left()}", PATIENCE_SECONDS)
+        return time.monotonic() - began
+
+    def sweep(self) -> None:
+        """After a failed test: end what is its own, so that the next test starts clean."""
+        for pid in self.processes():
+            try:
+                os.kill(pid, signal.SIGKILL)
+            except ProcessLookupError:
+                continue
+        shutil.rmtree(self.path, ignore_errors=True)
+
+
+def _comm(pid: int) -> str:
+    try:
+        return Path(f"/proc/{pid}/comm").read_text().strip()
+    except OSError:
+        return "gone"
+
+
+@pytest.fixture(autouse=True)
+def home(monkeypatch: pytest.MonkeyPatch) -> Iterator[Home]:
+    """A place of its own for each test, and nothing may be left in it."""
+    place = Home()
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(place.path))
+    yield place
+    limit = time.monotonic() + GONE_SECONDS_MAX
+    left = place.left()
+    while left and time.monotonic() < limit:
+        time.sleep(LOOK_SECONDS)
+        left = place.left()
+    place.sweep()
+    assert not left, "left behind"
+
+
+class Outcome(msgspec.Struct, frozen=True):
+    """A run that has ended."""
+
+    record: RunRecord
+    verdict: Verdict
+    events: list[dict[str, object]]
+
+    def told(self, event: str) -> list[str]:
+        """The texts of all events of this kind."""
+        return [str(e["text"]) for e in self.events if e["event"] == event]
+
+    def answers(self) -> list[Entry]:
+        """The replies that the client got."""
+        return [e for e in self.record.history.dialogue if e.kind is EntryKind.ANSWERED]
+
+
+class Started:
+    """A run that this process launched. `close` ends it whatever happens; it is a context manager."""
+
+    def __init__(
+        self,
+        home: Home,
+        work: Work,
+        *,
+        ftm: str = "pbr",
+        placement: str = "process",
+        faults: tuple[Fault, ...] = (),
+        seed: int = 0,
+        record: Path | None = None,
+    ) -> None:
+        options, listener = options_for(
+            ftm=ftm,
+            placement=placement,
+            work=work,
+            seed=seed,
+            faults=faults,
+            record=str(record) if record else None,
+        )
+        self.launched = launch(options, listener)
+        home.forks += [self.launched.supervisor, self.launched._warden]
+        self.private = self.launched.private
+        self.events: list[dict[str, object]] = []
+        self._ended = self._closed = False
+
+    def __enter__(self) -> "Started":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Kill it if it has not been seen to its end."""
+        if self._closed:
+            return
+        self._closed = True
+        if not self._ended:
+            os.kill(self.launched.supervisor, signal.SIGKILL)
+        self.launched.wait()
+        self.launched.remove()
+
+    # -- what it says -------------------------------------------------------------------------
+
+    def _next(self, limit: float, what: str) -> bool:
+        """Read one report; False at the end of the run."""
+        if not readable(self.launched.line.fileno(), limit - time.monotonic()):
+            pytest.fail(f"no report while waiting for {what}; so far: {self.events[-5:]}")
+        for report in self.launched.reports():
+            if report.kind == "event":
+                self.events.append(json.loads(report.data))
+            return True
+        self._ended = True
+        return False
+
+    def wait_for(self, event: str, text: str = "", *, after: int = 0) -> dict[str, object]:
+        """The first such event behind the first `after` ones, as soon as it is told."""
+        limit, at = time.monotonic() + WAIT_SECONDS_MAX, after
+        while True:
+            for found in self.events[at:]:
+                if found["event"] == event and text in str(found["text"]):
+                    return found
+            at = len(self.events)
+            if not self._next(limit, f"{event} {text}"):
+                printed = (self.launched.record / "processes.log").read_text()[-2000:]
+                pytest.fail(f"ended without {event} {text}: {self.events[-5:]} {self.launched.end} {printed}")
+
+    def finish(self, seconds: float = RUN_SECONDS_MAX) -> Outcome:
+        """Follow the run to its end and judge it."""
+        limit = time.monotonic() + seconds
+        while self._next(limit, "the end"):
+            pass
+        self.launched.wait()
+        record = read_record(self.launched.record)
+        self._closed = True
+        self.launched.remove()
+        return Outcome(record, judge(record), self.events)
+
+    # -- what it does -------------------------------------------------------------------------
+
+    def rows(self) -> list[Row]:
+        """Its processes."""
+        return ask.processes(self.private)
+
+    def pid(self, name: str) -> int:
+        """The pid of the process called `name`."""
+        return next(row.pid for row in self.rows() if row.name == name)
+
+    def status(self) -> dict[str, object]:
+        """What `aftbed status` would show."""
+        return ask.ask(self.private, ask.Status())
+
+    def redundant(self) -> bool:
+        """Whether a backup stands and no script is under way."""
+        try:
+            status = self.status()
+        except ConfigError:
+            return False  # not listening yet
+        return bool(status["backup"]) and not status["busy"]
+
+    def descriptors(self, pid: int) -> int:
+        """How many descriptors the process `pid` has open."""
+        return len(list(Path(f"/proc/{pid}/fd").iterdir()))
+
+    def answered(self) -> int:
+        """How many replies the client has got, read from its dialogues as they grow."""
+        folder = self.launched.record / "journal"
+        return sum(
+            entry.kind is EntryKind.ANSWERED
+            for path in folder.glob("client.*.dialogue")
+            if path.stat().st_size  # not there yet, and already in the directory
+            for entry in entries(path.read_bytes())
+        )
+
+    def wait_for_answers(self, count: int) -> None:
+        """Wait until the client has got `count` replies."""
+        until(lambda: self.answered() >= count, f"{count} replies")
+
+    def strike(self, name: str, sig: signal.Signals) -> int:
+        """Signal the process called `name`; its pid. A stopped one is seen stopped."""
+        pid = self.pid(name) if name != "supervisor" else self.launched.supervisor
+        os.kill(pid, sig)
+        if sig is signal.SIGSTOP:
+            until(lambda: state_of(pid) == "T", f"{name} to stop")
+        return pid
+
+
+def state_of(pid: int) -> str:
+    """The state letter of proc(5), or `""` of a process that is gone."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return ""
+
+
+def under_load(
+    home: Home, count: int, rate_hz: float = 200.0, *, ftm: str = "pbr", placement: str = "process"
+) -> Started:
+    """A run under synthetic load that has begun to answer."""
+    run = Started(home, LoadRun(count, rate_hz), ftm=ftm, placement=placement)
+    try:
+        run.wait_for("started")
+        run.wait_for_answers(20)
+    except BaseException:
+        run.close()
+        raise
+    return run
+
+
+# -- the command in a process of its own --------------------------------------------------------
+
+
+class Done(msgspec.Struct, frozen=True):
+    """A command that has ended."""
+
+    code: int
+    out: str
+    err: str
+
+    def verdict(self) -> Verdict:
+        """The one document of `--json`."""
+        return msgspec.json.decode(self.out, type=Verdict)
+
+
+def aftbed(*arguments: str | Path, flags: tuple[str, ...] = ()) -> Done:
+    """Run a command to its end; `flags` are the interpreter's."""
+    done = subprocess.run(
+        [sys.executable, *flags, "-m", "aftbed", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        timeout=RUN_SECONDS_MAX,
+        check=False,
+        stdin=subprocess.DEVNULL,
+    )
+    return Done(done.returncode, done.stdout, done.stderr)
+
+
+class Command:
+    """An `aftbed run` of its own, in the background. A context manager that kills it."""
+
+    def __init__(self, *arguments: str | Path) -> None:
+        command = [sys.executable, "-m", "aftbed", "run", *map(str, arguments)]
+        self._errors = tempfile.TemporaryFile("w+")  # noqa: SIM115 - for as long as the command
+        self.popen = subprocess.Popen(
+            command,
+            stdout=subprocess.PIPE,
+            stderr=self._errors,
+            stdin=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+        assert self.popen.stdout is not None
+        self._out = self.popen.stdout.fileno()
+        self._text = b""
+
+    def __enter__(self) -> "Command":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.popen.kill()
+        self.popen.wait()
+        assert self.popen.stdout is not None
+        self.popen.stdout.close()
+        self._errors.close()
+
+    def wait_for_line(self, words: str) -> str:
+        """The first line of its output that has `words`."""
+        limit = time.monotonic() + WAIT_SECONDS_MAX
+        while True:
+            lines = self._text.decode(errors="replace").splitlines(keepends=True)
+            for line in lines:
+                if words in line and line.endswith("\n"):
+                    return line.rstrip()
+            if not readable(self._out, limit - time.monotonic()):
+                pytest.fail(f"no line with {words!r} in {self._text[-500:]!r}")
+            got = os.read(self._out, 65536)
+            if not got:
+                pytest.fail(f"ended without {words!r}: {self._text[-500:]!r} {self._error_text()}")
+            self._text += got
+
+    def started(self) -> str:
+        """Wait until the graph stands; the id of the run."""
+        line = self.wait_for_line("run ")
+        self.wait_for_line("started: ")
+        return line.split()[1].rstrip(":")
+
+    def _error_text(self) -> str:
+        self._errors.seek(0)
+        return self._errors.read()
+
+    def done(self) -> Done:
+        """Wait for its end."""
+        limit = time.monotonic() + RUN_SECONDS_MAX
+        while True:
+            if not readable(self._out, limit - time.monotonic()):
+                pytest.fail(f"the command goes on: {self._text[-500:]!r}")
+            got = os.read(self._out, 65536)
+            if not got:
+                break
+            self._text += got
+        code = self.popen.wait(WAIT_SECONDS_MAX)
+        return Done(code, self._text.decode(errors="replace"), self._error_text())
+
+
+def only_run() -> Path:
+    """The private directory of the only live run, as soon as it answers."""
+    return rundir.root() / until(rundir.live, "a run")[0]

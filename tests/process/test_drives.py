@@ -1,0 +1,125 @@
+"""Whole drives and replays: what the car comes to, and that nothing of it hangs on the machine or the mechanism."""
+
+import os
+from pathlib import Path
+from typing import Final
+
+import pytest
+from liveruns import Done, aftbed
+
+from aftbed.campaign.record import read_record
+from aftbed.core.journal import EntryKind
+from aftbed.vehicle.aebmessages import decode_reply
+from aftbed.vehicle.scenario import scenario_names
+
+pytestmark = pytest.mark.process
+
+_SHARED: Final = os.environ.get("AFTBED_SHARED")
+DATA: Final = (Path(_SHARED) if _SHARED else Path(__file__).resolve().parents[2].parent / "shared") / "data"
+TOYOTA_LOG, TOYOTA_DBC = DATA / "rav4_following_50kmh.log", DATA / "toyota_adas.dbc"
+MECHANISMS: Final = (("none", "process"), ("pbr", "process"), ("pbr", "replica"))
+HEARTBEATS: Final = tuple(f" {number:03X}#" for number in range(0x700, 0x710))
+
+
+def passed(*arguments: str | Path) -> Done:
+    """A run that must pass."""
+    done = aftbed("run", "--json", *arguments)
+    assert done.code == 0, done.out + done.err
+    assert done.verdict().verdict == "pass"
+    return done
+
+
+def bus_log(record: Path, *arguments: str) -> list[str]:
+    """The frames of a short drive in lockstep."""
+    passed("--scenario", "ccrs-20", "--pace", "max", "--record", record, *arguments)
+    return (record / "bus.log").read_text().splitlines()
+
+
+def without_heartbeats(lines: list[str]) -> list[str]:
+    """All frames but those by which a mechanism shows itself."""
+    return [line for line in lines if not any(mark in line for mark in HEARTBEATS)]
+
+
+@pytest.mark.parametrize("scenario", scenario_names())
+@pytest.mark.parametrize(("ftm", "placement"), MECHANISMS)
+def test_every_scenario_comes_to_what_it_expects(scenario: str, ftm: str, placement: str) -> None:
+    done = passed("--scenario", scenario, "--ftm", ftm, "--placement", placement, "--pace", "max")
+    verdict = done.verdict()
+    assert verdict.vehicle is not None
+    assert verdict.requests.answered == verdict.requests.sent > 0
+    assert verdict.vehicle.braked is (scenario != "free-drive")
+
+
+def test_a_drive_in_real_time_passes() -> None:
+    verdict = passed("--scenario", "ccrs-20", "--pace", "4").verdict()
+    assert verdict.vehicle is not None
+    assert verdict.vehicle.stop_gap_m is not None
+
+
+@pytest.mark.deep
+@pytest.mark.parametrize("scenario", scenario_names())
+def test_every_scenario_passes_in_real_time_over_a_crash(scenario: str) -> None:
+    fault = "crash primary at checkpoint.sent nth 60"
+    verdict = passed("--scenario", scenario, "--pace", "real", "--inject", fault).verdict()
+    assert len(verdict.failovers) == 1
+    assert verdict.requests.lost == 0
+
+
+def test_the_same_seed_gives_the_same_frames_byte_for_byte(tmp_path: Path) -> None:
+    first = bus_log(tmp_path / "1", "--seed", "7")
+    assert bus_log(tmp_path / "2", "--seed", "7") == first
+    assert len(first) > 500
+
+
+def test_another_seed_gives_other_frames(tmp_path: Path) -> None:
+    assert bus_log(tmp_path / "1", "--seed", "7") != bus_log(tmp_path / "2", "--seed", "8")
+
+
+def test_no_mechanism_changes_what_is_on_the_bus(tmp_path: Path) -> None:
+    logs = [
+        without_heartbeats(
+            bus_log(tmp_path / f"{ftm}-{placement}", "--ftm", ftm, "--placement", placement)
+        )
+        for ftm, placement in MECHANISMS
+    ]
+    assert logs[0] == logs[1] == logs[2]
+
+
+def test_a_crash_changes_nothing_on_the_bus(tmp_path: Path) -> None:
+    crashed = bus_log(tmp_path / "1", "--inject", "crash primary at checkpoint.sent nth 60")
+    assert without_heartbeats(crashed) == without_heartbeats(bus_log(tmp_path / "2"))
+
+
+@pytest.mark.parametrize("policy", ["hold", "release", "latch"])
+def test_a_brake_policy_matters_to_nobody_while_requests_come(policy: str) -> None:
+    verdict = passed("--scenario", "ccrs-20", "--pace", "max", "--brake-policy", policy).verdict()
+    assert verdict.vehicle is not None
+    assert not verdict.vehicle.collision
+
+
+# -- a real drive --------------------------------------------------------------------------------
+
+
+def replay(record: Path, *arguments: str) -> list[tuple[int, bytes]]:
+    """The decisions over the real log, by id of the request; it must be believed and passed."""
+    files = ("--replay", TOYOTA_LOG, "--dbc", TOYOTA_DBC, "--map", "toyota")
+    verdict = passed(*files, "--pace", "max", "--record", record, *arguments).verdict()
+    assert verdict.requests.sent == verdict.requests.answered > 100
+    assert verdict.replay is not None
+    gateway, played = verdict.replay["gateway"], verdict.replay["played"]
+    assert isinstance(gateway, dict)
+    assert isinstance(played, dict)
+    assert gateway["refused"] == {}
+    assert gateway["accepted"] == played["sent"] == len(TOYOTA_LOG.read_bytes().splitlines())
+    assert (played["missing_answers"], played["deceleration_ms2_max"]) == (0, 0.0)
+    dialogue = read_record(record).history.dialogue
+    return [(e.request_id, e.payload) for e in dialogue if e.kind is EntryKind.ANSWERED]
+
+
+@pytest.mark.skipif(not TOYOTA_LOG.is_file(), reason="the real drive is not here")
+def test_a_real_drive_is_believed_never_braked_and_decided_alike(tmp_path: Path) -> None:
+    bare = replay(tmp_path / "none", "--ftm", "none")
+    assert replay(tmp_path / "pbr", "--ftm", "pbr") == bare
+    fault = "crash primary at checkpoint.sent nth 100"
+    assert replay(tmp_path / "crash", "--ftm", "pbr", "--inject", fault) == bare
+    assert all(decode_reply(payload).deceleration_ms2 == 0.0 for _, payload in bare)

@@ -1,0 +1,211 @@
+"""SIGKILL of every process of a run, under load: the service goes on, once each, and nothing is left (G1 to G7)."""
+
+import io
+import os
+import signal
+from pathlib import Path
+from typing import Final
+
+import pytest
+from liveruns import (
+    GONE_SECONDS_MAX,
+    Command,
+    Home,
+    Outcome,
+    Started,
+    aftbed,
+    ended,
+    only_run,
+    state_of,
+    under_load,
+    until,
+)
+
+from aftbed.core.journal import EntryKind
+from aftbed.ftm.mechanism import build
+from aftbed.runtime.unix import ask
+from aftbed.runtime.unix.options import LoadRun
+from aftbed.vehicle.candump import LogCounts, Refusal, parse_lines
+
+pytestmark = pytest.mark.process
+
+NODES: Final = tuple(build("pbr", "process").nodes)
+CHAIN: Final = ("protocol", "before", "proceed", "after", "server")
+OUTSIDE: Final = tuple(n for n in NODES if n.rpartition("/")[2] not in CHAIN)
+REQUESTS: Final = 150
+RATE_HZ: Final = 200.0
+
+
+def assert_served(outcome: Outcome, failovers: int) -> None:
+    """Every promise held, over as many changes of master."""
+    assert outcome.verdict.verdict == "pass", (outcome.verdict.reasons, outcome.events)
+    requests = outcome.verdict.requests
+    assert requests.sent == requests.answered == outcome.record.options.work.count
+    assert (requests.lost, requests.duplicated, requests.wrong) == (0, 0, 0)
+    assert len(outcome.verdict.failovers) == failovers, outcome.events
+    assert outcome.record.end is not None
+    assert outcome.record.end["epoch"] == 1 + failovers
+
+
+def load_over_a_kill(home: Home, name: str, placement: str = "process") -> Outcome:
+    """A run under load in which the process called `name` is killed."""
+    with under_load(home, REQUESTS, RATE_HZ, placement=placement) as run:
+        pid = run.strike(name, signal.SIGKILL)
+        assert ended(pid)
+        return run.finish()
+
+
+def test_there_are_the_seventeen_processes_of_the_paper(home: Home) -> None:
+    with under_load(home, REQUESTS, RATE_HZ) as run:
+        rows = run.rows()
+        assert [row.name for row in rows if row.node] == ["supervisor", *NODES]
+        assert len({row.pid for row in rows}) == len(rows)
+        assert len([row for row in rows if row.node]) == 17
+        assert_served(run.finish(), failovers=0)
+
+
+@pytest.mark.parametrize("part", CHAIN)
+def test_the_death_of_any_node_of_the_primary_is_one_failover(home: Home, part: str) -> None:
+    outcome = load_over_a_kill(home, f"a/{part}")
+    assert_served(outcome, failovers=1)
+    assert outcome.record.end is not None
+    assert (outcome.record.end["leader"], outcome.record.end["backup"]) == ("b", "a")
+
+
+@pytest.mark.parametrize("part", CHAIN)
+def test_the_death_of_any_node_of_the_backup_costs_nothing(home: Home, part: str) -> None:
+    outcome = load_over_a_kill(home, f"b/{part}")
+    assert_served(outcome, failovers=0)
+    assert outcome.record.end is not None
+    assert (outcome.record.end["leader"], outcome.record.end["backup"]) == ("a", "b")
+
+
+@pytest.mark.parametrize("name", OUTSIDE)
+def test_the_death_of_a_node_beside_the_replicas_is_no_failover(home: Home, name: str) -> None:
+    outcome = load_over_a_kill(home, name)
+    assert_served(outcome, failovers=0)
+    assert any(text.startswith(f"{name}:") for text in outcome.told("replaced"))
+    assert outcome.told("script") == []
+
+
+@pytest.mark.parametrize("name", ["a", "b"])
+def test_the_death_of_a_replica_in_one_node(home: Home, name: str) -> None:
+    assert_served(load_over_a_kill(home, name, "replica"), failovers=1 if name == "a" else 0)
+
+
+def test_the_death_of_the_zygote_is_no_failover(home: Home) -> None:
+    with under_load(home, REQUESTS, RATE_HZ) as run:
+        pid = run.strike("zygote", signal.SIGKILL)
+        assert ended(pid)
+        run.wait_for("died", "zygote")
+        until(lambda: run.pid("zygote") != pid, "a new zygote")
+        assert_served(run.finish(), failovers=0)
+
+
+def test_after_the_death_of_the_zygote_a_replica_can_be_replaced(home: Home) -> None:
+    """The spares that the dead zygote parked are enough for one; the next ones are the new zygote's."""
+    with under_load(home, 3 * REQUESTS, RATE_HZ) as run:
+        run.strike("zygote", signal.SIGKILL)
+        run.wait_for("died", "zygote")
+        for _ in range(2):
+            seen = len(run.events)
+            run.strike(f"{run.status()['leader']}/server", signal.SIGKILL)
+            run.wait_for("script.done", "new backup", after=seen)
+        assert_served(run.finish(), failovers=2)
+
+
+@pytest.mark.parametrize("name", ["proxy", "client", "recovery", "a/watchdog", "b/watchdog"])
+def test_a_node_beside_the_replicas_may_die_again_and_again(home: Home, name: str) -> None:
+    """Under many requests each death meets another moment of a request."""
+    with under_load(home, 1500, 1000.0) as run:
+        for _ in range(5):
+            seen = len(run.events)
+            run.strike(name, signal.SIGKILL)
+            run.wait_for("replaced", name, after=seen)
+        assert_served(run.finish(), failovers=0)
+
+
+def test_the_death_of_the_supervisor_ends_everything_and_is_inconclusive(home: Home) -> None:
+    with Command("--load", "100000@200") as command:
+        command.started()
+        pid = next(row.pid for row in ask.processes(only_run()) if row.name == "supervisor")
+        os.kill(pid, signal.SIGKILL)
+        assert ended(pid)
+        done = command.done()
+    assert done.code == 3, done.out + done.err
+    assert "verdict: inconclusive" in done.out
+    assert "the supervisor did not live to end the run" in done.out
+    assert home.seconds_to_clean() < GONE_SECONDS_MAX
+
+
+def test_a_killed_command_leaves_nothing_but_its_record(home: Home, tmp_path: Path) -> None:
+    record = tmp_path / "record"
+    with Command("--scenario", "free-drive", "--record", record) as command:
+        command.started()
+        command.wait_for_line("km/h")
+        until(lambda: _frames(record).frames > 100, "frames in the log")
+        command.popen.kill()
+        command.popen.wait()
+        assert home.seconds_to_clean() < GONE_SECONDS_MAX
+    assert_readable_to_the_last_line(record)
+    done = aftbed("check", record)
+    assert done.code == 3, done.out + done.err
+    assert "verdict: inconclusive" in done.out
+
+
+def test_command_and_supervisor_killed_at_once_leave_nothing_but_the_record(
+    home: Home, tmp_path: Path
+) -> None:
+    record = tmp_path / "record"
+    with Command("--scenario", "free-drive", "--record", record) as command:
+        command.started()
+        until(lambda: _frames(record).frames > 100, "frames in the log")
+        supervisor = next(row.pid for row in ask.processes(only_run()) if row.name == "supervisor")
+        command.popen.kill()
+        os.kill(supervisor, signal.SIGKILL)
+        command.popen.wait()
+        assert home.seconds_to_clean() < GONE_SECONDS_MAX
+    assert_readable_to_the_last_line(record)
+    assert aftbed("check", record).code == 3
+
+
+def test_a_killed_command_takes_a_stopped_supervisor_with_it(home: Home) -> None:
+    """Nobody else could tell it: it does not read."""
+    with Command("--load", "100000@200") as command:
+        command.started()
+        supervisor = next(row.pid for row in ask.processes(only_run()) if row.name == "supervisor")
+        os.kill(supervisor, signal.SIGSTOP)
+        until(lambda: state_of(supervisor) == "T", "the supervisor to stop")
+        command.popen.kill()
+        command.popen.wait()
+        assert home.seconds_to_clean() < GONE_SECONDS_MAX
+
+
+def test_the_record_of_a_killed_run_holds_every_reply_that_was_given(home: Home) -> None:
+    with Started(home, LoadRun(100_000, 0.0)) as run:
+        run.wait_for("started")
+        run.wait_for_answers(500)
+        given = run.answered()
+        run.strike("supervisor", signal.SIGKILL)
+        outcome = run.finish()
+    assert outcome.verdict.verdict == "inconclusive", outcome.verdict.reasons
+    assert outcome.verdict.checks["at_most_once"] == "pass"
+    assert outcome.verdict.checks["one_history"] == "pass"
+    dialogue = outcome.record.history.dialogue
+    assert sum(entry.kind is EntryKind.ANSWERED for entry in dialogue) >= given
+
+
+def _frames(record: Path) -> LogCounts:
+    counts = LogCounts()
+    log = record / "bus.log"
+    content = log.read_bytes() if log.exists() else b""
+    for _ in parse_lines(io.BytesIO(content), counts):
+        pass
+    return counts
+
+
+def assert_readable_to_the_last_line(record: Path) -> None:
+    """Nothing in the bus log is refused, but for what was being written."""
+    counts = _frames(record)
+    assert counts.frames > 100
+    assert set(counts.refused) <= {Refusal.TORN}, counts

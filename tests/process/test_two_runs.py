@@ -1,0 +1,75 @@
+"""Two runs side by side do not touch each other, and a command says which one it means."""
+
+import os
+import signal
+
+import pytest
+from liveruns import Command, Home, aftbed, under_load, until
+
+from aftbed.runtime.unix import ask, rundir
+
+pytestmark = pytest.mark.process
+
+
+def test_two_drives_at_once_both_pass(home: Home) -> None:
+    fault = "crash primary at checkpoint.sent nth 60"
+    drive = ("--scenario", "ccrs-20", "--pace", "max")
+    with Command(*drive, "--inject", fault) as first, Command(*drive) as second:
+        hit, spared = first.done(), second.done()
+    assert hit.code == 0, hit.out + hit.err
+    assert spared.code == 0, spared.out + spared.err
+    assert "failover" in hit.out
+    assert "failover" not in spared.out
+
+
+def test_a_crash_in_one_run_is_none_in_the_other(home: Home) -> None:
+    with under_load(home, 300) as one, Command("--load", "300@200", "--json") as other:
+        until(lambda: len(rundir.live()) == 2, "two runs")
+        seen = len(one.events)
+        one.strike("a/server", signal.SIGKILL)
+        one.wait_for("script.done", "new backup", after=seen)
+        assert len(one.finish().verdict.failovers) == 1
+        spared = other.done()
+    assert spared.code == 0, spared.out + spared.err
+    assert spared.verdict().failovers == []
+
+
+def test_with_two_runs_alive_a_command_must_name_one(home: Home) -> None:
+    with Command("--load", "100000@200") as first, Command("--load", "100000@200") as second:
+        ids = {first.started(), second.started()}
+        until(lambda: len(rundir.live()) == 2, "two runs")
+        for command in ("status", "ps", "graph", "stop"):
+            refused = aftbed(command)
+            assert refused.code == 2
+            assert refused.err.startswith("aftbed: error: 2 runs are alive: name one with --run")
+            assert all(run in refused.err for run in ids)
+        for run in ids:
+            named = aftbed("status", "--run", run)
+            assert named.code == 0, named.err
+            assert run in named.out
+        assert aftbed("stop", "--run", ids.pop()).code == 0
+        until(lambda: len(rundir.live()) == 1, "one run to end")
+        alone = aftbed("stop")
+        assert alone.code == 0, alone.err
+        for command in (first, second):
+            done = command.done()
+            assert done.code == 0, done.out + done.err
+            assert "verdict: pass" in done.out
+
+
+def test_the_directory_of_a_dead_run_is_no_run(home: Home) -> None:
+    """What a crash of the machine may leave: a directory, and a socket that nobody serves."""
+    private = rundir.create()
+    with pytest.raises(OSError, match=r"No such file|refused"):
+        rundir.connect(private)
+    assert rundir.live() == []
+    assert aftbed("status").err.startswith("aftbed: error: no run is alive")
+    rundir.remove(private)
+
+
+def test_the_directory_of_a_run_is_private(home: Home) -> None:
+    with under_load(home, 100) as run:
+        assert os.stat(run.private).st_mode & 0o777 == 0o700
+        assert os.stat(rundir.root()).st_mode & 0o777 == 0o700
+        ask.ask(run.private, ask.Stop())
+        assert run.finish().verdict.verdict == "pass"

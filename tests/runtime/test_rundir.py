@@ -1,0 +1,157 @@
+"""Where a run lives: private, found by itself, and refused where others could look in."""
+
+import re
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from aftbed.core.errors import ConfigError, HarnessError
+from aftbed.runtime.unix import rundir
+
+
+@pytest.fixture
+def runtime(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A runtime directory of this test alone; where the runs are."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    return tmp_path / "aftbed"
+
+
+@pytest.fixture
+def listeners() -> Iterator[list[socket.socket]]:
+    found: list[socket.socket] = []
+    yield found
+    for sock in found:
+        sock.close()
+
+
+def alive(listeners: list[socket.socket]) -> Path:
+    """A run whose supervisor listens."""
+    private = rundir.create()
+    sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    sock.bind(str(private / rundir.SOCKET_NAME))
+    sock.listen()
+    listeners.append(sock)
+    return private
+
+
+def mode(path: Path) -> int:
+    return path.stat().st_mode & 0o777
+
+
+def test_a_runs_directory_is_private(runtime: Path) -> None:
+    private = rundir.create()
+    assert private.parent == runtime == rundir.root()
+    assert mode(private) == mode(runtime) == 0o700
+
+
+def test_each_run_has_its_own(runtime: Path) -> None:
+    assert len({rundir.create() for _ in range(20)}) == 20
+
+
+def test_without_a_runtime_directory_it_lies_under_tmp(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    for missing in (None, str(tmp_path / "nowhere")):
+        if missing is None:
+            monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
+        else:
+            monkeypatch.setenv("XDG_RUNTIME_DIR", missing)
+        assert rundir.root().parent == tmp_path and rundir.root().name.startswith("aftbed-")
+
+
+@pytest.mark.parametrize("wide", [0o755, 0o770, 0o701, 0o777])
+def test_a_directory_that_others_can_enter_is_refused(runtime: Path, wide: int) -> None:
+    runtime.mkdir()
+    runtime.chmod(wide)
+    with pytest.raises(
+        HarnessError, match=re.escape(f"{runtime}: must be a directory of this user alone (mode 0700)")
+    ):
+        rundir.create()
+
+
+def test_a_directory_of_another_user_is_refused(runtime: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    another = rundir.root().stat().st_uid + 1
+    monkeypatch.setattr("os.getuid", lambda: another)
+    with pytest.raises(HarnessError, match="must be a directory of this user alone"):
+        rundir.root()
+
+
+def test_a_link_to_a_directory_is_refused(runtime: Path, tmp_path: Path) -> None:
+    (tmp_path / "elsewhere").mkdir(mode=0o700)
+    runtime.symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(HarnessError, match="must be a directory of this user alone"):
+        rundir.root()
+
+
+# -- the record
+
+
+def test_without_a_wish_the_record_goes_with_the_run(runtime: Path) -> None:
+    private = rundir.create()
+    record = rundir.record_directory(None, private)
+    assert record == private / "record" and (record / "journal").is_dir()
+    rundir.remove(private)
+    assert not private.exists() and runtime.exists()
+
+
+def test_a_wished_record_stays(runtime: Path, tmp_path: Path) -> None:
+    private = rundir.create()
+    record = rundir.record_directory(str(tmp_path / "new" / "record"), private)
+    assert record == tmp_path / "new" / "record" and (record / "journal").is_dir()
+    rundir.remove(private)
+    assert record.exists()
+
+
+def test_a_record_directory_that_exists_is_refused(runtime: Path, tmp_path: Path) -> None:
+    wanted = str(tmp_path / "record")
+    Path(wanted).mkdir()
+    message = re.escape(f"--record {wanted}: exists already; name a directory that does not")
+    with pytest.raises(ConfigError, match=message):
+        rundir.record_directory(wanted, runtime)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match="exists already"):
+        rundir.record_directory(str(tmp_path / "file"), runtime)
+
+
+def test_a_record_directory_that_cannot_be_made_is_refused(runtime: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match=r"--record .*/file/record: cannot be made: Not a directory"):
+        rundir.record_directory(str(tmp_path / "file" / "record"), runtime)
+
+
+# -- finding runs
+
+
+def test_the_only_run_is_found_by_itself(runtime: Path, listeners: list[socket.socket]) -> None:
+    private = alive(listeners)
+    rundir.create()  # a run whose supervisor is gone: nobody listens
+    assert rundir.live() == [private.name]
+    assert rundir.find(None) == rundir.find(private.name) == private
+
+
+def test_no_run_is_alive(runtime: Path) -> None:
+    with pytest.raises(ConfigError, match="no run is alive; start one with `aftbed run`"):
+        rundir.find(None)
+    with pytest.raises(ConfigError, match=r"--run abc: no such run is alive \(alive: none\)"):
+        rundir.find("abc")
+
+
+def test_several_runs_are_alive(runtime: Path, listeners: list[socket.socket]) -> None:
+    names = {alive(listeners).name, alive(listeners).name}
+    with pytest.raises(ConfigError, match=r"2 runs are alive: name one with --run \(alive: ") as caught:
+        rundir.find(None)
+    assert all(name in str(caught.value) for name in names)
+    with pytest.raises(ConfigError, match="--run abc: no such run is alive") as caught:
+        rundir.find("abc")
+    assert all(name in str(caught.value) for name in names)
+
+
+def test_a_dead_run_is_no_run(runtime: Path, listeners: list[socket.socket]) -> None:
+    private = alive(listeners)
+    listeners[0].close()
+    assert (private / rundir.SOCKET_NAME).exists() and rundir.live() == []
+    with pytest.raises(OSError, match="refused"):
+        rundir.connect(private)
