@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Final
 
 from aftbed.core.journal import HEADER_BYTES, LIFELINE_OFFSET
+from aftbed.runtime.unix import linux
 
 SYS_SET_ROBUST_LIST: Final = {"x86_64": 273, "aarch64": 99}.get(os.uname().machine, -1)
 SYS_FUTEX_WAITV: Final = 449  # the same number on every architecture
@@ -120,6 +121,7 @@ class Watcher:
 
     def _watch(self) -> None:
         signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())  # they are the main thread's
+        linux.answer_soon()
         os.sched_setaffinity(0, range(os.cpu_count() or 1))  # not bound to a core that is busy with the dead
         alive = [i for i, word in enumerate(self._words) if word.value]
         try:

@@ -21,6 +21,7 @@ PR_SET_PDEATHSIG: Final = 1
 PR_SET_NAME: Final = 15
 PR_SET_CHILD_SUBREAPER: Final = 36
 ADOPTION_SECONDS_MAX: Final = 5.0
+SLICE_NS: Final = 100_000  # the shortest that the kernel allows
 
 _libc: Final = ctypes.CDLL(None, use_errno=True)
 
@@ -44,6 +45,33 @@ def die_with(parent: int) -> None:
     _prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
         os._exit(1)
+
+
+class _SchedAttr(ctypes.Structure):
+    _fields_ = (
+        ("size", ctypes.c_uint32),
+        ("policy", ctypes.c_uint32),
+        ("flags", ctypes.c_uint64),
+        ("nice", ctypes.c_int32),
+        ("priority", ctypes.c_uint32),
+        ("runtime", ctypes.c_uint64),
+        ("deadline", ctypes.c_uint64),
+        ("period", ctypes.c_uint64),
+    )
+
+
+def answer_soon() -> None:
+    """Ask for short time slices for this thread: woken, it runs before whoever has long ones.
+
+    sched_setattr(2), `sched_runtime` of SCHED_OTHER (Linux 6.12); no privilege, no larger share of the
+    CPU, only sooner. Without it a watcher can wait 3 ms behind a backup that is catching up. A kernel
+    that does not know it ignores it.
+    """
+    number = {"x86_64": 314, "aarch64": 274}.get(os.uname().machine)
+    if number is not None:
+        attributes = _SchedAttr(size=ctypes.sizeof(_SchedAttr), runtime=SLICE_NS)
+        attributes.nice = os.getpriority(os.PRIO_PROCESS, 0)
+        _libc.syscall(number, 0, ctypes.byref(attributes), 0)
 
 
 def become_subreaper() -> None:

@@ -84,6 +84,7 @@ class Supervisor:
         """From the first fork to the last reaped process."""
         linux.become_subreaper()
         linux.no_core()
+        linux.answer_soon()
         wants_bus = not isinstance(self.options.work, LoadRun)
         if wants_bus:
             self.nursery.start_zygote(BUS, BUS_PRELOAD)
