@@ -40,7 +40,7 @@ def bench_recovery(ftm: str, placement: str, kills: int, *, pin: bool = True) ->
     parts: dict[str, list[float]] = {"detection": [], "fencing": [], "promotion": [], "first_reply": []}
     recovered = []
     for f in found:
-        if f.detected_ms is None or f.promoted_ms is None or f.recovered_ms is None:
+        if f.detected_ms is None or f.fenced_ms is None or f.promoted_ms is None or f.recovered_ms is None:
             continue
         recovered.append(f.recovered_ms)
         parts["detection"].append(f.detected_ms)

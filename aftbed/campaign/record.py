@@ -7,7 +7,7 @@ import msgspec
 
 from aftbed.core.check import History
 from aftbed.core.errors import ConfigError, PeerError
-from aftbed.core.journal import entries, records
+from aftbed.core.journal import dropped, entries, records
 from aftbed.runtime.unix.options import RunOptions
 
 
@@ -24,24 +24,22 @@ class RunRecord(msgspec.Struct, frozen=True):
 def read_record(path: Path) -> RunRecord:
     """The record in `path`. Raises ConfigError naming the file that is missing or malformed."""
     about = _json(path / "run.json")
-    options = msgspec.convert(about | {"private": "", "listener": -1}, RunOptions)
-    folder = path / "journal"
     try:
-        journals = {
-            p.name.removesuffix(".journal"): list(records(p.read_bytes()))
-            for p in sorted(folder.glob("*.journal"))
-        }
-        dialogue = [
-            e
-            for p in sorted(folder.glob("client.*.dialogue"), key=lambda p: int(p.name.split(".")[1]))
-            for e in entries(p.read_bytes())
-        ]
+        options = msgspec.convert(about | {"private": "", "listener": -1}, RunOptions)
+        started = msgspec.convert(about.get("started_ns"), int)
+    except msgspec.ValidationError as error:
+        raise ConfigError(f"{path / 'run.json'}: not the options of a run: {error}") from None
+    folder = path / "journal"
+    files = sorted(folder.glob("*.journal"))
+    dialogues = sorted(folder.glob("client.*.dialogue"), key=lambda p: int(p.name.split(".")[1]))
+    try:
+        journals = {p.name.removesuffix(".journal"): list(records(p.read_bytes())) for p in files}
+        dialogue = [e for p in dialogues for e in entries(p.read_bytes())]
+        lost = sum(dropped(p.read_bytes()) for p in (*files, *dialogues))
     except PeerError as error:
         raise ConfigError(f"{folder}: {error}") from None
     end = _json(path / "end.json") if (path / "end.json").exists() else None
-    started = about["started_ns"]
-    assert isinstance(started, int)
-    return RunRecord(path, options, started, end, History(journals, dialogue))
+    return RunRecord(path, options, started, end, History(journals, dialogue, lost))
 
 
 def _json(path: Path) -> dict[str, object]:

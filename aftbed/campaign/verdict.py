@@ -51,6 +51,7 @@ def judge(record: RunRecord) -> Verdict:
         "one_master": check.one_master(history),
         "clean_exit": _clean_exit(record),
         "faults_applied": _faults_applied(record),
+        "whole_history": _whole(record),
     }
     vehicle = _vehicle(record)
     scenario = "load"
@@ -85,6 +86,12 @@ def _word(checks: dict[str, Check]) -> Word:
     if "fail" in findings:
         return "fail"
     return "inconclusive" if "unknown" in findings else "pass"
+
+
+def _whole(record: RunRecord) -> Check:
+    """A journal that was full has not seen everything."""
+    lost = record.history.dropped
+    return Check("unknown", (f"{lost} records found no room in the journals",)) if lost else Check("pass")
 
 
 def _clean_exit(record: RunRecord) -> Check:

@@ -27,6 +27,7 @@ class History(msgspec.Struct, frozen=True):
 
     journals: dict[str, list[Record]]
     dialogue: list[Entry]
+    dropped: int = 0  # records that found no room: what they told is not known
 
     def events(self, *wanted: Event) -> list[Record]:
         """The records of these events, of all nodes, by time."""
@@ -62,7 +63,7 @@ class Failover(msgspec.Struct, frozen=True):
     epoch: int
     cause: str
     detected_ms: float | None
-    fenced_ms: float
+    fenced_ms: float | None
     promoted_ms: float | None
     recovered_ms: float | None
     blackout_ms: float | None
@@ -90,6 +91,8 @@ def exactly_one_answer(history: History) -> Check:
     """G2: each request sent has one reply."""
     answers = _answers(history)
     reasons = [f"request {i}: {len(a)} replies" for i, a in sorted(answers.items()) if len(a) != 1]
+    asked = {e.request_id for e in _sent(history)}
+    reasons += [f"request {i}: answered, but never sent" for i in sorted(answers.keys() - asked)]
     strays = [r.request_id for r in _client_refusals(history) if r.request_id]
     reasons += [f"request {i}: one reply too many reached the client" for i in strays]
     return _check(reasons) if answers else Check("unknown", ("no request was sent",))
@@ -109,18 +112,20 @@ def one_master(history: History) -> Check:
     reasons: list[str] = []
     masters: dict[int, int] = {}
     fences = history.events(Event.REPLICA_FENCED)
-    epoch, accepted_ns = 0, 0
+    epoch, began_ns = 0, 0
     for record in history.events(Event.REPLY_ACCEPTED):
         found, replica = record.detail >> 8, record.detail & 0xFF
         if found < epoch:
             reasons.append(f"a reply of epoch {found} accepted after one of epoch {epoch}")
         if masters.setdefault(found, replica) != replica:
             reasons.append(f"epoch {found}: replies of replicas {masters[found]} and {replica}")
-        if epoch and found > epoch:
-            old = masters[epoch]
-            if not any(f.detail & 0xFF == old and accepted_ns <= f.t_ns <= record.t_ns for f in fences):
-                reasons.append(f"replica {old} was not fenced between epochs {epoch} and {found}")
-        epoch, accepted_ns = max(epoch, found), record.t_ns
+        if found <= epoch:
+            continue
+        # What was sent before the fence may be read after it: the fence lies between the first replies.
+        old = masters.get(epoch, 0)
+        if epoch and not any(f.detail & 0xFF == old and began_ns <= f.t_ns <= record.t_ns for f in fences):
+            reasons.append(f"replica {old} was not fenced between epochs {epoch} and {found}")
+        epoch, began_ns = found, record.t_ns
     return _check(reasons) if masters else Check("unknown", ("no reply was accepted",))
 
 
@@ -147,7 +152,7 @@ def requests(history: History, bare: Application) -> Requests:
     return Requests(
         sent=len(sent_ns),
         answered=len(firsts),
-        lost=len(sent_ns) - len(firsts),
+        lost=sum(i not in firsts for i in sent_ns),
         duplicated=sum(len(a) > 1 for a in answers.values()) + refused,
         late=sum(t_ns - sent_ns[i] > LATE_NS for i, t_ns in firsts.items() if i in sent_ns),
         wrong=len(wrong_replies(history, bare)),
@@ -168,13 +173,12 @@ def failovers(history: History) -> list[Failover]:
 
 def _failover(history: History, promoted: Record, firsts: dict[int, int], lasts: dict[int, int]) -> Failover:
     fence = _last_before(history.events(Event.REPLICA_FENCED), promoted.t_ns)
-    assert fence is not None, "promoted, and nobody was fenced"
-    alarm = _last_before(history.events(Event.WATCHDOG_SUSPECT), fence.t_ns)
+    alarm = _last_before(history.events(Event.WATCHDOG_SUSPECT), (fence or promoted).t_ns)
     epoch = promoted.detail
     before_ns = max((t for e, t in lasts.items() if e < epoch), default=0)
-    faults = [f for f in history.events(Event.FAULT_APPLIED) if f.t_ns <= (alarm or fence).t_ns]
-    fault = faults[-1] if faults and (alarm or fence).t_ns - faults[-1].t_ns < 10**9 else None
-    start_ns = fault.t_ns if fault else (alarm or fence).t_ns
+    faults = [f for f in history.events(Event.FAULT_APPLIED) if f.t_ns <= (alarm or fence or promoted).t_ns]
+    fault = faults[-1] if faults and (alarm or fence or promoted).t_ns - faults[-1].t_ns < 10**9 else None
+    start_ns = fault.t_ns if fault else (alarm or fence or promoted).t_ns
     reply_ns = firsts.get(epoch)
     sent_ns = {e.request_id: e.t_ns for e in _sent(history)}
     first_id = next((r.request_id for r in history.events(Event.REPLY_ACCEPTED) if r.detail >> 8 == epoch), 0)
@@ -187,7 +191,7 @@ def _failover(history: History, promoted: Record, firsts: dict[int, int], lasts:
         epoch=epoch,
         cause="fault" if fault else ("alarm" if alarm else "unknown"),
         detected_ms=ms(alarm.t_ns) if alarm and fault else None,
-        fenced_ms=ms(fence.t_ns) or 0.0,
+        fenced_ms=ms(fence.t_ns) if fence else None,
         promoted_ms=ms(promoted.t_ns),
         recovered_ms=ms(reply_ns),
         blackout_ms=None if reply_ns is None else round((reply_ns - max(waiting_ns, before_ns)) / 1e6, 3),

@@ -40,7 +40,7 @@ class Event(Enum):
     STATE_RESTORED = (32, "state.restored")
     SUSPENDED = (33, "suspended")
     RESUMED = (34, "resumed")
-    PEER_REFUSED = (34, "peer.refused")
+    PEER_REFUSED = (35, "peer.refused")
     FAULT_APPLIED = (40, "fault.applied")
 
     def __init__(self, code: int, label: str) -> None:

@@ -24,6 +24,7 @@ MAGIC: Final = b"AFTBEDJ1"
 HEADER_BYTES: Final = 4096
 PULSE_OFFSET: Final = 8  # u64, monotonic ns
 FLAG_OFFSET: Final = 16  # u8, not 0: control mail waits
+DROPPED_OFFSET: Final = 24  # u32, records that found no room
 LIFELINE_OFFSET: Final = 32  # u32, a futex that the node holds
 NAME_OFFSET: Final = 64  # u8 length, then UTF-8
 NAME_BYTES_MAX: Final = 120
@@ -80,6 +81,12 @@ def node_name(data: bytes) -> str:
         raise PeerError(f"not a journal ({len(data)} bytes)")
     length = data[NAME_OFFSET]
     return data[NAME_OFFSET + 1 : NAME_OFFSET + 1 + length].decode(errors="replace")
+
+
+def dropped(data: bytes) -> int:
+    """How many records or entries found no room in the file. Raises PeerError if it is no journal."""
+    node_name(data)
+    return int.from_bytes(data[DROPPED_OFFSET : DROPPED_OFFSET + 4], "little")
 
 
 def records(data: bytes) -> Iterator[Record]:

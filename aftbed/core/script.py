@@ -96,12 +96,7 @@ class Script(msgspec.Struct, frozen=True):
 
 def problems(script: Script) -> list[str]:
     """Every reason to refuse `script`, or []."""
-    new = {verb.replica for verb in script.prepare if isinstance(verb, Spawn)}
-    found = [
-        f"prepare touches what already serves: {verb}"
-        for verb in script.prepare
-        if not isinstance(verb, Spawn) and _touches(verb).isdisjoint(new)
-    ]
+    found = _prepare_problems(script)
     if len(script.prepare) + len(script.commit) > STEPS_MAX:
         found.append(f"more than {STEPS_MAX} steps")
     held: set[str] = set()
@@ -118,8 +113,10 @@ def problems(script: Script) -> list[str]:
                 fenced.add(replica)
             case Kill(replica) if replica not in fenced:
                 found.append(f"killed before it was fenced: {replica}")
-            case Promote() | Attach() if not fenced:
+            case Promote(replica) | Attach(replica) if not fenced - {replica}:
                 found.append(f"a new master while the old one is not fenced: {verb}")
+            case Promote(replica) | Attach(replica) if replica in fenced:
+                found.append(f"a master that is fenced: {verb}")
             case Transfer() | Bind() if not held:
                 found.append(f"changed while requests flow: {verb}")
             case Spawn():
@@ -127,6 +124,18 @@ def problems(script: Script) -> list[str]:
             case _:
                 pass
     return found + [f"suspended, not resumed: {brick}" for brick in sorted(held)]
+
+
+def _prepare_problems(script: Script) -> list[str]:
+    """Prepare acts on nothing but what it has spawned before."""
+    new: set[str] = set()
+    found = []
+    for verb in script.prepare:
+        if isinstance(verb, Spawn):
+            new.add(verb.replica)
+        elif not _touches(verb) <= new:
+            found.append(f"prepare touches what already serves: {verb}")
+    return found
 
 
 def _touches(verb: AnyVerb) -> set[str]:

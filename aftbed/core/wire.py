@@ -14,6 +14,7 @@ from aftbed.core.errors import PeerError
 from aftbed.core.message import Message, WireMessage
 
 PACKET_BYTES_MAX: Final = 64 * 1024
+UNREADABLE: Final = (msgspec.DecodeError, UnicodeDecodeError, RecursionError)  # all that a decoder raises
 
 encode_unchecked: Callable[[Message], bytes] = msgspec.msgpack.Encoder().encode
 decode_unchecked: Callable[[bytes], WireMessage] = msgspec.msgpack.Decoder(WireMessage).decode
@@ -32,5 +33,5 @@ def decode(data: bytes) -> WireMessage:
         raise PeerError(f"packet of {len(data)} bytes, at most {PACKET_BYTES_MAX} are allowed")
     try:
         return decode_unchecked(data)
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+    except UNREADABLE as error:
         raise PeerError(f"not a message ({len(data)} bytes): {error}") from error

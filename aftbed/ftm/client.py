@@ -35,7 +35,7 @@ class Client(Brick):
 
     def step(self, port: str, msg: AnyMessage, now_ns: int) -> list[Effect]:
         """Take a request from the source, a reply from the Proxy, or word that the Proxy is a new one."""
-        if isinstance(msg, Submit):
+        if isinstance(msg, Submit) and len(self.unanswered) < BACKLOG_MAX:
             request = Request(0, self.next_id, msg.payload)
             self.unanswered[self.next_id] = request
             self.next_id += 1

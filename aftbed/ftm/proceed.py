@@ -6,7 +6,7 @@ from typing import Final
 from aftbed.core.brick import Brick, BrickState, Effect, Note, Send
 from aftbed.core.errors import PeerError
 from aftbed.core.event import Event
-from aftbed.core.message import AnyMessage, Reply, Request
+from aftbed.core.message import AnyMessage, Rebound, Reply, Request
 
 
 class State(BrickState):
@@ -37,6 +37,8 @@ class Compute(Brick):
         """Have it computed, or hand on the result."""
         state = MOVES.get((self.state, type(msg)))
         if state is None:
+            if isinstance(msg, Rebound):
+                return []
             raise PeerError(f"{type(msg).__name__} on {port} while {self.state.name}")
         self.state = state
         if isinstance(msg, Request):

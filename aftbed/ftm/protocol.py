@@ -116,6 +116,7 @@ class Protocol(Brick):
             last_id, items = msgspec.msgpack.decode(state, type=tuple[int, list[tuple[int, bytes]]])
         except msgspec.DecodeError as error:
             raise PeerError(f"not a reply log: {error}") from error
-        if len(items) > REPLIES_KEPT or [i for i, _ in items] != sorted({i for i, _ in items}):
+        ids = [request_id for request_id, _ in items]
+        if len(ids) > REPLIES_KEPT or ids != sorted(set(ids)) or (ids and ids[-1] > last_id):
             raise PeerError(f"a reply log of {len(items)} replies, or out of order")
         self.last_id, self.log = last_id, dict(items)

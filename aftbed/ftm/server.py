@@ -14,6 +14,7 @@ from aftbed.core.event import Event
 from aftbed.core.message import (
     AnyMessage,
     CaptureState,
+    Rebound,
     Reply,
     Request,
     RestoreState,
@@ -65,9 +66,11 @@ class Server(Brick):
     def step(self, port: str, msg: AnyMessage, now_ns: int) -> list[Effect]:
         """Execute, capture or restore."""
         if not isinstance(msg, _MESSAGES[self.state]):
+            if isinstance(msg, Rebound):
+                return []
             raise PeerError(f"{type(msg).__name__} on {port} while {self.state.name}")
         if isinstance(msg, Request):
-            payload = self.application.execute(msg.payload)
+            payload = self._execute(msg.payload)
             self.state = _EXECUTED if self.captured else _READY
             return [
                 Note(_ENTER, msg.request_id),
@@ -86,6 +89,13 @@ class Server(Brick):
             Note(Event.STATE_RESTORED, msg.request_id),
             Send("srv2aft", StateRestored(msg.epoch, msg.request_id)),
         ]
+
+    def _execute(self, request: bytes) -> bytes:
+        """The reply; an empty one to a request that the function refuses (its state is as it was)."""
+        try:
+            return self.application.execute(request)
+        except PeerError:
+            return b""
 
     def capture(self) -> bytes:
         """The function's state."""

@@ -4,6 +4,7 @@ crash TARGET [at EVENT [nth N] | after 200ms]
 hang  TARGET [for 50ms] [at EVENT [nth N] | after 200ms]
 """
 
+import re
 from typing import Final
 
 from aftbed.core.errors import ConfigError, unknown
@@ -12,6 +13,8 @@ from aftbed.core.fault import HANG_FOREVER_MS, Act, Fault, Trigger
 
 GRAMMAR: Final = "crash|hang TARGET [for 50ms] [at EVENT [nth N] | after 200ms]"
 DURATION_MS_MAX: Final = 3_600_000
+_NUMBER: Final = re.compile(r"[0-9]{1,10}(\.[0-9]{1,6})?")
+_WHOLE: Final = re.compile(r"[0-9]{1,12}")
 _KEYS: Final = ("for", "at", "nth", "after")
 
 
@@ -19,11 +22,11 @@ def milliseconds(text: str) -> int:
     """`50ms` or `2s` as whole milliseconds. Raises ConfigError."""
     for unit, factor in (("ms", 1), ("s", 1000)):
         number = text.removesuffix(unit)
-        if number != text and number.replace(".", "", 1).isdigit():
+        if number != text and _NUMBER.fullmatch(number):
             value = round(float(number) * factor)
             if 0 < value <= DURATION_MS_MAX:
                 return value
-    raise ConfigError(f"duration {text!r}: a positive number with its unit is allowed, as 50ms or 2s")
+    raise ConfigError(f"duration {text[:40]!r}: a positive number with its unit is allowed, as 50ms or 2s")
 
 
 def parse(text: str) -> Fault:
@@ -61,8 +64,8 @@ def build(
         raise ConfigError(f"'at {event}' and 'after {after}': one of them is allowed")
     if nth is not None and event is None:
         raise ConfigError(f"'nth {nth}' counts an event: 'at EVENT nth {nth}' is allowed")
-    if nth is not None and not (nth.isdigit() and int(nth) >= 1):
-        raise ConfigError(f"nth {nth!r}: a whole number from 1 on is allowed")
+    if nth is not None and not (_WHOLE.fullmatch(nth) and int(nth) >= 1):
+        raise ConfigError(f"nth {nth[:40]!r}: a whole number from 1 on is allowed")
     if event is not None:
         event_named(event)
     trigger = Trigger(event or "", int(nth or 1), milliseconds(after) if after else 0)

@@ -3,12 +3,13 @@
 from typing import Final
 
 from aftbed.core.errors import ConfigError, unknown
-from aftbed.core.event import event_named
+from aftbed.core.event import Event, event_named
 from aftbed.core.fault import Fault
 from aftbed.core.graph import Graph
 from aftbed.ftm.catalog import EMITTERS
 
 ROLES: Final = ("primary", "backup")
+STATE_ACCESS: Final = (Event.STATE_CAPTURED, Event.STATE_RESTORED)
 OTHERS: Final = ("supervisor", "zygote", "zygote.bus", "hub", "vehicle", "player")
 
 
@@ -37,6 +38,8 @@ def emitter(graph: Graph, event: str, leader: str, backup: str) -> str | None:
     if found is None:
         return None
     part, of_backup = found
+    if event_named(event) in STATE_ACCESS and not any(k.source_port == "aft2srv" for k in graph.links):
+        return None  # nobody asks this Server for its state
     for brick in graph.bricks:
         if brick.part == part and brick.replica in (None, backup if of_backup else leader):
             return graph.node_of(brick.name)

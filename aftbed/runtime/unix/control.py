@@ -25,7 +25,7 @@ from aftbed.core.message import (
     Watch,
 )
 from aftbed.core.script import Script
-from aftbed.core.wire import PACKET_BYTES_MAX
+from aftbed.core.wire import PACKET_BYTES_MAX, UNREADABLE
 
 FDS_MAX: Final = 64
 STATE_BYTES_MAX: Final = 64 << 20
@@ -251,19 +251,21 @@ class Line(Generic[Incoming]):
         data, ancillary, flags, _ = self.sock.recvmsg(
             PACKET_BYTES_MAX, _RIGHTS_BYTES, socket.MSG_CMSG_CLOEXEC
         )
-        if not data:
-            return None
         fds = array.array("i")
         for level, kind, payload in ancillary:
             if (level, kind) == (socket.SOL_SOCKET, socket.SCM_RIGHTS):
                 fds.frombytes(payload[: len(payload) - len(payload) % fds.itemsize])
+        if not data:
+            for fd in fds:
+                os.close(fd)
+            return None
         try:
             if flags & (socket.MSG_TRUNC | socket.MSG_CTRUNC):
                 raise PeerError(f"truncated control message of {len(data)} bytes, {len(fds)} descriptors")
             if data == _MEMFD and len(fds) == 1:
                 data = _read_memfd(fds.pop())
             return self._decode(data), list(fds)
-        except (msgspec.DecodeError, PeerError) as error:
+        except (*UNREADABLE, PeerError, OSError) as error:
             for fd in fds:
                 os.close(fd)
             raise PeerError(f"not a control message ({len(data)} bytes): {error}") from error
@@ -276,7 +278,7 @@ class Line(Generic[Incoming]):
 
 def _read_memfd(descriptor: int) -> bytes:
     with open(descriptor, "rb") as file:
-        size = os.fstat(file.fileno()).st_size
+        size = os.fstat(file.fileno()).st_size if file.seekable() else STATE_BYTES_MAX + 1
         if size > STATE_BYTES_MAX:
             raise PeerError(f"a state of {size} bytes, at most {STATE_BYTES_MAX} are allowed")
         file.seek(0)

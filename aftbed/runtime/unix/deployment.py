@@ -94,8 +94,11 @@ class Deployment:
         return got[key]
 
     def all_of(self, sent: Iterable[tuple[Key, str]]) -> Keys:
-        """Wait for the answers to several orders."""
+        """Wait for the answers to several orders. Raises StepFailed if a process has died before."""
         pairs = list(sent)
+        for _, node in pairs:
+            if not self.lives(node):
+                raise StepFailed(f"{node} died")
         yield Wait(frozenset(k for k, _ in pairs), frozenset(n for _, n in pairs))
 
     # -- processes ----------------------------------------------------------------------------

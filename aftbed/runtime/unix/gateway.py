@@ -6,6 +6,7 @@ from typing import Final
 
 import msgspec
 
+from aftbed.core.errors import PeerError
 from aftbed.core.journal import EntryKind
 from aftbed.core.message import Reply, Submit
 from aftbed.ftm.client import BACKLOG_MAX, Client
@@ -36,6 +37,7 @@ class GatewayDevice:
         self._t_us = 0
         self._answered = 0
         self._overrun = 0
+        self._refused = 0
         self._quiet = False
         self._sent_ns = 0
         self._cycle_us = 0.0  # of the last request
@@ -69,9 +71,14 @@ class GatewayDevice:
         """Out it goes as frames; written behind, so that a reply that nobody got is asked again."""
         self._answered += 1
         self._cycle_us = round((now_ns - self._sent_ns) / 1e3, 1)
-        for frame in self._gateway.on_reply(
-            reply.payload, self._t_us, reply.replica, reply.epoch, self._answered
-        ):
+        try:
+            frames = self._gateway.on_reply(
+                reply.payload, self._t_us, reply.replica, reply.epoch, self._answered
+            )
+        except PeerError:  # the function refused the request: there is nothing to ask the brakes for
+            self._refused += 1
+            frames = []
+        for frame in frames:
             self._bus.send(frame)
         self._dialogue.write(now_ns, reply.request_id, reply.epoch, EntryKind.ANSWERED, reply.payload)
 
@@ -92,6 +99,7 @@ class GatewayDevice:
                 "sent": self._client.next_id - 1,
                 "unanswered": len(self._client.unanswered) + len(self._payloads),
                 "overrun": self._overrun,
+                "replies_refused": self._refused,
                 "cycle_us": self._cycle_us,
                 "accepted": counts.accepted,
                 "ignored": counts.ignored,

@@ -47,6 +47,7 @@ class Jobs:
     def __init__(self) -> None:
         self._jobs: list[_Job] = []
         self._early: dict[Key, bytes] = {}  # settled before anybody waited for it
+        self._refused: dict[Key, str] = {}  # failed before anybody waited for it
 
     def __len__(self) -> int:
         return len(self._jobs)
@@ -65,7 +66,7 @@ class Jobs:
         """`key` has happened. An answer may come before its job gets to wait for it: it is kept."""
         waited_for = False
         for job in list(self._jobs):
-            if key in job.wait.keys and key not in job.got:
+            if job in self._jobs and key in job.wait.keys and key not in job.got:
                 waited_for = True
                 job.got[key] = value
                 if len(job.got) == len(job.wait.keys):
@@ -78,7 +79,12 @@ class Jobs:
 
     def fail(self, key: Key, reason: str) -> None:
         """`key` will not happen."""
-        self._throw([job for job in self._jobs if key in job.wait.keys], reason)
+        waiting = [job for job in self._jobs if key in job.wait.keys]
+        if not waiting and key[0] == "ack":
+            self._refused[key] = reason
+            if len(self._refused) > EARLY_MAX:
+                del self._refused[next(iter(self._refused))]
+        self._throw(waiting, reason)
 
     def died(self, process: str) -> None:
         """The process called `process` is dead."""
@@ -106,9 +112,13 @@ class Jobs:
                 job.wait = resume()
                 job.got = {key: self._early.pop(key) for key in job.wait.keys & self._early.keys()}
                 job.deadline_ns = time.monotonic_ns() + round(job.wait.seconds * 1e9)
-                if len(job.got) < len(job.wait.keys):
+                refused = [self._refused.pop(key) for key in job.wait.keys & self._refused.keys()]
+                if refused:
+                    resume = lambda why=refused[0]: job.steps.throw(StepFailed(why))  # type: ignore[misc]  # noqa: E731
+                elif len(job.got) == len(job.wait.keys):
+                    resume = lambda got=job.got: job.steps.send(got)  # type: ignore[misc]  # noqa: E731
+                else:
                     return
-                resume = lambda got=job.got: job.steps.send(got)  # type: ignore[misc]  # noqa: E731
         except StopIteration:
             self._end(job, "")
         except StepFailed as failure:

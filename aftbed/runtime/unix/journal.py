@@ -31,8 +31,11 @@ def _mapped(path: Path, name: str) -> mmap.mmap:
 
 
 def _grow(mapping: mmap.mmap) -> bool:
-    """One chunk more; False at the limit."""
+    """One chunk more; False, and the loss is counted, at the limit."""
     if len(mapping) >= FILE_BYTES_MAX:
+        at = layout.DROPPED_OFFSET
+        lost = int.from_bytes(mapping[at : at + 4], "little") + 1
+        mapping[at : at + 4] = min(lost, 0xFFFF_FFFF).to_bytes(4, "little")
         return False
     mapping.resize(len(mapping) + CHUNK_BYTES)
     return True

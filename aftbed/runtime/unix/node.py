@@ -46,7 +46,7 @@ WRITE_SECONDS_MAX: Final = 2.0
 FAULT_SECONDS_MAX: Final = 5.0
 NUDGE: Final = b"\0"
 EXIT_FENCED: Final = 3
-REFUSED: Final = (PeerError, msgspec.DecodeError, UnicodeDecodeError)
+REFUSED: Final = (PeerError, *wire.UNREADABLE)
 EXIT_ASSERT: Final = 70
 
 _now = time.monotonic_ns

@@ -4,6 +4,7 @@ The private one is `$XDG_RUNTIME_DIR/aftbed/ID` or `/tmp/aftbed-UID/ID`, mode 07
 run. Without `--record` the record lives, and goes, inside it.
 """
 
+import contextlib
 import os
 import secrets
 import shutil
@@ -25,7 +26,8 @@ def root() -> Path:
         path = Path(runtime) / "aftbed"
     else:
         path = Path(os.environ.get("TMPDIR") or "/tmp") / f"aftbed-{os.getuid()}"
-    path.mkdir(mode=0o700, exist_ok=True)
+    with contextlib.suppress(FileExistsError):
+        path.mkdir(mode=0o700)
     state = path.lstat()
     if not stat.S_ISDIR(state.st_mode) or state.st_uid != os.getuid() or state.st_mode & 0o077:
         raise HarnessError(f"{path}: must be a directory of this user alone (mode 0700); remove it")

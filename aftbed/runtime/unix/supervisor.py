@@ -209,7 +209,9 @@ class Supervisor:
             "faults": self.faults.receipts(),
             **self.work.end(),
         }
-        (self.record / "end.json").write_text(json.dumps(end))
+        unfinished = self.record / "end.json.new"
+        unfinished.write_text(json.dumps(end))
+        unfinished.rename(self.record / "end.json")  # whole, or not there
         self._report_owner("finished", json.dumps(end).encode())
 
     # -- what processes say -------------------------------------------------------------------
