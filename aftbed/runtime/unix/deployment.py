@@ -219,13 +219,16 @@ class Deployment:
     def cpu_of(self, node: str) -> int | None:
         """A replica's chain stays on its core; Client and Proxy stay beside the leader.
 
-        Who watches and recovers stays on the other core: it is idle when the leader dies, while the
-        leader's is busy for a while with taking dead processes down.
+        A Watchdog is on another core than the replica that it watches, and Recovery on another than
+        the leader: a core on which a replica has just died is busy for a while with taking it down.
         """
         leads = self.slots.get(self.leader or self.backup)
         for slot in self.slots.values():
             if set(self.graph.nodes.get(node, ("",))) <= slot.bricks:
                 return slot.cpu
+        watched = self.slots.get(node.removesuffix("/watchdog"))
+        if watched is not None:
+            return next((s.cpu for s in self.slots.values() if s is not watched), None)
         if node in BESIDE_LEADER:
             return leads.cpu if leads else None
         return next((s.cpu for s in self.slots.values() if s is not leads), None)

@@ -122,7 +122,6 @@ class Watcher:
     def _watch(self) -> None:
         signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())  # they are the main thread's
         linux.answer_soon()
-        os.sched_setaffinity(0, range(os.cpu_count() or 1))  # not bound to a core that is busy with the dead
         alive = [i for i, word in enumerate(self._words) if word.value]
         try:
             while alive and self._wanted:
