@@ -47,8 +47,9 @@ class Journal:
     `at` is where the next record goes; beyond `end` the file must grow before another step.
     """
 
-    def __init__(self, path: Path, node: str) -> None:
-        self.mapping = _mapped(path, node)
+    def __init__(self, path: Path | None, node: str) -> None:
+        """Without a path, one that nobody will read."""
+        self.mapping = mmap.mmap(-1, CHUNK_BYTES) if path is None else _mapped(path, node)
         self.at, self.end = layout.HEADER_BYTES, CHUNK_BYTES - STEP_BYTES_MAX
         self._pack = layout.RECORD.pack_into
 

@@ -17,6 +17,7 @@ where it outlives this process, or inside a request that the client will ask aga
 import os
 import select
 import signal
+import socket
 import sys
 import time
 import traceback
@@ -31,7 +32,8 @@ from aftbed.core.errors import PeerError
 from aftbed.core.event import Event
 from aftbed.core.fault import Act
 from aftbed.core.journal import FLAG_OFFSET, PULSE_OFFSET, RECORD
-from aftbed.core.message import AnyMessage, ChannelEnded, Message, Promoted, Rebound, Reply
+from aftbed.core.message import AnyMessage, ChannelEnded, Message, Promoted, Rebound, Reply, Request
+from aftbed.ftm.before import PassBefore
 from aftbed.runtime.unix import control, rehearsal
 from aftbed.runtime.unix.devices import Device, Sensor
 from aftbed.runtime.unix.journal import Journal
@@ -40,6 +42,7 @@ from aftbed.runtime.unix.orders import carry_out
 from aftbed.runtime.unix.wiring import Hosted, Inlet, Plan, Wiring
 
 PULSE_SECONDS: Final = 0.02
+REHEARSED: Final = 8
 REHEARSAL_MS: Final = 20.0  # of waiting at the start; the whole graph is there by then
 READ_BYTES_MAX: Final = wire.PACKET_BYTES_MAX + 1  # one byte more than is allowed, so that it is noticed
 WRITE_SECONDS_MAX: Final = 2.0
@@ -126,9 +129,9 @@ class Node:
         try:
             self._rehearse()
             while True:
-                self._turn()
+                self.turn()
                 if self._hot is not None:
-                    self._serve_hot(self._hot)
+                    self.serve_hot(self._hot)
         except BrokenPipeError:
             os._exit(EXIT_FENCED)
         except BaseException:  # noqa: BLE001 - the last frame of this process: nothing may leak out of it
@@ -145,9 +148,9 @@ class Node:
             for inlet in hosted.inlets.values():
                 poll.register(inlet.fd, select.POLLIN)
         poll.poll(REHEARSAL_MS)
-        rehearsal.once()
+        rehearsal.once(rehearse_host)
 
-    def _turn(self) -> None:
+    def turn(self) -> None:
         """Handle one thing, or wait for one."""
         if self.wiring.mail:
             hosted, port, message = self.wiring.mail.popleft()
@@ -172,10 +175,10 @@ class Node:
         else:
             self._poll(plan)
 
-    def _serve_hot(self, hosted: Hosted) -> None:
-        """The same as `_turn`, with all at hand, for a node that hosts one brick and polls nothing.
+    def serve_hot(self, hosted: Hosted) -> None:
+        """The same as `turn`, with all at hand, for a node that hosts one brick and polls nothing.
 
-        Returns for whatever is not mail on the one open port: `_turn` knows what to do.
+        Returns for whatever is not mail on the one open port: `turn` knows what to do.
         """
         brick, outs, inlets, device = hosted.brick, hosted.outs, self.wiring.hot_inlets, self.device
         step, open_ports, journal = brick.step, brick.open_ports, self.journal
@@ -417,3 +420,23 @@ class Node:
     def ack(self, token: int, data: bytes = b"", error: str = "") -> None:
         """Answer an order."""
         self.line.send(control.Ack(token, data, error))
+
+
+def rehearse_host() -> None:
+    """The tight loop, on a scratch node of one brick; see `rehearsal`."""
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    into, inlet = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    outlet, out = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    node = Node("rehearsal", control.Line(theirs, control.decode_order), Journal(None, "rehearsal"))
+    node.add("before", PassBefore())
+    node.wiring.bind_input("before", "pro2bfr", inlet.detach())
+    node.bind_output("before", "bfr2prd", outlet.detach(), 1)
+    for request_id in range(1, REHEARSED + 1):
+        into.send(wire.encode(Request(1, request_id, b"")))
+    into.send(NUDGE)
+    node.turn()
+    node.serve_hot(node.wiring.hosted["before"])
+    node.wiring.bind_input("before", "pro2bfr", None)
+    node.bind_output("before", "bfr2prd", None, 1)
+    for end in (ours, theirs, into, out):
+        end.close()

@@ -5,6 +5,7 @@ In a child it makes the child's own copies of the pages that a step writes to: w
 request after a failover pays some hundred page faults in each process of the new leader (0.5 ms).
 """
 
+from collections.abc import Callable
 from typing import Final
 
 from aftbed.core import wire
@@ -20,12 +21,13 @@ ROUNDS_ONCE: Final = 4
 _done = False
 
 
-def once() -> None:
-    """Rehearse, unless this process has done so."""
+def once(host: Callable[[], None]) -> None:
+    """Rehearse, and `host` after it, unless this process has done so."""
     global _done  # noqa: PLW0603 - one process, one rehearsal
     if not _done:
         _done = True
         rehearse(ROUNDS_ONCE)
+        host()
 
 
 def rehearse(rounds: int) -> None:

@@ -241,7 +241,6 @@ class Supervisor:
         if self.executor.busy or self._ending:
             return  # an earlier Recovery's script is under way; the new one hears how it ended
         began_ns = time.monotonic_ns()
-        self.tell("script", f"{ordered.purpose} ({ordered.replica})")
 
         def ended(failure: str) -> None:
             ms = f"{(time.monotonic_ns() - began_ns) / 1e6:.2f} ms"
@@ -250,6 +249,7 @@ class Supervisor:
             self.loop.after(0.002, lambda: self._settle_after(ordered))
 
         self.loop.jobs.start(ordered.purpose, self.executor.execute(ordered), ended)
+        self.tell("script", f"{ordered.purpose} ({ordered.replica})")
 
     def _settle_after(self, ordered: script.Script) -> None:
         """What can wait until after a script: spares, and faults that are still to come."""

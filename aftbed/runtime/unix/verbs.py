@@ -24,6 +24,7 @@ class Executor:
     def __init__(self, deployment: Deployment, journal: Journal, tell: Callable[[str, str], None]) -> None:
         self._deployment, self._journal, self._tell = deployment, journal, tell
         self.busy = False
+        self._promoting: Wait | None = None  # what Promote has yet to come to
 
     def execute(self, todo: script.Script) -> Keys:
         """Prepare, then commit. Raises StepFailed, having undone what hurts."""
@@ -67,9 +68,9 @@ class Executor:
             case script.Kill(replica):
                 self._kill(replica)
             case script.Promote(replica, epoch):
-                yield from self._promote(replica, epoch)
+                self._promote(replica, epoch)
             case script.Attach(replica, epoch):
-                self._attach(replica, epoch)
+                yield from self._attach(replica, epoch)
             case script.Suspend(brick):
                 yield from self._deployment.ask(self._node(brick), control.Suspend)
             case script.Resume(brick):
@@ -99,9 +100,10 @@ class Executor:
             deployment.leader = ""
             deployment.pin(BESIDE_LEADER)
         for channel in deployment.channels.touching(slot.bricks):
-            if channel.link.source in slot.bricks:
+            link = channel.link
+            if link.source in slot.bricks and link.sink not in slot.bricks:
                 channel.fence()
-            elif "/" in channel.link.source:
+            elif "/" in link.source and link.source not in slot.bricks:
                 channel.refuse()  # a leader that waits for a dead backup to read must not wait on
         self._note(Event.REPLICA_FENCED, replica)
 
@@ -120,7 +122,8 @@ class Executor:
         if deployment.backup == replica:
             deployment.backup = ""
 
-    def _promote(self, replica: str, epoch: int) -> Keys:
+    def _promote(self, replica: str, epoch: int) -> None:
+        """Say so, and go on: until it leads, its Protocol takes no request. Attach waits for it."""
         deployment = self._deployment
         slot = deployment.slots[replica]
         node = self._node(f"{replica}/after")
@@ -128,9 +131,9 @@ class Executor:
             node, lambda token: control.Tell(token, f"{replica}/after", message.Promote(epoch))
         )
         promoted = ("promoted", f"{replica}/protocol", epoch)
-        yield Wait(frozenset({key, promoted}), frozenset(slot.nodes))
+        self._promoting = Wait(frozenset({key, promoted}), frozenset(slot.nodes))
 
-    def _attach(self, replica: str, epoch: int) -> None:
+    def _attach(self, replica: str, epoch: int) -> Keys:
         """A Proxy that is being replaced needs nothing: the new one is bound to whoever leads."""
         deployment = self._deployment
         deployment.leader, deployment.backup, deployment.epoch = replica, "", epoch
@@ -142,6 +145,9 @@ class Executor:
                 channel = deployment.channels.get(source, port, sink)
                 assert channel is not None, port
                 self._hand_to_proxy(channel.link, channel.read.fileno(), channel.write.fileno(), epoch)
+        promoting, self._promoting = self._promoting, None
+        if promoting is not None:
+            yield promoting
         # The new leader's core is for the first reply now; what is left to do here can wait for the
         # other one, which is still busy with the dead.
         deployment.pin_watchers()

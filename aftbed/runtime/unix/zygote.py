@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Final, NoReturn
 
 from aftbed.runtime.unix import control, linux, rehearsal
+from aftbed.runtime.unix.node import rehearse_host
 from aftbed.runtime.unix.part import become
 
 PATIENCE_MS: Final = 20.0  # of a spare, before it uses its time to rehearse
@@ -95,7 +96,7 @@ def _wait_for_a_part(supervisor: int) -> NoReturn:
     poll = select.poll()
     poll.register(_CONTROL_FD, select.POLLIN)
     if not poll.poll(PATIENCE_MS):
-        rehearsal.once()
+        rehearsal.once(rehearse_host)
     got = line.recv()
     if got is None:
         os._exit(0)
