@@ -101,6 +101,15 @@ class BindOutput(Order, frozen=True):
     epoch: int
 
 
+class Follow(Order, frozen=True):
+    """To the Proxy: follow a new leader; `input` is the first descriptor, `output` the second."""
+
+    brick: str
+    input: str
+    output: str
+    epoch: int
+
+
 class Suspend(Order, frozen=True):
     """Finish what is inside, take no more, then answer."""
 
@@ -203,7 +212,7 @@ class Report(msgspec.Struct, frozen=True, tag=True):
 
 
 ToNode = (
-    Park | Assign | Serve | BindInput | BindOutput | Suspend | Resume | Capture | Restore | Tell
+    Park | Assign | Serve | BindInput | BindOutput | Follow | Suspend | Resume | Capture | Restore | Tell
     | WatchNodes | Arm | Stop | Quiet | Stats | Ack
 )  # fmt: skip
 FromNode = Hello | Ack | Said | Ordered | Fired | Report

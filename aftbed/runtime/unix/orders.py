@@ -25,6 +25,10 @@ def carry_out(node: "Node", order: control.ToNode, fds: list[int]) -> bytes | No
             wiring.bind_input(brick, port, fds.pop() if fds else None)
         case control.BindOutput(_, brick, port, epoch):
             node.bind_output(brick, port, fds.pop() if fds else None, epoch)
+        case control.Follow(_, brick, port, output, epoch):
+            read, write = fds
+            wiring.bind_input(brick, port, read)
+            node.bind_output(brick, output, write, epoch)
         case control.Suspend(token):
             node.suspend_token = token
             return None  # answered when quiescent

@@ -13,6 +13,7 @@ from aftbed.core import message, script
 from aftbed.core.event import Event
 from aftbed.core.graph import Link
 from aftbed.runtime.unix import control
+from aftbed.runtime.unix.channels import Channel
 from aftbed.runtime.unix.deployment import BESIDE_LEADER, Deployment, Keys
 from aftbed.runtime.unix.jobs import StepFailed, Wait
 from aftbed.runtime.unix.journal import Journal
@@ -25,6 +26,7 @@ class Executor:
         self._deployment, self._journal, self._tell = deployment, journal, tell
         self.busy = False
         self._promoting: Wait | None = None  # what Promote has yet to come to
+        self._last_words: Channel | None = None  # from a fenced leader to the Proxy
 
     def execute(self, todo: script.Script) -> Keys:
         """Prepare, then commit. Raises StepFailed, having undone what hurts."""
@@ -99,12 +101,19 @@ class Executor:
             # processes down neither runs them nor lets them go for some milliseconds.
             deployment.leader = ""
             deployment.pin(BESIDE_LEADER)
+        last_words: Channel | None = None
         for channel in deployment.channels.touching(slot.bricks):
             link = channel.link
-            if link.source in slot.bricks and link.sink not in slot.bricks:
+            if link.source in slot.bricks and link.sink == "proxy":
+                last_words = channel
+            elif link.source in slot.bricks and link.sink not in slot.bricks:
                 channel.fence()
             elif "/" in link.source and link.source not in slot.bricks:
                 channel.refuse()  # a leader that waits for a dead backup to read must not wait on
+        # A reply is on its way to the Proxy only if its checkpoint was on its way to the backup before,
+        # so the shut checkpoint channel is what counts. The other one is shut as soon as the Proxy
+        # follows the new leader: to wake it twice costs 0.1 ms of the blackout.
+        self._last_words = last_words
         self._note(Event.REPLICA_FENCED, replica)
 
     def _kill(self, replica: str) -> None:
@@ -137,30 +146,23 @@ class Executor:
         """A Proxy that is being replaced needs nothing: the new one is bound to whoever leads."""
         deployment = self._deployment
         deployment.leader, deployment.backup, deployment.epoch = replica, "", epoch
+        into = deployment.channels.get("proxy", "pxy2pro", f"{replica}/protocol")
+        back = deployment.channels.get(f"{replica}/protocol", "pro2pxy", "proxy")
+        assert into is not None and back is not None, replica
         if deployment.lives("proxy"):
-            for source, port, sink in (
-                (f"{replica}/protocol", "pro2pxy", "proxy"),
-                ("proxy", "pxy2pro", f"{replica}/protocol"),
-            ):
-                channel = deployment.channels.get(source, port, sink)
-                assert channel is not None, port
-                self._hand_to_proxy(channel.link, channel.read.fileno(), channel.write.fileno(), epoch)
+            deployment.order(
+                "proxy",
+                lambda token: control.Follow(token, "proxy", "pro2pxy", "pxy2pro", epoch),
+                (back.read.fileno(), into.write.fileno()),
+            )
+        if self._last_words is not None:
+            self._last_words.fence()
         promoting, self._promoting = self._promoting, None
         if promoting is not None:
             yield promoting
         # The new leader's core is for the first reply now; what is left to do here can wait for the
         # other one, which is still busy with the dead.
         deployment.pin_watchers()
-
-    def _hand_to_proxy(self, link: Link, read: int, write: int, epoch: int) -> None:
-        if link.sink == "proxy":
-            self._deployment.order(
-                "proxy", lambda token: control.BindInput(token, "proxy", link.sink_port), (read,)
-            )
-        else:
-            self._deployment.order(
-                "proxy", lambda token: control.BindOutput(token, "proxy", link.source_port, epoch), (write,)
-            )
 
     def _transfer(self, source: str, sink: str) -> Keys:
         state = yield from self._deployment.ask(
