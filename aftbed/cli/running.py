@@ -24,6 +24,7 @@ from aftbed.runtime.unix.options import CarRun, LoadRun, ReplayRun, Work
 
 POLICIES: Final = ("hold", "release", "latch")
 PACE_MIN, PACE_MAX = 0.01, 100.0
+SEED_MAX: Final = 2**63 - 1
 LOAD_MAX: Final = 10_000_000
 RATE_HZ_MAX: Final = 100_000.0
 
@@ -52,6 +53,8 @@ def run(asked: Asked, *, as_json: bool) -> int:
     graph = build(asked.ftm, asked.placement)
     faults = tuple(_fault(text, graph) for text in asked.faults)
     work = _work(asked)
+    if not 0 <= asked.seed <= SEED_MAX:
+        raise ConfigError(f"--seed {asked.seed}: 0 to {SEED_MAX} are allowed")
     if not 0 <= asked.bus_port <= 65535:
         raise ConfigError(f"--bus-port {asked.bus_port}: 0 to 65535 are allowed")
     options, listener = options_for(
