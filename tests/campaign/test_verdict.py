@@ -15,7 +15,7 @@ from aftbed.campaign.verdict import EXIT_CODES, Verdict, judge
 from aftbed.core.errors import ConfigError
 from aftbed.core.event import Event
 from aftbed.core.fault import Act, Fault, Trigger
-from aftbed.core.journal import EntryKind
+from aftbed.core.journal import DROPPED_OFFSET, EntryKind
 from aftbed.runtime.unix.journal import Dialogue, Journal
 from aftbed.runtime.unix.options import CarRun, LoadRun, ReplayRun, RunOptions, Work
 from aftbed.vehicle.function import default_application, sample_requests
@@ -64,6 +64,12 @@ class RecordInTheMaking:
         for _ in range(answers):
             self._dialogue.write(self.t_ns, self.sent, epoch, EntryKind.ANSWERED, reply)
 
+    def lose(self, name: str, count: int) -> None:
+        """Of what belonged into this file, `count` found no room."""
+        with (self.path / "journal" / name).open("r+b") as file:
+            file.seek(DROPPED_OFFSET)
+            file.write(count.to_bytes(4, "little"))
+
     def failover(self) -> None:
         self.note("a-after.1", Event.FAULT_APPLIED, detail=1)
         self.note("a-watchdog.1", Event.WATCHDOG_SUSPECT, detail=1)
@@ -111,6 +117,7 @@ def test_a_run_without_trouble_passes(path: Path) -> None:
         "one_master",
         "clean_exit",
         "faults_applied",
+        "whole_history",
     }
     assert set(verdict.checks.values()) == {"pass"}
     assert (verdict.run, verdict.seed, verdict.ftm, verdict.placement) == ("abc123", 7, "pbr", "process")
@@ -228,6 +235,39 @@ def test_without_an_end_the_receipts_of_faults_are_not_known(path: Path) -> None
     assert verdict.checks["faults_applied"] == "unknown"
 
 
+@pytest.mark.parametrize("name", ["a-server.1.journal", "client.1.dialogue"])
+def test_a_history_that_is_not_whole_is_inconclusive(path: Path, name: str) -> None:
+    record = whole(path)
+    record.lose(name, 3)
+    verdict = record.verdict()
+    assert (verdict.verdict, verdict.checks["whole_history"]) == ("inconclusive", "unknown")
+    assert verdict.reasons == ["whole_history: 3 records found no room in the journals"]
+
+
+def test_what_all_journals_have_dropped_is_added_up(path: Path) -> None:
+    record = whole(path)
+    for name in ("a-server.1.journal", "proxy.1.journal", "client.1.dialogue"):
+        record.lose(name, 2)
+    record.verdict()
+    assert read_record(path).history.dropped == 6
+
+
+def test_what_is_wrong_in_a_history_that_is_not_whole_fails(path: Path) -> None:
+    record = whole(path)
+    record.request(answers=0)
+    record.lose("proxy.1.journal", 1)
+    assert record.verdict().verdict == "fail"
+
+
+def test_an_end_that_was_just_being_written_is_none(path: Path) -> None:
+    """It is written beside its place and renamed: the supervisor may die in between."""
+    record = whole(path)
+    record.end = None
+    (path / "end.json.new").write_text('{"rea')
+    verdict = record.verdict()
+    assert (verdict.verdict, verdict.checks["clean_exit"]) == ("inconclusive", "unknown")
+
+
 def test_a_run_without_a_request_is_inconclusive(path: Path) -> None:
     verdict = RecordInTheMaking(path).verdict()
     assert verdict.verdict == "inconclusive" and verdict.launch_ms is None
@@ -301,7 +341,15 @@ def test_a_directory_that_is_no_record(tmp_path: Path) -> None:
         read_record(tmp_path)
 
 
-@pytest.mark.parametrize(("text", "message"), [("{", "not JSON"), ("[1]", "not a JSON object")])
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", "not JSON"),
+        ("[1]", "not a JSON object"),
+        ("{}", "not the options of a run: "),
+        ('{"run": 1}', "not the options of a run: "),
+    ],
+)
 def test_a_run_json_that_is_none(path: Path, text: str, message: str) -> None:
     record = whole(path)
     record.verdict()

@@ -146,6 +146,7 @@ def test_a_good_history_passes_every_check() -> None:
             "exactly_one_answer",
             "request 3: one reply too many reached the client",
         ),
+        (lambda: good().answered(4, epoch=2), "exactly_one_answer", "request 4: answered, but never sent"),
         (
             lambda: Tale().sent(1).answered(1, payload=b"00000000"),
             "one_history",
@@ -211,6 +212,14 @@ def test_a_refusal_of_something_else_is_no_second_answer() -> None:
     assert check.exactly_one_answer(tale.history()) == Check("pass")
 
 
+def test_a_reply_that_was_on_its_way_may_be_accepted_behind_the_fence() -> None:
+    """The fence ends a channel after what was sent: its master is none, its last reply is still one."""
+    tale = Tale().served(1).sent(2).executed(2).restored(2)
+    tale.fenced(1).accepted(2, epoch=1, replica=1).answered(2)
+    tale.promoted(2).served(3, epoch=2, replica=2)
+    assert set(judged(tale).values()) == {Check("pass")}
+
+
 def test_epochs_without_a_reply_are_skipped() -> None:
     tale = Tale().served(1).fenced(1).promoted(2).fenced(2).promoted(3).served(2, epoch=3, replica=1)
     assert check.one_master(tale.history()) == Check("pass")
@@ -257,6 +266,11 @@ def test_the_clients_account_of_a_bad_one() -> None:
     tale.note("client.1", Event.PEER_REFUSED, 1)  # a second one, refused by the client
     account = check.requests(tale.history(), Sums())
     assert account == Requests(sent=4, answered=3, lost=1, duplicated=2, late=1, wrong=2)
+
+
+def test_an_answer_to_what_was_never_asked_makes_no_request_lost() -> None:
+    account = check.requests(good().answered(4, epoch=2).history(), Sums())
+    assert (account.sent, account.lost) == (3, 0)
 
 
 @pytest.mark.parametrize(("more_ns", "late"), [(0, 0), (1, 1)])
@@ -308,6 +322,17 @@ def test_without_fault_and_alarm_they_count_from_the_fence() -> None:
         None,
         0.0,
         2.0,
+    )
+
+
+def test_a_promotion_without_any_of_them_has_no_time_of_its_fence() -> None:
+    """A broken history, but its figures are told beside the check that refuses it."""
+    (found,) = check.failovers(Tale().served(1).promoted(2).history())
+    assert (found.cause, found.fenced_ms, found.promoted_ms, found.recovered_ms) == (
+        "unknown",
+        None,
+        0.0,
+        None,
     )
 
 

@@ -11,6 +11,10 @@ def test_a_code_fits_into_a_record_and_is_not_that_of_no_record() -> None:
     assert all(code < 2**32 for code in BY_CODE)
 
 
+def test_each_event_has_its_own_code() -> None:
+    assert sorted(BY_CODE) == sorted(event.code for event in Event)
+
+
 def test_each_event_has_its_own_name() -> None:
     assert len(BY_LABEL) == len(Event)
     assert all(event_named(str(event)) is event for event in Event)

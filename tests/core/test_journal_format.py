@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from aftbed.core.errors import PeerError
 from aftbed.core.event import Event
 from aftbed.core.journal import (
+    DROPPED_OFFSET,
     ENTRY,
     HEADER_BYTES,
     NAME_BYTES_MAX,
@@ -16,6 +17,7 @@ from aftbed.core.journal import (
     Entry,
     EntryKind,
     Record,
+    dropped,
     entries,
     header,
     node_name,
@@ -23,8 +25,7 @@ from aftbed.core.journal import (
 )
 
 u64 = st.integers(0, 2**64 - 1)
-one_per_code: Final = list({event.code: event for event in Event}.values())
-some_records = st.lists(st.builds(Record, u64, st.sampled_from(one_per_code), u64, u64, st.just("a/after")))
+some_records = st.lists(st.builds(Record, u64, st.sampled_from(Event), u64, u64, st.just("a/after")))
 some_entries = st.lists(
     st.builds(Entry, u64, u64, st.integers(0, 2**16 - 1), st.sampled_from(EntryKind), st.binary(max_size=50))
 )
@@ -114,6 +115,16 @@ def test_the_name_of_the_node() -> None:
         assert node_name(header(name)) == name
     with pytest.raises(AssertionError):
         header("x" * (NAME_BYTES_MAX + 1))
+
+
+def test_what_found_no_room_is_counted_in_the_header() -> None:
+    data = bytearray(journal(RECORDS))
+    assert dropped(bytes(data)) == 0
+    data[DROPPED_OFFSET : DROPPED_OFFSET + 4] = b"\xff\xff\xff\xff"
+    assert dropped(bytes(data)) == 2**32 - 1
+    assert list(records(bytes(data))) == RECORDS
+    with pytest.raises(PeerError, match="not a journal"):
+        dropped(bytes(data[: HEADER_BYTES - 1]))
 
 
 @pytest.mark.parametrize("code", [9999, 2**32 - 1])

@@ -105,6 +105,12 @@ def test_text_that_is_no_text_is_refused() -> None:
         wire.decode(packet)
 
 
+def test_a_value_that_is_nested_too_deep_is_refused() -> None:
+    take_over_and_one_field_more = b"\x93\x09\x01" + b"\x91" * 50_000 + b"\x01"
+    with pytest.raises(PeerError, match="not a message"):
+        wire.decode(take_over_and_one_field_more)
+
+
 def test_tags_are_unique_and_what_travels_is_part_of_the_union() -> None:
     kinds = get_args(AnyMessage)
     tags = [kind.__struct_config__.tag for kind in kinds]

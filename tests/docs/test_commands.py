@@ -1,5 +1,6 @@
 """The commands in the pages are run, page by page, in an empty directory, and end as the page says."""
 
+import json
 import os
 import re
 import select
@@ -14,9 +15,10 @@ from pathlib import Path
 from typing import Final
 
 import pytest
-from pages import PAGES, ROOT, Block, Command, blocks
+from pages import PAGES, ROOT, Block, Command, blocks, names, table
 
 SECONDS_MAX: Final = 60.0
+DOCS: Final = ROOT / "docs"
 LONG_DRIVE: Final = """\
 description: an empty road, for as long as the page's commands take
 duration_s: 600
@@ -118,7 +120,7 @@ def check(block: Block, command: Command, done: subprocess.CompletedProcess[str]
 
 
 def run_page(page: Path, folder: Path, lives: list[LiveRun]) -> int:
-    """All commands of `page`, in order; how many there were. `lives` gets live runs, which the caller ends."""
+    """Run all commands of `page`; how many there were. `lives` gets live runs, for the caller to end."""
     count = 0
     for block in blocks(page):
         if name := block.value("file"):
@@ -149,6 +151,14 @@ def test_the_commands_of_a_page_end_as_it_says(page: Path, tmp_path: Path, priva
     finally:
         for live in lives:
             live.kill()
+
+
+def test_the_document_of_a_run_is_described_key_by_key(tmp_path: Path, private: Path) -> None:
+    done = aftbed(["run", "--scenario", "ccrs-20", "--pace", "max", "--json"], tmp_path)
+    found = json.loads(done.stdout)
+    keys = [name for row in table(DOCS / "commands.md", "key") for name in names(row[0])]
+    assert set(keys) == set(found)
+    assert [names(row[0])[0] for row in table(DOCS / "record.md", "check")] == list(found["checks"])
 
 
 @pytest.mark.parametrize(

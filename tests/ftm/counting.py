@@ -8,12 +8,17 @@ from aftbed.core.errors import PeerError
 
 
 class Counting:
-    """The reply to a request is `number of requests so far : checksum of all of them, in order`."""
+    """The reply to a request is `number of requests so far : checksum of all of them, in order`.
+
+    It refuses an empty one.
+    """
 
     def __init__(self) -> None:
         self.count, self.sum = 0, 0
 
     def execute(self, request: bytes) -> bytes:
+        if not request:
+            raise PeerError("an empty request")
         self.count, self.sum = self.count + 1, zlib.crc32(request, self.sum)
         return b"%d:%08x" % (self.count, self.sum)
 

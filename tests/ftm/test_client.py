@@ -52,6 +52,14 @@ def test_a_full_backlog_closes_the_port_until_an_answer_comes() -> None:
     assert "submit" in brick.open_ports()
 
 
+def test_a_client_with_a_full_backlog_refuses_one_more() -> None:
+    brick = client(BACKLOG_MAX)
+    before = inspected(brick)
+    with pytest.raises(PeerError, match="Submit on submit"):
+        brick.step("submit", Submit(b"what"), 0)
+    assert inspected(brick) == before
+
+
 def test_a_new_proxy_is_asked_what_is_unanswered_in_the_order_of_ids() -> None:
     brick = client(5)
     for number in (4, 2):

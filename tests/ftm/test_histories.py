@@ -131,6 +131,16 @@ def test_the_promises_hold_wherever_a_fault_strikes(
     assert all(host.brick.quiescent() for host in world.hosts.values()), "nothing is left inside"
 
 
+def test_a_request_that_the_function_refuses_does_not_stand_in_the_way_of_the_next() -> None:
+    world = World()
+    for payload in (b"before", b"", b"after"):
+        world.submit(payload)
+    world.run()
+    assert [(r.request_id, bool(r.payload)) for r in world.replies] == [(1, True), (2, False), (3, True)]
+    assert check.exactly_one_answer(world.history()) == check.Check("pass")
+    assert check.one_history(world.history(), Counting()) == check.Check("pass")
+
+
 @given(
     seed=st.integers(0, 2**32), at=st.integers(0, 60), whole=st.booleans(), part=st.sampled_from(CHAIN_PARTS)
 )

@@ -30,7 +30,7 @@ from aftbed.core.message import (
 from aftbed.ftm import after, proceed, protocol, proxy, server
 from aftbed.ftm.after import PbrAfter
 from aftbed.ftm.before import PassBefore
-from aftbed.ftm.client import Client
+from aftbed.ftm.client import BACKLOG_MAX, Client
 from aftbed.ftm.engine import AdaptationEngine
 from aftbed.ftm.proceed import Compute
 from aftbed.ftm.protocol import Protocol
@@ -92,6 +92,10 @@ def new_server(*, leads: bool, captured: bool = True) -> Brick:
     return Server(Counting(), 1, leads=leads, captured=captured)
 
 
+def bare_server() -> Brick:
+    return new_server(leads=True, captured=False)
+
+
 def client_that_waits() -> Brick:
     brick = Client()
     brick.step("submit", Submit(b"what"), 0)
@@ -107,18 +111,19 @@ CASES: Final = (
     by_table(leading_after, _A.CAPTURING, (Reply,), after.MOVES, TELLS),
     by_table(backup_after, _A.STANDBY, (), after.MOVES, TELLS | {Promote}),
     by_table(backup_after, _A.APPLYING, (Checkpoint,), after.MOVES, TELLS | {Promote}),
-    by_table(Compute, _C.IDLE, (), proceed.MOVES, frozenset()),
-    by_table(Compute, _C.COMPUTING, (Request,), proceed.MOVES, frozenset()),
+    by_table(Compute, _C.IDLE, (), proceed.MOVES, TELLS),
+    by_table(Compute, _C.COMPUTING, (Request,), proceed.MOVES, TELLS),
     by_hand("Proxy UNBOUND", Proxy, (), Rebound),
     by_hand("Proxy IDLE", bound_proxy, (), Rebound, Request),
     by_hand("Proxy WAITING", bound_proxy, (Request,), Rebound, Reply),
-    by_hand("Server STANDBY", lambda: new_server(leads=False), (), Request, RestoreState),
-    by_hand("Server READY", lambda: new_server(leads=True), (), Request),
-    by_hand("Server EXECUTED", lambda: new_server(leads=True), (Request,), CaptureState),
-    by_hand("Server READY bare", lambda: new_server(leads=True, captured=False), (Request,), Request),
+    by_hand("Server STANDBY", lambda: new_server(leads=False), (), Rebound, Request, RestoreState),
+    by_hand("Server READY", lambda: new_server(leads=True), (), Rebound, Request),
+    by_hand("Server EXECUTED", lambda: new_server(leads=True), (Request,), Rebound, CaptureState),
+    by_hand("Server READY bare", bare_server, (Request,), Rebound, Request),
     by_hand("Client", Client, (), Rebound, Submit),
     by_hand("Client waiting", client_that_waits, (), Rebound, Submit, Reply),
-    by_hand("PassBefore", PassBefore, (), Request),
+    by_hand("Client full", Client, (Submit,) * BACKLOG_MAX, Rebound, Reply),
+    by_hand("PassBefore", PassBefore, (), Rebound, Request),
     by_hand("Watchdog", Watchdog, (Watch,), Watch, NodeDied, Pulses, Rebound),
     by_hand("Recovery", Recovery, (), Suspect, Situation, Rebound),
     by_hand("AdaptationEngine", AdaptationEngine, ()),
@@ -144,6 +149,18 @@ def test_a_legal_message_is_taken_and_an_illegal_one_changes_nothing(case: Case,
         return
     with pytest.raises(PeerError, match=f"(?i){kind.__name__}"):
         brick.step("port", SAMPLES[kind], 0)
+    assert inspected(brick) == before
+
+
+@pytest.mark.parametrize(
+    "case", [c for c in CASES if c.name.startswith(("PassBefore", "Compute", "Server"))], ids=lambda c: c.name
+)
+@pytest.mark.parametrize("bound", [True, False])
+def test_where_a_port_leads_is_nothing_to_a_brick_that_asks_nothing_again(case: Case, bound: bool) -> None:
+    """Every brick is told of every output of its own; these have nothing to do about it."""
+    brick = brought_there(case)
+    before = inspected(brick)
+    assert brick.step("control", Rebound("x", bound, 1), 0) == []
     assert inspected(brick) == before
 
 

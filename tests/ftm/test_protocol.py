@@ -157,6 +157,14 @@ def test_a_log_out_of_order_or_too_long_is_refused(items: list[tuple[int, bytes]
     assert inspected(brick) == before
 
 
+def test_a_log_with_a_reply_newer_than_its_last_is_refused() -> None:
+    brick = Protocol(2, 1, leads=False)
+    before = inspected(brick)
+    with pytest.raises(PeerError, match="a reply log of"):
+        brick.restore(msgspec.msgpack.encode((1, [(5, b"reply 5")])))
+    assert inspected(brick) == before
+
+
 @given(st.binary(max_size=64))
 def test_bytes_that_are_no_log_are_refused(data: bytes) -> None:
     brick = Protocol(2, 1, leads=False)

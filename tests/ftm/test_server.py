@@ -52,6 +52,16 @@ def test_the_server_executes_and_marks_whose_reply_it_is() -> None:
     assert notes(effects) == [Event.SERVER_ENTER, Event.SERVER_EXIT]
 
 
+def test_a_request_that_the_function_refuses_is_answered_with_nothing() -> None:
+    brick = leader()
+    state = brick.capture()
+    effects = brick.step("prd2srv", Request(2, 7, b""), 0)
+    assert sends(effects) == [("srv2prd", Reply(2, 7, 1, b""))]
+    assert notes(effects) == [Event.SERVER_ENTER, Event.SERVER_EXIT]
+    assert sends(brick.step("aft2srv", CaptureState(2, 7), 0)) == [("srv2aft", StateCaptured(2, 7, state))]
+    assert sends(brick.step("prd2srv", REQUEST, 0)) == [("srv2prd", Reply(2, 7, 1, answer(1)))]
+
+
 def test_the_state_is_captured_after_exactly_the_request() -> None:
     brick = leader()
     brick.step("prd2srv", REQUEST, 0)

@@ -75,6 +75,8 @@ BAD: Final = {
     "crash primary at server.exit nth -1": "nth '-1': a whole number from 1 on is allowed",
     "crash primary at server.exit nth 1.5": "nth '1.5': a whole number from 1 on is allowed",
     "crash primary at server.exit nth two": "nth 'two': a whole number from 1 on is allowed",
+    "crash primary at server.exit nth ²": "nth '²': a whole number from 1 on is allowed",
+    "crash primary after ²ms": "duration '²ms': a positive number",
     "crash primary after 200": "duration '200': a positive number with its unit is allowed, as 50ms or 2s",
     "crash primary after ms": "duration 'ms': a positive number",
     "crash primary after -5ms": "duration '-5ms': a positive number",
@@ -92,6 +94,15 @@ BAD: Final = {
 def test_each_wrong_word_is_named(text: str) -> None:
     with pytest.raises(ConfigError, match=re.escape(BAD[text])):
         parse(text)
+
+
+@pytest.mark.parametrize(
+    ("words", "digits", "unit"), [("after", 400, "s"), ("after", 11, "ms"), ("at server.exit nth", 5000, "")]
+)
+def test_a_number_of_any_length_is_named_but_not_in_full(words: str, digits: int, unit: str) -> None:
+    number = "9" * digits + unit
+    with pytest.raises(ConfigError, match=rf"'{number[:40]}': a .* is allowed"):
+        parse(f"crash primary {words} {number}")
 
 
 @pytest.mark.parametrize(

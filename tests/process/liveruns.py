@@ -28,7 +28,7 @@ from aftbed.campaign.record import RunRecord, read_record
 from aftbed.campaign.verdict import Verdict, judge
 from aftbed.core.errors import ConfigError
 from aftbed.core.fault import Fault
-from aftbed.core.journal import Entry, EntryKind, entries
+from aftbed.core.journal import EntryKind, entries
 from aftbed.runtime.unix import ask, rundir
 from aftbed.runtime.unix.launch import launch, options_for
 from aftbed.runtime.unix.options import LoadRun, Work
@@ -102,7 +102,7 @@ class Home:
 
     def left(self) -> list[str]:
         """Everything that a run would have left behind (G7)."""
-        found = [f"process {pid} ({_comm(pid)})" for pid in self.processes()]
+        found = [f"process {pid}" for pid in self.processes()]
         found += [f"directory {path}" for path in self.runs()]
         return found + [f"shared memory {p}" for p in set(SHARED_MEMORY.iterdir()) - self._shared]
 
@@ -120,13 +120,6 @@ class Home:
             except ProcessLookupError:
                 continue
         shutil.rmtree(self.path, ignore_errors=True)
-
-
-def _comm(pid: int) -> str:
-    try:
-        return Path(f"/proc/{pid}/comm").read_text().strip()
-    except OSError:
-        return "gone"
 
 
 @pytest.fixture(autouse=True)
@@ -154,10 +147,6 @@ class Outcome(msgspec.Struct, frozen=True):
     def told(self, event: str) -> list[str]:
         """The texts of all events of this kind."""
         return [str(e["text"]) for e in self.events if e["event"] == event]
-
-    def answers(self) -> list[Entry]:
-        """The replies that the client got."""
-        return [e for e in self.record.history.dialogue if e.kind is EntryKind.ANSWERED]
 
 
 class Started:
@@ -297,11 +286,9 @@ def state_of(pid: int) -> str:
         return ""
 
 
-def under_load(
-    home: Home, count: int, rate_hz: float = 200.0, *, ftm: str = "pbr", placement: str = "process"
-) -> Started:
+def under_load(home: Home, count: int, rate_hz: float = 200.0, *, placement: str = "process") -> Started:
     """A run under synthetic load that has begun to answer."""
-    run = Started(home, LoadRun(count, rate_hz), ftm=ftm, placement=placement)
+    run = Started(home, LoadRun(count, rate_hz), placement=placement)
     try:
         run.wait_for("started")
         run.wait_for_answers(20)

@@ -14,18 +14,18 @@ from liveruns import Home, Started, under_load, until
 from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.core.fault import Act, Fault, Trigger
 from aftbed.core.wire import PACKET_BYTES_MAX
+from aftbed.ftm.mechanism import build
+from aftbed.runtime import targets
 from aftbed.runtime.unix import ask, rundir
 
 pytestmark = pytest.mark.process
 
 EXAMPLES: Final = 300
 WORDS: Final = st.text(max_size=20)
+GRAPH: Final = build("pbr", "process")
+WHOM: Final = {*targets.ROLES, *GRAPH.nodes, *targets.OTHERS}
 INTEGERS: Final = st.integers(-(2**63), 2**64 - 1)
-HARMLESS_TARGETS: Final = WORDS.filter(
-    lambda word: word not in {"primary", "backup", "supervisor", "hub", "vehicle", "player"}
-    and "/" not in word
-    and not word.startswith("zygote")
-)
+HARMLESS_TARGETS: Final = WORDS.filter(lambda word: word not in WHOM)
 
 questions = st.one_of(
     st.binary(max_size=200),

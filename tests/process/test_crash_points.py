@@ -74,6 +74,12 @@ def test_a_crash_of_one_node_of_the_primary_is_a_failover(part: str) -> None:
     assert_masked(drive(f"crash a/{part} at server.exit nth 100"), failovers=1)
 
 
+@pytest.mark.parametrize("event", ["request.received", "checkpoint.sent", "reply.stored", "reply.sent"])
+def test_whoever_waits_for_the_blow_may_die_of_it(event: str) -> None:
+    """The node that reaches the point asks for the blow; the failover kills it before it hears of it."""
+    assert_masked(drive(f"crash a/server at {event} nth 100"), failovers=1)
+
+
 @pytest.mark.parametrize("placement", ["process", "replica"])
 def test_the_new_backup_takes_over_in_its_turn(placement: str) -> None:
     faults = ("crash primary at checkpoint.sent nth 60", "crash primary at checkpoint.sent nth 160")

@@ -1,4 +1,4 @@
-"""SIGKILL of every process of a run, under load: the service goes on, once each, and nothing is left (G1 to G7)."""
+"""SIGKILL of every process of a run, under load: the service goes on, and nothing is left (G1 to G7)."""
 
 import io
 import os
@@ -193,6 +193,17 @@ def test_the_record_of_a_killed_run_holds_every_reply_that_was_given(home: Home)
     assert outcome.verdict.checks["one_history"] == "pass"
     dialogue = outcome.record.history.dialogue
     assert sum(entry.kind is EntryKind.ANSWERED for entry in dialogue) >= given
+
+
+@pytest.mark.parametrize("size", [0, 1 << 20])
+def test_a_journal_that_was_just_being_made_spoils_no_record(home: Home, tmp_path: Path, size: int) -> None:
+    """A node may be killed between the creation of its file and the header in it."""
+    record = tmp_path / "record"
+    assert aftbed("run", "--load", "50", "--record", record).code == 0
+    with (record / "journal" / "a.server.2.journal").open("wb") as journal:
+        journal.truncate(size)
+    done = aftbed("check", record)
+    assert done.code == 0, done.out + done.err
 
 
 def _frames(record: Path) -> LogCounts:

@@ -1,6 +1,5 @@
 """Two runs side by side do not touch each other, and a command says which one it means."""
 
-import os
 import signal
 
 import pytest
@@ -69,7 +68,7 @@ def test_the_directory_of_a_dead_run_is_no_run(home: Home) -> None:
 
 def test_the_directory_of_a_run_is_private(home: Home) -> None:
     with under_load(home, 100) as run:
-        assert os.stat(run.private).st_mode & 0o777 == 0o700
-        assert os.stat(rundir.root()).st_mode & 0o777 == 0o700
+        assert run.private.stat().st_mode & 0o777 == 0o700
+        assert rundir.root().stat().st_mode & 0o777 == 0o700
         ask.ask(run.private, ask.Stop())
         assert run.finish().verdict.verdict == "pass"

@@ -206,6 +206,8 @@ def test_a_file_over_the_limit_is_refused_unread(pair: Pair) -> None:
 
 # -- garbage
 
+SUSPEND_AND_MORE: Final = b"\x83\xa4type\xa7Suspend\xa5token\x01\xa1x"
+
 
 @pytest.mark.parametrize(
     "packet",
@@ -221,6 +223,8 @@ def test_a_file_over_the_limit_is_refused_unread(pair: Pair) -> None:
         msgspec.msgpack.encode(
             {"type": "Arm", "token": 1, "fault": 1, "event": "", "nth": 1, "act": "x", "itself": True}
         ),
+        msgspec.msgpack.encode(control.Capture(1, "node")).replace(b"node", b"\xff\xff\xff\xff"),
+        pytest.param(SUSPEND_AND_MORE + b"\x91" * 50_000 + b"\x01", id="nested too deep"),
     ],
 )
 @pytest.mark.parametrize("fds", [0, 2])
@@ -241,6 +245,47 @@ def test_a_file_with_garbage_is_refused(pair: Pair) -> None:
     os.close(fd)
     with pytest.raises(PeerError, match="not a control message"):
         pair.theirs.recv()
+
+
+def test_a_socket_is_no_file(pair: Pair) -> None:
+    socket.send_fds(pair.ours.sock, [b"\xc1"], [pair.ours.fileno()])
+    with pytest.raises(PeerError, match="not a control message"):
+        pair.theirs.recv()
+
+
+def test_an_empty_packet_is_the_end_and_its_descriptors_are_closed(pair: Pair) -> None:
+    socket.send_fds(pair.ours.sock, [b""], [0])
+    assert pair.theirs.recv() is None
+
+
+@given(st.lists(st.binary(min_size=1, max_size=80), min_size=1, max_size=5), st.integers(0, 3))
+def test_random_packets_are_orders_or_refused_and_leave_no_descriptor(packets: list[bytes], fds: int) -> None:
+    with Pair() as pair:
+        before = open_descriptors()
+        for packet in packets:
+            socket.send_fds(pair.ours.sock, [packet], [pair.ours.fileno()] * fds)
+            try:
+                got = pair.theirs.recv()
+            except PeerError:
+                continue
+            assert got is not None and isinstance(got[0], ORDERS)
+            for fd in got[1]:
+                os.close(fd)
+        assert open_descriptors() <= before
+
+
+@given(any_of(control.ToNode), st.data())
+def test_a_flipped_bit_gives_an_order_or_a_peer_error(order: msgspec.Struct, data: st.DataObject) -> None:
+    packet = bytearray(msgspec.msgpack.encode(order))
+    bit = data.draw(st.integers(0, 8 * len(packet) - 1))
+    packet[bit // 8] ^= 1 << bit % 8
+    with Pair() as pair:
+        pair.ours.sock.send(packet)
+        try:
+            got = pair.theirs.recv()
+        except PeerError:
+            return
+        assert got is not None and isinstance(got[0], ORDERS)
 
 
 @given(st.data())

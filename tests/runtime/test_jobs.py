@@ -91,6 +91,20 @@ def test_an_early_answer_is_given_once(jobs: Jobs) -> None:
     assert (first.ends, second.ends) == ([""], [])
 
 
+def test_a_refusal_that_comes_before_its_job_waits_for_it_is_kept(jobs: Jobs) -> None:
+    run = Run(jobs, wait(TWO), wait(ONE))
+    jobs.fail(ONE, "a/after: refused")
+    assert run.ends == []
+    jobs.settle(TWO)
+    assert run.undone == run.ends == ["a/after: refused"]
+
+
+def test_an_early_refusal_is_thrown_once(jobs: Jobs) -> None:
+    jobs.fail(ONE, "a/after: refused")
+    first, second = Run(jobs, wait(ONE)), Run(jobs, wait(ONE))
+    assert (first.ends, second.ends) == (["a/after: refused"], [])
+
+
 def test_only_answers_are_kept_and_not_for_ever(jobs: Jobs) -> None:
     jobs.settle(PROMOTED)
     assert Run(jobs, wait(PROMOTED)).ends == [], "an event is no answer: it must happen after one waits"
@@ -192,6 +206,22 @@ def test_a_job_may_fail_before_its_first_wait(jobs: Jobs) -> None:
     ends: list[str] = []
     jobs.start("script", steps(), ends.append)
     assert ends == ["failed"] and len(jobs) == 0
+
+
+def test_the_end_of_a_job_may_fail_another_that_waits_for_the_same_key(jobs: Jobs) -> None:
+    ends: list[str] = []
+
+    def first_ends(reason: str) -> None:
+        ends.append(reason)
+        jobs.died("b/after")
+
+    def steps_of(one: Wait) -> Steps:
+        yield one
+
+    jobs.start("first", steps_of(wait(ONE)), first_ends)
+    second = Run(jobs, wait(ONE, involved=("b/after",)))
+    jobs.settle(ONE)
+    assert ends == [""] and second.ends == ["b/after died"] and len(jobs) == 0
 
 
 def test_whoever_is_told_of_an_end_may_start_another_job(jobs: Jobs) -> None:

@@ -14,10 +14,12 @@ from aftbed.core.journal import (
     PULSE_OFFSET,
     RECORD,
     EntryKind,
+    dropped,
     entries,
     node_name,
     records,
 )
+from aftbed.runtime.unix import journal as mapped
 from aftbed.runtime.unix.journal import CHUNK_BYTES, Dialogue, Header, Journal
 
 PER_CHUNK: Final = (CHUNK_BYTES - HEADER_BYTES) // RECORD.size
@@ -58,6 +60,28 @@ def test_a_dialogue_grows_past_a_chunk_and_takes_an_entry_larger_than_one(tmp_pa
     found = list(entries(path.read_bytes()))
     assert [e.payload for e in found] == payloads
     assert {e.kind for e in found} == {EntryKind.SENT}
+
+
+def test_a_record_that_finds_no_room_is_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mapped, "FILE_BYTES_MAX", 2 * CHUNK_BYTES)
+    path = tmp_path / "a.journal"
+    journal = Journal(path, "a")
+    for number in range(3 * PER_CHUNK):
+        journal.write(number, Event.SERVER_EXIT, number, 0)
+    data = path.read_bytes()
+    kept = [r.request_id for r in records(data)]
+    assert len(data) == 2 * CHUNK_BYTES and kept == list(range(len(kept)))
+    assert dropped(data) == 3 * PER_CHUNK - len(kept) > 0
+
+
+def test_an_entry_that_finds_no_room_is_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mapped, "FILE_BYTES_MAX", CHUNK_BYTES)
+    path = tmp_path / "client.dialogue"
+    dialogue = Dialogue(path, "client")
+    for number in range(5):
+        dialogue.write(number, number, 1, EntryKind.SENT, bytes(CHUNK_BYTES // 3))
+    data = path.read_bytes()
+    assert [e.request_id for e in entries(data)] == [0, 1] and dropped(data) == 3
 
 
 def test_a_journal_is_made_once(tmp_path: Path) -> None:

@@ -79,6 +79,12 @@ def test_a_directory_of_another_user_is_refused(runtime: Path, monkeypatch: pyte
         rundir.root()
 
 
+def test_a_file_in_its_place_is_refused(runtime: Path) -> None:
+    runtime.write_text("")
+    with pytest.raises(HarnessError, match="must be a directory of this user alone"):
+        rundir.root()
+
+
 def test_a_link_to_a_directory_is_refused(runtime: Path, tmp_path: Path) -> None:
     (tmp_path / "elsewhere").mkdir(mode=0o700)
     runtime.symlink_to(tmp_path / "elsewhere")

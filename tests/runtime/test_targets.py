@@ -56,6 +56,12 @@ def test_every_event_of_the_request_path_can_trigger(placement: str, event: Even
             crash("primary", Trigger("checkpoint.sent")),
             "event 'checkpoint.sent' cannot trigger a fault under --ftm none (one of: ",
         ),
+        (
+            "none",
+            "process",
+            crash("primary", Trigger("state.captured")),  # there is a Server, but nobody asks for its state
+            "event 'state.captured' cannot trigger a fault under --ftm none (one of: ",
+        ),
     ],
 )
 def test_what_cannot_happen_is_refused_with_what_can(
@@ -71,7 +77,8 @@ def test_the_allowed_events_are_listed() -> None:
     listed = str(caught.value).partition("(one of: ")[2].rstrip(")").split(", ")
     assert listed == sorted(listed)
     assert {"request.sent", "server.enter", "server.exit", "reply.delivered"} <= set(listed)
-    assert {"checkpoint.sent", "before.exit", "watchdog.suspect"}.isdisjoint(listed)
+    missing = {"checkpoint.sent", "before.exit", "watchdog.suspect", "state.captured", "state.restored"}
+    assert missing.isdisjoint(listed)
 
 
 @pytest.mark.parametrize(

@@ -81,6 +81,8 @@ def test_what_the_hub_refuses_is_counted(hub: RunningHub, pair: tuple[Bus, Bus])
     a, b = pair
     a.set_time(10)
     a.set_time(9)
+    a.send(Frame(0, 0x122, b""))  # two connections have no order between them: b waits for a's to be taken
+    assert b.recv(DEADLINE_S) == Frame(10, 0x122, b"")
     b.send(Frame(0, 0x123, b""))
     assert a.recv(DEADLINE_S) == Frame(10, 0x123, b"")
     assert a.errors == 1

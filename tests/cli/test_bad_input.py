@@ -1,0 +1,323 @@
+"""Bad input: exit code 2, one message that says what, where and what is allowed, and nothing is left running.
+
+The command is called inside this process, which takes milliseconds; that a process of its own ends alike
+is shown for a few of them in `test_bad_input_process.py`.
+"""
+
+import socket
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+import pytest
+from liveruns import Home
+
+from aftbed.cli import main
+from aftbed.runtime.unix import rundir
+
+Run = Callable[..., str]
+
+SCENARIO: Final = """
+description: a car that stands
+duration_s: 9
+ego: {speed_kmh: 50}
+lead: {ttc_s: 4.0, speed_kmh: 0}
+expect: {outcome: stop}
+"""
+DBC: Final = """
+BU_: X
+BO_ 528 TRACK_0: 8 X
+ SG_ COUNTER : 7|8@0+ (1,0) [0|255] "" X
+ SG_ RANGE : 15|16@0+ (0.01,0) [0|300] "m" X
+ SG_ SPEED : 31|12@0- (0.025,0) [-100|100] "m/s" X
+ SG_ SIDE : 47|8@0- (0.1,0) [-10|10] "m" X
+ SG_ VALID : 48|1@0+ (1,0) [0|1] "" X
+ SG_ NEW : 49|1@0+ (1,0) [0|1] "" X
+"""
+MAP: Final = """
+description: a small radar
+cycle_ms: 50
+cycle_end: TRACK_0
+ego: {can_id: 0x0B4, length: 8, checksum: toyota, speed:
+  {unit: km/h, raw: {start_bit: 47, length_bits: 16, byte_order: big_endian, scale: 0.01}}}
+tracks:
+  messages: {name: "TRACK_{n}", first: 0, last: 0}
+  length: 8
+  counter: {signal: COUNTER, modulo: 256}
+  range: {signal: RANGE, unit: m}
+  relative_speed: {signal: SPEED, unit: m/s}
+  lateral_offset: {signal: SIDE, unit: m}
+  valid: VALID
+  new: NEW
+"""
+LOG: Final = "(0000000001.000000) can0 210#0102030405060708\n"
+
+
+@pytest.fixture
+def refused(home: Home, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
+    """Call `aftbed` with these arguments: its error, once all the rest has been checked."""
+
+    def call(*arguments: str | Path) -> str:
+        monkeypatch.setattr(sys, "argv", ["aftbed", *map(str, arguments)])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        shown = capsys.readouterr()
+        assert ended.value.code == 2, shown
+        assert shown.err.startswith("aftbed: error: ")
+        assert all(line.startswith(" ") for line in shown.err.splitlines()[1:]), "one message"
+        assert shown.out == ""
+        assert home.left() == []
+        return shown.err
+
+    return call
+
+
+def all_words(error: str, *words: str) -> bool:
+    """Whether `error` has each of `words`."""
+    return all(word in error for word in words)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--scenario", "ccrs50"), ("unknown scenario 'ccrs50'", "did you mean 'ccrs-50'", "free-drive")),
+        (("--scenario", ""), ("unknown scenario ''", "ccrs-50")),
+        (("--scenario", "absent.yaml"), ("absent.yaml", "No such file")),
+        (("--scenario", "/"), ("/", "directory")),
+        (("--ftm", "pbrr"), ("unknown FTM 'pbrr'", "did you mean 'pbr'", "none")),
+        (("--ftm", "PBR"), ("unknown FTM 'PBR'", "none, pbr")),
+        (("--placement", "replicas"), ("unknown placement", "did you mean 'replica'", "process")),
+        (("--placement", "single"), ("unknown placement 'single'",)),
+        (("--brake-policy", "latched"), ("unknown brake policy", "did you mean 'latch'", "hold")),
+        (("--pace", "fast"), ("--pace fast", "real, max, or a factor")),
+        (("--pace", "0"), ("--pace 0", "0.01 to 100")),
+        (("--pace", "-1"), ("--pace -1", "0.01 to 100")),
+        (("--pace", "nan"), ("--pace nan",)),
+        (("--pace", "inf"), ("--pace inf",)),
+        (("--seed", "9" * 30), ("--seed",)),
+        (("--load", "0"), ("--load 0", "COUNT@RATE")),
+        (("--load", "-5"), ("--load -5",)),
+        (("--load", "10@-1"), ("--load 10@-1",)),
+        (("--load", "10@nan"), ("--load 10@nan",)),
+        (("--load", "ten"), ("--load ten", "10000000")),
+        (("--load", "99999999999"), ("--load 99999999999",)),
+        (("--load", "10", "--replay", "x.log"), ("--replay and --load", "one of them")),
+        (("--bus-port", "65536"), ("--bus-port 65536", "0 to 65535")),
+        (("--bus-port", "-1"), ("--bus-port -1", "0 to 65535")),
+        (("--dbc", "x.dbc"), ("--dbc and --map", "--replay")),
+        (("--replay", "x.log"), ("--replay LOG needs --dbc FILE and --map FILE",)),
+        (("--replay", "x.log", "--dbc", "x.dbc"), ("needs --dbc FILE and --map FILE",)),
+    ],
+)
+def test_options_of_run(refused: Run, arguments: tuple[str, ...], words: tuple[str, ...]) -> None:
+    assert all_words(refused("run", *arguments), *words)
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        ("crush primary", ("unknown fault 'crush'", "did you mean 'crash'")),
+        ("crash", ("expected crash|hang TARGET",)),
+        ("", ("expected crash|hang TARGET",)),
+        ("crash primry", ("unknown target 'primry'", "did you mean 'primary'", "a/server")),
+        ("crash a/servr", ("did you mean 'a/server'",)),
+        ("crash c/server", ("unknown target 'c/server'",)),
+        ("crash primary at checkpoint.send", ("unknown event", "did you mean 'checkpoint.sent'")),
+        ("crash primary at node.died", ("cannot trigger a fault under --ftm pbr", "checkpoint.sent")),
+        ("crash primary on reply.sent", ("unknown word in fault", "at")),
+        ("crash primary at", ("'at' lacks its value",)),
+        ("crash primary at reply.sent nth 0", ("nth '0'", "from 1 on")),
+        ("crash primary at reply.sent nth -1", ("nth '-1'",)),
+        ("crash primary at reply.sent nth two", ("nth 'two'",)),
+        ("crash primary at reply.sent nth ²", ("nth '²'",)),
+        ("crash primary at reply.sent nth " + "9" * 30, ("nth",)),
+        ("crash primary after ²ms", ("duration '²ms'",)),
+        ("crash primary after 9999999s", ("duration '9999999s'",)),
+        ("crash primary nth 2", ("'at EVENT nth 2' is allowed",)),
+        ("crash primary for 50ms", ("a crash has no duration",)),
+        ("hang primary for 50", ("duration '50'", "50ms or 2s")),
+        ("hang primary for 0ms", ("duration '0ms'", "positive")),
+        ("hang primary for -5ms", ("duration '-5ms'",)),
+        ("crash primary at reply.sent after 5ms", ("one of them is allowed",)),
+        ("crash primary after 5ms after 6ms", ("'after' twice",)),
+    ],
+)
+def test_faults(refused: Run, fault: str, words: tuple[str, ...]) -> None:
+    assert all_words(refused("run", "--inject", fault), *words)
+
+
+def test_a_fault_that_this_mechanism_does_not_know(refused: Run) -> None:
+    assert "unknown target 'backup'" in refused("run", "--ftm", "none", "--inject", "crash backup")
+    at = "crash primary at checkpoint.sent"
+    assert "under --ftm none" in refused("run", "--ftm", "none", "--inject", at)
+    replica = ("--placement", "replica", "--inject", "crash a/server")
+    assert "unknown target 'a/server'" in refused("run", *replica)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("duration_s: 9", "duration: 9", ("duration",)),
+        ("duration_s: 9", "duration_s: 9\nweather: rain", ("weather",)),
+        ("speed_kmh: 50", "speed_ms: 14", ("ego", "speed_ms")),
+        ("speed_kmh: 50", "speed_kmh: -50", ("speed_kmh",)),
+        ("speed_kmh: 50", "speed_kmh: fast", ("speed_kmh",)),
+        ("ttc_s: 4.0", "gap_m: -10", ("gap_m",)),
+        ("ttc_s: 4.0", "gap_m: 0", ("gap_m", "more than 0")),
+        ("ttc_s: 4.0", "gap_m: 10, ttc_s: 4.0", ("both", "gap_m, ttc_s")),
+        ("ttc_s: 4.0", "ttc_s: 4.0m", ("ttc_s",)),
+        ("outcome: stop", "outcome: fly", ("outcome",)),
+        ("description", "descripton", ("descripton",)),
+        ("ego: {speed_kmh: 50}", "ego: [", ("yaml",)),
+        ("duration_s: 9", "duration_s: 9\nduration_s: 8", ("duration_s",)),
+    ],
+)
+def test_scenario_files(refused: Run, tmp_path: Path, old: str, new: str, words: tuple[str, ...]) -> None:
+    path = tmp_path / "mine.yaml"
+    assert old in SCENARIO
+    path.write_text(SCENARIO.replace(old, new, 1))
+    assert all_words(refused("run", "--scenario", path), str(path), *words)
+
+
+@pytest.mark.parametrize("content", [b"", b"\xff\xfe\x00", b"- a list\n", b"42\n", b"\0" * 100])
+def test_files_that_are_no_scenario(refused: Run, tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_bytes(content)
+    assert str(path) in refused("run", "--scenario", path)
+
+
+class Replay:
+    """The three files of a replay, each of which may be spoilt."""
+
+    def __init__(self, folder: Path) -> None:
+        self.log, self.dbc, self.map = folder / "x.log", folder / "x.dbc", folder / "x.yaml"
+        self.log.write_text(LOG)
+        self.dbc.write_text(DBC)
+        self.map.write_text(MAP)
+
+    def arguments(self) -> tuple[str | Path, ...]:
+        """For the command."""
+        return ("run", "--replay", self.log, "--dbc", self.dbc, "--map", self.map, "--pace", "max")
+
+
+@pytest.fixture
+def replay(tmp_path: Path) -> Replay:
+    """Three good files."""
+    return Replay(tmp_path)
+
+
+@pytest.mark.parametrize("content", ["BO_ 528 TRACK", 'VERSION "1', "not a DBC at all\n", "\0\1\2"])
+def test_a_dbc_that_does_not_parse(refused: Run, replay: Replay, content: str) -> None:
+    replay.dbc.write_text(content)
+    assert str(replay.dbc) in refused(*replay.arguments())
+
+
+def test_a_dbc_that_lacks_what_is_mapped(refused: Run, replay: Replay) -> None:
+    replay.dbc.write_text(DBC.replace("RANGE", "DISTANCE"))
+    assert all_words(refused(*replay.arguments()), str(replay.map), "RANGE")
+    replay.dbc.write_text(DBC.replace("TRACK_0", "TRACK_9"))
+    assert all_words(refused(*replay.arguments()), "TRACK_0")
+
+
+def test_a_dbc_that_is_not_there(refused: Run, replay: Replay) -> None:
+    replay.dbc.unlink()
+    assert all_words(refused(*replay.arguments()), str(replay.dbc), "No such file")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("cycle_ms", "cycle_s", ("cycle_s",)),
+        ("unit: m}", "unit: km}", ("range.unit", "'km'", "cm, m")),
+        ("unit: m/s", "unit: mph", ("unit",)),
+        ("modulo: 256", "modulo: -1", ("modulo",)),
+        ("checksum: toyota", "checksum: honda", ("checksum",)),
+        ("description: a small radar", "description: a small radar\ncolour: red", ("colour",)),
+        ("length: 8", "length: 9", ("length",)),
+    ],
+)
+def test_map_files(refused: Run, replay: Replay, old: str, new: str, words: tuple[str, ...]) -> None:
+    assert old in MAP
+    replay.map.write_text(MAP.replace(old, new, 1))
+    assert all_words(refused(*replay.arguments()), str(replay.map), *words)
+
+
+def test_a_map_that_does_not_exist(refused: Run, replay: Replay) -> None:
+    arguments = ("run", "--replay", replay.log, "--dbc", replay.dbc, "--map")
+    assert all_words(refused(*arguments, "toyotta"), "toyotta", "toyota")
+    replay.map.unlink()
+    assert all_words(refused(*arguments, replay.map), str(replay.map), "No such file")
+
+
+@pytest.mark.parametrize("content", ["", "garbage\n", LOG.rstrip("\n"), "\0" * 500, "(1.0) can0 210#01\n"])
+def test_a_log_without_a_frame(refused: Run, replay: Replay, content: str) -> None:
+    replay.log.write_text(content)
+    assert all_words(refused(*replay.arguments()), str(replay.log), "no line is a CAN frame")
+
+
+def test_a_log_that_is_not_there(refused: Run, replay: Replay) -> None:
+    replay.log.unlink()
+    assert all_words(refused(*replay.arguments()), str(replay.log), "No such file")
+
+
+def test_a_record_directory_that_exists(refused: Run, tmp_path: Path) -> None:
+    assert all_words(refused("run", "--record", tmp_path), f"--record {tmp_path}: exists already")
+    file = tmp_path / "file"
+    file.touch()
+    assert all_words(refused("run", "--record", file), "exists already")
+    assert all_words(refused("run", "--record", file / "below"), str(file))
+
+
+def test_a_port_in_use(refused: Run) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        assert all_words(refused("run", "--bus-port", str(port)), f"--bus-port {port}", "in use", "0 for any")
+
+
+@pytest.mark.parametrize(
+    "command", [("status",), ("ps",), ("graph",), ("stop",), ("inject", "crash", "primary")]
+)
+def test_no_run_is_alive(refused: Run, command: tuple[str, ...]) -> None:
+    assert "no run is alive; start one with `aftbed run`" in refused(*command)
+    named = refused(*command, "--run", "abcdef")
+    assert "--run abcdef: no such run is alive (alive: none)" in named
+    assert "no such run" in refused(*command, "--run", "../..")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--format", "svg"), ("unknown format 'svg'", "dot, mermaid, text")),
+        (("--ftm", "prb"), ("unknown FTM 'prb'", "did you mean 'pbr'")),
+        (("--ftm", "pbr", "--placement", "proces"), ("did you mean 'process'",)),
+    ],
+)
+def test_options_of_graph(refused: Run, arguments: tuple[str, ...], words: tuple[str, ...]) -> None:
+    assert all_words(refused("graph", *arguments), *words)
+
+
+def test_a_directory_that_is_no_record(refused: Run, tmp_path: Path) -> None:
+    assert all_words(refused("check", tmp_path), "run.json", "is this the record of a run?")
+    assert "is this the record of a run?" in refused("check", tmp_path / "absent")
+    (tmp_path / "run.json").write_text("{")
+    assert all_words(refused("check", tmp_path), "run.json", "not JSON")
+    (tmp_path / "run.json").write_text("[]")
+    assert all_words(refused("check", tmp_path), "run.json", "not a JSON object")
+    (tmp_path / "run.json").write_text("{}")
+    assert "run.json" in refused("check", tmp_path)
+
+
+def test_a_runtime_directory_of_others_is_not_used(
+    home: Home, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = rundir.root()
+    root.chmod(0o755)
+    monkeypatch.setattr(sys, "argv", ["aftbed", "status"])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 3
+    assert "must be a directory of this user alone" in capsys.readouterr().err
+    root.chmod(0o700)

@@ -1,0 +1,86 @@
+"""Bad input to a command in a process of its own; interpreters and limits that are refused."""
+
+import json
+import socket
+from pathlib import Path
+
+import pytest
+from liveruns import Done, Home, aftbed
+
+pytestmark = pytest.mark.process
+
+
+def assert_refused(done: Done, home: Home) -> None:
+    """One message, exit code 2, no traceback, nothing left."""
+    assert done.code == 2, done.out + done.err
+    assert done.err.startswith("aftbed: error: ")
+    assert "Traceback" not in done.err
+    assert done.out == ""
+    assert home.left() == []
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("run", "--scenario", "ccrs50"),
+        ("run", "--ftm", "pbrr"),
+        ("run", "--inject", "crash primary at checkpoint.send"),
+        ("run", "--pace", "fast"),
+        ("run", "--replay", "absent.log", "--dbc", "absent.dbc", "--map", "toyota"),
+        ("status",),
+        ("inject", "crash", "primary"),
+        ("check", "absent"),
+    ],
+)
+def test_bad_input_ends_the_command(home: Home, arguments: tuple[str, ...]) -> None:
+    assert_refused(aftbed(*arguments), home)
+
+
+def test_a_port_in_use_ends_the_command(home: Home) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        assert_refused(aftbed("run", "--bus-port", str(taken.getsockname()[1])), home)
+
+
+def test_a_refused_run_leaves_no_record(home: Home, tmp_path: Path) -> None:
+    record = tmp_path / "record"
+    assert_refused(aftbed("run", "--scenario", "ccrs50", "--record", record), home)
+    assert not record.exists()
+
+
+@pytest.mark.parametrize("command", [("--help",), ("run", "--load", "10"), ("status",)])
+def test_an_interpreter_without_asserts_is_refused(home: Home, command: tuple[str, ...]) -> None:
+    done = aftbed(*command, flags=("-O",))
+    assert done.code != 0
+    assert "refusing to run under python -O" in done.err
+    assert home.left() == []
+
+
+@pytest.mark.parametrize("option", [("--bus-port", "x"), ("--seed", "x"), ("--unknown",)])
+def test_usage_is_exit_code_2(home: Home, option: tuple[str, ...]) -> None:
+    done = aftbed("run", *option)
+    assert done.code == 2
+    assert option[0] in done.err
+    assert home.left() == []
+
+
+def test_a_log_with_spoilt_lines_is_replayed_without_them(home: Home, tmp_path: Path) -> None:
+    """Counted and refused; the frames around them are believed."""
+    from test_bad_input import DBC, MAP  # noqa: PLC0415 - beside this file
+
+    good = [f"(000000000{n}.000000) can0 210#{n:02X}00000000000000\n" for n in range(1, 6)]
+    lines = [*good[:3], "garbage\n", "(0000000001.000000) can0 210#00\n", *good[3:], good[4][:-9]]
+    log, dbc, mapped = tmp_path / "x.log", tmp_path / "x.dbc", tmp_path / "x.yaml"
+    log.write_text("".join(lines))
+    dbc.write_text(DBC)
+    mapped.write_text(MAP)
+    done = aftbed("run", "--replay", log, "--dbc", dbc, "--map", mapped, "--pace", "max", "--json")
+    assert done.code == 0, done.out + done.err
+    counts = json.loads(done.out)["replay"]["log"]
+    assert counts["refused"] == {
+        "not a candump line": 1,
+        "time runs backwards": 1,
+        "torn last line": 1,
+    }
+    assert counts["frames"] == 5
