@@ -4,6 +4,9 @@ After M. Amy, *Adaptive Fault Tolerance: Is ROS a Relevant Executive Support?* (
 """
 
 if not __debug__:  # fail-silence rests on asserts: without them a broken node goes on talking
-    raise SystemExit("aftbed: refusing to run under python -O: its fault model needs assert")
+    import sys
+
+    print("aftbed: error: refusing to run under python -O: its fault model needs assert", file=sys.stderr)
+    raise SystemExit(2)
 
 __version__ = "0.1.0"

@@ -46,7 +46,7 @@ def judge(record: RunRecord) -> Verdict:
     options, history = record.options, record.history
     checks = {
         "at_most_once": check.at_most_once(history),
-        "exactly_one_answer": check.exactly_one_answer(history),
+        "exactly_one_answer": check.exactly_one_answer(history, cut_off=record.end is None),
         "one_history": check.one_history(history, default_application()),
         "one_master": check.one_master(history),
         "clean_exit": _clean_exit(record),

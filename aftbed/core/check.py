@@ -87,14 +87,21 @@ def at_most_once(history: History) -> Check:
     return _check(reasons)
 
 
-def exactly_one_answer(history: History) -> Check:
-    """G2: each request sent has one reply."""
+def exactly_one_answer(history: History, *, cut_off: bool = False) -> Check:
+    """G2: each request sent has one reply. Of a history that was `cut_off`, what waited is not known."""
     answers = _answers(history)
-    reasons = [f"request {i}: {len(a)} replies" for i, a in sorted(answers.items()) if len(a) != 1]
+    waiting = [i for i, found in sorted(answers.items()) if not found] if cut_off else []
+    reasons = [
+        f"request {i}: {len(found)} replies"
+        for i, found in sorted(answers.items())
+        if len(found) != 1 and i not in waiting
+    ]
     asked = {e.request_id for e in _sent(history)}
     reasons += [f"request {i}: answered, but never sent" for i in sorted(answers.keys() - asked)]
     strays = [r.request_id for r in _client_refusals(history) if r.request_id]
     reasons += [f"request {i}: one reply too many reached the client" for i in strays]
+    if waiting and not reasons:
+        return Check("unknown", (f"requests {waiting[:REASONS_MAX]} waited when the run was cut off",))
     return _check(reasons) if answers else Check("unknown", ("no request was sent",))
 
 
@@ -112,20 +119,21 @@ def one_master(history: History) -> Check:
     reasons: list[str] = []
     masters: dict[int, int] = {}
     fences = history.events(Event.REPLICA_FENCED)
-    epoch, began_ns = 0, 0
+    promoted_ns = {r.detail: r.t_ns for r in history.events(Event.REPLICA_PROMOTED)}
+    epoch = 0
     for record in history.events(Event.REPLY_ACCEPTED):
         found, replica = record.detail >> 8, record.detail & 0xFF
         if found < epoch:
             reasons.append(f"a reply of epoch {found} accepted after one of epoch {epoch}")
         if masters.setdefault(found, replica) != replica:
             reasons.append(f"epoch {found}: replies of replicas {masters[found]} and {replica}")
-        if found <= epoch:
-            continue
-        # What was sent before the fence may be read after it: the fence lies between the first replies.
-        old = masters.get(epoch, 0)
-        if epoch and not any(f.detail & 0xFF == old and began_ns <= f.t_ns <= record.t_ns for f in fences):
-            reasons.append(f"replica {old} was not fenced between epochs {epoch} and {found}")
-        epoch, began_ns = found, record.t_ns
+        if epoch and found > epoch:
+            # What was sent before the fence may be accepted after it, so its place is before the promotion.
+            old, began_ns = masters[epoch], promoted_ns.get(epoch, 0)
+            ended_ns = promoted_ns.get(found, began_ns)
+            if not any(f.detail & 0xFF == old and began_ns <= f.t_ns <= ended_ns for f in fences):
+                reasons.append(f"replica {old} was not fenced between epochs {epoch} and {found}")
+        epoch = max(epoch, found)
     return _check(reasons) if masters else Check("unknown", ("no reply was accepted",))
 
 

@@ -83,14 +83,23 @@ def node_name(data: bytes) -> str:
     return data[NAME_OFFSET + 1 : NAME_OFFSET + 1 + length].decode(errors="replace")
 
 
+def unfinished(data: bytes) -> bool:
+    """A journal whose node died while it made it: empty, or not yet with a header."""
+    return not data or not any(data[: len(MAGIC)])
+
+
 def dropped(data: bytes) -> int:
     """How many records or entries found no room in the file. Raises PeerError if it is no journal."""
+    if unfinished(data):
+        return 0
     node_name(data)
     return int.from_bytes(data[DROPPED_OFFSET : DROPPED_OFFSET + 4], "little")
 
 
 def records(data: bytes) -> Iterator[Record]:
     """The committed records of a journal. Raises PeerError on what is no journal or has no such event."""
+    if unfinished(data):
+        return
     node = node_name(data)
     for at in range(HEADER_BYTES, len(data) - RECORD.size + 1, RECORD.size):
         t_ns, request_id, detail, _, code = RECORD.unpack_from(data, at)
@@ -104,6 +113,8 @@ def records(data: bytes) -> Iterator[Record]:
 
 def entries(data: bytes) -> Iterator[Entry]:
     """The committed entries of a dialogue. Raises PeerError on a malformed one."""
+    if unfinished(data):
+        return
     node_name(data)
     at = HEADER_BYTES
     while at + ENTRY.size <= len(data):

@@ -5,7 +5,7 @@ It has its place in the graph, its process and its death already; scripts come w
 
 from aftbed.core.brick import Brick, Effect
 from aftbed.core.errors import PeerError
-from aftbed.core.message import AnyMessage
+from aftbed.core.message import AnyMessage, Rebound
 
 
 class AdaptationEngine(Brick):
@@ -20,5 +20,7 @@ class AdaptationEngine(Brick):
         return True
 
     def step(self, port: str, msg: AnyMessage, now_ns: int) -> list[Effect]:
-        """Refuse all mail."""
+        """Refuse all mail but word of its channels."""
+        if isinstance(msg, Rebound):
+            return []
         raise PeerError(f"{type(msg).__name__} on {port}: the engine takes no mail")

@@ -117,6 +117,6 @@ class Protocol(Brick):
         except msgspec.DecodeError as error:
             raise PeerError(f"not a reply log: {error}") from error
         ids = [request_id for request_id, _ in items]
-        if len(ids) > REPLIES_KEPT or ids != sorted(set(ids)) or (ids and ids[-1] > last_id):
+        if len(ids) > REPLIES_KEPT or ids != sorted(set(ids)) or max(ids, default=0) != last_id:
             raise PeerError(f"a reply log of {len(items)} replies, or out of order")
         self.last_id, self.log = last_id, dict(items)

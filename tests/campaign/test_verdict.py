@@ -183,9 +183,16 @@ def test_what_is_left_behind_fails(path: Path) -> None:
 
 def test_a_fail_weighs_more_than_what_is_not_known(path: Path) -> None:
     record = whole(path)
-    record.request(answers=0)
+    record.request(answers=2)
     record.end = None
     assert record.verdict().verdict == "fail"
+
+
+def test_what_waited_when_the_run_was_cut_off_is_not_known(path: Path) -> None:
+    record = whole(path)
+    record.request(answers=0)
+    record.end = None
+    assert record.verdict().checks["exactly_one_answer"] == "unknown"
 
 
 # -- what is not known is no pass

@@ -97,12 +97,17 @@ def test_an_entry_in_the_making_is_none() -> None:
     assert list(entries(torn)) == []
 
 
-@pytest.mark.parametrize("length", [0, 1, 8, HEADER_BYTES - 1])
+@pytest.mark.parametrize("length", [1, 8, HEADER_BYTES - 1])
 def test_a_header_cut_short_is_no_journal(length: int) -> None:
     with pytest.raises(PeerError, match=f"not a journal \\({length} bytes\\)"):
         list(records(header("a/after")[:length]))
     with pytest.raises(PeerError, match="not a journal"):
         list(entries(header("client")[:length]))
+
+
+@pytest.mark.parametrize("data", [b"", bytes(HEADER_BYTES), bytes(2 * HEADER_BYTES)])
+def test_a_journal_whose_node_died_while_it_made_it_is_empty(data: bytes) -> None:
+    assert list(records(data)) == [] and list(entries(data)) == [] and dropped(data) == 0
 
 
 def test_another_magic_is_no_journal() -> None:
@@ -150,7 +155,7 @@ def test_garbage_behind_a_header_gives_records_or_a_peer_error(data: bytes) -> N
             continue
 
 
-@given(st.binary(max_size=300))
+@given(st.binary(min_size=1, max_size=300).filter(lambda data: any(data[:8])))
 def test_garbage_is_no_journal(data: bytes) -> None:
     for read in (records, entries):
         with pytest.raises(PeerError):

@@ -126,7 +126,7 @@ CASES: Final = (
     by_hand("PassBefore", PassBefore, (), Rebound, Request),
     by_hand("Watchdog", Watchdog, (Watch,), Watch, NodeDied, Pulses, Rebound),
     by_hand("Recovery", Recovery, (), Suspect, Situation, Rebound),
-    by_hand("AdaptationEngine", AdaptationEngine, ()),
+    by_hand("AdaptationEngine", AdaptationEngine, (), Rebound),
 )
 
 

@@ -8,6 +8,7 @@ import array
 import contextlib
 import os
 import socket
+import stat
 from collections.abc import Callable
 from typing import Final, Generic, TypeVar
 
@@ -286,9 +287,13 @@ class Line(Generic[Incoming]):
 
 
 def _read_memfd(descriptor: int) -> bytes:
-    with open(descriptor, "rb") as file:
-        size = os.fstat(file.fileno()).st_size if file.seekable() else STATE_BYTES_MAX + 1
-        if size > STATE_BYTES_MAX:
-            raise PeerError(f"a state of {size} bytes, at most {STATE_BYTES_MAX} are allowed")
-        file.seek(0)
-        return file.read()
+    """The packet in a memfd, which is closed. Raises PeerError if it is no file or too large."""
+    try:
+        state = os.fstat(descriptor)
+        if not stat.S_ISREG(state.st_mode):
+            raise PeerError("the descriptor of a large packet is not a memfd")
+        if state.st_size > STATE_BYTES_MAX:
+            raise PeerError(f"a packet of {state.st_size} bytes, at most {STATE_BYTES_MAX} are allowed")
+        return os.pread(descriptor, state.st_size, 0)
+    finally:
+        os.close(descriptor)

@@ -5,6 +5,7 @@ It is resumed with the values of the keys, or `StepFailed` is thrown into it at 
 what must be undone stands in an `except` beside what was done.
 """
 
+import contextlib
 import time
 from collections.abc import Callable, Generator
 from typing import Final
@@ -126,4 +127,5 @@ class Jobs:
 
     def _end(self, job: _Job, reason: str) -> None:
         self._jobs.remove(job)
-        job.on_end(reason)
+        with contextlib.suppress(StepFailed):  # an order to a process that is gone: its death is seen anyway
+            job.on_end(reason)

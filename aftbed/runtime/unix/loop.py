@@ -1,12 +1,19 @@
 """The supervisor's loop: one thread, one epoll, timers, jobs. Off the request path."""
 
+import contextlib
 import heapq
 import itertools
 import select
 import time
 from collections.abc import Callable
 
-from aftbed.runtime.unix.jobs import Jobs
+from aftbed.runtime.unix.jobs import Jobs, StepFailed
+
+
+def _call(call: Callable[[], None]) -> None:
+    """An order to a process that is gone must not end the run: its death is seen anyway."""
+    with contextlib.suppress(StepFailed):
+        call()
 
 
 class Loop:
@@ -49,10 +56,10 @@ class Loop:
                 for fd, reader in ready:
                     # A call before this one may have closed `fd`, and its number may be another's now.
                     if reader[0] is turn and self._readers.get(fd) is reader:
-                        reader[1]()
+                        _call(reader[1])
             self.jobs.expire(now_ns)
             while self._timers and self._timers[0][0] <= now_ns:
-                heapq.heappop(self._timers)[2]()
+                _call(heapq.heappop(self._timers)[2])
 
     def _patience_seconds(self) -> float:
         dues = [self._timers[0][0]] if self._timers else []

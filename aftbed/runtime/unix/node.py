@@ -48,6 +48,7 @@ READ_BYTES_MAX: Final = wire.PACKET_BYTES_MAX + 1  # one byte more than is allow
 WRITE_SECONDS_MAX: Final = 2.0
 FAULT_SECONDS_MAX: Final = 5.0
 NUDGE: Final = b"\0"
+HOST_FILES: Final = (__file__, control.__file__)  # what is blocked in here is not in a brick
 EXIT_FENCED: Final = 3
 REFUSED: Final = (PeerError, *wire.UNREADABLE)
 EXIT_ASSERT: Final = 70
@@ -115,7 +116,7 @@ class Node:
 
     def _on_timer(self, signum: int, frame: FrameType | None) -> None:
         at = self.journal.at
-        if at != self._pulse_at or (frame is not None and frame.f_code.co_filename == __file__):
+        if at != self._pulse_at or (frame is not None and frame.f_code.co_filename in HOST_FILES):
             self._pulse_at = at
             self._pulse(_now())
 
@@ -336,13 +337,15 @@ class Node:
     def _write_hard(self, hosted: Hosted, port: str, data: bytes) -> None:
         """The channel is full or shut: serve control meanwhile, since that may be about this channel.
 
-        Raises BrokenPipeError where this node is fenced, AssertionError where nobody reads.
+        Where it is bound elsewhere meanwhile, the brick has heard of it and has asked again what it
+        wants asked. Raises BrokenPipeError where this node is fenced, or nobody reads.
         """
+        failed = hosted.outs[port]
         limit = _now() + int(WRITE_SECONDS_MAX * 1e9)
         while _now() < limit:
             out = hosted.outs[port]
-            if not isinstance(out, int):
-                return  # unbound meanwhile: there is nobody to send it to
+            if not isinstance(out, int) or out is not failed:
+                return
             try:
                 _write(out, data)
             except BlockingIOError:

@@ -72,6 +72,8 @@ class Questions:
         except (OSError, AftbedError):
             got = None
         if got is not None:
+            for fd in got[1]:  # nobody asked for descriptors
+                os.close(fd)
             self._reply(got[0], lambda answer: self._send_answer(line, answer))
             return
         self._loop.forget(line.fileno())

@@ -10,6 +10,7 @@ import secrets
 import shutil
 import socket
 import stat
+import time
 from pathlib import Path
 from typing import Final
 
@@ -17,6 +18,8 @@ from aftbed.core.errors import ConfigError, HarnessError
 
 SOCKET_NAME: Final = "control"
 ID_BYTES: Final = 3
+ANSWER_SECONDS_MAX: Final = 2.0
+CONNECT_PAUSE_SECONDS: Final = 0.005
 
 
 def root() -> Path:
@@ -79,12 +82,27 @@ def connect(private: Path) -> socket.socket:
     """A connection to the supervisor of the run in `private`; raises OSError."""
     sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     try:
-        sock.settimeout(2.0)
-        sock.connect(str(private / SOCKET_NAME))
+        _connect(sock, str(private / SOCKET_NAME))
+        sock.settimeout(ANSWER_SECONDS_MAX)
     except OSError:
         sock.close()
         raise
     return sock
+
+
+def _connect(sock: socket.socket, address: str) -> None:
+    """A supervisor that is busy has a full queue for a moment; that is no death."""
+    limit = time.monotonic() + ANSWER_SECONDS_MAX
+    sock.setblocking(False)
+    while True:
+        try:
+            sock.connect(address)
+        except BlockingIOError:
+            if time.monotonic() > limit:
+                raise
+            time.sleep(CONNECT_PAUSE_SECONDS)  # connect(2) on a full queue gives no event to wait for
+        else:
+            return
 
 
 def find(run: str | None) -> Path:

@@ -118,6 +118,7 @@ class Supervisor:
 
     def _launched(self, failure: str) -> None:
         if failure:
+            self.tell("launch.failed", failure)
             self._finish(f"launch failed: {failure}")
             return
         self.tell("started", f"{len(self.deployment.nodes)} nodes in {self.graph_ms:.1f} ms")
@@ -130,6 +131,8 @@ class Supervisor:
             return
         except (OSError, AftbedError):
             got = None
+        for fd in got[1] if got is not None else ():
+            os.close(fd)
         if got is None or isinstance(got[0], control.Stop):
             self._finish("the command is gone" if got is None else "interrupted")
             if got is None:
@@ -322,7 +325,10 @@ class Supervisor:
         def ended(failure: str) -> None:
             ms = (time.monotonic_ns() - began_ns) / 1e6
             self.tell("replaced", f"{node}: {failure or f'{ms:.2f} ms'}")
-            if failure and not self._ending and not self.deployment.lives(node):
+            half = self.deployment.nodes.get(node)
+            if failure and not self._ending and half is not None and half.alive:
+                half.kill()  # half bound: its death is heard, and replaced in turn
+            elif failure and not self._ending:
                 self.loop.after(TICK_SECONDS, lambda: self._replace(node))
             if node == "recovery":
                 self._inform_recovery(failed=False)
