@@ -1,0 +1,70 @@
+# `make demo` and `make test` are all that a newcomer needs; `make help` lists the rest.
+# They work with nothing but python3 (>= 3.11) with venv and pip. Another interpreter: make PYTHON=python3.12 demo
+
+PYTHON ?= python3
+VENV   ?= .venv
+
+BIN      := $(VENV)/bin
+PLAIN    := $(VENV)/.installed-plain
+EDITABLE := $(VENV)/.installed-editable
+SOURCES  := pyproject.toml README.md $(shell find aftbed dbc -type f -not -name '*.pyc')
+
+FAULT := crash primary at checkpoint.sent nth 100
+
+.PHONY: help demo test lint fast process deep bench
+.NOTPARALLEL:
+.DELETE_ON_ERROR:
+
+help:
+	@echo "make demo     install into $(VENV), drive a car whose server's primary is killed on the way"
+	@echo "make test     install with the tools of the tests, then lint, fast and process"
+	@echo "make lint     ruff check, ruff format --check, mypy"
+	@echo "make fast     the tests without real runs"
+	@echo "make process  the tests that start real runs"
+	@echo "make deep     the exhaustive tests: minutes"
+	@echo "make bench    every number of the README"
+
+# Where the tests are installed, the package is too: then the demo needs nothing more.
+demo: $(if $(wildcard $(EDITABLE)),$(EDITABLE),$(PLAIN))
+	$(BIN)/aftbed run --ftm pbr --scenario ccrs-50 --pace real --inject "$(FAULT)"
+
+test: lint fast process
+
+lint: $(EDITABLE)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+fast: $(EDITABLE)
+	$(BIN)/python -m pytest -m "not process and not deep"
+
+process: $(EDITABLE)
+	$(BIN)/python -m pytest -m "process and not deep"
+
+deep: $(EDITABLE)
+	$(BIN)/python -m pytest -m deep
+
+bench: $(EDITABLE)
+	$(BIN)/aftbed bench cycle --ftm pbr --json
+	$(BIN)/aftbed bench cycle --ftm pbr --placement replica --json
+	$(BIN)/aftbed bench cycle --ftm none --json
+	$(BIN)/aftbed bench recovery --ftm pbr --json
+	$(BIN)/aftbed bench recovery --ftm pbr --placement replica --json
+	$(BIN)/aftbed bench launch --ftm pbr --json
+	$(BIN)/aftbed bench memory --ftm pbr --json
+
+# -- installation: a stamp each, so that a second `make` installs only what has changed ------------
+
+$(BIN)/python:
+	@$(PYTHON) -c 'import sys; sys.exit("aftbed needs Python 3.11 or newer, found " + sys.version.split()[0] + "; name another one: make PYTHON=python3.12" if sys.version_info < (3, 11) else 0)'
+	$(PYTHON) -m venv $(VENV)
+
+$(PLAIN): $(SOURCES) | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check .
+	@rm -f $(EDITABLE)
+	@touch $@
+
+$(EDITABLE): pyproject.toml | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[test]"
+	@rm -f $(PLAIN)
+	@touch $@
