@@ -9,9 +9,6 @@ from typing import Final
 
 import msgspec
 
-from aftbed.campaign.record import read_record
-from aftbed.campaign.verdict import EXIT_CODES, EXIT_INTERRUPTED, judge
-from aftbed.cli.show import show_verdict
 from aftbed.cli.view import View, open_view
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.fault import Fault
@@ -69,6 +66,11 @@ def run(asked: Asked, *, as_json: bool) -> int:
     )
     launched = launch(options, listener)
     view = open_view(options, quiet=as_json)
+    # While the processes start: none of this is needed before the end.
+    from aftbed.campaign.record import read_record  # noqa: PLC0415
+    from aftbed.campaign.verdict import EXIT_CODES, EXIT_INTERRUPTED, judge  # noqa: PLC0415
+    from aftbed.cli.show import show_verdict  # noqa: PLC0415
+
     interrupted = _follow(launched, view)
     launched.wait()
     try:

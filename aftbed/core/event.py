@@ -34,12 +34,8 @@ class Event(Enum):
     REPLICA_FENCED = (23, "replica.fenced")
     REPLICA_PROMOTED = (24, "replica.promoted")
     BACKUP_READY = (25, "backup.ready")
-    BACKUP_LOST = (26, "backup.lost")
-    NODE_STARTED = (30, "node.started")
     NODE_DIED = (31, "node.died")
     STATE_RESTORED = (32, "state.restored")
-    SUSPENDED = (33, "suspended")
-    RESUMED = (34, "resumed")
     PEER_REFUSED = (35, "peer.refused")
     FAULT_APPLIED = (40, "fault.applied")
 

@@ -10,7 +10,7 @@ from aftbed.ftm.catalog import EMITTERS
 
 ROLES: Final = ("primary", "backup")
 STATE_ACCESS: Final = (Event.STATE_CAPTURED, Event.STATE_RESTORED)
-OTHERS: Final = ("supervisor", "zygote", "zygote.bus", "hub", "vehicle", "player")
+OTHERS: Final = ("zygote", "zygote.bus", "hub", "vehicle", "player")
 
 
 def check(fault: Fault, graph: Graph) -> None:

@@ -43,8 +43,10 @@ def _build(line: control.Line[control.ToNode], order: control.Assign, fds: list[
     linux.set_name(order.node)
     if order.cpu is not None:
         os.sched_setaffinity(0, {order.cpu})
-    if order.replica == 0:  # in no replica's chain: it passes on, watches or recovers
+    if order.bricks[0][1] in ("watchdog", "recovery"):
         linux.answer_soon()
+    else:
+        linux.hand_over()
     linux.set_timeouts(line.sock, PULSE_SECONDS, 2.0)
     node = Node(order.node, line, Journal(Path(order.journal), order.node))
     node.start_pulse()

@@ -15,7 +15,7 @@ from aftbed.ftm.catalog import Setting, make
 from aftbed.ftm.mechanism import CHAIN_PARTS, build
 from aftbed.vehicle.function import default_application, sample_requests
 
-ROUNDS_WARM: Final = 64
+ROUNDS_WARM: Final = 16
 ROUNDS_ONCE: Final = 4
 
 _done = False
