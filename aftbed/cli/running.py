@@ -66,13 +66,13 @@ def run(asked: Asked, *, as_json: bool) -> int:
     )
     launched = launch(options, listener)
     view = open_view(options, quiet=as_json)
-    # While the processes start: none of this is needed before the end.
+    interrupted = _follow(launched, view)
+    launched.wait()
+    # Not before: the processes that start have better use for the cores.
     from aftbed.campaign.record import read_record  # noqa: PLC0415
     from aftbed.campaign.verdict import EXIT_CODES, EXIT_INTERRUPTED, judge  # noqa: PLC0415
     from aftbed.cli.show import show_verdict  # noqa: PLC0415
 
-    interrupted = _follow(launched, view)
-    launched.wait()
     try:
         verdict = judge(read_record(launched.record))
         show_verdict(verdict, as_json=as_json)

@@ -16,9 +16,8 @@ from aftbed.runtime.unix.channels import Channel, Channels
 from aftbed.runtime.unix.jobs import Key, StepFailed, Wait
 from aftbed.runtime.unix.journal import Header
 from aftbed.runtime.unix.processes import Nursery, Process
+from aftbed.runtime.unix.spawn import BUS, LIGHT
 
-LIGHT: Final = "zygote"
-BUS: Final = "zygote.bus"
 BESIDE_LEADER: Final = ("client", "proxy")
 WATCHED_KINDS: Final = ("client", "proxy", "watchdog", "recovery", "engine")
 

@@ -20,6 +20,7 @@ from aftbed.core.errors import ConfigError
 from aftbed.core.fault import Fault
 from aftbed.runtime.unix import control, linux, rundir
 from aftbed.runtime.unix.options import LoadRun, RunOptions, Work
+from aftbed.runtime.unix.spawn import BUS, LIGHT, start_zygote
 from aftbed.runtime.unix.warden import watch
 
 END_SECONDS_MAX: Final = 8.0
@@ -85,14 +86,17 @@ class Launched:
         """Never returns."""
         code = 1
         try:
-            from aftbed.runtime.unix.supervisor import supervise  # noqa: PLC0415 - not for the command
-
             signal.signal(signal.SIGINT, signal.SIG_IGN)
             log = os.open(self.record / "processes.log", os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
             os.dup2(log, 1)
             os.dup2(log, 2)
             linux.set_name("aftbed-supervis")
-            supervise(self.options, owner)
+            cpus = sorted(os.sched_getaffinity(0))
+            name = LIGHT if isinstance(self.options.work, LoadRun) else BUS
+            zygotes = {name: start_zygote(name, cpus)}  # it imports while we do; it has the most to import
+            from aftbed.runtime.unix.supervisor import supervise  # noqa: PLC0415
+
+            supervise(self.options, owner, zygotes)
             code = 0
         except BaseException:  # noqa: BLE001 - the last frame of this process
             import traceback  # noqa: PLC0415

@@ -18,7 +18,7 @@ from aftbed.runtime.unix import control, linux
 from aftbed.runtime.unix.jobs import Key, StepFailed, Wait
 from aftbed.runtime.unix.journal import Header
 from aftbed.runtime.unix.loop import Loop
-from aftbed.runtime.unix.zygote import start as start_zygote
+from aftbed.runtime.unix.spawn import Started, start_zygote
 
 REAP_SECONDS: Final = 0.01
 SPARE_SECONDS_MAX: Final = 5.0  # a zygote imports first
@@ -84,19 +84,16 @@ class Nursery:
         self.zygotes: dict[str, Process] = {}
         self.parked: dict[str, deque[Process]] = {}
         self._unborn: dict[str, list[Process]] = {}
-        self._preloads: dict[str, tuple[str, ...]] = {}
 
     # -- zygotes ------------------------------------------------------------------------------
 
-    def start_zygote(self, name: str, preload: tuple[str, ...]) -> None:
-        """Start a zygote."""
-        self._preloads[name] = preload
+    def start_zygote(self, name: str, started: Started | None = None) -> None:
+        """Take over a zygote that has been started, or start one."""
         self.parked.setdefault(name, deque())
         self._unborn[name] = []
-        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        pid, ours = started or start_zygote(name, self._cpus)
         process = self._adopt(name, "zygote", ours)
-        process.born(start_zygote(theirs.fileno(), os.getpid(), self._cpus, preload))
-        theirs.close()
+        process.born(pid)
         self.zygotes[name] = process
         self._watch(process)
 
@@ -105,7 +102,7 @@ class Nursery:
         wanted = len(self._unborn[name])
         for process in self._unborn[name]:
             self._forget(process)
-        self.start_zygote(name, self._preloads[name])
+        self.start_zygote(name)
         self.park(name, wanted)
 
     # -- spares -------------------------------------------------------------------------------

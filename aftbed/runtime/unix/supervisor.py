@@ -20,7 +20,7 @@ from aftbed.core.errors import AftbedError
 from aftbed.core.event import Event
 from aftbed.ftm.mechanism import build
 from aftbed.runtime.unix import control, linux
-from aftbed.runtime.unix.deployment import BUS, LIGHT, WATCHED_KINDS, Deployment, Keys
+from aftbed.runtime.unix.deployment import WATCHED_KINDS, Deployment, Keys
 from aftbed.runtime.unix.faults import Faults
 from aftbed.runtime.unix.jobs import STATS_JOB, StepFailed
 from aftbed.runtime.unix.journal import Journal
@@ -28,6 +28,7 @@ from aftbed.runtime.unix.loop import Loop
 from aftbed.runtime.unix.options import LoadRun, RunOptions
 from aftbed.runtime.unix.processes import Nursery, Process
 from aftbed.runtime.unix.questions import Questions
+from aftbed.runtime.unix.spawn import BUS, LIGHT, Started
 from aftbed.runtime.unix.verbs import Executor
 from aftbed.runtime.unix.work import Work
 
@@ -38,21 +39,13 @@ HANG_NS: Final = 150_000_000  # of what no Watchdog watches; a channel's pulse i
 LATE_NS_MAX: Final = 40_000_000
 DRAIN_SECONDS_MAX: Final = 2.0
 STOP_SECONDS_MAX: Final = 1.0
-BUS_PRELOAD: Final = (
-    "can.interfaces.socketcand",
-    "cantools",
-    "e2e.p11",
-    "aftbed.runtime.unix.gateway",
-    "aftbed.vehicle.car",
-    "aftbed.vehicle.player",
-)
 
 
 class Supervisor:
     """One run. `owner` is the line to the command; its end is the command's."""
 
-    def __init__(self, options: RunOptions, owner: socket.socket) -> None:
-        self.options = options
+    def __init__(self, options: RunOptions, owner: socket.socket, zygotes: dict[str, Started]) -> None:
+        self.options, self._zygotes = options, zygotes
         self.record = Path(options.record)
         self.started_ns = time.monotonic_ns()
         self.owner = control.Line(owner, control.decode_order)
@@ -85,10 +78,9 @@ class Supervisor:
         linux.become_subreaper()
         linux.no_core()
         linux.answer_soon()
-        wants_bus = not isinstance(self.options.work, LoadRun)
-        if wants_bus:
-            self.nursery.start_zygote(BUS, BUS_PRELOAD)
-        self.nursery.start_zygote(LIGHT, ())
+        wants_bus = BUS in self._zygotes
+        for name in (BUS, LIGHT) if wants_bus else (LIGHT,):
+            self.nursery.start_zygote(name, self._zygotes.get(name))
         self.nursery.park(LIGHT, len(self.deployment.graph.nodes) + self._spares() + wants_bus)
         if wants_bus:
             self.nursery.park(BUS, 2)
@@ -353,9 +345,9 @@ class Supervisor:
         self.loop.after(TICK_SECONDS, self._tick)
 
 
-def supervise(options: RunOptions, owner: socket.socket) -> None:
-    """Be the supervisor of a run, in a process of its own."""
-    supervisor = Supervisor(options, owner)
+def supervise(options: RunOptions, owner: socket.socket, zygotes: dict[str, Started]) -> None:
+    """Be the supervisor of a run, in a process of its own; the first zygote has been started."""
+    supervisor = Supervisor(options, owner, zygotes)
     try:
         supervisor.run()
     finally:

@@ -11,7 +11,7 @@ from typing import Final
 import msgspec
 
 from aftbed.runtime.unix import control
-from aftbed.runtime.unix.deployment import BUS, LIGHT, Deployment, Keys
+from aftbed.runtime.unix.deployment import Deployment, Keys
 from aftbed.runtime.unix.devices import LoadOptions
 from aftbed.runtime.unix.jobs import STATS_JOB, Key, Wait
 from aftbed.runtime.unix.loop import Loop
@@ -25,6 +25,7 @@ from aftbed.runtime.unix.options import (
     VehicleOptions,
 )
 from aftbed.runtime.unix.processes import Nursery, Process
+from aftbed.runtime.unix.spawn import BUS, LIGHT
 
 ATTACH_SECONDS_MAX: Final = 10.0
 LOAD_POLL_SECONDS: Final = 0.02

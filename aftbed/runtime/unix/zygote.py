@@ -11,42 +11,21 @@ import gc
 import importlib
 import os
 import select
-import site
 import socket
 import sys
-from pathlib import Path
 from typing import Final, NoReturn
 
 from aftbed.runtime.unix import control, linux, rehearsal
 from aftbed.runtime.unix.node import rehearse_host
 from aftbed.runtime.unix.part import become
+from aftbed.runtime.unix.spawn import CONTROL_FD
 
 PATIENCE_MS: Final = 20.0  # of a spare, before it uses its time to rehearse
-_CONTROL_FD: Final = 3
-
-
-def start(descriptor: int, supervisor: int, cpus: list[int], preload: tuple[str, ...]) -> int:
-    """Start a zygote in a fresh interpreter that serves `descriptor`; its pid.
-
-    A fresh one, since all that its parent has ever imported would weigh on every fork and every death.
-    """
-    arguments = [sys.executable, "-P", "-m", __name__, str(supervisor), ",".join(map(str, cpus)), *preload]
-    descriptors = [(os.POSIX_SPAWN_DUP2, descriptor, _CONTROL_FD)]
-    return os.posix_spawn(sys.executable, arguments, _environment(), file_actions=descriptors)
-
-
-def _environment() -> dict[str, str]:
-    """Where this very package is found; the working directory is not searched (`-P`)."""
-    home = str(Path(__file__).resolve().parents[3])
-    if home in site.getsitepackages():
-        return dict(os.environ)
-    path = os.environ.get("PYTHONPATH")
-    return os.environ | {"PYTHONPATH": home if path is None else os.pathsep.join((home, path))}
 
 
 def run(supervisor: int, cpus: list[int], preload: tuple[str, ...]) -> NoReturn:
-    """Be a zygote, serving `_CONTROL_FD`, until it ends. Never returns."""
-    os.set_inheritable(_CONTROL_FD, False)
+    """Be a zygote, serving `CONTROL_FD`, until it ends. Never returns."""
+    os.set_inheritable(CONTROL_FD, False)
     os.sched_setaffinity(0, cpus)
     linux.die_with(supervisor)
     linux.set_name("aftbed-zygote")
@@ -57,7 +36,7 @@ def run(supervisor: int, cpus: list[int], preload: tuple[str, ...]) -> NoReturn:
     linux.trim()
     gc.freeze()
     gc.disable()  # structs on the path are untracked; what is left dies by reference count
-    line = control.Line(socket.socket(fileno=_CONTROL_FD), control.decode_order)
+    line = control.Line(socket.socket(fileno=CONTROL_FD), control.decode_order)
     line.send(control.Hello(os.getpid()))
     while True:
         got = line.recv()
@@ -73,13 +52,13 @@ def _park(fds: list[int], supervisor: int) -> None:
     alive, life = os.pipe()
     intermediate = os.fork()
     if intermediate == 0:
-        os.close(_CONTROL_FD)
+        os.close(CONTROL_FD)
         for descriptor in fds:
             if os.fork() == 0:
                 os.close(life)
                 os.read(alive, 1)  # ends when the intermediate does, so that no spare spins meanwhile
-                os.dup2(descriptor, _CONTROL_FD, inheritable=False)
-                os.closerange(_CONTROL_FD + 1, 1 << 16)
+                os.dup2(descriptor, CONTROL_FD, inheritable=False)
+                os.closerange(CONTROL_FD + 1, 1 << 16)
                 _wait_for_a_part(supervisor)
         os._exit(0)
     os.waitpid(intermediate, 0)
@@ -91,10 +70,10 @@ def _wait_for_a_part(supervisor: int) -> NoReturn:
     """A spare: adopted, parked, then what it is told to be."""
     linux.die_with(supervisor)
     linux.set_name("aftbed-spare")
-    line = control.Line(socket.socket(fileno=_CONTROL_FD), control.decode_order)
+    line = control.Line(socket.socket(fileno=CONTROL_FD), control.decode_order)
     line.send(control.Hello(os.getpid()))
     poll = select.poll()
-    poll.register(_CONTROL_FD, select.POLLIN)
+    poll.register(CONTROL_FD, select.POLLIN)
     if not poll.poll(PATIENCE_MS):
         rehearsal.once(rehearse_host)
     got = line.recv()
