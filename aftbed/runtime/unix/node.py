@@ -15,38 +15,29 @@ where it outlives this process, or inside a request that the client will ask aga
 """
 
 import os
-import select
 import signal
-import socket
 import sys
 import time
 import traceback
 from types import FrameType
 from typing import Final, NoReturn
 
-import msgspec
-
 from aftbed.core import wire
 from aftbed.core.brick import CONTROL, Brick, Effect, Note, Order, Send
 from aftbed.core.errors import PeerError
 from aftbed.core.event import Event
-from aftbed.core.fault import Act
 from aftbed.core.journal import FLAG_OFFSET, PULSE_OFFSET, RECORD
-from aftbed.core.message import AnyMessage, ChannelEnded, Message, Promoted, Rebound, Reply, Request
-from aftbed.ftm.before import PassBefore
-from aftbed.runtime.unix import control, rehearsal
+from aftbed.core.message import AnyMessage, ChannelEnded, Message, Promoted, Rebound, Reply
+from aftbed.runtime.unix import control
 from aftbed.runtime.unix.devices import Device, Sensor
 from aftbed.runtime.unix.journal import Journal
 from aftbed.runtime.unix.lifeline import Held
-from aftbed.runtime.unix.orders import carry_out
+from aftbed.runtime.unix.orders import carry_out, fire
 from aftbed.runtime.unix.wiring import Hosted, Inlet, Plan, Wiring
 
 PULSE_SECONDS: Final = 0.02
-REHEARSED: Final = 8
-REHEARSAL_MS: Final = 20.0  # of waiting at the start; the whole graph is there by then
 READ_BYTES_MAX: Final = wire.PACKET_BYTES_MAX + 1  # one byte more than is allowed, so that it is noticed
 WRITE_SECONDS_MAX: Final = 2.0
-FAULT_SECONDS_MAX: Final = 5.0
 NUDGE: Final = b"\0"
 HOST_FILES: Final = (__file__, control.__file__)  # what is blocked in here is not in a brick
 EXIT_FENCED: Final = 3
@@ -128,7 +119,6 @@ class Node:
     def run(self) -> NoReturn:
         """Serve until told to stop; a failed assert ends the process (fail-silence)."""
         try:
-            self._rehearse()
             while True:
                 self.turn()
                 if self._hot is not None:
@@ -140,16 +130,6 @@ class Node:
             traceback.print_exc()
             sys.stderr.flush()
             os._exit(EXIT_ASSERT)
-
-    def _rehearse(self) -> None:
-        """Before the first mail, or when it is there."""
-        poll = select.poll()
-        poll.register(self.line.fileno(), select.POLLIN)
-        for hosted in self.wiring.hosted.values():
-            for inlet in hosted.inlets.values():
-                poll.register(inlet.fd, select.POLLIN)
-        poll.poll(REHEARSAL_MS)
-        rehearsal.once(rehearse_host)
 
     def turn(self) -> None:
         """Handle one thing, or wait for one."""
@@ -163,7 +143,7 @@ class Node:
                 self.ack(self.suspend_token)
                 self.suspend_token = 0
             if self.suspended:
-                self._serve_control(wait=True)
+                self.serve_control(wait=True)
                 return
         if self.device is not None and self._from_device(self.device):
             return
@@ -224,7 +204,7 @@ class Node:
     def _packet(self, inlet: Inlet, raw: bytes) -> None:
         """Handle a packet; control first."""
         if self.journal.mapping[FLAG_OFFSET]:
-            self._serve_control()
+            self.serve_control()
         if raw == b"":
             self._ended(inlet)
         elif raw != NUDGE:
@@ -247,7 +227,7 @@ class Node:
         now_ns = _now()
         fds = [fd for fd, _ in ready]
         if self.journal.mapping[FLAG_OFFSET] or self.line.fileno() in fds:
-            self._serve_control()
+            self.serve_control()
             return  # what is open may be another set now
         for fd in fds:
             inlet = plan.by_fd.get(fd)
@@ -329,7 +309,7 @@ class Node:
                 assert isinstance(effect, Note)
                 self.journal.write(now_ns, effect.event, effect.request_id, effect.detail)
                 if self.armed:
-                    self._fire(effect.event)
+                    fire(self, effect.event)
             else:
                 assert isinstance(effect, Order)
                 self.line.send(control.Ordered(hosted.name, effect.script))
@@ -349,9 +329,9 @@ class Node:
             try:
                 _write(out, data)
             except BlockingIOError:
-                self._serve_control()
+                self.serve_control()
             except BrokenPipeError:
-                if not self._serve_control(wait=True):
+                if not self.serve_control(wait=True):
                     continue
             else:
                 return
@@ -361,30 +341,9 @@ class Node:
         self._refused += 1
         self.journal.write(_now(), Event.PEER_REFUSED, request_id, 0)
 
-    # -- faults -------------------------------------------------------------------------------
-
-    def _fire(self, event: Event) -> None:
-        arm = self.armed.get(event)
-        if arm is None:
-            return
-        if arm.nth > 1:
-            self.armed[event] = msgspec.structs.replace(arm, nth=arm.nth - 1)
-            return
-        del self.armed[event]
-        self.journal.write(_now(), Event.FAULT_APPLIED, 0, arm.fault)
-        if arm.itself:
-            os.kill(os.getpid(), signal.SIGKILL if arm.act is Act.CRASH else signal.SIGSTOP)
-            return
-        self.line.send(control.Fired(arm.fault))
-        limit = _now() + int(FAULT_SECONDS_MAX * 1e9)
-        while _now() < limit:
-            if self._serve_control(wait=True, until=arm.fault):
-                return
-        raise AssertionError(f"fault {arm.fault} was not applied within {FAULT_SECONDS_MAX} s")
-
     # -- control ------------------------------------------------------------------------------
 
-    def _serve_control(self, wait: bool = False, until: int = 0) -> bool:
+    def serve_control(self, wait: bool = False, until: int = 0) -> bool:
         """Carry out the orders that wait; with `wait`, for a pulse at most. True if there was any.
 
         With `until`: True if the Ack of that fault was among them.
@@ -423,23 +382,3 @@ class Node:
     def ack(self, token: int, data: bytes = b"", error: str = "") -> None:
         """Answer an order."""
         self.line.send(control.Ack(token, data, error))
-
-
-def rehearse_host() -> None:
-    """The tight loop, on a scratch node of one brick; see `rehearsal`."""
-    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    into, inlet = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    outlet, out = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    node = Node("rehearsal", control.Line(theirs, control.decode_order), Journal(None, "rehearsal"))
-    node.add("before", PassBefore())
-    node.wiring.bind_input("before", "pro2bfr", inlet.detach())
-    node.bind_output("before", "bfr2prd", outlet.detach(), 1)
-    for request_id in range(1, REHEARSED + 1):
-        into.send(wire.encode(Request(1, request_id, b"")))
-    into.send(NUDGE)
-    node.turn()
-    node.serve_hot(node.wiring.hosted["before"])
-    node.wiring.bind_input("before", "pro2bfr", None)
-    node.bind_output("before", "bfr2prd", None, 1)
-    for end in (ours, theirs, into, out):
-        end.close()

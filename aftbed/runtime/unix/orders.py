@@ -1,17 +1,24 @@
-"""The orders that a node takes from the supervisor, each carried out between two steps."""
+"""The orders that a node takes from the supervisor, and the faults that it was told to wait for."""
 
 import os
-from typing import TYPE_CHECKING, assert_never
+import signal
+import time
+from typing import TYPE_CHECKING, Final, assert_never
+
+import msgspec
 
 from aftbed.core.brick import CONTROL
 from aftbed.core.errors import PeerError
-from aftbed.core.event import event_named
+from aftbed.core.event import Event, event_named
+from aftbed.core.fault import Act
 from aftbed.core.message import Watch
 from aftbed.runtime.unix import control
 from aftbed.runtime.unix.devices import Sensor
 
 if TYPE_CHECKING:
     from aftbed.runtime.unix.node import Node
+
+FAULT_SECONDS_MAX: Final = 5.0
 
 
 def carry_out(node: "Node", order: control.ToNode, fds: list[int]) -> bytes | None:
@@ -64,3 +71,24 @@ def _watch(node: "Node", order: control.WatchNodes, fds: list[int]) -> None:
     node.device.watch(order.nodes, order.journals, order.pids, fds)
     node.wiring.forget_plans()
     node.step(node.device_brick, CONTROL, Watch(order.replica, order.generation, order.nodes))
+
+
+def fire(node: "Node", event: Event) -> None:
+    """`event` has happened here: if a fault waits for it, and this is the time, act or ask for it."""
+    arm = node.armed.get(event)
+    if arm is None:
+        return
+    if arm.nth > 1:
+        node.armed[event] = msgspec.structs.replace(arm, nth=arm.nth - 1)
+        return
+    del node.armed[event]
+    node.journal.write(time.monotonic_ns(), Event.FAULT_APPLIED, 0, arm.fault)
+    if arm.itself:
+        os.kill(os.getpid(), signal.SIGKILL if arm.act is Act.CRASH else signal.SIGSTOP)
+        return
+    node.line.send(control.Fired(arm.fault))
+    limit = time.monotonic() + FAULT_SECONDS_MAX
+    while time.monotonic() < limit:
+        if node.serve_control(wait=True, until=arm.fault):
+            return
+    raise AssertionError(f"fault {arm.fault} was not applied within {FAULT_SECONDS_MAX} s")

@@ -9,7 +9,7 @@ import msgspec
 
 from aftbed.ftm.catalog import Setting, make
 from aftbed.ftm.client import Client
-from aftbed.runtime.unix import control, linux
+from aftbed.runtime.unix import control, linux, rehearsal
 from aftbed.runtime.unix.devices import Device, Load, LoadOptions, Sensor
 from aftbed.runtime.unix.journal import Journal
 from aftbed.runtime.unix.lifeline import Held
@@ -32,6 +32,7 @@ def become(
             serve(line, order, fds)
             os._exit(0)
         node = _build(line, order, fds)
+        rehearsal.before_mail(node)
     except BaseException as error:  # noqa: BLE001 - the last frame of this process
         line.send(control.Ack(order.token, error=f"{type(error).__name__}: {error}"))
         sys.excepthook(type(error), error, error.__traceback__)

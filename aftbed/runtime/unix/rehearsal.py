@@ -5,29 +5,36 @@ In a child it makes the child's own copies of the pages that a step writes to: w
 request after a failover pays some hundred page faults in each process of the new leader (0.5 ms).
 """
 
-from collections.abc import Callable
+import select
+import socket
 from typing import Final
 
 from aftbed.core import wire
 from aftbed.core.brick import CONTROL, Brick, Send
-from aftbed.core.message import ChannelEnded, Message, Promote, Rebound, Submit
+from aftbed.core.message import ChannelEnded, Message, Promote, Rebound, Request, Submit
+from aftbed.ftm.before import PassBefore
 from aftbed.ftm.catalog import Setting, make
 from aftbed.ftm.mechanism import CHAIN_PARTS, build
+from aftbed.runtime.unix import control
+from aftbed.runtime.unix.journal import Journal
+from aftbed.runtime.unix.node import NUDGE, Node
 from aftbed.vehicle.function import default_application, sample_requests
 
 ROUNDS_WARM: Final = 16
 ROUNDS_ONCE: Final = 4
+REHEARSED: Final = 8
+PATIENCE_MS: Final = 20.0  # of waiting for the first mail; the whole graph is there by then
 
 _done = False
 
 
-def once(host: Callable[[], None]) -> None:
-    """Rehearse, and `host` after it, unless this process has done so."""
+def once() -> None:
+    """Rehearse, unless this process has done so."""
     global _done  # noqa: PLW0603 - one process, one rehearsal
     if not _done:
         _done = True
         rehearse(ROUNDS_ONCE)
-        host()
+        rehearse_host()
 
 
 def rehearse(rounds: int) -> None:
@@ -49,6 +56,37 @@ def rehearse(rounds: int) -> None:
     ways |= {("proxy", "pxy2pro"): ("b/protocol", "pxy2pro"), ("b/protocol", "pro2pxy"): ("proxy", "pro2pxy")}
     bricks["proxy"].step(CONTROL, Rebound("pxy2pro", True, 2), 0)
     _serve(bricks, ways, requests)
+
+
+def before_mail(node: Node) -> None:
+    """Rehearse before the node's first mail, or when it is there."""
+    poll = select.poll()
+    poll.register(node.line.fileno(), select.POLLIN)
+    for hosted in node.wiring.hosted.values():
+        for inlet in hosted.inlets.values():
+            poll.register(inlet.fd, select.POLLIN)
+    poll.poll(PATIENCE_MS)
+    once()
+
+
+def rehearse_host() -> None:
+    """The tight loop of a host, on a scratch node of one brick."""
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    into, inlet = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    outlet, out = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    node = Node("rehearsal", control.Line(theirs, control.decode_order), Journal(None, "rehearsal"))
+    node.add("before", PassBefore())
+    node.wiring.bind_input("before", "pro2bfr", inlet.detach())
+    node.bind_output("before", "bfr2prd", outlet.detach(), 1)
+    for request_id in range(1, REHEARSED + 1):
+        into.send(wire.encode(Request(1, request_id, b"")))
+    into.send(NUDGE)
+    node.turn()
+    node.serve_hot(node.wiring.hosted["before"])
+    node.wiring.bind_input("before", "pro2bfr", None)
+    node.bind_output("before", "bfr2prd", None, 1)
+    for end in (ours, theirs, into, out):
+        end.close()
 
 
 Ways = dict[tuple[str, str], tuple[str, str]]

@@ -13,14 +13,11 @@ import os
 import select
 import socket
 import sys
-from typing import Final, NoReturn
+from typing import NoReturn
 
 from aftbed.runtime.unix import control, linux, rehearsal
-from aftbed.runtime.unix.node import rehearse_host
 from aftbed.runtime.unix.part import become
 from aftbed.runtime.unix.spawn import CONTROL_FD
-
-PATIENCE_MS: Final = 20.0  # of a spare, before it uses its time to rehearse
 
 
 def run(supervisor: int, cpus: list[int], preload: tuple[str, ...]) -> NoReturn:
@@ -74,8 +71,8 @@ def _wait_for_a_part(supervisor: int) -> NoReturn:
     line.send(control.Hello(os.getpid()))
     poll = select.poll()
     poll.register(CONTROL_FD, select.POLLIN)
-    if not poll.poll(PATIENCE_MS):
-        rehearsal.once(rehearse_host)
+    if not poll.poll(rehearsal.PATIENCE_MS):
+        rehearsal.once()
     got = line.recv()
     if got is None:
         os._exit(0)
