@@ -48,7 +48,6 @@ class EntryKind(IntEnum):
 
     SENT = 1
     ANSWERED = 2
-    DUPLICATE = 3
 
 
 class Entry(msgspec.Struct, frozen=True):

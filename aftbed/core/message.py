@@ -5,12 +5,7 @@ was sent. It grows by one at each failover; whoever receives an older one refuse
 `Request`s and `Reply`s are opaque bytes inside: the mechanism never looks into them.
 """
 
-from typing import Final
-
 import msgspec
-
-REQUEST_BYTES_MAX: Final = 16 * 1024
-REPLY_BYTES_MAX: Final = 16 * 1024
 
 
 class Message(msgspec.Struct, frozen=True, array_like=True, gc=False):

@@ -21,7 +21,10 @@ class Spawn(Verb, frozen=True):
 
 
 class Fence(Verb, frozen=True):
-    """Shut every channel that leads out of `replica`: what was sent stays readable, then ends."""
+    """Shut what leads out of `replica`: what was sent stays readable, then ends.
+
+    A leader's way to the Proxy is shut by the Attach that follows, behind its checkpoint channel.
+    """
 
     replica: str
 

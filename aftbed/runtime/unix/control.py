@@ -17,10 +17,8 @@ import msgspec
 from aftbed.core.errors import PeerError
 from aftbed.core.fault import Act
 from aftbed.core.message import (
-    NodeDied,
     Promote,
     Promoted,
-    Pulses,
     Rebound,
     Situation,
     Watch,
@@ -32,7 +30,7 @@ FDS_MAX: Final = 64
 STATE_BYTES_MAX: Final = 64 << 20
 _RIGHTS_BYTES: Final = socket.CMSG_SPACE(FDS_MAX * 4)
 
-Told = Promote | Rebound | Watch | Situation | NodeDied | Pulses
+Told = Promote | Rebound | Watch | Situation
 
 
 class Port(msgspec.Struct, frozen=True):
@@ -160,7 +158,7 @@ class Arm(Order, frozen=True):
 
 
 class Stop(Order, frozen=True):
-    """End yourself."""
+    """To a service, or from the command: come to an end, with what there is so far."""
 
 
 class Quiet(Order, frozen=True):

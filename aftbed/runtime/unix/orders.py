@@ -56,10 +56,7 @@ def carry_out(node: "Node", order: control.ToNode, fds: list[int]) -> bytes | No
         case control.Quiet():
             assert node.device is not None
             node.device.quiet()
-        case control.Stop():
-            node.ack(order.token)
-            os._exit(0)
-        case control.Park() | control.Assign() | control.Serve() | control.Ack():
+        case control.Park() | control.Assign() | control.Serve() | control.Stop() | control.Ack():
             raise PeerError(f"{type(order).__name__} to a node")
         case _:
             assert_never(order)

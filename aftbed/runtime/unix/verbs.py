@@ -97,16 +97,17 @@ class Executor:
     def _fence(self, replica: str) -> None:
         deployment = self._deployment
         slot = deployment.slots[replica]
-        if replica == deployment.leader:
+        leads = replica == deployment.leader
+        self._last_words = None
+        if leads:
             # Move Proxy and Client while they sleep: the fence wakes them, and a core that takes dead
             # processes down neither runs them nor lets them go for some milliseconds.
             deployment.leader = ""
             deployment.pin(BESIDE_LEADER)
-        last_words: Channel | None = None
         for channel in deployment.channels.touching(slot.bricks):
             link = channel.link
-            if link.source in slot.bricks and link.sink == "proxy":
-                last_words = channel
+            if leads and link.source in slot.bricks and link.sink == "proxy":
+                self._last_words = channel
             elif link.source in slot.bricks and link.sink not in slot.bricks:
                 channel.fence()
             elif "/" in link.source and link.source not in slot.bricks:
@@ -114,7 +115,6 @@ class Executor:
         # A reply is on its way to the Proxy only if its checkpoint was on its way to the backup before,
         # so the shut checkpoint channel is what counts. The other one is shut as soon as the Proxy
         # follows the new leader: to wake it twice costs 0.1 ms of the blackout.
-        self._last_words = last_words
         self._note(Event.REPLICA_FENCED, replica)
 
     def _kill(self, replica: str) -> None:
