@@ -51,11 +51,11 @@ class Channels:
     """All channels between nodes, found by their ends."""
 
     def __init__(self) -> None:
-        self._all: dict[tuple[str, str, str, str], Channel] = {}
+        self._all: dict[tuple[str, str, str], Channel] = {}
 
     def renew(self, link: Link) -> Channel:
         """A fresh channel for `link`; the old one is let go."""
-        key = (link.source, link.source_port, link.sink, link.sink_port)
+        key = (link.source, link.source_port, link.sink)
         old = self._all.pop(key, None)
         if old is not None:
             old.close()
@@ -72,15 +72,12 @@ class Channels:
 
     def get(self, source: str, port: str, sink: str) -> Channel | None:
         """The channel from `port` of `source` to `sink`."""
-        for channel in self._all.values():
-            if (channel.link.source, channel.link.source_port, channel.link.sink) == (source, port, sink):
-                return channel
-        return None
+        return self._all.get((source, port, sink))
 
     def drop(self, channel: Channel) -> None:
         """Let go of `channel`."""
         link = channel.link
-        self._all.pop((link.source, link.source_port, link.sink, link.sink_port), None)
+        self._all.pop((link.source, link.source_port, link.sink), None)
         channel.close()
 
     def __len__(self) -> int:

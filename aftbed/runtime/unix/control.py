@@ -27,6 +27,7 @@ from aftbed.core.script import Script
 from aftbed.core.wire import PACKET_BYTES_MAX, UNREADABLE
 
 FDS_MAX: Final = 64
+UNANSWERED: Final = 0  # the token of an order that gets no Ack
 STATE_BYTES_MAX: Final = 64 << 20
 _RIGHTS_BYTES: Final = socket.CMSG_SPACE(FDS_MAX * 4)
 
@@ -51,7 +52,7 @@ class Local(msgspec.Struct, frozen=True):
 
 
 class Order(msgspec.Struct, frozen=True, tag=True):
-    """Base of what the supervisor says; `token` comes back in the Ack."""
+    """Base of what the supervisor says; `token` comes back in the Ack, if it is not UNANSWERED."""
 
     token: int
 

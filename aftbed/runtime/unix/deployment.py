@@ -67,11 +67,22 @@ class Deployment:
             raise StepFailed(f"{node} is gone")
         self._tokens += 1
         token = self._tokens
-        self.nursery.order(process, make(token), fds)
-        if process.header is not None:
-            process.header.announce()
+        self._announce(process, make(token), fds)
         self._nudge(node)
         return ("ack", node, token), node
+
+    def leave(self, node: str, order: control.ToNode, fds: tuple[int, ...] = ()) -> None:
+        """Leave an order, unanswered, for when `node` wakes up next. Raises StepFailed if it is gone."""
+        process = self.nodes.get(node)
+        if process is None or not process.alive:
+            raise StepFailed(f"{node} is gone")
+        assert order.token == control.UNANSWERED
+        self._announce(process, order, fds)
+
+    def _announce(self, process: Process, order: control.ToNode, fds: tuple[int, ...]) -> None:
+        self.nursery.order(process, order, fds)
+        if process.header is not None:
+            process.header.announce()
 
     def _nudge(self, node: str) -> None:
         for brick in self.graph.nodes[node]:

@@ -69,6 +69,7 @@ class Sensor:
         self._lifelines: Watcher | None = None
         self._starvation: dict[str, linux.Starvation] = {}
         self._died: deque[str] = deque()
+        self._alarmed = False
         self._next_ns = 0
 
     def watch(
@@ -90,26 +91,29 @@ class Sensor:
         if self._lifelines is not None:
             self._lifelines.close()
         self._pidfds, self._headers, self._lifelines = {}, {}, None
+        self._alarmed = False
         self._died.clear()
 
     def fds(self) -> tuple[int, ...]:
-        """One pidfd per watched node that lives, and all lifelines together."""
+        """One pidfd per watched node, and all lifelines together; none after the first death."""
+        if self._alarmed:
+            return ()
         lifelines = (self._lifelines.fd,) if self._lifelines is not None else ()
         return (*lifelines, *self._pidfds)
 
     def ready(self, fd: int, now_ns: int) -> None:
-        """A readable pidfd is a dead process; it stays readable, so it goes."""
+        """A replica whose first node has died is lost: the deaths that follow are not looked at."""
         if self._lifelines is not None and fd == self._lifelines.fd:
             self._died += [self._nodes[index] for index in self._lifelines.died()]
-            return
-        self._died.append(self._pidfds.pop(fd))
-        os.close(fd)
+        else:
+            self._died.append(self._pidfds[fd])
+        self._alarmed = bool(self._died)
 
     def take(self, now_ns: int) -> NodeDied | Pulses | None:
         """Deaths first."""
         if self._died:
             return NodeDied(self._died.popleft())
-        if now_ns < self._next_ns or not self._headers:
+        if now_ns < self._next_ns or not self._headers or self._alarmed:
             return None
         self._next_ns = now_ns + PERIOD_NS
         return Pulses({node: self._seen_ns(node, now_ns) for node in self._headers})
@@ -133,7 +137,7 @@ class Sensor:
 
     def deadline_ns(self) -> int | None:
         """The next look at the pulses."""
-        return self._next_ns if self._headers else None
+        return self._next_ns if self._headers and not self._alarmed else None
 
     def stats(self) -> bytes:
         """None to give."""

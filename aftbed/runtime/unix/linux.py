@@ -21,7 +21,7 @@ PR_SET_PDEATHSIG: Final = 1
 PR_SET_NAME: Final = 15
 PR_SET_CHILD_SUBREAPER: Final = 36
 ADOPTION_SECONDS_MAX: Final = 5.0
-SLICE_NS: Final = 100_000  # the shortest that the kernel allows
+SLICE_NS: Final = 500_000  # shorter than the default of some ms, long enough for all that a failover orders
 
 _libc: Final = ctypes.CDLL(None, use_errno=True)
 

@@ -381,4 +381,5 @@ class Node:
 
     def ack(self, token: int, data: bytes = b"", error: str = "") -> None:
         """Answer an order."""
-        self.line.send(control.Ack(token, data, error))
+        if token != control.UNANSWERED:
+            self.line.send(control.Ack(token, data, error))

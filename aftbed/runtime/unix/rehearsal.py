@@ -5,16 +5,33 @@ In a child it makes the child's own copies of the pages that a step writes to: w
 request after a failover pays some hundred page faults in each process of the new leader (0.5 ms).
 """
 
+import os
 import select
 import socket
 from typing import Final
 
 from aftbed.core import wire
 from aftbed.core.brick import CONTROL, Brick, Send
-from aftbed.core.message import ChannelEnded, Message, Promote, Rebound, Request, Submit
+from aftbed.core.journal import FLAG_OFFSET, HEADER_BYTES, RECORD
+from aftbed.core.message import (
+    CaptureState,
+    ChannelEnded,
+    Message,
+    Promote,
+    Rebound,
+    Reply,
+    Request,
+    Submit,
+    TakeOver,
+)
+from aftbed.ftm.after import PbrAfter
 from aftbed.ftm.before import PassBefore
 from aftbed.ftm.catalog import Setting, make
 from aftbed.ftm.mechanism import CHAIN_PARTS, build
+from aftbed.ftm.proceed import Compute
+from aftbed.ftm.protocol import Protocol
+from aftbed.ftm.proxy import Proxy
+from aftbed.ftm.server import Server
 from aftbed.runtime.unix import control
 from aftbed.runtime.unix.journal import Journal
 from aftbed.runtime.unix.node import NUDGE, Node
@@ -69,24 +86,117 @@ def before_mail(node: Node) -> None:
     once()
 
 
+class _Scratch:
+    """A host of one brick, with all its ends here."""
+
+    def __init__(self, brick: Brick, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> None:
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self.line = control.Line(ours, control.decode_report)
+        self.node = Node("rehearsal", control.Line(theirs, control.decode_order), Journal(None, "rehearsal"))
+        self.node.add("brick", brick)
+        self._ends = [ours, theirs]
+        self.into = {port: self.channel() for port in inputs}
+        self._outs = {port: self.channel() for port in outputs}
+        for port, (_, read) in self.into.items():
+            self.node.wiring.bind_input("brick", port, os.dup(read.fileno()))
+        for port, (write, _) in self._outs.items():
+            self.node.bind_output("brick", port, os.dup(write.fileno()), 1)
+
+    def channel(self) -> tuple[socket.socket, socket.socket]:
+        """A writing and a reading end."""
+        ends = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._ends += ends
+        return ends
+
+    def order(self, order: control.ToNode, fds: tuple[int, ...] = ()) -> None:
+        """What the supervisor does to be heard."""
+        self.line.send(order, fds)
+        self.node.journal.mapping[FLAG_OFFSET] = 1
+        for write, _ in self.into.values():
+            write.send(NUDGE, socket.MSG_DONTWAIT)
+
+    def turns(self, count: int) -> None:
+        """Let the host work off what has come, as `Node.run` does."""
+        for _ in range(count):
+            self.node.turn()
+
+    def close(self) -> None:
+        """Close everything."""
+        for port in self.into:
+            self.node.wiring.bind_input("brick", port, None)
+        for port in self._outs:
+            self.node.bind_output("brick", port, None, 1)
+        for end in self._ends:
+            end.close()
+
+
 def rehearse_host() -> None:
-    """The tight loop of a host, on a scratch node of one brick."""
-    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    into, inlet = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    outlet, out = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    node = Node("rehearsal", control.Line(theirs, control.decode_order), Journal(None, "rehearsal"))
-    node.add("before", PassBefore())
-    node.wiring.bind_input("before", "pro2bfr", inlet.detach())
-    node.bind_output("before", "bfr2prd", outlet.detach(), 1)
-    for request_id in range(1, REHEARSED + 1):
-        into.send(wire.encode(Request(1, request_id, b"")))
-    into.send(NUDGE)
-    node.turn()
-    node.serve_hot(node.wiring.hosted["before"])
-    node.wiring.bind_input("before", "pro2bfr", None)
-    node.bind_output("before", "bfr2prd", None, 1)
-    for end in (ours, theirs, into, out):
-        end.close()
+    """A host at work: mail, control mail between it, and the part of each brick in a failover."""
+    _rehearse_mail()
+    _rehearse_promotion()
+    _rehearse_following()
+    request, (payload,) = Request(2, 1, b""), sample_requests(0, 1)
+    _rehearse_part(
+        Protocol(2, 1, leads=False),
+        (("aft2pro", TakeOver(2)), ("pxy2pro", request), ("aft2pro", Reply(2, 1, 2, b""))),
+        ("pro2bfr", "pro2pxy"),
+    )
+    _rehearse_part(
+        Compute(), (("bfr2prd", request), ("srv2prd", Reply(2, 1, 2, b""))), ("prd2srv", "prd2aft")
+    )
+    _rehearse_part(
+        Server(default_application(), 2, leads=False, captured=True),
+        (("prd2srv", Request(2, 1, payload)), ("aft2srv", CaptureState(2, 1))),
+        ("srv2prd", "srv2aft"),
+    )
+
+
+def _rehearse_mail() -> None:
+    scratch = _Scratch(PassBefore(), ("pro2bfr",), ("bfr2prd",))
+    into, _ = scratch.into["pro2bfr"]
+    request_id = 0
+    for _ in range(ROUNDS_ONCE):
+        for _ in range(REHEARSED):
+            request_id += 1
+            into.send(wire.encode(Request(1, request_id, b"")))
+        scratch.order(control.Resume(request_id))
+        scratch.turns(1)  # the order, then the first request
+        scratch.node.serve_hot(scratch.node.wiring.hosted["brick"])  # until it meets the nudge
+        assert scratch.node.journal.at == HEADER_BYTES + request_id * RECORD.size, "a rehearsal went wrong"
+        scratch.line.recv()
+    scratch.close()
+
+
+def _rehearse_promotion() -> None:
+    scratch = _Scratch(PbrAfter(1, leads=False), ("aft2aft", "srv2aft"), ("aft2srv", "aft2pro", "aft2aft"))
+    into, _ = scratch.into["aft2aft"]
+    scratch.order(control.Tell(control.UNANSWERED, "brick", Promote(2)))
+    into.shutdown(socket.SHUT_WR)
+    scratch.turns(2)  # the nudge and the order with it, then the end
+    scratch.close()
+
+
+def _rehearse_part(brick: Brick, mail: tuple[tuple[str, Message], ...], outputs: tuple[str, ...]) -> None:
+    scratch = _Scratch(brick, tuple({port: None for port, _ in mail}), outputs)
+    for port, message in mail:
+        scratch.into[port][0].send(wire.encode(message))
+        scratch.turns(1)
+    scratch.close()
+
+
+def _rehearse_following() -> None:
+    scratch = _Scratch(Proxy(), ("clt2pxy", "pro2pxy"), ("pxy2pro", "pxy2clt"))
+    into, _ = scratch.into["clt2pxy"]
+    into.send(wire.encode(Request(0, 1, b"")))
+    scratch.turns(1)
+    write, _ = scratch.channel()
+    _, read = scratch.channel()
+    fds = os.dup(read.fileno()), os.dup(write.fileno())
+    scratch.order(control.Follow(control.UNANSWERED, "brick", "pro2pxy", "pxy2pro", 2), fds)
+    scratch.turns(1)  # the old channel's nudge, and the order with it
+    for fd in fds:
+        os.close(fd)
+    scratch.close()
 
 
 Ways = dict[tuple[str, str], tuple[str, str]]

@@ -8,7 +8,7 @@ half made is killed.
 import contextlib
 import time
 from collections.abc import Callable
-from typing import assert_never
+from typing import Final, assert_never
 
 from aftbed.core import message, script
 from aftbed.core.event import Event
@@ -18,6 +18,8 @@ from aftbed.runtime.unix.channels import Channel
 from aftbed.runtime.unix.deployment import BESIDE_LEADER, Deployment, Keys
 from aftbed.runtime.unix.jobs import StepFailed, Wait
 from aftbed.runtime.unix.journal import Journal
+
+FIRST_REPLY_SECONDS: Final = 0.001
 
 
 class Executor:
@@ -137,11 +139,10 @@ class Executor:
         deployment = self._deployment
         slot = deployment.slots[replica]
         node = self._node(f"{replica}/after")
-        key, _ = deployment.order(
-            node, lambda token: control.Tell(token, f"{replica}/after", message.Promote(epoch))
-        )
+        # The end of the checkpoint channel, which the fence made, wakes it.
+        deployment.leave(node, control.Tell(control.UNANSWERED, f"{replica}/after", message.Promote(epoch)))
         promoted = ("promoted", f"{replica}/protocol", epoch)
-        self._promoting = Wait(frozenset({key, promoted}), frozenset(slot.nodes))
+        self._promoting = Wait(frozenset({promoted}), frozenset(slot.nodes))
 
     def _attach(self, replica: str, epoch: int) -> Keys:
         """A Proxy that is being replaced needs nothing: the new one is bound to whoever leads."""
@@ -151,18 +152,22 @@ class Executor:
         back = deployment.channels.get(f"{replica}/protocol", "pro2pxy", "proxy")
         assert into is not None and back is not None, replica
         with contextlib.suppress(StepFailed):
-            deployment.order(
+            deployment.leave(
                 "proxy",
-                lambda token: control.Follow(token, "proxy", "pro2pxy", "pxy2pro", epoch),
+                control.Follow(control.UNANSWERED, "proxy", "pro2pxy", "pxy2pro", epoch),
                 (back.read.fileno(), into.write.fileno()),
             )
         if self._last_words is not None:
-            self._last_words.fence()
+            self._last_words.fence()  # wakes a Proxy that waits for a reply
+        for channel in deployment.channels.into("proxy"):
+            if channel.link.source == "client":
+                channel.nudge()  # wakes one that waits for a request
+        # The new leader's core is for the first reply now: nothing is urgent here, and to wake up for
+        # each word from there would take it 0.1 ms.
+        time.sleep(FIRST_REPLY_SECONDS)
         promoting, self._promoting = self._promoting, None
         if promoting is not None:
             yield promoting
-        # The new leader's core is for the first reply now; what is left to do here can wait for the
-        # other one, which is still busy with the dead.
         deployment.pin_watchers()
 
     def _transfer(self, source: str, sink: str) -> Keys:
