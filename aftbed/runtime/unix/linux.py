@@ -21,6 +21,7 @@ PR_SET_PDEATHSIG: Final = 1
 PR_SET_NAME: Final = 15
 PR_SET_CHILD_SUBREAPER: Final = 36
 ADOPTION_SECONDS_MAX: Final = 5.0
+EXCUSED_NS_MAX: Final = 2_000_000_000  # as long as any step of the runtime may take
 SLICE_NS: Final = 500_000  # shorter than the default of some ms, long enough for all that a failover orders
 
 _libc: Final = ctypes.CDLL(None, use_errno=True)
@@ -114,10 +115,18 @@ def trim() -> None:
 
 
 class Starvation:
-    """Tells a process that hangs from one that the machine does not let run.
+    """Tells a process that hangs from one that the machine does not let run (proc(5)).
 
-    The former is stopped, asleep, or burns CPU; the latter is runnable and gets none (proc(5): the
-    state in `stat`, the time on a CPU in `schedstat`).
+    | state                  | its CPU time since it was asked for first | verdict                   |
+    |------------------------|-------------------------------------------|---------------------------|
+    | `T`, `t`, `Z`, `X`     | any                                       | hangs                     |
+    | `R`, runnable          | at most half of the time                  | starves                   |
+    | `R`                    | more                                      | hangs: it loops           |
+    | `D`, waits for a disk  | at most half of the time                  | starves                   |
+    | `S`, asleep            | none: the timer of its pulse did not come | starves: its core stalls  |
+    | `S`                    | some: the timer comes, and it goes on     | hangs: blocked in a brick |
+
+    No excuse lasts longer than `EXCUSED_NS_MAX`.
     """
 
     def __init__(self, pid: int) -> None:
@@ -129,7 +138,7 @@ class Starvation:
         self._since_ns = 0
 
     def starves(self, now_ns: int) -> bool:
-        """Asked while it shows nothing: runnable, and mostly without a CPU since it was asked first."""
+        """Asked while it shows nothing; see the table."""
         try:
             stat = Path(f"/proc/{self._pid}/stat").read_text()
             cpu_ns = int(Path(f"/proc/{self._pid}/schedstat").read_text().split()[0])
@@ -138,7 +147,15 @@ class Starvation:
         if self._since_ns == 0:
             self._since_ns, self._cpu_ns = now_ns, cpu_ns
         ran_ns, passed_ns = cpu_ns - self._cpu_ns, now_ns - self._since_ns
-        return stat.rpartition(")")[2].split()[0] == "R" and 2 * ran_ns <= passed_ns
+        if passed_ns > EXCUSED_NS_MAX:
+            return False
+        match stat.rpartition(")")[2].split()[0]:
+            case "R" | "D":
+                return 2 * ran_ns <= passed_ns
+            case "S":
+                return ran_ns == 0
+            case _:
+                return False
 
 
 def reap(pid: int) -> int | None:

@@ -1,0 +1,108 @@
+"""A machine that stalls is not a node that hangs: the table of `linux.Starvation` on real processes."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from aftbed.runtime.unix.linux import EXCUSED_NS_MAX, Starvation
+
+ASLEEP = "print(flush=True); import time; time.sleep(60)"
+# A brick that is blocked for good while the timer of the pulse goes on: the sleep is resumed each time.
+BLOCKED = """
+import signal, time
+signal.signal(signal.SIGALRM, lambda *_: print(flush=True))
+signal.setitimer(signal.ITIMER_REAL, 0.005, 0.005)
+time.sleep(60)
+"""
+LOOPS = """
+import os
+os.sched_setaffinity(0, {%d})
+%s
+print(flush=True)
+while True: pass
+"""
+WEAK = "os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))"
+PERIOD_NS = 100_000_000
+
+
+@contextmanager
+def process(program: str) -> Iterator["subprocess.Popen[bytes]"]:
+    child = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE)
+    try:
+        assert child.stdout is not None
+        child.stdout.readline()  # it is where it should be
+        yield child
+    finally:
+        child.kill()
+        child.wait()
+        assert child.stdout is not None
+        child.stdout.close()
+
+
+def test_a_stopped_process_hangs() -> None:
+    with process(ASLEEP) as child:
+        child.send_signal(signal.SIGSTOP)
+        os.waitid(os.P_PID, child.pid, os.WSTOPPED)
+        assert not Starvation(child.pid).starves(1)
+
+
+def test_a_process_that_is_gone_is_not_excused() -> None:
+    with process(ASLEEP) as child:
+        pass
+    assert not Starvation(child.pid).starves(1)
+
+
+def test_asleep_without_a_timer_is_a_core_that_stalls_and_no_excuse_lasts_for_ever() -> None:
+    with process(ASLEEP) as child:
+        starvation = Starvation(child.pid)
+        _until_asleep(child.pid)
+        assert starvation.starves(2)
+        assert starvation.starves(2 + EXCUSED_NS_MAX)
+        assert not starvation.starves(3 + EXCUSED_NS_MAX)
+        starvation.forget()
+        assert starvation.starves(4 + EXCUSED_NS_MAX)
+
+
+def test_blocked_while_its_timer_comes_is_a_hang() -> None:
+    with process(BLOCKED) as child:
+        starvation = Starvation(child.pid)
+        starvation.starves(1)
+        assert child.stdout is not None
+        for _ in range(3):
+            child.stdout.readline()  # its handler has run since
+        assert not starvation.starves(PERIOD_NS)
+
+
+@pytest.mark.parametrize(("word", "excused"), [("", False), (WEAK, True)])
+def test_runnable_without_a_cpu_starves_and_with_one_it_loops(word: str, excused: bool) -> None:
+    """The weak one shares its core with a strong one, which gets nearly all of it."""
+    cpu = min(os.sched_getaffinity(0))
+    with process(LOOPS % (cpu, word)) as looping, process(LOOPS % (cpu, "")) as strong:
+        watched = looping if excused else strong
+        other = strong if excused else looping
+        if not excused:
+            os.sched_setscheduler(other.pid, os.SCHED_IDLE, os.sched_param(0))
+        starvation = Starvation(watched.pid)
+        starvation.starves(1)
+        before = _cpu_ns(strong.pid)
+        while _cpu_ns(strong.pid) - before < PERIOD_NS:
+            os.sched_yield()
+        assert starvation.starves(1 + PERIOD_NS) is excused
+
+
+def _until_asleep(pid: int) -> None:
+    limit = time.monotonic() + 5.0
+    while Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "S":
+        assert time.monotonic() < limit, "it does not fall asleep"
+        os.sched_yield()
+
+
+def _cpu_ns(pid: int) -> int:
+    return int(Path(f"/proc/{pid}/schedstat").read_text().split()[0])
