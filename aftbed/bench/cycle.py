@@ -8,26 +8,36 @@ from aftbed.bench.ring import ring_us
 from aftbed.bench.runs import cycles_us, finish, start
 from aftbed.bench.statistics import quantile, summary
 from aftbed.core.graph import Graph
-from aftbed.ftm.mechanism import build
+from aftbed.ftm.mechanism import NONE, build, chain
 from aftbed.runtime.unix.options import LoadRun
 from aftbed.vehicle.function import sample_requests
 
 ROUNDS: Final = 5
 WARM_UP: Final = 200
 
-_PATH: Final = (  # of one request, by brick: what is in between is a hop where the nodes differ
-    "client", "proxy", "protocol", "before", "proceed", "server", "proceed", "after", "server",
-    "after", "protocol", "proxy", "client",
-)  # fmt: skip
+_ASKS_SERVER: Final = {  # how often a kind of brick asks the Server and waits, for one request
+    "compute.proceed": 1,
+    "tr.before": 1,
+    "tr.proceed": 2,
+    "pbr.after": 1,
+}
+
+
+def path(graph: Graph) -> list[str]:
+    """The bricks that a request and its reply meet, in their order; what goes to the backup is beside it."""
+    if graph.ftm == NONE:
+        return ["client", "proxy", "a/server", "proxy", "client"]
+    found = ["client", "proxy"]
+    for name in chain(graph, "a")[:-1]:
+        found += [name, *["a/server", name] * _ASKS_SERVER.get(graph.brick(name).kind, 0)]
+        if name.endswith("after"):
+            found.append(f"{name.removesuffix('after')}protocol")
+    return [*found, "proxy", "client"]
 
 
 def hops(graph: Graph) -> int:
     """How many channels between processes a request and its reply pass."""
-    parts = {b.part: graph.node_of(b.name) for b in graph.bricks if b.replica in (None, "a")}
-    path = [parts[part] for part in _PATH if part in parts]
-    if graph.ftm == "none":
-        path = [parts[part] for part in ("client", "proxy", "server", "proxy", "client")]
-    return sum(a != b for a, b in itertools.pairwise(path))
+    return sum(a != b for a, b in itertools.pairwise(graph.node_of(name) for name in path(graph)))
 
 
 def bench_cycle(ftm: str, placement: str, count: int, *, pin: bool = True) -> dict[str, object]:

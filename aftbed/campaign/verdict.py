@@ -8,10 +8,12 @@ from typing import Final, Literal
 import msgspec
 
 from aftbed.campaign.record import RunRecord
+from aftbed.campaign.succession import bare_server
+from aftbed.campaign.value import value
 from aftbed.core import check
 from aftbed.core.check import Check, Failover, Requests
+from aftbed.runtime.unix.closedloop import Proposed, read_proposals
 from aftbed.runtime.unix.options import CarRun, ReplayRun
-from aftbed.vehicle.function import default_application
 from aftbed.vehicle.report import VehicleResult
 from aftbed.vehicle.scenario import broken_expectations, load_scenario
 
@@ -39,20 +41,24 @@ class Verdict(msgspec.Struct, frozen=True):
     replay: dict[str, object] | None
     seconds: float | None
     launch_ms: float | None
+    proposals: list[Proposed] | msgspec.UnsetType = msgspec.UNSET  # where there is a policy
 
 
 def judge(record: RunRecord) -> Verdict:
     """Check everything that the record allows to check."""
-    options, history = record.options, record.history
+    options, history, bare = record.options, record.history, bare_server(record)
     checks = {
         "at_most_once": check.at_most_once(history),
         "exactly_one_answer": check.exactly_one_answer(history, cut_off=record.end is None),
-        "one_history": check.one_history(history, default_application()),
+        "one_history": check.one_history(history, bare()),
         "one_master": check.one_master(history),
         "clean_exit": _clean_exit(record),
         "faults_applied": _faults_applied(record),
         "whole_history": _whole(record),
     }
+    values = value(history, bare(), _faults(record))
+    if values is not None:
+        checks["value"] = values
     vehicle = _vehicle(record)
     scenario = "load"
     if isinstance(options.work, CarRun):
@@ -61,6 +67,7 @@ def judge(record: RunRecord) -> Verdict:
     replay = None
     if isinstance(options.work, ReplayRun):
         scenario, replay = f"replay {options.work.log}", _result(record)
+    proposals = read_proposals(record.path)
     sent = [e.t_ns for e in history.dialogue]
     return Verdict(
         run=options.run,
@@ -69,7 +76,7 @@ def judge(record: RunRecord) -> Verdict:
         placement=options.placement,
         scenario=scenario,
         verdict=_word(checks),
-        requests=check.requests(history, default_application()),
+        requests=check.requests(history, bare()),
         vehicle=vehicle,
         failovers=check.failovers(history),
         checks={name: c.finding for name, c in checks.items()},
@@ -78,6 +85,7 @@ def judge(record: RunRecord) -> Verdict:
         replay=replay,
         seconds=_number(record, "seconds"),
         launch_ms=round((min(sent) - record.started_ns) / 1e6, 3) if sent else None,
+        proposals=msgspec.UNSET if proposals is None else proposals,
     )
 
 
@@ -114,8 +122,13 @@ def _faults(record: RunRecord) -> list[dict[str, str]]:
 
 def _faults_applied(record: RunRecord) -> Check:
     """G8: a fault that did not fire proves nothing."""
-    missing = [f["fault"] for f in _faults(record) if f["receipt"] != "applied"]
-    return Check("unknown" if missing else "pass", tuple(f"never fired: {m}" for m in missing))
+    missing = [f for f in _faults(record) if f["receipt"] != "applied"]
+    return Check("unknown" if missing else "pass", tuple(map(_missed, missing)))
+
+
+def _missed(fault: dict[str, str]) -> str:
+    detail = fault.get("detail")
+    return f"{fault['receipt']}: {fault['fault']}: {detail}" if detail else f"never fired: {fault['fault']}"
 
 
 def _result(record: RunRecord) -> dict[str, object] | None:

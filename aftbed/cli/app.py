@@ -5,7 +5,9 @@ from typing import Annotated
 
 import typer
 
+from aftbed.cli.adapting import adapt as adapt_commands
 from aftbed.cli.bench import bench
+from aftbed.cli.ftm import ftm as ftm_commands
 
 app = typer.Typer(
     name="aftbed",
@@ -17,7 +19,9 @@ app = typer.Typer(
 )
 inject = typer.Typer(help="Inject a fault into a live run.", no_args_is_help=True, rich_markup_mode=None)
 app.add_typer(inject, name="inject")
+app.add_typer(adapt_commands, name="adapt")
 app.add_typer(bench, name="bench")
+app.add_typer(ftm_commands, name="ftm")
 
 Run = Annotated[str | None, typer.Option("--run", help="Id of the run, where several are alive.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else.")]
@@ -33,6 +37,17 @@ def run(
     faults: Annotated[
         list[str] | None, typer.Option("--inject", help='E.g. "crash primary at checkpoint.sent nth 100".')
     ] = None,
+    adaptations: Annotated[
+        list[str] | None, typer.Option("--adapt", help='E.g. "compose lfr+tr at request 120".')
+    ] = None,
+    recipe: Annotated[str, typer.Option(help="Of every --adapt: drained or paper.")] = "drained",
+    force: Annotated[
+        bool, typer.Option("--force", help="Carry out --adapt even where it does not suit the function.")
+    ] = False,
+    policy: Annotated[
+        str | None, typer.Option(help="When to adapt by itself: name of a policy, or a YAML file.")
+    ] = None,
+    approve: Annotated[str, typer.Option(help="What --policy proposes: auto (do it) or ask.")] = "auto",
     brake_policy: Annotated[
         str, typer.Option(help="Of the brake ECU on lost requests: hold, release or latch.")
     ] = "latch",
@@ -62,6 +77,11 @@ def run(
         pace=pace,
         seed=seed,
         faults=tuple(faults or ()),
+        adaptations=tuple(adaptations or ()),
+        recipe=recipe,
+        force=force,
+        policy=policy,
+        approve=approve,
         brake_policy=brake_policy,
         record=record,
         replay=replay,
@@ -135,9 +155,9 @@ Target = Annotated[str, typer.Argument(help="primary, backup, or a node as `aftb
 @inject.command()
 def crash(target: Target, at: At = None, nth: Nth = None, after: After = None, run: Run = None) -> None:
     """SIGKILL the target's processes."""
-    from aftbed.cli import live  # noqa: PLC0415
+    from aftbed.cli import injecting  # noqa: PLC0415
 
-    live.inject(run, "crash", target, None, at, nth, after)
+    injecting.strike(run, "crash", target, None, at, nth, after)
 
 
 @inject.command()
@@ -150,6 +170,28 @@ def hang(
     run: Run = None,
 ) -> None:
     """SIGSTOP the target's processes, and SIGCONT them after a while."""
-    from aftbed.cli import live  # noqa: PLC0415
+    from aftbed.cli import injecting  # noqa: PLC0415
 
-    live.inject(run, "hang", target, duration, at, nth, after)
+    injecting.strike(run, "hang", target, duration, at, nth, after)
+
+
+@inject.command()
+def bitflip(
+    place: Annotated[str, typer.Argument(help="result or state, of one execution.")],
+    bit: Annotated[
+        str | None, typer.Option("--bit", help="From bit 0 of byte 0; else drawn by the seed.")
+    ] = None,
+    replica: Annotated[
+        str | None, typer.Option("--replica", help="primary (default), backup, a or b.")
+    ] = None,
+    at: Annotated[
+        str | None, typer.Option("--at", help="Event of its Server; server.exit if left out.")
+    ] = None,
+    nth: Nth = None,
+    after: After = None,
+    run: Run = None,
+) -> None:
+    """Flip one bit of what the function answers or remembers, in one execution of one replica."""
+    from aftbed.cli import injecting  # noqa: PLC0415
+
+    injecting.flip(run, place, bit, replica, at, nth, after)

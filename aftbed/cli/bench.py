@@ -10,8 +10,8 @@ bench = typer.Typer(
 REQUESTS_MIN: Final = 5000
 KILLS_MIN: Final = 1
 
-Ftm = Annotated[str, typer.Option(help="none or pbr.")]
-Placement = Annotated[str, typer.Option(help="process or replica.")]
+Ftm = Annotated[str, typer.Option(help="none, pbr, lfr, tr, pbr+tr, ...: aftbed ftm list.")]
+Placement = Annotated[str, typer.Option(help="process, replica or single.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document.")]
 Pin = Annotated[bool, typer.Option(help="Keep each replica's chain on one core.")]
 
@@ -45,6 +45,24 @@ def recovery(
     if ftm == "none":
         raise ConfigError("--ftm none: the bare server does not recover; pbr is allowed")
     _print(bench_recovery(ftm, placement, kills, pin=pin), as_json=json)
+
+
+@bench.command()
+def adapt(
+    old: Annotated[str, typer.Option("--from", help="What runs first.")] = "pbr",
+    new: Annotated[str, typer.Option("--to", help="What it becomes.")] = "pbr+tr",
+    placement: Placement = "process",
+    recipe: Annotated[
+        str, typer.Option(help="drained, or paper: SIGSTOP, kill, launch, link, SIGCONT.")
+    ] = "drained",
+    adaptations: Annotated[int, typer.Option(min=1, help="There; as many lead back.")] = 50,
+    pin: Pin = True,
+    json: Json = False,
+) -> None:
+    """Adaptations there and back under load: what the client feels, and what is lost."""
+    from aftbed.bench.adapt import bench_adapt  # noqa: PLC0415
+
+    _print(bench_adapt(old, new, placement, recipe, adaptations, pin=pin), as_json=json)
 
 
 @bench.command()

@@ -4,8 +4,9 @@ import json
 import os
 import signal
 import sys
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import msgspec
 
@@ -13,11 +14,17 @@ from aftbed.cli.view import View, open_view
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.fault import Fault
 from aftbed.core.graph import Graph
+from aftbed.core.script import RECIPES
 from aftbed.ftm.mechanism import build
 from aftbed.inject.words import parse
 from aftbed.runtime import targets
+from aftbed.runtime.unix.control import Report
 from aftbed.runtime.unix.launch import Launched, launch, options_for
-from aftbed.runtime.unix.options import CarRun, LoadRun, ReplayRun, Work
+from aftbed.runtime.unix.options import CarRun, LoadRun, ReplayRun, Scheduled, Work
+
+if TYPE_CHECKING:
+    from aftbed.adapt.policy import Policy
+    from aftbed.runtime.unix.closedloop import ClosedLoop
 
 POLICIES: Final = ("hold", "release", "latch")
 PACE_MIN, PACE_MAX = 0.01, 100.0
@@ -35,6 +42,11 @@ class Asked(msgspec.Struct, frozen=True):
     pace: str
     seed: int
     faults: tuple[str, ...]
+    adaptations: tuple[str, ...]
+    recipe: str
+    force: bool
+    policy: str | None
+    approve: str
     brake_policy: str
     record: str | None
     replay: str | None
@@ -49,6 +61,8 @@ def run(asked: Asked, *, as_json: bool) -> int:
     """Run, show, judge; the exit code."""
     graph = build(asked.ftm, asked.placement)
     faults = tuple(_fault(text, graph) for text in asked.faults)
+    adaptations = _adaptations(asked, graph)
+    policy = _policy(asked, as_json=as_json)
     work = _work(asked)
     if not 0 <= asked.seed <= SEED_MAX:
         raise ConfigError(f"--seed {asked.seed}: 0 to {SEED_MAX} are allowed")
@@ -61,12 +75,14 @@ def run(asked: Asked, *, as_json: bool) -> int:
         seed=asked.seed,
         record=asked.record,
         faults=faults,
+        adaptations=adaptations,
         pin=asked.pin,
         bus_port=asked.bus_port,
     )
     launched = launch(options, listener)
     view = open_view(options, quiet=as_json)
-    interrupted = _follow(launched, view)
+    closed = _closed_loop(policy, asked, launched)
+    interrupted = _follow(launched, view, closed)
     launched.wait()
     # Not before: the processes that start have better use for the cores.
     from aftbed.campaign.record import read_record  # noqa: PLC0415
@@ -89,7 +105,45 @@ def _fault(text: str, graph: Graph) -> Fault:
     return fault
 
 
-def _follow(launched: Launched, view: View) -> bool:
+def _adaptations(asked: Asked, graph: Graph) -> tuple[Scheduled, ...]:
+    if not asked.adaptations:
+        if asked.recipe != RECIPES[0] or asked.force:
+            raise ConfigError("--recipe and --force say how --adapt is carried out: give --adapt too")
+        return ()
+    from aftbed.cli.adaptation import scheduled  # noqa: PLC0415 - only where there are any
+
+    return scheduled(asked.adaptations, graph, asked.recipe, force=asked.force)
+
+
+def _policy(asked: Asked, *, as_json: bool) -> "Policy | None":
+    if asked.policy is None and asked.approve == "auto":
+        return None
+    from aftbed.runtime.unix.closedloop import asked_for  # noqa: PLC0415 - only where there is one
+
+    return asked_for(asked.policy, asked.approve, asked.ftm, as_json=as_json)
+
+
+def _closed_loop(policy: "Policy | None", asked: Asked, launched: Launched) -> "ClosedLoop | None":
+    if policy is None:
+        return None
+    from aftbed.runtime.unix.closedloop import ClosedLoop  # noqa: PLC0415
+
+    return ClosedLoop(policy, asked.ftm, launched.private, launched.record, asked.approve)
+
+
+def _reports(launched: Launched, closed: "ClosedLoop | None") -> Iterator[Report]:
+    """What the run says; between two reports, a closed loop observes."""
+    reports = launched.reports()
+    while True:
+        if closed is not None:
+            closed.wait(launched.line.fileno())
+        report = next(reports, None)
+        if report is None:
+            return
+        yield report
+
+
+def _follow(launched: Launched, view: View, closed: "ClosedLoop | None") -> bool:
     """Show what is reported until the end; True if the user broke it off. A second Ctrl-C kills."""
     interrupted = False
 
@@ -103,13 +157,20 @@ def _follow(launched: Launched, view: View) -> bool:
     before = {s: signal.signal(s, interrupt) for s in (signal.SIGINT, signal.SIGTERM)}
     try:
         with view:
-            for report in launched.reports():
+            if closed is not None:
+                closed.show(view.event)
+            for report in _reports(launched, closed):
                 if report.kind == "telemetry":
                     view.telemetry(report.data)
                 elif report.kind == "cycle":
                     view.cycle(json.loads(report.data))
                 elif report.kind == "event":
-                    view.event(json.loads(report.data))
+                    event = json.loads(report.data)
+                    view.event(event)
+                    if closed is not None:
+                        closed.told(event)
+            if closed is not None:
+                closed.close()
     finally:
         for sig, handler in before.items():
             signal.signal(sig, handler)

@@ -3,6 +3,7 @@
 import msgspec
 
 from aftbed.campaign.verdict import Verdict
+from aftbed.runtime.unix.closedloop import proposed_line
 
 
 def show_verdict(verdict: Verdict, *, as_json: bool) -> None:
@@ -23,6 +24,8 @@ def show_verdict(verdict: Verdict, *, as_json: bool) -> None:
             f" promoted {_ms(f.promoted_ms)}, next good reply {_ms(f.recovered_ms)},"
             f" blackout {_ms(f.blackout_ms)}"
         )
+    for proposal in verdict.proposals or ():
+        print(f"  proposal   {proposed_line(proposal)}")
     for fault in verdict.faults:
         print(f"  fault      {fault['fault']}: {fault['receipt']}")
     print("  checks     " + ", ".join(f"{name} {found}" for name, found in verdict.checks.items()))

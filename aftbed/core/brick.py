@@ -17,7 +17,7 @@ import msgspec
 from aftbed.core.errors import PeerError
 from aftbed.core.event import Event
 from aftbed.core.message import AnyMessage, Message
-from aftbed.core.script import Script
+from aftbed.core.script import Phase, Script
 
 CONTROL: Final = "control"  # the port on which the runtime speaks to a brick
 NO_REQUEST: Final = 0
@@ -45,12 +45,23 @@ class Note(msgspec.Struct, frozen=True, gc=False):
 
 
 class Order(msgspec.Struct, frozen=True):
-    """Have the runtime execute `script` (Recovery and Engine only); answered by `Ordered`."""
+    """Have the runtime execute `script` (Recovery and Engine only), or one `phase` of adaptation `number`.
+
+    Recovery hears how it ended by Situation, the Engine by Progress.
+    """
 
     script: Script
+    phase: Phase = Phase.WHOLE
+    number: int = 0
 
 
-Effect = Send | Note | Order
+class Halt(msgspec.Struct, frozen=True):
+    """A detected stop: end this node, so that no wrong reply leaves it. The last effect of a step."""
+
+    reason: str
+
+
+Effect = Send | Note | Order | Halt
 
 
 class Brick(Protocol):

@@ -28,16 +28,26 @@ class Event(Enum):
     CHECKPOINT_APPLIED = (13, "checkpoint.applied")
     REPLY_ACCEPTED = (14, "reply.accepted")
     REPLY_REFUSED = (15, "reply.refused")
+    FOLLOWER_FORWARDED = (16, "follower.forwarded")
+    FOLLOWER_NOTIFIED = (17, "follower.notified")
+    FOLLOWER_DIVERGED = (18, "follower.diverged")
+    VOTE_COMPARED = (19, "vote.compared")
     WATCHDOG_SUSPECT = (20, "watchdog.suspect")
     RECOVERY_ENTER = (21, "recovery.enter")
     RECOVERY_EXIT = (22, "recovery.exit")
     REPLICA_FENCED = (23, "replica.fenced")
     REPLICA_PROMOTED = (24, "replica.promoted")
     BACKUP_READY = (25, "backup.ready")
+    DETECTED_STOP = (26, "detected.stop")
     NODE_DIED = (31, "node.died")
     STATE_RESTORED = (32, "state.restored")
     PEER_REFUSED = (35, "peer.refused")
     FAULT_APPLIED = (40, "fault.applied")
+    ADAPT_PLAN = (50, "adapt.plan")
+    ADAPT_STEP_ENTER = (51, "adapt.step.enter")
+    ADAPT_STEP_EXIT = (52, "adapt.step.exit")
+    ADAPT_COMMIT = (53, "adapt.commit")
+    ADAPT_ROLLBACK = (54, "adapt.rollback")
 
     def __init__(self, code: int, label: str) -> None:
         self.code = code
@@ -49,6 +59,8 @@ class Event(Enum):
 
 BY_CODE: Final = {event.code: event for event in Event}
 BY_LABEL: Final = {event.label: event for event in Event}
+
+RERUN: Final = 1  # detail of `server.enter` and `server.exit`: the request ran again, from the same state
 
 REQUEST_PATH: Final = (
     Event.REQUEST_SENT,

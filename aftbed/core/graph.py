@@ -11,7 +11,7 @@ from typing import Final
 
 import msgspec
 
-PLACEMENTS: Final = ("process", "replica")
+PLACEMENTS: Final = ("process", "replica", "single")
 
 
 class Kind(msgspec.Struct, frozen=True):
@@ -24,10 +24,16 @@ class Kind(msgspec.Struct, frozen=True):
 
 
 class BrickSpec(msgspec.Struct, frozen=True):
-    """A brick in the graph: `name` is unique, `kind` names an entry of the catalog."""
+    """A brick in the graph: `name` is unique, `kind` names an entry of the catalog.
+
+    `source` names a class that takes the place of the catalog's own, written off line (`MODULE:CLASS`
+    or `FILE.py:CLASS`); `application` one that takes the place of the function that a Server protects.
+    """
 
     name: str
     kind: str
+    source: str = ""
+    application: str = ""
 
     @property
     def replica(self) -> str | None:
@@ -56,7 +62,7 @@ class Link(msgspec.Struct, frozen=True):
         return self.source_port
 
 
-def _ends(link: Link) -> tuple[tuple[str, str, str], tuple[str, str, str]]:
+def ends(link: Link) -> tuple[tuple[str, str, str], tuple[str, str, str]]:
     """Both ends of `link` as (brick, port, side): one port name may be both an input and an output."""
     return (link.source, link.source_port, "out"), (link.sink, link.sink_port, "in")
 
@@ -84,6 +90,20 @@ class Graph(msgspec.Struct, frozen=True):
                 return node
         raise KeyError(brick)
 
+    def led_by(self, leader: str) -> "Graph":
+        """The same with `leader` leading: whom the Proxy is bound to, and which way replication goes."""
+        specs = {b.name: b for b in self.bricks}
+
+        def turned(link: Link) -> Link:
+            source, sink = specs[link.source].replica, specs[link.sink].replica
+            if source and sink and source not in (sink, leader):
+                return Link(link.sink, link.source_port, link.source, link.sink_port)
+            if "proxy" in (link.source, link.sink) and (source or sink):
+                return msgspec.structs.replace(link, standby=(source or sink) != leader)
+            return link
+
+        return msgspec.structs.replace(self, links=tuple(turned(k) for k in self.links))
+
     def problems(self, kinds: dict[str, Kind]) -> list[str]:
         """Every reason to refuse this graph, or []."""
         times = Counter(b.name for b in self.bricks)
@@ -108,9 +128,9 @@ class Graph(msgspec.Struct, frozen=True):
         return found
 
     def _binding_problems(self, ports: dict[str, Kind]) -> list[str]:
-        ends = Counter(end for k in self.links if not k.standby for end in _ends(k))
-        standby = {end for k in self.links if k.standby for end in _ends(k)}
-        found = [f"{b}:{p} is bound {n} times" for (b, p, _), n in ends.items() if n > 1]
+        bound = Counter(end for k in self.links if not k.standby for end in ends(k))
+        standby = {end for k in self.links if k.standby for end in ends(k)}
+        found = [f"{b}:{p} is bound {n} times" for (b, p, _), n in bound.items() if n > 1]
         for name, kind in ports.items():
             wanted = [(name, port, "out") for port in kind.outputs]
             wanted += [(name, port, "in") for port in kind.inputs]
@@ -118,7 +138,7 @@ class Graph(msgspec.Struct, frozen=True):
                 f"{name}:{port} is not bound"
                 for _, port, side in wanted
                 if port not in kind.optional
-                and not ends[name, port, side]
+                and not bound[name, port, side]
                 and (name, port, side) not in standby
             ]
         return found

@@ -29,18 +29,22 @@ LIFELINE_OFFSET: Final = 32  # u32, a futex that the node holds
 NAME_OFFSET: Final = 64  # u8 length, then UTF-8
 NAME_BYTES_MAX: Final = 120
 
-RECORD: Final = struct.Struct("<QQQII")  # time ns, request id, detail, 0, event code
+RECORD: Final = struct.Struct("<QQQII")  # time ns, request id, detail, brick, event code
 ENTRY: Final = struct.Struct("<QQIHH")  # time ns, request id, payload length, epoch, kind
 
 
 class Record(msgspec.Struct, frozen=True):
-    """One event of one node; `t_ns` is monotonic and common to all nodes of a host."""
+    """One event of one node; `t_ns` is monotonic and common to all nodes of a host.
+
+    `brick` tells the bricks of a node apart: 0 for the first that it hosts, 1 for the next.
+    """
 
     t_ns: int
     event: Event
     request_id: int
     detail: int
     node: str
+    brick: int = 0
 
 
 class EntryKind(IntEnum):
@@ -101,13 +105,13 @@ def records(data: bytes) -> Iterator[Record]:
         return
     node = node_name(data)
     for at in range(HEADER_BYTES, len(data) - RECORD.size + 1, RECORD.size):
-        t_ns, request_id, detail, _, code = RECORD.unpack_from(data, at)
+        t_ns, request_id, detail, brick, code = RECORD.unpack_from(data, at)
         if code == 0:
             return
         event = BY_CODE.get(code)
         if event is None:
             raise PeerError(f"{node}: record at byte {at} has the unknown event code {code}")
-        yield Record(t_ns, event, request_id, detail, node)
+        yield Record(t_ns, event, request_id, detail, node, brick)
 
 
 def entries(data: bytes) -> Iterator[Entry]:

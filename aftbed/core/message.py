@@ -7,6 +7,9 @@ was sent. It grows by one at each failover; whoever receives an older one refuse
 
 import msgspec
 
+from aftbed.core.graph import Graph
+from aftbed.core.script import Phase, Script
+
 
 class Message(msgspec.Struct, frozen=True, array_like=True, gc=False):
     """Base of all messages: an array on the wire, its tag first."""
@@ -77,7 +80,10 @@ class StoreReply(Message, frozen=True, array_like=True, gc=False, tag=8):
 
 
 class TakeOver(Message, frozen=True, array_like=True, gc=False, tag=9):
-    """All that came before in this channel is applied: lead, under this epoch."""
+    """All that came before in this channel is applied: lead, under this epoch.
+
+    It goes the way of a request, from the brick that was promoted on, and each brick hands it on.
+    """
 
     epoch: int
 
@@ -92,8 +98,51 @@ class Suspect(Message, frozen=True, array_like=True, gc=False, tag=10):
     at_ns: int
 
 
+class Notification(Message, frozen=True, array_like=True, gc=False, tag=11):
+    """LFR, leader to follower: the client gets the reply to `request_id`, which has this digest."""
+
+    epoch: int
+    request_id: int
+    digest: bytes
+
+
+class Trial(Message, frozen=True, array_like=True, gc=False, tag=12):
+    """TR: one execution of `payload`. A `rerun` starts from `state`, which the first run started from."""
+
+    epoch: int
+    request_id: int
+    payload: bytes
+    state: bytes
+    rerun: bool
+
+
+class Tried(Message, frozen=True, array_like=True, gc=False, tag=13):
+    """What one Trial came to: the reply, and the state after it."""
+
+    epoch: int
+    request_id: int
+    replica: int
+    payload: bytes
+    state: bytes
+
+
+class Trials(Message, frozen=True, array_like=True, gc=False, tag=14):
+    """TR, Proceed to After: two trials to compare, or the third one that was asked for."""
+
+    epoch: int
+    request_id: int
+    tried: tuple[Tried, ...]
+
+
+class Again(Message, frozen=True, array_like=True, gc=False, tag=15):
+    """TR, After to Proceed: two trials differ, run a third."""
+
+    epoch: int
+    request_id: int
+
+
 class Promote(Message, frozen=True, array_like=True, gc=False, tag=20):
-    """Runtime to the backup's After: drain the checkpoint channel to its end, then take over."""
+    """Runtime to the first brick of a backup that hears of its leader: drain to the end, then take over."""
 
     epoch: int
 
@@ -146,7 +195,8 @@ class Situation(Message, frozen=True, array_like=True, gc=False, tag=28):
     """Runtime to Recovery: who leads, who backs up, which slots are empty. `""` is nobody.
 
     Sent at the start and after each script, done or `failed`; so a new Recovery needs no memory of
-    the old one.
+    the old one. `replication` are the parts and ports by which a leader speaks to its backup;
+    `stateful` the parts whose state a new backup needs.
     """
 
     leader: str
@@ -156,6 +206,52 @@ class Situation(Message, frozen=True, array_like=True, gc=False, tag=28):
     epoch: int
     vacant: tuple[str, ...]
     failed: bool
+    replication: tuple[tuple[str, str], ...] = (("after", "aft2aft"),)
+    stateful: tuple[str, ...] = ("protocol", "server")
+
+
+class Goal(msgspec.Struct, frozen=True):
+    """What an adaptation is to come to: one of `expression`, `part` with `source`, or `script`."""
+
+    expression: str = ""
+    part: str = ""
+    source: str = ""
+    script: Script | None = None
+    recipe: str = "drained"
+
+
+class Adapt(Message, frozen=True, array_like=True, gc=False, tag=40):
+    """Runtime to the Engine: adaptation `number`, from the graph that runs."""
+
+    number: int
+    goal: Goal
+    graph: Graph
+
+
+class Progress(Message, frozen=True, array_like=True, gc=False, tag=41):
+    """Runtime to the Engine: a phase that it ordered has ended; `failure` is `""` or the reason."""
+
+    number: int
+    phase: Phase
+    failure: str
+
+
+class TakeUp(Message, frozen=True, array_like=True, gc=False, tag=42):
+    """Runtime to a new Engine: what the dead one had ordered last, and how it ended if it has."""
+
+    number: int
+    script: Script
+    phase: Phase
+    ended: bool
+    failure: str
+
+
+class Adapted(Message, frozen=True, array_like=True, gc=False, tag=43):
+    """The Engine to the runtime: how adaptation `number` ended: done, refused, rolled back."""
+
+    number: int
+    outcome: str
+    reason: str
 
 
 AnyMessage = (
@@ -169,6 +265,11 @@ AnyMessage = (
     | StoreReply
     | TakeOver
     | Suspect
+    | Notification
+    | Trial
+    | Tried
+    | Trials
+    | Again
     | Promote
     | Promoted
     | Rebound
@@ -178,6 +279,9 @@ AnyMessage = (
     | NodeDied
     | Pulses
     | Situation
+    | Adapt
+    | Progress
+    | TakeUp
 )
 
 WireMessage = (
@@ -191,4 +295,9 @@ WireMessage = (
     | StoreReply
     | TakeOver
     | Suspect
+    | Notification
+    | Trial
+    | Tried
+    | Trials
+    | Again
 )

@@ -5,7 +5,7 @@ from typing import Final
 from aftbed.core.brick import Brick, Effect, Note, Send
 from aftbed.core.errors import PeerError
 from aftbed.core.event import Event
-from aftbed.core.message import AnyMessage, Rebound, Request
+from aftbed.core.message import AnyMessage, Rebound, Request, TakeOver
 
 _OPEN: Final = ("pro2bfr",)
 _EXIT: Final = Event.BEFORE_EXIT  # bound once: a look-up in an enumeration is slow on the hot path
@@ -23,9 +23,11 @@ class PassBefore(Brick):
         return True
 
     def step(self, port: str, msg: AnyMessage, now_ns: int) -> list[Effect]:
-        """Pass a request on."""
-        if not isinstance(msg, Request):
-            if isinstance(msg, Rebound):
-                return []
-            raise PeerError(f"{type(msg).__name__} on {port}")
-        return [Note(_EXIT, msg.request_id), Send("bfr2prd", msg)]
+        """Pass on a request, or that all behind it is led from here."""
+        if isinstance(msg, Request):
+            return [Note(_EXIT, msg.request_id), Send("bfr2prd", msg)]
+        if isinstance(msg, TakeOver):
+            return [Send("bfr2prd", msg)]
+        if isinstance(msg, Rebound):
+            return []
+        raise PeerError(f"{type(msg).__name__} on {port}")

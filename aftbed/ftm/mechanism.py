@@ -1,51 +1,154 @@
 """From an FTM expression to a graph: `pbr` in placement `process` is the paper's graph (III-A).
 
-The paper's 17 processes are the 16 nodes made here and the supervisor, which has the place of the
-ROS master.
+An expression names mechanisms, the outermost first: `pbr+tr`. A mechanism is a row of MECHANISMS: kinds of
+bricks for Before, Proceed and After, and the links beyond those that every mechanism has. There is one rule
+for any depth: **the inner mechanism's Protocol-Before-Proceed-After stands where the outer one's Proceed
+stood**. The bricks of an inner mechanism carry its name: `a/tr.before`.
+
+What replicates (`pbr`, `lfr`) can only be outermost; what repeats the computation (`tr`) only innermost.
+The paper's 17 processes of a duplex (23 when composed) are the nodes made here and the supervisor, which
+has the place of the ROS master.
 """
 
 from typing import Final
 
 import msgspec
 
-from aftbed.core.errors import unknown
+from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.graph import PLACEMENTS, BrickSpec, Graph, Link
 from aftbed.ftm.catalog import KINDS
 
 REPLICAS: Final = ("a", "b")
+NONE: Final = "none"
 
 
 class Mechanism(msgspec.Struct, frozen=True):
-    """The rows of design table "Before | Proceed | After": kinds of bricks for one replica."""
+    """A row of the design's table "Before | Proceed | After".
+
+    `own`: links of this mechanism only, from part to part through a port that both ends call the same.
+    `replication`: parts and ports by which a leader speaks to its backup; none: one replica.
+    `innermost`: its Proceed is part of what it does, so nothing can take that place.
+    """
 
     before: str
     proceed: str
     after: str
+    own: tuple[tuple[str, str, str], ...] = ()
+    replication: tuple[tuple[str, str], ...] = ()
+    innermost: bool = False
 
 
-MECHANISMS: Final = {"pbr": Mechanism("pass.before", "compute.proceed", "pbr.after")}
-EXPRESSIONS: Final = ("none", *MECHANISMS)
+MECHANISMS: Final = {
+    "pbr": Mechanism(
+        "pass.before",
+        "compute.proceed",
+        "pbr.after",
+        own=(("after", "aft2srv", "server"), ("server", "srv2aft", "after")),
+        replication=(("after", "aft2aft"),),
+    ),
+    "lfr": Mechanism(
+        "lfr.before",
+        "compute.proceed",
+        "lfr.after",
+        replication=(("before", "bfr2bfr"), ("after", "aft2aft")),
+    ),
+    "tr": Mechanism(
+        "tr.before",
+        "tr.proceed",
+        "tr.after",
+        own=(
+            ("before", "bfr2srv", "server"),
+            ("server", "srv2bfr", "before"),
+            ("after", "aft2prd", "proceed"),
+        ),
+        innermost=True,
+    ),
+    "assert": Mechanism(
+        "assert.before", "compute.proceed", "assert.after", own=(("before", "bfr2aft", "after"),)
+    ),
+}
+DUPLEX: Final = tuple(name for name, row in MECHANISMS.items() if row.replication)
+SIMPLEX: Final = tuple(name for name, row in MECHANISMS.items() if not row.replication)
+STATEFUL: Final = ("protocol", "server")  # the parts whose state a new backup needs
+ONWARD: Final = ("pro2bfr", "bfr2prd", "prd2aft", "pro2pxy")  # the way of a request, the nearest first
 
-_CHAIN: Final = (  # within one replica
-    ("protocol", "pro2bfr", "before"),
-    ("before", "bfr2prd", "proceed"),
-    ("proceed", "prd2srv", "server"),
-    ("server", "srv2prd", "proceed"),
-    ("proceed", "prd2aft", "after"),
-    ("after", "aft2srv", "server"),
-    ("server", "srv2aft", "after"),
-    ("after", "aft2pro", "protocol"),
-)
-CHAIN_PARTS: Final = ("protocol", "before", "proceed", "after", "server")
+
+def parse(expression: str) -> tuple[str, ...]:
+    """The names of the mechanisms in `expression`, the outermost first; () for `none`.
+
+    Raises ConfigError on an unknown name and on an order that makes no sense.
+    """
+    if expression == NONE:
+        return ()
+    names = tuple(expression.split("+"))
+    for name in names:
+        if name not in MECHANISMS:
+            raise unknown("FTM", name, (NONE, *MECHANISMS))
+    for index, name in enumerate(names):
+        if MECHANISMS[name].replication and index > 0:
+            meant = "+".join((name, *(n for n in names if n not in DUPLEX)))
+            raise ConfigError(f"{expression}: {name} replicates, so it can only be outermost ({meant}?)")
+        if MECHANISMS[name].innermost and index < len(names) - 1:
+            meant = "+".join((*(n for n in names if n != name), name))
+            raise ConfigError(
+                f"{expression}: {name} repeats the computation itself, so it can only be innermost ({meant}?)"
+            )
+        if name in names[:index]:
+            raise ConfigError(f"{expression}: {name} within {name} adds nothing")
+    return names
 
 
-def build(expression: str, placement: str) -> Graph:
-    """The graph of `expression`; its first replica leads. Raises ConfigError on an unknown name."""
+def expressions() -> tuple[str, ...]:
+    """Every expression of one or two mechanisms that makes sense, `none` first."""
+    pairs = (f"{outer}+{inner}" for outer in MECHANISMS for inner in SIMPLEX if outer != inner)
+    return (NONE, *DUPLEX, *SIMPLEX, *(e for e in pairs if _makes_sense(e)))
+
+
+def chain(graph: Graph, replica: str) -> tuple[str, ...]:
+    """The bricks of `replica` that a request meets, in their order, the Server last; no Watchdog.
+
+    The order is read off the links: that of the bricks is another one after an adaptation.
+    """
+    server = f"{replica}/server"
+    bricks = {b.name for b in graph.bricks if b.replica == replica and b.kind != "watchdog"}
+    onward = {(k.source, k.source_port): k.sink for k in graph.links}
+    found: list[str] = []
+    ahead = bricks - {server}
+
+    def visit(brick: str) -> None:
+        if brick in ahead:
+            ahead.remove(brick)
+            found.append(brick)
+            for port in ONWARD:
+                visit(onward.get((brick, port), server))
+
+    visit(f"{replica}/protocol")
+    return (*found, *sorted(ahead), *(bricks & {server}))
+
+
+def _makes_sense(expression: str) -> bool:
+    try:
+        parse(expression)
+    except ConfigError:
+        return False
+    return True
+
+
+EXPRESSIONS: Final = expressions()
+
+
+def replication_of(expression: str) -> tuple[tuple[str, str], ...]:
+    """The parts and ports by which a leader speaks to its backup; () with one replica."""
+    names = parse(expression)
+    return MECHANISMS[names[0]].replication if names else ()
+
+
+def build(expression: str, placement: str, leader: str = REPLICAS[0]) -> Graph:
+    """The graph of `expression`; `leader` leads. Raises ConfigError on an unknown name."""
     if placement not in PLACEMENTS:
         raise unknown("placement", placement, PLACEMENTS)
-    if expression not in EXPRESSIONS:
-        raise unknown("FTM", expression, EXPRESSIONS)
-    graph = _bare(placement) if expression == "none" else _duplex(expression, placement)
+    names = parse(expression)
+    graph = _protected(names, placement, leader) if names else _bare(placement)
     problems = graph.problems(KINDS)
     assert not problems, problems
     return graph
@@ -64,41 +167,74 @@ def _bare(placement: str) -> Graph:
         BrickSpec("a/server", "bare.server"),
     )
     nodes: dict[str, tuple[str, ...]] = {b.name: (b.name,) for b in bricks}
-    return Graph("none", placement, bricks, links, nodes)
+    return Graph(NONE, placement, bricks, links, nodes)
 
 
-def _duplex(expression: str, placement: str) -> Graph:
-    mechanism = MECHANISMS[expression]
-    singles = [BrickSpec(name, name) for name in ("client", "proxy", "recovery", "engine")]
-    singles += [BrickSpec(f"{replica}/watchdog", "watchdog") for replica in REPLICAS]
-    bricks = singles
-    nodes: dict[str, tuple[str, ...]] = {b.name: (b.name,) for b in singles}
+def _protected(names: tuple[str, ...], placement: str, leader: str) -> Graph:
+    replication = MECHANISMS[names[0]].replication
+    follower = next(r for r in REPLICAS if r != leader)
+    replicas = REPLICAS if replication else (leader,)
+    bricks = [BrickSpec(name, name) for name in ("client", "proxy", "recovery", "engine")]
+    bricks += [BrickSpec(f"{replica}/watchdog", "watchdog") for replica in replicas]
+    nodes: dict[str, tuple[str, ...]] = {b.name: (b.name,) for b in bricks}
     links = [
         Link("client", "clt2pxy", "proxy", "clt2pxy"),
         Link("proxy", "pxy2clt", "client", "pxy2clt"),
-        Link("a/watchdog", "wdg2rec", "recovery", "wdg2rec"),
-        Link("b/watchdog", "wdg2rec", "recovery", "wdg2rec.b"),
-        Link("a/after", "aft2aft", "b/after", "aft2aft"),
+        *(Link(f"{r}/watchdog", "wdg2rec", "recovery", ALARMS[r]) for r in replicas),
+        *(Link(f"{leader}/{part}", port, f"{follower}/{part}", port) for part, port in replication),
     ]
-    for replica in REPLICAS:
-        chain = replica_bricks(mechanism, replica)
-        bricks = bricks + chain
-        links += replica_links(replica, standby=replica != REPLICAS[0])
-        names = tuple(b.name for b in chain)
-        nodes |= {n: (n,) for n in names} if placement == "process" else {replica: names}
-    return Graph(expression, placement, tuple(bricks), tuple(links), nodes)
+    hosted: dict[str, tuple[str, ...]] = {}
+    for replica in replicas:
+        chain, inside = replica_of(names, replica)
+        bricks += chain
+        links += inside
+        standby = replica != leader
+        links += [
+            Link("proxy", "pxy2pro", f"{replica}/protocol", "pxy2pro", standby),
+            Link(f"{replica}/protocol", "pro2pxy", "proxy", "pro2pxy", standby),
+        ]
+        chain_names = tuple(b.name for b in chain)
+        hosted |= {n: (n,) for n in chain_names} if placement == "process" else {replica: chain_names}
+    if placement == "single":  # both replicas in one node: nothing that a crash would leave over
+        hosted = {"single": tuple(name for bricks_of in hosted.values() for name in bricks_of)}
+    return Graph("+".join(names), placement, tuple(bricks), tuple(links), nodes | hosted)
 
 
-def replica_bricks(mechanism: Mechanism, replica: str) -> list[BrickSpec]:
-    """Protocol, Before, Proceed, After, Server of one replica."""
-    kinds = ("protocol", mechanism.before, mechanism.proceed, mechanism.after, "server")
-    return [BrickSpec(f"{replica}/{part}", kind) for part, kind in zip(CHAIN_PARTS, kinds, strict=True)]
+ALARMS: Final = {"a": "wdg2rec", "b": "wdg2rec.b"}  # Recovery's port for each replica's Watchdog
 
 
-def replica_links(replica: str, *, standby: bool) -> list[Link]:
-    """The links inside one replica, and its two to the Proxy (`standby`: not the Proxy's yet)."""
-    links = [Link(f"{replica}/{s}", port, f"{replica}/{k}", port) for s, port, k in _CHAIN]
-    return links + [
-        Link("proxy", "pxy2pro", f"{replica}/protocol", "pxy2pro", standby),
-        Link(f"{replica}/protocol", "pro2pxy", "proxy", "pro2pxy", standby),
-    ]
+def replica_of(names: tuple[str, ...], replica: str) -> tuple[list[BrickSpec], list[Link]]:
+    """The chain of one replica: its bricks, in the order of a request, and the links among them."""
+    bricks, links = _stage(names, f"{replica}/", "", replica)
+    return [*bricks, BrickSpec(f"{replica}/server", "server")], links
+
+
+def _stage(names: tuple[str, ...], at: str, prefix: str, replica: str) -> tuple[list[BrickSpec], list[Link]]:
+    """Protocol, Before, Proceed and After of `names[0]`, with the rest of `names` as its Proceed."""
+    row, rest = MECHANISMS[names[0]], names[1:]
+    server = f"{replica}/server"
+
+    def brick(part: str) -> str:
+        return server if part == "server" else f"{at}{prefix}{part}"
+
+    protocol = BrickSpec(brick("protocol"), "inner.protocol" if prefix else "protocol")
+    before, after = BrickSpec(brick("before"), row.before), BrickSpec(brick("after"), row.after)
+    links = [Link(protocol.name, "pro2bfr", before.name, "pro2bfr")]
+    if rest:
+        inner, inner_links = _stage(rest, at, f"{rest[0]}.", replica)
+        links += [
+            Link(before.name, "bfr2prd", inner[0].name, "pxy2pro"),
+            *inner_links,
+            Link(inner[0].name, "pro2pxy", after.name, "prd2aft"),
+        ]
+    else:
+        inner = [BrickSpec(brick("proceed"), row.proceed)]
+        links += [
+            Link(before.name, "bfr2prd", inner[0].name, "bfr2prd"),
+            Link(inner[0].name, "prd2srv", server, "prd2srv"),
+            Link(server, "srv2prd", inner[0].name, "srv2prd"),
+            Link(inner[0].name, "prd2aft", after.name, "prd2aft"),
+        ]
+    links += [Link(brick(source), port, brick(sink), port) for source, port, sink in row.own]
+    links.append(Link(after.name, "aft2pro", protocol.name, "aft2pro"))
+    return [protocol, before, *inner, after], links

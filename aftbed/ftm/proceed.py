@@ -6,7 +6,7 @@ from typing import Final
 from aftbed.core.brick import Brick, BrickState, Effect, Note, Send
 from aftbed.core.errors import PeerError
 from aftbed.core.event import Event
-from aftbed.core.message import AnyMessage, Rebound, Reply, Request
+from aftbed.core.message import AnyMessage, Rebound, Reply, Request, TakeOver
 
 
 class State(BrickState):
@@ -14,7 +14,11 @@ class State(BrickState):
     COMPUTING = auto()  # the Server has it
 
 
-MOVES: Final = {(State.IDLE, Request): State.COMPUTING, (State.COMPUTING, Reply): State.IDLE}
+MOVES: Final = {
+    (State.IDLE, Request): State.COMPUTING,
+    (State.IDLE, TakeOver): State.IDLE,
+    (State.COMPUTING, Reply): State.IDLE,
+}
 _ENTER: Final = Event.PROCEED_ENTER  # bound once: a look-up in an enumeration is slow on the hot path
 OPEN: Final = {State.IDLE: ("bfr2prd",), State.COMPUTING: ("srv2prd",)}
 
@@ -34,7 +38,7 @@ class Compute(Brick):
         return self.state is State.IDLE
 
     def step(self, port: str, msg: AnyMessage, now_ns: int) -> list[Effect]:
-        """Have it computed, or hand on the result."""
+        """Have it computed, or hand on the result; a TakeOver goes behind the results of all before it."""
         state = MOVES.get((self.state, type(msg)))
         if state is None:
             if isinstance(msg, Rebound):
@@ -43,5 +47,5 @@ class Compute(Brick):
         self.state = state
         if isinstance(msg, Request):
             return [Note(_ENTER, msg.request_id), Send("prd2srv", msg)]
-        assert isinstance(msg, Reply)
+        assert isinstance(msg, Reply | TakeOver)
         return [Send("prd2aft", msg)]

@@ -9,6 +9,10 @@ the middle of a failover is replaced by one that knows as much.
 | suspected | there             | failover: the backup leads      |
 | any       | suspected         | drop backup: the leader alone   |
 | sound     | none, slot vacant | new backup, by state transfer   |
+
+By which ports a leader speaks to its backup, and whose state a new backup needs, is the mechanism's
+business: the runtime says so with the situation. Where there is no such port, there is one replica, and
+nothing to be done about it.
 """
 
 from typing import Final
@@ -35,6 +39,8 @@ _OPEN: Final = ("wdg2rec", "wdg2rec.b")
 FAILURES_MAX: Final = 5  # scripts for a new backup that may fail in a row before Recovery gives up
 RETRY_NS: Final = 50_000_000
 
+Ports = tuple[tuple[str, str], ...]  # parts of the leader, each with its port to the same part of the backup
+
 
 def failover(dead: str, backup: str, epoch: int) -> Script:
     """Fence, drain, promote, attach; the kill comes last, since a fenced replica can do no harm."""
@@ -43,14 +49,13 @@ def failover(dead: str, backup: str, epoch: int) -> Script:
     )
 
 
-def drop_backup(leader: str, backup: str) -> Script:
+def drop_backup(leader: str, backup: str, replication: Ports) -> Script:
     """The leader goes on alone."""
-    return Script(
-        "drop backup", backup, (), (Fence(backup), Unbind(f"{leader}/after", "aft2aft"), Kill(backup))
-    )
+    unbinds = (Unbind(f"{leader}/{part}", port) for part, port in replication)
+    return Script("drop backup", backup, (), (Fence(backup), *unbinds, Kill(backup)))
 
 
-def new_backup(leader: str, replica: str) -> Script:
+def new_backup(leader: str, replica: str, replication: Ports, stateful: tuple[str, ...]) -> Script:
     """State transfer at a quiescent point; all that is slow happens in `prepare`."""
     return Script(
         "new backup",
@@ -58,9 +63,8 @@ def new_backup(leader: str, replica: str) -> Script:
         (Spawn(replica),),
         (
             Suspend(f"{leader}/protocol"),
-            Transfer(f"{leader}/protocol", f"{replica}/protocol"),
-            Transfer(f"{leader}/server", f"{replica}/server"),
-            Bind(f"{leader}/after", "aft2aft", f"{replica}/after"),
+            *(Transfer(f"{leader}/{part}", f"{replica}/{part}") for part in stateful),
+            *(Bind(f"{leader}/{part}", port, f"{replica}/{part}") for part, port in replication),
             Resume(f"{leader}/protocol"),
         ),
     )
@@ -68,14 +72,14 @@ def new_backup(leader: str, replica: str) -> Script:
 
 def decide(now: Situation, suspects: set[tuple[str, int]]) -> Script | None:
     """The script that the table of the module asks for, or None."""
-    if not now.leader:
+    if not now.leader or not now.replication:
         return None
     if now.backup and (now.backup, now.backup_generation) in suspects:
-        return drop_backup(now.leader, now.backup)
+        return drop_backup(now.leader, now.backup, now.replication)
     if (now.leader, now.leader_generation) in suspects:
         return failover(now.leader, now.backup, now.epoch + 1) if now.backup else None
     if not now.backup and now.vacant:
-        return new_backup(now.leader, now.vacant[0])
+        return new_backup(now.leader, now.vacant[0], now.replication, now.stateful)
     return None
 
 

@@ -1,7 +1,18 @@
-"""Server: the protected function behind three messages: execute, capture, restore (paper, III-A).
+"""Server: the protected function behind four messages: execute, try, capture, restore (paper, III-A).
 
-State access is the A of FT/A/R that PBR needs. The function is a stranger: bytes in, bytes out. Under
-a mechanism that captures the state after each request, a leader's Server is open for one thing at a time.
+State access is the A of FT/A/R that PBR and TR need. The function is a stranger: bytes in, bytes out. So is
+the mechanism: a Server learns what will be asked of it from where its outputs lead, which it is told. So a
+switch to another mechanism never exchanges it.
+
+| `srv2aft` leads | `srv2bfr` leads | as under    | open for                                             |
+|-----------------|-----------------|-------------|------------------------------------------------------|
+| nowhere         | nowhere         | lfr, assert | requests                                             |
+| to an After     | nowhere         | pbr         | a request, then the question for the state after it  |
+| nowhere         | to a Before     | tr          | trials, and the question for the state before them   |
+| to an After     | to a Before     | pbr+tr      | all of these                                         |
+
+Without tr one port is open at a time, in which a host can block; to wait for two costs it a poll. Under tr
+nothing here tells which one is next: a vote takes two trials, or three.
 """
 
 from enum import auto
@@ -10,7 +21,7 @@ from typing import Final
 from aftbed.core.application import Application
 from aftbed.core.brick import Brick, BrickState, Effect, Note, Send
 from aftbed.core.errors import PeerError
-from aftbed.core.event import Event
+from aftbed.core.event import RERUN, Event
 from aftbed.core.message import (
     AnyMessage,
     CaptureState,
@@ -20,25 +31,39 @@ from aftbed.core.message import (
     RestoreState,
     StateCaptured,
     StateRestored,
+    Trial,
+    Tried,
 )
 
 
 class State(BrickState):
-    STANDBY = auto()  # of a backup: states to restore, until the first request makes it a leader's
+    STANDBY = auto()  # a backup's or a leader's: the first request decides
     READY = auto()  # for a request
-    EXECUTED = auto()  # the state after it will be asked for
+    EXECUTED = auto()  # After will ask for the state after it
 
 
-OPEN: Final[dict[State, tuple[str, ...]]] = {
-    State.STANDBY: ("aft2srv", "prd2srv"),
-    State.READY: ("prd2srv",),
-    State.EXECUTED: ("aft2srv",),
+MOVES: Final = {  # where After does not ask for the state, what leads to EXECUTED leads to READY
+    ("prd2srv", State.STANDBY, Request): State.EXECUTED,
+    ("prd2srv", State.STANDBY, Trial): State.EXECUTED,
+    ("prd2srv", State.READY, Request): State.EXECUTED,
+    ("prd2srv", State.READY, Trial): State.EXECUTED,
+    ("prd2srv", State.EXECUTED, Trial): State.EXECUTED,  # a rerun, before After asks
+    ("aft2srv", State.STANDBY, RestoreState): State.STANDBY,
+    ("aft2srv", State.EXECUTED, CaptureState): State.READY,
+    ("bfr2srv", State.STANDBY, CaptureState): State.STANDBY,
+    ("bfr2srv", State.READY, CaptureState): State.READY,
 }
-_MESSAGES: Final = {
-    State.STANDBY: (Request, RestoreState),
-    State.READY: (Request,),
-    State.EXECUTED: (CaptureState,),
+OPEN: Final[dict[tuple[bool, bool], dict[State, tuple[str, ...]]]] = {  # by what leads: srv2aft, srv2bfr
+    (False, False): dict.fromkeys(State, ("prd2srv",)),
+    (True, False): {
+        State.STANDBY: ("aft2srv", "prd2srv"),
+        State.READY: ("prd2srv",),
+        State.EXECUTED: ("aft2srv",),
+    },
+    (False, True): dict.fromkeys(State, ("bfr2srv", "prd2srv")),
+    (True, True): dict.fromkeys(State, ("aft2srv", "bfr2srv", "prd2srv")),
 }
+_ANSWERED_ON: Final = {"aft2srv": "srv2aft", "bfr2srv": "srv2bfr"}
 
 # Bound once: a look-up in an enumeration is slow on the hot path.
 _READY: Final = State.READY
@@ -51,23 +76,26 @@ _CAPTURED: Final = Event.STATE_CAPTURED
 class Server(Brick):
     """`replica` (1 or 2) marks whose replies these are; `captured`: After asks for the state each time."""
 
-    def __init__(self, application: Application, replica: int, *, leads: bool, captured: bool) -> None:
-        self.application, self.replica, self.captured = application, replica, captured
-        self.state = State.READY if leads else State.STANDBY
+    def __init__(self, application: Application, replica: int) -> None:
+        self.application, self.replica = application, replica
+        self.state = State.STANDBY
+        self.captured = self.tried = False
+        self._open = OPEN[self.captured, self.tried]
 
     def open_ports(self) -> tuple[str, ...]:
-        """By state; see OPEN."""
-        return OPEN[self.state]
+        """By where the outputs lead and by state; see OPEN."""
+        return self._open[self.state]
 
     def quiescent(self) -> bool:
         """Nothing executed whose state is still to be captured."""
         return self.state is not State.EXECUTED
 
     def step(self, port: str, msg: AnyMessage, now_ns: int) -> list[Effect]:
-        """Execute, capture or restore."""
-        if not isinstance(msg, _MESSAGES[self.state]):
+        """Execute, try, capture or restore."""
+        state = MOVES.get((port, self.state, type(msg)))
+        if state is None:
             if isinstance(msg, Rebound):
-                return []
+                return self._rebound(msg)
             raise PeerError(f"{type(msg).__name__} on {port} while {self.state.name}")
         if isinstance(msg, Request):
             payload = self._execute(msg.payload)
@@ -78,16 +106,31 @@ class Server(Brick):
                 Send("srv2prd", Reply(msg.epoch, msg.request_id, self.replica, payload)),
             ]
         if isinstance(msg, CaptureState):
-            self.state = _READY
-            return [
-                Note(_CAPTURED, msg.request_id),
-                Send("srv2aft", StateCaptured(msg.epoch, msg.request_id, self.application.capture())),
-            ]
+            self.state = state
+            captured = StateCaptured(msg.epoch, msg.request_id, self.application.capture())
+            return [Note(_CAPTURED, msg.request_id), Send(_ANSWERED_ON[port], captured)]
+        if isinstance(msg, Trial):
+            return self._try(msg)
         assert isinstance(msg, RestoreState)
         self.application.restore(msg.state)
         return [
             Note(Event.STATE_RESTORED, msg.request_id),
             Send("srv2aft", StateRestored(msg.epoch, msg.request_id)),
+        ]
+
+    def _try(self, msg: Trial) -> list[Effect]:
+        """Execute, from the state of before if this is not the first time."""
+        if msg.rerun:
+            self.application.restore(msg.state)
+        elif self.state is _EXECUTED:
+            raise PeerError(f"Trial of request {msg.request_id}, and the state of the last is not captured")
+        payload, detail = self._execute(msg.payload), RERUN if msg.rerun else 0
+        self.state = _EXECUTED if self.captured else _READY
+        tried = Tried(msg.epoch, msg.request_id, self.replica, payload, self.application.capture())
+        return [
+            Note(_ENTER, msg.request_id, detail),
+            Note(_EXIT, msg.request_id, detail),
+            Send("srv2prd", tried),
         ]
 
     def _execute(self, request: bytes) -> bytes:
@@ -97,6 +140,15 @@ class Server(Brick):
         except PeerError:
             return b""
 
+    def _rebound(self, msg: Rebound) -> list[Effect]:
+        """Learn what will be asked. Who hears of an After anew may be a backup from now on, or a leader."""
+        if msg.port == "srv2aft":
+            self.captured, self.state = msg.bound, State.STANDBY
+        elif msg.port == "srv2bfr":
+            self.tried = msg.bound
+        self._open = OPEN[self.captured, self.tried]
+        return []
+
     def capture(self) -> bytes:
         """The function's state."""
         return self.application.capture()
@@ -104,3 +156,8 @@ class Server(Brick):
     def restore(self, state: bytes) -> None:
         """Take over a function's state."""
         self.application.restore(state)
+
+    def migrate(self, state: bytes) -> None:
+        """Take over the state of another function, which has been this one's until now."""
+        migrate = getattr(self.application, "migrate", self.application.restore)
+        migrate(state)

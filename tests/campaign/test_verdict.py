@@ -14,7 +14,7 @@ from aftbed.campaign.record import read_record
 from aftbed.campaign.verdict import EXIT_CODES, Verdict, judge
 from aftbed.core.errors import ConfigError
 from aftbed.core.event import Event
-from aftbed.core.fault import Act, Fault, Trigger
+from aftbed.core.fault import Act, Fault, Flip, Place, Trigger, flipped
 from aftbed.core.journal import DROPPED_OFFSET, EntryKind
 from aftbed.runtime.unix.journal import Dialogue, Journal
 from aftbed.runtime.unix.options import CarRun, LoadRun, ReplayRun, RunOptions, Work
@@ -26,6 +26,7 @@ START_NS: Final = 10**12
 CAR: Final = CarRun("ccrs-50", None, "latch")
 STOPPED: Final = VehicleResult(False, None, 2.5, 2.5, 9.0, True)
 CRASH: Final = Fault(Act.CRASH, "primary", Trigger("checkpoint.sent", 2))
+FLIP: Final = Fault(Act.BITFLIP, "primary", Trigger("server.exit", 2), flip=Flip(Place.RESULT, 8))
 FIRST_GENERATION: Final = 1 << 8
 
 
@@ -52,8 +53,10 @@ class RecordInTheMaking:
         self.t_ns += MS
         self._journals[journal].write(self.t_ns, event, request_id, detail)
 
-    def request(self, epoch: int = 1, replica: int = 1, answers: int = 1) -> None:
-        """One request, served as it should be; answered `answers` times."""
+    def request(
+        self, epoch: int = 1, replica: int = 1, answers: int = 1, flipped_bit: int | None = None
+    ) -> None:
+        """One request, served as it should be, but for `flipped_bit`; answered `answers` times."""
         self.sent += 1
         payload = sample_requests(7, self.sent)[-1]
         self.t_ns += MS
@@ -61,6 +64,8 @@ class RecordInTheMaking:
         self.note(f"{'ab'[replica - 1]}-server.1", Event.SERVER_EXIT, self.sent)
         self.note("proxy.1", Event.REPLY_ACCEPTED, self.sent, epoch << 8 | replica)
         reply = self._bare.execute(payload)
+        if flipped_bit is not None:
+            reply = flipped(reply, flipped_bit)
         for _ in range(answers):
             self._dialogue.write(self.t_ns, self.sent, epoch, EntryKind.ANSWERED, reply)
 
@@ -326,6 +331,61 @@ def test_a_replay_gives_its_figures_and_needs_no_car(path: Path) -> None:
     verdict = record.verdict()
     assert (verdict.scenario, verdict.replay, verdict.vehicle) == ("replay drive.log", {"played": 5}, None)
     assert verdict.verdict == "pass" and "vehicle" not in verdict.checks
+
+
+# -- value faults
+
+
+def hit(path: Path, receipt: str = "applied", detail: str = "bit 8 of the result") -> RecordInTheMaking:
+    """A run in which a bit was to be flipped."""
+    record = whole(path, faults=(FLIP,))
+    assert record.end is not None
+    record.end["faults"] = [{"fault": str(FLIP), "receipt": receipt, "detail": detail}]
+    return record
+
+
+def test_a_value_fault_that_never_reached_the_client_passes(path: Path) -> None:
+    verdict = hit(path).verdict()
+    assert (verdict.verdict, verdict.checks["value"], verdict.requests.wrong) == ("pass", "pass", 0)
+    assert verdict.faults == [{"fault": str(FLIP), "receipt": "applied", "detail": "bit 8 of the result"}]
+
+
+def test_a_value_fault_that_did_fails_and_says_what_it_asked_of_the_brakes(path: Path) -> None:
+    record = hit(path)
+    record.request(flipped_bit=8)  # byte 1 is the stage
+    verdict = record.verdict()
+    assert (verdict.verdict, verdict.requests.wrong) == ("fail", 1)
+    assert verdict.checks["value"] == verdict.checks["one_history"] == "fail"
+    assert verdict.reasons[-1] == "value: request 4: sdc: stage 1 instead of 0"
+
+
+def test_where_none_was_asked_for_there_is_no_such_check(path: Path) -> None:
+    record = whole(path, faults=(CRASH,))
+    record.failover()
+    assert "value" not in record.verdict().checks
+    assert "value" not in whole(path.parent / "other").verdict().checks
+
+
+def test_a_value_fault_that_was_not_applied_proves_nothing(path: Path) -> None:
+    verdict = hit(path, "not_activated", "there are 264 bits").verdict()
+    assert (verdict.verdict, verdict.checks["value"]) == ("inconclusive", "unknown")
+    assert verdict.reasons == [
+        f"faults_applied: not_activated: {FLIP}: there are 264 bits",
+        "value: no value fault was applied",
+    ]
+
+
+def test_a_wrong_reply_weighs_more_than_a_missing_receipt(path: Path) -> None:
+    record = hit(path)
+    record.request(flipped_bit=8)
+    record.end = None
+    assert (record.verdict().verdict, record.verdict().checks["value"]) == ("fail", "fail")
+
+
+def test_without_an_end_it_is_not_known_whether_a_bit_was_flipped(path: Path) -> None:
+    record = hit(path)
+    record.end = None
+    assert record.verdict().checks["value"] == "unknown"
 
 
 # -- records that are none

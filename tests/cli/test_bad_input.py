@@ -88,7 +88,7 @@ def all_words(error: str, *words: str) -> bool:
         (("--ftm", "pbrr"), ("unknown FTM 'pbrr'", "did you mean 'pbr'", "none")),
         (("--ftm", "PBR"), ("unknown FTM 'PBR'", "none, pbr")),
         (("--placement", "replicas"), ("unknown placement", "did you mean 'replica'", "process")),
-        (("--placement", "single"), ("unknown placement 'single'",)),
+        (("--placement", "double"), ("unknown placement 'double'", "single")),
         (("--brake-policy", "latched"), ("unknown brake policy", "did you mean 'latch'", "hold")),
         (("--pace", "fast"), ("--pace fast", "real, max, or a factor")),
         (("--pace", "0"), ("--pace 0", "0.01 to 100")),

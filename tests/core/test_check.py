@@ -11,7 +11,7 @@ import pytest
 from aftbed.core import check
 from aftbed.core.check import LATE_NS, REASONS_MAX, Check, Failover, History, Requests
 from aftbed.core.errors import PeerError
-from aftbed.core.event import Event
+from aftbed.core.event import RERUN, Event
 from aftbed.core.journal import Entry, EntryKind, Record
 
 MS = 1_000_000
@@ -64,6 +64,9 @@ class Tale:
 
     def executed(self, number: int, server: str = "a/server.1") -> "Tale":
         return self.note(server, Event.SERVER_EXIT, number)
+
+    def rerun(self, number: int, server: str = "a/server.1") -> "Tale":
+        return self.note(server, Event.SERVER_EXIT, number, RERUN)
 
     def restored(self, number: int, server: str = "b/server.1") -> "Tale":
         return self.note(server, Event.STATE_RESTORED, number)
@@ -135,6 +138,26 @@ def test_a_good_history_passes_every_check() -> None:
             "at_most_once",
             "b/server.1: request 1 (state.restored) after 2",
         ),
+        (
+            lambda: Tale().served(1).rerun(1).executed(1),  # after the vote, from the state after it
+            "at_most_once",
+            "a/server.1: request 1 (server.exit) after 1",
+        ),
+        (
+            lambda: Tale().served(1).served(2).rerun(1),  # undoes what 2 did
+            "at_most_once",
+            "a/server.1: request 1 (server.exit) after 2",
+        ),
+        (
+            lambda: Tale().served(1).rerun(1, "b/server.1"),  # of a checkpoint, not of an execution
+            "at_most_once",
+            "b/server.1: request 1 (server.exit) after 1",
+        ),
+        (
+            lambda: Tale().served(1).rerun(1).restored(1, "a/server.1"),
+            "at_most_once",
+            "a/server.1: request 1 (state.restored) after 1",
+        ),
         (lambda: good().sent(4), "exactly_one_answer", "request 4: 0 replies"),
         (
             lambda: good().answered(3, payload=good().dialogue[-1].payload),
@@ -204,6 +227,12 @@ def test_what_one_server_did_is_not_held_against_the_next() -> None:
     tale = Tale().served(1).sent(2).executed(2).fenced(1).promoted(2).executed(2, "b/server.1")
     assert check.at_most_once(tale.history()) == Check("pass")
     tale.executed(3, "a/server.1").executed(3, "a/server.2")
+    assert check.at_most_once(tale.history()) == Check("pass")
+
+
+def test_a_rerun_stands_in_the_place_of_the_run_before_it() -> None:
+    """A vote of two, a vote of three, and what follows: one effect for each request."""
+    tale = Tale().sent(1).executed(1).rerun(1).sent(2).executed(2).rerun(2).rerun(2).executed(3)
     assert check.at_most_once(tale.history()) == Check("pass")
 
 
@@ -365,3 +394,15 @@ def test_each_failover_is_told_in_order() -> None:
 
 def test_no_failover_no_figures() -> None:
     assert check.failovers(Tale().served(1).history()) == []
+
+
+def test_two_servers_in_one_node_are_two() -> None:
+    """Placement `single`: what one has executed, the other restores; each by itself only grows."""
+
+    def record(at: int, event: Event, request_id: int, brick: int) -> Record:
+        return Record(at, event, request_id, 0, "single", brick)
+
+    sound = [record(1, Event.SERVER_EXIT, 1, 4), record(2, Event.STATE_RESTORED, 1, 9)]
+    assert check.at_most_once(History({"single.1": sound}, [])).finding == "pass"
+    broken = [*sound, record(3, Event.SERVER_EXIT, 1, 9)]
+    assert check.at_most_once(History({"single.1": broken}, [])).finding == "fail"

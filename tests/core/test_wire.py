@@ -9,12 +9,21 @@ from hypothesis import strategies as st
 
 from aftbed.core import wire
 from aftbed.core.errors import PeerError
-from aftbed.core.message import AnyMessage, Checkpoint, Message, Reply, Request, Suspect, WireMessage
+from aftbed.core.message import AnyMessage, Checkpoint, Message, Reply, Request, Suspect, Tried, WireMessage
 
 KINDS: Final[tuple[type[Message], ...]] = get_args(WireMessage)
 
 numbers = st.integers(0, 2**64 - 1)
-BY_TYPE: Final = {int: numbers, bytes: st.binary(max_size=300), str: st.text(max_size=40)}
+BY_TYPE: Final = {
+    int: numbers,
+    bytes: st.binary(max_size=300),
+    str: st.text(max_size=40),
+    bool: st.booleans(),
+    tuple[Tried, ...]: st.lists(
+        st.builds(Tried, numbers, numbers, numbers, st.binary(max_size=99), st.binary(max_size=99)),
+        max_size=3,
+    ).map(tuple),
+}
 messages = st.one_of(
     *(st.builds(kind, *(BY_TYPE[f.type] for f in msgspec.structs.fields(kind))) for kind in KINDS)
 )

@@ -5,13 +5,13 @@ Each verb is a generator of stages, so that anything may happen between two of t
 
 from collections.abc import Iterator
 from enum import Enum, auto
-from typing import TYPE_CHECKING, Final, assert_never
+from typing import TYPE_CHECKING, Final
 
 from aftbed.core import script
 from aftbed.core.event import Event
 from aftbed.core.graph import Link
 from aftbed.core.message import Promote
-from aftbed.ftm.mechanism import CHAIN_PARTS, REPLICAS
+from aftbed.ftm.mechanism import REPLICAS
 
 if TYPE_CHECKING:
     from harness import World
@@ -99,25 +99,25 @@ class Executive:
                 yield from self._resume(brick)
             case script.Transfer(source, sink):
                 yield from self._transfer(source, sink)
-            case script.Bind(brick, port, target):
-                yield from self._bind(brick, port, target)
+            case script.Bind():
+                yield from self._bind(verb.link)
             case script.Unbind(brick, port):
                 yield from self._unbind(brick, port)
             case _:
-                assert_never(verb)
+                raise AssertionError(f"{verb} belongs into an adaptation")
 
     def _spawn(self, replica: str) -> None:
         world = self._world
         world.saying(f"spawn {replica}")
         world.generation[replica] += 1
         world.vacant.remove(replica)
-        names = {f"{replica}/{part}" for part in CHAIN_PARTS}
+        names = set(world.parts[replica])
         links = [k for k in world.graph.links if {k.source, k.sink} <= names | {"proxy"}]
         links = [k for k in links if {k.source, k.sink} & names]
         for link in links:
             world.renew(link)
-        for part in CHAIN_PARTS:
-            world.host(f"{replica}/{part}", leads=False)
+        for name in world.parts[replica]:
+            world.host(name, leads=False)
         for link in links:
             world.connect(link)
         world.watch(replica)
@@ -126,8 +126,7 @@ class Executive:
         world = self._world
         world.saying(f"fence {replica}")
         for channel in world.channels.values():
-            source, _, part = channel.link.source.partition("/")
-            channel.ended = channel.ended or (source == replica and part in CHAIN_PARTS)
+            channel.ended = channel.ended or channel.link.source in world.parts[replica]
         if replica == world.leader:
             world.leader = ""
         detail = world.generation[replica] << 8 | REPLICAS.index(replica) + 1
@@ -147,11 +146,12 @@ class Executive:
     def _promote(self, replica: str, epoch: int) -> Stages:
         world = self._world
         world.saying(f"promote {replica} epoch={epoch}")
-        if f"{replica}/after" not in world.hosts:
+        first, _ = world.replication[0]  # the one that a request meets first of those that hear of the leader
+        if f"{replica}/{first}" not in world.hosts:
             yield Stage.FAILED
-        world.tell(f"{replica}/after", Promote(epoch))
+        world.tell(f"{replica}/{first}", Promote(epoch))
         while (f"{replica}/protocol", epoch) not in world.promoted:
-            whole = len(world.chain(replica)) == len(CHAIN_PARTS)
+            whole = len(world.chain(replica)) == len(world.parts[replica])
             yield Stage.WAIT if whole else Stage.FAILED
 
     def _attach(self, replica: str, epoch: int) -> Stages:
@@ -188,24 +188,25 @@ class Executive:
             yield Stage.FAILED
         hosts[sink].brick.restore(hosts[source].brick.capture())
 
-    def _bind(self, brick: str, port: str, target: str) -> Stages:
+    def _bind(self, link: Link) -> Stages:
         world = self._world
-        world.saying(f"bind {port} of {brick} to {target}")
-        if port == "aft2aft":
-            world.backup = target.partition("/")[0]
-        if target not in world.hosts:
+        world.saying(f"bind {link.source_port} of {link.source} to {link.sink}")
+        if link.source.partition("/")[0] == world.leader != link.sink.partition("/")[0]:
+            world.backup = link.sink.partition("/")[0]  # from here on it holds all that the leader holds
+        if link.sink not in world.hosts:
             yield Stage.FAILED
-        channel = world.renew(Link(brick, port, target, port))
+        channel = world.renew(link)
         world.bind_input(channel)
         yield Stage.GO
-        if brick not in world.hosts:
+        if link.source not in world.hosts:
             yield Stage.FAILED
-        world.bind_output(channel, brick, port)
+        world.bind_output(channel, link.source, link.source_port)
 
     def _unbind(self, brick: str, port: str) -> Stages:
         world = self._world
         world.saying(f"unbind {port} of {brick}")
-        world.backup = ""
+        if (brick.partition("/")[2], port) in world.replication:
+            world.backup = ""
         if brick not in world.hosts:
             yield Stage.FAILED
         world.bind_output(None, brick, port)

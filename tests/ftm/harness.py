@@ -5,18 +5,21 @@ can be put between any two of them, also between two effects of one step. What m
 of moves; `choose` picks one (the first, for a dialogue that a person reads; a random one, for the rest).
 
 What the runtime does is done too (scripts: see `executive`), in its order: a fenced channel ends after what
-was sent, a brick that writes to it dies, what is suspended takes no mail, mail for a closed port waits.
+was sent, a brick that writes to it dies, what is suspended takes no mail, mail for a closed port waits. So
+are value faults (see `spoiling`).
 """
 
 from collections import deque
 from collections.abc import Callable
-from typing import Final, NamedTuple
+from typing import Final
 
 from counting import Counting
 from executive import Executive
+from hosts import Channel, Host, Sent
+from spoiling import Spoil, spoiled
 
 from aftbed.core import wire
-from aftbed.core.brick import CONTROL, Brick, Effect, Note, Order, Send
+from aftbed.core.brick import CONTROL, Halt, Note, Order, Send
 from aftbed.core.check import History
 from aftbed.core.errors import PeerError
 from aftbed.core.event import Event
@@ -32,53 +35,22 @@ from aftbed.core.message import (
     Reply,
     Situation,
     Submit,
-    Suspect,
-    TakeOver,
     Watch,
 )
 from aftbed.ftm.catalog import Setting, make
 from aftbed.ftm.client import Client
-from aftbed.ftm.mechanism import CHAIN_PARTS, REPLICAS, build
+from aftbed.ftm.mechanism import REPLICAS, STATEFUL, build, chain, replication_of
+from aftbed.ftm.server import Server
 
-STEPS_MAX: Final = 20_000
+STEPS_MAX: Final = 60_000
 SUPERVISOR: Final = "supervisor"
-
-
-class Channel:
-    """`mail` in its order, each with the number of its sending; `ended`: nothing more will come."""
-
-    def __init__(self, link: Link) -> None:
-        self.link = link
-        self.mail: deque[tuple[int, Message]] = deque()
-        self.ended = False
-
-
-class Host:
-    """One brick with its effects still to be performed, and its ends of channels."""
-
-    def __init__(self, name: str, brick: Brick, journal: str) -> None:
-        self.name, self.brick, self.journal = name, brick, journal
-        self.todo: deque[Effect] = deque()
-        self.inputs: dict[str, Channel] = {}
-        self.outputs: dict[str, Channel] = {}
-        self.suspended = False
-
-
-class Sent(NamedTuple):
-    """One message that was put into a channel."""
-
-    link: str
-    message: Message
-
-    def __str__(self) -> str:
-        match self.message:
-            case Suspect(node=node, cause=cause):
-                about = f"{node} {cause}"
-            case TakeOver(epoch=epoch):
-                about = f"epoch={epoch}"
-            case message:
-                about = str(message.request_id)  # type: ignore[attr-defined]
-        return f"{self.link} {type(self.message).__name__}({about})"
+SAID: Final = (  # events that no message shows
+    Event.DEDUPE_HIT,
+    Event.REPLY_REFUSED,
+    Event.FOLLOWER_DIVERGED,
+    Event.VOTE_COMPARED,
+    Event.DETECTED_STOP,
+)
 
 
 Move = tuple[str, str]  # what, of which brick
@@ -91,15 +63,18 @@ def first(moves: list[Move]) -> Move:
 
 
 class World:
-    """A deployed `pbr` graph with its client, in the state after the launch."""
+    """The deployed graph of an expression with its client, in the state after the launch."""
 
-    def __init__(self, choose: Choose = first) -> None:
-        self.graph = build("pbr", "process")
+    def __init__(self, choose: Choose = first, expression: str = "pbr") -> None:
+        self.graph = build(expression, "process")
+        self.replication = replication_of(expression)
+        replicas = REPLICAS if self.replication else REPLICAS[:1]
+        self.parts = {replica: chain(self.graph, replica) for replica in replicas}
         self.choose = choose
         self.hosts: dict[str, Host] = {}
         self.channels: dict[tuple[str, str, str], Channel] = {}
-        self.leader, self.backup, self.epoch = "a", "b", 1
-        self.generation = {"a": 1, "b": 1}
+        self.leader, self.backup, self.epoch = "a", "b" if self.replication else "", 1
+        self.generation = dict.fromkeys(replicas, 1)
         self.vacant: list[str] = []
         self.now_ns = 0
         self.journals: dict[str, list[Record]] = {}
@@ -108,6 +83,7 @@ class World:
         self.saying: Callable[[str], None] = lambda what: None  # told of all that happens
         self.promoted: set[tuple[str, int]] = set()
         self.dead: deque[str] = deque()  # nodes whose Watchdog does not know yet
+        self.spoil: Spoil = lambda replica, request_id: None
         self.executive = Executive(self)
         self._accused: set[tuple[str, int]] = set()
         self._lives: dict[str, int] = {}
@@ -120,10 +96,11 @@ class World:
         for link in self.graph.links:
             self.renew(link)
         for spec in self.graph.bricks:
-            self.host(spec.name, leads=spec.replica == "a")
+            if spec.kind != "engine":  # what it would do is not done here
+                self.host(spec.name, leads=spec.replica == "a")
         for link in self.graph.links:
             self.connect(link)
-        for replica in REPLICAS:
+        for replica in self.parts:
             self.watch(replica)
         self.inform(failed=False)
         self.run()
@@ -182,12 +159,12 @@ class World:
 
     def chain(self, replica: str) -> list[str]:
         """The bricks of `replica` that are there."""
-        return [n for p in CHAIN_PARTS if (n := f"{replica}/{p}") in self.hosts]
+        return [name for name in self.parts[replica] if name in self.hosts]
 
     def watch(self, replica: str) -> None:
         watchdog = f"{replica}/watchdog"
         if watchdog in self.hosts:
-            nodes = tuple(f"{replica}/{part}" for part in CHAIN_PARTS)
+            nodes = self.parts[replica]
             self.tell(watchdog, Watch(replica, self.generation[replica], nodes))
             of_others = [node for node in self.dead if node not in nodes]
             gone = [] if replica in self.vacant else [node for node in nodes if not self.seems_alive(node)]
@@ -197,8 +174,17 @@ class World:
         if "recovery" in self.hosts:
             leads = self.generation.get(self.leader, 0)
             backs = self.generation.get(self.backup, 0)
-            vacant = tuple(self.vacant)
-            situation = Situation(self.leader, leads, self.backup, backs, self.epoch, vacant, failed)
+            situation = Situation(
+                self.leader,
+                leads,
+                self.backup,
+                backs,
+                self.epoch,
+                tuple(self.vacant),
+                failed,
+                self.replication,
+                STATEFUL,
+            )
             self.tell("recovery", situation)
 
     # -- what happens to it -------------------------------------------------------------------
@@ -212,7 +198,7 @@ class World:
 
     def crash(self, target: str) -> None:
         """A brick, or a whole replica, is gone, with what it had still to do."""
-        for name in self.chain(target) if target in REPLICAS else [target]:
+        for name in self.chain(target) if target in self.parts else [target]:
             if name in self.hosts:
                 del self.hosts[name]
                 self.dead.append(name)
@@ -248,7 +234,10 @@ class World:
         if host is None:
             return
         try:
-            host.todo.extend(host.brick.step(port, message, self.now_ns))
+            effects = host.brick.step(port, message, self.now_ns)
+            if isinstance(host.brick, Server):
+                effects = spoiled(self.spoil, name, host.brick, effects, self.saying)
+            host.todo.extend(effects)
         except PeerError as error:
             self.record(host.journal, Event.PEER_REFUSED, getattr(message, "request_id", 0), 0)
             if not isinstance(message, Rebound | ChannelEnded):  # told to all, of interest to some
@@ -302,9 +291,9 @@ class World:
         ready = [
             (channel.mail[0][0] if channel.mail else self.now_ns, port, host.name)
             for host in self.hosts.values()
-            if not host.todo and not (host.suspended and host.brick.quiescent())
+            if not host.todo
             for port, channel in host.inputs.items()
-            if port in host.brick.open_ports() and (channel.mail or channel.ended)
+            if (channel.mail or channel.ended) and host.takes(port)
         ]
         found += [(port, name) for _, port, name in sorted(ready)]
         return found + script if self.executive.waits else found
@@ -341,6 +330,11 @@ class World:
                 self.record(host.journal, event, request_id, detail)
             case Order(ordered):
                 self.executive.order(ordered)
+            case Halt(reason):
+                assert not host.todo, "a detected stop is the last effect"
+                del self.hosts[host.name]
+                self.dead.append(host.name)
+                self.saying(f"{host.name} stops: {reason}")
             case Send(port, message) if port == CONTROL:
                 assert isinstance(message, Promoted)
                 self.promoted.add((host.name, message.epoch))
@@ -349,7 +343,8 @@ class World:
                 assert isinstance(message, Reply)
                 self.replies.append(message)
                 self._write_down(message.request_id, message.epoch, EntryKind.ANSWERED, message.payload)
-                self.saying(f"deliver Reply({message.request_id})={message.payload.decode()}")
+                said = message.payload.decode(errors="replace")
+                self.saying(f"deliver Reply({message.request_id})={said}")
             case Send(port, message):
                 self._send(host, port, message)
 
@@ -367,8 +362,8 @@ class World:
     def record(self, journal: str, event: Event, request_id: int, detail: int) -> None:
         node = journal.rpartition(".")[0]
         self.journals[journal].append(Record(self.now_ns, event, request_id, detail, node))
-        if event in (Event.DEDUPE_HIT, Event.REPLY_REFUSED):
-            self.saying(f"{event}({request_id})")
+        if event in SAID:
+            self.saying(f"{event}({request_id})" + (f"={detail}" if event is Event.VOTE_COMPARED else ""))
 
     def _write_down(self, request_id: int, epoch: int, kind: EntryKind, payload: bytes) -> None:
         self.dialogue.append(Entry(self.now_ns, request_id, epoch, kind, payload))

@@ -5,13 +5,19 @@ from typing import Final, get_args
 
 from aftbed.core.brick import Brick, Effect, Note, Send
 from aftbed.core.event import Event
+from aftbed.core.graph import Graph
 from aftbed.core.message import (
+    Adapt,
+    Again,
     AnyMessage,
     CaptureState,
     ChannelEnded,
     Checkpoint,
+    Goal,
     Message,
     NodeDied,
+    Notification,
+    Progress,
     Promote,
     Promoted,
     Pulses,
@@ -26,10 +32,18 @@ from aftbed.core.message import (
     Submit,
     Suspect,
     TakeOver,
+    TakeUp,
+    Trial,
+    Trials,
+    Tried,
     Watch,
 )
+from aftbed.core.script import Phase, Script
+from aftbed.ftm.lfr import digest
 
 STATE: Final = b"\x92\x01\x02"  # of `Counting`: one request, checksum 2
+
+TRIED: Final = Tried(1, 1, 1, b"that", STATE)
 
 SAMPLES: Final[dict[type, AnyMessage]] = {
     type(message): message
@@ -43,6 +57,11 @@ SAMPLES: Final[dict[type, AnyMessage]] = {
         StateRestored(1, 1),
         StoreReply(1, 1, b"that"),
         TakeOver(2),
+        Notification(1, 1, digest(b"that")),
+        Trial(1, 1, b"what", STATE, False),
+        TRIED,
+        Trials(1, 1, (TRIED, TRIED)),
+        Again(1, 1),
         Suspect("a", 1, "a/after", "crash", 5),
         Promote(2),
         Promoted(2),
@@ -53,6 +72,9 @@ SAMPLES: Final[dict[type, AnyMessage]] = {
         NodeDied("a/after"),
         Pulses({"a/after": 0}),
         Situation("a", 1, "b", 1, 1, (), False),
+        Adapt(1, Goal("lfr"), Graph("pbr", "process", (), (), {})),
+        Progress(1, Phase.PREPARE, ""),
+        TakeUp(1, Script("pbr to lfr", "", (), ()), Phase.COMMIT, False, ""),
     )
 }
 assert set(SAMPLES) == set(get_args(AnyMessage)), "one sample of each type"
@@ -60,7 +82,8 @@ assert set(SAMPLES) == set(get_args(AnyMessage)), "one sample of each type"
 
 def inspected(brick: Brick) -> dict[str, object]:
     """All that a brick is, inside and outside, as a value."""
-    inside = {k: copy.deepcopy(v) for k, v in vars(brick).items() if k != "application"}
+    strangers = ("application", "_acceptable")
+    inside = {k: copy.deepcopy(v) for k, v in vars(brick).items() if k not in strangers}
     outside = (brick.open_ports(), brick.quiescent(), brick.deadline_ns(), brick.capture())
     return inside | {"outside": outside}
 

@@ -4,12 +4,13 @@ A file in `tests/golden` holds commands and, behind `>`, all that follows from e
 put into channels, in their order, and what the runtime did. `pytest --rewrite` writes what follows anew;
 a change is committed only when it is understood.
 
-    ftm pbr                                  deploy
+    ftm EXPRESSION                           deploy
     request 1 d=40 [until LINK Message(1)]   the next request, with its payload; stop after that message
     run [until ...]                          go on
     crash primary|backup|BRICK               it is gone, and whatever it had still to do
     accuse BRICK                             its Watchdog believes so; it lives
     replace BRICK                            of no replica: dead, and another in its place
+    flip REPLICA NTH result|state BIT        in its nth execution from now on, in the last byte of that
     check PROMISE ...                        the checkers of core, over all that happened
 """
 
@@ -21,8 +22,10 @@ from typing import Final
 import pytest
 from counting import Counting
 from harness import World
+from spoiling import Flips, Hit
 
 from aftbed.core import check
+from aftbed.core.fault import Place
 
 GOLDEN: Final = Path(__file__).parents[1] / "golden"
 COLUMNS: Final = 106
@@ -33,11 +36,12 @@ class Stage:
 
     def __init__(self) -> None:
         self.said: list[str] = []
+        self._flips = Flips()
         self._world: World | None = None
 
     @property
     def world(self) -> World:
-        assert self._world is not None, "`ftm pbr` comes first"
+        assert self._world is not None, "`ftm EXPRESSION` comes first"
         return self._world
 
     def obey(self, line: str) -> list[str]:
@@ -47,9 +51,9 @@ class Stage:
         self.said.clear()
         match command:
             case "ftm":
-                assert words == "pbr", words
-                self._world = World()
+                self._world = World(expression=words)
                 self._world.saying = self.said.append
+                self._world.spoil = self._flips
             case "request":
                 number, _, payload = words.partition(" ")
                 assert int(number) == len([e for e in self.world.dialogue if e.kind == 1]) + 1, "the next id"
@@ -63,6 +67,9 @@ class Stage:
                 self.world.accuse(words)
             case "replace":
                 self.world.replace(words)
+            case "flip":
+                replica, nth, place, bit = words.split()
+                self._flips.plan(replica, int(nth), Hit(Place(place), int(bit)))
             case "check":
                 self._check(words.split())
             case _:
@@ -102,11 +109,26 @@ def test_dialogue(path: Path, rewrite: bool) -> None:
 
 def test_the_dialogues_are_there() -> None:
     names = {path.stem for path in GOLDEN.glob("*.txt")}
-    assert {
-        "pbr_normal",
+    assert names >= {
+        "assert_refused",
+        "lfr_crash_after_notification",
+        "lfr_crash_before_execution",
+        "lfr_crash_before_forward",
+        "lfr_crash_of_follower",
+        "lfr_divergence",
+        "lfr_normal",
+        "lfr_tr",
+        "none_normal",
+        "pbr_assert_refused",
         "pbr_crash_after_checkpoint",
         "pbr_crash_before_checkpoint",
         "pbr_crash_of_backup",
         "pbr_duplicate_request",
         "pbr_false_alarm",
-    } <= names
+        "pbr_normal",
+        "pbr_tr",
+        "pbr_tr_no_majority",
+        "tr_corrected",
+        "tr_no_majority",
+        "tr_normal",
+    }

@@ -8,12 +8,15 @@ from typing import Final, NamedTuple
 
 import pytest
 from counting import Counting
-from samples import SAMPLES, inspected
+from samples import SAMPLES, STATE, TRIED, inspected
 
 from aftbed.core.brick import Brick, BrickState
 from aftbed.core.errors import PeerError
 from aftbed.core.message import (
+    Again,
+    AnyMessage,
     CaptureState,
+    ChannelEnded,
     Checkpoint,
     NodeDied,
     Promote,
@@ -25,18 +28,26 @@ from aftbed.core.message import (
     Situation,
     Submit,
     Suspect,
+    TakeOver,
+    Trial,
+    Trials,
+    Tried,
     Watch,
 )
-from aftbed.ftm import after, proceed, protocol, proxy, server
+from aftbed.ftm import after, assertion, inner, lfr, proceed, protocol, proxy, server, tr
 from aftbed.ftm.after import PbrAfter
+from aftbed.ftm.assertion import AssertAfter, AssertBefore
 from aftbed.ftm.before import PassBefore
+from aftbed.ftm.catalog import KINDS, Setting, make
 from aftbed.ftm.client import BACKLOG_MAX, Client
-from aftbed.ftm.engine import AdaptationEngine
+from aftbed.ftm.inner import InnerProtocol
+from aftbed.ftm.lfr import LfrAfter, LfrBefore
 from aftbed.ftm.proceed import Compute
 from aftbed.ftm.protocol import Protocol
 from aftbed.ftm.proxy import Proxy
 from aftbed.ftm.recovery import Recovery
 from aftbed.ftm.server import Server
+from aftbed.ftm.tr import TrAfter, TrBefore, TrProceed
 from aftbed.ftm.watchdog import Watchdog
 
 BOUND: Final = Rebound("pxy2pro", True, 1)
@@ -46,24 +57,39 @@ Moves = dict[tuple[BrickState, type], BrickState]
 
 
 class Case(NamedTuple):
-    """A brick, brought into its state by legal mail; `moves` is None where no table says what follows."""
+    """A brick, brought into its state by legal mail; `moves` is None where no table says what follows.
+
+    `sample` takes the place of the one of its type. A Server goes by the `port` of a message too.
+    """
 
     name: str
     make: Callable[[], Brick]
-    mail: tuple[type, ...]
+    mail: tuple[type | AnyMessage, ...]
     legal: frozenset[type]
     moves: Moves | None = None
+    sample: AnyMessage | None = None
+    port: str = "port"
+
+    def message(self, kind: type) -> AnyMessage:
+        return self.sample if type(self.sample) is kind and self.sample is not None else SAMPLES[kind]
 
 
 def by_table(
-    make: Callable[[], Brick], state: BrickState, mail: tuple[type, ...], moves: Moves, tells: frozenset[type]
+    make: Callable[[], Brick],
+    state: BrickState,
+    mail: tuple[type | AnyMessage, ...],
+    moves: Moves,
+    tells: frozenset[type],
+    sample: AnyMessage | None = None,
 ) -> Case:
     legal = frozenset(kind for at, kind in moves if at is state)
-    return Case(f"{type(make()).__name__} {state.name}", make, mail, legal | tells, moves)
+    return Case(f"{type(make()).__name__} {state.name}", make, mail, legal | tells, moves, sample)
 
 
-def by_hand(name: str, make: Callable[[], Brick], mail: tuple[type, ...], *legal: type) -> Case:
-    return Case(name, make, mail, frozenset(legal))
+def by_hand(
+    name: str, make: Callable[[], Brick], mail: tuple[type, ...], *legal: type, port: str = "port"
+) -> Case:
+    return Case(name, make, mail, frozenset(legal), port=port)
 
 
 def backup_protocol() -> Brick:
@@ -88,12 +114,34 @@ def bound_proxy() -> Brick:
     return brick
 
 
-def new_server(*, leads: bool, captured: bool = True) -> Brick:
-    return Server(Counting(), 1, leads=leads, captured=captured)
+def server_of(*outputs: str) -> Callable[[], Brick]:
+    def make() -> Brick:
+        brick = Server(Counting(), 1)
+        for port in outputs:
+            brick.step("control", Rebound(port, True, 1), 0)
+        return brick
+
+    return make
 
 
-def bare_server() -> Brick:
-    return new_server(leads=True, captured=False)
+def leading_lfr_before() -> Brick:
+    return LfrBefore(1, leads=True)
+
+
+def following_lfr_before() -> Brick:
+    return LfrBefore(1, leads=False)
+
+
+def leading_lfr_after() -> Brick:
+    return LfrAfter(1, leads=True)
+
+
+def following_lfr_after() -> Brick:
+    return LfrAfter(1, leads=False)
+
+
+def assert_after() -> Brick:
+    return AssertAfter(lambda request, reply: True)
 
 
 def client_that_waits() -> Brick:
@@ -103,6 +151,18 @@ def client_that_waits() -> Brick:
 
 
 _P, _A, _C = protocol.State, after.State, proceed.State
+_LB, _LA, _TP = lfr.BeforeState, lfr.AfterState, tr.ProceedState
+DIFFERING: Final = Trials(1, 1, (TRIED, Tried(1, 1, 1, b"this", STATE)))
+
+Legal = dict[str, tuple[type, ...]]  # by port
+STANDBY: Final[Legal] = {
+    "prd2srv": (Request, Trial),
+    "aft2srv": (RestoreState,),
+    "bfr2srv": (CaptureState,),
+    "srv2prd": (),
+}
+READY: Final[Legal] = {"prd2srv": (Request, Trial), "aft2srv": (), "bfr2srv": (CaptureState,)}
+EXECUTED: Final[Legal] = {"prd2srv": (), "aft2srv": (CaptureState,), "bfr2srv": ()}
 CASES: Final = (
     by_table(backup_protocol, _P.BACKUP, (), protocol.MOVES, TELLS),
     by_table(leading_protocol, _P.IDLE, (), protocol.MOVES, TELLS),
@@ -116,24 +176,53 @@ CASES: Final = (
     by_hand("Proxy UNBOUND", Proxy, (), Rebound),
     by_hand("Proxy IDLE", bound_proxy, (), Rebound, Request),
     by_hand("Proxy WAITING", bound_proxy, (Request,), Rebound, Reply),
-    by_hand("Server STANDBY", lambda: new_server(leads=False), (), Rebound, Request, RestoreState),
-    by_hand("Server READY", lambda: new_server(leads=True), (), Rebound, Request),
-    by_hand("Server EXECUTED", lambda: new_server(leads=True), (Request,), Rebound, CaptureState),
-    by_hand("Server READY bare", bare_server, (Request,), Rebound, Request),
+    *(
+        by_hand(f"Server {state} of {name} on {port}", server_of(*outputs), mail, *legal, Rebound, port=port)
+        for name, outputs in (("lfr", ()), ("pbr", ("srv2aft",)), ("pbr+tr", ("srv2aft", "srv2bfr")))
+        for state, mail, ports in (
+            ("STANDBY", (), STANDBY),
+            ("after a request", (Request,), EXECUTED if outputs else READY),
+            ("after the state", (Request, CaptureState), READY),
+        )
+        if outputs or CaptureState not in mail
+        for port, legal in ports.items()
+    ),
+    by_table(InnerProtocol, inner.State.IDLE, (), inner.MOVES, TELLS),
+    by_table(InnerProtocol, inner.State.BUSY, (Request,), inner.MOVES, TELLS),
+    by_table(InnerProtocol, inner.State.HANDING_ON, (TakeOver,), inner.MOVES, TELLS),
+    by_table(leading_lfr_before, _LB.LEADING, (), lfr.BEFORE_MOVES, TELLS),
+    by_table(following_lfr_before, _LB.FOLLOWING, (), lfr.BEFORE_MOVES, TELLS | {Promote}),
+    by_table(following_lfr_before, _LB.LEADING, (ChannelEnded, Promote), lfr.BEFORE_MOVES, TELLS),
+    by_table(leading_lfr_after, _LA.LEADING, (), lfr.AFTER_MOVES, TELLS),
+    by_table(following_lfr_after, _LA.FOLLOWING, (), lfr.AFTER_MOVES, TELLS),
+    by_table(following_lfr_after, _LA.HOLDING, (Reply,), lfr.AFTER_MOVES, TELLS),
+    by_table(following_lfr_after, _LA.LEADING, (TakeOver,), lfr.AFTER_MOVES, TELLS),
+    by_table(TrBefore, tr.BeforeState.IDLE, (), tr.BEFORE_MOVES, TELLS),
+    by_table(TrBefore, tr.BeforeState.CAPTURING, (Request,), tr.BEFORE_MOVES, TELLS),
+    by_table(TrProceed, _TP.IDLE, (), tr.PROCEED_MOVES, TELLS),
+    by_table(TrProceed, _TP.FIRST, (Trial,), tr.PROCEED_MOVES, TELLS),
+    by_table(TrProceed, _TP.SECOND, (Trial, Tried), tr.PROCEED_MOVES, TELLS),
+    by_table(TrProceed, _TP.VOTING, (Trial, Tried, Tried), tr.PROCEED_MOVES, TELLS),
+    by_table(TrProceed, _TP.THIRD, (Trial, Tried, Tried, Again), tr.PROCEED_MOVES, TELLS),
+    by_table(TrAfter, tr.AfterState.IDLE, (), tr.AFTER_MOVES, TELLS, DIFFERING),
+    by_table(TrAfter, tr.AfterState.ASKED, (DIFFERING,), tr.AFTER_MOVES, TELLS, Trials(1, 1, (TRIED,))),
+    by_hand("AssertBefore", AssertBefore, (), Rebound, Request, TakeOver),
+    by_table(assert_after, assertion.State.IDLE, (), assertion.MOVES, TELLS),
+    by_table(assert_after, assertion.State.HOLDING, (Reply,), assertion.MOVES, TELLS),
     by_hand("Client", Client, (), Rebound, Submit),
     by_hand("Client waiting", client_that_waits, (), Rebound, Submit, Reply),
     by_hand("Client full", Client, (Submit,) * BACKLOG_MAX, Rebound, Reply),
-    by_hand("PassBefore", PassBefore, (), Rebound, Request),
+    by_hand("PassBefore", PassBefore, (), Rebound, Request, TakeOver),
     by_hand("Watchdog", Watchdog, (Watch,), Watch, NodeDied, Pulses, Rebound),
     by_hand("Recovery", Recovery, (), Suspect, Situation, Rebound),
-    by_hand("AdaptationEngine", AdaptationEngine, (), Rebound),
 )
 
 
 def brought_there(case: Case) -> Brick:
     brick = case.make()
-    for kind in case.mail:
-        brick.step("as it should", SAMPLES[kind], 0)
+    for one in case.mail:
+        message = SAMPLES[one] if isinstance(one, type) else one
+        brick.step("aft2srv" if one is CaptureState else "prd2srv", message, 0)
     return brick
 
 
@@ -143,17 +232,19 @@ def test_a_legal_message_is_taken_and_an_illegal_one_changes_nothing(case: Case,
     brick = brought_there(case)
     before = inspected(brick)
     if kind in case.legal:
-        brick.step("port", SAMPLES[kind], 0)
+        brick.step(case.port, case.message(kind), 0)
         moved = case.moves.get((before["state"], kind)) if case.moves else None  # type: ignore[arg-type]
         assert moved is None or vars(brick)["state"] is moved
         return
     with pytest.raises(PeerError, match=f"(?i){kind.__name__}"):
-        brick.step("port", SAMPLES[kind], 0)
+        brick.step(case.port, case.message(kind), 0)
     assert inspected(brick) == before
 
 
 @pytest.mark.parametrize(
-    "case", [c for c in CASES if c.name.startswith(("PassBefore", "Compute", "Server"))], ids=lambda c: c.name
+    "case",
+    [c for c in CASES if not c.name.startswith(("Client", "Proxy", "Watchdog"))],
+    ids=lambda c: c.name,
 )
 @pytest.mark.parametrize("bound", [True, False])
 def test_where_a_port_leads_is_nothing_to_a_brick_that_asks_nothing_again(case: Case, bound: bool) -> None:
@@ -172,6 +263,13 @@ def test_where_a_port_leads_is_nothing_to_a_brick_that_asks_nothing_again(case: 
         ("Compute", proceed.State),
         ("Proxy", proxy.State),
         ("Server", server.State),
+        ("InnerProtocol", inner.State),
+        ("LfrBefore", lfr.BeforeState),
+        ("LfrAfter", lfr.AfterState),
+        ("TrBefore", tr.BeforeState),
+        ("TrProceed", tr.ProceedState),
+        ("TrAfter", tr.AfterState),
+        ("AssertAfter", assertion.State),
     ],
 )
 def test_every_state_is_among_the_cases(name: str, states: type[BrickState]) -> None:
@@ -179,7 +277,12 @@ def test_every_state_is_among_the_cases(name: str, states: type[BrickState]) -> 
     assert covered == set(states)
 
 
-def test_only_an_unbound_proxy_and_the_engine_are_open_for_nothing() -> None:
+def test_every_brick_is_among_the_cases() -> None:
+    made = {type(make(kind, Setting(1, 1, True, Counting))) for kind in KINDS if kind != "engine"}
+    assert {type(case.make()) for case in CASES} == made
+
+
+def test_only_an_unbound_proxy_is_open_for_nothing() -> None:
     """A brick that waits for mail which its ports do not let in would wait for ever."""
     closed = {case.name for case in CASES if not brought_there(case).open_ports()}
-    assert closed == {"Proxy UNBOUND", "AdaptationEngine"}
+    assert closed == {"Proxy UNBOUND"}

@@ -2,6 +2,7 @@
 
 from typing import Final
 
+import msgspec
 import pytest
 from samples import notes
 
@@ -19,6 +20,7 @@ from aftbed.core.script import (
     Spawn,
     Suspend,
     Transfer,
+    Unbind,
     problems,
 )
 from aftbed.ftm.recovery import (
@@ -31,13 +33,24 @@ from aftbed.ftm.recovery import (
     new_backup,
 )
 
+PBR: Final = (("after", "aft2aft"),)
+LFR: Final = (("before", "bfr2bfr"), ("after", "aft2aft"))
+STATEFUL: Final = ("protocol", "server")
 WHOLE: Final = Situation("a", 1, "b", 1, 1, (), False)
 ALONE: Final = Situation("a", 1, "", 0, 1, ("b",), False)
 NOBODY: Final = Situation("", 0, "", 0, 1, ("a", "b"), True)
 
 
 def failed(situation: Situation) -> Situation:
-    return Situation(*(getattr(situation, f) for f in situation.__struct_fields__[:-1]), True)
+    return msgspec.structs.replace(situation, failed=True)
+
+
+def dropped() -> Script:
+    return drop_backup("a", "b", PBR)
+
+
+def renewed(leader: str, replica: str) -> Script:
+    return new_backup(leader, replica, PBR, STATEFUL)
 
 
 def ordered(effects: list[Effect]) -> list[Script]:
@@ -53,10 +66,10 @@ def alarm(replica: str, generation: int = 1) -> Suspect:
     [
         (WHOLE, set(), None),
         (WHOLE, {("a", 1)}, failover("a", "b", 2)),
-        (WHOLE, {("b", 1)}, drop_backup("a", "b")),
-        (WHOLE, {("a", 1), ("b", 1)}, drop_backup("a", "b")),
+        (WHOLE, {("b", 1)}, dropped()),
+        (WHOLE, {("a", 1), ("b", 1)}, dropped()),
         (WHOLE, {("a", 2)}, None),  # another generation's
-        (ALONE, set(), new_backup("a", "b")),
+        (ALONE, set(), renewed("a", "b")),
         (ALONE, {("a", 1)}, None),  # nobody is left to take over
         (Situation("a", 1, "", 0, 1, (), False), set(), None),  # the slot is not free yet
         (Situation("b", 3, "a", 2, 5, (), False), {("b", 3)}, failover("b", "a", 6)),
@@ -69,7 +82,7 @@ def test_the_table_of_decisions(
     assert decide(situation, suspects) == script
 
 
-@pytest.mark.parametrize("script", [failover("a", "b", 2), drop_backup("a", "b"), new_backup("a", "b")])
+@pytest.mark.parametrize("script", [failover("a", "b", 2), dropped(), renewed("a", "b")])
 def test_each_script_passes_its_check(script: Script) -> None:
     assert problems(script) == []
 
@@ -79,11 +92,39 @@ def test_a_failover_fences_before_it_promotes_and_promotes_before_it_attaches() 
 
 
 def test_a_new_backup_gets_all_state_while_the_leader_is_suspended() -> None:
-    script = new_backup("a", "b")
+    script = renewed("a", "b")
     assert script.prepare == (Spawn("b"),)
     kinds = [type(verb) for verb in script.commit]
     assert kinds == [Suspend, Transfer, Transfer, Bind, Resume]
     assert {v.source for v in script.commit if isinstance(v, Transfer)} == {"a/protocol", "a/server"}
+
+
+def test_what_a_leader_says_to_its_backup_is_bound_and_unbound_as_the_mechanism_has_it() -> None:
+    lfr = msgspec.structs.replace(WHOLE, replication=LFR)
+    script = decide(lfr, {("b", 1)})
+    assert script is not None and script.commit == (
+        Fence("b"),
+        Unbind("a/before", "bfr2bfr"),
+        Unbind("a/after", "aft2aft"),
+        Kill("b"),
+    )
+    script = decide(msgspec.structs.replace(ALONE, replication=LFR, stateful=("server",)), set())
+    assert script is not None and script.commit == (
+        Suspend("a/protocol"),
+        Transfer("a/server", "b/server"),
+        Bind("a/before", "bfr2bfr", "b/before"),
+        Bind("a/after", "aft2aft", "b/after"),
+        Resume("a/protocol"),
+    )
+    assert problems(script) == []
+
+
+@pytest.mark.parametrize("situation", [WHOLE, ALONE, Situation("a", 1, "", 0, 1, (), False)])
+@pytest.mark.parametrize("suspects", [set(), {("a", 1)}, {("b", 1)}])
+def test_with_one_replica_there_is_nothing_to_do(
+    situation: Situation, suspects: set[tuple[str, int]]
+) -> None:
+    assert decide(msgspec.structs.replace(situation, replication=()), suspects) is None
 
 
 def test_an_alarm_makes_it_act_and_the_report_ends_it() -> None:
@@ -94,7 +135,7 @@ def test_an_alarm_makes_it_act_and_the_report_ends_it() -> None:
     assert not brick.quiescent()
     effects = brick.step(CONTROL, Situation("b", 1, "", 0, 2, ("a",), False), 0)
     assert notes(effects) == [Event.RECOVERY_EXIT]
-    assert ordered(effects) == [new_backup("b", "a")], "redundancy is restored at once"
+    assert ordered(effects) == [renewed("b", "a")], "redundancy is restored at once"
     effects = brick.step(CONTROL, Situation("b", 1, "a", 2, 2, (), False), 0)
     assert notes(effects) == [Event.BACKUP_READY] and ordered(effects) == []
     assert brick.quiescent()
@@ -106,7 +147,7 @@ def test_one_script_at_a_time_what_comes_meanwhile_is_remembered() -> None:
     assert brick.ordered is not None
     assert ordered(brick.step("wdg2rec", alarm("b", 2), 0)) == []
     effects = brick.step(CONTROL, Situation("a", 1, "b", 2, 1, (), False), 0)
-    assert ordered(effects) == [drop_backup("a", "b")]
+    assert ordered(effects) == [dropped()]
 
 
 def test_an_alarm_against_the_past_is_forgotten() -> None:
@@ -129,7 +170,7 @@ def test_a_new_recovery_knows_as_much_as_the_old_one() -> None:
     assert brick.step(CONTROL, Rebound("wdg2rec", True, 1), 0) == []
     brick.step("wdg2rec", alarm("a"), 0)
     effects = brick.step(CONTROL, Situation("b", 1, "", 0, 2, ("a",), False), 0)
-    assert ordered(effects) == [new_backup("b", "a")]
+    assert ordered(effects) == [renewed("b", "a")]
 
 
 def test_a_new_backup_that_failed_is_tried_again_a_while_later() -> None:
@@ -139,7 +180,7 @@ def test_a_new_backup_that_failed_is_tried_again_a_while_later() -> None:
     assert effects == []
     assert brick.deadline_ns() == 1000 + RETRY_NS
     assert ordered(brick.step("wdg2rec", alarm("b", 9), 1001)) == [], "an alarm is no reason to hurry"
-    assert ordered(brick.wake(1000 + RETRY_NS)) == [new_backup("a", "b")]
+    assert ordered(brick.wake(1000 + RETRY_NS)) == [renewed("a", "b")]
     assert brick.deadline_ns() is None
 
 

@@ -4,23 +4,50 @@ import pytest
 from counting import Counting
 from samples import STATE, inspected, notes, sends
 
+from aftbed.core.brick import CONTROL, Effect, Note
 from aftbed.core.errors import PeerError
-from aftbed.core.event import Event
-from aftbed.core.message import CaptureState, Reply, Request, RestoreState, StateCaptured, StateRestored
+from aftbed.core.event import RERUN, Event
+from aftbed.core.message import (
+    CaptureState,
+    Rebound,
+    Reply,
+    Request,
+    RestoreState,
+    StateCaptured,
+    StateRestored,
+    Trial,
+    Tried,
+)
 from aftbed.ftm.before import PassBefore
-from aftbed.ftm.engine import AdaptationEngine
 from aftbed.ftm.proceed import Compute
-from aftbed.ftm.server import Server
+from aftbed.ftm.server import Server, State
 
 REQUEST = Request(2, 7, b"what")
 
 
+def bound(*outputs: str, replica: int = 1) -> Server:
+    """A Server whose outputs lead to Proceed, and to these."""
+    brick = Server(Counting(), replica)
+    for port in ("srv2prd", *outputs):
+        assert brick.step(CONTROL, Rebound(port, True, 2), 0) == []
+    return brick
+
+
 def leader() -> Server:
-    return Server(Counting(), 1, leads=True, captured=True)
+    """Under pbr: After captures."""
+    return bound("srv2aft")
 
 
 def backup() -> Server:
-    return Server(Counting(), 2, leads=False, captured=True)
+    return bound("srv2aft", replica=2)
+
+
+def trial(state: bytes, *, rerun: bool, number: int = 7) -> Trial:
+    return Trial(2, number, b"what", state, rerun)
+
+
+def details(effects: list[Effect]) -> list[int]:
+    return [e.detail for e in effects if isinstance(e, Note)]
 
 
 def answer(count: int) -> bytes:
@@ -72,9 +99,10 @@ def test_the_state_is_captured_after_exactly_the_request() -> None:
     assert brick.open_ports() == ("prd2srv",) and brick.quiescent()
 
 
-def test_a_bare_server_is_asked_for_no_state() -> None:
-    brick = Server(Counting(), 1, leads=True, captured=False)
+def test_a_server_whose_state_nobody_captures_is_open_for_requests() -> None:
+    brick = bound()
     for count in (1, 2):
+        assert brick.open_ports() == ("prd2srv",) and brick.quiescent()
         assert sends(brick.step("prd2srv", REQUEST, 0)) == [("srv2prd", Reply(2, 7, 1, answer(count)))]
 
 
@@ -105,10 +133,127 @@ def test_state_goes_over_to_a_new_backup() -> None:
     assert new.capture() == old.capture()
 
 
+# -- under another mechanism, and from one to the next
+
+
 @pytest.mark.parametrize(
-    "brick", [PassBefore(), Compute(), AdaptationEngine()], ids=lambda b: type(b).__name__
+    ("outputs", "ports"),
+    [
+        ((), {"prd2srv"}),
+        (("srv2aft",), {"prd2srv", "aft2srv"}),
+        (("srv2bfr",), {"prd2srv", "bfr2srv"}),
+        (("srv2aft", "srv2bfr"), {"prd2srv", "aft2srv", "bfr2srv"}),
+    ],
 )
-def test_a_brick_without_state_restores_nothing_else(brick: PassBefore | Compute | AdaptationEngine) -> None:
+def test_the_first_request_decides_whether_it_leads(outputs: tuple[str, ...], ports: set[str]) -> None:
+    assert set(bound(*outputs).open_ports()) == ports
+
+
+def test_under_pbr_one_port_is_open_at_a_time_and_under_tr_what_may_come() -> None:
+    plain, voting = bound("srv2aft"), bound("srv2aft", "srv2bfr")
+    for brick, alternates in ((plain, True), (voting, False)):
+        for _ in range(2):
+            brick.step("prd2srv", trial(STATE, rerun=False), 0)
+            assert brick.open_ports() == (("aft2srv",) if alternates else ("aft2srv", "bfr2srv", "prd2srv"))
+            assert not brick.quiescent()
+            brick.step("aft2srv", CaptureState(2, 7), 0)
+            assert brick.open_ports() == (("prd2srv",) if alternates else ("aft2srv", "bfr2srv", "prd2srv"))
+            assert brick.quiescent()
+
+
+def test_a_follower_becomes_a_backup_and_a_follower_again() -> None:
+    brick = bound(replica=2)
+    brick.step("prd2srv", REQUEST, 0)
+    assert brick.state is State.READY
+    brick.step(CONTROL, Rebound("srv2aft", True, 2), 0)
+    assert set(brick.open_ports()) == {"aft2srv", "prd2srv"}
+    effects = brick.step("aft2srv", RestoreState(2, 8, STATE), 0)
+    assert sends(effects) == [("srv2aft", StateRestored(2, 8))]
+    brick.step(CONTROL, Rebound("srv2aft", False, 2), 0)
+    assert brick.open_ports() == ("prd2srv",)
+    brick.step("prd2srv", REQUEST, 0)
+    assert brick.open_ports() == ("prd2srv",) and brick.quiescent()
+
+
+def test_a_leader_that_is_given_an_after_that_captures_is_captured_from_then_on() -> None:
+    brick = bound()
+    brick.step("prd2srv", REQUEST, 0)
+    brick.step(CONTROL, Rebound("srv2aft", True, 2), 0)
+    brick.step("prd2srv", REQUEST, 0)
+    assert brick.open_ports() == ("aft2srv",) and not brick.quiescent()
+
+
+def test_where_a_request_goes_when_it_is_done_changes_nothing() -> None:
+    brick = leader()
+    brick.step("prd2srv", REQUEST, 0)
+    before = inspected(brick)
+    assert brick.step(CONTROL, Rebound("srv2prd", True, 2), 0) == []
+    assert inspected(brick) == before
+
+
+# -- trials
+
+
+@pytest.mark.parametrize(
+    ("asked", "answered", "executed"), [("aft2srv", "srv2aft", True), ("bfr2srv", "srv2bfr", False)]
+)
+def test_who_asks_for_the_state_is_who_gets_it(asked: str, answered: str, executed: bool) -> None:
+    brick = bound("srv2aft", "srv2bfr")
+    if executed:
+        brick.step("prd2srv", trial(STATE, rerun=False), 0)
+    effects = brick.step(asked, CaptureState(2, 7), 0)
+    assert sends(effects) == [(answered, StateCaptured(2, 7, brick.capture()))]
+    assert notes(effects) == [Event.STATE_CAPTURED]
+
+
+def test_a_trial_is_executed_from_where_the_server_is() -> None:
+    brick = bound("srv2bfr")
+    brick.step("prd2srv", trial(STATE, rerun=False), 0)  # that state is for a rerun only
+    effects = brick.step("prd2srv", trial(STATE, rerun=False, number=8), 0)
+    assert sends(effects) == [("srv2prd", Tried(2, 8, 1, answer(2), brick.capture()))]
+    assert notes(effects) == [Event.SERVER_ENTER, Event.SERVER_EXIT] and details(effects) == [0, 0]
+
+
+def test_a_rerun_starts_from_the_state_of_before() -> None:
+    brick = bound("srv2bfr")
+    state = brick.capture()
+    first = sends(brick.step("prd2srv", trial(state, rerun=False), 0))
+    for _ in range(2):
+        effects = brick.step("prd2srv", trial(state, rerun=True), 0)
+        assert sends(effects) == first
+        assert notes(effects) == [Event.SERVER_ENTER, Event.SERVER_EXIT]
+        assert details(effects) == [RERUN, RERUN]
+
+
+def test_a_trial_that_the_function_refuses_is_answered_with_nothing() -> None:
+    brick = bound("srv2bfr")
+    state = brick.capture()
+    effects = brick.step("prd2srv", Trial(2, 7, b"", state, rerun=False), 0)
+    assert sends(effects) == [("srv2prd", Tried(2, 7, 1, b"", state))]
+
+
+def test_a_rerun_from_what_is_no_state_is_refused() -> None:
+    brick = bound("srv2bfr")
+    brick.step("prd2srv", trial(STATE, rerun=False), 0)
+    before = inspected(brick)
+    with pytest.raises(PeerError, match="not a state"):
+        brick.step("prd2srv", trial(b"", rerun=True), 0)
+    assert inspected(brick) == before
+
+
+def test_the_next_trial_waits_until_after_has_the_state() -> None:
+    brick = bound("srv2aft", "srv2bfr")
+    brick.step("prd2srv", trial(STATE, rerun=False), 0)
+    before = inspected(brick)
+    with pytest.raises(PeerError, match="the state of the last is not captured"):
+        brick.step("prd2srv", trial(STATE, rerun=False, number=8), 0)
+    with pytest.raises(PeerError, match="CaptureState on bfr2srv while EXECUTED"):
+        brick.step("bfr2srv", CaptureState(2, 8), 0)
+    assert inspected(brick) == before
+
+
+@pytest.mark.parametrize("brick", [PassBefore(), Compute()], ids=lambda b: type(b).__name__)
+def test_a_brick_without_state_restores_nothing_else(brick: PassBefore | Compute) -> None:
     assert brick.capture() == b""
     brick.restore(b"")
     with pytest.raises(PeerError, match=f"{type(brick).__name__} has no state to restore, given 1 bytes"):

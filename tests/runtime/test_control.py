@@ -13,7 +13,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from aftbed.core import script
 from aftbed.core.errors import PeerError
+from aftbed.core.fault import Act, Fault, Trigger
 from aftbed.core.wire import PACKET_BYTES_MAX
 from aftbed.runtime.unix import control
 from aftbed.runtime.unix.control import FDS_MAX, Line
@@ -30,10 +32,19 @@ PLAIN: Final = {
 }
 
 
+FLAT_VERBS: Final = tuple(kind for kind in get_args(script.AnyVerb) if kind is not script.Together)
+
+
 def any_of(kind: Any) -> st.SearchStrategy[Any]:
     """Any value of a type that a control message is made of."""
     if kind in PLAIN:
         return PLAIN[kind]
+    if kind is script.Together:  # verbs may hold verbs; one level is enough
+        return st.lists(st.one_of(map(any_of, FLAT_VERBS)), max_size=3).map(
+            lambda verbs: script.Together(tuple(verbs))
+        )
+    if kind is Fault:
+        return st.builds(Fault, st.sampled_from((Act.CRASH, Act.HANG)), st.text(max_size=9), any_of(Trigger))
     if isinstance(kind, type) and issubclass(kind, Enum):
         return st.sampled_from(kind)
     if isinstance(kind, type) and issubclass(kind, msgspec.Struct):

@@ -6,14 +6,20 @@ import pytest
 
 from aftbed.core.errors import ConfigError
 from aftbed.core.event import REQUEST_PATH, Event
-from aftbed.core.fault import Act, Fault, Trigger
+from aftbed.core.fault import BIT_MAX, Act, Fault, Flip, Place, Trigger
 from aftbed.core.graph import PLACEMENTS
-from aftbed.ftm.mechanism import build
-from aftbed.runtime.targets import OTHERS, check, emitter
+from aftbed.ftm.mechanism import DUPLEX, EXPRESSIONS, build
+from aftbed.runtime.targets import OTHERS, SUPERVISOR, check, emitter, emitters_in, waits_in
 
 
 def crash(target: str, trigger: Trigger | None = None) -> Fault:
     return Fault(Act.CRASH, target, trigger or Trigger())
+
+
+def bitflip(
+    place: Place, target: str = "primary", event: str = "", nth: int = 1, bit: int | None = None
+) -> Fault:
+    return Fault(Act.BITFLIP, target, Trigger(event, nth), flip=Flip(place, bit))
 
 
 @pytest.mark.parametrize("placement", PLACEMENTS)
@@ -100,3 +106,169 @@ def test_who_emits_an_event_depends_on_who_leads(
 ) -> None:
     backup = "b" if leader == "a" else "a"
     assert emitter(build("pbr", placement), event, leader, backup) == node
+
+
+# -- composed graphs
+
+
+@pytest.mark.parametrize(
+    ("ftm", "placement", "event", "node"),
+    [
+        ("pbr+tr", "process", "request.received", "a/protocol"),
+        ("pbr+tr", "process", "before.exit", "a/before"),  # and not a/tr.before
+        ("pbr+tr", "process", "proceed.enter", "a/tr.proceed"),
+        ("pbr+tr", "process", "checkpoint.sent", "a/after"),  # and not a/tr.after, which stands before it
+        ("pbr+assert", "process", "proceed.enter", "a/assert.proceed"),
+        ("pbr+tr", "process", "reply.sent", "a/protocol"),
+        ("lfr+tr", "process", "state.captured", "a/server"),
+        ("tr", "process", "state.captured", "a/server"),
+        ("tr", "replica", "server.exit", "a"),
+        ("lfr", "process", "state.captured", None),
+        ("lfr", "process", "state.restored", None),
+        ("lfr+tr", "process", "state.restored", None),  # its Servers hand out states, and are handed none
+        ("pbr+tr", "process", "state.restored", "b/server"),
+        ("pbr+tr", "single", "before.exit", "single"),
+        ("pbr+tr", "process", "vote.compared", "a/tr.after"),
+        ("tr", "process", "vote.compared", "a/after"),
+        ("pbr", "process", "vote.compared", None),
+        ("lfr", "process", "checkpoint.sent", None),
+        ("tr", "process", "checkpoint.sent", None),
+        ("lfr+tr", "process", "follower.forwarded", "a/before"),
+        ("lfr+assert", "process", "follower.notified", "a/after"),
+        ("lfr", "process", "follower.diverged", "b/after"),
+    ],
+)
+def test_the_outermost_emitter_is_meant(ftm: str, placement: str, event: str, node: str | None) -> None:
+    assert emitter(build(ftm, placement), event, "a", "b") == node
+
+
+@pytest.mark.parametrize("ftm", EXPRESSIONS)
+def test_a_fault_waits_in_a_brick_of_the_emitting_node(ftm: str) -> None:
+    for placement in PLACEMENTS:
+        graph = build(ftm, placement)
+        for event in Event:
+            node = emitter(graph, event.label, "a", "b")
+            brick = waits_in(crash("primary", Trigger(event.label)), graph, "a", "b")
+            if node is None or node == SUPERVISOR:
+                assert brick is None
+            else:
+                assert brick is not None and graph.node_of(brick) == node
+
+
+@pytest.mark.parametrize(
+    ("ftm", "placement", "event", "node", "count"),
+    [
+        ("pbr", "process", "before.exit", "a/before", 1),
+        ("pbr", "replica", "server.exit", "a", 1),
+        ("pbr+tr", "replica", "before.exit", "a", 2),
+        ("lfr", "single", "server.exit", "single", 2),
+    ],
+)
+def test_how_many_bricks_of_a_node_emit_an_event(
+    ftm: str, placement: str, event: str, node: str, count: int
+) -> None:
+    assert emitters_in(build(ftm, placement), event, node) == count
+
+
+# -- adaptations
+
+
+@pytest.mark.parametrize("event", [e for e in Event if e.label.startswith("adapt.")])
+def test_what_an_adaptation_comes_through_is_the_supervisors(event: Event) -> None:
+    for ftm in EXPRESSIONS:
+        expected = None if ftm == "none" else SUPERVISOR  # which has no Engine
+        assert emitter(build(ftm, "process"), event.label, "a", "") == expected
+    check(crash("engine", Trigger(event.label, 3)), build("pbr", "process"))
+
+
+def test_in_an_adaptation_the_nodes_of_any_mechanism_can_be_hit() -> None:
+    graph = build("pbr", "process")
+    check(crash("a/tr.proceed", Trigger("adapt.step.enter", 3)), graph)
+    with pytest.raises(ConfigError, match=r"unknown target 'a/tr\.proced'; did you mean 'a/tr\.proceed'\?"):
+        check(crash("a/tr.proced", Trigger("adapt.step.enter", 3)), graph)
+    with pytest.raises(ConfigError, match=r"unknown target 'a/tr\.proceed'"):
+        check(crash("a/tr.proceed", Trigger("server.exit", 3)), graph)
+
+
+# -- bitflips
+
+
+@pytest.mark.parametrize("placement", PLACEMENTS)
+@pytest.mark.parametrize("ftm", EXPRESSIONS)
+def test_a_bit_of_the_leader_can_be_flipped_under_every_mechanism(ftm: str, placement: str) -> None:
+    graph = build(ftm, placement)
+    for target in ("primary", "a", *(["b"] if ftm.startswith(DUPLEX) else [])):
+        for place in Place:
+            check(bitflip(place, target), graph)
+            check(bitflip(place, target, "server.exit", 100, BIT_MAX), graph)
+
+
+@pytest.mark.parametrize(
+    ("ftm", "fault", "message"),
+    [
+        (
+            "pbr",
+            bitflip(Place.RESULT, "primry"),
+            "unknown replica 'primry'; did you mean 'primary'? (one of: a, b, backup, primary)",
+        ),
+        ("pbr", bitflip(Place.RESULT, "a/server"), "unknown replica 'a/server'"),
+        ("pbr", bitflip(Place.RESULT, "hub"), "unknown replica 'hub'"),
+        ("tr", bitflip(Place.RESULT, "backup"), "unknown replica 'backup' (one of: a, primary)"),
+        ("tr", bitflip(Place.RESULT, "b"), "unknown replica 'b'"),
+        ("none", bitflip(Place.RESULT, "b"), "unknown replica 'b'"),
+        ("pbr", bitflip(Place.RESULT, bit=-1), f"bit -1: 0 to {BIT_MAX} are allowed"),
+        ("pbr", bitflip(Place.RESULT, bit=BIT_MAX + 1), f"bit {BIT_MAX + 1}: 0 to {BIT_MAX} are allowed"),
+        ("pbr", bitflip(Place.RESULT, nth=0), "nth 0: the first occurrence is nth 1"),
+        ("pbr", bitflip(Place.RESULT, event="server.exits"), "did you mean 'server.exit'?"),
+        (
+            "pbr",
+            bitflip(Place.RESULT, event="server.enter"),
+            "unknown event for a bit of the result in primary: 'server.enter'; did you mean 'server.exit'?",
+        ),
+        ("pbr", bitflip(Place.STATE, event="server.enter"), "(one of: server.exit, state.captured)"),
+        (
+            "pbr",
+            bitflip(Place.STATE, "b", "reply.sent"),
+            "(one of: server.exit, state.captured, state.restored)",
+        ),
+        ("pbr", bitflip(Place.STATE, event="adapt.commit"), "unknown event for a bit of the state"),
+        ("lfr", bitflip(Place.STATE, event="state.captured"), "(one of: server.exit)"),
+        ("none", bitflip(Place.STATE, event="state.captured"), "(one of: server.exit)"),
+        (
+            "pbr",
+            bitflip(Place.RESULT, "backup"),
+            "bitflip result in backup: under --ftm pbr the Server of a backup executes nothing",
+        ),
+        ("pbr", bitflip(Place.STATE, "backup"), "'server.exit' (one of: state.restored)"),
+    ],
+)
+def test_a_bit_that_cannot_be_flipped_is_refused_with_what_can(ftm: str, fault: Fault, message: str) -> None:
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        check(fault, build(ftm, "process"))
+
+
+@pytest.mark.parametrize(
+    ("ftm", "fault", "leader", "brick"),
+    [
+        ("pbr", bitflip(Place.RESULT), "a", "a/server"),
+        ("pbr", bitflip(Place.RESULT), "b", "b/server"),
+        ("pbr", bitflip(Place.RESULT, "b"), "a", None),  # executes nothing until it leads
+        ("pbr", bitflip(Place.RESULT, "b"), "b", "b/server"),
+        ("pbr", bitflip(Place.STATE, "backup", "state.restored"), "a", "b/server"),
+        ("pbr", bitflip(Place.STATE, "primary", "state.restored"), "a", None),
+        ("lfr", bitflip(Place.RESULT, "backup"), "a", "b/server"),
+        ("lfr+tr", bitflip(Place.STATE, "backup", "state.captured"), "b", "a/server"),
+        ("tr", bitflip(Place.STATE), "a", "a/server"),
+        ("none", bitflip(Place.RESULT, "a"), "a", "a/server"),
+    ],
+)
+def test_a_bitflip_waits_in_the_server_that_it_hits(
+    ftm: str, fault: Fault, leader: str, brick: str | None
+) -> None:
+    backup = "b" if leader == "a" else "a"
+    assert waits_in(fault, build(ftm, "process"), leader, backup) == brick
+
+
+def test_while_nobody_backs_up_no_bit_of_a_backup_can_be_flipped() -> None:
+    assert waits_in(bitflip(Place.RESULT, "backup"), build("lfr", "process"), "a", "") is None
+    assert waits_in(bitflip(Place.RESULT), build("lfr", "process"), "", "") is None

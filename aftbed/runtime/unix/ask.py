@@ -5,13 +5,18 @@ import socket
 import struct
 from collections.abc import Callable
 from pathlib import Path
+from typing import Final
 
 import msgspec
 
 from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.core.fault import Fault
+from aftbed.core.message import Goal
 from aftbed.runtime.unix import control, rundir
 from aftbed.runtime.unix.resources import Row
+
+ANSWER_SECONDS_MAX: Final = 2.0
+ADAPT_SECONDS_MAX: Final = 15.0  # to prepare, commit, observe and finish, on a busy machine
 
 
 class Status(msgspec.Struct, frozen=True, tag=True):
@@ -32,6 +37,16 @@ class Inject(msgspec.Struct, frozen=True, tag=True):
     fault: Fault
 
 
+class Adapt(msgspec.Struct, frozen=True, tag=True):
+    """Adapt; answered when it has ended."""
+
+    goal: Goal
+
+
+class Adaptations(msgspec.Struct, frozen=True, tag=True):
+    """Those that have ended."""
+
+
 class Stop(msgspec.Struct, frozen=True, tag=True):
     """End the run."""
 
@@ -43,7 +58,7 @@ class Answer(msgspec.Struct, frozen=True, tag=True):
     error: str = ""
 
 
-Question = Status | Processes | GraphNow | Inject | Stop
+Question = Status | Processes | GraphNow | Inject | Adapt | Adaptations | Stop
 decode_question: Callable[[bytes], Question] = msgspec.msgpack.Decoder(Question).decode
 decode_answer: Callable[[bytes], Answer] = msgspec.msgpack.Decoder(Answer).decode
 
@@ -59,21 +74,39 @@ def processes(private: Path) -> list[Row]:
     return msgspec.convert(ask(private, Processes())["processes"], list[Row])
 
 
-def ask(private: Path, question: Question) -> dict[str, object]:
+Waiting = control.Line[Answer]
+
+
+def ask(private: Path, question: Question, seconds: float = ANSWER_SECONDS_MAX) -> dict[str, object]:
     """Ask the run in `private`. Raises ConfigError with its refusal, HarnessError without an answer."""
+    return receive(send(private, question), seconds)
+
+
+def send(private: Path, question: Question) -> Waiting:
+    """Ask; the answer is for `receive`. Raises ConfigError where nobody listens."""
     try:
         line = control.Line(rundir.connect(private), decode_answer)
     except OSError as error:
         raise ConfigError(f"run {private.name} does not answer: {error.strerror}") from None
     try:
         line.send(question)
+    except OSError as error:
+        line.close()
+        raise HarnessError(f"run {private.name} does not hear: {error.strerror}") from None
+    return line
+
+
+def receive(line: Waiting, seconds: float = ANSWER_SECONDS_MAX) -> dict[str, object]:
+    """The answer. Raises ConfigError with a refusal, HarnessError without an answer."""
+    try:
+        line.sock.settimeout(seconds)
         got = line.recv()
     except OSError as error:
-        raise HarnessError(f"run {private.name} did not answer within 2 s: {error}") from None
+        raise HarnessError(f"the run did not answer within {seconds:.0f} s: {error}") from None
     finally:
         line.close()
     if got is None:
-        raise HarnessError(f"run {private.name} closed the connection (another user's run?)")
+        raise HarnessError("the run closed the connection (another user's run?)")
     answer, _ = got
     if answer.error:
         raise ConfigError(answer.error)

@@ -74,6 +74,19 @@ class Channels:
         """The channel from `port` of `source` to `sink`."""
         return self._all.get((source, port, sink))
 
+    def items(self) -> list[tuple[tuple[str, str, str], Channel]]:
+        """All of them, each with its source, port and sink."""
+        return list(self._all.items())
+
+    def take(self, key: tuple[str, str, str]) -> Channel:
+        """Take a channel out, open as it is."""
+        return self._all.pop(key)
+
+    def put(self, channel: Channel) -> None:
+        """Put a channel in."""
+        link = channel.link
+        self._all[link.source, link.source_port, link.sink] = channel
+
     def drop(self, channel: Channel) -> None:
         """Let go of `channel`."""
         link = channel.link

@@ -15,15 +15,20 @@ from typing import Final, Generic, TypeVar
 import msgspec
 
 from aftbed.core.errors import PeerError
-from aftbed.core.fault import Act
+from aftbed.core.fault import Act, Flip
+from aftbed.core.graph import BrickSpec, Graph
 from aftbed.core.message import (
+    Adapt,
+    Adapted,
+    Progress,
     Promote,
     Promoted,
     Rebound,
     Situation,
+    TakeUp,
     Watch,
 )
-from aftbed.core.script import Script
+from aftbed.core.script import Phase, Script
 from aftbed.core.wire import PACKET_BYTES_MAX, UNREADABLE
 
 FDS_MAX: Final = 64
@@ -31,11 +36,12 @@ UNANSWERED: Final = 0  # the token of an order that gets no Ack
 STATE_BYTES_MAX: Final = 64 << 20
 _RIGHTS_BYTES: Final = socket.CMSG_SPACE(FDS_MAX * 4)
 
-Told = Promote | Rebound | Watch | Situation
+Told = Promote | Rebound | Watch | Situation | Adapt | Progress | TakeUp
+NOWHERE: Final = -1  # the index of a port that is to lead nowhere
 
 
 class Port(msgspec.Struct, frozen=True):
-    """An end of a channel at a brick: the descriptor is the one at `index` among those that came along."""
+    """An end of a channel at a brick: the descriptor at `index` among those that came along, or NOWHERE."""
 
     brick: str
     port: str
@@ -61,22 +67,30 @@ class Park(Order, frozen=True):
     """To a zygote: fork one spare for each descriptor that came along."""
 
 
+class Trial(msgspec.Struct, frozen=True):
+    """A self-test: the graph to be, and requests that were recorded in this run."""
+
+    graph: Graph
+    requests: tuple[bytes, ...]
+
+
 class Assign(Order, frozen=True):
     """To a spare: be this node."""
 
     node: str
     journal: str
-    bricks: tuple[tuple[str, str], ...]  # name, kind
-    replica: int
+    bricks: tuple[BrickSpec, ...]
     epoch: int
-    leads: bool
+    leader: str
     inputs: tuple[Port, ...]
     outputs: tuple[Port, ...]
     locals: tuple[Local, ...]
     cpu: int | None
+    held: bool = False  # take no mail before a Resume
+    staged: bool = False  # nobody waits for it yet, and everybody will later: rehearse first
+    trial: Trial | None = None  # what is written off line must stand before it is wired
     device: str = ""  # see `devices`
     options: bytes = b""
-    device_fds: int = 0  # how many of the descriptors, at the end, are the device's
 
 
 class Serve(Order, frozen=True):
@@ -110,8 +124,19 @@ class Follow(Order, frozen=True):
     epoch: int
 
 
+class Rewire(Order, frozen=True):
+    """All that changes at this node's ports in one adaptation; then, if `suspend`, Suspend."""
+
+    inputs: tuple[Port, ...]
+    outputs: tuple[Port, ...]
+    epoch: int
+    suspend: bool
+
+
 class Suspend(Order, frozen=True):
-    """Finish what is inside, take no more, then answer."""
+    """Finish what is inside (`drain`: and all that waits at the open ports), take no more, then answer."""
+
+    drain: bool = False
 
 
 class Resume(Order, frozen=True):
@@ -125,10 +150,11 @@ class Capture(Order, frozen=True):
 
 
 class Restore(Order, frozen=True):
-    """Take over `state`."""
+    """Take over `state`; `migrate`: of a brick of another class, or with another function, perhaps."""
 
     brick: str
     state: bytes
+    migrate: bool = False
 
 
 class Tell(Order, frozen=True):
@@ -148,14 +174,26 @@ class WatchNodes(Order, frozen=True):
     pids: tuple[int, ...]
 
 
-class Arm(Order, frozen=True):
-    """At the `nth` time from now that `event` happens here: do `act` to yourself, or ask for it."""
+class Blow(msgspec.Struct, frozen=True):
+    """At the `nth` time that `brick` comes to the event: do `act` to yourself, or ask for it.
+
+    `draw` is the chance by which a bit is chosen where `flip` names none.
+    """
 
     fault: int
-    event: str
+    brick: str
     nth: int
     act: Act
     itself: bool
+    flip: Flip | None = None
+    draw: int = 0
+
+
+class Arm(Order, frozen=True):
+    """These wait for `event` here, counted from now, beside those that do already; `nth` 0: no longer."""
+
+    event: str
+    blows: tuple[Blow, ...]
 
 
 class Stop(Order, frozen=True):
@@ -176,6 +214,10 @@ class Hello(msgspec.Struct, frozen=True, tag=True):
     pid: int
 
 
+class Rested(msgspec.Struct, frozen=True, tag=True):
+    """A spare to the supervisor: it has rehearsed, and takes no CPU from anybody from here on."""
+
+
 class Ack(msgspec.Struct, frozen=True, tag=True):
     """The answer to an order; `error` is empty where it was carried out."""
 
@@ -188,14 +230,16 @@ class Said(msgspec.Struct, frozen=True, tag=True):
     """A brick to the runtime."""
 
     brick: str
-    message: Promoted
+    message: Promoted | Adapted
 
 
 class Ordered(msgspec.Struct, frozen=True, tag=True):
-    """Recovery or the Engine to the runtime: execute this."""
+    """Recovery or the Engine to the runtime: execute this, or this phase of it."""
 
     brick: str
     script: Script
+    phase: Phase = Phase.WHOLE
+    number: int = 0
 
 
 class Fired(msgspec.Struct, frozen=True, tag=True):
@@ -212,10 +256,10 @@ class Report(msgspec.Struct, frozen=True, tag=True):
 
 
 ToNode = (
-    Park | Assign | Serve | BindInput | BindOutput | Follow | Suspend | Resume | Capture | Restore | Tell
-    | WatchNodes | Arm | Stop | Quiet | Stats | Ack
+    Park | Assign | Serve | BindInput | BindOutput | Follow | Rewire | Suspend | Resume | Capture | Restore
+    | Tell | WatchNodes | Arm | Stop | Quiet | Stats | Ack
 )  # fmt: skip
-FromNode = Hello | Ack | Said | Ordered | Fired | Report
+FromNode = Hello | Rested | Ack | Said | Ordered | Fired | Report
 
 decode_order: Callable[[bytes], ToNode] = msgspec.msgpack.Decoder(ToNode).decode
 decode_report: Callable[[bytes], FromNode] = msgspec.msgpack.Decoder(FromNode).decode

@@ -4,12 +4,18 @@ It knows how to give a new process its ends of the channels, which is all that "
 and how to replace a process that belongs to no replica.
 """
 
+import contextlib
+import itertools
 import os
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Container, Generator, Iterable
 from pathlib import Path
 from typing import Final
 
+import msgspec
+
+from aftbed.core.errors import PeerError
 from aftbed.core.graph import Graph
+from aftbed.core.journal import EntryKind, entries
 from aftbed.ftm.mechanism import REPLICAS
 from aftbed.runtime.unix import control
 from aftbed.runtime.unix.channels import Channel, Channels
@@ -21,7 +27,12 @@ from aftbed.runtime.unix.spawn import BUS, LIGHT
 BESIDE_LEADER: Final = ("client", "proxy")
 WATCHED_KINDS: Final = ("client", "proxy", "watchdog", "recovery", "engine")
 
+RECORDED_MAX: Final = 16
+RECORDED_BYTES_MAX: Final = 1 << 16
+STAGED: Final = "'"  # behind the name of a process that is to become that node
+
 Keys = Generator[Wait, dict[Key, bytes], None]
+Staged = tuple[Process, tuple[Key, str]]  # a process, and the key of its Ack with its name
 DeviceOf = Callable[[str, int], tuple[str, bytes]]  # brick kind, incarnation -> device, its options
 
 
@@ -41,20 +52,41 @@ class Deployment:
     def __init__(
         self, graph: Graph, nursery: Nursery, record: Path, device_of: DeviceOf, cpus: list[int] | None
     ) -> None:
-        self.graph, self.nursery, self.record = graph, nursery, record
+        self.nursery, self.record = nursery, record
         self._device_of = device_of
         self.channels = Channels()
         self.nodes: dict[str, Process] = {}
         self.incarnations: dict[str, int] = {}
         self.epoch, self.leader, self.backup = 1, REPLICAS[0], ""
         self._tokens = 0
+        self._cpus = dict(zip(REPLICAS, itertools.cycle(cpus), strict=False)) if cpus else {}
+        self._generations: dict[str, int] = {}
         self.slots: dict[str, Slot] = {}
-        for index, name in enumerate(REPLICAS):
+        self.adopt(graph)
+
+    def adopt(self, graph: Graph, lost: Container[str] = ()) -> None:
+        """From now on, this is the graph that runs. A replica of other nodes is another generation of it:
+        what was suspected of its predecessor means nothing. What is suspected of a `lost` one stands.
+        """
+        self.graph = graph
+        for slot in self.slots.values():
+            self._generations[slot.name] = slot.generation
+        self.slots = {}
+        for name in REPLICAS:
             bricks = frozenset(
                 b.name for b in graph.bricks if b.replica == name and b.kind not in WATCHED_KINDS
             )
+            if graph.placement == "single":  # one node, so one fate: whoever leads in it
+                bricks = frozenset(b.name for b in graph.bricks if b.replica and b.kind not in WATCHED_KINDS)
+                bricks = bricks if name == self.leader else frozenset()
             if bricks:
-                self.slots[name] = Slot(name, bricks, cpus[index % len(cpus)] if cpus else None)
+                slot = self.slots[name] = Slot(name, bricks, self._cpus.get(name))
+                slot.nodes = [n for n in self.nodes_of(slot) if self.lives(n)]
+                slot.generation = self._generations.get(name, 0) + (name not in lost)
+
+    def nodes_of(self, slot: Slot) -> list[str]:
+        """The nodes of the graph that make up a replica."""
+        return [n for n, hosted in self.graph.nodes.items() if set(hosted) <= slot.bricks]
 
     # -- orders -------------------------------------------------------------------------------
 
@@ -63,13 +95,21 @@ class Deployment:
     ) -> tuple[Key, str]:
         """Send an order to `node`, waking it; the key of its Ack. Raises StepFailed if it is gone."""
         process = self.nodes.get(node)
-        if process is None or not process.alive:
+        if process is None:
             raise StepFailed(f"{node} is gone")
+        return self.order_to(process, make, fds)
+
+    def order_to(
+        self, process: Process, make: Callable[[int], control.ToNode], fds: tuple[int, ...] = ()
+    ) -> tuple[Key, str]:
+        """The same to a process that may serve or not: one that is staged, or was exchanged."""
+        if not process.alive:
+            raise StepFailed(f"{process.name} is gone")
         self._tokens += 1
         token = self._tokens
         self._announce(process, make(token), fds)
-        self._nudge(node)
-        return ("ack", node, token), node
+        self._nudge(process.name)
+        return ("ack", process.name, token), process.name
 
     def leave(self, node: str, order: control.ToNode, fds: tuple[int, ...] = ()) -> None:
         """Leave an order, unanswered, for when `node` wakes up next. Raises StepFailed if it is gone."""
@@ -85,7 +125,7 @@ class Deployment:
             process.header.announce()
 
     def _nudge(self, node: str) -> None:
-        for brick in self.graph.nodes[node]:
+        for brick in self.graph.nodes.get(node, ()):
             for channel in self.channels.into(brick):
                 channel.nudge()
 
@@ -113,27 +153,25 @@ class Deployment:
 
     # -- processes ----------------------------------------------------------------------------
 
-    def launch(self) -> Keys:
-        """The whole graph, from spares; the first replica leads, the second backs it up."""
+    def launch(self, held: Container[str] = ()) -> Keys:
+        """The whole graph, from spares; the first replica leads. Who is `held` waits for a Resume."""
         for link in self.graph.links:
             self.channels.renew(link)
-        for slot in self.slots.values():
-            slot.generation = 1
         sent = []
         for node in self.graph.nodes:
-            sent.append((yield from self._assign(node)))
+            sent.append((yield from self._assign(node, held=node in held)))
         yield from self.all_of(sent)
         if len(self.slots) > 1:
             self.backup = REPLICAS[1]
         self.pin_watchers()
         for slot in self.slots.values():
-            slot.nodes = [n for n in self.graph.nodes if set(self.graph.nodes[n]) <= slot.bricks]
+            slot.nodes = self.nodes_of(slot)
             yield from self.watch(slot)
 
     def spawn(self, slot: Slot) -> Keys:
         """A new generation of nodes in `slot`, its channels fresh, not leading."""
         slot.generation += 1
-        slot.nodes = [n for n in self.graph.nodes if set(self.graph.nodes[n]) <= slot.bricks]
+        slot.nodes = self.nodes_of(slot)
         for link in self.graph.links:
             inside = link.source in slot.bricks and link.sink in slot.bricks
             if inside or ("proxy" in (link.source, link.sink) and {link.source, link.sink} & slot.bricks):
@@ -144,13 +182,21 @@ class Deployment:
         yield from self.all_of(sent)
         yield from self.watch(slot)
 
-    def watch(self, slot: Slot) -> Keys:
-        """Have the Watchdog of `slot` watch its present nodes. Without a Watchdog: nothing."""
+    def shut_replication(self, slot: Slot) -> None:
+        """What `slot` sends to the other replica ends after what was sent."""
+        for channel in self.channels.touching(slot.bricks):
+            source, sink = channel.link.source, channel.link.sink
+            if source in slot.bricks and "/" in sink and sink not in slot.bricks:
+                channel.fence()
+
+    def watch(self, slot: Slot, *, nobody: bool = False) -> Keys:
+        """Have the Watchdog of `slot` watch its present nodes, or nobody. Without a Watchdog: nothing."""
         watchdog = f"{slot.name}/watchdog"
         process = self.nodes.get(watchdog)
         if process is None or not process.alive or not slot.nodes:
             return  # a Watchdog that is being replaced is told when it is there
-        hosts = [self.nodes[n] for n in slot.nodes]
+        nodes = () if nobody else tuple(slot.nodes)
+        hosts = [self.nodes[n] for n in nodes]
         if not all(host.alive for host in hosts):
             raise StepFailed(f"a node of replica {slot.name} died before it was watched")
         yield from self.ask(
@@ -159,7 +205,7 @@ class Deployment:
                 token,
                 slot.name,
                 slot.generation,
-                tuple(slot.nodes),
+                nodes,
                 tuple(str(host.journal) for host in hosts),
                 tuple(host.pid for host in hosts),
             ),
@@ -184,64 +230,97 @@ class Deployment:
             if node == f"{slot.name}/watchdog":
                 yield from self.watch(slot)
 
-    def _assign(self, node: str) -> Generator[Wait, dict[Key, bytes], tuple[Key, str]]:
-        """Make a spare this node. Returns the key of its Ack."""
-        specs = [self.graph.brick(name) for name in self.graph.nodes[node]]
+    def _assign(self, node: str, *, held: bool = False) -> Generator[Wait, dict[Key, bytes], tuple[Key, str]]:
+        """Make a spare this node, with its ends of channels. Returns the key of its Ack."""
+        bricks = frozenset(self.graph.nodes[node])
+        inputs, outputs, fds = self._ends(bricks)
+        process, sent = yield from self._make(node, node, self.graph, inputs, outputs, fds, held=held)
+        process.kind = "node"
+        self.nodes[node] = process
+        return sent
+
+    def stage(self, node: str, graph: Graph, *, held: bool) -> Generator[Wait, dict[Key, bytes], Staged]:
+        """Make a spare this node of `graph`, beside what serves, without any channel."""
+        stranger = any(graph.brick(b).source or graph.brick(b).application for b in graph.nodes[node])
+        name = f"{node}{STAGED}"
+        return (yield from self._make(name, node, graph, [], [], [], held=held, trial=stranger))
+
+    def _make(
+        self,
+        name: str,
+        node: str,
+        graph: Graph,
+        inputs: list[control.Port],
+        outputs: list[control.Port],
+        fds: list[int],
+        *,
+        held: bool,
+        trial: bool = False,
+    ) -> Generator[Wait, dict[Key, bytes], Staged]:
+        specs = tuple(graph.brick(name) for name in graph.nodes[node])
         incarnation = self.incarnations[node] = self.incarnations.get(node, 0) + 1
         device, options = self._device_of(specs[0].kind, incarnation)
         process = yield from self.nursery.spare(BUS if device == "gateway" else LIGHT)
-        process.name, process.kind, process.incarnation = node, "node", incarnation
+        process.name, process.kind, process.incarnation = name, "staged", incarnation
         process.journal = self.record / "journal" / f"{node.replace('/', '.')}.{incarnation}.journal"
-        self.nodes[node] = process
-        slot = next((s for s in self.slots.values() if specs[0].name in s.bricks), None)
-        inputs, outputs, fds = self._ends(frozenset(s.name for s in specs))
-        leads = slot is not None and slot.name == self.leader
+        names = {s.name for s in specs}
         locals_ = tuple(
             control.Local(k.source, k.source_port, k.sink, k.sink_port)
-            for k in self.graph.links
-            if {k.source, k.sink} <= {s.name for s in specs}
+            for k in graph.links
+            if {k.source, k.sink} <= names
         )
-        return self.order(
+        order = control.Assign(
+            0,
             node,
-            lambda token: control.Assign(
-                token,
-                node,
-                str(process.journal),
-                tuple((s.name, s.kind) for s in specs),
-                slot.number if slot else 0,
-                self.epoch,
-                leads,
-                tuple(inputs),
-                tuple(outputs),
-                locals_,
-                self.cpu_of(node),
-                device,
-                options,
-            ),
-            tuple(fds),
+            str(process.journal),
+            specs,
+            self.epoch,
+            self.leader,
+            tuple(inputs),
+            tuple(outputs),
+            locals_,
+            self.cpu_of(node, graph),
+            held,
+            name != node,
+            control.Trial(graph, self.recorded()) if trial else None,
+            device,
+            options,
         )
+        sent = self.order_to(process, lambda token: msgspec.structs.replace(order, token=token), tuple(fds))
+        return process, sent
+
+    def recorded(self) -> tuple[bytes, ...]:
+        """The first few requests of this run, with which what is new is tested."""
+        path = self.record / "journal" / "client.1.dialogue"
+        found: list[bytes] = []
+        with open(path, "rb") as file, contextlib.suppress(PeerError):  # the last entry is cut off
+            for entry in entries(file.read(RECORDED_BYTES_MAX)):
+                found += [entry.payload] if entry.kind is EntryKind.SENT else []
+        return tuple(found[:RECORDED_MAX])
 
     def assigned(self, process: Process) -> None:
         """The Ack of an Assign is here: its journal exists."""
         if process.header is None and process.journal is not None and process.journal.exists():
             process.header = Header(process.journal)
 
-    def cpu_of(self, node: str) -> int | None:
+    def cpu_of(self, node: str, graph: Graph | None = None) -> int | None:
         """A replica's chain stays on its core; Client and Proxy stay beside the leader.
 
         A Watchdog is on another core than the replica that it watches, and Recovery on another than
         the leader: a core on which a replica has just died is busy for a while with taking it down.
         """
-        leads = self.slots.get(self.leader or self.backup)
-        for slot in self.slots.values():
-            if set(self.graph.nodes.get(node, ("",))) <= slot.bricks:
-                return slot.cpu
-        watched = self.slots.get(node.removesuffix("/watchdog"))
-        if watched is not None:
-            return next((s.cpu for s in self.slots.values() if s is not watched), None)
+        hosted = (graph or self.graph).nodes.get(node, ())
+        leads = self.leader or self.backup
+        if node.endswith("/watchdog"):
+            return self._other_cpu(node.partition("/")[0])
+        if hosted and all("/" in brick for brick in hosted):
+            return self._cpus.get(hosted[0].partition("/")[0])
         if node in BESIDE_LEADER:
-            return leads.cpu if leads else None
-        return next((s.cpu for s in self.slots.values() if s is not leads), None)
+            return self._cpus.get(leads)
+        return self._other_cpu(leads)
+
+    def _other_cpu(self, replica: str) -> int | None:
+        return next((cpu for name, cpu in self._cpus.items() if name != replica), None)
 
     def pin(self, nodes: Iterable[str]) -> None:
         """Move `nodes` to where they belong now that another replica leads."""
@@ -265,8 +344,7 @@ class Deployment:
         if "proxy" not in (link.source, link.sink):
             return False
         other = link.sink if link.source == "proxy" else link.source
-        slot = next((s for s in self.slots.values() if other in s.bricks), None)
-        return slot is not None and slot.name != self.leader
+        return "/" in other and other.partition("/")[0] != self.leader
 
     def _ends(self, bricks: frozenset[str]) -> tuple[list[control.Port], list[control.Port], list[int]]:
         """The ends of all channels between `bricks` and others, as ports and descriptors."""

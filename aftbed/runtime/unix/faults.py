@@ -1,8 +1,9 @@
 """Faults on real processes: armed in the node that emits the event, applied through pidfds of this run.
 
-A crash of the emitter itself happens there, at the very point. Anything else is asked for: the
-emitter waits until the supervisor has hit the target and seen it hit (dead, or in state `T`), since a
-process goes on for a while after a signal was sent. Each fault ends with a receipt.
+A crash of the emitter itself happens there, at the very point; so does a bitflip, which needs nobody
+else. Anything else is asked for: the emitter waits until the supervisor has hit the target and seen it
+hit (dead, or in state `T`), since a process goes on for a while after a signal was sent. What an
+adaptation comes through is emitted by the supervisor itself: see `Faults.at`. Each fault ends with a receipt.
 """
 
 import contextlib
@@ -11,11 +12,12 @@ import signal
 import time
 from collections.abc import Callable, Generator
 from pathlib import Path
+from random import Random
 from typing import Final
 
 from aftbed.core.event import Event, event_named
-from aftbed.core.fault import Act, Fault
-from aftbed.core.journal import records
+from aftbed.core.fault import Act, Fault, Flip, marked
+from aftbed.core.journal import Record, records
 from aftbed.runtime import targets
 from aftbed.runtime.unix import control, linux
 from aftbed.runtime.unix.deployment import Deployment, Keys
@@ -25,94 +27,158 @@ from aftbed.runtime.unix.loop import Loop
 from aftbed.runtime.unix.processes import Process
 
 STOP_SECONDS_MAX: Final = 0.5
+DRAW_BITS: Final = 63
 
 
 class Armed:
-    """A fault and what has become of it: armed, applied, not_activated."""
+    """A fault and what has become of it: armed, applied, refused, not_activated; `detail` says more."""
 
-    def __init__(self, number: int, fault: Fault) -> None:
-        self.number, self.fault = number, fault
-        self.state = "armed"
-        self.armed_ns = time.monotonic_ns()
-        self.host: Process | None = None  # where it waits for its event
+    def __init__(self, number: int, fault: Fault, draw: int) -> None:
+        self.number, self.fault, self.draw = number, fault, draw
+        self.state, self.detail = "armed", ""
+        self.left = fault.trigger.nth  # of the occurrences of its event, since it came to its host
+        self.waits = False  # for its event: in its host, or, while nobody emits it, in none
+        self.host: Process | None = None
+        self.brick = ""
         self.itself = False
         self.journals: set[Path] = set()
+        self._since_ns = 0
+        self._share = 1  # how many bricks of the host emit the event
+
+    def move_in(self, host: Process, brick: str, share: int, *, itself: bool) -> None:
+        """Wait in `host` from now on."""
+        assert host.journal is not None, host.name
+        self.host, self.brick, self._share, self.itself = host, brick, share, itself
+        self.journals.add(host.journal)
+        self._since_ns = time.monotonic_ns()
+
+    def move_out(self) -> None:
+        """What happened in the host has been counted there, and is not forgotten."""
+        assert self.host is not None and self.host.journal is not None
+        event = event_named(self.fault.event)
+        happened = sum(
+            r.event is event and r.t_ns >= self._since_ns for r in records(self.host.journal.read_bytes())
+        )
+        self.left = max(1, self.left - happened // self._share)
+        self.host = None
+
+    def blow(self, nth: int) -> control.Blow:
+        """What the host is told."""
+        fault = self.fault
+        return control.Blow(self.number, self.brick, nth, fault.act, self.itself, fault.flip, self.draw)
 
 
 class Faults:
-    """All faults of a run."""
+    """All faults of a run; `seed` is the run's, and chooses the bits that nobody names."""
 
     def __init__(
-        self, deployment: Deployment, loop: Loop, journal: Journal, tell: Callable[[str, str], None]
+        self,
+        deployment: Deployment,
+        loop: Loop,
+        journal: Journal,
+        tell: Callable[[str, str], None],
+        seed: int = 0,
     ) -> None:
         self._deployment, self._loop, self._journal, self._tell = deployment, loop, journal, tell
+        self._seed = seed
         self._numbers = itertools.count(1_000_001)  # apart from the tokens of orders
         self._armed: list[Armed] = []
 
     def arm(self, fault: Fault) -> Keys:
         """Apply `fault` now, later, or have its emitter wait for its event. Raises StepFailed."""
-        armed = Armed(next(self._numbers), fault)
+        number = next(self._numbers)
+        armed = Armed(number, fault, Random(f"{self._seed}/{number}").getrandbits(DRAW_BITS))
         self._armed.append(armed)
         self._tell("armed", str(fault))
-        if fault.trigger.event:
-            yield from self._arm_event(armed)
-        elif fault.trigger.after_ms:
+        if fault.trigger.after_ms and not fault.trigger.event:
             self._loop.after(fault.trigger.after_ms / 1e3, lambda: self._start(armed))
-        else:
-            yield from self._apply(armed)
+            return
+        try:
+            yield from self._begin(armed)
+        except StepFailed:
+            armed.state = "not_activated"
+            raise
 
     def _start(self, armed: Armed) -> None:
-        self._loop.jobs.start(f"fault {armed.fault}", self._apply(armed), lambda failure: None)
+        self._loop.jobs.start(f"fault {armed.fault}", self._begin(armed), lambda failure: None)
 
-    def _arm_event(self, armed: Armed) -> Keys:
-        deployment, trigger = self._deployment, armed.fault.trigger
-        node = targets.emitter(deployment.graph, trigger.event, deployment.leader, deployment.backup)
-        if node is None or not deployment.lives(node):
-            raise StepFailed(f"{armed.fault}: nobody emits {trigger.event} now")
-        process = deployment.nodes[node]
-        happened = self._count(armed)
-        armed.host = process
-        if process.journal is not None:
-            armed.journals.add(process.journal)
-        armed.itself = armed.fault.act is Act.CRASH and node in self._nodes_of(armed.fault.target)
-        nth = max(1, trigger.nth - happened)
+    def _begin(self, armed: Armed) -> Keys:
+        yield from self._place(armed) if armed.fault.event else self._apply(armed)
+
+    def _place(self, armed: Armed) -> Keys:
+        """Have whoever emits its event wait for it. Raises StepFailed where nobody does now."""
+        deployment, fault = self._deployment, armed.fault
+        graph, roles = deployment.graph, (deployment.leader, deployment.backup)
+        armed.waits = True
+        if targets.emitter(graph, fault.event, *roles) == targets.SUPERVISOR:
+            return
+        brick = targets.waits_in(fault, graph, *roles)
+        node = "" if brick is None else graph.node_of(brick)
+        if brick is None or not deployment.lives(node):
+            raise StepFailed(f"{fault}: nobody emits {fault.event} now")
+        itself = fault.act is Act.CRASH and node in self._nodes_of(fault.target)
+        share = targets.emitters_in(graph, fault.event, node)
+        armed.move_in(deployment.nodes[node], brick, share, itself=itself)
         yield from deployment.ask(
-            node,
-            lambda token: control.Arm(token, armed.number, trigger.event, nth, armed.fault.act, armed.itself),
+            node, lambda token: control.Arm(token, fault.event, (armed.blow(armed.left),))
         )
 
-    def _count(self, armed: Armed) -> int:
-        """How often the event has happened since `armed`, in nodes that are no longer the emitter."""
-        event = event_named(armed.fault.trigger.event)
-        return sum(
-            r.event is event and r.t_ns >= armed.armed_ns
-            for path in armed.journals
-            for r in records(path.read_bytes())
-        )
+    def _stands(self, armed: Armed) -> bool:
+        """Whether the host of `armed` still is the one that emits its event."""
+        deployment, host = self._deployment, armed.host
+        brick = targets.waits_in(armed.fault, deployment.graph, deployment.leader, deployment.backup)
+        if host is None or brick != armed.brick:
+            return False
+        return host.alive and deployment.nodes.get(deployment.graph.node_of(brick)) is host
+
+    def _withdraw(self, armed: Armed) -> Keys:
+        """Its host no longer emits its event, or lives no longer."""
+        host = armed.host
+        armed.move_out()
+        if host is not None and host.alive and self._deployment.nodes.get(host.name) is host:
+            event, blow = armed.fault.event, armed.blow(0)
+            yield from self._deployment.ask(host.name, lambda token: control.Arm(token, event, (blow,)))
 
     def rearm(self) -> Keys:
-        """After a change of roles: what waits in a node that is not the emitter any more moves on."""
+        """After a change of roles, or of the graph: what waits in a node that is not the emitter moves on."""
         for armed in self._armed:
             self._look(armed)
-            if armed.state == "armed" and armed.host is not None and not armed.host.alive:
-                try:
-                    yield from self._arm_event(armed)
-                except StepFailed:
-                    continue  # nobody emits it now; the next change of roles asks again
+            if armed.state != "armed" or not armed.waits or self._stands(armed):
+                continue
+            with contextlib.suppress(StepFailed):  # nobody emits it now; the next change asks again
+                if armed.host is not None:
+                    yield from self._withdraw(armed)
+                yield from self._place(armed)
+
+    def at(self, event: Event) -> Keys:
+        """The executor has come to `event`: who is due is hit, and has been seen hit when this ends."""
+        for armed in list(self._armed):
+            if armed.state == "armed" and armed.waits and armed.fault.event == event.label:
+                armed.left -= 1
+                if armed.left == 0:
+                    yield from self._apply(armed)
 
     def _look(self, armed: Armed) -> None:
-        """A node that crashed itself has left word in its journal."""
-        if armed.state != "armed" or not armed.itself:
+        """A node that has hit itself has left word in its journal."""
+        if armed.state != "armed" or not (armed.itself or armed.fault.flip):
             return
         for path in armed.journals:
             for record in records(path.read_bytes()):
-                if record.event is Event.FAULT_APPLIED and record.detail == armed.number:
+                if marked(record.detail)[0] != armed.number:
+                    continue
+                if armed.fault.flip is not None:
+                    _settle_flip(armed, armed.fault.flip, record)
+                elif record.event is Event.FAULT_APPLIED:
                     armed.state = "applied"
 
     def fired(self, process: Process, number: int) -> None:
-        """The emitter has reached the point, and waits."""
+        """The emitter has reached the point, and waits; for a bitflip it has done what was to do."""
         armed = next((a for a in self._armed if a.number == number), None)
         if armed is None:
+            return
+        if armed.fault.flip is not None:
+            self._look(armed)
+            self._tell("fault", f"{armed.fault}: {armed.state}, {armed.detail}")
             return
         emitter = process
 
@@ -164,14 +230,28 @@ class Faults:
             self._loop.after(armed.fault.for_ms / 1e3, lambda: _resume(hit, pidfds))
         yield Wait(frozenset())
 
-    def receipts(self) -> list[dict[str, object]]:
-        """What became of each fault."""
+    def receipts(self) -> list[dict[str, str]]:
+        """What became of each fault; `detail` where there is more to say."""
         for armed in self._armed:
             self._look(armed)
         return [
             {"fault": str(a.fault), "receipt": "not_activated" if a.state == "armed" else a.state}
+            | ({"detail": a.detail} if a.detail else {})
             for a in self._armed
         ]
+
+
+def _settle_flip(armed: Armed, flip: Flip, record: Record) -> None:
+    """What the Server's host says of a bitflip: which bit it hit, or that there were so many and no other."""
+    _, bits = marked(record.detail)
+    of = f"of the {flip.place.value} of request {record.request_id} in {armed.brick}"
+    if record.event is Event.FAULT_APPLIED:
+        armed.state, armed.detail = "applied", f"bit {bits} {of}"
+    elif not bits or (flip.bit is not None and flip.bit >= bits):
+        armed.state, armed.detail = "not_activated", f"there are {bits} bits {of}"
+    else:
+        bit = flip.bit if flip.bit is not None else armed.draw % bits
+        armed.state, armed.detail = "refused", f"the function refused bit {bit} {of}"
 
 
 def _stopped(process: Process) -> bool:

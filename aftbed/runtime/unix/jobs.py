@@ -91,6 +91,10 @@ class Jobs:
         """The process called `process` is dead."""
         self._throw([job for job in self._jobs if process in job.wait.involved], f"{process} died")
 
+    def cancel(self, name: str, reason: str) -> None:
+        """Fail the job called `name`."""
+        self._throw([job for job in self._jobs if job.name == name], reason)
+
     def expire(self, now_ns: int) -> None:
         """Fail what is past its deadline."""
         late = [job for job in self._jobs if now_ns >= job.deadline_ns]

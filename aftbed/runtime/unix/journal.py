@@ -58,14 +58,14 @@ class Journal:
         self.at, self.end = layout.HEADER_BYTES, CHUNK_BYTES - STEP_BYTES_MAX
         self._pack = layout.RECORD.pack_into
 
-    def write(self, now_ns: int, event: Event, request_id: int, detail: int) -> None:
+    def write(self, now_ns: int, event: Event, request_id: int, detail: int, brick: int = 0) -> None:
         """Append a record."""
         at = self.at
         if at > self.end:
             if not _grow(self.mapping):
                 return
             self.end = len(self.mapping) - STEP_BYTES_MAX
-        self._pack(self.mapping, at, now_ns, request_id, detail, 0, event.code)
+        self._pack(self.mapping, at, now_ns, request_id, detail, brick, event.code)
         self.at = at + layout.RECORD.size
 
 

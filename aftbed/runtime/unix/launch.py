@@ -19,7 +19,7 @@ from aftbed import __version__
 from aftbed.core.errors import ConfigError
 from aftbed.core.fault import Fault
 from aftbed.runtime.unix import control, linux, rundir
-from aftbed.runtime.unix.options import LoadRun, RunOptions, Work
+from aftbed.runtime.unix.options import LoadRun, RunOptions, Scheduled, Work
 from aftbed.runtime.unix.spawn import BUS, LIGHT, start_zygote
 from aftbed.runtime.unix.warden import watch
 
@@ -180,6 +180,7 @@ def options_for(
     seed: int = 0,
     record: str | None = None,
     faults: tuple[Fault, ...] = (),
+    adaptations: tuple[Scheduled, ...] = (),
     pin: bool = True,
     bus_port: int = 0,
 ) -> tuple[RunOptions, socket.socket | None]:
@@ -202,6 +203,7 @@ def options_for(
         seed=seed,
         work=work,
         faults=faults,
+        adaptations=adaptations,
         pin=pin,
         listener=listener.fileno() if listener is not None else -1,
         port=listener.getsockname()[1] if listener is not None else 0,

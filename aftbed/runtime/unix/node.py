@@ -23,11 +23,11 @@ from types import FrameType
 from typing import Final, NoReturn
 
 from aftbed.core import wire
-from aftbed.core.brick import CONTROL, Brick, Effect, Note, Order, Send
+from aftbed.core.brick import CONTROL, Brick, Effect, Halt, Note, Order, Send
 from aftbed.core.errors import PeerError
 from aftbed.core.event import Event
 from aftbed.core.journal import FLAG_OFFSET, PULSE_OFFSET, RECORD
-from aftbed.core.message import AnyMessage, ChannelEnded, Message, Promoted, Rebound, Reply
+from aftbed.core.message import Adapted, AnyMessage, ChannelEnded, Message, Promoted, Rebound, Reply
 from aftbed.runtime.unix import control
 from aftbed.runtime.unix.devices import Device, Sensor
 from aftbed.runtime.unix.journal import Journal
@@ -43,6 +43,7 @@ HOST_FILES: Final = (__file__, control.__file__)  # what is blocked in here is n
 EXIT_FENCED: Final = 3
 REFUSED: Final = (PeerError, *wire.UNREADABLE)
 EXIT_ASSERT: Final = 70
+EXIT_DETECTED: Final = 71  # a detected stop
 
 _now = time.monotonic_ns
 _read = os.read
@@ -66,10 +67,16 @@ class Node:
         self._hot: Hosted | None = None  # served by the tight loop
         self.suspend_token = 0  # not 0: suspend as soon as quiescent
         self.suspended = False
+        self.draining = False  # suspend only when nothing waits at the open ports
         self.armed: dict[Event, control.Arm] = {}
         self._refused = 0
 
     # -- building -----------------------------------------------------------------------------
+
+    def link_inside(self, local: control.Local, epoch: int) -> None:
+        """A channel between two bricks of this node; the source is told, as of any other."""
+        self.wiring.link_inside(local)
+        self.step(self.wiring.hosted[local.brick], CONTROL, Rebound(local.port, True, epoch))
 
     def add(self, name: str, brick: Brick) -> None:
         """Host `brick`."""
@@ -94,7 +101,7 @@ class Node:
         self.device.accept(message, _now())
 
     def _say(self, brick: str, message: Message) -> None:
-        assert isinstance(message, Promoted)
+        assert isinstance(message, Promoted | Adapted)
         self.line.send(control.Said(brick, message))
 
     # -- the pulse ----------------------------------------------------------------------------
@@ -133,12 +140,12 @@ class Node:
 
     def turn(self) -> None:
         """Handle one thing, or wait for one."""
-        if self.wiring.mail:
-            hosted, port, message = self.wiring.mail.popleft()
-            self.step(hosted, port, message)
+        inside = self.wiring.inside() if self.wiring.mail else None
+        if inside is not None:
+            self.step(*inside)
             return
         if self.suspend_token or self.suspended:
-            if self.suspend_token and self.wiring.quiescent():
+            if self.suspend_token and self.wiring.quiescent() and not (self.draining and self._waits()):
                 self.suspended = True
                 self.ack(self.suspend_token)
                 self.suspend_token = 0
@@ -155,6 +162,11 @@ class Node:
             self._wait_for(plan.single)
         else:
             self._poll(plan)
+
+    def _waits(self) -> bool:
+        """Whether there is mail at an open port."""
+        plan = self.wiring.plan((), may_block=False)
+        return bool(plan.poll.poll(0))
 
     def serve_hot(self, hosted: Hosted) -> None:
         """The same as `turn`, with all at hand, for a node that hosts one brick and polls nothing.
@@ -195,6 +207,9 @@ class Node:
                 elif type(effect) is Note:
                     _pack(mapping, at, now_ns, effect.request_id, effect.detail, 0, effect.event.code)
                     at += RECORD_BYTES
+                else:
+                    journal.at = at
+                    self._order_or_halt(hosted, effect)
             journal.at = at
 
     def _wait_for(self, inlet: Inlet) -> None:
@@ -307,12 +322,21 @@ class Node:
                     out(effect.message)  # type: ignore[operator,union-attr]
             elif kind is Note:
                 assert isinstance(effect, Note)
-                self.journal.write(now_ns, effect.event, effect.request_id, effect.detail)
+                self.journal.write(now_ns, effect.event, effect.request_id, effect.detail, hosted.index)
                 if self.armed:
-                    fire(self, effect.event)
+                    fire(self, hosted, effects, effect)
             else:
-                assert isinstance(effect, Order)
-                self.line.send(control.Ordered(hosted.name, effect.script))
+                self._order_or_halt(hosted, effect)
+
+    def _order_or_halt(self, hosted: Hosted, effect: Effect) -> None:
+        if isinstance(effect, Order):
+            self.line.send(control.Ordered(hosted.name, effect.script, effect.phase, effect.number))
+            return
+        assert isinstance(effect, Halt)
+        print(
+            f"{hosted.name} (pid {os.getpid()}): detected stop: {effect.reason}", file=sys.stderr, flush=True
+        )
+        os._exit(EXIT_DETECTED)
 
     def _write_hard(self, hosted: Hosted, port: str, data: bytes) -> None:
         """The channel is full or shut: serve control meanwhile, since that may be about this channel.

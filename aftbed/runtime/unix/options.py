@@ -3,6 +3,7 @@
 import msgspec
 
 from aftbed.core.fault import Fault
+from aftbed.core.message import Goal
 
 
 class LoadRun(msgspec.Struct, frozen=True, tag=True):
@@ -32,6 +33,14 @@ class ReplayRun(msgspec.Struct, frozen=True, tag=True):
 Work = LoadRun | CarRun | ReplayRun
 
 
+class Scheduled(msgspec.Struct, frozen=True):
+    """An adaptation that begins when request `at_request` is sent, or `after_ms` after the launch."""
+
+    goal: Goal
+    at_request: int = 0
+    after_ms: float = 0.0
+
+
 class RunOptions(msgspec.Struct, frozen=True):
     """`private` and `record` are directories that exist; `listener` is the hub's bound socket."""
 
@@ -43,6 +52,7 @@ class RunOptions(msgspec.Struct, frozen=True):
     seed: int
     work: Work
     faults: tuple[Fault, ...] = ()
+    adaptations: tuple[Scheduled, ...] = ()
     pin: bool = True
     listener: int = -1
     port: int = 0

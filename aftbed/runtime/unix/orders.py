@@ -5,15 +5,16 @@ import signal
 import time
 from typing import TYPE_CHECKING, Final, assert_never
 
-import msgspec
+from msgspec import structs
 
-from aftbed.core.brick import CONTROL
+from aftbed.core.brick import CONTROL, Brick, Effect, Note, Send
 from aftbed.core.errors import PeerError
 from aftbed.core.event import Event, event_named
-from aftbed.core.fault import Act
-from aftbed.core.message import Watch
+from aftbed.core.fault import Act, Flip, Place, flipped, mark
+from aftbed.core.message import Message, Reply, StateCaptured, Tried, Watch
 from aftbed.runtime.unix import control
 from aftbed.runtime.unix.devices import Sensor
+from aftbed.runtime.unix.wiring import Hosted
 
 if TYPE_CHECKING:
     from aftbed.runtime.unix.node import Node
@@ -36,21 +37,25 @@ def carry_out(node: "Node", order: control.ToNode, fds: list[int]) -> bytes | No
             read, write = fds
             wiring.bind_input(brick, port, read)
             node.bind_output(brick, output, write, epoch)
-        case control.Suspend(token):
-            node.suspend_token = token
+        case control.Rewire():
+            return _rewire(node, order, fds)
+        case control.Suspend(token, drain):
+            node.suspend_token, node.draining = token, drain
             return None  # answered when quiescent
         case control.Resume():
             node.suspended, node.suspend_token = False, 0
         case control.Capture(_, brick):
             return wiring.hosted[brick].brick.capture()
-        case control.Restore(_, brick, state):
-            wiring.hosted[brick].brick.restore(state)
+        case control.Restore(_, brick, state, migrate):
+            taker = wiring.hosted[brick].brick
+            take = getattr(taker, "migrate", taker.restore) if migrate else taker.restore
+            take(state)
         case control.Tell(_, brick, message):
             node.step(wiring.hosted[brick], CONTROL, message)
         case control.WatchNodes():
             _watch(node, order, fds)
         case control.Arm():
-            node.armed[event_named(order.event)] = order
+            _arm(node, order)
         case control.Stats():
             return node.device.stats() if node.device is not None else b""
         case control.Quiet():
@@ -63,6 +68,19 @@ def carry_out(node: "Node", order: control.ToNode, fds: list[int]) -> bytes | No
     return b""
 
 
+def _rewire(node: "Node", order: control.Rewire, fds: list[int]) -> bytes | None:
+    for port in order.inputs:
+        found = None if port.index == control.NOWHERE else fds[port.index]
+        node.wiring.bind_input(port.brick, port.port, found)
+    for port in order.outputs:
+        found = None if port.index == control.NOWHERE else fds[port.index]
+        node.bind_output(port.brick, port.port, found, order.epoch)
+    if not order.suspend:
+        return b""
+    node.suspend_token, node.draining = order.token, False
+    return None  # answered when quiescent
+
+
 def _watch(node: "Node", order: control.WatchNodes, fds: list[int]) -> None:
     assert isinstance(node.device, Sensor) and node.device_brick is not None
     node.device.watch(order.nodes, order.journals, order.pids, fds)
@@ -70,22 +88,94 @@ def _watch(node: "Node", order: control.WatchNodes, fds: list[int]) -> None:
     node.step(node.device_brick, CONTROL, Watch(order.replica, order.generation, order.nodes))
 
 
-def fire(node: "Node", event: Event) -> None:
-    """`event` has happened here: if a fault waits for it, and this is the time, act or ask for it."""
-    arm = node.armed.get(event)
+# -- faults ---------------------------------------------------------------------------------------
+
+
+def _arm(node: "Node", order: control.Arm) -> None:
+    """Faults that wait for the same event go on counting; one that is told of again begins anew."""
+    event = event_named(order.event)
+    before = node.armed.pop(event, None)
+    told = {blow.fault for blow in order.blows}
+    kept = [blow for blow in before.blows if blow.fault not in told] if before is not None else []
+    blows = (*kept, *(blow for blow in order.blows if blow.nth))
+    if blows:
+        node.armed[event] = control.Arm(control.UNANSWERED, order.event, blows)
+
+
+def fire(node: "Node", hosted: Hosted, effects: list[Effect], note: Note) -> None:
+    """`note`, one of `effects`, is being performed: what waits for it and is due happens now.
+
+    A bit is flipped in what is sent behind it, so `effects` may be others from there on.
+    """
+    arm = node.armed.get(note.event)
     if arm is None:
         return
-    if arm.nth > 1:
-        node.armed[event] = msgspec.structs.replace(arm, nth=arm.nth - 1)
+    counted = [b if b.brick != hosted.name else structs.replace(b, nth=b.nth - 1) for b in arm.blows]
+    _arm(node, control.Arm(control.UNANSWERED, arm.event, tuple(counted)))
+    for blow in counted:
+        if blow.nth == 0 and blow.flip is not None:
+            _flip(node, hosted, effects, note, blow, blow.flip)
+        elif blow.nth == 0:
+            _strike(node, blow)
+
+
+def _strike(node: "Node", blow: control.Blow) -> None:
+    """Do it to ourselves, or wait until the supervisor has done it."""
+    node.journal.write(time.monotonic_ns(), Event.FAULT_APPLIED, 0, mark(blow.fault))
+    if blow.itself:
+        os.kill(os.getpid(), signal.SIGKILL if blow.act is Act.CRASH else signal.SIGSTOP)
         return
-    del node.armed[event]
-    node.journal.write(time.monotonic_ns(), Event.FAULT_APPLIED, 0, arm.fault)
-    if arm.itself:
-        os.kill(os.getpid(), signal.SIGKILL if arm.act is Act.CRASH else signal.SIGSTOP)
-        return
-    node.line.send(control.Fired(arm.fault))
+    node.line.send(control.Fired(blow.fault))
     limit = time.monotonic() + FAULT_SECONDS_MAX
     while time.monotonic() < limit:
-        if node.serve_control(wait=True, until=arm.fault):
+        if node.serve_control(wait=True, until=blow.fault):
             return
-    raise AssertionError(f"fault {arm.fault} was not applied within {FAULT_SECONDS_MAX} s")
+    raise AssertionError(f"fault {blow.fault} was not applied within {FAULT_SECONDS_MAX} s")
+
+
+def _flip(
+    node: "Node", hosted: Hosted, effects: list[Effect], note: Note, blow: control.Blow, flip: Flip
+) -> None:
+    """Hit what the Server has just made; the message that carries it away shows it.
+
+    The journal says which bit was hit, or, where that did not come to be, how many bits there were.
+    """
+    behind = next(i for i, effect in enumerate(effects) if effect is note) + 1
+    at, send = next((i, e) for i, e in enumerate(effects) if i >= behind and isinstance(e, Send))
+    data = _aimed_at(hosted.brick, send.message, flip.place)
+    bits = 8 * len(data)
+    bit = flip.bit if flip.bit is not None else blow.draw % max(1, bits)
+    message = None
+    if bit < bits:
+        message = _hit(hosted.brick, send.message, flip.place, data, bit)
+    if message is None:
+        node.journal.write(time.monotonic_ns(), Event.PEER_REFUSED, note.request_id, mark(blow.fault, bits))
+    else:
+        effects[at] = Send(send.port, message)
+        node.journal.write(time.monotonic_ns(), Event.FAULT_APPLIED, note.request_id, mark(blow.fault, bit))
+    node.line.send(control.Fired(blow.fault))  # nobody has to be waited for
+
+
+def _aimed_at(brick: Brick, message: Message, place: Place) -> bytes:
+    """The bytes that have the bit; none where the function does not hand out its state."""
+    if place is Place.RESULT:
+        assert isinstance(message, Reply | Tried), message
+        return message.payload
+    try:
+        return brick.capture()
+    except PeerError:
+        return b""
+
+
+def _hit(brick: Brick, message: Message, place: Place, data: bytes, bit: int) -> Message | None:
+    """What `message` is after the hit; None where the function refuses such a state, or ignores the bit."""
+    if place is Place.RESULT:
+        return structs.replace(message, payload=flipped(data, bit))
+    try:
+        brick.restore(flipped(data, bit))
+    except PeerError:
+        return None
+    state = brick.capture()
+    if state == data:
+        return None
+    return structs.replace(message, state=state) if isinstance(message, Tried | StateCaptured) else message

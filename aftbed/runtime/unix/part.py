@@ -1,14 +1,22 @@
 """What a spare becomes: a node of the graph, or a service beside it (the hub, the vehicle)."""
 
+import importlib
+import importlib.util
 import os
 import sys
 from pathlib import Path
+from types import ModuleType
 from typing import Final, NoReturn
 
 import msgspec
 
-from aftbed.ftm.catalog import Setting, make
+from aftbed.adapt import selftest
+from aftbed.adapt.bricks import load_application, make_brick
+from aftbed.core.errors import ConfigError
+from aftbed.core.graph import BrickSpec
+from aftbed.ftm.catalog import Setting
 from aftbed.ftm.client import Client
+from aftbed.ftm.mechanism import REPLICAS
 from aftbed.runtime.unix import control, linux, rehearsal
 from aftbed.runtime.unix.devices import Device, Load, LoadOptions, Sensor
 from aftbed.runtime.unix.journal import Journal
@@ -34,7 +42,11 @@ def become(
         node = _build(line, order, fds)
         rehearsal.before_mail(node)
     except BaseException as error:  # noqa: BLE001 - the last frame of this process
-        line.send(control.Ack(order.token, error=f"{type(error).__name__}: {error}"))
+        known = isinstance(error, ConfigError)
+        reason = str(error) if known else f"{type(error).__name__}: {error}"
+        line.send(control.Ack(order.token, error=reason))
+        if known:
+            os._exit(0)
         sys.excepthook(type(error), error, error.__traceback__)
         os._exit(EXIT_ASSERT)
     node.run()
@@ -44,7 +56,7 @@ def _build(line: control.Line[control.ToNode], order: control.Assign, fds: list[
     linux.set_name(order.node)
     if order.cpu is not None:
         os.sched_setaffinity(0, {order.cpu})
-    if order.bricks[0][1] in ("watchdog", "recovery"):
+    if order.bricks[0].kind in ("watchdog", "recovery"):
         linux.answer_soon()
     else:
         linux.hand_over()
@@ -52,14 +64,17 @@ def _build(line: control.Line[control.ToNode], order: control.Assign, fds: list[
     node = Node(order.node, line, Journal(Path(order.journal), order.node))
     node.start_pulse()
     node.lifeline = Held(Path(order.journal))
-    setting = Setting(order.replica, order.epoch, order.leads, default_application)
-    for name, kind in order.bricks:
-        node.add(name, make(kind, setting))
+    node.suspended = order.held
+    if order.staged:
+        rehearsal.once()
+    for spec in order.bricks:
+        node.add(spec.name, make_brick(spec, _setting(spec, order), load_module))
+    if order.trial is not None:
+        _try_out(order, order.trial)
     for local in order.locals:
-        node.wiring.link_inside(local)
+        node.link_inside(local, order.epoch)
     if order.device:
-        name = order.bricks[0][0]
-        node.attach(_device(order, node), name)
+        node.attach(_device(order, node), order.bricks[0].name)
     for port in order.inputs:
         node.wiring.bind_input(port.brick, port.port, fds[port.index])
     line.send(control.Ack(order.token))
@@ -68,10 +83,47 @@ def _build(line: control.Line[control.ToNode], order: control.Assign, fds: list[
     return node
 
 
+def _try_out(order: control.Assign, trial: control.Trial) -> None:
+    """The self-test of what was written off line."""
+    replica = next(s.replica for s in order.bricks if s.replica)
+    server = next(b for b in trial.graph.bricks if b.part == "server")
+
+    def setting(spec: BrickSpec) -> Setting:
+        return _setting(spec, order, leader=replica)
+
+    selftest.run(
+        trial.graph,
+        replica,
+        lambda spec: make_brick(spec, setting(spec), load_module),
+        trial.requests,
+        deterministic=setting(server).application().characteristics.deterministic,
+    )
+
+
+def _setting(spec: BrickSpec, order: control.Assign, leader: str = "") -> Setting:
+    """What a brick is made for: whose it is, whether it leads, and the function if that is not ours."""
+    number = REPLICAS.index(spec.replica) + 1 if spec.replica else 0
+    application = load_application(spec.application, load_module) if spec.application else default_application
+    epoch = selftest.EPOCH if leader else order.epoch
+    return Setting(number, epoch, spec.replica == (leader or order.leader), application)
+
+
+def load_module(place: str) -> ModuleType:
+    """The module called `place`, or in that file if it ends in `.py`. Raises ConfigError without the file."""
+    if not place.endswith(".py"):
+        return importlib.import_module(place)
+    spec = importlib.util.spec_from_file_location(Path(place).stem, place)
+    if spec is None or spec.loader is None or not Path(place).is_file():
+        raise ConfigError(f"{place}: no such file")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
 def _device(order: control.Assign, node: Node) -> Device:
     if order.device == "sensor":
         return Sensor()
-    client = node.wiring.hosted[order.bricks[0][0]].brick
+    client = node.wiring.hosted[order.bricks[0].name].brick
     assert isinstance(client, Client)
     if order.device == "load":
         options = msgspec.msgpack.decode(order.options, type=LoadOptions)

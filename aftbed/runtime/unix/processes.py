@@ -35,6 +35,7 @@ class Process:
         self.header: Header | None = None
         self.alive = True
         self.incarnation = 0
+        self.rested = False  # of a spare: it has rehearsed
         self.starvation: linux.Starvation | None = None
 
     def born(self, pid: int) -> None:
@@ -137,6 +138,13 @@ class Nursery:
         while len(self.parked[zygote]) < count:
             yield Wait(frozenset({("spare", zygote, 0)}), seconds=SPARE_SECONDS_MAX)
 
+    def calm(self, zygote: str) -> Generator[Wait, dict[Key, bytes], None]:
+        """Wait until no spare is being forked or rehearses: what comes next shall have the CPUs."""
+        while self._unborn[zygote]:
+            yield Wait(frozenset({("spare", zygote, 0)}), seconds=SPARE_SECONDS_MAX)
+        busy = {("rested", p.name, p.pid) for p in self.parked[zygote] if not p.rested and p.alive}
+        yield Wait(frozenset(busy), seconds=SPARE_SECONDS_MAX)
+
     def level(self, zygote: str, count: int) -> None:
         """Have `count` spares parked, in the end."""
         self.park(zygote, count - len(self.parked[zygote]) - len(self._unborn[zygote]))
@@ -167,6 +175,9 @@ class Nursery:
             assert not fds, f"{process.name} sent descriptors"
             if isinstance(message, control.Hello) and process.kind == "spare" and not process.pid:
                 self._hello(process, message.pid)
+            elif isinstance(message, control.Rested):
+                process.rested = True
+                self._loop.jobs.settle(("rested", process.name, process.pid))
             elif not isinstance(message, control.Hello):
                 self._on_report(process, message)
 

@@ -17,6 +17,7 @@ import msgspec
 from aftbed.core.errors import AftbedError, ConfigError
 from aftbed.runtime import targets
 from aftbed.runtime.unix import ask, control, rundir
+from aftbed.runtime.unix.adaptations import Adaptations, Outcome
 from aftbed.runtime.unix.deployment import Deployment
 from aftbed.runtime.unix.faults import Faults
 from aftbed.runtime.unix.loop import Loop
@@ -24,7 +25,7 @@ from aftbed.runtime.unix.options import RunOptions
 from aftbed.runtime.unix.resources import Row
 from aftbed.runtime.unix.work import Work
 
-BESIDE: Final = ("zygote", "spare", "service")
+BESIDE: Final = ("zygote", "spare", "service", "staged")
 QUESTIONS_MAX: Final = 16  # connections at once
 
 
@@ -37,11 +38,13 @@ class Questions:
         loop: Loop,
         deployment: Deployment,
         faults: Faults,
+        adaptations: Adaptations,
         work: Work,
         finish: Callable[[str], None],
     ) -> None:
         self._options, self._loop, self._deployment = options, loop, deployment
         self._faults, self._work, self._finish = faults, work, finish
+        self._adaptations = adaptations
         self._started_ns = time.monotonic_ns()
         self._lines: dict[int, control.Line[ask.Question]] = {}
 
@@ -104,6 +107,10 @@ class Questions:
                             ask.Answer(json.dumps({"armed": str(fault)}).encode(), error=failure)
                         ),
                     )
+                case ask.Adapt(goal):
+                    self._adaptations.ask(goal, lambda outcome: answer(_told(outcome)))
+                case ask.Adaptations():
+                    answer(ask.Answer(self._adaptations.to_json()))
                 case ask.Stop():
                     self._finish("stopped")
                     answer(ask.Answer(b'{"stopping": true}'))
@@ -115,7 +122,9 @@ class Questions:
         deployment = self._deployment
         return {
             "run": self._options.run,
-            "ftm": self._options.ftm,
+            "ftm": deployment.graph.ftm,
+            "adapting": self._adaptations.busy,
+            "adaptations": len(self._adaptations.history),
             "placement": self._options.placement,
             "seconds": round((time.monotonic_ns() - self._started_ns) / 1e9, 2),
             "leader": deployment.leader,
@@ -137,3 +146,9 @@ class Questions:
                 rows.append(Row(node, deployment.role_of(node), process.pid, True))
         others = [p for p in deployment.nursery.processes if p.kind in BESIDE and p.pid]
         return rows + [Row(p.name, p.kind, p.pid, False) for p in others]
+
+
+def _told(outcome: Outcome) -> ask.Answer:
+    """What the one who asked for an adaptation hears: only what was refused is an error."""
+    refused = outcome.outcome == "refused"
+    return ask.Answer(msgspec.json.encode(outcome), error=outcome.reason if refused else "")

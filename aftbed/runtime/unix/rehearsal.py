@@ -27,7 +27,7 @@ from aftbed.core.message import (
 from aftbed.ftm.after import PbrAfter
 from aftbed.ftm.before import PassBefore
 from aftbed.ftm.catalog import Setting, make
-from aftbed.ftm.mechanism import CHAIN_PARTS, build
+from aftbed.ftm.mechanism import REPLICAS, build, chain
 from aftbed.ftm.proceed import Compute
 from aftbed.ftm.protocol import Protocol
 from aftbed.ftm.proxy import Proxy
@@ -57,15 +57,19 @@ def once() -> None:
 def rehearse(rounds: int) -> None:
     """`rounds` requests through both replicas, then the backup takes over and serves as many."""
     graph = build("pbr", "replica")
-    names = ["client", "proxy", *(f"{r}/{part}" for r in "ab" for part in CHAIN_PARTS)]
+    names = ["client", "proxy", *(name for replica in REPLICAS for name in chain(graph, replica))]
     bricks: dict[str, Brick] = {}
     for name in names:
         leads = not name.startswith("b/")
         bricks[name] = make(graph.brick(name).kind, Setting(1, 1, leads, default_application))
-    ways = {(k.source, k.source_port): (k.sink, k.sink_port) for k in graph.links if not k.standby}
+    ways = {
+        (k.source, k.source_port): (k.sink, k.sink_port)
+        for k in graph.links
+        if not k.standby and {k.source, k.sink} <= set(names)
+    }
     requests = sample_requests(0, rounds)
-    bricks["proxy"].step(CONTROL, Rebound("pxy2pro", True, 1), 0)
-    bricks["a/after"].step(CONTROL, Rebound("aft2aft", True, 1), 0)
+    for name, port in ways:
+        bricks[name].step(CONTROL, Rebound(port, True, 1), 0)
     _serve(bricks, ways, requests)
     mail = [("b/after", CONTROL, Promote(2)), ("b/after", "aft2aft", ChannelEnded())]
     for name, port, message in mail:
@@ -145,7 +149,7 @@ def rehearse_host() -> None:
         Compute(), (("bfr2prd", request), ("srv2prd", Reply(2, 1, 2, b""))), ("prd2srv", "prd2aft")
     )
     _rehearse_part(
-        Server(default_application(), 2, leads=False, captured=True),
+        Server(default_application(), 2),
         (("prd2srv", Request(2, 1, payload)), ("aft2srv", CaptureState(2, 1))),
         ("srv2prd", "srv2aft"),
     )

@@ -18,8 +18,10 @@ import msgspec
 from aftbed.core import message, script
 from aftbed.core.errors import AftbedError
 from aftbed.core.event import Event
-from aftbed.ftm.mechanism import build
+from aftbed.core.script import Phase
+from aftbed.ftm.mechanism import STATEFUL, build, replication_of
 from aftbed.runtime.unix import control, linux
+from aftbed.runtime.unix.adaptations import ENGINE, Adaptations
 from aftbed.runtime.unix.deployment import WATCHED_KINDS, Deployment, Keys
 from aftbed.runtime.unix.faults import Faults
 from aftbed.runtime.unix.jobs import STATS_JOB, StepFailed
@@ -34,6 +36,9 @@ from aftbed.runtime.unix.work import Work
 
 TICK_SECONDS: Final = 0.02
 TELL_SECONDS: Final = 0.005
+RETRY_SECONDS: Final = 0.002
+SETTLE_SECONDS: Final = 0.002
+LOSSES: Final = ("failover", "drop backup")
 LOSS_SECONDS: Final = 0.5  # a failover is done long before
 HANG_NS: Final = 150_000_000  # of what no Watchdog watches; a channel's pulse is 20 ms
 LATE_NS_MAX: Final = 40_000_000
@@ -68,8 +73,20 @@ class Supervisor:
         self.work = Work(options, self.nursery, self.loop, self.tell, self._finish, self._report_owner)
         self.deployment = Deployment(graph, self.nursery, self.record, self.work.device_of, pinned)
         self.executor = Executor(self.deployment, self.journal, self.tell)
-        self.faults = Faults(self.deployment, self.loop, self.journal, self.tell)
-        self.questions = Questions(options, self.loop, self.deployment, self.faults, self.work, self._finish)
+        self.faults = Faults(self.deployment, self.loop, self.journal, self.tell, seed=options.seed)
+        self.adaptations = Adaptations(
+            self.deployment,
+            self.executor,
+            self.loop,
+            self.journal,
+            self.faults,
+            self.record,
+            self.tell,
+            lambda: self._inform_recovery(failed=False),
+        )
+        self.questions = Questions(
+            options, self.loop, self.deployment, self.faults, self.adaptations, self.work, self._finish
+        )
 
     # -- life ---------------------------------------------------------------------------------
 
@@ -102,10 +119,11 @@ class Supervisor:
         for zygote, count in self.work.spares_for(self.deployment).items():
             yield from self.nursery.parked_at_least(zygote, count)
         began_ns = time.monotonic_ns()
-        yield from self.deployment.launch()
+        yield from self.deployment.launch(held=self.work.held)
         self.graph_ms = (time.monotonic_ns() - began_ns) / 1e6
         for fault in self.options.faults:
             yield from self.faults.arm(fault)
+        yield from self.adaptations.schedule(self.options.adaptations)
         yield from self.work.start(self.deployment)
 
     def _launched(self, failure: str) -> None:
@@ -223,10 +241,16 @@ class Supervisor:
                     self.loop.jobs.settle(key, data)
             case control.Said(brick, message.Promoted(epoch)):
                 self.loop.jobs.settle(("promoted", brick, epoch))
-            case control.Ordered(_, ordered):
+            case control.Said(_, message.Adapted() as told):
+                self.adaptations.adapted(told)
+                self.loop.after(SETTLE_SECONDS, self._settle)
+            case control.Ordered(_, ordered, Phase.WHOLE):
                 self._on_script(ordered)
+            case control.Ordered(_, ordered, phase, number):
+                self.adaptations.ordered(ordered, phase, number)
             case control.Fired(fault):
-                self.faults.fired(process, fault)
+                if not self.adaptations.fired(process, fault):
+                    self.faults.fired(process, fault)
             case control.Report(kind, data):
                 self.work.on_report(process, kind, data)
             case _:
@@ -234,24 +258,31 @@ class Supervisor:
 
     def _on_script(self, ordered: script.Script) -> None:
         if self.executor.busy or self._ending:
-            return  # an earlier Recovery's script is under way; the new one hears how it ended
+            return  # another script is under way; Recovery hears how it ended
+        if ordered.purpose in LOSSES and self.adaptations.interrupted(ordered.replica):
+            return  # the way back first
         began_ns = time.monotonic_ns()
 
         def ended(failure: str) -> None:
             ms = f"{(time.monotonic_ns() - began_ns) / 1e6:.2f} ms"
             self.tell("script.failed" if failure else "script.done", f"{ordered.purpose}: {failure or ms}")
             self._inform_recovery(failed=bool(failure))
-            self.loop.after(0.002, lambda: self._settle_after(ordered))
+            self.loop.after(SETTLE_SECONDS, lambda: self._settle_after(ordered))
 
         self.loop.jobs.start(ordered.purpose, self.executor.execute(ordered), ended)
         self.tell("script", f"{ordered.purpose} ({ordered.replica})")
 
     def _settle_after(self, ordered: script.Script) -> None:
         """What can wait until after a script: spares, and faults that are still to come."""
+        if ordered.purpose == "new backup":
+            self._settle()
+        elif not self._ending:
+            self.loop.jobs.start("rearm", self.faults.rearm(), lambda _: None)
+
+    def _settle(self) -> None:
         if self._ending:
             return
-        if ordered.purpose == "new backup":
-            self.nursery.level(LIGHT, self._spares())
+        self.nursery.level(LIGHT, self._spares())
         self.loop.jobs.start("rearm", self.faults.rearm(), lambda _: None)
 
     def _inform_recovery(self, *, failed: bool) -> None:
@@ -269,6 +300,8 @@ class Supervisor:
             deployment.epoch,
             tuple(s.name for s in slots.values() if not s.nodes),
             failed,
+            replication_of(deployment.graph.ftm),
+            STATEFUL,
         )
         try:
             deployment.order("recovery", lambda token: control.Tell(token, "recovery", situation))
@@ -290,7 +323,11 @@ class Supervisor:
             self.nursery.level(LIGHT, self._spares())
         elif process.kind == "service":
             self._finish(f"{process.name} died")
+        elif process.kind == "staged":
+            return  # who waits for it has heard
         elif process.kind == "node" and self._replaceable(process.name):
+            if process.name != ENGINE:
+                self.adaptations.give_up_preparing(f"{process.name} died")
             self._replace(process.name)
         else:
             self.loop.after(LOSS_SECONDS, self._look_for_loss)
@@ -312,6 +349,9 @@ class Supervisor:
         return self.deployment.graph.brick(bricks[0]).kind in WATCHED_KINDS
 
     def _replace(self, node: str) -> None:
+        if self.adaptations.acting:  # both hand channels out
+            self.loop.after(RETRY_SECONDS, lambda: self._replace(node))
+            return
         began_ns = time.monotonic_ns()
 
         def ended(failure: str) -> None:
@@ -324,6 +364,8 @@ class Supervisor:
                 self.loop.after(TICK_SECONDS, lambda: self._replace(node))
             if node == "recovery":
                 self._inform_recovery(failed=False)
+            if node == ENGINE and not failure:
+                self.adaptations.engine_is_new()
             self.nursery.level(LIGHT, self._spares())
 
         self.loop.jobs.start(f"replace {node}", self.deployment.respawn(node), ended)

@@ -8,11 +8,12 @@ half made is killed.
 import contextlib
 import time
 from collections.abc import Callable
-from typing import Final, assert_never
+from typing import Final
 
 from aftbed.core import message, script
 from aftbed.core.event import Event
 from aftbed.core.graph import Link
+from aftbed.ftm.mechanism import replication_of
 from aftbed.runtime.unix import control
 from aftbed.runtime.unix.channels import Channel
 from aftbed.runtime.unix.deployment import BESIDE_LEADER, Deployment, Keys
@@ -82,12 +83,12 @@ class Executor:
                 yield from self._deployment.ask(self._node(brick), control.Resume)
             case script.Transfer(source, sink):
                 yield from self._transfer(source, sink)
-            case script.Bind(brick, port, target):
-                yield from self._bind(brick, port, target)
+            case script.Bind():
+                yield from self._bind(verb.link)
             case script.Unbind(brick, port):
                 yield from self._unbind(brick, port)
             case _:
-                assert_never(verb)
+                raise StepFailed(f"{type(verb).__name__} belongs into an adaptation")
 
     def _node(self, brick: str) -> str:
         return self._deployment.graph.node_of(brick)
@@ -138,9 +139,10 @@ class Executor:
         """Say so, and go on: until it leads, its Protocol takes no request. Attach waits for it."""
         deployment = self._deployment
         slot = deployment.slots[replica]
-        node = self._node(f"{replica}/after")
-        # The end of the checkpoint channel, which the fence made, wakes it.
-        deployment.leave(node, control.Tell(control.UNANSWERED, f"{replica}/after", message.Promote(epoch)))
+        part, _ = replication_of(deployment.graph.ftm)[0]  # who hears of the leader first
+        brick = f"{replica}/{part}"
+        # The end of the channel from the leader, which the fence made, wakes it.
+        deployment.leave(self._node(brick), control.Tell(control.UNANSWERED, brick, message.Promote(epoch)))
         promoted = ("promoted", f"{replica}/protocol", epoch)
         self._promoting = Wait(frozenset({promoted}), frozenset(slot.nodes))
 
@@ -168,6 +170,7 @@ class Executor:
         promoting, self._promoting = self._promoting, None
         if promoting is not None:
             yield promoting
+        deployment.graph = deployment.graph.led_by(replica)
         deployment.pin_watchers()
 
     def _transfer(self, source: str, sink: str) -> Keys:
@@ -176,16 +179,18 @@ class Executor:
         )
         yield from self._deployment.ask(self._node(sink), lambda token: control.Restore(token, sink, state))
 
-    def _bind(self, brick: str, port: str, target: str) -> Keys:
+    def _bind(self, link: Link) -> Keys:
         deployment = self._deployment
-        channel = deployment.channels.renew(Link(brick, port, target, port))
-        if port == "aft2aft":  # from here on `target` holds all that the leader holds
-            deployment.backup = target.partition("/")[0]
+        channel = deployment.channels.renew(link)
+        if link.source.partition("/")[0] == deployment.leader != link.sink.partition("/")[0]:
+            # From here on, the other replica holds all that the leader holds.
+            deployment.backup = link.sink.partition("/")[0]
         yield from deployment.all_of(deployment.rebind(channel))
 
     def _unbind(self, brick: str, port: str) -> Keys:
         deployment = self._deployment
-        if port == "aft2aft":
+        part = brick.partition("/")[2]
+        if (part, port) in replication_of(deployment.graph.ftm):
             deployment.backup = ""
         yield from deployment.ask(
             self._node(brick), lambda token: control.BindOutput(token, brick, port, deployment.epoch)

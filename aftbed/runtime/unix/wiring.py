@@ -25,10 +25,10 @@ class Inlet:
 class Hosted:
     """A brick, its inlets, and where its outputs lead: a descriptor or a function."""
 
-    __slots__ = ("brick", "inlets", "name", "outs")
+    __slots__ = ("brick", "index", "inlets", "name", "outs")
 
-    def __init__(self, name: str, brick: Brick) -> None:
-        self.name, self.brick = name, brick
+    def __init__(self, name: str, brick: Brick, index: int) -> None:
+        self.name, self.brick, self.index = name, brick, index
         self.inlets: dict[str, Inlet] = {}
         self.outs: dict[str, int | Callable[[Message], None]] = {}
 
@@ -63,7 +63,7 @@ class Wiring:
 
     def add(self, name: str, brick: Brick) -> Hosted:
         """Host `brick`."""
-        hosted = self.hosted[name] = Hosted(name, brick)
+        hosted = self.hosted[name] = Hosted(name, brick, len(self.hosted))
         self._fronts = list(self.hosted.values())
         self.timed = any(type(h.brick).deadline_ns is not Brick.deadline_ns for h in self._fronts)
         return hosted
@@ -92,6 +92,14 @@ class Wiring:
         if isinstance(old, int):
             os.close(old)
         return hosted
+
+    def inside(self) -> tuple[Hosted, str, Message] | None:
+        """The next mail between bricks of this node whose port is open, or None: the rest waits."""
+        for index, (hosted, port, message) in enumerate(self.mail):
+            if port in hosted.brick.open_ports():
+                del self.mail[index]
+                return hosted, port, message
+        return None
 
     def forget_plans(self) -> None:
         """What there is to wait for has changed."""

@@ -76,6 +76,11 @@ class Work:
         nodes = len(deployment.graph.nodes)
         return {LIGHT: nodes} if isinstance(self._options.work, LoadRun) else {LIGHT: nodes - 1, BUS: 1}
 
+    @property
+    def held(self) -> tuple[str, ...]:
+        """Who must not begin before faults and adaptations are armed: a load is inside the Client."""
+        return ("client",) if isinstance(self._options.work, LoadRun) else ()
+
     def before(self, deployment: Deployment) -> Keys:
         """What must stand before the graph does: the hub."""
         self._deployment = deployment
@@ -93,6 +98,7 @@ class Work:
         """The graph stands: let requests come."""
         work = self._options.work
         if isinstance(work, LoadRun):
+            yield from deployment.ask("client", control.Resume)
             self._loop.after(LOAD_POLL_SECONDS, lambda: self._watch_load(deployment))
             return
         if isinstance(work, CarRun):

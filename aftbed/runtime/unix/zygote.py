@@ -73,6 +73,7 @@ def _wait_for_a_part(supervisor: int) -> NoReturn:
     poll.register(CONTROL_FD, select.POLLIN)
     if not poll.poll(rehearsal.PATIENCE_MS):
         rehearsal.once()
+    line.send(control.Rested())
     got = line.recv()
     if got is None:
         os._exit(0)

@@ -1,0 +1,1 @@
+"""Adaptation: graph differences, scripts, the engine; whether a mechanism suits; when to change it."""

@@ -1,0 +1,311 @@
+"""Whether a mechanism suits: FT, A and R against what it tolerates and needs (paper, II; design 4).
+
+FT is the fault model asked for, A what the protected function declares, R the resources that there are. A
+mechanism is *consistent* with the three if it tolerates every fault asked for and finds all that it needs.
+ROWS says so per mechanism, as data. It is **reconstructed**: the paper's Fig. 1 is an image, so it was made
+from the text, from the related work of its authors, and from what our own bricks do. `table_from` lays a
+user's file over it.
+
+An expression follows from its parts, and has no row of its own:
+
+    tolerates, detects, needs   the union
+    CPUs, CPU load, bandwidth   the most that a part asks for
+    detects                     becomes tolerates under a mechanism that replicates: where one replica
+                                stops, the other one executes the request
+
+The two kinds of value fault. `value` is any wrong reply or state of one execution: TR compares, so it needs
+no idea of what is right. `implausible` is the part of it that the function's own assertion refuses: that is
+all that `assert` can see, so it covers `implausible` and never `value`.
+
+State access under LFR: a follower executes, so normal service needs none. A *new* follower does, and cannot
+have it: after a failover the survivor stays alone. That is no reason to refuse LFR; `remarks` says it.
+"""
+
+from collections import Counter
+from collections.abc import Iterable
+from typing import Annotated, Final, Literal
+
+import msgspec
+from msgspec import Meta
+
+from aftbed.core.application import Characteristics
+from aftbed.core.errors import ConfigError, unknown
+from aftbed.ftm.mechanism import DUPLEX, EXPRESSIONS, MECHANISMS, parse
+
+Fault = Literal["crash", "value", "implausible"]
+Level = Literal["none", "low", "high"]
+Part = Annotated[float, Meta(ge=0, le=1)]
+Rate = Annotated[float, Meta(ge=0, le=1e9)]
+
+FAULTS: Final[dict[Fault, str]] = {
+    "crash": "crashes",
+    "value": "value faults",
+    "implausible": "implausible value faults",
+}
+LEVELS: Final[tuple[Level, ...]] = ("none", "low", "high")
+TAKES: Final[dict[Level, str]] = {"none": "no", "low": "little", "high": "much"}
+
+
+class FaultModel(msgspec.Struct, frozen=True):
+    """FT: the faults that must be tolerated."""
+
+    crash: bool = True
+    value: bool = False
+    implausible: bool = False
+
+    def asked(self) -> tuple[Fault, ...]:
+        """Their names."""
+        given: dict[Fault, bool] = {
+            "crash": self.crash,
+            "value": self.value,
+            "implausible": self.implausible,
+        }
+        return tuple(fault for fault in FAULTS if given[fault])
+
+
+class Resources(msgspec.Struct, frozen=True):
+    """R: CPUs that may be used, how busy they are (0 to 1), kbit/s between the replicas.
+
+    `bandwidth_kbit_s` None: nothing limits it, as between replicas on one host.
+    """
+
+    cpus: int
+    cpu_load: float = 0.0
+    bandwidth_kbit_s: float | None = None
+
+
+class Row(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What one mechanism tolerates and needs. `deterministic`, `state_access`: why; empty: not needed."""
+
+    mechanism: str
+    tolerates: tuple[Fault, ...] = ()
+    detects: tuple[Fault, ...] = ()
+    deterministic: str = ""
+    state_access: str = ""
+    cpus: Annotated[int, Meta(ge=1, le=1024)] = 1
+    cpu_load: Level = "low"
+    bandwidth: Level = "none"
+
+
+class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What the classes of CPU load and bandwidth mean in numbers.
+
+    A mechanism of high CPU load at least doubles the work, so half of the CPUs must be free for it. The
+    bandwidths carry 50 requests a second of the brake function: as requests (low), as states (high).
+    """
+
+    low_cpu_load_max: Part = 0.9
+    high_cpu_load_max: Part = 0.5
+    low_bandwidth_kbit_s_min: Rate = 64.0
+    high_bandwidth_kbit_s_min: Rate = 256.0
+
+
+class Table(msgspec.Struct, frozen=True):
+    """The rows, by mechanism, and the limits."""
+
+    rows: dict[str, Row]
+    limits: Limits = Limits()
+
+
+class TableFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A user's file: each row takes the place of the shipped one for the same mechanism."""
+
+    rows: tuple[Row, ...] = ()
+    limits: Limits = Limits()
+
+
+class Demand(msgspec.Struct, frozen=True):
+    """What an expression tolerates and needs.
+
+    `deterministic`, `state_access`: a sentence for each part that needs it.
+    """
+
+    ftm: str
+    tolerates: tuple[Fault, ...]
+    detects: tuple[Fault, ...]
+    deterministic: tuple[str, ...]
+    state_access: tuple[str, ...]
+    cpus: int
+    cpu_load: Level
+    bandwidth: Level
+
+
+ROWS: Final = (  # reconstructed: see the top
+    Row(
+        "pbr",
+        tolerates=("crash",),
+        state_access="each checkpoint carries the whole state to the backup",
+        cpus=2,
+        cpu_load="low",
+        bandwidth="high",
+    ),
+    Row(
+        "lfr",
+        tolerates=("crash",),
+        deterministic="two replicas execute every request",
+        cpus=2,
+        cpu_load="high",
+        bandwidth="low",
+    ),
+    Row(
+        "tr",
+        tolerates=("value", "implausible"),
+        deterministic="executions of one request are compared",
+        state_access="every execution starts from the same state",
+        cpus=1,
+        cpu_load="high",
+        bandwidth="none",
+    ),
+    Row("assert", detects=("implausible",), cpus=1, cpu_load="low", bandwidth="none"),
+)
+TABLE: Final = Table({row.mechanism: row for row in ROWS})
+
+
+def table_from(file: TableFile, where: str) -> Table:
+    """The shipped table with the rows of `file` in it; `where` names the file. Raises ConfigError."""
+    for index, row in enumerate(file.rows):
+        if row.mechanism not in MECHANISMS:
+            reason = unknown("FTM", row.mechanism, MECHANISMS)
+            raise ConfigError(f"{where}: rows[{index}].mechanism: {reason}")
+    for name, times in Counter(row.mechanism for row in file.rows).items():
+        if times > 1:
+            raise ConfigError(f"{where}: rows: found {times} for {name}, allowed is one")
+    return Table(TABLE.rows | {row.mechanism: row for row in file.rows}, file.limits)
+
+
+def fault_model(text: str) -> FaultModel:
+    """`crash,value` as a FaultModel; `none` asks for no tolerance. Raises ConfigError."""
+    names = [] if text == "none" else text.split(",")
+    for name in names:
+        if name not in FAULTS:
+            raise unknown("fault", name, ("none", *FAULTS))
+    return FaultModel("crash" in names, "value" in names, "implausible" in names)
+
+
+def demand(expression: str, table: Table = TABLE) -> Demand:
+    """What `expression` tolerates and needs. Raises ConfigError if it is none."""
+    names = parse(expression)
+    rows = [table.rows[name] for name in names]
+    detects = _united(row.detects for row in rows)
+    tolerates = _united(row.tolerates for row in rows)
+    return Demand(
+        expression,
+        tolerates=_united((tolerates, detects)) if _replicates(names) else tolerates,
+        detects=detects,
+        deterministic=tuple(
+            f"{row.mechanism} needs a deterministic function: {row.deterministic}"
+            for row in rows
+            if row.deterministic
+        ),
+        state_access=tuple(
+            f"{row.mechanism} needs state access: {row.state_access}" for row in rows if row.state_access
+        ),
+        cpus=max([row.cpus for row in rows], default=1),
+        cpu_load=max([row.cpu_load for row in rows], default="low", key=LEVELS.index),
+        bandwidth=max([row.bandwidth for row in rows], default="none", key=LEVELS.index),
+    )
+
+
+def problems(
+    expression: str,
+    faults: FaultModel,
+    characteristics: Characteristics,
+    resources: Resources,
+    table: Table = TABLE,
+) -> list[str]:
+    """Every assumption of `expression` that does not hold, a sentence each; [] if it is consistent.
+
+    Raises ConfigError if it is no expression.
+    """
+    wanted = demand(expression, table)
+    found = [_not_tolerated(wanted, fault) for fault in faults.asked() if fault not in wanted.tolerates]
+    if not characteristics.deterministic:
+        found += wanted.deterministic
+    if not characteristics.state_access:
+        found += wanted.state_access
+    return found + _short_of(wanted, resources, table.limits)
+
+
+def consistent(
+    faults: FaultModel, characteristics: Characteristics, resources: Resources, table: Table = TABLE
+) -> list[str]:
+    """The expressions that would do, the cheapest first; [] is "no consistent FTM".
+
+    Cheap is little of, in this order: CPUs, CPU load, bandwidth; the last two summed over the parts.
+    """
+    found = [e for e in EXPRESSIONS if not problems(e, faults, characteristics, resources, table)]
+    return sorted(found, key=lambda expression: _cost(expression, table))
+
+
+def remarks(expression: str, characteristics: Characteristics) -> list[str]:
+    """What to know of an expression that is consistent all the same."""
+    if _replicates(parse(expression)) and not characteristics.state_access:
+        return [f"{expression} without state access: after a failover the survivor stays alone"]
+    return []
+
+
+def refusal(
+    expression: str,
+    faults: FaultModel,
+    characteristics: Characteristics,
+    resources: Resources,
+    table: Table = TABLE,
+) -> str:
+    """Why `expression` must not run here, with the expressions that may; "" if it may."""
+    found = problems(expression, faults, characteristics, resources, table)
+    if not found:
+        return ""
+    others = consistent(faults, characteristics, resources, table)
+    instead = f"consistent: {', '.join(others)}" if others else "no consistent FTM"
+    return f"{expression} is not consistent: {'; '.join(found)} ({instead})"
+
+
+def _united(faults: Iterable[tuple[Fault, ...]]) -> tuple[Fault, ...]:
+    """All of them once, in the order of FAULTS."""
+    found = {fault for some in faults for fault in some}
+    return tuple(fault for fault in FAULTS if fault in found)
+
+
+def _replicates(names: tuple[str, ...]) -> bool:
+    return bool(names) and names[0] in DUPLEX
+
+
+def _cost(expression: str, table: Table) -> tuple[int, int, int]:
+    rows = [table.rows[name] for name in parse(expression)]
+    cpu_load = sum(LEVELS.index(row.cpu_load) for row in rows)
+    return demand(expression, table).cpus, cpu_load, sum(LEVELS.index(row.bandwidth) for row in rows)
+
+
+def _not_tolerated(wanted: Demand, fault: Fault) -> str:
+    if fault in wanted.detects:
+        return (
+            f"{wanted.ftm} detects {FAULTS[fault]} and can only stop:"
+            " there is no second replica to execute instead"
+        )
+    known = ", ".join(wanted.tolerates) or "nothing"
+    return f"{wanted.ftm} does not tolerate {FAULTS[fault]} (it tolerates {known})"
+
+
+def _short_of(wanted: Demand, resources: Resources, limits: Limits) -> list[str]:
+    """The resources that do not suffice."""
+    found = []
+    if resources.cpus < wanted.cpus:
+        found.append(f"{wanted.ftm} needs {wanted.cpus} CPUs, found {resources.cpus}")
+    load_max = limits.high_cpu_load_max if wanted.cpu_load == "high" else limits.low_cpu_load_max
+    if wanted.cpu_load != "none" and resources.cpu_load > load_max:
+        found.append(
+            f"{wanted.ftm} takes {TAKES[wanted.cpu_load]} CPU:"
+            f" found a load of {resources.cpu_load:.0%}, allowed are {load_max:.0%}"
+        )
+    rates: dict[Level, float] = {
+        "none": 0.0,
+        "low": limits.low_bandwidth_kbit_s_min,
+        "high": limits.high_bandwidth_kbit_s_min,
+    }
+    bandwidth_kbit_s = resources.bandwidth_kbit_s
+    if bandwidth_kbit_s is not None and bandwidth_kbit_s < rates[wanted.bandwidth]:
+        found.append(
+            f"{wanted.ftm} takes {TAKES[wanted.bandwidth]} bandwidth:"
+            f" found {bandwidth_kbit_s:g} kbit/s, needed are {rates[wanted.bandwidth]:g}"
+        )
+    return found

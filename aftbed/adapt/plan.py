@@ -1,0 +1,351 @@
+"""The plan of an adaptation: the difference of two graphs, as a script (paper, III-B; design 4).
+
+The smallest set of bricks: a brick that is in both graphs with the same kind stays as it is, where it is. A
+node is exchanged if what it hosts changes (in placement `process` a node is a brick, so the set is
+smallest; in `replica` and `single` the node is the unit, since its bricks share a fate).
+
+| of the new graph                      | script                                                         |
+|---------------------------------------|----------------------------------------------------------------|
+| a node that the old one does not have | Stage; its state, if it is a new replica's, by Transfer        |
+| a node whose bricks differ            | Stage held, Migrate, Exchange, Resume; Retire in the end       |
+| a link at a brick that stays          | Bind, or Unbind where nothing is bound instead                 |
+| a node that only the old one has      | Retire                                                         |
+
+All that is slow is in `prepare`. While the client waits: the leader's Protocol is suspended (one request at
+a time, so its chain is empty then), the backup is drained, state moves, each node hears of its new
+channels at once, and the Protocol is resumed.
+
+The paper's recipe (III-B) is here too, as a script of the same kind: SIGSTOP the Protocol, kill, launch,
+link, SIGCONT. Nothing is drained, so what is inside is lost.
+"""
+
+from collections.abc import Iterable, Iterator
+from typing import Final
+
+import msgspec
+
+from aftbed.core.errors import ConfigError, unknown
+from aftbed.core.graph import PLACEMENTS, BrickSpec, Graph, Link
+from aftbed.core.script import (
+    RECIPES,
+    Align,
+    AnyVerb,
+    Bind,
+    Destroy,
+    Drain,
+    Exchange,
+    Freeze,
+    Migrate,
+    Resume,
+    Retire,
+    Script,
+    Stage,
+    Suspend,
+    Thaw,
+    Together,
+    Transfer,
+    Unbind,
+)
+from aftbed.ftm.mechanism import NONE, STATEFUL, build, chain, parse, replication_of
+
+JUDGES: Final = ("assert.after",)  # kinds that ask the function whether a reply can be right
+APPLICATION: Final = "app"  # what `adapt update` calls the protected function
+
+
+class Plan(msgspec.Struct, frozen=True):
+    """A script, what it starts from, what it leads to, and what it does as names of bricks."""
+
+    old: Graph
+    new: Graph
+    script: Script
+    replaced: tuple[str, ...]
+    added: tuple[str, ...]
+    removed: tuple[str, ...]
+    kept: tuple[str, ...]
+    rebound: tuple[str, ...]  # those of `kept` whose channels change
+
+    @property
+    def bricks_changed(self) -> int:
+        """How many bricks are made or ended."""
+        return len(self.replaced) + len(self.added) + len(self.removed)
+
+    @property
+    def bricks_total(self) -> int:
+        """How many bricks there are in the larger of both graphs."""
+        return max(len(self.old.bricks), len(self.new.bricks))
+
+
+def leader_of(graph: Graph) -> str:
+    """The replica that the Proxy of `graph` is bound to."""
+    for link in graph.links:
+        if link.source == "proxy" and link.source_port == "pxy2pro" and not link.standby:
+            return link.sink.partition("/")[0]
+    raise AssertionError("a graph whose Proxy is bound to nobody")
+
+
+def target(graph: Graph, expression: str) -> Graph:
+    """The graph of `expression` in the place of `graph`. Raises ConfigError where there is no way to it."""
+    parse(expression)
+    if NONE in (graph.ftm, expression):
+        raise ConfigError("none has no engine and no Protocol: an adaptation neither starts nor ends there")
+    if expression == graph.ftm:
+        raise ConfigError(f"{expression} is what runs already")
+    application = next(b.application for b in graph.bricks if b.part == "server")
+    new = build(expression, graph.placement, leader_of(graph))
+    updates = {(b.name, b.kind): b.source for b in graph.bricks if b.source}
+    kept = [b for b in new.bricks if (b.name, b.kind) in updates]
+    new = _with(new, {b.name: msgspec.structs.replace(b, source=updates[b.name, b.kind]) for b in kept})
+    if not application:
+        return new
+    return _with_function(new, application)
+
+
+def updated(graph: Graph, part: str, source: str) -> Graph:
+    """`graph` with `source` in the place of `part`'s class on every replica; `app` is the function.
+
+    Raises ConfigError, naming what there is, if no replica has such a part.
+    """
+    if part == APPLICATION:
+        return _with(graph, {b.name: msgspec.structs.replace(b, application=source) for b in _servers(graph)})
+    parts = sorted({b.part for b in graph.bricks if b.replica and b.kind != "watchdog"})
+    if part not in parts:
+        raise unknown("brick", part, (APPLICATION, *parts))
+    return _with(
+        graph,
+        {b.name: msgspec.structs.replace(b, source=source) for b in graph.bricks if b.part == part},
+    )
+
+
+def _servers(graph: Graph) -> list[BrickSpec]:
+    return [b for b in graph.bricks if b.part == "server"]
+
+
+def _with_function(graph: Graph, application: str) -> Graph:
+    """`graph` with another function, for those that call it and for those that judge what it says."""
+    concerned = [b for b in graph.bricks if b.part == "server" or b.kind in JUDGES]
+    return _with(graph, {b.name: msgspec.structs.replace(b, application=application) for b in concerned})
+
+
+def _with(graph: Graph, bricks: dict[str, BrickSpec]) -> Graph:
+    return msgspec.structs.replace(graph, bricks=tuple(bricks.get(b.name, b) for b in graph.bricks))
+
+
+def plan(old: Graph, new: Graph, recipe: str = RECIPES[0]) -> Plan:
+    """The script from `old` to `new`, both led by the same replica. Raises ConfigError on a bad recipe."""
+    if recipe not in RECIPES:
+        raise unknown("recipe", recipe, RECIPES)
+    if recipe != RECIPES[0] and old.placement != PLACEMENTS[0]:
+        raise ConfigError(
+            f"the paper's recipe exchanges processes of one brick each: placement {PLACEMENTS[0]},"
+            f" not {old.placement}"
+        )
+    if recipe != RECIPES[0] and bool(replication_of(old.ftm)) != bool(replication_of(new.ftm)):
+        raise ConfigError(
+            f"the paper's recipe exchanges bricks of replicas that are there: not {old.ftm} to {new.ftm}"
+        )
+    assert leader_of(old) == leader_of(new), "an adaptation does not change the leader"
+    change = _Change(old, new)
+    make = _drained if recipe == RECIPES[0] else _paper
+    prepare, commit = make(change)
+    finish = tuple(Retire(node) for node in (*change.exchanged, *change.removed_nodes))
+    if recipe != RECIPES[0]:
+        finish = ()
+    purpose = (
+        f"{old.ftm} to {new.ftm}" if old.ftm != new.ftm else f"update {', '.join(change.updated_parts())}"
+    )
+    script = Script(purpose, "", tuple(prepare), tuple(commit), finish, new.ftm, recipe)
+    return Plan(old, new, script, *change.names())
+
+
+class _Change:
+    """What differs between two graphs."""
+
+    def __init__(self, old: Graph, new: Graph) -> None:
+        self.old, self.new = old, new
+        self.leader = leader_of(new)
+        self.old_bricks = {b.name: b for b in old.bricks}
+        self.new_bricks = {b.name: b for b in new.bricks}
+        self.exchanged = [
+            n for n in new.nodes if n in old.nodes and self._content(old, n) != self._content(new, n)
+        ]
+        self.added_nodes = [n for n in new.nodes if n not in old.nodes]
+        self.removed_nodes = [n for n in old.nodes if n not in new.nodes]
+        self.staged = {b for n in (*self.exchanged, *self.added_nodes) for b in new.nodes[n]}
+        self.old_links = {_key(k): k for k in old.links}
+        self.new_links = {_key(k): k for k in new.links}
+
+    @staticmethod
+    def _content(graph: Graph, node: str) -> tuple[tuple[BrickSpec, ...], frozenset[Link]]:
+        hosted = graph.nodes[node]
+        inside = frozenset(k for k in graph.links if {k.source, k.sink} <= set(hosted))
+        return tuple(sorted((graph.brick(b) for b in hosted), key=lambda b: b.name)), inside
+
+    def names(self) -> tuple[tuple[str, ...], ...]:
+        """Bricks: replaced, added, removed, kept, rebound."""
+        both = [b for b in self.new_bricks if b in self.old_bricks]
+        replaced = [b for b in both if b in self.staged]
+        kept = [b for b in both if b not in self.staged]
+        touched = {b for k in self._changed_links() for b in (k.source, k.sink)}
+        return (
+            tuple(replaced),
+            tuple(b for b in self.new_bricks if b not in self.old_bricks),
+            tuple(b for b in self.old_bricks if b not in self.new_bricks),
+            tuple(kept),
+            tuple(b for b in kept if b in touched),
+        )
+
+    def updated_parts(self) -> list[str]:
+        """The parts whose class, or whose function, is another one."""
+        changed = [b for b in self.new_bricks.values() if b != self.old_bricks.get(b.name)]
+        return list(dict.fromkeys(b.part for b in changed))
+
+    def _changed_links(self) -> list[Link]:
+        gone = [k for key, k in self.old_links.items() if key not in self.new_links]
+        return gone + [k for key, k in self.new_links.items() if key not in self.old_links]
+
+    def held(self, node: str) -> bool:
+        """Whether a new node must not read yet: it shares an input with an old one, or waits for state."""
+        waits = any(
+            self.new_bricks[b].part in STATEFUL and self.new_bricks[b].replica in self.born()
+            for b in self.new.nodes[node]
+        )
+        if node in self.exchanged or waits:
+            return True
+        hosted = set(self.new.nodes[node])
+        return any(k.sink in hosted and _key(k) in self.old_links for k in self.new.links)
+
+    def binds(self) -> Iterator[Link]:
+        """The links that staged bricks or changed ends need."""
+        for key, link in self.new_links.items():
+            if key not in self.old_links or {link.source, link.sink} & self.staged:
+                yield link
+
+    def unbinds(self) -> Iterator[Unbind]:
+        """Ends at bricks that stay, which lead nowhere from now on."""
+        taken = {(k.source, k.source_port, "out") for k in self.new.links if not k.standby}
+        taken |= {(k.sink, k.sink_port, "in") for k in self.new.links if not k.standby}
+        for key, link in self.old_links.items():
+            if key in self.new_links or link.standby:
+                continue
+            for brick, port, side in (
+                (link.source, link.source_port, "out"),
+                (link.sink, link.sink_port, "in"),
+            ):
+                stays = brick in self.new_bricks and brick not in self.staged
+                if stays and (brick, port, side) not in taken:
+                    yield Unbind(brick, port)
+
+    def drains(self) -> list[str]:
+        """Of the backup, from the brick that hears of the leader on: what may still hold a request."""
+        replication = replication_of(self.old.ftm)
+        if not replication or not replication_of(self.new.ftm):
+            return []
+        backup = next(b.replica for b in self.old.bricks if b.replica not in (None, self.leader))
+        assert backup is not None
+        path = [n for n in chain(self.old, backup) if n != f"{backup}/protocol" and not n.endswith("/server")]
+        first = path.index(f"{backup}/{replication[0][0]}")
+        apart = [
+            n for n in path[first:] if self.old.node_of(n) != self.old.node_of(f"{self.leader}/protocol")
+        ]
+        return _one_per_node(self.old, apart)
+
+    def stateful(self, node: str) -> bool:
+        """Whether the old node holds state that the new one needs."""
+        for name in self.new.nodes[node]:
+            old, new = self.old_bricks.get(name), self.new_bricks[name]
+            if old is not None and (new.part in STATEFUL or new.source or old.source):
+                return True
+        return False
+
+    def born(self) -> list[str]:
+        """Replicas that only the new graph has."""
+        before = {b.replica for b in self.old.bricks}
+        return list(
+            dict.fromkeys(b.replica for b in self.new.bricks if b.replica and b.replica not in before)
+        )
+
+
+def drains(old: Graph, new: Graph) -> list[str]:
+    """Bricks of the backup, one per node, that are to be drained on the way from `old` to `new`, in order."""
+    return _Change(old, new).drains()
+
+
+def _key(link: Link) -> tuple[str, str, str, str]:
+    return link.source, link.source_port, link.sink, link.sink_port
+
+
+def _one_per_node(graph: Graph, bricks: Iterable[str]) -> list[str]:
+    """The first of `bricks` in each node."""
+    firsts: dict[str, str] = {}
+    for brick in bricks:
+        firsts.setdefault(graph.node_of(brick), brick)
+    return list(firsts.values())
+
+
+Steps = tuple[list[AnyVerb], list[AnyVerb]]  # prepare, commit
+
+
+def _drained(change: _Change) -> Steps:
+    """Nothing is inside when anything is exchanged."""
+    leads = f"{change.leader}/protocol"
+    drains = change.drains()
+    commit: list[AnyVerb] = [Suspend(leads), *(Drain(brick) for brick in drains)]
+    if replication_of(change.old.ftm) and replication_of(change.new.ftm) != replication_of(change.old.ftm):
+        commit += [
+            Align(f"{change.leader}/server", s.name)
+            for s in _servers(change.new)
+            if s.replica != change.leader and s.name in change.old_bricks
+        ]
+    commit += [Migrate(node) for node in change.exchanged if change.stateful(node)]
+    for replica in change.born():
+        commit += [Transfer(f"{change.leader}/{part}", f"{replica}/{part}") for part in STATEFUL]
+    commit.append(Together(tuple(_exchanges(change))))
+    # Whoever took a place begins only when its predecessor has stopped: they read the same channels.
+    commit.append(Together((*_resumes(change, drains), Resume(leads))))
+    return _prepare(change), commit
+
+
+def _prepare(change: _Change) -> list[AnyVerb]:
+    """Stage what is new, and give it its ends of channels."""
+    stages = [_stage_of(change, node) for node in (*change.exchanged, *change.added_nodes)]
+    binds = [_bind(k) for k in change.binds() if {k.source, k.sink} & change.staged]
+    return [*stages, *binds]
+
+
+def _stage_of(change: _Change, node: str, *, held: bool | None = None) -> AnyVerb:
+    bricks = tuple(change.new_bricks[b] for b in change.new.nodes[node])
+    return Stage(node, bricks, change.held(node) if held is None else held)
+
+
+def _exchanges(change: _Change) -> list[AnyVerb]:
+    """What the nodes hear of at once: who takes whose place, and the channels of those that stay."""
+    moved = [
+        _bind(k)
+        for k in change.binds()
+        if not k.standby and not {k.source, k.sink} <= change.staged and _key(k) not in change.old_links
+    ]
+    return [*(Exchange(node) for node in change.exchanged), *moved, *change.unbinds()]
+
+
+def _resumes(change: _Change, drains: list[str]) -> list[Resume]:
+    """Whoever waits, but the leader's Protocol."""
+    first = change.new.node_of(f"{change.leader}/protocol")
+    kept = [b for b in drains if b in change.new_bricks and b not in change.staged]
+    drained = {change.new.node_of(b): b for b in drains if b in change.new_bricks}
+    held = [n for n in (*change.exchanged, *change.added_nodes) if change.held(n) and n != first]
+    return [Resume(drained.get(n, change.new.nodes[n][0])) for n in held] + [Resume(b) for b in kept]
+
+
+def _bind(link: Link) -> Bind:
+    same = link.source_port == link.sink_port
+    return Bind(link.source, link.source_port, link.sink, "" if same else link.sink_port)
+
+
+def _paper(change: _Change) -> Steps:
+    """SIGSTOP the Protocol, kill, launch, link, SIGCONT (paper, III-B). All of it while the client waits."""
+    frozen = [p for s in _servers(change.old) if (p := f"{s.replica}/protocol") not in change.staged]
+    commit: list[AnyVerb] = [Freeze(brick) for brick in frozen]
+    commit += [Destroy(node) for node in (*change.exchanged, *change.removed_nodes)]
+    commit += [_stage_of(change, n, held=False) for n in (*change.exchanged, *change.added_nodes)]
+    linked = [_bind(k) for k in change.binds() if not k.standby]
+    return [], [*commit, Together((*linked, *change.unbinds())), *(Thaw(brick) for brick in frozen)]

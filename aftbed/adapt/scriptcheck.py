@@ -1,0 +1,299 @@
+"""Every reason to refuse a script on the graph that runs, with the step that it is about.
+
+Four looks, each only where those before found nothing:
+
+1. are there such bricks and nodes;
+2. is the script sound by itself (`core.script.problems`), and can the runtime carry out each verb;
+3. is the graph that it leads to one that can run: each required port bound once, by a channel that carries
+   what it takes, no loop in the request path, the leader the same, replicas that speak as `ftm` says;
+4. is nothing lost on the way: the leader's Protocol suspended and the backup drained while anything
+   changes, every end that leads nowhere unbound, every state moved. (The paper's recipe does not care.)
+
+A rule says what is wrong, not where. Where is found from outside: **the step of a problem is the one since
+which it never goes away**, looking at ever longer beginnings of the script. So no rule has to know about
+places, and a rule that is written later has them too.
+"""
+
+from collections.abc import Callable, Iterator
+from functools import cache
+from typing import Final
+
+import msgspec
+
+from aftbed.adapt.plan import drains, leader_of
+from aftbed.adapt.scriptfile import ARROW, phases, words
+from aftbed.core.errors import unknown
+from aftbed.core.graph import PLACEMENTS, Graph, Link, ends
+from aftbed.core.script import (
+    RECIPES,
+    Align,
+    AnyVerb,
+    Bind,
+    Destroy,
+    Drain,
+    Exchange,
+    Freeze,
+    Migrate,
+    Resume,
+    Retire,
+    Script,
+    Stage,
+    Suspend,
+    Thaw,
+    Transfer,
+    Unbind,
+    after,
+    flat,
+    names,
+    problems,
+)
+from aftbed.ftm.catalog import KINDS
+from aftbed.ftm.mechanism import EXPRESSIONS, NONE, REPLICAS, STATEFUL, build, replication_of
+
+REQUEST_PORTS: Final = ("pxy2pro", "pro2bfr", "bfr2prd", "prd2srv")  # the way of a request, as outputs
+_OF_NODES: Final = (Migrate, Exchange, Retire, Destroy)
+
+Rule = Callable[[Script], list[str]]
+
+
+def refusals(graph: Graph, script: Script) -> list[str]:
+    """Every reason to refuse `script` where `graph` runs, with its place; [] if it may be carried out."""
+    found = list(dict.fromkeys(_strangers(graph, script)))
+    looks: tuple[tuple[Rule, ...], ...] = (
+        (problems, lambda s: _forms(graph, s)),
+        (lambda s: _led_to(graph, s),),
+        (lambda s: _flow(graph, s), lambda s: _loose_ends(graph, s), lambda s: _states(graph, s)),
+    )
+    for rules in looks[: 3 if script.recipe == RECIPES[0] else 2]:
+        found = found or [reason for rule in rules for reason in _placed(script, rule)]
+    return found
+
+
+# -- what there is --------------------------------------------------------------------------------
+
+
+def _steps(script: Script) -> Iterator[tuple[str, AnyVerb]]:
+    """Every step with its place, as `commit[3]`."""
+    for phase, verbs in phases(script).items():
+        for index, verb in enumerate(verbs):
+            yield f"{phase}[{index}]", verb
+
+
+def _strangers(graph: Graph, script: Script) -> Iterator[str]:
+    """Names that are neither in the graph nor staged, with their places."""
+    staged = [v for v in flat((*script.prepare, *script.commit)) if isinstance(v, Stage)]
+    bricks = {b.name for b in graph.bricks} | {b.name for v in staged for b in v.bricks}
+    for place, step in _steps(script):
+        for verb in flat((step,)):
+            if isinstance(verb, Stage):
+                continue
+            is_node = isinstance(verb, _OF_NODES)
+            allowed = set(graph.nodes) if is_node else bricks
+            here = f"{place}: {type(verb).__name__.lower()}"
+            for name in names(verb):
+                if name not in allowed:
+                    yield f"{here}: {unknown('node' if is_node else 'brick', name, allowed)}"
+
+
+# -- what a script may do -------------------------------------------------------------------------
+
+
+def _forms(graph: Graph, script: Script) -> list[str]:
+    """What `problems` leaves to the runtime that carries the script out."""
+    verbs = list(flat((*script.prepare, *script.commit, *script.finish)))
+    staged = [v.node for v in verbs if isinstance(v, Stage)]
+    replaced = {v.node for v in verbs if isinstance(v, Exchange | Destroy)}
+    found = [f"{node} is staged twice" for index, node in enumerate(staged) if node in staged[:index]]
+    found += [
+        f"{node} serves, and what is staged beside it never takes its place"
+        for node in staged
+        if node in graph.nodes and node not in replaced
+    ]
+    new = _staged_bricks(script)
+    found += [
+        f"unbinds what is new: {v.brick}.{v.port}" for v in verbs if isinstance(v, Unbind) and v.brick in new
+    ]
+    standby = {_key(k) for k in graph.links if k.standby}
+    found += [
+        f"an adaptation does not change the leader: {_words(v.link)} is on standby"
+        for v in flat(script.commit)
+        if isinstance(v, Bind) and _key(v.link) in standby
+    ]
+    if script.recipe == RECIPES[0]:
+        paper = [v for v in verbs if isinstance(v, Freeze | Thaw)]
+        found += [f"{type(v).__name__.lower()} is for recipe {RECIPES[1]} only: {v.brick}" for v in paper]
+    elif graph.placement != PLACEMENTS[0]:
+        found.append(f"recipe {script.recipe} is for placement {PLACEMENTS[0]} only, found {graph.placement}")
+    return found
+
+
+def _staged_bricks(script: Script) -> set[str]:
+    staged = flat((*script.prepare, *script.commit))
+    return {b.name for v in staged if isinstance(v, Stage) for b in v.bricks}
+
+
+def _key(link: Link) -> tuple[str, str, str, str]:
+    return link.source, link.source_port, link.sink, link.sink_port
+
+
+def _words(link: Link) -> str:
+    return f"{link.source}.{link.source_port} {ARROW} {link.sink}.{link.sink_port}"
+
+
+# -- where it leads -------------------------------------------------------------------------------
+
+
+def _led_to(graph: Graph, script: Script) -> list[str]:
+    """What is wrong with the graph that comes of it."""
+    new = after(graph, script, KINDS)
+    found = new.problems(KINDS)
+    found += [
+        f"prepared, and not bound in commit: {_words(k)}"
+        for k in new.links
+        if k.standby and "proxy" not in (k.source, k.sink)
+    ]
+    found += [
+        f"{k.source}.{k.source_port} does not carry what {k.sink}.{k.sink_port} takes"
+        for k in _mismatched(new)
+    ]
+    found += _loops(new)
+    if NONE in (graph.ftm, script.ftm):
+        return [*found, f"an adaptation neither starts nor ends at {NONE}"]
+    return found + _masters(graph, new)
+
+
+def _mismatched(graph: Graph) -> list[Link]:
+    """Links between ports that no mechanism links."""
+    return [k for k in graph.links if (k.source_port, k.sink_port) not in _linked_ports()]
+
+
+@cache
+def _linked_ports() -> frozenset[tuple[str, str]]:
+    graphs = [build(e, PLACEMENTS[0]) for e in EXPRESSIONS if e != NONE]
+    return frozenset((k.source_port, k.sink_port) for g in graphs for k in g.links)
+
+
+def _loops(graph: Graph) -> list[str]:
+    """Bricks that a request would come back to. TR's own loop is of messages of its own."""
+    onward = {k.source: k.sink for k in graph.links if k.source_port in REQUEST_PORTS and not k.standby}
+    found: dict[frozenset[str], str] = {}
+    for start in onward:
+        way = [start]
+        while (brick := onward.get(way[-1])) is not None and brick not in way:
+            way.append(brick)
+        if brick is not None:
+            loop = way[way.index(brick) :]
+            found.setdefault(frozenset(loop), f"a loop in the request path: {' -> '.join((*loop, brick))}")
+    return list(found.values())
+
+
+def _masters(old: Graph, new: Graph) -> list[str]:
+    """Who leads, and how the leader speaks to its backup."""
+    leader = leader_of(old)
+    led = {k.sink for k in new.links if k.source == "proxy" and k.source_port == "pxy2pro" and not k.standby}
+    found = [
+        f"an adaptation does not change the leader: proxy.pxy2pro leads to {sink}, {leader} leads"
+        for sink in sorted(led)
+        if sink.partition("/")[0] != leader
+    ]
+    replicas = {b.name: b.replica for b in new.bricks}
+    between = {
+        (k.source.partition("/")[2], k.source_port)
+        for k in new.links
+        if replicas.get(k.source) and replicas.get(k.sink) and replicas[k.source] != replicas[k.sink]
+    }
+    wanted = set(replication_of(new.ftm))
+    if between != wanted:
+        found.append(
+            f"under {new.ftm} replicas speak through {_ports(wanted)}, found {_ports(between)}:"
+            " say in `ftm` what runs afterwards"
+        )
+    return found
+
+
+def _ports(ends_of: set[tuple[str, str]]) -> str:
+    return ", ".join(sorted(f"{part}.{port}" for part, port in ends_of)) or "nothing"
+
+
+# -- what is lost on the way ----------------------------------------------------------------------
+
+
+def _flow(graph: Graph, script: Script) -> list[str]:
+    """What changes while a request may be inside, and what never begins."""
+    leader = leader_of(graph)
+    leads, backups = f"{leader}/protocol", set(REPLICAS) - {leader}
+    undrained = set(drains(graph, graph)) if replication_of(script.ftm or graph.ftm) else set[str]()
+    suspended, resumed, found = False, set[str](), list[str]()
+    for verb in flat(script.commit):
+        match verb:
+            case Suspend(brick) | Drain(brick):
+                suspended = suspended or brick == leads
+                undrained.discard(brick)
+            case Resume(brick):
+                suspended = suspended and brick != leads
+                resumed.add(brick)
+            case Transfer() | Align() | Bind() | Unbind() | Migrate() | Exchange():
+                if not suspended:
+                    found.append(f"changed while {leads} lets requests in: {words(verb)}")
+                if undrained and backups & {name.partition("/")[0] for name in names(verb)}:
+                    found.append(f"changed before {', '.join(sorted(undrained))} is drained: {words(verb)}")
+            case _:
+                pass
+    held = [v for v in flat(script.prepare) if isinstance(v, Stage) and v.held]
+    return found + [
+        f"held, and never resumed: {v.node}" for v in held if resumed.isdisjoint(b.name for b in v.bricks)
+    ]
+
+
+def _loose_ends(graph: Graph, script: Script) -> list[str]:
+    """Ends at bricks that stay, whose channel goes: their bricks have to hear of it."""
+    new = after(graph, script, KINDS)
+    stay = {b.name for b in new.bricks} & {b.name for b in graph.bricks} - _staged_bricks(script)
+    kept = {end for k in new.links if not k.standby for end in ends(k)}
+    told = {(v.brick, v.port) for v in flat(script.commit) if isinstance(v, Unbind)}
+    gone = [
+        end for k in graph.links if not k.standby for end in ends(k) if end[0] in stay and end not in kept
+    ]
+    return [f"leads nowhere, and is not unbound: {b}.{p}" for b, p, _ in gone if (b, p) not in told]
+
+
+def _states(graph: Graph, script: Script) -> list[str]:
+    """Bricks that begin with no state, or with another one than their leader's."""
+    new, old = after(graph, script, KINDS), {b.name for b in graph.bricks}
+    verbs = list(flat((*script.prepare, *script.commit)))
+    equal = {v.sink for v in verbs if isinstance(v, Transfer | Align)}
+    migrated = {b for v in verbs if isinstance(v, Migrate) for b in new.nodes.get(v.node, ())} & old
+    stateful = [b for b in new.bricks if b.part in STATEFUL]
+    begins = _staged_bricks(script) - equal - migrated
+    found = [f"begins without a state: {b.name}" for b in stateful if b.name in begins]
+    if replication_of(graph.ftm) not in ((), replication_of(new.ftm)):
+        leads = f"{leader_of(graph)}/server"
+        backups = [b.name for b in stateful if b.part == "server" and b.name in old - equal - {leads}]
+        found += [f"may be behind {leads}, and is not aligned: {name}" for name in backups]
+    return found
+
+
+# -- which step -----------------------------------------------------------------------------------
+
+
+def _placed(script: Script, rule: Rule) -> list[str]:
+    """What `rule` finds, each with the step since which it is there."""
+    reasons = list(dict.fromkeys(rule(script)))
+    steps, places = list(_steps(script)), dict[str, str]()
+    for count in range(len(steps) - 1, -1, -1):
+        left = [reason for reason in reasons if reason not in places]
+        if not left:
+            break
+        before = rule(_beginning(script, count))
+        places |= {reason: f"{steps[count][0]}: " for reason in left if reason not in before}
+    return [places.get(reason, "") + reason for reason in reasons]
+
+
+def _beginning(script: Script, count: int) -> Script:
+    """`script` with its first `count` steps."""
+    rest, kept = count, []
+    for verbs in phases(script).values():
+        kept.append(verbs[:rest])
+        rest -= len(kept[-1])
+    prepare, commit, finish = kept
+    return msgspec.structs.replace(script, prepare=prepare, commit=commit, finish=finish)

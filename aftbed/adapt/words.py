@@ -1,0 +1,159 @@
+"""The words of an adaptation, the same on `run --adapt "..."` and on `aftbed adapt ...`.
+
+    to EXPR | switch EXPR | compose EXPR | decompose | update BRICK to SOURCE   [at request 120 | after 500ms]
+
+EXPR is always the whole of what will run. `to` leads anywhere. The other verbs say besides what kind of
+change is meant, so that a slip is refused, with the verb named that would do it:
+
+| verb      | the outer mechanism | inside                                  |
+|-----------|---------------------|-----------------------------------------|
+| switch    | becomes another     | whatever EXPR has                       |
+| compose   | is the running one  | all that is there, in order, and more   |
+| decompose | is the running one  | nothing any more                        |
+
+`update` exchanges the class of one brick on every replica; the brick `app` is the protected function.
+Without a word about when, an adaptation begins at once.
+"""
+
+import re
+from collections.abc import Iterable
+from typing import Final
+
+import msgspec
+
+from aftbed.core.errors import ConfigError, unknown
+from aftbed.core.message import Goal
+from aftbed.core.script import RECIPES
+from aftbed.ftm.mechanism import DUPLEX, SIMPLEX, parse
+
+VERBS: Final = ("to", "switch", "compose", "decompose", "update")
+GRAMMAR: Final = (
+    "to|switch|compose EXPR, decompose, or update BRICK to SOURCE, then [at request N | after 500ms]"
+)
+AFTER_MS_MAX: Final = 3_600_000.0
+_WHOLE: Final = re.compile(r"[0-9]{1,12}")
+_DURATION: Final = re.compile(r"([0-9]{1,10}(?:\.[0-9]{1,6})?)(ms|s)")
+_UNITS_MS: Final = {"ms": 1.0, "s": 1000.0}
+
+
+class Wish(msgspec.Struct, frozen=True):
+    """An adaptation as it was asked for: `name` is an expression, or a brick that is to become `source`."""
+
+    verb: str
+    name: str = ""
+    source: str = ""
+
+    def __str__(self) -> str:
+        to = f" to {self.source}" if self.source else ""
+        return f"{self.verb} {self.name}".strip() + to
+
+
+class Timed(msgspec.Struct, frozen=True):
+    """When a wish begins: when request `at_request` is sent, or `after_ms` after the launch; 0 is unsaid."""
+
+    wish: Wish
+    at_request: int = 0
+    after_ms: float = 0.0
+
+
+def read(text: str) -> Timed:
+    """The adaptation that `text` means. Raises ConfigError naming the word that is wrong."""
+    words = text.split()
+    if not words:
+        raise ConfigError(f"adaptation {text!r}: expected {GRAMMAR}")
+    verb, *rest = words
+    if verb not in VERBS:
+        raise unknown("adaptation", verb, VERBS)
+    length = {"decompose": 0, "update": 3}.get(verb, 1)
+    if len(rest) < length or (verb == "update" and rest[1] != "to"):
+        raise ConfigError(f"adaptation {text!r}: expected {GRAMMAR}")
+    name = rest[0] if length else ""
+    source = rest[2] if verb == "update" else ""
+    return _timed(text, Wish(verb, name, source), rest[length:])
+
+
+def _timed(text: str, wish: Wish, words: list[str]) -> Timed:
+    """The rest of an adaptation: when it begins."""
+    match words:
+        case []:
+            return Timed(wish)
+        case ["at", "request", number]:
+            if not (_WHOLE.fullmatch(number) and int(number) >= 1):
+                raise ConfigError(f"at request {number[:40]!r}: a whole number from 1 on is allowed")
+            return Timed(wish, at_request=int(number))
+        case ["after", duration]:
+            return Timed(wish, after_ms=_milliseconds(duration))
+        case _:
+            found = " ".join(words)
+            raise ConfigError(
+                f"adaptation {text!r}: found {found!r}, allowed is 'at request N' or 'after 500ms'"
+            )
+
+
+def _milliseconds(text: str) -> float:
+    found = _DURATION.fullmatch(text)
+    value = float(found[1]) * _UNITS_MS[found[2]] if found else 0.0
+    if not 0 < value <= AFTER_MS_MAX:
+        raise ConfigError(
+            f"after {text[:40]!r}: a positive number with its unit is allowed, as 500ms or 2s,"
+            f" up to {AFTER_MS_MAX / _UNITS_MS['s']:.0f}s"
+        )
+    return value
+
+
+def goal(wish: Wish, running: str, recipe: str = RECIPES[0]) -> Goal:
+    """What `wish` comes to where `running` runs. Raises ConfigError, naming the verb that would do."""
+    if recipe not in RECIPES:
+        raise unknown("recipe", recipe, RECIPES)
+    if wish.verb == "update":
+        return Goal(part=wish.name, source=wish.source, recipe=recipe)
+    if wish.verb == "decompose":
+        return Goal(expression=_decomposed(running), recipe=recipe)
+    new, old = parse(wish.name), parse(running)
+    if wish.verb != "to" and new and old:  # what begins or ends at `none` is refused by the plan, with a word
+        _check_verb(wish, running, old, new)
+    return Goal(expression=wish.name, recipe=recipe)
+
+
+def _decomposed(running: str) -> str:
+    names = parse(running)
+    if len(names) < 2:
+        raise ConfigError(f"there is nothing inside {running}: decompose takes away what is")
+    return names[0]
+
+
+def _check_verb(wish: Wish, running: str, old: tuple[str, ...], new: tuple[str, ...]) -> None:
+    if wish.name == running:
+        raise ConfigError(f"{running} is what runs already")
+    right = verb_for(old, new)
+    if right == wish.verb:
+        return
+    command = "aftbed adapt decompose" if right == "decompose" else f"aftbed adapt {right} {wish.name}"
+    if wish.verb == "switch":
+        raise ConfigError(f"{new[0]} is the outer mechanism already ({running} runs): {command}")
+    if new[0] == old[0]:
+        raise ConfigError(f"{wish.name} is not all of {running}, and more inside: {command}")
+    raise ConfigError(f"{new[0]} is not what runs ({running}): {_instead(wish.name, running, old, new)}")
+
+
+def _instead(expression: str, running: str, old: tuple[str, ...], new: tuple[str, ...]) -> str:
+    """What to do where the expression to compose begins with another mechanism than the running one."""
+    if old[0] in DUPLEX and set(new) <= set(SIMPLEX) and not set(new) & set(old):
+        return f"aftbed adapt compose {running}+{expression}, or to {expression}"
+    first = f", or switch {new[0]} first" if len(new) > 1 else ""
+    return f"aftbed adapt to {expression}{first}"
+
+
+def verb_for(old: tuple[str, ...], new: tuple[str, ...]) -> str:
+    """The narrowest verb that leads from the mechanisms `old` to `new`."""
+    if old[0] != new[0]:
+        return "switch"
+    if new == old[:1]:
+        return "decompose"
+    return "compose" if _within(old, new) else "to"
+
+
+def _within(some: Iterable[str], names: Iterable[str]) -> bool:
+    """Whether `names` has `some` in this order, whatever stands between them."""
+    rest = iter(names)
+    return all(name in rest for name in some)

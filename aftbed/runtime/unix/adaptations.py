@@ -1,0 +1,286 @@
+"""Adaptations of a run: who asks for one, what the Engine orders, how it ended.
+
+The Engine decides, phase by phase; here its orders are carried out, and what it must not forget is kept:
+a new Engine is told what the dead one had ordered last. While a phase acts on what serves, Recovery
+waits; a replica that is lost before the end of the observation undoes the adaptation, then it fails over.
+"""
+
+import functools
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from aftbed.core import message
+from aftbed.core.errors import ConfigError
+from aftbed.core.event import Event
+from aftbed.core.fault import Act
+from aftbed.core.script import Phase, Script
+from aftbed.runtime.unix import control
+from aftbed.runtime.unix.deployment import Deployment, Keys
+from aftbed.runtime.unix.exchange import Exchange
+from aftbed.runtime.unix.faults import Faults
+from aftbed.runtime.unix.jobs import StepFailed
+from aftbed.runtime.unix.journal import Journal
+from aftbed.runtime.unix.loop import Loop
+from aftbed.runtime.unix.options import Scheduled
+from aftbed.runtime.unix.processes import Process
+from aftbed.runtime.unix.verbs import Executor
+
+ENGINE: Final = "engine"
+HISTORY_NAME: Final = "adaptations.jsonl"
+RETRY_SECONDS: Final = 0.01
+RETRIES_MAX: Final = 100
+FIRST_TRIGGER: Final = 2_000_001  # apart from the numbers of faults and the tokens of orders
+
+Answer = Callable[["Outcome"], None]
+
+
+class Outcome(msgspec.Struct):
+    """One adaptation, as it is told and written down; times in milliseconds."""
+
+    number: int
+    purpose: str
+    recipe: str
+    ftm: str  # that runs after it
+    outcome: str = ""
+    reason: str = ""
+    asked_ms: float = 0.0  # since the start of the run
+    prepare_ms: float = 0.0
+    blackout_ms: float = 0.0
+    total_ms: float = 0.0
+    bricks_changed: int = 0
+    bricks_total: int = 0
+    application: str = ""  # the function that is protected after it, "" for the built-in one
+    opened_ns: int = 0  # when it was committed and requests were served again (monotonic)
+
+
+def _nobody(outcome: Outcome) -> None:
+    """Asked for with the run: it is in the history."""
+
+
+def _armed(blow: control.Blow, token: int) -> control.Arm:
+    return control.Arm(token, Event.REQUEST_SENT.label, (blow,))
+
+
+class _Current:
+    """The one under way."""
+
+    def __init__(self, outcome: Outcome, answer: Answer) -> None:
+        self.outcome, self.answer = outcome, answer
+        self.began_ns = time.monotonic_ns()
+        self.phase_ns = 0
+        self.script: Script | None = None
+        self.phase = Phase.PREPARE
+        self.ended, self.failure = False, ""
+        self.lost = ""  # a replica
+        self.exchange: Exchange | None = None
+
+
+class Adaptations:
+    """`inform_recovery` is called whenever Recovery may act again."""
+
+    def __init__(
+        self,
+        deployment: Deployment,
+        executor: Executor,
+        loop: Loop,
+        journal: Journal,
+        faults: Faults,
+        record: Path,
+        tell: Callable[[str, str], None],
+        inform_recovery: Callable[[], None],
+    ) -> None:
+        self._deployment, self._executor, self._loop = deployment, executor, loop
+        self._journal, self._faults, self._tell = journal, faults, tell
+        self._inform_recovery = inform_recovery
+        self._path = record / HISTORY_NAME
+        self._started_ns = time.monotonic_ns()
+        self._current: _Current | None = None
+        self.history: list[Outcome] = []
+        self._scheduled: dict[int, message.Goal] = {}  # by the number of their trigger
+
+    @property
+    def busy(self) -> bool:
+        """One is under way."""
+        return self._current is not None
+
+    @property
+    def acting(self) -> bool:
+        """A phase that acts on what serves is under way."""
+        now = self._current
+        return now is not None and now.phase in (Phase.COMMIT, Phase.UNDO) and not now.ended
+
+    def give_up_preparing(self, reason: str) -> None:
+        """What is staged has ends of channels that are being renewed."""
+        now = self._current
+        if now is not None and now.phase is Phase.PREPARE and not now.ended:
+            self._loop.jobs.cancel(f"adapt {now.phase.value}", reason)
+
+    # -- asked for ----------------------------------------------------------------------------
+
+    def ask(self, goal: message.Goal, answer: Answer, retries: int = RETRIES_MAX) -> None:
+        """Begin. Raises ConfigError where that cannot be now; waits a moment for redundancy to be back."""
+        deployment = self._deployment
+        if self._current is not None:
+            raise ConfigError(
+                f"adaptation {self._current.outcome.number} ({self._current.outcome.purpose}) is under way:"
+                " wait for its end (aftbed adapt history)"
+            )
+        alone = len(deployment.slots) > 1 and not deployment.backup
+        if self._executor.busy or alone or not deployment.lives(ENGINE):
+            if deployment.graph.ftm == "none" or not retries or not deployment.leader:
+                raise ConfigError(
+                    f"{deployment.graph.ftm}: no adaptation now: leader {deployment.leader or 'nobody'},"
+                    f" backup {deployment.backup or 'nobody'}, engine"
+                    f" {'there' if deployment.lives(ENGINE) else 'not there'}"
+                )
+            self._loop.after(RETRY_SECONDS, lambda: self._ask_again(goal, answer, retries - 1))
+            return
+        number = len(self.history) + 1
+        outcome = Outcome(number, goal.expression or goal.part or "script", goal.recipe, deployment.graph.ftm)
+        outcome.asked_ms = round((time.monotonic_ns() - self._started_ns) / 1e6, 3)
+        self._current = _Current(outcome, answer)
+        self._say(message.Adapt(number, goal, deployment.graph))
+
+    def schedule(self, scheduled: tuple[Scheduled, ...]) -> Keys:
+        """Those that were asked for with the run: at a request the Client waits until it has begun."""
+        for number, later in enumerate(scheduled, FIRST_TRIGGER):
+            if not later.at_request:
+                begin = functools.partial(self._ask_again, later.goal, _nobody, RETRIES_MAX)
+                self._loop.after(later.after_ms / 1e3, begin)
+                continue
+            self._scheduled[number] = later.goal
+            blow = control.Blow(number, "client", later.at_request, Act.HANG, itself=False)
+            yield from self._deployment.ask("client", functools.partial(_armed, blow))
+
+    def fired(self, process: Process, number: int) -> bool:
+        """The Client has come to its request. False if `number` is no trigger of an adaptation."""
+        goal = self._scheduled.pop(number, None)
+        if goal is None:
+            return False
+        self._ask_again(goal, _nobody, RETRIES_MAX)
+        self._deployment.nursery.order(process, control.Ack(number))
+        return True
+
+    def _ask_again(self, goal: message.Goal, answer: Answer, retries: int) -> None:
+        try:
+            self.ask(goal, answer, retries)
+        except ConfigError as error:
+            what = goal.expression or goal.part or "script"
+            outcome = Outcome(0, what, goal.recipe, self._deployment.graph.ftm, "refused", str(error))
+            self._tell("adapted", f"{what}: refused: {error}")
+            answer(outcome)
+
+    def _say(self, told: message.Adapt | message.Progress | message.TakeUp) -> None:
+        try:
+            self._deployment.order(ENGINE, lambda token: control.Tell(token, ENGINE, told))
+        except StepFailed:
+            return  # it is dead: its successor is told by `engine_is_new`
+
+    # -- what the Engine orders ---------------------------------------------------------------
+
+    def ordered(self, todo: Script, phase: Phase, number: int) -> None:
+        """Carry out a phase, and tell the Engine how it went."""
+        now = self._current
+        if now is None or now.outcome.number != number:
+            return
+        if phase is Phase.FINISH and now.lost:
+            return  # it was said before the Engine heard of the loss
+        if now.exchange is None or now.script is None:
+            now.exchange, now.script = Exchange(self._deployment, todo, self._step), todo
+            now.outcome.purpose, now.outcome.ftm = todo.purpose, todo.ftm or self._deployment.graph.ftm
+            now.outcome.bricks_total = max(len(g.bricks) for g in (now.exchange.old, now.exchange.new))
+            self._tell("adapt", f"{number}: {todo.purpose} ({todo.recipe})")
+        now.phase, now.ended, now.phase_ns = phase, False, time.monotonic_ns()
+        exchange = now.exchange
+        phases: dict[Phase, Callable[[], Keys]] = {
+            Phase.PREPARE: exchange.prepare,
+            Phase.COMMIT: exchange.commit,
+            Phase.FINISH: exchange.finish,
+            Phase.UNDO: functools.partial(exchange.undo, now.lost),
+        }
+        if phase in (Phase.COMMIT, Phase.UNDO):
+            self._executor.busy = True
+        self._loop.jobs.start(
+            f"adapt {phase.value}", phases[phase](), lambda failure: self._ended(now, failure)
+        )
+
+    def _step(self, event: Event, number: int) -> Keys:
+        """Journal a step before it acts; whatever fault waits for it strikes first."""
+        self._journal.write(time.monotonic_ns(), event, 0, number)
+        yield from self._faults.at(event)
+
+    def _ended(self, now: _Current, failure: str) -> None:
+        took_ms = round((time.monotonic_ns() - now.phase_ns) / 1e6, 3)
+        now.ended, now.failure = True, failure
+        self._tell("adapt.phase", f"{now.phase.value}: {failure or f'{took_ms:.2f} ms'}")
+        assert now.exchange is not None
+        if now.phase is Phase.PREPARE:
+            now.outcome.prepare_ms = took_ms
+        if now.phase is Phase.COMMIT and not failure:
+            closed = now.exchange.opened_ns - now.exchange.closed_ns
+            now.outcome.blackout_ms = round(closed / 1e6, 3)
+        if not (now.phase is Phase.COMMIT and failure):
+            self._executor.busy = False
+        self._say(message.Progress(now.outcome.number, now.phase, failure))
+        if now.phase in (Phase.COMMIT, Phase.UNDO) and not self._executor.busy:
+            self._inform_recovery()
+
+    def adapted(self, told: message.Adapted) -> None:
+        """The Engine says how it ended."""
+        now, self._current = self._current, None
+        if now is None:
+            return
+        if self._executor.busy and now.phase is Phase.COMMIT:  # it failed, and there is no way back
+            self._executor.busy = False
+            self._inform_recovery()
+        outcome = now.outcome
+        outcome.outcome, outcome.reason = told.outcome, told.reason
+        outcome.total_ms = round((time.monotonic_ns() - now.began_ns) / 1e6, 3)
+        outcome.ftm = self._deployment.graph.ftm
+        outcome.application = next(b.application for b in self._deployment.graph.bricks if b.part == "server")
+        if now.exchange is not None:
+            outcome.bricks_changed = now.exchange.bricks_changed
+            outcome.opened_ns = now.exchange.opened_ns if told.outcome == "done" else 0
+        self.history.append(outcome)
+        with open(self._path, "ab") as file:
+            file.write(msgspec.json.encode(outcome) + b"\n")
+        self._tell("adapted", f"{outcome.number}: {outcome.purpose}: {told.outcome} {told.reason}".rstrip())
+        now.answer(outcome)
+
+    # -- what happens meanwhile ---------------------------------------------------------------
+
+    def engine_is_new(self) -> None:
+        """Tell it what its predecessor had ordered last, if anything."""
+        now = self._current
+        if now is None:
+            return
+        if now.script is None:  # it had not even planned
+            self._current = None
+            outcome = now.outcome
+            outcome.outcome, outcome.reason = "refused", "the engine died while it planned: ask again"
+            now.answer(outcome)
+            return
+        self._say(message.TakeUp(now.outcome.number, now.script, now.phase, now.ended, now.failure))
+
+    def interrupted(self, replica: str) -> bool:
+        """Recovery wants to act on `replica`. True if it must wait, and will be told when it may."""
+        now = self._current
+        if now is None or now.exchange is None:
+            return False
+        self.give_up_preparing(f"replica {replica} is lost")  # its undoing touches nothing that serves
+        if now.phase is Phase.COMMIT and now.ended and not now.failure:
+            self._executor.busy = True
+            now.lost = replica
+            now.failure = f"replica {replica} was lost within the observation window"
+            self._say(message.Progress(now.outcome.number, Phase.COMMIT, now.failure))
+            return True
+        return False
+
+    def to_json(self) -> bytes:
+        """The history, for `aftbed adapt history`."""
+        return json.dumps({"adaptations": [msgspec.to_builtins(o) for o in self.history]}).encode()

@@ -1,0 +1,464 @@
+"""An adaptation on real processes: the phases of one script, and the way back (design 4, "Adaptation order").
+
+What is new is *staged*: processes beside those that serve, with their ends of channels, fed by nobody. A
+channel that both graphs have is kept, with the mail that is in it; a new brick gets a descriptor of the
+same socket. What is replaced is kept too, suspended, until the script is finished; so at any moment
+before that, `undo` needs nothing but to hand descriptors out as before.
+
+Who dies meanwhile fails the step that waits for it; `undo` leaves out whoever is dead.
+"""
+
+import contextlib
+import signal
+import time
+from collections.abc import Callable, Generator, Iterable
+from hashlib import blake2b
+from typing import Final
+
+from aftbed.adapt.plan import drains
+from aftbed.core import script
+from aftbed.core.event import Event
+from aftbed.core.graph import Graph, Link, ends
+from aftbed.core.script import Script, flat
+from aftbed.ftm.catalog import KINDS
+from aftbed.ftm.mechanism import REPLICAS, replication_of
+from aftbed.runtime.unix import control
+from aftbed.runtime.unix.channels import Channel
+from aftbed.runtime.unix.deployment import STAGED, Deployment, Keys
+from aftbed.runtime.unix.jobs import Key, StepFailed, Wait
+from aftbed.runtime.unix.processes import Process
+from aftbed.runtime.unix.spawn import LIGHT
+
+PREPARE_SECONDS_MAX: Final = 5.0  # a stranger's module is imported and tested meanwhile
+STEP_SECONDS_MAX: Final = 0.5
+SUSPEND_SECONDS_MAX: Final = 0.25  # longer, and the client would rather have the old mechanism back
+
+Answer = Generator[Wait, dict[Key, bytes], bytes]
+Ends = dict[tuple[str, str], int]  # brick, port -> descriptor, or NOWHERE
+
+
+class _Changes:
+    """What one process is told at once."""
+
+    def __init__(self, process: Process) -> None:
+        self.process = process
+        self.inputs: Ends = {}
+        self.outputs: Ends = {}
+        self.suspend = False
+
+    def order(self, epoch: int) -> tuple[Callable[[int], control.ToNode], tuple[int, ...]]:
+        """The order, but for its token, and the descriptors that go with it."""
+        fds: list[int] = []
+
+        def ports(ends: Ends) -> tuple[control.Port, ...]:
+            found = []
+            for (brick, port), fd in ends.items():
+                found.append(control.Port(brick, port, len(fds) if fd != control.NOWHERE else fd))
+                if fd != control.NOWHERE:
+                    fds.append(fd)
+            return tuple(found)
+
+        inputs, outputs = ports(self.inputs), ports(self.outputs)
+        return lambda token: control.Rewire(token, inputs, outputs, epoch, self.suspend), tuple(fds)
+
+
+class Exchange:
+    """One adaptation. `step` is called at each verb, before and after it."""
+
+    def __init__(self, deployment: Deployment, todo: Script, step: Callable[[Event, int], Keys]) -> None:
+        self._deployment, self._todo, self._step = deployment, todo, step
+        self.old: Graph = deployment.graph
+        self.new: Graph = script.after(self.old, todo, KINDS)
+        self._staged: dict[str, Process] = {}  # by node
+        self._replaced: dict[str, Process] = {}  # the old ones, by node
+        self._removed: dict[str, Process] = {}  # those that only the old graph has
+        self._fresh: dict[tuple[str, str, str], Channel] = {}
+        self._let_go: dict[tuple[str, str, str], Channel] = {}  # of the old graph only
+        self._suspended: list[tuple[str, Process]] = []  # brick, its node's process
+        self._migrated: list[str] = []
+        self._given: set[script.End] = set()  # ends that their bricks have
+        self._rewired = False
+        self._committing = False
+        self.committed = False
+        self._born: list[str] = []
+        self._lost: set[str] = set()  # replicas that are left to Recovery
+        self.closed_ns = self.opened_ns = 0  # when no request was served, and when again
+        self._number = 0
+
+    @property
+    def bricks_changed(self) -> int:
+        """How many bricks are made or ended."""
+        old, new = ({b.name: (b, g.node_of(b.name)) for b in g.bricks} for g in (self.old, self.new))
+        made = {
+            b.name
+            for v in flat((*self._todo.prepare, *self._todo.commit))
+            if isinstance(v, script.Stage)
+            for b in v.bricks
+        }
+        return len(made | (old.keys() - new.keys()))
+
+    # -- the phases ---------------------------------------------------------------------------
+
+    def prepare(self) -> Keys:
+        """Stage and bind what is new."""
+        yield from self._stage(v for v in flat(self._todo.prepare) if isinstance(v, script.Stage))
+        yield from self._rewire(v for v in flat(self._todo.prepare) if isinstance(v, script.Bind))
+        yield from self._deployment.nursery.calm(LIGHT)
+
+    def _stage(self, verbs: Iterable[script.Stage]) -> Keys:
+        sent = []
+        for verb in verbs:
+            yield from self._enter()
+            process, key = yield from self._deployment.stage(verb.node, self.new, held=verb.held)
+            self._staged[verb.node] = process
+            sent.append(key)
+        if sent:
+            yield Wait(frozenset(k for k, _ in sent), frozenset(n for _, n in sent), PREPARE_SECONDS_MAX)
+
+    def commit(self) -> Keys:
+        """All that the client waits for."""
+        self._committing = True
+        if self._todo.recipe != script.RECIPES[0]:
+            for slot in self._deployment.slots.values():  # it kills what they watch
+                yield from self._deployment.watch(slot, nobody=True)
+        self.closed_ns = time.monotonic_ns()
+        for verb in self._todo.commit:
+            yield from self._enter()
+            yield from self._do(verb)
+            yield from self._step(Event.ADAPT_STEP_EXIT, self._number)
+        self.opened_ns = time.monotonic_ns()
+        self._adopt()
+        yield from self._watch()
+
+    def finish(self) -> Keys:
+        """End what does not serve any more."""
+        for process in (*self._replaced.values(), *self._removed.values()):
+            _end(process)
+        for channel in self._let_go.values():
+            channel.close()
+        self._let_go, self._replaced, self._removed = {}, {}, {}
+        yield Wait(frozenset())
+
+    def _enter(self) -> Keys:
+        self._number += 1
+        yield from self._step(Event.ADAPT_STEP_ENTER, self._number)
+
+    # -- the verbs ----------------------------------------------------------------------------
+
+    def _do(self, verb: script.AnyVerb) -> Keys:
+        match verb:
+            case script.Suspend(brick):
+                yield from self._suspend(brick, drain=False)
+            case script.Drain(brick):
+                yield from self._suspend(brick, drain=True)
+            case script.Align(source, sink):
+                yield from self._align(source, sink)
+            case script.Transfer(source, sink):
+                state = yield from self._ask(source, lambda token: control.Capture(token, source))
+                yield from self._ask(sink, lambda token: control.Restore(token, sink, state))
+            case script.Migrate(node):
+                self._migrated.append(node)
+                serving, staged = self._deployment.nodes[node], self._staged[node]
+                yield from self._migrate(self.old, serving, self.new, staged, node)
+            case script.Together(verbs) if all(isinstance(v, script.Resume) for v in verbs):
+                yield from self._resume([v.brick for v in verbs if isinstance(v, script.Resume)])
+            case script.Resume(brick):
+                yield from self._resume([brick])
+            case script.Together() | script.Bind() | script.Unbind() | script.Exchange():
+                yield from self._rewire(flat((verb,)))
+            case script.Freeze(brick):
+                self._process(brick).kill(signal.SIGSTOP)
+            case script.Thaw(brick):
+                self._process(brick).kill(signal.SIGCONT)
+            case script.Destroy(node):
+                self._destroy(node)
+            case script.Stage():
+                yield from self._stage((verb,))
+            case _:
+                raise StepFailed(f"{type(verb).__name__} has no place in the commit of an adaptation")
+
+    def _process(self, brick: str) -> Process:
+        """Who hosts `brick`: what is staged under the name of a node that is new, else what serves."""
+        if brick in {b.name for b in self.old.bricks}:
+            node = self.old.node_of(brick)
+            if node in self._deployment.nodes:
+                return self._deployment.nodes[node]
+        node = self.new.node_of(brick)
+        process = self._staged.get(node) or self._deployment.nodes.get(node)
+        if process is None:
+            raise StepFailed(f"{node} is gone")
+        return process
+
+    def _ask(
+        self, brick: str, make: Callable[[int], control.ToNode], seconds: float = STEP_SECONDS_MAX
+    ) -> Answer:
+        return (yield from self._ask_of(self._process(brick), make, seconds))
+
+    def _destroy(self, node: str) -> None:
+        """With whatever is inside."""
+        process = self._deployment.nodes.get(node)
+        if process is None:
+            raise StepFailed(f"{node} is gone")
+        _end(process)
+        if node not in self.new.nodes:
+            del self._deployment.nodes[node]
+
+    def _suspend(self, brick: str, *, drain: bool) -> Keys:
+        self._suspended.append((brick, self._process(brick)))
+        yield from self._ask(brick, lambda token: control.Suspend(token, drain), SUSPEND_SECONDS_MAX)
+
+    def _resume(self, bricks: Iterable[str]) -> Keys:
+        sent = []
+        for brick in bricks:
+            sent.append(self._deployment.order_to(self._process(brick), control.Resume))
+            self._suspended = [(b, p) for b, p in self._suspended if b != brick]
+        yield Wait(frozenset(k for k, _ in sent), frozenset(n for _, n in sent), STEP_SECONDS_MAX)
+
+    def _align(self, source: str, sink: str) -> Keys:
+        asked = [
+            self._deployment.order_to(self._process(brick), lambda token, b=brick: control.Capture(token, b))  # type: ignore[misc]
+            for brick in (source, sink)
+        ]
+        got = yield Wait(frozenset(k for k, _ in asked), frozenset(n for _, n in asked), STEP_SECONDS_MAX)
+        states = [got[key] for key, _ in asked]
+        if blake2b(states[0]).digest() != blake2b(states[1]).digest():
+            yield from self._ask(sink, lambda token: control.Restore(token, sink, states[0]))
+
+    def _migrate(self, given: Graph, giver: Process, taken: Graph, taker: Process, node: str) -> Keys:
+        """The state of every brick that both have. What has none needs no taker."""
+        for brick in given.nodes[node]:
+            if brick not in taken.nodes[node]:
+                continue
+            state = yield from self._ask_of(giver, lambda token, b=brick: control.Capture(token, b))  # type: ignore[misc]
+            changed = given.brick(brick) != taken.brick(brick)
+            if state:
+                yield from self._ask_of(
+                    taker,
+                    lambda token, b=brick, s=state, c=changed: control.Restore(token, b, s, c),  # type: ignore[misc]
+                )
+
+    def _ask_of(
+        self, process: Process, make: Callable[[int], control.ToNode], seconds: float = STEP_SECONDS_MAX
+    ) -> Answer:
+        key, name = self._deployment.order_to(process, make)
+        got = yield Wait(frozenset({key}), frozenset({name}), seconds)
+        return got[key]
+
+    # -- channels -----------------------------------------------------------------------------
+
+    def _channel(self, link: Link) -> Channel:
+        """The channel of `link`: the one that serves already, or a fresh one."""
+        key = (link.source, link.source_port, link.sink)
+        standing = self._deployment.channels.get(*key)
+        if standing is not None:
+            return standing
+        if key not in self._fresh:
+            self._fresh[key] = Channel(link)
+        return self._fresh[key]
+
+    def _rewire(self, verbs: Iterable[script.AnyVerb]) -> Keys:
+        """Everybody hears of all that concerns him at once. In `prepare`, only what is staged."""
+        changes: dict[int, _Changes] = {}
+
+        def of(process: Process) -> _Changes:
+            return changes.setdefault(id(process), _Changes(process))
+
+        exchanged = []
+        for verb in verbs:
+            match verb:
+                case script.Bind():
+                    self._bind(verb.link, of)
+                case script.Unbind(brick, port):
+                    self._unbind(brick, port, of)
+                case script.Exchange(node):
+                    exchanged.append(node)
+                    old = self._deployment.nodes[node]
+                    of(old).suspend = True
+                    self._suspended.append((node, old))  # even if another one cannot be told
+                case _:
+                    raise StepFailed(f"{type(verb).__name__} among channels")
+        yield from self._tell(changes)
+        for node in exchanged:
+            self._take_place(node)
+
+    def _tell(self, changes: dict[int, _Changes]) -> Keys:
+        sent = []
+        for change in changes.values():
+            order, fds = change.order(self._deployment.epoch)
+            sent.append(self._deployment.order_to(change.process, order, fds))
+        if sent:
+            yield Wait(frozenset(k for k, _ in sent), frozenset(n for _, n in sent), STEP_SECONDS_MAX)
+
+    def _bind(self, link: Link, of: Callable[[Process], _Changes]) -> None:
+        if self.new.node_of(link.source) == self.new.node_of(link.sink):
+            return  # within one node: it knows
+        channel = self._channel(link)
+        shared = (link.source, link.source_port, link.sink) not in self._fresh
+        self._rewired = self._rewired or self._committing
+        for brick, port, fd, side in (
+            (link.sink, link.sink_port, channel.read.fileno(), "in"),
+            (link.source, link.source_port, channel.write.fileno(), "out"),
+        ):
+            staged = self._staged.get(self.new.node_of(brick))
+            given = (brick, port, side) in self._given or (staged is None and shared)
+            if not given and (self._committing or staged is not None):
+                self._given.add((brick, port, side))
+                change = of(staged or self._process(brick))
+                (change.inputs if side == "in" else change.outputs)[brick, port] = fd
+
+    def _unbind(self, brick: str, port: str, of: Callable[[Process], _Changes]) -> None:
+        self._rewired = True
+        change = of(self._process(brick))
+        outputs = KINDS[self.old.brick(brick).kind].outputs
+        (change.outputs if port in outputs else change.inputs)[brick, port] = control.NOWHERE
+
+    def _take_place(self, node: str) -> None:
+        """The staged process is the node from now on."""
+        deployment = self._deployment
+        old, new = deployment.nodes[node], self._staged.pop(node)
+        self._replaced[node] = old
+        old.name, old.kind = f"{node}{STAGED}", "staged"
+        new.name, new.kind = node, "node"
+        deployment.nodes[node] = new
+        self._suspended = [(b, new if p is old else p) for b, p in self._suspended]
+
+    def _adopt(self) -> None:
+        """The new graph runs."""
+        deployment = self._deployment
+        for node, process in self._staged.items():
+            process.name, process.kind = node, "node"
+            deployment.nodes[node] = process
+        self._born, self._staged = list(self._staged), {}
+        for node in [n for n in deployment.nodes if n not in self.new.nodes]:
+            process = self._removed[node] = deployment.nodes.pop(node)
+            process.name, process.kind = f"{node}{STAGED}", "staged"
+        kept = {(k.source, k.source_port, k.sink) for k in self.new.links}
+        for key, _ in deployment.channels.items():
+            if key not in kept:
+                self._let_go[key] = deployment.channels.take(key)
+        for channel in self._fresh.values():
+            deployment.channels.put(channel)
+        self._fresh.clear()
+        deployment.adopt(self.new)
+        others = [r for r in REPLICAS if r != deployment.leader]
+        alone = not replication_of(self.new.ftm) or others[0] not in deployment.slots
+        deployment.backup = "" if alone else others[0]
+        self.committed = True
+
+    def _watch(self) -> Keys:
+        for slot in self._deployment.slots.values():
+            if slot.name in self._lost:
+                continue
+            yield from self._deployment.watch(slot)
+
+    # -- the way back -------------------------------------------------------------------------
+
+    def undo(self, lost: str = "") -> Keys:
+        """What runs is the old graph again, whatever has been done; what is new dies.
+
+        A replica that is `lost`, or has a dead node, is left to Recovery: nothing of it serves again.
+        """
+        deployment = self._deployment
+        self._lost = {lost, *(_replica(n) for n, p in deployment.nodes.items() if not p.alive)} - {""}
+        if self.committed:
+            yield from self._reverse_adoption()
+        if self._rewired:
+            with contextlib.suppress(StepFailed):  # who dies meanwhile is left to Recovery
+                yield from self._tell(self._old_ends())
+        for node, old in self._replaced.items():
+            self._staged[node], deployment.nodes[node] = deployment.nodes[node], old
+            old.name, old.kind = node, "node"
+        for node, process in self._removed.items():
+            process.name, process.kind, deployment.nodes[node] = node, "node", process
+        if self.committed:
+            deployment.adopt(self.old, self._lost)
+            with contextlib.suppress(StepFailed):
+                yield from self._watch()  # before those die that are watched now
+        for process in self._staged.values():
+            _end(process)
+        for channel in self._fresh.values():
+            channel.close()
+        self._let_serve()
+        self._staged, self._replaced, self._removed = {}, {}, {}
+        self._suspended, self._fresh = [], {}
+        self.committed = False
+        yield Wait(frozenset())
+
+    def _let_serve(self) -> None:
+        """Whoever was suspended goes on, but for a lost replica."""
+        waiting = {id(p): p for p in (*(p for _, p in self._suspended), *self._replaced.values())}
+        for process in waiting.values():
+            if process.kind != "killed" and _replica(process.name) not in self._lost:
+                with contextlib.suppress(StepFailed):
+                    self._deployment.order_to(process, control.Resume)
+
+    def _old_ends(self) -> dict[int, _Changes]:
+        """What must be heard for the old graph to be wired as it was: by those that stay, what has changed;
+        by those that come back, everything, since a neighbour may have been replaced meanwhile.
+        """
+        changes: dict[int, _Changes] = {}
+        back = {b for node in self._replaced for b in self.old.nodes[node]}
+        stay = {b.name for b in self.old.bricks} & {b.name for b in self.new.bricks} - back
+        old_keys = {(k.source, k.source_port, k.sink) for k in self.old.links}
+        new_keys = {(k.source, k.source_port, k.sink) for k in self.new.links}
+
+        def tell(brick: str, port: str, side: str, fd: int) -> None:
+            node = self.old.node_of(brick)
+            process = self._replaced.get(node) or self._deployment.nodes.get(node)
+            if process is not None and process.alive and _replica(node) not in self._lost:
+                change = changes.setdefault(id(process), _Changes(process))
+                (change.inputs if side == "in" else change.outputs)[brick, port] = fd
+
+        for link, key in ((k, (k.source, k.source_port, k.sink)) for k in self.new.links):
+            if key not in old_keys and not link.standby:
+                for brick, port, side in ends(link):
+                    if brick in stay:
+                        tell(brick, port, side, control.NOWHERE)
+        for link, key in ((k, (k.source, k.source_port, k.sink)) for k in self.old.links):
+            channel = self._deployment.channels.get(*key)
+            inside = self.old.node_of(link.source) == self.old.node_of(link.sink)
+            for brick, port, side in ends(link):
+                wanted = brick in back or (brick in stay and key not in new_keys and not link.standby)
+                if wanted and channel is not None and not inside:
+                    end = channel.read if side == "in" else channel.write
+                    tell(brick, port, side, end.fileno())
+        return changes
+
+    def _reverse_adoption(self) -> Keys:
+        """From a graph that serves: stop it, take the state back, and let its channels go."""
+        deployment = self._deployment
+        for replica in self._lost & deployment.slots.keys():  # it may live and serve: not any more
+            deployment.shut_replication(deployment.slots[replica])
+        path = [(f"{deployment.leader}/protocol", False), *((b, True) for b in drains(self.new, self.old))]
+        for brick, drain in path:
+            if _replica(brick) not in self._lost:
+                with contextlib.suppress(StepFailed):
+                    yield from self._suspend(brick, drain=drain)
+        for node in self._migrated:
+            giver, taker = deployment.nodes[node], self._replaced[node]
+            with contextlib.suppress(StepFailed):
+                yield from self._migrate(self.new, giver, self.old, taker, node)
+        for node in self._born:
+            if node in deployment.nodes:
+                self._staged[node] = deployment.nodes.pop(node)
+        kept = {(k.source, k.source_port, k.sink) for k in self.old.links}
+        for key, _ in deployment.channels.items():
+            if key not in kept:
+                self._fresh[key] = deployment.channels.take(key)
+        for channel in self._let_go.values():
+            deployment.channels.put(channel)
+        self._let_go.clear()
+        others = [r for r in REPLICAS if r != deployment.leader]
+        deployment.backup = others[0] if replication_of(self.old.ftm) else ""
+
+
+def _replica(name: str) -> str:
+    """The replica of a node or brick, `""` for one of none."""
+    head, slash, _ = name.partition("/")
+    return head if slash or head in REPLICAS else ""
+
+
+def _end(process: Process) -> None:
+    """It dies, and its death is no news."""
+    process.kind = "killed"
+    process.kill()

@@ -1,0 +1,142 @@
+"""Variants of the protected function that differ from it in one thing each: what an app update may bring.
+
+| variant              | differs in   | so that                                                            |
+|----------------------|--------------|--------------------------------------------------------------------|
+| `WithoutStateAccess` | state access | PBR's backup never has the state; TR cannot go back to it          |
+| `NonDeterministic`   | determinism  | TR's executions differ without a fault; LFR's replicas diverge     |
+| `Cautious`           | decisions    | nothing breaks: version 2 warns earlier; its state is another form |
+
+Each wraps the function and declares what it is (`characteristics`), so that the wrong mechanism is refused
+beforehand; forced all the same, it breaks where the table above says. Named as
+`aftbed.vehicle.variants:Cautious`.
+"""
+
+from random import SystemRandom
+from typing import Final
+
+import msgspec
+
+from aftbed.core.application import Application, Characteristics
+from aftbed.core.errors import PeerError
+from aftbed.vehicle.aebmessages import STAGE_NONE, STAGE_WARN, decode_reply, encode_reply
+from aftbed.vehicle.function import STATE_BYTES, default_application
+
+NOISE_PART: Final = 0.01  # of the time to collision; the radar's own noise is more
+EARLY_TTC_S: Final = 3.5  # version 1 warns at 2.7 s
+CALM_TTC_S: Final = 4.0  # an early warning ends here
+CAUTIOUS_VERSION: Final = 2
+CAUTIOUS_BYTES: Final = 2 + STATE_BYTES  # version, whether it warns early, version 1's state
+
+
+class WithoutStateAccess:
+    """The function with its state locked in, as of a supplier who does not open it."""
+
+    characteristics = Characteristics(deterministic=True, state_access=False)
+
+    def __init__(self) -> None:
+        self._function: Application = default_application()
+
+    def execute(self, request: bytes) -> bytes:
+        """As the function does."""
+        return self._function.execute(request)
+
+    def capture(self) -> bytes:
+        """Nothing: the state is not to be had."""
+        return b""
+
+    def restore(self, state: bytes) -> None:
+        """Take the nothing that `capture` gives, and stay as it is. Raises PeerError on anything else."""
+        if state:
+            raise PeerError(f"state of {len(state)} bytes, expected none: there is no access to it")
+
+    def migrate(self, old_state: bytes) -> None:
+        """Begin where the open version ended; from here on the state is not to be had. Raises PeerError."""
+        self._function.restore(old_state)
+
+    def acceptable(self, request: bytes, reply: bytes) -> bool:
+        """As the function does."""
+        return self._function.acceptable(request, reply)
+
+
+class NonDeterministic:
+    """The function with a time to collision that is a matter of chance, by one part in a hundred.
+
+    Any one such reply is acceptable, and hardly two are equal, as of a function that reads its own clock.
+    """
+
+    characteristics = Characteristics(deterministic=False, state_access=True)
+
+    def __init__(self) -> None:
+        self._function: Application = default_application()
+        self._random = SystemRandom()  # another one would be the same in every fork of a zygote
+
+    def execute(self, request: bytes) -> bytes:
+        """As the function does, but for the time to collision, where there is one."""
+        reply = self._function.execute(request)
+        output = decode_reply(reply)
+        if output.ttc_s is None:
+            return reply
+        noise = self._random.uniform(-NOISE_PART, NOISE_PART)
+        other = encode_reply(msgspec.structs.replace(output, ttc_s=output.ttc_s * (1.0 + noise)))
+        return other if self._function.acceptable(request, other) else reply
+
+    def capture(self) -> bytes:
+        """As the function does: chance is in the reply, not in the state."""
+        return self._function.capture()
+
+    def restore(self, state: bytes) -> None:
+        """As the function does."""
+        self._function.restore(state)
+
+    def acceptable(self, request: bytes, reply: bytes) -> bool:
+        """As the function does."""
+        return self._function.acceptable(request, reply)
+
+
+class Cautious:
+    """Version 2: warns from `EARLY_TTC_S` on, and brakes as version 1 does.
+
+    Its state is version 1's behind two bytes, so that neither can be taken for the other; `migrate` makes
+    the one of the other.
+    """
+
+    characteristics = Characteristics(deterministic=True, state_access=True)
+
+    def __init__(self) -> None:
+        self._function: Application = default_application()
+        self._warns = False
+
+    def execute(self, request: bytes) -> bytes:
+        """As version 1 does; a warning where that has none yet. Raises PeerError, with nothing changed."""
+        reply = self._function.execute(request)
+        output = decode_reply(reply)
+        limit_s = CALM_TTC_S if self._warns else EARLY_TTC_S
+        self._warns = output.ttc_s is not None and output.ttc_s <= limit_s
+        if output.stage != STAGE_NONE or not self._warns:
+            return reply
+        return encode_reply(msgspec.structs.replace(output, stage=STAGE_WARN))
+
+    def capture(self) -> bytes:
+        """The whole state."""
+        return bytes((CAUTIOUS_VERSION, self._warns)) + self._function.capture()
+
+    def restore(self, state: bytes) -> None:
+        """Become what `capture` saw. Raises PeerError, with nothing changed, if `state` is not one."""
+        if len(state) != CAUTIOUS_BYTES:
+            raise PeerError(f"state of {len(state)} bytes, expected {CAUTIOUS_BYTES}")
+        version, warns, function = state[0], state[1], state[2:]
+        if version != CAUTIOUS_VERSION:
+            raise PeerError(f"state of version {version}, expected {CAUTIOUS_VERSION}")
+        if warns > 1:
+            raise PeerError(f"state with an early warning of {warns}, allowed is 0 or 1")
+        self._function.restore(function)
+        self._warns = bool(warns)
+
+    def migrate(self, old_state: bytes) -> None:
+        """Take over where version 1 stopped. Raises PeerError, with nothing changed, on another state."""
+        self._function.restore(old_state)
+        self._warns = False
+
+    def acceptable(self, request: bytes, reply: bytes) -> bool:
+        """As version 1 does: whatever warns may also be warned of earlier."""
+        return self._function.acceptable(request, reply)

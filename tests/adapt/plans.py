@@ -1,0 +1,38 @@
+"""Every adaptation that can be planned between two expressions: all pairs, placements, leaders, recipes."""
+
+from itertools import product
+from typing import Final, NamedTuple
+
+from aftbed.adapt.plan import Plan, plan
+from aftbed.core.graph import PLACEMENTS
+from aftbed.core.script import RECIPES
+from aftbed.ftm.mechanism import EXPRESSIONS, NONE, REPLICAS, build, replication_of
+
+RUNNABLE: Final = tuple(e for e in EXPRESSIONS if e != NONE)
+
+
+class Case(NamedTuple):
+    """One of them."""
+
+    old: str
+    new: str
+    placement: str = PLACEMENTS[0]
+    leader: str = REPLICAS[0]
+    recipe: str = RECIPES[0]
+
+    def plan(self) -> Plan:
+        """Its plan."""
+        old, new = (build(e, self.placement, self.leader) for e in (self.old, self.new))
+        return plan(old, new, self.recipe)
+
+
+def _alike(old: str, new: str) -> bool:
+    """The paper has as many replicas after an adaptation as before."""
+    return bool(replication_of(old)) == bool(replication_of(new))
+
+
+CASES: Final = tuple(
+    Case(old, new, placement, leader, recipe)
+    for old, new, placement, leader, recipe in product(RUNNABLE, RUNNABLE, PLACEMENTS, REPLICAS, RECIPES)
+    if old != new and (recipe == RECIPES[0] or (placement == PLACEMENTS[0] and _alike(old, new)))
+)

@@ -1,0 +1,316 @@
+"""The Adaptation Engine: the table of its phases, every illegal message, taking up what a dead one began."""
+
+from itertools import product
+from typing import Final
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from plans import CASES, Case
+
+from aftbed.adapt.engine import DONE, REFUSED, ROLLED_BACK, WINDOW_NS, AdaptationEngine, State, script_for
+from aftbed.core.brick import CONTROL, Effect, Note, Order, Send
+from aftbed.core.errors import ConfigError, PeerError
+from aftbed.core.event import Event
+from aftbed.core.graph import Graph
+from aftbed.core.message import Adapt, Adapted, AnyMessage, Goal, Progress, Promote, Rebound, TakeUp
+from aftbed.core.script import Bind, Destroy, Phase, Resume, Script, Suspend
+from aftbed.ftm.mechanism import build
+
+NUMBER: Final = 7
+NOW_NS: Final = 1_000_000_000
+PBR: Final = build("pbr", "process")
+SCRIPT: Final = Case("pbr", "pbr+tr").plan().script
+GOAL: Final = Goal(expression="pbr+tr")
+PHASES: Final = (Phase.PREPARE, Phase.COMMIT, Phase.FINISH, Phase.UNDO)
+STATES: Final = {
+    Phase.PREPARE: State.PREPARING,
+    Phase.COMMIT: State.COMMITTING,
+    Phase.FINISH: State.FINISHING,
+    Phase.UNDO: State.UNDOING,
+}
+
+
+def order(phase: Phase) -> Order:
+    return Order(SCRIPT, phase, NUMBER)
+
+
+def ended(outcome: str, reason: str = "") -> Send:
+    return Send(CONTROL, Adapted(NUMBER, outcome, reason))
+
+
+def tell(engine: AdaptationEngine, message: AnyMessage) -> list[Effect]:
+    return engine.step(CONTROL, message, NOW_NS)
+
+
+def went(engine: AdaptationEngine, phase: Phase, failure: str = "") -> list[Effect]:
+    return tell(engine, Progress(NUMBER, phase, failure))
+
+
+def begun() -> AdaptationEngine:
+    """An Engine that prepares."""
+    engine = AdaptationEngine()
+    tell(engine, Adapt(NUMBER, GOAL, PBR))
+    return engine
+
+
+def in_state(state: State) -> AdaptationEngine:
+    """An Engine on its way, there."""
+    engine = AdaptationEngine() if state is State.IDLE else begun()
+    if state in (State.COMMITTING, State.OBSERVING, State.FINISHING):
+        went(engine, Phase.PREPARE)
+    if state in (State.OBSERVING, State.FINISHING):
+        went(engine, Phase.COMMIT)
+    if state is State.FINISHING:
+        engine.wake(NOW_NS + WINDOW_NS)
+    if state is State.UNDOING:
+        went(engine, Phase.PREPARE, "no room")
+    assert engine.state is state
+    return engine
+
+
+# -- the table
+
+
+def test_an_adaptation_that_goes_well() -> None:
+    engine = AdaptationEngine()
+    assert engine.quiescent()
+    assert tell(engine, Adapt(NUMBER, GOAL, PBR)) == [
+        Note(Event.ADAPT_PLAN, detail=NUMBER),
+        order(Phase.PREPARE),
+    ]
+    assert not engine.quiescent()
+    assert went(engine, Phase.PREPARE) == [order(Phase.COMMIT)]
+    assert went(engine, Phase.COMMIT) == [Note(Event.ADAPT_COMMIT, detail=NUMBER)]
+    assert engine.deadline_ns() == NOW_NS + WINDOW_NS
+    assert engine.wake(NOW_NS + WINDOW_NS) == [order(Phase.FINISH)]
+    assert engine.deadline_ns() is None
+    assert went(engine, Phase.FINISH) == [ended(DONE)]
+    assert engine.quiescent()
+
+
+@pytest.mark.parametrize(
+    ("state", "phase", "outcome"),
+    [
+        (State.PREPARING, Phase.PREPARE, REFUSED),
+        (State.COMMITTING, Phase.COMMIT, ROLLED_BACK),
+        (State.OBSERVING, Phase.COMMIT, ROLLED_BACK),
+    ],
+)
+def test_a_phase_that_fails_is_undone(state: State, phase: Phase, outcome: str) -> None:
+    engine = in_state(state)
+    assert went(engine, phase, "it broke") == [Note(Event.ADAPT_ROLLBACK, detail=NUMBER), order(Phase.UNDO)]
+    assert engine.state is State.UNDOING and engine.deadline_ns() is None
+    assert went(engine, Phase.UNDO) == [ended(outcome, "it broke")]
+    assert engine.quiescent()
+
+
+def test_what_cannot_be_undone_is_told_with_both_reasons() -> None:
+    engine = in_state(State.COMMITTING)
+    went(engine, Phase.COMMIT, "it broke")
+    assert went(engine, Phase.UNDO, "and this too") == [ended(ROLLED_BACK, "it broke; and this too")]
+
+
+def test_what_serves_is_done_even_where_the_old_one_does_not_end() -> None:
+    engine = in_state(State.FINISHING)
+    assert went(engine, Phase.FINISH, "a/proceed does not die") == [ended(DONE, "a/proceed does not die")]
+
+
+def test_one_that_is_refused_leaves_no_trace_in_the_next() -> None:
+    engine = in_state(State.COMMITTING)
+    went(engine, Phase.COMMIT, "it broke")
+    went(engine, Phase.UNDO)
+    tell(engine, Adapt(NUMBER, GOAL, PBR))
+    went(engine, Phase.PREPARE, "no room")
+    assert went(engine, Phase.UNDO) == [ended(REFUSED, "no room")]
+    tell(engine, Adapt(NUMBER, GOAL, PBR))
+    for phase in (Phase.PREPARE, Phase.COMMIT):
+        went(engine, phase)
+    engine.wake(NOW_NS)
+    assert went(engine, Phase.FINISH) == [ended(DONE)]
+
+
+@pytest.mark.parametrize(
+    ("goal", "words"),
+    [
+        (Goal(expression="pbrr"), "unknown FTM 'pbrr'; did you mean 'pbr'?"),
+        (Goal(expression="tr+pbr"), "innermost"),
+        (Goal(expression="pbr"), "pbr is what runs already"),
+        (Goal(expression="none"), "neither starts nor ends"),
+        (Goal(expression="lfr", recipe="papr"), "did you mean 'paper'"),
+        (Goal(part="proced", source="x.py:X"), "did you mean 'proceed'"),
+        (Goal(script=msgspec.structs.replace(SCRIPT, commit=SCRIPT.commit[1:])), "resumed, not suspended"),
+        (Goal(script=msgspec.structs.replace(SCRIPT, finish=())), "is not bound"),
+    ],
+)
+def test_a_goal_that_leads_nowhere_is_refused_at_once(goal: Goal, words: str) -> None:
+    engine = AdaptationEngine()
+    (send,) = tell(engine, Adapt(NUMBER, goal, PBR))
+    assert isinstance(send, Send) and isinstance(send.message, Adapted)
+    assert (send.message.number, send.message.outcome) == (NUMBER, REFUSED)
+    assert words in send.message.reason
+    assert engine.quiescent()
+
+
+# -- illegal messages
+
+
+def legal(state: State, phase: Phase) -> bool:
+    """Whether the end of `phase` is what an Engine in `state` waits for."""
+    if state in (State.OBSERVING, State.FINISHING) and phase is Phase.COMMIT:
+        return True
+    return STATES.get(phase) is state
+
+
+ANOTHER_PHASE: Final = [
+    (state, Progress(NUMBER, phase, failure))
+    for state, phase, failure in product(State, (*PHASES, Phase.WHOLE), ("", "x"))
+    if not legal(state, phase) and state is not State.IDLE
+]
+ILLEGAL: Final = [
+    *((State.IDLE, Progress(NUMBER, phase, "")) for phase in PHASES),
+    *((state, Progress(NUMBER + 1, phase, "")) for state, phase in product(State, PHASES)),
+    *((state, Adapt(NUMBER + 1, GOAL, PBR)) for state in State if state is not State.IDLE),
+    *((state, TakeUp(NUMBER, SCRIPT, Phase.COMMIT, False, "")) for state in State if state is not State.IDLE),
+    *((state, Promote(2)) for state in State),
+]
+
+
+def image(engine: AdaptationEngine) -> tuple[object, ...]:
+    """All that an Engine remembers."""
+    return tuple(vars(engine).items())
+
+
+def refuses(state: State, message: AnyMessage) -> None:
+    engine = in_state(state)
+    before = image(engine)
+    with pytest.raises(PeerError, match=f"{type(message).__name__} on {CONTROL} while {state.name}"):
+        tell(engine, message)
+    assert image(engine) == before
+
+
+@pytest.mark.parametrize(("state", "message"), ILLEGAL)
+def test_an_illegal_message_is_refused_and_changes_nothing(state: State, message: AnyMessage) -> None:
+    refuses(state, message)
+
+
+@pytest.mark.parametrize(("state", "message"), ANOTHER_PHASE)
+def test_the_end_of_another_phase_is_refused(state: State, message: AnyMessage) -> None:
+    refuses(state, message)
+
+
+@pytest.mark.parametrize("state", State)
+def test_it_does_not_mind_where_its_ports_lead(state: State) -> None:
+    engine = in_state(state)
+    before = image(engine)
+    assert tell(engine, Rebound("x", True, 2)) == []
+    assert image(engine) == before and engine.open_ports() == ()
+
+
+# -- taking up
+
+
+@pytest.mark.parametrize("phase", PHASES)
+def test_a_phase_under_way_is_waited_for(phase: Phase) -> None:
+    engine = AdaptationEngine()
+    assert tell(engine, TakeUp(NUMBER, SCRIPT, phase, False, "")) == []
+    assert engine.state is STATES[phase]
+
+
+@pytest.mark.parametrize("failure", ["", "it broke"])
+@pytest.mark.parametrize("phase", PHASES)
+@pytest.mark.parametrize("told", [False, True])
+def test_a_new_engine_goes_on_as_the_dead_one_would_have(phase: Phase, failure: str, told: bool) -> None:
+    """Whether the phase had ended when it died (`told` by TakeUp), or ends later."""
+    new = AdaptationEngine()
+    if told:
+        found = tell(new, TakeUp(NUMBER, SCRIPT, phase, True, failure))
+    else:
+        tell(new, TakeUp(NUMBER, SCRIPT, phase, False, ""))
+        found = went(new, phase, failure)
+    if phase is Phase.UNDO:
+        assert found == [ended(ROLLED_BACK, failure)]
+        return
+    old = in_state(STATES[phase])
+    assert found == went(old, phase, failure)
+    assert (new.state, new.number, new.script) == (old.state, old.number, old.script)
+    assert new.deadline_ns() == old.deadline_ns()
+    if new.state is State.UNDOING:
+        assert went(new, Phase.UNDO) == went(old, Phase.UNDO)
+
+
+def test_one_that_died_while_it_observed_observes_again() -> None:
+    engine = AdaptationEngine()
+    assert tell(engine, TakeUp(NUMBER, SCRIPT, Phase.COMMIT, True, "")) == [
+        Note(Event.ADAPT_COMMIT, detail=NUMBER)
+    ]
+    assert engine.deadline_ns() == NOW_NS + WINDOW_NS
+    assert went(engine, Phase.COMMIT, "b is lost") == [
+        Note(Event.ADAPT_ROLLBACK, detail=NUMBER),
+        order(Phase.UNDO),
+    ]
+
+
+@given(st.lists(st.tuples(st.sampled_from(PHASES), st.booleans(), st.booleans()), max_size=12))
+def test_however_often_it_dies_it_ends_once_and_only_as_the_table_says(
+    fates: list[tuple[Phase, bool, bool]],
+) -> None:
+    """The runtime carries out what is ordered last; before each of its words the Engine may be a new one."""
+    engine, ordered, ends = begun(), Phase.PREPARE, []
+    failed = False
+    for _, fails, dies in [*fates, *((Phase.PREPARE, False, False),) * 5]:
+        if engine.quiescent():
+            break
+        if dies:
+            engine = AdaptationEngine()
+            tell(engine, TakeUp(NUMBER, SCRIPT, ordered, False, ""))
+        failed = failed or (fails and ordered in (Phase.PREPARE, Phase.COMMIT))
+        effects = went(engine, ordered, "it broke" if fails else "")
+        if engine.state is State.OBSERVING:
+            effects = engine.wake(NOW_NS + WINDOW_NS)
+        for effect in effects:
+            if isinstance(effect, Order):
+                ordered = effect.phase
+            elif isinstance(effect, Send):
+                assert isinstance(effect.message, Adapted)
+                ends.append(effect.message.outcome)
+    assert len(ends) == 1
+    assert (ends[0] == DONE) == (not failed)
+
+
+# -- the script that it makes of a goal
+
+
+@given(st.sampled_from(CASES))
+def test_the_script_of_an_expression_is_its_plan(case: Case) -> None:
+    plan = case.plan()
+    assert script_for(plan.old, Goal(expression=case.new, recipe=case.recipe)) == plan.script
+    assert script_for(plan.old, Goal(script=plan.script)) == plan.script
+
+
+@pytest.mark.parametrize(
+    ("script", "words"),
+    [
+        (Script("x", "", (), (Suspend("a/protocol"),)), "suspended, not resumed: a/protocol"),
+        (Script("x", "", (), (Destroy("a/proceed"),)), "killed with a request inside: a/proceed"),
+        (
+            Script(
+                "x",
+                "",
+                (),
+                (
+                    Suspend("a/protocol"),
+                    Bind("a/before", "bfr2prd", "b/proceed"),
+                    Resume("a/protocol"),
+                ),
+            ),
+            "a/proceed:bfr2prd is not bound; commit[1]: b/before:bfr2prd is not bound",
+        ),
+    ],
+)
+def test_a_script_written_by_hand_is_checked_whole(script: Script, words: str) -> None:
+    graph: Graph = PBR
+    with pytest.raises(ConfigError) as error:
+        script_for(graph, Goal(script=script))
+    assert str(error.value).startswith("the script 'x' is refused: ") and words in str(error.value)

@@ -1,0 +1,140 @@
+"""The self-test of what is written off line: whatever it does wrong is found before it gets a channel."""
+
+import msgspec
+import pytest
+
+from aftbed.adapt import selftest
+from aftbed.adapt.bricks import load, load_application, make_brick
+from aftbed.core.brick import Brick, Effect, Send
+from aftbed.core.errors import ConfigError
+from aftbed.core.graph import BrickSpec, Graph, Kind
+from aftbed.core.message import AnyMessage, Reply
+from aftbed.ftm.catalog import KINDS, Setting
+from aftbed.ftm.mechanism import EXPRESSIONS, NONE, build
+from aftbed.ftm.proceed import Compute
+from aftbed.vehicle.function import default_application, sample_requests
+
+REQUESTS = tuple(sample_requests(0, 8))
+SOURCE = f"{__name__}:Any"
+
+
+class Wrapped:
+    """A Proceed that is one, and whose misbehaviour is the test's."""
+
+    KIND: Kind = KINDS["compute.proceed"]
+
+    def __init__(self, setting: Setting) -> None:
+        self.inner = Compute()
+
+    def open_ports(self) -> tuple[str, ...]:
+        return self.inner.open_ports()
+
+    def quiescent(self) -> bool:
+        return self.inner.quiescent()
+
+    def step(self, port: str, msg: AnyMessage, now_ns: int) -> list[Effect]:
+        return self.change(self.inner.step(port, msg, now_ns))
+
+    def change(self, effects: list[Effect]) -> list[Effect]:
+        return effects
+
+
+class Silent(Wrapped):
+    def change(self, effects: list[Effect]) -> list[Effect]:
+        return [e for e in effects if not (isinstance(e, Send) and e.port == "prd2aft")]
+
+
+class Lying(Wrapped):
+    def change(self, effects: list[Effect]) -> list[Effect]:
+        return [_another(e) for e in effects]
+
+
+class Circling(Wrapped):
+    """Asks the Server again and again."""
+
+    def step(self, port: str, msg: AnyMessage, now_ns: int) -> list[Effect]:
+        effects = super().step(port, msg, now_ns)
+        if isinstance(msg, Reply):
+            raise RuntimeError("lost my way")
+        return effects
+
+
+def _another(effect: Effect) -> Effect:
+    if isinstance(effect, Send) and isinstance(effect.message, Reply):
+        return Send(effect.port, msgspec.structs.replace(effect.message, payload=b"lie"))
+    return effect
+
+
+def _with(graph: Graph, kind: type) -> tuple[Graph, selftest.Make]:
+    bricks = tuple(
+        msgspec.structs.replace(b, source=SOURCE) if b.part == "proceed" else b for b in graph.bricks
+    )
+
+    def make(spec: BrickSpec) -> Brick:
+        setting = Setting(1, selftest.EPOCH, True, default_application)
+        if spec.source:
+            found: Brick = kind(setting)
+            return found
+        return make_brick(spec, setting, _nothing)
+
+    return msgspec.structs.replace(graph, bricks=bricks), make
+
+
+def _nothing(place: str) -> type:
+    raise AssertionError(f"nothing is to be loaded, and {place} was")
+
+
+@pytest.mark.parametrize("expression", [e for e in EXPRESSIONS if e != NONE])
+def test_every_mechanism_passes_its_own_test(expression: str) -> None:
+    graph, make = _with(build(expression, "process"), Wrapped)
+    plain = msgspec.structs.replace(
+        graph, bricks=tuple(msgspec.structs.replace(b, source="") for b in graph.bricks)
+    )
+    selftest.run(plain, "a", make, REQUESTS)
+
+
+def test_a_sound_brick_passes() -> None:
+    graph, make = _with(build("pbr", "process"), Wrapped)
+    selftest.run(graph, "a", make, REQUESTS)
+
+
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [
+        (Silent, "recorded request 1 is never answered"),
+        (Lying, "recorded request 1: the reply is 6c6965, wanted is "),
+        (Circling, "a/proceed: Reply on srv2prd: RuntimeError: lost my way"),
+    ],
+)
+def test_what_is_wrong_is_named(kind: type, words: str) -> None:
+    graph, make = _with(build("pbr", "process"), kind)
+    with pytest.raises(ConfigError, match="self-test: ") as refusal:
+        selftest.run(graph, "a", make, REQUESTS)
+    assert words in str(refusal.value)
+
+
+# -- loading
+
+
+@pytest.mark.parametrize(
+    ("source", "words"),
+    [
+        ("nowhere", "names no class"),
+        (":X", "names no class"),
+        ("a.module:", "names no class"),
+    ],
+)
+def test_a_source_that_names_no_class(source: str, words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        load(source, _nothing)
+
+
+def test_a_brick_is_no_function() -> None:
+    from aftbed.runtime.unix.part import load_module  # noqa: PLC0415
+
+    with pytest.raises(ConfigError, match="is no protected function: it lacks execute"):
+        load_application("aftbed.ftm.proceed:Compute", load_module)
+    with pytest.raises(ConfigError, match=r"has no class Comput \(it has: .*Compute"):
+        load_application("aftbed.ftm.proceed:Comput", load_module)
+    with pytest.raises(ConfigError, match="cannot be imported: ModuleNotFoundError"):
+        load_application("aftbed.ftm.nothing:Compute", load_module)

@@ -1,0 +1,101 @@
+"""What a wrong reply says, told in the words of the brakes."""
+
+from typing import Final
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from aftbed.campaign.value import corruptions, value
+from aftbed.core.check import REASONS_MAX, History, wrong_replies
+from aftbed.core.fault import flipped
+from aftbed.core.journal import Entry, EntryKind
+from aftbed.vehicle.aebmessages import AebOutput, encode_reply
+from aftbed.vehicle.function import default_application, sample_requests
+
+FLIPPED: Final = [{"fault": "bitflip result in primary", "receipt": "applied"}]
+COUNT: Final = 8
+
+
+def history(wrong: dict[int, bytes]) -> History:
+    """`COUNT` requests with the bare server's replies, but for those of `wrong`; `b""` is a reply too."""
+    bare, dialogue = default_application(), list[Entry]()
+    for request_id, payload in enumerate(sample_requests(3, COUNT), 1):
+        reply = bare.execute(payload)
+        dialogue += [
+            Entry(request_id, request_id, 0, EntryKind.SENT, payload),
+            Entry(request_id, request_id, 1, EntryKind.ANSWERED, wrong.get(request_id, reply)),
+        ]
+    return History({}, dialogue)
+
+
+def right(request_id: int) -> bytes:
+    bare = default_application()
+    return [bare.execute(payload) for payload in sample_requests(3, COUNT)][request_id - 1]
+
+
+def test_a_history_without_a_wrong_reply_has_no_corruption() -> None:
+    assert corruptions(history({}), default_application()) == []
+
+
+def test_what_differs_is_named() -> None:
+    braking = encode_reply(AebOutput(3, 9.0, 0.5, 0, 0))
+    (found,) = corruptions(history({1: braking}), default_application())
+    assert found == (
+        "request 1: sdc: stage 3 instead of 0, deceleration_ms2 9.0 instead of 0.0,"
+        " ttc_s 0.5 instead of None, slot 0 instead of None"
+    )
+
+
+@pytest.mark.parametrize(
+    ("reply", "words"),
+    [
+        (b"", "what is no demand (empty) instead of stage 0 at 0.0 m/s2"),
+        (b"\xc1", "what is no demand (c1) instead of stage 0 at 0.0 m/s2"),
+    ],
+)
+def test_what_is_no_demand_is_named(reply: bytes, words: str) -> None:
+    assert corruptions(history({3: reply}), default_application()) == [f"request 3: sdc: {words}"]
+
+
+def test_the_same_demand_in_other_bytes_is_wrong_too() -> None:
+    longer = right(3).replace(b"\x95\x00", b"\x95\xcc\x00", 1)  # the stage as an uint8 of two bytes
+    (found,) = corruptions(history({3: longer}), default_application())
+    assert found == f"request 3: sdc: the same demand in other bytes ({longer.hex()})"
+
+
+def test_a_second_answer_that_is_wrong_counts() -> None:
+    tale = history({})
+    tale.dialogue.append(Entry(99, 3, 1, EntryKind.ANSWERED, b""))
+    assert len(corruptions(tale, default_application())) == 1
+
+
+def test_a_request_that_waits_is_not_wrong() -> None:
+    tale = history({})
+    assert corruptions(History({}, tale.dialogue[:-1]), default_application()) == []
+
+
+@given(st.dictionaries(st.integers(1, COUNT), st.integers(0, 8 * 12 - 1), max_size=COUNT))
+def test_as_many_as_the_checker_of_one_history_counts(bits: dict[int, int]) -> None:
+    tale = history({i: flipped(right(i), bit) for i, bit in bits.items()})
+    found = corruptions(tale, default_application())
+    assert [line.split(":")[0] for line in found] == [f"request {i}" for i in sorted(bits)]
+    assert wrong_replies(tale, default_application()) == sorted(bits)
+    check = value(tale, default_application(), FLIPPED)
+    assert check is not None and (check.finding == "fail") == bool(bits)
+    assert len(check.reasons) == min(len(bits), REASONS_MAX)
+
+
+@pytest.mark.parametrize(
+    ("receipts", "finding"),
+    [
+        ([], None),
+        ([{"fault": "crash primary", "receipt": "applied"}], None),
+        (FLIPPED, "pass"),
+        ([{"fault": "bitflip state in b", "receipt": "refused"}], "unknown"),
+        ([{"fault": "bitflip state in b", "receipt": "refused"}, *FLIPPED], "pass"),
+    ],
+)
+def test_no_bit_flipped_proves_nothing(receipts: list[dict[str, str]], finding: str | None) -> None:
+    check = value(history({}), default_application(), receipts)
+    assert (check.finding if check is not None else None) == finding

@@ -1,0 +1,299 @@
+"""`aftbed ftm`: what is printed, the exit codes, and that no word of the user's goes unexplained.
+
+The command is called inside this process; see `test_bad_input`.
+"""
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+import psutil
+import pytest
+
+from aftbed.cli import main
+from aftbed.ftm.mechanism import EXPRESSIONS, build
+
+Call = Callable[..., tuple[int, str, str]]
+
+VARIANTS: Final = "aftbed.vehicle.variants"
+AMPLE: Final = ("--cpus", "2", "--cpu-load", "0.1")
+MINE: Final = """
+from aftbed.core.application import Characteristics
+class Mine:
+    characteristics = Characteristics(deterministic=False, state_access=False)
+    def execute(self, request): return b""
+    def capture(self): return b""
+    def restore(self, state): pass
+    def acceptable(self, request, reply): return True
+class Odd(Mine):
+    characteristics = {"deterministic": True}
+class Half:
+    def execute(self, request): return b""
+"""
+
+
+@pytest.fixture
+def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Call:
+    """Call `aftbed ftm` with these arguments: exit code, output, errors."""
+
+    def called(*arguments: str) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["aftbed", "ftm", *arguments])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        shown = capsys.readouterr()
+        return int(ended.value.code or 0), shown.out, shown.err
+
+    return called
+
+
+def test_the_command_line_is_imported_without_what_its_commands_need() -> None:
+    code = "import sys, aftbed.cli.app; print(*sorted(m for m in sys.modules if m in sys.argv[1:]))"
+    heavy = ("aftbed.adapt.consistency", "aftbed.ftm.mechanism", "aftbed.runtime.unix.part", "psutil", "yaml")
+    done = subprocess.run([sys.executable, "-c", code, *heavy], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == ""
+
+
+# -- list and show
+
+
+def test_every_expression_is_listed_with_its_processes(call: Call) -> None:
+    code, out, _ = call("list")
+    rows = [line.split() for line in out.splitlines()]
+    assert code == 0
+    assert [row[0] for row in rows] == ["FTM", *EXPRESSIONS]
+    assert {row[0]: row[-1] for row in rows[1:]}.items() >= {"pbr": "17", "lfr+tr": "23", "tr": "11"}.items()
+    assert len({line.rindex(line.split()[-2]) for line in out.splitlines()[1:]}) == 1, "in columns"
+
+
+def test_the_list_as_a_document(call: Call) -> None:
+    code, out, _ = call("list", "--json")
+    found = {row["ftm"]: row for row in json.loads(out)}
+    assert code == 0 and list(found) == list(EXPRESSIONS)
+    assert found["lfr"] == {
+        "ftm": "lfr",
+        "tolerates": ["crash"],
+        "detects": [],
+        "needs": {
+            "deterministic": [
+                "lfr needs a deterministic function: two replicas execute every request",
+            ],
+            "state_access": [],
+        },
+        "cpus": 2,
+        "cpu_load": "high",
+        "bandwidth": "low",
+        "processes": 17,
+    }
+
+
+@pytest.mark.parametrize("expression", EXPRESSIONS)
+def test_an_expression_is_shown_with_all_its_bricks_and_channels(call: Call, expression: str) -> None:
+    graph = build(expression, "process")
+    code, out, _ = call("show", expression, "--json")
+    found = json.loads(out)
+    assert code == 0
+    assert [brick["name"] for brick in found["bricks"]] == [brick.name for brick in graph.bricks]
+    assert len(found["channels"]) == len(graph.links)
+    code, out, _ = call("show", expression)
+    assert code == 0
+    assert all(brick.part in out for brick in graph.bricks)
+    assert {k.name for k in graph.links} == {
+        word for word in out.split() if word in {k.name for k in graph.links}
+    }
+
+
+@pytest.mark.parametrize(
+    ("expression", "words"),
+    [
+        (
+            "lfr+tr",
+            ("crash, value, implausible", "tr needs state access", "before, tr.protocol, tr."),
+        ),
+        ("tr", ("1 CPU, high CPU load, no bandwidth", "11, one per brick")),
+        ("assert", ("tolerates  nothing", "detects    implausible", "nothing of the function")),
+        ("lfr+assert+tr", ("29, one per brick",)),
+    ],
+)
+def test_what_is_shown_of_an_expression(call: Call, expression: str, words: tuple[str, ...]) -> None:
+    code, out, _ = call("show", expression)
+    assert code == 0
+    assert [word for word in words if word not in out] == []
+    assert "b/protocol ->" not in out.replace("proxy", ""), "the second replica is as the first"
+
+
+# -- check
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "last"),
+    [
+        (("--ftm", "pbr"), 0, "pbr is consistent"),
+        ((), 0, "consistent: pbr, lfr, pbr+assert, lfr+assert, pbr+tr, lfr+tr"),
+        (("--faults", "crash,value"), 0, "consistent: pbr+tr, lfr+tr"),
+        (
+            ("--ftm", "pbr", "--app", f"{VARIANTS}:WithoutStateAccess"),
+            1,
+            "pbr is not consistent; consistent: lfr, lfr+assert",
+        ),
+        (("--ftm", "lfr", "--app", f"{VARIANTS}:WithoutStateAccess"), 0, "lfr is consistent"),
+        (
+            ("--ftm", "lfr", "--app", f"{VARIANTS}:NonDeterministic"),
+            1,
+            "lfr is not consistent; consistent: pbr, pbr+assert",
+        ),
+        (("--ftm", "lfr+tr", "--app", f"{VARIANTS}:Cautious"), 0, "lfr+tr is consistent"),
+        (
+            ("--ftm", "lfr+tr", "--app", f"{VARIANTS}:WithoutStateAccess", "--faults", "crash,value"),
+            1,
+            "lfr+tr is not consistent; no consistent FTM",
+        ),
+        (("--faults", "value", "--app", f"{VARIANTS}:NonDeterministic"), 1, "no consistent FTM"),
+        (
+            ("--ftm", "none"),
+            1,
+            "none is not consistent; consistent: pbr, lfr, pbr+assert",
+        ),
+        (("--ftm", "none", "--faults", "none"), 0, "none is consistent"),
+        (
+            ("--ftm", "pbr", "--bandwidth", "100"),
+            1,
+            "pbr is not consistent; consistent: lfr, lfr+assert",
+        ),
+        (("--bandwidth", "0"), 1, "no consistent FTM"),
+    ],
+)
+def test_the_last_line_and_the_exit_code_are_the_answer(
+    call: Call, arguments: tuple[str, ...], code: int, last: str
+) -> None:
+    found, out, err = call("check", *arguments, *AMPLE)
+    assert err == ""
+    assert out.splitlines()[-1].startswith(last)
+    assert found == code
+
+
+def test_the_reasons_and_what_they_rest_on_are_printed(call: Call) -> None:
+    arguments = ("--ftm", "pbr+tr", "--app", f"{VARIANTS}:WithoutStateAccess", "--bandwidth", "10")
+    _, out, _ = call("check", *arguments, "--faults", "crash,value", "--cpus", "1", "--cpu-load", "0.75")
+    assert out.splitlines() == [
+        "faults     crash, value",
+        f"function   deterministic, no state access ({VARIANTS}:WithoutStateAccess)",
+        "resources  1 CPU, load 75%, 10 kbit/s",
+        "because    pbr needs state access: each checkpoint carries the whole state to the backup",
+        "           tr needs state access: every execution starts from the same state",
+        "           pbr+tr needs 2 CPUs, found 1",
+        "           pbr+tr takes much CPU: found a load of 75%, allowed are 50%",
+        "           pbr+tr takes much bandwidth: found 10 kbit/s, needed are 256",
+        "pbr+tr is not consistent; no consistent FTM",
+    ]
+
+
+def test_a_follower_that_cannot_be_renewed_is_said(call: Call) -> None:
+    code, out, _ = call("check", "--ftm", "lfr", "--app", f"{VARIANTS}:WithoutStateAccess", *AMPLE)
+    assert code == 0
+    assert "remark     lfr without state access: after a failover the survivor stays alone\n" in out
+
+
+def test_the_answer_as_a_document(call: Call) -> None:
+    code, out, _ = call("check", "--ftm", "lfr", "--app", f"{VARIANTS}:NonDeterministic", *AMPLE, "--json")
+    assert code == 1
+    assert json.loads(out) == {
+        "ftm": "lfr",
+        "consistent": False,
+        "problems": ["lfr needs a deterministic function: two replicas execute every request"],
+        "remarks": [],
+        "consistent_ftms": ["pbr", "pbr+assert"],
+        "faults": ["crash"],
+        "app": f"{VARIANTS}:NonDeterministic",
+        "characteristics": {"deterministic": False, "state_access": True},
+        "resources": {"cpus": 2, "cpu_load": 0.1, "bandwidth_kbit_s": None},
+    }
+
+
+def test_what_is_not_given_is_measured(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
+    _, out, _ = call("check", "--json")
+    found = json.loads(out)["resources"]
+    assert found["cpus"] == len(psutil.Process().cpu_affinity())
+    assert 0.0 <= found["cpu_load"] <= 1.0
+    monkeypatch.setattr(psutil, "cpu_percent", lambda seconds: 97.0)
+    monkeypatch.setattr(psutil.Process, "cpu_affinity", lambda self: [0])
+    code, out, _ = call("check", "--ftm", "pbr", "--json")
+    assert code == 1 and json.loads(out)["resources"]["cpu_load"] == pytest.approx(0.97)
+    assert json.loads(out)["problems"][0] == "pbr needs 2 CPUs, found 1"
+    code, out, _ = call("check", "--ftm", "pbr", "--json", "--cpus", "4")
+    assert json.loads(out)["resources"]["cpus"] == 4
+
+
+def test_a_function_out_of_a_file(call: Call, tmp_path: Path) -> None:
+    path = tmp_path / "mine.py"
+    path.write_text(MINE)
+    code, out, _ = call("check", "--app", f"{path}:Mine", *AMPLE)
+    assert code == 1 and out.endswith("no consistent FTM\n")
+
+
+def test_a_table_of_the_users_decides(call: Call, tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text("rows: [{mechanism: pbr, tolerates: [crash, value], cpus: 1}]\n")
+    arguments = ("--ftm", "pbr", "--app", f"{VARIANTS}:WithoutStateAccess", "--faults", "value")
+    assert call("check", *arguments, *AMPLE)[0] == 1
+    assert call("check", *arguments, *AMPLE, "--table", str(path))[0] == 0
+    assert "1 CPU, low CPU load, no bandwidth" in call("show", "pbr", "--table", str(path))[1]
+    assert "crash, value" in call("list", "--table", str(path))[1].splitlines()[2]
+
+
+# -- bad input
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("show", "pbrr"), ("unknown FTM 'pbrr'", "did you mean 'pbr'")),
+        (("show", "tr+pbr"), ("tr+pbr", "pbr+tr?")),
+        (("show", ""), ("unknown FTM ''",)),
+        (("check", "--ftm", "lfr+rt"), ("unknown FTM 'rt'", "did you mean 'tr'")),
+        (("check", "--ftm", ""), ("unknown FTM ''",)),
+        (("check", "--faults", "crsh"), ("unknown fault 'crsh'", "did you mean 'crash'", "implausible")),
+        (("check", "--app", f"{VARIANTS}:Cautios"), (f"{VARIANTS}:Cautios", "Cautious")),
+        (("check", "--app", "aftbed.gone:Mine"), ("aftbed.gone:Mine", "cannot be imported")),
+        (("check", "--app", "mine"), ("'mine' names no class", "MODULE:CLASS or FILE.py:CLASS")),
+        (("check", "--app", "gone.py:Mine"), ("gone.py", "no such file")),
+        (("check", "--cpus", "0"), ("--cpus 0", "1 to 1024")),
+        (("check", "--cpu-load", "1.5"), ("--cpu-load 1.5", "0 to 1")),
+        (("check", "--cpu-load", "nan"), ("--cpu-load nan",)),
+        (("check", "--bandwidth", "-1"), ("--bandwidth -1", "kbit/s")),
+        (("check", "--bandwidth", "inf"), ("--bandwidth inf",)),
+        (("list", "--table", "gone.yaml"), ("gone.yaml", "No such file")),
+    ],
+)
+def test_bad_input_is_exit_code_2(call: Call, arguments: tuple[str, ...], words: tuple[str, ...]) -> None:
+    code, out, err = call(
+        *arguments, *(AMPLE if arguments[0] == "check" and "--cpu" not in arguments[1] else ())
+    )
+    assert (code, out) == (2, "")
+    assert err.startswith("aftbed: error: ")
+    assert [word for word in words if word not in err] == []
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("Half", ("no protected function", "capture, restore, acceptable, characteristics")),
+        ("Odd", ("characteristics are a dict", "allowed is a Characteristics")),
+        ("Mien", ("no class Mien", "Half, Mine, Odd")),
+    ],
+)
+def test_a_class_that_is_no_function(call: Call, tmp_path: Path, name: str, words: tuple[str, ...]) -> None:
+    path = tmp_path / "mine.py"
+    path.write_text(MINE)
+    code, out, err = call("check", "--app", f"{path}:{name}", *AMPLE)
+    assert (code, out) == (2, "")
+    assert [word for word in words if word not in err] == []
+
+
+def test_a_table_that_is_none(call: Call, tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text("rows: [{mechanism: pbt}]\n")
+    code, _, err = call("list", "--table", str(path))
+    assert code == 2 and f"{path}: rows[0].mechanism: unknown FTM 'pbt'; did you mean 'pbr'" in err

@@ -1,0 +1,267 @@
+"""A bit flipped in one execution of one replica reaches the client where nothing compares; TR outvotes it.
+
+Which requests a run serves, and so which bit means what, is fixed by its seed.
+"""
+
+import re
+from pathlib import Path
+from typing import Final
+
+import pytest
+from liveruns import Command, Done, Home, aftbed, under_load
+
+from aftbed.campaign.record import RunRecord, read_record
+from aftbed.campaign.verdict import Verdict
+from aftbed.core.event import Event
+from aftbed.core.graph import PLACEMENTS
+from aftbed.core.journal import Record
+from aftbed.ftm.mechanism import EXPRESSIONS, replication_of
+
+pytestmark = pytest.mark.process
+
+DRIVE: Final = ("--scenario", "ccrs-20", "--pace", "max")  # in lockstep: faults are armed before it begins
+COUNT: Final = 244  # requests of it
+HIT: Final = 100  # the request that is hit; TR executes each twice
+STAGE: Final = 8  # bit 0 of byte 1 of a reply: of the stage
+COUNTER: Final = 8  # bit 0 of byte 1 of a state: of the counter of the frames
+VERSION: Final = 0  # bit 0 of a state: no function takes a state of another version
+WITH_TR: Final = tuple(e for e in EXPRESSIONS if e.endswith("tr"))
+LIVE: Final = 300  # requests of a run that is hit from outside: 1.5 s
+WITHOUT: Final = ("none", "pbr", "lfr")
+
+
+class Ran:
+    """A drive that has ended, by its document and its record."""
+
+    def __init__(self, done: Done, record: RunRecord) -> None:
+        self.code, self.record = done.code, record
+        self.verdict: Verdict = done.verdict()
+        self.receipts = [fault["receipt"] for fault in self.verdict.faults]
+        self.details = [fault.get("detail", "") for fault in self.verdict.faults]
+
+    def events(self, *wanted: Event) -> list[Record]:
+        return self.record.history.events(*wanted)
+
+    def hits(self) -> list[tuple[str, int]]:
+        """Which node was hit at which request, by time."""
+        return [(r.node, r.request_id) for r in self.events(Event.FAULT_APPLIED) if r.request_id]
+
+
+def drive(folder: Path, ftm: str, *faults: str, placement: str = "process", seed: int = 0) -> Ran:
+    """A drive under `ftm`, with these faults."""
+    path = folder / f"record{len(list(folder.iterdir()))}"
+    injected = [word for fault in faults for word in ("--inject", fault)]
+    options = ("--placement", placement, "--seed", str(seed), "--record", path, "--json")
+    done = aftbed("run", "--ftm", ftm, *DRIVE, *options, *injected)
+    assert done.out, done.err
+    return Ran(done, read_record(path))
+
+
+def assert_served(ran: Ran) -> None:
+    """The client has noticed nothing."""
+    requests = ran.verdict.requests
+    assert requests.sent == requests.answered == COUNT
+    assert (requests.wrong, requests.lost, requests.duplicated) == (0, 0, 0)
+    assert ran.verdict.failovers == []
+
+
+# -- where nothing compares
+
+
+@pytest.mark.parametrize("ftm", WITHOUT)
+def test_a_flipped_result_reaches_the_client_and_fails(tmp_path: Path, ftm: str) -> None:
+    ran = drive(tmp_path, ftm, f"bitflip result bit {STAGE} at server.exit nth {HIT}")
+    assert ran.code == 1 and ran.verdict.verdict == "fail"
+    assert ran.verdict.requests.wrong == 1
+    assert ran.verdict.checks["value"] == ran.verdict.checks["one_history"] == "fail"
+    assert f"value: request {HIT}: sdc: stage 0 instead of 1" in ran.verdict.reasons
+    assert ran.receipts == ["applied"]
+    assert ran.details == [f"bit {STAGE} of the result of request {HIT} in a/server"]
+    assert ran.hits() == [("a/server", HIT)]
+
+
+def test_a_flipped_state_stays_wrong(tmp_path: Path) -> None:
+    ran = drive(tmp_path, "pbr", f"bitflip state bit {COUNTER} nth {HIT}")
+    assert ran.code == 1
+    assert ran.verdict.requests.wrong == COUNT - HIT, "the reply was there before the hit"
+    assert f"value: request {HIT + 1}: sdc: counter 11 instead of 10" in ran.verdict.reasons
+
+
+def test_a_state_that_is_wrong_is_the_backups_too(tmp_path: Path) -> None:
+    """The checkpoint carries the flipped bit, so the failover does not heal it."""
+    flip, crash = f"bitflip state bit {COUNTER} nth {HIT}", "crash primary at request.received nth 150"
+    ran = drive(tmp_path, "pbr", flip, crash)
+    assert ran.receipts == ["applied", "applied"]
+    assert len(ran.verdict.failovers) == 1 and ran.verdict.requests.wrong == COUNT - HIT
+
+
+def test_a_drive_says_what_the_brakes_were_asked_for() -> None:
+    done = aftbed("run", *DRIVE, "--inject", f"bitflip result bit {STAGE} nth {HIT}")
+    assert done.code == 1, done.out + done.err
+    assert "1 wrong" in done.out and "verdict: fail" in done.out
+    assert f"because    value: request {HIT}: sdc: stage 0 instead of 1" in done.out
+    assert f"applied, bit {STAGE} of the result of request {HIT} in a/server" in done.out
+    assert "  car        stopped " in done.out
+
+
+# -- time redundancy
+
+
+@pytest.mark.parametrize("which", [2 * HIT - 1, 2 * HIT], ids=["first run", "second run"])
+@pytest.mark.parametrize("place", [f"result bit {STAGE}", f"state bit {COUNTER}"])
+@pytest.mark.parametrize("ftm", WITH_TR)
+def test_a_third_run_outvotes_the_one_that_was_hit(tmp_path: Path, ftm: str, place: str, which: int) -> None:
+    ran = drive(tmp_path, ftm, f"bitflip {place} at server.exit nth {which}")
+    assert ran.code == 0, ran.verdict.reasons
+    assert_served(ran)
+    assert (ran.verdict.checks["value"], ran.receipts, ran.hits()) == (
+        "pass",
+        ["applied"],
+        [("a/server", HIT)],
+    )
+    votes = [r for r in ran.events(Event.VOTE_COMPARED) if r.node.startswith("a/")]
+    assert [r.request_id for r in votes if r.detail == 3] == [HIT]
+    assert len(votes) == COUNT
+    exits = [r for r in ran.events(Event.SERVER_EXIT) if r.node == "a/server" and r.request_id == HIT]
+    assert len(exits) == 3
+
+
+@pytest.mark.parametrize("placement", PLACEMENTS)
+@pytest.mark.parametrize("ftm", WITH_TR)
+def test_bits_of_several_requests_are_outvoted_in_every_placement(
+    tmp_path: Path, ftm: str, placement: str
+) -> None:
+    where = (("result", 50), (f"state bit {COUNTER}", 121), ("result", 302))
+    ran = drive(tmp_path, ftm, *(f"bitflip {place} nth {nth}" for place, nth in where), placement=placement)
+    assert_served(ran)
+    assert ran.receipts == ["applied"] * 3 and ran.verdict.checks["value"] == "pass"
+    assert len([r for r in ran.events(Event.VOTE_COMPARED) if r.detail == 3]) == 3
+
+
+def test_what_is_hit_before_the_first_run_is_in_all_of_them(tmp_path: Path) -> None:
+    """The limit of TR, and no more is promised: a fault of one execution is what it outvotes."""
+    ran = drive(tmp_path, "tr", f"bitflip state bit {COUNTER} at state.captured nth {HIT}")
+    assert ran.code == 1 and ran.receipts == ["applied"]
+    assert ran.verdict.checks["value"] == "fail"
+    assert f"value: request {HIT}: sdc: counter 8 instead of 9" in ran.verdict.reasons
+
+
+# -- the other replica
+
+
+def test_a_follower_that_was_hit_has_diverged_and_the_client_has_its_reply(tmp_path: Path) -> None:
+    ran = drive(tmp_path, "lfr", f"bitflip result bit {STAGE} in backup nth {HIT}")
+    assert ran.verdict.requests.wrong == 0 and ran.receipts == ["applied"]
+    assert ran.hits() == [("b/server", HIT)]
+    assert [(r.node, r.request_id) for r in ran.events(Event.FOLLOWER_DIVERGED)] == [("b/after", HIT)]
+
+
+@pytest.mark.parametrize("ftm", [e for e in WITH_TR if replication_of(e)])
+def test_a_bit_of_the_backup_is_no_concern_of_the_client(tmp_path: Path, ftm: str) -> None:
+    executes = ftm.startswith("lfr")
+    fault = "result in backup nth" if executes else f"state bit {COUNTER} in b at state.restored nth"
+    ran = drive(tmp_path, ftm, f"bitflip {fault} {HIT}")
+    assert_served(ran)
+    assert ran.code == 0, ran.verdict.reasons
+    assert [node for node, _ in ran.hits()] == ["b/server"]
+    assert ran.events(Event.FOLLOWER_DIVERGED) == []
+
+
+# -- receipts
+
+
+def test_a_bit_beyond_the_end_was_not_flipped_and_proves_nothing(tmp_path: Path) -> None:
+    ran = drive(tmp_path, "pbr", f"bitflip result bit 100000 nth {HIT}")
+    assert ran.code == 3 and ran.receipts == ["not_activated"]
+    assert re.fullmatch(rf"there are [0-9]+ bits of the result of request {HIT} in a/server", ran.details[0])
+    assert_served(ran)
+
+
+def test_a_state_that_the_function_refuses_was_not_flipped(tmp_path: Path) -> None:
+    ran = drive(tmp_path, "pbr", f"bitflip state bit {VERSION} nth {HIT}")
+    assert ran.code == 3 and ran.receipts == ["refused"]
+    assert ran.details == [f"the function refused bit {VERSION} of the state of request {HIT} in a/server"]
+    assert ran.verdict.checks["faults_applied"] == "unknown"
+    assert_served(ran)
+
+
+def test_the_bit_that_nobody_names_is_drawn_by_the_seed_and_said(tmp_path: Path) -> None:
+    one, again, other = (drive(tmp_path, "pbr", f"bitflip result nth {HIT}", seed=seed) for seed in (1, 1, 2))
+    assert one.details == again.details and one.details != other.details
+    for ran in (one, other):
+        assert re.fullmatch(rf"bit [0-9]+ of the result of request {HIT} in a/server", ran.details[0])
+
+
+# -- when
+
+
+def test_each_of_several_strikes_at_its_own_execution(tmp_path: Path) -> None:
+    """They wait for the same event in the same node, and were not armed in their order."""
+    ran = drive(tmp_path, "pbr", *(f"bitflip result bit {STAGE} nth {nth}" for nth in (200, 50, 125)))
+    assert ran.hits() == [("a/server", 50), ("a/server", 125), ("a/server", 200)]
+    assert ran.verdict.requests.wrong == 3 and ran.receipts == ["applied"] * 3
+
+
+@pytest.mark.parametrize("placement", ["process", "replica"])
+def test_a_bitflip_follows_the_leader_over_a_failover(tmp_path: Path, placement: str) -> None:
+    flip, crash = f"bitflip result bit {STAGE} nth 200", "crash primary at reply.sent nth 80"
+    ran = drive(tmp_path, "pbr", flip, crash, placement=placement)
+    assert ran.receipts == ["applied", "applied"] and len(ran.verdict.failovers) == 1
+    ((node, request_id),) = ran.hits()
+    assert node.startswith("b") and request_id >= 200  # what comes before it has moved is not counted
+
+
+def test_a_replica_is_hit_whatever_its_role_is_by_then(tmp_path: Path) -> None:
+    flip, crash = f"bitflip result bit {STAGE} in a nth 120", "crash primary at reply.sent nth 80"
+    ran = drive(tmp_path, "lfr", flip, crash)
+    assert ran.receipts == ["applied", "applied"] and len(ran.verdict.failovers) == 1
+    ((node, request_id),) = ran.hits()
+    assert node == "a/server" and request_id >= 120, "as a follower, in its next life"
+    assert ran.verdict.requests.wrong == 0
+
+
+# -- in a live run
+
+
+def test_a_live_run_is_hit_from_a_second_command(home: Home) -> None:
+    with under_load(home, LIVE) as started:
+        done = aftbed("inject", "bitflip", "result", "--bit", str(STAGE), "--nth", "5")
+        assert done.code == 0, done.err
+        assert "bitflip result bit 8 in primary at server.exit nth 5" in done.err
+        told = started.wait_for("fault", "applied")
+        outcome = started.finish()
+    assert outcome.verdict.requests.wrong == 1 and outcome.verdict.verdict == "fail"
+    (fault,) = outcome.verdict.faults
+    assert str(told["text"]) == f"{fault['fault']}: applied, {fault['detail']}"
+
+
+def test_after_a_while_the_next_execution_is_hit(home: Home) -> None:
+    with under_load(home, LIVE) as started:
+        done = aftbed("inject", "bitflip", "state", "--replica", "a", "--bit", "8", "--after", "100ms")
+        assert done.code == 0, done.err
+        outcome = started.finish()
+    (fault,) = outcome.verdict.faults
+    assert fault["receipt"] == "applied"
+    assert fault["fault"] == "bitflip state bit 8 in a after 100ms"
+    assert outcome.verdict.requests.wrong > 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("reslt",), "unknown place of a bitflip 'reslt'; did you mean 'result'?"),
+        (("result", "--replica", "c"), "unknown replica 'c'"),
+        (("result", "--bit", "-1"), "bit '-1': a whole number from 0"),
+        (("state", "--at", "reply.sent"), "unknown event for a bit of the state in primary: 'reply.sent'"),
+        (("result", "--replica", "backup"), "the Server of a backup executes nothing"),
+    ],
+)
+def test_what_cannot_be_flipped_is_refused_and_the_run_goes_on(
+    arguments: tuple[str, ...], words: str
+) -> None:
+    with Command("--load", "100000@200") as command:
+        command.started()
+        done = aftbed("inject", "bitflip", *arguments)
+        assert done.code == 2 and words in done.err, done.err
+        assert aftbed("stop").code == 0
+        assert command.done().code == 0
