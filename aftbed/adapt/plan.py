@@ -236,7 +236,10 @@ class _Change:
                     yield Unbind(brick, port)
 
     def drains(self) -> list[str]:
-        """Of the backup, from the brick that hears of the leader on: what may still hold a request."""
+        """Of the backup, from the brick that hears of the leader on: what may still hold a request.
+
+        Nothing of it changes if only what no request passes through does: a PBR backup does not compute.
+        """
         replication = replication_of(self.old.ftm)
         if not replication or not replication_of(self.new.ftm):
             return []
@@ -247,7 +250,9 @@ class _Change:
         apart = [
             n for n in path[first:] if self.old.node_of(n) != self.old.node_of(f"{self.leader}/protocol")
         ]
-        return _one_per_node(self.old, apart)
+        concerned = {*apart, *(f"{backup}/{part}" for part in STATEFUL)}
+        stays = self.new_bricks.keys() - self.staged
+        return _one_per_node(self.old, apart) if concerned - stays else []
 
     def stateful(self, node: str) -> bool:
         """Whether the old node holds state that the new one needs."""

@@ -222,7 +222,7 @@ def _flow(graph: Graph, script: Script) -> list[str]:
     """What changes while a request may be inside, and what never begins."""
     leader = leader_of(graph)
     leads, backups = f"{leader}/protocol", set(REPLICAS) - {leader}
-    undrained = set(drains(graph, graph)) if replication_of(script.ftm or graph.ftm) else set[str]()
+    undrained = set(drains(graph, after(graph, script, KINDS)))
     suspended, resumed, found = False, set[str](), list[str]()
     for verb in flat(script.commit):
         match verb:

@@ -29,7 +29,7 @@ Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and 
 
 @app.command()
 def run(
-    ftm: Annotated[str, typer.Option(help="none or pbr.")] = "pbr",
+    ftm: Annotated[str, typer.Option(help="none, pbr, lfr, tr, pbr+tr, ...: aftbed ftm list.")] = "pbr",
     scenario: Annotated[str, typer.Option(help="Name of a scenario, or a YAML file.")] = "ccrs-50",
     placement: Annotated[str, typer.Option(help="process (one per brick) or replica.")] = "process",
     pace: Annotated[str, typer.Option(help="real, a factor (4), or max (lockstep).")] = "real",

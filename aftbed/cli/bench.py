@@ -41,9 +41,16 @@ def recovery(
     """From SIGKILL of the primary to the next good reply, by its parts."""
     from aftbed.bench.recovery import bench_recovery  # noqa: PLC0415
     from aftbed.core.errors import ConfigError  # noqa: PLC0415
+    from aftbed.ftm.mechanism import DUPLEX, replication_of  # noqa: PLC0415
 
-    if ftm == "none":
-        raise ConfigError("--ftm none: the bare server does not recover; pbr is allowed")
+    if not replication_of(ftm):
+        raise ConfigError(
+            f"--ftm {ftm}: one replica does not recover; {' and '.join(DUPLEX)} do, and X+Y of them"
+        )
+    if placement == "single":
+        raise ConfigError(
+            "--placement single: both replicas die with their node; process and replica are allowed"
+        )
     _print(bench_recovery(ftm, placement, kills, pin=pin), as_json=json)
 
 

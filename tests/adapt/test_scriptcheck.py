@@ -18,6 +18,7 @@ from aftbed.core.script import (
     AnyVerb,
     Bind,
     Destroy,
+    Drain,
     Exchange,
     Freeze,
     Resume,
@@ -33,7 +34,12 @@ from aftbed.core.script import (
 from aftbed.ftm.mechanism import build
 
 PBR: Final = build("pbr", "process")
-COMPOSE: Final = Case("pbr", "pbr+tr").plan().script
+_PLANNED: Final = Case("pbr", "pbr+tr").plan().script
+_SUSPEND, _REWIRE, _RESUME = _PLANNED.commit
+COMPOSE: Final = msgspec.structs.replace(  # with a drain that a person would add, and the plan does not need
+    _PLANNED,
+    commit=(_SUSPEND, Drain("b/after"), _REWIRE, Together((Resume("b/after"), Resume("a/protocol")))),
+)
 SWITCH: Final = Case("pbr", "lfr").plan().script
 DRAINED: Final = tuple(case for case in CASES if case.recipe == RECIPES[0])
 RENEWED: Final = plan(PBR, updated(PBR, "server", "x.py:Server")).script

@@ -9,26 +9,25 @@ with it and without it until the first adaptation.
 | symptom                                | is read from                                                     |
 |----------------------------------------|------------------------------------------------------------------|
 | divergence, value_fault, detected_stop | the journals of what hosts an After; a `Tail` each               |
-| crash, hang                            | a replica's failover or drop, as told: a crash if a node of it   |
-|                                        | was told to have died about then, otherwise a hang               |
+| crash, hang                            | the `alarm` that the supervisor tells when a replica is lost     |
 
-**Time.** A look every `PERIOD_SECONDS`. A symptom counts from when it was journalled, and `consistent_after_ms`
-runs from there: from the first event (or sample) of what triggered it until the run says that it is adapted.
+**Time.** A look every `PERIOD_SECONDS`. A symptom counts from when it was journalled, and
+`consistent_after_ms` runs from there: from the first event (or sample) of what triggered it until the run
+says that it is adapted.
 
 **One at a time.** While a proposal waits for its answer, another one is dropped: what still holds is proposed
 again after the dwell time. While a person is asked, a different proposal takes the place of the open one.
 
-Limits. A detected stop of a duplex is seen twice, as such and as a crash, because it ends in a failover. A node
-that no Watchdog watches (Proxy, Recovery, Engine) is replaced and is no symptom. What replicas send each other
-is not measured: on one host nothing limits it, and no journal tells its size. Of each node the newest
-`INCARNATIONS` journals are read.
+Limits. A detected stop of a duplex is seen twice, as such and as a crash, because it ends in a failover. A
+node that no Watchdog watches (Proxy, Recovery, Engine) is replaced and is no symptom. What replicas send each
+other is not measured: on one host nothing limits it, and no journal tells its size. Of each node the newest
+`observation.INCARNATIONS` journals are read.
 """
 
 import os
 import select
 import sys
 import time
-from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 from typing import Final, Literal
@@ -38,27 +37,19 @@ import msgspec
 from aftbed.adapt import observer
 from aftbed.adapt.consistency import FaultModel, Resources, refusal
 from aftbed.adapt.observer import Declined, Measured, Observation, Observer, Proposal, Running, Seen
-from aftbed.adapt.policy import Beyond, Policy, PolicyFile, Resource, policy_from
-from aftbed.core import journal
+from aftbed.adapt.policy import Beyond, Policy, PolicyFile, policy_from
+from aftbed.core.application import Characteristics
 from aftbed.core.errors import AftbedError, ConfigError, PeerError, unknown
 from aftbed.core.journal import Record
 from aftbed.core.message import Goal
 from aftbed.ftm.mechanism import NONE, replication_of
 from aftbed.runtime.unix import ask
 from aftbed.runtime.unix.adaptations import HISTORY_NAME, Outcome
+from aftbed.runtime.unix.observation import MEASURED, Journals, Lines, Meter, lost
 
 PERIOD_SECONDS: Final = 0.1
-CHUNK_BYTES: Final = 2048 * journal.RECORD.size
-LINES_BYTES_MAX: Final = 1 << 20  # of the history, at one look
-INCARNATIONS: Final = 2
-LOAD_SAMPLES: Final = 10  # CPU load is that of the last second
-SETTLE_NS: Final = 100_000_000  # by when a death has been told that led to a failover
-DEATH_NS_MAX: Final = 2_000_000_000  # an older death is another one's cause
-REPLICA_NODES: Final = ("a", "b", "single")
-LOSSES: Final = ("failover", "drop backup")
 PROPOSALS_NAME: Final = "proposals.jsonl"
 APPROVALS: Final = ("auto", "ask")
-MEASURED: Final[tuple[Resource, ...]] = ("cpus", "cpu_load")
 AMPLE: Final = Resources(cpus=1024)
 _FOLDER: Final = Path(observer.__file__).resolve().parent / "policies"
 
@@ -66,8 +57,9 @@ Tell = Callable[[dict[str, object]], None]
 
 
 class Proposed(msgspec.Struct, frozen=True):
-    """A proposal that has come to its end. `outcome`: done, rolled back, refused, declined, superseded, cut off.
+    """A proposal that has come to its end.
 
+    `outcome`: done, rolled back, refused, declined, superseded, cut off.
     `t_ms`: since the start of the run; `consistent_after_ms`: from the change that triggered it, if done.
     """
 
@@ -127,135 +119,6 @@ def asked_for(policy: str | None, approve: str, ftm: str, *, as_json: bool) -> P
     return load_policy(policy)
 
 
-# -- what is read ---------------------------------------------------------------------------------
-
-
-class Tail:
-    """What was committed to a journal since the last look: each record once, and whole."""
-
-    def __init__(self, path: Path) -> None:
-        self._path, self._at, self._header = path, journal.HEADER_BYTES, b""
-
-    def new(self) -> list[Record]:
-        """The new records. Raises PeerError on what is no journal."""
-        found: list[Record] = []
-        with open(self._path, "rb") as file:
-            if not self._header and not self._read_header(file.read(journal.HEADER_BYTES)):
-                return found
-            file.seek(self._at)
-            full = True
-            while full:
-                data = file.read(CHUNK_BYTES)
-                some = list(journal.records(self._header + data))
-                found += some
-                self._at += len(some) * journal.RECORD.size
-                full = len(some) * journal.RECORD.size == CHUNK_BYTES
-        return found
-
-    def _read_header(self, data: bytes) -> bool:
-        """False while its node has not finished it."""
-        if len(data) < journal.HEADER_BYTES or journal.unfinished(data) or not journal.node_name(data):
-            return False
-        self._header = data
-        return True
-
-
-class Journals:
-    """The tails of all journals in which a symptom can stand."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self._tails: dict[Path, Tail] = {}
-
-    def new(self) -> list[Record]:
-        """What is new in them, by time. Raises PeerError."""
-        wanted = self._wanted()
-        self._tails = {path: self._tails.get(path) or Tail(path) for path in wanted}
-        found = [record for tail in self._tails.values() for record in tail.new()]
-        return sorted(found, key=lambda record: record.t_ns)
-
-    def _wanted(self) -> list[Path]:
-        """The newest of each node that hosts an After."""
-        nodes: dict[str, list[tuple[int, Path]]] = {}
-        for path in self._folder.glob("*.journal"):
-            node, _, incarnation = path.name.removesuffix(".journal").rpartition(".")
-            if node in REPLICA_NODES or node.endswith("after"):
-                nodes.setdefault(node, []).append((int(incarnation), path))
-        return [path for found in nodes.values() for _, path in sorted(found)[-INCARNATIONS:]]
-
-
-class Lines:
-    """The history of adaptations: what ended since the last look."""
-
-    def __init__(self, path: Path) -> None:
-        self._path, self._at = path, 0
-
-    def new(self) -> list[Outcome]:
-        """The lines that are whole."""
-        if not self._path.exists():
-            return []
-        with open(self._path, "rb") as file:
-            file.seek(self._at)
-            whole, end, _ = file.read(LINES_BYTES_MAX).rpartition(b"\n")
-        self._at += len(whole) + len(end)
-        return [msgspec.json.decode(line, type=Outcome) for line in whole.splitlines()]
-
-
-class Losses:
-    """Tells a crash from a hang by what the supervisor tells of a replica's loss."""
-
-    def __init__(self) -> None:
-        self._died_ns: dict[str, int] = {}  # by replica
-        self._lost: list[tuple[str, int]] = []
-
-    def told(self, event: str, text: str, now_ns: int) -> None:
-        """An event of the run."""
-        purpose, _, rest = text.partition(" (")
-        if event == "died":
-            self._died_ns[purpose.split("/")[0]] = now_ns
-        elif event == "script" and purpose in LOSSES:
-            self._lost.append((rest.rstrip(")"), now_ns))
-
-    def new(self, now_ns: int) -> list[Seen]:
-        """Those whose cause is certain by now."""
-        due = [loss for loss in self._lost if now_ns - loss[1] >= SETTLE_NS]
-        self._lost = [loss for loss in self._lost if loss not in due]
-        return [Seen("crash" if self._died(replica, t_ns) else "hang") for replica, t_ns in due]
-
-    def _died(self, replica: str, lost_ns: int) -> bool:
-        died_ns = self._died_ns.pop(replica, None)
-        return died_ns is not None and lost_ns - died_ns < DEATH_NS_MAX
-
-
-class Meter:
-    """Measures the resources that a policy names, and no others."""
-
-    def __init__(self, policy: Policy) -> None:
-        self._wanted = {rule.when.resource for rule in policy.rules if isinstance(rule.when, Beyond)}
-        self._samples: deque[tuple[float, float]] = deque(maxlen=LOAD_SAMPLES + 1)  # busy, all; seconds
-
-    def values(self) -> dict[Resource, float]:
-        """As they are now; CPU load is not known at the first look."""
-        found: dict[Resource, float] = {}
-        if "cpus" in self._wanted:
-            found["cpus"] = float(len(os.sched_getaffinity(0)))
-        if "cpu_load" in self._wanted:
-            self._samples.append(_cpu_seconds())
-            (busy_s, all_s), (busy_now_s, now_s) = self._samples[0], self._samples[-1]
-            if now_s > all_s:
-                found["cpu_load"] = (busy_now_s - busy_s) / (now_s - all_s)
-        return found
-
-
-def _cpu_seconds() -> tuple[float, float]:
-    """Busy and all, of all CPUs, since the boot. Guests are in `user` already."""
-    import psutil  # noqa: PLC0415 - 15 ms, where a policy asks for it
-
-    t = psutil.cpu_times()
-    busy = t.user + t.nice + t.system + t.irq + t.softirq + t.steal
-    return busy, busy + t.idle + t.iowait
-
-
 def _unsuitable(expression: str, application: str) -> str:
     """Why `expression` does not suit the function that is protected now; "" if it does."""
     from aftbed.adapt.bricks import load_application  # noqa: PLC0415 - at the first proposal
@@ -263,8 +126,10 @@ def _unsuitable(expression: str, application: str) -> str:
     from aftbed.vehicle.function import default_application  # noqa: PLC0415
 
     function = load_application(application, load_module) if application else default_application()
-    chosen_for = FaultModel(crash=bool(replication_of(expression)))
-    return refusal(expression, chosen_for, function.characteristics, AMPLE)
+    declared: object = getattr(function, "characteristics", None)
+    if not isinstance(declared, Characteristics):
+        return f"{application}: characteristics: found {declared!r}, allowed is Characteristics(...)"
+    return refusal(expression, FaultModel(crash=bool(replication_of(expression))), declared, AMPLE)
 
 
 # -- the loop -------------------------------------------------------------------------------------
@@ -279,13 +144,13 @@ class ClosedLoop:
         self._private, self._approve = private, approve
         self._started_ns = time.monotonic_ns()
         self._observer = Observer(policy, ftm, self._started_ns)
-        self._journals, self._losses, self._meter = Journals(record / "journal"), Losses(), Meter(policy)
+        self._journals, self._meter = Journals(record / "journal"), Meter(policy)
         self._history = Lines(record / HISTORY_NAME)
         self._path = record / PROPOSALS_NAME
         self._path.touch()  # there is a policy, even if it proposes nothing
         self._tell: Tell = lambda _: None
         self._application = ""
-        self._blind = self._deaf = False
+        self._blind = self._deaf = self._timed = False
         self._open: Proposal | None = None  # waits for a person, or for the run
         self._waiting: ask.Waiting | None = None
         self._due_ns = self._asked_ns = self._started_ns
@@ -327,8 +192,13 @@ class ClosedLoop:
         return {fd for fd, _ in poll.poll(wait_ns / 1e6)}
 
     def told(self, event: dict[str, object]) -> None:
-        """An event of the run, as the view is told it."""
-        self._losses.told(str(event["event"]), str(event["text"]), time.monotonic_ns())
+        """An event of the run, as the view is told it; its time tells when the run's clock began."""
+        now_ns = time.monotonic_ns()
+        zero_ns = now_ns - round(float(str(event["t_ms"])) * 1e6)
+        self._started_ns = min(zero_ns, self._started_ns) if self._timed else zero_ns
+        self._timed = True
+        if seen := lost(str(event["event"]), str(event["text"])):
+            self._step(seen, now_ns)
 
     def close(self) -> None:
         """The run has ended."""
@@ -351,8 +221,6 @@ class ClosedLoop:
         for record in self._records():
             for symptom in observer.symptoms(record.event, record.detail):
                 self._step(Seen(symptom), record.t_ns)
-        for seen in self._losses.new(now_ns):
-            self._step(seen, now_ns)
         self._step(Measured(self._meter.values()), now_ns)
 
     def _records(self) -> list[Record]:
@@ -381,9 +249,8 @@ class ClosedLoop:
                 return
             self._end(old, "superseded", f"{proposal.target} is proposed instead")
         self._open = proposal
-        self._say(
-            "proposed", f"{proposal.action}: {proposal.running} to {proposal.target} ({proposal.reason})"
-        )
+        change = f"{proposal.running} to {proposal.target}"
+        self._say("proposed", f"{proposal.action}: {change} ({proposal.reason})")
         if self._approve == "auto":
             self._carry_out(proposal)
         elif self._deaf:

@@ -7,6 +7,7 @@ and how to replace a process that belongs to no replica.
 import contextlib
 import itertools
 import os
+import time
 from collections.abc import Callable, Container, Generator, Iterable
 from pathlib import Path
 from typing import Final
@@ -17,9 +18,10 @@ from aftbed.core.errors import PeerError
 from aftbed.core.graph import Graph
 from aftbed.core.journal import EntryKind, entries
 from aftbed.ftm.mechanism import REPLICAS
+from aftbed.ftm.watchdog import HANG_DEADLINE_NS
 from aftbed.runtime.unix import control
 from aftbed.runtime.unix.channels import Channel, Channels
-from aftbed.runtime.unix.jobs import Key, StepFailed, Wait
+from aftbed.runtime.unix.jobs import STEP_SECONDS_MAX, Key, StepFailed, Wait
 from aftbed.runtime.unix.journal import Header
 from aftbed.runtime.unix.processes import Nursery, Process
 from aftbed.runtime.unix.spawn import BUS, LIGHT
@@ -29,6 +31,7 @@ WATCHED_KINDS: Final = ("client", "proxy", "watchdog", "recovery", "engine")
 
 RECORDED_MAX: Final = 16
 RECORDED_BYTES_MAX: Final = 1 << 16
+BIRTH_SECONDS_MAX: Final = 10.0  # each makes its journal first, and a disk may be busy
 STAGED: Final = "'"  # behind the name of a process that is to become that node
 
 Keys = Generator[Wait, dict[Key, bytes], None]
@@ -143,13 +146,13 @@ class Deployment:
         got = yield Wait(frozenset({key}), frozenset({name}))
         return got[key]
 
-    def all_of(self, sent: Iterable[tuple[Key, str]]) -> Keys:
+    def all_of(self, sent: Iterable[tuple[Key, str]], seconds: float = STEP_SECONDS_MAX) -> Keys:
         """Wait for the answers to several orders. Raises StepFailed if a process has died before."""
         pairs = list(sent)
         for _, node in pairs:
             if not self.lives(node):
                 raise StepFailed(f"{node} died")
-        yield Wait(frozenset(k for k, _ in pairs), frozenset(n for _, n in pairs))
+        yield Wait(frozenset(k for k, _ in pairs), frozenset(n for _, n in pairs), seconds)
 
     # -- processes ----------------------------------------------------------------------------
 
@@ -160,7 +163,7 @@ class Deployment:
         sent = []
         for node in self.graph.nodes:
             sent.append((yield from self._assign(node, held=node in held)))
-        yield from self.all_of(sent)
+        yield from self.all_of(sent, BIRTH_SECONDS_MAX)
         if len(self.slots) > 1:
             self.backup = REPLICAS[1]
         self.pin_watchers()
@@ -179,7 +182,7 @@ class Deployment:
         sent = []
         for node in slot.nodes:
             sent.append((yield from self._assign(node)))
-        yield from self.all_of(sent)
+        yield from self.all_of(sent, BIRTH_SECONDS_MAX)
         yield from self.watch(slot)
 
     def shut_replication(self, slot: Slot) -> None:
@@ -395,6 +398,17 @@ class Deployment:
         """Whether the process of `node` is there."""
         process = self.nodes.get(node)
         return process is not None and process.alive
+
+    def cause_of_loss(self, replica: str) -> str:
+        """What the Watchdog of `replica` saw: a node that is silent, or one that died.
+
+        A lifeline tells of a death before the pidfd does, so to ask whether all are alive would not do.
+        """
+        now_ns = time.monotonic_ns()
+        nodes = [self.nodes[node] for node in self.slots[replica].nodes if node in self.nodes]
+        dead = any(not node.alive for node in nodes)
+        silent = any(node.silent(now_ns, HANG_DEADLINE_NS) for node in nodes)
+        return "hang" if silent and not dead else "crash"
 
     def role_of(self, node: str) -> str:
         """What `aftbed ps` shows."""

@@ -57,6 +57,11 @@ class Process:
         """Signal it; False if it is gone."""
         return self.pidfd >= 0 and linux.kill(self.pidfd, sig)
 
+    def silent(self, now_ns: int, deadline_ns: int) -> bool:
+        """Whether it lives, as far as is known, and its pulse is older than `deadline_ns`."""
+        pulse_ns = self.header.pulse_ns() if self.alive and self.header is not None else 0
+        return 0 < pulse_ns < now_ns - deadline_ns
+
     def close(self) -> None:
         """Let go of all descriptors."""
         self.alive = False

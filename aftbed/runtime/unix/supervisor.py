@@ -262,6 +262,8 @@ class Supervisor:
         if ordered.purpose in LOSSES and self.adaptations.interrupted(ordered.replica):
             return  # the way back first
         began_ns = time.monotonic_ns()
+        if ordered.purpose in LOSSES:  # told before the others of the replica are killed
+            self.tell("alarm", f"{ordered.replica}: {self.deployment.cause_of_loss(ordered.replica)}")
 
         def ended(failure: str) -> None:
             ms = f"{(time.monotonic_ns() - began_ns) / 1e6:.2f} ms"
