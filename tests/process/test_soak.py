@@ -1,8 +1,9 @@
-"""Failover after failover with re-integration in one run: nothing grows with their number.
+"""Failover after failover, adaptation after adaptation, in one run: nothing grows with their number.
 
 The process tier does a few; the deep one a thousand.
 """
 
+import itertools
 import time
 from collections.abc import Callable
 from typing import Final
@@ -13,6 +14,7 @@ import pytest
 from liveruns import LOOK_SECONDS, Home, Started, until
 
 from aftbed.core.fault import Act, Fault, Trigger
+from aftbed.core.message import Goal
 from aftbed.runtime.unix import ask
 from aftbed.runtime.unix.options import LoadRun
 
@@ -86,6 +88,36 @@ def test_many_failovers_leave_no_trace(home: Home, placement: str, count: int) -
     assert outcome.verdict.verdict == "pass", outcome.verdict.reasons
     assert outcome.verdict.requests.lost == 0
     assert len(outcome.verdict.failovers) == WARM_UP + count
+
+
+def adapt_back_and_forth(run: Started, count: int) -> None:
+    """`count` adaptations: a composition, its end, and so on."""
+    for expression in itertools.islice(itertools.cycle(("pbr+tr", "pbr")), count):
+        found = ask.ask(run.private, ask.Adapt(Goal(expression=expression)), ask.ADAPT_SECONDS_MAX)
+        assert (found["outcome"], found["reason"]) == ("done", "")
+
+
+@pytest.mark.parametrize(
+    ("placement", "count"),
+    [
+        ("process", 10),
+        pytest.param("process", 1000, marks=[pytest.mark.deep, pytest.mark.timeout(1200)]),
+        pytest.param("replica", 1000, marks=[pytest.mark.deep, pytest.mark.timeout(1200)]),
+    ],
+)
+def test_many_adaptations_leave_no_trace(home: Home, placement: str, count: int) -> None:
+    with Started(home, LoadRun(ENDLESS, RATE_HZ), placement=placement) as run:
+        run.wait_for("started")
+        adapt_back_and_forth(run, 2 * WARM_UP)
+        until_settled(lambda: ["the dead"] if len(home.processes()) > len(run.rows()) + 1 else [])
+        before = size(home, run)
+        adapt_back_and_forth(run, count)
+        until_settled(lambda: grown(before, size(home, run), count))
+        run.launched.stop()
+        outcome = run.finish(120.0)
+    assert outcome.verdict.verdict == "pass", outcome.verdict.reasons
+    assert outcome.verdict.requests.lost == 0
+    assert not outcome.verdict.failovers
 
 
 def grown(before: Size, after: Size, count: int) -> list[str]:
