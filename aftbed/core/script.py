@@ -355,3 +355,10 @@ def _unbound(verb: Unbind, bricks: dict[str, BrickSpec], kinds: dict[str, Kind])
     spec = bricks.get(verb.brick)
     outputs = kinds[spec.kind].outputs if spec is not None and spec.kind in kinds else ()
     return (verb.brick, verb.port, "out" if verb.port in outputs else "in")
+
+
+def bricks_changed(old: Graph, new: Graph, script: Script) -> int:
+    """How many bricks `script`, which leads from `old` to `new`, makes or ends."""
+    staged = [v for v in flat((*script.prepare, *script.commit)) if isinstance(v, Stage)]
+    made = {b.name for v in staged for b in v.bricks}
+    return len(made | ({b.name for b in old.bricks} - {b.name for b in new.bricks}))

@@ -18,7 +18,7 @@ from aftbed.core import message
 from aftbed.core.errors import ConfigError
 from aftbed.core.event import Event
 from aftbed.core.fault import Act
-from aftbed.core.script import Phase, Script
+from aftbed.core.script import Phase, Script, bricks_changed
 from aftbed.runtime.unix import control
 from aftbed.runtime.unix.deployment import Deployment, Keys
 from aftbed.runtime.unix.exchange import Exchange
@@ -244,7 +244,8 @@ class Adaptations:
         outcome.ftm = self._deployment.graph.ftm
         outcome.application = next(b.application for b in self._deployment.graph.bricks if b.part == "server")
         if now.exchange is not None:
-            outcome.bricks_changed = now.exchange.bricks_changed
+            assert now.script is not None
+            outcome.bricks_changed = bricks_changed(now.exchange.old, now.exchange.new, now.script)
             outcome.opened_ns = now.exchange.opened_ns if told.outcome == "done" else 0
         self.history.append(outcome)
         with open(self._path, "ab") as file:

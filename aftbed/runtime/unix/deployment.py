@@ -4,8 +4,6 @@ It knows how to give a new process its ends of the channels, which is all that "
 and how to replace a process that belongs to no replica.
 """
 
-import contextlib
-import itertools
 import os
 import time
 from collections.abc import Callable, Container, Generator, Iterable
@@ -14,23 +12,19 @@ from typing import Final
 
 import msgspec
 
-from aftbed.core.errors import PeerError
 from aftbed.core.graph import Graph
-from aftbed.core.journal import EntryKind, entries
 from aftbed.ftm.mechanism import REPLICAS
 from aftbed.ftm.watchdog import HANG_DEADLINE_NS
 from aftbed.runtime.unix import control
 from aftbed.runtime.unix.channels import Channel, Channels
+from aftbed.runtime.unix.cores import Cores
 from aftbed.runtime.unix.jobs import STEP_SECONDS_MAX, Key, StepFailed, Wait
-from aftbed.runtime.unix.journal import Header
+from aftbed.runtime.unix.journal import Header, recorded_requests
 from aftbed.runtime.unix.processes import Nursery, Process
 from aftbed.runtime.unix.spawn import BUS, LIGHT
 
-BESIDE_LEADER: Final = ("client", "proxy")
 WATCHED_KINDS: Final = ("client", "proxy", "watchdog", "recovery", "engine")
 
-RECORDED_MAX: Final = 16
-RECORDED_BYTES_MAX: Final = 1 << 16
 BIRTH_SECONDS_MAX: Final = 10.0  # each makes its journal first, and a disk may be busy
 STAGED: Final = "'"  # behind the name of a process that is to become that node
 
@@ -42,8 +36,8 @@ DeviceOf = Callable[[str, int], tuple[str, bytes]]  # brick kind, incarnation ->
 class Slot:
     """One place for a replica; `generation` counts the replicas that were in it."""
 
-    def __init__(self, name: str, bricks: frozenset[str], cpu: int | None) -> None:
-        self.name, self.bricks, self.cpu = name, bricks, cpu
+    def __init__(self, name: str, bricks: frozenset[str]) -> None:
+        self.name, self.bricks = name, bricks
         self.number = REPLICAS.index(name) + 1
         self.generation = 0
         self.nodes: list[str] = []
@@ -62,7 +56,7 @@ class Deployment:
         self.incarnations: dict[str, int] = {}
         self.epoch, self.leader, self.backup = 1, REPLICAS[0], ""
         self._tokens = 0
-        self._cpus = dict(zip(REPLICAS, itertools.cycle(cpus), strict=False)) if cpus else {}
+        self._cores = Cores(cpus)
         self._generations: dict[str, int] = {}
         self.slots: dict[str, Slot] = {}
         self.adopt(graph)
@@ -83,7 +77,7 @@ class Deployment:
                 bricks = frozenset(b.name for b in graph.bricks if b.replica and b.kind not in WATCHED_KINDS)
                 bricks = bricks if name == self.leader else frozenset()
             if bricks:
-                slot = self.slots[name] = Slot(name, bricks, self._cpus.get(name))
+                slot = self.slots[name] = Slot(name, bricks)
                 slot.nodes = [n for n in self.nodes_of(slot) if self.lives(n)]
                 slot.generation = self._generations.get(name, 0) + (name not in lost)
 
@@ -285,21 +279,12 @@ class Deployment:
             self.cpu_of(node, graph),
             held,
             name != node,
-            control.Trial(graph, self.recorded()) if trial else None,
+            control.Trial(graph, recorded_requests(self.record)) if trial else None,
             device,
             options,
         )
         sent = self.order_to(process, lambda token: msgspec.structs.replace(order, token=token), tuple(fds))
         return process, sent
-
-    def recorded(self) -> tuple[bytes, ...]:
-        """The first few requests of this run, with which what is new is tested."""
-        path = self.record / "journal" / "client.1.dialogue"
-        found: list[bytes] = []
-        with open(path, "rb") as file, contextlib.suppress(PeerError):  # the last entry is cut off
-            for entry in entries(file.read(RECORDED_BYTES_MAX)):
-                found += [entry.payload] if entry.kind is EntryKind.SENT else []
-        return tuple(found[:RECORDED_MAX])
 
     def assigned(self, process: Process) -> None:
         """The Ack of an Assign is here: its journal exists."""
@@ -307,23 +292,9 @@ class Deployment:
             process.header = Header(process.journal)
 
     def cpu_of(self, node: str, graph: Graph | None = None) -> int | None:
-        """A replica's chain stays on its core; Client and Proxy stay beside the leader.
-
-        A Watchdog is on another core than the replica that it watches, and Recovery on another than
-        the leader: a core on which a replica has just died is busy for a while with taking it down.
-        """
+        """Where `node` belongs."""
         hosted = (graph or self.graph).nodes.get(node, ())
-        leads = self.leader or self.backup
-        if node.endswith("/watchdog"):
-            return self._other_cpu(node.partition("/")[0])
-        if hosted and all("/" in brick for brick in hosted):
-            return self._cpus.get(hosted[0].partition("/")[0])
-        if node in BESIDE_LEADER:
-            return self._cpus.get(leads)
-        return self._other_cpu(leads)
-
-    def _other_cpu(self, replica: str) -> int | None:
-        return next((cpu for name, cpu in self._cpus.items() if name != replica), None)
+        return self._cores.of(node, hosted, self.leader or self.backup)
 
     def pin(self, nodes: Iterable[str]) -> None:
         """Move `nodes` to where they belong now that another replica leads."""

@@ -18,7 +18,7 @@ from typing import Final
 from aftbed.adapt.plan import drains
 from aftbed.core import script
 from aftbed.core.event import Event
-from aftbed.core.graph import Graph, Link, ends
+from aftbed.core.graph import Graph, Link
 from aftbed.core.script import Script, flat
 from aftbed.ftm.catalog import KINDS
 from aftbed.ftm.mechanism import REPLICAS, replication_of
@@ -27,6 +27,7 @@ from aftbed.runtime.unix.channels import Channel
 from aftbed.runtime.unix.deployment import STAGED, Deployment, Keys
 from aftbed.runtime.unix.jobs import Key, StepFailed, Wait
 from aftbed.runtime.unix.processes import Process
+from aftbed.runtime.unix.rewiring import INPUT, Changes, replica_of, way_back
 from aftbed.runtime.unix.spawn import LIGHT
 
 PREPARE_SECONDS_MAX: Final = 5.0  # a stranger's module is imported and tested meanwhile
@@ -34,32 +35,6 @@ STEP_SECONDS_MAX: Final = 0.5
 SUSPEND_SECONDS_MAX: Final = 0.25  # longer, and the client would rather have the old mechanism back
 
 Answer = Generator[Wait, dict[Key, bytes], bytes]
-Ends = dict[tuple[str, str], int]  # brick, port -> descriptor, or NOWHERE
-
-
-class _Changes:
-    """What one process is told at once."""
-
-    def __init__(self, process: Process) -> None:
-        self.process = process
-        self.inputs: Ends = {}
-        self.outputs: Ends = {}
-        self.suspend = False
-
-    def order(self, epoch: int) -> tuple[Callable[[int], control.ToNode], tuple[int, ...]]:
-        """The order, but for its token, and the descriptors that go with it."""
-        fds: list[int] = []
-
-        def ports(ends: Ends) -> tuple[control.Port, ...]:
-            found = []
-            for (brick, port), fd in ends.items():
-                found.append(control.Port(brick, port, len(fds) if fd != control.NOWHERE else fd))
-                if fd != control.NOWHERE:
-                    fds.append(fd)
-            return tuple(found)
-
-        inputs, outputs = ports(self.inputs), ports(self.outputs)
-        return lambda token: control.Rewire(token, inputs, outputs, epoch, self.suspend), tuple(fds)
 
 
 class Exchange:
@@ -84,18 +59,6 @@ class Exchange:
         self._lost: set[str] = set()  # replicas that are left to Recovery
         self.closed_ns = self.opened_ns = 0  # when no request was served, and when again
         self._number = 0
-
-    @property
-    def bricks_changed(self) -> int:
-        """How many bricks are made or ended."""
-        old, new = ({b.name: (b, g.node_of(b.name)) for b in g.bricks} for g in (self.old, self.new))
-        made = {
-            b.name
-            for v in flat((*self._todo.prepare, *self._todo.commit))
-            if isinstance(v, script.Stage)
-            for b in v.bricks
-        }
-        return len(made | (old.keys() - new.keys()))
 
     # -- the phases ---------------------------------------------------------------------------
 
@@ -258,10 +221,10 @@ class Exchange:
 
     def _rewire(self, verbs: Iterable[script.AnyVerb]) -> Keys:
         """Everybody hears of all that concerns him at once. In `prepare`, only what is staged."""
-        changes: dict[int, _Changes] = {}
+        changes: dict[int, Changes] = {}
 
-        def of(process: Process) -> _Changes:
-            return changes.setdefault(id(process), _Changes(process))
+        def of(process: Process) -> Changes:
+            return changes.setdefault(id(process), Changes(process))
 
         exchanged = []
         for verb in verbs:
@@ -281,7 +244,7 @@ class Exchange:
         for node in exchanged:
             self._take_place(node)
 
-    def _tell(self, changes: dict[int, _Changes]) -> Keys:
+    def _tell(self, changes: dict[int, Changes]) -> Keys:
         sent = []
         for change in changes.values():
             order, fds = change.order(self._deployment.epoch)
@@ -289,24 +252,23 @@ class Exchange:
         if sent:
             yield Wait(frozenset(k for k, _ in sent), frozenset(n for _, n in sent), STEP_SECONDS_MAX)
 
-    def _bind(self, link: Link, of: Callable[[Process], _Changes]) -> None:
+    def _bind(self, link: Link, of: Callable[[Process], Changes]) -> None:
         if self.new.node_of(link.source) == self.new.node_of(link.sink):
             return  # within one node: it knows
         channel = self._channel(link)
         shared = (link.source, link.source_port, link.sink) not in self._fresh
         self._rewired = self._rewired or self._committing
         for brick, port, fd, side in (
-            (link.sink, link.sink_port, channel.read.fileno(), "in"),
+            (link.sink, link.sink_port, channel.read.fileno(), INPUT),
             (link.source, link.source_port, channel.write.fileno(), "out"),
         ):
             staged = self._staged.get(self.new.node_of(brick))
             given = (brick, port, side) in self._given or (staged is None and shared)
             if not given and (self._committing or staged is not None):
                 self._given.add((brick, port, side))
-                change = of(staged or self._process(brick))
-                (change.inputs if side == "in" else change.outputs)[brick, port] = fd
+                of(staged or self._process(brick)).bind(brick, port, side, fd)
 
-    def _unbind(self, brick: str, port: str, of: Callable[[Process], _Changes]) -> None:
+    def _unbind(self, brick: str, port: str, of: Callable[[Process], Changes]) -> None:
         self._rewired = True
         change = of(self._process(brick))
         outputs = KINDS[self.old.brick(brick).kind].outputs
@@ -359,7 +321,7 @@ class Exchange:
         A replica that is `lost`, or has a dead node, is left to Recovery: nothing of it serves again.
         """
         deployment = self._deployment
-        self._lost = {lost, *(_replica(n) for n, p in deployment.nodes.items() if not p.alive)} - {""}
+        self._lost = {lost, *(replica_of(n) for n, p in deployment.nodes.items() if not p.alive)} - {""}
         if self.committed:
             yield from self._reverse_adoption()
         if self._rewired:
@@ -388,41 +350,20 @@ class Exchange:
         """Whoever was suspended goes on, but for a lost replica."""
         waiting = {id(p): p for p in (*(p for _, p in self._suspended), *self._replaced.values())}
         for process in waiting.values():
-            if process.kind != "killed" and _replica(process.name) not in self._lost:
+            if process.kind != "killed" and replica_of(process.name) not in self._lost:
                 with contextlib.suppress(StepFailed):
                     self._deployment.order_to(process, control.Resume)
 
-    def _old_ends(self) -> dict[int, _Changes]:
-        """What must be heard for the old graph to be wired as it was: by those that stay, what has changed;
-        by those that come back, everything, since a neighbour may have been replaced meanwhile.
-        """
-        changes: dict[int, _Changes] = {}
-        back = {b for node in self._replaced for b in self.old.nodes[node]}
-        stay = {b.name for b in self.old.bricks} & {b.name for b in self.new.bricks} - back
-        old_keys = {(k.source, k.source_port, k.sink) for k in self.old.links}
-        new_keys = {(k.source, k.source_port, k.sink) for k in self.new.links}
+    def _old_ends(self) -> dict[int, Changes]:
+        """What must be heard for the old graph to be wired as it was."""
 
-        def tell(brick: str, port: str, side: str, fd: int) -> None:
-            node = self.old.node_of(brick)
+        def serving(node: str) -> Process | None:
             process = self._replaced.get(node) or self._deployment.nodes.get(node)
-            if process is not None and process.alive and _replica(node) not in self._lost:
-                change = changes.setdefault(id(process), _Changes(process))
-                (change.inputs if side == "in" else change.outputs)[brick, port] = fd
+            lost = process is None or not process.alive or replica_of(node) in self._lost
+            return None if lost else process
 
-        for link, key in ((k, (k.source, k.source_port, k.sink)) for k in self.new.links):
-            if key not in old_keys and not link.standby:
-                for brick, port, side in ends(link):
-                    if brick in stay:
-                        tell(brick, port, side, control.NOWHERE)
-        for link, key in ((k, (k.source, k.source_port, k.sink)) for k in self.old.links):
-            channel = self._deployment.channels.get(*key)
-            inside = self.old.node_of(link.source) == self.old.node_of(link.sink)
-            for brick, port, side in ends(link):
-                wanted = brick in back or (brick in stay and key not in new_keys and not link.standby)
-                if wanted and channel is not None and not inside:
-                    end = channel.read if side == "in" else channel.write
-                    tell(brick, port, side, end.fileno())
-        return changes
+        back = {b for node in self._replaced for b in self.old.nodes[node]}
+        return way_back(self.old, self.new, back, serving, self._deployment.channels)
 
     def _reverse_adoption(self) -> Keys:
         """From a graph that serves: stop it, take the state back, and let its channels go."""
@@ -431,7 +372,7 @@ class Exchange:
             deployment.shut_replication(deployment.slots[replica])
         path = [(f"{deployment.leader}/protocol", False), *((b, True) for b in drains(self.new, self.old))]
         for brick, drain in path:
-            if _replica(brick) not in self._lost:
+            if replica_of(brick) not in self._lost:
                 with contextlib.suppress(StepFailed):
                     yield from self._suspend(brick, drain=drain)
         for node in self._migrated:
@@ -450,12 +391,6 @@ class Exchange:
         self._let_go.clear()
         others = [r for r in REPLICAS if r != deployment.leader]
         deployment.backup = others[0] if replication_of(self.old.ftm) else ""
-
-
-def _replica(name: str) -> str:
-    """The replica of a node or brick, `""` for one of none."""
-    head, slash, _ = name.partition("/")
-    return head if slash or head in REPLICAS else ""
 
 
 def _end(process: Process) -> None:

@@ -12,11 +12,14 @@ from pathlib import Path
 from typing import Final
 
 from aftbed.core import journal as layout
+from aftbed.core.errors import PeerError
 from aftbed.core.event import Event
 
 CHUNK_BYTES: Final = 1 << 20
 FILE_BYTES_MAX: Final = 1 << 30
 READY_BYTES: Final = 1 << 16  # there from the start: a backup's first record is written when time counts
+RECORDED_MAX: Final = 16
+RECORDED_BYTES_MAX: Final = 1 << 16
 MADV_POPULATE_WRITE: Final = 23  # madvise(2)
 STEP_BYTES_MAX: Final = 8 * layout.RECORD.size  # what the notes of one step take at most
 
@@ -113,3 +116,13 @@ class Header:
     def close(self) -> None:
         """Unmap."""
         self._mapping.close()
+
+
+def recorded_requests(record: Path) -> tuple[bytes, ...]:
+    """The first few requests of a run, with which what is new is tested."""
+    found: list[bytes] = []
+    path = record / "journal" / "client.1.dialogue"
+    with open(path, "rb") as file, contextlib.suppress(PeerError):  # the last entry is cut off
+        for entry in layout.entries(file.read(RECORDED_BYTES_MAX)):
+            found += [entry.payload] if entry.kind is layout.EntryKind.SENT else []
+    return tuple(found[:RECORDED_MAX])

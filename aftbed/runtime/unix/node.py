@@ -23,7 +23,7 @@ from types import FrameType
 from typing import Final, NoReturn
 
 from aftbed.core import wire
-from aftbed.core.brick import CONTROL, Brick, Effect, Halt, Note, Order, Send
+from aftbed.core.brick import CONTROL, Brick, Effect, Note, Send
 from aftbed.core.errors import PeerError
 from aftbed.core.event import Event
 from aftbed.core.journal import FLAG_OFFSET, PULSE_OFFSET, RECORD
@@ -32,7 +32,7 @@ from aftbed.runtime.unix import control
 from aftbed.runtime.unix.devices import Device, Sensor
 from aftbed.runtime.unix.journal import Journal
 from aftbed.runtime.unix.lifeline import Held
-from aftbed.runtime.unix.orders import carry_out, fire
+from aftbed.runtime.unix.orders import carry_out, fire, order_or_halt
 from aftbed.runtime.unix.wiring import Hosted, Inlet, Plan, Wiring
 
 PULSE_SECONDS: Final = 0.02
@@ -43,7 +43,6 @@ HOST_FILES: Final = (__file__, control.__file__)  # what is blocked in here is n
 EXIT_FENCED: Final = 3
 REFUSED: Final = (PeerError, *wire.UNREADABLE)
 EXIT_ASSERT: Final = 70
-EXIT_DETECTED: Final = 71  # a detected stop
 
 _now = time.monotonic_ns
 _read = os.read
@@ -209,7 +208,7 @@ class Node:
                     at += RECORD_BYTES
                 else:
                     journal.at = at
-                    self._order_or_halt(hosted, effect)
+                    order_or_halt(self, hosted, effect)
             journal.at = at
 
     def _wait_for(self, inlet: Inlet) -> None:
@@ -326,17 +325,7 @@ class Node:
                 if self.armed:
                     fire(self, hosted, effects, effect)
             else:
-                self._order_or_halt(hosted, effect)
-
-    def _order_or_halt(self, hosted: Hosted, effect: Effect) -> None:
-        if isinstance(effect, Order):
-            self.line.send(control.Ordered(hosted.name, effect.script, effect.phase, effect.number))
-            return
-        assert isinstance(effect, Halt)
-        print(
-            f"{hosted.name} (pid {os.getpid()}): detected stop: {effect.reason}", file=sys.stderr, flush=True
-        )
-        os._exit(EXIT_DETECTED)
+                order_or_halt(self, hosted, effect)
 
     def _write_hard(self, hosted: Hosted, port: str, data: bytes) -> None:
         """The channel is full or shut: serve control meanwhile, since that may be about this channel.

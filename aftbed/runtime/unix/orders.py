@@ -2,12 +2,13 @@
 
 import os
 import signal
+import sys
 import time
 from typing import TYPE_CHECKING, Final, assert_never
 
 from msgspec import structs
 
-from aftbed.core.brick import CONTROL, Brick, Effect, Note, Send
+from aftbed.core.brick import CONTROL, Brick, Effect, Halt, Note, Order, Send
 from aftbed.core.errors import PeerError
 from aftbed.core.event import Event, event_named
 from aftbed.core.fault import Act, Flip, Place, flipped, mark
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from aftbed.runtime.unix.node import Node
 
 FAULT_SECONDS_MAX: Final = 5.0
+EXIT_DETECTED: Final = 71  # a detected stop
 
 
 def carry_out(node: "Node", order: control.ToNode, fds: list[int]) -> bytes | None:
@@ -179,3 +181,13 @@ def _hit(brick: Brick, message: Message, place: Place, data: bytes, bit: int) ->
     if state == data:
         return None
     return structs.replace(message, state=state) if isinstance(message, Tried | StateCaptured) else message
+
+
+def order_or_halt(node: "Node", hosted: Hosted, effect: Effect) -> None:
+    """The rare effects: a script for the runtime, or the end of this node."""
+    if isinstance(effect, Order):
+        node.line.send(control.Ordered(hosted.name, effect.script, effect.phase, effect.number))
+        return
+    assert isinstance(effect, Halt)
+    print(f"{hosted.name} (pid {os.getpid()}): detected stop: {effect.reason}", file=sys.stderr, flush=True)
+    os._exit(EXIT_DETECTED)

@@ -1,5 +1,6 @@
 """What a spare becomes: a node of the graph, or a service beside it (the hub, the vehicle)."""
 
+import gc
 import importlib
 import importlib.util
 import os
@@ -64,6 +65,8 @@ def _build(line: control.Line[control.ToNode], order: control.Assign, fds: list[
     node = Node(order.node, line, Journal(Path(order.journal), order.node))
     node.start_pulse()
     node.lifeline = Held(Path(order.journal))
+    if order.bricks[0].kind == "engine":
+        gc.enable()  # a plan leaves cycles behind, and nobody waits for the Engine on the request path
     node.suspended = order.held
     if order.staged:
         rehearsal.once()

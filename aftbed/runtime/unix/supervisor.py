@@ -262,8 +262,6 @@ class Supervisor:
         if ordered.purpose in LOSSES and self.adaptations.interrupted(ordered.replica):
             return  # the way back first
         began_ns = time.monotonic_ns()
-        if ordered.purpose in LOSSES:  # told before the others of the replica are killed
-            self.tell("alarm", f"{ordered.replica}: {self.deployment.cause_of_loss(ordered.replica)}")
 
         def ended(failure: str) -> None:
             ms = f"{(time.monotonic_ns() - began_ns) / 1e6:.2f} ms"
@@ -272,6 +270,8 @@ class Supervisor:
             self.loop.after(SETTLE_SECONDS, lambda: self._settle_after(ordered))
 
         self.loop.jobs.start(ordered.purpose, self.executor.execute(ordered), ended)
+        if ordered.purpose in LOSSES:  # its nodes are killed only when the new leader serves
+            self.tell("alarm", f"{ordered.replica}: {self.deployment.cause_of_loss(ordered.replica)}")
         self.tell("script", f"{ordered.purpose} ({ordered.replica})")
 
     def _settle_after(self, ordered: script.Script) -> None:

@@ -16,7 +16,8 @@ from aftbed.core.graph import Link
 from aftbed.ftm.mechanism import replication_of
 from aftbed.runtime.unix import control
 from aftbed.runtime.unix.channels import Channel
-from aftbed.runtime.unix.deployment import BESIDE_LEADER, Deployment, Keys
+from aftbed.runtime.unix.cores import BESIDE_LEADER
+from aftbed.runtime.unix.deployment import Deployment, Keys
 from aftbed.runtime.unix.jobs import StepFailed, Wait
 from aftbed.runtime.unix.journal import Journal
 

@@ -1,0 +1,83 @@
+"""What each process must hear for a graph to be wired: the ends of channels, one order for each process."""
+
+from collections.abc import Callable
+from typing import Final
+
+from aftbed.core.graph import Graph, Link, ends
+from aftbed.ftm.mechanism import REPLICAS
+from aftbed.runtime.unix import control
+from aftbed.runtime.unix.channels import Channels
+from aftbed.runtime.unix.processes import Process
+
+Ends = dict[tuple[str, str], int]  # brick, port -> descriptor, or NOWHERE
+INPUT: Final = "in"
+
+
+class Changes:
+    """What one process is told at once."""
+
+    def __init__(self, process: Process) -> None:
+        self.process = process
+        self.inputs: Ends = {}
+        self.outputs: Ends = {}
+        self.suspend = False
+
+    def bind(self, brick: str, port: str, side: str, fd: int) -> None:
+        """Have `port` lead to `fd`, or NOWHERE."""
+        (self.inputs if side == INPUT else self.outputs)[brick, port] = fd
+
+    def order(self, epoch: int) -> tuple[Callable[[int], control.ToNode], tuple[int, ...]]:
+        """The order, but for its token, and the descriptors that go with it."""
+        fds: list[int] = []
+
+        def ports(ends: Ends) -> tuple[control.Port, ...]:
+            found = []
+            for (brick, port), fd in ends.items():
+                found.append(control.Port(brick, port, len(fds) if fd != control.NOWHERE else fd))
+                if fd != control.NOWHERE:
+                    fds.append(fd)
+            return tuple(found)
+
+        inputs, outputs = ports(self.inputs), ports(self.outputs)
+        return lambda token: control.Rewire(token, inputs, outputs, epoch, self.suspend), tuple(fds)
+
+
+def way_back(
+    old: Graph, new: Graph, back: set[str], serving: Callable[[str], Process | None], channels: Channels
+) -> dict[int, Changes]:
+    """From `new` to `old`: by those that stay, what has changed; by those that come `back`, everything,
+    since a neighbour may have been replaced meanwhile. `serving`: the process of a node, if it may serve.
+    """
+    changes: dict[int, Changes] = {}
+    stay = {b.name for b in old.bricks} & {b.name for b in new.bricks} - back
+    old_keys, new_keys = ({_key(k) for k in g.links} for g in (old, new))
+
+    def tell(brick: str, port: str, side: str, fd: int) -> None:
+        process = serving(old.node_of(brick))
+        if process is not None:
+            changes.setdefault(id(process), Changes(process)).bind(brick, port, side, fd)
+
+    for link in new.links:
+        if _key(link) not in old_keys and not link.standby:
+            for brick, port, side in ends(link):
+                if brick in stay:
+                    tell(brick, port, side, control.NOWHERE)
+    for link in old.links:
+        channel = channels.get(*_key(link))
+        if channel is None or old.node_of(link.source) == old.node_of(link.sink):
+            continue
+        changed = _key(link) not in new_keys and not link.standby
+        for brick, port, side in ends(link):
+            if brick in back or (brick in stay and changed):
+                tell(brick, port, side, (channel.read if side == INPUT else channel.write).fileno())
+    return changes
+
+
+def _key(link: Link) -> tuple[str, str, str]:
+    return link.source, link.source_port, link.sink
+
+
+def replica_of(name: str) -> str:
+    """The replica of a node or brick, `""` for one of none."""
+    head, slash, _ = name.partition("/")
+    return head if slash or head in REPLICAS else ""
