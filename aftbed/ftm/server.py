@@ -11,7 +11,7 @@ switch to another mechanism never exchanges it.
 | nowhere         | to a Before     | tr          | trials, and the question for the state before them   |
 | to an After     | to a Before     | pbr+tr      | all of these                                         |
 
-Without tr one port is open at a time, in which a host can block; to wait for two costs it a poll. Under tr
+Nearly always one port is open, in which a host can block; to wait for two costs it a poll. After a rerun
 nothing here tells which one is next: a vote takes two trials, or three.
 """
 
@@ -39,6 +39,7 @@ from aftbed.core.message import (
 class State(BrickState):
     STANDBY = auto()  # a backup's or a leader's: the first request decides
     READY = auto()  # for a request
+    TRYING = auto()  # under tr: Before has the state, trials follow, up to a rerun
     EXECUTED = auto()  # After will ask for the state after it
 
 
@@ -50,24 +51,37 @@ MOVES: Final = {  # where After does not ask for the state, what leads to EXECUT
     ("prd2srv", State.EXECUTED, Trial): State.EXECUTED,  # a rerun, before After asks
     ("aft2srv", State.STANDBY, RestoreState): State.STANDBY,
     ("aft2srv", State.EXECUTED, CaptureState): State.READY,
-    ("bfr2srv", State.STANDBY, CaptureState): State.STANDBY,
-    ("bfr2srv", State.READY, CaptureState): State.READY,
+    ("bfr2srv", State.STANDBY, CaptureState): State.TRYING,
+    ("bfr2srv", State.READY, CaptureState): State.TRYING,
+    ("prd2srv", State.TRYING, Trial): State.TRYING,  # a rerun leads to EXECUTED
 }
 OPEN: Final[dict[tuple[bool, bool], dict[State, tuple[str, ...]]]] = {  # by what leads: srv2aft, srv2bfr
     (False, False): dict.fromkeys(State, ("prd2srv",)),
     (True, False): {
         State.STANDBY: ("aft2srv", "prd2srv"),
         State.READY: ("prd2srv",),
+        State.TRYING: ("prd2srv",),
         State.EXECUTED: ("aft2srv",),
     },
-    (False, True): dict.fromkeys(State, ("bfr2srv", "prd2srv")),
-    (True, True): dict.fromkeys(State, ("aft2srv", "bfr2srv", "prd2srv")),
+    (False, True): {
+        State.STANDBY: ("bfr2srv", "prd2srv"),
+        State.READY: ("bfr2srv", "prd2srv"),  # the next request, or a third trial
+        State.TRYING: ("prd2srv",),
+        State.EXECUTED: ("bfr2srv", "prd2srv"),
+    },
+    (True, True): {
+        State.STANDBY: ("aft2srv", "bfr2srv", "prd2srv"),
+        State.READY: ("bfr2srv",),
+        State.TRYING: ("prd2srv",),
+        State.EXECUTED: ("aft2srv", "prd2srv"),  # the question of After, or a third trial
+    },
 }
 _ANSWERED_ON: Final = {"aft2srv": "srv2aft", "bfr2srv": "srv2bfr"}
 
 # Bound once: a look-up in an enumeration is slow on the hot path.
 _READY: Final = State.READY
 _EXECUTED: Final = State.EXECUTED
+_TRYING: Final = State.TRYING
 _ENTER: Final = Event.SERVER_ENTER
 _EXIT: Final = Event.SERVER_EXIT
 _CAPTURED: Final = Event.STATE_CAPTURED
@@ -87,8 +101,8 @@ class Server(Brick):
         return self._open[self.state]
 
     def quiescent(self) -> bool:
-        """Nothing executed whose state is still to be captured."""
-        return self.state is not State.EXECUTED
+        """Nothing executed whose state is still to be captured, no trial to come."""
+        return self.state is not _EXECUTED and self.state is not _TRYING
 
     def step(self, port: str, msg: AnyMessage, now_ns: int) -> list[Effect]:
         """Execute, try, capture or restore."""
@@ -125,7 +139,7 @@ class Server(Brick):
         elif self.state is _EXECUTED:
             raise PeerError(f"Trial of request {msg.request_id}, and the state of the last is not captured")
         payload, detail = self._execute(msg.payload), RERUN if msg.rerun else 0
-        self.state = _EXECUTED if self.captured else _READY
+        self.state = (_EXECUTED if self.captured else _READY) if msg.rerun else _TRYING
         tried = Tried(msg.epoch, msg.request_id, self.replica, payload, self.application.capture())
         return [
             Note(_ENTER, msg.request_id, detail),

@@ -163,6 +163,7 @@ STANDBY: Final[Legal] = {
 }
 READY: Final[Legal] = {"prd2srv": (Request, Trial), "aft2srv": (), "bfr2srv": (CaptureState,)}
 EXECUTED: Final[Legal] = {"prd2srv": (), "aft2srv": (CaptureState,), "bfr2srv": ()}
+TRYING: Final[Legal] = {"prd2srv": (Trial,), "aft2srv": (), "bfr2srv": ()}
 CASES: Final = (
     by_table(backup_protocol, _P.BACKUP, (), protocol.MOVES, TELLS),
     by_table(leading_protocol, _P.IDLE, (), protocol.MOVES, TELLS),
@@ -183,6 +184,7 @@ CASES: Final = (
             ("STANDBY", (), STANDBY),
             ("after a request", (Request,), EXECUTED if outputs else READY),
             ("after the state", (Request, CaptureState), READY),
+            ("after a trial", (Trial,), TRYING),
         )
         if outputs or CaptureState not in mail
         for port, legal in ports.items()

@@ -149,16 +149,28 @@ def test_the_first_request_decides_whether_it_leads(outputs: tuple[str, ...], po
     assert set(bound(*outputs).open_ports()) == ports
 
 
-def test_under_pbr_one_port_is_open_at_a_time_and_under_tr_what_may_come() -> None:
-    plain, voting = bound("srv2aft"), bound("srv2aft", "srv2bfr")
-    for brick, alternates in ((plain, True), (voting, False)):
-        for _ in range(2):
-            brick.step("prd2srv", trial(STATE, rerun=False), 0)
-            assert brick.open_ports() == (("aft2srv",) if alternates else ("aft2srv", "bfr2srv", "prd2srv"))
-            assert not brick.quiescent()
-            brick.step("aft2srv", CaptureState(2, 7), 0)
-            assert brick.open_ports() == (("prd2srv",) if alternates else ("aft2srv", "bfr2srv", "prd2srv"))
-            assert brick.quiescent()
+def test_under_pbr_one_port_is_open_at_a_time() -> None:
+    brick = bound("srv2aft")
+    for number in (7, 8):
+        brick.step("prd2srv", Request(2, number, b"x"), 0)
+        assert brick.open_ports() == ("aft2srv",) and not brick.quiescent()
+        brick.step("aft2srv", CaptureState(2, number), 0)
+        assert brick.open_ports() == ("prd2srv",) and brick.quiescent()
+
+
+def test_under_tr_only_after_a_rerun_it_is_not_known_what_comes() -> None:
+    brick = bound("srv2aft", "srv2bfr")
+    assert brick.open_ports() == ("aft2srv", "bfr2srv", "prd2srv") and brick.quiescent()
+    for number in (7, 8):
+        brick.step("bfr2srv", CaptureState(2, number), 0)
+        assert brick.open_ports() == ("prd2srv",) and not brick.quiescent()
+        brick.step("prd2srv", trial(STATE, rerun=False, number=number), 0)
+        assert brick.open_ports() == ("prd2srv",) and not brick.quiescent()
+        for _ in range(2):  # After may ask for a third trial
+            brick.step("prd2srv", trial(STATE, rerun=True, number=number), 0)
+            assert brick.open_ports() == ("aft2srv", "prd2srv") and not brick.quiescent()
+        brick.step("aft2srv", CaptureState(2, number), 0)
+        assert brick.open_ports() == ("bfr2srv",) and brick.quiescent()
 
 
 def test_a_follower_becomes_a_backup_and_a_follower_again() -> None:
@@ -201,6 +213,7 @@ def test_who_asks_for_the_state_is_who_gets_it(asked: str, answered: str, execut
     brick = bound("srv2aft", "srv2bfr")
     if executed:
         brick.step("prd2srv", trial(STATE, rerun=False), 0)
+        brick.step("prd2srv", trial(STATE, rerun=True), 0)
     effects = brick.step(asked, CaptureState(2, 7), 0)
     assert sends(effects) == [(answered, StateCaptured(2, 7, brick.capture()))]
     assert notes(effects) == [Event.STATE_CAPTURED]
@@ -244,6 +257,7 @@ def test_a_rerun_from_what_is_no_state_is_refused() -> None:
 def test_the_next_trial_waits_until_after_has_the_state() -> None:
     brick = bound("srv2aft", "srv2bfr")
     brick.step("prd2srv", trial(STATE, rerun=False), 0)
+    brick.step("prd2srv", trial(STATE, rerun=True), 0)
     before = inspected(brick)
     with pytest.raises(PeerError, match="the state of the last is not captured"):
         brick.step("prd2srv", trial(STATE, rerun=False, number=8), 0)

@@ -81,9 +81,10 @@ def voting(*found: Tried) -> TrProceed:
 def test_a_trial_is_run_and_then_run_again_from_the_same_state() -> None:
     brick = TrProceed()
     effects = brick.step("bfr2prd", TRIAL, 0)
-    assert sends(effects) == [("prd2srv", TRIAL)] and notes(effects) == [Event.PROCEED_ENTER]
+    assert sends(effects) == [("prd2srv", TRIAL), ("prd2srv", RERUN)]
+    assert notes(effects) == [Event.PROCEED_ENTER]
     assert brick.open_ports() == ("srv2prd",) and not brick.quiescent()
-    assert sends(brick.step("srv2prd", RIGHT, 0)) == [("prd2srv", RERUN)]
+    assert sends(brick.step("srv2prd", RIGHT, 0)) == []
     assert brick.open_ports() == ("srv2prd",) and not brick.quiescent()
     assert sends(brick.step("srv2prd", WRONG[0], 0)) == [("prd2aft", trials(RIGHT, WRONG[0]))]
 
@@ -100,14 +101,15 @@ def test_asked_again_it_runs_it_once_more_and_is_done_with_it() -> None:
 def test_the_next_trial_may_come_without_a_third() -> None:
     brick = voting()
     later = Trial(2, 8, b"more", STATE, rerun=False)
-    assert sends(brick.step("bfr2prd", later, 0)) == [("prd2srv", later)]
+    again = Trial(2, 8, b"more", STATE, rerun=True)
+    assert sends(brick.step("bfr2prd", later, 0)) == [("prd2srv", later), ("prd2srv", again)]
     with pytest.raises(PeerError, match="trial of request 7, expected 8"):
         brick.step("srv2prd", RIGHT, 0)
 
 
 @pytest.mark.parametrize("wrong", WRONG)
 def test_while_a_trial_may_come_back_a_request_is_inside(wrong: Tried) -> None:
-    assert voting(RIGHT, RIGHT).quiescent()
+    assert voting(RIGHT, RIGHT).quiescent() and voting(RIGHT, RIGHT).open_ports() == ("bfr2prd",)
     assert not voting(RIGHT, wrong).quiescent()
 
 
