@@ -48,8 +48,15 @@ bench: $(EDITABLE)
 	$(BIN)/aftbed bench cycle --ftm pbr --json
 	$(BIN)/aftbed bench cycle --ftm pbr --placement replica --json
 	$(BIN)/aftbed bench cycle --ftm none --json
+	$(BIN)/aftbed bench cycle --ftm lfr --json
+	$(BIN)/aftbed bench cycle --ftm pbr+tr --json
+	$(BIN)/aftbed bench cycle --ftm lfr+tr --json
+	$(BIN)/aftbed bench adapt --from pbr --to pbr+tr --json
+	$(BIN)/aftbed bench adapt --from pbr --to lfr --json
+	$(BIN)/aftbed bench adapt --from pbr --to pbr+tr --recipe paper --json
 	$(BIN)/aftbed bench recovery --ftm pbr --json
 	$(BIN)/aftbed bench recovery --ftm pbr --placement replica --json
+	$(BIN)/aftbed bench recovery --ftm lfr --json
 	$(BIN)/aftbed bench launch --ftm pbr --json
 	$(BIN)/aftbed bench memory --ftm pbr --json
 

@@ -270,9 +270,14 @@ class _Change:
         )
 
 
-def drains(old: Graph, new: Graph) -> list[str]:
-    """Bricks of the backup, one per node, that are to be drained on the way from `old` to `new`, in order."""
-    return _Change(old, new).drains()
+def drains(old: Graph, new: Graph, staged: Iterable[str] = ()) -> list[str]:
+    """Bricks of the backup, one per node, that are to be drained on the way from `old` to `new`, in order.
+
+    `staged`: bricks that are exchanged even where they do not differ.
+    """
+    change = _Change(old, new)
+    change.staged |= set(staged)
+    return change.drains()
 
 
 def _key(link: Link) -> tuple[str, str, str, str]:

@@ -222,7 +222,8 @@ def _flow(graph: Graph, script: Script) -> list[str]:
     """What changes while a request may be inside, and what never begins."""
     leader = leader_of(graph)
     leads, backups = f"{leader}/protocol", set(REPLICAS) - {leader}
-    undrained = set(drains(graph, after(graph, script, KINDS)))
+    staged = [b.name for v in flat(script.prepare) if isinstance(v, Stage) for b in v.bricks]
+    undrained = set(drains(graph, after(graph, script, KINDS), staged))
     suspended, resumed, found = False, set[str](), list[str]()
     for verb in flat(script.commit):
         match verb:

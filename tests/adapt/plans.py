@@ -34,5 +34,7 @@ def _alike(old: str, new: str) -> bool:
 CASES: Final = tuple(
     Case(old, new, placement, leader, recipe)
     for old, new, placement, leader, recipe in product(RUNNABLE, RUNNABLE, PLACEMENTS, REPLICAS, RECIPES)
-    if old != new and (recipe == RECIPES[0] or (placement == PLACEMENTS[0] and _alike(old, new)))
+    if old != new
+    and (leader == REPLICAS[0] or placement == PLACEMENTS[0])
+    and (recipe == RECIPES[0] or (placement == PLACEMENTS[0] and _alike(old, new)))
 )

@@ -87,7 +87,8 @@ class Assign(Order, frozen=True):
     locals: tuple[Local, ...]
     cpu: int | None
     held: bool = False  # take no mail before a Resume
-    staged: bool = False  # nobody waits for it yet, and everybody will later: rehearse first
+    staged: bool = False  # nobody waits for it yet, and everybody will later: rehearse first,
+    aside: int | None = None  # on this core
     trial: Trial | None = None  # what is written off line must stand before it is wired
     device: str = ""  # see `devices`
     options: bytes = b""

@@ -279,6 +279,7 @@ class Deployment:
             self.cpu_of(node, graph),
             held,
             name != node,
+            self.cpu_of("recovery"),
             control.Trial(graph, recorded_requests(self.record)) if trial else None,
             device,
             options,
@@ -304,10 +305,11 @@ class Deployment:
                 os.sched_setaffinity(process.pid, {cpu})
 
     def pin_watchers(self) -> None:
-        """Move who watches and recovers, this process included, to the core that does not lead."""
+        """Move who watches, recovers or forks, this process included, to the core that does not lead."""
         cpu = self.cpu_of("recovery")
         if cpu is not None:
-            os.sched_setaffinity(0, {cpu})
+            for pid in (0, *(zygote.pid for zygote in self.nursery.zygotes.values() if zygote.alive)):
+                os.sched_setaffinity(pid, {cpu})
         self.pin(b.name for b in self.graph.bricks if b.kind in WATCHED_KINDS)
 
     # -- channels -----------------------------------------------------------------------------

@@ -55,6 +55,10 @@ def become(
 
 def _build(line: control.Line[control.ToNode], order: control.Assign, fds: list[int]) -> Node:
     linux.set_name(order.node)
+    if order.staged:
+        if order.aside is not None:
+            os.sched_setaffinity(0, {order.aside})  # requests are served on the other one
+        rehearsal.once()
     if order.cpu is not None:
         os.sched_setaffinity(0, {order.cpu})
     if order.bricks[0].kind in ("watchdog", "recovery"):
@@ -68,8 +72,6 @@ def _build(line: control.Line[control.ToNode], order: control.Assign, fds: list[
     if order.bricks[0].kind == "engine":
         gc.enable()  # a plan leaves cycles behind, and nobody waits for the Engine on the request path
     node.suspended = order.held
-    if order.staged:
-        rehearsal.once()
     for spec in order.bricks:
         node.add(spec.name, make_brick(spec, _setting(spec, order), load_module))
     if order.trial is not None:
