@@ -48,6 +48,7 @@ class Event(Enum):
     ADAPT_STEP_EXIT = (52, "adapt.step.exit")
     ADAPT_COMMIT = (53, "adapt.commit")
     ADAPT_ROLLBACK = (54, "adapt.rollback")
+    ADAPT_STEP_ACT = (55, "adapt.step.act")
 
     def __init__(self, code: int, label: str) -> None:
         self.code = code

@@ -196,7 +196,8 @@ class Situation(Message, frozen=True, array_like=True, gc=False, tag=28):
 
     Sent at the start and after each script, done or `failed`; so a new Recovery needs no memory of
     the old one. `replication` are the parts and ports by which a leader speaks to its backup;
-    `stateful` the parts whose state a new backup needs.
+    `stateful` the parts whose state a new backup needs; `lost` the replicas that are as good as dead,
+    though no Watchdog may say so.
     """
 
     leader: str
@@ -208,6 +209,7 @@ class Situation(Message, frozen=True, array_like=True, gc=False, tag=28):
     failed: bool
     replication: tuple[tuple[str, str], ...] = (("after", "aft2aft"),)
     stateful: tuple[str, ...] = ("protocol", "server")
+    lost: tuple[str, ...] = ()
 
 
 class Goal(msgspec.Struct, frozen=True):

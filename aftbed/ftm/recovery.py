@@ -115,7 +115,7 @@ class Recovery(Brick):
     def _heard(self, msg: Situation, now_ns: int) -> list[Effect]:
         done, self.ordered, self.situation = self.ordered, None, msg
         present = {(msg.leader, msg.leader_generation), (msg.backup, msg.backup_generation)}
-        self.suspects &= present
+        self.suspects = {s for s in present if s in self.suspects or s[0] in msg.lost}
         self._failures = self._failures + 1 if msg.failed else 0
         notes: list[Effect] = []
         if done is not None and not msg.failed:

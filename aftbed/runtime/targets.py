@@ -15,6 +15,7 @@ from aftbed.ftm.mechanism import EXPRESSIONS, build
 
 ROLES: Final = ("primary", "backup")
 OTHERS: Final = ("zygote", "zygote.bus", "hub", "vehicle", "player")
+STAGED: Final = "'"  # behind the name of a process that is to become that node, or was it before
 SUPERVISOR: Final = "supervisor"  # emits what an adaptation comes through
 ADAPTATION: Final = tuple(event for event in Event if event.label.startswith("adapt."))
 
@@ -55,7 +56,8 @@ def _nodes(fault: Fault, graph: Graph) -> tuple[str, ...]:
     if not fault.event or event_named(fault.event) not in ADAPTATION:
         return tuple(graph.nodes)
     others = (build(expression, graph.placement) for expression in EXPRESSIONS)
-    return tuple(dict.fromkeys(node for one in (graph, *others) for node in one.nodes))
+    nodes = dict.fromkeys(node for one in (graph, *others) for node in one.nodes)
+    return (*nodes, *(f"{node}{STAGED}" for node in nodes))
 
 
 def _check_flip(fault: Fault, graph: Graph) -> None:

@@ -141,6 +141,12 @@ def test_an_alarm_makes_it_act_and_the_report_ends_it() -> None:
     assert brick.quiescent()
 
 
+@pytest.mark.parametrize(("lost", "script"), [("a", failover("a", "b", 2)), ("b", dropped())])
+def test_a_replica_that_an_adaptation_has_left_dead_needs_no_alarm(lost: str, script: Script) -> None:
+    left = msgspec.structs.replace(WHOLE, lost=(lost,))
+    assert ordered(Recovery().step(CONTROL, left, 0)) == [script]
+
+
 def test_one_script_at_a_time_what_comes_meanwhile_is_remembered() -> None:
     brick = Recovery()
     brick.step(CONTROL, ALONE, 0)

@@ -242,6 +242,12 @@ def test_at_a_step_of_an_adaptation_the_target_is_dead_before_it_goes_on(run: Ru
     assert run.do(run.faults.at(Event.ADAPT_STEP_ENTER)) == [], "once"
 
 
+def test_while_a_step_is_under_way_the_death_is_not_waited_for(run: Run) -> None:
+    run.arm("crash b/server at adapt.step.act")
+    assert run.do(run.faults.at(Event.ADAPT_STEP_ACT)) == []
+    assert not run.deployment.lives("b/server")
+
+
 def test_each_fault_at_the_same_step_strikes(run: Run) -> None:
     run.arm("crash engine at adapt.commit")
     run.arm("crash proxy at adapt.commit")

@@ -218,6 +218,12 @@ class Started:
                 printed = (self.launched.record / "processes.log").read_text()[-2000:]
                 pytest.fail(f"ended without {event} {text}: {self.events[-5:]} {self.launched.end} {printed}")
 
+    def heard(self) -> list[dict[str, object]]:
+        """All that it has told so far."""
+        while not self._ended and readable(self.launched.line.fileno(), 0.0):
+            self._next(time.monotonic() + WAIT_SECONDS_MAX, "nothing")
+        return self.events
+
     def finish(self, seconds: float = RUN_SECONDS_MAX) -> Outcome:
         """Follow the run to its end and judge it."""
         limit = time.monotonic() + seconds

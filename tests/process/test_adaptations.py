@@ -1,22 +1,19 @@
-"""Adaptations under load, on real processes: every way from mechanism to mechanism, a death at every step.
+"""Adaptations under load, on real processes: every way from mechanism to mechanism.
 
 One run walks a closed trail through the graph whose nodes are mechanisms, so that each way is gone once. The
-process tier walks among the four mechanisms of the paper and strikes at a sample of the steps, drawn from
-a fixed seed; the deep tier does all.
+process tier walks among the four mechanisms of the paper, the deep tier among all. Deaths on the way:
+see `test_strikes`.
 """
 
 import itertools
-import random
 from pathlib import Path
 from typing import Final
 
 import pytest
 from liveruns import Home, Outcome, Started, until
 
-from aftbed.adapt.plan import plan, target
 from aftbed.core.errors import ConfigError
-from aftbed.core.event import Event
-from aftbed.core.fault import Act, Fault, Trigger
+from aftbed.core.fault import Fault
 from aftbed.core.journal import EntryKind
 from aftbed.core.message import Goal
 from aftbed.ftm.mechanism import EXPRESSIONS, NONE, build
@@ -30,8 +27,6 @@ ALL: Final = tuple(e for e in EXPRESSIONS if e != NONE)
 PLACEMENTS: Final = ("process", "replica", "single")
 RATE_HZ: Final = 200.0
 ENDLESS: Final = 10_000_000
-SEED: Final = 20161118
-SAMPLED: Final = 12
 
 
 def trail(mechanisms: tuple[str, ...]) -> list[str]:
@@ -109,73 +104,6 @@ def test_every_way_from_mechanism_to_mechanism(
             assert graph_of(run) == whole(expression, placement)
         outcome = ended(run)
     assert_nothing_happened_to_requests(outcome)
-
-
-# -- a death at any step --------------------------------------------------------------------------
-
-
-def strikes(pairs: list[tuple[str, str]], placement: str) -> list[tuple[str, str, str, int]]:
-    """From, to, who dies, at which step: each node that takes part, the Engine, Recovery and the Proxy."""
-    found = []
-    for old, new in pairs:
-        start = build(old, placement)
-        script = plan(start, target(start, new)).script
-        stages = [v for v in script.prepare if type(v).__name__ == "Stage"]
-        steps = len(stages) + len(script.commit)
-        nodes = [n for n in start.nodes if n not in ("client", "a/watchdog", "b/watchdog")]
-        found += [(old, new, node, step) for node in nodes for step in range(1, steps + 1)]
-    return found
-
-
-def sampled(pairs: list[tuple[str, str]], placement: str, count: int) -> list[tuple[str, str, str, int]]:
-    """Some of them, the same every time."""
-    return random.Random(SEED).sample(strikes(pairs, placement), count)
-
-
-PAIRS: Final = list(itertools.permutations(PAPER, 2))
-
-
-def strike(home: Home, placement: str, old: str, new: str, node: str, step: int) -> None:
-    """Crash `node` at `step` of the adaptation; in the end, one graph is whole and every request answered."""
-    fault = Fault(Act.CRASH, node, Trigger(Event.ADAPT_STEP_ENTER.label, step))
-    with serving(home, old, placement, fault) as run:
-        found = adapt_whatever_comes(run, Goal(expression=new))
-        expected = new if found == "done" else old
-        until(run.redundant, "redundancy")
-        leader = str(run.status()["leader"])
-        assert graph_of(run) == whole(expected, placement, leader), (found, run.events[-8:])
-        outcome = ended(run)
-    assert_nothing_happened_to_requests(outcome)
-    assert [f["receipt"] for f in outcome.verdict.faults] == ["applied"]
-
-
-def adapt_whatever_comes(run: Started, goal: Goal) -> str:
-    """`done`, `rolled back` or `refused`."""
-    try:
-        return str(adapt(run, goal)["outcome"])
-    except ConfigError:
-        return "refused"
-
-
-@pytest.mark.parametrize(("old", "new", "node", "step"), sampled(PAIRS, "process", SAMPLED))
-def test_a_death_at_a_step_leaves_one_graph_whole(
-    home: Home, old: str, new: str, node: str, step: int
-) -> None:
-    strike(home, "process", old, new, node, step)
-
-
-@pytest.mark.parametrize(("old", "new", "node", "step"), sampled(PAIRS, "replica", SAMPLED // 3))
-def test_a_death_at_a_step_in_placement_replica(home: Home, old: str, new: str, node: str, step: int) -> None:
-    strike(home, "replica", old, new, node, step)
-
-
-@pytest.mark.deep
-@pytest.mark.timeout(3600)
-@pytest.mark.parametrize("placement", ["process", "replica"])
-@pytest.mark.parametrize(("old", "new"), PAIRS)
-def test_a_death_at_every_step(home: Home, placement: str, old: str, new: str) -> None:
-    for a, b, node, step in strikes([(old, new)], placement):
-        strike(home, placement, a, b, node, step)
 
 
 # -- bricks designed off line ---------------------------------------------------------------------

@@ -184,6 +184,7 @@ def test_what_an_adaptation_comes_through_is_the_supervisors(event: Event) -> No
 def test_in_an_adaptation_the_nodes_of_any_mechanism_can_be_hit() -> None:
     graph = build("pbr", "process")
     check(crash("a/tr.proceed", Trigger("adapt.step.enter", 3)), graph)
+    check(crash("a/tr.proceed'", Trigger("adapt.step.act", 3)), graph)
     with pytest.raises(ConfigError, match=r"unknown target 'a/tr\.proced'; did you mean 'a/tr\.proceed'\?"):
         check(crash("a/tr.proced", Trigger("adapt.step.enter", 3)), graph)
     with pytest.raises(ConfigError, match=r"unknown target 'a/tr\.proceed'"):

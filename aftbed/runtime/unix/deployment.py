@@ -15,6 +15,7 @@ import msgspec
 from aftbed.core.graph import Graph
 from aftbed.ftm.mechanism import REPLICAS
 from aftbed.ftm.watchdog import HANG_DEADLINE_NS
+from aftbed.runtime.targets import STAGED
 from aftbed.runtime.unix import control
 from aftbed.runtime.unix.channels import Channel, Channels
 from aftbed.runtime.unix.cores import Cores
@@ -26,7 +27,6 @@ from aftbed.runtime.unix.spawn import BUS, LIGHT
 WATCHED_KINDS: Final = ("client", "proxy", "watchdog", "recovery", "engine")
 
 BIRTH_SECONDS_MAX: Final = 10.0  # each makes its journal first, and a disk may be busy
-STAGED: Final = "'"  # behind the name of a process that is to become that node
 
 Keys = Generator[Wait, dict[Key, bytes], None]
 Staged = tuple[Process, tuple[Key, str]]  # a process, and the key of its Ack with its name
@@ -55,6 +55,7 @@ class Deployment:
         self.nodes: dict[str, Process] = {}
         self.incarnations: dict[str, int] = {}
         self.epoch, self.leader, self.backup = 1, REPLICAS[0], ""
+        self.lost: set[str] = set()  # replicas that an adaptation has left to Recovery
         self._tokens = 0
         self._cores = Cores(cpus)
         self._generations: dict[str, int] = {}

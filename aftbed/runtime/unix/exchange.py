@@ -12,7 +12,6 @@ import contextlib
 import signal
 import time
 from collections.abc import Callable, Generator, Iterable
-from hashlib import blake2b
 from typing import Final
 
 from aftbed.adapt.plan import drains
@@ -22,19 +21,18 @@ from aftbed.core.graph import Graph, Link
 from aftbed.core.script import Script, flat
 from aftbed.ftm.catalog import KINDS
 from aftbed.ftm.mechanism import REPLICAS, replication_of
+from aftbed.runtime.targets import STAGED
 from aftbed.runtime.unix import control
 from aftbed.runtime.unix.channels import Channel
-from aftbed.runtime.unix.deployment import STAGED, Deployment, Keys
+from aftbed.runtime.unix.deployment import Deployment, Keys
 from aftbed.runtime.unix.jobs import Key, StepFailed, Wait
 from aftbed.runtime.unix.processes import Process
 from aftbed.runtime.unix.rewiring import INPUT, Changes, replica_of, way_back
 from aftbed.runtime.unix.spawn import LIGHT
+from aftbed.runtime.unix.transfer import Seat, align, answered, ask, migrate, transfer
 
 PREPARE_SECONDS_MAX: Final = 5.0  # a stranger's module is imported and tested meanwhile
-STEP_SECONDS_MAX: Final = 0.5
 SUSPEND_SECONDS_MAX: Final = 0.25  # longer, and the client would rather have the old mechanism back
-
-Answer = Generator[Wait, dict[Key, bytes], bytes]
 
 
 class Exchange:
@@ -54,6 +52,7 @@ class Exchange:
         self._given: set[script.End] = set()  # ends that their bricks have
         self._rewired = False
         self._committing = False
+        self._opened = False  # the leader's Protocol has been let on
         self.committed = False
         self._born: list[str] = []
         self._lost: set[str] = set()  # replicas that are left to Recovery
@@ -64,19 +63,22 @@ class Exchange:
 
     def prepare(self) -> Keys:
         """Stage and bind what is new."""
-        yield from self._stage(v for v in flat(self._todo.prepare) if isinstance(v, script.Stage))
+        sent = []
+        for verb in flat(self._todo.prepare):
+            if isinstance(verb, script.Stage):
+                yield from self._enter()
+                sent.append((yield from self._stage(verb)))
+                yield from self._step(Event.ADAPT_STEP_ACT, self._number)
+        yield from answered(sent, PREPARE_SECONDS_MAX)
+        for number in range(1, self._number + 1):
+            yield from self._step(Event.ADAPT_STEP_EXIT, number)
         yield from self._rewire(v for v in flat(self._todo.prepare) if isinstance(v, script.Bind))
         yield from self._deployment.nursery.calm(LIGHT)
 
-    def _stage(self, verbs: Iterable[script.Stage]) -> Keys:
-        sent = []
-        for verb in verbs:
-            yield from self._enter()
-            process, key = yield from self._deployment.stage(verb.node, self.new, held=verb.held)
-            self._staged[verb.node] = process
-            sent.append(key)
-        if sent:
-            yield Wait(frozenset(k for k, _ in sent), frozenset(n for _, n in sent), PREPARE_SECONDS_MAX)
+    def _stage(self, verb: script.Stage) -> Generator[Wait, dict[Key, bytes], tuple[Key, str]]:
+        process, sent = yield from self._deployment.stage(verb.node, self.new, held=verb.held)
+        self._staged[verb.node] = process
+        return sent
 
     def commit(self) -> Keys:
         """All that the client waits for."""
@@ -85,13 +87,26 @@ class Exchange:
             for slot in self._deployment.slots.values():  # it kills what they watch
                 yield from self._deployment.watch(slot, nobody=True)
         self.closed_ns = time.monotonic_ns()
-        for verb in self._todo.commit:
-            yield from self._enter()
-            yield from self._do(verb)
-            yield from self._step(Event.ADAPT_STEP_EXIT, self._number)
+        try:
+            for verb in self._todo.commit:
+                yield from self._enter()
+                yield from self._under_way(self._do(verb))
+                yield from self._step(Event.ADAPT_STEP_EXIT, self._number)
+            self._assert_whole()
+        except StepFailed:
+            if self._opened:  # requests may have passed: the state that counts is in what is new
+                self._adopt()
+            raise
         self.opened_ns = time.monotonic_ns()
         self._adopt()
         yield from self._watch()
+
+    def _assert_whole(self) -> None:
+        """Raise StepFailed if a node of a replica is dead: not every step asks everybody."""
+        for node in self.new.nodes:
+            process = self._staged.get(node) or self._deployment.nodes.get(node)
+            if replica_of(node) and (process is None or not process.alive):
+                raise StepFailed(f"{node} died")
 
     def finish(self) -> Keys:
         """End what does not serve any more."""
@@ -106,6 +121,17 @@ class Exchange:
         self._number += 1
         yield from self._step(Event.ADAPT_STEP_ENTER, self._number)
 
+    def _under_way(self, steps: Keys) -> Keys:
+        """`steps`, and the event between the first that they ask for and the answer to it."""
+        wait = next(steps, None)
+        yield from self._step(Event.ADAPT_STEP_ACT, self._number)
+        while wait is not None:
+            got = yield wait
+            try:
+                wait = steps.send(got)
+            except StopIteration:
+                return
+
     # -- the verbs ----------------------------------------------------------------------------
 
     def _do(self, verb: script.AnyVerb) -> Keys:
@@ -115,15 +141,15 @@ class Exchange:
             case script.Drain(brick):
                 yield from self._suspend(brick, drain=True)
             case script.Align(source, sink):
-                yield from self._align(source, sink)
+                yield from align(self._deployment, self._seat(source), self._seat(sink))
             case script.Transfer(source, sink):
-                state = yield from self._ask(source, lambda token: control.Capture(token, source))
-                yield from self._ask(sink, lambda token: control.Restore(token, sink, state))
+                yield from transfer(self._deployment, self._seat(source), self._seat(sink))
             case script.Migrate(node):
                 self._migrated.append(node)
                 serving, staged = self._deployment.nodes[node], self._staged[node]
-                yield from self._migrate(self.old, serving, self.new, staged, node)
+                yield from migrate(self._deployment, self.old, serving, self.new, staged, node)
             case script.Together(verbs) if all(isinstance(v, script.Resume) for v in verbs):
+                self._assert_whole()
                 yield from self._resume([v.brick for v in verbs if isinstance(v, script.Resume)])
             case script.Resume(brick):
                 yield from self._resume([brick])
@@ -135,8 +161,8 @@ class Exchange:
                 self._process(brick).kill(signal.SIGCONT)
             case script.Destroy(node):
                 self._destroy(node)
-            case script.Stage():
-                yield from self._stage((verb,))
+            case script.Stage() as verb:
+                yield from answered([(yield from self._stage(verb))], PREPARE_SECONDS_MAX)
             case _:
                 raise StepFailed(f"{type(verb).__name__} has no place in the commit of an adaptation")
 
@@ -152,10 +178,8 @@ class Exchange:
             raise StepFailed(f"{node} is gone")
         return process
 
-    def _ask(
-        self, brick: str, make: Callable[[int], control.ToNode], seconds: float = STEP_SECONDS_MAX
-    ) -> Answer:
-        return (yield from self._ask_of(self._process(brick), make, seconds))
+    def _seat(self, brick: str) -> Seat:
+        return brick, self._process(brick)
 
     def _destroy(self, node: str) -> None:
         """With whatever is inside."""
@@ -167,45 +191,19 @@ class Exchange:
             del self._deployment.nodes[node]
 
     def _suspend(self, brick: str, *, drain: bool) -> Keys:
-        self._suspended.append((brick, self._process(brick)))
-        yield from self._ask(brick, lambda token: control.Suspend(token, drain), SUSPEND_SECONDS_MAX)
+        process = self._process(brick)
+        self._suspended.append((brick, process))
+        yield from ask(
+            self._deployment, process, lambda token: control.Suspend(token, drain), SUSPEND_SECONDS_MAX
+        )
 
     def _resume(self, bricks: Iterable[str]) -> Keys:
         sent = []
         for brick in bricks:
             sent.append(self._deployment.order_to(self._process(brick), control.Resume))
+            self._opened = self._opened or brick == f"{self._deployment.leader}/protocol"
             self._suspended = [(b, p) for b, p in self._suspended if b != brick]
-        yield Wait(frozenset(k for k, _ in sent), frozenset(n for _, n in sent), STEP_SECONDS_MAX)
-
-    def _align(self, source: str, sink: str) -> Keys:
-        asked = [
-            self._deployment.order_to(self._process(brick), lambda token, b=brick: control.Capture(token, b))  # type: ignore[misc]
-            for brick in (source, sink)
-        ]
-        got = yield Wait(frozenset(k for k, _ in asked), frozenset(n for _, n in asked), STEP_SECONDS_MAX)
-        states = [got[key] for key, _ in asked]
-        if blake2b(states[0]).digest() != blake2b(states[1]).digest():
-            yield from self._ask(sink, lambda token: control.Restore(token, sink, states[0]))
-
-    def _migrate(self, given: Graph, giver: Process, taken: Graph, taker: Process, node: str) -> Keys:
-        """The state of every brick that both have. What has none needs no taker."""
-        for brick in given.nodes[node]:
-            if brick not in taken.nodes[node]:
-                continue
-            state = yield from self._ask_of(giver, lambda token, b=brick: control.Capture(token, b))  # type: ignore[misc]
-            changed = given.brick(brick) != taken.brick(brick)
-            if state:
-                yield from self._ask_of(
-                    taker,
-                    lambda token, b=brick, s=state, c=changed: control.Restore(token, b, s, c),  # type: ignore[misc]
-                )
-
-    def _ask_of(
-        self, process: Process, make: Callable[[int], control.ToNode], seconds: float = STEP_SECONDS_MAX
-    ) -> Answer:
-        key, name = self._deployment.order_to(process, make)
-        got = yield Wait(frozenset({key}), frozenset({name}), seconds)
-        return got[key]
+        yield from answered(sent)
 
     # -- channels -----------------------------------------------------------------------------
 
@@ -249,8 +247,7 @@ class Exchange:
         for change in changes.values():
             order, fds = change.order(self._deployment.epoch)
             sent.append(self._deployment.order_to(change.process, order, fds))
-        if sent:
-            yield Wait(frozenset(k for k, _ in sent), frozenset(n for _, n in sent), STEP_SECONDS_MAX)
+        yield from answered(sent)
 
     def _bind(self, link: Link, of: Callable[[Process], Changes]) -> None:
         if self.new.node_of(link.source) == self.new.node_of(link.sink):
@@ -321,7 +318,10 @@ class Exchange:
         A replica that is `lost`, or has a dead node, is left to Recovery: nothing of it serves again.
         """
         deployment = self._deployment
-        self._lost = {lost, *(replica_of(n) for n, p in deployment.nodes.items() if not p.alive)} - {""}
+        # Before requests are let on, it is the old processes that count: a new one may be dead.
+        serving = deployment.nodes if self.committed else deployment.nodes | self._replaced
+        self._lost = {lost, *(replica_of(n) for n, p in serving.items() if not p.alive)} - {""}
+        deployment.lost |= self._lost
         if self.committed:
             yield from self._reverse_adoption()
         if self._rewired:
@@ -378,7 +378,7 @@ class Exchange:
         for node in self._migrated:
             giver, taker = deployment.nodes[node], self._replaced[node]
             with contextlib.suppress(StepFailed):
-                yield from self._migrate(self.new, giver, self.old, taker, node)
+                yield from migrate(deployment, self.new, giver, self.old, taker, node)
         for node in self._born:
             if node in deployment.nodes:
                 self._staged[node] = deployment.nodes.pop(node)

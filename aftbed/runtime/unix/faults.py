@@ -151,11 +151,16 @@ class Faults:
                 yield from self._place(armed)
 
     def at(self, event: Event) -> Keys:
-        """The executor has come to `event`: who is due is hit, and has been seen hit when this ends."""
+        """The executor has come to `event`: who is due is hit, and has been seen hit when this ends.
+
+        But for what is under way: there, the death and the answer to the step are on their way at once.
+        """
         for armed in list(self._armed):
             if armed.state == "armed" and armed.waits and armed.fault.event == event.label:
                 armed.left -= 1
-                if armed.left == 0:
+                if armed.left == 0 and event is Event.ADAPT_STEP_ACT:
+                    next(self._apply(armed), None)
+                elif armed.left == 0:
                     yield from self._apply(armed)
 
     def _look(self, armed: Armed) -> None:

@@ -135,6 +135,7 @@ class Nursery:
                     self.park(zygote, 1)
                 yield Wait(frozenset({("spare", zygote, 0)}), seconds=SPARE_SECONDS_MAX)
             process = self.parked[zygote].popleft()
+            self._rests(process)
             if process.alive:
                 return process
 
@@ -147,8 +148,12 @@ class Nursery:
         """Wait until no spare is being forked or rehearses: what comes next shall have the CPUs."""
         while self._unborn[zygote]:
             yield Wait(frozenset({("spare", zygote, 0)}), seconds=SPARE_SECONDS_MAX)
-        busy = {("rested", p.name, p.pid) for p in self.parked[zygote] if not p.rested and p.alive}
+        busy = {("rested", "spare", p.pid) for p in self.parked[zygote] if not p.rested and p.alive}
         yield Wait(frozenset(busy), seconds=SPARE_SECONDS_MAX)
+
+    def _rests(self, process: Process) -> None:
+        """It rehearses no more, or is none of the spares any more."""
+        self._loop.jobs.settle(("rested", "spare", process.pid))
 
     def level(self, zygote: str, count: int) -> None:
         """Have `count` spares parked, in the end."""
@@ -182,7 +187,7 @@ class Nursery:
                 self._hello(process, message.pid)
             elif isinstance(message, control.Rested):
                 process.rested = True
-                self._loop.jobs.settle(("rested", process.name, process.pid))
+                self._rests(process)
             elif not isinstance(message, control.Hello):
                 self._on_report(process, message)
 
@@ -202,6 +207,7 @@ class Nursery:
         self._heard(process)  # its last words are still in the line
         self._loop.forget(process.pidfd)
         process.alive = False
+        self._rests(process)
         self._on_death(process)
         self._loop.after(REAP_SECONDS, lambda: self._reap(process))
 

@@ -78,6 +78,6 @@ def _key(link: Link) -> tuple[str, str, str]:
 
 
 def replica_of(name: str) -> str:
-    """The replica of a node or brick, `""` for one of none."""
-    head, slash, _ = name.partition("/")
-    return head if slash or head in REPLICAS else ""
+    """The replica that is lost with a node or brick, `""` for one of none, such as a Watchdog."""
+    head, _, part = name.partition("/")
+    return head if head in REPLICAS and part != "watchdog" else ""

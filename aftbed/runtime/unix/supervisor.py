@@ -19,7 +19,7 @@ from aftbed.core import message, script
 from aftbed.core.errors import AftbedError
 from aftbed.core.event import Event
 from aftbed.core.script import Phase
-from aftbed.ftm.mechanism import STATEFUL, build, replication_of
+from aftbed.ftm.mechanism import build
 from aftbed.runtime.unix import control, linux
 from aftbed.runtime.unix.adaptations import ENGINE, Adaptations
 from aftbed.runtime.unix.deployment import WATCHED_KINDS, Deployment, Keys
@@ -293,18 +293,7 @@ class Supervisor:
         self.tell("roles", f"{roles}, epoch {deployment.epoch}")
         if self.executor.busy or not deployment.lives("recovery") or self._ending:
             return
-        slots = deployment.slots
-        situation = message.Situation(
-            deployment.leader,
-            slots[deployment.leader].generation if deployment.leader else 0,
-            deployment.backup,
-            slots[deployment.backup].generation if deployment.backup else 0,
-            deployment.epoch,
-            tuple(s.name for s in slots.values() if not s.nodes),
-            failed,
-            replication_of(deployment.graph.ftm),
-            STATEFUL,
-        )
+        situation = self.executor.situation(failed=failed)
         try:
             deployment.order("recovery", lambda token: control.Tell(token, "recovery", situation))
         except StepFailed as error:
@@ -340,7 +329,8 @@ class Supervisor:
         if self._ending or self.executor.busy or deployment.backup:
             return
         slot = deployment.slots.get(deployment.leader)
-        if slot is not None and slot.nodes and all(deployment.lives(node) for node in slot.nodes):
+        nodes = slot.nodes if slot is not None and deployment.leader not in deployment.lost else []
+        if nodes and all(deployment.lives(node) for node in nodes):
             return
         self.tell("lost", "no replica is left: the service is gone")
         if isinstance(self.options.work, LoadRun):

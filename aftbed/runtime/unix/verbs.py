@@ -13,7 +13,7 @@ from typing import Final
 from aftbed.core import message, script
 from aftbed.core.event import Event
 from aftbed.core.graph import Link
-from aftbed.ftm.mechanism import replication_of
+from aftbed.ftm.mechanism import STATEFUL, replication_of
 from aftbed.runtime.unix import control
 from aftbed.runtime.unix.channels import Channel
 from aftbed.runtime.unix.cores import BESIDE_LEADER
@@ -52,6 +52,23 @@ class Executor:
             raise
         finally:
             self.busy = False
+
+    def situation(self, *, failed: bool) -> message.Situation:
+        """What Recovery must know to order the next script."""
+        deployment = self._deployment
+        slots, leader, backup = deployment.slots, deployment.leader, deployment.backup
+        return message.Situation(
+            leader,
+            slots[leader].generation if leader else 0,
+            backup,
+            slots[backup].generation if backup else 0,
+            deployment.epoch,
+            tuple(s.name for s in slots.values() if not s.nodes),
+            failed,
+            replication_of(deployment.graph.ftm),
+            STATEFUL,
+            tuple(sorted(deployment.lost)),
+        )
 
     def _undo(self, todo: script.Script, held: list[str]) -> None:
         deployment = self._deployment
@@ -133,6 +150,7 @@ class Executor:
         for channel in deployment.channels.touching(slot.bricks):
             deployment.channels.drop(channel)
         slot.nodes = []
+        deployment.lost.discard(replica)
         if deployment.backup == replica:
             deployment.backup = ""
 

@@ -1,0 +1,73 @@
+"""State on its way from one brick to another, asked of the processes that host them.
+
+A brick captures its state as bytes and takes bytes back (design 4, the brick contract); what they mean is
+its own affair. Both ends are quiet while it happens: that is the business of whoever asks.
+"""
+
+from collections.abc import Callable, Generator
+from hashlib import blake2b
+from typing import Final
+
+from aftbed.core.graph import Graph
+from aftbed.runtime.unix import control
+from aftbed.runtime.unix.deployment import Deployment, Keys
+from aftbed.runtime.unix.jobs import Key, Wait
+from aftbed.runtime.unix.processes import Process
+
+EXCHANGE_SECONDS_MAX: Final = 0.5
+
+Answer = Generator[Wait, dict[Key, bytes], bytes]
+Seat = tuple[str, Process]  # a brick, and who hosts it
+
+
+def ask(
+    deployment: Deployment,
+    process: Process,
+    make: Callable[[int], control.ToNode],
+    seconds: float = EXCHANGE_SECONDS_MAX,
+) -> Answer:
+    """What `process` answers to one order. Raises `StepFailed` if it dies, refuses, or takes too long."""
+    key, name = deployment.order_to(process, make)
+    got = yield Wait(frozenset({key}), frozenset({name}), seconds)
+    return got[key]
+
+
+def answered(sent: list[tuple[Key, str]], seconds: float = EXCHANGE_SECONDS_MAX) -> Keys:
+    """Wait for what several processes answer, among them such as have no place in the graph yet."""
+    if sent:
+        yield Wait(frozenset(k for k, _ in sent), frozenset(n for _, n in sent), seconds)
+
+
+def transfer(deployment: Deployment, source: Seat, sink: Seat) -> Keys:
+    """The sink's state is the source's."""
+    state = yield from ask(deployment, source[1], lambda token: control.Capture(token, source[0]))
+    yield from ask(deployment, sink[1], lambda token: control.Restore(token, sink[0], state))
+
+
+def align(deployment: Deployment, source: Seat, sink: Seat) -> Keys:
+    """The same, where the two differ: both are asked at once, and the digests are compared."""
+    asked = [
+        deployment.order_to(process, lambda token, b=brick: control.Capture(token, b))  # type: ignore[misc]
+        for brick, process in (source, sink)
+    ]
+    got = yield Wait(frozenset(k for k, _ in asked), frozenset(n for _, n in asked), EXCHANGE_SECONDS_MAX)
+    states = [got[key] for key, _ in asked]
+    if blake2b(states[0]).digest() != blake2b(states[1]).digest():
+        yield from ask(deployment, sink[1], lambda token: control.Restore(token, sink[0], states[0]))
+
+
+def migrate(
+    deployment: Deployment, given: Graph, giver: Process, taken: Graph, taker: Process, node: str
+) -> Keys:
+    """The state of every brick that `node` has in both graphs. What has none needs no taker."""
+    for brick in given.nodes[node]:
+        if brick not in taken.nodes[node]:
+            continue
+        state = yield from ask(deployment, giver, lambda token, b=brick: control.Capture(token, b))  # type: ignore[misc]
+        changed = given.brick(brick) != taken.brick(brick)
+        if state:
+            yield from ask(
+                deployment,
+                taker,
+                lambda token, b=brick, s=state, c=changed: control.Restore(token, b, s, c),  # type: ignore[misc]
+            )

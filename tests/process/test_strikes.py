@@ -1,0 +1,159 @@
+"""A death at every step of every adaptation: before it, while it is under way, after it (promise G5).
+
+One run walks from mechanism to mechanism, and at each adaptation somebody is struck: a node of the old
+graph, a process that is staged for the new one, the Engine, Recovery, the Proxy. Whatever comes of it, the
+old or the new graph is whole afterwards, redundancy is back, requests are answered, each once; the next
+adaptation starts from what is there. Names are those of a run that `a` leads; where `b` leads, they are
+exchanged.
+
+The process tier strikes at a sample drawn from a fixed seed, the deep tier everywhere.
+"""
+
+import itertools
+import random
+from collections.abc import Iterable, Iterator
+from typing import Final, NamedTuple
+
+import pytest
+from liveruns import Home, Started, until
+from test_adaptations import (
+    PAPER,
+    adapt,
+    assert_nothing_happened_to_requests,
+    ended,
+    graph_of,
+    serving,
+    whole,
+)
+
+from aftbed.adapt.plan import plan, target
+from aftbed.core.errors import ConfigError
+from aftbed.core.event import Event
+from aftbed.core.fault import Act, Fault, Trigger
+from aftbed.core.message import Goal
+from aftbed.core.script import Stage, flat
+from aftbed.ftm.mechanism import build
+from aftbed.runtime.targets import STAGED
+from aftbed.runtime.unix import ask
+
+pytestmark = pytest.mark.process
+
+WHEN: Final = (Event.ADAPT_STEP_ENTER, Event.ADAPT_STEP_ACT, Event.ADAPT_STEP_EXIT)
+PAIRS: Final = tuple(itertools.permutations(PAPER, 2))
+ELSEWHERE: Final = ("client", "a/watchdog", "b/watchdog")  # no part of an adaptation
+SEED: Final = 20161118
+SAMPLED: Final = 20
+STRIKES_MAX: Final = 40  # in one run
+OTHER: Final = {"a": "b", "b": "a"}
+
+
+class Strike(NamedTuple):
+    """Who dies at which step of an adaptation, and on which side of it."""
+
+    old: str
+    new: str
+    node: str
+    when: Event
+    step: int
+
+
+def strikes(old: str, new: str, placement: str) -> Iterator[Strike]:
+    """All of one way: each node that takes part, and each process that is staged, as soon as it is."""
+    start = build(old, placement)
+    script = plan(start, target(start, new)).script
+    staged = [v.node for v in flat(script.prepare) if isinstance(v, Stage)]
+    steps = range(1, len(staged) + len(script.commit) + 1)
+    for node, when, step in itertools.product(start.nodes, WHEN, steps):
+        if node not in ELSEWHERE:
+            yield Strike(old, new, node, when, step)
+    for node, when, step in itertools.product(staged, WHEN, steps):
+        if when is Event.ADAPT_STEP_EXIT or (step, WHEN.index(when)) > (len(staged), 0):  # all are staged
+            yield Strike(old, new, f"{node}{STAGED}", when, step)
+
+
+def mirrored(node: str, leader: str) -> str:
+    """The same node of a run that `leader` leads."""
+    replica, _, part = node.partition("/")
+    stem = replica.removesuffix(STAGED)
+    if leader == "a" or stem not in OTHER:
+        return node
+    return replica.replace(stem, OTHER[stem]) + (f"/{part}" if part else "")
+
+
+def strike(run: Started, struck: Strike, placement: str) -> str:
+    """One adaptation with one death; the mechanism that runs after it."""
+    leader = str(run.status()["leader"])
+    fault = Fault(Act.CRASH, mirrored(struck.node, leader), Trigger(struck.when.label, struck.step))
+    ask.ask(run.private, ask.Inject(fault))
+    came_to = struck.new if how_it_ended(run, Goal(expression=struck.new)) == "done" else struck.old
+    until(run.redundant, f"redundancy after {struck}")
+    assert graph_of(run) == whole(came_to, placement, str(run.status()["leader"])), struck
+    run.wait_for_answers(run.answered() + 1)
+    return came_to
+
+
+def how_it_ended(run: Started, goal: Goal) -> str:
+    """`done`, `rolled back`, or `refused` where the Engine died before it had planned."""
+    try:
+        return str(adapt(run, goal)["outcome"])
+    except ConfigError:
+        return "refused"
+
+
+def walk(home: Home, placement: str, todo: Iterable[Strike]) -> int:
+    """Strike at each of `todo`, in runs of at most STRIKES_MAX; how many it survived. Prints the breaches."""
+    left: dict[str, list[Strike]] = {}
+    for struck in todo:
+        left.setdefault(struck.old, []).append(struck)
+    survived = 0
+    while any(left.values()):
+        at = next(old for old, waiting in left.items() if waiting)
+        done: list[Strike] = []
+        with serving(home, at, placement) as run:
+            try:
+                while len(done) < STRIKES_MAX and left.get(at):
+                    done.append(left[at].pop())
+                    at = strike(run, done[-1], placement)
+                outcome = ended(run)
+                assert_nothing_happened_to_requests(outcome)
+                receipts = [f["receipt"] for f in outcome.verdict.faults]
+                assert receipts == ["applied"] * len(done), list(zip(receipts, done, strict=True))
+            except (AssertionError, pytest.fail.Exception) as error:
+                print(f"BROKEN at {done[-1]}, the last of {len(done)}: {error}")
+                print("".join(f"    {e['t_ms']} {e['event']} {e['text']}\n" for e in run.heard()[-40:]))
+                survived -= 1
+        survived += len(done)
+    return survived
+
+
+def sampled(placement: str, count: int) -> list[Strike]:
+    """Some of all, the same every time."""
+    return random.Random(SEED).sample([s for pair in PAIRS for s in strikes(*pair, placement)], count)
+
+
+@pytest.mark.parametrize("placement", ["process", "replica"])
+def test_a_death_at_a_step_leaves_one_graph_whole(home: Home, placement: str) -> None:
+    assert walk(home, placement, sampled(placement, SAMPLED)) == SAMPLED
+
+
+@pytest.mark.parametrize("node", ["a", "b", "b'"])
+@pytest.mark.parametrize("when", WHEN, ids=str)
+def test_a_death_while_requests_are_let_on(home: Home, node: str, when: Event) -> None:
+    last = max(s.step for s in strikes("pbr", "lfr", "replica"))
+    assert walk(home, "replica", [Strike("pbr", "lfr", node, when, last)]) == 1
+
+
+def test_an_engine_that_dies_takes_a_spare_that_the_adaptation_waits_for(home: Home) -> None:
+    fault = Fault(Act.CRASH, "engine", Trigger(Event.ADAPT_STEP_EXIT.label, 1))
+    with serving(home, "pbr", "process", fault) as run:
+        assert how_it_ended(run, Goal(expression="pbr+tr")) == "done"
+        assert_nothing_happened_to_requests(ended(run))
+
+
+@pytest.mark.deep
+@pytest.mark.timeout(7200)
+@pytest.mark.parametrize("placement", ["process", "replica"])
+@pytest.mark.parametrize(("old", "new"), PAIRS)
+def test_a_death_at_every_step(home: Home, placement: str, old: str, new: str) -> None:
+    todo = list(strikes(old, new, placement))
+    assert walk(home, placement, todo) == len(todo)
