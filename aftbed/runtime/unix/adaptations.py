@@ -23,7 +23,7 @@ from aftbed.runtime.unix import control
 from aftbed.runtime.unix.deployment import Deployment, Keys
 from aftbed.runtime.unix.exchange import Exchange
 from aftbed.runtime.unix.faults import Faults
-from aftbed.runtime.unix.jobs import StepFailed
+from aftbed.runtime.unix.jobs import StepFailed, Wait
 from aftbed.runtime.unix.journal import Journal
 from aftbed.runtime.unix.loop import Loop
 from aftbed.runtime.unix.options import Scheduled
@@ -32,6 +32,7 @@ from aftbed.runtime.unix.verbs import Executor
 
 ENGINE: Final = "engine"
 HISTORY_NAME: Final = "adaptations.jsonl"
+REPLACE: Final = "replace "  # begins the names of jobs that hand channels out
 RETRY_SECONDS: Final = 0.01
 RETRIES_MAX: Final = 100
 FIRST_TRIGGER: Final = 2_000_001  # apart from the numbers of faults and the tokens of orders
@@ -66,6 +67,11 @@ def _armed(blow: control.Blow, token: int) -> control.Arm:
     return control.Arm(token, Event.REQUEST_SENT.label, (blow,))
 
 
+def _spoiled(reason: str) -> Keys:
+    yield Wait(frozenset())
+    raise StepFailed(reason)
+
+
 class _Current:
     """The one under way."""
 
@@ -77,6 +83,7 @@ class _Current:
         self.phase = Phase.PREPARE
         self.ended, self.failure = False, ""
         self.lost = ""  # a replica
+        self.spoiled = ""  # why what has been prepared must not be committed
         self.exchange: Exchange | None = None
 
 
@@ -117,8 +124,10 @@ class Adaptations:
     def give_up_preparing(self, reason: str) -> None:
         """What is staged has ends of channels that are being renewed."""
         now = self._current
-        if now is not None and now.phase is Phase.PREPARE and not now.ended:
-            self._loop.jobs.cancel(f"adapt {now.phase.value}", reason)
+        if now is not None and now.phase is Phase.PREPARE:
+            now.spoiled = reason
+            if not now.ended:
+                self._loop.jobs.cancel(f"adapt {now.phase.value}", reason)
 
     # -- asked for ----------------------------------------------------------------------------
 
@@ -131,7 +140,8 @@ class Adaptations:
                 " wait for its end (aftbed adapt history)"
             )
         alone = len(deployment.slots) > 1 and not deployment.backup
-        if self._executor.busy or alone or not deployment.lives(ENGINE):
+        replacing = any(job.startswith(REPLACE) for job in self._loop.jobs.names())
+        if self._executor.busy or alone or replacing or not deployment.lives(ENGINE):
             if deployment.graph.ftm == "none" or not retries or not deployment.leader:
                 raise ConfigError(
                     f"{deployment.graph.ftm}: no adaptation now: leader {deployment.leader or 'nobody'},"
@@ -199,12 +209,12 @@ class Adaptations:
         exchange = now.exchange
         phases: dict[Phase, Callable[[], Keys]] = {
             Phase.PREPARE: exchange.prepare,
-            Phase.COMMIT: exchange.commit,
+            Phase.COMMIT: functools.partial(_spoiled, now.spoiled) if now.spoiled else exchange.commit,
             Phase.FINISH: exchange.finish,
             Phase.UNDO: functools.partial(exchange.undo, now.lost),
         }
         if phase in (Phase.COMMIT, Phase.UNDO):
-            self._executor.busy = True
+            self._executor.held = True
         self._loop.jobs.start(
             f"adapt {phase.value}", phases[phase](), lambda failure: self._ended(now, failure)
         )
@@ -225,7 +235,7 @@ class Adaptations:
             closed = now.exchange.opened_ns - now.exchange.closed_ns
             now.outcome.blackout_ms = round(closed / 1e6, 3)
         if not (now.phase is Phase.COMMIT and failure):
-            self._executor.busy = False
+            self._executor.held = False
         self._say(message.Progress(now.outcome.number, now.phase, failure))
         if now.phase in (Phase.COMMIT, Phase.UNDO) and not self._executor.busy:
             self._inform_recovery()
@@ -235,8 +245,8 @@ class Adaptations:
         now, self._current = self._current, None
         if now is None:
             return
-        if self._executor.busy and now.phase is Phase.COMMIT:  # it failed, and there is no way back
-            self._executor.busy = False
+        if self._executor.held and now.phase is Phase.COMMIT:  # it failed, and there is no way back
+            self._executor.held = False
             self._inform_recovery()
         outcome = now.outcome
         outcome.outcome, outcome.reason = told.outcome, told.reason
@@ -275,7 +285,7 @@ class Adaptations:
             return False
         self.give_up_preparing(f"replica {replica} is lost")  # its undoing touches nothing that serves
         if now.phase is Phase.COMMIT and now.ended and not now.failure:
-            self._executor.busy = True
+            self._executor.held = True
             now.lost = replica
             now.failure = f"replica {replica} was lost within the observation window"
             self._say(message.Progress(now.outcome.number, Phase.COMMIT, now.failure))

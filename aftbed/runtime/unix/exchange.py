@@ -321,8 +321,8 @@ class Exchange:
         # Before requests are let on, it is the old processes that count: a new one may be dead.
         serving = deployment.nodes if self.committed else deployment.nodes | self._replaced
         self._lost = {lost, *(replica_of(n) for n, p in serving.items() if not p.alive)} - {""}
-        deployment.lost |= self._lost
-        if self.committed:
+        if self.committed:  # else the Watchdogs have seen it
+            deployment.lost |= self._lost
             yield from self._reverse_adoption()
         if self._rewired:
             with contextlib.suppress(StepFailed):  # who dies meanwhile is left to Recovery

@@ -21,7 +21,7 @@ from aftbed.core.event import Event
 from aftbed.core.script import Phase
 from aftbed.ftm.mechanism import build
 from aftbed.runtime.unix import control, linux
-from aftbed.runtime.unix.adaptations import ENGINE, Adaptations
+from aftbed.runtime.unix.adaptations import ENGINE, REPLACE, Adaptations
 from aftbed.runtime.unix.deployment import WATCHED_KINDS, Deployment, Keys
 from aftbed.runtime.unix.faults import Faults
 from aftbed.runtime.unix.jobs import STATS_JOB, StepFailed
@@ -360,7 +360,7 @@ class Supervisor:
                 self.adaptations.engine_is_new()
             self.nursery.level(LIGHT, self._spares())
 
-        self.loop.jobs.start(f"replace {node}", self.deployment.respawn(node), ended)
+        self.loop.jobs.start(f"{REPLACE}{node}", self.deployment.respawn(node), ended)
 
     def _tick(self) -> None:
         """Look after the pulses of what no Watchdog watches: a node that hangs is killed, and replaced."""

@@ -29,16 +29,22 @@ class Executor:
 
     def __init__(self, deployment: Deployment, journal: Journal, tell: Callable[[str, str], None]) -> None:
         self._deployment, self._journal, self._tell = deployment, journal, tell
-        self.busy = False
+        self._running = False
+        self.held = False  # an adaptation acts on what serves
         self._promoting: Wait | None = None  # what Promote has yet to come to
         self._last_words: Channel | None = None  # from a fenced leader to the Proxy
+
+    @property
+    def busy(self) -> bool:
+        """No other script may begin."""
+        return self._running or self.held
 
     def execute(self, todo: script.Script) -> Keys:
         """Prepare, then commit. Raises StepFailed, having undone what hurts."""
         found = script.problems(todo)
         if found:
             raise StepFailed("; ".join(found))
-        self.busy = True
+        self._running = True
         held: list[str] = []
         try:
             for verb in (*todo.prepare, *todo.commit):
@@ -51,7 +57,7 @@ class Executor:
             self._undo(todo, held)
             raise
         finally:
-            self.busy = False
+            self._running = False
 
     def situation(self, *, failed: bool) -> message.Situation:
         """What Recovery must know to order the next script."""
