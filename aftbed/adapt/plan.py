@@ -162,7 +162,7 @@ class _Change:
 
     def __init__(self, old: Graph, new: Graph) -> None:
         self.old, self.new = old, new
-        self.leader = leader_of(new)
+        self.leader = leader_of(old)  # which an adaptation does not change
         self.old_bricks = {b.name: b for b in old.bricks}
         self.new_bricks = {b.name: b for b in new.bricks}
         self.exchanged = [

@@ -13,8 +13,8 @@ from aftbed.adapt.bricks import load_application
 from aftbed.campaign.record import RunRecord
 from aftbed.core.application import Application
 from aftbed.core.event import Event
-from aftbed.runtime.unix.adaptations import HISTORY_NAME
 from aftbed.runtime.unix.part import load_module
+from aftbed.runtime.unix.support import HISTORY_NAME
 from aftbed.vehicle.function import default_application
 
 Make = Callable[[], Application]

@@ -27,11 +27,10 @@ from aftbed.cli.adaptview import Outcome, history_lines, outcome_lines, plan_lin
 from aftbed.core.application import Characteristics
 from aftbed.core.errors import ConfigError
 from aftbed.core.graph import PLACEMENTS, BrickSpec, Graph
-from aftbed.core.message import Goal
+from aftbed.core.message import Goal, Scheduled
 from aftbed.core.script import AnyVerb, Script, Stage, Together
 from aftbed.ftm.mechanism import build, replication_of
 from aftbed.runtime.unix import ask, rundir
-from aftbed.runtime.unix.options import Scheduled
 
 AMPLE: Final = Resources(cpus=1024)
 EXIT_CODES: Final = {"done": 0, "rolled back": 1, "refused": 2}

@@ -14,13 +14,14 @@ from aftbed.cli.view import View, open_view
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.fault import Fault
 from aftbed.core.graph import Graph
+from aftbed.core.message import Scheduled
 from aftbed.core.script import RECIPES
 from aftbed.ftm.mechanism import build
 from aftbed.inject.words import parse
 from aftbed.runtime import targets
-from aftbed.runtime.unix.control import Report
+from aftbed.runtime.control import Report
 from aftbed.runtime.unix.launch import Launched, launch, options_for
-from aftbed.runtime.unix.options import CarRun, LoadRun, ReplayRun, Scheduled, Work
+from aftbed.runtime.unix.options import CarRun, LoadRun, ReplayRun, Work
 
 if TYPE_CHECKING:
     from aftbed.adapt.policy import Policy

@@ -222,6 +222,14 @@ class Goal(msgspec.Struct, frozen=True):
     recipe: str = "drained"
 
 
+class Scheduled(msgspec.Struct, frozen=True):
+    """An adaptation that begins when request `at_request` is sent, or `after_ms` after the launch."""
+
+    goal: Goal
+    at_request: int = 0
+    after_ms: float = 0.0
+
+
 class Adapt(Message, frozen=True, array_like=True, gc=False, tag=40):
     """Runtime to the Engine: adaptation `number`, from the graph that runs."""
 

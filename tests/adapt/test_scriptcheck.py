@@ -274,3 +274,12 @@ def test_of_no_plan_can_a_step_be_left_out(case: Case, phase: str, data: st.Data
     ):
         return
     assert refusals(there.old, msgspec.structs.replace(there.script, **{phase: rest})) != [], lost
+
+
+def test_a_beginning_that_leaves_the_proxy_bound_to_nobody_is_looked_at_as_well() -> None:
+    there = Case("assert", "pbr+assert", "replica", "a", "drained").plan()
+    (opened,) = there.script.commit[-1:]
+    assert isinstance(opened, Together) and Resume("b/protocol") in opened.verbs
+    without = Together(tuple(v for v in opened.verbs if v != Resume("b/protocol")))
+    script = msgspec.structs.replace(there.script, commit=(*there.script.commit[:-1], without))
+    assert refusals(there.old, script) != []

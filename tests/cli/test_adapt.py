@@ -21,11 +21,11 @@ from aftbed.cli.adaptation import scheduled
 from aftbed.cli.adaptview import WIDTH
 from aftbed.core.errors import ConfigError
 from aftbed.core.graph import Graph
-from aftbed.core.message import Goal
+from aftbed.core.message import Goal, Scheduled
 from aftbed.core.script import Script, Stage, flat
 from aftbed.ftm.mechanism import build
 from aftbed.runtime.unix import ask, rundir
-from aftbed.runtime.unix.options import RunOptions, Scheduled
+from aftbed.runtime.unix.options import RunOptions
 
 Run = Callable[..., str]
 VARIANTS: Final = "aftbed.vehicle.variants"

@@ -19,10 +19,11 @@ from aftbed.core.event import Event
 from aftbed.core.fault import Act, Flip, Place, flipped, mark, marked
 from aftbed.core.journal import Record, records
 from aftbed.core.message import AnyMessage, CaptureState, Message, Reply, Request, StateCaptured, Tried
-from aftbed.runtime.unix import control
+from aftbed.runtime import control
+from aftbed.runtime.orders import carry_out
 from aftbed.runtime.unix.journal import Journal
+from aftbed.runtime.unix.line import Line, decode_order, decode_report
 from aftbed.runtime.unix.node import Node
-from aftbed.runtime.unix.orders import carry_out
 
 STATE: Final = b"\x00\x01\x02\x03"
 REFUSED: Final = 0x80  # in the last byte of a state: no state has it
@@ -77,9 +78,9 @@ class Host:
     def __init__(self, path: Path, brick: Executing) -> None:
         self.brick, self.path, self.out = brick, path, list[Message]()
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        self.line = control.Line(ours, control.decode_report)
+        self.line = Line(ours, decode_report)
         ours.setblocking(False)
-        self.node = Node("a", control.Line(theirs, control.decode_order), Journal(path, "a"))
+        self.node = Node("a", Line(theirs, decode_order), Journal(path, "a"))
         for name in ("a/server", "b/server"):  # as in placement `single`
             self.node.add(name, brick)
             self.node.wiring.hosted[name].outs["out"] = self.out.append

@@ -13,11 +13,12 @@ from aftbed.core.event import Event
 from aftbed.core.fault import Fault, mark
 from aftbed.ftm.mechanism import build
 from aftbed.inject.words import parse
-from aftbed.runtime.unix import control
-from aftbed.runtime.unix.faults import Faults
-from aftbed.runtime.unix.jobs import StepFailed, Wait
+from aftbed.runtime import control
+from aftbed.runtime.faults import Faults
+from aftbed.runtime.jobs import StepFailed, Wait
 from aftbed.runtime.unix.journal import Journal
 from aftbed.runtime.unix.loop import Loop
+from aftbed.runtime.unix.support import Support
 
 FIRST: Final = 1_000_001  # the number of a run's first fault
 
@@ -27,14 +28,23 @@ class FakeProcess:
 
     def __init__(self, name: str, folder: Path, incarnation: int) -> None:
         self.name, self.pid, self.pidfd, self.kind = name, 10_000 + incarnation, -1, "node"
-        self.journal = folder / f"{name.replace('/', '.')}.{incarnation}.journal"
-        self.wrote = Journal(self.journal, name)
+        path = folder / f"{name.replace('/', '.')}.{incarnation}.journal"
+        self.journal, self.wrote = str(path), Journal(path, name)
         self.alive = True
         self.signals: list[int] = []
 
-    def kill(self, sig: int = 9) -> None:
-        self.signals.append(sig)
-        self.alive = sig != 9
+    def kill(self) -> None:
+        self.signals.append(9)
+        self.alive = False
+
+    def freeze(self) -> None:
+        self.signals.append(19)
+
+    def thaw(self) -> None:
+        self.signals.append(18)
+
+    def stopped(self) -> bool:
+        return bool(self.signals)
 
 
 class FakeSlot:
@@ -87,14 +97,17 @@ class Run:
     def __init__(self, folder: Path, ftm: str = "pbr", seed: int = 0, placement: str = "process") -> None:
         self.deployment = FakeDeployment(folder, ftm, placement)
         self.said: list[str] = []
-        self.journal = Journal(folder / "supervisor.journal", "supervisor")
-        self.faults = Faults(
-            self.deployment,  # type: ignore[arg-type]
+        (folder / "journal").mkdir()
+        support = Support(
+            folder,
             Loop(),
-            self.journal,
+            self.deployment,  # type: ignore[arg-type]
+            lambda kind, incarnation: ("", b""),
             lambda event, text: self.said.append(f"{event}: {text}"),
             seed,
         )
+        self.deployment.support = support
+        self.faults = Faults(self.deployment)  # type: ignore[arg-type]
 
     def do(self, steps: Generator[Wait, object, None]) -> list[Wait]:
         """Run a job to its end; what it waited for, all of which is so."""

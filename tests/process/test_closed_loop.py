@@ -19,7 +19,7 @@ from aftbed.core import journal
 from aftbed.core.errors import PeerError
 from aftbed.core.event import Event
 from aftbed.core.journal import RECORD, Record
-from aftbed.runtime.unix.adaptations import Outcome
+from aftbed.runtime.adaptations import Outcome
 from aftbed.runtime.unix.closedloop import Proposed, load_policy, policy_names, read_proposals
 from aftbed.runtime.unix.observation import CHUNK_BYTES, Journals, Lines, Meter, Tail, lost
 

@@ -27,7 +27,7 @@ from test_adaptations import (
 )
 
 from aftbed.adapt.plan import plan, target
-from aftbed.core.errors import ConfigError
+from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.core.event import Event
 from aftbed.core.fault import Act, Fault, Trigger
 from aftbed.core.message import Goal
@@ -118,7 +118,7 @@ def walk(home: Home, placement: str, todo: Iterable[Strike]) -> int:
                 assert_nothing_happened_to_requests(outcome)
                 receipts = [f["receipt"] for f in outcome.verdict.faults]
                 assert receipts == ["applied"] * len(done), list(zip(receipts, done, strict=True))
-            except (AssertionError, pytest.fail.Exception) as error:
+            except (AssertionError, HarnessError, pytest.fail.Exception) as error:
                 print(f"BROKEN at {done[-1]}, the last of {len(done)}: {error}")
                 print("".join(f"    {e['t_ms']} {e['event']} {e['text']}\n" for e in run.heard()[-40:]))
                 survived -= 1

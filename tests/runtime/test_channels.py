@@ -9,7 +9,8 @@ from typing import Final
 import pytest
 
 from aftbed.core.graph import Link
-from aftbed.runtime.unix.channels import Channel, Channels
+from aftbed.runtime.channels import Channels
+from aftbed.runtime.unix.channels import Channel
 from aftbed.runtime.unix.node import NUDGE
 
 LINK: Final = Link("a/after", "aft2aft", "b/after", "aft2aft")
@@ -138,7 +139,7 @@ def test_a_nudge_behind_a_fence_is_not_missed(channel: Channel) -> None:
 
 @pytest.fixture
 def channels() -> Iterator[Channels]:
-    found = Channels()
+    found = Channels(Channel)
     for link in (
         LINK,
         Link("a/after", "aft2pro", "a/protocol", "aft2pro"),

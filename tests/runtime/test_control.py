@@ -17,8 +17,8 @@ from aftbed.core import script
 from aftbed.core.errors import PeerError
 from aftbed.core.fault import Act, Fault, Trigger
 from aftbed.core.wire import PACKET_BYTES_MAX
-from aftbed.runtime.unix import control
-from aftbed.runtime.unix.control import FDS_MAX, Line
+from aftbed.runtime import control
+from aftbed.runtime.unix.line import FDS_MAX, STATE_BYTES_MAX, Line, decode_order, decode_report
 
 ORDERS: Final[tuple[type[msgspec.Struct], ...]] = get_args(control.ToNode)
 REPORTS: Final[tuple[type[msgspec.Struct], ...]] = get_args(control.FromNode)
@@ -66,8 +66,8 @@ class Pair:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         for end in (ours, theirs):
             end.setblocking(False)
-        self.ours = Line(ours, control.decode_report)
-        self.theirs = Line(theirs, control.decode_order)
+        self.ours = Line(ours, decode_report)
+        self.theirs = Line(theirs, decode_order)
 
     def __enter__(self) -> Self:
         return self
@@ -208,10 +208,10 @@ def test_a_packet_over_the_limit_is_refused(pair: Pair) -> None:
 
 def test_a_file_over_the_limit_is_refused_unread(pair: Pair) -> None:
     fd = os.memfd_create("test")
-    os.ftruncate(fd, control.STATE_BYTES_MAX + 1)
+    os.ftruncate(fd, STATE_BYTES_MAX + 1)
     socket.send_fds(pair.ours.sock, [b"\xc1"], [fd])
     os.close(fd)
-    with pytest.raises(PeerError, match=f"at most {control.STATE_BYTES_MAX} are allowed"):
+    with pytest.raises(PeerError, match=f"at most {STATE_BYTES_MAX} are allowed"):
         pair.theirs.recv()
 
 

@@ -6,7 +6,7 @@ from typing import Final
 
 import pytest
 
-from aftbed.runtime.unix.jobs import EARLY_MAX, STEP_SECONDS_MAX, Jobs, Key, StepFailed, Steps, Wait
+from aftbed.runtime.jobs import EARLY_MAX, STEP_SECONDS_MAX, Jobs, Key, StepFailed, Steps, Wait
 
 ONE: Final[Key] = ("ack", "a/after", 1)
 TWO: Final[Key] = ("ack", "b/after", 2)
@@ -37,7 +37,7 @@ class Run:
 
 @pytest.fixture
 def jobs() -> Jobs:
-    return Jobs()
+    return Jobs(time.monotonic_ns)
 
 
 def test_a_job_goes_on_when_all_its_keys_are_settled(jobs: Jobs) -> None:

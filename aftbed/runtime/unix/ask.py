@@ -12,7 +12,8 @@ import msgspec
 from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.core.fault import Fault
 from aftbed.core.message import Goal
-from aftbed.runtime.unix import control, rundir
+from aftbed.runtime.unix import rundir
+from aftbed.runtime.unix.line import Line
 from aftbed.runtime.unix.resources import Row
 
 ANSWER_SECONDS_MAX: Final = 2.0
@@ -74,7 +75,7 @@ def processes(private: Path) -> list[Row]:
     return msgspec.convert(ask(private, Processes())["processes"], list[Row])
 
 
-Waiting = control.Line[Answer]
+Waiting = Line[Answer]
 
 
 def ask(private: Path, question: Question, seconds: float = ANSWER_SECONDS_MAX) -> dict[str, object]:
@@ -85,7 +86,7 @@ def ask(private: Path, question: Question, seconds: float = ANSWER_SECONDS_MAX) 
 def send(private: Path, question: Question) -> Waiting:
     """Ask; the answer is for `receive`. Raises ConfigError where nobody listens."""
     try:
-        line = control.Line(rundir.connect(private), decode_answer)
+        line = Line(rundir.connect(private), decode_answer)
     except OSError as error:
         raise ConfigError(f"run {private.name} does not answer: {error.strerror}") from None
     try:

@@ -43,9 +43,10 @@ from aftbed.core.errors import AftbedError, ConfigError, PeerError, unknown
 from aftbed.core.journal import Record
 from aftbed.core.message import Goal
 from aftbed.ftm.mechanism import NONE, replication_of
+from aftbed.runtime.adaptations import Outcome
 from aftbed.runtime.unix import ask
-from aftbed.runtime.unix.adaptations import HISTORY_NAME, Outcome
 from aftbed.runtime.unix.observation import MEASURED, Journals, Lines, Meter, lost
+from aftbed.runtime.unix.support import HISTORY_NAME
 
 PERIOD_SECONDS: Final = 0.1
 PROPOSALS_NAME: Final = "proposals.jsonl"

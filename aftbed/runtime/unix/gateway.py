@@ -6,7 +6,6 @@ from typing import Final
 
 import msgspec
 
-from aftbed.core.errors import PeerError
 from aftbed.core.journal import EntryKind
 from aftbed.core.message import Reply, Submit
 from aftbed.ftm.client import BACKLOG_MAX, Client
@@ -15,7 +14,7 @@ from aftbed.runtime.unix.journal import Dialogue
 from aftbed.runtime.unix.options import GatewayOptions
 from aftbed.vehicle.bus import BusOptions, open_bus
 from aftbed.vehicle.dbcfile import load_dbc
-from aftbed.vehicle.gateway import BusGateway, Gateway
+from aftbed.vehicle.gateway import ClientGateway, Gateway
 from aftbed.vehicle.mapfile import find_map
 from aftbed.vehicle.mapped import MappedGateway
 
@@ -34,10 +33,7 @@ class GatewayDevice:
         self._gateway = _gateway(options)
         self._bus = open_bus(BusOptions(port=options.port))
         self._payloads: deque[bytes] = deque()
-        self._t_us = 0
-        self._answered = 0
         self._overrun = 0
-        self._refused = 0
         self._quiet = False
         self._sent_ns = 0
         self._cycle_us = 0.0  # of the last request
@@ -49,7 +45,6 @@ class GatewayDevice:
     def ready(self, fd: int, now_ns: int) -> None:
         """Take all frames that are there."""
         for frame in self._bus.drain():
-            self._t_us = max(self._t_us, frame.t_us)
             payload = self._gateway.on_frame(frame)
             if payload is None:
                 continue
@@ -69,16 +64,8 @@ class GatewayDevice:
 
     def accept(self, reply: Reply, now_ns: int) -> None:
         """Out it goes as frames; written behind, so that a reply that nobody got is asked again."""
-        self._answered += 1
         self._cycle_us = round((now_ns - self._sent_ns) / 1e3, 1)
-        try:
-            frames = self._gateway.on_reply(
-                reply.payload, self._t_us, reply.replica, reply.epoch, self._answered
-            )
-        except PeerError:  # the function refused the request: there is nothing to ask the brakes for
-            self._refused += 1
-            frames = []
-        for frame in frames:
+        for frame in self._gateway.on_reply(reply.payload, reply.replica, reply.epoch):
             self._bus.send(frame)
         self._dialogue.write(now_ns, reply.request_id, reply.epoch, EntryKind.ANSWERED, reply.payload)
 
@@ -99,7 +86,7 @@ class GatewayDevice:
                 "sent": self._client.next_id - 1,
                 "unanswered": len(self._client.unanswered) + len(self._payloads),
                 "overrun": self._overrun,
-                "replies_refused": self._refused,
+                "replies_refused": self._gateway.replies_refused,
                 "cycle_us": self._cycle_us,
                 "accepted": counts.accepted,
                 "ignored": counts.ignored,
@@ -108,7 +95,7 @@ class GatewayDevice:
         )
 
 
-def _gateway(options: GatewayOptions) -> BusGateway:
+def _gateway(options: GatewayOptions) -> ClientGateway:
     if options.map:
-        return MappedGateway(load_dbc(), Path(options.dbc), find_map(options.map))
-    return Gateway(load_dbc())
+        return ClientGateway(MappedGateway(load_dbc(), Path(options.dbc), find_map(options.map)))
+    return ClientGateway(Gateway(load_dbc()))

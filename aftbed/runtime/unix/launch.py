@@ -18,10 +18,14 @@ import msgspec
 from aftbed import __version__
 from aftbed.core.errors import ConfigError
 from aftbed.core.fault import Fault
-from aftbed.runtime.unix import control, linux, rundir
-from aftbed.runtime.unix.options import LoadRun, RunOptions, Scheduled, Work
-from aftbed.runtime.unix.spawn import BUS, LIGHT, start_zygote
+from aftbed.core.message import Scheduled
+from aftbed.runtime import control
+from aftbed.runtime.unix import linux, rundir
+from aftbed.runtime.unix.line import Line, decode_report
+from aftbed.runtime.unix.options import LoadRun, RunOptions, Work
+from aftbed.runtime.unix.spawn import start_zygote
 from aftbed.runtime.unix.warden import watch
+from aftbed.runtime.zygotes import BUS, LIGHT
 
 END_SECONDS_MAX: Final = 8.0
 KILL_SECONDS_MAX: Final = 1.0
@@ -80,7 +84,7 @@ class Launched:
         os.close(command_end)
         os.close(supervisor_end)
         self._life = [command_life]
-        self.line = control.Line(ours, control.decode_report)
+        self.line = Line(ours, decode_report)
 
     def _be_supervisor(self, owner: socket.socket) -> None:
         """Never returns."""

@@ -7,7 +7,7 @@ import select
 import time
 from collections.abc import Callable
 
-from aftbed.runtime.unix.jobs import Jobs, StepFailed
+from aftbed.runtime.jobs import Jobs, StepFailed
 
 
 def _call(call: Callable[[], None]) -> None:
@@ -25,7 +25,7 @@ class Loop:
         self._timers: list[tuple[int, int, Callable[[], None]]] = []
         self._order = itertools.count()
         self._ended = False
-        self.jobs = Jobs()
+        self.jobs = Jobs(self.now_ns)
 
     def read(self, fd: int, call: Callable[[], None], *, patient: bool = False) -> None:
         """Call `call` whenever `fd` is readable or has ended; if `patient`, after those that are not."""
@@ -41,6 +41,14 @@ class Loop:
         """Call `call` once, `seconds` from now."""
         due = time.monotonic_ns() + round(seconds * 1e9)
         heapq.heappush(self._timers, (due, next(self._order), call))
+
+    def now_ns(self) -> int:
+        """Monotonic."""
+        return time.monotonic_ns()
+
+    def rest(self, seconds: float) -> None:
+        """Leave the CPU to others for a moment."""
+        time.sleep(seconds)
 
     def end(self) -> None:
         """Let `run` return."""

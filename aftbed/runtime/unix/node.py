@@ -26,13 +26,15 @@ from aftbed.core import wire
 from aftbed.core.brick import CONTROL, Brick, Effect, Note, Send
 from aftbed.core.errors import PeerError
 from aftbed.core.event import Event
+from aftbed.core.fault import Act
 from aftbed.core.journal import FLAG_OFFSET, PULSE_OFFSET, RECORD
 from aftbed.core.message import Adapted, AnyMessage, ChannelEnded, Message, Promoted, Rebound, Reply
-from aftbed.runtime.unix import control
+from aftbed.runtime import control
+from aftbed.runtime.orders import carry_out, fire, order_or_halt
 from aftbed.runtime.unix.devices import Device, Sensor
 from aftbed.runtime.unix.journal import Journal
 from aftbed.runtime.unix.lifeline import Held
-from aftbed.runtime.unix.orders import carry_out, fire, order_or_halt
+from aftbed.runtime.unix.line import Line
 from aftbed.runtime.unix.wiring import Hosted, Inlet, Plan, Wiring
 
 PULSE_SECONDS: Final = 0.02
@@ -43,6 +45,8 @@ HOST_FILES: Final = (__file__, control.__file__)  # what is blocked in here is n
 EXIT_FENCED: Final = 3
 REFUSED: Final = (PeerError, *wire.UNREADABLE)
 EXIT_ASSERT: Final = 70
+EXIT_DETECTED: Final = 71  # a detected stop
+FAULT_NS_MAX: Final = 5_000_000_000
 
 _now = time.monotonic_ns
 _read = os.read
@@ -56,7 +60,7 @@ RECORD_BYTES: Final = RECORD.size
 class Node:
     """One process of the graph. `run` never returns."""
 
-    def __init__(self, name: str, line: control.Line[control.ToNode], journal: Journal) -> None:
+    def __init__(self, name: str, line: Line[control.ToNode], journal: Journal) -> None:
         self.name, self.line, self.journal = name, line, journal
         self.wiring = Wiring()
         self.device: Device | None = None
@@ -83,6 +87,14 @@ class Node:
         hosted.outs[CONTROL] = lambda message: self._say(name, message)
         self._hot = hosted if len(self.wiring.hosted) == 1 and not self.wiring.timed else None
 
+    def hosted(self, brick: str) -> Hosted:
+        """The brick of that name."""
+        return self.wiring.hosted[brick]
+
+    def bind_input(self, brick: str, port: str, end: int | None) -> None:
+        """Read `port` from that descriptor from now on."""
+        self.wiring.bind_input(brick, port, end)
+
     def bind_output(self, brick: str, port: str, descriptor: int | None, epoch: int) -> None:
         """Write `port` to `descriptor` from now on, and tell the brick."""
         hosted = self.wiring.bind_output(brick, port, descriptor)
@@ -102,6 +114,60 @@ class Node:
     def _say(self, brick: str, message: Message) -> None:
         assert isinstance(message, Promoted | Adapted)
         self.line.send(control.Said(brick, message))
+
+    # -- what orders and faults do to it: see `orders.Host` ------------------------------------
+
+    def suspend(self, token: int, *, drain: bool) -> None:
+        """Answer `token` as soon as no request is inside (`drain`: nor waits)."""
+        self.suspend_token, self.draining = token, drain
+
+    def resume(self) -> None:
+        """Undo `suspend`."""
+        self.suspended, self.suspend_token = False, 0
+
+    def tell(self, brick: str, message: control.Told) -> None:
+        """Have `brick` step with `message`."""
+        self.step(self.wiring.hosted[brick], CONTROL, message)
+
+    def watch(self, order: control.WatchNodes, fds: list[int]) -> None:
+        """Have the Watchdog watch these."""
+        assert isinstance(self.device, Sensor)
+        self.device.watch(order.nodes, order.journals, order.pids, fds)
+        self.wiring.forget_plans()
+
+    def stats(self) -> bytes:
+        """What its device counts."""
+        return self.device.stats() if self.device is not None else b""
+
+    def quiet(self) -> None:
+        """Its device hands in nothing more."""
+        assert self.device is not None
+        self.device.quiet()
+
+    def record(self, event: Event, request_id: int, detail: int) -> None:
+        """Write a record, now."""
+        self.journal.write(_now(), event, request_id, detail)
+
+    def say(self, report: control.FromNode) -> None:
+        """To the supervisor."""
+        self.line.send(report)
+
+    def strike_itself(self, act: Act) -> None:
+        """Die, or stop, here and now."""
+        os.kill(os.getpid(), signal.SIGKILL if act is Act.CRASH else signal.SIGSTOP)
+
+    def wait_until_hit(self, fault: int) -> None:
+        """Go no further until the supervisor has answered for `fault`."""
+        limit_ns = _now() + FAULT_NS_MAX
+        while _now() < limit_ns:
+            if self.serve_control(wait=True, until=fault):
+                return
+        raise AssertionError(f"fault {fault} was not applied within {FAULT_NS_MAX / 1e9} s")
+
+    def stop_detected(self, brick: str, reason: str) -> None:
+        """A detected stop: end here and now."""
+        print(f"{brick} (pid {os.getpid()}): detected stop: {reason}", file=sys.stderr, flush=True)
+        os._exit(EXIT_DETECTED)
 
     # -- the pulse ----------------------------------------------------------------------------
 

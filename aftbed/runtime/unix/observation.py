@@ -15,7 +15,7 @@ from aftbed.adapt.observer import Seen
 from aftbed.adapt.policy import Beyond, Policy, Resource
 from aftbed.core import journal
 from aftbed.core.journal import Record
-from aftbed.runtime.unix.adaptations import Outcome
+from aftbed.runtime.adaptations import Outcome
 
 FIRST_BYTES: Final = journal.HEADER_BYTES + journal.RECORD.size
 CODE_BYTES: Final = 4  # at the end of a record

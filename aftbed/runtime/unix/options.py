@@ -3,7 +3,7 @@
 import msgspec
 
 from aftbed.core.fault import Fault
-from aftbed.core.message import Goal
+from aftbed.core.message import Scheduled
 
 
 class LoadRun(msgspec.Struct, frozen=True, tag=True):
@@ -31,14 +31,6 @@ class ReplayRun(msgspec.Struct, frozen=True, tag=True):
 
 
 Work = LoadRun | CarRun | ReplayRun
-
-
-class Scheduled(msgspec.Struct, frozen=True):
-    """An adaptation that begins when request `at_request` is sent, or `after_ms` after the launch."""
-
-    goal: Goal
-    at_request: int = 0
-    after_ms: float = 0.0
 
 
 class RunOptions(msgspec.Struct, frozen=True):

@@ -18,10 +18,12 @@ from aftbed.core.graph import BrickSpec
 from aftbed.ftm.catalog import Setting
 from aftbed.ftm.client import Client
 from aftbed.ftm.mechanism import REPLICAS
-from aftbed.runtime.unix import control, linux, rehearsal
+from aftbed.runtime import control
+from aftbed.runtime.unix import linux, rehearsal
 from aftbed.runtime.unix.devices import Device, Load, LoadOptions, Sensor
 from aftbed.runtime.unix.journal import Journal
 from aftbed.runtime.unix.lifeline import Held
+from aftbed.runtime.unix.line import Line
 from aftbed.runtime.unix.node import EXIT_ASSERT, PULSE_SECONDS, Node
 from aftbed.runtime.unix.options import GatewayOptions
 from aftbed.vehicle.function import default_application, sample_requests
@@ -29,9 +31,7 @@ from aftbed.vehicle.function import default_application, sample_requests
 LOAD_REQUESTS: Final = 512
 
 
-def become(
-    line: control.Line[control.ToNode], order: control.Assign | control.Serve, fds: list[int]
-) -> NoReturn:
+def become(line: Line[control.ToNode], order: control.Assign | control.Serve, fds: list[int]) -> NoReturn:
     """Be what `order` says. Never returns."""
     try:
         if isinstance(order, control.Serve):
@@ -53,7 +53,7 @@ def become(
     node.run()
 
 
-def _build(line: control.Line[control.ToNode], order: control.Assign, fds: list[int]) -> Node:
+def _build(line: Line[control.ToNode], order: control.Assign, fds: list[int]) -> Node:
     linux.set_name(order.node)
     if order.staged:
         if order.aside is not None:

@@ -14,9 +14,11 @@ from typing import Final
 
 import msgspec
 
-from aftbed.runtime.unix import control, linux
-from aftbed.runtime.unix.jobs import Key, StepFailed, Wait
+from aftbed.runtime import control, interface
+from aftbed.runtime.jobs import Key, StepFailed, Wait
+from aftbed.runtime.unix import linux
 from aftbed.runtime.unix.journal import Header
+from aftbed.runtime.unix.line import Line, decode_report
 from aftbed.runtime.unix.loop import Loop
 from aftbed.runtime.unix.spawn import Started, start_zygote
 
@@ -28,10 +30,10 @@ PARK_BATCH: Final = 4  # spares per order: the first of them start while the nex
 class Process:
     """A child of the supervisor. `kind`: zygote, spare, node or service."""
 
-    def __init__(self, name: str, kind: str, line: control.Line[control.FromNode]) -> None:
+    def __init__(self, name: str, kind: str, line: Line[control.FromNode]) -> None:
         self.name, self.kind, self.line = name, kind, line
         self.pid, self.pidfd = 0, -1
-        self.journal: Path | None = None
+        self.journal = ""
         self.header: Header | None = None
         self.alive = True
         self.incarnation = 0
@@ -53,14 +55,47 @@ class Process:
             return False
         return not self.starvation.starves(now_ns) and now_ns - pulse_ns > deadline_ns
 
-    def kill(self, sig: signal.Signals = signal.SIGKILL) -> bool:
-        """Signal it; False if it is gone."""
+    def kill(self) -> bool:
+        """SIGKILL; False if it is gone."""
+        return self._signal(signal.SIGKILL)
+
+    def freeze(self) -> bool:
+        """SIGSTOP; False if it is gone."""
+        return self._signal(signal.SIGSTOP)
+
+    def thaw(self) -> bool:
+        """SIGCONT; False if it is gone."""
+        return self._signal(signal.SIGCONT)
+
+    def _signal(self, sig: signal.Signals) -> bool:
         return self.pidfd >= 0 and linux.kill(self.pidfd, sig)
 
     def silent(self, now_ns: int, deadline_ns: int) -> bool:
         """Whether it lives, as far as is known, and its pulse is older than `deadline_ns`."""
         pulse_ns = self.header.pulse_ns() if self.alive and self.header is not None else 0
         return 0 < pulse_ns < now_ns - deadline_ns
+
+    def stopped(self) -> bool:
+        """Whether the kernel has it in state `T` (proc(5)), or as a dead one."""
+        try:
+            stat = Path(f"/proc/{self.pid}/stat").read_text()
+        except OSError:
+            return True
+        return stat.rpartition(")")[2].split()[0] in "TZX"
+
+    def assigned(self) -> None:
+        """The Ack of an Assign is here: its journal exists."""
+        if self.header is None and self.journal and Path(self.journal).exists():
+            self.header = Header(Path(self.journal))
+
+    def announce(self) -> None:
+        """Raise the flag: an order waits."""
+        if self.header is not None:
+            self.header.announce()
+
+    def announced(self) -> bool:
+        """Whether it has yet to see the flag."""
+        return self.header is not None and self.header.announced()
 
     def close(self) -> None:
         """Let go of all descriptors."""
@@ -161,7 +196,7 @@ class Nursery:
 
     def _adopt(self, name: str, kind: str, sock: socket.socket) -> Process:
         sock.setblocking(False)
-        process = Process(name, kind, control.Line(sock, control.decode_report))
+        process = Process(name, kind, Line(sock, decode_report))
         self.processes.append(process)
         self._loop.read(sock.fileno(), lambda: self._heard(process))
         return process
@@ -226,8 +261,9 @@ class Nursery:
             if process in pool:
                 pool.remove(process)
 
-    def order(self, process: Process, order: control.ToNode, fds: tuple[int, ...] = ()) -> None:
+    def order(self, process: interface.Process, order: control.ToNode, fds: tuple[int, ...] = ()) -> None:
         """Send `order`. Raises StepFailed if the process is gone or does not read its line."""
+        assert isinstance(process, Process)
         try:
             process.line.send(order, fds)
         except OSError as error:

@@ -16,10 +16,11 @@ import msgspec
 
 from aftbed.core.errors import AftbedError, ConfigError
 from aftbed.runtime import targets
-from aftbed.runtime.unix import ask, control, rundir
-from aftbed.runtime.unix.adaptations import Adaptations, Outcome
-from aftbed.runtime.unix.deployment import Deployment
-from aftbed.runtime.unix.faults import Faults
+from aftbed.runtime.adaptations import Adaptations, Outcome
+from aftbed.runtime.deployment import Deployment
+from aftbed.runtime.faults import Faults
+from aftbed.runtime.unix import ask, rundir
+from aftbed.runtime.unix.line import Line
 from aftbed.runtime.unix.loop import Loop
 from aftbed.runtime.unix.options import RunOptions
 from aftbed.runtime.unix.resources import Row
@@ -46,7 +47,7 @@ class Questions:
         self._faults, self._work, self._finish = faults, work, finish
         self._adaptations = adaptations
         self._started_ns = time.monotonic_ns()
-        self._lines: dict[int, control.Line[ask.Question]] = {}
+        self._lines: dict[int, Line[ask.Question]] = {}
 
     def listen(self) -> None:
         """Open the socket; from here on the run is found by other commands."""
@@ -64,10 +65,10 @@ class Questions:
         if not ask.same_user(sock, os.getuid()) or len(self._lines) >= QUESTIONS_MAX:
             sock.close()
             return
-        line = self._lines[sock.fileno()] = control.Line(sock, ask.decode_question)
+        line = self._lines[sock.fileno()] = Line(sock, ask.decode_question)
         self._loop.read(sock.fileno(), lambda: self._answer(line))
 
-    def _answer(self, line: control.Line[ask.Question]) -> None:
+    def _answer(self, line: Line[ask.Question]) -> None:
         try:
             got = line.recv()
         except BlockingIOError:
@@ -83,7 +84,7 @@ class Questions:
         self._lines.pop(line.fileno(), None)
         line.close()
 
-    def _send_answer(self, line: control.Line[ask.Question], answer: ask.Answer) -> None:
+    def _send_answer(self, line: Line[ask.Question], answer: ask.Answer) -> None:
         try:
             line.send(answer)
         except OSError:

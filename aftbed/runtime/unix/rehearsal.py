@@ -32,8 +32,9 @@ from aftbed.ftm.proceed import Compute
 from aftbed.ftm.protocol import Protocol
 from aftbed.ftm.proxy import Proxy
 from aftbed.ftm.server import Server
-from aftbed.runtime.unix import control
+from aftbed.runtime import control
 from aftbed.runtime.unix.journal import Journal
+from aftbed.runtime.unix.line import Line, decode_order, decode_report
 from aftbed.runtime.unix.node import NUDGE, Node
 from aftbed.vehicle.function import default_application, sample_requests
 
@@ -95,8 +96,8 @@ class _Scratch:
 
     def __init__(self, brick: Brick, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> None:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        self.line = control.Line(ours, control.decode_report)
-        self.node = Node("rehearsal", control.Line(theirs, control.decode_order), Journal(None, "rehearsal"))
+        self.line = Line(ours, decode_report)
+        self.node = Node("rehearsal", Line(theirs, decode_order), Journal(None, "rehearsal"))
         self.node.add("brick", brick)
         self._ends = [ours, theirs]
         self.into = {port: self.channel() for port in inputs}

@@ -8,13 +8,14 @@ from pathlib import Path
 import msgspec
 
 from aftbed.core.errors import HarnessError
-from aftbed.runtime.unix import control
+from aftbed.runtime import control
+from aftbed.runtime.unix.line import Line
 from aftbed.runtime.unix.options import PlayerOptions, VehicleOptions
 from aftbed.vehicle.hub import HubOptions
 from aftbed.vehicle.hub import serve as serve_hub
 
 
-def serve(line: control.Line[control.ToNode], order: control.Serve, fds: list[int]) -> None:
+def serve(line: Line[control.ToNode], order: control.Serve, fds: list[int]) -> None:
     """Run the service that `order` names, until it is done or its line ends."""
     if order.service == "hub":
         _hub(line, order, fds)
@@ -25,7 +26,7 @@ def serve(line: control.Line[control.ToNode], order: control.Serve, fds: list[in
         _player(line, msgspec.msgpack.decode(order.options, type=PlayerOptions))
 
 
-def _hub(line: control.Line[control.ToNode], order: control.Serve, fds: list[int]) -> None:
+def _hub(line: Line[control.ToNode], order: control.Serve, fds: list[int]) -> None:
     import socket  # noqa: PLC0415 - imported by all others already
 
     listener, log = fds
@@ -40,7 +41,7 @@ def _hub(line: control.Line[control.ToNode], order: control.Serve, fds: list[int
     line.send(control.Report("result", msgspec.json.encode(counts)))
 
 
-def _stopper(line: control.Line[control.ToNode]) -> Callable[[], bool]:
+def _stopper(line: Line[control.ToNode]) -> Callable[[], bool]:
     """Becomes true when the supervisor says Stop, or is gone."""
     poll = select.poll()
     poll.register(line.fileno(), select.POLLIN)
@@ -54,14 +55,14 @@ def _stopper(line: control.Line[control.ToNode]) -> Callable[[], bool]:
     return stop
 
 
-def _wait_for_go(line: control.Line[control.ToNode]) -> bool:
+def _wait_for_go(line: Line[control.ToNode]) -> bool:
     """Attached: wait for Resume; False if it is a Stop, or the end."""
     line.send(control.Report("ready", b""))
     got = line.recv()
     return got is not None and isinstance(got[0], control.Resume)
 
 
-def _vehicle(line: control.Line[control.ToNode], options: VehicleOptions) -> None:
+def _vehicle(line: Line[control.ToNode], options: VehicleOptions) -> None:
     from aftbed.vehicle.bus import BusOptions  # noqa: PLC0415
     from aftbed.vehicle.car import CarBuses, DriveOptions, drive  # noqa: PLC0415
     from aftbed.vehicle.dbcfile import load_dbc  # noqa: PLC0415
@@ -91,7 +92,7 @@ def _vehicle(line: control.Line[control.ToNode], options: VehicleOptions) -> Non
     line.send(control.Report("result", msgspec.json.encode(result)))
 
 
-def _player(line: control.Line[control.ToNode], options: PlayerOptions) -> None:
+def _player(line: Line[control.ToNode], options: PlayerOptions) -> None:
     from aftbed.vehicle.bus import BusOptions, open_bus  # noqa: PLC0415
     from aftbed.vehicle.candump import read_log  # noqa: PLC0415
     from aftbed.vehicle.dbcfile import load_dbc  # noqa: PLC0415

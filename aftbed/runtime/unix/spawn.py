@@ -7,10 +7,10 @@ import sys
 from pathlib import Path
 from typing import Final
 
+from aftbed.runtime.zygotes import BUS, LIGHT
+
 ZYGOTE: Final = "aftbed.runtime.unix.zygote"
 CONTROL_FD: Final = 3
-LIGHT: Final = "zygote"
-BUS: Final = "zygote.bus"
 PRELOADS: Final[dict[str, tuple[str, ...]]] = {
     LIGHT: (),
     BUS: (

@@ -7,7 +7,6 @@ children (`PR_SET_PDEATHSIG`), and the end of its owner's line ends the run.
 
 import json
 import os
-import signal
 import socket
 import time
 from pathlib import Path
@@ -15,31 +14,25 @@ from typing import Final
 
 import msgspec
 
-from aftbed.core import message, script
 from aftbed.core.errors import AftbedError
-from aftbed.core.event import Event
-from aftbed.core.script import Phase
 from aftbed.ftm.mechanism import build
-from aftbed.runtime.unix import control, linux
-from aftbed.runtime.unix.adaptations import ENGINE, REPLACE, Adaptations
-from aftbed.runtime.unix.deployment import WATCHED_KINDS, Deployment, Keys
-from aftbed.runtime.unix.faults import Faults
-from aftbed.runtime.unix.jobs import STATS_JOB, StepFailed
-from aftbed.runtime.unix.journal import Journal
+from aftbed.runtime import control
+from aftbed.runtime.conductor import Conductor
+from aftbed.runtime.deployment import Keys
+from aftbed.runtime.jobs import STATS_JOB
+from aftbed.runtime.unix import linux
+from aftbed.runtime.unix.line import Line, decode_order
 from aftbed.runtime.unix.loop import Loop
 from aftbed.runtime.unix.options import LoadRun, RunOptions
 from aftbed.runtime.unix.processes import Nursery, Process
 from aftbed.runtime.unix.questions import Questions
-from aftbed.runtime.unix.spawn import BUS, LIGHT, Started
-from aftbed.runtime.unix.verbs import Executor
+from aftbed.runtime.unix.spawn import Started
+from aftbed.runtime.unix.support import Support
 from aftbed.runtime.unix.work import Work
+from aftbed.runtime.zygotes import BUS, LIGHT
 
 TICK_SECONDS: Final = 0.02
 TELL_SECONDS: Final = 0.005
-RETRY_SECONDS: Final = 0.002
-SETTLE_SECONDS: Final = 0.002
-LOSSES: Final = ("failover", "drop backup")
-LOSS_SECONDS: Final = 0.5  # a failover is done long before
 HANG_NS: Final = 150_000_000  # of what no Watchdog watches; a channel's pulse is 20 ms
 LATE_NS_MAX: Final = 40_000_000
 DRAIN_SECONDS_MAX: Final = 2.0
@@ -53,11 +46,10 @@ class Supervisor:
         self.options, self._zygotes = options, zygotes
         self.record = Path(options.record)
         self.started_ns = time.monotonic_ns()
-        self.owner = control.Line(owner, control.decode_order)
+        self.owner = Line(owner, decode_order)
         self.owner.sock.setblocking(False)
         self.loop = Loop()
         self.nursery = Nursery(self.loop, self._on_report, self._on_death)
-        self.journal = Journal(self.record / "journal" / "supervisor.1.journal", "supervisor")
         self._events = open(self.record / "events.jsonl", "ab", buffering=0)  # noqa: SIM115 - for the whole run
         self._ending = ""
         self._told: list[bytes] = []
@@ -71,19 +63,10 @@ class Supervisor:
         cpus = sorted(os.sched_getaffinity(0))
         pinned = cpus if options.pin and len(cpus) > 1 else None
         self.work = Work(options, self.nursery, self.loop, self.tell, self._finish, self._report_owner)
-        self.deployment = Deployment(graph, self.nursery, self.record, self.work.device_of, pinned)
-        self.executor = Executor(self.deployment, self.journal, self.tell)
-        self.faults = Faults(self.deployment, self.loop, self.journal, self.tell, seed=options.seed)
-        self.adaptations = Adaptations(
-            self.deployment,
-            self.executor,
-            self.loop,
-            self.journal,
-            self.faults,
-            self.record,
-            self.tell,
-            lambda: self._inform_recovery(failed=False),
-        )
+        support = Support(self.record, self.loop, self.nursery, self.work.device_of, self.tell, options.seed)
+        self.conductor = Conductor(graph, support, pinned, self._on_loss)
+        self.deployment, self.faults = self.conductor.deployment, self.conductor.faults
+        self.adaptations = self.conductor.adaptations
         self.questions = Questions(
             options, self.loop, self.deployment, self.faults, self.adaptations, self.work, self._finish
         )
@@ -98,7 +81,7 @@ class Supervisor:
         wants_bus = BUS in self._zygotes
         for name in (BUS, LIGHT) if wants_bus else (LIGHT,):
             self.nursery.start_zygote(name, self._zygotes.get(name))
-        self.nursery.park(LIGHT, len(self.deployment.graph.nodes) + self._spares() + wants_bus)
+        self.nursery.park(LIGHT, len(self.deployment.graph.nodes) + self.conductor.spares() + wants_bus)
         if wants_bus:
             self.nursery.park(BUS, 2)
         self.questions.listen()
@@ -107,12 +90,6 @@ class Supervisor:
         self._tick()
         self.loop.run()
         self._teardown()
-
-    def _spares(self) -> int:
-        """Enough for a replica and for one node beside it."""
-        slots, nodes = self.deployment.slots.values(), self.deployment.graph.nodes.values()
-        chain = max(sum(set(bricks) <= slot.bricks for bricks in nodes) for slot in slots)
-        return chain + 1 if len(slots) > 1 else 1
 
     def _launch(self) -> Keys:
         yield from self.work.before(self.deployment)
@@ -132,7 +109,7 @@ class Supervisor:
             self._finish(f"launch failed: {failure}")
             return
         self.tell("started", f"{len(self.deployment.nodes)} nodes in {self.graph_ms:.1f} ms")
-        self._inform_recovery(failed=False)
+        self.conductor.inform_recovery(failed=False)
 
     def _on_owner(self) -> None:
         try:
@@ -175,6 +152,7 @@ class Supervisor:
         if self._ending:
             return
         self._ending = reason or "done"
+        self.conductor.ending = True
         self._finish_reason = reason
         limit_ns = time.monotonic_ns() + round(DRAIN_SECONDS_MAX * 1e9)
         self.loop.jobs.start("stop", self.work.stop_source(self.deployment), lambda _: None)
@@ -182,7 +160,7 @@ class Supervisor:
 
     def _drain(self, limit_ns: int) -> None:
         """Wait until all is answered and no script is under way, or the limit is reached."""
-        settled = self.work.settled and not self.executor.busy and not len(self.loop.jobs)
+        settled = self.work.settled and not self.conductor.executor.busy and not len(self.loop.jobs)
         if self.owner_gone() or settled or time.monotonic_ns() > limit_ns:
             if not settled and not self.owner_gone():
                 self._incomplete = self.loop.jobs.names()
@@ -230,137 +208,26 @@ class Supervisor:
     # -- what processes say -------------------------------------------------------------------
 
     def _on_report(self, process: Process, report: msgspec.Struct) -> None:
-        match report:
-            case control.Ack(token, data, error):
-                self.deployment.assigned(process)
-                key = ("ack", process.name, token)
-                if error:
-                    self.tell("refused", f"{process.name}: {error}")
-                    self.loop.jobs.fail(key, f"{process.name}: {error}")
-                else:
-                    self.loop.jobs.settle(key, data)
-            case control.Said(brick, message.Promoted(epoch)):
-                self.loop.jobs.settle(("promoted", brick, epoch))
-            case control.Said(_, message.Adapted() as told):
-                self.adaptations.adapted(told)
-                self.loop.after(SETTLE_SECONDS, self._settle)
-            case control.Ordered(_, ordered, Phase.WHOLE):
-                self._on_script(ordered)
-            case control.Ordered(_, ordered, phase, number):
-                self.adaptations.ordered(ordered, phase, number)
-            case control.Fired(fault):
-                if not self.adaptations.fired(process, fault):
-                    self.faults.fired(process, fault)
-            case control.Report(kind, data):
-                self.work.on_report(process, kind, data)
-            case _:
-                self.tell("refused", f"{process.name} said {type(report).__name__}")
-
-    def _on_script(self, ordered: script.Script) -> None:
-        if self.executor.busy or self._ending:
-            return  # another script is under way; Recovery hears how it ended
-        if ordered.purpose in LOSSES and self.adaptations.interrupted(ordered.replica):
-            return  # the way back first
-        began_ns = time.monotonic_ns()
-
-        def ended(failure: str) -> None:
-            ms = f"{(time.monotonic_ns() - began_ns) / 1e6:.2f} ms"
-            self.tell("script.failed" if failure else "script.done", f"{ordered.purpose}: {failure or ms}")
-            self._inform_recovery(failed=bool(failure))
-            self.loop.after(SETTLE_SECONDS, lambda: self._settle_after(ordered))
-
-        self.loop.jobs.start(ordered.purpose, self.executor.execute(ordered), ended)
-        if ordered.purpose in LOSSES:  # its nodes are killed only when the new leader serves
-            self.tell("alarm", f"{ordered.replica}: {self.deployment.cause_of_loss(ordered.replica)}")
-        self.tell("script", f"{ordered.purpose} ({ordered.replica})")
-
-    def _settle_after(self, ordered: script.Script) -> None:
-        """What can wait until after a script: spares, and faults that are still to come."""
-        if ordered.purpose == "new backup":
-            self._settle()
-        elif not self._ending:
-            self.loop.jobs.start("rearm", self.faults.rearm(), lambda _: None)
-
-    def _settle(self) -> None:
-        if self._ending:
-            return
-        self.nursery.level(LIGHT, self._spares())
-        self.loop.jobs.start("rearm", self.faults.rearm(), lambda _: None)
-
-    def _inform_recovery(self, *, failed: bool) -> None:
-        deployment = self.deployment
-        roles = f"{deployment.leader or 'nobody'} leads, {deployment.backup or 'nobody'} backs up"
-        self.tell("roles", f"{roles}, epoch {deployment.epoch}")
-        if self.executor.busy or not deployment.lives("recovery") or self._ending:
-            return
-        situation = self.executor.situation(failed=failed)
-        try:
-            deployment.order("recovery", lambda token: control.Tell(token, "recovery", situation))
-        except StepFailed as error:
-            self.tell("refused", str(error))
+        if isinstance(report, control.Report):
+            self.work.on_report(process, report.kind, report.data)
+        else:
+            self.conductor.on_report(process, report)
 
     # -- deaths and hangs ---------------------------------------------------------------------
 
     def _on_death(self, process: Process) -> None:
-        self.journal.write(time.monotonic_ns(), Event.NODE_DIED, 0, process.pid)
-        self.loop.jobs.settle(("died", process.name, process.pid))
+        self.conductor.on_death(process)
         if process.kind == "killed" or self._ending:
             return
-        self.tell("died", f"{process.name} (pid {process.pid})")
-        self.loop.jobs.died(process.name)
         if process.kind == "zygote":
             self.nursery.restart_zygote(process.name)
-        elif process.kind == "spare":
-            self.nursery.level(LIGHT, self._spares())
         elif process.kind == "service":
             self._finish(f"{process.name} died")
-        elif process.kind == "staged":
-            return  # who waits for it has heard
-        elif process.kind == "node" and self._replaceable(process.name):
-            if process.name != ENGINE:
-                self.adaptations.give_up_preparing(f"{process.name} died")
-            self._replace(process.name)
-        else:
-            self.loop.after(LOSS_SECONDS, self._look_for_loss)
 
-    def _look_for_loss(self) -> None:
-        """No replica is left and none will come: say so, and end a load, which would wait for ever."""
-        deployment = self.deployment
-        if self._ending or self.executor.busy or deployment.backup:
-            return
-        slot = deployment.slots.get(deployment.leader)
-        nodes = slot.nodes if slot is not None and deployment.leader not in deployment.lost else []
-        if nodes and all(deployment.lives(node) for node in nodes):
-            return
-        self.tell("lost", "no replica is left: the service is gone")
+    def _on_loss(self) -> None:
+        """A load would wait for ever; a car drives on."""
         if isinstance(self.options.work, LoadRun):
             self._finish("")
-
-    def _replaceable(self, node: str) -> bool:
-        bricks = self.deployment.graph.nodes[node]
-        return self.deployment.graph.brick(bricks[0]).kind in WATCHED_KINDS
-
-    def _replace(self, node: str) -> None:
-        if self.adaptations.acting:  # both hand channels out
-            self.loop.after(RETRY_SECONDS, lambda: self._replace(node))
-            return
-        began_ns = time.monotonic_ns()
-
-        def ended(failure: str) -> None:
-            ms = (time.monotonic_ns() - began_ns) / 1e6
-            self.tell("replaced", f"{node}: {failure or f'{ms:.2f} ms'}")
-            half = self.deployment.nodes.get(node)
-            if failure and not self._ending and half is not None and half.alive:
-                half.kill()  # half bound: its death is heard, and replaced in turn
-            elif failure and not self._ending:
-                self.loop.after(TICK_SECONDS, lambda: self._replace(node))
-            if node == "recovery":
-                self._inform_recovery(failed=False)
-            if node == ENGINE and not failure:
-                self.adaptations.engine_is_new()
-            self.nursery.level(LIGHT, self._spares())
-
-        self.loop.jobs.start(f"{REPLACE}{node}", self.deployment.respawn(node), ended)
 
     def _tick(self) -> None:
         """Look after the pulses of what no Watchdog watches: a node that hangs is killed, and replaced."""
@@ -370,12 +237,12 @@ class Supervisor:
             self._grace_until_ns = now_ns + HANG_NS
         self._last_tick_ns = now_ns
         self.deployment.nudge_late()
-        if now_ns > self._grace_until_ns and not self._ending:
+        if self.graph_ms and now_ns > self._grace_until_ns and not self._ending:  # births have a limit
             for process in self.nursery.processes:
-                single = process.kind == "node" and self._replaceable(process.name)
+                single = process.kind == "node" and self.conductor.replaceable(process.name)
                 if single and process.hangs(now_ns, HANG_NS):
                     self.tell("hangs", f"{process.name} (pid {process.pid}): killed, to be replaced")
-                    process.kill(signal.SIGKILL)
+                    process.kill()
         self.loop.after(TICK_SECONDS, self._tick)
 
 

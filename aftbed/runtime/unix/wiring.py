@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from aftbed.core.brick import Brick
 from aftbed.core.message import Message
-from aftbed.runtime.unix import control
+from aftbed.runtime import control
 
 Mail = deque[tuple["Hosted", str, Message]]
 

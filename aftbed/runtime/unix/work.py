@@ -10,10 +10,10 @@ from typing import Final
 
 import msgspec
 
-from aftbed.runtime.unix import control
-from aftbed.runtime.unix.deployment import Deployment, Keys
+from aftbed.runtime import control
+from aftbed.runtime.deployment import Deployment, Keys
+from aftbed.runtime.jobs import STATS_JOB, Key, Wait
 from aftbed.runtime.unix.devices import LoadOptions
-from aftbed.runtime.unix.jobs import STATS_JOB, Key, Wait
 from aftbed.runtime.unix.loop import Loop
 from aftbed.runtime.unix.options import (
     CarRun,
@@ -25,7 +25,7 @@ from aftbed.runtime.unix.options import (
     VehicleOptions,
 )
 from aftbed.runtime.unix.processes import Nursery, Process
-from aftbed.runtime.unix.spawn import BUS, LIGHT
+from aftbed.runtime.zygotes import BUS, LIGHT
 
 ATTACH_SECONDS_MAX: Final = 10.0
 LOAD_POLL_SECONDS: Final = 0.02

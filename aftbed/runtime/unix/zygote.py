@@ -15,7 +15,9 @@ import socket
 import sys
 from typing import NoReturn
 
-from aftbed.runtime.unix import control, linux, rehearsal
+from aftbed.runtime import control
+from aftbed.runtime.unix import linux, rehearsal
+from aftbed.runtime.unix.line import Line, decode_order
 from aftbed.runtime.unix.part import become
 from aftbed.runtime.unix.spawn import CONTROL_FD
 
@@ -33,7 +35,7 @@ def run(supervisor: int, cpus: list[int], preload: tuple[str, ...]) -> NoReturn:
     linux.trim()
     gc.freeze()
     gc.disable()  # structs on the path are untracked; what is left dies by reference count
-    line = control.Line(socket.socket(fileno=CONTROL_FD), control.decode_order)
+    line = Line(socket.socket(fileno=CONTROL_FD), decode_order)
     line.send(control.Hello(os.getpid()))
     while True:
         got = line.recv()
@@ -67,7 +69,7 @@ def _wait_for_a_part(supervisor: int) -> NoReturn:
     """A spare: adopted, parked, then what it is told to be."""
     linux.die_with(supervisor)
     linux.set_name("aftbed-spare")
-    line = control.Line(socket.socket(fileno=CONTROL_FD), control.decode_order)
+    line = Line(socket.socket(fileno=CONTROL_FD), decode_order)
     line.send(control.Hello(os.getpid()))
     poll = select.poll()
     poll.register(CONTROL_FD, select.POLLIN)

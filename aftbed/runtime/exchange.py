@@ -9,8 +9,6 @@ Who dies meanwhile fails the step that waits for it; `undo` leaves out whoever i
 """
 
 import contextlib
-import signal
-import time
 from collections.abc import Callable, Generator, Iterable
 from typing import Final
 
@@ -21,15 +19,14 @@ from aftbed.core.graph import Graph, Link
 from aftbed.core.script import Script, flat
 from aftbed.ftm.catalog import KINDS
 from aftbed.ftm.mechanism import REPLICAS, replication_of
+from aftbed.runtime import control
+from aftbed.runtime.deployment import Deployment, Keys
+from aftbed.runtime.interface import Channel, Process
+from aftbed.runtime.jobs import Key, StepFailed, Wait
+from aftbed.runtime.rewiring import INPUT, Changes, replica_of, way_back
 from aftbed.runtime.targets import STAGED
-from aftbed.runtime.unix import control
-from aftbed.runtime.unix.channels import Channel
-from aftbed.runtime.unix.deployment import Deployment, Keys
-from aftbed.runtime.unix.jobs import Key, StepFailed, Wait
-from aftbed.runtime.unix.processes import Process
-from aftbed.runtime.unix.rewiring import INPUT, Changes, replica_of, way_back
-from aftbed.runtime.unix.spawn import LIGHT
-from aftbed.runtime.unix.transfer import Seat, align, answered, ask, migrate, transfer
+from aftbed.runtime.transfer import Seat, align, answered, ask, migrate, transfer
+from aftbed.runtime.zygotes import LIGHT
 
 PREPARE_SECONDS_MAX: Final = 5.0  # a stranger's module is imported and tested meanwhile
 SUSPEND_SECONDS_MAX: Final = 0.25  # longer, and the client would rather have the old mechanism back
@@ -86,7 +83,7 @@ class Exchange:
         if self._todo.recipe != script.RECIPES[0]:
             for slot in self._deployment.slots.values():  # it kills what they watch
                 yield from self._deployment.watch(slot, nobody=True)
-        self.closed_ns = time.monotonic_ns()
+        self.closed_ns = self._deployment.support.loop.now_ns()
         try:
             for verb in self._todo.commit:
                 yield from self._enter()
@@ -97,7 +94,7 @@ class Exchange:
             if self._opened:  # requests may have passed: the state that counts is in what is new
                 self._adopt()
             raise
-        self.opened_ns = time.monotonic_ns()
+        self.opened_ns = self._deployment.support.loop.now_ns()
         self._adopt()
         yield from self._watch()
 
@@ -156,9 +153,9 @@ class Exchange:
             case script.Together() | script.Bind() | script.Unbind() | script.Exchange():
                 yield from self._rewire(flat((verb,)))
             case script.Freeze(brick):
-                self._process(brick).kill(signal.SIGSTOP)
+                self._process(brick).freeze()
             case script.Thaw(brick):
-                self._process(brick).kill(signal.SIGCONT)
+                self._process(brick).thaw()
             case script.Destroy(node):
                 self._destroy(node)
             case script.Stage() as verb:
@@ -214,7 +211,7 @@ class Exchange:
         if standing is not None:
             return standing
         if key not in self._fresh:
-            self._fresh[key] = Channel(link)
+            self._fresh[key] = self._deployment.channels.make(link)
         return self._fresh[key]
 
     def _rewire(self, verbs: Iterable[script.AnyVerb]) -> Keys:

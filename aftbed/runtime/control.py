@@ -1,20 +1,13 @@
-"""What the supervisor and its processes say to each other, and how descriptors travel with it.
+"""What the executive and the nodes say to each other.
 
-One SEQPACKET pair per process. Each order carries a token; its answer is `Ack` with the same token,
-so an order without an answer is noticed by its deadline. A packet over the limit travels as a memfd.
+Each order carries a token; its answer is `Ack` with the same token, so an order without an answer is
+noticed by its deadline. How it travels, and ends of channels with it, is the runtime's affair.
 """
 
-import array
-import contextlib
-import os
-import socket
-import stat
-from collections.abc import Callable
-from typing import Final, Generic, TypeVar
+from typing import Final
 
 import msgspec
 
-from aftbed.core.errors import PeerError
 from aftbed.core.fault import Act, Flip
 from aftbed.core.graph import BrickSpec, Graph
 from aftbed.core.message import (
@@ -29,12 +22,8 @@ from aftbed.core.message import (
     Watch,
 )
 from aftbed.core.script import Phase, Script
-from aftbed.core.wire import PACKET_BYTES_MAX, UNREADABLE
 
-FDS_MAX: Final = 64
 UNANSWERED: Final = 0  # the token of an order that gets no Ack
-STATE_BYTES_MAX: Final = 64 << 20
-_RIGHTS_BYTES: Final = socket.CMSG_SPACE(FDS_MAX * 4)
 
 Told = Promote | Rebound | Watch | Situation | Adapt | Progress | TakeUp
 NOWHERE: Final = -1  # the index of a port that is to lead nowhere
@@ -261,83 +250,3 @@ ToNode = (
     | Tell | WatchNodes | Arm | Stop | Quiet | Stats | Ack
 )  # fmt: skip
 FromNode = Hello | Rested | Ack | Said | Ordered | Fired | Report
-
-decode_order: Callable[[bytes], ToNode] = msgspec.msgpack.Decoder(ToNode).decode
-decode_report: Callable[[bytes], FromNode] = msgspec.msgpack.Decoder(FromNode).decode
-_encode = msgspec.msgpack.Encoder().encode
-Incoming = TypeVar("Incoming")
-_MEMFD: Final = b"\xc1"  # a byte that MessagePack never uses
-
-
-class Line(Generic[Incoming]):
-    """One end of a control pair. Blocking or not as the socket is."""
-
-    def __init__(self, sock: socket.socket, decode: Callable[[bytes], Incoming]) -> None:
-        self.sock, self._decode = sock, decode
-
-    def fileno(self) -> int:
-        """For polling."""
-        return self.sock.fileno()
-
-    def send(self, message: msgspec.Struct, fds: tuple[int, ...] = ()) -> None:
-        """Send one message and descriptors. Raises OSError as sendmsg(2) does."""
-        data = _encode(message)
-        assert len(fds) <= FDS_MAX, f"{len(fds)} descriptors"
-        if len(data) > PACKET_BYTES_MAX:
-            assert len(data) <= STATE_BYTES_MAX and not fds, f"{len(data)} bytes"
-            with open(os.memfd_create("aftbed-state"), "wb") as file:
-                file.write(data)
-                file.flush()
-                self._sendmsg(_MEMFD, (file.fileno(),))
-        else:
-            self._sendmsg(data, fds)
-
-    def _sendmsg(self, data: bytes, fds: tuple[int, ...]) -> None:
-        rights = [(socket.SOL_SOCKET, socket.SCM_RIGHTS, array.array("i", fds))] if fds else []
-        self.sock.sendmsg([data], rights)
-
-    def recv(self) -> tuple[Incoming, list[int]] | None:
-        """The next message with its descriptors; None at the end.
-
-        Raises BlockingIOError where there is none, PeerError on what is not a message (its
-        descriptors are closed).
-        """
-        data, ancillary, flags, _ = self.sock.recvmsg(
-            PACKET_BYTES_MAX, _RIGHTS_BYTES, socket.MSG_CMSG_CLOEXEC
-        )
-        fds = array.array("i")
-        for level, kind, payload in ancillary:
-            if (level, kind) == (socket.SOL_SOCKET, socket.SCM_RIGHTS):
-                fds.frombytes(payload[: len(payload) - len(payload) % fds.itemsize])
-        if not data:
-            for fd in fds:
-                os.close(fd)
-            return None
-        try:
-            if flags & (socket.MSG_TRUNC | socket.MSG_CTRUNC):
-                raise PeerError(f"truncated control message of {len(data)} bytes, {len(fds)} descriptors")
-            if data == _MEMFD and len(fds) == 1:
-                data = _read_memfd(fds.pop())
-            return self._decode(data), list(fds)
-        except (*UNREADABLE, PeerError, OSError) as error:
-            for fd in fds:
-                os.close(fd)
-            raise PeerError(f"not a control message ({len(data)} bytes): {error}") from error
-
-    def close(self) -> None:
-        """Close the socket."""
-        with contextlib.suppress(OSError):
-            self.sock.close()
-
-
-def _read_memfd(descriptor: int) -> bytes:
-    """The packet in a memfd, which is closed. Raises PeerError if it is no file or too large."""
-    try:
-        state = os.fstat(descriptor)
-        if not stat.S_ISREG(state.st_mode):
-            raise PeerError("the descriptor of a large packet is not a memfd")
-        if state.st_size > STATE_BYTES_MAX:
-            raise PeerError(f"a packet of {state.st_size} bytes, at most {STATE_BYTES_MAX} are allowed")
-        return os.pread(descriptor, state.st_size, 0)
-    finally:
-        os.close(descriptor)

@@ -5,9 +5,9 @@ from typing import Final
 
 from aftbed.core.graph import Graph, Link, ends
 from aftbed.ftm.mechanism import REPLICAS
-from aftbed.runtime.unix import control
-from aftbed.runtime.unix.channels import Channels
-from aftbed.runtime.unix.processes import Process
+from aftbed.runtime import control
+from aftbed.runtime.channels import Channels
+from aftbed.runtime.interface import Process
 
 Ends = dict[tuple[str, str], int]  # brick, port -> descriptor, or NOWHERE
 INPUT: Final = "in"

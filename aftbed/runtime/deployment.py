@@ -4,10 +4,7 @@ It knows how to give a new process its ends of the channels, which is all that "
 and how to replace a process that belongs to no replica.
 """
 
-import os
-import time
 from collections.abc import Callable, Container, Generator, Iterable
-from pathlib import Path
 from typing import Final
 
 import msgspec
@@ -15,14 +12,13 @@ import msgspec
 from aftbed.core.graph import Graph
 from aftbed.ftm.mechanism import REPLICAS
 from aftbed.ftm.watchdog import HANG_DEADLINE_NS
+from aftbed.runtime import control
+from aftbed.runtime.channels import Channels
+from aftbed.runtime.cores import Cores
+from aftbed.runtime.interface import Channel, Process, Support
+from aftbed.runtime.jobs import STEP_SECONDS_MAX, Key, StepFailed, Wait
 from aftbed.runtime.targets import STAGED
-from aftbed.runtime.unix import control
-from aftbed.runtime.unix.channels import Channel, Channels
-from aftbed.runtime.unix.cores import Cores
-from aftbed.runtime.unix.jobs import STEP_SECONDS_MAX, Key, StepFailed, Wait
-from aftbed.runtime.unix.journal import Header, recorded_requests
-from aftbed.runtime.unix.processes import Nursery, Process
-from aftbed.runtime.unix.spawn import BUS, LIGHT
+from aftbed.runtime.zygotes import BUS, LIGHT
 
 WATCHED_KINDS: Final = ("client", "proxy", "watchdog", "recovery", "engine")
 
@@ -30,7 +26,6 @@ BIRTH_SECONDS_MAX: Final = 10.0  # each makes its journal first, and a disk may 
 
 Keys = Generator[Wait, dict[Key, bytes], None]
 Staged = tuple[Process, tuple[Key, str]]  # a process, and the key of its Ack with its name
-DeviceOf = Callable[[str, int], tuple[str, bytes]]  # brick kind, incarnation -> device, its options
 
 
 class Slot:
@@ -46,12 +41,9 @@ class Slot:
 class Deployment:
     """`leader` and `backup` are names of slots, or `""`."""
 
-    def __init__(
-        self, graph: Graph, nursery: Nursery, record: Path, device_of: DeviceOf, cpus: list[int] | None
-    ) -> None:
-        self.nursery, self.record = nursery, record
-        self._device_of = device_of
-        self.channels = Channels()
+    def __init__(self, graph: Graph, support: Support, cpus: list[int] | None) -> None:
+        self.support, self.nursery = support, support.nursery
+        self.channels = Channels(support.channel)
         self.nodes: dict[str, Process] = {}
         self.incarnations: dict[str, int] = {}
         self.epoch, self.leader, self.backup = 1, REPLICAS[0], ""
@@ -119,8 +111,7 @@ class Deployment:
 
     def _announce(self, process: Process, order: control.ToNode, fds: tuple[int, ...]) -> None:
         self.nursery.order(process, order, fds)
-        if process.header is not None:
-            process.header.announce()
+        process.announce()
 
     def _nudge(self, node: str) -> None:
         for brick in self.graph.nodes.get(node, ()):
@@ -130,7 +121,7 @@ class Deployment:
     def nudge_late(self) -> None:
         """Nudge again whoever has not looked at its control mail: it may have changed its inputs since."""
         for node, process in self.nodes.items():
-            if process.alive and process.header is not None and process.header.announced():
+            if process.alive and process.announced():
                 self._nudge(node)
 
     def ask(
@@ -204,7 +195,7 @@ class Deployment:
                 slot.name,
                 slot.generation,
                 nodes,
-                tuple(str(host.journal) for host in hosts),
+                tuple(host.journal for host in hosts),
                 tuple(host.pid for host in hosts),
             ),
             tuple(host.pidfd for host in hosts),
@@ -257,10 +248,10 @@ class Deployment:
     ) -> Generator[Wait, dict[Key, bytes], Staged]:
         specs = tuple(graph.brick(name) for name in graph.nodes[node])
         incarnation = self.incarnations[node] = self.incarnations.get(node, 0) + 1
-        device, options = self._device_of(specs[0].kind, incarnation)
+        device, options = self.support.device(specs[0].kind, incarnation)
         process = yield from self.nursery.spare(BUS if device == "gateway" else LIGHT)
         process.name, process.kind, process.incarnation = name, "staged", incarnation
-        process.journal = self.record / "journal" / f"{node.replace('/', '.')}.{incarnation}.journal"
+        process.journal = self.support.journal_of(node, incarnation)
         names = {s.name for s in specs}
         locals_ = tuple(
             control.Local(k.source, k.source_port, k.sink, k.sink_port)
@@ -270,7 +261,7 @@ class Deployment:
         order = control.Assign(
             0,
             node,
-            str(process.journal),
+            process.journal,
             specs,
             self.epoch,
             self.leader,
@@ -281,17 +272,12 @@ class Deployment:
             held,
             name != node,
             self.cpu_of("recovery"),
-            control.Trial(graph, recorded_requests(self.record)) if trial else None,
+            control.Trial(graph, self.support.recorded_requests()) if trial else None,
             device,
             options,
         )
         sent = self.order_to(process, lambda token: msgspec.structs.replace(order, token=token), tuple(fds))
         return process, sent
-
-    def assigned(self, process: Process) -> None:
-        """The Ack of an Assign is here: its journal exists."""
-        if process.header is None and process.journal is not None and process.journal.exists():
-            process.header = Header(process.journal)
 
     def cpu_of(self, node: str, graph: Graph | None = None) -> int | None:
         """Where `node` belongs."""
@@ -303,14 +289,14 @@ class Deployment:
         for node in nodes:
             cpu, process = self.cpu_of(node), self.nodes.get(node)
             if cpu is not None and process is not None and process.alive:
-                os.sched_setaffinity(process.pid, {cpu})
+                self.support.pin(process.pid, cpu)
 
     def pin_watchers(self) -> None:
         """Move who watches, recovers or forks, this process included, to the core that does not lead."""
         cpu = self.cpu_of("recovery")
         if cpu is not None:
             for pid in (0, *(zygote.pid for zygote in self.nursery.zygotes.values() if zygote.alive)):
-                os.sched_setaffinity(pid, {cpu})
+                self.support.pin(pid, cpu)
         self.pin(b.name for b in self.graph.bricks if b.kind in WATCHED_KINDS)
 
     # -- channels -----------------------------------------------------------------------------
@@ -378,7 +364,7 @@ class Deployment:
 
         A lifeline tells of a death before the pidfd does, so to ask whether all are alive would not do.
         """
-        now_ns = time.monotonic_ns()
+        now_ns = self.support.loop.now_ns()
         nodes = [self.nodes[node] for node in self.slots[replica].nodes if node in self.nodes]
         dead = any(not node.alive for node in nodes)
         silent = any(node.silent(now_ns, HANG_DEADLINE_NS) for node in nodes)

@@ -1,68 +1,130 @@
-"""The orders that a node takes from the supervisor, and the faults that it was told to wait for."""
+"""The orders that a node takes from the executive, and the faults that it was told to wait for.
 
-import os
-import signal
-import sys
-import time
-from typing import TYPE_CHECKING, Final, assert_never
+Written once for all runtimes: a `Host` is what a runtime makes of a node.
+"""
+
+from typing import Final, Protocol, assert_never
 
 from msgspec import structs
 
-from aftbed.core.brick import CONTROL, Brick, Effect, Halt, Note, Order, Send
+from aftbed.core.brick import Brick, Effect, Halt, Note, Order, Send
 from aftbed.core.errors import PeerError
 from aftbed.core.event import Event, event_named
 from aftbed.core.fault import Act, Flip, Place, flipped, mark
 from aftbed.core.message import Message, Reply, StateCaptured, Tried, Watch
-from aftbed.runtime.unix import control
-from aftbed.runtime.unix.devices import Sensor
-from aftbed.runtime.unix.wiring import Hosted
+from aftbed.runtime import control
 
-if TYPE_CHECKING:
-    from aftbed.runtime.unix.node import Node
-
-FAULT_SECONDS_MAX: Final = 5.0
-EXIT_DETECTED: Final = 71  # a detected stop
+Fds = list[int]
+WATCHDOG: Final = "{}/watchdog"
 
 
-def carry_out(node: "Node", order: control.ToNode, fds: list[int]) -> bytes | None:
+class Hosted(Protocol):
+    """A brick in its node."""
+
+    name: str
+    brick: Brick
+
+
+class Host(Protocol):
+    """A node, as an order finds it."""
+
+    armed: dict[Event, control.Arm]
+
+    def hosted(self, brick: str) -> Hosted:
+        """The brick of that name. Raises KeyError."""
+        ...
+
+    def bind_input(self, brick: str, port: str, end: int | None) -> None:
+        """Read `port` from that end of a channel, or from nowhere."""
+        ...
+
+    def bind_output(self, brick: str, port: str, end: int | None, epoch: int) -> None:
+        """Write `port` to that end, or to nowhere, and tell the brick."""
+        ...
+
+    def suspend(self, token: int, *, drain: bool) -> None:
+        """Answer `token` as soon as no request is inside (`drain`: nor waits)."""
+        ...
+
+    def resume(self) -> None:
+        """Undo `suspend`."""
+        ...
+
+    def tell(self, brick: str, message: control.Told) -> None:
+        """Have `brick` step with `message`."""
+        ...
+
+    def watch(self, order: control.WatchNodes, fds: Fds) -> None:
+        """Have the Watchdog watch these."""
+        ...
+
+    def stats(self) -> bytes:
+        """What its device counts."""
+        ...
+
+    def quiet(self) -> None:
+        """Its device hands in nothing more."""
+        ...
+
+    def record(self, event: Event, request_id: int, detail: int) -> None:
+        """Write a record, now."""
+        ...
+
+    def say(self, report: control.FromNode) -> None:
+        """To the executive."""
+        ...
+
+    def strike_itself(self, act: Act) -> None:
+        """Die, or stop, here and now."""
+        ...
+
+    def wait_until_hit(self, fault: int) -> None:
+        """Go no further until the executive has answered for `fault`."""
+        ...
+
+    def stop_detected(self, brick: str, reason: str) -> None:
+        """A detected stop: end here and now."""
+        ...
+
+
+def carry_out(node: Host, order: control.ToNode, fds: Fds) -> bytes | None:
     """Do what `order` says; the data of its Ack, or None where the Ack comes later.
 
     Raises PeerError where a brick refuses, or the order is not for a node.
     """
-    wiring = node.wiring
     match order:
         case control.BindInput(_, brick, port):
-            wiring.bind_input(brick, port, fds.pop() if fds else None)
+            node.bind_input(brick, port, fds.pop() if fds else None)
         case control.BindOutput(_, brick, port, epoch):
             node.bind_output(brick, port, fds.pop() if fds else None, epoch)
         case control.Follow(_, brick, port, output, epoch):
             read, write = fds
-            wiring.bind_input(brick, port, read)
+            node.bind_input(brick, port, read)
             node.bind_output(brick, output, write, epoch)
         case control.Rewire():
             return _rewire(node, order, fds)
         case control.Suspend(token, drain):
-            node.suspend_token, node.draining = token, drain
+            node.suspend(token, drain=drain)
             return None  # answered when quiescent
         case control.Resume():
-            node.suspended, node.suspend_token = False, 0
+            node.resume()
         case control.Capture(_, brick):
-            return wiring.hosted[brick].brick.capture()
+            return node.hosted(brick).brick.capture()
         case control.Restore(_, brick, state, migrate):
-            taker = wiring.hosted[brick].brick
+            taker = node.hosted(brick).brick
             take = getattr(taker, "migrate", taker.restore) if migrate else taker.restore
             take(state)
         case control.Tell(_, brick, message):
-            node.step(wiring.hosted[brick], CONTROL, message)
+            node.tell(brick, message)
         case control.WatchNodes():
-            _watch(node, order, fds)
+            node.watch(order, fds)
+            node.tell(WATCHDOG.format(order.replica), Watch(order.replica, order.generation, order.nodes))
         case control.Arm():
             _arm(node, order)
         case control.Stats():
-            return node.device.stats() if node.device is not None else b""
+            return node.stats()
         case control.Quiet():
-            assert node.device is not None
-            node.device.quiet()
+            node.quiet()
         case control.Park() | control.Assign() | control.Serve() | control.Stop() | control.Ack():
             raise PeerError(f"{type(order).__name__} to a node")
         case _:
@@ -70,30 +132,23 @@ def carry_out(node: "Node", order: control.ToNode, fds: list[int]) -> bytes | No
     return b""
 
 
-def _rewire(node: "Node", order: control.Rewire, fds: list[int]) -> bytes | None:
+def _rewire(node: Host, order: control.Rewire, fds: Fds) -> bytes | None:
     for port in order.inputs:
         found = None if port.index == control.NOWHERE else fds[port.index]
-        node.wiring.bind_input(port.brick, port.port, found)
+        node.bind_input(port.brick, port.port, found)
     for port in order.outputs:
         found = None if port.index == control.NOWHERE else fds[port.index]
         node.bind_output(port.brick, port.port, found, order.epoch)
     if not order.suspend:
         return b""
-    node.suspend_token, node.draining = order.token, False
+    node.suspend(order.token, drain=False)
     return None  # answered when quiescent
-
-
-def _watch(node: "Node", order: control.WatchNodes, fds: list[int]) -> None:
-    assert isinstance(node.device, Sensor) and node.device_brick is not None
-    node.device.watch(order.nodes, order.journals, order.pids, fds)
-    node.wiring.forget_plans()
-    node.step(node.device_brick, CONTROL, Watch(order.replica, order.generation, order.nodes))
 
 
 # -- faults ---------------------------------------------------------------------------------------
 
 
-def _arm(node: "Node", order: control.Arm) -> None:
+def _arm(node: Host, order: control.Arm) -> None:
     """Faults that wait for the same event go on counting; one that is told of again begins anew."""
     event = event_named(order.event)
     before = node.armed.pop(event, None)
@@ -104,7 +159,7 @@ def _arm(node: "Node", order: control.Arm) -> None:
         node.armed[event] = control.Arm(control.UNANSWERED, order.event, blows)
 
 
-def fire(node: "Node", hosted: Hosted, effects: list[Effect], note: Note) -> None:
+def fire(node: Host, hosted: Hosted, effects: list[Effect], note: Note) -> None:
     """`note`, one of `effects`, is being performed: what waits for it and is due happens now.
 
     A bit is flipped in what is sent behind it, so `effects` may be others from there on.
@@ -121,22 +176,18 @@ def fire(node: "Node", hosted: Hosted, effects: list[Effect], note: Note) -> Non
             _strike(node, blow)
 
 
-def _strike(node: "Node", blow: control.Blow) -> None:
+def _strike(node: Host, blow: control.Blow) -> None:
     """Do it to ourselves, or wait until the supervisor has done it."""
-    node.journal.write(time.monotonic_ns(), Event.FAULT_APPLIED, 0, mark(blow.fault))
+    node.record(Event.FAULT_APPLIED, 0, mark(blow.fault))
     if blow.itself:
-        os.kill(os.getpid(), signal.SIGKILL if blow.act is Act.CRASH else signal.SIGSTOP)
+        node.strike_itself(blow.act)
         return
-    node.line.send(control.Fired(blow.fault))
-    limit = time.monotonic() + FAULT_SECONDS_MAX
-    while time.monotonic() < limit:
-        if node.serve_control(wait=True, until=blow.fault):
-            return
-    raise AssertionError(f"fault {blow.fault} was not applied within {FAULT_SECONDS_MAX} s")
+    node.say(control.Fired(blow.fault))
+    node.wait_until_hit(blow.fault)
 
 
 def _flip(
-    node: "Node", hosted: Hosted, effects: list[Effect], note: Note, blow: control.Blow, flip: Flip
+    node: Host, hosted: Hosted, effects: list[Effect], note: Note, blow: control.Blow, flip: Flip
 ) -> None:
     """Hit what the Server has just made; the message that carries it away shows it.
 
@@ -151,11 +202,11 @@ def _flip(
     if bit < bits:
         message = _hit(hosted.brick, send.message, flip.place, data, bit)
     if message is None:
-        node.journal.write(time.monotonic_ns(), Event.PEER_REFUSED, note.request_id, mark(blow.fault, bits))
+        node.record(Event.PEER_REFUSED, note.request_id, mark(blow.fault, bits))
     else:
         effects[at] = Send(send.port, message)
-        node.journal.write(time.monotonic_ns(), Event.FAULT_APPLIED, note.request_id, mark(blow.fault, bit))
-    node.line.send(control.Fired(blow.fault))  # nobody has to be waited for
+        node.record(Event.FAULT_APPLIED, note.request_id, mark(blow.fault, bit))
+    node.say(control.Fired(blow.fault))  # nobody has to be waited for
 
 
 def _aimed_at(brick: Brick, message: Message, place: Place) -> bytes:
@@ -183,11 +234,10 @@ def _hit(brick: Brick, message: Message, place: Place, data: bytes, bit: int) ->
     return structs.replace(message, state=state) if isinstance(message, Tried | StateCaptured) else message
 
 
-def order_or_halt(node: "Node", hosted: Hosted, effect: Effect) -> None:
+def order_or_halt(node: Host, hosted: Hosted, effect: Effect) -> None:
     """The rare effects: a script for the runtime, or the end of this node."""
     if isinstance(effect, Order):
-        node.line.send(control.Ordered(hosted.name, effect.script, effect.phase, effect.number))
+        node.say(control.Ordered(hosted.name, effect.script, effect.phase, effect.number))
         return
     assert isinstance(effect, Halt)
-    print(f"{hosted.name} (pid {os.getpid()}): detected stop: {effect.reason}", file=sys.stderr, flush=True)
-    os._exit(EXIT_DETECTED)
+    node.stop_detected(hosted.name, effect.reason)

@@ -6,7 +6,6 @@ what must be undone stands in an `except` beside what was done.
 """
 
 import contextlib
-import time
 from collections.abc import Callable, Generator
 from typing import Final
 
@@ -45,7 +44,8 @@ class _Job:
 class Jobs:
     """All jobs under way."""
 
-    def __init__(self) -> None:
+    def __init__(self, now_ns: Callable[[], int]) -> None:
+        self._now_ns = now_ns
         self._jobs: list[_Job] = []
         self._early: dict[Key, bytes] = {}  # settled before anybody waited for it
         self._refused: dict[Key, str] = {}  # failed before anybody waited for it
@@ -116,7 +116,7 @@ class Jobs:
             while True:
                 job.wait = resume()
                 job.got = {key: self._early.pop(key) for key in job.wait.keys & self._early.keys()}
-                job.deadline_ns = time.monotonic_ns() + round(job.wait.seconds * 1e9)
+                job.deadline_ns = self._now_ns() + round(job.wait.seconds * 1e9)
                 refused = [self._refused.pop(key) for key in job.wait.keys & self._refused.keys()]
                 if refused:
                     resume = lambda why=refused[0]: job.steps.throw(StepFailed(why))  # type: ignore[misc]  # noqa: E731

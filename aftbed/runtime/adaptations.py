@@ -6,10 +6,7 @@ waits; a replica that is lost before the end of the observation undoes the adapt
 """
 
 import functools
-import json
-import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Final
 
 import msgspec
@@ -19,19 +16,15 @@ from aftbed.core.errors import ConfigError
 from aftbed.core.event import Event
 from aftbed.core.fault import Act
 from aftbed.core.script import Phase, Script, bricks_changed
-from aftbed.runtime.unix import control
-from aftbed.runtime.unix.deployment import Deployment, Keys
-from aftbed.runtime.unix.exchange import Exchange
-from aftbed.runtime.unix.faults import Faults
-from aftbed.runtime.unix.jobs import StepFailed, Wait
-from aftbed.runtime.unix.journal import Journal
-from aftbed.runtime.unix.loop import Loop
-from aftbed.runtime.unix.options import Scheduled
-from aftbed.runtime.unix.processes import Process
-from aftbed.runtime.unix.verbs import Executor
+from aftbed.runtime import control
+from aftbed.runtime.deployment import Deployment, Keys
+from aftbed.runtime.exchange import Exchange
+from aftbed.runtime.faults import Faults
+from aftbed.runtime.interface import Process
+from aftbed.runtime.jobs import StepFailed, Wait
+from aftbed.runtime.verbs import Executor
 
 ENGINE: Final = "engine"
-HISTORY_NAME: Final = "adaptations.jsonl"
 REPLACE: Final = "replace "  # begins the names of jobs that hand channels out
 RETRY_SECONDS: Final = 0.01
 RETRIES_MAX: Final = 100
@@ -75,9 +68,8 @@ def _spoiled(reason: str) -> Keys:
 class _Current:
     """The one under way."""
 
-    def __init__(self, outcome: Outcome, answer: Answer) -> None:
-        self.outcome, self.answer = outcome, answer
-        self.began_ns = time.monotonic_ns()
+    def __init__(self, outcome: Outcome, answer: Answer, began_ns: int) -> None:
+        self.outcome, self.answer, self.began_ns = outcome, answer, began_ns
         self.phase_ns = 0
         self.script: Script | None = None
         self.phase = Phase.PREPARE
@@ -94,18 +86,14 @@ class Adaptations:
         self,
         deployment: Deployment,
         executor: Executor,
-        loop: Loop,
-        journal: Journal,
         faults: Faults,
-        record: Path,
-        tell: Callable[[str, str], None],
         inform_recovery: Callable[[], None],
     ) -> None:
-        self._deployment, self._executor, self._loop = deployment, executor, loop
-        self._journal, self._faults, self._tell = journal, faults, tell
+        self._deployment, self._executor, self._faults = deployment, executor, faults
+        self._support, self._loop = deployment.support, deployment.support.loop
+        self._tell = self._support.tell
         self._inform_recovery = inform_recovery
-        self._path = record / HISTORY_NAME
-        self._started_ns = time.monotonic_ns()
+        self._started_ns = self._loop.now_ns()
         self._current: _Current | None = None
         self.history: list[Outcome] = []
         self._scheduled: dict[int, message.Goal] = {}  # by the number of their trigger
@@ -152,11 +140,11 @@ class Adaptations:
             return
         number = len(self.history) + 1
         outcome = Outcome(number, goal.expression or goal.part or "script", goal.recipe, deployment.graph.ftm)
-        outcome.asked_ms = round((time.monotonic_ns() - self._started_ns) / 1e6, 3)
-        self._current = _Current(outcome, answer)
+        outcome.asked_ms = round((self._loop.now_ns() - self._started_ns) / 1e6, 3)
+        self._current = _Current(outcome, answer, self._loop.now_ns())
         self._say(message.Adapt(number, goal, deployment.graph))
 
-    def schedule(self, scheduled: tuple[Scheduled, ...]) -> Keys:
+    def schedule(self, scheduled: tuple[message.Scheduled, ...]) -> Keys:
         """Those that were asked for with the run: at a request the Client waits until it has begun."""
         for number, later in enumerate(scheduled, FIRST_TRIGGER):
             if not later.at_request:
@@ -205,7 +193,7 @@ class Adaptations:
             now.outcome.purpose, now.outcome.ftm = todo.purpose, todo.ftm or self._deployment.graph.ftm
             now.outcome.bricks_total = max(len(g.bricks) for g in (now.exchange.old, now.exchange.new))
             self._tell("adapt", f"{number}: {todo.purpose} ({todo.recipe})")
-        now.phase, now.ended, now.phase_ns = phase, False, time.monotonic_ns()
+        now.phase, now.ended, now.phase_ns = phase, False, self._loop.now_ns()
         exchange = now.exchange
         phases: dict[Phase, Callable[[], Keys]] = {
             Phase.PREPARE: exchange.prepare,
@@ -221,11 +209,11 @@ class Adaptations:
 
     def _step(self, event: Event, number: int) -> Keys:
         """Journal a step before it acts; whatever fault waits for it strikes first."""
-        self._journal.write(time.monotonic_ns(), event, 0, number)
+        self._support.journal.write(self._loop.now_ns(), event, 0, number)
         yield from self._faults.at(event)
 
     def _ended(self, now: _Current, failure: str) -> None:
-        took_ms = round((time.monotonic_ns() - now.phase_ns) / 1e6, 3)
+        took_ms = round((self._loop.now_ns() - now.phase_ns) / 1e6, 3)
         now.ended, now.failure = True, failure
         self._tell("adapt.phase", f"{now.phase.value}: {failure or f'{took_ms:.2f} ms'}")
         assert now.exchange is not None
@@ -250,7 +238,7 @@ class Adaptations:
             self._inform_recovery()
         outcome = now.outcome
         outcome.outcome, outcome.reason = told.outcome, told.reason
-        outcome.total_ms = round((time.monotonic_ns() - now.began_ns) / 1e6, 3)
+        outcome.total_ms = round((self._loop.now_ns() - now.began_ns) / 1e6, 3)
         outcome.ftm = self._deployment.graph.ftm
         outcome.application = next(b.application for b in self._deployment.graph.bricks if b.part == "server")
         if now.exchange is not None:
@@ -258,8 +246,7 @@ class Adaptations:
             outcome.bricks_changed = bricks_changed(now.exchange.old, now.exchange.new, now.script)
             outcome.opened_ns = now.exchange.opened_ns if told.outcome == "done" else 0
         self.history.append(outcome)
-        with open(self._path, "ab") as file:
-            file.write(msgspec.json.encode(outcome) + b"\n")
+        self._support.keep(msgspec.json.encode(outcome))
         self._tell("adapted", f"{outcome.number}: {outcome.purpose}: {told.outcome} {told.reason}".rstrip())
         now.answer(outcome)
 
@@ -294,4 +281,4 @@ class Adaptations:
 
     def to_json(self) -> bytes:
         """The history, for `aftbed adapt history`."""
-        return json.dumps({"adaptations": [msgspec.to_builtins(o) for o in self.history]}).encode()
+        return msgspec.json.encode({"adaptations": self.history})

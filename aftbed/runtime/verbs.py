@@ -6,20 +6,17 @@ half made is killed.
 """
 
 import contextlib
-import time
-from collections.abc import Callable
 from typing import Final
 
 from aftbed.core import message, script
 from aftbed.core.event import Event
 from aftbed.core.graph import Link
 from aftbed.ftm.mechanism import STATEFUL, replication_of
-from aftbed.runtime.unix import control
-from aftbed.runtime.unix.channels import Channel
-from aftbed.runtime.unix.cores import BESIDE_LEADER
-from aftbed.runtime.unix.deployment import Deployment, Keys
-from aftbed.runtime.unix.jobs import StepFailed, Wait
-from aftbed.runtime.unix.journal import Journal
+from aftbed.runtime import control
+from aftbed.runtime.cores import BESIDE_LEADER
+from aftbed.runtime.deployment import Deployment, Keys
+from aftbed.runtime.interface import Channel
+from aftbed.runtime.jobs import StepFailed, Wait
 
 FIRST_REPLY_SECONDS: Final = 0.001
 
@@ -27,8 +24,8 @@ FIRST_REPLY_SECONDS: Final = 0.001
 class Executor:
     """Carries out scripts, one at a time."""
 
-    def __init__(self, deployment: Deployment, journal: Journal, tell: Callable[[str, str], None]) -> None:
-        self._deployment, self._journal, self._tell = deployment, journal, tell
+    def __init__(self, deployment: Deployment) -> None:
+        self._deployment, self._support = deployment, deployment.support
         self._running = False
         self.held = False  # an adaptation acts on what serves
         self._promoting: Wait | None = None  # what Promote has yet to come to
@@ -119,7 +116,7 @@ class Executor:
 
     def _note(self, event: Event, replica: str) -> None:
         slot = self._deployment.slots[replica]
-        self._journal.write(time.monotonic_ns(), event, 0, slot.generation << 8 | slot.number)
+        self._support.journal.write(self._support.loop.now_ns(), event, 0, slot.generation << 8 | slot.number)
 
     def _fence(self, replica: str) -> None:
         deployment = self._deployment
@@ -191,7 +188,7 @@ class Executor:
                 channel.nudge()  # wakes one that waits for a request
         # The new leader's core is for the first reply now: nothing is urgent here, and to wake up for
         # each word from there would take it 0.1 ms.
-        time.sleep(FIRST_REPLY_SECONDS)
+        self._support.loop.rest(FIRST_REPLY_SECONDS)
         promoting, self._promoting = self._promoting, None
         if promoting is not None:
             yield promoting

@@ -1,4 +1,4 @@
-"""Faults on real processes: armed in the node that emits the event, applied through pidfds of this run.
+"""Faults of a run: armed in the node that emits the event, applied to processes of this run.
 
 A crash of the emitter itself happens there, at the very point; so does a bitflip, which needs nobody
 else. Anything else is asked for: the emitter waits until the supervisor has hit the target and seen it
@@ -8,26 +8,18 @@ adaptation comes through is emitted by the supervisor itself: see `Faults.at`. E
 
 import contextlib
 import itertools
-import signal
-import time
-from collections.abc import Callable, Generator
-from pathlib import Path
-from random import Random
+from collections.abc import Generator, Iterable
 from typing import Final
 
 from aftbed.core.event import Event, event_named
 from aftbed.core.fault import Act, Fault, Flip, marked
-from aftbed.core.journal import Record, records
-from aftbed.runtime import targets
-from aftbed.runtime.unix import control, linux
-from aftbed.runtime.unix.deployment import Deployment, Keys
-from aftbed.runtime.unix.jobs import Key, StepFailed, Wait
-from aftbed.runtime.unix.journal import Journal
-from aftbed.runtime.unix.loop import Loop
-from aftbed.runtime.unix.processes import Process
+from aftbed.core.journal import Record
+from aftbed.runtime import control, targets
+from aftbed.runtime.deployment import Deployment, Keys
+from aftbed.runtime.interface import Process
+from aftbed.runtime.jobs import Key, StepFailed, Wait
 
-STOP_SECONDS_MAX: Final = 0.5
-DRAW_BITS: Final = 63
+STOP_NS_MAX: Final = 500_000_000
 
 
 class Armed:
@@ -41,24 +33,21 @@ class Armed:
         self.host: Process | None = None
         self.brick = ""
         self.itself = False
-        self.journals: set[Path] = set()
+        self.journals: set[str] = set()
         self._since_ns = 0
         self._share = 1  # how many bricks of the host emit the event
 
-    def move_in(self, host: Process, brick: str, share: int, *, itself: bool) -> None:
+    def move_in(self, host: Process, brick: str, share: int, now_ns: int, *, itself: bool) -> None:
         """Wait in `host` from now on."""
-        assert host.journal is not None, host.name
+        assert host.journal, host.name
         self.host, self.brick, self._share, self.itself = host, brick, share, itself
         self.journals.add(host.journal)
-        self._since_ns = time.monotonic_ns()
+        self._since_ns = now_ns
 
-    def move_out(self) -> None:
-        """What happened in the host has been counted there, and is not forgotten."""
-        assert self.host is not None and self.host.journal is not None
+    def move_out(self, records: Iterable[Record]) -> None:
+        """What happened in the host has been counted there, by its records, and is not forgotten."""
         event = event_named(self.fault.event)
-        happened = sum(
-            r.event is event and r.t_ns >= self._since_ns for r in records(self.host.journal.read_bytes())
-        )
+        happened = sum(r.event is event and r.t_ns >= self._since_ns for r in records)
         self.left = max(1, self.left - happened // self._share)
         self.host = None
 
@@ -69,25 +58,18 @@ class Armed:
 
 
 class Faults:
-    """All faults of a run; `seed` is the run's, and chooses the bits that nobody names."""
+    """All faults of a run."""
 
-    def __init__(
-        self,
-        deployment: Deployment,
-        loop: Loop,
-        journal: Journal,
-        tell: Callable[[str, str], None],
-        seed: int = 0,
-    ) -> None:
-        self._deployment, self._loop, self._journal, self._tell = deployment, loop, journal, tell
-        self._seed = seed
+    def __init__(self, deployment: Deployment) -> None:
+        self._deployment, self._support = deployment, deployment.support
+        self._loop, self._tell = self._support.loop, self._support.tell
         self._numbers = itertools.count(1_000_001)  # apart from the tokens of orders
         self._armed: list[Armed] = []
 
     def arm(self, fault: Fault) -> Keys:
         """Apply `fault` now, later, or have its emitter wait for its event. Raises StepFailed."""
         number = next(self._numbers)
-        armed = Armed(number, fault, Random(f"{self._seed}/{number}").getrandbits(DRAW_BITS))
+        armed = Armed(number, fault, self._support.draw(number))
         self._armed.append(armed)
         self._tell("armed", str(fault))
         if fault.trigger.after_ms and not fault.trigger.event:
@@ -118,7 +100,7 @@ class Faults:
             raise StepFailed(f"{fault}: nobody emits {fault.event} now")
         itself = fault.act is Act.CRASH and node in self._nodes_of(fault.target)
         share = targets.emitters_in(graph, fault.event, node)
-        armed.move_in(deployment.nodes[node], brick, share, itself=itself)
+        armed.move_in(deployment.nodes[node], brick, share, self._loop.now_ns(), itself=itself)
         yield from deployment.ask(
             node, lambda token: control.Arm(token, fault.event, (armed.blow(armed.left),))
         )
@@ -134,8 +116,9 @@ class Faults:
     def _withdraw(self, armed: Armed) -> Keys:
         """Its host no longer emits its event, or lives no longer."""
         host = armed.host
-        armed.move_out()
-        if host is not None and host.alive and self._deployment.nodes.get(host.name) is host:
+        assert host is not None
+        armed.move_out(self._support.records(host.journal))
+        if host.alive and self._deployment.nodes.get(host.name) is host:
             event, blow = armed.fault.event, armed.blow(0)
             yield from self._deployment.ask(host.name, lambda token: control.Arm(token, event, (blow,)))
 
@@ -168,7 +151,7 @@ class Faults:
         if armed.state != "armed" or not (armed.itself or armed.fault.flip):
             return
         for path in armed.journals:
-            for record in records(path.read_bytes()):
+            for record in self._support.records(path):
                 if marked(record.detail)[0] != armed.number:
                     continue
                 if armed.fault.flip is not None:
@@ -213,7 +196,7 @@ class Faults:
             armed.state = "not_activated"
             self._tell("fault", f"{armed.fault}: nobody to hit")
             return
-        self._journal.write(time.monotonic_ns(), Event.FAULT_APPLIED, 0, armed.number)
+        self._support.journal.write(self._loop.now_ns(), Event.FAULT_APPLIED, 0, armed.number)
         if armed.fault.act is Act.CRASH:
             dead: set[Key] = {("died", p.name, p.pid) for p in hit}
             for process in hit:
@@ -225,14 +208,13 @@ class Faults:
 
     def _hang(self, armed: Armed, hit: list[Process]) -> Generator[Wait, dict[Key, bytes], None]:
         for process in hit:
-            process.kill(signal.SIGSTOP)
-        limit = time.monotonic() + STOP_SECONDS_MAX
-        while not all(_stopped(p) for p in hit) and time.monotonic() < limit:
-            time.sleep(0)  # the state change is the kernel's next few microseconds of work
+            process.freeze()
+        limit_ns = self._loop.now_ns() + STOP_NS_MAX
+        while not all(p.stopped() for p in hit) and self._loop.now_ns() < limit_ns:
+            self._loop.rest(0)  # the state change is the kernel's next few microseconds of work
         armed.state = "applied"
         if armed.fault.for_ms:
-            pidfds = [p.pidfd for p in hit]
-            self._loop.after(armed.fault.for_ms / 1e3, lambda: _resume(hit, pidfds))
+            self._loop.after(armed.fault.for_ms / 1e3, lambda: _resume(hit))
         yield Wait(frozenset())
 
     def receipts(self) -> list[dict[str, str]]:
@@ -259,16 +241,6 @@ def _settle_flip(armed: Armed, flip: Flip, record: Record) -> None:
         armed.state, armed.detail = "refused", f"the function refused bit {bit} {of}"
 
 
-def _stopped(process: Process) -> bool:
-    """Whether the kernel has it in state `T` (proc(5)); a dead one counts as stopped."""
-    try:
-        stat = Path(f"/proc/{process.pid}/stat").read_text()
-    except OSError:
-        return True
-    return stat.rpartition(")")[2].split()[0] in "TZX"
-
-
-def _resume(processes: list[Process], pidfds: list[int]) -> None:
-    for process, pidfd in zip(processes, pidfds, strict=True):
-        if process.alive and process.pidfd == pidfd:
-            linux.kill(pidfd, signal.SIGCONT)
+def _resume(processes: list[Process]) -> None:
+    for process in processes:
+        process.thaw()

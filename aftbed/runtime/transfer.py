@@ -9,10 +9,10 @@ from hashlib import blake2b
 from typing import Final
 
 from aftbed.core.graph import Graph
-from aftbed.runtime.unix import control
-from aftbed.runtime.unix.deployment import Deployment, Keys
-from aftbed.runtime.unix.jobs import Key, Wait
-from aftbed.runtime.unix.processes import Process
+from aftbed.runtime import control
+from aftbed.runtime.deployment import Deployment, Keys
+from aftbed.runtime.interface import Process
+from aftbed.runtime.jobs import Key, Wait
 
 EXCHANGE_SECONDS_MAX: Final = 0.5
 

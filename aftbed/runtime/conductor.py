@@ -1,0 +1,182 @@
+"""The conductor: what a run does when a brick orders something, or a process speaks or dies.
+
+Recovery orders scripts, the Engine the phases of adaptations: they are carried out here, one at a time,
+and whoever ordered hears how it ended. What belongs to no replica (Client, Proxy, Watchdogs, Recovery,
+Engine) is replaced when it dies. None of it is on the request path: while it sleeps, requests flow.
+"""
+
+from collections.abc import Callable
+from typing import Final
+
+import msgspec
+
+from aftbed.core import message, script
+from aftbed.core.event import Event
+from aftbed.core.graph import Graph
+from aftbed.core.script import Phase
+from aftbed.runtime import control
+from aftbed.runtime.adaptations import ENGINE, REPLACE, Adaptations
+from aftbed.runtime.deployment import WATCHED_KINDS, Deployment
+from aftbed.runtime.faults import Faults
+from aftbed.runtime.interface import Process, Support
+from aftbed.runtime.jobs import StepFailed
+from aftbed.runtime.verbs import Executor
+from aftbed.runtime.zygotes import LIGHT
+
+RETRY_SECONDS: Final = 0.002
+AGAIN_SECONDS: Final = 0.02
+SETTLE_SECONDS: Final = 0.002
+LOSS_SECONDS: Final = 0.5  # a failover is done long before
+LOSSES: Final = ("failover", "drop backup")
+
+
+class Conductor:
+    """One run. `on_loss` is called when no replica is left and none will come."""
+
+    def __init__(
+        self, graph: Graph, support: Support, cpus: list[int] | None, on_loss: Callable[[], None]
+    ) -> None:
+        self._support, self._loop, self._on_loss = support, support.loop, on_loss
+        self.deployment = Deployment(graph, support, cpus)
+        self.executor = Executor(self.deployment)
+        self.faults = Faults(self.deployment)
+        self.adaptations = Adaptations(
+            self.deployment, self.executor, self.faults, lambda: self.inform_recovery(failed=False)
+        )
+        self.ending = False
+
+    def spares(self) -> int:
+        """Enough for a replica and for one node beside it."""
+        slots, nodes = self.deployment.slots.values(), self.deployment.graph.nodes.values()
+        chain = max(sum(set(bricks) <= slot.bricks for bricks in nodes) for slot in slots)
+        return chain + 1 if len(slots) > 1 else 1
+
+    # -- what processes say -------------------------------------------------------------------
+
+    def on_report(self, process: Process, report: msgspec.Struct) -> None:
+        """A node has said something."""
+        jobs = self._loop.jobs
+        match report:
+            case control.Ack(token, data, error):
+                process.assigned()
+                key = ("ack", process.name, token)
+                if error:
+                    self._support.tell("refused", f"{process.name}: {error}")
+                    jobs.fail(key, f"{process.name}: {error}")
+                else:
+                    jobs.settle(key, data)
+            case control.Said(brick, message.Promoted(epoch)):
+                jobs.settle(("promoted", brick, epoch))
+            case control.Said(_, message.Adapted() as told):
+                self.adaptations.adapted(told)
+                self._loop.after(SETTLE_SECONDS, self._settle)
+            case control.Ordered(_, ordered, Phase.WHOLE):
+                self._on_script(ordered)
+            case control.Ordered(_, ordered, phase, number):
+                self.adaptations.ordered(ordered, phase, number)
+            case control.Fired(fault):
+                if not self.adaptations.fired(process, fault):
+                    self.faults.fired(process, fault)
+            case _:
+                self._support.tell("refused", f"{process.name} said {type(report).__name__}")
+
+    def _on_script(self, ordered: script.Script) -> None:
+        if self.executor.busy or self.ending:
+            return  # another script is under way; Recovery hears how it ended
+        if ordered.purpose in LOSSES and self.adaptations.interrupted(ordered.replica):
+            return  # the way back first
+        began_ns, tell = self._loop.now_ns(), self._support.tell
+
+        def ended(failure: str) -> None:
+            ms = f"{(self._loop.now_ns() - began_ns) / 1e6:.2f} ms"
+            tell("script.failed" if failure else "script.done", f"{ordered.purpose}: {failure or ms}")
+            self.inform_recovery(failed=bool(failure))
+            self._loop.after(SETTLE_SECONDS, lambda: self._settle_after(ordered))
+
+        self._loop.jobs.start(ordered.purpose, self.executor.execute(ordered), ended)
+        if ordered.purpose in LOSSES:  # its nodes are killed only when the new leader serves
+            tell("alarm", f"{ordered.replica}: {self.deployment.cause_of_loss(ordered.replica)}")
+        tell("script", f"{ordered.purpose} ({ordered.replica})")
+
+    def _settle_after(self, ordered: script.Script) -> None:
+        """What can wait until after a script: spares, and faults that are still to come."""
+        if ordered.purpose == "new backup":
+            self._settle()
+        elif not self.ending:
+            self._loop.jobs.start("rearm", self.faults.rearm(), lambda _: None)
+
+    def _settle(self) -> None:
+        if self.ending:
+            return
+        self._support.nursery.level(LIGHT, self.spares())
+        self._loop.jobs.start("rearm", self.faults.rearm(), lambda _: None)
+
+    def inform_recovery(self, *, failed: bool) -> None:
+        """Tell it how things are; it may act again."""
+        deployment = self.deployment
+        roles = f"{deployment.leader or 'nobody'} leads, {deployment.backup or 'nobody'} backs up"
+        self._support.tell("roles", f"{roles}, epoch {deployment.epoch}")
+        if self.executor.busy or not deployment.lives("recovery") or self.ending:
+            return
+        situation = self.executor.situation(failed=failed)
+        try:
+            deployment.order("recovery", lambda token: control.Tell(token, "recovery", situation))
+        except StepFailed as error:
+            self._support.tell("refused", str(error))
+
+    # -- deaths -------------------------------------------------------------------------------
+
+    def on_death(self, process: Process) -> None:
+        """A process is dead, and nobody meant it to be unless its kind is `killed`."""
+        self._support.journal.write(self._loop.now_ns(), Event.NODE_DIED, 0, process.pid)
+        self._loop.jobs.settle(("died", process.name, process.pid))
+        if process.kind == "killed" or self.ending:
+            return
+        self._support.tell("died", f"{process.name} (pid {process.pid})")
+        self._loop.jobs.died(process.name)
+        if process.kind == "spare":
+            self._support.nursery.level(LIGHT, self.spares())
+        elif process.kind == "node" and self.replaceable(process.name):
+            if process.name != ENGINE:
+                self.adaptations.give_up_preparing(f"{process.name} died")
+            self._replace(process.name)
+        elif process.kind == "node":
+            self._loop.after(LOSS_SECONDS, self._look_for_loss)
+
+    def _look_for_loss(self) -> None:
+        deployment = self.deployment
+        if self.ending or self.executor.busy or deployment.backup:
+            return
+        slot = deployment.slots.get(deployment.leader)
+        nodes = slot.nodes if slot is not None and deployment.leader not in deployment.lost else []
+        if nodes and all(deployment.lives(node) for node in nodes):
+            return
+        self._support.tell("lost", "no replica is left: the service is gone")
+        self._on_loss()
+
+    def replaceable(self, node: str) -> bool:
+        """Whether `node` is one of the graph that belongs to no replica."""
+        bricks = self.deployment.graph.nodes.get(node, ())
+        return bool(bricks) and self.deployment.graph.brick(bricks[0]).kind in WATCHED_KINDS
+
+    def _replace(self, node: str) -> None:
+        if self.adaptations.acting:  # both hand channels out
+            self._loop.after(RETRY_SECONDS, lambda: self._replace(node))
+            return
+        began_ns = self._loop.now_ns()
+
+        def ended(failure: str) -> None:
+            ms = (self._loop.now_ns() - began_ns) / 1e6
+            self._support.tell("replaced", f"{node}: {failure or f'{ms:.2f} ms'}")
+            half = self.deployment.nodes.get(node)
+            if failure and not self.ending and half is not None and half.alive:
+                half.kill()  # half bound: its death is heard, and replaced in turn
+            elif failure and not self.ending:
+                self._loop.after(AGAIN_SECONDS, lambda: self._replace(node))
+            if node == "recovery":
+                self.inform_recovery(failed=False)
+            if node == ENGINE and not failure:
+                self.adaptations.engine_is_new()
+            self._support.nursery.level(LIGHT, self.spares())
+
+        self._loop.jobs.start(f"{REPLACE}{node}", self.deployment.respawn(node), ended)

@@ -1,0 +1,210 @@
+"""What the executive needs of a runtime: processes, channels, time. `unix` and `sim` both provide it.
+
+The executive (scripts, adaptations, failovers, faults) is written once, above this interface. So what
+the simulator explores is the very code that handles real processes; what differs is below: how a node is
+made, how mail travels, what a moment is.
+"""
+
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from typing import Protocol
+
+from aftbed.core.event import Event
+from aftbed.core.graph import Link
+from aftbed.core.journal import Record
+from aftbed.runtime.control import ToNode
+from aftbed.runtime.jobs import Jobs, Key, Wait
+
+
+class End(Protocol):
+    """An end of a channel; its number is what travels with an order."""
+
+    def fileno(self) -> int:
+        """The number."""
+        ...
+
+
+class Channel(Protocol):
+    """Both ends of `link`: order kept, a bounded queue, and it outlives the nodes at its ends."""
+
+    link: Link
+
+    @property
+    def write(self) -> End:
+        """Where the source writes."""
+        ...
+
+    @property
+    def read(self) -> End:
+        """Where the sink reads."""
+        ...
+
+    def fence(self) -> None:
+        """No more mail: what was sent stays readable and then ends; who writes later dies."""
+        ...
+
+    def refuse(self) -> None:
+        """Nobody will read: who waits for room dies."""
+        ...
+
+    def nudge(self) -> None:
+        """Wake the reader, so that it looks for orders."""
+        ...
+
+    def close(self) -> None:
+        """Let go of both ends; nodes keep theirs."""
+        ...
+
+
+class Process(Protocol):
+    """What can host a node. `kind`: zygote, spare, staged, node, service or killed."""
+
+    name: str
+    kind: str
+    pid: int
+    pidfd: int
+    journal: str  # where it writes its records, `""` for nowhere
+    incarnation: int
+    alive: bool
+
+    def kill(self) -> bool:
+        """End it, with whatever is inside; False if it is gone."""
+        ...
+
+    def freeze(self) -> bool:
+        """Stop it wherever it is; False if it is gone."""
+        ...
+
+    def thaw(self) -> bool:
+        """Let it go on from there; False if it is gone."""
+        ...
+
+    def stopped(self) -> bool:
+        """Whether it is seen to run no more: stopped, or dead."""
+        ...
+
+    def silent(self, now_ns: int, deadline_ns: int) -> bool:
+        """Whether it lives, as far as is known, and its pulse is older than `deadline_ns`."""
+        ...
+
+    def assigned(self) -> None:
+        """It has become what it was told to be."""
+        ...
+
+    def announce(self) -> None:
+        """Tell it that an order waits."""
+        ...
+
+    def announced(self) -> bool:
+        """Whether it has yet to look at its orders."""
+        ...
+
+
+class Nursery(Protocol):
+    """Where processes come from."""
+
+    @property
+    def processes(self) -> Sequence[Process]:
+        """All there are."""
+        ...
+
+    @property
+    def zygotes(self) -> Mapping[str, Process]:
+        """By name."""
+        ...
+
+    def spare(self, zygote: str) -> Generator[Wait, dict[Key, bytes], Process]:
+        """A process that can become anything; waits for one if there is none."""
+        ...
+
+    def calm(self, zygote: str) -> Generator[Wait, dict[Key, bytes], None]:
+        """Wait until no spare is in the making."""
+        ...
+
+    def level(self, zygote: str, count: int) -> None:
+        """Have `count` spares, in the end."""
+        ...
+
+    def order(self, process: Process, order: ToNode, fds: tuple[int, ...] = ()) -> None:
+        """Send an order with ends of channels. Raises StepFailed if the process is gone."""
+        ...
+
+
+class Journal(Protocol):
+    """The executive's own records."""
+
+    def write(self, now_ns: int, event: Event, request_id: int, detail: int, brick: int = 0) -> None:
+        """Append one."""
+        ...
+
+
+class Loop(Protocol):
+    """Time, and what is to happen in it."""
+
+    jobs: Jobs
+
+    def now_ns(self) -> int:
+        """Monotonic."""
+        ...
+
+    def after(self, seconds: float, call: Callable[[], None]) -> None:
+        """Call `call` once, `seconds` from now."""
+        ...
+
+    def rest(self, seconds: float) -> None:
+        """Stay out of the way of others for a moment."""
+        ...
+
+
+class Support(Protocol):
+    """A runtime, whole."""
+
+    @property
+    def loop(self) -> Loop:
+        """Time."""
+        ...
+
+    @property
+    def nursery(self) -> Nursery:
+        """Processes."""
+        ...
+
+    @property
+    def journal(self) -> Journal:
+        """What the executive does is recorded here."""
+        ...
+
+    def channel(self, link: Link) -> Channel:
+        """A fresh one."""
+        ...
+
+    def device(self, kind: str, incarnation: int) -> tuple[str, bytes]:
+        """What joins a brick of `kind` to the world, and its options; `""` for nothing."""
+        ...
+
+    def journal_of(self, node: str, incarnation: int) -> str:
+        """Where that node will write its records."""
+        ...
+
+    def records(self, journal: str) -> Iterable[Record]:
+        """What it has written so far."""
+        ...
+
+    def recorded_requests(self) -> tuple[bytes, ...]:
+        """The first few requests of the run."""
+        ...
+
+    def draw(self, number: int) -> int:
+        """Chance for fault `number`, the same whenever this seed is used: 63 bits."""
+        ...
+
+    def pin(self, pid: int, cpu: int) -> None:
+        """Have the process `pid` run on `cpu` only."""
+        ...
+
+    def keep(self, adaptation: bytes) -> None:
+        """Write down how an adaptation ended, as JSON."""
+        ...
+
+    def tell(self, event: str, text: str) -> None:
+        """A line for people."""
+        ...

@@ -1,0 +1,63 @@
+"""The Unix runtime, as the executive sees it: see `runtime.interface`."""
+
+import os
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from random import Random
+from typing import Final
+
+from aftbed.core.graph import Link
+from aftbed.core.journal import Record, records
+from aftbed.runtime.unix.channels import Channel
+from aftbed.runtime.unix.journal import Journal, recorded_requests
+from aftbed.runtime.unix.loop import Loop
+from aftbed.runtime.unix.processes import Nursery
+
+HISTORY_NAME: Final = "adaptations.jsonl"
+DRAW_BITS: Final = 63
+
+
+class Support:
+    """Of one run; `record` is its directory."""
+
+    def __init__(
+        self,
+        record: Path,
+        loop: Loop,
+        nursery: Nursery,
+        device: Callable[[str, int], tuple[str, bytes]],
+        tell: Callable[[str, str], None],
+        seed: int = 0,
+    ) -> None:
+        self._record, self._seed = record, seed
+        self.loop, self.nursery, self.device, self.tell = loop, nursery, device, tell
+        self.journal = Journal(record / "journal" / "supervisor.1.journal", "supervisor")
+
+    def channel(self, link: Link) -> Channel:
+        """A fresh pair of sockets."""
+        return Channel(link)
+
+    def journal_of(self, node: str, incarnation: int) -> str:
+        """A file for each life of a node."""
+        return str(self._record / "journal" / f"{node.replace('/', '.')}.{incarnation}.journal")
+
+    def records(self, journal: str) -> Iterable[Record]:
+        """What is committed in the file."""
+        return records(Path(journal).read_bytes())
+
+    def recorded_requests(self) -> tuple[bytes, ...]:
+        """From the client's dialogue."""
+        return recorded_requests(self._record)
+
+    def draw(self, number: int) -> int:
+        """Of the run's seed."""
+        return Random(f"{self._seed}/{number}").getrandbits(DRAW_BITS)
+
+    def pin(self, pid: int, cpu: int) -> None:
+        """See sched_setaffinity(2)."""
+        os.sched_setaffinity(pid, {cpu})
+
+    def keep(self, adaptation: bytes) -> None:
+        """One line in the record."""
+        with open(self._record / HISTORY_NAME, "ab") as file:
+            file.write(adaptation + b"\n")
