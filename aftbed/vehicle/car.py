@@ -5,7 +5,7 @@
     brake ECU --BRAKE_STATUS, EGO_STATE--> gateway
 
 In each step the brake ECU takes what has arrived, both ECUs send what is due, and the plant moves by
-1 ms under the brakes. A frame arrives, for an ECU, in the step that finds it.
+1 ms under the brakes: `body` has them, and the end of the drive; here is what carries their frames.
 
 *Paced* (`pace` 1.0 is real time, N is N times faster): steps stand on a fixed schedule of the wall
 clock. After a hiccup they are made up for, never skipped, so the car drives the same road however
@@ -17,17 +17,14 @@ frames, so the hub has them in this order; then time stands still until the AEB_
 RADAR_TRACK has come to the brake ECU. Nothing depends on the machine: the same seed gives the same
 frames, byte for byte in the bus log. A function that does not answer is waited for 3 s once, then
 shortly (`AnswerWatch`), and its misses are counted: a dead function does not hang the run.
-
-The drive ends one second after the car has come to stand and stayed there, on contact, or at the end
-of the scenario.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Final, Literal
 
 import msgspec
 
 from aftbed.core.errors import HarnessError
+from aftbed.vehicle.body import CarBody, End
 from aftbed.vehicle.bus import (
     HUB_ANSWER_S_MAX,
     AnswerWatch,
@@ -38,16 +35,10 @@ from aftbed.vehicle.bus import (
     open_bus,
 )
 from aftbed.vehicle.dbcfile import Codec
-from aftbed.vehicle.ecus import BrakeEcu, BrakePolicy, RadarEcu
+from aftbed.vehicle.ecus import BrakePolicy
 from aftbed.vehicle.frame import Frame
-from aftbed.vehicle.plant import STEP_US, Plant
 from aftbed.vehicle.report import Telemetry, VehicleResult
 from aftbed.vehicle.scenario import Scenario
-
-STANDSTILL_US: Final = 1_000_000  # the brakes' dead time and lag are ten times shorter
-TELEMETRY_US: Final = 50_000
-
-End = Literal["standstill", "collision", "duration", "stopped"]
 
 
 class DriveOptions(msgspec.Struct, frozen=True):
@@ -109,17 +100,13 @@ def drive(
 class _Car:
     def __init__(self, scenario: Scenario, codec: Codec, buses: CarBuses, options: DriveOptions) -> None:
         assert (options.pace is None) == (buses.clock is not None), "lockstep, or not?"
-        self._duration_us = scenario.duration_ms * 1000
         self._options = options
         self._buses = buses
-        self._plant = Plant(scenario.plant)
-        self._brake = BrakeEcu(codec, options.brake_policy)
-        self._radar = RadarEcu(codec, options.seed)
+        self._body = CarBody(scenario, codec, options.brake_policy, options.seed)
         self._track_id = codec.can_id("RADAR_TRACK")
         self._tracks = 0
-        self._still_us = 0
         self._lag_ms_max = 0.0
-        self._watch = AnswerWatch(buses.brake, codec.can_id("AEB_REQ"), self._brake_hears)
+        self._watch = AnswerWatch(buses.brake, codec.can_id("AEB_REQ"), self._body.hear)
 
     def run(self, report: Callable[[Telemetry], None], stop: Callable[[], bool]) -> DriveReport:
         schedule = None if self._options.pace is None else Schedule(self._options.pace)
@@ -127,49 +114,36 @@ class _Car:
             if schedule is None:
                 self._exchange_in_lockstep(stop)
             else:
-                schedule.wait_until(self._plant.t_us, stop)
+                schedule.wait_until(self._body.t_us, stop)
                 self._lag_ms_max = schedule.lag_ms_max
                 self._exchange()
-            demand_ms2 = self._brake.demand_ms2(self._plant)
-            if self._plant.t_us % TELEMETRY_US == 0:
-                report(self._telemetry())
-            self._plant.step(demand_ms2)
-            self._still_us = self._still_us + STEP_US if self._plant.stopped() else 0
-        report(self._telemetry())
+            self._body.step(report)
+        report(self._body.telemetry())
         return self._report(end)
 
     def _ended(self, stop: Callable[[], bool]) -> End | None:
-        if self._plant.collided:
-            return "collision"
-        if self._still_us >= STANDSTILL_US:
-            return "standstill"
-        if self._plant.t_us >= self._duration_us:
-            return "duration"
-        return "stopped" if stop() else None
+        return self._body.ended() or ("stopped" if stop() else None)
 
     # -- frames
-
-    def _brake_hears(self, frame: Frame) -> None:
-        self._brake.on_frame(Frame(self._plant.t_us, frame.can_id, frame.data))
 
     def _exchange(self) -> None:
         """Paced: take what has come, send what is due."""
         for frame in self._buses.brake.drain():
             self._watch.take(frame)
-        for frame in self._brake.frames(self._plant):
+        for frame in self._body.brake_frames():
             self._buses.brake.send(frame)
-        for frame in self._radar.frames(self._plant):
+        for frame in self._body.radar_frames():
             self._buses.radar.drain()  # it listens to nothing, but who does not read is put out
             self._buses.radar.send(frame)
             self._tracks += frame.can_id == self._track_id
 
     def _exchange_in_lockstep(self, stop: Callable[[], bool]) -> None:
         """Send what is due in an order that the hub cannot change, and wait for the answer."""
-        brake_frames, radar_frames = self._brake.frames(self._plant), self._radar.frames(self._plant)
+        brake_frames, radar_frames = self._body.brake_frames(), self._body.radar_frames()
         if not brake_frames and not radar_frames:
             return
         assert self._buses.clock is not None
-        self._buses.clock.set_time(self._plant.t_us)
+        self._buses.clock.set_time(self._body.t_us)
         _send_and_see(brake_frames, self._buses.brake, self._buses.radar, _ignore)
         asks = any(frame.can_id == self._track_id for frame in radar_frames)
         if asks:
@@ -179,27 +153,11 @@ class _Car:
             self._tracks += 1
             self._watch.wait(stop)
 
-    # -- reports
-
-    def _telemetry(self) -> Telemetry:
-        plant, brake = self._plant, self._brake
-        return Telemetry(
-            t_ms=plant.t_us // 1000,
-            speed_ms=plant.speed_ms,
-            gap_m=plant.gap_m,
-            ttc_s=plant.ttc_s(),
-            stage=brake.stage,
-            deceleration_ms2=max(0.0, -plant.acceleration_ms2),
-            fallback=brake.fallback,
-            frames_accepted=brake.accepted,
-            frames_refused=brake.refused,
-        )
-
     def _report(self, end: End) -> DriveReport:
         return DriveReport(
-            result=self._plant.result(),
+            result=self._body.result(),
             end=end,
-            t_us=self._plant.t_us,
+            t_us=self._body.t_us,
             tracks=self._tracks,
             answers=self._watch.answered,
             missing_answers=self._watch.missing,

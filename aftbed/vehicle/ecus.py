@@ -69,6 +69,10 @@ class Sender:
         """True if the message's cycle falls on `t_us`."""
         return t_us % self._cycle_us == self._offset_us
 
+    def next_us(self, from_us: int) -> int:
+        """The first time at or after `from_us` that is due."""
+        return from_us + (self._offset_us - from_us) % self._cycle_us
+
     def frame(self, t_us: int, signals: Mapping[str, float]) -> Frame:
         """The next frame of this message; CRC and counter are filled in."""
         data = self._codec.encode(self._name, {"CRC": 0, "COUNTER": 0, **signals})
@@ -86,6 +90,10 @@ class RadarEcu:
         self._status = Sender(codec, "RADAR_STATUS", RADAR_STATUS_OFFSET_US)
         self._seen = False
         self._cycle = 0
+
+    def track_due_us(self, from_us: int) -> int:
+        """The bus time of the first RADAR_TRACK at or after `from_us`."""
+        return self._track.next_us(from_us)
 
     def frames(self, plant: Plant) -> list[Frame]:
         """The frames due at `plant.t_us`. To be called once for each plant step."""

@@ -19,6 +19,7 @@ from typing import Final, Protocol
 
 import msgspec
 
+from aftbed.core.errors import PeerError
 from aftbed.vehicle.aebmessages import (
     RANGE_MAX_M,
     SPEED_MAX_MS,
@@ -62,6 +63,39 @@ class BusGateway(Protocol):
     def on_reply(self, reply: bytes, t_us: int, replica: int, epoch: int, answered: int) -> list[Frame]:
         """The frames that the reply becomes, sent at `t_us`. Raises PeerError if it is not a reply."""
         ...
+
+
+class ClientGateway:
+    """A gateway as its client has it: it knows the bus time, counts the replies, and raises nothing.
+
+    `replies_refused` are not replies to the brakes: the function refused the request, so there is
+    nothing to ask for.
+    """
+
+    def __init__(self, gateway: BusGateway) -> None:
+        self.answered = 0
+        self.replies_refused = 0
+        self._gateway = gateway
+        self._t_us = 0  # of the latest frame
+
+    @property
+    def counts(self) -> GatewayCounts:
+        """Of the frames."""
+        return self._gateway.counts
+
+    def on_frame(self, frame: Frame) -> bytes | None:
+        """See `BusGateway.on_frame`."""
+        self._t_us = max(self._t_us, frame.t_us)
+        return self._gateway.on_frame(frame)
+
+    def on_reply(self, reply: bytes, replica: int, epoch: int) -> list[Frame]:
+        """The frames that the reply becomes; none, and counted, if it is not one to the brakes."""
+        self.answered += 1
+        try:
+            return self._gateway.on_reply(reply, self._t_us, replica, epoch, self.answered)
+        except PeerError:
+            self.replies_refused += 1
+            return []
 
 
 class ReplySender:

@@ -4,7 +4,7 @@ import pytest
 from puredrive import CODEC
 
 from aftbed.vehicle.e2e import protect
-from aftbed.vehicle.ecus import BrakeEcu, BrakePolicy, Fallback, RadarEcu
+from aftbed.vehicle.ecus import BrakeEcu, BrakePolicy, Fallback, RadarEcu, Sender
 from aftbed.vehicle.frame import Frame
 from aftbed.vehicle.plant import Lead, Plant, PlantSetup
 
@@ -172,3 +172,11 @@ def test_the_noise_comes_from_the_seed_alone() -> None:
     plant = Plant(PlantSetup(10.0, Lead(50.0)))
     same, again, other = (RadarEcu(CODEC, seed).frames(plant) for seed in (1, 1, 2))
     assert same == again != other
+
+
+@pytest.mark.parametrize(("name", "offset_us"), [("RADAR_TRACK", 0), ("RADAR_STATUS", 5000)])
+def test_the_next_time_of_a_message_is_the_first_at_which_it_is_due(name: str, offset_us: int) -> None:
+    sender = Sender(CODEC, name, offset_us)
+    for from_us in range(0, 250_000, 1000):
+        first_us = next(t_us for t_us in range(from_us, from_us + 200_000, 1000) if sender.due(t_us))
+        assert sender.next_us(from_us) == first_us

@@ -9,7 +9,7 @@ from aftbed.core.errors import PeerError
 from aftbed.vehicle.aebmessages import AebInput, AebOutput, AebTarget, decode_request, encode_reply
 from aftbed.vehicle.e2e import intact, protect
 from aftbed.vehicle.frame import Frame
-from aftbed.vehicle.gateway import LANE_HALF_M, Gateway
+from aftbed.vehicle.gateway import LANE_HALF_M, ClientGateway, Gateway
 
 EGO = {"SPEED_VALID": 1.0, "SPEED": 14.0}
 TRACK = {"VALID": 1.0, "TRACK_ID": 5.0, "RANGE": 40.0, "RELATIVE_SPEED": -3.0}
@@ -226,3 +226,15 @@ def test_a_reply_that_is_none_is_refused_and_sends_nothing(reply: bytes, reason:
     with pytest.raises(PeerError, match=reason):
         gateway.on_reply(reply, 0, 1, 1, 1)
     assert len(gateway.on_reply(REPLY, 0, 1, 1, 1)) == 2  # the heartbeat is still due
+
+
+def test_a_client_s_gateway_stamps_and_counts_the_replies_and_raises_nothing() -> None:
+    gateway = ClientGateway(Gateway(CODEC))
+    gateway.on_frame(frame("EGO_STATE", 40, 0, EGO))
+    gateway.on_frame(frame("EGO_STATE", 30, 1, EGO))
+    assert gateway.on_reply(b"", 1, 1) == []
+    sent = gateway.on_reply(REPLY, 2, 7)
+    assert [(one.t_us, one.can_id) for one in sent] == [(40_000, 0x702), (40_000, 0x100)]
+    assert CODEC.decode("AEB_REQ", sent[1].data)["SEQUENCE"] == gateway.answered == 2
+    assert gateway.replies_refused == 1
+    assert gateway.counts.refused == {"sequence": 1, "time": 1}

@@ -1,0 +1,137 @@
+"""The car in virtual time, inside one process: no socket, no clock, no thread. The bus is a call.
+
+The body, the frames with their E2E and the gateway are those of a real run. Only what carries them is
+another: here a frame is seen by all in the instant in which it is sent, and time is what the caller says.
+
+    car.advance(now_ns)          the requests that the gateway hands to the client, up to now
+    car.deliver(reply, now_ns)   a reply that the client was given: out it goes as AEB_REQ
+    car.due_ns()                 when to advance next: no request is made before
+
+Time goes on, whether a reply comes, comes late or never, as in a paced run: a request that nobody answers
+is a gap for the brake ECU to bridge. In a step the ECUs send first, then what has arrived in this very
+instant is heard, then the plant moves. So a reply that is delivered at the time of its request brakes in
+the same step, as in lockstep: then frames and result are those of `drive` at pace "max", to the last
+bit. What arrives between two steps is heard by the next one; bus time is whole microseconds, rounded up.
+
+How often `advance` is called makes no difference: the plant is moved when it is asked for, so that the
+caller has one event for each radar cycle and not twenty.
+
+Limits: the bus is ideal. It takes no time, loses nothing, and has no other node on it.
+"""
+
+from collections import deque
+from collections.abc import Callable
+
+from aftbed.vehicle.body import CarBody, End
+from aftbed.vehicle.dbcfile import Codec, load_dbc
+from aftbed.vehicle.ecus import BrakePolicy
+from aftbed.vehicle.frame import Frame
+from aftbed.vehicle.gateway import ClientGateway, Gateway, GatewayCounts
+from aftbed.vehicle.plant import STEP_US
+from aftbed.vehicle.report import VehicleResult
+from aftbed.vehicle.scenario import Scenario
+
+
+class VirtualCar:
+    """A drive of `scenario`. All times are nanoseconds since its start, and never go back."""
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        *,
+        brake_policy: BrakePolicy = "latch",
+        seed: int = 0,
+        codec: Codec | None = None,
+        witness: Callable[[Frame], None] | None = None,
+    ) -> None:
+        """`codec` is aftbed's own DBC, loaded where none is given: that takes 3 ms.
+
+        `witness` sees every frame of the bus, in the order of the bus, as a log does.
+        """
+        codec = codec or load_dbc()
+        self._body = CarBody(scenario, codec, brake_policy, seed)
+        self._gateway = ClientGateway(Gateway(codec))
+        self._witness = witness
+        self._end = self._body.ended()
+        self._step_us = 0  # the step whose frames are to be sent next
+        self._now_ns = 0
+        self._arriving: deque[Frame] = deque()  # not heard yet
+
+    @property
+    def end(self) -> End | None:
+        """Why the drive is over; None while it is not."""
+        return self._end
+
+    @property
+    def t_us(self) -> int:
+        """How far the drive has come, in microseconds of bus time."""
+        return self._body.t_us
+
+    @property
+    def counts(self) -> GatewayCounts:
+        """The frames that the gateway has believed and refused."""
+        return self._gateway.counts
+
+    def due_ns(self) -> int | None:
+        """When the next request can be made, or the scenario ends; None when the drive is over."""
+        if self._end is not None:
+            return None
+        return min(self._body.track_due_us(self._step_us), self._body.duration_us) * 1000
+
+    def advance(self, now_ns: int) -> list[bytes]:
+        """Drive up to and including `now_ns`. The payloads of the requests that were made, in order."""
+        self._pass_to(now_ns)
+        payloads: list[bytes] = []
+        while self._end is None and self._step_us * 1000 <= now_ns:
+            if self._step_us > self._body.t_us:
+                self._finish_step()
+            if self._end is None:
+                payloads += self._begin_step()
+        return payloads
+
+    def deliver(self, payload: bytes, now_ns: int, *, replica: int = 1, epoch: int = 1) -> None:
+        """A reply has come to the gateway, from `replica` (1 or 2) of `epoch`: out go its frames.
+
+        What is no reply to the brakes is counted, and sends nothing.
+        """
+        self._pass_to(now_ns)
+        t_us = -(-now_ns // 1000)
+        for frame in self._gateway.on_reply(payload, replica, epoch):
+            self._arriving.append(Frame(t_us, frame.can_id, frame.data))
+
+    def result(self) -> VehicleResult:
+        """What the drive came to, so far."""
+        return self._body.result()
+
+    def _pass_to(self, now_ns: int) -> None:
+        assert now_ns >= self._now_ns, f"time goes back from {self._now_ns} to {now_ns} ns"
+        self._now_ns = now_ns
+
+    def _begin_step(self) -> list[bytes]:
+        """The ECUs send what is due. The request that this makes, if any."""
+        self._hear_until(self._body.t_us - 1)
+        self._step_us = self._body.t_us + STEP_US
+        payloads = []
+        for frame in self._body.brake_frames() + self._body.radar_frames():
+            self._show(frame)
+            payload = self._gateway.on_frame(frame)
+            if payload is not None:
+                payloads.append(payload)
+        return payloads
+
+    def _finish_step(self) -> None:
+        """The brake ECU hears what has come in this instant, and the plant moves."""
+        self._hear_until(self._body.t_us)
+        self._body.step()
+        self._end = self._body.ended()
+
+    def _hear_until(self, t_us: int) -> None:
+        """The brake ECU takes what has arrived at `t_us` or before."""
+        while self._arriving and self._arriving[0].t_us <= t_us:
+            frame = self._arriving.popleft()
+            self._show(frame)
+            self._body.hear(frame)
+
+    def _show(self, frame: Frame) -> None:
+        if self._witness is not None:
+            self._witness(frame)
