@@ -59,6 +59,7 @@ bench: $(EDITABLE)
 	$(BIN)/aftbed bench recovery --ftm lfr --json
 	$(BIN)/aftbed bench launch --ftm pbr --json
 	$(BIN)/aftbed bench memory --ftm pbr --json
+	$(BIN)/aftbed bench hops --ftm pbr --json
 
 # -- installation: a stamp each, so that a second `make` installs only what has changed ------------
 

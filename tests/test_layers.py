@@ -36,6 +36,8 @@ IMPURE_PLACES: Final = (  # where clock, socket, process, file and chance may li
     "aftbed.bench",
     "aftbed.cli",
 )
+SEEDED_PLACES: Final = ("aftbed.runtime.sim",)  # chance, but from a seed: nothing of `random` but its class
+SEEDED: Final = "from random import Random"
 PURE_MODULES: Final = frozenset(  # what the rest may import beside aftbed: neither clock nor I/O nor chance
     ("__future__", "abc", "bisect", "collections", "contextlib", "copy", "dataclasses", "difflib", "enum")
     + ("functools", "hashlib", "heapq", "itertools", "math", "msgspec", "operator", "re", "statistics")
@@ -89,6 +91,9 @@ def problems(module: str, source: str) -> list[str]:
             found += [f"{one}: it may not"] if ours and one.target not in allowed else []
         elif ours:
             found += _row_problems(one)
+        elif one.target == "random" and lies_in(module, SEEDED_PLACES):
+            line = source.splitlines()[one.line - 1]
+            found += [] if line == SEEDED else [f"{one}: chance is only to be had by {SEEDED!r}"]
         elif one.target.split(".")[0] not in PURE_MODULES and not lies_in(module, IMPURE_PLACES):
             found.append(f"{one}: only {', '.join(IMPURE_PLACES)} may")
     if module not in NO_ROW and not lies_in(module, IMPURE_PLACES):
@@ -153,6 +158,8 @@ def test_every_row_that_exists_is_looked_at() -> None:
         ("aftbed.ftm.proxy", "def f():\n    from os import fork", ":2 imports os"),
         ("aftbed.ftm.proxy", "if True:\n    import socket as s", ":2 imports socket"),
         ("aftbed.ftm.proxy", "from random import Random", "imports random"),
+        ("aftbed.runtime.sim.world", "import random", "chance is only to be had by"),
+        ("aftbed.runtime.sim.world", "from random import random", "chance is only to be had by"),
         ("aftbed.runtime.targets", "from pathlib import Path", "imports pathlib"),
         ("aftbed.runtime.targets", "from aftbed.runtime import unix", "what is pure imports what is not"),
         ("aftbed.ftm.proxy", "def f():\n    open('x')", "calls open"),
@@ -172,6 +179,7 @@ def test_a_planted_breach_is_found(module: str, source: str, reason: str) -> Non
         ("aftbed.cli.app", "from aftbed.core import wire\nimport aftbed.campaign.verdict, time"),
         ("aftbed.bench.runs", "from aftbed.campaign.record import read_record"),
         ("aftbed.runtime.unix.node", "import socket\nfrom aftbed.vehicle.function import AebFunction"),
+        ("aftbed.runtime.sim.world", "from random import Random"),
         ("aftbed.ftm.proxy", "import msgspec\nfrom collections.abc import Callable"),
         ("aftbed.__main__", "from aftbed.cli import main"),
         ("aftbed.runtime.unix.launch", "from aftbed import __version__"),

@@ -24,16 +24,14 @@ import msgspec
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.message import Goal
 from aftbed.core.script import RECIPES
+from aftbed.core.words import milliseconds
 from aftbed.ftm.mechanism import DUPLEX, SIMPLEX, parse
 
 VERBS: Final = ("to", "switch", "compose", "decompose", "update")
 GRAMMAR: Final = (
     "to|switch|compose EXPR, decompose, or update BRICK to SOURCE, then [at request N | after 500ms]"
 )
-AFTER_MS_MAX: Final = 3_600_000.0
 _WHOLE: Final = re.compile(r"[0-9]{1,12}")
-_DURATION: Final = re.compile(r"([0-9]{1,10}(?:\.[0-9]{1,6})?)(ms|s)")
-_UNITS_MS: Final = {"ms": 1.0, "s": 1000.0}
 
 
 class Wish(msgspec.Struct, frozen=True):
@@ -82,23 +80,12 @@ def _timed(text: str, wish: Wish, words: list[str]) -> Timed:
                 raise ConfigError(f"at request {number[:40]!r}: a whole number from 1 on is allowed")
             return Timed(wish, at_request=int(number))
         case ["after", duration]:
-            return Timed(wish, after_ms=_milliseconds(duration))
+            return Timed(wish, after_ms=milliseconds("after", duration))
         case _:
             found = " ".join(words)
             raise ConfigError(
                 f"adaptation {text!r}: found {found!r}, allowed is 'at request N' or 'after 500ms'"
             )
-
-
-def _milliseconds(text: str) -> float:
-    found = _DURATION.fullmatch(text)
-    value = float(found[1]) * _UNITS_MS[found[2]] if found else 0.0
-    if not 0 < value <= AFTER_MS_MAX:
-        raise ConfigError(
-            f"after {text[:40]!r}: a positive number with its unit is allowed, as 500ms or 2s,"
-            f" up to {AFTER_MS_MAX / _UNITS_MS['s']:.0f}s"
-        )
-    return value
 
 
 def goal(wish: Wish, running: str, recipe: str = RECIPES[0]) -> Goal:

@@ -93,6 +93,30 @@ def memory(ftm: Ftm = "pbr", placement: Placement = "process", json: Json = Fals
     _print(bench_memory(ftm, placement), as_json=json)
 
 
+@bench.command()
+def hops(
+    ftm: Ftm = "pbr",
+    requests: Annotated[int, typer.Option(min=100, help="After the warm-up.")] = REQUESTS_MIN,
+    pin: Pin = True,
+    json: Json = False,
+) -> None:
+    """The delay of one hop between two bricks in processes of their own, as a distribution."""
+    import msgspec  # noqa: PLC0415
+
+    from aftbed.bench.hops import bench_hops  # noqa: PLC0415
+
+    found = bench_hops(ftm, requests, pin=pin)
+    if json:
+        _print(msgspec.to_builtins(found), as_json=True)
+        return
+    _print({"ftm": found.ftm, "requests": found.requests, "samples": found.samples}, as_json=False)
+    for name, delay_ns in found.hop_ns.items():
+        print(f"{name:14} {delay_ns / 1e3:9.2f} us")
+    for pair in (*found.pairs, *found.beside):
+        apart = "  (not used: sends more)" if pair in found.beside else ""
+        print(f"p50 {pair.p50_ns / 1e3:9.2f} us  {pair.source} -> {pair.sink}{apart}")
+
+
 def _print(found: dict[str, object], *, as_json: bool) -> None:
     import json  # noqa: PLC0415
 

@@ -16,7 +16,7 @@ import msgspec
 
 from aftbed.core.errors import PeerError
 from aftbed.core.event import Event
-from aftbed.core.message import AnyMessage, Message
+from aftbed.core.message import AnyMessage, Message, Rebound
 from aftbed.core.script import Phase, Script
 
 CONTROL: Final = "control"  # the port on which the runtime speaks to a brick
@@ -62,6 +62,17 @@ class Halt(msgspec.Struct, frozen=True):
 
 
 Effect = Send | Note | Order | Halt
+
+
+def no_move(state: BrickState, port: str, msg: AnyMessage) -> list[Effect]:
+    """The answer to a message for which a brick's table of moves has no row in `state`.
+
+    A Rebound is told to every brick and is nothing to most of them. Raises PeerError on all else. The look-up
+    itself stays in `step`: it is done on every hop, and a call is not free.
+    """
+    if isinstance(msg, Rebound):
+        return []
+    raise PeerError(f"{type(msg).__name__} on {port} while {state.name}")
 
 
 class Brick(Protocol):

@@ -14,6 +14,7 @@ import msgspec
 from aftbed.core.application import Application
 from aftbed.core.errors import PeerError
 from aftbed.core.event import RERUN, Event
+from aftbed.core.graph import Graph
 from aftbed.core.journal import Entry, EntryKind, Record
 
 REASONS_MAX: Final = 5
@@ -233,3 +234,10 @@ def _answers(history: History) -> dict[int, list[Entry]]:
 
 def _client_refusals(history: History) -> list[Record]:
     return [r for r in history.events(Event.PEER_REFUSED) if r.node == "client"]
+
+
+def missing(hosted: Iterable[tuple[str, str]], whole: Graph) -> list[str]:
+    """G5: what differs between the bricks that live, with their kinds, and those of a whole graph."""
+    found, wanted = set(hosted), {(b.name, b.kind) for b in whole.bricks}
+    reasons = [f"{name} ({kind}) is missing" for name, kind in sorted(wanted - found)]
+    return reasons + [f"{name} ({kind}) should not be there" for name, kind in sorted(found - wanted)]

@@ -53,7 +53,7 @@ class Trigger(msgspec.Struct, frozen=True):
 
     event: str = ""
     nth: int = 1
-    after_ms: int = 0
+    after_ms: float = 0.0
 
 
 class Fault(msgspec.Struct, frozen=True):

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from enum import auto
 from typing import Final
 
-from aftbed.core.brick import Brick, BrickState, Effect, Halt, Note, Send
+from aftbed.core.brick import Brick, BrickState, Effect, Halt, Note, Send, no_move
 from aftbed.core.errors import PeerError
 from aftbed.core.event import Event
 from aftbed.core.message import AnyMessage, Rebound, Reply, Request, TakeOver
@@ -78,9 +78,7 @@ class AssertAfter(Brick):
         """Handle one message; see MOVES."""
         state = MOVES.get((self.state, type(msg)))
         if state is None:
-            if isinstance(msg, Rebound):
-                return []
-            raise PeerError(f"{type(msg).__name__} on {port} while {self.state.name}")
+            return no_move(self.state, port, msg)
         if isinstance(msg, Reply):
             self.state, self._held = state, msg
             return []

@@ -24,6 +24,7 @@ class Client(Brick):
     def __init__(self) -> None:
         self.next_id = 1
         self.unanswered: dict[int, Request] = {}
+        self._again: frozenset[int] = frozenset()  # asked twice, by a predecessor perhaps: may come twice
 
     def open_ports(self) -> tuple[str, ...]:
         """No new request while the backlog is full."""
@@ -42,10 +43,14 @@ class Client(Brick):
             return [Note(Event.REQUEST_SENT, request.request_id), Send("clt2pxy", request)]
         if isinstance(msg, Reply):
             if self.unanswered.pop(msg.request_id, None) is None:
+                if msg.request_id in self._again:
+                    self._again -= {msg.request_id}
+                    return []
                 raise PeerError(f"reply to request {msg.request_id}, which is not unanswered")
             return [Note(Event.REPLY_DELIVERED, msg.request_id, msg.replica), Send("deliver", msg)]
         if isinstance(msg, Rebound):
             # Ascending ids on a fresh channel: the order of ids is the order of execution (G3).
+            self._again = frozenset(self.unanswered)
             return [Send("clt2pxy", request) for request in self.unanswered.values()]
         raise PeerError(f"{type(msg).__name__} on {port}")
 

@@ -12,9 +12,9 @@ their replies; so it is admitted like a request, and while it is inside, nothing
 from enum import auto
 from typing import Final
 
-from aftbed.core.brick import NO_REQUEST, Brick, BrickState, Effect, Send
+from aftbed.core.brick import NO_REQUEST, Brick, BrickState, Effect, Send, no_move
 from aftbed.core.errors import PeerError
-from aftbed.core.message import AnyMessage, Rebound, Reply, Request, TakeOver
+from aftbed.core.message import AnyMessage, Reply, Request, TakeOver
 
 
 class State(BrickState):
@@ -51,9 +51,7 @@ class InnerProtocol(Brick):
         """Let one in, or let out what came of it."""
         state = MOVES.get((self.state, type(msg)))
         if state is None:
-            if isinstance(msg, Rebound):
-                return []
-            raise PeerError(f"{type(msg).__name__} on {port} while {self.state.name}")
+            return no_move(self.state, port, msg)
         if isinstance(msg, Request):
             self.state, self.busy_id = state, msg.request_id
             return [Send("pro2bfr", msg)]

@@ -3,10 +3,9 @@
 from enum import auto
 from typing import Final
 
-from aftbed.core.brick import Brick, BrickState, Effect, Note, Send
-from aftbed.core.errors import PeerError
+from aftbed.core.brick import Brick, BrickState, Effect, Note, Send, no_move
 from aftbed.core.event import Event
-from aftbed.core.message import AnyMessage, Rebound, Reply, Request, TakeOver
+from aftbed.core.message import AnyMessage, Reply, Request, TakeOver
 
 
 class State(BrickState):
@@ -41,9 +40,7 @@ class Compute(Brick):
         """Have it computed, or hand on the result; a TakeOver goes behind the results of all before it."""
         state = MOVES.get((self.state, type(msg)))
         if state is None:
-            if isinstance(msg, Rebound):
-                return []
-            raise PeerError(f"{type(msg).__name__} on {port} while {self.state.name}")
+            return no_move(self.state, port, msg)
         self.state = state
         if isinstance(msg, Request):
             return [Note(_ENTER, msg.request_id), Send("prd2srv", msg)]

@@ -11,10 +11,10 @@ from typing import Final
 
 import msgspec
 
-from aftbed.core.brick import CONTROL, Brick, BrickState, Effect, Note, Send
+from aftbed.core.brick import CONTROL, Brick, BrickState, Effect, Note, Send, no_move
 from aftbed.core.errors import PeerError
 from aftbed.core.event import Event
-from aftbed.core.message import AnyMessage, Promoted, Rebound, Reply, Request, StoreReply, TakeOver
+from aftbed.core.message import AnyMessage, Promoted, Reply, Request, StoreReply, TakeOver
 
 REPLIES_KEPT: Final = 256  # at least the client's backlog: what can be asked again can be answered again
 
@@ -62,9 +62,7 @@ class Protocol(Brick):
         """Admit, answer out of the log, store, or take over."""
         state = MOVES.get((self.state, type(msg)))
         if state is None:
-            if isinstance(msg, Rebound):
-                return []
-            raise PeerError(f"{type(msg).__name__} on {port} while {self.state.name}")
+            return no_move(self.state, port, msg)
         if isinstance(msg, Request):
             return self._admit(msg)
         if isinstance(msg, Reply):

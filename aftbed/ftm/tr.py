@@ -22,14 +22,13 @@ may be a third of a packet long.
 from enum import auto
 from typing import Final
 
-from aftbed.core.brick import Brick, BrickState, Effect, Halt, Note, Send
+from aftbed.core.brick import Brick, BrickState, Effect, Halt, Note, Send, no_move
 from aftbed.core.errors import PeerError
 from aftbed.core.event import Event
 from aftbed.core.message import (
     Again,
     AnyMessage,
     CaptureState,
-    Rebound,
     Reply,
     Request,
     StateCaptured,
@@ -79,9 +78,7 @@ class TrBefore(Brick):
         """Handle one message; see BEFORE_MOVES."""
         state = BEFORE_MOVES.get((self.state, type(msg)))
         if state is None:
-            if isinstance(msg, Rebound):
-                return []
-            raise PeerError(f"{type(msg).__name__} on {port} while {self.state.name}")
+            return no_move(self.state, port, msg)
         if isinstance(msg, Request):
             self.state, self._request = state, msg
             return [Send("bfr2srv", CaptureState(msg.epoch, msg.request_id))]
@@ -151,9 +148,7 @@ class TrProceed(Brick):
         """Handle one message; see PROCEED_MOVES."""
         state = PROCEED_MOVES.get((self.state, type(msg)))
         if state is None:
-            if isinstance(msg, Rebound):
-                return []
-            raise PeerError(f"{type(msg).__name__} on {port} while {self.state.name}")
+            return no_move(self.state, port, msg)
         if isinstance(msg, Trial):
             self.state, self._trial = state, msg
             # Both at once: the second starts from the same state, whatever the first one says.
@@ -234,9 +229,7 @@ class TrAfter(Brick):
     def step(self, port: str, msg: AnyMessage, now_ns: int) -> list[Effect]:
         """Handle one message; see AFTER_MOVES."""
         if (self.state, type(msg)) not in AFTER_MOVES:
-            if isinstance(msg, Rebound):
-                return []
-            raise PeerError(f"{type(msg).__name__} on {port} while {self.state.name}")
+            return no_move(self.state, port, msg)
         if isinstance(msg, TakeOver):
             return [Send("aft2pro", msg)]
         assert isinstance(msg, Trials)

@@ -13,28 +13,16 @@ from typing import Final
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.event import Event, event_named
 from aftbed.core.fault import BIT_MAX, HANG_FOREVER_MS, Act, Fault, Flip, Place, Trigger
+from aftbed.core.words import whole_milliseconds
 
 GRAMMAR: Final = (
     "crash|hang TARGET [for 50ms] [at EVENT [nth N] | after 200ms],"
     " or bitflip result|state [bit K] [in primary|backup|a|b] [at EVENT] [nth N] | [after 200ms]"
 )
-DURATION_MS_MAX: Final = 3_600_000
 TARGET_OF_A_FLIP: Final = "primary"
-_NUMBER: Final = re.compile(r"[0-9]{1,10}(\.[0-9]{1,6})?")
 _WHOLE: Final = re.compile(r"[0-9]{1,12}")
 _WHEN: Final = ("at", "nth", "after")
 _KEYS: Final = {Act.CRASH: ("for", *_WHEN), Act.HANG: ("for", *_WHEN), Act.BITFLIP: ("bit", "in", *_WHEN)}
-
-
-def milliseconds(text: str) -> int:
-    """`50ms` or `2s` as whole milliseconds. Raises ConfigError."""
-    for unit, factor in (("ms", 1), ("s", 1000)):
-        number = text.removesuffix(unit)
-        if number != text and _NUMBER.fullmatch(number):
-            value = round(float(number) * factor)
-            if 0 < value <= DURATION_MS_MAX:
-                return value
-    raise ConfigError(f"duration {text[:40]!r}: a positive number with its unit is allowed, as 50ms or 2s")
 
 
 def parse(text: str) -> Fault:
@@ -74,7 +62,8 @@ def build(
     if nth is not None and event is None:
         raise ConfigError(f"'nth {nth}' counts an event: 'at EVENT nth {nth}' is allowed")
     trigger = _trigger(event, nth, after)
-    return Fault(act, target, trigger, milliseconds(duration) if duration else HANG_FOREVER_MS)
+    hang_ms = whole_milliseconds("duration", duration) if duration else HANG_FOREVER_MS
+    return Fault(act, target, trigger, hang_ms)
 
 
 def build_flip(
@@ -102,4 +91,4 @@ def _trigger(event: str | None, nth: str | None, after: str | None) -> Trigger:
         raise ConfigError(f"nth {nth[:40]!r}: a whole number from 1 on is allowed")
     if event is not None:
         event_named(event)
-    return Trigger(event or "", int(nth or 1), milliseconds(after) if after else 0)
+    return Trigger(event or "", int(nth or 1), whole_milliseconds("duration", after) if after else 0)

@@ -104,6 +104,11 @@ class Adaptations:
         return self._current is not None
 
     @property
+    def to_come(self) -> bool:
+        """One that was asked for with the run waits for its request."""
+        return bool(self._scheduled)
+
+    @property
     def acting(self) -> bool:
         """A phase that acts on what serves is under way."""
         now = self._current

@@ -14,6 +14,7 @@ class Channels:
 
     def __init__(self, make: Callable[[Link], Channel]) -> None:
         self.make = make
+        self.fresh: dict[tuple[str, str, str], Channel] = {}  # of the graph to be: some read them already
         self._all: dict[tuple[str, str, str], Channel] = {}
 
     def renew(self, link: Link) -> Channel:

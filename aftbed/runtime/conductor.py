@@ -81,8 +81,8 @@ class Conductor:
                 self._support.tell("refused", f"{process.name} said {type(report).__name__}")
 
     def _on_script(self, ordered: script.Script) -> None:
-        if self.executor.busy or self.ending:
-            return  # another script is under way; Recovery hears how it ended
+        if self.executor.busy or self.ending or self.executor.stale(ordered):
+            return  # another script is under way, or has been; Recovery hears how it ended
         if ordered.purpose in LOSSES and self.adaptations.interrupted(ordered.replica):
             return  # the way back first
         began_ns, tell = self._loop.now_ns(), self._support.tell
@@ -92,6 +92,8 @@ class Conductor:
             tell("script.failed" if failure else "script.done", f"{ordered.purpose}: {failure or ms}")
             self.inform_recovery(failed=bool(failure))
             self._loop.after(SETTLE_SECONDS, lambda: self._settle_after(ordered))
+            if failure:
+                self._loop.after(LOSS_SECONDS, self._look_for_loss)
 
         self._loop.jobs.start(ordered.purpose, self.executor.execute(ordered), ended)
         if ordered.purpose in LOSSES:  # its nodes are killed only when the new leader serves
@@ -145,7 +147,10 @@ class Conductor:
 
     def _look_for_loss(self) -> None:
         deployment = self.deployment
-        if self.ending or self.executor.busy or deployment.backup:
+        if self.ending or deployment.backup:
+            return
+        if self.executor.busy:
+            self._loop.after(LOSS_SECONDS, self._look_for_loss)
             return
         slot = deployment.slots.get(deployment.leader)
         nodes = slot.nodes if slot is not None and deployment.leader not in deployment.lost else []
@@ -173,7 +178,7 @@ class Conductor:
                 half.kill()  # half bound: its death is heard, and replaced in turn
             elif failure and not self.ending:
                 self._loop.after(AGAIN_SECONDS, lambda: self._replace(node))
-            if node == "recovery":
+            if node == "recovery" or self.deployment.lost:
                 self.inform_recovery(failed=False)
             if node == ENGINE and not failure:
                 self.adaptations.engine_is_new()

@@ -115,8 +115,9 @@ class Deployment:
 
     def _nudge(self, node: str) -> None:
         for brick in self.graph.nodes.get(node, ()):
-            for channel in self.channels.into(brick):
-                channel.nudge()
+            for channel in (*self.channels.into(brick), *self.channels.fresh.values()):
+                if channel.link.sink == brick:
+                    channel.nudge()
 
     def nudge_late(self) -> None:
         """Nudge again whoever has not looked at its control mail: it may have changed its inputs since."""
@@ -169,7 +170,14 @@ class Deployment:
         for node in slot.nodes:
             sent.append((yield from self._assign(node)))
         yield from self.all_of(sent, BIRTH_SECONDS_MAX)
+        self.assert_whole(slot)
         yield from self.watch(slot)
+
+    def assert_whole(self, slot: Slot) -> None:
+        """Raise StepFailed if a node of `slot` is dead."""
+        dead = [node for node in slot.nodes if not self.lives(node)]
+        if dead:
+            raise StepFailed(f"{dead[0]} died")
 
     def shut_replication(self, slot: Slot) -> None:
         """What `slot` sends to the other replica ends after what was sent."""
@@ -179,15 +187,19 @@ class Deployment:
                 channel.fence()
 
     def watch(self, slot: Slot, *, nobody: bool = False) -> Keys:
-        """Have the Watchdog of `slot` watch its present nodes, or nobody. Without a Watchdog: nothing."""
+        """Have the Watchdog of `slot` watch its present nodes, or nobody. Without a Watchdog: nothing.
+
+        If one of them is dead already, the replica is `lost`: Recovery hears of it with the next situation.
+        """
         watchdog = f"{slot.name}/watchdog"
         process = self.nodes.get(watchdog)
         if process is None or not process.alive or not slot.nodes:
             return  # a Watchdog that is being replaced is told when it is there
         nodes = () if nobody else tuple(slot.nodes)
+        if not all(self.lives(n) for n in nodes):
+            self.lost.add(slot.name)  # its Watchdog has died before it could say so
+            return
         hosts = [self.nodes[n] for n in nodes]
-        if not all(host.alive for host in hosts):
-            raise StepFailed(f"a node of replica {slot.name} died before it was watched")
         yield from self.ask(
             watchdog,
             lambda token: control.WatchNodes(
@@ -209,11 +221,12 @@ class Deployment:
             self.channels.renew(link)
         yield from self.all_of([(yield from self._assign(node))])
         channels = [c for c in self.channels.touching(frozenset({brick})) if not self._held(c)]
-        # Inputs first, and the client's output last: once it asks again, the way back stands.
-        sent = [self._rebind_input(c) for c in channels if c.link.source == brick]
-        outputs = [c for c in channels if c.link.sink == brick]
-        outputs.sort(key=lambda c: c.link.source == "client")
-        sent += [self._rebind_output(c) for c in outputs]
+        # The way back stands before anything is asked on the way there: a new Client asks as soon as it is
+        # read, an old one asks again as soon as it may write.
+        into = [c for c in channels if c.link.sink == brick]
+        sent = [self._rebind_output(c) for c in into if c.link.source != "client"]
+        sent += [self._rebind_input(c) for c in channels if c.link.source == brick]
+        sent += [self._rebind_output(c) for c in into if c.link.source == "client"]
         yield from self.all_of(pair for pair in sent if pair is not None)
         for slot in self.slots.values():
             if node == f"{slot.name}/watchdog":

@@ -42,7 +42,7 @@ class Exchange:
         self._staged: dict[str, Process] = {}  # by node
         self._replaced: dict[str, Process] = {}  # the old ones, by node
         self._removed: dict[str, Process] = {}  # those that only the old graph has
-        self._fresh: dict[tuple[str, str, str], Channel] = {}
+        self._fresh = deployment.channels.fresh
         self._let_go: dict[tuple[str, str, str], Channel] = {}  # of the old graph only
         self._suspended: list[tuple[str, Process]] = []  # brick, its node's process
         self._migrated: list[str] = []
@@ -246,6 +246,17 @@ class Exchange:
             sent.append(self._deployment.order_to(change.process, order, fds))
         yield from answered(sent)
 
+    def _tell_whoever_lives(self, changes: dict[int, Changes]) -> Keys:
+        """The same, where some may be dead or die meanwhile: they are left to Recovery."""
+        sent = []
+        for change in changes.values():
+            order, fds = change.order(self._deployment.epoch)
+            with contextlib.suppress(StepFailed):
+                sent.append(self._deployment.order_to(change.process, order, fds))
+        for pair in sent:
+            with contextlib.suppress(StepFailed):
+                yield from answered([pair])
+
     def _bind(self, link: Link, of: Callable[[Process], Changes]) -> None:
         if self.new.node_of(link.source) == self.new.node_of(link.sink):
             return  # within one node: it knows
@@ -305,6 +316,7 @@ class Exchange:
         for slot in self._deployment.slots.values():
             if slot.name in self._lost:
                 continue
+            self._deployment.assert_whole(slot)
             yield from self._deployment.watch(slot)
 
     # -- the way back -------------------------------------------------------------------------
@@ -322,8 +334,7 @@ class Exchange:
             deployment.lost |= self._lost
             yield from self._reverse_adoption()
         if self._rewired:
-            with contextlib.suppress(StepFailed):  # who dies meanwhile is left to Recovery
-                yield from self._tell(self._old_ends())
+            yield from self._tell_whoever_lives(self._old_ends())
         for node, old in self._replaced.items():
             self._staged[node], deployment.nodes[node] = deployment.nodes[node], old
             old.name, old.kind = node, "node"
@@ -339,7 +350,8 @@ class Exchange:
             channel.close()
         self._let_serve()
         self._staged, self._replaced, self._removed = {}, {}, {}
-        self._suspended, self._fresh = [], {}
+        self._suspended = []
+        self._fresh.clear()
         self.committed = False
         yield Wait(frozenset())
 

@@ -56,6 +56,23 @@ class Executor:
         finally:
             self._running = False
 
+    def stale(self, todo: script.Script) -> bool:
+        """Whether `todo` was ordered before Recovery heard of what has changed since.
+
+        The word of that is on its way to it, and will make it decide anew.
+        """
+        deployment = self._deployment
+        epochs = [verb.epoch for verb in todo.commit if isinstance(verb, script.Promote)]
+        if any(epoch != deployment.epoch + 1 for epoch in epochs):
+            return True
+        match todo.purpose:
+            case "failover":
+                return todo.replica != deployment.leader or not deployment.backup
+            case "drop backup":
+                return todo.replica != deployment.backup
+            case _:
+                return bool(deployment.backup) or not deployment.leader
+
     def situation(self, *, failed: bool) -> message.Situation:
         """What Recovery must know to order the next script."""
         deployment = self._deployment
@@ -191,6 +208,7 @@ class Executor:
         self._support.loop.rest(FIRST_REPLY_SECONDS)
         promoting, self._promoting = self._promoting, None
         if promoting is not None:
+            deployment.assert_whole(deployment.slots[replica])
             yield promoting
         deployment.graph = deployment.graph.led_by(replica)
         deployment.pin_watchers()

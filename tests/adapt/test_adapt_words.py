@@ -57,7 +57,7 @@ def test_what_is_read(text: str, wanted: Timed) -> None:
         ("to lfr at request -1", ("at request '-1'",)),
         ("to lfr at request ²", ("at request '²'",)),
         ("to lfr at request " + "9" * 30, ("a whole number from 1 on",)),
-        ("to lfr after 5", ("after '5'", "500ms or 2s")),
+        ("to lfr after 5", ("after '5'", "50ms or 2s")),
         ("to lfr after 0ms", ("after '0ms'", "a positive number")),
         ("to lfr after -5ms", ("after '-5ms'",)),
         ("to lfr after 3601s", ("after '3601s'", "up to 3600s")),

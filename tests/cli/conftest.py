@@ -1,10 +1,66 @@
-"""The same homes as in `tests/process`, whose helpers are used here too."""
+"""How a command is called inside this process, in the same homes as in `tests/process`."""
 
 import sys
 from pathlib import Path
 
+import pytest
+from playedrun import Call, PlayedRun, Run
+
+from aftbed.cli import main
+from aftbed.runtime.unix import ask, rundir
+
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "process"))
 
-from liveruns import home
+from liveruns import Home, home
 
 __all__ = ["home"]
+
+
+@pytest.fixture
+def played(monkeypatch: pytest.MonkeyPatch) -> PlayedRun:
+    """The only run that is alive."""
+    run = PlayedRun()
+    monkeypatch.setattr(ask, "ask", run.ask)
+    monkeypatch.setattr(rundir, "find", lambda name: Path("/nowhere/abc123"))
+    return run
+
+
+@pytest.fixture
+def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Call:
+    """Call `aftbed` with these arguments: exit code, output, errors."""
+
+    def aftbed(*arguments: str | Path) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["aftbed", *map(str, arguments)])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        shown = capsys.readouterr()
+        return int(ended.value.code or 0), shown.out, shown.err
+
+    return aftbed
+
+
+@pytest.fixture
+def told(call: Call) -> Run:
+    """The output of a command that must succeed."""
+
+    def aftbed(*arguments: str | Path) -> str:
+        code, out, err = call(*arguments)
+        assert code == 0, err
+        return out
+
+    return aftbed
+
+
+@pytest.fixture
+def refused(home: Home, call: Call) -> Run:
+    """The error of a command that must be refused: one message, nothing printed, nothing left."""
+
+    def aftbed(*arguments: str | Path) -> str:
+        code, out, err = call(*arguments)
+        assert (code, out) == (2, ""), (code, out, err)
+        assert err.startswith("aftbed: error: ")
+        assert all(line.startswith(" ") for line in err.splitlines()[1:]), "one message"
+        assert home.left() == []
+        return err
+
+    return aftbed

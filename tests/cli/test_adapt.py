@@ -1,132 +1,18 @@
-"""`aftbed adapt` and `run --adapt` before a process is asked: what is refused, asked for, shown.
+"""`aftbed adapt`: what is asked for, what is shown, and what is refused before the run is asked.
 
 The run that the commands speak to is played here; real ones are in `tests/process/test_adapt_cli.py`.
 """
 
 import json
-import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import Final
 
-import msgspec
 import pytest
-import yaml
-from liveruns import Home
+from playedrun import CAUTIOUS, CLOSED, OUTCOME, RANDOM, VARIANTS, Call, PlayedRun, Run
 
-from aftbed.adapt.plan import APPLICATION, plan, updated
-from aftbed.adapt.scriptfile import ScriptFile, mapping, script_from
-from aftbed.cli import main, running
-from aftbed.cli.adaptation import scheduled
-from aftbed.cli.adaptview import WIDTH
-from aftbed.core.errors import ConfigError
-from aftbed.core.graph import Graph
-from aftbed.core.message import Goal, Scheduled
-from aftbed.core.script import Script, Stage, flat
+from aftbed.adapt.plan import APPLICATION, updated
+from aftbed.core.message import Goal
 from aftbed.ftm.mechanism import build
-from aftbed.runtime.unix import ask, rundir
-from aftbed.runtime.unix.options import RunOptions
-
-Run = Callable[..., str]
-VARIANTS: Final = "aftbed.vehicle.variants"
-CLOSED: Final = f"{VARIANTS}:WithoutStateAccess"
-RANDOM: Final = f"{VARIANTS}:NonDeterministic"
-CAUTIOUS: Final = f"{VARIANTS}:Cautious"
-OUTCOME: Final = {
-    "number": 3,
-    "purpose": "pbr to lfr",
-    "recipe": "drained",
-    "ftm": "lfr",
-    "outcome": "done",
-    "reason": "",
-    "asked_ms": 1234.5,
-    "prepare_ms": 12.25,
-    "blackout_ms": 0.75,
-    "total_ms": 118.5,
-    "bricks_changed": 4,
-    "bricks_total": 16,
-}
-
-
-class PlayedRun:
-    """A run that tells its graph, remembers what it was asked for, and answers `outcome`."""
-
-    def __init__(self) -> None:
-        self.graph: Graph = build("pbr", "process")
-        self.outcome: dict[str, object] = dict(OUTCOME)
-        self.history: list[dict[str, object]] = []
-        self.goals: list[Goal] = []
-        self.seconds = 0.0
-
-    def ask(self, private: Path, question: ask.Question, seconds: float = 0.0) -> dict[str, object]:
-        """In the place of `ask.ask`."""
-        assert private.name == "abc123"
-        match question:
-            case ask.GraphNow():
-                return msgspec.json.decode(msgspec.json.encode(self.graph))  # type: ignore[no-any-return]
-            case ask.Adaptations():
-                return {"adaptations": self.history}
-            case ask.Adapt(goal):
-                self.goals.append(goal)
-                self.seconds = seconds
-                if self.outcome["outcome"] == "refused" and self.outcome["reason"]:
-                    raise ConfigError(str(self.outcome["reason"]))
-                return self.outcome
-            case _:
-                raise AssertionError(question)
-
-
-@pytest.fixture
-def played(monkeypatch: pytest.MonkeyPatch) -> PlayedRun:
-    """The only run that is alive."""
-    run = PlayedRun()
-    monkeypatch.setattr(ask, "ask", run.ask)
-    monkeypatch.setattr(rundir, "find", lambda name: Path("/nowhere/abc123"))
-    return run
-
-
-@pytest.fixture
-def call(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> Callable[..., tuple[int, str, str]]:
-    """Call `aftbed` with these arguments: exit code, output, errors."""
-
-    def aftbed(*arguments: str | Path) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["aftbed", *map(str, arguments)])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        shown = capsys.readouterr()
-        return int(ended.value.code or 0), shown.out, shown.err
-
-    return aftbed
-
-
-@pytest.fixture
-def told(call: Callable[..., tuple[int, str, str]]) -> Run:
-    """The output of a command that must succeed."""
-
-    def aftbed(*arguments: str | Path) -> str:
-        code, out, err = call(*arguments)
-        assert code == 0, err
-        return out
-
-    return aftbed
-
-
-@pytest.fixture
-def refused(home: Home, call: Callable[..., tuple[int, str, str]]) -> Run:
-    """The error of a command that must be refused: one message, nothing printed, nothing left."""
-
-    def aftbed(*arguments: str | Path) -> str:
-        code, out, err = call(*arguments)
-        assert (code, out) == (2, ""), (code, out, err)
-        assert err.startswith("aftbed: error: ")
-        assert all(line.startswith(" ") for line in err.splitlines()[1:]), "one message"
-        assert home.left() == []
-        return err
-
-    return aftbed
-
+from aftbed.runtime.unix import ask
 
 # -- what is asked for
 
@@ -181,9 +67,7 @@ def test_the_outcome_as_json_is_the_document_of_the_run(played: PlayedRun, told:
     assert json.loads(told("adapt", "to", "lfr", "--json")) == OUTCOME
 
 
-def test_what_was_rolled_back_ends_with_code_1(
-    played: PlayedRun, call: Callable[..., tuple[int, str, str]]
-) -> None:
+def test_what_was_rolled_back_ends_with_code_1(played: PlayedRun, call: Call) -> None:
     played.outcome |= {"outcome": "rolled back", "reason": "b/after died"}
     for options in ((), ("--json",)):
         code, out, _ = call("adapt", "to", "lfr", *options)
@@ -197,9 +81,7 @@ def test_what_the_run_refuses_ends_with_code_2(played: PlayedRun, refused: Run) 
     assert len(played.goals) == 1
 
 
-def test_what_is_refused_without_a_reason_is_refused_all_the_same(
-    played: PlayedRun, call: Callable[..., tuple[int, str, str]]
-) -> None:
+def test_what_is_refused_without_a_reason_is_refused_all_the_same(played: PlayedRun, call: Call) -> None:
     played.outcome |= {"outcome": "refused"}
     assert call("adapt", "to", "lfr")[0] == 2
 
@@ -289,7 +171,7 @@ def test_the_recipe_of_the_paper_is_for_one_brick_per_process(played: PlayedRun,
 def test_what_does_not_suit_the_function_is_refused_unless_forced(
     played: PlayedRun,
     refused: Run,
-    call: Callable[..., tuple[int, str, str]],
+    call: Call,
     running: str,
     function: str,
     arguments: tuple[str, ...],
@@ -305,7 +187,7 @@ def test_what_does_not_suit_the_function_is_refused_unless_forced(
     assert notes.startswith("aftbed: forced: ") and reason in notes
 
 
-def test_to_take_away_is_not_refused(played: PlayedRun, call: Callable[..., tuple[int, str, str]]) -> None:
+def test_to_take_away_is_not_refused(played: PlayedRun, call: Call) -> None:
     """What is left needs no more than what runs; so it is with a brick."""
     played.graph = updated(build("pbr+tr", "process"), APPLICATION, CLOSED)
     assert call("adapt", "decompose")[::2] == (0, "")
@@ -332,9 +214,7 @@ def test_a_function_that_does_not_say_what_it_is(played: PlayedRun, refused: Run
     assert "mute.py:Mute: characteristics: found 'good', allowed is Characteristics(...)" in error
 
 
-def test_what_suits_with_a_reservation_is_done_with_a_note(
-    played: PlayedRun, call: Callable[..., tuple[int, str, str]]
-) -> None:
+def test_what_suits_with_a_reservation_is_done_with_a_note(played: PlayedRun, call: Call) -> None:
     played.graph = build("lfr", "process")
     code, _, notes = call("adapt", "update", "app", "--to", CLOSED)
     assert code == 0
@@ -348,249 +228,3 @@ def test_what_suits_with_a_reservation_is_done_with_a_note(
 def test_no_run_is_alive(refused: Run, arguments: tuple[str, ...]) -> None:
     assert "no run is alive; start one with `aftbed run`" in refused("adapt", *arguments)
     assert "--run abcdef: no such run is alive" in refused("adapt", *arguments, "--run", "abcdef")
-
-
-# -- a plan
-
-
-def test_a_plan_as_a_person_reads_it(told: Run) -> None:
-    lines = told("adapt", "plan", "pbr+tr", "--from", "pbr").splitlines()
-    assert lines[0] == "pbr to pbr+tr: 10 of 22 bricks (placement process, recipe drained)"
-    text = "\n".join(lines)
-    assert "  removed   a/proceed b/proceed\n" in text
-    assert "  rebound   a/before a/after a/server b/before b/after b/server\n" in text
-    assert "  added     a/tr.protocol a/tr.before" in text and "  kept      client proxy" in text
-    assert "  replaced" not in text
-    assert "prepare, while the old one serves: 30 steps\n  stage    a/tr.protocol (inner.protocol)\n" in text
-    assert "  bind     a/before.bfr2prd -> a/tr.protocol.pxy2pro\n" in text
-    assert "commit, while the client waits: 3 steps\n  suspend  a/protocol\n  together\n" in text
-    assert "    resume   a/protocol\nfinish, when nothing has broken: 2 steps\n  retire   a/proceed\n" in text
-    back = "way back, pbr+tr to pbr: 10 of 22 bricks (placement process, recipe drained)\n"
-    assert f"{back}commit, while the client waits: 3 steps\n  suspend  a/protocol\n" in text
-    assert max(len(line) for line in lines if line.startswith("  ")) <= WIDTH
-
-
-def test_a_plan_names_what_is_staged_and_how(told: Run) -> None:
-    text = told("adapt", "plan", "lfr", "--from", "pbr", "--placement", "replica")
-    assert "  stage    a: a/protocol (protocol), a/before (lfr.before)" in text and ", held\n" in text
-    paper = told("adapt", "plan", "lfr", "--from", "pbr", "--recipe", "paper")
-    assert "  freeze   a/protocol\n" in paper and "recipe paper" in paper
-
-
-@pytest.mark.parametrize("arguments", [(), ("--recipe", "paper"), ("--placement", "single")])
-def test_a_plan_as_yaml_is_its_script(told: Run, arguments: tuple[str, ...]) -> None:
-    text = told("adapt", "plan", "lfr+tr", "--from", "pbr", "--yaml", *arguments)
-    script = script_from(msgspec.convert(yaml.safe_load(text), ScriptFile), "x")
-    placement = "single" if "single" in arguments else "process"
-    recipe = "paper" if "paper" in arguments else "drained"
-    assert script == plan(build("pbr", placement), build("lfr+tr", placement), recipe).script
-
-
-def test_a_plan_as_json(told: Run) -> None:
-    found = json.loads(told("adapt", "plan", "pbr+tr", "--from", "pbr", "--json"))
-    assert (found["from"], found["to"], found["placement"], found["recipe"]) == (
-        "pbr",
-        "pbr+tr",
-        "process",
-        "drained",
-    )
-    assert (found["bricks_changed"], found["bricks_total"]) == (10, 22)
-    assert found["removed"] == ["a/proceed", "b/proceed"] and found["replaced"] == []
-    there = plan(build("pbr", "process"), build("pbr+tr", "process"))
-    assert found["script"] == mapping(there.script)
-    assert found["way_back"]["script"] == mapping(plan(there.new, there.old).script)
-
-
-def test_a_plan_from_what_runs(played: PlayedRun, told: Run) -> None:
-    played.graph = build("lfr", "process").led_by("b")
-    text = told("adapt", "plan", "lfr+tr")
-    assert text.startswith("lfr to lfr+tr: 10 of 22 bricks")
-    assert "  suspend  b/protocol\n" in text
-    assert played.goals == [], "nothing is changed"
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (("lfr", "--from", "pbrr"), ("unknown FTM 'pbrr'", "did you mean 'pbr'")),
-        (("pbrr", "--from", "pbr"), ("unknown FTM 'pbrr'",)),
-        (("pbr", "--from", "pbr"), ("pbr is what runs already",)),
-        (("pbr", "--from", "none"), ("neither starts nor ends",)),
-        (("lfr", "--from", "pbr", "--placement", "proces"), ("unknown placement", "did you mean 'process'")),
-        (("lfr", "--placement", "process"), ("--placement", "give --from EXPR too")),
-        (("lfr", "--from", "pbr", "--yaml", "--json"), ("--yaml and --json", "one of them")),
-        (("lfr", "--from", "pbr", "--recipe", "papr"), ("did you mean 'paper'",)),
-    ],
-)
-def test_a_plan_that_cannot_be_made(refused: Run, arguments: tuple[str, ...], words: tuple[str, ...]) -> None:
-    error = refused("adapt", "plan", *arguments)
-    assert all(word in error for word in words), error
-
-
-# -- a script
-
-
-@pytest.fixture
-def lfr(told: Run, tmp_path: Path) -> Path:
-    """The file of a script from pbr to lfr."""
-    path = tmp_path / "lfr.yaml"
-    path.write_text(told("adapt", "plan", "lfr", "--from", "pbr", "--yaml"))
-    return path
-
-
-def test_a_script_is_asked_for_as_it_is_written(played: PlayedRun, told: Run, lfr: Path) -> None:
-    told("adapt", "script", lfr)
-    (goal,) = played.goals
-    assert goal.script == plan(build("pbr", "process"), build("lfr", "process")).script
-    assert goal.recipe == "drained"
-
-
-def test_a_script_names_files_beside_itself(played: PlayedRun, told: Run, lfr: Path) -> None:
-    (lfr.parent / "mine.py").write_text("")
-    text = lfr.read_text()
-    wanted = "{a/before: {kind: lfr.before, source: mine.py:Mine}}"
-    assert "{a/before: lfr.before}" in text
-    lfr.write_text(text.replace("{a/before: lfr.before}", wanted))
-    told("adapt", "script", lfr)
-    script = played.goals[0].script
-    assert isinstance(script, Script)
-    sources = {b.name: b.source for v in flat(script.prepare) if isinstance(v, Stage) for b in v.bricks}
-    assert sources["a/before"] == f"{lfr.parent}/mine.py:Mine" and sources["a/after"] == ""
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "words"),
-    [
-        ("- suspend: a/protocol", "- suspend: a/protocool", ("commit[0]", "did you mean 'a/protocol'")),
-        ("- suspend: a/protocol", "- suspnd: a/protocol", ("commit[0]", "did you mean 'suspend'")),
-        ("- suspend: a/protocol\n", "", ("commit[3]: resumed, not suspended: a/protocol",)),
-        ("  - resume: a/protocol\n", "", ("commit[0]: suspended, not resumed: a/protocol",)),
-        ("finish:", "- destroy: a/proceed\nfinish:", ("commit[5]: killed with a request inside: a/proceed",)),
-        ("finish:", "- kill: a\nfinish:", ("commit[5]: kill is Recovery's",)),
-        ("- retire: a/before", "- retire: a/befor", ("finish[0]", "did you mean 'a/before'")),
-        ("  - unbind: b/server.srv2aft\n", "", ("leads nowhere, and is not unbound: b/server.srv2aft",)),
-        ("purpose:", "porpoise:", ("unknown key 'porpoise'", "did you mean 'purpose'")),
-        ("ftm: lfr", "ftm: lfrr", ("ftm: unknown FTM 'lfrr'",)),
-        ("lfr.before", "lfr.befor", ("prepare[0].stage.bricks.a/before", "did you mean 'lfr.before'")),
-        ("source", "source", ()),
-    ],
-)
-def test_a_script_with_a_mistake(
-    played: PlayedRun, refused: Run, lfr: Path, old: str, new: str, words: tuple[str, ...]
-) -> None:
-    text = lfr.read_text()
-    if old == new:
-        text = text.replace("{a/before: lfr.before}", "{a/before: {kind: lfr.before, source: gone.py:Mine}}")
-        words = ("gone.py", "no such file")
-    assert old in text or old == new
-    lfr.write_text(text.replace(old, new, 1))
-    error = refused("adapt", "script", lfr)
-    assert str(lfr) in error or old == new
-    assert all(word in error for word in words), error
-    assert played.goals == []
-
-
-def test_a_script_with_many_mistakes_is_told_them_all(played: PlayedRun, refused: Run, lfr: Path) -> None:
-    lfr.write_text(lfr.read_text().replace("drain:", "drane:").replace("align:", "allign:"))
-    lines = refused("adapt", "script", lfr).splitlines()
-    assert lines[0] == f"aftbed: error: {lfr}: 2 problems:"
-    assert [line.strip().partition(":")[0] for line in lines[1:]] == ["commit[1]", "commit[2]"]
-
-
-def test_a_script_for_another_graph_than_the_one_that_runs(
-    played: PlayedRun, refused: Run, lfr: Path
-) -> None:
-    played.graph = build("pbr", "replica")
-    assert "unknown node 'a/before'" in refused("adapt", "script", lfr)
-    played.graph = build("pbr", "process").led_by("b")
-    error = refused("adapt", "script", lfr)
-    assert "commit[2]: changed while b/protocol lets requests in: align a/server -> b/server" in error
-
-
-@pytest.mark.parametrize("content", ["", "[]", "5", "\0", "commit: [", "purpose: x"])
-def test_a_file_that_is_no_script(played: PlayedRun, refused: Run, tmp_path: Path, content: str) -> None:
-    path = tmp_path / "x.yaml"
-    path.write_text(content)
-    assert str(path) in refused("adapt", "script", path)
-    path.unlink()
-    assert "No such file" in refused("adapt", "script", path)
-
-
-# -- run --adapt
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (
-            ("--adapt", "compose lfr+tr at request 120"),
-            ("--adapt 'compose lfr+tr at request 120'", "switch lfr"),
-        ),
-        (("--adapt", "to lfr at 5"), ("--adapt 'to lfr at 5'", "'at request N'")),
-        (("--adapt", ""), ("--adapt ''", "expected")),
-        (("--adapt", "too lfr"), ("unknown adaptation 'too'", "did you mean 'to'")),
-        (("--ftm", "none", "--adapt", "to lfr"), ("neither starts nor ends",)),
-        (("--adapt", "update proced to m:C"), ("unknown brick 'proced'",)),
-        (("--adapt", "update proceed to gone.py:C"), ("no such file",)),
-        (("--adapt", f"update app to {CLOSED}"), ("pbr needs state access", "--force")),
-        (("--adapt", "to lfr", "--recipe", "papr"), ("did you mean 'paper'",)),
-        (("--adapt", "to lfr", "--recipe", "paper", "--placement", "replica"), ("not replica",)),
-        (("--recipe", "paper"), ("--recipe and --force", "give --adapt too")),
-        (("--force",), ("--recipe and --force", "give --adapt too")),
-        (
-            ("--adapt", "switch lfr", "--adapt", "switch lfr"),
-            ("--adapt 'switch lfr'", "is what runs already"),
-        ),
-        (
-            ("--adapt", "to lfr at request 9", "--adapt", "to pbr at request 8"),
-            ("--adapt 'to pbr at request 8'", "begins before the one that stands before it"),
-        ),
-        (("--adapt", "to lfr after 2s", "--adapt", "to pbr after 1s"), ("begins before the one",)),
-        (
-            ("--adapt", "to lfr", "--adapt", "to pbr at request 9", "--adapt", "to lfr at request 8"),
-            ("--adapt 'to lfr at request 8'", "begins before the one"),
-        ),
-    ],
-)
-def test_an_adaptation_of_a_run_is_refused_before_it_starts(
-    refused: Run, arguments: tuple[str, ...], words: tuple[str, ...]
-) -> None:
-    error = refused("run", "--load", "10", *arguments)
-    assert all(word in error for word in words), error
-
-
-def test_each_adaptation_of_a_run_begins_where_the_one_before_ends() -> None:
-    texts = ("switch lfr at request 5", "compose lfr+tr after 2s", "decompose at request 90")
-    assert scheduled(texts, build("pbr", "process"), "drained", force=False) == (
-        Scheduled(Goal(expression="lfr"), at_request=5),
-        Scheduled(Goal(expression="lfr+tr"), after_ms=2000.0),
-        Scheduled(Goal(expression="lfr"), at_request=90),
-    )
-
-
-def test_an_update_of_the_function_counts_for_what_comes_after_it() -> None:
-    graph = build("lfr", "process")
-    texts = (f"update app to {CLOSED} at request 5", "switch pbr at request 9")
-    with pytest.raises(ConfigError, match="--adapt 'switch pbr at request 9': pbr is not consistent"):
-        scheduled(texts, graph, "drained", force=False)
-    assert len(scheduled(texts, graph, "paper", force=True)) == 2
-
-
-def test_the_adaptations_of_a_run_are_among_its_options(home: Home, monkeypatch: pytest.MonkeyPatch) -> None:
-    started: list[RunOptions] = []
-
-    class StartedError(Exception):
-        pass
-
-    def launch(options: RunOptions, listener: object) -> None:
-        started.append(options)
-        rundir.remove(Path(options.private))
-        raise StartedError
-
-    monkeypatch.setattr(running, "launch", launch)
-    monkeypatch.setattr(
-        sys, "argv", ["aftbed", "run", "--load", "10", "--adapt", "to lfr after 1s", "--recipe", "paper"]
-    )
-    with pytest.raises(StartedError):
-        main()
-    assert started[0].adaptations == (Scheduled(Goal(expression="lfr", recipe="paper"), after_ms=1000.0),)

@@ -6,17 +6,15 @@ is shown for a few of them in `test_bad_input_process.py`.
 
 import socket
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
 import pytest
 from liveruns import Home
+from playedrun import Run
 
 from aftbed.cli import main
 from aftbed.runtime.unix import rundir
-
-Run = Callable[..., str]
 
 SCENARIO: Final = """
 description: a car that stands
@@ -52,25 +50,6 @@ tracks:
   new: NEW
 """
 LOG: Final = "(0000000001.000000) can0 210#0102030405060708\n"
-
-
-@pytest.fixture
-def refused(home: Home, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
-    """Call `aftbed` with these arguments: its error, once all the rest has been checked."""
-
-    def call(*arguments: str | Path) -> str:
-        monkeypatch.setattr(sys, "argv", ["aftbed", *map(str, arguments)])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        shown = capsys.readouterr()
-        assert ended.value.code == 2, shown
-        assert shown.err.startswith("aftbed: error: ")
-        assert all(line.startswith(" ") for line in shown.err.splitlines()[1:]), "one message"
-        assert shown.out == ""
-        assert home.left() == []
-        return shown.err
-
-    return call
 
 
 def all_words(error: str, *words: str) -> bool:

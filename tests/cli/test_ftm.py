@@ -6,17 +6,15 @@ The command is called inside this process; see `test_bad_input`.
 import json
 import subprocess
 import sys
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Final
 
 import psutil
 import pytest
+from playedrun import Call
 
-from aftbed.cli import main
 from aftbed.ftm.mechanism import EXPRESSIONS, build
-
-Call = Callable[..., tuple[int, str, str]]
 
 VARIANTS: Final = "aftbed.vehicle.variants"
 AMPLE: Final = ("--cpus", "2", "--cpu-load", "0.1")
@@ -36,17 +34,9 @@ class Half:
 
 
 @pytest.fixture
-def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Call:
+def call(call: Call) -> Call:
     """Call `aftbed ftm` with these arguments: exit code, output, errors."""
-
-    def called(*arguments: str) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["aftbed", "ftm", *arguments])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        shown = capsys.readouterr()
-        return int(ended.value.code or 0), shown.out, shown.err
-
-    return called
+    return partial(call, "ftm")
 
 
 def test_the_command_line_is_imported_without_what_its_commands_need() -> None:

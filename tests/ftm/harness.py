@@ -87,6 +87,7 @@ class World:
         self.executive = Executive(self)
         self._accused: set[tuple[str, int]] = set()
         self._lives: dict[str, int] = {}
+        self._looked = False  # the script that waits has looked, and nothing has happened since
         self._steps = 0
         self._launch()
 
@@ -270,6 +271,7 @@ class World:
         if not moves:
             return self._pass_time()
         what, name = self.choose(moves)
+        self._looked = what == "script"
         if what == "effect":
             self._perform(self.hosts[name])
         elif what == "script":
@@ -281,7 +283,10 @@ class World:
         return True
 
     def moves(self) -> list[Move]:
-        """All that may happen next: effects, the script (last if it waits), deaths, mail by its age."""
+        """All that may happen next: effects, the script, deaths, mail by its age.
+
+        A script that waits comes last, and looks again only after something else, if there is anything else.
+        """
         found: list[Move] = [("effect", h.name) for h in self.hosts.values() if h.todo]
         script: list[Move] = [("script", SUPERVISOR)] if self.executive.busy else []
         if not self.executive.waits:
@@ -296,7 +301,7 @@ class World:
             if (channel.mail or channel.ended) and host.takes(port)
         ]
         found += [(port, name) for _, port, name in sorted(ready)]
-        return found + script if self.executive.waits else found
+        return found + script if self.executive.waits and not (self._looked and found) else found
 
     def _pass_time(self) -> bool:
         """Nothing else to do: the earliest deadline comes."""

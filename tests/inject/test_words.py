@@ -22,7 +22,8 @@ from aftbed.core.fault import (
     mark,
     marked,
 )
-from aftbed.inject.words import DURATION_MS_MAX, build, build_flip, milliseconds, parse
+from aftbed.core.words import DURATION_MS_MAX
+from aftbed.inject.words import build, build_flip, parse
 
 durations = st.integers(1, DURATION_MS_MAX)
 triggers = st.one_of(
@@ -157,13 +158,6 @@ def test_a_number_of_any_length_is_named_but_not_in_full(words: str, digits: int
     number = "9" * digits + unit
     with pytest.raises(ConfigError, match=rf"'{number[:40]}': a .* is allowed"):
         parse(f"crash primary {words} {number}")
-
-
-@pytest.mark.parametrize(
-    ("text", "ms"), [("1ms", 1), ("50ms", 50), ("2s", 2000), ("0.5s", 500), ("3600s", DURATION_MS_MAX)]
-)
-def test_durations(text: str, ms: int) -> None:
-    assert milliseconds(text) == ms
 
 
 @given(st.text(max_size=30))

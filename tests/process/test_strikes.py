@@ -11,8 +11,8 @@ The process tier strikes at a sample drawn from a fixed seed, the deep tier ever
 
 import itertools
 import random
-from collections.abc import Iterable, Iterator
-from typing import Final, NamedTuple
+from collections.abc import Iterable
+from typing import Final
 
 import pytest
 from liveruns import Home, Started, until
@@ -26,49 +26,21 @@ from test_adaptations import (
     whole,
 )
 
-from aftbed.adapt.plan import plan, target
+from aftbed.campaign.explore import WHEN, Strike, strikes
 from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.core.event import Event
 from aftbed.core.fault import Act, Fault, Trigger
 from aftbed.core.message import Goal
-from aftbed.core.script import Stage, flat
-from aftbed.ftm.mechanism import build
 from aftbed.runtime.targets import STAGED
 from aftbed.runtime.unix import ask
 
 pytestmark = pytest.mark.process
 
-WHEN: Final = (Event.ADAPT_STEP_ENTER, Event.ADAPT_STEP_ACT, Event.ADAPT_STEP_EXIT)
 PAIRS: Final = tuple(itertools.permutations(PAPER, 2))
-ELSEWHERE: Final = ("client", "a/watchdog", "b/watchdog")  # no part of an adaptation
 SEED: Final = 20161118
 SAMPLED: Final = 20
 STRIKES_MAX: Final = 40  # in one run
 OTHER: Final = {"a": "b", "b": "a"}
-
-
-class Strike(NamedTuple):
-    """Who dies at which step of an adaptation, and on which side of it."""
-
-    old: str
-    new: str
-    node: str
-    when: Event
-    step: int
-
-
-def strikes(old: str, new: str, placement: str) -> Iterator[Strike]:
-    """All of one way: each node that takes part, and each process that is staged, as soon as it is."""
-    start = build(old, placement)
-    script = plan(start, target(start, new)).script
-    staged = [v.node for v in flat(script.prepare) if isinstance(v, Stage)]
-    steps = range(1, len(staged) + len(script.commit) + 1)
-    for node, when, step in itertools.product(start.nodes, WHEN, steps):
-        if node not in ELSEWHERE:
-            yield Strike(old, new, node, when, step)
-    for node, when, step in itertools.product(staged, WHEN, steps):
-        if when is Event.ADAPT_STEP_EXIT or (step, WHEN.index(when)) > (len(staged), 0):  # all are staged
-            yield Strike(old, new, f"{node}{STAGED}", when, step)
 
 
 def mirrored(node: str, leader: str) -> str:

@@ -1,78 +1,29 @@
-"""The protected function: what it refuses, what its state is, and when it brakes."""
+"""The protected function: which requests it refuses, and when it brakes."""
 
 import math
-from collections import Counter
-from collections.abc import Iterator
-from random import Random
 
 import msgspec
 import pytest
-from hypothesis import given, settings
+from aebcycles import EGO_MS, NEAR, ask, braking, cycles
+from hypothesis import given
 from hypothesis import strategies as st
 
 from aftbed.core.application import Characteristics
 from aftbed.core.errors import PeerError
-from aftbed.core.fault import flipped
 from aftbed.vehicle.aebmessages import (
-    SLOTS,
     STAGE_FULL,
     STAGE_NONE,
     STAGE_PARTIAL,
     STAGE_WARN,
     AebInput,
-    AebOutput,
     AebTarget,
     decode_reply,
     decode_request,
-    encode_reply,
     encode_request,
 )
-from aftbed.vehicle.function import (
-    BLIND_MS,
-    DEMAND_MS2,
-    STATE_BYTES,
-    AebFunction,
-    default_application,
-    sample_requests,
-)
+from aftbed.vehicle.function import BLIND_MS, AebFunction, default_application, sample_requests
 from aftbed.vehicle.threat import required_deceleration_ms2
 from aftbed.vehicle.tracker import HITS_CONFIRMED, MISSES_MAX, Track
-
-EGO_MS = 14.0
-NEAR = AebTarget(3, 14.0, -EGO_MS)  # a standing car, one second ahead
-
-targets = st.builds(
-    AebTarget,
-    st.integers(0, SLOTS - 1),
-    st.floats(0, 200),
-    st.floats(-60, 60),
-    st.booleans(),
-)
-cycles = st.builds(
-    AebInput,
-    st.integers(0, 100_000),
-    st.floats(0, 70),
-    st.booleans(),
-    st.booleans(),
-    st.lists(targets, max_size=SLOTS, unique_by=lambda target: target.slot).map(tuple),
-)
-
-
-def ask(
-    function: AebFunction, t_ms: int, *seen: AebTarget, ego: bool = True, radar: bool = True
-) -> AebOutput:
-    cycle = AebInput(t_ms, EGO_MS, ego, radar, seen)
-    return decode_reply(function.execute(encode_request(cycle)))
-
-
-def braking() -> tuple[AebFunction, int]:
-    """A function in full braking, and the time of its last request."""
-    function = AebFunction()
-    for t_ms in range(0, 1000, 20):
-        if ask(function, t_ms, NEAR).stage == STAGE_FULL:
-            return function, t_ms
-    raise AssertionError("never in full braking")
-
 
 # -- requests
 
@@ -134,109 +85,6 @@ def test_random_bytes_are_no_reply_or_a_sound_one(data: bytes) -> None:
     except PeerError:
         return
     assert 0 <= output.counter < 15
-
-
-# -- state
-
-
-def test_the_state_has_one_size_in_the_range_that_was_asked_for() -> None:
-    assert 200 <= STATE_BYTES <= 600
-    assert len(AebFunction().capture()) == len(braking()[0].capture()) == STATE_BYTES
-
-
-@given(st.lists(cycles, max_size=12), st.lists(cycles, max_size=4))
-@settings(max_examples=60)
-def test_a_restored_function_goes_on_bit_for_bit(before: list[AebInput], after: list[AebInput]) -> None:
-    first, second = AebFunction(), AebFunction()
-    for cycle in before:
-        first.execute(encode_request(cycle))
-    second.restore(first.capture())
-    assert second.capture() == first.capture()
-    for cycle in after:
-        assert first.execute(encode_request(cycle)) == second.execute(encode_request(cycle))
-        assert first.capture() == second.capture()
-
-
-def test_a_captured_state_is_a_copy() -> None:
-    function, t_ms = braking()
-    state = function.capture()
-    kept = bytes(state)
-    ask(function, t_ms + 20)
-    assert state == kept != function.capture()
-
-
-@pytest.mark.parametrize(
-    ("offset", "byte", "reason"),
-    [
-        (0, 2, "state of version 2, expected 1"),
-        (1, 15, "counter 15"),
-        (2, 4, "stage 4"),
-        (3, 2, "started 2"),
-        (11, 0x80, "ego speed -"),
-        (19, 0x80, "time -"),
-        (23, 0xFF, "timers"),
-    ],
-)
-def test_a_state_that_no_execution_leaves_is_refused(offset: int, byte: int, reason: str) -> None:
-    function, _ = braking()
-    before = function.capture()
-    damaged = bytearray(before)
-    damaged[offset] = byte
-    with pytest.raises(PeerError, match=reason):
-        function.restore(bytes(damaged))
-    assert function.capture() == before
-
-
-@pytest.mark.parametrize("length", [0, STATE_BYTES - 1, STATE_BYTES + 1])
-def test_a_state_of_another_size_is_refused(length: int) -> None:
-    with pytest.raises(PeerError, match=f"state of {length} bytes, expected {STATE_BYTES}"):
-        AebFunction().restore(bytes(length))
-
-
-@given(st.integers(0, STATE_BYTES * 8 - 1), cycles)
-@settings(max_examples=200)
-def test_a_flipped_bit_is_refused_or_gives_a_function_that_works(bit: int, cycle: AebInput) -> None:
-    function, _ = braking()
-    before = function.capture()
-    damaged = bytearray(before)
-    damaged[bit // 8] ^= 1 << bit % 8
-    try:
-        function.restore(bytes(damaged))
-    except PeerError:
-        assert function.capture() == before
-        return
-    assert function.capture() == bytes(damaged)
-    decode_reply(function.execute(encode_request(cycle)))
-    AebFunction().restore(function.capture())
-
-
-@pytest.mark.parametrize("byte", [0x01, 0x80])  # 0x80 at the end of a double is -0.0
-@pytest.mark.parametrize("offset", range(1, 26))
-def test_a_free_slot_is_zero_to_the_bit(offset: int, byte: int) -> None:
-    function, _ = braking()
-    damaged = bytearray(function.capture())
-    damaged[STATE_BYTES - 26 + offset] = byte
-    with pytest.raises(PeerError, match=r"state with Track\(hits=0, .* in slot 15"):
-        function.restore(bytes(damaged))
-
-
-def test_a_state_does_not_tell_in_which_order_its_targets_came() -> None:
-    near = [AebTarget(slot, 30.0 + slot, -EGO_MS) for slot in range(SLOTS)]
-    functions = AebFunction(), AebFunction()
-    for function, seen in zip(functions, (near, near[::-1]), strict=True):
-        for n in range(4):
-            ask(function, 20 * n, *seen)
-    assert functions[0].capture() == functions[1].capture()
-    assert functions[0].capture()[-26] == 4
-
-
-def test_the_transmit_counter_is_state() -> None:
-    function = AebFunction()
-    counters = [ask(function, t_ms).counter for t_ms in range(0, 400, 20)]
-    assert counters == [n % 15 for n in range(20)]
-    other = AebFunction()
-    other.restore(function.capture())
-    assert ask(other, 400).counter == 5
 
 
 # -- tracks
@@ -386,161 +234,6 @@ def test_a_jump_in_time_starts_all_tracks_anew(jump_ms: int, kept: bool) -> None
         assert (output.slot is None) == (n < HITS_CONFIRMED - 1)
     there = AebTarget(3, 59.2 - jump_ms / 100, -10.0)
     assert (ask(function, 1080 + jump_ms, there).slot is not None) == kept
-
-
-# -- the executable assertion
-
-
-def rough(seed: int, count: int) -> Iterator[AebInput]:
-    """A sample drive with all that can come between: blindness, lost and strange targets, gaps in time."""
-    random, late_ms = Random(seed), 0
-    for request in sample_requests(seed, count):
-        cycle = decode_request(request)
-        if random.random() < 0.02:
-            late_ms += random.choice((1, 200, 600))
-        yield AebInput(
-            cycle.t_ms + late_ms,
-            cycle.ego_speed_ms * (random.random() > 0.01),
-            random.random() > 0.05,
-            random.random() > 0.05,
-            tuple(strange(random, target) for target in cycle.targets if random.random() > 0.1),
-        )
-
-
-def strange(random: Random, target: AebTarget) -> AebTarget:
-    """`target`, at times with a noise of up to beyond what a track takes for the same one."""
-    size = random.choice((0.0, 0.0, 1.0, 5.0))
-    return AebTarget(
-        target.slot,
-        max(0.0, target.range_m + random.uniform(-1.1, 1.1) * size),
-        target.rel_speed_ms + random.uniform(-1.1, 1.1) * size,
-        random.random() < 0.02,
-    )
-
-
-@given(st.integers(0, 2**32))
-@settings(max_examples=3 * settings.default.max_examples)
-def test_every_reply_of_the_function_is_acceptable_in_a_rough_drive(seed: int) -> None:
-    function = AebFunction()
-    for cycle in rough(seed, 300):
-        request = encode_request(cycle)
-        assert function.acceptable(request, function.execute(request))
-
-
-@given(st.lists(cycles, max_size=12), st.booleans())
-def test_every_reply_of_the_function_is_acceptable_whatever_is_asked(
-    asked: list[AebInput], in_order: bool
-) -> None:
-    function = AebFunction()
-    for n, cycle in enumerate(asked):
-        at = msgspec.structs.replace(cycle, t_ms=20 * n) if in_order else cycle
-        request = encode_request(at)
-        assert function.acceptable(request, function.execute(request))
-
-
-def test_a_rough_drive_shows_every_stage_and_coasting_threats() -> None:
-    """The tests above are worth as much as what happens in them."""
-    seen: Counter[str] = Counter()
-    for seed in range(10):
-        function = AebFunction()
-        for cycle in rough(seed, 300):
-            output = decode_reply(function.execute(encode_request(cycle)))
-            measured = cycle.ego_valid and cycle.radar_valid
-            seen[f"stage {output.stage}"] += 1
-            seen["no ttc"] += output.slot is not None and output.ttc_s is None
-            seen["blind"] += output.slot is not None and not measured
-            slots = {target.slot for target in cycle.targets}
-            seen["coasting"] += measured and output.slot is not None and output.slot not in slots
-    wanted = {"stage 0", "stage 1", "stage 2", "stage 3", "no ttc", "blind", "coasting"}
-    assert {what for what, count in seen.items() if count > 5} >= wanted, seen
-
-
-def test_flipped_bits_are_noticed_as_often_as_is_said_and_always_in_the_demand() -> None:
-    noticed = {threat: Counter[bool]() for threat in (False, True)}
-    for seed in range(5):
-        function = AebFunction()
-        for request in sample_requests(seed, 1500)[::7]:
-            reply = function.execute(request)
-            output = decode_reply(reply)
-            for bit in range(8 * len(reply)):
-                found = not function.acceptable(request, flipped(reply, bit))
-                noticed[output.slot is not None][found] += 1
-                if not found:
-                    changed = decode_reply(flipped(reply, bit))
-                    assert changed.deceleration_ms2 == output.deceleration_ms2
-    shares = {threat: round(100 * n[True] / n.total()) for threat, n in noticed.items()}
-    said = AebFunction.acceptable.__doc__
-    assert said is not None and f"{shares[False]} % flipped where there is no threat" in said, shares
-    assert f"{shares[True]} % where" in said, shares
-
-
-NEARING = AebInput(1000, EGO_MS, True, True, (AebTarget(3, 28.0, -EGO_MS),))  # 2 s ahead
-
-
-def answering(**fields: object) -> bytes:
-    """A sound reply to NEARING, with some fields replaced."""
-    sound = AebOutput(STAGE_PARTIAL, DEMAND_MS2[STAGE_PARTIAL], 2.0, 3, 7)
-    return encode_reply(msgspec.structs.replace(sound, **fields))
-
-
-@pytest.mark.parametrize(
-    ("reply", "acceptable"),
-    [
-        (answering(), True),
-        (answering(counter=8), True),
-        (answering(stage=STAGE_WARN, deceleration_ms2=0.0), True),
-        (answering(slot=4, ttc_s=0.1), True),  # a track that is coasting
-        (answering(slot=None, ttc_s=None), True),  # the stage is held
-        (b"", False),
-        (answering() + b"\0", False),
-        (answering(stage=4), False),
-        (answering(stage=STAGE_FULL), False),
-        (answering(deceleration_ms2=9.0), False),
-        (answering(deceleration_ms2=-0.0, stage=STAGE_WARN), False),
-        (answering(stage=STAGE_NONE, deceleration_ms2=0.0), False),  # at 2 s, with a stage of NONE
-        (answering(slot=None), False),
-        (answering(ttc_s=None), False),  # it closes at 14 m/s
-        (answering(ttc_s=(28.0 - 2.5) / (14.0 + 3.5) + 0.001), True),
-        (answering(ttc_s=(28.0 - 2.5) / (14.0 + 3.5) - 0.001), False),
-        (answering(ttc_s=(28.0 + 2.5) / (14.0 - 3.5) - 0.001), True),
-        (answering(ttc_s=(28.0 + 2.5) / (14.0 - 3.5) + 0.001), False),
-    ],
-)
-def test_what_is_acceptable(reply: bytes, acceptable: bool) -> None:
-    assert AebFunction().acceptable(encode_request(NEARING), reply) == acceptable
-
-
-@pytest.mark.parametrize(
-    ("fields", "reply", "acceptable"),
-    [
-        (
-            {"radar_valid": False},
-            answering(stage=STAGE_NONE, deceleration_ms2=0.0),
-            True,
-        ),  # it decides nothing
-        ({"ego_valid": False}, answering(ttc_s=9.0), True),
-        ({"ego_speed_ms": 0.0}, answering(stage=STAGE_NONE, deceleration_ms2=0.0), True),
-        ({"targets": (AebTarget(3, 28.0, -EGO_MS, True),)}, answering(), False),  # not confirmed by now
-        ({"targets": (AebTarget(3, 28.0, 3.4),)}, answering(ttc_s=999.0), True),
-        ({"targets": (AebTarget(3, 28.0, 3.6),)}, answering(ttc_s=999.0), False),  # it moves away
-        ({"targets": (AebTarget(3, 28.0, 3.6),)}, answering(ttc_s=None), True),
-        ({"t_ms": -1}, answering(), False),  # such a request has one answer
-        ({"t_ms": -1}, b"", True),
-    ],
-)
-def test_what_is_acceptable_depends_on_the_request(
-    fields: dict[str, object], reply: bytes, acceptable: bool
-) -> None:
-    request = encode_request(msgspec.structs.replace(NEARING, **fields))
-    assert AebFunction().acceptable(request, reply) == acceptable
-
-
-def test_to_judge_a_reply_changes_nothing() -> None:
-    function, _ = braking()
-    before = function.capture()
-    assert function.acceptable(encode_request(NEARING), answering())
-    assert not function.acceptable(encode_request(NEARING), answering(stage=4))
-    assert function.capture() == before
 
 
 def test_the_function_is_deterministic_and_opens_its_state() -> None:

@@ -12,10 +12,11 @@ from typing import Final, Protocol
 
 import msgspec
 
-from aftbed.core.journal import Entry, EntryKind, entries
-from aftbed.core.message import NodeDied, Pulses, Reply, Request, Submit
+from aftbed.core.journal import Entry, entries
+from aftbed.core.message import NodeDied, Pulses, Reply, Submit
 from aftbed.ftm.client import Client
 from aftbed.ftm.watchdog import PERIOD_NS
+from aftbed.runtime.source import Load, resume_client
 from aftbed.runtime.unix import linux
 from aftbed.runtime.unix.journal import Dialogue, Header
 from aftbed.runtime.unix.lifeline import Watcher
@@ -144,17 +145,9 @@ class Sensor:
         return msgspec.msgpack.encode({})
 
 
-def resume_client(client: Client, dialogues: tuple[str, ...]) -> None:
-    """Give a new Client the state that its predecessors' dialogues tell."""
-    history: list[Entry] = []
-    for path in dialogues:
-        history += entries(Path(path).read_bytes())
-    waiting = {e.request_id: Request(0, e.request_id, e.payload) for e in history if e.kind is EntryKind.SENT}
-    next_id = max(waiting, default=0) + 1
-    for entry in history:
-        if entry.kind is EntryKind.ANSWERED:
-            waiting.pop(entry.request_id, None)
-    client.restore(msgspec.msgpack.encode((next_id, list(waiting.values()))))
+def told(dialogues: tuple[str, ...]) -> list[Entry]:
+    """What the dialogues of earlier Clients tell, in order."""
+    return [entry for path in dialogues for entry in entries(Path(path).read_bytes())]
 
 
 class LoadOptions(msgspec.Struct, frozen=True):
@@ -167,61 +160,8 @@ class LoadOptions(msgspec.Struct, frozen=True):
     earlier: tuple[str, ...] = ()
 
 
-class Load:
-    """Requests out of a seeded list, in a closed loop or at a fixed rate."""
-
-    port = "submit"
-
-    def __init__(self, client: Client, options: LoadOptions, requests: list[bytes]) -> None:
-        self._client, self._options, self._requests = client, options, requests
-        resume_client(client, options.earlier)
-        self._dialogue = Dialogue(Path(options.dialogue), "client")
-        self._period_ns = round(1e9 / options.rate_hz) if options.rate_hz else 0
-        self._next_ns = 0
-        self._answered = 0
-        self._count = options.count
-
-    def fds(self) -> tuple[int, ...]:
-        """None: the load comes from within."""
-        return ()
-
-    def ready(self, fd: int, now_ns: int) -> None:
-        """Never called."""
-        raise AssertionError(f"no descriptor {fd}")
-
-    def _due(self, now_ns: int) -> bool:
-        if self._client.next_id > self._count:
-            return False
-        return now_ns >= self._next_ns if self._period_ns else not self._client.unanswered
-
-    def take(self, now_ns: int) -> Submit | None:
-        """The next request, if it is due. Written ahead: a successor knows it even if we die now."""
-        if not self._due(now_ns):
-            return None
-        request_id = self._client.next_id
-        payload = self._requests[(request_id - 1) % len(self._requests)]
-        if self._period_ns:
-            self._next_ns = max(self._next_ns or now_ns, now_ns - 10 * self._period_ns) + self._period_ns
-        self._dialogue.write(now_ns, request_id, 0, EntryKind.SENT, payload)
-        return Submit(payload)
-
-    def accept(self, reply: Reply, now_ns: int) -> None:
-        """Keep the reply in the dialogue."""
-        self._answered += 1
-        self._dialogue.write(now_ns, reply.request_id, reply.epoch, EntryKind.ANSWERED, reply.payload)
-
-    def quiet(self) -> None:
-        """The load is at its end now."""
-        self._count = self._client.next_id - 1
-
-    def deadline_ns(self) -> int | None:
-        """When the next request is due."""
-        if not self._period_ns or self._client.next_id > self._count:
-            return None
-        return self._next_ns
-
-    def stats(self) -> bytes:
-        """How far the load is."""
-        sent, waiting = self._client.next_id - 1, len(self._client.unanswered)
-        done = sent >= self._count and not waiting
-        return msgspec.msgpack.encode({"sent": sent, "unanswered": waiting, "done": done})
+def make_load(client: Client, options: LoadOptions, requests: list[bytes]) -> Load:
+    """A load for a Client that may have had predecessors."""
+    resume_client(client, told(options.earlier))
+    dialogue = Dialogue(Path(options.dialogue), "client")
+    return Load(client, dialogue, requests, options.count, options.rate_hz)

@@ -9,7 +9,8 @@ import msgspec
 from aftbed.core.journal import EntryKind
 from aftbed.core.message import Reply, Submit
 from aftbed.ftm.client import BACKLOG_MAX, Client
-from aftbed.runtime.unix.devices import resume_client
+from aftbed.runtime.source import resume_client
+from aftbed.runtime.unix.devices import told
 from aftbed.runtime.unix.journal import Dialogue
 from aftbed.runtime.unix.options import GatewayOptions
 from aftbed.vehicle.bus import BusOptions, open_bus
@@ -28,7 +29,7 @@ class GatewayDevice:
 
     def __init__(self, client: Client, options: GatewayOptions) -> None:
         self._client = client
-        resume_client(client, options.earlier)
+        resume_client(client, told(options.earlier))
         self._dialogue = Dialogue(Path(options.dialogue), "client")
         self._gateway = _gateway(options)
         self._bus = open_bus(BusOptions(port=options.port))

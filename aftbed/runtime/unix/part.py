@@ -11,16 +11,12 @@ from typing import Final, NoReturn
 
 import msgspec
 
-from aftbed.adapt import selftest
-from aftbed.adapt.bricks import load_application, make_brick
 from aftbed.core.errors import ConfigError
-from aftbed.core.graph import BrickSpec
-from aftbed.ftm.catalog import Setting
 from aftbed.ftm.client import Client
-from aftbed.ftm.mechanism import REPLICAS
 from aftbed.runtime import control
+from aftbed.runtime.assembly import Assembler
 from aftbed.runtime.unix import linux, rehearsal
-from aftbed.runtime.unix.devices import Device, Load, LoadOptions, Sensor
+from aftbed.runtime.unix.devices import Device, LoadOptions, Sensor, make_load
 from aftbed.runtime.unix.journal import Journal
 from aftbed.runtime.unix.lifeline import Held
 from aftbed.runtime.unix.line import Line
@@ -72,12 +68,7 @@ def _build(line: Line[control.ToNode], order: control.Assign, fds: list[int]) ->
     if order.bricks[0].kind == "engine":
         gc.enable()  # a plan leaves cycles behind, and nobody waits for the Engine on the request path
     node.suspended = order.held
-    for spec in order.bricks:
-        node.add(spec.name, make_brick(spec, _setting(spec, order), load_module))
-    if order.trial is not None:
-        _try_out(order, order.trial)
-    for local in order.locals:
-        node.link_inside(local, order.epoch)
+    Assembler(default_application, load_module).fill(node, order)
     if order.device:
         node.attach(_device(order, node), order.bricks[0].name)
     for port in order.inputs:
@@ -86,31 +77,6 @@ def _build(line: Line[control.ToNode], order: control.Assign, fds: list[int]) ->
     for port in order.outputs:
         node.bind_output(port.brick, port.port, fds[port.index], order.epoch)
     return node
-
-
-def _try_out(order: control.Assign, trial: control.Trial) -> None:
-    """The self-test of what was written off line."""
-    replica = next(s.replica for s in order.bricks if s.replica)
-    server = next(b for b in trial.graph.bricks if b.part == "server")
-
-    def setting(spec: BrickSpec) -> Setting:
-        return _setting(spec, order, leader=replica)
-
-    selftest.run(
-        trial.graph,
-        replica,
-        lambda spec: make_brick(spec, setting(spec), load_module),
-        trial.requests,
-        deterministic=setting(server).application().characteristics.deterministic,
-    )
-
-
-def _setting(spec: BrickSpec, order: control.Assign, leader: str = "") -> Setting:
-    """What a brick is made for: whose it is, whether it leads, and the function if that is not ours."""
-    number = REPLICAS.index(spec.replica) + 1 if spec.replica else 0
-    application = load_application(spec.application, load_module) if spec.application else default_application
-    epoch = selftest.EPOCH if leader else order.epoch
-    return Setting(number, epoch, spec.replica == (leader or order.leader), application)
 
 
 def load_module(place: str) -> ModuleType:
@@ -132,7 +98,7 @@ def _device(order: control.Assign, node: Node) -> Device:
     assert isinstance(client, Client)
     if order.device == "load":
         options = msgspec.msgpack.decode(order.options, type=LoadOptions)
-        return Load(client, options, sample_requests(options.seed, LOAD_REQUESTS))
+        return make_load(client, options, sample_requests(options.seed, LOAD_REQUESTS))
     assert order.device == "gateway", order.device
     from aftbed.runtime.unix.gateway import GatewayDevice  # noqa: PLC0415 - see above
 

@@ -1,0 +1,96 @@
+"""The judgement over a simulated run: which promise it breaks, if any.
+
+The checkers are those of real runs. Beside them: an assert that failed in a brick is a fault of ours
+whatever came of it; the graph must be whole at the end (G5); and when the faults are over, the run must come
+to rest.
+A service that is gone because a fault struck each replica is no breach: nobody promised anything else.
+"""
+
+import itertools
+from collections.abc import Callable
+from typing import Final
+
+import msgspec
+
+from aftbed.campaign.value import corruptions
+from aftbed.core import check
+from aftbed.core.application import Application
+from aftbed.core.fault import Act
+from aftbed.core.graph import Graph
+from aftbed.ftm.mechanism import build, replication_of
+from aftbed.runtime.rewiring import replica_of
+from aftbed.runtime.sim.world import Run
+from aftbed.vehicle.function import default_application
+
+REST: Final = "rest"
+ASSERT: Final = "assert"
+
+
+class Breach(msgspec.Struct, frozen=True):
+    """`promise`: G1 to G6 (design 3), `rest` or `assert`."""
+
+    promise: str
+    reason: str
+
+    def __str__(self) -> str:
+        return f"{self.promise}: {self.reason}"
+
+
+def breaches(run: Run, function: Callable[[], Application] = default_application) -> tuple[Breach, ...]:
+    """All that `run` breaks; `function` makes the bare server."""
+    history, down = run.history, struck_down(run)
+    flips = any(f.act is Act.BITFLIP for f in run.setup.faults)
+    checks = {
+        "G1": check.at_most_once(history),
+        "G2": check.exactly_one_answer(history, cut_off=down),
+        "G4" if flips else "G3": check.one_history(history, function()),
+        "G6": check.one_master(history),
+    }
+    found = [Breach(name, c.reasons[0]) for name, c in checks.items() if c.finding == "fail"]
+    found += [Breach(ASSERT, failure) for failure in run.failures[:1]]
+    if run.rest.lost and not down:
+        names = ", ".join(name for _, name in run.struck) or "nobody"
+        found.append(Breach("G2", f"the service is lost, though only {names} was struck"))
+    if not run.rest.lost and not down:
+        found += [Breach("G5", reason) for reason in half_a_graph(run)[:1]]
+        found += [Breach(REST, "; ".join(run.rest.why_not))] if run.rest.why_not else []
+    return tuple(found)
+
+
+def struck_down(run: Run) -> bool:
+    """Whether faults struck each replica, the second before redundancy was back from the first."""
+    replicas = {b.replica for b in run.rest.graph.bricks if b.replica and b.part == "server"}
+    renewed = [t_ns for t_ns, event, text in run.told if event == "script.done" and "new backup" in text]
+    strikes = sorted((t_ns, replica_of(name)) for t_ns, name in run.struck if replica_of(name))
+    if len(replicas) < 2:
+        return bool(strikes)
+    return any(
+        other != replica and not any(first_ns < t_ns < second_ns for t_ns in renewed)
+        for (first_ns, replica), (second_ns, other) in itertools.combinations(strikes, 2)
+    )
+
+
+def half_a_graph(run: Run) -> list[str]:
+    """G5: what lives must be the whole graph that the adaptations, as they ended, have come to."""
+    done = [a.ftm for a in run.adaptations if a.outcome == "done"]
+    expected = done[-1] if done else run.setup.ftm
+    graph = run.rest.graph
+    if not run.rest.leader:
+        return ["nobody leads"]
+    if graph.ftm != expected:
+        return [f"{graph.ftm} runs, though the adaptations came to {expected}"]
+    return check.missing(run.rest.hosted, _whole(graph, expected, run.rest.leader))
+
+
+def _whole(graph: Graph, expression: str, leader: str) -> Graph:
+    return build(expression, graph.placement, leader if replication_of(expression) else "a")
+
+
+def outcome(run: Run, function: Callable[[], Application] = default_application) -> str:
+    """The class of what the faults did: masked, tolerated, unavailable, or sdc (design 2)."""
+    if corruptions(run.history, function()):
+        return "sdc"
+    if run.rest.lost:
+        return "unavailable"
+    late = check.requests(run.history, function()).late
+    return "tolerated" if late or check.failovers(run.history) else "masked"

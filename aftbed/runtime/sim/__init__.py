@@ -1,0 +1,1 @@
+"""The executive support in virtual time: one process, one seed."""

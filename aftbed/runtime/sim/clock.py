@@ -1,0 +1,83 @@
+"""Virtual time: a heap of what is to happen, and the chance by which delays are drawn.
+
+Nothing here looks at a clock. Between two events no time passes; two events of the same instant happen in
+the order in which they were planned. So a run is a function of its seed.
+"""
+
+import heapq
+from collections.abc import Callable
+from random import Random
+from typing import Final
+
+from aftbed.runtime.jobs import Jobs, StepFailed
+from aftbed.runtime.sim.hops import HOP_QUANTILES_NS
+
+START_NS: Final = 1_000_000_000  # so that no time is 0, which means "never" in some places
+HOP_BITS: Final = 7
+assert len(HOP_QUANTILES_NS) > 1 << HOP_BITS
+
+Call = Callable[[], None]
+
+
+class Clock:
+    """The loop of a run (see `runtime.interface.Loop`); `chance` is seeded by whoever makes it."""
+
+    def __init__(self, chance: Random) -> None:
+        self.ns = START_NS
+        self.heap: list[tuple[int, int, Call]] = []
+        self.count = 0  # events planned so far: breaks ties
+        self.chance = chance
+        self.jobs = Jobs(self.now_ns)
+        self._expiry_ns: int | None = None
+
+    def now_ns(self) -> int:
+        """Virtual."""
+        return self.ns
+
+    def at(self, t_ns: int, call: Call) -> None:
+        """Plan `call`."""
+        self.count += 1
+        heapq.heappush(self.heap, (t_ns, self.count, call))
+
+    def after(self, seconds: float, call: Call) -> None:
+        """Plan `call` for `seconds` from now. An order to the dead ends it quietly, as everywhere."""
+
+        def guarded() -> None:
+            try:
+                call()
+            except StepFailed:
+                return
+
+        self.at(self.ns + round(seconds * 1e9), guarded)
+
+    def rest(self, seconds: float) -> None:
+        """Nobody is in the way of anybody here."""
+
+    def hop_ns(self) -> int:
+        """How long a message takes, the step of its reader included: as measured."""
+        return HOP_QUANTILES_NS[self.chance.getrandbits(HOP_BITS)]
+
+    def between_ns(self, low_ns: int, high_ns: int) -> int:
+        """A delay, each as likely as the other."""
+        return low_ns + self.chance.getrandbits(30) * (high_ns - low_ns) // (1 << 30)
+
+    def step(self) -> bool:
+        """The next event; False if there is none."""
+        if not self.heap:
+            return False
+        self.ns, _, call = heapq.heappop(self.heap)
+        call()
+        return True
+
+    def watch_jobs(self) -> None:
+        """Have what is past its deadline fail: planned anew whenever a job has begun to wait."""
+        due = self.jobs.deadline_ns()
+        if due is None or (self._expiry_ns is not None and self._expiry_ns <= due):
+            return
+        self._expiry_ns = due
+        self.at(due, self._expire)
+
+    def _expire(self) -> None:
+        self._expiry_ns = None
+        self.jobs.expire(self.ns)
+        self.watch_jobs()

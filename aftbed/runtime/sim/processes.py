@@ -1,0 +1,223 @@
+"""Processes in virtual time: what is told to them and what they say takes a while, and so does their death.
+
+A signal is not instant: for some microseconds its target goes on. A death is seen first by who holds the
+lifeline (the Watchdog), later by the executive, as on Linux: 0.1 to 0.3 ms, and 0.5 to 0.8 ms (see
+`runtime.unix.lifeline`).
+"""
+
+from collections import deque
+from collections.abc import Callable, Generator
+from typing import Final
+
+from aftbed.core.errors import ConfigError
+from aftbed.core.journal import Record
+from aftbed.runtime import control, interface
+from aftbed.runtime.assembly import Assembler
+from aftbed.runtime.jobs import Key, StepFailed, Wait
+from aftbed.runtime.sim.channels import Channel
+from aftbed.runtime.sim.clock import Clock
+from aftbed.runtime.sim.devices import Device
+from aftbed.runtime.sim.node import Node
+
+SIGNAL_NS: Final = (5_000, 60_000)
+LIFELINE_NS: Final = (100_000, 300_000)
+PIDFD_NS: Final = (500_000, 800_000)
+LINE_NS: Final = (15_000, 60_000)  # an order, or an answer
+BIRTH_NS: Final = (500_000, 3_000_000)
+
+MakeDevice = Callable[[control.Assign, Node], Device]
+
+
+class Process:
+    """A child of the executive, which becomes one node."""
+
+    def __init__(self, number: int, nursery: "Nursery") -> None:
+        self.name, self.kind, self.journal, self.incarnation = "spare", "spare", "", 0
+        self.pid = self.pidfd = number
+        self.alive = True  # as far as the executive knows
+        self.node: Node | None = None
+        self.dead = False
+        self._nursery, self._clock = nursery, nursery.clock
+        self._order_ns = self._say_ns = 0  # of the last one that is under way
+        self._orders: deque[tuple[control.ToNode, tuple[int, ...]]] = deque()
+        self._reports: deque[control.FromNode] = deque()
+        self._noticed: list[Callable[[], None]] = []
+
+    # -- signals ------------------------------------------------------------------------------
+
+    def kill(self) -> bool:
+        """It dies soon."""
+        if self.dead:
+            return False
+        self._clock.at(self._clock.ns + self._clock.between_ns(*SIGNAL_NS), self.die)
+        return True
+
+    def freeze(self) -> bool:
+        """It stops at once."""
+        if self.dead:
+            return False
+        if self.node is not None:
+            self.node.freeze()
+            self._nursery.on_freeze(self)
+        return True
+
+    def thaw(self) -> bool:
+        """It goes on."""
+        if self.dead:
+            return False
+        if self.node is not None:
+            self.node.thaw()
+        return True
+
+    def stopped(self) -> bool:
+        """Whether it runs no more."""
+        return self.dead or (self.node is not None and bool(self.node.frozen_ns))
+
+    def silent(self, now_ns: int, deadline_ns: int) -> bool:
+        """Whether it lives, as far as is known, and its pulse is older than `deadline_ns`."""
+        return self.alive and self.pulse_ns(now_ns) < now_ns - deadline_ns
+
+    def pulse_ns(self, now_ns: int) -> int:
+        """When it was last seen running."""
+        return now_ns if self.node is None else self.node.pulse_ns(now_ns)
+
+    # -- death --------------------------------------------------------------------------------
+
+    def die(self) -> None:
+        """Dead here and now."""
+        if self.node is not None:
+            self.node.die()
+        else:
+            self.ended("")
+
+    def ended(self, reason: str) -> None:
+        """Those who look will see it."""
+        if self.dead:
+            return
+        self.dead = True
+        self._nursery.on_end(self, reason)
+        for call in self._noticed:
+            self._clock.at(self._clock.ns + self._clock.between_ns(*LIFELINE_NS), call)
+        seen_ns = max(self._say_ns, self._clock.ns + self._clock.between_ns(*PIDFD_NS))
+        self._clock.at(seen_ns, self._seen)
+
+    def notice(self, call: Callable[[], None]) -> None:
+        """Have `call` called when it is dead."""
+        if self.dead:
+            self._clock.at(self._clock.ns + self._clock.between_ns(*LIFELINE_NS), call)
+        else:
+            self._noticed.append(call)
+
+    def _seen(self) -> None:
+        self.alive = False
+        self._nursery.processes.remove(self)
+        self._nursery.on_death(self)
+
+    # -- the line -----------------------------------------------------------------------------
+
+    def order(self, order: control.ToNode, fds: tuple[int, ...]) -> None:
+        """It will read this. Raises StepFailed if it is gone."""
+        if self.dead:
+            raise StepFailed(f"{self.name} cannot be reached")
+        self._order_ns = max(self._order_ns + 1, self._clock.ns + self._clock.between_ns(*LINE_NS))
+        self._orders.append((order, fds))
+        self._clock.at(self._order_ns, self.read)
+
+    def read(self) -> None:
+        """The oldest order is here."""
+        order, fds = self._orders.popleft()
+        if self.dead:
+            return
+        if isinstance(order, control.Assign):
+            born_ns = self._clock.ns + self._clock.between_ns(*BIRTH_NS)
+            self._order_ns = max(self._order_ns, born_ns)
+            self._clock.at(born_ns, lambda: self._become(order, fds))
+        elif self.node is not None:
+            self.node.order(order, fds)
+
+    def _become(self, order: control.Assign, fds: tuple[int, ...]) -> None:
+        if self.dead:
+            return
+        try:
+            self.node = self._nursery.build(self, order, fds)
+        except ConfigError as error:
+            self.say(control.Ack(order.token, error=str(error)))
+            self.die()
+
+    def say(self, report: control.FromNode) -> None:
+        """The executive will hear this."""
+        self._say_ns = max(self._say_ns + 1, self._clock.ns + self._clock.between_ns(*LINE_NS))
+        self._reports.append(report)
+        self._clock.at(self._say_ns, self.heard)
+
+    def heard(self) -> None:
+        """The oldest report is at the executive."""
+        self._nursery.on_report(self, self._reports.popleft())
+
+    def assigned(self) -> None:
+        """Nothing to open."""
+
+    def announce(self) -> None:
+        """Orders arrive by themselves."""
+
+    def announced(self) -> bool:
+        """Whether an order is under way."""
+        return False
+
+
+class Nursery:
+    """Spares without end, at once: what a birth costs is in `BIRTH_NS`."""
+
+    def __init__(
+        self,
+        clock: Clock,
+        assembler: Assembler,
+        make_device: MakeDevice,
+        end: Callable[[int], Channel],
+        records: Callable[[str], list[Record]],
+    ) -> None:
+        self.clock = clock
+        self._assembler, self._make_device, self._end, self._records = assembler, make_device, end, records
+        self.processes: list[Process] = []
+        self.by_number: dict[int, Process] = {}
+        self.zygotes: dict[str, Process] = {}
+        self.on_report: Callable[[Process, control.FromNode], None] = lambda process, report: None
+        self.on_death: Callable[[Process], None] = lambda process: None
+        self.on_end: Callable[[Process, str], None] = lambda process, reason: None
+        self.on_freeze: Callable[[Process], None] = lambda process: None
+
+    def spare(self, zygote: str) -> Generator[Wait, dict[Key, bytes], Process]:
+        """A fresh one."""
+        process = Process(len(self.by_number) + 1, self)
+        self.by_number[process.pid] = process
+        self.processes.append(process)
+        yield Wait(frozenset())
+        return process
+
+    def calm(self, zygote: str) -> Generator[Wait, dict[Key, bytes], None]:
+        """It always is."""
+        yield Wait(frozenset())
+
+    def level(self, zygote: str, count: int) -> None:
+        """There are always enough."""
+
+    def order(self, process: interface.Process, order: control.ToNode, fds: tuple[int, ...] = ()) -> None:
+        """Send an order. Raises StepFailed if the process is gone."""
+        assert isinstance(process, Process)
+        process.order(order, fds)
+
+    def build(self, process: Process, order: control.Assign, fds: tuple[int, ...]) -> Node:
+        """The node that `order` describes. Raises ConfigError where a class is no good."""
+        records = self._records(order.journal)
+        node = Node(order.node, self.clock, records, self._end, process.say, process.ended)
+        node.suspended = order.held
+        self._assembler.fill(node, order)
+        if order.device:
+            node.attach(self._make_device(order, node), order.bricks[0].name)
+        for port in order.inputs:
+            node.bind_input(port.brick, port.port, fds[port.index])
+        process.say(control.Ack(order.token))
+        for port in order.outputs:
+            node.bind_output(port.brick, port.port, fds[port.index], order.epoch)
+        self.clock.at(self.clock.ns, node.run)
+        return node

@@ -1,0 +1,378 @@
+"""One simulated run: the whole graph, the executive, a source of requests, faults and adaptations; one seed.
+
+Two phases, as in TigerBeetle's simulator: while faults fly, only safety is asked for (nothing wrong, doubled
+or out of order). When all of them have been, the run must come to rest within a bound: every request has its
+answer, no script is under way, redundancy is back. It leaves a history, for the checkers of real runs.
+"""
+
+from collections.abc import Callable, Iterable
+from functools import lru_cache
+from random import Random
+from typing import Final
+
+import msgspec
+
+from aftbed.core.application import Application
+from aftbed.core.check import History
+from aftbed.core.errors import ConfigError
+from aftbed.core.event import Event
+from aftbed.core.fault import Fault
+from aftbed.core.graph import Graph, Link
+from aftbed.core.journal import Entry, EntryKind, Record
+from aftbed.core.message import Goal, Scheduled
+from aftbed.ftm.client import Client
+from aftbed.ftm.mechanism import build, replication_of
+from aftbed.runtime import control
+from aftbed.runtime.adaptations import Outcome
+from aftbed.runtime.assembly import Assembler, Make
+from aftbed.runtime.conductor import Conductor
+from aftbed.runtime.deployment import Keys
+from aftbed.runtime.sim.channels import Channel
+from aftbed.runtime.sim.clock import START_NS, Clock
+from aftbed.runtime.sim.devices import Car, Device, Sensor
+from aftbed.runtime.sim.node import Node
+from aftbed.runtime.sim.processes import Nursery, Process
+from aftbed.runtime.source import Load, resume_client
+from aftbed.vehicle.function import default_application, sample_requests
+from aftbed.vehicle.report import VehicleResult
+from aftbed.vehicle.virtual import VirtualCar
+
+REST_NS_MAX: Final = 3_000_000_000  # from the last fault to the rest, in virtual time
+STRAY_NS: Final = 5_000_000  # so long after the rest, what comes too late would still be seen
+LOOK_EVERY: Final = 32  # events between two looks at whether all is done
+EVENTS_MAX: Final = 20_000_000
+DRAW_BITS: Final = 63
+REQUESTS: Final = 512
+
+NoModule = Callable[[str], object]
+
+
+class Doom(msgspec.Struct, frozen=True):
+    """The node of `brick` dies before that effect of the brick, counted from 0 in its first life."""
+
+    brick: str
+    effect: int
+
+
+class Setup(msgspec.Struct, frozen=True):
+    """What a run is made of. `count` requests at `rate_hz` (0: the next follows the reply), or a car's."""
+
+    ftm: str = "pbr"
+    placement: str = "process"
+    seed: int = 0
+    count: int = 100
+    rate_hz: float = 0.0
+    faults: tuple[Fault, ...] = ()
+    adaptations: tuple[Scheduled, ...] = ()
+    dooms: tuple[Doom, ...] = ()
+
+
+class Rest(msgspec.Struct, frozen=True):
+    """How a run came to its end; `why_not` is empty if it came to rest in time."""
+
+    why_not: tuple[str, ...]
+    lost: bool  # no replica is left
+    ended_ns: int
+    leader: str
+    graph: Graph
+    hosted: tuple[tuple[str, str], ...]  # bricks that live, with the kind of each
+
+
+class Run(msgspec.Struct, frozen=True):
+    """What a run leaves behind."""
+
+    setup: Setup
+    history: History
+    rest: Rest
+    told: tuple[tuple[int, str, str], ...]  # time, event, text
+    adaptations: tuple[Outcome, ...]
+    faults: tuple[dict[str, str], ...]
+    failures: tuple[str, ...]  # of asserts, in nodes
+    vehicle: VehicleResult | None
+    effects: dict[str, int]  # by brick: how many it has performed in its first life
+    struck: tuple[tuple[int, str], ...]  # who died, or was stopped, of a fault, and when
+
+
+@lru_cache(maxsize=8)
+def requests_of(seed: int) -> list[bytes]:
+    """The load of a seed."""
+    return sample_requests(seed, REQUESTS)
+
+
+@lru_cache(maxsize=64)
+def _graph(ftm: str, placement: str) -> Graph:
+    return build(ftm, placement)
+
+
+def _nothing_off_line(place: str) -> object:
+    raise ConfigError(f"{place}: the simulator loads nothing that was written off line")
+
+
+class World:
+    """The `Support` of a simulated run, and the run itself."""
+
+    def __init__(
+        self,
+        setup: Setup,
+        *,
+        function: Callable[[], Application] = default_application,
+        requests: list[bytes] | None = None,
+        car: VirtualCar | None = None,
+        make: Make | None = None,
+        load: Callable[[str], object] = _nothing_off_line,
+        channel: type[Channel] = Channel,
+    ) -> None:
+        self.setup, self._car, self._channel = setup, car, channel
+        self._requests = requests if requests is not None else requests_of(0)
+        self.loop = Clock(Random(setup.seed))
+        self.journals: dict[str, list[Record]] = {}
+        self.dialogue: list[Entry] = []
+        self.told: list[tuple[int, str, str]] = []
+        self._ends: dict[int, Channel] = {}
+        self._kept: list[bytes] = []
+        self.failures: list[str] = []
+        self.struck: list[tuple[int, str]] = []  # who died, or was stopped, of a fault, and when
+        self.effects: dict[str, int] = {}
+        self.lost = False
+        self._car_began_ns = 0
+        self.journal = _Journal(self.journals.setdefault("supervisor.1", []))
+        assembler = Assembler(function, load, make)  # type: ignore[arg-type]
+        self.nursery = Nursery(
+            self.loop, assembler, self._make_device, self._ends.__getitem__, self._journal_for
+        )
+        self.conductor = Conductor(_graph(setup.ftm, setup.placement), self, None, self._on_loss)
+        self.nursery.on_report = self._on_report
+        self.nursery.on_death = self._on_death
+        self.nursery.on_end = self._on_end
+        self.nursery.on_freeze = lambda process: self.struck.append((self.loop.ns, process.name))
+        self._launched = False
+
+    # -- the runtime, as the executive sees it: see `runtime.interface.Support` ------------------
+
+    def channel(self, link: Link) -> Channel:
+        """A fresh one."""
+        channel = self._channel(link, self.loop, len(self._ends) + 1)
+        for end in (channel.write, channel.read):
+            self._ends[end.number] = channel
+        return channel
+
+    def device(self, kind: str, incarnation: int) -> tuple[str, bytes]:
+        """By the kind of its brick."""
+        return {"watchdog": "sensor", "client": "source"}.get(kind, ""), b""
+
+    def journal_of(self, node: str, incarnation: int) -> str:
+        """A name."""
+        return f"{node.replace('/', '.')}.{incarnation}"
+
+    def records(self, journal: str) -> Iterable[Record]:
+        """What has been written."""
+        return self.journals.get(journal, ())
+
+    def recorded_requests(self) -> tuple[bytes, ...]:
+        """The first few of the dialogue."""
+        return tuple(e.payload for e in self.dialogue if e.kind is EntryKind.SENT)[:16]
+
+    def draw(self, number: int) -> int:
+        """Of the run's seed."""
+        return Random(f"{self.setup.seed}/{number}").getrandbits(DRAW_BITS)
+
+    def pin(self, pid: int, cpu: int) -> None:
+        """There are no cores here."""
+
+    def keep(self, adaptation: bytes) -> None:
+        """For the outcome."""
+        self._kept.append(adaptation)
+
+    def tell(self, event: str, text: str) -> None:
+        """For the outcome."""
+        self.told.append((self.loop.ns, event, text))
+
+    # -- parts --------------------------------------------------------------------------------
+
+    def _journal_for(self, name: str) -> list[Record]:
+        return self.journals.setdefault(name, [])
+
+    def _make_device(self, order: control.Assign, node: Node) -> Device:
+        if order.device == "sensor":
+            by_number = self.nursery.by_number
+
+            def notice(number: int, call: Callable[[], None]) -> None:
+                def noticed() -> None:
+                    call()
+                    node.run()
+
+                by_number[number].notice(noticed)
+
+            return Sensor(by_number.__getitem__, notice)
+        client = node.hosted(order.bricks[0].name).brick
+        assert isinstance(client, Client)
+        resume_client(client, self.dialogue)
+        if self._car is not None:
+            self._car_began_ns = self._car_began_ns or self.loop.ns
+            return Car(client, self, self._car, self._car_began_ns)
+        return Load(client, self, self._requests, self.setup.count, self.setup.rate_hz)
+
+    def write(self, now_ns: int, request_id: int, epoch: int, kind: EntryKind, payload: bytes) -> None:
+        """An entry of the dialogue."""
+        self.dialogue.append(Entry(now_ns, request_id, epoch, kind, payload))
+
+    def _on_report(self, process: Process, report: control.FromNode) -> None:
+        self.conductor.on_report(process, report)
+        self.loop.watch_jobs()
+
+    def _on_death(self, process: Process) -> None:
+        self.conductor.on_death(process)
+        self.loop.watch_jobs()
+
+    def _on_end(self, process: Process, reason: str) -> None:
+        if process.node is not None and process.incarnation == 1:
+            self._count(process.node)
+        if not reason and process.kind != "killed":
+            self.struck.append((self.loop.ns, process.name))
+        if reason.startswith("assertion"):
+            self.failures.append(f"{process.name}: {reason}")
+            self.tell("assert", f"{process.name}: {reason}")
+
+    def _count(self, node: Node) -> None:
+        for brick in node.bricks.values():
+            self.effects.setdefault(brick.name, brick.effects)
+
+    def _on_loss(self) -> None:
+        self.lost = True
+
+    # -- the run ------------------------------------------------------------------------------
+
+    def _launch(self) -> Keys:
+        yield from self.conductor.deployment.launch(held=("client",))
+        for fault in self.setup.faults:
+            yield from self.conductor.faults.arm(fault)
+        yield from self.conductor.adaptations.schedule(self.setup.adaptations)
+        for doom in self.setup.dooms:
+            self._doom(doom)
+        yield from self.conductor.deployment.ask("client", control.Resume)
+
+    def _doom(self, doom: Doom) -> None:
+        deployment = self.conductor.deployment
+        process = deployment.nodes.get(deployment.graph.node_of(doom.brick))
+        assert isinstance(process, Process) and process.node is not None
+        process.node.doom = (doom.brick, doom.effect)
+
+    def _on_launched(self, failure: str) -> None:
+        assert not failure, f"the launch of {self.setup}: {failure}"
+        self._launched = True
+        self.conductor.inform_recovery(failed=False)
+
+    def run(self) -> Run:
+        """From the launch to the rest."""
+        loop = self.loop
+        loop.jobs.start("launch", self._launch(), self._on_launched)
+        loop.watch_jobs()
+        rested_ns = source_done_ns = 0
+        events = 0
+        while True:
+            for _ in range(LOOK_EVERY):
+                if not loop.step():
+                    break
+            events += LOOK_EVERY
+            assert events < EVENTS_MAX, f"no end in sight: {self.setup}"
+            loop.watch_jobs()
+            if not self._launched:
+                continue
+            if not source_done_ns and (self._source_ended() or self.lost or not loop.heap):
+                source_done_ns = loop.ns
+            if source_done_ns and not rested_ns and (self.lost or not self._unrest()):
+                rested_ns = loop.ns
+            if rested_ns and loop.ns > rested_ns + STRAY_NS:
+                break
+            if source_done_ns and loop.ns > source_done_ns + REST_NS_MAX:
+                break
+            if loop.ns > self._limit_ns() or not loop.heap:
+                break
+        return self._outcome(())
+
+    def _limit_ns(self) -> int:
+        """A source that is held up for ever must not hold up the simulator."""
+        period = 1 / self.setup.rate_hz if self.setup.rate_hz else 0.001
+        seconds = 60.0 if self._car is not None else self.setup.count * period
+        return START_NS + round(seconds * 1e9) + 2 * REST_NS_MAX
+
+    def _client(self) -> Node | None:
+        process = self.conductor.deployment.nodes.get("client")
+        return process.node if isinstance(process, Process) and not process.dead else None
+
+    def _source_ended(self) -> bool:
+        """All requests have been made, whether they are answered or not."""
+        node = self._client()
+        if node is None or node.device is None:
+            return False
+        if isinstance(node.device, Car):
+            return self._car is not None and self._car.due_ns() is None
+        client = node.hosted("client").brick
+        return isinstance(client, Client) and client.next_id > self.setup.count
+
+    def _unrest(self) -> list[str]:
+        """Why the run has not come to rest."""
+        conductor, found = self.conductor, []
+        node = self._client()
+        device = node.device if node is not None else None
+        if not isinstance(device, Load | Car):
+            found.append("no client")
+        elif not device.done:
+            found.append("requests wait")
+        if conductor.executor.busy or conductor.adaptations.busy or conductor.adaptations.to_come:
+            found.append("a script is under way")
+        if replication_of(conductor.deployment.graph.ftm) and not conductor.deployment.backup:
+            found.append("no redundancy")
+        found += [f"{name} is under way" for name in self.loop.jobs.names()]
+        return found
+
+    def _outcome(self, extra: tuple[str, ...]) -> Run:
+        deployment = self.conductor.deployment
+        hosted = []
+        for process in deployment.nodes.values():
+            if isinstance(process, Process) and process.node is not None:
+                if process.incarnation == 1:
+                    self._count(process.node)
+                hosted += [] if process.dead else list(process.node.bricks)
+        kinds = {b.name: b.kind for b in deployment.graph.bricks}
+        rest = Rest(
+            (*extra, *(() if self.lost else self._unrest())),
+            self.lost,
+            self.loop.ns,
+            deployment.leader,
+            deployment.graph,
+            tuple(sorted((name, kinds.get(name, "?")) for name in hosted)),
+        )
+        return Run(
+            self.setup,
+            History(self.journals, self.dialogue),
+            rest,
+            tuple(self.told),
+            tuple(self.conductor.adaptations.history),
+            tuple(self.conductor.faults.receipts()),
+            tuple(self.failures),
+            self._car.result() if self._car is not None else None,
+            self.effects,
+            tuple(self.struck),
+        )
+
+
+class _Journal:
+    """The executive's records."""
+
+    def __init__(self, records: list[Record]) -> None:
+        self._records = records
+
+    def write(self, now_ns: int, event: Event, request_id: int, detail: int, brick: int = 0) -> None:
+        """Append one."""
+        self._records.append(Record(now_ns, event, request_id, detail, "supervisor", brick))
+
+
+def simulate(setup: Setup) -> Run:
+    """One run of a load."""
+    return World(setup).run()
+
+
+def composed(expression: str, at_request: int) -> Scheduled:
+    """An adaptation to `expression` that begins at a request."""
+    return Scheduled(Goal(expression=expression), at_request)

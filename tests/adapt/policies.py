@@ -1,0 +1,54 @@
+"""What the tests of policies share: actions, files, and conditions on a resource with an oracle for them."""
+
+from pathlib import Path
+from typing import Final
+
+from hypothesis import strategies as st
+
+from aftbed.adapt.policy import ADAPTABLE, NS_PER_S, Action, Beyond, Policy, PolicyFile, policy_from
+from aftbed.ftm.mechanism import DUPLEX, SIMPLEX
+from aftbed.vehicle.yamlfile import read_yaml
+
+S: Final = NS_PER_S
+COMPOSE, DECOMPOSE = Action("compose", "tr"), Action("decompose")
+TO_LFR, TO_PBR = Action("switch", "lfr"), Action("switch", "pbr")
+ACTIONS: Final = (
+    *(Action("to", e) for e in ADAPTABLE),
+    *(Action("switch", name) for name in DUPLEX),
+    *(Action("compose", name) for name in SIMPLEX),
+    DECOMPOSE,
+)
+
+
+def read(tmp_path: Path, *rules: str, dwell: str = "5") -> Policy:
+    """The policy of a file with these rules."""
+    path = tmp_path / "mine.yaml"
+    path.write_text(f"dwell_s: {dwell}\nrules:\n" + "".join(f"  - {{{rule}}}\n" for rule in rules))
+    return policy_from(read_yaml(path, PolicyFile), str(path))
+
+
+levels = st.integers(0, 8).map(float)
+
+
+@st.composite
+def beyonds(draw: st.DrawFn) -> Beyond:
+    """Conditions on one resource."""
+    above, threshold = draw(st.booleans()), draw(levels)
+    until = draw(levels.filter(lambda value: value <= threshold if above else value >= threshold))
+    return Beyond("cpus", above, threshold, until, draw(st.integers(0, 3)))
+
+
+def beyond_oracle(when: Beyond, samples: list[tuple[int, float]]) -> list[bool]:
+    """After each sample, whether the condition holds; by looking at all samples so far."""
+    found = []
+    for index in range(len(samples)):
+        held = False
+        for t_ns, value in samples[: index + 1]:
+            run = 0
+            past = [s for s in samples[: index + 1] if s[0] <= t_ns]
+            while run < len(past) and when.begins(past[-1 - run][1]):
+                run += 1
+            begun = run > 0 and t_ns - past[-run][0] >= when.for_ns
+            held = not when.ends(value) if held else begun
+        found.append(held)
+    return found

@@ -1,0 +1,94 @@
+"""Records made by hand, in the very files that a run leaves behind."""
+
+import json
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from aftbed.campaign.record import read_record
+from aftbed.campaign.verdict import Verdict, judge
+from aftbed.core.event import Event
+from aftbed.core.fault import Act, Fault, Flip, Place, Trigger, flipped
+from aftbed.core.journal import DROPPED_OFFSET, EntryKind
+from aftbed.runtime.unix.journal import Dialogue, Journal
+from aftbed.runtime.unix.options import CarRun, LoadRun, RunOptions, Work
+from aftbed.vehicle.function import default_application, sample_requests
+from aftbed.vehicle.report import VehicleResult
+
+MS: Final = 1_000_000
+START_NS: Final = 10**12
+CAR: Final = CarRun("ccrs-50", None, "latch")
+STOPPED: Final = VehicleResult(False, None, 2.5, 2.5, 9.0, True)
+CRASH: Final = Fault(Act.CRASH, "primary", Trigger("checkpoint.sent", 2))
+FLIP: Final = Fault(Act.BITFLIP, "primary", Trigger("server.exit", 2), flip=Flip(Place.RESULT, 8))
+FIRST_GENERATION: Final = 1 << 8
+
+
+class RecordInTheMaking:
+    """A run of three requests, in the directory that it leaves; `end` is what the supervisor wrote."""
+
+    def __init__(self, path: Path, work: Work | None = None, faults: tuple[Fault, ...] = ()) -> None:
+        self.path = path
+        self.work = work or LoadRun(3, 0.0)
+        self.options = RunOptions("abc123", "/gone", str(path), "pbr", "process", 7, self.work, faults)
+        receipts = [{"fault": str(f), "receipt": "applied"} for f in faults]
+        self.end: dict[str, object] | None = {"reason": "", "left": [], "seconds": 1.5, "faults": receipts}
+        self.t_ns = START_NS
+        (path / "journal").mkdir(parents=True)
+        self._journals: dict[str, Journal] = {}
+        self._dialogue = Dialogue(path / "journal" / "client.1.dialogue", "client")
+        self._bare = default_application()
+        self.sent = 0
+
+    def note(self, journal: str, event: Event, request_id: int = 0, detail: int = 0) -> None:
+        if journal not in self._journals:
+            node = journal.rpartition(".")[0].replace("-", "/")
+            self._journals[journal] = Journal(self.path / "journal" / f"{journal}.journal", node)
+        self.t_ns += MS
+        self._journals[journal].write(self.t_ns, event, request_id, detail)
+
+    def request(
+        self, epoch: int = 1, replica: int = 1, answers: int = 1, flipped_bit: int | None = None
+    ) -> None:
+        """One request, served as it should be, but for `flipped_bit`; answered `answers` times."""
+        self.sent += 1
+        payload = sample_requests(7, self.sent)[-1]
+        self.t_ns += MS
+        self._dialogue.write(self.t_ns, self.sent, 0, EntryKind.SENT, payload)
+        self.note(f"{'ab'[replica - 1]}-server.1", Event.SERVER_EXIT, self.sent)
+        self.note("proxy.1", Event.REPLY_ACCEPTED, self.sent, epoch << 8 | replica)
+        reply = self._bare.execute(payload)
+        if flipped_bit is not None:
+            reply = flipped(reply, flipped_bit)
+        for _ in range(answers):
+            self._dialogue.write(self.t_ns, self.sent, epoch, EntryKind.ANSWERED, reply)
+
+    def lose(self, name: str, count: int) -> None:
+        """Of what belonged into this file, `count` found no room."""
+        with (self.path / "journal" / name).open("r+b") as file:
+            file.seek(DROPPED_OFFSET)
+            file.write(count.to_bytes(4, "little"))
+
+    def failover(self) -> None:
+        self.note("a-after.1", Event.FAULT_APPLIED, detail=1)
+        self.note("a-watchdog.1", Event.WATCHDOG_SUSPECT, detail=1)
+        self.note("supervisor", Event.REPLICA_FENCED, detail=FIRST_GENERATION | 1)
+        self.note("b-protocol.1", Event.REPLICA_PROMOTED, detail=2)
+
+    def verdict(self) -> Verdict:
+        """Write what is left to write, then read it all back and judge."""
+        about = msgspec.to_builtins(self.options) | {"started_ns": START_NS - 250 * MS}
+        del about["private"], about["listener"]  # of a live run only
+        (self.path / "run.json").write_text(json.dumps(about))
+        if self.end is not None:
+            (self.path / "end.json").write_text(json.dumps(self.end))
+        return judge(read_record(self.path))
+
+
+def whole(path: Path, work: Work | None = None, faults: tuple[Fault, ...] = ()) -> RecordInTheMaking:
+    """A run in which nothing is wrong."""
+    record = RecordInTheMaking(path, work, faults)
+    for _ in range(3):
+        record.request()
+    return record

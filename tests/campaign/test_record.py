@@ -1,0 +1,52 @@
+"""Records: what is read as one, and what is none."""
+
+from pathlib import Path
+
+import pytest
+from records import whole
+
+from aftbed.campaign.record import read_record
+from aftbed.core.errors import ConfigError
+from aftbed.runtime.unix.journal import Dialogue
+
+
+def test_several_incarnations_of_the_client_are_one_dialogue(path: Path) -> None:
+    """In the order of their numbers, not of their names: 10 comes after 9."""
+    record = whole(path)
+    for incarnation in range(2, 11):
+        record._dialogue = Dialogue(path / "journal" / f"client.{incarnation}.dialogue", "client")
+        record.request()
+    verdict = record.verdict()
+    assert verdict.verdict == "pass" and verdict.requests.sent == 12
+
+
+def test_a_directory_that_is_no_record(tmp_path: Path) -> None:
+    with pytest.raises(
+        ConfigError, match=r"run\.json: No such file or directory; is this the record of a run\?"
+    ):
+        read_record(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", "not JSON"),
+        ("[1]", "not a JSON object"),
+        ("{}", "not the options of a run: "),
+        ('{"run": 1}', "not the options of a run: "),
+    ],
+)
+def test_a_run_json_that_is_none(path: Path, text: str, message: str) -> None:
+    record = whole(path)
+    record.verdict()
+    (path / "run.json").write_text(text)
+    with pytest.raises(ConfigError, match=rf"run\.json: {message}"):
+        read_record(path)
+
+
+@pytest.mark.parametrize("name", ["a-server.1.journal", "client.1.dialogue"])
+def test_a_journal_that_is_none(path: Path, name: str) -> None:
+    whole(path).verdict()
+    (path / "journal" / name).write_bytes(b"garbage")
+    with pytest.raises(ConfigError, match=r"journal: not a journal \(7 bytes\)"):
+        read_record(path)

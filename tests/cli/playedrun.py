@@ -1,0 +1,62 @@
+"""A run that is played, for the commands that speak to one; real ones are in `tests/process`."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from aftbed.core.errors import ConfigError
+from aftbed.core.graph import Graph
+from aftbed.core.message import Goal
+from aftbed.ftm.mechanism import build
+from aftbed.runtime.unix import ask
+
+Call = Callable[..., tuple[int, str, str]]  # `aftbed` with these arguments: exit code, output, errors
+Run = Callable[..., str]
+VARIANTS: Final = "aftbed.vehicle.variants"
+CLOSED: Final = f"{VARIANTS}:WithoutStateAccess"
+RANDOM: Final = f"{VARIANTS}:NonDeterministic"
+CAUTIOUS: Final = f"{VARIANTS}:Cautious"
+OUTCOME: Final = {
+    "number": 3,
+    "purpose": "pbr to lfr",
+    "recipe": "drained",
+    "ftm": "lfr",
+    "outcome": "done",
+    "reason": "",
+    "asked_ms": 1234.5,
+    "prepare_ms": 12.25,
+    "blackout_ms": 0.75,
+    "total_ms": 118.5,
+    "bricks_changed": 4,
+    "bricks_total": 16,
+}
+
+
+class PlayedRun:
+    """A run that tells its graph, remembers what it was asked for, and answers `outcome`."""
+
+    def __init__(self) -> None:
+        self.graph: Graph = build("pbr", "process")
+        self.outcome: dict[str, object] = dict(OUTCOME)
+        self.history: list[dict[str, object]] = []
+        self.goals: list[Goal] = []
+        self.seconds = 0.0
+
+    def ask(self, private: Path, question: ask.Question, seconds: float = 0.0) -> dict[str, object]:
+        """In the place of `ask.ask`."""
+        assert private.name == "abc123"
+        match question:
+            case ask.GraphNow():
+                return msgspec.json.decode(msgspec.json.encode(self.graph))  # type: ignore[no-any-return]
+            case ask.Adaptations():
+                return {"adaptations": self.history}
+            case ask.Adapt(goal):
+                self.goals.append(goal)
+                self.seconds = seconds
+                if self.outcome["outcome"] == "refused" and self.outcome["reason"]:
+                    raise ConfigError(str(self.outcome["reason"]))
+                return self.outcome
+            case _:
+                raise AssertionError(question)

@@ -1,0 +1,93 @@
+"""`run --adapt`: what is refused before the run starts, and what each adaptation begins from."""
+
+import sys
+from pathlib import Path
+
+import pytest
+from liveruns import Home
+from playedrun import CLOSED, Run
+
+from aftbed.cli import main, running
+from aftbed.cli.adaptation import scheduled
+from aftbed.core.errors import ConfigError
+from aftbed.core.message import Goal, Scheduled
+from aftbed.ftm.mechanism import build
+from aftbed.runtime.unix import rundir
+from aftbed.runtime.unix.options import RunOptions
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (
+            ("--adapt", "compose lfr+tr at request 120"),
+            ("--adapt 'compose lfr+tr at request 120'", "switch lfr"),
+        ),
+        (("--adapt", "to lfr at 5"), ("--adapt 'to lfr at 5'", "'at request N'")),
+        (("--adapt", ""), ("--adapt ''", "expected")),
+        (("--adapt", "too lfr"), ("unknown adaptation 'too'", "did you mean 'to'")),
+        (("--ftm", "none", "--adapt", "to lfr"), ("neither starts nor ends",)),
+        (("--adapt", "update proced to m:C"), ("unknown brick 'proced'",)),
+        (("--adapt", "update proceed to gone.py:C"), ("no such file",)),
+        (("--adapt", f"update app to {CLOSED}"), ("pbr needs state access", "--force")),
+        (("--adapt", "to lfr", "--recipe", "papr"), ("did you mean 'paper'",)),
+        (("--adapt", "to lfr", "--recipe", "paper", "--placement", "replica"), ("not replica",)),
+        (("--recipe", "paper"), ("--recipe and --force", "give --adapt too")),
+        (("--force",), ("--recipe and --force", "give --adapt too")),
+        (
+            ("--adapt", "switch lfr", "--adapt", "switch lfr"),
+            ("--adapt 'switch lfr'", "is what runs already"),
+        ),
+        (
+            ("--adapt", "to lfr at request 9", "--adapt", "to pbr at request 8"),
+            ("--adapt 'to pbr at request 8'", "begins before the one that stands before it"),
+        ),
+        (("--adapt", "to lfr after 2s", "--adapt", "to pbr after 1s"), ("begins before the one",)),
+        (
+            ("--adapt", "to lfr", "--adapt", "to pbr at request 9", "--adapt", "to lfr at request 8"),
+            ("--adapt 'to lfr at request 8'", "begins before the one"),
+        ),
+    ],
+)
+def test_an_adaptation_of_a_run_is_refused_before_it_starts(
+    refused: Run, arguments: tuple[str, ...], words: tuple[str, ...]
+) -> None:
+    error = refused("run", "--load", "10", *arguments)
+    assert all(word in error for word in words), error
+
+
+def test_each_adaptation_of_a_run_begins_where_the_one_before_ends() -> None:
+    texts = ("switch lfr at request 5", "compose lfr+tr after 2s", "decompose at request 90")
+    assert scheduled(texts, build("pbr", "process"), "drained", force=False) == (
+        Scheduled(Goal(expression="lfr"), at_request=5),
+        Scheduled(Goal(expression="lfr+tr"), after_ms=2000.0),
+        Scheduled(Goal(expression="lfr"), at_request=90),
+    )
+
+
+def test_an_update_of_the_function_counts_for_what_comes_after_it() -> None:
+    graph = build("lfr", "process")
+    texts = (f"update app to {CLOSED} at request 5", "switch pbr at request 9")
+    with pytest.raises(ConfigError, match="--adapt 'switch pbr at request 9': pbr is not consistent"):
+        scheduled(texts, graph, "drained", force=False)
+    assert len(scheduled(texts, graph, "paper", force=True)) == 2
+
+
+def test_the_adaptations_of_a_run_are_among_its_options(home: Home, monkeypatch: pytest.MonkeyPatch) -> None:
+    started: list[RunOptions] = []
+
+    class StartedError(Exception):
+        pass
+
+    def launch(options: RunOptions, listener: object) -> None:
+        started.append(options)
+        rundir.remove(Path(options.private))
+        raise StartedError
+
+    monkeypatch.setattr(running, "launch", launch)
+    monkeypatch.setattr(
+        sys, "argv", ["aftbed", "run", "--load", "10", "--adapt", "to lfr after 1s", "--recipe", "paper"]
+    )
+    with pytest.raises(StartedError):
+        main()
+    assert started[0].adaptations == (Scheduled(Goal(expression="lfr", recipe="paper"), after_ms=1000.0),)

@@ -1,0 +1,134 @@
+"""The figures of a history: the client's account, and how long each failover took."""
+
+import pytest
+from tales import MS, Sums, Tale, good
+
+from aftbed.core import check
+from aftbed.core.check import LATE_NS, Failover, History, Requests
+from aftbed.core.event import Event
+from aftbed.core.journal import Entry, EntryKind, Record
+
+
+def test_the_clients_account_of_a_good_history() -> None:
+    account = check.requests(good().history(), Sums())
+    assert account == Requests(sent=3, answered=3, lost=0, duplicated=0, late=0, wrong=0)
+
+
+def test_the_clients_account_of_a_bad_one() -> None:
+    tale = Tale().served(1).sent(2)  # lost
+    tale.sent(3).wait(LATE_NS / MS).answered(3, payload=b"wrong and late")
+    tale.sent(4).answered(4, payload=b"").answered(4, payload=b"")  # wrong, twice
+    tale.note("client.1", Event.PEER_REFUSED, 1)  # a second one, refused by the client
+    account = check.requests(tale.history(), Sums())
+    assert account == Requests(sent=4, answered=3, lost=1, duplicated=2, late=1, wrong=2)
+
+
+def test_an_answer_to_what_was_never_asked_makes_no_request_lost() -> None:
+    account = check.requests(good().answered(4, epoch=2).history(), Sums())
+    assert (account.sent, account.lost) == (3, 0)
+
+
+@pytest.mark.parametrize(("more_ns", "late"), [(0, 0), (1, 1)])
+def test_how_late_is_late(more_ns: int, late: int) -> None:
+    entries = [
+        Entry(5, 1, 0, EntryKind.SENT, b"request 1"),
+        Entry(5 + LATE_NS + more_ns, 1, 1, EntryKind.ANSWERED, Sums().execute(b"request 1")),
+    ]
+    assert check.requests(History({}, entries), Sums()).late == late
+
+
+def a_failover(*, fault: bool, alarm: bool = True) -> Tale:
+    """Sent at +0, fault at +1 ms, alarm at +2, fence at +3, promotion at +4, accepted at +5."""
+    tale = Tale().served(1).sent(2)
+    if fault:
+        tale.note("a/server.1", Event.FAULT_APPLIED)
+    else:
+        tale.wait(1)
+    if alarm:
+        tale.note("a/watchdog.1", Event.WATCHDOG_SUSPECT)
+    else:
+        tale.wait(1)
+    return tale.fenced(1).promoted(2).accepted(2, epoch=2, replica=2).answered(2, epoch=2)
+
+
+def test_the_times_of_a_failover_count_from_the_fault() -> None:
+    assert check.failovers(a_failover(fault=True).history()) == [
+        Failover(
+            epoch=2,
+            cause="fault",
+            detected_ms=1.0,
+            fenced_ms=2.0,
+            promoted_ms=3.0,
+            recovered_ms=4.0,
+            blackout_ms=4.0,
+        )
+    ]
+
+
+def test_without_a_fault_they_count_from_the_alarm() -> None:
+    (found,) = check.failovers(a_failover(fault=False).history())
+    assert (found.cause, found.detected_ms, found.fenced_ms, found.recovered_ms) == ("alarm", None, 1.0, 3.0)
+
+
+def test_without_fault_and_alarm_they_count_from_the_fence() -> None:
+    (found,) = check.failovers(a_failover(fault=False, alarm=False).history())
+    assert (found.cause, found.detected_ms, found.fenced_ms, found.recovered_ms) == (
+        "unknown",
+        None,
+        0.0,
+        2.0,
+    )
+
+
+def test_a_promotion_without_any_of_them_has_no_time_of_its_fence() -> None:
+    """A broken history, but its figures are told beside the check that refuses it."""
+    (found,) = check.failovers(Tale().served(1).promoted(2).history())
+    assert (found.cause, found.fenced_ms, found.promoted_ms, found.recovered_ms) == (
+        "unknown",
+        None,
+        0.0,
+        None,
+    )
+
+
+def test_a_request_that_came_later_did_not_wait_for_the_failover() -> None:
+    tale = Tale().served(1).note("a/server.1", Event.FAULT_APPLIED)
+    tale.note("a/watchdog.1", Event.WATCHDOG_SUSPECT).fenced(1).promoted(2).wait(100)
+    tale.served(2, epoch=2, replica=2)
+    (found,) = check.failovers(tale.history())
+    assert found.recovered_ms == 107.0, "the fault was that long ago"
+    assert found.blackout_ms == 3.0, "but nobody waited"
+
+
+def test_a_failover_that_nobody_lived_to_use() -> None:
+    tale = Tale().served(1).note("a/watchdog.1", Event.WATCHDOG_SUSPECT).fenced(1).promoted(2)
+    (found,) = check.failovers(tale.history())
+    assert (found.promoted_ms, found.recovered_ms, found.blackout_ms) == (2.0, None, None)
+
+
+def test_an_old_fault_is_not_the_cause() -> None:
+    tale = Tale().served(1).note("hub.1", Event.FAULT_APPLIED).wait(1001)
+    tale.note("a/watchdog.1", Event.WATCHDOG_SUSPECT).fenced(1).promoted(2)
+    (found,) = check.failovers(tale.history())
+    assert found.cause == "alarm"
+
+
+def test_each_failover_is_told_in_order() -> None:
+    tale = a_failover(fault=True).fenced(2).promoted(3).served(3, epoch=3, replica=1)
+    assert [f.epoch for f in check.failovers(tale.history())] == [2, 3]
+
+
+def test_no_failover_no_figures() -> None:
+    assert check.failovers(Tale().served(1).history()) == []
+
+
+def test_two_servers_in_one_node_are_two() -> None:
+    """Placement `single`: what one has executed, the other restores; each by itself only grows."""
+
+    def record(at: int, event: Event, request_id: int, brick: int) -> Record:
+        return Record(at, event, request_id, 0, "single", brick)
+
+    sound = [record(1, Event.SERVER_EXIT, 1, 4), record(2, Event.STATE_RESTORED, 1, 9)]
+    assert check.at_most_once(History({"single.1": sound}, [])).finding == "pass"
+    broken = [*sound, record(3, Event.SERVER_EXIT, 1, 9)]
+    assert check.at_most_once(History({"single.1": broken}, [])).finding == "fail"
