@@ -19,7 +19,7 @@ from aftbed.core.event import Event
 from aftbed.core.fault import Fault
 from aftbed.core.graph import Graph, Link
 from aftbed.core.journal import Entry, EntryKind, Record
-from aftbed.core.message import Goal, Scheduled
+from aftbed.core.message import Scheduled
 from aftbed.ftm.client import Client
 from aftbed.ftm.mechanism import build, replication_of
 from aftbed.runtime import control
@@ -33,8 +33,10 @@ from aftbed.runtime.sim.devices import Car, Device, Sensor
 from aftbed.runtime.sim.node import Node
 from aftbed.runtime.sim.processes import Nursery, Process
 from aftbed.runtime.source import Load, resume_client
+from aftbed.vehicle.dbcfile import Codec, load_dbc
 from aftbed.vehicle.function import default_application, sample_requests
 from aftbed.vehicle.report import VehicleResult
+from aftbed.vehicle.scenario import load_scenario
 from aftbed.vehicle.virtual import VirtualCar
 
 REST_NS_MAX: Final = 3_000_000_000  # from the last fault to the rest, in virtual time
@@ -43,8 +45,6 @@ LOOK_EVERY: Final = 32  # events between two looks at whether all is done
 EVENTS_MAX: Final = 20_000_000
 DRAW_BITS: Final = 63
 REQUESTS: Final = 512
-
-NoModule = Callable[[str], object]
 
 
 class Doom(msgspec.Struct, frozen=True):
@@ -55,7 +55,10 @@ class Doom(msgspec.Struct, frozen=True):
 
 
 class Setup(msgspec.Struct, frozen=True):
-    """What a run is made of. `count` requests at `rate_hz` (0: the next follows the reply), or a car's."""
+    """What a run is made of, so that it can be repeated: nothing else has a part in it.
+
+    `count` requests at `rate_hz` (0: the next follows the reply); or those of a car in `scenario`.
+    """
 
     ftm: str = "pbr"
     placement: str = "process"
@@ -65,6 +68,7 @@ class Setup(msgspec.Struct, frozen=True):
     faults: tuple[Fault, ...] = ()
     adaptations: tuple[Scheduled, ...] = ()
     dooms: tuple[Doom, ...] = ()
+    scenario: str = ""
 
 
 class Rest(msgspec.Struct, frozen=True):
@@ -104,6 +108,15 @@ def _graph(ftm: str, placement: str) -> Graph:
     return build(ftm, placement)
 
 
+def _car(setup: Setup) -> VirtualCar:
+    return VirtualCar(load_scenario(setup.scenario), seed=setup.seed, codec=_codec())
+
+
+@lru_cache(maxsize=1)
+def _codec() -> Codec:
+    return load_dbc()
+
+
 def _nothing_off_line(place: str) -> object:
     raise ConfigError(f"{place}: the simulator loads nothing that was written off line")
 
@@ -117,12 +130,12 @@ class World:
         *,
         function: Callable[[], Application] = default_application,
         requests: list[bytes] | None = None,
-        car: VirtualCar | None = None,
         make: Make | None = None,
         load: Callable[[str], object] = _nothing_off_line,
         channel: type[Channel] = Channel,
     ) -> None:
-        self.setup, self._car, self._channel = setup, car, channel
+        self.setup, self._channel = setup, channel
+        self._car = _car(setup) if setup.scenario else None
         self._requests = requests if requests is not None else requests_of(0)
         self.loop = Clock(Random(setup.seed))
         self.journals: dict[str, list[Record]] = {}
@@ -369,10 +382,5 @@ class _Journal:
 
 
 def simulate(setup: Setup) -> Run:
-    """One run of a load."""
+    """One run."""
     return World(setup).run()
-
-
-def composed(expression: str, at_request: int) -> Scheduled:
-    """An adaptation to `expression` that begins at a request."""
-    return Scheduled(Goal(expression=expression), at_request)
