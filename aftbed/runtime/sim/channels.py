@@ -44,6 +44,15 @@ class Channel:
         self.ended = self.refused = self.closed = False
         self._last_ns = 0  # of an arrival
 
+    @property
+    def number(self) -> int:
+        """Of its writing end."""
+        return self.write.number
+
+    def heard_by(self) -> frozenset[str]:
+        """Who reads it."""
+        return frozenset([node.name for node in self.readers])
+
     def put(self, message: Message) -> bool:
         """Send. False if there is no room now, or nobody will ever read it: the writer waits for orders."""
         mail = self.mail
@@ -81,9 +90,13 @@ class Channel:
             return
         self.ended = True
         self._last_ns = max(self._last_ns + 1, self._clock.ns + self._clock.hop_ns())
-        self._clock.at(self._last_ns, self.arrive)
+        self._clock.message(self._last_ns, self, self._end_comes)
         for node in list(self.writers):
             self._clock.at(self._clock.ns, node.run)
+
+    def _end_comes(self) -> None:
+        self._last_ns = self._clock.ns
+        self.arrive()
 
     def over(self) -> bool:
         """Whether the reader has come to the end."""

@@ -7,7 +7,7 @@ the order in which they were planned. So a run is a function of its seed.
 import heapq
 from collections.abc import Callable
 from random import Random
-from typing import Final
+from typing import Final, Protocol
 
 from aftbed.runtime.jobs import Jobs, StepFailed
 from aftbed.runtime.sim.hops import HOP_QUANTILES_NS
@@ -17,6 +17,19 @@ HOP_BITS: Final = 7
 assert len(HOP_QUANTILES_NS) > 1 << HOP_BITS
 
 Call = Callable[[], None]
+
+
+class Line(Protocol):
+    """Something on which messages travel, in order."""
+
+    @property
+    def number(self) -> int:
+        """It is known by this."""
+        ...
+
+    def heard_by(self) -> frozenset[str] | None:
+        """The nodes at its end; None for the executive, which may touch anybody."""
+        ...
 
 
 class Clock:
@@ -38,6 +51,13 @@ class Clock:
         """Plan `call`."""
         self.count += 1
         heapq.heappush(self.heap, (t_ns, self.count, call))
+
+    def message(self, t_ns: int, line: "Line", call: Call) -> None:
+        """The same, for what travels on a line: never before what was put on it earlier."""
+        self.at(t_ns, call)
+
+    def begin(self) -> None:
+        """The launch is over: requests may come."""
 
     def after(self, seconds: float, call: Call) -> None:
         """Plan `call` for `seconds` from now. An order to the dead ends it quietly, as everywhere."""

@@ -28,6 +28,19 @@ BIRTH_NS: Final = (500_000, 3_000_000)
 MakeDevice = Callable[[control.Assign, Node], Device]
 
 
+class Wire:
+    """One direction between the executive and a process, or the news of its death."""
+
+    def __init__(self, number: int, process: "Process | None") -> None:
+        self.number, self._process = -number, process
+
+    def heard_by(self) -> frozenset[str] | None:
+        """The process, where one was named; else the executive."""
+        if self._process is None or self._process.node is None:
+            return None
+        return frozenset((self._process.node.name,))
+
+
 class Process:
     """A child of the executive, which becomes one node."""
 
@@ -42,6 +55,11 @@ class Process:
         self._orders: deque[tuple[control.ToNode, tuple[int, ...]]] = deque()
         self._reports: deque[control.FromNode] = deque()
         self._noticed: list[Callable[[], None]] = []
+        self._to_it, self._to_us, self._news = (
+            Wire(4 * number, self),
+            Wire(4 * number + 1, None),
+            Wire(4 * number + 2, None),
+        )
 
     # -- signals ------------------------------------------------------------------------------
 
@@ -49,7 +67,7 @@ class Process:
         """It dies soon."""
         if self.dead:
             return False
-        self._clock.at(self._clock.ns + self._clock.between_ns(*SIGNAL_NS), self.die)
+        self._clock.message(self._clock.ns + self._clock.between_ns(*SIGNAL_NS), self._to_it, self.die)
         return True
 
     def freeze(self) -> bool:
@@ -97,14 +115,14 @@ class Process:
         self.dead = True
         self._nursery.on_end(self, reason)
         for call in self._noticed:
-            self._clock.at(self._clock.ns + self._clock.between_ns(*LIFELINE_NS), call)
+            self._clock.message(self._clock.ns + self._clock.between_ns(*LIFELINE_NS), self._news, call)
         seen_ns = max(self._say_ns, self._clock.ns + self._clock.between_ns(*PIDFD_NS))
-        self._clock.at(seen_ns, self._seen)
+        self._clock.message(seen_ns, self._to_us, self._seen)
 
     def notice(self, call: Callable[[], None]) -> None:
         """Have `call` called when it is dead."""
         if self.dead:
-            self._clock.at(self._clock.ns + self._clock.between_ns(*LIFELINE_NS), call)
+            self._clock.message(self._clock.ns + self._clock.between_ns(*LIFELINE_NS), self._news, call)
         else:
             self._noticed.append(call)
 
@@ -121,7 +139,7 @@ class Process:
             raise StepFailed(f"{self.name} cannot be reached")
         self._order_ns = max(self._order_ns + 1, self._clock.ns + self._clock.between_ns(*LINE_NS))
         self._orders.append((order, fds))
-        self._clock.at(self._order_ns, self.read)
+        self._clock.message(self._order_ns, self._to_it, self.read)
 
     def read(self) -> None:
         """The oldest order is here."""
@@ -148,7 +166,7 @@ class Process:
         """The executive will hear this."""
         self._say_ns = max(self._say_ns + 1, self._clock.ns + self._clock.between_ns(*LINE_NS))
         self._reports.append(report)
-        self._clock.at(self._say_ns, self.heard)
+        self._clock.message(self._say_ns, self._to_us, self.heard)
 
     def heard(self) -> None:
         """The oldest report is at the executive."""

@@ -133,11 +133,12 @@ class World:
         make: Make | None = None,
         load: Callable[[str], object] = _nothing_off_line,
         channel: type[Channel] = Channel,
+        clock: Callable[[Random], Clock] = Clock,
     ) -> None:
         self.setup, self._channel = setup, channel
         self._car = _car(setup) if setup.scenario else None
         self._requests = requests if requests is not None else requests_of(0)
-        self.loop = Clock(Random(setup.seed))
+        self.loop = clock(Random(setup.seed))
         self.journals: dict[str, list[Record]] = {}
         self.dialogue: list[Entry] = []
         self.told: list[tuple[int, str, str]] = []
@@ -262,7 +263,6 @@ class World:
         yield from self.conductor.adaptations.schedule(self.setup.adaptations)
         for doom in self.setup.dooms:
             self._doom(doom)
-        yield from self.conductor.deployment.ask("client", control.Resume)
 
     def _doom(self, doom: Doom) -> None:
         deployment = self.conductor.deployment
@@ -274,6 +274,8 @@ class World:
         assert not failure, f"the launch of {self.setup}: {failure}"
         self._launched = True
         self.conductor.inform_recovery(failed=False)
+        self.loop.begin()
+        self.conductor.deployment.leave("client", control.Resume(control.UNANSWERED))
 
     def run(self) -> Run:
         """From the launch to the rest."""

@@ -1,0 +1,148 @@
+"""All orders in which messages can arrive, but for those that make no difference.
+
+In other runs, time decides what arrives next. Here a choice does: of all lines that carry something
+(channels, orders, answers, the news of a death) any one may deliver its oldest message. Two deliveries to
+different nodes commute, so of the orders that differ in nothing else only one is run: sleep sets (Godefroid,
+*Partial-Order Methods for the Verification of Concurrent Systems*, 1996, ch. 5). What the executive hears
+commutes with nothing.
+
+A run is repeated from its start for each order, choice by choice. Deadlines and births come when nothing else
+can: orders that only a slow machine brings about are left to the seeds.
+"""
+
+from collections import deque
+from collections.abc import Callable, Iterator
+from random import Random
+from typing import Final
+
+from aftbed.core.graph import Link
+from aftbed.core.message import Message
+from aftbed.runtime.sim.channels import QUEUE_MAX, Channel
+from aftbed.runtime.sim.clock import Call, Clock, Line
+
+STEP_NS: Final = 1_000  # of virtual time, per delivery
+ON_ITS_WAY: Final = 1 << 62
+
+Heard = frozenset[str] | None
+Sleep = dict[int, Heard]  # lines whose delivery would make no difference now, with who hears them
+
+
+class HeldChannel(Channel):
+    """A channel whose messages arrive when they are chosen to."""
+
+    def __init__(self, link: Link, clock: Clock, first_number: int) -> None:
+        super().__init__(link, clock, first_number)
+        assert isinstance(clock, Chooser)
+        self._chooser = clock
+
+    def put(self, message: Message) -> bool:
+        """Send."""
+        if not self._chooser.chooses:
+            return super().put(message)
+        if self.ended or self.refused or len(self.mail) >= QUEUE_MAX:
+            return False
+        self.mail.append((ON_ITS_WAY, message))
+        self._chooser.message(self._chooser.ns, self, self._come)
+        return True
+
+    def _come(self) -> None:
+        """The oldest one that is on its way has arrived."""
+        for index, (t_ns, message) in enumerate(self.mail):
+            if t_ns == ON_ITS_WAY:
+                self.mail[index] = (self._chooser.ns, message)
+                break
+        self.arrive()
+
+
+class Point:
+    """A moment with a choice: what could arrive, and what need not be tried."""
+
+    def __init__(self, enabled: dict[int, Heard], sleep: Sleep, chosen: int) -> None:
+        self.enabled, self.sleep, self.chosen = enabled, sleep, chosen
+
+    def next_sleep(self) -> Sleep:
+        """What still makes no difference behind the choice."""
+        heard = self.enabled[self.chosen]
+        return {line: other for line, other in self.sleep.items() if _commute(heard, other)}
+
+
+def _commute(one: Heard, other: Heard) -> bool:
+    return one is not None and other is not None and not one & other
+
+
+class Pruned(Exception):  # noqa: N818 - not an error: an order that is another one's equal
+    """Whatever could arrive now makes no difference to orders that were run already."""
+
+
+class Chooser(Clock):
+    """`points`: the choices of a run so far; the first ones are given, then comes the first that may be."""
+
+    def __init__(self, chance: Random, given: list[Point]) -> None:
+        super().__init__(chance)
+        self.points = list(given)
+        self._at = 0
+        self.chooses = False
+        self._lines: dict[int, tuple[Line, deque[Call]]] = {}
+
+    def begin(self) -> None:
+        """From now on."""
+        self.chooses = True
+
+    def message(self, t_ns: int, line: Line, call: Call) -> None:
+        """It waits to be chosen."""
+        if not self.chooses:
+            super().message(t_ns, line, call)
+            return
+        self._lines.setdefault(line.number, (line, deque()))[1].append(call)
+
+    def step(self) -> bool:
+        """What is due at this very moment, else a delivery, else the next deadline."""
+        if not self.chooses or (self.heap and self.heap[0][0] <= self.ns):
+            return super().step()
+        enabled = {number: line.heard_by() for number, (line, calls) in self._lines.items() if calls}
+        if not enabled:
+            return super().step()
+        if self._at == len(self.points):
+            sleep = self.points[-1].next_sleep() if self.points else {}
+            awake = [number for number in enabled if number not in sleep]
+            if not awake:
+                raise Pruned
+            self.points.append(Point(enabled, sleep, awake[0]))
+        chosen = self.points[self._at].chosen
+        self._at += 1
+        self.ns += STEP_NS
+        self._lines[chosen][1].popleft()()
+        return True
+
+
+def orders(run: Callable[[Callable[[Random], Clock]], object]) -> Iterator[bool]:
+    """Run `run` with a clock for every order. True for each order, False for each run that was cut short."""
+    given: list[Point] = []
+    while True:
+        made: list[Chooser] = []
+
+        def clock(chance: Random, given: list[Point] = given, made: list[Chooser] = made) -> Clock:
+            made.append(Chooser(chance, given))
+            return made[0]
+
+        try:
+            run(clock)
+            whole = True
+        except Pruned:
+            whole = False
+        yield whole
+        following = _following(made[0].points)
+        if following is None:
+            return
+        given = following
+
+
+def _following(points: list[Point]) -> list[Point] | None:
+    """The choices that lead to the next order: the last one that has an alternative takes it."""
+    for depth in range(len(points) - 1, -1, -1):
+        point = points[depth]
+        sleep = point.sleep | {point.chosen: point.enabled[point.chosen]}
+        awake = [number for number in point.enabled if number not in sleep]
+        if awake:
+            return [*points[:depth], Point(point.enabled, sleep, awake[0])]
+    return None
