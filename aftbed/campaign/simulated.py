@@ -15,6 +15,7 @@ import msgspec
 from aftbed.campaign.value import corruptions
 from aftbed.core import check
 from aftbed.core.application import Application
+from aftbed.core.check import History
 from aftbed.core.fault import Act
 from aftbed.core.graph import Graph
 from aftbed.ftm.mechanism import build, replication_of
@@ -87,10 +88,15 @@ def _whole(graph: Graph, expression: str, leader: str) -> Graph:
 
 
 def outcome(run: Run, function: Callable[[], Application] = default_application) -> str:
-    """The class of what the faults did: masked, tolerated, unavailable, or sdc (design 2)."""
-    if corruptions(run.history, function()):
+    """The class of what the faults did."""
+    return class_of(run.history, function, lost=run.rest.lost)
+
+
+def class_of(history: History, function: Callable[[], Application], *, lost: bool) -> str:
+    """`masked`, `tolerated`, `unavailable` or `sdc` (design 2), by what the client saw; the worst wins."""
+    if corruptions(history, function()):
         return "sdc"
-    if run.rest.lost:
+    if lost:
         return "unavailable"
-    late = check.requests(run.history, function()).late
-    return "tolerated" if late or check.failovers(run.history) else "masked"
+    late = check.requests(history, function()).late
+    return "tolerated" if late or check.failovers(history) else "masked"

@@ -16,6 +16,8 @@ from aftbed.runtime.sim.clock import Clock
 if TYPE_CHECKING:
     from aftbed.runtime.sim.node import Node
 
+COLD_AFTER_NS: Final = 20_000_000  # who has done nothing for so long,
+COLD_NS: Final = (10_000, 50_000)  # takes so much longer: its pages and caches are another's
 QUEUE_MAX: Final = 128  # messages; a socket pair holds about as many small ones
 
 
@@ -60,6 +62,8 @@ class Channel:
             return False
         clock = self._clock
         t_ns = clock.ns + clock.hop_ns()
+        if self.readers and t_ns - self.readers[0].ran_ns > COLD_AFTER_NS:
+            t_ns += clock.between_ns(*COLD_NS)
         if t_ns <= self._last_ns:
             t_ns = self._last_ns + 1
         self._last_ns = t_ns

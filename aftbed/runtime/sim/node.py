@@ -90,6 +90,7 @@ class Node:
         self._held_by = 0  # a fault
         self._timer_ns = NEVER
         self._running = False
+        self.ran_ns = 0  # when it last did anything
         self._timed: list[Hosted] = []
         self._only: Hosted | None = None  # the brick of a node that hosts one, and has no device
 
@@ -240,6 +241,7 @@ class Node:
         if self._running or not self.alive or self.frozen_ns:
             return
         self._running = True
+        self.ran_ns = self._clock.ns
         try:
             while self.alive and not self.frozen_ns and self._turn():
                 pass
@@ -280,19 +282,20 @@ class Node:
 
     def _read(self, hosted: Hosted) -> bool:
         """The hot path: mail at an open port of the only brick."""
-        inlets = hosted.inlets
-        for port in hosted.brick.open_ports():
-            channel = inlets.get(port)
-            if channel is None:
-                continue
-            mail = channel.mail
-            if mail:
-                if mail[0][0] <= self._clock.ns and self._oldest() in (None, (hosted, port)):
-                    self.step(hosted, port, channel.take())
-                    return True
-            elif channel.ended and channel.over():
-                self._end(hosted, port)
-                return True
+        ports = hosted.brick.open_ports()
+        if len(ports) != 1:
+            return self._read_any()
+        channel = hosted.inlets.get(ports[0])
+        if channel is None:
+            return False
+        if channel.mail:
+            if channel.mail[0][0] > self._clock.ns:
+                return False
+            self.step(hosted, ports[0], channel.take())
+            return True
+        if channel.ended and channel.over():
+            self._end(hosted, ports[0])
+            return True
         return False
 
     def _read_any(self) -> bool:

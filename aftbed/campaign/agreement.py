@@ -1,0 +1,129 @@
+"""Does the simulator say what real runs say? The same experiments on both, put side by side.
+
+Real records are grouped by what was done in them (mechanism, placement, source, faults, adaptations). For
+each group the same is simulated under as many seeds as are asked for. Two things are compared: the classes of
+what the faults did, and the times of recovery. They agree if no real run has a class that no seed has, and if
+the real median lies between the shortest and the longest simulated time, or the simulated median between the
+real ones. Where they do not, the report says so; what is left out here is in `docs/simulation.md`.
+"""
+
+from collections import Counter
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from aftbed.campaign.record import RunRecord, read_record
+from aftbed.campaign.simulated import class_of
+from aftbed.campaign.succession import bare_server
+from aftbed.core import check
+from aftbed.core.errors import ConfigError
+from aftbed.core.message import Scheduled
+from aftbed.runtime.sim.world import Setup, simulate
+from aftbed.runtime.unix.options import CarRun, LoadRun
+from aftbed.vehicle.function import default_application
+
+SEEDS: Final = 20
+
+
+class Times(msgspec.Struct, frozen=True):
+    """Of recoveries: fault to the first reply of the new master, in ms."""
+
+    count: int
+    low_ms: float
+    median_ms: float
+    high_ms: float
+
+
+class Agreement(msgspec.Struct, frozen=True):
+    """One group. `why_not` is empty where both agree."""
+
+    experiment: str
+    real: dict[str, int]  # classes, and how many runs have each
+    simulated: dict[str, int]
+    real_recovery: Times | None
+    simulated_recovery: Times | None
+    why_not: tuple[str, ...]
+
+
+def against(paths: Iterable[Path], seeds: int = SEEDS) -> list[Agreement]:
+    """Compare the records in `paths`. Raises ConfigError where one is none, or cannot be simulated."""
+    groups: dict[Setup, list[RunRecord]] = {}
+    for path in paths:
+        record = read_record(path)
+        groups.setdefault(setup_of(record), []).append(record)
+    return [_compare(setup, records, seeds) for setup, records in groups.items()]
+
+
+def setup_of(record: RunRecord) -> Setup:
+    """The same experiment for the simulator, its seed left out."""
+    options = record.options
+    adaptations = tuple(Scheduled(a.goal, a.at_request, a.after_ms) for a in options.adaptations)
+    if any(a.goal.part or a.goal.script for a in adaptations):
+        raise ConfigError(f"{record.path}: an update or a hand-written script is not simulated")
+    same = Setup(options.ftm, options.placement, faults=options.faults, adaptations=adaptations)
+    match options.work:
+        case LoadRun(count, rate_hz):
+            return msgspec.structs.replace(same, count=count, rate_hz=rate_hz)
+        case CarRun() as car:
+            return msgspec.structs.replace(same, scenario=car.scenario)
+        case _:
+            raise ConfigError(f"{record.path}: a replay is not simulated")
+
+
+def _compare(setup: Setup, records: list[RunRecord], seeds: int) -> Agreement:
+    real_classes, real_ms = Counter[str](), list[float]()
+    for record in records:
+        lost = record.end is None or not record.end.get("leader")
+        real_classes[class_of(record.history, bare_server(record), lost=lost)] += 1
+        real_ms += _recoveries(record.history)
+    sim_classes, sim_ms = Counter[str](), list[float]()
+    for seed in range(seeds):
+        run = simulate(msgspec.structs.replace(setup, seed=seed))
+        sim_classes[class_of(run.history, default_application, lost=run.rest.lost)] += 1
+        sim_ms += _recoveries(run.history)
+    real_times, sim_times = _times(real_ms), _times(sim_ms)
+    found = [
+        f"no seed ends {word}, as {n} real runs do"
+        for word, n in real_classes.items()
+        if word not in sim_classes
+    ]
+    return Agreement(
+        _words(setup),
+        dict(sorted(real_classes.items())),
+        dict(sorted(sim_classes.items())),
+        real_times,
+        sim_times,
+        (*found, *_apart(real_times, sim_times)),
+    )
+
+
+def _recoveries(history: check.History) -> list[float]:
+    return [f.recovered_ms for f in check.failovers(history) if f.recovered_ms is not None]
+
+
+def _times(found: list[float]) -> Times | None:
+    if not found:
+        return None
+    ordered = sorted(found)
+    return Times(len(ordered), ordered[0], ordered[len(ordered) // 2], ordered[-1])
+
+
+def _apart(real: Times | None, simulated: Times | None) -> list[str]:
+    if real is None or simulated is None:
+        return [] if real is simulated else ["only one of them has failovers"]
+    inside = simulated.low_ms <= real.median_ms <= simulated.high_ms
+    if inside or real.low_ms <= simulated.median_ms <= real.high_ms:
+        return []
+    return [
+        f"recovery: real median {real.median_ms} ms, simulated {simulated.low_ms} to {simulated.high_ms} ms"
+    ]
+
+
+def _words(setup: Setup) -> str:
+    source = setup.scenario or f"{setup.count} requests" + (
+        f" at {setup.rate_hz:g} Hz" if setup.rate_hz else ""
+    )
+    changes = [f"to {a.goal.expression} at request {a.at_request}" for a in setup.adaptations]
+    return "; ".join((f"{setup.ftm} {setup.placement}, {source}", *map(str, setup.faults), *changes))
