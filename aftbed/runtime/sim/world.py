@@ -279,31 +279,42 @@ class World:
 
     def run(self) -> Run:
         """From the launch to the rest."""
+        self.start()
+        self.end()
+        return self.outcome()
+
+    def start(self) -> None:
+        """Launch; requests come from here on."""
+        self.loop.jobs.start("launch", self._launch(), self._on_launched)
+        self.loop.watch_jobs()
+        while not self._launched:
+            assert self.loop.step(), f"the launch of {self.setup} ends nowhere"
+            self.loop.watch_jobs()
+
+    def advance(self, until_ns: int) -> None:
+        """Let happen what happens up to that time."""
+        while self.loop.heap and self.loop.heap[0][0] <= until_ns:
+            self.loop.step()
+            self.loop.watch_jobs()
+        self.loop.ns = max(self.loop.ns, until_ns)
+
+    def end(self) -> None:
+        """Come to rest: all requests made, all faults over, everything answered; or to the bound."""
         loop = self.loop
-        loop.jobs.start("launch", self._launch(), self._on_launched)
-        loop.watch_jobs()
-        rested_ns = source_done_ns = 0
-        events = 0
-        while True:
+        rested_ns = done_ns = 0
+        for _ in range(EVENTS_MAX // LOOK_EVERY):
             for _ in range(LOOK_EVERY):
                 if not loop.step():
-                    break
-            events += LOOK_EVERY
-            assert events < EVENTS_MAX, f"no end in sight: {self.setup}"
+                    return
             loop.watch_jobs()
-            if not self._launched:
-                continue
-            if not source_done_ns and (self._source_ended() or self.lost or not loop.heap):
-                source_done_ns = loop.ns
-            if source_done_ns and not rested_ns and (self.lost or not self._unrest()):
+            if not done_ns and (self._source_ended() or self.lost):
+                done_ns = loop.ns
+            if done_ns and not rested_ns and (self.lost or not self._unrest()):
                 rested_ns = loop.ns
-            if rested_ns and loop.ns > rested_ns + STRAY_NS:
-                break
-            if source_done_ns and loop.ns > source_done_ns + REST_NS_MAX:
-                break
-            if loop.ns > self._limit_ns() or not loop.heap:
-                break
-        return self._outcome(())
+            late = loop.ns > self._limit_ns() or (done_ns and loop.ns > done_ns + REST_NS_MAX)
+            if late or (rested_ns and loop.ns > rested_ns + STRAY_NS):
+                return
+        raise AssertionError(f"no end in sight: {self.setup}")
 
     def _limit_ns(self) -> int:
         """A source that is held up for ever must not hold up the simulator."""
@@ -341,7 +352,8 @@ class World:
         found += [f"{name} is under way" for name in self.loop.jobs.names()]
         return found
 
-    def _outcome(self, extra: tuple[str, ...]) -> Run:
+    def outcome(self) -> Run:
+        """What there is to judge."""
         deployment = self.conductor.deployment
         hosted = []
         for process in deployment.nodes.values():
@@ -351,7 +363,7 @@ class World:
                 hosted += [] if process.dead else list(process.node.bricks)
         kinds = {b.name: b.kind for b in deployment.graph.bricks}
         rest = Rest(
-            (*extra, *(() if self.lost else self._unrest())),
+            () if self.lost else tuple(self._unrest()),
             self.lost,
             self.loop.ns,
             deployment.leader,
