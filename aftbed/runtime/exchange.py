@@ -23,9 +23,9 @@ from aftbed.runtime import control
 from aftbed.runtime.deployment import Deployment, Keys
 from aftbed.runtime.interface import Channel, Process
 from aftbed.runtime.jobs import Key, StepFailed, Wait
-from aftbed.runtime.rewiring import INPUT, Changes, replica_of, way_back
+from aftbed.runtime.rewiring import INPUT, Changes, replica_of, tell, tell_whoever_lives, way_back
 from aftbed.runtime.targets import STAGED
-from aftbed.runtime.transfer import Seat, align, answered, ask, migrate, transfer
+from aftbed.runtime.transfer import EXCHANGE_SECONDS_MAX, Seat, align, answered, ask, migrate, transfer
 from aftbed.runtime.zygotes import LIGHT
 
 PREPARE_SECONDS_MAX: Final = 5.0  # a stranger's module is imported and tested meanwhile
@@ -235,27 +235,9 @@ class Exchange:
                     self._suspended.append((node, old))  # even if another one cannot be told
                 case _:
                     raise StepFailed(f"{type(verb).__name__} among channels")
-        yield from self._tell(changes)
+        yield from tell(self._deployment, changes)
         for node in exchanged:
             self._take_place(node)
-
-    def _tell(self, changes: dict[int, Changes]) -> Keys:
-        sent = []
-        for change in changes.values():
-            order, fds = change.order(self._deployment.epoch)
-            sent.append(self._deployment.order_to(change.process, order, fds))
-        yield from answered(sent)
-
-    def _tell_whoever_lives(self, changes: dict[int, Changes]) -> Keys:
-        """The same, where some may be dead or die meanwhile: they are left to Recovery."""
-        sent = []
-        for change in changes.values():
-            order, fds = change.order(self._deployment.epoch)
-            with contextlib.suppress(StepFailed):
-                sent.append(self._deployment.order_to(change.process, order, fds))
-        for pair in sent:
-            with contextlib.suppress(StepFailed):
-                yield from answered([pair])
 
     def _bind(self, link: Link, of: Callable[[Process], Changes]) -> None:
         if self.new.node_of(link.source) == self.new.node_of(link.sink):
@@ -334,7 +316,7 @@ class Exchange:
             deployment.lost |= self._lost
             yield from self._reverse_adoption()
         if self._rewired:
-            yield from self._tell_whoever_lives(self._old_ends())
+            yield from tell_whoever_lives(deployment, self._old_ends())
         for node, old in self._replaced.items():
             self._staged[node], deployment.nodes[node] = deployment.nodes[node], old
             old.name, old.kind = node, "node"
@@ -344,8 +326,8 @@ class Exchange:
             deployment.adopt(self.old, self._lost)
             with contextlib.suppress(StepFailed):
                 yield from self._watch()  # before those die that are watched now
-        for process in self._staged.values():
-            _end(process)
+        with contextlib.suppress(StepFailed):  # one that will not die within the time is let be
+            yield from self._end_staged()
         for channel in self._fresh.values():
             channel.close()
         self._let_serve()
@@ -354,6 +336,13 @@ class Exchange:
         self._fresh.clear()
         self.committed = False
         yield Wait(frozenset())
+
+    def _end_staged(self) -> Keys:
+        """And see them dead: one that lives a moment longer would take mail that is for the old ones."""
+        living = [process for process in self._staged.values() if process.alive]
+        for process in living:
+            _end(process)
+        yield Wait(frozenset(("died", p.name, p.pid) for p in living), seconds=EXCHANGE_SECONDS_MAX)
 
     def _let_serve(self) -> None:
         """Whoever was suspended goes on, but for a lost replica."""

@@ -1,5 +1,6 @@
 """What each process must hear for a graph to be wired: the ends of channels, one order for each process."""
 
+import contextlib
 from collections.abc import Callable
 from typing import Final
 
@@ -7,7 +8,10 @@ from aftbed.core.graph import Graph, Link, ends
 from aftbed.ftm.mechanism import REPLICAS
 from aftbed.runtime import control
 from aftbed.runtime.channels import Channels
+from aftbed.runtime.deployment import Deployment, Keys
 from aftbed.runtime.interface import Process
+from aftbed.runtime.jobs import StepFailed
+from aftbed.runtime.transfer import answered
 
 Ends = dict[tuple[str, str], int]  # brick, port -> descriptor, or NOWHERE
 INPUT: Final = "in"
@@ -40,6 +44,27 @@ class Changes:
 
         inputs, outputs = ports(self.inputs), ports(self.outputs)
         return lambda token: control.Rewire(token, inputs, outputs, epoch, self.suspend), tuple(fds)
+
+
+def tell(deployment: Deployment, changes: dict[int, Changes]) -> Keys:
+    """Everybody, at once. Raises StepFailed if one of them is dead, or dies."""
+    sent = []
+    for change in changes.values():
+        order, fds = change.order(deployment.epoch)
+        sent.append(deployment.order_to(change.process, order, fds))
+    yield from answered(sent)
+
+
+def tell_whoever_lives(deployment: Deployment, changes: dict[int, Changes]) -> Keys:
+    """The same, where some may be dead or die meanwhile: they are left to Recovery."""
+    sent = []
+    for change in changes.values():
+        order, fds = change.order(deployment.epoch)
+        with contextlib.suppress(StepFailed):
+            sent.append(deployment.order_to(change.process, order, fds))
+    for pair in sent:
+        with contextlib.suppress(StepFailed):
+            yield from answered([pair])
 
 
 def way_back(

@@ -1,36 +1,35 @@
-"""A traced run: beside what every run leaves behind, each message that was put into a channel.
+"""A traced run: beside what every run leaves behind, all that happened in it, in the order in which it did.
 
-Only a world that is made with a traced kind of channel keeps them; any other pays nothing. What is written
-is a function of the run, and a run is a function of its setup: two traces of one setup are equal byte for
-byte, on any machine.
+Only a traced world keeps each message that is put into a channel, and what was noted, told and answered
+between two of them; any other pays nothing. What is kept is a function of the run, and a run is a function of
+its setup: two traces of one setup are equal byte for byte, on any machine.
 
 Limits: bricks that share a node speak to each other without a channel, so in the placements `replica` and
-`single` what happens inside is told by the records alone.
+`single` what happens inside is told by the records alone. The executive's own records have their place by
+their time, behind what else happened in that instant.
 """
 
 import zlib
 from collections.abc import Iterator
 from heapq import merge
-from operator import itemgetter
-from typing import Final
+from typing import Final, assert_never
 
 import msgspec
 
 from aftbed.core.graph import Link
-from aftbed.core.journal import Entry, Record
+from aftbed.core.journal import Entry, EntryKind, Record
 from aftbed.core.message import Message
 from aftbed.runtime.assembly import Make
 from aftbed.runtime.sim.channels import Channel
 from aftbed.runtime.sim.clock import START_NS, Clock
 from aftbed.runtime.sim.world import Run, Setup, World
 
-Timed = tuple[int, str]  # virtual time in ns, and a line of text
-
-_SHOWN: Final = ("replica", "generation", "node", "cause", "rerun")  # fields that say more than their length
+EXECUTIVE: Final = "supervisor.1"  # its journal
+_SHOWN: Final = ("replica", "generation", "node", "cause", "rerun")  # fields that are shown as they are
 
 
 class Sent(msgspec.Struct, frozen=True):
-    """A message at the moment at which it was put into the channel `port` from `source` to `sink`."""
+    """A message when it was put into the channel `port` from the brick `source` to the brick `sink`."""
 
     t_ns: int
     source: str
@@ -39,15 +38,68 @@ class Sent(msgspec.Struct, frozen=True):
     message: Message
 
 
+class Told(msgspec.Struct, frozen=True):
+    """A line of the executive, for people."""
+
+    t_ns: int
+    event: str
+    text: str
+
+
+Happening = Sent | Record | Entry | Told
+
+
 class Trace(msgspec.Struct, frozen=True):
-    """A run, and its messages in the order in which they were sent."""
+    """A run, and what happened in it, by time."""
 
     run: Run
-    sent: tuple[Sent, ...]
+    happened: tuple[Happening, ...]
 
 
-def recording(sent: list[Sent]) -> type[Channel]:
-    """A kind of channel that appends to `sent` whatever is put into it."""
+def traced(setup: Setup, make: Make | None = None) -> Trace:
+    """Run `setup` and keep all that happens; `make` makes other bricks than the catalog's."""
+    world = _Traced(setup, make)
+    run = world.run()
+    executive = run.history.journals[EXECUTIVE]
+    return Trace(run, tuple(merge(world.happened, executive, key=lambda one: one.t_ns)))
+
+
+class _Records(list[Record]):
+    """A journal whose records go to `happened` too."""
+
+    def __init__(self, happened: list[Happening]) -> None:
+        super().__init__()
+        self._happened = happened
+
+    def append(self, record: Record) -> None:
+        """Here and there."""
+        super().append(record)
+        self._happened.append(record)
+
+
+class _Traced(World):
+    """A world that keeps what happens."""
+
+    def __init__(self, setup: Setup, make: Make | None) -> None:
+        self.happened: list[Happening] = []
+        super().__init__(setup, make=make, channel=_recording(self.happened))
+
+    def _journal_for(self, name: str) -> list[Record]:
+        return self.journals.setdefault(name, _Records(self.happened))
+
+    def tell(self, event: str, text: str) -> None:
+        """For the outcome, and in its place."""
+        super().tell(event, text)
+        self.happened.append(Told(self.loop.ns, event, text))
+
+    def write(self, now_ns: int, request_id: int, epoch: int, kind: EntryKind, payload: bytes) -> None:
+        """An entry of the dialogue, and in its place."""
+        super().write(now_ns, request_id, epoch, kind, payload)
+        self.happened.append(self.dialogue[-1])
+
+
+def _recording(happened: list[Happening]) -> type[Channel]:
+    """A kind of channel that appends to `happened` whatever is put into it."""
 
     class Recorded(Channel):
         def __init__(self, link: Link, clock: Clock, first_number: int) -> None:
@@ -55,39 +107,26 @@ def recording(sent: list[Sent]) -> type[Channel]:
             self._now = clock
 
         def put(self, message: Message) -> bool:
+            """Send; what there was no room for was not sent."""
             if not super().put(message):
                 return False
             link = self.link
-            sent.append(Sent(self._now.ns, link.source, link.name, link.sink, message))
+            happened.append(Sent(self._now.ns, link.source, link.name, link.sink, message))
             return True
 
     return Recorded
-
-
-def traced(setup: Setup, make: Make | None = None) -> Trace:
-    """Run `setup` with every message kept; `make` makes other bricks than the catalog's."""
-    sent: list[Sent] = []
-    run = World(setup, make=make, channel=recording(sent)).run()
-    return Trace(run, tuple(sent))
 
 
 # -- as text --------------------------------------------------------------------------------------
 
 
 def lines(trace: Trace) -> Iterator[str]:
-    """The whole of it: a line for each message, record, entry of the dialogue, and thing told, by time."""
-    history = trace.run.history
-    journals = [map(_record_line, records) for records in history.journals.values()]
-    sources = (
-        map(_sent_line, trace.sent),
-        *journals,
-        map(_entry_line, history.dialogue),
-        ((t_ns, f"told {event} {text}") for t_ns, event, text in trace.run.told),
-    )
-    for t_ns, line in merge(*sources, key=itemgetter(0)):
-        yield f"{milliseconds(t_ns):.6f} {line}"
+    """The whole of it, a line each, with the virtual time in ms; the last one says how it ended."""
+    for one in trace.happened:
+        yield f"{milliseconds(one.t_ns):.6f} {_line(one)}"
     rest = trace.run.rest
-    yield f"{milliseconds(rest.ended_ns):.6f} end {rest.leader or '-'} {' '.join(rest.why_not)}".rstrip()
+    ended = (f"end leader={rest.leader or 'nobody'}", "lost" if rest.lost else "", "; ".join(rest.why_not))
+    yield f"{milliseconds(rest.ended_ns):.6f} {' '.join(filter(None, ended))}"
 
 
 def milliseconds(t_ns: int) -> float:
@@ -96,7 +135,7 @@ def milliseconds(t_ns: int) -> float:
 
 
 def brief(message: Message) -> str:
-    """The message in a few words: its kind, its request as `#7`, its epoch as `e1`, what it carries."""
+    """A message in a few words: its kind, its request as `#7`, its epoch as `e1`, what it carries."""
     words = [type(message).__name__]
     for name in message.__struct_fields__:
         value = getattr(message, name)
@@ -104,24 +143,30 @@ def brief(message: Message) -> str:
             words.append(f"#{value}")
         elif name == "epoch":
             words.append(f"e{value}")
-        elif name in _SHOWN and value is not False and value != "":
+        elif name in _SHOWN:
             words.append(f"{name}={value}")
         elif isinstance(value, bytes) and value:
-            words.append(f"{name}={len(value)}B/{zlib.crc32(value):08x}")
+            words.append(f"{name}={_digest(value)}")
         elif name == "tried":
             words += [f"({brief(one)})" for one in value]
     return " ".join(words)
 
 
-def _sent_line(sent: Sent) -> Timed:
-    return sent.t_ns, f"sent {sent.source} {sent.port} {sent.sink} {brief(sent.message)}"
+def _digest(data: bytes) -> str:
+    """How much it is, and whether it is the same."""
+    return f"{len(data)}B/{zlib.crc32(data):08x}"
 
 
-def _record_line(record: Record) -> Timed:
-    where = f"{record.node}:{record.brick}" if record.brick else record.node
-    return record.t_ns, f"note {where} {record.event} #{record.request_id} {record.detail}"
-
-
-def _entry_line(entry: Entry) -> Timed:
-    crc = f"{len(entry.payload)}B/{zlib.crc32(entry.payload):08x}"
-    return entry.t_ns, f"client {entry.kind.name.lower()} #{entry.request_id} e{entry.epoch} {crc}"
+def _line(one: Happening) -> str:
+    match one:
+        case Sent():
+            return f"sent {one.source} {one.port} {one.sink} {brief(one.message)}"
+        case Record():
+            where = f"{one.node}:{one.brick}" if one.brick else one.node
+            return f"note {where} {one.event} #{one.request_id} {one.detail}"
+        case Entry():
+            return f"{one.kind.name.lower()} #{one.request_id} e{one.epoch} {_digest(one.payload)}"
+        case Told():
+            return f"told {one.event} {one.text}"
+        case _:
+            assert_never(one)
