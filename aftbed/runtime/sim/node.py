@@ -10,52 +10,25 @@ fault that the executive has to see applied: the effects that are left are perfo
 
 from collections import deque
 from collections.abc import Callable
-from typing import Final, NamedTuple
+from typing import Final
 
-from aftbed.core.brick import CONTROL, Brick, Effect, Note, Send
+from aftbed.core.brick import CONTROL, Brick
 from aftbed.core.errors import PeerError
 from aftbed.core.event import Event
 from aftbed.core.fault import Act
 from aftbed.core.journal import Record
 from aftbed.core.message import Adapted, AnyMessage, ChannelEnded, Message, Promoted, Rebound, Reply
 from aftbed.runtime import control
-from aftbed.runtime.orders import carry_out, fire, order_or_halt
+from aftbed.runtime.orders import carry_out
 from aftbed.runtime.sim.channels import Channel
 from aftbed.runtime.sim.clock import Clock
 from aftbed.runtime.sim.devices import Device, Sensor
+from aftbed.runtime.sim.effects import Died, Hosted, Performer
 
 NEVER: Final = 1 << 62
-WRITE_NS_MAX: Final = 2_000_000_000  # as a real node waits for room, or for word of another channel
 
 Say = Callable[[control.FromNode], None]
 Ends = Callable[[int], Channel]
-
-
-class _Held(NamedTuple):
-    """Effects from `at` on that could not be performed: by `out`, until `limit_ns` at most."""
-
-    hosted: "Hosted"
-    effects: list[Effect]
-    at: int
-    out: Channel | None
-    limit_ns: int
-
-
-class Died(BaseException):
-    """The node has died in the middle of a step. Not an Exception: nothing may take it for an error."""
-
-
-class Hosted:
-    """A brick, its inlets, and where its outputs lead: a channel, or a function."""
-
-    __slots__ = ("brick", "effects", "index", "inlets", "name", "outs", "timed")
-
-    def __init__(self, name: str, brick: Brick, index: int) -> None:
-        self.name, self.brick, self.index = name, brick, index
-        self.inlets: dict[str, Channel] = {}
-        self.outs: dict[str, Channel | Callable[[Message], None]] = {}
-        self.timed = type(brick).deadline_ns is not Brick.deadline_ns
-        self.effects = 0  # performed so far
 
 
 def _nowhere(message: Message) -> None:
@@ -81,13 +54,11 @@ class Node:
         self.device: Device | None = None
         self.device_brick: Hosted | None = None
         self.alive, self.frozen_ns = True, 0
-        self.doom: tuple[str, int] | None = None  # a brick, and before which of its effects it dies
         self.suspended = False
         self._suspend_token, self._draining = 0, False
         self._orders: deque[tuple[control.ToNode, tuple[int, ...]]] = deque()
         self._inside: deque[tuple[Hosted, str, Message]] = deque()
-        self._left: list[_Held] = []  # what a write or a fault holds up; the last one first
-        self._held_by = 0  # a fault
+        self.performer = Performer(self, clock)
         self._timer_ns = NEVER
         self._running = False
         self.ran_ns = 0  # when it last did anything
@@ -192,7 +163,7 @@ class Node:
 
     def wait_until_hit(self, fault: int) -> None:
         """Go no further until the executive has answered for `fault`."""
-        self._held_by = fault
+        self.performer.held_by = fault
 
     def stop_detected(self, brick: str, reason: str) -> None:
         """A detected stop: end here and now."""
@@ -256,10 +227,11 @@ class Node:
 
     def _turn(self) -> bool:
         """One thing; False if there is none."""
+        performer = self.performer
         if self._orders:
             self._serve(*self._orders.popleft())
             return True
-        if self._held_by or (self._left and not self._go_on()):
+        if performer.held_by or (performer.left and not performer.go_on()):
             return False
         if self._inside and self._step_inside():
             return True
@@ -351,7 +323,7 @@ class Node:
         due = hosted.brick.deadline_ns()
         if due is None or due > self._clock.ns:
             return False
-        self._perform(hosted, hosted.brick.wake(self._clock.ns), 0)
+        self.performer.perform(hosted, hosted.brick.wake(self._clock.ns), 0)
         return True
 
     def _set_timer(self) -> None:
@@ -379,99 +351,13 @@ class Node:
             self.record(Event.PEER_REFUSED, getattr(message, "request_id", 0), 0)
             return
         if effects:
-            self._perform(hosted, effects, 0)
-
-    def _perform(self, hosted: Hosted, effects: list[Effect], start: int) -> None:
-        """The effects from `start` on, in their order."""
-        if self.doom is not None or self.armed or start:
-            self._perform_carefully(hosted, effects, start)
-            return
-        hosted.effects += len(effects)
-        outs, now_ns = hosted.outs, self._clock.ns
-        for at, effect in enumerate(effects):
-            if type(effect) is Send:
-                out = outs[effect.port]
-                if isinstance(out, Channel):
-                    if not out.put(effect.message):
-                        hosted.effects -= len(effects) - at
-                        self._hold(hosted, effects, at, out)
-                        return
-                else:
-                    out(effect.message)
-            elif type(effect) is Note:
-                self.records.append(
-                    Record(now_ns, effect.event, effect.request_id, effect.detail, self.name, hosted.index)
-                )
-            else:
-                order_or_halt(self, hosted, effect)
-
-    def _perform_carefully(self, hosted: Hosted, effects: list[Effect], start: int) -> None:
-        """The same, where it may end before the last one."""
-        for at in range(start, len(effects)):
-            if self._held_by or self.frozen_ns:
-                self._hold(hosted, effects, at, None)
-                return
-            if self.doom == (hosted.name, hosted.effects):
-                raise Died
-            out = self._perform_one(hosted, effects, at)
-            if out is not None:
-                self._hold(hosted, effects, at, out)
-                return
-            hosted.effects += 1
-        if self.doom == (hosted.name, hosted.effects):
-            raise Died
-
-    def _perform_one(self, hosted: Hosted, effects: list[Effect], at: int) -> Channel | None:
-        """The channel that has no room for it, if it has to wait."""
-        effect = effects[at]
-        if isinstance(effect, Send):
-            out = hosted.outs[effect.port]
-            if isinstance(out, Channel):
-                return None if out.put(effect.message) else out
-            out(effect.message)
-        elif isinstance(effect, Note):
-            self.records.append(
-                Record(
-                    self._clock.ns, effect.event, effect.request_id, effect.detail, self.name, hosted.index
-                )
-            )
-            if self.armed:
-                fire(self, hosted, effects, effect)
-        else:
-            order_or_halt(self, hosted, effect)
-        return None
-
-    def _hold(self, hosted: Hosted, effects: list[Effect], at: int, out: Channel | None) -> None:
-        """Go on from there later. A write that is held up too long ends the node."""
-        limit_ns = self._clock.ns + WRITE_NS_MAX if out is not None else NEVER
-        self._left.append(_Held(hosted, effects, at, out, limit_ns))
-        if out is not None:
-            self._clock.at(limit_ns, self.run)
-
-    def _go_on(self) -> bool:
-        """With what was left. True if all is done."""
-        while self._left:
-            held = self._left[-1]
-            at, effect = held.at, held.effects[held.at]
-            if held.out is not None:
-                assert isinstance(effect, Send)
-                if held.hosted.outs[effect.port] is held.out and not held.out.put(effect.message):
-                    if self._clock.ns >= held.limit_ns:
-                        raise Died("fenced")
-                    return False
-                at += 1  # sent; or bound elsewhere: the brick has heard of it, and has asked again
-                held.hosted.effects += 1
-            self._left.pop()
-            before = len(self._left)
-            self._perform_carefully(held.hosted, held.effects, at)
-            if len(self._left) > before:
-                return False
-        return True
+            self.performer.perform(hosted, effects, 0)
 
     def _serve(self, order: control.ToNode, fds: tuple[int, ...]) -> None:
         """Carry out an order."""
         if isinstance(order, control.Ack):
-            self._held_by = 0 if order.token == self._held_by else self._held_by
+            performer = self.performer
+            performer.held_by = 0 if order.token == performer.held_by else performer.held_by
             return
         try:
             data = carry_out(self, order, list(fds))

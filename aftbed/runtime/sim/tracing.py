@@ -146,13 +146,13 @@ def brief(message: Message) -> str:
         elif name in _SHOWN:
             words.append(f"{name}={value}")
         elif isinstance(value, bytes) and value:
-            words.append(f"{name}={_digest(value)}")
+            words.append(f"{name}={digest(value)}")
         elif name == "tried":
             words += [f"({brief(one)})" for one in value]
     return " ".join(words)
 
 
-def _digest(data: bytes) -> str:
+def digest(data: bytes) -> str:
     """How much it is, and whether it is the same."""
     return f"{len(data)}B/{zlib.crc32(data):08x}"
 
@@ -165,7 +165,7 @@ def _line(one: Happening) -> str:
             where = f"{one.node}:{one.brick}" if one.brick else one.node
             return f"note {where} {one.event} #{one.request_id} {one.detail}"
         case Entry():
-            return f"{one.kind.name.lower()} #{one.request_id} e{one.epoch} {_digest(one.payload)}"
+            return f"{one.kind.name.lower()} #{one.request_id} e{one.epoch} {digest(one.payload)}"
         case Told():
             return f"told {one.event} {one.text}"
         case _:

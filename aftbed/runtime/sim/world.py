@@ -268,7 +268,7 @@ class World:
         deployment = self.conductor.deployment
         process = deployment.nodes.get(deployment.graph.node_of(doom.brick))
         assert isinstance(process, Process) and process.node is not None
-        process.node.doom = (doom.brick, doom.effect)
+        process.node.performer.doom = (doom.brick, doom.effect)
 
     def _on_launched(self, failure: str) -> None:
         assert not failure, f"the launch of {self.setup}: {failure}"
