@@ -23,6 +23,7 @@ from aftbed.runtime.rewiring import replica_of
 from aftbed.runtime.sim.world import Run
 from aftbed.vehicle.function import default_application
 
+SINGLE: Final = "single"  # the node of that placement: one host, one fate
 REST: Final = "rest"
 ASSERT: Final = "assert"
 
@@ -63,6 +64,8 @@ def struck_down(run: Run) -> bool:
     replicas = {b.replica for b in run.rest.graph.bricks if b.replica and b.part == "server"}
     renewed = [t_ns for t_ns, event, text in run.told if event == "script.done" and "new backup" in text]
     strikes = sorted((t_ns, replica_of(name)) for t_ns, name in run.struck if replica_of(name))
+    if any(name == SINGLE for _, name in run.struck):
+        return True
     if len(replicas) < 2:
         return bool(strikes)
     return any(

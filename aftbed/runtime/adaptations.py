@@ -24,6 +24,7 @@ from aftbed.runtime.interface import Process
 from aftbed.runtime.jobs import StepFailed, Wait
 from aftbed.runtime.verbs import Executor
 
+CLIENT: Final = "client"
 ENGINE: Final = "engine"
 REPLACE: Final = "replace "  # begins the names of jobs that hand channels out
 RETRY_SECONDS: Final = 0.01
@@ -96,7 +97,7 @@ class Adaptations:
         self._started_ns = self._loop.now_ns()
         self._current: _Current | None = None
         self.history: list[Outcome] = []
-        self._scheduled: dict[int, message.Goal] = {}  # by the number of their trigger
+        self._scheduled: dict[int, message.Scheduled] = {}  # by the number of their trigger
 
     @property
     def busy(self) -> bool:
@@ -156,16 +157,27 @@ class Adaptations:
                 begin = functools.partial(self._ask_again, later.goal, _nobody, RETRIES_MAX)
                 self._loop.after(later.after_ms / 1e3, begin)
                 continue
-            self._scheduled[number] = later.goal
-            blow = control.Blow(number, "client", later.at_request, Act.HANG, itself=False)
-            yield from self._deployment.ask("client", functools.partial(_armed, blow))
+            self._scheduled[number] = later
+        yield from self._arm(0)
+
+    def client_is_new(self) -> Keys:
+        """What waits for a request waits in the new Client from now on."""
+        lives = range(1, self._deployment.incarnations[CLIENT] + 1)
+        records = (r for n in lives for r in self._support.records(self._support.journal_of(CLIENT, n)))
+        yield from self._arm(sum(record.event is Event.REQUEST_SENT for record in records))
+
+    def _arm(self, sent: int) -> Keys:
+        """Have the Client, who has sent so many requests, wait for those that are to come."""
+        for number, later in self._scheduled.items():
+            blow = control.Blow(number, CLIENT, max(1, later.at_request - sent), Act.HANG, itself=False)
+            yield from self._deployment.ask(CLIENT, functools.partial(_armed, blow))
 
     def fired(self, process: Process, number: int) -> bool:
         """The Client has come to its request. False if `number` is no trigger of an adaptation."""
-        goal = self._scheduled.pop(number, None)
-        if goal is None:
+        later = self._scheduled.pop(number, None)
+        if later is None:
             return False
-        self._ask_again(goal, _nobody, RETRIES_MAX)
+        self._ask_again(later.goal, _nobody, RETRIES_MAX)
         self._deployment.nursery.order(process, control.Ack(number))
         return True
 

@@ -15,7 +15,7 @@ from aftbed.core.event import Event
 from aftbed.core.graph import Graph
 from aftbed.core.script import Phase
 from aftbed.runtime import control
-from aftbed.runtime.adaptations import ENGINE, REPLACE, Adaptations
+from aftbed.runtime.adaptations import CLIENT, ENGINE, REPLACE, Adaptations
 from aftbed.runtime.deployment import WATCHED_KINDS, Deployment
 from aftbed.runtime.faults import Faults
 from aftbed.runtime.interface import Process, Support
@@ -165,6 +165,8 @@ class Conductor:
         return bool(bricks) and self.deployment.graph.brick(bricks[0]).kind in WATCHED_KINDS
 
     def _replace(self, node: str) -> None:
+        if not self.replaceable(node):
+            return  # the graph that runs by now has no place for it
         if self.adaptations.acting:  # both hand channels out
             self._loop.after(RETRY_SECONDS, lambda: self._replace(node))
             return
@@ -182,6 +184,8 @@ class Conductor:
                 self.inform_recovery(failed=False)
             if node == ENGINE and not failure:
                 self.adaptations.engine_is_new()
+            if node == CLIENT and not failure:
+                self._loop.jobs.start("rearm", self.adaptations.client_is_new(), lambda _: None)
             self._support.nursery.level(LIGHT, self.spares())
 
         self._loop.jobs.start(f"{REPLACE}{node}", self.deployment.respawn(node), ended)

@@ -25,6 +25,7 @@ from aftbed.runtime.sim.clock import START_NS, Clock
 from aftbed.runtime.sim.world import Run, Setup, World
 
 EXECUTIVE: Final = "supervisor.1"  # its journal
+STRUCK: Final = "struck"  # what is told of a node that died of a fault, or was stopped by one
 _SHOWN: Final = ("replica", "generation", "node", "cause", "rerun")  # fields that are shown as they are
 
 
@@ -39,7 +40,7 @@ class Sent(msgspec.Struct, frozen=True):
 
 
 class Told(msgspec.Struct, frozen=True):
-    """A line of the executive, for people."""
+    """A line of the executive, for people; or, as `STRUCK`, the name of a node."""
 
     t_ns: int
     event: str
@@ -60,8 +61,9 @@ def traced(setup: Setup, make: Make | None = None) -> Trace:
     """Run `setup` and keep all that happens; `make` makes other bricks than the catalog's."""
     world = _Traced(setup, make)
     run = world.run()
-    executive = run.history.journals[EXECUTIVE]
-    return Trace(run, tuple(merge(world.happened, executive, key=lambda one: one.t_ns)))
+    struck = [Told(t_ns, STRUCK, node) for t_ns, node in run.struck]
+    sources: tuple[list[Happening], ...] = (world.happened, [*run.history.journals[EXECUTIVE]], [*struck])
+    return Trace(run, tuple(merge(*sources, key=lambda one: one.t_ns)))
 
 
 class _Records(list[Record]):

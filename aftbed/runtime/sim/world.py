@@ -6,7 +6,6 @@ answer, no script is under way, redundancy is back. It leaves a history, for the
 """
 
 from collections.abc import Callable, Iterable
-from functools import lru_cache
 from random import Random
 from typing import Final
 
@@ -14,15 +13,13 @@ import msgspec
 
 from aftbed.core.application import Application
 from aftbed.core.check import History
-from aftbed.core.errors import ConfigError
-from aftbed.core.event import Event
 from aftbed.core.fault import Fault
 from aftbed.core.graph import Graph, Link
 from aftbed.core.journal import Entry, EntryKind, Record
-from aftbed.core.message import Scheduled
+from aftbed.core.message import Goal, Scheduled
 from aftbed.ftm.client import Client
-from aftbed.ftm.mechanism import build, replication_of
-from aftbed.runtime import control
+from aftbed.ftm.mechanism import replication_of
+from aftbed.runtime import control, targets
 from aftbed.runtime.adaptations import Outcome
 from aftbed.runtime.assembly import Assembler, Make
 from aftbed.runtime.conductor import Conductor
@@ -30,21 +27,18 @@ from aftbed.runtime.deployment import Keys
 from aftbed.runtime.sim.channels import Channel
 from aftbed.runtime.sim.clock import START_NS, Clock
 from aftbed.runtime.sim.devices import Car, Device, Sensor
+from aftbed.runtime.sim.givens import Journal, car_in, graph_of, nothing_off_line, requests_of
 from aftbed.runtime.sim.node import Node
 from aftbed.runtime.sim.processes import Nursery, Process
 from aftbed.runtime.source import Load, resume_client
-from aftbed.vehicle.dbcfile import Codec, load_dbc
-from aftbed.vehicle.function import default_application, sample_requests
+from aftbed.vehicle.function import default_application
 from aftbed.vehicle.report import VehicleResult
-from aftbed.vehicle.scenario import load_scenario
-from aftbed.vehicle.virtual import VirtualCar
 
 REST_NS_MAX: Final = 3_000_000_000  # from the last fault to the rest, in virtual time
 STRAY_NS: Final = 5_000_000  # so long after the rest, what comes too late would still be seen
 LOOK_EVERY: Final = 32  # events between two looks at whether all is done
 EVENTS_MAX: Final = 20_000_000
 DRAW_BITS: Final = 63
-REQUESTS: Final = 512
 
 
 class Doom(msgspec.Struct, frozen=True):
@@ -97,30 +91,6 @@ class Run(msgspec.Struct, frozen=True):
     struck: tuple[tuple[int, str], ...]  # who died, or was stopped, of a fault, and when
 
 
-@lru_cache(maxsize=8)
-def requests_of(seed: int) -> list[bytes]:
-    """The load of a seed."""
-    return sample_requests(seed, REQUESTS)
-
-
-@lru_cache(maxsize=64)
-def _graph(ftm: str, placement: str) -> Graph:
-    return build(ftm, placement)
-
-
-def _car(setup: Setup) -> VirtualCar:
-    return VirtualCar(load_scenario(setup.scenario), seed=setup.seed, codec=_codec())
-
-
-@lru_cache(maxsize=1)
-def _codec() -> Codec:
-    return load_dbc()
-
-
-def _nothing_off_line(place: str) -> object:
-    raise ConfigError(f"{place}: the simulator loads nothing that was written off line")
-
-
 class World:
     """The `Support` of a simulated run, and the run itself."""
 
@@ -131,12 +101,12 @@ class World:
         function: Callable[[], Application] = default_application,
         requests: list[bytes] | None = None,
         make: Make | None = None,
-        load: Callable[[str], object] = _nothing_off_line,
+        load: Callable[[str], object] = nothing_off_line,
         channel: type[Channel] = Channel,
         clock: Callable[[Random], Clock] = Clock,
     ) -> None:
         self.setup, self._channel = setup, channel
-        self._car = _car(setup) if setup.scenario else None
+        self._car = car_in(setup.scenario, setup.seed) if setup.scenario else None
         self._requests = requests if requests is not None else requests_of(0)
         self.loop = clock(Random(setup.seed))
         self.journals: dict[str, list[Record]] = {}
@@ -149,12 +119,12 @@ class World:
         self.effects: dict[str, int] = {}
         self.lost = False
         self._car_began_ns = 0
-        self.journal = _Journal(self.journals.setdefault("supervisor.1", []))
+        self.journal = Journal(self.journals.setdefault("supervisor.1", []))
         assembler = Assembler(function, load, make)  # type: ignore[arg-type]
         self.nursery = Nursery(
             self.loop, assembler, self._make_device, self._ends.__getitem__, self._journal_for
         )
-        self.conductor = Conductor(_graph(setup.ftm, setup.placement), self, None, self._on_loss)
+        self.conductor = Conductor(graph_of(setup.ftm, setup.placement), self, None, self._on_loss)
         self.nursery.on_report = self._on_report
         self.nursery.on_death = self._on_death
         self.nursery.on_end = self._on_end
@@ -298,6 +268,17 @@ class World:
             self.loop.watch_jobs()
         self.loop.ns = max(self.loop.ns, until_ns)
 
+    def inject(self, fault: Fault) -> None:
+        """Arm one more, now. Raises ConfigError where there is no such fault."""
+        targets.check(fault, self.conductor.deployment.graph)
+        self.loop.jobs.start("inject", self.conductor.faults.arm(fault), lambda failure: None)
+        self.loop.watch_jobs()
+
+    def adapt(self, goal: Goal) -> None:
+        """Ask for an adaptation, now. Raises ConfigError where it is refused at once."""
+        self.conductor.adaptations.ask(goal, lambda outcome: None)
+        self.loop.watch_jobs()
+
     def end(self) -> None:
         """Come to rest: all requests made, all faults over, everything answered; or to the bound."""
         loop = self.loop
@@ -309,8 +290,8 @@ class World:
             loop.watch_jobs()
             if not done_ns and (self._source_ended() or self.lost):
                 done_ns = loop.ns
-            if done_ns and not rested_ns and (self.lost or not self._unrest()):
-                rested_ns = loop.ns
+            if done_ns:
+                rested_ns = (rested_ns or loop.ns) if self.lost or not self._unrest() else 0
             late = loop.ns > self._limit_ns() or (done_ns and loop.ns > done_ns + REST_NS_MAX)
             if late or (rested_ns and loop.ns > rested_ns + STRAY_NS):
                 return
@@ -350,6 +331,8 @@ class World:
         if replication_of(conductor.deployment.graph.ftm) and not conductor.deployment.backup:
             found.append("no redundancy")
         found += [f"{name} is under way" for name in self.loop.jobs.names()]
+        processes = [p for p in conductor.deployment.nodes.values() if isinstance(p, Process)]
+        found += [f"{p.name} is dead or stopped" for p in processes if p.stopped()][:1]
         return found
 
     def outcome(self) -> Run:
@@ -382,17 +365,6 @@ class World:
             self.effects,
             tuple(self.struck),
         )
-
-
-class _Journal:
-    """The executive's records."""
-
-    def __init__(self, records: list[Record]) -> None:
-        self._records = records
-
-    def write(self, now_ns: int, event: Event, request_id: int, detail: int, brick: int = 0) -> None:
-        """Append one."""
-        self._records.append(Record(now_ns, event, request_id, detail, "supervisor", brick))
 
 
 def simulate(setup: Setup) -> Run:

@@ -1,0 +1,54 @@
+"""What a simulated run is given: requests or a car, a graph, a journal. Made once where it can be."""
+
+from functools import lru_cache
+from typing import Final
+
+from aftbed.core.errors import ConfigError
+from aftbed.core.event import Event
+from aftbed.core.graph import Graph
+from aftbed.core.journal import Record
+from aftbed.ftm.mechanism import build
+from aftbed.vehicle.dbcfile import Codec, load_dbc
+from aftbed.vehicle.function import sample_requests
+from aftbed.vehicle.scenario import load_scenario
+from aftbed.vehicle.virtual import VirtualCar
+
+REQUESTS: Final = 512
+
+
+@lru_cache(maxsize=8)
+def requests_of(seed: int) -> list[bytes]:
+    """The load of a seed."""
+    return sample_requests(seed, REQUESTS)
+
+
+@lru_cache(maxsize=64)
+def graph_of(ftm: str, placement: str) -> Graph:
+    """The graph that a run begins with."""
+    return build(ftm, placement)
+
+
+def car_in(scenario: str, seed: int) -> VirtualCar:
+    """A car, and what comes towards it."""
+    return VirtualCar(load_scenario(scenario), seed=seed, codec=_codec())
+
+
+@lru_cache(maxsize=1)
+def _codec() -> Codec:
+    return load_dbc()
+
+
+def nothing_off_line(place: str) -> object:
+    """No module is found. Raises ConfigError."""
+    raise ConfigError(f"{place}: the simulator loads nothing that was written off line")
+
+
+class Journal:
+    """The executive's records."""
+
+    def __init__(self, records: list[Record]) -> None:
+        self._records = records
+
+    def write(self, now_ns: int, event: Event, request_id: int, detail: int, brick: int = 0) -> None:
+        """Append one."""
+        self._records.append(Record(now_ns, event, request_id, detail, "supervisor", brick))
