@@ -5,7 +5,7 @@ the simulator, makes no difference. Each checker answers pass, fail or unknown, 
 has a broken history in the tests that it must refuse.
 """
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable
 from typing import Final, Literal
 
@@ -238,6 +238,6 @@ def _client_refusals(history: History) -> list[Record]:
 
 def missing(hosted: Iterable[tuple[str, str]], whole: Graph) -> list[str]:
     """G5: what differs between the bricks that live, with their kinds, and those of a whole graph."""
-    found, wanted = set(hosted), {(b.name, b.kind) for b in whole.bricks}
+    found, wanted = Counter(hosted), Counter((b.name, b.kind) for b in whole.bricks)
     reasons = [f"{name} ({kind}) is missing" for name, kind in sorted(wanted - found)]
     return reasons + [f"{name} ({kind}) should not be there" for name, kind in sorted(found - wanted)]

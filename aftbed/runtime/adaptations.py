@@ -289,6 +289,8 @@ class Adaptations:
             return False
         self.give_up_preparing(f"replica {replica} is lost")  # its undoing touches nothing that serves
         if now.phase is Phase.COMMIT and now.ended and not now.failure:
+            if not now.exchange.can_go_back(replica):
+                return False  # what is new is all that there is
             self._executor.held = True
             now.lost = replica
             now.failure = f"replica {replica} was lost within the observation window"

@@ -27,6 +27,7 @@ RETRY_SECONDS: Final = 0.002
 AGAIN_SECONDS: Final = 0.02
 SETTLE_SECONDS: Final = 0.002
 LOSS_SECONDS: Final = 0.5  # a failover is done long before
+HANG_NS: Final = 150_000_000  # of what no Watchdog watches; a channel's pulse is 20 ms
 LOSSES: Final = ("failover", "drop backup")
 
 
@@ -126,7 +127,7 @@ class Conductor:
         except StepFailed as error:
             self._support.tell("refused", str(error))
 
-    # -- deaths -------------------------------------------------------------------------------
+    # -- deaths and hangs -------------------------------------------------------------------------------
 
     def on_death(self, process: Process) -> None:
         """A process is dead, and nobody meant it to be unless its kind is `killed`."""
@@ -144,6 +145,15 @@ class Conductor:
             self._replace(process.name)
         elif process.kind == "node":
             self._loop.after(LOSS_SECONDS, self._look_for_loss)
+
+    def look_for_hangs(self) -> None:
+        """What no Watchdog watches and shows no pulse is killed, and so replaced."""
+        now_ns = self._loop.now_ns()
+        for process in list(self._support.nursery.processes):
+            watched = process.kind == "node" and self.replaceable(process.name)
+            if watched and process.hangs(now_ns, HANG_NS):
+                self._support.tell("hangs", f"{process.name} (pid {process.pid}): killed, to be replaced")
+                process.kill()
 
     def _look_for_loss(self) -> None:
         deployment = self.deployment

@@ -22,8 +22,8 @@ from aftbed.ftm.mechanism import REPLICAS, replication_of
 from aftbed.runtime import control
 from aftbed.runtime.deployment import Deployment, Keys
 from aftbed.runtime.interface import Channel, Process
-from aftbed.runtime.jobs import Key, StepFailed, Wait
-from aftbed.runtime.rewiring import INPUT, Changes, replica_of, tell, tell_whoever_lives, way_back
+from aftbed.runtime.jobs import Key, StepFailed, Wait, amid
+from aftbed.runtime.rewiring import INPUT, Changes, gone, replica_of, tell, tell_whoever_lives, way_back
 from aftbed.runtime.targets import STAGED
 from aftbed.runtime.transfer import EXCHANGE_SECONDS_MAX, Seat, align, answered, ask, migrate, transfer
 from aftbed.runtime.zygotes import LIGHT
@@ -87,7 +87,7 @@ class Exchange:
         try:
             for verb in self._todo.commit:
                 yield from self._enter()
-                yield from self._under_way(self._do(verb))
+                yield from amid(self._do(verb), self._step(Event.ADAPT_STEP_ACT, self._number))
                 yield from self._step(Event.ADAPT_STEP_EXIT, self._number)
             self._assert_whole()
         except StepFailed:
@@ -96,6 +96,8 @@ class Exchange:
             raise
         self.opened_ns = self._deployment.support.loop.now_ns()
         self._adopt()
+        for slot in self._deployment.slots.values():
+            self._deployment.assert_whole(slot)
         yield from self._watch()
 
     def _assert_whole(self) -> None:
@@ -117,17 +119,6 @@ class Exchange:
     def _enter(self) -> Keys:
         self._number += 1
         yield from self._step(Event.ADAPT_STEP_ENTER, self._number)
-
-    def _under_way(self, steps: Keys) -> Keys:
-        """`steps`, and the event between the first that they ask for and the answer to it."""
-        wait = next(steps, None)
-        yield from self._step(Event.ADAPT_STEP_ACT, self._number)
-        while wait is not None:
-            got = yield wait
-            try:
-                wait = steps.send(got)
-            except StopIteration:
-                return
 
     # -- the verbs ----------------------------------------------------------------------------
 
@@ -296,10 +287,9 @@ class Exchange:
 
     def _watch(self) -> Keys:
         for slot in self._deployment.slots.values():
-            if slot.name in self._lost:
-                continue
-            self._deployment.assert_whole(slot)
-            yield from self._deployment.watch(slot)
+            if slot.name not in self._lost:
+                with contextlib.suppress(StepFailed):  # a Watchdog that is dead is replaced, and told then
+                    yield from self._deployment.watch(slot)
 
     # -- the way back -------------------------------------------------------------------------
 
@@ -310,8 +300,10 @@ class Exchange:
         """
         deployment = self._deployment
         # Before requests are let on, it is the old processes that count: a new one may be dead.
-        serving = deployment.nodes if self.committed else deployment.nodes | self._replaced
-        self._lost = {lost, *(replica_of(n) for n, p in serving.items() if not p.alive)} - {""}
+        # Afterwards both count: it is the old ones that are to serve, with the state of the new ones.
+        serving = list((deployment.nodes | self._replaced).items())
+        serving += list(deployment.nodes.items()) if self.committed else []
+        self._lost = {lost, *gone(serving, deployment.support.loop.now_ns())} - {""}
         if self.committed:  # else the Watchdogs have seen it
             deployment.lost |= self._lost
             yield from self._reverse_adoption()
@@ -324,8 +316,7 @@ class Exchange:
             process.name, process.kind, deployment.nodes[node] = node, "node", process
         if self.committed:
             deployment.adopt(self.old, self._lost)
-            with contextlib.suppress(StepFailed):
-                yield from self._watch()  # before those die that are watched now
+            yield from self._watch()  # before those die that are watched now
         with contextlib.suppress(StepFailed):  # one that will not die within the time is let be
             yield from self._end_staged()
         for channel in self._fresh.values():
@@ -371,12 +362,11 @@ class Exchange:
         path = [(f"{deployment.leader}/protocol", False), *((b, True) for b in drains(self.new, self.old))]
         for brick, drain in path:
             if replica_of(brick) not in self._lost:
-                with contextlib.suppress(StepFailed):
-                    yield from self._suspend(brick, drain=drain)
+                yield from self._or_lost(brick, self._suspend(brick, drain=drain))
         for node in self._migrated:
             giver, taker = deployment.nodes[node], self._replaced[node]
-            with contextlib.suppress(StepFailed):
-                yield from migrate(deployment, self.new, giver, self.old, taker, node)
+            if replica_of(node) not in self._lost:
+                yield from self._or_lost(node, migrate(deployment, self.new, giver, self.old, taker, node))
         for node in self._born:
             if node in deployment.nodes:
                 self._staged[node] = deployment.nodes.pop(node)
@@ -389,6 +379,18 @@ class Exchange:
         self._let_go.clear()
         others = [r for r in REPLICAS if r != deployment.leader]
         deployment.backup = others[0] if replication_of(self.old.ftm) else ""
+
+    def _or_lost(self, name: str, steps: Keys) -> Keys:
+        """A replica that cannot be stopped, or gives its state back to nobody, must not serve."""
+        try:
+            yield from steps
+        except StepFailed:
+            self._lost.add(replica_of(name))
+            self._deployment.lost.add(replica_of(name))
+
+    def can_go_back(self, without: str) -> bool:
+        """Whether what is replaced lives, but for that replica's."""
+        return all(p.alive for n, p in self._replaced.items() if replica_of(n) != without)
 
 
 def _end(process: Process) -> None:

@@ -86,6 +86,10 @@ class Process(Protocol):
         """Whether it lives, as far as is known, and its pulse is older than `deadline_ns`."""
         ...
 
+    def hangs(self, now_ns: int, deadline_ns: int) -> bool:
+        """Whether its pulse is older than `deadline_ns`, though the machine lets it run."""
+        ...
+
     def assigned(self) -> None:
         """It has become what it was told to be."""
         ...

@@ -33,6 +33,18 @@ class Wait(msgspec.Struct, frozen=True):
 Steps = Generator[Wait, dict[Key, bytes], None]
 
 
+def amid(steps: Steps, between: Steps) -> Steps:
+    """`steps`, and `between` after the first thing that they ask for, before it is waited for."""
+    wait = next(steps, None)
+    yield from between
+    while wait is not None:
+        got = yield wait
+        try:
+            wait = steps.send(got)
+        except StopIteration:
+            return
+
+
 class _Job:
     def __init__(self, name: str, steps: Steps, on_end: Callable[[str], None]) -> None:
         self.name, self.steps, self.on_end = name, steps, on_end

@@ -1,7 +1,7 @@
 """What each process must hear for a graph to be wired: the ends of channels, one order for each process."""
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Final
 
 from aftbed.core.graph import Graph, Link, ends
@@ -15,6 +15,7 @@ from aftbed.runtime.transfer import answered
 
 Ends = dict[tuple[str, str], int]  # brick, port -> descriptor, or NOWHERE
 INPUT: Final = "in"
+HANG_NS: Final = 150_000_000
 
 
 class Changes:
@@ -100,6 +101,11 @@ def way_back(
 
 def _key(link: Link) -> tuple[str, str, str]:
     return link.source, link.source_port, link.sink
+
+
+def gone(nodes: Iterable[tuple[str, Process]], now_ns: int) -> set[str]:
+    """The replicas that have a node that is dead, or hangs while the Watchdogs look elsewhere."""
+    return {replica_of(name) for name, p in nodes if not p.alive or p.hangs(now_ns, HANG_NS)}
 
 
 def replica_of(name: str) -> str:

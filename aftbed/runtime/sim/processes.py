@@ -49,7 +49,8 @@ class Process:
         self.pid = self.pidfd = number
         self.alive = True  # as far as the executive knows
         self.node: Node | None = None
-        self.dead = False
+        self.kinds: tuple[tuple[str, str], ...] = ()  # its bricks, and the kind of each
+        self.dead = self._still = False
         self._nursery, self._clock = nursery, nursery.clock
         self._order_ns = self._say_ns = 0  # of the last one that is under way
         self._orders: deque[tuple[control.ToNode, tuple[int, ...]]] = deque()
@@ -74,26 +75,32 @@ class Process:
         """It stops at once."""
         if self.dead:
             return False
+        self._still = True
         if self.node is not None:
             self.node.freeze()
-            self._nursery.on_freeze(self)
+        self._nursery.on_freeze(self)
         return True
 
     def thaw(self) -> bool:
         """It goes on."""
         if self.dead:
             return False
+        self._still = False
         if self.node is not None:
             self.node.thaw()
         return True
 
     def stopped(self) -> bool:
         """Whether it runs no more."""
-        return self.dead or (self.node is not None and bool(self.node.frozen_ns))
+        return self.dead or self._still or (self.node is not None and bool(self.node.frozen_ns))
 
     def silent(self, now_ns: int, deadline_ns: int) -> bool:
         """Whether it lives, as far as is known, and its pulse is older than `deadline_ns`."""
         return self.alive and self.pulse_ns(now_ns) < now_ns - deadline_ns
+
+    def hangs(self, now_ns: int, deadline_ns: int) -> bool:
+        """The same: here nobody is starved."""
+        return self.silent(now_ns, deadline_ns)
 
     def pulse_ns(self, now_ns: int) -> int:
         """When it was last seen running."""
@@ -161,6 +168,9 @@ class Process:
         except ConfigError as error:
             self.say(control.Ack(order.token, error=str(error)))
             self.die()
+        else:
+            if self._still:
+                self.node.freeze()
 
     def say(self, report: control.FromNode) -> None:
         """The executive will hear this."""
@@ -227,6 +237,7 @@ class Nursery:
     def build(self, process: Process, order: control.Assign, fds: tuple[int, ...]) -> Node:
         """The node that `order` describes. Raises ConfigError where a class is no good."""
         records = self._records(order.journal)
+        process.kinds = tuple((spec.name, spec.kind) for spec in order.bricks)
         node = Node(order.node, self.clock, records, self._end, process.say, process.ended)
         node.suspended = order.held
         self._assembler.fill(node, order)

@@ -35,6 +35,7 @@ from aftbed.vehicle.function import default_application
 from aftbed.vehicle.report import VehicleResult
 
 REST_NS_MAX: Final = 3_000_000_000  # from the last fault to the rest, in virtual time
+TICK_SECONDS: Final = 0.02  # as the supervisor looks after what no Watchdog watches
 STRAY_NS: Final = 5_000_000  # so long after the rest, what comes too late would still be seen
 LOOK_EVERY: Final = 32  # events between two looks at whether all is done
 EVENTS_MAX: Final = 20_000_000
@@ -244,8 +245,13 @@ class World:
         assert not failure, f"the launch of {self.setup}: {failure}"
         self._launched = True
         self.conductor.inform_recovery(failed=False)
+        self.loop.after(TICK_SECONDS, self._tick)
         self.loop.begin()
         self.conductor.deployment.leave("client", control.Resume(control.UNANSWERED))
+
+    def _tick(self) -> None:
+        self.conductor.look_for_hangs()
+        self.loop.after(TICK_SECONDS, self._tick)
 
     def run(self) -> Run:
         """From the launch to the rest."""
@@ -338,20 +344,17 @@ class World:
     def outcome(self) -> Run:
         """What there is to judge."""
         deployment = self.conductor.deployment
-        hosted = []
         for process in deployment.nodes.values():
-            if isinstance(process, Process) and process.node is not None:
-                if process.incarnation == 1:
-                    self._count(process.node)
-                hosted += [] if process.dead else list(process.node.bricks)
-        kinds = {b.name: b.kind for b in deployment.graph.bricks}
+            if isinstance(process, Process) and process.node is not None and process.incarnation == 1:
+                self._count(process.node)
+        hosted = [kind for p in self.nursery.processes if not p.dead for kind in p.kinds]
         rest = Rest(
             () if self.lost else tuple(self._unrest()),
             self.lost,
             self.loop.ns,
             deployment.leader,
             deployment.graph,
-            tuple(sorted((name, kinds.get(name, "?")) for name in hosted)),
+            tuple(sorted(hosted)),
         )
         return Run(
             self.setup,

@@ -17,7 +17,7 @@ import msgspec
 from aftbed.core.errors import AftbedError
 from aftbed.ftm.mechanism import build
 from aftbed.runtime import control
-from aftbed.runtime.conductor import Conductor
+from aftbed.runtime.conductor import HANG_NS, Conductor
 from aftbed.runtime.deployment import Keys
 from aftbed.runtime.jobs import STATS_JOB
 from aftbed.runtime.unix import linux
@@ -33,7 +33,6 @@ from aftbed.runtime.zygotes import BUS, LIGHT
 
 TICK_SECONDS: Final = 0.02
 TELL_SECONDS: Final = 0.005
-HANG_NS: Final = 150_000_000  # of what no Watchdog watches; a channel's pulse is 20 ms
 LATE_NS_MAX: Final = 40_000_000
 DRAIN_SECONDS_MAX: Final = 2.0
 STOP_SECONDS_MAX: Final = 1.0
@@ -238,11 +237,7 @@ class Supervisor:
         self._last_tick_ns = now_ns
         self.deployment.nudge_late()
         if self.graph_ms and now_ns > self._grace_until_ns and not self._ending:  # births have a limit
-            for process in self.nursery.processes:
-                single = process.kind == "node" and self.conductor.replaceable(process.name)
-                if single and process.hangs(now_ns, HANG_NS):
-                    self.tell("hangs", f"{process.name} (pid {process.pid}): killed, to be replaced")
-                    process.kill()
+            self.conductor.look_for_hangs()
         self.loop.after(TICK_SECONDS, self._tick)
 
 

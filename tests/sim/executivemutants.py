@@ -1,0 +1,386 @@
+"""Seeded bugs in the executive: in who watches and orders, in the verbs of a failover, in an adaptation.
+
+See `mutants` for what `explorer` says.
+"""
+
+from collections.abc import Callable, Iterable
+from typing import Final
+
+from msgspec.structs import replace
+from planting import (
+    ADAPT,
+    CLEAN,
+    CRASH,
+    OWN,
+    PAIRS,
+    Mutant,
+    adapted,
+    adapts,
+    answer,
+    clean,
+    crash,
+    crash_after,
+    crashes,
+    flip,
+    hang,
+    instead,
+    nothing,
+    pairs,
+    skipped,
+    wrapped,
+)
+
+from aftbed.adapt.engine import AdaptationEngine
+from aftbed.core import script
+from aftbed.core.fault import Place
+from aftbed.core.graph import Graph
+from aftbed.core.message import Rebound, TakeUp
+from aftbed.ftm import recovery
+from aftbed.ftm.recovery import Recovery
+from aftbed.ftm.watchdog import Watchdog
+from aftbed.runtime import exchange
+from aftbed.runtime.adaptations import Adaptations
+from aftbed.runtime.deployment import Deployment, Keys
+from aftbed.runtime.exchange import Exchange
+from aftbed.runtime.interface import Process
+from aftbed.runtime.sim import world
+from aftbed.runtime.sim.world import Setup
+from aftbed.runtime.verbs import Executor
+
+
+def _unfenced(self: Executor, replica: str) -> None:
+    if replica == self._deployment.leader:
+        self._deployment.leader = ""
+
+
+def _of(part: str) -> Callable[..., bool]:
+    """Transfers of that part's state."""
+    return lambda self, source, sink: source.endswith(part)
+
+
+def _is(*verbs: type) -> Callable[..., bool]:
+    return lambda self, verb: isinstance(verb, verbs)
+
+
+def _log_left_behind(right: Callable[..., object]) -> object:
+    def migrate(
+        deployment: Deployment, given: Graph, giver: Process, taken: Graph, taker: Process, node: str
+    ) -> object:
+        others = tuple(b for b in given.nodes[node] if not b.endswith("/protocol"))
+        thinner = replace(given, nodes=given.nodes | {node: others})
+        return right(deployment, thinner, giver, taken, taker, node)
+
+    return migrate
+
+
+def _state_left_there(right: Callable[..., object]) -> object:
+    def reverse(self: Exchange) -> object:
+        self._migrated = []
+        return right(self)
+
+    return reverse
+
+
+def _unnoticed(right: Callable[..., Keys]) -> object:
+    def resume(self: Exchange, bricks: Iterable[str]) -> Keys:
+        yield from right(self, bricks)
+        self._opened = False
+
+    return resume
+
+
+def _of_the_old_graph(right: Callable[..., object]) -> object:
+    def stage(self: Deployment, node: str, graph: Graph, *, held: bool) -> object:
+        return right(self, node, self.graph if node == "a/before" else graph, held=held)
+
+    return stage
+
+
+def _not_rebound(right: Callable[..., object]) -> object:
+    def undo(self: Exchange, lost: str = "") -> object:
+        self._rewired = False
+        return right(self, lost)
+
+    return undo
+
+
+def _same_epoch(right: Callable[..., script.Script]) -> object:
+    return lambda dead, backup, epoch: right(dead, backup, epoch - 1)
+
+
+def _reply_under_way() -> list[Setup]:
+    """A reply waits for the Proxy, which is stopped, while a new backup is made; then that has to lead."""
+    return [
+        Setup(
+            ftm,
+            count=40,
+            faults=(
+                crash("b/server", "request.received", 3),
+                hang("proxy", 30, "reply.stored", nth),
+                crash_after("primary", 15),
+            ),
+        )
+        for ftm in ("pbr", "lfr")
+        for nth in (8, 12)
+    ]
+
+
+def _backup_behind() -> list[Setup]:
+    """Requests wait in front of the follower while it is exchanged; later it has to lead."""
+    return [
+        adapted(
+            "lfr", "lfr+tr", hang("b/server", 40, "server.exit", nth), crash_after("primary", 150), count=80
+        )
+        for nth in (2, 3)
+    ]
+
+
+def _backup_wrong() -> list[Setup]:
+    """A bit of the backup's state is wrong when it becomes a follower; later it has to lead."""
+    return [
+        adapted(
+            "pbr",
+            "lfr",
+            flip(Place.STATE, bit, "state.restored", nth, "backup"),
+            crash_after("primary", 150),
+            count=80,
+        )
+        for nth in (4, 5, 6)
+        for bit in range(0, 400, 50)
+    ]
+
+
+EXECUTIVE: Final = (
+    Mutant(
+        "hangs not told",
+        "Watchdog never looks at the pulses",
+        instead(Watchdog, "_judge", lambda self, pulses, now_ns: []),
+        PAIRS,
+        pairs("pbr", ("client",), (9.0,)),
+        "G2",
+    ),
+    Mutant(
+        "suspicion not repeated",
+        "Watchdog does not tell a new Recovery what it had told the dead one",
+        answer(Watchdog, Rebound, lambda effects: []),
+        PAIRS,
+        pairs("pbr", ("recovery",), (0.05, 0.15, 0.25, 0.35)),
+        "G2",
+    ),
+    Mutant(
+        "no second try",
+        "Recovery gives up a new backup after one failure",
+        instead(Recovery, "deadline_ns", lambda self: None),
+        PAIRS,
+        pairs("pbr", ("b/server", "a/server"), (2.0, 3.0, 4.0)),
+        "rest",
+    ),
+    Mutant(
+        "no fencing",
+        "Executor does not shut the channels of a replica that was declared dead",
+        instead(Executor, "_fence", _unfenced),
+        CRASH,
+        crashes("pbr", "a/proceed"),
+        "G2",
+    ),
+    Mutant(
+        "same epoch again",
+        "Recovery has a backup lead under the epoch of the dead leader",
+        wrapped(recovery, "failover", _same_epoch),
+        CRASH,
+        crashes("pbr", "a/proceed"),
+        "G2",
+    ),
+    Mutant(
+        "proxy not told",
+        "Executor does not bind the Proxy to the new leader",
+        skipped(Executor, "_attach"),
+        CRASH,
+        crashes("pbr", "a/proceed"),
+        "G2",
+    ),
+    Mutant(
+        "dead replica not buried",
+        "Executor leaves the other nodes of a dead replica alive, in its slot",
+        instead(Executor, "_kill", lambda self, replica: None),
+        CRASH,
+        crashes("pbr", "a/proceed"),
+        "rest",
+    ),
+    Mutant(
+        "leader not resumed",
+        "Executor forgets to resume the leader's Protocol when the new backup has its state",
+        skipped(Executor, "_do", _is(script.Resume)),
+        PAIRS,
+        pairs("pbr", ("client",), (9.0,)),
+        "G2",
+    ),
+    Mutant(
+        "new backup without state",
+        "Executor binds a new backup, and transfers nothing to it",
+        skipped(Executor, "_transfer"),
+        PAIRS,
+        pairs("lfr", ("b/server",), (6.0, 9.0)),
+        "G3",
+    ),
+    Mutant(
+        "new backup without the reply log",
+        "Executor transfers the Server's state to a new backup, and not the replies",
+        skipped(Executor, "_transfer", _of("/protocol")),
+        OWN,
+        _reply_under_way,
+        "G3",
+    ),
+    Mutant(
+        "client without memory",
+        "a new Client does not read what its predecessor has asked",
+        instead(world, "resume_client", lambda client, history: None),
+        CRASH,
+        crashes("pbr", "client"),
+        "G3",
+    ),
+    Mutant(
+        "reply log lost in a switch",
+        "a Protocol that is exchanged starts with an empty log",
+        wrapped(exchange, "migrate", _log_left_behind),
+        ADAPT,
+        adapts("pbr", "lfr", "proxy", placement="replica", load=(150, 0.0), seeds=6),
+        "G3",
+    ),
+    Mutant(
+        "state lost in a switch",
+        "what is exchanged starts without the state of its predecessor",
+        skipped(Exchange, "_do", _is(script.Migrate)),
+        CLEAN,
+        clean(adapted("pbr", "lfr", placement="replica")),
+        "G3",
+    ),
+    Mutant(
+        "switch never resumed",
+        "Exchange forgets to resume whom it suspended",
+        instead(Exchange, "_resume", lambda self, bricks: nothing()),
+        CLEAN,
+        clean(adapted("pbr", "lfr"), adapted("pbr", "pbr+tr")),
+        "G2",
+    ),
+    Mutant(
+        "undone and not resumed",
+        "Exchange forgets to resume whom it suspended, on the way back",
+        instead(Exchange, "_let_serve", lambda self: None),
+        ADAPT,
+        adapts("pbr", "lfr", "b/after"),
+        "G2",
+    ),
+    Mutant(
+        "undone and not rebound",
+        "Exchange forgets to give the old bricks their channels back",
+        wrapped(Exchange, "undo", _not_rebound),
+        ADAPT,
+        adapts("pbr", "lfr", "b/after"),
+        "G2",
+    ),
+    Mutant(
+        "undone without the state",
+        "Exchange goes back to the bricks of before, and leaves them the state of before",
+        wrapped(Exchange, "_reverse_adoption", _state_left_there),
+        ADAPT,
+        adapts("pbr", "pbr+tr", "a", placement="replica"),
+        "G3",
+    ),
+    Mutant(
+        "not adopted once it serves",
+        "Exchange goes back as if no request had passed, where a commit fails after it let them on",
+        wrapped(Exchange, "_resume", _unnoticed),
+        ADAPT,
+        adapts("pbr", "pbr+tr", "a", placement="replica"),
+        "G3",
+    ),
+    Mutant(
+        "committed over the dead",
+        "Exchange does not look whether all that is to serve is alive",
+        instead(Exchange, "_assert_whole", lambda self: None),
+        ADAPT,
+        adapts("pbr", "lfr", "a/before"),
+        "G5",
+    ),
+    Mutant(
+        "prepared over the dead",
+        "Adaptations goes on with what is staged, though what it is bound to is being replaced",
+        instead(Adaptations, "give_up_preparing", lambda self, reason: None),
+        ADAPT,
+        adapts("pbr", "lfr", "a/before"),
+        "G2",
+    ),
+    Mutant(
+        "failover in the middle of a switch",
+        "Adaptations lets Recovery act on a replica before the way back is gone",
+        instead(Adaptations, "interrupted", lambda self, replica: False),
+        ADAPT,
+        adapts("pbr", "lfr", "a/before"),
+        "G2",
+    ),
+    Mutant(
+        "undone in word only",
+        "Exchange leaves everything as far as it has come, and says that it has gone back",
+        instead(Exchange, "undo", lambda self, lost="": nothing()),
+        ADAPT,
+        adapts("pbr", "pbr+tr", "b/after"),
+        "G5",
+    ),
+    Mutant(
+        "not drained",
+        "Exchange replaces bricks of the backup while requests wait in front of them",
+        skipped(Exchange, "_do", _is(script.Drain)),
+        OWN,
+        _backup_behind,
+        "G3",
+    ),
+    Mutant(
+        "not aligned",
+        "Exchange switches to another replication over two Servers that differ",
+        skipped(Exchange, "_do", _is(script.Align)),
+        OWN,
+        _backup_wrong,
+        "G4",
+    ),
+    Mutant(
+        "engine forgets",
+        "AdaptationEngine does not go on with what its predecessor had ordered",
+        answer(AdaptationEngine, TakeUp, lambda effects: []),
+        ADAPT,
+        adapts("pbr", "pbr+tr", "engine"),
+        "rest",
+    ),
+    Mutant(
+        "unbind forgotten",
+        "Exchange leaves a brick that stays bound to one that goes",
+        instead(Exchange, "_unbind", lambda self, brick, port, of: None),
+        CLEAN,
+        clean(adapted("pbr", "lfr")),
+        "G2",
+    ),
+    Mutant(
+        "redundancy not restored",
+        "Recovery is content with a leader alone",
+        instead(recovery, "new_backup", lambda *args: None),
+        CRASH,
+        crashes("pbr", "b/after"),
+        "rest",
+    ),
+    Mutant(
+        "staged not ended",
+        "Exchange leaves alive what it does not need any more",
+        instead(exchange, "_end", lambda process: None),
+        ADAPT,
+        adapts("pbr", "pbr+tr", "a/tr.before'"),
+        "G5",
+    ),
+    Mutant(
+        "old class staged",
+        "Exchange stages a Before of the old mechanism where the new one's should be",
+        wrapped(Deployment, "stage", _of_the_old_graph),
+        CLEAN,
+        clean(adapted("pbr", "lfr")),
+        "G5",
+    ),
+)

@@ -1,0 +1,393 @@
+"""Seeded bugs in the mechanisms, one in each row: in what a brick does with a message.
+
+`explorer` says whose experiments have to find it:
+
+| explorer | its experiments                                            |
+|----------|------------------------------------------------------------|
+| crash    | a death at each effect of some bricks                      |
+| adapt    | a death at each side of each step of an adaptation         |
+| pairs    | a second fault, some time after a first one                |
+| clean    | nothing happens                                            |
+| own      | faults that no explorer puts together, chosen for this bug |
+"""
+
+from collections.abc import Callable
+from typing import Final
+
+from msgspec.structs import replace
+from planting import (
+    CLEAN,
+    CRASH,
+    OWN,
+    Mutant,
+    Plant,
+    answer,
+    both,
+    clean,
+    crash,
+    crashes,
+    entered,
+    flip,
+    hang,
+    heard,
+    instead,
+    outcome,
+    wrapped,
+)
+
+from aftbed.core.brick import Effect, Note, Send
+from aftbed.core.event import Event
+from aftbed.core.fault import Place
+from aftbed.core.message import (
+    ChannelEnded,
+    Checkpoint,
+    Rebound,
+    Reply,
+    Request,
+    RestoreState,
+    Trial,
+    Trials,
+    Watch,
+)
+from aftbed.ftm import protocol, proxy, tr
+from aftbed.ftm.after import PbrAfter
+from aftbed.ftm.assertion import Acceptable, AssertAfter
+from aftbed.ftm.client import Client
+from aftbed.ftm.lfr import LfrAfter, LfrBefore
+from aftbed.ftm.protocol import Protocol
+from aftbed.ftm.proxy import Proxy
+from aftbed.ftm.server import Server
+from aftbed.ftm.tr import TrAfter
+from aftbed.ftm.watchdog import Watchdog
+from aftbed.runtime.sim.world import Setup
+
+
+def _log_ignored(right: object) -> object:
+    def admit(self: Protocol, msg: Request) -> list[Effect]:
+        self.state, self.busy_id = protocol.State.BUSY, msg.request_id
+        return [Note(Event.REQUEST_RECEIVED, msg.request_id), Send("pro2bfr", msg)]
+
+    return admit
+
+
+def _two_at_once() -> Plant:
+    busy = protocol.State.BUSY
+    return both(
+        entered(protocol.OPEN, {busy: ("aft2pro", "pxy2pro")}),
+        entered(protocol.MOVES, {(busy, Request): busy}),
+    )
+
+
+def _channel_not_drained(kind: type[PbrAfter | LfrBefore]) -> Plant:
+    def make(right: Callable[..., list[Effect]]) -> object:
+        def take_over(self: PbrAfter | LfrBefore) -> list[Effect]:
+            self.ended = True
+            return right(self)
+
+        return take_over
+
+    return wrapped(kind, "_take_over", make)
+
+
+def _stateless(effects: list[Effect]) -> list[Effect]:
+    return [
+        Send(e.port, replace(e.message, state=b""))
+        if isinstance(e, Send) and isinstance(e.message, Checkpoint)
+        else e
+        for e in effects
+    ]
+
+
+def _own_state(server: Server, msg: RestoreState | Trial) -> RestoreState | Trial:
+    """Restored, it changes nothing."""
+    if isinstance(msg, Trial) and not msg.rerun:
+        return msg
+    return replace(msg, state=server.application.capture())
+
+
+def _any_epoch(right: object) -> object:
+    def reply(self: Proxy, msg: Reply) -> list[Effect]:
+        assert self.waiting is not None
+        if msg.request_id != self.waiting.request_id:
+            return []
+        self.state, self.waiting = proxy.State.IDLE, None
+        accepted = Note(Event.REPLY_ACCEPTED, msg.request_id, msg.epoch << 8 | msg.replica)
+        return [accepted, Send("pxy2clt", msg)]
+
+    return reply
+
+
+def _never_promoted(right: Callable[..., list[Effect]]) -> object:
+    def step(self: Protocol, port: str, msg: object, now_ns: int) -> list[Effect]:
+        before = self.epoch
+        effects = right(self, port, msg, now_ns)
+        self.epoch = before
+        return effects
+
+    return step
+
+
+def _gullible(right: Callable[..., None]) -> object:
+    def init(self: AssertAfter, acceptable: Acceptable) -> None:
+        right(self, lambda request, reply: True)
+
+    return init
+
+
+def _old_epoch(right: Callable[..., list[Effect]]) -> object:
+    def rebound(self: Proxy, msg: Rebound) -> list[Effect]:
+        return right(self, replace(msg, epoch=self.epoch or msg.epoch))
+
+    return rebound
+
+
+def _minority(right: object) -> object:
+    def settle(self: TrAfter, msg: Trials) -> list[Effect]:
+        (third,) = msg.tried
+        wrong = next((t for t in self._held if not tr.equal(t, third)), third)
+        self.state, self._held = tr.AfterState.IDLE, ()
+        return self._answer(wrong, 3)
+
+    return settle
+
+
+def _second_is_right(right: object) -> object:
+    def compare(self: TrAfter, msg: Trials) -> list[Effect]:
+        return self._answer(msg.tried[1], 2)
+
+    return compare
+
+
+def _promoted_with_mail(ftm: str, behind: str, event: str) -> list[Setup]:
+    """The backup is behind when its leader dies: what was sent to it waits in its channel."""
+    return [
+        Setup(ftm, count=20, faults=(hang(behind, 20, "server.exit", 3), crash("primary", event, nth)))
+        for nth in (6, 8)
+    ]
+
+
+def _asked_meanwhile() -> list[Setup]:
+    """A new Proxy asks for what is being executed: its predecessor had asked, and died."""
+    return [
+        Setup(
+            "pbr",
+            count=10,
+            faults=(hang("a/server", 20, "server.exit", nth), crash("proxy", "server.exit", nth)),
+        )
+        for nth in (3, 4)
+    ]
+
+
+def _flips(ftm: str, place: Place, *bits: int) -> list[Setup]:
+    """In the first trial of a request, and in the second."""
+    return [
+        Setup(ftm, count=6, faults=(flip(place, bit, "server.exit", nth),)) for bit in bits for nth in (3, 4)
+    ]
+
+
+MECHANISMS: Final = (
+    Mutant(
+        "reply before checkpoint",
+        "PbrAfter sends the reply first, so the client may have one that no backup knows of",
+        outcome(PbrAfter, "_checkpoint_and_reply", lambda effects: effects[-1:] + effects[:-1]),
+        CRASH,
+        crashes("pbr", "a/after"),
+        "G3",
+    ),
+    Mutant(
+        "no dedupe",
+        "Protocol executes what is asked again, though the reply is in its log",
+        wrapped(Protocol, "_admit", _log_ignored),
+        CRASH,
+        crashes("pbr", "a/protocol"),
+        "G1",
+    ),
+    Mutant(
+        "dedupe from the stored reply only",
+        "Protocol admits an id again while it is being executed",
+        _two_at_once(),
+        OWN,
+        _asked_meanwhile,
+        "G1",
+    ),
+    Mutant(
+        "backup's reply not stored",
+        "PbrAfter of the backup applies a checkpoint, and does not tell its Protocol of the reply in it",
+        outcome(PbrAfter, "_applied", lambda effects: effects[:1]),
+        CRASH,
+        crashes("pbr", "a/protocol"),
+        "G1",
+    ),
+    Mutant(
+        "checkpoint without state",
+        "PbrAfter sends a checkpoint with the reply, and with no state",
+        outcome(PbrAfter, "_checkpoint_and_reply", _stateless),
+        CRASH,
+        crashes("pbr", "a/proceed"),
+        "G2",
+    ),
+    Mutant(
+        "checkpoint not applied",
+        "Server of the backup says that it has restored the state, and has not",
+        heard(Server, RestoreState, _own_state),
+        CRASH,
+        crashes("pbr", "a/proceed"),
+        "G3",
+    ),
+    Mutant(
+        "checkpoint forgotten",
+        "PbrAfter replies without any checkpoint, though there is a backup",
+        outcome(PbrAfter, "_checkpoint_and_reply", lambda effects: effects[-1:]),
+        CRASH,
+        crashes("pbr", "a/proceed"),
+        "G3",
+    ),
+    Mutant(
+        "promoted before its channel is drained",
+        "PbrAfter of the backup leads as soon as it is told to, with checkpoints in its channel",
+        _channel_not_drained(PbrAfter),
+        OWN,
+        lambda: _promoted_with_mail("pbr", "b/after", "checkpoint.sent"),
+        "G3",
+    ),
+    Mutant(
+        "leads with requests forwarded",
+        "LfrBefore of the follower leads as soon as it is told to, with requests in its channel",
+        _channel_not_drained(LfrBefore),
+        OWN,
+        lambda: _promoted_with_mail("lfr", "b/before", "follower.notified"),
+        "G3",
+    ),
+    Mutant(
+        "request not forwarded",
+        "LfrBefore of the leader passes a request on, and its follower never has it",
+        outcome(LfrBefore, "_forward", lambda effects: effects[-2:]),
+        CRASH,
+        crashes("lfr", "a/before"),
+        "G3",
+    ),
+    Mutant(
+        "forwarded after it was passed on",
+        "LfrBefore of the leader has it executed first, so it may be answered and its follower not have it",
+        outcome(LfrBefore, "_forward", lambda effects: effects[2:] + effects[:2]),
+        CRASH,
+        crashes("lfr", "a/before"),
+        "G3",
+    ),
+    Mutant(
+        "held reply lost with the leader",
+        "LfrAfter of the follower lets go of the reply that it holds when it hears that the leader is gone",
+        answer(LfrAfter, ChannelEnded, lambda effects: []),
+        CRASH,
+        crashes("lfr", "a/after"),
+        "G1",
+    ),
+    Mutant(
+        "old epoch kept",
+        "Protocol leads under the epoch in which it was a backup",
+        wrapped(Protocol, "step", _never_promoted),
+        CRASH,
+        crashes("pbr", "a/proceed"),
+        "G2",
+    ),
+    Mutant(
+        "epoch not checked",
+        "Protocol and Proxy believe what comes under whatever epoch, so that no one misses a new one",
+        both(
+            wrapped(Protocol, "step", _never_promoted),
+            heard(Protocol, Request, lambda leading, msg: replace(msg, epoch=leading.epoch)),
+            wrapped(Proxy, "_reply", _any_epoch),
+        ),
+        CRASH,
+        crashes("pbr", "a/after"),
+        "G6",
+    ),
+    Mutant(
+        "epoch not taken over",
+        "Proxy follows a new leader, and speaks to it under the epoch of the old one",
+        wrapped(Proxy, "_rebound", _old_epoch),
+        CRASH,
+        crashes("pbr", "a/proceed"),
+        "G2",
+    ),
+    Mutant(
+        "new leader not asked",
+        "Proxy does not ask the new leader what the old one has not answered",
+        answer(Proxy, Rebound, lambda effects: []),
+        CRASH,
+        crashes("pbr", "a/proceed"),
+        "G2",
+    ),
+    Mutant(
+        "client does not ask again",
+        "Client does not ask a new Proxy what the old one has not answered",
+        answer(Client, Rebound, lambda effects: []),
+        CRASH,
+        crashes("pbr", "proxy"),
+        "G2",
+    ),
+    Mutant(
+        "references compared",
+        "TrAfter compares what is the same object, and never sees a difference",
+        instead(tr, "equal", lambda one, other: True),
+        OWN,
+        lambda: _flips("pbr+tr", Place.RESULT, 0),
+        "G4",
+    ),
+    Mutant(
+        "replies compared, states not",
+        "TrAfter sees no fault that hits only what the function remembers",
+        instead(tr, "equal", lambda one, other: one.payload == other.payload),
+        OWN,
+        lambda: _flips("pbr+tr", Place.STATE, *range(0, 400, 40)),
+        "G4",
+    ),
+    Mutant(
+        "second trial from the state after the first",
+        "Server does not restore the state before it executes once more",
+        heard(Server, Trial, _own_state),
+        CLEAN,
+        clean(Setup("tr", count=6), Setup("pbr+tr", count=6)),
+        "G2",
+    ),
+    Mutant(
+        "third trial skipped",
+        "TrAfter answers with the second trial where the first two differ",
+        wrapped(TrAfter, "_compare", _second_is_right),
+        OWN,
+        lambda: _flips("lfr+tr", Place.RESULT, 0),
+        "G4",
+    ),
+    Mutant(
+        "minority wins",
+        "TrAfter answers with the trial that no other one is equal to",
+        wrapped(TrAfter, "_settle", _minority),
+        OWN,
+        lambda: _flips("tr", Place.RESULT, 0),
+        "G4",
+    ),
+    Mutant(
+        "assertion always true",
+        "AssertAfter lets any reply pass",
+        wrapped(AssertAfter, "__init__", _gullible),
+        OWN,
+        lambda: _flips("pbr+assert", Place.RESULT, 0, 1, 2),
+        "G4",
+    ),
+    Mutant(
+        "deaths not told",
+        "Watchdog suspects nobody, whoever dies",
+        instead(Watchdog, "_suspect", lambda self, node, cause, now_ns: []),
+        CRASH,
+        crashes("pbr", "a/proceed"),
+        "G2",
+    ),
+    Mutant(
+        "first node watched",
+        "Watchdog looks at the first node of its replica, and at no other one",
+        heard(Watchdog, Watch, lambda watchdog, msg: replace(msg, nodes=msg.nodes[:1])),
+        CRASH,
+        crashes("pbr", "a/proceed"),
+        "G2",
+    ),
+)

@@ -1,0 +1,250 @@
+"""The judgement over simulated runs: it passes an unbroken one, and refuses each that is broken in one thing.
+
+Which histories the checkers of `core.check` refuse is shown in `test_check`. Here is what the simulator asks
+beside them: whether what lives is the whole graph, whether the run came to rest, whether a loss is excused.
+"""
+
+from collections.abc import Callable
+from typing import Final
+
+import pytest
+from msgspec.structs import replace
+from planting import flip
+
+from aftbed.campaign.simulated import ASSERT, REST, breaches, half_a_graph, outcome, struck_down
+from aftbed.core.check import missing
+from aftbed.core.event import Event
+from aftbed.core.fault import Place
+from aftbed.core.journal import Entry, EntryKind, Record
+from aftbed.ftm.mechanism import build
+from aftbed.runtime.adaptations import Outcome
+from aftbed.runtime.sim.world import Run, Setup, simulate
+
+Broken = Callable[[Run], Run]
+
+MS: Final = 1_000_000
+UNBROKEN: Final = simulate(Setup("pbr", count=6))
+SIMPLEX: Final = simulate(Setup("tr", count=6))
+SWITCHED: Final = Outcome(1, "pbr to lfr", "drained", "lfr", "done")
+UNDONE: Final = Outcome(1, "pbr to lfr", "drained", "pbr", "rolled back")
+
+
+def noted(journal: str, event: Event, request_id: int, detail: int = 0) -> Broken:
+    """One more record, at the end of a journal."""
+
+    def broken(run: Run) -> Run:
+        records = run.history.journals[journal]
+        node = journal.rpartition(".")[0].replace(".", "/")
+        more = Record(run.rest.ended_ns, event, request_id, detail, node)
+        journals = run.history.journals | {journal: [*records, more]}
+        return replace(run, history=replace(run.history, journals=journals))
+
+    return broken
+
+
+def retold(change: Callable[[Entry], list[Entry]]) -> Broken:
+    """Another answer to request 3, or none, or two."""
+
+    def broken(run: Run) -> Run:
+        entries = run.history.dialogue
+        meant = [e.request_id == 3 and e.kind is EntryKind.ANSWERED for e in entries]
+        told = [
+            e for entry, yes in zip(entries, meant, strict=True) for e in (change(entry) if yes else [entry])
+        ]
+        return replace(run, history=replace(run.history, dialogue=told))
+
+    return broken
+
+
+def rested(**changes: object) -> Broken:
+    """Another end."""
+    return lambda run: replace(run, rest=replace(run.rest, **changes))
+
+
+def hosting(change: Callable[[set[tuple[str, str]]], set[tuple[str, str]]]) -> Broken:
+    """Other bricks live, in the end."""
+    return lambda run: rested(hosted=tuple(sorted(change(set(run.rest.hosted)))))(run)
+
+
+def adapted(*outcomes: Outcome) -> Broken:
+    """The adaptations ended so."""
+    return lambda run: replace(run, adaptations=outcomes)
+
+
+def struck(*names: str) -> Broken:
+    """Faults struck these, one each millisecond."""
+    return lambda run: replace(run, struck=tuple((n * MS, name) for n, name in enumerate(names, 1)))
+
+
+def renewed(ms: float) -> Broken:
+    """Redundancy was back at that time."""
+    return lambda run: replace(run, told=(*run.told, (round(ms * MS), "script.done", "new backup: 2.00 ms")))
+
+
+def with_a_flip(run: Run) -> Run:
+    """A value fault was asked for."""
+    return replace(run, setup=replace(run.setup, faults=(flip(Place.RESULT, 0, "server.exit", 1),)))
+
+
+def all_of(*broken: Broken) -> Broken:
+    """One after the other."""
+
+    def every(run: Run) -> Run:
+        for one in broken:
+            run = one(run)
+        return run
+
+    return every
+
+
+def said(run: Run) -> list[str]:
+    return [str(breach) for breach in breaches(run)]
+
+
+WRONG: Final = retold(lambda e: [replace(e, payload=e.payload[:-1] + b"\xff")])
+LOST: Final = rested(lost=True, leader="")
+
+
+@pytest.mark.parametrize("run", [UNBROKEN, SIMPLEX, simulate(Setup("none", count=6))])
+def test_an_unbroken_run_breaks_no_promise(run: Run) -> None:
+    assert breaches(run) == ()
+    assert outcome(run) == "masked"
+
+
+@pytest.mark.parametrize(
+    ("broken", "found"),
+    [
+        (noted("a.server.1", Event.SERVER_EXIT, 6), "G1: a.server.1: request 6 (server.exit) after 6"),
+        (noted("b.server.1", Event.STATE_RESTORED, 2), "G1: b.server.1: request 2 (state.restored) after 6"),
+        (retold(lambda e: [e, e]), "G2: request 3: 2 replies"),
+        (retold(lambda e: []), "G2: request 3: 0 replies"),
+        (WRONG, "G3: request 3: the reply is not the bare server's"),
+        (all_of(with_a_flip, WRONG), "G4: request 3: the reply is not the bare server's"),
+        (
+            hosting(lambda bricks: bricks - {("b/after", "pbr.after")}),
+            "G5: b/after (pbr.after) is missing",
+        ),
+        (
+            hosting(lambda bricks: bricks | {("a/tr.after", "tr.after")}),
+            "G5: a/tr.after (tr.after) should not be there",
+        ),
+        (
+            hosting(lambda bricks: bricks - {("b/after", "pbr.after")} | {("b/after", "lfr.after")}),
+            "G5: b/after (pbr.after) is missing",
+        ),
+        (rested(graph=build("lfr", "process")), "G5: lfr runs, though the adaptations came to pbr"),
+        (adapted(SWITCHED), "G5: pbr runs, though the adaptations came to lfr"),
+        (
+            all_of(adapted(UNDONE), rested(graph=build("lfr", "process"))),
+            "G5: lfr runs, though the adaptations came to pbr",
+        ),
+        (rested(leader=""), "G5: nobody leads"),
+        (noted("proxy.1", Event.REPLY_ACCEPTED, 6, 1 << 8 | 2), "G6: epoch 1: replies of replicas 1 and 2"),
+        (
+            noted("proxy.1", Event.REPLY_ACCEPTED, 6, 2 << 8 | 2),
+            "G6: replica 1 was not fenced between epochs 1 and 2",
+        ),
+        (
+            rested(why_not=("requests wait", "no redundancy")),
+            f"{REST}: requests wait; no redundancy",
+        ),
+        (
+            lambda run: replace(run, failures=("a/after: assertion failed", "b/after: assertion failed")),
+            f"{ASSERT}: a/after: assertion failed",
+        ),
+        (LOST, "G2: the service is lost, though only nobody was struck"),
+        (
+            all_of(LOST, struck("a/server", "a/after")),
+            "G2: the service is lost, though only a/server, a/after was struck",
+        ),
+        (
+            all_of(LOST, struck("proxy", "a/watchdog", "b")),
+            "G2: the service is lost, though only proxy, a/watchdog, b was struck",
+        ),
+        (
+            all_of(LOST, struck("a/server", "b/server"), renewed(1.5)),
+            "G2: the service is lost, though only a/server, b/server was struck",
+        ),
+    ],
+)
+def test_a_broken_run_is_refused_for_what_is_broken(broken: Broken, found: str) -> None:
+    """And for nothing else: each differs from an unbroken run in one thing."""
+    assert said(broken(UNBROKEN)) == [found]
+
+
+def test_every_promise_of_a_run_is_told() -> None:
+    run = all_of(WRONG, noted("a.server.1", Event.SERVER_EXIT, 6), rested(why_not=("no redundancy",)))(
+        UNBROKEN
+    )
+    assert [breach.promise for breach in breaches(run)] == ["G1", "G3", REST]
+
+
+def test_a_service_is_not_lost_in_vain() -> None:
+    """Where faults struck each replica, nobody promised more: but for at most once, and right replies."""
+    gone = all_of(LOST, struck("a/server", "b/after"), rested(why_not=("requests wait",), hosted=()))
+    unanswered = all_of(gone, retold(lambda e: []))(UNBROKEN)
+    assert breaches(unanswered) == ()
+    assert outcome(unanswered) == "unavailable"
+    assert [b.promise for b in breaches(all_of(gone, WRONG)(UNBROKEN))] == ["G3"]
+    doubled = all_of(gone, noted("a.server.1", Event.SERVER_EXIT, 6))(UNBROKEN)
+    assert [b.promise for b in breaches(doubled)] == ["G1"]
+
+
+@pytest.mark.parametrize(
+    ("broken", "down"),
+    [
+        (struck(), False),
+        (struck("a"), False),
+        (struck("a/server", "a/before"), False),
+        (struck("a/server", "b/watchdog"), False),
+        (struck("client", "proxy", "recovery", "engine"), False),
+        (struck("a", "b"), True),
+        (struck("b/after", "a/protocol"), True),
+        (all_of(struck("a", "b"), renewed(1.5)), False),
+        (all_of(struck("a", "b"), renewed(0.5)), True),  # before the first
+        (all_of(struck("a", "b"), renewed(2.5)), True),  # too late
+        (all_of(struck("a", "b", "a"), renewed(1.5)), True),  # the second pair of strikes
+        (all_of(struck("a", "b", "a"), renewed(1.5), renewed(2.5)), False),
+    ],
+)
+def test_a_duplex_is_struck_down_by_two_faults_with_no_redundancy_between(broken: Broken, down: bool) -> None:
+    assert struck_down(broken(UNBROKEN)) is down
+
+
+def test_a_single_replica_is_struck_down_by_one_fault() -> None:
+    assert not struck_down(struck("client", "a/watchdog")(SIMPLEX))
+    assert struck_down(struck("a/server")(SIMPLEX))
+
+
+def test_what_lives_must_be_the_graph_of_who_leads() -> None:
+    """After a failover too, and after an adaptation that is done."""
+    failed_over = rested(leader="b", graph=build("pbr", "process", "b"))(UNBROKEN)
+    assert half_a_graph(failed_over) == []
+    new = build("lfr", "process")
+    bricks = tuple((b.name, b.kind) for b in new.bricks)
+    assert half_a_graph(all_of(adapted(SWITCHED), rested(graph=new, hosted=bricks))(UNBROKEN)) == []
+    assert half_a_graph(adapted(UNDONE)(UNBROKEN)) == []
+
+
+def test_all_that_differs_from_a_whole_graph_is_told() -> None:
+    graph = build("pbr", "replica")
+    whole = [(b.name, b.kind) for b in graph.bricks]
+    assert missing(whole, graph) == []
+    assert missing(reversed(whole), graph) == []
+    assert missing(whole[1:], graph) == [f"{whole[0][0]} ({whole[0][1]}) is missing"]
+    assert missing([*whole, ("a/spare", "server")], graph) == ["a/spare (server) should not be there"]
+    assert len(missing([], graph)) == len(whole)
+
+
+@pytest.mark.parametrize(
+    ("broken", "word"),
+    [
+        (WRONG, "sdc"),
+        (all_of(WRONG, LOST), "sdc"),  # the worst one wins
+        (LOST, "unavailable"),
+        (retold(lambda e: [replace(e, t_ns=e.t_ns + 100 * MS)]), "tolerated"),
+        (noted("b.protocol.1", Event.REPLICA_PROMOTED, 0, 2), "tolerated"),
+    ],
+)
+def test_the_outcome_of_a_run_is_the_worst_that_happened(broken: Broken, word: str) -> None:
+    assert outcome(broken(UNBROKEN)) == word
