@@ -75,9 +75,12 @@ def test_blocked_while_its_timer_comes_is_a_hang() -> None:
         starvation = Starvation(child.pid)
         starvation.starves(1)
         assert child.stdout is not None
-        for _ in range(3):
-            child.stdout.readline()  # its handler has run since
-        assert not starvation.starves(PERIOD_NS)
+        child.stdout.readline()
+        child.stdout.readline()  # its handler has run since
+        limit = time.monotonic() + 5.0
+        while starvation.starves(PERIOD_NS):  # in its handler just now, and another has the core
+            assert time.monotonic() < limit, "it is excused"
+            child.stdout.readline()
 
 
 @pytest.mark.parametrize(("word", "excused"), [("", False), (WEAK, True)])
