@@ -95,7 +95,7 @@ def _compare(setup: Setup, records: list[RunRecord], seeds: int) -> Agreement:
         dict(sorted(sim_classes.items())),
         real_times,
         sim_times,
-        (*found, *_apart(real_times, sim_times)),
+        (*found, *apart(real_times, sim_times)),
     )
 
 
@@ -110,7 +110,8 @@ def _times(found: list[float]) -> Times | None:
     return Times(len(ordered), ordered[0], ordered[len(ordered) // 2], ordered[-1])
 
 
-def _apart(real: Times | None, simulated: Times | None) -> list[str]:
+def apart(real: Times | None, simulated: Times | None) -> list[str]:
+    """Why the times do not agree; empty if they do."""
     if real is None or simulated is None:
         return [] if real is simulated else ["only one of them has failovers"]
     inside = simulated.low_ms <= real.median_ms <= simulated.high_ms

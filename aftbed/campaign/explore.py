@@ -5,25 +5,31 @@
     pairs    each first fault of a few, followed by each second one, after each delay of a grid
 
 Every case is one simulated run of its own, judged by all checkers. An experiment is a value (`Setup`), so
-that a broken one is repeated by its number.
+that a broken one is repeated by its number in the same `Selection`.
 """
 
 import itertools
-from collections.abc import Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor
-from typing import Final, NamedTuple
+import signal
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from typing import Final, NamedTuple, TypeVar
 
 import msgspec
 
 from aftbed.adapt.plan import plan, target
-from aftbed.campaign.simulated import Breach, breaches
+from aftbed.campaign.simulated import ASSERT, Breach, breaches
+from aftbed.core.errors import ConfigError, HarnessError, unknown
 from aftbed.core.event import Event
 from aftbed.core.fault import Act, Fault, Flip, Place, Trigger
+from aftbed.core.journal import EntryKind
 from aftbed.core.message import Goal, Scheduled
 from aftbed.core.script import Stage, flat
 from aftbed.ftm.mechanism import build
 from aftbed.runtime.sim.world import Doom, Run, Setup, simulate
 from aftbed.runtime.targets import STAGED
+from aftbed.vehicle.scenario import broken_expectations, load_scenario
 
 DUPLEX: Final = ("pbr", "lfr", "pbr+tr", "lfr+tr", "pbr+assert", "lfr+assert")
 ADAPTABLE: Final = ("pbr", "lfr", "pbr+tr", "lfr+tr")
@@ -34,6 +40,11 @@ ADAPT_REQUESTS: Final = 40
 ADAPT_RATE_HZ: Final = 400.0
 ADAPT_AT: Final = 4  # the request at which the adaptation begins
 CHUNK: Final = 16  # experiments handed to a worker at once
+AHEAD: Final = 3  # chunks for each worker that are handed out before they are asked for
+CAR: Final = "vehicle"  # beside the promises: what the scenario expects of the car
+REASON_MAX: Final = 300  # characters of an error of our own
+
+T = TypeVar("T")
 
 
 class Strike(NamedTuple):
@@ -120,15 +131,64 @@ PAIR_RATE_HZ: Final = 2000.0
 FIRST_MS: Final = 1.0  # from the start of the load to the first fault, about
 
 
+# -- a choice of them -----------------------------------------------------------------------------
+
+
+class Explorer(NamedTuple):
+    """`ftms`: all that it knows; `every`: its experiments over some of them, always in the same order."""
+
+    ftms: tuple[str, ...]
+    every: Callable[["Selection"], Iterator[Setup]]
+
+
+class Selection(msgspec.Struct, frozen=True):
+    """What of all there is is explored; `requests` for `crash` only. An experiment has its number in it."""
+
+    explorer: str
+    ftms: tuple[str, ...]
+    placements: tuple[str, ...] = PLACEMENTS
+    requests: int = 0
+
+    def setups(self) -> Iterator[Setup]:
+        """Every experiment."""
+        return EXPLORERS[self.explorer].every(self)
+
+
+EXPLORERS: Final = {
+    "crash": Explorer(DUPLEX, lambda s: crashes(s.ftms, s.placements, s.requests)),
+    "adapt": Explorer(ADAPTABLE, lambda s: adaptations(itertools.permutations(s.ftms, 2), s.placements)),
+    "pairs": Explorer(DUPLEX, lambda s: pairs(s.ftms, s.placements)),
+}
+
+
+def selected(explorer: str, ftms: Iterable[str], placements: Iterable[str], requests: int = 0) -> Selection:
+    """The choice; nothing named is all there is. Raises ConfigError naming what cannot be explored."""
+    known = EXPLORERS[explorer].ftms
+    chosen = Selection(explorer, _chosen("FTM", ftms, known), _chosen("placement", placements, PLACEMENTS))
+    if explorer == "adapt" and len(chosen.ftms) < 2:
+        raise ConfigError(f"--ftm {chosen.ftms[0]}: an adaptation leads to another one: name two")
+    return msgspec.structs.replace(chosen, requests=requests)
+
+
+def _chosen(what: str, names: Iterable[str], known: tuple[str, ...]) -> tuple[str, ...]:
+    """Those of `known` that are named, each once, as they were named; all of them if none is."""
+    named = tuple(dict.fromkeys(names))
+    for name in named:
+        if name not in known:
+            raise unknown(what, name, known)
+    return named or known
+
+
 # -- exploring ------------------------------------------------------------------------------------
 
 
 class Broken(msgspec.Struct, frozen=True):
-    """An experiment that broke a promise."""
+    """An experiment that broke a promise, in words, and the command that repeats it."""
 
     number: int
     setup: str
     breaches: tuple[str, ...]
+    command: str
 
 
 class Explored(msgspec.Struct, frozen=True):
@@ -137,23 +197,101 @@ class Explored(msgspec.Struct, frozen=True):
     explored: int
     survived: int
     unavailable: int
+    seconds: float
     broken: tuple[Broken, ...]
+
+
+class Found(NamedTuple):
+    """What came of an experiment; `missed` are the faults and adaptations that never came about."""
+
+    lost: bool
+    breaches: tuple[Breach, ...]
+    requests: int = 0
+    missed: tuple[str, ...] = ()
+
+
+def attempt(setup: Setup) -> tuple[Run | None, tuple[Breach, ...]]:
+    """The run and what it breaks; None where the executive itself broke down: that is a fault of ours."""
+    try:
+        run = simulate(setup)
+    except Exception as error:  # noqa: BLE001 - whatever it is, this experiment has found it
+        reason = f"the executive broke down: {type(error).__name__}: {error}"
+        return None, (Breach(ASSERT, reason[:REASON_MAX]),)
+    return run, broken_by(run)
+
+
+def broken_by(run: Run) -> tuple[Breach, ...]:
+    """All that `run` breaks, and what the car should not have done."""
+    found = breaches(run)
+    if run.vehicle is None or run.rest.lost:  # the drive ends with the service: nobody knows what was to come
+        return found
+    car = broken_expectations(load_scenario(run.setup.scenario), run.vehicle)
+    return (*found, *(Breach(CAR, reason) for reason in car[:1]))
+
+
+def tried(setup: Setup) -> Found:
+    """One experiment, in numbers."""
+    run, broken = attempt(setup)
+    if run is None:
+        return Found(False, broken)
+    sent = sum(e.kind is EntryKind.SENT for e in run.history.dialogue)
+    return Found(run.rest.lost, broken, sent, missed(run))
+
+
+def missed(run: Run) -> tuple[str, ...]:
+    """G8: what was to happen in `run` and did not, so that it proves nothing about it."""
+    found = [f"never fired: {f['fault']}" for f in run.faults if f["receipt"] != "applied"]
+    begun = len(run.adaptations)
+    late = run.setup.adaptations[begun:]
+    return (*found, *(f"never began: the adaptation to {s.goal.expression or s.goal.part}" for s in late))
 
 
 def judged(setup: Setup) -> tuple[bool, tuple[Breach, ...]]:
     """Whether the service was lost, and what was broken."""
-    run: Run = simulate(setup)
-    return run.rest.lost, breaches(run)
+    run, broken = attempt(setup)
+    return run is not None and run.rest.lost, broken
 
 
-def explore(setups: Iterable[Setup], jobs: int = 1) -> Iterator[tuple[int, Setup, bool, tuple[Breach, ...]]]:
+def explore(
+    setups: Iterable[Setup], jobs: int = 1
+) -> Generator[tuple[int, Setup, bool, tuple[Breach, ...]], None, None]:
     """Every experiment with its number and what came of it, in order."""
-    first, second = itertools.tee(setups)
+    for number, setup, (lost, broken) in each(judged, setups, jobs):
+        yield number, setup, lost, broken
+
+
+def each(
+    judge: Callable[[Setup], T], setups: Iterable[Setup], jobs: int = 1
+) -> Generator[tuple[int, Setup, T], None, None]:
+    """`judge` on every experiment, in order, over `jobs` processes; there may be no end of them.
+
+    Raises HarnessError if one of the processes dies.
+    """
     if jobs == 1:
-        for number, setup in enumerate(first):
-            yield number, setup, *judged(setup)
+        for number, setup in enumerate(setups):
+            yield number, setup, judge(setup)
         return
-    with ProcessPoolExecutor(jobs) as pool:
-        found = pool.map(judged, first, chunksize=CHUNK)
-        for number, (setup, (lost, broken)) in enumerate(zip(second, found, strict=True)):
-            yield number, setup, lost, broken
+    numbered = enumerate(setups)
+    under_way: deque[tuple[list[tuple[int, Setup]], Future[list[T]]]] = deque()
+    pool = ProcessPoolExecutor(jobs, initializer=_leave_interrupts_to_the_command)
+    try:
+        while True:
+            while len(under_way) < AHEAD * jobs and (chunk := list(itertools.islice(numbered, CHUNK))):
+                under_way.append((chunk, pool.submit(_all, judge, [setup for _, setup in chunk])))
+            if not under_way:
+                return
+            chunk, future = under_way.popleft()
+            for (number, setup), found in zip(chunk, future.result(), strict=True):
+                yield number, setup, found
+    except BrokenProcessPool as error:
+        raise HarnessError(f"a process that simulates has died: {error}") from error
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _all(judge: Callable[[Setup], T], setups: list[Setup]) -> list[T]:
+    return [judge(setup) for setup in setups]
+
+
+def _leave_interrupts_to_the_command() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -7,7 +7,9 @@ import typer
 
 from aftbed.cli.adapting import adapt as adapt_commands
 from aftbed.cli.bench import bench
+from aftbed.cli.explore import explore
 from aftbed.cli.ftm import ftm as ftm_commands
+from aftbed.cli.sim import sim
 
 app = typer.Typer(
     name="aftbed",
@@ -22,6 +24,7 @@ app.add_typer(inject, name="inject")
 app.add_typer(adapt_commands, name="adapt")
 app.add_typer(bench, name="bench")
 app.add_typer(ftm_commands, name="ftm")
+app.add_typer(explore, name="explore")
 
 Run = Annotated[str | None, typer.Option("--run", help="Id of the run, where several are alive.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else.")]
@@ -144,6 +147,9 @@ def stop(run: Run = None) -> None:
     from aftbed.cli import live  # noqa: PLC0415
 
     live.stop(run)
+
+
+app.command()(sim)
 
 
 At = Annotated[str | None, typer.Option("--at", help="Event to strike at, as checkpoint.sent.")]

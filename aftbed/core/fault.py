@@ -84,7 +84,7 @@ class Fault(msgspec.Struct, frozen=True):
         if self.trigger.event:
             words += ["at", self.trigger.event, "nth", str(self.trigger.nth)]
         elif self.trigger.after_ms:
-            words += ["after", f"{self.trigger.after_ms}ms"]
+            words += ["after", f"{self.trigger.after_ms:.6f}".rstrip("0").rstrip(".") + "ms"]
         return " ".join(words)
 
     def _whom(self) -> list[str]:

@@ -13,7 +13,7 @@ from typing import Final
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.event import Event, event_named
 from aftbed.core.fault import BIT_MAX, HANG_FOREVER_MS, Act, Fault, Flip, Place, Trigger
-from aftbed.core.words import whole_milliseconds
+from aftbed.core.words import milliseconds, whole_milliseconds
 
 GRAMMAR: Final = (
     "crash|hang TARGET [for 50ms] [at EVENT [nth N] | after 200ms],"
@@ -91,4 +91,4 @@ def _trigger(event: str | None, nth: str | None, after: str | None) -> Trigger:
         raise ConfigError(f"nth {nth[:40]!r}: a whole number from 1 on is allowed")
     if event is not None:
         event_named(event)
-    return Trigger(event or "", int(nth or 1), whole_milliseconds("duration", after) if after else 0)
+    return Trigger(event or "", int(nth or 1), milliseconds("duration", after) if after else 0.0)

@@ -122,7 +122,7 @@ BAD: Final = {
     "crash primary after ms": "duration 'ms': a positive number",
     "crash primary after -5ms": "duration '-5ms': a positive number",
     "crash primary after 0ms": "duration '0ms': a positive number",
-    "crash primary after 0.2ms": "duration '0.2ms': a positive number",
+    "crash primary after 0.0ms": "duration '0.0ms': a positive number",
     "crash primary after 5m": "duration '5m': a positive number",
     "crash primary after 1e3ms": "duration '1e3ms': a positive number",
     "crash primary after 3601s": "duration '3601s': a positive number",

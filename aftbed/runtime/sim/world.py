@@ -294,7 +294,7 @@ class World:
                 if not loop.step():
                     return
             loop.watch_jobs()
-            if not done_ns and (self._source_ended() or self.lost):
+            if not done_ns and (self._source_ended() or (self.lost and self._car is None)):
                 done_ns = loop.ns
             if done_ns:
                 rested_ns = (rested_ns or loop.ns) if self.lost or not self._unrest() else 0

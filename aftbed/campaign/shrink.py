@@ -1,0 +1,224 @@
+"""Shrinking: out of an experiment that breaks a promise, the smallest that still does.
+
+Greedy, as in delta debugging (Zeller and Hildebrandt, 2002): of all experiments that are simpler in one
+respect, the first that still breaks it takes the place of the last, and it begins anew, until none does. What
+is simpler, the most telling first:
+
+| respect                | simpler                                                             |
+|------------------------|---------------------------------------------------------------------|
+| load                   | no car; fewer requests; a closed loop                               |
+| faults, dooms          | one less; earlier (a smaller `nth`, `after_ms`, effect); shorter    |
+| adaptations            | one less; earlier                                                   |
+| all that is counted    | requests, `nth` and the request of an adaptation, by as much each   |
+| mechanism, placement   | nothing inside, if no bit is flipped; `pbr`; one brick a node       |
+
+An experiment stays one that something is promised of (see `swarm`): with fewer requests nothing is planned
+behind the last of them, and what is aimed at a thing that the simpler graph does not have is not tried.
+
+Limits: a minimum in each respect alone. Where two would have to change at once, and not by as much, it is not
+found. A fault keeps its target.
+"""
+
+import itertools
+from collections.abc import Callable, Iterator
+from typing import Final, TypeVar
+
+from msgspec import json
+from msgspec.structs import replace
+
+from aftbed.campaign.simulated import Breach
+from aftbed.core.errors import ConfigError
+from aftbed.core.fault import Act, Fault
+from aftbed.core.message import Scheduled
+from aftbed.ftm.mechanism import build, parse, replication_of
+from aftbed.runtime import targets
+from aftbed.runtime.sim.world import Doom, Setup
+
+TRIES_MAX: Final = 400
+CAR_COUNT: Final = 100  # requests in the place of a car
+MS_MIN: Final = 0.6  # no fault is planned earlier: a launch must succeed
+REQUEST_MS_MIN: Final = 0.02  # what a request takes at least
+
+Broken = Callable[[Setup], tuple[Breach, ...]]
+Item = TypeVar("Item")
+
+
+def shrink(setup: Setup, broken: Broken, tries_max: int = TRIES_MAX) -> Setup:
+    """The simplest that breaks what `setup` breaks first; `broken` is asked `tries_max` times at most.
+
+    The same for the same arguments, and never one that `broken` has not said to break it.
+    """
+    first = broken(setup)
+    assert first, f"nothing is broken by {setup}"
+    promise, tried = first[0].promise, {_key(setup)}
+    tries = 1
+    while tries < tries_max:
+        for simpler in _simpler(setup):
+            if _key(simpler) in tried:
+                continue
+            if tries == tries_max:
+                break
+            tries += 1
+            tried.add(_key(simpler))
+            found = broken(simpler)
+            if found and found[0].promise == promise:
+                setup = simpler
+                break
+        else:
+            break
+    return setup
+
+
+def _key(setup: Setup) -> bytes:
+    return json.encode(setup)
+
+
+def _simpler(setup: Setup) -> Iterator[Setup]:
+    """All that are simpler in one respect, and still make sense."""
+    ways = (_fewer, _smaller_loads, _smaller_graphs, _earlier, *_ONE_BY_ONE)
+    return filter(_makes_sense, map(_in_time, itertools.chain.from_iterable(way(setup) for way in ways)))
+
+
+def _makes_sense(setup: Setup) -> bool:
+    graph = build(setup.ftm, setup.placement)
+    try:
+        for fault in setup.faults:
+            targets.check(fault, graph)
+    except ConfigError:
+        return False
+    return {doom.brick for doom in setup.dooms} <= {brick.name for brick in graph.bricks}
+
+
+def _in_time(setup: Setup) -> Setup:
+    """Nothing is planned for behind the last request."""
+    if setup.scenario:
+        return setup
+    load_ms = max(MS_MIN, (setup.count - 1) * (1e3 / setup.rate_hz if setup.rate_hz else REQUEST_MS_MIN))
+
+    def timely(fault: Fault) -> Fault:
+        trigger = fault.trigger
+        if trigger.event or trigger.after_ms <= load_ms:
+            return fault
+        return replace(fault, trigger=replace(trigger, after_ms=round(load_ms, 3)))
+
+    return replace(
+        setup,
+        faults=tuple(timely(f) for f in setup.faults),
+        adaptations=tuple(replace(a, at_request=min(a.at_request, setup.count)) for a in setup.adaptations),
+    )
+
+
+# -- ways ------------------------------------------------------------------------------------------
+
+
+def _fewer(setup: Setup) -> Iterator[Setup]:
+    for at in range(len(setup.faults)):
+        yield replace(setup, faults=_without(setup.faults, at))
+    for at in range(len(setup.adaptations)):
+        yield replace(setup, adaptations=_without(setup.adaptations, at))
+    for at in range(len(setup.dooms)):
+        yield replace(setup, dooms=_without(setup.dooms, at))
+
+
+def _smaller_loads(setup: Setup) -> Iterator[Setup]:
+    if setup.scenario:
+        yield replace(setup, scenario="", count=CAR_COUNT, rate_hz=0.0)
+        return
+    for count in _smaller(setup.count):
+        yield replace(setup, count=count)
+    if setup.rate_hz:
+        yield replace(setup, rate_hz=0.0)
+
+
+def _smaller_graphs(setup: Setup) -> Iterator[Setup]:
+    """A duplex stays one, and where a bit is flipped TR stays."""
+    names = parse(setup.ftm)
+    flips = any(fault.act is Act.BITFLIP for fault in setup.faults)
+    if len(names) > 1 and not flips:
+        yield replace(setup, ftm=names[0])
+    if replication_of(setup.ftm) and names[0] != "pbr":
+        yield replace(setup, ftm="+".join(("pbr", *names[1:])))
+    if setup.placement != "process":
+        yield replace(setup, placement="process")
+
+
+def _earlier(setup: Setup) -> Iterator[Setup]:
+    """The way to the first thing that is counted becomes shorter; what comes after it keeps its distance."""
+    counted = [f.trigger.nth for f in setup.faults if f.trigger.event]
+    counted += [a.at_request for a in setup.adaptations if a.at_request]
+    first = min((setup.count, *counted))
+    for left in _smaller(first) if counted else ():
+        yield _by(setup, first - left)
+
+
+def _by(setup: Setup, gone: int) -> Setup:
+    """`setup` without its first requests, `gone` of them."""
+
+    def of(fault: Fault) -> Fault:
+        nth = fault.trigger.nth - gone * bool(fault.trigger.event)
+        return replace(fault, trigger=replace(fault.trigger, nth=nth))
+
+    adaptations = (replace(a, at_request=a.at_request - gone * bool(a.at_request)) for a in setup.adaptations)
+    faults = tuple(map(of, setup.faults))
+    return replace(setup, count=setup.count - gone, faults=faults, adaptations=tuple(adaptations))
+
+
+def _earlier_faults(setup: Setup) -> Iterator[Setup]:
+    for at, fault in enumerate(setup.faults):
+        for other in _earlier_fault(fault):
+            yield replace(setup, faults=_with(setup.faults, at, other))
+
+
+def _earlier_fault(fault: Fault) -> Iterator[Fault]:
+    trigger = fault.trigger
+    for nth in _smaller(trigger.nth):
+        yield replace(fault, trigger=replace(trigger, nth=nth))
+    for after_ms in _sooner(trigger.after_ms):
+        yield replace(fault, trigger=replace(trigger, after_ms=after_ms))
+    for for_ms in _smaller(fault.for_ms):
+        yield replace(fault, for_ms=for_ms)
+
+
+def _earlier_adaptations(setup: Setup) -> Iterator[Setup]:
+    for at, scheduled in enumerate(setup.adaptations):
+        for other in _earlier_adaptation(scheduled):
+            yield replace(setup, adaptations=_with(setup.adaptations, at, other))
+
+
+def _earlier_adaptation(scheduled: Scheduled) -> Iterator[Scheduled]:
+    for at_request in _smaller(scheduled.at_request):
+        yield replace(scheduled, at_request=at_request)
+    for after_ms in _sooner(scheduled.after_ms):
+        yield replace(scheduled, after_ms=after_ms)
+
+
+def _earlier_dooms(setup: Setup) -> Iterator[Setup]:
+    for at, doom in enumerate(setup.dooms):
+        for effect in _smaller(doom.effect, least=0):
+            yield replace(setup, dooms=_with(setup.dooms, at, Doom(doom.brick, effect)))
+
+
+_ONE_BY_ONE: Final = (_earlier_faults, _earlier_adaptations, _earlier_dooms)
+
+# -- numbers and tuples ----------------------------------------------------------------------------
+
+
+def _smaller(number: int, least: int = 1) -> Iterator[int]:
+    """The smallest, the one half way, and the next: so the last step is to a minimum."""
+    if number > least:
+        yield from dict.fromkeys((least, (least + number) // 2, number - 1))
+
+
+def _sooner(ms: float) -> Iterator[float]:
+    """Half of it, or without what is behind the point; 0 means something else."""
+    for found in (round(ms / 2, 3), float(int(ms))):
+        if MS_MIN <= found < ms:
+            yield found
+
+
+def _without(items: tuple[Item, ...], at: int) -> tuple[Item, ...]:
+    return items[:at] + items[at + 1 :]
+
+
+def _with(items: tuple[Item, ...], at: int, item: Item) -> tuple[Item, ...]:
+    return items[:at] + (item,) + items[at + 1 :]

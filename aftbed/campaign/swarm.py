@@ -1,0 +1,219 @@
+"""Swarm: a whole experiment out of one seed, so that what nobody thought of is tried too.
+
+Explorers try all there is of one kind. A swarm draws of every kind at once: mechanism, placement, load,
+faults, adaptations, and by the same seed the delays. As in swarm testing (Groce et al., 2012), a run leaves
+out most of what there is: one with no adaptation, or with no fault, comes to where the others do not.
+
+What is drawn is within what is promised (design 3), so that **every breach is a bug**:
+
+| drawn                                   | but never                                                        |
+|-----------------------------------------|------------------------------------------------------------------|
+| a crash of any node or role             | under `none`, which has nobody to replace what died              |
+| a hang for a time, of any node or role  | the same                                                         |
+| a hang for good, of a role or a replica | of a node that no Watchdog watches                               |
+| a bit flipped in an execution           | without TR from the start to the end; two within a few requests  |
+| an adaptation, refused or not           | away from TR in a run with a flipped bit                         |
+| both replicas in one node               | for a duplex: the run could not come to rest without redundancy  |
+| a car                                   | with two faults, or one replica: it may lose its brakes          |
+
+Every fault comes while requests are still to come: one that strikes behind the last would have to be waited
+for. So the time of a fault is at most what the load takes at least (with the launch, which a fault must not
+disturb), and an event is counted up to a part of the requests only.
+"""
+
+from collections.abc import Iterable, Iterator
+from functools import lru_cache
+from random import Random
+from typing import Final
+
+from aftbed.core.errors import ConfigError
+from aftbed.core.event import REQUEST_PATH, Event
+from aftbed.core.fault import Act, Fault, Flip, Place, Trigger
+from aftbed.core.graph import PLACEMENTS
+from aftbed.core.message import Goal, Scheduled
+from aftbed.ftm.catalog import EMITTERS
+from aftbed.ftm.mechanism import EXPRESSIONS, NONE, build, parse, replication_of
+from aftbed.runtime import targets
+from aftbed.runtime.rewiring import replica_of
+from aftbed.runtime.sim.world import Setup
+from aftbed.vehicle.scenario import scenario_names
+
+DUPLEX: Final = tuple(e for e in EXPRESSIONS if replication_of(e))
+SIMPLEX: Final = tuple(e for e in EXPRESSIONS if not replication_of(e))
+DUPLEX_PART: Final = 0.85
+NONE_PART: Final = 0.04
+SINGLE_PART: Final = 0.3  # of those with one replica
+CAR_PART: Final = 0.01
+CLOSED_PART: Final = 0.4  # of the loads: the next request follows the reply
+FLIPS_PART: Final = 0.5  # of the runs with TR and a fault
+ADAPTED_PART: Final = 0.5
+
+REQUESTS: Final = (20, 380)
+RATE_HZ: Final = (200.0, 4000.0)
+FAULTS_MAX: Final = 3
+ADAPTATIONS_MAX: Final = 2
+HANG_MS_MAX: Final = 400
+NTH_PART: Final = 0.75  # of the requests: an event is counted so far at most
+RARE_NTH_MAX: Final = 2  # of events that not every request brings
+RARE_PART: Final = 0.15  # of the events that a fault waits for
+STEPS_MAX: Final = 16  # of an adaptation
+CAR_FAULTS_MAX: Final = 1
+CAR_REQUESTS: Final = 40  # fewer than any scenario has
+CAR_MS: Final = 1500.0  # less than any scenario lasts
+REQUEST_MS_MIN: Final = 0.02  # what a request takes at least
+LAUNCH_MS: Final = 0.6  # from the arming of a fault to the first request, at most: a launch must succeed
+FLIPS_APART: Final = 50  # executions, so that no request sees two
+BIT_DRAWN_MAX: Final = 4096
+
+_OFTEN: Final = frozenset(  # with every request, where they are emitted at all
+    (*REQUEST_PATH, Event.REPLY_ACCEPTED, Event.CHECKPOINT_APPLIED, Event.STATE_RESTORED)
+    + (Event.FOLLOWER_FORWARDED, Event.FOLLOWER_NOTIFIED, Event.VOTE_COMPARED)
+)
+_STEPS: Final = (Event.ADAPT_STEP_ENTER, Event.ADAPT_STEP_ACT, Event.ADAPT_STEP_EXIT)
+
+
+def drawn(seed: int) -> Setup:
+    """The experiment of `seed`, which is whole: nothing but it has a part in the run."""
+    return _Draw(seed).setup()
+
+
+def experiments(seeds: Iterable[int]) -> Iterator[Setup]:
+    """Those of `seeds`, in their order."""
+    return map(drawn, seeds)
+
+
+@lru_cache(maxsize=128)
+def _events(ftm: str, placement: str) -> tuple[Event, ...]:
+    """What a fault can wait for where `ftm` runs."""
+    graph = build(ftm, placement)
+    found = []
+    for event in EMITTERS:
+        try:
+            targets.check(Fault(Act.CRASH, targets.ROLES[0], Trigger(event.label)), graph)
+        except ConfigError:
+            continue
+        found.append(event)
+    return tuple(found)
+
+
+class _Draw:
+    """One draw: each part from what the parts before it allow."""
+
+    def __init__(self, seed: int) -> None:
+        self._seed = seed
+        self._chance = chance = Random(f"swarm/{seed}")
+        self._scenario = chance.choice(scenario_names()) if chance.random() < CAR_PART else ""
+        self._ftm = self._draw_ftm()
+        self._placement = self._draw_placement()
+        self._count = round(chance.triangular(*REQUESTS))
+        self._rate_hz = 0.0
+        if chance.random() >= CLOSED_PART:
+            low, high = RATE_HZ
+            self._rate_hz = float(round(low * (high / low) ** chance.random()))
+        faults_max = 0 if self._ftm == NONE else CAR_FAULTS_MAX if self._scenario else FAULTS_MAX
+        self._faults_wanted = chance.randint(0, faults_max)
+        self._flips = "tr" in parse(self._ftm) and self._faults_wanted > 0 and chance.random() < FLIPS_PART
+
+    def setup(self) -> Setup:
+        """All of it."""
+        adaptations = self._draw_adaptations()
+        faults = self._draw_faults(adapted=bool(adaptations))
+        return Setup(
+            self._ftm,
+            self._placement,
+            self._seed,
+            self._count,
+            self._rate_hz,
+            faults,
+            adaptations,
+            scenario=self._scenario,
+        )
+
+    # -- what runs ----------------------------------------------------------------------------
+
+    def _draw_ftm(self) -> str:
+        which = self._chance.random()
+        if which < DUPLEX_PART or self._scenario:
+            return self._chance.choice(DUPLEX)
+        return NONE if which > 1 - NONE_PART else "tr"
+
+    def _draw_placement(self) -> str:
+        if not replication_of(self._ftm) and self._chance.random() < SINGLE_PART:
+            return "single"
+        return self._chance.choice([p for p in PLACEMENTS if p != "single"])
+
+    def _draw_adaptations(self) -> tuple[Scheduled, ...]:
+        chance = self._chance
+        if chance.random() >= ADAPTED_PART:
+            return ()
+        ways = DUPLEX if self._scenario else SIMPLEX if self._placement == "single" else EXPRESSIONS
+        ways = tuple(e for e in ways if e != NONE and ("tr" in parse(e) or not self._flips))
+        found = [
+            Scheduled(Goal(expression=chance.choice(ways)), chance.randint(1, self._requests()))
+            for _ in range(chance.randint(1, ADAPTATIONS_MAX))
+        ]
+        return tuple(sorted(found, key=lambda scheduled: scheduled.at_request))
+
+    def _requests(self) -> int:
+        """How many there will be at least."""
+        return CAR_REQUESTS if self._scenario else self._count
+
+    # -- what goes wrong ----------------------------------------------------------------------
+
+    def _draw_faults(self, *, adapted: bool) -> tuple[Fault, ...]:
+        wanted = self._faults_wanted
+        flips = self._draw_flips(self._chance.randint(1, wanted)) if self._flips else []
+        others = [self._draw_fault(adapted) for _ in range(wanted - len(flips))]
+        return (*flips, *others)
+
+    def _draw_flips(self, count: int) -> list[Fault]:
+        """All in one role, and far enough from each other."""
+        chance = self._chance
+        lfr = parse(self._ftm)[0] == "lfr"  # whose follower executes too
+        role = chance.choice(targets.ROLES if lfr else targets.ROLES[:1])
+        found = []
+        nth = chance.randint(1, self._nth_max())
+        for _ in range(count):
+            bit = chance.choice((None, chance.randrange(BIT_DRAWN_MAX)))
+            flip = Flip(chance.choice(tuple(Place)), bit)
+            found.append(Fault(Act.BITFLIP, role, Trigger(Event.SERVER_EXIT.label, nth), flip=flip))
+            nth += FLIPS_APART + chance.randrange(FLIPS_APART)
+        return found
+
+    def _draw_fault(self, adapted: bool) -> Fault:
+        chance = self._chance
+        trigger = self._draw_trigger(adapted)
+        steps = trigger.event in {event.label for event in _STEPS}
+        target = self._draw_target(staged=steps)
+        if chance.random() < 0.6 or target.endswith(targets.STAGED):
+            return Fault(Act.CRASH, target, trigger)
+        watched = target in targets.ROLES or replica_of(target)
+        hang_ms = 0 if watched and chance.random() < 0.4 else chance.randint(1, HANG_MS_MAX)
+        return Fault(Act.HANG, target, trigger, hang_ms)
+
+    def _draw_target(self, *, staged: bool) -> str:
+        chance, graph = self._chance, build(self._ftm, self._placement)
+        if chance.random() < 0.4:
+            return chance.choice(targets.roles(graph))
+        node = chance.choice(list(graph.nodes))
+        return f"{node}{targets.STAGED}" if staged and replica_of(node) and chance.random() < 0.3 else node
+
+    def _draw_trigger(self, adapted: bool) -> Trigger:
+        chance = self._chance
+        if adapted and chance.random() < 0.5:
+            return Trigger(chance.choice(_STEPS).label, chance.randint(1, STEPS_MAX))
+        if chance.random() < 0.3:
+            return Trigger(after_ms=round(LAUNCH_MS + self._load_ms() * chance.random(), 3))
+        often = chance.random() >= RARE_PART
+        event = chance.choice([e for e in _events(self._ftm, self._placement) if (e in _OFTEN) is often])
+        return Trigger(event.label, chance.randint(1, self._nth_max() if often else RARE_NTH_MAX))
+
+    def _nth_max(self) -> int:
+        return max(1, round(self._requests() * NTH_PART))
+
+    def _load_ms(self) -> float:
+        """What the load takes at least."""
+        if self._scenario:
+            return CAR_MS
+        period_ms = 1e3 / self._rate_hz if self._rate_hz else REQUEST_MS_MIN
+        return (self._count - 1) * period_ms

@@ -1,0 +1,133 @@
+"""`aftbed explore`: the exact count, the number that repeats an experiment, the exit codes."""
+
+import json
+import re
+import shlex
+from collections.abc import Callable
+from functools import partial
+from typing import Final
+
+import pytest
+from playedrun import Call, Run
+
+from aftbed.campaign.explore import EXPLORERS, PLACEMENTS, selected
+from aftbed.campaign.simulated import Breach
+from aftbed.runtime.sim.world import Setup
+
+SMALL: Final = ("crash", "--ftm", "lfr", "--placement", "replica", "--requests", "1")
+
+
+@pytest.fixture
+def explore(call: Call) -> Call:
+    """Call `aftbed explore`."""
+    return partial(call, "explore")
+
+
+@pytest.fixture
+def broken(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[Setup], bool]], None]:
+    """Have experiments break G1."""
+
+    def breaks(which: Callable[[Setup], bool]) -> None:
+        def judged(setup: Setup) -> tuple[bool, tuple[Breach, ...]]:
+            return False, (Breach("G1", "planted"),) if which(setup) else ()
+
+        monkeypatch.setattr("aftbed.campaign.explore.judged", judged)
+
+    return breaks
+
+
+def test_the_count_is_exact(explore: Call) -> None:
+    code, out, err = explore(*SMALL)
+    number = len(list(selected("crash", ["lfr"], ["replica"], 1).setups()))
+    assert (code, err) == (0, "")
+    assert re.fullmatch(rf"{number} of {number} survived \(0 unavailable\) in [0-9.]+ s\n", out)
+
+
+def test_the_document_counts_the_same_with_one_process_and_with_two(explore: Call) -> None:
+    found = [json.loads(explore(*SMALL, "--jobs", jobs, "--json")[1]) for jobs in ("1", "2")]
+    for document in found:
+        assert set(document) == {"explored", "survived", "unavailable", "seconds", "broken"}
+        assert document["explored"] == document["survived"] > 20 and document["broken"] == []
+    assert found[0]["explored"] == found[1]["explored"]
+
+
+def test_names_are_separated_by_commas_or_given_one_by_one(explore: Call) -> None:
+    small = ("crash", "--placement", "replica", "--requests", "1", "--jobs", "1", "--json")
+    together, apart = (
+        json.loads(explore(*small, *ftms)[1])["explored"]
+        for ftms in (("--ftm", "pbr,lfr"), ("--ftm", "pbr", "--ftm", "lfr"))
+    )
+    assert together == apart == len(list(selected("crash", ("pbr", "lfr"), ("replica",), 1).setups()))
+
+
+def test_one_that_broke_is_told_with_the_command_that_repeats_it(
+    explore: Call, call: Call, broken: Callable[[Callable[[Setup], bool]], None]
+) -> None:
+    numbered = list(selected("crash", ("lfr",), ("replica",), 1).setups())
+    broken(lambda setup: setup == numbered[7])
+    code, out, _ = explore(*SMALL, "--jobs", "1")
+    assert code == 1
+    assert out.startswith("broken: 7: lfr (replica), seed 0, 1 request; ")
+    assert "  because    G1: planted" in out
+    assert f"{len(numbered) - 1} of {len(numbered)} survived" in out
+    (command,) = re.findall(r"repeat +(aftbed .*)", out)
+    code, again, _ = call(*shlex.split(command)[1:])
+    assert code == 0, "that one is sound"
+    assert again.startswith(f"7: lfr (replica), seed 0, 1 request; {numbered[7].dooms[0].brick} dies")
+    assert "1 of 1 survived" in again
+
+
+def test_of_many_that_broke_some_are_told_and_all_are_in_the_document(
+    explore: Call, broken: Callable[[Callable[[Setup], bool]], None]
+) -> None:
+    broken(lambda setup: True)
+    code, out, _ = explore(*SMALL, "--jobs", "1")
+    assert code == 1 and len(re.findall("^broken:", out, re.MULTILINE)) == 20
+    assert re.search(r"^and [0-9]+ more; --json lists them all$", out, re.MULTILINE)
+    document = json.loads(explore(*SMALL, "--jobs", "1", "--json")[1])
+    assert len(document["broken"]) == document["explored"] and document["survived"] == 0
+    first = document["broken"][0]
+    assert first["number"] == 0 and first["breaches"] == ["G1: planted"]
+    assert first["command"].startswith(
+        "aftbed explore crash --ftm lfr --placement replica --requests 1 --only 0"
+    )
+
+
+@pytest.mark.parametrize(
+    ("words", "experiment"),
+    [
+        (("adapt", "--ftm", "pbr,pbr+tr", "--only", "100"), "to pbr+tr at request 4"),
+        (("pairs", "--ftm", "lfr", "--only", "4"), "crash client after 1.5ms"),
+    ],
+)
+def test_one_experiment_by_its_number(explore: Call, words: tuple[str, ...], experiment: str) -> None:
+    code, out, _ = explore(*words)
+    assert code == 0
+    assert experiment in out.splitlines()[0] and "1 of 1 survived" in out
+
+
+@pytest.mark.parametrize("explorer", EXPLORERS)
+def test_a_selection_of_all_holds_that_of_each(explorer: str) -> None:
+    whole = selected(explorer, (), (), 1)
+    assert whole.placements == PLACEMENTS and whole.ftms == EXPLORERS[explorer].ftms
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("crash", "--requests", "0"), ("--requests 0", "1 to 1000")),
+        (("crash", "--requests", "-3"), ("--requests -3",)),
+        (("crash", "--jobs", "0"), ("--jobs 0", "1 to 256")),
+        (("crash", "--ftm", "prb"), ("unknown FTM 'prb'", "did you mean 'pbr'")),
+        (("crash", "--ftm", "pbr,"), ("unknown FTM ''",)),
+        (("crash", "--ftm", "tr"), ("unknown FTM 'tr'", "lfr+tr")),
+        (("adapt", "--ftm", "pbr+assert,pbr"), ("unknown FTM 'pbr+assert'",)),
+        (("adapt", "--ftm", "pbr"), ("--ftm pbr", "name two")),
+        (("pairs", "--placement", "single"), ("unknown placement 'single'", "process, replica")),
+        ((*SMALL, "--only", "99999"), ("--only 99999", "0 to ")),
+        ((*SMALL, "--only", "-1"), ("--only -1",)),
+    ],
+)
+def test_options_that_are_refused(refused: Run, arguments: tuple[str, ...], words: tuple[str, ...]) -> None:
+    error = refused("explore", *arguments)
+    assert all(word in error for word in words), error

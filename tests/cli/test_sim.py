@@ -1,0 +1,277 @@
+"""`aftbed sim`: what is printed of one run and of many, the exit codes, how a failure is repeated."""
+
+import itertools
+import json
+import re
+import shlex
+from contextlib import closing
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+import pytest
+from msgspec.structs import replace
+from playedrun import Call, Run
+
+from aftbed.campaign.explore import each, tried
+from aftbed.campaign.swarm import drawn
+from aftbed.cli import simulating
+from aftbed.cli.simfailure import repeating
+from aftbed.core.fault import Act, Fault, Trigger
+from aftbed.core.message import Goal, Scheduled
+from aftbed.runtime.sim.world import Doom, Setup
+
+FLIP: Final = ("--ftm", "pbr", "--count", "10", "--faults", "bitflip result bit 60 nth 3")  # no TR: sdc
+
+
+@pytest.fixture
+def call(call: Call) -> Call:
+    """Call `aftbed` with one process that simulates: exit code, output, errors."""
+
+    def aftbed(*arguments: str | Path) -> tuple[int, str, str]:
+        many = {"--seeds", "--minutes"} & set(map(str, arguments))
+        return call(*arguments, *(("--jobs", "1") if many else ()))
+
+    return aftbed
+
+
+@pytest.fixture
+def sim(call: Call) -> Call:
+    """Call `aftbed sim`."""
+    return partial(call, "sim")
+
+
+# -- one run
+
+
+def test_a_run_is_told_from_seed_to_seed(sim: Call) -> None:
+    code, out, err = sim("--seed", "7", "--count", "20", "--faults", "crash primary at server.exit nth 3")
+    lines = out.splitlines()
+    assert (code, err) == (0, "")
+    assert lines[0] == lines[-1] == "seed 7"
+    assert lines[1] == "pbr (process), seed 7, 20 requests; crash primary at server.exit nth 3"
+    assert "  requests   20 sent, 20 answered, 0 lost, 0 duplicated, 0 late, 0 wrong" in lines
+    assert any(line.startswith("  failover   to epoch 2: detected 0.") for line in lines)
+    assert "  fault      crash primary at server.exit nth 3: applied" in lines
+    assert re.search(r"^[0-9.]+ ms of virtual time in [0-9.]+ ms; outcome: tolerated$", out, re.MULTILINE)
+    assert lines[-2] == "verdict: pass"
+
+
+def test_the_same_seed_tells_the_same(sim: Call) -> None:
+    arguments = ("--seed", "3", "--count", "20", "--rate", "900", "--faults", "crash backup after 4ms")
+    first, second = (re.sub(r" in [0-9.]+ ms", "", sim(*arguments)[1]) for _ in range(2))
+    assert first == second
+
+
+def test_an_adaptation_is_told_with_its_blackout(sim: Call) -> None:
+    words = ("--ftm", "lfr", "--count", "30", "--rate", "500", "--adapt", "compose lfr+tr at request 5")
+    code, out, _ = sim(*words)
+    assert code == 0
+    assert re.search(r"1 +0\.01 s .* 10/22 drained lfr to lfr\+tr: done", out)
+    document = json.loads(sim(*words, "--json")[1])
+    (adaptation,) = document["adaptations"]
+    assert adaptation["outcome"] == "done" and 0 < adaptation["blackout_ms"] < 3
+    assert document["verdict"] == "pass" and document["requests"]["answered"] == 30
+
+
+def test_a_car_stops_short(sim: Call) -> None:
+    code, out, _ = sim("--scenario", "ccrs-20", "--faults", "crash primary at server.exit nth 40")
+    assert code == 0
+    assert re.search(r"^  car        stopped [0-9.]+ m short", out, re.MULTILINE)
+    assert "vehicle pass" in out
+
+
+def test_what_was_asked_for_and_never_came_about_is_no_pass(sim: Call) -> None:
+    fault = ("--count", "10", "--faults", "crash primary at server.exit nth 11")
+    code, out, _ = sim(*fault)
+    assert code == 3
+    assert "never fired: crash primary at server.exit nth 11" in out and "verdict: inconclusive" in out
+    code, out, _ = sim("--count", "10", "--adapt", "to lfr after 60s", "--json")
+    assert code == 3
+    assert json.loads(out)["missed"] == ["never began: the adaptation to lfr"]
+    code, out, _ = sim(*fault, "--seeds", "0..2")
+    assert code == 3
+    assert "inconclusive: in 3 runs" in out and "seed 0: never fired" in out
+
+
+def test_a_service_whose_every_replica_was_struck_is_unavailable_and_nothing_is_broken(sim: Call) -> None:
+    code, out, _ = sim("--ftm", "none", "--count", "10", "--faults", "crash primary at server.exit nth 3")
+    assert code == 0 and "outcome: unavailable" in out
+
+
+# -- a failure
+
+
+def test_a_failure_is_shrunk_and_its_commands_repeat_it(sim: Call, call: Call) -> None:
+    code, out, _ = sim("--seed", "5", *FLIP)
+    assert code == 1
+    assert "  because    G4: request 3: the reply is not the bare server's" in out
+    assert out.splitlines()[0] == out.splitlines()[-1] == "seed 5"
+    original, shrunk = re.findall(r"^  repeat +(aftbed sim .*)$", out, re.MULTILINE)
+    assert "--count 10" in original and "nth 3" in original
+    assert "--seed 5" in shrunk and "--count 1 " in shrunk and "nth 1" in shrunk
+    for command in (original, shrunk):
+        code, again, _ = call(*shlex.split(command)[1:])
+        assert code == 1 and "because    G4: request" in again
+
+
+def test_the_document_of_a_failure(sim: Call) -> None:
+    code, out, _ = sim("--seed", "5", *FLIP, "--json")
+    found = json.loads(out)
+    assert code == 1
+    assert (found["seed"], found["verdict"], found["outcome"]) == (5, "fail", "sdc")
+    assert found["breaches"] == ["G4: request 3: the reply is not the bare server's"]
+    assert found["command"].startswith("aftbed sim --seed 5 --ftm pbr --count 10 --faults ")
+    assert "--count 1 " in found["shrunk"]
+
+
+def test_a_failure_shows_its_last_messages_and_draws_them(sim: Call, tmp_path: Path) -> None:
+    _, out, _ = sim(*FLIP, "--diagram", tmp_path / "last.md")
+    drawn_text = out.partition("verdict: fail\n")[2].partition("found: ")[0]
+    assert "pxy2pro" in drawn_text and "fault.applied: bitflip result bit 60 in primary" in drawn_text
+    assert drawn_text.splitlines()[-1] == "broken: G4: request 3: the reply is not the bare server's"
+    assert (tmp_path / "last.md").read_text().startswith("sequenceDiagram\n")
+
+
+def test_a_diagram_of_many_is_of_the_first_that_broke(sim: Call, tmp_path: Path) -> None:
+    path = tmp_path / "first.md"
+    code, _, err = sim("--seeds", "0..1", "--count", "3", "--diagram", path)
+    assert code == 0 and not path.exists()
+    assert f"nothing broke: {path} is not written" in err
+    code, _, err = sim("--seeds", "0..1", *FLIP, "--diagram", path)
+    assert (code, err) == (1, "") and "sequenceDiagram" in path.read_text()
+
+
+def test_a_breakdown_of_the_executive_is_a_failure(sim: Call, monkeypatch: pytest.MonkeyPatch) -> None:
+    def breaks_down(setup: Setup) -> None:
+        raise KeyError("a/server")
+
+    monkeypatch.setattr("aftbed.campaign.explore.simulate", breaks_down)
+    monkeypatch.setattr("aftbed.cli.simulating.failure", lambda *_, **__: None)
+    code, out, _ = sim("--json")
+    assert code == 1 and json.loads(out)["verdict"] == "fail"
+
+
+def test_every_experiment_of_a_swarm_has_a_command_of_its_own() -> None:
+    for setup in map(drawn, range(300)):
+        assert repeating(setup).startswith(f"aftbed sim --seed {setup.seed} --ftm {setup.ftm} "), setup
+
+
+def test_what_an_engine_would_refuse_needs_force() -> None:
+    same = Setup(adaptations=(Scheduled(Goal(expression="pbr"), 5),))
+    assert repeating(same).endswith('--adapt "to pbr at request 5" --force')
+    other = Setup(adaptations=(Scheduled(Goal(expression="lfr"), 0, 2.5),))
+    assert repeating(other).endswith('--adapt "to lfr after 2.5ms"')
+
+
+def test_a_time_in_a_command_is_exact_and_what_no_command_says_has_none() -> None:
+    early = Setup(faults=(Fault(Act.CRASH, "primary", Trigger(after_ms=0.125)),))
+    assert repeating(early).endswith('--faults "crash primary after 0.125ms"')
+    assert repeating(replace(early, dooms=(Doom("a/server", 1),))) == ""
+
+
+# -- many
+
+
+def test_many_runs_are_counted(sim: Call) -> None:
+    code, out, _ = sim("--seeds", "3..6", "--count", "5")
+    lines = out.splitlines()
+    assert code == 0 and lines[0] == lines[-1] == "seeds 3..6"
+    assert re.fullmatch(
+        r"4 of 4 survived \(0 unavailable\) in [0-9.]+ s: [0-9 ]+ runs/s, [0-9 ]+ requests/s", lines[-2]
+    )
+
+
+def test_the_document_of_many(sim: Call) -> None:
+    code, out, _ = sim("--seeds", "0..1", *FLIP, "--json")
+    found = json.loads(out)
+    assert code == 1
+    assert (found["seeds"], found["runs"], found["survived"], found["unavailable"]) == ([0, 1], 2, 0, 0)
+    assert [broken["seed"] for broken in found["broken"]] == [0, 1]
+    assert set(found["broken"][0]) == {"seed", "breaches", "command", "shrunk"}
+    assert found["runs_per_second"] > 0 and found["requests_per_second"] > 0
+
+
+def test_of_many_that_break_only_the_first_are_shrunk(sim: Call) -> None:
+    last = simulating.SHRUNK_MAX
+    broken = json.loads(sim("--seeds", f"0..{last}", *FLIP, "--json")[1])["broken"]
+    assert [bool(one["shrunk"]) for one in broken] == [True] * last + [False]
+    out = sim("--seeds", f"0..{last}", *FLIP)[1]
+    assert len(re.findall("^found: ", out, re.MULTILINE)) == last
+    assert f"{last + 1} broke in all; --json lists them" in out
+
+
+def test_two_processes_find_the_same_as_one_in_the_same_order() -> None:
+    setups = [Setup("lfr", seed=seed, count=1 + seed % 3) for seed in range(40)]
+    alone, together = (list(each(tried, setups, jobs)) for jobs in (1, 2))
+    assert alone == together
+    assert [(number, setup.seed) for number, setup, _ in alone] == [(n, n) for n in range(40)]
+
+
+def test_what_has_no_end_is_not_handed_out_all_at_once() -> None:
+    endless = (Setup("none", seed=seed, count=1) for seed in itertools.count())
+    with closing(each(tried, endless, 2)) as found:
+        assert [number for number, _, _ in itertools.islice(found, 20)] == list(range(20))
+
+
+def test_minutes_go_on_from_the_seed(sim: Call) -> None:
+    code, out, _ = sim("--seed", "4", "--minutes", "0.001", "--count", "5", "--json")
+    found = json.loads(out)
+    assert code == 0 and found["runs"] >= 1
+    assert found["seeds"] == [4, 3 + found["runs"]]
+
+
+def test_a_swarm_is_drawn_from_the_seed(sim: Call) -> None:
+    _, out, _ = sim("--swarm", "--seed", "3", "--json")
+    assert json.loads(out)["setup"].startswith(f"{drawn(3).ftm} ({drawn(3).placement}), seed 3, ")
+
+
+# -- bad input
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--seeds", "5..4"), ("--seeds 5..4", "no seed is in it", "as 4..5")),
+        (("--seeds", "5"), ("--seeds '5'", "A..B")),
+        (("--seeds", "a..b"), ("A..B", "0..99")),
+        (("--seeds", "-1..4"), ("A..B",)),
+        (("--seeds", "0..9999999999999999999"), ("--seeds", "9223372036854775807")),
+        (("--seeds", "0..3", "--seed", "1"), ("--seeds and --seed", "stands alone")),
+        (("--seeds", "0..3", "--minutes", "1"), ("--seeds and --minutes",)),
+        (("--seed", "-1"), ("--seed -1", "0 to 9223372036854775807")),
+        (("--minutes", "0"), ("--minutes 0.0", "more than 0")),
+        (("--minutes", "nan"), ("--minutes nan",)),
+        (("--count", "0"), ("--count 0", "1 to 100000")),
+        (("--count", "100001"), ("--count 100001",)),
+        (("--rate", "0"), ("--rate 0.0", "each follows the reply before")),
+        (("--rate", "nan"), ("--rate nan",)),
+        (("--count", "100000", "--rate", "1"), ("--rate 1.0", "3600 s of virtual time")),
+        (("--jobs", "0"), ("--jobs 0", "1 to 256")),
+        (("--ftm", "pbrr"), ("unknown FTM 'pbrr'", "did you mean 'pbr'")),
+        (("--placement", "proces"), ("unknown placement", "did you mean 'process'")),
+        (("--scenario", "ccrs50"), ("unknown scenario 'ccrs50'", "did you mean 'ccrs-50'")),
+        (("--scenario", "ccrs-50", "--count", "5"), ("the car makes the requests", "--count")),
+        (("--swarm", "--ftm", "pbr"), ("--swarm draws everything", "leave out --ftm")),
+        (("--swarm", "--count", "3", "--force"), ("leave out --count, --force",)),
+        (("--faults", "crash a/servr"), ("unknown target 'a/servr'", "did you mean 'a/server'")),
+        (("--ftm", "none", "--faults", "crash backup"), ("unknown target 'backup'",)),
+        (("--faults", "crash zygote"), ("the simulator has no zygote",)),
+        (("--faults", "crash primary after 9999999s"), ("duration '9999999s'",)),
+        (("--faults", "crash primary at server.exitt"), ("did you mean 'server.exit'",)),
+        (
+            ("--ftm", "none", "--faults", "crash primary at checkpoint.sent"),
+            ("cannot trigger a fault under --ftm none",),
+        ),
+        (("--adapt", "to lfrr"), ("--adapt 'to lfrr'", "did you mean 'lfr'")),
+        (("--adapt", "to lfr at request 101"), ("there are 100 requests",)),
+        (("--adapt", "update before to aftbed.ftm.before:PbrBefore"), ("loads no brick",)),
+        (("--adapt", "decompose", "--force"), ("to EXPR",)),
+        (("--adapt", "to lfr", "--recipe", "papr"), ("unknown recipe 'papr'",)),
+        (("--force",), ("give --adapt too",)),
+        (("--diagram", "/nowhere/at/all.md"), ("--diagram /nowhere/at/all.md", "a directory that exists")),
+    ],
+)
+def test_options_that_are_refused(refused: Run, arguments: tuple[str, ...], words: tuple[str, ...]) -> None:
+    error = refused("sim", *arguments)
+    assert all(word in error for word in words), error
