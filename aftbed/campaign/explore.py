@@ -223,7 +223,7 @@ def attempt(setup: Setup) -> tuple[Run | None, tuple[Breach, ...]]:
 def broken_by(run: Run) -> tuple[Breach, ...]:
     """All that `run` breaks, and what the car should not have done."""
     found = breaches(run)
-    if run.vehicle is None or run.rest.lost:  # the drive ends with the service: nobody knows what was to come
+    if run.vehicle is None or run.rest.lost:  # nobody promised that it would end well
         return found
     car = broken_expectations(load_scenario(run.setup.scenario), run.vehicle)
     return (*found, *(Breach(CAR, reason) for reason in car[:1]))

@@ -76,6 +76,9 @@ class Load:
         self._dialogue.write(now_ns, request_id, 0, EntryKind.SENT, payload)
         return Submit(payload)
 
+    def wait(self, now_ns: int) -> None:
+        """A load that is held up makes good for it later, as far as it does."""
+
     def accept(self, reply: Reply, now_ns: int) -> None:
         """Keep the reply in the dialogue."""
         self._dialogue.write(now_ns, reply.request_id, reply.epoch, EntryKind.ANSWERED, reply.payload)

@@ -25,6 +25,10 @@ class Device(Protocol):
         """The next message for the brick, or None."""
         ...
 
+    def wait(self, now_ns: int) -> None:
+        """Nobody takes anything now, and time goes on."""
+        ...
+
     def accept(self, reply: Reply, now_ns: int) -> None:
         """What the brick sent to `deliver`."""
         ...
@@ -85,6 +89,9 @@ class Sensor:
         self._next_ns = now_ns + PERIOD_NS
         return Pulses({name: node.pulse_ns(now_ns) for name, node in self._nodes.items()})
 
+    def wait(self, now_ns: int) -> None:
+        """Whoever dies is kept in mind."""
+
     def accept(self, reply: Reply, now_ns: int) -> None:
         """Nothing is delivered to a sensor."""
         raise AssertionError("a reply delivered to a Watchdog's sensor")
@@ -120,6 +127,10 @@ class Car:
         payload = self._payloads.popleft()
         self._dialogue.write(now_ns, self._client.next_id, 0, EntryKind.SENT, payload)
         return Submit(payload)
+
+    def wait(self, now_ns: int) -> None:
+        """The car drives on; what it asks for is kept, as far as there is room."""
+        self._payloads.extend(self._car.advance(now_ns - self._began_ns))
 
     def accept(self, reply: Reply, now_ns: int) -> None:
         """To the brakes; written behind, so that a reply that nobody got is asked again."""

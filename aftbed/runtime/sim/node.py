@@ -311,7 +311,10 @@ class Node:
 
     def _from_device(self) -> bool:
         device, hosted = self.device, self.device_brick
-        if device is None or hosted is None or device.port not in hosted.brick.open_ports():
+        if device is None or hosted is None:
+            return False
+        if device.port not in hosted.brick.open_ports():
+            device.wait(self._clock.ns)
             return False
         message = device.take(self._clock.ns)
         if message is None:
