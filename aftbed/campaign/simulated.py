@@ -7,7 +7,7 @@ A service that is gone because a fault struck each replica is no breach: nobody 
 """
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Final
 
 import msgspec
@@ -24,6 +24,7 @@ from aftbed.runtime.sim.world import Run
 from aftbed.vehicle.function import default_application
 
 SINGLE: Final = "single"  # the node of that placement: one host, one fate
+RENEWAL: Final = "new backup"
 REST: Final = "rest"
 ASSERT: Final = "assert"
 
@@ -60,18 +61,32 @@ def breaches(run: Run, function: Callable[[], Application] = default_application
 
 
 def struck_down(run: Run) -> bool:
-    """Whether faults struck each replica, the second before redundancy was back from the first."""
+    """Whether faults struck each replica, the second before redundancy was back from the first.
+
+    Or any, where for a time there may have been one only.
+    """
     replicas = {b.replica for b in run.rest.graph.bricks if b.replica and b.part == "server"}
-    renewed = [t_ns for t_ns, event, text in run.told if event == "script.done" and "new backup" in text]
+    renewed = list(_renewals(run))
     strikes = sorted((t_ns, replica_of(name)) for t_ns, name in run.struck if replica_of(name))
     if any(name == SINGLE for _, name in run.struck):
         return True
-    if len(replicas) < 2:
+    simplex = any(a.goal.expression and not replication_of(a.goal.expression) for a in run.setup.adaptations)
+    if len(replicas) < 2 or simplex:
         return bool(strikes)
     return any(
-        other != replica and not any(first_ns < t_ns < second_ns for t_ns in renewed)
+        other != replica and not any(first_ns < began and done < second_ns for began, done in renewed)
         for (first_ns, replica), (second_ns, other) in itertools.combinations(strikes, 2)
     )
+
+
+def _renewals(run: Run) -> Iterator[tuple[int, int]]:
+    """When each new backup was begun, and when it stood."""
+    began_ns = 0
+    for t_ns, event, text in run.told:
+        if event == "script" and text.startswith(RENEWAL):
+            began_ns = t_ns
+        elif event == "script.done" and text.startswith(RENEWAL):
+            yield began_ns, t_ns
 
 
 def half_a_graph(run: Run) -> list[str]:

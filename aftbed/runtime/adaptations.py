@@ -69,8 +69,8 @@ def _spoiled(reason: str) -> Keys:
 class _Current:
     """The one under way."""
 
-    def __init__(self, outcome: Outcome, answer: Answer, began_ns: int) -> None:
-        self.outcome, self.answer, self.began_ns = outcome, answer, began_ns
+    def __init__(self, outcome: Outcome, answer: Answer, began_ns: int, epoch: int) -> None:
+        self.outcome, self.answer, self.began_ns, self.epoch = outcome, answer, began_ns, epoch
         self.phase_ns = 0
         self.script: Script | None = None
         self.phase = Phase.PREPARE
@@ -147,7 +147,7 @@ class Adaptations:
         number = len(self.history) + 1
         outcome = Outcome(number, goal.expression or goal.part or "script", goal.recipe, deployment.graph.ftm)
         outcome.asked_ms = round((self._loop.now_ns() - self._started_ns) / 1e6, 3)
-        self._current = _Current(outcome, answer, self._loop.now_ns())
+        self._current = _Current(outcome, answer, self._loop.now_ns(), deployment.epoch)
         self._say(message.Adapt(number, goal, deployment.graph))
 
     def schedule(self, scheduled: tuple[message.Scheduled, ...]) -> Keys:
@@ -161,10 +161,15 @@ class Adaptations:
         yield from self._arm(0)
 
     def client_is_new(self) -> Keys:
-        """What waits for a request waits in the new Client from now on."""
+        """What waits for a request waits in the new Client from now on, which has been held until now."""
         lives = range(1, self._deployment.incarnations[CLIENT] + 1)
         records = (r for n in lives for r in self._support.records(self._support.journal_of(CLIENT, n)))
-        yield from self._arm(sum(record.event is Event.REQUEST_SENT for record in records))
+        sent = sum(record.event is Event.REQUEST_SENT for record in records)
+        for number, later in list(self._scheduled.items()):
+            if later.at_request <= sent:
+                self._begin(number)
+        yield from self._arm(sent)
+        yield from self._deployment.ask(CLIENT, control.Resume)
 
     def _arm(self, sent: int) -> Keys:
         """Have the Client, who has sent so many requests, wait for those that are to come."""
@@ -174,12 +179,14 @@ class Adaptations:
 
     def fired(self, process: Process, number: int) -> bool:
         """The Client has come to its request. False if `number` is no trigger of an adaptation."""
-        later = self._scheduled.pop(number, None)
-        if later is None:
+        if number not in self._scheduled:
             return False
-        self._ask_again(later.goal, _nobody, RETRIES_MAX)
+        self._begin(number)
         self._deployment.nursery.order(process, control.Ack(number))
         return True
+
+    def _begin(self, number: int) -> None:
+        self._ask_again(self._scheduled.pop(number).goal, _nobody, RETRIES_MAX)
 
     def _ask_again(self, goal: message.Goal, answer: Answer, retries: int) -> None:
         try:
@@ -205,6 +212,13 @@ class Adaptations:
             return
         if phase is Phase.FINISH and now.lost:
             return  # it was said before the Engine heard of the loss
+        if now.exchange is None and (now.epoch != self._deployment.epoch or self._executor.busy):
+            now.spoiled = now.spoiled or "the leader has changed since it was planned"
+        if now.exchange is None and now.spoiled:
+            now.phase, now.ended = phase, True
+            now.failure = "" if phase is Phase.UNDO else now.spoiled
+            self._say(message.Progress(number, phase, now.failure))
+            return
         if now.exchange is None or now.script is None:
             now.exchange, now.script = Exchange(self._deployment, todo, self._step), todo
             now.outcome.purpose, now.outcome.ftm = todo.purpose, todo.ftm or self._deployment.graph.ftm

@@ -175,8 +175,9 @@ class Conductor:
         return bool(bricks) and self.deployment.graph.brick(bricks[0]).kind in WATCHED_KINDS
 
     def _replace(self, node: str) -> None:
-        if not self.replaceable(node):
-            return  # the graph that runs by now has no place for it
+        under_way = f"{REPLACE}{node}" in self._loop.jobs.names()
+        if not self.replaceable(node) or under_way or self.deployment.lives(node):
+            return  # the graph that runs by now has no place for it, or it is taken
         if self.adaptations.acting:  # both hand channels out
             self._loop.after(RETRY_SECONDS, lambda: self._replace(node))
             return
@@ -198,4 +199,5 @@ class Conductor:
                 self._loop.jobs.start("rearm", self.adaptations.client_is_new(), lambda _: None)
             self._support.nursery.level(LIGHT, self.spares())
 
-        self._loop.jobs.start(f"{REPLACE}{node}", self.deployment.respawn(node), ended)
+        held = node == CLIENT and self.adaptations.to_come  # until it knows what waits for its requests
+        self._loop.jobs.start(f"{REPLACE}{node}", self.deployment.respawn(node, held=held), ended)

@@ -180,11 +180,13 @@ class Deployment:
             raise StepFailed(f"{dead[0]} died")
 
     def shut_replication(self, slot: Slot) -> None:
-        """What `slot` sends to the other replica ends after what was sent."""
+        """What `slot` sends to the other replica ends after what was sent; what is sent to it, is refused."""
         for channel in self.channels.touching(slot.bricks):
             source, sink = channel.link.source, channel.link.sink
             if source in slot.bricks and "/" in sink and sink not in slot.bricks:
                 channel.fence()
+            elif sink in slot.bricks and "/" in source and source not in slot.bricks:
+                channel.refuse()
 
     def watch(self, slot: Slot, *, nobody: bool = False) -> Keys:
         """Have the Watchdog of `slot` watch its present nodes, or nobody. Without a Watchdog: nothing.
@@ -213,13 +215,13 @@ class Deployment:
             tuple(host.pidfd for host in hosts),
         )
 
-    def respawn(self, node: str) -> Keys:
+    def respawn(self, node: str, *, held: bool = False) -> Keys:
         """Replace a dead node of no replica: fresh channels, and its neighbours are told."""
         (brick,) = self.graph.nodes[node]
         touching = [c.link for c in self.channels.touching(frozenset({brick})) if not self._held(c)]
         for link in touching:
             self.channels.renew(link)
-        yield from self.all_of([(yield from self._assign(node))])
+        yield from self.all_of([(yield from self._assign(node, held=held))])
         channels = [c for c in self.channels.touching(frozenset({brick})) if not self._held(c)]
         # The way back stands before anything is asked on the way there: a new Client asks as soon as it is
         # read, an old one asks again as soon as it may write.

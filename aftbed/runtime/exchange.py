@@ -23,9 +23,18 @@ from aftbed.runtime import control
 from aftbed.runtime.deployment import Deployment, Keys
 from aftbed.runtime.interface import Channel, Process
 from aftbed.runtime.jobs import Key, StepFailed, Wait, amid
-from aftbed.runtime.rewiring import INPUT, Changes, gone, replica_of, tell, tell_whoever_lives, way_back
+from aftbed.runtime.rewiring import (
+    INPUT,
+    Changes,
+    gone,
+    replica_of,
+    stop_replication,
+    tell,
+    tell_whoever_lives,
+    way_back,
+)
 from aftbed.runtime.targets import STAGED
-from aftbed.runtime.transfer import EXCHANGE_SECONDS_MAX, Seat, align, answered, ask, migrate, transfer
+from aftbed.runtime.transfer import Seat, align, answered, ask, end, migrate, seen_dead, transfer
 from aftbed.runtime.zygotes import LIGHT
 
 PREPARE_SECONDS_MAX: Final = 5.0  # a stranger's module is imported and tested meanwhile
@@ -110,7 +119,7 @@ class Exchange:
     def finish(self) -> Keys:
         """End what does not serve any more."""
         for process in (*self._replaced.values(), *self._removed.values()):
-            _end(process)
+            end(process)
         for channel in self._let_go.values():
             channel.close()
         self._let_go, self._replaced, self._removed = {}, {}, {}
@@ -174,7 +183,7 @@ class Exchange:
         process = self._deployment.nodes.get(node)
         if process is None:
             raise StepFailed(f"{node} is gone")
-        _end(process)
+        end(process)
         if node not in self.new.nodes:
             del self._deployment.nodes[node]
 
@@ -317,8 +326,7 @@ class Exchange:
         if self.committed:
             deployment.adopt(self.old, self._lost)
             yield from self._watch()  # before those die that are watched now
-        with contextlib.suppress(StepFailed):  # one that will not die within the time is let be
-            yield from self._end_staged()
+        yield from seen_dead(self._staged.values())
         for channel in self._fresh.values():
             channel.close()
         self._let_serve()
@@ -327,13 +335,6 @@ class Exchange:
         self._fresh.clear()
         self.committed = False
         yield Wait(frozenset())
-
-    def _end_staged(self) -> Keys:
-        """And see them dead: one that lives a moment longer would take mail that is for the old ones."""
-        living = [process for process in self._staged.values() if process.alive]
-        for process in living:
-            _end(process)
-        yield Wait(frozenset(("died", p.name, p.pid) for p in living), seconds=EXCHANGE_SECONDS_MAX)
 
     def _let_serve(self) -> None:
         """Whoever was suspended goes on, but for a lost replica."""
@@ -357,8 +358,13 @@ class Exchange:
     def _reverse_adoption(self) -> Keys:
         """From a graph that serves: stop it, take the state back, and let its channels go."""
         deployment = self._deployment
-        for replica in self._lost & deployment.slots.keys():  # it may live and serve: not any more
+        if deployment.leader in self._lost and not replication_of(self.new.ftm):
+            self._lost |= set(REPLICAS)  # nobody else has its state
+            deployment.lost |= self._lost
+        for replica in sorted(self._lost & deployment.slots.keys()):  # it may live and serve: not any more
             deployment.shut_replication(deployment.slots[replica])
+        if deployment.leader not in self._lost and self._lost:
+            yield from stop_replication(deployment, self.new.ftm, self._process)
         path = [(f"{deployment.leader}/protocol", False), *((b, True) for b in drains(self.new, self.old))]
         for brick, drain in path:
             if replica_of(brick) not in self._lost:
@@ -391,9 +397,3 @@ class Exchange:
     def can_go_back(self, without: str) -> bool:
         """Whether what is replaced lives, but for that replica's."""
         return all(p.alive for n, p in self._replaced.items() if replica_of(n) != without)
-
-
-def _end(process: Process) -> None:
-    """It dies, and its death is no news."""
-    process.kind = "killed"
-    process.kill()

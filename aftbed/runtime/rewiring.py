@@ -1,17 +1,18 @@
 """What each process must hear for a graph to be wired: the ends of channels, one order for each process."""
 
 import contextlib
+import functools
 from collections.abc import Callable, Iterable
 from typing import Final
 
 from aftbed.core.graph import Graph, Link, ends
-from aftbed.ftm.mechanism import REPLICAS
+from aftbed.ftm.mechanism import REPLICAS, replication_of
 from aftbed.runtime import control
 from aftbed.runtime.channels import Channels
 from aftbed.runtime.deployment import Deployment, Keys
 from aftbed.runtime.interface import Process
 from aftbed.runtime.jobs import StepFailed
-from aftbed.runtime.transfer import answered
+from aftbed.runtime.transfer import answered, ask
 
 Ends = dict[tuple[str, str], int]  # brick, port -> descriptor, or NOWHERE
 INPUT: Final = "in"
@@ -68,6 +69,15 @@ def tell_whoever_lives(deployment: Deployment, changes: dict[int, Changes]) -> K
             yield from answered([pair])
 
 
+def stop_replication(deployment: Deployment, ftm: str, host: Callable[[str], Process]) -> Keys:
+    """A leader that waits for a lost backup to read waits no more."""
+    for part, port in replication_of(ftm):
+        brick = f"{deployment.leader}/{part}"
+        unbind = functools.partial(control.BindOutput, brick=brick, port=port, epoch=deployment.epoch)
+        with contextlib.suppress(StepFailed):
+            yield from ask(deployment, host(brick), unbind)
+
+
 def way_back(
     old: Graph, new: Graph, back: set[str], serving: Callable[[str], Process | None], channels: Channels
 ) -> dict[int, Changes]:
@@ -84,7 +94,8 @@ def way_back(
             changes.setdefault(id(process), Changes(process)).bind(brick, port, side, fd)
 
     for link in new.links:
-        if _key(link) not in old_keys and not link.standby:
+        inside = new.node_of(link.source) == new.node_of(link.sink)  # nobody else was told of it
+        if _key(link) not in old_keys and not link.standby and not inside:
             for brick, port, side in ends(link):
                 if brick in stay:
                     tell(brick, port, side, control.NOWHERE)

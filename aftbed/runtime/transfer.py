@@ -1,10 +1,11 @@
-"""State on its way from one brick to another, asked of the processes that host them.
+"""What an adaptation asks of processes, and their ends; state on its way from one brick to another.
 
 A brick captures its state as bytes and takes bytes back (design 4, the brick contract); what they mean is
 its own affair. Both ends are quiet while it happens: that is the business of whoever asks.
 """
 
-from collections.abc import Callable, Generator
+import contextlib
+from collections.abc import Callable, Generator, Iterable
 from hashlib import blake2b
 from typing import Final
 
@@ -12,7 +13,7 @@ from aftbed.core.graph import Graph
 from aftbed.runtime import control
 from aftbed.runtime.deployment import Deployment, Keys
 from aftbed.runtime.interface import Process
-from aftbed.runtime.jobs import Key, Wait
+from aftbed.runtime.jobs import Key, StepFailed, Wait
 
 EXCHANGE_SECONDS_MAX: Final = 0.5
 
@@ -36,6 +37,24 @@ def answered(sent: list[tuple[Key, str]], seconds: float = EXCHANGE_SECONDS_MAX)
     """Wait for what several processes answer, among them such as have no place in the graph yet."""
     if sent:
         yield Wait(frozenset(k for k, _ in sent), frozenset(n for _, n in sent), seconds)
+
+
+def end(process: Process) -> None:
+    """It dies, and its death is no news."""
+    process.kind = "killed"
+    process.kill()
+
+
+def seen_dead(processes: Iterable[Process]) -> Keys:
+    """End them all, and wait: one that lived a moment longer would take mail that is for others.
+
+    One that will not die within the time is let be.
+    """
+    living = [process for process in processes if process.alive]
+    for process in living:
+        end(process)
+    with contextlib.suppress(StepFailed):
+        yield Wait(frozenset(("died", p.name, p.pid) for p in living), seconds=EXCHANGE_SECONDS_MAX)
 
 
 def transfer(deployment: Deployment, source: Seat, sink: Seat) -> Keys:

@@ -38,7 +38,7 @@ from aftbed.core.message import Rebound, TakeUp
 from aftbed.ftm import recovery
 from aftbed.ftm.recovery import Recovery
 from aftbed.ftm.watchdog import Watchdog
-from aftbed.runtime import exchange
+from aftbed.runtime import exchange, transfer
 from aftbed.runtime.adaptations import Adaptations
 from aftbed.runtime.deployment import Deployment, Keys
 from aftbed.runtime.exchange import Exchange
@@ -370,7 +370,7 @@ EXECUTIVE: Final = (
     Mutant(
         "staged not ended",
         "Exchange leaves alive what it does not need any more",
-        instead(exchange, "_end", lambda process: None),
+        instead(transfer, "end", lambda process: None),
         ADAPT,
         adapts("pbr", "pbr+tr", "a/tr.before'"),
         "G5",
