@@ -23,6 +23,7 @@ from aftbed.runtime.sim.world import Run, Setup, simulate
 Broken = Callable[[Run], Run]
 
 MS: Final = 1_000_000
+RENEWAL_MS: Final = 0.1  # from its beginning to its end
 UNBROKEN: Final = simulate(Setup("pbr", count=6))
 SIMPLEX: Final = simulate(Setup("tr", count=6))
 SWITCHED: Final = Outcome(1, "pbr to lfr", "drained", "lfr", "done")
@@ -78,7 +79,9 @@ def struck(*names: str) -> Broken:
 
 def renewed(ms: float) -> Broken:
     """Redundancy was back at that time."""
-    return lambda run: replace(run, told=(*run.told, (round(ms * MS), "script.done", "new backup: 2.00 ms")))
+    begun = (round((ms - RENEWAL_MS) * MS), "script", "new backup (b)")
+    stands = (round(ms * MS), "script.done", f"new backup: {RENEWAL_MS:.2f} ms")
+    return lambda run: replace(run, told=(*run.told, begun, stands))
 
 
 def with_a_flip(run: Run) -> Run:
