@@ -122,6 +122,13 @@ def pairs(ftms: Iterable[str], placements: Iterable[str]) -> Iterator[Setup]:
                 Fault(Act.BITFLIP, "primary", Trigger(Event.SERVER_EXIT.label, 3), flip=Flip(place, bit))
                 for place, bit in places
             ]
+        if ftm.startswith("pbr"):  # in the backup's checkpoint
+            firsts += [
+                Fault(
+                    Act.BITFLIP, "backup", Trigger(Event.STATE_RESTORED.label, 3), flip=Flip(Place.STATE, bit)
+                )
+                for bit in (0, 100)
+            ]
         for first, node, delay_ms in itertools.product(firsts, nodes, DELAYS_MS):
             second = Fault(Act.CRASH, node, Trigger(after_ms=FIRST_MS + delay_ms))
             yield Setup(ftm, placement, count=PAIR_REQUESTS, rate_hz=PAIR_RATE_HZ, faults=(first, second))
