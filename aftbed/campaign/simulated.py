@@ -4,7 +4,8 @@ The checkers are those of real runs. Beside them: an assert that failed in a bri
 whatever came of it; the graph must be whole at the end (G5); and when the faults are over, the run must come
 to rest.
 No mechanism outvotes a bit that is flipped in a checkpoint, so nothing is promised of the values then, but
-that a switch brings the Servers in line. A service that is gone because a fault struck each replica is no breach: nobody promised anything else.
+that a switch brings the Servers in line. A service that is gone because a fault struck each replica is no
+breach: nobody promised anything else.
 """
 
 import itertools
