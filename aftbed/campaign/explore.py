@@ -9,6 +9,7 @@ that a broken one is repeated by its number in the same `Selection`.
 """
 
 import itertools
+import os
 import signal
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
@@ -29,6 +30,7 @@ from aftbed.core.script import Stage, flat
 from aftbed.ftm.mechanism import build
 from aftbed.runtime.sim.world import Doom, Run, Setup, simulate
 from aftbed.runtime.targets import STAGED
+from aftbed.runtime.unix import linux
 from aftbed.vehicle.scenario import broken_expectations, load_scenario
 
 DUPLEX: Final = ("pbr", "lfr", "pbr+tr", "lfr+tr", "pbr+assert", "lfr+assert")
@@ -268,7 +270,7 @@ def explore(
 
 
 def each(
-    judge: Callable[[Setup], T], setups: Iterable[Setup], jobs: int = 1
+    judge: Callable[[Setup], T], setups: Iterable[Setup], jobs: int = 1, chunk_size: int = CHUNK
 ) -> Generator[tuple[int, Setup, T], None, None]:
     """`judge` on every experiment, in order, over `jobs` processes; there may be no end of them.
 
@@ -280,10 +282,10 @@ def each(
         return
     numbered = enumerate(setups)
     under_way: deque[tuple[list[tuple[int, Setup]], Future[list[T]]]] = deque()
-    pool = ProcessPoolExecutor(jobs, initializer=_leave_interrupts_to_the_command)
+    pool = ProcessPoolExecutor(jobs, initializer=_belong_to, initargs=(os.getpid(),))
     try:
         while True:
-            while len(under_way) < AHEAD * jobs and (chunk := list(itertools.islice(numbered, CHUNK))):
+            while len(under_way) < AHEAD * jobs and (chunk := list(itertools.islice(numbered, chunk_size))):
                 under_way.append((chunk, pool.submit(_all, judge, [setup for _, setup in chunk])))
             if not under_way:
                 return
@@ -300,5 +302,7 @@ def _all(judge: Callable[[Setup], T], setups: list[Setup]) -> list[T]:
     return [judge(setup) for setup in setups]
 
 
-def _leave_interrupts_to_the_command() -> None:
+def _belong_to(command: int) -> None:
+    """Leave interrupts to the command, and die with it, whatever ends it (G7)."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    linux.die_with(command)

@@ -7,13 +7,13 @@ experiment ends when all its orders have been run, or at a bound on the runs, wh
 
 import itertools
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from random import Random
 from typing import Final
 
 import msgspec
 
+from aftbed.campaign.explore import each
 from aftbed.campaign.simulated import Breach, breaches
 from aftbed.runtime.sim.clock import Clock
 from aftbed.runtime.sim.interleaving import HeldChannel, orders
@@ -64,9 +64,5 @@ def all_orders(setup: Setup, runs_max: int = RUNS_MAX) -> Ordered:
 
 def explore_orders(setups: Iterable[Setup], runs_max: int = RUNS_MAX, jobs: int = 1) -> Iterator[Ordered]:
     """Every experiment, in order."""
-    one = partial(all_orders, runs_max=runs_max)
-    if jobs == 1:
-        yield from map(one, setups)
-        return
-    with ProcessPoolExecutor(jobs) as pool:
-        yield from pool.map(one, setups)
+    for _, _, found in each(partial(all_orders, runs_max=runs_max), setups, jobs, chunk_size=1):
+        yield found

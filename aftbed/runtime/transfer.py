@@ -5,6 +5,7 @@ its own affair. Both ends are quiet while it happens: that is the business of wh
 """
 
 import contextlib
+import functools
 from collections.abc import Callable, Generator, Iterable
 from hashlib import blake2b
 from typing import Final
@@ -66,7 +67,7 @@ def transfer(deployment: Deployment, source: Seat, sink: Seat) -> Keys:
 def align(deployment: Deployment, source: Seat, sink: Seat) -> Keys:
     """The same, where the two differ: both are asked at once, and the digests are compared."""
     asked = [
-        deployment.order_to(process, lambda token, b=brick: control.Capture(token, b))  # type: ignore[misc]
+        deployment.order_to(process, functools.partial(control.Capture, brick=brick))
         for brick, process in (source, sink)
     ]
     got = yield Wait(frozenset(k for k, _ in asked), frozenset(n for _, n in asked), EXCHANGE_SECONDS_MAX)
@@ -82,11 +83,8 @@ def migrate(
     for brick in given.nodes[node]:
         if brick not in taken.nodes[node]:
             continue
-        state = yield from ask(deployment, giver, lambda token, b=brick: control.Capture(token, b))  # type: ignore[misc]
+        state = yield from ask(deployment, giver, functools.partial(control.Capture, brick=brick))
         changed = given.brick(brick) != taken.brick(brick)
         if state:
-            yield from ask(
-                deployment,
-                taker,
-                lambda token, b=brick, s=state, c=changed: control.Restore(token, b, s, c),  # type: ignore[misc]
-            )
+            restored = functools.partial(control.Restore, brick=brick, state=state, migrate=changed)
+            yield from ask(deployment, taker, restored)

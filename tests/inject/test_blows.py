@@ -86,7 +86,7 @@ class Host:
             self.node.wiring.hosted[name].outs["out"] = self.out.append
 
     def arm(self, *blows: control.Blow, event: str = EXIT) -> None:
-        assert carry_out(self.node, control.Arm(1, event, blows), []) == b""
+        assert carry_out(self.node.host, control.Arm(1, event, blows), []) == b""
 
     def execute(self, request_id: int, name: str = "a/server") -> Message:
         """The answer to one request."""

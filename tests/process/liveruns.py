@@ -163,13 +163,9 @@ class Started:
         seed: int = 0,
         record: Path | None = None,
     ) -> None:
+        kept = str(record) if record else None
         options, listener = options_for(
-            ftm=ftm,
-            placement=placement,
-            work=work,
-            seed=seed,
-            faults=faults,
-            record=str(record) if record else None,
+            ftm=ftm, placement=placement, work=work, seed=seed, faults=faults, record=kept
         )
         self.launched = launch(options, listener)
         home.forks += [self.launched.supervisor, self.launched._warden]

@@ -6,8 +6,13 @@ import pytest
 
 from aftbed.campaign.simulated import breaches
 from aftbed.core.message import Goal, Scheduled
+from aftbed.ftm.mechanism import STATEFUL, replication_of
+from aftbed.ftm.recovery import drop_backup, failover, new_backup
 from aftbed.inject.words import parse
-from aftbed.runtime.sim.world import Doom, Setup, simulate
+from aftbed.runtime import control
+from aftbed.runtime.sim.world import Doom, Setup, World, simulate
+
+MS: Final = 1_000_000
 
 
 class Found(NamedTuple):
@@ -151,3 +156,24 @@ OTHERS: Final = {
 @pytest.mark.parametrize("what", OTHERS)
 def test_a_run_that_broke_a_promise(what: str) -> None:
     assert breaches(simulate(OTHERS[what])) == ()
+
+
+def test_a_script_that_was_ordered_before_the_last_one_was_done_is_not_carried_out() -> None:
+    """Recovery decides anew when it hears of the last one: what it ordered before would be the end of all."""
+    world = World(Setup("pbr", count=40, rate_hz=400.0, faults=(parse("crash primary after 5ms"),)))
+    world.start()
+    world.advance(world.loop.ns + 20 * MS)
+    deployment = world.conductor.deployment
+    assert (deployment.leader, deployment.backup, deployment.epoch) == ("b", "a", 2)
+    recovery = deployment.nodes["recovery"]
+    for old_news in (
+        failover("a", "b", 2),
+        failover("b", "a", 2),
+        drop_backup("a", "b", replication_of("pbr")),
+        new_backup("b", "a", replication_of("pbr"), STATEFUL),
+    ):
+        world.conductor.on_report(recovery, control.Ordered("recovery", old_news))
+    world.end()
+    run = world.outcome()
+    assert breaches(run) == () and run.rest.leader == "b"
+    assert [text for _, event, text in run.told if event == "script"] == ["failover (a)", "new backup (a)"]

@@ -1,7 +1,7 @@
 """What a simulated run is given: requests or a car, a graph, a journal. Made once where it can be."""
 
 from functools import lru_cache
-from typing import Final
+from typing import Final, NoReturn
 
 from aftbed.core.errors import ConfigError
 from aftbed.core.event import Event
@@ -38,7 +38,7 @@ def _codec() -> Codec:
     return load_dbc()
 
 
-def nothing_off_line(place: str) -> object:
+def nothing_off_line(place: str) -> NoReturn:
     """No module is found. Raises ConfigError."""
     raise ConfigError(f"{place}: the simulator loads nothing that was written off line")
 

@@ -102,7 +102,6 @@ class World:
         function: Callable[[], Application] = default_application,
         requests: list[bytes] | None = None,
         make: Make | None = None,
-        load: Callable[[str], object] = nothing_off_line,
         channel: type[Channel] = Channel,
         clock: Callable[[Random], Clock] = Clock,
     ) -> None:
@@ -114,14 +113,13 @@ class World:
         self.dialogue: list[Entry] = []
         self.told: list[tuple[int, str, str]] = []
         self._ends: dict[int, Channel] = {}
-        self._kept: list[bytes] = []
         self.failures: list[str] = []
         self.struck: list[tuple[int, str]] = []  # who died, or was stopped, of a fault, and when
         self.effects: dict[str, int] = {}
         self.lost = False
         self._car_began_ns = 0
         self.journal = Journal(self.journals.setdefault("supervisor.1", []))
-        assembler = Assembler(function, load, make)  # type: ignore[arg-type]
+        assembler = Assembler(function, nothing_off_line, make)
         self.nursery = Nursery(
             self.loop, assembler, self._make_device, self._ends.__getitem__, self._journal_for
         )
@@ -165,8 +163,7 @@ class World:
         """There are no cores here."""
 
     def keep(self, adaptation: bytes) -> None:
-        """For the outcome."""
-        self._kept.append(adaptation)
+        """The outcome has them all."""
 
     def tell(self, event: str, text: str) -> None:
         """For the outcome."""

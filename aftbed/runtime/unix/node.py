@@ -26,7 +26,6 @@ from aftbed.core import wire
 from aftbed.core.brick import CONTROL, Brick, Effect, Note, Send
 from aftbed.core.errors import PeerError
 from aftbed.core.event import Event
-from aftbed.core.fault import Act
 from aftbed.core.journal import FLAG_OFFSET, PULSE_OFFSET, RECORD
 from aftbed.core.message import Adapted, AnyMessage, ChannelEnded, Message, Promoted, Rebound, Reply
 from aftbed.runtime import control
@@ -35,22 +34,20 @@ from aftbed.runtime.unix.devices import Device, Sensor
 from aftbed.runtime.unix.journal import Journal
 from aftbed.runtime.unix.lifeline import Held
 from aftbed.runtime.unix.line import Line
+from aftbed.runtime.unix.obedience import Obedience
 from aftbed.runtime.unix.wiring import Hosted, Inlet, Plan, Wiring
 
 PULSE_SECONDS: Final = 0.02
 READ_BYTES_MAX: Final = wire.PACKET_BYTES_MAX + 1  # one byte more than is allowed, so that it is noticed
 WRITE_SECONDS_MAX: Final = 2.0
 NUDGE: Final = b"\0"
-HOST_FILES: Final = (__file__, control.__file__)  # what is blocked in here is not in a brick
+HOST_FILES: Final = (__file__, Line.recv.__code__.co_filename)  # what is blocked here is in no brick
 EXIT_FENCED: Final = 3
 REFUSED: Final = (PeerError, *wire.UNREADABLE)
 EXIT_ASSERT: Final = 70
-EXIT_DETECTED: Final = 71  # a detected stop
-FAULT_NS_MAX: Final = 5_000_000_000
 
 _now = time.monotonic_ns
-_read = os.read
-_write = os.write
+_read, _write = os.read, os.write
 _encode = wire.encode_unchecked
 _decode = wire.decode_unchecked
 _pack = RECORD.pack_into
@@ -73,6 +70,7 @@ class Node:
         self.draining = False  # suspend only when nothing waits at the open ports
         self.armed: dict[Event, control.Arm] = {}
         self._refused = 0
+        self.host = Obedience(self)
 
     # -- building -----------------------------------------------------------------------------
 
@@ -87,14 +85,6 @@ class Node:
         hosted.outs[CONTROL] = lambda message: self._say(name, message)
         self._hot = hosted if len(self.wiring.hosted) == 1 and not self.wiring.timed else None
 
-    def hosted(self, brick: str) -> Hosted:
-        """The brick of that name."""
-        return self.wiring.hosted[brick]
-
-    def bind_input(self, brick: str, port: str, end: int | None) -> None:
-        """Read `port` from that descriptor from now on."""
-        self.wiring.bind_input(brick, port, end)
-
     def bind_output(self, brick: str, port: str, descriptor: int | None, epoch: int) -> None:
         """Write `port` to `descriptor` from now on, and tell the brick."""
         hosted = self.wiring.bind_output(brick, port, descriptor)
@@ -103,8 +93,8 @@ class Node:
     def attach(self, device: Device, brick: str) -> None:
         """Join `device` to `brick`."""
         self.device, self.device_brick = device, self.wiring.hosted[brick]
-        if device.fds() or device.deadline_ns() is not None or isinstance(device, Sensor):
-            self._hot = None
+        polled = device.fds() or device.deadline_ns() is not None or isinstance(device, Sensor)
+        self._hot = None if polled else self._hot
         self.device_brick.outs["deliver"] = self._deliver
 
     def _deliver(self, message: Message) -> None:
@@ -114,60 +104,6 @@ class Node:
     def _say(self, brick: str, message: Message) -> None:
         assert isinstance(message, Promoted | Adapted)
         self.line.send(control.Said(brick, message))
-
-    # -- what orders and faults do to it: see `orders.Host` ------------------------------------
-
-    def suspend(self, token: int, *, drain: bool) -> None:
-        """Answer `token` as soon as no request is inside (`drain`: nor waits)."""
-        self.suspend_token, self.draining = token, drain
-
-    def resume(self) -> None:
-        """Undo `suspend`."""
-        self.suspended, self.suspend_token = False, 0
-
-    def tell(self, brick: str, message: control.Told) -> None:
-        """Have `brick` step with `message`."""
-        self.step(self.wiring.hosted[brick], CONTROL, message)
-
-    def watch(self, order: control.WatchNodes, fds: list[int]) -> None:
-        """Have the Watchdog watch these."""
-        assert isinstance(self.device, Sensor)
-        self.device.watch(order.nodes, order.journals, order.pids, fds)
-        self.wiring.forget_plans()
-
-    def stats(self) -> bytes:
-        """What its device counts."""
-        return self.device.stats() if self.device is not None else b""
-
-    def quiet(self) -> None:
-        """Its device hands in nothing more."""
-        assert self.device is not None
-        self.device.quiet()
-
-    def record(self, event: Event, request_id: int, detail: int) -> None:
-        """Write a record, now."""
-        self.journal.write(_now(), event, request_id, detail)
-
-    def say(self, report: control.FromNode) -> None:
-        """To the supervisor."""
-        self.line.send(report)
-
-    def strike_itself(self, act: Act) -> None:
-        """Die, or stop, here and now."""
-        os.kill(os.getpid(), signal.SIGKILL if act is Act.CRASH else signal.SIGSTOP)
-
-    def wait_until_hit(self, fault: int) -> None:
-        """Go no further until the supervisor has answered for `fault`."""
-        limit_ns = _now() + FAULT_NS_MAX
-        while _now() < limit_ns:
-            if self.serve_control(wait=True, until=fault):
-                return
-        raise AssertionError(f"fault {fault} was not applied within {FAULT_NS_MAX / 1e9} s")
-
-    def stop_detected(self, brick: str, reason: str) -> None:
-        """A detected stop: end here and now."""
-        print(f"{brick} (pid {os.getpid()}): detected stop: {reason}", file=sys.stderr, flush=True)
-        os._exit(EXIT_DETECTED)
 
     # -- the pulse ----------------------------------------------------------------------------
 
@@ -274,7 +210,7 @@ class Node:
                     at += RECORD_BYTES
                 else:
                     journal.at = at
-                    order_or_halt(self, hosted, effect)
+                    order_or_halt(self.host, hosted, effect)
             journal.at = at
 
     def _wait_for(self, inlet: Inlet) -> None:
@@ -389,9 +325,9 @@ class Node:
                 assert isinstance(effect, Note)
                 self.journal.write(now_ns, effect.event, effect.request_id, effect.detail, hosted.index)
                 if self.armed:
-                    fire(self, hosted, effects, effect)
+                    fire(self.host, hosted, effects, effect)
             else:
-                order_or_halt(self, hosted, effect)
+                order_or_halt(self.host, hosted, effect)
 
     def _write_hard(self, hosted: Hosted, port: str, data: bytes) -> None:
         """The channel is full or shut: serve control meanwhile, since that may be about this channel.
@@ -441,7 +377,7 @@ class Node:
                 served = served or order.token == until
                 continue
             try:
-                data = carry_out(self, order, fds)
+                data = carry_out(self.host, order, fds)
             except PeerError as error:
                 self.ack(order.token, error=str(error))
             else:
