@@ -15,13 +15,13 @@ from typing import Final
 import msgspec
 
 from aftbed.campaign.value import corruptions
+from aftbed.campaign.wholeness import half_a_graph
 from aftbed.core import check
 from aftbed.core.application import Application
 from aftbed.core.check import History
 from aftbed.core.event import Event
 from aftbed.core.fault import Act
-from aftbed.core.graph import Graph
-from aftbed.ftm.mechanism import build, replication_of
+from aftbed.ftm.mechanism import replication_of
 from aftbed.runtime.rewiring import replica_of
 from aftbed.runtime.sim.world import Run
 from aftbed.vehicle.function import default_application
@@ -60,7 +60,7 @@ def breaches(run: Run, function: Callable[[], Application] = default_application
         names = ", ".join(name for _, name in run.struck) or "nobody"
         found.append(Breach("G2", f"the service is lost, though only {names} was struck"))
     if not run.rest.lost and not down:
-        found += [Breach("G5", reason) for reason in half_a_graph(run)[:1]]
+        found += [Breach("G5", reason) for reason in half_a_graph(run.rest.hosted, _expected(run))[:1]]
         found += [Breach(REST, "; ".join(run.rest.why_not))] if run.rest.why_not else []
     return tuple(found)
 
@@ -94,20 +94,10 @@ def _renewals(run: Run) -> Iterator[tuple[int, int]]:
             yield began_ns, t_ns
 
 
-def half_a_graph(run: Run) -> list[str]:
-    """G5: what lives must be the whole graph that the adaptations, as they ended, have come to."""
+def _expected(run: Run) -> str:
+    """The FTM that the adaptations, as they ended, have come to."""
     done = [a.ftm for a in run.adaptations if a.outcome == "done"]
-    expected = done[-1] if done else run.setup.ftm
-    graph = run.rest.graph
-    if not run.rest.leader:
-        return ["nobody leads"]
-    if graph.ftm != expected:
-        return [f"{graph.ftm} runs, though the adaptations came to {expected}"]
-    return check.missing(run.rest.hosted, _whole(graph, expected, run.rest.leader))
-
-
-def _whole(graph: Graph, expression: str, leader: str) -> Graph:
-    return build(expression, graph.placement, leader if replication_of(expression) else "a")
+    return done[-1] if done else run.setup.ftm
 
 
 def outcome(run: Run, function: Callable[[], Application] = default_application) -> str:

@@ -61,7 +61,7 @@ def bare_server(record: RunRecord) -> Make:
     changes: list[tuple[int, Make]] = []
     stored = record.history.events(Event.REPLY_STORED)
     running = BUILT_IN
-    for outcome in _adaptations(record):
+    for outcome in adaptations(record):
         if outcome["outcome"] != "done" or outcome["application"] == running:
             continue
         running = str(outcome["application"])
@@ -71,7 +71,8 @@ def bare_server(record: RunRecord) -> Make:
     return lambda: Succession(changes)
 
 
-def _adaptations(record: RunRecord) -> list[dict[str, object]]:
+def adaptations(record: RunRecord) -> list[dict[str, object]]:
+    """How each one ended, in order."""
     path = record.path / HISTORY_NAME
     lines = path.read_bytes().splitlines() if path.exists() else []
     found = []

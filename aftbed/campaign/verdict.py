@@ -8,10 +8,12 @@ from typing import Final, Literal
 import msgspec
 
 from aftbed.campaign.record import RunRecord
-from aftbed.campaign.succession import bare_server
+from aftbed.campaign.succession import adaptations, bare_server
 from aftbed.campaign.value import value
+from aftbed.campaign.wholeness import half_a_graph
 from aftbed.core import check
 from aftbed.core.check import Check, Failover, Requests
+from aftbed.runtime.hosting import Hosted
 from aftbed.runtime.unix.closedloop import Proposed, read_proposals
 from aftbed.runtime.unix.options import CarRun, ReplayRun
 from aftbed.vehicle.report import VehicleResult
@@ -52,6 +54,7 @@ def judge(record: RunRecord) -> Verdict:
         "exactly_one_answer": check.exactly_one_answer(history, cut_off=record.end is None),
         "one_history": check.one_history(history, bare()),
         "one_master": check.one_master(history),
+        "whole_graph": _whole_graph(record),
         "clean_exit": _clean_exit(record),
         "faults_applied": _faults_applied(record),
         "whole_history": _whole(record),
@@ -112,6 +115,21 @@ def _clean_exit(record: RunRecord) -> Check:
     if reason not in STOPPED:
         return Check("unknown", (reason,))
     return Check("pass")
+
+
+def _whole_graph(record: RunRecord) -> Check:
+    """G5, of a run that ended with somebody who leads and nothing under way."""
+    if record.end is None or "hosted" not in record.end:
+        return Check("unknown", ("the supervisor did not live to say what lived",))
+    living = msgspec.convert(record.end["hosted"], Hosted)
+    if not living.leader or record.end.get("lost"):
+        return Check("pass")  # there is no service left; what that means, the other checks say
+    under_way = record.end.get("unfinished")
+    if under_way:
+        return Check("unknown", (f"the run ended while this was under way: {under_way}",))
+    done = [str(a["ftm"]) for a in adaptations(record) if a["outcome"] == "done"]
+    reasons = half_a_graph(living, done[-1] if done else record.options.ftm)
+    return Check("fail" if reasons else "pass", tuple(reasons[: check.REASONS_MAX]))
 
 
 def _faults(record: RunRecord) -> list[dict[str, str]]:

@@ -46,6 +46,16 @@ class Conductor:
         )
         self.ending = False
 
+    def at_rest(self) -> bool:
+        """Nothing is under way, and nobody who should serve is missing, as far as is known."""
+        deployment, jobs = self.deployment, self._loop.jobs
+        if self.executor.busy or self.adaptations.busy or len(jobs):
+            return False
+        absent = {
+            n for slot in deployment.slots.values() if slot.name != deployment.leader for n in slot.nodes
+        }
+        return all(deployment.lives(node) for node in deployment.graph.nodes if node not in absent)
+
     def spares(self) -> int:
         """Enough for a replica and for one node beside it."""
         slots, nodes = self.deployment.slots.values(), self.deployment.graph.nodes.values()

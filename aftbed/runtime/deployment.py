@@ -267,6 +267,7 @@ class Deployment:
         process = yield from self.nursery.spare(BUS if device == "gateway" else LIGHT)
         process.name, process.kind, process.incarnation = name, "staged", incarnation
         process.journal = self.support.journal_of(node, incarnation)
+        process.bricks = tuple((spec.name, spec.kind) for spec in specs)
         names = {s.name for s in specs}
         locals_ = tuple(
             control.Local(k.source, k.source_port, k.sink, k.sink_port)

@@ -64,6 +64,7 @@ class Process(Protocol):
     pidfd: int
     journal: str  # where it writes its records, `""` for nowhere
     incarnation: int
+    bricks: tuple[tuple[str, str], ...]  # that it was told to host, with the kind of each
     alive: bool
 
     def kill(self) -> bool:

@@ -11,6 +11,7 @@ from aftbed.campaign.verdict import Verdict, judge
 from aftbed.core.event import Event
 from aftbed.core.fault import Act, Fault, Flip, Place, Trigger, flipped
 from aftbed.core.journal import DROPPED_OFFSET, EntryKind
+from aftbed.ftm.mechanism import build
 from aftbed.runtime.unix.journal import Dialogue, Journal
 from aftbed.runtime.unix.options import CarRun, LoadRun, RunOptions, Work
 from aftbed.vehicle.function import default_application, sample_requests
@@ -33,7 +34,16 @@ class RecordInTheMaking:
         self.work = work or LoadRun(3, 0.0)
         self.options = RunOptions("abc123", "/gone", str(path), "pbr", "process", 7, self.work, faults)
         receipts = [{"fault": str(f), "receipt": "applied"} for f in faults]
-        self.end: dict[str, object] | None = {"reason": "", "left": [], "seconds": 1.5, "faults": receipts}
+        lives = [[b.name, b.kind] for b in build("pbr", "process").bricks]
+        hosted = {"ftm": "pbr", "placement": "process", "leader": "a", "backup": "b", "bricks": lives}
+        self.end: dict[str, object] | None = {
+            "reason": "",
+            "left": [],
+            "unfinished": [],
+            "seconds": 1.5,
+            "faults": receipts,
+            "hosted": hosted,
+        }
         self.t_ns = START_NS
         (path / "journal").mkdir(parents=True)
         self._journals: dict[str, Journal] = {}
@@ -63,6 +73,11 @@ class RecordInTheMaking:
             reply = flipped(reply, flipped_bit)
         for _ in range(answers):
             self._dialogue.write(self.t_ns, self.sent, epoch, EntryKind.ANSWERED, reply)
+
+    def host(self, **changes: object) -> None:
+        """What lived at the end was another graph."""
+        assert self.end is not None
+        self.end["hosted"] = msgspec.convert(self.end["hosted"], dict[str, object]) | changes
 
     def lose(self, name: str, count: int) -> None:
         """Of what belonged into this file, `count` found no room."""

@@ -10,6 +10,8 @@ from records import CRASH, FLIP, RecordInTheMaking, whole
 from aftbed.campaign.record import read_record
 from aftbed.campaign.verdict import EXIT_CODES
 from aftbed.core.event import Event
+from aftbed.ftm.mechanism import build
+from aftbed.runtime.unix.support import HISTORY_NAME
 
 
 def test_a_run_without_trouble_passes(path: Path) -> None:
@@ -20,6 +22,7 @@ def test_a_run_without_trouble_passes(path: Path) -> None:
         "exactly_one_answer",
         "one_history",
         "one_master",
+        "whole_graph",
         "clean_exit",
         "faults_applied",
         "whole_history",
@@ -86,6 +89,38 @@ def test_what_is_left_behind_fails(path: Path) -> None:
     assert verdict.reasons == ["clean_exit: left behind: ['a/after (123)']"]
 
 
+def test_half_a_graph_fails(path: Path) -> None:
+    record = whole(path)
+    record.host(bricks=[[b.name, b.kind] for b in build("pbr", "process").bricks if b.name != "b/after"])
+    verdict = record.verdict()
+    assert verdict.verdict == "fail"
+    assert verdict.reasons == ["whole_graph: b/after (pbr.after) is missing"]
+
+
+def test_a_graph_to_which_no_adaptation_led_fails(path: Path) -> None:
+    record = whole(path)
+    record.host(ftm="lfr", bricks=[[b.name, b.kind] for b in build("lfr", "process").bricks])
+    assert record.verdict().reasons == ["whole_graph: lfr runs, though the adaptations came to pbr"]
+    told = {"number": 1, "outcome": "done", "ftm": "lfr", "application": ""}
+    (path / HISTORY_NAME).write_text(json.dumps(told) + "\n")
+    assert record.verdict().verdict == "pass"
+
+
+def test_the_graph_of_a_service_that_is_gone_is_not_asked_for(path: Path) -> None:
+    record = whole(path)
+    record.host(leader="", bricks=[])
+    assert record.verdict().checks["whole_graph"] == "pass"
+
+
+def test_what_was_under_way_at_the_end_is_not_known(path: Path) -> None:
+    record = whole(path)
+    assert record.end is not None
+    record.end["unfinished"] = ["new backup"]
+    verdict = record.verdict()
+    assert (verdict.verdict, verdict.checks["whole_graph"]) == ("inconclusive", "unknown")
+    assert verdict.reasons == ["whole_graph: the run ended while this was under way: ['new backup']"]
+
+
 def test_a_fail_weighs_more_than_what_is_not_known(path: Path) -> None:
     record = whole(path)
     record.request(answers=2)
@@ -108,7 +143,10 @@ def test_a_run_without_an_end_is_inconclusive(path: Path) -> None:
     record.end = None
     verdict = record.verdict()
     assert (verdict.verdict, verdict.checks["clean_exit"]) == ("inconclusive", "unknown")
-    assert verdict.reasons == ["clean_exit: the supervisor did not live to end the run"]
+    assert verdict.reasons == [
+        "whole_graph: the supervisor did not live to say what lived",
+        "clean_exit: the supervisor did not live to end the run",
+    ]
     assert verdict.seconds is None
 
 

@@ -11,7 +11,8 @@ import pytest
 from msgspec.structs import replace
 from planting import flip
 
-from aftbed.campaign.simulated import ASSERT, REST, breaches, half_a_graph, outcome, struck_down
+from aftbed.campaign.simulated import ASSERT, REST, breaches, outcome, struck_down
+from aftbed.campaign.wholeness import half_a_graph
 from aftbed.core.check import missing
 from aftbed.core.event import Event
 from aftbed.core.fault import Place
@@ -62,9 +63,14 @@ def rested(**changes: object) -> Broken:
     return lambda run: replace(run, rest=replace(run.rest, **changes))
 
 
+def living(**changes: object) -> Broken:
+    """Another graph runs, or another replica leads, in the end."""
+    return lambda run: rested(hosted=replace(run.rest.hosted, **changes))(run)
+
+
 def hosting(change: Callable[[set[tuple[str, str]]], set[tuple[str, str]]]) -> Broken:
     """Other bricks live, in the end."""
-    return lambda run: rested(hosted=tuple(sorted(change(set(run.rest.hosted)))))(run)
+    return lambda run: living(bricks=tuple(sorted(change(set(run.rest.hosted.bricks)))))(run)
 
 
 def adapted(*outcomes: Outcome) -> Broken:
@@ -135,13 +141,13 @@ def test_an_unbroken_run_breaks_no_promise(run: Run) -> None:
             hosting(lambda bricks: bricks - {("b/after", "pbr.after")} | {("b/after", "lfr.after")}),
             "G5: b/after (pbr.after) is missing",
         ),
-        (rested(graph=build("lfr", "process")), "G5: lfr runs, though the adaptations came to pbr"),
+        (living(ftm="lfr"), "G5: lfr runs, though the adaptations came to pbr"),
         (adapted(SWITCHED), "G5: pbr runs, though the adaptations came to lfr"),
         (
-            all_of(adapted(UNDONE), rested(graph=build("lfr", "process"))),
+            all_of(adapted(UNDONE), living(ftm="lfr")),
             "G5: lfr runs, though the adaptations came to pbr",
         ),
-        (rested(leader=""), "G5: nobody leads"),
+        (living(leader=""), "G5: nobody leads"),
         (noted("proxy.1", Event.REPLY_ACCEPTED, 6, 1 << 8 | 2), "G6: epoch 1: replies of replicas 1 and 2"),
         (
             noted("proxy.1", Event.REPLY_ACCEPTED, 6, 2 << 8 | 2),
@@ -184,7 +190,7 @@ def test_every_promise_of_a_run_is_told() -> None:
 
 def test_a_service_is_not_lost_in_vain() -> None:
     """Where faults struck each replica, nobody promised more: but for at most once, and right replies."""
-    gone = all_of(LOST, struck("a/server", "b/after"), rested(why_not=("requests wait",), hosted=()))
+    gone = all_of(LOST, struck("a/server", "b/after"), rested(why_not=("requests wait",)))
     unanswered = all_of(gone, retold(lambda e: []))(UNBROKEN)
     assert breaches(unanswered) == ()
     assert outcome(unanswered) == "unavailable"
@@ -221,12 +227,24 @@ def test_a_single_replica_is_struck_down_by_one_fault() -> None:
 
 def test_what_lives_must_be_the_graph_of_who_leads() -> None:
     """After a failover too, and after an adaptation that is done."""
-    failed_over = rested(leader="b", graph=build("pbr", "process", "b"))(UNBROKEN)
-    assert half_a_graph(failed_over) == []
-    new = build("lfr", "process")
-    bricks = tuple((b.name, b.kind) for b in new.bricks)
-    assert half_a_graph(all_of(adapted(SWITCHED), rested(graph=new, hosted=bricks))(UNBROKEN)) == []
-    assert half_a_graph(adapted(UNDONE)(UNBROKEN)) == []
+    begun = UNBROKEN.rest.hosted
+    assert half_a_graph(replace(begun, leader="b", backup="a"), "pbr") == []
+    switched = replace(begun, ftm="lfr", bricks=bricks_of("lfr"))
+    assert half_a_graph(switched, "lfr") == []
+    assert half_a_graph(replace(begun, ftm="lfr"), "lfr")[0] == "a/after (lfr.after) is missing"
+
+
+def test_of_a_survivor_alone_only_its_own_replica_is_asked_for() -> None:
+    alone = tuple(brick for brick in bricks_of("pbr") if not brick[0].startswith("a/"))
+    survivor = replace(UNBROKEN.rest.hosted, leader="b", backup="", bricks=alone)
+    assert half_a_graph(survivor, "pbr") == []
+    broken = replace(survivor, bricks=tuple(b for b in alone if b[0] != "b/server"))
+    assert half_a_graph(broken, "pbr") == ["b/server (server) is missing"]
+    assert half_a_graph(replace(survivor, backup="a"), "pbr")[0] == "a/after (pbr.after) is missing"
+
+
+def bricks_of(ftm: str) -> tuple[tuple[str, str], ...]:
+    return tuple((b.name, b.kind) for b in build(ftm, "process").bricks)
 
 
 def test_all_that_differs_from_a_whole_graph_is_told() -> None:

@@ -26,6 +26,7 @@ from aftbed.runtime.sim.devices import Device, Sensor
 from aftbed.runtime.sim.effects import Died, Hosted, Performer
 
 NEVER: Final = 1 << 62
+PULSE_NS: Final = 20_000_000  # an idle node looks up so often
 
 Say = Callable[[control.FromNode], None]
 Ends = Callable[[int], Channel]
@@ -53,7 +54,7 @@ class Node:
         self.armed: dict[Event, control.Arm] = {}
         self.device: Device | None = None
         self.device_brick: Hosted | None = None
-        self.alive, self.frozen_ns = True, 0
+        self.alive, self.frozen_ns, self._pulse_ns = True, 0, 0
         self.suspended = False
         self._suspend_token, self._draining = 0, False
         self._orders: deque[tuple[control.ToNode, tuple[int, ...]]] = deque()
@@ -172,8 +173,10 @@ class Node:
     # -- its life -----------------------------------------------------------------------------
 
     def freeze(self) -> None:
-        """Stopped wherever it is."""
-        self.frozen_ns = self.frozen_ns or self._clock.ns
+        """Stopped wherever it is; its pulse was shown some time before."""
+        if not self.frozen_ns:
+            self.frozen_ns = self._clock.ns
+            self._pulse_ns = self._clock.ns - self._clock.between_ns(0, PULSE_NS)
 
     def thaw(self) -> None:
         """It goes on from there."""
@@ -182,7 +185,7 @@ class Node:
 
     def pulse_ns(self, now_ns: int) -> int:
         """When it was last seen running."""
-        return self.frozen_ns or now_ns
+        return self._pulse_ns if self.frozen_ns else now_ns
 
     def die(self, reason: str = "") -> None:
         """Dead; its ends of channels are the kernel's to close."""

@@ -23,6 +23,9 @@ SIGNAL_NS: Final = (5_000, 60_000)
 LIFELINE_NS: Final = (100_000, 300_000)
 PIDFD_NS: Final = (500_000, 800_000)
 LINE_NS: Final = (15_000, 60_000)  # an order, or an answer
+FIRST_NS: Final = (100_000, 250_000)  # the first order of its kind runs code that no cache holds
+ROUSED_NS: Final = (200_000, 450_000)  # the executive sleeps while requests flow
+SLEEPS_AFTER_NS: Final = 5_000_000
 BIRTH_NS: Final = (500_000, 3_000_000)
 
 MakeDevice = Callable[[control.Assign, Node], Device]
@@ -49,11 +52,12 @@ class Process:
         self.pid = self.pidfd = number
         self.alive = True  # as far as the executive knows
         self.node: Node | None = None
-        self.kinds: tuple[tuple[str, str], ...] = ()  # its bricks, and the kind of each
+        self.bricks: tuple[tuple[str, str], ...] = ()
         self.dead = self._still = False
         self._nursery, self._clock = nursery, nursery.clock
         self._order_ns = self._say_ns = 0  # of the last one that is under way
         self._orders: deque[tuple[control.ToNode, tuple[int, ...]]] = deque()
+        self._known: set[type[control.ToNode]] = set()  # kinds of orders that it has had
         self._reports: deque[control.FromNode] = deque()
         self._noticed: list[Callable[[], None]] = []
         self._to_it, self._to_us, self._news = (
@@ -144,7 +148,11 @@ class Process:
         """It will read this. Raises StepFailed if it is gone."""
         if self.dead:
             raise StepFailed(f"{self.name} cannot be reached")
-        self._order_ns = max(self._order_ns + 1, self._clock.ns + self._clock.between_ns(*LINE_NS))
+        delay_ns = self._clock.between_ns(*LINE_NS)
+        if type(order) not in self._known:
+            self._known.add(type(order))
+            delay_ns += self._clock.between_ns(*FIRST_NS)
+        self._order_ns = max(self._order_ns + 1, self._clock.ns + delay_ns)
         self._orders.append((order, fds))
         self._clock.message(self._order_ns, self._to_it, self.read)
 
@@ -174,7 +182,8 @@ class Process:
 
     def say(self, report: control.FromNode) -> None:
         """The executive will hear this."""
-        self._say_ns = max(self._say_ns + 1, self._clock.ns + self._clock.between_ns(*LINE_NS))
+        delay_ns = self._clock.between_ns(*LINE_NS) + self._nursery.rouse_ns()
+        self._say_ns = max(self._say_ns + 1, self._clock.ns + delay_ns)
         self._reports.append(report)
         self._clock.message(self._say_ns, self._to_us, self.heard)
 
@@ -209,10 +218,17 @@ class Nursery:
         self.processes: list[Process] = []
         self.by_number: dict[int, Process] = {}
         self.zygotes: dict[str, Process] = {}
+        self._heard_ns = 0
         self.on_report: Callable[[Process, control.FromNode], None] = lambda process, report: None
         self.on_death: Callable[[Process], None] = lambda process: None
         self.on_end: Callable[[Process, str], None] = lambda process, reason: None
         self.on_freeze: Callable[[Process], None] = lambda process: None
+
+    def rouse_ns(self) -> int:
+        """How much longer the executive takes to hear what is said to it now."""
+        asleep = self.clock.ns - self._heard_ns > SLEEPS_AFTER_NS
+        self._heard_ns = self.clock.ns
+        return self.clock.between_ns(*ROUSED_NS) if asleep else 0
 
     def spare(self, zygote: str) -> Generator[Wait, dict[Key, bytes], Process]:
         """A fresh one."""
@@ -237,7 +253,6 @@ class Nursery:
     def build(self, process: Process, order: control.Assign, fds: tuple[int, ...]) -> Node:
         """The node that `order` describes. Raises ConfigError where a class is no good."""
         records = self._records(order.journal)
-        process.kinds = tuple((spec.name, spec.kind) for spec in order.bricks)
         node = Node(order.node, self.clock, records, self._end, process.say, process.ended)
         node.suspended = order.held
         self._assembler.fill(node, order)

@@ -24,6 +24,7 @@ from aftbed.runtime.adaptations import Outcome
 from aftbed.runtime.assembly import Assembler, Make
 from aftbed.runtime.conductor import Conductor
 from aftbed.runtime.deployment import Keys
+from aftbed.runtime.hosting import Hosted, hosted
 from aftbed.runtime.sim.channels import Channel
 from aftbed.runtime.sim.clock import START_NS, Clock
 from aftbed.runtime.sim.devices import Car, Device, Sensor
@@ -74,7 +75,7 @@ class Rest(msgspec.Struct, frozen=True):
     ended_ns: int
     leader: str
     graph: Graph
-    hosted: tuple[tuple[str, str], ...]  # bricks that live, with the kind of each
+    hosted: Hosted
 
 
 class Run(msgspec.Struct, frozen=True):
@@ -344,14 +345,13 @@ class World:
         for process in deployment.nodes.values():
             if isinstance(process, Process) and process.node is not None and process.incarnation == 1:
                 self._count(process.node)
-        hosted = [kind for p in self.nursery.processes if not p.dead for kind in p.kinds]
         rest = Rest(
             () if self.lost else tuple(self._unrest()),
             self.lost,
             self.loop.ns,
             deployment.leader,
             deployment.graph,
-            tuple(sorted(hosted)),
+            hosted(deployment),
         )
         return Run(
             self.setup,

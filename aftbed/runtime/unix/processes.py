@@ -37,6 +37,7 @@ class Process:
         self.header: Header | None = None
         self.alive = True
         self.incarnation = 0
+        self.bricks: tuple[tuple[str, str], ...] = ()
         self.rested = False  # of a spare: it has rehearsed
         self.starvation: linux.Starvation | None = None
 

@@ -19,6 +19,7 @@ from aftbed.ftm.mechanism import build
 from aftbed.runtime import control
 from aftbed.runtime.conductor import HANG_NS, Conductor
 from aftbed.runtime.deployment import Keys
+from aftbed.runtime.hosting import hosted
 from aftbed.runtime.jobs import STATS_JOB
 from aftbed.runtime.unix import linux
 from aftbed.runtime.unix.line import Line, decode_order
@@ -56,6 +57,7 @@ class Supervisor:
         self._grace_until_ns = 0
         self.graph_ms = 0.0
         self._incomplete: list[str] = []
+        self._lost = False
         self._last_tick_ns = 0
         self._situation_wanted = False
         graph = build(options.ftm, options.placement)
@@ -151,18 +153,18 @@ class Supervisor:
         if self._ending:
             return
         self._ending = reason or "done"
-        self.conductor.ending = True
         self._finish_reason = reason
         limit_ns = time.monotonic_ns() + round(DRAIN_SECONDS_MAX * 1e9)
         self.loop.jobs.start("stop", self.work.stop_source(self.deployment), lambda _: None)
         self._drain(limit_ns)
 
     def _drain(self, limit_ns: int) -> None:
-        """Wait until all is answered and no script is under way, or the limit is reached."""
-        settled = self.work.settled and not self.conductor.executor.busy and not len(self.loop.jobs)
+        """Wait until all is answered, and what fails or changes has come to its end; or to the limit."""
+        settled = self.work.settled and (self._lost or self.conductor.at_rest())
         if self.owner_gone() or settled or time.monotonic_ns() > limit_ns:
             if not settled and not self.owner_gone():
                 self._incomplete = self.loop.jobs.names()
+            self.conductor.ending = True
             self.loop.end()
             return
         if not len(self.loop.jobs):
@@ -176,6 +178,7 @@ class Supervisor:
     def _teardown(self) -> None:
         """Kill what is left, reap it, say how it ended, and leave."""
         self._tell_all()
+        living = hosted(self.deployment)
         for process in self.nursery.processes:
             process.kill()
         limit = time.monotonic() + STOP_SECONDS_MAX
@@ -193,8 +196,10 @@ class Supervisor:
             "graph_ms": round(self.graph_ms, 3),
             "left": left,
             "unfinished": self._incomplete,
+            "lost": self._lost,
             "leader": self.deployment.leader,
             "backup": self.deployment.backup,
+            "hosted": msgspec.to_builtins(living),
             "epoch": self.deployment.epoch,
             "faults": self.faults.receipts(),
             **self.work.end(),
@@ -225,6 +230,7 @@ class Supervisor:
 
     def _on_loss(self) -> None:
         """A load would wait for ever; a car drives on."""
+        self._lost = True
         if isinstance(self.options.work, LoadRun):
             self._finish("")
 
@@ -236,7 +242,7 @@ class Supervisor:
             self._grace_until_ns = now_ns + HANG_NS
         self._last_tick_ns = now_ns
         self.deployment.nudge_late()
-        if self.graph_ms and now_ns > self._grace_until_ns and not self._ending:  # births have a limit
+        if self.graph_ms and now_ns > self._grace_until_ns:  # births have a limit
             self.conductor.look_for_hangs()
         self.loop.after(TICK_SECONDS, self._tick)
 
