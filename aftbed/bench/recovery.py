@@ -12,7 +12,7 @@ from aftbed.bench.runs import finish, start
 from aftbed.bench.statistics import summary
 from aftbed.core.check import failovers
 from aftbed.core.errors import ConfigError, HarnessError
-from aftbed.core.fault import Act, Fault, Trigger
+from aftbed.core.fault import Crash, Fault, Trigger
 from aftbed.runtime.unix import ask
 from aftbed.runtime.unix.options import LoadRun
 
@@ -29,7 +29,7 @@ def bench_recovery(ftm: str, placement: str, kills: int, *, pin: bool = True) ->
         epoch = 0
         for _ in range(kills):
             epoch = _wait_for_redundancy(launched.private, epoch)
-            ask.ask(launched.private, ask.Inject(Fault(Act.CRASH, "primary", Trigger())))
+            ask.ask(launched.private, ask.Inject(Fault(Crash(), "primary", Trigger())))
         _wait_for_redundancy(launched.private, epoch)
         launched.stop()
     except BaseException:

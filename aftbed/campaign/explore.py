@@ -23,10 +23,11 @@ from aftbed.adapt.plan import plan, target
 from aftbed.campaign.simulated import ASSERT, Breach, breaches
 from aftbed.core.errors import ConfigError, HarnessError, unknown
 from aftbed.core.event import Event
-from aftbed.core.fault import Act, Fault, Flip, Place, Trigger
+from aftbed.core.fault import FIRED, Action, Crash, Fault, Hang, Trigger
 from aftbed.core.journal import EntryKind
 from aftbed.core.message import Goal, Scheduled
 from aftbed.core.script import Stage, flat
+from aftbed.core.valuefault import EXECUTED, Bit, Flip, Place
 from aftbed.ftm.mechanism import build
 from aftbed.runtime.sim.world import Doom, Run, Setup, simulate
 from aftbed.runtime.targets import STAGED
@@ -46,6 +47,7 @@ AHEAD: Final = 3  # chunks for each worker that are handed out before they are a
 CAR: Final = "vehicle"  # beside the promises: what the scenario expects of the car
 REASON_MAX: Final = 300  # characters of an error of our own
 
+S = TypeVar("S")
 T = TypeVar("T")
 
 
@@ -94,11 +96,12 @@ def adaptations(pairs: Iterable[tuple[str, str]], placements: Iterable[str]) -> 
                 placement,
                 count=ADAPT_REQUESTS,
                 rate_hz=ADAPT_RATE_HZ,
-                faults=(Fault(Act.CRASH, struck.node, Trigger(struck.when.label, struck.step)),),
+                faults=(Fault(Crash(), struck.node, Trigger(struck.when.label, struck.step)),),
                 adaptations=(Scheduled(Goal(expression=new), ADAPT_AT),),
             )
 
 
+STRIKES: Final[tuple[Action, ...]] = (Crash(), Hang())
 FIRST_EVENTS: Final = (  # where the first fault of a pair strikes the leader's side
     Event.REQUEST_RECEIVED,
     Event.BEFORE_EXIT,
@@ -116,23 +119,21 @@ def pairs(ftms: Iterable[str], placements: Iterable[str]) -> Iterator[Setup]:
         nodes = list(build(ftm, placement).nodes)
         firsts = [
             Fault(act, "primary", Trigger(event.label, 3))
-            for act, event in itertools.product((Act.CRASH, Act.HANG), FIRST_EVENTS)
+            for act, event in itertools.product(STRIKES, FIRST_EVENTS)
         ]
         if "tr" in ftm.split("+"):
-            places = itertools.product(Place, (0, 100))
+            places = itertools.product(EXECUTED, (0, 100))
             firsts += [
-                Fault(Act.BITFLIP, "primary", Trigger(Event.SERVER_EXIT.label, 3), flip=Flip(place, bit))
+                Fault(Flip(place, Bit(bit)), "primary", Trigger(Event.SERVER_EXIT.label, 3))
                 for place, bit in places
             ]
         if ftm.startswith("pbr"):  # in the backup's checkpoint
             firsts += [
-                Fault(
-                    Act.BITFLIP, "backup", Trigger(Event.STATE_RESTORED.label, 3), flip=Flip(Place.STATE, bit)
-                )
+                Fault(Flip(Place.STATE, Bit(bit)), "backup", Trigger(Event.STATE_RESTORED.label, 3))
                 for bit in (0, 100)
             ]
         for first, node, delay_ms in itertools.product(firsts, nodes, DELAYS_MS):
-            second = Fault(Act.CRASH, node, Trigger(after_ms=FIRST_MS + delay_ms))
+            second = Fault(Crash(), node, Trigger(after_ms=FIRST_MS + delay_ms))
             yield Setup(ftm, placement, count=PAIR_REQUESTS, rate_hz=PAIR_RATE_HZ, faults=(first, second))
 
 
@@ -249,7 +250,7 @@ def tried(setup: Setup) -> Found:
 
 def missed(run: Run) -> tuple[str, ...]:
     """G8: what was to happen in `run` and did not, so that it proves nothing about it."""
-    found = [f"never fired: {f['fault']}" for f in run.faults if f["receipt"] != "applied"]
+    found = [f"never fired: {f['fault']}" for f in run.faults if f["receipt"] not in FIRED]
     begun = len(run.adaptations)
     late = run.setup.adaptations[begun:]
     return (*found, *(f"never began: the adaptation to {s.goal.expression or s.goal.part}" for s in late))
@@ -270,8 +271,8 @@ def explore(
 
 
 def each(
-    judge: Callable[[Setup], T], setups: Iterable[Setup], jobs: int = 1, chunk_size: int = CHUNK
-) -> Generator[tuple[int, Setup, T], None, None]:
+    judge: Callable[[S], T], setups: Iterable[S], jobs: int = 1, chunk_size: int = CHUNK
+) -> Generator[tuple[int, S, T], None, None]:
     """`judge` on every experiment, in order, over `jobs` processes; there may be no end of them.
 
     Raises HarnessError if one of the processes dies.
@@ -281,7 +282,7 @@ def each(
             yield number, setup, judge(setup)
         return
     numbered = enumerate(setups)
-    under_way: deque[tuple[list[tuple[int, Setup]], Future[list[T]]]] = deque()
+    under_way: deque[tuple[list[tuple[int, S]], Future[list[T]]]] = deque()
     pool = ProcessPoolExecutor(jobs, initializer=_belong_to, initargs=(os.getpid(),))
     try:
         while True:
@@ -298,7 +299,7 @@ def each(
         pool.shutdown(cancel_futures=True)
 
 
-def _all(judge: Callable[[Setup], T], setups: list[Setup]) -> list[T]:
+def _all(judge: Callable[[S], T], setups: list[S]) -> list[T]:
     return [judge(setup) for setup in setups]
 
 

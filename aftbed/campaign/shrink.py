@@ -28,8 +28,9 @@ from msgspec.structs import replace
 
 from aftbed.campaign.simulated import Breach
 from aftbed.core.errors import ConfigError
-from aftbed.core.fault import Act, Fault
+from aftbed.core.fault import Fault, Hang, Slow
 from aftbed.core.message import Scheduled
+from aftbed.core.valuefault import Flip
 from aftbed.ftm.mechanism import build, parse, replication_of
 from aftbed.runtime import targets
 from aftbed.runtime.sim.world import Doom, Setup
@@ -133,7 +134,7 @@ def _smaller_loads(setup: Setup) -> Iterator[Setup]:
 def _smaller_graphs(setup: Setup) -> Iterator[Setup]:
     """A duplex stays one, and where a bit is flipped TR stays."""
     names = parse(setup.ftm)
-    flips = any(fault.act is Act.BITFLIP for fault in setup.faults)
+    flips = any(isinstance(fault.action, Flip) for fault in setup.faults)
     if len(names) > 1 and not flips:
         yield replace(setup, ftm=names[0])
     if replication_of(setup.ftm) and names[0] != "pbr":
@@ -175,8 +176,9 @@ def _earlier_fault(fault: Fault) -> Iterator[Fault]:
         yield replace(fault, trigger=replace(trigger, nth=nth))
     for after_ms in _sooner(trigger.after_ms):
         yield replace(fault, trigger=replace(trigger, after_ms=after_ms))
-    for for_ms in _smaller(fault.for_ms):
-        yield replace(fault, for_ms=for_ms)
+    if isinstance(fault.action, Hang | Slow):
+        for for_ms in _smaller(fault.action.for_ms):
+            yield replace(fault, action=replace(fault.action, for_ms=for_ms))
 
 
 def _earlier_adaptations(setup: Setup) -> Iterator[Setup]:

@@ -20,7 +20,7 @@ from aftbed.core import check
 from aftbed.core.application import Application
 from aftbed.core.check import History
 from aftbed.core.event import Event
-from aftbed.core.fault import Act
+from aftbed.core.valuefault import Flip
 from aftbed.ftm.mechanism import replication_of
 from aftbed.runtime.rewiring import replica_of
 from aftbed.runtime.sim.world import Run
@@ -28,7 +28,11 @@ from aftbed.vehicle.function import default_application
 
 SINGLE: Final = "single"  # the node of that placement: one host, one fate
 RENEWAL: Final = "new backup"
-UNPROMISED: Final = (Event.STATE_CAPTURED.label, Event.STATE_RESTORED.label)  # a bit of a checkpoint
+UNPROMISED: Final = frozenset(  # a bit of a checkpoint, or of a reply that is kept
+    event.label
+    for event in (Event.STATE_CAPTURED, Event.STATE_RESTORED, Event.CHECKPOINT_SENT)
+    + (Event.CHECKPOINT_APPLIED, Event.REPLY_STORED, Event.DEDUPE_HIT)
+)
 REST: Final = "rest"
 ASSERT: Final = "assert"
 
@@ -46,7 +50,7 @@ class Breach(msgspec.Struct, frozen=True):
 def breaches(run: Run, function: Callable[[], Application] = default_application) -> tuple[Breach, ...]:
     """All that `run` breaks; `function` makes the bare server."""
     history, down = run.history, struck_down(run)
-    flips = [f for f in run.setup.faults if f.act is Act.BITFLIP]
+    flips = [f for f in run.setup.faults if isinstance(f.action, Flip)]
     checks = {
         "G1": check.at_most_once(history),
         "G2": check.exactly_one_answer(history, cut_off=down),

@@ -29,6 +29,8 @@ class Succession:
         self._changes = list(changes)
         self._count = 0
         self.characteristics = self._function.characteristics
+        versions = (self._function, *(make() for _, make in changes))
+        self.deterministic = all(version.characteristics.deterministic for version in versions)
 
     def execute(self, request: bytes) -> bytes:
         """By the version whose turn it is."""
@@ -56,7 +58,7 @@ class Succession:
         return self._function.acceptable(request, reply)
 
 
-def bare_server(record: RunRecord) -> Make:
+def bare_server(record: RunRecord) -> Callable[[], Succession]:
     """Makes the bare server of this run. Raises ConfigError where a version of the function is gone."""
     changes: list[tuple[int, Make]] = []
     stored = record.history.events(Event.REPLY_STORED)

@@ -28,9 +28,10 @@ from typing import Final
 
 from aftbed.core.errors import ConfigError
 from aftbed.core.event import REQUEST_PATH, Event
-from aftbed.core.fault import Act, Fault, Flip, Place, Trigger
+from aftbed.core.fault import Crash, Fault, Hang, Trigger
 from aftbed.core.graph import PLACEMENTS
 from aftbed.core.message import Goal, Scheduled
+from aftbed.core.valuefault import EXECUTED, Bit, Flip
 from aftbed.ftm.catalog import EMITTERS
 from aftbed.ftm.mechanism import EXPRESSIONS, NONE, build, parse, replication_of
 from aftbed.runtime import targets
@@ -89,7 +90,7 @@ def _events(ftm: str, placement: str) -> tuple[Event, ...]:
     found = []
     for event in EMITTERS:
         try:
-            targets.check(Fault(Act.CRASH, targets.ROLES[0], Trigger(event.label)), graph)
+            targets.check(Fault(Crash(), targets.ROLES[0], Trigger(event.label)), graph)
         except ConfigError:
             continue
         found.append(event)
@@ -175,8 +176,8 @@ class _Draw:
         nth = chance.randint(1, self._nth_max())
         for _ in range(count):
             bit = chance.choice((None, chance.randrange(BIT_DRAWN_MAX)))
-            flip = Flip(chance.choice(tuple(Place)), bit)
-            found.append(Fault(Act.BITFLIP, role, Trigger(Event.SERVER_EXIT.label, nth), flip=flip))
+            flip = Flip(chance.choice(EXECUTED), Bit(bit))
+            found.append(Fault(flip, role, Trigger(Event.SERVER_EXIT.label, nth)))
             nth += FLIPS_APART + chance.randrange(FLIPS_APART)
         return found
 
@@ -186,10 +187,10 @@ class _Draw:
         steps = trigger.event in {event.label for event in _STEPS}
         target = self._draw_target(staged=steps)
         if chance.random() < 0.6 or target.endswith(targets.STAGED):
-            return Fault(Act.CRASH, target, trigger)
+            return Fault(Crash(), target, trigger)
         watched = target in targets.ROLES or replica_of(target)
         hang_ms = 0 if watched and chance.random() < 0.4 else chance.randint(1, HANG_MS_MAX)
-        return Fault(Act.HANG, target, trigger, hang_ms)
+        return Fault(Hang(hang_ms), target, trigger)
 
     def _draw_target(self, *, staged: bool) -> str:
         chance, graph = self._chance, build(self._ftm, self._placement)

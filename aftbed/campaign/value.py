@@ -10,20 +10,21 @@ from itertools import starmap
 from aftbed.core.application import Application
 from aftbed.core.check import REASONS_MAX, Check, History
 from aftbed.core.errors import PeerError
-from aftbed.core.fault import Act
+from aftbed.core.fault import FIRED
 from aftbed.core.journal import EntryKind
+from aftbed.core.valuefault import BITFLIP
 from aftbed.vehicle.aebmessages import AebOutput, decode_reply
 
 
 def value(history: History, bare: Application, faults: list[dict[str, str]]) -> Check | None:
     """The check, by the receipts of a run; None where no value fault was asked for. `bare` is a fresh one."""
-    flips = [f for f in faults if f["fault"].split()[0] == Act.BITFLIP.value]
+    flips = [f for f in faults if f["fault"].split()[0] == BITFLIP]
     if not flips:
         return None
     wrong = corruptions(history, bare)
     if wrong:
         return Check("fail", tuple(wrong[:REASONS_MAX]))
-    if all(f["receipt"] != "applied" for f in flips):
+    if not any(f["receipt"] in FIRED for f in flips):
         return Check("unknown", ("no value fault was applied",))
     return Check("pass")
 

@@ -13,6 +13,7 @@ from aftbed.campaign.value import value
 from aftbed.campaign.wholeness import half_a_graph
 from aftbed.core import check
 from aftbed.core.check import Check, Failover, Requests
+from aftbed.core.fault import FIRED
 from aftbed.runtime.hosting import Hosted
 from aftbed.runtime.unix.closedloop import Proposed, read_proposals
 from aftbed.runtime.unix.options import CarRun, ReplayRun
@@ -140,7 +141,7 @@ def _faults(record: RunRecord) -> list[dict[str, str]]:
 
 def _faults_applied(record: RunRecord) -> Check:
     """G8: a fault that did not fire proves nothing."""
-    missing = [f for f in _faults(record) if f["receipt"] != "applied"]
+    missing = [f for f in _faults(record) if f["receipt"] not in FIRED]
     return Check("unknown" if missing else "pass", tuple(map(_missed, missing)))
 
 

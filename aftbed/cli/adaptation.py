@@ -18,8 +18,9 @@ import msgspec
 from aftbed.adapt import words
 from aftbed.adapt.consistency import FaultModel, Resources, refusal, remarks
 from aftbed.adapt.engine import script_for
-from aftbed.adapt.plan import APPLICATION, Plan, target, updated
+from aftbed.adapt.plan import APPLICATION, Plan, target
 from aftbed.adapt.plan import plan as planned
+from aftbed.adapt.schedule import before, led_to
 from aftbed.adapt.scriptcheck import refusals
 from aftbed.adapt.scriptfile import ScriptFile, mapping, refuse, script_from
 from aftbed.adapt.words import Wish
@@ -44,7 +45,7 @@ def change(run: str | None, wish: Wish, recipe: str, *, force: bool, as_json: bo
     private = rundir.find(run)
     graph = _graph_of(private)
     goal = _goal(wish, graph, recipe)
-    _refuse_unsuitable(_led_to(graph, goal), wish, force=force)
+    _refuse_unsuitable(led_to(graph, goal), wish, force=force)
     return _ask(private, goal, as_json=as_json)
 
 
@@ -88,34 +89,20 @@ def scheduled(texts: tuple[str, ...], start: Graph, recipe: str, *, force: bool)
         try:
             timed = words.read(text)
             goal = _goal(timed.wish, graph, recipe)
-            graph = _led_to(graph, goal)
+            graph = led_to(graph, goal)
             _refuse_unsuitable(graph, timed.wish, force=force)
         except ConfigError as error:
             raise ConfigError(f"--adapt {text!r}: {error}") from error
         found.append(Scheduled(goal, timed.at_request, timed.after_ms))
-        if len(found) > 1 and _before(found[-1], found[-2]):
+        if len(found) > 1 and before(found[-1], found[-2]):
             raise ConfigError(f"--adapt {text!r}: it begins before the one that stands before it")
     return tuple(found)
-
-
-def _before(one: Scheduled, other: Scheduled) -> bool:
-    """Whether `one` certainly begins before `other`."""
-    if one.at_request and other.at_request:
-        return one.at_request < other.at_request
-    return not one.at_request and not other.at_request and one.after_ms < other.after_ms
 
 
 def _goal(wish: Wish, graph: Graph, recipe: str) -> Goal:
     if wish.verb == "update":
         wish = msgspec.structs.replace(wish, source=_source(wish.source, Path.cwd()))
     return words.goal(wish, graph.ftm, recipe)
-
-
-def _led_to(graph: Graph, goal: Goal) -> Graph:
-    """The graph that `goal` leads to. Raises ConfigError if nothing leads there."""
-    new = updated(graph, goal.part, goal.source) if goal.part else target(graph, goal.expression)
-    planned(graph, new, goal.recipe)
-    return new
 
 
 def _source(text: str, folder: Path) -> str:

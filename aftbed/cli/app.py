@@ -7,8 +7,10 @@ import typer
 
 from aftbed.cli.adapting import adapt as adapt_commands
 from aftbed.cli.bench import bench
+from aftbed.cli.campaign import campaign
 from aftbed.cli.explore import explore
 from aftbed.cli.ftm import ftm as ftm_commands
+from aftbed.cli.inject import inject
 from aftbed.cli.sim import sim
 
 app = typer.Typer(
@@ -19,12 +21,12 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-inject = typer.Typer(help="Inject a fault into a live run.", no_args_is_help=True, rich_markup_mode=None)
 app.add_typer(inject, name="inject")
 app.add_typer(adapt_commands, name="adapt")
 app.add_typer(bench, name="bench")
 app.add_typer(ftm_commands, name="ftm")
 app.add_typer(explore, name="explore")
+app.add_typer(campaign, name="campaign")
 
 Run = Annotated[str | None, typer.Option("--run", help="Id of the run, where several are alive.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else.")]
@@ -149,55 +151,18 @@ def stop(run: Run = None) -> None:
     live.stop(run)
 
 
+@app.command()
+def doctor(
+    clean: Annotated[bool, typer.Option("--clean", help="Remove what dead runs left behind.")] = False,
+    json: Json = False,
+) -> None:
+    """What of this machine is missing or in the way, and what dead runs left behind.
+
+    Exit code: 0 nothing is missing and nothing left, 1 something is.
+    """
+    from aftbed.cli import doctor as doctoring  # noqa: PLC0415
+
+    raise typer.Exit(doctoring.doctor(clean=clean, as_json=json))
+
+
 app.command()(sim)
-
-
-At = Annotated[str | None, typer.Option("--at", help="Event to strike at, as checkpoint.sent.")]
-Nth = Annotated[str | None, typer.Option("--nth", help="Which occurrence of the event, counted from now.")]
-After = Annotated[str | None, typer.Option("--after", help="How long from now, as 200ms.")]
-Target = Annotated[str, typer.Argument(help="primary, backup, or a node as `aftbed ps` names it.")]
-
-
-@inject.command()
-def crash(target: Target, at: At = None, nth: Nth = None, after: After = None, run: Run = None) -> None:
-    """SIGKILL the target's processes."""
-    from aftbed.cli import injecting  # noqa: PLC0415
-
-    injecting.strike(run, "crash", target, None, at, nth, after)
-
-
-@inject.command()
-def hang(
-    target: Target,
-    duration: Annotated[str | None, typer.Option("--for", help="How long, as 50ms; else for good.")] = None,
-    at: At = None,
-    nth: Nth = None,
-    after: After = None,
-    run: Run = None,
-) -> None:
-    """SIGSTOP the target's processes, and SIGCONT them after a while."""
-    from aftbed.cli import injecting  # noqa: PLC0415
-
-    injecting.strike(run, "hang", target, duration, at, nth, after)
-
-
-@inject.command()
-def bitflip(
-    place: Annotated[str, typer.Argument(help="result or state, of one execution.")],
-    bit: Annotated[
-        str | None, typer.Option("--bit", help="From bit 0 of byte 0; else drawn by the seed.")
-    ] = None,
-    replica: Annotated[
-        str | None, typer.Option("--replica", help="primary (default), backup, a or b.")
-    ] = None,
-    at: Annotated[
-        str | None, typer.Option("--at", help="Event of its Server; server.exit if left out.")
-    ] = None,
-    nth: Nth = None,
-    after: After = None,
-    run: Run = None,
-) -> None:
-    """Flip one bit of what the function answers or remembers, in one execution of one replica."""
-    from aftbed.cli import injecting  # noqa: PLC0415
-
-    injecting.flip(run, place, bit, replica, at, nth, after)

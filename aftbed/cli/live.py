@@ -1,16 +1,13 @@
 """Commands for a live run, from a second terminal."""
 
 import json
-import sys
 from typing import Final
 
 import msgspec
 
 from aftbed.core.errors import unknown
-from aftbed.core.fault import Act
 from aftbed.core.graph import Graph
 from aftbed.ftm.mechanism import build
-from aftbed.inject.words import build as build_fault
 from aftbed.runtime.unix import ask, rundir
 from aftbed.runtime.unix.resources import measured
 
@@ -94,19 +91,3 @@ def stop(run: str | None) -> None:
     private = rundir.find(run)
     ask.ask(private, ask.Stop())
     print(f"run {private.name}: stopping")
-
-
-def inject(
-    run: str | None,
-    act: str,
-    target: str,
-    duration: str | None,
-    event: str | None,
-    nth: str | None,
-    after: str | None,
-) -> None:
-    """Arm a fault in the run, or strike at once."""
-    fault = build_fault(Act(act), target, duration, event, nth, after)
-    private = rundir.find(run)
-    ask.ask(private, ask.Inject(fault))
-    print(f"run {private.name}: {fault}", file=sys.stderr)

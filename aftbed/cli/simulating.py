@@ -23,7 +23,7 @@ from aftbed.cli.simasked import Asked, Make, check_diagram, jobs_of, made_of, se
 from aftbed.cli.simfailure import Failure, failure, picture
 from aftbed.cli.simview import Bar, adaptation_lines, described, event_lines, spaced
 from aftbed.core import check
-from aftbed.core.fault import Act
+from aftbed.core.valuefault import Flip
 from aftbed.runtime.sim.clock import START_NS
 from aftbed.runtime.sim.world import Run, Setup
 from aftbed.vehicle.function import default_application
@@ -106,7 +106,7 @@ def _verdict(done: Run, verdict: Word, reasons: tuple[str, ...]) -> Verdict:
 
 def _checked(done: Run) -> list[str]:
     """The promises that were checked: of a service that is gone, some cannot be."""
-    flips = any(fault.act is Act.BITFLIP for fault in done.setup.faults)
+    flips = any(isinstance(fault.action, Flip) for fault in done.setup.faults)
     names = ["G1", "G2", "G4" if flips else "G3", "G6", ASSERT]
     names += [] if done.rest.lost else ["G5", REST]
     return names + ([CAR] if done.vehicle is not None and not done.rest.lost else [])

@@ -1,55 +1,120 @@
 """Faults as values, and the trigger that says when: the words of `aftbed inject`.
 
-A fault is aimed at a node, a replica or a role; it fires at the nth occurrence of a named event, or
-some time after it was armed. The node that emits the event acts on itself at that very point; where
-the target is another one, the emitter waits until the target has been hit, so the point is as exact.
+A fault of a *process* (`crash`, `hang`, `slow`) is aimed at a node, a replica or a role; it fires at the nth
+occurrence of a named event, or some time after it was armed. The node that emits the event acts on itself at
+that very point; where the target is another one, the emitter waits until the target has been hit, so the
+point is as exact.
 
-A bitflip is a *value fault*: one bit of one execution in one replica, of what it answers (`result`) or
-of what it remembers (`state`). It can only strike where a Server has just executed, captured or restored.
+A fault of a *channel* (`omission`, `delay`, `duplicate`, `reorder`) strikes the nth message on it, where it
+is sent. A *value fault* (`bitflip`, see `core.valuefault`) strikes what somebody has in hand at an event.
+
+What strikes a message or a value can come again. A fault that lasts belongs to the process that it struck
+first, as a broken part of hardware does: who takes the place of that process is sound.
+
+A fault of the *bus* is a value of its own, with its own words for when and for how long: see `core.busfault`.
 """
 
 from enum import Enum
-from typing import Final
+from typing import Final, assert_never
 
 import msgspec
 
-from aftbed.core.event import Event
+from aftbed.core.busfault import BusFault
+from aftbed.core.valuefault import BITFLIP, FLIPPED_AT, Flip, next_success
 
 HANG_FOREVER_MS: Final = 0
-BIT_MAX: Final = 2**32 - 1  # the largest state has 2**29 bits
+SLOW_MS: Final = 2.0
+SLOW_MS_MAX: Final = 500.0  # a step: orders are answered between two of them, and within 2 s
+DISTURBED_MS: Final = 20.0
+BUS: Final = "bus"  # the target of a fault of the bus
 _BIT_SHIFT: Final = 32
+FIRED: Final = ("applied", "activated")  # receipts of a fault that happened
 
 
-class Act(Enum):
-    """What is done to the target."""
-
-    CRASH = "crash"  # SIGKILL
-    HANG = "hang"  # SIGSTOP
-    BITFLIP = "bitflip"
+class Crash(msgspec.Struct, frozen=True, tag="crash"):
+    """SIGKILL."""
 
 
-class Place(Enum):
-    """What of an execution a bit is flipped in."""
+class Hang(msgspec.Struct, frozen=True, tag="hang"):
+    """SIGSTOP, and SIGCONT after `for_ms`, if that is not 0."""
 
-    RESULT = "result"
-    STATE = "state"
-
-
-FLIPPED_AT: Final = {  # where a Server has just made, or handed out, what is flipped
-    Place.RESULT: (Event.SERVER_EXIT,),
-    Place.STATE: (Event.SERVER_EXIT, Event.STATE_CAPTURED, Event.STATE_RESTORED),
-}
+    for_ms: int = HANG_FOREVER_MS
 
 
-class Flip(msgspec.Struct, frozen=True):
-    """Bit `bit`, counted from bit 0 of byte 0; without one it is drawn, by the seed of the run."""
+class Slow(msgspec.Struct, frozen=True, tag="slow"):
+    """Each step of the target's bricks takes `by_ms` longer; for good, if `for_ms` is 0."""
 
-    place: Place
-    bit: int | None = None
+    by_ms: float = SLOW_MS
+    for_ms: int = 0
+
+
+class How(Enum):
+    """What is done to a message."""
+
+    OMISSION = "omission"  # it is not sent
+    DELAY = "delay"  # it is sent later, and what comes behind it too
+    DUPLICATE = "duplicate"  # it is sent twice
+    REORDER = "reorder"  # it is sent behind its successor, if that comes in time
+
+
+LATER: Final = (How.DELAY, How.REORDER)
+
+
+class Disturb(msgspec.Struct, frozen=True, tag="disturb"):
+    """Messages on `channel` are not sent as they should; LATER holds one back for `by_ms` at most."""
+
+    how: How
+    channel: str
+    by_ms: float = DISTURBED_MS
+
+
+Action = Crash | Hang | Slow | Disturb | Flip | BusFault
+
+
+class Transient(msgspec.Struct, frozen=True, tag="transient"):
+    """It strikes once."""
+
+
+class Permanent(msgspec.Struct, frozen=True, tag="permanent"):
+    """Every occurrence from the first strike on."""
+
+
+class Every(msgspec.Struct, frozen=True, tag="every"):
+    """Every `count`th occurrence from the first strike on."""
+
+    count: int
+
+
+class Chance(msgspec.Struct, frozen=True, tag="chance"):
+    """Each occurrence behind the first strike with chance `p`, by the seed of the run."""
+
+    p: float
+
+
+Persistence = Transient | Permanent | Every | Chance
+ONCE: Final = Transient()
+
+
+def gap(persistence: Persistence, draw: int, struck: int) -> int:
+    """How many occurrences on from strike number `struck` the next one is; 0 if there is none."""
+    match persistence:
+        case Transient():
+            return 0
+        case Permanent():
+            return 1
+        case Every(count):
+            return count
+        case Chance(p):
+            return next_success(p, draw, struck)
+        case _:
+            assert_never(persistence)
 
 
 class Trigger(msgspec.Struct, frozen=True):
-    """At the `nth` occurrence of the event called `event`, or `after_ms` after arming."""
+    """At the `nth` occurrence of the event called `event`, or `after_ms` after arming.
+
+    Of a fault of a channel, which waits for no event: at the `nth` message from the arming on.
+    """
 
     event: str = ""
     nth: int = 1
@@ -57,49 +122,113 @@ class Trigger(msgspec.Struct, frozen=True):
 
 
 class Fault(msgspec.Struct, frozen=True):
-    """`target` is `primary`, `backup` or the name of a node; `for_ms` 0 hangs for good.
+    """`target` is `primary`, `backup` or the name of a node; of a value or a channel, a role or a replica.
 
-    A bitflip has a `flip`, and a role or a replica for its target. Raises ValueError on a mixture.
+    Raises ValueError on a mixture that means nothing.
     """
 
-    act: Act
+    action: Action
     target: str
     trigger: Trigger
-    for_ms: int = HANG_FOREVER_MS
-    flip: Flip | None = None
+    persistence: Persistence = ONCE
 
     def __post_init__(self) -> None:
-        if (self.act is Act.BITFLIP) != (self.flip is not None):
-            raise ValueError(f"a {self.act.value} {'without' if self.flip is None else 'with'} a bit to flip")
+        if isinstance(self.action, BusFault) and (self.trigger, self.target) != (Trigger(), BUS):
+            raise ValueError("a fault of the bus has its own words for when")
+        if self.persistence != ONCE and not isinstance(self.action, Flip | Disturb):
+            raise ValueError(f"a {self.word} strikes once")
+        if isinstance(self.action, Disturb) and self.trigger.event:
+            raise ValueError(f"a fault of a channel waits for no event: {self.trigger.event}")
+
+    @property
+    def word(self) -> str:
+        """What it is called."""
+        return word_of(self.action)
 
     @property
     def event(self) -> str:
-        """The event that it waits for, or `""`: a bitflip can wait for nothing less than an execution."""
-        return self.trigger.event or (Event.SERVER_EXIT.label if self.flip is not None else "")
+        """The event that it waits for, or `""`: a value fault can wait for nothing less than a value."""
+        at = FLIPPED_AT[self.action.place][0].label if isinstance(self.action, Flip) else ""
+        return self.trigger.event or at
 
     def __str__(self) -> str:
-        words = [self.act.value, *self._whom()]
-        if self.for_ms:
-            words += ["for", f"{self.for_ms}ms"]
-        if self.trigger.event:
-            words += ["at", self.trigger.event, "nth", str(self.trigger.nth)]
-        elif self.trigger.after_ms:
-            words += ["after", f"{self.trigger.after_ms:.6f}".rstrip("0").rstrip(".") + "ms"]
-        return " ".join(words)
+        if isinstance(self.action, BusFault):
+            return str(self.action)
+        words = [self.word, *_whom(self.action, self.target), self._when(), _again(self.persistence)]
+        return " ".join(filter(None, words))
 
-    def _whom(self) -> list[str]:
-        if self.flip is None:
-            return [self.target]
-        bit = [] if self.flip.bit is None else ["bit", str(self.flip.bit)]
-        return [self.flip.place.value, *bit, "in", self.target]
+    def _when(self) -> str:
+        trigger = self.trigger
+        if trigger.event:
+            return f"at {trigger.event} nth {trigger.nth}"
+        if trigger.after_ms:
+            return f"after {_ms(trigger.after_ms)}"
+        return f"nth {trigger.nth}" if isinstance(self.action, Disturb) else ""
 
 
-def flipped(data: bytes, bit: int) -> bytes:
-    """`data` with this bit the other way round; there is such a bit in it."""
-    assert 0 <= bit < 8 * len(data), f"bit {bit} of {len(data)} bytes"
-    changed = bytearray(data)
-    changed[bit // 8] ^= 1 << bit % 8
-    return bytes(changed)
+def on_bus(fault: BusFault) -> Fault:
+    """A fault of the bus, among the others."""
+    return Fault(fault, BUS, Trigger())
+
+
+def word_of(action: Action) -> str:
+    """What a fault with that action is called."""
+    match action:
+        case Crash():
+            return "crash"
+        case Hang():
+            return "hang"
+        case Slow():
+            return "slow"
+        case Flip():
+            return BITFLIP
+        case Disturb(how):
+            return how.value
+        case BusFault():
+            return action.verb
+        case _:
+            assert_never(action)
+
+
+def _whom(action: Action, target: str) -> list[str]:
+    """The words between what it is called and when it strikes."""
+    match action:
+        case Crash():
+            return [target]
+        case Hang(for_ms):
+            return [target, f"for {for_ms}ms" if for_ms else ""]
+        case Slow(by_ms, for_ms):
+            return [target, f"by {_ms(by_ms)}", f"for {for_ms}ms" if for_ms else ""]
+        case Flip(place, pattern):
+            return [place.value, str(pattern), "in", target]
+        case Disturb(how, channel, by_ms):
+            return [channel, f"by {_ms(by_ms)}" if how in LATER else "", "in", target]
+        case BusFault():
+            raise AssertionError(f"{action} has words of its own")
+        case _:
+            assert_never(action)
+
+
+def _again(persistence: Persistence) -> str:
+    match persistence:
+        case Transient():
+            return ""
+        case Permanent():
+            return "permanent"
+        case Every(count):
+            return f"intermittent every {count}"
+        case Chance(p):
+            return f"intermittent p {_number(p)}"
+        case _:
+            assert_never(persistence)
+
+
+def _ms(ms: float) -> str:
+    return f"{_number(ms)}ms"
+
+
+def _number(number: float) -> str:
+    return f"{number:.6f}".rstrip("0").rstrip(".")
 
 
 def mark(number: int, bits: int = 0) -> int:

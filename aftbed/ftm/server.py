@@ -19,7 +19,7 @@ from enum import auto
 from typing import Final
 
 from aftbed.core.application import Application
-from aftbed.core.brick import Brick, BrickState, Effect, Note, Send
+from aftbed.core.brick import Brick, BrickState, Effect, Halt, Note, Send
 from aftbed.core.errors import PeerError
 from aftbed.core.event import RERUN, Event
 from aftbed.core.message import (
@@ -126,7 +126,11 @@ class Server(Brick):
         if isinstance(msg, Trial):
             return self._try(msg)
         assert isinstance(msg, RestoreState)
-        self.application.restore(msg.state)
+        try:
+            self.application.restore(msg.state)
+        except PeerError as error:  # a backup that cannot follow is none: it is dropped, and another one made
+            reason = f"the state after request {msg.request_id} is refused: {error}"
+            return [Note(Event.DETECTED_STOP, msg.request_id), Halt(reason)]
         return [
             Note(Event.STATE_RESTORED, msg.request_id),
             Send("srv2aft", StateRestored(msg.epoch, msg.request_id)),

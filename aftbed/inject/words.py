@@ -1,94 +1,242 @@
 """The words of a fault, the same on `run --inject "..."` and on `aftbed inject ...`.
 
-crash   TARGET [at EVENT [nth N] | after 200ms]
-hang    TARGET [for 50ms] [at EVENT [nth N] | after 200ms]
-bitflip result|state [bit K] [in primary|backup|a|b] [at EVENT] [nth N] | [after 200ms]
+crash   TARGET                      [at EVENT [nth N] | after 200ms]
+hang    TARGET [for 50ms]           [at EVENT [nth N] | after 200ms]
+slow    TARGET [by 2ms] [for 500ms] [at EVENT [nth N] | after 200ms]
+omission|duplicate CHANNEL           [in REPLICA] [nth N | after 200ms] [AGAIN]
+delay|reorder      CHANNEL [by 20ms] [in REPLICA] [nth N | after 200ms] [AGAIN]
+bitflip PLACE [BITS] [in REPLICA] [at EVENT] [nth N] | [after 200ms] [AGAIN]
 
-A bitflip strikes at an execution: without a word about when, at the next one (`at server.exit`).
+BITS  = bit K | bits N | byte [K] | burst N [bit K] | stuck K=0|1
+AGAIN = permanent | intermittent every N | intermittent p 0.1
+
+A bitflip strikes where its value is in hand: without a word about when, at the next such event.
+
+Faults of the bus have words of their own: see `buswords`.
 """
 
 import re
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 from aftbed.core.errors import ConfigError, unknown
-from aftbed.core.event import Event, event_named
-from aftbed.core.fault import BIT_MAX, HANG_FOREVER_MS, Act, Fault, Flip, Place, Trigger
+from aftbed.core.event import event_named
+from aftbed.core.fault import (
+    DISTURBED_MS,
+    HANG_FOREVER_MS,
+    LATER,
+    ONCE,
+    SLOW_MS,
+    SLOW_MS_MAX,
+    Chance,
+    Crash,
+    Disturb,
+    Every,
+    Fault,
+    Hang,
+    How,
+    Permanent,
+    Persistence,
+    Slow,
+    Trigger,
+    on_bus,
+)
+from aftbed.core.valuefault import (
+    BIT_MAX,
+    BITS_MAX,
+    FLIPPED_AT,
+    Bit,
+    Bits,
+    Burst,
+    Byte,
+    Flip,
+    Pattern,
+    Place,
+    Stuck,
+)
 from aftbed.core.words import milliseconds, whole_milliseconds
+from aftbed.inject import buswords
 
 GRAMMAR: Final = (
-    "crash|hang TARGET [for 50ms] [at EVENT [nth N] | after 200ms],"
-    " or bitflip result|state [bit K] [in primary|backup|a|b] [at EVENT] [nth N] | [after 200ms]"
+    "crash|hang|slow TARGET [by 2ms] [for 50ms] [at EVENT [nth N] | after 200ms],"
+    " omission|delay|duplicate|reorder CHANNEL [by 20ms] [in primary|backup|a|b] [nth N | after 200ms],"
+    " or bitflip PLACE [bit K] [in primary|backup|a|b] [at EVENT] [nth N] | [after 200ms]"
 )
-TARGET_OF_A_FLIP: Final = "primary"
+ANYBODY: Final = "primary"  # where no replica is named
+EVERY, CHANCE, PERMANENT, INTERMITTENT = "every", "p", "permanent", "intermittent"
+_BYTE: Final = "byte"
 _WHOLE: Final = re.compile(r"[0-9]{1,12}")
+_PART: Final = re.compile(r"[01](\.[0-9]{1,6})?")
+_STUCK: Final = re.compile(r"([0-9]{1,12})=([01])")
 _WHEN: Final = ("at", "nth", "after")
-_KEYS: Final = {Act.CRASH: ("for", *_WHEN), Act.HANG: ("for", *_WHEN), Act.BITFLIP: ("bit", "in", *_WHEN)}
+_AGAIN: Final = (PERMANENT, INTERMITTENT)
+_PATTERNS: Final = ("bits", _BYTE, "burst", "stuck", "bit")  # `bit` says where a burst begins, too
+_CHANNEL: Final = {how.value: how for how in How}
+_KEYS: Final[dict[str, tuple[str, ...]]] = {
+    "crash": ("for", *_WHEN),
+    "hang": ("for", *_WHEN),
+    "slow": ("by", "for", *_WHEN),
+    "bitflip": (*_PATTERNS, "in", *_WHEN, *_AGAIN),
+    **dict.fromkeys(_CHANNEL, ("by", "in", "nth", "after", *_AGAIN)),
+}
+KINDS: Final = tuple(_KEYS)
+Found = Mapping[str, str]
 
 
 def parse(text: str) -> Fault:
     """The fault that `text` means. Raises ConfigError naming the word that is wrong."""
-    words = text.split()
+    return read(text.split())
+
+
+def read(words: Sequence[str]) -> Fault:
+    """The same, of words that were told apart already."""
+    text = " ".join(words)
+    if buswords.speaks_of_the_bus(words):
+        return on_bus(buswords.parse(text))
     if len(words) < 2:
         raise ConfigError(f"fault {text!r}: expected {GRAMMAR}")
-    if words[0] not in {act.value for act in Act}:
-        raise unknown("fault", words[0], [act.value for act in Act])
-    act = Act(words[0])
-    found = _pairs(text, words[2:], _KEYS[act])
-    when = (found.get("at"), found.get("nth"), found.get("after"))
-    if act is Act.BITFLIP:
-        return build_flip(words[1], found.get("bit"), found.get("in"), *when)
-    return build(act, words[1], found.get("for"), *when)
+    kind, what, *rest = words
+    if kind not in _KEYS:
+        raise unknown("fault", kind, {*_KEYS, *buswords.VERBS})
+    found = _told(text, rest, _KEYS[kind])
+    if kind == "bitflip":
+        return _flip(what, found)
+    if kind in _CHANNEL:
+        return _disturb(_CHANNEL[kind], what, found)
+    return _of_a_process(kind, what, found)
 
 
-def _pairs(text: str, words: list[str], keys: tuple[str, ...]) -> dict[str, str]:
-    """The rest of a fault: words that say what the word behind them is."""
+def _told(text: str, words: list[str], keys: tuple[str, ...]) -> dict[str, str]:
+    """The rest of a fault: words that say what the word behind them is, if one has to be."""
     rest, found = list(words), dict[str, str]()
     while rest:
         key = rest.pop(0)
         if key not in keys:
             raise unknown(f"word in fault {text!r}:", key, keys)
-        if key in found or not rest:
-            raise ConfigError(f"fault {text!r}: {key!r} {'twice' if key in found else 'lacks its value'}")
-        found[key] = rest.pop(0)
+        if key in found:
+            raise ConfigError(f"fault {text!r}: {key!r} twice")
+        found[key] = _value(text, key, rest)
     return found
 
 
-def build(
-    act: Act, target: str, duration: str | None, event: str | None, nth: str | None, after: str | None
-) -> Fault:
-    """A crash or a hang out of its parts. Raises ConfigError where they contradict each other."""
-    if duration is not None and act is not Act.HANG:
-        raise ConfigError(f"'for {duration}': a {act.value} has no duration; only a hang has")
-    if nth is not None and event is None:
+def _value(text: str, key: str, rest: list[str]) -> str:
+    """What belongs to `key`, taken from `rest`."""
+    if key == PERMANENT or (key == _BYTE and not (rest and _is_value(rest[0]))):
+        return ""
+    wanted = 2 if key == INTERMITTENT else 1
+    if len(rest) < wanted:
+        raise ConfigError(f"fault {text!r}: {key!r} lacks its value")
+    taken = [rest.pop(0) for _ in range(wanted)]
+    return " ".join(taken)
+
+
+def _is_value(word: str) -> bool:
+    return not word.isalpha()
+
+
+# -- the three families --------------------------------------------------------------------------
+
+
+def _of_a_process(kind: str, target: str, found: Found) -> Fault:
+    """A crash, a hang, or a slow one."""
+    duration, nth = found.get("for"), found.get("nth")
+    if duration is not None and kind == "crash":
+        raise ConfigError(f"'for {duration}': a crash has no duration; a hang and a slow have")
+    if nth is not None and "at" not in found:
         raise ConfigError(f"'nth {nth}' counts an event: 'at EVENT nth {nth}' is allowed")
-    trigger = _trigger(event, nth, after)
-    hang_ms = whole_milliseconds("duration", duration) if duration else HANG_FOREVER_MS
-    return Fault(act, target, trigger, hang_ms)
+    trigger = _trigger(found)
+    for_ms = whole_milliseconds("duration", duration) if duration is not None else HANG_FOREVER_MS
+    if kind == "crash":
+        return Fault(Crash(), target, trigger)
+    if kind == "hang":
+        return Fault(Hang(for_ms), target, trigger)
+    by_ms = milliseconds("delay", found["by"]) if "by" in found else SLOW_MS
+    if by_ms > SLOW_MS_MAX:
+        raise ConfigError(f"'by {found['by']}': a step can be slower by {SLOW_MS_MAX:g}ms at most")
+    return Fault(Slow(by_ms, for_ms), target, trigger)
 
 
-def build_flip(
-    place: str, bit: str | None, replica: str | None, event: str | None, nth: str | None, after: str | None
-) -> Fault:
-    """A bitflip out of its parts. Raises ConfigError where they contradict each other."""
+def _disturb(how: How, channel: str, found: Found) -> Fault:
+    if "by" in found and how not in LATER:
+        later = " and a ".join(h.value for h in LATER)
+        raise ConfigError(f"'by {found['by']}': {how.value} holds nothing back; a {later} does")
+    _not_both(found, "nth", "after")
+    by_ms = milliseconds("delay", found["by"]) if "by" in found else DISTURBED_MS
+    action = Disturb(how, channel, by_ms)
+    return Fault(action, found.get("in", ANYBODY), _trigger(found), _persistence(found))
+
+
+def _flip(place: str, found: Found) -> Fault:
     places = [p.value for p in Place]
     if place not in places:
         raise unknown("place of a bitflip", place, places)
-    if bit is not None and not (_WHOLE.fullmatch(bit) and int(bit) <= BIT_MAX):
-        raise ConfigError(f"bit {bit[:40]!r}: a whole number from 0 to {BIT_MAX} is allowed")
-    if nth is not None and after is not None:
-        raise ConfigError(f"'nth {nth}' and 'after {after}': one of them is allowed")
-    if nth is not None and event is None:
-        event = Event.SERVER_EXIT.label
-    trigger = _trigger(event, nth, after)
-    flip = Flip(Place(place), None if bit is None else int(bit))
-    return Fault(Act.BITFLIP, replica or TARGET_OF_A_FLIP, trigger, flip=flip)
+    flip = Flip(Place(place), _pattern(found))
+    _not_both(found, "nth", "after")
+    if "nth" in found and "at" not in found:
+        found = {**found, "at": FLIPPED_AT[flip.place][0].label}
+    return Fault(flip, found.get("in", ANYBODY), _trigger(found), _persistence(found))
 
 
-def _trigger(event: str | None, nth: str | None, after: str | None) -> Trigger:
-    if event is not None and after is not None:
-        raise ConfigError(f"'at {event}' and 'after {after}': one of them is allowed")
-    if nth is not None and not (_WHOLE.fullmatch(nth) and int(nth) >= 1):
-        raise ConfigError(f"nth {nth[:40]!r}: a whole number from 1 on is allowed")
+# -- parts ----------------------------------------------------------------------------------------
+
+
+def _pattern(found: Found) -> Pattern:
+    """Which bits. Raises ConfigError where two ways of saying it are mixed."""
+    named = [key for key in _PATTERNS if key in found]
+    if len(named) > 1 and named != ["burst", "bit"]:
+        one, other = (f"{key} {found[key]}".strip() for key in named[:2])
+        raise ConfigError(f"{one!r} and {other!r}: one of them is allowed")
+    at = _whole("bit", found["bit"], 0, BIT_MAX) if "bit" in found else None
+    if "bits" in found:
+        return Bits(_whole("bits", found["bits"], 1, BITS_MAX))
+    if _BYTE in found:
+        return Byte(_whole("byte", found[_BYTE], 0, BIT_MAX // 8) if found[_BYTE] else None)
+    if "burst" in found:
+        return Burst(_whole("burst", found["burst"], 1, BITS_MAX), at)
+    if "stuck" in found:
+        stuck = _STUCK.fullmatch(found["stuck"])
+        if stuck is None or int(stuck[1]) > BIT_MAX:
+            raise ConfigError(f"stuck {found['stuck'][:40]!r}: a bit and its value are allowed, as 60=1")
+        return Stuck(int(stuck[1]), int(stuck[2]))
+    return Bit(at)
+
+
+def _persistence(found: Found) -> Persistence:
+    if PERMANENT in found and INTERMITTENT in found:
+        raise ConfigError(f"{PERMANENT!r} and '{INTERMITTENT} {found[INTERMITTENT]}': one of them is allowed")
+    if PERMANENT in found:
+        return Permanent()
+    if INTERMITTENT not in found:
+        return ONCE
+    word, value = found[INTERMITTENT].split(" ", 1)
+    if word == EVERY:
+        return Every(_whole(EVERY, value, 1, 10**12 - 1))
+    if word != CHANCE:
+        raise unknown(f"word behind {INTERMITTENT!r}:", word, (EVERY, CHANCE))
+    p = float(value) if _PART.fullmatch(value) else 0.0
+    if not 0 < p <= 1:
+        raise ConfigError(f"p {value[:40]!r}: a chance above 0 and up to 1 is allowed, as 0.1")
+    return Chance(p)
+
+
+def _trigger(found: Found) -> Trigger:
+    event, after = found.get("at"), found.get("after")
+    _not_both(found, "at", "after")
+    nth = _whole("nth", found["nth"], 1, None) if "nth" in found else 1
     if event is not None:
         event_named(event)
-    return Trigger(event or "", int(nth or 1), milliseconds("duration", after) if after else 0.0)
+    return Trigger(event or "", nth, milliseconds("duration", after) if after is not None else 0.0)
+
+
+def _not_both(found: Found, one: str, other: str) -> None:
+    if one in found and other in found:
+        raise ConfigError(f"'{one} {found[one]}' and '{other} {found[other]}': one of them is allowed")
+
+
+def _whole(what: str, text: str, least: int, most: int | None) -> int:
+    """A whole number in its limits. Raises ConfigError."""
+    value = int(text) if _WHOLE.fullmatch(text) else least - 1
+    if value < least or (most is not None and value > most):
+        limits = f"from {least} on" if most is None else f"from {least} to {most}"
+        raise ConfigError(f"{what} {text[:40]!r}: a whole number {limits} is allowed")
+    return value

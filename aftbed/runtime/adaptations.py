@@ -14,7 +14,7 @@ import msgspec
 from aftbed.core import message
 from aftbed.core.errors import ConfigError
 from aftbed.core.event import Event
-from aftbed.core.fault import Act
+from aftbed.core.fault import Hang
 from aftbed.core.script import Phase, Script, bricks_changed
 from aftbed.runtime import control
 from aftbed.runtime.deployment import Deployment, Keys
@@ -174,7 +174,7 @@ class Adaptations:
     def _arm(self, sent: int) -> Keys:
         """Have the Client, who has sent so many requests, wait for those that are to come."""
         for number, later in self._scheduled.items():
-            blow = control.Blow(number, CLIENT, max(1, later.at_request - sent), Act.HANG, itself=False)
+            blow = control.Blow(number, CLIENT, max(1, later.at_request - sent), Hang(), itself=False)
             yield from self._deployment.ask(CLIENT, functools.partial(_armed, blow))
 
     def fired(self, process: Process, number: int) -> bool:

@@ -8,7 +8,8 @@ from typing import Final
 
 import msgspec
 
-from aftbed.core.fault import Act, Flip
+from aftbed.core.busfault import BusFault
+from aftbed.core.fault import ONCE, Action, Persistence
 from aftbed.core.graph import BrickSpec, Graph
 from aftbed.core.message import (
     Adapt,
@@ -165,18 +166,20 @@ class WatchNodes(Order, frozen=True):
 
 
 class Blow(msgspec.Struct, frozen=True):
-    """At the `nth` time that `brick` comes to the event: do `act` to yourself, or ask for it.
+    """At the `nth` time that `brick` comes to the event: do `action` to yourself, or ask for it.
 
-    `draw` is the chance by which a bit is chosen where `flip` names none.
+    `draw` is the chance by which is chosen what `action` and `persistence` leave open; `struck`: how often
+    it has struck here so far.
     """
 
     fault: int
     brick: str
     nth: int
-    act: Act
+    action: Action
     itself: bool
-    flip: Flip | None = None
     draw: int = 0
+    persistence: Persistence = ONCE
+    struck: int = 0
 
 
 class Arm(Order, frozen=True):
@@ -184,6 +187,26 @@ class Arm(Order, frozen=True):
 
     event: str
     blows: tuple[Blow, ...]
+
+
+class Interfere(Order, frozen=True):
+    """Disturb what `blow.brick` sends on the channel, from the `nth` message on; `nth` 0: no longer."""
+
+    blow: Blow
+
+
+class SlowDown(Order, frozen=True):
+    """Each step takes so much longer from now on, for the sake of `fault`; 0: no longer."""
+
+    fault: int
+    by_ns: int
+
+
+class DisturbBus(Order, frozen=True):
+    """To the hub: arm this fault of the bus; `token` is its number, `draw` seeds its chance."""
+
+    fault: BusFault
+    draw: int
 
 
 class Stop(Order, frozen=True):
@@ -247,6 +270,6 @@ class Report(msgspec.Struct, frozen=True, tag=True):
 
 ToNode = (
     Park | Assign | Serve | BindInput | BindOutput | Follow | Rewire | Suspend | Resume | Capture | Restore
-    | Tell | WatchNodes | Arm | Stop | Quiet | Stats | Ack
+    | Tell | WatchNodes | Arm | Interfere | SlowDown | DisturbBus | Stop | Quiet | Stats | Ack
 )  # fmt: skip
 FromNode = Hello | Rested | Ack | Said | Ordered | Fired | Report

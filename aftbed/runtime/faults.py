@@ -1,33 +1,44 @@
 """Faults of a run: armed in the node that emits the event, applied to processes of this run.
 
-A crash of the emitter itself happens there, at the very point; so does a bitflip, which needs nobody
-else. Anything else is asked for: the emitter waits until the supervisor has hit the target and seen it
-hit (dead, or in state `T`), since a process goes on for a while after a signal was sent. What an
-adaptation comes through is emitted by the supervisor itself: see `Faults.at`. Each fault ends with a receipt.
+A crash of the emitter itself happens there, at the very point; so does what strikes a value or a message,
+which needs nobody else. Anything else is asked for: the emitter waits until the supervisor has hit the target
+and seen it hit (dead, in state `T`, or slow by its own word), since a process goes on for a while after a
+signal was sent. What an adaptation comes through is emitted by the supervisor itself: see `Faults.at`.
+
+Each fault ends with a receipt. One that has struck stays where it is, even if it lasts: it belongs to that
+process, and not to the one that takes its place.
 """
 
 import contextlib
 import itertools
 from collections.abc import Generator, Iterable
-from typing import Final
+from typing import Final, assert_never
 
+from aftbed.core.busfault import BusFault
 from aftbed.core.event import Event, event_named
-from aftbed.core.fault import Act, Fault, Flip, marked
+from aftbed.core.fault import Crash, Disturb, Fault, Hang, Slow
 from aftbed.core.journal import Record
-from aftbed.runtime import control, targets
+from aftbed.core.valuefault import Flip, Place
+from aftbed.runtime import control, receipts, targets
 from aftbed.runtime.deployment import Deployment, Keys
 from aftbed.runtime.interface import Process
 from aftbed.runtime.jobs import Key, StepFailed, Wait
+from aftbed.runtime.receipts import ACTIVATED, APPLIED, ARMED, INJECT_ERROR, NOT_ACTIVATED, Receipt
 
 STOP_NS_MAX: Final = 500_000_000
 
 
+class NobodyThere(StepFailed):
+    """Nobody comes to the point of a fault as things are."""
+
+
 class Armed:
-    """A fault and what has become of it: armed, applied, refused, not_activated; `detail` says more."""
+    """A fault and what has become of it; `hit` are the processes that the executive struck."""
 
     def __init__(self, number: int, fault: Fault, draw: int) -> None:
         self.number, self.fault, self.draw = number, fault, draw
-        self.state, self.detail = "armed", ""
+        self.receipt = Receipt()
+        self.hit: list[Process] = []
         self.left = fault.trigger.nth  # of the occurrences of its event, since it came to its host
         self.waits = False  # for its event: in its host, or, while nobody emits it, in none
         self.host: Process | None = None
@@ -45,16 +56,25 @@ class Armed:
         self._since_ns = now_ns
 
     def move_out(self, records: Iterable[Record]) -> None:
-        """What happened in the host has been counted there, by its records, and is not forgotten."""
-        event = event_named(self.fault.event)
-        happened = sum(r.event is event and r.t_ns >= self._since_ns for r in records)
-        self.left = max(1, self.left - happened // self._share)
+        """What happened in the host has been counted there, by its records, and is not forgotten.
+
+        But messages are in no record: for them the count begins anew.
+        """
+        if self.fault.event:
+            event = event_named(self.fault.event)
+            happened = sum(r.event is event and r.t_ns >= self._since_ns for r in records)
+            self.left = max(1, self.left - happened // self._share)
         self.host = None
 
-    def blow(self, nth: int) -> control.Blow:
-        """What the host is told."""
+    def order(self, token: int, nth: int) -> control.Arm | control.Interfere:
+        """What the host is told; `nth` 0: to wait no longer."""
         fault = self.fault
-        return control.Blow(self.number, self.brick, nth, fault.act, self.itself, fault.flip, self.draw)
+        blow = control.Blow(
+            self.number, self.brick, nth, fault.action, self.itself, self.draw, fault.persistence
+        )
+        if isinstance(fault.action, Disturb):
+            return control.Interfere(token, blow)
+        return control.Arm(token, fault.event, (blow,))
 
 
 class Faults:
@@ -75,35 +95,42 @@ class Faults:
         if fault.trigger.after_ms and not fault.trigger.event:
             self._loop.after(fault.trigger.after_ms / 1e3, lambda: self._start(armed))
             return
-        try:
-            yield from self._begin(armed)
-        except StepFailed:
-            armed.state = "not_activated"
-            raise
+        yield from self._begin(armed)
 
     def _start(self, armed: Armed) -> None:
         self._loop.jobs.start(f"fault {armed.fault}", self._begin(armed), lambda failure: None)
 
     def _begin(self, armed: Armed) -> Keys:
-        yield from self._place(armed) if armed.fault.event else self._apply(armed)
+        action = armed.fault.action
+        waits = armed.fault.event or isinstance(action, Disturb)
+        try:
+            if isinstance(action, BusFault):
+                yield from self._support.disturb(armed.number, action, armed.draw)
+            else:
+                yield from self._place(armed) if waits else self._apply(armed)
+        except NobodyThere as failure:
+            armed.receipt = Receipt(NOT_ACTIVATED, str(failure))
+            raise
+        except StepFailed as failure:
+            armed.receipt = Receipt(INJECT_ERROR, str(failure))
+            raise
 
     def _place(self, armed: Armed) -> Keys:
-        """Have whoever emits its event wait for it. Raises StepFailed where nobody does now."""
+        """Have whoever comes to its point wait for it. Raises NobodyThere, or StepFailed."""
         deployment, fault = self._deployment, armed.fault
         graph, roles = deployment.graph, (deployment.leader, deployment.backup)
         armed.waits = True
-        if targets.emitter(graph, fault.event, *roles) == targets.SUPERVISOR:
+        if fault.event and targets.emitter(graph, fault.event, *roles) == targets.SUPERVISOR:
             return
         brick = targets.waits_in(fault, graph, *roles)
         node = "" if brick is None else graph.node_of(brick)
         if brick is None or not deployment.lives(node):
-            raise StepFailed(f"{fault}: nobody emits {fault.event} now")
-        itself = fault.act is Act.CRASH and node in self._nodes_of(fault.target)
-        share = targets.emitters_in(graph, fault.event, node)
+            does = f"emits {fault.event}" if fault.event else "sends there"
+            raise NobodyThere(f"{fault}: nobody {does} now")
+        itself = isinstance(fault.action, Crash) and node in self._nodes_of(fault.target)
+        share = targets.emitters_in(graph, fault.event, node) if fault.event else 1
         armed.move_in(deployment.nodes[node], brick, share, self._loop.now_ns(), itself=itself)
-        yield from deployment.ask(
-            node, lambda token: control.Arm(token, fault.event, (armed.blow(armed.left),))
-        )
+        yield from deployment.ask(node, lambda token: armed.order(token, armed.left))
 
     def _stands(self, armed: Armed) -> bool:
         """Whether the host of `armed` still is the one that emits its event."""
@@ -119,14 +146,13 @@ class Faults:
         assert host is not None
         armed.move_out(self._support.records(host.journal))
         if host.alive and self._deployment.nodes.get(host.name) is host:
-            event, blow = armed.fault.event, armed.blow(0)
-            yield from self._deployment.ask(host.name, lambda token: control.Arm(token, event, (blow,)))
+            yield from self._deployment.ask(host.name, lambda token: armed.order(token, 0))
 
     def rearm(self) -> Keys:
         """After a change of roles, or of the graph: what waits in a node that is not the emitter moves on."""
         for armed in self._armed:
             self._look(armed)
-            if armed.state != "armed" or not armed.waits or self._stands(armed):
+            if armed.receipt.state != ARMED or not armed.waits or self._stands(armed):
                 continue
             with contextlib.suppress(StepFailed):  # nobody emits it now; the next change asks again
                 if armed.host is not None:
@@ -139,7 +165,7 @@ class Faults:
         But for what is under way: there, the death and the answer to the step are on their way at once.
         """
         for armed in list(self._armed):
-            if armed.state == "armed" and armed.waits and armed.fault.event == event.label:
+            if armed.receipt.state == ARMED and armed.waits and armed.fault.event == event.label:
                 armed.left -= 1
                 if armed.left == 0 and event is Event.ADAPT_STEP_ACT:
                     next(self._apply(armed), None)
@@ -147,26 +173,61 @@ class Faults:
                     yield from self._apply(armed)
 
     def _look(self, armed: Armed) -> None:
-        """A node that has hit itself has left word in its journal."""
-        if armed.state != "armed" or not (armed.itself or armed.fault.flip):
-            return
-        for path in armed.journals:
-            for record in self._support.records(path):
-                if marked(record.detail)[0] != armed.number:
-                    continue
-                if armed.fault.flip is not None:
-                    _settle_flip(armed, armed.fault.flip, record)
-                elif record.event is Event.FAULT_APPLIED:
-                    armed.state = "applied"
+        """A node that has hit itself, or has felt what hit it, has left word in its journal."""
+        paths = armed.journals | {p.journal for p in armed.hit if p.journal}
+        journal = [record for path in paths for record in self._support.records(path)]
+        words = receipts.told(armed.number, journal)
+        match armed.fault.action:
+            case Crash():
+                self._look_for_death(armed, itself=bool(words) and armed.itself)
+            case Hang():
+                if armed.receipt.state == APPLIED and not all(p.alive for p in armed.hit):
+                    armed.receipt = Receipt(ACTIVATED)
+            case Slow():
+                if armed.receipt.state == APPLIED and words:
+                    armed.receipt = Receipt(ACTIVATED)
+            case BusFault():
+                struck = self._support.bus_fault(armed.number)
+                if struck is not None:
+                    armed.receipt = Receipt(struck.receipt, struck.detail)
+            case Disturb():
+                if words:
+                    armed.receipt = receipts.of_channel(armed.brick, words)
+            case Flip() as flip:
+                if words:
+                    used = [*journal, *self._log_of(armed)] if flip.place is Place.LOG else journal
+                    found = receipts.of_flip(armed.fault, flip, armed.brick, armed.draw, words, used)
+                    armed.receipt = found
+            case _:
+                assert_never(armed.fault.action)
+
+    def _look_for_death(self, armed: Armed, *, itself: bool) -> None:
+        if itself:
+            dead = armed.host is None or not armed.host.alive
+            armed.receipt = Receipt(ACTIVATED if dead else APPLIED)
+        elif armed.receipt.state == APPLIED and not any(p.alive for p in armed.hit):
+            armed.receipt = Receipt(ACTIVATED)
+
+    def _log_of(self, armed: Armed) -> Iterable[Record]:
+        """What the Protocol of the struck replica has written, if it is not the one that was struck."""
+        deployment = self._deployment
+        replica = armed.brick.partition("/")[0]
+        node = next(
+            (n for n, hosted in deployment.graph.nodes.items() if f"{replica}/protocol" in hosted), ""
+        )
+        process = deployment.nodes.get(node)
+        if process is None or process.journal in armed.journals:
+            return ()
+        return self._support.records(process.journal)
 
     def fired(self, process: Process, number: int) -> None:
-        """The emitter has reached the point, and waits; for a bitflip it has done what was to do."""
+        """The emitter has reached the point, and waits; or it has done by itself what was to do."""
         armed = next((a for a in self._armed if a.number == number), None)
         if armed is None:
             return
-        if armed.fault.flip is not None:
+        if isinstance(armed.fault.action, Flip | Disturb):
             self._look(armed)
-            self._tell("fault", f"{armed.fault}: {armed.state}, {armed.detail}")
+            self._tell("fault", f"{armed.fault}: {armed.receipt.state}, {armed.receipt.detail}")
             return
         emitter = process
 
@@ -191,56 +252,72 @@ class Faults:
         return found or [p for p in self._deployment.nursery.processes if p.name == target and p.pid]
 
     def _apply(self, armed: Armed) -> Keys:
-        hit = self._hit(armed.fault.target)
+        armed.hit = hit = self._hit(armed.fault.target)
         if not hit:
-            armed.state = "not_activated"
+            armed.receipt = Receipt(NOT_ACTIVATED, "nobody to hit")
             self._tell("fault", f"{armed.fault}: nobody to hit")
             return
         self._support.journal.write(self._loop.now_ns(), Event.FAULT_APPLIED, 0, armed.number)
-        if armed.fault.act is Act.CRASH:
-            dead: set[Key] = {("died", p.name, p.pid) for p in hit}
-            for process in hit:
-                process.kill()
-            armed.state = "applied"
-            yield Wait(frozenset(dead))
-        else:
-            yield from self._hang(armed, hit)
+        match armed.fault.action:
+            case Crash():
+                dead: set[Key] = {("died", p.name, p.pid) for p in hit}
+                for process in hit:
+                    process.kill()
+                armed.receipt = Receipt(APPLIED)
+                yield Wait(frozenset(dead))
+            case Hang(for_ms):
+                yield from self._hang(armed, hit, for_ms)
+            case Slow(by_ms, for_ms):
+                yield from self._slow(armed, hit, round(by_ms * 1e6), for_ms)
+            case Flip() | Disturb() | BusFault():
+                raise AssertionError(f"{armed.fault} strikes where it waits")
+            case _:
+                assert_never(armed.fault.action)
 
-    def _hang(self, armed: Armed, hit: list[Process]) -> Generator[Wait, dict[Key, bytes], None]:
+    def _hang(self, armed: Armed, hit: list[Process], for_ms: int) -> Generator[Wait, dict[Key, bytes], None]:
         for process in hit:
-            process.freeze()
+            process.freeze(for_ms)
         limit_ns = self._loop.now_ns() + STOP_NS_MAX
         while not all(p.stopped() for p in hit) and self._loop.now_ns() < limit_ns:
             self._loop.rest(0)  # the state change is the kernel's next few microseconds of work
-        armed.state = "applied"
-        if armed.fault.for_ms:
-            self._loop.after(armed.fault.for_ms / 1e3, lambda: _resume(hit))
+        running = [p.name for p in hit if not p.stopped()]
+        if running:
+            seconds = STOP_NS_MAX / 1e9
+            armed.receipt = Receipt(
+                INJECT_ERROR, f"not seen stopped within {seconds} s: {', '.join(running)}"
+            )
+        else:
+            armed.receipt = Receipt(APPLIED)
+        if for_ms:
+            self._loop.after(for_ms / 1e3, lambda: _resume(armed))
         yield Wait(frozenset())
+
+    def _slow(self, armed: Armed, hit: list[Process], by_ns: int, for_ms: int) -> Keys:
+        deployment, number = self._deployment, armed.number
+        sent = [deployment.order_to(p, lambda token: control.SlowDown(token, number, by_ns)) for p in hit]
+        yield from deployment.all_of(sent)
+        armed.receipt = Receipt(APPLIED)
+        if for_ms:
+            self._loop.after(for_ms / 1e3, lambda: self._speed_up(armed))
+
+    def _speed_up(self, armed: Armed) -> None:
+        for process in armed.hit:
+            with contextlib.suppress(StepFailed):  # it is gone, and its slowness with it
+                self._deployment.order_to(process, lambda token: control.SlowDown(token, armed.number, 0))
 
     def receipts(self) -> list[dict[str, str]]:
         """What became of each fault; `detail` where there is more to say."""
         for armed in self._armed:
             self._look(armed)
         return [
-            {"fault": str(a.fault), "receipt": "not_activated" if a.state == "armed" else a.state}
-            | ({"detail": a.detail} if a.detail else {})
+            {"fault": str(a.fault), "receipt": a.receipt.state}
+            | ({"detail": a.receipt.detail} if a.receipt.detail else {})
             for a in self._armed
         ]
 
 
-def _settle_flip(armed: Armed, flip: Flip, record: Record) -> None:
-    """What the Server's host says of a bitflip: which bit it hit, or that there were so many and no other."""
-    _, bits = marked(record.detail)
-    of = f"of the {flip.place.value} of request {record.request_id} in {armed.brick}"
-    if record.event is Event.FAULT_APPLIED:
-        armed.state, armed.detail = "applied", f"bit {bits} {of}"
-    elif not bits or (flip.bit is not None and flip.bit >= bits):
-        armed.state, armed.detail = "not_activated", f"there are {bits} bits {of}"
-    else:
-        bit = flip.bit if flip.bit is not None else armed.draw % bits
-        armed.state, armed.detail = "refused", f"the function refused bit {bit} {of}"
-
-
-def _resume(processes: list[Process]) -> None:
-    for process in processes:
-        process.thaw()
+def _resume(armed: Armed) -> None:
+    """Its time is over: who still is stopped runs on."""
+    ran_on = [process.thaw() for process in armed.hit]
+    if any(ran_on) and armed.receipt.state == APPLIED:
+        armed.receipt = Receipt(ACTIVATED)

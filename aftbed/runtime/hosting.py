@@ -1,8 +1,17 @@
-"""What of a graph lives, at the end of a run: for the judgement whether it is whole (G5)."""
+"""What of a graph lives at the end of a run, and in which state: for the judgement (G5, `latent`)."""
+
+import contextlib
+import hashlib
+from typing import Final
 
 import msgspec
 
-from aftbed.runtime.deployment import Deployment
+from aftbed.runtime import control
+from aftbed.runtime.deployment import Deployment, Keys
+from aftbed.runtime.jobs import StepFailed
+
+DIGEST_DIGITS: Final = 16
+LOOKS_MAX: Final = 20  # at a backup that has yet to apply what was sent to it
 
 
 class Hosted(msgspec.Struct, frozen=True):
@@ -21,3 +30,28 @@ def hosted(deployment: Deployment) -> Hosted:
     living = [p for p in deployment.nursery.processes if p.alive and p.kind != "killed"]
     bricks = tuple(sorted(brick for process in living for brick in process.bricks))
     return Hosted(graph.ftm, graph.placement, deployment.leader, deployment.backup, bricks)
+
+
+def digest(state: bytes) -> str:
+    """Short, for a record; equal states have the same."""
+    return hashlib.sha256(state).hexdigest()[:DIGEST_DIGITS]
+
+
+def look_at_states(deployment: Deployment, found: dict[str, str]) -> Keys:
+    """Put the digest of each Server's state into `found`, by replica; a function may hand out none."""
+    for _ in range(LOOKS_MAX):
+        for replica in (deployment.leader, deployment.backup):
+            with contextlib.suppress(StepFailed):
+                yield from _look_at(deployment, replica, found)
+        if len(set(found.values())) <= 1:
+            return
+
+
+def _look_at(deployment: Deployment, replica: str, found: dict[str, str]) -> Keys:
+    server = f"{replica}/server"
+    if not any(b.name == server for b in deployment.graph.bricks):
+        return
+    node = deployment.graph.node_of(server)
+    state = yield from deployment.ask(node, lambda token: control.Capture(token, server))
+    if state:
+        found[replica] = digest(state)

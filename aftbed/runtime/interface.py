@@ -8,6 +8,7 @@ made, how mail travels, what a moment is.
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from typing import Protocol
 
+from aftbed.core.busfault import BusFault, Struck
 from aftbed.core.event import Event
 from aftbed.core.graph import Link
 from aftbed.core.journal import Record
@@ -71,8 +72,11 @@ class Process(Protocol):
         """End it, with whatever is inside; False if it is gone."""
         ...
 
-    def freeze(self) -> bool:
-        """Stop it wherever it is; False if it is gone."""
+    def freeze(self, for_ms: int = 0) -> bool:
+        """Stop it wherever it is, at most that long, 0 for good; False if it is gone.
+
+        Who stops it lets it go on; the time is what holds if that one dies first.
+        """
         ...
 
     def thaw(self) -> bool:
@@ -200,6 +204,14 @@ class Support(Protocol):
 
     def draw(self, number: int) -> int:
         """Chance for fault `number`, the same whenever this seed is used: 63 bits."""
+        ...
+
+    def disturb(self, number: int, fault: BusFault, draw: int) -> Generator[Wait, dict[Key, bytes], None]:
+        """Arm a fault of the bus; it is armed when this ends. Raises StepFailed where there is no bus."""
+        ...
+
+    def bus_fault(self, number: int) -> Struck | None:
+        """What has become of it, as far as is known."""
         ...
 
     def pin(self, pid: int, cpu: int) -> None:

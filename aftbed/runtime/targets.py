@@ -6,10 +6,24 @@ that passes on): the outermost is meant.
 
 from typing import Final
 
+from aftbed.core.busfault import BusFault
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.event import Event, event_named
-from aftbed.core.fault import BIT_MAX, FLIPPED_AT, Fault
+from aftbed.core.fault import SLOW_MS_MAX, Disturb, Fault, Slow
 from aftbed.core.graph import BrickSpec, Graph
+from aftbed.core.valuefault import (
+    BIT_MAX,
+    BITS_MAX,
+    FLIPPED_AT,
+    Bit,
+    Bits,
+    Burst,
+    Byte,
+    Flip,
+    Pattern,
+    Stuck,
+)
+from aftbed.core.words import DURATION_MS_MAX
 from aftbed.ftm.catalog import EMITTERS
 from aftbed.ftm.mechanism import EXPRESSIONS, build
 
@@ -24,10 +38,19 @@ def check(fault: Fault, graph: Graph) -> None:
     """Raise ConfigError, naming what is allowed, if `fault` cannot happen in `graph`."""
     if fault.trigger.nth < 1:
         raise ConfigError(f"nth {fault.trigger.nth}: the first occurrence is nth 1")
-    if fault.flip is not None:
-        _check_flip(fault, graph)
+    if isinstance(fault.action, BusFault):  # it names what is on the bus, not in the graph
         return
-    allowed = (*roles(graph), *_nodes(fault, graph), *OTHERS)
+    if isinstance(fault.action, Flip):
+        _check_flip(fault, fault.action, graph)
+        return
+    if isinstance(fault.action, Disturb):
+        _check_channel(fault, fault.action, graph)
+        return
+    allowed: tuple[str, ...] = (*roles(graph), *_nodes(fault, graph), *OTHERS)
+    if isinstance(fault.action, Slow):
+        allowed = (*roles(graph), *graph.nodes)  # it is their bricks' steps that are slow
+        if not 0 < fault.action.by_ms <= SLOW_MS_MAX:
+            raise ConfigError(f"by {fault.action.by_ms:g}ms: up to {SLOW_MS_MAX:g}ms are allowed")
     if fault.target not in allowed:
         raise unknown("target", fault.target, allowed)
     if not fault.event:
@@ -60,21 +83,87 @@ def _nodes(fault: Fault, graph: Graph) -> tuple[str, ...]:
     return (*nodes, *(f"{node}{STAGED}" for node in nodes))
 
 
-def _check_flip(fault: Fault, graph: Graph) -> None:
-    assert fault.flip is not None
-    place, bit = fault.flip.place, fault.flip.bit
-    if bit is not None and not 0 <= bit <= BIT_MAX:
-        raise ConfigError(f"bit {bit}: 0 to {BIT_MAX} are allowed")
+def _check_flip(fault: Fault, flip: Flip, graph: Graph) -> None:
+    _check_pattern(flip.pattern)
+    place = flip.place
+    event = event_named(fault.event).label
+    emitted = {
+        e.label for e in FLIPPED_AT[place] for b in _standings(fault, graph) if _emits(graph, e, backs_up=b)
+    }
+    if not emitted:
+        executes = f"the Server of a {fault.target} executes nothing"
+        nothing = (
+            executes if all(_part(e) == "server" for e in FLIPPED_AT[place]) else f"{fault.target} has none"
+        )
+        raise ConfigError(f"{fault}: under --ftm {graph.ftm} {nothing}")
+    if event not in emitted:
+        raise unknown(f"event for a bit of the {place.value} in {fault.target}:", event, emitted)
+
+
+def _check_pattern(pattern: Pattern) -> None:
+    match pattern:
+        case Bit(at) | Burst(_, at) if at is not None and not 0 <= at <= BIT_MAX:
+            raise ConfigError(f"bit {at}: 0 to {BIT_MAX} are allowed")
+        case Byte(at) if at is not None and not 0 <= at <= BIT_MAX // 8:
+            raise ConfigError(f"byte {at}: 0 to {BIT_MAX // 8} are allowed")
+        case Bits(count) | Burst(count, _) if not 1 <= count <= BITS_MAX:
+            raise ConfigError(f"{count} bits: 1 to {BITS_MAX} are allowed")
+        case Stuck(at, value) if not 0 <= at <= BIT_MAX or value not in (0, 1):
+            raise ConfigError(f"stuck {at}={value}: a bit from 0 to {BIT_MAX}, and 0 or 1, are allowed")
+        case _:
+            return
+
+
+def _check_channel(fault: Fault, action: Disturb, graph: Graph) -> None:
+    channels = {link.name for link in graph.links}
+    if action.channel not in channels:
+        raise unknown("channel", action.channel, channels)
+    if not 0 < action.by_ms <= DURATION_MS_MAX:
+        raise ConfigError(f"by {action.by_ms:g}ms: up to {DURATION_MS_MAX}ms are allowed")
+    _standings(fault, graph)
+    leads = [(leader, _meant(fault.target, leader, _other(graph, leader))) for leader in replicas(graph)]
+    if all(sender(graph, action.channel, meant, leader) is None for leader, meant in leads):
+        raise ConfigError(
+            f"{fault}: under --ftm {graph.ftm} {fault.target} sends nothing on {action.channel}"
+        )
+
+
+def _standings(fault: Fault, graph: Graph) -> list[bool]:
+    """Whether the replica that is meant backs up: over a run, it may do both. Raises ConfigError."""
     allowed = (*roles(graph), *replicas(graph))
     if fault.target not in allowed:
         raise unknown("replica", fault.target, allowed)
-    event = event_named(fault.event).label
-    standings = [role == "backup" for role in roles(graph) if fault.target in (role, *replicas(graph))]
-    emitted = [e.label for e in FLIPPED_AT[place] for b in standings if _server_emits(graph, e, backs_up=b)]
-    if not emitted:
-        raise ConfigError(f"{fault}: under --ftm {graph.ftm} the Server of a {fault.target} executes nothing")
-    if event not in emitted:
-        raise unknown(f"event for a bit of the {place.value} in {fault.target}:", event, set(emitted))
+    return [role == "backup" for role in roles(graph) if fault.target in (role, *replicas(graph))]
+
+
+def _meant(target: str, leader: str, backup: str) -> str:
+    """The replica that `target` means, or `""` if there is none now."""
+    return {"primary": leader, "backup": backup}.get(target, target)
+
+
+def _other(graph: Graph, replica: str) -> str:
+    return next((r for r in replicas(graph) if r != replica), "")
+
+
+def _part(event: Event) -> str:
+    return EMITTERS[event][0]
+
+
+def _emits(graph: Graph, event: Event, *, backs_up: bool) -> bool:
+    """Whether a replica that leads, or `backs_up`, comes to `event`."""
+    part, of_backup = EMITTERS[event]
+    if part == "server":
+        return _server_emits(graph, event, backs_up=backs_up)
+    return backs_up is of_backup and any(_is(brick, part) for brick in graph.bricks)
+
+
+def sender(graph: Graph, channel: str, replica: str, leader: str) -> str | None:
+    """The brick of `replica` that sends on `channel` while `leader` leads; who is of none is the leader's."""
+    kin = {brick.name: brick.replica or leader for brick in graph.bricks}
+    links = [k for k in graph.led_by(leader).links if k.name == channel and not k.standby]
+    found = [graph.brick(k.source) for k in links if kin[k.source] == replica]
+    first = min(found, key=_depth, default=None)
+    return None if first is None else first.name
 
 
 def _server_emits(graph: Graph, event: Event, *, backs_up: bool) -> bool:
@@ -98,15 +187,20 @@ def emitter(graph: Graph, event: str, leader: str, backup: str) -> str | None:
 
 
 def waits_in(fault: Fault, graph: Graph, leader: str, backup: str) -> str | None:
-    """The brick in which `fault` waits for its event; None where nobody emits it, or the supervisor does."""
+    """The brick in which `fault` waits; None where nobody comes to its point, or the supervisor does."""
+    replica = _meant(fault.target, leader, backup)
+    if isinstance(fault.action, Disturb):
+        return sender(graph, fault.action.channel, replica, leader)
     event = event_named(fault.event)
-    if fault.flip is None:
+    if not isinstance(fault.action, Flip):
         brick = _emitting(graph, event, leader, backup)
         return None if brick is None else brick.name
-    replica = {"primary": leader, "backup": backup}.get(fault.target, fault.target)
-    if replica not in replicas(graph) or not _server_emits(graph, event, backs_up=replica != leader):
+    if replica not in replicas(graph):
         return None
-    return f"{replica}/server"
+    if _part(event) == "server":
+        return f"{replica}/server" if _server_emits(graph, event, backs_up=replica != leader) else None
+    brick = _emitting(graph, event, leader, backup)
+    return brick.name if brick is not None and brick.replica == replica else None
 
 
 def emitters_in(graph: Graph, event: str, node: str) -> int:

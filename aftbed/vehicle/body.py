@@ -17,6 +17,7 @@ of the scenario.
 from collections.abc import Callable
 from typing import Final, Literal
 
+from aftbed.core.busfault import Condition
 from aftbed.vehicle.dbcfile import Codec
 from aftbed.vehicle.ecus import BrakeEcu, BrakePolicy, RadarEcu
 from aftbed.vehicle.frame import Frame
@@ -68,6 +69,16 @@ class CarBody:
     def hear(self, frame: Frame) -> None:
         """A frame has come to the brake ECU, which takes it to be of this step."""
         self._brake.on_frame(Frame(self._plant.t_us, frame.can_id, frame.data))
+
+    def noticed(self) -> list[tuple[int, str]]:
+        """What the brake ECU has found wrong since it was last asked: of which frames, and what."""
+        found = list(self._brake.noticed)
+        self._brake.noticed.clear()
+        return found
+
+    def is_so(self, condition: Condition) -> bool:
+        """Whether `condition` holds in this instant."""
+        return condition.holds(self._plant.ttc_s(), self._plant.gap_m, self._plant.speed_ms)
 
     def step(self, report: Callable[[Telemetry], None] | None = None) -> None:
         """Go on by 1 ms. `report` is called each 50 ms, with what the brakes have decided here."""

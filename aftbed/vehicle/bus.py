@@ -18,7 +18,7 @@ the same sockets): not worth a client of our own.
 
 *Lockstep.* Time is in the hands of one connection of the hub. The lines and frames of one connection
 keep their order, those of two do not: a node that sends all frames itself uses `Bus.set_time`, which
-asks for no answer; where several nodes send, `HubClock` sets the time from a connection of its own
+asks for no answer; where several nodes send, a `HubLine` sets the time from a connection of its own
 and waits until the hub has it. `AnswerWatch` is the other half: time stands still until the
 protected function has answered. In real time, `Schedule` says when what is due.
 """
@@ -30,7 +30,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
-from typing import TYPE_CHECKING, Final, Literal
+from typing import TYPE_CHECKING, Final, Literal, Protocol
 
 import msgspec
 
@@ -54,11 +54,17 @@ Interface = Literal["socketcand", "virtual", "socketcan"]
 
 
 class BusOptions(msgspec.Struct, frozen=True):
-    """Which bus to attach to. `port` is the hub's, for `socketcand` only."""
+    """Which bus to attach to. `port` is the hub's, for `socketcand` only.
+
+    `node` is the name that the hub is told, so that it can be cut off, and `uses` are the identifiers
+    that it makes something of.
+    """
 
     interface: Interface = "socketcand"
     channel: str = "can0"
     port: int = 0
+    node: str = ""
+    uses: tuple[int, ...] = ()
 
 
 class Bus:
@@ -117,6 +123,22 @@ class Bus:
         if self._socket is None:
             raise HarnessError("only the hub keeps virtual time")
         self._socket.sendall(f"< aftbed time {t_us} >".encode("ascii"))
+
+    def notice(self, can_id: int, word: str) -> None:
+        """Say beside the bus what is wrong with these frames, where there is somebody to say it to."""
+        self._aside(f"noticed {can_id:03X} {word}")
+
+    def unasked(self, can_id: int) -> None:
+        """Say beside the bus that no request was made of a frame of which one might be expected."""
+        self._aside(f"unasked {can_id:03X}")
+
+    def _aside(self, words: str) -> None:
+        if self._socket is None:
+            return
+        try:
+            self._socket.sendall(f"< aftbed {words} >".encode("ascii"))
+        except OSError as error:
+            raise HarnessError(f"the CAN bus took no word: {error}") from error
 
     def close(self) -> None:
         """Leave the bus, once the hub has taken all that was sent."""
@@ -211,49 +233,28 @@ def _open_hub(options: BusOptions) -> Bus:
     if not isinstance(sock, socket.socket):
         raise HarnessError(f"python-can {can.__version__} keeps its socket elsewhere; 4.6 is known to work")
     sock.settimeout(None)
+    if options.node:
+        uses = "".join(f" {can_id:03X}" for can_id in options.uses)
+        sock.sendall(f"< aftbed node {options.node}{uses} >".encode("ascii"))
     return Bus(bus, sock, sock.fileno())
 
 
-class HubClock:
-    """The hand on the hub's virtual time: a connection that hears no frames, only answers."""
+class Changes(Protocol):
+    """Who knows of frames that were got more or less often than they were sent: a `HubLine`."""
 
-    def __init__(self, options: BusOptions) -> None:
-        if options.interface != "socketcand":
-            raise ConfigError(f"lockstep needs the hub, interface socketcand, not {options.interface}")
-        try:
-            self._socket = socket.create_connection((HOST, options.port), HUB_ANSWER_S_MAX)
-        except OSError as error:
-            raise HarnessError(f"no CAN hub at {HOST}:{options.port}: {error}") from error
-        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        try:
-            self._expect("< hi >")
-            self._ask(f"< open {options.channel} >")
-        except HarnessError:
-            self.close()
-            raise
+    disturbed: bool
 
-    def set_time(self, t_us: int) -> None:
-        """Return when the hub has taken `t_us` as its time. HarnessError if it does not."""
-        self._ask(f"< aftbed time {t_us} >")
+    def fileno(self) -> int:
+        """What to wait on."""
+        ...
 
-    def close(self) -> None:
-        """Hang up; the time of the hub stays as it is, for good."""
-        self._socket.close()
+    def changes(self) -> list[tuple[int, int]]:
+        """By identifier, by how many."""
+        ...
 
-    def _ask(self, line: str) -> None:
-        try:
-            self._socket.sendall(line.encode("ascii"))
-        except OSError as error:
-            raise HarnessError(f"the CAN hub did not take {line}: {error}") from error
-        self._expect("< ok >")
-
-    def _expect(self, line: str) -> None:
-        try:
-            found = self._socket.recv(256).decode("ascii", "replace")
-        except OSError as error:
-            raise HarnessError(f"the CAN hub gave no answer: {error}") from error
-        if found != line:
-            raise HarnessError(f"the CAN hub answered {found!r}, expected {line!r}")
+    def settle(self) -> None:
+        """Wait for what is on its way."""
+        ...
 
 
 class AnswerWatch:
@@ -262,14 +263,25 @@ class AnswerWatch:
     A first miss is waited for `FIRST_ANSWER_S_MAX`. From then on the function is thought dead and
     costs `NEXT_ANSWER_S_MAX` per question, until it answers again; then it gets the same short time
     to catch up with the questions it still owes, so that later answers are matched to the right ones.
+
+    Where the bus has faults, `line` tells of questions and answers that are more or fewer than were sent.
     """
 
-    def __init__(self, bus: Bus, answer_id: int, on_frame: Callable[[Frame], None]) -> None:
+    def __init__(
+        self,
+        bus: Bus,
+        answer_id: int,
+        on_frame: Callable[[Frame], None],
+        question_id: int = -1,
+        line: Changes | None = None,
+    ) -> None:
         self.answered = 0
         self.missing = 0
         self._bus = bus
         self._answer_id = answer_id
         self._on_frame = on_frame
+        self._ids = (question_id, answer_id)
+        self._line = line
         self._outstanding = 0
         self._mute = False
 
@@ -283,11 +295,11 @@ class AnswerWatch:
         """Return when nothing is owed, when the deadline has passed, or when `stop()` says so."""
         before, mute = self.answered, self._mute
         end_s = time.monotonic() + (NEXT_ANSWER_S_MAX if mute else FIRST_ANSWER_S_MAX)
-        while self._outstanding and not stop():
+        while self._owed() and not stop():
             rest_s = end_s - time.monotonic()
             if rest_s <= 0:
                 break
-            frame = self._bus.recv(min(rest_s, STOP_CHECK_S))
+            frame = self._next(min(rest_s, STOP_CHECK_S))
             if frame is not None and self.take(frame) and mute:
                 end_s = time.monotonic() + NEXT_ANSWER_S_MAX
         self._judge(self.answered > before, stopped=self._outstanding > 0 and time.monotonic() < end_s)
@@ -300,6 +312,29 @@ class AnswerWatch:
         self.answered += 1
         self._outstanding = max(0, self._outstanding - 1)
         return True
+
+    def _owed(self) -> bool:
+        """Whether an answer is owed, by all that is known about the bus."""
+        if self._line is None:
+            return self._outstanding > 0
+        self._change(self._line)
+        if self._outstanding == 0 and self._line.disturbed:  # does more come than was asked for?
+            self._line.settle()
+            self._change(self._line)
+        return self._outstanding > 0
+
+    def _change(self, line: Changes) -> None:
+        change = sum(change for can_id, change in line.changes() if can_id in self._ids)
+        self._outstanding = max(0, min(self._outstanding + change, OUTSTANDING_MAX))
+
+    def _next(self, rest_s: float) -> Frame | None:
+        """The next frame; None after a while, or when there is news of the bus."""
+        if self._line is None or not self._line.disturbed:
+            return self._bus.recv(rest_s)
+        frame = self._bus.recv(0.0)
+        if frame is None:
+            select.select([self._bus.fileno(), self._line.fileno()], [], [], rest_s)
+        return frame
 
     def _judge(self, heard: bool, *, stopped: bool) -> None:
         if self._outstanding == 0 or heard:  # what is still owed by one who speaks again is lost

@@ -12,33 +12,32 @@ clock. After a hiccup they are made up for, never skipped, so the car drives the
 loaded the machine is; only the answers come later.
 
 *Lockstep* (`pace` None, "max"): virtual time, as fast as it goes. When frames are due, the hub is
-given the time of the step; the brake ECU sends, and the radar sends only after it has seen those
-frames, so the hub has them in this order; then time stands still until the AEB_REQ that answers the
-RADAR_TRACK has come to the brake ECU. Nothing depends on the machine: the same seed gives the same
-frames, byte for byte in the bus log. A function that does not answer is waited for 3 s once, then
-shortly (`AnswerWatch`), and its misses are counted: a dead function does not hang the run.
+given the time of the step; the brake ECU sends, and the radar sends only after those frames have been
+over the wire, so they come in this order; then time stands still until the AEB_REQ that answers the
+RADAR_TRACK has come to the brake ECU. Where the bus has faults, the hub says what more or less there is
+to wait for, and when something comes of them by itself (`HubLine`). Nothing depends on the machine: the
+same seed gives the same frames, byte for byte in the bus log. A function that does not answer is waited for
+3 s once, then shortly (`AnswerWatch`), and its misses are counted: a dead function does not hang the run.
+
+In either, the conditions at which faults of the bus open are looked at in every step, before its frames are
+sent; and what the brake ECU has found wrong with a frame is said beside the bus.
 """
 
 from collections.abc import Callable, Sequence
 
 import msgspec
 
-from aftbed.core.errors import HarnessError
+from aftbed.core.busfault import NODES
 from aftbed.vehicle.body import CarBody, End
-from aftbed.vehicle.bus import (
-    HUB_ANSWER_S_MAX,
-    AnswerWatch,
-    Bus,
-    BusOptions,
-    HubClock,
-    Schedule,
-    open_bus,
-)
+from aftbed.vehicle.bus import AnswerWatch, Bus, BusOptions, Schedule, open_bus
 from aftbed.vehicle.dbcfile import Codec
 from aftbed.vehicle.ecus import BrakePolicy
 from aftbed.vehicle.frame import Frame
+from aftbed.vehicle.hubline import HubLine
 from aftbed.vehicle.report import Telemetry, VehicleResult
 from aftbed.vehicle.scenario import Scenario
+
+RADAR, BRAKE, _ = NODES
 
 
 class DriveOptions(msgspec.Struct, frozen=True):
@@ -68,17 +67,21 @@ class DriveReport(msgspec.Struct, frozen=True):
 class CarBuses:
     """The car's attachments. When this exists they are complete: the drive may begin."""
 
-    def __init__(self, options: BusOptions, *, lockstep: bool) -> None:
-        self.clock = HubClock(options) if lockstep else None
-        self.brake = open_bus(options)
-        self.radar = open_bus(options)
+    def __init__(self, options: BusOptions, *, lockstep: bool, hears: tuple[int, ...] = ()) -> None:
+        """`hears` are the identifiers of the frames that the brake ECU follows."""
+        on_hub = lockstep or options.interface == "socketcand"
+        self.line = HubLine(options) if on_hub else None
+        self.brake = open_bus(msgspec.structs.replace(options, node=BRAKE, uses=hears))
+        self.radar = open_bus(msgspec.structs.replace(options, node=RADAR))
+        if self.line is not None:
+            self.line.drives_the_car()
 
     def close(self) -> None:
         """Leave the bus."""
         self.brake.close()
         self.radar.close()
-        if self.clock is not None:
-            self.clock.close()
+        if self.line is not None:
+            self.line.close()
 
 
 def drive(
@@ -99,14 +102,17 @@ def drive(
 
 class _Car:
     def __init__(self, scenario: Scenario, codec: Codec, buses: CarBuses, options: DriveOptions) -> None:
-        assert (options.pace is None) == (buses.clock is not None), "lockstep, or not?"
+        assert options.pace is not None or buses.line is not None, "lockstep without a hub"
         self._options = options
         self._buses = buses
         self._body = CarBody(scenario, codec, options.brake_policy, options.seed)
         self._track_id = codec.can_id("RADAR_TRACK")
         self._tracks = 0
         self._lag_ms_max = 0.0
-        self._watch = AnswerWatch(buses.brake, codec.can_id("AEB_REQ"), self._body.hear)
+        self._sent = {RADAR: 0, BRAKE: 0}
+        line = buses.line if options.pace is None else None
+        answer_id = codec.can_id("AEB_REQ")
+        self._watch = AnswerWatch(buses.brake, answer_id, self._body.hear, self._track_id, line)
 
     def run(self, report: Callable[[Telemetry], None], stop: Callable[[], bool]) -> DriveReport:
         schedule = None if self._options.pace is None else Schedule(self._options.pace)
@@ -118,6 +124,8 @@ class _Car:
                 self._lag_ms_max = schedule.lag_ms_max
                 self._exchange()
             self._body.step(report)
+            for can_id, word in self._body.noticed():
+                self._buses.brake.notice(can_id, word)
         report(self._body.telemetry())
         return self._report(end)
 
@@ -128,6 +136,9 @@ class _Car:
 
     def _exchange(self) -> None:
         """Paced: take what has come, send what is due."""
+        if self._buses.line is not None:
+            self._buses.line.changes()  # of no concern: time does not wait
+            self._look(self._buses.line)
         for frame in self._buses.brake.drain():
             self._watch.take(frame)
         for frame in self._body.brake_frames():
@@ -137,21 +148,45 @@ class _Car:
             self._buses.radar.send(frame)
             self._tracks += frame.can_id == self._track_id
 
+    def _look(self, line: HubLine) -> None:
+        """Tell the hub which conditions hold now."""
+        for number, condition in list(line.conditions.items()):
+            if self._body.is_so(condition):
+                if self._options.pace is None:
+                    line.set_time(self._body.t_us)
+                line.met(number)
+
     def _exchange_in_lockstep(self, stop: Callable[[], bool]) -> None:
         """Send what is due in an order that the hub cannot change, and wait for the answer."""
+        line, t_us = self._buses.line, self._body.t_us
+        assert line is not None
+        if line.conditions:
+            self._look(line)
         brake_frames, radar_frames = self._body.brake_frames(), self._body.radar_frames()
-        if not brake_frames and not radar_frames:
+        due = line.due_us is not None and line.due_us <= t_us
+        if not (brake_frames or radar_frames or due):
             return
-        assert self._buses.clock is not None
-        self._buses.clock.set_time(self._body.t_us)
-        _send_and_see(brake_frames, self._buses.brake, self._buses.radar, _ignore)
+        line.set_time(t_us)
+        if due:
+            self._watch.wait(stop)  # for what is answered of what the hub had held back
+        self._send(BRAKE, self._buses.brake, brake_frames, line)
         asks = any(frame.can_id == self._track_id for frame in radar_frames)
         if asks:
             self._watch.asked()
-        _send_and_see(radar_frames, self._buses.radar, self._buses.brake, self._watch.take)
+        self._send(RADAR, self._buses.radar, radar_frames, line)
+        self._buses.radar.drain()
         if asks:
             self._tracks += 1
+        if asks or line.disturbed:
             self._watch.wait(stop)
+
+    def _send(self, node: str, bus: Bus, frames: Sequence[Frame], line: HubLine) -> None:
+        """Return when all `frames` have been over the wire."""
+        for frame in frames:
+            bus.send(frame)
+        if frames:
+            self._sent[node] += len(frames)
+            line.carried(node, self._sent[node])
 
     def _report(self, end: End) -> DriveReport:
         return DriveReport(
@@ -163,22 +198,3 @@ class _Car:
             missing_answers=self._watch.missing,
             lag_ms_max=self._lag_ms_max,
         )
-
-
-def _ignore(_: Frame) -> None:
-    """What a node does with frames that are not for it."""
-
-
-def _send_and_see(
-    frames: Sequence[Frame], sender: Bus, witness: Bus, take: Callable[[Frame], object]
-) -> None:
-    """Return when `witness` has seen all `frames`, so that the hub has; `take` gets all it sees."""
-    for frame in frames:
-        sender.send(frame)
-    for frame in frames:
-        seen = None
-        while seen is None or (seen.can_id, seen.data) != (frame.can_id, frame.data):
-            seen = witness.recv(HUB_ANSWER_S_MAX)
-            if seen is None:
-                raise HarnessError(f"the CAN hub did not relay {frame.can_id:#05x} in {HUB_ANSWER_S_MAX} s")
-            take(seen)

@@ -67,6 +67,35 @@ class Codec:
             raise ConfigError(f"{self.path}: message {name} has no E2EDataID")
         return int(attributes["E2EDataID"].value)
 
+    def senders(self) -> list[str]:
+        """The nodes that send something, in small letters."""
+        return sorted({node.lower() for message in self._messages.values() for node in message.senders})
+
+    def sent_by(self, node: str) -> list[str]:
+        """The messages that `node` sends."""
+        messages = self._messages.values()
+        return [m.name for m in messages if node in (sender.lower() for sender in m.senders)]
+
+    def patch(self, name: str, signal: str, value: float) -> tuple[bytes, bytes]:
+        """Where the bits of a signal are in its message, as a mask, and what they are for `value`.
+
+        Any value that has bits will do, also one outside the range that the file gives. ConfigError else.
+        """
+        found, message = self._signal(name, signal), self._message(name)
+        if message.is_multiplexed():
+            raise ConfigError(f"{self.path}: {name} is multiplexed: which signals it has is in its data")
+        half, whole = 2 ** (found.length - 1), 2**found.length
+        least, most = (-half, half - 1) if found.is_signed else (0, whole - 1)
+        scale, offset = float(found.scale), float(found.offset)
+        raw = round((value - offset) / scale)
+        if found.is_float or not least <= raw <= most:
+            low, high = sorted((offset + scale * least, offset + scale * most))
+            raise ConfigError(f"{name}.{signal}={value:g}: its bits hold {low:g} to {high:g}")
+        ones = -1 if found.is_signed else most
+        zero = dict.fromkeys(self.signal_names(name), 0)
+        encoded = [message.encode(zero | {signal: r}, scaling=False, strict=False) for r in (ones, raw)]
+        return encoded[0], encoded[1]
+
     def unit(self, name: str, signal: str) -> str:
         """The unit of a signal as the file has it, "" where it has none."""
         return self._signal(name, signal).unit or ""

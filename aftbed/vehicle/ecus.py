@@ -18,13 +18,15 @@ arbitration order, and RADAR_STATUS is kept 5 ms off the grid of the others: so 
 frame of its 10 ms batch, and the request it makes sees the EGO_STATE of the same instant.
 """
 
+from collections import deque
 from collections.abc import Mapping
 from enum import IntEnum
 from random import Random
 from typing import Final, Literal
 
+from aftbed.core.busfault import FALLBACK
 from aftbed.vehicle.dbcfile import Codec
-from aftbed.vehicle.e2e import COUNTER_COUNT, Receiver, Supervision, protect
+from aftbed.vehicle.e2e import COUNTER_COUNT, ChannelState, Receiver, Status, Supervision, protect
 from aftbed.vehicle.frame import Frame
 from aftbed.vehicle.plant import Plant
 
@@ -42,6 +44,7 @@ HOLD_US: Final = 60_000
 LATE_US: Final = 30_000  # one cycle and a half: from here on a request is missing
 AEB_REQ_TIMEOUT_US: Final = 100_000
 STAGE_FULL: Final = 3
+NOTICED_MAX: Final = 64
 
 
 class Fallback(IntEnum):
@@ -141,6 +144,7 @@ class BrakeEcu:
         self.fallback = Fallback.NONE
         self.accepted = 0
         self.refused = 0
+        self.noticed: deque[tuple[int, str]] = deque(maxlen=NOTICED_MAX)  # of which frames, what is wrong
         self._codec = codec
         self._policy = policy
         self._aeb_req_id = codec.can_id("AEB_REQ")
@@ -157,7 +161,10 @@ class BrakeEcu:
         """Take any frame off the bus; `frame.t_us` is when it arrived. Ignores all but AEB_REQ."""
         if frame.can_id != self._aeb_req_id:
             return
+        first = self._receiver.state is ChannelState.NODATA
         status = self._receiver.check(frame.data, frame.t_us)
+        if status is not Status.OK and not (first and status is Status.WRONGSEQUENCE):
+            self.noticed.append((frame.can_id, status.name.lower()))
         if not self._receiver.usable(status):
             self.refused += 1
             return
@@ -169,7 +176,9 @@ class BrakeEcu:
         if self._request is None:
             return 0.0
         self._receiver.poll(plant.t_us)
-        self.fallback = self._choose(plant, self._request)
+        before, self.fallback = self.fallback, self._choose(plant, self._request)
+        if self.fallback is not before and self.fallback is not Fallback.NONE:
+            self.noticed.append((self._aeb_req_id, FALLBACK))
         if self.fallback is Fallback.RELEASE:
             self.stage, self._demand_ms2 = 0, 0.0
         elif self.fallback is not Fallback.LATCH:  # a latch keeps the stage and demand that it began with

@@ -15,6 +15,7 @@ The lateral selection is made here: a target farther than `LANE_HALF_M` from the
 not in our path and not in the request. The function knows range and speed only.
 """
 
+from collections import deque
 from typing import Final, Protocol
 
 import msgspec
@@ -36,6 +37,7 @@ LANE_HALF_M: Final = 1.5  # half a lane, less half of what a car may stick into 
 TIMEOUT_CYCLES: Final = 6
 REPLICAS: Final = (1, 2)
 TTC_MAX_S: Final = 40.95  # range of the signal
+NOTICED_MAX: Final = 64
 BLIND_PART: Final = 0.75  # of a radar cycle must have passed since the last request for a blind one
 
 
@@ -82,6 +84,22 @@ class ClientGateway:
     def counts(self) -> GatewayCounts:
         """Of the frames."""
         return self._gateway.counts
+
+    def noticed(self) -> list[tuple[int, str]]:
+        """What was found wrong since this was last asked: of which frames, and what."""
+        if not isinstance(self._gateway, Gateway) or not self._gateway.noticed:
+            return []
+        found = list(self._gateway.noticed)
+        self._gateway.noticed.clear()
+        return found
+
+    def makes_requests(self, can_id: int) -> bool:
+        """Whether a request is made of a frame with this identifier, if it is believed."""
+        return isinstance(self._gateway, Gateway) and can_id == self._gateway.track_id
+
+    def uses(self) -> tuple[int, ...]:
+        """The identifiers that it makes something of."""
+        return self._gateway.uses if isinstance(self._gateway, Gateway) else ()
 
     def on_frame(self, frame: Frame) -> bytes | None:
         """See `BusGateway.on_frame`."""
@@ -150,7 +168,9 @@ class Gateway:
         self._codec = codec
         self._sender = ReplySender(codec)
         self._ego_id, self._ego = codec.can_id("EGO_STATE"), _receiver(codec, "EGO_STATE")
-        self._track_id, self._track = codec.can_id("RADAR_TRACK"), _receiver(codec, "RADAR_TRACK")
+        self.track_id, self._track = codec.can_id("RADAR_TRACK"), _receiver(codec, "RADAR_TRACK")
+        self.uses = (self._ego_id, self.track_id)
+        self.noticed: deque[tuple[int, str]] = deque(maxlen=NOTICED_MAX)  # of which frames, what is wrong
         self._t_us = 0
         self._ego_us = 0
         self._ego_speed_ms: float | None = None  # the last one believed
@@ -159,7 +179,7 @@ class Gateway:
 
     def on_frame(self, frame: Frame) -> bytes | None:
         """See `BusGateway.on_frame`: a request for each RADAR_TRACK that is believed."""
-        if frame.can_id not in (self._ego_id, self._track_id):
+        if frame.can_id not in self.uses:
             self.counts.ignored += 1
             return None
         if frame.t_us < self._t_us:
@@ -201,6 +221,7 @@ class Gateway:
         target = target_of(slot, signals["RANGE"], signals["RELATIVE_SPEED"], new)
         if signals["VALID"] and target is None:
             self.counts.refuse("range")
+            self.noticed.append((frame.can_id, "range"))
             return None
         self.counts.accepted += 1
         in_path = signals["VALID"] and abs(signals["LATERAL_OFFSET"]) <= LANE_HALF_M
@@ -210,16 +231,23 @@ class Gateway:
         """The ego speed, and whether it is to be believed now."""
         timeout_us = self._ego.supervision.timeout_us
         if self._ego_speed_ms is None or t_us - self._ego_us > timeout_us:
+            self.noticed.append((self._ego_id, "timeout"))
             return 0.0, False
         return self._ego_speed_ms, True
 
     def _believed(self, receiver: Receiver, frame: Frame) -> bool:
         """Let E2E judge the frame; count it if it is refused."""
         self._t_us = frame.t_us
+        first = receiver.state is ChannelState.NODATA
         status = receiver.check(frame.data, frame.t_us)
         if receiver.usable(status):
+            if status is Status.OK_SOMELOST:
+                self.noticed.append((frame.can_id, "lost"))
             return True
-        self.counts.refuse(_reason(receiver, frame, status))
+        reason = _reason(receiver, frame, status)
+        self.counts.refuse(reason)
+        if not first or status is not Status.WRONGSEQUENCE:  # which is all that a first frame can be
+            self.noticed.append((frame.can_id, reason))
         return False
 
 

@@ -28,8 +28,7 @@ backwards.
 the bus is measured by, then one `write` to the log before the next frame is taken. So a `kill -9`
 costs the log no more than the frame under way.
 
-*Limits.* Nothing that a client does may stop the bus. One who does not read is disconnected when
-256 KiB wait for it; one who sends more than the wire carries is not read until its queue is short.
+*Beside the bus* nodes of ours say more, and faults of the bus strike here: see `hubline`, `hubfaults`.
 
 Limit, said openly: python-can demands that a read gives `< ok >` and nothing behind it, while the
 first frame may follow at once. So the hub sends one byte of TCP urgent data between the two: a reader
@@ -42,115 +41,71 @@ import re
 import select
 import socket
 import time
-from collections import deque
 from os import read, write
-from typing import Final
+from typing import TYPE_CHECKING, Final, Protocol
 
-import msgspec
-
-from aftbed.core.errors import ConfigError, HarnessError, PeerError
+from aftbed.core.busfault import BusFault, Struck
+from aftbed.core.errors import HarnessError, PeerError
 from aftbed.vehicle.candump import log_line
 from aftbed.vehicle.frame import Frame
+from aftbed.vehicle.hubclient import Client, Clients, HubCounts, HubOptions, frame_bits, parse_send
 
-CLIENTS_MAX: Final = 64
+if TYPE_CHECKING:
+    from aftbed.vehicle.hubfaults import Delivery, HubFaults
+
 EVENTS_MAX: Final = 32  # in one round; the rest comes in the next
 READ_BYTES_MAX: Final = 4096
 ELEMENT_BYTES_MAX: Final = 128  # the longest legal one has 46
 LAST_FRAMES_S_MAX: Final = 0.1
-OUTPUT_BYTES_MAX: Final = 256 * 1024
-FRAMES_QUEUED_MAX: Final = 256  # of one client
 LOG_BYTES_MAX: Final = 1024 * 1024 * 1024
 
-_SEND: Final = re.compile(rb"< send ([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8}) ([0-9]) ((?:[0-9A-Fa-f]{1,2} ){0,8}) ?")
 _TIME: Final = re.compile(rb"< aftbed time ([0-9]{1,16}) ")
+_NODE: Final = re.compile(rb"< aftbed node ([a-z_][a-z0-9_]{0,31})((?: [0-9A-F]{3}){0,16}) ")
+_AWAIT: Final = re.compile(rb"< aftbed await ([a-z_][a-z0-9_]{0,31}) ([0-9]{1,12}) ")
+_MET: Final = re.compile(rb"< aftbed met ([0-9]{1,12}) ")
+_UNASKED: Final = re.compile(rb"< aftbed unasked ([0-9A-F]{3}) ")
+_NOTICED: Final = re.compile(rb"< aftbed noticed ([0-9A-F]{3}) ([a-z_]{1,32}) ")
 _HEARD: Final = select.EPOLLIN | select.EPOLLHUP | select.EPOLLERR
 
 
-class HubOptions(msgspec.Struct, frozen=True):
-    """How the bus behaves. `origin_ns` is the start of the run by the monotonic clock."""
+class Desk(Protocol):
+    """Whom the hub works for; the line to it is the life descriptor."""
 
-    channel: str = "can0"
-    lockstep: bool = False
-    pace: float = 1.0  # seconds of bus time in a second
-    bitrate_bps: int | None = None  # None: a frame takes no time on the wire
-    origin_ns: int | None = None  # None: when `serve` is called
+    def attend(self, hub: "Hub") -> bool:
+        """Carry out what is ordered on the line; False at its end."""
+        ...
 
-    def __post_init__(self) -> None:
-        """Refuse a bus on which no time would pass."""
-        if not self.pace > 0:
-            raise ConfigError(f"bus pace {self.pace}, allowed is more than 0")
-        if self.bitrate_bps is not None and not 1_000 <= self.bitrate_bps <= 1_000_000:
-            raise ConfigError(f"bus bitrate {self.bitrate_bps} bit/s, allowed is 1000 to 1000000")
-
-
-class HubCounts(msgspec.Struct):
-    """What happened on the bus: frames carried, elements refused, clients put out by reason."""
-
-    frames: int = 0
-    refused: int = 0
-    slow_readers: int = 0
-    oversized: int = 0
-    turned_away: int = 0
-
-
-def frame_bits(data_bytes: int) -> int:
-    """Bits of a data frame with an 11-bit identifier on the wire, stuffing at its worst.
-
-    34 bits and the data are open to stuffing, at most one bit in four (Davis et al. 2007); the
-    13 bits of delimiters, acknowledgement, end of frame and intermission are not.
-    """
-    stuffable = 34 + 8 * data_bytes
-    return stuffable + (stuffable - 1) // 4 + 13
-
-
-def parse_send(element: bytes, t_us: int) -> Frame:
-    """The frame in `< send ID LENGTH BYTES` (without its `>`). Raises PeerError."""
-    match = _SEND.fullmatch(element)
-    if match is None:
-        raise PeerError("malformed send")
-    identifier, length, text = match.groups()
-    if len(identifier) != 3:
-        raise PeerError("29-bit identifiers are not carried")
-    data = bytes([int(byte, 16) for byte in text.split()])
-    if len(data) != int(length):
-        raise PeerError(f"length {int(length)} but {len(data)} bytes")
-    return Frame(t_us, int(identifier, 16), data)
-
-
-class _Client:
-    """One connection: how far its handshake is, and what waits in either direction."""
-
-    __slots__ = ("frames", "inbox", "interest", "opened", "outbox", "raw", "sock")
-
-    def __init__(self, sock: socket.socket) -> None:
-        self.sock = sock
-        self.opened = False
-        self.raw = False
-        self.inbox = b""
-        self.outbox = bytearray()
-        self.frames: deque[Frame] = deque()  # `t_us` is when the node asked for the bus
-        self.interest = select.EPOLLIN
+    def report(self, news: list[Struck]) -> None:
+        """Something has become of these faults."""
+        ...
 
 
 class Hub:
     """The bus. `serve` makes one and runs it; it owns the connections, not the descriptors given."""
 
-    def __init__(self, listener: socket.socket, log_fd: int, options: HubOptions, life_fd: int) -> None:
+    def __init__(
+        self, listener: socket.socket, log_fd: int, options: HubOptions, life_fd: int, desk: Desk | None
+    ) -> None:
         self.counts = HubCounts()
         self._options = options
         self._listener = listener
         self._log_fd = log_fd
         self._life_fd = life_fd
+        self._desk = desk
         self._origin_ns = time.monotonic_ns() if options.origin_ns is None else options.origin_ns
-        self._clients: dict[int, _Client] = {}
-        self._hearers: list[_Client] = []  # replaced, never changed: it is walked while clients drop
-        self._senders: list[_Client] = []  # who has frames waiting; outlives the connection
-        self._time_master: _Client | None = None
+        self._senders: list[Client] = []  # who has frames waiting; outlives the connection
+        self._time_master: Client | None = None
+        self._plant: Client | None = None  # who drives the car
+        self._awaited: tuple[Client, str, int] | None = None  # who wants to know when so many are carried
+        self._faults: HubFaults | None = None  # None: nothing is to be looked after
+        self._past_faults: HubFaults | None = None
         self._virtual_us = 0
-        self._wire: tuple[_Client, Frame] | None = None  # in transmission, until its `t_us`
+        self._wire: tuple[Client, Frame] | None = None  # in transmission, until its `t_us`
         self._wire_free_us = 0
         self._log_bytes = 0
         self._epoll = select.epoll()
+        self._clients = Clients(listener, self._epoll, self.counts)
+        self._send, self._drop = self._clients.send, self._clients.drop
         listener.setblocking(False)
         self._epoll.register(listener.fileno(), select.EPOLLIN)
         self._epoll.register(life_fd, select.EPOLLIN)
@@ -160,7 +115,11 @@ class Hub:
         alive = True
         while alive:
             alive = self._attend_all(self._wait())
+            if self._faults is not None and not self._options.lockstep:
+                self._release(self._faults)
             self._carry()
+            if self._awaited is not None:
+                self._answer_awaited(*self._awaited)
         self._epoll.unregister(self._life_fd)
         self._epoll.unregister(self._listener.fileno())
         end_s = time.monotonic() + LAST_FRAMES_S_MAX
@@ -177,14 +136,14 @@ class Hub:
             if client is not None:
                 self._attend(client, mask)
             elif fd == self._life_fd:
-                alive = bool(read(fd, READ_BYTES_MAX))
+                alive = bool(read(fd, READ_BYTES_MAX)) if self._desk is None else self._desk.attend(self)
             elif fd == self._listener.fileno():
-                self._accept()
+                self._clients.accept()
         return alive
 
     def close(self) -> None:
         """Hang up on all clients."""
-        for client in list(self._clients.values()):
+        for client in self._clients.all():
             self._drop(client)
         self._epoll.close()
 
@@ -197,10 +156,14 @@ class Hub:
         return elapsed_us if self._options.pace == 1.0 else int(elapsed_us * self._options.pace)
 
     def _wait(self) -> list[tuple[int, int]]:
-        """The next events; at once with none when the transmission on the wire ends."""
-        if self._wire is None:
+        """The next events; at once with none when the transmission on the wire ends, or a fault is due."""
+        due_us = self._wire[1].t_us if self._wire is not None else None
+        if self._faults is not None and not self._options.lockstep:
+            fault_us = self._faults.due_us()
+            due_us = fault_us if due_us is None else min(due_us, due_us if fault_us is None else fault_us)
+        if due_us is None:
             return self._epoll.poll(-1, EVENTS_MAX)
-        rest_us = self._wire[1].t_us - self._now_us()
+        rest_us = due_us - self._now_us()
         if rest_us > 0:  # epoll counts milliseconds, select microseconds, and an epoll can be selected
             select.select([self._epoll], [], [], rest_us / (1e6 * self._options.pace))
         return self._epoll.poll(0, EVENTS_MAX)
@@ -215,14 +178,18 @@ class Hub:
                 if frame.t_us > self._now_us() and not self._options.lockstep:
                     return
                 self._wire = None
-                self._deliver(frame, sender)
+                sender.carried += 1
+                if self._faults is None:
+                    self._deliver(frame, sender, self._clients.hearers)
+                else:
+                    self._disturb(self._faults, frame, sender)
             if not self._senders:
                 return
             winner = min(self._senders, key=lambda client: client.frames[0].can_id)
             self._wire = (winner, self._transmitted(winner.frames.popleft()))
             if not winner.frames:
                 self._senders.remove(winner)
-            self._watch(winner)
+            self._clients.watch(winner)
 
     def _transmitted(self, frame: Frame) -> Frame:
         """`frame` with the time at which its transmission ends, beginning when the wire is free."""
@@ -233,14 +200,14 @@ class Hub:
             return frame
         return Frame(self._wire_free_us, frame.can_id, frame.data)
 
-    def _deliver(self, frame: Frame, sender: _Client) -> None:
+    def _deliver(self, frame: Frame, sender: Client | None, hearers: list[Client]) -> None:
         """The one place through which every frame passes: relay it, then record it."""
         self.counts.frames += 1
         seconds, micros = divmod(frame.t_us, 1_000_000)
         text = f"< frame {frame.can_id:03X} {seconds}.{micros:06d} {frame.data.hex().upper()} >".encode(
             "ascii"
         )
-        for client in self._hearers:
+        for client in hearers:
             if client is not sender:
                 self._send(client, text)
         line = log_line(frame, self._options.channel).encode("ascii")
@@ -250,47 +217,63 @@ class Hub:
         if write(self._log_fd, line) != len(line):
             raise HarnessError("the bus log took only a part of a line: is the disk full?")
 
+    # -- faults of the bus
+
+    def disturb(self, number: int, fault: BusFault, draw: int) -> None:
+        """Arm `fault`, which is aimed; `draw` seeds its chance."""
+        from aftbed.vehicle.hubfaults import HubFaults  # noqa: PLC0415 - it needs the CRC, and few runs it
+
+        if self._past_faults is None:
+            self._past_faults = HubFaults(
+                lambda line: self._tell(self._time_master, line), lambda line: self._tell(self._plant, line)
+            )
+        self._faults = self._past_faults
+        self._faults.arm(number, fault, draw, self._now_us())
+
+    def forget(self, number: int) -> None:
+        """End that fault."""
+        if self._faults is not None:
+            self._faults.forget(number, self._now_us())
+
+    @property
+    def disturbed(self) -> bool:
+        """Whether a fault can still strike; if not, a frame costs no more than it ever did."""
+        return self._faults is not None
+
+    def struck(self) -> list[Struck]:
+        """What has become of all faults."""
+        return [] if self._past_faults is None else self._past_faults.struck()
+
+    def _disturb(self, faults: "HubFaults", frame: Frame, sender: Client) -> None:
+        self._deliver_all(faults, faults.carry(frame, sender, self._clients.hearers))
+
+    def _release(self, faults: "HubFaults") -> None:
+        self._deliver_all(faults, faults.release(self._now_us(), self._clients.hearers))
+
+    def _deliver_all(self, faults: "HubFaults", deliveries: "list[Delivery]") -> None:
+        for one in deliveries:
+            self._deliver(one.frame, None, one.hearers)
+        self._look_after(faults)
+
+    def _look_after(self, faults: "HubFaults") -> None:
+        if self._desk is not None and (news := faults.news()):
+            self._desk.report(news)
+        if faults.idle:
+            self._faults = None
+
+    def _tell(self, client: Client | None, line: bytes) -> None:
+        if client is not None:
+            self._send(client, line)
+
     # -- clients
 
-    def _accept(self) -> None:
-        try:
-            sock, _ = self._listener.accept()
-        except OSError:  # gone before it was accepted
-            return
-        if len(self._clients) >= CLIENTS_MAX:
-            self.counts.turned_away += 1
-            sock.close()
-            return
-        sock.setblocking(False)
-        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        client = self._clients[sock.fileno()] = _Client(sock)
-        self._epoll.register(sock.fileno(), client.interest)
-        self._send(client, b"< hi >")
-
-    def _drop(self, client: _Client) -> None:
-        """Hang up. What the node had handed over before still gets its turn on the wire."""
-        if self._clients.pop(client.sock.fileno(), None) is None:
-            return
-        self._hearers = [other for other in self._hearers if other is not client]
-        self._epoll.unregister(client.sock.fileno())
-        client.sock.close()
-
-    def _attend(self, client: _Client, events: int) -> None:
+    def _attend(self, client: Client, events: int) -> None:
         if events & select.EPOLLOUT:
-            self._flush(client)
+            self._clients.flush(client)
         if events & _HEARD:
             self._receive(client)
 
-    def _watch(self, client: _Client) -> None:
-        """Ask only for the events that can be served: a full queue is not read into."""
-        interest = select.EPOLLOUT if client.outbox else 0
-        if len(client.frames) < FRAMES_QUEUED_MAX:
-            interest |= select.EPOLLIN
-        if interest != client.interest and client.sock.fileno() in self._clients:
-            client.interest = interest
-            self._epoll.modify(client.sock.fileno(), interest)
-
-    def _receive(self, client: _Client) -> None:
+    def _receive(self, client: Client) -> None:
         try:
             data = client.sock.recv(READ_BYTES_MAX)
         except BlockingIOError:
@@ -307,9 +290,9 @@ class Hub:
             self.counts.oversized += 1
             self._refuse(client, f"element over {ELEMENT_BYTES_MAX} bytes")
             self._drop(client)
-        self._watch(client)
+        self._clients.watch(client)
 
-    def _take(self, client: _Client, element: bytes) -> None:
+    def _take(self, client: Client, element: bytes) -> None:
         """Act on one element (without its `>`), or refuse it, having changed nothing."""
         try:
             if client.raw and element.startswith(b"< send "):
@@ -321,8 +304,8 @@ class Hub:
         except PeerError as error:
             self._refuse(client, str(error))
 
-    def _command(self, client: _Client, element: bytes) -> None:
-        """Everything but a frame: rare, so legibility before speed."""
+    def _command(self, client: Client, element: bytes) -> None:
+        """Everything but a frame."""
         if element == b"< echo ":
             self._send(client, b"< echo >")
         elif element.startswith(b"< open ") and not client.opened:
@@ -332,65 +315,84 @@ class Hub:
             self._send(client, b"< ok >")
         elif element == b"< rawmode " and client.opened and not client.raw:
             client.raw = True
-            self._hearers = [*self._hearers, client]
+            self._clients.hearers = [*self._clients.hearers, client]
             self._send(client, b"< ok >\n", socket.MSG_OOB)
         elif (match := _TIME.fullmatch(element)) is not None and client.opened:
             self._set_time(client, int(match[1]))
-            self._send(client, b"< ok >")
+            self._send(client, self._ok())
+        elif element.startswith(b"< aftbed ") and client.opened:
+            self._aside(client, element)
         else:
             raise PeerError("unknown command, or not now")
 
-    def _set_time(self, client: _Client, t_us: int) -> None:
+    def _aside(self, client: Client, element: bytes) -> None:
+        """What nodes of ours say beside the bus; only what is asked for is answered."""
+        if (match := _NODE.fullmatch(element)) is not None:
+            client.name = match[1].decode("ascii")
+            client.uses = frozenset(int(word, 16) for word in match[2].split())
+        elif (match := _AWAIT.fullmatch(element)) is not None:
+            self._awaited = (client, match[1].decode("ascii"), int(match[2]))
+        elif element == b"< aftbed plant ":
+            self._plant = client
+            self._send(client, b"< ok >" + (self._faults.watches() if self._faults is not None else b""))
+        elif (match := _MET.fullmatch(element)) is not None:
+            if self._faults is not None:
+                self._faults.met(int(match[1]), self._now_us())
+                self._release(self._faults)
+            self._send(client, self._ok())
+        elif (match := _UNASKED.fullmatch(element)) is not None:
+            if self._past_faults is not None:
+                self._past_faults.unasked(int(match[1], 16))
+        elif (match := _NOTICED.fullmatch(element)) is not None:
+            if self._past_faults is not None:
+                self._past_faults.noticed(client.name, int(match[1], 16), match[2].decode("ascii"))
+                self._look_after(self._past_faults)
+        else:
+            raise PeerError("unknown command, or not now")
+
+    def _ok(self) -> bytes:
+        """To the time master: once there have been faults, when something is due next."""
+        if self._past_faults is None:
+            return b"< ok >"
+        due_us = self._past_faults.due_us()
+        return f"< ok {'-' if due_us is None else due_us} >".encode("ascii")
+
+    def _answer_awaited(self, client: Client, node: str, frames: int) -> None:
+        if any(c.name == node and c.carried >= frames for c in self._clients.all()):
+            self._awaited = None
+            self._send(client, self._ok())
+
+    def _set_time(self, client: Client, t_us: int) -> None:
         if not self._options.lockstep:
             raise PeerError("this bus runs in real time")
         if self._time_master not in (None, client):
             raise PeerError("another client is the time master")
         if t_us < self._virtual_us:
             raise PeerError(f"time runs backwards, from {self._virtual_us} to {t_us}")
+        if self._faults is not None:
+            self._carry()  # what was sent before is of before
         self._time_master, self._virtual_us = client, t_us
+        if self._faults is not None:
+            self._release(self._faults)
 
     # -- output
 
-    def _refuse(self, client: _Client, reason: str) -> None:
+    def _refuse(self, client: Client, reason: str) -> None:
         self.counts.refused += 1
         seconds, micros = divmod(self._now_us(), 1_000_000)
         self._send(client, f"< error 20000000 {seconds}.{micros:06d} {reason} >".encode("ascii"))
 
-    def _send(self, client: _Client, data: bytes, flags: int = 0) -> None:
-        """Send, or queue what the socket does not take; a client with too much queued is dropped."""
-        sent = 0
-        if not client.outbox:
-            try:
-                sent = client.sock.send(data, flags | socket.MSG_NOSIGNAL)
-            except BlockingIOError:
-                pass
-            except OSError:
-                self._drop(client)
-                return
-        if sent < len(data):
-            client.outbox += data[sent:]
-            if len(client.outbox) > OUTPUT_BYTES_MAX:
-                self.counts.slow_readers += 1
-                self._drop(client)
-            self._watch(client)
 
-    def _flush(self, client: _Client) -> None:
-        try:
-            del client.outbox[: client.sock.send(client.outbox, socket.MSG_NOSIGNAL)]
-        except BlockingIOError:
-            return
-        except OSError:
-            self._drop(client)
-            return
-        self._watch(client)
-
-
-def serve(listener: socket.socket, log_fd: int, options: HubOptions, life_fd: int) -> HubCounts:
+def serve(
+    listener: socket.socket, log_fd: int, options: HubOptions, life_fd: int, desk: Desk | None = None
+) -> HubCounts:
     """Run a bus on `listener`, bound and listening, until `life_fd` reads its end; record on `log_fd`.
+
+    A `desk` reads `life_fd` itself.
 
     Raises HarnessError, or OSError, when a frame cannot be recorded.
     """
-    hub = Hub(listener, log_fd, options, life_fd)
+    hub = Hub(listener, log_fd, options, life_fd, desk)
     try:
         return hub.run()
     finally:

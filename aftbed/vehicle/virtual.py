@@ -16,20 +16,38 @@ bit. What arrives between two steps is heard by the next one; bus time is whole 
 How often `advance` is called makes no difference: the plant is moved when it is asked for, so that the
 caller has one event for each radar cycle and not twenty.
 
-Limits: the bus is ideal. It takes no time, loses nothing, and has no other node on it.
+*Faults of the bus* (`disturb`) strike between the one who sends and those who hear, as in the hub. A frame
+that is held back comes in the step that finds it due, like everything on this bus.
+
+Limits: but for its faults the bus is ideal. It takes no time, loses nothing, and has no other node on it.
 """
 
 from collections import deque
 from collections.abc import Callable
 
+import msgspec
+
+from aftbed.core.busfault import NODES, BusFault, Struck
+from aftbed.vehicle.aim import aimed
 from aftbed.vehicle.body import CarBody, End
 from aftbed.vehicle.dbcfile import Codec, load_dbc
+from aftbed.vehicle.disturbance import Disturber, Sent
 from aftbed.vehicle.ecus import BrakePolicy
 from aftbed.vehicle.frame import Frame
 from aftbed.vehicle.gateway import ClientGateway, Gateway, GatewayCounts
 from aftbed.vehicle.plant import STEP_US
 from aftbed.vehicle.report import VehicleResult
 from aftbed.vehicle.scenario import Scenario
+
+RADAR, BRAKE, GATEWAY = NODES
+
+
+class _Arriving(msgspec.Struct, frozen=True):
+    """A frame on its way to the brake ECU, which hears it if it is not cut off."""
+
+    frame: Frame
+    heard: bool = True
+    by: tuple[int, ...] = ()
 
 
 class VirtualCar:
@@ -49,13 +67,17 @@ class VirtualCar:
         `witness` sees every frame of the bus, in the order of the bus, as a log does.
         """
         codec = codec or load_dbc()
+        self._codec = codec
         self._body = CarBody(scenario, codec, brake_policy, seed)
         self._gateway = ClientGateway(Gateway(codec))
         self._witness = witness
         self._end = self._body.ended()
         self._step_us = 0  # the step whose frames are to be sent next
         self._now_ns = 0
-        self._arriving: deque[Frame] = deque()  # not heard yet
+        self._arriving: deque[_Arriving] = deque()  # not heard yet
+        self._disturber: Disturber | None = None
+        self._asked: list[bytes] = []  # requests that were made before anybody came for them
+        self._answer_id = codec.can_id("AEB_REQ")
 
     @property
     def end(self) -> End | None:
@@ -76,13 +98,24 @@ class VirtualCar:
         """When the next request can be made, or the scenario ends; None when the drive is over."""
         if self._end is not None:
             return None
-        return min(self._body.track_due_us(self._step_us), self._body.duration_us) * 1000
+        if self._asked:
+            return self._now_ns
+        due_us = min(self._body.track_due_us(self._step_us), self._body.duration_us)
+        released_us = self._disturber.due_us() if self._disturber is not None else None
+        if released_us is not None:  # it comes with a step that has not begun
+            due_us = min(due_us, max(self._step_us, -(-released_us // STEP_US) * STEP_US))
+        return due_us * 1000
 
     def advance(self, now_ns: int) -> list[bytes]:
         """Drive up to and including `now_ns`. The payloads of the requests that were made, in order."""
         self._pass_to(now_ns)
+        payloads, self._asked = self._asked, []
+        return payloads + self._drive(now_ns)
+
+    def _drive(self, until_ns: int) -> list[bytes]:
+        """Take the steps up to and including that time. The requests that they make."""
         payloads: list[bytes] = []
-        while self._end is None and self._step_us * 1000 <= now_ns:
+        while self._end is None and self._step_us * 1000 <= until_ns:
             if self._step_us > self._body.t_us:
                 self._finish_step()
             if self._end is None:
@@ -95,9 +128,70 @@ class VirtualCar:
         What is no reply to the brakes is counted, and sends nothing.
         """
         self._pass_to(now_ns)
+        if self._disturber is not None:  # what comes before this reply is disturbed before it
+            self._asked += self._drive(now_ns)
         t_us = -(-now_ns // 1000)
-        for frame in self._gateway.on_reply(payload, replica, epoch):
-            self._arriving.append(Frame(t_us, frame.can_id, frame.data))
+        for answer in self._gateway.on_reply(payload, replica, epoch):
+            frame = Frame(t_us, answer.can_id, answer.data)
+            if self._disturber is None or self._end is not None:
+                self._arriving.append(_Arriving(frame))
+            else:
+                self._put(self._disturber, self._disturber.carry(frame, GATEWAY))
+
+    # -- faults of the bus ----------------------------------------------------------------------
+
+    def disturb(self, number: int, fault: BusFault, draw: int, now_ns: int) -> None:
+        """Arm `fault` before anything of `now_ns` happens.
+
+        Raises ConfigError where it is not aimed yet, and names what does not exist.
+        """
+        fault = fault if fault.aim is not None else aimed(fault, [self._codec])
+        self._pass_to(now_ns)
+        self._asked += self._drive(now_ns - 1)
+        self._disturber = self._disturber or Disturber()
+        self._disturber.arm(number, fault, draw, -(-now_ns // 1000))
+
+    def forget(self, number: int, now_ns: int) -> None:
+        """End the fault before anything of `now_ns` happens."""
+        self._pass_to(now_ns)
+        self._asked += self._drive(now_ns - 1)
+        if self._disturber is not None:
+            self._disturber.forget(number, -(-now_ns // 1000))
+
+    def struck(self) -> list[Struck]:
+        """What has become of each fault."""
+        return self._disturber.struck() if self._disturber is not None else []
+
+    def struck_by(self, number: int) -> Struck | None:
+        """What has become of one."""
+        return next((struck for struck in self.struck() if struck.number == number), None)
+
+    def _disturbed(self, disturber: Disturber) -> list[bytes]:
+        """The begin of a step: what the car is in by now, and what is due. The requests that it makes."""
+        t_us = self._body.t_us
+        for number, condition in disturber.conditions():
+            if self._body.is_so(condition):
+                disturber.met(number, t_us)
+        return self._put(disturber, disturber.release(t_us))
+
+    def _put(self, disturber: Disturber, sent: list[Sent]) -> list[bytes]:
+        """Have these frames heard by who hears them. The requests that are made."""
+        payloads = []
+        for one in sent:
+            frame, sender = one.frame, one.sender
+            if sender != GATEWAY:
+                self._show(frame)
+                if not disturber.deaf(sender, GATEWAY, frame.t_us):
+                    payload = self._gateway.on_frame(frame)
+                    payloads += [payload] if payload is not None else []
+                    if frame.can_id in self._gateway.uses():
+                        disturber.reached(one.by, GATEWAY)
+            else:
+                heard = not disturber.deaf(sender, BRAKE, frame.t_us)
+                self._arriving.append(_Arriving(frame, heard, one.by))
+        for can_id, word in self._gateway.noticed():
+            disturber.noticed(GATEWAY, can_id, word)
+        return payloads
 
     def result(self) -> VehicleResult:
         """What the drive came to, so far."""
@@ -111,6 +205,13 @@ class VirtualCar:
         """The ECUs send what is due. The request that this makes, if any."""
         self._hear_until(self._body.t_us - 1)
         self._step_us = self._body.t_us + STEP_US
+        disturber = self._disturber
+        if disturber is not None:
+            payloads = self._disturbed(disturber)
+            for frames, node in ((self._body.brake_frames(), BRAKE), (self._body.radar_frames(), RADAR)):
+                for frame in frames:
+                    payloads += self._put(disturber, disturber.carry(frame, node))
+            return payloads
         payloads = []
         for frame in self._body.brake_frames() + self._body.radar_frames():
             self._show(frame)
@@ -123,14 +224,20 @@ class VirtualCar:
         """The brake ECU hears what has come in this instant, and the plant moves."""
         self._hear_until(self._body.t_us)
         self._body.step()
+        if self._disturber is not None:
+            for can_id, word in self._body.noticed():
+                self._disturber.noticed(BRAKE, can_id, word)
         self._end = self._body.ended()
 
     def _hear_until(self, t_us: int) -> None:
         """The brake ECU takes what has arrived at `t_us` or before."""
-        while self._arriving and self._arriving[0].t_us <= t_us:
-            frame = self._arriving.popleft()
-            self._show(frame)
-            self._body.hear(frame)
+        while self._arriving and self._arriving[0].frame.t_us <= t_us:
+            one = self._arriving.popleft()
+            self._show(one.frame)
+            if one.heard:
+                self._body.hear(one.frame)
+                if one.by and one.frame.can_id == self._answer_id and self._disturber is not None:
+                    self._disturber.reached(one.by, BRAKE)
 
     def _show(self, frame: Frame) -> None:
         if self._witness is not None:

@@ -41,22 +41,28 @@ class _Loader(yaml.SafeLoader):
 
 def read_yaml(path: Path, shape: type[S]) -> S:
     """The file as a `shape`. Raises ConfigError naming file, key, what was found and what is allowed."""
-    found = _parse(path)
+    data = _read(path)
+    found = _parse(path, data)
     if found is None:
         found = {}
     try:
         return msgspec.convert(found, shape)
     except msgspec.ValidationError as error:
-        raise ConfigError(f"{path}: {_explain(str(error), found, shape)}") from error
+        line = _line(data, str(error))
+        raise ConfigError(f"{path}: {line}{_explain(str(error), found, shape)}") from error
 
 
-def _parse(path: Path) -> object:
+def _read(path: Path) -> bytes:
     try:
         data = path.read_bytes()
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
     if len(data) > YAML_BYTES_MAX:
         raise ConfigError(f"{path}: {len(data)} bytes, allowed are {YAML_BYTES_MAX}")
+    return data
+
+
+def _parse(path: Path, data: bytes) -> object:
     try:
         found: object = yaml.load(data, Loader=_Loader)  # a SafeLoader
     except yaml.MarkedYAMLError as error:
@@ -65,6 +71,24 @@ def _parse(path: Path) -> object:
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise ConfigError(f"{path}: not YAML: {error}") from error
     return found
+
+
+def _line(data: bytes, reason: str) -> str:
+    """`line N: `, where in the file what msgspec refuses stands; `""` for a file without any content."""
+    node: yaml.Node | None = yaml.compose(data, Loader=_Loader)
+    strange = _UNKNOWN.search(reason)
+    at = _WHERE.search(reason)
+    keys = [key for key in re.split(r"[.\[\]]+", at["path"] if at else "") if key]
+    for key in (*keys, *([strange["key"]] if strange else [])):
+        if isinstance(node, yaml.MappingNode):
+            pairs = {str(name.value): (name, value) for name, value in node.value}
+            if key in pairs and strange is not None and key == strange["key"]:
+                node = pairs[key][0]
+            elif key in pairs:
+                node = pairs[key][1]
+        elif isinstance(node, yaml.SequenceNode) and key.isdigit():
+            node = node.value[int(key)]
+    return f"line {node.start_mark.line + 1}: " if node is not None else ""
 
 
 def _explain(reason: str, found: object, shape: type[msgspec.Struct]) -> str:

@@ -210,12 +210,12 @@ def test_a_step_that_is_wrong(step: str, reason: str) -> None:
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        ("purpose: x\n", "x.yaml: key 'commit' is missing"),
-        ("commit: []\n", "x.yaml: key 'purpose' is missing"),
-        ("purpose: x\ncommit: []\nprepair: []\n", "x.yaml: unknown key 'prepair'; did you mean 'prepare'?"),
-        ("purpose: x\ncommit: a/x\n", "x.yaml: commit: found 'a/x', allowed is a list"),
-        ("purpose: x\ncommit: []\nrecipe: papr\n", "x.yaml: recipe: found 'papr', allowed is one of"),
-        ("purpose: ''\ncommit: []\n", "x.yaml: purpose: found ''"),
+        ("purpose: x\n", "x.yaml: line 1: key 'commit' is missing"),
+        ("commit: []\n", "x.yaml: line 1: key 'purpose' is missing"),
+        ("purpose: x\ncommit: []\nprepair: []\n", "x.yaml: line 3: unknown key 'prepair'; did you mean"),
+        ("purpose: x\ncommit: a/x\n", "x.yaml: line 2: commit: found 'a/x', allowed is a list"),
+        ("purpose: x\ncommit: []\nrecipe: papr\n", "x.yaml: line 3: recipe: found 'papr', allowed is one of"),
+        ("purpose: ''\ncommit: []\n", "x.yaml: line 1: purpose: found ''"),
         ("purpose: x\ncommit: []\ncommit: []\n", "x.yaml: line 3: key 'commit' stands twice"),
         ("purpose: x\ncommit: []\nftm: lfrr\n", "x.yaml: ftm: unknown FTM 'lfrr'; did you mean 'lfr'?"),
         ("purpose: x\ncommit: []\nftm: tr+pbr\n", "x.yaml: ftm: tr+pbr: "),

@@ -9,8 +9,9 @@ import msgspec
 from aftbed.campaign.record import read_record
 from aftbed.campaign.verdict import Verdict, judge
 from aftbed.core.event import Event
-from aftbed.core.fault import Act, Fault, Flip, Place, Trigger, flipped
+from aftbed.core.fault import Crash, Fault, Trigger
 from aftbed.core.journal import DROPPED_OFFSET, EntryKind
+from aftbed.core.valuefault import Bit, Flip, Place, flipped
 from aftbed.ftm.mechanism import build
 from aftbed.runtime.unix.journal import Dialogue, Journal
 from aftbed.runtime.unix.options import CarRun, LoadRun, RunOptions, Work
@@ -21,8 +22,8 @@ MS: Final = 1_000_000
 START_NS: Final = 10**12
 CAR: Final = CarRun("ccrs-50", None, "latch")
 STOPPED: Final = VehicleResult(False, None, 2.5, 2.5, 9.0, True)
-CRASH: Final = Fault(Act.CRASH, "primary", Trigger("checkpoint.sent", 2))
-FLIP: Final = Fault(Act.BITFLIP, "primary", Trigger("server.exit", 2), flip=Flip(Place.RESULT, 8))
+CRASH: Final = Fault(Crash(), "primary", Trigger("checkpoint.sent", 2))
+FLIP: Final = Fault(Flip(Place.RESULT, Bit(8)), "primary", Trigger("server.exit", 2))
 FIRST_GENERATION: Final = 1 << 8
 
 

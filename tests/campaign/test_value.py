@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 
 from aftbed.campaign.value import corruptions, value
 from aftbed.core.check import REASONS_MAX, History, wrong_replies
-from aftbed.core.fault import flipped
 from aftbed.core.journal import Entry, EntryKind
+from aftbed.core.valuefault import flipped
 from aftbed.vehicle.aebmessages import AebOutput, encode_reply
 from aftbed.vehicle.function import default_application, sample_requests
 

@@ -97,8 +97,8 @@ def test_options_of_run(refused: Run, arguments: tuple[str, ...], words: tuple[s
     ("fault", "words"),
     [
         ("crush primary", ("unknown fault 'crush'", "did you mean 'crash'")),
-        ("crash", ("expected crash|hang TARGET",)),
-        ("", ("expected crash|hang TARGET",)),
+        ("crash", ("expected crash|hang|slow TARGET",)),
+        ("", ("expected crash|hang|slow TARGET",)),
         ("crash primry", ("unknown target 'primry'", "did you mean 'primary'", "a/server")),
         ("crash a/servr", ("did you mean 'a/server'",)),
         ("crash c/server", ("unknown target 'c/server'",)),

@@ -17,7 +17,7 @@ from aftbed.campaign.explore import each, tried
 from aftbed.campaign.swarm import drawn
 from aftbed.cli import simulating
 from aftbed.cli.simfailure import repeating
-from aftbed.core.fault import Act, Fault, Trigger
+from aftbed.core.fault import Crash, Fault, Trigger
 from aftbed.core.message import Goal, Scheduled
 from aftbed.runtime.sim.world import Doom, Setup
 
@@ -52,7 +52,7 @@ def test_a_run_is_told_from_seed_to_seed(sim: Call) -> None:
     assert lines[1] == "pbr (process), seed 7, 20 requests; crash primary at server.exit nth 3"
     assert "  requests   20 sent, 20 answered, 0 lost, 0 duplicated, 0 late, 0 wrong" in lines
     assert any(line.startswith("  failover   to epoch 2: detected 0.") for line in lines)
-    assert "  fault      crash primary at server.exit nth 3: applied" in lines
+    assert "  fault      crash primary at server.exit nth 3: activated" in lines
     assert re.search(r"^[0-9.]+ ms of virtual time in [0-9.]+ ms; outcome: tolerated$", out, re.MULTILINE)
     assert lines[-2] == "verdict: pass"
 
@@ -165,7 +165,7 @@ def test_what_an_engine_would_refuse_needs_force() -> None:
 
 
 def test_a_time_in_a_command_is_exact_and_what_no_command_says_has_none() -> None:
-    early = Setup(faults=(Fault(Act.CRASH, "primary", Trigger(after_ms=0.125)),))
+    early = Setup(faults=(Fault(Crash(), "primary", Trigger(after_ms=0.125)),))
     assert repeating(early).endswith('--faults "crash primary after 0.125ms"')
     assert repeating(replace(early, dooms=(Doom("a/server", 1),))) == ""
 

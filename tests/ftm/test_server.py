@@ -4,7 +4,7 @@ import pytest
 from counting import Counting
 from samples import STATE, inspected, notes, sends
 
-from aftbed.core.brick import CONTROL, Effect, Note
+from aftbed.core.brick import CONTROL, Effect, Halt, Note
 from aftbed.core.errors import PeerError
 from aftbed.core.event import RERUN, Event
 from aftbed.core.message import (
@@ -114,13 +114,20 @@ def test_a_backup_restores_and_leads_from_there() -> None:
     assert sends(new.step("prd2srv", REQUEST, 0)) == [("srv2prd", Reply(2, 7, 2, answer(2)))]
 
 
+def test_a_checkpoint_whose_state_is_none_ends_the_backup() -> None:
+    """It can follow no further: whoever is silent is replaced, whoever waits for an answer is not."""
+    for data in (b"", b"\xc1", STATE + b"x"):
+        effects = backup().step("aft2srv", RestoreState(1, 7, data), 0)
+        assert notes(effects) == [Event.DETECTED_STOP] and sends(effects) == []
+        assert isinstance(effects[-1], Halt)
+        assert effects[-1].reason.startswith("the state after request 7 is refused: not a state")
+
+
 def test_a_state_that_is_none_is_refused() -> None:
     brick = backup()
     brick.restore(STATE)
     before = inspected(brick)
     for data in (b"", b"\xc1", STATE + b"x"):
-        with pytest.raises(PeerError, match="not a state"):
-            brick.step("aft2srv", RestoreState(1, 1, data), 0)
         with pytest.raises(PeerError, match="not a state"):
             brick.restore(data)
         assert inspected(brick) == before

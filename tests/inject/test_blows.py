@@ -16,9 +16,10 @@ from msgspec import structs
 from aftbed.core.brick import Brick, Effect, Note, Send
 from aftbed.core.errors import PeerError
 from aftbed.core.event import Event
-from aftbed.core.fault import Act, Flip, Place, flipped, mark, marked
+from aftbed.core.fault import Crash, Hang, mark, marked
 from aftbed.core.journal import Record, records
 from aftbed.core.message import AnyMessage, CaptureState, Message, Reply, Request, StateCaptured, Tried
+from aftbed.core.valuefault import EXECUTED, Bit, Flip, Place, flipped
 from aftbed.runtime import control
 from aftbed.runtime.orders import carry_out
 from aftbed.runtime.unix.journal import Journal
@@ -124,7 +125,7 @@ def host(tmp_path: Path) -> Iterator[Host]:
 def flip(
     place: Place, bit: int | None, nth: int = 1, *, fault: int = 7, brick: str = "a/server", draw: int = 0
 ) -> control.Blow:
-    return control.Blow(fault, brick, nth, Act.BITFLIP, False, Flip(place, bit), draw)
+    return control.Blow(fault, brick, nth, Flip(place, Bit(bit)), False, draw)
 
 
 def test_a_bit_of_the_result_is_flipped_in_one_execution(host: Host) -> None:
@@ -179,7 +180,7 @@ def test_a_captured_state_shows_the_hit(host: Host) -> None:
 # -- what does not come to be
 
 
-@pytest.mark.parametrize("place", Place)
+@pytest.mark.parametrize("place", EXECUTED)
 def test_a_bit_beyond_the_end_is_not_flipped(host: Host, place: Place) -> None:
     host.arm(flip(place, 8 * len(STATE)))
     assert host.execute(1) == Reply(1, 1, 1, b"\x01\x02")
@@ -258,7 +259,7 @@ def test_a_fault_that_is_told_of_again_begins_anew(host: Host) -> None:
 
 
 def test_what_is_not_done_here_is_waited_for(host: Host) -> None:
-    host.arm(control.Blow(7, "a/server", 1, Act.HANG, itself=False))
+    host.arm(control.Blow(7, "a/server", 1, Hang(), itself=False))
     host.line.send(control.Ack(7))
     assert host.execute(1) == Reply(1, 1, 1, b"\x01\x02")
     assert [(r.event, r.detail) for r in host.told()] == [(Event.FAULT_APPLIED, mark(7))]
@@ -266,7 +267,7 @@ def test_what_is_not_done_here_is_waited_for(host: Host) -> None:
 
 
 def test_a_node_kills_itself_behind_the_note_and_before_the_reply(host: Host) -> None:
-    host.arm(control.Blow(7, "a/server", 2, Act.CRASH, itself=True))
+    host.arm(control.Blow(7, "a/server", 2, Crash(), itself=True))
     host.execute(1)
     pid = os.fork()
     if pid == 0:

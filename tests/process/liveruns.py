@@ -134,7 +134,7 @@ def home(monkeypatch: pytest.MonkeyPatch) -> Iterator[Home]:
         time.sleep(LOOK_SECONDS)
         left = place.left()
     place.sweep()
-    assert not left, "left behind"
+    assert not left, f"left behind: {left}"
 
 
 class Outcome(msgspec.Struct, frozen=True):

@@ -75,7 +75,7 @@ def test_a_flipped_result_reaches_the_client_and_fails(tmp_path: Path, ftm: str)
     assert ran.verdict.requests.wrong == 1
     assert ran.verdict.checks["value"] == ran.verdict.checks["one_history"] == "fail"
     assert f"value: request {HIT}: sdc: stage 0 instead of 1" in ran.verdict.reasons
-    assert ran.receipts == ["applied"]
+    assert ran.receipts == ["activated"]
     assert ran.details == [f"bit {STAGE} of the result of request {HIT} in a/server"]
     assert ran.hits() == [("a/server", HIT)]
 
@@ -91,7 +91,7 @@ def test_a_state_that_is_wrong_is_the_backups_too(tmp_path: Path) -> None:
     """The checkpoint carries the flipped bit, so the failover does not heal it."""
     flip, crash = f"bitflip state bit {COUNTER} nth {HIT}", "crash primary at request.received nth 150"
     ran = drive(tmp_path, "pbr", flip, crash)
-    assert ran.receipts == ["applied", "applied"]
+    assert ran.receipts == ["activated", "activated"]
     assert len(ran.verdict.failovers) == 1 and ran.verdict.requests.wrong == COUNT - HIT
 
 
@@ -100,7 +100,7 @@ def test_a_drive_says_what_the_brakes_were_asked_for() -> None:
     assert done.code == 1, done.out + done.err
     assert "1 wrong" in done.out and "verdict: fail" in done.out
     assert f"because    value: request {HIT}: sdc: stage 0 instead of 1" in done.out
-    assert f"applied, bit {STAGE} of the result of request {HIT} in a/server" in done.out
+    assert f"activated, bit {STAGE} of the result of request {HIT} in a/server" in done.out
     assert "  car        stopped " in done.out
 
 
@@ -116,7 +116,7 @@ def test_a_third_run_outvotes_the_one_that_was_hit(tmp_path: Path, ftm: str, pla
     assert_served(ran)
     assert (ran.verdict.checks["value"], ran.receipts, ran.hits()) == (
         "pass",
-        ["applied"],
+        ["activated"],
         [("a/server", HIT)],
     )
     votes = [r for r in ran.events(Event.VOTE_COMPARED) if r.node.startswith("a/")]
@@ -134,14 +134,14 @@ def test_bits_of_several_requests_are_outvoted_in_every_placement(
     where = (("result", 50), (f"state bit {COUNTER}", 121), ("result", 302))
     ran = drive(tmp_path, ftm, *(f"bitflip {place} nth {nth}" for place, nth in where), placement=placement)
     assert_served(ran)
-    assert ran.receipts == ["applied"] * 3 and ran.verdict.checks["value"] == "pass"
+    assert ran.receipts == ["activated"] * 3 and ran.verdict.checks["value"] == "pass"
     assert len([r for r in ran.events(Event.VOTE_COMPARED) if r.detail == 3]) == 3
 
 
 def test_what_is_hit_before_the_first_run_is_in_all_of_them(tmp_path: Path) -> None:
     """The limit of TR, and no more is promised: a fault of one execution is what it outvotes."""
     ran = drive(tmp_path, "tr", f"bitflip state bit {COUNTER} at state.captured nth {HIT}")
-    assert ran.code == 1 and ran.receipts == ["applied"]
+    assert ran.code == 1 and ran.receipts == ["activated"]
     assert ran.verdict.checks["value"] == "fail"
     assert f"value: request {HIT}: sdc: counter 8 instead of 9" in ran.verdict.reasons
 
@@ -151,7 +151,7 @@ def test_what_is_hit_before_the_first_run_is_in_all_of_them(tmp_path: Path) -> N
 
 def test_a_follower_that_was_hit_has_diverged_and_the_client_has_its_reply(tmp_path: Path) -> None:
     ran = drive(tmp_path, "lfr", f"bitflip result bit {STAGE} in backup nth {HIT}")
-    assert ran.verdict.requests.wrong == 0 and ran.receipts == ["applied"]
+    assert ran.verdict.requests.wrong == 0 and ran.receipts == ["activated"]
     assert ran.hits() == [("b/server", HIT)]
     assert [(r.node, r.request_id) for r in ran.events(Event.FOLLOWER_DIVERGED)] == [("b/after", HIT)]
 
@@ -179,7 +179,7 @@ def test_a_bit_beyond_the_end_was_not_flipped_and_proves_nothing(tmp_path: Path)
 
 def test_a_state_that_the_function_refuses_was_not_flipped(tmp_path: Path) -> None:
     ran = drive(tmp_path, "pbr", f"bitflip state bit {VERSION} nth {HIT}")
-    assert ran.code == 3 and ran.receipts == ["refused"]
+    assert ran.code == 3 and ran.receipts == ["not_activated"]
     assert ran.details == [f"the function refused bit {VERSION} of the state of request {HIT} in a/server"]
     assert ran.verdict.checks["faults_applied"] == "unknown"
     assert_served(ran)
@@ -199,14 +199,14 @@ def test_each_of_several_strikes_at_its_own_execution(tmp_path: Path) -> None:
     """They wait for the same event in the same node, and were not armed in their order."""
     ran = drive(tmp_path, "pbr", *(f"bitflip result bit {STAGE} nth {nth}" for nth in (200, 50, 125)))
     assert ran.hits() == [("a/server", 50), ("a/server", 125), ("a/server", 200)]
-    assert ran.verdict.requests.wrong == 3 and ran.receipts == ["applied"] * 3
+    assert ran.verdict.requests.wrong == 3 and ran.receipts == ["activated"] * 3
 
 
 @pytest.mark.parametrize("placement", ["process", "replica"])
 def test_a_bitflip_follows_the_leader_over_a_failover(tmp_path: Path, placement: str) -> None:
     flip, crash = f"bitflip result bit {STAGE} nth 200", "crash primary at reply.sent nth 80"
     ran = drive(tmp_path, "pbr", flip, crash, placement=placement)
-    assert ran.receipts == ["applied", "applied"] and len(ran.verdict.failovers) == 1
+    assert ran.receipts == ["activated", "activated"] and len(ran.verdict.failovers) == 1
     ((node, request_id),) = ran.hits()
     assert node.startswith("b") and request_id >= 200  # what comes before it has moved is not counted
 
@@ -214,7 +214,7 @@ def test_a_bitflip_follows_the_leader_over_a_failover(tmp_path: Path, placement:
 def test_a_replica_is_hit_whatever_its_role_is_by_then(tmp_path: Path) -> None:
     flip, crash = f"bitflip result bit {STAGE} in a nth 120", "crash primary at reply.sent nth 80"
     ran = drive(tmp_path, "lfr", flip, crash)
-    assert ran.receipts == ["applied", "applied"] and len(ran.verdict.failovers) == 1
+    assert ran.receipts == ["activated", "activated"] and len(ran.verdict.failovers) == 1
     ((node, request_id),) = ran.hits()
     assert node == "a/server" and request_id >= 120, "as a follower, in its next life"
     assert ran.verdict.requests.wrong == 0
@@ -228,11 +228,11 @@ def test_a_live_run_is_hit_from_a_second_command(home: Home) -> None:
         done = aftbed("inject", "bitflip", "result", "--bit", str(STAGE), "--nth", "5")
         assert done.code == 0, done.err
         assert "bitflip result bit 8 in primary at server.exit nth 5" in done.err
-        told = started.wait_for("fault", "applied")
+        told = started.wait_for("fault", "activated")
         outcome = started.finish()
     assert outcome.verdict.requests.wrong == 1 and outcome.verdict.verdict == "fail"
     (fault,) = outcome.verdict.faults
-    assert str(told["text"]) == f"{fault['fault']}: applied, {fault['detail']}"
+    assert str(told["text"]) == f"{fault['fault']}: activated, {fault['detail']}"
 
 
 def test_after_a_while_the_next_execution_is_hit(home: Home) -> None:
@@ -241,7 +241,7 @@ def test_after_a_while_the_next_execution_is_hit(home: Home) -> None:
         assert done.code == 0, done.err
         outcome = started.finish()
     (fault,) = outcome.verdict.faults
-    assert fault["receipt"] == "applied"
+    assert fault["receipt"] == "activated"
     assert fault["fault"] == "bitflip state bit 8 in a after 100ms"
     assert outcome.verdict.requests.wrong > 0
 

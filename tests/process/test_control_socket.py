@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from liveruns import Home, Started, under_load, until
 
 from aftbed.core.errors import ConfigError, HarnessError
-from aftbed.core.fault import Act, Fault, Trigger
+from aftbed.core.fault import Crash, Fault, Hang, Trigger
 from aftbed.core.wire import PACKET_BYTES_MAX
 from aftbed.ftm.mechanism import build
 from aftbed.runtime import targets
@@ -37,7 +37,7 @@ questions = st.one_of(
     ),
     st.builds(
         lambda target, event, nth, after_ms, for_ms: msgspec.msgpack.encode(
-            ask.Inject(Fault(Act.HANG, target, Trigger(event, nth, after_ms), for_ms))
+            ask.Inject(Fault(Hang(for_ms), target, Trigger(event, nth, after_ms)))
         ),
         HARMLESS_TARGETS,
         st.sampled_from(["", "request.sent", "checkpoint.applied", "nonsense"]),
@@ -105,7 +105,7 @@ def test_garbage_changes_nothing(run: Started) -> None:
 
 
 def test_truncated_questions_change_nothing(run: Started) -> None:
-    fault = Fault(Act.CRASH, "primary", Trigger())
+    fault = Fault(Crash(), "primary", Trigger())
     for question in (ask.Inject(fault), ask.Stop(), ask.Processes()):
         whole = msgspec.msgpack.encode(question)
         for length in range(1, len(whole)):
@@ -160,5 +160,5 @@ def test_a_closed_end_before_the_answer_is_nobodys_trouble(run: Started) -> None
 @pytest.mark.parametrize("number", [0, -1, 2**32, 2**63, 2**64 - 1])
 def test_a_fault_with_absurd_numbers_does_not_end_the_run(run: Started, number: int) -> None:
     for trigger in (Trigger("request.sent", nth=number), Trigger(after_ms=number)):
-        tell(run, msgspec.msgpack.encode(ask.Inject(Fault(Act.HANG, "engine", trigger, for_ms=number))))
+        tell(run, msgspec.msgpack.encode(ask.Inject(Fault(Hang(number), "engine", trigger))))
         run.status()

@@ -12,7 +12,7 @@ import pytest
 from liveruns import Home, Outcome, Started, ended, state_of, under_load, until
 
 from aftbed.core.event import Event
-from aftbed.core.fault import Act, Fault, Trigger
+from aftbed.core.fault import Fault, Hang, Trigger
 from aftbed.ftm.mechanism import build
 from aftbed.runtime.unix import ask
 from aftbed.runtime.unix.options import LoadRun
@@ -95,13 +95,13 @@ def test_a_death_while_the_supervisor_is_stopped_is_dealt_with_afterwards(home: 
 def test_a_short_pause_of_a_replica_is_not_a_failover(home: Home) -> None:
     """Below the deadline nothing may happen; what was stopped goes on by itself."""
     with under_load(home, 150, RATE_HZ) as run:
-        ask.ask(run.private, ask.Inject(Fault(Act.HANG, "primary", Trigger(), for_ms=10)))
+        ask.ask(run.private, ask.Inject(Fault(Hang(10), "primary", Trigger())))
         assert_promises(run.finish(), failovers=0)
 
 
 def test_a_hang_that_ends_by_itself_is_not_believed(home: Home) -> None:
     """The primary is stopped, replaced, and told to go on: no reply of the old epoch is accepted."""
-    fault = Fault(Act.HANG, "primary", Trigger("server.enter", 60), for_ms=500)
+    fault = Fault(Hang(500), "primary", Trigger("server.enter", 60))
     with Started(home, LoadRun(400, RATE_HZ), faults=(fault,)) as run:
         run.wait_for("script.done", "failover")
         outcome = run.finish()

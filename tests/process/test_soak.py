@@ -13,7 +13,7 @@ import psutil
 import pytest
 from liveruns import LOOK_SECONDS, Home, Started, until
 
-from aftbed.core.fault import Act, Fault, Trigger
+from aftbed.core.fault import Crash, Fault, Trigger
 from aftbed.core.message import Goal
 from aftbed.runtime.unix import ask
 from aftbed.runtime.unix.options import LoadRun
@@ -61,7 +61,7 @@ def fail_over(run: Started, count: int) -> None:
     """Crash the primary `count` times, each time when a backup stands."""
     for _ in range(count):
         leader = run.status()["leader"]
-        ask.ask(run.private, ask.Inject(Fault(Act.CRASH, "primary", Trigger())))
+        ask.ask(run.private, ask.Inject(Fault(Crash(), "primary", Trigger())))
         until(lambda led=leader: run.status()["leader"] not in ("", led), "another leader")
         until(run.redundant, "redundancy")
 

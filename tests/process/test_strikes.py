@@ -29,7 +29,7 @@ from test_adaptations import (
 from aftbed.campaign.explore import WHEN, Strike, strikes
 from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.core.event import Event
-from aftbed.core.fault import Act, Fault, Trigger
+from aftbed.core.fault import Crash, Fault, Trigger
 from aftbed.core.message import Goal
 from aftbed.runtime.targets import STAGED
 from aftbed.runtime.unix import ask
@@ -55,7 +55,7 @@ def mirrored(node: str, leader: str) -> str:
 def strike(run: Started, struck: Strike, placement: str) -> str:
     """One adaptation with one death; the mechanism that runs after it."""
     leader = str(run.status()["leader"])
-    fault = Fault(Act.CRASH, mirrored(struck.node, leader), Trigger(struck.when.label, struck.step))
+    fault = Fault(Crash(), mirrored(struck.node, leader), Trigger(struck.when.label, struck.step))
     ask.ask(run.private, ask.Inject(fault))
     came_to = struck.new if how_it_ended(run, Goal(expression=struck.new)) == "done" else struck.old
     until(run.redundant, f"redundancy after {struck}")
@@ -89,7 +89,7 @@ def walk(home: Home, placement: str, todo: Iterable[Strike]) -> int:
                 outcome = ended(run)
                 assert_nothing_happened_to_requests(outcome)
                 receipts = [f["receipt"] for f in outcome.verdict.faults]
-                assert receipts == ["applied"] * len(done), list(zip(receipts, done, strict=True))
+                assert receipts == ["activated"] * len(done), list(zip(receipts, done, strict=True))
             except (AssertionError, HarnessError, pytest.fail.Exception) as error:
                 print(f"BROKEN at {done[-1]}, the last of {len(done)}: {error}")
                 print("".join(f"    {e['t_ms']} {e['event']} {e['text']}\n" for e in run.heard()[-40:]))
@@ -116,7 +116,7 @@ def test_a_death_while_requests_are_let_on(home: Home, node: str, when: Event) -
 
 
 def test_an_engine_that_dies_takes_a_spare_that_the_adaptation_waits_for(home: Home) -> None:
-    fault = Fault(Act.CRASH, "engine", Trigger(Event.ADAPT_STEP_EXIT.label, 1))
+    fault = Fault(Crash(), "engine", Trigger(Event.ADAPT_STEP_EXIT.label, 1))
     with serving(home, "pbr", "process", fault) as run:
         assert how_it_ended(run, Goal(expression="pbr+tr")) == "done"
         assert_nothing_happened_to_requests(ended(run))

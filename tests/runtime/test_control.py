@@ -14,9 +14,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from aftbed.core import script
+from aftbed.core.busfault import BusFault
 from aftbed.core.errors import PeerError
-from aftbed.core.fault import Act, Fault, Trigger
+from aftbed.core.fault import Crash, Fault, Hang, Trigger
 from aftbed.core.wire import PACKET_BYTES_MAX
+from aftbed.inject.buswords import parse
 from aftbed.runtime import control
 from aftbed.runtime.unix.line import FDS_MAX, STATE_BYTES_MAX, Line, decode_order, decode_report
 
@@ -26,6 +28,7 @@ REPORTS: Final[tuple[type[msgspec.Struct], ...]] = get_args(control.FromNode)
 PLAIN: Final = {
     int: st.integers(0, 2**63 - 1),
     str: st.text(max_size=20),
+    float: st.floats(allow_nan=False),
     bytes: st.binary(max_size=99),
     bool: st.booleans(),
     type(None): st.none(),
@@ -43,8 +46,10 @@ def any_of(kind: Any) -> st.SearchStrategy[Any]:
         return st.lists(st.one_of(map(any_of, FLAT_VERBS)), max_size=3).map(
             lambda verbs: script.Together(tuple(verbs))
         )
+    if kind is BusFault:  # its parts do not go with each other at will
+        return st.sampled_from(BUS_FAULTS)
     if kind is Fault:
-        return st.builds(Fault, st.sampled_from((Act.CRASH, Act.HANG)), st.text(max_size=9), any_of(Trigger))
+        return st.builds(Fault, st.sampled_from((Crash(), Hang())), st.text(max_size=9), any_of(Trigger))
     if isinstance(kind, type) and issubclass(kind, Enum):
         return st.sampled_from(kind)
     if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
@@ -57,6 +62,19 @@ def any_of(kind: Any) -> st.SearchStrategy[Any]:
     if get_origin(kind) is dict:
         return st.dictionaries(*parts, max_size=3)
     return st.one_of(parts)
+
+
+BUS_FAULTS: Final = tuple(
+    map(
+        parse,
+        (
+            "omission bus A nth 5",
+            "corrupt bus from radar signal B=-1.5 crc good when ttc < 1.2 for 3ms",
+            "partition a,b|c after 2s",
+            "reorder bus A intermittent p 0.25",
+        ),
+    )
+)
 
 
 class Pair:

@@ -1,5 +1,6 @@
 """Where a run lives: private, found by itself, and refused where others could look in."""
 
+import os
 import re
 import socket
 from collections.abc import Iterator
@@ -161,3 +162,34 @@ def test_a_dead_run_is_no_run(runtime: Path, listeners: list[socket.socket]) -> 
     assert (private / rundir.SOCKET_NAME).exists() and rundir.live() == []
     with pytest.raises(OSError, match="refused"):
         rundir.connect(private)
+
+
+# -- whose it is
+
+
+def test_a_run_has_an_owner_until_it_is_removed(runtime: Path) -> None:
+    private = rundir.create()
+    assert rundir.owned(private)
+    rundir.remove(private)
+    assert not rundir.owned(private)
+
+
+def test_a_child_of_its_owner_does_not_own_it(runtime: Path) -> None:
+    """Else a run would seem alive as long as any other run of the same command."""
+    private = rundir.create()
+    end, life = os.pipe()
+    told, telling = os.pipe()
+    child = os.fork()
+    if child == 0:
+        os.close(life)
+        os.write(telling, b"!")
+        os.read(end, 1)  # lives until the test has looked
+        os._exit(0)
+    try:
+        assert os.read(told, 1) == b"!"
+        os.close(rundir._owned.pop(private))  # as at the owner's death
+        assert not rundir.owned(private)
+    finally:
+        for descriptor in (life, end, told, telling):
+            os.close(descriptor)
+        os.waitpid(child, 0)

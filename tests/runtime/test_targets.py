@@ -6,20 +6,22 @@ import pytest
 
 from aftbed.core.errors import ConfigError
 from aftbed.core.event import REQUEST_PATH, Event
-from aftbed.core.fault import BIT_MAX, Act, Fault, Flip, Place, Trigger
+from aftbed.core.fault import Crash, Disturb, Fault, How, Slow, Trigger
 from aftbed.core.graph import PLACEMENTS
+from aftbed.core.valuefault import BIT_MAX, EXECUTED, Bit, Bits, Burst, Byte, Flip, Place, Stuck
 from aftbed.ftm.mechanism import DUPLEX, EXPRESSIONS, build
+from aftbed.inject.words import parse
 from aftbed.runtime.targets import OTHERS, SUPERVISOR, check, emitter, emitters_in, waits_in
 
 
 def crash(target: str, trigger: Trigger | None = None) -> Fault:
-    return Fault(Act.CRASH, target, trigger or Trigger())
+    return Fault(Crash(), target, trigger or Trigger())
 
 
 def bitflip(
     place: Place, target: str = "primary", event: str = "", nth: int = 1, bit: int | None = None
 ) -> Fault:
-    return Fault(Act.BITFLIP, target, Trigger(event, nth), flip=Flip(place, bit))
+    return Fault(Flip(place, Bit(bit)), target, Trigger(event, nth))
 
 
 @pytest.mark.parametrize("placement", PLACEMENTS)
@@ -199,7 +201,7 @@ def test_in_an_adaptation_the_nodes_of_any_mechanism_can_be_hit() -> None:
 def test_a_bit_of_the_leader_can_be_flipped_under_every_mechanism(ftm: str, placement: str) -> None:
     graph = build(ftm, placement)
     for target in ("primary", "a", *(["b"] if ftm.startswith(DUPLEX) else [])):
-        for place in Place:
+        for place in EXECUTED:
             check(bitflip(place, target), graph)
             check(bitflip(place, target, "server.exit", 100, BIT_MAX), graph)
 
@@ -273,3 +275,88 @@ def test_a_bitflip_waits_in_the_server_that_it_hits(
 def test_while_nobody_backs_up_no_bit_of_a_backup_can_be_flipped() -> None:
     assert waits_in(bitflip(Place.RESULT, "backup"), build("lfr", "process"), "a", "") is None
     assert waits_in(bitflip(Place.RESULT), build("lfr", "process"), "", "") is None
+
+
+# -- the other values, channels, and who is slow
+
+
+@pytest.mark.parametrize(
+    ("ftm", "text", "leader", "brick"),
+    [
+        ("pbr", "bitflip request", "a", "a/server"),
+        ("pbr", "bitflip request in backup", "a", None),
+        ("lfr", "bitflip request in backup", "a", "b/server"),
+        ("pbr", "bitflip checkpoint", "b", "b/after"),
+        ("pbr", "bitflip checkpoint in b", "a", None),
+        ("pbr+tr", "bitflip log", "a", "a/protocol"),
+        ("pbr", "bitflip log in backup at checkpoint.applied", "a", "b/after"),
+        ("pbr", "bitflip log in b at checkpoint.applied", "b", None),
+        ("pbr", "omission pxy2pro", "a", "proxy"),
+        ("pbr", "omission pxy2pro", "b", "proxy"),
+        ("pbr", "omission pxy2pro in b", "a", None),
+        ("pbr", "omission pxy2pro in b", "b", "proxy"),
+        ("pbr", "omission pro2pxy", "b", "b/protocol"),
+        ("pbr", "omission pro2pxy in a", "b", None),
+        ("pbr", "omission aft2aft", "b", "b/after"),
+        ("pbr", "omission srv2prd in b", "a", "b/server"),
+        ("pbr", "omission aft2srv in backup", "b", "a/after"),
+        ("lfr+tr", "omission bfr2bfr", "b", "b/before"),
+        ("pbr+tr", "omission prd2aft", "a", "a/tr.proceed"),
+        ("none", "omission clt2pxy", "a", "client"),
+    ],
+)
+def test_a_fault_waits_in_the_brick_that_has_it_in_hand(
+    ftm: str, text: str, leader: str, brick: str | None
+) -> None:
+    graph = build(ftm, "process")
+    assert waits_in(parse(text), graph, leader, {"a": "b", "b": "a"}[leader]) == brick
+
+
+@pytest.mark.parametrize("placement", PLACEMENTS)
+@pytest.mark.parametrize("ftm", EXPRESSIONS)
+def test_every_channel_of_every_graph_can_be_disturbed(ftm: str, placement: str) -> None:
+    graph = build(ftm, placement)
+    for link in graph.links:
+        check(parse(f"omission {link.name}"), graph)
+
+
+@pytest.mark.parametrize(
+    ("ftm", "text", "message"),
+    [
+        ("pbr", "omission pxy2prro", "unknown channel 'pxy2prro'; did you mean 'pxy2pro'? (one of: aft2aft,"),
+        ("pbr", "omission bfr2bfr", "unknown channel 'bfr2bfr'"),
+        ("pbr", "omission aft2aft in c", "unknown replica 'c' (one of: a, b, backup, primary)"),
+        ("none", "omission pxy2pro in backup", "unknown replica 'backup'"),
+        ("pbr", "omission pxy2pro in backup", "under --ftm pbr backup sends nothing on pxy2pro"),
+        ("pbr", "omission aft2aft in backup", "backup sends nothing on aft2aft"),
+        ("pbr", "slow hub", "unknown target 'hub'"),
+        ("pbr", "slow b/after' at adapt.step.enter", 'unknown target "b/after\'"'),
+        ("lfr", "bitflip checkpoint", "under --ftm lfr primary has none"),
+        ("pbr", "bitflip checkpoint in backup", "under --ftm pbr backup has none"),
+        ("pbr", "bitflip log in backup", "'reply.stored' (one of: checkpoint.applied)"),
+        ("lfr", "bitflip log in backup", "under --ftm lfr backup has none"),
+        ("pbr", "bitflip request in backup", "the Server of a backup executes nothing"),
+        ("pbr", "bitflip request at server.exit", "(one of: server.enter)"),
+    ],
+)
+def test_what_is_not_there_is_refused_with_what_is(ftm: str, text: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        check(parse(text), build(ftm, "process"))
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        (Slow(0.0), "by 0ms: up to 500ms are allowed"),
+        (Slow(501.0), "by 501ms: up to 500ms are allowed"),
+        (Disturb(How.DELAY, "aft2aft", -1.0), "by -1ms: up to 3600000ms are allowed"),
+        (Flip(Place.RESULT, Bits(65)), "65 bits: 1 to 64 are allowed"),
+        (Flip(Place.RESULT, Burst(0, 3)), "0 bits: 1 to 64 are allowed"),
+        (Flip(Place.RESULT, Burst(3, -1)), "bit -1: 0 to 4294967295 are allowed"),
+        (Flip(Place.RESULT, Byte(-1)), "byte -1: 0 to 536870911 are allowed"),
+        (Flip(Place.RESULT, Stuck(3, 2)), "stuck 3=2: a bit from 0 to 4294967295, and 0 or 1, are allowed"),
+    ],
+)
+def test_a_number_that_words_cannot_say_is_refused_too(action: Slow | Disturb | Flip, message: str) -> None:
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        check(Fault(action, "primary", Trigger()), build("pbr", "process"))

@@ -32,9 +32,9 @@ from planting import (
 
 from aftbed.adapt.engine import AdaptationEngine
 from aftbed.core import script
-from aftbed.core.fault import Place
 from aftbed.core.graph import Graph
 from aftbed.core.message import Rebound, TakeUp
+from aftbed.core.valuefault import Place
 from aftbed.ftm import recovery
 from aftbed.ftm.recovery import Recovery
 from aftbed.ftm.watchdog import Watchdog

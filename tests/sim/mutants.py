@@ -37,7 +37,6 @@ from planting import (
 
 from aftbed.core.brick import Effect, Note, Send
 from aftbed.core.event import Event
-from aftbed.core.fault import Place
 from aftbed.core.message import (
     ChannelEnded,
     Checkpoint,
@@ -49,6 +48,7 @@ from aftbed.core.message import (
     Trials,
     Watch,
 )
+from aftbed.core.valuefault import Place
 from aftbed.ftm import protocol, proxy, tr
 from aftbed.ftm.after import PbrAfter
 from aftbed.ftm.assertion import Acceptable, AssertAfter

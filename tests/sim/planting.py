@@ -12,8 +12,9 @@ import msgspec
 
 from aftbed.campaign import explore
 from aftbed.core.brick import Brick, Effect
-from aftbed.core.fault import Act, Fault, Flip, Place, Trigger
+from aftbed.core.fault import Crash, Fault, Hang, Trigger
 from aftbed.core.message import Goal, Scheduled
+from aftbed.core.valuefault import Bit, Flip, Place
 from aftbed.runtime.sim.world import Setup
 
 Plant = Callable[[], AbstractContextManager[object]]
@@ -191,19 +192,19 @@ def adapted(old: str, new: str, *faults: Fault, placement: str = "process", coun
 
 def crash(target: str, event: str, nth: int = 1) -> Fault:
     """At an event."""
-    return Fault(Act.CRASH, target, Trigger(event, nth))
+    return Fault(Crash(), target, Trigger(event, nth))
 
 
 def crash_after(target: str, ms: float) -> Fault:
     """At a time."""
-    return Fault(Act.CRASH, target, Trigger(after_ms=ms))
+    return Fault(Crash(), target, Trigger(after_ms=ms))
 
 
 def hang(target: str, for_ms: int, event: str, nth: int = 1) -> Fault:
     """At an event; it goes on by itself."""
-    return Fault(Act.HANG, target, Trigger(event, nth), for_ms=for_ms)
+    return Fault(Hang(for_ms), target, Trigger(event, nth))
 
 
 def flip(place: Place, bit: int, event: str, nth: int, target: str = "primary") -> Fault:
     """One bit of one execution."""
-    return Fault(Act.BITFLIP, target, Trigger(event, nth), flip=Flip(place, bit))
+    return Fault(Flip(place, Bit(bit)), target, Trigger(event, nth))

@@ -20,8 +20,9 @@ from msgspec.structs import replace
 from aftbed.campaign.simulated import breaches
 from aftbed.core import check
 from aftbed.core.event import Event
-from aftbed.core.fault import Act, Fault, Flip, Place, Trigger
+from aftbed.core.fault import FIRED, Crash, Fault, Trigger
 from aftbed.core.journal import EntryKind
+from aftbed.core.valuefault import EXECUTED, Bit, Flip, Place
 from aftbed.ftm.mechanism import EXPRESSIONS, build, chain, parse, replication_of
 from aftbed.runtime.sim.clock import Clock
 from aftbed.runtime.sim.processes import Process
@@ -159,10 +160,10 @@ def test_who_belongs_to_no_replica_may_die_as_well(
 def test_one_replica_after_the_other_may_die(ftm: str, seed: int, event: Event) -> None:
     """The second one when redundancy is back: what leads then was made by state transfer."""
     nths = (2, 40)
-    faults = tuple(Fault(Act.CRASH, "primary", Trigger(event.label, nth)) for nth in nths)
+    faults = tuple(Fault(Crash(), "primary", Trigger(event.label, nth)) for nth in nths)
     world, run = played(Setup(ftm, "process", seed, 80, 2000.0, faults))
     assert_promises(world, run)
-    assert world.conductor.deployment.epoch == 1 + sum(f["receipt"] == "applied" for f in run.faults) > 1
+    assert world.conductor.deployment.epoch == 1 + sum(f["receipt"] in FIRED for f in run.faults) > 1
 
 
 def transient(ftm: str, role: str, count: int, random: Random) -> tuple[Fault, ...]:
@@ -171,9 +172,9 @@ def transient(ftm: str, role: str, count: int, random: Random) -> tuple[Fault, .
     for request in range(count):
         if random.random() < 0.4:
             nth = 2 * request + len(found) + random.choice((1, 2))
-            place = random.choice(tuple(Place))
-            flip = Flip(place, random.randrange(*BITS[place]))
-            found.append(Fault(Act.BITFLIP, role, Trigger(Event.SERVER_EXIT.label, nth), flip=flip))
+            place = random.choice(EXECUTED)
+            flip = Flip(place, Bit(random.randrange(*BITS[place])))
+            found.append(Fault(flip, role, Trigger(Event.SERVER_EXIT.label, nth)))
     return tuple(found)
 
 
@@ -187,7 +188,7 @@ def test_one_value_fault_per_request_never_reaches_the_client(ftm: str, seed: in
     faults = tuple(f for role in roles for f in transient(ftm, role, count, random))
     world, run = played(Setup(ftm, "process", seed, count, faults=faults))
     assert_promises(world, run)
-    applied = sum(f["receipt"] == "applied" for f in run.faults)
+    applied = sum(f["receipt"] in FIRED for f in run.faults)
     votes = [r.detail for r in run.history.events(Event.VOTE_COMPARED)]
     assert (votes.count(3), votes.count(2)) == (applied, len(roles) * count - applied)
     assert run.history.events(Event.DETECTED_STOP) == [] and world.conductor.deployment.epoch == 1
@@ -202,7 +203,7 @@ def test_what_an_assertion_finds_stops_one_replica_and_the_other_goes_on(
 ) -> None:
     if role == "backup" and not ftm.startswith("lfr"):
         return  # it executes nothing
-    fault = Fault(Act.BITFLIP, role, Trigger(Event.SERVER_EXIT.label, nth), flip=Flip(Place.RESULT, SEEN))
+    fault = Fault(Flip(Place.RESULT, Bit(SEEN)), role, Trigger(Event.SERVER_EXIT.label, nth))
     world, run = played(Setup(ftm, "process", seed, 5, faults=(fault,)))
     assert_promises(world, run)
     assert len(run.history.events(Event.DETECTED_STOP)) == 1
@@ -212,7 +213,7 @@ def test_what_an_assertion_finds_stops_one_replica_and_the_other_goes_on(
 @pytest.mark.parametrize("ftm", ["none", "pbr", "lfr"])
 def test_without_a_mechanism_against_it_a_value_fault_reaches_the_client(ftm: str) -> None:
     """What the tests above do is done: where nothing is there to find it, it is found by the check."""
-    fault = Fault(Act.BITFLIP, "primary", Trigger(Event.SERVER_EXIT.label, 2), flip=Flip(Place.RESULT, 0))
+    fault = Fault(Flip(Place.RESULT, Bit(0)), "primary", Trigger(Event.SERVER_EXIT.label, 2))
     _, run = played(Setup(ftm, count=3, faults=(fault,)))
     assert check.wrong_replies(run.history, Counting()) == [2]
 
@@ -228,7 +229,7 @@ def test_a_request_that_the_function_refuses_does_not_stand_in_the_way_of_the_ne
 @pytest.mark.parametrize("ftm", SIMPLEX)
 def test_with_one_replica_a_crash_ends_the_service_and_nothing_else_is_tried(ftm: str) -> None:
     last = next(brick for brick in bricks_of(ftm, "a") if brick.endswith("proceed"))
-    fault = Fault(Act.CRASH, last, Trigger(Event.REQUEST_SENT.label, 2))
+    fault = Fault(Crash(), last, Trigger(Event.REQUEST_SENT.label, 2))
     _, run = played(Setup(ftm, count=2, faults=(fault,)))
     assert run.rest.lost
     assert [e.request_id for e in run.history.dialogue if e.kind is EntryKind.ANSWERED] == [1]

@@ -7,11 +7,11 @@ import pytest
 from aftbed.campaign.diagram import escaped, mermaid, text
 from aftbed.campaign.simulated import Breach
 from aftbed.campaign.swarm import drawn
-from aftbed.core.fault import Act, Fault, Trigger
+from aftbed.core.fault import Crash, Fault, Trigger
 from aftbed.runtime.sim.tracing import Trace, traced
 from aftbed.runtime.sim.world import Setup
 
-CRASH = Fault(Act.CRASH, "primary", Trigger("checkpoint.sent", 2))
+CRASH = Fault(Crash(), "primary", Trigger("checkpoint.sent", 2))
 LOST = Breach("G2", "request 2: 0 replies")
 UNREST = Breach("rest", "requests wait; <no> end")
 

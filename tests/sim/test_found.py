@@ -5,8 +5,9 @@ from typing import Final
 import pytest
 
 from aftbed.campaign.explore import attempt
-from aftbed.core.fault import Act, Fault, Trigger
+from aftbed.core.fault import Crash, Fault, Hang, Trigger
 from aftbed.core.message import Goal, Scheduled
+from aftbed.core.valuefault import Bit, Flip, Place
 from aftbed.runtime.sim.world import Setup
 
 AT_MS: Final = 5.0
@@ -14,7 +15,7 @@ AT_MS: Final = 5.0
 
 def dies(target: str, after_ms: float) -> Fault:
     """A crash at a time."""
-    return Fault(Act.CRASH, target, Trigger(after_ms=after_ms))
+    return Fault(Crash(), target, Trigger(after_ms=after_ms))
 
 
 def wanted(expression: str) -> tuple[Scheduled, ...]:
@@ -23,6 +24,16 @@ def wanted(expression: str) -> tuple[Scheduled, ...]:
 
 
 FOUND: Final = {
+    # A backup whose Server refuses a checkpoint waited for its answer, and could take over nothing for ever.
+    "a checkpoint that is refused": Setup(
+        "pbr",
+        count=300,
+        rate_hz=2000.0,
+        faults=(
+            Fault(Flip(Place.CHECKPOINT, Bit(0)), "primary", Trigger("checkpoint.sent", 5)),
+            Fault(Crash(), "primary", Trigger("reply.sent", 200)),
+        ),
+    ),
     # The successor dies while it is bound: it is replaced for its own death, and again for the failure.
     "two clients": Setup("pbr", count=40, rate_hz=500.0, faults=(dies("client", 1.0), dies("client", 1.9))),
     "two recoveries": Setup(
@@ -34,7 +45,7 @@ FOUND: Final = {
         count=100,
         rate_hz=500.0,
         faults=(
-            Fault(Act.HANG, "engine", Trigger(after_ms=AT_MS - 1), 100),
+            Fault(Hang(100), "engine", Trigger(after_ms=AT_MS - 1)),
             dies("a/protocol", 20.0),
         ),
         adaptations=wanted("tr"),
@@ -62,7 +73,7 @@ FOUND: Final = {
         "replica",
         count=40,
         rate_hz=400.0,
-        faults=(Fault(Act.CRASH, "recovery", Trigger("adapt.step.enter", 3)),),
+        faults=(Fault(Crash(), "recovery", Trigger("adapt.step.enter", 3)),),
         adaptations=(Scheduled(Goal(expression="tr"), 4),),
     ),
 }

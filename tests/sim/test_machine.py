@@ -19,9 +19,10 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 from aftbed.campaign.simulated import breaches
 from aftbed.core.errors import ConfigError
 from aftbed.core.event import Event
-from aftbed.core.fault import Act, Fault, Flip, Place, Trigger
+from aftbed.core.fault import Crash, Fault, Hang, Trigger
 from aftbed.core.journal import EntryKind
 from aftbed.core.message import Goal, NodeDied
+from aftbed.core.valuefault import EXECUTED, Bit, Flip, Place
 from aftbed.ftm.mechanism import EXPRESSIONS, NONE, parse, replication_of
 from aftbed.runtime.rewiring import replica_of
 from aftbed.runtime.sim.processes import Process
@@ -78,7 +79,7 @@ class Interference(RuleBasedStateMachine):
 
     @rule(node=whom)
     def a_node_dies(self, node: int) -> None:
-        self.world.inject(Fault(Act.CRASH, self._node(node), Trigger()))
+        self.world.inject(Fault(Crash(), self._node(node), Trigger()))
 
     @rule(first=whom, second=whom)
     def two_nodes_die(self, first: int, second: int) -> None:
@@ -88,18 +89,18 @@ class Interference(RuleBasedStateMachine):
     @rule(event=st.sampled_from((Event.SERVER_EXIT, Event.REPLY_SENT, Event.STATE_CAPTURED)))
     def the_primary_will_die(self, event: Event) -> None:
         try:
-            self.world.inject(Fault(Act.CRASH, "primary", Trigger(event.label)))
+            self.world.inject(Fault(Crash(), "primary", Trigger(event.label)))
         except ConfigError:  # nobody emits it under this mechanism
             return
 
     @rule(node=whom, ms=st.integers(1, HANG_MS_MAX))
     def a_node_hangs(self, node: int, ms: int) -> None:
-        self.world.inject(Fault(Act.HANG, self._node(node), Trigger(), ms))
+        self.world.inject(Fault(Hang(ms), self._node(node), Trigger()))
 
     @rule(role=st.sampled_from(("primary", "backup")))
     def a_replica_hangs_for_good(self, role: str) -> None:
         if role in roles(self.world.conductor.deployment.graph):
-            self.world.inject(Fault(Act.HANG, role, Trigger()))
+            self.world.inject(Fault(Hang(), role, Trigger()))
 
     @rule(node=whom)
     def a_watchdog_is_mistaken(self, node: int) -> None:
@@ -113,11 +114,11 @@ class Interference(RuleBasedStateMachine):
         watchdog.node.step(watchdog.node.hosted(watchdog.name), "sense", NodeDied(name))
 
     @precondition(lambda self: self._votes and self._sent() - self._flipped_at >= FLIPS_APART)
-    @rule(place=st.sampled_from(tuple(Place)), bit=st.integers(0, RESULT_BITS - 1))
+    @rule(place=st.sampled_from(EXECUTED), bit=st.integers(0, RESULT_BITS - 1))
     def a_bit_flips(self, place: Place, bit: int) -> None:
         self._flipped_at = self._sent()
-        flip = Flip(place, bit % STATE_BITS if place is Place.STATE else bit)
-        self.world.inject(Fault(Act.BITFLIP, "primary", Trigger(), flip=flip))
+        flip = Flip(place, Bit(bit % STATE_BITS if place is Place.STATE else bit))
+        self.world.inject(Fault(flip, "primary", Trigger()))
 
     @rule(expression=st.sampled_from(SOUND))
     def it_is_adapted(self, expression: str) -> None:

@@ -15,8 +15,8 @@ from aftbed.campaign.simulated import ASSERT, REST, breaches, outcome, struck_do
 from aftbed.campaign.wholeness import half_a_graph
 from aftbed.core.check import missing
 from aftbed.core.event import Event
-from aftbed.core.fault import Place
 from aftbed.core.journal import Entry, EntryKind, Record
+from aftbed.core.valuefault import Place
 from aftbed.ftm.mechanism import build
 from aftbed.runtime.adaptations import Outcome
 from aftbed.runtime.sim.world import Run, Setup, simulate

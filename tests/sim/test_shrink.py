@@ -12,18 +12,19 @@ from aftbed.campaign.shrink import shrink
 from aftbed.campaign.simulated import Breach, breaches
 from aftbed.campaign.swarm import drawn, experiments
 from aftbed.core.brick import Brick, Effect
-from aftbed.core.fault import Act, Fault, Flip, Place, Trigger
+from aftbed.core.fault import Crash, Fault, Hang, Trigger
 from aftbed.core.graph import BrickSpec
 from aftbed.core.message import Goal, Scheduled, StateCaptured
+from aftbed.core.valuefault import Flip, Place
 from aftbed.ftm.after import PbrAfter
 from aftbed.ftm.catalog import Setting, make
 from aftbed.runtime.sim.world import Doom, Setup, World
 
 Broken = Callable[[Setup], tuple[Breach, ...]]
 
-CRASH = Fault(Act.CRASH, "a/after", Trigger("server.exit", 30))
-HANG = Fault(Act.HANG, "b/server", Trigger(after_ms=20.0), 90)
-FLIP = Fault(Act.BITFLIP, "primary", Trigger("server.exit", 60), flip=Flip(Place.RESULT))
+CRASH = Fault(Crash(), "a/after", Trigger("server.exit", 30))
+HANG = Fault(Hang(90), "b/server", Trigger(after_ms=20.0))
+FLIP = Fault(Flip(Place.RESULT), "primary", Trigger("server.exit", 60))
 TO_PBR = Scheduled(Goal(expression="pbr"), 80)
 TO_LFR = Scheduled(Goal(expression="lfr+tr"), 150)
 LARGE = Setup("lfr+tr", "process", 5, 200, 1000.0, (HANG, CRASH, FLIP), (TO_PBR, TO_LFR))
@@ -38,24 +39,28 @@ def test_a_crash_and_seven_requests_are_left_of_it() -> None:
     def broken(setup: Setup) -> bool:
         return setup.count >= 7 and any(f.target == "a/after" for f in setup.faults)
 
-    least = Fault(Act.CRASH, "a/after", Trigger("server.exit", 1))
+    least = Fault(Crash(), "a/after", Trigger("server.exit", 1))
     assert shrink(LARGE, where(broken)) == Setup("pbr", "process", 5, 7, 0.0, (least,))
 
 
 def test_what_it_takes_stays() -> None:
     def broken(setup: Setup) -> bool:
-        hangs = [f for f in setup.faults if f.act is Act.HANG and f.for_ms > 60 and f.trigger.after_ms >= 3]
+        hangs = [
+            f
+            for f in setup.faults
+            if isinstance(f.action, Hang) and f.action.for_ms > 60 and f.trigger.after_ms >= 3
+        ]
         late = any(a.at_request >= 11 for a in setup.adaptations)
         return bool(hangs) and late and setup.rate_hz > 0 and "lfr" in setup.ftm
 
     found = shrink(LARGE, where(broken))
     (hang,), (adaptation,) = found.faults, found.adaptations
-    assert hang.for_ms == 61 and 3 <= hang.trigger.after_ms < 6
+    assert hang.action == Hang(61) and 3 <= hang.trigger.after_ms < 6
     assert (found.ftm, found.rate_hz, adaptation.at_request, found.count) == ("lfr", 1000.0, 11, 11)
 
 
 def test_where_a_bit_is_flipped_tr_stays() -> None:
-    found = shrink(LARGE, where(lambda setup: any(f.act is Act.BITFLIP for f in setup.faults)))
+    found = shrink(LARGE, where(lambda setup: any(isinstance(f.action, Flip) for f in setup.faults)))
     assert found == Setup("pbr+tr", "process", 5, 1, 0.0, (replace(FLIP, trigger=Trigger("server.exit", 1)),))
 
 
@@ -87,7 +92,7 @@ def test_a_car_gives_way_to_a_load() -> None:
 
 
 def test_what_the_graph_does_not_have_is_not_tried() -> None:
-    node = Fault(Act.CRASH, "a", Trigger("request.received", 1))  # of placement `replica`
+    node = Fault(Crash(), "a", Trigger("request.received", 1))  # of placement `replica`
     inner = Doom("a/tr.before", 3)
     setup = Setup("pbr+tr", "replica", 5, 1, 0.0, (node,), dooms=(inner,))
     found = shrink(setup, where(lambda setup: bool(setup.faults and setup.dooms)))
@@ -156,7 +161,7 @@ def with_the_bug_broken(setup: Setup) -> tuple[Breach, ...]:
 def suspects() -> Iterator[Setup]:
     """Of a swarm, those that have more than one thing going on, a crash at a checkpoint among them."""
     for setup in experiments(range(20_000)):
-        crashes = [f for f in setup.faults if (f.act, f.event) == (Act.CRASH, "checkpoint.sent")]
+        crashes = [f for f in setup.faults if (f.action, f.event) == (Crash(), "checkpoint.sent")]
         busy = len(setup.faults) > 1 and setup.adaptations and not setup.scenario
         if busy and "pbr" in setup.ftm and any(f.target == "primary" for f in crashes):
             yield setup
@@ -169,6 +174,6 @@ def test_a_swarm_finds_a_bug_and_it_shrinks_to_one_fault() -> None:
     least = shrink(setup, with_the_bug_broken)
     assert with_the_bug_broken(least)[0].promise == first[0].promise
     assert len(least.faults) == 1 and not least.adaptations and least.count <= 5, least
-    assert least.faults[0].act is Act.CRASH
+    assert least.faults[0].action == Crash()
     assert least.seed == setup.seed and not breaches(World(least).run())
     assert drawn(setup.seed) == setup

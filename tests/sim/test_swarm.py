@@ -12,7 +12,8 @@ from aftbed.campaign import swarm
 from aftbed.campaign.explore import attempt
 from aftbed.campaign.swarm import drawn, experiments
 from aftbed.core.event import Event
-from aftbed.core.fault import Act
+from aftbed.core.fault import Crash, Hang
+from aftbed.core.valuefault import Flip
 from aftbed.ftm.mechanism import build, parse, replication_of
 from aftbed.runtime import targets
 from aftbed.runtime.rewiring import replica_of
@@ -40,8 +41,8 @@ def test_of_everything_there_is_some() -> None:
     assert Counter(len(s.faults) for s in many()).keys() == {0, 1, 2, 3}
     assert Counter(len(s.adaptations) for s in many()).keys() == {0, 1, 2}
     faults = [fault for s in many() for fault in s.faults]
-    assert {fault.act for fault in faults} == set(Act)
-    assert {bool(fault.for_ms) for fault in faults if fault.act is Act.HANG} == {True, False}
+    assert {type(fault.action) for fault in faults} == {Crash, Hang, Flip}
+    assert {bool(fault.action.for_ms) for fault in faults if isinstance(fault.action, Hang)} == {True, False}
     assert any(fault.target.endswith(targets.STAGED) for fault in faults)
     assert any(fault.trigger.after_ms for fault in faults)
     assert {Event.CHECKPOINT_SENT.label, Event.ADAPT_STEP_ACT.label} <= {f.trigger.event for f in faults}
@@ -68,16 +69,16 @@ def test_nobody_is_asked_for_what_he_does_not_promise() -> None:
         assert not (duplex and setup.placement == "single")
         assert setup.ftm != "none" or not setup.faults
         for fault in setup.faults:
-            for_good = fault.act is Act.HANG and not fault.for_ms
+            for_good = isinstance(fault.action, Hang) and not fault.action.for_ms
             watched = fault.target in targets.ROLES or replica_of(fault.target)
             assert watched or not for_good, setup
-            assert not fault.target.endswith(targets.STAGED) or fault.act is Act.CRASH
+            assert not fault.target.endswith(targets.STAGED) or isinstance(fault.action, Crash)
 
 
 def test_a_bit_is_flipped_only_where_tr_will_see_it() -> None:
     flipped = 0
     for setup in many():
-        flips = [fault for fault in setup.faults if fault.act is Act.BITFLIP]
+        flips = [fault for fault in setup.faults if isinstance(fault.action, Flip)]
         if not flips:
             continue
         flipped += 1

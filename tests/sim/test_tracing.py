@@ -8,12 +8,12 @@ import sys
 import pytest
 
 from aftbed.campaign.swarm import drawn
-from aftbed.core.fault import Act, Fault, Trigger
+from aftbed.core.fault import Crash, Fault, Trigger
 from aftbed.core.message import Checkpoint, Goal, Scheduled, Trials, Tried
 from aftbed.runtime.sim.tracing import Sent, brief, lines, milliseconds, traced
 from aftbed.runtime.sim.world import Setup, simulate
 
-CRASH = Fault(Act.CRASH, "primary", Trigger("checkpoint.sent", 5))
+CRASH = Fault(Crash(), "primary", Trigger("checkpoint.sent", 5))
 FAILOVER = Setup("pbr", "process", 3, 30, 1000.0, (CRASH,), (Scheduled(Goal(expression="lfr+tr"), 20),))
 SWARM = range(8)
 HASH_SEEDS = ("0", "1", "12345")

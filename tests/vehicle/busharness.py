@@ -1,6 +1,7 @@
 """What the bus tests share: a hub in a thread or a process, a raw client, a gateway that answers."""
 
 import os
+import queue
 import socket
 import subprocess
 import sys
@@ -9,14 +10,35 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from aftbed.core.busfault import Struck
 from aftbed.core.errors import HarnessError
 from aftbed.vehicle.bus import BusOptions, open_bus
 from aftbed.vehicle.dbcfile import Codec
 from aftbed.vehicle.ecus import Sender
 from aftbed.vehicle.frame import Frame
-from aftbed.vehicle.hub import HubCounts, HubOptions, serve
+from aftbed.vehicle.hub import Hub, serve
+from aftbed.vehicle.hubclient import HubCounts, HubOptions
 
 DEADLINE_S = 5.0
+
+
+class TestDesk:
+    """Whom a hub in a thread works for: a byte on its life descriptor is an order in the queue."""
+
+    __test__ = False
+
+    def __init__(self, life: int) -> None:
+        self._life = life
+        self.orders: queue.SimpleQueue[Callable[[Hub], None]] = queue.SimpleQueue()
+        self.reports: list[list[Struck]] = []
+
+    def attend(self, hub: Hub) -> bool:
+        for _ in (got := os.read(self._life, 4096)):
+            self.orders.get()(hub)
+        return bool(got)
+
+    def report(self, news: list[Struck]) -> None:
+        self.reports.append(news)
 
 
 class RunningHub:
@@ -33,14 +55,32 @@ class RunningHub:
         self._log_fd = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
         self._life_read, self._life_write = os.pipe()
         self._error: BaseException | None = None
+        self.desk = TestDesk(self._life_read)
         self._thread = threading.Thread(target=self._run, args=(options,), daemon=True)
         self._thread.start()
 
     def _run(self, options: HubOptions) -> None:
         try:
-            self.counts = serve(self._listener, self._log_fd, options, self._life_read)
+            self.counts = serve(self._listener, self._log_fd, options, self._life_read, self.desk)
         except BaseException as error:  # noqa: BLE001 - raised again in the test's thread
             self._error = error
+
+    def order(self, what: Callable[[Hub], object]) -> None:
+        """Return when the hub has done it, in its own thread."""
+        done = threading.Event()
+
+        def carry_out(hub: Hub) -> None:
+            what(hub)
+            done.set()
+
+        self.desk.orders.put(carry_out)
+        os.write(self._life_write, b".")
+        assert done.wait(DEADLINE_S), "the hub does not take orders"
+
+    def struck(self) -> list[Struck]:
+        found: list[Struck] = []
+        self.order(lambda hub: found.extend(hub.struck()))
+        return found
 
     def stop(self) -> HubCounts:
         if self._life_write >= 0:
@@ -69,7 +109,8 @@ def running_hub(
 
 _HUB_PROCESS = """
 import os, socket, sys
-from aftbed.vehicle.hub import HubOptions, serve
+from aftbed.vehicle.hub import serve
+from aftbed.vehicle.hubclient import HubOptions
 listener = socket.socket(fileno=int(sys.argv[1]))
 log = os.open(sys.argv[2], os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
 serve(listener, log, HubOptions(), 0)

@@ -9,9 +9,10 @@ from busharness import DEADLINE_S, RawClient, RunningHub, running_hub
 
 from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.vehicle import bus as bus_module
-from aftbed.vehicle.bus import AnswerWatch, Bus, BusOptions, HubClock, Schedule, open_bus
+from aftbed.vehicle.bus import AnswerWatch, Bus, BusOptions, Schedule, open_bus
 from aftbed.vehicle.frame import Frame
-from aftbed.vehicle.hub import HubOptions
+from aftbed.vehicle.hubclient import HubOptions
+from aftbed.vehicle.hubline import HubLine
 
 ANSWER_ID = 0x100
 
@@ -93,12 +94,12 @@ def test_no_hub_is_said_at_once() -> None:
     with pytest.raises(HarnessError, match=r"no CAN hub at 127\.0\.0\.1:1"):
         open_bus(options)
     with pytest.raises(HarnessError, match=r"no CAN hub at 127\.0\.0\.1:1"):
-        HubClock(options)
+        HubLine(options)
 
 
 def test_a_channel_that_is_not_there(hub: RunningHub) -> None:
     with pytest.raises(HarnessError, match="only can0 is here"):
-        HubClock(BusOptions(port=hub.port, channel="can7"))
+        HubLine(BusOptions(port=hub.port, channel="can7"))
 
 
 def test_the_virtual_bus_has_the_same_face() -> None:
@@ -116,7 +117,7 @@ def test_the_virtual_bus_has_the_same_face() -> None:
         with pytest.raises(HarnessError, match="virtual time"):
             a.set_time(1)
         with pytest.raises(ConfigError, match="lockstep needs the hub"):
-            HubClock(options)
+            HubLine(options)
     finally:
         a.close()
         b.close()
@@ -129,7 +130,7 @@ def test_a_kernel_interface_that_is_not_there() -> None:
 
 def test_the_hub_clock_sets_time_for_all(hub: RunningHub, pair: tuple[Bus, Bus]) -> None:
     a, b = pair
-    clock = HubClock(hub.options)
+    clock = HubLine(hub.options)
     for t_us in range(0, 500_000, 5_000):  # the hub has the time before the frame, each time
         clock.set_time(t_us)
         a.send(Frame(0, 0x123, b""))
@@ -139,7 +140,7 @@ def test_the_hub_clock_sets_time_for_all(hub: RunningHub, pair: tuple[Bus, Bus])
     with pytest.raises(HarnessError, match="runs backwards"):
         clock.set_time(0)
     clock.close()
-    second = HubClock(hub.options)
+    second = HubLine(hub.options)
     with pytest.raises(HarnessError, match="another client"):
         second.set_time(10**6)
     second.close()

@@ -16,7 +16,7 @@ from aftbed.vehicle.bus import BusOptions
 from aftbed.vehicle.candump import read_log
 from aftbed.vehicle.car import CarBuses, DriveOptions, DriveReport, drive
 from aftbed.vehicle.dbcfile import Codec, load_dbc
-from aftbed.vehicle.hub import HubOptions
+from aftbed.vehicle.hubclient import HubOptions
 from aftbed.vehicle.report import Telemetry
 from aftbed.vehicle.scenario import Scenario, load_scenario
 

@@ -10,7 +10,7 @@ from aebcycles import EGO_MS, braking, cycles
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aftbed.core.fault import flipped
+from aftbed.core.valuefault import flipped
 from aftbed.vehicle.aebmessages import (
     STAGE_FULL,
     STAGE_NONE,

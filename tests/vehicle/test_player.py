@@ -12,7 +12,7 @@ from aftbed.vehicle.bus import open_bus
 from aftbed.vehicle.candump import LogFrame, read_log
 from aftbed.vehicle.dbcfile import Codec, load_dbc
 from aftbed.vehicle.frame import Frame
-from aftbed.vehicle.hub import HubOptions
+from aftbed.vehicle.hubclient import HubOptions
 from aftbed.vehicle.player import PlayReport, play
 
 CYCLE_END_ID = 0x22F

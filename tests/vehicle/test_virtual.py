@@ -30,7 +30,7 @@ from aftbed.vehicle.ecus import BrakePolicy
 from aftbed.vehicle.frame import Frame
 from aftbed.vehicle.function import default_application
 from aftbed.vehicle.gateway import ClientGateway, Gateway
-from aftbed.vehicle.hub import HubOptions
+from aftbed.vehicle.hubclient import HubOptions
 from aftbed.vehicle.report import VehicleResult
 from aftbed.vehicle.scenario import broken_expectations, load_scenario, scenario_names
 from aftbed.vehicle.virtual import VirtualCar

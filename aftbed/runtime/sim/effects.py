@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from aftbed.core.brick import Brick, Effect, Note, Send
 from aftbed.core.journal import Record
 from aftbed.core.message import Message
-from aftbed.runtime.orders import fire, order_or_halt
+from aftbed.runtime.blows import fire
+from aftbed.runtime.orders import order_or_halt
 from aftbed.runtime.sim.channels import Channel
 from aftbed.runtime.sim.clock import Clock
 

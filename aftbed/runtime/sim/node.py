@@ -15,15 +15,16 @@ from typing import Final
 from aftbed.core.brick import CONTROL, Brick
 from aftbed.core.errors import PeerError
 from aftbed.core.event import Event
-from aftbed.core.fault import Act
 from aftbed.core.journal import Record
 from aftbed.core.message import Adapted, AnyMessage, ChannelEnded, Message, Promoted, Rebound, Reply
 from aftbed.runtime import control
+from aftbed.runtime.diversion import Diversion
 from aftbed.runtime.orders import carry_out
 from aftbed.runtime.sim.channels import Channel
 from aftbed.runtime.sim.clock import Clock
 from aftbed.runtime.sim.devices import Device, Sensor
 from aftbed.runtime.sim.effects import Died, Hosted, Performer
+from aftbed.runtime.sim.hindrance import Hindrance
 
 NEVER: Final = 1 << 62
 PULSE_NS: Final = 20_000_000  # an idle node looks up so often
@@ -52,6 +53,9 @@ class Node:
         self._say, self._on_end = say, on_end
         self.bricks: dict[str, Hosted] = {}
         self.armed: dict[Event, control.Arm] = {}
+        self.slowed: dict[int, int] = {}
+        self.diverted: dict[tuple[str, str], Diversion] = {}
+        self._hindrance = Hindrance(self, clock)
         self.device: Device | None = None
         self.device_brick: Hosted | None = None
         self.alive, self.frozen_ns, self._pulse_ns = True, 0, 0
@@ -112,6 +116,7 @@ class Node:
 
     def bind_output(self, brick: str, port: str, end: int | None, epoch: int) -> None:
         """Write `port` to the channel with that end from now on, and tell the brick."""
+        self._hindrance.lift(brick, port)
         hosted = self.bricks[brick]
         old = hosted.outs.get(port)
         hosted.outs[port] = _nowhere
@@ -120,6 +125,7 @@ class Node:
             channel.writers.append(self)
         if isinstance(old, Channel):
             old.leave(self)
+        self._hindrance.lay(brick, port)
         self.step(hosted, CONTROL, Rebound(port, end is not None, epoch))
 
     def suspend(self, token: int, *, drain: bool) -> None:
@@ -156,15 +162,21 @@ class Node:
         """To the executive."""
         self._say(report)
 
-    def strike_itself(self, act: Act) -> None:
-        """Die, or stop, here and now."""
-        if act is Act.CRASH:
-            raise Died
-        self.freeze()
+    def die_here(self) -> None:
+        """Be killed, here and now."""
+        raise Died
 
     def wait_until_hit(self, fault: int) -> None:
         """Go no further until the executive has answered for `fault`."""
         self.performer.held_by = fault
+
+    def slow(self) -> None:
+        """Go by `slowed` from the next step on."""
+        self._hindrance.slow()
+
+    def divert(self, brick: str, port: str) -> None:
+        """Go by `diverted`, which has changed for this port."""
+        self._hindrance.divert(brick, port)
 
     def stop_detected(self, brick: str, reason: str) -> None:
         """A detected stop: end here and now."""

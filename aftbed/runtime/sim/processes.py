@@ -75,8 +75,8 @@ class Process:
         self._clock.message(self._clock.ns + self._clock.between_ns(*SIGNAL_NS), self._to_it, self.die)
         return True
 
-    def freeze(self) -> bool:
-        """It stops at once."""
+    def freeze(self, for_ms: int = 0) -> bool:
+        """It stops at once. Here the executive does not die before it lets it go on."""
         if self.dead:
             return False
         self._still = True

@@ -12,11 +12,14 @@ from typing import Final
 import msgspec
 
 from aftbed.core.application import Application
+from aftbed.core.busfault import BusFault, Struck
 from aftbed.core.check import History
+from aftbed.core.errors import ConfigError
 from aftbed.core.fault import Fault
 from aftbed.core.graph import Graph, Link
 from aftbed.core.journal import Entry, EntryKind, Record
 from aftbed.core.message import Goal, Scheduled
+from aftbed.core.valuefault import Flip
 from aftbed.ftm.client import Client
 from aftbed.ftm.mechanism import replication_of
 from aftbed.runtime import control, targets
@@ -25,9 +28,11 @@ from aftbed.runtime.assembly import Assembler, Make
 from aftbed.runtime.conductor import Conductor
 from aftbed.runtime.deployment import Keys
 from aftbed.runtime.hosting import Hosted, hosted
+from aftbed.runtime.jobs import Wait
 from aftbed.runtime.sim.channels import Channel
 from aftbed.runtime.sim.clock import START_NS, Clock
 from aftbed.runtime.sim.devices import Car, Device, Sensor
+from aftbed.runtime.sim.ending import states_of
 from aftbed.runtime.sim.givens import Journal, car_in, graph_of, nothing_off_line, requests_of
 from aftbed.runtime.sim.node import Node
 from aftbed.runtime.sim.processes import Nursery, Process
@@ -35,6 +40,7 @@ from aftbed.runtime.source import Load, resume_client
 from aftbed.vehicle.function import default_application
 from aftbed.vehicle.report import VehicleResult
 
+STOPPED: Final = "detected stop"  # in the reason of a death
 REST_NS_MAX: Final = 3_000_000_000  # from the last fault to the rest, in virtual time
 TICK_SECONDS: Final = 0.02  # as the supervisor looks after what no Watchdog watches
 STRAY_NS: Final = 5_000_000  # so long after the rest, what comes too late would still be seen
@@ -76,6 +82,7 @@ class Rest(msgspec.Struct, frozen=True):
     leader: str
     graph: Graph
     hosted: Hosted
+    states: dict[str, str]  # digests of the Servers' states, by replica
 
 
 class Run(msgspec.Struct, frozen=True):
@@ -160,6 +167,17 @@ class World:
         """Of the run's seed."""
         return Random(f"{self.setup.seed}/{number}").getrandbits(DRAW_BITS)
 
+    def disturb(self, number: int, fault: BusFault, draw: int) -> Keys:
+        """In the car's own bus. Raises ConfigError where there is none."""
+        if self._car is None:
+            raise ConfigError(f"{fault}: without a scenario there is no bus")
+        self._car.disturb(number, fault, draw, self.loop.ns - self._car_began_ns if self._launched else 0)
+        yield Wait(frozenset())
+
+    def bus_fault(self, number: int) -> Struck | None:
+        """By the car's bus."""
+        return self._car.struck_by(number) if self._car is not None else None
+
     def pin(self, pid: int, cpu: int) -> None:
         """There are no cores here."""
 
@@ -210,7 +228,8 @@ class World:
     def _on_end(self, process: Process, reason: str) -> None:
         if process.node is not None and process.incarnation == 1:
             self._count(process.node)
-        if not reason and process.kind != "killed":
+        flipped = STOPPED in reason and any(isinstance(fault.action, Flip) for fault in self.setup.faults)
+        if (not reason or flipped) and process.kind != "killed":
             self.struck.append((self.loop.ns, process.name))
         if reason.startswith("assertion"):
             self.failures.append(f"{process.name}: {reason}")
@@ -352,6 +371,7 @@ class World:
             deployment.leader,
             deployment.graph,
             hosted(deployment),
+            states_of(deployment),
         )
         return Run(
             self.setup,

@@ -6,6 +6,7 @@ from typing import Final
 
 import msgspec
 
+from aftbed.core.busfault import NODES
 from aftbed.core.journal import EntryKind
 from aftbed.core.message import Reply, Submit
 from aftbed.ftm.client import BACKLOG_MAX, Client
@@ -20,6 +21,7 @@ from aftbed.vehicle.mapfile import find_map
 from aftbed.vehicle.mapped import MappedGateway
 
 PAYLOADS_MAX: Final = BACKLOG_MAX
+*_, GATEWAY = NODES
 
 
 class GatewayDevice:
@@ -32,7 +34,7 @@ class GatewayDevice:
         resume_client(client, told(options.earlier))
         self._dialogue = Dialogue(Path(options.dialogue), "client")
         self._gateway = _gateway(options)
-        self._bus = open_bus(BusOptions(port=options.port))
+        self._bus = open_bus(BusOptions(port=options.port, node=GATEWAY, uses=self._gateway.uses()))
         self._payloads: deque[bytes] = deque()
         self._overrun = 0
         self._quiet = False
@@ -48,11 +50,15 @@ class GatewayDevice:
         for frame in self._bus.drain():
             payload = self._gateway.on_frame(frame)
             if payload is None:
+                if self._gateway.makes_requests(frame.can_id):
+                    self._bus.unasked(frame.can_id)
                 continue
             if len(self._payloads) >= PAYLOADS_MAX:
                 self._payloads.popleft()  # the oldest track is worth least
                 self._overrun += 1
             self._payloads.append(payload)
+        for can_id, word in self._gateway.noticed():
+            self._bus.notice(can_id, word)
 
     def take(self, now_ns: int) -> Submit | None:
         """The next request. Written ahead: a successor knows it even if we die now."""

@@ -1,7 +1,9 @@
 """Starting a run from a command, and being told how it goes.
 
 The command forks the warden and the supervisor before it does anything else that takes memory; the
-supervisor has a session of its own, so a terminal's Ctrl-C reaches the command alone.
+supervisor has a session of its own, so a terminal's Ctrl-C reaches the command alone. By the ends of
+what a `Launched` holds its run knows that the command is gone. So no child of the command keeps them, of
+this run or of a later one: else one run would end behind the other, each a little later.
 """
 
 import os
@@ -9,9 +11,10 @@ import select
 import signal
 import socket
 import time
+import weakref
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Final
+from typing import Final, NoReturn
 
 import msgspec
 
@@ -20,11 +23,13 @@ from aftbed.core.errors import ConfigError
 from aftbed.core.fault import Fault
 from aftbed.core.message import Scheduled
 from aftbed.runtime import control
-from aftbed.runtime.unix import linux, rundir
+from aftbed.runtime.unix import linux, members, rundir
+from aftbed.runtime.unix.busaim import aim
 from aftbed.runtime.unix.line import Line, decode_report
 from aftbed.runtime.unix.options import LoadRun, RunOptions, Work
-from aftbed.runtime.unix.spawn import start_zygote
-from aftbed.runtime.unix.warden import watch
+from aftbed.runtime.unix.spawn import fork_zygote, start_zygote
+from aftbed.runtime.unix.undo import Ledger
+from aftbed.runtime.unix.warden import Watched, watch
 from aftbed.runtime.zygotes import BUS, LIGHT
 
 END_SECONDS_MAX: Final = 8.0
@@ -49,8 +54,8 @@ def bind_hub(port: int) -> socket.socket:
 class Launched:
     """A run in progress, seen from its command."""
 
-    def __init__(self, options: RunOptions, listener: socket.socket | None) -> None:
-        self.options = options
+    def __init__(self, options: RunOptions, listener: socket.socket | None, *, warm: bool = False) -> None:
+        self.options, self._warm = options, warm
         self.private = Path(options.private)
         self.record = Path(options.record)
         self.started_ns = time.monotonic_ns()
@@ -63,13 +68,14 @@ class Launched:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         command_end, command_life = os.pipe()
         supervisor_end, supervisor_life = os.pipe()
+        waker = os.eventfd(0)
         self._supervisor = os.fork()
         if self._supervisor == 0:
             os.setsid()
             for fd in (command_end, command_life, supervisor_end):
                 os.close(fd)
             ours.close()
-            self._be_supervisor(theirs)
+            self._be_supervisor(theirs, waker)
         self._pidfd = os.pidfd_open(self._supervisor)
         theirs.close()
         os.close(supervisor_life)
@@ -80,27 +86,56 @@ class Launched:
             ours.close()
             if listener is not None:
                 listener.close()
-            watch(self.private, command_end, supervisor_end, self._pidfd)
-        os.close(command_end)
-        os.close(supervisor_end)
+            self._be_warden(command_end, supervisor_end, waker)
+        self._warden_pidfd = os.pidfd_open(self._warden)
+        for fd in (command_end, supervisor_end, waker):
+            os.close(fd)
         self._life = [command_life]
         self.line = Line(ours, decode_report)
+        _HELD.add(self)
 
-    def _be_supervisor(self, owner: socket.socket) -> None:
-        """Never returns."""
+    def let_go(self) -> None:
+        """In a child of the command: this run is not its own."""
+        self.line.close()
+        for fd in (*self._life, self._pidfd, self._warden_pidfd):
+            os.close(fd)
+
+    def _be_warden(self, command_end: int, supervisor_end: int, waker: int) -> NoReturn:
+        try:
+            watch(
+                Watched(
+                    private=self.private,
+                    record=self.record,
+                    started_ns=self.started_ns,
+                    command_end=command_end,
+                    supervisor_end=supervisor_end,
+                    supervisor_pidfd=self._pidfd,
+                    waker=waker,
+                )
+            )
+        finally:
+            os._exit(1)  # never into what the command goes on to do
+
+    def _be_supervisor(self, owner: socket.socket, waker: int) -> NoReturn:
         code = 1
         try:
             signal.signal(signal.SIGINT, signal.SIG_IGN)
+            members.mark(self.private)
+            os.environ[members.VARIABLE] = str(self.private)  # of all that is executed from here on
             log = os.open(self.record / "processes.log", os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
             os.dup2(log, 1)
             os.dup2(log, 2)
             linux.set_name("aftbed-supervis")
             cpus = sorted(os.sched_getaffinity(0))
-            name = LIGHT if isinstance(self.options.work, LoadRun) else BUS
-            zygotes = {name: start_zygote(name, cpus)}  # it imports while we do; it has the most to import
+            load = isinstance(self.options.work, LoadRun)
+            if self._warm:
+                zygotes = {name: fork_zygote(name, cpus) for name in ((LIGHT,) if load else (LIGHT, BUS))}
+            else:
+                name = LIGHT if load else BUS  # it imports while we do; it has the most to import
+                zygotes = {name: start_zygote(name, cpus)}
             from aftbed.runtime.unix.supervisor import supervise  # noqa: PLC0415
 
-            supervise(self.options, owner, zygotes)
+            supervise(self.options, owner, zygotes, Ledger(self.private, waker))
             code = 0
         except BaseException:  # noqa: BLE001 - the last frame of this process
             import traceback  # noqa: PLC0415
@@ -143,34 +178,54 @@ class Launched:
     def wait(self) -> None:
         """Wait for the supervisor's end; kill it if that does not come. The record is still there."""
         self.line.close()
-        if not self._pidfd_ready(END_SECONDS_MAX):
+        if not _ends(self._pidfd, END_SECONDS_MAX):
             linux.kill(self._pidfd, signal.SIGKILL)
-            self._pidfd_ready(KILL_SECONDS_MAX)
+            _ends(self._pidfd, KILL_SECONDS_MAX)
         os.waitpid(self._supervisor, 0)
-        os.close(self._pidfd)
 
     def remove(self) -> None:
         """The record has been read: let everything go."""
         rundir.remove(self.private)
-        for fd in self._life:
+        life, self._life = self._life, []
+        for fd in life:
             os.close(fd)
-        self._life = []
+        if not _ends(self._warden_pidfd, KILL_SECONDS_MAX):
+            linux.kill(self._warden_pidfd, signal.SIGKILL)  # stopped, it would be waited for for ever
         os.waitpid(self._warden, 0)
-
-    def _pidfd_ready(self, seconds: float) -> bool:
-        poll = select.poll()
-        poll.register(self._pidfd, select.POLLIN)
-        return bool(poll.poll(seconds * 1e3))
+        _HELD.discard(self)
+        os.close(self._pidfd)
+        os.close(self._warden_pidfd)
 
 
-def launch(options: RunOptions, listener: socket.socket | None) -> Launched:
-    """Start a run. `run.json` is written first: a record says what it is a record of."""
+_HELD: Final[weakref.WeakSet[Launched]] = weakref.WeakSet()
+
+
+def _let_go() -> None:
+    for launched in list(_HELD):
+        launched.let_go()
+    _HELD.clear()  # a child of this child has other descriptors by the same numbers
+
+
+os.register_at_fork(after_in_child=_let_go)
+
+
+def _ends(pidfd: int, seconds: float) -> bool:
+    poll = select.poll()
+    poll.register(pidfd, select.POLLIN)
+    return bool(poll.poll(seconds * 1e3))
+
+
+def launch(options: RunOptions, listener: socket.socket | None, *, warm: bool = False) -> Launched:
+    """Start a run. `run.json` is written first: a record says what it is a record of.
+
+    `warm`: this process has been warmed up (`spawn.warm_up`), and zygotes are forks of it.
+    """
     about = {"version": __version__, "started_ns": time.monotonic_ns(), **msgspec.to_builtins(options)}
     for key in ("listener", "private"):
         about.pop(key)
     about["load"] = isinstance(options.work, LoadRun)
     (Path(options.record) / "run.json").write_bytes(msgspec.json.format(msgspec.json.encode(about)))
-    launched = Launched(options, listener)
+    launched = Launched(options, listener, warm=warm)
     if listener is not None:
         listener.close()
     return launched
@@ -189,6 +244,7 @@ def options_for(
     bus_port: int = 0,
 ) -> tuple[RunOptions, socket.socket | None]:
     """A run directory and, where there is a bus, its socket. Raises ConfigError, leaving nothing."""
+    faults = tuple(aim(fault, work) for fault in faults)
     listener = None if isinstance(work, LoadRun) else bind_hub(bus_port)
     private = rundir.create()
     try:

@@ -36,16 +36,24 @@ def _prctl(option: int, argument: int) -> None:
 def die_with(parent: int) -> None:
     """Have the kernel kill this process when `parent` dies. Ends it now if that happened already.
 
-    Waits to be adopted by `parent` first: the signal is bound to the parent of this moment.
+    Waits to be adopted by `parent` first: the signal is bound to the parent of this moment. A dead one
+    adopts nobody, and may have died before its child came here.
     """
     limit = time.monotonic() + ADOPTION_SECONDS_MAX
     while os.getppid() != parent:
-        if time.monotonic() > limit:
+        if _dead(parent) or time.monotonic() > limit:
             os._exit(1)
         os.sched_yield()
     _prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
         os._exit(1)
+
+
+def _dead(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] in "ZX"
+    except OSError:
+        return True
 
 
 class _SchedAttr(ctypes.Structure):
@@ -156,6 +164,14 @@ class Starvation:
                 return ran_ns == 0
             case _:
                 return False
+
+
+def waited_ns(pid: int) -> int:
+    """How long `pid` has been runnable and not run so far (schedstats); 0 where that cannot be told."""
+    try:
+        return int(Path(f"/proc/{pid}/schedstat").read_text().split()[1])
+    except (OSError, ValueError, IndexError):
+        return 0
 
 
 def reap(pid: int) -> int | None:

@@ -1,14 +1,14 @@
 """The host of bricks in a process: mail in, `step`, effects out. This is the hot path.
 
-Blocking, never spinning. A node whose bricks have one open port, which is the rule on the request
-path, blocks in a plain read of that port: a poll before each read costs 1.4 us a hop (measured, 20 %
-of a hop). So the control socket is not polled there; the supervisor raises a flag in the header of
-the node's journal and puts a *nudge*, a packet of one byte, into the node's inputs. A node looks at
-the flag after each wake-up, before it looks at the mail: control is served before data.
+Blocking, never spinning. A node whose bricks have one open port, which is the rule on the request path,
+blocks in a plain read of that port: a poll before each read costs 1.4 us a hop (measured, 20 % of a hop). So
+the control socket is not polled there; the supervisor raises a flag in the header of the node's journal and
+puts a *nudge*, a packet of one byte, into the node's inputs. A node looks at the flag after each wake-up,
+before it looks at the mail: control is served before data.
 
 The pulse is an interval timer's signal: its handler writes the time into the header, but only if it
-interrupted the host and not a brick, or if the journal has grown since: so a brick that loops for ever
-stops the pulse. (A receive timeout on the sockets would do too; it costs 0.3 us a hop.)
+interrupted the host and not a brick, or if the journal has grown since: so a brick that loops for ever stops
+the pulse. (A receive timeout on the sockets would do too; it costs 0.3 us a hop.)
 
 What is read from a channel is handled before anything else is read, so mail is either in the kernel,
 where it outlives this process, or inside a request that the client will ask again.
@@ -29,7 +29,9 @@ from aftbed.core.event import Event
 from aftbed.core.journal import FLAG_OFFSET, PULSE_OFFSET, RECORD
 from aftbed.core.message import Adapted, AnyMessage, ChannelEnded, Message, Promoted, Rebound, Reply
 from aftbed.runtime import control
-from aftbed.runtime.orders import carry_out, fire, order_or_halt
+from aftbed.runtime.blows import fire
+from aftbed.runtime.orders import carry_out, order_or_halt
+from aftbed.runtime.unix import hindrance
 from aftbed.runtime.unix.devices import Device, Sensor
 from aftbed.runtime.unix.journal import Journal
 from aftbed.runtime.unix.lifeline import Held
@@ -41,15 +43,13 @@ PULSE_SECONDS: Final = 0.02
 READ_BYTES_MAX: Final = wire.PACKET_BYTES_MAX + 1  # one byte more than is allowed, so that it is noticed
 WRITE_SECONDS_MAX: Final = 2.0
 NUDGE: Final = b"\0"
-HOST_FILES: Final = (__file__, Line.recv.__code__.co_filename)  # what is blocked here is in no brick
+HOST_FILES: Final = (__file__, Line.recv.__code__.co_filename, hindrance.__file__)  # waiting, in no brick
 EXIT_FENCED: Final = 3
 REFUSED: Final = (PeerError, *wire.UNREADABLE)
 EXIT_ASSERT: Final = 70
 
-_now = time.monotonic_ns
-_read, _write = os.read, os.write
-_encode = wire.encode_unchecked
-_decode = wire.decode_unchecked
+_now, _read, _write = time.monotonic_ns, os.read, os.write
+_encode, _decode = wire.encode_unchecked, wire.decode_unchecked
 _pack = RECORD.pack_into
 RECORD_BYTES: Final = RECORD.size
 
@@ -166,8 +166,7 @@ class Node:
 
     def _waits(self) -> bool:
         """Whether there is mail at an open port."""
-        plan = self.wiring.plan((), may_block=False)
-        return bool(plan.poll.poll(0))
+        return bool(self.wiring.plan((), may_block=False).poll.poll(0))
 
     def serve_hot(self, hosted: Hosted) -> None:
         """The same as `turn`, with all at hand, for a node that hosts one brick and polls nothing.
@@ -203,7 +202,7 @@ class Node:
                         _write(out, raw if effect.message is message else _encode(effect.message))
                     except OSError:
                         journal.at = at  # control mail that is served meanwhile may write records
-                        self._write_hard(hosted, effect.port, wire.encode(effect.message))
+                        self.write_hard(hosted, effect.port, wire.encode(effect.message))
                         at = journal.at
                 elif type(effect) is Note:
                     _pack(mapping, at, now_ns, effect.request_id, effect.detail, 0, effect.event.code)
@@ -218,7 +217,7 @@ class Node:
         self._packet(inlet, _read(inlet.fd, READ_BYTES_MAX))
 
     def _packet(self, inlet: Inlet, raw: bytes) -> None:
-        """Handle a packet; control first."""
+        """Control first."""
         if self.journal.mapping[FLAG_OFFSET]:
             self.serve_control()
         if raw == b"":
@@ -239,7 +238,7 @@ class Node:
 
     def _poll(self, plan: Plan) -> None:
         """Wait for several things; the control line goes first."""
-        ready = plan.poll.poll(self._patience_ms())
+        ready = plan.poll.poll(self.patience_ms())
         now_ns = _now()
         fds = [fd for fd, _ in ready]
         if self.journal.mapping[FLAG_OFFSET] or self.line.fileno() in fds:
@@ -254,7 +253,8 @@ class Node:
                 self.device.ready(fd, now_ns)
         self._wake(now_ns)
 
-    def _patience_ms(self) -> float:
+    def patience_ms(self) -> float:
+        """How long to wait at most."""
         due = [h.brick.deadline_ns() for h in self.wiring.hosted.values()] if self.wiring.timed else []
         if self.device is not None:
             due.append(self.device.deadline_ns())
@@ -318,7 +318,7 @@ class Node:
                     try:
                         _write(out, data)  # type: ignore[arg-type]
                     except OSError:
-                        self._write_hard(hosted, effect.port, data or b"")  # type: ignore[union-attr]
+                        self.write_hard(hosted, effect.port, data or b"")  # type: ignore[union-attr]
                 else:
                     out(effect.message)  # type: ignore[operator,union-attr]
             elif kind is Note:
@@ -329,11 +329,11 @@ class Node:
             else:
                 order_or_halt(self.host, hosted, effect)
 
-    def _write_hard(self, hosted: Hosted, port: str, data: bytes) -> None:
+    def write_hard(self, hosted: Hosted, port: str, data: bytes) -> None:
         """The channel is full or shut: serve control meanwhile, since that may be about this channel.
 
-        Where it is bound elsewhere meanwhile, the brick has heard of it and has asked again what it
-        wants asked. Raises BrokenPipeError where this node is fenced, or nobody reads.
+        Where it is bound elsewhere meanwhile, the brick has heard of it and has asked again what it wants
+        asked. Raises BrokenPipeError where this node is fenced, or nobody reads.
         """
         failed = hosted.outs[port]
         limit = _now() + int(WRITE_SECONDS_MAX * 1e9)

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Final
 
 from aftbed.core.brick import CONTROL
 from aftbed.core.event import Event
-from aftbed.core.fault import Act
 from aftbed.runtime import control
+from aftbed.runtime.diversion import Diversion
 from aftbed.runtime.unix.devices import Sensor
+from aftbed.runtime.unix.hindrance import Hindrance
 from aftbed.runtime.unix.wiring import Hosted
 
 if TYPE_CHECKING:
@@ -26,6 +27,9 @@ class Obedience:
     def __init__(self, node: "Node") -> None:
         self._node = node
         self.armed = node.armed
+        self.slowed: dict[int, int] = {}
+        self.diverted: dict[tuple[str, str], Diversion] = {}
+        self._hindrance = Hindrance(node, self)
 
     def hosted(self, brick: str) -> Hosted:
         """The brick of that name."""
@@ -37,7 +41,9 @@ class Obedience:
 
     def bind_output(self, brick: str, port: str, end: int | None, epoch: int) -> None:
         """Write `port` to that descriptor from now on, and tell the brick."""
+        self._hindrance.lift(brick, port)
         self._node.bind_output(brick, port, end, epoch)
+        self._hindrance.lay(brick, port)
 
     def suspend(self, token: int, *, drain: bool) -> None:
         """Answer `token` as soon as no request is inside (`drain`: nor waits)."""
@@ -74,9 +80,9 @@ class Obedience:
         """To the supervisor."""
         self._node.line.send(report)
 
-    def strike_itself(self, act: Act) -> None:
-        """Die, or stop, here and now."""
-        os.kill(os.getpid(), signal.SIGKILL if act is Act.CRASH else signal.SIGSTOP)
+    def die_here(self) -> None:
+        """Be killed, here and now."""
+        os.kill(os.getpid(), signal.SIGKILL)
 
     def wait_until_hit(self, fault: int) -> None:
         """Go no further until the supervisor has answered for `fault`."""
@@ -85,6 +91,14 @@ class Obedience:
             if self._node.serve_control(wait=True, until=fault):
                 return
         raise AssertionError(f"fault {fault} was not applied within {FAULT_NS_MAX / 1e9} s")
+
+    def slow(self) -> None:
+        """Go by `slowed` from the next step on."""
+        self._hindrance.slow()
+
+    def divert(self, brick: str, port: str) -> None:
+        """Go by `diverted`, which has changed for this port."""
+        self._hindrance.divert(brick, port)
 
     def stop_detected(self, brick: str, reason: str) -> None:
         """A detected stop: end here and now."""

@@ -16,11 +16,12 @@ import msgspec
 
 from aftbed.runtime import control, interface
 from aftbed.runtime.jobs import Key, StepFailed, Wait
-from aftbed.runtime.unix import linux
+from aftbed.runtime.unix import linux, members
 from aftbed.runtime.unix.journal import Header
 from aftbed.runtime.unix.line import Line, decode_report
 from aftbed.runtime.unix.loop import Loop
 from aftbed.runtime.unix.spawn import Started, start_zygote
+from aftbed.runtime.unix.undo import Ledger
 
 REAP_SECONDS: Final = 0.01
 SPARE_SECONDS_MAX: Final = 5.0  # a zygote imports first
@@ -30,8 +31,8 @@ PARK_BATCH: Final = 4  # spares per order: the first of them start while the nex
 class Process:
     """A child of the supervisor. `kind`: zygote, spare, node or service."""
 
-    def __init__(self, name: str, kind: str, line: Line[control.FromNode]) -> None:
-        self.name, self.kind, self.line = name, kind, line
+    def __init__(self, name: str, kind: str, line: Line[control.FromNode], ledger: Ledger) -> None:
+        self.name, self.kind, self.line, self._ledger = name, kind, line, ledger
         self.pid, self.pidfd = 0, -1
         self.journal = ""
         self.header: Header | None = None
@@ -60,13 +61,22 @@ class Process:
         """SIGKILL; False if it is gone."""
         return self._signal(signal.SIGKILL)
 
-    def freeze(self) -> bool:
-        """SIGSTOP; False if it is gone."""
+    def freeze(self, for_ms: int = 0) -> bool:
+        """SIGSTOP, once its undo is written (`runtime.unix.undo`); False if it is gone.
+
+        Raises StepFailed, having stopped nothing, if it cannot be written.
+        """
+        if self.pidfd < 0:
+            return False
+        self._ledger.ahead(self.name, self.pid, for_ms)
         return self._signal(signal.SIGSTOP)
 
     def thaw(self) -> bool:
-        """SIGCONT; False if it is gone."""
-        return self._signal(signal.SIGCONT)
+        """SIGCONT; False if it is gone. One that is not seen to go on is left to the warden."""
+        sent = self._signal(signal.SIGCONT)
+        if sent and members.state_of(self.pid) != "T":
+            self._ledger.undone(self.pid)
+        return sent
 
     def _signal(self, sig: signal.Signals) -> bool:
         return self.pidfd >= 0 and linux.kill(self.pidfd, sig)
@@ -118,8 +128,9 @@ class Nursery:
         loop: Loop,
         on_report: Callable[[Process, msgspec.Struct], None],
         on_death: Callable[[Process], None],
+        ledger: Ledger,
     ) -> None:
-        self._loop = loop
+        self._loop, self._ledger = loop, ledger
         self._cpus = sorted(os.sched_getaffinity(0))
         self._on_report, self._on_death = on_report, on_death
         self.processes: list[Process] = []
@@ -197,7 +208,7 @@ class Nursery:
 
     def _adopt(self, name: str, kind: str, sock: socket.socket) -> Process:
         sock.setblocking(False)
-        process = Process(name, kind, Line(sock, decode_report))
+        process = Process(name, kind, Line(sock, decode_report), self._ledger)
         self.processes.append(process)
         self._loop.read(sock.fileno(), lambda: self._heard(process))
         return process

@@ -2,9 +2,14 @@
 
 The private one is `$XDG_RUNTIME_DIR/aftbed/ID` or `/tmp/aftbed-UID/ID`, mode 0700; it goes with the
 run. Without `--record` the record lives, and goes, inside it.
+
+It belongs to the process that made it, the command, and is locked by it (flock(2)) from the first moment
+on: the kernel lets go of the lock with that process, so whether a run has an owner is never a guess. The
+lock is not inherited: whatever else descends from the command, of this run or of another, lets go of it.
 """
 
 import contextlib
+import fcntl
 import os
 import secrets
 import shutil
@@ -20,6 +25,8 @@ SOCKET_NAME: Final = "control"
 ID_BYTES: Final = 3
 ANSWER_SECONDS_MAX: Final = 2.0
 CONNECT_PAUSE_SECONDS: Final = 0.005
+
+_owned: dict[Path, int] = {}  # by private directory, the descriptor that holds its lock
 
 
 def root() -> Path:
@@ -45,7 +52,47 @@ def create() -> Path:
             path.mkdir(mode=0o700)
         except FileExistsError:
             continue
+        _owned[path] = _locked(path)
         return path
+
+
+def _locked(path: Path) -> int:
+    descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+    except OSError as error:
+        os.close(descriptor)
+        path.rmdir()
+        raise HarnessError(
+            f"{path}: cannot be locked: {error.strerror}; set XDG_RUNTIME_DIR or TMPDIR to a local disk"
+        ) from None
+    return descriptor
+
+
+def _disown() -> None:
+    """In a child: it owns none of the runs of its parent."""
+    for descriptor in _owned.values():
+        os.close(descriptor)
+    _owned.clear()
+
+
+os.register_at_fork(after_in_child=_disown)
+
+
+def owned(private: Path) -> bool:
+    """Whether the process that made `private` lives; False too where there is no such directory."""
+    try:
+        descriptor = os.open(private, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    else:
+        return False
+    finally:
+        os.close(descriptor)
 
 
 def record_directory(wanted: str | None, private: Path) -> Path:
@@ -64,6 +111,8 @@ def record_directory(wanted: str | None, private: Path) -> Path:
 def remove(private: Path) -> None:
     """Remove the private directory of a run that has ended."""
     shutil.rmtree(private, ignore_errors=True)
+    if private in _owned:
+        os.close(_owned.pop(private))
 
 
 def live() -> list[str]:

@@ -7,12 +7,15 @@ from pathlib import Path
 
 import msgspec
 
+from aftbed.core.busfault import Struck
 from aftbed.core.errors import HarnessError
 from aftbed.runtime import control
+from aftbed.runtime.unix import bus
 from aftbed.runtime.unix.line import Line
 from aftbed.runtime.unix.options import PlayerOptions, VehicleOptions
-from aftbed.vehicle.hub import HubOptions
+from aftbed.vehicle.hub import Hub
 from aftbed.vehicle.hub import serve as serve_hub
+from aftbed.vehicle.hubclient import HubOptions
 
 
 def serve(line: Line[control.ToNode], order: control.Serve, fds: list[int]) -> None:
@@ -26,6 +29,30 @@ def serve(line: Line[control.ToNode], order: control.Serve, fds: list[int]) -> N
         _player(line, msgspec.msgpack.decode(order.options, type=PlayerOptions))
 
 
+class _Desk:
+    """What the hub is told, and what it tells: see `vehicle.hub.Desk`."""
+
+    def __init__(self, line: Line[control.ToNode]) -> None:
+        self._line = line
+
+    def attend(self, hub: Hub) -> bool:
+        """Carry out the next order; False when the line has ended."""
+        got = self._line.recv()
+        if got is None:
+            return False
+        order = got[0]
+        if isinstance(order, control.DisturbBus):
+            hub.disturb(order.token, order.fault, order.draw)
+            self._line.send(control.Report(bus.DISTURBED, str(order.token).encode()))
+        elif isinstance(order, control.Stats):
+            self._line.send(control.Report(bus.ASKED, msgspec.msgpack.encode(hub.struck())))
+        return True
+
+    def report(self, news: list[Struck]) -> None:
+        """To the supervisor."""
+        self._line.send(control.Report(bus.STRUCK, msgspec.msgpack.encode(news)))
+
+
 def _hub(line: Line[control.ToNode], order: control.Serve, fds: list[int]) -> None:
     import socket  # noqa: PLC0415 - imported by all others already
 
@@ -36,6 +63,7 @@ def _hub(line: Line[control.ToNode], order: control.Serve, fds: list[int]) -> No
         log,
         msgspec.msgpack.decode(order.options, type=HubOptions),
         line.fileno(),
+        _Desk(line),
     )
     os.close(log)
     line.send(control.Report("result", msgspec.json.encode(counts)))
@@ -69,7 +97,8 @@ def _vehicle(line: Line[control.ToNode], options: VehicleOptions) -> None:
     from aftbed.vehicle.scenario import load_scenario  # noqa: PLC0415
 
     scenario, codec = load_scenario(options.scenario), load_dbc()
-    buses = CarBuses(BusOptions(port=options.port), lockstep=options.pace is None)
+    hears = (codec.can_id("AEB_REQ"),)
+    buses = CarBuses(BusOptions(port=options.port), lockstep=options.pace is None, hears=hears)
     if not _wait_for_go(line):
         return
     try:
@@ -102,14 +131,14 @@ def _player(line: Line[control.ToNode], options: PlayerOptions) -> None:
 
     gateway = MappedGateway(load_dbc(), Path(options.dbc), find_map(options.map))
     frames, counts = read_log(Path(options.log))
-    bus = open_bus(BusOptions(port=options.port))
+    attached = open_bus(BusOptions(port=options.port, node="player"))
     if not _wait_for_go(line):
         return
     try:
         result = play(
             frames,
             load_dbc(),
-            bus,
+            attached,
             options.pace,
             ends_cycle=lambda frame: gateway.on_frame(frame) is not None,
             stop=_stopper(line),

@@ -1,5 +1,7 @@
 """Starting zygotes: the first thing that a supervisor does, before it imports what it needs itself."""
 
+import gc
+import importlib
 import os
 import site
 import socket
@@ -30,6 +32,36 @@ def start_zygote(name: str, cpus: list[int]) -> Started:
     """Start the zygote called `name` as a child of this process."""
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     pid = start(theirs.fileno(), os.getpid(), cpus, PRELOADS[name])
+    theirs.close()
+    return pid, ours
+
+
+def warm_up(name: str) -> None:
+    """Import and rehearse what `fork_zygote` hands on: once, in a process that starts many runs."""
+    from aftbed.runtime.unix import rehearsal, supervisor, zygote  # noqa: PLC0415 - for who starts many
+
+    assert supervisor and zygote
+    for module in PRELOADS[name]:
+        importlib.import_module(module)
+    rehearsal.rehearse(rehearsal.ROUNDS_WARM)
+    gc.collect()
+    gc.freeze()  # what is here stays: no child looks at it, and copies its pages, again
+
+
+def fork_zygote(name: str, cpus: list[int]) -> Started:
+    """The same out of this process, which has been warmed up: 0.2 s of imports less, for some pages more."""
+    from aftbed.runtime.unix import zygote  # noqa: PLC0415
+
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    supervisor = os.getpid()
+    pid = os.fork()
+    if pid == 0:
+        try:
+            os.dup2(theirs.fileno(), CONTROL_FD)
+            os.closerange(CONTROL_FD + 1, 1 << 16)
+            zygote.run(supervisor, cpus, (), warm=True)
+        finally:
+            os._exit(1)
     theirs.close()
     return pid, ours
 

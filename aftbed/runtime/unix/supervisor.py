@@ -19,7 +19,7 @@ from aftbed.ftm.mechanism import build
 from aftbed.runtime import control
 from aftbed.runtime.conductor import HANG_NS, Conductor
 from aftbed.runtime.deployment import Keys
-from aftbed.runtime.hosting import hosted
+from aftbed.runtime.hosting import hosted, look_at_states
 from aftbed.runtime.jobs import STATS_JOB
 from aftbed.runtime.unix import linux
 from aftbed.runtime.unix.line import Line, decode_order
@@ -29,6 +29,7 @@ from aftbed.runtime.unix.processes import Nursery, Process
 from aftbed.runtime.unix.questions import Questions
 from aftbed.runtime.unix.spawn import Started
 from aftbed.runtime.unix.support import Support
+from aftbed.runtime.unix.undo import Ledger
 from aftbed.runtime.unix.work import Work
 from aftbed.runtime.zygotes import BUS, LIGHT
 
@@ -42,14 +43,16 @@ STOP_SECONDS_MAX: Final = 1.0
 class Supervisor:
     """One run. `owner` is the line to the command; its end is the command's."""
 
-    def __init__(self, options: RunOptions, owner: socket.socket, zygotes: dict[str, Started]) -> None:
+    def __init__(
+        self, options: RunOptions, owner: socket.socket, zygotes: dict[str, Started], ledger: Ledger
+    ) -> None:
         self.options, self._zygotes = options, zygotes
         self.record = Path(options.record)
         self.started_ns = time.monotonic_ns()
         self.owner = Line(owner, decode_order)
         self.owner.sock.setblocking(False)
         self.loop = Loop()
-        self.nursery = Nursery(self.loop, self._on_report, self._on_death)
+        self.nursery = Nursery(self.loop, self._on_report, self._on_death, ledger)
         self._events = open(self.record / "events.jsonl", "ab", buffering=0)  # noqa: SIM115 - for the whole run
         self._ending = ""
         self._told: list[bytes] = []
@@ -57,14 +60,24 @@ class Supervisor:
         self._grace_until_ns = 0
         self.graph_ms = 0.0
         self._incomplete: list[str] = []
-        self._lost = False
+        self._lost = self._looked = False
+        self._waited_ns: dict[int, int] = {}
+        self._states: dict[str, str] = {}  # digests, by replica, at the end
         self._last_tick_ns = 0
         self._situation_wanted = False
         graph = build(options.ftm, options.placement)
         cpus = sorted(os.sched_getaffinity(0))
         pinned = cpus if options.pin and len(cpus) > 1 else None
         self.work = Work(options, self.nursery, self.loop, self.tell, self._finish, self._report_owner)
-        support = Support(self.record, self.loop, self.nursery, self.work.device_of, self.tell, options.seed)
+        support = Support(
+            self.record,
+            self.loop,
+            self.nursery,
+            self.work.device_of,
+            self.tell,
+            options.seed,
+            self.work.bus,
+        )
         self.conductor = Conductor(graph, support, pinned, self._on_loss)
         self.deployment, self.faults = self.conductor.deployment, self.conductor.faults
         self.adaptations = self.conductor.adaptations
@@ -109,6 +122,7 @@ class Supervisor:
             self.tell("launch.failed", failure)
             self._finish(f"launch failed: {failure}")
             return
+        self._waited_ns = {p.pid: linux.waited_ns(p.pid) for p in self.deployment.nodes.values()}
         self.tell("started", f"{len(self.deployment.nodes)} nodes in {self.graph_ms:.1f} ms")
         self.conductor.inform_recovery(failed=False)
 
@@ -161,6 +175,11 @@ class Supervisor:
     def _drain(self, limit_ns: int) -> None:
         """Wait until all is answered, and what fails or changes has come to its end; or to the limit."""
         settled = self.work.settled and (self._lost or self.conductor.at_rest())
+        if settled and not self._looked:
+            self._looked = True
+            look = look_at_states(self.deployment, self._states)
+            self.loop.jobs.start("states", look, lambda _: self._drain(limit_ns))
+            return
         if self.owner_gone() or settled or time.monotonic_ns() > limit_ns:
             if not settled and not self.owner_gone():
                 self._incomplete = self.loop.jobs.names()
@@ -179,6 +198,7 @@ class Supervisor:
         """Kill what is left, reap it, say how it ended, and leave."""
         self._tell_all()
         living = hosted(self.deployment)
+        waits = [linux.waited_ns(pid) - before for pid, before in self._waited_ns.items()]
         for process in self.nursery.processes:
             process.kill()
         limit = time.monotonic() + STOP_SECONDS_MAX
@@ -200,6 +220,8 @@ class Supervisor:
             "leader": self.deployment.leader,
             "backup": self.deployment.backup,
             "hosted": msgspec.to_builtins(living),
+            "states": self._states,
+            "starved_ms": round(max(waits, default=0) / 1e6, 3),  # of the node that waited longest for a CPU
             "epoch": self.deployment.epoch,
             "faults": self.faults.receipts(),
             **self.work.end(),
@@ -247,9 +269,9 @@ class Supervisor:
         self.loop.after(TICK_SECONDS, self._tick)
 
 
-def supervise(options: RunOptions, owner: socket.socket, zygotes: dict[str, Started]) -> None:
+def supervise(options: RunOptions, owner: socket.socket, zygotes: dict[str, Started], ledger: Ledger) -> None:
     """Be the supervisor of a run, in a process of its own; the first zygote has been started."""
-    supervisor = Supervisor(options, owner, zygotes)
+    supervisor = Supervisor(options, owner, zygotes, ledger)
     try:
         supervisor.run()
     finally:

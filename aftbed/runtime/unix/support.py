@@ -6,8 +6,12 @@ from pathlib import Path
 from random import Random
 from typing import Final
 
+from aftbed.core.busfault import BusFault, Struck
 from aftbed.core.graph import Link
 from aftbed.core.journal import Record, records
+from aftbed.runtime.deployment import Keys
+from aftbed.runtime.jobs import StepFailed
+from aftbed.runtime.unix.bus import BusFaults
 from aftbed.runtime.unix.channels import Channel
 from aftbed.runtime.unix.journal import Journal, recorded_requests
 from aftbed.runtime.unix.loop import Loop
@@ -28,8 +32,9 @@ class Support:
         device: Callable[[str, int], tuple[str, bytes]],
         tell: Callable[[str, str], None],
         seed: int = 0,
+        bus: BusFaults | None = None,
     ) -> None:
-        self._record, self._seed = record, seed
+        self._record, self._seed, self._bus = record, seed, bus
         self.loop, self.nursery, self.device, self.tell = loop, nursery, device, tell
         self.journal = Journal(record / "journal" / "supervisor.1.journal", "supervisor")
 
@@ -52,6 +57,16 @@ class Support:
     def draw(self, number: int) -> int:
         """Of the run's seed."""
         return Random(f"{self._seed}/{number}").getrandbits(DRAW_BITS)
+
+    def disturb(self, number: int, fault: BusFault, draw: int) -> Keys:
+        """By the hub."""
+        if self._bus is None:
+            raise StepFailed(f"{fault}: this run has no bus")
+        yield from self._bus.disturb(number, fault, draw)
+
+    def bus_fault(self, number: int) -> Struck | None:
+        """As the hub has said."""
+        return self._bus.struck(number) if self._bus is not None else None
 
     def pin(self, pid: int, cpu: int) -> None:
         """See sched_setaffinity(2)."""

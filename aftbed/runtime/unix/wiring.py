@@ -10,6 +10,7 @@ from aftbed.core.message import Message
 from aftbed.runtime import control
 
 Mail = deque[tuple["Hosted", str, Message]]
+Output = int | Callable[[Message], None]  # a descriptor, or a function
 
 
 class Inlet:
@@ -30,7 +31,7 @@ class Hosted:
     def __init__(self, name: str, brick: Brick, index: int) -> None:
         self.name, self.brick, self.index = name, brick, index
         self.inlets: dict[str, Inlet] = {}
-        self.outs: dict[str, int | Callable[[Message], None]] = {}
+        self.outs: dict[str, Output] = {}
 
 
 class Plan:

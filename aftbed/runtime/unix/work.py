@@ -13,6 +13,8 @@ import msgspec
 from aftbed.runtime import control
 from aftbed.runtime.deployment import Deployment, Keys
 from aftbed.runtime.jobs import STATS_JOB, Key, Wait
+from aftbed.runtime.unix import bus
+from aftbed.runtime.unix.bus import BusFaults
 from aftbed.runtime.unix.devices import LoadOptions
 from aftbed.runtime.unix.loop import Loop
 from aftbed.runtime.unix.options import (
@@ -29,6 +31,7 @@ from aftbed.runtime.zygotes import BUS, LIGHT
 
 ATTACH_SECONDS_MAX: Final = 10.0
 LOAD_POLL_SECONDS: Final = 0.02
+STALL_SECONDS_MAX: Final = 3.0  # a recovery takes milliseconds, a loss is seen after half a second
 CYCLE_EVERY: Final = 10  # telemetries: so often the cycle time is shown
 
 
@@ -47,11 +50,14 @@ class Work:
         self._options, self._nursery, self._loop = options, nursery, loop
         self._tell, self._finish, self._report_owner = tell, finish, report_owner
         self._services: dict[str, Process] = {}
+        self.bus = BusFaults(nursery, loop.jobs.settle, tell)
         self._result: object = None
         self._stats: dict[str, object] = {}
         self.telemetry: dict[str, object] | None = None
         self.settled = False
         self._telemetries = 0
+        self._progress: tuple[object, object] = (None, None)
+        self._moved_ns = time.monotonic_ns()
 
     def device_of(self, kind: str, incarnation: int) -> tuple[str, bytes]:
         """The device of a brick of `kind`, and its options."""
@@ -91,6 +97,7 @@ class Work:
         log = os.open(Path(self._options.record) / "bus.log", flags, 0o600)
         options = {"lockstep": work.pace is None, "pace": work.pace or 1.0, "origin_ns": time.monotonic_ns()}
         yield from self._serve(LIGHT, "hub", msgspec.msgpack.encode(options), (self._options.listener, log))
+        self.bus.serve(self._services["hub"])
         os.close(log)
         socket.socket(fileno=self._options.listener).close()  # the hub's alone from here on
 
@@ -134,6 +141,8 @@ class Work:
         """What a service says."""
         if kind == "ready":
             self._loop.jobs.settle(("ready", process.name, 0))
+        elif kind in bus.KINDS:
+            self.bus.on_report(kind, data)
         elif kind == "telemetry":
             self.telemetry = msgspec.msgpack.decode(data)
             self._report_owner("telemetry", data)
@@ -158,11 +167,20 @@ class Work:
             process = self._services.get(name)
             if process is not None and process.alive and process.kind == "service":
                 self._nursery.order(process, control.Stop(0))
+        yield from self.bus.ask()
         yield from deployment.ask("client", control.Quiet)
 
     def _watch_load(self, deployment: Deployment) -> None:
+        """Until all is answered, or nothing moves any more: a reply that got lost is waited for in vain."""
+
         def asked(failure: str) -> None:
+            progress, now_ns = (self._stats.get("sent"), self._stats.get("unanswered")), time.monotonic_ns()
+            if progress != self._progress:
+                self._progress, self._moved_ns = progress, now_ns
             if self._stats.get("done"):
+                self._finish("")
+            elif now_ns - self._moved_ns > STALL_SECONDS_MAX * 1e9:
+                self._tell("stalled", f"no request was sent or answered for {STALL_SECONDS_MAX:g} s")
                 self._finish("")
             else:
                 self._loop.after(LOAD_POLL_SECONDS, lambda: self._watch_load(deployment))

@@ -22,17 +22,18 @@ from aftbed.runtime.unix.part import become
 from aftbed.runtime.unix.spawn import CONTROL_FD
 
 
-def run(supervisor: int, cpus: list[int], preload: tuple[str, ...]) -> NoReturn:
-    """Be a zygote, serving `CONTROL_FD`, until it ends. Never returns."""
+def run(supervisor: int, cpus: list[int], preload: tuple[str, ...], *, warm: bool = False) -> NoReturn:
+    """Be a zygote, serving `CONTROL_FD`, until it ends; `warm`: its parent has imported and rehearsed."""
     os.set_inheritable(CONTROL_FD, False)
     os.sched_setaffinity(0, cpus)
     linux.die_with(supervisor)
     linux.set_name("aftbed-zygote")
     for module in preload:
         importlib.import_module(module)
-    rehearsal.rehearse(rehearsal.ROUNDS_WARM)
-    gc.collect()
-    linux.trim()
+    if not warm:
+        rehearsal.rehearse(rehearsal.ROUNDS_WARM)
+        gc.collect()
+        linux.trim()
     gc.freeze()
     gc.disable()  # structs on the path are untracked; what is left dies by reference count
     line = Line(socket.socket(fileno=CONTROL_FD), decode_order)

@@ -1,0 +1,114 @@
+"""The FT/A/R table, measured: what each mechanism assumes, and what comes of it where that does not hold.
+
+The paper's Fig. 1 says which mechanism suits which faults (FT) and which function (A). `adapt.consistency`
+has that as a table; here is what was measured. For each stratum of a campaign over mechanisms, variants of
+the function and faults: what the table says of it, and the share of experiments in which the client got wrong
+replies or none, or the replicas came apart, with its interval. Where the table is right, it says "holds" if
+nothing broke, and names the assumption if something did. It can be wrong in both ways: a cell where it says
+"holds" and something broke, and one where it names an assumption and nothing did.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Iterator
+from typing import Final
+
+import msgspec
+
+from aftbed.adapt.bricks import load_application
+from aftbed.adapt.consistency import FaultModel, Resources, problems
+from aftbed.adapt.words import read
+from aftbed.campaign.experiment import FAILED, UNKNOWN, Result
+from aftbed.campaign.ledger import Ledger
+from aftbed.campaign.statistics import Interval, proportion
+from aftbed.core.application import Application, Characteristics
+from aftbed.inject.words import parse
+from aftbed.runtime.unix.part import load_module
+from aftbed.vehicle.function import default_application
+
+BROKEN: Final = (*FAILED, "latent", "detected_stop")
+REFUSED: Final = "refused by the self-test"
+AMPLE: Final = Resources(cpus=1024)
+APPLICATION: Final = "app"
+VALUE_WORDS: Final = ("bitflip", "byte", "burst", "stuck")
+
+
+class Cell(msgspec.Struct, frozen=True):
+    """`assumption`: what the table says is broken there, `""` where it says that the mechanism holds."""
+
+    stratum: str
+    assumption: str
+    experiments: int
+    broken: int
+    interval: Interval
+    outcomes: dict[str, int]
+    agrees: bool
+
+
+def cells(ledger: Ledger) -> Iterator[Cell]:
+    """One for each stratum, of the experiments whose faults happened and of which something is known."""
+    groups: dict[str, list[Result]] = {}
+    for result in ledger.results:
+        if result.activated and result.outcome not in UNKNOWN:
+            groups.setdefault(result.experiment.stratum, []).append(result)
+    for name, group in groups.items():
+        outcomes = Counter(_came_to(result) for result in group)
+        broken = sum(count for outcome, count in outcomes.items() if outcome in BROKEN)
+        assumption = assumed_wrongly(group[0])
+        yield Cell(
+            name,
+            assumption,
+            len(group),
+            broken,
+            proportion(broken, len(group), ledger.head.spec.confidence),
+            dict(outcomes),
+            bool(assumption) == bool(broken or outcomes[REFUSED]),
+        )
+
+
+def _came_to(result: Result) -> str:
+    return REFUSED if "refused" in result.adapted else result.outcome
+
+
+def assumed_wrongly(result: Result) -> str:
+    """What the table says against this mechanism, for these faults and this function; "" for nothing."""
+    experiment = result.experiment
+    faults = [parse(text) for text in experiment.faults]
+    words = [str(fault).split()[0] for fault in faults]
+    asked = FaultModel(
+        crash=any(word in ("crash", "hang") for word in words),
+        value=any(word in VALUE_WORDS for word in words),
+    )
+    found = problems(experiment.ftm, asked, _characteristics(experiment.adaptations), AMPLE)
+    if asked.value and not found and any("permanent" in text for text in experiment.faults):
+        found = [f"{experiment.ftm} takes a value fault for transient: this one is in every execution"]
+    return "; ".join(found)
+
+
+def _characteristics(adaptations: tuple[str, ...]) -> Characteristics:
+    """Of the last version of the function."""
+    make: Callable[[], Application] = default_application
+    for text in adaptations:
+        wish = read(text).wish
+        if wish.verb == "update" and wish.name == APPLICATION:
+            make = load_application(wish.source, load_module)
+    return make().characteristics
+
+
+def markdown(ledger: Ledger) -> str:
+    """The table for people."""
+    head = ledger.head
+    found = list(cells(ledger))
+    lines = [
+        "| stratum | what the table says | broke | outcomes | |",
+        "|---|---|---|---|---|",
+    ]
+    for cell in found:
+        outcomes = ", ".join(f"{name} {count}" for name, count in sorted(cell.outcomes.items()))
+        share = f"{cell.broken} of {cell.experiments} ({cell.interval.low:.0%} to {cell.interval.high:.0%})"
+        agrees = "agrees" if cell.agrees else "**differs**"
+        lines.append(f"| {cell.stratum} | {cell.assumption or 'holds'} | {share} | {outcomes} | {agrees} |")
+    about = (
+        f"{len(ledger.results)} experiments, {len(found)} strata, seed {head.seed}, code {head.code};"
+        f" intervals of {head.spec.confidence:.0%} (Clopper-Pearson)."
+    )
+    return "\n".join([*lines, "", about, ""])

@@ -1,0 +1,93 @@
+"""What came of an experiment, as a class (design 2); the worst of all that applies.
+
+Two kinds of evidence: the client's dialogue against the bare server (what it saw), and the run's own
+records (what had to happen so that it saw no more). A *golden run* is that bare server over the same
+requests: its replies, and its last state, with which the state of each replica at the end is compared, so
+that a corruption that has not yet come out is seen too (`latent`). A car is compared with the same drive
+without a fault.
+"""
+
+from collections.abc import Callable, Iterable
+from typing import Final
+
+from aftbed.adapt.observer import VOTE_MASKED
+from aftbed.campaign.experiment import OUTCOMES, worst
+from aftbed.campaign.value import corruptions
+from aftbed.core import check
+from aftbed.core.application import Application
+from aftbed.core.check import History, Requests
+from aftbed.core.errors import PeerError
+from aftbed.core.event import Event
+from aftbed.core.journal import EntryKind
+from aftbed.ftm.mechanism import replication_of
+from aftbed.runtime.hosting import Hosted, digest
+
+ACTED: Final = (Event.RECOVERY_ENTER, Event.ADAPT_ROLLBACK)
+
+
+def outcome_of(
+    history: History,
+    function: Callable[[], Application],
+    *,
+    lost: bool,
+    living: Hosted | None,
+    digests: Iterable[str] = (),
+    golden: bool = True,
+) -> tuple[str, tuple[str, ...]]:
+    """The class and its reasons. `digests`: of the replicas' states at the end, as far as they are known.
+
+    Not `golden`: the function is not deterministic, so nobody can say what it should have answered.
+    """
+    counts = check.requests(history, function())
+    found: dict[str, str] = {}
+    wrong = corruptions(history, function()) if golden else []
+    if wrong:
+        found["sdc"] = wrong[0]
+    unanswered(history, counts, found, lost=lost)
+    doubled = check.at_most_once(history).reasons
+    if doubled or counts.duplicated:
+        found["duplicate_effect"] = doubled[0] if doubled else f"doubled replies: {counts.duplicated}"
+    if history.events(Event.DETECTED_STOP):
+        found["detected_stop"] = "a replica ended itself rather than answer"
+    if counts.late:
+        found["degraded"] = f"late replies: {counts.late}"
+    if living is not None and not lost and replication_of(living.ftm) and not living.backup:
+        found["degraded"] = "nobody backs up at the end"
+    acted = [event.label for event in ACTED if history.events(event)] + _outvoted(history)
+    if acted:
+        found["tolerated"] = f"the mechanism acted: {', '.join(acted)}"
+    states = set(digests)
+    if history.events(Event.FOLLOWER_DIVERGED) or len(states) > 1:
+        found["latent"] = "the replicas differ"
+    elif states and golden and not wrong and states != {golden_digest(history, function())}:
+        found["latent"] = "the state of the replicas is not the bare server's"
+    word = worst(list(found))
+    return word, tuple(found[name] for name in sorted(found, key=OUTCOMES.index, reverse=True))
+
+
+def unanswered(history: History, counts: Requests, found: dict[str, str], *, lost: bool) -> None:
+    """Requests without a reply: nobody was there, nobody spoke any more, or single ones got lost."""
+    if lost:
+        found["unavailable"] = "no replica was left"
+    elif counts.lost:
+        answered = {e.request_id for e in history.dialogue if e.kind is EntryKind.ANSWERED}
+        last = max((e.request_id for e in history.dialogue if e.kind is EntryKind.SENT), default=0)
+        word = "omission" if last in answered else "hang"
+        found[word] = f"requests without a reply: {counts.lost}"
+
+
+def _outvoted(history: History) -> list[str]:
+    """Third executions: two that differed were compared before."""
+    votes = history.events(Event.VOTE_COMPARED)
+    return ["a third execution"] if any(vote.detail == VOTE_MASKED for vote in votes) else []
+
+
+def golden_digest(history: History, bare: Application) -> str:
+    """Of the state of the bare server after the same requests; `bare` is a fresh one."""
+    for entry in history.dialogue:
+        if entry.kind is EntryKind.SENT:
+            try:
+                bare.execute(entry.payload)
+            except PeerError:
+                continue
+    return digest(bare.capture())

@@ -1,0 +1,270 @@
+"""One experiment carried out, on real processes or in the simulator, and its result.
+
+Trouble of the harness (a run that does not start, a supervisor that dies) is `harness_error`, a history
+that is not whole is `inconclusive`: neither says anything of the mechanism. The result of a real run is
+handed over *before* its record is torn down, so that a death in between costs a directory and no verdict.
+"""
+
+import time
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Final
+
+import msgspec
+
+from aftbed.adapt.schedule import scheduled
+from aftbed.campaign.classify import outcome_of
+from aftbed.campaign.experiment import OUTCOMES, UNKNOWN, Experiment, Result, worst
+from aftbed.campaign.noise import Probe, starved
+from aftbed.campaign.planning import faults_of
+from aftbed.campaign.record import RunRecord, read_record
+from aftbed.campaign.succession import adaptations, bare_server
+from aftbed.campaign.verdict import Verdict, judge
+from aftbed.core import check
+from aftbed.core.application import Application
+from aftbed.core.check import History
+from aftbed.core.errors import AftbedError
+from aftbed.core.fault import Fault
+from aftbed.core.message import Scheduled
+from aftbed.core.script import RECIPES
+from aftbed.ftm.mechanism import build
+from aftbed.runtime.hosting import Hosted
+from aftbed.runtime.sim.world import Setup, simulate
+from aftbed.runtime.unix import linux, spawn
+from aftbed.runtime.unix.launch import launch, options_for
+from aftbed.runtime.unix.options import CarRun, LoadRun, Work
+from aftbed.runtime.zygotes import BUS, LIGHT
+from aftbed.vehicle.function import default_application
+from aftbed.vehicle.report import VehicleResult
+
+REASONS_MAX: Final = 3
+REASON_MAX: Final = 300  # characters
+TIMED: Final = ("degraded", "hang")  # classes that a slow machine alone can bring about
+APPLIED: Final = ("applied", "activated")
+RUN_SECONDS_MAX: Final = 60.0
+
+Keep = Callable[[Result], None]
+
+
+def carry_out(experiment: Experiment, keep: Keep) -> Result:
+    """Run it, and `keep` the result before anything of the run is taken down."""
+    began_s = time.monotonic()
+    kept: list[Result] = []
+
+    def once(result: Result) -> None:
+        kept.append(msgspec.structs.replace(result, seconds=round(time.monotonic() - began_s, 3)))
+        keep(kept[0])
+
+    simulated = experiment.runtime == "sim"
+    noisy_before = not simulated and _probe().noisy()
+
+    def kept_if_quiet(result: Result) -> None:
+        noisy = result.noisy or noisy_before or (not simulated and _probe().noisy())
+        once(_without_times(result) if noisy else result)
+
+    try:
+        (_simulated if simulated else _real)(experiment, kept_if_quiet)
+    except (AftbedError, OSError, AssertionError) as error:
+        if not kept:  # else the verdict is there already: what failed behind it was the teardown
+            reason = f"{type(error).__name__}: {error}"[:REASON_MAX]
+            once(Result(experiment, "harness_error", activated=False, reasons=(reason,)))
+    return kept[0]
+
+
+@lru_cache(maxsize=1)
+def _probe() -> Probe:
+    """Of this process."""
+    return Probe()
+
+
+@lru_cache(maxsize=2)
+def _warm_up(name: str) -> None:
+    """Once in this process: its zygotes are forks of it."""
+    spawn.warm_up(name)
+
+
+def _without_times(result: Result) -> Result:
+    """What can be said of a run on a machine that was too busy."""
+    reasons = ("the machine was too busy for times to mean anything", *result.reasons)
+    false_alarm = result.outcome == "tolerated" and result.unexpected
+    outcome = "inconclusive" if result.outcome in TIMED or false_alarm else result.outcome
+    return msgspec.structs.replace(
+        result,
+        noisy=True,
+        outcome=outcome,
+        unexpected=result.unexpected and outcome == result.outcome,
+        reasons=reasons if outcome != result.outcome else result.reasons,
+        detected_ms=None,
+        recovery_ms=None,
+        blackout_ms=None,
+        adapt_blackout_ms=None,
+    )
+
+
+# -- the simulator --------------------------------------------------------------------------------
+
+
+def setup_of(experiment: Experiment) -> Setup:
+    """What the simulator makes of it. Raises ConfigError."""
+    faults, changes = _asked(experiment)
+    return Setup(
+        experiment.ftm,
+        experiment.placement,
+        experiment.seed,
+        experiment.requests,
+        experiment.rate_hz,
+        faults,
+        changes,
+        scenario=experiment.scenario,
+    )
+
+
+def _simulated(experiment: Experiment, keep: Keep) -> None:
+    run = simulate(setup_of(experiment))
+    outcome, reasons = outcome_of(
+        run.history,
+        default_application,
+        lost=run.rest.lost,
+        living=run.rest.hosted,
+        digests=run.rest.states.values(),
+    )
+    if run.failures:
+        outcome, reasons = "harness_error", run.failures
+    keep(
+        _result(
+            experiment,
+            run.history,
+            (outcome, reasons),
+            run.faults,
+            default_application,
+            tuple(a.outcome for a in run.adaptations),
+            max((a.blackout_ms for a in run.adaptations), default=None),
+            run.vehicle,
+        )
+    )
+
+
+# -- real processes -------------------------------------------------------------------------------
+
+
+def _real(experiment: Experiment, keep: Keep) -> None:
+    faults, changes = _asked(experiment)
+    work: Work = LoadRun(experiment.requests, experiment.rate_hz)
+    if experiment.scenario:
+        work = CarRun(experiment.scenario, None, "latch")
+    options, listener = options_for(
+        ftm=experiment.ftm,
+        placement=experiment.placement,
+        work=work,
+        seed=experiment.seed,
+        faults=faults,
+        adaptations=changes,
+    )
+    _warm_up(BUS if experiment.scenario else LIGHT)
+    launched = launch(options, listener, warm=True)
+    try:
+        linux.set_timeouts(launched.line.sock, RUN_SECONDS_MAX, RUN_SECONDS_MAX)  # between two reports
+        for _ in launched.reports():
+            pass
+        launched.wait()
+        keep(_judged(experiment, read_record(launched.record)))
+    finally:
+        launched.remove()
+
+
+def _judged(experiment: Experiment, record: RunRecord) -> Result:
+    verdict, bare = judge(record), bare_server(record)
+    end = record.end or {}
+    living = msgspec.convert(end["hosted"], Hosted) if "hosted" in end else None
+    states = msgspec.convert(end.get("states", {}), dict[str, str])
+    found = outcome_of(
+        record.history,
+        bare,
+        lost=_lost(end),
+        living=living,
+        digests=states.values(),
+        golden=bare().deterministic,
+    )
+    history = adaptations(record)
+    blackouts = [float(str(a["blackout_ms"])) for a in history]
+    result = _result(
+        experiment,
+        record.history,
+        _honest(found, verdict),
+        tuple(verdict.faults),
+        bare,
+        tuple(str(a["outcome"]) for a in history),
+        max(blackouts, default=None),
+        verdict.vehicle,
+    )
+    noisy = starved(float(str(end.get("starved_ms", 0.0))), float(str(end.get("seconds", 0.0))))
+    return msgspec.structs.replace(result, noisy=noisy)
+
+
+def _lost(end: dict[str, object]) -> bool:
+    return bool(end.get("lost")) or not end.get("leader", "")
+
+
+def _honest(found: tuple[str, tuple[str, ...]], verdict: Verdict) -> tuple[str, tuple[str, ...]]:
+    """G8: what the harness does not know is worse than any outcome that it believes to have seen."""
+    outcome, reasons = found
+    checks = {name: word for name, word in verdict.checks.items() if name != "faults_applied"}
+    if checks["clean_exit"] == "fail" or checks["whole_graph"] == "fail":
+        return "harness_error", tuple(verdict.reasons)
+    unknown = [name for name, word in checks.items() if word == "unknown"]
+    if "clean_exit" in unknown:
+        return "harness_error", tuple(verdict.reasons)
+    if unknown and outcome != "sdc":
+        return "inconclusive", tuple(verdict.reasons)
+    return outcome, reasons
+
+
+# -- both -----------------------------------------------------------------------------------------
+
+
+def _asked(experiment: Experiment) -> tuple[tuple[Fault, ...], tuple[Scheduled, ...]]:
+    graph = build(experiment.ftm, experiment.placement)
+    recipe = experiment.recipe or RECIPES[0]
+    return faults_of(experiment, graph), scheduled(experiment.adaptations, graph, recipe)
+
+
+def _result(
+    experiment: Experiment,
+    history: History,
+    found: tuple[str, tuple[str, ...]],
+    faults: tuple[dict[str, str], ...],
+    function: Callable[[], Application],
+    adapted: tuple[str, ...],
+    adapt_blackout_ms: float | None,
+    vehicle: VehicleResult | None,
+) -> Result:
+    outcome, reasons = found
+    failovers = check.failovers(history)
+    recovery_ms = _longest([f.recovered_ms for f in failovers])
+    if recovery_ms is not None and recovery_ms > (experiment.budget_ms or recovery_ms):
+        outcome = worst([outcome, "degraded"])
+        reasons = (f"recovery took {recovery_ms:g} ms, {experiment.budget_ms:g} are allowed", *reasons)
+    applied = all(f["receipt"] in APPLIED for f in faults)
+    activated = applied and len(adapted) == len(experiment.adaptations)
+    return Result(
+        experiment,
+        outcome,
+        unexpected=activated and outcome not in (*(experiment.expected or OUTCOMES), *UNKNOWN),
+        activated=activated,
+        reasons=tuple(reason[:REASON_MAX] for reason in reasons[:REASONS_MAX]),
+        faults=faults,
+        requests=check.requests(history, function()),
+        failovers=len(failovers),
+        detected_ms=_longest([f.detected_ms for f in failovers]),
+        recovery_ms=recovery_ms,
+        blackout_ms=_longest([f.blackout_ms for f in failovers]),
+        adapted=adapted,
+        adapt_blackout_ms=adapt_blackout_ms,
+        collision=vehicle.collision if vehicle is not None else None,
+        impact_kmh=vehicle.impact_speed_kmh if vehicle is not None else None,
+        gap_m=vehicle.stop_gap_m if vehicle is not None else None,
+    )
+
+
+def _longest(times: list[float | None]) -> float | None:
+    return max((t for t in times if t is not None), default=None)

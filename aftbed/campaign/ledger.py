@@ -1,0 +1,153 @@
+"""The records of a campaign: a text file, one JSON document per line, appended as the results come.
+
+The first line says what it is the ledger of. Each further line is one result, written in one `write` to a
+file opened for appending, by the process that has just judged the run: so a `kill -9` of the campaign
+loses at most what is in flight, and workers need no lock. A last line without its end can only be what a
+full disk or a dead machine left; `resume` cuts it off, everybody else refuses it.
+"""
+
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Final, TypeVar
+
+import msgspec
+
+from aftbed.campaign.environment import Environment, here
+from aftbed.campaign.experiment import Experiment, Result
+from aftbed.campaign.planning import Plan
+from aftbed.campaign.spec import Spec
+from aftbed.core.errors import ConfigError
+
+NAME: Final = "records.jsonl"
+LINE_BYTES_MAX: Final = 1_000_000
+OWN: Final = {"digest": "spec", "code": "version of the code", "shard": "shard", "shards": "number of shards"}
+
+T = TypeVar("T")
+
+
+class Head(msgspec.Struct, frozen=True):
+    """The first line. `shard` I of `shards`, counted from 1."""
+
+    campaign: str
+    digest: str
+    code: str
+    seed: int
+    spec: Spec
+    environment: Environment
+    shard: int = 1
+    shards: int = 1
+
+
+class Ledger(msgspec.Struct, frozen=True):
+    """A ledger, read."""
+
+    path: Path
+    head: Head
+    results: tuple[Result, ...]
+
+
+def head_of(plan: Plan, shard: int = 1, shards: int = 1) -> Head:
+    """Of the ledger of `plan`."""
+    spec = plan.spec
+    return Head(spec.campaign, plan.digest, plan.code, spec.seed, spec, here(), shard, shards)
+
+
+def begin(path: Path, head: Head) -> None:
+    """A new ledger. Raises ConfigError where there is one."""
+    try:
+        with open(path, "xb") as file:
+            file.write(msgspec.json.encode(head) + b"\n")
+    except FileExistsError:
+        text = f"{path}: exists already: --resume goes on with it, --out names another place"
+        raise ConfigError(text) from None
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be made: {error.strerror}") from None
+
+
+def resume(path: Path, head: Head) -> set[str]:
+    """The ids of what has been done; a torn last line is cut off. Raises ConfigError on another's."""
+    data = _bytes(path)
+    whole = data.rfind(b"\n") + 1
+    found = read(path, data[:whole])
+    for name in OWN:
+        old, new = getattr(found.head, name), getattr(head, name)
+        if old != new:
+            raise ConfigError(f"{path}: another {OWN[name]} ({old}; now {new}): --out begins a new campaign")
+    if whole < len(data):
+        os.truncate(path, whole)
+    return {result.experiment.id for result in found.results}
+
+
+def opened(path: Path) -> int:
+    """A descriptor to append results to."""
+    return os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CLOEXEC)
+
+
+def append(descriptor: int, result: Result) -> None:
+    """One line, whole or not at all."""
+    line = msgspec.json.encode(result) + b"\n"
+    assert len(line) <= LINE_BYTES_MAX, f"{len(line)} bytes for one result"
+    os.write(descriptor, line)
+
+
+def read(path: Path, data: bytes | None = None) -> Ledger:
+    """The ledger in `path`. Raises ConfigError naming the line that is no record."""
+    data = _bytes(path) if data is None else data
+    lines = data.split(b"\n")
+    if lines[-1]:
+        raise ConfigError(
+            f"{path}: line {len(lines)}: it is torn: `aftbed campaign run --resume` cuts it off and goes on"
+        )
+    if len(lines) < 2:
+        raise ConfigError(f"{path}: it is empty: not the records of a campaign")
+    head = _decoded(path, 1, lines[0], Head)
+    results = [_decoded(path, number, line, Result) for number, line in enumerate(lines[1:-1], 2)]
+    _refuse_doubles(path, results)
+    return Ledger(path, head, tuple(sorted(results, key=lambda r: r.experiment.index)))
+
+
+def merged(ledgers: Iterable[Ledger]) -> Ledger:
+    """One ledger out of those of all shards. Raises ConfigError where they do not belong together."""
+    found = list(ledgers)
+    first = found[0]
+    for other in found[1:]:
+        if (other.head.digest, other.head.code) != (first.head.digest, first.head.code):
+            raise ConfigError(f"{other.path}: of another spec or code than {first.path}")
+        if other.head.shard == first.head.shard:
+            raise ConfigError(f"{other.path}: shard {other.head.shard} of {other.head.shards} stands twice")
+    results = [result for ledger in found for result in ledger.results]
+    _refuse_doubles(first.path, results)
+    head = msgspec.structs.replace(first.head, shard=1, shards=1)
+    return Ledger(first.path, head, tuple(sorted(results, key=lambda r: r.experiment.index)))
+
+
+def find(ledger: Ledger, name: str) -> Result:
+    """The result whose experiment has the id, or the beginning of the id, or the index `name`."""
+    found = [r for r in ledger.results if r.experiment.id.startswith(name) or str(r.experiment.index) == name]
+    exact = [r for r in found if str(r.experiment.index) == name] or found
+    if len(exact) != 1:
+        raise ConfigError(f"experiment {name!r}: {len(exact)} of {ledger.path} are called so: give its id")
+    return exact[0]
+
+
+def _refuse_doubles(path: Path, results: list[Result]) -> None:
+    seen: dict[str, Experiment] = {}
+    for result in results:
+        if result.experiment.id in seen:
+            raise ConfigError(f"{path}: experiment {result.experiment.id} stands twice")
+        seen[result.experiment.id] = result.experiment
+
+
+def _bytes(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}; is this the directory of a campaign?") from None
+
+
+def _decoded(path: Path, number: int, line: bytes, shape: type[T]) -> T:
+    try:
+        return msgspec.json.decode(line, type=shape)
+    except msgspec.DecodeError as error:
+        raise ConfigError(f"{path}: line {number}: {error}") from None

@@ -1,0 +1,183 @@
+"""From a campaign file to its experiments: a list that is the same for the same file, seed and code.
+
+The strata take turns, so that a campaign that ends early has seen all of them. The experiment of a stratum
+with the number n takes the nth point of the stratum's matrix (then the first again), and draws from a
+generator of its own: `Random(f"{seed}/{stratum}/{n}")`. So neither the number of jobs nor the order in
+which they end has a part in what is run.
+"""
+
+import hashlib
+import itertools
+from collections.abc import Iterator
+from functools import lru_cache
+from pathlib import Path
+from random import Random
+from typing import Final
+
+import msgspec
+
+import aftbed
+from aftbed.adapt.schedule import scheduled
+from aftbed.campaign.experiment import Experiment
+from aftbed.campaign.spec import ANY, AdaptationEntry, FaultEntry, Spec, Value
+from aftbed.core.errors import ConfigError
+from aftbed.core.fault import Fault
+from aftbed.core.graph import Graph
+from aftbed.ftm.mechanism import build
+from aftbed.inject.words import parse
+from aftbed.runtime import targets
+from aftbed.runtime.unix.busaim import aim
+from aftbed.runtime.unix.options import CarRun, LoadRun, Work
+
+ID_DIGITS: Final = 16
+SEED_BITS: Final = 31
+JOINED: Final = " · "
+
+
+class Stratum(msgspec.Struct, frozen=True):
+    """`expected`: outcomes, none where nothing is asked."""
+
+    name: str
+    ftm: str
+    placement: str
+    fault: FaultEntry
+    adaptation: AdaptationEntry
+    expected: tuple[str, ...]
+
+
+class Plan(msgspec.Struct, frozen=True):
+    """`digest` of the spec: what belongs to another one is not mixed with this."""
+
+    spec: Spec
+    digest: str
+    code: str
+    strata: tuple[Stratum, ...]
+
+    @property
+    def size(self) -> int:
+        """How many experiments there are at most."""
+        return len(self.strata) * self.spec.stop.experiments
+
+    def experiments(self) -> Iterator[Experiment]:
+        """All of them, in order. Raises ConfigError where one cannot be."""
+        for number in range(self.spec.stop.experiments):
+            for place, stratum in enumerate(self.strata):
+                yield self.experiment(number * len(self.strata) + place, number, stratum)
+
+    def experiment(self, index: int, number: int, stratum: Stratum) -> Experiment:
+        """The one of `stratum` with that number."""
+        spec = self.spec
+        chance = Random(f"{spec.seed}/{stratum.name}/{number}")
+        seed = chance.getrandbits(SEED_BITS)
+        faults = _filled(stratum.fault, number, chance)
+        whole = f"{self.digest}/{self.code}/{index}"
+        return Experiment(
+            hashlib.sha256(whole.encode()).hexdigest()[:ID_DIGITS],
+            index,
+            number,
+            stratum.name,
+            seed,
+            stratum.ftm,
+            stratum.placement,
+            spec.system.runtime,
+            spec.system.scenario,
+            spec.system.requests,
+            spec.system.rate_hz,
+            faults,
+            stratum.adaptation.texts,
+            stratum.adaptation.recipe if stratum.adaptation.texts else "",
+            stratum.expected,
+            spec.recovery_budget_ms,
+        )
+
+
+def plan(spec: Spec) -> Plan:
+    """The plan of `spec`, every experiment of it checked. Raises ConfigError naming the key."""
+    strata = tuple(strata_of(spec))
+    if not strata:
+        raise ConfigError("mechanisms: no entry of faults and adaptations is left for any of them")
+    made = Plan(spec, digest_of(spec), code_version(), strata)
+    for stratum in strata:
+        _check(made, stratum)
+    return made
+
+
+def digest_of(spec: Spec) -> str:
+    """Equal specs have the same."""
+    return hashlib.sha256(msgspec.json.encode(spec, order="deterministic")).hexdigest()[:ID_DIGITS]
+
+
+@lru_cache(maxsize=1)
+def code_version() -> str:
+    """The version of the package, and a digest of its code: a changed line makes it another one."""
+    home, digest = Path(aftbed.__file__).parent, hashlib.sha256()
+    for path in sorted(home.rglob("*.py")):
+        digest.update(path.relative_to(home).as_posix().encode() + path.read_bytes())
+    return f"{aftbed.__version__}+{digest.hexdigest()[:8]}"
+
+
+def strata_of(spec: Spec) -> Iterator[Stratum]:
+    """In their order."""
+    product = itertools.product(spec.mechanisms, spec.system.placements, spec.adaptations, spec.faults)
+    for ftm, placement, adaptation, fault in product:
+        if ftm not in (fault.mechanisms or spec.mechanisms):
+            continue
+        if ftm not in (adaptation.mechanisms or spec.mechanisms):
+            continue
+        words = [ftm, *([placement] if len(spec.system.placements) > 1 else [])]
+        words += [adaptation.name] if len(spec.adaptations) > 1 else []
+        expected = fault.expect.get(ftm, fault.expect.get(ANY, ()))
+        yield Stratum(JOINED.join((*words, fault.name)), ftm, placement, fault, adaptation, expected)
+
+
+def _filled(entry: FaultEntry, number: int, chance: Random) -> tuple[str, ...]:
+    """The faults of experiment `number`: its point of the matrix, and what is drawn."""
+    names = list(entry.matrix)
+    points = list(itertools.product(*entry.matrix.values()))
+    values: dict[str, Value] = dict(zip(names, points[number % len(points)], strict=True))
+    values |= {name: chance.randint(*limits) for name, limits in entry.draw.items()}
+    try:
+        return tuple(text.format(**values) for text in entry.texts)
+    except (KeyError, IndexError, ValueError) as error:
+        raise ConfigError(f"fault {entry.texts}: {{{error}}} stands neither in matrix nor in draw") from None
+
+
+def points(entry: FaultEntry) -> int:
+    """How many points its matrix has."""
+    found = 1
+    for values in entry.matrix.values():
+        found *= len(values)
+    return found
+
+
+def population(entry: FaultEntry) -> int:
+    """How many faults the entry can mean: the size of its part of the fault space."""
+    found = points(entry)
+    for low, high in entry.draw.values():
+        found *= high - low + 1
+    return found
+
+
+def faults_of(experiment: Experiment, graph: Graph) -> tuple[Fault, ...]:
+    """As values, checked. Raises ConfigError."""
+    work: Work = CarRun(experiment.scenario, None, "") if experiment.scenario else LoadRun(1, 0.0)
+    found = tuple(parse(text) for text in experiment.faults)
+    for fault in found:
+        targets.check(fault, graph)
+        aim(fault, work)
+    return found
+
+
+def _check(made: Plan, stratum: Stratum) -> None:
+    """Every point of the matrix, before anything runs."""
+    where = f"faults: {stratum.fault.name!r} under {stratum.ftm}"
+    graph = build(stratum.ftm, stratum.placement)
+    try:
+        for number in range(points(stratum.fault)):
+            faults_of(made.experiment(0, number, stratum), graph)
+    except ConfigError as error:
+        raise ConfigError(f"{where}: {error}") from error
+    try:
+        scheduled(stratum.adaptation.texts, graph, stratum.adaptation.recipe)
+    except ConfigError as error:
+        raise ConfigError(f"adaptations: {stratum.adaptation.name!r} under {stratum.ftm}: {error}") from error

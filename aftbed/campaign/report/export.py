@@ -1,0 +1,151 @@
+"""The results as a table for other programs: a row per experiment, in CSV or in Parquet.
+
+The columns are the same in both, their types too where a format has types; the unit stands at the end of a
+name. What is unknown (no failover, no car) is an empty field in CSV and a null in Parquet. What there can be
+several of, such as faults and reasons, is one text, parted by `; `.
+
+Limits: CSV knows no types, so a reader guesses them. A text that a spreadsheet would take for a formula is
+exported as it is: the records are the user's own.
+"""
+
+import csv
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+from aftbed.campaign.experiment import Result
+from aftbed.campaign.ledger import Ledger
+from aftbed.core.errors import ConfigError
+
+Value = str | int | float | bool | None
+PARTED: Final = "; "
+
+COLUMNS: Final = {  # name: type
+    "experiment": str,
+    "index": int,
+    "stratum": str,
+    "number": int,
+    "seed": int,
+    "ftm": str,
+    "placement": str,
+    "runtime": str,
+    "scenario": str,
+    "requests": int,
+    "rate_hz": float,
+    "faults": str,
+    "adaptations": str,
+    "recipe": str,
+    "expected": str,
+    "outcome": str,
+    "unexpected": bool,
+    "activated": bool,
+    "receipts": str,
+    "reasons": str,
+    "sent": int,
+    "answered": int,
+    "lost": int,
+    "duplicated": int,
+    "late": int,
+    "wrong": int,
+    "failovers": int,
+    "adapted": str,
+    "collision": bool,
+    "noisy": bool,
+    "detected_ms": float,
+    "recovery_ms": float,
+    "blackout_ms": float,
+    "adapt_blackout_ms": float,
+    "impact_kmh": float,
+    "gap_m": float,
+    "duration_s": float,
+    "command": str,
+}
+
+
+def rows(ledger: Ledger) -> Iterator[dict[str, Value]]:
+    """A value for each of `COLUMNS`, for each result."""
+    for result in ledger.results:
+        yield _asked(result) | _found(result)
+
+
+def write_csv(ledger: Ledger, path: Path) -> None:
+    """With a head line; UTF-8. Raises ConfigError where `path` cannot be written."""
+    try:
+        with path.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, list(COLUMNS), lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(rows(ledger))
+    except OSError as error:
+        raise _unwritable(path, error) from None
+
+
+def write_parquet(ledger: Ledger, path: Path) -> None:
+    """Raises ConfigError where `path` cannot be written, or pyarrow is not there."""
+    try:
+        import pyarrow  # noqa: PLC0415 - an extra, and slow to import
+        from pyarrow import parquet  # noqa: PLC0415
+    except ImportError:
+        raise ConfigError(f"{path}: Parquet needs pyarrow: pip install aftbed[parquet]") from None
+    kinds = {str: pyarrow.string(), int: pyarrow.int64(), float: pyarrow.float64(), bool: pyarrow.bool_()}
+    schema = pyarrow.schema([(name, kinds[kind]) for name, kind in COLUMNS.items()])
+    head = ledger.head
+    about = {"campaign": head.campaign, "seed": str(head.seed), "spec": head.digest, "code": head.code}
+    table = pyarrow.Table.from_pylist(list(rows(ledger)), schema=schema.with_metadata(about))
+    try:
+        parquet.write_table(table, path)
+    except OSError as error:
+        raise _unwritable(path, error) from None
+
+
+def _unwritable(path: Path, error: OSError) -> ConfigError:
+    return ConfigError(f"{path}: cannot be written: {error.strerror or error}")
+
+
+def _asked(result: Result) -> dict[str, Value]:
+    experiment = result.experiment
+    return {
+        "experiment": experiment.id,
+        "index": experiment.index,
+        "stratum": experiment.stratum,
+        "number": experiment.number,
+        "seed": experiment.seed,
+        "ftm": experiment.ftm,
+        "placement": experiment.placement,
+        "runtime": experiment.runtime,
+        "scenario": experiment.scenario,
+        "requests": experiment.requests,
+        "rate_hz": experiment.rate_hz,
+        "faults": PARTED.join(experiment.faults),
+        "adaptations": PARTED.join(experiment.adaptations),
+        "recipe": experiment.recipe,
+        "expected": PARTED.join(experiment.expected),
+        "command": experiment.command(),
+    }
+
+
+def _found(result: Result) -> dict[str, Value]:
+    counts = result.requests
+    return {
+        "outcome": result.outcome,
+        "unexpected": result.unexpected,
+        "activated": result.activated,
+        "receipts": PARTED.join(fault.get("receipt", "") for fault in result.faults),
+        "reasons": PARTED.join(result.reasons),
+        "sent": counts.sent if counts else None,
+        "answered": counts.answered if counts else None,
+        "lost": counts.lost if counts else None,
+        "duplicated": counts.duplicated if counts else None,
+        "late": counts.late if counts else None,
+        "wrong": counts.wrong if counts else None,
+        "failovers": result.failovers,
+        "adapted": PARTED.join(result.adapted),
+        "collision": result.collision,
+        "noisy": result.noisy,
+        "detected_ms": result.detected_ms,
+        "recovery_ms": result.recovery_ms,
+        "blackout_ms": result.blackout_ms,
+        "adapt_blackout_ms": result.adapt_blackout_ms,
+        "impact_kmh": result.impact_kmh,
+        "gap_m": result.gap_m,
+        "duration_s": result.seconds,
+    }

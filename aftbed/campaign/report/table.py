@@ -1,0 +1,181 @@
+"""A campaign at the terminal: how it goes while it runs, and what it came to.
+
+While it runs, a terminal shows one picture that is redrawn in place: progress, rate, time left, and a line
+per stratum. Anything else (a pipe, the log of a CI) gets a plain line now and then. The picture is drawn by
+who adds a result, never by a thread: a thread would be forked with the processes that do the experiments.
+"""
+
+import sys
+import time
+from collections import Counter
+from types import TracebackType
+from typing import TYPE_CHECKING, Final, Self
+
+from aftbed.campaign.experiment import OUTCOMES, Result
+from aftbed.campaign.statistics import Interval
+from aftbed.campaign.summary import GateResult, StratumSummary, Summary, Times
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+    from rich.live import Live
+
+REDRAW_S: Final = 0.1
+LINE_S: Final = 10.0  # between two plain lines
+ROWS_MAX: Final = 30  # strata in the picture
+BAR: Final = 30  # characters
+STYLES: Final = {  # of the words of outcomes; whatever is not here is red
+    "masked": "green",
+    "latent": "yellow",
+    "tolerated": "green",
+    "degraded": "yellow",
+    "detected_stop": "yellow",
+    "inconclusive": "magenta",
+    "harness_error": "magenta",
+}
+
+
+# -- at the end -----------------------------------------------------------------------------------
+
+
+def summary_lines(summary: Summary) -> list[str]:
+    """What it came to, the verdict last."""
+    lines = [_head(summary)]
+    lines += ["", *_aligned([_STRATUM, *map(_stratum, summary.strata)])] if summary.strata else []
+    lines += ["", *_aligned([_GATE, *map(_gate, summary.gates)])] if summary.gates else []
+    return [*lines, f"gate: {summary.gate}"]
+
+
+_STRATUM: Final = ("stratum", "runs", "outcomes", "unexpected", "recovery p50, p99")
+_GATE: Final = ("gate", "metric", "strata", "allowed", "measured", "judged by", "because")
+
+
+def _head(summary: Summary) -> str:
+    of = f" of {summary.planned}" if summary.planned != summary.experiments else ""
+    counts = f"{summary.experiments}{of} experiments"
+    return f"campaign {summary.campaign}, seed {summary.seed}: {counts} in {summary.seconds:.1f} s"
+
+
+def _stratum(stratum: StratumSummary) -> tuple[str, ...]:
+    runs = f"{stratum.experiments}"
+    if stratum.activated < stratum.experiments:
+        runs += f", {stratum.activated} struck"
+    return stratum.name, runs, _outcomes(stratum.outcomes), _unexpected(stratum), _times(stratum.recovery_ms)
+
+
+def _outcomes(counts: dict[str, int]) -> str:
+    return ", ".join(f"{name} {count}" for name, count in counts.items())
+
+
+def _unexpected(stratum: StratumSummary) -> str:
+    if not stratum.expected:
+        return "-"
+    return f"{stratum.unexpected} ({_share(stratum.unexpected_interval)})"
+
+
+def _share(interval: Interval) -> str:
+    return f"{100 * interval.low:.1f} to {100 * interval.high:.1f} %"
+
+
+def _times(times: Times | None) -> str:
+    return "-" if times is None else f"{times.p50:.3g}, {times.p99:.3g} ms"
+
+
+def _gate(gate: GateResult) -> tuple[str, ...]:
+    return (
+        gate.word,
+        gate.metric,
+        gate.strata,
+        gate.limit,
+        _figure(gate.value),
+        _figure(gate.bound),
+        gate.reason,
+    )
+
+
+def _figure(value: float | None) -> str:
+    return "-" if value is None else f"{value:.4g}"
+
+
+def _aligned(rows: list[tuple[str, ...]]) -> list[str]:
+    """Columns as wide as they have to be."""
+    widths = [max(len(row[at]) for row in rows) for at in range(len(rows[0]))]
+    return ["  ".join(f"{word:<{n}}" for word, n in zip(row, widths, strict=True)).rstrip() for row in rows]
+
+
+# -- while it runs --------------------------------------------------------------------------------
+
+
+class Progress:
+    """A context manager that is told each result. `total` experiments there will be at most."""
+
+    def __init__(self, campaign: str, total: int, *, quiet: bool = False) -> None:
+        self._campaign, self._total, self._quiet = campaign, total, quiet
+        self._began_s = self._shown_s = time.monotonic()
+        self._done = self._unexpected = 0
+        self._outcomes = Counter[str]()
+        self._strata: dict[str, Counter[str]] = {}
+        self._live: Live | None = None
+
+    def __enter__(self) -> Self:
+        if not self._quiet and sys.stdout.isatty():
+            from rich.live import Live  # noqa: PLC0415 - only where somebody looks
+
+            self._live = Live(get_renderable=self._picture, auto_refresh=False, transient=True)
+            self._live.start(refresh=True)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._live is not None:
+            self._live.stop()
+
+    def add(self, result: Result) -> None:
+        """One more."""
+        self._done += 1
+        self._unexpected += result.unexpected
+        self._outcomes[result.outcome] += 1
+        self._strata.setdefault(result.experiment.stratum, Counter())[result.outcome] += 1
+        now_s = time.monotonic()
+        period_s = REDRAW_S if self._live is not None else LINE_S
+        if self._quiet or now_s < self._shown_s + period_s:
+            return
+        self._shown_s = now_s
+        if self._live is not None:
+            self._live.refresh()
+        else:
+            print(self.line(), flush=True)
+
+    def line(self) -> str:
+        """How far it is, in one line."""
+        counts = ", ".join(f"{name} {self._outcomes[name]}" for name in OUTCOMES if self._outcomes[name])
+        unexpected = f"; {self._unexpected} unexpected" if self._unexpected else ""
+        return f"{self._pace()}: {counts}{unexpected}"
+
+    def _pace(self) -> str:
+        rate = self._done / max(time.monotonic() - self._began_s, 1e-9)
+        left_s = (self._total - self._done) / rate if self._done else 0.0
+        left = f", {_clock(left_s)} left" if 0 < self._done < self._total else ""
+        return f"{self._done} of {self._total}, {rate:.3g}/s{left}"
+
+    def _picture(self) -> "RenderableType":
+        from rich.console import Group  # noqa: PLC0415
+        from rich.table import Table  # noqa: PLC0415
+        from rich.text import Text  # noqa: PLC0415
+
+        full = BAR * self._done // max(1, self._total)
+        head = Text.assemble((self._campaign, "bold"), "  ", ("━" * full, "green"), "━" * (BAR - full), "  ")
+        head.append(self._pace())
+        head.append(f"  {self._unexpected} unexpected" if self._unexpected else "", "bold red")
+        table = Table(box=None, pad_edge=False, show_header=False)
+        for name, counts in list(self._strata.items())[:ROWS_MAX]:
+            words = [(f"{o} {counts[o]}  ", STYLES.get(o, "red")) for o in OUTCOMES if counts[o]]
+            table.add_row(Text(name), str(counts.total()), Text.assemble(*words))
+        more = len(self._strata) - ROWS_MAX
+        return Group(head, table, Text(f"and {more} more strata" if more > 0 else ""))
+
+
+def _clock(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"

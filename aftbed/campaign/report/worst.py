@@ -1,0 +1,65 @@
+"""The runs that a person should look at first, and what happened in one of them.
+
+First come the unexpected ones; then, among these and behind them, the worst outcome; then the slowest. One
+run of a stratum stands for it: forty runs that fail in the same way are one thing to know.
+
+A ledger keeps no messages, so a run is simulated to draw it: same bricks, scripts, faults and seed. A run of
+real processes need not come to the same there (the times are others, so a fault may strike another request);
+then the report says so, and the drawing shows what the simulator saw.
+"""
+
+from collections.abc import Iterable
+from typing import Final
+
+import msgspec
+
+from aftbed.campaign.executing import carry_out, setup_of
+from aftbed.campaign.experiment import OUTCOMES, Experiment, Result
+from aftbed.core.errors import AftbedError
+from aftbed.runtime.sim.tracing import Trace, traced
+
+REASON_MAX: Final = 300  # characters
+
+
+class Rerun(msgspec.Struct, frozen=True):
+    """A run simulated once more: what came of it there, and all that happened; or why it cannot be."""
+
+    outcome: str
+    trace: Trace | None
+    why_not: str = ""
+
+
+def by_badness(results: Iterable[Result]) -> list[Result]:
+    """One of each stratum, the worst first. A run that came out at its best and as expected is left out."""
+    found: dict[str, Result] = {}
+    for result in sorted(results, key=_badness, reverse=True):
+        if result.unexpected or result.outcome != OUTCOMES[0] or not result.activated:
+            found.setdefault(result.experiment.stratum, result)
+    return list(found.values())
+
+
+def slowness_ms(result: Result) -> float:
+    """The longest of its times."""
+    times = (result.recovery_ms, result.blackout_ms, result.adapt_blackout_ms)
+    return max((t for t in times if t is not None), default=0.0)
+
+
+def worst_of(results: Iterable[Result]) -> Result:
+    """The first to look at; there is one."""
+    return max(results, key=_badness)
+
+
+def rerun(experiment: Experiment) -> Rerun:
+    """In the simulator, whatever it ran on."""
+    simulated = msgspec.structs.replace(experiment, runtime="sim")
+    again = carry_out(simulated, lambda _: None)
+    try:
+        return Rerun(again.outcome, traced(setup_of(simulated)))
+    except (AftbedError, AssertionError, LookupError, ValueError) as error:
+        return Rerun(again.outcome, None, str(error)[:REASON_MAX] or type(error).__name__)
+
+
+def _badness(result: Result) -> tuple[bool, int, float, int]:
+    """Of two that are equally bad the earlier comes first."""
+    place = OUTCOMES.index(result.outcome) if result.outcome in OUTCOMES else len(OUTCOMES)
+    return result.unexpected, place, slowness_ms(result), -result.experiment.index

@@ -1,0 +1,142 @@
+"""A campaign carried out: its plan, or what is left of it, over some processes, until enough is known.
+
+A worker is a process that performs one experiment after the other and appends each result to the ledger
+itself. What ends a campaign early (its own stop rule, an interrupt, a `kill -9`) leaves a ledger that can be
+gone on with.
+"""
+
+import itertools
+import os
+import time
+from collections import Counter
+from collections.abc import Generator, Iterator
+from functools import partial
+from pathlib import Path
+
+import msgspec
+
+from aftbed.campaign import ledger
+from aftbed.campaign.executing import carry_out
+from aftbed.campaign.experiment import Experiment, Result
+from aftbed.campaign.explore import each
+from aftbed.campaign.planning import Plan
+from aftbed.core.errors import ConfigError
+
+
+class Asked(msgspec.Struct, frozen=True):
+    """How to go about it; `out` is the directory of the campaign."""
+
+    out: Path
+    jobs: int = 1
+    shard: int = 1
+    shards: int = 1
+    resume: bool = False
+    scheduler: str = ""  # address of a Dask scheduler, in the place of `jobs` processes
+
+
+def run(plan: Plan, asked: Asked) -> Generator[Result, None, None]:
+    """Each result as soon as it is in the ledger. Raises ConfigError before anything runs."""
+    stop = plan.spec.stop
+    if asked.shards > 1 and (stop.half_width is not None or stop.first_failure):
+        key = "half_width" if stop.half_width is not None else "first_failure"
+        raise ConfigError(
+            f"--shard: stop.{key} looks at all results, a shard sees only its own: leave it out"
+        )
+    if asked.scheduler:
+        from aftbed.campaign import dasked  # noqa: PLC0415 - an extra
+
+        dasked.connect(asked.scheduler).close()  # before anything is written
+    path = asked.out / ledger.NAME
+    head = ledger.head_of(plan, asked.shard, asked.shards)
+    if asked.resume:
+        earlier = ledger.resume(path, head)
+    else:
+        asked.out.mkdir(parents=True, exist_ok=True)
+        ledger.begin(path, head)
+        earlier = set()
+    return _results(plan, asked, path, earlier)
+
+
+def _results(plan: Plan, asked: Asked, path: Path, earlier: set[str]) -> Generator[Result, None, None]:
+    stop = plan.spec.stop
+    limit_s = time.monotonic() + stop.minutes * 60 if stop.minutes is not None else None
+    state = _Progress(plan, path, earlier)
+    for first, last in _looks(plan):
+        todo = [e for e in state.open(first, last) if e.index % asked.shards == asked.shard - 1]
+        for result in performed(todo, path, asked):
+            state.add(result)
+            yield result
+            late = limit_s is not None and time.monotonic() > limit_s
+            if late or (stop.first_failure and result.unexpected):
+                return
+
+
+def performed(todo: list[Experiment], path: Path, asked: Asked) -> Iterator[Result]:
+    """Each result, which is in the ledger by then."""
+    if not asked.scheduler:
+        for _, _, result in each(partial(_perform, os.fspath(path)), todo, asked.jobs, chunk_size=1):
+            yield result
+        return
+    from aftbed.campaign import dasked  # noqa: PLC0415 - an extra
+
+    descriptor = ledger.opened(path)
+    try:
+        with dasked.connect(asked.scheduler) as client:
+            for result in dasked.over(client, iter(todo)):
+                ledger.append(descriptor, result)
+                yield result
+    finally:
+        os.close(descriptor)
+
+
+def _perform(path: str, experiment: Experiment) -> Result:
+    """In a worker."""
+    descriptor = ledger.opened(Path(path))
+    try:
+        return carry_out(experiment, partial(ledger.append, descriptor))
+    finally:
+        os.close(descriptor)
+
+
+def _looks(plan: Plan) -> Iterator[tuple[int, int]]:
+    """The parts of the numbers of each stratum, with a look at the results after each."""
+    stop = plan.spec.stop
+    looks = min(stop.looks, stop.experiments) if stop.half_width is not None else 1
+    edges = [round(stop.experiments * look / looks) for look in range(looks + 1)]
+    yield from itertools.pairwise(edges)
+
+
+class _Progress:
+    """What has been done, and which strata are known well enough."""
+
+    def __init__(self, plan: Plan, path: Path, earlier: set[str]) -> None:
+        self._plan, self._earlier = plan, earlier
+        self._count = Counter[str]()
+        self._unexpected = Counter[str]()
+        for result in ledger.read(path).results:
+            self.add(result)
+
+    def add(self, result: Result) -> None:
+        self._count[result.experiment.stratum] += 1
+        self._unexpected[result.experiment.stratum] += result.unexpected
+
+    def open(self, first: int, last: int) -> Iterator[Experiment]:
+        """What is left to do with numbers from `first` to before `last`."""
+        strata = [(i, s) for i, s in enumerate(self._plan.strata) if not self._settled(s.name, first)]
+        for number in range(first, last):
+            for place, stratum in strata:
+                index = number * len(self._plan.strata) + place
+                experiment = self._plan.experiment(index, number, stratum)
+                if experiment.id not in self._earlier:
+                    yield experiment
+
+    def _settled(self, name: str, looked_at: int) -> bool:
+        wanted = self._plan.spec.stop.half_width
+        if wanted is None or not looked_at:
+            return False
+        from aftbed.campaign.statistics import half_width, proportion  # noqa: PLC0415 - not for workers
+        from aftbed.campaign.summary import confidence_of  # noqa: PLC0415
+
+        confidence = confidence_of(self._plan.spec)
+        interval = proportion(self._unexpected[name], self._count[name], confidence)
+        return half_width(interval) <= wanted

@@ -1,0 +1,225 @@
+"""A campaign file: what is tried, how often, what is expected of it, and what fails the build.
+
+    campaign: crash
+    about: A crash of the primary at each point of a request's way.
+    seed: 1
+    system: {requests: 100}                  # or {scenario: ccrs-50}
+    mechanisms: [pbr, lfr]
+    faults:
+    - name: crash primary
+      fault: crash primary at {event} nth {nth}
+      matrix: {event: [request.received, server.exit, reply.sent]}    # each of them, in turn
+      draw: {nth: [1, 90]}                                            # one of them, by the seed
+      expect: {"*": [masked, tolerated]}
+    stop: {experiments: 30}                  # in each stratum
+    gates:
+    - {metric: unexpected, max: 0.02}        # the upper end of the interval must not exceed it
+
+A *stratum* is one mechanism, one placement, one adaptation and one entry of `faults`. The experiments of a
+stratum go through its matrix in turn; what is drawn depends on the seed, the stratum and the number of the
+experiment, and on nothing else. Words that a mechanism does not know (an event that it never emits) are
+refused before anything runs: such an entry says `mechanisms: [...]` for itself.
+
+*Expected* is the class of the outcome (`experiment.OUTCOMES`), per mechanism; `"*"` is any other. An outcome
+that is better than the expected ones counts as unexpected too: an oracle that never sees anything is no
+oracle.
+"""
+
+from pathlib import Path
+from typing import Annotated, Final, Literal
+
+import msgspec
+from msgspec import Meta
+
+from aftbed.campaign.experiment import OUTCOMES
+from aftbed.core.errors import ConfigError, unknown
+from aftbed.core.graph import PLACEMENTS
+from aftbed.core.script import RECIPES
+from aftbed.ftm.mechanism import EXPRESSIONS
+from aftbed.vehicle.scenario import load_scenario
+from aftbed.vehicle.yamlfile import read_yaml
+
+SHIPPED: Final = Path(__file__).resolve().parent.parent / "campaigns"
+ANY: Final = "*"
+EXPERIMENTS_MAX: Final = 1_000_000
+METRICS: Final = (
+    *OUTCOMES,
+    "failed",
+    "unexpected",
+    "unknown",  # inconclusive, or a harness_error
+    "not_activated",
+    "collision",
+    "recovery_ms_p50",
+    "recovery_ms_p99",
+    "blackout_ms_p50",
+    "blackout_ms_p99",
+    "adapt_blackout_ms_p50",
+    "adapt_blackout_ms_p99",
+)
+
+Value = str | int | float
+Positive = Annotated[int, Meta(ge=1, le=EXPERIMENTS_MAX)]
+Share = Annotated[float, Meta(gt=0, lt=1)]
+
+
+class System(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What the mechanisms protect: `requests` of a load, or those of a car in `scenario`."""
+
+    requests: Annotated[int, Meta(ge=1, le=1_000_000)] = 100
+    rate_hz: Annotated[float, Meta(ge=0, le=100_000)] = 0.0  # 0: the next follows the reply
+    scenario: str = ""
+    placements: tuple[str, ...] = ("process",)
+    runtime: Literal["unix", "sim"] = "unix"
+
+
+class FaultEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """`fault` in the words of `--inject`, `{name}`s filled in; several strike in the same run."""
+
+    name: str
+    fault: str | tuple[str, ...] = ()
+    matrix: dict[str, tuple[Value, ...]] = {}
+    draw: dict[str, tuple[int, int]] = {}
+    mechanisms: tuple[str, ...] = ()  # where not all
+    expect: dict[str, tuple[str, ...]] = {}
+
+    @property
+    def texts(self) -> tuple[str, ...]:
+        """As they stand in the file."""
+        return (self.fault,) if isinstance(self.fault, str) else self.fault
+
+
+class AdaptationEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """`adapt` in the words of `--adapt`; in each run, one after the other."""
+
+    name: str
+    adapt: str | tuple[str, ...] = ()
+    recipe: str = RECIPES[0]
+    mechanisms: tuple[str, ...] = ()
+
+    @property
+    def texts(self) -> tuple[str, ...]:
+        """As they stand in the file."""
+        return (self.adapt,) if isinstance(self.adapt, str) else self.adapt
+
+
+class Stop(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """When enough is known: whichever comes first.
+
+    `half_width`: of the interval of `unexpected` in a stratum, looked at after each of `looks` equal parts
+    of `experiments`, with a confidence that allows for so many looks.
+    """
+
+    experiments: Positive = 20  # per stratum
+    half_width: Share | None = None
+    looks: Annotated[int, Meta(ge=1, le=20)] = 4
+    minutes: Annotated[float, Meta(gt=0, le=100_000)] | None = None
+    first_failure: bool = False
+
+
+class Gate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """`metric` of the strata whose name matches `strata`, taken together, is at most `max`, or at least
+    `min`.
+
+    A share is judged by the bound of its interval, so few experiments prove little.
+    """
+
+    metric: str
+    max: float | None = None
+    min: float | None = None
+    strata: str = ANY  # a pattern as of file names
+
+
+class Spec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A campaign file, key by key."""
+
+    campaign: Annotated[str, Meta(pattern="^[a-z0-9][a-z0-9-]{0,40}$")]
+    mechanisms: Annotated[tuple[str, ...], Meta(min_length=1)]
+    faults: Annotated[tuple[FaultEntry, ...], Meta(min_length=1)]
+    about: str = ""
+    seed: Annotated[int, Meta(ge=0)] = 0
+    system: System = System()
+    adaptations: tuple[AdaptationEntry, ...] = (AdaptationEntry("none"),)
+    stop: Stop = Stop()
+    gates: tuple[Gate, ...] = ()
+    confidence: Annotated[float, Meta(gt=0.5, lt=1)] = 0.95
+    recovery_budget_ms: Annotated[float, Meta(gt=0)] | None = None  # longer is `degraded`
+    not_activated_max: Annotated[float, Meta(ge=0, le=1)] = 0.3  # two gates that are always there (G8)
+    unknown_max: Annotated[float, Meta(ge=0, le=1)] = 0.3
+
+
+def read_spec(name: str) -> Spec:
+    """The shipped campaign of that name, or a file. Raises ConfigError naming file, line and key."""
+    path = Path(name)
+    if not name.endswith((".yaml", ".yml")):
+        path = SHIPPED / f"{name}.yaml"
+        if not path.exists():
+            raise unknown("campaign", name, shipped())
+    spec = read_yaml(path, Spec)
+    try:
+        check(spec)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from error
+    return spec
+
+
+def shipped() -> list[str]:
+    """The names of the campaigns that come with the package."""
+    return sorted(path.stem for path in SHIPPED.glob("*.yaml"))
+
+
+def check(spec: Spec) -> None:
+    """What the types do not say. Raises ConfigError naming the key."""
+    _each_known("mechanisms", spec.mechanisms, EXPRESSIONS)
+    _each_known("system.placements", spec.system.placements, PLACEMENTS)
+    if not spec.system.placements:
+        raise ConfigError("system.placements: found none, allowed is at least one of them")
+    if spec.system.scenario:
+        load_scenario(spec.system.scenario)
+    _all_different("faults", [entry.name for entry in spec.faults])
+    _all_different("adaptations", [entry.name for entry in spec.adaptations])
+    if not spec.adaptations:
+        raise ConfigError("adaptations: found none; leave the key out, or name at least one")
+    for number, entry in enumerate(spec.faults):
+        _check_fault(f"faults[{number}]", entry, spec)
+    for number, adaptation in enumerate(spec.adaptations):
+        where = f"adaptations[{number}]"
+        _each_known(f"{where}.mechanisms", adaptation.mechanisms, spec.mechanisms)
+        _each_known(f"{where}.recipe", (adaptation.recipe,), RECIPES)
+    for number, gate in enumerate(spec.gates):
+        _check_gate(f"gates[{number}]", gate)
+
+
+def _check_fault(where: str, entry: FaultEntry, spec: Spec) -> None:
+    _each_known(f"{where}.mechanisms", entry.mechanisms, spec.mechanisms)
+    for key, values in entry.matrix.items():
+        if not values:
+            raise ConfigError(f"{where}.matrix.{key}: it is empty: name at least one value")
+    for key, (low, high) in entry.draw.items():
+        if low > high:
+            raise ConfigError(f"{where}.draw.{key}: found [{low}, {high}], allowed is [lowest, highest]")
+    twice = entry.matrix.keys() & entry.draw.keys()
+    if twice:
+        raise ConfigError(f"{where}: {min(twice)!r} stands in matrix and in draw")
+    for mechanism, outcomes in entry.expect.items():
+        if mechanism != ANY:
+            _each_known(f"{where}.expect", (mechanism,), spec.mechanisms)
+        _each_known(f"{where}.expect.{mechanism}", outcomes, OUTCOMES)
+
+
+def _check_gate(where: str, gate: Gate) -> None:
+    if gate.metric not in METRICS:
+        raise ConfigError(f"{where}.metric: {unknown('metric', gate.metric, METRICS)}")
+    if (gate.max is None) == (gate.min is None):
+        raise ConfigError(f"{where}: either max or min is allowed, and needed")
+
+
+def _each_known(where: str, names: tuple[str, ...], allowed: tuple[str, ...]) -> None:
+    for name in names:
+        if name not in allowed:
+            raise ConfigError(f"{where}: {unknown('name', name, allowed)}")
+
+
+def _all_different(where: str, names: list[str]) -> None:
+    for name in names:
+        if names.count(name) > 1:
+            raise ConfigError(f"{where}: {name!r} stands twice")

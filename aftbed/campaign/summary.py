@@ -1,0 +1,229 @@
+"""What a campaign has come to: its strata, its gates, and whether it passes.
+
+A gate on a share is judged by the bound of the interval that the number of experiments allows, so "0 of 10"
+proves only that the share is below 31 %; a gate on a time by the bound of the quantile's interval. A stratum
+with a fault in which nothing ever struck fails whatever else is well, and so do too many faults that did not
+strike: a campaign that could not have failed proves nothing (G8).
+"""
+
+import fnmatch
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from typing import Final, Literal
+
+import msgspec
+
+from aftbed.bench.statistics import quantile
+from aftbed.campaign.experiment import OUTCOMES, UNKNOWN, Result, failed
+from aftbed.campaign.faultspace import Count, extrapolated
+from aftbed.campaign.ledger import Ledger
+from aftbed.campaign.planning import population, strata_of
+from aftbed.campaign.spec import Gate, Spec
+from aftbed.campaign.statistics import (
+    Interval,
+    look_confidence,
+    proportion,
+    quantile_interval,
+    quantile_needs,
+)
+
+Word = Literal["pass", "fail"]
+NOT_ACTIVATED: Final = "not_activated"
+QUANTILES: Final = {"p50": 0.5, "p99": 0.99}
+SHARES: Final[dict[str, Callable[[Result], bool]]] = {
+    "unexpected": lambda r: r.unexpected,
+    "failed": failed,
+    "unknown": lambda r: r.outcome in UNKNOWN,
+    NOT_ACTIVATED: lambda r: not r.activated,
+    "collision": lambda r: bool(r.collision),
+    **{name: (lambda r, name=name: r.outcome == name) for name in OUTCOMES},  # type: ignore[misc]
+}
+
+OF: Final[dict[str, Callable[[Result], bool]]] = {  # which experiments a share is a share of, where not all
+    "unexpected": lambda r: r.activated,
+    NOT_ACTIVATED: lambda r: bool(r.experiment.faults),
+}
+
+
+class Times(msgspec.Struct, frozen=True):
+    """Milliseconds; `p99_interval` is None where there are too few values to bound it."""
+
+    count: int
+    p50: float
+    p99: float
+    max: float
+    p50_interval: Interval | None
+    p99_interval: Interval | None
+
+
+class StratumSummary(msgspec.Struct, frozen=True):
+    """`unexpected_interval`: of the share of experiments that came out otherwise than expected."""
+
+    name: str
+    experiments: int
+    activated: int
+    outcomes: dict[str, int]
+    expected: tuple[str, ...]
+    failed: int
+    population: int
+    failures: Count  # extrapolated to the population
+    unexpected: int
+    unexpected_interval: Interval
+    recovery_ms: Times | None
+    blackout_ms: Times | None
+    adapt_blackout_ms: Times | None
+
+
+class GateResult(msgspec.Struct, frozen=True):
+    """`value` is what was measured, `bound` what the gate was judged by; both None where nothing was."""
+
+    metric: str
+    strata: str
+    limit: str
+    value: float | None
+    bound: float | None
+    word: Word
+    reason: str
+
+
+class Summary(msgspec.Struct, frozen=True):
+    """The one document of `aftbed campaign run --json`."""
+
+    campaign: str
+    seed: int
+    code: str
+    experiments: int
+    planned: int
+    outcomes: dict[str, int]
+    strata: tuple[StratumSummary, ...]
+    gates: tuple[GateResult, ...]
+    gate: Word
+    seconds: float
+
+
+def summarise(ledger: Ledger, planned: int, seconds: float) -> Summary:
+    """All of it. `planned`: how many experiments there should be at most."""
+    spec, results = ledger.head.spec, ledger.results
+    groups: dict[str, list[Result]] = {}
+    for result in results:
+        groups.setdefault(result.experiment.stratum, []).append(result)
+    confidence = confidence_of(spec)
+    gates = tuple(judged(gate, groups, confidence) for gate in (*spec.gates, *_always(spec)))
+    gates += tuple(_vacuous(name, group) for name, group in groups.items() if _never_struck(group))
+    sizes = {stratum.name: population(stratum.fault) for stratum in strata_of(spec)}
+    broken = not results or any(g.word == "fail" for g in gates)
+    return Summary(
+        spec.campaign,
+        spec.seed,
+        ledger.head.code,
+        len(results),
+        planned,
+        _counted(results),
+        tuple(_stratum(name, group, sizes.get(name, 1), confidence) for name, group in groups.items()),
+        gates,
+        "fail" if broken else "pass",
+        round(seconds, 3),
+    )
+
+
+def confidence_of(spec: Spec) -> float:
+    """Of each interval: higher where the data were looked at more than once to decide when to stop."""
+    looks = spec.stop.looks if spec.stop.half_width is not None else 1
+    return look_confidence(spec.confidence, looks)
+
+
+def _stratum(name: str, group: list[Result], size: int, confidence: float) -> StratumSummary:
+    unexpected, harm = sum(r.unexpected for r in group), sum(map(failed, group))
+    return StratumSummary(
+        name,
+        len(group),
+        sum(r.activated for r in group),
+        _counted(group),
+        group[0].experiment.expected,
+        harm,
+        size,
+        extrapolated(harm, len(group), size, confidence),
+        unexpected,
+        proportion(unexpected, sum(r.activated for r in group), confidence),
+        times([r.recovery_ms for r in group], confidence),
+        times([r.blackout_ms for r in group], confidence),
+        times([r.adapt_blackout_ms for r in group], confidence),
+    )
+
+
+def times(values: Iterable[float | None], confidence: float) -> Times | None:
+    """Quantiles with their intervals; None of nothing."""
+    found = sorted(v for v in values if v is not None)
+    if not found:
+        return None
+    return Times(
+        len(found),
+        quantile(found, 0.5),
+        quantile(found, 0.99),
+        found[-1],
+        quantile_interval(found, 0.5, confidence),
+        quantile_interval(found, 0.99, confidence),
+    )
+
+
+def _counted(results: Iterable[Result]) -> dict[str, int]:
+    found = Counter(r.outcome for r in results)
+    return {name: found[name] for name in OUTCOMES if found[name]}
+
+
+# -- gates ----------------------------------------------------------------------------------------
+
+
+def judged(gate: Gate, groups: dict[str, list[Result]], confidence: float) -> GateResult:
+    """`gate` over the strata that it means."""
+    group = [r for name, results in groups.items() if fnmatch.fnmatch(name, gate.strata) for r in results]
+    limit = f"at most {gate.max:g}" if gate.max is not None else f"at least {gate.min:g}"
+    if not group:
+        return _failed(gate, limit, f"no stratum is called {gate.strata!r}")
+    if gate.metric in SHARES:
+        share = SHARES[gate.metric]
+        of = OF.get(gate.metric)
+        group = list(filter(of, group)) if of is not None else group
+        count = sum(share(r) for r in group)
+        interval = proportion(count, len(group), confidence)
+        return _by_interval(gate, limit, count / max(1, len(group)), interval)
+    return _of_times(gate, limit, group, confidence)
+
+
+def _of_times(gate: Gate, limit: str, group: list[Result], confidence: float) -> GateResult:
+    name, _, which = gate.metric.rpartition("_")
+    values, q = [v for r in group if (v := getattr(r, name)) is not None], QUANTILES[which]
+    interval = quantile_interval(values, q, confidence) if values else None
+    if interval is None:
+        needed = quantile_needs(q, confidence)
+        return _failed(
+            gate, limit, f"{len(values)} values; {needed} are needed to bound it at {confidence:.1%}"
+        )
+    return _by_interval(gate, limit, quantile(values, q), interval)
+
+
+def _by_interval(gate: Gate, limit: str, value: float, interval: Interval) -> GateResult:
+    bound = interval.high if gate.max is not None else interval.low
+    kept = bound <= gate.max if gate.max is not None else bound >= (gate.min or 0.0)
+    reason = "" if kept else f"{value:.4g} was measured, and it may be {bound:.4g}"
+    return GateResult(gate.metric, gate.strata, limit, value, bound, "pass" if kept else "fail", reason)
+
+
+def _failed(gate: Gate, limit: str, reason: str) -> GateResult:
+    return GateResult(gate.metric, gate.strata, limit, None, None, "fail", reason)
+
+
+def _always(spec: Spec) -> Iterator[Gate]:
+    """G8: what did not happen, and what is not known, is no pass."""
+    if any(entry.texts for entry in spec.faults):
+        yield Gate(NOT_ACTIVATED, max=spec.not_activated_max)
+    yield Gate("unknown", max=spec.unknown_max)
+
+
+def _never_struck(group: list[Result]) -> bool:
+    return bool(group[0].experiment.faults) and not any(r.activated for r in group)
+
+
+def _vacuous(name: str, group: list[Result]) -> GateResult:
+    reason = f"none of {len(group)} faults struck: this stratum could not have failed"
+    return GateResult(NOT_ACTIVATED, name, "not all", 1.0, None, "fail", reason)

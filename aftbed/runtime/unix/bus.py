@@ -1,0 +1,69 @@
+"""The supervisor's hold on the hub: faults of the bus go there, and what has become of them comes back."""
+
+import contextlib
+from collections.abc import Callable, Generator
+from typing import Final
+
+import msgspec
+
+from aftbed.core.busfault import BusFault, Struck
+from aftbed.runtime import control
+from aftbed.runtime.jobs import Key, StepFailed, Wait
+from aftbed.runtime.unix.processes import Nursery, Process
+
+HUB: Final = "hub"
+DISTURBED: Final = "disturbed"  # the hub to us: that fault is armed
+STRUCK: Final = "struck"  # the hub to us: what has become of these
+ASKED: Final = "struck.all"  # the same, of all, since we asked
+KINDS: Final = (DISTURBED, STRUCK, ASKED)
+
+Steps = Generator[Wait, dict[Key, bytes], None]
+
+
+class BusFaults:
+    """Of one run. `settle` wakes the jobs that wait for the hub; `tell` is a line for people."""
+
+    def __init__(
+        self, nursery: Nursery, settle: Callable[[Key], None], tell: Callable[[str, str], None]
+    ) -> None:
+        self._nursery, self._settle, self._tell = nursery, settle, tell
+        self._hub: Process | None = None
+        self._faults: dict[int, BusFault] = {}
+        self._struck: dict[int, Struck] = {}
+
+    def serve(self, hub: Process) -> None:
+        """There is a hub."""
+        self._hub = hub
+
+    def disturb(self, number: int, fault: BusFault, draw: int) -> Steps:
+        """Return when the hub has armed the fault. Raises StepFailed."""
+        if self._hub is None or not self._hub.alive:
+            raise StepFailed(f"{fault}: this run has no bus")
+        if fault.aim is None:
+            raise StepFailed(f"{fault}: it was not aimed at the messages of this bus")
+        self._faults[number] = fault
+        self._nursery.order(self._hub, control.DisturbBus(number, fault, draw))
+        yield Wait(frozenset({(DISTURBED, HUB, number)}), frozenset({HUB}))
+
+    def ask(self) -> Steps:
+        """Hear what has become of all faults by now."""
+        if self._faults and self._hub is not None and self._hub.alive:
+            with contextlib.suppress(StepFailed):  # then what it has said before has to do
+                self._nursery.order(self._hub, control.Stats(control.UNANSWERED))
+                yield Wait(frozenset({(ASKED, HUB, 0)}), frozenset({HUB}))
+
+    def on_report(self, kind: str, data: bytes) -> None:
+        """What the hub says."""
+        if kind == DISTURBED:
+            self._settle((DISTURBED, HUB, int(data)))
+            return
+        for struck in msgspec.msgpack.decode(data, type=list[Struck]):
+            before, self._struck[struck.number] = self._struck.get(struck.number), struck
+            if struck.receipt != (before.receipt if before is not None else "armed"):
+                self._tell("fault", f"{self._faults[struck.number]}: {struck.receipt}, {struck.detail}")
+        if kind == ASKED:
+            self._settle((ASKED, HUB, 0))
+
+    def struck(self, number: int) -> Struck | None:
+        """The latest that is known of a fault."""
+        return self._struck.get(number)

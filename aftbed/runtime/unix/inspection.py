@@ -1,0 +1,312 @@
+"""What of this machine is missing, or in the way: each check says what it is for and what to do.
+
+`missing` is what a run cannot do without; `warning` is what makes it slower, what makes its figures
+worse, or what only some commands need. A check tries the thing itself where that does no harm, and reads
+no version numbers: a kernel has many calls that its sandbox refuses.
+"""
+
+import ctypes
+import errno
+import importlib.metadata
+import mmap
+import os
+import platform
+import re
+import resource
+import shutil
+import signal
+import socket
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final, Literal
+
+import msgspec
+
+from aftbed.core.errors import HarnessError
+from aftbed.runtime.unix import rundir
+from aftbed.runtime.unix.lifeline import SYS_FUTEX_WAITV
+
+Status = Literal["ok", "warning", "missing"]
+
+FILES_MIN, FILES_GOOD = 256, 1024  # a supervisor of 37 processes holds 180, more while it adapts
+PROCESSES_MIN: Final = 64
+FREE_BYTES_MIN, FREE_BYTES_GOOD = 50_000_000, 500_000_000  # a run of some minutes takes some MB
+SOCKET_PATH_MAX: Final = 107  # unix(7), without the NUL
+STEAL_SECONDS: Final = 0.2
+STEAL_MAX: Final = 0.01
+PR_GET_PDEATHSIG: Final = 2
+OPTIONAL: Final = {  # what some commands use where it is there
+    "scipy": "exact intervals of a campaign's statistics",
+    "jinja2": "the HTML report of a campaign",
+    "pyarrow": "export of a campaign's records as Parquet",
+    "distributed": "campaigns on many machines (Dask)",
+}
+BROWSERS: Final = ("chromium", "chromium-browser", "google-chrome", "chrome")
+
+_libc: Final = ctypes.CDLL(None, use_errno=True)
+
+
+class Check(msgspec.Struct, frozen=True):
+    """One thing looked at: what was found, what it is for, and what to do unless it is `ok`."""
+
+    name: str
+    status: Status
+    found: str
+    serves: str
+    remedy: str = ""
+
+
+def inspect() -> list[Check]:
+    """Every check, in the order in which a run needs them."""
+    return [*kernel(), *limits(), *place(), *python(), *extras(), *measuring()]
+
+
+def _check(name: str, status: Status, found: str, serves: str, remedy: str) -> Check:
+    return Check(name, status, found, serves, "" if status == "ok" else remedy)
+
+
+# -- the kernel -----------------------------------------------------------------------------------
+
+
+def _tried(name: str, serves: str, remedy: str, call: Callable[[], object]) -> Check:
+    """Missing if the kernel refuses `call`."""
+    try:
+        call()
+    except (OSError, AttributeError, HarnessError) as error:
+        return Check(name, "missing", str(error), serves, remedy)
+    return Check(name, "ok", "works", serves)
+
+
+def _pidfd() -> None:
+    descriptor = os.pidfd_open(os.getpid())
+    try:
+        signal.pidfd_send_signal(descriptor, 0)
+    finally:
+        os.close(descriptor)
+
+
+def _memfd() -> None:
+    descriptor = os.memfd_create("aftbed-doctor")
+    try:
+        os.ftruncate(descriptor, mmap.PAGESIZE)
+        mmap.mmap(descriptor, mmap.PAGESIZE).close()
+    finally:
+        os.close(descriptor)
+
+
+def _parent_death_signal() -> None:
+    found = ctypes.c_int()
+    if _libc.prctl(PR_GET_PDEATHSIG, ctypes.byref(found), 0, 0, 0) != 0:
+        raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
+
+
+def _packets() -> None:
+    for end in socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET):
+        end.close()
+
+
+def _loopback() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as sock:
+        sock.bind(("127.0.0.1", 0))
+        sock.listen()
+
+
+def _process_files() -> None:
+    Path("/proc/self/stat").read_bytes()
+    Path("/proc/self/environ").read_bytes()
+    os.listdir("/proc/self/fd")  # noqa: PTH208 - its names are all that is wanted
+
+
+def kernel() -> list[Check]:
+    """System calls without which there is no run, and those without which it is slower."""
+    sandbox = "Linux 5.4 or later, and a sandbox (container, seccomp) that allows it"
+    return [
+        _tried("pidfd", "deaths are seen; a signal reaches the process that was meant", sandbox, _pidfd),
+        _tried("memfd", "states above a packet travel; the mark of a run", sandbox, _memfd),
+        _tried("parent death signal", "no process outlives its run (G7)", sandbox, _parent_death_signal),
+        _tried("packet sockets", "the channels between bricks", sandbox, _packets),
+        _tried("loopback", "the CAN bus between processes", "bring the interface lo up", _loopback),
+        _tried("/proc", "hangs, stops and leftovers are seen", "mount proc(5) at /proc", _process_files),
+        _futexes(),
+    ]
+
+
+def _futexes() -> Check:
+    ctypes.set_errno(0)
+    _libc.syscall(SYS_FUTEX_WAITV, None, 0, 0, None, 0)  # nothing to wait for: EINVAL where it exists
+    there = ctypes.get_errno() != errno.ENOSYS
+    serves = "a death is seen half a millisecond earlier"
+    found = "works" if there else "the kernel has none"
+    return _check("futex_waitv", "ok" if there else "warning", found, serves, "Linux 5.16 or later")
+
+
+# -- limits ---------------------------------------------------------------------------------------
+
+
+def limits() -> list[Check]:
+    """CPUs, descriptors, processes."""
+    return [_cpus(), _pinning(), _files(), _processes()]
+
+
+def _cpus() -> Check:
+    count = len(os.sched_getaffinity(0))
+    remedy = "give it two: on one, the replicas wait for each other, and figures mean little"
+    found = f"{count} usable of {os.cpu_count()}"
+    return _check("CPUs", "ok" if count > 1 else "warning", found, "a core for each replica", remedy)
+
+
+def _pinning() -> Check:
+    serves = "a replica's chain stays on its core"
+    try:
+        os.sched_setaffinity(0, os.sched_getaffinity(0))
+    except OSError as error:
+        return Check("pinning", "missing", str(error), serves, "allow sched_setaffinity(2)")
+    return Check("pinning", "ok", "allowed", serves)
+
+
+def _limit(number: int) -> str:
+    return "unlimited" if number == resource.RLIM_INFINITY else str(number)
+
+
+def _files() -> Check:
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    room = float("inf") if soft == resource.RLIM_INFINITY else soft
+    status: Status = "missing" if room < FILES_MIN else "warning" if room < FILES_GOOD else "ok"
+    found = f"{_limit(soft)} of at most {_limit(hard)}"
+    serves = "the supervisor holds all channels"
+    return _check("open files", status, found, serves, f"ulimit -n {FILES_GOOD}")
+
+
+def _processes() -> Check:
+    soft, _ = resource.getrlimit(resource.RLIMIT_NPROC)
+    serves = "a run has up to 40"
+    if soft == resource.RLIM_INFINITY or os.getuid() == 0:
+        return Check("processes", "ok", "unlimited", serves)
+    mine = sum(p.name.isdigit() and p.stat().st_uid == os.getuid() for p in _there(Path("/proc")))
+    status: Status = "ok" if soft - mine >= PROCESSES_MIN else "missing"
+    found = f"{max(0, soft - mine)} more allowed"
+    return _check("processes", status, found, serves, f"ulimit -u {mine + PROCESSES_MIN}, or more")
+
+
+def _there(folder: Path) -> list[os.DirEntry[str]]:
+    """What still is there when it is looked at."""
+    found = []
+    for entry in os.scandir(folder):
+        try:
+            entry.stat()
+        except OSError:
+            continue
+        found.append(entry)
+    return found
+
+
+# -- where runs live ------------------------------------------------------------------------------
+
+
+def place() -> list[Check]:
+    """The directory of all runs."""
+    serves = "control sockets and records of runs, closed to others"
+    try:
+        root = rundir.root()
+    except (HarnessError, OSError) as error:
+        remedy = "remove it, or set XDG_RUNTIME_DIR or TMPDIR to a directory of yours"
+        return [Check("run directory", "missing", str(error), serves, remedy)]
+    longest = len(os.fsencode(root / ("0" * 2 * rundir.ID_BYTES) / rundir.SOCKET_NAME))
+    if longest > SOCKET_PATH_MAX:
+        found = f"{root}: {longest - SOCKET_PATH_MAX} bytes too long for a socket's path"
+        remedy = "set XDG_RUNTIME_DIR or TMPDIR to a shorter path"
+        return [Check("run directory", "missing", found, serves, remedy)]
+    return [Check("run directory", "ok", f"{root}, mode 0700", serves), _space(root)]
+
+
+def _space(root: Path) -> Check:
+    free = shutil.disk_usage(root).free
+    status: Status = "missing" if free < FREE_BYTES_MIN else "warning" if free < FREE_BYTES_GOOD else "ok"
+    remedy = "make room, or keep records elsewhere: aftbed run --record"
+    return _check("space", status, f"{free / 1e6:.0f} MB free in {root}", "journals and bus logs", remedy)
+
+
+# -- Python ---------------------------------------------------------------------------------------
+
+
+def python() -> list[Check]:
+    """The interpreter, and the packages that aftbed cannot do without."""
+    serves = "a failed assert ends a node: fail-silence"
+    status: Status = "ok" if __debug__ else "missing"
+    asserts = _check("asserts", status, "on" if __debug__ else "off", serves, "no -O, no PYTHONOPTIMIZE")
+    version = Check("Python", "ok", platform.python_version(), "the interpreter of all nodes")
+    return [version, asserts, _packages()]
+
+
+def _packages() -> Check:
+    serves = "the bus, the wire format, the command line"
+    try:
+        wanted = [r for r in importlib.metadata.requires("aftbed") or [] if "extra ==" not in r]
+    except importlib.metadata.PackageNotFoundError:
+        return Check("packages", "warning", "aftbed is not installed", serves, "pip install .")
+    names = [match[0] for match in (re.match(r"[\w.-]+", r) for r in wanted) if match]
+    lacking = [name for name in names if not _version(name)]
+    found = f"without {', '.join(lacking)}" if lacking else f"all {len(names)}"
+    remedy = f"pip install {' '.join(lacking)}"
+    return _check("packages", "missing" if lacking else "ok", found, serves, remedy)
+
+
+def _version(package: str) -> str:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return ""
+
+
+def extras() -> list[Check]:
+    """What single commands need."""
+    found = []
+    for package, serves in OPTIONAL.items():
+        version = _version(package)
+        status: Status = "ok" if version else "warning"
+        found.append(_check(package, status, version or "not installed", serves, f"pip install {package}"))
+    browser = next((where for name in BROWSERS if (where := shutil.which(name))), "")
+    status = "ok" if browser else "warning"
+    serves = "tests of the HTML report, and nothing else"
+    found.append(_check("Chromium", status, browser or "not found", serves, "install chromium"))
+    return found
+
+
+# -- what spoils figures --------------------------------------------------------------------------
+
+
+def measuring() -> list[Check]:
+    """What makes times larger, or scatter; verdicts do not depend on it."""
+    return [_governor(), _steal(), _load()]
+
+
+def _governor() -> Check:
+    serves = "benches: a clock that stays as it is"
+    files = sorted(Path("/sys/devices/system/cpu").glob("cpu[0-9]*/cpufreq/scaling_governor"))
+    kinds = {file.read_text().strip() for file in files}
+    found = ", ".join(sorted(kinds)) or "not to be seen from here"
+    status: Status = "ok" if kinds <= {"performance"} else "warning"
+    return _check("CPU governor", status, found, serves, "cpupower frequency-set -g performance")
+
+
+def _jiffies() -> list[int]:
+    return [int(word) for word in Path("/proc/stat").read_text().splitlines()[0].split()[1:9]]
+
+
+def _steal() -> Check:
+    before = _jiffies()
+    time.sleep(STEAL_SECONDS)  # what is sampled, not what is waited for
+    passed = [b - a for a, b in zip(before, _jiffies(), strict=True)]
+    share = passed[7] / max(1, sum(passed))
+    status: Status = "ok" if share <= STEAL_MAX else "warning"
+    serves = "benches: a core that is ours"
+    remedy = "other guests of this machine take its CPUs: measure elsewhere, or later"
+    return _check("CPU steal", status, f"{share:.1%}", serves, remedy)
+
+
+def _load() -> Check:
+    load, count = os.getloadavg()[0], os.cpu_count() or 1
+    status: Status = "ok" if load < count else "warning"
+    serves = "benches: nobody else runs"
+    return _check("load", status, f"{load:.1f} on {count} CPUs", serves, "measure when nothing else runs")

@@ -1,0 +1,390 @@
+"""What a fault of the bus does to its frames. Pure: frames in, frames out; time is the frames' own.
+
+The hub between processes and the bus of the car in virtual time both let a frame pass through a `Disturber`
+at the moment at which it has the bus to itself:
+
+    carry(frame, sender)     what comes onto the bus in its place, now: the frame, another one, two, or none
+    release(now_us)          what comes now without being sent now: held back before, or a babbling idiot's
+    due_us()                 when `release` is worth calling next
+    deaf(sender, node, ...)  whether the node does not hear that sender now: bus-off, partition
+
+Several faults are armed at once: what one lets through, the next one gets, in the order of arming. What
+is released is not struck again.
+
+*Time.* A fault opens at its time, and ends by time where it lasts: both are looked at when a frame or a
+`release` comes, and compared with bus time, so it makes no difference when anybody looks.
+
+*Babbling idiot.* One that sends identifier 0 without a pause wins every arbitration. So nobody else gets a
+frame through: a node's controller holds the latest of each message, as a transmit buffer does, and these go
+out in the order of arbitration when it ends. The flood itself is carried as one frame in each millisecond,
+which stands for the three or four that 500 kbit/s would allow: who reads the bus has to see it, not to drown
+in it.
+
+*Who noticed.* A receiver that finds something wrong with a frame, or misses one, says so beside the bus, by
+the identifier (`noticed`); who takes a struck frame in (`reached`), and says nothing, has believed it. A
+brake ECU in its fallback has noticed whatever there is to notice.
+"""
+
+from random import Random
+from typing import Final
+
+import msgspec
+from e2e.p11 import e2e_p11_protect
+
+from aftbed.core.busfault import (
+    FALLBACK,
+    NODE_ACTS,
+    Babble,
+    BusFault,
+    BusOff,
+    Condition,
+    Delay,
+    Duplicate,
+    Every,
+    FlipBit,
+    Intermittent,
+    Lasting,
+    Masquerade,
+    Omission,
+    Partition,
+    Permanent,
+    Reorder,
+    SetSignal,
+    Struck,
+    StuckCounter,
+    Transient,
+)
+from aftbed.core.valuefault import flipped
+from aftbed.vehicle.frame import Frame
+
+REORDER_US_MAX: Final = 1_000_000  # a frame without a successor is not swallowed
+FLOOD_US: Final = 1000
+FLOOD_ID: Final = 0
+FLOOD_FRAMES_MAX: Final = 100  # in one release: a bus that was away for long does not make up for it
+COUNTER_MASK: Final = 0x0F
+
+
+class Sent(msgspec.Struct, frozen=True):
+    """A frame that comes onto the bus, from `sender`; `by` are the faults that struck it."""
+
+    frame: Frame
+    sender: str
+    by: tuple[int, ...] = ()
+
+
+class _Armed:
+    """A fault, and what it has come to."""
+
+    def __init__(self, number: int, fault: BusFault, chance: Random, now_us: int) -> None:
+        assert fault.aim is not None, f"{fault} is not aimed"
+        opening = fault.opening
+        self.number, self.fault, self.chance = number, fault, chance
+        self.marks = {mark.can_id: mark for mark in fault.aim.marks}
+        self.opens_us = now_us + opening.after_us if opening.when is None else None
+        self.since_us: int | None = None  # when it first struck, or took hold
+        self.over = False
+        self.seen = 0
+        self.counters: dict[int, int] = {}  # of the frames before
+        self.swapped: Sent | None = None
+        self.swap_due_us = 0
+        self.starved: dict[int, Sent] = {}
+        self.flood_us = 0
+        self.frames = self.first_us = self.first_id = 0
+        self.ids: set[int] = set()
+        self.noticed = self.believed = ""
+
+    @property
+    def on_nodes(self) -> bool:
+        return isinstance(self.fault.act, NODE_ACTS)
+
+    def open(self, now_us: int) -> bool:
+        return not self.over and self.opens_us is not None and self.opens_us <= now_us
+
+    def ends_us(self) -> int | None:
+        """When it ends by time; None while that cannot be said."""
+        persistence, since_us = self.fault.persistence, self.since_us
+        if self.over or since_us is None or not isinstance(persistence, Lasting):
+            return None
+        return since_us + persistence.for_us
+
+    def holds(self, now_us: int) -> bool:
+        """An act on nodes: whether it has hold of them. It takes hold when that is first asked in time."""
+        if not self.open(now_us):
+            return False
+        if self.since_us is None:
+            assert self.opens_us is not None
+            self.since_us = self.flood_us = self.opens_us
+        return not self._ended(now_us)
+
+    def _ended(self, now_us: int) -> bool:
+        ends_us = self.ends_us()
+        self.over = self.over or (ends_us is not None and now_us >= ends_us)
+        return self.over
+
+    def strikes(self, now_us: int) -> bool:
+        """Whether the fault strikes the frame of now, which is one of those that it is aimed at."""
+        if not self.open(now_us):
+            return False
+        self.seen += 1
+        if self.seen < self.fault.opening.nth:
+            return False
+        self.since_us = now_us if self.since_us is None else self.since_us
+        match self.fault.persistence:
+            case Transient():
+                self.over = True
+                return True
+            case Lasting():
+                return not self._ended(now_us)
+            case Intermittent(p):
+                return self.chance.random() < p
+            case Every(count):
+                return (self.seen - self.fault.opening.nth) % count == 0
+            case Permanent():
+                return True
+
+    def spare(self) -> None:
+        """There was nothing to change in the frame: the next one is due."""
+        if isinstance(self.fault.persistence, Transient):
+            self.over = False
+
+    def count(self, frame: Frame) -> None:
+        """It was struck."""
+        if not self.frames:
+            self.first_us, self.first_id = frame.t_us, frame.can_id
+        self.frames += 1
+        self.ids.add(frame.can_id)
+
+    def struck(self) -> Struck:
+        return Struck(
+            self.number,
+            self.frames,
+            self.first_us,
+            self.first_id,
+            self.noticed,
+            self.believed,
+            began=self.on_nodes and self.since_us is not None,
+        )
+
+    def quiet(self) -> bool:
+        """Whether nothing will come of it any more."""
+        return self.over and self.swapped is None and not self.starved
+
+
+class Disturber:
+    """All faults of one bus."""
+
+    def __init__(self) -> None:
+        self._armed: dict[int, _Armed] = {}
+        self._held: list[tuple[int, Sent]] = []  # due, in the order of their coming
+
+    def arm(self, number: int, fault: BusFault, draw: int, now_us: int) -> None:
+        """`fault` is aimed; `draw` seeds its chance."""
+        self._armed[number] = _Armed(number, fault, Random(draw), now_us)
+
+    def forget(self, number: int, now_us: int) -> None:
+        """It ends now; what it holds back is due."""
+        armed = self._armed.get(number)
+        if armed is not None:
+            armed.over = True
+            armed.swap_due_us = now_us
+            self._held = [(now_us if number in sent.by else due_us, sent) for due_us, sent in self._held]
+
+    def conditions(self) -> list[tuple[int, Condition]]:
+        """What somebody has to look at the car for, by the number of the fault."""
+        waiting = [a for a in self._armed.values() if a.opens_us is None and not a.over]
+        return [(a.number, a.fault.opening.when) for a in waiting if a.fault.opening.when is not None]
+
+    def met(self, number: int, now_us: int) -> None:
+        """The condition holds now."""
+        armed = self._armed.get(number)
+        if armed is not None and armed.opens_us is None:
+            armed.opens_us = now_us
+
+    def struck(self) -> list[Struck]:
+        """What has become of each."""
+        return [armed.struck() for armed in self._armed.values()]
+
+    @property
+    def idle(self) -> bool:
+        """Whether the bus is as it was, and stays so."""
+        return not self._held and all(armed.quiet() for armed in self._armed.values())
+
+    # -- frames -------------------------------------------------------------------------------
+
+    def carry(self, frame: Frame, sender: str) -> list[Sent]:
+        """What comes onto the bus now, since `sender` has sent `frame`; `t_us` of it is now."""
+        sent = [Sent(frame, sender)]
+        for armed in self._armed.values():
+            if armed.on_nodes:
+                sent = [one for one in sent if self._gets_through(armed, one)]
+            elif frame.can_id in armed.marks:
+                sent = [out for one in sent for out in self._struck(armed, one)]
+        return sent
+
+    def release(self, now_us: int) -> list[Sent]:
+        """What comes onto the bus now without being sent now."""
+        for armed in self._armed.values():
+            self._let_go(armed, now_us)
+        due = [sent for due_us, sent in self._held if due_us <= now_us]
+        self._held = [(due_us, sent) for due_us, sent in self._held if due_us > now_us]
+        return [_at(now_us, sent) for sent in due] + [
+            flood for armed in self._armed.values() for flood in self._flood(armed, now_us)
+        ]
+
+    def due_us(self) -> int | None:
+        """When something is to happen next of which no frame will tell."""
+        due = [due_us for due_us, _ in self._held]
+        for armed in self._armed.values():
+            due += [armed.swap_due_us] if armed.swapped is not None else []
+            due += [0] if armed.starved and armed.over else []
+            due += [ends_us] if (ends_us := armed.ends_us()) is not None else []
+            if armed.on_nodes and not armed.over and armed.opens_us is not None:
+                babbles = isinstance(armed.fault.act, Babble)
+                if armed.since_us is None:
+                    due.append(armed.opens_us)
+                elif babbles:
+                    due.append(armed.flood_us)
+        return min(due, default=None)
+
+    def deaf(self, sender: str, node: str, now_us: int) -> bool:
+        """Whether `node` hears nothing of `sender` now."""
+        return any(
+            _cuts(armed, sender, node)
+            for armed in self._armed.values()
+            if armed.on_nodes and armed.holds(now_us)
+        )
+
+    # -- who noticed --------------------------------------------------------------------------
+
+    def noticed(self, node: str, can_id: int, word: str) -> None:
+        """`node` finds something wrong with the frames of `can_id`."""
+        for armed in self._armed.values():
+            if armed.frames and not armed.noticed and (can_id in armed.ids or word == FALLBACK):
+                armed.noticed = f"{node} ({word})"
+
+    def reached(self, by: tuple[int, ...], node: str) -> None:
+        """A frame that these have struck has come to `node`, which makes something of it."""
+        for number in by:
+            armed = self._armed[number]
+            armed.believed = armed.believed or node
+
+    # -- acts ---------------------------------------------------------------------------------
+
+    def _gets_through(self, armed: _Armed, sent: Sent) -> bool:
+        """Whether the frame comes onto the bus in spite of what has hold of a node."""
+        frame = sent.frame
+        if not armed.holds(frame.t_us):
+            return True
+        match armed.fault.act:
+            case Babble():
+                armed.count(frame)
+                armed.starved[frame.can_id] = sent
+                return False
+            case BusOff(node):
+                armed.count(frame)  # it is kept from the bus, or else from the node
+                return sent.sender != node
+            case Partition(side, other):
+                if sent.sender in (*side, *other):
+                    armed.count(frame)
+        return True
+
+    def _struck(self, armed: _Armed, sent: Sent) -> list[Sent]:
+        """What `armed` makes of a frame that it is aimed at."""
+        frame, by = sent.frame, (*sent.by, armed.number)
+        if armed.swapped is not None:
+            late, armed.swapped = armed.swapped, None
+            return [sent, _at(frame.t_us, late)]
+        strikes = armed.strikes(frame.t_us)
+        changed = _changed(armed, frame) if strikes else None
+        if changed is None:
+            if strikes:
+                armed.spare()
+            if len(frame.data) > 1:
+                armed.counters[frame.can_id] = frame.data[1] & COUNTER_MASK
+            return [sent]
+        armed.count(frame)
+        struck = Sent(changed, sent.sender, by)
+        match armed.fault.act:
+            case Omission():
+                return []
+            case Delay(by_us):
+                self._held.append((frame.t_us + by_us, struck))
+                return []
+            case Duplicate():
+                return [sent, struck]
+            case Reorder():
+                armed.swapped, armed.swap_due_us = struck, frame.t_us + REORDER_US_MAX
+                return []
+            case _:
+                return [struck]
+
+    def _let_go(self, armed: _Armed, now_us: int) -> None:
+        """What is over lets go of what it had."""
+        if armed.on_nodes:
+            armed.holds(now_us)
+        elif (ends_us := armed.ends_us()) is not None and now_us >= ends_us:
+            armed.over = True
+        if armed.swapped is not None and now_us >= armed.swap_due_us:
+            self._held.append((armed.swap_due_us, armed.swapped))
+            armed.swapped = None
+        if armed.over and armed.starved:
+            waiting = sorted(armed.starved.items())
+            armed.starved = {}
+            self._held += [(now_us, sent) for _, sent in waiting]
+
+    def _flood(self, armed: _Armed, now_us: int) -> list[Sent]:
+        if not isinstance(armed.fault.act, Babble) or not armed.holds(now_us):
+            return []
+        node = armed.fault.act.node
+        missed = (now_us - armed.flood_us) // FLOOD_US + 1
+        armed.flood_us += max(0, missed) * FLOOD_US
+        off = [a.fault.act for a in self._armed.values() if a.on_nodes and a.holds(now_us)]
+        if BusOff(node) in off:
+            return []
+        flood = Sent(Frame(now_us, FLOOD_ID, bytes(8)), node)
+        return [flood] * min(max(0, missed), FLOOD_FRAMES_MAX)
+
+
+def _at(now_us: int, sent: Sent) -> Sent:
+    frame = sent.frame
+    return Sent(Frame(now_us, frame.can_id, frame.data), sent.sender, sent.by)
+
+
+def _cuts(armed: _Armed, sender: str, node: str) -> bool:
+    match armed.fault.act:
+        case BusOff(off):
+            return node == off
+        case Partition(side, other):
+            return (sender in side and node in other) or (sender in other and node in side)
+        case _:
+            return False
+
+
+def _changed(armed: _Armed, frame: Frame) -> Frame | None:
+    """The frame as the act makes it; None where there is nothing to change: then it is not struck."""
+    mark, data = armed.marks[frame.can_id], frame.data
+    match armed.fault.act:
+        case FlipBit(bit):
+            data = flipped(data, bit) if bit < 8 * len(data) else data
+        case SetSignal():
+            if len(data) == len(mark.mask):
+                parts = zip(data, mark.mask, mark.bits, strict=True)
+                data = bytes(byte & ~where | bits for byte, where, bits in parts)
+        case StuckCounter():
+            counter = armed.counters.get(frame.can_id)
+            if counter is not None and len(data) > 1:
+                data = bytes([data[0], data[1] & ~COUNTER_MASK | counter, *data[2:]])
+        case Masquerade():
+            return Frame(frame.t_us, frame.can_id, resealed(data, mark.data_id)) if len(data) > 1 else None
+        case _:
+            return frame
+    if data == frame.data:
+        return None
+    return Frame(frame.t_us, frame.can_id, resealed(data, mark.data_id) if mark.data_id >= 0 else data)
+
+
+def resealed(data: bytes, data_id: int) -> bytes:
+    """`data` with a CRC that fits it and `data_id`; the counter stays, whatever it is."""
+    frame = bytearray(data)
+    e2e_p11_protect(frame, data_id, increment_counter=False)
+    return bytes(frame)

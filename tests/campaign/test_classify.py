@@ -1,0 +1,149 @@
+"""The class of an outcome: each on a history that has just that, and on simulated runs that come to it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import msgspec
+import pytest
+
+from aftbed.campaign.classify import golden_digest, outcome_of
+from aftbed.campaign.executing import carry_out
+from aftbed.campaign.experiment import OUTCOMES, Experiment, worst
+from aftbed.core.check import LATE_NS, History
+from aftbed.core.event import Event
+from aftbed.core.journal import Entry, EntryKind, Record
+from aftbed.runtime.hosting import Hosted
+from aftbed.runtime.sim.world import Run, Setup, simulate
+from aftbed.vehicle.function import default_application
+
+CLEAN = simulate(Setup("pbr", count=8))
+Entries = Callable[[list[Entry]], list[Entry]]
+
+
+@dataclass
+class Found:
+    """How a clean run is judged, once something in it is changed."""
+
+    history: History = CLEAN.history
+    lost: bool = False
+    living: Hosted | None = CLEAN.rest.hosted
+    digests: tuple[str, ...] = tuple(CLEAN.rest.states.values())
+
+    def word(self) -> str:
+        return outcome_of(
+            self.history, default_application, lost=self.lost, living=self.living, digests=self.digests
+        )[0]
+
+
+def dialogue(change: Entries) -> History:
+    return msgspec.structs.replace(CLEAN.history, dialogue=change(list(CLEAN.history.dialogue)))
+
+
+def noted(event: Event, detail: int = 0) -> History:
+    journals = dict(CLEAN.history.journals)
+    journals["a.after.1"] = [*journals["a.after.1"], Record(1, event, 3, detail, "a/after")]
+    return msgspec.structs.replace(CLEAN.history, journals=journals)
+
+
+def without(*ids: int) -> History:
+    return dialogue(lambda es: [e for e in es if e.kind is EntryKind.SENT or e.request_id not in ids])
+
+
+def answered(change: Callable[[Entry], list[Entry]]) -> History:
+    def told(entries: list[Entry]) -> list[Entry]:
+        meant = [e.request_id == 3 and e.kind is EntryKind.ANSWERED for e in entries]
+        return [c for e, yes in zip(entries, meant, strict=True) for c in (change(e) if yes else [e])]
+
+    return dialogue(told)
+
+
+@pytest.mark.parametrize(
+    ("found", "word"),
+    [
+        (Found(), "masked"),
+        (Found(digests=("0" * 16, CLEAN.rest.states["a"])), "latent"),
+        (Found(noted(Event.RECOVERY_ENTER)), "tolerated"),
+        (Found(noted(Event.VOTE_COMPARED, 3)), "tolerated"),
+        (Found(noted(Event.VOTE_COMPARED, 2)), "masked"),
+        (
+            Found(answered(lambda e: [msgspec.structs.replace(e, t_ns=e.t_ns + LATE_NS + 1)])),
+            "degraded",
+        ),
+        (Found(living=msgspec.structs.replace(CLEAN.rest.hosted, backup="")), "degraded"),
+        (Found(noted(Event.DETECTED_STOP)), "detected_stop"),
+        (Found(without(3)), "omission"),
+        (Found(answered(lambda e: [e, e])), "duplicate_effect"),
+        (Found(without(6, 7, 8), lost=True), "unavailable"),
+        (Found(without(6, 7, 8)), "hang"),
+        (Found(answered(lambda e: [msgspec.structs.replace(e, payload=b"x")])), "sdc"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_each_class_has_its_history(found: Found, word: str) -> None:
+    assert found.word() == word
+
+
+def test_the_worst_wins() -> None:
+    found = Found(answered(lambda e: [msgspec.structs.replace(e, payload=b"x")]), lost=True)
+    assert found.word() == "sdc"
+    assert worst(["tolerated", "omission", "masked"]) == "omission"
+    assert worst([]) == OUTCOMES[0] == "masked"
+
+
+def test_a_golden_run_ends_in_the_state_of_both_replicas() -> None:
+    assert {golden_digest(CLEAN.history, default_application())} == set(CLEAN.rest.states.values())
+    assert set(CLEAN.rest.states) == {"a", "b"}
+
+
+def experiment(ftm: str, *faults: str, **more: object) -> Experiment:
+    found = Experiment("0" * 16, 0, 0, "s", 5, ftm, "process", "sim", "", 40, 400.0, faults)
+    return msgspec.structs.replace(found, **more)
+
+
+@pytest.mark.parametrize(
+    ("ftm", "fault", "word"),
+    [
+        ("pbr", "crash primary at server.exit nth 9", "tolerated"),
+        ("pbr", "crash backup at state.restored nth 9", "tolerated"),
+        ("pbr", "crash proxy at reply.sent nth 9", "masked"),
+        ("pbr", "hang primary at server.exit nth 9", "tolerated"),
+        ("none", "crash primary at server.exit nth 9", "unavailable"),
+        ("none", "bitflip result bit 60 at server.exit nth 9", "sdc"),
+        ("pbr", "bitflip result bit 60 at server.exit nth 9", "sdc"),
+        ("pbr+tr", "bitflip result bit 60 at server.exit nth 9", "tolerated"),
+        ("pbr", "bitflip state bit 40 in backup at state.restored nth 40", "latent"),
+    ],
+)
+def test_a_simulated_run_comes_to_its_class(ftm: str, fault: str, word: str) -> None:
+    result = carry_out(experiment(ftm, fault), lambda _: None)
+    assert (result.outcome, result.activated) == (word, True), result.reasons
+    assert result.unexpected is False, "nothing was expected of it"
+
+
+def test_what_never_fired_is_said_not_to_have_been_activated() -> None:
+    asked = experiment("pbr", "crash primary at server.exit nth 400", expected=("tolerated",))
+    result = carry_out(asked, lambda _: None)
+    assert (result.outcome, result.activated, result.unexpected) == ("masked", False, False)
+
+
+def test_a_recovery_over_its_budget_is_degraded() -> None:
+    asked = experiment("pbr", "crash primary at server.exit nth 9", budget_ms=0.01)
+    result = carry_out(asked, lambda _: None)
+    assert result.outcome == "degraded"
+    assert result.reasons[0].endswith("0.01 are allowed")
+
+
+def test_trouble_of_the_harness_is_an_outcome_and_not_a_pass() -> None:
+    kept: list[object] = []
+    result = carry_out(experiment("pbr", "crash nobody"), kept.append)
+    assert (result.outcome, result.activated) == ("harness_error", False)
+    assert "unknown target 'nobody'" in result.reasons[0]
+    assert kept == [result]
+
+
+def test_a_run_is_told_with_its_times() -> None:
+    result = carry_out(experiment("pbr", "crash primary at server.exit nth 9"), lambda _: None)
+    assert result.requests is not None and result.requests.sent == 40
+    assert result.recovery_ms is not None and result.detected_ms is not None
+    assert 0 < result.detected_ms < result.recovery_ms
+    assert isinstance(CLEAN, Run)

@@ -1,0 +1,132 @@
+"""JUnit XML: what a CI reads must be true, whole, and name the command that repeats the worst."""
+
+from pathlib import Path
+from typing import Final
+from xml.etree import ElementTree
+
+import msgspec
+import pytest
+from campaigns import result
+from reported import HOSTILE, hostile, mixed, named, summary_of, with_results
+
+from aftbed.campaign.experiment import Result
+from aftbed.campaign.ledger import Ledger
+from aftbed.campaign.report.junit import junit_xml
+from aftbed.campaign.spec import Gate
+
+SCHEMA: Final = {  # what junit-10.xsd and jenkins-junit.xsd both allow: attributes needed, allowed; children
+    "testsuites": ((), ("name", "time", "tests", "failures", "errors"), ("testsuite",)),
+    "testsuite": (
+        ("name", "tests", "failures", "errors"),
+        ("time", "skipped", "timestamp", "hostname", "id", "package"),
+        ("properties", "testcase", "system-out", "system-err"),
+    ),
+    "properties": ((), (), ("property",)),
+    "property": (("name", "value"), (), ()),
+    "testcase": (("name",), ("classname", "time"), ("skipped", "failure", "system-out", "system-err")),
+    "failure": ((), ("type", "message"), ()),
+}
+
+
+@pytest.fixture(scope="module")
+def ledger(tmp_path_factory: pytest.TempPathFactory) -> Ledger:
+    return mixed(tmp_path_factory.mktemp("mixed"))
+
+
+def suite_of(ledger: Ledger) -> ElementTree.Element:
+    root = ElementTree.fromstring(junit_xml(summary_of(ledger), ledger))
+    keeps_to_the_schema(root)
+    (suite,) = root
+    return suite
+
+
+def keeps_to_the_schema(element: ElementTree.Element) -> None:
+    needed, allowed, children = SCHEMA[element.tag]
+    assert set(needed) <= set(element.keys()) <= {*needed, *allowed}, element.attrib
+    places = [children.index(child.tag) for child in element]
+    assert places == sorted(places), f"{element.tag}: {[child.tag for child in element]}"
+    for child in element:
+        keeps_to_the_schema(child)
+
+
+def failures(suite: ElementTree.Element) -> dict[str, ElementTree.Element]:
+    cases = {case.get("name", ""): case.find("failure") for case in suite.iter("testcase")}
+    return {name: failure for name, failure in cases.items() if failure is not None}
+
+
+def some(*outcomes: str, reasons: tuple[str, ...] = (), activated: bool = True) -> list[Result]:
+    """Of one stratum."""
+    found = []
+    for index, outcome in enumerate(outcomes):
+        unexpected = outcome != "tolerated"
+        one = result(outcome, index=index, unexpected=unexpected, reasons=reasons, activated=activated)
+        experiment = msgspec.structs.replace(one.experiment, expected=("tolerated",))
+        found.append(msgspec.structs.replace(one, experiment=experiment))
+    return found
+
+
+def test_a_case_per_stratum_and_per_gate(ledger: Ledger) -> None:
+    suite, summary = suite_of(ledger), summary_of(ledger)
+    names = [(case.get("classname"), case.get("name")) for case in suite.iter("testcase")]
+    strata = [("aftbed.mixed", stratum.name) for stratum in summary.strata]
+    gates = [("aftbed.mixed.gates", f"{g.metric} {g.limit} in {g.strata}") for g in summary.gates]
+    assert names == strata + gates
+    assert suite.get("tests") == str(len(names)) and suite.get("failures") == str(len(failures(suite)))
+
+
+def test_properties_say_what_was_run(ledger: Ledger) -> None:
+    found = {p.get("name"): p.get("value") for p in suite_of(ledger).iter("property")}
+    summary = summary_of(ledger)
+    assert found["seed"] == "7" and found["code"] == ledger.head.code and found["gate"] == summary.gate
+    assert found["experiments"] == str(len(ledger.results))
+    assert {f"outcome.{name}": str(n) for name, n in summary.outcomes.items()}.items() <= found.items()
+
+
+def test_a_failure_says_why_and_how_to_repeat_the_worst(ledger: Ledger) -> None:
+    group = some("tolerated", "degraded", "sdc", "degraded", reasons=("because",))
+    failure = failures(suite_of(with_results(ledger, *group)))["pbr · crash"]
+    assert failure.get("type") == "unexpected"
+    assert failure.get("message", "").startswith(
+        "3 of 4 unexpected: tolerated 1, degraded 2, sdc 1; expected: tol"
+    )
+    lines = (failure.text or "").splitlines()
+    assert lines[1:] == [f"the worst: experiment {2:016x}: sdc", "because", group[2].experiment.command()]
+
+
+def test_a_gate_on_unexpected_that_holds_excuses_the_stratum(ledger: Ledger) -> None:
+    group = some("tolerated", "degraded")
+    assert failures(suite_of(with_results(ledger, *group, gates=(Gate("unexpected", max=1.0),)))) == {}
+    elsewhere = (Gate("unexpected", max=1.0, strata="lfr*"), Gate("sdc", max=1.0))
+    assert "pbr · crash" in failures(suite_of(with_results(ledger, *group, gates=elsewhere)))
+
+
+def test_a_gate_that_fails_names_the_worst_of_its_strata(ledger: Ledger) -> None:
+    group = [*some("sdc", "tolerated"), named(some("harness_error")[0], "lfr · crash")]
+    other = msgspec.structs.replace(group[2].experiment, id="f" * 16)
+    group[2] = msgspec.structs.replace(group[2], experiment=other)
+    found = failures(suite_of(with_results(ledger, *group, gates=(Gate("sdc", max=0.1, strata="pbr*"),))))
+    failure = found["sdc at most 0.1 in pbr*"]
+    assert failure.get("type") == "gate" and "and it may be" in failure.get("message", "")
+    assert f"experiment {0:016x}: sdc" in (failure.text or "")
+
+
+def test_a_stratum_that_could_not_have_failed_fails(ledger: Ledger) -> None:
+    found = failures(suite_of(with_results(ledger, *some("tolerated", "tolerated", activated=False))))
+    assert found["pbr · crash"].get("type") == "not_activated"
+    assert len(found) == 2  # and so does the gate that the campaign has for it
+
+
+def test_hostile_names_are_text_and_what_xml_cannot_say_is_replaced(ledger: Ledger) -> None:
+    found = failures(suite_of(with_results(ledger, hostile())))
+    assert HOSTILE.replace("\x01", "�") in found
+
+
+def test_no_results_no_cases_but_gates(ledger: Ledger) -> None:
+    cases = list(suite_of(with_results(ledger)).iter("testcase"))
+    assert {case.get("classname") for case in cases} == {"aftbed.mixed.gates"}
+
+
+def test_it_says_its_encoding(ledger: Ledger, tmp_path: Path) -> None:
+    path = tmp_path / "junit.xml"
+    path.write_text(junit_xml(summary_of(ledger), ledger), encoding="utf-8")
+    assert "pbr · steady · crash primary" in [c.get("name") for c in ElementTree.parse(path).iter("testcase")]

@@ -1,0 +1,56 @@
+"""The plan: the same for the same file and seed, and nothing else has a part in it."""
+
+from pathlib import Path
+
+import pytest
+from campaigns import CRASHES, planned
+
+from aftbed.campaign.planning import population
+
+
+def test_strata_take_turns_through_their_matrices(tmp_path: Path) -> None:
+    found = planned(tmp_path)
+    names = [s.name for s in found.strata]
+    assert names == ["pbr · crash", "pbr · nothing", "lfr · crash", "lfr · nothing", "none · nothing"]
+    experiments = list(found.experiments())
+    assert [e.index for e in experiments] == list(range(found.size)) == list(range(20))
+    assert [e.stratum for e in experiments[:5]] == names
+    events = [e.faults[0].split()[3] for e in experiments if e.stratum == names[0]]
+    assert events == ["server.exit", "reply.sent", "server.exit", "reply.sent"]
+
+
+def test_the_same_file_gives_the_same_plan(tmp_path: Path) -> None:
+    assert list(planned(tmp_path).experiments()) == list(planned(tmp_path).experiments())
+
+
+@pytest.mark.parametrize("change", [("seed: 3", "seed: 4"), ("requests: 30", "requests: 31")])
+def test_another_file_gives_other_ids(tmp_path: Path, change: tuple[str, str]) -> None:
+    first, other = planned(tmp_path), planned(tmp_path, CRASHES.replace(*change))
+    assert first.digest != other.digest
+    assert not {e.id for e in first.experiments()} & {e.id for e in other.experiments()}
+
+
+def test_more_experiments_leave_the_first_as_they_were(tmp_path: Path) -> None:
+    """What is drawn depends on the stratum and the number alone."""
+    few, many = planned(tmp_path), planned(tmp_path, CRASHES.replace("experiments: 4", "experiments: 9"))
+    drawn = {(e.stratum, e.number): (e.seed, e.faults) for e in many.experiments()}
+    assert all(drawn[e.stratum, e.number] == (e.seed, e.faults) for e in few.experiments())
+
+
+def test_what_is_drawn_covers_its_limits(tmp_path: Path) -> None:
+    found = planned(tmp_path, CRASHES.replace("experiments: 4", "experiments: 400"))
+    drawn = {int(e.faults[0].split()[-1]) for e in found.experiments() if e.faults}
+    assert drawn == set(range(1, 26))
+
+
+def test_the_fault_space_of_a_stratum_is_counted(tmp_path: Path) -> None:
+    found = planned(tmp_path)
+    assert [population(s.fault) for s in found.strata] == [50, 1, 50, 1, 1]
+
+
+def test_a_command_repeats_an_experiment(tmp_path: Path) -> None:
+    experiment = next(planned(tmp_path).experiments())
+    fault = experiment.faults[0]
+    assert experiment.command() == (
+        f"aftbed sim --ftm pbr --placement process --seed {experiment.seed} --count 30 --faults '{fault}'"
+    )

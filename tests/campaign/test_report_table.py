@@ -1,0 +1,113 @@
+"""The terminal: lines at the end, a picture while it runs; plain lines where nobody looks."""
+
+import io
+import os
+import pty
+import subprocess
+import sys
+from pathlib import Path
+
+import msgspec
+import pytest
+from campaigns import result
+from reported import mixed, summary_of, with_results
+
+from aftbed.campaign.ledger import Ledger
+from aftbed.campaign.report import table
+from aftbed.campaign.report.table import Progress, summary_lines
+
+
+@pytest.fixture(scope="module")
+def ledger(tmp_path_factory: pytest.TempPathFactory) -> Ledger:
+    return mixed(tmp_path_factory.mktemp("mixed"))
+
+
+def test_the_lines_name_strata_gates_and_last_the_verdict(ledger: Ledger) -> None:
+    summary = summary_of(ledger)
+    lines = summary_lines(summary)
+    assert lines[0] == f"campaign mixed, seed 7: {len(ledger.results)} experiments in 2.5 s"
+    assert lines[-1] == "gate: fail"
+    for stratum in summary.strata:
+        (line,) = [line for line in lines if line.startswith(f"{stratum.name}  ")]
+        assert ", ".join(f"{name} {count}" for name, count in stratum.outcomes.items()) in line
+    for gate in summary.gates:
+        assert any(
+            line.startswith(gate.word) and gate.metric in line and gate.limit in line for line in lines
+        )
+
+
+def test_columns_are_aligned(ledger: Ledger) -> None:
+    lines = summary_lines(summary_of(ledger))
+    head = next(line for line in lines if line.startswith("stratum "))
+    rows = lines[lines.index(head) + 1 : lines.index("", lines.index(head))]
+    assert rows and all(row[head.index("runs") - 1] == " " != row[head.index("runs")] for row in rows)
+
+
+def test_what_is_missing_is_said(ledger: Ledger) -> None:
+    summary = msgspec.structs.replace(summary_of(ledger), planned=1000)
+    assert f"{len(ledger.results)} of 1000 experiments" in summary_lines(summary)[0]
+    silent = with_results(ledger, result("masked", activated=False), result("masked", index=1))
+    assert any("2, 1 struck" in line for line in summary_lines(summary_of(silent)))
+    assert summary_lines(summary_of(with_results(ledger)))[-1] == "gate: fail"
+
+
+def test_plain_lines_where_stdout_is_no_terminal(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(table, "LINE_S", 0.0)
+    with Progress("try", 3) as progress:
+        progress.add(result("tolerated"))
+        progress.add(result("sdc", index=1, unexpected=True))
+    first, second = capsys.readouterr().out.splitlines()
+    assert first.startswith("1 of 3, ") and first.endswith(" left: tolerated 1")
+    assert second.startswith("2 of 3, ") and second.endswith(": tolerated 1, sdc 1; 1 unexpected")
+
+
+def test_quiet_is_quiet(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(table, "LINE_S", 0.0)
+    with Progress("try", 1, quiet=True) as progress:
+        progress.add(result())
+    assert capsys.readouterr().out == ""
+
+
+def test_no_lines_before_it_is_time(capsys: pytest.CaptureFixture[str]) -> None:
+    with Progress("try", 1) as progress:
+        progress.add(result())
+    assert capsys.readouterr().out == ""
+
+
+LIVE = """
+import sys, threading
+sys.path.insert(0, {folder!r})
+from campaigns import result
+from aftbed.campaign.report import table
+table.REDRAW_S = 0.0
+with table.Progress("try", 40) as progress:
+    for index in range(40):
+        progress.add(result("tolerated", f"pbr {{index}}", index, unexpected=index == 7))
+    assert threading.active_count() == 1, "a thread would be forked with the workers"
+"""
+
+
+def test_a_terminal_gets_a_picture_that_goes_away() -> None:
+    """In a real one: the picture is redrawn in place, and no thread draws it."""
+    master, slave = pty.openpty()
+    code = LIVE.format(folder=str(Path(__file__).parent))
+    environment = os.environ | {"TERM": "xterm", "COLUMNS": "120", "LINES": "60"}
+    child = subprocess.Popen([sys.executable, "-c", code], stdout=slave, stderr=slave, env=environment)
+    os.close(slave)
+    seen = io.BytesIO()
+    while data := _read(master):
+        seen.write(data)
+    os.close(master)
+    assert child.wait(60) == 0, seen.getvalue().decode()
+    said = seen.getvalue().decode()
+    assert "40 of 40" in said and "1 unexpected" in said and "pbr 0" in said
+    assert "and 10 more strata" in said and "\x1b[1A" in said
+
+
+def _read(descriptor: int) -> bytes:
+    try:
+        return os.read(descriptor, 65536)
+    except OSError:  # the other end is closed
+        return b""

@@ -1,0 +1,96 @@
+"""A campaign file: what is wrong with it is said with file, line and key, before anything runs."""
+
+import re
+from pathlib import Path
+
+import msgspec
+import pytest
+from campaigns import CRASHES, planned, written
+
+from aftbed.campaign.planning import plan
+from aftbed.campaign.spec import Spec, read_spec, shipped
+from aftbed.core.errors import ConfigError
+
+
+def refusal(folder: Path, text: str) -> str:
+    with pytest.raises(ConfigError) as refused:
+        plan(read_spec(str(written(folder, text))))
+    return str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("seed: 3", "sed: 3", r"try.yaml: line 3: unknown key 'sed'; did you mean 'seed'\?"),
+        ("seed: 3", "seed: -1", r"line 3: seed: found -1, allowed is a whole number at least 0"),
+        ("requests: 30", "requests: 30 Hz", r"line 4: system.requests: found '30 Hz', allowed is a whole"),
+        ("runtime: sim", "runtime: ros", r"line 4: system.runtime: found 'ros', allowed is one of"),
+        ("[pbr, lfr, none]", "[pbr, lfx]", r"mechanisms: unknown name 'lfx'; did you mean 'lfr'"),
+        ("[pbr, lfr, none]", "[]", r"line 5: mechanisms: found \[\], allowed is a list"),
+        ("{event}", "{evnt}", r"'evnt'.* stands neither in matrix nor in draw"),
+        (
+            "server.exit",
+            "server.exot",
+            r"'crash' under pbr: unknown event 'server.exot'; did you mean 'server.exit'",
+        ),
+        (
+            "crash primary",
+            "crash primry",
+            r"'crash' under pbr: unknown target 'primry'; did you mean 'primary'",
+        ),
+        ("[server.exit, reply.sent]", "[]", r"faults\[0\].matrix.event: it is empty"),
+        ("[1, 25]", "[25, 1]", r"faults\[0\].draw.nth: found \[25, 1\], allowed is \[lowest, highest\]"),
+        ("[1, 25]", "[1, 25]}\n  bits: {", r"faults\[0\]: unknown key 'bits'"),
+        (
+            "[tolerated]",
+            "[tolerable]",
+            r"faults\[0\].expect.\*: unknown name 'tolerable'; did you mean 'tolerated'",
+        ),
+        ("name: nothing", "name: crash", r"faults: 'crash' stands twice"),
+        (
+            "stop: {experiments: 4}",
+            "stop: {experiments: 0}",
+            r"stop.experiments: found 0, allowed is a whole",
+        ),
+        (
+            "stop: {experiments: 4}",
+            "gates: [{metric: sdcc, max: 0.1}]",
+            r"gates\[0\].metric: unknown metric 'sdcc'; did you mean 'sdc'",
+        ),
+        ("stop: {experiments: 4}", "gates: [{metric: sdc}]", r"gates\[0\]: either max or min"),
+        ("campaign: try", "campaign: [", r"try.yaml: line \d+: "),
+        ("seed: 3", "seed: 3\nseed: 4", r"line 4: key 'seed' stands twice"),
+    ],
+)
+def test_what_is_wrong_is_named(tmp_path: Path, old: str, new: str, said: str) -> None:
+    assert old in CRASHES
+    found = refusal(tmp_path, CRASHES.replace(old, new))
+    assert re.search(said, found), found
+    assert str(tmp_path / "try.yaml") in found or "under" in found
+
+
+def test_a_campaign_that_does_not_exist_is_named_with_those_that_do() -> None:
+    with pytest.raises(ConfigError, match=r"unknown campaign 'crsh'; did you mean 'crash'"):
+        read_spec("crsh")
+
+
+@pytest.mark.parametrize("name", shipped())
+def test_a_shipped_campaign_can_be_run(name: str) -> None:
+    """Every experiment of it is checked against the graph that it will find."""
+    spec = read_spec(name)
+    assert spec.campaign == name and spec.about
+    assert plan(spec).size > 0
+
+
+def test_the_schema_knows_every_key() -> None:
+    """For editors: a key that the reader takes is in it, and no other is allowed."""
+    definitions = msgspec.json.schema(Spec)["$defs"]
+    assert set(definitions["Spec"]["properties"]) == set(Spec.__struct_fields__)
+    assert all(d["additionalProperties"] is False for name, d in definitions.items() if "properties" in d)
+
+
+def test_an_event_that_a_mechanism_never_emits_is_refused(tmp_path: Path) -> None:
+    text = CRASHES.replace("server.exit", "checkpoint.sent")
+    assert "'crash' under lfr: event 'checkpoint.sent' cannot trigger a fault" in refusal(tmp_path, text)
+    only = text.replace("mechanisms: [pbr, lfr]\n  expect", "mechanisms: [pbr]\n  expect")
+    assert planned(tmp_path, only).size == 16

@@ -1,0 +1,146 @@
+"""`aftbed campaign`, in the simulator: the way of a user from a file to a gate."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+from playedrun import Call, Run
+
+SPEC = """
+campaign: try
+seed: 3
+system: {requests: 30, runtime: sim}
+mechanisms: [pbr, none]
+faults:
+- name: crash
+  fault: crash primary at server.exit nth {nth}
+  draw: {nth: [1, 25]}
+  expect: {pbr: [tolerated], none: [unavailable]}
+stop: {experiments: 12}
+gates:
+- {metric: unexpected, max: 0.2}
+- {metric: failed, max: 0.3, strata: "pbr*"}
+"""
+
+
+@pytest.fixture
+def spec(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "try.yaml"
+    path.write_text(SPEC)
+    return path
+
+
+def test_from_a_file_to_a_gate(spec: Path, call: Call) -> None:
+    code, out, err = call("campaign", "run", spec, "--jobs", "1", "--json")
+    assert code == 0, err
+    document = json.loads(out)
+    assert (document["campaign"], document["experiments"], document["gate"]) == ("try", 24, "pass")
+    assert document["outcomes"] == {"tolerated": 12, "unavailable": 12}
+    assert [s["name"] for s in document["strata"]] == ["pbr · crash", "none · crash"]
+    folder = spec.parent / "campaign-try"
+    assert json.loads((folder / "summary.json").read_text()) == document
+    assert {p.name for p in folder.iterdir()} == {"records.jsonl", "summary.json", "junit.xml", "report.html"}
+
+
+def test_a_gate_that_is_not_kept_fails_the_build(spec: Path, call: Call) -> None:
+    spec.write_text(SPEC.replace("pbr: [tolerated]", "pbr: [masked]"))
+    code, out, _ = call("campaign", "run", spec, "--jobs", "1", "--out", "out")
+    assert code == 1
+    assert "gate: fail" in out.splitlines()
+    assert re.search(r"fail +unexpected +\* +at most 0.2 +0.5 ", out), out
+
+
+def test_what_is_there_is_reported_again(spec: Path, told: Run) -> None:
+    first = json.loads(told("campaign", "run", spec, "--out", "out", "--json"))
+    again = json.loads(told("campaign", "report", "out", "--json"))
+    assert first | {"seconds": 0} == again | {"seconds": 0}
+
+
+def test_shards_are_merged(spec: Path, told: Run, call: Call) -> None:
+    whole = json.loads(told("campaign", "run", spec, "--out", "whole", "--json"))
+    for shard in (1, 2):
+        call("campaign", "run", spec, "--shard", f"{shard}/2", "--out", f"part{shard}")
+    merged = json.loads(told("campaign", "merge", "part1", "part2", "--out", "merged", "--json"))
+    assert merged["strata"] == whole["strata"] and merged["gates"] == whole["gates"]
+
+
+def test_a_plan_runs_nothing(spec: Path, told: Run) -> None:
+    shown = told("campaign", "plan", spec, "--experiments", "3", "--out", "plan.jsonl")
+    assert "6 experiments at most" in shown
+    assert len((spec.parent / "plan.jsonl").read_text().splitlines()) == 6
+    assert not (spec.parent / "campaign-try").exists()
+
+
+def test_an_experiment_is_replayed(spec: Path, told: Run) -> None:
+    told("campaign", "run", spec, "--out", "out", "--json")
+    found = json.loads(told("campaign", "replay", "out", "1", "--json"))
+    assert found["before"]["outcome"] == found["after"]["outcome"] == "unavailable"
+    shown = told("campaign", "replay", "out", "1")
+    assert "aftbed sim --ftm none --placement process --seed" in shown
+
+
+def test_an_experiment_is_shrunk(spec: Path, told: Run) -> None:
+    told("campaign", "run", spec, "--out", "out", "--json")
+    found = json.loads(told("campaign", "shrink", "out", "1", "--json"))
+    assert found["ftm"] == "none" and found["requests"] == 1
+    assert found["faults"] == ["crash primary at server.exit nth 1"]
+
+
+def test_two_campaigns_are_compared(spec: Path, told: Run, call: Call) -> None:
+    told("campaign", "run", spec, "--out", "base", "--json")
+    same = json.loads(told("campaign", "compare", "base", "base", "--json"))
+    assert not same["worse"] and [c["pairs"] for c in same["changes"]] == [12, 12]
+    records = spec.parent / "base" / "records.jsonl"
+    worse = records.read_text().replace('"outcome":"tolerated"', '"outcome":"sdc"')
+    (spec.parent / "new").mkdir()
+    (spec.parent / "new" / "records.jsonl").write_text(worse)
+    code, out, _ = call("campaign", "compare", "base", "new")
+    assert code == 1
+    assert re.search(r"pbr · crash +12 pairs: 0 failed only before, 12 only now .*: worse", out), out
+
+
+@pytest.mark.parametrize("name", ["out.csv", "out.parquet"])
+def test_results_are_exported(spec: Path, told: Run, name: str) -> None:
+    told("campaign", "run", spec, "--out", "out", "--json")
+    told("campaign", "export", "out", "--out", name)
+    assert (spec.parent / name).stat().st_size > 1000
+
+
+def test_the_schema_is_for_editors(told: Run) -> None:
+    assert json.loads(told("campaign", "schema"))["$ref"] == "#/$defs/Spec"
+
+
+def test_the_shipped_campaigns_are_listed(told: Run) -> None:
+    names = [line.split()[0] for line in told("campaign", "list").splitlines()]
+    assert names == ["adaptation", "assumptions", "bitflip", "ci-smoke", "crash", "paper-recipe"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("run", "none-such"), "unknown campaign 'none-such'"),
+        (("run", "nowhere.yaml"), "nowhere.yaml: cannot be read: No such file"),
+        (("run", "crash", "--shard", "3/2"), "--shard '3/2': I/N is allowed, I from 1 to N"),
+        (("run", "crash", "--jobs", "0"), "--jobs 0: 1 to "),
+        (("run", "crash", "--experiments", "0"), "--experiments 0: 1 to 1000000 are allowed"),
+        (("run", "crash", "--seed", "-1"), "--seed -1: 0 or more is allowed"),
+        (("run", "crash", "--runtime", "ros"), "unknown runtime 'ros'"),
+        (("run", "crash", "--executor", "dask"), "--executor dask and --scheduler ADDRESS go together"),
+        (("run", "crash", "--executor", "slurm"), "unknown executor 'slurm'"),
+        (
+            ("run", "crash", "--resume", "--out", "x"),
+            "x/records.jsonl: No such file or directory; is this the",
+        ),
+        (("report", "x"), "x/records.jsonl: No such file or directory; is this the"),
+        (("export", "x", "--out", "y.ods"), "unknown kind of file '.ods'; did you mean '.csv'?"),
+        (("replay", "x", "1"), "x/records.jsonl: No such file or directory; is this the"),
+    ],
+)
+def test_bad_input_is_refused_and_nothing_is_run(
+    refused: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], said: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert said in refused("campaign", *arguments)
+    assert list(tmp_path.iterdir()) == []

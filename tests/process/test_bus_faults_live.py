@@ -1,0 +1,87 @@
+"""Faults of the bus in whole runs: armed before the drive or from a second command, with their receipts."""
+
+from pathlib import Path
+from typing import Final
+
+import pytest
+from liveruns import Command, Home, Started, aftbed
+
+from aftbed.runtime.unix.options import CarRun
+
+pytestmark = pytest.mark.process
+
+DRIVE: Final = ("--scenario", "ccrs-20", "--pace", "max", "--json")
+
+
+def test_a_drive_is_disturbed_and_the_receipt_says_how(tmp_path: Path) -> None:
+    """In lockstep, so it is one frame of one cycle, and the same one whenever it is run again."""
+    words, logs = "corrupt bus RADAR_TRACK bit 21 nth 50", []
+    for number in range(2):
+        record = tmp_path / str(number)
+        done = aftbed("run", *DRIVE, "--inject", words, "--record", record)
+        assert done.code == 0, done.out + done.err
+        detail = "1 frame, at 0.980000 s, id 130; noticed by gateway (checksum)"
+        expected = {"fault": words, "receipt": "activated", "detail": detail}
+        assert done.verdict().faults == [expected]
+        logs.append([line for line in (record / "bus.log").read_text().splitlines() if " 70" not in line])
+    assert logs[0] == logs[1] and logs[0]
+
+
+def test_the_end_counts_all_that_was_struck() -> None:
+    done = aftbed("run", *DRIVE, "--inject", "duplicate bus EGO_STATE after 1s for 205ms")
+    (found,) = done.verdict().faults
+    assert found["receipt"] == "activated" and found["detail"].startswith(
+        "21 frames, the first at 1.000000 s"
+    )
+
+
+def test_a_fault_on_a_condition_in_real_time() -> None:
+    words = "bus-off gateway when gap < 15 for 100ms"
+    done = aftbed("run", "--scenario", "ccrs-20", "--pace", "4", "--json", "--inject", words)
+    (found,) = done.verdict().faults
+    assert found["receipt"] == "activated", done.out
+    assert done.verdict().vehicle is not None and done.code == 0, done.out
+
+
+def test_a_fault_that_never_strikes_proves_nothing() -> None:
+    done = aftbed("run", *DRIVE, "--inject", "omission bus RADAR_TRACK nth 100000")
+    assert done.code == 3
+    assert [fault["receipt"] for fault in done.verdict().faults] in (["armed"], ["not_activated"])
+
+
+def test_a_live_run_is_disturbed_from_a_second_command(home: Home) -> None:
+    with Started(home, CarRun("ccrs-50", 1.0, "latch")) as started:
+        started.wait_for("started")
+        done = aftbed("inject", "bus", "omission bus AEB_REQ for 100ms")
+        assert done.code == 0, done.err
+        assert "omission bus AEB_REQ for 100ms" in done.err
+        started.wait_for("fault", "activated")
+        outcome = started.finish()
+    (found,) = outcome.verdict.faults
+    assert found["receipt"] == "activated" and found["detail"].endswith("noticed by brake (fallback)")
+    assert outcome.verdict.verdict == "pass"
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        ("omission bus RADAR_TRAC", "unknown message 'RADAR_TRAC'; did you mean 'RADAR_TRACK'?"),
+        ("bus-off wheel", "unknown node of the bus 'wheel'"),
+        ("delay bus AEB_REQ", "'by' is missing"),
+    ],
+)
+def test_what_is_not_on_the_bus_is_refused_before_anything_starts(words: str, says: str) -> None:
+    done = aftbed("run", *DRIVE, "--inject", words)
+    assert done.code == 2 and says in done.err, done.err
+    assert done.out == ""
+
+
+def test_a_load_has_no_bus() -> None:
+    done = aftbed("run", "--load", "10", "--inject", "omission bus AEB_REQ")
+    assert done.code == 2 and "a run of --load has no bus" in done.err
+    with Command("--load", "100000@200") as command:
+        command.started()
+        live = aftbed("inject", "bus", "omission bus AEB_REQ")
+        assert live.code == 2 and "a run of --load has no bus" in live.err
+        assert aftbed("stop").code == 0
+        assert command.done().code == 0

@@ -1,0 +1,97 @@
+"""A campaign on real processes: killed at any moment, gone on with; complete, nothing left, nothing twice."""
+
+import json
+import signal
+import subprocess
+import sys
+from functools import partial
+from pathlib import Path
+from random import Random
+
+import pytest
+from liveruns import GONE_SECONDS_MAX, Home, aftbed, until
+
+from aftbed.campaign import ledger
+from aftbed.core.errors import ConfigError
+
+pytestmark = pytest.mark.process
+
+SPEC = """
+campaign: live
+seed: 2
+system: {requests: 40}
+mechanisms: [pbr, lfr]
+faults:
+- name: crash
+  fault: crash primary at {event} nth {nth}
+  matrix: {event: [server.exit, reply.sent]}
+  draw: {nth: [1, 35]}
+  expect: {"*": [tolerated, degraded]}
+- name: nothing
+  expect: {"*": [masked, degraded]}
+stop: {experiments: 6}
+unknown_max: 1.0
+not_activated_max: 1.0
+"""
+MOMENTS = 10
+EXPERIMENTS = 24
+
+
+@pytest.fixture
+def spec(tmp_path: Path) -> Path:
+    path = tmp_path / "live.yaml"
+    path.write_text(SPEC)
+    return path
+
+
+def done(out: Path) -> int:
+    """How many experiments the ledger has by now."""
+    try:
+        return max(0, (out / ledger.NAME).read_bytes().count(b"\n") - 1)
+    except OSError:
+        return 0
+
+
+def reached(out: Path, mark: int, running: subprocess.Popen[bytes]) -> bool:
+    """Whether more than `mark` are done, or no more will come."""
+    return done(out) > mark or running.poll() is not None
+
+
+def test_a_campaign_that_is_killed_again_and_again_comes_to_its_end(
+    home: Home, spec: Path, tmp_path: Path
+) -> None:
+    out, chance = tmp_path / "out", Random(7)
+    marks = sorted(chance.sample(range(EXPERIMENTS), MOMENTS))
+    command = [sys.executable, "-m", "aftbed", "campaign", "run", str(spec), "--out", str(out), "--jobs", "2"]
+    for number, mark in enumerate(marks):
+        resumed = ["--resume"] if number else []
+        running = subprocess.Popen([*command, *resumed], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        try:
+            until(partial(reached, out, mark, running), f"experiment {mark}")
+            running.send_signal(signal.SIGKILL)
+            running.wait()
+        finally:
+            running.kill()
+            running.wait()
+        assert home.seconds_to_clean() < GONE_SECONDS_MAX, home.left()
+    ended = aftbed(*command[3:], "--resume", "--json")
+    assert ended.code in (0, 1), ended.err
+    document = json.loads(ended.out)
+    assert (document["experiments"], document["planned"]) == (EXPERIMENTS, EXPERIMENTS)
+    found = ledger.read(out / ledger.NAME)  # refuses what stands twice
+    assert [r.experiment.index for r in found.results] == list(range(EXPERIMENTS))
+    assert all(r.activated for r in found.results)
+    assert not any(r.unexpected for r in found.results), [r for r in found.results if r.unexpected]
+    assert not home.left()
+
+
+def test_the_records_are_complete_before_a_run_is_taken_down(home: Home, spec: Path, tmp_path: Path) -> None:
+    """Whatever is in the ledger is a whole result: there is no torn line, wherever it was killed."""
+    out = tmp_path / "out"
+    ended = aftbed("campaign", "run", spec, "--out", out, "--experiments", "1", "--json")
+    assert ended.code in (0, 1), ended.err
+    assert done(out) == 4
+    with pytest.raises(ConfigError, match="stands twice"):
+        lines = (out / ledger.NAME).read_bytes().splitlines(keepends=True)
+        (out / ledger.NAME).write_bytes(b"".join((*lines, lines[-1])))
+        ledger.read(out / ledger.NAME)

@@ -1,0 +1,85 @@
+"""What `aftbed doctor` says of a machine: what can be made wrong here is found, and has a remedy."""
+
+import os
+import resource
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from aftbed.runtime.unix import inspection, rundir
+from aftbed.runtime.unix.inspection import Check, inspect
+
+
+@pytest.fixture
+def limits() -> Iterator[None]:
+    """What a test changes of this process is as before when it ends."""
+    files, cpus = resource.getrlimit(resource.RLIMIT_NOFILE), os.sched_getaffinity(0)
+    yield
+    resource.setrlimit(resource.RLIMIT_NOFILE, files)
+    os.sched_setaffinity(0, cpus)
+
+
+@pytest.fixture(autouse=True)
+def runtime(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    return tmp_path
+
+
+def found(name: str) -> Check:
+    return next(check for check in inspect() if check.name == name)
+
+
+def test_a_machine_that_runs_the_tests_has_what_a_run_needs() -> None:
+    checks = {check.name: check for check in inspect()}
+    assert [c for c in checks.values() if c.status == "missing"] == []
+    for name in ("pidfd", "memfd", "parent death signal", "packet sockets", "loopback", "/proc"):
+        assert (checks[name].status, checks[name].found) == ("ok", "works")
+    assert checks["asserts"].found == "on"
+    assert checks["run directory"].found == f"{rundir.root()}, mode 0700"
+
+
+def test_what_is_not_well_has_a_remedy() -> None:
+    for check in inspect():
+        assert check.found and check.serves
+        assert bool(check.remedy) == (check.status != "ok"), check
+
+
+def test_a_call_that_is_refused_is_missing() -> None:
+    def refused() -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    check = inspection._tried("pidfd", "deaths", "allow it", refused)
+    assert (check.status, check.remedy) == ("missing", "allow it")
+    assert "Operation not permitted" in check.found
+
+
+@pytest.mark.parametrize(("files", "status"), [(200, "missing"), (512, "warning"), (1024, "ok")])
+def test_few_open_files(limits: None, files: int, status: str) -> None:
+    resource.setrlimit(resource.RLIMIT_NOFILE, (files, resource.getrlimit(resource.RLIMIT_NOFILE)[1]))
+    check = found("open files")
+    assert check.status == status
+    assert check.found.startswith(f"{files} of at most ")
+    assert check.remedy == ("" if status == "ok" else "ulimit -n 1024")
+
+
+def test_one_cpu(limits: None) -> None:
+    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+    check = found("CPUs")
+    assert check.status == "warning" and check.found == f"1 usable of {os.cpu_count()}"
+
+
+def test_a_path_that_is_too_long_for_a_socket(runtime: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    deep = runtime / ("d" * 100)
+    deep.mkdir()
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(deep))
+    check = found("run directory")
+    assert check.status == "missing" and check.found.endswith("bytes too long for a socket's path")
+    assert check.remedy == "set XDG_RUNTIME_DIR or TMPDIR to a shorter path"
+
+
+def test_a_package_that_is_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(inspection.OPTIONAL, "no-such-package-of-aftbed", "nothing")
+    check = found("no-such-package-of-aftbed")
+    assert (check.status, check.found) == ("warning", "not installed")
+    assert check.remedy == "pip install no-such-package-of-aftbed"

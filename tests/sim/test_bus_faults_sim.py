@@ -1,0 +1,76 @@
+"""Faults of the bus in simulated runs: the same words, the same receipts, under every mechanism."""
+
+from typing import Final
+
+import pytest
+
+from aftbed.inject.words import parse
+from aftbed.runtime.sim.world import Run, Setup, World, simulate
+
+DRIVE: Final = "ccrs-20"
+
+
+def drive(*faults: str, ftm: str = "pbr", seed: int = 1) -> Run:
+    return simulate(Setup(ftm=ftm, seed=seed, scenario=DRIVE, faults=tuple(map(parse, faults))))
+
+
+@pytest.mark.parametrize("ftm", ["none", "pbr", "lfr+tr"])
+@pytest.mark.parametrize(
+    ("words", "noticed"),
+    [
+        (
+            "corrupt bus RADAR_TRACK bit 21 nth 50",
+            "1 frame, at 0.980000 s, id 130; noticed by gateway (checksum)",
+        ),
+        (
+            "stuck-counter bus RADAR_TRACK nth 50",
+            "1 frame, at 0.980000 s, id 130; noticed by gateway (repeated)",
+        ),
+        (
+            "corrupt bus RADAR_TRACK signal LATERAL_OFFSET=9 crc good nth 50",
+            "1 frame, at 0.980000 s, id 130; believed by gateway",
+        ),
+    ],
+)
+def test_a_frame_is_struck_and_who_noticed_is_said(words: str, noticed: str, ftm: str) -> None:
+    run = drive(words, ftm=ftm)
+    assert run.faults == ({"fault": words, "receipt": "activated", "detail": noticed},)
+    assert run.rest.why_not == ()
+    assert run.vehicle is not None and not run.vehicle.collision
+
+
+def test_the_same_seed_is_the_same_run() -> None:
+    words = ("omission bus from radar intermittent p 0.1", "crash primary at reply.sent nth 60")
+    first, again, other = drive(*words), drive(*words), drive(*words, seed=2)
+    assert first.faults == again.faults and first.vehicle == again.vehicle
+    assert first.history.dialogue == again.history.dialogue
+    assert first.faults != other.faults
+
+
+def test_a_held_back_track_makes_its_request_when_it_comes() -> None:
+    run = drive("delay bus RADAR_TRACK by 7ms for 1s")
+    sent = [e.t_ns for e in run.history.dialogue if e.kind.name == "SENT"]
+    offsets = {round((t_ns - sent[-1]) / 1e6) % 20 for t_ns in sent}
+    assert offsets == {0, 7}
+    assert run.faults[0]["receipt"] == "activated"
+
+
+def test_a_bus_that_is_cut_for_a_while_leaves_a_run_that_comes_to_rest() -> None:
+    run = drive("bus-off gateway after 1s for 300ms", "partition radar|gateway after 2s for 300ms")
+    assert [fault["receipt"] for fault in run.faults] == ["activated", "activated"]
+    assert run.rest.why_not == () and run.vehicle is not None and not run.vehicle.collision
+
+
+def test_a_live_run_is_disturbed() -> None:
+    world = World(Setup(seed=1, scenario=DRIVE))
+    world.start()
+    world.advance(world.loop.ns + 1_000_000_000)
+    world.inject(parse("omission bus AEB_REQ for 100ms"))
+    world.end()
+    (fault,) = world.outcome().faults
+    assert fault["receipt"] == "activated" and fault["detail"].startswith("5 frames")
+
+
+def test_a_fault_that_is_never_due_stays_armed() -> None:
+    (fault,) = drive("omission bus RADAR_TRACK nth 100000").faults
+    assert fault["receipt"] in ("armed", "not_activated")

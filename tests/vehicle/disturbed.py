@@ -1,0 +1,143 @@
+"""The same drive with the same faults, over a real hub in lockstep and in virtual time."""
+
+import threading
+from collections import deque
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+
+import msgspec
+from busharness import DEADLINE_S, RunningHub, running_hub
+from puredrive import CODEC
+
+from aftbed.core.busfault import BusFault, Struck
+from aftbed.core.errors import HarnessError
+from aftbed.inject.buswords import parse
+from aftbed.vehicle.aim import aimed
+from aftbed.vehicle.bus import BusOptions, open_bus
+from aftbed.vehicle.candump import read_log
+from aftbed.vehicle.car import CarBuses, DriveOptions, DriveReport, drive
+from aftbed.vehicle.frame import Frame
+from aftbed.vehicle.function import default_application
+from aftbed.vehicle.gateway import ClientGateway, Gateway
+from aftbed.vehicle.hubclient import HubOptions
+from aftbed.vehicle.report import VehicleResult
+from aftbed.vehicle.scenario import load_scenario
+from aftbed.vehicle.virtual import VirtualCar
+
+FIRST_NUMBER = 7
+SEED = 5
+
+
+def fault(words: str) -> BusFault:
+    return aimed(parse(words), [CODEC])
+
+
+class Disturbed(msgspec.Struct):
+    """A drive that came to its end."""
+
+    frames: list[Frame]
+    result: VehicleResult
+    struck: list[Struck]
+    refused: dict[str, int]
+    report: DriveReport | None = None
+
+    def of(self, can_id: int) -> list[Frame]:
+        """The frames of one identifier, as they were on the bus."""
+        return [frame for frame in self.frames if frame.can_id == can_id]
+
+    @property
+    def ids(self) -> set[int]:
+        return {frame.can_id for frame in self.frames}
+
+
+class NamedGateway:
+    """The client process in a thread, as `runtime.unix.gateway` is: it says its name, and what it notices."""
+
+    def __init__(self, options: BusOptions) -> None:
+        self.gateway = ClientGateway(Gateway(CODEC))
+        self._function = default_application()
+        self._bus = open_bus(msgspec.structs.replace(options, node="gateway", uses=self.gateway.uses()))
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> "NamedGateway":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        self._thread.join(DEADLINE_S)
+        assert not self._thread.is_alive()
+        self._bus.close()
+
+    def _run(self) -> None:
+        while not self._over.is_set():
+            try:
+                frame = self._bus.recv(0.02)
+                if frame is not None:
+                    self._hear(frame)
+            except HarnessError:  # the hub went first
+                return
+
+    def _hear(self, frame: Frame) -> None:
+        payload = self.gateway.on_frame(frame)
+        if payload is not None:
+            for answer in self.gateway.on_reply(self._function.execute(payload), 1, 1):
+                self._bus.send(answer)
+        elif self.gateway.makes_requests(frame.can_id):
+            self._bus.unasked(frame.can_id)
+        for can_id, word in self.gateway.noticed():
+            self._bus.notice(can_id, word)
+
+
+def arm(hub: RunningHub, faults: tuple[str, ...]) -> None:
+    for number, words in enumerate(faults, FIRST_NUMBER):
+        one = fault(words)
+        hub.order(lambda it, number=number, one=one: it.disturb(number, one, SEED))  # type: ignore[misc]
+
+
+def real(
+    log: Path, *faults: str, pace: float | None = None, then: Callable[[RunningHub, int], None] | None = None
+) -> Disturbed:
+    """Over a hub on 127.0.0.1. `then` is called with the hub and the time, each 50 ms of bus time."""
+    lockstep = pace is None
+    with (
+        running_hub(log, HubOptions(lockstep=lockstep, pace=pace or 1.0)) as hub,
+        NamedGateway(hub.options) as gateway,
+        closing(CarBuses(hub.options, lockstep=lockstep, hears=(CODEC.can_id("AEB_REQ"),))) as buses,
+    ):
+        arm(hub, faults)
+        report = drive(
+            load_scenario("ccrs-50"),
+            CODEC,
+            buses,
+            DriveOptions(pace=pace, seed=SEED),
+            report=lambda telemetry: then(hub, telemetry.t_ms) if then is not None else None,
+            stop=lambda: False,
+        )
+        struck, refused = hub.struck(), dict(gateway.gateway.counts.refused)
+    frames = [entry.frame for entry in read_log(log)[0]]
+    return Disturbed(frames, report.result, struck, refused, report)
+
+
+def virtual(*faults: str, late_ns: int = 0, tick_ns: int | None = None) -> Disturbed:
+    """In virtual time; each reply comes that late. `tick_ns` advances the car that often as well."""
+    frames: list[Frame] = []
+    car = VirtualCar(load_scenario("ccrs-50"), seed=SEED, codec=CODEC, witness=frames.append)
+    for number, words in enumerate(faults, FIRST_NUMBER):
+        car.disturb(number, parse(words), SEED, 0)
+    function, now_ns = default_application(), 0
+    replies: deque[tuple[int, bytes]] = deque()
+    while (due_ns := car.due_ns()) is not None:
+        next_ns = due_ns if tick_ns is None else min(due_ns, now_ns + tick_ns)
+        now_ns = min(next_ns, replies[0][0]) if replies else next_ns
+        while replies and replies[0][0] <= now_ns:
+            car.deliver(replies.popleft()[1], now_ns)
+        for payload in car.advance(now_ns):
+            reply = function.execute(payload)
+            if late_ns:
+                replies.append((now_ns + late_ns, reply))
+            else:
+                car.deliver(reply, now_ns)
+    return Disturbed(frames, car.result(), car.struck(), dict(car.counts.refused))
