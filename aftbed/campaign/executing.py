@@ -60,7 +60,7 @@ def carry_out(experiment: Experiment, keep: Keep) -> Result:
 
     def kept_if_quiet(result: Result) -> None:
         noisy = result.noisy or noisy_before or (not simulated and _probe().noisy())
-        once(_without_times(result) if noisy else result)
+        once(without_times(result) if noisy else result)
 
     try:
         (_simulated if simulated else _real)(experiment, kept_if_quiet)
@@ -83,7 +83,7 @@ def _warm_up(name: str) -> None:
     spawn.warm_up(name)
 
 
-def _without_times(result: Result) -> Result:
+def without_times(result: Result) -> Result:
     """What can be said of a run on a machine that was too busy."""
     reasons = ("the machine was too busy for times to mean anything", *result.reasons)
     false_alarm = result.outcome == "tolerated" and result.unexpected

@@ -143,7 +143,7 @@ def reorder(
 
 @inject.command()
 def bitflip(
-    place: Annotated[str, typer.Argument(help="result, state, request, checkpoint or log.")],
+    place: Annotated[str, typer.Argument(help="result, state, state.FIELD, request, checkpoint or log.")],
     bit: Annotated[
         str | None, typer.Option("--bit", help="From bit 0 of byte 0; else drawn by the seed.")
     ] = None,

@@ -4,9 +4,28 @@ The mechanisms (`ftm`) and the car (`vehicle`) are strangers to each other; this
 know in common. Requests, replies and states are opaque bytes to the mechanism.
 """
 
-from typing import Protocol
+import re
+from typing import Final, Literal, Protocol
 
 import msgspec
+
+from aftbed.core.errors import ConfigError, unknown
+
+Width = Literal["u8", "u32", "i64", "u64", "f64"]
+BITS: Final[dict[Width, int]] = {"u8": 8, "u32": 32, "i64": 64, "u64": 64, "f64": 64}
+
+
+class Field(msgspec.Struct, frozen=True):
+    """A variable in the state as `capture` gives it, little-endian: bit 0 is the one of least weight."""
+
+    name: str
+    kind: Width
+    offset_bytes: int
+
+    @property
+    def size_bits(self) -> int:
+        """How wide it is."""
+        return BITS[self.kind]
 
 
 class Characteristics(msgspec.Struct, frozen=True):
@@ -22,6 +41,8 @@ class Characteristics(msgspec.Struct, frozen=True):
 
 class Application(Protocol):
     """A protected function. What it declares is believed, and measured by campaigns.
+
+    One whose state has a fixed layout may declare it, as `fields: tuple[Field, ...]`: see `fields_of`.
 
     `execute` is the only thing that changes the state. No clock, no chance, no I/O: time comes
     in with the request.
@@ -47,3 +68,19 @@ class Application(Protocol):
         Looks at nothing but these two, and changes nothing.
         """
         ...
+
+
+def fields_of(application: Application | type[Application]) -> tuple[Field, ...]:
+    """The variables that the state consists of, where the function says so; else none."""
+    fields: tuple[Field, ...] = getattr(application, "fields", ())
+    return fields
+
+
+def field_named(name: str, fields: tuple[Field, ...]) -> Field:
+    """The field called `name`. Raises ConfigError naming those there are, with N for any number."""
+    if not fields:
+        raise ConfigError(f"state.{name}: the function declares no fields; state is allowed, as a whole")
+    found = next((field for field in fields if field.name == name), None)
+    if found is None:
+        raise unknown("field of the state", name, {re.sub(r"\d+\.", "N.", field.name) for field in fields})
+    return found

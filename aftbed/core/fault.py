@@ -11,6 +11,8 @@ is sent. A *value fault* (`bitflip`, see `core.valuefault`) strikes what somebod
 What strikes a message or a value can come again. A fault that lasts belongs to the process that it struck
 first, as a broken part of hardware does: who takes the place of that process is sound.
 
+A bitflip of a *field* of the state strikes memory, and waits as a fault of a process does.
+
 A fault of the *bus* is a value of its own, with its own words for when and for how long: see `core.busfault`.
 """
 
@@ -20,7 +22,7 @@ from typing import Final, assert_never
 import msgspec
 
 from aftbed.core.busfault import BusFault
-from aftbed.core.valuefault import BITFLIP, FLIPPED_AT, Flip, next_success
+from aftbed.core.valuefault import BITFLIP, FLIPPED_AT, Flip, Place, next_success
 
 HANG_FOREVER_MS: Final = 0
 SLOW_MS: Final = 2.0
@@ -137,6 +139,11 @@ class Fault(msgspec.Struct, frozen=True):
             raise ValueError("a fault of the bus has its own words for when")
         if self.persistence != ONCE and not isinstance(self.action, Flip | Disturb):
             raise ValueError(f"a {self.word} strikes once")
+        if isinstance(self.action, Flip) and self.action.field:
+            if self.action.place is not Place.STATE:
+                raise ValueError(f"a {self.action.place.value} has no fields")
+            if self.persistence != ONCE:
+                raise ValueError("a bitflip of a field strikes once")
         if isinstance(self.action, Disturb) and self.trigger.event:
             raise ValueError(f"a fault of a channel waits for no event: {self.trigger.event}")
 
@@ -147,9 +154,13 @@ class Fault(msgspec.Struct, frozen=True):
 
     @property
     def event(self) -> str:
-        """The event that it waits for, or `""`: a value fault can wait for nothing less than a value."""
-        at = FLIPPED_AT[self.action.place][0].label if isinstance(self.action, Flip) else ""
-        return self.trigger.event or at
+        """The event that it waits for, or `""`: a value fault can wait for nothing less than a value.
+
+        But memory is always there.
+        """
+        if isinstance(self.action, Flip) and not self.action.field:
+            return self.trigger.event or FLIPPED_AT[self.action.place][0].label
+        return self.trigger.event
 
     def __str__(self) -> str:
         if isinstance(self.action, BusFault):
@@ -199,8 +210,8 @@ def _whom(action: Action, target: str) -> list[str]:
             return [target, f"for {for_ms}ms" if for_ms else ""]
         case Slow(by_ms, for_ms):
             return [target, f"by {_ms(by_ms)}", f"for {for_ms}ms" if for_ms else ""]
-        case Flip(place, pattern):
-            return [place.value, str(pattern), "in", target]
+        case Flip(_, pattern):
+            return [action.where, str(pattern), "in", target]
         case Disturb(how, channel, by_ms):
             return [channel, f"by {_ms(by_ms)}" if how in LATER else "", "in", target]
         case BusFault():

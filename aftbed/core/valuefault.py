@@ -95,10 +95,16 @@ BITFLIP: Final = "bitflip"
 
 
 class Flip(msgspec.Struct, frozen=True, tag=BITFLIP):
-    """Where, and which bits."""
+    """Where, and which bits. Those of a `field` of the state are flipped in memory, at any moment."""
 
     place: Place
     pattern: Pattern = Bit()
+    field: str = ""
+
+    @property
+    def where(self) -> str:
+        """In words."""
+        return f"{self.place.value}.{self.field}" if self.field else self.place.value
 
 
 def hit(pattern: Pattern, data: bytes, draw: int) -> tuple[int, ...] | None:

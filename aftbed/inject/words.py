@@ -6,11 +6,13 @@ slow    TARGET [by 2ms] [for 500ms] [at EVENT [nth N] | after 200ms]
 omission|duplicate CHANNEL           [in REPLICA] [nth N | after 200ms] [AGAIN]
 delay|reorder      CHANNEL [by 20ms] [in REPLICA] [nth N | after 200ms] [AGAIN]
 bitflip PLACE [BITS] [in REPLICA] [at EVENT] [nth N] | [after 200ms] [AGAIN]
+bitflip state.FIELD [BITS] [in REPLICA] [at EVENT] [nth N] | [after 200ms]
 
 BITS  = bit K | bits N | byte [K] | burst N [bit K] | stuck K=0|1
 AGAIN = permanent | intermittent every N | intermittent p 0.1
 
-A bitflip strikes where its value is in hand: without a word about when, at the next such event.
+A bitflip strikes where its value is in hand: without a word about when, at the next such event. That of a
+field strikes memory, which is there at any time: without a word about when, at once.
 
 Faults of the bus have words of their own: see `buswords`.
 """
@@ -60,7 +62,7 @@ from aftbed.inject import buswords
 GRAMMAR: Final = (
     "crash|hang|slow TARGET [by 2ms] [for 50ms] [at EVENT [nth N] | after 200ms],"
     " omission|delay|duplicate|reorder CHANNEL [by 20ms] [in primary|backup|a|b] [nth N | after 200ms],"
-    " or bitflip PLACE [bit K] [in primary|backup|a|b] [at EVENT] [nth N] | [after 200ms]"
+    " or bitflip PLACE|state.FIELD [bit K] [in primary|backup|a|b] [at EVENT] [nth N] | [after 200ms]"
 )
 ANYBODY: Final = "primary"  # where no replica is named
 EVERY, CHANCE, PERMANENT, INTERMITTENT = "every", "p", "permanent", "intermittent"
@@ -68,6 +70,8 @@ _BYTE: Final = "byte"
 _WHOLE: Final = re.compile(r"[0-9]{1,12}")
 _PART: Final = re.compile(r"[01](\.[0-9]{1,6})?")
 _STUCK: Final = re.compile(r"([0-9]{1,12})=([01])")
+_FIELD: Final = re.compile(r"[A-Za-z0-9_]+(\.[A-Za-z0-9_]+)*")
+FIELD_CHARACTERS_MAX: Final = 60
 _WHEN: Final = ("at", "nth", "after")
 _AGAIN: Final = (PERMANENT, INTERMITTENT)
 _PATTERNS: Final = ("bits", _BYTE, "burst", "stuck", "bit")  # `bit` says where a burst begins, too
@@ -166,15 +170,30 @@ def _disturb(how: How, channel: str, found: Found) -> Fault:
     return Fault(action, found.get("in", ANYBODY), _trigger(found), _persistence(found))
 
 
-def _flip(place: str, found: Found) -> Fault:
+def _flip(what: str, found: Found) -> Fault:
+    place, dot, field = what.partition(".")
     places = [p.value for p in Place]
     if place not in places:
         raise unknown("place of a bitflip", place, places)
-    flip = Flip(Place(place), _pattern(found))
+    if dot:
+        _check_field(place, field, found)
+    flip = Flip(Place(place), _pattern(found), field)
     _not_both(found, "nth", "after")
     if "nth" in found and "at" not in found:
         found = {**found, "at": FLIPPED_AT[flip.place][0].label}
     return Fault(flip, found.get("in", ANYBODY), _trigger(found), _persistence(found))
+
+
+def _check_field(place: str, field: str, found: Found) -> None:
+    """Raise ConfigError unless `place.field` can be one, and what is said of it too."""
+    if place != Place.STATE.value:
+        raise ConfigError(f"{place + '.' + field[:40]!r}: only the state has fields, as state.ego_ms")
+    if not _FIELD.fullmatch(field) or len(field) > FIELD_CHARACTERS_MAX:
+        named = f"letters, digits, _ and . are allowed, {FIELD_CHARACTERS_MAX} at most"
+        raise ConfigError(f"field {field[:40]!r} of the state: {named}")
+    lasting = next((word for word in _AGAIN if word in found), None)
+    if lasting is not None:
+        raise ConfigError(f"{lasting!r}: a bitflip of a field strikes once; that of a whole state can last")
 
 
 # -- parts ----------------------------------------------------------------------------------------

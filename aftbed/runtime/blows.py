@@ -73,7 +73,7 @@ def fire(node: Host, hosted: Hosted, effects: list[Effect], note: Note) -> None:
     counted = [b if b.brick != hosted.name else structs.replace(b, nth=b.nth - 1) for b in armed.blows]
     arm(node, control.Arm(control.UNANSWERED, armed.event, tuple(map(_again, counted))))
     for blow in counted:
-        if blow.nth == 0 and isinstance(blow.action, Flip):
+        if blow.nth == 0 and isinstance(blow.action, Flip) and not blow.action.field:
             if blow.action.place not in TAPPED:
                 _flip(node, hosted, effects, note, blow, blow.action)
         elif blow.nth == 0:

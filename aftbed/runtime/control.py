@@ -138,6 +138,7 @@ class Capture(Order, frozen=True):
     """Answer with the state of `brick`."""
 
     brick: str
+    look: bool = False  # at what is there; it is not going to be used
 
 
 class Restore(Order, frozen=True):
@@ -200,6 +201,13 @@ class SlowDown(Order, frozen=True):
 
     fault: int
     by_ns: int
+
+
+class KeepInCell(Order, frozen=True):
+    """Keep the state of a Server's function in the memory that came along; the answer is its Layout."""
+
+    brick: str
+    cell: int
 
 
 class DisturbBus(Order, frozen=True):
@@ -270,6 +278,6 @@ class Report(msgspec.Struct, frozen=True, tag=True):
 
 ToNode = (
     Park | Assign | Serve | BindInput | BindOutput | Follow | Rewire | Suspend | Resume | Capture | Restore
-    | Tell | WatchNodes | Arm | Interfere | SlowDown | DisturbBus | Stop | Quiet | Stats | Ack
+    | Tell | WatchNodes | Arm | Interfere | SlowDown | KeepInCell | DisturbBus | Stop | Quiet | Stats | Ack
 )  # fmt: skip
 FromNode = Hello | Rested | Ack | Said | Ordered | Fired | Report

@@ -15,11 +15,14 @@ from collections.abc import Generator, Iterable
 from typing import Final, assert_never
 
 from aftbed.core.busfault import BusFault
+from aftbed.core.errors import ConfigError
 from aftbed.core.event import Event, event_named
 from aftbed.core.fault import Crash, Disturb, Fault, Hang, Slow
 from aftbed.core.journal import Record
 from aftbed.core.valuefault import Flip, Place
 from aftbed.runtime import control, receipts, targets
+from aftbed.runtime.cell import check_field
+from aftbed.runtime.cells import Cells, Hit, receipt
 from aftbed.runtime.deployment import Deployment, Keys
 from aftbed.runtime.interface import Process
 from aftbed.runtime.jobs import Key, StepFailed, Wait
@@ -42,6 +45,7 @@ class Armed:
         self.left = fault.trigger.nth  # of the occurrences of its event, since it came to its host
         self.waits = False  # for its event: in its host, or, while nobody emits it, in none
         self.host: Process | None = None
+        self.flipped: Hit | None = None  # in memory
         self.brick = ""
         self.itself = False
         self.journals: set[str] = set()
@@ -85,6 +89,7 @@ class Faults:
         self._loop, self._tell = self._support.loop, self._support.tell
         self._numbers = itertools.count(1_000_001)  # apart from the tokens of orders
         self._armed: list[Armed] = []
+        self._cells = Cells(deployment)
 
     def arm(self, fault: Fault) -> Keys:
         """Apply `fault` now, later, or have its emitter wait for its event. Raises StepFailed."""
@@ -92,6 +97,8 @@ class Faults:
         armed = Armed(number, fault, self._support.draw(number))
         self._armed.append(armed)
         self._tell("armed", str(fault))
+        if isinstance(fault.action, Flip) and fault.action.field:
+            yield from self._move_in(armed, fault.action)
         if fault.trigger.after_ms and not fault.trigger.event:
             self._loop.after(fault.trigger.after_ms / 1e3, lambda: self._start(armed))
             return
@@ -193,6 +200,9 @@ class Faults:
             case Disturb():
                 if words:
                     armed.receipt = receipts.of_channel(armed.brick, words)
+            case Flip() if armed.flipped is not None:
+                home = armed.flipped.home
+                armed.receipt = receipt(armed.flipped, self._support.records(home.process.journal))
             case Flip() as flip:
                 if words:
                     used = [*journal, *self._log_of(armed)] if flip.place is Place.LOG else journal
@@ -225,7 +235,8 @@ class Faults:
         armed = next((a for a in self._armed if a.number == number), None)
         if armed is None:
             return
-        if isinstance(armed.fault.action, Flip | Disturb):
+        action = armed.fault.action
+        if isinstance(action, Disturb) or (isinstance(action, Flip) and not action.field):
             self._look(armed)
             self._tell("fault", f"{armed.fault}: {armed.receipt.state}, {armed.receipt.detail}")
             return
@@ -251,7 +262,40 @@ class Faults:
         found = [p for n, p in self._deployment.nodes.items() if n in nodes and p.alive]
         return found or [p for p in self._deployment.nursery.processes if p.name == target and p.pid]
 
+    # -- a field of the state -----------------------------------------------------------------
+
+    def _move_in(self, armed: Armed, flip: Flip) -> Keys:
+        """Have the function that is meant live in a cell. Raises StepFailed where it has no such field."""
+        with contextlib.suppress(StepFailed):  # it is gone: who takes its place is asked when it is time
+            home = yield from self._cells.of(self._replica_of(armed.fault.target))
+            try:
+                check_field(flip, home.layout.fields)
+            except ConfigError as error:
+                armed.receipt = Receipt(NOT_ACTIVATED, str(error))
+        if armed.receipt.state == NOT_ACTIVATED:
+            raise NobodyThere(armed.receipt.detail)
+
+    def _replica_of(self, target: str) -> str:
+        """The replica that is meant now, or `""`."""
+        return {"primary": self._deployment.leader, "backup": self._deployment.backup}.get(target, target)
+
+    def _flip(self, armed: Armed, flip: Flip) -> Keys:
+        """In memory, wherever that is now: who leads may be another since the arming."""
+        try:
+            home = yield from self._cells.of(self._replica_of(armed.fault.target))
+            now_ns = self._loop.now_ns()
+            self._support.journal.write(now_ns, Event.FAULT_APPLIED, 0, armed.number)
+            armed.flipped = home.flip(flip, now_ns, armed.draw)
+        except (StepFailed, ConfigError) as error:
+            armed.receipt = Receipt(NOT_ACTIVATED, str(error))
+        else:
+            armed.receipt = receipt(armed.flipped, ())
+        self._tell("fault", f"{armed.fault}: {armed.receipt.state}, {armed.receipt.detail}")
+
     def _apply(self, armed: Armed) -> Keys:
+        if isinstance(armed.fault.action, Flip):
+            yield from self._flip(armed, armed.fault.action)
+            return
         armed.hit = hit = self._hit(armed.fault.target)
         if not hit:
             armed.receipt = Receipt(NOT_ACTIVATED, "nobody to hit")
@@ -269,7 +313,7 @@ class Faults:
                 yield from self._hang(armed, hit, for_ms)
             case Slow(by_ms, for_ms):
                 yield from self._slow(armed, hit, round(by_ms * 1e6), for_ms)
-            case Flip() | Disturb() | BusFault():
+            case Disturb() | BusFault():
                 raise AssertionError(f"{armed.fault} strikes where it waits")
             case _:
                 assert_never(armed.fault.action)

@@ -44,6 +44,10 @@ class Host(Protocol):
         """Undo `suspend`."""
         ...
 
+    def memory(self, end: int) -> memoryview:
+        """The memory of the cell with that end, which is let go of."""
+        ...
+
     def tell(self, brick: str, message: control.Told) -> None:
         """Have `brick` step with `message`."""
         ...

@@ -52,6 +52,6 @@ def _look_at(deployment: Deployment, replica: str, found: dict[str, str]) -> Key
     if not any(b.name == server for b in deployment.graph.bricks):
         return
     node = deployment.graph.node_of(server)
-    state = yield from deployment.ask(node, lambda token: control.Capture(token, server))
+    state = yield from deployment.ask(node, lambda token: control.Capture(token, server, look=True))
     if state:
         found[replica] = digest(state)

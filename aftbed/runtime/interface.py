@@ -56,6 +56,24 @@ class Channel(Protocol):
         ...
 
 
+class Cell(Protocol):
+    """Memory that a node keeps the state of a function in."""
+
+    memory: memoryview
+
+    def fileno(self) -> int:
+        """The number that travels with an order."""
+        ...
+
+    def seal(self) -> None:
+        """Nobody else is to have it."""
+        ...
+
+    def close(self) -> None:
+        """Let go of it; a node that lives keeps it."""
+        ...
+
+
 class Process(Protocol):
     """What can host a node. `kind`: zygote, spare, staged, node, service or killed."""
 
@@ -184,6 +202,10 @@ class Support(Protocol):
 
     def channel(self, link: Link) -> Channel:
         """A fresh one."""
+        ...
+
+    def cell(self) -> Cell:
+        """A fresh one, all zero."""
         ...
 
     def device(self, kind: str, incarnation: int) -> tuple[str, bytes]:

@@ -6,6 +6,7 @@ from aftbed.core.brick import Effect, Halt, Order
 from aftbed.core.errors import PeerError
 from aftbed.core.message import Watch
 from aftbed.runtime import blows, control
+from aftbed.runtime.cell import look, move_in
 from aftbed.runtime.host import Fds, Host, Hosted
 
 WATCHDOG: Final = "{}/watchdog"
@@ -32,8 +33,9 @@ def carry_out(node: Host, order: control.ToNode, fds: Fds) -> bytes | None:
             return None  # answered when quiescent
         case control.Resume():
             node.resume()
-        case control.Capture(_, brick):
-            return node.hosted(brick).brick.capture()
+        case control.Capture(_, brick, looks):
+            found = node.hosted(brick).brick
+            return look(found) if looks else found.capture()
         case control.Restore(_, brick, state, migrate):
             taker = node.hosted(brick).brick
             take = getattr(taker, "migrate", taker.restore) if migrate else taker.restore
@@ -45,13 +47,20 @@ def carry_out(node: Host, order: control.ToNode, fds: Fds) -> bytes | None:
             node.tell(WATCHDOG.format(order.replica), Watch(order.replica, order.generation, order.nodes))
         case control.Arm() | control.Interfere() | control.SlowDown():
             blows.take(node, order)
+        case control.KeepInCell():
+            return move_in(node, order, node.memory(fds.pop()))
         case control.Stats():
             return node.stats()
         case control.Quiet():
             node.quiet()
-        case control.Park() | control.Assign() | control.Serve() | control.Stop() | control.Ack():
-            raise PeerError(f"{type(order).__name__} to a node")
-        case control.DisturbBus():
+        case (
+            control.Park()
+            | control.Assign()
+            | control.Serve()
+            | control.DisturbBus()
+            | control.Stop()
+            | control.Ack()
+        ):
             raise PeerError(f"{type(order).__name__} to a node")
         case _:
             assert_never(order)

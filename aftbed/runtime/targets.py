@@ -6,6 +6,7 @@ that passes on): the outermost is meant.
 
 from typing import Final
 
+from aftbed.core.application import fields_of
 from aftbed.core.busfault import BusFault
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.event import Event, event_named
@@ -26,6 +27,8 @@ from aftbed.core.valuefault import (
 from aftbed.core.words import DURATION_MS_MAX
 from aftbed.ftm.catalog import EMITTERS
 from aftbed.ftm.mechanism import EXPRESSIONS, build
+from aftbed.runtime.cell import check_field
+from aftbed.vehicle.function import AebFunction
 
 ROLES: Final = ("primary", "backup")
 OTHERS: Final = ("zygote", "zygote.bus", "hub", "vehicle", "player")
@@ -41,7 +44,10 @@ def check(fault: Fault, graph: Graph) -> None:
     if isinstance(fault.action, BusFault):  # it names what is on the bus, not in the graph
         return
     if isinstance(fault.action, Flip):
-        _check_flip(fault, fault.action, graph)
+        if fault.action.field:
+            _check_field(fault, fault.action, graph)
+        else:
+            _check_flip(fault, fault.action, graph)
         return
     if isinstance(fault.action, Disturb):
         _check_channel(fault, fault.action, graph)
@@ -53,6 +59,10 @@ def check(fault: Fault, graph: Graph) -> None:
             raise ConfigError(f"by {fault.action.by_ms:g}ms: up to {SLOW_MS_MAX:g}ms are allowed")
     if fault.target not in allowed:
         raise unknown("target", fault.target, allowed)
+    _check_event(fault, graph)
+
+
+def _check_event(fault: Fault, graph: Graph) -> None:
     if not fault.event:
         return
     event = event_named(fault.event)
@@ -98,6 +108,15 @@ def _check_flip(fault: Fault, flip: Flip, graph: Graph) -> None:
         raise ConfigError(f"{fault}: under --ftm {graph.ftm} {nothing}")
     if event not in emitted:
         raise unknown(f"event for a bit of the {place.value} in {fault.target}:", event, emitted)
+
+
+def _check_field(fault: Fault, flip: Flip, graph: Graph) -> None:
+    """What a function that was written off line declares is known in its node."""
+    _check_pattern(flip.pattern)
+    _standings(fault, graph)
+    _check_event(fault, graph)
+    if not any(brick.application for brick in graph.bricks):
+        check_field(flip, fields_of(AebFunction))
 
 
 def _check_pattern(pattern: Pattern) -> None:
@@ -192,7 +211,7 @@ def waits_in(fault: Fault, graph: Graph, leader: str, backup: str) -> str | None
     if isinstance(fault.action, Disturb):
         return sender(graph, fault.action.channel, replica, leader)
     event = event_named(fault.event)
-    if not isinstance(fault.action, Flip):
+    if not isinstance(fault.action, Flip) or fault.action.field:
         brick = _emitting(graph, event, leader, backup)
         return None if brick is None else brick.name
     if replica not in replicas(graph):

@@ -27,7 +27,7 @@ from random import Random
 from struct import Struct
 from typing import Final
 
-from aftbed.core.application import Application, Characteristics
+from aftbed.core.application import Application, Characteristics, Field
 from aftbed.core.errors import PeerError
 from aftbed.vehicle.aebmessages import (
     COUNTER_COUNT,
@@ -69,6 +69,24 @@ _TRACK: Final = Struct("<BBddd")  # hits, misses, range, speed, acceleration; al
 STATE_BYTES: Final = _HEADER.size + _TRACK.size * SLOTS
 _OFFSETS: Final = tuple(range(_HEADER.size, STATE_BYTES, _TRACK.size))  # by slot
 _EMPTY: Final = bytes(STATE_BYTES)
+_FIELDS: Final = (  # of the header, behind the version
+    Field("counter", "u8", 1),
+    Field("stage", "u8", 2),
+    Field("started", "u8", 3),
+    Field("ego_ms", "f64", 4),
+    Field("t_ms", "i64", 12),
+    Field("warned_ms", "u32", 20),
+    Field("clear_ms", "u32", 24),
+    Field("still_ms", "u32", 28),
+    Field("blind_ms", "u32", 32),
+)
+_TRACK_FIELDS: Final = (
+    Field("hits", "u8", 0),
+    Field("misses", "u8", 1),
+    Field("range_m", "f64", 2),
+    Field("speed_ms", "f64", 10),
+    Field("acceleration_ms2", "f64", 18),
+)
 _FREE: Final = bytes(_TRACK.size)
 
 
@@ -76,6 +94,14 @@ class AebFunction:
     """The application. `execute` is the only thing that changes it; see the module's theory."""
 
     characteristics = Characteristics()
+    fields: tuple[Field, ...] = (
+        *_FIELDS,
+        *(
+            Field(f"track{slot}.{field.name}", field.kind, offset + field.offset_bytes)
+            for slot, offset in enumerate(_OFFSETS)
+            for field in _TRACK_FIELDS
+        ),
+    )
 
     def __init__(self) -> None:
         self._counter = 0

@@ -74,6 +74,7 @@ disturbances = st.one_of(
     st.builds(Disturb, st.sampled_from(LATER), st.sampled_from(("pxy2pro", "aft2aft")), durations),
     st.builds(Disturb, st.sampled_from([how for how in How if how not in LATER]), st.just("aft2pro")),
 )
+fields = st.from_regex(r"[A-Za-z0-9_]{1,20}(\.[A-Za-z0-9_]{1,20})?", fullmatch=True)
 replicas = st.sampled_from(("primary", "backup", "a", "b"))
 faults = st.one_of(
     st.builds(Fault, st.just(Crash()), st.sampled_from(("primary", "b/after")), triggers),
@@ -88,6 +89,7 @@ faults = st.one_of(
         Fault, disturbances, replicas, st.builds(Trigger, nth=st.integers(1, 10**9)) | after, persistences
     ),
     st.builds(Fault, st.builds(Flip, st.sampled_from(Place), patterns), replicas, triggers, persistences),
+    st.builds(Fault, st.builds(Flip, st.just(Place.STATE), patterns, fields), replicas, triggers),
 )
 
 
@@ -136,6 +138,15 @@ def test_a_fault_reads_back_as_it_was(fault: Fault) -> None:
         (
             "bitflip state in b nth 3 at state.restored bit 9",
             bitflip(Place.STATE, 9, "b", Trigger("state.restored", 3)),
+        ),
+        ("bitflip state.ego_ms", Fault(Flip(Place.STATE, Bit(), "ego_ms"), "primary", Trigger())),
+        (
+            "bitflip state.track0.range_m bit 52 in b nth 7",
+            Fault(Flip(Place.STATE, Bit(52), "track0.range_m"), "b", Trigger("server.exit", 7)),
+        ),
+        (
+            "bitflip state.t_ms byte 1 after 20ms",
+            Fault(Flip(Place.STATE, Byte(1), "t_ms"), "primary", Trigger(after_ms=20)),
         ),
         ("slow primary", Fault(Slow(2.0, 0), "primary", Trigger())),
         (
@@ -206,6 +217,12 @@ BAD: Final = {
     "hang primary for nanms": "duration 'nanms': a positive number",
     "bitflip": "fault 'bitflip': expected crash|hang|slow TARGET",
     "bitflip reslt": "unknown place of a bitflip 'reslt'; did you mean 'result'? (one of: checkpoint,",
+    "bitflip result.ego_ms": "'result.ego_ms': only the state has fields, as state.ego_ms",
+    "bitflip state.": "field '' of the state: letters, digits, _ and . are allowed, 60 at most",
+    "bitflip state.a..b": "field 'a..b' of the state: letters, digits, _ and . are allowed, 60 at most",
+    f"bitflip state.{61 * 'a'}": "of the state: letters, digits, _ and . are allowed, 60 at most",
+    "bitflip state.a permanent": "'permanent': a bitflip of a field strikes once; that of a whole state",
+    "bitflip state.a intermittent every 2": "'intermittent': a bitflip of a field strikes once",
     "bitflip result bitz 3": "'bitz'; did you mean 'bit",
     "bitflip result for 5ms": "unknown word in fault 'bitflip result for 5ms': 'for'",
     "bitflip result bit": "'bit' lacks its value",

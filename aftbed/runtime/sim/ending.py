@@ -3,6 +3,7 @@
 import contextlib
 
 from aftbed.core.errors import PeerError
+from aftbed.runtime.cell import look
 from aftbed.runtime.deployment import Deployment
 from aftbed.runtime.hosting import digest
 from aftbed.runtime.sim.processes import Process
@@ -15,6 +16,6 @@ def states_of(deployment: Deployment) -> dict[str, str]:
         process = deployment.nodes.get(deployment.graph.node_of(f"{replica}/server"))
         if isinstance(process, Process) and process.node is not None and not process.stopped():
             with contextlib.suppress(PeerError):
-                state = process.node.hosted(f"{replica}/server").brick.capture()
+                state = look(process.node.hosted(f"{replica}/server").brick)
                 found |= {replica: digest(state)} if state else {}
     return found

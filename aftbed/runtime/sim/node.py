@@ -9,7 +9,7 @@ fault that the executive has to see applied: the effects that are left are perfo
 """
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Final
 
 from aftbed.core.brick import CONTROL, Brick
@@ -20,6 +20,7 @@ from aftbed.core.message import Adapted, AnyMessage, ChannelEnded, Message, Prom
 from aftbed.runtime import control
 from aftbed.runtime.diversion import Diversion
 from aftbed.runtime.orders import carry_out
+from aftbed.runtime.sim.cells import Cell
 from aftbed.runtime.sim.channels import Channel
 from aftbed.runtime.sim.clock import Clock
 from aftbed.runtime.sim.devices import Device, Sensor
@@ -56,6 +57,7 @@ class Node:
         self.slowed: dict[int, int] = {}
         self.diverted: dict[tuple[str, str], Diversion] = {}
         self._hindrance = Hindrance(self, clock)
+        self.cells: Sequence[Cell] = ()  # those of the run
         self.device: Device | None = None
         self.device_brick: Hosted | None = None
         self.alive, self.frozen_ns, self._pulse_ns = True, 0, 0
@@ -135,6 +137,10 @@ class Node:
     def resume(self) -> None:
         """Undo `suspend`."""
         self.suspended, self._suspend_token = False, 0
+
+    def memory(self, end: int) -> memoryview:
+        """The memory of the cell with that number."""
+        return self.cells[end].memory
 
     def tell(self, brick: str, message: control.Told) -> None:
         """Have `brick` step with `message`."""

@@ -14,6 +14,7 @@ from aftbed.core.journal import Record
 from aftbed.runtime import control, interface
 from aftbed.runtime.assembly import Assembler
 from aftbed.runtime.jobs import Key, StepFailed, Wait
+from aftbed.runtime.sim.cells import Cell
 from aftbed.runtime.sim.channels import Channel
 from aftbed.runtime.sim.clock import Clock
 from aftbed.runtime.sim.devices import Device
@@ -218,6 +219,7 @@ class Nursery:
         self.processes: list[Process] = []
         self.by_number: dict[int, Process] = {}
         self.zygotes: dict[str, Process] = {}
+        self.cells: list[Cell] = []
         self._heard_ns = 0
         self.on_report: Callable[[Process, control.FromNode], None] = lambda process, report: None
         self.on_death: Callable[[Process], None] = lambda process: None
@@ -254,7 +256,7 @@ class Nursery:
         """The node that `order` describes. Raises ConfigError where a class is no good."""
         records = self._records(order.journal)
         node = Node(order.node, self.clock, records, self._end, process.say, process.ended)
-        node.suspended = order.held
+        node.suspended, node.cells = order.held, self.cells
         self._assembler.fill(node, order)
         if order.device:
             node.attach(self._make_device(order, node), order.bricks[0].name)

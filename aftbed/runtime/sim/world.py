@@ -29,6 +29,7 @@ from aftbed.runtime.conductor import Conductor
 from aftbed.runtime.deployment import Keys
 from aftbed.runtime.hosting import Hosted, hosted
 from aftbed.runtime.jobs import Wait
+from aftbed.runtime.sim.cells import Cell
 from aftbed.runtime.sim.channels import Channel
 from aftbed.runtime.sim.clock import START_NS, Clock
 from aftbed.runtime.sim.devices import Car, Device, Sensor
@@ -146,6 +147,12 @@ class World:
         for end in (channel.write, channel.read):
             self._ends[end.number] = channel
         return channel
+
+    def cell(self) -> Cell:
+        """A fresh one."""
+        cell = Cell(len(self.nursery.cells))
+        self.nursery.cells.append(cell)
+        return cell
 
     def device(self, kind: str, incarnation: int) -> tuple[str, bytes]:
         """By the kind of its brick."""

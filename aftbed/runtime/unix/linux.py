@@ -134,12 +134,13 @@ class Starvation:
     | `S`, asleep            | none: the timer of its pulse did not come | starves: its core stalls  |
     | `S`                    | some: the timer comes, and it goes on     | hangs: blocked in a brick |
 
+    And whatever its state: one that was ready to run, and was not let run, for a quarter of the time starves.
     No excuse lasts longer than `EXCUSED_NS_MAX`.
     """
 
     def __init__(self, pid: int) -> None:
         self._pid = pid
-        self._since_ns, self._cpu_ns = 0, 0
+        self._since_ns, self._cpu_ns, self._waited_ns = 0, 0, 0
 
     def forget(self) -> None:
         """It has shown that it runs."""
@@ -149,19 +150,20 @@ class Starvation:
         """Asked while it shows nothing; see the table."""
         try:
             stat = Path(f"/proc/{self._pid}/stat").read_text()
-            cpu_ns = int(Path(f"/proc/{self._pid}/schedstat").read_text().split()[0])
+            cpu_ns, waited_ns = map(int, Path(f"/proc/{self._pid}/schedstat").read_text().split()[:2])
         except (OSError, ValueError, IndexError):
             return False
         if self._since_ns == 0:
-            self._since_ns, self._cpu_ns = now_ns, cpu_ns
+            self._since_ns, self._cpu_ns, self._waited_ns = now_ns, cpu_ns, waited_ns
         ran_ns, passed_ns = cpu_ns - self._cpu_ns, now_ns - self._since_ns
         if passed_ns > EXCUSED_NS_MAX:
             return False
+        held_up = 4 * (waited_ns - self._waited_ns) > passed_ns
         match stat.rpartition(")")[2].split()[0]:
             case "R" | "D":
-                return 2 * ran_ns <= passed_ns
+                return held_up or 2 * ran_ns <= passed_ns
             case "S":
-                return ran_ns == 0
+                return held_up or ran_ns == 0
             case _:
                 return False
 

@@ -10,6 +10,7 @@ from aftbed.core.brick import CONTROL
 from aftbed.core.event import Event
 from aftbed.runtime import control
 from aftbed.runtime.diversion import Diversion
+from aftbed.runtime.unix import cells
 from aftbed.runtime.unix.devices import Sensor
 from aftbed.runtime.unix.hindrance import Hindrance
 from aftbed.runtime.unix.wiring import Hosted
@@ -52,6 +53,10 @@ class Obedience:
     def resume(self) -> None:
         """Undo `suspend`."""
         self._node.suspended, self._node.suspend_token = False, 0
+
+    def memory(self, end: int) -> memoryview:
+        """The memory of the cell behind that descriptor."""
+        return cells.mapped(end)
 
     def tell(self, brick: str, message: control.Told) -> None:
         """Have `brick` step with `message`."""

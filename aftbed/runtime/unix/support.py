@@ -12,6 +12,7 @@ from aftbed.core.journal import Record, records
 from aftbed.runtime.deployment import Keys
 from aftbed.runtime.jobs import StepFailed
 from aftbed.runtime.unix.bus import BusFaults
+from aftbed.runtime.unix.cells import Cell
 from aftbed.runtime.unix.channels import Channel
 from aftbed.runtime.unix.journal import Journal, recorded_requests
 from aftbed.runtime.unix.loop import Loop
@@ -41,6 +42,10 @@ class Support:
     def channel(self, link: Link) -> Channel:
         """A fresh pair of sockets."""
         return Channel(link)
+
+    def cell(self) -> Cell:
+        """A fresh memfd."""
+        return Cell()
 
     def journal_of(self, node: str, incarnation: int) -> str:
         """A file for each life of a node."""

@@ -1,0 +1,47 @@
+"""What is said of a run on a machine that was too busy for times to mean anything."""
+
+import pytest
+from campaigns import result
+
+from aftbed.campaign.executing import without_times
+from aftbed.campaign.noise import STARVED_MS_MIN, Probe, starved
+
+
+@pytest.mark.parametrize(
+    ("starved_ms", "seconds", "word"),
+    [
+        (STARVED_MS_MIN, 0.1, False),
+        (STARVED_MS_MIN + 1, 0.1, True),
+        (STARVED_MS_MIN + 1, 10.0, False),  # a long run waits more in all
+        (501.0, 10.0, True),
+    ],
+)
+def test_a_node_that_waits_long_for_a_cpu_makes_a_run_noisy(
+    starved_ms: float, seconds: float, word: bool
+) -> None:
+    assert starved(starved_ms, seconds) is word
+
+
+@pytest.mark.parametrize(
+    ("outcome", "unexpected", "after"),
+    [
+        ("degraded", False, "inconclusive"),  # late
+        ("hang", True, "inconclusive"),
+        ("tolerated", True, "inconclusive"),  # a failover that nobody expected: a false alarm
+        ("tolerated", False, "tolerated"),
+        ("masked", False, "masked"),
+        ("sdc", True, "sdc"),  # no machine is so busy that it makes up a wrong value
+        ("omission", True, "omission"),
+    ],
+)
+def test_what_a_slow_machine_can_bring_about_is_inconclusive(
+    outcome: str, unexpected: bool, after: str
+) -> None:
+    found = without_times(result(outcome, unexpected=unexpected, recovery_ms=70.0, blackout_ms=70.0))
+    assert (found.outcome, found.noisy) == (after, True)
+    assert found.unexpected is (unexpected and after == outcome)
+    assert (found.recovery_ms, found.blackout_ms) == (None, None)
+
+
+def test_a_probe_is_calibrated_by_the_machine_it_runs_on() -> None:
+    assert Probe().quiet_ms < 1000
