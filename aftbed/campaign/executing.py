@@ -18,7 +18,7 @@ from aftbed.campaign.experiment import OUTCOMES, UNKNOWN, Experiment, Result, wo
 from aftbed.campaign.noise import Probe, starved
 from aftbed.campaign.planning import faults_of
 from aftbed.campaign.record import RunRecord, read_record
-from aftbed.campaign.succession import adaptations, bare_server
+from aftbed.campaign.succession import bare_server
 from aftbed.campaign.verdict import Verdict, judge
 from aftbed.core import check
 from aftbed.core.application import Application
@@ -185,7 +185,7 @@ def _judged(experiment: Experiment, record: RunRecord) -> Result:
         digests=states.values(),
         golden=bare().deterministic,
     )
-    history = adaptations(record)
+    history = record.adaptations
     blackouts = [float(str(a["blackout_ms"])) for a in history]
     result = _result(
         experiment,

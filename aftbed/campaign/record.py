@@ -9,6 +9,7 @@ from aftbed.core.check import History
 from aftbed.core.errors import ConfigError, PeerError
 from aftbed.core.journal import dropped, entries, records
 from aftbed.runtime.unix.options import RunOptions
+from aftbed.runtime.unix.support import HISTORY_NAME
 
 
 class RunRecord(msgspec.Struct, frozen=True):
@@ -19,6 +20,7 @@ class RunRecord(msgspec.Struct, frozen=True):
     started_ns: int
     end: dict[str, object] | None
     history: History
+    adaptations: tuple[dict[str, object], ...] = ()  # how each one ended, in order
 
 
 def read_record(path: Path) -> RunRecord:
@@ -39,7 +41,21 @@ def read_record(path: Path) -> RunRecord:
     except PeerError as error:
         raise ConfigError(f"{folder}: {error}") from None
     end = _json(path / "end.json") if (path / "end.json").exists() else None
-    return RunRecord(path, options, started, end, History(journals, dialogue, lost))
+    return RunRecord(path, options, started, end, History(journals, dialogue, lost), _adaptations(path))
+
+
+def _adaptations(path: Path) -> tuple[dict[str, object], ...]:
+    try:
+        lines = (path / HISTORY_NAME).read_bytes().splitlines()
+    except FileNotFoundError:
+        return ()
+    found = []
+    for line in lines:
+        try:
+            found.append(json.loads(line))
+        except ValueError:  # the last line, cut off with the run
+            break
+    return tuple(found)
 
 
 def _json(path: Path) -> dict[str, object]:

@@ -5,7 +5,6 @@ in place, the bare server is updated too, before the same request: the first tha
 the adaptation let requests through again.
 """
 
-import json
 from collections.abc import Callable
 from typing import Final
 
@@ -14,7 +13,6 @@ from aftbed.campaign.record import RunRecord
 from aftbed.core.application import Application
 from aftbed.core.event import Event
 from aftbed.runtime.unix.part import load_module
-from aftbed.runtime.unix.support import HISTORY_NAME
 from aftbed.vehicle.function import default_application
 
 Make = Callable[[], Application]
@@ -63,7 +61,7 @@ def bare_server(record: RunRecord) -> Callable[[], Succession]:
     changes: list[tuple[int, Make]] = []
     stored = record.history.events(Event.REPLY_STORED)
     running = BUILT_IN
-    for outcome in adaptations(record):
+    for outcome in record.adaptations:
         if outcome["outcome"] != "done" or outcome["application"] == running:
             continue
         running = str(outcome["application"])
@@ -71,16 +69,3 @@ def bare_server(record: RunRecord) -> Callable[[], Succession]:
         first = 1 + max((r.request_id for r in stored if r.t_ns < opened_ns), default=0)
         changes.append((first, load_application(running, load_module) if running else default_application))
     return lambda: Succession(changes)
-
-
-def adaptations(record: RunRecord) -> list[dict[str, object]]:
-    """How each one ended, in order."""
-    path = record.path / HISTORY_NAME
-    lines = path.read_bytes().splitlines() if path.exists() else []
-    found = []
-    for line in lines:
-        try:
-            found.append(json.loads(line))
-        except ValueError:  # the last line, cut off with the run
-            break
-    return found

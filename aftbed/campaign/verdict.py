@@ -8,7 +8,7 @@ from typing import Final, Literal
 import msgspec
 
 from aftbed.campaign.record import RunRecord
-from aftbed.campaign.succession import adaptations, bare_server
+from aftbed.campaign.succession import bare_server
 from aftbed.campaign.value import value
 from aftbed.campaign.wholeness import half_a_graph
 from aftbed.core import check
@@ -128,7 +128,7 @@ def _whole_graph(record: RunRecord) -> Check:
     under_way = record.end.get("unfinished")
     if under_way:
         return Check("unknown", (f"the run ended while this was under way: {under_way}",))
-    done = [str(a["ftm"]) for a in adaptations(record) if a["outcome"] == "done"]
+    done = [str(a["ftm"]) for a in record.adaptations if a["outcome"] == "done"]
     reasons = half_a_graph(living, done[-1] if done else record.options.ftm)
     return Check("fail" if reasons else "pass", tuple(reasons[: check.REASONS_MAX]))
 

@@ -4,9 +4,8 @@ One for each process that hosts a Server at which a fault of a field is aimed, f
 that takes the place of another has none before it is told to move into a fresh one.
 """
 
-import itertools
 from collections.abc import Generator, Iterable
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import msgspec
 
@@ -21,11 +20,12 @@ from aftbed.runtime.interface import Cell, Process
 from aftbed.runtime.jobs import Key, StepFailed, Wait
 from aftbed.runtime.receipts import ACTIVATED, APPLIED, NOT_ACTIVATED, Receipt
 
-FIRST_CELL: Final = 1_500_001  # apart from the numbers of faults and of triggers
-
 
 class Home:
-    """A process, the cell that its function lives in, and, once it has answered, the layout."""
+    """A process, the cell that its function lives in, and, once it has answered, the layout.
+
+    The cell has the `number` of the fault for whose sake it was made, the first one there.
+    """
 
     def __init__(self, number: int, brick: str, process: Process, cell: Cell) -> None:
         self.number, self.brick, self.process, self.cell = number, brick, process, cell
@@ -58,21 +58,24 @@ class Cells:
 
     def __init__(self, deployment: Deployment) -> None:
         self._deployment = deployment
-        self._numbers = itertools.count(FIRST_CELL)
         self._homes: dict[Process, Home] = {}
 
-    def of(self, replica: str) -> Generator[Wait, dict[Key, bytes], Home]:
-        """Where the function of `replica` lives from now on. Raises StepFailed if there is none."""
-        deployment, brick = self._deployment, f"{replica}/server"
+    def leave_the_dead(self) -> None:
+        """Let go of the cells of processes that are gone."""
         for dead in [process for process in self._homes if not process.alive]:
             self._homes.pop(dead).cell.close()
+
+    def of(self, replica: str, fault: int) -> Generator[Wait, dict[Key, bytes], Home]:
+        """Where the function of `replica` lives from now on. Raises StepFailed if there is none."""
+        deployment, brick = self._deployment, f"{replica}/server"
+        self.leave_the_dead()
         node = next((n for n, hosted in deployment.graph.nodes.items() if brick in hosted), "")
         process = deployment.nodes.get(node)
         if process is None or not process.alive:
             raise StepFailed("nobody to hit")
         home = self._homes.get(process)
         if home is None:
-            home = Home(next(self._numbers), brick, process, deployment.support.cell())
+            home = Home(fault, brick, process, deployment.support.cell())
             self._homes[process] = home
         if not home.moved_in:
             number, ends = home.number, (home.cell.fileno(),)

@@ -157,9 +157,12 @@ class Faults:
 
     def rearm(self) -> Keys:
         """After a change of roles, or of the graph: what waits in a node that is not the emitter moves on."""
+        self._cells.leave_the_dead()
         for armed in self._armed:
+            if armed.receipt.state != ARMED or not armed.waits:
+                continue
             self._look(armed)
-            if armed.receipt.state != ARMED or not armed.waits or self._stands(armed):
+            if armed.receipt.state != ARMED or self._stands(armed):
                 continue
             with contextlib.suppress(StepFailed):  # nobody emits it now; the next change asks again
                 if armed.host is not None:
@@ -200,11 +203,11 @@ class Faults:
             case Disturb():
                 if words:
                     armed.receipt = receipts.of_channel(armed.brick, words)
-            case Flip() if armed.flipped is not None:
-                home = armed.flipped.home
-                armed.receipt = receipt(armed.flipped, self._support.records(home.process.journal))
             case Flip() as flip:
-                if words:
+                if armed.flipped is not None:
+                    records = self._support.records(armed.flipped.home.process.journal)
+                    armed.receipt = receipt(armed.flipped, records)
+                elif words and not flip.field:
                     used = [*journal, *self._log_of(armed)] if flip.place is Place.LOG else journal
                     found = receipts.of_flip(armed.fault, flip, armed.brick, armed.draw, words, used)
                     armed.receipt = found
@@ -267,7 +270,7 @@ class Faults:
     def _move_in(self, armed: Armed, flip: Flip) -> Keys:
         """Have the function that is meant live in a cell. Raises StepFailed where it has no such field."""
         with contextlib.suppress(StepFailed):  # it is gone: who takes its place is asked when it is time
-            home = yield from self._cells.of(self._replica_of(armed.fault.target))
+            home = yield from self._cells.of(self._replica_of(armed.fault.target), armed.number)
             try:
                 check_field(flip, home.layout.fields)
             except ConfigError as error:
@@ -282,7 +285,7 @@ class Faults:
     def _flip(self, armed: Armed, flip: Flip) -> Keys:
         """In memory, wherever that is now: who leads may be another since the arming."""
         try:
-            home = yield from self._cells.of(self._replica_of(armed.fault.target))
+            home = yield from self._cells.of(self._replica_of(armed.fault.target), armed.number)
             now_ns = self._loop.now_ns()
             self._support.journal.write(now_ns, Event.FAULT_APPLIED, 0, armed.number)
             armed.flipped = home.flip(flip, now_ns, armed.draw)

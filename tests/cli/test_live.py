@@ -100,7 +100,7 @@ def test_inject_crash_of_the_primary(drive: Command) -> None:
     assert (status["leader"], status["backup"], status["epoch"]) == ("b", "a", 2)
     roles = {row["name"]: row["role"] for row in json.loads(told(drive, "ps", "--json"))}
     assert (roles["a/server"], roles["b/server"]) == ("backup", "primary")
-    ended_well(drive, "failover   to epoch 2", "crash primary: applied")
+    ended_well(drive, "failover   to epoch 2", "crash primary: activated")
 
 
 @pytest.mark.parametrize("target", ["backup", "proxy", "a/before", "a/watchdog", "engine"])
@@ -109,14 +109,14 @@ def test_inject_crash_of_another(drive: Command, target: str) -> None:
     drive.wait_for_line(
         "script.done: new backup" if target in ("backup", "a/before") else f"replaced: {target}"
     )
-    ended_well(drive, f"crash {target}: applied")
+    ended_well(drive, f"crash {target}: activated")
 
 
 def test_inject_crash_at_the_nth_event(drive: Command) -> None:
     told(drive, "inject", "crash", "a/server", "--at", "checkpoint.sent", "--nth", "5")
     drive.wait_for_line("armed: crash a/server at checkpoint.sent nth 5")
     drive.wait_for_line("script.done: new backup")
-    ended_well(drive, "crash a/server at checkpoint.sent nth 5: applied")
+    ended_well(drive, "crash a/server at checkpoint.sent nth 5: activated")
 
 
 def test_inject_a_short_hang(drive: Command) -> None:
@@ -128,7 +128,7 @@ def test_inject_a_short_hang(drive: Command) -> None:
 def test_inject_after_a_while(drive: Command) -> None:
     told(drive, "inject", "crash", "primary", "--after", "200ms")
     drive.wait_for_line("script.done: failover")
-    ended_well(drive, "crash primary after 200ms: applied")
+    ended_well(drive, "crash primary after 200ms: activated")
 
 
 @pytest.mark.parametrize(

@@ -89,8 +89,8 @@ def test_it_is_memory_of_that_process_and_of_no_other(home: Home) -> None:
         assert held(run) == {"a/server": old}
 
         ask.ask(run.private, ask.Inject(parse("crash a/server")))
-        until(lambda: run.status()["primary"] == "b" and run.redundant(), "a new backup")
-        assert not held(run), "nobody has the dead one's"
+        until(lambda: run.status()["leader"] == "b" and run.redundant(), "a new backup")
+        assert not held(run) and not cells(run.launched.supervisor), "nobody has the dead one's"
         ask.ask(run.private, ask.Inject(parse(f"{FLIP} in a at request.received {NEVER}")))
         fresh = cells(run.pid("a/server"))
         assert len(fresh) == 1 and not fresh & old and held(run) == {"a/server": fresh}

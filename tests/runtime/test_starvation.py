@@ -28,6 +28,13 @@ os.sched_setaffinity(0, {%d})
 print(flush=True)
 while True: pass
 """
+DOZES = """
+import os, time
+os.sched_setaffinity(0, {%d})
+os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+print(flush=True)
+while True: time.sleep(0.001)
+"""
 WEAK = "os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))"
 PERIOD_NS = 100_000_000
 
@@ -72,15 +79,35 @@ def test_asleep_without_a_timer_is_a_core_that_stalls_and_no_excuse_lasts_for_ev
 
 def test_blocked_while_its_timer_comes_is_a_hang() -> None:
     with process(BLOCKED) as child:
-        starvation = Starvation(child.pid)
-        starvation.starves(1)
         assert child.stdout is not None
-        child.stdout.readline()
-        child.stdout.readline()  # its handler has run since
         limit = time.monotonic() + 5.0
-        while starvation.starves(PERIOD_NS):  # in its handler just now, and another has the core
-            assert time.monotonic() < limit, "it is excused"
+        while True:  # it may be in its handler just now, and another has the core
+            starvation = Starvation(child.pid)
+            starvation.starves(time.monotonic_ns())
             child.stdout.readline()
+            child.stdout.readline()  # its handler has run since
+            if not starvation.starves(time.monotonic_ns()):
+                return
+            assert time.monotonic() < limit, "it is excused"
+
+
+def test_one_that_waits_for_its_core_starves_even_where_it_sleeps_just_now() -> None:
+    """It runs a little now and then, and each time it has waited long for that."""
+    cpu = min(os.sched_getaffinity(0))
+    with process(DOZES % cpu) as dozing, process(LOOPS % (cpu, "")):
+        limit = time.monotonic() + 5.0
+        while True:
+            starvation, began_ns = Starvation(dozing.pid), time.monotonic_ns()
+            starvation.starves(began_ns)
+            before_ns = _cpu_ns(dozing.pid)
+            while time.monotonic_ns() - began_ns < PERIOD_NS or _cpu_ns(dozing.pid) == before_ns:
+                assert time.monotonic() < limit, "it never runs"
+                os.sched_yield()
+            _until_asleep(dozing.pid)
+            now_ns = time.monotonic_ns()
+            if _state(dozing.pid) == "S":
+                assert starvation.starves(now_ns)
+                return
 
 
 @pytest.mark.parametrize(("word", "excused"), [("", False), (WEAK, True)])
@@ -102,9 +129,13 @@ def test_runnable_without_a_cpu_starves_and_with_one_it_loops(word: str, excused
 
 def _until_asleep(pid: int) -> None:
     limit = time.monotonic() + 5.0
-    while Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "S":
+    while _state(pid) != "S":
         assert time.monotonic() < limit, "it does not fall asleep"
         os.sched_yield()
+
+
+def _state(pid: int) -> str:
+    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
 
 
 def _cpu_ns(pid: int) -> int:

@@ -129,6 +129,13 @@ def test_memory_is_there_at_any_time(when: str) -> None:
     assert [r for r, _ in receipts(run)] == ["activated"]
 
 
+def test_two_faults_in_one_cell_have_a_receipt_each() -> None:
+    """The cell was made for the first, which never comes to its point."""
+    never, second = f"{FLIP} at reply.sent nth 1000", "bitflip state.counter bit 1 at reply.sent nth 10"
+    run = played("pbr", never, second, f"bitflip state.counter bit 2 at reply.delivered nth {COUNT}")
+    assert [r for r, _ in receipts(run)] == ["armed", "activated", "applied"]
+
+
 def test_the_same_seed_hits_the_same_bit() -> None:
     first, second = (played("pbr", "bitflip state.track0.range_m at reply.sent nth 10") for _ in range(2))
     assert first.faults == second.faults and first.rest.states == second.rest.states

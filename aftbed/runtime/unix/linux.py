@@ -132,9 +132,10 @@ class Starvation:
     | `R`                    | more                                      | hangs: it loops           |
     | `D`, waits for a disk  | at most half of the time                  | starves                   |
     | `S`, asleep            | none: the timer of its pulse did not come | starves: its core stalls  |
+    | `S`                    | some, and for a quarter of the time it    | starves: it gets too      |
+    |                        | was ready to run and not let run          | little, and too late      |
     | `S`                    | some: the timer comes, and it goes on     | hangs: blocked in a brick |
 
-    And whatever its state: one that was ready to run, and was not let run, for a quarter of the time starves.
     No excuse lasts longer than `EXCUSED_NS_MAX`.
     """
 
@@ -158,12 +159,11 @@ class Starvation:
         ran_ns, passed_ns = cpu_ns - self._cpu_ns, now_ns - self._since_ns
         if passed_ns > EXCUSED_NS_MAX:
             return False
-        held_up = 4 * (waited_ns - self._waited_ns) > passed_ns
         match stat.rpartition(")")[2].split()[0]:
             case "R" | "D":
-                return held_up or 2 * ran_ns <= passed_ns
+                return 2 * ran_ns <= passed_ns
             case "S":
-                return held_up or ran_ns == 0
+                return ran_ns == 0 or 4 * (waited_ns - self._waited_ns) > passed_ns
             case _:
                 return False
 

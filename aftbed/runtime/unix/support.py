@@ -52,8 +52,11 @@ class Support:
         return str(self._record / "journal" / f"{node.replace('/', '.')}.{incarnation}.journal")
 
     def records(self, journal: str) -> Iterable[Record]:
-        """What is committed in the file."""
-        return records(Path(journal).read_bytes())
+        """What is committed in the file; nothing, if its node has died before it made one."""
+        try:
+            return records(Path(journal).read_bytes())
+        except FileNotFoundError:
+            return ()
 
     def recorded_requests(self) -> tuple[bytes, ...]:
         """From the client's dialogue."""
