@@ -52,6 +52,21 @@ def test_a_gate_that_is_not_kept_fails_the_build(spec: Path, call: Call) -> None
     assert re.search(r"fail +unexpected +\* +at most 0.2 +0.5 ", out), out
 
 
+def test_a_campaign_whose_faults_cannot_fire_fails(spec: Path, call: Call) -> None:
+    """Whatever else is well: everything in it is as it should be."""
+    text = (
+        SPEC.replace("[1, 25]", "[100, 200]")
+        .replace("[pbr, none]", "[pbr]")
+        .replace(", none: [unavailable]", "")
+    )
+    spec.write_text(text)
+    code, out, _ = call("campaign", "run", spec, "--jobs", "1", "--out", "out", "--json")
+    document = json.loads(out)
+    assert (code, document["gate"], document["outcomes"]) == (1, "fail", {"masked": 12})
+    failed = {gate["metric"]: gate["reason"] for gate in document["gates"] if gate["word"] == "fail"}
+    assert failed["not_activated"] == "none of 12 faults struck: this stratum could not have failed"
+
+
 def test_what_is_there_is_reported_again(spec: Path, told: Run) -> None:
     first = json.loads(told("campaign", "run", spec, "--out", "out", "--json"))
     again = json.loads(told("campaign", "report", "out", "--json"))

@@ -122,7 +122,7 @@ def test_inject_crash_at_the_nth_event(drive: Command) -> None:
 def test_inject_a_short_hang(drive: Command) -> None:
     told(drive, "inject", "hang", "engine", "--for", "50ms")
     assert json.loads(told(drive, "status", "--json"))["epoch"] == 1
-    ended_well(drive, "hang engine for 50ms: applied")
+    ended_well(drive, "hang engine for 50ms: activated")
 
 
 def test_inject_after_a_while(drive: Command) -> None:
