@@ -26,7 +26,6 @@ from aftbed.runtime.zygotes import LIGHT
 RETRY_SECONDS: Final = 0.002
 AGAIN_SECONDS: Final = 0.02
 SETTLE_SECONDS: Final = 0.002
-REFILL_SECONDS: Final = 0.05  # forks are CPU time of those who serve; a spare that is wanted is made at once
 LOSS_SECONDS: Final = 0.5  # a failover is done long before
 HANG_NS: Final = 150_000_000  # of what no Watchdog watches; a channel's pulse is 20 ms
 LOSSES: Final = ("failover", "drop backup")
@@ -122,12 +121,8 @@ class Conductor:
     def _settle(self) -> None:
         if self.ending:
             return
-        self._loop.after(REFILL_SECONDS, self._refill)
+        self._support.nursery.level(LIGHT, self.spares())
         self._loop.jobs.start("rearm", self.faults.rearm(), lambda _: None)
-
-    def _refill(self) -> None:
-        if not self.ending:
-            self._support.nursery.level(LIGHT, self.spares())
 
     def inform_recovery(self, *, failed: bool) -> None:
         """Tell it how things are; it may act again."""
