@@ -75,7 +75,7 @@ def setup_of(record: RunRecord) -> Setup:
 def _compare(setup: Setup, records: list[RunRecord], seeds: int) -> Agreement:
     real_classes, real_ms = Counter[str](), list[float]()
     for record in records:
-        lost = record.end is None or not record.end.get("leader")
+        lost = record.end is None or bool(record.end.get("lost")) or not record.end.get("leader")
         real_classes[class_of(record.history, bare_server(record), lost=lost)] += 1
         real_ms += _recoveries(record.history)
     sim_classes, sim_ms = Counter[str](), list[float]()

@@ -26,6 +26,7 @@ from aftbed.runtime.unix.part import load_module
 from aftbed.vehicle.function import default_application
 
 BROKEN: Final = (*FAILED, "latent", "detected_stop")
+ROLLED_BACK: Final = "rolled back"
 REFUSED: Final = "refused by the self-test"
 AMPLE: Final = Resources(cpus=1024)
 APPLICATION: Final = "app"
@@ -45,10 +46,14 @@ class Cell(msgspec.Struct, frozen=True):
 
 
 def cells(ledger: Ledger) -> Iterator[Cell]:
-    """One for each stratum, of the experiments whose faults happened and of which something is known."""
+    """One for each stratum, of the experiments whose faults happened and of which something is known.
+
+    Where an update was rolled back, some requests were served by one version and some by the other: left out.
+    """
     groups: dict[str, list[Result]] = {}
     for result in ledger.results:
-        if result.activated and result.outcome not in UNKNOWN:
+        known = result.activated and result.outcome not in UNKNOWN
+        if known and ROLLED_BACK not in result.adapted:
             groups.setdefault(result.experiment.stratum, []).append(result)
     for name, group in groups.items():
         outcomes = Counter(_came_to(result) for result in group)
