@@ -33,6 +33,11 @@ class Asked(msgspec.Struct, frozen=True):
     resume: bool = False
     scheduler: str = ""  # address of a Dask scheduler, in the place of `jobs` processes
 
+    def has(self, index: int, strata: int) -> bool:
+        """Whether an experiment is of this shard: each shard has its part of every stratum."""
+        number, place = divmod(index, strata)
+        return (number + place) % self.shards == self.shard - 1
+
 
 def run(plan: Plan, asked: Asked) -> Generator[Result, None, None]:
     """Each result as soon as it is in the ledger. Raises ConfigError before anything runs."""
@@ -62,7 +67,7 @@ def _results(plan: Plan, asked: Asked, path: Path, earlier: set[str]) -> Generat
     limit_s = time.monotonic() + stop.minutes * 60 if stop.minutes is not None else None
     state = _Progress(plan, path, earlier)
     for first, last in _looks(plan):
-        todo = [e for e in state.open(first, last) if e.index % asked.shards == asked.shard - 1]
+        todo = [e for e in state.open(first, last) if asked.has(e.index, len(plan.strata))]
         for result in performed(todo, path, asked):
             state.add(result)
             yield result

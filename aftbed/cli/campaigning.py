@@ -156,7 +156,7 @@ def _follow(found: Plan, asked: running.Asked, *, as_json: bool) -> bool:
     from aftbed.campaign.report.table import Progress  # noqa: PLC0415
 
     results = running.run(found, asked)  # refuses what it refuses before anything is shown
-    todo = len([0 for e in range(found.size) if e % asked.shards == asked.shard - 1])
+    todo = sum(asked.has(index, len(found.strata)) for index in range(found.size))
     try:
         with closing(results), Progress(found.spec.campaign, todo, quiet=as_json) as progress:
             for result in results:

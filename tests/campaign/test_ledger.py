@@ -67,6 +67,8 @@ def test_shards_merge_to_the_whole(tmp_path: Path) -> None:
     whole = ran(found, tmp_path / "whole")
     shards = [ran(found, tmp_path / f"{i}", shard=i, shards=3) for i in (1, 2, 3)]
     assert [len(shard.results) for shard in shards] == [7, 7, 6]
+    names = {stratum.name for stratum in found.strata}
+    assert all({r.experiment.stratum for r in shard.results} == names for shard in shards)
     merged = ledger.merged(shards)
     assert [(r.experiment, r.outcome, r.faults) for r in merged.results] == [
         (r.experiment, r.outcome, r.faults) for r in whole.results
