@@ -14,6 +14,8 @@ from aftbed.runtime.unix import ask
 from aftbed.runtime.unix.options import LoadRun
 
 pytestmark = pytest.mark.process
+LIVE = 20_000  # requests, 200 a second: a command comes in time on any machine, then it is stopped
+STRUCK = 600  # three seconds
 
 COUNT: Final = 80
 RATE_HZ: Final = 200.0
@@ -180,13 +182,13 @@ def test_a_kept_reply_that_was_hit_is_answered_once_more(home: Home) -> None:
 def test_a_live_run_is_struck_from_a_second_command(
     home: Home, arguments: tuple[str, ...], fault: str
 ) -> None:
-    with under_load(home, 200) as run:
+    with under_load(home, STRUCK) as run:
         done = aftbed("inject", *arguments)
         assert done.code == 0 and f": {fault}" in done.err, done.err
         outcome = run.finish()
     assert outcome.verdict.faults[0]["fault"] == fault
     assert receipts(outcome)[0] in ("activated", "applied")
-    assert outcome.verdict.requests.answered == 200
+    assert outcome.verdict.requests.answered == STRUCK
 
 
 @pytest.mark.parametrize(
@@ -202,7 +204,8 @@ def test_a_live_run_is_struck_from_a_second_command(
     ],
 )
 def test_what_cannot_be_is_refused(home: Home, arguments: tuple[str, ...], words: str) -> None:
-    with under_load(home, 100) as run:
+    with under_load(home, LIVE) as run:
         done = aftbed("inject", *arguments)
         assert done.code == 2 and words in done.err, done.err
+        run.launched.stop()
         assert run.finish().verdict.verdict == "pass"
