@@ -9,6 +9,11 @@ PLAIN    := $(VENV)/.installed-plain
 EDITABLE := $(VENV)/.installed-editable
 SOURCES  := pyproject.toml README.md $(shell find aftbed dbc -type f -not -name '*.pyc')
 
+# The tests without real runs take every core. Of real runs, each has a core for either replica: two at a time
+# are as many as two cores bear without false alarms. A file stays together, for the runs that its tests share.
+FAST := -n auto --dist worksteal -m "not process and not deep"
+REAL := -n 2 --dist loadfile -m "process and not deep"
+
 FAULT := crash primary at checkpoint.sent nth 100
 
 .PHONY: help demo test lint fast process deep bench
@@ -20,8 +25,8 @@ help:
 	@echo "make test     install with the tools of the tests, then lint, fast and process"
 	@echo "make lint     ruff check, ruff format --check, mypy"
 	@echo "make fast     the tests without real runs"
-	@echo "make process  the tests that start real runs"
-	@echo "make deep     the exhaustive tests: minutes"
+	@echo "make process  the tests that start real runs: a sample of their combinations"
+	@echo "make deep     the exhaustive tests, one after the other: hours"
 	@echo "make bench    every number of the README"
 
 # Where the tests are installed, the package is too: then the demo needs nothing more.
@@ -36,10 +41,10 @@ lint: $(EDITABLE)
 	$(BIN)/mypy
 
 fast: $(EDITABLE)
-	$(BIN)/python -m pytest -m "not process and not deep"
+	$(BIN)/python -m pytest $(FAST)
 
 process: $(EDITABLE)
-	$(BIN)/python -m pytest -m "process and not deep"
+	$(BIN)/python -m pytest $(REAL)
 
 deep: $(EDITABLE)
 	$(BIN)/python -m pytest -m deep

@@ -74,6 +74,9 @@ class Resources(msgspec.Struct, frozen=True):
     bandwidth_kbit_s: float | None = None
 
 
+AMPLE: Final = Resources(cpus=1024)  # where R is not at stake
+
+
 class Row(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What one mechanism tolerates and needs. `deterministic`, `state_access`: why; empty: not needed."""
 
@@ -258,6 +261,15 @@ def refusal(
     others = consistent(faults, characteristics, resources, table)
     instead = f"consistent: {', '.join(others)}" if others else "no consistent FTM"
     return f"{expression} is not consistent: {'; '.join(found)} ({instead})"
+
+
+def unsuitable(expression: str, characteristics: Characteristics) -> str:
+    """Why `expression` does not suit a function, by its A alone; "" if it does.
+
+    The faults asked for are those that the mechanism is chosen for: crashes, where it replicates. Resources
+    are not judged.
+    """
+    return refusal(expression, FaultModel(crash=_replicates(parse(expression))), characteristics, AMPLE)
 
 
 def _united(faults: Iterable[tuple[Fault, ...]]) -> tuple[Fault, ...]:

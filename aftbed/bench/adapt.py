@@ -107,10 +107,10 @@ def _there_and_back(
     there: Outcomes = []
     back: Outcomes = []
     try:
-        _ready(launched.private)
+        ready(launched.private)
         for _ in range(count):
             for expression, outcomes in ((new, there), (old, back)):
-                outcomes.append(_adapt(launched.private, Goal(expression=expression)))
+                outcomes.append(adapted(launched.private, Goal(expression=expression)))
                 time.sleep(PAUSE_SECONDS)
         launched.stop()
     except BaseException:
@@ -128,8 +128,8 @@ def _one_by_one(
     for _ in range(count):
         launched = start(old, placement, LoadRun(REQUESTS_ENDLESS, RATE_HZ), pin=pin)
         try:
-            _ready(launched.private)
-            there.append(_adapt(launched.private, Goal(expression=new, recipe=recipe)))
+            ready(launched.private)
+            there.append(adapted(launched.private, Goal(expression=new, recipe=recipe)))
             time.sleep(PAUSE_SECONDS)
         finally:
             launched.stop()
@@ -137,14 +137,15 @@ def _one_by_one(
     return there, [], records
 
 
-def _adapt(private: Path, goal: Goal) -> dict[str, object]:
+def adapted(private: Path, goal: Goal) -> dict[str, object]:
+    """How the adaptation ended. Raises HarnessError unless it is done."""
     outcome = ask.ask(private, ask.Adapt(goal), ask.ADAPT_SECONDS_MAX)
     if outcome["outcome"] != "done":
         raise HarnessError(f"an adaptation of the bench ended {outcome['outcome']}: {outcome['reason']}")
     return outcome
 
 
-def _ready(private: Path) -> None:
+def ready(private: Path) -> None:
     """Until the run serves with all its replicas."""
     limit = time.monotonic() + READY_SECONDS_MAX
     while time.monotonic() < limit:

@@ -40,7 +40,9 @@ def hops(graph: Graph) -> int:
     return sum(a != b for a, b in itertools.pairwise(graph.node_of(name) for name in path(graph)))
 
 
-def bench_cycle(ftm: str, placement: str, count: int, *, pin: bool = True) -> dict[str, object]:
+def bench_cycle(
+    ftm: str, placement: str, count: int, *, pin: bool = True, rounds: int = ROUNDS
+) -> dict[str, object]:
     """`cycle_us{p50,p95,p99,max}, ring_us{...}, hops, ratio_p50`."""
     wanted = hops(build(ftm, placement))
     cpus = sorted(os.sched_getaffinity(0))
@@ -49,8 +51,8 @@ def bench_cycle(ftm: str, placement: str, count: int, *, pin: bool = True) -> di
     cycles: list[float] = []
     ring: list[float] = []
     ratios: list[float] = []
-    for _ in range(ROUNDS):
-        share = -(-count // ROUNDS)
+    for _ in range(rounds):
+        share = -(-count // rounds)
         bare = ring_us(wanted, size, share, cpu)
         record = finish(start(ftm, placement, LoadRun(share + WARM_UP, 0.0), pin=pin))
         ours = cycles_us(record, WARM_UP)

@@ -23,7 +23,7 @@ PAUSE_SECONDS: Final = 0.02  # of undisturbed service between two kills
 
 
 def bench_recovery(ftm: str, placement: str, kills: int, *, pin: bool = True) -> dict[str, object]:
-    """`recovery_ms{p50,p99,max}` and its parts: detection, fencing, promotion, first reply."""
+    """`recovery_ms{p50,p99,max}`, the same without detection, and its parts: see `docs/commands.md`."""
     launched = start(ftm, placement, LoadRun(REQUESTS_ENDLESS, 0.0), pin=pin)
     try:
         epoch = 0
@@ -54,6 +54,7 @@ def bench_recovery(ftm: str, placement: str, kills: int, *, pin: bool = True) ->
         "placement": placement,
         "kills": kills,
         "recovery_ms": summary(recovered, 3),
+        "after_detection_ms": summary([r - d for r, d in zip(recovered, parts["detection"], strict=True)], 3),
         "parts_ms": {name: summary(values, 3) for name, values in parts.items()},
     }
 

@@ -15,12 +15,16 @@ from typing import Final
 import msgspec
 
 from aftbed.adapt.bricks import load_application
-from aftbed.adapt.consistency import FaultModel, Resources, problems
+from aftbed.adapt.consistency import AMPLE, FaultModel, problems
+from aftbed.adapt.plan import APPLICATION
 from aftbed.adapt.words import read
 from aftbed.campaign.experiment import FAILED, UNKNOWN, Result
 from aftbed.campaign.ledger import Ledger
 from aftbed.campaign.statistics import Interval, proportion
 from aftbed.core.application import Application, Characteristics
+from aftbed.core.fault import Action, Crash, FlipMemory, Hang
+from aftbed.core.persistence import Permanent
+from aftbed.core.valuefault import Flip
 from aftbed.inject.words import parse
 from aftbed.runtime.unix.part import load_module
 from aftbed.vehicle.function import default_application
@@ -28,9 +32,6 @@ from aftbed.vehicle.function import default_application
 BROKEN: Final = (*FAILED, "latent", "detected_stop")
 ROLLED_BACK: Final = "rolled back"
 REFUSED: Final = "refused by the self-test"
-AMPLE: Final = Resources(cpus=1024)
-APPLICATION: Final = "app"
-VALUE_WORDS: Final = ("bitflip", "byte", "burst", "stuck")
 
 
 class Cell(msgspec.Struct, frozen=True):
@@ -78,15 +79,22 @@ def assumed_wrongly(result: Result) -> str:
     """What the table says against this mechanism, for these faults and this function; "" for nothing."""
     experiment = result.experiment
     faults = [parse(text) for text in experiment.faults]
-    words = [str(fault).split()[0] for fault in faults]
+    flips = [fault for fault in faults if isinstance(fault.action, Flip | FlipMemory)]
     asked = FaultModel(
-        crash=any(word in ("crash", "hang") for word in words),
-        value=any(word in VALUE_WORDS for word in words),
+        crash=any(isinstance(fault.action, Crash | Hang) for fault in faults),
+        value=bool(flips),
     )
     found = problems(experiment.ftm, asked, _characteristics(experiment.adaptations), AMPLE)
-    if asked.value and not found and any("permanent" in text for text in experiment.faults):
+    if not found and any(isinstance(fault.persistence, Permanent) for fault in flips):
         found = [f"{experiment.ftm} takes a value fault for transient: this one is in every execution"]
+    if not found and any(_at_rest(fault.action) for fault in flips):
+        found = [f"{experiment.ftm} compares executions: a state that is wrong before is in all of them"]
     return "; ".join(found)
+
+
+def _at_rest(action: Action) -> bool:
+    """Whether it strikes what no execution has in hand."""
+    return isinstance(action, FlipMemory) or (isinstance(action, Flip) and bool(action.field))
 
 
 def _characteristics(adaptations: tuple[str, ...]) -> Characteristics:
@@ -113,7 +121,7 @@ def markdown(ledger: Ledger) -> str:
         agrees = "agrees" if cell.agrees else "**differs**"
         lines.append(f"| {cell.stratum} | {cell.assumption or 'holds'} | {share} | {outcomes} | {agrees} |")
     about = (
-        f"{len(ledger.results)} experiments, {len(found)} strata, seed {head.seed}, code {head.code};"
+        f"{len(ledger.results)} experiments, {len(found)} strata, seed {head.spec.seed}, code {head.code};"
         f" intervals of {head.spec.confidence:.0%} (Clopper-Pearson)."
     )
     return "\n".join([*lines, "", about, ""])

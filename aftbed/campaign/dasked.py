@@ -7,6 +7,7 @@ Dask worker has threads and a run is begun by a fork. Every machine needs the sa
 answer says by which code it was made, and another's is refused.
 """
 
+import os
 import subprocess
 import sys
 from collections.abc import Generator, Iterator
@@ -19,14 +20,16 @@ from aftbed.campaign.executing import carry_out
 from aftbed.campaign.experiment import Experiment, Result
 from aftbed.campaign.planning import code_version
 from aftbed.core.errors import ConfigError, HarnessError
+from aftbed.runtime.unix import linux
 
 if TYPE_CHECKING:
-    from distributed import Client
+    from distributed import Client, Future
 
 CONNECT_SECONDS_MAX: Final = 10
 RUN_SECONDS_MAX: Final = 120.0
-AHEAD: Final = 3  # experiments per thread of the cluster that are handed out before they are asked for
 AGAIN_MAX: Final = 3  # workers that may die under one experiment
+SILENCE_SECONDS_MAX: Final = (AGAIN_MAX + 1) * RUN_SECONDS_MAX + 60.0  # as long as one may take, tried again
+AHEAD: Final = 3  # experiments per thread of the cluster that are handed out before they are asked for
 
 Answer = tuple[str, bytes]  # the code version, and the result
 
@@ -36,7 +39,7 @@ def perform(task: bytes) -> Answer:
     experiment = msgspec.json.decode(task, type=Experiment)
     if experiment.runtime == "sim":
         return code_version(), msgspec.json.encode(carry_out(experiment, lambda _: None))
-    command = [sys.executable, "-P", "-m", "aftbed.campaign.dasked"]
+    command = [sys.executable, "-P", "-m", "aftbed.campaign.dasked", str(os.getpid())]
     done = subprocess.run(command, input=task, capture_output=True, timeout=RUN_SECONDS_MAX, check=False)
     if done.returncode != 0:
         raise HarnessError(f"a worker could not run {experiment.id}: {done.stderr.decode()[-500:]}")
@@ -57,34 +60,41 @@ def connect(address: str) -> "Client":
 
 def over(client: "Client", experiments: Iterator[Experiment]) -> Generator[Result, None, None]:
     """Every result as it comes. Raises HarnessError where an experiment cannot be had."""
-    from distributed import as_completed  # noqa: PLC0415
+    from distributed import wait  # noqa: PLC0415
 
     threads = sum(client.nthreads().values())
     if not threads:
         raise HarnessError("the scheduler has no workers: start some, as `dask worker ADDRESS`")
-    pending = as_completed()
-
-    def hand_out(count: int) -> None:
-        for experiment in islice(experiments, count):
+    pending: set[Future[Answer]] = set()
+    while True:
+        for experiment in islice(experiments, AHEAD * threads - len(pending)):
             task = msgspec.json.encode(experiment)
-            pending.add(
-                client.submit(perform, task, key=f"aftbed-{experiment.id}", retries=AGAIN_MAX, pure=False)
-            )
-
-    hand_out(AHEAD * threads)
-    for future in pending:
+            key = f"aftbed-{experiment.id}"
+            pending.add(client.submit(perform, task, key=key, retries=AGAIN_MAX, pure=False))
+        if not pending:
+            return
         try:
-            code, data = future.result()
-        except Exception as error:  # whatever a worker died of
-            raise HarnessError(f"experiment {future.key}: {type(error).__name__}: {error}") from error
-        if code != code_version():
-            raise ConfigError(f"a worker has aftbed {code}, this is {code_version()}: install the same one")
-        yield msgspec.json.decode(data, type=Result)
-        hand_out(1)
+            done, pending = wait(pending, timeout=SILENCE_SECONDS_MAX, return_when="FIRST_COMPLETED")
+        except TimeoutError:
+            raise HarnessError(
+                f"no worker has answered for {SILENCE_SECONDS_MAX:g} s: are there any left? --resume goes on"
+            ) from None
+        yield from map(_answered, done)
+
+
+def _answered(future: "Future[Answer]") -> Result:
+    try:
+        code, data = future.result()
+    except Exception as error:  # whatever a worker died of
+        raise HarnessError(f"experiment {future.key}: {type(error).__name__}: {error}") from error
+    if code != code_version():
+        raise ConfigError(f"a worker has aftbed {code}, this is {code_version()}: install the same one")
+    return msgspec.json.decode(data, type=Result)
 
 
 def main() -> None:
-    """One experiment from stdin, its result to stdout: the interpreter of a real run."""
+    """One experiment from stdin, its result to stdout: a real run's interpreter. It dies with its worker."""
+    linux.die_with(int(sys.argv[1]))
     experiment = msgspec.json.decode(sys.stdin.buffer.read(), type=Experiment)
     sys.stdout.buffer.write(msgspec.json.encode(carry_out(experiment, lambda _: None)))
 

@@ -75,12 +75,17 @@ class Experiment(msgspec.Struct, frozen=True):
 
 
 class Result(msgspec.Struct, frozen=True, omit_defaults=True):
-    """What came of an experiment: one line of the ledger. Times in ms; `gap_m` and `impact_kmh` of a car."""
+    """What came of an experiment: one line of the ledger. Times in ms; `gap_m` and `impact_kmh` of a car.
+
+    `broken`: what was promised whatever the faults are, and was not kept: one master (G6), a whole graph
+    (G5), a clean exit (G7).
+    """
 
     experiment: Experiment
     outcome: str
     unexpected: bool = False  # its faults happened, and it came to another class than is expected
     activated: bool = True  # every fault of it happened
+    broken: tuple[str, ...] = ()
     reasons: tuple[str, ...] = ()
     faults: tuple[dict[str, str], ...] = ()
     requests: Requests | None = None
@@ -93,6 +98,7 @@ class Result(msgspec.Struct, frozen=True, omit_defaults=True):
     collision: bool | None = None
     impact_kmh: float | None = None
     gap_m: float | None = None
+    golden_gap_m: float | None = None  # of the same drive without a fault
     noisy: bool = False  # the machine was too busy for its times to mean anything
     seconds: float = 0.0
 

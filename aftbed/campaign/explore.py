@@ -12,9 +12,10 @@ import itertools
 import os
 import signal
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor
+from collections.abc import Callable, Generator, Iterable, Iterator, MutableSequence
+from concurrent.futures import Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from multiprocessing.sharedctypes import RawArray
 from typing import Final, NamedTuple, TypeVar
 
 import msgspec
@@ -44,11 +45,13 @@ ADAPT_RATE_HZ: Final = 400.0
 ADAPT_AT: Final = 4  # the request at which the adaptation begins
 CHUNK: Final = 16  # experiments handed to a worker at once
 AHEAD: Final = 3  # chunks for each worker that are handed out before they are asked for
+CHUNK_SECONDS_MAX: Final = 900.0  # it takes seconds, on a busy machine a minute: one that takes more hangs
 CAR: Final = "vehicle"  # beside the promises: what the scenario expects of the car
 REASON_MAX: Final = 300  # characters of an error of our own
 
 S = TypeVar("S")
 T = TypeVar("T")
+Alone = Callable[[int, S], str]  # number and experiment -> a command
 
 
 class Strike(NamedTuple):
@@ -263,34 +266,48 @@ def judged(setup: Setup) -> tuple[bool, tuple[Breach, ...]]:
 
 
 def explore(
-    setups: Iterable[Setup], jobs: int = 1
+    setups: Iterable[Setup], jobs: int = 1, alone: Alone[Setup] | None = None
 ) -> Generator[tuple[int, Setup, bool, tuple[Breach, ...]], None, None]:
-    """Every experiment with its number and what came of it, in order."""
-    for number, setup, (lost, broken) in each(judged, setups, jobs):
+    """Every experiment with its number and what came of it, in order. See `each`."""
+    for number, setup, (lost, broken) in each(judged, setups, jobs, alone=alone):
         yield number, setup, lost, broken
 
 
 def each(
-    judge: Callable[[S], T], setups: Iterable[S], jobs: int = 1, chunk_size: int = CHUNK
+    judge: Callable[[S], T],
+    setups: Iterable[S],
+    jobs: int = 1,
+    chunk_size: int = CHUNK,
+    *,
+    alone: Alone[S] | None = None,
+    seconds_max: float = CHUNK_SECONDS_MAX,
 ) -> Generator[tuple[int, S, T], None, None]:
     """`judge` on every experiment, in order, over `jobs` processes; there may be no end of them.
 
-    Raises HarnessError if one of the processes dies.
+    Raises HarnessError if one of the processes dies, or hangs: if `chunk_size` experiments, one after the
+    other, take more than `seconds_max`. `alone` is the command that runs one of them by itself.
     """
     if jobs == 1:
         for number, setup in enumerate(setups):
             yield number, setup, judge(setup)
         return
     numbered = enumerate(setups)
-    under_way: deque[tuple[list[tuple[int, S]], Future[list[T]]]] = deque()
-    pool = ProcessPoolExecutor(jobs, initializer=_belong_to, initargs=(os.getpid(),))
+    under_way: deque[tuple[int, list[tuple[int, S]], Future[list[T]]]] = deque()
+    board = RawArray("q", 2 * AHEAD * jobs)  # of each chunk under way: who is at it, and at which experiment
+    places = itertools.cycle(range(0, len(board), 2))
+    pool = ProcessPoolExecutor(jobs, initializer=_belong_to, initargs=(os.getpid(), board))
     try:
         while True:
             while len(under_way) < AHEAD * jobs and (chunk := list(itertools.islice(numbered, chunk_size))):
-                under_way.append((chunk, pool.submit(_all, judge, [setup for _, setup in chunk])))
+                place = next(places)
+                under_way.append((place, chunk, pool.submit(_all, judge, place, chunk)))
             if not under_way:
                 return
-            chunk, future = under_way.popleft()
+            place, chunk, future = under_way.popleft()
+            if not wait((future,), seconds_max).done:
+                pid, hung = board[place : place + 2]
+                os.kill(pid, signal.SIGKILL)  # it breaks the pool, which ends the others
+                raise HarnessError(_hung(hung, dict(chunk)[hung], seconds_max, alone))
             for (number, setup), found in zip(chunk, future.result(), strict=True):
                 yield number, setup, found
     except BrokenProcessPool as error:
@@ -299,11 +316,26 @@ def each(
         pool.shutdown(cancel_futures=True)
 
 
-def _all(judge: Callable[[S], T], setups: list[S]) -> list[T]:
-    return [judge(setup) for setup in setups]
+def _hung(number: int, setup: S, seconds_max: float, alone: Alone[S] | None) -> str:
+    command = f"; alone: {alone(number, setup)}" if alone is not None else ""
+    what = f"{setup}"[:REASON_MAX]
+    return f"experiment {number} hangs, after {seconds_max:g} s there is no result: {what}{command}"
 
 
-def _belong_to(command: int) -> None:
+_board: MutableSequence[int] = []  # of the command, in its workers
+
+
+def _all(judge: Callable[[S], T], place: int, chunk: list[tuple[int, S]]) -> list[T]:
+    found = []
+    for number, setup in chunk:
+        _board[place], _board[place + 1] = os.getpid(), number
+        found.append(judge(setup))
+    return found
+
+
+def _belong_to(command: int, board: MutableSequence[int]) -> None:
     """Leave interrupts to the command, and die with it, whatever ends it (G7)."""
+    global _board  # noqa: PLW0603 - one for a process, which is one worker of one pool
+    _board = board
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     linux.die_with(command)

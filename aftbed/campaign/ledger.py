@@ -17,7 +17,7 @@ from aftbed.campaign.environment import Environment, here
 from aftbed.campaign.experiment import Experiment, Result
 from aftbed.campaign.planning import Plan
 from aftbed.campaign.spec import Spec
-from aftbed.core.errors import ConfigError
+from aftbed.core.errors import ConfigError, HarnessError
 
 NAME: Final = "records.jsonl"
 LINE_BYTES_MAX: Final = 1_000_000
@@ -29,10 +29,8 @@ T = TypeVar("T")
 class Head(msgspec.Struct, frozen=True):
     """The first line. `shard` I of `shards`, counted from 1."""
 
-    campaign: str
     digest: str
     code: str
-    seed: int
     spec: Spec
     environment: Environment
     shard: int = 1
@@ -49,8 +47,7 @@ class Ledger(msgspec.Struct, frozen=True):
 
 def head_of(plan: Plan, shard: int = 1, shards: int = 1) -> Head:
     """Of the ledger of `plan`."""
-    spec = plan.spec
-    return Head(spec.campaign, plan.digest, plan.code, spec.seed, spec, here(), shard, shards)
+    return Head(plan.digest, plan.code, plan.spec, here(), shard, shards)
 
 
 def begin(path: Path, head: Head) -> None:
@@ -65,8 +62,8 @@ def begin(path: Path, head: Head) -> None:
         raise ConfigError(f"{path}: cannot be made: {error.strerror}") from None
 
 
-def resume(path: Path, head: Head) -> set[str]:
-    """The ids of what has been done; a torn last line is cut off. Raises ConfigError on another's."""
+def resume(path: Path, head: Head) -> None:
+    """Make it ready to go on with: a torn last line is cut off. Raises ConfigError on another's."""
     data = _bytes(path)
     whole = data.rfind(b"\n") + 1
     found = read(path, data[:whole])
@@ -76,7 +73,6 @@ def resume(path: Path, head: Head) -> set[str]:
             raise ConfigError(f"{path}: another {OWN[name]} ({old}; now {new}): --out begins a new campaign")
     if whole < len(data):
         os.truncate(path, whole)
-    return {result.experiment.id for result in found.results}
 
 
 def opened(path: Path) -> int:
@@ -88,7 +84,15 @@ def append(descriptor: int, result: Result) -> None:
     """One line, whole or not at all."""
     line = msgspec.json.encode(result) + b"\n"
     assert len(line) <= LINE_BYTES_MAX, f"{len(line)} bytes for one result"
-    os.write(descriptor, line)
+    try:
+        written = os.write(descriptor, line)
+    except OSError as error:
+        raise HarnessError(f"{_path_of(descriptor)}: a result cannot be written: {error.strerror}") from None
+    if written != len(line):
+        raise HarnessError(
+            f"{_path_of(descriptor)}: {written} of {len(line)} bytes of a result fitted: make room, "
+            "then go on with --resume"
+        )
 
 
 def read(path: Path, data: bytes | None = None) -> Ledger:
@@ -114,8 +118,12 @@ def merged(ledgers: Iterable[Ledger]) -> Ledger:
     for other in found[1:]:
         if (other.head.digest, other.head.code) != (first.head.digest, first.head.code):
             raise ConfigError(f"{other.path}: of another spec or code than {first.path}")
-        if other.head.shard == first.head.shard:
-            raise ConfigError(f"{other.path}: shard {other.head.shard} of {other.head.shards} stands twice")
+        if other.head.shards != first.head.shards:
+            raise ConfigError(
+                f"{other.path}: shard {other.head.shard} of {other.head.shards}; {first.path} is one of "
+                f"{first.head.shards}: shards of one run belong together"
+            )
+    _refuse_gaps(found)
     results = [result for ledger in found for result in ledger.results]
     _refuse_doubles(first.path, results)
     head = msgspec.structs.replace(first.head, shard=1, shards=1)
@@ -131,12 +139,29 @@ def find(ledger: Ledger, name: str) -> Result:
     return exact[0]
 
 
+def _refuse_gaps(ledgers: list[Ledger]) -> None:
+    """Each shard once, and all of them: a sum that lacks one looks like a whole campaign."""
+    shards = ledgers[0].head.shards
+    stands: dict[int, Path] = {}
+    for ledger in ledgers:
+        if ledger.head.shard in stands:
+            raise ConfigError(f"{ledger.path}: shard {ledger.head.shard} of {shards} stands twice")
+        stands[ledger.head.shard] = ledger.path
+    missing = [str(shard) for shard in range(1, shards + 1) if shard not in stands]
+    if missing:
+        raise ConfigError(f"shard {', '.join(missing)} of {shards} is missing: name the records of all")
+
+
 def _refuse_doubles(path: Path, results: list[Result]) -> None:
     seen: dict[str, Experiment] = {}
     for result in results:
         if result.experiment.id in seen:
             raise ConfigError(f"{path}: experiment {result.experiment.id} stands twice")
         seen[result.experiment.id] = result.experiment
+
+
+def _path_of(descriptor: int) -> str:
+    return str(Path(f"/proc/self/fd/{descriptor}").readlink())
 
 
 def _bytes(path: Path) -> bytes:

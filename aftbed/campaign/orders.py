@@ -13,12 +13,13 @@ from typing import Final
 
 import msgspec
 
-from aftbed.campaign.explore import each
+from aftbed.campaign.explore import CHUNK_SECONDS_MAX, each
 from aftbed.campaign.simulated import Breach, breaches
 from aftbed.runtime.sim.clock import Clock
 from aftbed.runtime.sim.interleaving import HeldChannel, orders
 from aftbed.runtime.sim.world import Doom, Setup, World, simulate
 
+RUN_SECONDS_MAX: Final = 1.0  # on a busy machine
 RUNS_MAX: Final = 2_000  # per experiment, unless another bound is given
 CRASHED: Final = ("protocol", "before", "proceed", "after", "server")  # parts whose death is a crash here
 
@@ -64,5 +65,7 @@ def all_orders(setup: Setup, runs_max: int = RUNS_MAX) -> Ordered:
 
 def explore_orders(setups: Iterable[Setup], runs_max: int = RUNS_MAX, jobs: int = 1) -> Iterator[Ordered]:
     """Every experiment, in order."""
-    for _, _, found in each(partial(all_orders, runs_max=runs_max), setups, jobs, chunk_size=1):
+    seconds_max = max(CHUNK_SECONDS_MAX, runs_max * RUN_SECONDS_MAX)
+    judge = partial(all_orders, runs_max=runs_max)
+    for _, _, found in each(judge, setups, jobs, chunk_size=1, seconds_max=seconds_max):
         yield found

@@ -19,11 +19,12 @@ import msgspec
 import aftbed
 from aftbed.adapt.schedule import scheduled
 from aftbed.campaign.experiment import Experiment
-from aftbed.campaign.spec import ANY, AdaptationEntry, FaultEntry, Spec, Value
+from aftbed.campaign.spec import ANY, AdaptationEntry, FaultEntry, Spec, System, Value
 from aftbed.core.errors import ConfigError
-from aftbed.core.fault import Fault
+from aftbed.core.fault import Fault, FlipMemory
 from aftbed.core.graph import Graph
 from aftbed.ftm.mechanism import build
+from aftbed.inject.parts import refuse_unsafe
 from aftbed.inject.words import parse
 from aftbed.runtime import targets
 from aftbed.runtime.unix.busaim import aim
@@ -168,13 +169,22 @@ def faults_of(experiment: Experiment, graph: Graph) -> tuple[Fault, ...]:
     return found
 
 
+def _check_memory(faults: tuple[Fault, ...], system: System) -> None:
+    """Raise ConfigError where a fault strikes memory that there is not, or that nobody has opened to it."""
+    for fault in faults:
+        if isinstance(fault.action, FlipMemory):
+            if system.runtime == "sim":
+                raise ConfigError(f"{fault}: under system.runtime sim processes have no memory of their own")
+            refuse_unsafe(str(fault), unsafe=system.unsafe_memory, say="system.unsafe_memory: true")
+
+
 def _check(made: Plan, stratum: Stratum) -> None:
     """Every point of the matrix, before anything runs."""
     where = f"faults: {stratum.fault.name!r} under {stratum.ftm}"
     graph = build(stratum.ftm, stratum.placement)
     try:
         for number in range(points(stratum.fault)):
-            faults_of(made.experiment(0, number, stratum), graph)
+            _check_memory(faults_of(made.experiment(0, number, stratum), graph), made.spec.system)
     except ConfigError as error:
         raise ConfigError(f"{where}: {error}") from error
     try:

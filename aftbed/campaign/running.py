@@ -16,9 +16,9 @@ from pathlib import Path
 import msgspec
 
 from aftbed.campaign import ledger
-from aftbed.campaign.executing import carry_out
+from aftbed.campaign.executing import REQUESTS_PER_SECOND_MIN, carry_out
 from aftbed.campaign.experiment import Experiment, Result
-from aftbed.campaign.explore import each
+from aftbed.campaign.explore import CHUNK_SECONDS_MAX, each
 from aftbed.campaign.planning import Plan
 from aftbed.core.errors import ConfigError
 
@@ -54,21 +54,20 @@ def run(plan: Plan, asked: Asked) -> Generator[Result, None, None]:
     path = asked.out / ledger.NAME
     head = ledger.head_of(plan, asked.shard, asked.shards)
     if asked.resume:
-        earlier = ledger.resume(path, head)
+        ledger.resume(path, head)
     else:
         asked.out.mkdir(parents=True, exist_ok=True)
         ledger.begin(path, head)
-        earlier = set()
-    return _results(plan, asked, path, earlier)
+    return _results(plan, asked, path)
 
 
-def _results(plan: Plan, asked: Asked, path: Path, earlier: set[str]) -> Generator[Result, None, None]:
+def _results(plan: Plan, asked: Asked, path: Path) -> Generator[Result, None, None]:
     stop = plan.spec.stop
     limit_s = time.monotonic() + stop.minutes * 60 if stop.minutes is not None else None
-    state = _Progress(plan, path, earlier)
+    state = _Progress(plan, path)
     for first, last in _looks(plan):
-        todo = [e for e in state.open(first, last) if asked.has(e.index, len(plan.strata))]
-        for result in performed(todo, path, asked):
+        todo = (e for e in state.open(first, last) if asked.has(e.index, len(plan.strata)))
+        for result in performed(todo, path, asked, _seconds_max(plan)):
             state.add(result)
             yield result
             late = limit_s is not None and time.monotonic() > limit_s
@@ -76,10 +75,17 @@ def _results(plan: Plan, asked: Asked, path: Path, earlier: set[str]) -> Generat
                 return
 
 
-def performed(todo: list[Experiment], path: Path, asked: Asked) -> Iterator[Result]:
+def _seconds_max(plan: Plan) -> float:
+    """An experiment that takes more hangs; real ones have deadlines of their own, and end before."""
+    system = plan.spec.system
+    return CHUNK_SECONDS_MAX + 2 * system.requests / (system.rate_hz or REQUESTS_PER_SECOND_MIN)
+
+
+def performed(todo: Iterator[Experiment], path: Path, asked: Asked, seconds_max: float) -> Iterator[Result]:
     """Each result, which is in the ledger by then."""
     if not asked.scheduler:
-        for _, _, result in each(partial(_perform, os.fspath(path)), todo, asked.jobs, chunk_size=1):
+        perform = partial(_perform, os.fspath(path))
+        for _, _, result in each(perform, todo, asked.jobs, 1, seconds_max=seconds_max):
             yield result
         return
     from aftbed.campaign import dasked  # noqa: PLC0415 - an extra
@@ -87,7 +93,7 @@ def performed(todo: list[Experiment], path: Path, asked: Asked) -> Iterator[Resu
     descriptor = ledger.opened(path)
     try:
         with dasked.connect(asked.scheduler) as client:
-            for result in dasked.over(client, iter(todo)):
+            for result in dasked.over(client, todo):
                 ledger.append(descriptor, result)
                 yield result
     finally:
@@ -114,11 +120,13 @@ def _looks(plan: Plan) -> Iterator[tuple[int, int]]:
 class _Progress:
     """What has been done, and which strata are known well enough."""
 
-    def __init__(self, plan: Plan, path: Path, earlier: set[str]) -> None:
-        self._plan, self._earlier = plan, earlier
+    def __init__(self, plan: Plan, path: Path) -> None:
+        self._plan = plan
+        results = ledger.read(path).results
+        self._earlier = frozenset(result.experiment.id for result in results)
         self._count = Counter[str]()
         self._unexpected = Counter[str]()
-        for result in ledger.read(path).results:
+        for result in results:
             self.add(result)
 
     def add(self, result: Result) -> None:

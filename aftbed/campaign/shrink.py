@@ -33,6 +33,7 @@ from aftbed.core.message import Scheduled
 from aftbed.core.valuefault import Flip
 from aftbed.ftm.mechanism import build, parse, replication_of
 from aftbed.runtime import targets
+from aftbed.runtime.sim.givens import check
 from aftbed.runtime.sim.world import Doom, Setup
 
 TRIES_MAX: Final = 400
@@ -85,6 +86,7 @@ def _makes_sense(setup: Setup) -> bool:
     try:
         for fault in setup.faults:
             targets.check(fault, graph)
+            check(fault, setup.scenario)
     except ConfigError:
         return False
     return {doom.brick for doom in setup.dooms} <= {brick.name for brick in graph.bricks}

@@ -64,7 +64,7 @@ def breaches(run: Run, function: Callable[[], Application] = default_application
         names = ", ".join(name for _, name in run.struck) or "nobody"
         found.append(Breach("G2", f"the service is lost, though only {names} was struck"))
     if not run.rest.lost and not down:
-        found += [Breach("G5", reason) for reason in half_a_graph(run.rest.hosted, _expected(run))[:1]]
+        found += [Breach("G5", reason) for reason in half_a_graph(run.rest.hosted, expected_of(run))[:1]]
         found += [Breach(REST, "; ".join(run.rest.why_not))] if run.rest.why_not else []
     return tuple(found)
 
@@ -98,7 +98,7 @@ def _renewals(run: Run) -> Iterator[tuple[int, int]]:
             yield began_ns, t_ns
 
 
-def _expected(run: Run) -> str:
+def expected_of(run: Run) -> str:
     """The FTM that the adaptations, as they ended, have come to."""
     done = [a.ftm for a in run.adaptations if a.outcome == "done"]
     return done[-1] if done else run.setup.ftm

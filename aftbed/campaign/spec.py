@@ -48,6 +48,7 @@ METRICS: Final = (
     "unexpected",
     "unknown",  # inconclusive, or a harness_error
     "not_activated",
+    "broken",
     "collision",
     "recovery_ms_p50",
     "recovery_ms_p99",
@@ -70,6 +71,7 @@ class System(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     scenario: str = ""
     placements: tuple[str, ...] = ("process",)
     runtime: Literal["unix", "sim"] = "unix"
+    unsafe_memory: bool = False  # faults may strike any memory of a node
 
 
 class FaultEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

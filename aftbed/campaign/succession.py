@@ -3,45 +3,82 @@
 G3 compares with the bare server over the same requests. Where `aftbed adapt update app` put another function
 in place, the bare server is updated too, before the same request: the first that was answered after
 the adaptation let requests through again.
+
+An update that was rolled back may have served meanwhile. Then the version of before goes on, with the state
+of the new one, behind the last request that a replica had executed, or heard the outcome of, which served
+again. What only a lost replica had executed was executed once more, by the version of before.
 """
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Iterable
 from typing import Final
+
+import msgspec
 
 from aftbed.adapt.bricks import load_application
 from aftbed.campaign.record import RunRecord
 from aftbed.core.application import Application
+from aftbed.core.check import History
+from aftbed.core.errors import PeerError
 from aftbed.core.event import Event
+from aftbed.runtime.rewiring import replica_of
 from aftbed.runtime.unix.part import load_module
 from aftbed.vehicle.function import default_application
 
 Make = Callable[[], Application]
+Change = tuple[int, Make | None]  # from which request on, counted from 1; None: the version of before
 BUILT_IN: Final = ""
+DONE: Final = "done"
+
+
+class Told(msgspec.Struct, frozen=True):
+    """What counts of an adaptation's outcome: see `runtime.adaptations.Outcome`."""
+
+    outcome: str
+    application: str = BUILT_IN
+    tried: str = BUILT_IN
+    opened_ns: int = 0
+    undone_ns: int = 0
+    lost: str = ""
 
 
 class Succession:
-    """`changes`: from which request on (counted from 1) which function, in order."""
+    """`changes`, in their order."""
 
-    def __init__(self, changes: list[tuple[int, Make]]) -> None:
+    def __init__(self, changes: list[Change]) -> None:
         self._function: Application = default_application()
+        self._before: list[Application] = []
         self._changes = list(changes)
         self._count = 0
         self.characteristics = self._function.characteristics
-        versions = (self._function, *(make() for _, make in changes))
+        versions = (self._function, *(make() for _, make in changes if make is not None))
         self.deterministic = all(version.characteristics.deterministic for version in versions)
 
     def execute(self, request: bytes) -> bytes:
         """By the version whose turn it is."""
         self._count += 1
         while self._changes and self._count >= self._changes[0][0]:
-            self._update(self._changes.pop(0)[1]())
+            _, make = self._changes.pop(0)
+            if make is not None:
+                self._update(make())
+            else:
+                self._go_back()
         return self._function.execute(request)
 
     def _update(self, new: Application) -> None:
         state = self._function.capture()
         if state:  # as in the run: what has none to give lets its successor begin anew
             getattr(new, "migrate", new.restore)(state)
+        self._before.append(self._function)
         self._function, self.characteristics = new, new.characteristics
+
+    def _go_back(self) -> None:
+        """The version of before was kept as it was; it takes the state of the other, if there is one."""
+        state, old = self._function.capture(), self._before.pop()
+        with contextlib.suppress(PeerError):  # no replica went on that refused it
+            if state:
+                getattr(old, "migrate", old.restore)(state)
+        self._function, self.characteristics = old, old.characteristics
 
     def capture(self) -> bytes:
         """Of the present version."""
@@ -58,14 +95,35 @@ class Succession:
 
 def bare_server(record: RunRecord) -> Callable[[], Succession]:
     """Makes the bare server of this run. Raises ConfigError where a version of the function is gone."""
-    changes: list[tuple[int, Make]] = []
-    stored = record.history.events(Event.REPLY_STORED)
+    return succession(record.history, record.adaptations)
+
+
+def succession(history: History, adaptations: Iterable[object]) -> Callable[[], Succession]:
+    """The same, of outcomes or of what was written of them. Raises ConfigError."""
+    changes: list[Change] = []
     running = BUILT_IN
-    for outcome in record.adaptations:
-        if outcome["outcome"] != "done" or outcome["application"] == running:
+    for outcome in adaptations:
+        told = msgspec.convert(outcome, Told, from_attributes=True)
+        function = told.application if told.outcome == DONE else told.tried
+        if not told.opened_ns or function == running:
             continue
-        running = str(outcome["application"])
-        opened_ns = int(str(outcome["opened_ns"]))
-        first = 1 + max((r.request_id for r in stored if r.t_ns < opened_ns), default=0)
-        changes.append((first, load_application(running, load_module) if running else default_application))
+        stored = (r.request_id for r in history.events(Event.REPLY_STORED) if r.t_ns < told.opened_ns)
+        first = 1 + max(stored, default=0)
+        make = load_application(function, load_module) if function else default_application
+        changes.append((first, make))
+        if told.undone_ns:
+            changes.append((max(first, _first_behind(history, told)), None))
+        else:
+            running = function
     return lambda: Succession(changes)
+
+
+def _first_behind(history: History, undone: Told) -> int:
+    """The first request that is the old version's again."""
+    lost = undone.lost.split()
+    known = (
+        r.request_id
+        for r in history.events(Event.SERVER_EXIT, Event.STATE_RESTORED)
+        if undone.opened_ns <= r.t_ns < undone.undone_ns and replica_of(r.node) not in lost
+    )
+    return 1 + max(known, default=0)

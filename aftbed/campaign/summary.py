@@ -3,7 +3,8 @@
 A gate on a share is judged by the bound of the interval that the number of experiments allows, so "0 of 10"
 proves only that the share is below 31 %; a gate on a time by the bound of the quantile's interval. A stratum
 with a fault in which nothing ever struck fails whatever else is well, and so do too many faults that did not
-strike: a campaign that could not have failed proves nothing (G8).
+strike: a campaign that could not have failed proves nothing (G8). And so does a single experiment that broke
+what no fault excuses.
 """
 
 import fnmatch
@@ -18,7 +19,7 @@ from aftbed.campaign.experiment import OUTCOMES, UNKNOWN, Result, failed
 from aftbed.campaign.faultspace import Count, extrapolated
 from aftbed.campaign.ledger import Ledger
 from aftbed.campaign.planning import population, strata_of
-from aftbed.campaign.spec import Gate, Spec
+from aftbed.campaign.spec import ANY, Gate, Spec
 from aftbed.campaign.statistics import (
     Interval,
     look_confidence,
@@ -29,12 +30,14 @@ from aftbed.campaign.statistics import (
 
 Word = Literal["pass", "fail"]
 NOT_ACTIVATED: Final = "not_activated"
+BROKEN: Final = "broken"
 QUANTILES: Final = {"p50": 0.5, "p99": 0.99}
 SHARES: Final[dict[str, Callable[[Result], bool]]] = {
     "unexpected": lambda r: r.unexpected,
     "failed": failed,
     "unknown": lambda r: r.outcome in UNKNOWN,
     NOT_ACTIVATED: lambda r: not r.activated,
+    BROKEN: lambda r: bool(r.broken),
     "collision": lambda r: bool(r.collision),
     **{name: (lambda r, name=name: r.outcome == name) for name in OUTCOMES},  # type: ignore[misc]
 }
@@ -109,6 +112,7 @@ def summarise(ledger: Ledger, planned: int, seconds: float) -> Summary:
         groups.setdefault(result.experiment.stratum, []).append(result)
     confidence = confidence_of(spec)
     gates = tuple(judged(gate, groups, confidence) for gate in (*spec.gates, *_always(spec)))
+    gates += (_unexcused(results),)
     gates += tuple(_vacuous(name, group) for name, group in groups.items() if _never_struck(group))
     sizes = {stratum.name: population(stratum.fault) for stratum in strata_of(spec)}
     broken = not results or any(g.word == "fail" for g in gates)
@@ -218,6 +222,14 @@ def _always(spec: Spec) -> Iterator[Gate]:
     if any(entry.texts for entry in spec.faults):
         yield Gate(NOT_ACTIVATED, max=spec.not_activated_max)
     yield Gate("unknown", max=spec.unknown_max)
+
+
+def _unexcused(results: Iterable[Result]) -> GateResult:
+    """Not a share: what no fault excuses must not happen once."""
+    found = [r for r in results if r.broken]
+    word: Word = "fail" if found else "pass"
+    reason = f"experiment {found[0].experiment.id}: {found[0].broken[0]}" if found else ""
+    return GateResult(BROKEN, ANY, "none", float(len(found)), None, word, reason)
 
 
 def _never_struck(group: list[Result]) -> bool:

@@ -11,6 +11,7 @@ What is drawn is within what is promised (design 3), so that **every breach is a
 | a crash of any node or role             | under `none`, which has nobody to replace what died              |
 | a hang for a time, of any node or role  | the same                                                         |
 | a hang for good, of a role or a replica | of a node that no Watchdog watches                               |
+| a slow node, a message that comes late  | so slow or late that the run cannot come to rest in time         |
 | a bit flipped in an execution           | without TR from the start to the end; two within a few requests  |
 | an adaptation, refused or not           | away from TR in a run with a flipped bit                         |
 | both replicas in one node               | for a duplex: the run could not come to rest without redundancy  |
@@ -28,7 +29,7 @@ from typing import Final
 
 from aftbed.core.errors import ConfigError
 from aftbed.core.event import REQUEST_PATH, Event
-from aftbed.core.fault import Crash, Fault, Hang, Trigger
+from aftbed.core.fault import Crash, Disturb, Fault, Hang, How, Slow, Trigger
 from aftbed.core.graph import PLACEMENTS
 from aftbed.core.message import Goal, Scheduled
 from aftbed.core.valuefault import EXECUTED, Bit, Flip
@@ -54,6 +55,10 @@ RATE_HZ: Final = (200.0, 4000.0)
 FAULTS_MAX: Final = 3
 ADAPTATIONS_MAX: Final = 2
 HANG_MS_MAX: Final = 400
+LATE_PART: Final = 0.2  # of the faults: a channel or a node that is late
+LATE_MS_MAX: Final = 10
+CHECKPOINTS: Final = "aft2aft"
+SLOW_FOR_MS_MAX: Final = 100
 NTH_PART: Final = 0.75  # of the requests: an event is counted so far at most
 RARE_NTH_MAX: Final = 2  # of events that not every request brings
 RARE_PART: Final = 0.15  # of the events that a fault waits for
@@ -94,6 +99,24 @@ def _events(ftm: str, placement: str) -> tuple[Event, ...]:
         except ConfigError:
             continue
         found.append(event)
+    return tuple(found)
+
+
+@lru_cache(maxsize=128)
+def _channels(ftm: str, placement: str) -> tuple[str, ...]:
+    """Those on which somebody sends for the replica that leads, but that of the checkpoints.
+
+    A checkpoint that is held back dies with who holds it, when the reply has gone: two faults, and two
+    replicas that differ.
+    """
+    graph = build(ftm, placement)
+    found = []
+    for channel in sorted({link.name for link in graph.links} - {CHECKPOINTS}):
+        try:
+            targets.check(Fault(Disturb(How.DELAY, channel), targets.ROLES[0], Trigger()), graph)
+        except ConfigError:
+            continue
+        found.append(channel)
     return tuple(found)
 
 
@@ -183,6 +206,8 @@ class _Draw:
 
     def _draw_fault(self, adapted: bool) -> Fault:
         chance = self._chance
+        if chance.random() < LATE_PART:
+            return self._draw_late()
         trigger = self._draw_trigger(adapted)
         steps = trigger.event in {event.label for event in _STEPS}
         target = self._draw_target(staged=steps)
@@ -191,6 +216,23 @@ class _Draw:
         watched = target in targets.ROLES or replica_of(target)
         hang_ms = 0 if watched and chance.random() < 0.4 else chance.randint(1, HANG_MS_MAX)
         return Fault(Hang(hang_ms), target, trigger)
+
+    def _draw_late(self) -> Fault:
+        """Something that takes its time; it may be taken for dead, and must not be heard then."""
+        chance, graph = self._chance, build(self._ftm, self._placement)
+        by_ms = chance.randint(1, LATE_MS_MAX)
+        if chance.random() < 0.5:
+            slow = Slow(by_ms, chance.randint(1, SLOW_FOR_MS_MAX))
+            node = chance.choice(list(graph.nodes))
+            return Fault(
+                slow, node, Trigger(after_ms=round(LAUNCH_MS + self._load_ms() * chance.random(), 3))
+            )
+        channel = chance.choice(_channels(self._ftm, self._placement))
+        return Fault(
+            Disturb(How.DELAY, channel, by_ms),
+            targets.ROLES[0],
+            Trigger(nth=chance.randint(1, self._nth_max())),
+        )
 
     def _draw_target(self, *, staged: bool) -> str:
         chance, graph = self._chance, build(self._ftm, self._placement)

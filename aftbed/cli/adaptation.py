@@ -3,11 +3,9 @@
 What can be refused is refused here, before the run is asked: a wrong word, a mechanism that does not suit
 the function (`consistency`), a script with a mistake in it. The Engine plans and checks once more, on the
 graph that runs when it begins.
-
-Of the FT/A/R that decide what suits, only A is at stake here. The faults asked for are those that the
-mechanism is chosen for: crashes, where it replicates. Resources are not judged.
 """
 
+import functools
 import json
 import sys
 from pathlib import Path
@@ -15,12 +13,12 @@ from typing import Final
 
 import msgspec
 
-from aftbed.adapt import words
-from aftbed.adapt.consistency import FaultModel, Resources, refusal, remarks
+from aftbed.adapt import schedule
+from aftbed.adapt.consistency import remarks, unsuitable
 from aftbed.adapt.engine import script_for
 from aftbed.adapt.plan import APPLICATION, Plan, target
 from aftbed.adapt.plan import plan as planned
-from aftbed.adapt.schedule import before, led_to
+from aftbed.adapt.schedule import goal_of, led_to
 from aftbed.adapt.scriptcheck import refusals
 from aftbed.adapt.scriptfile import ScriptFile, mapping, refuse, script_from
 from aftbed.adapt.words import Wish
@@ -30,10 +28,9 @@ from aftbed.core.errors import ConfigError
 from aftbed.core.graph import PLACEMENTS, BrickSpec, Graph
 from aftbed.core.message import Goal, Scheduled
 from aftbed.core.script import AnyVerb, Script, Stage, Together
-from aftbed.ftm.mechanism import build, replication_of
+from aftbed.ftm.mechanism import build
 from aftbed.runtime.unix import ask, rundir
 
-AMPLE: Final = Resources(cpus=1024)
 EXIT_CODES: Final = {"done": 0, "rolled back": 1, "refused": 2}
 
 
@@ -44,7 +41,7 @@ def change(run: str | None, wish: Wish, recipe: str, *, force: bool, as_json: bo
     """Have `wish` come true in the run; the exit code."""
     private = rundir.find(run)
     graph = _graph_of(private)
-    goal = _goal(wish, graph, recipe)
+    goal = goal_of(wish, graph, recipe, _here)
     _refuse_unsuitable(led_to(graph, goal), wish, force=force)
     return _ask(private, goal, as_json=as_json)
 
@@ -79,30 +76,16 @@ def _ask(private: Path, goal: Goal, *, as_json: bool) -> int:
 
 
 def scheduled(texts: tuple[str, ...], start: Graph, recipe: str, *, force: bool) -> tuple[Scheduled, ...]:
-    """The adaptations of a run that begins with `start`, each checked on the graph that it will find.
-
-    They follow each other as they were given. Raises ConfigError naming the text that is wrong.
-    """
-    found: list[Scheduled] = []
-    graph = start
-    for text in texts:
-        try:
-            timed = words.read(text)
-            goal = _goal(timed.wish, graph, recipe)
-            graph = led_to(graph, goal)
-            _refuse_unsuitable(graph, timed.wish, force=force)
-        except ConfigError as error:
-            raise ConfigError(f"--adapt {text!r}: {error}") from error
-        found.append(Scheduled(goal, timed.at_request, timed.after_ms))
-        if len(found) > 1 and before(found[-1], found[-2]):
-            raise ConfigError(f"--adapt {text!r}: it begins before the one that stands before it")
-    return tuple(found)
+    """The adaptations of `--adapt`, each checked on the graph that it will find. Raises ConfigError."""
+    judge = functools.partial(_refuse_unsuitable, force=force)
+    try:
+        return schedule.scheduled(texts, start, recipe, resolve=_here, judge=judge)
+    except ConfigError as error:
+        raise ConfigError(f"--adapt {error}") from error
 
 
-def _goal(wish: Wish, graph: Graph, recipe: str) -> Goal:
-    if wish.verb == "update":
-        wish = msgspec.structs.replace(wish, source=_source(wish.source, Path.cwd()))
-    return words.goal(wish, graph.ftm, recipe)
+def _here(text: str) -> str:
+    return _source(text, Path.cwd())
 
 
 def _source(text: str, folder: Path) -> str:
@@ -147,8 +130,7 @@ def _refuse_unsuitable(new: Graph, wish: Wish, *, force: bool) -> None:
     if wish.verb == "decompose" or (wish.verb == "update" and wish.name != APPLICATION):
         return  # no more is needed than what runs needs
     declared = _characteristics(new)
-    chosen_for = FaultModel(crash=bool(replication_of(new.ftm)))
-    if reason := refusal(new.ftm, chosen_for, declared, AMPLE):
+    if reason := unsuitable(new.ftm, declared):
         if not force:
             raise ConfigError(f"{reason}; --force does it all the same")
         print(f"aftbed: forced: {reason}", file=sys.stderr)

@@ -11,6 +11,8 @@ from aftbed.cli.campaign import campaign
 from aftbed.cli.explore import explore
 from aftbed.cli.ftm import ftm as ftm_commands
 from aftbed.cli.inject import inject
+from aftbed.cli.log import log
+from aftbed.cli.scenario import scenario as scenario_commands
 from aftbed.cli.sim import sim
 
 app = typer.Typer(
@@ -27,6 +29,8 @@ app.add_typer(bench, name="bench")
 app.add_typer(ftm_commands, name="ftm")
 app.add_typer(explore, name="explore")
 app.add_typer(campaign, name="campaign")
+app.add_typer(log, name="log")
+app.add_typer(scenario_commands, name="scenario")
 
 Run = Annotated[str | None, typer.Option("--run", help="Id of the run, where several are alive.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else.")]
@@ -67,6 +71,11 @@ def run(
     ] = None,
     bus_port: Annotated[int, typer.Option(help="TCP port of the bus on 127.0.0.1; 0 is any free one.")] = 0,
     pin: Annotated[bool, typer.Option(help="Keep each replica's chain on one core.")] = True,
+    unsafe_memory: Annotated[
+        bool, typer.Option("--unsafe-memory", help='Allow --inject "bitflip memory ...".')
+    ] = False,
+    mcap: Annotated[Path | None, typer.Option(help="Write the run to this file, for Foxglove.")] = None,
+    trace: Annotated[Path | None, typer.Option(help="Write its nodes to this file, for Perfetto.")] = None,
     json: Json = False,
 ) -> None:
     """Drive a car at an obstacle, under a fault tolerance mechanism; end with a verdict.
@@ -95,6 +104,9 @@ def run(
         load=load,
         bus_port=bus_port,
         pin=pin,
+        unsafe_memory=unsafe_memory,
+        mcap=mcap,
+        trace=trace,
     )
     raise typer.Exit(running.run(asked, as_json=json))
 

@@ -4,6 +4,8 @@ from typing import Annotated, Final
 
 import typer
 
+from aftbed.cli.benchpaper import paper
+
 bench = typer.Typer(
     help="Measure, each time beside the bare limit.", no_args_is_help=True, rich_markup_mode=None
 )
@@ -115,6 +117,9 @@ def hops(
     for pair in (*found.pairs, *found.beside):
         apart = "  (not used: sends more)" if pair in found.beside else ""
         print(f"p50 {pair.p50_ns / 1e3:9.2f} us  {pair.source} -> {pair.sink}{apart}")
+
+
+bench.command()(paper)
 
 
 def _print(found: dict[str, object], *, as_json: bool) -> None:

@@ -24,7 +24,6 @@ RUNTIMES: Final = ("unix", "sim")
 EXECUTORS: Final = ("local", "dask")
 SECONDS_EACH: Final = {"unix": 0.35, "sim": 0.01}  # for an estimate: on one core
 EXIT_CODES: Final = {"pass": 0, "fail": 1}
-EXIT_HARNESS: Final = 3
 SUMMARY: Final = "summary.json"
 JUNIT: Final = "junit.xml"
 HTML: Final = "report.html"

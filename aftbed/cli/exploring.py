@@ -102,7 +102,7 @@ class _Exploration:
 
     def _explore(self, jobs: int) -> None:
         what = f"explore {self._selection.explorer}"
-        found = closing(explore(self._setups, jobs))
+        found = closing(explore(self._setups, jobs, lambda number, _: command(self._selection, number)))
         with Bar(what, len(self._setups), quiet=self._as_json) as bar, found as results:
             for number, setup, lost, broken in results:
                 self._runs += 1

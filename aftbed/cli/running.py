@@ -12,11 +12,12 @@ import msgspec
 
 from aftbed.cli.view import View, open_view
 from aftbed.core.errors import ConfigError, unknown
-from aftbed.core.fault import Fault
+from aftbed.core.fault import Fault, FlipMemory
 from aftbed.core.graph import Graph
 from aftbed.core.message import Scheduled
 from aftbed.core.script import RECIPES
 from aftbed.ftm.mechanism import build
+from aftbed.inject.parts import refuse_unsafe
 from aftbed.inject.words import parse
 from aftbed.runtime import targets
 from aftbed.runtime.control import Report
@@ -56,12 +57,15 @@ class Asked(msgspec.Struct, frozen=True):
     load: str | None
     bus_port: int
     pin: bool
+    unsafe_memory: bool = False
+    mcap: Path | None = None
+    trace: Path | None = None
 
 
 def run(asked: Asked, *, as_json: bool) -> int:
     """Run, show, judge; the exit code."""
     graph = build(asked.ftm, asked.placement)
-    faults = tuple(_fault(text, graph) for text in asked.faults)
+    faults = tuple(_fault(text, graph, unsafe=asked.unsafe_memory) for text in asked.faults)
     adaptations = _adaptations(asked, graph)
     policy = _policy(asked, as_json=as_json)
     work = _work(asked)
@@ -69,6 +73,7 @@ def run(asked: Asked, *, as_json: bool) -> int:
         raise ConfigError(f"--seed {asked.seed}: 0 to {SEED_MAX} are allowed")
     if not 0 <= asked.bus_port <= 65535:
         raise ConfigError(f"--bus-port {asked.bus_port}: 0 to 65535 are allowed")
+    _check_files(asked)
     options, listener = options_for(
         ftm=asked.ftm,
         placement=asked.placement,
@@ -95,13 +100,41 @@ def run(asked: Asked, *, as_json: bool) -> int:
         show_verdict(verdict, as_json=as_json)
         if verdict.verdict == "inconclusive" and not as_json:
             _show_log(launched.record / "processes.log")
+        unwritten = _write_files(asked, launched.record, as_json=as_json)
     finally:
         launched.remove()
-    return EXIT_INTERRUPTED if interrupted else EXIT_CODES[verdict.verdict]
+    code = EXIT_CODES[verdict.verdict]
+    return EXIT_INTERRUPTED if interrupted else code or (EXIT_CODES["inconclusive"] if unwritten else 0)
 
 
-def _fault(text: str, graph: Graph) -> Fault:
+def _check_files(asked: Asked) -> None:
+    if asked.mcap is not None or asked.trace is not None:
+        from aftbed.campaign.runfiles.export import Wanted, check  # noqa: PLC0415 - only where there are any
+
+        check(Wanted(asked.mcap, asked.trace))
+
+
+def _write_files(asked: Asked, record: Path, *, as_json: bool) -> bool:
+    """The files of `--mcap` and `--trace`; True if one could not be written: the verdict stands then, too."""
+    if asked.mcap is None and asked.trace is None:
+        return False
+    from aftbed.campaign.record import read_record  # noqa: PLC0415
+    from aftbed.campaign.runfiles.export import Wanted, export  # noqa: PLC0415
+
+    try:
+        lines = export(read_record(record), Wanted(asked.mcap, asked.trace))
+    except ConfigError as error:
+        print(f"aftbed: trouble: {error}", file=sys.stderr)
+        return True
+    if not as_json:
+        print("\n".join(lines))
+    return False
+
+
+def _fault(text: str, graph: Graph, *, unsafe: bool) -> Fault:
     fault = parse(text)
+    if isinstance(fault.action, FlipMemory):
+        refuse_unsafe(str(fault), unsafe=unsafe)
     targets.check(fault, graph)
     return fault
 
@@ -204,14 +237,14 @@ def _replay(asked: Asked, pace: float | None) -> ReplayRun:
     if asked.dbc is None or asked.map_file is None:
         raise ConfigError("--replay LOG needs --dbc FILE and --map FILE, which say what its frames mean")
     from aftbed.vehicle.candump import read_log  # noqa: PLC0415
-    from aftbed.vehicle.dbcfile import load_dbc  # noqa: PLC0415
+    from aftbed.vehicle.dbcfile import find_dbc  # noqa: PLC0415
     from aftbed.vehicle.mapfile import bind, find_map  # noqa: PLC0415
 
     assert asked.replay is not None
-    bind(find_map(asked.map_file), load_dbc(Path(asked.dbc)))
+    dbc, map_path = find_dbc(asked.dbc), find_map(asked.map_file)
+    bind(map_path, dbc)
     read_log(Path(asked.replay))
-    map_path = find_map(asked.map_file)
-    return ReplayRun(str(Path(asked.replay).resolve()), str(Path(asked.dbc).resolve()), str(map_path), pace)
+    return ReplayRun(str(Path(asked.replay).resolve()), str(dbc.resolve()), str(map_path), pace)
 
 
 def _pace(text: str) -> float | None:

@@ -20,6 +20,7 @@ from aftbed.core.graph import Graph
 from aftbed.core.message import Goal, Scheduled
 from aftbed.core.script import RECIPES
 from aftbed.ftm.mechanism import build
+from aftbed.runtime.sim.givens import check
 from aftbed.runtime.sim.world import Setup
 from aftbed.vehicle.scenario import load_scenario
 
@@ -137,6 +138,8 @@ def made_of(asked: Asked) -> Make:
     setup = replace(
         _load(asked), ftm=graph.ftm, placement=graph.placement, faults=faults, adaptations=adaptations
     )
+    for fault in faults:
+        check(fault, setup.scenario)
     for late in adaptations:
         if not setup.scenario and late.at_request > setup.count:
             raise ConfigError(

@@ -67,11 +67,16 @@ class Failure(NamedTuple):
 
 def failure(setup: Setup, broken: tuple[Breach, ...], *, swarm: bool, shrinks: bool = True) -> Failure:
     """What there is to tell about it."""
-    original = f"aftbed sim --swarm --seed {setup.seed}" if swarm else repeating(setup)
+    original = again(setup, swarm=swarm)
     if not shrinks:
         return Failure(setup, broken, original, None, "")
     smaller = shrink(setup, lambda simpler: attempt(simpler)[1])
     return Failure(setup, broken, original, smaller, repeating(smaller))
+
+
+def again(setup: Setup, *, swarm: bool) -> str:
+    """The command that repeats `setup`, of a swarm perhaps; "" if there is none."""
+    return f"aftbed sim --swarm --seed {setup.seed}" if swarm else repeating(setup)
 
 
 def repeating(setup: Setup) -> str:

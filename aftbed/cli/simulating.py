@@ -20,7 +20,7 @@ from aftbed.campaign.verdict import EXIT_CODES, EXIT_INTERRUPTED, Verdict, Word
 from aftbed.cli import simagainst
 from aftbed.cli.show import show_verdict
 from aftbed.cli.simasked import Asked, Make, check_diagram, jobs_of, made_of, seeds_against, seeds_of
-from aftbed.cli.simfailure import Failure, failure, picture
+from aftbed.cli.simfailure import Failure, again, failure, picture
 from aftbed.cli.simview import Bar, adaptation_lines, described, event_lines, spaced
 from aftbed.core import check
 from aftbed.core.valuefault import Flip
@@ -175,7 +175,8 @@ class _Many:
     def _simulate(self, jobs: int) -> None:
         total = self._seconds or self._last - self._first + 1
         setups = map(self._make, range(self._first, self._last + 1))
-        with Bar("sim", total, quiet=self._as_json) as bar, closing(each(tried, setups, jobs)) as found:
+        results = each(tried, setups, jobs, alone=lambda _, setup: again(setup, swarm=self._asked.swarm))
+        with Bar("sim", total, quiet=self._as_json) as bar, closing(results) as found:
             for number, setup, what in found:
                 self._count(setup, what)
                 self._took_s = time.monotonic() - self._began_s

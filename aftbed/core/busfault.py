@@ -21,6 +21,9 @@ from typing import Final, Literal
 
 import msgspec
 
+from aftbed.core.persistence import ONCE, Chance, Every, Lasting, Permanent, Transient
+from aftbed.core.words import duration, number
+
 SECOND_US: Final = 1_000_000
 NODES: Final = ("radar", "brake", "gateway")  # that a car's bus has
 FALLBACK: Final = "fallback"  # what a brake ECU that misses its requests says that it has noticed
@@ -129,6 +132,9 @@ class Condition(msgspec.Struct, frozen=True):
             return False
         return found < self.value if self.below else found > self.value
 
+    def __str__(self) -> str:
+        return f"{self.quantity} {'<' if self.below else '>'} {number(self.value)}"
+
 
 class Opening(msgspec.Struct, frozen=True):
     """At once, `after_us` of bus time, or when the condition holds; from there on the `nth` frame."""
@@ -142,33 +148,7 @@ class Opening(msgspec.Struct, frozen=True):
             raise ValueError("a fault that opens after a time and on a condition")
 
 
-class Transient(msgspec.Struct, frozen=True, tag=True):
-    """One frame."""
-
-
-class Lasting(msgspec.Struct, frozen=True, tag=True):
-    """Every frame for that long, counted from the first."""
-
-    for_us: int
-
-
-class Intermittent(msgspec.Struct, frozen=True, tag=True):
-    """Each frame with probability `p`, by the seed of the run."""
-
-    p: float
-
-
-class Every(msgspec.Struct, frozen=True, tag=True):
-    """Each `count`th frame from the first on."""
-
-    count: int
-
-
-class Permanent(msgspec.Struct, frozen=True, tag=True):
-    """Every frame, to the end of the run."""
-
-
-Persistence = Transient | Lasting | Intermittent | Every | Permanent
+Persistence = Transient | Lasting | Chance | Every | Permanent
 
 
 # -- what the names came to ----------------------------------------------------------------------
@@ -198,7 +178,7 @@ class BusFault(msgspec.Struct, frozen=True, tag="bus"):
     act: BusAct
     frames: Frames | None = None
     opening: Opening = Opening()
-    persistence: Persistence = Transient()
+    persistence: Persistence = ONCE
     aim: Aim | None = None
 
     def __post_init__(self) -> None:
@@ -217,20 +197,8 @@ class BusFault(msgspec.Struct, frozen=True, tag="bus"):
     def __str__(self) -> str:
         whom = [] if self.frames is None else ["bus", *_frames(self.frames)]
         verb, *how = _act(self.act)
-        return " ".join([verb, *whom, *how, *_opening(self.opening), *self._lasting()])
-
-    def _lasting(self) -> list[str]:
-        match self.persistence:
-            case Transient():
-                return []
-            case Lasting(for_us):
-                return ["for", duration(for_us)]
-            case Intermittent(p):
-                return ["intermittent", "p", number(p)]
-            case Every(count):
-                return ["intermittent", "every", str(count)]
-            case Permanent():
-                return ["permanent"]
+        words = [verb, *whom, *how, *_opening(self.opening), str(self.persistence)]
+        return " ".join(filter(None, words))
 
 
 class Struck(msgspec.Struct, frozen=True):
@@ -247,6 +215,7 @@ class Struck(msgspec.Struct, frozen=True):
     believed: str = ""
     began: bool = False  # an act on nodes took hold, of whatever frames there were
     error: str = ""
+    waits: bool = False  # for its condition, which has not held yet
 
     @property
     def receipt(self) -> Receipt:
@@ -275,23 +244,13 @@ class Struck(msgspec.Struct, frozen=True):
 # -- the words -----------------------------------------------------------------------------------
 
 
-def duration(t_us: int) -> str:
-    """As the words have it: `40ms`."""
-    return f"{number(t_us / 1000)}ms"
-
-
-def number(value: float) -> str:
-    """Six decimals at most, and none in vain."""
-    return f"{value:.6f}".rstrip("0").rstrip(".")
-
-
 def _act(act: BusAct) -> list[str]:
     """The verb, and what stands behind the frames."""
     match act:
         case Omission():
             return ["omission"]
         case Delay(by_us):
-            return ["delay", "by", duration(by_us)]
+            return ["delay", "by", duration(by_us / 1000)]
         case Duplicate():
             return ["duplicate"]
         case Reorder():
@@ -321,8 +280,7 @@ def _frames(frames: Frames) -> list[str]:
 
 
 def _opening(opening: Opening) -> list[str]:
-    words = ["after", duration(opening.after_us)] if opening.after_us else []
+    words = ["after", duration(opening.after_us / 1000)] if opening.after_us else []
     if opening.when is not None:
-        when = opening.when
-        words = ["when", when.quantity, "<" if when.below else ">", number(when.value)]
+        words = ["when", str(opening.when)]
     return words + (["nth", str(opening.nth)] if opening.nth != 1 else [])

@@ -11,7 +11,10 @@ is sent. A *value fault* (`bitflip`, see `core.valuefault`) strikes what somebod
 What strikes a message or a value can come again. A fault that lasts belongs to the process that it struck
 first, as a broken part of hardware does: who takes the place of that process is sound.
 
-A bitflip of a *field* of the state strikes memory, and waits as a fault of a process does.
+A bitflip of a *field* of the state strikes memory, and waits as a fault of a process does. So does one of
+the *memory* of a process as it is, whatever is kept there.
+
+Any of them can wait for a condition of the car first: it is as if it were armed then.
 
 A fault of the *bus* is a value of its own, with its own words for when and for how long: see `core.busfault`.
 """
@@ -21,13 +24,18 @@ from typing import Final, assert_never
 
 import msgspec
 
-from aftbed.core.busfault import BusFault
-from aftbed.core.valuefault import BITFLIP, FLIPPED_AT, Flip, Place, next_success
+from aftbed.core.busfault import BusFault, Condition
+from aftbed.core.persistence import ONCE, Persistence
+from aftbed.core.valuefault import BITFLIP, FLIPPED_AT, Flip, Place
+from aftbed.core.words import duration, number
 
 HANG_FOREVER_MS: Final = 0
 SLOW_MS: Final = 2.0
 SLOW_MS_MAX: Final = 500.0  # a step: orders are answered between two of them, and within 2 s
+SHARE_MIN, SHARE_MAX = 0.01, 0.99  # of a CPU; a step of some milliseconds then is within SLOW_MS_MAX
 DISTURBED_MS: Final = 20.0
+MEMORY: Final = "memory"  # where a bit is flipped that is no value of anybody's
+BYTE_BITS: Final = 8
 BUS: Final = "bus"  # the target of a fault of the bus
 _BIT_SHIFT: Final = 32
 FIRED: Final = ("applied", "activated")  # receipts of a fault that happened
@@ -44,10 +52,19 @@ class Hang(msgspec.Struct, frozen=True, tag="hang"):
 
 
 class Slow(msgspec.Struct, frozen=True, tag="slow"):
-    """Each step of the target's bricks takes `by_ms` longer; for good, if `for_ms` is 0."""
+    """Each step of the target's bricks takes `by_ms` longer; for good, if `for_ms` is 0.
+
+    Or, with a `share` of a CPU, each takes as much longer as it would if it had no more than that.
+    """
 
     by_ms: float = SLOW_MS
     for_ms: int = 0
+    share: float | None = None
+
+    @property
+    def how(self) -> str:
+        """In words."""
+        return f"by {duration(self.by_ms)}" if self.share is None else f"share {number(100 * self.share)}%"
 
 
 class How(Enum):
@@ -70,57 +87,31 @@ class Disturb(msgspec.Struct, frozen=True, tag="disturb"):
     by_ms: float = DISTURBED_MS
 
 
-Action = Crash | Hang | Slow | Disturb | Flip | BusFault
+class FlipMemory(msgspec.Struct, frozen=True, tag="memory"):
+    """Bit `bit` of one byte of a process's own memory; what is left out is drawn, from what it can write."""
+
+    bit: int | None = None
+    address: int | None = None
 
 
-class Transient(msgspec.Struct, frozen=True, tag="transient"):
-    """It strikes once."""
-
-
-class Permanent(msgspec.Struct, frozen=True, tag="permanent"):
-    """Every occurrence from the first strike on."""
-
-
-class Every(msgspec.Struct, frozen=True, tag="every"):
-    """Every `count`th occurrence from the first strike on."""
-
-    count: int
-
-
-class Chance(msgspec.Struct, frozen=True, tag="chance"):
-    """Each occurrence behind the first strike with chance `p`, by the seed of the run."""
-
-    p: float
-
-
-Persistence = Transient | Permanent | Every | Chance
-ONCE: Final = Transient()
-
-
-def gap(persistence: Persistence, draw: int, struck: int) -> int:
-    """How many occurrences on from strike number `struck` the next one is; 0 if there is none."""
-    match persistence:
-        case Transient():
-            return 0
-        case Permanent():
-            return 1
-        case Every(count):
-            return count
-        case Chance(p):
-            return next_success(p, draw, struck)
-        case _:
-            assert_never(persistence)
+Action = Crash | Hang | Slow | Disturb | Flip | FlipMemory | BusFault
 
 
 class Trigger(msgspec.Struct, frozen=True):
     """At the `nth` occurrence of the event called `event`, or `after_ms` after arming.
 
-    Of a fault of a channel, which waits for no event: at the `nth` message from the arming on.
+    Of a fault of a channel, which waits for no event: at the `nth` message from the arming on. With `when`,
+    that is the first step of the car at which the condition holds.
     """
 
     event: str = ""
     nth: int = 1
     after_ms: float = 0.0
+    when: Condition | None = None
+
+    def __post_init__(self) -> None:
+        if self.after_ms and self.when is not None:
+            raise ValueError("a fault that strikes after a time and on a condition")
 
 
 class Fault(msgspec.Struct, frozen=True):
@@ -165,16 +156,17 @@ class Fault(msgspec.Struct, frozen=True):
     def __str__(self) -> str:
         if isinstance(self.action, BusFault):
             return str(self.action)
-        words = [self.word, *_whom(self.action, self.target), self._when(), _again(self.persistence)]
+        words = [self.word, *_whom(self.action, self.target), *self._when(), str(self.persistence)]
         return " ".join(filter(None, words))
 
-    def _when(self) -> str:
+    def _when(self) -> list[str]:
         trigger = self.trigger
+        when = "" if trigger.when is None else f"when {trigger.when}"
         if trigger.event:
-            return f"at {trigger.event} nth {trigger.nth}"
+            return [f"at {trigger.event} nth {trigger.nth}", when]
         if trigger.after_ms:
-            return f"after {_ms(trigger.after_ms)}"
-        return f"nth {trigger.nth}" if isinstance(self.action, Disturb) else ""
+            return [f"after {duration(trigger.after_ms)}"]
+        return [f"nth {trigger.nth}" if isinstance(self.action, Disturb) else "", when]
 
 
 def on_bus(fault: BusFault) -> Fault:
@@ -191,7 +183,7 @@ def word_of(action: Action) -> str:
             return "hang"
         case Slow():
             return "slow"
-        case Flip():
+        case Flip() | FlipMemory():
             return BITFLIP
         case Disturb(how):
             return how.value
@@ -208,38 +200,19 @@ def _whom(action: Action, target: str) -> list[str]:
             return [target]
         case Hang(for_ms):
             return [target, f"for {for_ms}ms" if for_ms else ""]
-        case Slow(by_ms, for_ms):
-            return [target, f"by {_ms(by_ms)}", f"for {for_ms}ms" if for_ms else ""]
+        case Slow(_, for_ms):
+            return [target, action.how, f"for {for_ms}ms" if for_ms else ""]
+        case FlipMemory(bit, address):
+            at = "" if address is None else f"address {address:#x}"
+            return [MEMORY, "" if bit is None else f"bit {bit}", at, "in", target]
         case Flip(_, pattern):
             return [action.where, str(pattern), "in", target]
         case Disturb(how, channel, by_ms):
-            return [channel, f"by {_ms(by_ms)}" if how in LATER else "", "in", target]
+            return [channel, f"by {duration(by_ms)}" if how in LATER else "", "in", target]
         case BusFault():
             raise AssertionError(f"{action} has words of its own")
         case _:
             assert_never(action)
-
-
-def _again(persistence: Persistence) -> str:
-    match persistence:
-        case Transient():
-            return ""
-        case Permanent():
-            return "permanent"
-        case Every(count):
-            return f"intermittent every {count}"
-        case Chance(p):
-            return f"intermittent p {_number(p)}"
-        case _:
-            assert_never(persistence)
-
-
-def _ms(ms: float) -> str:
-    return f"{_number(ms)}ms"
-
-
-def _number(number: float) -> str:
-    return f"{number:.6f}".rstrip("0").rstrip(".")
 
 
 def mark(number: int, bits: int = 0) -> int:

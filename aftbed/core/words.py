@@ -27,6 +27,16 @@ def whole_milliseconds(what: str, text: str) -> int:
     return value
 
 
+def number(value: float) -> str:
+    """As it is written: six decimals at most, and none in vain."""
+    return f"{value:.6f}".rstrip("0").rstrip(".")
+
+
+def duration(ms: float) -> str:
+    """As `milliseconds` reads it."""
+    return f"{number(ms)}ms"
+
+
 def _refusal(what: str, text: str) -> ConfigError:
     return ConfigError(
         f"{what} {text[:40]!r}: a positive number with its unit is allowed, as 50ms or 2s,"

@@ -16,11 +16,11 @@ by whoever has it: here is what can be said of the words alone.
 
 import re
 from collections import deque
-from collections.abc import Sequence
-from typing import Final, cast
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Final
 
 from aftbed.core.busfault import (
-    QUANTITIES,
     Babble,
     BusAct,
     BusFault,
@@ -28,25 +28,21 @@ from aftbed.core.busfault import (
     Condition,
     Delay,
     Duplicate,
-    Every,
     FlipBit,
     Frames,
-    Intermittent,
-    Lasting,
     Masquerade,
     Omission,
     Opening,
     Partition,
-    Permanent,
     Persistence,
-    Quantity,
     Reorder,
     SetSignal,
     StuckCounter,
-    Transient,
 )
 from aftbed.core.errors import ConfigError, unknown
+from aftbed.core.persistence import ONCE, Chance, Every, Lasting, Permanent
 from aftbed.core.words import milliseconds
+from aftbed.inject import parts
 
 GRAMMAR: Final = (
     "omission|duplicate|reorder|stuck-counter bus FRAMES, delay bus FRAMES by 40ms,"
@@ -60,8 +56,7 @@ VERBS: Final = (*ON_FRAMES, *ON_NODES)
 FRAME_BITS: Final = 64
 _NAME: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,127}")
 _NODE: Final = re.compile(r"[a-z_][a-z0-9_]{0,31}")
-_WHOLE: Final = re.compile(r"[0-9]{1,9}")
-_NUMBER: Final = re.compile(r"-?[0-9]{1,9}(\.[0-9]{1,6})?")
+NTH_MAX: Final = 999_999_999
 _PLAIN: Final[dict[str, BusAct]] = {
     "omission": Omission(),
     "duplicate": Duplicate(),
@@ -120,6 +115,14 @@ class _Words:
     def more(self) -> bool:
         return bool(self._left)
 
+    @contextmanager
+    def blaming(self) -> Iterator[None]:
+        """An error from here on is one of this fault."""
+        try:
+            yield
+        except ConfigError as error:
+            raise self.wrong(str(error)) from None
+
     def wrong(self, why: str) -> ConfigError:
         return ConfigError(f"fault {self.text[:200]!r}: {why}; allowed is: {GRAMMAR}")
 
@@ -152,7 +155,7 @@ def _corruption(words: _Words) -> BusAct:
     if what == "signal":
         text = words.next("NAME=VALUE")
         name, _, value = text.partition("=")
-        if not _NAME.fullmatch(name) or not _NUMBER.fullmatch(value):
+        if not _NAME.fullmatch(name) or not parts.NUMBER.fullmatch(value):
             raise words.wrong(f"signal {text[:40]!r}: NAME=VALUE is allowed, with up to six decimals")
         return SetSignal(name, float(value), _crc_good(words))
     raise words.wrong(f"found {what[:40]!r} where 'bit' or 'signal' is expected")
@@ -184,7 +187,7 @@ def _node_act(verb: str, words: _Words) -> BusAct:
 def _rest(words: _Words, *, on_nodes: bool) -> tuple[Opening, Persistence]:
     """Each of these words once, in any order."""
     after_us, when, nth = 0, None, 1
-    persistence: Persistence = Permanent() if on_nodes else Transient()
+    persistence: Persistence = Permanent() if on_nodes else ONCE
     seen: set[str] = set()
     while words.more():
         word = words.next("")
@@ -198,7 +201,7 @@ def _rest(words: _Words, *, on_nodes: bool) -> tuple[Opening, Persistence]:
             case "when":
                 when = _condition(words)
             case "nth" if not on_nodes:
-                nth = _whole(words, "nth", 1, 999_999_999)
+                nth = _whole(words, "nth", 1, NTH_MAX)
             case "for":
                 persistence = Lasting(_duration_us(words))
             case "intermittent" if not on_nodes:
@@ -213,34 +216,16 @@ def _rest(words: _Words, *, on_nodes: bool) -> tuple[Opening, Persistence]:
 
 
 def _condition(words: _Words) -> Condition:
-    quantity = words.next("ttc, gap or speed")
-    if quantity not in QUANTITIES:
-        raise unknown("quantity of the car", quantity, QUANTITIES)
-    than = words.next("'<' or '>'")
-    if than not in ("<", ">"):
-        raise words.wrong(f"found {than[:40]!r} where '<' or '>' is expected")
-    value = words.next("a value")
-    if not _NUMBER.fullmatch(value):
-        raise words.wrong(
-            f"{quantity} {than} {value[:40]!r}: a number is allowed (ttc in s, gap in m, speed in m/s)"
-        )
-    return Condition(cast("Quantity", quantity), than == "<", float(value))
+    found = [words.next(what) for what in ("ttc, gap or speed", "'<' or '>'", "a value")]
+    with words.blaming():
+        return parts.condition(*found)
 
 
-def _intermittent(words: _Words) -> Persistence:
+def _intermittent(words: _Words) -> Every | Chance:
     """Every Nth, or by chance."""
-    if words.take("every"):
-        return Every(_whole(words, "every", 1, 999_999_999))
-    words.demand("p")
-    return Intermittent(_probability(words))
-
-
-def _probability(words: _Words) -> float:
-    text = words.next("a probability")
-    value = float(text) if _NUMBER.fullmatch(text) else 0.0
-    if not 0 < value <= 1:
-        raise words.wrong(f"p {text[:40]!r}: more than 0, up to 1, is allowed")
-    return value
+    word, value = words.next("'every' or 'p'"), words.next("a number")
+    with words.blaming():
+        return parts.intermittent(word, value)
 
 
 # -- words ---------------------------------------------------------------------------------------
@@ -262,9 +247,8 @@ def _node(words: _Words) -> str:
 
 def _whole(words: _Words, what: str, least: int, most: int) -> int:
     found = words.next(f"the number of {what!r}")
-    if not _WHOLE.fullmatch(found) or not least <= int(found) <= most:
-        raise words.wrong(f"{what} {found[:40]!r}: a whole number from {least} to {most} is allowed")
-    return int(found)
+    with words.blaming():
+        return parts.whole(what, found, least, most)
 
 
 def _duration_us(words: _Words) -> int:

@@ -15,6 +15,7 @@ from aftbed.core import message
 from aftbed.core.errors import ConfigError
 from aftbed.core.event import Event
 from aftbed.core.fault import Hang
+from aftbed.core.graph import Graph
 from aftbed.core.script import Phase, Script, bricks_changed
 from aftbed.runtime import control
 from aftbed.runtime.deployment import Deployment, Keys
@@ -50,7 +51,15 @@ class Outcome(msgspec.Struct):
     bricks_changed: int = 0
     bricks_total: int = 0
     application: str = ""  # the function that is protected after it, "" for the built-in one
-    opened_ns: int = 0  # when it was committed and requests were served again (monotonic)
+    tried: str = ""  # the function of the new graph, kept or not
+    opened_ns: int = 0  # from when on the new graph served (monotonic), 0 if it never did
+    undone_ns: int = 0  # from when on the old one served again
+    lost: str = ""  # the replicas that did not serve again, and were left to Recovery, as "a" or "a b"
+
+
+def function_of(graph: Graph) -> str:
+    """The protected function of `graph`, "" for the built-in one."""
+    return next(b.application for b in graph.bricks if b.part == "server")
 
 
 def _nobody(outcome: Outcome) -> None:
@@ -271,11 +280,12 @@ class Adaptations:
         outcome.outcome, outcome.reason = told.outcome, told.reason
         outcome.total_ms = round((self._loop.now_ns() - now.began_ns) / 1e6, 3)
         outcome.ftm = self._deployment.graph.ftm
-        outcome.application = next(b.application for b in self._deployment.graph.bricks if b.part == "server")
+        outcome.application = function_of(self._deployment.graph)
         if now.exchange is not None:
             assert now.script is not None
             outcome.bricks_changed = bricks_changed(now.exchange.old, now.exchange.new, now.script)
-            outcome.opened_ns = now.exchange.opened_ns if told.outcome == "done" else 0
+            outcome.tried, outcome.opened_ns = function_of(now.exchange.new), now.exchange.turned_ns
+            outcome.undone_ns, outcome.lost = now.exchange.undone_ns, " ".join(sorted(now.exchange.lost))
         self.history.append(outcome)
         self._support.keep(msgspec.json.encode(outcome))
         self._tell("adapted", f"{outcome.number}: {outcome.purpose}: {told.outcome} {told.reason}".rstrip())

@@ -6,6 +6,7 @@ backup; so when their event is next, the brick's `step` is *tapped*: what goes i
 and the tap is taken away. Nothing here is run by a node that no fault waits in.
 """
 
+import math
 from collections.abc import Iterable
 from typing import Final, assert_never
 
@@ -15,7 +16,7 @@ from msgspec import structs
 from aftbed.core.brick import Brick, Effect, Note, Send
 from aftbed.core.errors import PeerError
 from aftbed.core.event import Event, event_named
-from aftbed.core.fault import Disturb, gap, mark
+from aftbed.core.fault import Disturb, mark
 from aftbed.core.message import (
     AnyMessage,
     Checkpoint,
@@ -27,6 +28,7 @@ from aftbed.core.message import (
     Trial,
     Tried,
 )
+from aftbed.core.persistence import gap
 from aftbed.core.valuefault import Flip, Place, changed, hit
 from aftbed.runtime import control
 from aftbed.runtime.diversion import BITTEN, Diversion, Meddler
@@ -44,8 +46,8 @@ def take(node: Host, order: control.Arm | control.Interfere | control.SlowDown) 
             arm(node, order)
         case control.Interfere(_, blow):
             interfere(node, blow)
-        case control.SlowDown(_, fault, by_ns):
-            slow_down(node, fault, by_ns)
+        case control.SlowDown():
+            slow_down(node, order)
         case _:
             assert_never(order)
 
@@ -264,24 +266,35 @@ class _Noting:
             self._node.say(control.Fired(self._fault))
 
 
-def slow_down(node: Host, fault: int, by_ns: int) -> None:
+def slow_down(node: Host, order: control.SlowDown) -> None:
     """Have each step take so much longer, or no longer."""
-    node.slowed.pop(fault, None)
-    if by_ns:
-        node.slowed[fault] = by_ns
+    node.slowed.pop(order.fault, None)
+    if order.by_ns or order.share < control.WHOLE:
+        node.slowed[order.fault] = order
     node.slow()
 
 
 class Slowness:
-    """How much longer a step takes; `note` is told of each fault the first time that it has an effect."""
+    """How much longer a step takes. It is written down of each fault when that is felt for the first time."""
 
     def __init__(self, node: Host) -> None:
         self._node = node
         self._felt: set[int] = set()
 
-    def feel(self) -> int:
+    def longer_ns(self) -> int:
         """A step is being taken: by how many ns it is slower."""
-        for fault in self._node.slowed.keys() - self._felt:
-            self._felt.add(fault)
-            self._node.record(Event.FAULT_APPLIED, 0, mark(fault))
-        return sum(self._node.slowed.values())
+        return sum(self._feel(order).by_ns for order in self._slowed() if order.by_ns)
+
+    def stretched_ns(self, used_ns: int) -> int:
+        """Of a CPU, so much was used: how many ns more it would have taken with no more than its share."""
+        shares = [self._feel(order).share for order in self._slowed() if order.share < control.WHOLE]
+        return round(used_ns * (1 / math.prod(shares) - 1))
+
+    def _slowed(self) -> list[control.SlowDown]:
+        return list(self._node.slowed.values())
+
+    def _feel(self, order: control.SlowDown) -> control.SlowDown:
+        if order.fault not in self._felt:
+            self._felt.add(order.fault)
+            self._node.record(Event.FAULT_APPLIED, 0, mark(order.fault))
+        return order

@@ -8,8 +8,8 @@ from typing import Final
 
 import msgspec
 
-from aftbed.core.busfault import BusFault
-from aftbed.core.fault import ONCE, Action, Persistence
+from aftbed.core.busfault import BusFault, Condition
+from aftbed.core.fault import Action
 from aftbed.core.graph import BrickSpec, Graph
 from aftbed.core.message import (
     Adapt,
@@ -22,8 +22,10 @@ from aftbed.core.message import (
     TakeUp,
     Watch,
 )
+from aftbed.core.persistence import ONCE, Persistence
 from aftbed.core.script import Phase, Script
 
+WHOLE: Final = 1.0  # of a CPU
 UNANSWERED: Final = 0  # the token of an order that gets no Ack
 
 Told = Promote | Rebound | Watch | Situation | Adapt | Progress | TakeUp
@@ -197,10 +199,14 @@ class Interfere(Order, frozen=True):
 
 
 class SlowDown(Order, frozen=True):
-    """Each step takes so much longer from now on, for the sake of `fault`; 0: no longer."""
+    """Each step takes so much longer from now on, for the sake of `fault`, and as with a `share` of a CPU.
+
+    By nothing, with the whole CPU: no longer.
+    """
 
     fault: int
     by_ns: int
+    share: float = WHOLE
 
 
 class KeepInCell(Order, frozen=True):
@@ -215,6 +221,12 @@ class DisturbBus(Order, frozen=True):
 
     fault: BusFault
     draw: int
+
+
+class WatchCar(Order, frozen=True):
+    """To the hub: say when the car is so; `token` is the number of the fault. An Ack has to follow."""
+
+    condition: Condition
 
 
 class Stop(Order, frozen=True):
@@ -278,6 +290,7 @@ class Report(msgspec.Struct, frozen=True, tag=True):
 
 ToNode = (
     Park | Assign | Serve | BindInput | BindOutput | Follow | Rewire | Suspend | Resume | Capture | Restore
-    | Tell | WatchNodes | Arm | Interfere | SlowDown | KeepInCell | DisturbBus | Stop | Quiet | Stats | Ack
+    | Tell | WatchNodes | Arm | Interfere | SlowDown | KeepInCell | DisturbBus | WatchCar | Stop | Quiet
+    | Stats | Ack
 )  # fmt: skip
 FromNode = Hello | Rested | Ack | Said | Ordered | Fired | Report

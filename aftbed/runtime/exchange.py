@@ -9,23 +9,24 @@ Who dies meanwhile fails the step that waits for it; `undo` leaves out whoever i
 """
 
 import contextlib
-from collections.abc import Callable, Generator, Iterable
+import functools
+from collections.abc import Callable, Generator, Iterable, Sequence
 from typing import Final
 
 from aftbed.adapt.plan import drains
 from aftbed.core import script
 from aftbed.core.event import Event
-from aftbed.core.graph import Graph, Link
+from aftbed.core.graph import Graph
 from aftbed.core.script import Script, flat
 from aftbed.ftm.catalog import KINDS
 from aftbed.ftm.mechanism import REPLICAS, replication_of
 from aftbed.runtime import control
-from aftbed.runtime.deployment import Deployment, Keys
+from aftbed.runtime.deployment import Deployment, Keys, Slot
 from aftbed.runtime.interface import Channel, Process
 from aftbed.runtime.jobs import Key, StepFailed, Wait, amid
 from aftbed.runtime.rewiring import (
-    INPUT,
     Changes,
+    Wires,
     gone,
     replica_of,
     stop_replication,
@@ -52,18 +53,19 @@ class Exchange:
         self._replaced: dict[str, Process] = {}  # the old ones, by node
         self._removed: dict[str, Process] = {}  # those that only the old graph has
         self._fresh = deployment.channels.fresh
+        self._wires = Wires(deployment, self.new, self._staged)
         self._let_go: dict[tuple[str, str, str], Channel] = {}  # of the old graph only
         self._suspended: list[tuple[str, Process]] = []  # brick, its node's process
         self._migrated: list[str] = []
-        self._given: set[script.End] = set()  # ends that their bricks have
         self._rewired = False
         self._committing = False
         self._opened = False  # the leader's Protocol has been let on
+        self._one_way = False  # what is replaced cannot go on from the state of what is new
         self.committed = False
         self._born: list[str] = []
-        self._lost: set[str] = set()  # replicas that are left to Recovery
-        self.closed_ns = self.opened_ns = 0  # when no request was served, and when again
-        self._number = 0
+        self.lost: set[str] = set()  # replicas that are left to Recovery
+        self._number = self.closed_ns = self.opened_ns = 0  # when no request was served, and when again
+        self.turned_ns = self.undone_ns = 0  # requests after it are the new graph's; the old one's again
 
     # -- the phases ---------------------------------------------------------------------------
 
@@ -78,7 +80,11 @@ class Exchange:
         yield from answered(sent, PREPARE_SECONDS_MAX)
         for number in range(1, self._number + 1):
             yield from self._step(Event.ADAPT_STEP_EXIT, number)
-        yield from self._rewire(v for v in flat(self._todo.prepare) if isinstance(v, script.Bind))
+        yield from self._rewire([v for v in flat(self._todo.prepare) if isinstance(v, script.Bind)])
+        wiring = [v for v in self._todo.commit if _wires(v)]
+        # The paper's recipe stages in the commit; of several, the later ones depend on the first.
+        if self._todo.recipe == script.RECIPES[0] and len(wiring) == 1:
+            self._wires.foresee(tuple(flat((wiring[0],))))
         yield from self._deployment.nursery.calm(LIGHT)
 
     def _stage(self, verb: script.Stage) -> Generator[Wait, dict[Key, bytes], tuple[Key, str]]:
@@ -102,12 +108,25 @@ class Exchange:
         except StepFailed:
             if self._opened:  # requests may have passed: the state that counts is in what is new
                 self._adopt()
-            raise
+                yield from self._try_way_back()
+            if not self._one_way:
+                raise
         self.opened_ns = self._deployment.support.loop.now_ns()
-        self._adopt()
-        for slot in self._deployment.slots.values():
-            self._deployment.assert_whole(slot)
+        if not self.committed:
+            self._adopt()
         yield from self._watch()
+        if not self._one_way:
+            yield from self._try_way_back()
+        for slot in self._deployment.slots.values():
+            if self._one_way:
+                self._leave_if_dead(slot)
+            else:
+                self._deployment.assert_whole(slot)
+
+    def _leave_if_dead(self, slot: Slot) -> None:
+        """There is no way back, so it is Recovery's, as at any other time."""
+        if not all(map(self._deployment.lives, self._deployment.nodes_of(slot))):
+            self._deployment.lost.add(slot.name)
 
     def _assert_whole(self) -> None:
         """Raise StepFailed if a node of a replica is dead: not every step asks everybody."""
@@ -145,17 +164,18 @@ class Exchange:
                 self._migrated.append(node)
                 serving, staged = self._deployment.nodes[node], self._staged[node]
                 yield from migrate(self._deployment, self.old, serving, self.new, staged, node)
-            case script.Together(verbs) if all(isinstance(v, script.Resume) for v in verbs):
+            case _ if _wires(verb):
+                yield from self._rewire(tuple(flat((verb,))))
+            case script.Together(verbs):
                 self._assert_whole()
                 yield from self._resume([v.brick for v in verbs if isinstance(v, script.Resume)])
             case script.Resume(brick):
                 yield from self._resume([brick])
-            case script.Together() | script.Bind() | script.Unbind() | script.Exchange():
-                yield from self._rewire(flat((verb,)))
             case script.Freeze(brick):
-                self._process(brick).freeze()
+                self._wires.process(brick).freeze()
             case script.Thaw(brick):
-                self._process(brick).thaw()
+                self.turned_ns = self._deployment.support.loop.now_ns()
+                self._wires.process(brick).thaw()
             case script.Destroy(node):
                 self._destroy(node)
             case script.Stage() as verb:
@@ -163,20 +183,8 @@ class Exchange:
             case _:
                 raise StepFailed(f"{type(verb).__name__} has no place in the commit of an adaptation")
 
-    def _process(self, brick: str) -> Process:
-        """Who hosts `brick`: what is staged under the name of a node that is new, else what serves."""
-        if brick in {b.name for b in self.old.bricks}:
-            node = self.old.node_of(brick)
-            if node in self._deployment.nodes:
-                return self._deployment.nodes[node]
-        node = self.new.node_of(brick)
-        process = self._staged.get(node) or self._deployment.nodes.get(node)
-        if process is None:
-            raise StepFailed(f"{node} is gone")
-        return process
-
     def _seat(self, brick: str) -> Seat:
-        return brick, self._process(brick)
+        return brick, self._wires.process(brick)
 
     def _destroy(self, node: str) -> None:
         """With whatever is inside."""
@@ -188,7 +196,7 @@ class Exchange:
             del self._deployment.nodes[node]
 
     def _suspend(self, brick: str, *, drain: bool) -> Keys:
-        process = self._process(brick)
+        process = self._wires.process(brick)
         self._suspended.append((brick, process))
         yield from ask(
             self._deployment, process, lambda token: control.Suspend(token, drain), SUSPEND_SECONDS_MAX
@@ -197,69 +205,25 @@ class Exchange:
     def _resume(self, bricks: Iterable[str]) -> Keys:
         sent = []
         for brick in bricks:
-            sent.append(self._deployment.order_to(self._process(brick), control.Resume))
-            self._opened = self._opened or brick == f"{self._deployment.leader}/protocol"
+            before_ns = self._deployment.support.loop.now_ns()
+            sent.append(self._deployment.order_to(self._wires.process(brick), control.Resume))
+            if brick == f"{self._deployment.leader}/protocol":
+                self._opened, self.turned_ns = True, before_ns
             self._suspended = [(b, p) for b, p in self._suspended if b != brick]
         yield from answered(sent)
 
     # -- channels -----------------------------------------------------------------------------
 
-    def _channel(self, link: Link) -> Channel:
-        """The channel of `link`: the one that serves already, or a fresh one."""
-        key = (link.source, link.source_port, link.sink)
-        standing = self._deployment.channels.get(*key)
-        if standing is not None:
-            return standing
-        if key not in self._fresh:
-            self._fresh[key] = self._deployment.channels.make(link)
-        return self._fresh[key]
-
-    def _rewire(self, verbs: Iterable[script.AnyVerb]) -> Keys:
+    def _rewire(self, verbs: Sequence[script.AnyVerb]) -> Keys:
         """Everybody hears of all that concerns him at once. In `prepare`, only what is staged."""
-        changes: dict[int, Changes] = {}
-
-        def of(process: Process) -> Changes:
-            return changes.setdefault(id(process), Changes(process))
-
-        exchanged = []
-        for verb in verbs:
-            match verb:
-                case script.Bind():
-                    self._bind(verb.link, of)
-                case script.Unbind(brick, port):
-                    self._unbind(brick, port, of)
-                case script.Exchange(node):
-                    exchanged.append(node)
-                    old = self._deployment.nodes[node]
-                    of(old).suspend = True
-                    self._suspended.append((node, old))  # even if another one cannot be told
-                case _:
-                    raise StepFailed(f"{type(verb).__name__} among channels")
-        yield from tell(self._deployment, changes)
+        bound = any(isinstance(verb, script.Bind | script.Unbind) for verb in verbs)
+        self._rewired = self._rewired or (bound and self._committing)
+        exchanged = [verb.node for verb in verbs if isinstance(verb, script.Exchange)]
+        for node in exchanged:  # even if another one cannot be told
+            self._suspended.append((node, self._wires.serving(node)))
+        yield from tell(self._deployment, self._wires.told(verbs, committing=self._committing))
         for node in exchanged:
             self._take_place(node)
-
-    def _bind(self, link: Link, of: Callable[[Process], Changes]) -> None:
-        if self.new.node_of(link.source) == self.new.node_of(link.sink):
-            return  # within one node: it knows
-        channel = self._channel(link)
-        shared = (link.source, link.source_port, link.sink) not in self._fresh
-        self._rewired = self._rewired or self._committing
-        for brick, port, fd, side in (
-            (link.sink, link.sink_port, channel.read.fileno(), INPUT),
-            (link.source, link.source_port, channel.write.fileno(), "out"),
-        ):
-            staged = self._staged.get(self.new.node_of(brick))
-            given = (brick, port, side) in self._given or (staged is None and shared)
-            if not given and (self._committing or staged is not None):
-                self._given.add((brick, port, side))
-                of(staged or self._process(brick)).bind(brick, port, side, fd)
-
-    def _unbind(self, brick: str, port: str, of: Callable[[Process], Changes]) -> None:
-        self._rewired = True
-        change = of(self._process(brick))
-        outputs = KINDS[self.old.brick(brick).kind].outputs
-        (change.outputs if port in outputs else change.inputs)[brick, port] = control.NOWHERE
 
     def _take_place(self, node: str) -> None:
         """The staged process is the node from now on."""
@@ -277,7 +241,8 @@ class Exchange:
         for node, process in self._staged.items():
             process.name, process.kind = node, "node"
             deployment.nodes[node] = process
-        self._born, self._staged = list(self._staged), {}
+        self._born = list(self._staged)
+        self._staged.clear()
         for node in [n for n in deployment.nodes if n not in self.new.nodes]:
             process = self._removed[node] = deployment.nodes.pop(node)
             process.name, process.kind = f"{node}{STAGED}", "staged"
@@ -296,7 +261,7 @@ class Exchange:
 
     def _watch(self) -> Keys:
         for slot in self._deployment.slots.values():
-            if slot.name not in self._lost:
+            if slot.name not in self.lost:
                 with contextlib.suppress(StepFailed):  # a Watchdog that is dead is replaced, and told then
                     yield from self._deployment.watch(slot)
 
@@ -312,9 +277,9 @@ class Exchange:
         # Afterwards both count: it is the old ones that are to serve, with the state of the new ones.
         serving = list((deployment.nodes | self._replaced).items())
         serving += list(deployment.nodes.items()) if self.committed else []
-        self._lost = {lost, *gone(serving, deployment.support.loop.now_ns())} - {""}
+        self.lost = {lost, *gone(serving, deployment.support.loop.now_ns())} - {""}
         if self.committed:  # else the Watchdogs have seen it
-            deployment.lost |= self._lost
+            deployment.lost |= self.lost
             yield from self._reverse_adoption()
         if self._rewired:
             yield from tell_whoever_lives(deployment, self._old_ends())
@@ -324,14 +289,15 @@ class Exchange:
         for node, process in self._removed.items():
             process.name, process.kind, deployment.nodes[node] = node, "node", process
         if self.committed:
-            deployment.adopt(self.old, self._lost)
+            deployment.adopt(self.old, self.lost)
             yield from self._watch()  # before those die that are watched now
         yield from seen_dead(self._staged.values())
         for channel in self._fresh.values():
             channel.close()
+        self.undone_ns = deployment.support.loop.now_ns()
         self._let_serve()
-        self._staged, self._replaced, self._removed = {}, {}, {}
-        self._suspended = []
+        self._replaced, self._removed, self._suspended = {}, {}, []
+        self._staged.clear()
         self._fresh.clear()
         self.committed = False
         yield Wait(frozenset())
@@ -340,7 +306,7 @@ class Exchange:
         """Whoever was suspended goes on, but for a lost replica."""
         waiting = {id(p): p for p in (*(p for _, p in self._suspended), *self._replaced.values())}
         for process in waiting.values():
-            if process.kind != "killed" and replica_of(process.name) not in self._lost:
+            if process.kind != "killed" and replica_of(process.name) not in self.lost:
                 with contextlib.suppress(StepFailed):
                     self._deployment.order_to(process, control.Resume)
 
@@ -349,7 +315,7 @@ class Exchange:
 
         def serving(node: str) -> Process | None:
             process = self._replaced.get(node) or self._deployment.nodes.get(node)
-            lost = process is None or not process.alive or replica_of(node) in self._lost
+            lost = process is None or not process.alive or replica_of(node) in self.lost
             return None if lost else process
 
         back = {b for node in self._replaced for b in self.old.nodes[node]}
@@ -358,20 +324,20 @@ class Exchange:
     def _reverse_adoption(self) -> Keys:
         """From a graph that serves: stop it, take the state back, and let its channels go."""
         deployment = self._deployment
-        if deployment.leader in self._lost and not replication_of(self.new.ftm):
-            self._lost |= set(REPLICAS)  # nobody else has its state
-            deployment.lost |= self._lost
-        for replica in sorted(self._lost & deployment.slots.keys()):  # it may live and serve: not any more
+        if deployment.leader in self.lost and not replication_of(self.new.ftm):
+            self.lost |= set(REPLICAS)  # nobody else has its state
+            deployment.lost |= self.lost
+        for replica in sorted(self.lost & deployment.slots.keys()):  # it may live and serve: not any more
             deployment.shut_replication(deployment.slots[replica])
-        if deployment.leader not in self._lost and self._lost:
-            yield from stop_replication(deployment, self.new.ftm, self._process)
+        if deployment.leader not in self.lost and self.lost:
+            yield from stop_replication(deployment, self.new.ftm, self._wires.process)
         path = [(f"{deployment.leader}/protocol", False), *((b, True) for b in drains(self.new, self.old))]
         for brick, drain in path:
-            if replica_of(brick) not in self._lost:
+            if replica_of(brick) not in self.lost:
                 yield from self._or_lost(brick, self._suspend(brick, drain=drain))
         for node in self._migrated:
             giver, taker = deployment.nodes[node], self._replaced[node]
-            if replica_of(node) not in self._lost:
+            if replica_of(node) not in self.lost:
                 yield from self._or_lost(node, migrate(deployment, self.new, giver, self.old, taker, node))
         for node in self._born:
             if node in deployment.nodes:
@@ -391,9 +357,44 @@ class Exchange:
         try:
             yield from steps
         except StepFailed:
-            self._lost.add(replica_of(name))
+            self.lost.add(replica_of(name))
             self._deployment.lost.add(replica_of(name))
 
+    def _try_way_back(self) -> Keys:
+        """Whether a class of before takes the state of the one that has its place: it need not.
+
+        Asked when requests have been let on, so that nobody waits for it; what is replaced rests meanwhile.
+        """
+        deployment = self._deployment
+        for node, brick in self._another_class():
+            capture = functools.partial(control.Capture, brick=brick)
+            giver, taker = self._wires.serving(node), self._replaced[node]
+            try:
+                state = yield from ask(deployment, giver, capture)
+                if state:
+                    restore = functools.partial(control.Restore, brick=brick, state=state, migrate=True)
+                    yield from ask(deployment, taker, restore)
+            except StepFailed:
+                self._one_way = self._one_way or (giver.alive and taker.alive)  # else it was a death
+
+    def _another_class(self) -> list[tuple[str, str]]:
+        """Where state was handed to a brick of another class, or with another function: nodes and bricks."""
+
+        def written(graph: Graph, brick: str) -> tuple[str, str]:
+            return graph.brick(brick).source, graph.brick(brick).application
+
+        moved = [(n, b) for n in self._migrated for b in self.old.nodes[n] if b in self.new.nodes[n]]
+        return [(n, b) for n, b in moved if written(self.old, b) != written(self.new, b)]
+
     def can_go_back(self, without: str) -> bool:
-        """Whether what is replaced lives, but for that replica's."""
-        return all(p.alive for n, p in self._replaced.items() if replica_of(n) != without)
+        """Whether what is replaced lives, but for that replica's, and can take the state."""
+        return not self._one_way and all(
+            p.alive for n, p in self._replaced.items() if replica_of(n) != without
+        )
+
+
+def _wires(verb: script.AnyVerb) -> bool:
+    """Whether `verb` is about channels and places."""
+    if isinstance(verb, script.Together):
+        return not all(isinstance(inner, script.Resume) for inner in verb.verbs)
+    return isinstance(verb, script.Bind | script.Unbind | script.Exchange)

@@ -5,6 +5,9 @@ which needs nobody else. Anything else is asked for: the emitter waits until the
 and seen it hit (dead, in state `T`, or slow by its own word), since a process goes on for a while after a
 signal was sent. What an adaptation comes through is emitted by the supervisor itself: see `Faults.at`.
 
+A fault with a condition of the car is armed when that holds. In virtual time and in lockstep the car waits
+with its next step until that is done; in real time it drives on, and the receipt says for how long.
+
 Each fault ends with a receipt. One that has struck stays where it is, even if it lasts: it belongs to that
 process, and not to the one that takes its place.
 """
@@ -16,15 +19,16 @@ from typing import Final, assert_never
 
 from aftbed.core.busfault import BusFault
 from aftbed.core.errors import ConfigError
-from aftbed.core.event import Event, event_named
-from aftbed.core.fault import Crash, Disturb, Fault, Hang, Slow
+from aftbed.core.event import Event
+from aftbed.core.fault import Crash, Disturb, Fault, FlipMemory, Hang, Slow
 from aftbed.core.journal import Record
 from aftbed.core.valuefault import Flip, Place
 from aftbed.runtime import control, receipts, targets
+from aftbed.runtime.armed import Armed
 from aftbed.runtime.cell import check_field
-from aftbed.runtime.cells import Cells, Hit, receipt
+from aftbed.runtime.cells import Cells, receipt
 from aftbed.runtime.deployment import Deployment, Keys
-from aftbed.runtime.interface import Process
+from aftbed.runtime.interface import Met, Process
 from aftbed.runtime.jobs import Key, StepFailed, Wait
 from aftbed.runtime.receipts import ACTIVATED, APPLIED, ARMED, INJECT_ERROR, NOT_ACTIVATED, Receipt
 
@@ -33,52 +37,6 @@ STOP_NS_MAX: Final = 500_000_000
 
 class NobodyThere(StepFailed):
     """Nobody comes to the point of a fault as things are."""
-
-
-class Armed:
-    """A fault and what has become of it; `hit` are the processes that the executive struck."""
-
-    def __init__(self, number: int, fault: Fault, draw: int) -> None:
-        self.number, self.fault, self.draw = number, fault, draw
-        self.receipt = Receipt()
-        self.hit: list[Process] = []
-        self.left = fault.trigger.nth  # of the occurrences of its event, since it came to its host
-        self.waits = False  # for its event: in its host, or, while nobody emits it, in none
-        self.host: Process | None = None
-        self.flipped: Hit | None = None  # in memory
-        self.brick = ""
-        self.itself = False
-        self.journals: set[str] = set()
-        self._since_ns = 0
-        self._share = 1  # how many bricks of the host emit the event
-
-    def move_in(self, host: Process, brick: str, share: int, now_ns: int, *, itself: bool) -> None:
-        """Wait in `host` from now on."""
-        assert host.journal, host.name
-        self.host, self.brick, self._share, self.itself = host, brick, share, itself
-        self.journals.add(host.journal)
-        self._since_ns = now_ns
-
-    def move_out(self, records: Iterable[Record]) -> None:
-        """What happened in the host has been counted there, by its records, and is not forgotten.
-
-        But messages are in no record: for them the count begins anew.
-        """
-        if self.fault.event:
-            event = event_named(self.fault.event)
-            happened = sum(r.event is event and r.t_ns >= self._since_ns for r in records)
-            self.left = max(1, self.left - happened // self._share)
-        self.host = None
-
-    def order(self, token: int, nth: int) -> control.Arm | control.Interfere:
-        """What the host is told; `nth` 0: to wait no longer."""
-        fault = self.fault
-        blow = control.Blow(
-            self.number, self.brick, nth, fault.action, self.itself, self.draw, fault.persistence
-        )
-        if isinstance(fault.action, Disturb):
-            return control.Interfere(token, blow)
-        return control.Arm(token, fault.event, (blow,))
 
 
 class Faults:
@@ -99,6 +57,9 @@ class Faults:
         self._tell("armed", str(fault))
         if isinstance(fault.action, Flip) and fault.action.field:
             yield from self._move_in(armed, fault.action)
+        if fault.trigger.when is not None:
+            yield from self._support.watch(number, fault.trigger.when, lambda met: self._met(armed, met))
+            return
         if fault.trigger.after_ms and not fault.trigger.event:
             self._loop.after(fault.trigger.after_ms / 1e3, lambda: self._start(armed))
             return
@@ -106,6 +67,14 @@ class Faults:
 
     def _start(self, armed: Armed) -> None:
         self._loop.jobs.start(f"fault {armed.fault}", self._begin(armed), lambda failure: None)
+
+    def _met(self, armed: Armed, met: Met) -> None:
+        """Its condition holds."""
+        armed.met, armed.unmet = met, None
+        self._tell("met", f"{armed.fault}: at {met.t_us / 1e6:.6f} s")
+        self._loop.jobs.start(
+            f"fault {armed.fault}", self._begin(armed), lambda failure: armed.begun(self._loop.now_ns())
+        )
 
     def _begin(self, armed: Armed) -> Keys:
         action = armed.fault.action
@@ -190,6 +159,8 @@ class Faults:
         match armed.fault.action:
             case Crash():
                 self._look_for_death(armed, itself=bool(words) and armed.itself)
+            case FlipMemory():
+                pass
             case Hang():
                 if armed.receipt.state == APPLIED and not all(p.alive for p in armed.hit):
                     armed.receipt = Receipt(ACTIVATED)
@@ -200,6 +171,7 @@ class Faults:
                 struck = self._support.bus_fault(armed.number)
                 if struck is not None:
                     armed.receipt = Receipt(struck.receipt, struck.detail)
+                    armed.unmet = armed.fault.action.opening.when if struck.waits else None
             case Disturb():
                 if words:
                     armed.receipt = receipts.of_channel(armed.brick, words)
@@ -314,8 +286,11 @@ class Faults:
                 yield Wait(frozenset(dead))
             case Hang(for_ms):
                 yield from self._hang(armed, hit, for_ms)
-            case Slow(by_ms, for_ms):
-                yield from self._slow(armed, hit, round(by_ms * 1e6), for_ms)
+            case Slow() as slow:
+                yield from self._slow(armed, hit, slow)
+            case FlipMemory() as flip:
+                self._flip_memory(armed, hit, flip)
+                yield Wait(frozenset())
             case Disturb() | BusFault():
                 raise AssertionError(f"{armed.fault} strikes where it waits")
             case _:
@@ -339,27 +314,39 @@ class Faults:
             self._loop.after(for_ms / 1e3, lambda: _resume(armed))
         yield Wait(frozenset())
 
-    def _slow(self, armed: Armed, hit: list[Process], by_ns: int, for_ms: int) -> Keys:
+    def _slow(self, armed: Armed, hit: list[Process], slow: Slow) -> Keys:
         deployment, number = self._deployment, armed.number
-        sent = [deployment.order_to(p, lambda token: control.SlowDown(token, number, by_ns)) for p in hit]
+        by_ns, share = round(slow.by_ms * 1e6), slow.share or control.WHOLE
+        sent = [
+            deployment.order_to(p, lambda token: control.SlowDown(token, number, by_ns, share)) for p in hit
+        ]
         yield from deployment.all_of(sent)
         armed.receipt = Receipt(APPLIED)
-        if for_ms:
-            self._loop.after(for_ms / 1e3, lambda: self._speed_up(armed))
+        if slow.for_ms:
+            self._loop.after(slow.for_ms / 1e3, lambda: self._speed_up(armed))
 
     def _speed_up(self, armed: Armed) -> None:
         for process in armed.hit:
             with contextlib.suppress(StepFailed):  # it is gone, and its slowness with it
                 self._deployment.order_to(process, lambda token: control.SlowDown(token, armed.number, 0))
 
+    def _flip_memory(self, armed: Armed, hit: list[Process], flip: FlipMemory) -> None:
+        """Of a replica, in one of its nodes."""
+        process = sorted(hit, key=lambda p: p.name)[armed.draw % len(hit)]
+        try:
+            armed.receipt = Receipt(APPLIED, self._support.flip_memory(process, flip, armed.draw))
+        except StepFailed as failure:
+            armed.receipt = Receipt(INJECT_ERROR, str(failure))
+        self._tell("fault", f"{armed.fault}: {armed.receipt.state}, {armed.receipt.detail}")
+
     def receipts(self) -> list[dict[str, str]]:
         """What became of each fault; `detail` where there is more to say."""
         for armed in self._armed:
             self._look(armed)
+        reports = [(armed.fault, armed.report()) for armed in self._armed]
         return [
-            {"fault": str(a.fault), "receipt": a.receipt.state}
-            | ({"detail": a.receipt.detail} if a.receipt.detail else {})
-            for a in self._armed
+            {"fault": str(fault), "receipt": said.state} | ({"detail": said.detail} if said.detail else {})
+            for fault, said in reports
         ]
 
 

@@ -21,7 +21,7 @@ class Host(Protocol):
     """A node, as an order finds it."""
 
     armed: dict[Event, control.Arm]
-    slowed: dict[int, int]  # by fault: how many ns each step takes longer
+    slowed: dict[int, control.SlowDown]  # by fault
     diverted: dict[tuple[str, str], Diversion]  # by brick and port: what disturbs it
 
     def hosted(self, brick: str) -> Hosted:

@@ -6,10 +6,11 @@ made, how mail travels, what a moment is.
 """
 
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
-from aftbed.core.busfault import BusFault, Struck
+from aftbed.core.busfault import BusFault, Condition, Struck
 from aftbed.core.event import Event
+from aftbed.core.fault import FlipMemory
 from aftbed.core.graph import Link
 from aftbed.core.journal import Record
 from aftbed.runtime.control import ToNode
@@ -182,6 +183,17 @@ class Loop(Protocol):
         ...
 
 
+class Met(NamedTuple):
+    """A condition holds, at `t_us` of the drive. The car waits for `go_on`; or it does not wait.
+
+    Then `since_ns` is when it was found to hold, by the loop's clock; else 0.
+    """
+
+    t_us: int
+    since_ns: int
+    go_on: Callable[[], None]
+
+
 class Support(Protocol):
     """A runtime, whole."""
 
@@ -230,6 +242,19 @@ class Support(Protocol):
 
     def disturb(self, number: int, fault: BusFault, draw: int) -> Generator[Wait, dict[Key, bytes], None]:
         """Arm a fault of the bus; it is armed when this ends. Raises StepFailed where there is no bus."""
+        ...
+
+    def watch(
+        self, number: int, condition: Condition, met: Callable[[Met], None]
+    ) -> Generator[Wait, dict[Key, bytes], None]:
+        """For fault `number`: have `met` called once, at the first step at which `condition` holds.
+
+        It is looked at from when this ends. Raises StepFailed where there is no car.
+        """
+        ...
+
+    def flip_memory(self, process: Process, flip: FlipMemory, draw: int) -> str:
+        """Flip a bit of the memory of `process`; which it was, in words. Raises StepFailed."""
         ...
 
     def bus_fault(self, number: int) -> Struck | None:

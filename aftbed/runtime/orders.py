@@ -58,6 +58,7 @@ def carry_out(node: Host, order: control.ToNode, fds: Fds) -> bytes | None:
             | control.Assign()
             | control.Serve()
             | control.DisturbBus()
+            | control.WatchCar()
             | control.Stop()
             | control.Ack()
         ):

@@ -1,20 +1,28 @@
-"""What each process must hear for a graph to be wired: the ends of channels, one order for each process."""
+"""What each process must hear for a graph to be wired: the ends of channels, one order for each process.
+
+`Wires` knows which ends the bricks of a graph to be have been given. What is said while the client waits is
+worked out before (`Wires.foresee`), and holds as long as nobody and nothing has been replaced meanwhile.
+"""
 
 import contextlib
 import functools
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Final
 
+from aftbed.core import script
 from aftbed.core.graph import Graph, Link, ends
+from aftbed.ftm.catalog import KINDS
 from aftbed.ftm.mechanism import REPLICAS, replication_of
 from aftbed.runtime import control
 from aftbed.runtime.channels import Channels
 from aftbed.runtime.deployment import Deployment, Keys
-from aftbed.runtime.interface import Process
+from aftbed.runtime.interface import Channel, Process
 from aftbed.runtime.jobs import StepFailed
 from aftbed.runtime.transfer import answered, ask
 
 Ends = dict[tuple[str, str], int]  # brick, port -> descriptor, or NOWHERE
+Ports = tuple[control.Port, ...]
+Written = tuple[Ports, Ports, tuple[int, ...]]  # inputs, outputs, the descriptors that go with them
 INPUT: Final = "in"
 HANG_NS: Final = 150_000_000
 
@@ -27,6 +35,7 @@ class Changes:
         self.inputs: Ends = {}
         self.outputs: Ends = {}
         self.suspend = False
+        self._written: Written | None = None
 
     def bind(self, brick: str, port: str, side: str, fd: int) -> None:
         """Have `port` lead to `fd`, or NOWHERE."""
@@ -34,9 +43,14 @@ class Changes:
 
     def order(self, epoch: int) -> tuple[Callable[[int], control.ToNode], tuple[int, ...]]:
         """The order, but for its token, and the descriptors that go with it."""
+        inputs, outputs, fds = self._written or self.write()
+        return lambda token: control.Rewire(token, inputs, outputs, epoch, self.suspend), fds
+
+    def write(self) -> Written:
+        """Once nothing more is to be bound."""
         fds: list[int] = []
 
-        def ports(ends: Ends) -> tuple[control.Port, ...]:
+        def ports(ends: Ends) -> Ports:
             found = []
             for (brick, port), fd in ends.items():
                 found.append(control.Port(brick, port, len(fds) if fd != control.NOWHERE else fd))
@@ -44,8 +58,109 @@ class Changes:
                     fds.append(fd)
             return tuple(found)
 
-        inputs, outputs = ports(self.inputs), ports(self.outputs)
-        return lambda token: control.Rewire(token, inputs, outputs, epoch, self.suspend), tuple(fds)
+        self._written = ports(self.inputs), ports(self.outputs), tuple(fds)
+        return self._written
+
+
+Told = dict[int, Changes]  # by the identity of the process
+Present = tuple[list[Process], list[Channel]]
+
+
+class Wires:
+    """The ends of channels on the way from one graph to another. `staged`: processes, by their node."""
+
+    def __init__(self, deployment: Deployment, new: Graph, staged: dict[str, Process]) -> None:
+        self._deployment, self._staged = deployment, staged
+        self.old: Graph = deployment.graph
+        self.new = new
+        self._fresh = deployment.channels.fresh
+        self._given: set[script.End] = set()  # ends that their bricks have
+        self._foreseen: tuple[Sequence[script.AnyVerb], Present, Told] | None = None
+
+    def process(self, brick: str) -> Process:
+        """Who hosts `brick`: what is staged under the name of a node that is new, else what serves."""
+        if brick in {b.name for b in self.old.bricks}:
+            node = self.old.node_of(brick)
+            if node in self._deployment.nodes:
+                return self._deployment.nodes[node]
+        node = self.new.node_of(brick)
+        process = self._staged.get(node) or self._deployment.nodes.get(node)
+        if process is None:
+            raise StepFailed(f"{node} is gone")
+        return process
+
+    def serving(self, node: str) -> Process:
+        """The process that is `node` now."""
+        process = self._deployment.nodes.get(node)
+        if process is None:
+            raise StepFailed(f"{node} is gone")
+        return process
+
+    def foresee(self, verbs: Sequence[script.AnyVerb]) -> None:
+        """Work out now what is to be told later, if nothing is bound and nobody replaced before."""
+        given = set(self._given)
+        told = self.told(verbs, committing=True)
+        self._given = given
+        for change in told.values():
+            change.write()
+        self._foreseen = verbs, self._present(), told
+
+    def told(self, verbs: Sequence[script.AnyVerb], *, committing: bool) -> Told:
+        """What everybody must hear. While not yet `committing`, only what is staged hears anything."""
+        if self._foreseen is not None and self._foreseen[:2] == (verbs, self._present()):
+            return self._foreseen[2]
+        changes: Told = {}
+
+        def of(process: Process) -> Changes:
+            return changes.setdefault(id(process), Changes(process))
+
+        for verb in verbs:
+            match verb:
+                case script.Bind():
+                    self._bind(verb.link, of, committing=committing)
+                case script.Unbind(brick, port):
+                    self._unbind(brick, port, of)
+                case script.Exchange(node):
+                    of(self.serving(node)).suspend = True
+                case _:
+                    raise StepFailed(f"{type(verb).__name__} among channels")
+        return changes
+
+    def _present(self) -> Present:
+        """All that an order names; processes and channels are compared by identity."""
+        deployment = self._deployment
+        channels = [channel for _, channel in deployment.channels.items()]
+        return [*deployment.nodes.values(), *self._staged.values()], channels
+
+    def _bind(self, link: Link, of: Callable[[Process], Changes], *, committing: bool) -> None:
+        if self.new.node_of(link.source) == self.new.node_of(link.sink):
+            return  # within one node: it knows
+        channel = self._channel(link)
+        shared = (link.source, link.source_port, link.sink) not in self._fresh
+        for brick, port, fd, side in (
+            (link.sink, link.sink_port, channel.read.fileno(), INPUT),
+            (link.source, link.source_port, channel.write.fileno(), "out"),
+        ):
+            staged = self._staged.get(self.new.node_of(brick))
+            given = (brick, port, side) in self._given or (staged is None and shared)
+            if not given and (committing or staged is not None):
+                self._given.add((brick, port, side))
+                of(staged or self.process(brick)).bind(brick, port, side, fd)
+
+    def _unbind(self, brick: str, port: str, of: Callable[[Process], Changes]) -> None:
+        change = of(self.process(brick))
+        outputs = KINDS[self.old.brick(brick).kind].outputs
+        (change.outputs if port in outputs else change.inputs)[brick, port] = control.NOWHERE
+
+    def _channel(self, link: Link) -> Channel:
+        """The channel of `link`: the one that serves already, or a fresh one."""
+        key = (link.source, link.source_port, link.sink)
+        standing = self._deployment.channels.get(*key)
+        if standing is not None:
+            return standing
+        if key not in self._fresh:
+            self._fresh[key] = self._deployment.channels.make(link)
+        return self._fresh[key]
 
 
 def tell(deployment: Deployment, changes: dict[int, Changes]) -> Keys:

@@ -10,7 +10,7 @@ from aftbed.core.application import fields_of
 from aftbed.core.busfault import BusFault
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.event import Event, event_named
-from aftbed.core.fault import SLOW_MS_MAX, Disturb, Fault, Slow
+from aftbed.core.fault import SHARE_MAX, SHARE_MIN, SLOW_MS_MAX, Disturb, Fault, FlipMemory, Slow
 from aftbed.core.graph import BrickSpec, Graph
 from aftbed.core.valuefault import (
     BIT_MAX,
@@ -55,11 +55,21 @@ def check(fault: Fault, graph: Graph) -> None:
     allowed: tuple[str, ...] = (*roles(graph), *_nodes(fault, graph), *OTHERS)
     if isinstance(fault.action, Slow):
         allowed = (*roles(graph), *graph.nodes)  # it is their bricks' steps that are slow
-        if not 0 < fault.action.by_ms <= SLOW_MS_MAX:
-            raise ConfigError(f"by {fault.action.by_ms:g}ms: up to {SLOW_MS_MAX:g}ms are allowed")
+        _check_slow(fault.action)
+    if isinstance(fault.action, FlipMemory):
+        allowed = (*roles(graph), *graph.nodes)
     if fault.target not in allowed:
         raise unknown("target", fault.target, allowed)
     _check_event(fault, graph)
+
+
+def _check_slow(slow: Slow) -> None:
+    if slow.share is not None:
+        if not SHARE_MIN <= slow.share <= SHARE_MAX:
+            limits = f"{SHARE_MIN:.0%} to {SHARE_MAX:.0%} of a CPU are allowed"
+            raise ConfigError(f"share {slow.share:.3%}: {limits}")
+    elif not 0 < slow.by_ms <= SLOW_MS_MAX:
+        raise ConfigError(f"by {slow.by_ms:g}ms: up to {SLOW_MS_MAX:g}ms are allowed")
 
 
 def _check_event(fault: Fault, graph: Graph) -> None:

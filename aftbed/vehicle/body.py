@@ -17,11 +17,14 @@ of the scenario.
 from collections.abc import Callable
 from typing import Final, Literal
 
+import msgspec
+
 from aftbed.core.busfault import Condition
+from aftbed.vehicle.aebmessages import STAGE_WARN
 from aftbed.vehicle.dbcfile import Codec
 from aftbed.vehicle.ecus import BrakeEcu, BrakePolicy, RadarEcu
 from aftbed.vehicle.frame import Frame
-from aftbed.vehicle.plant import STEP_US, Plant
+from aftbed.vehicle.plant import STEP_US, Driver, Plant
 from aftbed.vehicle.report import Telemetry, VehicleResult
 from aftbed.vehicle.scenario import Scenario
 
@@ -40,6 +43,9 @@ class CarBody:
         self._brake = BrakeEcu(codec, policy)
         self._radar = RadarEcu(codec, seed)
         self._still_us = 0
+        self._demand_max_ms2 = 0.0
+        self._warned_us: int | None = None
+        self._braked_us: int | None = None  # by the function
 
     @property
     def t_us(self) -> int:
@@ -85,7 +91,10 @@ class CarBody:
         demand_ms2 = self._brake.demand_ms2(self._plant)
         if report is not None and self._plant.t_us % TELEMETRY_US == 0:
             report(self.telemetry())
-        self._plant.step(demand_ms2)
+        if demand_ms2 > self._demand_max_ms2 or self._warned_us is None:
+            self._heed(demand_ms2)
+        driver = self._plant.setup.driver
+        self._plant.step(demand_ms2 if driver is None else max(demand_ms2, self._pedal_ms2(driver)))
         self._still_us = self._still_us + STEP_US if self._plant.stopped() else 0
 
     def telemetry(self) -> Telemetry:
@@ -105,4 +114,25 @@ class CarBody:
 
     def result(self) -> VehicleResult:
         """What the drive came to, so far."""
-        return self._plant.result()
+        warning_s = None
+        if self._braked_us is not None and self._warned_us is not None:
+            warning_s = (self._braked_us - self._warned_us) / 1e6
+        return msgspec.structs.replace(
+            self._plant.result(),
+            warning_s=warning_s,
+            demand_max_ms2=self._demand_max_ms2,
+        )
+
+    def _heed(self, demand_ms2: float) -> None:
+        """Note what is asked of the brakes now, where it is the first or the most of its kind."""
+        if self._warned_us is None and self._brake.stage >= STAGE_WARN:
+            self._warned_us = self._plant.t_us
+        if self._braked_us is None and demand_ms2 > 0.0:
+            self._braked_us = self._plant.t_us
+        self._demand_max_ms2 = max(self._demand_max_ms2, demand_ms2)
+
+    def _pedal_ms2(self, driver: Driver) -> float:
+        """What the driver asks of the brakes, who has been warned, or not."""
+        if self._warned_us is None or self._plant.t_us - self._warned_us < driver.reaction_ms * 1000:
+            return 0.0
+        return driver.deceleration_ms2

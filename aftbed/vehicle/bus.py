@@ -36,6 +36,7 @@ import msgspec
 
 from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.vehicle.frame import Frame
+from aftbed.vehicle.pythoncan import lean
 
 if TYPE_CHECKING:
     import can
@@ -197,6 +198,7 @@ def _say_goodbye(sock: socket.socket) -> None:
 
 def open_bus(options: BusOptions) -> Bus:
     """Attach. When this returns, every frame that the bus carries from here on arrives."""
+    lean()
     import can  # noqa: PLC0415 - a tenth of a second, for those who drive only
 
     if options.interface == "socketcand":

@@ -154,7 +154,7 @@ class _Car:
             if self._body.is_so(condition):
                 if self._options.pace is None:
                     line.set_time(self._body.t_us)
-                line.met(number)
+                line.met(number, self._body.t_us)
 
     def _exchange_in_lockstep(self, stop: Callable[[], bool]) -> None:
         """Send what is due in an order that the hub cannot change, and wait for the answer."""

@@ -3,7 +3,12 @@
 `Codec` is a thin typed face over cantools: raw numbers in physical units, no names for values, and
 aftbed's own errors. A frame that does not decode is a `PeerError`; a DBC that does not parse, or
 lacks a message or a signal that somebody asked for, is the user's: `ConfigError`, with the file,
-the line that cantools found, and the nearest name that exists.
+cantools' reason, the line, and the nearest name that exists.
+
+A DBC whose signals overlap or lie outside their message contradicts itself, so it is refused. There are
+such files of real cars, most often wrong in messages that nobody here needs. Who knows that asks for
+`strict` False: then the file is read, a message with overlapping signals is decoded signal by signal,
+each as the file has it, and a signal outside its message is not there for anybody (`misfits`).
 
 cantools is imported when a DBC is loaded and not before: the mechanism's processes never need it,
 and `aftbed --help` must not wait for it.
@@ -11,18 +16,21 @@ and `aftbed --help` must not wait for it.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, cast
 
 from aftbed.core.errors import ConfigError, PeerError, unknown
 from aftbed.vehicle.frame import DATA_LENGTH_MAX
+from aftbed.vehicle.pythoncan import lean
 
 if TYPE_CHECKING:
     from cantools.database.can import Database, Message
     from cantools.database.can.signal import Signal
 
 DBC_BYTES_MAX: Final = 16_000_000  # the largest real ones known to us have two; a log given by mistake more
+SHIPPED: Final = Path(__file__).resolve().parent / "maps"  # beside the maps that go with them
 _PACKAGE: Final = Path(__file__).resolve().parents[1]
 _CANDIDATES: Final = (
     _PACKAGE / "dbc" / "aftbed.dbc",  # in a wheel
@@ -33,9 +41,16 @@ _CANDIDATES: Final = (
 class Codec:
     """One DBC, loaded: encodes and decodes by message name, in the physical units of the file."""
 
-    def __init__(self, database: Database, path: Path) -> None:
+    def __init__(self, database: Database, path: Path, misfits: Mapping[str, frozenset[str]]) -> None:
+        """`misfits`: of each message that contradicts itself, the signals that lie outside of it."""
         self.path = path
         self._messages: dict[str, Message] = {message.name: message for message in database.messages}
+        self._misfits = misfits
+        self._pieces = {
+            name: [_alone(message, signal) for signal in message.signals if signal.name not in misfits[name]]
+            for name, message in self._messages.items()
+            if name in misfits and not message.is_multiplexed()
+        }
 
     def names(self) -> list[str]:
         """All messages of the file."""
@@ -44,6 +59,10 @@ class Codec:
     def signal_names(self, name: str) -> list[str]:
         """All signals of message `name`."""
         return [signal.name for signal in self._message(name).signals]
+
+    def misfits(self, name: str) -> frozenset[str]:
+        """The signals of message `name` that do not lie in it: in a DBC that was not read strictly."""
+        return self._misfits.get(name, frozenset())
 
     def can_id(self, name: str) -> int:
         """The 11-bit identifier of message `name`."""
@@ -87,13 +106,15 @@ class Codec:
         half, whole = 2 ** (found.length - 1), 2**found.length
         least, most = (-half, half - 1) if found.is_signed else (0, whole - 1)
         scale, offset = float(found.scale), float(found.offset)
+        if signal in self.misfits(name) or scale == 0.0:
+            raise ConfigError(f"{self.path}: {name}.{signal} has no bits that stand for a value")
         raw = round((value - offset) / scale)
         if found.is_float or not least <= raw <= most:
             low, high = sorted((offset + scale * least, offset + scale * most))
             raise ConfigError(f"{name}.{signal}={value:g}: its bits hold {low:g} to {high:g}")
         ones = -1 if found.is_signed else most
-        zero = dict.fromkeys(self.signal_names(name), 0)
-        encoded = [message.encode(zero | {signal: r}, scaling=False, strict=False) for r in (ones, raw)]
+        alone = _alone(message, found)
+        encoded = [alone.encode({signal: r}, scaling=False, strict=False) for r in (ones, raw)]
         return encoded[0], encoded[1]
 
     def unit(self, name: str, signal: str) -> str:
@@ -122,7 +143,12 @@ class Codec:
         if len(data) != message.length:
             raise PeerError(f"{name} of {len(data)} bytes, expected {message.length}")
         # Numbers only: no names for values were asked for, and CAN messages hold no containers.
-        return cast("dict[str, float]", message.decode(data, decode_choices=False))
+        if name not in self._pieces:
+            return cast("dict[str, float]", message.decode(data, decode_choices=False))
+        found: dict[str, float] = {}
+        for piece in self._pieces[name]:
+            found |= cast("dict[str, float]", piece.decode(data, decode_choices=False))
+        return found
 
     def _message(self, name: str) -> Message:
         message = self._messages.get(name)
@@ -137,21 +163,125 @@ class Codec:
         raise ConfigError(f"{self.path}: {unknown(f'signal of {name}', signal, self.signal_names(name))}")
 
 
-def load_dbc(path: Path | None = None) -> Codec:
-    """Load aftbed's own DBC, or the user's. ConfigError names the file, the reason and the line."""
+def find_dbc(name_or_path: str) -> Path:
+    """A shipped DBC by name, or the path as it is: whatever has a slash or a dot in it, or is a file."""
+    path = Path(name_or_path)
+    if "/" in name_or_path or "." in name_or_path or path.is_file():
+        return path
+    names = sorted(shipped.stem for shipped in SHIPPED.glob("*.dbc"))
+    if name_or_path not in names:
+        raise unknown("DBC", name_or_path, names)
+    return SHIPPED / f"{name_or_path}.dbc"
+
+
+def load_dbc(path: Path | None = None, *, strict: bool = True) -> Codec:
+    """Load aftbed's own DBC, or the user's. ConfigError names the file, the reason and the line.
+
+    With `strict` False also one whose signals overlap, or lie outside their message: see above.
+    """
     chosen = path or _own_dbc()
     text = _read(chosen)
-    from cantools.database.can import Database  # noqa: PLC0415  # lazily, see above
+    try:
+        database = _parsed(text, strict=strict)
+    except _refusals() as error:
+        raise ConfigError(f"{chosen}: {_explain(error, text)}{_way_out(text, strict=strict)}") from error
+    _check_messages(database, chosen, text)
+    return Codec(database, chosen, {} if strict else _contradictions(database))
+
+
+def _refusals() -> tuple[type[Exception], ...]:
+    """What cantools raises about a file; the general ones were found by feeding it damaged files."""
     from cantools.errors import Error  # noqa: PLC0415
     from textparser import ParseError  # noqa: PLC0415  # what cantools' parser raises: has line and column
 
-    database = Database()
+    return (Error, ParseError, ValueError, LookupError, ArithmeticError, AttributeError, TypeError)
+
+
+def _parsed(text: str, *, strict: bool) -> Database:
+    lean()  # cantools imports python-can
+    from cantools.database.can import Database  # noqa: PLC0415  # lazily, see above
+
+    database = Database(strict=strict)
+    database.add_dbc_string(text)
+    return database
+
+
+def _explain(error: Exception, text: str) -> str:
+    """The line, where cantools does not say it, and its reason in one line."""
+    reason = " ".join(str(error).split())
+    if isinstance(error, KeyError):
+        reason = f"{reason} is not defined"
+    elif isinstance(error, LookupError | AttributeError | TypeError):
+        reason = f"cantools gives up: {reason}"
+    line = 0 if " at line " in reason else _line(error, text)
+    return f"{f'line {line}: ' if line else ''}not a DBC that can be read: {reason}"
+
+
+def _line(error: Exception, text: str) -> int:
+    """Where in the file that stands what the reason names: signal, message, attribute, entry; 0: nowhere."""
+    message = re.search(r"message (\w+)", str(error))
+    if message is not None:
+        signals = re.search(r"signals? (\w+)(?: and (\w+))?", str(error))
+        return _line_of(text, message[1], signals.groups() if signals is not None else ())
+    named = str(error.args[0]) if isinstance(error, KeyError) else str(error).rpartition("\n")[2].strip()
+    return next((number for number, line in enumerate(text.splitlines(), 1) if named and named in line), 0)
+
+
+def _line_of(text: str, message: str, signals: tuple[str | None, ...] = ()) -> int:
+    """The line of the last of the signals in the message, or else of the message; 0 if it is not there."""
+    found, inside = 0, False
+    for number, line in enumerate(text.splitlines(), 1):
+        if opens := re.match(r"\s*BO_\s+\d+\s+(\w+)", line):
+            inside = opens[1] == message
+            found = number if inside and not found else found
+        elif inside and (named := re.match(r"\s*SG_\s+(\w+)", line)) and named[1] in signals:
+            found = number
+    return found
+
+
+def _way_out(text: str, *, strict: bool) -> str:
+    """What the user can do about it, if anything."""
+    if not strict:
+        return ""
     try:
-        database.add_dbc_string(text)
-    except (Error, ParseError, ValueError, KeyError, OverflowError) as error:
-        raise ConfigError(f"{chosen}: not a DBC that can be read: {error}") from error
-    _check_classic(database, chosen)
-    return Codec(database, chosen)
+        _parsed(text, strict=False)
+    except _refusals():
+        return ""
+    return " (a map with `strict: false` takes it as it is)"
+
+
+def _contradictions(database: Database) -> dict[str, frozenset[str]]:
+    """The messages with signals that overlap or lie outside, each with those that lie outside."""
+    from cantools.errors import Error  # noqa: PLC0415
+
+    found: dict[str, frozenset[str]] = {}
+    for message in database.messages:
+        try:
+            message.refresh(strict=True)
+        except Error:
+            signals = () if message.is_multiplexed() else message.signals
+            found[message.name] = frozenset(s.name for s in signals if not _fits(message, s))
+    return found
+
+
+def _fits(message: Message, signal: Signal) -> bool:
+    from cantools.errors import Error  # noqa: PLC0415
+
+    try:
+        _alone(message, signal).refresh(strict=True)
+    except Error:
+        return False
+    return True
+
+
+def _alone(message: Message, signal: Signal) -> Message:
+    """The message as if it had this one signal only: so no other can be in its way."""
+    from cantools.database.can import Message as CanMessage  # noqa: PLC0415
+
+    wide = message.is_extended_frame
+    return CanMessage(
+        message.frame_id, message.name, message.length, [signal], is_extended_frame=wide, strict=False
+    )
 
 
 def _own_dbc() -> Path:
@@ -172,10 +302,15 @@ def _read(path: Path) -> str:
         raise ConfigError(f"{path}: not text, at byte {error.start}") from error
 
 
-def _check_classic(database: Database, path: Path) -> None:
-    """An empty file parses too, and long frames belong to CAN FD: refuse both by name."""
+def _check_messages(database: Database, path: Path, text: str) -> None:
+    """An empty file parses too, long frames belong to CAN FD, and of two of a name one would be lost."""
     if not database.messages:
         raise ConfigError(f"{path}: holds no message")
+    seen: set[str] = set()
     for message in database.messages:
-        if message.length > DATA_LENGTH_MAX:
-            raise ConfigError(f"{path}: message {message.name} has {message.length} bytes, allowed is 0 to 8")
+        where = f"{path}: line {_line_of(text, message.name)}: message {message.name}"
+        if not 0 <= message.length <= DATA_LENGTH_MAX:
+            raise ConfigError(f"{where} has {message.length} bytes, allowed is 0 to 8")
+        if message.name in seen:
+            raise ConfigError(f"{where} stands twice, allowed is once")
+        seen.add(message.name)

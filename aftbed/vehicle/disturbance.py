@@ -40,20 +40,16 @@ from aftbed.core.busfault import (
     Condition,
     Delay,
     Duplicate,
-    Every,
     FlipBit,
-    Intermittent,
-    Lasting,
     Masquerade,
     Omission,
     Partition,
-    Permanent,
     Reorder,
     SetSignal,
     Struck,
     StuckCounter,
-    Transient,
 )
+from aftbed.core.persistence import Chance, Every, Lasting, Permanent, Transient
 from aftbed.core.valuefault import flipped
 from aftbed.vehicle.frame import Frame
 
@@ -135,7 +131,7 @@ class _Armed:
                 return True
             case Lasting():
                 return not self._ended(now_us)
-            case Intermittent(p):
+            case Chance(p):
                 return self.chance.random() < p
             case Every(count):
                 return (self.seen - self.fault.opening.nth) % count == 0
@@ -163,6 +159,7 @@ class _Armed:
             self.noticed,
             self.believed,
             began=self.on_nodes and self.since_us is not None,
+            waits=self.opens_us is None,
         )
 
     def quiet(self) -> bool:

@@ -1,9 +1,9 @@
-"""AUTOSAR E2E profile 11: no signal of a safety frame is believed before this says so.
+"""AUTOSAR E2E: no signal of a safety frame is believed before this says so.
 
-Layout: byte 0 is the CRC (SAE J1850, over the data id and all other bytes), the low nibble of byte 1
-a counter that runs 0 to 14 and round. 15 does not occur; a frame that carries it is wrong. The CRC
-is the `autosar-e2e` library's, the counter and its supervision are ours, with the states of the
-AUTOSAR PRS E2E protocol:
+On our own bus it is profile 11: byte 0 is the CRC (SAE J1850, over the data id and all other bytes), the
+low nibble of byte 1 a counter that runs 0 to 14 and round. 15 does not occur; a frame that carries it is
+wrong. Other people's buses have other profiles: see `e2eprofiles`. The CRC is the `autosar-e2e` library's,
+the supervision of the counter is ours, the same for all, with the states of the AUTOSAR PRS E2E protocol:
 
     per frame   OK             CRC right, counter one further than the last
                 OK_SOMELOST    CRC right, counter 2 to `delta_max` further: usable, some are missing
@@ -18,21 +18,21 @@ and per message a window of the last statuses, from which the state of the chann
 
 A frame may be used if it is OK or OK_SOMELOST *and* the channel is VALID: `Receiver.usable`.
 
-The counter alone is not enough. It wraps after 15 frames, so a loss of exactly 15 (300 ms at 20 ms)
-looks like perfect continuity to it. A timeout in bus time closes the hole: after
+The counter alone is not enough. It wraps after 15 frames (16 in P02, 256 in P05), so a loss of exactly
+15 (300 ms at 20 ms) looks like perfect continuity to it. A timeout in bus time closes the hole: after
 `timeout_us` without a good frame the sequence is void, the window is forgotten, the channel is
 INVALID, and the next frame can only start a new sequence (WRONGSEQUENCE). Time is passed in.
 """
 
 from collections import deque
 from enum import Enum, auto
-from typing import Final
+from typing import Final, assert_never
 
 import msgspec
-from e2e.p11 import e2e_p11_check, e2e_p11_protect
 
-COUNTER_COUNT: Final = 15  # 0 to 14: 15 is never sent
-PROTECTED_BYTES_MIN: Final = 2
+from aftbed.vehicle.e2eprofiles import P11, Profile, bytes_min, counter_count, counter_of, is_intact, with_e2e
+
+COUNTER_COUNT: Final = 15  # of profile 11, 0 to 14: 15 is never sent
 
 
 class Status(Enum):
@@ -59,9 +59,12 @@ class ChannelState(Enum):
 
 
 class Supervision(msgspec.Struct, frozen=True):
-    """How one message is watched. The counter must not be able to wrap within `timeout_us`."""
+    """How one message is watched. The counter must not be able to wrap within `timeout_us`.
 
-    data_id: int
+    `protection` is its profile; a data id alone is profile 11 with it, as all of our own messages have.
+    """
+
+    protection: Profile | int
     cycle_us: int
     timeout_us: int
     length: int = 8
@@ -72,27 +75,27 @@ class Supervision(msgspec.Struct, frozen=True):
 
     def __post_init__(self) -> None:
         """All of these are ours, never a peer's."""
-        assert 0 <= self.data_id <= 0xFFFF
-        assert self.length >= PROTECTED_BYTES_MIN
-        assert 1 <= self.delta_max < COUNTER_COUNT
-        assert self.cycle_us < self.timeout_us < COUNTER_COUNT * self.cycle_us
+        count = counter_count(self.profile)
+        assert self.length >= bytes_min(self.profile)
+        assert 1 <= self.delta_max < count
+        assert self.cycle_us < self.timeout_us < count * self.cycle_us
         assert 1 <= self.ok_min <= self.window_size
         assert 0 <= self.errors_max < self.window_size
 
+    @property
+    def profile(self) -> Profile:
+        """What the frames are protected by."""
+        return P11(self.protection) if isinstance(self.protection, int) else self.protection
+
 
 def protect(data: bytes, data_id: int, counter: int) -> bytes:
-    """`data` with the counter and the CRC in their places; its other bits stay as they are."""
-    assert 0 <= counter < COUNTER_COUNT
-    assert len(data) >= PROTECTED_BYTES_MIN
-    frame = bytearray(data)
-    frame[1] = (frame[1] & 0xF0) | counter
-    e2e_p11_protect(frame, data_id, increment_counter=False)
-    return bytes(frame)
+    """`data` with counter and CRC by profile 11, as on our own bus; its other bits stay as they are."""
+    return with_e2e(P11(data_id), data, counter)
 
 
 def intact(data: bytes, data_id: int) -> bool:
-    """True if the CRC and the counter's value are right; says nothing about the sequence."""
-    return len(data) >= PROTECTED_BYTES_MIN and e2e_p11_check(bytearray(data), data_id)
+    """True if CRC and counter are right by profile 11, as on our own bus; says nothing about the sequence."""
+    return is_intact(P11(data_id), data)
 
 
 class Receiver:
@@ -101,6 +104,8 @@ class Receiver:
     def __init__(self, supervision: Supervision) -> None:
         self.supervision = supervision
         self.state = ChannelState.NODATA
+        self._profile = supervision.profile
+        self._counter_count = counter_count(self._profile)
         self._counter: int | None = None  # None: no sequence to compare with
         self._good_us = 0  # when the last frame with a right CRC came
         self._looked_us = 0  # when time was last accounted for, by a frame or by NONEWDATA
@@ -111,7 +116,7 @@ class Receiver:
         self._expire(now_us)
         status = self._judge(data)
         if status is not Status.ERROR:
-            self._counter = data[1] & 0x0F
+            self._counter = counter_of(self._profile, data)
             self._good_us = now_us
         self._looked_us = now_us
         self._add(status)
@@ -134,16 +139,32 @@ class Receiver:
         """True if the frame that was just judged `status` may be believed."""
         return status in GOOD and self.state is ChannelState.VALID
 
+    def refusal(self, data: bytes, status: Status) -> str | None:
+        """Why the frame that was just judged `status` may not be believed, in a word; None if it may."""
+        if self.usable(status):
+            return None
+        match status:
+            case Status.ERROR:
+                return "length" if len(data) != self.supervision.length else "checksum"
+            case Status.REPEATED:
+                return "repeated"
+            case Status.WRONGSEQUENCE:
+                return "sequence"
+            case Status.OK | Status.OK_SOMELOST | Status.NONEWDATA:
+                return "channel"
+            case _:
+                assert_never(status)
+
     def timed_out(self, now_us: int) -> bool:
         """True if no good frame came for longer than the timeout, or none ever."""
         return self._counter is None or now_us - self._good_us > self.supervision.timeout_us
 
     def _judge(self, data: bytes) -> Status:
-        if len(data) != self.supervision.length or not intact(data, self.supervision.data_id):
+        if len(data) != self.supervision.length or not is_intact(self._profile, data):
             return Status.ERROR
         if self._counter is None:
             return Status.WRONGSEQUENCE
-        delta = ((data[1] & 0x0F) - self._counter) % COUNTER_COUNT
+        delta = (counter_of(self._profile, data) - self._counter) % self._counter_count
         if delta == 0:
             return Status.REPEATED
         if delta == 1:

@@ -115,7 +115,8 @@ class RadarEcu:
         if plant.gap_m is None or not seen:
             return _track_signals(False, False, 0.0, 0.0, 0.0)
         relative_ms = plant.lead_speed_ms - plant.speed_ms
-        return _track_signals(True, new, max(0.0, plant.gap_m + noise[0]), relative_ms + noise[1], noise[2])
+        range_m, lateral_m = max(0.0, plant.gap_m + noise[0]), plant.lateral_m + noise[2]
+        return _track_signals(True, new, range_m, relative_ms + noise[1], lateral_m)
 
     def _noise(self, half_width: float) -> float:
         """Bell-shaped and bounded: four uniforms, and none of a platform's own log or cos."""
@@ -131,7 +132,7 @@ def _track_signals(
         "TRACK_ID": TRACK_ID,
         "RANGE": range_m,
         "RELATIVE_SPEED": max(-100.0, min(100.0, relative_ms)),
-        "LATERAL_OFFSET": lateral_m,
+        "LATERAL_OFFSET": max(-10.0, min(10.0, lateral_m)),
     }
 
 

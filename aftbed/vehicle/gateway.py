@@ -240,31 +240,15 @@ class Gateway:
         self._t_us = frame.t_us
         first = receiver.state is ChannelState.NODATA
         status = receiver.check(frame.data, frame.t_us)
-        if receiver.usable(status):
+        reason = receiver.refusal(frame.data, status)
+        if reason is None:
             if status is Status.OK_SOMELOST:
                 self.noticed.append((frame.can_id, "lost"))
             return True
-        reason = _reason(receiver, frame, status)
         self.counts.refuse(reason)
         if not first or status is not Status.WRONGSEQUENCE:  # which is all that a first frame can be
             self.noticed.append((frame.can_id, reason))
         return False
-
-
-def _reason(receiver: Receiver, frame: Frame, status: Status) -> str:
-    """Why a frame is refused, in a word."""
-    if len(frame.data) != receiver.supervision.length:
-        return "length"
-    match status:
-        case Status.ERROR:
-            return "checksum"
-        case Status.REPEATED:
-            return "repeated"
-        case Status.WRONGSEQUENCE:
-            return "sequence"
-        case _:
-            assert receiver.state is not ChannelState.VALID
-            return "channel"
 
 
 def _receiver(codec: Codec, name: str) -> Receiver:

@@ -42,13 +42,14 @@ import select
 import socket
 import time
 from os import read, write
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Final
 
 from aftbed.core.busfault import BusFault, Struck
 from aftbed.core.errors import HarnessError, PeerError
 from aftbed.vehicle.candump import log_line
 from aftbed.vehicle.frame import Frame
 from aftbed.vehicle.hubclient import Client, Clients, HubCounts, HubOptions, frame_bits, parse_send
+from aftbed.vehicle.hubdesk import Desk, Watches
 
 if TYPE_CHECKING:
     from aftbed.vehicle.hubfaults import Delivery, HubFaults
@@ -62,22 +63,10 @@ LOG_BYTES_MAX: Final = 1024 * 1024 * 1024
 _TIME: Final = re.compile(rb"< aftbed time ([0-9]{1,16}) ")
 _NODE: Final = re.compile(rb"< aftbed node ([a-z_][a-z0-9_]{0,31})((?: [0-9A-F]{3}){0,16}) ")
 _AWAIT: Final = re.compile(rb"< aftbed await ([a-z_][a-z0-9_]{0,31}) ([0-9]{1,12}) ")
-_MET: Final = re.compile(rb"< aftbed met ([0-9]{1,12}) ")
+_MET: Final = re.compile(rb"< aftbed met ([0-9]{1,12}) ([0-9]{1,16}) ([0-9]{1,20}) ")
 _UNASKED: Final = re.compile(rb"< aftbed unasked ([0-9A-F]{3}) ")
 _NOTICED: Final = re.compile(rb"< aftbed noticed ([0-9A-F]{3}) ([a-z_]{1,32}) ")
 _HEARD: Final = select.EPOLLIN | select.EPOLLHUP | select.EPOLLERR
-
-
-class Desk(Protocol):
-    """Whom the hub works for; the line to it is the life descriptor."""
-
-    def attend(self, hub: "Hub") -> bool:
-        """Carry out what is ordered on the line; False at its end."""
-        ...
-
-    def report(self, news: list[Struck]) -> None:
-        """Something has become of these faults."""
-        ...
 
 
 class Hub:
@@ -99,6 +88,12 @@ class Hub:
         self._awaited: tuple[Client, str, int] | None = None  # who wants to know when so many are carried
         self._faults: HubFaults | None = None  # None: nothing is to be looked after
         self._past_faults: HubFaults | None = None
+        self.watches = Watches(
+            lambda line: self._tell(self._plant, line),
+            lambda car: self._send(car, self._ok()),
+            desk,
+            lockstep=options.lockstep,
+        )
         self._virtual_us = 0
         self._wire: tuple[Client, Frame] | None = None  # in transmission, until its `t_us`
         self._wire_free_us = 0
@@ -334,12 +329,14 @@ class Hub:
             self._awaited = (client, match[1].decode("ascii"), int(match[2]))
         elif element == b"< aftbed plant ":
             self._plant = client
-            self._send(client, b"< ok >" + (self._faults.watches() if self._faults is not None else b""))
+            own = self._faults.watches() if self._faults is not None else b""
+            self._send(client, b"< ok >" + own + self.watches.lines())
         elif (match := _MET.fullmatch(element)) is not None:
+            number, t_us, since_ns = map(int, match.groups())
             if self._faults is not None:
-                self._faults.met(int(match[1]), self._now_us())
+                self._faults.met(number, self._now_us())
                 self._release(self._faults)
-            self._send(client, self._ok())
+            self.watches.met(number, t_us, since_ns, client)
         elif (match := _UNASKED.fullmatch(element)) is not None:
             if self._past_faults is not None:
                 self._past_faults.unasked(int(match[1], 16))

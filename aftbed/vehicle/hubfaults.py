@@ -20,10 +20,11 @@ from collections.abc import Callable, Sequence
 
 import msgspec
 
-from aftbed.core.busfault import BusFault, Condition, Struck, number
+from aftbed.core.busfault import BusFault, Struck
 from aftbed.vehicle.disturbance import Disturber, Sent
 from aftbed.vehicle.frame import Frame
 from aftbed.vehicle.hubclient import Client
+from aftbed.vehicle.hubdesk import watch_line
 
 
 class Delivery(msgspec.Struct, frozen=True):
@@ -46,7 +47,7 @@ class HubFaults:
         self._disturber.arm(fault_number, fault, draw, now_us)
         for waiting, condition in self._disturber.conditions():
             if waiting == fault_number:
-                self._tell_plant(_watch(waiting, condition))
+                self._tell_plant(watch_line(waiting, condition))
 
     def forget(self, fault_number: int, now_us: int) -> None:
         """No longer; what it holds back is due."""
@@ -54,7 +55,7 @@ class HubFaults:
 
     def watches(self) -> bytes:
         """What a car that has just come has to look at."""
-        return b"".join(_watch(waiting, condition) for waiting, condition in self._disturber.conditions())
+        return b"".join(watch_line(waiting, condition) for waiting, condition in self._disturber.conditions())
 
     def met(self, fault_number: int, now_us: int) -> None:
         """The car says that the condition holds."""
@@ -117,11 +118,6 @@ class HubFaults:
 
     def _deaf(self, sender: str, hearer: Client, now_us: int) -> bool:
         return self._disturber.deaf(sender, hearer.name, now_us)
-
-
-def _watch(fault_number: int, condition: Condition) -> bytes:
-    than = "below" if condition.below else "above"
-    return f"< watch {fault_number} {condition.quantity} {than} {number(condition.value)} >".encode("ascii")
 
 
 def _change(can_id: int, change: int) -> bytes:

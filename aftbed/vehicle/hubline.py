@@ -1,14 +1,14 @@
 """The car's line to the hub: a connection that hears no frames, only what is said beside the bus.
 
 In lockstep it has the hand on the hub's virtual time. In real time, too, the car looks for the conditions at
-which faults of the bus open (`when ttc < 1.2`), since nobody else knows the truth about it: the hub says what
+which faults open (`when ttc < 1.2`), since nobody else knows the truth about it: the hub says what
 to look for, and is told when it is so.
 
     > < aftbed plant >            < < ok >              here is the car
                                   < < watch 7 ttc below 1.2 >
     > < aftbed time 20000 >       < < ok >              with faults about, when one is due: < ok 31000 >
     > < aftbed await radar 12 >   < < ok >              once twelve frames of the radar have been carried
-    > < aftbed met 7 >            < < ok - >
+    > < aftbed met 7 3240 5678 >  < < ok - >            at 3240 us of the drive, 5678 ns by the clock
                                   < < change 130 -1 >   see `hubfaults`
 
 What the hub says of its own accord comes before the answer that it would concern: so who has the answer to
@@ -18,6 +18,7 @@ What the hub says of its own accord comes before the answer that it would concer
 import re
 import select
 import socket
+import time
 from collections import deque
 from typing import Final, cast
 
@@ -73,10 +74,13 @@ class HubLine:
         """Return when that many frames of `node` have been over the wire since it came."""
         self._ask(f"< aftbed await {node} {frames} >")
 
-    def met(self, number: int) -> None:
-        """The condition of that fault holds: return when the hub knows."""
+    def met(self, number: int, t_us: int) -> None:
+        """The condition of that fault holds at `t_us` of the drive: return when the hub knows.
+
+        In lockstep, when what begins with it has begun.
+        """
         self.conditions.pop(number, None)
-        self._ask(f"< aftbed met {number} >")
+        self._ask(f"< aftbed met {number} {t_us} {time.monotonic_ns()} >")
 
     def settle(self) -> None:
         """Return when all that the hub has said by now is here."""

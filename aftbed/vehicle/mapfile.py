@@ -1,205 +1,129 @@
 """Maps: which messages and signals of somebody else's bus mean what to the protected function.
 
-A map is YAML. It names messages and signals of a DBC, the unit in which each quantity comes, the length
-of each message, and the rules for its checksum and counter. `bind` checks it whole against the DBC, so a
-map that binds cannot fail later: what is left is one `Rule` per CAN id. A quantity that the DBC does not
-know may be given by its place in the data (`raw`), in the DBC's own way of counting bits.
-
-    cycle_end   the message that ends a radar cycle; its arrival makes the request
-    ego.speed   the ego's own speed
-    tracks      the radar's slots, up to 16: one message each, `name` with {n} from `first` to `last`
-    others      messages that are judged and counted, but not used
+A map is YAML; `mapshape` says what it may hold. It names messages and signals of a DBC, the unit in which
+each quantity comes, the length of each message, and the rules for its checksum and counter. `bind` checks
+it whole against the DBC, so a map that binds cannot fail later: what is left is one `Rule` per CAN id.
 """
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Final, Literal
+from typing import Final, assert_never
 
 import msgspec
-from msgspec import Meta
 
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.vehicle.aebmessages import SLOTS
-from aftbed.vehicle.dbcfile import Codec
-from aftbed.vehicle.frame import CAN_ID_MAX
+from aftbed.vehicle.dbcfile import SHIPPED, Codec, load_dbc
+from aftbed.vehicle.e2e import Supervision
+from aftbed.vehicle.e2eprofiles import (
+    LIST_ID_MAX,
+    LIST_IDS,
+    NIBBLE_ID_MAX,
+    P01,
+    P02,
+    P05,
+    P11,
+    Profile,
+    bytes_min,
+    counter_count,
+)
+from aftbed.vehicle.mapshape import (
+    Counter,
+    E2EMap,
+    EgoMap,
+    Flag,
+    MapFile,
+    Messages,
+    OtherMap,
+    Quantity,
+    RawSignal,
+    Sum,
+    TrackMap,
+)
 from aftbed.vehicle.yamlfile import read_yaml
 
-SpeedUnit = Literal["m/s", "km/h"]
-DistanceUnit = Literal["m", "cm"]
-ChecksumRule = Literal["toyota", "none"]
-Length = Annotated[int, Meta(ge=1, le=8)]
-
-TO_SI: Final[Mapping[str, float]] = {"m": 1.0, "cm": 0.01, "m/s": 1.0, "km/h": 1 / 3.6}
-_FOLDER: Final = Path(__file__).resolve().parent / "maps"
-
-
-class RawSignal(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A place in the data, as in a DBC: `start_bit` is the highest bit if big-endian, else the lowest."""
-
-    start_bit: Annotated[int, Meta(ge=0, le=63)]
-    length_bits: Annotated[int, Meta(ge=1, le=32)]
-    byte_order: Literal["big_endian", "little_endian"]
-    signed: bool = False
-    scale: Annotated[float, Meta(ge=-1e6, le=1e6)] = 1.0
-    offset: Annotated[float, Meta(ge=-1e6, le=1e6)] = 0.0
-
-    def first_bit(self) -> int:
-        """Bits to the left of the signal: of all data if big-endian, else to the right."""
-        if self.byte_order == "little_endian":
-            return self.start_bit
-        return self.start_bit // 8 * 8 + 7 - self.start_bit % 8
-
-    def read(self, data: bytes) -> float:
-        """The value in `data`, which is long enough."""
-        if self.byte_order == "little_endian":
-            number = int.from_bytes(data, "little") >> self.first_bit()
-        else:
-            number = int.from_bytes(data, "big") >> (8 * len(data) - self.first_bit() - self.length_bits)
-        number &= (1 << self.length_bits) - 1
-        if self.signed and number >> (self.length_bits - 1):
-            number -= 1 << self.length_bits
-        return number * self.scale + self.offset
-
-
-class Speed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A speed: a signal of the DBC, or raw."""
-
-    unit: SpeedUnit
-    signal: str | None = None
-    raw: RawSignal | None = None
-
-
-class Distance(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A distance: a signal of the DBC, or raw."""
-
-    unit: DistanceUnit
-    signal: str | None = None
-    raw: RawSignal | None = None
-
-
-Quantity = Speed | Distance
-
-
-class Counter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A counter that rises by one with each frame, and starts over at `modulo`."""
-
-    signal: str
-    modulo: Annotated[int, Meta(ge=2, le=65536)]
-
-
-class Messages(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One message, or those whose names have the numbers `first` to `last` in the place of {n}."""
-
-    name: str
-    first: Annotated[int, Meta(ge=0, le=255)] = 0
-    last: Annotated[int, Meta(ge=0, le=255)] = 0
-
-    def names(self) -> list[str]:
-        """All of them, in order."""
-        return [self.name.replace("{n}", str(number)) for number in range(self.first, self.last + 1)]
-
-
-class EgoMap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The message with the ego speed: by `message` in the DBC, or by `can_id`. Unknown after `timeout_ms`."""
-
-    length: Length
-    speed: Speed
-    message: str | None = None
-    can_id: Annotated[int, Meta(ge=0, le=CAN_ID_MAX)] | None = None
-    checksum: ChecksumRule = "none"
-    counter: Counter | None = None
-    timeout_ms: Annotated[int, Meta(ge=1, le=10_000)] = 200
-
-
-class TrackMap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The radar's slots. `valid` and `new` are signals that are 1 for yes."""
-
-    messages: Messages
-    length: Length
-    range: Distance
-    relative_speed: Speed
-    lateral_offset: Distance
-    valid: str
-    new: str | None = None
-    checksum: ChecksumRule = "none"
-    counter: Counter | None = None
-
-
-class OtherMap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Messages that belong to the radar but say nothing that is needed."""
-
-    messages: Messages
-    length: Length
-    checksum: ChecksumRule = "none"
-    counter: Counter | None = None
-
-
-class MapFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A map, key by key."""
-
-    description: str
-    cycle_ms: Annotated[int, Meta(ge=1, le=1000)]
-    cycle_end: str
-    ego: EgoMap
-    tracks: TrackMap
-    others: tuple[OtherMap, ...] = ()
-    lane_half_width_m: Annotated[float, Meta(gt=0, le=10)] = 1.5
+E2E_TIMEOUT_CYCLES: Final = 6  # as on our own bus
 
 
 class Rule(msgspec.Struct, frozen=True):
-    """How to judge the frames of one CAN id. `name` None: not in the DBC. `slot` None: not a track."""
+    """How to judge the frames of one CAN id.
+
+    `name` None: not in the DBC. `watch`: by E2E, and then there is neither checksum nor counter beside it.
+    `slot`: which of the tracks' messages it is; None: not a track.
+    """
 
     can_id: int
     name: str | None
     length: int
-    checksum: ChecksumRule
+    checksum: Sum
     counter: Counter | None
+    watch: Supervision | None
     slot: int | None = None
 
 
 class BoundMap(msgspec.Struct, frozen=True):
-    """A map that was checked against its DBC."""
+    """A map that was checked against its DBC.
+
+    A radar cycle ends with a frame of `cycle_end_id`, or else with the last of the objects that a frame of
+    `count_id` has announced: one of the two is None. `allots`: the objects are more than slots, or have
+    numbers of their own.
+    """
 
     map: MapFile
     codec: Codec
     rules: dict[int, Rule]
     ego_id: int
-    cycle_end_id: int
+    cycle_end_id: int | None
+    count_id: int | None
+    allots: bool
 
 
 def find_map(name_or_path: str) -> Path:
     """A shipped map by name, or the path as it is: whatever has a slash or ends in .yaml or .yml."""
     if "/" in name_or_path or name_or_path.endswith((".yaml", ".yml")):
         return Path(name_or_path)
-    names = sorted(path.stem for path in _FOLDER.glob("*.yaml"))
+    names = sorted(path.stem for path in SHIPPED.glob("*.yaml"))
     if name_or_path not in names:
         raise unknown("map", name_or_path, names)
-    return _FOLDER / f"{name_or_path}.yaml"
+    return SHIPPED / f"{name_or_path}.yaml"
 
 
-def bind(path: Path, codec: Codec) -> BoundMap:
+def load_mapped(path: Path, dbc: Path) -> Codec:
+    """The DBC as the map at `path` wants it read: strictly, or not. Raises ConfigError."""
+    return load_dbc(dbc, strict=read_yaml(path, MapFile).strict)
+
+
+def bind(path: Path, dbc: Path) -> BoundMap:
     """Read the map at `path` and check all of it against the DBC. Raises ConfigError."""
-    return _Binding(path, codec).bound(read_yaml(path, MapFile))
+    file = read_yaml(path, MapFile)
+    return _Binding(path, load_dbc(dbc, strict=file.strict), file).bound()
 
 
 class _Binding:
     """The checks; each says the file, the key, what was found and what is allowed."""
 
-    def __init__(self, path: Path, codec: Codec) -> None:
+    def __init__(self, path: Path, codec: Codec, file: MapFile) -> None:
         self._path = path
         self._codec = codec
+        self._file = file
         self._rules: dict[int, Rule] = {}
 
-    def bound(self, file: MapFile) -> BoundMap:
+    def bound(self) -> BoundMap:
+        file, tracks = self._file, self._file.tracks
         ego = self._ego(file.ego)
-        self._tracks(file.tracks)
+        self._tracks(tracks)
         for index, other in enumerate(file.others):
-            for name in self._names(f"others[{index}].messages", other.messages):
-                self._add(f"others[{index}]", other, name, None)
-        ids = {rule.name: rule.can_id for rule in self._rules.values() if rule.name is not None}
-        if file.cycle_end not in ids:
-            raise ConfigError(f"{self._path}: cycle_end: {unknown('mapped message', file.cycle_end, ids)}")
-        return BoundMap(file, self._codec, self._rules, ego, ids[file.cycle_end])
+            names = self._names(f"others[{index}].messages", other.messages)
+            for number, name in enumerate(names):
+                self._add(f"others[{index}]", other, name, None, number, len(names))
+        if (file.cycle_end is None) == (tracks.count is None):
+            raise self._error("cycle_end", "cycle_end and tracks.count", "exactly one of them")
+        end = None if file.cycle_end is None else self._mapped("cycle_end", file.cycle_end)
+        count = None
+        if tracks.count is not None:
+            count = self._mapped("tracks.count.message", tracks.count.message)
+            self._whole("tracks.count.signal", tracks.count.message, tracks.count.signal)
+        allots = tracks.slot is not None or len(tracks.messages.names()) > SLOTS
+        return BoundMap(file, self._codec, self._rules, ego, end, count, allots)
 
     def _ego(self, ego: EgoMap) -> int:
         if (ego.message is None) == (ego.can_id is None):
@@ -207,30 +131,46 @@ class _Binding:
         if ego.can_id is None:
             assert ego.message is not None
             self._message("ego.message", ego.message)
-            can_id = self._add("ego", ego, ego.message, None)
+            can_id = self._add("ego", ego, ego.message, None, 0, 1)
         else:
             can_id = ego.can_id
             if ego.counter is not None:
                 raise self._error("ego.counter", "a signal", "none, as ego is given by can_id")
-            self._rules[can_id] = Rule(can_id, None, ego.length, ego.checksum, None)
+            self._rules[can_id] = self._rule("ego", ego, can_id, None, None, 0, 1)
         self._quantity("ego.speed", ego.speed, ego.message, ego.length)
         return can_id
 
     def _tracks(self, tracks: TrackMap) -> None:
         names = self._names("tracks.messages", tracks.messages)
-        if len(names) > SLOTS:
-            raise self._error("tracks.messages", f"{len(names)} messages", f"at most {SLOTS}")
-        for slot, name in enumerate(names):
-            self._add("tracks", tracks, name, slot)
+        if tracks.slot is not None and len(names) > 1:
+            raise self._error("tracks.slot", f"a signal, for {len(names)} messages", "one for one message")
+        if tracks.count is not None and tracks.slot is None:
+            raise self._error("tracks.count", "count without slot", "both, or neither")
+        if (tracks.lateral_offset is None) == (tracks.angle is None):
+            raise self._error("tracks", "lateral_offset and angle", "exactly one of them")
+        for number, name in enumerate(names):
+            self._add("tracks", tracks, name, number, number, len(names))
             self._quantity("tracks.range", tracks.range, name, tracks.length)
             self._quantity("tracks.relative_speed", tracks.relative_speed, name, tracks.length)
-            self._quantity("tracks.lateral_offset", tracks.lateral_offset, name, tracks.length)
-            self._signal("tracks.valid", name, tracks.valid)
-            if tracks.new is not None:
-                self._signal("tracks.new", name, tracks.new)
+            if tracks.lateral_offset is not None:
+                self._quantity("tracks.lateral_offset", tracks.lateral_offset, name, tracks.length)
+            if tracks.angle is not None:
+                self._quantity("tracks.angle", tracks.angle, name, tracks.length)
+            if tracks.slot is not None:
+                self._whole("tracks.slot", name, tracks.slot)
+            self._flag("tracks.valid", name, tracks.valid)
+            self._flag("tracks.new", name, tracks.new)
 
-    def _add(self, key: str, given: EgoMap | TrackMap | OtherMap, name: str, slot: int | None) -> int:
-        """Make the rule of one message of the DBC."""
+    def _add(
+        self,
+        key: str,
+        given: EgoMap | TrackMap | OtherMap,
+        name: str,
+        slot: int | None,
+        number: int,
+        of: int,
+    ) -> int:
+        """Make the rule of one message of the DBC, `number` of as many with the same."""
         can_id, length = self._codec.can_id(name), self._codec.length(name)
         if given.length != length:
             raise self._error(f"{key}.length", str(given.length), f"{length}, as {name} has in the DBC")
@@ -239,9 +179,83 @@ class _Binding:
         if self._codec.multiplexed(name):
             raise self._error(key, f"{name}, which is multiplexed", "a message with the same signals always")
         if given.counter is not None:
-            self._counter(f"{key}.counter.signal", name, given.counter.signal)
-        self._rules[can_id] = Rule(can_id, name, length, given.checksum, given.counter, slot)
+            self._whole(f"{key}.counter.signal", name, given.counter.signal)
+        self._rules[can_id] = self._rule(key, given, can_id, name, slot, number, of)
         return can_id
+
+    def _rule(
+        self,
+        key: str,
+        given: EgoMap | TrackMap | OtherMap,
+        can_id: int,
+        name: str | None,
+        slot: int | None,
+        number: int,
+        of: int,
+    ) -> Rule:
+        if not isinstance(given.checksum, E2EMap):
+            return Rule(can_id, name, given.length, given.checksum, given.counter, None, slot)
+        if given.counter is not None:
+            raise self._error(f"{key}.counter", "a signal", f"none, as {given.checksum.profile} has its own")
+        watch = self._watch(f"{key}.checksum", given.checksum, given.length, number, of)
+        return Rule(can_id, name, given.length, "none", None, watch, slot)
+
+    def _watch(self, key: str, given: E2EMap, length: int, number: int, of: int) -> Supervision:
+        """The supervision of one message by E2E."""
+        profile = self._profile(key, given, number, of)
+        if length < bytes_min(profile):
+            allowed = f"at most {given.offset - bytes_min(profile) + length}, by the length"
+            raise self._error(f"{key}.offset", str(given.offset), allowed)
+        cycle_ms = given.cycle_ms or self._file.cycle_ms
+        timeout_ms = given.timeout_ms or E2E_TIMEOUT_CYCLES * cycle_ms
+        turn_ms = counter_count(profile) * cycle_ms
+        if not cycle_ms < timeout_ms < turn_ms:
+            allowed = (
+                f"more than {cycle_ms}, a cycle, and less than {turn_ms}, in which the counter comes round"
+            )
+            raise self._error(f"{key}.timeout_ms", str(timeout_ms), allowed)
+        return Supervision(profile, cycle_ms * 1000, timeout_ms * 1000, length)
+
+    def _profile(self, key: str, given: E2EMap, number: int, of: int) -> Profile:
+        mode = given.mode
+        match given.profile:
+            case "p01":
+                data_id = self._data_id(key, given, number, of)
+                return P01(data_id, mode, given.offset)
+            case "p02":
+                ids = given.data_ids
+                if given.data_id is not None or ids is None or len(ids) != LIST_IDS or max(ids) > LIST_ID_MAX:
+                    found = "data_id" if given.data_id is not None else str(list(ids or ()))
+                    raise self._error(f"{key}.data_ids", found, "a list of 16 numbers from 0 to 255")
+                if mode != "both" or given.offset:
+                    raise self._error(key, "mode or offset", "neither, in p02")
+                return P02(bytes(ids))
+            case "p05":
+                if mode != "both":
+                    raise self._error(f"{key}.mode", mode, "both, in p05")
+                return P05(self._data_id(key, given, number, of), given.offset)
+            case "p11":
+                if mode not in ("both", "nibble"):
+                    raise self._error(f"{key}.mode", mode, "both or nibble, in p11")
+                return P11(self._data_id(key, given, number, of), mode, given.offset)
+            case _:
+                assert_never(given.profile)
+
+    def _data_id(self, key: str, given: E2EMap, number: int, of: int) -> int:
+        """Of the one of `of` messages with this number."""
+        if (given.data_id is None) == (given.data_ids is None):
+            raise self._error(key, "data_id and data_ids", "exactly one of them")
+        if given.data_ids is not None and len(given.data_ids) != of:
+            raise self._error(
+                f"{key}.data_ids", f"{len(given.data_ids)} numbers", f"{of}, one for each message"
+            )
+        data_id = given.data_id if given.data_ids is None else given.data_ids[number]
+        assert data_id is not None
+        if given.mode == "nibble" and data_id > NIBBLE_ID_MAX:
+            raise self._error(
+                key, f"data id {data_id:#06x}", f"at most {NIBBLE_ID_MAX:#06x} with mode nibble"
+            )
+        return data_id
 
     def _names(self, key: str, messages: Messages) -> list[str]:
         if messages.last < messages.first:
@@ -254,9 +268,7 @@ class _Binding:
         if (quantity.signal is None) == (quantity.raw is None):
             raise self._error(key, "signal and raw", "exactly one of them")
         if quantity.raw is not None:
-            end_bit = quantity.raw.first_bit() + quantity.raw.length_bits
-            if end_bit > 8 * length:
-                raise self._error(f"{key}.raw", f"{end_bit} bits", f"at most {8 * length}, by the length")
+            self._raw(f"{key}.raw", quantity.raw, length)
             return
         assert quantity.signal is not None
         if name is None:
@@ -265,6 +277,24 @@ class _Binding:
         unit = self._codec.unit(name, quantity.signal)
         if unit not in ("", quantity.unit):
             raise self._error(f"{key}.unit", quantity.unit, f"{unit}, as {quantity.signal} has in the DBC")
+
+    def _raw(self, key: str, raw: RawSignal, length: int) -> None:
+        end_bit = raw.first_bit() + raw.length_bits
+        if end_bit > 8 * length:
+            raise self._error(key, f"{end_bit} bits", f"at most {8 * length}, by the length")
+
+    def _flag(self, key: str, name: str, flag: str | Flag | None) -> None:
+        if isinstance(flag, Flag):
+            self._whole(f"{key}.signal", name, flag.signal)
+        elif flag is not None:
+            self._signal(key, name, flag)
+
+    def _mapped(self, key: str, message: str) -> int:
+        """The id of a message that has a rule."""
+        ids = {rule.name: rule.can_id for rule in self._rules.values() if rule.name is not None}
+        if message not in ids:
+            raise ConfigError(f"{self._path}: {key}: {unknown('mapped message', message, ids)}")
+        return ids[message]
 
     def _message(self, key: str, name: str) -> None:
         if name not in self._codec.names():
@@ -275,8 +305,10 @@ class _Binding:
         if signal not in self._codec.signal_names(name):
             reason = unknown(f"signal of {name}", signal, self._codec.signal_names(name))
             raise ConfigError(f"{self._path}: {key}: {reason}, by {self._codec.path}")
+        if signal in self._codec.misfits(name):
+            raise self._error(key, f"{signal}, which does not lie in {name}", "a signal that does")
 
-    def _counter(self, key: str, name: str, signal: str) -> None:
+    def _whole(self, key: str, name: str, signal: str) -> None:
         self._signal(key, name, signal)
         if not self._codec.whole(name, signal):
             raise self._error(key, f"{signal}, which has a scale", "a whole number")

@@ -1,24 +1,31 @@
 """The gateway on somebody else's bus: real frames in, by a map; our own AEB_REQ out.
 
 Each frame is judged by the rule of its id, in this order: time, length, checksum, counter, range. A frame
-that is refused is counted by the reason and changes nothing at all. The frame that ends the radar's cycle
-makes the request, out of the tracks that were refreshed in that cycle: a slot whose frame was lost or
-refused is a miss to the function, never an old value. A cycle whose last frame is lost or refused makes
-no request.
+that is refused is counted by the reason and changes nothing at all. Where a message is protected by E2E,
+the profile and its supervision judge length, checksum and sequence, as on our own bus (`e2e`); any other
+checksum and counter are weaker than that: an 8-bit sum, no data id, and no window of statuses.
 
-Such rules are weaker than E2E: an 8-bit sum and a counter without a data id, and no window of statuses.
+The frame that ends the radar's cycle makes the request, out of the tracks that were refreshed in that
+cycle: a slot whose frame was lost or refused is a miss to the function, never an old value. A cycle whose
+last frame is lost or refused makes no request. Where the radar announces how many objects it will send,
+the cycle ends with the last of them, or at once if there are none; one that lacks some ends with the next
+announcement, and makes its request out of what came.
 """
 
+from math import cos, isfinite, sin
 from pathlib import Path
 from typing import Final
 
 import msgspec
 
 from aftbed.vehicle.aebmessages import SPEED_MAX_MS, AebInput, AebTarget, encode_request
-from aftbed.vehicle.dbcfile import Codec, load_dbc
+from aftbed.vehicle.dbcfile import Codec
+from aftbed.vehicle.e2e import Receiver
 from aftbed.vehicle.frame import Frame
 from aftbed.vehicle.gateway import GatewayCounts, ReplySender, target_of
-from aftbed.vehicle.mapfile import TO_SI, Quantity, Rule, bind
+from aftbed.vehicle.mapfile import Rule, bind
+from aftbed.vehicle.mapshape import TO_SI, Flag, Quantity
+from aftbed.vehicle.slots import SlotBook
 
 FRESH_CYCLES: Final = 1.5  # a log's time stamps come in batches, so a cycle may look longer than it was
 
@@ -29,7 +36,7 @@ def toyota_checksum(can_id: int, data: bytes) -> int:
 
 
 class SeenTrack(msgspec.Struct, frozen=True):
-    """What a slot's last frame said, at `t_us`; no target if it was not valid or not in our path."""
+    """What an object's last frame said, at `t_us`; no target if it was not valid or not in our path."""
 
     t_us: int
     target: AebTarget | None
@@ -42,10 +49,16 @@ class MappedGateway:
         """Raises ConfigError if the DBC does not parse, or the map does not fit it."""
         self.counts = GatewayCounts()
         self._sender = ReplySender(codec)
-        self._bound = bind(map_file, load_dbc(dbc))
+        self._bound = bind(map_file, dbc)
+        self._receivers = {
+            rule.can_id: Receiver(rule.watch) for rule in self._bound.rules.values() if rule.watch is not None
+        }
+        self._book = SlotBook() if self._bound.allots else None
         self._t_us = 0
         self._counters: dict[int, int] = {}
-        self._tracks: dict[int, SeenTrack] = {}
+        self._tracks: dict[int, SeenTrack] = {}  # by number: of the object, or of the message
+        self._announced = 0  # by the last announcement
+        self._awaited = 0  # so many objects make the cycle whole; 0 is none that is open
         self._ego: tuple[int, float] | None = None  # bus time and speed, last accepted
 
     def on_frame(self, frame: Frame) -> bytes | None:
@@ -60,7 +73,14 @@ class MappedGateway:
             return None
         self.counts.accepted += 1
         self._t_us = frame.t_us
-        return self._request(frame.t_us) if frame.can_id == self._bound.cycle_end_id else None
+        if frame.can_id == self._bound.cycle_end_id:
+            return self._request(frame.t_us)
+        if frame.can_id == self._bound.count_id:
+            return self._announce(frame.t_us)
+        if rule.slot is not None and 0 < self._awaited <= len(self._tracks):
+            self._awaited = 0
+            return self._request(frame.t_us)
+        return None
 
     def on_reply(self, reply: bytes, t_us: int, replica: int, epoch: int, answered: int) -> list[Frame]:
         """See `BusGateway.on_reply`."""
@@ -70,6 +90,11 @@ class MappedGateway:
         """Take what the frame says, or say why not; then nothing has changed."""
         if frame.t_us < self._t_us:
             return "time"
+        receiver = self._receivers.get(rule.can_id)
+        if receiver is not None:
+            refusal = receiver.refusal(frame.data, receiver.check(frame.data, frame.t_us))
+            if refusal is not None:
+                return refusal
         if len(frame.data) != rule.length:
             return "length"
         if rule.checksum == "toyota" and toyota_checksum(rule.can_id, frame.data) != frame.data[-1]:
@@ -95,39 +120,71 @@ class MappedGateway:
             if not 0.0 <= speed_ms <= SPEED_MAX_MS:
                 return False
             self._ego = (frame.t_us, speed_ms)
-        if rule.slot is not None:
-            target = self._target(rule.slot, signals, frame.data)
-            if target is None and signals[self._bound.map.tracks.valid]:
+        count = self._bound.map.tracks.count
+        if count is not None and frame.can_id == self._bound.count_id:
+            self._announced = int(signals[count.signal])
+        return rule.slot is None or self._take_track(frame, rule.slot, signals)
+
+    def _take_track(self, frame: Frame, number: int, signals: dict[str, float]) -> bool:
+        """Keep a track: that of the object that the frame names, or else of the message with this number."""
+        tracks = self._bound.map.tracks
+        if tracks.slot is not None:
+            number = int(signals[tracks.slot])
+        target = None
+        if tracks.valid is None or _said(tracks.valid, signals):
+            new = tracks.new is not None and _said(tracks.new, signals)
+            distance_m, lateral_m = self._place(signals, frame.data)
+            target = target_of(0, distance_m, _si(tracks.relative_speed, signals, frame.data), new)
+            if target is None or not isfinite(lateral_m):
                 return False
-            in_path = target is not None and self._in_path(signals, frame.data)
-            self._tracks[rule.slot] = SeenTrack(frame.t_us, target if in_path else None)
+            if abs(lateral_m) > self._bound.map.lane_half_width_m:
+                target = None
+        self._tracks[number] = SeenTrack(frame.t_us, target)
         return True
 
-    def _target(self, slot: int, signals: dict[str, float], data: bytes) -> AebTarget | None:
-        """The slot's target, None if there is none or its values are beyond any sensor."""
+    def _place(self, signals: dict[str, float], data: bytes) -> tuple[float, float]:
+        """How far ahead and how far beside us, in metres."""
         tracks = self._bound.map.tracks
-        if not signals[tracks.valid]:
-            return None
-        new = tracks.new is not None and bool(signals[tracks.new])
-        range_m, speed_ms = _si(tracks.range, signals, data), _si(tracks.relative_speed, signals, data)
-        return target_of(slot, range_m, speed_ms, new)
+        range_m = _si(tracks.range, signals, data)
+        if tracks.angle is None:
+            assert tracks.lateral_offset is not None
+            return range_m, _si(tracks.lateral_offset, signals, data)
+        angle = _si(tracks.angle, signals, data)
+        return (range_m * cos(angle), range_m * sin(angle)) if isfinite(angle) else (range_m, angle)
 
-    def _in_path(self, signals: dict[str, float], data: bytes) -> bool:
-        lateral_m = _si(self._bound.map.tracks.lateral_offset, signals, data)
-        return abs(lateral_m) <= self._bound.map.lane_half_width_m
+    def _announce(self, t_us: int) -> bytes | None:
+        """A new cycle: the one before ends now if it lacks something, the new one if it will have nothing."""
+        made = self._request(t_us) if self._awaited else None
+        self._tracks.clear()
+        self._awaited = self._announced
+        return made if self._awaited else self._request(t_us, empty=True)
 
-    def _request(self, t_us: int) -> bytes:
+    def _request(self, t_us: int, *, empty: bool = False) -> bytes:
+        """`empty`: the radar has said that there is nothing, which is not the same as to say nothing."""
         fresh_us = round(FRESH_CYCLES * self._bound.map.cycle_ms * 1000)
-        fresh = [seen for _, seen in sorted(self._tracks.items()) if t_us - seen.t_us <= fresh_us]
-        targets = tuple(seen.target for seen in fresh if seen.target is not None)
+        fresh = {number: seen for number, seen in self._tracks.items() if t_us - seen.t_us <= fresh_us}
+        targets = self._slotted({n: seen.target for n, seen in fresh.items() if seen.target is not None})
         self._tracks.clear()
         known = self._ego is not None and t_us - self._ego[0] <= self._bound.map.ego.timeout_ms * 1000
         speed_ms = self._ego[1] if self._ego is not None and known else 0.0
-        return encode_request(AebInput(t_us // 1000, speed_ms, known, bool(fresh), targets))
+        return encode_request(AebInput(t_us // 1000, speed_ms, known, bool(fresh) or empty, targets))
+
+    def _slotted(self, found: dict[int, AebTarget]) -> tuple[AebTarget, ...]:
+        """The targets, by number, in the function's slots."""
+        if self._book is not None:
+            return self._book.assign(found)
+        return tuple(msgspec.structs.replace(found[number], slot=number) for number in sorted(found))
+
+
+def _said(flag: str | Flag, signals: dict[str, float]) -> bool:
+    """Whether a flag of the map says yes."""
+    if isinstance(flag, Flag):
+        return int(signals[flag.signal]) in flag.values
+    return bool(signals[flag])
 
 
 def _si(quantity: Quantity, signals: dict[str, float], data: bytes) -> float:
-    """A mapped quantity in metres or metres per second."""
+    """A mapped quantity in metres, metres per second, or as an angle in radians."""
     if quantity.raw is not None:
         return quantity.raw.read(data) * TO_SI[quantity.unit]
     assert quantity.signal is not None

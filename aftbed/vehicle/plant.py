@@ -1,15 +1,17 @@
 """The car and the car ahead: longitudinal truth, in fixed steps of 1 ms.
 
-The ego's brakes do nothing for a dead time, then approach what is asked of them as a first-order lag,
-and no tyre gives more than friction times gravity. The driver holds the speed until braking is asked
-for, then takes the foot off for good: drag and rolling resistance act from there on. The car ahead
-stands, drives on at constant speed, or brakes with a linear ramp.
+The ego's brakes do nothing for a dead time, then approach what is asked of them as a first-order lag.
+They give no more than they can, and no tyre gives more than friction times gravity. The driver holds the
+speed until braking is asked for, then takes the foot off for good: drag and rolling resistance act from
+there on. The car ahead stands, drives on at constant speed, or brakes with a linear ramp. It is in our
+lane, or beside it for good, or comes into it from the side.
 
 Contact is interpolated inside the step in which the gap closes, so the impact speed does not depend on
-the step. After contact the drive is over and nothing moves any more. Only + - * / on doubles: the same
-drive on every machine, bit for bit.
+the step. After contact the drive is over and nothing moves any more. What is beside us when we reach it
+is not hit but passed: from there on the road is empty. Gaps count only while the car ahead is in our
+way. Only + - * / on doubles: the same drive on every machine, bit for bit.
 
-Limits: one dimension, one target, no road gradient, no load transfer, no ABS dynamics.
+Limits: the ego keeps its lane; one target, no road gradient, no load transfer, no ABS dynamics.
 """
 
 from collections import deque
@@ -20,13 +22,13 @@ import msgspec
 from aftbed.vehicle.report import VehicleResult
 
 STEP_US: Final = 1000
-_STEP_S: Final = 0.001
 GRAVITY_MS2: Final = 9.81
 KMH_PER_MS: Final = 3.6
-DEAD_TIME_STEPS: Final = 100  # 0.1 s: hydraulics build no pressure yet
-LAG_S: Final = 0.1
+DEAD_TIME_MS: Final = 100  # hydraulics build no pressure yet
+LAG_MS: Final = 100
 ROLLING_MS2: Final = 0.12  # rolling resistance of a passenger car, 0.012 g
 DRAG_PER_M: Final = 0.000_27  # 0.5 rho cd A / m, for 0.66 m2 and 1500 kg
+IN_THE_WAY_M: Final = 1.8  # from middle to middle: two cars of this width, side by side, touch
 
 
 class LeadBraking(msgspec.Struct, frozen=True):
@@ -37,47 +39,83 @@ class LeadBraking(msgspec.Struct, frozen=True):
     ramp_ms: int = 0
 
 
+class CutIn(msgspec.Struct, frozen=True):
+    """The car ahead comes to the middle of our lane, from `after_ms` on, in `over_ms`, evenly."""
+
+    after_ms: int
+    over_ms: int
+
+
 class Lead(msgspec.Struct, frozen=True):
-    """The car ahead at the start of the drive."""
+    """The car ahead at the start of the drive; `lateral_m` is to the left of the middle of our lane."""
 
     gap_m: float
     speed_ms: float = 0.0
     braking: LeadBraking | None = None
+    lateral_m: float = 0.0
+    cut_in: CutIn | None = None
+
+
+class Brakes(msgspec.Struct, frozen=True):
+    """What the ego's brakes can. None is no limit: of the jerk but the lag, of the rest but the tyres."""
+
+    dead_time_ms: int = DEAD_TIME_MS
+    lag_ms: int = LAG_MS
+    jerk_max_ms3: float | None = None
+    deceleration_max_ms2: float | None = None
+
+
+class Driver(msgspec.Struct, frozen=True):
+    """Brakes by so much, so long after the warning: the robot of Euro NCAP's tests of warnings."""
+
+    reaction_ms: int
+    deceleration_ms2: float
 
 
 class PlantSetup(msgspec.Struct, frozen=True):
-    """The start of a drive. `lead` None is an empty road; `jerk_max_ms3` None is no limit."""
+    """The start of a drive. `lead` None is an empty road, `driver` None one who heeds no warning."""
 
     speed_ms: float
     lead: Lead | None = None
     friction: float = 0.9
-    jerk_max_ms3: float | None = None
+    brakes: Brakes = Brakes()
+    driver: Driver | None = None
 
 
 class Plant:
-    """The state of both cars at `t_us`, microseconds of bus time since the start."""
+    """The state of both cars at `t_us`, microseconds of bus time since the start.
 
-    def __init__(self, setup: PlantSetup) -> None:
-        lead = setup.lead
+    `step_us` is for tests of what the step does to a drive: everybody else has `STEP_US`.
+    """
+
+    def __init__(self, setup: PlantSetup, step_us: int = STEP_US) -> None:
+        lead, brakes = setup.lead, setup.brakes
         self.setup = setup
         self.t_us = 0
         self.speed_ms = setup.speed_ms
         self.acceleration_ms2 = 0.0
         self.lead_speed_ms = lead.speed_ms if lead else 0.0
+        self.lateral_m = lead.lateral_m if lead else 0.0
         self.gap_m = lead.gap_m if lead else None
         self.collided = False
+        self._step_us, self._step_s = step_us, step_us / 1e6
         self._brake_ms2 = 0.0
-        self._pipe = deque([0.0] * DEAD_TIME_STEPS, maxlen=DEAD_TIME_STEPS)
+        self._brake_most_ms2 = setup.friction * GRAVITY_MS2
+        if brakes.deceleration_max_ms2 is not None:
+            self._brake_most_ms2 = min(self._brake_most_ms2, brakes.deceleration_max_ms2)
+        self._gain = min(1.0, self._step_s / (brakes.lag_ms / 1000)) if brakes.lag_ms else 1.0
+        delay = brakes.dead_time_ms * 1000 // step_us
+        self._pipe = deque([0.0] * (delay + 1), maxlen=delay + 1)
         self._braked = False
         self._impact_speed_ms: float | None = None
-        self._min_gap_m = self.gap_m
+        self._min_gap_m = self.gap_m if self._in_the_way() else None
         self._stop_gap_m: float | None = None
         self._max_deceleration_ms2 = 0.0
 
     def step(self, demand_ms2: float) -> None:
-        """Advance by 1 ms with `demand_ms2` asked of the brakes: m/s2, 0 or more."""
+        """Advance by one step with `demand_ms2` asked of the brakes: m/s2, 0 or more."""
         assert demand_ms2 >= 0.0
-        self.t_us += STEP_US
+        self.t_us += self._step_us
         if self.collided:
             return
         self._braked = self._braked or demand_ms2 > 0.0
@@ -86,7 +124,7 @@ class Plant:
         if self.gap_m is not None:
             self._move_gap(self.gap_m, self._move_lead() - ego_m, closing_before_ms)
         if self.speed_ms == 0.0 and self._stop_gap_m is None and not self.collided:
-            self._stop_gap_m = self.gap_m
+            self._stop_gap_m = self.gap_m if self._in_the_way() else None
 
     def stopped(self) -> bool:
         """True when the ego stands still, or the drive has ended in a collision."""
@@ -111,32 +149,48 @@ class Plant:
             braked=self._braked,
         )
 
+    def _in_the_way(self) -> bool:
+        return -IN_THE_WAY_M < self.lateral_m < IN_THE_WAY_M
+
     def _move_ego(self, demand_ms2: float) -> float:
         """Metres that the ego moves in this step."""
         self._move_brake(demand_ms2)
         resistance_ms2 = ROLLING_MS2 + DRAG_PER_M * self.speed_ms * self.speed_ms if self._braked else 0.0
         deceleration_ms2 = self._brake_ms2 + resistance_ms2
         before_ms = self.speed_ms
-        self.speed_ms = max(0.0, before_ms - deceleration_ms2 * _STEP_S)
-        self.acceleration_ms2 = (self.speed_ms - before_ms) / _STEP_S
+        self.speed_ms = max(0.0, before_ms - deceleration_ms2 * self._step_s)
+        self.acceleration_ms2 = (self.speed_ms - before_ms) / self._step_s
         self._max_deceleration_ms2 = max(self._max_deceleration_ms2, -self.acceleration_ms2)
-        return (before_ms + self.speed_ms) / 2.0 * _STEP_S
+        return (before_ms + self.speed_ms) / 2.0 * self._step_s
 
     def _move_brake(self, demand_ms2: float) -> None:
-        """Dead time, lag, jerk limit, and what the tyres can give."""
-        asked_ms2 = min(self._pipe[0], self.setup.friction * GRAVITY_MS2)
+        """Dead time, lag, jerk limit, and what brakes and tyres can give."""
         self._pipe.append(demand_ms2)  # the oldest one leaves by itself
-        change_ms2 = (asked_ms2 - self._brake_ms2) * (_STEP_S / LAG_S)
-        if self.setup.jerk_max_ms3 is not None:
-            limit_ms2 = self.setup.jerk_max_ms3 * _STEP_S
+        asked_ms2 = min(self._pipe[0], self._brake_most_ms2)
+        change_ms2 = (asked_ms2 - self._brake_ms2) * self._gain
+        jerk_max_ms3 = self.setup.brakes.jerk_max_ms3
+        if jerk_max_ms3 is not None:
+            limit_ms2 = jerk_max_ms3 * self._step_s
             change_ms2 = max(-limit_ms2, min(limit_ms2, change_ms2))
         self._brake_ms2 += change_ms2
 
     def _move_lead(self) -> float:
         """Metres that the car ahead moves in this step."""
+        lead = self.setup.lead
+        assert lead is not None
+        if lead.cut_in is not None:
+            self._move_sideways(lead.lateral_m, lead.cut_in)
         before_ms = self.lead_speed_ms
-        self.lead_speed_ms = max(0.0, before_ms - self._lead_deceleration_ms2() * _STEP_S)
-        return (before_ms + self.lead_speed_ms) / 2.0 * _STEP_S
+        self.lead_speed_ms = max(0.0, before_ms - self._lead_deceleration_ms2() * self._step_s)
+        return (before_ms + self.lead_speed_ms) / 2.0 * self._step_s
+
+    def _move_sideways(self, from_m: float, cut_in: CutIn) -> None:
+        """Evenly, since what is judged is where the car ahead is, not how it feels in there."""
+        left_ms = cut_in.after_ms + cut_in.over_ms - self.t_us / 1000
+        if left_ms <= 0.0:
+            self.lateral_m = 0.0
+        elif left_ms < cut_in.over_ms:
+            self.lateral_m = from_m * (left_ms / cut_in.over_ms)
 
     def _lead_deceleration_ms2(self) -> float:
         braking = self.setup.lead.braking if self.setup.lead else None
@@ -152,6 +206,9 @@ class Plant:
     def _move_gap(self, before_m: float, change_m: float, closing_before_ms: float) -> None:
         """Change the gap; find contact inside the step."""
         after_m = before_m + change_m
+        if not self._in_the_way():
+            self.gap_m = after_m if after_m > 0.0 else None  # None: passed
+            return
         if after_m <= 0.0 < before_m:
             part = before_m / (before_m - after_m)
             closing_ms = self.speed_ms - self.lead_speed_ms
@@ -159,5 +216,5 @@ class Plant:
             self.collided, after_m = True, 0.0
             self.speed_ms = self.lead_speed_ms = self.acceleration_ms2 = 0.0
         self.gap_m = after_m
-        assert self._min_gap_m is not None
-        self._min_gap_m = min(self._min_gap_m, after_m)
+        if self._min_gap_m is None or after_m < self._min_gap_m:
+            self._min_gap_m = after_m

@@ -27,7 +27,7 @@ from collections.abc import Callable
 
 import msgspec
 
-from aftbed.core.busfault import NODES, BusFault, Struck
+from aftbed.core.busfault import NODES, BusFault, Condition, Struck
 from aftbed.vehicle.aim import aimed
 from aftbed.vehicle.body import CarBody, End
 from aftbed.vehicle.dbcfile import Codec, load_dbc
@@ -76,6 +76,8 @@ class VirtualCar:
         self._now_ns = 0
         self._arriving: deque[_Arriving] = deque()  # not heard yet
         self._disturber: Disturber | None = None
+        self._watched: list[tuple[Condition, Callable[[int], None]]] = []
+        self._held = 0  # by so many, before the step that has begun
         self._asked: list[bytes] = []  # requests that were made before anybody came for them
         self._answer_id = codec.can_id("AEB_REQ")
 
@@ -115,10 +117,12 @@ class VirtualCar:
     def _drive(self, until_ns: int) -> list[bytes]:
         """Take the steps up to and including that time. The requests that they make."""
         payloads: list[bytes] = []
-        while self._end is None and self._step_us * 1000 <= until_ns:
+        while self._end is None and not self._held and self._step_us * 1000 <= until_ns:
             if self._step_us > self._body.t_us:
                 self._finish_step()
-            if self._end is None:
+            if self._watched:
+                self._look()
+            if self._end is None and not self._held:
                 payloads += self._begin_step()
         return payloads
 
@@ -137,6 +141,37 @@ class VirtualCar:
                 self._arriving.append(_Arriving(frame))
             else:
                 self._put(self._disturber, self._disturber.carry(frame, GATEWAY))
+
+    # -- conditions --------------------------------------------------------------------------------
+
+    @property
+    def watched(self) -> bool:
+        """Whether the car has to be driven step by step, so that a condition is found to hold in time."""
+        return bool(self._watched) and self._end is None
+
+    def watch(self, condition: Condition, met: Callable[[int], None]) -> None:
+        """Call `met`, once, at the begin of the first step at which `condition` holds: with its bus time.
+
+        Nothing of that step happens before `go_on`.
+        """
+        self._watched.append((condition, met))
+
+    def go_on(self, now_ns: int) -> None:
+        """The step of a condition can be taken, as far as that one is concerned."""
+        self._held -= 1
+        self.pass_time(now_ns)
+
+    def pass_time(self, now_ns: int) -> None:
+        """Drive up to and including `now_ns`; the requests that are made wait to be fetched."""
+        self._pass_to(now_ns)
+        self._asked += self._drive(now_ns)
+
+    def _look(self) -> None:
+        holds = [one for one in self._watched if self._body.is_so(one[0])]
+        self._watched = [one for one in self._watched if one not in holds]
+        self._held += len(holds)
+        for _, met in holds:
+            met(self._body.t_us)
 
     # -- faults of the bus ----------------------------------------------------------------------
 

@@ -14,6 +14,7 @@ HIDDEN = "update app to aftbed.vehicle.variants:WithoutStateAccess at request 4"
 NOISY = "update app to aftbed.vehicle.variants:NonDeterministic at request 4"
 CRASH = "crash primary after 220ms"
 FLIP = "bitflip result bit 5 after 220ms"
+AT_REST = "bitflip state.t_ms bit 9 in primary after 220ms"
 LASTING = "bitflip result bit 5 at server.exit nth 9 permanent"
 
 
@@ -44,6 +45,7 @@ def measured(
         ("tr", (CRASH,), (), ("unavailable",), "crashes", True),
         ("lfr+tr", (FLIP,), (), ("tolerated",), "", True),
         ("lfr+tr", (LASTING,), (), ("sdc",), "transient", True),
+        ("lfr+tr", (AT_REST,), (), ("sdc",), "wrong before", True),
     ],
 )
 def test_the_table_is_held_against_what_was_measured(

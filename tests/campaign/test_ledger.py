@@ -1,5 +1,8 @@
 """The ledger: appended to, gone on with, merged; what does not belong together is refused by name."""
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -7,7 +10,7 @@ from campaigns import CRASHES, planned, ran, result
 
 from aftbed.campaign import ledger
 from aftbed.campaign.ledger import head_of
-from aftbed.core.errors import ConfigError
+from aftbed.core.errors import ConfigError, HarnessError
 
 
 def begun(folder: Path, count: int = 3) -> Path:
@@ -31,9 +34,47 @@ def test_a_torn_last_line_is_refused_and_cut_off_by_resume(tmp_path: Path, cut: 
     path.write_bytes(path.read_bytes()[:-cut])
     with pytest.raises(ConfigError, match=r"records.jsonl: line 4: it is torn: .*--resume"):
         ledger.read(path)
-    done = ledger.resume(path, head_of(planned(tmp_path)))
-    assert done == {result(index=i).experiment.id for i in range(2)}
-    assert len(ledger.read(path).results) == 2
+    ledger.resume(path, head_of(planned(tmp_path)))
+    assert ledger.read(path).results == tuple(result(index=i) for i in range(2))
+
+
+def test_a_full_disk_is_told() -> None:
+    descriptor = ledger.opened(Path("/dev/full"))
+    try:
+        with pytest.raises(
+            HarnessError, match="/dev/full: a result cannot be written: No space left on device"
+        ):
+            ledger.append(descriptor, result())
+    finally:
+        os.close(descriptor)
+
+
+def test_a_result_that_fits_in_part_only_is_told(tmp_path: Path) -> None:
+    """In a process of its own, whose files may not grow beyond what is there and ten bytes."""
+    path = begun(tmp_path)
+    program = (
+        "import resource, signal, sys\n"
+        "from pathlib import Path\n"
+        "from campaigns import result\n"
+        "from aftbed.campaign import ledger\n"
+        "path = Path(sys.argv[1])\n"
+        "limit = path.stat().st_size + 10\n"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))\n"
+        "ledger.append(ledger.opened(path), result(index=9))\n"
+    )
+    here = os.fspath(Path(__file__).parent)
+    done = subprocess.run(
+        [sys.executable, "-c", program, path],
+        env={**os.environ, "PYTHONPATH": here},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert "10 of" in done.stderr and "make room, then go on with --resume" in done.stderr, done.stderr
+    ledger.resume(path, head_of(planned(tmp_path)))
+    assert ledger.read(path).results == tuple(result(index=i) for i in range(3))
 
 
 def test_a_line_that_is_no_record_is_named(tmp_path: Path) -> None:
@@ -78,6 +119,11 @@ def test_shards_merge_to_the_whole(tmp_path: Path) -> None:
 def test_what_does_not_belong_together_is_not_merged(tmp_path: Path) -> None:
     first = ran(planned(tmp_path), tmp_path / "a", shard=1, shards=20)
     other = ran(planned(tmp_path, CRASHES.replace("seed: 3", "seed: 4")), tmp_path / "b", shard=2, shards=20)
+    half = ran(planned(tmp_path), tmp_path / "c", shard=2, shards=2)
+    with pytest.raises(ConfigError, match=r"shard 2 of 2; .* is one of 20: shards of one run belong"):
+        ledger.merged([first, half])
+    with pytest.raises(ConfigError, match="shard 1 of 2 is missing: name the records of all"):
+        ledger.merged([half])
     with pytest.raises(ConfigError, match="of another spec or code"):
         ledger.merged([first, other])
     with pytest.raises(ConfigError, match="shard 1 of 20 stands twice"):

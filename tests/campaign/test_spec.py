@@ -27,6 +27,11 @@ def refusal(folder: Path, text: str) -> str:
         ("runtime: sim", "runtime: ros", r"line 4: system.runtime: found 'ros', allowed is one of"),
         ("[pbr, lfr, none]", "[pbr, lfx]", r"mechanisms: unknown name 'lfx'; did you mean 'lfr'"),
         ("[pbr, lfr, none]", "[]", r"line 5: mechanisms: found \[\], allowed is a list"),
+        (
+            "crash primary at {event} nth {nth}",
+            "bitflip memory at {event} nth {nth}",
+            "under system.runtime sim",
+        ),
         ("{event}", "{evnt}", r"'evnt'.* stands neither in matrix nor in draw"),
         (
             "server.exit",

@@ -70,8 +70,19 @@ def test_a_campaign_whose_faults_do_not_strike_fails(tmp_path: Path) -> None:
     """The gate on what was not activated is there without being asked for."""
     missed = judged(tmp_path, many(40) + many(60, first=40, activated=False))
     assert missed.gate == "fail"
-    assert [(g.metric, g.word) for g in missed.gates] == [("not_activated", "fail"), ("unknown", "pass")]
+    assert [(g.metric, g.word) for g in missed.gates] == [
+        ("not_activated", "fail"),
+        ("unknown", "pass"),
+        ("broken", "pass"),
+    ]
     assert judged(tmp_path, many(95) + many(5, first=95, activated=False)).gate == "pass"
+
+
+def test_one_experiment_that_broke_what_no_fault_excuses_fails_the_campaign(tmp_path: Path) -> None:
+    masters = msgspec.structs.replace(result("masked", index=400), broken=("one_master: two at 3 ms",))
+    found = judged(tmp_path, [*many(400), masters])
+    assert (found.gate, found.gates[-1].metric, found.gates[-1].word) == ("fail", "broken", "fail")
+    assert found.gates[-1].reason == f"experiment {masters.experiment.id}: one_master: two at 3 ms"
 
 
 def test_a_stratum_in_which_nothing_struck_fails_by_itself(tmp_path: Path) -> None:

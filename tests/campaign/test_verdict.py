@@ -11,6 +11,7 @@ from aftbed.campaign.record import read_record
 from aftbed.campaign.verdict import EXIT_CODES
 from aftbed.core.event import Event
 from aftbed.ftm.mechanism import build
+from aftbed.runtime.unix.options import COMMAND_GONE
 from aftbed.runtime.unix.support import HISTORY_NAME
 
 
@@ -133,6 +134,15 @@ def test_what_waited_when_the_run_was_cut_off_is_not_known(path: Path) -> None:
     record.request(answers=0)
     record.end = None
     assert record.verdict().checks["exactly_one_answer"] == "unknown"
+
+
+@pytest.mark.parametrize(("reason", "word"), [(COMMAND_GONE, "unknown"), ("", "fail")])
+def test_a_run_whose_command_was_killed_waits_for_no_answer(path: Path, reason: str, word: str) -> None:
+    record = whole(path)
+    record.request(answers=0)
+    assert record.end is not None
+    record.end["reason"] = reason
+    assert record.verdict().checks["exactly_one_answer"] == word
 
 
 # -- what is not known is no pass

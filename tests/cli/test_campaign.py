@@ -129,7 +129,7 @@ def test_the_schema_is_for_editors(told: Run) -> None:
 
 def test_the_shipped_campaigns_are_listed(told: Run) -> None:
     names = [line.split()[0] for line in told("campaign", "list").splitlines()]
-    assert names == ["adaptation", "assumptions", "bitflip", "ci-smoke", "crash", "paper-recipe"]
+    assert names == ["adaptation", "assumptions", "bitflip", "bus", "ci-smoke", "crash", "paper-recipe"]
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,8 @@ from typing import Final
 import pytest
 from pages import PAGES, ROOT, Block, Command, blocks, names, table
 
-SECONDS_MAX: Final = 60.0
+SECONDS_MAX: Final = 180.0  # of one command, on a machine under load
+PAGE_SECONDS_MAX: Final = 900
 DOCS: Final = ROOT / "docs"
 LONG_DRIVE: Final = """\
 description: an empty road, for as long as the page's commands take
@@ -140,6 +141,7 @@ def run_page(page: Path, folder: Path, lives: list[LiveRun]) -> int:
     return count
 
 
+@pytest.mark.timeout(PAGE_SECONDS_MAX)
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_the_commands_of_a_page_end_as_it_says(page: Path, tmp_path: Path, private: Path) -> None:
     shutil.copy(ROOT / "dbc" / "aftbed.dbc", tmp_path)

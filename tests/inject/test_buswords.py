@@ -11,23 +11,19 @@ from aftbed.core.busfault import (
     Condition,
     Delay,
     Duplicate,
-    Every,
     FlipBit,
     Frames,
-    Intermittent,
-    Lasting,
     Masquerade,
     Omission,
     Opening,
     Partition,
-    Permanent,
     Reorder,
     SetSignal,
     StuckCounter,
-    Transient,
 )
 from aftbed.core.errors import ConfigError
 from aftbed.core.fault import Fault, on_bus
+from aftbed.core.persistence import Chance, Every, Lasting, Permanent, Transient
 from aftbed.inject import words
 from aftbed.inject.buswords import VERBS, parse
 
@@ -42,7 +38,7 @@ OPENINGS = st.builds(Opening, after_us=st.just(0) | TIMES_US, nth=st.integers(1,
     nth=st.integers(1, 10**6),
 )
 LASTING = st.builds(Lasting, TIMES_US) | st.just(Permanent())
-CHANCES = st.integers(1, 10**6).map(lambda millionths: Intermittent(millionths / 1_000_000)) | st.builds(
+CHANCES = st.integers(1, 10**6).map(lambda millionths: Chance(millionths / 1_000_000)) | st.builds(
     Every, st.integers(1, 10**6)
 )
 FRAME_ACTS = st.one_of(
@@ -117,7 +113,7 @@ def test_whatever_is_typed_is_a_fault_or_refused(typed: list[str]) -> None:
         ),
         (
             "reorder bus from brake intermittent p 0.25",
-            BusFault(Reorder(), Frames(sender="brake"), persistence=Intermittent(0.25)),
+            BusFault(Reorder(), Frames(sender="brake"), persistence=Chance(0.25)),
         ),
     ],
 )
@@ -144,7 +140,7 @@ def test_the_grammar(text: str, fault: BusFault) -> None:
         ("corrupt bus A signal RANGE=1e3", "signal 'RANGE=1e3': NAME=VALUE is allowed"),
         ("masquerade bus A", "'as' is missing"),
         ("omission bus A nth 0", "nth '0': a whole number from 1"),
-        ("omission bus A intermittent p 1.5", "p '1.5': more than 0, up to 1"),
+        ("omission bus A intermittent p 1.5", "p '1.5': a chance above 0 and up to 1 is allowed"),
         ("omission bus A for 1s permanent", "'permanent' says again what has been said"),
         ("omission bus A after 1s when gap < 3", "'when' says again what has been said"),
         ("omission bus A when tcc < 3", "unknown quantity of the car 'tcc'; did you mean 'ttc'?"),

@@ -3,94 +3,19 @@
 import re
 from typing import Final
 
-import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from somefaults import faults
 
+from aftbed.core.busfault import Condition
 from aftbed.core.errors import ConfigError
-from aftbed.core.event import Event
-from aftbed.core.fault import (
-    HANG_FOREVER_MS,
-    LATER,
-    ONCE,
-    SLOW_MS_MAX,
-    Chance,
-    Crash,
-    Disturb,
-    Every,
-    Fault,
-    Hang,
-    How,
-    Permanent,
-    Persistence,
-    Slow,
-    Transient,
-    Trigger,
-    gap,
-    mark,
-    marked,
-)
-from aftbed.core.valuefault import (
-    BIT_MAX,
-    BITS_MAX,
-    Bit,
-    Bits,
-    Burst,
-    Byte,
-    Flip,
-    Pattern,
-    Place,
-    Stuck,
-    changed,
-    flipped,
-    hit,
-)
-from aftbed.core.words import DURATION_MS_MAX
+from aftbed.core.fault import Crash, Disturb, Fault, FlipMemory, Hang, How, Slow, Trigger
+from aftbed.core.persistence import Chance, Every, Permanent
+from aftbed.core.valuefault import Bit, Bits, Burst, Byte, Flip, Place, Stuck
 from aftbed.inject.words import KINDS, parse, read
 
-durations = st.integers(1, DURATION_MS_MAX)
-after = st.builds(Trigger, after_ms=durations)
-triggers = st.one_of(
-    st.just(Trigger()),
-    st.builds(Trigger, st.sampled_from([e.label for e in Event]), st.integers(1, 10**9)),
-    after,
-)
-bits = st.integers(0, BIT_MAX)
-patterns = st.one_of(
-    st.builds(Bit, st.none() | bits),
-    st.builds(Bits, st.integers(1, BITS_MAX)),
-    st.builds(Byte, st.none() | st.integers(0, BIT_MAX // 8)),
-    st.builds(Burst, st.integers(1, BITS_MAX), st.none() | bits),
-    st.builds(Stuck, bits, st.integers(0, 1)),
-)
-persistences = st.one_of(
-    st.just(ONCE),
-    st.just(Permanent()),
-    st.builds(Every, st.integers(1, 10**6)),
-    st.builds(Chance, st.integers(1, 10**6).map(lambda millionths: millionths / 1e6)),
-)
-disturbances = st.one_of(
-    st.builds(Disturb, st.sampled_from(LATER), st.sampled_from(("pxy2pro", "aft2aft")), durations),
-    st.builds(Disturb, st.sampled_from([how for how in How if how not in LATER]), st.just("aft2pro")),
-)
-fields = st.from_regex(r"[A-Za-z0-9_]{1,20}(\.[A-Za-z0-9_]{1,20})?", fullmatch=True)
-replicas = st.sampled_from(("primary", "backup", "a", "b"))
-faults = st.one_of(
-    st.builds(Fault, st.just(Crash()), st.sampled_from(("primary", "b/after")), triggers),
-    st.builds(Fault, st.builds(Hang, st.just(HANG_FOREVER_MS) | durations), st.just("backup"), triggers),
-    st.builds(
-        Fault,
-        st.builds(Slow, st.integers(1, round(SLOW_MS_MAX)), st.just(0) | durations),
-        st.just("a/server"),
-        triggers,
-    ),
-    st.builds(
-        Fault, disturbances, replicas, st.builds(Trigger, nth=st.integers(1, 10**9)) | after, persistences
-    ),
-    st.builds(Fault, st.builds(Flip, st.sampled_from(Place), patterns), replicas, triggers, persistences),
-    st.builds(Fault, st.builds(Flip, st.just(Place.STATE), patterns, fields), replicas, triggers),
-)
+TTC: Final = Condition("ttc", True, 1.2)
 
 
 def bitflip(
@@ -108,6 +33,28 @@ def test_a_fault_reads_back_as_it_was(fault: Fault) -> None:
     ("text", "fault"),
     [
         ("crash primary", Fault(Crash(), "primary", Trigger())),
+        ("crash primary when ttc < 1.2", Fault(Crash(), "primary", Trigger(when=TTC))),
+        ("hang backup for 50ms when ttc < 1.2", Fault(Hang(50), "backup", Trigger(when=TTC))),
+        (
+            "crash primary when ttc < 1.2 at reply.sent nth 3",
+            Fault(Crash(), "primary", Trigger("reply.sent", 3, when=TTC)),
+        ),
+        (
+            "omission pxy2pro when gap > 30 nth 2",
+            Fault(
+                Disturb(How.OMISSION, "pxy2pro"),
+                "primary",
+                Trigger(nth=2, when=Condition("gap", False, 30)),
+            ),
+        ),
+        ("bitflip result when ttc < 1.2", bitflip(Place.RESULT, trigger=Trigger(when=TTC))),
+        ("slow primary share 25%", Fault(Slow(0.0, 0, 0.25), "primary", Trigger())),
+        ("slow a/server share 2.5% for 1s", Fault(Slow(0.0, 1000, 0.025), "a/server", Trigger())),
+        ("bitflip memory", Fault(FlipMemory(), "primary", Trigger())),
+        (
+            "bitflip memory bit 3 address 0x7f00 in a/server at reply.sent",
+            Fault(FlipMemory(3, 0x7F00), "a/server", Trigger("reply.sent")),
+        ),
         ("  crash   b/after ", Fault(Crash(), "b/after", Trigger())),
         ("crash primary at checkpoint.sent", Fault(Crash(), "primary", Trigger("checkpoint.sent", 1))),
         (
@@ -186,11 +133,26 @@ def test_the_grammar(text: str, fault: Fault) -> None:
 
 
 BAD: Final = {
+    "crash primary when ttc < soon": "ttc < 'soon': a number is allowed (ttc in s, gap in m, speed in m/s)",
+    "crash primary when ttc = 1": "found '=' where '<' or '>' is expected",
+    "crash primary when tcc < 1": "unknown quantity of the car 'tcc'; did you mean 'ttc'?",
+    "crash primary when ttc < 1 after 2s": "'after 2s' and 'when ttc < 1': one of them is allowed",
+    "slow primary share 25": "share '25': 1% to 99% of a CPU are allowed, as 25%",
+    "slow primary share 100%": "share '100%': 1% to 99% of a CPU are allowed, as 25%",
+    "slow primary share 0%": "share '0%': 1% to 99% of a CPU are allowed, as 25%",
+    "slow primary by 2ms share 25%": "'by 2ms' and 'share 25%': one of them is allowed",
+    "hang primary share 25%": "unknown word in fault 'hang primary share 25%': 'share'",
+    "bitflip memory bit 8": "bit '8': a whole number from 0 to 7 is allowed",
+    "bitflip memory byte 3": "'byte': of memory one bit is flipped, once: 'bit 0' to 'bit 7' of a byte",
+    "bitflip memory permanent": "'permanent': of memory one bit is flipped, once",
+    "bitflip memory nth 3": "'nth 3' counts an event: 'at EVENT nth 3' is allowed",
+    "bitflip memory address 4096": "address '4096': a hexadecimal number is allowed, as 0x7f0012345678",
+    "bitflip result address 0x10": "'address 0x10': only memory has addresses: 'bitflip memory'",
     "": "fault '': expected crash|hang|slow TARGET",
     "crash": "fault 'crash': expected crash|hang|slow TARGET",
     "crush primary": "unknown fault 'crush'; did you mean 'crash'? (one of:",
-    "crash primary when server.exit": "unknown word in fault 'crash primary when server.exit': 'when'",
-    "crash primary att server.exit": "'att'; did you mean 'at'? (one of: after, at, for, nth)",
+    "crash primary when server.exit": "fault 'crash primary when server.exit': 'when' lacks its value",
+    "crash primary att server.exit": "'att'; did you mean 'at'? (one of: after, at, for, nth, when)",
     "crash primary at": "'at' lacks its value",
     "crash primary at server.exit nth": "'nth' lacks its value",
     "crash primary at server.exit at server.exit": "'at' twice",
@@ -235,7 +197,7 @@ BAD: Final = {
     "bitflip result at server.exit after 5ms": "'at server.exit' and 'after 5ms': one of them is allowed",
     "bitflip result at server.exits": "unknown event 'server.exits'; did you mean 'server.exit'?",
     "crash primary permanent": "unknown word in fault 'crash primary permanent': 'permanent'",
-    "hang primary by 3ms": "unknown word in fault 'hang primary by 3ms': 'by' (one of: after, at, for, nth)",
+    "hang primary by 3ms": "unknown word in fault 'hang primary by 3ms': 'by' (one of: after, at,",
     "slow primary by 501ms": "'by 501ms': a step can be slower by 500ms at most",
     "slow primary by 2": "delay '2': a positive number with its unit is allowed",
     "omission pxy2pro by 3ms": "'by 3ms': omission holds nothing back; a delay and a reorder does",
@@ -260,7 +222,7 @@ BAD: Final = {
     "bitflip result stuck 60=2": "stuck '60=2': a bit and its value are allowed, as 60=1",
     "bitflip result bits 3 bit 1": "'bits 3' and 'bit 1': one of them is allowed",
     "bitflip result stuck 1=1 byte": "'byte' and 'stuck 1=1': one of them is allowed",
-    "crash primary bit 3": "unknown word in fault 'crash primary bit 3': 'bit' (one of: after, at, for, nth)",
+    "crash primary bit 3": "unknown word in fault 'crash primary bit 3': 'bit' (one of: after, at,",
 }
 
 
@@ -305,6 +267,14 @@ SOME_WORDS: Final = (
     "nth",
     "for",
     "after",
+    "when",
+    "ttc",
+    "<",
+    "share",
+    "25%",
+    "memory",
+    "address",
+    "0x7f",
     "5ms",
     "2s",
     "server.exit",
@@ -326,140 +296,3 @@ def test_words_that_were_told_apart_are_not_split_again() -> None:
     assert read(["crash", "primary", "after", "2s"]) == parse("crash primary after 2s")
     with pytest.raises(ConfigError, match="bit '1 permanent': a whole number"):
         read(["bitflip", "result", "bit", "1 permanent"])
-
-
-# -- the value fault as a value
-
-
-@pytest.mark.parametrize(
-    ("fault", "event"),
-    [
-        (bitflip(Place.RESULT), "server.exit"),
-        (bitflip(Place.STATE, trigger=Trigger("state.captured", 2)), "state.captured"),
-        (bitflip(Place.RESULT, trigger=Trigger(after_ms=5)), "server.exit"),
-        (Fault(Crash(), "primary", Trigger()), ""),
-        (Fault(Crash(), "primary", Trigger("reply.sent")), "reply.sent"),
-        (Fault(Disturb(How.DELAY, "aft2aft"), "primary", Trigger(nth=3)), ""),
-    ],
-)
-def test_a_bitflip_waits_for_an_execution_at_least(fault: Fault, event: str) -> None:
-    assert fault.event == event
-
-
-@pytest.mark.parametrize(
-    ("action", "trigger", "persistence", "message"),
-    [
-        (Crash(), Trigger(), Permanent(), "a crash strikes once"),
-        (Slow(), Trigger(), Every(3), "a slow strikes once"),
-        (Disturb(How.DELAY, "aft2aft"), Trigger("reply.sent"), ONCE, "waits for no event: reply.sent"),
-    ],
-)
-def test_a_mixture_of_two_faults_is_none(
-    action: Crash | Slow | Disturb, trigger: Trigger, persistence: Persistence, message: str
-) -> None:
-    with pytest.raises(ValueError, match=message):
-        Fault(action, "primary", trigger, persistence)
-    parts = {"action": action, "target": "primary", "trigger": trigger, "persistence": persistence}
-    with pytest.raises(msgspec.ValidationError, match=message):
-        msgspec.msgpack.decode(msgspec.msgpack.encode(parts), type=Fault)
-
-
-@given(faults)
-def test_a_fault_travels_as_it_is(fault: Fault) -> None:
-    assert msgspec.msgpack.decode(msgspec.msgpack.encode(fault), type=Fault) == fault
-
-
-def test_bits_count_from_bit_0_of_byte_0() -> None:
-    assert flipped(b"\x00\x00", 0) == b"\x01\x00"
-    assert flipped(b"\x00\x00", 7) == b"\x80\x00"
-    assert flipped(b"\x00\x00", 8) == b"\x00\x01"
-    assert flipped(b"\xff\xff", 15) == b"\xff\x7f"
-
-
-@given(st.binary(min_size=1, max_size=40), st.data())
-def test_a_flip_changes_one_bit_and_a_second_one_undoes_it(data: bytes, more: st.DataObject) -> None:
-    bit = more.draw(st.integers(0, 8 * len(data) - 1))
-    changed = flipped(data, bit)
-    assert int.from_bytes(data, "little") ^ int.from_bytes(changed, "little") == 1 << bit
-    assert len(changed) == len(data) and flipped(changed, bit) == data
-
-
-@pytest.mark.parametrize("bit", [16, -1])
-def test_a_bit_that_is_not_there_is_our_mistake(bit: int) -> None:
-    with pytest.raises(AssertionError):
-        flipped(b"\x00\x00", bit)
-
-
-@given(st.integers(0, 2**32 - 1), st.integers(0, BIT_MAX))
-def test_a_mark_keeps_both_its_numbers(number: int, bits: int) -> None:
-    assert marked(mark(number, bits)) == (number, bits)
-    assert 0 <= mark(number, bits) < 2**64
-
-
-# -- which bits
-
-
-@given(patterns, st.binary(max_size=80), st.integers(0, 2**63 - 1))
-def test_a_pattern_and_a_draw_tell_the_bits(pattern: Pattern, data: bytes, draw: int) -> None:
-    found = hit(pattern, data, draw)
-    assert hit(pattern, data, draw) == found
-    if found is None:
-        return
-    assert list(found) == sorted(set(found)) and all(0 <= bit < 8 * len(data) for bit in found)
-    other = changed(data, found)
-    match pattern:
-        case Bit(at):
-            assert len(found) == 1 and at in (None, *found)
-        case Bits(count):
-            assert len(found) == count
-        case Byte(at):
-            places = [i for i, (a, b) in enumerate(zip(data, other, strict=True)) if a != b]
-            assert len(places) == 1 and at in (None, *places)
-        case Burst(count, at):
-            assert found == tuple(range(found[0], found[0] + count)) and at in (None, found[0])
-        case Stuck(at, value):
-            assert other[at // 8] >> at % 8 & 1 == value
-            assert found == () or data != other
-
-
-def test_a_byte_always_has_another_value_and_it_may_be_any() -> None:
-    values = {changed(b"\x00\x55", hit(Byte(1), b"\x00\x55", draw) or ())[1] for draw in range(3000)}
-    assert values == set(range(256)) - {0x55}
-
-
-@pytest.mark.parametrize(
-    ("pattern", "size"),
-    [
-        (Bit(16), 2),
-        (Bit(), 0),
-        (Bits(17), 2),
-        (Byte(2), 2),
-        (Byte(), 0),
-        (Burst(17), 2),
-        (Burst(2, 15), 2),
-        (Stuck(16, 1), 2),
-    ],
-)
-def test_where_there_are_no_such_bits_none_are_hit(pattern: Pattern, size: int) -> None:
-    assert hit(pattern, bytes(size), 7) is None
-
-
-def test_a_bit_that_is_stuck_at_what_it_is_changes_nothing() -> None:
-    assert hit(Stuck(1, 1), b"\x02", 0) == () and hit(Stuck(1, 0), b"\x02", 0) == (1,)
-
-
-# -- how often
-
-
-@pytest.mark.parametrize(("persistence", "gaps"), [(Transient(), 0), (Permanent(), 1), (Every(7), 7)])
-def test_the_next_strike_is_so_far_away(persistence: Persistence, gaps: int) -> None:
-    assert {gap(persistence, 5, struck) for struck in range(1, 9)} == {gaps}
-
-
-@pytest.mark.parametrize("p", [1.0, 0.5, 0.1, 0.01])
-def test_a_chance_strikes_so_often(p: float) -> None:
-    """The mean of a geometric distribution is 1/p, its deviation less than that."""
-    gaps = [gap(Chance(p), 5, struck) for struck in range(1, 4001)]
-    assert min(gaps) == 1
-    assert abs(sum(gaps) / len(gaps) * p - 1) < 5 / 4000**0.5
-    assert p == 1.0 or gaps != [gap(Chance(p), 6, struck) for struck in range(1, 4001)]

@@ -1,9 +1,7 @@
 """Real runs for tests: started, watched, broken, and looked for after their end.
 
 `Started` is a run that this process launched and reads the reports of; `Command` is an `aftbed` of its
-own. Both belong to a `Home`, the XDG_RUNTIME_DIR of one test. Whatever descends from a test carries the
-name of its home in its environment (`/proc/PID/environ`), or is a fork of this process whose pid is
-known; so after a test it can be told, without a name to guess, whether anything of it is left.
+own. Both belong to a `Home` (`homes`).
 
 Nothing here sleeps to wait: a wait is a poll of a descriptor or of a condition, with a deadline.
 """
@@ -11,18 +9,25 @@ Nothing here sleeps to wait: a wait is a poll of a descriptor or of a condition,
 import json
 import os
 import select
-import shutil
 import signal
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import Final
 
 import msgspec
 import pytest
+from homes import (
+    GONE_SECONDS_MAX,
+    LOOK_SECONDS,
+    PATIENCE_SECONDS,
+    WAIT_SECONDS_MAX,
+    Home,
+    home,
+    until,
+)
 
 from aftbed.campaign.record import RunRecord, read_record
 from aftbed.campaign.verdict import Verdict, judge
@@ -34,24 +39,26 @@ from aftbed.runtime.unix.launch import launch, options_for
 from aftbed.runtime.unix.options import LoadRun, Work
 from aftbed.runtime.unix.resources import Row
 
-WAIT_SECONDS_MAX: Final = 20.0
 RUN_SECONDS_MAX: Final = 60.0
-LOOK_SECONDS: Final = 0.005  # between two looks at what no descriptor tells
-GONE_SECONDS_MAX: Final = 1.0  # G7
-PATIENCE_SECONDS: Final = 5.0  # how long a test waits for what G7 allows a second
-SHARED_MEMORY: Final = Path("/dev/shm")
 
-Found = TypeVar("Found")
-
-
-def until(look: Callable[[], Found], what: str, seconds: float = WAIT_SECONDS_MAX) -> Found:
-    """What `look` returns as soon as that is true. Fails the test at the deadline, saying `what`."""
-    limit = time.monotonic() + seconds
-    while not (found := look()):
-        if time.monotonic() > limit:
-            pytest.fail(f"waited {seconds} s for {what}")
-        time.sleep(LOOK_SECONDS)
-    return found
+__all__ = [  # what others import from here
+    "GONE_SECONDS_MAX",
+    "LOOK_SECONDS",
+    "PATIENCE_SECONDS",
+    "WAIT_SECONDS_MAX",
+    "Command",
+    "Done",
+    "Home",
+    "Outcome",
+    "Started",
+    "aftbed",
+    "ended",
+    "home",
+    "readable",
+    "state_of",
+    "under_load",
+    "until",
+]
 
 
 def readable(descriptor: int, seconds: float) -> bool:
@@ -71,70 +78,6 @@ def ended(pid: int, seconds: float = WAIT_SECONDS_MAX) -> bool:
         return readable(pidfd, seconds)
     finally:
         os.close(pidfd)
-
-
-class Home:
-    """The XDG_RUNTIME_DIR of one test. Its path is short: a socket's may have 108 bytes."""
-
-    def __init__(self) -> None:
-        self.path = Path(tempfile.mkdtemp(prefix="aft-", dir="/tmp"))
-        self._mark = f"XDG_RUNTIME_DIR={self.path}".encode()
-        self._shared = set(SHARED_MEMORY.iterdir())
-        self.forks: list[int] = []
-
-    def processes(self) -> list[int]:
-        """The pids of what runs in this home, this process aside."""
-        found = [int(p.name) for p in Path("/proc").iterdir() if p.name.isdigit() and self._is_ours(p)]
-        return [pid for pid in found if pid != os.getpid()]
-
-    def _is_ours(self, process: Path) -> bool:
-        try:
-            if int(process.name) in self.forks:
-                return (process / "stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
-            return self._mark in (process / "environ").read_bytes().split(b"\0")
-        except OSError:
-            return False
-
-    def runs(self) -> list[Path]:
-        """The private directories there are, of runs alive or dead."""
-        root = self.path / "aftbed"
-        return list(root.iterdir()) if root.exists() else []
-
-    def left(self) -> list[str]:
-        """Everything that a run would have left behind (G7)."""
-        found = [f"process {pid}" for pid in self.processes()]
-        found += [f"directory {path}" for path in self.runs()]
-        return found + [f"shared memory {p}" for p in set(SHARED_MEMORY.iterdir()) - self._shared]
-
-    def seconds_to_clean(self) -> float:
-        """How long it takes from now until nothing is left."""
-        began = time.monotonic()
-        until(lambda: not self.left(), f"the end of {self.left()}", PATIENCE_SECONDS)
-        return time.monotonic() - began
-
-    def sweep(self) -> None:
-        """After a failed test: end what is its own, so that the next test starts clean."""
-        for pid in self.processes():
-            try:
-                os.kill(pid, signal.SIGKILL)
-            except ProcessLookupError:
-                continue
-        shutil.rmtree(self.path, ignore_errors=True)
-
-
-@pytest.fixture(autouse=True)
-def home(monkeypatch: pytest.MonkeyPatch) -> Iterator[Home]:
-    """A place of its own for each test, and nothing may be left in it."""
-    place = Home()
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(place.path))
-    yield place
-    limit = time.monotonic() + GONE_SECONDS_MAX
-    left = place.left()
-    while left and time.monotonic() < limit:
-        time.sleep(LOOK_SECONDS)
-        left = place.left()
-    place.sweep()
-    assert not left, f"left behind: {left}"
 
 
 class Outcome(msgspec.Struct, frozen=True):

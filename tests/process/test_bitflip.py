@@ -9,6 +9,7 @@ from typing import Final
 
 import pytest
 from liveruns import Command, Done, Home, aftbed, under_load
+from sampling import sampled
 
 from aftbed.campaign.record import RunRecord, read_record
 from aftbed.campaign.verdict import Verdict
@@ -16,6 +17,7 @@ from aftbed.core.event import Event
 from aftbed.core.graph import PLACEMENTS
 from aftbed.core.journal import Record
 from aftbed.ftm.mechanism import EXPRESSIONS, replication_of
+from aftbed.runtime.unix import ask
 
 pytestmark = pytest.mark.process
 
@@ -26,7 +28,8 @@ STAGE: Final = 8  # bit 0 of byte 1 of a reply: of the stage
 COUNTER: Final = 8  # bit 0 of byte 1 of a state: of the counter of the frames
 VERSION: Final = 0  # bit 0 of a state: no function takes a state of another version
 WITH_TR: Final = tuple(e for e in EXPRESSIONS if e.endswith("tr"))
-LIVE: Final = 300  # requests of a run that is hit from outside: 1.5 s
+LIVE: Final = 300  # requests of a run that is told something from outside: 1.5 s
+ENDLESS: Final = 100_000  # until it is stopped
 WITHOUT: Final = ("none", "pbr", "lfr")
 
 
@@ -107,11 +110,13 @@ def test_a_drive_says_what_the_brakes_were_asked_for() -> None:
 # -- time redundancy
 
 
-@pytest.mark.parametrize("which", [2 * HIT - 1, 2 * HIT], ids=["first run", "second run"])
-@pytest.mark.parametrize("place", [f"result bit {STAGE}", f"state bit {COUNTER}"])
-@pytest.mark.parametrize("ftm", WITH_TR)
-def test_a_third_run_outvotes_the_one_that_was_hit(tmp_path: Path, ftm: str, place: str, which: int) -> None:
-    ran = drive(tmp_path, ftm, f"bitflip {place} at server.exit nth {which}")
+PLACES: Final = (f"result bit {STAGE}", f"state bit {COUNTER}")
+RUNS: Final = {"first run": 2 * HIT - 1, "second run": 2 * HIT}
+
+
+@pytest.mark.parametrize(("ftm", "place", "run"), sampled(WITH_TR, PLACES, tuple(RUNS)))
+def test_a_third_run_outvotes_the_one_that_was_hit(tmp_path: Path, ftm: str, place: str, run: str) -> None:
+    ran = drive(tmp_path, ftm, f"bitflip {place} at server.exit nth {RUNS[run]}")
     assert ran.code == 0, ran.verdict.reasons
     assert_served(ran)
     assert (ran.verdict.checks["value"], ran.receipts, ran.hits()) == (
@@ -126,8 +131,7 @@ def test_a_third_run_outvotes_the_one_that_was_hit(tmp_path: Path, ftm: str, pla
     assert len(exits) == 3
 
 
-@pytest.mark.parametrize("placement", PLACEMENTS)
-@pytest.mark.parametrize("ftm", WITH_TR)
+@pytest.mark.parametrize(("ftm", "placement"), sampled(WITH_TR, PLACEMENTS))
 def test_bits_of_several_requests_are_outvoted_in_every_placement(
     tmp_path: Path, ftm: str, placement: str
 ) -> None:
@@ -224,11 +228,12 @@ def test_a_replica_is_hit_whatever_its_role_is_by_then(tmp_path: Path) -> None:
 
 
 def test_a_live_run_is_hit_from_a_second_command(home: Home) -> None:
-    with under_load(home, LIVE) as started:
+    with under_load(home, ENDLESS) as started:
         done = aftbed("inject", "bitflip", "result", "--bit", str(STAGE), "--nth", "5")
         assert done.code == 0, done.err
         assert "bitflip result bit 8 in primary at server.exit nth 5" in done.err
         told = started.wait_for("fault", "activated")
+        ask.ask(started.private, ask.Stop())
         outcome = started.finish()
     assert outcome.verdict.requests.wrong == 1 and outcome.verdict.verdict == "fail"
     (fault,) = outcome.verdict.faults
@@ -236,14 +241,16 @@ def test_a_live_run_is_hit_from_a_second_command(home: Home) -> None:
 
 
 def test_after_a_while_the_next_execution_is_hit(home: Home) -> None:
-    with under_load(home, LIVE) as started:
-        done = aftbed("inject", "bitflip", "state", "--replica", "a", "--bit", "8", "--after", "100ms")
+    with under_load(home, ENDLESS) as started:
+        done = aftbed("inject", "bitflip", "result", "--replica", "a", "--bit", "8", "--after", "100ms")
         assert done.code == 0, done.err
+        started.wait_for_answers(started.answered() + 75)  # at 200 a second: that is behind the hit
+        ask.ask(started.private, ask.Stop())
         outcome = started.finish()
     (fault,) = outcome.verdict.faults
     assert fault["receipt"] == "activated"
-    assert fault["fault"] == "bitflip state bit 8 in a after 100ms"
-    assert outcome.verdict.requests.wrong > 0
+    assert fault["fault"] == "bitflip result bit 8 in a after 100ms"
+    assert outcome.verdict.requests.wrong == 1
 
 
 @pytest.mark.parametrize(

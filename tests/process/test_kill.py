@@ -20,6 +20,7 @@ from liveruns import (
     under_load,
     until,
 )
+from sampling import every
 
 from aftbed.core.journal import EntryKind
 from aftbed.ftm.mechanism import build
@@ -114,7 +115,7 @@ def test_after_the_death_of_the_zygote_a_replica_can_be_replaced(home: Home) -> 
         assert_served(run.finish(), failovers=2)
 
 
-@pytest.mark.parametrize("name", ["proxy", "client", "recovery", "a/watchdog", "b/watchdog"])
+@pytest.mark.parametrize("name", every(2, ["proxy", "client", "recovery", "b/watchdog", "a/watchdog"]))
 def test_a_node_beside_the_replicas_may_die_again_and_again(home: Home, name: str) -> None:
     """Under many requests each death meets another moment of a request."""
     with under_load(home, 1500, 1000.0) as run:

@@ -5,7 +5,7 @@ import subprocess
 import sys
 
 import pytest
-from liveruns import GONE_SECONDS_MAX, Home, until
+from liveruns import GONE_SECONDS_MAX, PATIENCE_SECONDS, Home, until
 
 pytestmark = pytest.mark.process
 
@@ -19,7 +19,7 @@ def test_no_simulator_outlives_its_command(home: Home, end: signal.Signals) -> N
     try:
         until(lambda: len(home.processes()) == 1 + JOBS, "the simulators")
         explored.send_signal(end)
-        explored.wait(GONE_SECONDS_MAX)
+        explored.wait(PATIENCE_SECONDS)
         assert home.seconds_to_clean() < GONE_SECONDS_MAX
     finally:
         explored.kill()

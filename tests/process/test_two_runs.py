@@ -9,6 +9,8 @@ from aftbed.runtime.unix import ask, rundir
 
 pytestmark = pytest.mark.process
 
+LONG = 100_000  # requests: until it is stopped
+
 
 def test_two_drives_at_once_both_pass(home: Home) -> None:
     fault = "crash primary at checkpoint.sent nth 60"
@@ -22,11 +24,13 @@ def test_two_drives_at_once_both_pass(home: Home) -> None:
 
 
 def test_a_crash_in_one_run_is_none_in_the_other(home: Home) -> None:
-    with under_load(home, 300) as one, Command("--load", "300@200", "--json") as other:
+    with under_load(home, LONG) as one, Command("--load", f"{LONG}@200", "--json") as other:
         until(lambda: len(rundir.live()) == 2, "two runs")
         seen = len(one.events)
         one.strike("a/server", signal.SIGKILL)
         one.wait_for("script.done", "new backup", after=seen)
+        for run in rundir.live():
+            ask.ask(rundir.find(run), ask.Stop())
         assert len(one.finish().verdict.failovers) == 1
         spared = other.done()
     assert spared.code == 0, spared.out + spared.err

@@ -1,12 +1,13 @@
 """The control line over a real socket pair: messages, descriptors, large states, and garbage."""
 
+import functools
 import os
 import random
 import socket
 from collections.abc import Iterator
 from enum import Enum
 from pathlib import Path
-from typing import Any, Final, Self, get_args, get_origin
+from typing import Any, Final, Literal, Self, get_args, get_origin
 
 import msgspec
 import pytest
@@ -14,13 +15,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from aftbed.core import script
-from aftbed.core.busfault import BusFault
+from aftbed.core.busfault import BusFault, Condition
 from aftbed.core.errors import PeerError
 from aftbed.core.fault import Crash, Fault, Hang, Trigger
 from aftbed.core.wire import PACKET_BYTES_MAX
 from aftbed.inject.buswords import parse
 from aftbed.runtime import control
-from aftbed.runtime.unix.line import FDS_MAX, STATE_BYTES_MAX, Line, decode_order, decode_report
+from aftbed.runtime.unix.line import FDS_MAX, Line, decode_order, decode_report
+from aftbed.runtime.unix.packets import STATE_BYTES_MAX
 
 ORDERS: Final[tuple[type[msgspec.Struct], ...]] = get_args(control.ToNode)
 REPORTS: Final[tuple[type[msgspec.Struct], ...]] = get_args(control.FromNode)
@@ -38,6 +40,7 @@ PLAIN: Final = {
 FLAT_VERBS: Final = tuple(kind for kind in get_args(script.AnyVerb) if kind is not script.Together)
 
 
+@functools.cache  # to build one takes longer than to draw from it
 def any_of(kind: Any) -> st.SearchStrategy[Any]:
     """Any value of a type that a control message is made of."""
     if kind in PLAIN:
@@ -50,6 +53,13 @@ def any_of(kind: Any) -> st.SearchStrategy[Any]:
         return st.sampled_from(BUS_FAULTS)
     if kind is Fault:
         return st.builds(Fault, st.sampled_from((Crash(), Hang())), st.text(max_size=9), any_of(Trigger))
+    if kind is Trigger:  # after a time, or on a condition
+        event, nth = PLAIN[str], PLAIN[int]
+        return st.builds(Trigger, event, nth, PLAIN[float]) | st.builds(
+            Trigger, event, nth, when=any_of(Condition)
+        )
+    if get_origin(kind) is Literal:
+        return st.sampled_from(get_args(kind))
     if isinstance(kind, type) and issubclass(kind, Enum):
         return st.sampled_from(kind)
     if isinstance(kind, type) and issubclass(kind, msgspec.Struct):

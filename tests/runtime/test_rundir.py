@@ -10,6 +10,8 @@ import pytest
 
 from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.runtime.unix import rundir
+from aftbed.runtime.unix.launch import launch, options_for
+from aftbed.runtime.unix.options import LoadRun
 
 
 @pytest.fixture
@@ -49,6 +51,17 @@ def test_a_runs_directory_is_private(runtime: Path) -> None:
 
 def test_each_run_has_its_own(runtime: Path) -> None:
     assert len({rundir.create() for _ in range(20)}) == 20
+
+
+def test_a_run_that_has_just_taken_the_place_is_left_alone(runtime: Path) -> None:
+    """Two commands that drew the same name: one of them says so, and removes nothing of the other's."""
+    options, _ = options_for(ftm="none", placement="single", work=LoadRun(1, 0.0))
+    taken = Path(options.private)
+    rundir.make(taken)
+    rundir._owned.pop(taken)  # as if by another process
+    with pytest.raises(HarnessError, match=f"{taken}: cannot be made: File exists; start the run again"):
+        launch(options, None)
+    assert taken.is_dir()
 
 
 def test_without_a_runtime_directory_it_lies_under_tmp(
@@ -98,7 +111,7 @@ def test_a_link_to_a_directory_is_refused(runtime: Path, tmp_path: Path) -> None
 
 def test_without_a_wish_the_record_goes_with_the_run(runtime: Path) -> None:
     private = rundir.create()
-    record = rundir.record_directory(None, private)
+    record = rundir.record_directory(private / "record")
     assert record == private / "record" and (record / "journal").is_dir()
     rundir.remove(private)
     assert not private.exists() and runtime.exists()
@@ -106,7 +119,7 @@ def test_without_a_wish_the_record_goes_with_the_run(runtime: Path) -> None:
 
 def test_a_wished_record_stays(runtime: Path, tmp_path: Path) -> None:
     private = rundir.create()
-    record = rundir.record_directory(str(tmp_path / "new" / "record"), private)
+    record = rundir.record_directory(tmp_path / "new" / "record")
     assert record == tmp_path / "new" / "record" and (record / "journal").is_dir()
     rundir.remove(private)
     assert record.exists()
@@ -117,16 +130,16 @@ def test_a_record_directory_that_exists_is_refused(runtime: Path, tmp_path: Path
     Path(wanted).mkdir()
     message = re.escape(f"--record {wanted}: exists already; name a directory that does not")
     with pytest.raises(ConfigError, match=message):
-        rundir.record_directory(wanted, runtime)
+        rundir.record_directory(Path(wanted))
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match="exists already"):
-        rundir.record_directory(str(tmp_path / "file"), runtime)
+        rundir.record_directory(tmp_path / "file")
 
 
 def test_a_record_directory_that_cannot_be_made_is_refused(runtime: Path, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match=r"--record .*/file/record: cannot be made: Not a directory"):
-        rundir.record_directory(str(tmp_path / "file" / "record"), runtime)
+        rundir.record_directory(tmp_path / "file" / "record")
 
 
 # -- finding runs

@@ -43,6 +43,7 @@ from aftbed.runtime.adaptations import Adaptations
 from aftbed.runtime.deployment import Deployment, Keys
 from aftbed.runtime.exchange import Exchange
 from aftbed.runtime.interface import Process
+from aftbed.runtime.rewiring import Wires
 from aftbed.runtime.sim import world
 from aftbed.runtime.sim.world import Setup
 from aftbed.runtime.verbs import Executor
@@ -354,7 +355,7 @@ EXECUTIVE: Final = (
     Mutant(
         "unbind forgotten",
         "Exchange leaves a brick that stays bound to one that goes",
-        instead(Exchange, "_unbind", lambda self, brick, port, of: None),
+        instead(Wires, "_unbind", lambda self, brick, port, of: None),
         CLEAN,
         clean(adapted("pbr", "lfr")),
         "G2",

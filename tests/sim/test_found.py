@@ -5,7 +5,7 @@ from typing import Final
 import pytest
 
 from aftbed.campaign.explore import attempt
-from aftbed.core.fault import Crash, Fault, Hang, Trigger
+from aftbed.core.fault import Crash, Disturb, Fault, Hang, How, Trigger
 from aftbed.core.message import Goal, Scheduled
 from aftbed.core.valuefault import Bit, Flip, Place
 from aftbed.runtime.sim.world import Setup
@@ -66,6 +66,16 @@ FOUND: Final = {
         rate_hz=2000.0,
         faults=(dies("a/server", AT_MS - 0.3),),
         adaptations=wanted("tr"),
+    ),
+    # The fault moves to the new leader, whose channel to a backup leads nowhere yet.
+    "a channel that is not bound yet": Setup(
+        "pbr",
+        count=40,
+        rate_hz=500.0,
+        faults=(
+            Fault(Disturb(How.DELAY, "aft2aft", 2.0), "primary", Trigger(nth=3)),
+            Fault(Crash(), "a/after", Trigger("server.enter", 1)),
+        ),
     ),
     # The way back unbinds what is inside the node that serves again.
     "half a graph after the way back": Setup(

@@ -12,7 +12,7 @@ from aftbed.campaign import swarm
 from aftbed.campaign.explore import attempt
 from aftbed.campaign.swarm import drawn, experiments
 from aftbed.core.event import Event
-from aftbed.core.fault import Crash, Hang
+from aftbed.core.fault import Crash, Disturb, Hang, Slow
 from aftbed.core.valuefault import Flip
 from aftbed.ftm.mechanism import build, parse, replication_of
 from aftbed.runtime import targets
@@ -41,7 +41,7 @@ def test_of_everything_there_is_some() -> None:
     assert Counter(len(s.faults) for s in many()).keys() == {0, 1, 2, 3}
     assert Counter(len(s.adaptations) for s in many()).keys() == {0, 1, 2}
     faults = [fault for s in many() for fault in s.faults]
-    assert {type(fault.action) for fault in faults} == {Crash, Hang, Flip}
+    assert {type(fault.action) for fault in faults} == {Crash, Hang, Flip, Slow, Disturb}
     assert {bool(fault.action.for_ms) for fault in faults if isinstance(fault.action, Hang)} == {True, False}
     assert any(fault.target.endswith(targets.STAGED) for fault in faults)
     assert any(fault.trigger.after_ms for fault in faults)
@@ -97,7 +97,8 @@ def test_what_is_planned_comes_before_the_end_of_the_load() -> None:
         assert all(1 <= a.at_request <= setup.count for a in setup.adaptations)
         last_ms = (setup.count - 1) * (1e3 / setup.rate_hz if setup.rate_hz else swarm.REQUEST_MS_MIN)
         assert all(f.trigger.after_ms <= swarm.LAUNCH_MS + last_ms for f in setup.faults)
-        assert all(f.trigger.event or f.trigger.after_ms >= swarm.LAUNCH_MS for f in setup.faults)
+        timed = [f for f in setup.faults if not f.trigger.event and not isinstance(f.action, Disturb)]
+        assert all(f.trigger.after_ms >= swarm.LAUNCH_MS for f in timed)
 
 
 def test_a_request_takes_no_less_than_the_draw_believes() -> None:

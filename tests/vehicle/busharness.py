@@ -10,12 +10,16 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import msgspec
+
 from aftbed.core.busfault import Struck
 from aftbed.core.errors import HarnessError
-from aftbed.vehicle.bus import BusOptions, open_bus
+from aftbed.vehicle.bus import Bus, BusOptions, open_bus
 from aftbed.vehicle.dbcfile import Codec
 from aftbed.vehicle.ecus import Sender
 from aftbed.vehicle.frame import Frame
+from aftbed.vehicle.function import default_application
+from aftbed.vehicle.gateway import ClientGateway, Gateway
 from aftbed.vehicle.hub import Hub, serve
 from aftbed.vehicle.hubclient import HubCounts, HubOptions
 
@@ -178,6 +182,40 @@ class RawClient:
             pass
 
 
+class Listener:
+    """A node of the bus in a thread: it hears every frame, until its test is over or the hub has gone."""
+
+    def __init__(self, options: BusOptions, hear: Callable[[Bus, Frame], None]) -> None:
+        self._hear = hear
+        self._bus = open_bus(options)
+        self._over = threading.Event()
+        self._idle = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def rest(self) -> None:
+        """Return when it has heard all that was on the bus by now."""
+        self._idle.clear()
+        assert self._idle.wait(DEADLINE_S), "the bus does not fall silent"
+
+    def close(self) -> None:
+        self._over.set()
+        self._thread.join(DEADLINE_S)
+        assert not self._thread.is_alive()
+        self._bus.close()
+
+    def _run(self) -> None:
+        while not self._over.is_set():
+            try:
+                frame = self._bus.recv(0.02)
+                if frame is not None:
+                    self._hear(self._bus, frame)
+                else:
+                    self._idle.set()
+            except HarnessError:  # the hub went first
+                return
+
+
 class TestGateway:
     """A stand-in for the client process: answers each RADAR_TRACK, with a heartbeat before some.
 
@@ -198,40 +236,62 @@ class TestGateway:
         self._track_id = codec.can_id("RADAR_TRACK") if track_id is None else track_id
         self._own_track = track_id is None
         self._sender = Sender(codec, "AEB_REQ")
-        self._bus = open_bus(options)
-        self._over = threading.Event()
         self.answers = 0
-        self._thread = threading.Thread(target=self._run, daemon=True)
-        self._thread.start()
+        self._listener = Listener(options, self._answer)
 
     def __enter__(self) -> "TestGateway":
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._over.set()
-        self._thread.join(DEADLINE_S)
-        assert not self._thread.is_alive()
-        self._bus.close()
+        self._listener.close()
 
-    def _run(self) -> None:
-        while not self._over.is_set():
-            try:
-                frame = self._bus.recv(0.02)
-                if frame is not None and frame.can_id == self._track_id:
-                    self._answer(frame)
-            except HarnessError:  # the hub went first
-                return
-
-    def _answer(self, frame: Frame) -> None:
+    def _answer(self, bus: Bus, frame: Frame) -> None:
+        if frame.can_id != self._track_id:
+            return
         decision = self._decide(self._codec.decode("RADAR_TRACK", frame.data) if self._own_track else {})
         if decision is None:
             return
         self.answers += 1
         if self.answers % 3 == 0:
-            self._bus.send(Frame(frame.t_us, 0x701, bytes([1, 0, 0, *self.answers.to_bytes(4, "little"), 0])))
+            bus.send(Frame(frame.t_us, 0x701, bytes([1, 0, 0, *self.answers.to_bytes(4, "little"), 0])))
         stage, deceleration_ms2 = decision
         signals = {"STAGE": stage, "DECELERATION": deceleration_ms2, "TTC_VALID": 0, "TTC": 0, "TARGET": 0}
-        self._bus.send(self._sender.frame(frame.t_us, {**signals, "SEQUENCE": self.answers % 0x10000}))
+        bus.send(self._sender.frame(frame.t_us, {**signals, "SEQUENCE": self.answers % 0x10000}))
+
+
+class FunctionGateway:
+    """The client process, as `runtime.unix.gateway` is: the gateway, with the bare function as its server.
+
+    `named`: it says its name to the bus, what it uses, and what it notices; else it is nobody in particular.
+    """
+
+    def __init__(self, options: BusOptions, codec: Codec, *, named: bool = False) -> None:
+        self.gateway = ClientGateway(Gateway(codec))
+        self._function = default_application()
+        self._named = named
+        if named:
+            options = msgspec.structs.replace(options, node="gateway", uses=self.gateway.uses())
+        self._listener = Listener(options, self._hear)
+
+    def __enter__(self) -> "FunctionGateway":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._listener.close()
+
+    def rest(self) -> None:
+        """Return when it has heard all that was on the bus by now."""
+        self._listener.rest()
+
+    def _hear(self, bus: Bus, frame: Frame) -> None:
+        payload = self.gateway.on_frame(frame)
+        if payload is not None:
+            for answer in self.gateway.on_reply(self._function.execute(payload), 1, 1):
+                bus.send(answer)
+        elif self._named and self.gateway.makes_requests(frame.can_id):
+            bus.unasked(frame.can_id)
+        for can_id, word in self.gateway.noticed() if self._named else ():
+            bus.notice(can_id, word)
 
 
 def brake_late(track: dict[str, float]) -> tuple[int, float]:

@@ -1,25 +1,21 @@
 """The same drive with the same faults, over a real hub in lockstep and in virtual time."""
 
-import threading
 from collections import deque
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
 import msgspec
-from busharness import DEADLINE_S, RunningHub, running_hub
+from busharness import FunctionGateway, RunningHub, running_hub
 from puredrive import CODEC
 
 from aftbed.core.busfault import BusFault, Struck
-from aftbed.core.errors import HarnessError
 from aftbed.inject.buswords import parse
 from aftbed.vehicle.aim import aimed
-from aftbed.vehicle.bus import BusOptions, open_bus
 from aftbed.vehicle.candump import read_log
 from aftbed.vehicle.car import CarBuses, DriveOptions, DriveReport, drive
 from aftbed.vehicle.frame import Frame
 from aftbed.vehicle.function import default_application
-from aftbed.vehicle.gateway import ClientGateway, Gateway
 from aftbed.vehicle.hubclient import HubOptions
 from aftbed.vehicle.report import VehicleResult
 from aftbed.vehicle.scenario import load_scenario
@@ -51,46 +47,6 @@ class Disturbed(msgspec.Struct):
         return {frame.can_id for frame in self.frames}
 
 
-class NamedGateway:
-    """The client process in a thread, as `runtime.unix.gateway` is: it says its name, and what it notices."""
-
-    def __init__(self, options: BusOptions) -> None:
-        self.gateway = ClientGateway(Gateway(CODEC))
-        self._function = default_application()
-        self._bus = open_bus(msgspec.structs.replace(options, node="gateway", uses=self.gateway.uses()))
-        self._over = threading.Event()
-        self._thread = threading.Thread(target=self._run, daemon=True)
-        self._thread.start()
-
-    def __enter__(self) -> "NamedGateway":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._over.set()
-        self._thread.join(DEADLINE_S)
-        assert not self._thread.is_alive()
-        self._bus.close()
-
-    def _run(self) -> None:
-        while not self._over.is_set():
-            try:
-                frame = self._bus.recv(0.02)
-                if frame is not None:
-                    self._hear(frame)
-            except HarnessError:  # the hub went first
-                return
-
-    def _hear(self, frame: Frame) -> None:
-        payload = self.gateway.on_frame(frame)
-        if payload is not None:
-            for answer in self.gateway.on_reply(self._function.execute(payload), 1, 1):
-                self._bus.send(answer)
-        elif self.gateway.makes_requests(frame.can_id):
-            self._bus.unasked(frame.can_id)
-        for can_id, word in self.gateway.noticed():
-            self._bus.notice(can_id, word)
-
-
 def arm(hub: RunningHub, faults: tuple[str, ...]) -> None:
     for number, words in enumerate(faults, FIRST_NUMBER):
         one = fault(words)
@@ -104,7 +60,7 @@ def real(
     lockstep = pace is None
     with (
         running_hub(log, HubOptions(lockstep=lockstep, pace=pace or 1.0)) as hub,
-        NamedGateway(hub.options) as gateway,
+        FunctionGateway(hub.options, CODEC, named=True) as gateway,
         closing(CarBuses(hub.options, lockstep=lockstep, hears=(CODEC.can_id("AEB_REQ"),))) as buses,
     ):
         arm(hub, faults)
@@ -116,7 +72,9 @@ def real(
             report=lambda telemetry: then(hub, telemetry.t_ms) if then is not None else None,
             stop=lambda: False,
         )
-        struck, refused = hub.struck(), dict(gateway.gateway.counts.refused)
+        struck = hub.struck()
+        gateway.rest()
+        refused = dict(gateway.gateway.counts.refused)
     frames = [entry.frame for entry in read_log(log)[0]]
     return Disturbed(frames, report.result, struck, refused, report)
 

@@ -4,6 +4,7 @@ Who judges whether one has bitten are the receivers: the gateway's E2E checks, t
 """
 
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -294,11 +295,12 @@ def test_a_babbling_idiot_in_real_time_starts_and_ends_by_itself(hub: RunningHub
 def test_a_delayed_frame_comes_in_its_time_though_nothing_else_happens(hub: RunningHub) -> None:
     with Node(hub.port, "radar") as radar, Node(hub.port, "brake") as brake:
         arm(hub, "delay bus RADAR_TRACK by 30ms")
+        sent_s = time.monotonic()
         radar.send(0x130)
         radar.send(0x131)
         second, first = brake.read().split(), brake.read().split()
         assert (second[2], first[2]) == ("131", "130")
-        assert float(first[3]) - float(second[3]) >= 0.025
+        assert time.monotonic() - sent_s >= 0.03, "however busy the machine is"
 
 
 def test_when_all_is_over_the_hub_looks_at_nothing_any_more(hub: RunningHub) -> None:
@@ -341,7 +343,7 @@ def test_the_car_is_told_what_to_look_for_whenever_it_comes(tmp_path: Path) -> N
         arm(hub, "omission bus AEB_REQ when gap > 30.5", 8)
         line.set_time(0)
         assert {n: str(c.quantity) for n, c in line.conditions.items()} == {FIRST_NUMBER: "ttc", 8: "gap"}
-        line.met(8)
+        line.met(8, 0)
         assert list(line.conditions) == [FIRST_NUMBER] and line.disturbed
         line.close()
 

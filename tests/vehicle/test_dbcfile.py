@@ -2,12 +2,16 @@
 
 import subprocess
 import sys
+import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from aftbed.core.errors import ConfigError, PeerError
-from aftbed.vehicle.dbcfile import load_dbc
+from aftbed.vehicle.dbcfile import Codec, find_dbc, load_dbc
 
 CODEC = load_dbc()
 
@@ -69,23 +73,154 @@ def test_unknown_names_come_with_the_nearest() -> None:
         CODEC.unit("RADAR_TRACK", "RANG")
 
 
+SYNTAX = 'BU_: X\nBO_ 1 X: 8 V\n SG_ A : 0|8@1+ (1,0) [0|1] "" V\n\nBO_ 2 Y 8 V\n'
+OUTSIDE = (
+    'BU_: X\nBO_ 2 Y: 8 V\n\nBO_ 1 X: 2 V\n SG_ A : 0|8@1+ (1,0) [0|1] "" V\n'
+    ' SG_ B : 12|8@1+ (1,0) [0|1] "" V\n'
+)
+OVERLAP = (
+    'BU_: X\nBO_ 1 X: 2 V\n SG_ A : 0|8@1+ (1,0) [0|1] "m" V\n SG_ B : 4|8@1- (0.5,1) [0|1] "" V\n'
+    'BO_ 2 Y: 1 V\n SG_ B : 0|8@1+ (1,0) [0|1] "" V\n'
+)
+WAY_OUT = " (a map with `strict: false` takes it as it is)"
+
+
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
+        (SYNTAX, "not a DBC that can be read: Invalid syntax at line 5, column 9"),
         ("BU_: X\nBO_ 1 X 8 V\n", "Invalid syntax at line 2"),
         ("", "Invalid syntax at line 1"),
-        ('BO_ 1 X: 8 V\n SG_ A : 60|8@1+ (1,0) [0|1] "" V\n', "The signal A does not fit in message X"),
-        ("BO_ 1 X: 64 V\n", "message X has 64 bytes, allowed is 0 to 8"),
+        (OUTSIDE, f"line 6: not a DBC that can be read: The signal B does not fit in message X.{WAY_OUT}"),
+        (
+            OVERLAP,
+            f"line 4: not a DBC that can be read: The signals B and A are overlapping in message X.{WAY_OUT}",
+        ),
+        (
+            'BU_: X\nBO_ 1 X: 8 V\n SG_ A : 0|0@1+ (1,0) [0|1] "" V\n',
+            "line 3: not a DBC that can be read: The sig",
+        ),
+        (
+            "BU_: X\nBO_ 2048 X: 8 V\n",
+            "line 2: not a DBC that can be read: Standard frame id 0x800 is more than 11",
+        ),
+        (
+            'BU_: X\nBO_ 1 X: 8 V\nBA_ "Cycle" BO_ 1 10;\n',
+            "line 3: not a DBC that can be read: 'Cycle' is not def",
+        ),
+        (
+            'BU_: X\nBO_ 1 X: 8 V\nVAL_ 1 SPED 1 "a";\n',
+            "line 3: not a DBC that can be read: unused VAL_ entries in",
+        ),
+        ('BU_: X\nBA_DEF_ BO_ "Cycle" INT 0 ;\nBO_ 1 X: 8 V\n', "cantools gives up: list index out of range"),
+        ("BU_: X\nBO_ 1 X: 64 V\n", "line 2: message X has 64 bytes, allowed is 0 to 8"),
+        ("BU_: X\nBO_ 1 X: -8 V\n", "line 2: message X has -8 bytes, allowed is 0 to 8"),
+        ("BU_: X\nBO_ 1 X: 8 V\nBO_ 2 X: 8 V\n", "line 2: message X stands twice, allowed is once"),
         ("BU_: X\n", "holds no message"),
     ],
 )
-def test_a_bad_dbc_is_refused(tmp_path: Path, text: str, reason: str) -> None:
+def test_a_bad_dbc_is_refused_with_the_reason_and_the_line(tmp_path: Path, text: str, reason: str) -> None:
     path = tmp_path / "bad.dbc"
     path.write_text(text)
     with pytest.raises(ConfigError) as error:
         load_dbc(path)
-    assert str(error.value).startswith(f"{path}: ")
-    assert reason in str(error.value)
+    assert str(error.value).startswith(f"{path}: {reason}") or f": {reason}" in str(error.value)
+    assert "\n" not in str(error.value)
+    assert ("strict" in str(error.value)) == (WAY_OUT in reason)  # offered only where it helps
+
+
+@pytest.fixture
+def lenient(tmp_path: Path) -> Callable[[str], Codec]:
+    """A DBC that contradicts itself, read all the same."""
+
+    def load(text: str) -> Codec:
+        (tmp_path / "bad.dbc").write_text(text)
+        return load_dbc(tmp_path / "bad.dbc", strict=False)
+
+    return load
+
+
+def test_signals_that_overlap_are_read_each_as_the_file_has_it(lenient: Callable[[str], Codec]) -> None:
+    codec = lenient(OVERLAP)
+    assert codec.decode("X", bytes([0xFF, 0x0A])) == {"A": 255.0, "B": -81 * 0.5 + 1.0}
+    assert codec.misfits("X") == codec.misfits("Y") == frozenset()
+    assert codec.patch("X", "B", 1.0) == (bytes([0xF0, 0x0F]), bytes(2))
+    assert codec.decode("Y", b"\x07") == {"B": 7.0}
+    with pytest.raises(PeerError, match="X of 1 bytes, expected 2"):
+        codec.decode("X", b"\x07")
+
+
+def test_a_signal_outside_its_message_is_not_there(lenient: Callable[[str], Codec]) -> None:
+    codec = lenient(OUTSIDE)
+    assert codec.decode("X", bytes([7, 0xFF])) == {"A": 7.0}
+    assert codec.misfits("X") == {"B"}
+    with pytest.raises(ConfigError, match=r"X\.B has no bits that stand for a value"):
+        codec.patch("X", "B", 1.0)
+
+
+def test_what_no_way_of_reading_helps_is_refused_without_offering_one(
+    lenient: Callable[[str], Codec],
+) -> None:
+    with pytest.raises(ConfigError, match="Invalid syntax at line 5") as error:
+        lenient(SYNTAX)
+    assert "strict" not in str(error.value)
+
+
+def test_a_scale_of_zero_stands_for_no_value(lenient: Callable[[str], Codec]) -> None:
+    codec = lenient('BU_: X\nBO_ 1 X: 8 V\n SG_ A : 0|8@1+ (0,0) [0|1] "" V\n')
+    with pytest.raises(ConfigError, match=r"X\.A has no bits that stand for a value"):
+        codec.patch("X", "A", 1.0)
+
+
+PIECES = (
+    "BO_",
+    "SG_",
+    "1",
+    "99999999999999",
+    "-1",
+    "1e999",
+    ":",
+    "|",
+    "@",
+    "(0,0)",
+    "m0",
+    "M",
+    "VAL_",
+    "BA_",
+    '"',
+    ";",
+)
+WORDS = Path(CODEC.path).read_text().split(" ")
+
+
+@given(
+    st.lists(st.tuples(st.integers(0, len(WORDS) - 1), st.sampled_from(["", *PIECES])), max_size=4),
+    st.booleans(),
+)
+@settings(max_examples=40)
+def test_a_damaged_dbc_is_loaded_or_refused(changes: list[tuple[int, str]], strict: bool) -> None:
+    words = list(WORDS)
+    for place, word in changes:
+        words[place] = word
+    with tempfile.NamedTemporaryFile("w", suffix=".dbc") as file:
+        file.write(" ".join(words))
+        file.flush()
+        try:
+            codec = load_dbc(Path(file.name), strict=strict)
+        except ConfigError as error:
+            assert str(error).startswith(f"{file.name}: ")
+            return
+        for name in codec.names():
+            if not codec.multiplexed(name):
+                codec.decode(name, bytes(codec.length(name)))
+
+
+def test_a_shipped_dbc_is_found_by_name_and_a_file_by_its_path(tmp_path: Path) -> None:
+    assert find_dbc("ars408-like").name == "ars408-like.dbc"
+    assert find_dbc("./esr-like") == Path("./esr-like")
+    assert find_dbc("mine.dbc") == Path("mine.dbc")
+    with pytest.raises(ConfigError, match="unknown DBC 'ars408'; did you mean 'ars408-like'"):
+        find_dbc("ars408")
 
 
 def test_a_dbc_that_is_not_there_is_refused(tmp_path: Path) -> None:

@@ -1,21 +1,17 @@
 """The mapped gateway: Toyota's radar, the real drive, and maps that do not fit."""
 
 from collections.abc import Callable
-from pathlib import Path
 
 import pytest
-import yaml
 from hypothesis import given
 from hypothesis import strategies as st
-from puredrive import CODEC, TOYOTA_DBC, TOYOTA_LOG
+from puredrive import CODEC
 
 from aftbed.core.errors import ConfigError
-from aftbed.vehicle.aebmessages import AebInput, AebTarget, decode_reply, decode_request
-from aftbed.vehicle.candump import read_log
+from aftbed.vehicle.aebmessages import AebInput, AebTarget, decode_request
 from aftbed.vehicle.frame import Frame
-from aftbed.vehicle.function import AebFunction
-from aftbed.vehicle.mapfile import RawSignal, find_map
 from aftbed.vehicle.mapped import MappedGateway, toyota_checksum
+from aftbed.vehicle.mapshape import RawSignal
 
 DBC = """
 BU_: X
@@ -273,6 +269,83 @@ def test_a_map_that_does_not_fit_is_refused(make: Make, old: str, new: str, reas
     assert reason in str(error.value)
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "reason"),
+    [
+        (
+            "last: 1}",
+            "last: 1}\n  slot: COUNTER",
+            "tracks.slot: found a signal, for 2 messages, allowed is one for",
+        ),
+        (
+            "  valid: VALID",
+            "  valid: VALID\n  slot: COUNT",
+            "unknown signal of TRACK_0 'COUNT'; did you mean",
+        ),
+        ("  valid: VALID", "  valid: VALID\n  slot: RANGE", "tracks.slot: found RANGE, which has a scale"),
+        (
+            "  valid: VALID",
+            "  valid: VALID\n  count: {message: END, signal: COUNTER}",
+            "tracks.count: found count without slot, allowed is both, or neither",
+        ),
+        (
+            "  valid: VALID",
+            "  slot: COUNTER\n  count: {message: END, signal: COUNTER}",
+            "cycle_end: found cycle_end and tracks.count, allowed is exactly one of them",
+        ),
+        (
+            "cycle_end: END\n",
+            "",
+            "cycle_end: found cycle_end and tracks.count, allowed is exactly one of them",
+        ),
+        (
+            "  lateral_offset: {signal: SIDE, unit: m}\n",
+            "",
+            "tracks: found lateral_offset and angle, allowed is exactly one of them",
+        ),
+        (
+            "  valid: VALID",
+            "  angle: {signal: SIDE, unit: deg}",
+            "tracks: found lateral_offset and angle, allowed is exactly one of them",
+        ),
+        ("lateral_offset: {signal: SIDE, unit: m}", "angle: {signal: SIDE, unit: m}", "one of deg, rad"),
+        (
+            "lateral_offset: {signal: SIDE, unit: m}",
+            "angle: {signal: SIDE, unit: deg}",
+            "found deg, allowed is m, as",
+        ),
+        (
+            "valid: VALID",
+            "valid: {signal: VALIDE, values: [1]}",
+            "tracks.valid.signal: unknown signal of TRACK_0",
+        ),
+        ("valid: VALID", "valid: {signal: VALID, values: []}", "tracks.valid.values: found []"),
+        (
+            "valid: VALID",
+            "valid: {signal: RANGE, values: [1]}",
+            "tracks.valid.signal: found RANGE, which has a scale",
+        ),
+        (
+            "modulo: 256}\n  range",
+            "modulo: 2}\n  range",
+            "modulo: found 2, allowed is a whole number at least 3",
+        ),
+    ],
+)
+def test_what_does_not_go_together_is_refused(make: Make, old: str, new: str, reason: str) -> None:
+    """Of one message only, where `slot` is what is refused, since of two it cannot be right."""
+    with pytest.raises(ConfigError) as error:
+        _make_one(make, old, new) if "slot" in new and "2 messages" not in reason else make(old, new)
+    assert "radar.yaml: " in str(error.value)
+    assert reason in str(error.value)
+
+
+def _make_one(make: Make, old: str, new: str) -> MappedGateway:
+    """The map with one message of tracks, and one more text replaced."""
+    one = MAP.replace('name: "TRACK_{n}", first: 0, last: 1', "name: TRACK_0")
+    return make(MAP, one.replace(old, new, 1))
+
+
 _VALID_TO_SUM = DBC[DBC.index("SG_ VALID") : DBC.index("SUM :")]
 
 
@@ -290,40 +363,28 @@ def test_a_dbc_that_does_not_fit_is_refused(make: Make, old: str, new: str, reas
     assert reason in str(error.value)
 
 
-def test_an_unknown_map_comes_with_the_nearest() -> None:
-    with pytest.raises(ConfigError, match="unknown map 'toyotta'; did you mean 'toyota'"):
-        find_map("toyotta")
-    assert find_map("./my.yaml") == Path("./my.yaml")
+OVERLAPPING = ("NEW : 49|1@0+ (1,0) [0|1]", "NEW : 48|1@0+ (1,0) [0|1]")
+OUTSIDE = ("SG_ NEW : 49|1@0+", "SG_ NEW : 64|1@0+")
 
 
-def test_the_shipped_map_is_found_and_says_what_it_is() -> None:
-    assert yaml.safe_load(find_map("toyota").read_text())["cycle_end"] == "TRACK_B_15"
+def test_a_dbc_that_contradicts_itself_is_read_if_the_map_says_so(make: Make) -> None:
+    with pytest.raises(
+        ConfigError, match=r"radar\.dbc: line 9: .*NEW and VALID are overlapping in message TRACK_0"
+    ):
+        make(dbc=OVERLAPPING)
+    gateway = make("cycle_ms: 50", "cycle_ms: 50\nstrict: false", dbc=OVERLAPPING)
+    request = feed(gateway, ego(0), track(0, 0, 1), end(10, 1))
+    assert request is not None
+    assert request.targets == (AebTarget(0, 30.0, -2.0, True),)  # the one bit says both
 
 
-@pytest.mark.skipif(not TOYOTA_LOG.is_file(), reason="the real drive is not here")
-class TestRealDrive:
-    def frames(self) -> list[Frame]:
-        log, _ = read_log(TOYOTA_LOG)
-        start_us = log[0].frame.t_us
-        return [Frame(entry.frame.t_us - start_us, entry.frame.can_id, entry.frame.data) for entry in log]
-
-    def test_all_frames_are_accepted_and_the_function_never_even_warns(self) -> None:
-        gateway, function = MappedGateway(CODEC, TOYOTA_DBC, find_map("toyota")), AebFunction()
-        requests = [made for frame in self.frames() if (made := gateway.on_frame(frame)) is not None]
-        assert (gateway.counts.accepted, gateway.counts.refused) == (6920, {})
-        assert len(requests) == 200
-        cycles = [decode_request(request) for request in requests]
-        assert all(cycle.ego_valid and cycle.radar_valid and cycle.targets for cycle in cycles)
-        assert min(cycle.ego_speed_ms for cycle in cycles) * 3.6 > 49
-        nearest_m = min(target.range_m for cycle in cycles for target in cycle.targets)
-        assert 25.0 < nearest_m < 30.0
-        assert {decode_reply(function.execute(request)).stage for request in requests} == {0}
-
-    def test_damaged_frames_are_refused_one_by_one_and_nothing_else_is(self) -> None:
-        gateway = MappedGateway(CODEC, TOYOTA_DBC, find_map("toyota"))
-        damaged = 0
-        for number, frame in enumerate(self.frames()):
-            flip = 0x40 if number % 10 == 3 else 0
-            damaged += flip > 0
-            gateway.on_frame(Frame(frame.t_us, frame.can_id, bytes([frame.data[0] ^ flip]) + frame.data[1:]))
-        assert gateway.counts.refused == {"checksum": damaged}
+def test_a_signal_outside_its_message_cannot_be_mapped(make: Make) -> None:
+    with pytest.raises(ConfigError, match=r"radar\.dbc: line 9: .*NEW does not fit in message TRACK_0"):
+        make(dbc=OUTSIDE)
+    with pytest.raises(
+        ConfigError, match=r"tracks\.new: found NEW, which does not lie in TRACK_0, allowed is"
+    ):
+        make("cycle_ms: 50", "cycle_ms: 50\nstrict: false", dbc=OUTSIDE)
+    unused = MAP.replace("  new: NEW\n", "").replace("cycle_ms: 50", "cycle_ms: 50\nstrict: false")
+    gateway = make(MAP, unused, dbc=OUTSIDE)
+    assert feed(gateway, ego(0), track(0, 0, 1), end(10, 1)) is not None

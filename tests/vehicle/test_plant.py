@@ -2,7 +2,7 @@
 
 import pytest
 
-from aftbed.vehicle.plant import GRAVITY_MS2, Lead, LeadBraking, Plant, PlantSetup
+from aftbed.vehicle.plant import GRAVITY_MS2, Brakes, CutIn, Lead, LeadBraking, Plant, PlantSetup
 
 
 def run(plant: Plant, steps: int, demand_ms2: float) -> Plant:
@@ -93,8 +93,64 @@ def test_a_lead_brakes_with_its_ramp_and_stops() -> None:
 
 
 def test_a_jerk_limit_makes_the_brakes_slower() -> None:
-    free, limited = (run(Plant(PlantSetup(20.0, jerk_max_ms3=j)), 200, 9.0) for j in (None, 20.0))
+    free, limited = (
+        run(Plant(PlantSetup(20.0, brakes=Brakes(jerk_max_ms3=j))), 200, 9.0) for j in (None, 20.0)
+    )
     assert -limited.acceleration_ms2 < 20.0 * 0.1 + 0.3 < -free.acceleration_ms2
+
+
+def test_brakes_give_no_more_than_they_can_though_the_tyres_would() -> None:
+    able, laden = (
+        run(Plant(PlantSetup(30.0, brakes=Brakes(deceleration_max_ms2=most))), 1000, 12.0)
+        for most in (None, 6.43)
+    )
+    assert able.result().max_deceleration_ms2 > 0.9 * GRAVITY_MS2
+    assert 6.43 < laden.result().max_deceleration_ms2 < 6.43 + 0.5
+    slippery = PlantSetup(30.0, friction=0.3, brakes=Brakes(deceleration_max_ms2=6.43))
+    assert run(Plant(slippery), 1000, 12.0).result().max_deceleration_ms2 < 0.3 * GRAVITY_MS2 + 0.5
+
+
+@pytest.mark.parametrize("dead_time_ms", [0, 1, 50, 250])
+def test_the_dead_time_is_what_it_is_said_to_be(dead_time_ms: int) -> None:
+    """Nothing but resistance for so long; all that was asked for in the next step, without a lag."""
+    plant = run(Plant(PlantSetup(20.0, brakes=Brakes(dead_time_ms, lag_ms=0))), dead_time_ms, 5.0)
+    assert -plant.acceleration_ms2 < 0.3
+    assert -run(plant, 1, 5.0).acceleration_ms2 == pytest.approx(5.0 + 0.12 + 0.108, abs=0.01)
+
+
+@pytest.mark.parametrize("lag_ms", [50, 200])
+def test_after_one_lag_of_any_length_the_brakes_give_63_percent(lag_ms: int) -> None:
+    plant = run(Plant(PlantSetup(30.0, brakes=Brakes(0, lag_ms))), lag_ms, 5.0)
+    resistance_ms2 = 0.12 + 0.00027 * plant.speed_ms**2
+    assert -plant.acceleration_ms2 - resistance_ms2 == pytest.approx(5.0 * 0.632, abs=0.05)
+
+
+def test_a_car_beside_our_lane_is_passed_and_not_hit() -> None:
+    plant = run(Plant(PlantSetup(10.0, Lead(20.0, lateral_m=3.5))), 1999, 0.0)
+    assert plant.gap_m == pytest.approx(0.01)
+    assert plant.ttc_s() == pytest.approx(0.001)
+    run(plant, 2, 0.0)
+    assert (plant.gap_m, plant.ttc_s(), plant.speed_ms) == (None, None, 10.0)
+    result = run(plant, 500, 9.0).result()
+    assert (result.collision, result.min_gap_m, result.stop_gap_m) == (False, None, None)
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_a_car_cuts_in_evenly_and_its_gap_counts_from_when_it_is_in_the_way(side: float) -> None:
+    lead = Lead(30.0, 10.0, lateral_m=3.6 * side, cut_in=CutIn(1000, 2000))
+    plant = run(Plant(PlantSetup(12.0, lead)), 1000, 0.0)
+    assert plant.lateral_m == 3.6 * side
+    assert run(plant, 1000, 0.0).lateral_m == pytest.approx(1.8 * side)
+    assert run(plant, 500, 0.0).lateral_m == pytest.approx(0.9 * side)
+    assert run(plant, 700, 0.0).lateral_m == 0.0
+    assert plant.result().min_gap_m == plant.gap_m == pytest.approx(30.0 - 3.2 * 2.0)
+
+
+def test_a_car_that_has_cut_in_is_hit_like_any_other() -> None:
+    lead = Lead(10.0, 10.0, lateral_m=3.0, cut_in=CutIn(0, 500))
+    result = run(Plant(PlantSetup(20.0, lead)), 2000, 0.0).result()
+    assert result.collision
+    assert result.impact_speed_kmh == pytest.approx(36.0)
 
 
 def test_time_to_collision() -> None:

@@ -11,7 +11,7 @@ from aftbed.core.errors import ConfigError
 from aftbed.vehicle.aebmessages import STAGE_FULL, STAGE_NONE, STAGE_WARN
 from aftbed.vehicle.ecus import Fallback
 from aftbed.vehicle.frame import Frame
-from aftbed.vehicle.plant import Lead, LeadBraking, PlantSetup
+from aftbed.vehicle.plant import Brakes, CutIn, Driver, Lead, LeadBraking, PlantSetup
 from aftbed.vehicle.report import VehicleResult
 from aftbed.vehicle.scenario import broken_expectations, load_scenario, scenario_names
 
@@ -155,6 +155,7 @@ ego: {speed_kmh: 36}
 lead: {gap_m: 40, speed_kmh: 18, braking: {after_s: 1, deceleration_ms2: 6, ramp_s: 0.5}}
 road: {friction: 0.5}
 brakes: {jerk_max_ms3: 30}
+driver: {reaction_s: 1.2, deceleration_ms2: 4}
 expect: {outcome: impact, impact_speed_kmh_max: 20}
 """
 
@@ -168,8 +169,28 @@ def write(folder: Path, text: str) -> str:
 def test_a_file_becomes_a_scenario_in_si_units(tmp_path: Path) -> None:
     scenario = load_scenario(write(tmp_path, GOOD))
     lead = Lead(40.0, 5.0, LeadBraking(1000, 6.0, 500))
-    assert scenario.plant == PlantSetup(10.0, lead, friction=0.5, jerk_max_ms3=30.0)
+    assert scenario.plant == PlantSetup(10.0, lead, 0.5, Brakes(jerk_max_ms3=30.0), Driver(1200, 4.0))
     assert (scenario.name, scenario.duration_ms, scenario.expect.outcome) == ("mine", 5000, "impact")
+
+
+def test_what_is_left_out_has_the_values_of_the_plant(tmp_path: Path) -> None:
+    text = GOOD.replace(", ramp_s: 0.5", "")
+    for key in ("road", "brakes", "driver"):
+        text = "\n".join(line for line in text.splitlines() if not line.startswith(key))
+    scenario = load_scenario(write(tmp_path, text))
+    assert scenario.plant == PlantSetup(10.0, Lead(40.0, 5.0, LeadBraking(1000, 6.0, 1000)))
+    assert scenario.plant.brakes == Brakes(dead_time_ms=100, lag_ms=100)
+
+
+def test_brakes_and_the_way_into_the_lane_are_settable(tmp_path: Path) -> None:
+    text = GOOD.replace(
+        "brakes: {jerk_max_ms3: 30}",
+        "brakes: {dead_time_s: 0.05, lag_s: 0, jerk_max_ms3: 30, deceleration_max_ms2: 6.43}",
+    ).replace("gap_m: 40,", "gap_m: 40, lateral_m: -3.5, cut_in: {after_s: 1, over_s: 2},")
+    scenario = load_scenario(write(tmp_path, text))
+    assert scenario.plant.brakes == Brakes(50, 0, 30.0, 6.43)
+    assert scenario.plant.lead is not None
+    assert (scenario.plant.lead.lateral_m, scenario.plant.lead.cut_in) == (-3.5, CutIn(1000, 2000))
 
 
 def test_a_gap_may_be_given_as_time_to_collision(tmp_path: Path) -> None:
@@ -202,6 +223,43 @@ def test_a_gap_may_be_given_as_time_to_collision(tmp_path: Path) -> None:
         ("gap_m: 40, speed_kmh: 18", "ttc_s: 4, speed_kmh: 36", "lead.ttc_s: found 4.0, allowed is gap_m"),
         ("after_s: 1", "after: 1", "lead.braking: unknown key 'after'; did you mean 'after_s'"),
         ("outcome: impact", "outcome: crash", "expect.outcome: found 'crash', allowed is one of impact, no_"),
+        (
+            "speed_kmh: 36",
+            "speed_kmh: 201",
+            "ego.speed_kmh: found 201, allowed is a number at least 0 and at most 200",
+        ),
+        (
+            "speed_kmh: 18",
+            "speed_kmh: 250",
+            "lead.speed_kmh: found 250, allowed is a number at least 0 and at most 200",
+        ),
+        (
+            "jerk_max_ms3: 30",
+            "dead_time_s: 3",
+            "brakes.dead_time_s: found 3, allowed is a number at least 0 and at most 2",
+        ),
+        ("jerk_max_ms3: 30", "lag_ms: 100", "brakes: unknown key 'lag_ms'; did you mean 'lag_s'"),
+        (
+            "jerk_max_ms3: 30",
+            "deceleration_max_ms2: 0",
+            "brakes.deceleration_max_ms2: found 0, allowed is a number more than 0 and at most 12 or nothing",
+        ),
+        (
+            "gap_m: 40,",
+            "gap_m: 40, lateral_m: 11,",
+            "lead.lateral_m: found 11, allowed is a number at least -10 and at most 10",
+        ),
+        (
+            "gap_m: 40,",
+            "gap_m: 40, cut_in: {after_s: 1, over_s: 2},",
+            "lead.cut_in: found without lateral_m, allowed is a car beside our lane",
+        ),
+        (
+            "reaction_s: 1.2",
+            "reaction_s: -1",
+            "driver.reaction_s: found -1, allowed is a number at least 0 and at most 10",
+        ),
+        ("reaction_s: 1.2, ", "", "driver: key 'reaction_s' is missing"),
         ("friction: 0.5", "friction: [1]", "road.friction: found [1], allowed is a number"),
         ("ego: {speed_kmh: 36}", "ego: 36", "ego: found 36, allowed is keys and values: speed_kmh"),
         ("description: a test", "description: {", "line "),

@@ -8,7 +8,6 @@ import os
 import subprocess
 import sys
 import tempfile
-import threading
 from collections.abc import Callable
 from contextlib import closing
 from functools import cache
@@ -18,18 +17,15 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from busharness import DEADLINE_S, running_hub
+from busharness import FunctionGateway, running_hub
 from puredrive import CODEC
 
-from aftbed.core.errors import HarnessError
-from aftbed.vehicle.bus import BusOptions, open_bus
 from aftbed.vehicle.candump import log_line
 from aftbed.vehicle.car import CarBuses, DriveOptions, DriveReport
 from aftbed.vehicle.car import drive as drive_on_hub
 from aftbed.vehicle.ecus import BrakePolicy
 from aftbed.vehicle.frame import Frame
 from aftbed.vehicle.function import default_application
-from aftbed.vehicle.gateway import ClientGateway, Gateway
 from aftbed.vehicle.hubclient import HubOptions
 from aftbed.vehicle.report import VehicleResult
 from aftbed.vehicle.scenario import broken_expectations, load_scenario, scenario_names
@@ -106,43 +102,11 @@ def drive(
 # -- the real drive ------------------------------------------------------------------------------
 
 
-class FunctionGateway:
-    """The client process in a thread: the gateway, and the bare function as its server."""
-
-    def __init__(self, options: BusOptions) -> None:
-        self._gateway = ClientGateway(Gateway(CODEC))
-        self._function = default_application()
-        self._bus = open_bus(options)
-        self._over = threading.Event()
-        self._thread = threading.Thread(target=self._run, daemon=True)
-        self._thread.start()
-
-    def __enter__(self) -> "FunctionGateway":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._over.set()
-        self._thread.join(DEADLINE_S)
-        assert not self._thread.is_alive()
-        self._bus.close()
-
-    def _run(self) -> None:
-        while not self._over.is_set():
-            try:
-                frame = self._bus.recv(0.02)
-                payload = self._gateway.on_frame(frame) if frame is not None else None
-                if payload is not None:
-                    for answer in self._gateway.on_reply(self._function.execute(payload), 1, 1):
-                        self._bus.send(answer)
-            except HarnessError:  # the hub went first
-                return
-
-
 def real_drive(log: Path, scenario: str, policy: BrakePolicy, seed: int) -> DriveReport:
     """In lockstep, over a real hub."""
     with (
         running_hub(log, HubOptions(lockstep=True)) as hub,
-        FunctionGateway(hub.options),
+        FunctionGateway(hub.options, CODEC),
         closing(CarBuses(hub.options, lockstep=True)) as buses,
     ):
         options = DriveOptions(pace=None, brake_policy=policy, seed=seed)

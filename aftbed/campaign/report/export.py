@@ -89,7 +89,8 @@ def write_parquet(ledger: Ledger, path: Path) -> None:
     kinds = {str: pyarrow.string(), int: pyarrow.int64(), float: pyarrow.float64(), bool: pyarrow.bool_()}
     schema = pyarrow.schema([(name, kinds[kind]) for name, kind in COLUMNS.items()])
     head = ledger.head
-    about = {"campaign": head.campaign, "seed": str(head.seed), "spec": head.digest, "code": head.code}
+    spec = head.spec
+    about = {"campaign": spec.campaign, "seed": str(spec.seed), "spec": head.digest, "code": head.code}
     table = pyarrow.Table.from_pylist(list(rows(ledger)), schema=schema.with_metadata(about))
     try:
         parquet.write_table(table, path)

@@ -107,7 +107,8 @@ def _allowed(name: str, gates: Iterable[GateResult]) -> bool:
 def _worst_text(results: list[Result]) -> str:
     worst = worst_of(results)
     experiment = worst.experiment
-    lines = [f"the worst: experiment {experiment.id}: {worst.outcome}", *worst.reasons, experiment.command()]
+    head = f"the worst: experiment {experiment.id}: {worst.outcome}"
+    lines = [head, *worst.broken, *worst.reasons, experiment.command()]
     return "\n".join(lines)
 
 

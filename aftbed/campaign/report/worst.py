@@ -1,7 +1,8 @@
 """The runs that a person should look at first, and what happened in one of them.
 
-First come the unexpected ones; then, among these and behind them, the worst outcome; then the slowest. One
-run of a stratum stands for it: forty runs that fail in the same way are one thing to know.
+First come those that broke what no fault excuses, then the unexpected ones; then, among these and behind
+them, the worst outcome; then the slowest. One run of a stratum stands for it: forty runs that fail in the
+same way are one thing to know.
 
 A ledger keeps no messages, so a run is simulated to draw it: same bricks, scripts, faults and seed. A run of
 real processes need not come to the same there (the times are others, so a fault may strike another request);
@@ -33,7 +34,7 @@ def by_badness(results: Iterable[Result]) -> list[Result]:
     """One of each stratum, the worst first. A run that came out at its best and as expected is left out."""
     found: dict[str, Result] = {}
     for result in sorted(results, key=_badness, reverse=True):
-        if result.unexpected or result.outcome != OUTCOMES[0] or not result.activated:
+        if result.broken or result.unexpected or result.outcome != OUTCOMES[0] or not result.activated:
             found.setdefault(result.experiment.stratum, result)
     return list(found.values())
 
@@ -59,7 +60,7 @@ def rerun(experiment: Experiment) -> Rerun:
         return Rerun(again.outcome, None, str(error)[:REASON_MAX] or type(error).__name__)
 
 
-def _badness(result: Result) -> tuple[bool, int, float, int]:
+def _badness(result: Result) -> tuple[bool, bool, int, float, int]:
     """Of two that are equally bad the earlier comes first."""
     place = OUTCOMES.index(result.outcome) if result.outcome in OUTCOMES else len(OUTCOMES)
-    return result.unexpected, place, slowness_ms(result), -result.experiment.index
+    return bool(result.broken), result.unexpected, place, slowness_ms(result), -result.experiment.index

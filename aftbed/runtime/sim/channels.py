@@ -51,6 +51,11 @@ class Channel:
         """Of its writing end."""
         return self.write.number
 
+    @property
+    def beneath(self) -> "Channel":
+        """Itself: what may be laid over it is another."""
+        return self
+
     def heard_by(self) -> frozenset[str]:
         """Who reads it."""
         return frozenset([node.name for node in self.readers])

@@ -148,9 +148,14 @@ class Car:
         return None if due is None else due + self._began_ns
 
     @property
+    def over(self) -> bool:
+        """The drive is over."""
+        return self._car.due_ns() is None
+
+    @property
     def done(self) -> bool:
         """The drive is over, and all is answered."""
-        return self._car.due_ns() is None and not self._payloads and not self._client.unanswered
+        return self.over and not self._payloads and not self._client.unanswered
 
     def stats(self) -> bytes:
         """How far the requests are."""

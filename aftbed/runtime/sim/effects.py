@@ -49,6 +49,16 @@ class _Held(NamedTuple):
     limit_ns: int
 
 
+def _way(tried: Channel, now: Channel | Callable[[Message], None]) -> Channel | None:
+    """Where to send what had no room in `tried`, since the port leads `now`; None where that is elsewhere.
+
+    A fault that was armed at the channel meanwhile strikes what is sent later.
+    """
+    if not isinstance(now, Channel) or now.beneath is not tried.beneath:
+        return None
+    return tried if tried.beneath is tried else now
+
+
 class Performer:
     """Of one node. `doom`: a brick, and before which of its effects it dies; `held_by`: a fault, or 0."""
 
@@ -135,7 +145,8 @@ class Performer:
             at, effect = held.at, held.effects[held.at]
             if held.out is not None:
                 assert isinstance(effect, Send)
-                if held.hosted.outs[effect.port] is held.out and not held.out.put(effect.message):
+                way = _way(held.out, held.hosted.outs[effect.port])
+                if way is not None and not way.put(effect.message):
                     if self._clock.ns >= held.limit_ns:
                         raise Died("fenced")
                     return False

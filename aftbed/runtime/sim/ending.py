@@ -1,12 +1,21 @@
-"""The states in which the Servers of a simulated run end: see `runtime.hosting`."""
+"""How a simulated run comes to its end: whether all is asked and answered, what is not at rest, which states.
+
+The states are those of the Servers: see `runtime.hosting`.
+"""
 
 import contextlib
 
 from aftbed.core.errors import PeerError
+from aftbed.ftm.client import Client
+from aftbed.ftm.mechanism import replication_of
 from aftbed.runtime.cell import look
+from aftbed.runtime.conductor import Conductor
 from aftbed.runtime.deployment import Deployment
 from aftbed.runtime.hosting import digest
+from aftbed.runtime.sim.devices import Car
+from aftbed.runtime.sim.node import Node
 from aftbed.runtime.sim.processes import Process
+from aftbed.runtime.source import Load
 
 
 def states_of(deployment: Deployment) -> dict[str, str]:
@@ -18,4 +27,39 @@ def states_of(deployment: Deployment) -> dict[str, str]:
             with contextlib.suppress(PeerError):
                 state = look(process.node.hosted(f"{replica}/server").brick)
                 found |= {replica: digest(state)} if state else {}
+    return found
+
+
+def _client(deployment: Deployment) -> Node | None:
+    process = deployment.nodes.get("client")
+    return process.node if isinstance(process, Process) and not process.dead else None
+
+
+def source_ended(deployment: Deployment, count: int) -> bool:
+    """Whether all requests have been made, be they answered or not."""
+    node = _client(deployment)
+    if node is None or node.device is None:
+        return False
+    if isinstance(node.device, Car):
+        return node.device.over
+    client = node.hosted("client").brick
+    return isinstance(client, Client) and client.next_id > count
+
+
+def unrest(conductor: Conductor) -> list[str]:
+    """Why the run has not come to rest."""
+    deployment, found = conductor.deployment, []
+    node = _client(deployment)
+    device = node.device if node is not None else None
+    if not isinstance(device, Load | Car):
+        found.append("no client")
+    elif not device.done:
+        found.append("requests wait")
+    if conductor.executor.busy or conductor.adaptations.busy or conductor.adaptations.to_come:
+        found.append("a script is under way")
+    if replication_of(deployment.graph.ftm) and not deployment.backup:
+        found.append("no redundancy")
+    found += [f"{name} is under way" for name in deployment.support.loop.jobs.names()]
+    processes = [p for p in deployment.nodes.values() if isinstance(p, Process)]
+    found += [f"{p.name} is dead or stopped" for p in processes if p.stopped()][:1]
     return found

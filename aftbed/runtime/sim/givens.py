@@ -3,8 +3,10 @@
 from functools import lru_cache
 from typing import Final, NoReturn
 
+from aftbed.core.busfault import BusFault
 from aftbed.core.errors import ConfigError
 from aftbed.core.event import Event
+from aftbed.core.fault import Fault, FlipMemory
 from aftbed.core.graph import Graph
 from aftbed.core.journal import Record
 from aftbed.ftm.mechanism import build
@@ -36,6 +38,18 @@ def car_in(scenario: str, seed: int) -> VirtualCar:
 @lru_cache(maxsize=1)
 def _codec() -> Codec:
     return load_dbc()
+
+
+def check(fault: Fault, scenario: str) -> None:
+    """Raise ConfigError where there is nothing here that `fault` could strike, or wait for."""
+    if isinstance(fault.action, FlipMemory):
+        raise ConfigError(f"{fault}: simulated processes have no memory of their own; use real ones")
+    if scenario:
+        return
+    if isinstance(fault.action, BusFault):
+        raise ConfigError(f"{fault}: without a scenario there is no bus")
+    if fault.trigger.when is not None:
+        raise ConfigError(f"{fault}: 'when' looks at the car, and without a scenario there is none")
 
 
 def nothing_off_line(place: str) -> NoReturn:

@@ -54,7 +54,7 @@ class Node:
         self._say, self._on_end = say, on_end
         self.bricks: dict[str, Hosted] = {}
         self.armed: dict[Event, control.Arm] = {}
-        self.slowed: dict[int, int] = {}
+        self.slowed: dict[int, control.SlowDown] = {}
         self.diverted: dict[tuple[str, str], Diversion] = {}
         self._hindrance = Hindrance(self, clock)
         self.cells: Sequence[Cell] = ()  # those of the run

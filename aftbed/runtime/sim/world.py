@@ -7,34 +7,35 @@ answer, no script is under way, redundancy is back. It leaves a history, for the
 
 from collections.abc import Callable, Iterable
 from random import Random
-from typing import Final
+from typing import Final, NoReturn
 
 import msgspec
 
+from aftbed.adapt.bricks import LoadModule
 from aftbed.core.application import Application
-from aftbed.core.busfault import BusFault, Struck
+from aftbed.core.busfault import BusFault, Condition, Struck
 from aftbed.core.check import History
-from aftbed.core.errors import ConfigError
-from aftbed.core.fault import Fault
+from aftbed.core.fault import Fault, FlipMemory
 from aftbed.core.graph import Graph, Link
 from aftbed.core.journal import Entry, EntryKind, Record
 from aftbed.core.message import Goal, Scheduled
 from aftbed.core.valuefault import Flip
 from aftbed.ftm.client import Client
-from aftbed.ftm.mechanism import replication_of
 from aftbed.runtime import control, targets
 from aftbed.runtime.adaptations import Outcome
 from aftbed.runtime.assembly import Assembler, Make
 from aftbed.runtime.conductor import Conductor
 from aftbed.runtime.deployment import Keys
 from aftbed.runtime.hosting import Hosted, hosted
+from aftbed.runtime.interface import Met
 from aftbed.runtime.jobs import Wait
+from aftbed.runtime.sim import ending
 from aftbed.runtime.sim.cells import Cell
 from aftbed.runtime.sim.channels import Channel
 from aftbed.runtime.sim.clock import START_NS, Clock
 from aftbed.runtime.sim.devices import Car, Device, Sensor
-from aftbed.runtime.sim.ending import states_of
-from aftbed.runtime.sim.givens import Journal, car_in, graph_of, nothing_off_line, requests_of
+from aftbed.runtime.sim.drive import Drive
+from aftbed.runtime.sim.givens import Journal, check, graph_of, nothing_off_line, requests_of
 from aftbed.runtime.sim.node import Node
 from aftbed.runtime.sim.processes import Nursery, Process
 from aftbed.runtime.source import Load, resume_client
@@ -111,13 +112,16 @@ class World:
         function: Callable[[], Application] = default_application,
         requests: list[bytes] | None = None,
         make: Make | None = None,
+        load: LoadModule = nothing_off_line,
         channel: type[Channel] = Channel,
         clock: Callable[[Random], Clock] = Clock,
     ) -> None:
         self.setup, self._channel = setup, channel
-        self._car = car_in(setup.scenario, setup.seed) if setup.scenario else None
         self._requests = requests if requests is not None else requests_of(0)
         self.loop = clock(Random(setup.seed))
+        self._drive = Drive(setup.scenario, setup.seed, self.loop) if setup.scenario else None
+        for fault in setup.faults:
+            check(fault, self.setup.scenario)
         self.journals: dict[str, list[Record]] = {}
         self.dialogue: list[Entry] = []
         self.told: list[tuple[int, str, str]] = []
@@ -126,9 +130,8 @@ class World:
         self.struck: list[tuple[int, str]] = []  # who died, or was stopped, of a fault, and when
         self.effects: dict[str, int] = {}
         self.lost = False
-        self._car_began_ns = 0
         self.journal = Journal(self.journals.setdefault("supervisor.1", []))
-        assembler = Assembler(function, nothing_off_line, make)
+        assembler = Assembler(function, load, make)
         self.nursery = Nursery(
             self.loop, assembler, self._make_device, self._ends.__getitem__, self._journal_for
         )
@@ -175,15 +178,24 @@ class World:
         return Random(f"{self.setup.seed}/{number}").getrandbits(DRAW_BITS)
 
     def disturb(self, number: int, fault: BusFault, draw: int) -> Keys:
-        """In the car's own bus. Raises ConfigError where there is none."""
-        if self._car is None:
-            raise ConfigError(f"{fault}: without a scenario there is no bus")
-        self._car.disturb(number, fault, draw, self.loop.ns - self._car_began_ns if self._launched else 0)
+        """In the car's own bus."""
+        assert self._drive is not None, fault
+        self._drive.disturb(number, fault, draw)
         yield Wait(frozenset())
+
+    def watch(self, number: int, condition: Condition, met: Callable[[Met], None]) -> Keys:
+        """By the car itself."""
+        assert self._drive is not None, condition
+        self._drive.watch(condition, met)
+        yield Wait(frozenset())
+
+    def flip_memory(self, process: object, flip: FlipMemory, draw: int) -> NoReturn:
+        """Nobody asks for it: see `givens.check`."""
+        raise AssertionError(f"{process} has no memory")
 
     def bus_fault(self, number: int) -> Struck | None:
         """By the car's bus."""
-        return self._car.struck_by(number) if self._car is not None else None
+        return self._drive.struck_by(number) if self._drive is not None else None
 
     def pin(self, pid: int, cpu: int) -> None:
         """There are no cores here."""
@@ -215,9 +227,8 @@ class World:
         client = node.hosted(order.bricks[0].name).brick
         assert isinstance(client, Client)
         resume_client(client, self.dialogue)
-        if self._car is not None:
-            self._car_began_ns = self._car_began_ns or self.loop.ns
-            return Car(client, self, self._car, self._car_began_ns)
+        if self._drive is not None:
+            return Car(client, self, *self._drive.seat(node.run))
         return Load(client, self, self._requests, self.setup.count, self.setup.rate_hz)
 
     def write(self, now_ns: int, request_id: int, epoch: int, kind: EntryKind, payload: bytes) -> None:
@@ -268,6 +279,8 @@ class World:
     def _on_launched(self, failure: str) -> None:
         assert not failure, f"the launch of {self.setup}: {failure}"
         self._launched = True
+        if self._drive is not None:
+            self._drive.go()
         self.conductor.inform_recovery(failed=False)
         self.loop.after(TICK_SECONDS, self._tick)
         self.loop.begin()
@@ -300,6 +313,7 @@ class World:
 
     def inject(self, fault: Fault) -> None:
         """Arm one more, now. Raises ConfigError where there is no such fault."""
+        check(fault, self.setup.scenario)
         targets.check(fault, self.conductor.deployment.graph)
         self.loop.jobs.start("inject", self.conductor.faults.arm(fault), lambda failure: None)
         self.loop.watch_jobs()
@@ -318,10 +332,11 @@ class World:
                 if not loop.step():
                     return
             loop.watch_jobs()
-            if not done_ns and (self._source_ended() or (self.lost and self._car is None)):
+            ended = ending.source_ended(self.conductor.deployment, self.setup.count)
+            if not done_ns and (ended or (self.lost and self._drive is None)):
                 done_ns = loop.ns
             if done_ns:
-                rested_ns = (rested_ns or loop.ns) if self.lost or not self._unrest() else 0
+                rested_ns = (rested_ns or loop.ns) if self.lost or not ending.unrest(self.conductor) else 0
             late = loop.ns > self._limit_ns() or (done_ns and loop.ns > done_ns + REST_NS_MAX)
             if late or (rested_ns and loop.ns > rested_ns + STRAY_NS):
                 return
@@ -330,40 +345,8 @@ class World:
     def _limit_ns(self) -> int:
         """A source that is held up for ever must not hold up the simulator."""
         period = 1 / self.setup.rate_hz if self.setup.rate_hz else 0.001
-        seconds = 60.0 if self._car is not None else self.setup.count * period
+        seconds = 60.0 if self._drive is not None else self.setup.count * period
         return START_NS + round(seconds * 1e9) + 2 * REST_NS_MAX
-
-    def _client(self) -> Node | None:
-        process = self.conductor.deployment.nodes.get("client")
-        return process.node if isinstance(process, Process) and not process.dead else None
-
-    def _source_ended(self) -> bool:
-        """All requests have been made, whether they are answered or not."""
-        node = self._client()
-        if node is None or node.device is None:
-            return False
-        if isinstance(node.device, Car):
-            return self._car is not None and self._car.due_ns() is None
-        client = node.hosted("client").brick
-        return isinstance(client, Client) and client.next_id > self.setup.count
-
-    def _unrest(self) -> list[str]:
-        """Why the run has not come to rest."""
-        conductor, found = self.conductor, []
-        node = self._client()
-        device = node.device if node is not None else None
-        if not isinstance(device, Load | Car):
-            found.append("no client")
-        elif not device.done:
-            found.append("requests wait")
-        if conductor.executor.busy or conductor.adaptations.busy or conductor.adaptations.to_come:
-            found.append("a script is under way")
-        if replication_of(conductor.deployment.graph.ftm) and not conductor.deployment.backup:
-            found.append("no redundancy")
-        found += [f"{name} is under way" for name in self.loop.jobs.names()]
-        processes = [p for p in conductor.deployment.nodes.values() if isinstance(p, Process)]
-        found += [f"{p.name} is dead or stopped" for p in processes if p.stopped()][:1]
-        return found
 
     def outcome(self) -> Run:
         """What there is to judge."""
@@ -372,13 +355,13 @@ class World:
             if isinstance(process, Process) and process.node is not None and process.incarnation == 1:
                 self._count(process.node)
         rest = Rest(
-            () if self.lost else tuple(self._unrest()),
+            () if self.lost else tuple(ending.unrest(self.conductor)),
             self.lost,
             self.loop.ns,
             deployment.leader,
             deployment.graph,
             hosted(deployment),
-            states_of(deployment),
+            ending.states_of(deployment),
         )
         return Run(
             self.setup,
@@ -388,7 +371,7 @@ class World:
             tuple(self.conductor.adaptations.history),
             tuple(self.conductor.faults.receipts()),
             tuple(self.failures),
-            self._car.result() if self._car is not None else None,
+            self._drive.result() if self._drive is not None else None,
             self.effects,
             tuple(self.struck),
         )

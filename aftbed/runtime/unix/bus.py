@@ -1,4 +1,7 @@
-"""The supervisor's hold on the hub: faults of the bus go there, and what has become of them comes back."""
+"""The supervisor's hold on the hub: faults of the bus go there, and what has become of them comes back.
+
+Conditions of the car at which other faults begin go there, too: who knows the car is connected to it.
+"""
 
 import contextlib
 from collections.abc import Callable, Generator
@@ -6,8 +9,9 @@ from typing import Final
 
 import msgspec
 
-from aftbed.core.busfault import BusFault, Struck
+from aftbed.core.busfault import BusFault, Condition, Struck
 from aftbed.runtime import control
+from aftbed.runtime.interface import Met
 from aftbed.runtime.jobs import Key, StepFailed, Wait
 from aftbed.runtime.unix.processes import Nursery, Process
 
@@ -15,7 +19,9 @@ HUB: Final = "hub"
 DISTURBED: Final = "disturbed"  # the hub to us: that fault is armed
 STRUCK: Final = "struck"  # the hub to us: what has become of these
 ASKED: Final = "struck.all"  # the same, of all, since we asked
-KINDS: Final = (DISTURBED, STRUCK, ASKED)
+WATCHED: Final = "watched"  # the hub to us: that condition is looked at
+MET: Final = "met"  # the hub to us: it holds
+KINDS: Final = (DISTURBED, STRUCK, ASKED, WATCHED, MET)
 
 Steps = Generator[Wait, dict[Key, bytes], None]
 
@@ -30,6 +36,7 @@ class BusFaults:
         self._hub: Process | None = None
         self._faults: dict[int, BusFault] = {}
         self._struck: dict[int, Struck] = {}
+        self._met: dict[int, Callable[[Met], None]] = {}
 
     def serve(self, hub: Process) -> None:
         """There is a hub."""
@@ -45,6 +52,19 @@ class BusFaults:
         self._nursery.order(self._hub, control.DisturbBus(number, fault, draw))
         yield Wait(frozenset({(DISTURBED, HUB, number)}), frozenset({HUB}))
 
+    def watch(self, number: int, condition: Condition, met: Callable[[Met], None]) -> Steps:
+        """Return when the car looks for it. Raises StepFailed."""
+        if self._hub is None or not self._hub.alive:
+            raise StepFailed(f"when {condition}: this run has no car")
+        self._met[number] = met
+        self._nursery.order(self._hub, control.WatchCar(number, condition))
+        yield Wait(frozenset({(WATCHED, HUB, number)}), frozenset({HUB}))
+
+    def _is_met(self, number: int, t_us: int, since_ns: int) -> None:
+        hub, met = self._hub, self._met.pop(number, None)
+        if met is not None and hub is not None:
+            met(Met(t_us, since_ns, lambda: self._nursery.order(hub, control.Ack(number))))
+
     def ask(self) -> Steps:
         """Hear what has become of all faults by now."""
         if self._faults and self._hub is not None and self._hub.alive:
@@ -54,8 +74,11 @@ class BusFaults:
 
     def on_report(self, kind: str, data: bytes) -> None:
         """What the hub says."""
-        if kind == DISTURBED:
-            self._settle((DISTURBED, HUB, int(data)))
+        if kind in (DISTURBED, WATCHED):
+            self._settle((kind, HUB, int(data)))
+            return
+        if kind == MET:
+            self._is_met(*msgspec.msgpack.decode(data, type=tuple[int, int, int]))
             return
         for struck in msgspec.msgpack.decode(data, type=list[Struck]):
             before, self._struck[struck.number] = self._struck.get(struck.number), struck

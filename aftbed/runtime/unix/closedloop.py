@@ -35,14 +35,14 @@ from typing import Final, Literal
 import msgspec
 
 from aftbed.adapt import observer
-from aftbed.adapt.consistency import FaultModel, Resources, refusal
+from aftbed.adapt.consistency import unsuitable
 from aftbed.adapt.observer import Declined, Measured, Observation, Observer, Proposal, Running, Seen
 from aftbed.adapt.policy import Beyond, Policy, PolicyFile, policy_from
 from aftbed.core.application import Characteristics
 from aftbed.core.errors import AftbedError, ConfigError, PeerError, unknown
 from aftbed.core.journal import Record
 from aftbed.core.message import Goal
-from aftbed.ftm.mechanism import NONE, replication_of
+from aftbed.ftm.mechanism import NONE
 from aftbed.runtime.adaptations import Outcome
 from aftbed.runtime.unix import ask
 from aftbed.runtime.unix.observation import MEASURED, Journals, Lines, Meter, lost
@@ -51,7 +51,6 @@ from aftbed.runtime.unix.support import HISTORY_NAME
 PERIOD_SECONDS: Final = 0.1
 PROPOSALS_NAME: Final = "proposals.jsonl"
 APPROVALS: Final = ("auto", "ask")
-AMPLE: Final = Resources(cpus=1024)
 _FOLDER: Final = Path(observer.__file__).resolve().parent / "policies"
 
 Tell = Callable[[dict[str, object]], None]
@@ -130,7 +129,7 @@ def _unsuitable(expression: str, application: str) -> str:
     declared: object = getattr(function, "characteristics", None)
     if not isinstance(declared, Characteristics):
         return f"{application}: characteristics: found {declared!r}, allowed is Characteristics(...)"
-    return refusal(expression, FaultModel(crash=bool(replication_of(expression))), declared, AMPLE)
+    return unsuitable(expression, declared)
 
 
 # -- the loop -------------------------------------------------------------------------------------

@@ -26,6 +26,7 @@ import msgspec
 from aftbed.core.errors import HarnessError
 from aftbed.runtime.unix import rundir
 from aftbed.runtime.unix.lifeline import SYS_FUTEX_WAITV
+from aftbed.runtime.unix.memory import YAMA, try_on_a_child
 
 Status = Literal["ok", "warning", "missing"]
 
@@ -59,7 +60,7 @@ class Check(msgspec.Struct, frozen=True):
 
 def inspect() -> list[Check]:
     """Every check, in the order in which a run needs them."""
-    return [*kernel(), *limits(), *place(), *python(), *extras(), *measuring()]
+    return [*kernel(), *limits(), *place(), *python(), *extras(), foreign_memory(), *measuring()]
 
 
 def _check(name: str, status: Status, found: str, serves: str, remedy: str) -> Check:
@@ -271,6 +272,21 @@ def extras() -> list[Check]:
     serves = "tests of the HTML report, and nothing else"
     found.append(_check("Chromium", status, browser or "not found", serves, "install chromium"))
     return found
+
+
+def foreign_memory() -> Check:
+    """Whether the memory of a child can be written, by trying it."""
+    serves = "aftbed inject bitflip --level memory"
+    try:
+        scope = YAMA.read_text().strip()
+    except OSError:
+        scope = "none"  # a kernel without Yama
+    try:
+        try_on_a_child()
+    except (OSError, HarnessError) as error:
+        remedy = f"echo 1 > {YAMA}, or CAP_SYS_PTRACE; in a container, allow process_vm_writev"
+        return Check("memory of nodes", "warning", f"{error} (Yama scope: {scope})", serves, remedy)
+    return Check("memory of nodes", "ok", f"can be written (Yama scope: {scope})", serves)
 
 
 # -- what spoils figures --------------------------------------------------------------------------

@@ -1,7 +1,9 @@
 """Starting a run from a command, and being told how it goes.
 
-The command forks the warden and the supervisor before it does anything else that takes memory; the
-supervisor has a session of its own, so a terminal's Ctrl-C reaches the command alone. By the ends of
+The command forks the supervisor and the warden before it does anything else that takes memory, and before
+there is anything to remove: only then it makes the private directory, and says *go*. So whenever the command
+is killed, there is a warden, or nothing is left. The supervisor has a session of its own, so a terminal's
+Ctrl-C reaches the command alone. By the ends of
 what a `Launched` holds its run knows that the command is gone. So no child of the command keeps them, of
 this run or of a later one: else one run would end behind the other, each a little later.
 """
@@ -34,6 +36,7 @@ from aftbed.runtime.zygotes import BUS, LIGHT
 
 END_SECONDS_MAX: Final = 8.0
 KILL_SECONDS_MAX: Final = 1.0
+GO: Final = b"go"
 
 
 def bind_hub(port: int) -> socket.socket:
@@ -61,6 +64,7 @@ class Launched:
         self.started_ns = time.monotonic_ns()
         self._life: list[int] = []
         self._start(listener)
+        self._go()
         self._reports = iter(self._listen())
         self.end: dict[str, object] | None = None
 
@@ -94,6 +98,26 @@ class Launched:
         self.line = Line(ours, decode_report)
         _HELD.add(self)
 
+    def _go(self) -> None:
+        """Make the directories. `run.json` is written first: a record says what it is a record of."""
+        about = {"version": __version__, "started_ns": self.started_ns, **msgspec.to_builtins(self.options)}
+        for key in ("listener", "private"):
+            about.pop(key)
+        about["load"] = isinstance(self.options.work, LoadRun)
+        try:
+            rundir.make(self.private)
+            if self.record.parent == self.private:
+                rundir.record_directory(self.record)
+            (self.record / "run.json").write_bytes(msgspec.json.format(msgspec.json.encode(about)))
+        except BaseException:
+            if not rundir.owned_here(self.private):  # it is another run's: nothing of it is ours to remove
+                linux.kill(self._warden_pidfd, signal.SIGKILL)
+            self.line.close()
+            os.waitpid(self._supervisor, 0)
+            self.remove()
+            raise
+        self.line.sock.send(GO)
+
     def let_go(self) -> None:
         """In a child of the command: this run is not its own."""
         self.line.close()
@@ -118,6 +142,8 @@ class Launched:
 
     def _be_supervisor(self, owner: socket.socket, waker: int) -> NoReturn:
         code = 1
+        if owner.recv(len(GO)) != GO:
+            os._exit(code)
         try:
             signal.signal(signal.SIGINT, signal.SIG_IGN)
             members.mark(self.private)
@@ -185,7 +211,8 @@ class Launched:
 
     def remove(self) -> None:
         """The record has been read: let everything go."""
-        rundir.remove(self.private)
+        if rundir.owned_here(self.private):
+            rundir.remove(self.private)
         life, self._life = self._life, []
         for fd in life:
             os.close(fd)
@@ -216,15 +243,7 @@ def _ends(pidfd: int, seconds: float) -> bool:
 
 
 def launch(options: RunOptions, listener: socket.socket | None, *, warm: bool = False) -> Launched:
-    """Start a run. `run.json` is written first: a record says what it is a record of.
-
-    `warm`: this process has been warmed up (`spawn.warm_up`), and zygotes are forks of it.
-    """
-    about = {"version": __version__, "started_ns": time.monotonic_ns(), **msgspec.to_builtins(options)}
-    for key in ("listener", "private"):
-        about.pop(key)
-    about["load"] = isinstance(options.work, LoadRun)
-    (Path(options.record) / "run.json").write_bytes(msgspec.json.format(msgspec.json.encode(about)))
+    """Start a run. `warm`: this process has been warmed up (`spawn.warm_up`), and zygotes are forks of it."""
     launched = Launched(options, listener, warm=warm)
     if listener is not None:
         listener.close()
@@ -243,14 +262,13 @@ def options_for(
     pin: bool = True,
     bus_port: int = 0,
 ) -> tuple[RunOptions, socket.socket | None]:
-    """A run directory and, where there is a bus, its socket. Raises ConfigError, leaving nothing."""
+    """What a run needs; where there is a bus, its socket too. Raises ConfigError, leaving nothing."""
     faults = tuple(aim(fault, work) for fault in faults)
     listener = None if isinstance(work, LoadRun) else bind_hub(bus_port)
-    private = rundir.create()
+    private = rundir.free()
     try:
-        directory = rundir.record_directory(record, private)
+        directory = rundir.record_directory(Path(record)) if record else private / "record"
     except ConfigError:
-        rundir.remove(private)
         if listener is not None:
             listener.close()
         raise

@@ -7,7 +7,6 @@ import array
 import contextlib
 import os
 import socket
-import stat
 from collections.abc import Callable
 from typing import Final, Generic, TypeVar
 
@@ -16,16 +15,15 @@ import msgspec
 from aftbed.core.errors import PeerError
 from aftbed.core.wire import PACKET_BYTES_MAX, UNREADABLE
 from aftbed.runtime.control import FromNode, ToNode
+from aftbed.runtime.unix import packets
 
 FDS_MAX: Final = 64
-STATE_BYTES_MAX: Final = 64 << 20
 _RIGHTS_BYTES: Final = socket.CMSG_SPACE(FDS_MAX * 4)
 
 decode_order: Callable[[bytes], ToNode] = msgspec.msgpack.Decoder(ToNode).decode
 decode_report: Callable[[bytes], FromNode] = msgspec.msgpack.Decoder(FromNode).decode
 _encode = msgspec.msgpack.Encoder().encode
 Incoming = TypeVar("Incoming")
-_MEMFD: Final = b"\xc1"  # a byte that MessagePack never uses
 
 
 class Line(Generic[Incoming]):
@@ -43,11 +41,8 @@ class Line(Generic[Incoming]):
         data = _encode(message)
         assert len(fds) <= FDS_MAX, f"{len(fds)} descriptors"
         if len(data) > PACKET_BYTES_MAX:
-            assert len(data) <= STATE_BYTES_MAX and not fds, f"{len(data)} bytes"
-            with open(os.memfd_create("aftbed-state"), "wb") as file:
-                file.write(data)
-                file.flush()
-                self._sendmsg(_MEMFD, (file.fileno(),))
+            assert not fds, f"{len(data)} bytes, and descriptors"
+            packets.send_in_file(self.sock, data)
         else:
             self._sendmsg(data, fds)
 
@@ -64,10 +59,7 @@ class Line(Generic[Incoming]):
         data, ancillary, flags, _ = self.sock.recvmsg(
             PACKET_BYTES_MAX, _RIGHTS_BYTES, socket.MSG_CMSG_CLOEXEC
         )
-        fds = array.array("i")
-        for level, kind, payload in ancillary:
-            if (level, kind) == (socket.SOL_SOCKET, socket.SCM_RIGHTS):
-                fds.frombytes(payload[: len(payload) - len(payload) % fds.itemsize])
+        fds = packets.descriptors_in(ancillary)
         if not data:
             for fd in fds:
                 os.close(fd)
@@ -75,9 +67,9 @@ class Line(Generic[Incoming]):
         try:
             if flags & (socket.MSG_TRUNC | socket.MSG_CTRUNC):
                 raise PeerError(f"truncated control message of {len(data)} bytes, {len(fds)} descriptors")
-            if data == _MEMFD and len(fds) == 1:
-                data = _read_memfd(fds.pop())
-            return self._decode(data), list(fds)
+            if data == packets.ANNOUNCED and len(fds) == 1:
+                data = packets.read_file(fds.pop())
+            return self._decode(data), fds
         except (*UNREADABLE, PeerError, OSError) as error:
             for fd in fds:
                 os.close(fd)
@@ -87,16 +79,3 @@ class Line(Generic[Incoming]):
         """Close the socket."""
         with contextlib.suppress(OSError):
             self.sock.close()
-
-
-def _read_memfd(descriptor: int) -> bytes:
-    """The packet in a memfd, which is closed. Raises PeerError if it is no file or too large."""
-    try:
-        state = os.fstat(descriptor)
-        if not stat.S_ISREG(state.st_mode):
-            raise PeerError("the descriptor of a large packet is not a memfd")
-        if state.st_size > STATE_BYTES_MAX:
-            raise PeerError(f"a packet of {state.st_size} bytes, at most {STATE_BYTES_MAX} are allowed")
-        return os.pread(descriptor, state.st_size, 0)
-    finally:
-        os.close(descriptor)

@@ -30,26 +30,33 @@ from aftbed.core.journal import FLAG_OFFSET, PULSE_OFFSET, RECORD
 from aftbed.core.message import Adapted, AnyMessage, ChannelEnded, Message, Promoted, Rebound, Reply
 from aftbed.runtime import control
 from aftbed.runtime.blows import fire
-from aftbed.runtime.orders import carry_out, order_or_halt
-from aftbed.runtime.unix import hindrance
+from aftbed.runtime.orders import order_or_halt
+from aftbed.runtime.unix import hindrance, obedience, packets
 from aftbed.runtime.unix.devices import Device, Sensor
 from aftbed.runtime.unix.journal import Journal
 from aftbed.runtime.unix.lifeline import Held
 from aftbed.runtime.unix.line import Line
 from aftbed.runtime.unix.obedience import Obedience
+from aftbed.runtime.unix.packets import READ_BYTES_MAX
 from aftbed.runtime.unix.wiring import Hosted, Inlet, Plan, Wiring
 
 PULSE_SECONDS: Final = 0.02
-READ_BYTES_MAX: Final = wire.PACKET_BYTES_MAX + 1  # one byte more than is allowed, so that it is noticed
 WRITE_SECONDS_MAX: Final = 2.0
 NUDGE: Final = b"\0"
-HOST_FILES: Final = (__file__, Line.recv.__code__.co_filename, hindrance.__file__)  # waiting, in no brick
+HOST_FILES: Final = (  # waiting, in no brick
+    __file__,
+    Line.recv.__code__.co_filename,
+    hindrance.__file__,
+    obedience.__file__,
+    packets.__file__,
+)
 EXIT_FENCED: Final = 3
 REFUSED: Final = (PeerError, *wire.UNREADABLE)
 EXIT_ASSERT: Final = 70
 
 _now, _read, _write = time.monotonic_ns, os.read, os.write
 _encode, _decode = wire.encode_unchecked, wire.decode_unchecked
+_put, _LARGE = packets.put, wire.PACKET_BYTES_MAX
 _pack = RECORD.pack_into
 RECORD_BYTES: Final = RECORD.size
 
@@ -69,6 +76,7 @@ class Node:
         self.suspended = False
         self.draining = False  # suspend only when nothing waits at the open ports
         self.armed: dict[Event, control.Arm] = {}
+        self._announced: Inlet | None = None  # the next packet there is a large one
         self._refused = 0
         self.host = Obedience(self)
 
@@ -129,7 +137,7 @@ class Node:
         try:
             while True:
                 self.turn()
-                if self._hot is not None:
+                if self._hot is not None and self._announced is None:
                     self.serve_hot(self._hot)
         except BrokenPipeError:
             os._exit(EXIT_FENCED)
@@ -141,6 +149,9 @@ class Node:
 
     def turn(self) -> None:
         """Handle one thing, or wait for one."""
+        if self._announced is not None:
+            self._take_announced(self._announced)
+            return
         inside = self.wiring.inside() if self.wiring.mail else None
         if inside is not None:
             self.step(*inside)
@@ -148,10 +159,10 @@ class Node:
         if self.suspend_token or self.suspended:
             if self.suspend_token and self.wiring.quiescent() and not (self.draining and self._waits()):
                 self.suspended = True
-                self.ack(self.suspend_token)
+                self.host.ack(self.suspend_token)
                 self.suspend_token = 0
             if self.suspended:
-                self.serve_control(wait=True)
+                self.host.serve_control(wait=True)
                 return
         if self.device is not None and self._from_device(self.device):
             return
@@ -198,11 +209,12 @@ class Node:
                     if type(out) is not int:
                         out(effect.message)  # type: ignore[operator]
                         continue
+                    data = raw if effect.message is message else _encode(effect.message)
                     try:
-                        _write(out, raw if effect.message is message else _encode(effect.message))
+                        (_write if len(data) <= _LARGE else _put)(out, data)
                     except OSError:
                         journal.at = at  # control mail that is served meanwhile may write records
-                        self.write_hard(hosted, effect.port, wire.encode(effect.message))
+                        self.write_hard(hosted, effect.port, data)
                         at = journal.at
                 elif type(effect) is Note:
                     _pack(mapping, at, now_ns, effect.request_id, effect.detail, 0, effect.event.code)
@@ -219,16 +231,32 @@ class Node:
     def _packet(self, inlet: Inlet, raw: bytes) -> None:
         """Control first."""
         if self.journal.mapping[FLAG_OFFSET]:
-            self.serve_control()
+            self.host.serve_control()
         if raw == b"":
             self._ended(inlet)
+        elif raw == packets.ANNOUNCED:
+            self._announced = inlet
         elif raw != NUDGE:
             try:
-                message = wire.decode(raw)
-            except PeerError:
+                message = _decode(raw)
+            except wire.UNREADABLE:
                 self._refuse(0)
                 return
             self.step(inlet.hosted, inlet.port, message, raw)
+
+    def _take_announced(self, inlet: Inlet) -> None:
+        """Read the large packet that is next, or what has come in between."""
+        try:
+            raw = packets.take(inlet.fd)
+        except PeerError:
+            self._announced = None
+            self._refuse(0)
+            return
+        if raw != NUDGE:
+            self._announced = None
+        self._packet(inlet, raw)
+        if self._announced is not None and inlet.hosted.inlets.get(inlet.port) is not inlet:
+            self._announced = None  # the order that has just been served has taken the channel away
 
     def _ended(self, inlet: Inlet) -> None:
         """The channel is drained to its end: nothing more will come from it."""
@@ -242,7 +270,7 @@ class Node:
         now_ns = _now()
         fds = [fd for fd, _ in ready]
         if self.journal.mapping[FLAG_OFFSET] or self.line.fileno() in fds:
-            self.serve_control()
+            self.host.serve_control()
             return  # what is open may be another set now
         for fd in fds:
             inlet = plan.by_fd.get(fd)
@@ -270,7 +298,7 @@ class Node:
         for hosted in list(self.wiring.hosted.values()):
             due = hosted.brick.deadline_ns()
             if due is not None and now_ns >= due:
-                self._perform(hosted, hosted.brick.wake(now_ns), now_ns, None, None)
+                self.perform(hosted, hosted.brick.wake(now_ns), now_ns, None, None)
 
     def _from_device(self, device: Device) -> bool:
         """Let the brick have what the device holds for it; False if that is nothing."""
@@ -296,9 +324,9 @@ class Node:
         except PeerError:
             self._refuse(getattr(message, "request_id", 0))
             return
-        self._perform(hosted, effects, now_ns, message, raw)
+        self.perform(hosted, effects, now_ns, message, raw)
 
-    def _perform(
+    def perform(
         self,
         hosted: Hosted,
         effects: list[Effect],
@@ -314,11 +342,11 @@ class Node:
                 out = outs[effect.port]  # type: ignore[union-attr]
                 if type(out) is int:
                     same = raw is not None and effect.message is message  # type: ignore[union-attr]
-                    data = raw if same else _encode(effect.message)  # type: ignore[union-attr]
+                    data: bytes = raw if same else _encode(effect.message)  # type: ignore[union-attr,assignment]
                     try:
-                        _write(out, data)  # type: ignore[arg-type]
+                        (_write if len(data) <= _LARGE else _put)(out, data)
                     except OSError:
-                        self.write_hard(hosted, effect.port, data or b"")  # type: ignore[union-attr]
+                        self.write_hard(hosted, effect.port, data)  # type: ignore[union-attr]
                 else:
                     out(effect.message)  # type: ignore[operator,union-attr]
             elif kind is Note:
@@ -332,21 +360,22 @@ class Node:
     def write_hard(self, hosted: Hosted, port: str, data: bytes) -> None:
         """The channel is full or shut: serve control meanwhile, since that may be about this channel.
 
-        Where it is bound elsewhere meanwhile, the brick has heard of it and has asked again what it wants
-        asked. Raises BrokenPipeError where this node is fenced, or nobody reads.
+        A fault that is armed at it meanwhile strikes what is sent later. Where it is bound elsewhere, the
+        brick has heard of it and has asked again what it wants asked. Raises BrokenPipeError where this node
+        is fenced, or nobody reads.
         """
-        failed = hosted.outs[port]
+        failed = self.host.beneath(hosted, port)
         limit = _now() + int(WRITE_SECONDS_MAX * 1e9)
         while _now() < limit:
-            out = hosted.outs[port]
+            out = self.host.beneath(hosted, port)
             if not isinstance(out, int) or out is not failed:
                 return
             try:
-                _write(out, data)
+                _put(out, data)
             except BlockingIOError:
-                self.serve_control()
+                self.host.serve_control()
             except BrokenPipeError:
-                if not self.serve_control(wait=True):
+                if not self.host.serve_control(wait=True):
                     continue
             else:
                 return
@@ -355,46 +384,3 @@ class Node:
     def _refuse(self, request_id: int) -> None:
         self._refused += 1
         self.journal.write(_now(), Event.PEER_REFUSED, request_id, 0)
-
-    # -- control ------------------------------------------------------------------------------
-
-    def serve_control(self, wait: bool = False, until: int = 0) -> bool:
-        """Carry out the orders that wait; with `wait`, for a pulse at most. True if there was any.
-
-        With `until`: True if the Ack of that fault was among them.
-        """
-        self.journal.mapping[FLAG_OFFSET] = 0
-        served = False
-        while True:
-            try:
-                got = self._receive(wait and not served)
-            except BlockingIOError:
-                return served
-            if got is None:
-                os._exit(0)  # the supervisor is gone, and this run with it
-            order, fds = got
-            if isinstance(order, control.Ack):
-                served = served or order.token == until
-                continue
-            try:
-                data = carry_out(self.host, order, fds)
-            except PeerError as error:
-                self.ack(order.token, error=str(error))
-            else:
-                if data is not None:
-                    self.ack(order.token, data)
-            served = served or not until
-
-    def _receive(self, wait: bool) -> tuple[control.ToNode, list[int]] | None:
-        if not wait:
-            self.line.sock.setblocking(False)
-            try:
-                return self.line.recv()
-            finally:
-                self.line.sock.setblocking(True)
-        return self.line.recv()
-
-    def ack(self, token: int, data: bytes = b"", error: str = "") -> None:
-        """Answer an order."""
-        if token != control.UNANSWERED:
-            self.line.send(control.Ack(token, data, error))

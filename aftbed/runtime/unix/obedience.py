@@ -1,4 +1,8 @@
-"""What orders and faults do to a node that is a process: see `orders.Host`."""
+"""What orders and faults do to a node that is a process (see `orders.Host`), and how orders come to it.
+
+Control is served before data, and also where the node cannot go on: while it is suspended, while a channel
+has no room, while a fault has to be seen applied.
+"""
 
 import os
 import signal
@@ -7,13 +11,16 @@ import time
 from typing import TYPE_CHECKING, Final
 
 from aftbed.core.brick import CONTROL
+from aftbed.core.errors import PeerError
 from aftbed.core.event import Event
+from aftbed.core.journal import FLAG_OFFSET
 from aftbed.runtime import control
 from aftbed.runtime.diversion import Diversion
+from aftbed.runtime.orders import carry_out
 from aftbed.runtime.unix import cells
 from aftbed.runtime.unix.devices import Sensor
 from aftbed.runtime.unix.hindrance import Hindrance
-from aftbed.runtime.unix.wiring import Hosted
+from aftbed.runtime.unix.wiring import Hosted, Output
 
 if TYPE_CHECKING:
     from aftbed.runtime.unix.node import Node
@@ -28,7 +35,7 @@ class Obedience:
     def __init__(self, node: "Node") -> None:
         self._node = node
         self.armed = node.armed
-        self.slowed: dict[int, int] = {}
+        self.slowed: dict[int, control.SlowDown] = {}
         self.diverted: dict[tuple[str, str], Diversion] = {}
         self._hindrance = Hindrance(node, self)
 
@@ -93,7 +100,7 @@ class Obedience:
         """Go no further until the supervisor has answered for `fault`."""
         limit_ns = time.monotonic_ns() + FAULT_NS_MAX
         while time.monotonic_ns() < limit_ns:
-            if self._node.serve_control(wait=True, until=fault):
+            if self.serve_control(wait=True, until=fault):
                 return
         raise AssertionError(f"fault {fault} was not applied within {FAULT_NS_MAX / 1e9} s")
 
@@ -105,7 +112,55 @@ class Obedience:
         """Go by `diverted`, which has changed for this port."""
         self._hindrance.divert(brick, port)
 
+    def beneath(self, hosted: Hosted, port: str) -> Output:
+        """Where the port leads, whatever disturbs it."""
+        return self._hindrance.beneath(hosted, port)
+
     def stop_detected(self, brick: str, reason: str) -> None:
         """A detected stop: end here and now."""
         print(f"{brick} (pid {os.getpid()}): detected stop: {reason}", file=sys.stderr, flush=True)
         os._exit(EXIT_DETECTED)
+
+    # -- how they come ------------------------------------------------------------------------
+
+    def serve_control(self, wait: bool = False, until: int = 0) -> bool:
+        """Carry out the orders that wait; with `wait`, for a pulse at most. True if there was any.
+
+        With `until`: True if the Ack of that fault was among them.
+        """
+        self._node.journal.mapping[FLAG_OFFSET] = 0
+        served = False
+        while True:
+            try:
+                got = self._receive(wait and not served)
+            except BlockingIOError:
+                return served
+            if got is None:
+                os._exit(0)  # the supervisor is gone, and this run with it
+            order, fds = got
+            if isinstance(order, control.Ack):
+                served = served or order.token == until
+                continue
+            try:
+                data = carry_out(self, order, fds)
+            except PeerError as error:
+                self.ack(order.token, error=str(error))
+            else:
+                if data is not None:
+                    self.ack(order.token, data)
+            served = served or not until
+
+    def _receive(self, wait: bool) -> tuple[control.ToNode, list[int]] | None:
+        line = self._node.line
+        if wait:
+            return line.recv()
+        line.sock.setblocking(False)
+        try:
+            return line.recv()
+        finally:
+            line.sock.setblocking(True)
+
+    def ack(self, token: int, data: bytes = b"", error: str = "") -> None:
+        """Answer an order."""
+        if token != control.UNANSWERED:
+            self._node.line.send(control.Ack(token, data, error))

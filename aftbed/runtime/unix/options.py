@@ -1,9 +1,13 @@
 """What a run is made of, checked by the command before a process is started."""
 
+from typing import Final
+
 import msgspec
 
 from aftbed.core.fault import Fault
 from aftbed.core.message import Scheduled
+
+COMMAND_GONE: Final = "the command is gone"  # a reason to end at once, whatever waits for an answer
 
 
 class LoadRun(msgspec.Struct, frozen=True, tag=True):
@@ -34,7 +38,7 @@ Work = LoadRun | CarRun | ReplayRun
 
 
 class RunOptions(msgspec.Struct, frozen=True):
-    """`private` and `record` are directories that exist; `listener` is the hub's bound socket."""
+    """`private` and `record` are directories, made by the launch; `listener` is the hub's bound socket."""
 
     run: str
     private: str

@@ -46,14 +46,25 @@ def root() -> Path:
 
 def create() -> Path:
     """A new private directory; its name is the id of the run."""
-    while True:
-        path = root() / secrets.token_hex(ID_BYTES)
-        try:
-            path.mkdir(mode=0o700)
-        except FileExistsError:
-            continue
-        _owned[path] = _locked(path)
-        return path
+    path = free()
+    make(path)
+    return path
+
+
+def free() -> Path:
+    """Where a private directory can be made."""
+    while (path := root() / secrets.token_hex(ID_BYTES)).exists():
+        pass
+    return path
+
+
+def make(path: Path) -> None:
+    """Make it, and own it. Raises HarnessError where another run has just done so, or nobody can."""
+    try:
+        path.mkdir(mode=0o700)
+    except OSError as error:
+        raise HarnessError(f"{path}: cannot be made: {error.strerror}; start the run again") from None
+    _owned[path] = _locked(path)
 
 
 def _locked(path: Path) -> int:
@@ -95,16 +106,20 @@ def owned(private: Path) -> bool:
         os.close(descriptor)
 
 
-def record_directory(wanted: str | None, private: Path) -> Path:
-    """The directory of the record; raises ConfigError if `wanted` exists or cannot be made."""
-    path = Path(wanted) if wanted else private / "record"
+def owned_here(private: Path) -> bool:
+    """Whether this process has made it."""
+    return private in _owned
+
+
+def record_directory(path: Path) -> Path:
+    """Make the directory of a record; raises ConfigError if `path` exists or cannot be made."""
     try:
         path.mkdir(parents=True)
         (path / "journal").mkdir()
     except FileExistsError:
-        raise ConfigError(f"--record {wanted}: exists already; name a directory that does not") from None
+        raise ConfigError(f"--record {path}: exists already; name a directory that does not") from None
     except OSError as error:
-        raise ConfigError(f"--record {wanted}: cannot be made: {error.strerror}") from None
+        raise ConfigError(f"--record {path}: cannot be made: {error.strerror}") from None
     return path.resolve()
 
 

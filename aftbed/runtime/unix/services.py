@@ -44,6 +44,11 @@ class _Desk:
         if isinstance(order, control.DisturbBus):
             hub.disturb(order.token, order.fault, order.draw)
             self._line.send(control.Report(bus.DISTURBED, str(order.token).encode()))
+        elif isinstance(order, control.WatchCar):
+            hub.watches.watch(order.token, order.condition)
+            self._line.send(control.Report(bus.WATCHED, str(order.token).encode()))
+        elif isinstance(order, control.Ack):
+            hub.watches.go_on(order.token)
         elif isinstance(order, control.Stats):
             self._line.send(control.Report(bus.ASKED, msgspec.msgpack.encode(hub.struck())))
         return True
@@ -51,6 +56,10 @@ class _Desk:
     def report(self, news: list[Struck]) -> None:
         """To the supervisor."""
         self._line.send(control.Report(bus.STRUCK, msgspec.msgpack.encode(news)))
+
+    def met(self, fault_number: int, t_us: int, since_ns: int) -> None:
+        """To the supervisor."""
+        self._line.send(control.Report(bus.MET, msgspec.msgpack.encode((fault_number, t_us, since_ns))))
 
 
 def _hub(line: Line[control.ToNode], order: control.Serve, fds: list[int]) -> None:

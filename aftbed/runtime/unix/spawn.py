@@ -16,9 +16,7 @@ CONTROL_FD: Final = 3
 PRELOADS: Final[dict[str, tuple[str, ...]]] = {
     LIGHT: (),
     BUS: (
-        "can.interfaces.socketcand",
-        "cantools",
-        "e2e.p11",
+        "aftbed.vehicle.libraries",
         "aftbed.runtime.unix.gateway",
         "aftbed.vehicle.car",
         "aftbed.vehicle.player",

@@ -24,7 +24,7 @@ from aftbed.runtime.jobs import STATS_JOB
 from aftbed.runtime.unix import linux
 from aftbed.runtime.unix.line import Line, decode_order
 from aftbed.runtime.unix.loop import Loop
-from aftbed.runtime.unix.options import LoadRun, RunOptions
+from aftbed.runtime.unix.options import COMMAND_GONE, LoadRun, RunOptions
 from aftbed.runtime.unix.processes import Nursery, Process
 from aftbed.runtime.unix.questions import Questions
 from aftbed.runtime.unix.spawn import Started
@@ -37,6 +37,8 @@ TICK_SECONDS: Final = 0.02
 TELL_SECONDS: Final = 0.005
 LATE_NS_MAX: Final = 40_000_000
 DRAIN_SECONDS_MAX: Final = 2.0
+DRAIN_SECONDS: Final = 0.005  # between two looks at what is still under way
+LOOKS_MAX: Final = 80  # at states that differ: time for a follower on a busy machine
 STOP_SECONDS_MAX: Final = 1.0
 
 
@@ -60,7 +62,7 @@ class Supervisor:
         self._grace_until_ns = 0
         self.graph_ms = 0.0
         self._incomplete: list[str] = []
-        self._lost = self._looked = False
+        self._lost, self._looks_left = False, LOOKS_MAX
         self._waited_ns: dict[int, int] = {}
         self._states: dict[str, str] = {}  # digests, by replica, at the end
         self._last_tick_ns = 0
@@ -77,6 +79,7 @@ class Supervisor:
             self.tell,
             options.seed,
             self.work.bus,
+            Path(options.private),
         )
         self.conductor = Conductor(graph, support, pinned, self._on_loss)
         self.deployment, self.faults = self.conductor.deployment, self.conductor.faults
@@ -136,7 +139,7 @@ class Supervisor:
         for fd in got[1] if got is not None else ():
             os.close(fd)
         if got is None or isinstance(got[0], control.Stop):
-            self._finish("the command is gone" if got is None else "interrupted")
+            self._finish(COMMAND_GONE if got is None else "interrupted")
             if got is None:
                 self.loop.forget(self.owner.fileno())
 
@@ -175,10 +178,9 @@ class Supervisor:
     def _drain(self, limit_ns: int) -> None:
         """Wait until all is answered, and what fails or changes has come to its end; or to the limit."""
         settled = self.work.settled and (self._lost or self.conductor.at_rest())
-        if settled and not self._looked:
-            self._looked = True
+        if settled and self._looks_left:
             look = look_at_states(self.deployment, self._states)
-            self.loop.jobs.start("states", look, lambda _: self._drain(limit_ns))
+            self.loop.jobs.start("states", look, lambda _: self._looked(limit_ns))
             return
         if self.owner_gone() or settled or time.monotonic_ns() > limit_ns:
             if not settled and not self.owner_gone():
@@ -188,27 +190,26 @@ class Supervisor:
             return
         if not len(self.loop.jobs):
             self.loop.jobs.start(STATS_JOB, self.work.ask_stats(self.deployment), lambda _: None)
-        self.loop.after(0.005, lambda: self._drain(limit_ns))
+        self.loop.after(DRAIN_SECONDS, lambda: self._drain(limit_ns))
+
+    def _looked(self, limit_ns: int) -> None:
+        """A replica may have yet to apply what was sent to it: look again, for a time."""
+        self._looks_left -= 1
+        if len(set(self._states.values())) <= 1:
+            self._looks_left = 0
+        pause_s = DRAIN_SECONDS if self._looks_left else 0.0
+        self.loop.after(pause_s, lambda: self._drain(limit_ns))
 
     def owner_gone(self) -> bool:
         """Nobody waits for a verdict."""
-        return self._finish_reason == "the command is gone"
+        return self._finish_reason == COMMAND_GONE
 
     def _teardown(self) -> None:
         """Kill what is left, reap it, say how it ended, and leave."""
         self._tell_all()
         living = hosted(self.deployment)
         waits = [linux.waited_ns(pid) - before for pid, before in self._waited_ns.items()]
-        for process in self.nursery.processes:
-            process.kill()
-        limit = time.monotonic() + STOP_SECONDS_MAX
-        while self.nursery.processes and time.monotonic() < limit:
-            for process in list(self.nursery.processes):
-                if not process.pid or linux.reap(process.pid) is not None:
-                    process.close()
-                    self.nursery.processes.remove(process)
-            time.sleep(0.001)  # no event to wait for: a killed process is a matter of a millisecond
-        left = [f"{p.name} ({p.pid})" for p in self.nursery.processes]
+        left = self._bury()
         end = {
             "reason": self._finish_reason,
             "ended_ns": time.monotonic_ns(),
@@ -230,6 +231,28 @@ class Supervisor:
         unfinished.write_text(json.dumps(end))
         unfinished.rename(self.record / "end.json")  # whole, or not there
         self._report_owner("finished", json.dumps(end).encode())
+
+    def _bury(self) -> list[str]:
+        """Kill all, and reap what dies; what is left after a second. The dying need a CPU, too."""
+        dying = self.nursery.processes
+        starvation = {p.pid: linux.Starvation(p.pid) for p in dying if p.pid}
+        began_ns = time.monotonic_ns()
+        for watch in starvation.values():
+            watch.starves(began_ns)  # counts from here
+        for process in dying:
+            process.kill()
+        while dying:
+            before = len(dying)
+            for process in list(dying):
+                if not process.pid or linux.reap(process.pid) is not None:
+                    process.close()
+                    dying.remove(process)
+            now_ns = time.monotonic_ns()
+            late = now_ns - began_ns > STOP_SECONDS_MAX * 1e9 and len(dying) == before
+            if late and not any(starvation[p.pid].starves(now_ns) for p in dying):
+                break  # while some die, the rest may become ours to reap: a zygote's children
+            time.sleep(0.001)  # no event to wait for: a killed process is a matter of a millisecond
+        return [f"{p.name} ({p.pid})" for p in dying]
 
     # -- what processes say -------------------------------------------------------------------
 

@@ -6,11 +6,15 @@ from pathlib import Path
 from random import Random
 from typing import Final
 
-from aftbed.core.busfault import BusFault, Struck
+from aftbed.core.busfault import BusFault, Condition, Struck
+from aftbed.core.fault import FlipMemory
 from aftbed.core.graph import Link
 from aftbed.core.journal import Record, records
 from aftbed.runtime.deployment import Keys
+from aftbed.runtime.interface import Met
+from aftbed.runtime.interface import Process as AnyProcess
 from aftbed.runtime.jobs import StepFailed
+from aftbed.runtime.unix import memory
 from aftbed.runtime.unix.bus import BusFaults
 from aftbed.runtime.unix.cells import Cell
 from aftbed.runtime.unix.channels import Channel
@@ -34,8 +38,9 @@ class Support:
         tell: Callable[[str, str], None],
         seed: int = 0,
         bus: BusFaults | None = None,
+        private: Path | None = None,
     ) -> None:
-        self._record, self._seed, self._bus = record, seed, bus
+        self._record, self._seed, self._bus, self._private = record, seed, bus, private
         self.loop, self.nursery, self.device, self.tell = loop, nursery, device, tell
         self.journal = Journal(record / "journal" / "supervisor.1.journal", "supervisor")
 
@@ -71,6 +76,18 @@ class Support:
         if self._bus is None:
             raise StepFailed(f"{fault}: this run has no bus")
         yield from self._bus.disturb(number, fault, draw)
+
+    def watch(self, number: int, condition: Condition, met: Callable[[Met], None]) -> Keys:
+        """By the car, whom the hub asks."""
+        if self._bus is None:
+            raise StepFailed(f"when {condition}: this run has no car")
+        yield from self._bus.watch(number, condition, met)
+
+    def flip_memory(self, process: AnyProcess, flip: FlipMemory, draw: int) -> str:
+        """By process_vm_writev(2)."""
+        if self._private is None:
+            raise StepFailed("nothing tells which processes are of this run")
+        return memory.flip(memory.Owner(process.name, process.pid, self._private), flip, draw)
 
     def bus_fault(self, number: int) -> Struck | None:
         """As the hub has said."""

@@ -2,15 +2,21 @@
 
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import psutil
 import pytest
-from campaigns import CRASHES, planned, ran
+from liveruns import GONE_SECONDS_MAX, Home, ended, until
 
 from aftbed.campaign import ledger, running
 from aftbed.core.errors import ConfigError
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "campaign"))
+
+from campaigns import CRASHES, planned, ran
 
 pytestmark = [
     pytest.mark.process,
@@ -90,6 +96,67 @@ def test_real_processes_on_a_cluster(tmp_path: Path) -> None:
     with cluster(tmp_path, 1) as (address, _):
         found = ran(planned(tmp_path, text), tmp_path / "out", scheduler=address)
     assert {r.outcome for r in found.results} <= {"masked", "tolerated"}, [r.reasons for r in found.results]
+
+
+def test_a_worker_that_dies_in_the_midst_of_a_real_run_leaves_nothing(tmp_path: Path, home: Home) -> None:
+    """Its interpreter, its run and all processes of that die with it, and another worker does the work."""
+    text = CRASHES.replace("requests: 30, runtime: sim", "requests: 400, rate_hz: 200, runtime: unix")
+    found = planned(tmp_path, text.replace("experiments: 4", "experiments: 2"))
+    with cluster(tmp_path, 2) as (address, workers):
+        told = []
+        for result in running.run(found, running.Asked(tmp_path / "out", scheduler=address)):
+            told.append(result.experiment.id)
+            if len(told) == 1:
+                under_way = new_run_below(workers[0].pid)
+                workers[0].kill()
+                limit = time.monotonic() + GONE_SECONDS_MAX
+                assert all(ended(pid, limit - time.monotonic()) for pid in under_way)
+    assert len(set(told)) == len(told) == found.size == 10
+    assert not home.runs()
+
+
+def new_run_below(worker: int) -> list[int]:
+    """The pids of its next run, which has just begun: the present one may be at its end."""
+    old = set(run_below(worker))
+    until(lambda: set(run_below(worker)) - old, "a new run on the first worker")
+    return run_below(worker)
+
+
+def run_below(worker: int) -> list[int]:
+    """The pids of a run that the worker has under way: its interpreter has started something."""
+    try:
+        children = psutil.Process(worker).children(recursive=True)
+    except psutil.NoSuchProcess:
+        return []
+    return [child.pid for child in children] if len(children) > 1 else []
+
+
+LOCAL = """
+import sys
+if __name__ == "__main__":
+    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as local:
+        print(local.scheduler_address, flush=True)
+        sys.stdin.read()
+"""
+
+
+def test_a_local_cluster_comes_to_the_same_results(tmp_path: Path) -> None:
+    """Dask's own way to have a few workers, what a user tries first: here in a process of its own."""
+    found = planned(tmp_path)
+    here = ran(found, tmp_path / "here")
+    program = tmp_path / "local.py"
+    program.write_text(LOCAL)
+    with subprocess.Popen(
+        [sys.executable, program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+    ) as local:
+        try:
+            assert local.stdout is not None
+            there = ran(found, tmp_path / "there", scheduler=local.stdout.readline().decode().strip())
+        finally:
+            local.communicate(timeout=60)
+    assert [(r.experiment, r.outcome) for r in there.results] == [
+        (r.experiment, r.outcome) for r in here.results
+    ]
 
 
 def test_a_scheduler_that_is_not_there_is_refused_before_anything_is_written(tmp_path: Path) -> None:

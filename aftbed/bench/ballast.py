@@ -1,0 +1,77 @@
+"""A protected function whose state is of any size, for the sweep over it.
+
+It computes next to nothing, and the same for each size: it counts its requests in the first bytes of its
+state, and answers with a digest of the count and the request. All the rest of the state is ballast, which
+is captured, sent and restored with it. A class of any size is there under its name, `Ballast1000v2` being
+version 2 of the one whose state has 1000 bytes, so that an update of the function puts it into a run
+(`source_of`). Two versions of a size differ in nothing: they are there to be exchanged for each other.
+
+No field is declared, so its state lies in no shared memory.
+"""
+
+import re
+from hashlib import blake2b
+from typing import Final
+
+from aftbed.core.application import Characteristics
+from aftbed.core.errors import PeerError
+
+COUNT_BYTES: Final = 8
+REPLY_BYTES: Final = 8
+SIZE_BYTES_MIN: Final = COUNT_BYTES
+SIZE_BYTES_MAX: Final = 32 << 20
+VERSIONS: Final = (1, 2)
+
+_NAME: Final = re.compile(r"Ballast([1-9][0-9]{0,8})v([12])")
+
+
+class Ballast:
+    """The application; `size_bytes` is that of what `capture` returns."""
+
+    characteristics = Characteristics()
+    size_bytes = SIZE_BYTES_MIN
+
+    def __init__(self) -> None:
+        self._state = bytearray(self.size_bytes)
+
+    def execute(self, request: bytes) -> bytes:
+        """A digest of how many requests there were, and of this one."""
+        count = (int.from_bytes(self._state[:COUNT_BYTES], "little") + 1) % (1 << 8 * COUNT_BYTES)
+        self._state[:COUNT_BYTES] = count.to_bytes(COUNT_BYTES, "little")
+        return blake2b(self._state[:COUNT_BYTES] + request, digest_size=REPLY_BYTES).digest()
+
+    def capture(self) -> bytes:
+        """All of it."""
+        return bytes(self._state)
+
+    def restore(self, state: bytes) -> None:
+        """Replace all of it. Raises PeerError, state unchanged, on another size."""
+        if len(state) != self.size_bytes:
+            raise PeerError(f"state of {len(state)} bytes, expected {self.size_bytes}")
+        self._state[:] = state
+
+    def migrate(self, old_state: bytes) -> None:
+        """Take over from a version of the same size; after any other function, begin anew."""
+        self._state[:] = old_state if len(old_state) == self.size_bytes else bytes(self.size_bytes)
+
+    def acceptable(self, request: bytes, reply: bytes) -> bool:
+        """Whether it has the size of a reply."""
+        return len(reply) == REPLY_BYTES
+
+
+def source_of(size_bytes: int, version: int) -> str:
+    """What `aftbed adapt update app --to` takes; the size lies within the limits above."""
+    assert SIZE_BYTES_MIN <= size_bytes <= SIZE_BYTES_MAX, size_bytes
+    assert version in VERSIONS, version
+    return f"{__name__}:Ballast{size_bytes}v{version}"
+
+
+def __getattr__(name: str) -> type[Ballast]:
+    """The class of a size and version, by its name (PEP 562)."""
+    found = _NAME.fullmatch(name)
+    size_bytes = int(found[1]) if found else 0
+    if not SIZE_BYTES_MIN <= size_bytes <= SIZE_BYTES_MAX:
+        raise AttributeError(
+            f"{__name__} has no {name}: Ballast(BYTES)v1 or v2, {SIZE_BYTES_MIN} to {SIZE_BYTES_MAX} bytes"
+        )
+    return type(name, (Ballast,), {"size_bytes": size_bytes, "__module__": __name__})

@@ -1,0 +1,94 @@
+"""What happened in a run beside the requests, and in which words: the records of all journals, and what was
+told.
+
+A fault that was applied is called by its own words, as `aftbed run` was given them; others are called by
+the name of their event. `Kind` says what it belongs to, so that a reader can keep apart what broke from
+what mended it.
+"""
+
+import json
+from collections.abc import Iterator
+from enum import Enum
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from aftbed.campaign.diagram import FIRST_FAULT
+from aftbed.campaign.record import RunRecord
+from aftbed.campaign.report.happenings import DUE, STEPS, USUAL
+from aftbed.core.event import Event
+from aftbed.core.fault import marked
+from aftbed.core.journal import Record
+from aftbed.runtime.adaptations import FIRST_TRIGGER
+
+TOLD_NAME: Final = "events.jsonl"
+FAILURES: Final = frozenset(
+    (Event.DETECTED_STOP, Event.FOLLOWER_DIVERGED, Event.NODE_DIED, Event.WATCHDOG_SUSPECT)
+)
+
+
+class Kind(Enum):
+    """What a happening belongs to."""
+
+    REQUEST = "request"  # the path of a request
+    FAULT = "fault"  # what was done to the system
+    FAILURE = "failure"  # what broke, or was seen broken
+    RECOVERY = "recovery"
+    ADAPTATION = "adaptation"
+
+
+class Told(NamedTuple):
+    """A line for people, when it was told by the monotonic clock."""
+
+    t_ns: int
+    event: str
+    text: str
+
+
+def journals(record: RunRecord) -> Iterator[tuple[str, int, list[Record]]]:
+    """For each process: its node, the how manyeth process of that name it is, and its records."""
+    for name, records in record.history.journals.items():
+        if records:
+            life = name.rpartition(".")[2]
+            yield records[0].node, int(life) if life.isdigit() else 1, records
+
+
+def kind_of(one: Record) -> Kind:
+    if one.event is Event.FAULT_APPLIED:
+        return Kind.FAULT if marked(one.detail)[0] < FIRST_TRIGGER else Kind.ADAPTATION
+    if one.event in FAILURES:
+        return Kind.FAILURE
+    if one.event in USUAL or one.event is Event.DEDUPE_HIT:
+        return Kind.REQUEST
+    return Kind.ADAPTATION if str(one.event).startswith("adapt") else Kind.RECOVERY
+
+
+def words_of(one: Record, record: RunRecord) -> str:
+    """A record in words; a fault in its own."""
+    if one.event is Event.FAULT_APPLIED:
+        number = marked(one.detail)[0]
+        return DUE if number >= FIRST_TRIGGER else _fault(number - FIRST_FAULT, record)
+    if one.event is Event.NODE_DIED:
+        return f"{one.event}: process {one.detail}"
+    words = [str(one.event), *([f"#{one.request_id}"] if one.request_id else [])]
+    return " ".join([*words, *([str(one.detail)] if one.event in STEPS else [])])
+
+
+def _fault(at: int, record: RunRecord) -> str:
+    """The end of a run tells of faults that were asked for while it lived, too."""
+    told = (record.end or {}).get("faults")
+    if isinstance(told, list) and 0 <= at < len(told) and isinstance(told[at], dict):
+        return str(told[at].get("fault", "a fault"))
+    faults = record.options.faults
+    return str(faults[at]) if 0 <= at < len(faults) else "a fault"
+
+
+def told_in(record: RunRecord) -> Iterator[Told]:
+    """The lines for people, up to one that was cut off."""
+    path: Path = record.path / TOLD_NAME
+    for line in path.read_bytes().splitlines() if path.exists() else ():
+        try:
+            found = json.loads(line)
+            t_ns = record.started_ns + int(found["t_ms"] * 1e6)
+            yield Told(t_ns, str(found["event"]), str(found["text"]))
+        except (ValueError, KeyError, TypeError):
+            return

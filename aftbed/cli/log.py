@@ -1,0 +1,57 @@
+"""`aftbed log`: files that other tools open, made of a log of the bus or of the record of a run."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+log = typer.Typer(
+    help="Files that other tools open: logs of the bus in their formats, and the record of a run.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+)
+
+
+@log.command()
+def convert(
+    source: Annotated[Path, typer.Argument(help="A log of a CAN bus.")],
+    sink: Annotated[Path, typer.Argument(help="The file to write.")],
+    from_format: Annotated[
+        str | None,
+        typer.Option("--from", help="candump, asc, blf, trc or mf4, if SOURCE's ending does not say."),
+    ] = None,
+    to_format: Annotated[
+        str | None,
+        typer.Option("--to", help="One of these or csv (by signal), if SINK's ending does not say."),
+    ] = None,
+    dbc: Annotated[
+        Path | None, typer.Option(help="What is in the frames, for csv; aftbed's own if left out.")
+    ] = None,
+) -> None:
+    """Write a log of a CAN bus in another format."""
+    from aftbed.vehicle.logs.convert import convert as converted  # noqa: PLC0415
+
+    done = converted(source, sink, from_format, to_format, dbc)
+    print(f"{sink}: {done.frames} frames, {done.source} to {done.sink}")
+    for reason, count in done.left_out.items():
+        print(f"  left out: {count} times {reason}")
+
+
+@log.command()
+def export(
+    record: Annotated[Path, typer.Argument(help="The directory of --record.")],
+    mcap: Annotated[Path | None, typer.Option(help="Write the run to this file, for Foxglove.")] = None,
+    trace: Annotated[Path | None, typer.Option(help="Write its nodes to this file, for Perfetto.")] = None,
+) -> None:
+    """Write the record of a run as files that other tools open."""
+    from aftbed.campaign.record import read_record  # noqa: PLC0415
+    from aftbed.campaign.runfiles.export import Wanted, check  # noqa: PLC0415
+    from aftbed.campaign.runfiles.export import export as exported  # noqa: PLC0415
+    from aftbed.core.errors import ConfigError  # noqa: PLC0415
+
+    wanted = Wanted(mcap, trace)
+    if wanted == Wanted():
+        raise ConfigError("nothing to write: give --mcap FILE, --trace FILE, or both")
+    check(wanted)
+    for line in exported(read_record(record), wanted):
+        print(line)

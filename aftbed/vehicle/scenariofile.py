@@ -1,0 +1,174 @@
+"""What a scenario file may hold, key by key, and the `Scenario` that is made of it.
+
+The same keys describe a file of the user's, a shipped scenario, and the rows of a published table
+(`tables`): whatever one of them can say, the others can. Units are in the keys, ranges in the types;
+what is refused names the file, the key, what was found and what is allowed.
+"""
+
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+from aftbed.core.errors import ConfigError
+from aftbed.vehicle.plant import (
+    DEAD_TIME_MS,
+    KMH_PER_MS,
+    LAG_MS,
+    Brakes,
+    CutIn,
+    Driver,
+    Lead,
+    LeadBraking,
+    PlantSetup,
+)
+
+Outcome = Literal["stop", "no_collision", "no_braking", "impact"]
+
+Speed = Annotated[float, Meta(ge=0, le=200)]
+Distance = Annotated[float, Meta(ge=0, le=1000)]
+Duration = Annotated[float, Meta(ge=0, le=3600)]
+Deceleration = Annotated[float, Meta(ge=0, le=12)]
+Lag = Annotated[float, Meta(ge=0, le=2)]
+
+
+class Expectation(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What the drive must come to. The two limits apply whatever the outcome."""
+
+    outcome: Outcome
+    impact_speed_kmh_max: Speed = 0.0
+    stop_gap_m_min: Distance = 0.0
+
+
+class Scenario(msgspec.Struct, frozen=True):
+    """A drive, ready for `Plant(scenario.plant)`; it ends at `duration_ms` at the latest."""
+
+    name: str
+    description: str
+    duration_ms: int
+    plant: PlantSetup
+    expect: Expectation
+
+
+class EgoKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """`ego:`"""
+
+    speed_kmh: Speed
+
+
+class BrakingKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """`lead.braking:`. Euro NCAP gives the car ahead one second to reach its deceleration."""
+
+    after_s: Duration
+    deceleration_ms2: Deceleration
+    ramp_s: Duration = 1.0
+
+
+class CutInKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """`lead.cut_in:`"""
+
+    after_s: Duration
+    over_s: Annotated[float, Meta(gt=0, le=60)]
+
+
+class LeadKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """`lead:`. Either `gap_m`, or the time in which the ego would close it: `ttc_s`."""
+
+    speed_kmh: Speed
+    gap_m: Distance | None = None
+    ttc_s: Annotated[float, Meta(gt=0, le=60)] | None = None
+    braking: BrakingKeys | None = None
+    lateral_m: Annotated[float, Meta(ge=-10, le=10)] = 0.0
+    cut_in: CutInKeys | None = None
+
+
+class RoadKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """`road:`"""
+
+    friction: Annotated[float, Meta(gt=0, le=1.2)] = 0.9
+
+
+class BrakesKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """`brakes:`"""
+
+    dead_time_s: Lag = DEAD_TIME_MS / 1000
+    lag_s: Lag = LAG_MS / 1000
+    jerk_max_ms3: Annotated[float, Meta(gt=0, le=1000)] | None = None
+    deceleration_max_ms2: Annotated[float, Meta(gt=0, le=12)] | None = None
+
+
+class DriverKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """`driver:`, one who brakes when warned."""
+
+    reaction_s: Annotated[float, Meta(ge=0, le=10)]
+    deceleration_ms2: Deceleration
+
+
+class ScenarioKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A scenario file."""
+
+    description: str
+    duration_s: Annotated[float, Meta(gt=0, le=3600)]
+    ego: EgoKeys
+    expect: Expectation
+    lead: LeadKeys | None = None
+    road: RoadKeys = RoadKeys()
+    brakes: BrakesKeys = BrakesKeys()
+    driver: DriverKeys | None = None
+
+
+def scenario_of(name: str, where: str, keys: ScenarioKeys) -> Scenario:
+    """The scenario that `keys` describe. Raises ConfigError, which begins with `where`."""
+    setup = PlantSetup(
+        speed_ms=keys.ego.speed_kmh / KMH_PER_MS,
+        lead=_lead(where, keys.lead, keys.ego.speed_kmh) if keys.lead else None,
+        friction=keys.road.friction,
+        brakes=_brakes(keys.brakes),
+        driver=Driver(_ms(keys.driver.reaction_s), keys.driver.deceleration_ms2) if keys.driver else None,
+    )
+    return Scenario(name, keys.description, _ms(keys.duration_s), setup, keys.expect)
+
+
+def _ms(duration_s: float) -> int:
+    return round(duration_s * 1000)
+
+
+def _brakes(keys: BrakesKeys) -> Brakes:
+    return Brakes(_ms(keys.dead_time_s), _ms(keys.lag_s), keys.jerk_max_ms3, keys.deceleration_max_ms2)
+
+
+def _lead(where: str, keys: LeadKeys, ego_kmh: float) -> Lead:
+    return Lead(
+        gap_m=_gap_m(where, keys, ego_kmh),
+        speed_ms=keys.speed_kmh / KMH_PER_MS,
+        braking=_braking(keys.braking) if keys.braking else None,
+        lateral_m=keys.lateral_m,
+        cut_in=_cut_in(where, keys.cut_in, keys.lateral_m) if keys.cut_in else None,
+    )
+
+
+def _braking(keys: BrakingKeys) -> LeadBraking:
+    return LeadBraking(_ms(keys.after_s), keys.deceleration_ms2, _ms(keys.ramp_s))
+
+
+def _cut_in(where: str, keys: CutInKeys, lateral_m: float) -> CutIn:
+    if lateral_m == 0.0:
+        raise ConfigError(f"{where}: lead.cut_in: found without lateral_m, allowed is a car beside our lane")
+    return CutIn(_ms(keys.after_s), max(1, _ms(keys.over_s)))
+
+
+def _gap_m(where: str, lead: LeadKeys, ego_kmh: float) -> float:
+    """The gap as given, or as it follows from `ttc_s`. Zero would be a collision before the start."""
+    if (lead.gap_m is None) == (lead.ttc_s is None):
+        given = "none of them" if lead.gap_m is None else "both"
+        raise ConfigError(f"{where}: lead: found {given}, allowed is one of gap_m, ttc_s")
+    if lead.ttc_s is not None:
+        closing_kmh = ego_kmh - lead.speed_kmh
+        if closing_kmh <= 0.0:
+            reason = f"found {lead.ttc_s}, allowed is gap_m, because the gap does not close"
+            raise ConfigError(f"{where}: lead.ttc_s: {reason}")
+        return lead.ttc_s * closing_kmh / KMH_PER_MS
+    assert lead.gap_m is not None
+    if lead.gap_m == 0.0:
+        raise ConfigError(f"{where}: lead.gap_m: found 0, allowed is more than 0")
+    return lead.gap_m

@@ -1,0 +1,193 @@
+"""Published tables of what an emergency brake must do, row by row, as data: `cases/*.yaml`.
+
+A table has groups (one target, one state of the car), a group has rows: a speed, and the greatest speed
+at impact with which the row is passed. Each group says where its numbers are from, and where one of them
+is not from the text of a regulation or a protocol, it says that too. A row is a scenario like any
+other: `load_scenario("r152:m1-60")`, and so every `--scenario`.
+
+    r152      UN Regulation No. 152: the speed is the relative one
+    ncap      Euro NCAP, car-to-car rear: the speed is the ego's
+    negative  nothing is due, and nothing may be asked of the brakes
+
+What a table asks for beside the impact is in the case: how long the warning has to come before emergency
+braking, and how much or how little may be asked of the brakes.
+"""
+
+import difflib
+from functools import lru_cache
+from pathlib import Path
+from typing import Annotated, Final, Literal
+
+import msgspec
+from msgspec import Meta
+
+from aftbed.core.errors import ConfigError, unknown
+from aftbed.vehicle.report import VehicleResult
+from aftbed.vehicle.scenariofile import (
+    BrakesKeys,
+    Deceleration,
+    DriverKeys,
+    Duration,
+    EgoKeys,
+    Expectation,
+    LeadKeys,
+    RoadKeys,
+    Scenario,
+    ScenarioKeys,
+    Speed,
+    scenario_of,
+)
+from aftbed.vehicle.yamlfile import read_yaml
+
+SEPARATOR: Final = ":"  # between table and row, in the name of a case
+COLOURS: Final = ((5.0, "green"), (15.0, "yellow"), (30.0, "orange"), (40.0, "brown"))  # below, in km/h
+WORST_COLOUR: Final = "red"
+NEAR_NAMES: Final = 8
+
+_FOLDER: Final = Path(__file__).resolve().parent / "cases"
+
+
+class Case(msgspec.Struct, frozen=True):
+    """One row of a table. What is None is not asked for."""
+
+    name: str  # the scenario's too
+    table: str
+    group: str
+    speed_kmh: float  # of the row: the relative speed in r152, else the ego's
+    limit_kmh: float  # greatest relative speed at contact with which the row is passed; 0 is no contact
+    warning_s_min: float | None  # the warning comes at least so long before emergency braking
+    demand_ms2_min: float | None  # what emergency braking asks for at least
+    source: str
+    demand_ms2_max: float | None = None  # no more than this may be asked of the brakes
+
+
+class _Group(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Rows of one kind. The rows are pairs: speed, limit. `speed` says whose the first one is."""
+
+    description: str
+    source: str
+    duration_s: Annotated[float, Meta(gt=0, le=3600)]
+    rows: Annotated[tuple[tuple[Speed, Speed], ...], Meta(min_length=1)]
+    speed: Literal["ego", "relative"] = "ego"
+    lead: LeadKeys | None = None
+    road: RoadKeys = RoadKeys()
+    brakes: BrakesKeys = BrakesKeys()
+    driver: DriverKeys | None = None
+    warning_s_min: Duration | None = None
+    demand_ms2_min: Deceleration | None = None
+    demand_ms2_max: Deceleration | None = None
+
+
+class _Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A file of cases."""
+
+    title: str
+    groups: dict[str, _Group]
+
+
+def table_names() -> list[str]:
+    """The tables that there are."""
+    return sorted(path.stem for path in _FOLDER.glob("*.yaml"))
+
+
+def group_names(table: str) -> list[str]:
+    """The groups of a table, in its order. Raises ConfigError if there is no such table."""
+    return list(_table(table).groups)
+
+
+def title(table: str) -> str:
+    """What a table is, in a line. Raises ConfigError if there is no such table."""
+    return _table(table).title
+
+
+def cases(table: str, group: str | None = None) -> tuple[Case, ...]:
+    """The rows of a table, or of one group of it. Raises ConfigError on a name that does not exist."""
+    groups = _table(table).groups
+    if group is not None and group not in groups:
+        raise unknown(f"group of table {table}", group, groups)
+    return tuple(
+        _case(table, name, held, speed_kmh, limit_kmh)
+        for name, held in groups.items()
+        if group in (None, name)
+        for speed_kmh, limit_kmh in held.rows
+    )
+
+
+def case_scenario(name: str) -> Scenario:
+    """The drive of the case of this name. Raises ConfigError, with names that are near, if there is none."""
+    table = name.partition(SEPARATOR)[0]
+    for case in cases(table):
+        if case.name == name:
+            return _scenario(case, _table(table).groups[case.group])
+    names = [case.name for case in cases(table)]
+    near = difflib.get_close_matches(name, names, n=NEAR_NAMES, cutoff=0.0)
+    raise ConfigError(
+        f"unknown case {name!r} (of {len(names)} in table {table}, the nearest: {', '.join(near)})"
+    )
+
+
+def broken(case: Case, result: VehicleResult) -> list[str]:
+    """Every way in which a drive fails its row, or []."""
+    found = []
+    impact_kmh = (result.impact_speed_kmh or 0.0) if result.collision else 0.0
+    if result.collision and (impact_kmh > case.limit_kmh or case.limit_kmh == 0.0):
+        allowed = f"at most {case.limit_kmh:g}" if case.limit_kmh else "none"
+        found.append(f"impact at {impact_kmh:.1f} km/h, allowed is {allowed}")
+    demand_ms2 = result.demand_max_ms2
+    if case.demand_ms2_min is not None and demand_ms2 < case.demand_ms2_min:
+        found.append(f"asked for {demand_ms2:.1f} m/s2, at least {case.demand_ms2_min:g} are due")
+    if case.demand_ms2_max is not None and demand_ms2 > case.demand_ms2_max:
+        found.append(f"asked for {demand_ms2:.1f} m/s2, allowed is at most {case.demand_ms2_max:g}")
+    warning_s = result.warning_s
+    if case.warning_s_min is not None and warning_s is not None and warning_s < case.warning_s_min:
+        found.append(f"warned {warning_s:.2f} s before braking, at least {case.warning_s_min:g} s are due")
+    return found
+
+
+def colour(impact_kmh: float) -> str:
+    """The colour in which Euro NCAP prints a speed at impact."""
+    return next((name for below_kmh, name in COLOURS if impact_kmh < below_kmh), WORST_COLOUR)
+
+
+@lru_cache(maxsize=8)
+def _table(name: str) -> _Table:
+    if name not in table_names():
+        raise unknown("table", name, table_names())
+    return read_yaml(_FOLDER / f"{name}.yaml", _Table)
+
+
+def _case(table: str, name: str, group: _Group, speed_kmh: float, limit_kmh: float) -> Case:
+    return Case(
+        name=f"{table}{SEPARATOR}{name}-{speed_kmh:g}",
+        table=table,
+        group=name,
+        speed_kmh=speed_kmh,
+        limit_kmh=limit_kmh,
+        warning_s_min=group.warning_s_min,
+        demand_ms2_min=group.demand_ms2_min,
+        source=group.source,
+        demand_ms2_max=group.demand_ms2_max,
+    )
+
+
+def _scenario(case: Case, group: _Group) -> Scenario:
+    lead_kmh = group.lead.speed_kmh if group.lead is not None else 0.0
+    keys = ScenarioKeys(
+        description=f"{group.description}, {case.speed_kmh:g} km/h",
+        duration_s=group.duration_s,
+        ego=EgoKeys(case.speed_kmh + (lead_kmh if group.speed == "relative" else 0.0)),
+        expect=_expectation(case),
+        lead=group.lead,
+        road=group.road,
+        brakes=group.brakes,
+        driver=group.driver,
+    )
+    return scenario_of(case.name, f"{_FOLDER / case.table}.yaml: {case.group}", keys)
+
+
+def _expectation(case: Case) -> Expectation:
+    if case.demand_ms2_max == 0.0:
+        return Expectation("no_braking")
+    if case.limit_kmh == 0.0:
+        return Expectation("no_collision")
+    return Expectation("impact", impact_speed_kmh_max=case.limit_kmh)

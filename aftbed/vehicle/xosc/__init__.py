@@ -1,0 +1,1 @@
+"""OpenSCENARIO XML files, read: the parts of `aftbed.vehicle.openscenario`."""

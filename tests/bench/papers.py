@@ -1,0 +1,44 @@
+"""A document of `aftbed bench paper` that nobody measured, for tests of what is made of it."""
+
+from aftbed.bench.paperdocument import Count, Paper, figure
+from aftbed.bench.placements import Cycle, Loaded, Placed, times
+from aftbed.bench.published import CYCLE_PBR, Published
+from aftbed.bench.sweep import Sized
+from aftbed.bench.usage import Usage
+from aftbed.campaign.environment import Environment
+
+USAGE = Usage(1.0, 17, 6, 13.15, 83.4, 7, 0.5, 26.6)
+TIMES = times([0.1, 0.2, 0.4])
+CYCLE = Cycle("pbr", "process", 3, 12, times([100.0, 110.0, 180.0]), times([75.0, 76.0, 90.0]), 1.4)
+
+
+def made_up(note: str = "", refused: str = "too large") -> Paper:
+    """One row of each kind, the second of some."""
+    return Paper(
+        title="Title",
+        source="place, id",
+        their_machine="slow",
+        environment=Environment("CPython 3", "Linux 6", "2 of 2, fast", "aftbed bench paper"),
+        quick=True,
+        seconds=12.4,
+        speed_kmh=50.0,
+        deceleration_ms2=8.83,
+        rospy_cycle_ms=0.6,
+        figures=(
+            figure("cycle.pbr", "cycle of pbr", TIMES, 3, 75.0, CYCLE_PBR),
+            figure("start", "start", times([408.0]), 1, 75.0, note=note),
+            figure("whole", "whole", times([130.0]), 1, 75.0, Published(300, 300, "still"), served=True),
+        ),
+        processes=(Count("pbr", "process", 17, 17), Count("pbr", "replica", 9, None)),
+        placements=(Placed("process", True, CYCLE, USAGE, USAGE),),
+        state=(
+            Sized("pbr", 100, 900, times([110.0, 120.0]), 75.0, 2, TIMES, TIMES),
+            Sized("pbr", 60_000, 900, times([310.0, 320.0]), 75.0, 2, TIMES, TIMES),
+            Sized("pbr", 10_000_000, refused=refused),
+        ),
+        load=(
+            Loaded("pbr", "process", 10.0, 30, 10.0, TIMES, 75.0, USAGE),
+            Loaded("pbr", "process", 2000.0, 6000, 1999.7, TIMES, 75.0, USAGE),
+        ),
+        notes=("something is missing",),
+    )

@@ -1,0 +1,406 @@
+"""A run as a trace and as MCAP: what a person sees there is what the record says."""
+
+import copy
+import json
+from collections import Counter
+from pathlib import Path
+from typing import Any, Final
+
+import pytest
+from mcap.reader import make_reader
+from records import CAR, CRASH, MS, RecordInTheMaking
+from tracechecks import problems
+
+from aftbed.campaign.record import RunRecord, read_record
+from aftbed.campaign.runfiles import tracefile
+from aftbed.campaign.runfiles.axis import Axis
+from aftbed.campaign.runfiles.export import Wanted, check, export
+from aftbed.campaign.runfiles.steps import between_processes, ends_ns, followed, steps_of
+from aftbed.core.errors import ConfigError
+from aftbed.core.event import Event
+from aftbed.core.journal import EntryKind
+from aftbed.runtime.adaptations import FIRST_TRIGGER
+from aftbed.runtime.unix.journal import Dialogue
+from aftbed.runtime.unix.options import CarRun, LoadRun, ReplayRun, Work
+from aftbed.vehicle.aebmessages import AebInput, AebTarget, encode_request
+from aftbed.vehicle.candump import log_line
+from aftbed.vehicle.dbcfile import Codec, load_dbc
+from aftbed.vehicle.e2e import protect
+from aftbed.vehicle.frame import Frame
+
+CODEC: Final[Codec] = load_dbc()
+FIRST_FAULT: Final = 1_000_001
+PBR_PATH: Final = (  # journal, event: one request under PBR, as it happens
+    ("client.1", Event.REQUEST_SENT),
+    ("a-protocol.1", Event.REQUEST_RECEIVED),
+    ("a-before.1", Event.BEFORE_EXIT),
+    ("a-proceed.1", Event.PROCEED_ENTER),
+    ("a-server.1", Event.SERVER_ENTER),
+    ("a-server.1", Event.SERVER_EXIT),
+    ("a-server.1", Event.STATE_CAPTURED),
+    ("a-after.1", Event.CHECKPOINT_SENT),
+    ("b-server.1", Event.STATE_RESTORED),
+    ("a-protocol.1", Event.REPLY_STORED),
+    ("b-after.1", Event.CHECKPOINT_APPLIED),
+    ("a-protocol.1", Event.REPLY_SENT),
+    ("proxy.1", Event.REPLY_ACCEPTED),
+    ("client.1", Event.REPLY_DELIVERED),
+)
+
+
+def run_of(path: Path, work: Work | None = None, requests: int = 2) -> RecordInTheMaking:
+    """A run whose journals have the whole path of each request; it has to be `finished`."""
+    run = RecordInTheMaking(path, work, (CRASH,))
+    for number in range(1, requests + 1):
+        for journal, event in PBR_PATH:
+            run.note(journal, event, number)
+    return run
+
+
+def finished(run: RecordInTheMaking) -> RunRecord:
+    run.verdict()
+    return read_record(run.path)
+
+
+def arrows(record: RunRecord) -> list[tuple[str, str, str]]:
+    steps = steps_of(record)
+    found = between_processes(steps, followed(steps))
+    return [(steps[one.cause].node, one.channel, steps[one.effect].node) for one in found]
+
+
+# -- the trace ------------------------------------------------------------------------------------
+
+
+def test_the_messages_of_a_request_are_those_of_the_paper(tmp_path: Path) -> None:
+    assert arrows(finished(run_of(tmp_path, requests=1))) == [
+        ("client", "pxy2pro", "a/protocol"),
+        ("a/protocol", "pro2bfr", "a/before"),
+        ("a/before", "bfr2prd", "a/proceed"),
+        ("a/proceed", "prd2srv", "a/server"),
+        ("a/server", "srv2aft", "a/after"),
+        ("a/after", "aft2aft", "b/server"),
+        ("a/after", "aft2pro", "a/protocol"),
+        ("b/server", "srv2aft", "b/after"),
+        ("a/protocol", "pro2pxy", "proxy"),
+        ("proxy", "pxy2clt", "client"),
+    ]
+
+
+def test_a_request_that_is_asked_again_is_answered_by_who_leads_then(tmp_path: Path) -> None:
+    run = RecordInTheMaking(tmp_path)
+    for journal, event in PBR_PATH[:8]:
+        run.note(journal, event, 1)
+    run.note("b-protocol.1", Event.DEDUPE_HIT, 1)
+    run.note("proxy.1", Event.REPLY_ACCEPTED, 1)
+    assert arrows(finished(run))[-2:] == [
+        ("client", "pxy2pro", "b/protocol"),
+        ("b/protocol", "pro2pxy", "proxy"),
+    ]
+
+
+LFR_PATH: Final = (
+    *PBR_PATH[:2],
+    ("a-before.1", Event.FOLLOWER_FORWARDED),
+    ("a-proceed.1", Event.PROCEED_ENTER),
+    ("b-before.1", Event.BEFORE_EXIT),
+    ("b-proceed.1", Event.PROCEED_ENTER),
+    ("a-server.1", Event.SERVER_ENTER),
+    ("b-server.1", Event.SERVER_ENTER),
+    ("a-server.1", Event.SERVER_EXIT),
+    ("b-server.1", Event.SERVER_EXIT),
+    ("a-after.1", Event.FOLLOWER_NOTIFIED),
+    ("a-protocol.1", Event.REPLY_STORED),
+)
+
+
+def test_the_replicas_of_lfr_execute_each_for_itself(tmp_path: Path) -> None:
+    run = RecordInTheMaking(tmp_path)
+    for journal, event in LFR_PATH:
+        run.note(journal, event, 1)
+    assert arrows(finished(run)) == [
+        ("client", "pxy2pro", "a/protocol"),
+        ("a/protocol", "pro2bfr", "a/before"),
+        ("a/before", "bfr2bfr", "b/before"),
+        ("b/before", "bfr2prd", "b/proceed"),
+        ("a/proceed", "prd2srv", "a/server"),
+        ("b/proceed", "prd2srv", "b/server"),
+        ("a/server", "prd2aft", "a/after"),
+        ("a/after", "aft2pro", "a/protocol"),
+    ]
+
+
+def test_arrows_belong_to_one_request(tmp_path: Path) -> None:
+    run = RecordInTheMaking(tmp_path)
+    run.note("client.1", Event.REQUEST_SENT, 1)
+    run.note("client.1", Event.REQUEST_SENT, 2)
+    run.note("a-protocol.1", Event.REQUEST_RECEIVED, 1)
+    steps = steps_of(finished(run))
+    assert [(steps[f.cause].request_id, steps[f.effect].request_id) for f in followed(steps)] == [(1, 1)]
+
+
+def test_a_step_ends_when_what_followed_begins_and_before_the_next_of_its_process(tmp_path: Path) -> None:
+    run = RecordInTheMaking(tmp_path)
+    run.t_ns -= MS  # each note is a ms behind the one before
+    run.note("client.1", Event.REQUEST_SENT, 1)
+    run.t_ns -= MS - 50_000
+    run.note("a-protocol.1", Event.REQUEST_RECEIVED, 1)
+    run.t_ns -= MS - 500
+    run.note("a-protocol.1", Event.DEDUPE_HIT, 2)
+    steps = steps_of(finished(run))
+    lengths = [end - step.t_ns for step, end in zip(steps, ends_ns(steps, followed(steps)), strict=True)]
+    assert lengths == [50_000, 500, 1_000]
+
+
+def test_a_step_of_which_nothing_came_for_long_is_not_drawn_as_long(tmp_path: Path) -> None:
+    run = RecordInTheMaking(tmp_path)
+    run.note("client.1", Event.REQUEST_SENT, 1)
+    run.note("a-protocol.1", Event.REQUEST_RECEIVED, 1)  # a ms later: the first was hung
+    steps = steps_of(finished(run))
+    assert ends_ns(steps, followed(steps))[0] - steps[0].t_ns == 200_000
+
+
+@pytest.fixture
+def eventful(tmp_path: Path) -> RunRecord:
+    """A crash, a failover, an adaptation, requests, and words for people."""
+    run = run_of(tmp_path)
+    run.request()
+    run.note("a-after.1", Event.FAULT_APPLIED, detail=FIRST_FAULT)
+    run.note("a-watchdog.1", Event.WATCHDOG_SUSPECT, detail=1)
+    run.note("supervisor.1", Event.NODE_DIED, detail=4711)
+    run.note("client.1", Event.FAULT_APPLIED, detail=FIRST_TRIGGER)
+    run.note("engine.1", Event.ADAPT_PLAN, detail=1)
+    run.note("supervisor.1", Event.ADAPT_STEP_ENTER, detail=3)
+    run.note("engine.1", Event.ADAPT_COMMIT, detail=1)
+    run.note("a-after.2", Event.CHECKPOINT_APPLIED, 2)
+    told = [{"t_ms": 1.5, "event": "alarm", "text": "a: crash"}, {"t_ms": 2.5, "event": "roles", "text": "b"}]
+    lines = "".join(json.dumps(line) + "\n" for line in told) + '{"t_ms": 3'
+    (tmp_path / "events.jsonl").write_text(lines)
+    return finished(run)
+
+
+def traced(record: RunRecord) -> list[dict[str, Any]]:
+    """As the file has it."""
+    path = record.path / "trace.json"
+    assert tracefile.write(record, path) == len(json.loads(path.read_text())["traceEvents"])
+    document = json.loads(path.read_text())
+    assert document["otherData"]["ftm"] == "pbr"
+    return document["traceEvents"]  # type: ignore[no-any-return]
+
+
+def test_a_trace_is_one_that_a_viewer_can_show(eventful: RunRecord) -> None:
+    events = traced(eventful)
+    assert problems(events) == []
+    assert {"X", "s", "f", "i", "b", "e", "M"} == {event["ph"] for event in events}
+
+
+def test_faults_and_steps_of_adaptations_are_instants_in_their_own_words(eventful: RunRecord) -> None:
+    instants = {e["name"]: e["cat"] for e in traced(eventful) if e["ph"] == "i"}
+    assert instants == {
+        "crash primary at checkpoint.sent nth 2": "fault",
+        "watchdog.suspect": "failure",
+        "node.died: process 4711": "failure",
+        "an adaptation is due": "adaptation",
+        "adapt.plan": "adaptation",
+        "adapt.step.enter 3": "adaptation",
+        "adapt.commit": "adaptation",
+        "alarm: a: crash": "told",
+        "roles: b": "told",
+    }
+
+
+def test_who_takes_the_place_of_a_dead_process_has_a_track_of_its_own(eventful: RunRecord) -> None:
+    threads = [e["args"]["name"] for e in traced(eventful) if e["name"] == "thread_name"]
+    assert {"a/after", "a/after (2)"} < set(threads)
+    assert threads[0] == "client"
+    assert len(threads) == len(set(threads))
+
+
+def test_a_request_is_a_slice_from_its_sending_to_its_reply(eventful: RunRecord) -> None:
+    found = [e for e in traced(eventful) if e.get("cat") == "request"]
+    assert [(e["ph"], e["name"]) for e in found] == [("b", "request 1"), ("e", "request 1")]
+
+
+@pytest.mark.parametrize(
+    ("phase", "change", "said"),
+    [
+        ("f", {"id": 999_999}, "has one end only"),
+        ("f", {"ts": 0.0}, "goes back in time"),
+        ("s", {"ts": 0.001}, "is bound to no slice"),
+        ("s", {"name": "aft2aft2"}, "changes its name"),
+        ("X", {"dur": 1e9}, "begins within the one before"),
+        ("X", {"dur": -1.0}, "ends before it begins"),
+        ("X", {"ts": 1e12}, "is behind"),
+        ("X", {"tid": 77}, "has no name"),
+        ("e", {"id": 77}, "ends and was not begun"),
+        ("b", {"id": 77}, "never ends"),
+    ],
+)
+def test_the_checker_of_traces_refuses_a_broken_one(
+    phase: str, change: dict[str, object], said: str, eventful: RunRecord
+) -> None:
+    events = copy.deepcopy(traced(eventful))
+    next(event for event in events if event["ph"] == phase).update(change)
+    assert any(said in problem for problem in problems(events)), problems(events)
+
+
+# -- the axis of time -----------------------------------------------------------------------------
+
+
+def asking(path: Path, work: Work, *pairs: tuple[int, int]) -> RunRecord:
+    """A run with a request at each (t_ns, t_ms)."""
+    run = RecordInTheMaking(path, work)
+    dialogue = Dialogue(path / "journal" / "client.2.dialogue", "client")
+    for number, (t_ns, t_ms) in enumerate(pairs, 1):
+        target = AebTarget(0, 40.0, -10.0)
+        payload = encode_request(AebInput(t_ms, 14.0, True, True, (target,)))
+        dialogue.write(t_ns, number, 0, EntryKind.SENT, payload)
+    dialogue.write(pairs[-1][0], 99, 0, EntryKind.SENT, b"\xff struck by a fault")
+    return finished(run)
+
+
+def test_in_real_time_the_axis_is_the_monotonic_clock_less_one_offset(tmp_path: Path) -> None:
+    begin = 5_000 * MS
+    late = ((begin + 20 * MS + 900_000, 20), (begin + 40 * MS + 100_000, 40), (begin + 130 * MS, 60))
+    axis = Axis(asking(tmp_path, CarRun("ccrs-50", 1.0, "latch"), *late))
+    assert axis.at(begin + 50 * MS) == 50 * MS - 100_000, "by the fastest request"
+    assert axis.at(begin - 1_000 * MS) == 0, "what was before the car's run lies at its beginning"
+
+
+def test_at_another_pace_bus_time_goes_faster(tmp_path: Path) -> None:
+    axis = Axis(asking(tmp_path, CarRun("ccrs-50", 4.0, "latch"), (1_005 * MS, 20), (1_010 * MS, 40)))
+    assert axis.at(1_020 * MS) == 80 * MS
+
+
+def test_in_lockstep_time_stands_still_while_the_function_works(tmp_path: Path) -> None:
+    axis = Axis(asking(tmp_path, CAR, (1_000 * MS, 20), (1_002 * MS, 40)))
+    assert [axis.at(t * MS) for t in (999, 1_000, 1_001, 1_002, 1_999)] == [
+        0,
+        20 * MS,
+        20 * MS,
+        40 * MS,
+        40 * MS,
+    ]
+
+
+def test_without_a_bus_the_axis_is_the_time_since_the_launch(tmp_path: Path) -> None:
+    record = finished(run_of(tmp_path, LoadRun(2, 0.0)))
+    assert Axis(record).at(record.started_ns + 7) == 7
+
+
+# -- MCAP -----------------------------------------------------------------------------------------
+
+
+def frame(t_us: int, name: str, broken: bool = False, **signals: float) -> str:
+    values = dict.fromkeys(CODEC.signal_names(name), 0.0) | signals
+    data = protect(CODEC.encode(name, values), CODEC.data_id(name), 0)
+    if broken:
+        data = bytes([data[0] ^ 1]) + data[1:]
+    return log_line(Frame(t_us, CODEC.can_id(name), data), "can0")
+
+
+def mcap_of(record: RunRecord) -> dict[str, list[tuple[int, dict[str, Any]]]]:
+    """What the reader of the format finds: time and message, by topic."""
+    path = record.path / "run.mcap"
+    lines = export(record, Wanted(mcap=path))
+    found: dict[str, list[tuple[int, dict[str, Any]]]] = {}
+    times = []
+    with path.open("rb") as file:
+        for schema, channel, message in make_reader(file).iter_messages(log_time_order=False):
+            assert schema is not None and schema.encoding == "jsonschema"
+            about = json.loads(schema.data)
+            content = json.loads(message.data)
+            assert about["type"] == "object" and "$ref" not in schema.data.decode()
+            assert set(about.get("required", ())) <= set(content) <= set(about["properties"])
+            found.setdefault(channel.topic, []).append((message.log_time, content))
+            times.append(message.log_time)
+    assert times == sorted(times)
+    assert lines == [f"{path}: {len(times)} messages"]
+    return found
+
+
+def test_what_is_on_the_bus_is_on_the_topics(tmp_path: Path) -> None:
+    run = run_of(tmp_path, CAR)
+    (tmp_path / "bus.log").write_text(
+        frame(1_000, "EGO_STATE", SPEED=15, ACCELERATION=-2.0, SPEED_VALID=1)
+        + frame(2_000, "RADAR_TRACK", VALID=1, RANGE=30, RELATIVE_SPEED=-10, LATERAL_OFFSET=0.5)
+        + frame(3_000, "AEB_REQ", STAGE=2, DECELERATION=4, TTC=3, TTC_VALID=1, TARGET=5, SEQUENCE=9)
+        + frame(
+            4_000,
+            "BRAKE_STATUS",
+            STAGE_APPLIED=2,
+            FALLBACK=3,
+            DECELERATION_ACTUAL=3.5,
+            DECELERATION_DEMANDED=4,
+        )
+        + frame(5_000, "RADAR_TRACK")
+        + frame(6_000, "EGO_STATE", broken=True, SPEED=60, SPEED_VALID=1)
+        + "(0000000000.006000) can0 13"
+    )
+    found = mcap_of(finished(run))
+    assert found["/ego"] == [(MS, {"speed_ms": 15.0, "speed_kmh": 54.0, "acceleration_ms2": -2.0})]
+    lead = {"in_sight": True, "gap_m": 30.0, "relative_speed_ms": -10.0, "speed_ms": 5.0}
+    assert found["/lead"] == [
+        (2 * MS, lead | {"lateral_offset_m": 0.5, "ttc_s": 3.0}),
+        (5 * MS, {"in_sight": False}),
+    ]
+    asked = {"stage": 2, "stage_name": "PARTIAL", "demand_ms2": 4.0, "sequence": 9, "ttc_s": 3.0, "target": 5}
+    assert found["/function"] == [(3 * MS, asked)]
+    ((_, brake),) = found["/brake"]
+    assert (brake["stage_name"], brake["fallback_name"], brake["deceleration_ms2"]) == (
+        "PARTIAL",
+        "LATCH",
+        3.5,
+    )
+    frames = found["/can"]
+    assert [message["intact"] for _, message in frames] == [True] * 5 + [False], (
+        "the broken one is not believed"
+    )
+    assert frames[0][1] | {"data": ""} == {
+        "id": 0x120, "interface": "can0", "length": 8, "data": "", "name": "EGO_STATE", "intact": True,
+    }  # fmt: skip
+
+
+def test_faults_and_adaptations_are_on_a_topic_apart_from_the_path_of_requests(eventful: RunRecord) -> None:
+    found = mcap_of(eventful)
+    kinds = Counter(message["kind"] for _, message in found["/ftm"])
+    assert kinds == {"fault": 1, "failure": 2, "adaptation": 4}
+    assert {message["kind"] for _, message in found["/ftm/requests"]} == {"request"}
+    ((t_ns, fault),) = [(t, m) for t, m in found["/ftm"] if m["kind"] == "fault"]
+    assert fault["text"] == "crash primary at checkpoint.sent nth 2"
+    assert (fault["node"], fault["run_ms"]) == ("a/after", t_ns / 1e6)
+    assert [(m["level"], m["message"]) for _, m in found["/log"]] == [(3, "alarm: a: crash"), (2, "roles: b")]
+    assert found["/log"][0][1]["timestamp"] == {"sec": 0, "nsec": 1_500_000}
+
+
+def test_a_replay_shows_what_the_function_was_told(tmp_path: Path) -> None:
+    work = ReplayRun("/gone.log", "/gone.dbc", "/gone.yaml", None)
+    record = asking(tmp_path, work, (1_000 * MS, 20))
+    (tmp_path / "bus.log").write_text(
+        "(0000000000.020000) can1 120#0102\n" + frame(20_500, "AEB_REQ", STAGE=1)
+    )
+    found = mcap_of(record)
+    assert found["/ego"] == [(20 * MS, {"speed_ms": 14.0, "speed_kmh": 50.4})]
+    lead = {"in_sight": True, "gap_m": 40.0, "relative_speed_ms": -10.0, "speed_ms": 4.0, "ttc_s": 4.0}
+    assert found["/lead"] == [(20 * MS, lead)]
+    assert "name" not in found["/can"][0][1], "a frame of another bus is not aftbed's EGO_STATE"
+    assert [message["stage"] for _, message in found["/function"]] == [1]
+
+
+def test_a_file_that_cannot_be_written_is_refused_before_the_run(tmp_path: Path) -> None:
+    for wanted, said in (
+        (Wanted(mcap=tmp_path), f"--mcap {tmp_path}: is a directory, a file is allowed"),
+        (Wanted(trace=tmp_path / "no" / "a"), f"--trace {tmp_path}/no/a: {tmp_path}/no is no directory"),
+        (Wanted(tmp_path / "a", tmp_path / "a"), f"--mcap and --trace: {tmp_path}/a is asked for as both"),
+    ):
+        with pytest.raises(ConfigError) as refused:
+            check(wanted)
+        assert str(refused.value) == said
+
+
+@pytest.mark.parametrize("kind", ["mcap", "trace"])
+def test_a_file_for_which_there_is_no_room_is_an_error(kind: str, tmp_path: Path) -> None:
+    """Here: in a directory that takes no new file."""
+    record = finished(run_of(tmp_path / "run"))
+    wanted = Wanted(**{kind: Path("/proc/file")})
+    with pytest.raises(ConfigError, match=r"^/proc/file: cannot be written: "):
+        export(record, wanted)

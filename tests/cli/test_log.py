@@ -1,0 +1,50 @@
+"""`aftbed log`: what it prints, what it writes, and what it refuses."""
+
+from pathlib import Path
+
+import pytest
+from playedrun import Run
+
+LOG = "(0000000001.000000) can0 120#1B10413600000000\n(0000000001.010000) can0 7FF#\n"
+
+
+@pytest.fixture
+def log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    path = Path("bus.log")
+    path.write_text(LOG)
+    return path
+
+
+def test_there_and_back_again(log: Path, told: Run) -> None:
+    assert told("log", "convert", log, "bus.blf") == "bus.blf: 2 frames, candump to blf\n"
+    assert (
+        told("log", "convert", "bus.blf", "again", "--to", "candump") == "again: 2 frames, blf to candump\n"
+    )
+    assert Path("again").read_text() == LOG
+
+
+def test_what_was_left_out_is_said(log: Path, told: Run) -> None:
+    assert told("log", "convert", log, "bus.csv") == (
+        "bus.csv: 1 frames, candump to csv\n  left out: 1 times frame that the DBC does not have\n"
+    )
+
+
+def test_a_format_that_is_not_known_is_refused_with_all_there_are(log: Path, refused: Run) -> None:
+    allowed = "(one of: asc, blf, candump, csv, mf4, trc)"
+    assert refused("log", "convert", log, "bus.txt") == (
+        f"aftbed: error: bus.txt: the ending '.txt' says no format; --to does {allowed}\n"
+    )
+
+
+def test_an_export_without_a_file_and_one_of_no_record_are_refused(log: Path, refused: Run) -> None:
+    assert "nothing to write: give --mcap FILE, --trace FILE, or both" in refused("log", "export", ".")
+    assert "run.json: No such file or directory; is this the record of a run?" in refused(
+        "log", "export", ".", "--trace", "trace.json"
+    )
+    assert not Path("trace.json").exists()
+
+
+def test_a_run_that_could_not_write_its_files_does_not_start(log: Path, refused: Run) -> None:
+    assert "--mcap no/run.mcap: " in refused("run", "--load", "5", "--mcap", "no/run.mcap")
+    assert "--trace .: is a directory" in refused("run", "--load", "5", "--trace", ".")

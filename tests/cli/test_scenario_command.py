@@ -1,0 +1,173 @@
+"""`aftbed scenario`: what is listed and shown, a table with its exit code and document, what is refused."""
+
+import json
+from functools import partial
+from pathlib import Path
+
+import pytest
+from playedrun import Call, Run
+
+from aftbed.cli.scenarioasked import Asked, chosen
+from aftbed.vehicle.scenario import scenario_names
+from aftbed.vehicle.tables import table_names
+
+
+@pytest.fixture
+def table(call: Call) -> Call:
+    """Call `aftbed scenario table` with one process that simulates."""
+
+    def aftbed(*arguments: str | Path) -> tuple[int, str, str]:
+        return call("scenario", "table", *arguments, "--jobs", "1")
+
+    return aftbed
+
+
+def test_the_list_has_every_scenario_and_every_table(told: Run) -> None:
+    found = json.loads(told("scenario", "list", "--json"))
+    assert list(found["scenarios"]) == scenario_names()
+    assert [one["table"] for one in found["tables"]] == table_names()
+    lines = told("scenario", "list").splitlines()
+    assert any(line.split()[:3] == ["m1", "9", "rows"] for line in lines)
+
+
+def test_a_row_is_shown_with_what_its_table_demands(told: Run) -> None:
+    out = told("scenario", "show", "r152:m1-60")
+    assert out.startswith("r152:m1-60: ")
+    assert "impact at 35 km/h at most, a warning 0.8 s before braking, a demand of 5 m/s2 at least" in out
+    found = json.loads(told("scenario", "show", "r152:m1-60", "--json"))
+    assert found["row"]["limit_kmh"] == 35
+    assert found["scenario"]["plant"]["speed_ms"] == pytest.approx(60 / 3.6)
+
+
+def test_a_scenario_of_no_table_is_shown_without_a_row(told: Run) -> None:
+    assert "row of" not in told("scenario", "show", "ccrb-50-12m")
+    assert json.loads(told("scenario", "show", "ccrb-50-12m", "--json"))["row"] is None
+
+
+def test_a_table_that_passes_is_one_document_and_exit_code_0(table: Call) -> None:
+    code, out, err = table("negative", "--group", "beside", "--json")
+    found = json.loads(out)
+    assert (code, err) == (0, "")
+    assert (found["table"], found["group"], found["seed"], found["pass"]) == ("negative", "beside", 0, True)
+    assert [row["case"] for row in found["rows"]] == [f"negative:beside-{v}" for v in (30, 50, 80)]
+    keys = {"case", "speed_kmh", "limit_kmh", "impact_kmh", "min_gap_m", "warning_s", "pass"}
+    assert all(keys <= set(row) for row in found["rows"])
+
+
+def test_a_row_that_fails_is_exit_code_1_and_says_why(table: Call, tmp_path: Path) -> None:
+    fault = "crash primary at server.enter nth 100"
+    code, out, _ = table("ncap", "--group", "ccrb-12m-6", "--fault", fault)
+    assert code == 1
+    assert "none, crash primary at server.enter nth 100" in out.splitlines()
+    assert "  ncap:ccrb-12m-6-50: impact at " in out
+    assert f'  repeat  aftbed sim --scenario ncap:ccrb-12m-6-50 --ftm none --seed 0 --faults "{fault}"' in out
+    assert "0 of 1 rows pass" in out
+
+
+def test_the_same_fault_is_survived_under_a_mechanism_beside(table: Call) -> None:
+    fault = "crash primary at server.enter nth 100"
+    code, out, _ = table("ncap", "--group", "ccrb-12m-6", "--fault", fault, "--ftm", "none,pbr", "--json")
+    rows = json.loads(out)["rows"]
+    assert code == 1
+    assert [(row["ftm"], row["pass"]) for row in rows] == [("none", False), ("pbr", True)]
+
+
+def test_a_fault_that_never_strikes_is_exit_code_3(table: Call) -> None:
+    never = ("--fault", "crash primary at server.enter nth 100000")
+    code, out, _ = table("negative", "--group", "following", *never)
+    assert code == 3
+    assert out.rstrip().split("\n")[-1].startswith("0 of 1 rows pass; the fault never struck in 1")
+
+
+def test_outages_are_lines_of_their_own_and_are_drawn(table: Call, tmp_path: Path) -> None:
+    plot = tmp_path / "road.svg"
+    arguments = ("ncap", "--group", "ccrb-12m-6", "--ftm", "none", "--outage", "2s", "--plot", plot)
+    code, out, _ = table(*arguments)
+    assert code == 1
+    lines = out.splitlines()
+    assert "none" in lines and "outage 2000ms (under none)" in lines
+    assert sum(" instants: every 0.4 s" in line for line in lines) == 1
+    drawing = plot.read_text()
+    assert drawing.startswith("<svg xmlns=") and "outage 2000ms" in drawing
+
+
+def test_what_is_driven_is_a_line_for_each_mechanism_and_each_outage() -> None:
+    asked = Asked("r152", "m1", ("pbr", "lfr", "pbr"), "worst-instant", ("2ms", "0.3s", "2ms"))
+    lines = chosen(asked).lines
+    crash = "crash primary at the worst instant"
+    assert [line.name for line in lines] == [f"pbr, {crash}", f"lfr, {crash}", "outage 2ms", "outage 300ms"]
+    assert [line.outage_ms for line in lines] == [None, None, 2, 300]
+    assert all(line.searched for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("asked", "names"),
+    [
+        (Asked("r152"), ["none"]),
+        (Asked("r152", outages=("2ms",)), ["outage 2ms"]),
+        (Asked("r152", ftms=("pbr",), outages=("2ms",)), ["pbr", "outage 2ms"]),
+        (
+            Asked("r152", fault="worst-instant", outages=("2ms",)),
+            ["none, crash primary at the worst instant", "outage 2ms"],
+        ),
+    ],
+)
+def test_what_is_left_out_is_the_bare_function(asked: Asked, names: list[str]) -> None:
+    assert [line.name for line in chosen(asked).lines] == names
+
+
+def test_a_hang_can_be_searched_and_any_fault_aimed() -> None:
+    searched = chosen(Asked("r152", ftms=("pbr",), fault="hang primary for 30ms at worst-instant")).lines[0]
+    assert searched.searched and str(searched.fault) == "hang primary for 30ms"
+    aimed = chosen(Asked("r152", ftms=("pbr",), fault="bitflip result bit 3 at server.exit nth 9")).lines[0]
+    assert not aimed.searched and str(aimed.fault).endswith("at server.exit nth 9")
+
+
+# -- what is refused
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["r125"], "unknown table 'r125'; did you mean 'r152'?"),
+        (["r152", "--group", "m2"], "unknown group of table r152 'm2'"),
+        (["r152", "--ftm", "pbr,lfx"], "lfx"),
+        (["r152", "--ftm", "pbr", "--fault", "explode primary"], "unknown fault 'explode'"),
+        (["r152", "--fault", "crash backup at worst-instant"], "unknown target 'backup'"),
+        (
+            ["r152", "--fault", "crash primary after 1s at worst-instant"],
+            "without any other time is searched",
+        ),
+        (["r152", "--fault", "bitflip result bit 3 at worst-instant"], "without any other time is searched"),
+        (["r152", "--fault", "crash primary worst-instant"], "FAULT WORDS at worst-instant is allowed"),
+        (["r152", "--fault", "crash hub"], "the simulator has no hub"),
+        (["r152", "--outage", "300"], "--outage '300': a positive number with its unit is allowed"),
+        (["r152", "--outage", "0.2ms"], "--outage 0.2ms: 1ms is the shortest that is allowed"),
+        (["r152", "--outage", "10s"], "--outage 10s: r152:m1-10 lasts 10 s; a shorter one is allowed"),
+        (["r152", "--seed", "-1"], "--seed -1: 0 to "),
+        (["r152", "--jobs", "0"], "--jobs 0: 1 to "),
+        (
+            ["r152", "--plot", "road.png"],
+            "--plot road.png: a file .svg in a directory that exists is allowed",
+        ),
+        (["r152", "--plot", "nowhere/road.svg"], "--plot nowhere/road.svg: a file .svg in a directory"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_bad_input_names_the_argument(refused: Run, arguments: list[str], said: str) -> None:
+    assert said in refused("scenario", "table", *arguments)
+
+
+@pytest.mark.parametrize("command", ["show", "run"])
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [("ccrs-51", "unknown scenario 'ccrs-51'; did you mean"), ("r152:m1-61", "unknown case 'r152:m1-61'")],
+)
+def test_a_drive_that_does_not_exist(refused: Run, command: str, name: str, said: str) -> None:
+    assert said in refused("scenario", command, name)
+
+
+def test_run_is_aftbed_run(refused: Run) -> None:
+    error = partial(refused, "scenario", "run", "ccrs-20")
+    assert "--pace fast: real, max, or a factor" in error("--pace", "fast")
+    assert "unknown fault 'explode'" in error("--inject", "explode primary")

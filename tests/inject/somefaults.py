@@ -1,0 +1,100 @@
+"""Any fault there is, for hypothesis to draw."""
+
+from hypothesis import strategies as st
+
+from aftbed.core.busfault import QUANTITIES, Condition
+from aftbed.core.event import Event
+from aftbed.core.fault import (
+    HANG_FOREVER_MS,
+    LATER,
+    SHARE_MAX,
+    SHARE_MIN,
+    SLOW_MS_MAX,
+    Crash,
+    Disturb,
+    Fault,
+    FlipMemory,
+    Hang,
+    How,
+    Slow,
+    Trigger,
+)
+from aftbed.core.persistence import ONCE, Chance, Every, Permanent
+from aftbed.core.valuefault import BIT_MAX, BITS_MAX, Bit, Bits, Burst, Byte, Flip, Place, Stuck
+from aftbed.core.words import DURATION_MS_MAX
+
+durations = st.integers(1, DURATION_MS_MAX)
+after = st.builds(Trigger, after_ms=durations)
+conditions = st.builds(
+    Condition,
+    st.sampled_from(QUANTITIES),
+    st.booleans(),
+    st.integers(-(10**9), 10**9).map(lambda millionths: millionths / 1e6),
+)
+triggers = st.one_of(
+    st.just(Trigger()),
+    st.builds(
+        Trigger,
+        st.sampled_from([e.label for e in Event]),
+        st.integers(1, 10**9),
+        when=st.none() | conditions,
+    ),
+    st.builds(Trigger, when=conditions),
+    after,
+)
+bits = st.integers(0, BIT_MAX)
+patterns = st.one_of(
+    st.builds(Bit, st.none() | bits),
+    st.builds(Bits, st.integers(1, BITS_MAX)),
+    st.builds(Byte, st.none() | st.integers(0, BIT_MAX // 8)),
+    st.builds(Burst, st.integers(1, BITS_MAX), st.none() | bits),
+    st.builds(Stuck, bits, st.integers(0, 1)),
+)
+persistences = st.one_of(
+    st.just(ONCE),
+    st.just(Permanent()),
+    st.builds(Every, st.integers(1, 10**6)),
+    st.builds(Chance, st.integers(1, 10**6).map(lambda millionths: millionths / 1e6)),
+)
+disturbances = st.one_of(
+    st.builds(Disturb, st.sampled_from(LATER), st.sampled_from(("pxy2pro", "aft2aft")), durations),
+    st.builds(Disturb, st.sampled_from([how for how in How if how not in LATER]), st.just("aft2pro")),
+)
+fields = st.from_regex(r"[A-Za-z0-9_]{1,20}(\.[A-Za-z0-9_]{1,20})?", fullmatch=True)
+replicas = st.sampled_from(("primary", "backup", "a", "b"))
+faults = st.one_of(
+    st.builds(Fault, st.just(Crash()), st.sampled_from(("primary", "b/after")), triggers),
+    st.builds(Fault, st.builds(Hang, st.just(HANG_FOREVER_MS) | durations), st.just("backup"), triggers),
+    st.builds(
+        Fault,
+        st.builds(Slow, st.integers(1, round(SLOW_MS_MAX)), st.just(0) | durations),
+        st.just("a/server"),
+        triggers,
+    ),
+    st.builds(
+        Fault,
+        disturbances,
+        replicas,
+        st.builds(Trigger, nth=st.integers(1, 10**9), when=st.none() | conditions) | after,
+        persistences,
+    ),
+    st.builds(
+        Fault,
+        st.builds(
+            Slow,
+            st.just(0.0),
+            st.just(0) | durations,
+            st.integers(round(1e5 * SHARE_MIN), round(1e5 * SHARE_MAX)).map(lambda n: n / 1000 / 100),
+        ),
+        st.just("primary"),
+        triggers,
+    ),
+    st.builds(
+        Fault,
+        st.builds(FlipMemory, st.none() | st.integers(0, 7), st.none() | st.integers(0, 2**48 - 1)),
+        st.sampled_from(("primary", "b/after")),
+        triggers,
+    ),
+    st.builds(Fault, st.builds(Flip, st.sampled_from(Place), patterns), replicas, triggers, persistences),
+    st.builds(Fault, st.builds(Flip, st.just(Place.STATE), patterns, fields), replicas, triggers),
+)

@@ -1,0 +1,237 @@
+"""What hinders a real node: a channel that is full when a fault comes or goes; a share of a CPU.
+
+Orders lie in the control line before the node looks at it. One of them has the brick hand out its state, and
+what the brick does then is to read its channel empty: so what happens while there is no room happens in an
+order that is known.
+"""
+
+import os
+import socket
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+import pytest
+
+from aftbed.core import wire
+from aftbed.core.brick import Brick, Effect, Send
+from aftbed.core.event import Event
+from aftbed.core.fault import Disturb, How, marked
+from aftbed.core.journal import FLAG_OFFSET, records
+from aftbed.core.message import AnyMessage, Request
+from aftbed.core.persistence import Permanent
+from aftbed.runtime import control
+from aftbed.runtime.orders import carry_out
+from aftbed.runtime.unix.journal import Journal
+from aftbed.runtime.unix.line import Line, decode_order, decode_report
+from aftbed.runtime.unix.node import Node
+
+FILLER: Final = Request(1, 0, bytes(2000))
+BRICK, PORT = "a/after", "aft2aft"
+FAULT: Final = 7
+WORK_NS: Final = 3_000_000  # of CPU time, in a step
+
+
+class Passing(Brick):
+    """Sends on what it gets. Its state is what has come out of the channel, which it reads empty for that."""
+
+    def __init__(self, reader: socket.socket) -> None:
+        self.reader, self.got, self.works_ns = reader, list[int](), 0
+
+    def open_ports(self) -> tuple[str, ...]:
+        return ("in",)
+
+    def quiescent(self) -> bool:
+        return True
+
+    def step(self, port: str, msg: AnyMessage, now_ns: int) -> list[Effect]:
+        until_ns = time.thread_time_ns() + self.works_ns
+        while time.thread_time_ns() < until_ns:
+            pass
+        return [Send(PORT, msg)] if isinstance(msg, Request) else []
+
+    def capture(self) -> bytes:
+        while True:
+            try:
+                message = wire.decode(self.reader.recv(wire.PACKET_BYTES_MAX))
+            except BlockingIOError:
+                return bytes(self.got)
+            assert isinstance(message, Request)
+            self.got += [message.request_id] if message.request_id else []
+
+    def restore(self, state: bytes) -> None:
+        raise AssertionError("it has none")
+
+
+class Host:
+    """A node with such a brick; `order` lays an order into its control line, `out` is what has come out."""
+
+    def __init__(self, path: Path) -> None:
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self.line, self.path = Line(ours, decode_report), path
+        ours.setblocking(False)
+        writer, self.reader = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        for end in (writer, self.reader):
+            end.setblocking(False)
+        self.brick = Passing(self.reader)
+        self.node = Node("a", Line(theirs, decode_order), Journal(path, "a"))
+        self.node.add(BRICK, self.brick)
+        self.writer = writer.detach()
+        self.node.bind_output(BRICK, PORT, self.writer, 1)
+
+    def fill(self) -> None:
+        data = wire.encode(FILLER)
+        try:
+            while True:
+                os.write(self.writer, data)
+        except BlockingIOError:
+            return
+
+    def order(self, order: control.ToNode) -> None:
+        self.line.send(order)
+        self.node.journal.mapping[FLAG_OFFSET] = 1
+
+    def drain(self) -> None:
+        """Once the node looks at its orders, there is room."""
+        self.order(control.Capture(control.UNANSWERED, BRICK))
+
+    def disturb(self, how: How, nth: int = 1, *, permanent: bool = False) -> control.Interfere:
+        blow = control.Blow(FAULT, BRICK, nth, Disturb(how, PORT), False)
+        if permanent:
+            blow = control.Blow(FAULT, BRICK, nth, Disturb(how, PORT), False, persistence=Permanent())
+        return control.Interfere(control.UNANSWERED, blow)
+
+    def send(self, request_id: int) -> None:
+        self.node.step(self.node.wiring.hosted[BRICK], "in", Request(1, request_id, b""))
+
+    def out(self) -> list[int]:
+        return list(self.brick.capture())
+
+    def direct(self) -> bool:
+        """Whether the port leads to its channel, with nothing in between."""
+        return self.node.wiring.hosted[BRICK].outs[PORT] == self.writer
+
+    def close(self) -> None:
+        for end in (self.line, self.node.line, self.reader):
+            end.close()
+        os.close(self.writer)
+
+
+@pytest.fixture
+def host(tmp_path: Path) -> Iterator[Host]:
+    made = Host(tmp_path / "a.journal")
+    yield made
+    made.close()
+
+
+# -- full channels --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("how", How)
+def test_a_fault_that_is_armed_while_its_sender_waits_for_room_strikes_what_comes_later(
+    host: Host, how: How
+) -> None:
+    host.fill()
+    host.order(host.disturb(how))
+    host.drain()
+    host.send(1)
+    assert host.out() == [1], "it was sent before the fault was there"
+    host.send(2)
+    host.send(3)
+    expected = {
+        How.OMISSION: [1, 3],
+        How.DELAY: [1],  # the rest is held back
+        How.DUPLICATE: [1, 2, 2, 3],
+        How.REORDER: [1, 3, 2],
+    }
+    assert host.out() == expected[how]
+
+
+def test_a_fault_that_is_lifted_while_what_it_let_through_waits_for_room_loses_none_of_it(host: Host) -> None:
+    carry_out(host.node.host, host.disturb(How.DUPLICATE, permanent=True), [])
+    host.fill()
+    host.order(host.disturb(How.DUPLICATE, nth=0))
+    host.drain()
+    host.send(1)
+    host.send(2)
+    assert host.out() == [1, 1, 2] and host.direct()
+
+
+def test_what_is_disturbed_waits_for_room_as_anything_does(host: Host) -> None:
+    carry_out(host.node.host, host.disturb(How.OMISSION, nth=2), [])
+    host.fill()
+    host.drain()
+    for request_id in (1, 2, 3):
+        host.send(request_id)
+    assert host.out() == [1, 3] and host.direct()
+
+
+def test_where_the_port_is_bound_elsewhere_meanwhile_it_is_not_sent(host: Host) -> None:
+    """As without a fault: the brick has heard of it, and asks again for what it wants."""
+    carry_out(host.node.host, host.disturb(How.DUPLICATE), [])
+    host.fill()
+    other, reader = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    bind = control.BindOutput(control.UNANSWERED, BRICK, PORT, 2)
+    host.line.send(bind, (other.fileno(),))
+    other.close()
+    host.send(1)
+    reader.setblocking(False)
+    with pytest.raises(BlockingIOError):
+        reader.recv(1)
+    host.send(2)
+    assert wire.decode(reader.recv(wire.PACKET_BYTES_MAX)) == Request(1, 2, b"")
+    reader.close()
+    host.writer = host.node.wiring.hosted[BRICK].outs[PORT]  # type: ignore[assignment]
+
+
+# -- a share of a CPU -----------------------------------------------------------------------------
+
+
+def slowed(host: Host, share: float, by_ns: int = 0) -> None:
+    order = control.SlowDown(control.UNANSWERED, FAULT, by_ns, share)
+    assert carry_out(host.node.host, order, []) == b""
+
+
+def took_ns(host: Host, steps: int) -> tuple[int, int]:
+    """So many steps: by the clock, and of a CPU."""
+    began_ns, used_ns = time.monotonic_ns(), time.thread_time_ns()
+    for request_id in range(1, steps + 1):
+        host.send(request_id)
+    return time.monotonic_ns() - began_ns, time.thread_time_ns() - used_ns
+
+
+@pytest.mark.parametrize("share", [0.5, 0.25, 0.1])
+def test_a_node_has_its_share_of_a_cpu_and_no_more(host: Host, share: float) -> None:
+    """The other way round cannot be told on a machine that others use: there, it may get less."""
+    host.brick.works_ns = WORK_NS
+    slowed(host, share)
+    clock_ns, used_ns = took_ns(host, 5)
+    assert used_ns >= 5 * WORK_NS and used_ns / clock_ns < share * 1.1
+    assert host.out() == [1, 2, 3, 4, 5]
+
+
+def test_the_effects_come_after_the_wait(host: Host) -> None:
+    host.brick.works_ns = WORK_NS
+    slowed(host, 0.25)
+    began_ns = time.monotonic_ns()
+    host.send(1)
+    assert time.monotonic_ns() - began_ns >= 0.9 * WORK_NS / 0.25 and host.out() == [1]
+
+
+def test_when_it_is_over_nothing_is_left_of_it(host: Host) -> None:
+    slowed(host, 0.25)
+    host.send(1)
+    slowed(host, control.WHOLE)
+    assert host.node.host.slowed == {} and host.node.armed == {}
+    assert not {"step", "perform"} & vars(host.node).keys(), "the node is on its fast way again"
+
+
+def test_it_is_written_down_when_it_is_felt_and_once(host: Host) -> None:
+    slowed(host, 0.25)
+    words = [r for r in records(host.path.read_bytes()) if r.event is Event.FAULT_APPLIED]
+    assert words == [], "no step yet"
+    for request_id in (1, 2):
+        host.send(request_id)
+    (word,) = [r for r in records(host.path.read_bytes()) if r.event is Event.FAULT_APPLIED]
+    assert marked(word.detail)[0] == FAULT

@@ -1,0 +1,111 @@
+"""The home of a test: the XDG_RUNTIME_DIR of its runs, and what is left in it when they are over.
+
+Whatever descends from a test carries the name of its home in its environment (`/proc/PID/environ`), or is a
+fork of this process whose pid is known; so after a test it can be told, without a name to guess, whether
+anything of it is left. Other tests, and other people's processes, may run beside it.
+"""
+
+import contextlib
+import os
+import shutil
+import signal
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Final, TypeVar
+
+import pytest
+
+WAIT_SECONDS_MAX: Final = 60.0  # a wait ends with its event: this is for machines under load
+LOOK_SECONDS: Final = 0.005  # between two looks at what no descriptor tells
+GONE_SECONDS_MAX: Final = 1.0  # G7
+PATIENCE_SECONDS: Final = 5.0  # how long a test waits for what G7 allows a second
+SHARED_MEMORY: Final = Path("/dev/shm")
+
+Found = TypeVar("Found")
+
+
+def until(look: Callable[[], Found], what: str, seconds: float = WAIT_SECONDS_MAX) -> Found:
+    """What `look` returns as soon as that is true. Fails the test at the deadline, saying `what`."""
+    limit = time.monotonic() + seconds
+    while not (found := look()):
+        if time.monotonic() > limit:
+            pytest.fail(f"waited {seconds} s for {what}")
+        time.sleep(LOOK_SECONDS)
+    return found
+
+
+class Home:
+    """The XDG_RUNTIME_DIR of one test. Its path is short: a socket's may have 108 bytes."""
+
+    def __init__(self) -> None:
+        self.path = Path(tempfile.mkdtemp(prefix="aft-", dir="/tmp"))
+        self._mark = f"XDG_RUNTIME_DIR={self.path}".encode()
+        self._shared = set(SHARED_MEMORY.iterdir())
+        self.forks: list[int] = []
+
+    def processes(self) -> list[int]:
+        """The pids of what runs in this home, this process aside."""
+        found = [int(p.name) for p in Path("/proc").iterdir() if p.name.isdigit() and self._is_ours(p)]
+        return [pid for pid in found if pid != os.getpid()]
+
+    def _is_ours(self, process: Path) -> bool:
+        try:
+            if int(process.name) in self.forks:
+                return (process / "stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
+            return self._mark in (process / "environ").read_bytes().split(b"\0")
+        except OSError:
+            return False
+
+    def runs(self) -> list[Path]:
+        """The private directories there are, of runs alive or dead."""
+        root = self.path / "aftbed"
+        return list(root.iterdir()) if root.exists() else []
+
+    def left(self) -> list[str]:
+        """Everything that a run would have left behind (G7)."""
+        found = [f"process {pid}" for pid in self.processes()]
+        found += [f"directory {path}" for path in self.runs()]
+        new = set(SHARED_MEMORY.iterdir()) - self._shared
+        return found + [f"shared memory {p}" for p in new if not self._is_mapped_elsewhere(p)]
+
+    def _is_mapped_elsewhere(self, path: Path) -> bool:
+        """Whether somebody else's process has it: other tests, and others, run beside this one."""
+        ours = {*self.processes(), os.getpid()}
+        for process in Path("/proc").iterdir():
+            if process.name.isdigit() and int(process.name) not in ours:
+                with contextlib.suppress(OSError):
+                    if f" {path}" in (process / "maps").read_text():
+                        return True
+        return False
+
+    def seconds_to_clean(self) -> float:
+        """How long it takes from now until nothing is left."""
+        began = time.monotonic()
+        until(lambda: not self.left(), f"the end of {self.left()}", PATIENCE_SECONDS)
+        return time.monotonic() - began
+
+    def sweep(self) -> None:
+        """After a failed test: end what is its own, so that the next test starts clean."""
+        for pid in self.processes():
+            try:
+                os.kill(pid, signal.SIGKILL)
+            except ProcessLookupError:
+                continue
+        shutil.rmtree(self.path, ignore_errors=True)
+
+
+@pytest.fixture(autouse=True)
+def home(monkeypatch: pytest.MonkeyPatch) -> Iterator[Home]:
+    """A place of its own for each test, and nothing may be left in it."""
+    place = Home()
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(place.path))
+    yield place
+    limit = time.monotonic() + GONE_SECONDS_MAX
+    left = place.left()
+    while left and time.monotonic() < limit:
+        time.sleep(LOOK_SECONDS)
+        left = place.left()
+    place.sweep()
+    assert not left, f"left behind: {left}"

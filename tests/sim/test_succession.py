@@ -1,0 +1,103 @@
+"""Updates of the function in simulated runs: which version served which request, though one was undone."""
+
+from pathlib import Path
+from typing import Final
+
+import pytest
+import versions
+
+from aftbed.campaign.simulated import breaches
+from aftbed.campaign.succession import succession
+from aftbed.core.check import wrong_replies
+from aftbed.core.fault import Crash, Fault, Trigger
+from aftbed.core.message import Goal, Scheduled
+from aftbed.runtime.sim.world import Doom, Run, Setup, World
+from aftbed.runtime.unix.part import load_module
+from aftbed.vehicle.function import default_application
+
+VERSIONS: Final = str(Path(versions.__file__).resolve())
+ONE_WAY: Final = "aftbed.vehicle.variants:Cautious"  # the first version refuses its state
+FIRST: Final = 4  # the request at which the update begins
+EFFECTS: Final = 16  # of a brick: several requests
+
+
+def setup(
+    ftm: str,
+    placement: str,
+    source: str,
+    faults: tuple[Fault, ...] = (),
+    dooms: tuple[Doom, ...] = (),
+) -> Setup:
+    """60 requests at 400 a second, with an update to `source`."""
+    update = Scheduled(Goal(part="app", source=f"{VERSIONS}:{source}"), FIRST)
+    return Setup(ftm, placement, count=60, rate_hz=400, faults=faults, dooms=dooms, adaptations=(update,))
+
+
+def updated(ftm: str, placement: str, source: str, *faults: Fault) -> Run:
+    return World(setup(ftm, placement, source, faults), load=load_module).run()
+
+
+@pytest.mark.parametrize("ftm", ["pbr", "lfr", "pbr+tr", "tr"])
+def test_an_update_is_compared_with_the_version_that_served(ftm: str) -> None:
+    run = updated(ftm, "process", "Firm")
+    assert [a.outcome for a in run.adaptations] == ["done"]
+    assert breaches(run, succession(run.history, run.adaptations)) == ()
+    wrong = wrong_replies(run.history, default_application())
+    assert wrong == list(range(wrong[0], 61)) and FIRST <= wrong[0] < FIRST + 8, "from the update to the end"
+
+
+@pytest.mark.parametrize("target", ["primary", "backup", "a/server", "b/protocol"])
+@pytest.mark.parametrize("source", ["Firm", "Closed"])
+@pytest.mark.parametrize("placement", ["process", "replica"])
+@pytest.mark.parametrize("ftm", ["pbr", "lfr"])
+def test_an_update_that_is_undone_served_only_meanwhile(
+    ftm: str, placement: str, source: str, target: str
+) -> None:
+    if placement == "replica":
+        target = target.partition("/")[0]
+    run = updated(ftm, placement, source, Fault(Crash(), target, Trigger(after_ms=60)))
+    assert [a.outcome for a in run.adaptations] == ["rolled back"]
+    assert breaches(run, succession(run.history, run.adaptations)) == ()
+    wrong = wrong_replies(run.history, default_application())
+    assert wrong, "the second version served"
+    if source == "Firm":  # else the first one goes on with the state that it had left
+        assert wrong == list(range(wrong[0], wrong[-1] + 1)) and wrong[-1] < 60
+
+
+@pytest.mark.parametrize("brick", ["a/protocol", "a/before", "a/after"])
+@pytest.mark.parametrize("ftm", ["pbr", "lfr", "pbr+tr"])
+def test_wherever_in_a_request_the_leader_dies(ftm: str, brick: str) -> None:
+    """What only the dead one had executed is done again by the first version; what the other knew is not."""
+    undone = 0
+    for effect in range(40, 40 + EFFECTS):
+        run = World(setup(ftm, "process", "Firm", dooms=(Doom(brick, effect),)), load=load_module).run()
+        undone += [a.outcome for a in run.adaptations] == ["rolled back"]
+        assert breaches(run, succession(run.history, run.adaptations)) == (), effect
+    assert undone == EFFECTS
+
+
+@pytest.mark.parametrize("target", ["primary", "backup"])
+@pytest.mark.parametrize("placement", ["process", "replica"])
+@pytest.mark.parametrize("ftm", ["pbr", "lfr"])
+def test_where_the_first_version_takes_no_state_back_the_second_goes_on(
+    ftm: str, placement: str, target: str
+) -> None:
+    """One death never costs the service, also while requests are just being let on (14.2 to 14.6 ms)."""
+    outcomes = []
+    for after_ms in (12.0, 13.0, 14.0, *(14.1 + n / 20 for n in range(14)), 15.0, 16.0, 30.0, 60.0, 100.0):
+        fault = Fault(Crash(), target, Trigger(after_ms=after_ms))
+        update = Scheduled(Goal(part="app", source=ONE_WAY), FIRST)
+        given = Setup(ftm, placement, count=60, rate_hz=400, faults=(fault,), adaptations=(update,))
+        run = World(given, load=load_module).run()
+        assert not run.rest.lost, after_ms
+        assert breaches(run, succession(run.history, run.adaptations)) == (), after_ms
+        outcomes.append(run.adaptations[0].outcome)
+    assert outcomes[-4:] == ["done"] * 4 and set(outcomes) >= {"done", "rolled back"}
+
+
+def test_what_never_served_is_no_version() -> None:
+    """It died before requests were let on again."""
+    run = updated("pbr", "process", "Firm", Fault(Crash(), "a/protocol", Trigger("adapt.step.enter", 4)))
+    assert [(a.outcome, a.opened_ns) for a in run.adaptations] == [("rolled back", 0)]
+    assert breaches(run, succession(run.history, run.adaptations)) == ()
+    assert wrong_replies(run.history, default_application()) == []

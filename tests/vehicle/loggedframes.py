@@ -1,0 +1,36 @@
+"""Logs made by chance: every kind of frame that a log may hold."""
+
+from typing import Final
+
+from hypothesis import strategies as st
+
+from aftbed.vehicle.frame import CAN_ID_MAX
+from aftbed.vehicle.logs.frames import EXTENDED_ID_MAX, TIME_US_MAX, Kind, LoggedFrame
+
+NOW_US: Final = 1_790_000_000_000_000
+TIMES_US: Final = st.one_of(
+    st.integers(0, 60_000_000),  # since the start of a log
+    st.integers(NOW_US, NOW_US + 3_600_000_000),
+    st.integers(0, TIME_US_MAX),
+)
+INTERFACES: Final = st.sampled_from(("can0", "can1", "can7"))
+
+
+@st.composite
+def frames(draw: st.DrawFn) -> LoggedFrame:
+    """Any one."""
+    kind = draw(st.sampled_from(Kind))
+    extended = kind is Kind.ERROR or draw(st.booleans())
+    return LoggedFrame(
+        t_us=draw(TIMES_US),
+        interface=draw(INTERFACES),
+        can_id=draw(st.integers(0, EXTENDED_ID_MAX if extended else CAN_ID_MAX)),
+        data=b"" if kind is Kind.REMOTE else draw(st.binary(max_size=8)),
+        extended=extended,
+        kind=kind,
+        length=draw(st.integers(0, 8)) if kind is Kind.REMOTE else 0,
+        sent=kind is not Kind.ERROR and draw(st.booleans()),  # nobody sends an error frame
+    )
+
+
+LOGS: Final = st.lists(frames(), min_size=1, max_size=12).map(tuple)

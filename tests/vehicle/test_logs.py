@@ -1,0 +1,178 @@
+"""A log comes back as it was, through every format, but for what the format does not have."""
+
+import re
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Final
+
+import msgspec
+import pytest
+from hypothesis import HealthCheck, given, settings
+from loggedframes import LOGS, NOW_US
+
+from aftbed.core.errors import ConfigError, PeerError
+from aftbed.vehicle.candump import read_log
+from aftbed.vehicle.frame import Frame
+from aftbed.vehicle.logs import candumpfile
+from aftbed.vehicle.logs.convert import READERS, WRITERS, convert
+from aftbed.vehicle.logs.frames import Kind, Log, LoggedFrame, numbers
+
+REAL_LOG: Final = Path(__file__).resolve().parents[3] / "shared" / "data" / "rav4_following_50kmh.log"
+KEPT_IN_FIXTURE: Final = (HealthCheck.function_scoped_fixture, HealthCheck.too_slow)
+FORMATS: Final = ("candump", "asc", "blf", "trc", "mf4")
+Frames = tuple[LoggedFrame, ...]
+
+
+def without_direction(frames: Frames) -> Frames:
+    return tuple(msgspec.structs.replace(frame, sent=False) for frame in frames)
+
+
+def without_errors_content(frames: Frames) -> Frames:
+    def bare(frame: LoggedFrame) -> LoggedFrame:
+        if frame.kind is not Kind.ERROR:
+            return frame
+        return LoggedFrame(frame.t_us, frame.interface, 0, extended=True, kind=Kind.ERROR)
+
+    return tuple(bare(frame) for frame in frames)
+
+
+def data_only(frames: Frames) -> Frames:
+    return tuple(frame for frame in frames if frame.kind is Kind.DATA)
+
+
+def by_time(frames: Frames) -> Frames:
+    order = (Kind.DATA, Kind.ERROR, Kind.REMOTE)
+    return tuple(sorted(frames, key=lambda frame: (frame.t_us, order.index(frame.kind))))
+
+
+COMES_BACK: Final[dict[str, Callable[[Frames], Frames]]] = {
+    "candump": without_direction,
+    "asc": without_errors_content,
+    "blf": lambda frames: frames,
+    "trc": data_only,
+    "mf4": by_time,
+}
+
+
+@pytest.mark.parametrize("name", FORMATS)
+@settings(max_examples=40, suppress_health_check=KEPT_IN_FIXTURE, deadline=None)
+@given(frames=LOGS)
+def test_every_frame_comes_back_to_the_microsecond(name: str, frames: Frames, tmp_path: Path) -> None:
+    path = tmp_path / "there"
+    WRITERS[name](Log(frames), path)
+    assert READERS[name](path).frames == COMES_BACK[name](frames)
+
+
+@pytest.fixture(params=["America/New_York", "Asia/Kolkata", "Pacific/Auckland"])
+def zone(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setenv("TZ", request.param)
+    time.tzset()
+    yield
+    monkeypatch.undo()
+    time.tzset()
+
+
+@pytest.mark.parametrize("name", FORMATS)
+@pytest.mark.parametrize("t_us", [0, 5_123_456, NOW_US + 5_001])
+def test_a_log_of_any_zone_comes_back(name: str, t_us: int, tmp_path: Path, zone: None) -> None:
+    frames = (LoggedFrame(t_us, "can0", 0x123, b"\x01"), LoggedFrame(t_us + 1, "can0", 0x124, b""))
+    WRITERS[name](Log(frames), tmp_path / "there")
+    assert READERS[name](tmp_path / "there").frames == frames
+
+
+def test_a_log_without_a_date_has_none_in_another_zone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frames = (LoggedFrame(1_500_000, "can0", 0x123, b"\x01"),)
+    WRITERS["asc"](Log(frames), tmp_path / "there")
+    monkeypatch.setenv("TZ", "Pacific/Auckland")
+    time.tzset()
+    try:
+        assert READERS["asc"](tmp_path / "there").frames == frames
+    finally:
+        monkeypatch.undo()
+        time.tzset()
+
+
+def test_interfaces_keep_their_numbers_and_names_get_free_ones() -> None:
+    def seen(*names: str) -> dict[str, int]:
+        return numbers(LoggedFrame(0, name, 1) for name in names)
+
+    assert seen("can3", "can0") == {"can3": 3, "can0": 0}
+    assert seen("vcan0", "can0", "bus", "can1") == {"vcan0": 2, "can0": 0, "bus": 3, "can1": 1}
+    assert seen("can256") == {"can256": 0}
+    with pytest.raises(ConfigError, match="256 interfaces in one log, allowed are 255"):
+        seen(*(f"bus{n}x" for n in range(256)))
+
+
+@pytest.mark.parametrize(
+    ("line", "found"),
+    [
+        (b"(0000000001.000002) can0 130#0102", LoggedFrame(1_000_002, "can0", 0x130, b"\x01\x02")),
+        (b"(1.000002) vcan0 130# T", LoggedFrame(1_000_002, "vcan0", 0x130, sent=True)),
+        (b"(1.000002) can0 00000130#ff R\r", LoggedFrame(1_000_002, "can0", 0x130, b"\xff", extended=True)),
+        (b"(1.1000000) can0 130# R", LoggedFrame(2_000_000, "can0", 0x130)),  # of asc2log
+        (b"(1.000002) can0 130#R", LoggedFrame(1_000_002, "can0", 0x130, kind=Kind.REMOTE)),
+        (b"(1.000002) can0 130#r8", LoggedFrame(1_000_002, "can0", 0x130, kind=Kind.REMOTE, length=8)),
+        (
+            b"(1.000002) can0 20000004#0010000000000000",
+            LoggedFrame(1_000_002, "can0", 4, bytes.fromhex("0010000000000000"), True, Kind.ERROR),
+        ),
+        (b"(1.000002) can0 130##1AABB", None),
+    ],
+)
+def test_a_line_of_candump_means_what_can_utils_mean(line: bytes, found: LoggedFrame | None) -> None:
+    assert candumpfile.parse(line) == found
+
+
+@pytest.mark.parametrize(
+    ("line", "reason"),
+    [
+        (b"", "not a candump line: '', expected"),
+        (b"hello", "not a candump line: 'hello', expected"),
+        (b"(1.000002) can0 130#010", "not a candump line"),
+        (b"(1.000002) can0 130#0102030405060708_9", "not a candump line"),
+        (b"(1.000002) can0 900#01", "CAN id 0x900, allowed is 0 to 0x7ff"),
+        (b"(1.000002) can0 40000000#01", "CAN id 0x40000000, allowed is 0 to 0x1fffffff"),
+        (b"(1.000002) can0 130#010203040506070809", "9 bytes, allowed are 0 to 8"),
+        (b"(1.000002) can0 130#R9", "a remote frame for 9 bytes, allowed are 0 to 8"),
+        (b"(1.000002) can0 20000004#R", "cannot be an error frame and a remote frame"),
+        (b"(9999999999.000002) can0 130#", "time 9999999999.000002 s, allowed is 0 to 4294967295 s"),
+    ],
+)
+def test_a_line_that_is_no_candump_is_refused_with_its_reason(line: bytes, reason: str) -> None:
+    with pytest.raises(PeerError, match=re.escape(reason)):
+        candumpfile.parse(line)
+
+
+def test_what_aftbed_logs_is_read_as_a_replay_reads_it(tmp_path: Path) -> None:
+    path = tmp_path / "bus.log"
+    path.write_text("(0000000000.005000) can0 131#1410010100000000\n(0000000000.010000) can0 110#85\n")
+    replayed, _ = read_log(path)
+    read = candumpfile.read(path).frames
+    assert [Frame(f.t_us, f.can_id, f.data) for f in read] == [logged.frame for logged in replayed]
+
+
+@pytest.mark.skipif(not REAL_LOG.exists(), reason="the real drive is not on this machine")
+@pytest.mark.parametrize("name", [f for f in FORMATS if f != "candump"])
+def test_a_real_drive_comes_back_byte_for_byte(name: str, tmp_path: Path) -> None:
+    there, back = tmp_path / "there", tmp_path / "back.log"
+    done = convert(REAL_LOG, there, to_format=name)
+    assert (done.frames, done.left_out) == (6920, {})
+    convert(there, back, from_format=name)
+    assert back.read_bytes() == REAL_LOG.read_bytes()
+
+
+def test_what_is_left_out_is_counted(tmp_path: Path) -> None:
+    log = tmp_path / "all.log"
+    log.write_text(
+        "(1.000000) can0 130#01\n(1.000001) can0 130#R2\n(1.000002) can0 20000080#\n"
+        "(1.000003) can0 130##001\n(1.000004) can0 131#02\n(1.000005) can0 13"
+    )
+    kept = {"CAN FD frame": 1, "torn last line": 1}
+    assert convert(log, tmp_path / "all.blf").left_out == kept
+    done = convert(log, tmp_path / "all.trc")
+    assert done.frames == 2
+    assert done.left_out == kept | {"remote frame": 1, "error frame": 1}
+    assert convert(tmp_path / "all.trc", tmp_path / "back.log").frames == 2

@@ -1,0 +1,68 @@
+"""Maps by name; and a real drive through one: every frame is accepted, and the function never even warns."""
+
+from pathlib import Path
+
+import pytest
+import yaml
+from puredrive import CODEC, TOYOTA_DBC, TOYOTA_LOG
+
+from aftbed.core.errors import ConfigError
+from aftbed.vehicle.aebmessages import decode_reply, decode_request
+from aftbed.vehicle.candump import read_log
+from aftbed.vehicle.frame import Frame
+from aftbed.vehicle.function import AebFunction
+from aftbed.vehicle.mapfile import find_map
+from aftbed.vehicle.mapped import MappedGateway
+from aftbed.vehicle.mapshape import Messages
+
+
+@pytest.mark.parametrize(
+    ("name", "names"),
+    [
+        ("T{n}", ["T8", "T9", "T10"]),
+        ("T{n:02}", ["T08", "T09", "T10"]),
+        ("{n:03}T{n}", ["008T8", "009T9", "010T10"]),
+        ("T{n:2}", ["T{n:2}"] * 3),
+    ],
+)
+def test_names_with_numbers(name: str, names: list[str]) -> None:
+    assert Messages(name, 8, 10).names() == names
+
+
+def test_an_unknown_map_comes_with_the_nearest() -> None:
+    with pytest.raises(ConfigError, match="unknown map 'toyotta'; did you mean 'toyota'"):
+        find_map("toyotta")
+    assert find_map("./my.yaml") == Path("./my.yaml")
+
+
+def test_the_shipped_map_is_found_and_says_what_it_is() -> None:
+    assert yaml.safe_load(find_map("toyota").read_text())["cycle_end"] == "TRACK_B_15"
+
+
+@pytest.mark.skipif(not TOYOTA_LOG.is_file(), reason="the real drive is not here")
+class TestRealDrive:
+    def frames(self) -> list[Frame]:
+        log, _ = read_log(TOYOTA_LOG)
+        start_us = log[0].frame.t_us
+        return [Frame(entry.frame.t_us - start_us, entry.frame.can_id, entry.frame.data) for entry in log]
+
+    def test_all_frames_are_accepted_and_the_function_never_even_warns(self) -> None:
+        gateway, function = MappedGateway(CODEC, TOYOTA_DBC, find_map("toyota")), AebFunction()
+        requests = [made for frame in self.frames() if (made := gateway.on_frame(frame)) is not None]
+        assert (gateway.counts.accepted, gateway.counts.refused) == (6920, {})
+        assert len(requests) == 200
+        cycles = [decode_request(request) for request in requests]
+        assert all(cycle.ego_valid and cycle.radar_valid and cycle.targets for cycle in cycles)
+        assert min(cycle.ego_speed_ms for cycle in cycles) * 3.6 > 49
+        nearest_m = min(target.range_m for cycle in cycles for target in cycle.targets)
+        assert 25.0 < nearest_m < 30.0
+        assert {decode_reply(function.execute(request)).stage for request in requests} == {0}
+
+    def test_damaged_frames_are_refused_one_by_one_and_nothing_else_is(self) -> None:
+        gateway = MappedGateway(CODEC, TOYOTA_DBC, find_map("toyota"))
+        damaged = 0
+        for number, frame in enumerate(self.frames()):
+            flip = 0x40 if number % 10 == 3 else 0
+            damaged += flip > 0
+            gateway.on_frame(Frame(frame.t_us, frame.can_id, bytes([frame.data[0] ^ flip]) + frame.data[1:]))
+        assert gateway.counts.refused == {"checksum": damaged}
