@@ -201,10 +201,14 @@ class Started:
         return len(list(Path(f"/proc/{pid}/fd").iterdir()))
 
     def answered(self) -> int:
-        """How many replies the client has got, read from its dialogues as they grow."""
+        """How many replies the client has got."""
+        return self.entries(EntryKind.ANSWERED)
+
+    def entries(self, kind: EntryKind) -> int:
+        """How many entries of `kind` are in the client's dialogues, read as they grow."""
         folder = self.launched.record / "journal"
         return sum(
-            entry.kind is EntryKind.ANSWERED
+            entry.kind is kind
             for path in folder.glob("client.*.dialogue")
             if path.stat().st_size  # not there yet, and already in the directory
             for entry in entries(path.read_bytes())

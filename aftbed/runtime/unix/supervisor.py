@@ -189,7 +189,7 @@ class Supervisor:
             self.loop.end()
             return
         if not len(self.loop.jobs):
-            self.loop.jobs.start(STATS_JOB, self.work.ask_stats(self.deployment), lambda _: None)
+            self.loop.jobs.start(STATS_JOB, self.work.wind_up(self.deployment), lambda _: None)
         self.loop.after(DRAIN_SECONDS, lambda: self._drain(limit_ns))
 
     def _looked(self, limit_ns: int) -> None:

@@ -168,7 +168,14 @@ class Work:
             if process is not None and process.alive and process.kind == "service":
                 self._nursery.order(process, control.Stop(0))
         yield from self.bus.ask()
+        yield from self.wind_up(deployment)
+
+    def wind_up(self, deployment: Deployment) -> Keys:
+        """Have nothing more sent, and see what is unanswered: counts from before that could be out of date."""
         yield from deployment.ask("client", control.Quiet)
+        yield from self.ask_stats(deployment)
+        source_is_done = self._result is not None or isinstance(self._options.work, LoadRun)
+        self.settled = source_is_done and not self._stats.get("unanswered", 1)
 
     def _watch_load(self, deployment: Deployment) -> None:
         """Until all is answered, or nothing moves any more: a reply that got lost is waited for in vain."""
@@ -191,8 +198,6 @@ class Work:
         """Ask the client how far it is."""
         data = yield from deployment.ask("client", control.Stats)
         self._stats = msgspec.msgpack.decode(data)
-        source_is_done = self._result is not None or isinstance(self._options.work, LoadRun)
-        self.settled = source_is_done and not self._stats.get("unanswered", 1)
 
     def end(self) -> dict[str, object]:
         """For the record."""

@@ -1,0 +1,39 @@
+"""A run ends at rest: all that was sent is answered, and both replicas are behind the last request."""
+
+import pytest
+from liveruns import Home, Started, until
+
+from aftbed.core.journal import EntryKind
+from aftbed.inject.words import parse
+from aftbed.runtime.unix import ask
+from aftbed.runtime.unix.options import LoadRun
+
+pytestmark = pytest.mark.process
+
+COUNT = 30
+
+
+def test_a_follower_that_is_behind_is_waited_for(home: Home) -> None:
+    """Its last requests take it a tenth of a second, the leader has answered long before."""
+    fault = parse(f"slow backup by 20ms at server.exit nth {COUNT - 2}")
+    outcome = Started(home, LoadRun(COUNT, 200.0), ftm="lfr", faults=(fault,)).finish()
+    assert outcome.verdict.verdict == "pass", outcome.verdict.reasons
+    assert outcome.verdict.faults[0]["receipt"] in ("applied", "activated")
+    assert outcome.record.end is not None
+    states = outcome.record.end["states"]
+    assert isinstance(states, dict) and set(states) == {"a", "b"}
+    assert states["a"] == states["b"]
+
+
+def test_what_is_under_way_when_it_is_stopped_is_answered(home: Home) -> None:
+    """Each takes 80 ms here; of a run that is polled every 20 ms, the last look is then older than the request."""
+    fault = parse("delay pxy2pro by 80ms permanent")
+    with Started(home, LoadRun(1000, 5.2), faults=(fault,)) as run:
+        run.wait_for_answers(1)
+        sent = run.entries(EntryKind.SENT)
+        until(lambda: run.entries(EntryKind.SENT) > sent, "another request")
+        ask.ask(run.private, ask.Stop())
+        outcome = run.finish()
+    requests = outcome.verdict.requests
+    assert outcome.verdict.verdict == "pass", outcome.verdict.reasons
+    assert requests.sent == requests.answered > 1
