@@ -26,7 +26,7 @@ def test_a_follower_that_is_behind_is_waited_for(home: Home) -> None:
 
 
 def test_what_is_under_way_when_it_is_stopped_is_answered(home: Home) -> None:
-    """Each takes 80 ms here; of a run that is polled every 20 ms, the last look is then older than the request."""
+    """Each takes 80 ms here; the last look of a run that is polled every 20 ms is older than that."""
     fault = parse("delay pxy2pro by 80ms permanent")
     with Started(home, LoadRun(1000, 5.2), faults=(fault,)) as run:
         run.wait_for_answers(1)

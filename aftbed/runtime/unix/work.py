@@ -171,7 +171,7 @@ class Work:
         yield from self.wind_up(deployment)
 
     def wind_up(self, deployment: Deployment) -> Keys:
-        """Have nothing more sent, and see what is unanswered: counts from before that could be out of date."""
+        """Have nothing more sent, then see what is unanswered: a count from before may be out of date."""
         yield from deployment.ask("client", control.Quiet)
         yield from self.ask_stats(deployment)
         source_is_done = self._result is not None or isinstance(self._options.work, LoadRun)
