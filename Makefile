@@ -65,6 +65,8 @@ bench: $(EDITABLE)
 	$(BIN)/aftbed bench launch --ftm pbr --json
 	$(BIN)/aftbed bench memory --ftm pbr --json
 	$(BIN)/aftbed bench hops --ftm pbr --json
+	$(BIN)/aftbed bench campaign --json
+	$(BIN)/aftbed bench campaign --sim --experiments 4000 --json
 
 # -- installation: a stamp each, so that a second `make` installs only what has changed ------------
 

@@ -35,6 +35,7 @@ from aftbed.runtime.sim.world import Setup, simulate
 from aftbed.runtime.unix import linux, spawn
 from aftbed.runtime.unix.launch import launch, options_for
 from aftbed.runtime.unix.options import CarRun, LoadRun, Work
+from aftbed.runtime.unix.pages import Area
 from aftbed.runtime.zygotes import BUS, LIGHT
 from aftbed.vehicle.function import default_application
 from aftbed.vehicle.report import VehicleResult
@@ -80,9 +81,9 @@ def _probe() -> Probe:
 
 
 @lru_cache(maxsize=2)
-def _warm_up(name: str) -> None:
+def _warm_up(name: str) -> tuple[Area, ...]:
     """Once in this process: its zygotes are forks of it."""
-    spawn.warm_up(name)
+    return spawn.warm_up(name)
 
 
 def without_times(result: Result) -> Result:
@@ -163,8 +164,7 @@ def _real(experiment: Experiment, standing: ExitStack) -> Result:
         faults=faults,
         adaptations=changes,
     )
-    _warm_up(BUS if experiment.scenario else LIGHT)
-    launched = launch(options, listener, warm=True)
+    launched = launch(options, listener, _warm_up(BUS if experiment.scenario else LIGHT))
     standing.callback(launched.remove)
     silence_s = RUN_SECONDS_MAX + experiment.requests * (1 / (experiment.rate_hz or REQUESTS_PER_SECOND_MIN))
     linux.set_timeouts(launched.line.sock, silence_s, silence_s)  # of a load, nothing is heard to its end

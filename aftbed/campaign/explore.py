@@ -15,6 +15,7 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, MutableSequence
 from concurrent.futures import Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import get_context
 from multiprocessing.sharedctypes import RawArray
 from typing import Final, NamedTuple, TypeVar
 
@@ -281,13 +282,16 @@ def each(
     *,
     alone: Alone[S] | None = None,
     seconds_max: float = CHUNK_SECONDS_MAX,
+    fresh: bool = False,
 ) -> Generator[tuple[int, S, T], None, None]:
     """`judge` on every experiment, in order, over `jobs` processes; there may be no end of them.
 
+    `fresh`: processes that import what `judge` takes, and have nothing of the command's: those of a real run
+    are forks of them, and all that is in them would be copied with each.
     Raises HarnessError if one of the processes dies, or hangs: if `chunk_size` experiments, one after the
     other, take more than `seconds_max`. `alone` is the command that runs one of them by itself.
     """
-    if jobs == 1:
+    if jobs == 1 and not fresh:
         for number, setup in enumerate(setups):
             yield number, setup, judge(setup)
         return
@@ -295,7 +299,8 @@ def each(
     under_way: deque[tuple[int, list[tuple[int, S]], Future[list[T]]]] = deque()
     board = RawArray("q", 2 * AHEAD * jobs)  # of each chunk under way: who is at it, and at which experiment
     places = itertools.cycle(range(0, len(board), 2))
-    pool = ProcessPoolExecutor(jobs, initializer=_belong_to, initargs=(os.getpid(), board))
+    start = get_context("spawn" if fresh else "fork")
+    pool = ProcessPoolExecutor(jobs, start, _belong_to, (os.getpid(), board))
     try:
         while True:
             while len(under_way) < AHEAD * jobs and (chunk := list(itertools.islice(numbered, chunk_size))):

@@ -8,6 +8,7 @@ import msgspec
 from aftbed.core.check import History
 from aftbed.core.errors import ConfigError, PeerError
 from aftbed.core.journal import dropped, entries, records
+from aftbed.runtime.unix.journal import contents
 from aftbed.runtime.unix.options import RunOptions
 from aftbed.runtime.unix.support import HISTORY_NAME
 
@@ -35,9 +36,9 @@ def read_record(path: Path) -> RunRecord:
     files = sorted(folder.glob("*.journal"))
     dialogues = sorted(folder.glob("client.*.dialogue"), key=lambda p: int(p.name.split(".")[1]))
     try:
-        journals = {p.name.removesuffix(".journal"): list(records(p.read_bytes())) for p in files}
-        dialogue = [e for p in dialogues for e in entries(p.read_bytes())]
-        lost = sum(dropped(p.read_bytes()) for p in (*files, *dialogues))
+        journals = {p.name.removesuffix(".journal"): list(records(contents(p))) for p in files}
+        dialogue = [e for p in dialogues for e in entries(contents(p))]
+        lost = sum(dropped(contents(p)) for p in (*files, *dialogues))
     except PeerError as error:
         raise ConfigError(f"{folder}: {error}") from None
     end = _json(path / "end.json") if (path / "end.json").exists() else None

@@ -67,7 +67,7 @@ def _results(plan: Plan, asked: Asked, path: Path) -> Generator[Result, None, No
     state = _Progress(plan, path)
     for first, last in _looks(plan):
         todo = (e for e in state.open(first, last) if asked.has(e.index, len(plan.strata)))
-        for result in performed(todo, path, asked, _seconds_max(plan)):
+        for result in performed(todo, path, asked, plan):
             state.add(result)
             yield result
             late = limit_s is not None and time.monotonic() > limit_s
@@ -81,11 +81,12 @@ def _seconds_max(plan: Plan) -> float:
     return CHUNK_SECONDS_MAX + 2 * system.requests / (system.rate_hz or REQUESTS_PER_SECOND_MIN)
 
 
-def performed(todo: Iterator[Experiment], path: Path, asked: Asked, seconds_max: float) -> Iterator[Result]:
+def performed(todo: Iterator[Experiment], path: Path, asked: Asked, plan: Plan) -> Iterator[Result]:
     """Each result, which is in the ledger by then."""
     if not asked.scheduler:
         perform = partial(_perform, os.fspath(path))
-        for _, _, result in each(perform, todo, asked.jobs, 1, seconds_max=seconds_max):
+        fresh = plan.spec.system.runtime == "unix"
+        for _, _, result in each(perform, todo, asked.jobs, 1, seconds_max=_seconds_max(plan), fresh=fresh):
             yield result
         return
     from aftbed.campaign import dasked  # noqa: PLC0415 - an extra

@@ -96,6 +96,21 @@ def memory(ftm: Ftm = "pbr", placement: Placement = "process", json: Json = Fals
 
 
 @bench.command()
+def campaign(
+    ftm: Ftm = "pbr",
+    placement: Placement = "process",
+    sim: Annotated[bool, typer.Option("--sim", help="In the simulator.")] = False,
+    experiments: Annotated[int, typer.Option(min=1, help="Each with a crash of the primary.")] = 400,
+    jobs: Annotated[int, typer.Option(min=1, help="Processes side by side.")] = 2,
+    json: Json = False,
+) -> None:
+    """Experiments per minute: 100 requests and one crash each, verdict included."""
+    from aftbed.bench.campaign import bench_campaign  # noqa: PLC0415
+
+    _print(bench_campaign(ftm, placement, "sim" if sim else "unix", experiments, jobs), as_json=json)
+
+
+@bench.command()
 def hops(
     ftm: Ftm = "pbr",
     requests: Annotated[int, typer.Option(min=100, help="After the warm-up.")] = REQUESTS_MIN,

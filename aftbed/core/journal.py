@@ -64,6 +64,7 @@ class Entry(msgspec.Struct, frozen=True):
     payload: bytes
 
 
+Data = bytes | memoryview  # of a whole file, or of its beginning
 _KINDS: Final = frozenset(EntryKind)
 
 
@@ -78,20 +79,20 @@ def header(node: str) -> bytes:
     return bytes(page)
 
 
-def node_name(data: bytes) -> str:
+def node_name(data: Data) -> str:
     """Whose journal this is. Raises PeerError if it is none."""
     if len(data) < HEADER_BYTES or data[: len(MAGIC)] != MAGIC:
         raise PeerError(f"not a journal ({len(data)} bytes)")
     length = data[NAME_OFFSET]
-    return data[NAME_OFFSET + 1 : NAME_OFFSET + 1 + length].decode(errors="replace")
+    return bytes(data[NAME_OFFSET + 1 : NAME_OFFSET + 1 + length]).decode(errors="replace")
 
 
-def unfinished(data: bytes) -> bool:
+def unfinished(data: Data) -> bool:
     """A journal whose node died while it made it: empty, or not yet with a header."""
     return not data or not any(data[: len(MAGIC)])
 
 
-def dropped(data: bytes) -> int:
+def dropped(data: Data) -> int:
     """How many records or entries found no room in the file. Raises PeerError if it is no journal."""
     if unfinished(data):
         return 0
@@ -99,7 +100,7 @@ def dropped(data: bytes) -> int:
     return int.from_bytes(data[DROPPED_OFFSET : DROPPED_OFFSET + 4], "little")
 
 
-def records(data: bytes) -> Iterator[Record]:
+def records(data: Data) -> Iterator[Record]:
     """The committed records of a journal. Raises PeerError on what is no journal or has no such event."""
     if unfinished(data):
         return
@@ -114,7 +115,7 @@ def records(data: bytes) -> Iterator[Record]:
         yield Record(t_ns, event, request_id, detail, node, brick)
 
 
-def entries(data: bytes) -> Iterator[Entry]:
+def entries(data: Data) -> Iterator[Entry]:
     """The committed entries of a dialogue. Raises PeerError on a malformed one."""
     if unfinished(data):
         return
@@ -127,5 +128,5 @@ def entries(data: bytes) -> Iterator[Entry]:
         start = at + ENTRY.size
         if kind not in _KINDS or start + length > len(data):
             raise PeerError(f"entry at byte {at}: kind {kind}, {length} bytes")
-        yield Entry(t_ns, request_id, epoch, EntryKind(kind), data[start : start + length])
+        yield Entry(t_ns, request_id, epoch, EntryKind(kind), bytes(data[start : start + length]))
         at = start + length

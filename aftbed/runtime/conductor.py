@@ -6,6 +6,7 @@ Engine) is replaced when it dies. None of it is on the request path: while it sl
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Final
 
 import msgspec
@@ -26,6 +27,7 @@ from aftbed.runtime.zygotes import LIGHT
 RETRY_SECONDS: Final = 0.002
 AGAIN_SECONDS: Final = 0.02
 SETTLE_SECONDS: Final = 0.002
+RESTOCK_SECONDS: Final = 0.05  # from a new backup until spares are forked anew: the next loss may be near
 LOSS_SECONDS: Final = 0.5  # a failover is done long before
 HANG_NS: Final = 150_000_000  # of what no Watchdog watches; a channel's pulse is 20 ms
 LOSSES: Final = ("failover", "drop backup")
@@ -45,6 +47,7 @@ class Conductor:
             self.deployment, self.executor, self.faults, lambda: self.inform_recovery(failed=False)
         )
         self.ending = False
+        self._scripts = 0  # how many have begun
 
     def at_rest(self) -> bool:
         """Nothing is under way, and nobody who should serve is missing, as far as is known."""
@@ -80,7 +83,8 @@ class Conductor:
                 jobs.settle(("promoted", brick, epoch))
             case control.Said(_, message.Adapted() as told):
                 self.adaptations.adapted(told)
-                self._loop.after(SETTLE_SECONDS, self._settle)
+                self._loop.after(SETTLE_SECONDS, self._rearm)
+                self._loop.after(SETTLE_SECONDS, self._restock)  # the next one waits until that is done
             case control.Ordered(_, ordered, Phase.WHOLE):
                 self._on_script(ordered)
             case control.Ordered(_, ordered, phase, number):
@@ -96,6 +100,7 @@ class Conductor:
             return  # another script is under way, or has been; Recovery hears how it ended
         if ordered.purpose in LOSSES and self.adaptations.interrupted(ordered.replica):
             return  # the way back first
+        self._scripts += 1
         began_ns, tell = self._loop.now_ns(), self._support.tell
 
         def ended(failure: str) -> None:
@@ -114,15 +119,21 @@ class Conductor:
     def _settle_after(self, ordered: script.Script) -> None:
         """What can wait until after a script: spares, and faults that are still to come."""
         if ordered.purpose == "new backup":
-            self._settle()
-        elif not self.ending:
+            self._loop.after(RESTOCK_SECONDS, partial(self._restock_after, self._scripts))
+        self._rearm()
+
+    def _rearm(self) -> None:
+        if not self.ending:
             self._loop.jobs.start("rearm", self.faults.rearm(), lambda _: None)
 
-    def _settle(self) -> None:
-        if self.ending:
-            return
-        self._support.nursery.level(LIGHT, self.spares())
-        self._loop.jobs.start("rearm", self.faults.rearm(), lambda _: None)
+    def _restock_after(self, scripts: int) -> None:
+        """Unless something is under way again: who takes part in that needs the CPUs."""
+        if scripts == self._scripts and not self.adaptations.busy:
+            self._restock()
+
+    def _restock(self) -> None:
+        if not self.ending:
+            self._support.nursery.level(LIGHT, self.spares())
 
     def inform_recovery(self, *, failed: bool) -> None:
         """Tell it how things are; it may act again."""

@@ -247,10 +247,6 @@ class Hello(msgspec.Struct, frozen=True, tag=True):
     pid: int
 
 
-class Rested(msgspec.Struct, frozen=True, tag=True):
-    """A spare to the supervisor: it has rehearsed, and takes no CPU from anybody from here on."""
-
-
 class Ack(msgspec.Struct, frozen=True, tag=True):
     """The answer to an order; `error` is empty where it was carried out."""
 
@@ -293,4 +289,4 @@ ToNode = (
     | Tell | WatchNodes | Arm | Interfere | SlowDown | KeepInCell | DisturbBus | WatchCar | Stop | Quiet
     | Stats | Ack
 )  # fmt: skip
-FromNode = Hello | Rested | Ack | Said | Ordered | Fired | Report
+FromNode = Hello | Ack | Said | Ordered | Fired | Report

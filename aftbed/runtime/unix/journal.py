@@ -14,14 +14,22 @@ from typing import Final
 from aftbed.core import journal as layout
 from aftbed.core.errors import PeerError
 from aftbed.core.event import Event
+from aftbed.runtime.unix import linux
 
 CHUNK_BYTES: Final = 1 << 20
 FILE_BYTES_MAX: Final = 1 << 30
 READY_BYTES: Final = 1 << 16  # there from the start: a backup's first record is written when time counts
 RECORDED_MAX: Final = 16
 RECORDED_BYTES_MAX: Final = 1 << 16
-MADV_POPULATE_WRITE: Final = 23  # madvise(2)
 STEP_BYTES_MAX: Final = 8 * layout.RECORD.size  # what the notes of one step take at most
+
+
+def contents(path: Path) -> layout.Data:
+    """What is in the file, read where it is looked at: of a chunk, most is empty. Raises OSError."""
+    with path.open("rb") as file:
+        if not os.fstat(file.fileno()).st_size:
+            return b""
+        return memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
 
 
 def _mapped(path: Path, name: str) -> mmap.mmap:
@@ -33,7 +41,7 @@ def _mapped(path: Path, name: str) -> mmap.mmap:
     finally:
         os.close(descriptor)
     with contextlib.suppress(OSError, ValueError):  # Linux before 5.14: the pages come one by one
-        mapping.madvise(MADV_POPULATE_WRITE, 0, READY_BYTES)
+        mapping.madvise(linux.MADV_POPULATE_WRITE, 0, READY_BYTES)
     mapping[: layout.HEADER_BYTES] = layout.header(name)
     return mapping
 

@@ -29,6 +29,7 @@ from aftbed.runtime.unix import linux, members, rundir
 from aftbed.runtime.unix.busaim import aim
 from aftbed.runtime.unix.line import Line, decode_report
 from aftbed.runtime.unix.options import LoadRun, RunOptions, Work
+from aftbed.runtime.unix.pages import Area
 from aftbed.runtime.unix.spawn import fork_zygote, start_zygote
 from aftbed.runtime.unix.undo import Ledger
 from aftbed.runtime.unix.warden import Watched, watch
@@ -57,7 +58,9 @@ def bind_hub(port: int) -> socket.socket:
 class Launched:
     """A run in progress, seen from its command."""
 
-    def __init__(self, options: RunOptions, listener: socket.socket | None, *, warm: bool = False) -> None:
+    def __init__(
+        self, options: RunOptions, listener: socket.socket | None, warm: tuple[Area, ...] | None
+    ) -> None:
         self.options, self._warm = options, warm
         self.private = Path(options.private)
         self.record = Path(options.record)
@@ -154,8 +157,9 @@ class Launched:
             linux.set_name("aftbed-supervis")
             cpus = sorted(os.sched_getaffinity(0))
             load = isinstance(self.options.work, LoadRun)
-            if self._warm:
-                zygotes = {name: fork_zygote(name, cpus) for name in ((LIGHT,) if load else (LIGHT, BUS))}
+            if self._warm is not None:
+                names = (LIGHT,) if load else (LIGHT, BUS)
+                zygotes = {name: fork_zygote(cpus, self._warm) for name in names}
             else:
                 name = LIGHT if load else BUS  # it imports while we do; it has the most to import
                 zygotes = {name: start_zygote(name, cpus)}
@@ -242,9 +246,11 @@ def _ends(pidfd: int, seconds: float) -> bool:
     return bool(poll.poll(seconds * 1e3))
 
 
-def launch(options: RunOptions, listener: socket.socket | None, *, warm: bool = False) -> Launched:
-    """Start a run. `warm`: this process has been warmed up (`spawn.warm_up`), and zygotes are forks of it."""
-    launched = Launched(options, listener, warm=warm)
+def launch(
+    options: RunOptions, listener: socket.socket | None, warm: tuple[Area, ...] | None = None
+) -> Launched:
+    """Start a run. `warm`: what `spawn.warm_up` said in this process; its zygotes are forks of it."""
+    launched = Launched(options, listener, warm)
     if listener is not None:
         listener.close()
     return launched

@@ -20,11 +20,13 @@ from aftbed.core.errors import HarnessError
 PR_SET_PDEATHSIG: Final = 1
 PR_SET_NAME: Final = 15
 PR_SET_CHILD_SUBREAPER: Final = 36
+MADV_POPULATE_WRITE: Final = 23
 ADOPTION_SECONDS_MAX: Final = 5.0
 EXCUSED_NS_MAX: Final = 2_000_000_000  # as long as any step of the runtime may take
 SLICE_NS: Final = 500_000  # shorter than the default of some ms, long enough for all that a failover orders
 
 _libc: Final = ctypes.CDLL(None, use_errno=True)
+_libc.madvise.argtypes = (ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int)
 
 
 def _prctl(option: int, argument: int) -> None:
@@ -120,6 +122,11 @@ def kill(pidfd: int, sig: signal.Signals) -> bool:
 def trim() -> None:
     """Give memory that is allocated but free back to the kernel: less to copy at a fork, and to unmap."""
     _libc.malloc_trim(0)
+
+
+def populate(address: int, size: int) -> None:
+    """Have the kernel copy these pages for this process now, as if it had written to them; or not."""
+    _libc.madvise(address, size, MADV_POPULATE_WRITE)
 
 
 class Starvation:

@@ -15,7 +15,7 @@ from aftbed.core.errors import ConfigError
 from aftbed.ftm.client import Client
 from aftbed.runtime import control
 from aftbed.runtime.assembly import Assembler
-from aftbed.runtime.unix import linux, rehearsal
+from aftbed.runtime.unix import linux
 from aftbed.runtime.unix.devices import Device, LoadOptions, Sensor, make_load
 from aftbed.runtime.unix.journal import Journal
 from aftbed.runtime.unix.lifeline import Held
@@ -37,7 +37,6 @@ def become(line: Line[control.ToNode], order: control.Assign | control.Serve, fd
             serve(line, order, fds)
             os._exit(0)
         node = _build(line, order, fds)
-        rehearsal.before_mail(node)
     except BaseException as error:  # noqa: BLE001 - the last frame of this process
         known = isinstance(error, ConfigError)
         reason = str(error) if known else f"{type(error).__name__}: {error}"
@@ -51,10 +50,8 @@ def become(line: Line[control.ToNode], order: control.Assign | control.Serve, fd
 
 def _build(line: Line[control.ToNode], order: control.Assign, fds: list[int]) -> Node:
     linux.set_name(order.node)
-    if order.staged:
-        if order.aside is not None:
-            os.sched_setaffinity(0, {order.aside})  # requests are served on the other one
-        rehearsal.once()
+    if order.staged and order.aside is not None:
+        os.sched_setaffinity(0, {order.aside})  # requests are served on the other one
     if order.cpu is not None:
         os.sched_setaffinity(0, {order.cpu})
     if order.bricks[0].kind in ("watchdog", "recovery"):

@@ -25,7 +25,8 @@ from aftbed.runtime.unix.undo import Ledger
 
 REAP_SECONDS: Final = 0.01
 SPARE_SECONDS_MAX: Final = 5.0  # a zygote imports first
-PARK_BATCH: Final = 4  # spares per order: the first of them start while the next are forked
+DEMAND: Final = 3  # spares that are forked where one is waited for: whoever takes one takes more
+PARK_BATCH: Final = 8  # spares per order: the first of them start while the next are forked
 
 
 class Process:
@@ -39,7 +40,6 @@ class Process:
         self.alive = True
         self.incarnation = 0
         self.bricks: tuple[tuple[str, str], ...] = ()
-        self.rested = False  # of a spare: it has rehearsed
         self.starvation: linux.Starvation | None = None
 
     def born(self, pid: int) -> None:
@@ -137,6 +137,7 @@ class Nursery:
         self.zygotes: dict[str, Process] = {}
         self.parked: dict[str, deque[Process]] = {}
         self._unborn: dict[str, list[Process]] = {}
+        self._levels: dict[str, int] = {}
 
     # -- zygotes ------------------------------------------------------------------------------
 
@@ -179,10 +180,9 @@ class Nursery:
         while True:
             while not self.parked[zygote]:
                 if not self._unborn[zygote]:
-                    self.park(zygote, 1)
+                    self.park(zygote, DEMAND)
                 yield Wait(frozenset({("spare", zygote, 0)}), seconds=SPARE_SECONDS_MAX)
             process = self.parked[zygote].popleft()
-            self._rests(process)
             if process.alive:
                 return process
 
@@ -192,19 +192,21 @@ class Nursery:
             yield Wait(frozenset({("spare", zygote, 0)}), seconds=SPARE_SECONDS_MAX)
 
     def calm(self, zygote: str) -> Generator[Wait, dict[Key, bytes], None]:
-        """Wait until no spare is being forked or rehearses: what comes next shall have the CPUs."""
+        """Wait until no spare is being forked: what comes next shall have the CPUs."""
         while self._unborn[zygote]:
             yield Wait(frozenset({("spare", zygote, 0)}), seconds=SPARE_SECONDS_MAX)
-        busy = {("rested", "spare", p.pid) for p in self.parked[zygote] if not p.rested and p.alive}
-        yield Wait(frozenset(busy), seconds=SPARE_SECONDS_MAX)
-
-    def _rests(self, process: Process) -> None:
-        """It rehearses no more, or is none of the spares any more."""
-        self._loop.jobs.settle(("rested", "spare", process.pid))
 
     def level(self, zygote: str, count: int) -> None:
-        """Have `count` spares parked, in the end."""
-        self.park(zygote, count - len(self.parked[zygote]) - len(self._unborn[zygote]))
+        """Have `count` spares parked, in the end: one after the other, since others need the CPUs, too."""
+        self._levels[zygote] = count
+        self._fill(zygote)
+
+    def _fill(self, zygote: str) -> None:
+        """Fork the next one to the level asked for. Once that is reached, what is taken is not replaced."""
+        if len(self.parked[zygote]) >= self._levels.get(zygote, 0):
+            self._levels.pop(zygote, None)
+        elif not self._unborn[zygote]:
+            self.park(zygote, 1)
 
     def _adopt(self, name: str, kind: str, sock: socket.socket) -> Process:
         sock.setblocking(False)
@@ -232,9 +234,6 @@ class Nursery:
             assert not fds, f"{process.name} sent descriptors"
             if isinstance(message, control.Hello) and process.kind == "spare" and not process.pid:
                 self._hello(process, message.pid)
-            elif isinstance(message, control.Rested):
-                process.rested = True
-                self._rests(process)
             elif not isinstance(message, control.Hello):
                 self._on_report(process, message)
 
@@ -245,6 +244,7 @@ class Nursery:
             if process in unborn:
                 unborn.remove(process)
                 self.parked[name].append(process)
+                self._fill(name)
                 self._loop.jobs.settle(("spare", name, 0))
 
     # -- death --------------------------------------------------------------------------------
@@ -254,7 +254,6 @@ class Nursery:
         self._heard(process)  # its last words are still in the line
         self._loop.forget(process.pidfd)
         process.alive = False
-        self._rests(process)
         self._on_death(process)
         self._loop.after(REAP_SECONDS, lambda: self._reap(process))
 

@@ -1,12 +1,11 @@
 """The rehearsal: requests through a whole chain in memory, before there are real ones.
 
-In the zygote it warms up the interpreter (specialised code, filled caches), which its children inherit.
-In a child it makes the child's own copies of the pages that a step writes to: without it the first
-request after a failover pays some hundred page faults in each process of the new leader (0.5 ms).
+In the zygote it warms up the interpreter (specialised code, filled caches), which its children inherit. Then
+a child of it that is thrown away shows which pages a step writes to, for the others to have from their birth.
 """
 
+import gc
 import os
-import select
 import socket
 from typing import Final
 
@@ -33,26 +32,35 @@ from aftbed.ftm.protocol import Protocol
 from aftbed.ftm.proxy import Proxy
 from aftbed.ftm.server import Server
 from aftbed.runtime import control
+from aftbed.runtime.unix import linux
 from aftbed.runtime.unix.journal import Journal
 from aftbed.runtime.unix.line import Line, decode_order, decode_report
 from aftbed.runtime.unix.node import NUDGE, Node
+from aftbed.runtime.unix.pages import Area, written_by
 from aftbed.vehicle.function import default_application, sample_requests
 
 ROUNDS_WARM: Final = 16
 ROUNDS_ONCE: Final = 4
 REHEARSED: Final = 8
-PATIENCE_MS: Final = 20.0  # of waiting for the first mail; the whole graph is there by then
-
-_done = False
 
 
-def once() -> None:
-    """Rehearse, unless this process has done so."""
-    global _done  # noqa: PLW0603 - one process, one rehearsal
-    if not _done:
-        _done = True
-        rehearse(ROUNDS_ONCE)
+def warm_up() -> tuple[Area, ...]:
+    """As often as it takes until the interpreter has seen it all; then, where a child will write to.
+
+    What is here stays: no collection looks at it from here on, which would be to write to it.
+    """
+    rehearse(ROUNDS_WARM)
+    for _ in range(ROUNDS_WARM):
         rehearse_host()
+    gc.collect()
+    linux.trim()
+    gc.freeze()
+    return written_by(_once)
+
+
+def _once() -> None:
+    rehearse(ROUNDS_ONCE)
+    rehearse_host()
 
 
 def rehearse(rounds: int) -> None:
@@ -78,17 +86,6 @@ def rehearse(rounds: int) -> None:
     ways |= {("proxy", "pxy2pro"): ("b/protocol", "pxy2pro"), ("b/protocol", "pro2pxy"): ("proxy", "pro2pxy")}
     bricks["proxy"].step(CONTROL, Rebound("pxy2pro", True, 2), 0)
     _serve(bricks, ways, requests)
-
-
-def before_mail(node: Node) -> None:
-    """Rehearse before the node's first mail, or when it is there."""
-    poll = select.poll()
-    poll.register(node.line.fileno(), select.POLLIN)
-    for hosted in node.wiring.hosted.values():
-        for inlet in hosted.inlets.values():
-            poll.register(inlet.fd, select.POLLIN)
-    poll.poll(PATIENCE_MS)
-    once()
 
 
 class _Scratch:

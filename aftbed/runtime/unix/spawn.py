@@ -1,6 +1,5 @@
 """Starting zygotes: the first thing that a supervisor does, before it imports what it needs itself."""
 
-import gc
 import importlib
 import os
 import site
@@ -9,6 +8,7 @@ import sys
 from pathlib import Path
 from typing import Final
 
+from aftbed.runtime.unix.pages import Area
 from aftbed.runtime.zygotes import BUS, LIGHT
 
 ZYGOTE: Final = "aftbed.runtime.unix.zygote"
@@ -34,19 +34,20 @@ def start_zygote(name: str, cpus: list[int]) -> Started:
     return pid, ours
 
 
-def warm_up(name: str) -> None:
-    """Import and rehearse what `fork_zygote` hands on: once, in a process that starts many runs."""
+def warm_up(name: str) -> tuple[Area, ...]:
+    """Import and rehearse what `fork_zygote` hands on: once, in a process that starts many runs.
+
+    Returns where a node will write to.
+    """
     from aftbed.runtime.unix import rehearsal, supervisor, zygote  # noqa: PLC0415 - for who starts many
 
     assert supervisor and zygote
     for module in PRELOADS[name]:
         importlib.import_module(module)
-    rehearsal.rehearse(rehearsal.ROUNDS_WARM)
-    gc.collect()
-    gc.freeze()  # what is here stays: no child looks at it, and copies its pages, again
+    return rehearsal.warm_up()
 
 
-def fork_zygote(name: str, cpus: list[int]) -> Started:
+def fork_zygote(cpus: list[int], areas: tuple[Area, ...]) -> Started:
     """The same out of this process, which has been warmed up: 0.2 s of imports less, for some pages more."""
     from aftbed.runtime.unix import zygote  # noqa: PLC0415
 
@@ -57,7 +58,7 @@ def fork_zygote(name: str, cpus: list[int]) -> Started:
         try:
             os.dup2(theirs.fileno(), CONTROL_FD)
             os.closerange(CONTROL_FD + 1, 1 << 16)
-            zygote.run(supervisor, cpus, (), warm=True)
+            zygote.run(supervisor, cpus, (), areas)
         finally:
             os._exit(1)
     theirs.close()

@@ -18,7 +18,7 @@ from aftbed.runtime.unix import memory
 from aftbed.runtime.unix.bus import BusFaults
 from aftbed.runtime.unix.cells import Cell
 from aftbed.runtime.unix.channels import Channel
-from aftbed.runtime.unix.journal import Journal, recorded_requests
+from aftbed.runtime.unix.journal import Journal, contents, recorded_requests
 from aftbed.runtime.unix.loop import Loop
 from aftbed.runtime.unix.processes import Nursery
 
@@ -59,7 +59,7 @@ class Support:
     def records(self, journal: str) -> Iterable[Record]:
         """What is committed in the file; nothing, if its node has died before it made one."""
         try:
-            return records(Path(journal).read_bytes())
+            return records(contents(Path(journal)))
         except FileNotFoundError:
             return ()
 

@@ -10,30 +10,33 @@ proportion to its memory; one for what needs the bus (`preload`).
 import gc
 import importlib
 import os
-import select
 import socket
 import sys
 from typing import NoReturn
 
 from aftbed.runtime import control
-from aftbed.runtime.unix import linux, rehearsal
+from aftbed.runtime.unix import linux, pages, rehearsal
 from aftbed.runtime.unix.line import Line, decode_order
+from aftbed.runtime.unix.pages import Area
 from aftbed.runtime.unix.part import become
 from aftbed.runtime.unix.spawn import CONTROL_FD
 
 
-def run(supervisor: int, cpus: list[int], preload: tuple[str, ...], *, warm: bool = False) -> NoReturn:
-    """Be a zygote, serving `CONTROL_FD`, until it ends; `warm`: its parent has imported and rehearsed."""
+def run(
+    supervisor: int, cpus: list[int], preload: tuple[str, ...], areas: tuple[Area, ...] | None = None
+) -> NoReturn:
+    """Be a zygote, serving `CONTROL_FD`, until it ends.
+
+    `areas`: where a node writes to, if the parent of this process has found it out (`spawn.warm_up`).
+    """
     os.set_inheritable(CONTROL_FD, False)
     os.sched_setaffinity(0, cpus)
     linux.die_with(supervisor)
     linux.set_name("aftbed-zygote")
     for module in preload:
         importlib.import_module(module)
-    if not warm:
-        rehearsal.rehearse(rehearsal.ROUNDS_WARM)
-        gc.collect()
-        linux.trim()
+    if areas is None:
+        areas = rehearsal.warm_up()
     gc.freeze()
     gc.disable()  # structs on the path are untracked; what is left dies by reference count
     line = Line(socket.socket(fileno=CONTROL_FD), decode_order)
@@ -44,10 +47,10 @@ def run(supervisor: int, cpus: list[int], preload: tuple[str, ...], *, warm: boo
             os._exit(0)
         order, fds = got
         assert isinstance(order, control.Park), order
-        _park(fds, supervisor)
+        _park(fds, supervisor, areas)
 
 
-def _park(fds: list[int], supervisor: int) -> None:
+def _park(fds: list[int], supervisor: int, areas: tuple[Area, ...]) -> None:
     """Fork one spare per descriptor, through an intermediate that leaves them to the supervisor."""
     alive, life = os.pipe()
     intermediate = os.fork()
@@ -59,24 +62,20 @@ def _park(fds: list[int], supervisor: int) -> None:
                 os.read(alive, 1)  # ends when the intermediate does, so that no spare spins meanwhile
                 os.dup2(descriptor, CONTROL_FD, inheritable=False)
                 os.closerange(CONTROL_FD + 1, 1 << 16)
-                _wait_for_a_part(supervisor)
+                _wait_for_a_part(supervisor, areas)
         os._exit(0)
     os.waitpid(intermediate, 0)
     for descriptor in (*fds, alive, life):
         os.close(descriptor)
 
 
-def _wait_for_a_part(supervisor: int) -> NoReturn:
+def _wait_for_a_part(supervisor: int, areas: tuple[Area, ...]) -> NoReturn:
     """A spare: adopted, parked, then what it is told to be."""
     linux.die_with(supervisor)
     linux.set_name("aftbed-spare")
+    pages.own(areas)
     line = Line(socket.socket(fileno=CONTROL_FD), decode_order)
     line.send(control.Hello(os.getpid()))
-    poll = select.poll()
-    poll.register(CONTROL_FD, select.POLLIN)
-    if not poll.poll(rehearsal.PATIENCE_MS):
-        rehearsal.once()
-    line.send(control.Rested())
     got = line.recv()
     if got is None:
         os._exit(0)

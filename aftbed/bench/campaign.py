@@ -1,0 +1,52 @@
+"""How many experiments a minute a campaign does: 100 requests, one crash of the primary, and the verdict.
+
+Everything counts, from the start of the workers to the last line in the ledger. `cpu_ms` is what all
+processes of an experiment took together: it tells a slow machine from one that has other work, too.
+"""
+
+import os
+import resource
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Final, Literal
+
+from aftbed.campaign import running
+from aftbed.campaign.planning import plan
+from aftbed.campaign.spec import FaultEntry, Spec, Stop, System, check
+
+CRASH: Final = FaultEntry("crash primary", "crash primary at server.exit nth {nth}", draw={"nth": (1, 90)})
+
+
+def bench_campaign(
+    ftm: str, placement: str, runtime: Literal["unix", "sim"], experiments: int, jobs: int
+) -> dict[str, object]:
+    """`per_minute`, `seconds`, `cpu_ms` per experiment, and `outcomes`. Raises ConfigError."""
+    system = System(placements=(placement,), runtime=runtime)
+    spec = Spec("bench", (ftm,), (CRASH,), system=system, stop=Stop(experiments))
+    check(spec)
+    planned = plan(spec)
+    with tempfile.TemporaryDirectory(prefix="aftbed-bench-") as folder:
+        began_s, began_cpu_s = time.monotonic(), _cpu_s()
+        asked = running.Asked(Path(folder) / "campaign", jobs)
+        outcomes = Counter(result.outcome for result in running.run(planned, asked))
+        seconds, cpu_s = time.monotonic() - began_s, _cpu_s() - began_cpu_s
+    return {
+        "ftm": ftm,
+        "placement": placement,
+        "runtime": runtime,
+        "jobs": jobs,
+        "cpus": len(os.sched_getaffinity(0)),
+        "experiments": experiments,
+        "outcomes": dict(outcomes),
+        "seconds": round(seconds, 1),
+        "per_minute": round(60 * experiments / seconds),
+        "cpu_ms": round(cpu_s / experiments * 1e3, 1),
+    }
+
+
+def _cpu_s() -> float:
+    """Of this process, and of all below it that have ended."""
+    used = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return sum(each.ru_utime + each.ru_stime for each in used)

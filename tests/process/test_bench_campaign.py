@@ -1,0 +1,24 @@
+"""`aftbed bench campaign`: what it counts are experiments that came to their verdict."""
+
+import json
+
+import pytest
+from liveruns import Home, aftbed
+
+pytestmark = pytest.mark.process
+
+
+@pytest.mark.parametrize("options", [("--jobs", "1"), ("--placement", "replica"), ("--sim",)])
+def test_every_experiment_is_carried_out(home: Home, options: tuple[str, ...]) -> None:
+    done = aftbed("bench", "campaign", "--experiments", "4", *options, "--json")
+    assert done.code == 0, done.err
+    found = json.loads(done.out)
+    assert found["outcomes"] == {"tolerated": 4} and found["experiments"] == 4
+    assert found["cpu_ms"] > 0 and found["per_minute"] > 0
+    assert found["runtime"] == ("sim" if "--sim" in options else "unix")
+
+
+def test_an_unknown_placement_is_refused(home: Home) -> None:
+    done = aftbed("bench", "campaign", "--placement", "nowhere")
+    assert done.code == 2
+    assert "system.placements: unknown" in done.err and "nowhere" in done.err

@@ -1,0 +1,60 @@
+"""The pages that some work writes to are found, and had in advance."""
+
+import ctypes
+import mmap
+from collections.abc import Iterator
+
+import pytest
+
+from aftbed.runtime.unix.pages import PAGE, Area, own, written_by
+
+PAGES = 16
+
+
+@pytest.fixture
+def memory() -> Iterator[mmap.mmap]:
+    """Private memory of which each page is there."""
+    with mmap.mmap(-1, PAGES * PAGE, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS) as mapped:
+        mapped.madvise(mmap.MADV_NOHUGEPAGE)
+        for page in range(PAGES):
+            mapped[page * PAGE] = 1
+        yield mapped
+
+
+def within(memory: mmap.mmap, areas: tuple[Area, ...]) -> list[Area]:
+    """Those in `memory`, by number of their first page, and their length in pages."""
+    start = ctypes.addressof(ctypes.c_char.from_buffer(memory))
+    found = [((a - start) // PAGE, size // PAGE) for a, size in areas]
+    return [(page, count) for page, count in found if 0 <= page < PAGES]
+
+
+def test_what_is_written_to_is_found_and_nothing_else(memory: mmap.mmap) -> None:
+    def work() -> None:
+        for page in (2, 5, 6, 15):
+            memory[page * PAGE + 7] = 2
+        assert memory[9 * PAGE] == 1, "a page that is only read"
+
+    assert within(memory, written_by(work)) == [(2, 1), (5, 2), (15, 1)]
+    assert memory[2 * PAGE + 7] == 0, "it was done in a child"
+
+
+def test_a_child_that_owns_them_has_its_own_copies_with_what_was_there(memory: mmap.mmap) -> None:
+    start = ctypes.addressof(ctypes.c_char.from_buffer(memory))
+
+    def work() -> None:
+        own(((start + 3 * PAGE, PAGE), (start + 8 * PAGE, 3 * PAGE)))
+        assert all(memory[page * PAGE] == 1 for page in range(PAGES))
+
+    assert within(memory, written_by(work)) == [(3, 1), (8, 3)]
+
+
+def test_memory_that_is_not_there_is_passed_over(memory: mmap.mmap) -> None:
+    own(((1 << 46, PAGE),))
+    assert memory[0] == 1
+
+
+def test_where_the_work_fails_nothing_is_known() -> None:
+    def fails() -> None:
+        raise RuntimeError
+
+    assert written_by(fails) == ()
