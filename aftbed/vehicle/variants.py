@@ -16,10 +16,10 @@ from typing import Final
 
 import msgspec
 
-from aftbed.core.application import Application, Characteristics
+from aftbed.core.application import Application, Characteristics, Field
 from aftbed.core.errors import PeerError
 from aftbed.vehicle.aebmessages import STAGE_NONE, STAGE_WARN, decode_reply, encode_reply
-from aftbed.vehicle.function import STATE_BYTES, default_application
+from aftbed.vehicle.function import STATE_BYTES, AebFunction, default_application
 
 NOISE_PART: Final = 0.01  # of the time to collision; the radar's own noise is more
 EARLY_TTC_S: Final = 3.5  # version 1 warns at 2.7 s
@@ -65,6 +65,7 @@ class NonDeterministic:
     """
 
     characteristics = Characteristics(deterministic=False, state_access=True)
+    fields = AebFunction.fields
 
     def __init__(self) -> None:
         self._function: Application = default_application()
@@ -101,6 +102,10 @@ class Cautious:
     """
 
     characteristics = Characteristics(deterministic=True, state_access=True)
+    fields: tuple[Field, ...] = (
+        Field("warns", "u8", 1),
+        *(Field(field.name, field.kind, 2 + field.offset_bytes) for field in AebFunction.fields),
+    )
 
     def __init__(self) -> None:
         self._function: Application = default_application()

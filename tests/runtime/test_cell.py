@@ -2,13 +2,14 @@
 
 import re
 import struct
+from collections.abc import Callable
 from typing import Final
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aftbed.core.application import Characteristics, Field, Width, field_named, fields_of
+from aftbed.core.application import Application, Characteristics, Field, Width, field_named, fields_of
 from aftbed.core.errors import ConfigError, PeerError
 from aftbed.core.valuefault import Bit, Bits, Burst, Byte, Flip, Pattern, Place, Stuck, flipped
 from aftbed.ftm.mechanism import build
@@ -17,7 +18,7 @@ from aftbed.runtime.cell import CELL_BYTES, InCell, check_field, differing
 from aftbed.runtime.targets import check, waits_in
 from aftbed.vehicle.aebmessages import decode_reply, decode_request
 from aftbed.vehicle.function import STATE_BYTES, AebFunction, sample_requests
-from aftbed.vehicle.variants import Cautious
+from aftbed.vehicle.variants import Cautious, NonDeterministic, WithoutStateAccess
 
 REQUESTS: Final = sample_requests(3, 40)
 FORMATS: Final[dict[Width, str]] = {"u8": "<B", "u32": "<I", "i64": "<q", "u64": "<Q", "f64": "<d"}
@@ -61,8 +62,9 @@ def test_the_fields_are_the_state_but_for_its_version() -> None:
     assert sorted(taken) == list(range(1, STATE_BYTES))
 
 
-def test_a_field_is_what_its_name_says() -> None:
-    function = AebFunction()
+@pytest.mark.parametrize("make", [AebFunction, NonDeterministic, Cautious])
+def test_a_field_is_what_its_name_says(make: Callable[[], Application]) -> None:
+    function = make()
     reply = decode_reply([function.execute(request) for request in REQUESTS][-1])
     cycle, state = decode_request(REQUESTS[-1]), function.capture()
     found = {field.name: value(field, state) for field in fields_of(function)}
@@ -99,7 +101,7 @@ def test_a_function_that_declares_nothing_has_no_fields() -> None:
     with pytest.raises(
         ConfigError, match=r"state\.ego_ms: the function declares no fields; state is allowed"
     ):
-        field_named("ego_ms", fields_of(Cautious()))
+        field_named("ego_ms", fields_of(WithoutStateAccess()))
 
 
 @pytest.mark.parametrize(
