@@ -9,21 +9,15 @@ that a broken one is repeated by its number in the same `Selection`.
 """
 
 import itertools
-import os
-import signal
-from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator, MutableSequence
-from concurrent.futures import Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
-from multiprocessing import get_context
-from multiprocessing.sharedctypes import RawArray
-from typing import Final, NamedTuple, TypeVar
+from collections.abc import Callable, Generator, Iterable, Iterator
+from typing import Final, NamedTuple
 
 import msgspec
 
 from aftbed.adapt.plan import plan, target
 from aftbed.campaign.simulated import ASSERT, Breach, breaches
-from aftbed.core.errors import ConfigError, HarnessError, unknown
+from aftbed.campaign.workers import Alone, each
+from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.event import Event
 from aftbed.core.fault import FIRED, Action, Crash, Fault, Hang, Trigger
 from aftbed.core.journal import EntryKind
@@ -33,7 +27,6 @@ from aftbed.core.valuefault import EXECUTED, Bit, Flip, Place
 from aftbed.ftm.mechanism import build
 from aftbed.runtime.sim.world import Doom, Run, Setup, simulate
 from aftbed.runtime.targets import STAGED
-from aftbed.runtime.unix import linux
 from aftbed.vehicle.scenario import broken_expectations, load_scenario
 
 DUPLEX: Final = ("pbr", "lfr", "pbr+tr", "lfr+tr", "pbr+assert", "lfr+assert")
@@ -44,15 +37,8 @@ ELSEWHERE: Final = ("client", "a/watchdog", "b/watchdog")  # take no part in an 
 ADAPT_REQUESTS: Final = 40
 ADAPT_RATE_HZ: Final = 400.0
 ADAPT_AT: Final = 4  # the request at which the adaptation begins
-CHUNK: Final = 16  # experiments handed to a worker at once
-AHEAD: Final = 3  # chunks for each worker that are handed out before they are asked for
-CHUNK_SECONDS_MAX: Final = 900.0  # it takes seconds, on a busy machine a minute: one that takes more hangs
 CAR: Final = "vehicle"  # beside the promises: what the scenario expects of the car
 REASON_MAX: Final = 300  # characters of an error of our own
-
-S = TypeVar("S")
-T = TypeVar("T")
-Alone = Callable[[int, S], str]  # number and experiment -> a command
 
 
 class Strike(NamedTuple):
@@ -272,75 +258,3 @@ def explore(
     """Every experiment with its number and what came of it, in order. See `each`."""
     for number, setup, (lost, broken) in each(judged, setups, jobs, alone=alone):
         yield number, setup, lost, broken
-
-
-def each(
-    judge: Callable[[S], T],
-    setups: Iterable[S],
-    jobs: int = 1,
-    chunk_size: int = CHUNK,
-    *,
-    alone: Alone[S] | None = None,
-    seconds_max: float = CHUNK_SECONDS_MAX,
-    fresh: bool = False,
-) -> Generator[tuple[int, S, T], None, None]:
-    """`judge` on every experiment, in order, over `jobs` processes; there may be no end of them.
-
-    `fresh`: processes that import what `judge` takes, and have nothing of the command's: those of a real run
-    are forks of them, and all that is in them would be copied with each.
-    Raises HarnessError if one of the processes dies, or hangs: if `chunk_size` experiments, one after the
-    other, take more than `seconds_max`. `alone` is the command that runs one of them by itself.
-    """
-    if jobs == 1 and not fresh:
-        for number, setup in enumerate(setups):
-            yield number, setup, judge(setup)
-        return
-    numbered = enumerate(setups)
-    under_way: deque[tuple[int, list[tuple[int, S]], Future[list[T]]]] = deque()
-    board = RawArray("q", 2 * AHEAD * jobs)  # of each chunk under way: who is at it, and at which experiment
-    places = itertools.cycle(range(0, len(board), 2))
-    start = get_context("spawn" if fresh else "fork")
-    pool = ProcessPoolExecutor(jobs, start, _belong_to, (os.getpid(), board))
-    try:
-        while True:
-            while len(under_way) < AHEAD * jobs and (chunk := list(itertools.islice(numbered, chunk_size))):
-                place = next(places)
-                under_way.append((place, chunk, pool.submit(_all, judge, place, chunk)))
-            if not under_way:
-                return
-            place, chunk, future = under_way.popleft()
-            if not wait((future,), seconds_max).done:
-                pid, hung = board[place : place + 2]
-                os.kill(pid, signal.SIGKILL)  # it breaks the pool, which ends the others
-                raise HarnessError(_hung(hung, dict(chunk)[hung], seconds_max, alone))
-            for (number, setup), found in zip(chunk, future.result(), strict=True):
-                yield number, setup, found
-    except BrokenProcessPool as error:
-        raise HarnessError(f"a process that simulates has died: {error}") from error
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
-def _hung(number: int, setup: S, seconds_max: float, alone: Alone[S] | None) -> str:
-    command = f"; alone: {alone(number, setup)}" if alone is not None else ""
-    what = f"{setup}"[:REASON_MAX]
-    return f"experiment {number} hangs, after {seconds_max:g} s there is no result: {what}{command}"
-
-
-_board: MutableSequence[int] = []  # of the command, in its workers
-
-
-def _all(judge: Callable[[S], T], place: int, chunk: list[tuple[int, S]]) -> list[T]:
-    found = []
-    for number, setup in chunk:
-        _board[place], _board[place + 1] = os.getpid(), number
-        found.append(judge(setup))
-    return found
-
-
-def _belong_to(command: int, board: MutableSequence[int]) -> None:
-    """Leave interrupts to the command, and die with it, whatever ends it (G7)."""
-    global _board  # noqa: PLW0603 - one for a process, which is one worker of one pool
-    _board = board
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    linux.die_with(command)

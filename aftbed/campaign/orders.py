@@ -13,8 +13,8 @@ from typing import Final
 
 import msgspec
 
-from aftbed.campaign.explore import CHUNK_SECONDS_MAX, each
 from aftbed.campaign.simulated import Breach, breaches
+from aftbed.campaign.workers import SECONDS_MAX, each
 from aftbed.runtime.sim.clock import Clock
 from aftbed.runtime.sim.interleaving import HeldChannel, orders
 from aftbed.runtime.sim.world import Doom, Setup, World, simulate
@@ -65,7 +65,7 @@ def all_orders(setup: Setup, runs_max: int = RUNS_MAX) -> Ordered:
 
 def explore_orders(setups: Iterable[Setup], runs_max: int = RUNS_MAX, jobs: int = 1) -> Iterator[Ordered]:
     """Every experiment, in order."""
-    seconds_max = max(CHUNK_SECONDS_MAX, runs_max * RUN_SECONDS_MAX)
+    seconds_max = max(SECONDS_MAX, runs_max * RUN_SECONDS_MAX)
     judge = partial(all_orders, runs_max=runs_max)
-    for _, _, found in each(judge, setups, jobs, chunk_size=1, seconds_max=seconds_max):
+    for _, _, found in each(judge, setups, jobs, seconds_max=seconds_max):
         yield found

@@ -9,6 +9,7 @@ which they end has a part in what is run.
 import hashlib
 import itertools
 from collections.abc import Iterator
+from fnmatch import fnmatchcase
 from functools import lru_cache
 from pathlib import Path
 from random import Random
@@ -20,7 +21,7 @@ import aftbed
 from aftbed.adapt.schedule import scheduled
 from aftbed.campaign.experiment import Experiment
 from aftbed.campaign.spec import ANY, AdaptationEntry, FaultEntry, Spec, System, Value
-from aftbed.core.errors import ConfigError
+from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.fault import Fault, FlipMemory
 from aftbed.core.graph import Graph
 from aftbed.ftm.mechanism import build
@@ -94,6 +95,7 @@ class Plan(msgspec.Struct, frozen=True):
 
 def plan(spec: Spec) -> Plan:
     """The plan of `spec`, every experiment of it checked. Raises ConfigError naming the key."""
+    _check_left_out(spec)
     strata = tuple(strata_of(spec))
     if not strata:
         raise ConfigError("mechanisms: no entry of faults and adaptations is left for any of them")
@@ -128,7 +130,19 @@ def strata_of(spec: Spec) -> Iterator[Stratum]:
         words = [ftm, *([placement] if len(spec.system.placements) > 1 else [])]
         words += [adaptation.name] if len(spec.adaptations) > 1 else []
         expected = fault.expect.get(ftm, fault.expect.get(ANY, ()))
-        yield Stratum(JOINED.join((*words, fault.name)), ftm, placement, fault, adaptation, expected)
+        name = JOINED.join((*words, fault.name))
+        if not any(fnmatchcase(name, pattern) for pattern in spec.leave_out):
+            yield Stratum(name, ftm, placement, fault, adaptation, expected)
+
+
+def _check_left_out(spec: Spec) -> None:
+    """What is left out would be there."""
+    every = [stratum.name for stratum in strata_of(msgspec.structs.replace(spec, leave_out=()))]
+    for number, pattern in enumerate(spec.leave_out):
+        if every and not any(fnmatchcase(name, pattern) for name in every):
+            raise ConfigError(f"leave_out[{number}]: {unknown('stratum', pattern, every)}")
+    if every and not any(strata_of(spec)):
+        raise ConfigError("leave_out: it leaves no stratum in")
 
 
 def _filled(entry: FaultEntry, number: int, chance: Random) -> tuple[str, ...]:

@@ -18,8 +18,8 @@ import msgspec
 from msgspec.structs import replace
 
 from aftbed.campaign.course import Course, Struck, course_of, strike
-from aftbed.campaign.explore import each
 from aftbed.campaign.residual import closing_speed_ms, impact_kmh, left_m, residual_kmh
+from aftbed.campaign.workers import each
 from aftbed.campaign.worstinstant import worst_instant
 from aftbed.core.fault import Fault, Hang, Slow, Trigger
 from aftbed.runtime.sim.world import Setup
@@ -96,7 +96,7 @@ def drives(cases: Sequence[Case], lines: Iterable[Line], seed: int) -> list[Driv
 
 def driven(todo: Sequence[Drive], jobs: int) -> Generator[tuple[Row, ...], None, None]:
     """The rows of each drive, in order. Raises HarnessError if the simulator breaks down."""
-    for _, _, rows in each(drive, todo, jobs, chunk_size=1):
+    for _, _, rows in each(drive, todo, jobs):
         yield rows
 
 

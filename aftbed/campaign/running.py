@@ -18,8 +18,8 @@ import msgspec
 from aftbed.campaign import ledger
 from aftbed.campaign.executing import REQUESTS_PER_SECOND_MIN, carry_out
 from aftbed.campaign.experiment import Experiment, Result
-from aftbed.campaign.explore import CHUNK_SECONDS_MAX, each
 from aftbed.campaign.planning import Plan
+from aftbed.campaign.workers import SECONDS_MAX, each
 from aftbed.core.errors import ConfigError
 
 
@@ -78,7 +78,7 @@ def _results(plan: Plan, asked: Asked, path: Path) -> Generator[Result, None, No
 def _seconds_max(plan: Plan) -> float:
     """An experiment that takes more hangs; real ones have deadlines of their own, and end before."""
     system = plan.spec.system
-    return CHUNK_SECONDS_MAX + 2 * system.requests / (system.rate_hz or REQUESTS_PER_SECOND_MIN)
+    return SECONDS_MAX + 2 * system.requests / (system.rate_hz or REQUESTS_PER_SECOND_MIN)
 
 
 def performed(todo: Iterator[Experiment], path: Path, asked: Asked, plan: Plan) -> Iterator[Result]:
@@ -86,7 +86,7 @@ def performed(todo: Iterator[Experiment], path: Path, asked: Asked, plan: Plan) 
     if not asked.scheduler:
         perform = partial(_perform, os.fspath(path))
         fresh = plan.spec.system.runtime == "unix"
-        for _, _, result in each(perform, todo, asked.jobs, 1, seconds_max=_seconds_max(plan), fresh=fresh):
+        for _, _, result in each(perform, todo, asked.jobs, seconds_max=_seconds_max(plan), fresh=fresh):
             yield result
         return
     from aftbed.campaign import dasked  # noqa: PLC0415 - an extra

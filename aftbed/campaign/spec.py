@@ -141,6 +141,7 @@ class Spec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     seed: Annotated[int, Meta(ge=0)] = 0
     system: System = System()
     adaptations: tuple[AdaptationEntry, ...] = (AdaptationEntry("none"),)
+    leave_out: tuple[str, ...] = ()  # strata, by patterns as of file names
     stop: Stop = Stop()
     gates: tuple[Gate, ...] = ()
     confidence: Annotated[float, Meta(gt=0.5, lt=1)] = 0.95

@@ -56,8 +56,11 @@ def made(changes: Changes) -> Plan:
             raise unknown("runtime", changes.runtime, RUNTIMES)
         system = msgspec.structs.replace(spec.system, runtime=changes.runtime)
         spec = msgspec.structs.replace(spec, system=system)
-    check(spec)
-    return plan(spec)
+    try:
+        check(spec)
+        return plan(spec)
+    except ConfigError as error:
+        raise ConfigError(f"{changes.name}: {error}") from error
 
 
 # -- before anything runs -------------------------------------------------------------------------

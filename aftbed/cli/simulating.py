@@ -14,9 +14,10 @@ from typing import Final
 
 import msgspec
 
-from aftbed.campaign.explore import CAR, Found, attempt, each, missed, tried
+from aftbed.campaign.explore import CAR, Found, attempt, missed, tried
 from aftbed.campaign.simulated import ASSERT, REST, Breach, outcome
 from aftbed.campaign.verdict import EXIT_CODES, EXIT_INTERRUPTED, Verdict, Word
+from aftbed.campaign.workers import each
 from aftbed.cli import simagainst
 from aftbed.cli.show import show_verdict
 from aftbed.cli.simasked import Asked, Make, check_diagram, jobs_of, made_of, seeds_against, seeds_of

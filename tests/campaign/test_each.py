@@ -1,5 +1,6 @@
-"""Experiments over several processes: in order, and one that hangs is named, killed and not waited for."""
+"""Experiments over several processes: in order; one that hangs, or whose process dies, is named."""
 
+import itertools
 import os
 import signal
 import time
@@ -7,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from aftbed.campaign.explore import each
+from aftbed.campaign.workers import each
 from aftbed.core.errors import HarnessError
 
 LIMIT_S = 20.0  # what a machine under load may take for a failure that is due after one second
@@ -20,6 +21,22 @@ def doubled(number: int) -> int:
 def hangs_at_five(number: int) -> int:
     while number == 5:
         signal.pause()
+    return number
+
+
+def dies_at_five(number: int) -> int:
+    if number == 5:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number
+
+
+def heavy(data: bytes) -> bytes:
+    return data[::-1]
+
+
+def fails_at_five(number: int) -> int:
+    if number == 5:
+        raise ArithmeticError("of its own")
     return number
 
 
@@ -39,12 +56,68 @@ def test_results_come_in_order(jobs: int) -> None:
 
 def test_one_that_hangs_is_named_with_its_command_and_nobody_is_left() -> None:
     before, began_s = workers(), time.monotonic()
-    found = each(hangs_at_five, range(9), 2, 4, alone=lambda number, _: f"run {number}", seconds_max=1.0)
+    found = each(hangs_at_five, range(9), 2, alone=lambda number, _: f"run {number}", seconds_max=1.0)
     with pytest.raises(HarnessError) as raised:
         list(found)
     assert str(raised.value) == "experiment 5 hangs, after 1 s there is no result: 5; alone: run 5"
     assert time.monotonic() - began_s < LIMIT_S
     assert workers() <= before
+
+
+def test_one_whose_process_dies_is_named_and_nobody_is_left() -> None:
+    before = workers()
+    with pytest.raises(HarnessError) as raised:
+        list(each(dies_at_five, range(9), 2, alone=lambda number, _: f"run {number}"))
+    said = "experiment 5 has no result, its process has been killed by signal 9: 5; alone: run 5"
+    assert str(raised.value) == said
+    assert workers() <= before
+
+
+@pytest.mark.parametrize("fresh", [False, True])
+def test_what_is_larger_than_a_pipe_comes_through_and_nobody_is_left(fresh: bool) -> None:
+    before = workers()
+    setups = [bytes([number]) * 3_000_000 + b"end" for number in range(6)]
+    assert [found for _, _, found in each(heavy, setups, 2, fresh=fresh)] == [s[::-1] for s in setups]
+    assert workers() <= before
+
+
+class Unpickled:
+    """A judge that does `what` to the process that is told of it."""
+
+    def __init__(self, *what: object) -> None:
+        self._what = what
+
+    def __reduce__(self) -> tuple[object, ...]:
+        function, *arguments = self._what
+        return function, tuple(arguments)
+
+    def __call__(self, setup: bytes) -> bytes:
+        return setup
+
+
+def test_a_worker_that_does_not_get_as_far_as_an_experiment_is_named() -> None:
+    before = workers()
+    with pytest.raises(HarnessError, match="experiment 0 has no result, its process has ended with code 7"):
+        list(each(Unpickled(os._exit, 7), [b"a"], 1, fresh=True))
+    assert workers() <= before
+
+
+def test_one_that_does_not_take_what_it_is_given_is_named_and_not_waited_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("aftbed.campaign.workers.TALK_SECONDS_MAX", 0.5)
+    before, stops = workers(), Unpickled(signal.raise_signal, signal.SIGSTOP)
+    with pytest.raises(HarnessError, match=r"experiment 0 hangs, after 0\.5 s there is no result"):
+        list(each(stops, [bytes(30_000_000)], 1, fresh=True))
+    assert workers() <= before
+
+
+def test_results_before_an_error_are_handed_on_and_the_error_says_where_it_was_raised() -> None:
+    found = each(fails_at_five, range(9), 2)
+    assert [number for number, _, _ in itertools.islice(found, 5)] == [0, 1, 2, 3, 4]
+    with pytest.raises(ArithmeticError, match="of its own") as raised:
+        next(found)
+    assert "in fails_at_five" in raised.value.__notes__[0]
 
 
 def test_an_error_of_an_experiment_is_no_hang() -> None:

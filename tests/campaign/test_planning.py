@@ -19,6 +19,15 @@ def test_strata_take_turns_through_their_matrices(tmp_path: Path) -> None:
     assert events == ["server.exit", "reply.sent", "server.exit", "reply.sent"]
 
 
+def test_a_stratum_that_is_left_out_is_not_there_and_the_others_are_as_they_were(tmp_path: Path) -> None:
+    whole = planned(tmp_path)
+    less = planned(tmp_path, CRASHES.replace("stop:", "leave_out: ['lfr · *']\nstop:"))
+    names = [stratum.name for stratum in whole.strata if not stratum.name.startswith("lfr · ")]
+    assert [stratum.name for stratum in less.strata] == names != []
+    seeds = {(e.stratum, e.number): (e.seed, e.faults) for e in whole.experiments()}
+    assert all(seeds[e.stratum, e.number] == (e.seed, e.faults) for e in less.experiments())
+
+
 def test_the_same_file_gives_the_same_plan(tmp_path: Path) -> None:
     assert list(planned(tmp_path).experiments()) == list(planned(tmp_path).experiments())
 

@@ -13,8 +13,9 @@ import pytest
 from msgspec.structs import replace
 from playedrun import Call, Run
 
-from aftbed.campaign.explore import each, tried
+from aftbed.campaign.explore import tried
 from aftbed.campaign.swarm import drawn
+from aftbed.campaign.workers import each
 from aftbed.cli import simulating
 from aftbed.cli.simfailure import repeating
 from aftbed.core.fault import Crash, Fault, Trigger

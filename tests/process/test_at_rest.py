@@ -1,12 +1,16 @@
 """A run ends at rest: all that was sent is answered, and both replicas are behind the last request."""
 
+import time
+
 import pytest
 from liveruns import Home, Started, until
 
+from aftbed.core.event import Event
 from aftbed.core.journal import EntryKind
 from aftbed.inject.words import parse
 from aftbed.runtime.unix import ask
 from aftbed.runtime.unix.options import LoadRun
+from aftbed.runtime.unix.processes import Process
 
 pytestmark = pytest.mark.process
 
@@ -37,3 +41,21 @@ def test_what_is_under_way_when_it_is_stopped_is_answered(home: Home) -> None:
     requests = outcome.verdict.requests
     assert outcome.verdict.verdict == "pass", outcome.verdict.reasons
     assert requests.sent == requests.answered > 1
+
+
+@pytest.mark.parametrize("ftm", ["pbr", "lfr"])
+def test_the_end_of_a_run_is_nothing_to_recover_from(
+    home: Home, monkeypatch: pytest.MonkeyPatch, ftm: str
+) -> None:
+    """Nobody acts on the deaths, though the supervisor is held up after each kill."""
+    kill = Process.kill
+
+    def slowly(process: Process) -> bool:
+        killed = kill(process)
+        time.sleep(0.005)  # not to wait for anything: it is what happens here
+        return killed
+
+    monkeypatch.setattr(Process, "kill", slowly)  # the supervisor is a fork of this process
+    outcome = Started(home, LoadRun(COUNT, 0.0), ftm=ftm).finish()
+    assert outcome.verdict.verdict == "pass", outcome.verdict.reasons
+    assert not outcome.record.history.events(Event.WATCHDOG_SUSPECT, Event.RECOVERY_ENTER)

@@ -12,7 +12,7 @@ one as ever.
 
 import os
 import struct
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -49,10 +49,9 @@ def written_by(work: Callable[[], None]) -> tuple[Area, ...]:
     return tuple(_own_areas(private, told))
 
 
-def own(areas: Iterable[Area]) -> None:
+def own(areas: Sequence[Area]) -> None:
     """Have a copy of what is there, as it is."""
-    for address, size in areas:
-        linux.populate(address, size)
+    linux.populate(areas)
 
 
 def _private() -> Iterator[Area]:

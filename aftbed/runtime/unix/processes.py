@@ -27,6 +27,7 @@ REAP_SECONDS: Final = 0.01
 SPARE_SECONDS_MAX: Final = 5.0  # a zygote imports first
 DEMAND: Final = 3  # spares that are forked where one is waited for: whoever takes one takes more
 PARK_BATCH: Final = 8  # spares per order: the first of them start while the next are forked
+WATCHING_KINDS: Final = ("watchdog", "recovery")
 
 
 class Process:
@@ -98,6 +99,10 @@ class Process:
         """The Ack of an Assign is here: its journal exists."""
         if self.header is None and self.journal and Path(self.journal).exists():
             self.header = Header(Path(self.journal))
+
+    def watches(self) -> bool:
+        """Whether it would act on the death of another."""
+        return any(kind in WATCHING_KINDS for _, kind in self.bricks)
 
     def announce(self) -> None:
         """Raise the flag: an order waits."""

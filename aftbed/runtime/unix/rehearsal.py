@@ -7,6 +7,7 @@ a child of it that is thrown away shows which pages a step writes to, for the ot
 import gc
 import os
 import socket
+from functools import lru_cache
 from typing import Final
 
 from aftbed.core import wire
@@ -43,6 +44,8 @@ ROUNDS_WARM: Final = 16
 ROUNDS_ONCE: Final = 4
 REHEARSED: Final = 8
 
+Ways = dict[tuple[str, str], tuple[str, str]]
+
 
 def warm_up() -> tuple[Area, ...]:
     """As often as it takes until the interpreter has seen it all; then, where a child will write to.
@@ -65,27 +68,35 @@ def _once() -> None:
 
 def rehearse(rounds: int) -> None:
     """`rounds` requests through both replicas, then the backup takes over and serves as many."""
+    kinds, ways, requests = _scene()
+    bricks: dict[str, Brick] = {}
+    for name, kind in kinds.items():
+        bricks[name] = make(kind, Setting(1, 1, not name.startswith("b/"), default_application))
+    for name, port in ways:
+        bricks[name].step(CONTROL, Rebound(port, True, 1), 0)
+    _serve(bricks, ways, requests[:rounds])
+    mail = [("b/after", CONTROL, Promote(2)), ("b/after", "aft2aft", ChannelEnded())]
+    for name, port, message in mail:
+        _deliver(bricks, ways, [(name, port, message)])
+    ways = ways | {
+        ("proxy", "pxy2pro"): ("b/protocol", "pxy2pro"),
+        ("b/protocol", "pro2pxy"): ("proxy", "pro2pxy"),
+    }
+    bricks["proxy"].step(CONTROL, Rebound("pxy2pro", True, 2), 0)
+    _serve(bricks, ways, requests[:rounds])
+
+
+@lru_cache(maxsize=1)
+def _scene() -> tuple[dict[str, str], Ways, list[bytes]]:
+    """Kinds by name, ways of their mail, requests; made once: a node makes nothing like it."""
     graph = build("pbr", "replica")
     names = ["client", "proxy", *(name for replica in REPLICAS for name in chain(graph, replica))]
-    bricks: dict[str, Brick] = {}
-    for name in names:
-        leads = not name.startswith("b/")
-        bricks[name] = make(graph.brick(name).kind, Setting(1, 1, leads, default_application))
     ways = {
         (k.source, k.source_port): (k.sink, k.sink_port)
         for k in graph.links
         if not k.standby and {k.source, k.sink} <= set(names)
     }
-    requests = sample_requests(0, rounds)
-    for name, port in ways:
-        bricks[name].step(CONTROL, Rebound(port, True, 1), 0)
-    _serve(bricks, ways, requests)
-    mail = [("b/after", CONTROL, Promote(2)), ("b/after", "aft2aft", ChannelEnded())]
-    for name, port, message in mail:
-        _deliver(bricks, ways, [(name, port, message)])
-    ways |= {("proxy", "pxy2pro"): ("b/protocol", "pxy2pro"), ("b/protocol", "pro2pxy"): ("proxy", "pro2pxy")}
-    bricks["proxy"].step(CONTROL, Rebound("pxy2pro", True, 2), 0)
-    _serve(bricks, ways, requests)
+    return {name: graph.brick(name).kind for name in names}, ways, sample_requests(0, ROUNDS_WARM)
 
 
 class _Scratch:
@@ -199,9 +210,6 @@ def _rehearse_following() -> None:
     for fd in fds:
         os.close(fd)
     scratch.close()
-
-
-Ways = dict[tuple[str, str], tuple[str, str]]
 
 
 def _serve(bricks: dict[str, Brick], ways: Ways, requests: list[bytes]) -> None:

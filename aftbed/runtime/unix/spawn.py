@@ -72,10 +72,10 @@ def start(descriptor: int, supervisor: int, cpus: list[int], preload: tuple[str,
     """
     arguments = [sys.executable, "-P", "-m", ZYGOTE, str(supervisor), ",".join(map(str, cpus)), *preload]
     descriptors = [(os.POSIX_SPAWN_DUP2, descriptor, CONTROL_FD)]
-    return os.posix_spawn(sys.executable, arguments, _environment(), file_actions=descriptors)
+    return os.posix_spawn(sys.executable, arguments, environment(), file_actions=descriptors)
 
 
-def _environment() -> dict[str, str]:
+def environment() -> dict[str, str]:
     """Where this very package is found; the working directory is not searched (`-P`)."""
     home = str(Path(__file__).resolve().parents[3])
     if home in site.getsitepackages():

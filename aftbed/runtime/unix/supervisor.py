@@ -233,13 +233,16 @@ class Supervisor:
         self._report_owner("finished", json.dumps(end).encode())
 
     def _bury(self) -> list[str]:
-        """Kill all, and reap what dies; what is left after a second. The dying need a CPU, too."""
+        """Kill all, and reap what dies; what is left after a second. The dying need a CPU, too.
+
+        Whoever watches is killed first: the end of the run is nothing to recover from.
+        """
         dying = self.nursery.processes
         starvation = {p.pid: linux.Starvation(p.pid) for p in dying if p.pid}
         began_ns = time.monotonic_ns()
         for watch in starvation.values():
             watch.starves(began_ns)  # counts from here
-        for process in dying:
+        for process in sorted(dying, key=Process.watches, reverse=True):
             process.kill()
         while dying:
             before = len(dying)
