@@ -35,6 +35,13 @@ def test_the_end_counts_all_that_was_struck() -> None:
     )
 
 
+def test_a_silence_is_noticed_by_a_brake_that_falls_back() -> None:
+    done = aftbed("run", *DRIVE, "--inject", "omission bus AEB_REQ after 1s for 100ms")
+    (found,) = done.verdict().faults
+    detail = "5 frames, the first at 1.000000 s, id 100; noticed by brake (fallback)"
+    assert (found["receipt"], found["detail"]) == ("activated", detail)
+
+
 def test_a_fault_on_a_condition_in_real_time() -> None:
     words = "bus-off gateway when gap < 15 for 100ms"
     done = aftbed("run", "--scenario", "ccrs-20", "--pace", "4", "--json", "--inject", words)
@@ -58,7 +65,8 @@ def test_a_live_run_is_disturbed_from_a_second_command(home: Home) -> None:
         started.wait_for("fault", "activated")
         outcome = started.finish()
     (found,) = outcome.verdict.faults
-    assert found["receipt"] == "activated" and found["detail"].endswith("noticed by brake (fallback)")
+    assert found["receipt"] == "activated", found
+    assert "noticed by brake (" in found["detail"], found  # the sign depends on who is late
     assert outcome.verdict.verdict == "pass"
 
 

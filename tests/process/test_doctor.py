@@ -22,6 +22,7 @@ from aftbed.runtime.unix.options import LoadRun
 pytestmark = pytest.mark.process
 
 ENDLESS: Final = ("--load", "100000@200")
+OF_THE_MOMENT: Final = ("CPU steal", "load")  # measured anew by each command
 
 
 def doctor(*arguments: str) -> tuple[int, Diagnosis]:
@@ -221,7 +222,11 @@ def test_the_document_and_the_lines_say_the_same(home: Home) -> None:
     code, found = doctor()
     shown = aftbed("doctor")
     assert shown.code == code
-    lines = [line for line in shown.out.splitlines() if not line.startswith(" ")]
-    assert [line.split()[0] for line in lines[:-1]] == [c.status for c in found.checks]
+    lines = [line for line in shown.out.splitlines() if not line.startswith(" ")][:-1]
+    for line, check in zip(lines, found.checks, strict=True):
+        status, name = line.split(maxsplit=1)
+        assert name.startswith(check.name)
+        if check.name not in OF_THE_MOMENT:
+            assert status == check.status
     assert all(bool(c.remedy) == (c.status != "ok") for c in found.checks)
     assert json.loads(aftbed("doctor", "--json").out)["left"] == []
