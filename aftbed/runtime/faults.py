@@ -50,7 +50,10 @@ class Faults:
         self._cells = Cells(deployment)
 
     def arm(self, fault: Fault) -> Keys:
-        """Apply `fault` now, later, or have its emitter wait for its event. Raises StepFailed."""
+        """Apply `fault` now, later, or have its emitter wait for its event.
+
+        Raises StepFailed; NobodyThere is a refusal: nothing has been armed, and the run is not judged by it.
+        """
         number = next(self._numbers)
         armed = Armed(number, fault, self._support.draw(number))
         self._armed.append(armed)
@@ -63,7 +66,12 @@ class Faults:
         if fault.trigger.after_ms and not fault.trigger.event:
             self._loop.after(fault.trigger.after_ms / 1e3, lambda: self._start(armed))
             return
-        yield from self._begin(armed)
+        try:
+            yield from self._begin(armed)
+        except NobodyThere as refusal:
+            self._armed.remove(armed)
+            self._tell("refused", str(refusal))
+            raise
 
     def _start(self, armed: Armed) -> None:
         self._loop.jobs.start(f"fault {armed.fault}", self._begin(armed), lambda failure: None)

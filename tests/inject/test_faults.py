@@ -50,7 +50,7 @@ def test_a_fault_that_nobody_can_wait_for_is_refused_and_stays_so(run: Run) -> N
         run.arm("crash backup at checkpoint.applied")
     run.deployment.backup = "b"
     run.do(run.faults.rearm())
-    assert run.deployment.told == []
+    assert run.deployment.told == [] and run.faults.receipts() == []
 
 
 def test_the_bit_that_is_not_named_hangs_on_the_seed_and_on_the_fault(tmp_path: Path) -> None:

@@ -3,12 +3,14 @@
 Which requests a run serves, and so which bit means what, is fixed by its seed.
 """
 
+import os
 import re
+import signal
 from pathlib import Path
 from typing import Final
 
 import pytest
-from liveruns import Command, Done, Home, aftbed, under_load
+from liveruns import Command, Done, Home, Started, aftbed, under_load, until
 from sampling import sampled
 
 from aftbed.campaign.record import RunRecord, read_record
@@ -17,7 +19,9 @@ from aftbed.core.event import Event
 from aftbed.core.graph import PLACEMENTS
 from aftbed.core.journal import Record
 from aftbed.ftm.mechanism import EXPRESSIONS, replication_of
-from aftbed.runtime.unix import ask
+from aftbed.inject.words import parse
+from aftbed.runtime.unix import ask, rundir
+from aftbed.runtime.unix.options import LoadRun
 
 pytestmark = pytest.mark.process
 
@@ -238,6 +242,21 @@ def test_a_live_run_is_hit_from_a_second_command(home: Home) -> None:
     assert outcome.verdict.requests.wrong == 1 and outcome.verdict.verdict == "fail"
     (fault,) = outcome.verdict.faults
     assert str(told["text"]) == f"{fault['fault']}: activated, {fault['detail']}"
+
+
+def test_what_is_asked_while_a_run_starts_is_done_when_it_has(home: Home) -> None:
+    with Started(home, LoadRun(ENDLESS, 200.0)) as started:
+        until(lambda: rundir.live() and any(row.role == "zygote" for row in started.rows()), "a zygote")
+        zygote = next(row.pid for row in started.rows() if row.role == "zygote")
+        os.kill(zygote, signal.SIGSTOP)
+        asked = ask.send(started.private, ask.Inject(parse("bitflip result bit 8")))
+        assert "launch" in str(started.status()["busy"])
+        os.kill(zygote, signal.SIGCONT)
+        ask.receive(asked)
+        started.wait_for("fault", "activated")
+        ask.ask(started.private, ask.Stop())
+        outcome = started.finish()
+    assert [fault["receipt"] for fault in outcome.verdict.faults] == ["activated"]
 
 
 def test_after_a_while_the_next_execution_is_hit(home: Home) -> None:

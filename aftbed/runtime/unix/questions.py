@@ -27,7 +27,9 @@ from aftbed.runtime.unix.resources import Row
 from aftbed.runtime.unix.work import Work
 
 BESIDE: Final = ("zygote", "spare", "service", "staged")
-QUESTIONS_MAX: Final = 16  # connections at once
+QUESTIONS_MAX: Final = 16  # connections at once, and questions that wait for the launch
+
+Answering = Callable[[ask.Answer], None]
 
 
 class Questions:
@@ -48,6 +50,13 @@ class Questions:
         self._adaptations = adaptations
         self._started_ns = time.monotonic_ns()
         self._lines: dict[int, Line[ask.Question]] = {}
+        self._early: list[tuple[ask.Question, Answering]] | None = []  # what waits for the launch
+
+    def launched(self) -> None:
+        """The graph is whole, and the function works: from here on it can be disturbed and changed."""
+        early, self._early = self._early, None
+        for question, answer in early or ():
+            self._reply(question, answer)
 
     def listen(self) -> None:
         """Open the socket; from here on the run is found by other commands."""
@@ -90,9 +99,13 @@ class Questions:
         except OSError:
             return
 
-    def _reply(self, question: ask.Question, answer: Callable[[ask.Answer], None]) -> None:
+    def _reply(self, question: ask.Question, answer: Answering) -> None:
         try:
             match question:
+                case ask.Inject() | ask.Adapt() if self._early is not None:
+                    if len(self._early) >= QUESTIONS_MAX:
+                        raise ConfigError("the run has not started yet: ask again when it has")
+                    self._early.append((question, answer))
                 case ask.Status():
                     answer(ask.Answer(json.dumps(self.status()).encode()))
                 case ask.Processes():

@@ -128,6 +128,7 @@ class Supervisor:
         self._waited_ns = {p.pid: linux.waited_ns(p.pid) for p in self.deployment.nodes.values()}
         self.tell("started", f"{len(self.deployment.nodes)} nodes in {self.graph_ms:.1f} ms")
         self.conductor.inform_recovery(failed=False)
+        self.questions.launched()
 
     def _on_owner(self) -> None:
         try:
