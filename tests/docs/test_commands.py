@@ -26,7 +26,7 @@ duration_s: 600
 ego: {speed_kmh: 80}
 expect: {outcome: no_braking}
 """
-_PLACEHOLDER: Final = re.compile(r"\.\.\.|\b[0-9a-f]{6}\b|\b\d+(?= late)")  # left out, the id of a run, real time
+_PLACEHOLDER: Final = re.compile(r"\.\.\.|\b[0-9a-f]{6}\b|\b\d+(?= late)")  # left out, ids, real time
 
 pytestmark = pytest.mark.process
 
@@ -106,7 +106,7 @@ class LiveRun:
 
 
 def matches(shown: str, output: str) -> bool:
-    """Whether the line `shown` begins a line of `output`; ids, `...` and how many are late stand for anything."""
+    """Whether the line `shown` begins a line of `output`; what is `_PLACEHOLDER` stands for anything."""
     pattern = ".*".join(re.escape(part) for part in _PLACEHOLDER.split(shown))
     return re.search(f"^{pattern}", output, re.MULTILINE) is not None
 
