@@ -6,10 +6,12 @@ A failing example prints the line that repeats it.
 """
 
 import os
+from typing import Final
 
 import pytest
 from hypothesis import HealthCheck, settings
 
+ID_MAX: Final = 60  # characters of a parameter in the name of its test: some are megabytes
 _SLOW_IS_FINE = (HealthCheck.too_slow,)
 
 settings.register_profile("dev", deadline=None, print_blob=True, suppress_health_check=_SLOW_IS_FINE)
@@ -20,6 +22,10 @@ settings.load_profile("ci" if os.environ.get("CI") else "dev")
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--rewrite", action="store_true", help="write the golden dialogues anew")
+
+
+def pytest_make_parametrize_id(val: object) -> str | None:
+    return f"{val[:ID_MAX]!r}..." if isinstance(val, str | bytes) and len(val) > ID_MAX else None
 
 
 @pytest.fixture

@@ -1,14 +1,13 @@
 """What is no log, or only a part of one, is one clear error, and leaves the disk as it was."""
 
-import builtins
 import re
 import resource
 import struct
+import sys
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from types import ModuleType
 from typing import Final
 
 import pytest
@@ -193,12 +192,41 @@ def test_an_object_of_no_length_does_not_go_on_for_ever(size: int, head: int, tm
         READERS["blf"](path)
 
 
-@pytest.mark.parametrize("name", sorted(READERS))
+@pytest.mark.parametrize("packed", [b"\0\0", b"x\x9c\xff"], ids=["no zlib", "no deflate"])
+def test_an_mf4_whose_blocks_cannot_be_unpacked_is_malformed(packed: bytes, tmp_path: Path) -> None:
+    WRITERS["mf4"](Log(FRAMES), tmp_path / "whole.mf4")
+    whole = bytearray((tmp_path / "whole.mf4").read_bytes())
+    data = whole.index(b"##DZ") + 48  # behind the head of a block of packed data (ASAM MDF 4.1, DZBLOCK)
+    whole[data : data + len(packed)] = packed
+    with pytest.raises(ConfigError, match=r"a.mf4: not an MF4 that can be read: torn or malformed: "):
+        READERS["mf4"](made(tmp_path / "a.mf4", bytes(whole)))
+
+
+def test_an_mf4_whose_reader_dies_is_malformed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As it does where asammdf follows a pointer to nowhere; here it is given no time."""
+    monkeypatch.setattr("aftbed.vehicle.logs.mf4file.READ_SECONDS_MAX", 0.001)
+    WRITERS["mf4"](MF4, tmp_path / "a.mf4")
+    with pytest.raises(ConfigError, match=r"malformed: its reader took more than 0\.001 s"):
+        READERS["mf4"](tmp_path / "a.mf4")
+
+
+@pytest.mark.parametrize("name", sorted(READERS.keys() - {"mf4"}))
 @settings(max_examples=60, suppress_health_check=WITH_FILES, deadline=None)
 @given(data=st.data())
 def test_a_reader_answers_any_bytes_with_frames_or_one_error(
     name: str, data: st.DataObject, tmp_path: Path
 ) -> None:
+    answers_any_bytes(name, data, tmp_path)
+
+
+@settings(max_examples=12, suppress_health_check=WITH_FILES, deadline=None)
+@given(data=st.data())
+def test_the_reader_of_mf4_too(data: st.DataObject, tmp_path: Path) -> None:
+    """Fewer: each is read by a process of its own."""
+    answers_any_bytes("mf4", data, tmp_path)
+
+
+def answers_any_bytes(name: str, data: st.DataObject, tmp_path: Path) -> None:
     whole = tmp_path / f"whole.{name}"
     if not whole.exists():
         WRITERS[name](MF4, whole)
@@ -214,14 +242,7 @@ def test_a_reader_answers_any_bytes_with_frames_or_one_error(
 
 
 def test_an_extra_that_is_missing_says_how_to_get_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    real = builtins.__import__
-
-    def without(name: str, *rest: object) -> ModuleType:
-        if name.partition(".")[0] == "asammdf":
-            raise ImportError(name)
-        return real(name, *rest)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(builtins, "__import__", without)
+    monkeypatch.setitem(sys.modules, "asammdf", None)
     source = made(tmp_path / "a.log", "(1.000000) can0 130#01\n")
     said = re.escape('MF4 needs asammdf: pip install "aftbed[mf4]"')
     with pytest.raises(ConfigError, match=said):

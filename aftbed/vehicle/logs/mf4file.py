@@ -10,53 +10,82 @@ different kinds come back in the order data, error, remote. Its times are second
 Channels are numbered from 0, as by python-can. The extra `mf4` brings asammdf.
 """
 
-import gc
 import io
+import os
+import signal
 import sys
 from datetime import UTC, datetime
+from importlib.util import find_spec
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Final
 
 from aftbed.core.errors import ConfigError
 from aftbed.vehicle.logs.frames import Kind, Log, LoggedFrame, content, numbers, origin_us
-from aftbed.vehicle.logs.messages import READ_ERRORS, taken
+from aftbed.vehicle.logs.messages import taken
 from aftbed.vehicle.pythoncan import with_asammdf
 
 NAMES: Final = {Kind.DATA: "CAN_DataFrame", Kind.ERROR: "CAN_ErrorFrame", Kind.REMOTE: "CAN_RemoteFrame"}
 MAGIC: Final = b"MDF     "
 UNFINISHED: Final = b"UnFinMF "
+READ_SECONDS_MAX: Final = 600.0  # a million frames take 20 s
+UNREADABLE: Final = "{path}: not an MF4 that can be read: torn or malformed: {why}"
 
 
 def read(path: Path) -> Log:
-    """The log at `path`. Raises ConfigError naming the file."""
-    data = content(path)
-    if not data.startswith((MAGIC, UNFINISHED)):
+    """The log at `path`. Raises ConfigError naming the file.
+
+    A process of its own reads it: there is native code in asammdf that follows a malformed file to wherever
+    that points, and dies of it.
+    """
+    if not content(path).startswith((MAGIC, UNFINISHED)):
         raise ConfigError(f"{path}: not an MF4: it does not begin with MDF")
     _needed()
-    from asammdf.blocks.utils import MdfException  # noqa: PLC0415 - slow to import
-
-    failed = ""
-    hook, sys.unraisablehook = sys.unraisablehook, lambda _: None
+    context = get_context("spawn")
+    ours, its = context.Pipe(duplex=False)
+    reader = context.Process(target=_answer, args=(path, its, READ_SECONDS_MAX))
+    reader.start()
+    its.close()
     try:
-        try:
-            return _read(path, data)
-        except (*READ_ERRORS, MdfException, OSError, MemoryError) as error:
-            failed = str(error) if str(error) and "BytesIO" not in str(error) else type(error).__name__
-        gc.collect()  # what asammdf has half made is not fit to be closed, and would complain at any time
+        found: Log | str = ours.recv()
+    except EOFError:
+        reader.join()
+        found = UNREADABLE.format(path=path, why=f"its reader {_ended(reader.exitcode)}")
     finally:
-        sys.unraisablehook = hook
-    raise ConfigError(f"{path}: not an MF4 that can be read: torn or malformed: {failed}")
+        reader.kill()  # it has nothing more to say
+        reader.join()
+        ours.close()
+    if isinstance(found, str):
+        raise ConfigError(found)
+    return found
 
 
-def _read(path: Path, data: bytes) -> Log:
+def _ended(code: int | None) -> str:
+    if code == -signal.SIGALRM:
+        return f"took more than {READ_SECONDS_MAX:g} s"
+    return f"was killed by signal {-code}" if code is not None and code < 0 else f"ended with code {code}"
+
+
+def _answer(path: Path, its: Connection, seconds_max: float) -> None:
+    """The reader: the log, or why there is none. Its standard error would be asammdf's."""
+    signal.setitimer(signal.ITIMER_REAL, seconds_max)
+    with Path(os.devnull).open("w") as nowhere:
+        os.dup2(nowhere.fileno(), sys.stderr.fileno())
+    try:
+        its.send(_read(path))
+    except ConfigError as error:
+        its.send(str(error))
+    except Exception as error:  # noqa: BLE001 - asammdf's, python-can's, those of four decompressors
+        why = str(error) if str(error) and "BytesIO" not in str(error) else type(error).__name__
+        its.send(UNREADABLE.format(path=path, why=why))
+
+
+def _read(path: Path) -> Log:
     with_asammdf()
     from can.io.mf4 import MF4Reader  # noqa: PLC0415 - slow to import
 
-    reader = MF4Reader(io.BytesIO(data))
-    try:
-        return taken(path, reader, lambda: "in its tables of frames")
-    finally:
-        reader.stop()
+    return taken(path, MF4Reader(io.BytesIO(content(path))), lambda: "in its tables of frames")
 
 
 def write(log: Log, path: Path) -> None:
@@ -103,7 +132,5 @@ def _fields(frame: LoggedFrame, channel: int) -> dict[str, int]:
 
 
 def _needed() -> None:
-    try:
-        import asammdf  # noqa: F401, PLC0415 - an extra, and slow to import
-    except ImportError:
-        raise ConfigError('MF4 needs asammdf: pip install "aftbed[mf4]"') from None
+    if find_spec("asammdf") is None:
+        raise ConfigError('MF4 needs asammdf: pip install "aftbed[mf4]"')
