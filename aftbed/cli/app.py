@@ -36,6 +36,25 @@ Run = Annotated[str | None, typer.Option("--run", help="Id of the run, where sev
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else.")]
 
 
+def _version(asked: bool) -> None:
+    if asked:
+        from aftbed.campaign.planning import code_version  # noqa: PLC0415 - for this alone
+
+        typer.echo(f"aftbed {code_version()}")
+        raise typer.Exit
+
+
+Version = Annotated[
+    bool,
+    typer.Option("--version", callback=_version, is_eager=True, help="Print it, with a digest of the code."),
+]
+
+
+@app.callback()
+def aftbed(*, version: Version = False) -> None:
+    """What comes before a command."""
+
+
 @app.command()
 def run(
     ftm: Annotated[str, typer.Option(help="none, pbr, lfr, tr, pbr+tr, ...: aftbed ftm list.")] = "pbr",

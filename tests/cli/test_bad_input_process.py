@@ -7,6 +7,8 @@ from pathlib import Path
 import pytest
 from liveruns import Done, Home, aftbed
 
+from aftbed.campaign.planning import code_version
+
 pytestmark = pytest.mark.process
 
 
@@ -55,6 +57,11 @@ def test_an_interpreter_without_asserts_is_refused(home: Home, command: tuple[st
     assert done.code != 0
     assert "refusing to run under python -O" in done.err
     assert home.left() == []
+
+
+def test_the_version_is_the_one_of_the_records() -> None:
+    done = aftbed("--version")
+    assert (done.code, done.out, done.err) == (0, f"aftbed {code_version()}\n", "")
 
 
 @pytest.mark.parametrize("option", [("--bus-port", "x"), ("--seed", "x"), ("--unknown",)])
