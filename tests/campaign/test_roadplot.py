@@ -3,7 +3,7 @@
 from typing import Final
 from xml.etree import ElementTree
 
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from aftbed.campaign.report.roadplot import Curve, Point, road_plot
@@ -42,6 +42,7 @@ def test_the_higher_impact_lies_higher() -> None:
 
 
 @given(st.lists(curves, min_size=1, max_size=4))
+@example([Curve("a", "n", (Point(0.0, 0.0, 0.0), Point(5e-324, 0.0, 0.0)))])
 def test_whatever_the_numbers_it_is_a_drawing_inside_of_its_frame(some: list[Curve]) -> None:
     root = ElementTree.fromstring(road_plot("any", some))
     width, height = float(root.get("width", "")), float(root.get("height", ""))

@@ -48,10 +48,11 @@ def drive_by_clock(
     onset_ms: int,
     outage_ms: tuple[int, int] = (0, 0),
     step_us: int = STEP_US,
+    drive_ms: int = DRIVE_MS,
 ) -> VehicleResult:
     """To the end: braking from `onset_ms` on, but not from the first to the second instant of `outage_ms`."""
     plant = Plant(setup, step_us)
-    while plant.t_us < DRIVE_MS * 1000 and not plant.stopped():
+    while plant.t_us < drive_ms * 1000 and not plant.stopped():
         t_ms = plant.t_us / 1000
         asked = t_ms >= onset_ms and not outage_ms[0] <= t_ms < outage_ms[1]
         plant.step(demand_ms2 if asked else 0.0)
@@ -137,7 +138,8 @@ def test_a_later_start_changes_nothing(
 
     lead_ms = min(lead_ms, speed_ms)
     now = drive_by_clock(PlantSetup(speed_ms, lead(0)), demand_ms2, onset_ms)
-    later = drive_by_clock(PlantSetup(speed_ms, lead(later_ms)), demand_ms2, onset_ms + later_ms)
+    setup = PlantSetup(speed_ms, lead(later_ms))
+    later = drive_by_clock(setup, demand_ms2, onset_ms + later_ms, drive_ms=DRIVE_MS + later_ms)
     assert later.collision == now.collision
     assert impact_kmh(later) == pytest.approx(impact_kmh(now), abs=1e-4)
     assert later.stop_gap_m == pytest.approx(now.stop_gap_m, abs=1e-6)

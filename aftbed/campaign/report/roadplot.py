@@ -19,6 +19,7 @@ WIDTH, HEIGHT = 620.0, 300.0
 LEFT, RIGHT, TOP, BOTTOM = 52.0, 16.0, 34.0, 44.0
 LEGEND_PX: Final = 18.0
 LEAST_KMH: Final = 10.0  # of the upright axis
+SPAN_KMH_MIN: Final = 1.0  # of the level one: rows that lie closer get some room beside them
 TICKS: Final = 6
 COLOURS: Final = ("#0072b2", "#d55e00", "#008f68", "#a8568b", "#8a6d00", "#2f8fc4", "#3d3d3d")
 DASHES: Final = ("", "7 3", "2 2", "8 3 2 3", "12 3", "4 4", "1 3")
@@ -119,7 +120,7 @@ class _Frame:
     """From km/h to pixels."""
 
     def __init__(self, low_kmh: float, high_kmh: float, top_kmh: float) -> None:
-        spare = 5.0 if low_kmh == high_kmh else 0.0
+        spare = 5.0 if high_kmh - low_kmh < SPAN_KMH_MIN else 0.0
         self._low, self._high, self._top = low_kmh - spare, high_kmh + spare, top_kmh
 
     def x(self, speed_kmh: float) -> float:
