@@ -6,11 +6,13 @@ Which requests a run serves, and so which bit means what, is fixed by its seed.
 import os
 import re
 import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
 import pytest
-from liveruns import Command, Done, Home, Started, aftbed, under_load, until
+from liveruns import Command, Done, Home, Started, aftbed, state_of, under_load, until
 from sampling import sampled
 
 from aftbed.campaign.record import RunRecord, read_record
@@ -244,19 +246,35 @@ def test_a_live_run_is_hit_from_a_second_command(home: Home) -> None:
     assert str(told["text"]) == f"{fault['fault']}: activated, {fault['detail']}"
 
 
+@contextmanager
+def held_in_its_launch(home: Home) -> Iterator[tuple[Started, int]]:
+    """A run, and the zygote that its launch waits for: it is stopped. A launch may be quicker than we are."""
+    for _ in range(5):
+        with Started(home, LoadRun(ENDLESS, 200.0)) as started:
+            until(lambda: rundir.live() and any(row.role == "zygote" for row in started.rows()), "a zygote")
+            zygote = next(row.pid for row in started.rows() if row.role == "zygote")
+            os.kill(zygote, signal.SIGSTOP)
+            until(lambda: state_of(zygote) == "T", "it to stop")  # noqa: B023
+            if "launch" in str(started.status()["busy"]):
+                yield started, zygote
+                return
+    pytest.fail("no launch was caught under way")
+
+
 def test_what_is_asked_while_a_run_starts_is_done_when_it_has(home: Home) -> None:
-    with Started(home, LoadRun(ENDLESS, 200.0)) as started:
-        until(lambda: rundir.live() and any(row.role == "zygote" for row in started.rows()), "a zygote")
-        zygote = next(row.pid for row in started.rows() if row.role == "zygote")
-        os.kill(zygote, signal.SIGSTOP)
+    with held_in_its_launch(home) as (started, zygote):
+        given_up = ask.send(started.private, ask.Inject(parse("crash primary")))
+        started.status()
+        given_up.close()
         asked = ask.send(started.private, ask.Inject(parse("bitflip result bit 8")))
-        assert "launch" in str(started.status()["busy"])
+        started.status()
         os.kill(zygote, signal.SIGCONT)
         ask.receive(asked)
         started.wait_for("fault", "activated")
         ask.ask(started.private, ask.Stop())
         outcome = started.finish()
-    assert [fault["receipt"] for fault in outcome.verdict.faults] == ["activated"]
+    ((fault, receipt),) = [(fault["fault"], fault["receipt"]) for fault in outcome.verdict.faults]
+    assert fault.startswith("bitflip") and receipt == "activated", "who has given up is not obeyed"
 
 
 def test_after_a_while_the_next_execution_is_hit(home: Home) -> None:

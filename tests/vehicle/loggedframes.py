@@ -5,16 +5,13 @@ from typing import Final
 from hypothesis import strategies as st
 
 from aftbed.vehicle.frame import CAN_ID_MAX
-from aftbed.vehicle.logs.frames import EXTENDED_ID_MAX, Kind, LoggedFrame
+from aftbed.vehicle.logs.frames import EXTENDED_ID_MAX, TIME_US_MAX, Kind, LoggedFrame
 
-# python-can has seconds as floats. A time is rounded four times on its way through a BLF: until 2038 by less
-# than half a microsecond in all; later, if the log spans decades, by more.
-EXACT_US_MAX: Final = 2**31 * 1_000_000 - 1
 NOW_US: Final = 1_790_000_000_000_000
 TIMES_US: Final = st.one_of(
     st.integers(0, 60_000_000),  # since the start of a log
     st.integers(NOW_US, NOW_US + 3_600_000_000),
-    st.integers(0, EXACT_US_MAX),
+    st.integers(0, TIME_US_MAX),
 )
 INTERFACES: Final = st.sampled_from(("can0", "can1", "can7"))
 

@@ -8,7 +8,7 @@ from typing import Final
 
 import msgspec
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, assume, given, settings
 from loggedframes import LOGS, NOW_US
 
 from aftbed.core.errors import ConfigError, PeerError
@@ -21,6 +21,9 @@ from aftbed.vehicle.logs.frames import Kind, Log, LoggedFrame, numbers
 REAL_LOG: Final = Path(__file__).resolve().parents[3] / "shared" / "data" / "rav4_following_50kmh.log"
 KEPT_IN_FIXTURE: Final = (HealthCheck.function_scoped_fixture, HealthCheck.too_slow)
 FORMATS: Final = ("candump", "asc", "blf", "trc", "mf4")
+# python-can has seconds as floats. A time is rounded four times on its way through a BLF: until 2038 by less
+# than half a microsecond in all; later, if the log spans decades, by more.
+BLF_EXACT_US_MAX: Final = 2**31 * 1_000_000 - 1
 Frames = tuple[LoggedFrame, ...]
 
 
@@ -59,13 +62,14 @@ COMES_BACK: Final[dict[str, Callable[[Frames], Frames]]] = {
 @settings(max_examples=40, suppress_health_check=KEPT_IN_FIXTURE, deadline=None)
 @given(frames=LOGS)
 def test_every_frame_comes_back_to_the_microsecond(name: str, frames: Frames, tmp_path: Path) -> None:
+    assume(name != "blf" or max(frame.t_us for frame in frames) <= BLF_EXACT_US_MAX)
     comes_back(name, frames, tmp_path)
 
 
-@settings(max_examples=8, suppress_health_check=KEPT_IN_FIXTURE, deadline=None)
+@pytest.mark.process  # each is read by one of its own
+@settings(max_examples=40, suppress_health_check=KEPT_IN_FIXTURE, deadline=None)
 @given(frames=LOGS)
-def test_every_frame_of_an_mf4_too(frames: Frames, tmp_path: Path) -> None:
-    """Fewer: each is read by a process of its own."""
+def test_every_frame_of_an_mf4_comes_back_too(frames: Frames, tmp_path: Path) -> None:
     comes_back("mf4", frames, tmp_path)
 
 

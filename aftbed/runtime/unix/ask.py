@@ -107,7 +107,7 @@ def receive(line: Waiting, seconds: float = ANSWER_SECONDS_MAX) -> dict[str, obj
     finally:
         line.close()
     if got is None:
-        raise HarnessError("the run closed the connection (another user's run?)")
+        raise HarnessError("the run closed the connection: it has ended, or is another user's")
     answer, _ = got
     if answer.error:
         raise ConfigError(answer.error)

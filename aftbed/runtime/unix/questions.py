@@ -9,6 +9,7 @@ import os
 import socket
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -29,8 +30,6 @@ from aftbed.runtime.unix.work import Work
 BESIDE: Final = ("zygote", "spare", "service", "staged")
 QUESTIONS_MAX: Final = 16  # connections at once, and questions that wait for the launch
 
-Answering = Callable[[ask.Answer], None]
-
 
 class Questions:
     """The control socket of the run."""
@@ -50,13 +49,14 @@ class Questions:
         self._adaptations = adaptations
         self._started_ns = time.monotonic_ns()
         self._lines: dict[int, Line[ask.Question]] = {}
-        self._early: list[tuple[ask.Question, Answering]] | None = []  # what waits for the launch
+        self._early: list[tuple[Line[ask.Question], ask.Question]] | None = []  # what waits for the launch
 
     def launched(self) -> None:
         """The graph is whole, and the function works: from here on it can be disturbed and changed."""
         early, self._early = self._early, None
-        for question, answer in early or ():
-            self._reply(question, answer)
+        for line, question in early or ():
+            if self._lines.get(line.fileno()) is line:  # who waits no longer was told that it failed
+                self._reply(line, question)
 
     def listen(self) -> None:
         """Open the socket; from here on the run is found by other commands."""
@@ -87,7 +87,7 @@ class Questions:
         if got is not None:
             for fd in got[1]:  # nobody asked for descriptors
                 os.close(fd)
-            self._reply(got[0], lambda answer: self._send_answer(line, answer))
+            self._reply(line, got[0])
             return
         self._loop.forget(line.fileno())
         self._lines.pop(line.fileno(), None)
@@ -99,13 +99,14 @@ class Questions:
         except OSError:
             return
 
-    def _reply(self, question: ask.Question, answer: Answering) -> None:
+    def _reply(self, line: Line[ask.Question], question: ask.Question) -> None:
+        answer = partial(self._send_answer, line)
         try:
             match question:
                 case ask.Inject() | ask.Adapt() if self._early is not None:
                     if len(self._early) >= QUESTIONS_MAX:
                         raise ConfigError("the run has not started yet: ask again when it has")
-                    self._early.append((question, answer))
+                    self._early.append((line, question))
                 case ask.Status():
                     answer(ask.Answer(json.dumps(self.status()).encode()))
                 case ask.Processes():
