@@ -77,7 +77,7 @@ def lies_in(module: str, places: tuple[str, ...]) -> bool:
 
 
 def part(module: str) -> str:
-    """The package of `module`: `aftbed.core.wire` is in `core`."""
+    """The package of `module`: `aftbed.core.messages` is in `core`."""
     return module.split(".")[1]
 
 
@@ -145,25 +145,25 @@ def test_every_row_that_exists_is_looked_at() -> None:
 @pytest.mark.parametrize(
     ("module", "source", "reason"),
     [
-        ("aftbed.core.wire", "import aftbed.ftm.proxy", "a lower row imports an upper one"),
-        ("aftbed.core.wire", "from aftbed import ftm", "a lower row imports an upper one"),
-        ("aftbed.ftm.proxy", "from aftbed.runtime.unix import node", "a lower row imports an upper one"),
+        ("aftbed.core.messages", "import aftbed.ftm.client", "a lower row imports an upper one"),
+        ("aftbed.core.messages", "from aftbed import ftm", "a lower row imports an upper one"),
+        ("aftbed.ftm.client", "from aftbed.runtime.unix import node", "a lower row imports an upper one"),
         ("aftbed.runtime.unix.node", "from aftbed.inject.words import parse", "a lower row imports"),
         ("aftbed.inject.words", "from aftbed.campaign import record", "a lower row imports an upper one"),
-        ("aftbed.ftm.proxy", "from aftbed.vehicle.frame import Frame", "ftm and vehicle are strangers"),
+        ("aftbed.ftm.client", "from aftbed.vehicle.frame import Frame", "ftm and vehicle are strangers"),
         ("aftbed.vehicle.car", "import aftbed.ftm", "vehicle and ftm are strangers"),
         ("aftbed.inject.words", "from aftbed.vehicle import bus", "inject and vehicle are strangers"),
-        ("aftbed.ftm.proxy", "def f():\n    from aftbed.vehicle import bus", ":2 imports aftbed.vehicle"),
-        ("aftbed.core.wire", "import time", "only aftbed.runtime.unix"),
-        ("aftbed.ftm.proxy", "def f():\n    from os import fork", ":2 imports os"),
-        ("aftbed.ftm.proxy", "if True:\n    import socket as s", ":2 imports socket"),
-        ("aftbed.ftm.proxy", "from random import Random", "imports random"),
+        ("aftbed.ftm.client", "def f():\n    from aftbed.vehicle import bus", ":2 imports aftbed.vehicle"),
+        ("aftbed.core.messages", "import time", "only aftbed.runtime.unix"),
+        ("aftbed.ftm.client", "def f():\n    from os import fork", ":2 imports os"),
+        ("aftbed.ftm.client", "if True:\n    import socket as s", ":2 imports socket"),
+        ("aftbed.ftm.client", "from random import Random", "imports random"),
         ("aftbed.runtime.sim.world", "import random", "chance is only to be had by"),
         ("aftbed.runtime.sim.world", "from random import random", "chance is only to be had by"),
         ("aftbed.runtime.targets", "from pathlib import Path", "imports pathlib"),
         ("aftbed.runtime.targets", "from aftbed.runtime import unix", "what is pure imports what is not"),
-        ("aftbed.ftm.proxy", "def f():\n    open('x')", "calls open"),
-        ("aftbed.attic.old", "import aftbed.core.wire", "attic is no row"),
+        ("aftbed.ftm.client", "def f():\n    open('x')", "calls open"),
+        ("aftbed.attic.old", "import aftbed.core.messages", "attic is no row"),
         ("aftbed", "from aftbed.core import wire", "it may not"),
         ("aftbed.__main__", "from aftbed.core import wire", "it may not"),
     ],
@@ -180,7 +180,7 @@ def test_a_planted_breach_is_found(module: str, source: str, reason: str) -> Non
         ("aftbed.bench.runs", "from aftbed.campaign.record import read_record"),
         ("aftbed.runtime.unix.node", "import socket\nfrom aftbed.vehicle.function import AebFunction"),
         ("aftbed.runtime.sim.world", "from random import Random"),
-        ("aftbed.ftm.proxy", "import msgspec\nfrom collections.abc import Callable"),
+        ("aftbed.ftm.client", "import msgspec\nfrom collections.abc import Callable"),
         ("aftbed.__main__", "from aftbed.cli import main"),
         ("aftbed.runtime.unix.launch", "from aftbed import __version__"),
     ],

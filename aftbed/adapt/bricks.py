@@ -14,7 +14,7 @@ from aftbed.core.application import Application
 from aftbed.core.brick import Brick
 from aftbed.core.errors import ConfigError
 from aftbed.core.graph import BrickSpec, Kind
-from aftbed.ftm.catalog import KINDS, Setting, make
+from aftbed.ftm.registry import KINDS, Setting, make
 
 APPLICATION_NAMES: Final = ("execute", "capture", "restore", "acceptable", "characteristics")
 BRICK_NAMES: Final = ("step", "open_ports", "quiescent")

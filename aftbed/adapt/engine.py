@@ -23,11 +23,11 @@ from aftbed.adapt.plan import plan, target, updated
 from aftbed.adapt.scriptcheck import refusals
 from aftbed.core.brick import CONTROL, Brick, BrickState, Effect, Note, Order, Send
 from aftbed.core.errors import ConfigError, PeerError
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.core.graph import Graph
-from aftbed.core.message import Adapt, Adapted, AnyMessage, Goal, Progress, Rebound, TakeUp
+from aftbed.core.messages import Adapt, Adapted, AnyMessage, Goal, Progress, Rebound, TakeUp
 from aftbed.core.script import RECIPES, Phase, Script, after, problems
-from aftbed.ftm.catalog import KINDS
+from aftbed.ftm.registry import KINDS
 
 WINDOW_NS: Final = 100_000_000
 DONE: Final = "done"
@@ -36,7 +36,7 @@ ROLLED_BACK: Final = "rolled back"
 FAILED: Final = "failed"
 
 
-class State(BrickState):
+class EngineState(BrickState):
     IDLE = auto()
     PREPARING = auto()
     COMMITTING = auto()
@@ -46,10 +46,10 @@ class State(BrickState):
 
 
 _BY_PHASE: Final = {
-    Phase.PREPARE: State.PREPARING,
-    Phase.COMMIT: State.COMMITTING,
-    Phase.FINISH: State.FINISHING,
-    Phase.UNDO: State.UNDOING,
+    Phase.PREPARE: EngineState.PREPARING,
+    Phase.COMMIT: EngineState.COMMITTING,
+    Phase.FINISH: EngineState.FINISHING,
+    Phase.UNDO: EngineState.UNDOING,
 }
 
 
@@ -73,7 +73,7 @@ class AdaptationEngine(Brick):
     """`number` and `script` are those of the adaptation under way."""
 
     def __init__(self) -> None:
-        self.state = State.IDLE
+        self.state = EngineState.IDLE
         self.number = 0
         self.script: Script | None = None
         self.reason = ""  # of what is being undone
@@ -86,16 +86,16 @@ class AdaptationEngine(Brick):
 
     def quiescent(self) -> bool:
         """Nothing under way."""
-        return self.state is State.IDLE
+        return self.state is EngineState.IDLE
 
     def step(self, port: str, msg: AnyMessage, now_ns: int) -> list[Effect]:
         """Begin, go on, or take up what another has begun."""
         match msg:
-            case Adapt() if self.state is State.IDLE:
+            case Adapt() if self.state is EngineState.IDLE:
                 return self._begin(msg)
             case Progress() if msg.number == self.number and self._waits_for(msg.phase):
                 return self._went(msg.phase, msg.failure, now_ns)
-            case TakeUp() if self.state is State.IDLE:
+            case TakeUp() if self.state is EngineState.IDLE:
                 self.number, self.script, self.state = msg.number, msg.script, _BY_PHASE[msg.phase]
                 self.outcome = REFUSED if msg.phase is Phase.PREPARE else ROLLED_BACK
                 return self._went(msg.phase, msg.failure, now_ns) if msg.ended else []
@@ -105,7 +105,7 @@ class AdaptationEngine(Brick):
                 raise PeerError(f"{type(msg).__name__} on {port} while {self.state.name}")
 
     def _waits_for(self, phase: Phase) -> bool:
-        if self.state in (State.OBSERVING, State.FINISHING) and phase is Phase.COMMIT:
+        if self.state in (EngineState.OBSERVING, EngineState.FINISHING) and phase is Phase.COMMIT:
             return True  # what is new may still fail
         return _BY_PHASE.get(phase) is self.state
 
@@ -135,7 +135,7 @@ class AdaptationEngine(Brick):
             case Phase.PREPARE:
                 return self._order(Phase.COMMIT)
             case Phase.COMMIT:
-                self.state, self._until_ns = State.OBSERVING, now_ns + WINDOW_NS
+                self.state, self._until_ns = EngineState.OBSERVING, now_ns + WINDOW_NS
                 return [Note(Event.ADAPT_COMMIT, detail=self.number)]
             case Phase.FINISH:
                 return self._end(DONE, failure)
@@ -143,7 +143,7 @@ class AdaptationEngine(Brick):
                 return self._end(self.outcome, "; ".join(r for r in (self.reason, failure) if r))
 
     def _end(self, outcome: str, reason: str) -> list[Effect]:
-        self.state, self.script = State.IDLE, None
+        self.state, self.script = EngineState.IDLE, None
         return [Send(CONTROL, Adapted(self.number, outcome, reason))]
 
     def deadline_ns(self) -> int | None:

@@ -19,7 +19,7 @@ from typing import Final, Protocol
 import msgspec
 
 from aftbed.adapt.policy import Beyond, Burst, Condition, Policy, Quiet, Resource, Rule, Symptom, conflict
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 
 VOTE_MASKED: Final = 3  # detail of `vote.compared`: it took a third trial, so one of them was wrong
 

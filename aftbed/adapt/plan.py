@@ -46,7 +46,7 @@ from aftbed.core.script import (
     Transfer,
     Unbind,
 )
-from aftbed.ftm.mechanism import NONE, STATEFUL, build, chain, parse, replication_of
+from aftbed.ftm.compose import NONE, STATEFUL, build, chain, parse, replication_of
 
 JUDGES: Final = ("assert.after",)  # kinds that ask the function whether a reply can be right
 APPLICATION: Final = "app"  # what `adapt update` calls the protected function

@@ -30,7 +30,7 @@ import msgspec
 from msgspec import Meta
 
 from aftbed.core.errors import ConfigError, unknown
-from aftbed.ftm.mechanism import DUPLEX, EXPRESSIONS, MECHANISMS, NONE, SIMPLEX, parse
+from aftbed.ftm.compose import DUPLEX, EXPRESSIONS, MECHANISMS, NONE, SIMPLEX, parse
 
 # What is observed of a run; `observer.symptoms` says by which events.
 Symptom = Literal["crash", "hang", "value_fault", "divergence", "detected_stop"]

@@ -9,7 +9,7 @@ from aftbed.adapt.plan import plan, target, updated
 from aftbed.adapt.words import Wish
 from aftbed.core.errors import ConfigError
 from aftbed.core.graph import Graph
-from aftbed.core.message import Goal, Scheduled
+from aftbed.core.messages import Goal, Scheduled
 
 Resolve = Callable[[str], str]
 Judge = Callable[[Graph, Wish], None]

@@ -47,8 +47,8 @@ from aftbed.core.script import (
     names,
     problems,
 )
-from aftbed.ftm.catalog import KINDS
-from aftbed.ftm.mechanism import EXPRESSIONS, NONE, REPLICAS, STATEFUL, build, replication_of
+from aftbed.ftm.compose import EXPRESSIONS, NONE, REPLICAS, STATEFUL, build, replication_of
+from aftbed.ftm.registry import KINDS
 
 REQUEST_PORTS: Final = ("pxy2pro", "pro2bfr", "bfr2prd", "prd2srv")  # the way of a request, as outputs
 _OF_NODES: Final = (Migrate, Exchange, Retire, Destroy)

@@ -56,8 +56,8 @@ from aftbed.core.script import (
     Transfer,
     Unbind,
 )
-from aftbed.ftm.catalog import KINDS
-from aftbed.ftm.mechanism import parse
+from aftbed.ftm.compose import parse
+from aftbed.ftm.registry import KINDS
 
 ARROW: Final = "->"
 PORTS: Final = tuple(dict.fromkeys(p for kind in KINDS.values() for p in (*kind.inputs, *kind.outputs)))

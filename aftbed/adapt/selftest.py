@@ -15,8 +15,8 @@ import msgspec
 from aftbed.core.brick import CONTROL, Brick, Halt, Send
 from aftbed.core.errors import ConfigError
 from aftbed.core.graph import BrickSpec, Graph
-from aftbed.core.message import AnyMessage, Message, Rebound, Reply, Request
-from aftbed.ftm.mechanism import chain
+from aftbed.core.messages import AnyMessage, Message, Rebound, Reply, Request
+from aftbed.ftm.compose import chain
 
 STEPS_MAX: Final = 500  # for one request; the longest mechanism takes 40
 EPOCH: Final = 1

@@ -22,10 +22,10 @@ from typing import Final
 import msgspec
 
 from aftbed.core.errors import ConfigError, unknown
-from aftbed.core.message import Goal
+from aftbed.core.messages import Goal
 from aftbed.core.script import RECIPES
 from aftbed.core.words import milliseconds
-from aftbed.ftm.mechanism import DUPLEX, SIMPLEX, parse
+from aftbed.ftm.compose import DUPLEX, SIMPLEX, parse
 
 VERBS: Final = ("to", "switch", "compose", "decompose", "update")
 GRAMMAR: Final = (

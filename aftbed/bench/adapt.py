@@ -20,7 +20,7 @@ from aftbed.campaign.record import RunRecord
 from aftbed.core import check
 from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.core.journal import EntryKind
-from aftbed.core.message import Goal
+from aftbed.core.messages import Goal
 from aftbed.core.script import RECIPES
 from aftbed.runtime.unix import ask
 from aftbed.runtime.unix.options import LoadRun

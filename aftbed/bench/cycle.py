@@ -8,7 +8,7 @@ from aftbed.bench.ring import ring_us
 from aftbed.bench.runs import cycles_us, finish, start
 from aftbed.bench.statistics import quantile, summary
 from aftbed.core.graph import Graph
-from aftbed.ftm.mechanism import NONE, build, chain
+from aftbed.ftm.compose import NONE, build, chain
 from aftbed.runtime.unix.options import LoadRun
 from aftbed.vehicle.function import sample_requests
 

@@ -39,9 +39,9 @@ from aftbed.bench.cycle import WARM_UP, path
 from aftbed.bench.runs import finish, start
 from aftbed.campaign.record import RunRecord
 from aftbed.core.errors import HarnessError
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.core.graph import Graph
-from aftbed.ftm.mechanism import build
+from aftbed.ftm.compose import build
 from aftbed.runtime.unix.options import LoadRun
 
 PLACEMENT: Final = "process"

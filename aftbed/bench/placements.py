@@ -19,8 +19,8 @@ from aftbed.bench.statistics import quantile, summary
 from aftbed.bench.usage import Usage, usage
 from aftbed.campaign.record import RunRecord
 from aftbed.core.errors import HarnessError
-from aftbed.core.event import Event
-from aftbed.ftm.mechanism import build
+from aftbed.core.events import Event
+from aftbed.ftm.compose import build
 from aftbed.runtime.unix import ask
 from aftbed.runtime.unix.options import LoadRun
 

@@ -9,7 +9,7 @@ import socket
 import time
 from typing import Final
 
-from aftbed.core.wire import PACKET_BYTES_MAX
+from aftbed.core.messages import PACKET_BYTES_MAX
 from aftbed.runtime.unix import linux
 
 WARM_UP: Final = 200

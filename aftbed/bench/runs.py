@@ -2,7 +2,7 @@
 
 from aftbed.campaign.record import RunRecord, read_record
 from aftbed.core.errors import HarnessError
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.core.fault import Fault
 from aftbed.runtime.unix.launch import Launched, launch, options_for
 from aftbed.runtime.unix.options import LoadRun

@@ -25,8 +25,7 @@ from aftbed.bench.adapt import REQUESTS_ENDLESS, adapted, ready
 from aftbed.bench.placements import ENDS, Times, latencies_us, ring_p50_us, times
 from aftbed.bench.runs import finish, start
 from aftbed.core.errors import ConfigError, HarnessError
-from aftbed.core.message import Goal
-from aftbed.core.wire import PACKET_BYTES_MAX
+from aftbed.core.messages import PACKET_BYTES_MAX, Goal
 from aftbed.runtime.unix.options import LoadRun
 
 PLACEMENT: Final = "process"

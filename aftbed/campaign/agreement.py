@@ -19,7 +19,7 @@ from aftbed.campaign.simulated import class_of
 from aftbed.campaign.succession import bare_server
 from aftbed.core import check
 from aftbed.core.errors import ConfigError
-from aftbed.core.message import Scheduled
+from aftbed.core.messages import Scheduled
 from aftbed.runtime.sim.world import Setup, simulate
 from aftbed.runtime.unix.options import CarRun, LoadRun
 from aftbed.vehicle.function import default_application

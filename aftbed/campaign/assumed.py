@@ -1,6 +1,6 @@
 """The FT/A/R table, measured: what each mechanism assumes, and what comes of it where that does not hold.
 
-The paper's Fig. 1 says which mechanism suits which faults (FT) and which function (A). `adapt.consistency`
+The paper's Fig. 1 says which mechanism suits which faults (FT) and which function (A). `adapt.suitability`
 has that as a table; here is what was measured. For each stratum of a campaign over mechanisms, variants of
 the function and faults: what the table says of it, and the share of experiments in which the client got wrong
 replies or none, or the replicas came apart, with its interval. Where the table is right, it says "holds" if
@@ -15,8 +15,8 @@ from typing import Final
 import msgspec
 
 from aftbed.adapt.bricks import load_application
-from aftbed.adapt.consistency import AMPLE, FaultModel, problems
 from aftbed.adapt.plan import APPLICATION
+from aftbed.adapt.suitability import AMPLE, FaultModel, problems
 from aftbed.adapt.words import read
 from aftbed.campaign.experiment import FAILED, UNKNOWN, Result
 from aftbed.campaign.ledger import Ledger

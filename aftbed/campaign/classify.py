@@ -17,9 +17,9 @@ from aftbed.core import check
 from aftbed.core.application import Application
 from aftbed.core.check import History, Requests
 from aftbed.core.errors import PeerError
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.core.journal import EntryKind
-from aftbed.ftm.mechanism import replication_of
+from aftbed.ftm.compose import replication_of
 from aftbed.runtime.hosting import Hosted, digest
 
 ACTED: Final = (Event.RECOVERY_ENTER, Event.ADAPT_ROLLBACK)

@@ -15,11 +15,11 @@ from msgspec.structs import replace
 
 from aftbed.campaign.simulated import breaches
 from aftbed.core.errors import HarnessError
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.core.fault import FIRED, Crash, Fault, Trigger
 from aftbed.core.journal import Entry, EntryKind
-from aftbed.ftm.catalog import EMITTERS
-from aftbed.ftm.mechanism import build
+from aftbed.ftm.compose import build
+from aftbed.ftm.registry import EMITTERS
 from aftbed.runtime.sim.world import Run, Setup, World, simulate
 from aftbed.runtime.targets import emitter
 from aftbed.vehicle.aebmessages import STAGE_NONE, decode_reply, decode_request

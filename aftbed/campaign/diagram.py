@@ -13,10 +13,10 @@ from collections.abc import Iterable, Sequence
 from typing import Final, NamedTuple, assert_never
 
 from aftbed.campaign.simulated import Breach
-from aftbed.core.event import REQUEST_PATH, Event
+from aftbed.core.events import REQUEST_PATH, Event
 from aftbed.core.fault import Fault, marked
 from aftbed.core.journal import Entry, Record
-from aftbed.ftm.mechanism import build
+from aftbed.ftm.compose import build
 from aftbed.runtime.sim.tracing import STRUCK, Happening, Sent, Told, Trace, brief, digest, milliseconds
 
 LAST: Final = 40  # lines of a listing; arrows and notes of a diagram

@@ -27,9 +27,9 @@ from aftbed.core import check
 from aftbed.core.application import Application
 from aftbed.core.check import History
 from aftbed.core.fault import FIRED, Fault
-from aftbed.core.message import Scheduled
+from aftbed.core.messages import Scheduled
 from aftbed.core.script import RECIPES
-from aftbed.ftm.mechanism import build
+from aftbed.ftm.compose import build
 from aftbed.runtime.hosting import Hosted
 from aftbed.runtime.sim.world import Setup, simulate
 from aftbed.runtime.unix import linux, spawn

@@ -18,13 +18,13 @@ from aftbed.adapt.plan import plan, target
 from aftbed.campaign.simulated import ASSERT, Breach, breaches
 from aftbed.campaign.workers import Alone, each
 from aftbed.core.errors import ConfigError, unknown
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.core.fault import FIRED, Action, Crash, Fault, Hang, Trigger
 from aftbed.core.journal import EntryKind
-from aftbed.core.message import Goal, Scheduled
+from aftbed.core.messages import Goal, Scheduled
 from aftbed.core.script import Stage, flat
 from aftbed.core.valuefault import EXECUTED, Bit, Flip, Place
-from aftbed.ftm.mechanism import build
+from aftbed.ftm.compose import build
 from aftbed.runtime.sim.world import Doom, Run, Setup, simulate
 from aftbed.runtime.targets import STAGED
 from aftbed.vehicle.scenario import broken_expectations, load_scenario

@@ -24,7 +24,7 @@ from aftbed.campaign.spec import ANY, AdaptationEntry, FaultEntry, Spec, System,
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.fault import Fault, FlipMemory
 from aftbed.core.graph import Graph
-from aftbed.ftm.mechanism import build
+from aftbed.ftm.compose import build
 from aftbed.inject.parts import refuse_unsafe
 from aftbed.inject.words import parse
 from aftbed.runtime import targets

@@ -29,9 +29,9 @@ from msgspec.structs import replace
 from aftbed.campaign.simulated import Breach
 from aftbed.core.errors import ConfigError
 from aftbed.core.fault import Fault, Hang, Slow
-from aftbed.core.message import Scheduled
+from aftbed.core.messages import Scheduled
 from aftbed.core.valuefault import Flip
-from aftbed.ftm.mechanism import build, parse, replication_of
+from aftbed.ftm.compose import build, parse, replication_of
 from aftbed.runtime import targets
 from aftbed.runtime.sim.givens import check
 from aftbed.runtime.sim.world import Doom, Setup

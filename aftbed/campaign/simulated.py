@@ -19,9 +19,9 @@ from aftbed.campaign.wholeness import half_a_graph
 from aftbed.core import check
 from aftbed.core.application import Application
 from aftbed.core.check import History
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.core.valuefault import Flip
-from aftbed.ftm.mechanism import replication_of
+from aftbed.ftm.compose import replication_of
 from aftbed.runtime.rewiring import replica_of
 from aftbed.runtime.sim.world import Run
 from aftbed.vehicle.function import default_application

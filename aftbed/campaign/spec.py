@@ -35,7 +35,7 @@ from aftbed.campaign.experiment import OUTCOMES
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.graph import PLACEMENTS
 from aftbed.core.script import RECIPES
-from aftbed.ftm.mechanism import EXPRESSIONS
+from aftbed.ftm.compose import EXPRESSIONS
 from aftbed.vehicle.scenario import load_scenario
 from aftbed.vehicle.yamlfile import read_yaml
 

@@ -20,7 +20,7 @@ from aftbed.campaign.record import RunRecord
 from aftbed.core.application import Application
 from aftbed.core.check import History
 from aftbed.core.errors import PeerError
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.runtime.rewiring import replica_of
 from aftbed.runtime.unix.part import load_module
 from aftbed.vehicle.function import default_application

@@ -28,13 +28,13 @@ from random import Random
 from typing import Final
 
 from aftbed.core.errors import ConfigError
-from aftbed.core.event import REQUEST_PATH, Event
+from aftbed.core.events import REQUEST_PATH, Event
 from aftbed.core.fault import Crash, Disturb, Fault, Hang, How, Slow, Trigger
 from aftbed.core.graph import PLACEMENTS
-from aftbed.core.message import Goal, Scheduled
+from aftbed.core.messages import Goal, Scheduled
 from aftbed.core.valuefault import EXECUTED, Bit, Flip
-from aftbed.ftm.catalog import EMITTERS
-from aftbed.ftm.mechanism import EXPRESSIONS, NONE, build, parse, replication_of
+from aftbed.ftm.compose import EXPRESSIONS, NONE, build, parse, replication_of
+from aftbed.ftm.registry import EMITTERS
 from aftbed.runtime import targets
 from aftbed.runtime.rewiring import replica_of
 from aftbed.runtime.sim.world import Setup

@@ -5,7 +5,7 @@ that ended before redundancy was back, the backup's bricks are not asked for.
 """
 
 from aftbed.core import check
-from aftbed.ftm.mechanism import build, replication_of
+from aftbed.ftm.compose import build, replication_of
 from aftbed.runtime.hosting import Hosted
 
 

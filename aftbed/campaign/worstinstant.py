@@ -28,7 +28,7 @@ import msgspec
 
 from aftbed.campaign.branching import Branch, branched
 from aftbed.campaign.course import Course, Struck, strike
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.core.fault import Action, Fault, Hang, Slow, Trigger
 from aftbed.vehicle.report import VehicleResult
 

@@ -14,21 +14,21 @@ from typing import Final
 import msgspec
 
 from aftbed.adapt import schedule
-from aftbed.adapt.consistency import remarks, unsuitable
 from aftbed.adapt.engine import script_for
 from aftbed.adapt.plan import APPLICATION, Plan, target
 from aftbed.adapt.plan import plan as planned
 from aftbed.adapt.schedule import goal_of, led_to
 from aftbed.adapt.scriptcheck import refusals
 from aftbed.adapt.scriptfile import ScriptFile, mapping, refuse, script_from
+from aftbed.adapt.suitability import remarks, unsuitable
 from aftbed.adapt.words import Wish
 from aftbed.cli.adaptview import Outcome, history_lines, outcome_lines, plan_lines, yaml_lines
 from aftbed.core.application import Characteristics
 from aftbed.core.errors import ConfigError
 from aftbed.core.graph import PLACEMENTS, BrickSpec, Graph
-from aftbed.core.message import Goal, Scheduled
+from aftbed.core.messages import Goal, Scheduled
 from aftbed.core.script import AnyVerb, Script, Stage, Together
-from aftbed.ftm.mechanism import build
+from aftbed.ftm.compose import build
 from aftbed.runtime.unix import ask, rundir
 
 EXIT_CODES: Final = {"done": 0, "rolled back": 1, "refused": 2}

@@ -43,7 +43,7 @@ def recovery(
     """From SIGKILL of the primary to the next good reply, by its parts."""
     from aftbed.bench.recovery import bench_recovery  # noqa: PLC0415
     from aftbed.core.errors import ConfigError  # noqa: PLC0415
-    from aftbed.ftm.mechanism import DUPLEX, replication_of  # noqa: PLC0415
+    from aftbed.ftm.compose import DUPLEX, replication_of  # noqa: PLC0415
 
     if not replication_of(ftm):
         raise ConfigError(

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 if TYPE_CHECKING:
-    from aftbed.adapt.consistency import Demand, Resources, Table
+    from aftbed.adapt.suitability import Demand, Resources, Table
     from aftbed.core.application import Characteristics
     from aftbed.core.graph import Graph
 
@@ -35,8 +35,8 @@ TableOption = Annotated[
 @ftm.command("list")
 def list_(table: TableOption = None, json: Json = False) -> None:
     """Every FTM expression: what it tolerates and needs, and how many processes it takes."""
-    from aftbed.adapt.consistency import demand  # noqa: PLC0415
-    from aftbed.ftm.mechanism import EXPRESSIONS, build  # noqa: PLC0415
+    from aftbed.adapt.suitability import demand  # noqa: PLC0415
+    from aftbed.ftm.compose import EXPRESSIONS, build  # noqa: PLC0415
 
     rules = _table(table)
     found = [(demand(name, rules), build(name, "process")) for name in EXPRESSIONS]
@@ -59,8 +59,8 @@ def show(
     json: Json = False,
 ) -> None:
     """One FTM expression: what it tolerates and needs, its bricks and its channels."""
-    from aftbed.adapt.consistency import demand  # noqa: PLC0415
-    from aftbed.ftm.mechanism import build  # noqa: PLC0415
+    from aftbed.adapt.suitability import demand  # noqa: PLC0415
+    from aftbed.ftm.compose import build  # noqa: PLC0415
 
     wanted, graph = demand(expr, _table(table)), build(expr, "process")
     if json:
@@ -100,7 +100,7 @@ def check(
 
     Exit code: 0 consistent, 1 not consistent, 2 usage.
     """
-    from aftbed.adapt.consistency import consistent, fault_model, problems, remarks  # noqa: PLC0415
+    from aftbed.adapt.suitability import consistent, fault_model, problems, remarks  # noqa: PLC0415
 
     model, rules = fault_model(faults), _table(table)
     declared, resources = _declared(app), _resources(cpus, cpu_load, bandwidth)
@@ -135,7 +135,7 @@ def _print_verdict(expression: str | None, found: list[str], notes: list[str], o
 def _table(path: str | None) -> "Table":
     from pathlib import Path  # noqa: PLC0415
 
-    from aftbed.adapt.consistency import TABLE, TableFile, table_from  # noqa: PLC0415
+    from aftbed.adapt.suitability import TABLE, TableFile, table_from  # noqa: PLC0415
 
     if path is None:
         return TABLE
@@ -163,7 +163,7 @@ def _declared(app: str | None) -> "Characteristics":
 
 def _resources(cpus: int | None, cpu_load: float | None, bandwidth: float | None) -> "Resources":
     """What was given, and what is measured for the rest."""
-    from aftbed.adapt.consistency import Resources  # noqa: PLC0415
+    from aftbed.adapt.suitability import Resources  # noqa: PLC0415
     from aftbed.core.errors import ConfigError  # noqa: PLC0415
 
     if cpus is not None and not 1 <= cpus <= CPUS_MAX:

@@ -7,7 +7,7 @@ import msgspec
 
 from aftbed.core.errors import unknown
 from aftbed.core.graph import Graph
-from aftbed.ftm.mechanism import build
+from aftbed.ftm.compose import build
 from aftbed.runtime.unix import ask, rundir
 from aftbed.runtime.unix.resources import measured
 

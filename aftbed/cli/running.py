@@ -14,9 +14,9 @@ from aftbed.cli.view import View, open_view
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.fault import Fault, FlipMemory
 from aftbed.core.graph import Graph
-from aftbed.core.message import Scheduled
+from aftbed.core.messages import Scheduled
 from aftbed.core.script import RECIPES
-from aftbed.ftm.mechanism import build
+from aftbed.ftm.compose import build
 from aftbed.inject.parts import refuse_unsafe
 from aftbed.inject.words import parse
 from aftbed.runtime import targets

@@ -13,7 +13,7 @@ from aftbed.core.errors import ConfigError
 from aftbed.core.fault import Crash, Fault, Hang, Slow, Trigger
 from aftbed.core.graph import Graph
 from aftbed.core.words import milliseconds, whole_milliseconds
-from aftbed.ftm.mechanism import build
+from aftbed.ftm.compose import build
 from aftbed.inject.words import parse
 from aftbed.runtime import targets
 from aftbed.vehicle.scenario import load_scenario

@@ -17,9 +17,9 @@ from aftbed.cli.running import RATE_HZ_MAX, SEED_MAX
 from aftbed.cli.simview import read_fault
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.graph import Graph
-from aftbed.core.message import Goal, Scheduled
+from aftbed.core.messages import Goal, Scheduled
 from aftbed.core.script import RECIPES
-from aftbed.ftm.mechanism import build
+from aftbed.ftm.compose import build
 from aftbed.runtime.sim.givens import check
 from aftbed.runtime.sim.world import Setup
 from aftbed.vehicle.scenario import load_scenario

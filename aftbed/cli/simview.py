@@ -12,7 +12,7 @@ from aftbed.cli.adaptview import Outcome, history_lines
 from aftbed.core.errors import ConfigError
 from aftbed.core.fault import Fault
 from aftbed.core.graph import Graph
-from aftbed.core.message import Scheduled
+from aftbed.core.messages import Scheduled
 from aftbed.core.script import RECIPES
 from aftbed.inject.words import parse
 from aftbed.runtime import targets

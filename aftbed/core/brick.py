@@ -15,8 +15,8 @@ from typing import Final, Protocol
 import msgspec
 
 from aftbed.core.errors import PeerError
-from aftbed.core.event import Event
-from aftbed.core.message import AnyMessage, Message, Rebound
+from aftbed.core.events import Event
+from aftbed.core.messages import AnyMessage, Message, Rebound
 from aftbed.core.script import Phase, Script
 
 CONTROL: Final = "control"  # the port on which the runtime speaks to a brick

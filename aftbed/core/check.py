@@ -13,7 +13,7 @@ import msgspec
 
 from aftbed.core.application import Application
 from aftbed.core.errors import PeerError
-from aftbed.core.event import RERUN, Event
+from aftbed.core.events import RERUN, Event
 from aftbed.core.graph import Graph
 from aftbed.core.journal import Entry, EntryKind, Record
 

@@ -18,7 +18,7 @@ from typing import Final
 import msgspec
 
 from aftbed.core.errors import PeerError
-from aftbed.core.event import BY_CODE, Event
+from aftbed.core.events import BY_CODE, Event
 
 MAGIC: Final = b"AFTBEDJ1"
 HEADER_BYTES: Final = 4096

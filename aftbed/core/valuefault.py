@@ -14,7 +14,7 @@ from typing import Final, assert_never
 
 import msgspec
 
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 
 BIT_MAX: Final = 2**32 - 1  # the largest state has 2**29 bits
 BITS_MAX: Final = 64  # at a time: each has its record

@@ -14,8 +14,8 @@ from typing import Final
 
 from aftbed.core.brick import Brick, BrickState, Effect, Halt, Note, Send, no_move
 from aftbed.core.errors import PeerError
-from aftbed.core.event import Event
-from aftbed.core.message import AnyMessage, Rebound, Reply, Request, TakeOver
+from aftbed.core.events import Event
+from aftbed.core.messages import AnyMessage, Rebound, Reply, Request, TakeOver
 
 _BEFORE_OPEN: Final = ("pro2bfr",)
 _EXIT: Final = Event.BEFORE_EXIT  # bound once: a look-up in an enumeration is slow on the hot path
@@ -45,24 +45,24 @@ class AssertBefore(Brick):
         raise PeerError(f"{type(msg).__name__} on {port}")
 
 
-class State(BrickState):
+class AssertAfterState(BrickState):
     IDLE = auto()  # no reply held
     HOLDING = auto()  # a reply held, its request is in the channel from Before
 
 
 MOVES: Final = {
-    (State.IDLE, Reply): State.HOLDING,
-    (State.IDLE, TakeOver): State.IDLE,
-    (State.HOLDING, Request): State.IDLE,
+    (AssertAfterState.IDLE, Reply): AssertAfterState.HOLDING,
+    (AssertAfterState.IDLE, TakeOver): AssertAfterState.IDLE,
+    (AssertAfterState.HOLDING, Request): AssertAfterState.IDLE,
 }
-OPEN: Final = {State.IDLE: ("prd2aft",), State.HOLDING: ("bfr2aft",)}
+OPEN: Final = {AssertAfterState.IDLE: ("prd2aft",), AssertAfterState.HOLDING: ("bfr2aft",)}
 
 
 class AssertAfter(Brick):
     """`acceptable` is the function's own check."""
 
     def __init__(self, acceptable: Acceptable) -> None:
-        self.state = State.IDLE
+        self.state = AssertAfterState.IDLE
         self._acceptable = acceptable
         self._held: Reply | None = None
 
@@ -72,7 +72,7 @@ class AssertAfter(Brick):
 
     def quiescent(self) -> bool:
         """No reply held."""
-        return self.state is State.IDLE
+        return self.state is AssertAfterState.IDLE
 
     def step(self, port: str, msg: AnyMessage, now_ns: int) -> list[Effect]:
         """Handle one message; see MOVES."""

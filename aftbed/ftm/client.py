@@ -4,14 +4,15 @@ Paper, III-A: the client sends requests to the Proxy and knows nothing of replic
 requests (the gateway of the car, or a load) hands them in on `submit` and takes replies from `deliver`.
 """
 
+from enum import auto
 from typing import Final
 
 import msgspec
 
-from aftbed.core.brick import Brick, Effect, Note, Send
+from aftbed.core.brick import Brick, BrickState, Effect, Note, Send
 from aftbed.core.errors import PeerError
-from aftbed.core.event import Event
-from aftbed.core.message import AnyMessage, Rebound, Reply, Request, Submit
+from aftbed.core.events import Event
+from aftbed.core.messages import AnyMessage, Rebound, Reply, Request, Submit
 
 BACKLOG_MAX: Final = 64  # unanswered requests; beyond it the port `submit` is closed
 _WAITING: Final = ("submit", "pxy2clt")
@@ -65,3 +66,84 @@ class Client(Brick):
         except msgspec.DecodeError as error:
             raise PeerError(f"not a state of a Client: {error}") from error
         self.next_id, self.unanswered = next_id, {r.request_id: r for r in waiting}
+
+
+# -- Proxy: the client's only way in; it knows who leads, and asks the new leader what is unanswered.
+#
+# Paper, III-A. One request at a time is under way; the others wait in the client's channel, which costs
+# nothing, since a Protocol admits one at a time too. One master (G6) is enforced here: a reply under
+# another epoch than the one to which the Proxy is bound is refused, whoever sent it.
+
+
+class ProxyState(BrickState):
+    UNBOUND = auto()  # nobody leads: requests wait in their channel
+    IDLE = auto()  # bound, nothing under way
+    WAITING = auto()  # a request is under way
+
+
+PROXY_OPEN: Final[dict[ProxyState, tuple[str, ...]]] = {
+    ProxyState.UNBOUND: (),
+    ProxyState.IDLE: ("clt2pxy",),
+    ProxyState.WAITING: ("pro2pxy",),
+}
+
+# Bound once: a look-up in an enumeration is slow on the hot path.
+_IDLE: Final = ProxyState.IDLE
+_ASKING: Final = ProxyState.WAITING
+_ACCEPTED: Final = Event.REPLY_ACCEPTED
+
+
+class Proxy(Brick):
+    """`waiting` is the request under way; it survives a change of leader, under the new epoch."""
+
+    def __init__(self) -> None:
+        self.state = ProxyState.UNBOUND
+        self.epoch = 0
+        self.waiting: Request | None = None
+
+    def open_ports(self) -> tuple[str, ...]:
+        """By state; see OPEN."""
+        return PROXY_OPEN[self.state]
+
+    def quiescent(self) -> bool:
+        """Nothing under way."""
+        return self.waiting is None
+
+    def step(self, port: str, msg: AnyMessage, now_ns: int) -> list[Effect]:
+        """Pass a request on, a reply back, or go over to a new leader."""
+        if isinstance(msg, Request) and self.state is _IDLE:
+            self.state, self.waiting = _ASKING, Request(self.epoch, msg.request_id, msg.payload)
+            return [Send("pxy2pro", self.waiting)]
+        if isinstance(msg, Reply) and self.state is _ASKING:
+            return self._reply(msg)
+        if isinstance(msg, Rebound):
+            return self._rebound(msg)
+        raise PeerError(f"{type(msg).__name__} on {port} while {self.state.name}")
+
+    def _reply(self, reply: Reply) -> list[Effect]:
+        assert self.waiting is not None
+        if reply.epoch != self.epoch:
+            return [Note(Event.REPLY_REFUSED, reply.request_id, reply.epoch)]
+        if reply.request_id != self.waiting.request_id:
+            return []  # asked twice, over a failover or by a resending client: answered once
+        self.state, self.waiting = _IDLE, None
+        return [
+            Note(_ACCEPTED, reply.request_id, reply.epoch << 8 | reply.replica),
+            Send("pxy2clt", reply),
+        ]
+
+    def _rebound(self, msg: Rebound) -> list[Effect]:
+        if msg.port != "pxy2pro":
+            return []
+        if not msg.bound:
+            self.state, self.epoch = ProxyState.UNBOUND, 0
+            return []
+        if msg.epoch < self.epoch:
+            raise PeerError(f"bound under epoch {msg.epoch} after {self.epoch}")
+        self.epoch = msg.epoch
+        if self.waiting is None:
+            self.state = ProxyState.IDLE
+            return []
+        self.state = ProxyState.WAITING
+        self.waiting = Request(msg.epoch, self.waiting.request_id, self.waiting.payload)
+        return [Send("pxy2pro", self.waiting)]

@@ -24,8 +24,8 @@ from typing import Final
 
 from aftbed.core.brick import Brick, BrickState, Effect, Note, Send
 from aftbed.core.errors import PeerError
-from aftbed.core.event import Event
-from aftbed.core.message import (
+from aftbed.core.events import Event
+from aftbed.core.messages import (
     AnyMessage,
     ChannelEnded,
     Notification,
@@ -45,41 +45,41 @@ def digest(payload: bytes) -> bytes:
     return blake2b(payload, digest_size=DIGEST_BYTES).digest()
 
 
-class BeforeState(BrickState):
+class LfrBeforeState(BrickState):
     LEADING = auto()  # requests come from the Protocol
     FOLLOWING = auto()  # requests come from the leader's Before
 
 
-class AfterState(BrickState):
+class LfrAfterState(BrickState):
     LEADING = auto()  # no reply is ever held
     FOLLOWING = auto()  # no reply held
     HOLDING = auto()  # an own reply held, until the leader's is known
 
 
 BEFORE_MOVES: Final = {
-    (BeforeState.LEADING, Request): BeforeState.LEADING,
-    (BeforeState.FOLLOWING, Request): BeforeState.FOLLOWING,
-    (BeforeState.FOLLOWING, ChannelEnded): BeforeState.FOLLOWING,
+    (LfrBeforeState.LEADING, Request): LfrBeforeState.LEADING,
+    (LfrBeforeState.FOLLOWING, Request): LfrBeforeState.FOLLOWING,
+    (LfrBeforeState.FOLLOWING, ChannelEnded): LfrBeforeState.FOLLOWING,
 }
-BEFORE_OPEN: Final = {BeforeState.LEADING: ("pro2bfr",), BeforeState.FOLLOWING: ("bfr2bfr",)}
+BEFORE_OPEN: Final = {LfrBeforeState.LEADING: ("pro2bfr",), LfrBeforeState.FOLLOWING: ("bfr2bfr",)}
 AFTER_MOVES: Final = {
-    (AfterState.LEADING, Reply): AfterState.LEADING,
-    (AfterState.FOLLOWING, Reply): AfterState.HOLDING,  # or stored at once, where the leader is gone
-    (AfterState.FOLLOWING, TakeOver): AfterState.LEADING,
-    (AfterState.HOLDING, Notification): AfterState.FOLLOWING,
-    (AfterState.HOLDING, ChannelEnded): AfterState.FOLLOWING,
+    (LfrAfterState.LEADING, Reply): LfrAfterState.LEADING,
+    (LfrAfterState.FOLLOWING, Reply): LfrAfterState.HOLDING,  # or stored at once, where the leader is gone
+    (LfrAfterState.FOLLOWING, TakeOver): LfrAfterState.LEADING,
+    (LfrAfterState.HOLDING, Notification): LfrAfterState.FOLLOWING,
+    (LfrAfterState.HOLDING, ChannelEnded): LfrAfterState.FOLLOWING,
 }
 AFTER_OPEN: Final = {
-    AfterState.LEADING: ("prd2aft",),
-    AfterState.FOLLOWING: ("prd2aft",),
-    AfterState.HOLDING: ("aft2aft",),
+    LfrAfterState.LEADING: ("prd2aft",),
+    LfrAfterState.FOLLOWING: ("prd2aft",),
+    LfrAfterState.HOLDING: ("aft2aft",),
 }
 
 # Bound once: a look-up in an enumeration is slow on the hot path.
-_BEFORE_LEADS: Final = BeforeState.LEADING
-_AFTER_LEADS: Final = AfterState.LEADING
-_FOLLOWING: Final = AfterState.FOLLOWING
-_HOLDING: Final = AfterState.HOLDING
+_BEFORE_LEADS: Final = LfrBeforeState.LEADING
+_AFTER_LEADS: Final = LfrAfterState.LEADING
+_FOLLOWING: Final = LfrAfterState.FOLLOWING
+_HOLDING: Final = LfrAfterState.HOLDING
 _FORWARDED: Final = Event.FOLLOWER_FORWARDED
 _NOTIFIED: Final = Event.FOLLOWER_NOTIFIED
 _EXIT: Final = Event.BEFORE_EXIT
@@ -89,7 +89,7 @@ class LfrBefore(Brick):
     """`duplex`: there is a follower to forward to."""
 
     def __init__(self, epoch: int, leads: bool) -> None:
-        self.state = BeforeState.LEADING if leads else BeforeState.FOLLOWING
+        self.state = LfrBeforeState.LEADING if leads else LfrBeforeState.FOLLOWING
         self.epoch, self.duplex = epoch, False
         self.promote_epoch = 0  # not 0: lead under it as soon as the channel has ended
         self.ended = False
@@ -149,7 +149,7 @@ class LfrAfter(Brick):
     """`duplex`: there is a follower to notify. `ended`: there is no leader to hear of any more."""
 
     def __init__(self, epoch: int, leads: bool) -> None:
-        self.state = AfterState.LEADING if leads else AfterState.FOLLOWING
+        self.state = LfrAfterState.LEADING if leads else LfrAfterState.FOLLOWING
         self.epoch, self.duplex = epoch, False
         self.ended = False
         self._held: Reply | None = None

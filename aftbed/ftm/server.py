@@ -21,8 +21,8 @@ from typing import Final
 from aftbed.core.application import Application
 from aftbed.core.brick import Brick, BrickState, Effect, Halt, Note, Send
 from aftbed.core.errors import PeerError
-from aftbed.core.event import RERUN, Event
-from aftbed.core.message import (
+from aftbed.core.events import RERUN, Event
+from aftbed.core.messages import (
     AnyMessage,
     CaptureState,
     Rebound,
@@ -36,7 +36,7 @@ from aftbed.core.message import (
 )
 
 
-class State(BrickState):
+class ServerState(BrickState):
     STANDBY = auto()  # a backup's or a leader's: the first request decides
     READY = auto()  # for a request
     TRYING = auto()  # under tr: Before has the state, trials follow, up to a rerun
@@ -44,44 +44,46 @@ class State(BrickState):
 
 
 MOVES: Final = {  # where After does not ask for the state, what leads to EXECUTED leads to READY
-    ("prd2srv", State.STANDBY, Request): State.EXECUTED,
-    ("prd2srv", State.STANDBY, Trial): State.EXECUTED,
-    ("prd2srv", State.READY, Request): State.EXECUTED,
-    ("prd2srv", State.READY, Trial): State.EXECUTED,
-    ("prd2srv", State.EXECUTED, Trial): State.EXECUTED,  # a rerun, before After asks
-    ("aft2srv", State.STANDBY, RestoreState): State.STANDBY,
-    ("aft2srv", State.EXECUTED, CaptureState): State.READY,
-    ("bfr2srv", State.STANDBY, CaptureState): State.TRYING,
-    ("bfr2srv", State.READY, CaptureState): State.TRYING,
-    ("prd2srv", State.TRYING, Trial): State.TRYING,  # a rerun leads to EXECUTED
+    ("prd2srv", ServerState.STANDBY, Request): ServerState.EXECUTED,
+    ("prd2srv", ServerState.STANDBY, Trial): ServerState.EXECUTED,
+    ("prd2srv", ServerState.READY, Request): ServerState.EXECUTED,
+    ("prd2srv", ServerState.READY, Trial): ServerState.EXECUTED,
+    ("prd2srv", ServerState.EXECUTED, Trial): ServerState.EXECUTED,  # a rerun, before After asks
+    ("aft2srv", ServerState.STANDBY, RestoreState): ServerState.STANDBY,
+    ("aft2srv", ServerState.EXECUTED, CaptureState): ServerState.READY,
+    ("bfr2srv", ServerState.STANDBY, CaptureState): ServerState.TRYING,
+    ("bfr2srv", ServerState.READY, CaptureState): ServerState.TRYING,
+    ("prd2srv", ServerState.TRYING, Trial): ServerState.TRYING,  # a rerun leads to EXECUTED
 }
-OPEN: Final[dict[tuple[bool, bool], dict[State, tuple[str, ...]]]] = {  # by what leads: srv2aft, srv2bfr
-    (False, False): dict.fromkeys(State, ("prd2srv",)),
+OPEN: Final[
+    dict[tuple[bool, bool], dict[ServerState, tuple[str, ...]]]
+] = {  # by what leads: srv2aft, srv2bfr
+    (False, False): dict.fromkeys(ServerState, ("prd2srv",)),
     (True, False): {
-        State.STANDBY: ("aft2srv", "prd2srv"),
-        State.READY: ("prd2srv",),
-        State.TRYING: ("prd2srv",),
-        State.EXECUTED: ("aft2srv",),
+        ServerState.STANDBY: ("aft2srv", "prd2srv"),
+        ServerState.READY: ("prd2srv",),
+        ServerState.TRYING: ("prd2srv",),
+        ServerState.EXECUTED: ("aft2srv",),
     },
     (False, True): {
-        State.STANDBY: ("bfr2srv", "prd2srv"),
-        State.READY: ("bfr2srv", "prd2srv"),  # the next request, or a third trial
-        State.TRYING: ("prd2srv",),
-        State.EXECUTED: ("bfr2srv", "prd2srv"),
+        ServerState.STANDBY: ("bfr2srv", "prd2srv"),
+        ServerState.READY: ("bfr2srv", "prd2srv"),  # the next request, or a third trial
+        ServerState.TRYING: ("prd2srv",),
+        ServerState.EXECUTED: ("bfr2srv", "prd2srv"),
     },
     (True, True): {
-        State.STANDBY: ("aft2srv", "bfr2srv", "prd2srv"),
-        State.READY: ("bfr2srv",),
-        State.TRYING: ("prd2srv",),
-        State.EXECUTED: ("aft2srv", "prd2srv"),  # the question of After, or a third trial
+        ServerState.STANDBY: ("aft2srv", "bfr2srv", "prd2srv"),
+        ServerState.READY: ("bfr2srv",),
+        ServerState.TRYING: ("prd2srv",),
+        ServerState.EXECUTED: ("aft2srv", "prd2srv"),  # the question of After, or a third trial
     },
 }
 _ANSWERED_ON: Final = {"aft2srv": "srv2aft", "bfr2srv": "srv2bfr"}
 
 # Bound once: a look-up in an enumeration is slow on the hot path.
-_READY: Final = State.READY
-_EXECUTED: Final = State.EXECUTED
-_TRYING: Final = State.TRYING
+_READY: Final = ServerState.READY
+_EXECUTED: Final = ServerState.EXECUTED
+_TRYING: Final = ServerState.TRYING
 _ENTER: Final = Event.SERVER_ENTER
 _EXIT: Final = Event.SERVER_EXIT
 _CAPTURED: Final = Event.STATE_CAPTURED
@@ -92,7 +94,7 @@ class Server(Brick):
 
     def __init__(self, application: Application, replica: int) -> None:
         self.application, self.replica = application, replica
-        self.state = State.STANDBY
+        self.state = ServerState.STANDBY
         self.captured = self.tried = False
         self._open = OPEN[self.captured, self.tried]
 
@@ -161,7 +163,7 @@ class Server(Brick):
     def _rebound(self, msg: Rebound) -> list[Effect]:
         """Learn what will be asked. Who hears of an After anew may be a backup from now on, or a leader."""
         if msg.port == "srv2aft":
-            self.captured, self.state = msg.bound, State.STANDBY
+            self.captured, self.state = msg.bound, ServerState.STANDBY
         elif msg.port == "srv2bfr":
             self.tried = msg.bound
         self._open = OPEN[self.captured, self.tried]

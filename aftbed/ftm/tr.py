@@ -24,8 +24,8 @@ from typing import Final
 
 from aftbed.core.brick import Brick, BrickState, Effect, Halt, Note, Send, no_move
 from aftbed.core.errors import PeerError
-from aftbed.core.event import Event
-from aftbed.core.message import (
+from aftbed.core.events import Event
+from aftbed.core.messages import (
     Again,
     AnyMessage,
     CaptureState,
@@ -46,24 +46,24 @@ _PROCEED_ENTER: Final = Event.PROCEED_ENTER
 _COMPARED: Final = Event.VOTE_COMPARED
 
 
-class BeforeState(BrickState):
+class TrBeforeState(BrickState):
     IDLE = auto()  # no request in progress
     CAPTURING = auto()  # request held, waiting for the Server's state
 
 
 BEFORE_MOVES: Final = {
-    (BeforeState.IDLE, Request): BeforeState.CAPTURING,
-    (BeforeState.IDLE, TakeOver): BeforeState.IDLE,
-    (BeforeState.CAPTURING, StateCaptured): BeforeState.IDLE,
+    (TrBeforeState.IDLE, Request): TrBeforeState.CAPTURING,
+    (TrBeforeState.IDLE, TakeOver): TrBeforeState.IDLE,
+    (TrBeforeState.CAPTURING, StateCaptured): TrBeforeState.IDLE,
 }
-BEFORE_OPEN: Final = {BeforeState.IDLE: ("pro2bfr",), BeforeState.CAPTURING: ("srv2bfr",)}
+BEFORE_OPEN: Final = {TrBeforeState.IDLE: ("pro2bfr",), TrBeforeState.CAPTURING: ("srv2bfr",)}
 
 
 class TrBefore(Brick):
     """Captures, for one request at a time, the state that all its trials start from."""
 
     def __init__(self) -> None:
-        self.state = BeforeState.IDLE
+        self.state = TrBeforeState.IDLE
         self._request: Request | None = None
 
     def open_ports(self) -> tuple[str, ...]:
@@ -72,7 +72,7 @@ class TrBefore(Brick):
 
     def quiescent(self) -> bool:
         """No request held."""
-        return self.state is BeforeState.IDLE
+        return self.state is TrBeforeState.IDLE
 
     def step(self, port: str, msg: AnyMessage, now_ns: int) -> list[Effect]:
         """Handle one message; see BEFORE_MOVES."""
@@ -92,7 +92,7 @@ class TrBefore(Brick):
         return [Note(_BEFORE_EXIT, request.request_id), Send("bfr2prd", trial)]
 
 
-class ProceedState(BrickState):
+class TrProceedState(BrickState):
     IDLE = auto()  # no request in progress
     FIRST = auto()  # the Server has the trial, twice
     SECOND = auto()  # one result is there
@@ -101,25 +101,25 @@ class ProceedState(BrickState):
 
 
 PROCEED_MOVES: Final = {
-    (ProceedState.IDLE, Trial): ProceedState.FIRST,
-    (ProceedState.IDLE, TakeOver): ProceedState.IDLE,
-    (ProceedState.FIRST, Tried): ProceedState.SECOND,
-    (ProceedState.SECOND, Tried): ProceedState.VOTING,
-    (ProceedState.VOTING, Trial): ProceedState.FIRST,
-    (ProceedState.VOTING, TakeOver): ProceedState.VOTING,
-    (ProceedState.VOTING, Again): ProceedState.THIRD,
-    (ProceedState.THIRD, Tried): ProceedState.IDLE,
+    (TrProceedState.IDLE, Trial): TrProceedState.FIRST,
+    (TrProceedState.IDLE, TakeOver): TrProceedState.IDLE,
+    (TrProceedState.FIRST, Tried): TrProceedState.SECOND,
+    (TrProceedState.SECOND, Tried): TrProceedState.VOTING,
+    (TrProceedState.VOTING, Trial): TrProceedState.FIRST,
+    (TrProceedState.VOTING, TakeOver): TrProceedState.VOTING,
+    (TrProceedState.VOTING, Again): TrProceedState.THIRD,
+    (TrProceedState.THIRD, Tried): TrProceedState.IDLE,
 }
-PROCEED_OPEN: Final[dict[ProceedState, tuple[str, ...]]] = {
-    ProceedState.IDLE: ("bfr2prd",),
-    ProceedState.FIRST: ("srv2prd",),
-    ProceedState.SECOND: ("srv2prd",),
-    ProceedState.VOTING: ("bfr2prd", "aft2prd"),
-    ProceedState.THIRD: ("srv2prd",),
+PROCEED_OPEN: Final[dict[TrProceedState, tuple[str, ...]]] = {
+    TrProceedState.IDLE: ("bfr2prd",),
+    TrProceedState.FIRST: ("srv2prd",),
+    TrProceedState.SECOND: ("srv2prd",),
+    TrProceedState.VOTING: ("bfr2prd", "aft2prd"),
+    TrProceedState.THIRD: ("srv2prd",),
 }
 
 
-_VOTING: Final = ProceedState.VOTING
+_VOTING: Final = TrProceedState.VOTING
 _NEXT: Final = ("bfr2prd",)
 
 
@@ -131,7 +131,7 @@ class TrProceed(Brick):
     """
 
     def __init__(self) -> None:
-        self.state = ProceedState.IDLE
+        self.state = TrProceedState.IDLE
         self.agreed = True
         self._trial: Trial | None = None
         self._first: Tried | None = None
@@ -142,7 +142,7 @@ class TrProceed(Brick):
 
     def quiescent(self) -> bool:
         """No trial under way, and none to be asked for."""
-        return self.state is ProceedState.IDLE or (self.state is ProceedState.VOTING and self.agreed)
+        return self.state is TrProceedState.IDLE or (self.state is TrProceedState.VOTING and self.agreed)
 
     def step(self, port: str, msg: AnyMessage, now_ns: int) -> list[Effect]:
         """Handle one message; see PROCEED_MOVES."""
@@ -164,13 +164,13 @@ class TrProceed(Brick):
         self.state = state
         return [Send("prd2aft", msg)]
 
-    def _tried(self, msg: Tried, state: ProceedState) -> list[Effect]:
+    def _tried(self, msg: Tried, state: TrProceedState) -> list[Effect]:
         self._expect(msg.request_id)
         self.state = state
-        if state is ProceedState.SECOND:
+        if state is TrProceedState.SECOND:
             self._first = msg
             return []
-        if state is ProceedState.IDLE:
+        if state is TrProceedState.IDLE:
             self._trial = None
             return [Send("prd2aft", Trials(msg.epoch, msg.request_id, (msg,)))]
         first, self._first = self._first, None
@@ -192,18 +192,18 @@ class TrProceed(Brick):
         return Trial(trial.epoch, trial.request_id, trial.payload, trial.state, rerun=True)
 
 
-class AfterState(BrickState):
+class TrAfterState(BrickState):
     IDLE = auto()  # no trials held
     ASKED = auto()  # two trials held that differ, waiting for the third
 
 
 AFTER_MOVES: Final = {
-    (AfterState.IDLE, Trials): AfterState.ASKED,  # or answered at once, where they are equal
-    (AfterState.IDLE, TakeOver): AfterState.IDLE,
-    (AfterState.ASKED, Trials): AfterState.IDLE,
+    (TrAfterState.IDLE, Trials): TrAfterState.ASKED,  # or answered at once, where they are equal
+    (TrAfterState.IDLE, TakeOver): TrAfterState.IDLE,
+    (TrAfterState.ASKED, Trials): TrAfterState.IDLE,
 }
-AFTER_OPEN: Final = {AfterState.IDLE: ("prd2aft",), AfterState.ASKED: ("prd2aft",)}
-_WANTED: Final = {AfterState.IDLE: 2, AfterState.ASKED: 1}  # how many trials come at once
+AFTER_OPEN: Final = {TrAfterState.IDLE: ("prd2aft",), TrAfterState.ASKED: ("prd2aft",)}
+_WANTED: Final = {TrAfterState.IDLE: 2, TrAfterState.ASKED: 1}  # how many trials come at once
 
 
 def equal(one: Tried, other: Tried) -> bool:
@@ -215,7 +215,7 @@ class TrAfter(Brick):
     """The vote."""
 
     def __init__(self) -> None:
-        self.state = AfterState.IDLE
+        self.state = TrAfterState.IDLE
         self._held: tuple[Tried, ...] = ()
 
     def open_ports(self) -> tuple[str, ...]:
@@ -224,7 +224,7 @@ class TrAfter(Brick):
 
     def quiescent(self) -> bool:
         """No trials held."""
-        return self.state is AfterState.IDLE
+        return self.state is TrAfterState.IDLE
 
     def step(self, port: str, msg: AnyMessage, now_ns: int) -> list[Effect]:
         """Handle one message; see AFTER_MOVES."""
@@ -242,14 +242,14 @@ class TrAfter(Brick):
         first, second = msg.tried
         if equal(first, second):
             return self._answer(second, 2)
-        self.state, self._held = AfterState.ASKED, msg.tried
+        self.state, self._held = TrAfterState.ASKED, msg.tried
         return [Send("aft2prd", Again(msg.epoch, msg.request_id))]
 
     def _settle(self, msg: Trials) -> list[Effect]:
         (third,) = msg.tried
         if any(equal(third, held) for held in self._held):
             # The Server is as this trial, its last, has left it: in a state of the majority.
-            self.state, self._held = AfterState.IDLE, ()
+            self.state, self._held = TrAfterState.IDLE, ()
             return self._answer(third, 3)
         return [
             Note(_COMPARED, msg.request_id, UNDECIDED),

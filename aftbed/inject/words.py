@@ -24,7 +24,7 @@ from collections.abc import Mapping, Sequence
 from typing import Final
 
 from aftbed.core.errors import ConfigError, unknown
-from aftbed.core.event import event_named
+from aftbed.core.events import event_named
 from aftbed.core.fault import (
     BYTE_BITS,
     DISTURBED_MS,

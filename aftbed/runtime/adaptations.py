@@ -11,9 +11,9 @@ from typing import Final
 
 import msgspec
 
-from aftbed.core import message
+from aftbed.core import messages
 from aftbed.core.errors import ConfigError
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.core.fault import Hang
 from aftbed.core.graph import Graph
 from aftbed.core.script import Phase, Script, bricks_changed
@@ -106,7 +106,7 @@ class Adaptations:
         self._started_ns = self._loop.now_ns()
         self._current: _Current | None = None
         self.history: list[Outcome] = []
-        self._scheduled: dict[int, message.Scheduled] = {}  # by the number of their trigger
+        self._scheduled: dict[int, messages.Scheduled] = {}  # by the number of their trigger
 
     @property
     def busy(self) -> bool:
@@ -134,7 +134,7 @@ class Adaptations:
 
     # -- asked for ----------------------------------------------------------------------------
 
-    def ask(self, goal: message.Goal, answer: Answer, retries: int = RETRIES_MAX) -> None:
+    def ask(self, goal: messages.Goal, answer: Answer, retries: int = RETRIES_MAX) -> None:
         """Begin. Raises ConfigError where that cannot be now; waits a moment for redundancy to be back."""
         deployment = self._deployment
         if self._current is not None:
@@ -157,9 +157,9 @@ class Adaptations:
         outcome = Outcome(number, goal.expression or goal.part or "script", goal.recipe, deployment.graph.ftm)
         outcome.asked_ms = round((self._loop.now_ns() - self._started_ns) / 1e6, 3)
         self._current = _Current(outcome, answer, self._loop.now_ns(), deployment.epoch)
-        self._say(message.Adapt(number, goal, deployment.graph))
+        self._say(messages.Adapt(number, goal, deployment.graph))
 
-    def schedule(self, scheduled: tuple[message.Scheduled, ...]) -> Keys:
+    def schedule(self, scheduled: tuple[messages.Scheduled, ...]) -> Keys:
         """Those that were asked for with the run: at a request the Client waits until it has begun."""
         for number, later in enumerate(scheduled, FIRST_TRIGGER):
             if not later.at_request:
@@ -197,7 +197,7 @@ class Adaptations:
     def _begin(self, number: int) -> None:
         self._ask_again(self._scheduled.pop(number).goal, _nobody, RETRIES_MAX)
 
-    def _ask_again(self, goal: message.Goal, answer: Answer, retries: int) -> None:
+    def _ask_again(self, goal: messages.Goal, answer: Answer, retries: int) -> None:
         try:
             self.ask(goal, answer, retries)
         except ConfigError as error:
@@ -206,7 +206,7 @@ class Adaptations:
             self._tell("adapted", f"{what}: refused: {error}")
             answer(outcome)
 
-    def _say(self, told: message.Adapt | message.Progress | message.TakeUp) -> None:
+    def _say(self, told: messages.Adapt | messages.Progress | messages.TakeUp) -> None:
         try:
             self._deployment.order(ENGINE, lambda token: control.Tell(token, ENGINE, told))
         except StepFailed:
@@ -226,7 +226,7 @@ class Adaptations:
         if now.exchange is None and now.spoiled:
             now.phase, now.ended = phase, True
             now.failure = "" if phase is Phase.UNDO else now.spoiled
-            self._say(message.Progress(number, phase, now.failure))
+            self._say(messages.Progress(number, phase, now.failure))
             return
         if now.exchange is None or now.script is None:
             now.exchange, now.script = Exchange(self._deployment, todo, self._step), todo
@@ -264,11 +264,11 @@ class Adaptations:
             now.outcome.blackout_ms = round(closed / 1e6, 3)
         if not (now.phase is Phase.COMMIT and failure):
             self._executor.held = False
-        self._say(message.Progress(now.outcome.number, now.phase, failure))
+        self._say(messages.Progress(now.outcome.number, now.phase, failure))
         if now.phase in (Phase.COMMIT, Phase.UNDO) and not self._executor.busy:
             self._inform_recovery()
 
-    def adapted(self, told: message.Adapted) -> None:
+    def adapted(self, told: messages.Adapted) -> None:
         """The Engine says how it ended."""
         now, self._current = self._current, None
         if now is None:
@@ -304,7 +304,7 @@ class Adaptations:
             outcome.outcome, outcome.reason = "refused", "the engine died while it planned: ask again"
             now.answer(outcome)
             return
-        self._say(message.TakeUp(now.outcome.number, now.script, now.phase, now.ended, now.failure))
+        self._say(messages.TakeUp(now.outcome.number, now.script, now.phase, now.ended, now.failure))
 
     def interrupted(self, replica: str) -> bool:
         """Recovery wants to act on `replica`. True if it must wait, and will be told when it may."""
@@ -318,7 +318,7 @@ class Adaptations:
             self._executor.held = True
             now.lost = replica
             now.failure = f"replica {replica} was lost within the observation window"
-            self._say(message.Progress(now.outcome.number, Phase.COMMIT, now.failure))
+            self._say(messages.Progress(now.outcome.number, Phase.COMMIT, now.failure))
             return True
         return False
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 
-from aftbed.core.event import event_named
+from aftbed.core.events import event_named
 from aftbed.core.fault import Disturb, Fault
 from aftbed.core.journal import Record
 from aftbed.runtime import control

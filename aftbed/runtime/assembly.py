@@ -8,8 +8,8 @@ from aftbed.adapt.bricks import LoadModule, load_application, make_brick
 from aftbed.core.application import Application
 from aftbed.core.brick import Brick
 from aftbed.core.graph import BrickSpec
-from aftbed.ftm.catalog import Setting
-from aftbed.ftm.mechanism import REPLICAS
+from aftbed.ftm.compose import REPLICAS
+from aftbed.ftm.registry import Setting
 from aftbed.runtime import control
 
 Make = Callable[[BrickSpec, Setting], Brick]

@@ -15,9 +15,9 @@ from msgspec import structs
 
 from aftbed.core.brick import Brick, Effect, Note, Send
 from aftbed.core.errors import PeerError
-from aftbed.core.event import Event, event_named
+from aftbed.core.events import Event, event_named
 from aftbed.core.fault import Disturb, mark
-from aftbed.core.message import (
+from aftbed.core.messages import (
     AnyMessage,
     Checkpoint,
     Message,

@@ -22,7 +22,7 @@ import msgspec
 from aftbed.core.application import Application, Field, field_named, fields_of
 from aftbed.core.brick import Brick
 from aftbed.core.errors import ConfigError, PeerError
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.core.fault import mark
 from aftbed.core.valuefault import Byte, Flip, Stuck, hit
 from aftbed.ftm.server import Server

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import msgspec
 
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.core.fault import marked
 from aftbed.core.journal import Record
 from aftbed.core.valuefault import Flip, hit

@@ -11,8 +11,8 @@ from typing import Final
 
 import msgspec
 
-from aftbed.core import message, script
-from aftbed.core.event import Event
+from aftbed.core import messages, script
+from aftbed.core.events import Event
 from aftbed.core.graph import Graph
 from aftbed.core.script import Phase
 from aftbed.runtime import control
@@ -79,9 +79,9 @@ class Conductor:
                     jobs.fail(key, f"{process.name}: {error}")
                 else:
                     jobs.settle(key, data)
-            case control.Said(brick, message.Promoted(epoch)):
+            case control.Said(brick, messages.Promoted(epoch)):
                 jobs.settle(("promoted", brick, epoch))
-            case control.Said(_, message.Adapted() as told):
+            case control.Said(_, messages.Adapted() as told):
                 self.adaptations.adapted(told)
                 self._loop.after(SETTLE_SECONDS, self._rearm)
                 self._loop.after(SETTLE_SECONDS, self._restock)  # the next one waits until that is done

@@ -11,7 +11,7 @@ import msgspec
 from aftbed.core.busfault import BusFault, Condition
 from aftbed.core.fault import Action
 from aftbed.core.graph import BrickSpec, Graph
-from aftbed.core.message import (
+from aftbed.core.messages import (
     Adapt,
     Adapted,
     Progress,

@@ -8,7 +8,7 @@ taking it down.
 import itertools
 from typing import Final
 
-from aftbed.ftm.mechanism import REPLICAS
+from aftbed.ftm.compose import REPLICAS
 
 BESIDE_LEADER: Final = ("client", "proxy")
 

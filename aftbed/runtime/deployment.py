@@ -10,8 +10,8 @@ from typing import Final
 import msgspec
 
 from aftbed.core.graph import Graph
-from aftbed.ftm.mechanism import REPLICAS
-from aftbed.ftm.watchdog import HANG_DEADLINE_NS
+from aftbed.ftm.compose import REPLICAS
+from aftbed.ftm.failover import HANG_DEADLINE_NS
 from aftbed.runtime import control
 from aftbed.runtime.channels import Channels
 from aftbed.runtime.cores import Cores

@@ -10,7 +10,7 @@ from collections.abc import Callable, Container, Mapping
 from typing import Final, NamedTuple, Protocol, assert_never
 
 from aftbed.core.fault import Disturb, How
-from aftbed.core.message import Message
+from aftbed.core.messages import Message
 from aftbed.core.persistence import gap
 from aftbed.runtime import control
 

@@ -15,11 +15,11 @@ from typing import Final
 
 from aftbed.adapt.plan import drains
 from aftbed.core import script
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.core.graph import Graph
 from aftbed.core.script import Script, flat
-from aftbed.ftm.catalog import KINDS
-from aftbed.ftm.mechanism import REPLICAS, replication_of
+from aftbed.ftm.compose import REPLICAS, replication_of
+from aftbed.ftm.registry import KINDS
 from aftbed.runtime import control
 from aftbed.runtime.deployment import Deployment, Keys, Slot
 from aftbed.runtime.interface import Channel, Process

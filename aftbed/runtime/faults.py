@@ -19,7 +19,7 @@ from typing import Final, assert_never
 
 from aftbed.core.busfault import BusFault
 from aftbed.core.errors import ConfigError
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.core.fault import Crash, Disturb, Fault, FlipMemory, Hang, Slow
 from aftbed.core.journal import Record
 from aftbed.core.valuefault import Flip, Place

@@ -3,7 +3,7 @@
 from typing import Protocol
 
 from aftbed.core.brick import Brick
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.runtime import control
 from aftbed.runtime.diversion import Diversion
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from typing import NamedTuple, Protocol
 
 from aftbed.core.busfault import BusFault, Condition, Struck
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.core.fault import FlipMemory
 from aftbed.core.graph import Link
 from aftbed.core.journal import Record

@@ -4,7 +4,7 @@ from typing import Final, assert_never
 
 from aftbed.core.brick import Effect, Halt, Order
 from aftbed.core.errors import PeerError
-from aftbed.core.message import Watch
+from aftbed.core.messages import Watch
 from aftbed.runtime import blows, control
 from aftbed.runtime.cell import look, move_in
 from aftbed.runtime.host import Fds, Host, Hosted

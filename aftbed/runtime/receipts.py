@@ -16,7 +16,7 @@ from typing import Final
 
 import msgspec
 
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.core.fault import Fault, marked
 from aftbed.core.journal import Record
 from aftbed.core.valuefault import Byte, Flip, Place, Stuck, hit

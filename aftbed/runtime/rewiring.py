@@ -11,8 +11,8 @@ from typing import Final
 
 from aftbed.core import script
 from aftbed.core.graph import Graph, Link, ends
-from aftbed.ftm.catalog import KINDS
-from aftbed.ftm.mechanism import REPLICAS, replication_of
+from aftbed.ftm.compose import REPLICAS, replication_of
+from aftbed.ftm.registry import KINDS
 from aftbed.runtime import control
 from aftbed.runtime.channels import Channels
 from aftbed.runtime.deployment import Deployment, Keys

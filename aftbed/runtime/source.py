@@ -10,7 +10,7 @@ from typing import Final, Protocol
 import msgspec
 
 from aftbed.core.journal import Entry, EntryKind
-from aftbed.core.message import Reply, Request, Submit
+from aftbed.core.messages import Reply, Request, Submit
 from aftbed.ftm.client import Client
 
 CATCH_UP: Final = 10  # periods: a load that was held up makes good for no more

@@ -9,7 +9,7 @@ from typing import Final
 from aftbed.core.application import fields_of
 from aftbed.core.busfault import BusFault
 from aftbed.core.errors import ConfigError, unknown
-from aftbed.core.event import Event, event_named
+from aftbed.core.events import Event, event_named
 from aftbed.core.fault import SHARE_MAX, SHARE_MIN, SLOW_MS_MAX, Disturb, Fault, FlipMemory, Slow
 from aftbed.core.graph import BrickSpec, Graph
 from aftbed.core.valuefault import (
@@ -25,8 +25,8 @@ from aftbed.core.valuefault import (
     Stuck,
 )
 from aftbed.core.words import DURATION_MS_MAX
-from aftbed.ftm.catalog import EMITTERS
-from aftbed.ftm.mechanism import EXPRESSIONS, build
+from aftbed.ftm.compose import EXPRESSIONS, build
+from aftbed.ftm.registry import EMITTERS
 from aftbed.runtime.cell import check_field
 from aftbed.vehicle.function import AebFunction
 

@@ -8,10 +8,10 @@ half made is killed.
 import contextlib
 from typing import Final
 
-from aftbed.core import message, script
-from aftbed.core.event import Event
+from aftbed.core import messages, script
+from aftbed.core.events import Event
 from aftbed.core.graph import Link
-from aftbed.ftm.mechanism import STATEFUL, replication_of
+from aftbed.ftm.compose import STATEFUL, replication_of
 from aftbed.runtime import control
 from aftbed.runtime.cores import BESIDE_LEADER
 from aftbed.runtime.deployment import Deployment, Keys
@@ -73,11 +73,11 @@ class Executor:
             case _:
                 return bool(deployment.backup) or not deployment.leader
 
-    def situation(self, *, failed: bool) -> message.Situation:
+    def situation(self, *, failed: bool) -> messages.Situation:
         """What Recovery must know to order the next script."""
         deployment = self._deployment
         slots, leader, backup = deployment.slots, deployment.leader, deployment.backup
-        return message.Situation(
+        return messages.Situation(
             leader,
             slots[leader].generation if leader else 0,
             backup,
@@ -181,7 +181,7 @@ class Executor:
         part, _ = replication_of(deployment.graph.ftm)[0]  # who hears of the leader first
         brick = f"{replica}/{part}"
         # The end of the channel from the leader, which the fence made, wakes it.
-        deployment.leave(self._node(brick), control.Tell(control.UNANSWERED, brick, message.Promote(epoch)))
+        deployment.leave(self._node(brick), control.Tell(control.UNANSWERED, brick, messages.Promote(epoch)))
         promoted = ("promoted", f"{replica}/protocol", epoch)
         self._promoting = Wait(frozenset({promoted}), frozenset(slot.nodes))
 

@@ -7,7 +7,7 @@ from typing import Final, NamedTuple
 from aftbed.adapt.plan import Plan, plan
 from aftbed.core.graph import PLACEMENTS
 from aftbed.core.script import RECIPES
-from aftbed.ftm.mechanism import EXPRESSIONS, NONE, REPLICAS, build, replication_of
+from aftbed.ftm.compose import EXPRESSIONS, NONE, REPLICAS, build, replication_of
 
 RUNNABLE: Final = tuple(e for e in EXPRESSIONS if e != NONE)
 

@@ -6,7 +6,7 @@ from typing import Final
 from hypothesis import strategies as st
 
 from aftbed.adapt.policy import ADAPTABLE, NS_PER_S, Action, Beyond, Policy, PolicyFile, policy_from
-from aftbed.ftm.mechanism import DUPLEX, SIMPLEX
+from aftbed.ftm.compose import DUPLEX, SIMPLEX
 from aftbed.vehicle.yamlfile import read_yaml
 
 S: Final = NS_PER_S

@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 
 from aftbed.adapt.words import VERBS, Timed, Wish, goal, read, verb_for
 from aftbed.core.errors import ConfigError
-from aftbed.core.message import Goal
+from aftbed.core.messages import Goal
 from aftbed.core.script import RECIPES
-from aftbed.ftm.mechanism import EXPRESSIONS, NONE, parse
+from aftbed.ftm.compose import EXPRESSIONS, NONE, parse
 
 RUNNABLE: Final = tuple(e for e in EXPRESSIONS if e != NONE)
 

@@ -9,14 +9,22 @@ from hypothesis import given
 from hypothesis import strategies as st
 from plans import CASES, Case
 
-from aftbed.adapt.engine import DONE, REFUSED, ROLLED_BACK, WINDOW_NS, AdaptationEngine, State, script_for
+from aftbed.adapt.engine import (
+    DONE,
+    REFUSED,
+    ROLLED_BACK,
+    WINDOW_NS,
+    AdaptationEngine,
+    EngineState,
+    script_for,
+)
 from aftbed.core.brick import CONTROL, Effect, Note, Order, Send
 from aftbed.core.errors import ConfigError, PeerError
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.core.graph import Graph
-from aftbed.core.message import Adapt, Adapted, AnyMessage, Goal, Progress, Promote, Rebound, TakeUp
+from aftbed.core.messages import Adapt, Adapted, AnyMessage, Goal, Progress, Promote, Rebound, TakeUp
 from aftbed.core.script import Bind, Destroy, Phase, Resume, Script, Suspend
-from aftbed.ftm.mechanism import build
+from aftbed.ftm.compose import build
 
 NUMBER: Final = 7
 NOW_NS: Final = 1_000_000_000
@@ -25,10 +33,10 @@ SCRIPT: Final = Case("pbr", "pbr+tr").plan().script
 GOAL: Final = Goal(expression="pbr+tr")
 PHASES: Final = (Phase.PREPARE, Phase.COMMIT, Phase.FINISH, Phase.UNDO)
 STATES: Final = {
-    Phase.PREPARE: State.PREPARING,
-    Phase.COMMIT: State.COMMITTING,
-    Phase.FINISH: State.FINISHING,
-    Phase.UNDO: State.UNDOING,
+    Phase.PREPARE: EngineState.PREPARING,
+    Phase.COMMIT: EngineState.COMMITTING,
+    Phase.FINISH: EngineState.FINISHING,
+    Phase.UNDO: EngineState.UNDOING,
 }
 
 
@@ -55,16 +63,16 @@ def begun() -> AdaptationEngine:
     return engine
 
 
-def in_state(state: State) -> AdaptationEngine:
+def in_state(state: EngineState) -> AdaptationEngine:
     """An Engine on its way, there."""
-    engine = AdaptationEngine() if state is State.IDLE else begun()
-    if state in (State.COMMITTING, State.OBSERVING, State.FINISHING):
+    engine = AdaptationEngine() if state is EngineState.IDLE else begun()
+    if state in (EngineState.COMMITTING, EngineState.OBSERVING, EngineState.FINISHING):
         went(engine, Phase.PREPARE)
-    if state in (State.OBSERVING, State.FINISHING):
+    if state in (EngineState.OBSERVING, EngineState.FINISHING):
         went(engine, Phase.COMMIT)
-    if state is State.FINISHING:
+    if state is EngineState.FINISHING:
         engine.wake(NOW_NS + WINDOW_NS)
-    if state is State.UNDOING:
+    if state is EngineState.UNDOING:
         went(engine, Phase.PREPARE, "no room")
     assert engine.state is state
     return engine
@@ -93,32 +101,32 @@ def test_an_adaptation_that_goes_well() -> None:
 @pytest.mark.parametrize(
     ("state", "phase", "outcome"),
     [
-        (State.PREPARING, Phase.PREPARE, REFUSED),
-        (State.COMMITTING, Phase.COMMIT, ROLLED_BACK),
-        (State.OBSERVING, Phase.COMMIT, ROLLED_BACK),
+        (EngineState.PREPARING, Phase.PREPARE, REFUSED),
+        (EngineState.COMMITTING, Phase.COMMIT, ROLLED_BACK),
+        (EngineState.OBSERVING, Phase.COMMIT, ROLLED_BACK),
     ],
 )
-def test_a_phase_that_fails_is_undone(state: State, phase: Phase, outcome: str) -> None:
+def test_a_phase_that_fails_is_undone(state: EngineState, phase: Phase, outcome: str) -> None:
     engine = in_state(state)
     assert went(engine, phase, "it broke") == [Note(Event.ADAPT_ROLLBACK, detail=NUMBER), order(Phase.UNDO)]
-    assert engine.state is State.UNDOING and engine.deadline_ns() is None
+    assert engine.state is EngineState.UNDOING and engine.deadline_ns() is None
     assert went(engine, Phase.UNDO) == [ended(outcome, "it broke")]
     assert engine.quiescent()
 
 
 def test_what_cannot_be_undone_is_told_with_both_reasons() -> None:
-    engine = in_state(State.COMMITTING)
+    engine = in_state(EngineState.COMMITTING)
     went(engine, Phase.COMMIT, "it broke")
     assert went(engine, Phase.UNDO, "and this too") == [ended(ROLLED_BACK, "it broke; and this too")]
 
 
 def test_what_serves_is_done_even_where_the_old_one_does_not_end() -> None:
-    engine = in_state(State.FINISHING)
+    engine = in_state(EngineState.FINISHING)
     assert went(engine, Phase.FINISH, "a/proceed does not die") == [ended(DONE, "a/proceed does not die")]
 
 
 def test_one_that_is_refused_leaves_no_trace_in_the_next() -> None:
-    engine = in_state(State.COMMITTING)
+    engine = in_state(EngineState.COMMITTING)
     went(engine, Phase.COMMIT, "it broke")
     went(engine, Phase.UNDO)
     tell(engine, Adapt(NUMBER, GOAL, PBR))
@@ -156,24 +164,28 @@ def test_a_goal_that_leads_nowhere_is_refused_at_once(goal: Goal, words: str) ->
 # -- illegal messages
 
 
-def legal(state: State, phase: Phase) -> bool:
+def legal(state: EngineState, phase: Phase) -> bool:
     """Whether the end of `phase` is what an Engine in `state` waits for."""
-    if state in (State.OBSERVING, State.FINISHING) and phase is Phase.COMMIT:
+    if state in (EngineState.OBSERVING, EngineState.FINISHING) and phase is Phase.COMMIT:
         return True
     return STATES.get(phase) is state
 
 
 ANOTHER_PHASE: Final = [
     (state, Progress(NUMBER, phase, failure))
-    for state, phase, failure in product(State, (*PHASES, Phase.WHOLE), ("", "x"))
-    if not legal(state, phase) and state is not State.IDLE
+    for state, phase, failure in product(EngineState, (*PHASES, Phase.WHOLE), ("", "x"))
+    if not legal(state, phase) and state is not EngineState.IDLE
 ]
 ILLEGAL: Final = [
-    *((State.IDLE, Progress(NUMBER, phase, "")) for phase in PHASES),
-    *((state, Progress(NUMBER + 1, phase, "")) for state, phase in product(State, PHASES)),
-    *((state, Adapt(NUMBER + 1, GOAL, PBR)) for state in State if state is not State.IDLE),
-    *((state, TakeUp(NUMBER, SCRIPT, Phase.COMMIT, False, "")) for state in State if state is not State.IDLE),
-    *((state, Promote(2)) for state in State),
+    *((EngineState.IDLE, Progress(NUMBER, phase, "")) for phase in PHASES),
+    *((state, Progress(NUMBER + 1, phase, "")) for state, phase in product(EngineState, PHASES)),
+    *((state, Adapt(NUMBER + 1, GOAL, PBR)) for state in EngineState if state is not EngineState.IDLE),
+    *(
+        (state, TakeUp(NUMBER, SCRIPT, Phase.COMMIT, False, ""))
+        for state in EngineState
+        if state is not EngineState.IDLE
+    ),
+    *((state, Promote(2)) for state in EngineState),
 ]
 
 
@@ -182,7 +194,7 @@ def image(engine: AdaptationEngine) -> tuple[object, ...]:
     return tuple(vars(engine).items())
 
 
-def refuses(state: State, message: AnyMessage) -> None:
+def refuses(state: EngineState, message: AnyMessage) -> None:
     engine = in_state(state)
     before = image(engine)
     with pytest.raises(PeerError, match=f"{type(message).__name__} on {CONTROL} while {state.name}"):
@@ -191,17 +203,17 @@ def refuses(state: State, message: AnyMessage) -> None:
 
 
 @pytest.mark.parametrize(("state", "message"), ILLEGAL)
-def test_an_illegal_message_is_refused_and_changes_nothing(state: State, message: AnyMessage) -> None:
+def test_an_illegal_message_is_refused_and_changes_nothing(state: EngineState, message: AnyMessage) -> None:
     refuses(state, message)
 
 
 @pytest.mark.parametrize(("state", "message"), ANOTHER_PHASE)
-def test_the_end_of_another_phase_is_refused(state: State, message: AnyMessage) -> None:
+def test_the_end_of_another_phase_is_refused(state: EngineState, message: AnyMessage) -> None:
     refuses(state, message)
 
 
-@pytest.mark.parametrize("state", State)
-def test_it_does_not_mind_where_its_ports_lead(state: State) -> None:
+@pytest.mark.parametrize("state", EngineState)
+def test_it_does_not_mind_where_its_ports_lead(state: EngineState) -> None:
     engine = in_state(state)
     before = image(engine)
     assert tell(engine, Rebound("x", True, 2)) == []
@@ -236,7 +248,7 @@ def test_a_new_engine_goes_on_as_the_dead_one_would_have(phase: Phase, failure: 
     assert found == went(old, phase, failure)
     assert (new.state, new.number, new.script) == (old.state, old.number, old.script)
     assert new.deadline_ns() == old.deadline_ns()
-    if new.state is State.UNDOING:
+    if new.state is EngineState.UNDOING:
         assert went(new, Phase.UNDO) == went(old, Phase.UNDO)
 
 
@@ -267,7 +279,7 @@ def test_however_often_it_dies_it_ends_once_and_only_as_the_table_says(
             tell(engine, TakeUp(NUMBER, SCRIPT, ordered, False, ""))
         failed = failed or (fails and ordered in (Phase.PREPARE, Phase.COMMIT))
         effects = went(engine, ordered, "it broke" if fails else "")
-        if engine.state is State.OBSERVING:
+        if engine.state is EngineState.OBSERVING:
             effects = engine.wake(NOW_NS + WINDOW_NS)
         for effect in effects:
             if isinstance(effect, Order):

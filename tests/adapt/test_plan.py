@@ -33,8 +33,8 @@ from aftbed.core.script import (
     flat,
     problems,
 )
-from aftbed.ftm.catalog import KINDS
-from aftbed.ftm.mechanism import NONE, REPLICAS, STATEFUL, build, chain, replication_of
+from aftbed.ftm.compose import NONE, REPLICAS, STATEFUL, build, chain, replication_of
+from aftbed.ftm.registry import KINDS
 
 DUPLEX_PAIRS: Final = list(permutations([e for e in RUNNABLE if replication_of(e)], 2))
 PARTS: Final = ("protocol", "before", "proceed", "after", "server", APPLICATION)

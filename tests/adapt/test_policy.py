@@ -24,8 +24,8 @@ from aftbed.adapt.policy import (
     policy_from,
 )
 from aftbed.core.errors import ConfigError
-from aftbed.core.event import Event
-from aftbed.ftm.mechanism import EXPRESSIONS, parse
+from aftbed.core.events import Event
+from aftbed.ftm.compose import EXPRESSIONS, parse
 from aftbed.vehicle.yamlfile import read_yaml
 
 # -- actions

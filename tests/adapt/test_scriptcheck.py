@@ -31,7 +31,7 @@ from aftbed.core.script import (
     Unbind,
     flat,
 )
-from aftbed.ftm.mechanism import build
+from aftbed.ftm.compose import build
 
 PBR: Final = build("pbr", "process")
 _PLANNED: Final = Case("pbr", "pbr+tr").plan().script

@@ -37,8 +37,8 @@ from aftbed.core.script import (
     Transfer,
     Unbind,
 )
-from aftbed.ftm.catalog import KINDS
-from aftbed.ftm.mechanism import EXPRESSIONS
+from aftbed.ftm.compose import EXPRESSIONS
+from aftbed.ftm.registry import KINDS
 from aftbed.vehicle.yamlfile import read_yaml
 
 SWITCH: Final = Case("pbr", "lfr").plan().script

@@ -8,10 +8,10 @@ from aftbed.adapt.bricks import load, load_application, make_brick
 from aftbed.core.brick import Brick, Effect, Send
 from aftbed.core.errors import ConfigError
 from aftbed.core.graph import BrickSpec, Graph, Kind
-from aftbed.core.message import AnyMessage, Reply
-from aftbed.ftm.catalog import KINDS, Setting
-from aftbed.ftm.mechanism import EXPRESSIONS, NONE, build
-from aftbed.ftm.proceed import Compute
+from aftbed.core.messages import AnyMessage, Reply
+from aftbed.ftm.chain import Compute
+from aftbed.ftm.compose import EXPRESSIONS, NONE, build
+from aftbed.ftm.registry import KINDS, Setting
 from aftbed.vehicle.function import default_application, sample_requests
 
 REQUESTS = tuple(sample_requests(0, 8))
@@ -133,8 +133,8 @@ def test_a_brick_is_no_function() -> None:
     from aftbed.runtime.unix.part import load_module  # noqa: PLC0415
 
     with pytest.raises(ConfigError, match="is no protected function: it lacks execute"):
-        load_application("aftbed.ftm.proceed:Compute", load_module)
+        load_application("aftbed.ftm.chain:Compute", load_module)
     with pytest.raises(ConfigError, match=r"has no class Comput \(it has: .*Compute"):
-        load_application("aftbed.ftm.proceed:Comput", load_module)
+        load_application("aftbed.ftm.chain:Comput", load_module)
     with pytest.raises(ConfigError, match="cannot be imported: ModuleNotFoundError"):
         load_application("aftbed.ftm.nothing:Compute", load_module)

@@ -8,11 +8,11 @@ import msgspec
 
 from aftbed.campaign.record import read_record
 from aftbed.campaign.verdict import Verdict, judge
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.core.fault import Crash, Fault, Trigger
 from aftbed.core.journal import DROPPED_OFFSET, EntryKind
 from aftbed.core.valuefault import Bit, Flip, Place, flipped
-from aftbed.ftm.mechanism import build
+from aftbed.ftm.compose import build
 from aftbed.runtime.unix.journal import Dialogue, Journal
 from aftbed.runtime.unix.options import CarRun, LoadRun, RunOptions, Work
 from aftbed.vehicle.function import default_application, sample_requests

@@ -10,7 +10,7 @@ from aftbed.campaign.classify import golden_digest, outcome_of
 from aftbed.campaign.executing import carry_out
 from aftbed.campaign.experiment import OUTCOMES, Experiment, worst
 from aftbed.core.check import LATE_NS, History
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.core.journal import Entry, EntryKind, Record
 from aftbed.runtime.hosting import Hosted
 from aftbed.runtime.sim.world import Run, Setup, simulate

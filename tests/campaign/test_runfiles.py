@@ -17,7 +17,7 @@ from aftbed.campaign.runfiles.axis import Axis
 from aftbed.campaign.runfiles.export import Wanted, check, export
 from aftbed.campaign.runfiles.steps import between_processes, ends_ns, followed, steps_of
 from aftbed.core.errors import ConfigError
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.core.journal import EntryKind
 from aftbed.runtime.adaptations import FIRST_TRIGGER
 from aftbed.runtime.unix.journal import Dialogue

@@ -9,8 +9,8 @@ from records import CRASH, FLIP, RecordInTheMaking, whole
 
 from aftbed.campaign.record import read_record
 from aftbed.campaign.verdict import EXIT_CODES
-from aftbed.core.event import Event
-from aftbed.ftm.mechanism import build
+from aftbed.core.events import Event
+from aftbed.ftm.compose import build
 from aftbed.runtime.unix.options import COMMAND_GONE
 from aftbed.runtime.unix.support import HISTORY_NAME
 

@@ -8,8 +8,8 @@ import msgspec
 
 from aftbed.core.errors import ConfigError
 from aftbed.core.graph import Graph
-from aftbed.core.message import Goal
-from aftbed.ftm.mechanism import build
+from aftbed.core.messages import Goal
+from aftbed.ftm.compose import build
 from aftbed.runtime.unix import ask
 
 Call = Callable[..., tuple[int, str, str]]  # `aftbed` with these arguments: exit code, output, errors

@@ -10,8 +10,8 @@ import pytest
 from playedrun import CAUTIOUS, CLOSED, OUTCOME, RANDOM, VARIANTS, Call, PlayedRun, Run
 
 from aftbed.adapt.plan import APPLICATION, updated
-from aftbed.core.message import Goal
-from aftbed.ftm.mechanism import build
+from aftbed.core.messages import Goal
+from aftbed.ftm.compose import build
 from aftbed.runtime.unix import ask
 
 # -- what is asked for

@@ -12,7 +12,7 @@ from aftbed.adapt.plan import plan
 from aftbed.adapt.scriptfile import ScriptFile, mapping, script_from
 from aftbed.cli.adaptview import WIDTH
 from aftbed.core.script import Script, Stage, flat
-from aftbed.ftm.mechanism import build
+from aftbed.ftm.compose import build
 
 # -- a plan
 

@@ -14,7 +14,7 @@ import psutil
 import pytest
 from playedrun import Call
 
-from aftbed.ftm.mechanism import EXPRESSIONS, build
+from aftbed.ftm.compose import EXPRESSIONS, build
 
 VARIANTS: Final = "aftbed.vehicle.variants"
 AMPLE: Final = ("--cpus", "2", "--cpu-load", "0.1")
@@ -41,7 +41,7 @@ def call(call: Call) -> Call:
 
 def test_the_command_line_is_imported_without_what_its_commands_need() -> None:
     code = "import sys, aftbed.cli.app; print(*sorted(m for m in sys.modules if m in sys.argv[1:]))"
-    heavy = ("aftbed.adapt.consistency", "aftbed.ftm.mechanism", "aftbed.runtime.unix.part", "psutil", "yaml")
+    heavy = ("aftbed.adapt.suitability", "aftbed.ftm.compose", "aftbed.runtime.unix.part", "psutil", "yaml")
     done = subprocess.run([sys.executable, "-c", code, *heavy], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == ""
 

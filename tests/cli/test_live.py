@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from liveruns import Command, Home, aftbed, until
 
-from aftbed.ftm.mechanism import build
+from aftbed.ftm.compose import build
 from aftbed.runtime.unix import ask, rundir
 
 pytestmark = pytest.mark.process

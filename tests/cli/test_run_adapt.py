@@ -10,8 +10,8 @@ from playedrun import CLOSED, Run
 from aftbed.cli import main, running
 from aftbed.cli.adaptation import scheduled
 from aftbed.core.errors import ConfigError
-from aftbed.core.message import Goal, Scheduled
-from aftbed.ftm.mechanism import build
+from aftbed.core.messages import Goal, Scheduled
+from aftbed.ftm.compose import build
 from aftbed.runtime.unix import rundir
 from aftbed.runtime.unix.options import RunOptions
 

@@ -19,7 +19,7 @@ from aftbed.campaign.workers import each
 from aftbed.cli import simulating
 from aftbed.cli.simfailure import repeating
 from aftbed.core.fault import Crash, Fault, Trigger
-from aftbed.core.message import Goal, Scheduled
+from aftbed.core.messages import Goal, Scheduled
 from aftbed.runtime.sim.world import Doom, Setup
 
 FLIP: Final = ("--ftm", "pbr", "--count", "10", "--faults", "bitflip result bit 60 nth 3")  # no TR: sdc
@@ -266,7 +266,7 @@ def test_a_swarm_is_drawn_from_the_seed(sim: Call) -> None:
         ),
         (("--adapt", "to lfrr"), ("--adapt 'to lfrr'", "did you mean 'lfr'")),
         (("--adapt", "to lfr at request 101"), ("there are 100 requests",)),
-        (("--adapt", "update before to aftbed.ftm.before:PbrBefore"), ("loads no brick",)),
+        (("--adapt", "update before to aftbed.ftm.chain:PbrBefore"), ("loads no brick",)),
         (("--adapt", "decompose", "--force"), ("to EXPR",)),
         (("--adapt", "to lfr", "--recipe", "papr"), ("unknown recipe 'papr'",)),
         (("--force",), ("give --adapt too",)),

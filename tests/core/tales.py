@@ -5,7 +5,7 @@ import zlib
 from aftbed.core import check
 from aftbed.core.check import Check, History
 from aftbed.core.errors import PeerError
-from aftbed.core.event import RERUN, Event
+from aftbed.core.events import RERUN, Event
 from aftbed.core.journal import Entry, EntryKind, Record
 
 MS = 1_000_000

@@ -10,7 +10,7 @@ from tales import Sums, Tale, good, judged
 
 from aftbed.core import check
 from aftbed.core.check import REASONS_MAX, Check
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 
 
 def test_a_good_history_passes_every_check() -> None:

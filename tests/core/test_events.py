@@ -3,7 +3,7 @@
 import pytest
 
 from aftbed.core.errors import ConfigError, unknown
-from aftbed.core.event import BY_CODE, BY_LABEL, REQUEST_PATH, Event, event_named
+from aftbed.core.events import BY_CODE, BY_LABEL, REQUEST_PATH, Event, event_named
 
 
 def test_a_code_fits_into_a_record_and_is_not_that_of_no_record() -> None:

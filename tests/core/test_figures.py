@@ -5,7 +5,7 @@ from tales import MS, Sums, Tale, good
 
 from aftbed.core import check
 from aftbed.core.check import LATE_NS, Failover, History, Requests
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.core.journal import Entry, EntryKind, Record
 
 

@@ -10,10 +10,10 @@ from pages import PAGES, ROOT, anchors, blocks, links, names, prose, sections, t
 
 from aftbed.campaign.verdict import EXIT_CODES, EXIT_INTERRUPTED
 from aftbed.cli.app import app
-from aftbed.core.event import BY_LABEL, REQUEST_PATH
+from aftbed.core.events import BY_LABEL, REQUEST_PATH
 from aftbed.core.graph import PLACEMENTS
-from aftbed.ftm.catalog import EMITTERS
-from aftbed.ftm.mechanism import EXPRESSIONS, build
+from aftbed.ftm.compose import EXPRESSIONS, build
+from aftbed.ftm.registry import EMITTERS
 from aftbed.runtime import targets
 from aftbed.vehicle.candump import Refusal
 from aftbed.vehicle.dbcfile import load_dbc

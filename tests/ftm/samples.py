@@ -4,9 +4,9 @@ import copy
 from typing import Final, get_args
 
 from aftbed.core.brick import Brick, Effect, Note, Send
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.core.graph import Graph
-from aftbed.core.message import (
+from aftbed.core.messages import (
     Adapt,
     Again,
     AnyMessage,

@@ -5,8 +5,8 @@ from samples import STATE, inspected, notes, sends
 
 from aftbed.core.brick import CONTROL, Note, Send
 from aftbed.core.errors import PeerError
-from aftbed.core.event import Event
-from aftbed.core.message import (
+from aftbed.core.events import Event
+from aftbed.core.messages import (
     CaptureState,
     ChannelEnded,
     Checkpoint,
@@ -19,7 +19,7 @@ from aftbed.core.message import (
     StoreReply,
     TakeOver,
 )
-from aftbed.ftm.after import PbrAfter, State
+from aftbed.ftm.pbr import PbrAfter, PbrAfterState
 
 REPLY = Reply(1, 7, 1, b"that")
 CHECKPOINT = Checkpoint(1, 7, b"that", STATE)
@@ -148,18 +148,18 @@ def test_the_restoring_of_another_request_is_refused() -> None:
 def test_promoted_it_drains_its_channel_to_the_end_before_it_leads() -> None:
     brick = backup()
     assert brick.step(CONTROL, Promote(2), 0) == []
-    assert brick.state is State.STANDBY and brick.open_ports() == ("aft2aft",)
+    assert brick.state is PbrAfterState.STANDBY and brick.open_ports() == ("aft2aft",)
     brick.step("aft2aft", CHECKPOINT, 0)  # was still in the channel
     stored = brick.step("srv2aft", StateRestored(1, 7), 0)
     assert [type(m) for _, m in sends(stored)] == [StoreReply]
     assert brick.step("aft2aft", ChannelEnded(), 0) == [Send("aft2pro", TakeOver(2))]
-    assert (brick.state, brick.epoch) == (State.IDLE, 2)
+    assert (brick.state, brick.epoch) == (PbrAfterState.IDLE, 2)
 
 
 def test_the_channel_may_end_before_the_promotion() -> None:
     brick = backup()
     assert brick.step("aft2aft", ChannelEnded(), 0) == []
-    assert brick.state is State.STANDBY
+    assert brick.state is PbrAfterState.STANDBY
     assert brick.step(CONTROL, Promote(2), 0) == [Send("aft2pro", TakeOver(2))]
 
 
@@ -169,7 +169,7 @@ def test_promoted_while_it_applies_a_checkpoint_it_waits_for_that_and_for_the_en
     assert brick.step(CONTROL, Promote(2), 0) == []
     applied = brick.step("srv2aft", StateRestored(1, 7), 0)
     assert notes(applied) == [Event.CHECKPOINT_APPLIED]
-    assert brick.state is State.STANDBY
+    assert brick.state is PbrAfterState.STANDBY
     assert brick.step("aft2aft", ChannelEnded(), 0) == [Send("aft2pro", TakeOver(2))]
 
 

@@ -6,8 +6,8 @@ from samples import inspected, notes, sends
 
 from aftbed.core.brick import Halt, Note, Send
 from aftbed.core.errors import PeerError
-from aftbed.core.event import Event
-from aftbed.core.message import Reply, Request, TakeOver
+from aftbed.core.events import Event
+from aftbed.core.messages import Reply, Request, TakeOver
 from aftbed.ftm.assertion import AssertAfter, AssertBefore
 
 REQUEST = Request(2, 7, b"what")

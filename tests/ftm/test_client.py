@@ -7,8 +7,8 @@ from samples import inspected, notes, sends
 
 from aftbed.core.brick import CONTROL
 from aftbed.core.errors import PeerError
-from aftbed.core.event import Event
-from aftbed.core.message import Rebound, Reply, Request, Submit
+from aftbed.core.events import Event
+from aftbed.core.messages import Rebound, Reply, Request, Submit
 from aftbed.ftm.client import BACKLOG_MAX, Client
 
 

@@ -4,10 +4,8 @@ import pytest
 from samples import inspected, notes, sends
 
 from aftbed.core.errors import PeerError
-from aftbed.core.message import Reply, Request, TakeOver
-from aftbed.ftm.before import PassBefore
-from aftbed.ftm.inner import InnerProtocol
-from aftbed.ftm.proceed import Compute
+from aftbed.core.messages import Reply, Request, TakeOver
+from aftbed.ftm.chain import Compute, InnerProtocol, PassBefore
 
 REQUEST = Request(1, 7, b"what")
 REPLY = Reply(1, 7, 1, b"that")

@@ -7,8 +7,8 @@ from samples import inspected, notes, sends
 
 from aftbed.core.brick import CONTROL, Note, Send
 from aftbed.core.errors import PeerError
-from aftbed.core.event import Event
-from aftbed.core.message import (
+from aftbed.core.events import Event
+from aftbed.core.messages import (
     ChannelEnded,
     Notification,
     Promote,
@@ -18,7 +18,7 @@ from aftbed.core.message import (
     StoreReply,
     TakeOver,
 )
-from aftbed.ftm.lfr import AfterState, BeforeState, LfrAfter, LfrBefore, digest
+from aftbed.ftm.lfr import LfrAfter, LfrAfterState, LfrBefore, LfrBeforeState, digest
 
 REQUEST = Request(1, 7, b"what")
 REPLY = Reply(1, 7, 1, b"that")
@@ -164,13 +164,13 @@ def test_promoted_it_works_off_what_was_forwarded_before_it_leads() -> None:
     assert brick.open_ports() == ("bfr2bfr",)
     assert [type(m) for _, m in sends(brick.step("bfr2bfr", REQUEST, 0))] == [Request]
     assert brick.step("bfr2bfr", ChannelEnded(), 0) == [Send("bfr2prd", TakeOver(2))]
-    assert (brick.state, brick.epoch, brick.open_ports()) == (BeforeState.LEADING, 2, ("pro2bfr",))
+    assert (brick.state, brick.epoch, brick.open_ports()) == (LfrBeforeState.LEADING, 2, ("pro2bfr",))
 
 
 def test_the_channel_may_end_before_the_promotion() -> None:
     brick = following_before()
     assert brick.step("bfr2bfr", ChannelEnded(), 0) == []
-    assert brick.state is BeforeState.FOLLOWING
+    assert brick.state is LfrBeforeState.FOLLOWING
     assert brick.step(CONTROL, Promote(2), 0) == [Send("bfr2prd", TakeOver(2))]
 
 
@@ -195,7 +195,7 @@ def test_after_leads_behind_all_replies_and_says_so() -> None:
         brick.step("prd2aft", TakeOver(2), 0)
     brick.step("aft2aft", NOTIFICATION, 0)
     assert brick.step("prd2aft", TakeOver(2), 0) == [Send("aft2pro", TakeOver(2))]
-    assert (brick.state, brick.epoch) == (AfterState.LEADING, 2)
+    assert (brick.state, brick.epoch) == (LfrAfterState.LEADING, 2)
     reply = Reply(2, 8, 2, b"more")
     assert brick.step("prd2aft", reply, 0) == [Send("aft2pro", reply)], "held no more"
 

@@ -11,10 +11,10 @@ from counting import Counting
 
 from aftbed.core.brick import Brick
 from aftbed.core.errors import ConfigError
-from aftbed.core.event import REQUEST_PATH
+from aftbed.core.events import REQUEST_PATH
 from aftbed.core.graph import PLACEMENTS, BrickSpec, Graph, Kind, Link, ends
-from aftbed.ftm.catalog import EMITTERS, KINDS, Setting, make
-from aftbed.ftm.mechanism import EXPRESSIONS, MECHANISMS, build, chain, parse, replication_of
+from aftbed.ftm.compose import EXPRESSIONS, MECHANISMS, build, chain, parse, replication_of
+from aftbed.ftm.registry import EMITTERS, KINDS, Setting, make
 
 CHANNELS: Final = frozenset(  # the paper's names
     ("clt2pxy", "pxy2pro", "pro2bfr", "bfr2prd", "prd2srv")

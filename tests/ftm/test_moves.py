@@ -12,7 +12,7 @@ from samples import SAMPLES, STATE, TRIED, inspected
 
 from aftbed.core.brick import Brick, BrickState
 from aftbed.core.errors import PeerError
-from aftbed.core.message import (
+from aftbed.core.messages import (
     Again,
     AnyMessage,
     CaptureState,
@@ -34,21 +34,16 @@ from aftbed.core.message import (
     Tried,
     Watch,
 )
-from aftbed.ftm import after, assertion, inner, lfr, proceed, protocol, proxy, server, tr
-from aftbed.ftm.after import PbrAfter
+from aftbed.ftm import assertion, chain, client, lfr, pbr, server, tr
 from aftbed.ftm.assertion import AssertAfter, AssertBefore
-from aftbed.ftm.before import PassBefore
-from aftbed.ftm.catalog import KINDS, Setting, make
-from aftbed.ftm.client import BACKLOG_MAX, Client
-from aftbed.ftm.inner import InnerProtocol
+from aftbed.ftm.chain import Compute, InnerProtocol, PassBefore, Protocol
+from aftbed.ftm.client import BACKLOG_MAX, Client, Proxy
+from aftbed.ftm.failover import Recovery, Watchdog
 from aftbed.ftm.lfr import LfrAfter, LfrBefore
-from aftbed.ftm.proceed import Compute
-from aftbed.ftm.protocol import Protocol
-from aftbed.ftm.proxy import Proxy
-from aftbed.ftm.recovery import Recovery
+from aftbed.ftm.pbr import PbrAfter
+from aftbed.ftm.registry import KINDS, Setting, make
 from aftbed.ftm.server import Server
 from aftbed.ftm.tr import TrAfter, TrBefore, TrProceed
-from aftbed.ftm.watchdog import Watchdog
 
 BOUND: Final = Rebound("pxy2pro", True, 1)
 TELLS: Final = frozenset({Rebound})  # the runtime's word, of interest in any state
@@ -150,8 +145,8 @@ def client_that_waits() -> Brick:
     return brick
 
 
-_P, _A, _C = protocol.State, after.State, proceed.State
-_LB, _LA, _TP = lfr.BeforeState, lfr.AfterState, tr.ProceedState
+_P, _A, _C = chain.ProtocolState, pbr.PbrAfterState, chain.ComputeState
+_LB, _LA, _TP = lfr.LfrBeforeState, lfr.LfrAfterState, tr.TrProceedState
 DIFFERING: Final = Trials(1, 1, (TRIED, Tried(1, 1, 1, b"this", STATE)))
 
 Legal = dict[str, tuple[type, ...]]  # by port
@@ -165,15 +160,15 @@ READY: Final[Legal] = {"prd2srv": (Request, Trial), "aft2srv": (), "bfr2srv": (C
 EXECUTED: Final[Legal] = {"prd2srv": (), "aft2srv": (CaptureState,), "bfr2srv": ()}
 TRYING: Final[Legal] = {"prd2srv": (Trial,), "aft2srv": (), "bfr2srv": ()}
 CASES: Final = (
-    by_table(backup_protocol, _P.BACKUP, (), protocol.MOVES, TELLS),
-    by_table(leading_protocol, _P.IDLE, (), protocol.MOVES, TELLS),
-    by_table(leading_protocol, _P.BUSY, (Request,), protocol.MOVES, TELLS),
-    by_table(leading_after, _A.IDLE, (), after.MOVES, TELLS),
-    by_table(leading_after, _A.CAPTURING, (Reply,), after.MOVES, TELLS),
-    by_table(backup_after, _A.STANDBY, (), after.MOVES, TELLS | {Promote}),
-    by_table(backup_after, _A.APPLYING, (Checkpoint,), after.MOVES, TELLS | {Promote}),
-    by_table(Compute, _C.IDLE, (), proceed.MOVES, TELLS),
-    by_table(Compute, _C.COMPUTING, (Request,), proceed.MOVES, TELLS),
+    by_table(backup_protocol, _P.BACKUP, (), chain.PROTOCOL_MOVES, TELLS),
+    by_table(leading_protocol, _P.IDLE, (), chain.PROTOCOL_MOVES, TELLS),
+    by_table(leading_protocol, _P.BUSY, (Request,), chain.PROTOCOL_MOVES, TELLS),
+    by_table(leading_after, _A.IDLE, (), pbr.MOVES, TELLS),
+    by_table(leading_after, _A.CAPTURING, (Reply,), pbr.MOVES, TELLS),
+    by_table(backup_after, _A.STANDBY, (), pbr.MOVES, TELLS | {Promote}),
+    by_table(backup_after, _A.APPLYING, (Checkpoint,), pbr.MOVES, TELLS | {Promote}),
+    by_table(Compute, _C.IDLE, (), chain.COMPUTE_MOVES, TELLS),
+    by_table(Compute, _C.COMPUTING, (Request,), chain.COMPUTE_MOVES, TELLS),
     by_hand("Proxy UNBOUND", Proxy, (), Rebound),
     by_hand("Proxy IDLE", bound_proxy, (), Rebound, Request),
     by_hand("Proxy WAITING", bound_proxy, (Request,), Rebound, Reply),
@@ -189,9 +184,9 @@ CASES: Final = (
         if outputs or CaptureState not in mail
         for port, legal in ports.items()
     ),
-    by_table(InnerProtocol, inner.State.IDLE, (), inner.MOVES, TELLS),
-    by_table(InnerProtocol, inner.State.BUSY, (Request,), inner.MOVES, TELLS),
-    by_table(InnerProtocol, inner.State.HANDING_ON, (TakeOver,), inner.MOVES, TELLS),
+    by_table(InnerProtocol, chain.InnerState.IDLE, (), chain.INNER_MOVES, TELLS),
+    by_table(InnerProtocol, chain.InnerState.BUSY, (Request,), chain.INNER_MOVES, TELLS),
+    by_table(InnerProtocol, chain.InnerState.HANDING_ON, (TakeOver,), chain.INNER_MOVES, TELLS),
     by_table(leading_lfr_before, _LB.LEADING, (), lfr.BEFORE_MOVES, TELLS),
     by_table(following_lfr_before, _LB.FOLLOWING, (), lfr.BEFORE_MOVES, TELLS | {Promote}),
     by_table(following_lfr_before, _LB.LEADING, (ChannelEnded, Promote), lfr.BEFORE_MOVES, TELLS),
@@ -199,18 +194,18 @@ CASES: Final = (
     by_table(following_lfr_after, _LA.FOLLOWING, (), lfr.AFTER_MOVES, TELLS),
     by_table(following_lfr_after, _LA.HOLDING, (Reply,), lfr.AFTER_MOVES, TELLS),
     by_table(following_lfr_after, _LA.LEADING, (TakeOver,), lfr.AFTER_MOVES, TELLS),
-    by_table(TrBefore, tr.BeforeState.IDLE, (), tr.BEFORE_MOVES, TELLS),
-    by_table(TrBefore, tr.BeforeState.CAPTURING, (Request,), tr.BEFORE_MOVES, TELLS),
+    by_table(TrBefore, tr.TrBeforeState.IDLE, (), tr.BEFORE_MOVES, TELLS),
+    by_table(TrBefore, tr.TrBeforeState.CAPTURING, (Request,), tr.BEFORE_MOVES, TELLS),
     by_table(TrProceed, _TP.IDLE, (), tr.PROCEED_MOVES, TELLS),
     by_table(TrProceed, _TP.FIRST, (Trial,), tr.PROCEED_MOVES, TELLS),
     by_table(TrProceed, _TP.SECOND, (Trial, Tried), tr.PROCEED_MOVES, TELLS),
     by_table(TrProceed, _TP.VOTING, (Trial, Tried, Tried), tr.PROCEED_MOVES, TELLS),
     by_table(TrProceed, _TP.THIRD, (Trial, Tried, Tried, Again), tr.PROCEED_MOVES, TELLS),
-    by_table(TrAfter, tr.AfterState.IDLE, (), tr.AFTER_MOVES, TELLS, DIFFERING),
-    by_table(TrAfter, tr.AfterState.ASKED, (DIFFERING,), tr.AFTER_MOVES, TELLS, Trials(1, 1, (TRIED,))),
+    by_table(TrAfter, tr.TrAfterState.IDLE, (), tr.AFTER_MOVES, TELLS, DIFFERING),
+    by_table(TrAfter, tr.TrAfterState.ASKED, (DIFFERING,), tr.AFTER_MOVES, TELLS, Trials(1, 1, (TRIED,))),
     by_hand("AssertBefore", AssertBefore, (), Rebound, Request, TakeOver),
-    by_table(assert_after, assertion.State.IDLE, (), assertion.MOVES, TELLS),
-    by_table(assert_after, assertion.State.HOLDING, (Reply,), assertion.MOVES, TELLS),
+    by_table(assert_after, assertion.AssertAfterState.IDLE, (), assertion.MOVES, TELLS),
+    by_table(assert_after, assertion.AssertAfterState.HOLDING, (Reply,), assertion.MOVES, TELLS),
     by_hand("Client", Client, (), Rebound, Submit),
     by_hand("Client waiting", client_that_waits, (), Rebound, Submit, Reply),
     by_hand("Client full", Client, (Submit,) * BACKLOG_MAX, Rebound, Reply),
@@ -260,18 +255,18 @@ def test_where_a_port_leads_is_nothing_to_a_brick_that_asks_nothing_again(case: 
 @pytest.mark.parametrize(
     ("name", "states"),
     [
-        ("Protocol", protocol.State),
-        ("PbrAfter", after.State),
-        ("Compute", proceed.State),
-        ("Proxy", proxy.State),
-        ("Server", server.State),
-        ("InnerProtocol", inner.State),
-        ("LfrBefore", lfr.BeforeState),
-        ("LfrAfter", lfr.AfterState),
-        ("TrBefore", tr.BeforeState),
-        ("TrProceed", tr.ProceedState),
-        ("TrAfter", tr.AfterState),
-        ("AssertAfter", assertion.State),
+        ("Protocol", chain.ProtocolState),
+        ("PbrAfter", pbr.PbrAfterState),
+        ("Compute", chain.ComputeState),
+        ("Proxy", client.ProxyState),
+        ("Server", server.ServerState),
+        ("InnerProtocol", chain.InnerState),
+        ("LfrBefore", lfr.LfrBeforeState),
+        ("LfrAfter", lfr.LfrAfterState),
+        ("TrBefore", tr.TrBeforeState),
+        ("TrProceed", tr.TrProceedState),
+        ("TrAfter", tr.TrAfterState),
+        ("AssertAfter", assertion.AssertAfterState),
     ],
 )
 def test_every_state_is_among_the_cases(name: str, states: type[BrickState]) -> None:

@@ -8,10 +8,10 @@ from samples import inspected, notes, sends
 
 from aftbed.core.brick import CONTROL
 from aftbed.core.errors import PeerError
-from aftbed.core.event import Event
-from aftbed.core.message import Promoted, Reply, Request, StoreReply, TakeOver
+from aftbed.core.events import Event
+from aftbed.core.messages import Promoted, Reply, Request, StoreReply, TakeOver
+from aftbed.ftm.chain import REPLIES_KEPT, Protocol, ProtocolState
 from aftbed.ftm.client import BACKLOG_MAX
-from aftbed.ftm.protocol import REPLIES_KEPT, Protocol, State
 
 
 def leader(answered: int = 0) -> Protocol:
@@ -68,7 +68,7 @@ def test_a_duplicate_is_answered_out_of_the_log_and_goes_no_further() -> None:
     effects = brick.step("pxy2pro", request(2), 0)
     assert sends(effects) == [("pro2pxy", Reply(1, 2, 1, b"reply 2"))]
     assert notes(effects) == [Event.DEDUPE_HIT]
-    assert brick.state is State.IDLE
+    assert brick.state is ProtocolState.IDLE
 
 
 def test_the_log_is_bounded_and_what_is_older_is_refused() -> None:

@@ -5,9 +5,9 @@ from samples import inspected, notes, sends
 
 from aftbed.core.brick import CONTROL
 from aftbed.core.errors import PeerError
-from aftbed.core.event import Event
-from aftbed.core.message import Rebound, Reply, Request
-from aftbed.ftm.proxy import Proxy
+from aftbed.core.events import Event
+from aftbed.core.messages import Rebound, Reply, Request
+from aftbed.ftm.client import Proxy
 
 
 def bound(epoch: int = 1) -> Proxy:

@@ -7,8 +7,8 @@ import pytest
 from samples import notes
 
 from aftbed.core.brick import CONTROL, Effect, Order
-from aftbed.core.event import Event
-from aftbed.core.message import Rebound, Situation, Suspect
+from aftbed.core.events import Event
+from aftbed.core.messages import Rebound, Situation, Suspect
 from aftbed.core.script import (
     Attach,
     Bind,
@@ -23,15 +23,7 @@ from aftbed.core.script import (
     Unbind,
     problems,
 )
-from aftbed.ftm.recovery import (
-    FAILURES_MAX,
-    RETRY_NS,
-    Recovery,
-    decide,
-    drop_backup,
-    failover,
-    new_backup,
-)
+from aftbed.ftm.failover import FAILURES_MAX, RETRY_NS, Recovery, decide, drop_backup, failover, new_backup
 
 PBR: Final = (("after", "aft2aft"),)
 LFR: Final = (("before", "bfr2bfr"), ("after", "aft2aft"))

@@ -6,8 +6,8 @@ from samples import STATE, inspected, notes, sends
 
 from aftbed.core.brick import CONTROL, Effect, Halt, Note
 from aftbed.core.errors import PeerError
-from aftbed.core.event import RERUN, Event
-from aftbed.core.message import (
+from aftbed.core.events import RERUN, Event
+from aftbed.core.messages import (
     CaptureState,
     Rebound,
     Reply,
@@ -18,9 +18,8 @@ from aftbed.core.message import (
     Trial,
     Tried,
 )
-from aftbed.ftm.before import PassBefore
-from aftbed.ftm.proceed import Compute
-from aftbed.ftm.server import Server, State
+from aftbed.ftm.chain import Compute, PassBefore
+from aftbed.ftm.server import Server, ServerState
 
 REQUEST = Request(2, 7, b"what")
 
@@ -183,7 +182,7 @@ def test_under_tr_only_after_a_rerun_it_is_not_known_what_comes() -> None:
 def test_a_follower_becomes_a_backup_and_a_follower_again() -> None:
     brick = bound(replica=2)
     brick.step("prd2srv", REQUEST, 0)
-    assert brick.state is State.READY
+    assert brick.state is ServerState.READY
     brick.step(CONTROL, Rebound("srv2aft", True, 2), 0)
     assert set(brick.open_ports()) == {"aft2srv", "prd2srv"}
     effects = brick.step("aft2srv", RestoreState(2, 8, STATE), 0)

@@ -5,8 +5,8 @@ from samples import STATE, inspected, notes, sends
 
 from aftbed.core.brick import Halt, Note, Send
 from aftbed.core.errors import PeerError
-from aftbed.core.event import Event
-from aftbed.core.message import (
+from aftbed.core.events import Event
+from aftbed.core.messages import (
     Again,
     CaptureState,
     Reply,
@@ -17,7 +17,7 @@ from aftbed.core.message import (
     Trials,
     Tried,
 )
-from aftbed.ftm.tr import UNDECIDED, ProceedState, TrAfter, TrBefore, TrProceed
+from aftbed.ftm.tr import UNDECIDED, TrAfter, TrBefore, TrProceed, TrProceedState
 
 REQUEST = Request(2, 7, b"what")
 TRIAL = Trial(2, 7, b"what", STATE, rerun=False)
@@ -74,7 +74,7 @@ def voting(*found: Tried) -> TrProceed:
     brick.step("bfr2prd", TRIAL, 0)
     for one in found or (RIGHT, RIGHT):
         brick.step("srv2prd", one, 0)
-    assert brick.state is ProceedState.VOTING
+    assert brick.state is TrProceedState.VOTING
     return brick
 
 

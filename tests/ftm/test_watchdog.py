@@ -6,9 +6,9 @@ import pytest
 from samples import notes, sends
 
 from aftbed.core.brick import CONTROL, Effect
-from aftbed.core.event import Event
-from aftbed.core.message import NodeDied, Pulses, Rebound, Suspect, Watch
-from aftbed.ftm.watchdog import HANG_DEADLINE_NS, LATE_NS_MAX, PERIOD_NS, Watchdog
+from aftbed.core.events import Event
+from aftbed.core.messages import NodeDied, Pulses, Rebound, Suspect, Watch
+from aftbed.ftm.failover import HANG_DEADLINE_NS, LATE_NS_MAX, PERIOD_NS, Watchdog
 
 NODES: Final = ("a/protocol", "a/server")
 START_NS: Final = 10**12

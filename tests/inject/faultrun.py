@@ -9,9 +9,9 @@ from typing import Final
 
 import pytest
 
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.core.fault import Fault
-from aftbed.ftm.mechanism import build
+from aftbed.ftm.compose import build
 from aftbed.inject.words import parse
 from aftbed.runtime import control
 from aftbed.runtime.faults import Faults

@@ -3,7 +3,7 @@
 from hypothesis import strategies as st
 
 from aftbed.core.busfault import QUANTITIES, Condition
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.core.fault import (
     HANG_FOREVER_MS,
     LATER,

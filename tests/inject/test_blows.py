@@ -15,10 +15,10 @@ from msgspec import structs
 
 from aftbed.core.brick import Brick, Effect, Note, Send
 from aftbed.core.errors import PeerError
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.core.fault import Crash, Hang, mark, marked
 from aftbed.core.journal import Record, records
-from aftbed.core.message import AnyMessage, CaptureState, Message, Reply, Request, StateCaptured, Tried
+from aftbed.core.messages import AnyMessage, CaptureState, Message, Reply, Request, StateCaptured, Tried
 from aftbed.core.valuefault import EXECUTED, Bit, Flip, Place, flipped
 from aftbed.runtime import control
 from aftbed.runtime.orders import carry_out

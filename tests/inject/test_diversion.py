@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from aftbed.core.fault import Disturb, How
-from aftbed.core.message import CaptureState, Message
+from aftbed.core.messages import CaptureState, Message
 from aftbed.core.persistence import ONCE, Every, Permanent, Persistence
 from aftbed.runtime import control
 from aftbed.runtime.diversion import BITTEN, STRUCK, Diversion, Meddler

@@ -6,7 +6,7 @@ The rest is in `test_faults`.
 import pytest
 from faultrun import FIRST, FakeProcess, Run, run
 
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.core.fault import mark
 from aftbed.runtime import control
 from aftbed.runtime import faults as faults_module

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from faultrun import FIRST, Run, run
 
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.runtime import control
 from aftbed.runtime.jobs import StepFailed
 

@@ -14,12 +14,12 @@ from typing import Final
 
 import pytest
 
-from aftbed.core import wire
+from aftbed.core import messages
 from aftbed.core.brick import Brick, Effect, Send
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.core.fault import Disturb, How, marked
 from aftbed.core.journal import FLAG_OFFSET, records
-from aftbed.core.message import AnyMessage, Request
+from aftbed.core.messages import AnyMessage, Request
 from aftbed.core.persistence import Permanent
 from aftbed.runtime import control
 from aftbed.runtime.orders import carry_out
@@ -54,7 +54,7 @@ class Passing(Brick):
     def capture(self) -> bytes:
         while True:
             try:
-                message = wire.decode(self.reader.recv(wire.PACKET_BYTES_MAX))
+                message = messages.decode(self.reader.recv(messages.PACKET_BYTES_MAX))
             except BlockingIOError:
                 return bytes(self.got)
             assert isinstance(message, Request)
@@ -81,7 +81,7 @@ class Host:
         self.node.bind_output(BRICK, PORT, self.writer, 1)
 
     def fill(self) -> None:
-        data = wire.encode(FILLER)
+        data = messages.encode(FILLER)
         try:
             while True:
                 os.write(self.writer, data)
@@ -180,7 +180,7 @@ def test_where_the_port_is_bound_elsewhere_meanwhile_it_is_not_sent(host: Host) 
     with pytest.raises(BlockingIOError):
         reader.recv(1)
     host.send(2)
-    assert wire.decode(reader.recv(wire.PACKET_BYTES_MAX)) == Request(1, 2, b"")
+    assert messages.decode(reader.recv(messages.PACKET_BYTES_MAX)) == Request(1, 2, b"")
     reader.close()
     host.writer = host.node.wiring.hosted[BRICK].outs[PORT]  # type: ignore[assignment]
 

@@ -16,7 +16,7 @@ CLOSED: Final = "aftbed.vehicle.variants:WithoutStateAccess"
 CAUTIOUS: Final = "aftbed.vehicle.variants:Cautious"
 BRICK: Final = """\
 from aftbed.core.graph import Kind
-from aftbed.ftm.proceed import Compute
+from aftbed.ftm.chain import Compute
 
 class Counting(Compute):
     KIND = Kind("counting", ("bfr2prd", "srv2prd"), ("prd2srv", "prd2aft"))

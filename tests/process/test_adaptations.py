@@ -15,8 +15,8 @@ from liveruns import Home, Outcome, Started, until
 from aftbed.core.errors import ConfigError
 from aftbed.core.fault import Fault
 from aftbed.core.journal import EntryKind
-from aftbed.core.message import Goal
-from aftbed.ftm.mechanism import EXPRESSIONS, NONE, build
+from aftbed.core.messages import Goal
+from aftbed.ftm.compose import EXPRESSIONS, NONE, build
 from aftbed.runtime.unix import ask
 from aftbed.runtime.unix.options import LoadRun
 
@@ -109,8 +109,8 @@ def test_every_way_from_mechanism_to_mechanism(
 # -- bricks designed off line ---------------------------------------------------------------------
 
 TEMPLATE: Final = """
-from aftbed.ftm.catalog import KINDS
-from aftbed.ftm.proceed import Compute
+from aftbed.ftm.registry import KINDS
+from aftbed.ftm.chain import Compute
 
 class Mine:
     KIND = KINDS[{kind!r}]

@@ -5,7 +5,7 @@ import time
 import pytest
 from liveruns import Home, Started, until
 
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.core.journal import EntryKind
 from aftbed.inject.words import parse
 from aftbed.runtime.unix import ask

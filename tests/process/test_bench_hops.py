@@ -11,8 +11,8 @@ import pytest
 from liveruns import Home, aftbed
 
 from aftbed.bench.hops import PLACEMENT, Pair, delays_ns, nearest, single_hops, undisturbed
-from aftbed.core.event import Event
-from aftbed.ftm.mechanism import EXPRESSIONS, build
+from aftbed.core.events import Event
+from aftbed.ftm.compose import EXPRESSIONS, build
 
 REQUESTS: Final = 100
 PBR_PAIRS: Final = [

@@ -17,10 +17,10 @@ from sampling import sampled
 
 from aftbed.campaign.record import RunRecord, read_record
 from aftbed.campaign.verdict import Verdict
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.core.graph import PLACEMENTS
 from aftbed.core.journal import Record
-from aftbed.ftm.mechanism import EXPRESSIONS, replication_of
+from aftbed.ftm.compose import EXPRESSIONS, replication_of
 from aftbed.inject.words import parse
 from aftbed.runtime.unix import ask, rundir
 from aftbed.runtime.unix.options import LoadRun

@@ -17,7 +17,7 @@ from liveruns import WAIT_SECONDS_MAX, Done, Home, aftbed
 from aftbed.adapt.observer import Seen
 from aftbed.core import journal
 from aftbed.core.errors import PeerError
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.core.journal import RECORD, Record
 from aftbed.runtime.adaptations import Outcome
 from aftbed.runtime.unix.closedloop import Proposed, load_policy, policy_names, read_proposals

@@ -10,7 +10,7 @@ from typing import Final
 import pytest
 from liveruns import Home, Started, aftbed, under_load, until
 
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.core.fault import FlipMemory
 from aftbed.core.journal import EntryKind
 from aftbed.inject.words import parse

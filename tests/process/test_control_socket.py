@@ -13,8 +13,8 @@ from liveruns import Home, Started, under_load, until
 
 from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.core.fault import Crash, Fault, Hang, Trigger
-from aftbed.core.wire import PACKET_BYTES_MAX
-from aftbed.ftm.mechanism import build
+from aftbed.core.messages import PACKET_BYTES_MAX
+from aftbed.ftm.compose import build
 from aftbed.runtime import targets
 from aftbed.runtime.unix import ask, rundir
 

@@ -11,7 +11,7 @@ from liveruns import aftbed
 from sampling import every
 
 from aftbed.campaign.verdict import Verdict
-from aftbed.core.event import REQUEST_PATH
+from aftbed.core.events import REQUEST_PATH
 
 pytestmark = pytest.mark.process
 

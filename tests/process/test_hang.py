@@ -12,9 +12,9 @@ import pytest
 from liveruns import Home, Outcome, Started, ended, state_of, under_load, until
 from sampling import every
 
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.core.fault import Fault, Hang, Trigger
-from aftbed.ftm.mechanism import build
+from aftbed.ftm.compose import build
 from aftbed.runtime.unix import ask
 from aftbed.runtime.unix.options import LoadRun
 

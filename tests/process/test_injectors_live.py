@@ -6,7 +6,7 @@ from typing import Final
 import pytest
 from liveruns import Home, Outcome, Started, aftbed, under_load
 
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.core.fault import marked
 from aftbed.core.journal import EntryKind
 from aftbed.inject.words import parse

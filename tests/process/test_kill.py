@@ -23,7 +23,7 @@ from liveruns import (
 from sampling import every
 
 from aftbed.core.journal import EntryKind
-from aftbed.ftm.mechanism import build
+from aftbed.ftm.compose import build
 from aftbed.runtime.unix import ask
 from aftbed.runtime.unix.options import LoadRun
 from aftbed.vehicle.candump import LogCounts, Refusal, parse_lines

@@ -7,7 +7,7 @@ from typing import Final
 import pytest
 from liveruns import Home, Outcome, Started, aftbed, under_load, until
 
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.inject.words import parse
 from aftbed.runtime.unix import ask
 from aftbed.runtime.unix.cells import NAME

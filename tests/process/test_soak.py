@@ -14,7 +14,7 @@ import pytest
 from liveruns import LOOK_SECONDS, Home, Started, until
 
 from aftbed.core.fault import Crash, Fault, Trigger
-from aftbed.core.message import Goal
+from aftbed.core.messages import Goal
 from aftbed.runtime.unix import ask
 from aftbed.runtime.unix.options import LoadRun
 

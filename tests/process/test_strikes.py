@@ -28,9 +28,9 @@ from test_adaptations import (
 
 from aftbed.campaign.explore import WHEN, Strike, strikes
 from aftbed.core.errors import ConfigError, HarnessError
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.core.fault import Crash, Fault, Trigger
-from aftbed.core.message import Goal
+from aftbed.core.messages import Goal
 from aftbed.runtime.targets import STAGED
 from aftbed.runtime.unix import ask
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from aftbed.core.application import Application, Characteristics, Field, Width, field_named, fields_of
 from aftbed.core.errors import ConfigError, PeerError
 from aftbed.core.valuefault import Bit, Bits, Burst, Byte, Flip, Pattern, Place, Stuck, flipped
-from aftbed.ftm.mechanism import build
+from aftbed.ftm.compose import build
 from aftbed.inject.words import parse
 from aftbed.runtime.cell import CELL_BYTES, InCell, check_field, differing
 from aftbed.runtime.targets import check, waits_in

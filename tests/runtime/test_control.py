@@ -18,7 +18,7 @@ from aftbed.core import script
 from aftbed.core.busfault import BusFault, Condition
 from aftbed.core.errors import PeerError
 from aftbed.core.fault import Crash, Fault, Hang, Trigger
-from aftbed.core.wire import PACKET_BYTES_MAX
+from aftbed.core.messages import PACKET_BYTES_MAX
 from aftbed.inject.buswords import parse
 from aftbed.runtime import control
 from aftbed.runtime.unix.line import FDS_MAX, Line, decode_order, decode_report

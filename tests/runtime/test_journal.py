@@ -7,7 +7,7 @@ from typing import Final
 
 import pytest
 
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.core.journal import (
     FLAG_OFFSET,
     HEADER_BYTES,

@@ -11,7 +11,7 @@ from typing import Final
 import pytest
 
 from aftbed.core.brick import Brick, Effect
-from aftbed.core.message import AnyMessage
+from aftbed.core.messages import AnyMessage
 from aftbed.runtime.unix.journal import Header, Journal
 from aftbed.runtime.unix.line import Line, decode_order
 from aftbed.runtime.unix.linux import set_timeouts

@@ -5,11 +5,11 @@ import re
 import pytest
 
 from aftbed.core.errors import ConfigError
-from aftbed.core.event import REQUEST_PATH, Event
+from aftbed.core.events import REQUEST_PATH, Event
 from aftbed.core.fault import Crash, Disturb, Fault, How, Slow, Trigger
 from aftbed.core.graph import PLACEMENTS
 from aftbed.core.valuefault import BIT_MAX, EXECUTED, Bit, Bits, Burst, Byte, Flip, Place, Stuck
-from aftbed.ftm.mechanism import DUPLEX, EXPRESSIONS, build
+from aftbed.ftm.compose import DUPLEX, EXPRESSIONS, build
 from aftbed.inject.words import parse
 from aftbed.runtime.targets import OTHERS, SUPERVISOR, check, emitter, emitters_in, waits_in
 

@@ -33,11 +33,10 @@ from planting import (
 from aftbed.adapt.engine import AdaptationEngine
 from aftbed.core import script
 from aftbed.core.graph import Graph
-from aftbed.core.message import Rebound, TakeUp
+from aftbed.core.messages import Rebound, TakeUp
 from aftbed.core.valuefault import Place
-from aftbed.ftm import recovery
-from aftbed.ftm.recovery import Recovery
-from aftbed.ftm.watchdog import Watchdog
+from aftbed.ftm import failover
+from aftbed.ftm.failover import Recovery, Watchdog
 from aftbed.runtime import exchange, transfer
 from aftbed.runtime.adaptations import Adaptations
 from aftbed.runtime.deployment import Deployment, Keys
@@ -187,7 +186,7 @@ EXECUTIVE: Final = (
     Mutant(
         "same epoch again",
         "Recovery has a backup lead under the epoch of the dead leader",
-        wrapped(recovery, "failover", _same_epoch),
+        wrapped(failover, "failover", _same_epoch),
         CRASH,
         crashes("pbr", "a/proceed"),
         "G2",
@@ -363,7 +362,7 @@ EXECUTIVE: Final = (
     Mutant(
         "redundancy not restored",
         "Recovery is content with a leader alone",
-        instead(recovery, "new_backup", lambda *args: None),
+        instead(failover, "new_backup", lambda *args: None),
         CRASH,
         crashes("pbr", "b/after"),
         "rest",

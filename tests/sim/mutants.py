@@ -36,8 +36,8 @@ from planting import (
 )
 
 from aftbed.core.brick import Effect, Note, Send
-from aftbed.core.event import Event
-from aftbed.core.message import (
+from aftbed.core.events import Event
+from aftbed.core.messages import (
     ChannelEnded,
     Checkpoint,
     Rebound,
@@ -49,32 +49,31 @@ from aftbed.core.message import (
     Watch,
 )
 from aftbed.core.valuefault import Place
-from aftbed.ftm import protocol, proxy, tr
-from aftbed.ftm.after import PbrAfter
+from aftbed.ftm import chain, client, tr
 from aftbed.ftm.assertion import Acceptable, AssertAfter
-from aftbed.ftm.client import Client
+from aftbed.ftm.chain import Protocol
+from aftbed.ftm.client import Client, Proxy
+from aftbed.ftm.failover import Watchdog
 from aftbed.ftm.lfr import LfrAfter, LfrBefore
-from aftbed.ftm.protocol import Protocol
-from aftbed.ftm.proxy import Proxy
+from aftbed.ftm.pbr import PbrAfter
 from aftbed.ftm.server import Server
 from aftbed.ftm.tr import TrAfter
-from aftbed.ftm.watchdog import Watchdog
 from aftbed.runtime.sim.world import Setup
 
 
 def _log_ignored(right: object) -> object:
     def admit(self: Protocol, msg: Request) -> list[Effect]:
-        self.state, self.busy_id = protocol.State.BUSY, msg.request_id
+        self.state, self.busy_id = chain.ProtocolState.BUSY, msg.request_id
         return [Note(Event.REQUEST_RECEIVED, msg.request_id), Send("pro2bfr", msg)]
 
     return admit
 
 
 def _two_at_once() -> Plant:
-    busy = protocol.State.BUSY
+    busy = chain.ProtocolState.BUSY
     return both(
-        entered(protocol.OPEN, {busy: ("aft2pro", "pxy2pro")}),
-        entered(protocol.MOVES, {(busy, Request): busy}),
+        entered(chain.PROTOCOL_OPEN, {busy: ("aft2pro", "pxy2pro")}),
+        entered(chain.PROTOCOL_MOVES, {(busy, Request): busy}),
     )
 
 
@@ -110,7 +109,7 @@ def _any_epoch(right: object) -> object:
         assert self.waiting is not None
         if msg.request_id != self.waiting.request_id:
             return []
-        self.state, self.waiting = proxy.State.IDLE, None
+        self.state, self.waiting = client.ProxyState.IDLE, None
         accepted = Note(Event.REPLY_ACCEPTED, msg.request_id, msg.epoch << 8 | msg.replica)
         return [accepted, Send("pxy2clt", msg)]
 
@@ -145,7 +144,7 @@ def _minority(right: object) -> object:
     def settle(self: TrAfter, msg: Trials) -> list[Effect]:
         (third,) = msg.tried
         wrong = next((t for t in self._held if not tr.equal(t, third)), third)
-        self.state, self._held = tr.AfterState.IDLE, ()
+        self.state, self._held = tr.TrAfterState.IDLE, ()
         return self._answer(wrong, 3)
 
     return settle

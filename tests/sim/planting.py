@@ -13,7 +13,7 @@ import msgspec
 from aftbed.campaign import explore
 from aftbed.core.brick import Brick, Effect
 from aftbed.core.fault import Crash, Fault, Hang, Trigger
-from aftbed.core.message import Goal, Scheduled
+from aftbed.core.messages import Goal, Scheduled
 from aftbed.core.valuefault import Bit, Flip, Place
 from aftbed.runtime.sim.world import Setup
 

@@ -7,7 +7,7 @@ import pytest
 from aftbed.campaign.shrink import shrink
 from aftbed.campaign.simulated import Breach
 from aftbed.core.errors import ConfigError
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.core.journal import EntryKind
 from aftbed.inject.words import parse
 from aftbed.runtime.sim.world import Run, Setup, World, simulate

@@ -19,11 +19,11 @@ from msgspec.structs import replace
 
 from aftbed.campaign.simulated import breaches
 from aftbed.core import check
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.core.fault import FIRED, Crash, Fault, Trigger
 from aftbed.core.journal import EntryKind
 from aftbed.core.valuefault import EXECUTED, Bit, Flip, Place
-from aftbed.ftm.mechanism import EXPRESSIONS, build, chain, parse, replication_of
+from aftbed.ftm.compose import EXPRESSIONS, build, chain, parse, replication_of
 from aftbed.runtime.sim.clock import Clock
 from aftbed.runtime.sim.processes import Process
 from aftbed.runtime.sim.world import Doom, Run, Setup, World

@@ -8,7 +8,7 @@ from planting import adapted, crash_after
 
 from aftbed.campaign.simulated import breaches
 from aftbed.core import script
-from aftbed.core.message import Goal, Scheduled
+from aftbed.core.messages import Goal, Scheduled
 from aftbed.runtime.rewiring import Told, Wires
 from aftbed.runtime.sim.world import Setup, simulate
 

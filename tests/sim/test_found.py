@@ -6,7 +6,7 @@ import pytest
 
 from aftbed.campaign.explore import attempt
 from aftbed.core.fault import Crash, Disturb, Fault, Hang, How, Trigger
-from aftbed.core.message import Goal, Scheduled
+from aftbed.core.messages import Goal, Scheduled
 from aftbed.core.valuefault import Bit, Flip, Place
 from aftbed.runtime.sim.world import Setup
 

@@ -22,7 +22,7 @@ from counting import Counting
 from whiteboard import Whiteboard
 
 from aftbed.core import check
-from aftbed.core.message import Goal, NodeDied
+from aftbed.core.messages import Goal, NodeDied
 from aftbed.inject.words import parse
 from aftbed.runtime.sim.node import Node
 from aftbed.runtime.sim.processes import Process

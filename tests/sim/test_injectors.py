@@ -10,10 +10,10 @@ from typing import Final
 import pytest
 
 from aftbed.campaign.value import corruptions
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.core.fault import marked
 from aftbed.core.journal import EntryKind
-from aftbed.core.message import Goal, Scheduled
+from aftbed.core.messages import Goal, Scheduled
 from aftbed.inject.words import parse
 from aftbed.runtime import targets
 from aftbed.runtime.sim.givens import graph_of

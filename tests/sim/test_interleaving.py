@@ -10,8 +10,8 @@ from aftbed.campaign.orders import all_orders, experiments
 from aftbed.campaign.simulated import breaches
 from aftbed.core.brick import Brick, Effect, Note
 from aftbed.core.graph import BrickSpec
-from aftbed.core.message import AnyMessage
-from aftbed.ftm.catalog import Setting
+from aftbed.core.messages import AnyMessage
+from aftbed.ftm.registry import Setting
 from aftbed.runtime.sim.clock import Clock
 from aftbed.runtime.sim.interleaving import Chooser, HeldChannel, orders
 from aftbed.runtime.sim.world import Doom, Setup, World

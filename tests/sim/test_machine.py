@@ -18,12 +18,12 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 
 from aftbed.campaign.simulated import breaches
 from aftbed.core.errors import ConfigError
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.core.fault import Crash, Fault, Hang, Trigger
 from aftbed.core.journal import EntryKind
-from aftbed.core.message import Goal, NodeDied
+from aftbed.core.messages import Goal, NodeDied
 from aftbed.core.valuefault import EXECUTED, Bit, Flip, Place
-from aftbed.ftm.mechanism import EXPRESSIONS, NONE, parse, replication_of
+from aftbed.ftm.compose import EXPRESSIONS, NONE, parse, replication_of
 from aftbed.runtime.rewiring import replica_of
 from aftbed.runtime.sim.processes import Process
 from aftbed.runtime.sim.world import Setup, World

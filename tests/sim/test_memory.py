@@ -5,7 +5,7 @@ from typing import Final
 import pytest
 
 from aftbed.campaign.value import corruptions
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.inject.words import parse
 from aftbed.runtime import targets
 from aftbed.runtime.sim.givens import graph_of

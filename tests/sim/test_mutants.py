@@ -13,7 +13,7 @@ from mutants import MECHANISMS
 from planting import EXPLORERS, Mutant, flip, instead
 
 from aftbed.campaign.simulated import Breach, breaches
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.core.valuefault import Place
 from aftbed.ftm import lfr
 from aftbed.runtime.sim.world import Setup, simulate

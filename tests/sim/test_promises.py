@@ -14,10 +14,10 @@ from planting import flip
 from aftbed.campaign.simulated import ASSERT, REST, breaches, outcome, struck_down
 from aftbed.campaign.wholeness import half_a_graph
 from aftbed.core.check import missing
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.core.journal import Entry, EntryKind, Record
 from aftbed.core.valuefault import Place
-from aftbed.ftm.mechanism import build
+from aftbed.ftm.compose import build
 from aftbed.runtime.adaptations import Outcome
 from aftbed.runtime.sim.world import Run, Setup, simulate
 

@@ -4,7 +4,7 @@ from typing import Final
 
 import pytest
 
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.core.journal import EntryKind
 from aftbed.inject.words import parse
 from aftbed.runtime.sim.hindrance import STEP_NS

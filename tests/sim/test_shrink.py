@@ -14,10 +14,10 @@ from aftbed.campaign.swarm import drawn, experiments
 from aftbed.core.brick import Brick, Effect
 from aftbed.core.fault import Crash, Fault, Hang, Trigger
 from aftbed.core.graph import BrickSpec
-from aftbed.core.message import Goal, Scheduled, StateCaptured
+from aftbed.core.messages import Goal, Scheduled, StateCaptured
 from aftbed.core.valuefault import Flip, Place
-from aftbed.ftm.after import PbrAfter
-from aftbed.ftm.catalog import Setting, make
+from aftbed.ftm.pbr import PbrAfter
+from aftbed.ftm.registry import Setting, make
 from aftbed.runtime.sim.world import Doom, Setup, World
 
 Broken = Callable[[Setup], tuple[Breach, ...]]

@@ -10,7 +10,7 @@ from aftbed.campaign.simulated import breaches
 from aftbed.campaign.succession import succession
 from aftbed.core.check import wrong_replies
 from aftbed.core.fault import Crash, Fault, Trigger
-from aftbed.core.message import Goal, Scheduled
+from aftbed.core.messages import Goal, Scheduled
 from aftbed.runtime.sim.world import Doom, Run, Setup, World
 from aftbed.runtime.unix.part import load_module
 from aftbed.vehicle.function import default_application

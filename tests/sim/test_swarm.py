@@ -11,10 +11,10 @@ from msgspec import json
 from aftbed.campaign import swarm
 from aftbed.campaign.explore import attempt
 from aftbed.campaign.swarm import drawn, experiments
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.core.fault import Crash, Disturb, Hang, Slow
 from aftbed.core.valuefault import Flip
-from aftbed.ftm.mechanism import build, parse, replication_of
+from aftbed.ftm.compose import build, parse, replication_of
 from aftbed.runtime import targets
 from aftbed.runtime.rewiring import replica_of
 from aftbed.runtime.sim.world import Setup, simulate

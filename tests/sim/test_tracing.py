@@ -9,7 +9,7 @@ import pytest
 
 from aftbed.campaign.swarm import drawn
 from aftbed.core.fault import Crash, Fault, Trigger
-from aftbed.core.message import Checkpoint, Goal, Scheduled, Trials, Tried
+from aftbed.core.messages import Checkpoint, Goal, Scheduled, Trials, Tried
 from aftbed.runtime.sim.tracing import Sent, brief, lines, milliseconds, traced
 from aftbed.runtime.sim.world import Setup, simulate
 

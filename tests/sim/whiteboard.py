@@ -15,10 +15,10 @@ from typing import Final
 from counting import Counting
 
 from aftbed.core import script
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.core.fault import marked
 from aftbed.core.journal import EntryKind, Record
-from aftbed.core.message import Message, Notification, Suspect, TakeOver, Trial, Trials
+from aftbed.core.messages import Message, Notification, Suspect, TakeOver, Trial, Trials
 from aftbed.core.script import Phase
 from aftbed.runtime import control
 from aftbed.runtime.sim.channels import Channel

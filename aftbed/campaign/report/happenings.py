@@ -11,11 +11,11 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import Final, NamedTuple
 
 from aftbed.campaign import diagram
-from aftbed.core.event import REQUEST_PATH, Event
+from aftbed.core.events import REQUEST_PATH, Event
 from aftbed.core.fault import marked
 from aftbed.core.journal import Record
-from aftbed.core.message import Message
-from aftbed.ftm.mechanism import build
+from aftbed.core.messages import Message
+from aftbed.ftm.compose import build
 from aftbed.runtime.adaptations import FIRST_TRIGGER
 from aftbed.runtime.sim.tracing import STRUCK, Happening, Sent, Told, Trace
 

@@ -15,7 +15,7 @@ from typing import Final, NamedTuple
 from aftbed.campaign.diagram import FIRST_FAULT
 from aftbed.campaign.record import RunRecord
 from aftbed.campaign.report.happenings import DUE, STEPS, USUAL
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.core.fault import marked
 from aftbed.core.journal import Record
 from aftbed.runtime.adaptations import FIRST_TRIGGER

@@ -17,7 +17,7 @@ from typing import Final, NamedTuple
 
 from aftbed.campaign.record import RunRecord
 from aftbed.campaign.runfiles.happened import Kind, journals, kind_of
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 
 LEAST_NS, MOST_NS = 1_000, 200_000
 LED_TO: Final[dict[tuple[Event, Event], str]] = {  # the cause, what followed: the channel

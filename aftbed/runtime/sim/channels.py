@@ -10,7 +10,7 @@ from collections import deque
 from typing import TYPE_CHECKING, Final
 
 from aftbed.core.graph import Link
-from aftbed.core.message import Message
+from aftbed.core.messages import Message
 from aftbed.runtime.sim.clock import Clock
 
 if TYPE_CHECKING:

@@ -7,9 +7,9 @@ from typing import Protocol
 import msgspec
 
 from aftbed.core.journal import EntryKind
-from aftbed.core.message import NodeDied, Pulses, Reply, Submit
+from aftbed.core.messages import NodeDied, Pulses, Reply, Submit
 from aftbed.ftm.client import BACKLOG_MAX, Client
-from aftbed.ftm.watchdog import PERIOD_NS
+from aftbed.ftm.failover import PERIOD_NS
 from aftbed.runtime.source import Dialogue
 from aftbed.vehicle.virtual import VirtualCar
 

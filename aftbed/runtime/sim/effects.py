@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from aftbed.core.brick import Brick, Effect, Note, Send
 from aftbed.core.journal import Record
-from aftbed.core.message import Message
+from aftbed.core.messages import Message
 from aftbed.runtime.blows import fire
 from aftbed.runtime.orders import order_or_halt
 from aftbed.runtime.sim.channels import Channel

@@ -7,7 +7,7 @@ import contextlib
 
 from aftbed.core.errors import PeerError
 from aftbed.ftm.client import Client
-from aftbed.ftm.mechanism import replication_of
+from aftbed.ftm.compose import replication_of
 from aftbed.runtime.cell import look
 from aftbed.runtime.conductor import Conductor
 from aftbed.runtime.deployment import Deployment

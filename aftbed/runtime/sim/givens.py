@@ -5,11 +5,11 @@ from typing import Final, NoReturn
 
 from aftbed.core.busfault import BusFault
 from aftbed.core.errors import ConfigError
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.core.fault import Fault, FlipMemory
 from aftbed.core.graph import Graph
 from aftbed.core.journal import Record
-from aftbed.ftm.mechanism import build
+from aftbed.ftm.compose import build
 from aftbed.vehicle.dbcfile import Codec, load_dbc
 from aftbed.vehicle.function import sample_requests
 from aftbed.vehicle.scenario import load_scenario

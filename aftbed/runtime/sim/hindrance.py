@@ -10,8 +10,8 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Final
 
 from aftbed.core.brick import CONTROL
-from aftbed.core.event import Event
-from aftbed.core.message import AnyMessage, Message
+from aftbed.core.events import Event
+from aftbed.core.messages import AnyMessage, Message
 from aftbed.runtime.blows import OFF_THE_FAST_WAY, Slowness
 from aftbed.runtime.diversion import Sender, follow
 from aftbed.runtime.sim.channels import QUEUE_MAX, Channel

@@ -16,7 +16,7 @@ from random import Random
 from typing import Final
 
 from aftbed.core.graph import Link
-from aftbed.core.message import Message
+from aftbed.core.messages import Message
 from aftbed.runtime.sim.channels import QUEUE_MAX, Channel
 from aftbed.runtime.sim.clock import Call, Clock, Line
 

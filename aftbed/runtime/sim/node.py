@@ -14,9 +14,9 @@ from typing import Final
 
 from aftbed.core.brick import CONTROL, Brick
 from aftbed.core.errors import PeerError
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.core.journal import Record
-from aftbed.core.message import Adapted, AnyMessage, ChannelEnded, Message, Promoted, Rebound, Reply
+from aftbed.core.messages import Adapted, AnyMessage, ChannelEnded, Message, Promoted, Rebound, Reply
 from aftbed.runtime import control
 from aftbed.runtime.diversion import Diversion
 from aftbed.runtime.orders import carry_out

@@ -18,7 +18,7 @@ import msgspec
 
 from aftbed.core.graph import Link
 from aftbed.core.journal import Entry, EntryKind, Record
-from aftbed.core.message import Message
+from aftbed.core.messages import Message
 from aftbed.runtime.assembly import Make
 from aftbed.runtime.sim.channels import Channel
 from aftbed.runtime.sim.clock import START_NS, Clock

@@ -18,7 +18,7 @@ from aftbed.core.check import History
 from aftbed.core.fault import Fault, FlipMemory
 from aftbed.core.graph import Graph, Link
 from aftbed.core.journal import Entry, EntryKind, Record
-from aftbed.core.message import Goal, Scheduled
+from aftbed.core.messages import Goal, Scheduled
 from aftbed.core.valuefault import Flip
 from aftbed.ftm.client import Client
 from aftbed.runtime import control, targets

@@ -11,7 +11,7 @@ import msgspec
 
 from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.core.fault import Fault
-from aftbed.core.message import Goal
+from aftbed.core.messages import Goal
 from aftbed.runtime.unix import rundir
 from aftbed.runtime.unix.line import Line
 from aftbed.runtime.unix.resources import Row

@@ -35,14 +35,14 @@ from typing import Final, Literal
 import msgspec
 
 from aftbed.adapt import observer
-from aftbed.adapt.consistency import unsuitable
 from aftbed.adapt.observer import Declined, Measured, Observation, Observer, Proposal, Running, Seen
 from aftbed.adapt.policy import Beyond, Policy, PolicyFile, policy_from
+from aftbed.adapt.suitability import unsuitable
 from aftbed.core.application import Characteristics
 from aftbed.core.errors import AftbedError, ConfigError, PeerError, unknown
 from aftbed.core.journal import Record
-from aftbed.core.message import Goal
-from aftbed.ftm.mechanism import NONE
+from aftbed.core.messages import Goal
+from aftbed.ftm.compose import NONE
 from aftbed.runtime.adaptations import Outcome
 from aftbed.runtime.unix import ask
 from aftbed.runtime.unix.observation import MEASURED, Journals, Lines, Meter, lost

@@ -13,9 +13,9 @@ from typing import Final, Protocol
 import msgspec
 
 from aftbed.core.journal import Entry, entries
-from aftbed.core.message import NodeDied, Pulses, Reply, Submit
+from aftbed.core.messages import NodeDied, Pulses, Reply, Submit
 from aftbed.ftm.client import Client
-from aftbed.ftm.watchdog import PERIOD_NS
+from aftbed.ftm.failover import PERIOD_NS
 from aftbed.runtime.source import Load, resume_client
 from aftbed.runtime.unix import linux
 from aftbed.runtime.unix.journal import Dialogue, Header

@@ -8,7 +8,7 @@ import msgspec
 
 from aftbed.core.busfault import NODES
 from aftbed.core.journal import EntryKind
-from aftbed.core.message import Reply, Submit
+from aftbed.core.messages import Reply, Submit
 from aftbed.ftm.client import BACKLOG_MAX, Client
 from aftbed.runtime.source import resume_client
 from aftbed.runtime.unix.devices import told

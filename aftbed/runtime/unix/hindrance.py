@@ -17,11 +17,11 @@ import contextlib
 import time
 from typing import TYPE_CHECKING, Final
 
-from aftbed.core import wire
+from aftbed.core import messages
 from aftbed.core.brick import CONTROL, Brick, Effect
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.core.fault import SLOW_MS_MAX
-from aftbed.core.message import AnyMessage, Message
+from aftbed.core.messages import AnyMessage, Message
 from aftbed.runtime.blows import OFF_THE_FAST_WAY, Slowness
 from aftbed.runtime.diversion import follow
 from aftbed.runtime.unix import packets
@@ -117,16 +117,16 @@ class Hindrance:
     def _put(self, hosted: Hosted, port: str, message: Message) -> None:
         self._send(hosted, port, self._host.diverted[hosted.name, port].take(message, time.monotonic_ns()))
 
-    def _send(self, hosted: Hosted, port: str, messages: list[Message]) -> None:
+    def _send(self, hosted: Hosted, port: str, mail: list[Message]) -> None:
         """Behind the diversion, which may be lifted while there is no room."""
         out = self._laid[hosted.name, port]
-        for message in messages:
+        for message in mail:
             if self.beneath(hosted, port) is not out:
                 return  # bound elsewhere meanwhile: the brick has heard of it, and has asked again
             try:
                 _write(out, message)
             except OSError:
-                self._node.write_hard(hosted, port, wire.encode_unchecked(message))
+                self._node.write_hard(hosted, port, messages.encode_unchecked(message))
         diversion = self._host.diverted.get((hosted.name, port))
         if diversion is not None and diversion.over:
             self.lift(hosted.name, port)
@@ -166,6 +166,6 @@ class Hindrance:
 def _write(out: Output, message: Message) -> None:
     """Raises OSError as write(2) does."""
     if isinstance(out, int):
-        packets.put(out, wire.encode_unchecked(message))
+        packets.put(out, messages.encode_unchecked(message))
     else:
         out(message)

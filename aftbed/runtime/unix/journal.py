@@ -13,7 +13,7 @@ from typing import Final
 
 from aftbed.core import journal as layout
 from aftbed.core.errors import PeerError
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.runtime.unix import linux
 
 CHUNK_BYTES: Final = 1 << 20

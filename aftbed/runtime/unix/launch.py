@@ -23,7 +23,7 @@ import msgspec
 from aftbed import __version__
 from aftbed.core.errors import ConfigError
 from aftbed.core.fault import Fault
-from aftbed.core.message import Scheduled
+from aftbed.core.messages import Scheduled
 from aftbed.runtime import control
 from aftbed.runtime.unix import linux, members, rundir
 from aftbed.runtime.unix.busaim import aim

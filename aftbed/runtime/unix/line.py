@@ -13,7 +13,7 @@ from typing import Final, Generic, TypeVar
 import msgspec
 
 from aftbed.core.errors import PeerError
-from aftbed.core.wire import PACKET_BYTES_MAX, UNREADABLE
+from aftbed.core.messages import PACKET_BYTES_MAX, UNREADABLE
 from aftbed.runtime.control import FromNode, ToNode
 from aftbed.runtime.unix import packets
 

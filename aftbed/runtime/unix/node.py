@@ -22,12 +22,12 @@ import traceback
 from types import FrameType
 from typing import Final, NoReturn
 
-from aftbed.core import wire
+from aftbed.core import messages
 from aftbed.core.brick import CONTROL, Brick, Effect, Note, Send
 from aftbed.core.errors import PeerError
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.core.journal import FLAG_OFFSET, PULSE_OFFSET, RECORD
-from aftbed.core.message import Adapted, AnyMessage, ChannelEnded, Message, Promoted, Rebound, Reply
+from aftbed.core.messages import Adapted, AnyMessage, ChannelEnded, Message, Promoted, Rebound, Reply
 from aftbed.runtime import control
 from aftbed.runtime.blows import fire
 from aftbed.runtime.orders import order_or_halt
@@ -51,12 +51,12 @@ HOST_FILES: Final = (  # waiting, in no brick
     packets.__file__,
 )
 EXIT_FENCED: Final = 3
-REFUSED: Final = (PeerError, *wire.UNREADABLE)
+REFUSED: Final = (PeerError, *messages.UNREADABLE)
 EXIT_ASSERT: Final = 70
 
 _now, _read, _write = time.monotonic_ns, os.read, os.write
-_encode, _decode = wire.encode_unchecked, wire.decode_unchecked
-_put, _LARGE = packets.put, wire.PACKET_BYTES_MAX
+_encode, _decode = messages.encode_unchecked, messages.decode_unchecked
+_put, _LARGE = packets.put, messages.PACKET_BYTES_MAX
 _pack = RECORD.pack_into
 RECORD_BYTES: Final = RECORD.size
 
@@ -239,7 +239,7 @@ class Node:
         elif raw != NUDGE:
             try:
                 message = _decode(raw)
-            except wire.UNREADABLE:
+            except messages.UNREADABLE:
                 self._refuse(0)
                 return
             self.step(inlet.hosted, inlet.port, message, raw)

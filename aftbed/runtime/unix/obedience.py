@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 from aftbed.core.brick import CONTROL
 from aftbed.core.errors import PeerError
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.core.journal import FLAG_OFFSET
 from aftbed.runtime import control
 from aftbed.runtime.diversion import Diversion

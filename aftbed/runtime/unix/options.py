@@ -5,7 +5,7 @@ from typing import Final
 import msgspec
 
 from aftbed.core.fault import Fault
-from aftbed.core.message import Scheduled
+from aftbed.core.messages import Scheduled
 
 COMMAND_GONE: Final = "the command is gone"  # a reason to end at once, whatever waits for an answer
 

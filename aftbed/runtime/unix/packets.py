@@ -16,7 +16,7 @@ import stat
 from typing import Final
 
 from aftbed.core.errors import PeerError
-from aftbed.core.wire import PACKET_BYTES_MAX
+from aftbed.core.messages import PACKET_BYTES_MAX
 
 STATE_BYTES_MAX: Final = 64 << 20
 ANNOUNCED: Final = b"\xc1"  # a byte that MessagePack never uses

@@ -10,10 +10,10 @@ import socket
 from functools import lru_cache
 from typing import Final
 
-from aftbed.core import wire
+from aftbed.core import messages
 from aftbed.core.brick import CONTROL, Brick, Send
 from aftbed.core.journal import FLAG_OFFSET, HEADER_BYTES, RECORD
-from aftbed.core.message import (
+from aftbed.core.messages import (
     CaptureState,
     ChannelEnded,
     Message,
@@ -24,13 +24,11 @@ from aftbed.core.message import (
     Submit,
     TakeOver,
 )
-from aftbed.ftm.after import PbrAfter
-from aftbed.ftm.before import PassBefore
-from aftbed.ftm.catalog import Setting, make
-from aftbed.ftm.mechanism import REPLICAS, build, chain
-from aftbed.ftm.proceed import Compute
-from aftbed.ftm.protocol import Protocol
-from aftbed.ftm.proxy import Proxy
+from aftbed.ftm.chain import Compute, PassBefore, Protocol
+from aftbed.ftm.client import Proxy
+from aftbed.ftm.compose import REPLICAS, build, chain
+from aftbed.ftm.pbr import PbrAfter
+from aftbed.ftm.registry import Setting, make
 from aftbed.ftm.server import Server
 from aftbed.runtime import control
 from aftbed.runtime.unix import linux
@@ -171,7 +169,7 @@ def _rehearse_mail() -> None:
     for _ in range(ROUNDS_ONCE):
         for _ in range(REHEARSED):
             request_id += 1
-            into.send(wire.encode(Request(1, request_id, b"")))
+            into.send(messages.encode(Request(1, request_id, b"")))
         scratch.order(control.Resume(request_id))
         scratch.turns(1)  # the order, then the first request
         scratch.node.serve_hot(scratch.node.wiring.hosted["brick"])  # until it meets the nudge
@@ -192,7 +190,7 @@ def _rehearse_promotion() -> None:
 def _rehearse_part(brick: Brick, mail: tuple[tuple[str, Message], ...], outputs: tuple[str, ...]) -> None:
     scratch = _Scratch(brick, tuple({port: None for port, _ in mail}), outputs)
     for port, message in mail:
-        scratch.into[port][0].send(wire.encode(message))
+        scratch.into[port][0].send(messages.encode(message))
         scratch.turns(1)
     scratch.close()
 
@@ -200,7 +198,7 @@ def _rehearse_part(brick: Brick, mail: tuple[tuple[str, Message], ...], outputs:
 def _rehearse_following() -> None:
     scratch = _Scratch(Proxy(), ("clt2pxy", "pro2pxy"), ("pxy2pro", "pxy2clt"))
     into, _ = scratch.into["clt2pxy"]
-    into.send(wire.encode(Request(0, 1, b"")))
+    into.send(messages.encode(Request(0, 1, b"")))
     scratch.turns(1)
     write, _ = scratch.channel()
     _, read = scratch.channel()
@@ -223,4 +221,4 @@ def _deliver(bricks: dict[str, Brick], ways: Ways, mail: list[tuple[str, str, Me
         for effect in bricks[name].step(port, message, 0):  # type: ignore[arg-type]
             if isinstance(effect, Send) and (name, effect.port) in ways:
                 sink, sink_port = ways[name, effect.port]
-                mail.append((sink, sink_port, wire.decode(wire.encode(effect.message))))
+                mail.append((sink, sink_port, messages.decode(messages.encode(effect.message))))

@@ -15,7 +15,7 @@ from typing import Final
 import msgspec
 
 from aftbed.core.errors import AftbedError
-from aftbed.ftm.mechanism import build
+from aftbed.ftm.compose import build
 from aftbed.runtime import control
 from aftbed.runtime.conductor import HANG_NS, Conductor
 from aftbed.runtime.deployment import Keys

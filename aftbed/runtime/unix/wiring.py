@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable
 
 from aftbed.core.brick import Brick
-from aftbed.core.message import Message
+from aftbed.core.messages import Message
 from aftbed.runtime import control
 
 Mail = deque[tuple["Hosted", str, Message]]

@@ -30,7 +30,7 @@ from msgspec import Meta
 
 from aftbed.core.application import Characteristics
 from aftbed.core.errors import ConfigError, unknown
-from aftbed.ftm.mechanism import DUPLEX, EXPRESSIONS, MECHANISMS, parse
+from aftbed.ftm.compose import DUPLEX, EXPRESSIONS, MECHANISMS, parse
 
 Fault = Literal["crash", "value", "implausible"]
 Level = Literal["none", "low", "high"]

@@ -16,7 +16,7 @@ import msgspec
 
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.graph import PLACEMENTS, BrickSpec, Graph, Link
-from aftbed.ftm.catalog import KINDS
+from aftbed.ftm.registry import KINDS
 
 REPLICAS: Final = ("a", "b")
 NONE: Final = "none"

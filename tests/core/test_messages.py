@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aftbed.core import wire
+from aftbed.core import messages
 from aftbed.core.errors import PeerError
-from aftbed.core.message import AnyMessage, Checkpoint, Message, Reply, Request, Suspect, Tried, WireMessage
+from aftbed.core.messages import AnyMessage, Checkpoint, Message, Reply, Request, Suspect, Tried, WireMessage
 
 KINDS: Final[tuple[type[Message], ...]] = get_args(WireMessage)
 
@@ -24,72 +24,72 @@ BY_TYPE: Final = {
         max_size=3,
     ).map(tuple),
 }
-messages = st.one_of(
+some_message = st.one_of(
     *(st.builds(kind, *(BY_TYPE[f.type] for f in msgspec.structs.fields(kind))) for kind in KINDS)
 )
 
 
-@given(messages)
+@given(some_message)
 def test_what_is_sent_arrives(message: Message) -> None:
-    assert wire.decode(wire.encode(message)) == message
+    assert messages.decode(messages.encode(message)) == message
 
 
 @given(st.binary(max_size=200))
 def test_random_bytes_are_a_message_or_a_peer_error(data: bytes) -> None:
     try:
-        message = wire.decode(data)
+        message = messages.decode(data)
     except PeerError:
         return
     assert isinstance(message, KINDS)
 
 
-@given(messages, st.data())
+@given(some_message, st.data())
 def test_a_flipped_bit_gives_a_message_of_the_union_or_a_peer_error(
     message: Message, data: st.DataObject
 ) -> None:
-    packet = bytearray(wire.encode(message))
+    packet = bytearray(messages.encode(message))
     bit = data.draw(st.integers(0, 8 * len(packet) - 1))
     packet[bit // 8] ^= 1 << bit % 8
     try:
-        found = wire.decode(bytes(packet))
+        found = messages.decode(bytes(packet))
     except PeerError:
         return
     assert isinstance(found, KINDS)
 
 
-@given(messages, st.data())
+@given(some_message, st.data())
 def test_a_truncated_packet_is_refused(message: Message, data: st.DataObject) -> None:
-    packet = wire.encode(message)
+    packet = messages.encode(message)
     with pytest.raises(PeerError, match="not a message"):
-        wire.decode(packet[: data.draw(st.integers(0, len(packet) - 1))])
+        messages.decode(packet[: data.draw(st.integers(0, len(packet) - 1))])
 
 
-@given(messages, st.binary(min_size=1, max_size=9))
+@given(some_message, st.binary(min_size=1, max_size=9))
 def test_a_packet_is_one_message(message: Message, more: bytes) -> None:
     with pytest.raises(PeerError, match="trailing"):
-        wire.decode(wire.encode(message) + more)
+        messages.decode(messages.encode(message) + more)
 
 
 def test_the_limit_is_kept_at_its_edge() -> None:
-    tried = wire.PACKET_BYTES_MAX - 100
+    tried = messages.PACKET_BYTES_MAX - 100
     around = len(msgspec.msgpack.encode(Request(1, 1, bytes(tried)))) - tried
-    largest = Request(1, 1, bytes(wire.PACKET_BYTES_MAX - around))
-    packet = wire.encode(largest)
-    assert len(packet) == wire.PACKET_BYTES_MAX
-    assert wire.decode(packet) == largest
+    largest = Request(1, 1, bytes(messages.PACKET_BYTES_MAX - around))
+    packet = messages.encode(largest)
+    assert len(packet) == messages.PACKET_BYTES_MAX
+    assert messages.decode(packet) == largest
     with pytest.raises(AssertionError, match="Request of"):
-        wire.encode(Request(1, 1, largest.payload + b"x"))
+        messages.encode(Request(1, 1, largest.payload + b"x"))
 
 
 def test_a_packet_over_the_limit_is_refused_unread() -> None:
-    packet = msgspec.msgpack.encode(Request(1, 1, bytes(wire.PACKET_BYTES_MAX)))
-    with pytest.raises(PeerError, match=f"at most {wire.PACKET_BYTES_MAX} are allowed"):
-        wire.decode(packet)
+    packet = msgspec.msgpack.encode(Request(1, 1, bytes(messages.PACKET_BYTES_MAX)))
+    with pytest.raises(PeerError, match=f"at most {messages.PACKET_BYTES_MAX} are allowed"):
+        messages.decode(packet)
 
 
 def test_the_sender_of_a_packet_over_the_limit_is_us() -> None:
     with pytest.raises(AssertionError, match="Checkpoint of"):
-        wire.encode(Checkpoint(1, 1, b"", bytes(wire.PACKET_BYTES_MAX)))
+        messages.encode(Checkpoint(1, 1, b"", bytes(messages.PACKET_BYTES_MAX)))
 
 
 @pytest.mark.parametrize(
@@ -105,19 +105,19 @@ def test_the_sender_of_a_packet_over_the_limit_is_us() -> None:
 )
 def test_a_well_formed_value_that_is_no_message_is_refused(value: object) -> None:
     with pytest.raises(PeerError, match="not a message"):
-        wire.decode(msgspec.msgpack.encode(value))
+        messages.decode(msgspec.msgpack.encode(value))
 
 
 def test_text_that_is_no_text_is_refused() -> None:
-    packet = wire.encode(Suspect("a", 1, "node", "crash", 5)).replace(b"node", b"\xff\xff\xff\xff")
+    packet = messages.encode(Suspect("a", 1, "node", "crash", 5)).replace(b"node", b"\xff\xff\xff\xff")
     with pytest.raises(PeerError, match="not a message"):
-        wire.decode(packet)
+        messages.decode(packet)
 
 
 def test_a_value_that_is_nested_too_deep_is_refused() -> None:
     take_over_and_one_field_more = b"\x93\x09\x01" + b"\x91" * 50_000 + b"\x01"
     with pytest.raises(PeerError, match="not a message"):
-        wire.decode(take_over_and_one_field_more)
+        messages.decode(take_over_and_one_field_more)
 
 
 def test_tags_are_unique_and_what_travels_is_part_of_the_union() -> None:
@@ -133,4 +133,4 @@ def test_messages_are_frozen() -> None:
 
 
 def test_epoch_zero_and_large_ids_travel() -> None:
-    assert wire.decode(wire.encode(Reply(0, 2**63, 2, b""))) == Reply(0, 2**63, 2, b"")
+    assert messages.decode(messages.encode(Reply(0, 2**63, 2, b""))) == Reply(0, 2**63, 2, b"")

@@ -10,21 +10,16 @@ import msgspec
 
 from aftbed.core.application import Application
 from aftbed.core.brick import Brick
-from aftbed.core.event import Event
+from aftbed.core.events import Event
 from aftbed.core.graph import Kind
-from aftbed.ftm.after import PbrAfter
 from aftbed.ftm.assertion import AssertAfter, AssertBefore
-from aftbed.ftm.before import PassBefore
-from aftbed.ftm.client import Client
-from aftbed.ftm.inner import InnerProtocol
+from aftbed.ftm.chain import Compute, InnerProtocol, PassBefore, Protocol
+from aftbed.ftm.client import Client, Proxy
+from aftbed.ftm.failover import Recovery, Watchdog
 from aftbed.ftm.lfr import LfrAfter, LfrBefore
-from aftbed.ftm.proceed import Compute
-from aftbed.ftm.protocol import Protocol
-from aftbed.ftm.proxy import Proxy
-from aftbed.ftm.recovery import Recovery
+from aftbed.ftm.pbr import PbrAfter
 from aftbed.ftm.server import Server
 from aftbed.ftm.tr import TrAfter, TrBefore, TrProceed
-from aftbed.ftm.watchdog import Watchdog
 
 
 class Setting(msgspec.Struct, frozen=True):

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aftbed.adapt.consistency import (
+from aftbed.adapt.suitability import (
     FAULTS,
     ROWS,
     TABLE,
@@ -26,11 +26,11 @@ from aftbed.adapt.consistency import (
     remarks,
     table_from,
 )
-from aftbed.core import wire
+from aftbed.core import messages
 from aftbed.core.application import Characteristics
 from aftbed.core.errors import ConfigError
-from aftbed.core.message import Checkpoint, Notification, Request
-from aftbed.ftm.mechanism import DUPLEX, EXPRESSIONS, MECHANISMS, parse
+from aftbed.core.messages import Checkpoint, Notification, Request
+from aftbed.ftm.compose import DUPLEX, EXPRESSIONS, MECHANISMS, parse
 from aftbed.vehicle.function import default_application, sample_requests
 from aftbed.vehicle.yamlfile import read_yaml
 
@@ -107,9 +107,11 @@ def test_the_limits_of_bandwidth_carry_the_function_at_50_requests_a_second() ->
     requests = sample_requests(1, 500)
     replies = [function.execute(request) for request in requests]
     last = 2**32
-    by_state = max(len(wire.encode(Checkpoint(last, last, reply, function.capture()))) for reply in replies)
-    by_request = max(len(wire.encode(Request(last, last, request))) for request in requests)
-    by_request += len(wire.encode(Notification(last, last, bytes(32))))
+    by_state = max(
+        len(messages.encode(Checkpoint(last, last, reply, function.capture()))) for reply in replies
+    )
+    by_request = max(len(messages.encode(Request(last, last, request))) for request in requests)
+    by_request += len(messages.encode(Notification(last, last, bytes(32))))
     limits = TABLE.limits
     assert by_request * 8 * 50 / 1000 <= limits.low_bandwidth_kbit_s_min
     assert limits.low_bandwidth_kbit_s_min < by_state * 8 * 50 / 1000 <= limits.high_bandwidth_kbit_s_min

@@ -1,26 +1,17 @@
-"""Recovery: decides what to do about a replica that is dead or hangs, and restores redundancy.
+"""Watchdog: tells Recovery that a node of its replica is dead or hangs. One per replica.
 
-Paper, III-A: the Watchdog's alarm makes Recovery promote the backup. The decision is a function of
-the situation that the runtime reports and of the suspicions against it; so a Recovery that died in
-the middle of a failover is replaced by one that knows as much.
-
-| leader    | backup            | script                          |
-|-----------|-------------------|---------------------------------|
-| suspected | there             | failover: the backup leads      |
-| any       | suspected         | drop backup: the leader alone   |
-| sound     | none, slot vacant | new backup, by state transfer   |
-
-By which ports a leader speaks to its backup, and whose state a new backup needs, is the mechanism's
-business: the runtime says so with the situation. Where there is no such port, there is one replica, and
-nothing to be done about it.
+A death comes as a message (the host holds the pidfds). A hang is a node whose pulse is older than a
+deadline. The deadline only counts while this Watchdog itself runs on time: if the pulses, which the
+host hands in every `PERIOD_NS`, come late, the machine was stalled, and every node gets the whole
+deadline again. That is what keeps a busy machine from a false failover.
 """
 
 from typing import Final
 
-from aftbed.core.brick import Brick, Effect, Note, Order
+from aftbed.core.brick import Brick, Effect, Note, Order, Send
 from aftbed.core.errors import PeerError
-from aftbed.core.event import Event
-from aftbed.core.message import AnyMessage, Rebound, Situation, Suspect
+from aftbed.core.events import Event
+from aftbed.core.messages import AnyMessage, NodeDied, Pulses, Rebound, Situation, Suspect, Watch
 from aftbed.core.script import (
     Attach,
     Bind,
@@ -35,7 +26,84 @@ from aftbed.core.script import (
     Unbind,
 )
 
-_OPEN: Final = ("wdg2rec", "wdg2rec.b")
+PERIOD_NS: Final = 10_000_000
+HANG_DEADLINE_NS: Final = 60_000_000
+LATE_NS_MAX: Final = 10_000_000
+_OPEN: Final = ("sense",)
+
+
+class Watchdog(Brick):
+    """`nodes` are watched from `since_ns` on; one suspicion per generation is enough."""
+
+    def __init__(self) -> None:
+        self.replica, self.generation = "", 0
+        self.nodes: tuple[str, ...] = ()
+        self.suspect: Suspect | None = None
+        self._last_ns = 0
+        self._grace_until_ns = 0
+
+    def open_ports(self) -> tuple[str, ...]:
+        """What the host senses."""
+        return _OPEN
+
+    def quiescent(self) -> bool:
+        """It holds no request."""
+        return True
+
+    def step(self, port: str, msg: AnyMessage, now_ns: int) -> list[Effect]:
+        """Be told whom to watch, that a node died, or how the pulses are."""
+        if isinstance(msg, Watch):
+            self.replica, self.generation, self.nodes = msg.replica, msg.generation, msg.nodes
+            self.suspect, self._last_ns = None, now_ns
+            self._grace_until_ns = now_ns + HANG_DEADLINE_NS
+            return []
+        if isinstance(msg, NodeDied):
+            return self._suspect(msg.node, "crash", now_ns) if msg.node in self.nodes else []
+        if isinstance(msg, Pulses):
+            return self._judge(msg, now_ns)
+        if isinstance(msg, Rebound):  # Recovery is a new one: it knows nothing yet
+            return [Send("wdg2rec", self.suspect)] if self.suspect and msg.bound else []
+        raise PeerError(f"{type(msg).__name__} on {port}")
+
+    def _judge(self, pulses: Pulses, now_ns: int) -> list[Effect]:
+        if now_ns - self._last_ns > PERIOD_NS + LATE_NS_MAX:
+            self._grace_until_ns = now_ns + HANG_DEADLINE_NS
+        self._last_ns = now_ns
+        if now_ns < self._grace_until_ns:
+            return []
+        for node in self.nodes:
+            if now_ns - pulses.seen_ns.get(node, now_ns) > HANG_DEADLINE_NS:
+                return self._suspect(node, "hang", now_ns)
+        return []
+
+    def _suspect(self, node: str, cause: str, now_ns: int) -> list[Effect]:
+        if self.suspect is not None:
+            return []
+        self.suspect = Suspect(self.replica, self.generation, node, cause, now_ns)
+        return [
+            Send("wdg2rec", self.suspect),
+            Note(Event.WATCHDOG_SUSPECT, detail=self.generation),
+        ]
+
+
+# -- Recovery: decides what to do about a replica that is dead or hangs, and restores redundancy.
+#
+# Paper, III-A: the Watchdog's alarm makes Recovery promote the backup. The decision is a function of
+# the situation that the runtime reports and of the suspicions against it; so a Recovery that died in
+# the middle of a failover is replaced by one that knows as much.
+#
+# | leader    | backup            | script                          |
+# |-----------|-------------------|---------------------------------|
+# | suspected | there             | failover: the backup leads      |
+# | any       | suspected         | drop backup: the leader alone   |
+# | sound     | none, slot vacant | new backup, by state transfer   |
+#
+# By which ports a leader speaks to its backup, and whose state a new backup needs, is the mechanism's
+# business: the runtime says so with the situation. Where there is no such port, there is one replica, and
+# nothing to be done about it.
+
+
+_ALARM_PORTS: Final = ("wdg2rec", "wdg2rec.b")
 FAILURES_MAX: Final = 5  # scripts for a new backup that may fail in a row before Recovery gives up
 RETRY_NS: Final = 50_000_000
 
@@ -95,7 +163,7 @@ class Recovery(Brick):
 
     def open_ports(self) -> tuple[str, ...]:
         """The alarms of both Watchdogs."""
-        return _OPEN
+        return _ALARM_PORTS
 
     def quiescent(self) -> bool:
         """No script under way."""

@@ -13,8 +13,8 @@ from typing import Final
 
 from aftbed.core.brick import Brick, BrickState, Effect, Note, Send
 from aftbed.core.errors import PeerError
-from aftbed.core.event import Event
-from aftbed.core.message import (
+from aftbed.core.events import Event
+from aftbed.core.messages import (
     AnyMessage,
     CaptureState,
     ChannelEnded,
@@ -30,7 +30,7 @@ from aftbed.core.message import (
 )
 
 
-class State(BrickState):
+class PbrAfterState(BrickState):
     IDLE = auto()  # leading, no request in progress
     CAPTURING = auto()  # leading, reply held, waiting for the Server's state
     STANDBY = auto()  # backup, waiting for a checkpoint
@@ -38,22 +38,22 @@ class State(BrickState):
 
 
 MOVES: Final = {
-    (State.IDLE, Reply): State.CAPTURING,
-    (State.CAPTURING, StateCaptured): State.IDLE,
-    (State.STANDBY, Checkpoint): State.APPLYING,
-    (State.STANDBY, ChannelEnded): State.STANDBY,
-    (State.APPLYING, StateRestored): State.STANDBY,
+    (PbrAfterState.IDLE, Reply): PbrAfterState.CAPTURING,
+    (PbrAfterState.CAPTURING, StateCaptured): PbrAfterState.IDLE,
+    (PbrAfterState.STANDBY, Checkpoint): PbrAfterState.APPLYING,
+    (PbrAfterState.STANDBY, ChannelEnded): PbrAfterState.STANDBY,
+    (PbrAfterState.APPLYING, StateRestored): PbrAfterState.STANDBY,
 }
 OPEN: Final = {
-    State.IDLE: ("prd2aft",),
-    State.CAPTURING: ("srv2aft",),
-    State.STANDBY: ("aft2aft",),
-    State.APPLYING: ("srv2aft",),
+    PbrAfterState.IDLE: ("prd2aft",),
+    PbrAfterState.CAPTURING: ("srv2aft",),
+    PbrAfterState.STANDBY: ("aft2aft",),
+    PbrAfterState.APPLYING: ("srv2aft",),
 }
 
 # Bound once: a look-up in an enumeration is slow on the hot path.
-_IDLE: Final = State.IDLE
-_CAPTURING: Final = State.CAPTURING
+_IDLE: Final = PbrAfterState.IDLE
+_CAPTURING: Final = PbrAfterState.CAPTURING
 _SENT: Final = Event.CHECKPOINT_SENT
 
 
@@ -61,7 +61,7 @@ class PbrAfter(Brick):
     """`duplex`: there is a backup to send checkpoints to."""
 
     def __init__(self, epoch: int, leads: bool) -> None:
-        self.state = State.IDLE if leads else State.STANDBY
+        self.state = PbrAfterState.IDLE if leads else PbrAfterState.STANDBY
         self.epoch, self.duplex = epoch, False
         self.promote_epoch = 0  # not 0: lead under it as soon as the channel has ended
         self.ended = False
@@ -74,7 +74,7 @@ class PbrAfter(Brick):
 
     def quiescent(self) -> bool:
         """No reply held, no checkpoint half applied."""
-        return self.state in (State.IDLE, State.STANDBY)
+        return self.state in (PbrAfterState.IDLE, PbrAfterState.STANDBY)
 
     def step(self, port: str, msg: AnyMessage, now_ns: int) -> list[Effect]:
         """Handle one message; see MOVES and, for what the runtime says, `_told`."""
@@ -116,7 +116,7 @@ class PbrAfter(Brick):
     def _apply(self, msg: Checkpoint) -> list[Effect]:
         if msg.epoch != self.epoch:
             raise PeerError(f"checkpoint {msg.request_id} under epoch {msg.epoch}, expected {self.epoch}")
-        self.state, self._checkpoint = State.APPLYING, msg
+        self.state, self._checkpoint = PbrAfterState.APPLYING, msg
         return [Send("aft2srv", RestoreState(msg.epoch, msg.request_id, msg.state))]
 
     def _applied(self, msg: StateRestored) -> list[Effect]:
@@ -124,7 +124,7 @@ class PbrAfter(Brick):
         assert held is not None
         if msg.request_id != held.request_id:
             raise PeerError(f"restored {msg.request_id}, expected {held.request_id}")
-        self.state, self._checkpoint = State.STANDBY, None
+        self.state, self._checkpoint = PbrAfterState.STANDBY, None
         return [
             Note(Event.CHECKPOINT_APPLIED, held.request_id),
             Send("aft2pro", StoreReply(held.epoch, held.request_id, held.reply)),
@@ -135,14 +135,14 @@ class PbrAfter(Brick):
             if msg.port == "aft2aft":
                 self.duplex = msg.bound
             return []
-        if msg.epoch <= self.epoch or self.state in (State.IDLE, State.CAPTURING):
+        if msg.epoch <= self.epoch or self.state in (PbrAfterState.IDLE, PbrAfterState.CAPTURING):
             raise PeerError(f"promoted to epoch {msg.epoch} while {self.state.name} in epoch {self.epoch}")
         self.promote_epoch = msg.epoch
         return self._take_over()
 
     def _take_over(self) -> list[Effect]:
-        if not self.promote_epoch or not self.ended or self.state is not State.STANDBY:
+        if not self.promote_epoch or not self.ended or self.state is not PbrAfterState.STANDBY:
             return []
-        self.state, self.epoch = State.IDLE, self.promote_epoch
+        self.state, self.epoch = PbrAfterState.IDLE, self.promote_epoch
         self.promote_epoch, self.duplex = 0, False
         return [Send("aft2pro", TakeOver(self.epoch))]
