@@ -24,7 +24,7 @@ from aftbed.core.messages import Goal
 from aftbed.core.script import RECIPES
 from aftbed.runtime.unix import ask
 from aftbed.runtime.unix.options import LoadRun
-from aftbed.vehicle.function import default_application
+from aftbed.vehicle.aeb.function import default_application
 
 RATE_HZ: Final = 200.0
 REQUESTS_ENDLESS: Final = 10_000_000

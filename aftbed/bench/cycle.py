@@ -10,7 +10,7 @@ from aftbed.bench.statistics import quantile, summary
 from aftbed.core.graph import Graph
 from aftbed.ftm.compose import NONE, build, chain
 from aftbed.runtime.unix.options import LoadRun
-from aftbed.vehicle.function import sample_requests
+from aftbed.vehicle.aeb.function import sample_requests
 
 ROUNDS: Final = 5
 WARM_UP: Final = 200

@@ -22,7 +22,7 @@ from aftbed.core.errors import ConfigError
 from aftbed.core.messages import Scheduled
 from aftbed.runtime.sim.world import Setup, simulate
 from aftbed.runtime.unix.options import CarRun, LoadRun
-from aftbed.vehicle.function import default_application
+from aftbed.vehicle.aeb.function import default_application
 
 SEEDS: Final = 20
 

@@ -27,7 +27,7 @@ from aftbed.core.persistence import Permanent
 from aftbed.core.valuefault import Flip
 from aftbed.inject.words import parse
 from aftbed.runtime.unix.part import load_module
-from aftbed.vehicle.function import default_application
+from aftbed.vehicle.aeb.function import default_application
 
 BROKEN: Final = (*FAILED, "latent", "detected_stop")
 ROLLED_BACK: Final = "rolled back"

@@ -26,7 +26,7 @@ from aftbed.core.errors import HarnessError
 from aftbed.core.fault import FIRED, Fault
 from aftbed.runtime.sim.world import World
 from aftbed.runtime.unix import linux
-from aftbed.vehicle.report import VehicleResult
+from aftbed.vehicle.plant import VehicleResult
 
 LOOK_NS: Final = 100_000_000  # of virtual time, between two looks at whether it is decided
 DECIDED_SECONDS_MAX: Final = 60.0  # a drive takes a tenth of a second

@@ -22,8 +22,8 @@ from aftbed.ftm.compose import build
 from aftbed.ftm.registry import EMITTERS
 from aftbed.runtime.sim.world import Run, Setup, World, simulate
 from aftbed.runtime.targets import emitter
-from aftbed.vehicle.aebmessages import STAGE_NONE, decode_reply, decode_request
-from aftbed.vehicle.report import VehicleResult
+from aftbed.vehicle.aeb.messages import STAGE_NONE, decode_reply, decode_request
+from aftbed.vehicle.plant import VehicleResult
 
 LEADER, BACKUP = "a", "b"  # as every run begins
 LATER: Final = Fault(Crash(), "primary", Trigger(after_ms=3_600_000.0))

@@ -37,8 +37,8 @@ from aftbed.runtime.unix.launch import launch, options_for
 from aftbed.runtime.unix.options import CarRun, LoadRun, Work
 from aftbed.runtime.unix.pages import Area
 from aftbed.runtime.zygotes import BUS, LIGHT
-from aftbed.vehicle.function import default_application
-from aftbed.vehicle.report import VehicleResult
+from aftbed.vehicle.aeb.function import default_application
+from aftbed.vehicle.plant import VehicleResult
 
 REASONS_MAX: Final = 3
 REASON_MAX: Final = 300  # characters

@@ -27,7 +27,8 @@ from aftbed.core.valuefault import EXECUTED, Bit, Flip, Place
 from aftbed.ftm.compose import build
 from aftbed.runtime.sim.world import Doom, Run, Setup, simulate
 from aftbed.runtime.targets import STAGED
-from aftbed.vehicle.scenario import broken_expectations, load_scenario
+from aftbed.vehicle.scenarios.library import load_scenario
+from aftbed.vehicle.scenarios.scenario import broken_expectations
 
 DUPLEX: Final = ("pbr", "lfr", "pbr+tr", "lfr+tr", "pbr+assert", "lfr+assert")
 ADAPTABLE: Final = ("pbr", "lfr", "pbr+tr", "lfr+tr")

@@ -21,9 +21,8 @@ Limits: a car ahead that brakes has no such v0.
 from math import sqrt
 from typing import Final
 
-from aftbed.vehicle.plant import KMH_PER_MS
-from aftbed.vehicle.report import VehicleResult
-from aftbed.vehicle.scenario import Scenario
+from aftbed.vehicle.plant import KMH_PER_MS, VehicleResult
+from aftbed.vehicle.scenarios.scenario import Scenario
 
 SLACK_MS: Final = 2.0
 

@@ -23,9 +23,9 @@ from aftbed.campaign.workers import each
 from aftbed.campaign.worstinstant import worst_instant
 from aftbed.core.fault import Fault, Hang, Slow, Trigger
 from aftbed.runtime.sim.world import Setup
-from aftbed.vehicle.report import VehicleResult
-from aftbed.vehicle.scenario import load_scenario
-from aftbed.vehicle.tables import Case, broken, colour
+from aftbed.vehicle.plant import VehicleResult
+from aftbed.vehicle.scenarios.library import load_scenario
+from aftbed.vehicle.scenarios.tables import Case, broken, colour
 
 COLOURED: Final = "ncap"
 NONE: Final = "none"

@@ -24,7 +24,7 @@ from aftbed.core.valuefault import Flip
 from aftbed.ftm.compose import replication_of
 from aftbed.runtime.rewiring import replica_of
 from aftbed.runtime.sim.world import Run
-from aftbed.vehicle.function import default_application
+from aftbed.vehicle.aeb.function import default_application
 
 SINGLE: Final = "single"  # the node of that placement: one host, one fate
 RENEWAL: Final = "new backup"

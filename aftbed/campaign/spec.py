@@ -36,7 +36,7 @@ from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.graph import PLACEMENTS
 from aftbed.core.script import RECIPES
 from aftbed.ftm.compose import EXPRESSIONS
-from aftbed.vehicle.scenario import load_scenario
+from aftbed.vehicle.scenarios.library import load_scenario
 from aftbed.vehicle.yamlfile import read_yaml
 
 SHIPPED: Final = Path(__file__).resolve().parent.parent / "campaigns"

@@ -23,7 +23,7 @@ from aftbed.core.errors import PeerError
 from aftbed.core.events import Event
 from aftbed.runtime.rewiring import replica_of
 from aftbed.runtime.unix.part import load_module
-from aftbed.vehicle.function import default_application
+from aftbed.vehicle.aeb.function import default_application
 
 Make = Callable[[], Application]
 Change = tuple[int, Make | None]  # from which request on, counted from 1; None: the version of before

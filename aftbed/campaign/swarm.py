@@ -38,7 +38,7 @@ from aftbed.ftm.registry import EMITTERS
 from aftbed.runtime import targets
 from aftbed.runtime.rewiring import replica_of
 from aftbed.runtime.sim.world import Setup
-from aftbed.vehicle.scenario import scenario_names
+from aftbed.vehicle.scenarios.library import scenario_names
 
 DUPLEX: Final = tuple(e for e in EXPRESSIONS if replication_of(e))
 SIMPLEX: Final = tuple(e for e in EXPRESSIONS if not replication_of(e))

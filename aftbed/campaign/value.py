@@ -13,7 +13,7 @@ from aftbed.core.errors import PeerError
 from aftbed.core.fault import FIRED
 from aftbed.core.journal import EntryKind
 from aftbed.core.valuefault import BITFLIP
-from aftbed.vehicle.aebmessages import AebOutput, decode_reply
+from aftbed.vehicle.aeb.messages import AebOutput, decode_reply
 
 
 def value(history: History, bare: Application, faults: list[dict[str, str]]) -> Check | None:

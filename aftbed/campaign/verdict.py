@@ -17,8 +17,9 @@ from aftbed.core.fault import FIRED
 from aftbed.runtime.hosting import Hosted
 from aftbed.runtime.unix.closedloop import Proposed, read_proposals
 from aftbed.runtime.unix.options import COMMAND_GONE, CarRun, ReplayRun
-from aftbed.vehicle.report import VehicleResult
-from aftbed.vehicle.scenario import broken_expectations, load_scenario
+from aftbed.vehicle.plant import VehicleResult
+from aftbed.vehicle.scenarios.library import load_scenario
+from aftbed.vehicle.scenarios.scenario import broken_expectations
 
 Word = Literal["pass", "fail", "inconclusive"]
 EXIT_CODES: Final[dict[Word, int]] = {"pass": 0, "fail": 1, "inconclusive": 3}

@@ -30,7 +30,7 @@ from aftbed.campaign.branching import Branch, branched
 from aftbed.campaign.course import Course, Struck, strike
 from aftbed.core.events import Event
 from aftbed.core.fault import Action, Fault, Hang, Slow, Trigger
-from aftbed.vehicle.report import VehicleResult
+from aftbed.vehicle.plant import VehicleResult
 
 STEP_CYCLES: Final = 20  # 0.4 s
 FINER_CYCLES: Final = (10, 5, 2, 1)

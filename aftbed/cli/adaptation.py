@@ -142,7 +142,7 @@ def _characteristics(graph: Graph) -> Characteristics:
     """What the function of `graph` declares. Raises ConfigError if it cannot be had."""
     from aftbed.adapt.bricks import load_application  # noqa: PLC0415
     from aftbed.runtime.unix.part import load_module  # noqa: PLC0415 - 50 ms, where it is needed
-    from aftbed.vehicle.function import default_application  # noqa: PLC0415
+    from aftbed.vehicle.aeb.function import default_application  # noqa: PLC0415
 
     source = next(b.application for b in graph.bricks if b.part == "server")
     function = load_application(source, load_module) if source else default_application()

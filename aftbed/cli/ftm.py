@@ -150,7 +150,7 @@ def _declared(app: str | None) -> "Characteristics":
     from aftbed.core.application import Characteristics  # noqa: PLC0415
     from aftbed.core.errors import ConfigError  # noqa: PLC0415
     from aftbed.runtime.unix.part import load_module  # noqa: PLC0415
-    from aftbed.vehicle.function import default_application  # noqa: PLC0415
+    from aftbed.vehicle.aeb.function import default_application  # noqa: PLC0415
 
     if app is None:
         return default_application().characteristics

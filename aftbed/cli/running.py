@@ -222,7 +222,7 @@ def _work(asked: Asked) -> Work:
         return _replay(asked, pace)
     if asked.dbc is not None or asked.map_file is not None:
         raise ConfigError("--dbc and --map say what a replayed log means: give --replay LOG too")
-    from aftbed.vehicle.scenario import load_scenario  # noqa: PLC0415 - PyYAML costs 15 ms
+    from aftbed.vehicle.scenarios.library import load_scenario  # noqa: PLC0415 - PyYAML costs 15 ms
 
     load_scenario(asked.scenario)
     if asked.brake_policy not in POLICIES:
@@ -236,9 +236,8 @@ def _work(asked: Asked) -> Work:
 def _replay(asked: Asked, pace: float | None) -> ReplayRun:
     if asked.dbc is None or asked.map_file is None:
         raise ConfigError("--replay LOG needs --dbc FILE and --map FILE, which say what its frames mean")
-    from aftbed.vehicle.candump import read_log  # noqa: PLC0415
-    from aftbed.vehicle.dbcfile import find_dbc  # noqa: PLC0415
-    from aftbed.vehicle.mapfile import bind, find_map  # noqa: PLC0415
+    from aftbed.vehicle.can.candump import read_log  # noqa: PLC0415
+    from aftbed.vehicle.replay.map_file import bind, find_dbc, find_map  # noqa: PLC0415
 
     assert asked.replay is not None
     dbc, map_path = find_dbc(asked.dbc), find_map(asked.map_file)

@@ -16,8 +16,8 @@ from aftbed.core.words import milliseconds, whole_milliseconds
 from aftbed.ftm.compose import build
 from aftbed.inject.words import parse
 from aftbed.runtime import targets
-from aftbed.vehicle.scenario import load_scenario
-from aftbed.vehicle.tables import Case, cases
+from aftbed.vehicle.scenarios.library import load_scenario
+from aftbed.vehicle.scenarios.tables import Case, cases
 
 WORST: Final = "worst-instant"
 PLOT: Final = ".svg"

@@ -14,7 +14,7 @@ from aftbed.cli import scenarioview
 from aftbed.cli.scenarioasked import Asked, Chosen, chosen
 from aftbed.cli.simview import Bar
 from aftbed.core.errors import ConfigError
-from aftbed.vehicle import tables
+from aftbed.vehicle.scenarios import tables
 
 EXIT_PASS, EXIT_FAIL, EXIT_NO_FAULT = 0, 1, 3
 

@@ -10,9 +10,10 @@ import msgspec
 
 from aftbed.campaign.roadtable import Line, Row
 from aftbed.campaign.worstinstant import STEP_CYCLES
-from aftbed.vehicle import tables
 from aftbed.vehicle.plant import KMH_PER_MS, Lead
-from aftbed.vehicle.scenario import Scenario, load_scenario, scenario_names
+from aftbed.vehicle.scenarios import tables
+from aftbed.vehicle.scenarios.library import load_scenario, scenario_names
+from aftbed.vehicle.scenarios.scenario import Scenario
 
 WIDTH: Final = 150  # characters, where there is no terminal to ask
 CYCLE_S: Final = 0.02

@@ -22,7 +22,7 @@ from aftbed.core.script import RECIPES
 from aftbed.ftm.compose import build
 from aftbed.runtime.sim.givens import check
 from aftbed.runtime.sim.world import Setup
-from aftbed.vehicle.scenario import load_scenario
+from aftbed.vehicle.scenarios.library import load_scenario
 
 COUNT_MAX: Final = 100_000
 LOAD_S_MAX: Final = 3600.0  # of virtual time

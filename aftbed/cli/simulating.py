@@ -27,7 +27,7 @@ from aftbed.core import check
 from aftbed.core.valuefault import Flip
 from aftbed.runtime.sim.clock import START_NS
 from aftbed.runtime.sim.world import Run, Setup
-from aftbed.vehicle.function import default_application
+from aftbed.vehicle.aeb.function import default_application
 
 SHRUNK_MAX: Final = 3  # of many that broke: shrinking one takes up to 400 runs
 MISSED_MAX: Final = 3

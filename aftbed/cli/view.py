@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final, Protocol, Self
 import msgspec
 
 from aftbed.runtime.unix.options import RunOptions
-from aftbed.vehicle.report import Telemetry
+from aftbed.vehicle.plant import Telemetry
 
 if TYPE_CHECKING:
     from rich.console import RenderableType

@@ -28,7 +28,7 @@ from aftbed.core.words import DURATION_MS_MAX
 from aftbed.ftm.compose import EXPRESSIONS, build
 from aftbed.ftm.registry import EMITTERS
 from aftbed.runtime.cell import check_field
-from aftbed.vehicle.function import AebFunction
+from aftbed.vehicle.aeb.function import AebFunction
 
 ROLES: Final = ("primary", "backup")
 OTHERS: Final = ("zygote", "zygote.bus", "hub", "vehicle", "player")

@@ -23,7 +23,7 @@ from aftbed.core.busfault import (
     StuckCounter,
 )
 from aftbed.core.errors import ConfigError, unknown
-from aftbed.vehicle.dbcfile import Codec
+from aftbed.vehicle.can.dbc_file import Codec
 
 CRC_BITS: Final = 8  # of E2E profile 11: the first byte
 

@@ -51,7 +51,7 @@ from aftbed.core.busfault import (
 )
 from aftbed.core.persistence import Chance, Every, Lasting, Permanent, Transient
 from aftbed.core.valuefault import flipped
-from aftbed.vehicle.frame import Frame
+from aftbed.vehicle.can.frame import Frame
 
 REORDER_US_MAX: Final = 1_000_000  # a frame without a successor is not swallowed
 FLOOD_US: Final = 1000

@@ -21,7 +21,7 @@ from typing import Final, Protocol
 import msgspec
 
 from aftbed.core.errors import PeerError
-from aftbed.vehicle.aebmessages import (
+from aftbed.vehicle.aeb.messages import (
     RANGE_MAX_M,
     SPEED_MAX_MS,
     AebInput,
@@ -29,9 +29,9 @@ from aftbed.vehicle.aebmessages import (
     decode_reply,
     encode_request,
 )
-from aftbed.vehicle.dbcfile import Codec
-from aftbed.vehicle.e2e import ChannelState, Receiver, Status, Supervision, protect
-from aftbed.vehicle.frame import Frame
+from aftbed.vehicle.can.dbc_file import Codec
+from aftbed.vehicle.can.e2e import ChannelState, Receiver, Status, Supervision, protect
+from aftbed.vehicle.can.frame import Frame
 
 LANE_HALF_M: Final = 1.5  # half a lane, less half of what a car may stick into it without being in our way
 TIMEOUT_CYCLES: Final = 6

@@ -28,7 +28,7 @@ import msgspec
 
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.vehicle.plant import KMH_PER_MS
-from aftbed.vehicle.scenariofile import ScenarioKeys, scenario_of
+from aftbed.vehicle.scenarios.scenario import ScenarioKeys, scenario_of
 from aftbed.vehicle.xosc.parameters import Values, declared, substituted
 from aftbed.vehicle.xosc.placing import read_cars
 from aftbed.vehicle.xosc.road import check_road

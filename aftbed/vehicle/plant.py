@@ -1,15 +1,19 @@
 """The car and the car ahead: longitudinal truth, in fixed steps of 1 ms.
 
-The ego's brakes do nothing for a dead time, then approach what is asked of them as a first-order lag.
-They give no more than they can, and no tyre gives more than friction times gravity. The driver holds the
-speed until braking is asked for, then takes the foot off for good: drag and rolling resistance act from
-there on. The car ahead stands, drives on at constant speed, or brakes with a linear ramp. It is in our
-lane, or beside it for good, or comes into it from the side.
+The ego's brakes do nothing for a dead time, then approach the demand as a first-order lag. They give no
+more than their own limit, and no tyre gives more than friction times gravity. The driver holds the speed
+until braking is asked for, then takes the foot off for good: drag and rolling resistance act from there
+on. The car ahead stands, drives at constant speed, or brakes with a linear ramp. It is in our lane, or
+beside it, or comes into it from the side.
 
 Contact is interpolated inside the step in which the gap closes, so the impact speed does not depend on
-the step. After contact the drive is over and nothing moves any more. What is beside us when we reach it
-is not hit but passed: from there on the road is empty. Gaps count only while the car ahead is in our
-way. Only + - * / on doubles: the same drive on every machine, bit for bit.
+the step. After contact the drive is over and nothing moves any more. A car beside us is passed, not hit:
+from there on the road is empty. Gaps count only while the car ahead is in our way. Only + - * / on
+doubles: the same drive on every machine, bit for bit.
+
+The plant is the only source of `VehicleResult` and `Telemetry`: nothing in them comes off the bus, so a
+frame fault cannot make a collision look like a stop. Warning and demand in them are what the brake ECU
+made of the frames that it believed.
 
 Limits: the ego keeps its lane; one target, no road gradient, no load transfer, no ABS dynamics.
 """
@@ -19,7 +23,39 @@ from typing import Final
 
 import msgspec
 
-from aftbed.vehicle.report import VehicleResult
+
+class VehicleResult(msgspec.Struct, frozen=True):
+    """A whole drive. `min_gap_m` and `stop_gap_m` are None without a target or without a stop.
+
+    `warning_s` is the time from the first warning to the first braking that the function asks for, however
+    little: UN R152 calls every such demand emergency braking. 0.0 if the two came together, None without
+    braking. `demand_max_ms2` is the greatest deceleration that it asks for. `braked` is true also of a driver
+    who has heeded the warning.
+    """
+
+    collision: bool
+    impact_speed_kmh: float | None
+    min_gap_m: float | None
+    stop_gap_m: float | None
+    max_deceleration_ms2: float
+    braked: bool
+    warning_s: float | None = None
+    demand_max_ms2: float = 0.0
+
+
+class Telemetry(msgspec.Struct, frozen=True):
+    """One instant of the drive, for the live view. `stage` is the stage that the brakes follow."""
+
+    t_ms: int
+    speed_ms: float
+    gap_m: float | None
+    ttc_s: float | None
+    stage: int
+    deceleration_ms2: float
+    fallback: int
+    frames_accepted: int
+    frames_refused: int
+
 
 STEP_US: Final = 1000
 GRAVITY_MS2: Final = 9.81

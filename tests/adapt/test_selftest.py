@@ -12,7 +12,7 @@ from aftbed.core.messages import AnyMessage, Reply
 from aftbed.ftm.chain import Compute
 from aftbed.ftm.compose import EXPRESSIONS, NONE, build
 from aftbed.ftm.registry import KINDS, Setting
-from aftbed.vehicle.function import default_application, sample_requests
+from aftbed.vehicle.aeb.function import default_application, sample_requests
 
 REQUESTS = tuple(sample_requests(0, 8))
 SOURCE = f"{__name__}:Any"

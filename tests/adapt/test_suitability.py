@@ -31,7 +31,7 @@ from aftbed.core.application import Characteristics
 from aftbed.core.errors import ConfigError
 from aftbed.core.messages import Checkpoint, Notification, Request
 from aftbed.ftm.compose import DUPLEX, EXPRESSIONS, MECHANISMS, parse
-from aftbed.vehicle.function import default_application, sample_requests
+from aftbed.vehicle.aeb.function import default_application, sample_requests
 from aftbed.vehicle.yamlfile import read_yaml
 
 OPEN: Final = Characteristics(deterministic=True, state_access=True)

@@ -15,8 +15,8 @@ from aftbed.core.valuefault import Bit, Flip, Place, flipped
 from aftbed.ftm.compose import build
 from aftbed.runtime.unix.journal import Dialogue, Journal
 from aftbed.runtime.unix.options import CarRun, LoadRun, RunOptions, Work
-from aftbed.vehicle.function import default_application, sample_requests
-from aftbed.vehicle.report import VehicleResult
+from aftbed.vehicle.aeb.function import default_application, sample_requests
+from aftbed.vehicle.plant import VehicleResult
 
 MS: Final = 1_000_000
 START_NS: Final = 10**12

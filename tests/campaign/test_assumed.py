@@ -10,8 +10,8 @@ from aftbed.campaign.assumed import cells, markdown
 from aftbed.campaign.experiment import Experiment, Result
 from aftbed.campaign.ledger import Ledger, head_of
 
-HIDDEN = "update app to aftbed.vehicle.variants:WithoutStateAccess at request 4"
-NOISY = "update app to aftbed.vehicle.variants:NonDeterministic at request 4"
+HIDDEN = "update app to aftbed.vehicle.aeb.variants:WithoutStateAccess at request 4"
+NOISY = "update app to aftbed.vehicle.aeb.variants:NonDeterministic at request 4"
 CRASH = "crash primary after 220ms"
 FLIP = "bitflip result bit 5 after 220ms"
 AT_REST = "bitflip state.t_ms bit 9 in primary after 220ms"

@@ -14,7 +14,7 @@ from aftbed.core.events import Event
 from aftbed.core.journal import Entry, EntryKind, Record
 from aftbed.runtime.hosting import Hosted
 from aftbed.runtime.sim.world import Run, Setup, simulate
-from aftbed.vehicle.function import default_application
+from aftbed.vehicle.aeb.function import default_application
 
 CLEAN = simulate(Setup("pbr", count=8))
 Entries = Callable[[list[Entry]], list[Entry]]

@@ -12,9 +12,8 @@ from roads import sudden_course
 from aftbed.campaign.residual import closing_speed_ms, impact_kmh, residual_kmh
 from aftbed.campaign.worstinstant import worst_instant
 from aftbed.core.fault import Hang
-from aftbed.vehicle.plant import KMH_PER_MS, Lead, Plant, PlantSetup
-from aftbed.vehicle.report import VehicleResult
-from aftbed.vehicle.scenario import load_scenario
+from aftbed.vehicle.plant import KMH_PER_MS, Lead, Plant, PlantSetup, VehicleResult
+from aftbed.vehicle.scenarios.library import load_scenario
 
 FULL_MS2: Final = 9.0
 PLANT_KMH: Final = 0.15  # drag makes the deceleration differ by 1 % along the way

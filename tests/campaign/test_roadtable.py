@@ -8,7 +8,7 @@ from msgspec.structs import replace
 from aftbed.campaign.roadtable import PRIMARY, Drive, Line, Row, drive, driven, drives, outage
 from aftbed.core.fault import Crash, Fault, Trigger
 from aftbed.inject.words import parse
-from aftbed.vehicle.tables import Case, cases
+from aftbed.vehicle.scenarios.tables import Case, cases
 
 BARE: Final = Line("none", "none")
 LOST_M_MAX: Final = 0.05

@@ -22,11 +22,11 @@ from aftbed.core.journal import EntryKind
 from aftbed.runtime.adaptations import FIRST_TRIGGER
 from aftbed.runtime.unix.journal import Dialogue
 from aftbed.runtime.unix.options import CarRun, LoadRun, ReplayRun, Work
-from aftbed.vehicle.aebmessages import AebInput, AebTarget, encode_request
-from aftbed.vehicle.candump import log_line
-from aftbed.vehicle.dbcfile import Codec, load_dbc
-from aftbed.vehicle.e2e import protect
-from aftbed.vehicle.frame import Frame
+from aftbed.vehicle.aeb.messages import AebInput, AebTarget, encode_request
+from aftbed.vehicle.can.candump import log_line
+from aftbed.vehicle.can.dbc_file import Codec, load_dbc
+from aftbed.vehicle.can.e2e import protect
+from aftbed.vehicle.can.frame import Frame
 
 CODEC: Final[Codec] = load_dbc()
 FIRST_FAULT: Final = 1_000_001

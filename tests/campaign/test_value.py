@@ -10,8 +10,8 @@ from aftbed.campaign.value import corruptions, value
 from aftbed.core.check import REASONS_MAX, History, wrong_replies
 from aftbed.core.journal import Entry, EntryKind
 from aftbed.core.valuefault import flipped
-from aftbed.vehicle.aebmessages import AebOutput, encode_reply
-from aftbed.vehicle.function import default_application, sample_requests
+from aftbed.vehicle.aeb.function import default_application, sample_requests
+from aftbed.vehicle.aeb.messages import AebOutput, encode_reply
 
 FLIPPED: Final = [{"fault": "bitflip result in primary", "receipt": "applied"}]
 COUNT: Final = 8

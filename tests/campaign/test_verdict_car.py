@@ -7,7 +7,7 @@ import pytest
 from records import CAR, STOPPED, RecordInTheMaking, whole
 
 from aftbed.runtime.unix.options import ReplayRun
-from aftbed.vehicle.report import VehicleResult
+from aftbed.vehicle.plant import VehicleResult
 
 
 def drive(path: Path, result: VehicleResult | None, end: str = "stopped itself") -> RecordInTheMaking:

@@ -14,7 +14,7 @@ from aftbed.runtime.unix import ask
 
 Call = Callable[..., tuple[int, str, str]]  # `aftbed` with these arguments: exit code, output, errors
 Run = Callable[..., str]
-VARIANTS: Final = "aftbed.vehicle.variants"
+VARIANTS: Final = "aftbed.vehicle.aeb.variants"
 CLOSED: Final = f"{VARIANTS}:WithoutStateAccess"
 RANDOM: Final = f"{VARIANTS}:NonDeterministic"
 CAUTIOUS: Final = f"{VARIANTS}:Cautious"

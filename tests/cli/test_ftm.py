@@ -16,7 +16,7 @@ from playedrun import Call
 
 from aftbed.ftm.compose import EXPRESSIONS, build
 
-VARIANTS: Final = "aftbed.vehicle.variants"
+VARIANTS: Final = "aftbed.vehicle.aeb.variants"
 AMPLE: Final = ("--cpus", "2", "--cpu-load", "0.1")
 MINE: Final = """
 from aftbed.core.application import Characteristics

@@ -8,8 +8,8 @@ import pytest
 from playedrun import Call, Run
 
 from aftbed.cli.scenarioasked import Asked, chosen
-from aftbed.vehicle.scenario import scenario_names
-from aftbed.vehicle.tables import table_names
+from aftbed.vehicle.scenarios.library import scenario_names
+from aftbed.vehicle.scenarios.tables import table_names
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from playedrun import Run
 
-from aftbed.vehicle.scenario import load_scenario
+from aftbed.vehicle.scenarios.library import load_scenario
 
 FOLDER = Path(__file__).resolve().parents[1] / "vehicle" / "xosc"
 LEAD_BRAKES = FOLDER / "lead_brakes.xosc"

@@ -15,10 +15,10 @@ from aftbed.core.graph import PLACEMENTS
 from aftbed.ftm.compose import EXPRESSIONS, build
 from aftbed.ftm.registry import EMITTERS
 from aftbed.runtime import targets
-from aftbed.vehicle.candump import Refusal
-from aftbed.vehicle.dbcfile import load_dbc
+from aftbed.vehicle.can.candump import Refusal
+from aftbed.vehicle.can.dbc_file import load_dbc
 from aftbed.vehicle.ecus import BRAKE_POLICIES
-from aftbed.vehicle.scenario import load_scenario, scenario_names
+from aftbed.vehicle.scenarios.library import load_scenario, scenario_names
 
 DOCS: Final = ROOT / "docs"
 README: Final = ROOT / "README.md"

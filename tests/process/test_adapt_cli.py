@@ -12,8 +12,8 @@ from liveruns import WAIT_SECONDS_MAX, Command, Done, Home, aftbed, until
 
 pytestmark = pytest.mark.process
 
-CLOSED: Final = "aftbed.vehicle.variants:WithoutStateAccess"
-CAUTIOUS: Final = "aftbed.vehicle.variants:Cautious"
+CLOSED: Final = "aftbed.vehicle.aeb.variants:WithoutStateAccess"
+CAUTIOUS: Final = "aftbed.vehicle.aeb.variants:Cautious"
 BRICK: Final = """\
 from aftbed.core.graph import Kind
 from aftbed.ftm.chain import Compute

@@ -21,7 +21,7 @@ import msgspec
 import pytest
 from liveruns import Home, home
 
-from aftbed.vehicle.bus import BusOptions, open_bus
+from aftbed.vehicle.can.bus import BusOptions, open_bus
 from aftbed.vehicle.logs.candumpfile import read as read_candump
 from aftbed.vehicle.logs.candumpfile import write as write_candump
 from aftbed.vehicle.logs.convert import READERS, convert

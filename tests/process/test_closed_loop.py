@@ -101,7 +101,7 @@ def test_a_loss_is_told_by_its_cause(home: Home, tmp_path: Path, fault: str, eve
 
 def test_what_the_run_refuses_is_an_outcome(home: Home, tmp_path: Path) -> None:
     """The function has lost its state access meanwhile, and TR needs it."""
-    closed = "update app to aftbed.vehicle.variants:WithoutStateAccess at request 20"
+    closed = "update app to aftbed.vehicle.aeb.variants:WithoutStateAccess at request 20"
     options = ("--ftm", "lfr", *LOAD, *DIVERGE, "--adapt", closed, "--json")
     (one,) = proposals(aftbed("run", *options, "--policy", policy(tmp_path, TWO_DIVERGENCES)))[:1]
     assert one.outcome == "refused" and "tr needs state access" in one.why

@@ -12,8 +12,8 @@ from sampling import sampled
 
 from aftbed.campaign.record import read_record
 from aftbed.core.journal import EntryKind
-from aftbed.vehicle.aebmessages import decode_reply
-from aftbed.vehicle.scenario import scenario_names
+from aftbed.vehicle.aeb.messages import decode_reply
+from aftbed.vehicle.scenarios.library import scenario_names
 
 pytestmark = pytest.mark.process
 

@@ -26,7 +26,7 @@ from aftbed.core.journal import EntryKind
 from aftbed.ftm.compose import build
 from aftbed.runtime.unix import ask
 from aftbed.runtime.unix.options import LoadRun
-from aftbed.vehicle.candump import LogCounts, Refusal, parse_lines
+from aftbed.vehicle.can.candump import LogCounts, Refusal, parse_lines
 
 pytestmark = pytest.mark.process
 

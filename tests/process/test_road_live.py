@@ -7,8 +7,8 @@ import pytest
 from liveruns import Done, aftbed
 
 from aftbed.runtime.sim.world import Setup, simulate
-from aftbed.vehicle.candump import log_line
-from aftbed.vehicle.tables import Case, broken, cases
+from aftbed.vehicle.can.candump import log_line
+from aftbed.vehicle.scenarios.tables import Case, broken, cases
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "vehicle"))
 

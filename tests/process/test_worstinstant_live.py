@@ -11,7 +11,7 @@ from aftbed.campaign.roadtable import PRIMARY, repeat
 from aftbed.campaign.worstinstant import worst_instant
 from aftbed.core.fault import Action, Crash, Hang
 from aftbed.runtime.sim.world import Setup
-from aftbed.vehicle.report import VehicleResult
+from aftbed.vehicle.plant import VehicleResult
 
 pytestmark = pytest.mark.process
 

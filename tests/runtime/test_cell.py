@@ -16,9 +16,9 @@ from aftbed.ftm.compose import build
 from aftbed.inject.words import parse
 from aftbed.runtime.cell import CELL_BYTES, InCell, check_field, differing
 from aftbed.runtime.targets import check, waits_in
-from aftbed.vehicle.aebmessages import decode_reply, decode_request
-from aftbed.vehicle.function import STATE_BYTES, AebFunction, sample_requests
-from aftbed.vehicle.variants import Cautious, NonDeterministic, WithoutStateAccess
+from aftbed.vehicle.aeb.function import STATE_BYTES, AebFunction, sample_requests
+from aftbed.vehicle.aeb.messages import decode_reply, decode_request
+from aftbed.vehicle.aeb.variants import Cautious, NonDeterministic, WithoutStateAccess
 
 REQUESTS: Final = sample_requests(3, 40)
 FORMATS: Final[dict[Width, str]] = {"u8": "<B", "u32": "<I", "i64": "<q", "u64": "<Q", "f64": "<d"}

@@ -6,7 +6,7 @@ import pytest
 
 from aftbed.core.errors import ConfigError
 from aftbed.runtime.unix.launch import bind_hub
-from aftbed.vehicle.bus import HOST
+from aftbed.vehicle.can.bus import HOST
 
 TEST_NET: str = "192.0.2.1"  # RFC 5737: nobody has it; nothing is sent there
 

@@ -18,7 +18,7 @@ from aftbed.inject.words import parse
 from aftbed.runtime import targets
 from aftbed.runtime.sim.givens import graph_of
 from aftbed.runtime.sim.world import Run, Setup, World
-from aftbed.vehicle.function import default_application
+from aftbed.vehicle.aeb.function import default_application
 
 COUNT: Final = 40
 RATE_HZ: Final = 200.0

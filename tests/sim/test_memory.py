@@ -10,7 +10,7 @@ from aftbed.inject.words import parse
 from aftbed.runtime import targets
 from aftbed.runtime.sim.givens import graph_of
 from aftbed.runtime.sim.world import Run, Setup, World
-from aftbed.vehicle.function import default_application
+from aftbed.vehicle.aeb.function import default_application
 
 COUNT: Final = 40
 FLIP: Final = "bitflip state.counter bit 0"  # a state like any other

@@ -13,10 +13,10 @@ from aftbed.core.fault import Crash, Fault, Trigger
 from aftbed.core.messages import Goal, Scheduled
 from aftbed.runtime.sim.world import Doom, Run, Setup, World
 from aftbed.runtime.unix.part import load_module
-from aftbed.vehicle.function import default_application
+from aftbed.vehicle.aeb.function import default_application
 
 VERSIONS: Final = str(Path(versions.__file__).resolve())
-ONE_WAY: Final = "aftbed.vehicle.variants:Cautious"  # the first version refuses its state
+ONE_WAY: Final = "aftbed.vehicle.aeb.variants:Cautious"  # the first version refuses its state
 FIRST: Final = 4  # the request at which the update begins
 EFFECTS: Final = 16  # of a brick: several requests
 

@@ -6,8 +6,8 @@ Their state has the first version's form, so that either takes it from the other
 import msgspec
 
 from aftbed.core.application import Application, Characteristics
-from aftbed.vehicle.aebmessages import decode_reply, encode_reply
-from aftbed.vehicle.function import default_application
+from aftbed.vehicle.aeb.function import default_application
+from aftbed.vehicle.aeb.messages import decode_reply, encode_reply
 
 FIRM_MS2 = 0.125
 

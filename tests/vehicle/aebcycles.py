@@ -2,7 +2,8 @@
 
 from hypothesis import strategies as st
 
-from aftbed.vehicle.aebmessages import (
+from aftbed.vehicle.aeb.function import AebFunction
+from aftbed.vehicle.aeb.messages import (
     SLOTS,
     STAGE_FULL,
     AebInput,
@@ -11,7 +12,6 @@ from aftbed.vehicle.aebmessages import (
     decode_reply,
     encode_request,
 )
-from aftbed.vehicle.function import AebFunction
 
 EGO_MS = 14.0
 NEAR = AebTarget(3, 14.0, -EGO_MS)  # a standing car, one second ahead

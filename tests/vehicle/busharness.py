@@ -14,14 +14,13 @@ import msgspec
 
 from aftbed.core.busfault import Struck
 from aftbed.core.errors import HarnessError
-from aftbed.vehicle.bus import Bus, BusOptions, open_bus
-from aftbed.vehicle.dbcfile import Codec
+from aftbed.vehicle.aeb.function import default_application
+from aftbed.vehicle.can.bus import Bus, BusOptions, open_bus
+from aftbed.vehicle.can.dbc_file import Codec
+from aftbed.vehicle.can.frame import Frame
+from aftbed.vehicle.can.hub import Hub, HubCounts, HubOptions, serve
 from aftbed.vehicle.ecus import Sender
-from aftbed.vehicle.frame import Frame
-from aftbed.vehicle.function import default_application
 from aftbed.vehicle.gateway import ClientGateway, Gateway
-from aftbed.vehicle.hub import Hub, serve
-from aftbed.vehicle.hubclient import HubCounts, HubOptions
 
 DEADLINE_S = 5.0
 
@@ -113,8 +112,8 @@ def running_hub(
 
 _HUB_PROCESS = """
 import os, socket, sys
-from aftbed.vehicle.hub import serve
-from aftbed.vehicle.hubclient import HubOptions
+from aftbed.vehicle.can.hub import serve
+from aftbed.vehicle.can.hub import HubOptions
 listener = socket.socket(fileno=int(sys.argv[1]))
 log = os.open(sys.argv[2], os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
 serve(listener, log, HubOptions(), 0)

@@ -11,15 +11,15 @@ from puredrive import CODEC
 
 from aftbed.core.busfault import BusFault, Struck
 from aftbed.inject.buswords import parse
+from aftbed.vehicle.aeb.function import default_application
 from aftbed.vehicle.aim import aimed
-from aftbed.vehicle.candump import read_log
-from aftbed.vehicle.car import CarBuses, DriveOptions, DriveReport, drive
-from aftbed.vehicle.frame import Frame
-from aftbed.vehicle.function import default_application
-from aftbed.vehicle.hubclient import HubOptions
-from aftbed.vehicle.report import VehicleResult
-from aftbed.vehicle.scenario import load_scenario
-from aftbed.vehicle.virtual import VirtualCar
+from aftbed.vehicle.can.candump import read_log
+from aftbed.vehicle.can.frame import Frame
+from aftbed.vehicle.can.hub import HubOptions
+from aftbed.vehicle.drive_real import CarBuses, DriveOptions, DriveReport, drive
+from aftbed.vehicle.drive_virtual import VirtualCar
+from aftbed.vehicle.plant import VehicleResult
+from aftbed.vehicle.scenarios.library import load_scenario
 
 FIRST_NUMBER = 7
 SEED = 5

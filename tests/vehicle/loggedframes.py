@@ -4,7 +4,7 @@ from typing import Final
 
 from hypothesis import strategies as st
 
-from aftbed.vehicle.frame import CAN_ID_MAX
+from aftbed.vehicle.can.frame import CAN_ID_MAX
 from aftbed.vehicle.logs.frames import EXTENDED_ID_MAX, TIME_US_MAX, Kind, LoggedFrame
 
 NOW_US: Final = 1_790_000_000_000_000

@@ -11,9 +11,9 @@ import cantools
 from cantools.database import Database
 from puredrive import TOYOTA_DBC, TOYOTA_LOG
 
-from aftbed.vehicle.candump import LogFrame, read_log
-from aftbed.vehicle.frame import Frame
-from aftbed.vehicle.mapped import toyota_checksum
+from aftbed.vehicle.can.candump import LogFrame, read_log
+from aftbed.vehicle.can.frame import Frame
+from aftbed.vehicle.replay.mapped_gateway import toyota_checksum
 
 WHY_NOT = f"the real drive is not here: no data/{TOYOTA_LOG.name} in the folder that AFTBED_SHARED names"
 

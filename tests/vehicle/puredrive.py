@@ -6,14 +6,13 @@ from pathlib import Path
 
 import msgspec
 
-from aftbed.vehicle.aebmessages import AebOutput, decode_reply
-from aftbed.vehicle.dbcfile import load_dbc
+from aftbed.vehicle.aeb.function import AebFunction
+from aftbed.vehicle.aeb.messages import AebOutput, decode_reply
+from aftbed.vehicle.can.dbc_file import load_dbc
+from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.ecus import BrakeEcu, BrakePolicy, RadarEcu
-from aftbed.vehicle.frame import Frame
-from aftbed.vehicle.function import AebFunction
 from aftbed.vehicle.gateway import Gateway
-from aftbed.vehicle.plant import Plant, PlantSetup
-from aftbed.vehicle.report import VehicleResult
+from aftbed.vehicle.plant import Plant, PlantSetup, VehicleResult
 
 CODEC = load_dbc()
 _SHARED = os.environ.get("AFTBED_SHARED")

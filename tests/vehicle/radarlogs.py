@@ -10,9 +10,10 @@ from pathlib import Path
 
 import msgspec
 
-from aftbed.vehicle.candump import log_line
-from aftbed.vehicle.dbcfile import Codec, find_dbc, load_dbc
-from aftbed.vehicle.frame import Frame
+from aftbed.vehicle.can.candump import log_line
+from aftbed.vehicle.can.dbc_file import Codec, load_dbc
+from aftbed.vehicle.can.frame import Frame
+from aftbed.vehicle.replay.map_file import find_dbc
 
 EGO_MS = 14.0  # about 50 km/h
 ESR_EGO_ID = 0x4F0

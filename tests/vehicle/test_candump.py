@@ -8,8 +8,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from aftbed.core.errors import ConfigError
-from aftbed.vehicle.candump import LogCounts, LogFrame, Refusal, log_line, parse_line, parse_lines, read_log
-from aftbed.vehicle.frame import Frame
+from aftbed.vehicle.can.candump import (
+    LogCounts,
+    LogFrame,
+    Refusal,
+    log_line,
+    parse_line,
+    parse_lines,
+    read_log,
+)
+from aftbed.vehicle.can.frame import Frame
 
 GOOD = b"(0000000012.345678) can0 130#0102030405060708"
 REAL_LOG = Path(__file__).resolve().parents[3] / "shared" / "data" / "rav4_following_50kmh.log"

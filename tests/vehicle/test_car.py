@@ -11,14 +11,15 @@ import pytest
 from busharness import TestGateway, brake_late, running_hub
 
 from aftbed.core.errors import HarnessError
-from aftbed.vehicle import bus as bus_module
-from aftbed.vehicle.bus import BusOptions
-from aftbed.vehicle.candump import read_log
-from aftbed.vehicle.car import CarBuses, DriveOptions, DriveReport, drive
-from aftbed.vehicle.dbcfile import Codec, load_dbc
-from aftbed.vehicle.hubclient import HubOptions
-from aftbed.vehicle.report import Telemetry
-from aftbed.vehicle.scenario import Scenario, load_scenario
+from aftbed.vehicle.can import bus as bus_module
+from aftbed.vehicle.can.bus import BusOptions
+from aftbed.vehicle.can.candump import read_log
+from aftbed.vehicle.can.dbc_file import Codec, load_dbc
+from aftbed.vehicle.can.hub import HubOptions
+from aftbed.vehicle.drive_real import CarBuses, DriveOptions, DriveReport, drive
+from aftbed.vehicle.plant import Telemetry
+from aftbed.vehicle.scenarios.library import load_scenario
+from aftbed.vehicle.scenarios.scenario import Scenario
 
 Decide = Callable[[dict[str, float]], tuple[int, float] | None]
 

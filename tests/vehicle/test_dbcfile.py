@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aftbed.core.errors import ConfigError, PeerError
-from aftbed.vehicle.dbcfile import Codec, find_dbc, load_dbc
+from aftbed.vehicle.can.dbc_file import Codec, load_dbc
+from aftbed.vehicle.replay.map_file import find_dbc
 
 CODEC = load_dbc()
 
@@ -230,7 +231,8 @@ def test_a_dbc_that_is_not_there_is_refused(tmp_path: Path) -> None:
 
 def test_cantools_is_not_imported_before_a_dbc_is_loaded() -> None:
     code = (
-        "import sys, aftbed.vehicle.dbcfile, aftbed.vehicle.gateway, aftbed.vehicle.mapped,"
-        " aftbed.vehicle.ecus, aftbed.vehicle.function; assert 'cantools' not in sys.modules"
+        "import sys, aftbed.vehicle.can.dbc_file, aftbed.vehicle.gateway,"
+        " aftbed.vehicle.replay.mapped_gateway, aftbed.vehicle.ecus,"
+        " aftbed.vehicle.aeb.function; assert 'cantools' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=30)

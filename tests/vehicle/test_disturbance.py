@@ -11,10 +11,10 @@ from aftbed.core.busfault import BusFault, Condition, Struck
 from aftbed.core.errors import ConfigError
 from aftbed.inject.buswords import parse
 from aftbed.vehicle.aim import aimed
-from aftbed.vehicle.dbcfile import load_dbc
+from aftbed.vehicle.can.dbc_file import load_dbc
+from aftbed.vehicle.can.e2e import intact, protect
+from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.disturbance import FLOOD_ID, REORDER_US_MAX, Disturber, Sent
-from aftbed.vehicle.e2e import intact, protect
-from aftbed.vehicle.frame import Frame
 
 TRACK, AEB_REQ, EGO = (CODEC.can_id(name) for name in ("RADAR_TRACK", "AEB_REQ", "EGO_STATE"))
 DATA_ID, EGO_DATA_ID = CODEC.data_id("RADAR_TRACK"), CODEC.data_id("EGO_STATE")

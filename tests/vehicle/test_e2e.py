@@ -5,15 +5,7 @@ from e2e.crc import calculate_crc8
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aftbed.vehicle.e2e import (
-    COUNTER_COUNT,
-    ChannelState,
-    Receiver,
-    Status,
-    Supervision,
-    intact,
-    protect,
-)
+from aftbed.vehicle.can.e2e import COUNTER_COUNT, ChannelState, Receiver, Status, Supervision, intact, protect
 
 ID = 0x1130
 CYCLE_US = 20_000

@@ -5,13 +5,15 @@ from e2e.crc import calculate_crc8, calculate_crc8_h2f, calculate_crc16
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aftbed.vehicle.e2e import Receiver, Status, Supervision
-from aftbed.vehicle.e2eprofiles import (
+from aftbed.vehicle.can.e2e import (
     P01,
     P02,
     P05,
     P11,
     Profile,
+    Receiver,
+    Status,
+    Supervision,
     ambiguous,
     bytes_min,
     counter_count,

@@ -3,9 +3,9 @@
 import pytest
 from puredrive import CODEC
 
-from aftbed.vehicle.e2e import protect
+from aftbed.vehicle.can.e2e import protect
+from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.ecus import BrakeEcu, BrakePolicy, Fallback, RadarEcu, Sender
-from aftbed.vehicle.frame import Frame
 from aftbed.vehicle.plant import Lead, Plant, PlantSetup
 
 FULL, WARN, NONE = (3, 9.0), (1, 0.0), (0, 0.0)

@@ -4,7 +4,7 @@ import msgspec
 import pytest
 
 from aftbed.core.errors import PeerError
-from aftbed.vehicle.frame import Frame
+from aftbed.vehicle.can.frame import Frame
 
 
 def test_the_edges_are_allowed() -> None:

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from aftbed.core.application import Characteristics
 from aftbed.core.errors import PeerError
-from aftbed.vehicle.aebmessages import (
+from aftbed.vehicle.aeb.function import BLIND_MS, AebFunction, default_application, sample_requests
+from aftbed.vehicle.aeb.messages import (
     STAGE_FULL,
     STAGE_NONE,
     STAGE_PARTIAL,
@@ -21,9 +22,8 @@ from aftbed.vehicle.aebmessages import (
     decode_request,
     encode_request,
 )
-from aftbed.vehicle.function import BLIND_MS, AebFunction, default_application, sample_requests
-from aftbed.vehicle.threat import required_deceleration_ms2
-from aftbed.vehicle.tracker import HITS_CONFIRMED, MISSES_MAX, Track
+from aftbed.vehicle.aeb.threat import required_deceleration_ms2
+from aftbed.vehicle.aeb.tracker import HITS_CONFIRMED, MISSES_MAX, Track
 
 # -- requests
 

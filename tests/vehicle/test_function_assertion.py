@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aftbed.core.valuefault import flipped
-from aftbed.vehicle.aebmessages import (
+from aftbed.vehicle.aeb.function import DEMAND_MS2, AebFunction, sample_requests
+from aftbed.vehicle.aeb.messages import (
     STAGE_FULL,
     STAGE_NONE,
     STAGE_PARTIAL,
@@ -24,7 +25,6 @@ from aftbed.vehicle.aebmessages import (
     encode_reply,
     encode_request,
 )
-from aftbed.vehicle.function import DEMAND_MS2, AebFunction, sample_requests
 
 
 def rough(seed: int, count: int) -> Iterator[AebInput]:

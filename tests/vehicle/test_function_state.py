@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aftbed.core.errors import PeerError
-from aftbed.vehicle.aebmessages import SLOTS, AebInput, AebTarget, decode_reply, encode_request
-from aftbed.vehicle.function import STATE_BYTES, AebFunction
+from aftbed.vehicle.aeb.function import STATE_BYTES, AebFunction
+from aftbed.vehicle.aeb.messages import SLOTS, AebInput, AebTarget, decode_reply, encode_request
 
 
 def test_the_state_has_one_size_in_the_range_that_was_asked_for() -> None:

@@ -6,9 +6,9 @@ from hypothesis import strategies as st
 from puredrive import CODEC
 
 from aftbed.core.errors import PeerError
-from aftbed.vehicle.aebmessages import AebInput, AebOutput, AebTarget, decode_request, encode_reply
-from aftbed.vehicle.e2e import intact, protect
-from aftbed.vehicle.frame import Frame
+from aftbed.vehicle.aeb.messages import AebInput, AebOutput, AebTarget, decode_request, encode_reply
+from aftbed.vehicle.can.e2e import intact, protect
+from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.gateway import LANE_HALF_M, ClientGateway, Gateway
 
 EGO = {"SPEED_VALID": 1.0, "SPEED": 14.0}

@@ -15,9 +15,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aftbed.core.errors import ConfigError, PeerError
-from aftbed.vehicle.candump import LogCounts, Refusal, parse_lines, read_log
-from aftbed.vehicle.hub import ELEMENT_BYTES_MAX
-from aftbed.vehicle.hubclient import CLIENTS_MAX, HubOptions, frame_bits, parse_send
+from aftbed.vehicle.can.candump import LogCounts, Refusal, parse_lines, read_log
+from aftbed.vehicle.can.hub import CLIENTS_MAX, ELEMENT_BYTES_MAX, HubOptions, frame_bits, parse_send
 
 LOCKSTEP = HubOptions(lockstep=True)
 

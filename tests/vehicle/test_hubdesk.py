@@ -6,9 +6,7 @@ from collections.abc import Iterator
 import pytest
 
 from aftbed.core.busfault import Condition, Struck
-from aftbed.vehicle.hub import Hub
-from aftbed.vehicle.hubclient import Client
-from aftbed.vehicle.hubdesk import Watches
+from aftbed.vehicle.can.hub import Client, Hub, Watches
 
 TTC = Condition("ttc", True, 1.2)
 

@@ -12,8 +12,8 @@ from hypothesis import HealthCheck, assume, given, settings
 from loggedframes import LOGS, NOW_US
 
 from aftbed.core.errors import ConfigError, PeerError
-from aftbed.vehicle.candump import read_log
-from aftbed.vehicle.frame import Frame
+from aftbed.vehicle.can.candump import read_log
+from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.logs import candumpfile
 from aftbed.vehicle.logs.convert import READERS, WRITERS, convert
 from aftbed.vehicle.logs.frames import Kind, Log, LoggedFrame, numbers

@@ -7,7 +7,7 @@ from typing import Final
 import pytest
 
 from aftbed.core.errors import ConfigError
-from aftbed.vehicle.dbcfile import Codec, load_dbc
+from aftbed.vehicle.can.dbc_file import Codec, load_dbc
 from aftbed.vehicle.logs.candumpfile import line_of
 from aftbed.vehicle.logs.convert import convert
 from aftbed.vehicle.logs.frames import LoggedFrame

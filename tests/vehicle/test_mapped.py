@@ -8,10 +8,10 @@ from hypothesis import strategies as st
 from puredrive import CODEC
 
 from aftbed.core.errors import ConfigError
-from aftbed.vehicle.aebmessages import AebInput, AebTarget, decode_request
-from aftbed.vehicle.frame import Frame
-from aftbed.vehicle.mapped import MappedGateway, toyota_checksum
-from aftbed.vehicle.mapshape import RawSignal
+from aftbed.vehicle.aeb.messages import AebInput, AebTarget, decode_request
+from aftbed.vehicle.can.frame import Frame
+from aftbed.vehicle.replay.map_file import RawSignal
+from aftbed.vehicle.replay.mapped_gateway import MappedGateway, toyota_checksum
 
 DBC = """
 BU_: X

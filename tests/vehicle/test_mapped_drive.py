@@ -7,13 +7,12 @@ import yaml
 from puredrive import CODEC, TOYOTA_DBC, TOYOTA_LOG
 
 from aftbed.core.errors import ConfigError
-from aftbed.vehicle.aebmessages import decode_reply, decode_request
-from aftbed.vehicle.candump import read_log
-from aftbed.vehicle.frame import Frame
-from aftbed.vehicle.function import AebFunction
-from aftbed.vehicle.mapfile import find_map
-from aftbed.vehicle.mapped import MappedGateway
-from aftbed.vehicle.mapshape import Messages
+from aftbed.vehicle.aeb.function import AebFunction
+from aftbed.vehicle.aeb.messages import decode_reply, decode_request
+from aftbed.vehicle.can.candump import read_log
+from aftbed.vehicle.can.frame import Frame
+from aftbed.vehicle.replay.map_file import Messages, find_map
+from aftbed.vehicle.replay.mapped_gateway import MappedGateway
 
 
 @pytest.mark.parametrize(

@@ -6,10 +6,10 @@ import pytest
 from puredrive import CODEC
 
 from aftbed.core.errors import ConfigError
-from aftbed.vehicle.aebmessages import decode_request
-from aftbed.vehicle.e2eprofiles import P01, P02, P05, P11, Profile, counter_count, with_e2e
-from aftbed.vehicle.frame import Frame
-from aftbed.vehicle.mapped import MappedGateway
+from aftbed.vehicle.aeb.messages import decode_request
+from aftbed.vehicle.can.e2e import P01, P02, P05, P11, Profile, counter_count, with_e2e
+from aftbed.vehicle.can.frame import Frame
+from aftbed.vehicle.replay.mapped_gateway import MappedGateway
 
 Make = Callable[..., MappedGateway]
 

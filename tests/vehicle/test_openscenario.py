@@ -22,7 +22,8 @@ from xoscfiles import (
 from aftbed.runtime.sim.world import Setup, simulate
 from aftbed.vehicle.openscenario import Imported, Wanted, import_scenario, write
 from aftbed.vehicle.plant import Lead, LeadBraking
-from aftbed.vehicle.scenario import Scenario, load_scenario
+from aftbed.vehicle.scenarios.library import load_scenario
+from aftbed.vehicle.scenarios.scenario import Scenario
 from aftbed.vehicle.xosc.storyboard import Drive
 
 

@@ -12,7 +12,7 @@ from xoscfiles import LEAD_BRAKES, SLOW_LEAD, VALUES, imported
 
 from aftbed.core.errors import ConfigError
 from aftbed.vehicle.openscenario import Wanted, import_scenario
-from aftbed.vehicle.scenariofile import ScenarioKeys
+from aftbed.vehicle.scenarios.scenario import ScenarioKeys
 from aftbed.vehicle.xosc import tree
 from aftbed.vehicle.xosc.expression import EXPRESSION_CHARACTERS_MAX, FUNCTIONS, evaluate
 from aftbed.vehicle.xosc.tree import parse_tree

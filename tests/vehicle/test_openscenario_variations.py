@@ -8,7 +8,7 @@ from xoscfiles import FOLDER, LEAD_BRAKES, VALUES, changed
 
 from aftbed.core.errors import ConfigError
 from aftbed.vehicle.openscenario import Imported, Wanted, import_scenario, write
-from aftbed.vehicle.scenario import load_scenario
+from aftbed.vehicle.scenarios.library import load_scenario
 
 GAPS = '<Element value="12"/>'
 RANGE = '<Range lowerLimit="2" upperLimit="6"/>'

@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 from puredrive import CODEC
 from radarlogs import EGO_MS, FAR, RADARS, STANDING, Car, ars408, codec, drive, write
 
-from aftbed.vehicle.aebmessages import (
+from aftbed.vehicle.aeb.function import AebFunction
+from aftbed.vehicle.aeb.messages import (
     STAGE_FULL,
     AebInput,
     AebOutput,
@@ -24,12 +25,10 @@ from aftbed.vehicle.aebmessages import (
     decode_reply,
     decode_request,
 )
-from aftbed.vehicle.candump import read_log
-from aftbed.vehicle.dbcfile import find_dbc
-from aftbed.vehicle.frame import Frame
-from aftbed.vehicle.function import AebFunction
-from aftbed.vehicle.mapfile import find_map
-from aftbed.vehicle.mapped import MappedGateway
+from aftbed.vehicle.can.candump import read_log
+from aftbed.vehicle.can.frame import Frame
+from aftbed.vehicle.replay.map_file import find_dbc, find_map
+from aftbed.vehicle.replay.mapped_gateway import MappedGateway
 
 APPROACH = (STANDING, *FAR)
 

@@ -4,12 +4,12 @@ import pytest
 from paintedlog import SEEN_US, WHY_NOT, painted, real_drive
 from puredrive import CODEC, TOYOTA_DBC, TOYOTA_LOG
 
-from aftbed.vehicle.aebmessages import STAGE_FULL, STAGE_NONE, STAGE_WARN, AebOutput, decode_reply
-from aftbed.vehicle.candump import LogFrame
-from aftbed.vehicle.frame import Frame
-from aftbed.vehicle.function import AebFunction
-from aftbed.vehicle.mapfile import find_map
-from aftbed.vehicle.mapped import MappedGateway
+from aftbed.vehicle.aeb.function import AebFunction
+from aftbed.vehicle.aeb.messages import STAGE_FULL, STAGE_NONE, STAGE_WARN, AebOutput, decode_reply
+from aftbed.vehicle.can.candump import LogFrame
+from aftbed.vehicle.can.frame import Frame
+from aftbed.vehicle.replay.map_file import find_map
+from aftbed.vehicle.replay.mapped_gateway import MappedGateway
 
 pytestmark = pytest.mark.skipif(not TOYOTA_LOG.is_file(), reason=WHY_NOT)
 

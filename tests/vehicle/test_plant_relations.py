@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from puredrive import drive
 
-from aftbed.vehicle.frame import Frame
+from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.plant import (
     GRAVITY_MS2,
     STEP_US,
@@ -20,9 +20,9 @@ from aftbed.vehicle.plant import (
     LeadBraking,
     Plant,
     PlantSetup,
+    VehicleResult,
 )
-from aftbed.vehicle.report import VehicleResult
-from aftbed.vehicle.scenario import load_scenario
+from aftbed.vehicle.scenarios.library import load_scenario
 
 DRIVE_MS = 15_000
 STEP_ERROR_M = 0.03  # of the place where the ego stands, or would stand at full grip

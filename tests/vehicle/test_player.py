@@ -7,13 +7,13 @@ from pathlib import Path
 import pytest
 from busharness import TestGateway, running_hub
 
-from aftbed.vehicle import bus as bus_module
-from aftbed.vehicle.bus import open_bus
-from aftbed.vehicle.candump import LogFrame, read_log
-from aftbed.vehicle.dbcfile import Codec, load_dbc
-from aftbed.vehicle.frame import Frame
-from aftbed.vehicle.hubclient import HubOptions
-from aftbed.vehicle.player import PlayReport, play
+from aftbed.vehicle.can import bus as bus_module
+from aftbed.vehicle.can.bus import open_bus
+from aftbed.vehicle.can.candump import LogFrame, read_log
+from aftbed.vehicle.can.dbc_file import Codec, load_dbc
+from aftbed.vehicle.can.frame import Frame
+from aftbed.vehicle.can.hub import HubOptions
+from aftbed.vehicle.replay.player import PlayReport, play
 
 CYCLE_END_ID = 0x22F
 START_US = 1_533_198_917_000_181

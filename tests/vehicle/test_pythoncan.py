@@ -18,11 +18,11 @@ print("asammdf" in sys.modules)
 @pytest.mark.parametrize(
     ("module", "act"),
     [
-        ("aftbed.vehicle.libraries", ""),
-        ("aftbed.vehicle.dbcfile", "from aftbed.vehicle.dbcfile import load_dbc; load_dbc()"),
+        ("aftbed.vehicle.can.libraries", ""),
+        ("aftbed.vehicle.can.dbc_file", "from aftbed.vehicle.can.dbc_file import load_dbc; load_dbc()"),
         (
-            "aftbed.vehicle.bus",
-            "from aftbed.vehicle.bus import *; open_bus(BusOptions(interface='virtual')).close()",
+            "aftbed.vehicle.can.bus",
+            "from aftbed.vehicle.can.bus import *; open_bus(BusOptions(interface='virtual')).close()",
         ),
     ],
 )

@@ -8,12 +8,12 @@ import pytest
 from puredrive import as_it_is, drive
 
 from aftbed.core.errors import ConfigError
-from aftbed.vehicle.aebmessages import STAGE_FULL, STAGE_NONE, STAGE_WARN
+from aftbed.vehicle.aeb.messages import STAGE_FULL, STAGE_NONE, STAGE_WARN
+from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.ecus import Fallback
-from aftbed.vehicle.frame import Frame
-from aftbed.vehicle.plant import Brakes, CutIn, Driver, Lead, LeadBraking, PlantSetup
-from aftbed.vehicle.report import VehicleResult
-from aftbed.vehicle.scenario import broken_expectations, load_scenario, scenario_names
+from aftbed.vehicle.plant import Brakes, CutIn, Driver, Lead, LeadBraking, PlantSetup, VehicleResult
+from aftbed.vehicle.scenarios.library import load_scenario, scenario_names
+from aftbed.vehicle.scenarios.scenario import broken_expectations
 
 NAMES = ["ccrb-50-12m", "ccrb-50-40m", "ccrm-50", "ccrs-20", "ccrs-42", "ccrs-50", "free-drive"]
 

@@ -10,12 +10,12 @@ import yaml
 import aftbed
 from aftbed.core.errors import ConfigError
 from aftbed.runtime.sim.world import Setup, simulate
-from aftbed.vehicle.dbcfile import load_dbc
-from aftbed.vehicle.plant import KMH_PER_MS, Driver
-from aftbed.vehicle.report import VehicleResult
-from aftbed.vehicle.scenario import broken_expectations, load_scenario
-from aftbed.vehicle.tables import Case, broken, cases, colour, group_names, table_names, title
-from aftbed.vehicle.virtual import VirtualCar
+from aftbed.vehicle.can.dbc_file import load_dbc
+from aftbed.vehicle.drive_virtual import VirtualCar
+from aftbed.vehicle.plant import KMH_PER_MS, Driver, VehicleResult
+from aftbed.vehicle.scenarios.library import load_scenario
+from aftbed.vehicle.scenarios.scenario import broken_expectations
+from aftbed.vehicle.scenarios.tables import Case, broken, cases, colour, group_names, table_names, title
 
 CODEC = load_dbc()
 EVERY_CASE = [case for table in table_names() for case in cases(table)]

@@ -11,11 +11,10 @@ from hypothesis import strategies as st
 
 from aftbed.core.application import Application, Characteristics
 from aftbed.core.errors import PeerError
-from aftbed.vehicle import variants
-from aftbed.vehicle.aebmessages import STAGE_NONE, STAGE_WARN, AebOutput, decode_reply, encode_reply
-from aftbed.vehicle.function import STATE_BYTES, default_application, sample_requests
-from aftbed.vehicle.scenario import broken_expectations, load_scenario
-from aftbed.vehicle.variants import (
+from aftbed.vehicle.aeb import variants
+from aftbed.vehicle.aeb.function import STATE_BYTES, default_application, sample_requests
+from aftbed.vehicle.aeb.messages import STAGE_NONE, STAGE_WARN, AebOutput, decode_reply, encode_reply
+from aftbed.vehicle.aeb.variants import (
     CALM_TTC_S,
     EARLY_TTC_S,
     NOISE_PART,
@@ -23,6 +22,8 @@ from aftbed.vehicle.variants import (
     NonDeterministic,
     WithoutStateAccess,
 )
+from aftbed.vehicle.scenarios.library import load_scenario
+from aftbed.vehicle.scenarios.scenario import broken_expectations
 
 Make = Callable[[], Application]
 VARIANTS: Final[tuple[Make, ...]] = (WithoutStateAccess, NonDeterministic, Cautious)

@@ -20,16 +20,17 @@ import pytest
 from busharness import FunctionGateway, running_hub
 from puredrive import CODEC
 
-from aftbed.vehicle.candump import log_line
-from aftbed.vehicle.car import CarBuses, DriveOptions, DriveReport
-from aftbed.vehicle.car import drive as drive_on_hub
+from aftbed.vehicle.aeb.function import default_application
+from aftbed.vehicle.can.candump import log_line
+from aftbed.vehicle.can.frame import Frame
+from aftbed.vehicle.can.hub import HubOptions
+from aftbed.vehicle.drive_real import CarBuses, DriveOptions, DriveReport
+from aftbed.vehicle.drive_real import drive as drive_on_hub
+from aftbed.vehicle.drive_virtual import VirtualCar
 from aftbed.vehicle.ecus import BrakePolicy
-from aftbed.vehicle.frame import Frame
-from aftbed.vehicle.function import default_application
-from aftbed.vehicle.hubclient import HubOptions
-from aftbed.vehicle.report import VehicleResult
-from aftbed.vehicle.scenario import broken_expectations, load_scenario, scenario_names
-from aftbed.vehicle.virtual import VirtualCar
+from aftbed.vehicle.plant import VehicleResult
+from aftbed.vehicle.scenarios.library import load_scenario, scenario_names
+from aftbed.vehicle.scenarios.scenario import broken_expectations
 
 MS = 1_000_000  # nanoseconds
 AEB_REQ = 0x100
@@ -305,6 +306,8 @@ def test_time_does_not_go_back() -> None:
 
 
 def test_it_brings_no_socket_along() -> None:
-    found = "import sys, aftbed.vehicle.virtual; print(*sorted(sys.modules))"
+    found = "import sys, aftbed.vehicle.drive_virtual; print(*sorted(sys.modules))"
     names = subprocess.run([sys.executable, "-c", found], capture_output=True, text=True, check=True).stdout
-    assert not {"socket", "select", "can", "aftbed.vehicle.bus", "aftbed.vehicle.hub"} & set(names.split())
+    assert not {"socket", "select", "can", "aftbed.vehicle.can.bus", "aftbed.vehicle.can.hub"} & set(
+        names.split()
+    )

@@ -6,13 +6,13 @@ import pytest
 from aftbed.core.application import Application
 from aftbed.core.journal import EntryKind
 from aftbed.runtime.sim.world import Setup, simulate
-from aftbed.vehicle.aebmessages import STAGE_WARN, AebOutput, decode_reply, encode_reply
-from aftbed.vehicle.dbcfile import load_dbc
-from aftbed.vehicle.function import AebFunction
-from aftbed.vehicle.plant import Driver
-from aftbed.vehicle.report import VehicleResult
-from aftbed.vehicle.scenario import Scenario, load_scenario
-from aftbed.vehicle.virtual import VirtualCar
+from aftbed.vehicle.aeb.function import AebFunction
+from aftbed.vehicle.aeb.messages import STAGE_WARN, AebOutput, decode_reply, encode_reply
+from aftbed.vehicle.can.dbc_file import load_dbc
+from aftbed.vehicle.drive_virtual import VirtualCar
+from aftbed.vehicle.plant import Driver, VehicleResult
+from aftbed.vehicle.scenarios.library import load_scenario
+from aftbed.vehicle.scenarios.scenario import Scenario
 
 CODEC = load_dbc()
 CYCLE_NS = 20_000_000

@@ -22,7 +22,7 @@ from aftbed.campaign.record import RunRecord
 from aftbed.core.errors import PeerError
 from aftbed.core.journal import EntryKind
 from aftbed.runtime.unix.options import LoadRun
-from aftbed.vehicle.aebmessages import AebInput, decode_request
+from aftbed.vehicle.aeb.messages import AebInput, decode_request
 
 
 class Asked(NamedTuple):

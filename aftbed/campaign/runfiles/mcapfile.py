@@ -45,11 +45,11 @@ from aftbed.campaign.runfiles.topics import (
 )
 from aftbed.core.errors import ConfigError, PeerError
 from aftbed.runtime.unix.options import CarRun, ReplayRun
-from aftbed.vehicle.aebmessages import AebInput
-from aftbed.vehicle.candump import LogCounts, LogFrame, parse_lines
-from aftbed.vehicle.dbcfile import Codec, load_dbc
-from aftbed.vehicle.e2e import intact
-from aftbed.vehicle.pythoncan import lean
+from aftbed.vehicle.aeb.messages import AebInput
+from aftbed.vehicle.can.candump import LogCounts, LogFrame, parse_lines
+from aftbed.vehicle.can.dbc_file import Codec, load_dbc
+from aftbed.vehicle.can.e2e import intact
+from aftbed.vehicle.can.python_can import lean
 
 BUS_NAME: Final = "bus.log"
 STAGES: Final = ("NONE", "WARN", "PARTIAL", "FULL")

@@ -11,7 +11,7 @@ from aftbed.core.messages import NodeDied, Pulses, Reply, Submit
 from aftbed.ftm.client import BACKLOG_MAX, Client
 from aftbed.ftm.failover import PERIOD_NS
 from aftbed.runtime.source import Dialogue
-from aftbed.vehicle.virtual import VirtualCar
+from aftbed.vehicle.drive_virtual import VirtualCar
 
 Notice = Callable[[int, Callable[[], None]], None]
 

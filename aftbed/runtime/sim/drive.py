@@ -1,8 +1,8 @@
 """The car of a simulated run: when it began, faults of its bus, and the conditions at which faults begin.
 
-The car is driven as far as somebody asks it to (`vehicle.virtual`), which is once in a cycle of its radar.
-While a condition is waited for, it is driven step by step, so what begins on that condition begins at the
-very virtual time of that step; and, as in lockstep, before anything else that belongs to the step.
+The car (`vehicle.drive_virtual`) is advanced on demand, which is once in a cycle of its radar. While a
+condition is waited for, it is driven step by step: what begins on that condition begins at the very virtual
+time of that step and, as in lockstep, before anything else that belongs to the step.
 """
 
 from collections.abc import Callable
@@ -12,9 +12,8 @@ from aftbed.core.busfault import BusFault, Condition, Struck
 from aftbed.runtime.interface import Met
 from aftbed.runtime.sim.clock import Clock
 from aftbed.runtime.sim.givens import car_in
-from aftbed.vehicle.plant import STEP_US
-from aftbed.vehicle.report import VehicleResult
-from aftbed.vehicle.virtual import VirtualCar
+from aftbed.vehicle.drive_virtual import VirtualCar
+from aftbed.vehicle.plant import STEP_US, VehicleResult
 
 STEP_NS: Final = STEP_US * 1000
 

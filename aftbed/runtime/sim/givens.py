@@ -10,10 +10,10 @@ from aftbed.core.fault import Fault, FlipMemory
 from aftbed.core.graph import Graph
 from aftbed.core.journal import Record
 from aftbed.ftm.compose import build
-from aftbed.vehicle.dbcfile import Codec, load_dbc
-from aftbed.vehicle.function import sample_requests
-from aftbed.vehicle.scenario import load_scenario
-from aftbed.vehicle.virtual import VirtualCar
+from aftbed.vehicle.aeb.function import sample_requests
+from aftbed.vehicle.can.dbc_file import Codec, load_dbc
+from aftbed.vehicle.drive_virtual import VirtualCar
+from aftbed.vehicle.scenarios.library import load_scenario
 
 REQUESTS: Final = 512
 

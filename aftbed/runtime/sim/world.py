@@ -39,8 +39,8 @@ from aftbed.runtime.sim.givens import Journal, check, graph_of, nothing_off_line
 from aftbed.runtime.sim.node import Node
 from aftbed.runtime.sim.processes import Nursery, Process
 from aftbed.runtime.source import Load, resume_client
-from aftbed.vehicle.function import default_application
-from aftbed.vehicle.report import VehicleResult
+from aftbed.vehicle.aeb.function import default_application
+from aftbed.vehicle.plant import VehicleResult
 
 STOPPED: Final = "detected stop"  # in the reason of a death
 REST_NS_MAX: Final = 3_000_000_000  # from the last fault to the rest, in virtual time

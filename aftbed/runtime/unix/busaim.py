@@ -31,8 +31,8 @@ def aim(fault: Fault, work: Work) -> Fault:
     if isinstance(work, LoadRun):
         raise ConfigError(f"{fault}: a run of --load has no bus")
     from aftbed.vehicle.aim import aimed  # noqa: PLC0415 - a tenth of a second, for those who need it
-    from aftbed.vehicle.dbcfile import load_dbc  # noqa: PLC0415
-    from aftbed.vehicle.mapfile import find_map, load_mapped  # noqa: PLC0415
+    from aftbed.vehicle.can.dbc_file import load_dbc  # noqa: PLC0415
+    from aftbed.vehicle.replay.map_file import find_map, load_mapped  # noqa: PLC0415
 
     codecs = [load_dbc()]
     if isinstance(work, ReplayRun):

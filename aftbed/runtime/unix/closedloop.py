@@ -123,7 +123,7 @@ def _unsuitable(expression: str, application: str) -> str:
     """Why `expression` does not suit the function that is protected now; "" if it does."""
     from aftbed.adapt.bricks import load_application  # noqa: PLC0415 - at the first proposal
     from aftbed.runtime.unix.part import load_module  # noqa: PLC0415
-    from aftbed.vehicle.function import default_application  # noqa: PLC0415
+    from aftbed.vehicle.aeb.function import default_application  # noqa: PLC0415
 
     function = load_application(application, load_module) if application else default_application()
     declared: object = getattr(function, "characteristics", None)

@@ -14,11 +14,11 @@ from aftbed.runtime.source import resume_client
 from aftbed.runtime.unix.devices import told
 from aftbed.runtime.unix.journal import Dialogue
 from aftbed.runtime.unix.options import GatewayOptions
-from aftbed.vehicle.bus import BusOptions, open_bus
-from aftbed.vehicle.dbcfile import load_dbc
+from aftbed.vehicle.can.bus import BusOptions, open_bus
+from aftbed.vehicle.can.dbc_file import load_dbc
 from aftbed.vehicle.gateway import ClientGateway, Gateway
-from aftbed.vehicle.mapfile import find_map
-from aftbed.vehicle.mapped import MappedGateway
+from aftbed.vehicle.replay.map_file import find_map
+from aftbed.vehicle.replay.mapped_gateway import MappedGateway
 
 PAYLOADS_MAX: Final = BACKLOG_MAX
 *_, GATEWAY = NODES

@@ -22,7 +22,7 @@ from aftbed.runtime.unix.lifeline import Held
 from aftbed.runtime.unix.line import Line
 from aftbed.runtime.unix.node import EXIT_ASSERT, PULSE_SECONDS, Node
 from aftbed.runtime.unix.options import GatewayOptions
-from aftbed.vehicle.function import default_application, sample_requests
+from aftbed.vehicle.aeb.function import default_application, sample_requests
 
 LOAD_REQUESTS: Final = 512
 

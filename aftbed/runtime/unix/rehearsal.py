@@ -36,7 +36,7 @@ from aftbed.runtime.unix.journal import Journal
 from aftbed.runtime.unix.line import Line, decode_order, decode_report
 from aftbed.runtime.unix.node import NUDGE, Node
 from aftbed.runtime.unix.pages import Area, written_by
-from aftbed.vehicle.function import default_application, sample_requests
+from aftbed.vehicle.aeb.function import default_application, sample_requests
 
 ROUNDS_WARM: Final = 16
 ROUNDS_ONCE: Final = 4

@@ -13,9 +13,8 @@ from aftbed.runtime import control
 from aftbed.runtime.unix import bus
 from aftbed.runtime.unix.line import Line
 from aftbed.runtime.unix.options import PlayerOptions, VehicleOptions
-from aftbed.vehicle.hub import Hub
-from aftbed.vehicle.hub import serve as serve_hub
-from aftbed.vehicle.hubclient import HubOptions
+from aftbed.vehicle.can.hub import Hub, HubOptions
+from aftbed.vehicle.can.hub import serve as serve_hub
 
 
 def serve(line: Line[control.ToNode], order: control.Serve, fds: list[int]) -> None:
@@ -30,7 +29,7 @@ def serve(line: Line[control.ToNode], order: control.Serve, fds: list[int]) -> N
 
 
 class _Desk:
-    """What the hub is told, and what it tells: see `vehicle.hub.Desk`."""
+    """What the hub is told, and what it tells: see `vehicle.can.hub.Desk`."""
 
     def __init__(self, line: Line[control.ToNode]) -> None:
         self._line = line
@@ -100,10 +99,10 @@ def _wait_for_go(line: Line[control.ToNode]) -> bool:
 
 
 def _vehicle(line: Line[control.ToNode], options: VehicleOptions) -> None:
-    from aftbed.vehicle.bus import BusOptions  # noqa: PLC0415
-    from aftbed.vehicle.car import CarBuses, DriveOptions, drive  # noqa: PLC0415
-    from aftbed.vehicle.dbcfile import load_dbc  # noqa: PLC0415
-    from aftbed.vehicle.scenario import load_scenario  # noqa: PLC0415
+    from aftbed.vehicle.can.bus import BusOptions  # noqa: PLC0415
+    from aftbed.vehicle.can.dbc_file import load_dbc  # noqa: PLC0415
+    from aftbed.vehicle.drive_real import CarBuses, DriveOptions, drive  # noqa: PLC0415
+    from aftbed.vehicle.scenarios.library import load_scenario  # noqa: PLC0415
 
     scenario, codec = load_scenario(options.scenario), load_dbc()
     hears = (codec.can_id("AEB_REQ"),)
@@ -131,12 +130,12 @@ def _vehicle(line: Line[control.ToNode], options: VehicleOptions) -> None:
 
 
 def _player(line: Line[control.ToNode], options: PlayerOptions) -> None:
-    from aftbed.vehicle.bus import BusOptions, open_bus  # noqa: PLC0415
-    from aftbed.vehicle.candump import read_log  # noqa: PLC0415
-    from aftbed.vehicle.dbcfile import load_dbc  # noqa: PLC0415
-    from aftbed.vehicle.mapfile import find_map  # noqa: PLC0415
-    from aftbed.vehicle.mapped import MappedGateway  # noqa: PLC0415
-    from aftbed.vehicle.player import play  # noqa: PLC0415
+    from aftbed.vehicle.can.bus import BusOptions, open_bus  # noqa: PLC0415
+    from aftbed.vehicle.can.candump import read_log  # noqa: PLC0415
+    from aftbed.vehicle.can.dbc_file import load_dbc  # noqa: PLC0415
+    from aftbed.vehicle.replay.map_file import find_map  # noqa: PLC0415
+    from aftbed.vehicle.replay.mapped_gateway import MappedGateway  # noqa: PLC0415
+    from aftbed.vehicle.replay.player import play  # noqa: PLC0415
 
     gateway = MappedGateway(load_dbc(), Path(options.dbc), find_map(options.map))
     frames, counts = read_log(Path(options.log))

@@ -16,10 +16,10 @@ CONTROL_FD: Final = 3
 PRELOADS: Final[dict[str, tuple[str, ...]]] = {
     LIGHT: (),
     BUS: (
-        "aftbed.vehicle.libraries",
+        "aftbed.vehicle.can.libraries",
         "aftbed.runtime.unix.gateway",
-        "aftbed.vehicle.car",
-        "aftbed.vehicle.player",
+        "aftbed.vehicle.drive_real",
+        "aftbed.vehicle.replay.player",
     ),
 }
 

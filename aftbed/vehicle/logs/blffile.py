@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import Final
 
 from aftbed.core.errors import ConfigError, PeerError
-from aftbed.vehicle.candump import LOG_BYTES_MAX
+from aftbed.vehicle.can.candump import LOG_BYTES_MAX
+from aftbed.vehicle.can.python_can import lean
 from aftbed.vehicle.logs.frames import Log, content, numbers, origin_us
 from aftbed.vehicle.logs.messages import Memory, message_of, taken
-from aftbed.vehicle.pythoncan import lean
 
 SIGNATURE: Final = b"LOGG"
 OBJECT: Final = b"LOBJ"

@@ -1,4 +1,4 @@
-"""The candump format for any classic CAN bus; `vehicle.candump` is the narrow form of it that a replay
+"""The candump format for any classic CAN bus; `vehicle.can.candump` is the narrow form of it that a replay
 believes.
 
     (1533198917.000181) can1 215#EB30BAF740F62142        11 bits: three digits
@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Final
 
 from aftbed.core.errors import ConfigError, PeerError
-from aftbed.vehicle.candump import LINE_SHOWN_CHARACTERS_MAX, Refusal
+from aftbed.vehicle.can.candump import LINE_SHOWN_CHARACTERS_MAX, Refusal
 from aftbed.vehicle.logs.frames import EXTENDED_ID_MAX, Kind, Log, LoggedFrame, content
 
 EXPECTED: Final = "(SECONDS.MICROSECONDS) INTERFACE ID#DATA, e.g. (0000000012.345678) can0 130#01020304"

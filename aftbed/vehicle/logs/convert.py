@@ -13,10 +13,11 @@ from typing import Final, TypeVar
 import msgspec
 
 from aftbed.core.errors import ConfigError, unknown
-from aftbed.vehicle.dbcfile import Codec, find_dbc, load_dbc
+from aftbed.vehicle.can.dbc_file import Codec, load_dbc
+from aftbed.vehicle.can.python_can import lean
 from aftbed.vehicle.logs import blffile, candumpfile, mf4file, signals, textfiles
 from aftbed.vehicle.logs.frames import Log, without
-from aftbed.vehicle.pythoncan import lean
+from aftbed.vehicle.replay.map_file import find_dbc
 
 Answer = TypeVar("Answer")
 CSV: Final = "csv"

@@ -1,6 +1,6 @@
 """What a log of a CAN bus holds, whatever its format: frames, each with its time and where it was seen.
 
-Wider than what aftbed's own bus carries (`vehicle.frame`), since the logs of other buses are to be
+Wider than what aftbed's own bus carries (`vehicle.can.frame`), since the logs of other buses are to be
 converted as well: identifiers of 11 and 29 bits, remote frames, error frames. Narrower than what exists:
 CAN FD is left out, and so is what a format has beside the frames (statistics, comments, triggers). What is
 left out is counted by its reason and never silently gone; what is malformed is an error and not left out.
@@ -22,8 +22,8 @@ from typing import Final
 import msgspec
 
 from aftbed.core.errors import ConfigError, PeerError
-from aftbed.vehicle.candump import LOG_BYTES_MAX
-from aftbed.vehicle.frame import CAN_ID_MAX, DATA_LENGTH_MAX
+from aftbed.vehicle.can.candump import LOG_BYTES_MAX
+from aftbed.vehicle.can.frame import CAN_ID_MAX, DATA_LENGTH_MAX
 
 EXTENDED_ID_MAX: Final = 0x1FFFFFFF
 TIME_US_MAX: Final = 2**32 * 1_000_000 - 1  # in 2106; a float holds microseconds up to there

@@ -22,9 +22,9 @@ from pathlib import Path
 from typing import Final
 
 from aftbed.core.errors import ConfigError
+from aftbed.vehicle.can.python_can import with_asammdf
 from aftbed.vehicle.logs.frames import Kind, Log, LoggedFrame, content, numbers, origin_us
 from aftbed.vehicle.logs.messages import taken
-from aftbed.vehicle.pythoncan import with_asammdf
 
 NAMES: Final = {Kind.DATA: "CAN_DataFrame", Kind.ERROR: "CAN_ErrorFrame", Kind.REMOTE: "CAN_RemoteFrame"}
 MAGIC: Final = b"MDF     "

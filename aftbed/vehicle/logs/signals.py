@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Final
 
 from aftbed.core.errors import ConfigError, PeerError
-from aftbed.vehicle.dbcfile import Codec
-from aftbed.vehicle.frame import CAN_ID_MAX
+from aftbed.vehicle.can.dbc_file import Codec
+from aftbed.vehicle.can.frame import CAN_ID_MAX
 from aftbed.vehicle.logs.frames import Kind, Log, LoggedFrame, without
 
 UNKNOWN: Final = "frame that the DBC does not have"

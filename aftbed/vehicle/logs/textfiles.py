@@ -18,9 +18,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from aftbed.core.errors import ConfigError
+from aftbed.vehicle.can.python_can import lean
 from aftbed.vehicle.logs.frames import DATED_US_MIN, Kind, Log, content, numbers, origin_us, without
 from aftbed.vehicle.logs.messages import Memory, message_of, taken
-from aftbed.vehicle.pythoncan import lean
 
 if TYPE_CHECKING:
     from can import ASCReader, Message

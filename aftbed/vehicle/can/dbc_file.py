@@ -22,16 +22,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, cast
 
 from aftbed.core.errors import ConfigError, PeerError, unknown
-from aftbed.vehicle.frame import DATA_LENGTH_MAX
-from aftbed.vehicle.pythoncan import lean
+from aftbed.vehicle.can.frame import DATA_LENGTH_MAX
+from aftbed.vehicle.can.python_can import lean
 
 if TYPE_CHECKING:
     from cantools.database.can import Database, Message
     from cantools.database.can.signal import Signal
 
 DBC_BYTES_MAX: Final = 16_000_000  # the largest real ones known to us have two; a log given by mistake more
-SHIPPED: Final = Path(__file__).resolve().parent / "maps"  # beside the maps that go with them
-_PACKAGE: Final = Path(__file__).resolve().parents[1]
+_PACKAGE: Final = Path(__file__).resolve().parents[2]
 _CANDIDATES: Final = (
     _PACKAGE / "dbc" / "aftbed.dbc",  # in a wheel
     _PACKAGE.parent / "dbc" / "aftbed.dbc",  # in a checkout
@@ -161,17 +160,6 @@ class Codec:
             if candidate.name == signal:
                 return candidate
         raise ConfigError(f"{self.path}: {unknown(f'signal of {name}', signal, self.signal_names(name))}")
-
-
-def find_dbc(name_or_path: str) -> Path:
-    """A shipped DBC by name, or the path as it is: whatever has a slash or a dot in it, or is a file."""
-    path = Path(name_or_path)
-    if "/" in name_or_path or "." in name_or_path or path.is_file():
-        return path
-    names = sorted(shipped.stem for shipped in SHIPPED.glob("*.dbc"))
-    if name_or_path not in names:
-        raise unknown("DBC", name_or_path, names)
-    return SHIPPED / f"{name_or_path}.dbc"
 
 
 def load_dbc(path: Path | None = None, *, strict: bool = True) -> Codec:

@@ -14,14 +14,11 @@ from pathlib import Path
 from typing import Final
 
 from aftbed.core.errors import unknown
-from aftbed.vehicle.report import VehicleResult
-from aftbed.vehicle.scenariofile import Expectation, Outcome, Scenario, ScenarioKeys, scenario_of
-from aftbed.vehicle.tables import SEPARATOR, case_scenario
+from aftbed.vehicle.scenarios.scenario import Scenario, ScenarioKeys, scenario_of
+from aftbed.vehicle.scenarios.tables import SEPARATOR, case_scenario
 from aftbed.vehicle.yamlfile import read_yaml
 
-__all__ = ["Expectation", "Outcome", "Scenario", "broken_expectations", "load_scenario", "scenario_names"]
-
-_FOLDER: Final = Path(__file__).resolve().parent / "scenarios"
+_FOLDER: Final = Path(__file__).resolve().parent
 
 
 def scenario_names() -> list[str]:
@@ -43,22 +40,3 @@ def load_scenario(name_or_path: str) -> Scenario:
     else:
         raise unknown("scenario", name_or_path, scenario_names())
     return scenario_of(path.stem, str(path), read_yaml(path, ScenarioKeys))
-
-
-def broken_expectations(scenario: Scenario, result: VehicleResult) -> list[str]:
-    """Every way in which `result` is not what the scenario expects, or []."""
-    expect = scenario.expect
-    found = []
-    if result.collision:
-        impact_kmh = result.impact_speed_kmh or 0.0
-        if expect.outcome != "impact":
-            found.append(f"collision at {impact_kmh:.1f} km/h, expected {expect.outcome}")
-        elif impact_kmh > expect.impact_speed_kmh_max:
-            found.append(f"impact at {impact_kmh:.1f} km/h, allowed are {expect.impact_speed_kmh_max:.1f}")
-    elif expect.outcome == "stop" and result.stop_gap_m is None:
-        found.append("the car did not stop, expected stop")
-    if expect.outcome == "no_braking" and result.braked:
-        found.append("the car braked, expected no_braking")
-    if result.stop_gap_m is not None and result.stop_gap_m < expect.stop_gap_m_min:
-        found.append(f"stopped at {result.stop_gap_m:.2f} m, at least {expect.stop_gap_m_min:.2f} m expected")
-    return found

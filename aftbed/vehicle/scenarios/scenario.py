@@ -21,6 +21,7 @@ from aftbed.vehicle.plant import (
     Lead,
     LeadBraking,
     PlantSetup,
+    VehicleResult,
 )
 
 Outcome = Literal["stop", "no_collision", "no_braking", "impact"]
@@ -172,3 +173,22 @@ def _gap_m(where: str, lead: LeadKeys, ego_kmh: float) -> float:
     if lead.gap_m == 0.0:
         raise ConfigError(f"{where}: lead.gap_m: found 0, allowed is more than 0")
     return lead.gap_m
+
+
+def broken_expectations(scenario: Scenario, result: VehicleResult) -> list[str]:
+    """Every way in which `result` is not what the scenario expects, or []."""
+    expect = scenario.expect
+    found = []
+    if result.collision:
+        impact_kmh = result.impact_speed_kmh or 0.0
+        if expect.outcome != "impact":
+            found.append(f"collision at {impact_kmh:.1f} km/h, expected {expect.outcome}")
+        elif impact_kmh > expect.impact_speed_kmh_max:
+            found.append(f"impact at {impact_kmh:.1f} km/h, allowed are {expect.impact_speed_kmh_max:.1f}")
+    elif expect.outcome == "stop" and result.stop_gap_m is None:
+        found.append("the car did not stop, expected stop")
+    if expect.outcome == "no_braking" and result.braked:
+        found.append("the car braked, expected no_braking")
+    if result.stop_gap_m is not None and result.stop_gap_m < expect.stop_gap_m_min:
+        found.append(f"stopped at {result.stop_gap_m:.2f} m, at least {expect.stop_gap_m_min:.2f} m expected")
+    return found

@@ -29,7 +29,7 @@ from typing import Final
 
 from aftbed.core.application import Application, Characteristics, Field
 from aftbed.core.errors import PeerError
-from aftbed.vehicle.aebmessages import (
+from aftbed.vehicle.aeb.messages import (
     COUNTER_COUNT,
     SLOTS,
     SPEED_MAX_MS,
@@ -46,8 +46,8 @@ from aftbed.vehicle.aebmessages import (
     encode_reply,
     encode_request,
 )
-from aftbed.vehicle.threat import WARN_TTC_S, Threat, worst
-from aftbed.vehicle.tracker import ALPHA, BETA, GATE_M, GATE_MS, HITS_CONFIRMED, Track
+from aftbed.vehicle.aeb.threat import WARN_TTC_S, Threat, worst
+from aftbed.vehicle.aeb.tracker import ALPHA, BETA, GATE_M, GATE_MS, HITS_CONFIRMED, Track
 
 DEMAND_MS2: Final = (0.0, 0.0, 4.0, 9.0)  # by stage; full is more than the tyres give
 GAP_MS: Final = 500

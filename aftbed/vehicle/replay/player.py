@@ -16,10 +16,10 @@ from typing import Final
 import msgspec
 
 from aftbed.core.errors import PeerError
-from aftbed.vehicle.bus import AnswerWatch, Bus, Schedule
-from aftbed.vehicle.candump import LogFrame
-from aftbed.vehicle.dbcfile import Codec
-from aftbed.vehicle.frame import Frame
+from aftbed.vehicle.can.bus import AnswerWatch, Bus, Schedule
+from aftbed.vehicle.can.candump import LogFrame
+from aftbed.vehicle.can.dbc_file import Codec
+from aftbed.vehicle.can.frame import Frame
 
 STAGE_PARTIAL: Final = 2
 

@@ -28,7 +28,7 @@ backwards.
 the bus is measured by, then one `write` to the log before the next frame is taken. So a `kill -9`
 costs the log no more than the frame under way.
 
-*Beside the bus* nodes of ours say more, and faults of the bus strike here: see `hubline`, `hubfaults`.
+*Beside the bus* nodes of ours say more, and faults of the bus strike here: see `hub_client`.
 
 Limit, said openly: python-can demands that a read gives `< ok >` and nothing behind it, while the
 first frame may follow at once. So the hub sends one byte of TCP urgent data between the two: a reader
@@ -41,18 +41,343 @@ import re
 import select
 import socket
 import time
+from collections import deque
+from collections.abc import Callable, Sequence
 from os import read, write
-from typing import TYPE_CHECKING, Final
+from typing import Final, Protocol
 
-from aftbed.core.busfault import BusFault, Struck
-from aftbed.core.errors import HarnessError, PeerError
-from aftbed.vehicle.candump import log_line
-from aftbed.vehicle.frame import Frame
-from aftbed.vehicle.hubclient import Client, Clients, HubCounts, HubOptions, frame_bits, parse_send
-from aftbed.vehicle.hubdesk import Desk, Watches
+import msgspec
 
-if TYPE_CHECKING:
-    from aftbed.vehicle.hubfaults import Delivery, HubFaults
+from aftbed.core.busfault import BusFault, Condition, Struck
+from aftbed.core.errors import ConfigError, HarnessError, PeerError
+from aftbed.core.words import number
+from aftbed.vehicle.can.candump import log_line
+from aftbed.vehicle.can.frame import Frame
+from aftbed.vehicle.disturbance import Disturber, Sent
+
+CLIENTS_MAX: Final = 64
+OUTPUT_BYTES_MAX: Final = 256 * 1024
+FRAMES_QUEUED_MAX: Final = 256  # of one client
+_SEND: Final = re.compile(rb"< send ([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8}) ([0-9]) ((?:[0-9A-Fa-f]{1,2} ){0,8}) ?")
+
+
+class HubOptions(msgspec.Struct, frozen=True):
+    """How the bus behaves. `origin_ns` is the start of the run by the monotonic clock."""
+
+    channel: str = "can0"
+    lockstep: bool = False
+    pace: float = 1.0  # seconds of bus time in a second
+    bitrate_bps: int | None = None  # None: a frame takes no time on the wire
+    origin_ns: int | None = None  # None: when `serve` is called
+
+    def __post_init__(self) -> None:
+        """Refuse a bus on which no time would pass."""
+        if not self.pace > 0:
+            raise ConfigError(f"bus pace {self.pace}, allowed is more than 0")
+        if self.bitrate_bps is not None and not 1_000 <= self.bitrate_bps <= 1_000_000:
+            raise ConfigError(f"bus bitrate {self.bitrate_bps} bit/s, allowed is 1000 to 1000000")
+
+
+class HubCounts(msgspec.Struct):
+    """What happened on the bus: frames carried, elements refused, clients put out by reason."""
+
+    frames: int = 0
+    refused: int = 0
+    slow_readers: int = 0
+    oversized: int = 0
+    turned_away: int = 0
+
+
+class Client:
+    """How far its handshake is, what waits in either direction, and who it says that it is."""
+
+    __slots__ = (
+        "carried",
+        "frames",
+        "inbox",
+        "interest",
+        "name",
+        "opened",
+        "outbox",
+        "raw",
+        "sock",
+        "uses",
+    )
+
+    def __init__(self, sock: socket.socket) -> None:
+        self.sock = sock
+        self.name = f"client {sock.fileno()}"  # no node has a blank in its name
+        self.uses: frozenset[int] = frozenset()  # the identifiers that it makes something of, if it said so
+        self.opened = False
+        self.raw = False
+        self.inbox = b""
+        self.outbox = bytearray()
+        self.frames: deque[Frame] = deque()  # `t_us` is when the node asked for the bus
+        self.carried = 0  # of them, over the wire
+        self.interest = select.EPOLLIN
+
+
+def frame_bits(data_bytes: int) -> int:
+    """Bits of a data frame with an 11-bit identifier on the wire, stuffing at its worst.
+
+    34 bits and the data are open to stuffing, at most one bit in four (Davis et al. 2007); the
+    13 bits of delimiters, acknowledgement, end of frame and intermission are not.
+    """
+    stuffable = 34 + 8 * data_bytes
+    return stuffable + (stuffable - 1) // 4 + 13
+
+
+def parse_send(element: bytes, t_us: int) -> Frame:
+    """The frame in `< send ID LENGTH BYTES` (without its `>`). Raises PeerError."""
+    match = _SEND.fullmatch(element)
+    if match is None:
+        raise PeerError("malformed send")
+    identifier, length, text = match.groups()
+    if len(identifier) != 3:
+        raise PeerError("29-bit identifiers are not carried")
+    data = bytes([int(byte, 16) for byte in text.split()])
+    if len(data) != int(length):
+        raise PeerError(f"length {int(length)} but {len(data)} bytes")
+    return Frame(t_us, int(identifier, 16), data)
+
+
+class Clients:
+    """All connections."""
+
+    def __init__(self, listener: socket.socket, epoll: select.epoll, counts: HubCounts) -> None:
+        self._listener, self._epoll, self._counts = listener, epoll, counts
+        self._by_fd: dict[int, Client] = {}
+        self.hearers: list[Client] = []  # replaced, never changed: it is walked while clients drop
+
+    def get(self, fd: int) -> Client | None:
+        """Whose descriptor this is."""
+        return self._by_fd.get(fd)
+
+    def all(self) -> list[Client]:
+        """Who is connected."""
+        return list(self._by_fd.values())
+
+    def accept(self) -> None:
+        try:
+            sock, _ = self._listener.accept()
+        except OSError:  # gone before it was accepted
+            return
+        if len(self._by_fd) >= CLIENTS_MAX:
+            self._counts.turned_away += 1
+            sock.close()
+            return
+        sock.setblocking(False)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        client = self._by_fd[sock.fileno()] = Client(sock)
+        self._epoll.register(sock.fileno(), client.interest)
+        self.send(client, b"< hi >")
+
+    def drop(self, client: Client) -> None:
+        """Hang up. What the node had handed over before still gets its turn on the wire."""
+        if self._by_fd.pop(client.sock.fileno(), None) is None:
+            return
+        self.hearers = [other for other in self.hearers if other is not client]
+        self._epoll.unregister(client.sock.fileno())
+        client.sock.close()
+
+    def watch(self, client: Client) -> None:
+        """Ask only for the events that can be served: a full queue is not read into."""
+        interest = select.EPOLLOUT if client.outbox else 0
+        if len(client.frames) < FRAMES_QUEUED_MAX:
+            interest |= select.EPOLLIN
+        if interest != client.interest and client.sock.fileno() in self._by_fd:
+            client.interest = interest
+            self._epoll.modify(client.sock.fileno(), interest)
+
+    def send(self, client: Client, data: bytes, flags: int = 0) -> None:
+        """Send, or queue what the socket does not take; a client with too much queued is dropped."""
+        sent = 0
+        if not client.outbox:
+            try:
+                sent = client.sock.send(data, flags | socket.MSG_NOSIGNAL)
+            except BlockingIOError:
+                pass
+            except OSError:
+                self.drop(client)
+                return
+        if sent < len(data):
+            client.outbox += data[sent:]
+            if len(client.outbox) > OUTPUT_BYTES_MAX:
+                self._counts.slow_readers += 1
+                self.drop(client)
+            self.watch(client)
+
+    def flush(self, client: Client) -> None:
+        try:
+            del client.outbox[: client.sock.send(client.outbox, socket.MSG_NOSIGNAL)]
+        except BlockingIOError:
+            return
+        except OSError:
+            self.drop(client)
+            return
+        self.watch(client)
+
+
+class Desk(Protocol):
+    """The line to it is the life descriptor."""
+
+    def attend(self, hub: "Hub") -> bool:
+        """Carry out what is ordered on the line; False at its end."""
+        ...
+
+    def report(self, news: list[Struck]) -> None:
+        """Something has become of these faults."""
+        ...
+
+    def met(self, fault_number: int, t_us: int, since_ns: int) -> None:
+        """The condition of that fault holds; `since_ns` is 0 where the car waits for `Watches.go_on`."""
+        ...
+
+
+class Watches:
+    """Conditions of faults that are none of the bus. `tell_plant` says a line to the car, `answer` its ok."""
+
+    def __init__(
+        self,
+        tell_plant: Callable[[bytes], None],
+        answer: Callable[[Client], None],
+        desk: Desk | None,
+        *,
+        lockstep: bool,
+    ) -> None:
+        self._tell_plant, self._answer, self._desk, self._lockstep = tell_plant, answer, desk, lockstep
+        self._open: dict[int, Condition] = {}
+        self._held: dict[int, Client] = {}  # the car, by the fault for which it waits
+
+    def watch(self, fault_number: int, condition: Condition) -> None:
+        """From now on."""
+        self._open[fault_number] = condition
+        self._tell_plant(watch_line(fault_number, condition))
+
+    def lines(self) -> bytes:
+        """What a car that has just come has to look at."""
+        return b"".join(watch_line(*watched) for watched in self._open.items())
+
+    def met(self, fault_number: int, t_us: int, since_ns: int, car: Client) -> None:
+        """The car says that the condition of a fault, ours or one of the bus, holds."""
+        if self._open.pop(fault_number, None) is None or self._desk is None:
+            self._answer(car)
+            return
+        if self._lockstep:
+            self._held[fault_number] = car
+        else:
+            self._answer(car)
+        self._desk.met(fault_number, t_us, 0 if self._lockstep else since_ns)
+
+    def go_on(self, fault_number: int) -> None:
+        """What was to be done is done: answer the car that waits for it."""
+        car = self._held.pop(fault_number, None)
+        if car is not None:
+            self._answer(car)
+
+
+def watch_line(fault_number: int, condition: Condition) -> bytes:
+    """What the car is told to look at."""
+    than = "below" if condition.below else "above"
+    return f"< watch {fault_number} {condition.quantity} {than} {number(condition.value)} >".encode("ascii")
+
+
+class Delivery(msgspec.Struct, frozen=True):
+    """A frame, and who hears it."""
+
+    frame: Frame
+    hearers: list[Client]
+
+
+class HubFaults:
+    """All faults of a hub. `tell_master` and `tell_plant` say a line to who sets the time, and to the car."""
+
+    def __init__(self, tell_master: Callable[[bytes], None], tell_plant: Callable[[bytes], None]) -> None:
+        self._tell_master, self._tell_plant = tell_master, tell_plant
+        self._disturber = Disturber()
+        self._said: dict[int, str] = {}  # the receipts that were reported
+
+    def arm(self, fault_number: int, fault: BusFault, draw: int, now_us: int) -> None:
+        """From now on."""
+        self._disturber.arm(fault_number, fault, draw, now_us)
+        for waiting, condition in self._disturber.conditions():
+            if waiting == fault_number:
+                self._tell_plant(watch_line(waiting, condition))
+
+    def forget(self, fault_number: int, now_us: int) -> None:
+        """No longer; what it holds back is due."""
+        self._disturber.forget(fault_number, now_us)
+
+    def watches(self) -> bytes:
+        """What a car that has just come has to look at."""
+        return b"".join(watch_line(waiting, condition) for waiting, condition in self._disturber.conditions())
+
+    def met(self, fault_number: int, now_us: int) -> None:
+        """The car says that the condition holds."""
+        self._disturber.met(fault_number, now_us)
+
+    def noticed(self, node: str, can_id: int, word: str) -> None:
+        """A node says that something is wrong with these frames."""
+        self._disturber.noticed(node, can_id, word)
+
+    def unasked(self, can_id: int) -> None:
+        """The gateway makes no request of a frame."""
+        self._tell_master(_change(can_id, -1))
+
+    @property
+    def idle(self) -> bool:
+        """Whether the bus is as if there had never been a fault."""
+        return self._disturber.idle
+
+    def due_us(self) -> int | None:
+        """When to call `release` next."""
+        return self._disturber.due_us()
+
+    def struck(self) -> list[Struck]:
+        """What has become of each."""
+        return self._disturber.struck()
+
+    def news(self) -> list[Struck]:
+        """Those whose receipt is another one than when this was last asked."""
+        found = [s for s in self._disturber.struck() if self._said.get(s.number, "armed") != s.receipt]
+        self._said |= {s.number: s.receipt for s in found}
+        return found
+
+    # -- frames -------------------------------------------------------------------------------
+
+    def carry(self, frame: Frame, sender: Client, hearers: Sequence[Client]) -> list[Delivery]:
+        """What comes of a frame that `sender` has sent, and who hears it."""
+        sent = self._disturber.carry(frame, sender.name)
+        expected = sum(c is not sender and frame.can_id in c.uses for c in hearers)
+        return self._deliveries(sent, frame.t_us, hearers, {frame.can_id: -expected})
+
+    def release(self, now_us: int, hearers: Sequence[Client]) -> list[Delivery]:
+        """What comes by itself now."""
+        return self._deliveries(self._disturber.release(now_us), now_us, hearers, {})
+
+    def _deliveries(
+        self, sent: list[Sent], now_us: int, hearers: Sequence[Client], changes: dict[int, int]
+    ) -> list[Delivery]:
+        found = []
+        for one in sent:
+            heard = [c for c in hearers if c.name != one.sender and not self._deaf(one.sender, c, now_us)]
+            users = [c for c in heard if one.frame.can_id in c.uses]
+            for user in users:
+                self._disturber.reached(one.by, user.name)
+            changes[one.frame.can_id] = changes.get(one.frame.can_id, 0) + len(users)
+            found.append(Delivery(one.frame, heard))
+        for can_id, change in changes.items():
+            if change:
+                self._tell_master(_change(can_id, change))
+        return found
+
+    def _deaf(self, sender: str, hearer: Client, now_us: int) -> bool:
+        return self._disturber.deaf(sender, hearer.name, now_us)
+
+
+def _change(can_id: int, change: int) -> bytes:
+    return f"< change {can_id:03X} {change:+d} >".encode("ascii")
+
 
 EVENTS_MAX: Final = 32  # in one round; the rest comes in the next
 READ_BYTES_MAX: Final = 4096
@@ -216,7 +541,6 @@ class Hub:
 
     def disturb(self, number: int, fault: BusFault, draw: int) -> None:
         """Arm `fault`, which is aimed; `draw` seeds its chance."""
-        from aftbed.vehicle.hubfaults import HubFaults  # noqa: PLC0415 - it needs the CRC, and few runs it
 
         if self._past_faults is None:
             self._past_faults = HubFaults(

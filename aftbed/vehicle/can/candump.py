@@ -24,7 +24,7 @@ from typing import Final
 import msgspec
 
 from aftbed.core.errors import ConfigError
-from aftbed.vehicle.frame import CAN_ID_MAX, DATA_LENGTH_MAX, Frame
+from aftbed.vehicle.can.frame import CAN_ID_MAX, DATA_LENGTH_MAX, Frame
 
 LOG_BYTES_MAX: Final = 256 * 1024 * 1024
 LINE_SHOWN_CHARACTERS_MAX: Final = 60

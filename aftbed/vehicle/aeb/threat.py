@@ -11,8 +11,8 @@ from typing import Final
 
 import msgspec
 
-from aftbed.vehicle.aebmessages import STAGE_FULL, STAGE_NONE, STAGE_PARTIAL, STAGE_WARN
-from aftbed.vehicle.tracker import HITS_CONFIRMED, Track
+from aftbed.vehicle.aeb.messages import STAGE_FULL, STAGE_NONE, STAGE_PARTIAL, STAGE_WARN
+from aftbed.vehicle.aeb.tracker import HITS_CONFIRMED, Track
 
 MARGIN_M: Final = 1.5  # bumper to bumper, at standstill
 REACTION_S: Final = 0.2  # dead time and lag of the brakes

@@ -1,26 +1,25 @@
-"""How a node of ours attaches to the CAN bus: python-can, with types and without its surprises.
+"""How a node of ours attaches to the CAN bus: python-can with types, and with its quirks handled.
 
-`socketcand` is the hub between processes; `virtual` is python-can's bus inside one process;
-`socketcan` is the kernel's (vcan, hardware). Three things about the socketcand client of python-can
-4.6 have to be known:
+`socketcand` is the hub between processes, `virtual` is python-can's bus inside one process, `socketcan`
+is the kernel's (vcan, hardware). Quirks of the socketcand client of python-can 4.6:
 
-1. One read of its socket may yield several frames; it keeps the rest in a buffer of its own. Who
-   waits on the descriptor alone misses them. Here `drain` empties that buffer, and the rule for a
-   node is: drain first, then wait on `fileno()`.
-2. It does not see that the hub is gone: it reads its end of file again and again. Here that is a
-   HarnessError, for without a bus there is no run.
-3. It has no `fileno` and hides its socket. It is taken out by its name, checked, and used for
-   nothing but waiting, seeing the end, and the time line of lockstep.
+1. One read of its socket may yield several frames; it keeps the rest in a buffer of its own. Waiting on
+   the descriptor alone misses them. `drain` empties that buffer, so the rule for a node is: drain first,
+   then wait on `fileno()`.
+2. It does not notice that the hub is gone: it reads end of file again and again. `Bus` raises
+   HarnessError, because without a bus there is no run.
+3. It has no `fileno` and hides its socket. `open_bus` takes the socket by its private name, checks it, and
+   uses it only to wait, to see the end of file, and to send lines beside the frames.
 
-Measured: python-can costs 7 us to send a frame and 3 us to take one out of a full socket, and adds
-11 us to the 59 us of a frame from one process through the hub to another (53 us for bare bytes over
-the same sockets): not worth a client of our own.
+Measured: python-can costs 7 us to send a frame and 3 us to take one out of a full socket, and adds 11 us
+to the 59 us of a frame from one process through the hub to another (53 us for bare bytes over the same
+sockets). A client of our own would not be worth it.
 
-*Lockstep.* Time is in the hands of one connection of the hub. The lines and frames of one connection
-keep their order, those of two do not: a node that sends all frames itself uses `Bus.set_time`, which
-asks for no answer; where several nodes send, a `HubLine` sets the time from a connection of its own
-and waits until the hub has it. `AnswerWatch` is the other half: time stands still until the
-protected function has answered. In real time, `Schedule` says when what is due.
+*Lockstep.* One connection of the hub sets the virtual time. Lines and frames of one connection keep their
+order, those of two do not: a node that sends all frames itself uses `Bus.set_time`, which waits for no
+answer; where several nodes send, a `HubLine` sets the time from a connection of its own and waits until
+the hub has taken it. `AnswerWatch` is the other half: time stands still until the protected function has
+answered. In real time, `Schedule` says when a step is due.
 """
 
 import logging
@@ -35,8 +34,8 @@ from typing import TYPE_CHECKING, Final, Literal, Protocol
 import msgspec
 
 from aftbed.core.errors import ConfigError, HarnessError
-from aftbed.vehicle.frame import Frame
-from aftbed.vehicle.pythoncan import lean
+from aftbed.vehicle.can.frame import Frame
+from aftbed.vehicle.can.python_can import lean
 
 if TYPE_CHECKING:
     import can

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 
 import msgspec
 
-from aftbed.vehicle.aebmessages import SLOTS, AebTarget
+from aftbed.vehicle.aeb.messages import SLOTS, AebTarget
 
 
 class SlotBook:

@@ -22,8 +22,8 @@ import msgspec
 from msgspec import Meta
 
 from aftbed.core.errors import ConfigError, unknown
-from aftbed.vehicle.report import VehicleResult
-from aftbed.vehicle.scenariofile import (
+from aftbed.vehicle.plant import VehicleResult
+from aftbed.vehicle.scenarios.scenario import (
     BrakesKeys,
     Deceleration,
     DriverKeys,

@@ -17,7 +17,7 @@ each assignment).
 from dataclasses import dataclass
 from typing import Final
 
-from aftbed.vehicle.aebmessages import RANGE_MAX_M, SPEED_MAX_MS, AebTarget
+from aftbed.vehicle.aeb.messages import RANGE_MAX_M, SPEED_MAX_MS, AebTarget
 
 HITS_CONFIRMED: Final = 3
 HITS_MAX: Final = 255

@@ -28,14 +28,13 @@ from collections.abc import Callable, Sequence
 import msgspec
 
 from aftbed.core.busfault import NODES
-from aftbed.vehicle.body import CarBody, End
-from aftbed.vehicle.bus import AnswerWatch, Bus, BusOptions, Schedule, open_bus
-from aftbed.vehicle.dbcfile import Codec
-from aftbed.vehicle.ecus import BrakePolicy
-from aftbed.vehicle.frame import Frame
-from aftbed.vehicle.hubline import HubLine
-from aftbed.vehicle.report import Telemetry, VehicleResult
-from aftbed.vehicle.scenario import Scenario
+from aftbed.vehicle.can.bus import AnswerWatch, Bus, BusOptions, Schedule, open_bus
+from aftbed.vehicle.can.dbc_file import Codec
+from aftbed.vehicle.can.frame import Frame
+from aftbed.vehicle.can.hub_client import HubLine
+from aftbed.vehicle.ecus import BrakePolicy, CarBody, End
+from aftbed.vehicle.plant import Telemetry, VehicleResult
+from aftbed.vehicle.scenarios.scenario import Scenario
 
 RADAR, BRAKE, _ = NODES
 

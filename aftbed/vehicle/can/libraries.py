@@ -3,7 +3,7 @@
 import importlib
 from typing import Final
 
-from aftbed.vehicle.pythoncan import lean
+from aftbed.vehicle.can.python_can import lean
 
 LIBRARIES: Final = ("can.interfaces.socketcand", "cantools", "e2e.p11")
 

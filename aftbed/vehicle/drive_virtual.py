@@ -29,15 +29,13 @@ import msgspec
 
 from aftbed.core.busfault import NODES, BusFault, Condition, Struck
 from aftbed.vehicle.aim import aimed
-from aftbed.vehicle.body import CarBody, End
-from aftbed.vehicle.dbcfile import Codec, load_dbc
+from aftbed.vehicle.can.dbc_file import Codec, load_dbc
+from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.disturbance import Disturber, Sent
-from aftbed.vehicle.ecus import BrakePolicy
-from aftbed.vehicle.frame import Frame
+from aftbed.vehicle.ecus import BrakePolicy, CarBody, End
 from aftbed.vehicle.gateway import ClientGateway, Gateway, GatewayCounts
-from aftbed.vehicle.plant import STEP_US
-from aftbed.vehicle.report import VehicleResult
-from aftbed.vehicle.scenario import Scenario
+from aftbed.vehicle.plant import STEP_US, VehicleResult
+from aftbed.vehicle.scenarios.scenario import Scenario
 
 RADAR, BRAKE, GATEWAY = NODES
 

@@ -18,14 +18,13 @@ from typing import Final
 
 import msgspec
 
-from aftbed.vehicle.aebmessages import SPEED_MAX_MS, AebInput, AebTarget, encode_request
-from aftbed.vehicle.dbcfile import Codec
-from aftbed.vehicle.e2e import Receiver
-from aftbed.vehicle.frame import Frame
+from aftbed.vehicle.aeb.messages import SPEED_MAX_MS, AebInput, AebTarget, encode_request
+from aftbed.vehicle.can.dbc_file import Codec
+from aftbed.vehicle.can.e2e import Receiver
+from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.gateway import GatewayCounts, ReplySender, target_of
-from aftbed.vehicle.mapfile import Rule, bind
-from aftbed.vehicle.mapshape import TO_SI, Flag, Quantity
-from aftbed.vehicle.slots import SlotBook
+from aftbed.vehicle.replay.map_file import TO_SI, Flag, Quantity, Rule, bind
+from aftbed.vehicle.replay.slots import SlotBook
 
 FRESH_CYCLES: Final = 1.5  # a log's time stamps come in batches, so a cycle may look longer than it was
 

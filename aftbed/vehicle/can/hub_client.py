@@ -24,7 +24,7 @@ from typing import Final, cast
 
 from aftbed.core.busfault import Condition, Quantity
 from aftbed.core.errors import ConfigError, HarnessError
-from aftbed.vehicle.bus import HOST, HUB_ANSWER_S_MAX, BusOptions
+from aftbed.vehicle.can.bus import HOST, HUB_ANSWER_S_MAX, BusOptions
 
 READ_BYTES_MAX: Final = 4096
 _OK: Final = re.compile(r"< ok (?:(-|[0-9]+) )?>")

@@ -8,7 +8,7 @@
 
 Each wraps the function and declares what it is (`characteristics`), so that the wrong mechanism is refused
 beforehand; forced all the same, it breaks where the table above says. Named as
-`aftbed.vehicle.variants:Cautious`.
+`aftbed.vehicle.aeb.variants:Cautious`.
 """
 
 from random import SystemRandom
@@ -18,8 +18,8 @@ import msgspec
 
 from aftbed.core.application import Application, Characteristics, Field
 from aftbed.core.errors import PeerError
-from aftbed.vehicle.aebmessages import STAGE_NONE, STAGE_WARN, decode_reply, encode_reply
-from aftbed.vehicle.function import STATE_BYTES, AebFunction, default_application
+from aftbed.vehicle.aeb.function import STATE_BYTES, AebFunction, default_application
+from aftbed.vehicle.aeb.messages import STAGE_NONE, STAGE_WARN, decode_reply, encode_reply
 
 NOISE_PART: Final = 0.01  # of the time to collision; the radar's own noise is more
 EARLY_TTC_S: Final = 3.5  # version 1 warns at 2.7 s

@@ -1,0 +1,1 @@
+"""The protected function: automatic emergency braking (AEB)."""

@@ -1,0 +1,1 @@
+"""The CAN bus: frames, logs, DBC, E2E protection, the hub between processes and its clients."""

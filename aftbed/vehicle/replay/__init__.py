@@ -1,0 +1,1 @@
+"""Recorded CAN logs of other cars: the player, and the gateway that reads them by a map file."""
