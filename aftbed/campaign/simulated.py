@@ -9,7 +9,7 @@ breach: nobody promised anything else.
 """
 
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Final
 
 import msgspec
@@ -20,6 +20,7 @@ from aftbed.core import check
 from aftbed.core.application import Application
 from aftbed.core.check import History
 from aftbed.core.events import Event
+from aftbed.core.script import ScriptKind
 from aftbed.core.valuefault import Flip
 from aftbed.ftm.compose import replication_of
 from aftbed.runtime.rewiring import replica_of
@@ -27,7 +28,6 @@ from aftbed.runtime.sim.world import Run
 from aftbed.vehicle.aeb.function import default_application
 
 SINGLE: Final = "single"  # the node of that placement: one host, one fate
-RENEWAL: Final = "new backup"
 UNPROMISED: Final = frozenset(  # a bit of a checkpoint, or of a reply that is kept
     event.label
     for event in (Event.STATE_CAPTURED, Event.STATE_RESTORED, Event.CHECKPOINT_SENT)
@@ -75,7 +75,11 @@ def struck_down(run: Run) -> bool:
     Or any, where for a time there may have been one only.
     """
     replicas = {b.replica for b in run.rest.graph.bricks if b.replica and b.part == "server"}
-    renewed = list(_renewals(run))
+    renewed = [
+        (s.began_ns, s.ended_ns)
+        for s in run.scripts
+        if s.kind is ScriptKind.NEW_BACKUP and s.ended_ns and not s.failure
+    ]
     strikes = sorted((t_ns, replica_of(name)) for t_ns, name in run.struck if replica_of(name))
     if any(name == SINGLE for _, name in run.struck):
         return True
@@ -86,16 +90,6 @@ def struck_down(run: Run) -> bool:
         other != replica and not any(first_ns < began and done < second_ns for began, done in renewed)
         for (first_ns, replica), (second_ns, other) in itertools.combinations(strikes, 2)
     )
-
-
-def _renewals(run: Run) -> Iterator[tuple[int, int]]:
-    """When each new backup was begun, and when it stood."""
-    began_ns = 0
-    for t_ns, event, text in run.told:
-        if event == "script" and text.startswith(RENEWAL):
-            began_ns = t_ns
-        elif event == "script.done" and text.startswith(RENEWAL):
-            yield began_ns, t_ns
 
 
 def expected_of(run: Run) -> str:

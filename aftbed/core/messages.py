@@ -268,6 +268,24 @@ class Adapted(Message, frozen=True, array_like=True, gc=False, tag=43):
     reason: str
 
 
+class HoldAt(Message, frozen=True, array_like=True, gc=False, tag=44):
+    """Runtime to the Client: report these requests, and send each of them only when it is released."""
+
+    requests: tuple[int, ...]
+
+
+class RequestHeld(Message, frozen=True, array_like=True, gc=False, tag=45):
+    """The Client to the runtime: it has come to `request_id`, and waits for its Release."""
+
+    request_id: int
+
+
+class Release(Message, frozen=True, array_like=True, gc=False, tag=46):
+    """Runtime to the Client: send `request_id`, if it is held."""
+
+    request_id: int
+
+
 AnyMessage = (
     Request
     | Reply
@@ -296,6 +314,8 @@ AnyMessage = (
     | Adapt
     | Progress
     | TakeUp
+    | HoldAt
+    | Release
 )
 
 WireMessage = (

@@ -178,8 +178,20 @@ class Phase(Enum):
     UNDO = "undo"
 
 
+class ScriptKind(Enum):
+    """What a script does as a whole."""
+
+    FAILOVER = "failover"
+    DROP_BACKUP = "drop backup"
+    NEW_BACKUP = "new backup"
+    ADAPTATION = "adaptation"
+
+
+LOSSES: Final = frozenset((ScriptKind.FAILOVER, ScriptKind.DROP_BACKUP))  # each follows the loss of a replica
+
+
 class Script(msgspec.Struct, frozen=True):
-    """`purpose` is what a person reads: `failover`, `new backup`, `pbr to pbr+tr`.
+    """`purpose` is text for people: `failover`, `new backup`, `pbr to pbr+tr`.
 
     `ftm` is the expression of what runs after it, `""` for what ran before.
     `replica` is the one that a script of Recovery is about, `""` for an adaptation.
@@ -192,6 +204,7 @@ class Script(msgspec.Struct, frozen=True):
     finish: tuple[AnyVerb, ...] = ()
     ftm: str = ""
     recipe: str = RECIPES[0]
+    kind: ScriptKind = ScriptKind.ADAPTATION
 
 
 def flat(verbs: tuple[AnyVerb, ...]) -> Iterator[AnyVerb]:

@@ -2,6 +2,10 @@
 
 Paper, III-A: the client sends requests to the Proxy and knows nothing of replicas. The source of the
 requests (the gateway of the car, or a load) hands them in on `submit` and takes replies from `deliver`.
+
+The runtime can have the Client stop at requests of given ids (`HoldAt`): it reports such a request instead of
+sending it, closes `submit`, and sends it when the runtime says `Release`. So an adaptation begins at an exact
+request.
 """
 
 from enum import auto
@@ -9,10 +13,10 @@ from typing import Final
 
 import msgspec
 
-from aftbed.core.brick import Brick, BrickState, Effect, Note, Send
+from aftbed.core.brick import CONTROL, Brick, BrickState, Effect, Note, Send
 from aftbed.core.errors import PeerError
 from aftbed.core.events import Event
-from aftbed.core.messages import AnyMessage, Rebound, Reply, Request, Submit
+from aftbed.core.messages import AnyMessage, HoldAt, Rebound, Release, Reply, Request, RequestHeld, Submit
 
 BACKLOG_MAX: Final = 64  # unanswered requests; beyond it the port `submit` is closed
 _WAITING: Final = ("submit", "pxy2clt")
@@ -25,23 +29,29 @@ class Client(Brick):
     def __init__(self) -> None:
         self.next_id = 1
         self.unanswered: dict[int, Request] = {}
+        self._hold_at: frozenset[int] = frozenset()
+        self._held: Request | None = None
         self._again: frozenset[int] = frozenset()  # asked twice, by a predecessor perhaps: may come twice
 
     def open_ports(self) -> tuple[str, ...]:
-        """No new request while the backlog is full."""
-        return _WAITING if len(self.unanswered) < BACKLOG_MAX else _FULL
+        """No new request while one is held, or the backlog is full."""
+        return _WAITING if self._held is None and len(self.unanswered) < BACKLOG_MAX else _FULL
 
     def quiescent(self) -> bool:
         """All is answered."""
         return not self.unanswered
 
     def step(self, port: str, msg: AnyMessage, now_ns: int) -> list[Effect]:
-        """Take a request from the source, a reply from the Proxy, or word that the Proxy is a new one."""
-        if isinstance(msg, Submit) and len(self.unanswered) < BACKLOG_MAX:
+        """A request from the source, a reply from the Proxy, a new Proxy, or an order of the runtime."""
+        if isinstance(msg, Submit) and self._held is None and len(self.unanswered) < BACKLOG_MAX:
             request = Request(0, self.next_id, msg.payload)
             self.unanswered[self.next_id] = request
             self.next_id += 1
-            return [Note(Event.REQUEST_SENT, request.request_id), Send("clt2pxy", request)]
+            sent = Note(Event.REQUEST_SENT, request.request_id)
+            if request.request_id in self._hold_at:
+                self._held = request
+                return [sent, Send(CONTROL, RequestHeld(request.request_id))]
+            return [sent, Send("clt2pxy", request)]
         if isinstance(msg, Reply):
             if self.unanswered.pop(msg.request_id, None) is None:
                 if msg.request_id in self._again:
@@ -51,8 +61,20 @@ class Client(Brick):
             return [Note(Event.REPLY_DELIVERED, msg.request_id, msg.replica), Send("deliver", msg)]
         if isinstance(msg, Rebound):
             # Ascending ids on a fresh channel: the order of ids is the order of execution (G3).
-            self._again = frozenset(self.unanswered)
-            return [Send("clt2pxy", request) for request in self.unanswered.values()]
+            sent_before = [request for request in self.unanswered.values() if request is not self._held]
+            self._again = frozenset(request.request_id for request in sent_before)
+            return [Send("clt2pxy", request) for request in sent_before]
+        if isinstance(msg, HoldAt):
+            self._hold_at = frozenset(msg.requests)
+            # A successor of the Client that had come to them has sent them again by now.
+            passed = [number for number in msg.requests if number < self.next_id]
+            return [Send(CONTROL, RequestHeld(number)) for number in passed]
+        if isinstance(msg, Release):
+            held = self._held
+            if held is None or held.request_id != msg.request_id:
+                return []
+            self._held = None
+            return [Send("clt2pxy", held)]
         raise PeerError(f"{type(msg).__name__} on {port}")
 
     def capture(self) -> bytes:

@@ -13,6 +13,7 @@ from aftbed.core.errors import PeerError
 from aftbed.core.events import Event
 from aftbed.core.messages import AnyMessage, NodeDied, Pulses, Rebound, Situation, Suspect, Watch
 from aftbed.core.script import (
+    AnyVerb,
     Attach,
     Bind,
     Fence,
@@ -20,6 +21,7 @@ from aftbed.core.script import (
     Promote,
     Resume,
     Script,
+    ScriptKind,
     Spawn,
     Suspend,
     Transfer,
@@ -112,15 +114,15 @@ Ports = tuple[tuple[str, str], ...]  # parts of the leader, each with its port t
 
 def failover(dead: str, backup: str, epoch: int) -> Script:
     """Fence, drain, promote, attach; the kill comes last, since a fenced replica can do no harm."""
-    return Script(
-        "failover", dead, (), (Fence(dead), Promote(backup, epoch), Attach(backup, epoch), Kill(dead))
-    )
+    commit = (Fence(dead), Promote(backup, epoch), Attach(backup, epoch), Kill(dead))
+    return Script("failover", dead, (), commit, kind=ScriptKind.FAILOVER)
 
 
 def drop_backup(leader: str, backup: str, replication: Ports) -> Script:
     """The leader goes on alone."""
-    unbinds = (Unbind(f"{leader}/{part}", port) for part, port in replication)
-    return Script("drop backup", backup, (), (Fence(backup), *unbinds, Kill(backup)))
+    unbinds = [Unbind(f"{leader}/{part}", port) for part, port in replication]
+    commit: tuple[AnyVerb, ...] = (Fence(backup), *unbinds, Kill(backup))
+    return Script("drop backup", backup, (), commit, kind=ScriptKind.DROP_BACKUP)
 
 
 def new_backup(leader: str, replica: str, replication: Ports, stateful: tuple[str, ...]) -> Script:
@@ -135,6 +137,7 @@ def new_backup(leader: str, replica: str, replication: Ports, stateful: tuple[st
             *(Bind(f"{leader}/{part}", port, f"{replica}/{part}") for part, port in replication),
             Resume(f"{leader}/protocol"),
         ),
+        kind=ScriptKind.NEW_BACKUP,
     )
 
 
@@ -187,7 +190,7 @@ class Recovery(Brick):
         self._failures = self._failures + 1 if msg.failed else 0
         notes: list[Effect] = []
         if done is not None and not msg.failed:
-            event = Event.BACKUP_READY if done.purpose == "new backup" else Event.RECOVERY_EXIT
+            event = Event.BACKUP_READY if done.kind is ScriptKind.NEW_BACKUP else Event.RECOVERY_EXIT
             notes.append(Note(event, detail=msg.epoch))
         if msg.failed and self._failures < FAILURES_MAX:
             self._retry_ns = now_ns + RETRY_NS
@@ -199,7 +202,7 @@ class Recovery(Brick):
         script = decide(self.situation, self.suspects)
         if script is None:
             return []
-        if script.purpose == "new backup":
+        if script.kind is ScriptKind.NEW_BACKUP:
             if self._failures >= FAILURES_MAX or (self._retry_ns is not None and now_ns < self._retry_ns):
                 return []
             self._retry_ns = None

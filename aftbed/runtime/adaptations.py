@@ -5,6 +5,7 @@ a new Engine is told what the dead one had ordered last. While a phase acts on w
 waits; a replica that is lost before the end of the observation undoes the adaptation, then it fails over.
 """
 
+import contextlib
 import functools
 from collections.abc import Callable
 from typing import Final
@@ -14,14 +15,12 @@ import msgspec
 from aftbed.core import messages
 from aftbed.core.errors import ConfigError
 from aftbed.core.events import Event
-from aftbed.core.fault import Hang
 from aftbed.core.graph import Graph
 from aftbed.core.script import Phase, Script, bricks_changed
 from aftbed.runtime import control
 from aftbed.runtime.deployment import Deployment, Keys
 from aftbed.runtime.exchange import Exchange
 from aftbed.runtime.faults import Faults
-from aftbed.runtime.interface import Process
 from aftbed.runtime.jobs import StepFailed, Wait
 from aftbed.runtime.verbs import Executor
 
@@ -30,7 +29,6 @@ ENGINE: Final = "engine"
 REPLACE: Final = "replace "  # begins the names of jobs that hand channels out
 RETRY_SECONDS: Final = 0.01
 RETRIES_MAX: Final = 100
-FIRST_TRIGGER: Final = 2_000_001  # apart from the numbers of faults and the tokens of orders
 
 Answer = Callable[["Outcome"], None]
 
@@ -64,10 +62,6 @@ def function_of(graph: Graph) -> str:
 
 def _nobody(outcome: Outcome) -> None:
     """Asked for with the run: it is in the history."""
-
-
-def _armed(blow: control.Blow, token: int) -> control.Arm:
-    return control.Arm(token, Event.REQUEST_SENT.label, (blow,))
 
 
 def _spoiled(reason: str) -> Keys:
@@ -106,7 +100,7 @@ class Adaptations:
         self._started_ns = self._loop.now_ns()
         self._current: _Current | None = None
         self.history: list[Outcome] = []
-        self._scheduled: dict[int, messages.Scheduled] = {}  # by the number of their trigger
+        self._scheduled: list[messages.Scheduled] = []  # those that wait for their request
 
     @property
     def busy(self) -> bool:
@@ -160,42 +154,35 @@ class Adaptations:
         self._say(messages.Adapt(number, goal, deployment.graph))
 
     def schedule(self, scheduled: tuple[messages.Scheduled, ...]) -> Keys:
-        """Those that were asked for with the run: at a request the Client waits until it has begun."""
-        for number, later in enumerate(scheduled, FIRST_TRIGGER):
-            if not later.at_request:
+        """Those that were asked for with the run. The Client sends their requests when they have begun."""
+        for later in scheduled:
+            if later.at_request:
+                self._scheduled.append(later)
+            else:
                 begin = functools.partial(self._ask_again, later.goal, _nobody, RETRIES_MAX)
                 self._loop.after(later.after_ms / 1e3, begin)
-                continue
-            self._scheduled[number] = later
-        yield from self._arm(0)
+        yield from self._hold_requests()
 
     def client_is_new(self) -> Keys:
-        """What waits for a request waits in the new Client from now on, which has been held until now."""
-        lives = range(1, self._deployment.incarnations[CLIENT] + 1)
-        records = (r for n in lives for r in self._support.records(self._support.journal_of(CLIENT, n)))
-        sent = sum(record.event is Event.REQUEST_SENT for record in records)
-        for number, later in list(self._scheduled.items()):
-            if later.at_request <= sent:
-                self._begin(number)
-        yield from self._arm(sent)
+        """Have the new Client, which takes no mail yet, hold the requests that adaptations wait for."""
+        yield from self._hold_requests()
         yield from self._deployment.ask(CLIENT, control.Resume)
 
-    def _arm(self, sent: int) -> Keys:
-        """Have the Client, who has sent so many requests, wait for those that are to come."""
-        for number, later in self._scheduled.items():
-            blow = control.Blow(number, CLIENT, max(1, later.at_request - sent), Hang(), itself=False)
-            yield from self._deployment.ask(CLIENT, functools.partial(_armed, blow))
+    def _hold_requests(self) -> Keys:
+        requests = tuple(sorted({later.at_request for later in self._scheduled}))
+        if requests:
+            hold = messages.HoldAt(requests)
+            yield from self._deployment.ask(CLIENT, lambda token: control.Tell(token, CLIENT, hold))
 
-    def fired(self, process: Process, number: int) -> bool:
-        """The Client has come to its request. False if `number` is no trigger of an adaptation."""
-        if number not in self._scheduled:
-            return False
-        self._begin(number)
-        self._deployment.nursery.order(process, control.Ack(number))
-        return True
-
-    def _begin(self, number: int) -> None:
-        self._ask_again(self._scheduled.pop(number).goal, _nobody, RETRIES_MAX)
+    def request_held(self, request_id: int) -> None:
+        """The Client has come to `request_id`: begin what waits for it, then have the request sent."""
+        due = [later for later in self._scheduled if later.at_request == request_id]
+        self._scheduled = [later for later in self._scheduled if later.at_request != request_id]
+        for later in due:
+            self._ask_again(later.goal, _nobody, RETRIES_MAX)
+        release = messages.Release(request_id)
+        with contextlib.suppress(StepFailed):  # the Client is dead; its successor sends the request again
+            self._deployment.order(CLIENT, lambda token: control.Tell(token, CLIENT, release))
 
     def _ask_again(self, goal: messages.Goal, answer: Answer, retries: int) -> None:
         try:

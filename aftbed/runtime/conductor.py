@@ -14,12 +14,12 @@ import msgspec
 from aftbed.core import messages, script
 from aftbed.core.events import Event
 from aftbed.core.graph import Graph
-from aftbed.core.script import Phase
+from aftbed.core.script import LOSSES, Phase, ScriptKind
 from aftbed.runtime import control
 from aftbed.runtime.adaptations import CLIENT, ENGINE, REPLACE, Adaptations
 from aftbed.runtime.deployment import WATCHED_KINDS, Deployment
 from aftbed.runtime.faults import Faults
-from aftbed.runtime.interface import Process, Support
+from aftbed.runtime.interface import Process, ProcessKind, Support
 from aftbed.runtime.jobs import StepFailed
 from aftbed.runtime.verbs import Executor
 from aftbed.runtime.zygotes import LIGHT
@@ -30,7 +30,16 @@ SETTLE_SECONDS: Final = 0.002
 RESTOCK_SECONDS: Final = 0.05  # from a new backup until spares are forked anew: the next loss may be near
 LOSS_SECONDS: Final = 0.5  # a failover is done long before
 HANG_NS: Final = 150_000_000  # of what no Watchdog watches; a channel's pulse is 20 ms
-LOSSES: Final = ("failover", "drop backup")
+
+
+class ScriptRun(msgspec.Struct):
+    """A script of Recovery: `ended_ns` is 0 while it runs, `failure` is `""` if it was done."""
+
+    kind: ScriptKind
+    replica: str
+    began_ns: int
+    ended_ns: int = 0
+    failure: str = ""
 
 
 class Conductor:
@@ -47,7 +56,7 @@ class Conductor:
             self.deployment, self.executor, self.faults, lambda: self.inform_recovery(failed=False)
         )
         self.ending = False
-        self._scripts = 0  # how many have begun
+        self.scripts: list[ScriptRun] = []  # of Recovery
 
     def at_rest(self) -> bool:
         """Nothing is under way, and nobody who should serve is missing, as far as is known."""
@@ -81,6 +90,8 @@ class Conductor:
                     jobs.settle(key, data)
             case control.Said(brick, messages.Promoted(epoch)):
                 jobs.settle(("promoted", brick, epoch))
+            case control.Said(_, messages.RequestHeld(request_id)):
+                self.adaptations.request_held(request_id)
             case control.Said(_, messages.Adapted() as told):
                 self.adaptations.adapted(told)
                 self._loop.after(SETTLE_SECONDS, self._rearm)
@@ -90,21 +101,22 @@ class Conductor:
             case control.Ordered(_, ordered, phase, number):
                 self.adaptations.ordered(ordered, phase, number)
             case control.Fired(fault):
-                if not self.adaptations.fired(process, fault):
-                    self.faults.fired(process, fault)
+                self.faults.fired(process, fault)
             case _:
                 self._support.tell("refused", f"{process.name} said {type(report).__name__}")
 
     def _on_script(self, ordered: script.Script) -> None:
         if self.executor.busy or self.ending or self.executor.stale(ordered):
             return  # another script is under way, or has been; Recovery hears how it ended
-        if ordered.purpose in LOSSES and self.adaptations.interrupted(ordered.replica):
+        if ordered.kind in LOSSES and self.adaptations.interrupted(ordered.replica):
             return  # the way back first
-        self._scripts += 1
-        began_ns, tell = self._loop.now_ns(), self._support.tell
+        run = ScriptRun(ordered.kind, ordered.replica, self._loop.now_ns())
+        self.scripts.append(run)
+        tell = self._support.tell
 
         def ended(failure: str) -> None:
-            ms = f"{(self._loop.now_ns() - began_ns) / 1e6:.2f} ms"
+            run.ended_ns, run.failure = self._loop.now_ns(), failure
+            ms = f"{(run.ended_ns - run.began_ns) / 1e6:.2f} ms"
             tell("script.failed" if failure else "script.done", f"{ordered.purpose}: {failure or ms}")
             self.inform_recovery(failed=bool(failure))
             self._loop.after(SETTLE_SECONDS, lambda: self._settle_after(ordered))
@@ -112,14 +124,14 @@ class Conductor:
                 self._loop.after(LOSS_SECONDS, self._look_for_loss)
 
         self._loop.jobs.start(ordered.purpose, self.executor.execute(ordered), ended)
-        if ordered.purpose in LOSSES:  # its nodes are killed only when the new leader serves
+        if ordered.kind in LOSSES:  # its nodes are killed only when the new leader serves
             tell("alarm", f"{ordered.replica}: {self.deployment.cause_of_loss(ordered.replica)}")
         tell("script", f"{ordered.purpose} ({ordered.replica})")
 
     def _settle_after(self, ordered: script.Script) -> None:
         """What can wait until after a script: spares, and faults that are still to come."""
-        if ordered.purpose == "new backup":
-            self._loop.after(RESTOCK_SECONDS, partial(self._restock_after, self._scripts))
+        if ordered.kind is ScriptKind.NEW_BACKUP:
+            self._loop.after(RESTOCK_SECONDS, partial(self._restock_after, len(self.scripts)))
         self._rearm()
 
     def _rearm(self) -> None:
@@ -128,7 +140,7 @@ class Conductor:
 
     def _restock_after(self, scripts: int) -> None:
         """Unless something is under way again: who takes part in that needs the CPUs."""
-        if scripts == self._scripts and not self.adaptations.busy:
+        if scripts == len(self.scripts) and not self.adaptations.busy:
             self._restock()
 
     def _restock(self) -> None:
@@ -154,24 +166,24 @@ class Conductor:
         """A process is dead, and nobody meant it to be unless its kind is `killed`."""
         self._support.journal.write(self._loop.now_ns(), Event.NODE_DIED, 0, process.pid)
         self._loop.jobs.settle(("died", process.name, process.pid))
-        if process.kind == "killed" or self.ending:
+        if process.kind is ProcessKind.KILLED or self.ending:
             return
         self._support.tell("died", f"{process.name} (pid {process.pid})")
         self._loop.jobs.died(process.name)
-        if process.kind == "spare":
+        if process.kind is ProcessKind.SPARE:
             self._support.nursery.level(LIGHT, self.spares())
-        elif process.kind == "node" and self.replaceable(process.name):
+        elif process.kind is ProcessKind.NODE and self.replaceable(process.name):
             if process.name != ENGINE:
                 self.adaptations.give_up_preparing(f"{process.name} died")
             self._replace(process.name)
-        elif process.kind == "node":
+        elif process.kind is ProcessKind.NODE:
             self._loop.after(LOSS_SECONDS, self._look_for_loss)
 
     def look_for_hangs(self) -> None:
         """What no Watchdog watches and shows no pulse is killed, and so replaced."""
         now_ns = self._loop.now_ns()
         for process in list(self._support.nursery.processes):
-            watched = process.kind == "node" and self.replaceable(process.name)
+            watched = process.kind is ProcessKind.NODE and self.replaceable(process.name)
             if watched and process.hangs(now_ns, HANG_NS):
                 self._support.tell("hangs", f"{process.name} (pid {process.pid}): killed, to be replaced")
                 process.kill()

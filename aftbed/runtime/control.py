@@ -14,10 +14,13 @@ from aftbed.core.graph import BrickSpec, Graph
 from aftbed.core.messages import (
     Adapt,
     Adapted,
+    HoldAt,
     Progress,
     Promote,
     Promoted,
     Rebound,
+    Release,
+    RequestHeld,
     Situation,
     TakeUp,
     Watch,
@@ -28,7 +31,8 @@ from aftbed.core.script import Phase, Script
 WHOLE: Final = 1.0  # of a CPU
 UNANSWERED: Final = 0  # the token of an order that gets no Ack
 
-Told = Promote | Rebound | Watch | Situation | Adapt | Progress | TakeUp
+Told = Promote | Rebound | Watch | Situation | Adapt | Progress | TakeUp | HoldAt | Release
+Spoken = Promoted | Adapted | RequestHeld  # what bricks say to the runtime
 NOWHERE: Final = -1  # the index of a port that is to lead nowhere
 
 
@@ -259,7 +263,7 @@ class Said(msgspec.Struct, frozen=True, tag=True):
     """A brick to the runtime."""
 
     brick: str
-    message: Promoted | Adapted
+    message: Spoken
 
 
 class Ordered(msgspec.Struct, frozen=True, tag=True):

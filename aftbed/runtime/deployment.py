@@ -15,7 +15,7 @@ from aftbed.ftm.failover import HANG_DEADLINE_NS
 from aftbed.runtime import control
 from aftbed.runtime.channels import Channels
 from aftbed.runtime.cores import Cores
-from aftbed.runtime.interface import Channel, Process, Support
+from aftbed.runtime.interface import Channel, Process, ProcessKind, Support
 from aftbed.runtime.jobs import STEP_SECONDS_MAX, Key, StepFailed, Wait
 from aftbed.runtime.targets import STAGED
 from aftbed.runtime.zygotes import BUS, LIGHT
@@ -239,7 +239,7 @@ class Deployment:
         bricks = frozenset(self.graph.nodes[node])
         inputs, outputs, fds = self._ends(bricks)
         process, sent = yield from self._make(node, node, self.graph, inputs, outputs, fds, held=held)
-        process.kind = "node"
+        process.kind = ProcessKind.NODE
         self.nodes[node] = process
         return sent
 
@@ -265,7 +265,7 @@ class Deployment:
         incarnation = self.incarnations[node] = self.incarnations.get(node, 0) + 1
         device, options = self.support.device(specs[0].kind, incarnation)
         process = yield from self.nursery.spare(BUS if device == "gateway" else LIGHT)
-        process.name, process.kind, process.incarnation = name, "staged", incarnation
+        process.name, process.kind, process.incarnation = name, ProcessKind.STAGED, incarnation
         process.journal = self.support.journal_of(node, incarnation)
         process.bricks = tuple((spec.name, spec.kind) for spec in specs)
         names = {s.name for s in specs}

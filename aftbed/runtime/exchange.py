@@ -22,7 +22,7 @@ from aftbed.ftm.compose import REPLICAS, replication_of
 from aftbed.ftm.registry import KINDS
 from aftbed.runtime import control
 from aftbed.runtime.deployment import Deployment, Keys, Slot
-from aftbed.runtime.interface import Channel, Process
+from aftbed.runtime.interface import Channel, Process, ProcessKind
 from aftbed.runtime.jobs import Key, StepFailed, Wait, amid
 from aftbed.runtime.rewiring import (
     Changes,
@@ -230,8 +230,8 @@ class Exchange:
         deployment = self._deployment
         old, new = deployment.nodes[node], self._staged.pop(node)
         self._replaced[node] = old
-        old.name, old.kind = f"{node}{STAGED}", "staged"
-        new.name, new.kind = node, "node"
+        old.name, old.kind = f"{node}{STAGED}", ProcessKind.STAGED
+        new.name, new.kind = node, ProcessKind.NODE
         deployment.nodes[node] = new
         self._suspended = [(b, new if p is old else p) for b, p in self._suspended]
 
@@ -239,13 +239,13 @@ class Exchange:
         """The new graph runs."""
         deployment = self._deployment
         for node, process in self._staged.items():
-            process.name, process.kind = node, "node"
+            process.name, process.kind = node, ProcessKind.NODE
             deployment.nodes[node] = process
         self._born = list(self._staged)
         self._staged.clear()
         for node in [n for n in deployment.nodes if n not in self.new.nodes]:
             process = self._removed[node] = deployment.nodes.pop(node)
-            process.name, process.kind = f"{node}{STAGED}", "staged"
+            process.name, process.kind = f"{node}{STAGED}", ProcessKind.STAGED
         kept = {(k.source, k.source_port, k.sink) for k in self.new.links}
         for key, _ in deployment.channels.items():
             if key not in kept:
@@ -285,9 +285,9 @@ class Exchange:
             yield from tell_whoever_lives(deployment, self._old_ends())
         for node, old in self._replaced.items():
             self._staged[node], deployment.nodes[node] = deployment.nodes[node], old
-            old.name, old.kind = node, "node"
+            old.name, old.kind = node, ProcessKind.NODE
         for node, process in self._removed.items():
-            process.name, process.kind, deployment.nodes[node] = node, "node", process
+            process.name, process.kind, deployment.nodes[node] = node, ProcessKind.NODE, process
         if self.committed:
             deployment.adopt(self.old, self.lost)
             yield from self._watch()  # before those die that are watched now
@@ -306,7 +306,7 @@ class Exchange:
         """Whoever was suspended goes on, but for a lost replica."""
         waiting = {id(p): p for p in (*(p for _, p in self._suspended), *self._replaced.values())}
         for process in waiting.values():
-            if process.kind != "killed" and replica_of(process.name) not in self.lost:
+            if process.kind is not ProcessKind.KILLED and replica_of(process.name) not in self.lost:
                 with contextlib.suppress(StepFailed):
                     self._deployment.order_to(process, control.Resume)
 

@@ -8,6 +8,7 @@ import msgspec
 
 from aftbed.runtime import control
 from aftbed.runtime.deployment import Deployment, Keys
+from aftbed.runtime.interface import ProcessKind
 from aftbed.runtime.jobs import StepFailed
 
 DIGEST_DIGITS: Final = 16
@@ -26,7 +27,7 @@ class Hosted(msgspec.Struct, frozen=True):
 def hosted(deployment: Deployment) -> Hosted:
     """As the executive sees it at this moment: a node that is dead, and not yet seen dead, lives."""
     graph = deployment.graph
-    living = [p for p in deployment.nursery.processes if p.alive and p.kind != "killed"]
+    living = [p for p in deployment.nursery.processes if p.alive and p.kind is not ProcessKind.KILLED]
     bricks = tuple(sorted(brick for process in living for brick in process.bricks))
     return Hosted(graph.ftm, graph.placement, deployment.leader, deployment.backup, bricks)
 

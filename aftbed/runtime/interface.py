@@ -6,6 +6,7 @@ made, how mail travels, what a moment is.
 """
 
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from enum import Enum
 from typing import NamedTuple, Protocol
 
 from aftbed.core.busfault import BusFault, Condition, Struck
@@ -75,11 +76,22 @@ class Cell(Protocol):
         ...
 
 
+class ProcessKind(Enum):
+    """What a process of a run is used for."""
+
+    ZYGOTE = "zygote"  # forks spares
+    SPARE = "spare"  # can become anything
+    STAGED = "staged"  # hosts bricks beside a node that serves
+    NODE = "node"  # a node of the graph that runs
+    SERVICE = "service"  # no node: the hub, the vehicle
+    KILLED = "killed"  # by the executive: its death is no news
+
+
 class Process(Protocol):
-    """What can host a node. `kind`: zygote, spare, staged, node, service or killed."""
+    """What can host a node."""
 
     name: str
-    kind: str
+    kind: ProcessKind
     pid: int
     pidfd: int
     journal: str  # where it writes its records, `""` for nowhere

@@ -13,7 +13,7 @@ from typing import Final
 from aftbed.core.graph import Graph
 from aftbed.runtime import control
 from aftbed.runtime.deployment import Deployment, Keys
-from aftbed.runtime.interface import Process
+from aftbed.runtime.interface import Process, ProcessKind
 from aftbed.runtime.jobs import Key, StepFailed, Wait
 
 EXCHANGE_SECONDS_MAX: Final = 0.5
@@ -42,7 +42,7 @@ def answered(sent: list[tuple[Key, str]], seconds: float = EXCHANGE_SECONDS_MAX)
 
 def end(process: Process) -> None:
     """It dies, and its death is no news."""
-    process.kind = "killed"
+    process.kind = ProcessKind.KILLED
     process.kill()
 
 

@@ -15,7 +15,7 @@ from aftbed.ftm.compose import STATEFUL, replication_of
 from aftbed.runtime import control
 from aftbed.runtime.cores import BESIDE_LEADER
 from aftbed.runtime.deployment import Deployment, Keys
-from aftbed.runtime.interface import Channel
+from aftbed.runtime.interface import Channel, ProcessKind
 from aftbed.runtime.jobs import StepFailed, Wait
 
 FIRST_REPLY_SECONDS: Final = 0.001
@@ -65,10 +65,10 @@ class Executor:
         epochs = [verb.epoch for verb in todo.commit if isinstance(verb, script.Promote)]
         if any(epoch != deployment.epoch + 1 for epoch in epochs):
             return True
-        match todo.purpose:
-            case "failover":
+        match todo.kind:
+            case script.ScriptKind.FAILOVER:
                 return todo.replica != deployment.leader or not deployment.backup
-            case "drop backup":
+            case script.ScriptKind.DROP_BACKUP:
                 return todo.replica != deployment.backup
             case _:
                 return bool(deployment.backup) or not deployment.leader
@@ -92,11 +92,11 @@ class Executor:
 
     def _undo(self, todo: script.Script, held: list[str]) -> None:
         deployment = self._deployment
-        if todo.purpose == "failover":  # the backup failed while it took over: nobody is left
+        if todo.kind is script.ScriptKind.FAILOVER:  # the backup failed while it took over: nobody is left
             for slot in deployment.slots.values():
                 self._kill(slot.name)
             deployment.leader = deployment.backup = ""
-        if todo.purpose == "new backup" and deployment.backup != todo.replica:
+        if todo.kind is script.ScriptKind.NEW_BACKUP and deployment.backup != todo.replica:
             self._kill(todo.replica)
         for brick in held:
             node = deployment.graph.node_of(brick)
@@ -165,7 +165,7 @@ class Executor:
         for node in slot.nodes:
             process = deployment.nodes.pop(node, None)
             if process is not None:
-                process.kind = "killed"
+                process.kind = ProcessKind.KILLED
                 process.kill()
         for channel in deployment.channels.touching(slot.bricks):
             deployment.channels.drop(channel)

@@ -122,7 +122,7 @@ def test_the_fault_and_the_steps_of_the_failover_are_marked() -> None:
 
 def test_the_steps_of_an_adaptation_are_marked() -> None:
     drawn = space_time(trace_of(adapt="compose pbr+tr at request 20"))
-    assert {"an adaptation is due", "adapt.plan", "adapt.commit"} <= set(texts(drawn.body))
+    assert {"adapt.plan", "adapt.commit"} <= set(texts(drawn.body))
     assert any("adapt.step.enter 1" in title for title in titles(drawn.body))
     assert "fault" not in {c for e in drawing(drawn.body).iter() for c in e.get("class", "").split()}
 

@@ -19,7 +19,6 @@ from aftbed.campaign.runfiles.steps import between_processes, ends_ns, followed,
 from aftbed.core.errors import ConfigError
 from aftbed.core.events import Event
 from aftbed.core.journal import EntryKind
-from aftbed.runtime.adaptations import FIRST_TRIGGER
 from aftbed.runtime.unix.journal import Dialogue
 from aftbed.runtime.unix.options import CarRun, LoadRun, ReplayRun, Work
 from aftbed.vehicle.aeb.messages import AebInput, AebTarget, encode_request
@@ -167,7 +166,6 @@ def eventful(tmp_path: Path) -> RunRecord:
     run.note("a-after.1", Event.FAULT_APPLIED, detail=FIRST_FAULT)
     run.note("a-watchdog.1", Event.WATCHDOG_SUSPECT, detail=1)
     run.note("supervisor.1", Event.NODE_DIED, detail=4711)
-    run.note("client.1", Event.FAULT_APPLIED, detail=FIRST_TRIGGER)
     run.note("engine.1", Event.ADAPT_PLAN, detail=1)
     run.note("supervisor.1", Event.ADAPT_STEP_ENTER, detail=3)
     run.note("engine.1", Event.ADAPT_COMMIT, detail=1)
@@ -199,7 +197,6 @@ def test_faults_and_steps_of_adaptations_are_instants_in_their_own_words(eventfu
         "crash primary at checkpoint.sent nth 2": "fault",
         "watchdog.suspect": "failure",
         "node.died: process 4711": "failure",
-        "an adaptation is due": "adaptation",
         "adapt.plan": "adaptation",
         "adapt.step.enter 3": "adaptation",
         "adapt.commit": "adaptation",
@@ -363,7 +360,7 @@ def test_what_is_on_the_bus_is_on_the_topics(tmp_path: Path) -> None:
 def test_faults_and_adaptations_are_on_a_topic_apart_from_the_path_of_requests(eventful: RunRecord) -> None:
     found = mcap_of(eventful)
     kinds = Counter(message["kind"] for _, message in found["/ftm"])
-    assert kinds == {"fault": 1, "failure": 2, "adaptation": 4}
+    assert kinds == {"fault": 1, "failure": 2, "adaptation": 3}
     assert {message["kind"] for _, message in found["/ftm/requests"]} == {"request"}
     ((t_ns, fault),) = [(t, m) for t, m in found["/ftm"] if m["kind"] == "fault"]
     assert fault["text"] == "crash primary at checkpoint.sent nth 2"

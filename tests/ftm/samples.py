@@ -14,6 +14,7 @@ from aftbed.core.messages import (
     ChannelEnded,
     Checkpoint,
     Goal,
+    HoldAt,
     Message,
     NodeDied,
     Notification,
@@ -22,6 +23,7 @@ from aftbed.core.messages import (
     Promoted,
     Pulses,
     Rebound,
+    Release,
     Reply,
     Request,
     RestoreState,
@@ -75,6 +77,8 @@ SAMPLES: Final[dict[type, AnyMessage]] = {
         Adapt(1, Goal("lfr"), Graph("pbr", "process", (), (), {})),
         Progress(1, Phase.PREPARE, ""),
         TakeUp(1, Script("pbr to lfr", "", (), ()), Phase.COMMIT, False, ""),
+        HoldAt((1,)),
+        Release(1),
     )
 }
 assert set(SAMPLES) == set(get_args(AnyMessage)), "one sample of each type"

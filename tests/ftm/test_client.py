@@ -8,7 +8,7 @@ from samples import inspected, notes, sends
 from aftbed.core.brick import CONTROL
 from aftbed.core.errors import PeerError
 from aftbed.core.events import Event
-from aftbed.core.messages import Rebound, Reply, Request, Submit
+from aftbed.core.messages import HoldAt, Rebound, Release, Reply, Request, RequestHeld, Submit
 from aftbed.ftm.client import BACKLOG_MAX, Client
 
 
@@ -85,3 +85,27 @@ def test_bytes_that_are_no_state_are_refused(data: bytes) -> None:
         brick.restore(data)
     except PeerError:
         assert inspected(brick) == before
+
+
+def test_a_request_at_which_it_is_to_hold_is_reported_and_sent_when_released() -> None:
+    brick = client(1)
+    assert brick.step(CONTROL, HoldAt((2, 5)), 0) == []
+    effects = brick.step("submit", Submit(b"2"), 0)
+    assert sends(effects) == [(CONTROL, RequestHeld(2))] and notes(effects) == [Event.REQUEST_SENT]
+    assert "submit" not in brick.open_ports() and not brick.quiescent()
+    assert brick.step(CONTROL, Release(1), 0) == []
+    assert sends(brick.step(CONTROL, Release(2), 0)) == [("clt2pxy", Request(0, 2, b"2"))]
+    assert brick.step(CONTROL, Release(2), 0) == []
+    assert sends(brick.step("submit", Submit(b"3"), 0)) == [("clt2pxy", Request(0, 3, b"3"))]
+
+
+def test_a_held_request_is_not_sent_to_a_new_proxy() -> None:
+    brick = client(1)
+    brick.step(CONTROL, HoldAt((2,)), 0)
+    brick.step("submit", Submit(b"2"), 0)
+    assert sends(brick.step(CONTROL, Rebound("clt2pxy", True, 1), 0)) == [("clt2pxy", Request(0, 1, b"1"))]
+
+
+def test_requests_that_a_predecessor_has_come_to_are_reported_at_once() -> None:
+    brick = client(3)
+    assert sends(brick.step(CONTROL, HoldAt((2, 9)), 0)) == [(CONTROL, RequestHeld(2))]

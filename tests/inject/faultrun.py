@@ -15,6 +15,7 @@ from aftbed.ftm.compose import build
 from aftbed.inject.words import parse
 from aftbed.runtime import control
 from aftbed.runtime.faults import Faults
+from aftbed.runtime.interface import ProcessKind
 from aftbed.runtime.jobs import StepFailed, Wait
 from aftbed.runtime.unix.journal import Journal
 from aftbed.runtime.unix.loop import Loop
@@ -27,7 +28,7 @@ class FakeProcess:
     """A node's process; `wrote` is its journal. A signal kills it, or stops it, at once."""
 
     def __init__(self, name: str, folder: Path, incarnation: int) -> None:
-        self.name, self.pid, self.pidfd, self.kind = name, 10_000 + incarnation, -1, "node"
+        self.name, self.pid, self.pidfd, self.kind = name, 10_000 + incarnation, -1, ProcessKind.NODE
         path = folder / f"{name.replace('/', '.')}.{incarnation}.journal"
         self.journal, self.wrote = str(path), Journal(path, name)
         self.alive = self.thaws = True

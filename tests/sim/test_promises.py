@@ -16,9 +16,11 @@ from aftbed.campaign.wholeness import half_a_graph
 from aftbed.core.check import missing
 from aftbed.core.events import Event
 from aftbed.core.journal import Entry, EntryKind, Record
+from aftbed.core.script import ScriptKind
 from aftbed.core.valuefault import Place
 from aftbed.ftm.compose import build
 from aftbed.runtime.adaptations import Outcome
+from aftbed.runtime.conductor import ScriptRun
 from aftbed.runtime.sim.world import Run, Setup, simulate
 
 Broken = Callable[[Run], Run]
@@ -85,9 +87,8 @@ def struck(*names: str) -> Broken:
 
 def renewed(ms: float) -> Broken:
     """Redundancy was back at that time."""
-    begun = (round((ms - RENEWAL_MS) * MS), "script", "new backup (b)")
-    stands = (round(ms * MS), "script.done", f"new backup: {RENEWAL_MS:.2f} ms")
-    return lambda run: replace(run, told=(*run.told, begun, stands))
+    renewal = ScriptRun(ScriptKind.NEW_BACKUP, "b", round((ms - RENEWAL_MS) * MS), round(ms * MS))
+    return lambda run: replace(run, scripts=(*run.scripts, renewal))
 
 
 def with_a_flip(run: Run) -> Run:

@@ -16,7 +16,6 @@ from aftbed.core.fault import marked
 from aftbed.core.journal import Record
 from aftbed.core.messages import Message
 from aftbed.ftm.compose import build
-from aftbed.runtime.adaptations import FIRST_TRIGGER
 from aftbed.runtime.sim.tracing import STRUCK, Happening, Sent, Told, Trace
 
 BEFORE, AFTER = 14, 30  # happenings around a turning point
@@ -52,7 +51,6 @@ KINDS: Final = {  # of messages: the class of their arrow
     "StateRestored": "state",
 }
 CONTROL: Final = "control"
-DUE: Final = "an adaptation is due"  # triggers of adaptations are armed as those of faults are
 
 
 class Placed(NamedTuple):
@@ -171,7 +169,7 @@ def said(one: Record | Told, trace: Trace) -> str:
         return f"{one.text} was hit" if one.event == STRUCK else f"{one.event}: {one.text}"
     faults, at = trace.run.setup.faults, marked(one.detail)[0] - diagram.FIRST_FAULT
     if one.event is Event.FAULT_APPLIED:
-        return str(faults[at]) if 0 <= at < len(faults) else DUE
+        return str(faults[at])
     words = [str(one.event), *([f"#{one.request_id}"] if one.request_id else [])]
     return " ".join([*words, *([str(one.detail)] if one.detail and one.event in STEPS else [])])
 
@@ -180,7 +178,7 @@ def class_of(one: Record | Told) -> str:
     if isinstance(one, Told):
         return "fault" if one.event == STRUCK else "adapt" if one.event.startswith("adapt") else "told"
     if one.event is Event.FAULT_APPLIED:
-        return "fault" if marked(one.detail)[0] < FIRST_TRIGGER else "adapt"
+        return "fault"
     if one.event in (Event.DETECTED_STOP, Event.FOLLOWER_DIVERGED):
         return "fault"
     return "adapt" if str(one.event).startswith("adapt") else "told"

@@ -14,11 +14,10 @@ from typing import Final, NamedTuple
 
 from aftbed.campaign.diagram import FIRST_FAULT
 from aftbed.campaign.record import RunRecord
-from aftbed.campaign.report.happenings import DUE, STEPS, USUAL
+from aftbed.campaign.report.happenings import STEPS, USUAL
 from aftbed.core.events import Event
 from aftbed.core.fault import marked
 from aftbed.core.journal import Record
-from aftbed.runtime.adaptations import FIRST_TRIGGER
 
 TOLD_NAME: Final = "events.jsonl"
 FAILURES: Final = frozenset(
@@ -54,7 +53,7 @@ def journals(record: RunRecord) -> Iterator[tuple[str, int, list[Record]]]:
 
 def kind_of(one: Record) -> Kind:
     if one.event is Event.FAULT_APPLIED:
-        return Kind.FAULT if marked(one.detail)[0] < FIRST_TRIGGER else Kind.ADAPTATION
+        return Kind.FAULT
     if one.event in FAILURES:
         return Kind.FAILURE
     if one.event in USUAL or one.event is Event.DEDUPE_HIT:
@@ -65,8 +64,7 @@ def kind_of(one: Record) -> Kind:
 def words_of(one: Record, record: RunRecord) -> str:
     """A record in words; a fault in its own."""
     if one.event is Event.FAULT_APPLIED:
-        number = marked(one.detail)[0]
-        return DUE if number >= FIRST_TRIGGER else _fault(number - FIRST_FAULT, record)
+        return _fault(marked(one.detail)[0] - FIRST_FAULT, record)
     if one.event is Event.NODE_DIED:
         return f"{one.event}: process {one.detail}"
     words = [str(one.event), *([f"#{one.request_id}"] if one.request_id else [])]

@@ -16,7 +16,7 @@ from aftbed.core.brick import CONTROL, Brick
 from aftbed.core.errors import PeerError
 from aftbed.core.events import Event
 from aftbed.core.journal import Record
-from aftbed.core.messages import Adapted, AnyMessage, ChannelEnded, Message, Promoted, Rebound, Reply
+from aftbed.core.messages import AnyMessage, ChannelEnded, Message, Rebound, Reply
 from aftbed.runtime import control
 from aftbed.runtime.diversion import Diversion
 from aftbed.runtime.orders import carry_out
@@ -82,7 +82,7 @@ class Node:
         self._only = hosted if len(self.bricks) == 1 else None
 
     def _speak(self, brick: str, message: Message) -> None:
-        assert isinstance(message, Promoted | Adapted)
+        assert isinstance(message, control.Spoken)
         self._say(control.Said(brick, message))
 
     def link_inside(self, local: control.Local, epoch: int) -> None:

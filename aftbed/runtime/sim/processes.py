@@ -13,6 +13,7 @@ from aftbed.core.errors import ConfigError
 from aftbed.core.journal import Record
 from aftbed.runtime import control, interface
 from aftbed.runtime.assembly import Assembler
+from aftbed.runtime.interface import ProcessKind
 from aftbed.runtime.jobs import Key, StepFailed, Wait
 from aftbed.runtime.sim.cells import Cell
 from aftbed.runtime.sim.channels import Channel
@@ -49,7 +50,7 @@ class Process:
     """A child of the executive, which becomes one node."""
 
     def __init__(self, number: int, nursery: "Nursery") -> None:
-        self.name, self.kind, self.journal, self.incarnation = "spare", "spare", "", 0
+        self.name, self.kind, self.journal, self.incarnation = "spare", ProcessKind.SPARE, "", 0
         self.pid = self.pidfd = number
         self.alive = True  # as far as the executive knows
         self.node: Node | None = None

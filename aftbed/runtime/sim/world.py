@@ -24,10 +24,10 @@ from aftbed.ftm.client import Client
 from aftbed.runtime import control, targets
 from aftbed.runtime.adaptations import Outcome
 from aftbed.runtime.assembly import Assembler, Make
-from aftbed.runtime.conductor import Conductor
+from aftbed.runtime.conductor import Conductor, ScriptRun
 from aftbed.runtime.deployment import Keys
 from aftbed.runtime.hosting import Hosted, hosted
-from aftbed.runtime.interface import Met
+from aftbed.runtime.interface import Met, ProcessKind
 from aftbed.runtime.jobs import Wait
 from aftbed.runtime.sim import ending
 from aftbed.runtime.sim.cells import Cell
@@ -94,6 +94,7 @@ class Run(msgspec.Struct, frozen=True):
     history: History
     rest: Rest
     told: tuple[tuple[int, str, str], ...]  # time, event, text
+    scripts: tuple[ScriptRun, ...]  # of Recovery
     adaptations: tuple[Outcome, ...]
     faults: tuple[dict[str, str], ...]
     failures: tuple[str, ...]  # of asserts, in nodes
@@ -247,7 +248,7 @@ class World:
         if process.node is not None and process.incarnation == 1:
             self._count(process.node)
         flipped = STOPPED in reason and any(isinstance(fault.action, Flip) for fault in self.setup.faults)
-        if (not reason or flipped) and process.kind != "killed":
+        if (not reason or flipped) and process.kind is not ProcessKind.KILLED:
             self.struck.append((self.loop.ns, process.name))
         if reason.startswith("assertion"):
             self.failures.append(f"{process.name}: {reason}")
@@ -368,6 +369,7 @@ class World:
             History(self.journals, self.dialogue),
             rest,
             tuple(self.told),
+            tuple(self.conductor.scripts),
             tuple(self.conductor.adaptations.history),
             tuple(self.conductor.faults.receipts()),
             tuple(self.failures),

@@ -27,7 +27,7 @@ from aftbed.core.brick import CONTROL, Brick, Effect, Note, Send
 from aftbed.core.errors import PeerError
 from aftbed.core.events import Event
 from aftbed.core.journal import FLAG_OFFSET, PULSE_OFFSET, RECORD
-from aftbed.core.messages import Adapted, AnyMessage, ChannelEnded, Message, Promoted, Rebound, Reply
+from aftbed.core.messages import AnyMessage, ChannelEnded, Message, Rebound, Reply
 from aftbed.runtime import control
 from aftbed.runtime.blows import fire
 from aftbed.runtime.orders import order_or_halt
@@ -110,7 +110,7 @@ class Node:
         self.device.accept(message, _now())
 
     def _say(self, brick: str, message: Message) -> None:
-        assert isinstance(message, Promoted | Adapted)
+        assert isinstance(message, control.Spoken)
         self.line.send(control.Said(brick, message))
 
     # -- the pulse ----------------------------------------------------------------------------

@@ -15,6 +15,7 @@ from typing import Final
 import msgspec
 
 from aftbed.runtime import control, interface
+from aftbed.runtime.interface import ProcessKind
 from aftbed.runtime.jobs import Key, StepFailed, Wait
 from aftbed.runtime.unix import linux, members
 from aftbed.runtime.unix.journal import Header
@@ -31,9 +32,9 @@ WATCHING_KINDS: Final = ("watchdog", "recovery")
 
 
 class Process:
-    """A child of the supervisor. `kind`: zygote, spare, node or service."""
+    """A child of the supervisor."""
 
-    def __init__(self, name: str, kind: str, line: Line[control.FromNode], ledger: Ledger) -> None:
+    def __init__(self, name: str, kind: ProcessKind, line: Line[control.FromNode], ledger: Ledger) -> None:
         self.name, self.kind, self.line, self._ledger = name, kind, line, ledger
         self.pid, self.pidfd = 0, -1
         self.journal = ""
@@ -151,7 +152,7 @@ class Nursery:
         self.parked.setdefault(name, deque())
         self._unborn[name] = []
         pid, ours = started or start_zygote(name, self._cpus)
-        process = self._adopt(name, "zygote", ours)
+        process = self._adopt(name, ProcessKind.ZYGOTE, ours)
         process.born(pid)
         self.zygotes[name] = process
         self._watch(process)
@@ -172,7 +173,7 @@ class Nursery:
             batch = min(count, PARK_BATCH)
             pairs = [socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET) for _ in range(batch)]
             for ours, _ in pairs:
-                self._unborn[zygote].append(self._adopt("spare", "spare", ours))
+                self._unborn[zygote].append(self._adopt("spare", ProcessKind.SPARE, ours))
             with contextlib.suppress(OSError):  # a dead zygote: its restart asks again
                 fds = tuple(end.fileno() for _, end in pairs)
                 self.zygotes[zygote].line.send(control.Park(0), fds)
@@ -213,7 +214,7 @@ class Nursery:
         elif not self._unborn[zygote]:
             self.park(zygote, 1)
 
-    def _adopt(self, name: str, kind: str, sock: socket.socket) -> Process:
+    def _adopt(self, name: str, kind: ProcessKind, sock: socket.socket) -> Process:
         sock.setblocking(False)
         process = Process(name, kind, Line(sock, decode_report), self._ledger)
         self.processes.append(process)
@@ -237,7 +238,7 @@ class Nursery:
                 return
             message, fds = got
             assert not fds, f"{process.name} sent descriptors"
-            if isinstance(message, control.Hello) and process.kind == "spare" and not process.pid:
+            if isinstance(message, control.Hello) and process.kind is ProcessKind.SPARE and not process.pid:
                 self._hello(process, message.pid)
             elif not isinstance(message, control.Hello):
                 self._on_report(process, message)

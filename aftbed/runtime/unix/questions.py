@@ -20,6 +20,7 @@ from aftbed.runtime import targets
 from aftbed.runtime.adaptations import Adaptations, Outcome
 from aftbed.runtime.deployment import Deployment
 from aftbed.runtime.faults import Faults
+from aftbed.runtime.interface import ProcessKind
 from aftbed.runtime.unix import ask, rundir
 from aftbed.runtime.unix.line import Line
 from aftbed.runtime.unix.loop import Loop
@@ -27,7 +28,7 @@ from aftbed.runtime.unix.options import RunOptions
 from aftbed.runtime.unix.resources import Row
 from aftbed.runtime.unix.work import Work
 
-BESIDE: Final = ("zygote", "spare", "service", "staged")
+BESIDE: Final = (ProcessKind.ZYGOTE, ProcessKind.SPARE, ProcessKind.SERVICE, ProcessKind.STAGED)
 QUESTIONS_MAX: Final = 16  # connections at once, and questions that wait for the launch
 
 
@@ -160,7 +161,7 @@ class Questions:
             if process is not None and process.alive:
                 rows.append(Row(node, deployment.role_of(node), process.pid, True))
         others = [p for p in deployment.nursery.processes if p.kind in BESIDE and p.pid]
-        return rows + [Row(p.name, p.kind, p.pid, False) for p in others]
+        return rows + [Row(p.name, p.kind.value, p.pid, False) for p in others]
 
 
 def _told(outcome: Outcome) -> ask.Answer:

@@ -20,6 +20,7 @@ from aftbed.runtime import control
 from aftbed.runtime.conductor import HANG_NS, Conductor
 from aftbed.runtime.deployment import Keys
 from aftbed.runtime.hosting import hosted, look_at_states
+from aftbed.runtime.interface import ProcessKind
 from aftbed.runtime.jobs import STATS_JOB
 from aftbed.runtime.unix import linux
 from aftbed.runtime.unix.line import Line, decode_order
@@ -270,11 +271,11 @@ class Supervisor:
 
     def _on_death(self, process: Process) -> None:
         self.conductor.on_death(process)
-        if process.kind == "killed" or self._ending:
+        if process.kind is ProcessKind.KILLED or self._ending:
             return
-        if process.kind == "zygote":
+        if process.kind is ProcessKind.ZYGOTE:
             self.nursery.restart_zygote(process.name)
-        elif process.kind == "service":
+        elif process.kind is ProcessKind.SERVICE:
             self._finish(f"{process.name} died")
 
     def _on_loss(self) -> None:

@@ -12,6 +12,7 @@ import msgspec
 
 from aftbed.runtime import control
 from aftbed.runtime.deployment import Deployment, Keys
+from aftbed.runtime.interface import ProcessKind
 from aftbed.runtime.jobs import STATS_JOB, Key, Wait
 from aftbed.runtime.unix import bus
 from aftbed.runtime.unix.bus import BusFaults
@@ -132,7 +133,7 @@ class Work:
         self, zygote: str, name: str, options: bytes, fds: tuple[int, ...]
     ) -> Generator[Wait, dict[Key, bytes], None]:
         process = yield from self._nursery.spare(zygote)
-        process.name, process.kind = name, "service"
+        process.name, process.kind = name, ProcessKind.SERVICE
         self._services[name] = process
         self._nursery.order(process, control.Serve(0, name, options), fds)
         yield Wait(frozenset({("ready", name, 0)}), frozenset({name}), ATTACH_SECONDS_MAX)
@@ -154,7 +155,7 @@ class Work:
             self._finish(f"{process.name}: {data.decode()}")
         elif kind == "result" and process.name in ("vehicle", "player"):
             self._result = json.loads(data)
-            process.kind = "killed"  # it is done: its death is no event
+            process.kind = ProcessKind.KILLED  # it is done: its death is no event
             self._finish("")
 
     def _report_cycle(self, failure: str) -> None:
@@ -165,7 +166,7 @@ class Work:
         """No more requests; the car or the player ends with the result so far."""
         for name in ("vehicle", "player"):
             process = self._services.get(name)
-            if process is not None and process.alive and process.kind == "service":
+            if process is not None and process.alive and process.kind is ProcessKind.SERVICE:
                 self._nursery.order(process, control.Stop(0))
         yield from self.bus.ask()
         yield from self.wind_up(deployment)
