@@ -6,7 +6,8 @@ from typing import Final
 
 from aftbed.bench.ring import ring_us
 from aftbed.bench.runs import cycles_us, finish, start
-from aftbed.bench.statistics import quantile, summary
+from aftbed.bench.statistics import summary
+from aftbed.campaign.statistics import quantile
 from aftbed.core.graph import Graph
 from aftbed.ftm.compose import NONE, build, chain
 from aftbed.runtime.unix.options import LoadRun

@@ -12,8 +12,8 @@ import time
 from pathlib import Path
 from typing import Final
 
-from aftbed.bench.statistics import quantile
 from aftbed.campaign.record import read_record
+from aftbed.campaign.statistics import quantile
 from aftbed.core.errors import HarnessError
 from aftbed.core.journal import EntryKind
 

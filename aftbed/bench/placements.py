@@ -15,9 +15,10 @@ from aftbed.bench.adapt import REQUESTS_ENDLESS, ready
 from aftbed.bench.cycle import bench_cycle, hops
 from aftbed.bench.ring import ring_us
 from aftbed.bench.runs import finish, start
-from aftbed.bench.statistics import quantile, summary
+from aftbed.bench.statistics import summary
 from aftbed.bench.usage import Usage, usage
 from aftbed.campaign.record import RunRecord
+from aftbed.campaign.statistics import quantile
 from aftbed.core.errors import HarnessError
 from aftbed.core.events import Event
 from aftbed.ftm.compose import build

@@ -1,13 +1,6 @@
-"""Quantiles of a sample, by nearest rank: no value is reported that was not measured."""
+"""The summary of a sample of times."""
 
-import math
-
-
-def quantile(values: list[float], share: float) -> float:
-    """The value that `share` of `values` do not exceed (nearest rank)."""
-    assert values and 0 < share <= 1
-    ordered = sorted(values)
-    return ordered[max(0, math.ceil(share * len(ordered)) - 1)]
+from aftbed.campaign.statistics import quantile
 
 
 def summary(values: list[float], digits: int = 1) -> dict[str, float]:

@@ -29,13 +29,13 @@ import numpy as np
 import numpy.typing as npt
 from scipy import special
 
-from aftbed.bench.statistics import quantile
 from aftbed.campaign.statistics import (
     CONFIDENCE,
     RESAMPLES,
     Interval,
     check_resamples,
     place,
+    quantile,
     quantile_needs,
     tail,
 )

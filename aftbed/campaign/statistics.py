@@ -44,9 +44,7 @@ from statistics import NormalDist
 from typing import Final
 
 import msgspec
-from scipy import special
 
-from aftbed.bench.statistics import quantile
 from aftbed.core.errors import ConfigError, unknown
 
 CONFIDENCE: Final = 0.95
@@ -105,8 +103,21 @@ def look_confidence(confidence: float, looks: int) -> float:
     return 1 - beyond / looks
 
 
+def quantile(values: Sequence[float], share: float) -> float:
+    """The value that `share` of `values` do not exceed, by nearest rank: always one of the values.
+
+    The benches take it too, and they fork the supervisors that they measure. So this module imports scipy
+    (30 MB) only inside of the functions that need it.
+    """
+    assert values and 0 < share <= 1
+    ordered = sorted(values)
+    return ordered[max(0, math.ceil(share * len(ordered)) - 1)]
+
+
 def quantile_interval(values: Sequence[float], q: float, confidence: float = CONFIDENCE) -> Interval | None:
     """The interval of the q-quantile, between two of the values; None if there are too few for one."""
+    from scipy import special  # noqa: PLC0415 - heavy: see `quantile`
+
     beyond, ordered = tail(confidence), _ordered(values, q)
     size = len(ordered)
     # The true quantile lies below the value of rank r if fewer than r of all values lie below it.
@@ -184,6 +195,8 @@ def _share_interval(count: float, of: int, beyond: float, method: str) -> Interv
 
 
 def _clopper_pearson(count: float, of: int, beyond: float) -> Interval:
+    from scipy import special  # noqa: PLC0415 - heavy: see `quantile`
+
     low = special.betaincinv(count, of - count + 1, beyond) if count > 0 else 0.0
     high = 1 - special.betaincinv(of - count, count + 1, beyond) if count < of else 1.0
     return Interval(float(low), float(high))

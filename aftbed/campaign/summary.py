@@ -14,7 +14,6 @@ from typing import Final, Literal
 
 import msgspec
 
-from aftbed.bench.statistics import quantile
 from aftbed.campaign.experiment import OUTCOMES, UNKNOWN, Result, failed
 from aftbed.campaign.faultspace import Count, extrapolated
 from aftbed.campaign.ledger import Ledger
@@ -24,6 +23,7 @@ from aftbed.campaign.statistics import (
     Interval,
     look_confidence,
     proportion,
+    quantile,
     quantile_interval,
     quantile_needs,
 )

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aftbed.bench.statistics import quantile
 from aftbed.campaign.comparison import mcnemar, paired_quantile_shift
+from aftbed.campaign.statistics import quantile
 from aftbed.core.errors import ConfigError
 
 SEED: Final = 20262

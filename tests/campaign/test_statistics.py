@@ -12,7 +12,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import special
 
-from aftbed.bench.statistics import quantile
 from aftbed.campaign.statistics import (
     Interval,
     bootstrap_interval,
@@ -20,6 +19,7 @@ from aftbed.campaign.statistics import (
     look_confidence,
     needed,
     proportion,
+    quantile,
     quantile_interval,
     quantile_needs,
 )
