@@ -22,8 +22,9 @@ ROWS: Final = {  # package: row, the lowest first
     "adapt": 2,
     "inject": 4,
     "campaign": 5,
-    "bench": 5,
-    "cli": 6,
+    "bench": 6,
+    "report": 6,
+    "cli": 7,
 }
 STRANGERS: Final = frozenset({"ftm", "vehicle", "inject"})  # none of them imports another
 NO_ROW: Final = {"aftbed": (), "aftbed.__main__": ("aftbed.cli",)}  # all that they may import
@@ -33,6 +34,7 @@ IMPURE_PLACES: Final = (  # where clock, socket, process, file and chance may li
     "aftbed.vehicle",
     "aftbed.inject",
     "aftbed.campaign",
+    "aftbed.report",
     "aftbed.bench",
     "aftbed.cli",
 )

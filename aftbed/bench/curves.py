@@ -9,19 +9,8 @@ from typing import Final
 
 import msgspec
 
-from aftbed.campaign.report import svg
-from aftbed.campaign.report.plots import (
-    BOTTOM,
-    HEIGHT,
-    LEFT,
-    RIGHT,
-    STYLES,
-    TOP,
-    WIDTH,
-    Axis,
-    axis_of,
-    milliseconds,
-)
+from aftbed.report import svg
+from aftbed.report.plots import BOTTOM, HEIGHT, LEFT, RIGHT, STYLES, TOP, WIDTH, Axis, axis_of, milliseconds
 
 ROW_PX: Final = 46.0
 MARK_PX: Final = 3.0

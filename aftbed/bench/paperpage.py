@@ -14,8 +14,8 @@ from aftbed.bench import curves
 from aftbed.bench.curves import Points, Range
 from aftbed.bench.paperdocument import Paper
 from aftbed.bench.papertext import here, notes, size, tables
-from aftbed.campaign.report import plots
-from aftbed.campaign.report.html import TEMPLATES as STYLES
+from aftbed.report import plots
+from aftbed.report.html import TEMPLATES as STYLES
 
 TEMPLATES: Final = Path(__file__).resolve().parent / "templates"
 

@@ -15,7 +15,7 @@ from aftbed.bench.placements import Loaded, Placed
 from aftbed.bench.published import Published
 from aftbed.bench.road import OnRoad
 from aftbed.bench.sweep import Sized
-from aftbed.campaign.report.plots import milliseconds
+from aftbed.report.plots import milliseconds
 
 NOTHING: Final = "-"
 

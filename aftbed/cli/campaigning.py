@@ -155,7 +155,7 @@ def _shard(text: str) -> tuple[int, int]:
 
 def _follow(found: Plan, asked: running.Asked, *, as_json: bool) -> bool:
     """Show results as they come; True if the user broke it off."""
-    from aftbed.campaign.report.table import Progress  # noqa: PLC0415
+    from aftbed.report.terminal import Progress  # noqa: PLC0415
 
     results = running.run(found, asked)  # refuses what it refuses before anything is shown
     todo = sum(asked.has(index, len(found.strata)) for index in range(found.size))
@@ -171,10 +171,10 @@ def _follow(found: Plan, asked: running.Asked, *, as_json: bool) -> bool:
 
 def _judge(folder: Path, planned: int, seconds: float, *, as_json: bool) -> int:
     """The summary of what is in the ledger, and its reports."""
-    from aftbed.campaign.report.html import html_report  # noqa: PLC0415 - scipy, Jinja2
-    from aftbed.campaign.report.junit import junit_xml  # noqa: PLC0415
-    from aftbed.campaign.report.table import summary_lines  # noqa: PLC0415
     from aftbed.campaign.summary import summarise  # noqa: PLC0415
+    from aftbed.report.html import html_report  # noqa: PLC0415 - scipy, Jinja2
+    from aftbed.report.junit import junit_xml  # noqa: PLC0415
+    from aftbed.report.terminal import summary_lines  # noqa: PLC0415
 
     records = ledger.read(folder / ledger.NAME)
     summary = summarise(records, planned, seconds)
@@ -211,7 +211,7 @@ def merge(folders: list[Path], out: Path, *, as_json: bool) -> int:
 
 def export(folder: Path, out: Path) -> None:
     """By the ending of the file."""
-    from aftbed.campaign.report.export import write_csv, write_parquet  # noqa: PLC0415
+    from aftbed.report.export import write_csv, write_parquet  # noqa: PLC0415
 
     writers = {".csv": write_csv, ".parquet": write_parquet}
     if out.suffix not in writers:

@@ -8,13 +8,13 @@ from typing import Final, NamedTuple
 
 from msgspec.structs import replace
 
-from aftbed.campaign import diagram
 from aftbed.campaign.explore import attempt
 from aftbed.campaign.shrink import shrink
 from aftbed.campaign.simulated import Breach
 from aftbed.cli.simasked import DEFAULT, Asked, made_of
 from aftbed.cli.simview import adaptation_words, command, described
 from aftbed.core.errors import ConfigError
+from aftbed.report import sequence
 from aftbed.runtime.sim.tracing import traced
 from aftbed.runtime.sim.world import Setup
 
@@ -120,4 +120,4 @@ def picture(setup: Setup, broken: tuple[Breach, ...]) -> Picture:
     if attempt(setup)[0] is None:
         return Picture("", "")
     trace = traced(setup)
-    return Picture(diagram.text(trace, broken), diagram.mermaid(trace, broken))
+    return Picture(sequence.text(trace, broken), sequence.mermaid(trace, broken))

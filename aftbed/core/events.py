@@ -76,6 +76,12 @@ REQUEST_PATH: Final = (
     Event.REPLY_SENT,
     Event.REPLY_DELIVERED,
 )
+REQUEST_EVENTS: Final = frozenset(  # records that a request leaves when nothing goes wrong
+    (*REQUEST_PATH, Event.REPLY_ACCEPTED, Event.CHECKPOINT_APPLIED, Event.STATE_RESTORED)
+    + (Event.FOLLOWER_FORWARDED, Event.FOLLOWER_NOTIFIED, Event.VOTE_COMPARED)
+)
+STEP_EVENTS: Final = frozenset((Event.ADAPT_STEP_ENTER, Event.ADAPT_STEP_ACT, Event.ADAPT_STEP_EXIT))
+FIRST_FAULT: Final = 1_000_001  # number of the first fault of a run, in the detail of `fault.applied`
 
 
 def event_named(label: str) -> Event:

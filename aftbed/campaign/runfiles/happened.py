@@ -12,13 +12,12 @@ from enum import Enum
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from aftbed.campaign.diagram import FIRST_FAULT
 from aftbed.campaign.record import RunRecord
-from aftbed.campaign.report.happenings import STEPS, USUAL
-from aftbed.core.events import Event
+from aftbed.core.events import FIRST_FAULT, REQUEST_EVENTS, STEP_EVENTS, Event
 from aftbed.core.fault import marked
 from aftbed.core.journal import Record
 
+DUE: Final = "an adaptation is due"  # its trigger is armed as a fault is
 TOLD_NAME: Final = "events.jsonl"
 FAILURES: Final = frozenset(
     (Event.DETECTED_STOP, Event.FOLLOWER_DIVERGED, Event.NODE_DIED, Event.WATCHDOG_SUSPECT)
@@ -56,7 +55,7 @@ def kind_of(one: Record) -> Kind:
         return Kind.FAULT
     if one.event in FAILURES:
         return Kind.FAILURE
-    if one.event in USUAL or one.event is Event.DEDUPE_HIT:
+    if one.event in REQUEST_EVENTS or one.event is Event.DEDUPE_HIT:
         return Kind.REQUEST
     return Kind.ADAPTATION if str(one.event).startswith("adapt") else Kind.RECOVERY
 
@@ -68,7 +67,7 @@ def words_of(one: Record, record: RunRecord) -> str:
     if one.event is Event.NODE_DIED:
         return f"{one.event}: process {one.detail}"
     words = [str(one.event), *([f"#{one.request_id}"] if one.request_id else [])]
-    return " ".join([*words, *([str(one.detail)] if one.event in STEPS else [])])
+    return " ".join([*words, *([str(one.detail)] if one.event in STEP_EVENTS else [])])
 
 
 def _fault(at: int, record: RunRecord) -> str:

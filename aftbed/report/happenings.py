@@ -10,17 +10,17 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Final, NamedTuple
 
-from aftbed.campaign import diagram
-from aftbed.core.events import REQUEST_PATH, Event
+from aftbed.core.events import FIRST_FAULT, REQUEST_EVENTS, STEP_EVENTS, Event
 from aftbed.core.fault import marked
 from aftbed.core.journal import Record
 from aftbed.core.messages import Message
 from aftbed.ftm.compose import build
+from aftbed.report import sequence
 from aftbed.runtime.sim.tracing import STRUCK, Happening, Sent, Told, Trace
 
 BEFORE, AFTER = 14, 30  # happenings around a turning point
 KEPT_MAX: Final = 330  # happenings of a diagram
-EXECUTIVE: Final = diagram.EXECUTIVE
+EXECUTIVE: Final = sequence.EXECUTIVE
 GAP_PX: Final = 98.0
 WAIT_NS, WAIT_PX = 30_000, 14.0  # a longer one takes so much more room for each power of ten
 LEFT: Final = 14.0
@@ -29,11 +29,6 @@ TURNS: Final = frozenset(
     (Event.FAULT_APPLIED, Event.WATCHDOG_SUSPECT, Event.RECOVERY_ENTER, Event.REPLICA_PROMOTED)
     + (Event.RECOVERY_EXIT, Event.DETECTED_STOP, Event.FOLLOWER_DIVERGED, Event.BACKUP_READY)
     + (Event.ADAPT_PLAN, Event.ADAPT_COMMIT, Event.ADAPT_ROLLBACK)
-)
-STEPS: Final = frozenset((Event.ADAPT_STEP_ENTER, Event.ADAPT_STEP_ACT, Event.ADAPT_STEP_EXIT))
-USUAL: Final = frozenset(
-    (*REQUEST_PATH, Event.REPLY_ACCEPTED, Event.CHECKPOINT_APPLIED, Event.STATE_RESTORED)
-    + (Event.FOLLOWER_FORWARDED, Event.FOLLOWER_NOTIFIED, Event.VOTE_COMPARED)
 )
 KINDS: Final = {  # of messages: the class of their arrow
     "Request": "request",
@@ -103,7 +98,7 @@ def _room(one: Happening) -> float:
         case Sent():
             return 16.0
         case Record(event=event):
-            return 3.0 if event in USUAL else 9.0
+            return 3.0 if event in REQUEST_EVENTS else 9.0
         case Told():
             return 9.0
         case _:
@@ -167,11 +162,11 @@ def said(one: Record | Told, trace: Trace) -> str:
     """A mark in words; a fault in its own."""
     if isinstance(one, Told):
         return f"{one.text} was hit" if one.event == STRUCK else f"{one.event}: {one.text}"
-    faults, at = trace.run.setup.faults, marked(one.detail)[0] - diagram.FIRST_FAULT
+    faults, at = trace.run.setup.faults, marked(one.detail)[0] - FIRST_FAULT
     if one.event is Event.FAULT_APPLIED:
         return str(faults[at])
     words = [str(one.event), *([f"#{one.request_id}"] if one.request_id else [])]
-    return " ".join([*words, *([str(one.detail)] if one.detail and one.event in STEPS else [])])
+    return " ".join([*words, *([str(one.detail)] if one.detail and one.event in STEP_EVENTS else [])])
 
 
 def class_of(one: Record | Told) -> str:

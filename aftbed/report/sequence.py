@@ -13,7 +13,7 @@ from collections.abc import Iterable, Sequence
 from typing import Final, NamedTuple, assert_never
 
 from aftbed.campaign.simulated import Breach
-from aftbed.core.events import REQUEST_PATH, Event
+from aftbed.core.events import FIRST_FAULT, REQUEST_EVENTS, Event
 from aftbed.core.fault import Fault, marked
 from aftbed.core.journal import Entry, Record
 from aftbed.ftm.compose import build
@@ -21,12 +21,7 @@ from aftbed.runtime.sim.tracing import STRUCK, Happening, Sent, Told, Trace, bri
 
 LAST: Final = 40  # lines of a listing; arrows and notes of a diagram
 EXECUTIVE: Final = "supervisor"
-FIRST_FAULT: Final = 1_000_001  # the number of the first of a run, as in `runtime.faults`
 _REQUEST: Final = re.compile(r"\brequest (\d+)")
-_USUAL: Final = frozenset(  # with every request: an arrow shows as much
-    (*REQUEST_PATH, Event.REPLY_ACCEPTED, Event.CHECKPOINT_APPLIED, Event.STATE_RESTORED)
-    + (Event.FOLLOWER_FORWARDED, Event.FOLLOWER_NOTIFIED, Event.VOTE_COMPARED)
-)
 _ESCAPED: Final = re.compile(r"[^A-Za-z0-9 _.,:'/()=+*-]|\b[Ee](?=[Nn][Dd]\b)")  # `end` would end a block
 
 
@@ -126,7 +121,7 @@ def _draw(one: Happening, nodes: dict[str, str], faults: Sequence[Fault]) -> lis
         case Sent():
             source, sink = nodes.get(one.source, one.source), nodes.get(one.sink, one.sink)
             return [_Drawn(one.t_ns, source, sink, f"{one.port} {brief(one.message)}")]
-        case Record() if one.event not in _USUAL:
+        case Record() if one.event not in REQUEST_EVENTS:
             node = "" if one.node == EXECUTIVE else one.node
             return [_Drawn(one.t_ns, node, "", _noted(one, faults))]
         case Told(event=event) if event == STRUCK:

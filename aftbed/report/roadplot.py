@@ -13,7 +13,7 @@ from typing import Final
 
 import msgspec
 
-from aftbed.campaign.report import svg
+from aftbed.report import svg
 
 WIDTH, HEIGHT = 620.0, 300.0
 LEFT, RIGHT, TOP, BOTTOM = 52.0, 16.0, 34.0, 44.0

@@ -11,13 +11,12 @@ import math
 from collections.abc import Iterable, Iterator
 from typing import Final, NamedTuple
 
-from aftbed.campaign import diagram
-from aftbed.campaign.report import svg
-from aftbed.campaign.report.happenings import (
+from aftbed.core.events import REQUEST_EVENTS, STEP_EVENTS
+from aftbed.core.journal import Entry, Record
+from aftbed.report import sequence, svg
+from aftbed.report.happenings import (
     GAP_PX,
-    STEPS,
     TURNS,
-    USUAL,
     Placed,
     class_of,
     hosts_of,
@@ -29,7 +28,6 @@ from aftbed.campaign.report.happenings import (
     said,
     struck,
 )
-from aftbed.core.journal import Entry, Record
 from aftbed.runtime.sim.tracing import Happening, Sent, Told, Trace, brief, milliseconds
 
 ROW_PX, LANE_PX, LANES_MAX = 20.0, 15.0, 7
@@ -63,7 +61,7 @@ def space_time(trace: Trace) -> Drawn:
     rows = rows_of(trace, [p.one for p in placed])
     labels = list(_labels(trace, placed))
     page = _Page(trace, placed, rows, labels)
-    text = diagram.text(Trace(trace.run, tuple(trace.happened[at] for at in kept)), last=len(kept))
+    text = sequence.text(Trace(trace.run, tuple(trace.happened[at] for at in kept)), last=len(kept))
     return Drawn(page.names(), page.body(), text)
 
 
@@ -200,7 +198,7 @@ class _Page:
         match one:
             case Sent():
                 return self._arrow(one, x)
-            case Record(event=event) if event in USUAL:
+            case Record(event=event) if event in REQUEST_EVENTS:
                 dot: svg.Attributes = {"cx": x, "cy": self._y(one.node), "r": 1.6, "class": "dot"}
                 return svg.group(
                     "", svg.element("circle", dot), title=self._title(one, said(one, self._trace))
@@ -214,7 +212,7 @@ class _Page:
         y, css = self._y(self._nodes(one)[0]), class_of(one)
         shape = svg.path(f"M{x - 5:.1f} {y - 5:.1f}l10 10m0 -10l-10 10", "cross")
         if css != "fault":
-            size = 3 if isinstance(one, Record) and one.event in STEPS else 4.5
+            size = 3 if isinstance(one, Record) and one.event in STEP_EVENTS else 4.5
             shape = svg.path(
                 f"M{x:.1f} {y - size:.1f}l{size} {size}l-{size} {size}l-{size} -{size}z", "diamond"
             )

@@ -22,8 +22,8 @@ from xml.etree import ElementTree
 
 from aftbed.campaign.experiment import Result
 from aftbed.campaign.ledger import Ledger
-from aftbed.campaign.report.worst import worst_of
 from aftbed.campaign.summary import GateResult, StratumSummary, Summary
+from aftbed.report.worst import worst_of
 
 UNEXPECTED: Final = "unexpected"
 NOT_ACTIVATED: Final = "not_activated"

@@ -9,13 +9,13 @@ from typing import Final
 import msgspec
 import pytest
 from campaigns import result
-from reported import HOSTILE, MACHINE, hostile, mixed, summary_of, with_results
+from reported import HOSTILE, MACHINE, hostile, summary_of, with_results
 
 from aftbed.campaign.experiment import OUTCOMES
 from aftbed.campaign.ledger import Ledger
-from aftbed.campaign.report.html import DRAWN_MAX, html_report, percent
-from aftbed.campaign.report.worst import by_badness
 from aftbed.campaign.spec import Gate
+from aftbed.report.html import DRAWN_MAX, html_report, percent
+from aftbed.report.worst import by_badness
 
 VOID: Final = frozenset(("meta", "link", "br"))
 FETCHING: Final = frozenset(("src", "srcset", "data", "action", "poster", "background"))
@@ -57,11 +57,6 @@ class Page(HTMLParser):
 
     def values(self, name: str) -> list[str]:
         return [value for attribute, value in self.attributes if attribute == name]
-
-
-@pytest.fixture(scope="module")
-def ledger(tmp_path_factory: pytest.TempPathFactory) -> Ledger:
-    return mixed(tmp_path_factory.mktemp("mixed"))
 
 
 @pytest.fixture(scope="module")
@@ -190,7 +185,7 @@ def test_what_is_not_quite_all_is_not_rounded_to_all(share: float, said: str) ->
 
 
 def test_the_templates_are_part_of_the_package() -> None:
-    import aftbed.campaign.report as package  # noqa: PLC0415
+    import aftbed.report as package  # noqa: PLC0415
 
     folder = Path(package.__file__).parent / "templates"
     assert {path.name for path in folder.iterdir()} == {"report.html.j2", "report.css"}

@@ -5,14 +5,13 @@ from typing import Final
 from xml.etree import ElementTree
 
 import msgspec
-import pytest
 from campaigns import result
-from reported import HOSTILE, hostile, mixed, named, summary_of, with_results
+from reported import HOSTILE, hostile, named, summary_of, with_results
 
 from aftbed.campaign.experiment import Result
 from aftbed.campaign.ledger import Ledger
-from aftbed.campaign.report.junit import junit_xml
 from aftbed.campaign.spec import Gate
+from aftbed.report.junit import junit_xml
 
 SCHEMA: Final = {  # what junit-10.xsd and jenkins-junit.xsd both allow: attributes needed, allowed; children
     "testsuites": ((), ("name", "time", "tests", "failures", "errors"), ("testsuite",)),
@@ -26,11 +25,6 @@ SCHEMA: Final = {  # what junit-10.xsd and jenkins-junit.xsd both allow: attribu
     "testcase": (("name",), ("classname", "time"), ("skipped", "failure", "system-out", "system-err")),
     "failure": ((), ("type", "message"), ()),
 }
-
-
-@pytest.fixture(scope="module")
-def ledger(tmp_path_factory: pytest.TempPathFactory) -> Ledger:
-    return mixed(tmp_path_factory.mktemp("mixed"))
 
 
 def suite_of(ledger: Ledger) -> ElementTree.Element:

@@ -4,10 +4,10 @@ import re
 
 import pytest
 
-from aftbed.campaign.diagram import escaped, mermaid, text
 from aftbed.campaign.simulated import Breach
 from aftbed.campaign.swarm import drawn
 from aftbed.core.fault import Crash, Fault, Trigger
+from aftbed.report.sequence import escaped, mermaid, text
 from aftbed.runtime.sim.tracing import Trace, traced
 from aftbed.runtime.sim.world import Setup
 

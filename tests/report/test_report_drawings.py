@@ -8,12 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from aftbed.adapt.schedule import scheduled
-from aftbed.campaign.report.happenings import KEPT_MAX
-from aftbed.campaign.report.plots import POINTS_MAX, Limit, axis_of, ecdf
-from aftbed.campaign.report.spacetime import space_time
 from aftbed.core.script import RECIPES
 from aftbed.ftm.compose import build
 from aftbed.inject.words import parse
+from aftbed.report.happenings import KEPT_MAX
+from aftbed.report.plots import POINTS_MAX, Limit, axis_of, ecdf
+from aftbed.report.spacetime import space_time
 from aftbed.runtime.sim.tracing import Trace, traced
 from aftbed.runtime.sim.world import Setup
 

@@ -14,8 +14,8 @@ from typing import Final
 
 import msgspec
 
-from aftbed.campaign.report import svg
 from aftbed.campaign.statistics import quantile
+from aftbed.report import svg
 
 POINTS_MAX: Final = 400
 LOG_FROM: Final = 20.0

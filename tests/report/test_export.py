@@ -7,16 +7,11 @@ from pathlib import Path
 
 import pytest
 from campaigns import result
-from reported import HOSTILE, hostile, mixed, with_results
+from reported import HOSTILE, hostile, with_results
 
 from aftbed.campaign.ledger import Ledger
-from aftbed.campaign.report.export import COLUMNS, rows, write_csv, write_parquet
 from aftbed.core.errors import ConfigError
-
-
-@pytest.fixture(scope="module")
-def ledger(tmp_path_factory: pytest.TempPathFactory) -> Ledger:
-    return mixed(tmp_path_factory.mktemp("mixed"))
+from aftbed.report.export import COLUMNS, rows, write_csv, write_parquet
 
 
 def read_csv(path: Path) -> list[dict[str, str]]:
@@ -82,7 +77,7 @@ import sys
 sys.modules["pyarrow"] = None  # as if it were not installed
 from pathlib import Path
 from aftbed.campaign.ledger import Ledger
-from aftbed.campaign.report.export import write_parquet
+from aftbed.report.export import write_parquet
 from aftbed.core.errors import ConfigError
 try:
     write_parquet(None, Path("r.parquet"))

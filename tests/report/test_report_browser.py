@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Final
 
 import pytest
-from reported import hostile, mixed, summary_of, with_results
+from reported import hostile, summary_of, with_results
 
 from aftbed.campaign.ledger import Ledger
-from aftbed.campaign.report.html import DRAWN_MAX, html_report
+from aftbed.report.html import DRAWN_MAX, html_report
 
 NAMES: Final = ("chromium", "chromium-browser", "google-chrome")
 BROWSER: Final = next((found for name in NAMES if (found := shutil.which(name))), None)
@@ -32,11 +32,6 @@ pytestmark = [
     pytest.mark.process,
     pytest.mark.skipif(BROWSER is None, reason=f"none of {', '.join(NAMES)} is installed"),
 ]
-
-
-@pytest.fixture(scope="module")
-def ledger(tmp_path_factory: pytest.TempPathFactory) -> Ledger:
-    return mixed(tmp_path_factory.mktemp("mixed"))
 
 
 def opened(page: Path, *options: str, width: int = 1280) -> tuple[str, str]:

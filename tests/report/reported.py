@@ -1,6 +1,5 @@
 """A small campaign with many outcomes, simulated once, for the tests of reports."""
 
-from functools import lru_cache
 from pathlib import Path
 from typing import Final
 
@@ -51,7 +50,6 @@ HOSTILE: Final = """<script>alert("1")</script> & 'x' ]]> {{ 7 * 7 }} \x01 é"""
 MACHINE: Final = Environment("CPython 3.11.0", "Linux 6.1", "2 of 2, Some CPU", "aftbed campaign")
 
 
-@lru_cache(maxsize=1)
 def mixed(folder: Path) -> Ledger:
     """All its experiments, carried out."""
     found = planned(folder, MIXED)

@@ -6,7 +6,7 @@ from xml.etree import ElementTree
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from aftbed.campaign.report.roadplot import Curve, Point, road_plot
+from aftbed.report.roadplot import Curve, Point, road_plot
 
 SVG: Final = "{http://www.w3.org/2000/svg}"
 points = st.builds(

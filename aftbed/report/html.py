@@ -18,14 +18,14 @@ from markupsafe import Markup
 
 from aftbed.campaign.experiment import OUTCOMES, Result
 from aftbed.campaign.ledger import Ledger
-from aftbed.campaign.report import plots
-from aftbed.campaign.report.matrix import MEANINGS, Places, anchor_of, matrix, shares
-from aftbed.campaign.report.plots import Limit, milliseconds
-from aftbed.campaign.report.spacetime import space_time
-from aftbed.campaign.report.worst import by_badness, rerun, slowness_ms
 from aftbed.campaign.spec import Gate, Spec
 from aftbed.campaign.statistics import Interval
 from aftbed.campaign.summary import Summary, confidence_of
+from aftbed.report import plots
+from aftbed.report.matrix import MEANINGS, Places, anchor_of, matrix, shares
+from aftbed.report.plots import Limit, milliseconds
+from aftbed.report.spacetime import space_time
+from aftbed.report.worst import by_badness, rerun, slowness_ms
 
 TEMPLATES: Final = Path(__file__).resolve().parent / "templates"
 DRAWN_MAX: Final = 3  # runs that are simulated again

@@ -10,16 +10,11 @@ from pathlib import Path
 import msgspec
 import pytest
 from campaigns import result
-from reported import mixed, summary_of, with_results
+from reported import summary_of, with_results
 
 from aftbed.campaign.ledger import Ledger
-from aftbed.campaign.report import table
-from aftbed.campaign.report.table import Progress, summary_lines
-
-
-@pytest.fixture(scope="module")
-def ledger(tmp_path_factory: pytest.TempPathFactory) -> Ledger:
-    return mixed(tmp_path_factory.mktemp("mixed"))
+from aftbed.report import terminal
+from aftbed.report.terminal import Progress, summary_lines
 
 
 def test_the_lines_name_strata_gates_and_last_the_verdict(ledger: Ledger) -> None:
@@ -54,7 +49,7 @@ def test_what_is_missing_is_said(ledger: Ledger) -> None:
 def test_plain_lines_where_stdout_is_no_terminal(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(table, "LINE_S", 0.0)
+    monkeypatch.setattr(terminal, "LINE_S", 0.0)
     with Progress("try", 3) as progress:
         progress.add(result("tolerated"))
         progress.add(result("sdc", index=1, unexpected=True))
@@ -64,7 +59,7 @@ def test_plain_lines_where_stdout_is_no_terminal(
 
 
 def test_quiet_is_quiet(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(table, "LINE_S", 0.0)
+    monkeypatch.setattr(terminal, "LINE_S", 0.0)
     with Progress("try", 1, quiet=True) as progress:
         progress.add(result())
     assert capsys.readouterr().out == ""
@@ -80,9 +75,9 @@ LIVE = """
 import sys, threading
 sys.path.insert(0, {folder!r})
 from campaigns import result
-from aftbed.campaign.report import table
-table.REDRAW_S = 0.0
-with table.Progress("try", 40) as progress:
+from aftbed.report import terminal
+terminal.REDRAW_S = 0.0
+with terminal.Progress("try", 40) as progress:
     for index in range(40):
         progress.add(result("tolerated", f"pbr {{index}}", index, unexpected=index == 7))
     assert threading.active_count() == 1, "a thread would be forked with the workers"
@@ -92,7 +87,7 @@ with table.Progress("try", 40) as progress:
 def test_a_terminal_gets_a_picture_that_goes_away() -> None:
     """In a real one: the picture is redrawn in place, and no thread draws it."""
     master, slave = pty.openpty()
-    code = LIVE.format(folder=str(Path(__file__).parent))
+    code = LIVE.format(folder=str(Path(__file__).resolve().parents[1] / "campaign"))
     environment = os.environ | {"TERM": "xterm", "COLUMNS": "120", "LINES": "60"}
     child = subprocess.Popen([sys.executable, "-c", code], stdout=slave, stderr=slave, env=environment)
     os.close(slave)

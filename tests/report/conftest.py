@@ -1,0 +1,17 @@
+"""What the tests of reports share: a small campaign with many outcomes, simulated once."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "campaign"))  # `campaigns`
+
+from reported import mixed
+
+from aftbed.campaign.ledger import Ledger
+
+
+@pytest.fixture(scope="session")
+def ledger(tmp_path_factory: pytest.TempPathFactory) -> Ledger:
+    return mixed(tmp_path_factory.mktemp("mixed"))
