@@ -29,7 +29,6 @@ from aftbed.core.graph import PLACEMENTS, BrickSpec, Graph, Link
 from aftbed.core.script import (
     RECIPES,
     Align,
-    AnyVerb,
     Bind,
     Destroy,
     Drain,
@@ -40,6 +39,7 @@ from aftbed.core.script import (
     Retire,
     Script,
     Stage,
+    Step,
     Suspend,
     Thaw,
     Together,
@@ -292,14 +292,14 @@ def _one_per_node(graph: Graph, bricks: Iterable[str]) -> list[str]:
     return list(firsts.values())
 
 
-Steps = tuple[list[AnyVerb], list[AnyVerb]]  # prepare, commit
+Steps = tuple[list[Step], list[Step]]  # prepare, commit
 
 
 def _drained(change: _Change) -> Steps:
     """Nothing is inside when anything is exchanged."""
     leads = f"{change.leader}/protocol"
     drains = change.drains()
-    commit: list[AnyVerb] = [Suspend(leads), *(Drain(brick) for brick in drains)]
+    commit: list[Step] = [Suspend(leads), *(Drain(brick) for brick in drains)]
     if replication_of(change.old.ftm) and replication_of(change.new.ftm) != replication_of(change.old.ftm):
         commit += [
             Align(f"{change.leader}/server", s.name)
@@ -315,19 +315,19 @@ def _drained(change: _Change) -> Steps:
     return _prepare(change), commit
 
 
-def _prepare(change: _Change) -> list[AnyVerb]:
+def _prepare(change: _Change) -> list[Step]:
     """Stage what is new, and give it its ends of channels."""
     stages = [_stage_of(change, node) for node in (*change.exchanged, *change.added_nodes)]
     binds = [_bind(k) for k in change.binds() if {k.source, k.sink} & change.staged]
     return [*stages, *binds]
 
 
-def _stage_of(change: _Change, node: str, *, held: bool | None = None) -> AnyVerb:
+def _stage_of(change: _Change, node: str, *, held: bool | None = None) -> Step:
     bricks = tuple(change.new_bricks[b] for b in change.new.nodes[node])
     return Stage(node, bricks, change.held(node) if held is None else held)
 
 
-def _exchanges(change: _Change) -> list[AnyVerb]:
+def _exchanges(change: _Change) -> list[Step]:
     """What the nodes hear of at once: who takes whose place, and the channels of those that stay."""
     moved = [
         _bind(k)
@@ -354,7 +354,7 @@ def _bind(link: Link) -> Bind:
 def _paper(change: _Change) -> Steps:
     """SIGSTOP the Protocol, kill, launch, link, SIGCONT (paper, III-B). All of it while the client waits."""
     frozen = [p for s in _servers(change.old) if (p := f"{s.replica}/protocol") not in change.staged]
-    commit: list[AnyVerb] = [Freeze(brick) for brick in frozen]
+    commit: list[Step] = [Freeze(brick) for brick in frozen]
     commit += [Destroy(node) for node in (*change.exchanged, *change.removed_nodes)]
     commit += [_stage_of(change, n, held=False) for n in (*change.exchanged, *change.added_nodes)]
     linked = [_bind(k) for k in change.binds() if not k.standby]

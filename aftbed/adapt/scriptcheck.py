@@ -27,7 +27,6 @@ from aftbed.core.graph import PLACEMENTS, Graph, Link, ends
 from aftbed.core.script import (
     RECIPES,
     Align,
-    AnyVerb,
     Bind,
     Destroy,
     Drain,
@@ -38,6 +37,7 @@ from aftbed.core.script import (
     Retire,
     Script,
     Stage,
+    Step,
     Suspend,
     Thaw,
     Transfer,
@@ -72,7 +72,7 @@ def refusals(graph: Graph, script: Script) -> list[str]:
 # -- what there is --------------------------------------------------------------------------------
 
 
-def _steps(script: Script) -> Iterator[tuple[str, AnyVerb]]:
+def _steps(script: Script) -> Iterator[tuple[str, Step]]:
     """Every step with its place, as `commit[3]`."""
     for phase, verbs in phases(script).items():
         for index, verb in enumerate(verbs):

@@ -34,7 +34,6 @@ from aftbed.core.graph import BrickSpec
 from aftbed.core.script import (
     RECIPES,
     Align,
-    AnyVerb,
     Attach,
     Bind,
     Destroy,
@@ -50,6 +49,7 @@ from aftbed.core.script import (
     Script,
     Spawn,
     Stage,
+    Step,
     Suspend,
     Thaw,
     Together,
@@ -63,7 +63,7 @@ ARROW: Final = "->"
 PORTS: Final = tuple(dict.fromkeys(p for kind in KINDS.values() for p in (*kind.inputs, *kind.outputs)))
 RECOVERY: Final = ("spawn", "fence", "kill", "promote", "attach")
 
-_ON_ONE: Final[dict[str, Callable[[str], AnyVerb]]] = {
+_ON_ONE: Final[dict[str, Callable[[str], Step]]] = {
     "suspend": Suspend,
     "drain": Drain,
     "resume": Resume,
@@ -74,10 +74,10 @@ _ON_ONE: Final[dict[str, Callable[[str], AnyVerb]]] = {
     "thaw": Thaw,
     "destroy": Destroy,
 }
-_ON_TWO: Final[dict[str, Callable[[str, str], AnyVerb]]] = {"transfer": Transfer, "align": Align}
+_ON_TWO: Final[dict[str, Callable[[str, str], Step]]] = {"transfer": Transfer, "align": Align}
 VERBS: Final = ("stage", "bind", "unbind", *_ON_TWO, *_ON_ONE, "together")
 
-Step = dict[str, object]  # one verb, and what it acts on
+StepEntry = dict[str, object]  # one verb, and what it acts on
 
 
 class ScriptFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -115,12 +115,12 @@ def mapping(script: Script) -> dict[str, object]:
     return found
 
 
-def phases(script: Script) -> dict[str, tuple[AnyVerb, ...]]:
+def phases(script: Script) -> dict[str, tuple[Step, ...]]:
     """The steps of `script`, by the name of their phase, in the order in which they are carried out."""
     return {"prepare": script.prepare, "commit": script.commit, "finish": script.finish}
 
 
-def step(verb: AnyVerb) -> Step:
+def step(verb: Step) -> StepEntry:
     """One verb as a step of a file."""
     name = type(verb).__name__.lower()
     match verb:
@@ -142,14 +142,14 @@ def step(verb: AnyVerb) -> Step:
             raise AssertionError(f"{name} has no place in an adaptation")
 
 
-def words(verb: AnyVerb) -> str:
+def words(verb: Step) -> str:
     """One verb in a line, as `suspend a/protocol`."""
     ((name, value),) = step(verb).items()
     return f"{name} {value}"
 
 
-def _stage(verb: Stage) -> Step:
-    found: Step = {"node": verb.node, "bricks": {b.name: _brick(b) for b in verb.bricks}}
+def _stage(verb: Stage) -> StepEntry:
+    found: StepEntry = {"node": verb.node, "bricks": {b.name: _brick(b) for b in verb.bricks}}
     return found | {"held": True} if verb.held else found
 
 
@@ -186,7 +186,7 @@ def refuse(where: str, problems: list[str]) -> None:
         raise ScriptError("\n  ".join((f"{where}: {len(problems)} problems:", *problems)))
 
 
-def _steps(steps: Iterable[object], where: str, found: list[str]) -> tuple[AnyVerb, ...]:
+def _steps(steps: Iterable[object], where: str, found: list[str]) -> tuple[Step, ...]:
     verbs = []
     for index, entry in enumerate(steps):
         try:
@@ -196,7 +196,7 @@ def _steps(steps: Iterable[object], where: str, found: list[str]) -> tuple[AnyVe
     return tuple(verbs)
 
 
-def _verb(entry: object, where: str, found: list[str]) -> AnyVerb:
+def _verb(entry: object, where: str, found: list[str]) -> Step:
     """The verb of one step. What is wrong inside of `together` is added to `found`."""
     if not isinstance(entry, dict) or len(entry) != 1:
         raise ConfigError(f"{where}: found {entry!r}, allowed is one verb with what it acts on")
@@ -247,7 +247,7 @@ def _brick_from(name: str, value: object, where: str) -> BrickSpec:
     return BrickSpec(name, file.kind, file.source, file.application)
 
 
-def _keys(value: object, where: str, allowed: tuple[str, ...], needed: tuple[str, ...]) -> Step:
+def _keys(value: object, where: str, allowed: tuple[str, ...], needed: tuple[str, ...]) -> StepEntry:
     if not isinstance(value, dict):
         raise ConfigError(f"{where}: found {value!r}, allowed are the keys {', '.join(allowed)}")
     for key in value:

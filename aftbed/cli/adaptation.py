@@ -27,7 +27,7 @@ from aftbed.core.application import Characteristics
 from aftbed.core.errors import ConfigError
 from aftbed.core.graph import PLACEMENTS, BrickSpec, Graph
 from aftbed.core.messages import Goal, Scheduled
-from aftbed.core.script import AnyVerb, Script, Stage, Together
+from aftbed.core.script import Script, Stage, Step, Together
 from aftbed.ftm.compose import build
 from aftbed.runtime.unix import ask, rundir
 
@@ -109,7 +109,7 @@ def _absolute(script: Script, folder: Path) -> Script:
         application = _source(spec.application, folder) if spec.application else ""
         return msgspec.structs.replace(spec, source=source, application=application)
 
-    def verb(one: AnyVerb) -> AnyVerb:
+    def verb(one: Step) -> Step:
         match one:
             case Stage():
                 return msgspec.structs.replace(one, bricks=tuple(brick(b) for b in one.bricks))

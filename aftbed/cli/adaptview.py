@@ -7,7 +7,7 @@ import msgspec
 
 from aftbed.adapt.plan import Plan
 from aftbed.adapt.scriptfile import phases, step
-from aftbed.core.script import AnyVerb, Stage, Together
+from aftbed.core.script import Stage, Step, Together
 
 WIDTH: Final = 100
 WHEN: Final = {
@@ -72,7 +72,7 @@ def plan_lines(there: Plan, back: Plan) -> Iterator[str]:
     yield from _phase("commit", back.script.commit)
 
 
-def _phase(name: str, verbs: tuple[AnyVerb, ...]) -> Iterator[str]:
+def _phase(name: str, verbs: tuple[Step, ...]) -> Iterator[str]:
     if not verbs:
         return
     yield f"{name}, {WHEN[name]}: {len(verbs)} step{'s' if len(verbs) > 1 else ''}"
@@ -100,10 +100,10 @@ def _listed(name: str, bricks: tuple[str, ...]) -> Iterator[str]:
     yield line
 
 
-def _step_lines(verb: AnyVerb, indent: str) -> Iterator[str]:
+def _step_lines(verb: Step, indent: str) -> Iterator[str]:
     if isinstance(verb, Together):
         yield f"{indent}together"
-        for inner in verb.verbs:
+        for inner in verb.steps:
             yield from _step_lines(inner, indent + "  ")
         return
     ((name, value),) = step(verb).items()

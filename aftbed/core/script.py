@@ -1,12 +1,14 @@
-"""What the runtime can be asked to do, as data: a script of verbs, executed in order.
+"""What the runtime can be asked to do, as data: a script of steps, and the way back from them.
 
-Recovery and the Adaptation Engine order scripts, a file written by hand may hold one. `prepare` steps touch
-new nodes only and can be undone; `commit` steps act on what serves; `finish` steps end what no longer does.
-A script is one value, so that the whole of it can be checked before its first step runs, journalled,
-simulated and crashed. What it makes of a graph is computed by `after` (graph in, graph out).
+Recovery and the Adaptation Engine order scripts; a file that a person writes may hold one. `prepare` acts on
+new nodes only, `commit` on what serves, `finish` ends what no longer serves. A script is one value, so the
+whole of it is checked before its first step runs, journalled, simulated and crashed.
+
+`after` computes the graph that a script leads to, `inverse` the steps that lead back: a part of a plan and
+then its inverse are the identity on the graph.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from enum import Enum
 from typing import Final
 
@@ -15,78 +17,78 @@ import msgspec
 from aftbed.core.graph import BrickSpec, Graph, Kind, Link, ends
 
 
-class Verb(msgspec.Struct, frozen=True, tag=True):
-    """Base of the verbs. Bricks are named `a/protocol`, replicas `a` and `b`, nodes as in the graph."""
+class ScriptStep(msgspec.Struct, frozen=True, tag=True):
+    """Base of the steps. Bricks are named `a/protocol`, replicas `a` and `b`, nodes as in the graph."""
 
 
-class Spawn(Verb, frozen=True):
+class Spawn(ScriptStep, frozen=True):
     """Create all nodes of a new generation of `replica` and bind the channels among them."""
 
     replica: str
 
 
-class Fence(Verb, frozen=True):
-    """Shut what leads out of `replica`: what was sent stays readable, then ends.
+class Fence(ScriptStep, frozen=True):
+    """Shut the channels that lead out of `replica`: what was sent stays readable, then they end.
 
-    A leader's way to the Proxy is shut by the Attach that follows, behind its checkpoint channel.
+    A leader's channel to the Proxy is shut by the Attach that follows, behind its checkpoint channel.
     """
 
     replica: str
 
 
-class Kill(Verb, frozen=True):
-    """SIGKILL the nodes of `replica` (fenced before)."""
+class Kill(ScriptStep, frozen=True):
+    """SIGKILL the nodes of `replica`. One that leads has been fenced before."""
 
     replica: str
 
 
-class Promote(Verb, frozen=True):
-    """Have `replica` drain what its leader sent to the end and lead under `epoch`."""
+class Promote(ScriptStep, frozen=True):
+    """Have `replica` drain the channels from its leader to their end, then lead under `epoch`."""
 
     replica: str
     epoch: int
 
 
-class Attach(Verb, frozen=True):
+class Attach(ScriptStep, frozen=True):
     """Bind the Proxy to `replica`; it resends what is unanswered."""
 
     replica: str
     epoch: int
 
 
-class Suspend(Verb, frozen=True):
+class Suspend(ScriptStep, frozen=True):
     """Let the node of `brick` finish the request inside it and take no further one; mail waits."""
 
     brick: str
 
 
-class Drain(Verb, frozen=True):
-    """Let the node of `brick` work off what waits for it, then take no more. Who feeds it is suspended."""
+class Drain(ScriptStep, frozen=True):
+    """Let the node of `brick` work off its mail, then take no more. The brick that feeds it is suspended."""
 
     brick: str
 
 
-class Resume(Verb, frozen=True):
-    """Undo Suspend or Drain; or let a node that was staged `held` begin."""
+class Resume(ScriptStep, frozen=True):
+    """End a Suspend or Drain; or let a node that was staged `held` begin."""
 
     brick: str
 
 
-class Transfer(Verb, frozen=True):
+class Transfer(ScriptStep, frozen=True):
     """Capture the state of `source` and restore it in `sink` (both quiescent)."""
 
     source: str
     sink: str
 
 
-class Align(Verb, frozen=True):
-    """Make the state of `sink` that of `source`, checked by digest; nothing moves where they are equal."""
+class Align(ScriptStep, frozen=True):
+    """Make the state of `sink` that of `source`, compared by digest; nothing moves where they are equal."""
 
     source: str
     sink: str
 
 
-class Bind(Verb, frozen=True):
+class Bind(ScriptStep, frozen=True, repr_omit_defaults=True):
     """Bind `port` of `brick` to `target_port` of `target` (`""`: of the same name).
 
     In `prepare`, only bricks that are staged get their end; the other end waits in the runtime.
@@ -96,21 +98,22 @@ class Bind(Verb, frozen=True):
     port: str
     target: str
     target_port: str = ""
+    standby: bool = False  # in an inverse only: the runtime keeps the end of the Proxy
 
     @property
     def link(self) -> Link:
         """The link that this makes."""
-        return Link(self.brick, self.port, self.target, self.target_port or self.port)
+        return Link(self.brick, self.port, self.target, self.target_port or self.port, self.standby)
 
 
-class Unbind(Verb, frozen=True):
+class Unbind(ScriptStep, frozen=True):
     """Let `port` of `brick` lead nowhere."""
 
     brick: str
     port: str
 
 
-class Stage(Verb, frozen=True):
+class Stage(ScriptStep, frozen=True):
     """Create `node` with these bricks beside what serves. `held`: it takes no mail before Resume."""
 
     node: str
@@ -118,49 +121,49 @@ class Stage(Verb, frozen=True):
     held: bool = False
 
 
-class Migrate(Verb, frozen=True):
-    """Hand the state of each brick of the serving `node` to its like in the staged one (quiescent)."""
+class Migrate(ScriptStep, frozen=True):
+    """Hand the state of each brick of `node` to the brick of that name in the node beside it (quiescent)."""
 
     node: str
 
 
-class Exchange(Verb, frozen=True):
-    """The staged `node` takes the place of the serving one, which is kept, suspended, until Retire."""
+class Exchange(ScriptStep, frozen=True):
+    """What stands beside `node` takes its place; what had it stands beside it, suspended, until Retire."""
 
     node: str
 
 
-class Retire(Verb, frozen=True):
-    """End what no longer serves: the node that was exchanged, or that the new graph does not have."""
+class Retire(ScriptStep, frozen=True):
+    """End what stands beside `node`; or, where nothing does, a node that the new graph does not have."""
 
     node: str
 
 
-class Freeze(Verb, frozen=True):
-    """SIGSTOP to the node of `brick`, whatever it is doing. The paper's recipe, and nobody else's."""
+class Freeze(ScriptStep, frozen=True):
+    """SIGSTOP to the node of `brick`, whatever it is doing. In the paper's recipe only."""
 
     brick: str
 
 
-class Thaw(Verb, frozen=True):
-    """SIGCONT to the node of `brick`."""
+class Thaw(ScriptStep, frozen=True):
+    """SIGCONT to the node of `brick`. In the paper's recipe only."""
 
     brick: str
 
 
-class Destroy(Verb, frozen=True):
-    """SIGKILL to `node`, with whatever is inside it. The paper's recipe, and nobody else's."""
+class Destroy(ScriptStep, frozen=True):
+    """SIGKILL to `node`, with whatever is inside it. In the paper's recipe only."""
 
     node: str
 
 
-class Together(Verb, frozen=True):
-    """These in any order, at the same time: each node hears of all that concerns it at once."""
+class Together(ScriptStep, frozen=True):
+    """These in any order, at the same time: each node gets all that concerns it in one order."""
 
-    verbs: "tuple[AnyVerb, ...]"
+    steps: "tuple[Step, ...]"
 
 
-AnyVerb = (
+Step = (
     Spawn | Fence | Kill | Promote | Attach | Suspend | Drain | Resume | Transfer | Align | Bind | Unbind
     | Stage | Migrate | Exchange | Retire | Freeze | Thaw | Destroy | Together
 )  # fmt: skip
@@ -169,7 +172,7 @@ STEPS_MAX: Final = 1024
 
 
 class Phase(Enum):
-    """The parts of a script that are ordered one by one; `UNDO` takes back what was done."""
+    """The parts of a script that are ordered one by one; `UNDO` runs the inverse of what was done."""
 
     WHOLE = "whole"
     PREPARE = "prepare"
@@ -193,27 +196,27 @@ LOSSES: Final = frozenset((ScriptKind.FAILOVER, ScriptKind.DROP_BACKUP))  # each
 class Script(msgspec.Struct, frozen=True):
     """`purpose` is text for people: `failover`, `new backup`, `pbr to pbr+tr`.
 
-    `ftm` is the expression of what runs after it, `""` for what ran before.
+    `ftm` is the expression that runs after it, `""` for the one that ran before.
     `replica` is the one that a script of Recovery is about, `""` for an adaptation.
     """
 
     purpose: str
     replica: str
-    prepare: tuple[AnyVerb, ...]
-    commit: tuple[AnyVerb, ...]
-    finish: tuple[AnyVerb, ...] = ()
+    prepare: tuple[Step, ...]
+    commit: tuple[Step, ...]
+    finish: tuple[Step, ...] = ()
     ftm: str = ""
     recipe: str = RECIPES[0]
     kind: ScriptKind = ScriptKind.ADAPTATION
 
 
-def flat(verbs: tuple[AnyVerb, ...]) -> Iterator[AnyVerb]:
-    """Every single verb, in order."""
-    for verb in verbs:
-        if isinstance(verb, Together):
-            yield from flat(verb.verbs)
+def flat(steps: Iterable[Step]) -> Iterator[Step]:
+    """Every single step, in order."""
+    for step in steps:
+        if isinstance(step, Together):
+            yield from flat(step.steps)
         else:
-            yield verb
+            yield step
 
 
 def problems(script: Script) -> list[str]:
@@ -221,18 +224,18 @@ def problems(script: Script) -> list[str]:
     found = _prepare_problems(script) + _suspension_problems(script) + _mastership_problems(script)
     if len(script.prepare) + len(script.commit) + len(script.finish) > STEPS_MAX:
         found.append(f"more than {STEPS_MAX} steps")
-    wrong = [v for v in flat(script.finish) if not isinstance(v, Retire)]
-    return found + [f"finish only retires: {verb}" for verb in wrong]
+    wrong = [s for s in flat(script.finish) if not isinstance(s, Retire)]
+    return found + [f"finish only retires: {step}" for step in wrong]
 
 
 def _suspension_problems(script: Script) -> list[str]:
     """What is suspended is resumed, and nothing is changed while requests flow."""
-    staged = {v.node for v in flat(script.prepare) if isinstance(v, Stage)}
-    waiting = {b.name for v in flat(script.prepare) if isinstance(v, Stage) and v.held for b in v.bricks}
+    staged = {s.node for s in flat(script.prepare) if isinstance(s, Stage)}
+    waiting = {b.name for s in flat(script.prepare) if isinstance(s, Stage) and s.held for b in s.bricks}
     held: set[str] = set()
     found: list[str] = []
-    for verb in flat(script.commit):
-        match verb:
+    for step in flat(script.commit):
+        match step:
             case Suspend(brick) | Drain(brick) | Freeze(brick):
                 held.add(brick)
             case Resume(brick) | Thaw(brick) if brick in held:
@@ -240,7 +243,7 @@ def _suspension_problems(script: Script) -> list[str]:
             case Resume(brick) | Thaw(brick) if brick not in waiting:
                 found.append(f"resumed, not suspended: {brick}")
             case Transfer() | Align() | Bind() | Migrate() | Exchange() if not held:
-                found.append(f"changed while requests flow: {verb}")
+                found.append(f"changed while requests flow: {step}")
             case Exchange(node) | Migrate(node) if node not in staged:
                 found.append(f"nothing is staged to take the place of {node}")
             case Destroy(node) if script.recipe == RECIPES[0]:
@@ -249,8 +252,8 @@ def _suspension_problems(script: Script) -> list[str]:
                 found.append(f"spawned while the client waits: {node}")
             case _:
                 pass
-    exchanged = {v.node for v in flat(script.commit) if isinstance(v, Exchange)}
-    ended = {v.node for v in flat(script.finish) if isinstance(v, Retire)} - exchanged
+    exchanged = {s.node for s in flat(script.commit) if isinstance(s, Exchange)}
+    ended = {s.node for s in flat(script.finish) if isinstance(s, Retire)} - exchanged
     left = sorted(brick for brick in held if brick not in ended and _head(brick) not in ended)
     return found + [f"suspended, not resumed: {brick}" for brick in left]
 
@@ -259,16 +262,16 @@ def _mastership_problems(script: Script) -> list[str]:
     """The old master is fenced before there is a new one, and before it is killed."""
     fenced: set[str] = set()
     found = []
-    for verb in flat(script.commit):
-        match verb:
+    for step in flat(script.commit):
+        match step:
             case Fence(replica):
                 fenced.add(replica)
             case Kill(replica) if replica not in fenced:
                 found.append(f"killed before it was fenced: {replica}")
             case Promote(replica) | Attach(replica) if not fenced - {replica}:
-                found.append(f"a new master while the old one is not fenced: {verb}")
+                found.append(f"a new master while the old one is not fenced: {step}")
             case Promote(replica) | Attach(replica) if replica in fenced:
-                found.append(f"a master that is fenced: {verb}")
+                found.append(f"a master that is fenced: {step}")
             case _:
                 pass
     return found
@@ -278,16 +281,16 @@ def _prepare_problems(script: Script) -> list[str]:
     """Prepare acts on nothing but what it has made before."""
     new: set[str] = set()
     found = []
-    for verb in flat(script.prepare):
-        match verb:
+    for step in flat(script.prepare):
+        match step:
             case Spawn(replica):
                 new.add(replica)
             case Stage(node, bricks):
                 new |= {node, *(b.name for b in bricks)}
             case Bind(brick, _, target) if {brick, target} & new or {_head(brick), _head(target)} <= new:
                 pass
-            case _ if not {_head(name) for name in names(verb)} <= new:
-                found.append(f"prepare touches what already serves: {verb}")
+            case _ if not {_head(name) for name in names(step)} <= new:
+                found.append(f"prepare touches what already serves: {step}")
             case _:
                 pass
     return found
@@ -297,9 +300,9 @@ def _head(name: str) -> str:
     return name.partition("/")[0]
 
 
-def names(verb: AnyVerb) -> tuple[str, ...]:
-    """The replicas, nodes and bricks that `verb` acts on."""
-    match verb:
+def names(step: Step) -> tuple[str, ...]:
+    """The replicas, nodes and bricks that `step` acts on."""
+    match step:
         case Spawn(replica) | Fence(replica) | Kill(replica) | Promote(replica) | Attach(replica):
             return (replica,)
         case Suspend(name) | Drain(name) | Resume(name) | Unbind(name) | Freeze(name) | Thaw(name):
@@ -310,68 +313,278 @@ def names(verb: AnyVerb) -> tuple[str, ...]:
             return (source, sink)
         case Bind(brick, _, target):
             return (brick, target)
-        case Together(verbs):
-            return tuple(name for inner in verbs for name in names(inner))
+        case Together(steps):
+            return tuple(name for inner in steps for name in names(inner))
 
 
 # -- against a graph ------------------------------------------------------------------------------
 
 End = tuple[str, str, str]  # brick, port, side: one port name may be both an input and an output
+LinkKey = tuple[str, str, str, str]
+
+
+class Layout(msgspec.Struct, frozen=True):
+    """A graph in the middle of a script.
+
+    `staged`: bricks of nodes that stand beside a node of the same name and have not served yet.
+    `replaced`: bricks of nodes whose place another one has taken; they can take it again until Retire.
+    `added`: nodes that the script has made and the graph did not have.
+    `prepared`: links that are not in force yet; one on standby has not been bound in the commit so far.
+    `suspended`: nodes of the graph that take no mail.
+    """
+
+    graph: Graph
+    staged: dict[str, tuple[BrickSpec, ...]] = {}
+    replaced: dict[str, tuple[BrickSpec, ...]] = {}
+    added: frozenset[str] = frozenset()
+    prepared: tuple[Link, ...] = ()
+    suspended: frozenset[str] = frozenset()
 
 
 def after(graph: Graph, script: Script, kinds: dict[str, Kind]) -> Graph:
-    """What `script` makes of `graph`: bricks staged and retired, links bound and unbound."""
-    bricks = {b.name: b for b in graph.bricks}
-    nodes = dict(graph.nodes)
-    verbs = tuple(flat((*script.prepare, *script.commit, *script.finish)))
-    for verb in verbs:
-        if isinstance(verb, Stage):
-            nodes[verb.node] = tuple(b.name for b in verb.bricks)
-            bricks |= {b.name: b for b in verb.bricks}
-    exchanged = {v.node for v in verbs if isinstance(v, Exchange)}
-    gone = {v.node for v in verbs if isinstance(v, Retire | Destroy)} - exchanged
-    nodes = {node: held for node, held in nodes.items() if node not in gone or _staged(node, verbs)}
-    hosted = {name for held in nodes.values() for name in held}
-    bricks = {name: spec for name, spec in bricks.items() if name in hosted}
-    new = {b.name for v in verbs if isinstance(v, Stage) for b in v.bricks}
-    fresh = _bound(graph, script, new)
-    freed = {end for k in fresh if not k.standby for end in ends(k)} | {
-        _unbound(v, bricks, kinds) for v in verbs if isinstance(v, Unbind)
-    }
-    kept = [
-        k
-        for k in graph.links
-        if {k.source, k.sink} <= set(bricks)
-        and new.isdisjoint((k.source, k.sink))
-        and (k.standby or freed.isdisjoint(ends(k)))
+    """The graph that `script` leads to. What it stages counts as in place, exchanged or not."""
+    fold = _Fold(Layout(graph), kinds)
+    fold.apply(script.prepare, committing=False)
+    fold.apply((*script.commit, *script.finish), committing=True)
+    for node in list(fold.staged):
+        fold.exchange(node)
+    waiting = [k for key, k in fold.prepared.items() if key not in fold.links]
+    found = fold.layout().graph
+    return msgspec.structs.replace(found, ftm=script.ftm or graph.ftm, links=(*found.links, *waiting))
+
+
+def applied(
+    layout: Layout, steps: Iterable[Step], kinds: dict[str, Kind], *, committing: bool = True
+) -> Layout:
+    """What `steps` make of `layout`. While not `committing`, bricks that serve keep their links."""
+    fold = _Fold(layout, kinds)
+    fold.apply(steps, committing=committing)
+    return fold.layout()
+
+
+class _Fold:
+    """A Layout that steps are applied to."""
+
+    def __init__(self, layout: Layout, kinds: dict[str, Kind]) -> None:
+        self._graph, self._kinds = layout.graph, kinds
+        self._committing = False
+        self._made: set[LinkKey] = set()  # links that these steps have made: no later one takes their ends
+        self.bricks = {b.name: b for b in layout.graph.bricks}
+        self.nodes = dict(layout.graph.nodes)
+        self.links = {_key(k): k for k in layout.graph.links}
+        self.staged, self.replaced = dict(layout.staged), dict(layout.replaced)
+        self.added, self.suspended = set(layout.added), set(layout.suspended)
+        self.prepared = {_key(k): k for k in layout.prepared}
+
+    def layout(self) -> Layout:
+        graph = msgspec.structs.replace(
+            self._graph,
+            bricks=tuple(self.bricks.values()),
+            links=tuple(self.links.values()),
+            nodes=self.nodes,
+        )
+        added, suspended = frozenset(self.added), frozenset(self.suspended)
+        return Layout(graph, self.staged, self.replaced, added, tuple(self.prepared.values()), suspended)
+
+    def apply(self, steps: Iterable[Step], *, committing: bool) -> None:
+        """Of steps that happen together, Exchange comes first."""
+        self._committing = committing
+        for step in steps:
+            inner = list(flat((step,)))
+            for one in sorted(inner, key=lambda s: not isinstance(s, Exchange)):
+                self._apply(one)
+
+    def _apply(self, step: Step) -> None:
+        match step:
+            case Stage(node, bricks, held):
+                self._stage(node, bricks, held=held)
+            case Bind():
+                self._bind(step.link)
+            case Unbind(brick, port):
+                self._free({self._end(brick, port)})
+            case Exchange(node):
+                self.exchange(node)
+            case Retire(node) | Destroy(node):
+                self._remove(node)
+            case Suspend(brick) | Drain(brick) | Freeze(brick):
+                self.suspended |= self._host(brick)
+            case Resume(brick) | Thaw(brick):
+                self.suspended -= self._host(brick)
+            case _:
+                pass  # moves state, or changes the leader
+
+    def _host(self, brick: str) -> set[str]:
+        return {node for node, hosted in self.nodes.items() if brick in hosted}
+
+    def _stage(self, node: str, bricks: tuple[BrickSpec, ...], *, held: bool) -> None:
+        if node in self.nodes:
+            self.staged[node] = bricks
+            return
+        self._place(node, bricks)
+        self.added.add(node)
+        self.suspended |= {node} if held else set()
+
+    def _place(self, node: str, bricks: tuple[BrickSpec, ...]) -> None:
+        self.nodes[node] = tuple(b.name for b in bricks)
+        self.bricks |= {b.name: b for b in bricks}
+
+    def _staged_bricks(self) -> set[str]:
+        return {b.name for bricks in self.staged.values() for b in bricks}
+
+    def _bind(self, link: Link) -> None:
+        key, bricks, staged = _key(link), {link.source, link.sink}, self._staged_bricks()
+        new = staged | {b for node in self.added for b in self.nodes[node]}
+        waits = not self._committing and not bricks <= new
+        if waits or bricks & staged:
+            self.prepared[key] = msgspec.structs.replace(link, standby=waits)
+            return
+        self.prepared.pop(key, None)
+        if key not in self.links:
+            self._put_in_force(link)
+
+    def _put_in_force(self, link: Link) -> None:
+        if not link.standby:
+            self._free(set(ends(link)))
+        self.links[_key(link)] = link
+        self._made.add(_key(link))
+
+    def _free(self, freed: set[End]) -> None:
+        self.links = {
+            key: k
+            for key, k in self.links.items()
+            if k.standby or key in self._made or freed.isdisjoint(ends(k))
+        }
+
+    def _end(self, brick: str, port: str) -> End:
+        spec = self.bricks.get(brick)
+        outputs = self._kinds[spec.kind].outputs if spec is not None and spec.kind in self._kinds else ()
+        return (brick, port, "out" if port in outputs else "in")
+
+    def exchange(self, node: str) -> None:
+        """Links that both nodes have stay as they are. One that comes back has none until they are bound."""
+        comes_back = node in self.replaced
+        if node not in self.nodes or not (comes_back or node in self.staged):
+            return
+        incoming = self.replaced.pop(node) if comes_back else self.staged.pop(node)
+        outgoing = self.nodes[node]
+        self.replaced[node] = tuple(self.bricks[name] for name in outgoing)
+        bricks = {*outgoing, *(b.name for b in incoming)}
+        if comes_back:
+            self.prepared = _apart_from(bricks, self.prepared)
+        apart = _apart_from(bricks, self.links)
+        self.links = {key: k for key, k in self.links.items() if key in self.prepared or key in apart}
+        for name in outgoing:
+            del self.bricks[name]
+        self._place(node, incoming)
+        self.suspended.add(node)
+        staged = self._staged_bricks()
+        for key, link in list(self.prepared.items()):
+            both = {link.source, link.sink}
+            if both & bricks and not both & staged and key in self.links:
+                del self.prepared[key]
+            elif both & bricks and not both & staged and not link.standby:
+                self._put_in_force(self.prepared.pop(key))
+
+    def _remove(self, node: str) -> None:
+        if node in self.staged:
+            gone = {b.name for b in self.staged.pop(node)}
+        elif node in self.replaced:
+            del self.replaced[node]
+            return
+        else:
+            gone = set(self.nodes.pop(node, ()))
+            self.bricks = {name: b for name, b in self.bricks.items() if name not in gone}
+            self.links = _apart_from(gone, self.links)
+            self.added.discard(node)
+            self.suspended.discard(node)
+        self.prepared = _apart_from(gone, self.prepared)
+
+
+def _apart_from(bricks: set[str], links: dict[LinkKey, Link]) -> dict[LinkKey, Link]:
+    return {key: k for key, k in links.items() if bricks.isdisjoint((k.source, k.sink))}
+
+
+def _key(link: Link) -> LinkKey:
+    return link.source, link.source_port, link.sink, link.sink_port
+
+
+# -- the way back ---------------------------------------------------------------------------------
+
+ONE_WAY: Final = (Fence, Kill, Promote, Attach, Retire, Destroy)  # these end processes, or a mastership
+
+
+def reversible(steps: Iterable[Step]) -> bool:
+    """Whether there is a way back from `steps`."""
+    return not any(isinstance(step, ONE_WAY) for step in flat(steps))
+
+
+def inverse(
+    graph: Graph, done: Sequence[Step], kinds: dict[str, Kind], drains: Sequence[str] = ()
+) -> list[Step]:
+    """The steps that undo `done`, which was done to `graph` and is reversible.
+
+    They have the shape of a commit: what serves is suspended and hands its state back, what was replaced
+    takes its place again, what was staged is ended, and what was suspended is resumed, the leader last. State
+    is handed back only where requests may have passed meanwhile; `drains` are the bricks of the backup that
+    are to be drained first then, in order. A node that comes back is bound to all its channels again: its
+    neighbours may have been replaced meanwhile.
+    """
+    assert reversible(done), done
+    steps = list(flat(done))
+    begun = next((at for at, step in enumerate(done) if isinstance(step, Suspend | Drain)), len(done))
+    reached = applied(Layout(graph), done[:begun], kinds, committing=False)
+    reached = applied(reached, done[begun:], kinds)
+    stopped = [step.brick for step in steps if isinstance(step, Suspend | Drain)]
+    first = stopped[0] if stopped else ""  # the Protocol of the leader
+    back: list[Step] = []
+    drained: list[str] = []  # nodes
+    if Resume(first) in steps:
+        moved = [s.node for s in steps if isinstance(s, Migrate) and s.node in reached.replaced]
+        back += [Suspend(first), *(Drain(brick) for brick in drains), *(Migrate(node) for node in moved)]
+        drained = [reached.graph.node_of(brick) for brick in drains]
+    back += _at_once(Retire(node) for node in reached.staged)
+    rebound = _links_back(graph, reached)
+    back += _at_once(rebound)
+    back += _at_once(Retire(node) for node in (*reached.replaced, *sorted(reached.added)))
+    back += [Kill(step.replica) for step in steps if isinstance(step, Spawn)]
+    waiting = (*reached.replaced, *sorted(reached.suspended), *map(graph.node_of, stopped), *drained)
+    resumed = [_stopped_as(graph.nodes[n], stopped) for n in dict.fromkeys(waiting) if n in graph.nodes]
+    resumed.sort(key=lambda brick: brick == first)
+    return [*back, *_at_once(map(Resume, resumed))]
+
+
+def _at_once(steps: Iterable[Step]) -> list[Step]:
+    found = tuple(steps)
+    return [Together(found)] if found else []
+
+
+def _stopped_as(hosted: tuple[str, ...], stopped: list[str]) -> str:
+    """The brick of a node by which it was suspended."""
+    return next((brick for brick in stopped if brick in hosted), hosted[0])
+
+
+def _links_back(graph: Graph, reached: Layout) -> list[Step]:
+    """What leads from the links of `reached` to those of `graph`, and each node to its place."""
+    returning = {name for node in reached.replaced for name in graph.nodes[node]}
+    stay = {b.name for b in graph.bricks} & {b.name for b in reached.graph.bricks} - returning
+    there, wanted = ({_key(k): k for k in links} for links in (reached.graph.links, graph.links))
+    taken = {end for k in graph.links if not k.standby for end in ends(k)}
+    binds = [
+        Bind(k.source, k.source_port, k.sink, k.sink_port, k.standby)
+        for key, k in wanted.items()
+        if returning & {k.source, k.sink} or (key not in there and not k.standby)
     ]
-    return Graph(script.ftm or graph.ftm, graph.placement, tuple(bricks.values()), (*kept, *fresh), nodes)
-
-
-def _bound(graph: Graph, script: Script, new: set[str]) -> list[Link]:
-    """The links that the script makes; one whose end at an old brick is never given away is on standby."""
-    old = {(k.source, k.source_port, k.sink, k.sink_port): k for k in graph.links}
-    in_commit = {v.link for v in flat(script.commit) if isinstance(v, Bind)}
-    links = []
-    for link in dict.fromkeys(v.link for v in flat((*script.prepare, *script.commit)) if isinstance(v, Bind)):
-        waits = link not in in_commit and not {link.source, link.sink} <= new
-        standing = old.get((link.source, link.source_port, link.sink, link.sink_port))
-        links.append(standing or msgspec.structs.replace(link, standby=waits))
-    return links
-
-
-def _staged(node: str, verbs: tuple[AnyVerb, ...]) -> bool:
-    return any(isinstance(v, Stage) and v.node == node for v in verbs)
-
-
-def _unbound(verb: Unbind, bricks: dict[str, BrickSpec], kinds: dict[str, Kind]) -> End:
-    spec = bricks.get(verb.brick)
-    outputs = kinds[spec.kind].outputs if spec is not None and spec.kind in kinds else ()
-    return (verb.brick, verb.port, "out" if verb.port in outputs else "in")
+    loose = [end for key, k in there.items() if key not in wanted and not k.standby for end in ends(k)]
+    unbinds = [
+        Unbind(brick, port)
+        for brick, port, side in loose
+        if brick in stay and (brick, port, side) not in taken
+    ]
+    return [*map(Exchange, reached.replaced), *binds, *unbinds]
 
 
 def bricks_changed(old: Graph, new: Graph, script: Script) -> int:
     """How many bricks `script`, which leads from `old` to `new`, makes or ends."""
-    staged = [v for v in flat((*script.prepare, *script.commit)) if isinstance(v, Stage)]
-    made = {b.name for v in staged for b in v.bricks}
+    staged = [s for s in flat((*script.prepare, *script.commit)) if isinstance(s, Stage)]
+    made = {b.name for s in staged for b in s.bricks}
     return len(made | ({b.name for b in old.bricks} - {b.name for b in new.bricks}))

@@ -13,7 +13,6 @@ from aftbed.core.errors import PeerError
 from aftbed.core.events import Event
 from aftbed.core.messages import AnyMessage, NodeDied, Pulses, Rebound, Situation, Suspect, Watch
 from aftbed.core.script import (
-    AnyVerb,
     Attach,
     Bind,
     Fence,
@@ -23,6 +22,7 @@ from aftbed.core.script import (
     Script,
     ScriptKind,
     Spawn,
+    Step,
     Suspend,
     Transfer,
     Unbind,
@@ -121,7 +121,7 @@ def failover(dead: str, backup: str, epoch: int) -> Script:
 def drop_backup(leader: str, backup: str, replication: Ports) -> Script:
     """The leader goes on alone."""
     unbinds = [Unbind(f"{leader}/{part}", port) for part, port in replication]
-    commit: tuple[AnyVerb, ...] = (Fence(backup), *unbinds, Kill(backup))
+    commit: tuple[Step, ...] = (Fence(backup), *unbinds, Kill(backup))
     return Script("drop backup", backup, (), commit, kind=ScriptKind.DROP_BACKUP)
 
 

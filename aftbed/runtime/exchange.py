@@ -150,7 +150,7 @@ class Exchange:
 
     # -- the verbs ----------------------------------------------------------------------------
 
-    def _do(self, verb: script.AnyVerb) -> Keys:
+    def _do(self, verb: script.Step) -> Keys:
         match verb:
             case script.Suspend(brick):
                 yield from self._suspend(brick, drain=False)
@@ -214,7 +214,7 @@ class Exchange:
 
     # -- channels -----------------------------------------------------------------------------
 
-    def _rewire(self, verbs: Sequence[script.AnyVerb]) -> Keys:
+    def _rewire(self, verbs: Sequence[script.Step]) -> Keys:
         """Everybody hears of all that concerns him at once. In `prepare`, only what is staged."""
         bound = any(isinstance(verb, script.Bind | script.Unbind) for verb in verbs)
         self._rewired = self._rewired or (bound and self._committing)
@@ -393,8 +393,8 @@ class Exchange:
         )
 
 
-def _wires(verb: script.AnyVerb) -> bool:
+def _wires(verb: script.Step) -> bool:
     """Whether `verb` is about channels and places."""
     if isinstance(verb, script.Together):
-        return not all(isinstance(inner, script.Resume) for inner in verb.verbs)
+        return not all(isinstance(inner, script.Resume) for inner in verb.steps)
     return isinstance(verb, script.Bind | script.Unbind | script.Exchange)

@@ -75,7 +75,7 @@ class Wires:
         self.new = new
         self._fresh = deployment.channels.fresh
         self._given: set[script.End] = set()  # ends that their bricks have
-        self._foreseen: tuple[Sequence[script.AnyVerb], Present, Told] | None = None
+        self._foreseen: tuple[Sequence[script.Step], Present, Told] | None = None
 
     def process(self, brick: str) -> Process:
         """Who hosts `brick`: what is staged under the name of a node that is new, else what serves."""
@@ -96,7 +96,7 @@ class Wires:
             raise StepFailed(f"{node} is gone")
         return process
 
-    def foresee(self, verbs: Sequence[script.AnyVerb]) -> None:
+    def foresee(self, verbs: Sequence[script.Step]) -> None:
         """Work out now what is to be told later, if nothing is bound and nobody replaced before."""
         given = set(self._given)
         told = self.told(verbs, committing=True)
@@ -105,7 +105,7 @@ class Wires:
             change.write()
         self._foreseen = verbs, self._present(), told
 
-    def told(self, verbs: Sequence[script.AnyVerb], *, committing: bool) -> Told:
+    def told(self, verbs: Sequence[script.Step], *, committing: bool) -> Told:
         """What everybody must hear. While not yet `committing`, only what is staged hears anything."""
         if self._foreseen is not None and self._foreseen[:2] == (verbs, self._present()):
             return self._foreseen[2]

@@ -103,7 +103,7 @@ class Executor:
             if deployment.lives(node):
                 deployment.order(node, control.Resume)
 
-    def _do(self, verb: script.AnyVerb) -> Keys:
+    def _do(self, verb: script.Step) -> Keys:
         match verb:
             case script.Spawn(replica):
                 yield from self._deployment.spawn(self._deployment.slots[replica])

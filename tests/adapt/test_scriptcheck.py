@@ -15,7 +15,6 @@ from aftbed.adapt.plan import plan, updated
 from aftbed.adapt.scriptcheck import refusals
 from aftbed.core.script import (
     RECIPES,
-    AnyVerb,
     Bind,
     Destroy,
     Drain,
@@ -25,6 +24,7 @@ from aftbed.core.script import (
     Retire,
     Script,
     Stage,
+    Step,
     Suspend,
     Thaw,
     Together,
@@ -45,17 +45,17 @@ DRAINED: Final = tuple(case for case in CASES if case.recipe == RECIPES[0])
 RENEWED: Final = plan(PBR, updated(PBR, "server", "x.py:Server")).script
 
 
-def prepared(script: Script, *verbs: AnyVerb) -> Script:
+def prepared(script: Script, *verbs: Step) -> Script:
     """`script` with `verbs` at the end of its preparation."""
     return msgspec.structs.replace(script, prepare=(*script.prepare, *verbs))
 
 
-def committed(script: Script, at: int, *verbs: AnyVerb) -> Script:
+def committed(script: Script, at: int, *verbs: Step) -> Script:
     """`script` with `verbs` before step `at` of its commit."""
     return msgspec.structs.replace(script, commit=(*script.commit[:at], *verbs, *script.commit[at:]))
 
 
-def finished(script: Script, *verbs: AnyVerb) -> Script:
+def finished(script: Script, *verbs: Step) -> Script:
     """`script` with `verbs` at its end."""
     return msgspec.structs.replace(script, finish=(*script.finish, *verbs))
 
@@ -171,11 +171,11 @@ def test_a_graph_that_cannot_run(bad: Script, reason: str) -> None:
     assert any(found.startswith(reason) for found in refusals(PBR, bad)), refusals(PBR, bad)
 
 
-def together_without(script: Script, at: int, verb: AnyVerb) -> Script:
+def together_without(script: Script, at: int, verb: Step) -> Script:
     """`script` without `verb`, which stands in the Together at step `at` of its commit."""
     step = script.commit[at]
-    assert isinstance(step, Together) and verb in step.verbs
-    rest = Together(tuple(v for v in step.verbs if v != verb))
+    assert isinstance(step, Together) and verb in step.steps
+    rest = Together(tuple(v for v in step.steps if v != verb))
     return msgspec.structs.replace(script, commit=(*script.commit[:at], rest, *script.commit[at + 1 :]))
 
 
@@ -248,14 +248,14 @@ def test_an_update_is_let_through(part: str, placement: str) -> None:
     assert refusals(graph, plan(graph, updated(graph, part, "x.py:X")).script) == []
 
 
-def losses(verbs: tuple[AnyVerb, ...]) -> list[tuple[AnyVerb, tuple[AnyVerb, ...]]]:
+def losses(verbs: tuple[Step, ...]) -> list[tuple[Step, tuple[Step, ...]]]:
     """Each verb, however deep, with the steps that are left without it."""
     found = []
     for at, verb in enumerate(verbs):
         found.append((verb, verbs[:at] + verbs[at + 1 :]))
         if isinstance(verb, Together):
             found += [
-                (inner, (*verbs[:at], Together(rest), *verbs[at + 1 :])) for inner, rest in losses(verb.verbs)
+                (inner, (*verbs[:at], Together(rest), *verbs[at + 1 :])) for inner, rest in losses(verb.steps)
             ]
     return found
 
@@ -264,7 +264,7 @@ def losses(verbs: tuple[AnyVerb, ...]) -> list[tuple[AnyVerb, tuple[AnyVerb, ...
 def test_of_no_plan_can_a_step_be_left_out(case: Case, phase: str, data: st.DataObject) -> None:
     """But what is said twice: a channel that is prepared and bound, the end of what was exchanged."""
     there = case.plan()
-    verbs: tuple[AnyVerb, ...] = getattr(there.script, phase)
+    verbs: tuple[Step, ...] = getattr(there.script, phase)
     if not verbs:
         return
     lost, rest = data.draw(st.sampled_from(losses(verbs)))
@@ -279,7 +279,7 @@ def test_of_no_plan_can_a_step_be_left_out(case: Case, phase: str, data: st.Data
 def test_a_beginning_that_leaves_the_proxy_bound_to_nobody_is_looked_at_as_well() -> None:
     there = Case("assert", "pbr+assert", "replica", "a", "drained").plan()
     (opened,) = there.script.commit[-1:]
-    assert isinstance(opened, Together) and Resume("b/protocol") in opened.verbs
-    without = Together(tuple(v for v in opened.verbs if v != Resume("b/protocol")))
+    assert isinstance(opened, Together) and Resume("b/protocol") in opened.steps
+    without = Together(tuple(v for v in opened.steps if v != Resume("b/protocol")))
     script = msgspec.structs.replace(there.script, commit=(*there.script.commit[:-1], without))
     assert refusals(there.old, script) != []

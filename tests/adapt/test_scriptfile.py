@@ -19,7 +19,6 @@ from aftbed.core.graph import BrickSpec
 from aftbed.core.script import (
     RECIPES,
     Align,
-    AnyVerb,
     Bind,
     Destroy,
     Drain,
@@ -31,6 +30,7 @@ from aftbed.core.script import (
     Retire,
     Script,
     Stage,
+    Step,
     Suspend,
     Thaw,
     Together,
@@ -152,12 +152,12 @@ def test_a_port_with_a_dot_in_its_name() -> None:
 
 def test_no_verb_is_missing() -> None:
     """Each verb of core.script is either in the file's grammar or Recovery's."""
-    known = {v.__name__.lower() for v in AnyVerb.__args__}  # type: ignore[attr-defined]
+    known = {v.__name__.lower() for v in Step.__args__}  # type: ignore[attr-defined]
     assert known == {*VERBS, *RECOVERY}
 
 
 @pytest.mark.parametrize("verb", [Fence("a")])
-def test_what_is_of_recovery_cannot_be_written(verb: AnyVerb) -> None:
+def test_what_is_of_recovery_cannot_be_written(verb: Step) -> None:
     with pytest.raises(AssertionError, match="no place"):
         mapping(Script("x", "", (), (verb,)))
 

@@ -5,7 +5,6 @@ import pytest
 
 from aftbed.core.script import (
     STEPS_MAX,
-    AnyVerb,
     Attach,
     Bind,
     Fence,
@@ -14,6 +13,7 @@ from aftbed.core.script import (
     Resume,
     Script,
     Spawn,
+    Step,
     Suspend,
     Transfer,
     Unbind,
@@ -21,7 +21,7 @@ from aftbed.core.script import (
 )
 
 
-def script(prepare: tuple[AnyVerb, ...] = (), commit: tuple[AnyVerb, ...] = ()) -> Script:
+def script(prepare: tuple[Step, ...] = (), commit: tuple[Step, ...] = ()) -> Script:
     return Script("test", "b", prepare, commit)
 
 

@@ -37,7 +37,7 @@ PLAIN: Final = {
 }
 
 
-FLAT_VERBS: Final = tuple(kind for kind in get_args(script.AnyVerb) if kind is not script.Together)
+FLAT_VERBS: Final = tuple(kind for kind in get_args(script.Step) if kind is not script.Together)
 
 
 @functools.cache  # to build one takes longer than to draw from it

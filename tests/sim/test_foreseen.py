@@ -26,14 +26,14 @@ def worked_out(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, bool]]:
     told, foresee = Wires.told, Wires.foresee
     foreseeing = False
 
-    def watched_told(self: Wires, verbs: Sequence[script.AnyVerb], *, committing: bool) -> Told:
+    def watched_told(self: Wires, verbs: Sequence[script.Step], *, committing: bool) -> Told:
         known = self._foreseen
         answer = told(self, verbs, committing=committing)
         who = "foresee" if foreseeing else "commit" if committing else "prepare"
         found.append((who, known is not None and answer is known[2]))
         return answer
 
-    def watched_foresee(self: Wires, verbs: Sequence[script.AnyVerb]) -> None:
+    def watched_foresee(self: Wires, verbs: Sequence[script.Step]) -> None:
         nonlocal foreseeing
         foreseeing = True
         foresee(self, verbs)

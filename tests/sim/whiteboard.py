@@ -113,7 +113,7 @@ class Whiteboard(World):
 
     def __init__(self, expression: str, payloads: list[bytes], seed: int = 0) -> None:
         self.said: list[str] = []
-        self._steps: list[script.AnyVerb] = []  # of the adaptation under way
+        self._steps: list[script.Step] = []  # of the adaptation under way
         setup = Setup(expression, seed=seed, count=len(payloads), rate_hz=1e9 / PERIOD_NS)
         super().__init__(
             setup, function=Counting, requests=payloads, channel=_speaking(self.say), clock=Steady
@@ -225,7 +225,7 @@ def words(message: Message) -> str:
     return f"{type(message).__name__}({about})"
 
 
-def spoken(verb: script.AnyVerb) -> str:
+def spoken(verb: script.Step) -> str:
     """A verb of a script."""
     match verb:
         case script.Promote(replica, epoch):
