@@ -1,31 +1,48 @@
-"""Adaptation Engine: exchanges bricks while the service runs, as a transaction (paper, III-B; design 4).
+"""Adaptation Engine: exchanges bricks while the service runs, as a transaction (paper, III-B).
 
-It plans (graph difference to script), has the runtime carry out one phase after the other, and decides
-after each. Nothing that it must remember is only here: the runtime tells a new Engine what its dead
-predecessor had ordered last, and the table below goes on from there.
+It plans (graph difference to script), orders one phase after the other from the runtime, and decides after
+each. It keeps nothing that only it knows: the runtime sends a new Engine what the dead one had ordered last,
+and the table goes on from there.
 
 | phase that ended | well                                   | not well                     |
 |------------------|----------------------------------------|------------------------------|
 | prepare          | commit                                 | undo, then `refused`         |
 | commit           | observe for `WINDOW_NS`, then finish   | undo, then `rolled back`     |
 | ... by the paper | the same                               | `failed`: it has no way back |
-| finish           | `done`                                 | `done`: it serves, said so   |
+| finish           | `done`                                 | `done`, with the reason      |
 | undo             | `refused` or `rolled back`             | the same, with both reasons  |
 
-While it observes, and until the old bricks are gone, a failure of what is new is told as the failure of its
-commit: undo. The paper's recipe kills first; there is nothing to go back to.
+While the Engine observes, and until the old bricks are gone, the runtime reports a failure of a new brick as
+the failure of the commit: undo. The paper's recipe kills first, so there is nothing to go back to.
 """
 
+from collections.abc import Mapping
 from enum import auto
-from typing import Final
+from typing import ClassVar, Final
 
 from aftbed.adapt.plan import plan, target, updated
 from aftbed.adapt.scriptcheck import refusals
-from aftbed.core.brick import CONTROL, Brick, BrickState, Effect, Note, Order, Send
-from aftbed.core.errors import ConfigError, PeerError
+from aftbed.core.brick import (
+    CONTROL,
+    DEADLINE_PASSED,
+    SAME_STATE,
+    BrickAnswer,
+    BrickState,
+    Choice,
+    DeadlinePassed,
+    Effect,
+    Handler,
+    Machine,
+    Move,
+    Moves,
+    Note,
+    Order,
+    Send,
+)
+from aftbed.core.errors import ConfigError
 from aftbed.core.events import Event
 from aftbed.core.graph import Graph
-from aftbed.core.messages import Adapt, Adapted, AnyMessage, Goal, Progress, Rebound, TakeUp
+from aftbed.core.messages import Adapt, Adapted, AnyMessage, Goal, Progress, TakeUp
 from aftbed.core.script import RECIPES, Phase, Script, after, problems
 from aftbed.ftm.registry import KINDS
 
@@ -45,12 +62,49 @@ class EngineState(BrickState):
     UNDOING = auto()
 
 
-_BY_PHASE: Final = {
-    Phase.PREPARE: EngineState.PREPARING,
-    Phase.COMMIT: EngineState.COMMITTING,
-    Phase.FINISH: EngineState.FINISHING,
-    Phase.UNDO: EngineState.UNDOING,
+class PhaseEnd(BrickAnswer):
+    """How a phase ended, as far as the next one depends on it."""
+
+    PREPARED = auto()
+    NOT_PREPARED = auto()
+    COMMITTED = auto()
+    NOT_COMMITTED = auto()
+    LOST = auto()  # not committed, by a recipe that has no way back
+    FINISHED = auto()
+    UNDONE = auto()
+    OF_ANOTHER = auto()  # of another adaptation
+
+
+class TakenUp(BrickAnswer):
+    """The phase that a dead Engine had ordered last, and that has not ended."""
+
+    PREPARE = auto()
+    COMMIT = auto()
+    FINISH = auto()
+    UNDO = auto()
+
+
+_S: Final = EngineState
+_WELL: Final = {
+    Phase.PREPARE: PhaseEnd.PREPARED,
+    Phase.COMMIT: PhaseEnd.COMMITTED,
+    Phase.FINISH: PhaseEnd.FINISHED,
+    Phase.UNDO: PhaseEnd.UNDONE,
 }
+_FAILED: Final = _WELL | {Phase.PREPARE: PhaseEnd.NOT_PREPARED, Phase.COMMIT: PhaseEnd.NOT_COMMITTED}
+_UNDER_WAY: Final = {
+    Phase.PREPARE: TakenUp.PREPARE,
+    Phase.COMMIT: TakenUp.COMMIT,
+    Phase.FINISH: TakenUp.FINISH,
+    Phase.UNDO: TakenUp.UNDO,
+}
+
+
+def end_of(phase: Phase, failure: str, script: Script) -> PhaseEnd | None:
+    """How `phase` of `script` ended; None for what is no phase of an adaptation."""
+    if failure and phase is Phase.COMMIT and script.recipe != RECIPES[0]:
+        return PhaseEnd.LOST
+    return (_FAILED if failure else _WELL).get(phase)
 
 
 def script_for(graph: Graph, goal: Goal) -> Script:
@@ -69,81 +123,122 @@ def script_for(graph: Graph, goal: Goal) -> Script:
     return script
 
 
-class AdaptationEngine(Brick):
+Ended = Progress | TakeUp  # messages that say how a phase ended
+
+
+def _after(first: Handler, moves: Mapping[object, Move]) -> dict[object, Move]:
+    """`moves` with `first` before each of their handlers: what it does is part of the same step."""
+
+    def both(then: Handler) -> Handler:
+        def handle(engine: "AdaptationEngine", msg: TakeUp) -> list[Effect]:
+            return [*first(engine, msg), *then(engine, msg)]
+
+        return handle
+
+    return {answer: (both(do), state) for answer, (do, state) in moves.items()}
+
+
+class AdaptationEngine(Machine):
     """`number` and `script` are those of the adaptation under way."""
 
+    AT_REST = (_S.IDLE,)
+
     def __init__(self) -> None:
-        self.state = EngineState.IDLE
+        super().__init__(_S.IDLE)
         self.number = 0
         self.script: Script | None = None
         self.reason = ""  # of what is being undone
         self.outcome = REFUSED
+        self._refusal = ""
         self._until_ns: int | None = None
 
-    def open_ports(self) -> tuple[str, ...]:
-        """None: only the runtime speaks to it."""
-        return ()
+    def step(self, port: str, msg: AnyMessage | DeadlinePassed, now_ns: int) -> list[Effect]:
+        """As every Machine; the observation begins with its state."""
+        effects = super().step(port, msg, now_ns)
+        if self.state is _S.OBSERVING:
+            if self._until_ns is None:
+                self._until_ns = now_ns + WINDOW_NS
+        else:
+            self._until_ns = None
+        return effects
 
-    def quiescent(self) -> bool:
-        """Nothing under way."""
-        return self.state is EngineState.IDLE
+    # -- questions ----------------------------------------------------------------------------
 
-    def step(self, port: str, msg: AnyMessage, now_ns: int) -> list[Effect]:
-        """Begin, go on, or take up what another has begun."""
-        match msg:
-            case Adapt() if self.state is EngineState.IDLE:
-                return self._begin(msg)
-            case Progress() if msg.number == self.number and self._waits_for(msg.phase):
-                return self._went(msg.phase, msg.failure, now_ns)
-            case TakeUp() if self.state is EngineState.IDLE:
-                self.number, self.script, self.state = msg.number, msg.script, _BY_PHASE[msg.phase]
-                self.outcome = REFUSED if msg.phase is Phase.PREPARE else ROLLED_BACK
-                return self._went(msg.phase, msg.failure, now_ns) if msg.ended else []
-            case Rebound():
-                return []
-            case _:
-                raise PeerError(f"{type(msg).__name__} on {port} while {self.state.name}")
-
-    def _waits_for(self, phase: Phase) -> bool:
-        if self.state in (EngineState.OBSERVING, EngineState.FINISHING) and phase is Phase.COMMIT:
-            return True  # what is new may still fail
-        return _BY_PHASE.get(phase) is self.state
-
-    def _begin(self, msg: Adapt) -> list[Effect]:
+    def can_be_planned(self, msg: Adapt) -> bool:
+        """Make the script; False, with the reason kept, if there is none."""
         try:
-            self.script = script_for(msg.graph, msg.goal)
+            self.script, self._refusal = script_for(msg.graph, msg.goal), ""
         except ConfigError as error:
-            return [Send(CONTROL, Adapted(msg.number, REFUSED, str(error)))]
+            self._refusal = str(error)
+        return not self._refusal
+
+    def phase_end(self, msg: Progress) -> PhaseEnd | None:
+        """How the phase ended."""
+        if msg.number != self.number:
+            return PhaseEnd.OF_ANOTHER
+        assert self.script is not None
+        return end_of(msg.phase, msg.failure, self.script)
+
+    def taken_up(self, msg: TakeUp) -> TakenUp | PhaseEnd | None:
+        """The phase that is under way, or how it ended."""
+        if not msg.ended:
+            return _UNDER_WAY.get(msg.phase)
+        return end_of(msg.phase, msg.failure, msg.script)
+
+    # -- handlers -----------------------------------------------------------------------------
+
+    def prepare(self, msg: Adapt) -> list[Effect]:
+        """Begin adaptation `msg.number`."""
         self.number, self.reason = msg.number, ""
         return [Note(Event.ADAPT_PLAN, detail=msg.number), *self._order(Phase.PREPARE)]
 
+    def refuse(self, msg: Adapt) -> list[Effect]:
+        """Nothing was begun."""
+        return [Send(CONTROL, Adapted(msg.number, REFUSED, self._refusal))]
+
+    def wait(self, msg: TakeUp) -> list[Effect]:
+        """Go on where another Engine ended."""
+        self.number, self.script = msg.number, msg.script
+        self.outcome = REFUSED if msg.phase is Phase.PREPARE else ROLLED_BACK
+        return []
+
+    def commit(self, msg: Ended) -> list[Effect]:
+        """All that is slow is done."""
+        return self._order(Phase.COMMIT)
+
+    def observe(self, msg: Ended) -> list[Effect]:
+        """The new graph serves; the old bricks stay for `WINDOW_NS`."""
+        self._until_ns = None
+        return [Note(Event.ADAPT_COMMIT, detail=self.number)]
+
+    def finish(self, msg: DeadlinePassed) -> list[Effect]:
+        """Nothing failed: the old bricks may go."""
+        return self._order(Phase.FINISH)
+
+    def undo(self, msg: Ended) -> list[Effect]:
+        """Go back to the graph that was there."""
+        self.reason = msg.failure
+        self.outcome = REFUSED if msg.phase is Phase.PREPARE else ROLLED_BACK
+        return [Note(Event.ADAPT_ROLLBACK, detail=self.number), *self._order(Phase.UNDO)]
+
+    def end_lost(self, msg: Ended) -> list[Effect]:
+        """Neither the old graph nor the new one."""
+        return self._end(FAILED, msg.failure)
+
+    def end_done(self, msg: Ended) -> list[Effect]:
+        """The new graph serves, even if an old brick could not be ended."""
+        return self._end(DONE, msg.failure)
+
+    def end_undone(self, msg: Ended) -> list[Effect]:
+        """With the reason of the undo, and that of its failure."""
+        return self._end(self.outcome, "; ".join(r for r in (self.reason, msg.failure) if r))
+
     def _order(self, phase: Phase) -> list[Effect]:
         assert self.script is not None
-        self.state = _BY_PHASE[phase]
         return [Order(self.script, phase, self.number)]
 
-    def _went(self, phase: Phase, failure: str, now_ns: int) -> list[Effect]:
-        """The table of the module."""
-        self._until_ns = None
-        match phase:
-            case Phase.COMMIT if failure and self.script is not None and self.script.recipe != RECIPES[0]:
-                return self._end(FAILED, failure)
-            case Phase.PREPARE | Phase.COMMIT if failure:
-                self.reason = failure
-                self.outcome = REFUSED if phase is Phase.PREPARE else ROLLED_BACK
-                return [Note(Event.ADAPT_ROLLBACK, detail=self.number), *self._order(Phase.UNDO)]
-            case Phase.PREPARE:
-                return self._order(Phase.COMMIT)
-            case Phase.COMMIT:
-                self.state, self._until_ns = EngineState.OBSERVING, now_ns + WINDOW_NS
-                return [Note(Event.ADAPT_COMMIT, detail=self.number)]
-            case Phase.FINISH:
-                return self._end(DONE, failure)
-            case _:
-                return self._end(self.outcome, "; ".join(r for r in (self.reason, failure) if r))
-
     def _end(self, outcome: str, reason: str) -> list[Effect]:
-        self.state, self.script = EngineState.IDLE, None
+        self.script = None
         return [Send(CONTROL, Adapted(self.number, outcome, reason))]
 
     def deadline_ns(self) -> int | None:
@@ -151,6 +246,41 @@ class AdaptationEngine(Brick):
         return self._until_ns
 
     def wake(self, now_ns: int) -> list[Effect]:
-        """Nothing broke: the old bricks may go."""
-        self._until_ns = None
-        return self._order(Phase.FINISH)
+        """The observation is over."""
+        return self.step(CONTROL, DEADLINE_PASSED, now_ns)
+
+    # -- the table ----------------------------------------------------------------------------
+
+    _PREPARED: ClassVar[dict[object, Move]] = {
+        PhaseEnd.PREPARED: (commit, _S.COMMITTING),
+        PhaseEnd.NOT_PREPARED: (undo, _S.UNDOING),
+    }
+    _COMMITTED: ClassVar[dict[object, Move]] = {
+        PhaseEnd.COMMITTED: (observe, _S.OBSERVING),
+        PhaseEnd.NOT_COMMITTED: (undo, _S.UNDOING),
+        PhaseEnd.LOST: (end_lost, _S.IDLE),
+    }
+    _FINISHED: ClassVar[dict[object, Move]] = {PhaseEnd.FINISHED: (end_done, _S.IDLE)}
+    _UNDONE: ClassVar[dict[object, Move]] = {PhaseEnd.UNDONE: (end_undone, _S.IDLE)}
+    MOVES: ClassVar[Moves] = {
+        (_S.IDLE, CONTROL, Adapt): Choice(
+            can_be_planned, {True: (prepare, _S.PREPARING), False: (refuse, SAME_STATE)}
+        ),
+        (_S.IDLE, CONTROL, TakeUp): Choice(
+            taken_up,
+            {
+                TakenUp.PREPARE: (wait, _S.PREPARING),
+                TakenUp.COMMIT: (wait, _S.COMMITTING),
+                TakenUp.FINISH: (wait, _S.FINISHING),
+                TakenUp.UNDO: (wait, _S.UNDOING),
+                **_after(wait, _PREPARED | _COMMITTED | _FINISHED | _UNDONE),
+            },
+        ),
+        (_S.PREPARING, CONTROL, Progress): Choice(phase_end, _PREPARED),
+        (_S.COMMITTING, CONTROL, Progress): Choice(phase_end, _COMMITTED),
+        (_S.OBSERVING, CONTROL, DeadlinePassed): (finish, _S.FINISHING),
+        # What is new may still fail: the runtime reports it as the failure of its commit.
+        (_S.OBSERVING, CONTROL, Progress): Choice(phase_end, _COMMITTED),
+        (_S.FINISHING, CONTROL, Progress): Choice(phase_end, _FINISHED | _COMMITTED),
+        (_S.UNDOING, CONTROL, Progress): Choice(phase_end, _UNDONE),
+    }

@@ -1,91 +1,88 @@
-"""Protocol: at most once. It admits one request at a time and remembers the replies it gave.
+"""What every mechanism has: the Protocol of a replica, a Before that passes on, a Proceed that computes once,
+and the Protocol of a mechanism inside another one.
 
-Paper, III-A: the entry of a replica. A request is a duplicate from its admission, not only from its
-stored reply: what is admitted closes the port, so a resent one waits in its channel and then finds
-the reply in the log. On the backup's side the log is filled by checkpoints; TakeOver, which comes in
-the same channel behind the last of them, makes it the leader.
+Paper, III-A: a request meets Protocol, Before, Proceed, Server and After, and its reply leaves by the
+Protocol. A mechanism brings its own Before, Proceed and After where it does something there.
 """
 
 from enum import auto
-from typing import Final
+from typing import ClassVar, Final
 
 import msgspec
 
-from aftbed.core.brick import CONTROL, NO_REQUEST, Brick, BrickState, Effect, Note, Send, no_move
+from aftbed.core.brick import (
+    CONTROL,
+    NO_REQUEST,
+    SAME_STATE,
+    BrickAnswer,
+    BrickState,
+    Choice,
+    Effect,
+    Machine,
+    Moves,
+    Note,
+    Send,
+)
 from aftbed.core.errors import PeerError
 from aftbed.core.events import Event
-from aftbed.core.messages import AnyMessage, Promoted, Rebound, Reply, Request, StoreReply, TakeOver
+from aftbed.core.messages import Promoted, Reply, Request, StoreReply, TakeOver
 
 REPLIES_KEPT: Final = 256  # at least the client's backlog: what can be asked again can be answered again
 
+# Bound once: a look-up in an enumeration is slow on the hot path.
+_RECEIVED: Final = Event.REQUEST_RECEIVED
+_STORED: Final = Event.REPLY_STORED
+_SENT: Final = Event.REPLY_SENT
+_BEFORE_EXIT: Final = Event.BEFORE_EXIT
+_PROCEED_ENTER: Final = Event.PROCEED_ENTER
+
 
 class ProtocolState(BrickState):
-    BACKUP = auto()  # the log is filled by checkpoints; requests wait in their channel
+    BACKUP = auto()  # the log is filled by the leader; requests wait in their channel
     IDLE = auto()  # leading, no request inside
     BUSY = auto()  # leading, one request admitted
 
 
-PROTOCOL_MOVES: Final = {
-    (ProtocolState.BACKUP, StoreReply): ProtocolState.BACKUP,
-    (ProtocolState.BACKUP, TakeOver): ProtocolState.IDLE,
-    (ProtocolState.IDLE, Request): ProtocolState.BUSY,
-    (ProtocolState.BUSY, Reply): ProtocolState.IDLE,
-}
-PROTOCOL_OPEN: Final = {
-    ProtocolState.BACKUP: ("aft2pro",),
-    ProtocolState.IDLE: ("pxy2pro",),
-    ProtocolState.BUSY: ("aft2pro",),
-}
-
-# Bound once: a look-up in an enumeration is slow on the hot path.
-_IDLE: Final = ProtocolState.IDLE
-_BUSY: Final = ProtocolState.BUSY
-_RECEIVED: Final = Event.REQUEST_RECEIVED
-_STORED: Final = Event.REPLY_STORED
-_SENT: Final = Event.REPLY_SENT
+class RequestAge(BrickAnswer):
+    NEW = auto()  # above all ids in the log
+    OLD = auto()  # at most the newest id in the log
 
 
-class Protocol(Brick):
-    """`log` maps the ids of the last requests to their replies; `last_id` is the newest of them."""
+_NEW, _OLD = RequestAge.NEW, RequestAge.OLD
+
+
+class Protocol(Machine):
+    """At most once: admits one request at a time and remembers the replies that it gave.
+
+    The entry of a replica. A request is a duplicate from its admission on, not only from its stored reply: an
+    admitted request closes the port, so a repeated one waits in its channel and then finds its reply in the
+    log. A backup's log is filled by its After. TakeOver comes in the same channel behind the last of them and
+    makes this replica the leader.
+
+    `log` maps the ids of the last requests to their replies; `last_id` is the newest of them.
+    """
+
+    AT_REST = (ProtocolState.BACKUP, ProtocolState.IDLE)
 
     def __init__(self, replica: int, epoch: int, leads: bool) -> None:
-        self.state = ProtocolState.IDLE if leads else ProtocolState.BACKUP
+        super().__init__(ProtocolState.IDLE if leads else ProtocolState.BACKUP)
         self.replica, self.epoch = replica, epoch
         self.last_id, self.busy_id = 0, 0
         self.log: dict[int, bytes] = {}
 
-    def open_ports(self) -> tuple[str, ...]:
-        """One request at a time."""
-        return PROTOCOL_OPEN[self.state]
-
-    def quiescent(self) -> bool:
-        """No request admitted."""
-        return self.state is not ProtocolState.BUSY
-
-    def step(self, port: str, msg: AnyMessage, now_ns: int) -> list[Effect]:
-        """Admit, answer out of the log, store, or take over."""
-        state = PROTOCOL_MOVES.get((self.state, type(msg)))
-        if state is None:
-            return no_move(self.state, port, msg)
-        if isinstance(msg, Request):
-            return self._admit(msg)
-        if isinstance(msg, Reply):
-            return self._answer(msg)
-        if isinstance(msg, StoreReply):
-            self._store(msg.request_id, msg.payload)
-            return []
-        assert isinstance(msg, TakeOver)
-        if msg.epoch <= self.epoch:
-            raise PeerError(f"take over under epoch {msg.epoch} after {self.epoch}")
-        self.state, self.epoch = state, msg.epoch
-        return [Note(Event.REPLICA_PROMOTED, detail=msg.epoch), Send(CONTROL, Promoted(msg.epoch))]
-
-    def _admit(self, msg: Request) -> list[Effect]:
+    def age(self, msg: Request) -> RequestAge:
+        """Raises PeerError if the request was sent under another epoch."""
         if msg.epoch != self.epoch:
             raise PeerError(f"request {msg.request_id} under epoch {msg.epoch}, expected {self.epoch}")
-        if msg.request_id > self.last_id:
-            self.state, self.busy_id = _BUSY, msg.request_id
-            return [Note(_RECEIVED, msg.request_id), Send("pro2bfr", msg)]
+        return _NEW if msg.request_id > self.last_id else _OLD
+
+    def admit(self, msg: Request) -> list[Effect]:
+        """Let the request in; the port of requests closes."""
+        self.busy_id = msg.request_id
+        return [Note(_RECEIVED, msg.request_id), Send("pro2bfr", msg)]
+
+    def answer_again(self, msg: Request) -> list[Effect]:
+        """Answer out of the log: nothing is executed."""
         stored = self.log.get(msg.request_id)
         if stored is None:
             raise PeerError(f"request {msg.request_id} is older than the {REPLIES_KEPT} replies kept")
@@ -94,12 +91,24 @@ class Protocol(Brick):
             Send("pro2pxy", Reply(self.epoch, msg.request_id, self.replica, stored)),
         ]
 
-    def _answer(self, msg: Reply) -> list[Effect]:
+    def answer(self, msg: Reply) -> list[Effect]:
+        """Store the reply, then send it."""
         if msg.request_id != self.busy_id:
             raise PeerError(f"reply to request {msg.request_id}, expected {self.busy_id}")
         self._store(msg.request_id, msg.payload)
-        self.state = _IDLE
         return [Note(_STORED, msg.request_id), Send("pro2pxy", msg), Note(_SENT, msg.request_id)]
+
+    def store(self, msg: StoreReply) -> list[Effect]:
+        """A backup's After has a reply that the leader gave, or will give."""
+        self._store(msg.request_id, msg.payload)
+        return []
+
+    def take_over(self, msg: TakeOver) -> list[Effect]:
+        """Lead from here on: all that the old leader may have answered is in the log."""
+        if msg.epoch <= self.epoch:
+            raise PeerError(f"take over under epoch {msg.epoch} after {self.epoch}")
+        self.epoch = msg.epoch
+        return [Note(Event.REPLICA_PROMOTED, detail=msg.epoch), Send(CONTROL, Promoted(msg.epoch))]
 
     def _store(self, request_id: int, payload: bytes) -> None:
         assert request_id > self.last_id, f"reply {request_id} stored after {self.last_id}"
@@ -123,37 +132,44 @@ class Protocol(Brick):
             raise PeerError(f"a reply log of {len(items)} replies, or out of order")
         self.last_id, self.log = last_id, dict(items)
 
-
-# -- Before brick of PBR: passes the request on (paper, III-A: PBR does nothing before the computation).
-
-
-_OPEN: Final = ("pro2bfr",)
-_EXIT: Final = Event.BEFORE_EXIT  # bound once: a look-up in an enumeration is slow on the hot path
-
-
-class PassBefore(Brick):
-    """Stateless."""
-
-    def open_ports(self) -> tuple[str, ...]:
-        """Always ready for a request."""
-        return _OPEN
-
-    def quiescent(self) -> bool:
-        """Never holds one."""
-        return True
-
-    def step(self, port: str, msg: AnyMessage, now_ns: int) -> list[Effect]:
-        """Pass on a request, or that all behind it is led from here."""
-        if isinstance(msg, Request):
-            return [Note(_EXIT, msg.request_id), Send("bfr2prd", msg)]
-        if isinstance(msg, TakeOver):
-            return [Send("bfr2prd", msg)]
-        if isinstance(msg, Rebound):
-            return []
-        raise PeerError(f"{type(msg).__name__} on {port}")
+    MOVES: ClassVar[Moves] = {
+        (ProtocolState.BACKUP, "aft2pro", StoreReply): (store, SAME_STATE),
+        (ProtocolState.BACKUP, "aft2pro", TakeOver): (take_over, ProtocolState.IDLE),
+        (ProtocolState.IDLE, "pxy2pro", Request): Choice(
+            age,
+            {
+                RequestAge.NEW: (admit, ProtocolState.BUSY),
+                RequestAge.OLD: (answer_again, SAME_STATE),
+            },
+        ),
+        (ProtocolState.BUSY, "aft2pro", Reply): (answer, ProtocolState.IDLE),
+    }
 
 
-# -- Proceed brick: has the Server compute, and hands the result to After (paper, III-A).
+class PassState(BrickState):
+    READY = auto()  # never holds a request
+
+
+class PassBefore(Machine):
+    """Before of a mechanism that does nothing ahead of the computation: passes requests on."""
+
+    AT_REST = (PassState.READY,)
+
+    def __init__(self) -> None:
+        super().__init__(PassState.READY)
+
+    def pass_on(self, msg: Request) -> list[Effect]:
+        """The very request."""
+        return [Note(_BEFORE_EXIT, msg.request_id), Send("bfr2prd", msg)]
+
+    def pass_take_over(self, msg: TakeOver) -> list[Effect]:
+        """TakeOver goes the way of a request, behind those before it."""
+        return [Send("bfr2prd", msg)]
+
+    MOVES: ClassVar[Moves] = {
+        (PassState.READY, "pro2bfr", Request): (pass_on, SAME_STATE),
+        (PassState.READY, "pro2bfr", TakeOver): (pass_take_over, SAME_STATE),
+    }
 
 
 class ComputeState(BrickState):
@@ -161,50 +177,27 @@ class ComputeState(BrickState):
     COMPUTING = auto()  # the Server has it
 
 
-COMPUTE_MOVES: Final = {
-    (ComputeState.IDLE, Request): ComputeState.COMPUTING,
-    (ComputeState.IDLE, TakeOver): ComputeState.IDLE,
-    (ComputeState.COMPUTING, Reply): ComputeState.IDLE,
-}
-_ENTER: Final = Event.PROCEED_ENTER  # bound once: a look-up in an enumeration is slow on the hot path
-COMPUTE_OPEN: Final = {ComputeState.IDLE: ("bfr2prd",), ComputeState.COMPUTING: ("srv2prd",)}
+class Compute(Machine):
+    """Proceed that has the Server compute once, and hands the result to After (paper, III-A)."""
 
-
-class Compute(Brick):
-    """One computation per request."""
+    AT_REST = (ComputeState.IDLE,)
 
     def __init__(self) -> None:
-        self.state = ComputeState.IDLE
+        super().__init__(ComputeState.IDLE)
 
-    def open_ports(self) -> tuple[str, ...]:
-        """A request, then its result."""
-        return COMPUTE_OPEN[self.state]
+    def compute(self, msg: Request) -> list[Effect]:
+        """Have the Server execute the request."""
+        return [Note(_PROCEED_ENTER, msg.request_id), Send("prd2srv", msg)]
 
-    def quiescent(self) -> bool:
-        """Nothing being computed."""
-        return self.state is ComputeState.IDLE
-
-    def step(self, port: str, msg: AnyMessage, now_ns: int) -> list[Effect]:
-        """Have it computed, or hand on the result; a TakeOver goes behind the results of all before it."""
-        state = COMPUTE_MOVES.get((self.state, type(msg)))
-        if state is None:
-            return no_move(self.state, port, msg)
-        self.state = state
-        if isinstance(msg, Request):
-            return [Note(_ENTER, msg.request_id), Send("prd2srv", msg)]
-        assert isinstance(msg, Reply | TakeOver)
+    def hand_on(self, msg: Reply | TakeOver) -> list[Effect]:
+        """A result; or a TakeOver, behind the results of all requests before it."""
         return [Send("prd2aft", msg)]
 
-
-# -- Protocol of an inner mechanism: the entry and the exit of what stands in the place of an outer Proceed.
-#
-# Paper, III-B: to compose, the inner mechanism's Protocol-Before-Proceed-After takes the place of the outer
-# one's Proceed. To its neighbours this Protocol is that Proceed: a request in, its reply out. So it keeps no
-# log, since the outermost Protocol has one, and no epoch, since a failover changes that.
-#
-# It admits one request at a time, also where the outer Before hands on several (a follower's does): inside,
-# capture and execution belong together. A TakeOver comes behind all requests and has to come out behind all
-# their replies; so it is admitted like a request, and while it is inside, nothing else is.
+    MOVES: ClassVar[Moves] = {
+        (ComputeState.IDLE, "bfr2prd", Request): (compute, ComputeState.COMPUTING),
+        (ComputeState.IDLE, "bfr2prd", TakeOver): (hand_on, SAME_STATE),
+        (ComputeState.COMPUTING, "srv2prd", Reply): (hand_on, ComputeState.IDLE),
+    }
 
 
 class InnerState(BrickState):
@@ -213,52 +206,51 @@ class InnerState(BrickState):
     HANDING_ON = auto()  # a TakeOver inside
 
 
-INNER_MOVES: Final = {
-    (InnerState.IDLE, Request): InnerState.BUSY,
-    (InnerState.IDLE, TakeOver): InnerState.HANDING_ON,
-    (InnerState.BUSY, Reply): InnerState.IDLE,
-    (InnerState.HANDING_ON, TakeOver): InnerState.IDLE,
-}
-INNER_OPEN: Final = {
-    InnerState.IDLE: ("pxy2pro",),
-    InnerState.BUSY: ("aft2pro",),
-    InnerState.HANDING_ON: ("aft2pro",),
-}
+class InnerProtocol(Machine):
+    """Protocol of an inner mechanism: entry and exit of what stands in the place of an outer Proceed.
 
+    Paper, III-B: to compose, the inner mechanism's Protocol-Before-Proceed-After takes the place of the outer
+    one's Proceed. To its neighbours this Protocol is that Proceed: a request in, its reply out. So it keeps
+    no log, since the outermost Protocol has one, and no epoch, since a failover changes that.
 
-class InnerProtocol(Brick):
-    """`busy_id` is the request inside, `epoch` the TakeOver's."""
+    It admits one request at a time, also where the outer Before hands on several (a follower's does): inside,
+    capture and execution belong together. A TakeOver comes behind all requests and has to leave behind all
+    their replies. So it is admitted like a request, and while it is inside, nothing else is.
+
+    `busy_id` is the request inside, `epoch` that of the TakeOver inside.
+    """
+
+    AT_REST = (InnerState.IDLE,)
 
     def __init__(self) -> None:
-        self.state = InnerState.IDLE
+        super().__init__(InnerState.IDLE)
         self.busy_id, self.epoch = NO_REQUEST, 0
 
-    def open_ports(self) -> tuple[str, ...]:
-        """One in, then the same out."""
-        return INNER_OPEN[self.state]
+    def admit(self, msg: Request) -> list[Effect]:
+        """Let the request in; the port closes."""
+        self.busy_id = msg.request_id
+        return [Send("pro2bfr", msg)]
 
-    def quiescent(self) -> bool:
-        """Nothing inside."""
-        return self.state is InnerState.IDLE
+    def release(self, msg: Reply) -> list[Effect]:
+        """Its reply leaves."""
+        if msg.request_id != self.busy_id:
+            raise PeerError(f"reply to request {msg.request_id}, expected {self.busy_id}")
+        return [Send("pro2pxy", msg)]
 
-    def step(self, port: str, msg: AnyMessage, now_ns: int) -> list[Effect]:
-        """Let one in, or let out what came of it."""
-        state = INNER_MOVES.get((self.state, type(msg)))
-        if state is None:
-            return no_move(self.state, port, msg)
-        if isinstance(msg, Request):
-            self.state, self.busy_id = state, msg.request_id
-            return [Send("pro2bfr", msg)]
-        if isinstance(msg, Reply):
-            if msg.request_id != self.busy_id:
-                raise PeerError(f"reply to request {msg.request_id}, expected {self.busy_id}")
-            self.state = state
-            return [Send("pro2pxy", msg)]
-        assert isinstance(msg, TakeOver)
-        if state is InnerState.HANDING_ON:
-            self.state, self.epoch = state, msg.epoch
-            return [Send("pro2bfr", msg)]
+    def admit_take_over(self, msg: TakeOver) -> list[Effect]:
+        """Let the TakeOver in; the port closes."""
+        self.epoch = msg.epoch
+        return [Send("pro2bfr", msg)]
+
+    def release_take_over(self, msg: TakeOver) -> list[Effect]:
+        """It leaves behind all replies."""
         if msg.epoch != self.epoch:
             raise PeerError(f"take over under epoch {msg.epoch}, expected {self.epoch}")
-        self.state = state
         return [Send("pro2pxy", msg)]
+
+    MOVES: ClassVar[Moves] = {
+        (InnerState.IDLE, "pxy2pro", Request): (admit, InnerState.BUSY),
+        (InnerState.IDLE, "pxy2pro", TakeOver): (admit_take_over, InnerState.HANDING_ON),
+        (InnerState.BUSY, "aft2pro", Reply): (release, InnerState.IDLE),
+        (InnerState.HANDING_ON, "aft2pro", TakeOver): (release_take_over, InnerState.IDLE),
+    }

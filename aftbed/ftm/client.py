@@ -9,11 +9,23 @@ request.
 """
 
 from enum import auto
-from typing import Final
+from typing import ClassVar, Final
 
 import msgspec
 
-from aftbed.core.brick import CONTROL, Brick, BrickState, Effect, Note, Send
+from aftbed.core.brick import (
+    CONTROL,
+    SAME_STATE,
+    Brick,
+    BrickAnswer,
+    BrickState,
+    Choice,
+    Effect,
+    Machine,
+    Moves,
+    Note,
+    Send,
+)
 from aftbed.core.errors import PeerError
 from aftbed.core.events import Event
 from aftbed.core.messages import AnyMessage, HoldAt, Rebound, Release, Reply, Request, RequestHeld, Submit
@@ -90,82 +102,136 @@ class Client(Brick):
         self.next_id, self.unanswered = next_id, {r.request_id: r for r in waiting}
 
 
-# -- Proxy: the client's only way in; it knows who leads, and asks the new leader what is unanswered.
-#
-# Paper, III-A. One request at a time is under way; the others wait in the client's channel, which costs
-# nothing, since a Protocol admits one at a time too. One master (G6) is enforced here: a reply under
-# another epoch than the one to which the Proxy is bound is refused, whoever sent it.
-
-
 class ProxyState(BrickState):
-    UNBOUND = auto()  # nobody leads: requests wait in their channel
+    UNBOUND = auto()  # no replica leads: requests wait in their channel
+    UNBOUND_WAITING = auto()  # no replica leads; the request under way goes to the next leader
     IDLE = auto()  # bound, nothing under way
     WAITING = auto()  # a request is under way
 
 
-PROXY_OPEN: Final[dict[ProxyState, tuple[str, ...]]] = {
-    ProxyState.UNBOUND: (),
-    ProxyState.IDLE: ("clt2pxy",),
-    ProxyState.WAITING: ("pro2pxy",),
-}
+class ReplyIs(BrickAnswer):
+    WANTED = auto()  # to the request under way, under the epoch of the leader
+    OF_OTHER_EPOCH = auto()
+    REPEATED = auto()  # to a request that was asked twice and answered before
+
+
+class LeaderIs(BrickAnswer):
+    BOUND = auto()
+    UNBOUND = auto()
+    UNCHANGED = auto()  # it is another port that was bound
+
+
+_S: Final = ProxyState
 
 # Bound once: a look-up in an enumeration is slow on the hot path.
-_IDLE: Final = ProxyState.IDLE
-_ASKING: Final = ProxyState.WAITING
+_WANTED: Final = ReplyIs.WANTED
 _ACCEPTED: Final = Event.REPLY_ACCEPTED
 
 
-class Proxy(Brick):
-    """`waiting` is the request under way; it survives a change of leader, under the new epoch."""
+class Proxy(Machine):
+    """The client's only way in: it knows which replica leads, and asks a new leader what is unanswered.
+
+    Paper, III-A. One request at a time is under way; the others wait in the client's channel, which costs
+    nothing, since a Protocol admits one at a time too. One master (G6) is enforced here: a reply under an
+    epoch other than that to which the Proxy is bound is refused.
+
+    `waiting` is the request under way; it survives a change of leader, under the new epoch.
+    """
+
+    AT_REST = (_S.UNBOUND, _S.IDLE)
 
     def __init__(self) -> None:
-        self.state = ProxyState.UNBOUND
+        super().__init__(_S.UNBOUND)
         self.epoch = 0
         self.waiting: Request | None = None
 
-    def open_ports(self) -> tuple[str, ...]:
-        """By state; see OPEN."""
-        return PROXY_OPEN[self.state]
+    def pass_on(self, msg: Request) -> list[Effect]:
+        """Under the epoch of the leader."""
+        self.waiting = request = Request(self.epoch, msg.request_id, msg.payload)
+        return [Send("pxy2pro", request)]
 
-    def quiescent(self) -> bool:
-        """Nothing under way."""
-        return self.waiting is None
+    def which_reply(self, msg: Reply) -> ReplyIs:
+        """Whether it is the one that is waited for."""
+        waiting = self.waiting
+        assert waiting is not None
+        if msg.epoch != self.epoch:
+            return ReplyIs.OF_OTHER_EPOCH
+        return _WANTED if msg.request_id == waiting.request_id else ReplyIs.REPEATED
 
-    def step(self, port: str, msg: AnyMessage, now_ns: int) -> list[Effect]:
-        """Pass a request on, a reply back, or go over to a new leader."""
-        if isinstance(msg, Request) and self.state is _IDLE:
-            self.state, self.waiting = _ASKING, Request(self.epoch, msg.request_id, msg.payload)
-            return [Send("pxy2pro", self.waiting)]
-        if isinstance(msg, Reply) and self.state is _ASKING:
-            return self._reply(msg)
-        if isinstance(msg, Rebound):
-            return self._rebound(msg)
-        raise PeerError(f"{type(msg).__name__} on {port} while {self.state.name}")
-
-    def _reply(self, reply: Reply) -> list[Effect]:
-        assert self.waiting is not None
-        if reply.epoch != self.epoch:
-            return [Note(Event.REPLY_REFUSED, reply.request_id, reply.epoch)]
-        if reply.request_id != self.waiting.request_id:
-            return []  # asked twice, over a failover or by a resending client: answered once
-        self.state, self.waiting = _IDLE, None
+    def accept(self, msg: Reply) -> list[Effect]:
+        """The one answer that the client gets."""
+        self.waiting = None
         return [
-            Note(_ACCEPTED, reply.request_id, reply.epoch << 8 | reply.replica),
-            Send("pxy2clt", reply),
+            Note(_ACCEPTED, msg.request_id, msg.epoch << 8 | msg.replica),
+            Send("pxy2clt", msg),
         ]
 
-    def _rebound(self, msg: Rebound) -> list[Effect]:
+    def refuse(self, msg: Reply) -> list[Effect]:
+        """Of a replica that does not lead, or no longer."""
+        return [Note(Event.REPLY_REFUSED, msg.request_id, msg.epoch)]
+
+    def drop(self, msg: Reply) -> list[Effect]:
+        """Asked twice, over a failover or by a client that asks again: answered once."""
+        return []
+
+    def which_binding(self, msg: Rebound) -> LeaderIs:
+        """Whether `pxy2pro` leads to a replica now. Raises PeerError if that leads under an older epoch."""
         if msg.port != "pxy2pro":
-            return []
+            return LeaderIs.UNCHANGED
         if not msg.bound:
-            self.state, self.epoch = ProxyState.UNBOUND, 0
-            return []
+            return LeaderIs.UNBOUND
         if msg.epoch < self.epoch:
             raise PeerError(f"bound under epoch {msg.epoch} after {self.epoch}")
+        return LeaderIs.BOUND
+
+    def bind(self, msg: Rebound) -> list[Effect]:
+        """Requests go to this leader."""
         self.epoch = msg.epoch
-        if self.waiting is None:
-            self.state = ProxyState.IDLE
-            return []
-        self.state = ProxyState.WAITING
-        self.waiting = Request(msg.epoch, self.waiting.request_id, self.waiting.payload)
-        return [Send("pxy2pro", self.waiting)]
+        return []
+
+    def bind_then_ask_again(self, msg: Rebound) -> list[Effect]:
+        """The request under way goes to this leader."""
+        assert self.waiting is not None
+        self.epoch = msg.epoch
+        return self.pass_on(self.waiting)
+
+    def unbind(self, msg: Rebound) -> list[Effect]:
+        """No replica leads: a later one may have any epoch."""
+        self.epoch = 0
+        return []
+
+    def ignore(self, msg: Rebound) -> list[Effect]:
+        """The way to the client is nothing to it."""
+        return []
+
+    _REBOUND_AT_REST: ClassVar[Choice] = Choice(
+        which_binding,
+        {
+            LeaderIs.BOUND: (bind, _S.IDLE),
+            LeaderIs.UNBOUND: (unbind, _S.UNBOUND),
+            LeaderIs.UNCHANGED: (ignore, SAME_STATE),
+        },
+    )
+    _REBOUND_UNDER_WAY: ClassVar[Choice] = Choice(
+        which_binding,
+        {
+            LeaderIs.BOUND: (bind_then_ask_again, _S.WAITING),
+            LeaderIs.UNBOUND: (unbind, _S.UNBOUND_WAITING),
+            LeaderIs.UNCHANGED: (ignore, SAME_STATE),
+        },
+    )
+    MOVES: ClassVar[Moves] = {
+        (_S.UNBOUND, CONTROL, Rebound): _REBOUND_AT_REST,
+        (_S.UNBOUND_WAITING, CONTROL, Rebound): _REBOUND_UNDER_WAY,
+        (_S.IDLE, "clt2pxy", Request): (pass_on, _S.WAITING),
+        (_S.IDLE, CONTROL, Rebound): _REBOUND_AT_REST,
+        (_S.WAITING, "pro2pxy", Reply): Choice(
+            which_reply,
+            {
+                ReplyIs.WANTED: (accept, _S.IDLE),
+                ReplyIs.OF_OTHER_EPOCH: (refuse, SAME_STATE),
+                ReplyIs.REPEATED: (drop, SAME_STATE),
+            },
+        ),
+        (_S.WAITING, CONTROL, Rebound): _REBOUND_UNDER_WAY,
+    }

@@ -1,32 +1,31 @@
-"""Before and After of LFR: leader and follower both execute; only the leader answers.
+"""LFR, leader-follower replication: both replicas execute, only the leader answers.
 
-Paper, III-A: the leader's Before forwards the request to the follower, and its After notifies the
-follower of the reply, before the client has it. No state travels, so the function must be deterministic: the
-notification carries a digest of the leader's reply, and a follower whose own differs says so. It goes on
-with its own, since nobody can tell here which one is right.
+Paper, III-A: the leader's Before forwards the request to the follower, and its After notifies the follower of
+the reply before the client has it. No state travels, so the function must be deterministic: the notification
+carries a digest of the leader's reply, and a follower whose own reply differs records it. It goes on with its
+own, since nothing shows which of the two is right.
 
 | | leader | follower |
 |-|--------|----------|
-| Before | forwards, then passes on | takes what is forwarded, each in its turn |
-| After | notifies, then replies | holds its own reply until it hears that the client has one |
+| Before | forwards, then passes on | takes what is forwarded, one request after the other |
+| After | notifies, then replies | holds its own reply until it is notified of the leader's |
 
-What was forwarded is executed by whoever lives, and what was not forwarded was not executed: so a leader
-that dies anywhere leaves no effect that its follower lacks. Promoted, a follower works off what was
-forwarded, to the end of the channel. TakeOver goes behind that, through the whole chain; so by the time its
-Protocol leads, the reply to every request that its leader may have answered is in the log.
+What was forwarded is executed by the replica that survives, and what was not forwarded was not executed. So a
+leader that dies leaves no effect that its follower lacks. When a follower is promoted, it works off what was
+forwarded, to the end of the channel. TakeOver goes behind that, through the whole chain. By the time the
+follower's Protocol leads, the reply to every request that its leader may have answered is in the log.
 
 Limit: while a follower is being replaced (by state transfer), the leader serves alone.
 """
 
 from enum import auto
 from hashlib import blake2b
-from typing import Final
+from typing import ClassVar, Final
 
-from aftbed.core.brick import Brick, BrickState, Effect, Note, Send
+from aftbed.core.brick import ANY_STATE, CONTROL, SAME_STATE, BrickState, Effect, Machine, Moves, Note, Send
 from aftbed.core.errors import PeerError
 from aftbed.core.events import Event
 from aftbed.core.messages import (
-    AnyMessage,
     ChannelEnded,
     Notification,
     Promote,
@@ -39,6 +38,11 @@ from aftbed.core.messages import (
 
 DIGEST_BYTES: Final = 16
 
+# Bound once: a look-up in an enumeration is slow on the hot path.
+_FORWARDED: Final = Event.FOLLOWER_FORWARDED
+_NOTIFIED: Final = Event.FOLLOWER_NOTIFIED
+_EXIT: Final = Event.BEFORE_EXIT
+
 
 def digest(payload: bytes) -> bytes:
     """What a follower compares its own reply with: BLAKE2b of `payload`, `DIGEST_BYTES` long."""
@@ -48,152 +52,121 @@ def digest(payload: bytes) -> bytes:
 class LfrBeforeState(BrickState):
     LEADING = auto()  # requests come from the Protocol
     FOLLOWING = auto()  # requests come from the leader's Before
+    ENDED = auto()  # following, channel drained to its end: leads as soon as it is promoted
+    PROMOTED = auto()  # following, leads as soon as its channel is drained
 
 
-class LfrAfterState(BrickState):
-    LEADING = auto()  # no reply is ever held
-    FOLLOWING = auto()  # no reply held
-    HOLDING = auto()  # an own reply held, until the leader's is known
+_B: Final = LfrBeforeState
 
 
-BEFORE_MOVES: Final = {
-    (LfrBeforeState.LEADING, Request): LfrBeforeState.LEADING,
-    (LfrBeforeState.FOLLOWING, Request): LfrBeforeState.FOLLOWING,
-    (LfrBeforeState.FOLLOWING, ChannelEnded): LfrBeforeState.FOLLOWING,
-}
-BEFORE_OPEN: Final = {LfrBeforeState.LEADING: ("pro2bfr",), LfrBeforeState.FOLLOWING: ("bfr2bfr",)}
-AFTER_MOVES: Final = {
-    (LfrAfterState.LEADING, Reply): LfrAfterState.LEADING,
-    (LfrAfterState.FOLLOWING, Reply): LfrAfterState.HOLDING,  # or stored at once, where the leader is gone
-    (LfrAfterState.FOLLOWING, TakeOver): LfrAfterState.LEADING,
-    (LfrAfterState.HOLDING, Notification): LfrAfterState.FOLLOWING,
-    (LfrAfterState.HOLDING, ChannelEnded): LfrAfterState.FOLLOWING,
-}
-AFTER_OPEN: Final = {
-    LfrAfterState.LEADING: ("prd2aft",),
-    LfrAfterState.FOLLOWING: ("prd2aft",),
-    LfrAfterState.HOLDING: ("aft2aft",),
-}
+class LfrBefore(Machine):
+    """Never holds a request. `duplex`: there is a follower to forward to."""
 
-# Bound once: a look-up in an enumeration is slow on the hot path.
-_BEFORE_LEADS: Final = LfrBeforeState.LEADING
-_AFTER_LEADS: Final = LfrAfterState.LEADING
-_FOLLOWING: Final = LfrAfterState.FOLLOWING
-_HOLDING: Final = LfrAfterState.HOLDING
-_FORWARDED: Final = Event.FOLLOWER_FORWARDED
-_NOTIFIED: Final = Event.FOLLOWER_NOTIFIED
-_EXIT: Final = Event.BEFORE_EXIT
-
-
-class LfrBefore(Brick):
-    """`duplex`: there is a follower to forward to."""
+    AT_REST = tuple(LfrBeforeState)
 
     def __init__(self, epoch: int, leads: bool) -> None:
-        self.state = LfrBeforeState.LEADING if leads else LfrBeforeState.FOLLOWING
+        super().__init__(_B.LEADING if leads else _B.FOLLOWING)
         self.epoch, self.duplex = epoch, False
-        self.promote_epoch = 0  # not 0: lead under it as soon as the channel has ended
-        self.ended = False
+        self.promote_epoch = 0  # the epoch to lead under, once promoted
 
-    def open_ports(self) -> tuple[str, ...]:
-        """By state; see BEFORE_OPEN."""
-        return BEFORE_OPEN[self.state]
-
-    def quiescent(self) -> bool:
-        """It never holds a request."""
-        return True
-
-    def step(self, port: str, msg: AnyMessage, now_ns: int) -> list[Effect]:
-        """Handle one message; see BEFORE_MOVES and, for what the runtime says, `_told`."""
-        if (self.state, type(msg)) not in BEFORE_MOVES:
-            if isinstance(msg, Rebound | Promote):
-                return self._told(msg)
-            raise PeerError(f"{type(msg).__name__} on {port} while {self.state.name}")
-        if isinstance(msg, Request):
-            return self._forward(msg) if self.state is _BEFORE_LEADS else self._follow(msg)
-        assert isinstance(msg, ChannelEnded)
-        self.ended = True
-        return self._take_over()
-
-    def _forward(self, msg: Request) -> list[Effect]:
+    def forward(self, msg: Request) -> list[Effect]:
+        """The follower's copy first, then the leader's own chain."""
         passed_on: list[Effect] = [Note(_EXIT, msg.request_id), Send("bfr2prd", msg)]
         if not self.duplex:
             return passed_on
-        # A crash between the two leaves a follower that executes what its leader did not. Swapped, the
-        # leader could have executed and answered what nobody else ever heard of.
+        # A crash between the two sends leaves a follower that executes what its leader did not. Swapped, the
+        # leader could have executed and answered a request that the follower never got.
         return [Send("bfr2bfr", msg), Note(_FORWARDED, msg.request_id), *passed_on]
 
-    def _follow(self, msg: Request) -> list[Effect]:
+    def follow(self, msg: Request) -> list[Effect]:
+        """Pass on what the leader has forwarded."""
         if msg.epoch != self.epoch:
             raise PeerError(f"request {msg.request_id} under epoch {msg.epoch}, expected {self.epoch}")
         return [Note(_EXIT, msg.request_id), Send("bfr2prd", msg)]
 
-    def _told(self, msg: Rebound | Promote) -> list[Effect]:
-        if isinstance(msg, Rebound):
-            if msg.port == "bfr2bfr":
-                self.duplex = msg.bound
-            return []
-        if msg.epoch <= self.epoch or self.state is _BEFORE_LEADS:
+    def rebound(self, msg: Rebound) -> list[Effect]:
+        """Learn whether there is a follower."""
+        if msg.port == "bfr2bfr":
+            self.duplex = msg.bound
+        return []
+
+    def end_of_channel(self, msg: ChannelEnded) -> list[Effect]:
+        """All that the old leader had forwarded is passed on."""
+        return []
+
+    def promote(self, msg: Promote) -> list[Effect]:
+        """Remember the epoch to lead under; the channel is still to be drained."""
+        if msg.epoch <= self.epoch:
             raise PeerError(f"promoted to epoch {msg.epoch} while {self.state.name} in epoch {self.epoch}")
         self.promote_epoch = msg.epoch
-        return self._take_over()
+        return []
 
-    def _take_over(self) -> list[Effect]:
-        if not self.promote_epoch or not self.ended:
-            return []
-        self.state, self.epoch = _BEFORE_LEADS, self.promote_epoch
-        self.promote_epoch, self.duplex = 0, False
+    def promote_at_once(self, msg: Promote) -> list[Effect]:
+        """The channel is drained already."""
+        self.promote(msg)
+        return self._lead()
+
+    def lead(self, msg: ChannelEnded) -> list[Effect]:
+        """The channel is drained, and this replica is promoted."""
+        return self._lead()
+
+    def _lead(self) -> list[Effect]:
+        self.epoch, self.promote_epoch, self.duplex = self.promote_epoch, 0, False
         return [Send("bfr2prd", TakeOver(self.epoch))]
 
+    MOVES: ClassVar[Moves] = {
+        (_B.LEADING, "pro2bfr", Request): (forward, SAME_STATE),
+        (_B.FOLLOWING, "bfr2bfr", Request): (follow, SAME_STATE),
+        (_B.FOLLOWING, "bfr2bfr", ChannelEnded): (end_of_channel, _B.ENDED),
+        (_B.FOLLOWING, CONTROL, Promote): (promote, _B.PROMOTED),
+        (_B.PROMOTED, "bfr2bfr", Request): (follow, SAME_STATE),
+        (_B.PROMOTED, "bfr2bfr", ChannelEnded): (lead, _B.LEADING),
+        (_B.PROMOTED, CONTROL, Promote): (promote, SAME_STATE),
+        (_B.ENDED, CONTROL, Promote): (promote_at_once, _B.LEADING),
+        (_B.ENDED, "bfr2bfr", Request): (follow, _B.FOLLOWING),  # another channel was bound since
+        (_B.ENDED, "bfr2bfr", ChannelEnded): (end_of_channel, SAME_STATE),
+        (ANY_STATE, CONTROL, Rebound): (rebound, SAME_STATE),
+    }
 
-class LfrAfter(Brick):
-    """`duplex`: there is a follower to notify. `ended`: there is no leader to hear of any more."""
+
+class LfrAfterState(BrickState):
+    LEADING = auto()  # holds no reply, ever
+    FOLLOWING = auto()  # no reply held
+    HOLDING = auto()  # own reply held, until the leader's is known
+    ALONE = auto()  # the leader is gone: an own reply is stored at once
+
+
+_A: Final = LfrAfterState
+
+
+class LfrAfter(Machine):
+    """`duplex`: there is a follower to notify. A notification waits in its channel for the own reply."""
+
+    AT_REST = (_A.LEADING, _A.FOLLOWING, _A.ALONE)
 
     def __init__(self, epoch: int, leads: bool) -> None:
-        self.state = LfrAfterState.LEADING if leads else LfrAfterState.FOLLOWING
+        super().__init__(_A.LEADING if leads else _A.FOLLOWING)
         self.epoch, self.duplex = epoch, False
-        self.ended = False
         self._held: Reply | None = None
 
-    def open_ports(self) -> tuple[str, ...]:
-        """By state; see AFTER_OPEN. A notification waits in its channel until its reply is there."""
-        return AFTER_OPEN[self.state]
-
-    def quiescent(self) -> bool:
-        """No reply held."""
-        return self.state is not _HOLDING
-
-    def step(self, port: str, msg: AnyMessage, now_ns: int) -> list[Effect]:
-        """Handle one message; see AFTER_MOVES."""
-        state = AFTER_MOVES.get((self.state, type(msg)))
-        if state is None:
-            if isinstance(msg, Rebound):
-                return self._rebound(msg)
-            raise PeerError(f"{type(msg).__name__} on {port} while {self.state.name}")
-        if isinstance(msg, Reply):
-            return self._notify(msg) if state is _AFTER_LEADS else self._hold(msg)
-        if isinstance(msg, Notification):
-            return self._compare(msg)
-        if isinstance(msg, TakeOver):
-            return self._take_over(msg)
-        assert isinstance(msg, ChannelEnded)
-        self.ended = True
-        return self._store()
-
-    def _notify(self, msg: Reply) -> list[Effect]:
+    def notify_then_reply(self, msg: Reply) -> list[Effect]:
+        """The follower knows of the reply before the client has it."""
         if not self.duplex:
             return [Send("aft2pro", msg)]
-        # A crash between the two leaves a follower that has executed and heard all of it.
+        # A crash between the two sends leaves a follower that has the reply to everything executed.
         return [
             Send("aft2aft", Notification(msg.epoch, msg.request_id, digest(msg.payload))),
             Note(_NOTIFIED, msg.request_id),
             Send("aft2pro", msg),
         ]
 
-    def _hold(self, msg: Reply) -> list[Effect]:
-        self.state, self._held = _HOLDING, msg
-        return self._store() if self.ended else []
+    def hold(self, msg: Reply) -> list[Effect]:
+        """Keep the own reply until the leader's is known."""
+        self._held = msg
+        return []
 
-    def _compare(self, msg: Notification) -> list[Effect]:
+    def compare_then_store(self, msg: Notification) -> list[Effect]:
+        """Record a difference; the own reply is stored in any case."""
         held = self._held
         assert held is not None
         if (msg.epoch, msg.request_id) != (self.epoch, held.request_id):
@@ -201,23 +174,41 @@ class LfrAfter(Brick):
                 f"notified of request {msg.request_id} under epoch {msg.epoch},"
                 f" expected {held.request_id} under {self.epoch}"
             )
+        self._held = None
         if msg.digest == digest(held.payload):
-            return self._store()
-        return [Note(Event.FOLLOWER_DIVERGED, held.request_id), *self._store()]
+            return self.store(held)
+        return [Note(Event.FOLLOWER_DIVERGED, held.request_id), *self.store(held)]
 
-    def _store(self) -> list[Effect]:
-        held, self.state, self._held = self._held, _FOLLOWING, None
+    def store_held(self, msg: ChannelEnded) -> list[Effect]:
+        """No notification will come: the leader is gone."""
+        held, self._held = self._held, None
         assert held is not None
-        return [Send("aft2pro", StoreReply(held.epoch, held.request_id, held.payload))]
+        return self.store(held)
 
-    def _take_over(self, msg: TakeOver) -> list[Effect]:
+    def store(self, msg: Reply) -> list[Effect]:
+        """Hand the own reply to the Protocol's log."""
+        return [Send("aft2pro", StoreReply(msg.epoch, msg.request_id, msg.payload))]
+
+    def take_over(self, msg: TakeOver) -> list[Effect]:
+        """Lead from here on: all replies before this are in the log."""
         if msg.epoch <= self.epoch:
             raise PeerError(f"take over under epoch {msg.epoch} after {self.epoch}")
-        self.state, self.epoch = _AFTER_LEADS, msg.epoch
-        self.duplex = False
+        self.epoch, self.duplex = msg.epoch, False
         return [Send("aft2pro", msg)]
 
-    def _rebound(self, msg: Rebound) -> list[Effect]:
+    def rebound(self, msg: Rebound) -> list[Effect]:
+        """Learn whether there is a follower."""
         if msg.port == "aft2aft":
             self.duplex = msg.bound
         return []
+
+    MOVES: ClassVar[Moves] = {
+        (_A.LEADING, "prd2aft", Reply): (notify_then_reply, SAME_STATE),
+        (_A.FOLLOWING, "prd2aft", Reply): (hold, _A.HOLDING),
+        (_A.FOLLOWING, "prd2aft", TakeOver): (take_over, _A.LEADING),
+        (_A.HOLDING, "aft2aft", Notification): (compare_then_store, _A.FOLLOWING),
+        (_A.HOLDING, "aft2aft", ChannelEnded): (store_held, _A.ALONE),
+        (_A.ALONE, "prd2aft", Reply): (store, SAME_STATE),
+        (_A.ALONE, "prd2aft", TakeOver): (take_over, _A.LEADING),
+        (ANY_STATE, CONTROL, Rebound): (rebound, SAME_STATE),
+    }

@@ -1,29 +1,41 @@
 """Server: the protected function behind four messages: execute, try, capture, restore (paper, III-A).
 
-State access is the A of FT/A/R that PBR and TR need. The function is a stranger: bytes in, bytes out. So is
-the mechanism: a Server learns what will be asked of it from where its outputs lead, which it is told. So a
+State access is the A of FT/A/R that some mechanisms need. The Server knows neither the function (bytes in,
+bytes out) nor the mechanism: it learns what will be asked of it from which of its outputs are bound. So a
 switch to another mechanism never exchanges it.
 
-| `srv2aft` leads | `srv2bfr` leads | as under    | open for                                             |
-|-----------------|-----------------|-------------|------------------------------------------------------|
-| nowhere         | nowhere         | lfr, assert | requests                                             |
-| to an After     | nowhere         | pbr         | a request, then the question for the state after it  |
-| nowhere         | to a Before     | tr          | trials, and the question for the state before them   |
-| to an After     | to a Before     | pbr+tr      | all of these                                         |
+| `srv2aft` bound | `srv2bfr` bound | what is asked of it                                        |
+|-----------------|-----------------|------------------------------------------------------------|
+| no              | no              | requests                                                   |
+| to an After     | no              | a request, then the state after it                         |
+| no              | to a Before     | the state before a request, then trials of it              |
+| to an After     | to a Before     | the state before, trials, the state after                  |
 
-Nearly always one port is open, in which a host can block; to wait for two costs it a poll. After a rerun
-nothing here tells which one is next: a vote takes two trials, or three.
+Each of the four is a table of its own. Nearly always one port is open, in which a host can block; waiting for
+two costs it a poll. After a rerun two are open, since nothing shows here whether a vote takes another trial.
 """
 
 from enum import auto
-from typing import Final
+from typing import ClassVar, Final
 
 from aftbed.core.application import Application
-from aftbed.core.brick import Brick, BrickState, Effect, Halt, Note, Send
+from aftbed.core.brick import (
+    ANY_STATE,
+    CONTROL,
+    SAME_STATE,
+    BrickAnswer,
+    BrickState,
+    Choice,
+    Effect,
+    Halt,
+    Machine,
+    Moves,
+    Note,
+    Send,
+)
 from aftbed.core.errors import PeerError
 from aftbed.core.events import RERUN, Event
 from aftbed.core.messages import (
-    AnyMessage,
     CaptureState,
     Rebound,
     Reply,
@@ -39,98 +51,84 @@ from aftbed.core.messages import (
 class ServerState(BrickState):
     STANDBY = auto()  # a backup's or a leader's: the first request decides
     READY = auto()  # for a request
-    TRYING = auto()  # under tr: Before has the state, trials follow, up to a rerun
+    TRYING = auto()  # Before has the state, trials follow, up to a rerun
     EXECUTED = auto()  # After will ask for the state after it
 
 
-MOVES: Final = {  # where After does not ask for the state, what leads to EXECUTED leads to READY
-    ("prd2srv", ServerState.STANDBY, Request): ServerState.EXECUTED,
-    ("prd2srv", ServerState.STANDBY, Trial): ServerState.EXECUTED,
-    ("prd2srv", ServerState.READY, Request): ServerState.EXECUTED,
-    ("prd2srv", ServerState.READY, Trial): ServerState.EXECUTED,
-    ("prd2srv", ServerState.EXECUTED, Trial): ServerState.EXECUTED,  # a rerun, before After asks
-    ("aft2srv", ServerState.STANDBY, RestoreState): ServerState.STANDBY,
-    ("aft2srv", ServerState.EXECUTED, CaptureState): ServerState.READY,
-    ("bfr2srv", ServerState.STANDBY, CaptureState): ServerState.TRYING,
-    ("bfr2srv", ServerState.READY, CaptureState): ServerState.TRYING,
-    ("prd2srv", ServerState.TRYING, Trial): ServerState.TRYING,  # a rerun leads to EXECUTED
+class TrialRun(BrickAnswer):
+    FIRST = auto()
+    RERUN = auto()
+
+
+class BoundOutput(BrickAnswer):
+    STATE_AFTER = auto()  # srv2aft
+    STATE_BEFORE = auto()  # srv2bfr
+    OTHER = auto()
+
+
+STATE_AFTER, STATE_BEFORE, STATE_BEFORE_AND_AFTER = "state after", "state before", "state before and after"
+_TABLES: Final = {  # srv2aft bound, srv2bfr bound
+    (False, False): "",
+    (True, False): STATE_AFTER,
+    (False, True): STATE_BEFORE,
+    (True, True): STATE_BEFORE_AND_AFTER,
 }
-OPEN: Final[
-    dict[tuple[bool, bool], dict[ServerState, tuple[str, ...]]]
-] = {  # by what leads: srv2aft, srv2bfr
-    (False, False): dict.fromkeys(ServerState, ("prd2srv",)),
-    (True, False): {
-        ServerState.STANDBY: ("aft2srv", "prd2srv"),
-        ServerState.READY: ("prd2srv",),
-        ServerState.TRYING: ("prd2srv",),
-        ServerState.EXECUTED: ("aft2srv",),
-    },
-    (False, True): {
-        ServerState.STANDBY: ("bfr2srv", "prd2srv"),
-        ServerState.READY: ("bfr2srv", "prd2srv"),  # the next request, or a third trial
-        ServerState.TRYING: ("prd2srv",),
-        ServerState.EXECUTED: ("bfr2srv", "prd2srv"),
-    },
-    (True, True): {
-        ServerState.STANDBY: ("aft2srv", "bfr2srv", "prd2srv"),
-        ServerState.READY: ("bfr2srv",),
-        ServerState.TRYING: ("prd2srv",),
-        ServerState.EXECUTED: ("aft2srv", "prd2srv"),  # the question of After, or a third trial
-    },
-}
-_ANSWERED_ON: Final = {"aft2srv": "srv2aft", "bfr2srv": "srv2bfr"}
+
+_S: Final = ServerState
+_OUTPUTS: Final = {"srv2aft": BoundOutput.STATE_AFTER, "srv2bfr": BoundOutput.STATE_BEFORE}
 
 # Bound once: a look-up in an enumeration is slow on the hot path.
-_READY: Final = ServerState.READY
-_EXECUTED: Final = ServerState.EXECUTED
-_TRYING: Final = ServerState.TRYING
+_FIRST, _RERUN = TrialRun.FIRST, TrialRun.RERUN
 _ENTER: Final = Event.SERVER_ENTER
 _EXIT: Final = Event.SERVER_EXIT
 _CAPTURED: Final = Event.STATE_CAPTURED
 
 
-class Server(Brick):
-    """`replica` (1 or 2) marks whose replies these are; `captured`: After asks for the state each time."""
+class Server(Machine):
+    """`replica` (1 or 2) marks the replies as its own."""
+
+    AT_REST = (_S.STANDBY, _S.READY)
 
     def __init__(self, application: Application, replica: int) -> None:
+        super().__init__(_S.STANDBY)
         self.application, self.replica = application, replica
-        self.state = ServerState.STANDBY
-        self.captured = self.tried = False
-        self._open = OPEN[self.captured, self.tried]
+        self._state_after = self._state_before = False  # whether the outputs for it are bound
 
-    def open_ports(self) -> tuple[str, ...]:
-        """By where the outputs lead and by state; see OPEN."""
-        return self._open[self.state]
+    def execute(self, msg: Request) -> list[Effect]:
+        """Compute the reply."""
+        payload = self._execute(msg.payload)
+        return [
+            Note(_ENTER, msg.request_id),
+            Note(_EXIT, msg.request_id),
+            Send("srv2prd", Reply(msg.epoch, msg.request_id, self.replica, payload)),
+        ]
 
-    def quiescent(self) -> bool:
-        """Nothing executed whose state is still to be captured, no trial to come."""
-        return self.state is not _EXECUTED and self.state is not _TRYING
+    def which_run(self, msg: Trial) -> TrialRun:
+        """The first trial of a request, or another one."""
+        return _RERUN if msg.rerun else _FIRST
 
-    def step(self, port: str, msg: AnyMessage, now_ns: int) -> list[Effect]:
-        """Execute, try, capture or restore."""
-        state = MOVES.get((port, self.state, type(msg)))
-        if state is None:
-            if isinstance(msg, Rebound):
-                return self._rebound(msg)
-            raise PeerError(f"{type(msg).__name__} on {port} while {self.state.name}")
-        if isinstance(msg, Request):
-            payload = self._execute(msg.payload)
-            self.state = _EXECUTED if self.captured else _READY
-            return [
-                Note(_ENTER, msg.request_id),
-                Note(_EXIT, msg.request_id),
-                Send("srv2prd", Reply(msg.epoch, msg.request_id, self.replica, payload)),
-            ]
-        if isinstance(msg, CaptureState):
-            self.state = state
-            captured = StateCaptured(msg.epoch, msg.request_id, self.application.capture())
-            return [Note(_CAPTURED, msg.request_id), Send(_ANSWERED_ON[port], captured)]
-        if isinstance(msg, Trial):
-            return self._try(msg)
-        assert isinstance(msg, RestoreState)
+    def try_first(self, msg: Trial) -> list[Effect]:
+        """Execute from the present state."""
+        return self._try(msg, 0)
+
+    def try_again(self, msg: Trial) -> list[Effect]:
+        """Execute from the state that the first trial started from."""
+        self.application.restore(msg.state)
+        return self._try(msg, RERUN)
+
+    def capture_after(self, msg: CaptureState) -> list[Effect]:
+        """After asks for the state after exactly this request."""
+        return self._capture(msg, "srv2aft")
+
+    def capture_before(self, msg: CaptureState) -> list[Effect]:
+        """Before asks for the state before this request."""
+        return self._capture(msg, "srv2bfr")
+
+    def restore_state(self, msg: RestoreState) -> list[Effect]:
+        """Take over the state of a checkpoint. A backup that cannot is dropped, and a new one is made."""
         try:
             self.application.restore(msg.state)
-        except PeerError as error:  # a backup that cannot follow is none: it is dropped, and another one made
+        except PeerError as error:
             reason = f"the state after request {msg.request_id} is refused: {error}"
             return [Note(Event.DETECTED_STOP, msg.request_id), Halt(reason)]
         return [
@@ -138,20 +136,27 @@ class Server(Brick):
             Send("srv2aft", StateRestored(msg.epoch, msg.request_id)),
         ]
 
-    def _try(self, msg: Trial) -> list[Effect]:
-        """Execute, from the state of before if this is not the first time."""
-        if msg.rerun:
-            self.application.restore(msg.state)
-        elif self.state is _EXECUTED:
-            raise PeerError(f"Trial of request {msg.request_id}, and the state of the last is not captured")
-        payload, detail = self._execute(msg.payload), RERUN if msg.rerun else 0
-        self.state = (_EXECUTED if self.captured else _READY) if msg.rerun else _TRYING
-        tried = Tried(msg.epoch, msg.request_id, self.replica, payload, self.application.capture())
-        return [
-            Note(_ENTER, msg.request_id, detail),
-            Note(_EXIT, msg.request_id, detail),
-            Send("srv2prd", tried),
-        ]
+    def which_output(self, msg: Rebound) -> BoundOutput:
+        """Which of the four tables may be the next one depends on it."""
+        return _OUTPUTS.get(msg.port, BoundOutput.OTHER)
+
+    def rebind_after(self, msg: Rebound) -> list[Effect]:
+        """With another After this replica may back up from now on, or lead."""
+        self._state_after = msg.bound
+        return self._go_by_bindings()
+
+    def rebind_before(self, msg: Rebound) -> list[Effect]:
+        """Trials will come, or requests."""
+        self._state_before = msg.bound
+        return self._go_by_bindings()
+
+    def rebind_other(self, msg: Rebound) -> list[Effect]:
+        """Where replies go changes nothing here."""
+        return []
+
+    def _go_by_bindings(self) -> list[Effect]:
+        self.go_by(_TABLES[self._state_after, self._state_before])
+        return []
 
     def _execute(self, request: bytes) -> bytes:
         """The reply; an empty one to a request that the function refuses (its state is as it was)."""
@@ -160,14 +165,18 @@ class Server(Brick):
         except PeerError:
             return b""
 
-    def _rebound(self, msg: Rebound) -> list[Effect]:
-        """Learn what will be asked. Who hears of an After anew may be a backup from now on, or a leader."""
-        if msg.port == "srv2aft":
-            self.captured, self.state = msg.bound, ServerState.STANDBY
-        elif msg.port == "srv2bfr":
-            self.tried = msg.bound
-        self._open = OPEN[self.captured, self.tried]
-        return []
+    def _try(self, msg: Trial, detail: int) -> list[Effect]:
+        payload = self._execute(msg.payload)
+        tried = Tried(msg.epoch, msg.request_id, self.replica, payload, self.application.capture())
+        return [
+            Note(_ENTER, msg.request_id, detail),
+            Note(_EXIT, msg.request_id, detail),
+            Send("srv2prd", tried),
+        ]
+
+    def _capture(self, msg: CaptureState, port: str) -> list[Effect]:
+        captured = StateCaptured(msg.epoch, msg.request_id, self.application.capture())
+        return [Note(_CAPTURED, msg.request_id), Send(port, captured)]
 
     def capture(self) -> bytes:
         """The function's state."""
@@ -181,3 +190,68 @@ class Server(Brick):
         """Take over the state of another function, which has been this one's until now."""
         migrate = getattr(self.application, "migrate", self.application.restore)
         migrate(state)
+
+    # -- the tables ---------------------------------------------------------------------------
+
+    _REBOUND: ClassVar[Moves] = {
+        (ANY_STATE, CONTROL, Rebound): Choice(
+            which_output,
+            {
+                BoundOutput.STATE_AFTER: (rebind_after, _S.STANDBY),
+                BoundOutput.STATE_BEFORE: (rebind_before, SAME_STATE),
+                BoundOutput.OTHER: (rebind_other, SAME_STATE),
+            },
+        ),
+        (_S.TRYING, CONTROL, Rebound): Choice(
+            which_output,
+            {
+                BoundOutput.STATE_AFTER: (rebind_after, _S.STANDBY),
+                BoundOutput.STATE_BEFORE: (rebind_before, _S.STANDBY),  # that Before's trials will not come
+                BoundOutput.OTHER: (rebind_other, SAME_STATE),
+            },
+        ),
+    }
+    _TRIAL_THEN_READY: ClassVar[Choice] = Choice(
+        which_run, {TrialRun.FIRST: (try_first, _S.TRYING), TrialRun.RERUN: (try_again, _S.READY)}
+    )
+    _TRIAL_THEN_EXECUTED: ClassVar[Choice] = Choice(
+        which_run, {TrialRun.FIRST: (try_first, _S.TRYING), TrialRun.RERUN: (try_again, _S.EXECUTED)}
+    )
+
+    MOVES: ClassVar[Moves] = {  # nothing is asked for beside requests
+        (_S.STANDBY, "prd2srv", Request): (execute, _S.READY),
+        (_S.READY, "prd2srv", Request): (execute, SAME_STATE),
+        **_REBOUND,
+    }
+    MOVES_STATE_AFTER: ClassVar[Moves] = {
+        (_S.STANDBY, "aft2srv", RestoreState): (restore_state, SAME_STATE),
+        (_S.STANDBY, "prd2srv", Request): (execute, _S.EXECUTED),
+        (_S.READY, "prd2srv", Request): (execute, _S.EXECUTED),
+        (_S.EXECUTED, "aft2srv", CaptureState): (capture_after, _S.READY),
+        **_REBOUND,
+    }
+    MOVES_STATE_BEFORE: ClassVar[Moves] = {
+        (_S.STANDBY, "bfr2srv", CaptureState): (capture_before, _S.TRYING),
+        (_S.STANDBY, "prd2srv", Trial): _TRIAL_THEN_READY,
+        (_S.READY, "bfr2srv", CaptureState): (capture_before, _S.TRYING),  # the next request ...
+        (_S.READY, "prd2srv", Trial): _TRIAL_THEN_READY,  # ... or a third trial
+        (_S.TRYING, "prd2srv", Trial): _TRIAL_THEN_READY,
+        **_REBOUND,
+    }
+    MOVES_BOTH: ClassVar[Moves] = {
+        (_S.STANDBY, "aft2srv", RestoreState): (restore_state, SAME_STATE),
+        (_S.STANDBY, "bfr2srv", CaptureState): (capture_before, _S.TRYING),
+        (_S.STANDBY, "prd2srv", Trial): _TRIAL_THEN_EXECUTED,
+        (_S.READY, "bfr2srv", CaptureState): (capture_before, _S.TRYING),
+        (_S.TRYING, "prd2srv", Trial): _TRIAL_THEN_EXECUTED,
+        (_S.EXECUTED, "aft2srv", CaptureState): (capture_after, _S.READY),  # the end of the request ...
+        (_S.EXECUTED, "prd2srv", Trial): Choice(
+            which_run, {TrialRun.RERUN: (try_again, SAME_STATE)}
+        ),  # ... or a third trial
+        **_REBOUND,
+    }
+    FURTHER_MOVES: ClassVar[dict[str, Moves]] = {
+        STATE_AFTER: MOVES_STATE_AFTER,
+        STATE_BEFORE: MOVES_STATE_BEFORE,
+        STATE_BEFORE_AND_AFTER: MOVES_BOTH,
+    }

@@ -1,33 +1,43 @@
-"""Before, Proceed and After of TR, time redundancy: one request, executed twice from the same state.
+"""TR, time redundancy: one request, executed twice from the same state.
 
 Paper, III-B: Before captures the Server's state, Proceed computes more than once, After compares. What is
-compared is the reply *and* the state after it: a fault that only hits what the function remembers would come
-out with some later request, when there is nothing left to compare it with.
+compared is the reply *and* the state after it: a fault that hits only the state would show with some later
+request, when there is nothing left to compare it with.
 
 | two trials | third trial           | then                                                             |
 |------------|-----------------------|------------------------------------------------------------------|
 | equal      | -                     | that reply                                                       |
 | differ     | equal to one of them  | that reply: the fault was in the other                           |
-| differ     | equal to none         | detected stop: no reply leaves, and under a duplex the other one |
-|            |                       | executes                                                         |
+| differ     | equal to none         | detected stop: no reply leaves, and under a duplex the other     |
+|            |                       | replica executes                                                 |
 
 The Server is left in the state of the majority: the trial that settles a vote is the last one that ran, and
 it is one of the equal ones. So nothing has to be restored when the vote is over.
 
-Limits: a fault that hits what was captured, before the first trial, is in all of them. So is one that lasts,
+Limits: a fault that hits the captured state, before the first trial, is in all of them. So is one that lasts,
 or that comes twice with the same effect. A trial carries the state, and two of them are one packet: a state
 may be a third of a packet long.
 """
 
 from enum import auto
-from typing import Final
+from typing import ClassVar, Final
 
-from aftbed.core.brick import Brick, BrickState, Effect, Halt, Note, Send, no_move
+from aftbed.core.brick import (
+    SAME_STATE,
+    BrickAnswer,
+    BrickState,
+    Choice,
+    Effect,
+    Halt,
+    Machine,
+    Moves,
+    Note,
+    Send,
+)
 from aftbed.core.errors import PeerError
 from aftbed.core.events import Event
 from aftbed.core.messages import (
     Again,
-    AnyMessage,
     CaptureState,
     Reply,
     Request,
@@ -46,150 +56,139 @@ _PROCEED_ENTER: Final = Event.PROCEED_ENTER
 _COMPARED: Final = Event.VOTE_COMPARED
 
 
+def equal(one: Tried, other: Tried) -> bool:
+    """Whether two trials agree, in the reply and in the state after it."""
+    return one.payload == other.payload and one.state == other.state
+
+
 class TrBeforeState(BrickState):
     IDLE = auto()  # no request in progress
     CAPTURING = auto()  # request held, waiting for the Server's state
 
 
-BEFORE_MOVES: Final = {
-    (TrBeforeState.IDLE, Request): TrBeforeState.CAPTURING,
-    (TrBeforeState.IDLE, TakeOver): TrBeforeState.IDLE,
-    (TrBeforeState.CAPTURING, StateCaptured): TrBeforeState.IDLE,
-}
-BEFORE_OPEN: Final = {TrBeforeState.IDLE: ("pro2bfr",), TrBeforeState.CAPTURING: ("srv2bfr",)}
+_B: Final = TrBeforeState
 
 
-class TrBefore(Brick):
+class TrBefore(Machine):
     """Captures, for one request at a time, the state that all its trials start from."""
 
+    AT_REST = (_B.IDLE,)
+
     def __init__(self) -> None:
-        self.state = TrBeforeState.IDLE
+        super().__init__(_B.IDLE)
         self._request: Request | None = None
 
-    def open_ports(self) -> tuple[str, ...]:
-        """By state; see BEFORE_OPEN."""
-        return BEFORE_OPEN[self.state]
+    def ask_for_state(self, msg: Request) -> list[Effect]:
+        """Hold the request until the state before it is captured."""
+        self._request = msg
+        return [Send("bfr2srv", CaptureState(msg.epoch, msg.request_id))]
 
-    def quiescent(self) -> bool:
-        """No request held."""
-        return self.state is TrBeforeState.IDLE
-
-    def step(self, port: str, msg: AnyMessage, now_ns: int) -> list[Effect]:
-        """Handle one message; see BEFORE_MOVES."""
-        state = BEFORE_MOVES.get((self.state, type(msg)))
-        if state is None:
-            return no_move(self.state, port, msg)
-        if isinstance(msg, Request):
-            self.state, self._request = state, msg
-            return [Send("bfr2srv", CaptureState(msg.epoch, msg.request_id))]
-        if isinstance(msg, TakeOver):
-            return [Send("bfr2prd", msg)]
-        assert isinstance(msg, StateCaptured) and self._request is not None
-        if msg.request_id != self._request.request_id:
-            raise PeerError(f"state for request {msg.request_id}, expected {self._request.request_id}")
-        request, self.state, self._request = self._request, state, None
+    def begin_trial(self, msg: StateCaptured) -> list[Effect]:
+        """Request and state go on together."""
+        request = self._request
+        assert request is not None
+        if msg.request_id != request.request_id:
+            raise PeerError(f"state for request {msg.request_id}, expected {request.request_id}")
+        self._request = None
         trial = Trial(request.epoch, request.request_id, request.payload, msg.state, rerun=False)
         return [Note(_BEFORE_EXIT, request.request_id), Send("bfr2prd", trial)]
 
+    def hand_on(self, msg: TakeOver) -> list[Effect]:
+        """Behind all requests."""
+        return [Send("bfr2prd", msg)]
+
+    MOVES: ClassVar[Moves] = {
+        (_B.IDLE, "pro2bfr", Request): (ask_for_state, _B.CAPTURING),
+        (_B.IDLE, "pro2bfr", TakeOver): (hand_on, SAME_STATE),
+        (_B.CAPTURING, "srv2bfr", StateCaptured): (begin_trial, _B.IDLE),
+    }
+
 
 class TrProceedState(BrickState):
-    IDLE = auto()  # no request in progress
+    IDLE = auto()  # no request in progress, or both trials agree: After asks for no third one
     FIRST = auto()  # the Server has the trial, twice
     SECOND = auto()  # one result is there
-    VOTING = auto()  # After has both; it asks for a third, or the next request comes
+    VOTING = auto()  # After has two results that differ, and asks for a third one
     THIRD = auto()  # the Server has the trial, for the third time
 
 
-PROCEED_MOVES: Final = {
-    (TrProceedState.IDLE, Trial): TrProceedState.FIRST,
-    (TrProceedState.IDLE, TakeOver): TrProceedState.IDLE,
-    (TrProceedState.FIRST, Tried): TrProceedState.SECOND,
-    (TrProceedState.SECOND, Tried): TrProceedState.VOTING,
-    (TrProceedState.VOTING, Trial): TrProceedState.FIRST,
-    (TrProceedState.VOTING, TakeOver): TrProceedState.VOTING,
-    (TrProceedState.VOTING, Again): TrProceedState.THIRD,
-    (TrProceedState.THIRD, Tried): TrProceedState.IDLE,
-}
-PROCEED_OPEN: Final[dict[TrProceedState, tuple[str, ...]]] = {
-    TrProceedState.IDLE: ("bfr2prd",),
-    TrProceedState.FIRST: ("srv2prd",),
-    TrProceedState.SECOND: ("srv2prd",),
-    TrProceedState.VOTING: ("bfr2prd", "aft2prd"),
-    TrProceedState.THIRD: ("srv2prd",),
-}
+_P: Final = TrProceedState
 
 
-_VOTING: Final = TrProceedState.VOTING
-_NEXT: Final = ("bfr2prd",)
+class TrProceed(Machine):
+    """Runs a trial twice, and a third time if After asks for it.
 
-
-class TrProceed(Brick):
-    """`agreed`: the trials of the last request are equal, so that After has nothing more to ask.
-
-    After decides; this is only to know whether a request may still come back here. No two ports have mail
-    at a time in VOTING: the next request is let in when this one has been answered.
+    After decides. Proceed compares only to know whether a request may still come back to it: where two trials
+    agree, one open port is enough, which saves the host a poll. The next trial is legal in VOTING too: an
+    After written off line may settle a vote between two trials that differ.
     """
 
+    AT_REST = (_P.IDLE,)
+
     def __init__(self) -> None:
-        self.state = TrProceedState.IDLE
-        self.agreed = True
+        super().__init__(_P.IDLE)
         self._trial: Trial | None = None
         self._first: Tried | None = None
 
-    def open_ports(self) -> tuple[str, ...]:
-        """By state; see PROCEED_OPEN. Where trials are equal, After asks for no third, which saves a poll."""
-        return _NEXT if self.agreed and self.state is _VOTING else PROCEED_OPEN[self.state]
+    def run_twice(self, msg: Trial) -> list[Effect]:
+        """Both at once: the second starts from the same state, whatever comes of the first."""
+        self._trial = msg
+        return [Note(_PROCEED_ENTER, msg.request_id), Send("prd2srv", msg), Send("prd2srv", self._rerun(msg))]
 
-    def quiescent(self) -> bool:
-        """No trial under way, and none to be asked for."""
-        return self.state is TrProceedState.IDLE or (self.state is TrProceedState.VOTING and self.agreed)
+    def hold_first(self, msg: Tried) -> list[Effect]:
+        """One result of two."""
+        self._expect(msg)
+        self._first = msg
+        return []
 
-    def step(self, port: str, msg: AnyMessage, now_ns: int) -> list[Effect]:
-        """Handle one message; see PROCEED_MOVES."""
-        state = PROCEED_MOVES.get((self.state, type(msg)))
-        if state is None:
-            return no_move(self.state, port, msg)
-        if isinstance(msg, Trial):
-            self.state, self._trial = state, msg
-            # Both at once: the second starts from the same state, whatever the first one says.
-            again = self._rerun(msg.request_id)
-            return [Note(_PROCEED_ENTER, msg.request_id), Send("prd2srv", msg), Send("prd2srv", again)]
-        if isinstance(msg, Tried):
-            return self._tried(msg, state)
-        if isinstance(msg, Again):
-            rerun = self._rerun(msg.request_id)
-            self.state = state
-            return [Send("prd2srv", rerun)]
-        assert isinstance(msg, TakeOver)
-        self.state = state
-        return [Send("prd2aft", msg)]
+    def agrees(self, msg: Tried) -> bool:
+        """Whether the second result is the first one."""
+        self._expect(msg)
+        assert self._first is not None
+        return equal(self._first, msg)
 
-    def _tried(self, msg: Tried, state: TrProceedState) -> list[Effect]:
-        self._expect(msg.request_id)
-        self.state = state
-        if state is TrProceedState.SECOND:
-            self._first = msg
-            return []
-        if state is TrProceedState.IDLE:
-            self._trial = None
-            return [Send("prd2aft", Trials(msg.epoch, msg.request_id, (msg,)))]
+    def send_both(self, msg: Tried) -> list[Effect]:
+        """After has two results to compare."""
         first, self._first = self._first, None
         assert first is not None
-        self.agreed = equal(first, msg)
         return [Send("prd2aft", Trials(msg.epoch, msg.request_id, (first, msg)))]
 
-    def _expect(self, request_id: int) -> Trial:
-        """The trial under way; raises PeerError if it is not the one that is meant."""
+    def run_again(self, msg: Again) -> list[Effect]:
+        """The third trial."""
+        return [Send("prd2srv", self._rerun(self._expect(msg)))]
+
+    def send_third(self, msg: Tried) -> list[Effect]:
+        """After has a third result."""
+        self._expect(msg)
+        return [Send("prd2aft", Trials(msg.epoch, msg.request_id, (msg,)))]
+
+    def hand_on(self, msg: TakeOver) -> list[Effect]:
+        """Behind all results."""
+        return [Send("prd2aft", msg)]
+
+    def _expect(self, msg: Tried | Again) -> Trial:
+        """The trial under way; raises PeerError if `msg` is about another one."""
         trial = self._trial
         assert trial is not None
-        if request_id != trial.request_id:
-            raise PeerError(f"trial of request {request_id}, expected {trial.request_id}")
+        if msg.request_id != trial.request_id:
+            raise PeerError(f"trial of request {msg.request_id}, expected {trial.request_id}")
         return trial
 
-    def _rerun(self, request_id: int) -> Trial:
-        """The trial once more; raises PeerError if it is not the one that is meant."""
-        trial = self._expect(request_id)
+    def _rerun(self, trial: Trial) -> Trial:
         return Trial(trial.epoch, trial.request_id, trial.payload, trial.state, rerun=True)
+
+    MOVES: ClassVar[Moves] = {
+        (_P.IDLE, "bfr2prd", Trial): (run_twice, _P.FIRST),
+        (_P.IDLE, "bfr2prd", TakeOver): (hand_on, SAME_STATE),
+        (_P.FIRST, "srv2prd", Tried): (hold_first, _P.SECOND),
+        (_P.SECOND, "srv2prd", Tried): Choice(
+            agrees, {True: (send_both, _P.IDLE), False: (send_both, _P.VOTING)}
+        ),
+        (_P.VOTING, "bfr2prd", Trial): (run_twice, _P.FIRST),
+        (_P.VOTING, "bfr2prd", TakeOver): (hand_on, SAME_STATE),
+        (_P.VOTING, "aft2prd", Again): (run_again, _P.THIRD),
+        (_P.THIRD, "srv2prd", Tried): (send_third, _P.IDLE),
+    }
 
 
 class TrAfterState(BrickState):
@@ -197,66 +196,82 @@ class TrAfterState(BrickState):
     ASKED = auto()  # two trials held that differ, waiting for the third
 
 
-AFTER_MOVES: Final = {
-    (TrAfterState.IDLE, Trials): TrAfterState.ASKED,  # or answered at once, where they are equal
-    (TrAfterState.IDLE, TakeOver): TrAfterState.IDLE,
-    (TrAfterState.ASKED, Trials): TrAfterState.IDLE,
-}
-AFTER_OPEN: Final = {TrAfterState.IDLE: ("prd2aft",), TrAfterState.ASKED: ("prd2aft",)}
-_WANTED: Final = {TrAfterState.IDLE: 2, TrAfterState.ASKED: 1}  # how many trials come at once
+_A: Final = TrAfterState
 
 
-def equal(one: Tried, other: Tried) -> bool:
-    """Whether two trials came to the same, in what is answered and in what is remembered."""
-    return one.payload == other.payload and one.state == other.state
+class Vote(BrickAnswer):
+    MAJORITY = auto()  # the last trial has an equal one
+    OPEN = auto()  # two trials differ
+    NONE = auto()  # three trials, no two of them equal
 
 
-class TrAfter(Brick):
+_MAJORITY, _OPEN, _NONE = Vote.MAJORITY, Vote.OPEN, Vote.NONE
+
+
+class TrAfter(Machine):
     """The vote."""
 
+    AT_REST = (_A.IDLE,)
+
     def __init__(self) -> None:
-        self.state = TrAfterState.IDLE
+        super().__init__(_A.IDLE)
         self._held: tuple[Tried, ...] = ()
 
-    def open_ports(self) -> tuple[str, ...]:
-        """By state; see AFTER_OPEN."""
-        return AFTER_OPEN[self.state]
+    def vote(self, msg: Trials) -> Vote:
+        """Compare. Raises PeerError unless two trials come first, then a third one, all of one request."""
+        tried, held = msg.tried, self._held
+        if len(tried) != (1 if held else 2):
+            raise self._refusal(msg)
+        compared = (*held, *tried)
+        for one in compared:
+            if one.request_id != msg.request_id:
+                raise self._refusal(msg)
+        last = tried[-1]
+        for other in compared[:-1]:
+            if equal(last, other):
+                return _MAJORITY
+        return _NONE if held else _OPEN
 
-    def quiescent(self) -> bool:
-        """No trials held."""
-        return self.state is TrAfterState.IDLE
+    def _refusal(self, msg: Trials) -> PeerError:
+        ids = {msg.request_id, *(one.request_id for one in (*self._held, *msg.tried))}
+        return PeerError(f"{len(msg.tried)} trials of requests {sorted(ids)} while {self.state.name}")
 
-    def step(self, port: str, msg: AnyMessage, now_ns: int) -> list[Effect]:
-        """Handle one message; see AFTER_MOVES."""
-        if (self.state, type(msg)) not in AFTER_MOVES:
-            return no_move(self.state, port, msg)
-        if isinstance(msg, TakeOver):
-            return [Send("aft2pro", msg)]
-        assert isinstance(msg, Trials)
-        ids = {msg.request_id, *(t.request_id for t in (*self._held, *msg.tried))}
-        if len(msg.tried) != _WANTED[self.state] or len(ids) > 1:
-            raise PeerError(f"{len(msg.tried)} trials of requests {sorted(ids)} while {self.state.name}")
-        return self._settle(msg) if self._held else self._compare(msg)
+    def reply(self, msg: Trials) -> list[Effect]:
+        """Two trials agree."""
+        return self._reply(msg.tried[-1], 2)
 
-    def _compare(self, msg: Trials) -> list[Effect]:
-        first, second = msg.tried
-        if equal(first, second):
-            return self._answer(second, 2)
-        self.state, self._held = TrAfterState.ASKED, msg.tried
+    def reply_by_third(self, msg: Trials) -> list[Effect]:
+        """The third trial is right, and the Server is as this trial, its last, has left it."""
+        self._held = ()
+        return self._reply(msg.tried[-1], 3)
+
+    def ask_for_third(self, msg: Trials) -> list[Effect]:
+        """Two trials differ."""
+        self._held = msg.tried
         return [Send("aft2prd", Again(msg.epoch, msg.request_id))]
 
-    def _settle(self, msg: Trials) -> list[Effect]:
-        (third,) = msg.tried
-        if any(equal(third, held) for held in self._held):
-            # The Server is as this trial, its last, has left it: in a state of the majority.
-            self.state, self._held = TrAfterState.IDLE, ()
-            return self._answer(third, 3)
+    def stop(self, msg: Trials) -> list[Effect]:
+        """No majority."""
         return [
             Note(_COMPARED, msg.request_id, UNDECIDED),
             Note(Event.DETECTED_STOP, msg.request_id),
             Halt(f"no majority for request {msg.request_id}: three trials, no two of them equal"),
         ]
 
-    def _answer(self, tried: Tried, trials: int) -> list[Effect]:
+    def hand_on(self, msg: TakeOver) -> list[Effect]:
+        """Behind all replies."""
+        return [Send("aft2pro", msg)]
+
+    def _reply(self, tried: Tried, trials: int) -> list[Effect]:
         reply = Reply(tried.epoch, tried.request_id, tried.replica, tried.payload)
         return [Note(_COMPARED, tried.request_id, trials), Send("aft2pro", reply)]
+
+    MOVES: ClassVar[Moves] = {
+        (_A.IDLE, "prd2aft", Trials): Choice(
+            vote, {Vote.MAJORITY: (reply, SAME_STATE), Vote.OPEN: (ask_for_third, _A.ASKED)}
+        ),
+        (_A.IDLE, "prd2aft", TakeOver): (hand_on, SAME_STATE),
+        (_A.ASKED, "prd2aft", Trials): Choice(
+            vote, {Vote.MAJORITY: (reply_by_third, _A.IDLE), Vote.NONE: (stop, SAME_STATE)}
+        ),
+    }

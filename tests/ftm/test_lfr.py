@@ -170,7 +170,7 @@ def test_promoted_it_works_off_what_was_forwarded_before_it_leads() -> None:
 def test_the_channel_may_end_before_the_promotion() -> None:
     brick = following_before()
     assert brick.step("bfr2bfr", ChannelEnded(), 0) == []
-    assert brick.state is LfrBeforeState.FOLLOWING
+    assert brick.state is LfrBeforeState.ENDED
     assert brick.step(CONTROL, Promote(2), 0) == [Send("bfr2prd", TakeOver(2))]
 
 
@@ -185,7 +185,7 @@ def test_a_promotion_to_an_epoch_that_does_not_grow_is_refused(epoch: int) -> No
 
 def test_who_leads_is_not_promoted() -> None:
     brick = leading_before()
-    with pytest.raises(PeerError, match="promoted to epoch 2 while LEADING in epoch 1"):
+    with pytest.raises(PeerError, match="Promote on control while LEADING"):
         brick.step(CONTROL, Promote(2), 0)
 
 

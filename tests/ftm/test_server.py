@@ -265,7 +265,7 @@ def test_the_next_trial_waits_until_after_has_the_state() -> None:
     brick.step("prd2srv", trial(STATE, rerun=False), 0)
     brick.step("prd2srv", trial(STATE, rerun=True), 0)
     before = inspected(brick)
-    with pytest.raises(PeerError, match="the state of the last is not captured"):
+    with pytest.raises(PeerError, match="Trial on prd2srv while EXECUTED"):
         brick.step("prd2srv", trial(STATE, rerun=False, number=8), 0)
     with pytest.raises(PeerError, match="CaptureState on bfr2srv while EXECUTED"):
         brick.step("bfr2srv", CaptureState(2, 8), 0)

@@ -72,9 +72,10 @@ def test_before_hands_a_take_over_on_but_not_past_a_request() -> None:
 def voting(*found: Tried) -> TrProceed:
     brick = TrProceed()
     brick.step("bfr2prd", TRIAL, 0)
-    for one in found or (RIGHT, RIGHT):
+    for one in found:
         brick.step("srv2prd", one, 0)
-    assert brick.state is TrProceedState.VOTING
+    agree = found[0] == found[1]
+    assert brick.state is (TrProceedState.IDLE if agree else TrProceedState.VOTING)
     return brick
 
 
@@ -98,8 +99,9 @@ def test_asked_again_it_runs_it_once_more_and_is_done_with_it() -> None:
     assert brick.open_ports() == ("bfr2prd",) and brick.quiescent()
 
 
-def test_the_next_trial_may_come_without_a_third() -> None:
-    brick = voting()
+@pytest.mark.parametrize("second", [RIGHT, WRONG[0]])
+def test_the_next_trial_may_come_without_a_third(second: Tried) -> None:
+    brick = voting(RIGHT, second)
     later = Trial(2, 8, b"more", STATE, rerun=False)
     again = Trial(2, 8, b"more", STATE, rerun=True)
     assert sends(brick.step("bfr2prd", later, 0)) == [("prd2srv", later), ("prd2srv", again)]
@@ -118,7 +120,7 @@ def test_while_a_trial_may_come_back_a_request_is_inside(wrong: Tried) -> None:
     [
         ("srv2prd", tried(number=6), ()),
         ("srv2prd", tried(number=6), (RIGHT,)),
-        ("aft2prd", Again(2, 6), (RIGHT, RIGHT)),
+        ("aft2prd", Again(2, 6), (RIGHT, WRONG[0])),
     ],
 )
 def test_what_is_about_another_request_is_refused(
@@ -136,7 +138,7 @@ def test_what_is_about_another_request_is_refused(
 
 
 def test_proceed_hands_a_take_over_on_but_not_past_a_trial() -> None:
-    for brick in (TrProceed(), voting()):
+    for brick in (TrProceed(), voting(RIGHT, RIGHT), voting(RIGHT, WRONG[0])):
         assert sends(brick.step("bfr2prd", TakeOver(2), 0)) == [("prd2aft", TakeOver(2))]
     brick = TrProceed()
     brick.step("bfr2prd", TRIAL, 0)

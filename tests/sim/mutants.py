@@ -20,7 +20,6 @@ from planting import (
     CRASH,
     OWN,
     Mutant,
-    Plant,
     answer,
     both,
     clean,
@@ -35,11 +34,11 @@ from planting import (
     wrapped,
 )
 
-from aftbed.core.brick import Effect, Note, Send
-from aftbed.core.events import Event
+from aftbed.core.brick import CONTROL, Choice, Effect, Send
 from aftbed.core.messages import (
     ChannelEnded,
     Checkpoint,
+    Promote,
     Rebound,
     Reply,
     Request,
@@ -49,43 +48,33 @@ from aftbed.core.messages import (
     Watch,
 )
 from aftbed.core.valuefault import Place
-from aftbed.ftm import chain, client, tr
+from aftbed.ftm import tr
 from aftbed.ftm.assertion import Acceptable, AssertAfter
-from aftbed.ftm.chain import Protocol
-from aftbed.ftm.client import Client, Proxy
+from aftbed.ftm.chain import Protocol, ProtocolState, RequestAge
+from aftbed.ftm.client import Client, Proxy, ReplyIs
 from aftbed.ftm.failover import Watchdog
-from aftbed.ftm.lfr import LfrAfter, LfrBefore
-from aftbed.ftm.pbr import PbrAfter
+from aftbed.ftm.lfr import LfrAfter, LfrBefore, LfrBeforeState
+from aftbed.ftm.pbr import PbrAfter, PbrAfterState
 from aftbed.ftm.server import Server
-from aftbed.ftm.tr import TrAfter
+from aftbed.ftm.tr import TrAfter, Vote
 from aftbed.runtime.sim.world import Setup
 
-
-def _log_ignored(right: object) -> object:
-    def admit(self: Protocol, msg: Request) -> list[Effect]:
-        self.state, self.busy_id = chain.ProtocolState.BUSY, msg.request_id
-        return [Note(Event.REQUEST_RECEIVED, msg.request_id), Send("pro2bfr", msg)]
-
-    return admit
-
-
-def _two_at_once() -> Plant:
-    busy = chain.ProtocolState.BUSY
-    return both(
-        entered(chain.PROTOCOL_OPEN, {busy: ("aft2pro", "pxy2pro")}),
-        entered(chain.PROTOCOL_MOVES, {(busy, Request): busy}),
+_IDLE, _BUSY = ProtocolState.IDLE, ProtocolState.BUSY
+_LOG_IGNORED: Final = {
+    (_IDLE, "pxy2pro", Request): Choice(Protocol.age, dict.fromkeys(RequestAge, (Protocol.admit, _BUSY)))
+}
+_TWO_AT_ONCE: Final = {
+    (_BUSY, "pxy2pro", Request): Choice(
+        Protocol.age,
+        {RequestAge.NEW: (Protocol.admit, _BUSY), RequestAge.OLD: (Protocol.answer_again, _BUSY)},
     )
-
-
-def _channel_not_drained(kind: type[PbrAfter | LfrBefore]) -> Plant:
-    def make(right: Callable[..., list[Effect]]) -> object:
-        def take_over(self: PbrAfter | LfrBefore) -> list[Effect]:
-            self.ended = True
-            return right(self)
-
-        return take_over
-
-    return wrapped(kind, "_take_over", make)
+}
+_CHECKPOINTS_NOT_DRAINED: Final = {
+    (PbrAfterState.STANDBY, CONTROL, Promote): (PbrAfter.promote_at_once, PbrAfterState.IDLE)
+}
+_REQUESTS_NOT_DRAINED: Final = {
+    (LfrBeforeState.FOLLOWING, CONTROL, Promote): (LfrBefore.promote_at_once, LfrBeforeState.LEADING)
+}
 
 
 def _stateless(effects: list[Effect]) -> list[Effect]:
@@ -105,15 +94,11 @@ def _own_state(server: Server, msg: RestoreState | Trial) -> RestoreState | Tria
 
 
 def _any_epoch(right: object) -> object:
-    def reply(self: Proxy, msg: Reply) -> list[Effect]:
+    def which_reply(self: Proxy, msg: Reply) -> ReplyIs:
         assert self.waiting is not None
-        if msg.request_id != self.waiting.request_id:
-            return []
-        self.state, self.waiting = client.ProxyState.IDLE, None
-        accepted = Note(Event.REPLY_ACCEPTED, msg.request_id, msg.epoch << 8 | msg.replica)
-        return [accepted, Send("pxy2clt", msg)]
+        return ReplyIs.WANTED if msg.request_id == self.waiting.request_id else ReplyIs.REPEATED
 
-    return reply
+    return which_reply
 
 
 def _never_promoted(right: Callable[..., list[Effect]]) -> object:
@@ -133,28 +118,14 @@ def _gullible(right: Callable[..., None]) -> object:
     return init
 
 
-def _old_epoch(right: Callable[..., list[Effect]]) -> object:
-    def rebound(self: Proxy, msg: Rebound) -> list[Effect]:
-        return right(self, replace(msg, epoch=self.epoch or msg.epoch))
-
-    return rebound
-
-
 def _minority(right: object) -> object:
-    def settle(self: TrAfter, msg: Trials) -> list[Effect]:
+    def reply_by_third(self: TrAfter, msg: Trials) -> list[Effect]:
         (third,) = msg.tried
         wrong = next((t for t in self._held if not tr.equal(t, third)), third)
-        self.state, self._held = tr.TrAfterState.IDLE, ()
-        return self._answer(wrong, 3)
+        self._held = ()
+        return self._reply(wrong, 3)
 
-    return settle
-
-
-def _second_is_right(right: object) -> object:
-    def compare(self: TrAfter, msg: Trials) -> list[Effect]:
-        return self._answer(msg.tried[1], 2)
-
-    return compare
+    return reply_by_third
 
 
 def _promoted_with_mail(ftm: str, behind: str, event: str) -> list[Setup]:
@@ -188,7 +159,7 @@ MECHANISMS: Final = (
     Mutant(
         "reply before checkpoint",
         "PbrAfter sends the reply first, so the client may have one that no backup knows of",
-        outcome(PbrAfter, "_checkpoint_and_reply", lambda effects: effects[-1:] + effects[:-1]),
+        outcome(PbrAfter, "checkpoint_then_reply", lambda effects: effects[-1:] + effects[:-1]),
         CRASH,
         crashes("pbr", "a/after"),
         "G3",
@@ -196,7 +167,7 @@ MECHANISMS: Final = (
     Mutant(
         "no dedupe",
         "Protocol executes what is asked again, though the reply is in its log",
-        wrapped(Protocol, "_admit", _log_ignored),
+        entered(Protocol, _LOG_IGNORED),
         CRASH,
         crashes("pbr", "a/protocol"),
         "G1",
@@ -204,7 +175,7 @@ MECHANISMS: Final = (
     Mutant(
         "dedupe from the stored reply only",
         "Protocol admits an id again while it is being executed",
-        _two_at_once(),
+        entered(Protocol, _TWO_AT_ONCE),
         OWN,
         _asked_meanwhile,
         "G1",
@@ -212,7 +183,7 @@ MECHANISMS: Final = (
     Mutant(
         "backup's reply not stored",
         "PbrAfter of the backup applies a checkpoint, and does not tell its Protocol of the reply in it",
-        outcome(PbrAfter, "_applied", lambda effects: effects[:1]),
+        outcome(PbrAfter, "store_reply", lambda effects: effects[:1]),
         CRASH,
         crashes("pbr", "a/protocol"),
         "G1",
@@ -220,7 +191,7 @@ MECHANISMS: Final = (
     Mutant(
         "checkpoint without state",
         "PbrAfter sends a checkpoint with the reply, and with no state",
-        outcome(PbrAfter, "_checkpoint_and_reply", _stateless),
+        outcome(PbrAfter, "checkpoint_then_reply", _stateless),
         CRASH,
         crashes("pbr", "a/proceed"),
         "G2",
@@ -236,7 +207,7 @@ MECHANISMS: Final = (
     Mutant(
         "checkpoint forgotten",
         "PbrAfter replies without any checkpoint, though there is a backup",
-        outcome(PbrAfter, "_checkpoint_and_reply", lambda effects: effects[-1:]),
+        outcome(PbrAfter, "checkpoint_then_reply", lambda effects: effects[-1:]),
         CRASH,
         crashes("pbr", "a/proceed"),
         "G3",
@@ -244,7 +215,7 @@ MECHANISMS: Final = (
     Mutant(
         "promoted before its channel is drained",
         "PbrAfter of the backup leads as soon as it is told to, with checkpoints in its channel",
-        _channel_not_drained(PbrAfter),
+        entered(PbrAfter, _CHECKPOINTS_NOT_DRAINED),
         OWN,
         lambda: _promoted_with_mail("pbr", "b/after", "checkpoint.sent"),
         "G3",
@@ -252,7 +223,7 @@ MECHANISMS: Final = (
     Mutant(
         "leads with requests forwarded",
         "LfrBefore of the follower leads as soon as it is told to, with requests in its channel",
-        _channel_not_drained(LfrBefore),
+        entered(LfrBefore, _REQUESTS_NOT_DRAINED),
         OWN,
         lambda: _promoted_with_mail("lfr", "b/before", "follower.notified"),
         "G3",
@@ -260,7 +231,7 @@ MECHANISMS: Final = (
     Mutant(
         "request not forwarded",
         "LfrBefore of the leader passes a request on, and its follower never has it",
-        outcome(LfrBefore, "_forward", lambda effects: effects[-2:]),
+        outcome(LfrBefore, "forward", lambda effects: effects[-2:]),
         CRASH,
         crashes("lfr", "a/before"),
         "G3",
@@ -268,7 +239,7 @@ MECHANISMS: Final = (
     Mutant(
         "forwarded after it was passed on",
         "LfrBefore of the leader has it executed first, so it may be answered and its follower not have it",
-        outcome(LfrBefore, "_forward", lambda effects: effects[2:] + effects[:2]),
+        outcome(LfrBefore, "forward", lambda effects: effects[2:] + effects[:2]),
         CRASH,
         crashes("lfr", "a/before"),
         "G3",
@@ -295,7 +266,7 @@ MECHANISMS: Final = (
         both(
             wrapped(Protocol, "step", _never_promoted),
             heard(Protocol, Request, lambda leading, msg: replace(msg, epoch=leading.epoch)),
-            wrapped(Proxy, "_reply", _any_epoch),
+            wrapped(Proxy, "which_reply", _any_epoch),
         ),
         CRASH,
         crashes("pbr", "a/after"),
@@ -304,7 +275,7 @@ MECHANISMS: Final = (
     Mutant(
         "epoch not taken over",
         "Proxy follows a new leader, and speaks to it under the epoch of the old one",
-        wrapped(Proxy, "_rebound", _old_epoch),
+        heard(Proxy, Rebound, lambda bound, msg: replace(msg, epoch=bound.epoch or msg.epoch)),
         CRASH,
         crashes("pbr", "a/proceed"),
         "G2",
@@ -352,7 +323,7 @@ MECHANISMS: Final = (
     Mutant(
         "third trial skipped",
         "TrAfter answers with the second trial where the first two differ",
-        wrapped(TrAfter, "_compare", _second_is_right),
+        instead(TrAfter, "vote", lambda self, msg: Vote.MAJORITY),
         OWN,
         lambda: _flips("lfr+tr", Place.RESULT, 0),
         "G4",
@@ -360,7 +331,7 @@ MECHANISMS: Final = (
     Mutant(
         "minority wins",
         "TrAfter answers with the trial that no other one is equal to",
-        wrapped(TrAfter, "_settle", _minority),
+        wrapped(TrAfter, "reply_by_third", _minority),
         OWN,
         lambda: _flips("tr", Place.RESULT, 0),
         "G4",

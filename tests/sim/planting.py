@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 import msgspec
 
 from aftbed.campaign import explore
-from aftbed.core.brick import Brick, Effect
+from aftbed.core.brick import Brick, Effect, Machine, Moves
 from aftbed.core.fault import Crash, Fault, Hang, Trigger
 from aftbed.core.messages import Goal, Scheduled
 from aftbed.core.valuefault import Bit, Flip, Place
@@ -45,29 +45,39 @@ class Mutant(NamedTuple):
 
 @contextmanager
 def _exchanged(owner: object, name: str, make: Callable[..., object]) -> Iterator[None]:
-    right = vars(owner)[name]
+    own = name in vars(owner)
+    right = getattr(owner, name)
     setattr(owner, name, make(right))
+    _fill(owner)
     try:
         yield
     finally:
-        setattr(owner, name, right)
+        if own:
+            setattr(owner, name, right)
+        else:
+            delattr(owner, name)
+        _fill(owner)
+
+
+def _fill(owner: object, rows: Moves | None = None) -> None:
+    """Have the tables of a Machine name its present methods, with `rows` in the place of those of MOVES."""
+    if isinstance(owner, type) and issubclass(owner, Machine):
+        for name, moves in owner.all_moves().items():
+            owner.TABLES[name].fill(owner, {**moves, **(rows or {})} if not name else moves)
 
 
 @contextmanager
-def _entered(table: dict[object, object], rows: dict[object, object]) -> Iterator[None]:
-    right = dict(table)
-    table.update(rows)
+def _entered(kind: type[Machine], rows: Moves) -> Iterator[None]:
+    _fill(kind, rows)
     try:
         yield
     finally:
-        table.clear()
-        table.update(right)
+        _fill(kind)
 
 
-def entered(table: object, rows: dict[object, object]) -> Plant:
-    """A table of a brick has these rows in the place of its own."""
-    assert isinstance(table, dict)
-    return lambda: _entered(table, rows)
+def entered(kind: type[Machine], rows: Moves) -> Plant:
+    """The table of a brick has these rows in the place of its own."""
+    return lambda: _entered(kind, rows)
 
 
 def wrapped(owner: object, name: str, make: Callable[..., object]) -> Plant:

@@ -144,8 +144,8 @@ def test_what_breaks_nothing_cannot_be_shrunk() -> None:
 class ReplyFirst(PbrAfter):
     """The reply before the checkpoint: a client may hold what the backup never knew."""
 
-    def _checkpoint_and_reply(self, msg: StateCaptured) -> list[Effect]:
-        return super()._checkpoint_and_reply(msg)[::-1]
+    def checkpoint_then_reply(self, msg: StateCaptured) -> list[Effect]:
+        return super().checkpoint_then_reply(msg)[::-1]
 
 
 def with_the_bug(spec: BrickSpec, setting: Setting) -> Brick:

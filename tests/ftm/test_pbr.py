@@ -98,7 +98,7 @@ def test_who_leads_is_not_promoted(capturing: bool) -> None:
     if capturing:
         brick.step("prd2aft", REPLY, 0)
     before = inspected(brick)
-    with pytest.raises(PeerError, match="promoted to epoch 2"):
+    with pytest.raises(PeerError, match="Promote on control while"):
         brick.step(CONTROL, Promote(2), 0)
     assert inspected(brick) == before
 
@@ -148,7 +148,7 @@ def test_the_restoring_of_another_request_is_refused() -> None:
 def test_promoted_it_drains_its_channel_to_the_end_before_it_leads() -> None:
     brick = backup()
     assert brick.step(CONTROL, Promote(2), 0) == []
-    assert brick.state is PbrAfterState.STANDBY and brick.open_ports() == ("aft2aft",)
+    assert brick.state is PbrAfterState.PROMOTED and brick.open_ports() == ("aft2aft",)
     brick.step("aft2aft", CHECKPOINT, 0)  # was still in the channel
     stored = brick.step("srv2aft", StateRestored(1, 7), 0)
     assert [type(m) for _, m in sends(stored)] == [StoreReply]
@@ -159,7 +159,7 @@ def test_promoted_it_drains_its_channel_to_the_end_before_it_leads() -> None:
 def test_the_channel_may_end_before_the_promotion() -> None:
     brick = backup()
     assert brick.step("aft2aft", ChannelEnded(), 0) == []
-    assert brick.state is PbrAfterState.STANDBY
+    assert brick.state is PbrAfterState.ENDED
     assert brick.step(CONTROL, Promote(2), 0) == [Send("aft2pro", TakeOver(2))]
 
 
@@ -169,7 +169,7 @@ def test_promoted_while_it_applies_a_checkpoint_it_waits_for_that_and_for_the_en
     assert brick.step(CONTROL, Promote(2), 0) == []
     applied = brick.step("srv2aft", StateRestored(1, 7), 0)
     assert notes(applied) == [Event.CHECKPOINT_APPLIED]
-    assert brick.state is PbrAfterState.STANDBY
+    assert brick.state is PbrAfterState.PROMOTED
     assert brick.step("aft2aft", ChannelEnded(), 0) == [Send("aft2pro", TakeOver(2))]
 
 
@@ -186,7 +186,7 @@ def test_it_leads_once() -> None:
     brick = backup()
     brick.step("aft2aft", ChannelEnded(), 0)
     brick.step(CONTROL, Promote(2), 0)
-    with pytest.raises(PeerError, match="promoted to epoch 3 while IDLE"):
+    with pytest.raises(PeerError, match="Promote on control while IDLE"):
         brick.step(CONTROL, Promote(3), 0)
 
 
