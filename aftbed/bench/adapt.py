@@ -16,12 +16,12 @@ from typing import Final
 from aftbed.bench.ring import ring_us
 from aftbed.bench.runs import cycles_us, finish, start
 from aftbed.bench.statistics import summary
-from aftbed.campaign.record import RunRecord
-from aftbed.core import check
 from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.core.journal import EntryKind
 from aftbed.core.messages import Goal
 from aftbed.core.script import RECIPES
+from aftbed.judge import checks
+from aftbed.judge.record import RunRecord
 from aftbed.runtime.unix import ask
 from aftbed.runtime.unix.options import LoadRun
 from aftbed.vehicle.aeb.function import default_application
@@ -79,7 +79,7 @@ def _times(outcomes: Outcomes) -> dict[str, object]:
 
 
 def _requests(records: list[RunRecord]) -> dict[str, int]:
-    counts = [check.requests(r.history, default_application()) for r in records]
+    counts = [checks.requests(r.history, default_application()) for r in records]
     return {
         "sent": sum(c.sent for c in counts),
         "lost": sum(c.lost for c in counts),
@@ -97,7 +97,7 @@ def _reordered(record: RunRecord) -> int:
 
 
 def _is_stuck(record: RunRecord) -> bool:
-    return check.requests(record.history, default_application()).lost > 0
+    return checks.requests(record.history, default_application()).lost > 0
 
 
 def _there_and_back(

@@ -12,8 +12,8 @@ from collections import Counter
 from pathlib import Path
 from typing import Final, Literal
 
-from aftbed.campaign import running
-from aftbed.campaign.planning import plan
+from aftbed.campaign import runner
+from aftbed.campaign.plan import plan
 from aftbed.campaign.spec import FaultEntry, Spec, Stop, System, check
 
 CRASH: Final = FaultEntry("crash primary", "crash primary at server.exit nth {nth}", draw={"nth": (1, 90)})
@@ -29,8 +29,8 @@ def bench_campaign(
     planned = plan(spec)
     with tempfile.TemporaryDirectory(prefix="aftbed-bench-") as folder:
         began_s, began_cpu_s = time.monotonic(), _cpu_s()
-        asked = running.Asked(Path(folder) / "campaign", jobs)
-        outcomes = Counter(result.outcome for result in running.run(planned, asked))
+        asked = runner.Asked(Path(folder) / "campaign", jobs)
+        outcomes = Counter(result.outcome for result in runner.run(planned, asked))
         seconds, cpu_s = time.monotonic() - began_s, _cpu_s() - began_cpu_s
     return {
         "ftm": ftm,

@@ -37,11 +37,11 @@ import msgspec
 
 from aftbed.bench.cycle import WARM_UP, path
 from aftbed.bench.runs import finish, start
-from aftbed.campaign.record import RunRecord
 from aftbed.core.errors import HarnessError
 from aftbed.core.events import Event
 from aftbed.core.graph import Graph
 from aftbed.ftm.compose import build
+from aftbed.judge.record import RunRecord
 from aftbed.runtime.unix.options import LoadRun
 
 PLACEMENT: Final = "process"

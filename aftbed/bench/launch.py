@@ -12,10 +12,10 @@ import time
 from pathlib import Path
 from typing import Final
 
-from aftbed.campaign.record import read_record
 from aftbed.campaign.statistics import quantile
 from aftbed.core.errors import HarnessError
 from aftbed.core.journal import EntryKind
+from aftbed.judge.record import read_record
 
 RUN_SECONDS_MAX: Final = 30.0
 

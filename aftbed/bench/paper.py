@@ -30,7 +30,7 @@ from aftbed.bench.placements import Cycle, Loaded, Placed, Times, times
 from aftbed.bench.recovery import bench_recovery
 from aftbed.bench.road import DECELERATION_MS2, SPEED_KMH
 from aftbed.bench.sweep import PLACEMENT, Sized, sized, sweep_sizes
-from aftbed.campaign.environment import here
+from aftbed.campaign.ledger import here
 from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.core.graph import PLACEMENTS
 from aftbed.core.script import RECIPES

@@ -6,7 +6,7 @@ from aftbed.bench.placements import Loaded, Placed, Times
 from aftbed.bench.published import Published
 from aftbed.bench.road import OnRoad, on_road
 from aftbed.bench.sweep import Sized
-from aftbed.campaign.environment import Environment
+from aftbed.campaign.ledger import Environment
 
 
 class Figure(msgspec.Struct, frozen=True):

@@ -17,11 +17,11 @@ from aftbed.bench.ring import ring_us
 from aftbed.bench.runs import finish, start
 from aftbed.bench.statistics import summary
 from aftbed.bench.usage import Usage, usage
-from aftbed.campaign.record import RunRecord
 from aftbed.campaign.statistics import quantile
 from aftbed.core.errors import HarnessError
 from aftbed.core.events import Event
 from aftbed.ftm.compose import build
+from aftbed.judge.record import RunRecord
 from aftbed.runtime.unix import ask
 from aftbed.runtime.unix.options import LoadRun
 

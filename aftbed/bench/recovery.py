@@ -10,9 +10,9 @@ from typing import Final
 
 from aftbed.bench.runs import finish, start
 from aftbed.bench.statistics import summary
-from aftbed.core.check import failovers
 from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.core.fault import Crash, Fault, Trigger
+from aftbed.judge.checks import failovers
 from aftbed.runtime.unix import ask
 from aftbed.runtime.unix.options import LoadRun
 

@@ -17,7 +17,7 @@ from typing import Final
 
 import msgspec
 
-from aftbed.campaign.residual import speed_left_ms
+from aftbed.search.road_table import speed_left_ms
 from aftbed.vehicle.plant import GRAVITY_MS2, KMH_PER_MS
 
 SPEED_KMH: Final = 50.0

@@ -1,9 +1,9 @@
 """Runs for a bench: a synthetic load, no car, and the record of it."""
 
-from aftbed.campaign.record import RunRecord, read_record
 from aftbed.core.errors import HarnessError
 from aftbed.core.events import Event
 from aftbed.core.fault import Fault
+from aftbed.judge.record import RunRecord, read_record
 from aftbed.runtime.unix.launch import Launched, launch, options_for
 from aftbed.runtime.unix.options import LoadRun
 

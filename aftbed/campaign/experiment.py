@@ -7,29 +7,42 @@ never a pass (G8).
 """
 
 import shlex
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from functools import lru_cache
 from typing import Final
 
 import msgspec
 
-from aftbed.core.check import Requests
-
-OUTCOMES: Final = (  # from the best to the worst
-    "masked",
-    "latent",  # a wrong state behind right replies
-    "tolerated",
-    "degraded",  # late replies, a recovery over its budget, or no redundancy at the end
-    "detected_stop",
-    "omission",  # requests without a reply, then replies again
-    "duplicate_effect",
-    "unavailable",  # no replica was left
-    "hang",  # a replica was left, and no reply came any more
-    "sdc",  # a wrong reply reached the client
-    "inconclusive",
-    "harness_error",
-)
-
-UNKNOWN: Final = ("inconclusive", "harness_error")  # nothing is known of the mechanism
-FAILED: Final = OUTCOMES[OUTCOMES.index("omission") : OUTCOMES.index("sdc") + 1]
+from aftbed.adapt.schedule import scheduled
+from aftbed.core.application import Application
+from aftbed.core.errors import ConfigError
+from aftbed.core.fault import FIRED, Fault
+from aftbed.core.graph import Graph
+from aftbed.core.history import History
+from aftbed.core.messages import Scheduled
+from aftbed.core.script import RECIPES
+from aftbed.ftm.compose import build
+from aftbed.inject.words import parse
+from aftbed.judge import checks
+from aftbed.judge.checks import Requests, half_a_graph
+from aftbed.judge.outcome import FAILED, OUTCOMES, UNKNOWN, outcome_of, worst
+from aftbed.judge.record import RunRecord, read_record
+from aftbed.judge.reference import bare_server
+from aftbed.judge.verdict import Breach, Verdict, expected_of, judge
+from aftbed.runtime import targets
+from aftbed.runtime.hosting import Hosted
+from aftbed.runtime.sim.world import Setup, simulate
+from aftbed.runtime.unix import linux, spawn
+from aftbed.runtime.unix.busaim import aim
+from aftbed.runtime.unix.launch import launch, options_for
+from aftbed.runtime.unix.options import CarRun, LoadRun, Work
+from aftbed.runtime.unix.pages import Area
+from aftbed.runtime.zygotes import BUS, LIGHT
+from aftbed.search.shrink import shrink
+from aftbed.vehicle.aeb.function import default_application
+from aftbed.vehicle.plant import VehicleResult
 
 
 class Experiment(msgspec.Struct, frozen=True):
@@ -108,6 +121,341 @@ def failed(result: Result) -> bool:
     return result.outcome in FAILED
 
 
-def worst(outcomes: list[str]) -> str:
-    """The worst of them; `masked` of none."""
-    return max(outcomes, key=OUTCOMES.index, default=OUTCOMES[0])
+# -- Whether the machine lets times mean anything: a probe beside each real experiment.
+#
+# Experiments side by side, or the neighbours of a virtual machine, can take the CPU away for longer than
+# any
+# mechanism needs to recover. So each worker measures, before and after each experiment, how late it wakes
+# from
+# sleeps of a millisecond, as a node does that waits for mail, and the supervisor of the run says how long
+# its
+# most unlucky node was ready to run and had no CPU. If either is far off, the experiment is marked as
+# noisy:
+# what depends on time in it is inconclusive, what does not (a wrong reply, a lost one) stands.
+
+
+SLEEP_SECONDS: Final = 0.001
+SLEEPS: Final = 5
+FACTOR: Final = 10.0
+LATE_MS_MIN: Final = 5.0  # a recovery takes about as long on a bad day: less is no excuse
+STARVED_MS_MIN: Final = 20.0  # in a run,
+STARVED_PART: Final = 0.05  # and more than so much of it
+
+
+def lateness_ms() -> float:
+    """How much longer than asked for the median sleep took."""
+    found = []
+    for _ in range(SLEEPS):
+        began_s = time.perf_counter()
+        time.sleep(SLEEP_SECONDS)
+        found.append((time.perf_counter() - began_s - SLEEP_SECONDS) * 1e3)
+    return sorted(found)[SLEEPS // 2]
+
+
+class Probe:
+    """Calibrated when it is made."""
+
+    def __init__(self) -> None:
+        self.quiet_ms = lateness_ms()
+
+    def noisy(self) -> bool:
+        """Whether it is now."""
+        return lateness_ms() > max(LATE_MS_MIN, FACTOR * self.quiet_ms)
+
+
+def starved(starved_ms: float, seconds: float) -> bool:
+    """Whether a node had to wait for a CPU for so long that the times of a run of `seconds` mean nothing."""
+    return starved_ms > max(STARVED_MS_MIN, STARVED_PART * seconds * 1e3)
+
+
+# -- One experiment carried out, on real processes or in the simulator, and its result.
+#
+# Trouble of the harness (a run that does not start, a supervisor that dies) is `harness_error`, a history
+# that is not whole is `inconclusive`: neither says anything of the mechanism. The result of a real run is
+# handed over *before* its record is torn down, so that a death in between costs a directory and no verdict.
+
+
+REASONS_MAX: Final = 3
+REASON_MAX: Final = 300  # characters
+TIMED: Final = ("degraded", "hang")  # classes that a slow machine alone can bring about
+UNEXCUSED: Final = ("one_master", "whole_graph", "clean_exit")  # checks that hold whatever the faults are
+RUN_SECONDS_MAX: Final = 60.0
+REQUESTS_PER_SECOND_MIN: Final = 100.0  # of a closed loop on a busy machine
+
+Keep = Callable[[Result], None]
+
+
+def carry_out(experiment: Experiment, keep: Keep) -> Result:
+    """Run it, and `keep` the result before anything of the run is taken down.
+
+    Whatever goes wrong in the run is an outcome, `harness_error`. What goes wrong in `keep` is raised.
+    """
+    began_s = time.monotonic()
+    with ExitStack() as standing:
+        try:
+            result = (_simulated if experiment.runtime == "sim" else _quietly)(experiment, standing)
+        except Exception as error:  # noqa: BLE001 - one experiment must not end a campaign
+            reason = f"{type(error).__name__}: {error}"[:REASON_MAX]
+            result = Result(experiment, "harness_error", activated=False, reasons=(reason,))
+        result = msgspec.structs.replace(result, seconds=round(time.monotonic() - began_s, 3))
+        keep(result)
+    return result
+
+
+def _quietly(experiment: Experiment, standing: ExitStack) -> Result:
+    """On real processes; without its times, where the machine was too busy for them."""
+    noisy = _probe().noisy()
+    result = _real(experiment, standing)
+    return without_times(result) if noisy or result.noisy or _probe().noisy() else result
+
+
+@lru_cache(maxsize=1)
+def _probe() -> Probe:
+    """Of this process."""
+    return Probe()
+
+
+@lru_cache(maxsize=2)
+def _warm_up(name: str) -> tuple[Area, ...]:
+    """Once in this process: its zygotes are forks of it."""
+    return spawn.warm_up(name)
+
+
+def without_times(result: Result) -> Result:
+    """What can be said of a run on a machine that was too busy."""
+    reasons = ("the machine was too busy for times to mean anything", *result.reasons)
+    false_alarm = result.outcome == "tolerated" and result.unexpected
+    outcome = "inconclusive" if result.outcome in TIMED or false_alarm else result.outcome
+    return msgspec.structs.replace(
+        result,
+        noisy=True,
+        outcome=outcome,
+        unexpected=result.unexpected and outcome == result.outcome,
+        reasons=reasons if outcome != result.outcome else result.reasons,
+        detected_ms=None,
+        recovery_ms=None,
+        blackout_ms=None,
+        adapt_blackout_ms=None,
+    )
+
+
+def faults_of(experiment: Experiment, graph: Graph) -> tuple[Fault, ...]:
+    """As values, checked. Raises ConfigError."""
+    work: Work = CarRun(experiment.scenario, None, "") if experiment.scenario else LoadRun(1, 0.0)
+    found = tuple(parse(text) for text in experiment.faults)
+    for fault in found:
+        targets.check(fault, graph)
+        aim(fault, work)
+    return found
+
+
+# -- the simulator --------------------------------------------------------------------------------
+
+
+def setup_of(experiment: Experiment) -> Setup:
+    """What the simulator makes of it. Raises ConfigError."""
+    faults, changes = _asked(experiment)
+    return Setup(
+        experiment.ftm,
+        experiment.placement,
+        experiment.seed,
+        experiment.requests,
+        experiment.rate_hz,
+        faults,
+        changes,
+        scenario=experiment.scenario,
+    )
+
+
+def _simulated(experiment: Experiment, standing: ExitStack) -> Result:
+    run = simulate(setup_of(experiment))
+    outcome, reasons = outcome_of(
+        run.history,
+        default_application,
+        lost=run.rest.lost,
+        living=run.rest.hosted,
+        digests=run.rest.states.values(),
+    )
+    reasons += tuple(f"an assertion failed: {failure}" for failure in run.failures)
+    broken = checks.one_master(run.history).reasons
+    if not run.rest.lost and not run.rest.why_not:
+        broken += tuple(half_a_graph(run.rest.hosted, expected_of(run)))
+    return _result(
+        experiment,
+        run.history,
+        (outcome, reasons),
+        broken,
+        run.faults,
+        default_application,
+        tuple(a.outcome for a in run.adaptations),
+        max((a.blackout_ms for a in run.adaptations), default=None),
+        run.vehicle,
+    )
+
+
+# -- real processes -------------------------------------------------------------------------------
+
+
+def _real(experiment: Experiment, standing: ExitStack) -> Result:
+    faults, changes = _asked(experiment)
+    work: Work = LoadRun(experiment.requests, experiment.rate_hz)
+    if experiment.scenario:
+        work = CarRun(experiment.scenario, None, "latch")
+    options, listener = options_for(
+        ftm=experiment.ftm,
+        placement=experiment.placement,
+        work=work,
+        seed=experiment.seed,
+        faults=faults,
+        adaptations=changes,
+    )
+    launched = launch(options, listener, _warm_up(BUS if experiment.scenario else LIGHT))
+    standing.callback(launched.remove)
+    silence_s = RUN_SECONDS_MAX + experiment.requests * (1 / (experiment.rate_hz or REQUESTS_PER_SECOND_MIN))
+    linux.set_timeouts(launched.line.sock, silence_s, silence_s)  # of a load, nothing is heard to its end
+    for _ in launched.reports():
+        pass
+    launched.wait()
+    return _judged(experiment, read_record(launched.record))
+
+
+def _judged(experiment: Experiment, record: RunRecord) -> Result:
+    verdict, bare = judge(record), bare_server(record)
+    end = record.end or {}
+    living = msgspec.convert(end["hosted"], Hosted) if "hosted" in end else None
+    states = msgspec.convert(end.get("states", {}), dict[str, str])
+    found = outcome_of(
+        record.history,
+        bare,
+        lost=_lost(end),
+        living=living,
+        digests=states.values(),
+        golden=bare().deterministic,
+    )
+    history = record.adaptations
+    blackouts = [float(str(a["blackout_ms"])) for a in history]
+    result = _result(
+        experiment,
+        record.history,
+        _honest(found, verdict),
+        tuple(reason for reason in verdict.reasons if reason.partition(":")[0] in UNEXCUSED),
+        tuple(verdict.faults),
+        bare,
+        tuple(str(a["outcome"]) for a in history),
+        max(blackouts, default=None),
+        verdict.vehicle,
+    )
+    noisy = starved(float(str(end.get("starved_ms", 0.0))), float(str(end.get("seconds", 0.0))))
+    return msgspec.structs.replace(result, noisy=noisy)
+
+
+def _lost(end: dict[str, object]) -> bool:
+    return bool(end.get("lost")) or not end.get("leader", "")
+
+
+def _honest(found: tuple[str, tuple[str, ...]], verdict: Verdict) -> tuple[str, tuple[str, ...]]:
+    """G8: what the harness does not know is worse than any outcome that it believes to have seen."""
+    unknown = {name for name, word in verdict.checks.items() if word == "unknown"} - {"faults_applied"}
+    if "clean_exit" in unknown:
+        return "harness_error", tuple(verdict.reasons)
+    if unknown and found[0] != "sdc":
+        return "inconclusive", tuple(verdict.reasons)
+    return found
+
+
+# -- both -----------------------------------------------------------------------------------------
+
+
+def _asked(experiment: Experiment) -> tuple[tuple[Fault, ...], tuple[Scheduled, ...]]:
+    graph = build(experiment.ftm, experiment.placement)
+    recipe = experiment.recipe or RECIPES[0]
+    return faults_of(experiment, graph), scheduled(experiment.adaptations, graph, recipe)
+
+
+def _result(
+    experiment: Experiment,
+    history: History,
+    found: tuple[str, tuple[str, ...]],
+    broken: tuple[str, ...],
+    faults: tuple[dict[str, str], ...],
+    function: Callable[[], Application],
+    adapted: tuple[str, ...],
+    adapt_blackout_ms: float | None,
+    vehicle: VehicleResult | None,
+) -> Result:
+    outcome, reasons = found
+    failovers = checks.failovers(history)
+    recovery_ms = _longest([f.recovered_ms for f in failovers])
+    if recovery_ms is not None and recovery_ms > (experiment.budget_ms or recovery_ms):
+        outcome = worst([outcome, "degraded"])
+        reasons = (f"recovery took {recovery_ms:g} ms, {experiment.budget_ms:g} are allowed", *reasons)
+    golden = golden_drive(experiment.scenario, experiment.seed) if vehicle is not None else None
+    if vehicle is not None and golden is not None and vehicle.collision and not golden.collision:
+        outcome = worst([outcome, "unavailable"])
+        reasons = (f"the car hit something at {vehicle.impact_speed_kmh} km/h", *reasons)
+    applied = all(f["receipt"] in FIRED for f in faults)
+    activated = applied and len(adapted) == len(experiment.adaptations)
+    return Result(
+        experiment,
+        outcome,
+        unexpected=activated and outcome not in (*(experiment.expected or OUTCOMES), *UNKNOWN),
+        activated=activated,
+        broken=tuple(reason[:REASON_MAX] for reason in broken[:REASONS_MAX]),
+        reasons=tuple(reason[:REASON_MAX] for reason in reasons[:REASONS_MAX]),
+        faults=faults,
+        requests=checks.requests(history, function()),
+        failovers=len(failovers),
+        detected_ms=_longest([f.detected_ms for f in failovers]),
+        recovery_ms=recovery_ms,
+        blackout_ms=_longest([f.blackout_ms for f in failovers]),
+        adapted=adapted,
+        adapt_blackout_ms=adapt_blackout_ms,
+        collision=vehicle.collision if vehicle is not None else None,
+        impact_kmh=vehicle.impact_speed_kmh if vehicle is not None else None,
+        gap_m=vehicle.stop_gap_m if vehicle is not None else None,
+        golden_gap_m=golden.stop_gap_m if golden is not None else None,
+    )
+
+
+@lru_cache(maxsize=256)
+def golden_drive(scenario: str, seed: int) -> VehicleResult | None:
+    """What the car does with the bare server, and no fault."""
+    return simulate(Setup("none", seed=seed, scenario=scenario)).vehicle
+
+
+def _longest(times: list[float | None]) -> float | None:
+    return max((t for t in times if t is not None), default=None)
+
+
+# -- The smallest experiment with the same outcome: `shrink`, told that an outcome is what is broken.
+
+
+def smallest(result: Result) -> Experiment:
+    """In the simulator. Raises ConfigError where the experiment does not come to the same there."""
+    first = msgspec.structs.replace(result.experiment, runtime="sim")
+    setup = setup_of(first)
+
+    def same(simpler: Setup) -> tuple[Breach, ...]:
+        found = carry_out(_as(first, simpler), lambda _: None)
+        return (Breach(found.outcome, "; ".join(found.reasons)),) if found.outcome == result.outcome else ()
+
+    if not same(setup):
+        raise ConfigError(
+            f"experiment {result.experiment.id}: the simulator does not come to {result.outcome} with it,"
+            " so it cannot be shrunk there: `aftbed campaign replay` runs it again as it was"
+        )
+    return _as(first, shrink(setup, same))
+
+
+def _as(first: Experiment, setup: Setup) -> Experiment:
+    """The words of `setup`."""
+    return msgspec.structs.replace(
+        first,
+        ftm=setup.ftm,
+        placement=setup.placement,
+        requests=setup.count,
+        rate_hz=setup.rate_hz,
+        scenario=setup.scenario,
+        faults=tuple(map(str, setup.faults)),
+        adaptations=first.adaptations if setup.adaptations else (),
+    )

@@ -31,11 +31,11 @@ from typing import Annotated, Final, Literal
 import msgspec
 from msgspec import Meta
 
-from aftbed.campaign.experiment import OUTCOMES
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.graph import PLACEMENTS
 from aftbed.core.script import RECIPES
 from aftbed.ftm.compose import EXPRESSIONS
+from aftbed.judge.outcome import OUTCOMES
 from aftbed.vehicle.scenarios.library import load_scenario
 from aftbed.vehicle.yamlfile import read_yaml
 

@@ -14,19 +14,21 @@ from typing import Final, Literal
 
 import msgspec
 
-from aftbed.campaign.experiment import OUTCOMES, UNKNOWN, Result, failed
-from aftbed.campaign.faultspace import Count, extrapolated
+from aftbed.campaign.experiment import Result, failed
 from aftbed.campaign.ledger import Ledger
-from aftbed.campaign.planning import population, strata_of
+from aftbed.campaign.plan import population, strata_of
 from aftbed.campaign.spec import ANY, Gate, Spec
 from aftbed.campaign.statistics import (
+    Count,
     Interval,
+    extrapolated,
     look_confidence,
     proportion,
     quantile,
     quantile_interval,
     quantile_needs,
 )
+from aftbed.judge.outcome import OUTCOMES, UNKNOWN
 
 Word = Literal["pass", "fail"]
 NOT_ACTIVATED: Final = "not_activated"

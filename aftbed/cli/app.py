@@ -38,7 +38,7 @@ Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and 
 
 def _version(asked: bool) -> None:
     if asked:
-        from aftbed.campaign.planning import code_version  # noqa: PLC0415 - for this alone
+        from aftbed.campaign.plan import code_version  # noqa: PLC0415 - for this alone
 
         typer.echo(f"aftbed {code_version()}")
         raise typer.Exit
@@ -136,9 +136,9 @@ def check(
     json: Json = False,
 ) -> None:
     """Judge a recorded run again."""
-    from aftbed.campaign.record import read_record  # noqa: PLC0415
-    from aftbed.campaign.verdict import EXIT_CODES, judge  # noqa: PLC0415
     from aftbed.cli.show import show_verdict  # noqa: PLC0415
+    from aftbed.judge.record import read_record  # noqa: PLC0415
+    from aftbed.judge.verdict import EXIT_CODES, judge  # noqa: PLC0415
 
     verdict = judge(read_record(record))
     show_verdict(verdict, as_json=json)

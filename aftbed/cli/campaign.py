@@ -131,7 +131,7 @@ def compare(base: Folder, new: Folder, json: Json = False) -> None:
 def assumptions(folder: Folder) -> None:
     """What each mechanism assumes, and what came of it where that does not hold, as Markdown."""
     from aftbed.campaign import ledger  # noqa: PLC0415
-    from aftbed.campaign.assumed import markdown  # noqa: PLC0415
+    from aftbed.campaign.assumptions import markdown  # noqa: PLC0415
 
     print(markdown(ledger.read(folder / ledger.NAME)), end="")
 

@@ -10,15 +10,14 @@ from typing import Final
 
 import msgspec
 
-from aftbed.campaign import ledger, running
-from aftbed.campaign.executing import carry_out
-from aftbed.campaign.experiment import Experiment, Result
+from aftbed.campaign import ledger, runner
+from aftbed.campaign.experiment import Experiment, Result, carry_out
 from aftbed.campaign.ledger import Ledger
-from aftbed.campaign.planning import Plan, plan
+from aftbed.campaign.plan import Plan, plan
 from aftbed.campaign.spec import EXPERIMENTS_MAX, Spec, check, read_spec, shipped
-from aftbed.campaign.verdict import EXIT_INTERRUPTED
 from aftbed.cli.simasked import jobs_of
 from aftbed.core.errors import ConfigError, unknown
+from aftbed.judge.verdict import EXIT_INTERRUPTED
 
 RUNTIMES: Final = ("unix", "sim")
 EXECUTORS: Final = ("local", "dask")
@@ -133,7 +132,7 @@ def run(changes: Changes, how: How, *, as_json: bool) -> int:
     return EXIT_INTERRUPTED if interrupted else code
 
 
-def _asked(found: Plan, how: How) -> running.Asked:
+def _asked(found: Plan, how: How) -> runner.Asked:
     if how.executor not in EXECUTORS:
         raise unknown("executor", how.executor, EXECUTORS)
     if (how.executor == "dask") != (how.scheduler is not None):
@@ -142,7 +141,7 @@ def _asked(found: Plan, how: How) -> running.Asked:
         raise ConfigError("--jobs: how many there are is the scheduler's to say")
     number, of = _shard(how.shard)
     folder = how.out if how.out is not None else Path(f"campaign-{found.spec.campaign}")
-    return running.Asked(folder, jobs_of(how.jobs), number, of, how.resume, how.scheduler or "")
+    return runner.Asked(folder, jobs_of(how.jobs), number, of, how.resume, how.scheduler or "")
 
 
 def _shard(text: str) -> tuple[int, int]:
@@ -153,11 +152,11 @@ def _shard(text: str) -> tuple[int, int]:
     return number, of
 
 
-def _follow(found: Plan, asked: running.Asked, *, as_json: bool) -> bool:
+def _follow(found: Plan, asked: runner.Asked, *, as_json: bool) -> bool:
     """Show results as they come; True if the user broke it off."""
     from aftbed.report.terminal import Progress  # noqa: PLC0415
 
-    results = running.run(found, asked)  # refuses what it refuses before anything is shown
+    results = runner.run(found, asked)  # refuses what it refuses before anything is shown
     todo = sum(asked.has(index, len(found.strata)) for index in range(found.size))
     try:
         with closing(results), Progress(found.spec.campaign, todo, quiet=as_json) as progress:
@@ -251,7 +250,7 @@ def _came(result: Result) -> str:
 
 def shrink(folder: Path, name: str, *, as_json: bool) -> int:
     """In the simulator, whatever it ran on: there a run is repeated to the last event."""
-    from aftbed.campaign.campaignshrink import smallest  # noqa: PLC0415
+    from aftbed.campaign.experiment import smallest  # noqa: PLC0415
 
     _, before = _one(folder, name)
     found: Experiment = smallest(before)

@@ -5,7 +5,7 @@ from pathlib import Path
 import msgspec
 
 from aftbed.campaign import ledger
-from aftbed.campaign.pairing import Change, compare
+from aftbed.campaign.compare import Change, compare
 
 
 def run(base: Path, new: Path, *, as_json: bool) -> int:

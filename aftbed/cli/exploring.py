@@ -6,14 +6,13 @@ from typing import Final
 
 import msgspec
 
-from aftbed.campaign.explore import PLACEMENTS, Broken, Explored, Selection, attempt, explore, selected
-from aftbed.campaign.simulated import Breach
-from aftbed.campaign.verdict import EXIT_CODES, EXIT_INTERRUPTED
 from aftbed.cli.simasked import jobs_of
 from aftbed.cli.simfailure import picture
 from aftbed.cli.simview import Bar, described, event_lines, spaced
 from aftbed.core.errors import ConfigError
+from aftbed.judge.verdict import EXIT_CODES, EXIT_INTERRUPTED, Breach
 from aftbed.runtime.sim.world import Setup
+from aftbed.search.explore import PLACEMENTS, Broken, Explored, Selection, attempt, explore, selected
 
 REQUESTS_MAX: Final = 1000
 LISTED_MAX: Final = 20  # of those that broke; --json lists all

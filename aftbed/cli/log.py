@@ -44,10 +44,10 @@ def export(
     trace: Annotated[Path | None, typer.Option(help="Write its nodes to this file, for Perfetto.")] = None,
 ) -> None:
     """Write the record of a run as files that other tools open."""
-    from aftbed.campaign.record import read_record  # noqa: PLC0415
     from aftbed.campaign.runfiles.export import Wanted, check  # noqa: PLC0415
     from aftbed.campaign.runfiles.export import export as exported  # noqa: PLC0415
     from aftbed.core.errors import ConfigError  # noqa: PLC0415
+    from aftbed.judge.record import read_record  # noqa: PLC0415
 
     wanted = Wanted(mcap, trace)
     if wanted == Wanted():

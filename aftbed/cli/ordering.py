@@ -5,13 +5,12 @@ from typing import Final
 
 import msgspec
 
-from aftbed.campaign.explore import selected
-from aftbed.campaign.orders import Ordered, experiments, explore_orders
-from aftbed.campaign.verdict import EXIT_CODES
 from aftbed.cli.exploring import REQUESTS_MAX, Asked
 from aftbed.cli.simasked import jobs_of
 from aftbed.cli.simview import Bar, described, spaced
 from aftbed.core.errors import ConfigError
+from aftbed.judge.verdict import EXIT_CODES
+from aftbed.search.explore import Ordered, experiments, explore_orders, selected
 
 BOUND_MAX: Final = 10_000_000
 

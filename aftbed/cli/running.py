@@ -91,9 +91,9 @@ def run(asked: Asked, *, as_json: bool) -> int:
     interrupted = _follow(launched, view, closed)
     launched.wait()
     # Not before: the processes that start have better use for the cores.
-    from aftbed.campaign.record import read_record  # noqa: PLC0415
-    from aftbed.campaign.verdict import EXIT_CODES, EXIT_INTERRUPTED, judge  # noqa: PLC0415
     from aftbed.cli.show import show_verdict  # noqa: PLC0415
+    from aftbed.judge.record import read_record  # noqa: PLC0415
+    from aftbed.judge.verdict import EXIT_CODES, EXIT_INTERRUPTED, judge  # noqa: PLC0415
 
     try:
         verdict = judge(read_record(launched.record))
@@ -118,8 +118,8 @@ def _write_files(asked: Asked, record: Path, *, as_json: bool) -> bool:
     """The files of `--mcap` and `--trace`; True if one could not be written: the verdict stands then, too."""
     if asked.mcap is None and asked.trace is None:
         return False
-    from aftbed.campaign.record import read_record  # noqa: PLC0415
     from aftbed.campaign.runfiles.export import Wanted, export  # noqa: PLC0415
+    from aftbed.judge.record import read_record  # noqa: PLC0415
 
     try:
         lines = export(read_record(record), Wanted(asked.mcap, asked.trace))

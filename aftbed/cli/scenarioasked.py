@@ -5,7 +5,6 @@ from typing import Final
 
 import msgspec
 
-from aftbed.campaign.roadtable import NONE, PRIMARY, Line, outage
 from aftbed.cli.running import SEED_MAX
 from aftbed.cli.simasked import jobs_of
 from aftbed.cli.simview import read_fault
@@ -16,6 +15,7 @@ from aftbed.core.words import milliseconds, whole_milliseconds
 from aftbed.ftm.compose import build
 from aftbed.inject.words import parse
 from aftbed.runtime import targets
+from aftbed.search.road_table import NONE, PRIMARY, Line, outage
 from aftbed.vehicle.scenarios.library import load_scenario
 from aftbed.vehicle.scenarios.tables import Case, cases
 

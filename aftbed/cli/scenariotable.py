@@ -7,13 +7,13 @@ from contextlib import closing
 from itertools import groupby
 from pathlib import Path
 
-from aftbed.campaign.roadtable import Row, driven, drives
-from aftbed.campaign.verdict import EXIT_INTERRUPTED
 from aftbed.cli import scenarioview
 from aftbed.cli.scenarioasked import Asked, Chosen, chosen
 from aftbed.cli.simview import Bar
 from aftbed.core.errors import ConfigError
+from aftbed.judge.verdict import EXIT_INTERRUPTED
 from aftbed.report.roadplot import Curve, Point, road_plot
+from aftbed.search.road_table import Row, driven, drives
 from aftbed.vehicle.scenarios import tables
 
 EXIT_PASS, EXIT_FAIL, EXIT_NO_FAULT = 0, 1, 3

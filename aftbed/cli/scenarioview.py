@@ -8,8 +8,8 @@ from typing import Final
 
 import msgspec
 
-from aftbed.campaign.roadtable import Line, Row
-from aftbed.campaign.worstinstant import STEP_CYCLES
+from aftbed.search.road_table import Line, Row
+from aftbed.search.worst_instant import STEP_CYCLES
 from aftbed.vehicle.plant import KMH_PER_MS, Lead
 from aftbed.vehicle.scenarios import tables
 from aftbed.vehicle.scenarios.library import load_scenario, scenario_names

@@ -2,7 +2,7 @@
 
 import msgspec
 
-from aftbed.campaign.verdict import Verdict
+from aftbed.judge.verdict import Verdict
 from aftbed.runtime.unix.closedloop import proposed_line
 
 

@@ -6,8 +6,8 @@ import msgspec
 from rich.console import Console
 from rich.table import Table
 
-from aftbed.campaign.agreement import Agreement, Times, against
-from aftbed.campaign.verdict import EXIT_CODES
+from aftbed.judge.verdict import EXIT_CODES
+from aftbed.search.agreement import Agreement, Times, against
 
 
 def run(records: tuple[Path, ...], seeds: int, *, as_json: bool) -> int:

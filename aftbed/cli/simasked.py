@@ -10,8 +10,6 @@ import msgspec
 from msgspec.structs import replace
 
 from aftbed.adapt import words
-from aftbed.campaign.agreement import SEEDS
-from aftbed.campaign.swarm import drawn
 from aftbed.cli.adaptation import scheduled
 from aftbed.cli.running import RATE_HZ_MAX, SEED_MAX
 from aftbed.cli.simview import read_fault
@@ -22,6 +20,8 @@ from aftbed.core.script import RECIPES
 from aftbed.ftm.compose import build
 from aftbed.runtime.sim.givens import check
 from aftbed.runtime.sim.world import Setup
+from aftbed.search.agreement import SEEDS
+from aftbed.search.swarm import drawn
 from aftbed.vehicle.scenarios.library import load_scenario
 
 COUNT_MAX: Final = 100_000

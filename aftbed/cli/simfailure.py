@@ -8,15 +8,15 @@ from typing import Final, NamedTuple
 
 from msgspec.structs import replace
 
-from aftbed.campaign.explore import attempt
-from aftbed.campaign.shrink import shrink
-from aftbed.campaign.simulated import Breach
 from aftbed.cli.simasked import DEFAULT, Asked, made_of
 from aftbed.cli.simview import adaptation_words, command, described
 from aftbed.core.errors import ConfigError
+from aftbed.judge.verdict import Breach
 from aftbed.report import sequence
 from aftbed.runtime.sim.tracing import traced
 from aftbed.runtime.sim.world import Setup
+from aftbed.search.explore import attempt
+from aftbed.search.shrink import shrink
 
 NO_COMMAND: Final = "(no command line says it: repeat the original)"
 

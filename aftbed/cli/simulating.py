@@ -14,19 +14,18 @@ from typing import Final
 
 import msgspec
 
-from aftbed.campaign.explore import CAR, Found, attempt, missed, tried
-from aftbed.campaign.simulated import ASSERT, REST, Breach, outcome
-from aftbed.campaign.verdict import EXIT_CODES, EXIT_INTERRUPTED, Verdict, Word
-from aftbed.campaign.workers import each
 from aftbed.cli import simagainst
 from aftbed.cli.show import show_verdict
 from aftbed.cli.simasked import Asked, Make, check_diagram, jobs_of, made_of, seeds_against, seeds_of
 from aftbed.cli.simfailure import Failure, again, failure, picture
 from aftbed.cli.simview import Bar, adaptation_lines, described, event_lines, spaced
-from aftbed.core import check
 from aftbed.core.valuefault import Flip
+from aftbed.judge import checks
+from aftbed.judge.verdict import ASSERT, EXIT_CODES, EXIT_INTERRUPTED, REST, Breach, Verdict, Word, outcome
 from aftbed.runtime.sim.clock import START_NS
 from aftbed.runtime.sim.world import Run, Setup
+from aftbed.runtime.unix.worker_pool import each
+from aftbed.search.explore import CAR, Found, attempt, missed, tried
 from aftbed.vehicle.aeb.function import default_application
 
 SHRUNK_MAX: Final = 3  # of many that broke: shrinking one takes up to 400 runs
@@ -93,9 +92,9 @@ def _verdict(done: Run, verdict: Word, reasons: tuple[str, ...]) -> Verdict:
         placement=setup.placement,
         scenario=setup.scenario or "load",
         verdict=verdict,
-        requests=check.requests(done.history, default_application()),
+        requests=checks.requests(done.history, default_application()),
         vehicle=done.vehicle,
-        failovers=check.failovers(done.history),
+        failovers=checks.failovers(done.history),
         checks={name: "fail" if name in broken else "pass" for name in _checked(done)},
         reasons=list(reasons),
         faults=list(done.faults),

@@ -16,11 +16,12 @@ import jinja2
 import msgspec
 from markupsafe import Markup
 
-from aftbed.campaign.experiment import OUTCOMES, Result
+from aftbed.campaign.experiment import Result
 from aftbed.campaign.ledger import Ledger
 from aftbed.campaign.spec import Gate, Spec
 from aftbed.campaign.statistics import Interval
 from aftbed.campaign.summary import Summary, confidence_of
+from aftbed.judge.outcome import OUTCOMES
 from aftbed.report import plots
 from aftbed.report.matrix import MEANINGS, Places, anchor_of, matrix, shares
 from aftbed.report.plots import Limit, milliseconds

@@ -9,10 +9,10 @@ from typing import Final
 
 import msgspec
 
-from aftbed.campaign.experiment import OUTCOMES
-from aftbed.campaign.planning import JOINED, strata_of
+from aftbed.campaign.plan import JOINED, strata_of
 from aftbed.campaign.spec import Spec
 from aftbed.campaign.summary import StratumSummary
+from aftbed.judge.outcome import OUTCOMES
 
 MEANINGS: Final = {
     "masked": "nobody could notice the fault",

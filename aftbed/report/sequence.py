@@ -12,11 +12,11 @@ import re
 from collections.abc import Iterable, Sequence
 from typing import Final, NamedTuple, assert_never
 
-from aftbed.campaign.simulated import Breach
 from aftbed.core.events import FIRST_FAULT, REQUEST_EVENTS, Event
 from aftbed.core.fault import Fault, marked
 from aftbed.core.journal import Entry, Record
 from aftbed.ftm.compose import build
+from aftbed.judge.verdict import Breach
 from aftbed.runtime.sim.tracing import STRUCK, Happening, Sent, Told, Trace, brief, digest, milliseconds
 
 LAST: Final = 40  # lines of a listing; arrows and notes of a diagram

@@ -11,9 +11,10 @@ from collections import Counter
 from types import TracebackType
 from typing import TYPE_CHECKING, Final, Self
 
-from aftbed.campaign.experiment import OUTCOMES, Result
+from aftbed.campaign.experiment import Result
 from aftbed.campaign.statistics import Interval
 from aftbed.campaign.summary import GateResult, StratumSummary, Summary, Times
+from aftbed.judge.outcome import OUTCOMES
 
 if TYPE_CHECKING:
     from rich.console import RenderableType

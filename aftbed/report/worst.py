@@ -14,9 +14,9 @@ from typing import Final
 
 import msgspec
 
-from aftbed.campaign.executing import carry_out, setup_of
-from aftbed.campaign.experiment import OUTCOMES, Experiment, Result
+from aftbed.campaign.experiment import Experiment, Result, carry_out, setup_of
 from aftbed.core.errors import AftbedError
+from aftbed.judge.outcome import OUTCOMES
 from aftbed.runtime.sim.tracing import Trace, traced
 
 REASON_MAX: Final = 300  # characters

@@ -5,7 +5,7 @@ from aftbed.bench.placements import Cycle, Loaded, Placed, times
 from aftbed.bench.published import CYCLE_PBR, Published
 from aftbed.bench.sweep import Sized
 from aftbed.bench.usage import Usage
-from aftbed.campaign.environment import Environment
+from aftbed.campaign.ledger import Environment
 
 USAGE = Usage(1.0, 17, 6, 13.15, 83.4, 7, 0.5, 26.6)
 TIMES = times([0.1, 0.2, 0.4])

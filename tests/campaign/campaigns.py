@@ -5,10 +5,10 @@ from typing import Final
 
 import msgspec
 
-from aftbed.campaign import ledger, running
+from aftbed.campaign import ledger, runner
 from aftbed.campaign.experiment import Experiment, Result
 from aftbed.campaign.ledger import Ledger
-from aftbed.campaign.planning import Plan, plan
+from aftbed.campaign.plan import Plan, plan
 from aftbed.campaign.spec import read_spec
 
 CRASHES: Final = """
@@ -43,7 +43,7 @@ def planned(folder: Path, text: str = CRASHES) -> Plan:
 
 def ran(found: Plan, out: Path, jobs: int = 1, **asked: object) -> Ledger:
     """Run it; its ledger."""
-    for _ in running.run(found, msgspec.structs.replace(running.Asked(out, jobs), **asked)):
+    for _ in runner.run(found, msgspec.structs.replace(runner.Asked(out, jobs), **asked)):
         pass
     return ledger.read(out / ledger.NAME)
 

@@ -6,13 +6,13 @@ from typing import Final
 
 import msgspec
 
-from aftbed.campaign.record import read_record
-from aftbed.campaign.verdict import Verdict, judge
 from aftbed.core.events import Event
 from aftbed.core.fault import Crash, Fault, Trigger
 from aftbed.core.journal import DROPPED_OFFSET, EntryKind
 from aftbed.core.valuefault import Bit, Flip, Place, flipped
 from aftbed.ftm.compose import build
+from aftbed.judge.record import read_record
+from aftbed.judge.verdict import Verdict, judge
 from aftbed.runtime.unix.journal import Dialogue, Journal
 from aftbed.runtime.unix.options import CarRun, LoadRun, RunOptions, Work
 from aftbed.vehicle.aeb.function import default_application, sample_requests

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from aftbed.campaign.course import Course, course_of
 from aftbed.runtime.sim.world import Setup
+from aftbed.search.worst_instant import Course, course_of
 
 SUDDEN = """
 description: a car that stands so near that full braking cannot wait for anything

@@ -6,7 +6,7 @@ import msgspec
 import pytest
 from campaigns import planned
 
-from aftbed.campaign.assumed import cells, markdown
+from aftbed.campaign.assumptions import cells, markdown
 from aftbed.campaign.experiment import Experiment, Result
 from aftbed.campaign.ledger import Ledger, head_of
 

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 import msgspec
 import pytest
 
-from aftbed.campaign.classify import golden_digest, outcome_of
-from aftbed.campaign.executing import carry_out
-from aftbed.campaign.experiment import OUTCOMES, Experiment, worst
-from aftbed.core.check import LATE_NS, History
+from aftbed.campaign.experiment import Experiment, carry_out
 from aftbed.core.events import Event
+from aftbed.core.history import History
 from aftbed.core.journal import Entry, EntryKind, Record
+from aftbed.judge.checks import LATE_NS
+from aftbed.judge.outcome import OUTCOMES, golden_digest, outcome_of, worst
 from aftbed.runtime.hosting import Hosted
 from aftbed.runtime.sim.world import Run, Setup, simulate
 from aftbed.vehicle.aeb.function import default_application

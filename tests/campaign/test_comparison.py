@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aftbed.campaign.comparison import mcnemar, paired_quantile_shift
+from aftbed.campaign.compare import mcnemar, paired_quantile_shift
 from aftbed.campaign.statistics import quantile
 from aftbed.core.errors import ConfigError
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from aftbed.campaign.workers import each
 from aftbed.core.errors import HarnessError
+from aftbed.runtime.unix.worker_pool import each
 
 LIMIT_S = 20.0  # what a machine under load may take for a failure that is due after one second
 
@@ -105,7 +105,7 @@ def test_a_worker_that_does_not_get_as_far_as_an_experiment_is_named() -> None:
 def test_one_that_does_not_take_what_it_is_given_is_named_and_not_waited_for(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("aftbed.campaign.workers.TALK_SECONDS_MAX", 0.5)
+    monkeypatch.setattr("aftbed.runtime.unix.worker_pool.TALK_SECONDS_MAX", 0.5)
     before, stops = workers(), Unpickled(signal.raise_signal, signal.SIGSTOP)
     with pytest.raises(HarnessError, match=r"experiment 0 hangs, after 0\.5 s there is no result"):
         list(each(stops, [bytes(30_000_000)], 1, fresh=True))

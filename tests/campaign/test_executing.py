@@ -5,9 +5,9 @@ import errno
 import msgspec
 import pytest
 
-from aftbed.campaign import executing
-from aftbed.campaign.executing import carry_out, golden_drive
-from aftbed.campaign.experiment import OUTCOMES, Experiment, Result
+from aftbed.campaign import experiment
+from aftbed.campaign.experiment import Experiment, Result, carry_out, golden_drive
+from aftbed.judge.outcome import OUTCOMES
 
 CALM = Experiment("0" * 16, 0, 0, "s", 5, "pbr", "process", "sim", "", 20, 400.0, ())
 DRIVE = msgspec.structs.replace(
@@ -27,7 +27,7 @@ def test_what_goes_wrong_in_keeping_is_raised() -> None:
 
 def test_an_error_of_any_kind_is_an_outcome(monkeypatch: pytest.MonkeyPatch) -> None:
     """A bug of ours in one experiment of ten thousand ends neither the campaign nor as a pass."""
-    monkeypatch.setattr(executing, "setup_of", lambda _: 1 // 0)
+    monkeypatch.setattr(experiment, "setup_of", lambda _: 1 // 0)
     kept: list[Result] = []
     result = carry_out(CALM, kept.append)
     assert (result.outcome, result.activated) == ("harness_error", False)

@@ -7,8 +7,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aftbed.campaign.faultspace import Count, Coverage, Stratum, coverage, extrapolated, extrapolated_sum
-from aftbed.campaign.statistics import Interval, proportion
+from aftbed.campaign.statistics import (
+    Count,
+    Coverage,
+    Interval,
+    Stratum,
+    coverage,
+    extrapolated,
+    extrapolated_sum,
+    proportion,
+)
 from aftbed.core.errors import ConfigError
 
 SEED: Final = 20261

@@ -3,8 +3,7 @@
 import pytest
 from campaigns import result
 
-from aftbed.campaign.executing import without_times
-from aftbed.campaign.noise import STARVED_MS_MIN, Probe, starved
+from aftbed.campaign.experiment import STARVED_MS_MIN, Probe, starved, without_times
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from campaigns import CRASHES, planned
 
-from aftbed.campaign.planning import population
+from aftbed.campaign.plan import population
 
 
 def test_strata_take_turns_through_their_matrices(tmp_path: Path) -> None:

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 from records import whole
 
-from aftbed.campaign.record import read_record
 from aftbed.core.errors import ConfigError
+from aftbed.judge.record import read_record
 from aftbed.runtime.unix.journal import Dialogue
 
 

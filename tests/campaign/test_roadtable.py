@@ -5,9 +5,9 @@ from typing import Final
 import pytest
 from msgspec.structs import replace
 
-from aftbed.campaign.roadtable import PRIMARY, Drive, Line, Row, drive, driven, drives, outage
 from aftbed.core.fault import Crash, Fault, Trigger
 from aftbed.inject.words import parse
+from aftbed.search.road_table import PRIMARY, Drive, Line, Row, drive, driven, drives, outage
 from aftbed.vehicle.scenarios.tables import Case, cases
 
 BARE: Final = Line("none", "none")

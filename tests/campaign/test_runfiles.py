@@ -11,7 +11,6 @@ from mcap.reader import make_reader
 from records import CAR, CRASH, MS, RecordInTheMaking
 from tracechecks import problems
 
-from aftbed.campaign.record import RunRecord, read_record
 from aftbed.campaign.runfiles import tracefile
 from aftbed.campaign.runfiles.axis import Axis
 from aftbed.campaign.runfiles.export import Wanted, check, export
@@ -19,6 +18,7 @@ from aftbed.campaign.runfiles.steps import between_processes, ends_ns, followed,
 from aftbed.core.errors import ConfigError
 from aftbed.core.events import Event
 from aftbed.core.journal import EntryKind
+from aftbed.judge.record import RunRecord, read_record
 from aftbed.runtime.unix.journal import Dialogue
 from aftbed.runtime.unix.options import CarRun, LoadRun, ReplayRun, Work
 from aftbed.vehicle.aeb.messages import AebInput, AebTarget, encode_request

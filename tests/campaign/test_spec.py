@@ -7,7 +7,7 @@ import msgspec
 import pytest
 from campaigns import CRASHES, planned, written
 
-from aftbed.campaign.planning import plan
+from aftbed.campaign.plan import plan
 from aftbed.campaign.spec import Spec, read_spec, shipped
 from aftbed.cli.campaigning import Changes, made
 from aftbed.core.errors import ConfigError

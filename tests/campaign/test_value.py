@@ -6,10 +6,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aftbed.campaign.value import corruptions, value
-from aftbed.core.check import REASONS_MAX, History, wrong_replies
+from aftbed.core.history import History
 from aftbed.core.journal import Entry, EntryKind
 from aftbed.core.valuefault import flipped
+from aftbed.judge.checks import REASONS_MAX, corruptions, value, wrong_replies
 from aftbed.vehicle.aeb.function import default_application, sample_requests
 from aftbed.vehicle.aeb.messages import AebOutput, encode_reply
 

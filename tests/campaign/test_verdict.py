@@ -7,10 +7,10 @@ import msgspec
 import pytest
 from records import CRASH, FLIP, RecordInTheMaking, whole
 
-from aftbed.campaign.record import read_record
-from aftbed.campaign.verdict import EXIT_CODES
 from aftbed.core.events import Event
 from aftbed.ftm.compose import build
+from aftbed.judge.record import read_record
+from aftbed.judge.verdict import EXIT_CODES
 from aftbed.runtime.unix.options import COMMAND_GONE
 from aftbed.runtime.unix.support import HISTORY_NAME
 

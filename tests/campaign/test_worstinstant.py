@@ -11,14 +11,24 @@ import pytest
 from msgspec.structs import replace
 from roads import near_course, sudden_course
 
-from aftbed.campaign import branching
-from aftbed.campaign.branching import Branch, branched
-from aftbed.campaign.course import Course, course_of, strike
-from aftbed.campaign.worstinstant import ANCHOR, STEP_CYCLES, coarse, harm, span, worst_instant
 from aftbed.core.errors import HarnessError
 from aftbed.core.fault import Action, Crash, Fault, Hang, Trigger
 from aftbed.inject.words import parse
 from aftbed.runtime.sim.world import Setup, simulate
+from aftbed.search import worst_instant as search_worst_instant
+from aftbed.search.worst_instant import (
+    ANCHOR,
+    STEP_CYCLES,
+    Branch,
+    Course,
+    branched,
+    coarse,
+    course_of,
+    harm,
+    span,
+    strike,
+    worst_instant,
+)
 
 NO_LOSS_M: Final = 0.05  # what a failover may take of the gap
 STEP_M: Final = 0.02  # a step of the brakes, at the speeds of these drives
@@ -148,8 +158,8 @@ def test_of_a_drive_without_a_target_all_is_searched() -> None:
 
 
 def test_a_copy_that_comes_to_no_end_is_killed_and_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(branching, "DECIDED_SECONDS_MAX", 0.05)
-    monkeypatch.setattr(branching, "_decided", lambda *_: signal.pause())
+    monkeypatch.setattr(search_worst_instant, "DECIDED_SECONDS_MAX", 0.05)
+    monkeypatch.setattr(search_worst_instant, "_decided", lambda *_: signal.pause())
     course = course_of(Setup("none", scenario="ccrs-20"))
     branch = Branch(500.0, Fault(Crash(), "primary", Trigger()))
     before = psutil.Process().children()
@@ -161,7 +171,7 @@ def test_a_copy_that_comes_to_no_end_is_killed_and_told(monkeypatch: pytest.Monk
 def test_a_copy_that_dies_says_why(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(branching, "_decided", lambda *_: 1 // 0)
+    monkeypatch.setattr(search_worst_instant, "_decided", lambda *_: 1 // 0)
     course = course_of(Setup("none", scenario="ccrs-20"))
     branch = Branch(500.0, Fault(Crash(), "primary", Trigger()))
     with pytest.raises(HarnessError, match="the copy of the simulator died, ccrs-20"):

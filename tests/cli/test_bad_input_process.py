@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from liveruns import Done, Home, aftbed
 
-from aftbed.campaign.planning import code_version
+from aftbed.campaign.plan import code_version
 
 pytestmark = pytest.mark.process
 

@@ -10,9 +10,9 @@ from typing import Final
 import pytest
 from playedrun import Call, Run
 
-from aftbed.campaign.explore import EXPLORERS, PLACEMENTS, selected
-from aftbed.campaign.simulated import Breach
+from aftbed.judge.verdict import Breach
 from aftbed.runtime.sim.world import Setup
+from aftbed.search.explore import EXPLORERS, PLACEMENTS, selected
 
 SMALL: Final = ("crash", "--ftm", "lfr", "--placement", "replica", "--requests", "1")
 
@@ -31,7 +31,7 @@ def broken(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[Setup], bool]
         def judged(setup: Setup) -> tuple[bool, tuple[Breach, ...]]:
             return False, (Breach("G1", "planted"),) if which(setup) else ()
 
-        monkeypatch.setattr("aftbed.campaign.explore.judged", judged)
+        monkeypatch.setattr("aftbed.search.explore.judged", judged)
 
     return breaks
 

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 from playedrun import Call
 
-from aftbed.campaign.agreement import Agreement, Times, apart
 from aftbed.cli import simagainst
+from aftbed.search.agreement import Agreement, Times, apart
 
 LFR = ("explore", "order", "--ftm", "lfr", "--placement", "replica")
 

@@ -13,14 +13,14 @@ import pytest
 from msgspec.structs import replace
 from playedrun import Call, Run
 
-from aftbed.campaign.explore import tried
-from aftbed.campaign.swarm import drawn
-from aftbed.campaign.workers import each
 from aftbed.cli import simulating
 from aftbed.cli.simfailure import repeating
 from aftbed.core.fault import Crash, Fault, Trigger
 from aftbed.core.messages import Goal, Scheduled
 from aftbed.runtime.sim.world import Doom, Setup
+from aftbed.runtime.unix.worker_pool import each
+from aftbed.search.explore import tried
+from aftbed.search.swarm import drawn
 
 FLIP: Final = ("--ftm", "pbr", "--count", "10", "--faults", "bitflip result bit 60 nth 3")  # no TR: sdc
 
@@ -147,7 +147,7 @@ def test_a_breakdown_of_the_executive_is_a_failure(sim: Call, monkeypatch: pytes
     def breaks_down(setup: Setup) -> None:
         raise KeyError("a/server")
 
-    monkeypatch.setattr("aftbed.campaign.explore.simulate", breaks_down)
+    monkeypatch.setattr("aftbed.search.explore.simulate", breaks_down)
     monkeypatch.setattr("aftbed.cli.simulating.failure", lambda *_, **__: None)
     code, out, _ = sim("--json")
     assert code == 1 and json.loads(out)["verdict"] == "fail"

@@ -2,11 +2,12 @@
 
 import zlib
 
-from aftbed.core import check
-from aftbed.core.check import Check, History
 from aftbed.core.errors import PeerError
 from aftbed.core.events import RERUN, Event
+from aftbed.core.history import History
 from aftbed.core.journal import Entry, EntryKind, Record
+from aftbed.judge import checks
+from aftbed.judge.checks import Check
 
 MS = 1_000_000
 FIRST_GENERATION = 1 << 8
@@ -98,8 +99,8 @@ def good() -> Tale:
 def judged(tale: Tale) -> dict[str, Check]:
     history = tale.history()
     return {
-        "at_most_once": check.at_most_once(history),
-        "exactly_one_answer": check.exactly_one_answer(history),
-        "one_history": check.one_history(history, Sums()),
-        "one_master": check.one_master(history),
+        "at_most_once": checks.at_most_once(history),
+        "exactly_one_answer": checks.exactly_one_answer(history),
+        "one_history": checks.one_history(history, Sums()),
+        "one_master": checks.one_master(history),
     }

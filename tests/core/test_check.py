@@ -8,9 +8,9 @@ from collections.abc import Callable
 import pytest
 from tales import Sums, Tale, good, judged
 
-from aftbed.core import check
-from aftbed.core.check import REASONS_MAX, Check
 from aftbed.core.events import Event
+from aftbed.judge import checks
+from aftbed.judge.checks import REASONS_MAX, Check
 
 
 def test_a_good_history_passes_every_check() -> None:
@@ -127,20 +127,20 @@ def test_a_broken_history_is_refused_by_its_check(
 def test_what_one_server_did_is_not_held_against_the_next() -> None:
     """The effect of a request that died with its replica was never applied to what goes on."""
     tale = Tale().served(1).sent(2).executed(2).fenced(1).promoted(2).executed(2, "b/server.1")
-    assert check.at_most_once(tale.history()) == Check("pass")
+    assert checks.at_most_once(tale.history()) == Check("pass")
     tale.executed(3, "a/server.1").executed(3, "a/server.2")
-    assert check.at_most_once(tale.history()) == Check("pass")
+    assert checks.at_most_once(tale.history()) == Check("pass")
 
 
 def test_a_rerun_stands_in_the_place_of_the_run_before_it() -> None:
     """A vote of two, a vote of three, and what follows: one effect for each request."""
     tale = Tale().sent(1).executed(1).rerun(1).sent(2).executed(2).rerun(2).rerun(2).executed(3)
-    assert check.at_most_once(tale.history()) == Check("pass")
+    assert checks.at_most_once(tale.history()) == Check("pass")
 
 
 def test_a_refusal_of_something_else_is_no_second_answer() -> None:
     tale = good().note("client.1", Event.PEER_REFUSED, 0).note("proxy.1", Event.PEER_REFUSED, 3)
-    assert check.exactly_one_answer(tale.history()) == Check("pass")
+    assert checks.exactly_one_answer(tale.history()) == Check("pass")
 
 
 def test_a_reply_that_was_on_its_way_may_be_accepted_behind_the_fence() -> None:
@@ -153,12 +153,12 @@ def test_a_reply_that_was_on_its_way_may_be_accepted_behind_the_fence() -> None:
 
 def test_epochs_without_a_reply_are_skipped() -> None:
     tale = Tale().served(1).fenced(1).promoted(2).fenced(2).promoted(3).served(2, epoch=3, replica=1)
-    assert check.one_master(tale.history()) == Check("pass")
+    assert checks.one_master(tale.history()) == Check("pass")
 
 
 def test_each_failover_needs_its_own_fence() -> None:
     tale = good().promoted(3).served(4, epoch=3, replica=1)
-    assert check.one_master(tale.history()).reasons == ("replica 2 was not fenced between epochs 2 and 3",)
+    assert checks.one_master(tale.history()).reasons == ("replica 2 was not fenced between epochs 2 and 3",)
 
 
 def test_an_empty_history_is_unknown_and_no_pass() -> None:
@@ -174,9 +174,9 @@ def test_the_first_few_reasons_are_given() -> None:
     tale = Tale()
     for number in range(1, 2 * REASONS_MAX):
         tale.sent(number)
-    assert len(check.exactly_one_answer(tale.history()).reasons) == REASONS_MAX
+    assert len(checks.exactly_one_answer(tale.history()).reasons) == REASONS_MAX
 
 
 def test_a_request_that_the_function_refuses_is_answered_with_nothing() -> None:
     tale = Tale().sent(1, b"").answered(1, payload=b"").served(2)
-    assert check.one_history(tale.history(), Sums()) == Check("pass")
+    assert checks.one_history(tale.history(), Sums()) == Check("pass")

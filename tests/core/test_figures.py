@@ -3,14 +3,15 @@
 import pytest
 from tales import MS, Sums, Tale, good
 
-from aftbed.core import check
-from aftbed.core.check import LATE_NS, Failover, History, Requests
 from aftbed.core.events import Event
+from aftbed.core.history import History
 from aftbed.core.journal import Entry, EntryKind, Record
+from aftbed.judge import checks
+from aftbed.judge.checks import LATE_NS, Failover, Requests
 
 
 def test_the_clients_account_of_a_good_history() -> None:
-    account = check.requests(good().history(), Sums())
+    account = checks.requests(good().history(), Sums())
     assert account == Requests(sent=3, answered=3, lost=0, duplicated=0, late=0, wrong=0)
 
 
@@ -19,12 +20,12 @@ def test_the_clients_account_of_a_bad_one() -> None:
     tale.sent(3).wait(LATE_NS / MS).answered(3, payload=b"wrong and late")
     tale.sent(4).answered(4, payload=b"").answered(4, payload=b"")  # wrong, twice
     tale.note("client.1", Event.PEER_REFUSED, 1)  # a second one, refused by the client
-    account = check.requests(tale.history(), Sums())
+    account = checks.requests(tale.history(), Sums())
     assert account == Requests(sent=4, answered=3, lost=1, duplicated=2, late=1, wrong=2)
 
 
 def test_an_answer_to_what_was_never_asked_makes_no_request_lost() -> None:
-    account = check.requests(good().answered(4, epoch=2).history(), Sums())
+    account = checks.requests(good().answered(4, epoch=2).history(), Sums())
     assert (account.sent, account.lost) == (3, 0)
 
 
@@ -34,7 +35,7 @@ def test_how_late_is_late(more_ns: int, late: int) -> None:
         Entry(5, 1, 0, EntryKind.SENT, b"request 1"),
         Entry(5 + LATE_NS + more_ns, 1, 1, EntryKind.ANSWERED, Sums().execute(b"request 1")),
     ]
-    assert check.requests(History({}, entries), Sums()).late == late
+    assert checks.requests(History({}, entries), Sums()).late == late
 
 
 def a_failover(*, fault: bool, alarm: bool = True) -> Tale:
@@ -52,7 +53,7 @@ def a_failover(*, fault: bool, alarm: bool = True) -> Tale:
 
 
 def test_the_times_of_a_failover_count_from_the_fault() -> None:
-    assert check.failovers(a_failover(fault=True).history()) == [
+    assert checks.failovers(a_failover(fault=True).history()) == [
         Failover(
             epoch=2,
             cause="fault",
@@ -66,12 +67,12 @@ def test_the_times_of_a_failover_count_from_the_fault() -> None:
 
 
 def test_without_a_fault_they_count_from_the_alarm() -> None:
-    (found,) = check.failovers(a_failover(fault=False).history())
+    (found,) = checks.failovers(a_failover(fault=False).history())
     assert (found.cause, found.detected_ms, found.fenced_ms, found.recovered_ms) == ("alarm", None, 1.0, 3.0)
 
 
 def test_without_fault_and_alarm_they_count_from_the_fence() -> None:
-    (found,) = check.failovers(a_failover(fault=False, alarm=False).history())
+    (found,) = checks.failovers(a_failover(fault=False, alarm=False).history())
     assert (found.cause, found.detected_ms, found.fenced_ms, found.recovered_ms) == (
         "unknown",
         None,
@@ -82,7 +83,7 @@ def test_without_fault_and_alarm_they_count_from_the_fence() -> None:
 
 def test_a_promotion_without_any_of_them_has_no_time_of_its_fence() -> None:
     """A broken history, but its figures are told beside the check that refuses it."""
-    (found,) = check.failovers(Tale().served(1).promoted(2).history())
+    (found,) = checks.failovers(Tale().served(1).promoted(2).history())
     assert (found.cause, found.fenced_ms, found.promoted_ms, found.recovered_ms) == (
         "unknown",
         None,
@@ -95,31 +96,31 @@ def test_a_request_that_came_later_did_not_wait_for_the_failover() -> None:
     tale = Tale().served(1).note("a/server.1", Event.FAULT_APPLIED)
     tale.note("a/watchdog.1", Event.WATCHDOG_SUSPECT).fenced(1).promoted(2).wait(100)
     tale.served(2, epoch=2, replica=2)
-    (found,) = check.failovers(tale.history())
+    (found,) = checks.failovers(tale.history())
     assert found.recovered_ms == 107.0, "the fault was that long ago"
     assert found.blackout_ms == 3.0, "but nobody waited"
 
 
 def test_a_failover_that_nobody_lived_to_use() -> None:
     tale = Tale().served(1).note("a/watchdog.1", Event.WATCHDOG_SUSPECT).fenced(1).promoted(2)
-    (found,) = check.failovers(tale.history())
+    (found,) = checks.failovers(tale.history())
     assert (found.promoted_ms, found.recovered_ms, found.blackout_ms) == (2.0, None, None)
 
 
 def test_an_old_fault_is_not_the_cause() -> None:
     tale = Tale().served(1).note("hub.1", Event.FAULT_APPLIED).wait(1001)
     tale.note("a/watchdog.1", Event.WATCHDOG_SUSPECT).fenced(1).promoted(2)
-    (found,) = check.failovers(tale.history())
+    (found,) = checks.failovers(tale.history())
     assert found.cause == "alarm"
 
 
 def test_each_failover_is_told_in_order() -> None:
     tale = a_failover(fault=True).fenced(2).promoted(3).served(3, epoch=3, replica=1)
-    assert [f.epoch for f in check.failovers(tale.history())] == [2, 3]
+    assert [f.epoch for f in checks.failovers(tale.history())] == [2, 3]
 
 
 def test_no_failover_no_figures() -> None:
-    assert check.failovers(Tale().served(1).history()) == []
+    assert checks.failovers(Tale().served(1).history()) == []
 
 
 def test_two_servers_in_one_node_are_two() -> None:
@@ -129,6 +130,6 @@ def test_two_servers_in_one_node_are_two() -> None:
         return Record(at, event, request_id, 0, "single", brick)
 
     sound = [record(1, Event.SERVER_EXIT, 1, 4), record(2, Event.STATE_RESTORED, 1, 9)]
-    assert check.at_most_once(History({"single.1": sound}, [])).finding == "pass"
+    assert checks.at_most_once(History({"single.1": sound}, [])).finding == "pass"
     broken = [*sound, record(3, Event.SERVER_EXIT, 1, 9)]
-    assert check.at_most_once(History({"single.1": broken}, [])).finding == "fail"
+    assert checks.at_most_once(History({"single.1": broken}, [])).finding == "fail"

@@ -8,12 +8,12 @@ import pytest
 import typer
 from pages import PAGES, ROOT, anchors, blocks, links, names, prose, sections, table
 
-from aftbed.campaign.verdict import EXIT_CODES, EXIT_INTERRUPTED
 from aftbed.cli.app import app
 from aftbed.core.events import BY_LABEL, REQUEST_PATH
 from aftbed.core.graph import PLACEMENTS
 from aftbed.ftm.compose import EXPRESSIONS, build
 from aftbed.ftm.registry import EMITTERS
+from aftbed.judge.verdict import EXIT_CODES, EXIT_INTERRUPTED
 from aftbed.runtime import targets
 from aftbed.vehicle.can.candump import Refusal
 from aftbed.vehicle.can.dbc_file import load_dbc

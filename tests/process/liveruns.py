@@ -29,11 +29,11 @@ from homes import (
     until,
 )
 
-from aftbed.campaign.record import RunRecord, read_record
-from aftbed.campaign.verdict import Verdict, judge
 from aftbed.core.errors import ConfigError
 from aftbed.core.fault import Fault
 from aftbed.core.journal import EntryKind, entries
+from aftbed.judge.record import RunRecord, read_record
+from aftbed.judge.verdict import Verdict, judge
 from aftbed.runtime.unix import ask, rundir
 from aftbed.runtime.unix.launch import launch, options_for
 from aftbed.runtime.unix.options import LoadRun, Work

@@ -15,13 +15,13 @@ import pytest
 from liveruns import Command, Done, Home, Started, aftbed, state_of, under_load, until
 from sampling import sampled
 
-from aftbed.campaign.record import RunRecord, read_record
-from aftbed.campaign.verdict import Verdict
 from aftbed.core.events import Event
 from aftbed.core.graph import PLACEMENTS
 from aftbed.core.journal import Record
 from aftbed.ftm.compose import EXPRESSIONS, replication_of
 from aftbed.inject.words import parse
+from aftbed.judge.record import RunRecord, read_record
+from aftbed.judge.verdict import Verdict
 from aftbed.runtime.unix import ask, rundir
 from aftbed.runtime.unix.options import LoadRun
 

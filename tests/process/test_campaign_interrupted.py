@@ -13,8 +13,8 @@ import pytest
 from liveruns import GONE_SECONDS_MAX, WAIT_SECONDS_MAX, Home, until
 
 from aftbed.campaign import ledger
-from aftbed.campaign.verdict import EXIT_INTERRUPTED
-from aftbed.campaign.workers import RUN_END_SECONDS_MAX
+from aftbed.judge.verdict import EXIT_INTERRUPTED
+from aftbed.runtime.unix.worker_pool import RUN_END_SECONDS_MAX
 
 pytestmark = pytest.mark.process
 

@@ -10,8 +10,8 @@ import pytest
 from liveruns import aftbed
 from sampling import every
 
-from aftbed.campaign.verdict import Verdict
 from aftbed.core.events import REQUEST_PATH
+from aftbed.judge.verdict import Verdict
 
 pytestmark = pytest.mark.process
 

@@ -10,8 +10,8 @@ import pytest
 from liveruns import Done, aftbed
 from sampling import sampled
 
-from aftbed.campaign.record import read_record
 from aftbed.core.journal import EntryKind
+from aftbed.judge.record import read_record
 from aftbed.vehicle.aeb.messages import decode_reply
 from aftbed.vehicle.scenarios.library import scenario_names
 

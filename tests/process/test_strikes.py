@@ -26,13 +26,13 @@ from test_adaptations import (
     whole,
 )
 
-from aftbed.campaign.explore import WHEN, Strike, strikes
 from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.core.events import Event
 from aftbed.core.fault import Crash, Fault, Trigger
 from aftbed.core.messages import Goal
 from aftbed.runtime.targets import STAGED
 from aftbed.runtime.unix import ask
+from aftbed.search.explore import WHEN, Strike, strikes
 
 pytestmark = pytest.mark.process
 

@@ -6,11 +6,10 @@ from typing import Final
 import pytest
 from liveruns import aftbed
 
-from aftbed.campaign.course import course_of
-from aftbed.campaign.roadtable import PRIMARY, repeat
-from aftbed.campaign.worstinstant import worst_instant
 from aftbed.core.fault import Action, Crash, Hang
 from aftbed.runtime.sim.world import Setup
+from aftbed.search.road_table import PRIMARY, repeat
+from aftbed.search.worst_instant import course_of, worst_instant
 from aftbed.vehicle.plant import VehicleResult
 
 pytestmark = pytest.mark.process

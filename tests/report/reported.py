@@ -6,10 +6,8 @@ from typing import Final
 import msgspec
 from campaigns import planned, result
 
-from aftbed.campaign.environment import Environment
-from aftbed.campaign.executing import carry_out
-from aftbed.campaign.experiment import Result
-from aftbed.campaign.ledger import Ledger, head_of
+from aftbed.campaign.experiment import Result, carry_out
+from aftbed.campaign.ledger import Environment, Ledger, head_of
 from aftbed.campaign.spec import Gate
 from aftbed.campaign.summary import Summary, summarise
 

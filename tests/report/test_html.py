@@ -11,9 +11,9 @@ import pytest
 from campaigns import result
 from reported import HOSTILE, MACHINE, hostile, summary_of, with_results
 
-from aftbed.campaign.experiment import OUTCOMES
 from aftbed.campaign.ledger import Ledger
 from aftbed.campaign.spec import Gate
+from aftbed.judge.outcome import OUTCOMES
 from aftbed.report.html import DRAWN_MAX, html_report, percent
 from aftbed.report.worst import by_badness
 

@@ -4,12 +4,12 @@ import re
 
 import pytest
 
-from aftbed.campaign.simulated import Breach
-from aftbed.campaign.swarm import drawn
 from aftbed.core.fault import Crash, Fault, Trigger
+from aftbed.judge.verdict import Breach
 from aftbed.report.sequence import escaped, mermaid, text
 from aftbed.runtime.sim.tracing import Trace, traced
 from aftbed.runtime.sim.world import Setup
+from aftbed.search.swarm import drawn
 
 CRASH = Fault(Crash(), "primary", Trigger("checkpoint.sent", 2))
 LOST = Breach("G2", "request 2: 0 replies")

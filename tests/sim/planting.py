@@ -10,12 +10,12 @@ from typing import Final, NamedTuple
 
 import msgspec
 
-from aftbed.campaign import explore
 from aftbed.core.brick import Brick, Effect, Machine, Moves
 from aftbed.core.fault import Crash, Fault, Hang, Trigger
 from aftbed.core.messages import Goal, Scheduled
 from aftbed.core.valuefault import Bit, Flip, Place
 from aftbed.runtime.sim.world import Setup
+from aftbed.search import explore
 
 Plant = Callable[[], AbstractContextManager[object]]
 Setups = Callable[[], Iterable[Setup]]

@@ -5,8 +5,7 @@ import pytest
 from executivemutants import EXECUTIVE
 from mutants import MECHANISMS
 
-from aftbed.campaign.executing import carry_out
-from aftbed.campaign.experiment import Experiment, Result
+from aftbed.campaign.experiment import Experiment, Result, carry_out
 
 MUTANTS = {mutant.name: mutant for mutant in (*MECHANISMS, *EXECUTIVE)}
 CALM = Experiment("0" * 16, 0, 0, "s", 5, "pbr", "process", "sim", "", 40, 400.0, ())

@@ -4,13 +4,13 @@ from typing import Final
 
 import pytest
 
-from aftbed.campaign.shrink import shrink
-from aftbed.campaign.simulated import Breach
 from aftbed.core.errors import ConfigError
 from aftbed.core.events import Event
 from aftbed.core.journal import EntryKind
 from aftbed.inject.words import parse
+from aftbed.judge.verdict import Breach
 from aftbed.runtime.sim.world import Run, Setup, World, simulate
+from aftbed.search.shrink import shrink
 
 DRIVE: Final = "ccrs-20"
 HELD_US: Final = 2_000_000  # ttc < 2 in this drive: at 20 km/h, 11.1 m before the obstacle

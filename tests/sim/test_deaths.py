@@ -17,13 +17,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from aftbed.campaign.simulated import breaches
-from aftbed.core import check
 from aftbed.core.events import Event
 from aftbed.core.fault import FIRED, Crash, Fault, Trigger
 from aftbed.core.journal import EntryKind
 from aftbed.core.valuefault import EXECUTED, Bit, Flip, Place
 from aftbed.ftm.compose import EXPRESSIONS, build, chain, parse, replication_of
+from aftbed.judge import checks
+from aftbed.judge.verdict import breaches
 from aftbed.runtime.sim.clock import Clock
 from aftbed.runtime.sim.processes import Process
 from aftbed.runtime.sim.world import Doom, Run, Setup, World
@@ -215,7 +215,7 @@ def test_without_a_mechanism_against_it_a_value_fault_reaches_the_client(ftm: st
     """What the tests above do is done: where nothing is there to find it, it is found by the check."""
     fault = Fault(Flip(Place.RESULT, Bit(0)), "primary", Trigger(Event.SERVER_EXIT.label, 2))
     _, run = played(Setup(ftm, count=3, faults=(fault,)))
-    assert check.wrong_replies(run.history, Counting()) == [2]
+    assert checks.wrong_replies(run.history, Counting()) == [2]
 
 
 @pytest.mark.parametrize("ftm", (*EXPRESSIONS, *NESTED))

@@ -6,9 +6,9 @@ from typing import Final
 import pytest
 from planting import adapted, crash_after
 
-from aftbed.campaign.simulated import breaches
 from aftbed.core import script
 from aftbed.core.messages import Goal, Scheduled
+from aftbed.judge.verdict import breaches
 from aftbed.runtime.rewiring import Told, Wires
 from aftbed.runtime.sim.world import Setup, simulate
 

@@ -4,11 +4,11 @@ from typing import Final
 
 import pytest
 
-from aftbed.campaign.explore import attempt
 from aftbed.core.fault import Crash, Disturb, Fault, Hang, How, Trigger
 from aftbed.core.messages import Goal, Scheduled
 from aftbed.core.valuefault import Bit, Flip, Place
 from aftbed.runtime.sim.world import Setup
+from aftbed.search.explore import attempt
 
 AT_MS: Final = 5.0
 

@@ -21,9 +21,9 @@ import pytest
 from counting import Counting
 from whiteboard import Whiteboard
 
-from aftbed.core import check
 from aftbed.core.messages import Goal, NodeDied
 from aftbed.inject.words import parse
+from aftbed.judge import checks
 from aftbed.runtime.sim.node import Node
 from aftbed.runtime.sim.processes import Process
 
@@ -92,10 +92,10 @@ class Stage:
     def _judge(self) -> None:
         history = self.world.outcome().history
         judges = {
-            "at_most_once": check.at_most_once(history),
-            "exactly_one_answer": check.exactly_one_answer(history),
-            "one_history": check.one_history(history, Counting()),
-            "one_master": check.one_master(history),
+            "at_most_once": checks.at_most_once(history),
+            "exactly_one_answer": checks.exactly_one_answer(history),
+            "one_history": checks.one_history(history, Counting()),
+            "one_master": checks.one_master(history),
         }
         for name, found in judges.items():
             self.world.said.append(f"{name}: {'; '.join((found.finding, *found.reasons))}")

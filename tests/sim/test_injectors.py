@@ -9,12 +9,12 @@ from typing import Final
 
 import pytest
 
-from aftbed.campaign.value import corruptions
 from aftbed.core.events import Event
 from aftbed.core.fault import marked
 from aftbed.core.journal import EntryKind
 from aftbed.core.messages import Goal, Scheduled
 from aftbed.inject.words import parse
+from aftbed.judge.checks import corruptions
 from aftbed.runtime import targets
 from aftbed.runtime.sim.givens import graph_of
 from aftbed.runtime.sim.world import Run, Setup, World

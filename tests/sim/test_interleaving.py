@@ -6,15 +6,15 @@ from random import Random
 import pytest
 
 from aftbed.adapt.bricks import make_brick
-from aftbed.campaign.orders import all_orders, experiments
-from aftbed.campaign.simulated import breaches
 from aftbed.core.brick import Brick, Effect, Note
 from aftbed.core.graph import BrickSpec
 from aftbed.core.messages import AnyMessage
 from aftbed.ftm.registry import Setting
+from aftbed.judge.verdict import breaches
 from aftbed.runtime.sim.clock import Clock
 from aftbed.runtime.sim.interleaving import Chooser, HeldChannel, orders
 from aftbed.runtime.sim.world import Doom, Setup, World
+from aftbed.search.explore import all_orders, experiments
 
 
 @pytest.mark.parametrize(

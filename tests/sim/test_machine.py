@@ -16,7 +16,6 @@ from hypothesis import Phase, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from aftbed.campaign.simulated import breaches
 from aftbed.core.errors import ConfigError
 from aftbed.core.events import Event
 from aftbed.core.fault import Crash, Fault, Hang, Trigger
@@ -24,6 +23,7 @@ from aftbed.core.journal import EntryKind
 from aftbed.core.messages import Goal, NodeDied
 from aftbed.core.valuefault import EXECUTED, Bit, Flip, Place
 from aftbed.ftm.compose import EXPRESSIONS, NONE, parse, replication_of
+from aftbed.judge.verdict import breaches
 from aftbed.runtime.rewiring import replica_of
 from aftbed.runtime.sim.processes import Process
 from aftbed.runtime.sim.world import Setup, World

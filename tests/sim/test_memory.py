@@ -4,9 +4,9 @@ from typing import Final
 
 import pytest
 
-from aftbed.campaign.value import corruptions
 from aftbed.core.events import Event
 from aftbed.inject.words import parse
+from aftbed.judge.checks import corruptions
 from aftbed.runtime import targets
 from aftbed.runtime.sim.givens import graph_of
 from aftbed.runtime.sim.world import Run, Setup, World

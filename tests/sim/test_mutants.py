@@ -12,10 +12,10 @@ from executivemutants import EXECUTIVE
 from mutants import MECHANISMS
 from planting import EXPLORERS, Mutant, flip, instead
 
-from aftbed.campaign.simulated import Breach, breaches
 from aftbed.core.events import Event
 from aftbed.core.valuefault import Place
 from aftbed.ftm import lfr
+from aftbed.judge.verdict import Breach, breaches
 from aftbed.runtime.sim.world import Setup, simulate
 
 MUTANTS: Final = (*MECHANISMS, *EXECUTIVE)

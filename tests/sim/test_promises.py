@@ -1,6 +1,6 @@
 """The judgement over simulated runs: it passes an unbroken one, and refuses each that is broken in one thing.
 
-Which histories the checkers of `core.check` refuse is shown in `test_check`. Here is what the simulator asks
+`test_check` shows which histories the checkers of `judge.checks` refuse. Here is what the simulator checks
 beside them: whether what lives is the whole graph, whether the run came to rest, whether a loss is excused.
 """
 
@@ -11,14 +11,13 @@ import pytest
 from msgspec.structs import replace
 from planting import flip
 
-from aftbed.campaign.simulated import ASSERT, REST, breaches, outcome, struck_down
-from aftbed.campaign.wholeness import half_a_graph
-from aftbed.core.check import missing
 from aftbed.core.events import Event
 from aftbed.core.journal import Entry, EntryKind, Record
 from aftbed.core.script import ScriptKind
 from aftbed.core.valuefault import Place
 from aftbed.ftm.compose import build
+from aftbed.judge.checks import half_a_graph, missing
+from aftbed.judge.verdict import ASSERT, REST, breaches, outcome, struck_down
 from aftbed.runtime.adaptations import Outcome
 from aftbed.runtime.conductor import ScriptRun
 from aftbed.runtime.sim.world import Run, Setup, simulate

@@ -8,9 +8,6 @@ from msgspec import json
 from msgspec.structs import replace
 
 from aftbed.adapt.engine import AdaptationEngine
-from aftbed.campaign.shrink import shrink
-from aftbed.campaign.simulated import Breach, breaches
-from aftbed.campaign.swarm import drawn, experiments
 from aftbed.core.brick import Brick, Effect
 from aftbed.core.fault import Crash, Fault, Hang, Trigger
 from aftbed.core.graph import BrickSpec
@@ -18,7 +15,10 @@ from aftbed.core.messages import Goal, Scheduled, StateCaptured
 from aftbed.core.valuefault import Flip, Place
 from aftbed.ftm.pbr import PbrAfter
 from aftbed.ftm.registry import Setting, make
+from aftbed.judge.verdict import Breach, breaches
 from aftbed.runtime.sim.world import Doom, Setup, World
+from aftbed.search.shrink import shrink
+from aftbed.search.swarm import drawn, experiments
 
 Broken = Callable[[Setup], tuple[Breach, ...]]
 

@@ -6,11 +6,11 @@ from typing import Final
 import pytest
 import versions
 
-from aftbed.campaign.simulated import breaches
-from aftbed.campaign.succession import succession
-from aftbed.core.check import wrong_replies
 from aftbed.core.fault import Crash, Fault, Trigger
 from aftbed.core.messages import Goal, Scheduled
+from aftbed.judge.checks import wrong_replies
+from aftbed.judge.reference import succession
+from aftbed.judge.verdict import breaches
 from aftbed.runtime.sim.world import Doom, Run, Setup, World
 from aftbed.runtime.unix.part import load_module
 from aftbed.vehicle.aeb.function import default_application

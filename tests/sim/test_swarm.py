@@ -8,9 +8,6 @@ from statistics import mean
 import pytest
 from msgspec import json
 
-from aftbed.campaign import swarm
-from aftbed.campaign.explore import attempt
-from aftbed.campaign.swarm import drawn, experiments
 from aftbed.core.events import Event
 from aftbed.core.fault import Crash, Disturb, Hang, Slow
 from aftbed.core.valuefault import Flip
@@ -18,6 +15,9 @@ from aftbed.ftm.compose import build, parse, replication_of
 from aftbed.runtime import targets
 from aftbed.runtime.rewiring import replica_of
 from aftbed.runtime.sim.world import Setup, simulate
+from aftbed.search import swarm
+from aftbed.search.explore import attempt
+from aftbed.search.swarm import drawn, experiments
 
 DRAWN = 3_000
 RUN = range(40)

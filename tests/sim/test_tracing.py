@@ -7,11 +7,11 @@ import sys
 
 import pytest
 
-from aftbed.campaign.swarm import drawn
 from aftbed.core.fault import Crash, Fault, Trigger
 from aftbed.core.messages import Checkpoint, Goal, Scheduled, Trials, Tried
 from aftbed.runtime.sim.tracing import Sent, brief, lines, milliseconds, traced
 from aftbed.runtime.sim.world import Setup, simulate
+from aftbed.search.swarm import drawn
 
 CRASH = Fault(Crash(), "primary", Trigger("checkpoint.sent", 5))
 FAILOVER = Setup("pbr", "process", 3, 30, 1000.0, (CRASH,), (Scheduled(Goal(expression="lfr+tr"), 20),))
@@ -19,7 +19,7 @@ SWARM = range(8)
 HASH_SEEDS = ("0", "1", "12345")
 HASHED = f"""
 import hashlib
-from aftbed.campaign.swarm import drawn
+from aftbed.search.swarm import drawn
 from aftbed.runtime.sim.tracing import lines, traced
 found = hashlib.sha256()
 for seed in {SWARM!r}:

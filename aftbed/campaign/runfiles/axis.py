@@ -18,9 +18,9 @@ from bisect import bisect_right
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from aftbed.campaign.record import RunRecord
 from aftbed.core.errors import PeerError
 from aftbed.core.journal import EntryKind
+from aftbed.judge.record import RunRecord
 from aftbed.runtime.unix.options import LoadRun
 from aftbed.vehicle.aeb.messages import AebInput, decode_request
 

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import msgspec
 
-from aftbed.campaign.record import RunRecord
 from aftbed.campaign.runfiles import mcapfile, tracefile
 from aftbed.core.errors import ConfigError
+from aftbed.judge.record import RunRecord
 from aftbed.vehicle.logs.convert import written
 
 

@@ -12,10 +12,10 @@ from enum import Enum
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from aftbed.campaign.record import RunRecord
 from aftbed.core.events import FIRST_FAULT, REQUEST_EVENTS, STEP_EVENTS, Event
 from aftbed.core.fault import marked
 from aftbed.core.journal import Record
+from aftbed.judge.record import RunRecord
 
 DUE: Final = "an adaptation is due"  # its trigger is armed as a fault is
 TOLD_NAME: Final = "events.jsonl"

@@ -27,7 +27,6 @@ from typing import Final, NamedTuple
 import msgspec
 from msgspec import UNSET
 
-from aftbed.campaign.record import RunRecord
 from aftbed.campaign.runfiles.axis import Axis, asked_in
 from aftbed.campaign.runfiles.happened import Kind, journals, kind_of, told_in, words_of
 from aftbed.campaign.runfiles.topics import (
@@ -44,6 +43,7 @@ from aftbed.campaign.runfiles.topics import (
     schema_of,
 )
 from aftbed.core.errors import ConfigError, PeerError
+from aftbed.judge.record import RunRecord
 from aftbed.runtime.unix.options import CarRun, ReplayRun
 from aftbed.vehicle.aeb.messages import AebInput
 from aftbed.vehicle.can.candump import LogCounts, LogFrame, parse_lines

@@ -15,9 +15,9 @@ from collections import defaultdict
 from collections.abc import Iterator
 from typing import Final, NamedTuple
 
-from aftbed.campaign.record import RunRecord
 from aftbed.campaign.runfiles.happened import Kind, journals, kind_of
 from aftbed.core.events import Event
+from aftbed.judge.record import RunRecord
 
 LEAST_NS, MOST_NS = 1_000, 200_000
 LED_TO: Final[dict[tuple[Event, Event], str]] = {  # the cause, what followed: the channel

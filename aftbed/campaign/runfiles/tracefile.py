@@ -15,11 +15,11 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Final
 
-from aftbed.campaign.record import RunRecord
 from aftbed.campaign.runfiles.happened import Kind, journals, kind_of, told_in, words_of
 from aftbed.campaign.runfiles.steps import Step, between_processes, ends_ns, followed, steps_of
 from aftbed.core.events import Event
 from aftbed.core.journal import EntryKind
+from aftbed.judge.record import RunRecord
 
 Value = str | int | float | dict[str, "Value"] | list["Value"]
 TraceEvent = dict[str, Value]

@@ -14,9 +14,9 @@ import msgspec
 from aftbed.adapt.bricks import LoadModule
 from aftbed.core.application import Application
 from aftbed.core.busfault import BusFault, Condition, Struck
-from aftbed.core.check import History
 from aftbed.core.fault import Fault, FlipMemory
 from aftbed.core.graph import Graph, Link
+from aftbed.core.history import History
 from aftbed.core.journal import Entry, EntryKind, Record
 from aftbed.core.messages import Goal, Scheduled
 from aftbed.core.valuefault import Flip

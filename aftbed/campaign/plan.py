@@ -19,17 +19,12 @@ import msgspec
 
 import aftbed
 from aftbed.adapt.schedule import scheduled
-from aftbed.campaign.experiment import Experiment
+from aftbed.campaign.experiment import Experiment, faults_of
 from aftbed.campaign.spec import ANY, AdaptationEntry, FaultEntry, Spec, System, Value
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.fault import Fault, FlipMemory
-from aftbed.core.graph import Graph
 from aftbed.ftm.compose import build
 from aftbed.inject.parts import refuse_unsafe
-from aftbed.inject.words import parse
-from aftbed.runtime import targets
-from aftbed.runtime.unix.busaim import aim
-from aftbed.runtime.unix.options import CarRun, LoadRun, Work
 
 ID_DIGITS: Final = 16
 SEED_BITS: Final = 31
@@ -170,16 +165,6 @@ def population(entry: FaultEntry) -> int:
     found = points(entry)
     for low, high in entry.draw.values():
         found *= high - low + 1
-    return found
-
-
-def faults_of(experiment: Experiment, graph: Graph) -> tuple[Fault, ...]:
-    """As values, checked. Raises ConfigError."""
-    work: Work = CarRun(experiment.scenario, None, "") if experiment.scenario else LoadRun(1, 0.0)
-    found = tuple(parse(text) for text in experiment.faults)
-    for fault in found:
-        targets.check(fault, graph)
-        aim(fault, work)
     return found
 
 

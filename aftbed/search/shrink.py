@@ -26,12 +26,12 @@ from typing import Final, TypeVar
 from msgspec import json
 from msgspec.structs import replace
 
-from aftbed.campaign.simulated import Breach
 from aftbed.core.errors import ConfigError
 from aftbed.core.fault import Fault, Hang, Slow
 from aftbed.core.messages import Scheduled
 from aftbed.core.valuefault import Flip
 from aftbed.ftm.compose import build, parse, replication_of
+from aftbed.judge.verdict import Breach
 from aftbed.runtime import targets
 from aftbed.runtime.sim.givens import check
 from aftbed.runtime.sim.world import Doom, Setup

@@ -7,6 +7,7 @@ has a broken history in the tests that it must refuse.
 
 from collections import Counter, defaultdict
 from collections.abc import Iterable
+from itertools import starmap
 from typing import Final, Literal
 
 import msgspec
@@ -14,26 +15,19 @@ import msgspec
 from aftbed.core.application import Application
 from aftbed.core.errors import PeerError
 from aftbed.core.events import RERUN, Event
+from aftbed.core.fault import FIRED
 from aftbed.core.graph import Graph
+from aftbed.core.history import History
 from aftbed.core.journal import Entry, EntryKind, Record
+from aftbed.core.valuefault import BITFLIP
+from aftbed.ftm.compose import build, replication_of
+from aftbed.runtime.hosting import Hosted
+from aftbed.vehicle.aeb.messages import AebOutput, decode_reply
 
 REASONS_MAX: Final = 5
 LATE_NS: Final = 60_000_000  # as long as the brake ECU holds the last request
 
 Finding = Literal["pass", "fail", "unknown"]
-
-
-class History(msgspec.Struct, frozen=True):
-    """`journals` maps the name of each journal to its records, in their order."""
-
-    journals: dict[str, list[Record]]
-    dialogue: list[Entry]
-    dropped: int = 0  # records that found no room: what they told is not known
-
-    def events(self, *wanted: Event) -> list[Record]:
-        """The records of these events, of all nodes, by time."""
-        found = [r for records in self.journals.values() for r in records if r.event in wanted]
-        return sorted(found, key=lambda record: record.t_ns)
 
 
 class Check(msgspec.Struct, frozen=True):
@@ -241,3 +235,84 @@ def missing(hosted: Iterable[tuple[str, str]], whole: Graph) -> list[str]:
     found, wanted = Counter(hosted), Counter((b.name, b.kind) for b in whole.bricks)
     reasons = [f"{name} ({kind}) is missing" for name, kind in sorted(wanted - found)]
     return reasons + [f"{name} ({kind}) should not be there" for name, kind in sorted(found - wanted)]
+
+
+# -- G4: a value fault never reaches the client. And where one does: what it asks the brakes for.
+#
+# Judged by the replies alone, whatever mechanism there was: only TR promises it, without TR a flipped bit
+# is expected to come through, as silent data corruption (sdc). A run without a flipped bit proves nothing.
+
+
+def value(history: History, bare: Application, faults: list[dict[str, str]]) -> Check | None:
+    """The check, by the receipts of a run; None where no value fault was asked for. `bare` is a fresh one."""
+    flips = [f for f in faults if f["fault"].split()[0] == BITFLIP]
+    if not flips:
+        return None
+    wrong = corruptions(history, bare)
+    if wrong:
+        return Check("fail", tuple(wrong[:REASONS_MAX]))
+    if not any(f["receipt"] in FIRED for f in flips):
+        return Check("unknown", ("no value fault was applied",))
+    return Check("pass")
+
+
+def corruptions(history: History, bare: Application) -> list[str]:
+    """Each reply that is not the bare server's, and what it says instead; in the order of the requests."""
+    answers: dict[int, list[bytes]] = defaultdict(list)
+    for entry in history.dialogue:
+        if entry.kind is EntryKind.ANSWERED:
+            answers[entry.request_id].append(entry.payload)
+    found = []
+    for entry in history.dialogue:
+        if entry.kind is EntryKind.SENT:
+            try:
+                right = bare.execute(entry.payload)
+            except PeerError:
+                right = b""
+            wrong = next((a for a in answers[entry.request_id] if a != right), None)
+            if wrong is not None:
+                found.append(f"request {entry.request_id}: sdc: {_difference(wrong, right)}")
+    return found
+
+
+def _difference(wrong: bytes, right: bytes) -> str:
+    """What the brake ECU is asked for, and what it should have been asked for."""
+    expected, found = _read(right), _read(wrong)
+    if expected is None or found is None:
+        return f"{_text(found, wrong)} instead of {_text(expected, right)}"
+    fields = [(f, getattr(found, f), getattr(expected, f)) for f in AebOutput.__struct_fields__]
+    differing = [(f, a, b) for f, a, b in fields if a != b]
+    said = starmap("{} {} instead of {}".format, differing)
+    return ", ".join(said) or f"the same demand in other bytes ({wrong.hex()})"
+
+
+def _read(reply: bytes) -> AebOutput | None:
+    try:
+        return decode_reply(reply)
+    except PeerError:
+        return None
+
+
+def _text(output: AebOutput | None, reply: bytes) -> str:
+    if output is None:
+        return f"what is no demand ({reply.hex() or 'empty'})"
+    return f"stage {output.stage} at {output.deceleration_ms2} m/s2"
+
+
+# -- G5: what lives at the end of a run is a whole graph, the one to which its adaptations came.
+#
+# "An adaptation either completes or leaves the graph that was there: never half of one" (design 3). Of a
+# run
+# that ended before redundancy was back, the backup's bricks are not asked for.
+
+
+def half_a_graph(hosted: Hosted, expected: str) -> list[str]:
+    """What is missing, or should not be there, where `expected` is the FTM that should run; [] if whole."""
+    if not hosted.leader:
+        return ["nobody leads"]
+    if hosted.ftm != expected:
+        return [f"{hosted.ftm} runs, though the adaptations came to {expected}"]
+    duplex = bool(replication_of(expected))
+    whole = build(expected, hosted.placement, hosted.leader if duplex else "a")
+    joining = "" if hosted.backup or not duplex else ("b" if hosted.leader == "a" else "a")
+    return [r for r in missing(hosted.bricks, whole) if not joining or not r.startswith(f"{joining}/")]

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import msgspec
 
-from aftbed.core.check import History
 from aftbed.core.errors import ConfigError, PeerError
+from aftbed.core.history import History
 from aftbed.core.journal import dropped, entries, records
 from aftbed.runtime.unix.journal import contents
 from aftbed.runtime.unix.options import RunOptions

@@ -18,7 +18,7 @@ from aftbed.adapt.bricks import load_application
 from aftbed.adapt.plan import APPLICATION
 from aftbed.adapt.suitability import AMPLE, FaultModel, problems
 from aftbed.adapt.words import read
-from aftbed.campaign.experiment import FAILED, UNKNOWN, Result
+from aftbed.campaign.experiment import Result
 from aftbed.campaign.ledger import Ledger
 from aftbed.campaign.statistics import Interval, proportion
 from aftbed.core.application import Application, Characteristics
@@ -26,6 +26,7 @@ from aftbed.core.fault import Action, Crash, FlipMemory, Hang
 from aftbed.core.persistence import Permanent
 from aftbed.core.valuefault import Flip
 from aftbed.inject.words import parse
+from aftbed.judge.outcome import FAILED, UNKNOWN
 from aftbed.runtime.unix.part import load_module
 from aftbed.vehicle.aeb.function import default_application
 

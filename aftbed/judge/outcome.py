@@ -11,18 +11,40 @@ from collections.abc import Callable, Iterable
 from typing import Final
 
 from aftbed.adapt.observer import VOTE_MASKED
-from aftbed.campaign.experiment import OUTCOMES, worst
-from aftbed.campaign.value import corruptions
-from aftbed.core import check
 from aftbed.core.application import Application
-from aftbed.core.check import History, Requests
 from aftbed.core.errors import PeerError
 from aftbed.core.events import Event
+from aftbed.core.history import History
 from aftbed.core.journal import EntryKind
 from aftbed.ftm.compose import replication_of
+from aftbed.judge import checks
+from aftbed.judge.checks import Requests, corruptions
 from aftbed.runtime.hosting import Hosted, digest
 
+OUTCOMES: Final = (  # from the best to the worst
+    "masked",
+    "latent",  # a wrong state behind right replies
+    "tolerated",
+    "degraded",  # late replies, a recovery over its budget, or no redundancy at the end
+    "detected_stop",
+    "omission",  # requests without a reply, then replies again
+    "duplicate_effect",
+    "unavailable",  # no replica was left
+    "hang",  # a replica was left, and no reply came any more
+    "sdc",  # a wrong reply reached the client
+    "inconclusive",
+    "harness_error",
+)
+
+UNKNOWN: Final = ("inconclusive", "harness_error")  # nothing is known of the mechanism
+FAILED: Final = OUTCOMES[OUTCOMES.index("omission") : OUTCOMES.index("sdc") + 1]
+
 ACTED: Final = (Event.RECOVERY_ENTER, Event.ADAPT_ROLLBACK)
+
+
+def worst(outcomes: list[str]) -> str:
+    """The worst of them; `masked` of none."""
+    return max(outcomes, key=OUTCOMES.index, default=OUTCOMES[0])
 
 
 def outcome_of(
@@ -38,13 +60,13 @@ def outcome_of(
 
     Not `golden`: the function is not deterministic, so nobody can say what it should have answered.
     """
-    counts = check.requests(history, function())
+    counts = checks.requests(history, function())
     found: dict[str, str] = {}
     wrong = corruptions(history, function()) if golden else []
     if wrong:
         found["sdc"] = wrong[0]
     unanswered(history, counts, found, lost=lost)
-    doubled = check.at_most_once(history).reasons
+    doubled = checks.at_most_once(history).reasons
     if doubled or counts.duplicated:
         found["duplicate_effect"] = doubled[0] if doubled else f"doubled replies: {counts.duplicated}"
     if history.events(Event.DETECTED_STOP):

@@ -16,11 +16,10 @@ from pathlib import Path
 import msgspec
 
 from aftbed.campaign import ledger
-from aftbed.campaign.executing import REQUESTS_PER_SECOND_MIN, carry_out
-from aftbed.campaign.experiment import Experiment, Result
-from aftbed.campaign.planning import Plan
-from aftbed.campaign.workers import SECONDS_MAX, each
+from aftbed.campaign.experiment import REQUESTS_PER_SECOND_MIN, Experiment, Result, carry_out
+from aftbed.campaign.plan import Plan
 from aftbed.core.errors import ConfigError
+from aftbed.runtime.unix.worker_pool import SECONDS_MAX, each
 
 
 class Asked(msgspec.Struct, frozen=True):
@@ -48,9 +47,9 @@ def run(plan: Plan, asked: Asked) -> Generator[Result, None, None]:
             f"--shard: stop.{key} looks at all results, a shard sees only its own: leave it out"
         )
     if asked.scheduler:
-        from aftbed.campaign import dasked  # noqa: PLC0415 - an extra
+        from aftbed.campaign import dask  # noqa: PLC0415 - an extra
 
-        dasked.connect(asked.scheduler).close()  # before anything is written
+        dask.connect(asked.scheduler).close()  # before anything is written
     path = asked.out / ledger.NAME
     head = ledger.head_of(plan, asked.shard, asked.shards)
     if asked.resume:
@@ -89,12 +88,12 @@ def performed(todo: Iterator[Experiment], path: Path, asked: Asked, plan: Plan) 
         for _, _, result in each(perform, todo, asked.jobs, seconds_max=_seconds_max(plan), fresh=fresh):
             yield result
         return
-    from aftbed.campaign import dasked  # noqa: PLC0415 - an extra
+    from aftbed.campaign import dask  # noqa: PLC0415 - an extra
 
     descriptor = ledger.opened(path)
     try:
-        with dasked.connect(asked.scheduler) as client:
-            for result in dasked.over(client, todo):
+        with dask.connect(asked.scheduler) as client:
+            for result in dask.over(client, todo):
                 ledger.append(descriptor, result)
                 yield result
     finally:

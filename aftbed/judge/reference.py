@@ -16,11 +16,11 @@ from typing import Final
 import msgspec
 
 from aftbed.adapt.bricks import load_application
-from aftbed.campaign.record import RunRecord
 from aftbed.core.application import Application
-from aftbed.core.check import History
 from aftbed.core.errors import PeerError
 from aftbed.core.events import Event
+from aftbed.core.history import History
+from aftbed.judge.record import RunRecord
 from aftbed.runtime.rewiring import replica_of
 from aftbed.runtime.unix.part import load_module
 from aftbed.vehicle.aeb.function import default_application

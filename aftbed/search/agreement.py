@@ -14,12 +14,13 @@ from typing import Final
 
 import msgspec
 
-from aftbed.campaign.record import RunRecord, read_record
-from aftbed.campaign.simulated import class_of
-from aftbed.campaign.succession import bare_server
-from aftbed.core import check
+from aftbed.core import history as core_history
 from aftbed.core.errors import ConfigError
 from aftbed.core.messages import Scheduled
+from aftbed.judge import checks
+from aftbed.judge.record import RunRecord, read_record
+from aftbed.judge.reference import bare_server
+from aftbed.judge.verdict import class_of
 from aftbed.runtime.sim.world import Setup, simulate
 from aftbed.runtime.unix.options import CarRun, LoadRun
 from aftbed.vehicle.aeb.function import default_application
@@ -99,8 +100,8 @@ def _compare(setup: Setup, records: list[RunRecord], seeds: int) -> Agreement:
     )
 
 
-def _recoveries(history: check.History) -> list[float]:
-    return [f.recovered_ms for f in check.failovers(history) if f.recovered_ms is not None]
+def _recoveries(history: core_history.History) -> list[float]:
+    return [f.recovered_ms for f in checks.failovers(history) if f.recovered_ms is not None]
 
 
 def _times(found: list[float]) -> Times | None:

@@ -16,9 +16,8 @@ from typing import TYPE_CHECKING, Final
 
 import msgspec
 
-from aftbed.campaign.executing import carry_out
-from aftbed.campaign.experiment import Experiment, Result
-from aftbed.campaign.planning import code_version
+from aftbed.campaign.experiment import Experiment, Result, carry_out
+from aftbed.campaign.plan import code_version
 from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.runtime.unix import linux
 
@@ -39,7 +38,7 @@ def perform(task: bytes) -> Answer:
     experiment = msgspec.json.decode(task, type=Experiment)
     if experiment.runtime == "sim":
         return code_version(), msgspec.json.encode(carry_out(experiment, lambda _: None))
-    command = [sys.executable, "-P", "-m", "aftbed.campaign.dasked", str(os.getpid())]
+    command = [sys.executable, "-P", "-m", "aftbed.campaign.dask", str(os.getpid())]
     done = subprocess.run(command, input=task, capture_output=True, timeout=RUN_SECONDS_MAX, check=False)
     if done.returncode != 0:
         raise HarnessError(f"a worker could not run {experiment.id}: {done.stderr.decode()[-500:]}")
