@@ -1,13 +1,13 @@
-"""The command line: parses, prints, and turns a verdict into an exit code. Imports lazily."""
+"""The command line: parses, prints, and maps a verdict to an exit code."""
 
 import sys
+
+from aftbed.cli.app import app
+from aftbed.core.errors import ConfigError, HarnessError, PeerError
 
 
 def main() -> None:
     """The console script `aftbed`."""
-    from aftbed.cli.app import app  # noqa: PLC0415 - typer costs 40 ms
-    from aftbed.core.errors import ConfigError, HarnessError, PeerError  # noqa: PLC0415
-
     try:
         app()
     except ConfigError as error:

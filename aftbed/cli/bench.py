@@ -1,16 +1,35 @@
-"""`aftbed bench`: every number that the README quotes, with the command that makes it."""
+"""`aftbed bench`: measure the figures of docs/ and the README, each beside its bare limit.
 
+The processes that are measured are forked from this one. So what only some figures need (campaigns, plots) is
+imported where it is used.
+"""
+
+import sys
+from json import dumps
+from pathlib import Path
 from typing import Annotated, Final
 
+import msgspec
 import typer
 
-from aftbed.cli.benchpaper import paper
+from aftbed.bench.adapt import bench_adapt
+from aftbed.bench.cycle import bench_cycle
+from aftbed.bench.hops import bench_hops
+from aftbed.bench.launch import bench_launch
+from aftbed.bench.memory import bench_memory
+from aftbed.bench.recovery import bench_recovery
+from aftbed.cli.options import Recipe
+from aftbed.core.errors import ConfigError
+from aftbed.ftm.compose import DUPLEX, replication_of
 
 bench = typer.Typer(
-    help="Measure, each time beside the bare limit.", no_args_is_help=True, rich_markup_mode=None
+    help="Measure, with the bare limit measured beside each figure.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
 )
 REQUESTS_MIN: Final = 5000
 KILLS_MIN: Final = 1
+PROGRESS: Final = "  measuring: "
 
 Ftm = Annotated[str, typer.Option(help="none, pbr, lfr, tr, pbr+tr, ...: aftbed ftm list.")]
 Placement = Annotated[str, typer.Option(help="process, replica or single.")]
@@ -26,9 +45,7 @@ def cycle(
     pin: Pin = True,
     json: Json = False,
 ) -> None:
-    """Cycle time seen by the client, in turn with a bare ring of as many hops."""
-    from aftbed.bench.cycle import bench_cycle  # noqa: PLC0415
-
+    """Cycle time at the client, alternating with a bare ring of the same number of hops."""
     _print(bench_cycle(ftm, placement, requests, pin=pin), as_json=json)
 
 
@@ -36,15 +53,11 @@ def cycle(
 def recovery(
     ftm: Ftm = "pbr",
     placement: Placement = "process",
-    kills: Annotated[int, typer.Option(min=KILLS_MIN, help="Of the primary.")] = 50,
+    kills: Annotated[int, typer.Option(min=KILLS_MIN, help="How often the primary is killed.")] = 50,
     pin: Pin = True,
     json: Json = False,
 ) -> None:
     """From SIGKILL of the primary to the next good reply, by its parts."""
-    from aftbed.bench.recovery import bench_recovery  # noqa: PLC0415
-    from aftbed.core.errors import ConfigError  # noqa: PLC0415
-    from aftbed.ftm.compose import DUPLEX, replication_of  # noqa: PLC0415
-
     if not replication_of(ftm):
         raise ConfigError(
             f"--ftm {ftm}: one replica does not recover; {' and '.join(DUPLEX)} do, and X+Y of them"
@@ -58,19 +71,15 @@ def recovery(
 
 @bench.command()
 def adapt(
-    old: Annotated[str, typer.Option("--from", help="What runs first.")] = "pbr",
-    new: Annotated[str, typer.Option("--to", help="What it becomes.")] = "pbr+tr",
+    old: Annotated[str, typer.Option("--from", help="The first mechanism.")] = "pbr",
+    new: Annotated[str, typer.Option("--to", help="The mechanism it is adapted to.")] = "pbr+tr",
     placement: Placement = "process",
-    recipe: Annotated[
-        str, typer.Option(help="drained, or paper: SIGSTOP, kill, launch, link, SIGCONT.")
-    ] = "drained",
+    recipe: Recipe = "drained",
     adaptations: Annotated[int, typer.Option(min=1, help="There; as many lead back.")] = 50,
     pin: Pin = True,
     json: Json = False,
 ) -> None:
-    """Adaptations there and back under load: what the client feels, and what is lost."""
-    from aftbed.bench.adapt import bench_adapt  # noqa: PLC0415
-
+    """Adaptations there and back under load: the blackout at the client, and what is lost."""
     _print(bench_adapt(old, new, placement, recipe, adaptations, pin=pin), as_json=json)
 
 
@@ -82,16 +91,12 @@ def launch(
     json: Json = False,
 ) -> None:
     """From the start of `aftbed run` to the first reply; and the graph alone, from a warm zygote."""
-    from aftbed.bench.launch import bench_launch  # noqa: PLC0415
-
     _print(bench_launch(ftm, placement, runs), as_json=json)
 
 
 @bench.command()
 def memory(ftm: Ftm = "pbr", placement: Placement = "process", json: Json = False) -> None:
     """PSS and RSS of the graph's processes, and of all others apart."""
-    from aftbed.bench.memory import bench_memory  # noqa: PLC0415
-
     _print(bench_memory(ftm, placement), as_json=json)
 
 
@@ -105,7 +110,7 @@ def campaign(
     json: Json = False,
 ) -> None:
     """Experiments per minute: 100 requests and one crash each, verdict included."""
-    from aftbed.bench.campaign import bench_campaign  # noqa: PLC0415
+    from aftbed.bench.campaign import bench_campaign  # noqa: PLC0415 - see above
 
     _print(bench_campaign(ftm, placement, "sim" if sim else "unix", experiments, jobs), as_json=json)
 
@@ -118,10 +123,6 @@ def hops(
     json: Json = False,
 ) -> None:
     """The delay of one hop between two bricks in processes of their own, as a distribution."""
-    import msgspec  # noqa: PLC0415
-
-    from aftbed.bench.hops import bench_hops  # noqa: PLC0415
-
     found = bench_hops(ftm, requests, pin=pin)
     if json:
         _print(msgspec.to_builtins(found), as_json=True)
@@ -134,14 +135,43 @@ def hops(
         print(f"p50 {pair.p50_ns / 1e3:9.2f} us  {pair.source} -> {pair.sink}{apart}")
 
 
-bench.command()(paper)
+@bench.command()
+def paper(
+    quick: Annotated[bool, typer.Option("--quick", help="Half a minute: too few samples to quote.")] = False,
+    html: Annotated[Path | None, typer.Option(help="Write a page with plots to this file.")] = None,
+    markdown: Annotated[bool, typer.Option("--markdown", help="Print the tables as markdown.")] = False,
+    json: Json = False,
+) -> None:
+    """Every figure of the paper's Section IV beside ours, measured now; placements; sweeps."""
+    from aftbed.bench.paper import FULL, QUICK, bench_paper  # noqa: PLC0415 - see above
+
+    if json and markdown:
+        raise ConfigError("--json and --markdown: one of them is allowed")
+    if html is not None and not html.parent.is_dir():
+        raise ConfigError(f"--html {html}: {html.parent} is no directory")
+    if html is not None and html.is_dir():
+        raise ConfigError(f"--html {html}: a directory; the name of a file is allowed")
+    found = bench_paper(QUICK if quick else FULL, _show_progress)
+    if json:
+        print(msgspec.json.encode(found).decode())
+    else:
+        from aftbed.bench import papertext  # noqa: PLC0415 - after the measurement
+
+        for line in papertext.markdown(found) if markdown else papertext.text(found):
+            print(line)
+    if html is not None:
+        from aftbed.bench.paperpage import html_page  # noqa: PLC0415 - after the measurement
+
+        html.write_text(html_page(found), encoding="utf-8")
+
+
+def _show_progress(what: str) -> None:
+    print(f"{PROGRESS}{what}", file=sys.stderr, flush=True)
 
 
 def _print(found: dict[str, object], *, as_json: bool) -> None:
-    import json  # noqa: PLC0415
-
     if as_json:
-        print(json.dumps(found))
+        print(dumps(found))
         return
     for key, value in found.items():
         parts = value.items() if isinstance(value, dict) else [("", value)]

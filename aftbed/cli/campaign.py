@@ -1,9 +1,37 @@
-"""`aftbed campaign`: many experiments from one file, judged with statistics, ended by a gate."""
+"""`aftbed campaign`: many experiments from one file, judged with statistics, ended by a gate.
 
+Statistics and reports need scipy and Jinja2 (0.4 s, 30 MB), so they are imported where they are used.
+"""
+
+import re
+import sys
+import time
+from contextlib import closing
+from json import dumps
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
+import msgspec
 import typer
+
+from aftbed.campaign import ledger, runner
+from aftbed.campaign.experiment import Result, carry_out, smallest
+from aftbed.campaign.plan import Plan
+from aftbed.campaign.plan import plan as plan_of
+from aftbed.campaign.spec import EXPERIMENTS_MAX, Spec, check, read_spec, shipped
+from aftbed.cli.options import Json, jobs_of, takes
+from aftbed.core.errors import ConfigError, unknown
+from aftbed.judge.verdict import EXIT_INTERRUPTED
+from aftbed.report.export import write_csv, write_parquet
+
+RUNTIMES: Final = ("unix", "sim")
+EXECUTORS: Final = ("local", "dask")
+SECONDS_EACH: Final = {"unix": 0.35, "sim": 0.01}  # of an experiment on one core: for the estimate of `plan`
+EXIT_CODES: Final = {"pass": 0, "fail": 1}
+SUMMARY: Final = "summary.json"
+JUNIT: Final = "junit.xml"
+HTML: Final = "report.html"
+_SHARD: Final = re.compile(r"([0-9]{1,6})/([0-9]{1,6})")
 
 campaign = typer.Typer(
     help="Many experiments from one file, judged with statistics, ended by a gate.",
@@ -11,86 +39,212 @@ campaign = typer.Typer(
     rich_markup_mode=None,
 )
 
-Name = Annotated[
-    str, typer.Argument(help="Name of a shipped campaign (aftbed campaign list), or a YAML file.")
-]
 Folder = Annotated[Path, typer.Argument(help="The directory of a campaign (its --out).")]
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else.")]
-Seed = Annotated[int | None, typer.Option(help="In the place of the file's.")]
-Experiments = Annotated[
-    int | None, typer.Option("--experiments", help="In each stratum, in the place of the file's.")
-]
-Runtime = Annotated[str | None, typer.Option(help="unix or sim, in the place of the file's.")]
+ExperimentName = Annotated[str, typer.Argument(help="Id of the experiment, its beginning, or its number.")]
+
+
+# -- before anything runs -------------------------------------------------------------------------
 
 
 @campaign.command("list")
 def list_() -> None:
     """The campaigns that come with aftbed."""
-    from aftbed.cli import campaigning  # noqa: PLC0415
-
-    campaigning.show_shipped()
+    for name in shipped():
+        print(f"{name:<14} {read_spec(name).about}")
 
 
 @campaign.command()
 def schema() -> None:
     """The JSON schema of a campaign file, for editors."""
-    from aftbed.cli import campaigning  # noqa: PLC0415
+    print(dumps(msgspec.json.schema(Spec), indent=2))
 
-    campaigning.show_schema()
+
+class CampaignArguments(msgspec.Struct, frozen=True, kw_only=True):
+    """A campaign, and the options that override its file."""
+
+    name: Annotated[
+        str, typer.Argument(help="Name of a shipped campaign (aftbed campaign list), or a YAML file.")
+    ]
+    seed: Annotated[int | None, typer.Option(help="Overrides that of the file.")] = None
+    experiments: Annotated[
+        int | None, typer.Option("--experiments", help="In each stratum; overrides that of the file.")
+    ] = None
+    runtime: Annotated[str | None, typer.Option(help="unix or sim; overrides that of the file.")] = None
+
+
+def planned(given: CampaignArguments) -> Plan:
+    """The plan. Raises ConfigError before anything runs."""
+    spec = read_spec(given.name)
+    if given.seed is not None:
+        if given.seed < 0:
+            raise ConfigError(f"--seed {given.seed}: 0 or more is allowed")
+        spec = msgspec.structs.replace(spec, seed=given.seed)
+    if given.experiments is not None:
+        if not 1 <= given.experiments <= EXPERIMENTS_MAX:
+            raise ConfigError(f"--experiments {given.experiments}: 1 to {EXPERIMENTS_MAX} are allowed")
+        stop = msgspec.structs.replace(spec.stop, experiments=given.experiments)
+        spec = msgspec.structs.replace(spec, stop=stop)
+    if given.runtime is not None:
+        if given.runtime not in RUNTIMES:
+            raise unknown("runtime", given.runtime, RUNTIMES)
+        system = msgspec.structs.replace(spec.system, runtime=given.runtime)
+        spec = msgspec.structs.replace(spec, system=system)
+    try:
+        check(spec)
+        return plan_of(spec)
+    except ConfigError as error:
+        raise ConfigError(f"{given.name}: {error}") from error
+
+
+class PlanArguments(CampaignArguments, frozen=True, kw_only=True):
+    """The options of `aftbed campaign plan`."""
+
+    out: Annotated[Path | None, typer.Option(help="Write every experiment to this file, a line each.")] = None
+    json: Json = False
 
 
 @campaign.command()
-def plan(
-    name: Name,
-    seed: Seed = None,
-    experiments: Experiments = None,
-    runtime: Runtime = None,
-    out: Annotated[
-        Path | None, typer.Option(help="Write every experiment to this file, a line each.")
-    ] = None,
-    json: Json = False,
-) -> None:
-    """What would be run: the strata, how many experiments, about how long. Nothing is run."""
-    from aftbed.cli import campaigning  # noqa: PLC0415
+@takes(PlanArguments)
+def plan(given: PlanArguments) -> None:
+    """What would be run: the strata, the number of experiments, about how long. Nothing is run."""
+    found = planned(given)
+    spec = found.spec
+    if given.out is not None:
+        lines = (msgspec.json.encode(e) + b"\n" for e in found.experiments())
+        try:
+            given.out.write_bytes(b"".join(lines))
+        except OSError as error:
+            raise ConfigError(f"--out {given.out}: {error.strerror}") from None
+    seconds = round(found.size * SECONDS_EACH[spec.system.runtime], 1)
+    if given.json:
+        strata = [
+            {"name": s.name, "experiments": spec.stop.experiments, "expected": list(s.expected)}
+            for s in found.strata
+        ]
+        about = {"campaign": spec.campaign, "seed": spec.seed, "digest": found.digest, "code": found.code}
+        print(dumps(about | {"experiments": found.size, "seconds": seconds, "strata": strata}))
+        return
+    print(f"{spec.campaign}: {spec.about}" if spec.about else spec.campaign)
+    width = max(len(s.name) for s in found.strata)
+    for stratum in found.strata:
+        expected = f"expected {', '.join(stratum.expected)}" if stratum.expected else ""
+        print(f"  {stratum.name:<{width}}  {spec.stop.experiments:>6}  {expected}".rstrip())
+    print(f"{found.size} experiments at most, about {_duration(seconds)} on one core")
 
-    campaigning.show_plan(campaigning.Changes(name, seed, experiments, runtime), out, as_json=json)
+
+def _duration(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"
 
 
-@campaign.command()
-def run(
-    name: Name,
+# -- running --------------------------------------------------------------------------------------
+
+
+class CampaignRunArguments(CampaignArguments, frozen=True, kw_only=True):
+    """The options of `aftbed campaign run`."""
+
     out: Annotated[
         Path | None, typer.Option(help="Directory of the records and reports; campaign-NAME if left out.")
-    ] = None,
-    jobs: Annotated[
-        int | None, typer.Option(help="Experiments side by side; one per CPU if left out.")
-    ] = None,
-    shard: Annotated[str, typer.Option(help="I/N: only the Ith of N parts.")] = "1/1",
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with what is there.")] = False,
-    seed: Seed = None,
-    experiments: Experiments = None,
-    runtime: Runtime = None,
-    executor: Annotated[str, typer.Option(help="local processes, or dask (needs --scheduler).")] = "local",
-    scheduler: Annotated[str | None, typer.Option(help="Address of a Dask scheduler.")] = None,
-    json: Json = False,
-) -> None:
-    """Run it, and judge it.
+    ] = None
+    jobs: Annotated[int | None, typer.Option(help="Experiments side by side; one per CPU if left out.")] = (
+        None
+    )
+    shard: Annotated[str, typer.Option(help="I/N: only the Ith of N parts.")] = "1/1"
+    resume: Annotated[bool, typer.Option("--resume", help="Run only what is missing in the directory.")] = (
+        False
+    )
+    executor: Annotated[str, typer.Option(help="local processes, or dask (needs --scheduler).")] = EXECUTORS[
+        0
+    ]
+    scheduler: Annotated[str | None, typer.Option(help="Address of a Dask scheduler.")] = None
+    json: Json = False
+
+
+@campaign.command()
+@takes(CampaignRunArguments)
+def run(given: CampaignRunArguments) -> None:
+    """Run the experiments, judge the campaign, write its reports.
 
     Exit code: 0 all gates pass, 1 one does not, 2 usage, 3 trouble of the harness, 130 interrupted.
     """
-    from aftbed.cli import campaigning  # noqa: PLC0415
+    found = planned(given)
+    asked = _asked(found, given)
+    began_s = time.monotonic()
+    interrupted = _follow(found, asked, as_json=given.json)
+    code = _judge(asked.out, found.size, time.monotonic() - began_s, as_json=given.json)
+    raise typer.Exit(EXIT_INTERRUPTED if interrupted else code)
 
-    changes = campaigning.Changes(name, seed, experiments, runtime)
-    how = campaigning.How(out, jobs, shard, resume, executor, scheduler)
-    raise typer.Exit(campaigning.run(changes, how, as_json=json))
+
+def _asked(found: Plan, given: CampaignRunArguments) -> runner.Asked:
+    if given.executor not in EXECUTORS:
+        raise unknown("executor", given.executor, EXECUTORS)
+    if (given.executor == "dask") != (given.scheduler is not None):
+        raise ConfigError("--executor dask and --scheduler ADDRESS go together")
+    if given.scheduler is not None and given.jobs is not None:
+        raise ConfigError("--jobs: how many there are is the scheduler's to say")
+    number, of = _shard(given.shard)
+    folder = given.out if given.out is not None else Path(f"campaign-{found.spec.campaign}")
+    return runner.Asked(folder, jobs_of(given.jobs), number, of, given.resume, given.scheduler or "")
+
+
+def _shard(text: str) -> tuple[int, int]:
+    match = _SHARD.fullmatch(text)
+    number, of = (int(match[1]), int(match[2])) if match else (0, 0)
+    if not 1 <= number <= of:
+        raise ConfigError(f"--shard {text[:40]!r}: I/N is allowed, I from 1 to N")
+    return number, of
+
+
+def _follow(found: Plan, asked: runner.Asked, *, as_json: bool) -> bool:
+    """Run, and show each result; True if the user interrupted it."""
+    from aftbed.report.terminal import Progress  # noqa: PLC0415 - scipy
+
+    results = runner.run(found, asked)  # raises ConfigError here, before the progress is shown
+    todo = sum(asked.has(index, len(found.strata)) for index in range(found.size))
+    try:
+        with closing(results), Progress(found.spec.campaign, todo, quiet=as_json) as progress:
+            for result in results:
+                progress.add(result)
+    except KeyboardInterrupt:
+        print("interrupted: --resume goes on from here", file=sys.stderr)
+        return True
+    return False
+
+
+def _judge(folder: Path, size: int, seconds: float, *, as_json: bool) -> int:
+    """Summarise the ledger, of a campaign of `size` experiments, and write the reports; the exit code."""
+    from aftbed.campaign.summary import summarise  # noqa: PLC0415
+    from aftbed.report.html import html_report  # noqa: PLC0415 - scipy
+    from aftbed.report.junit import junit_xml  # noqa: PLC0415
+    from aftbed.report.terminal import summary_lines  # noqa: PLC0415
+
+    records = ledger.read(folder / ledger.NAME)
+    summary = summarise(records, size, seconds)
+    document = msgspec.json.encode(summary)
+    (folder / SUMMARY).write_bytes(msgspec.json.format(document))
+    (folder / JUNIT).write_text(junit_xml(summary, records), encoding="utf-8")
+    (folder / HTML).write_text(html_report(summary, records), encoding="utf-8")
+    if as_json:
+        print(document.decode())
+    else:
+        print("\n".join(summary_lines(summary)))
+        print(f"records and reports: {folder}")
+    return EXIT_CODES[summary.gate]
+
+
+# -- from the records -----------------------------------------------------------------------------
 
 
 @campaign.command()
 def report(folder: Folder, json: Json = False) -> None:
     """Judge the records of a campaign again, and write its reports anew."""
-    from aftbed.cli import campaigning  # noqa: PLC0415
+    raise typer.Exit(_report(folder, as_json=json))
 
-    raise typer.Exit(campaigning.report(folder, as_json=json))
+
+def _report(folder: Path, *, as_json: bool) -> int:
+    records = ledger.read(folder / ledger.NAME)
+    size = len(plan_of(records.head.spec).strata) * records.head.spec.stop.experiments
+    seconds = sum(result.seconds for result in records.results)
+    return _judge(folder, size, seconds, as_json=as_json)
 
 
 @campaign.command()
@@ -99,9 +253,10 @@ def export(
     out: Annotated[Path, typer.Option(help="A file: .csv, or .parquet (pip install 'aftbed[parquet]').")],
 ) -> None:
     """The results as a table, one row each."""
-    from aftbed.cli import campaigning  # noqa: PLC0415
-
-    campaigning.export(folder, out)
+    writers = {".csv": write_csv, ".parquet": write_parquet}
+    if out.suffix not in writers:
+        raise unknown("kind of file", out.suffix, writers)
+    writers[out.suffix](ledger.read(folder / ledger.NAME), out)
 
 
 @campaign.command()
@@ -110,10 +265,14 @@ def merge(
     out: Annotated[Path, typer.Option(help="A new directory.")],
     json: Json = False,
 ) -> None:
-    """One campaign out of its shards."""
-    from aftbed.cli import campaigning  # noqa: PLC0415
-
-    raise typer.Exit(campaigning.merge(folders, out, as_json=json))
+    """Merge the shards of a campaign, and report on the whole."""
+    merged = ledger.merged([ledger.read(folder / ledger.NAME) for folder in folders])
+    out.mkdir(parents=True, exist_ok=True)
+    path = out / ledger.NAME
+    ledger.begin(path, merged.head)
+    with open(ledger.opened(path), "wb") as file:
+        file.writelines(msgspec.json.encode(result) + b"\n" for result in merged.results)
+    raise typer.Exit(_report(out, as_json=json))
 
 
 @campaign.command()
@@ -122,34 +281,82 @@ def compare(base: Folder, new: Folder, json: Json = False) -> None:
 
     Exit code: 0 no stratum has become worse, 1 one has, 2 usage.
     """
-    from aftbed.cli.campaignpairs import run as compared  # noqa: PLC0415
+    from aftbed.campaign.compare import Change  # noqa: PLC0415 - scipy
+    from aftbed.campaign.compare import compare as compared  # noqa: PLC0415
 
-    raise typer.Exit(compared(base, new, as_json=json))
+    def line(change: Change) -> str:
+        shift = "p99 recovery: too few to tell"
+        if change.shift_ms is not None:
+            shift = f"p99 recovery {change.shift_ms.low:+.3f} to {change.shift_ms.high:+.3f} ms"
+        differ = f"{change.only_base} failed only before, {change.only_new} only now (p {change.p:.3g})"
+        word = "worse" if change.worse else "same or better"
+        return f"  {change.stratum:<{width}}  {change.pairs:>5} pairs: {differ}; {shift}: {word}"
+
+    found = compared(ledger.read(base / ledger.NAME), ledger.read(new / ledger.NAME))
+    if json:
+        print(msgspec.json.encode(found).decode())
+    else:
+        print(f"base {found.base}, new {found.new}; {found.unpaired} experiments without their pair")
+        width = max(len(change.stratum) for change in found.changes)
+        print("\n".join(map(line, found.changes)))
+    raise typer.Exit(1 if found.worse else 0)
 
 
 @campaign.command()
 def assumptions(folder: Folder) -> None:
-    """What each mechanism assumes, and what came of it where that does not hold, as Markdown."""
-    from aftbed.campaign import ledger  # noqa: PLC0415
-    from aftbed.campaign.assumptions import markdown  # noqa: PLC0415
+    """What each mechanism assumes, and the outcomes where that does not hold, as Markdown."""
+    from aftbed.campaign.assumptions import markdown  # noqa: PLC0415 - scipy
 
     print(markdown(ledger.read(folder / ledger.NAME)), end="")
 
 
-Experiment = Annotated[str, typer.Argument(help="Id of the experiment, its beginning, or its number.")]
+# -- one experiment -------------------------------------------------------------------------------
 
 
 @campaign.command()
-def replay(folder: Folder, experiment: Experiment, json: Json = False) -> None:
-    """Run one experiment of a campaign again."""
-    from aftbed.cli import campaigning  # noqa: PLC0415
+def replay(folder: Folder, experiment: ExperimentName, json: Json = False) -> None:
+    """Run one experiment of a campaign again.
 
-    raise typer.Exit(campaigning.replay(folder, experiment, as_json=json))
+    Exit code: 0 the outcome is the same, 1 it is not, 2 usage.
+    """
+    before = _result(folder, experiment)
+    after = carry_out(before.experiment, lambda result: None)
+    if json:
+        document = {"before": msgspec.to_builtins(before), "after": msgspec.to_builtins(after)}
+        print(dumps(document))
+    else:
+        print(_title(before))
+        print(f"  then  {_outcome(before)}")
+        print(f"  now   {_outcome(after)}")
+        print(before.experiment.command())
+    raise typer.Exit(0 if after.outcome == before.outcome else 1)
 
 
 @campaign.command()
-def shrink(folder: Folder, experiment: Experiment, json: Json = False) -> None:
-    """The smallest experiment with the same outcome, in the simulator."""
-    from aftbed.cli import campaigning  # noqa: PLC0415
+def shrink(folder: Folder, experiment: ExperimentName, json: Json = False) -> None:
+    """The smallest experiment with the same outcome, in the simulator.
 
-    raise typer.Exit(campaigning.shrink(folder, experiment, as_json=json))
+    A real experiment is shrunk in the simulator, too: there a run is repeated to the last event.
+    """
+    before = _result(folder, experiment)
+    found = smallest(before)
+    if json:
+        print(msgspec.json.encode(found).decode())
+    else:
+        print(_title(before))
+        print(f"  outcome  {_outcome(before)}")
+        print(f"  smallest  {found.command()}")
+
+
+def _result(folder: Path, name: str) -> Result:
+    return ledger.find(ledger.read(folder / ledger.NAME), name)
+
+
+def _title(result: Result) -> str:
+    experiment = result.experiment
+    return f"{experiment.id} (number {experiment.index}): {experiment.stratum}, seed {experiment.seed}"
+
+
+def _outcome(result: Result) -> str:
+    because = f": {'; '.join(result.reasons)}" if result.reasons else ""
+    return f"{result.outcome}{because}"

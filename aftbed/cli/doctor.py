@@ -1,9 +1,12 @@
-"""`aftbed doctor`: what of the machine is missing, and what dead runs left behind."""
+"""`aftbed doctor`: what the machine lacks, and what dead runs left behind."""
 
-import json
+from json import dumps
+from typing import Annotated
 
 import msgspec
+import typer
 
+from aftbed.cli.options import Json
 from aftbed.core.errors import HarnessError
 from aftbed.runtime.unix import leftovers
 from aftbed.runtime.unix.inspection import Check, inspect
@@ -11,7 +14,7 @@ from aftbed.runtime.unix.leftovers import Left
 
 
 class Diagnosis(msgspec.Struct, frozen=True):
-    """What --json prints. `left` is what is there when the command ends; `ok` is its exit code."""
+    """The document of --json. `left` is what remains when the command ends; `ok` decides the exit code."""
 
     checks: list[Check]
     left: list[Left]
@@ -19,8 +22,24 @@ class Diagnosis(msgspec.Struct, frozen=True):
     ok: bool
 
 
-def doctor(*, clean: bool, as_json: bool) -> int:
-    """Look, clean if asked to, print; 0 if nothing is missing and nothing left, else 1."""
+def doctor(
+    clean: Annotated[bool, typer.Option("--clean", help="Remove what dead runs left behind.")] = False,
+    json: Json = False,
+) -> None:
+    """What this machine lacks, and what dead runs left behind.
+
+    Exit code: 0 nothing is missing and nothing left, 1 something is.
+    """
+    diagnosis = _diagnose(clean=clean)
+    if json:
+        print(dumps(msgspec.to_builtins(diagnosis)))
+    else:
+        _show(diagnosis, clean=clean)
+    raise typer.Exit(0 if diagnosis.ok else 1)
+
+
+def _diagnose(*, clean: bool) -> Diagnosis:
+    """Inspect the machine, and remove what dead runs left if `clean`."""
     checks = inspect()
     removed: list[Left] = []
     left: list[Left] = []
@@ -28,15 +47,10 @@ def doctor(*, clean: bool, as_json: bool) -> int:
         left = leftovers.find()
         if clean:
             removed, left = leftovers.clean(left)
-    except HarnessError:  # no place for runs, which is among the checks
+    except HarnessError:  # runs have no directory here: one of the checks reports it
         assert any(c.status == "missing" for c in checks)
     ok = not left and all(c.status != "missing" for c in checks)
-    diagnosis = Diagnosis(checks, left, removed, ok)
-    if as_json:
-        print(json.dumps(msgspec.to_builtins(diagnosis)))
-    else:
-        _show(diagnosis, clean=clean)
-    return 0 if ok else 1
+    return Diagnosis(checks, left, removed, ok)
 
 
 def _show(diagnosis: Diagnosis, *, clean: bool) -> None:

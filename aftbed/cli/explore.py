@@ -1,99 +1,265 @@
-"""`aftbed explore`: not some experiments of a kind, but all there are, with a count that is exact."""
+"""`aftbed explore`: simulate every experiment of one kind, and count them exactly."""
 
+import time
+from contextlib import closing
 from typing import Annotated, Final
 
+import msgspec
 import typer
 
+from aftbed.cli.options import Json, jobs_of, separated
+from aftbed.cli.sim import described, event_lines, picture
+from aftbed.cli.views import Bar, spaced
+from aftbed.core.errors import ConfigError
+from aftbed.judge.verdict import EXIT_CODES, EXIT_INTERRUPTED, Breach
+from aftbed.runtime.sim.world import Setup
+from aftbed.search.explore import (
+    PLACEMENTS,
+    Broken,
+    Explored,
+    Ordered,
+    Selection,
+    attempt,
+    experiments,
+    explore_orders,
+    selected,
+)
+from aftbed.search.explore import explore as explore_all
+
+REQUESTS: Final = 3
+ORDER_REQUESTS: Final = 2
+REQUESTS_MAX: Final = 1000
+BOUND: Final = 2_000
+BOUND_MAX: Final = 10_000_000
+LISTED_MAX: Final = 20  # broken experiments that are printed; --json has all of them
+
 explore = typer.Typer(
-    help="Simulate all there is of one kind: exhaustive, with an exact count.",
+    help="Simulate every experiment of one kind, with an exact count.",
     no_args_is_help=True,
     rich_markup_mode=None,
 )
-REQUESTS: Final = 3
-ORDER_REQUESTS: Final = 2
-BOUND: Final = 2_000
 
-Ftm = Annotated[
+Ftms = Annotated[
     list[str] | None,
-    typer.Option(help="Mechanisms, separated by commas or given one by one; else all it knows."),
+    typer.Option("--ftm", help="Mechanisms, separated by commas or given one by one; all if left out."),
 ]
-Placement = Annotated[list[str] | None, typer.Option(help="process or replica, likewise; both if left out.")]
+Placements = Annotated[
+    list[str] | None, typer.Option("--placement", help="process or replica, likewise; both if left out.")
+]
 Jobs = Annotated[int | None, typer.Option(help="Processes; one per CPU if left out.")]
 Only = Annotated[int | None, typer.Option(help="One experiment of this selection, by its number.")]
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else.")]
+
+
+# -- crash, adapt, pairs: each experiment is one run ----------------------------------------------
 
 
 @explore.command()
 def crash(
-    ftm: Ftm = None,
-    placement: Placement = None,
-    requests: Annotated[int, typer.Option(help="Of each run.")] = REQUESTS,
+    ftm: Ftms = None,
+    placement: Placements = None,
+    requests: Annotated[int, typer.Option(help="Requests of each run.")] = REQUESTS,
     jobs: Jobs = None,
     only: Only = None,
     json: Json = False,
 ) -> None:
-    """A death before each effect of each brick, and after its last.
+    """A crash before each effect of each brick, and after its last.
 
     Exit code of all explorers: 0 all survived, 1 a promise was broken, 2 usage, 130 interrupted.
     """
-    _explore("crash", ftm, placement, jobs, only, json=json, requests=requests)
+    workers = jobs_of(jobs)
+    _check("--requests", requests, REQUESTS_MAX)
+    _explore(selected("crash", separated(ftm), separated(placement), requests), workers, only, as_json=json)
 
 
 @explore.command()
 def adapt(
-    ftm: Ftm = None, placement: Placement = None, jobs: Jobs = None, only: Only = None, json: Json = False
+    ftm: Ftms = None, placement: Placements = None, jobs: Jobs = None, only: Only = None, json: Json = False
 ) -> None:
-    """A death before, during and after each step of each adaptation, of each node that takes part."""
-    _explore("adapt", ftm, placement, jobs, only, json=json)
+    """A crash before, during and after each step of each adaptation, of each node that takes part."""
+    workers = jobs_of(jobs)
+    _explore(selected("adapt", separated(ftm), separated(placement)), workers, only, as_json=json)
 
 
 @explore.command()
 def pairs(
-    ftm: Ftm = None, placement: Placement = None, jobs: Jobs = None, only: Only = None, json: Json = False
+    ftm: Ftms = None, placement: Placements = None, jobs: Jobs = None, only: Only = None, json: Json = False
 ) -> None:
-    """Each first fault of a few, then the death of each node, after each delay of a grid."""
-    _explore("pairs", ftm, placement, jobs, only, json=json)
+    """Each first fault of a few, then the crash of each node, after each delay of a grid."""
+    workers = jobs_of(jobs)
+    _explore(selected("pairs", separated(ftm), separated(placement)), workers, only, as_json=json)
+
+
+def _explore(selection: Selection, jobs: int, only: int | None, *, as_json: bool) -> None:
+    setups = list(selection.setups())
+    if only is not None:
+        raise typer.Exit(_explore_one(selection, setups, only, as_json=as_json))
+    raise typer.Exit(_Exploration(selection, setups, as_json=as_json).run(jobs))
+
+
+def _explore_one(selection: Selection, setups: list[Setup], number: int, *, as_json: bool) -> int:
+    if not 0 <= number < len(setups):
+        raise ConfigError(f"--only {number}: this selection has the experiments 0 to {len(setups) - 1}")
+    setup, began_s = setups[number], time.monotonic()
+    done, broken = attempt(setup)
+    lost = done is not None and done.rest.lost
+    found = (_broken(selection, number, setup, broken),) if broken else ()
+    result = Explored(1, 1 - len(found), int(lost and not broken), _since(began_s), found)
+    if as_json:
+        print(msgspec.json.encode(result).decode())
+    else:
+        print(f"{number}: {described(setup)}")
+        print("\n".join(event_lines(done) if done is not None else ()))
+        print("\n".join(picture(setup, broken).lines()))
+        print("\n".join((*_breach_lines(found), _count(result))))
+    return EXIT_CODES["fail" if broken else "pass"]
+
+
+class _Exploration:
+    """All experiments of a selection."""
+
+    def __init__(self, selection: Selection, setups: list[Setup], *, as_json: bool) -> None:
+        self._selection, self._setups, self._as_json = selection, setups, as_json
+        self._began_s = time.monotonic()
+        self._runs = self._unavailable = 0
+        self._broken: list[Broken] = []
+
+    def run(self, jobs: int) -> int:
+        """Run them in `jobs` processes, show the result; the exit code."""
+        interrupted = False
+        try:
+            self._explore(jobs)
+        except KeyboardInterrupt:
+            interrupted = True
+        survived = self._runs - len(self._broken)
+        result = Explored(self._runs, survived, self._unavailable, _since(self._began_s), tuple(self._broken))
+        if self._as_json:
+            print(msgspec.json.encode(result).decode())
+        else:
+            self._show(result)
+        if interrupted:
+            return EXIT_INTERRUPTED
+        return EXIT_CODES["fail" if self._broken else "pass"]
+
+    def _explore(self, jobs: int) -> None:
+        what = f"explore {self._selection.explorer}"
+        found = closing(explore_all(self._setups, jobs, lambda number, _: _command(self._selection, number)))
+        with Bar(what, len(self._setups), quiet=self._as_json) as bar, found as results:
+            for number, setup, lost, breaches in results:
+                self._runs += 1
+                self._unavailable += lost and not breaches
+                if breaches:
+                    self._add_broken(_broken(self._selection, number, setup, breaches))
+                bar.show(self._runs, self._runs, len(self._broken))
+
+    def _add_broken(self, broken: Broken) -> None:
+        self._broken.append(broken)
+        if not self._as_json and len(self._broken) <= LISTED_MAX:
+            print("\n".join(_breach_lines((broken,))), flush=True)
+
+    def _show(self, result: Explored) -> None:
+        more = len(result.broken) - LISTED_MAX
+        if more > 0:
+            print(f"and {spaced(more)} more; --json lists them all")
+        if self._runs < len(self._setups):
+            print(f"interrupted: {spaced(self._runs)} of {spaced(len(self._setups))} were run")
+        print(_count(result))
+
+
+def _command(selection: Selection, only: int) -> str:
+    """The command that runs one experiment of `selection` again."""
+    requests = f" --requests {selection.requests}" if selection.requests else ""
+    ftms, placements = ",".join(selection.ftms), ",".join(selection.placements)
+    where = "" if selection.placements == PLACEMENTS else f" --placement {placements}"
+    return f"aftbed explore {selection.explorer} --ftm {ftms}{where}{requests} --only {only}"
+
+
+def _broken(selection: Selection, number: int, setup: Setup, breaches: tuple[Breach, ...]) -> Broken:
+    return Broken(number, described(setup), tuple(map(str, breaches)), _command(selection, number))
+
+
+def _breach_lines(found: tuple[Broken, ...]) -> list[str]:
+    lines = []
+    for broken in found:
+        lines += [f"broken: {broken.number}: {broken.setup}"]
+        lines += [f"  because    {breach}" for breach in broken.breaches]
+        lines += [f"  repeat     {broken.command}"]
+    return lines
+
+
+def _count(result: Explored) -> str:
+    return (
+        f"{spaced(result.survived)} of {spaced(result.explored)} survived"
+        f" ({spaced(result.unavailable)} unavailable) in {result.seconds:.1f} s"
+    )
+
+
+def _since(began_s: float) -> float:
+    return round(time.monotonic() - began_s, 3)
+
+
+def _check(name: str, value: int, most: int) -> None:
+    if not 1 <= value <= most:
+        raise ConfigError(f"{name} {value}: 1 to {most} are allowed")
+
+
+# -- order: each experiment is many runs ----------------------------------------------------------
 
 
 @explore.command()
 def order(
-    ftm: Ftm = None,
-    placement: Placement = None,
-    requests: Annotated[int, typer.Option(help="At most, undisturbed; one with a crash.")] = ORDER_REQUESTS,
+    ftm: Ftms = None,
+    placement: Placements = None,
+    requests: Annotated[
+        int, typer.Option(help="Requests of an undisturbed run, at most; one with a crash.")
+    ] = ORDER_REQUESTS,
     bound: Annotated[int, typer.Option(help="Runs of one experiment, at most.")] = BOUND,
     jobs: Jobs = None,
     json: Json = False,
 ) -> None:
-    """Every order in which messages can arrive, but for those that make no difference."""
-    from aftbed.cli import exploring, ordering  # noqa: PLC0415
+    """Every order in which messages can arrive, without those that make no difference."""
+    workers = jobs_of(jobs)
+    _check("--requests", requests, REQUESTS_MAX)
+    _check("--bound", bound, BOUND_MAX)
+    chosen = selected("crash", separated(ftm), separated(placement), requests)  # the same mechanisms
+    setups = list(experiments(chosen.ftms, chosen.placements, requests))
+    began_s, found = time.monotonic(), list[Ordered]()
+    with Bar("explore order", len(setups), quiet=json) as bar:
+        for one in explore_orders(setups, bound, workers):
+            found.append(one)
+            bar.show(len(found), len(found), sum(bool(o.broken) for o in found))
+            if not json:
+                print(_order_lines(one), flush=True)
+    _show_orders(found, bound, _since(began_s), as_json=json)
+    raise typer.Exit(EXIT_CODES["fail" if any(one.broken for one in found) else "pass"])
 
-    asked = exploring.Asked("order", _names(ftm), _names(placement), requests, jobs, None)
-    raise typer.Exit(ordering.run(asked, bound, as_json=json))
+
+def _order_lines(one: Ordered) -> str:
+    whole = "all" if one.complete else "at least"
+    lines = [f"{whole} {spaced(one.orders)} orders ({spaced(one.cut)} cut): {described(one.setup)}"]
+    lines += [f"  broken in {spaced(one.broken)}: {reason}" for reason in one.breaches]
+    return "\n".join(lines)
 
 
-def _explore(
-    explorer: str,
-    ftm: list[str] | None,
-    placement: list[str] | None,
-    jobs: int | None,
-    only: int | None,
-    *,
-    json: bool,
-    requests: int | None = None,
-) -> None:
-    from aftbed.cli import exploring  # noqa: PLC0415
-
-    asked = exploring.Asked(
-        explorer=explorer,
-        ftms=_names(ftm),
-        placements=_names(placement),
-        requests=requests,
-        jobs=jobs,
-        only=only,
+def _show_orders(found: list[Ordered], bound: int, seconds: float, *, as_json: bool) -> None:
+    orders, broken = sum(o.orders for o in found), sum(o.broken for o in found)
+    complete = sum(o.complete for o in found)
+    if as_json:
+        document = {
+            "explored": orders,
+            "survived": orders - broken,
+            "experiments": len(found),
+            "complete": complete,
+            "bound": bound,
+            "seconds": seconds,
+            "broken": [
+                {"setup": described(o.setup), "orders": o.broken, "breaches": o.breaches}
+                for o in found
+                if o.broken
+            ],
+        }
+        print(msgspec.json.encode(document).decode())
+        return
+    print(
+        f"{spaced(orders - broken)} of {spaced(orders)} orders survived; all orders of {complete} of"
+        f" {len(found)} experiments, the others up to {spaced(bound)} runs each; {seconds:.1f} s"
     )
-    raise typer.Exit(exploring.run(asked, as_json=json))
-
-
-def _names(given: list[str] | None) -> tuple[str, ...]:
-    """Separated by commas, or given one by one."""
-    return tuple(name for text in given or () for name in text.split(","))

@@ -1,18 +1,39 @@
-"""`aftbed ftm`: what each mechanism tolerates and needs, and which one suits (FT, A and R; design 4).
+"""`aftbed ftm`: what each mechanism tolerates and needs, and which one suits.
 
-`check` compares with what is asked for (`--faults`), what the protected function declares (`--app`) and what
-there is: CPUs and their load are measured where they are not given. The bandwidth between two replicas on
-one host is that of its memory, so nothing limits it unless it is given.
+`check` compares the mechanism with the faults (`--faults`), with what the protected function declares
+(`--app`) and with the resources: CPUs and their load are measured unless they are given. The bandwidth
+between two replicas on one host is that of its memory, so it is unlimited unless it is given.
 """
 
-from typing import TYPE_CHECKING, Annotated, Final
+from pathlib import Path
+from typing import Annotated, Final
 
+import msgspec
+import psutil
 import typer
 
-if TYPE_CHECKING:
-    from aftbed.adapt.suitability import Demand, Resources, Table
-    from aftbed.core.application import Characteristics
-    from aftbed.core.graph import Graph
+from aftbed.adapt.bricks import load_application
+from aftbed.adapt.suitability import (
+    TABLE,
+    Demand,
+    Resources,
+    Table,
+    TableFile,
+    consistent,
+    demand,
+    fault_model,
+    problems,
+    remarks,
+    table_from,
+)
+from aftbed.cli.options import Json
+from aftbed.core.application import Characteristics
+from aftbed.core.errors import ConfigError
+from aftbed.core.graph import Graph
+from aftbed.ftm.compose import EXPRESSIONS, build
+from aftbed.runtime.unix.part import load_module
+from aftbed.vehicle.aeb.function import default_application
+from aftbed.vehicle.yamlfile import read_yaml
 
 ftm = typer.Typer(
     help="What each mechanism tolerates and needs, and which one suits.",
@@ -26,18 +47,14 @@ SAMPLE_SECONDS: Final = 0.2  # of the CPU load
 COLUMNS: Final = ("DETERMINISTIC", "STATE ACCESS", "CPUS", "CPU LOAD", "BANDWIDTH", "PROCESSES")
 NO_FTM: Final = "no consistent FTM"
 
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else.")]
 TableOption = Annotated[
-    str | None, typer.Option("--table", help="YAML file whose rows take the place of the shipped ones.")
+    str | None, typer.Option("--table", help="YAML file whose rows replace the shipped ones.")
 ]
 
 
 @ftm.command("list")
 def list_(table: TableOption = None, json: Json = False) -> None:
     """Every FTM expression: what it tolerates and needs, and how many processes it takes."""
-    from aftbed.adapt.suitability import demand  # noqa: PLC0415
-    from aftbed.ftm.compose import EXPRESSIONS, build  # noqa: PLC0415
-
     rules = _table(table)
     found = [(demand(name, rules), build(name, "process")) for name in EXPRESSIONS]
     if json:
@@ -59,9 +76,6 @@ def show(
     json: Json = False,
 ) -> None:
     """One FTM expression: what it tolerates and needs, its bricks and its channels."""
-    from aftbed.adapt.suitability import demand  # noqa: PLC0415
-    from aftbed.ftm.compose import build  # noqa: PLC0415
-
     wanted, graph = demand(expr, _table(table)), build(expr, "process")
     if json:
         bricks = [{"name": brick.name, "kind": brick.kind} for brick in graph.bricks]
@@ -81,17 +95,19 @@ def show(
 
 @ftm.command()
 def check(
-    expression: Annotated[str | None, typer.Option("--ftm", help="The one to judge; else all.")] = None,
+    expression: Annotated[
+        str | None, typer.Option("--ftm", help="The FTM to judge; all of them if left out.")
+    ] = None,
     faults: Annotated[
         str, typer.Option(help="To be tolerated: crash, value, implausible, separated by commas; or none.")
     ] = "crash",
     app: Annotated[
         str | None, typer.Option(help="The protected function, as MODULE:CLASS or FILE.py:CLASS.")
     ] = None,
-    cpus: Annotated[int | None, typer.Option(help="Else those that this process may use.")] = None,
-    cpu_load: Annotated[float | None, typer.Option(help="0 to 1; else as measured.")] = None,
+    cpus: Annotated[int | None, typer.Option(help="CPUs that this process may use, if left out.")] = None,
+    cpu_load: Annotated[float | None, typer.Option(help="0 to 1; measured if left out.")] = None,
     bandwidth: Annotated[
-        float | None, typer.Option(help="kbit/s between the replicas; else not limited.")
+        float | None, typer.Option(help="kbit/s between the replicas; unlimited if left out.")
     ] = None,
     table: TableOption = None,
     json: Json = False,
@@ -100,8 +116,6 @@ def check(
 
     Exit code: 0 consistent, 1 not consistent, 2 usage.
     """
-    from aftbed.adapt.suitability import consistent, fault_model, problems, remarks  # noqa: PLC0415
-
     model, rules = fault_model(faults), _table(table)
     declared, resources = _declared(app), _resources(cpus, cpu_load, bandwidth)
     others = consistent(model, declared, resources, rules)
@@ -122,7 +136,7 @@ def check(
 
 
 def _print_verdict(expression: str | None, found: list[str], notes: list[str], others: list[str]) -> None:
-    """The reasons, and in the last line the answer."""
+    """The reasons; the last line is the answer."""
     _print_block("because", found)
     _print_block("remark", notes)
     would_do = f"consistent: {', '.join(others)}" if others else NO_FTM
@@ -132,26 +146,14 @@ def _print_verdict(expression: str | None, found: list[str], notes: list[str], o
         print(f"{expression} is not consistent; {would_do}" if found else f"{expression} is consistent")
 
 
-def _table(path: str | None) -> "Table":
-    from pathlib import Path  # noqa: PLC0415
-
-    from aftbed.adapt.suitability import TABLE, TableFile, table_from  # noqa: PLC0415
-
+def _table(path: str | None) -> Table:
     if path is None:
         return TABLE
-    from aftbed.vehicle.yamlfile import read_yaml  # noqa: PLC0415 - PyYAML costs 15 ms
-
     return table_from(read_yaml(Path(path), TableFile), path)
 
 
-def _declared(app: str | None) -> "Characteristics":
-    """What the function says of itself."""
-    from aftbed.adapt.bricks import load_application  # noqa: PLC0415
-    from aftbed.core.application import Characteristics  # noqa: PLC0415
-    from aftbed.core.errors import ConfigError  # noqa: PLC0415
-    from aftbed.runtime.unix.part import load_module  # noqa: PLC0415
-    from aftbed.vehicle.aeb.function import default_application  # noqa: PLC0415
-
+def _declared(app: str | None) -> Characteristics:
+    """What the protected function declares."""
     if app is None:
         return default_application().characteristics
     found: object = getattr(load_application(app, load_module), "characteristics", None)
@@ -161,11 +163,8 @@ def _declared(app: str | None) -> "Characteristics":
     return found
 
 
-def _resources(cpus: int | None, cpu_load: float | None, bandwidth: float | None) -> "Resources":
-    """What was given, and what is measured for the rest."""
-    from aftbed.adapt.suitability import Resources  # noqa: PLC0415
-    from aftbed.core.errors import ConfigError  # noqa: PLC0415
-
+def _resources(cpus: int | None, cpu_load: float | None, bandwidth: float | None) -> Resources:
+    """The resources that are given; the others are measured."""
     if cpus is not None and not 1 <= cpus <= CPUS_MAX:
         raise ConfigError(f"--cpus {cpus}: 1 to {CPUS_MAX} are allowed")
     if cpu_load is not None and not 0.0 <= cpu_load <= 1.0:
@@ -174,15 +173,13 @@ def _resources(cpus: int | None, cpu_load: float | None, bandwidth: float | None
         raise ConfigError(f"--bandwidth {bandwidth:g}: 0 to {BANDWIDTH_KBIT_S_MAX:g} kbit/s are allowed")
     if cpus is not None and cpu_load is not None:
         return Resources(cpus, cpu_load, bandwidth)
-    import psutil  # noqa: PLC0415 - 15 ms that nobody else needs
-
     measured = len(psutil.Process().cpu_affinity()) if cpus is None else cpus
     load = psutil.cpu_percent(SAMPLE_SECONDS) / 100 if cpu_load is None else cpu_load
     return Resources(measured, load, bandwidth)
 
 
-def _summary(wanted: "Demand", graph: "Graph") -> dict[str, object]:
-    """An expression as it stands in a JSON document."""
+def _summary(wanted: Demand, graph: Graph) -> dict[str, object]:
+    """One expression in the document of --json."""
     return {
         "ftm": wanted.ftm,
         "tolerates": wanted.tolerates,
@@ -195,21 +192,21 @@ def _summary(wanted: "Demand", graph: "Graph") -> dict[str, object]:
     }
 
 
-def _processes(graph: "Graph") -> int:
-    """As the paper counts them: the nodes, and the supervisor in the place of the ROS master."""
+def _processes(graph: Graph) -> int:
+    """The count of the paper: the nodes, and the supervisor instead of the ROS master."""
     return len(graph.nodes) + 1
 
 
-def _bricks(graph: "Graph") -> list[str]:
-    """By place: those beside the replicas, and those of each replica."""
+def _bricks(graph: Graph) -> list[str]:
+    """The bricks of each replica, and those beside the replicas."""
     places: dict[str, list[str]] = {}
     for brick in graph.bricks:
         places.setdefault(brick.replica or "beside", []).append(brick.part)
     return [f"{place}: {', '.join(parts)}" for place, parts in places.items()]
 
 
-def _channels(graph: "Graph") -> list[str]:
-    """All but those inside of the second replica, which are as those of the first."""
+def _channels(graph: Graph) -> list[str]:
+    """All channels except those inside the second replica, which equal those inside the first."""
     second = max((brick.replica for brick in graph.bricks if brick.replica), default="")
     first = min((brick.replica for brick in graph.bricks if brick.replica), default="")
     hidden = f"{second}/" if first != second else "/"
@@ -220,13 +217,13 @@ def _channels(graph: "Graph") -> list[str]:
     ]
 
 
-def _function(declared: "Characteristics", app: str | None) -> str:
+def _function(declared: Characteristics, app: str | None) -> str:
     determinism = "deterministic" if declared.deterministic else "not deterministic"
     access = "state access" if declared.state_access else "no state access"
     return f"{determinism}, {access} ({app or 'the brake function'})"
 
 
-def _machine(resources: "Resources") -> str:
+def _machine(resources: Resources) -> str:
     bandwidth = resources.bandwidth_kbit_s
     limit = "bandwidth not limited" if bandwidth is None else f"{bandwidth:g} kbit/s"
     return f"{_cpus(resources.cpus)}, load {resources.cpu_load:.0%}, {limit}"
@@ -242,6 +239,4 @@ def _print_block(head: str, lines: list[str]) -> None:
 
 
 def _print_json(found: object) -> None:
-    import msgspec  # noqa: PLC0415
-
     print(msgspec.json.encode(found).decode())

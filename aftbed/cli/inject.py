@@ -1,23 +1,37 @@
-"""`aftbed inject`: the faults, each with its options. What they mean is said in `docs/faults.md`."""
+"""`aftbed inject`: a fault for a live run, from a second terminal. The words are those of docs/faults.md."""
 
 import re
+import sys
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Annotated, Final
 
+import msgspec
 import typer
+
+from aftbed.cli.options import Run
+from aftbed.core.errors import ConfigError, unknown
+from aftbed.core.fault import MEMORY, Fault, on_bus
+from aftbed.inject import buswords
+from aftbed.inject.parts import refuse_unsafe
+from aftbed.inject.words import read
+from aftbed.runtime.unix import ask, rundir
+from aftbed.runtime.unix.busaim import aim
+from aftbed.runtime.unix.options import Work
 
 inject = typer.Typer(help="Inject a fault into a live run.", no_args_is_help=True, rich_markup_mode=None)
 
-Run = Annotated[str | None, typer.Option("--run", help="Id of the run, where several are alive.")]
 At = Annotated[str | None, typer.Option("--at", help="Event to strike at, as checkpoint.sent.")]
 Nth = Annotated[str | None, typer.Option("--nth", help="Which occurrence of the event, counted from now.")]
 NthMessage = Annotated[str | None, typer.Option("--nth", help="Which message, counted from now.")]
 After = Annotated[str | None, typer.Option("--after", help="How long from now, as 200ms.")]
 When = Annotated[
-    str | None, typer.Option("--when", help='When the car is so, as "ttc < 1.2": ttc, gap or speed.')
+    str | None,
+    typer.Option("--when", help='At a state of the car, as "ttc < 1.2": ttc, gap or speed.'),
 ]
 Target = Annotated[str, typer.Argument(help="primary, backup, or a node as `aftbed ps` names it.")]
 Replica = Annotated[str | None, typer.Option("--replica", help="primary (default), backup, a or b.")]
-For = Annotated[str | None, typer.Option("--for", help="How long, as 50ms; else for good.")]
+For = Annotated[str | None, typer.Option("--for", help="How long, as 50ms; permanently if left out.")]
 Channel = Annotated[str, typer.Argument(help="As `aftbed graph` names it: pxy2pro, aft2aft, ...")]
 By = Annotated[str | None, typer.Option("--by", help="How long it is held back, as 5ms; 20ms if left out.")]
 Permanent = Annotated[bool, typer.Option("--permanent", help="Each time from the first strike on.")]
@@ -25,31 +39,12 @@ Every = Annotated[str | None, typer.Option("--every", help="Each Nth time from t
 Chance = Annotated[str | None, typer.Option("--chance", help="Each time with this chance, as 0.1; seeded.")]
 
 Words = list[tuple[str, str | None]]
-DRAWN: Final = "drawn"  # the word for a byte that is left to the seed
-_COMPARED: Final = re.compile(r"([<>])")
+LEVELS: Final = ("value", MEMORY)
+DRAWN: Final = "drawn"  # in the place of a byte's number: the seed chooses the byte
+_COMPARISON: Final = re.compile(r"([<>])")
 
 
-def _send(run: str | None, kind: str, what: str, words: Words, again: list[str] | None = None) -> None:
-    from aftbed.cli import injecting  # noqa: PLC0415
-
-    told = [word for key, value in words if value is not None for word in (key, *_values(key, value))]
-    injecting.send(run, [kind, what, *told, *(again or [])])
-
-
-def _values(key: str, value: str) -> list[str]:
-    """A condition is three words, however it is written."""
-    return _COMPARED.sub(r" \1 ", value).split() if key == "when" else [value]
-
-
-def _when(at: str | None, nth: str | None, after: str | None, when: str | None) -> Words:
-    return [("at", at), ("nth", nth), ("after", after), ("when", when)]
-
-
-def _again(permanent: bool, every: str | None, chance: str | None) -> list[str]:
-    found = ["permanent"] if permanent else []
-    for key, value in (("every", every), ("p", chance)):
-        found += ["intermittent", key, value] if value is not None else []
-    return found
+# -- crash, hang, slow ----------------------------------------------------------------------------
 
 
 @inject.command()
@@ -57,7 +52,7 @@ def crash(
     target: Target, at: At = None, nth: Nth = None, after: After = None, when: When = None, run: Run = None
 ) -> None:
     """SIGKILL the target's processes."""
-    _send(run, "crash", target, _when(at, nth, after, when))
+    _send(run, "crash", target, _trigger(at, nth, after, when))
 
 
 @inject.command()
@@ -71,13 +66,15 @@ def hang(
     run: Run = None,
 ) -> None:
     """SIGSTOP the target's processes, and SIGCONT them after a while."""
-    _send(run, "hang", target, [("for", duration), *_when(at, nth, after, when)])
+    _send(run, "hang", target, [("for", duration), *_trigger(at, nth, after, when)])
 
 
 @inject.command()
 def slow(
     target: Target,
-    by: Annotated[str | None, typer.Option("--by", help="How much longer each takes; else 2ms.")] = None,
+    by: Annotated[
+        str | None, typer.Option("--by", help="How much longer each step takes; 2ms if left out.")
+    ] = None,
     share: Annotated[
         str | None, typer.Option("--share", help="Or: as if it had this share of a CPU, as 25%.")
     ] = None,
@@ -88,13 +85,16 @@ def slow(
     when: When = None,
     run: Run = None,
 ) -> None:
-    """Have each step of the target's bricks take longer."""
+    """Make each step of the target's bricks take longer."""
     words: Words = [("by", by), ("share", share), ("for", duration)]
-    _send(run, "slow", target, [*words, *_when(at, nth, after, when)])
+    _send(run, "slow", target, [*words, *_trigger(at, nth, after, when)])
 
 
-def _at_once(kind: str, about: str) -> None:
-    """The command of a fault of a channel that holds nothing back."""
+# -- faults of a channel --------------------------------------------------------------------------
+
+
+def _without_delay(kind: str, about: str) -> None:
+    """Define the command of a fault of a channel that has no delay."""
 
     @inject.command(kind, help=about)
     def strike(
@@ -108,12 +108,12 @@ def _at_once(kind: str, about: str) -> None:
         chance: Chance = None,
         run: Run = None,
     ) -> None:
-        words = [("in", replica), *_when(None, nth, after, when)]
-        _send(run, kind, channel, words, _again(permanent, every, chance))
+        words = [("in", replica), *_trigger(None, nth, after, when)]
+        _send(run, kind, channel, words, _persistence(permanent, every, chance))
 
 
-def _held_back(kind: str, about: str) -> None:
-    """The command of one that holds messages back."""
+def _with_delay(kind: str, about: str) -> None:
+    """Define the command of a fault of a channel that holds messages back."""
 
     @inject.command(kind, help=about)
     def strike(
@@ -128,14 +128,17 @@ def _held_back(kind: str, about: str) -> None:
         chance: Chance = None,
         run: Run = None,
     ) -> None:
-        words = [("by", by), ("in", replica), *_when(None, nth, after, when)]
-        _send(run, kind, channel, words, _again(permanent, every, chance))
+        words = [("by", by), ("in", replica), *_trigger(None, nth, after, when)]
+        _send(run, kind, channel, words, _persistence(permanent, every, chance))
 
 
-_at_once("omission", "Lose a message.")
-_held_back("delay", "Hold a message back, and what comes behind it.")
-_at_once("duplicate", "Send a message twice.")
-_held_back("reorder", "Send a message behind its successor, or late, if none comes.")
+_without_delay("omission", "Lose a message.")
+_with_delay("delay", "Hold a message back, and those behind it.")
+_without_delay("duplicate", "Send a message twice.")
+_with_delay("reorder", "Send a message after its successor, or late if none comes.")
+
+
+# -- bitflip, bus ---------------------------------------------------------------------------------
 
 
 @inject.command()
@@ -143,11 +146,11 @@ def bitflip(
     place: Annotated[
         str,
         typer.Argument(
-            help="result, state, state.FIELD, request, checkpoint or log; of --level memory, the target."
+            help="result, state, state.FIELD, request, checkpoint or log; with --level memory, the target."
         ),
     ],
     bit: Annotated[
-        str | None, typer.Option("--bit", help="From bit 0 of byte 0; else drawn by the seed.")
+        str | None, typer.Option("--bit", help="From bit 0 of byte 0; drawn by the seed if left out.")
     ] = None,
     bits: Annotated[str | None, typer.Option("--bits", help="So many different bits, drawn.")] = None,
     byte: Annotated[str | None, typer.Option("--byte", help="All of this byte, or of a `drawn` one.")] = None,
@@ -155,17 +158,19 @@ def bitflip(
         str | None, typer.Option("--burst", help="So many bits side by side, from --bit on.")
     ] = None,
     stuck: Annotated[str | None, typer.Option("--stuck", help="A bit and its value, as 60=1.")] = None,
-    level: Annotated[
-        str, typer.Option("--level", help="value, or memory: any byte of a process, whatever it holds.")
-    ] = "value",
+    level: Annotated[str, typer.Option("--level", help="value, or memory: any byte of a process.")] = "value",
     address: Annotated[
-        str | None, typer.Option("--address", help="With --level memory: of the byte, as 0x7f00; else drawn.")
+        str | None,
+        typer.Option(
+            "--address", help="With --level memory: address of the byte, as 0x7f00; drawn if left out."
+        ),
     ] = None,
     unsafe_memory: Annotated[
-        bool, typer.Option("--unsafe-memory", help="What --level memory does may have any consequence.")
+        bool,
+        typer.Option("--unsafe-memory", help="Allow --level memory, which may have any consequence."),
     ] = False,
     replica: Replica = None,
-    at: Annotated[str | None, typer.Option("--at", help="Event at which the value is in hand.")] = None,
+    at: Annotated[str | None, typer.Option("--at", help="Event at which the brick holds the value.")] = None,
     nth: Nth = None,
     after: After = None,
     when: When = None,
@@ -174,15 +179,24 @@ def bitflip(
     chance: Chance = None,
     run: Run = None,
 ) -> None:
-    """Flip bits of what the function gets, answers or remembers, of a checkpoint, a kept reply, or memory."""
-    from aftbed.cli.injecting import at_level  # noqa: PLC0415
-
-    what, target = at_level(level, place, replica, unsafe=unsafe_memory)
+    """Flip bits of a request, a result, the state, a checkpoint, a reply in the log, or memory."""
+    what, target = _at_level(level, place, replica, unsafe=unsafe_memory)
     words: Words = [("bit", bit), ("bits", bits), ("burst", burst), ("stuck", stuck), ("address", address)]
-    again = _again(permanent, every, chance)
     which = [] if byte is None else ["byte"] if byte == DRAWN else ["byte", byte]
-    words += [("in", target), *_when(at, nth, after, when)]
-    _send(run, "bitflip", what, words, [*which, *again])
+    words += [("in", target), *_trigger(at, nth, after, when)]
+    _send(run, "bitflip", what, words, [*which, *_persistence(permanent, every, chance)])
+
+
+def _at_level(level: str, place: str, replica: str | None, *, unsafe: bool) -> tuple[str, str | None]:
+    """What is flipped, and in which target; at the level of memory, `place` is the target."""
+    if level not in LEVELS:
+        raise unknown("level of a bitflip", level, LEVELS)
+    if level != MEMORY:
+        return place, replica
+    if replica is not None:
+        raise ConfigError(f"--replica {replica}: with --level {MEMORY} the target is {place!r} already")
+    refuse_unsafe(f"--level {MEMORY}", unsafe=unsafe)
+    return MEMORY, place
 
 
 @inject.command()
@@ -190,7 +204,44 @@ def bus(
     words: Annotated[str, typer.Argument(help='E.g. "omission bus RADAR_TRACK for 200ms": docs/faults.md.')],
     run: Run = None,
 ) -> None:
-    """Disturb frames on the CAN bus, or cut nodes off it."""
-    from aftbed.cli import injecting  # noqa: PLC0415
+    """Disturb frames on the CAN bus, or disconnect nodes from it."""
+    _arm(run, on_bus(buswords.parse(words)))
 
-    injecting.send_to_bus(run, words)
+
+# -- options to words, words to the run -----------------------------------------------------------
+
+
+def _trigger(at: str | None, nth: str | None, after: str | None, when: str | None) -> Words:
+    return [("at", at), ("nth", nth), ("after", after), ("when", when)]
+
+
+def _persistence(permanent: bool, every: str | None, chance: str | None) -> list[str]:
+    found = ["permanent"] if permanent else []
+    for key, value in (("every", every), ("p", chance)):
+        found += ["intermittent", key, value] if value is not None else []
+    return found
+
+
+def _send(run: str | None, kind: str, what: str, options: Words, others: Sequence[str] = ()) -> None:
+    words = [word for key, value in options if value is not None for word in (key, *_values(key, value))]
+    _arm(run, read([kind, what, *words, *others]))
+
+
+def _values(key: str, value: str) -> list[str]:
+    """The words of an option's value; a condition is three words, with or without spaces."""
+    return _COMPARISON.sub(r" \1 ", value).split() if key == "when" else [value]
+
+
+class _RecordHead(msgspec.Struct, frozen=True):
+    """The part of a record's run.json that is needed here."""
+
+    work: Work
+
+
+def _arm(run: str | None, fault: Fault) -> None:
+    """Have the run arm the fault. The messages and signals it may name are those of the run's work."""
+    private = rundir.find(run)
+    record = Path(str(ask.ask(private, ask.Status())["record"]))
+    head = msgspec.json.decode((record / "run.json").read_bytes(), type=_RecordHead)
+    ask.ask(private, ask.Inject(aim(fault, head.work)))
+    print(f"run {private.name}: {fault}", file=sys.stderr)

@@ -1,34 +1,34 @@
-"""Commands for a live run, from a second terminal."""
+"""Commands for a live run, from a second terminal: `aftbed status`, `ps`, `graph`, `stop`."""
 
-import json
-from typing import Final
+from json import dumps
+from typing import Annotated, Final
 
 import msgspec
+import typer
 
+from aftbed.cli.options import Json, Run
 from aftbed.core.errors import unknown
 from aftbed.core.graph import Graph
 from aftbed.ftm.compose import build
 from aftbed.runtime.unix import ask, rundir
 from aftbed.runtime.unix.resources import measured
 
-FORMATS: Final = ("text", "dot", "mermaid")
 
-
-def status(run: str | None, *, as_json: bool) -> None:
-    """Print how the run is."""
+def status(run: Run = None, json: Json = False) -> None:
+    """Show the state of a live run."""
     found = ask.ask(rundir.find(run), ask.Status())
-    if as_json:
-        print(json.dumps(found))
+    if json:
+        print(dumps(found))
         return
     for key, value in found.items():
         print(f"{key:10} {value}")
 
 
-def ps(run: str | None, *, as_json: bool) -> None:
-    """Print the processes of the run, the nodes first."""
+def ps(run: Run = None, json: Json = False) -> None:
+    """The processes of a live run: name, role, pid, CPU, memory (PSS)."""
     rows = measured(ask.processes(rundir.find(run)))
-    if as_json:
-        print(json.dumps(msgspec.to_builtins(rows)))
+    if json:
+        print(dumps(msgspec.to_builtins(rows)))
         return
     print(f"{'NAME':14} {'ROLE':10} {'PID':>7} {'CPU%':>6} {'PSS MB':>7}")
     for row in rows:
@@ -38,15 +38,30 @@ def ps(run: str | None, *, as_json: bool) -> None:
     print(f"{len(nodes_mb)} processes, {sum(nodes_mb):.1f} MB; {len(rows) - len(nodes_mb)} beside")
 
 
-def graph(run: str | None, ftm: str | None, placement: str, style: str) -> None:
-    """Print the graph of an FTM, or of a live run."""
+def stop(run: Run = None) -> None:
+    """End a live run; its command prints the verdict so far."""
+    private = rundir.find(run)
+    ask.ask(private, ask.Stop())
+    print(f"run {private.name}: stopping")
+
+
+# -- graph ----------------------------------------------------------------------------------------
+
+
+def graph(
+    ftm: Annotated[str | None, typer.Option(help="Show this FTM's graph; without it, a live run's.")] = None,
+    placement: Annotated[str, typer.Option(help="With --ftm: process or replica.")] = "process",
+    style: Annotated[str, typer.Option("--format", help="text, dot or mermaid.")] = "text",
+    run: Run = None,
+) -> None:
+    """The bricks, their channels and their nodes."""
     if style not in FORMATS:
         raise unknown("format", style, FORMATS)
     if ftm is not None:
         shown = build(ftm, placement)
     else:
         shown = msgspec.convert(ask.ask(rundir.find(run), ask.GraphNow()), Graph)
-    print({"text": _text, "dot": _dot, "mermaid": _mermaid}[style](shown))
+    print(FORMATS[style](shown))
 
 
 def _text(graph: Graph) -> str:
@@ -86,8 +101,4 @@ def _mermaid(graph: Graph) -> str:
     return "\n".join(lines)
 
 
-def stop(run: str | None) -> None:
-    """End the run."""
-    private = rundir.find(run)
-    ask.ask(private, ask.Stop())
-    print(f"run {private.name}: stopping")
+FORMATS: Final = {"text": _text, "dot": _dot, "mermaid": _mermaid}

@@ -1,12 +1,18 @@
-"""`aftbed log`: files that other tools open, made of a log of the bus or of the record of a run."""
+"""`aftbed log`: convert a log of the bus, or the record of a run, to files that other tools open."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from aftbed.campaign.runfiles.export import Wanted, check
+from aftbed.campaign.runfiles.export import export as write_files
+from aftbed.core.errors import ConfigError
+from aftbed.judge.record import read_record
+from aftbed.vehicle.logs.convert import convert as convert_log
+
 log = typer.Typer(
-    help="Files that other tools open: logs of the bus in their formats, and the record of a run.",
+    help="Convert a log of the bus or the record of a run for other tools.",
     no_args_is_help=True,
     rich_markup_mode=None,
 )
@@ -25,13 +31,11 @@ def convert(
         typer.Option("--to", help="One of these or csv (by signal), if SINK's ending does not say."),
     ] = None,
     dbc: Annotated[
-        Path | None, typer.Option(help="What is in the frames, for csv; aftbed's own if left out.")
+        Path | None, typer.Option(help="The DBC of the frames, for csv; aftbed's own if left out.")
     ] = None,
 ) -> None:
     """Write a log of a CAN bus in another format."""
-    from aftbed.vehicle.logs.convert import convert as converted  # noqa: PLC0415
-
-    done = converted(source, sink, from_format, to_format, dbc)
+    done = convert_log(source, sink, from_format, to_format, dbc)
     print(f"{sink}: {done.frames} frames, {done.source} to {done.sink}")
     for reason, count in done.left_out.items():
         print(f"  left out: {count} times {reason}")
@@ -44,14 +48,9 @@ def export(
     trace: Annotated[Path | None, typer.Option(help="Write its nodes to this file, for Perfetto.")] = None,
 ) -> None:
     """Write the record of a run as files that other tools open."""
-    from aftbed.campaign.runfiles.export import Wanted, check  # noqa: PLC0415
-    from aftbed.campaign.runfiles.export import export as exported  # noqa: PLC0415
-    from aftbed.core.errors import ConfigError  # noqa: PLC0415
-    from aftbed.judge.record import read_record  # noqa: PLC0415
-
     wanted = Wanted(mcap, trace)
     if wanted == Wanted():
         raise ConfigError("nothing to write: give --mcap FILE, --trace FILE, or both")
     check(wanted)
-    for line in exported(read_record(record), wanted):
+    for line in write_files(read_record(record), wanted):
         print(line)

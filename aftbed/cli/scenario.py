@@ -1,11 +1,48 @@
-"""`aftbed scenario`: the drives that there are, and the published tables that they are rows of."""
+"""`aftbed scenario`: drives, published tables whose rows are drives, and drives from OpenSCENARIO files."""
 
+import sys
+import time
+from collections.abc import Sequence
+from contextlib import closing
+from itertools import groupby
+from json import dumps
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
+import msgspec
+import rich.table
 import typer
+from rich.console import Console
 
-from aftbed.cli.scenarioimport import import_
+from aftbed.cli.options import Json, check_seed, jobs_of, separated, takes
+from aftbed.cli.run import RunArguments, execute
+from aftbed.cli.sim import read_fault
+from aftbed.cli.views import Bar
+from aftbed.core.errors import ConfigError
+from aftbed.core.fault import Crash, Fault, Hang, Slow, Trigger
+from aftbed.core.graph import Graph
+from aftbed.core.words import milliseconds, whole_milliseconds
+from aftbed.ftm.compose import build
+from aftbed.inject.words import parse
+from aftbed.judge.verdict import EXIT_INTERRUPTED
+from aftbed.report.roadplot import Curve, Point, road_plot
+from aftbed.runtime import targets
+from aftbed.search.road_table import NONE, PRIMARY, Line, Row, driven, drives, outage
+from aftbed.search.worst_instant import STEP_CYCLES
+from aftbed.vehicle.openscenario import Imported, Wanted, import_scenario, write
+from aftbed.vehicle.plant import KMH_PER_MS, Lead
+from aftbed.vehicle.scenarios import tables
+from aftbed.vehicle.scenarios.library import load_scenario, scenario_names
+from aftbed.vehicle.scenarios.scenario import Scenario
+
+EXIT_PASS, EXIT_FAIL, EXIT_NO_FAULT = 0, 1, 3
+WORST: Final = "worst-instant"
+PLOT_SUFFIX: Final = ".svg"
+WIDTH: Final = 150  # characters, if standard output is no terminal
+CYCLE_S: Final = 0.02
+HEADS: Final = ("row", "km/h", "allowed", "impact", "gap", "warned")
+FAULT_HEADS: Final = ("struck at", "worst of", "lost")
+OUTAGE_HEADS: Final = ("at most",)
 
 scenario = typer.Typer(
     help="Drives and published tables: what must stop, and what still does under faults.",
@@ -14,31 +51,110 @@ scenario = typer.Typer(
 )
 
 Name = Annotated[str, typer.Argument(help="A scenario, a row of a table (r152:m1-60), or a YAML file.")]
-Ftm = Annotated[str, typer.Option(help="none, pbr, lfr, tr, pbr+tr, ...: aftbed ftm list.")]
-Seed = Annotated[int, typer.Option(help="Of all chance.")]
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else.")]
+Seed = Annotated[int, typer.Option(help="Seed of all random numbers.")]
+
+
+# -- list, show -----------------------------------------------------------------------------------
 
 
 @scenario.command("list")
 def list_(json: Json = False) -> None:
     """The scenarios that are shipped, and the tables with their groups."""
-    from aftbed.cli import scenarioview  # noqa: PLC0415
-
-    scenarioview.show_list(as_json=json)
+    scenarios = {name: load_scenario(name).description for name in scenario_names()}
+    groups = {
+        name: {group: len(tables.cases(name, group)) for group in tables.group_names(name)}
+        for name in tables.table_names()
+    }
+    if json:
+        listed = [{"table": name, "title": tables.title(name), "groups": groups[name]} for name in groups]
+        print(dumps({"scenarios": scenarios, "tables": listed}))
+        return
+    width = max(map(len, (*scenarios, *(group for counted in groups.values() for group in counted))))
+    print("scenarios")
+    for name, description in scenarios.items():
+        print(f"  {name:<{width}}  {description}")
+    for name, counted in groups.items():
+        print(f"table {name}: {tables.title(name)}")
+        for group, count in counted.items():
+            rows = [case.name for case in tables.cases(name, group)]
+            ends = rows[0] if count == 1 else f"{rows[0]} to {rows[-1]}"
+            print(f"  {group:<{width}}  {count:>2} row{'s' if count > 1 else ' '}  {ends}")
 
 
 @scenario.command()
 def show(name: Name, json: Json = False) -> None:
-    """How a drive begins, and what it must come to."""
-    from aftbed.cli import scenarioview  # noqa: PLC0415
+    """How a drive begins, and what its outcome must be."""
+    drive, case = load_scenario(name), _case(name)
+    if json:
+        row = None if case is None else msgspec.to_builtins(case)
+        print(dumps({"scenario": msgspec.to_builtins(drive), "row": row}))
+        return
+    lines = [
+        ("ego", f"{drive.plant.speed_ms * KMH_PER_MS:.1f} km/h"),
+        ("ahead", _ahead(drive.plant.lead)),
+    ]
+    lines += [("road", f"friction {drive.plant.friction:g}"), ("lasts", _lasts(drive))]
+    lines += [("expected", _expected(drive))]
+    if case is not None:
+        lines += [
+            ("row of", f"{case.table}, {case.group}"),
+            ("demands", _demands(case)),
+            ("source", case.source),
+        ]
+    print(f"{drive.name}: {drive.description}")
+    print("\n".join(f"  {head:<9}{text}" for head, text in lines))
 
-    scenarioview.show_scenario(name, as_json=json)
+
+def _case(name: str) -> tables.Case | None:
+    table = name.partition(tables.SEPARATOR)[0]
+    if table not in tables.table_names():
+        return None
+    return next((case for case in tables.cases(table) if case.name == name), None)
+
+
+def _ahead(lead: Lead | None) -> str:
+    if lead is None:
+        return "an empty road"
+    words = [f"a car {lead.gap_m:.1f} m ahead at {lead.speed_ms * KMH_PER_MS:.1f} km/h"]
+    if lead.braking is not None:
+        after_s = lead.braking.after_ms / 1000
+        words.append(f"brakes at {lead.braking.deceleration_ms2:g} m/s2 after {after_s:g} s")
+    if lead.cut_in is not None:
+        words.append(f"cuts in after {lead.cut_in.after_ms / 1000:g} s")
+    elif lead.lateral_m:
+        words.append(f"{abs(lead.lateral_m):g} m beside our lane's middle")
+    return ", ".join(words)
+
+
+def _lasts(scenario: Scenario) -> str:
+    return f"{scenario.duration_ms / 1000:g} s at most"
+
+
+def _expected(scenario: Scenario) -> str:
+    expect = scenario.expect
+    words = [expect.outcome.replace("_", " ")]
+    words += [f"at {expect.impact_speed_kmh_max:g} km/h at most"] if expect.impact_speed_kmh_max else []
+    words += [f"{expect.stop_gap_m_min:g} m short at least"] if expect.stop_gap_m_min else []
+    return ", ".join(words)
+
+
+def _demands(case: tables.Case) -> str:
+    """What the table asks for, apart from what is expected of the scenario."""
+    words = ["no contact" if not case.limit_kmh else f"impact at {case.limit_kmh:g} km/h at most"]
+    if case.warning_s_min is not None:
+        words.append(f"a warning {case.warning_s_min:g} s before braking")
+    if case.demand_ms2_min is not None:
+        words.append(f"a demand of {case.demand_ms2_min:g} m/s2 at least")
+    return ", ".join(words)
+
+
+# -- run ------------------------------------------------------------------------------------------
 
 
 @scenario.command()
 def run(
     name: Name,
-    ftm: Ftm = "pbr",
+    ftm: Annotated[str, typer.Option(help="none, pbr, lfr, tr, pbr+tr, ...: aftbed ftm list.")] = "pbr",
     placement: Annotated[str, typer.Option(help="process (one per brick) or replica.")] = "process",
     pace: Annotated[str, typer.Option(help="real, a factor (4), or max (lockstep).")] = "real",
     seed: Seed = 0,
@@ -51,57 +167,345 @@ def run(
 
     Exit code: 0 pass, 1 a promise was broken, 2 usage, 3 inconclusive, 130 interrupted and cleaned.
     """
-    from aftbed.cli.app import run as run_  # noqa: PLC0415 - this is a part of it
+    arguments = RunArguments(
+        ftm=ftm,
+        scenario=name,
+        placement=placement,
+        pace=pace,
+        seed=seed,
+        faults=tuple(faults or ()),
+        json=json,
+    )
+    raise typer.Exit(execute(arguments))
 
-    run_(ftm=ftm, scenario=name, placement=placement, pace=pace, seed=seed, faults=faults, json=json)
+
+# -- table: its options ---------------------------------------------------------------------------
 
 
-@scenario.command()
-def table(
-    name: Annotated[str, typer.Argument(help="r152, ncap or negative.")],
-    group: Annotated[str | None, typer.Option(help="One group of its rows; all if left out.")] = None,
+class TableArguments(msgspec.Struct, frozen=True):
+    """The options of `aftbed scenario table`."""
+
+    name: Annotated[str, typer.Argument(help="r152, ncap or negative.")]
+    group: Annotated[str | None, typer.Option(help="One group of its rows; all if left out.")] = None
     ftm: Annotated[
-        list[str] | None, typer.Option(help="Mechanisms, separated by commas; none if left out.")
-    ] = None,
+        tuple[str, ...], typer.Option(help="Mechanisms, separated by commas; none if left out.")
+    ] = ()
     fault: Annotated[
         str | None,
         typer.Option(
             help='worst-instant (a crash of the primary), "FAULT WORDS at worst-instant",'
             ' or "FAULT WORDS at EVENT nth N".'
         ),
-    ] = None,
+    ] = None
     outage: Annotated[
-        list[str] | None,
+        tuple[str, ...],
         typer.Option(
-            help="The function does not answer for so long (300ms), at the worst"
-            " instant, and nothing stands in for it. May be given several times."
+            help="How long the function does not answer (300ms), at the worst instant, with no FTM."
+            " May be given several times."
         ),
-    ] = None,
-    seed: Seed = 0,
-    jobs: Annotated[
-        int | None, typer.Option(help="Processes that simulate; one per CPU if left out.")
-    ] = None,
-    plot: Annotated[Path | None, typer.Option(help="Draw the speeds at impact to this SVG file.")] = None,
-    json: Json = False,
-) -> None:
+    ] = ()
+    seed: Seed = 0
+    jobs: Annotated[int | None, typer.Option(help="Processes that simulate; one per CPU if left out.")] = None
+    plot: Annotated[Path | None, typer.Option(help="Draw the speeds at impact to this SVG file.")] = None
+    json: Json = False
+
+
+class TableDrive(msgspec.Struct, frozen=True):
+    """What is to be driven: each case under each line."""
+
+    cases: tuple[tables.Case, ...]
+    lines: tuple[Line, ...]
+    seed: int
+    jobs: int
+
+
+def table_drive(given: TableArguments) -> TableDrive:
+    """Check the options. Raises ConfigError naming the argument, before anything is driven."""
+    rows = tables.cases(given.name, given.group)
+    check_seed(given.seed)
+    _check_plot(given.plot)
+    lines = (*_mechanism_lines(given), *(_outage_line(text, rows) for text in dict.fromkeys(given.outage)))
+    return TableDrive(rows, lines, given.seed, jobs_of(given.jobs))
+
+
+def _check_plot(plot: Path | None) -> None:
+    """Raise ConfigError if `--plot` cannot be written."""
+    if plot is None:
+        return
+    if plot.suffix != PLOT_SUFFIX or plot.is_dir() or not plot.absolute().parent.is_dir():
+        raise ConfigError(f"--plot {plot}: a file {PLOT_SUFFIX} in a directory that exists is allowed")
+
+
+def _mechanism_lines(given: TableArguments) -> tuple[Line, ...]:
+    """A line for each mechanism; with outages and no fault, only for those that are named."""
+    named = tuple(dict.fromkeys(separated(given.ftm)))
+    if not named:
+        named = () if given.outage and given.fault is None else (NONE,)
+    return tuple(_mechanism_line(ftm, given.fault) for ftm in named)
+
+
+def _mechanism_line(ftm: str, fault: str | None) -> Line:
+    graph = build(ftm, "process")
+    if fault is None:
+        return Line(ftm, ftm)
+    words = fault.split()
+    if words[-1:] != [WORST]:
+        return Line(f"{ftm}, {fault}", ftm, read_fault(fault, graph))
+    found = _searched(fault, words, graph)
+    return Line(f"{ftm}, {found} at the worst instant", ftm, found, searched=True)
+
+
+def _searched(text: str, words: list[str], graph: Graph) -> Fault:
+    """`worst-instant` alone, a crash of the primary; or `hang primary for 50ms at worst-instant`."""
+    if len(words) == 1:
+        return Fault(Crash(), PRIMARY, Trigger())
+    if words[-2] != "at":
+        raise ConfigError(f"--fault {text!r}: {WORST}, or FAULT WORDS at {WORST} is allowed")
+    fault = parse(" ".join(words[:-2]))
+    if not isinstance(fault.action, Crash | Hang | Slow) or fault.trigger != Trigger():
+        raise ConfigError(f"--fault {text!r}: a crash, a hang or a slow without any other time is searched")
+    targets.check(fault, graph)
+    return fault
+
+
+def _outage_line(text: str, rows: tuple[tables.Case, ...]) -> Line:
+    """Raises ConfigError if the outage is longer than one of the drives."""
+    if milliseconds("--outage", text) < 1.0:
+        raise ConfigError(f"--outage {text}: 1ms is the shortest that is allowed")
+    length_ms = whole_milliseconds("--outage", text)
+    for case in rows:
+        lasts_ms = load_scenario(case.name).duration_ms
+        if length_ms >= lasts_ms:
+            raise ConfigError(
+                f"--outage {text}: {case.name} lasts {lasts_ms / 1000:g} s; a shorter one is allowed"
+            )
+    return outage(length_ms)
+
+
+# -- table: the drives ----------------------------------------------------------------------------
+
+
+@scenario.command()
+@takes(TableArguments)
+def table(given: TableArguments) -> None:
     """Drive a whole table on the simulator, without a fault or with one at its worst.
 
     Exit code: 0 all rows pass, 1 a row fails, 2 usage, 3 a fault never struck, 130 interrupted.
     """
-    from aftbed.cli import scenariotable  # noqa: PLC0415
-    from aftbed.cli.scenarioasked import Asked  # noqa: PLC0415
+    found = table_drive(given)
+    began_s = time.monotonic()
+    try:
+        rows = _drive(found, quiet=given.json)
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        raise typer.Exit(EXIT_INTERRUPTED) from None
+    seconds = round(time.monotonic() - began_s, 2)
+    if given.plot is not None:
+        _plot(given.plot, given.name, found, rows)
+    if given.json:
+        about = {"table": given.name, "group": given.group, "seed": given.seed, "seconds": seconds}
+        passed = all(row.passed for row in rows)
+        print(dumps({**about, "pass": passed, "rows": [msgspec.to_builtins(row) for row in rows]}))
+    else:
+        where = f", {given.group}" if given.group else ""
+        print(f"{given.name}{where}: {tables.title(given.name)}; seed {given.seed}")
+        _show_lines(found.lines, rows)
+        print(f"\n{_counted(rows)} in {seconds:.1f} s")
+    raise typer.Exit(_exit_code(rows))
 
-    asked = Asked(
-        table=name,
-        group=group,
-        ftms=tuple(one for text in ftm or () for one in text.split(",")),
-        fault=fault,
-        outages=tuple(outage or ()),
-        seed=seed,
-        jobs=jobs,
-        plot=plot,
-    )
-    raise typer.Exit(scenariotable.run(asked, as_json=json))
+
+def _drive(found: TableDrive, *, quiet: bool) -> list[Row]:
+    """All rows, in the order of the lines and of the table."""
+    todo = drives(found.cases, found.lines, found.seed)
+    rows: dict[tuple[str, str], Row] = {}
+    with closing(driven(todo, found.jobs)) as coming, Bar("driving", len(todo), quiet=quiet) as bar:
+        for done, these in enumerate(coming, 1):
+            rows |= {(row.line, row.case): row for row in these}
+            bar.show(done, len(rows), sum(not row.passed for row in rows.values()))
+    return [rows[line.name, case.name] for line in found.lines for case in found.cases]
 
 
-scenario.command("import")(import_)
+def _counted(rows: Sequence[Row]) -> str:
+    passed, struck = sum(row.passed for row in rows), all(row.struck for row in rows)
+    tail = "" if struck else f"; the fault never struck in {sum(not row.struck for row in rows)}"
+    return f"{passed} of {len(rows)} rows pass{tail}"
+
+
+def _exit_code(rows: Sequence[Row]) -> int:
+    if any(row.struck and not row.passed for row in rows):
+        return EXIT_FAIL
+    return EXIT_PASS if all(row.struck for row in rows) else EXIT_NO_FAULT
+
+
+def _plot(path: Path, table: str, found: TableDrive, rows: Sequence[Row]) -> None:
+    """A picture for each group."""
+    groups = {case.name: case.group for case in found.cases}
+    curves = [
+        Curve(group, line, tuple(_point(row) for row in sorted(of, key=lambda row: row.speed_kmh)))
+        for (line, group), of in groupby(rows, key=lambda row: (row.line, groups[row.case]))
+    ]
+    try:
+        path.write_text(road_plot(f"{table}: speed left at impact", curves), encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"--plot {path}: {error.strerror}") from None
+
+
+def _point(row: Row) -> Point:
+    return Point(row.speed_kmh, row.impact_kmh, row.limit_kmh, row.closed_form_kmh)
+
+
+# -- table: what is printed -----------------------------------------------------------------------
+
+
+def _show_lines(lines: Sequence[Line], rows: Sequence[Row]) -> None:
+    """For each line a table, why rows fail, and the command that repeats the worst row."""
+    by_line = {name: list(of) for name, of in groupby(rows, key=lambda row: row.line)}
+    for line in lines:
+        found = by_line[line.name]
+        print(f"\n{line.name}" + (f" (under {line.ftm})" if line.outage_ms is not None else ""))
+        _print_rows(line, found)
+        for text in (*_failures(line, found), *_search(line, found), *_repeat(line, found)):
+            print(f"  {text}")
+
+
+def _print_rows(line: Line, rows: Sequence[Row]) -> None:
+    heads = (*HEADS, *(FAULT_HEADS if line.fault else ()), *(OUTAGE_HEADS if line.outage_ms else ()), "")
+    grid = rich.table.Table(box=None, pad_edge=False, padding=(0, 3, 0, 0), header_style="")
+    for at, head in enumerate(heads):
+        grid.add_column(head, no_wrap=True, justify="left" if at in (0, len(heads) - 1) else "right")
+    for row in rows:
+        style = "" if row.passed else "red"
+        grid.add_row(*_cells(line, row), style=style)
+    console = Console(width=None if sys.stdout.isatty() else WIDTH, highlight=False)
+    with console.capture() as captured:
+        console.print(grid)
+    print("\n".join(line.rstrip() for line in captured.get().splitlines()))
+
+
+def _cells(line: Line, row: Row) -> list[str]:
+    cells = [
+        row.case,
+        f"{row.speed_kmh:g}",
+        f"{row.limit_kmh:g}" if row.limit_kmh else "none",
+        f"{row.impact_kmh:.1f} km/h" if row.impact_kmh else "-",
+        "-" if row.min_gap_m is None else f"{row.min_gap_m:.2f} m",
+        "-" if row.warning_s is None else f"{row.warning_s:.2f} s",
+    ]
+    if line.fault is not None:
+        cells.append("-" if row.at_s is None else f"{row.at_s:.3f} s")
+        cells.append("-" if row.instants is None else f"{row.instants}")
+        cells.append(_lost(row))
+    if line.outage_ms is not None:
+        cells.append("-" if row.closed_form_kmh is None else f"{row.closed_form_kmh:.1f} km/h")
+    verdict = "pass" if row.passed else "fail" if row.struck else "no fault"
+    return [*cells, verdict + (f", {row.colour}" if row.colour else "")]
+
+
+def _lost(row: Row) -> str:
+    if row.loss_kmh:
+        return f"{row.loss_kmh:.1f} km/h"
+    return "-" if row.loss_m is None else f"{row.loss_m:.3f} m"
+
+
+def _failures(line: Line, rows: Sequence[Row]) -> list[str]:
+    """Each row that fails, with why; of an outage, also that it must."""
+    failed = [row for row in rows if not row.passed]
+    found = [f"{row.case}: {'; '.join(row.because)}" for row in failed]
+    must = [f"{row.case}: {row.must_fail}" for row in failed if row.must_fail]
+    if must:
+        found += [f"{len(must)} of these must fail, since nothing stands in for the function:", *must]
+    if line.outage_ms is not None and not failed:
+        found.append(f"no row fails: {line.outage_ms} ms are less than what the function keeps in hand")
+    return found
+
+
+def _search(line: Line, rows: Sequence[Row]) -> list[str]:
+    """How the worst instants were found."""
+    if not line.searched:
+        return []
+    runs = sum(row.instants or 0 for row in rows)
+    step = f"every {STEP_CYCLES * CYCLE_S:g} s and at each change of stage, then down to 1 ms"
+    return [f"worst of {runs} instants: {step}"]
+
+
+def _repeat(line: Line, rows: Sequence[Row]) -> list[str]:
+    """The commands that repeat the row that lost most."""
+    if line.fault is None:
+        return []
+    struck = [row for row in rows if row.struck]
+    if not struck:
+        return []
+    worst = max(struck, key=lambda row: (not row.passed, row.loss_kmh or 0.0, row.loss_m or 0.0))
+    return [f"{'repeat' if at == 0 else '      '}  {text}" for at, text in enumerate(worst.repeat)]
+
+
+# -- import ---------------------------------------------------------------------------------------
+
+
+@scenario.command("import")
+def import_(
+    file: Annotated[Path, typer.Argument(metavar="FILE.xosc", help="One car behind another, straight on.")],
+    variations: Annotated[
+        Path | None, typer.Option(metavar="DIST.xosc", help="A ParameterValueDistribution for FILE.")
+    ] = None,
+    ego: Annotated[
+        str | None, typer.Option(help="The vehicle of the function; default: the one called Ego.")
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Directory of the scenario files.")] = Path(),
+    expect: Annotated[
+        str, typer.Option(help="The expected outcome of each drive: stop, no_collision or no_braking.")
+    ] = "no_collision",
+    duration: Annotated[
+        float | None,
+        typer.Option(metavar="SECONDS", help="Length of a drive; default: its StopTrigger, or 30."),
+    ] = None,
+    replace_controller: Annotated[
+        bool,
+        typer.Option(
+            "--replace-controller", help="Leave out the controller of the ego: the function controls it."
+        ),
+    ] = False,
+    seed: Annotated[int, typer.Option(help="Seed of a stochastic distribution that has no randomSeed.")] = 0,
+    force: Annotated[bool, typer.Option("--force", help="Overwrite files that differ.")] = False,
+    json: Json = False,
+) -> None:
+    """Make scenario files of an OpenSCENARIO 1.0 to 1.3 file; all or nothing."""
+    wanted = Wanted(ego, expect, duration, replace_controller, seed)
+    imported = import_scenario(file, variations, wanted)
+    paths = write(imported, out, force=force)
+    if json:
+        _print_json(imported, paths)
+    else:
+        _print_text(imported, paths)
+
+
+def _print_json(imported: Imported, paths: list[Path]) -> None:
+    document = {
+        "file": imported.path,
+        "version": imported.version,
+        "description": imported.description,
+        "sets": imported.sets,
+        "scenarios": [
+            {"name": one.name, "path": str(path), "parameters": one.parameters}
+            for one, path in zip(imported.variations, paths, strict=True)
+        ],
+        "taken": msgspec.to_builtins(imported.taken),
+        "ignored": msgspec.to_builtins(imported.ignored),
+    }
+    print(msgspec.json.encode(document).decode())
+
+
+def _print_text(imported: Imported, paths: list[Path]) -> None:
+    print(f"{imported.path}: OpenSCENARIO {imported.version}: {' '.join(imported.description.split())}")
+    print("taken")
+    for taken in imported.taken:
+        print(f"  line {taken.line:<5} {taken.element:26} {taken.meaning}")
+    print("ignored")
+    for ignored in imported.ignored:
+        elsewhere = f" ({ignored.path})" if ignored.path != imported.path else ""
+        print(f"  line {ignored.line:<5} {ignored.element:26} {ignored.reason}{elsewhere}")
+    if imported.sets > len(paths):
+        print(f"{imported.sets} sets of values, {len(paths)} of them different")
+    print("written")
+    for path in paths:
+        print(f"  {path}")

@@ -13,7 +13,7 @@ from plans import CASES, Case
 
 from aftbed.adapt.scriptcheck import refusals
 from aftbed.adapt.scriptfile import PORTS, RECOVERY, VERBS, ScriptFile, mapping, refuse, script_from
-from aftbed.cli.adaptview import yaml_lines
+from aftbed.cli.adapt import yaml_lines
 from aftbed.core.errors import ConfigError, ScriptError
 from aftbed.core.graph import BrickSpec
 from aftbed.core.script import (

@@ -9,13 +9,13 @@ from campaigns import CRASHES, planned, written
 
 from aftbed.campaign.plan import plan
 from aftbed.campaign.spec import Spec, read_spec, shipped
-from aftbed.cli.campaigning import Changes, made
+from aftbed.cli import campaign as command
 from aftbed.core.errors import ConfigError
 
 
 def refusal(folder: Path, text: str) -> str:
     with pytest.raises(ConfigError) as refused:
-        made(Changes(str(written(folder, text))))
+        command.planned(command.CampaignArguments(name=str(written(folder, text))))
     return str(refused.value)
 
 

@@ -1,20 +1,15 @@
-"""Bad input: exit code 2, one message that says what, where and what is allowed, and nothing is left running.
+"""Bad input to `aftbed run`: exit code 2, one message, and nothing is started.
 
-The command is called inside this process, which takes milliseconds; that a process of its own ends alike
-is shown for a few of them in `test_bad_input_process.py`.
+The command is called in this process, which takes milliseconds. `test_app_process.py` calls a few of the same
+in a process of their own.
 """
 
 import socket
-import sys
 from pathlib import Path
 from typing import Final
 
 import pytest
-from liveruns import Home
 from playedrun import Run
-
-from aftbed.cli import main
-from aftbed.runtime.unix import rundir
 
 SCENARIO: Final = """
 description: a car that stands
@@ -256,47 +251,6 @@ def test_a_port_in_use(refused: Run) -> None:
         assert all_words(refused("run", "--bus-port", str(port)), f"--bus-port {port}", "in use", "0 for any")
 
 
-@pytest.mark.parametrize(
-    "command", [("status",), ("ps",), ("graph",), ("stop",), ("inject", "crash", "primary")]
-)
-def test_no_run_is_alive(refused: Run, command: tuple[str, ...]) -> None:
-    assert "no run is alive; start one with `aftbed run`" in refused(*command)
-    named = refused(*command, "--run", "abcdef")
-    assert "--run abcdef: no such run is alive (alive: none)" in named
-    assert "no such run" in refused(*command, "--run", "../..")
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (("--format", "svg"), ("unknown format 'svg'", "dot, mermaid, text")),
-        (("--ftm", "prb"), ("unknown FTM 'prb'", "did you mean 'pbr'")),
-        (("--ftm", "pbr", "--placement", "proces"), ("did you mean 'process'",)),
-    ],
-)
-def test_options_of_graph(refused: Run, arguments: tuple[str, ...], words: tuple[str, ...]) -> None:
-    assert all_words(refused("graph", *arguments), *words)
-
-
-def test_a_directory_that_is_no_record(refused: Run, tmp_path: Path) -> None:
-    assert all_words(refused("check", tmp_path), "run.json", "is this the record of a run?")
-    assert "is this the record of a run?" in refused("check", tmp_path / "absent")
-    (tmp_path / "run.json").write_text("{")
-    assert all_words(refused("check", tmp_path), "run.json", "not JSON")
-    (tmp_path / "run.json").write_text("[]")
-    assert all_words(refused("check", tmp_path), "run.json", "not a JSON object")
-    (tmp_path / "run.json").write_text("{}")
-    assert "run.json" in refused("check", tmp_path)
-
-
-def test_a_runtime_directory_of_others_is_not_used(
-    home: Home, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    root = rundir.root()
-    root.chmod(0o755)
-    monkeypatch.setattr(sys, "argv", ["aftbed", "status"])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert ended.value.code == 3
-    assert "must be a directory of this user alone" in capsys.readouterr().err
-    root.chmod(0o700)
+def test_a_run_that_could_not_write_its_files_does_not_start(refused: Run) -> None:
+    assert "--mcap no/run.mcap: " in refused("run", "--load", "5", "--mcap", "no/run.mcap")
+    assert "--trace .: is a directory" in refused("run", "--load", "5", "--trace", ".")

@@ -14,6 +14,7 @@ from aftbed.judge.verdict import Breach
 from aftbed.runtime.sim.world import Setup
 from aftbed.search.explore import EXPLORERS, PLACEMENTS, selected
 
+ORDER: Final = ("order", "--ftm", "lfr", "--placement", "replica")
 SMALL: Final = ("crash", "--ftm", "lfr", "--placement", "replica", "--requests", "1")
 
 
@@ -112,6 +113,29 @@ def test_a_selection_of_all_holds_that_of_each(explorer: str) -> None:
     assert whole.placements == PLACEMENTS and whole.ftms == EXPLORERS[explorer].ftms
 
 
+# -- order
+
+
+def test_every_order_is_counted_and_the_bound_is_said(explore: Call) -> None:
+    code, out, _ = explore(*ORDER, "--requests", "2", "--bound", "20")
+    lines = out.splitlines()
+    assert code == 0
+    assert lines[0] == "all 2 orders (3 cut): lfr (replica), seed 0, 1 request"
+    assert lines[1] == "all 6 orders (13 cut): lfr (replica), seed 0, 2 requests"
+    assert all(line.startswith("at least ") for line in lines[2:-1]), "20 runs are not enough with a crash"
+    assert "all orders of 2 of " in lines[-1] and "the others up to 20 runs each" in lines[-1]
+
+
+def test_as_one_document(explore: Call) -> None:
+    code, out, _ = explore(*ORDER, "--requests", "1", "--bound", "5", "--json")
+    found = json.loads(out)
+    assert code == 0 and found["explored"] == found["survived"] > 0
+    assert (found["bound"], found["complete"], found["broken"]) == (5, 1, [])
+
+
+# -- bad input
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -126,6 +150,9 @@ def test_a_selection_of_all_holds_that_of_each(explorer: str) -> None:
         (("pairs", "--placement", "single"), ("unknown placement 'single'", "process, replica")),
         ((*SMALL, "--only", "99999"), ("--only 99999", "0 to ")),
         ((*SMALL, "--only", "-1"), ("--only -1",)),
+        ((*ORDER, "--bound", "0"), ("--bound 0: 1 to 10000000 are allowed",)),
+        ((*ORDER, "--requests", "0"), ("--requests 0: 1 to 1000 are allowed",)),
+        (("order", "--ftm", "lfrr"), ("unknown FTM 'lfrr'",)),
     ],
 )
 def test_options_that_are_refused(refused: Run, arguments: tuple[str, ...], words: tuple[str, ...]) -> None:

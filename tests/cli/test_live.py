@@ -1,210 +1,27 @@
-"""The commands of a second terminal, against a run that lives; and the ways in which a run ends."""
-
-import json
-import re
-import signal
-from collections.abc import Iterator
-from pathlib import Path
+"""`aftbed status`, `ps`, `graph`, `stop`: what they refuse. A live run answers in `test_live_process.py`."""
 
 import pytest
-from liveruns import Command, Home, aftbed, until
-
-from aftbed.ftm.compose import build
-from aftbed.runtime.unix import ask, rundir
-
-pytestmark = pytest.mark.process
-
-NODES = tuple(build("pbr", "process").nodes)
-
-
-@pytest.fixture
-def drive(home: Home) -> Iterator[Command]:
-    """A car on a free road, in real time."""
-    with Command("--scenario", "free-drive", "--pace", "real", "--ftm", "pbr") as command:
-        command.started()
-        command.wait_for_line("km/h")
-        yield command
-
-
-def ended_well(command: Command, *words: str) -> None:
-    """Stop the run: it passes, and its report has `words`."""
-    stopped = aftbed("stop")
-    assert stopped.code == 0, stopped.err
-    assert stopped.out.endswith("stopping\n")
-    done = command.done()
-    assert done.code == 0, done.out + done.err
-    assert "verdict: pass" in done.out
-    assert "never braked" in done.out
-    for word in words:
-        assert word in done.out
-
-
-def told(command: Command, *arguments: str) -> str:
-    """The output of a command that must succeed."""
-    done = aftbed(*arguments)
-    assert done.code == 0, done.err
-    return done.out
-
-
-def test_status_says_how_the_run_is(drive: Command) -> None:
-    run = rundir.live()[0]
-    status = json.loads(told(drive, "status", "--json"))
-    assert status["run"] == run
-    assert (status["ftm"], status["placement"]) == ("pbr", "process")
-    assert (status["leader"], status["backup"], status["epoch"]) == ("a", "b", 1)
-    assert status["vehicle"]["speed_ms"] > 0
-    text = told(drive, "status")
-    assert re.search(rf"^run +{run}$", text, re.MULTILINE)
-    assert re.search(r"^leader +a$", text, re.MULTILINE)
-    ended_well(drive)
-
-
-def test_ps_lists_the_seventeen_processes(drive: Command) -> None:
-    rows = json.loads(told(drive, "ps", "--json"))
-    nodes = [row for row in rows if row["node"]]
-    assert [row["name"] for row in nodes] == ["supervisor", *NODES]
-    roles = {row["name"]: row["role"] for row in nodes}
-    assert roles["a/server"] == "primary"
-    assert roles["b/server"] == "backup"
-    assert roles["proxy"] == "proxy"
-    assert {"hub", "vehicle", "zygote"} <= {row["name"] for row in rows if not row["node"]}
-    for row in rows:
-        assert Path(f"/proc/{row['pid']}").exists()
-        assert 0 < row["pss_mb"] <= row["rss_mb"] < 200
-    lines = told(drive, "ps").splitlines()
-    assert lines[0].split() == ["NAME", "ROLE", "PID", "CPU%", "PSS", "MB"]
-    assert lines[-1].startswith("17 processes, ")
-    assert [line.split()[0] for line in lines[1:18]] == ["supervisor", *NODES]
-    ended_well(drive)
-
-
-def test_graph_shows_the_live_graph_in_every_format(drive: Command) -> None:
-    text = told(drive, "graph")
-    assert text == told(drive, "graph", "--ftm", "pbr", "--placement", "process")
-    assert text.startswith("ftm pbr, placement process: 16 nodes\n")
-    assert "aft2aft  a/after -> b/after" in text
-    dot = told(drive, "graph", "--format", "dot")
-    assert dot.startswith("digraph aftbed {")
-    assert dot.rstrip().endswith("}")
-    assert '"a/after" -> "b/after" [label="aft2aft"]' in dot
-    mermaid = told(drive, "graph", "--format", "mermaid")
-    assert mermaid.startswith("flowchart LR")
-    assert "a_after -->|aft2aft| b_after" in mermaid
-    ended_well(drive)
-
-
-def test_inject_crash_of_the_primary(drive: Command) -> None:
-    told(drive, "inject", "crash", "primary")
-    drive.wait_for_line("script.done: new backup")
-    status = json.loads(told(drive, "status", "--json"))
-    assert (status["leader"], status["backup"], status["epoch"]) == ("b", "a", 2)
-    roles = {row["name"]: row["role"] for row in json.loads(told(drive, "ps", "--json"))}
-    assert (roles["a/server"], roles["b/server"]) == ("backup", "primary")
-    ended_well(drive, "failover   to epoch 2", "crash primary: activated")
-
-
-@pytest.mark.parametrize("target", ["backup", "proxy", "a/before", "a/watchdog", "engine"])
-def test_inject_crash_of_another(drive: Command, target: str) -> None:
-    told(drive, "inject", "crash", target)
-    drive.wait_for_line(
-        "script.done: new backup" if target in ("backup", "a/before") else f"replaced: {target}"
-    )
-    ended_well(drive, f"crash {target}: activated")
-
-
-def test_inject_crash_at_the_nth_event(drive: Command) -> None:
-    told(drive, "inject", "crash", "a/server", "--at", "checkpoint.sent", "--nth", "5")
-    drive.wait_for_line("armed: crash a/server at checkpoint.sent nth 5")
-    drive.wait_for_line("script.done: new backup")
-    ended_well(drive, "crash a/server at checkpoint.sent nth 5: activated")
-
-
-def test_inject_a_short_hang(drive: Command) -> None:
-    told(drive, "inject", "hang", "engine", "--for", "50ms")
-    assert json.loads(told(drive, "status", "--json"))["epoch"] == 1
-    ended_well(drive, "hang engine for 50ms: activated")
-
-
-def test_inject_after_a_while(drive: Command) -> None:
-    told(drive, "inject", "crash", "primary", "--after", "200ms")
-    drive.wait_for_line("script.done: failover")
-    ended_well(drive, "crash primary after 200ms: activated")
+from playedrun import Run
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    "command", [("status",), ("ps",), ("graph",), ("stop",), ("inject", "crash", "primary")]
+)
+def test_no_run_is_alive(refused: Run, command: tuple[str, ...]) -> None:
+    assert "no run is alive; start one with `aftbed run`" in refused(*command)
+    named = refused(*command, "--run", "abcdef")
+    assert "--run abcdef: no such run is alive (alive: none)" in named
+    assert "no such run" in refused(*command, "--run", "../..")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
     [
-        (("crash", "primry"), "did you mean 'primary'?"),
-        (("crash", "a/servr"), "did you mean 'a/server'?"),
-        (("crash", "primary", "--at", "checkpoint.send"), "did you mean 'checkpoint.sent'?"),
-        (("crash", "primary", "--nth", "3"), "'at EVENT nth 3' is allowed"),
-        (("crash", "primary", "--at", "reply.sent", "--after", "5ms"), "one of them is allowed"),
-        (("crash", "primary", "--at", "node.died"), "cannot trigger a fault under --ftm pbr"),
-        (("hang", "primary", "--for", "50"), "as 50ms or 2s"),
+        (("--format", "svg"), ("unknown format 'svg'", "dot, mermaid, text")),
+        (("--ftm", "prb"), ("unknown FTM 'prb'", "did you mean 'pbr'")),
+        (("--ftm", "pbr", "--placement", "proces"), ("did you mean 'process'",)),
     ],
 )
-def test_a_wrong_fault_is_refused_and_the_run_goes_on(
-    drive: Command, words: tuple[str, ...], message: str
-) -> None:
-    done = aftbed("inject", *words)
-    assert done.code == 2
-    assert done.err.startswith("aftbed: error: ")
-    assert message in done.err
-    ended_well(drive)
-
-
-# -- how a run ends ------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("sig", [signal.SIGINT, signal.SIGTERM])
-def test_an_interrupt_ends_the_run_with_its_verdict(home: Home, sig: signal.Signals) -> None:
-    with Command("--scenario", "free-drive") as command:
-        command.started()
-        command.wait_for_line("km/h")
-        command.popen.send_signal(sig)
-        done = command.done()
-        assert done.code == 130, done.out + done.err
-        assert "verdict: pass" in done.out
-        assert "0 lost, 0 duplicated" in done.out
-        assert home.left() == []
-
-
-def test_an_interrupt_of_json_gives_the_document(home: Home) -> None:
-    with Command("--load", "100000@200", "--json") as command:
-        private = rundir.root() / until(rundir.live, "the run")[0]
-        until(lambda: ask.ask(private, ask.Status())["backup"], "redundancy")
-        command.popen.send_signal(signal.SIGINT)
-        done = command.done()
-    assert done.code == 130, done.out + done.err
-    assert done.verdict().requests.lost == 0
-
-
-def test_a_run_that_is_stopped_by_another_command_passes(home: Home) -> None:
-    with Command("--load", "100000@200") as command:
-        command.started()
-        ended = aftbed("stop")
-        assert ended.code == 0, ended.err
-        done = command.done()
-    assert done.code == 0, done.out + done.err
-
-
-def test_a_recorded_run_is_judged_alike_again(home: Home, tmp_path: Path) -> None:
-    record = tmp_path / "record"
-    fault = "crash primary at checkpoint.sent nth 60"
-    drive = ("--scenario", "ccrs-20", "--pace", "max", "--inject", fault, "--record", record)
-    first = aftbed("run", *drive, "--json")
-    assert first.code == 0, first.out + first.err
-    again = aftbed("check", record, "--json")
-    assert (again.code, again.out) == (0, first.out)
-    names = {path.name for path in record.iterdir()}
-    assert {"run.json", "journal", "bus.log", "end.json", "events.jsonl"} <= names
-    assert "verdict: pass" in aftbed("check", record).out
-
-
-def test_a_plain_run_says_what_happens_in_lines(home: Home) -> None:
-    fault = "crash primary at checkpoint.sent nth 60"
-    done = aftbed("run", "--scenario", "ccrs-20", "--pace", "max", "--inject", fault)
-    assert done.code == 0, done.err
-    for words in ("started: 16 nodes", "km/h", "FULL", "script.done: failover", "stopped", "verdict: pass"):
-        assert words in done.out
-    assert done.err == ""
+def test_options_of_graph(refused: Run, arguments: tuple[str, ...], words: tuple[str, ...]) -> None:
+    error = refused("graph", *arguments)
+    assert all(word in error for word in words), error

@@ -43,8 +43,3 @@ def test_an_export_without_a_file_and_one_of_no_record_are_refused(log: Path, re
         "log", "export", ".", "--trace", "trace.json"
     )
     assert not Path("trace.json").exists()
-
-
-def test_a_run_that_could_not_write_its_files_does_not_start(log: Path, refused: Run) -> None:
-    assert "--mcap no/run.mcap: " in refused("run", "--load", "5", "--mcap", "no/run.mcap")
-    assert "--trace .: is a directory" in refused("run", "--load", "5", "--trace", ".")

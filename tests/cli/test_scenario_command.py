@@ -1,4 +1,4 @@
-"""`aftbed scenario`: what is listed and shown, a table with its exit code and document, what is refused."""
+"""`aftbed scenario`: list, show, tables with their exit codes and documents, import, and what is refused."""
 
 import json
 from functools import partial
@@ -7,9 +7,20 @@ from pathlib import Path
 import pytest
 from playedrun import Call, Run
 
-from aftbed.cli.scenarioasked import Asked, chosen
-from aftbed.vehicle.scenarios.library import scenario_names
+from aftbed.cli.scenario import TableArguments, table_drive
+from aftbed.vehicle.scenarios.library import load_scenario, scenario_names
 from aftbed.vehicle.scenarios.tables import table_names
+
+FOLDER = Path(__file__).resolve().parents[1] / "vehicle" / "xosc"
+LEAD_BRAKES = FOLDER / "lead_brakes.xosc"
+VALUES = FOLDER / "lead_brakes_values.xosc"
+SLOW_LEAD = FOLDER / "slow_lead.xosc"
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The working directory of the command: `scenario import` writes there by default."""
+    monkeypatch.chdir(tmp_path)
 
 
 @pytest.fixture
@@ -92,8 +103,8 @@ def test_outages_are_lines_of_their_own_and_are_drawn(table: Call, tmp_path: Pat
 
 
 def test_what_is_driven_is_a_line_for_each_mechanism_and_each_outage() -> None:
-    asked = Asked("r152", "m1", ("pbr", "lfr", "pbr"), "worst-instant", ("2ms", "0.3s", "2ms"))
-    lines = chosen(asked).lines
+    given = TableArguments("r152", "m1", ("pbr", "lfr", "pbr"), "worst-instant", ("2ms", "0.3s", "2ms"))
+    lines = table_drive(given).lines
     crash = "crash primary at the worst instant"
     assert [line.name for line in lines] == [f"pbr, {crash}", f"lfr, {crash}", "outage 2ms", "outage 300ms"]
     assert [line.outage_ms for line in lines] == [None, None, 2, 300]
@@ -101,25 +112,29 @@ def test_what_is_driven_is_a_line_for_each_mechanism_and_each_outage() -> None:
 
 
 @pytest.mark.parametrize(
-    ("asked", "names"),
+    ("given", "names"),
     [
-        (Asked("r152"), ["none"]),
-        (Asked("r152", outages=("2ms",)), ["outage 2ms"]),
-        (Asked("r152", ftms=("pbr",), outages=("2ms",)), ["pbr", "outage 2ms"]),
+        (TableArguments("r152"), ["none"]),
+        (TableArguments("r152", outage=("2ms",)), ["outage 2ms"]),
+        (TableArguments("r152", ftm=("pbr",), outage=("2ms",)), ["pbr", "outage 2ms"]),
         (
-            Asked("r152", fault="worst-instant", outages=("2ms",)),
+            TableArguments("r152", fault="worst-instant", outage=("2ms",)),
             ["none, crash primary at the worst instant", "outage 2ms"],
         ),
     ],
 )
-def test_what_is_left_out_is_the_bare_function(asked: Asked, names: list[str]) -> None:
-    assert [line.name for line in chosen(asked).lines] == names
+def test_what_is_left_out_is_the_bare_function(given: TableArguments, names: list[str]) -> None:
+    assert [line.name for line in table_drive(given).lines] == names
 
 
 def test_a_hang_can_be_searched_and_any_fault_aimed() -> None:
-    searched = chosen(Asked("r152", ftms=("pbr",), fault="hang primary for 30ms at worst-instant")).lines[0]
+    searched = table_drive(
+        TableArguments("r152", ftm=("pbr",), fault="hang primary for 30ms at worst-instant")
+    ).lines[0]
     assert searched.searched and str(searched.fault) == "hang primary for 30ms"
-    aimed = chosen(Asked("r152", ftms=("pbr",), fault="bitflip result bit 3 at server.exit nth 9")).lines[0]
+    aimed = table_drive(
+        TableArguments("r152", ftm=("pbr",), fault="bitflip result bit 3 at server.exit nth 9")
+    ).lines[0]
     assert not aimed.searched and str(aimed.fault).endswith("at server.exit nth 9")
 
 
@@ -171,3 +186,70 @@ def test_run_is_aftbed_run(refused: Run) -> None:
     error = partial(refused, "scenario", "run", "ccrs-20")
     assert "--pace fast: real, max, or a factor" in error("--pace", "fast")
     assert "unknown fault 'explode'" in error("--inject", "explode primary")
+
+
+# -- import
+
+
+def test_what_was_taken_ignored_and_written_is_printed(told: Run, tmp_path: Path) -> None:
+    out = told("scenario", "import", LEAD_BRAKES, "--expect", "stop").splitlines()
+    assert out[0] == f"{LEAD_BRAKES}: OpenSCENARIO 1.2: the car ahead brakes"
+    taken, ignored, written = (out.index(word) for word in ("taken", "ignored", "written"))
+    assert "  line 123   SpeedAction                Lead brakes at 6 m/s2 from 1 s on" in out[taken:ignored]
+    assert "  line 18    SceneGraphFile             for pictures" in out[ignored:written]
+    assert out[written:] == ["written", "  lead_brakes.yaml"]
+    assert load_scenario(str(tmp_path / "lead_brakes.yaml")).expect.outcome == "stop"
+
+
+def test_one_document_for_many_variations(told: Run, tmp_path: Path) -> None:
+    out = told("scenario", "import", LEAD_BRAKES, "--variations", VALUES, "--out", "made", "--json")
+    found = json.loads(out)
+    assert set(found) == {
+        *("file", "version", "description", "sets", "scenarios", "taken", "ignored"),
+    }
+    assert found["sets"] == len(found["scenarios"]) == 6
+    assert found["scenarios"][0] == {
+        "name": "lead_brakes-Gap-12-Deceleration-2",
+        "path": "made/lead_brakes-Gap-12-Deceleration-2.yaml",
+        "parameters": {"Gap": "12", "Deceleration": "2"},
+    }
+    assert all(load_scenario(one["path"]).plant.lead for one in found["scenarios"])
+    assert {"path", "line", "element", "reason"} == set(found["ignored"][0])
+    assert {"path", "line", "element", "meaning"} == set(found["taken"][0])
+
+
+def test_an_entry_of_a_catalog_says_in_which_file_it_stands(told: Run) -> None:
+    out = told("scenario", "import", SLOW_LEAD, "--ego", "Host", "--replace-controller", "--duration", "9")
+    assert f"({FOLDER / 'catalogs' / 'cars.xosc'})" in out
+    assert "replaced by aftbed's function, as asked for" in out
+    assert load_scenario("./slow_lead.yaml").duration_ms == 9000
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        ([SLOW_LEAD], "which vehicle is the ego? --ego NAME says it (one of: Host, Target)"),
+        ([SLOW_LEAD, "--ego", "Host"], "  line 66: ActivateControllerAction: controllers: "),
+        ([LEAD_BRAKES, "--ego", "Bert"], "--ego: unknown vehicle 'Bert' (one of: Ego, Lead)"),
+        ([LEAD_BRAKES, "--expect", "crash"], "--expect: unknown outcome 'crash'"),
+        ([LEAD_BRAKES, "--duration", "0"], "--duration: found 0, allowed is more than 0 and at most 3600"),
+        ([LEAD_BRAKES, "--variations", LEAD_BRAKES], "no ParameterValueDistribution in it"),
+        ([LEAD_BRAKES, "--out", LEAD_BRAKES], "cannot be written: "),
+        ([VALUES], "a distribution: import lead_brakes.xosc with --variations"),
+        (["nowhere.xosc"], "nowhere.xosc: cannot be read: No such file or directory"),
+    ],
+)
+def test_a_bad_wish_writes_nothing(
+    arguments: list[str | Path], reason: str, refused: Run, tmp_path: Path
+) -> None:
+    assert reason in refused("scenario", "import", *arguments)
+    assert not list(tmp_path.glob("*.yaml"))
+
+
+def test_a_file_of_somebody_elses_stays(told: Run, refused: Run, tmp_path: Path) -> None:
+    mine = tmp_path / "lead_brakes.yaml"
+    mine.write_text("mine")
+    assert "exists, and says something else; --force" in refused("scenario", "import", LEAD_BRAKES)
+    assert mine.read_text() == "mine"
+    told("scenario", "import", LEAD_BRAKES, "--force")
+    assert mine.read_text() != "mine"

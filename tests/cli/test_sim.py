@@ -13,12 +13,12 @@ import pytest
 from msgspec.structs import replace
 from playedrun import Call, Run
 
-from aftbed.cli import simulating
-from aftbed.cli.simfailure import repeating
+from aftbed.cli.sim import SHRUNK_MAX, repeating
 from aftbed.core.fault import Crash, Fault, Trigger
 from aftbed.core.messages import Goal, Scheduled
 from aftbed.runtime.sim.world import Doom, Setup
 from aftbed.runtime.unix.worker_pool import each
+from aftbed.search.agreement import Agreement, Times, apart
 from aftbed.search.explore import tried
 from aftbed.search.swarm import drawn
 
@@ -30,7 +30,8 @@ def call(call: Call) -> Call:
     """Call `aftbed` with one process that simulates: exit code, output, errors."""
 
     def aftbed(*arguments: str | Path) -> tuple[int, str, str]:
-        many = {"--seeds", "--minutes"} & set(map(str, arguments))
+        words = set(map(str, arguments))
+        many = {"--seeds", "--minutes"} & words and "--against" not in words
         return call(*arguments, *(("--jobs", "1") if many else ()))
 
     return aftbed
@@ -148,7 +149,7 @@ def test_a_breakdown_of_the_executive_is_a_failure(sim: Call, monkeypatch: pytes
         raise KeyError("a/server")
 
     monkeypatch.setattr("aftbed.search.explore.simulate", breaks_down)
-    monkeypatch.setattr("aftbed.cli.simulating.failure", lambda *_, **__: None)
+    monkeypatch.setattr("aftbed.cli.sim.broken_run", lambda *_, **__: None)
     code, out, _ = sim("--json")
     assert code == 1 and json.loads(out)["verdict"] == "fail"
 
@@ -194,7 +195,7 @@ def test_the_document_of_many(sim: Call) -> None:
 
 
 def test_of_many_that_break_only_the_first_are_shrunk(sim: Call) -> None:
-    last = simulating.SHRUNK_MAX
+    last = SHRUNK_MAX
     broken = json.loads(sim("--seeds", f"0..{last}", *FLIP, "--json")[1])["broken"]
     assert [bool(one["shrunk"]) for one in broken] == [True] * last + [False]
     out = sim("--seeds", f"0..{last}", *FLIP)[1]
@@ -227,12 +228,43 @@ def test_a_swarm_is_drawn_from_the_seed(sim: Call) -> None:
     assert json.loads(out)["setup"].startswith(f"{drawn(3).ftm} ({drawn(3).placement}), seed 3, ")
 
 
+# -- real records beside their simulation
+
+FAST: Final = Times(20, 0.2, 0.4, 0.6)
+
+
+@pytest.mark.parametrize(
+    ("real", "words"),
+    [
+        (Times(3, 0.5, 0.55, 3.0), ""),  # the real median lies among the simulated times
+        (Times(3, 0.3, 0.7, 3.0), ""),  # the simulated median lies among the real ones
+        (Times(3, 0.7, 0.9, 3.0), "recovery: real median 0.9 ms, simulated 0.2 to 0.6 ms"),
+        (None, "only one of them has failovers"),
+    ],
+)
+def test_times_agree_where_a_median_lies_within_the_other(real: Times | None, words: str) -> None:
+    assert apart(real, FAST) == ([words] if words else [])
+
+
+@pytest.mark.parametrize(("why_not", "code"), [((), 0), (("not alike",), 1)])
+def test_what_does_not_agree_is_an_exit_code(
+    sim: Call, monkeypatch: pytest.MonkeyPatch, why_not: tuple[str, ...], code: int
+) -> None:
+    one = Agreement("pbr process", {"masked": 1}, {"masked": 20}, FAST, None, why_not)
+    monkeypatch.setattr("aftbed.cli.sim.against", lambda records, seeds: [one] if seeds == 3 else [])
+    found, out, _ = sim("--against", str(Path("there")), "--seeds", "0..2", "--json")
+    assert (found, json.loads(out)["agree"]) == (code, not why_not)
+
+
 # -- bad input
 
 
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
+        (("--against", "/nowhere"), ("/nowhere/run.json: No such file or directory",)),
+        (("--against", "/nowhere", "--ftm", "lfr"), ("--against: the experiments are the records'",)),
+        (("--against", "/nowhere", "--seeds", "5..4"), ("5..4",)),
         (("--seeds", "5..4"), ("--seeds 5..4", "no seed is in it", "as 4..5")),
         (("--seeds", "5"), ("--seeds '5'", "A..B")),
         (("--seeds", "a..b"), ("A..B", "0..99")),

@@ -8,7 +8,7 @@ import pytest
 import typer
 from pages import PAGES, ROOT, anchors, blocks, links, names, prose, sections, table
 
-from aftbed.cli.app import app
+from aftbed.cli.app import LazyCommand, app
 from aftbed.core.events import BY_LABEL, REQUEST_PATH
 from aftbed.core.graph import PLACEMENTS
 from aftbed.ftm.compose import EXPRESSIONS, build
@@ -28,6 +28,8 @@ def commands() -> Iterator[tuple[str, list[str]]]:
     """Every command of the command line, as `inject crash`, with the options and arguments it takes."""
 
     def walk(command: object, path: tuple[str, ...]) -> Iterator[tuple[str, list[str]]]:
+        if isinstance(command, LazyCommand):
+            command = command.load()
         children = getattr(command, "commands", None)
         if children is not None:
             for name, child in children.items():

@@ -1,4 +1,4 @@
-"""Bad input to a command in a process of its own; interpreters and limits that are refused."""
+"""Commands in processes of their own: bad input, exit codes, the version, an interpreter that is refused."""
 
 import json
 import socket
@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 from liveruns import Done, Home, aftbed
+from test_bad_input import DBC, MAP
 
 from aftbed.campaign.plan import code_version
 
@@ -74,8 +75,6 @@ def test_usage_is_exit_code_2(home: Home, option: tuple[str, ...]) -> None:
 
 def test_a_log_with_spoilt_lines_is_replayed_without_them(home: Home, tmp_path: Path) -> None:
     """Counted and refused; the frames around them are believed."""
-    from test_bad_input import DBC, MAP  # noqa: PLC0415 - beside this file
-
     good = [f"(000000000{n}.000000) can0 210#{n:02X}00000000000000\n" for n in range(1, 6)]
     lines = [*good[:3], "garbage\n", "(0000000001.000000) can0 210#00\n", *good[3:], good[4][:-9]]
     log, dbc, mapped = tmp_path / "x.log", tmp_path / "x.dbc", tmp_path / "x.yaml"

@@ -1,4 +1,4 @@
-"""`run --adapt`: what is refused before the run starts, and what each adaptation begins from."""
+"""`aftbed run --adapt`: what is refused before the run starts, and what each adaptation begins from."""
 
 import sys
 from pathlib import Path
@@ -7,8 +7,8 @@ import pytest
 from liveruns import Home
 from playedrun import CLOSED, Run
 
-from aftbed.cli import main, running
-from aftbed.cli.adaptation import scheduled
+from aftbed.cli import main, run
+from aftbed.cli.adapt import scheduled
 from aftbed.core.errors import ConfigError
 from aftbed.core.messages import Goal, Scheduled
 from aftbed.ftm.compose import build
@@ -84,7 +84,7 @@ def test_the_adaptations_of_a_run_are_among_its_options(home: Home, monkeypatch:
         rundir.remove(Path(options.private))
         raise StartedError
 
-    monkeypatch.setattr(running, "launch", launch)
+    monkeypatch.setattr(run, "launch", launch)
     monkeypatch.setattr(
         sys, "argv", ["aftbed", "run", "--load", "10", "--adapt", "to lfr after 1s", "--recipe", "paper"]
     )

@@ -1,0 +1,365 @@
+"""`aftbed adapt`: change the mechanism, a brick or the function of a live run; and `aftbed run --adapt`.
+
+What can be refused is refused here, before the run is asked: an unknown word, a mechanism that does not suit
+the function (`suitability`), a script with an error. The Engine plans and checks once more when it begins,
+on the graph that runs then.
+"""
+
+import functools
+import sys
+from collections.abc import Iterator
+from json import dumps
+from pathlib import Path
+from typing import Annotated, Final
+
+import msgspec
+import typer
+import yaml
+
+from aftbed.adapt import schedule
+from aftbed.adapt.bricks import load_application
+from aftbed.adapt.engine import script_for
+from aftbed.adapt.plan import APPLICATION, Plan, target
+from aftbed.adapt.plan import plan as plan_between
+from aftbed.adapt.schedule import goal_of, led_to
+from aftbed.adapt.scriptcheck import refusals
+from aftbed.adapt.scriptfile import ScriptFile, mapping, phases, refuse, script_from, step
+from aftbed.adapt.suitability import remarks, unsuitable
+from aftbed.adapt.words import Wish
+from aftbed.cli.options import Json, Recipe, Run
+from aftbed.cli.views import EndedAdaptation, history_lines
+from aftbed.core.application import Characteristics
+from aftbed.core.errors import ConfigError
+from aftbed.core.graph import PLACEMENTS, BrickSpec, Graph
+from aftbed.core.messages import Goal, Scheduled
+from aftbed.core.script import Script, Stage, Step, Together
+from aftbed.ftm.compose import build
+from aftbed.runtime.unix import ask, rundir
+from aftbed.runtime.unix.part import load_module
+from aftbed.vehicle.aeb.function import default_application
+from aftbed.vehicle.yamlfile import read_yaml
+
+EXIT_CODES: Final = {"done": 0, "rolled back": 1, "refused": 2}
+WIDTH: Final = 100
+WHEN: Final = {
+    "prepare": "while the old one serves",
+    "commit": "while the client waits",
+    "finish": "when nothing has broken",
+}
+
+adapt = typer.Typer(
+    help="Change the mechanism of a live run: update, switch, compose.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+)
+
+Expr = Annotated[str, typer.Argument(help="The whole new expression, the outer mechanism first: lfr+tr.")]
+Force = Annotated[bool, typer.Option("--force", help="Even where it does not suit the function.")]
+
+
+# -- change a live run ----------------------------------------------------------------------------
+
+
+@adapt.command()
+def to(
+    expr: Expr, recipe: Recipe = "drained", force: Force = False, run: Run = None, json: Json = False
+) -> None:
+    """Replace what runs by EXPR.
+
+    Exit code of all that adapts: 0 done, 1 rolled back, 2 refused.
+    """
+    _change(Wish("to", expr), run, recipe, force=force, as_json=json)
+
+
+@adapt.command()
+def switch(
+    expr: Expr, recipe: Recipe = "drained", force: Force = False, run: Run = None, json: Json = False
+) -> None:
+    """Replace the outer mechanism by another one."""
+    _change(Wish("switch", expr), run, recipe, force=force, as_json=json)
+
+
+@adapt.command()
+def compose(
+    expr: Expr, recipe: Recipe = "drained", force: Force = False, run: Run = None, json: Json = False
+) -> None:
+    """Keep the outer mechanism, and add mechanisms inside it."""
+    _change(Wish("compose", expr), run, recipe, force=force, as_json=json)
+
+
+@adapt.command()
+def decompose(recipe: Recipe = "drained", run: Run = None, json: Json = False) -> None:
+    """Keep the outer mechanism, and remove those inside it."""
+    _change(Wish("decompose", ""), run, recipe, force=False, as_json=json)
+
+
+@adapt.command()
+def update(
+    brick: Annotated[str, typer.Argument(help="A brick of a replica, as tr.after; app is the function.")],
+    source: Annotated[str, typer.Option("--to", help="MODULE:CLASS or FILE.py:CLASS.")],
+    recipe: Recipe = "drained",
+    force: Force = False,
+    run: Run = None,
+    json: Json = False,
+) -> None:
+    """Replace the class of one brick on every replica; the class may be newer than the run."""
+    _change(Wish("update", brick, source), run, recipe, force=force, as_json=json)
+
+
+@adapt.command()
+def script(
+    file: Annotated[str, typer.Argument(help="A YAML file, as `adapt plan --yaml` prints it.")],
+    run: Run = None,
+    json: Json = False,
+) -> None:
+    """Carry out a script from a file; all of it is checked before its first step."""
+    path = Path(file)
+    wanted = _absolute(script_from(read_yaml(path, ScriptFile), file), path.parent)
+    private = rundir.find(run)
+    graph = _graph_of(private)
+    refuse(file, refusals(graph, wanted))
+    goal = Goal(script=wanted, recipe=wanted.recipe)
+    script_for(graph, goal)
+    raise typer.Exit(_ask(private, goal, as_json=json))
+
+
+def _change(wish: Wish, run: str | None, recipe: str, *, force: bool, as_json: bool) -> None:
+    private = rundir.find(run)
+    graph = _graph_of(private)
+    goal = goal_of(wish, graph, recipe, _source_here)
+    _refuse_unsuitable(led_to(graph, goal), wish, force=force)
+    raise typer.Exit(_ask(private, goal, as_json=as_json))
+
+
+def _graph_of(private: Path) -> Graph:
+    return msgspec.convert(ask.ask(private, ask.GraphNow()), Graph)
+
+
+def _ask(private: Path, goal: Goal, *, as_json: bool) -> int:
+    """Have the run adapt, print how it ended; the exit code."""
+    found = ask.ask(private, ask.Adapt(goal), ask.ADAPT_SECONDS_MAX)
+    ended = msgspec.convert(found, EndedAdaptation)
+    if as_json:
+        print(dumps(found))
+    else:
+        print(f"run {private.name}: {ended}")
+        print(
+            f"  prepare {ended.prepare_ms:.2f} ms, blackout {ended.blackout_ms:.2f} ms,"
+            f" total {ended.total_ms:.2f} ms; {ended.bricks_changed} of {ended.bricks_total} bricks"
+        )
+    return EXIT_CODES[ended.outcome]
+
+
+# -- what is refused before the run is asked ------------------------------------------------------
+
+
+def scheduled(texts: tuple[str, ...], start: Graph, recipe: str, *, force: bool) -> tuple[Scheduled, ...]:
+    """The adaptations of `--adapt`, each checked on the graph that it will find. Raises ConfigError."""
+    judge = functools.partial(_refuse_unsuitable, force=force)
+    try:
+        return schedule.scheduled(texts, start, recipe, resolve=_source_here, judge=judge)
+    except ConfigError as error:
+        raise ConfigError(f"--adapt {error}") from error
+
+
+def _refuse_unsuitable(new: Graph, wish: Wish, *, force: bool) -> None:
+    """Raise ConfigError if the mechanism of `new` does not suit its function, unless `force`."""
+    if wish.verb == "decompose" or (wish.verb == "update" and wish.name != APPLICATION):
+        return  # the new graph needs no more of the function than the old one
+    declared = _characteristics(new)
+    if reason := unsuitable(new.ftm, declared):
+        if not force:
+            raise ConfigError(f"{reason}; --force does it all the same")
+        print(f"aftbed: forced: {reason}", file=sys.stderr)
+    for remark in remarks(new.ftm, declared):
+        print(f"aftbed: note: {remark}", file=sys.stderr)
+
+
+def _characteristics(graph: Graph) -> Characteristics:
+    """What the function of `graph` declares. Raises ConfigError if it declares nothing."""
+    source = next(b.application for b in graph.bricks if b.part == "server")
+    function = load_application(source, load_module) if source else default_application()
+    declared: object = getattr(function, "characteristics", None)
+    if not isinstance(declared, Characteristics):
+        raise ConfigError(f"{source}: characteristics: found {declared!r}, allowed is Characteristics(...)")
+    return declared
+
+
+def _source_here(text: str) -> str:
+    return _source(text, Path.cwd())
+
+
+def _source(text: str, folder: Path) -> str:
+    """`FILE.py:CLASS` with the absolute path of the file. Raises ConfigError if there is no such file."""
+    place, colon, name = text.rpartition(":")
+    if not (colon and place and name.isidentifier()):
+        raise ConfigError(f"{text!r} names no class; MODULE:CLASS or FILE.py:CLASS is allowed")
+    if not place.endswith(".py"):
+        return text
+    path = (folder / place).resolve()
+    if not path.is_file():
+        raise ConfigError(f"{text}: {path}: no such file")
+    return f"{path}:{name}"
+
+
+def _absolute(script: Script, folder: Path) -> Script:
+    """`script`, with the classes that it names resolved against `folder`."""
+
+    def brick(spec: BrickSpec) -> BrickSpec:
+        source = _source(spec.source, folder) if spec.source else ""
+        application = _source(spec.application, folder) if spec.application else ""
+        return msgspec.structs.replace(spec, source=source, application=application)
+
+    def resolved(verb: Step) -> Step:
+        match verb:
+            case Stage():
+                return msgspec.structs.replace(verb, bricks=tuple(brick(b) for b in verb.bricks))
+            case Together(steps):
+                return Together(tuple(resolved(inner) for inner in steps))
+            case _:
+                return verb
+
+    prepare, commit = (tuple(resolved(v) for v in steps) for steps in (script.prepare, script.commit))
+    return msgspec.structs.replace(script, prepare=prepare, commit=commit)
+
+
+# -- a plan that is only shown --------------------------------------------------------------------
+
+
+@adapt.command()
+def plan(
+    expr: Expr,
+    start: Annotated[
+        str | None, typer.Option("--from", help="From this mechanism; without it, from what runs.")
+    ] = None,
+    placement: Annotated[
+        str | None, typer.Option(help="With --from: process (default), replica or single.")
+    ] = None,
+    recipe: Recipe = "drained",
+    run: Run = None,
+    as_yaml: Annotated[bool, typer.Option("--yaml", help="Print the script as a file.")] = False,
+    json: Json = False,
+) -> None:
+    """Show the steps of an adaptation to EXPR, and the way back. Nothing is changed."""
+    if as_yaml and json:
+        raise ConfigError("--yaml and --json: one of them is allowed")
+    if start is None and placement is not None:
+        raise ConfigError("--placement says where --from stands: give --from EXPR too")
+    old = _graph_of(rundir.find(run)) if start is None else build(start, placement or PLACEMENTS[0])
+    there = plan_between(old, target(old, expr), recipe)
+    back = plan_between(there.new, old, recipe)
+    if as_yaml:
+        print("\n".join(yaml_lines(mapping(there.script))))
+    elif json:
+        print(dumps({**_document(there), "way_back": _document(back)}))
+    else:
+        print("\n".join(_plan_lines(there, back)))
+
+
+def _document(plan: Plan) -> dict[str, object]:
+    return {
+        "from": plan.old.ftm,
+        "to": plan.new.ftm,
+        "placement": plan.new.placement,
+        "recipe": plan.script.recipe,
+        "bricks_changed": plan.bricks_changed,
+        "bricks_total": plan.bricks_total,
+        "replaced": plan.replaced,
+        "added": plan.added,
+        "removed": plan.removed,
+        "kept": plan.kept,
+        "rebound": plan.rebound,
+        "script": mapping(plan.script),
+    }
+
+
+def _plan_lines(there: Plan, back: Plan) -> Iterator[str]:
+    """The plan, its steps, and the commit of the way back."""
+    yield _headline(there)
+    for name in ("replaced", "added", "removed", "rebound", "kept"):
+        yield from _wrapped(name, getattr(there, name))
+    for name, verbs in phases(there.script).items():
+        yield from _phase(name, verbs)
+    yield f"way back, {_headline(back)}"
+    yield from _phase("commit", back.script.commit)
+
+
+def _headline(plan: Plan) -> str:
+    return (
+        f"{plan.script.purpose}: {plan.bricks_changed} of {plan.bricks_total} bricks"
+        f" (placement {plan.new.placement}, recipe {plan.script.recipe})"
+    )
+
+
+def _wrapped(name: str, bricks: tuple[str, ...]) -> Iterator[str]:
+    """`name` and its bricks, in lines of at most WIDTH characters."""
+    if not bricks:
+        return
+    line = f"  {name:9}"
+    for brick in bricks:
+        if len(line) + len(brick) + 1 > WIDTH:
+            yield line
+            line = " " * 11
+        line += f" {brick}"
+    yield line
+
+
+def _phase(name: str, verbs: tuple[Step, ...]) -> Iterator[str]:
+    if not verbs:
+        return
+    yield f"{name}, {WHEN[name]}: {len(verbs)} step{'s' if len(verbs) > 1 else ''}"
+    for verb in verbs:
+        yield from _step_lines(verb, "  ")
+
+
+def _step_lines(verb: Step, indent: str) -> Iterator[str]:
+    if isinstance(verb, Together):
+        yield f"{indent}together"
+        for inner in verb.steps:
+            yield from _step_lines(inner, indent + "  ")
+        return
+    ((name, value),) = step(verb).items()
+    if isinstance(verb, Stage):
+        kinds = ", ".join(f"{b.name} ({b.source or b.application or b.kind})" for b in verb.bricks)
+        value = (f"{verb.node}: " if (verb.node,) != tuple(b.name for b in verb.bricks) else "") + kinds
+        value += ", held" if verb.held else ""
+    yield f"{indent}{name:8} {value}"
+
+
+def yaml_lines(script: dict[str, object]) -> Iterator[str]:
+    """A script (`scriptfile.mapping`) as a YAML file: a line for each key and each step."""
+    for key, value in script.items():
+        if isinstance(value, list):
+            yield f"{key}:" if value else f"{key}: []"
+            yield from _yaml_steps(value, "")
+        else:
+            yield f"{key}: {_yaml(value)}"
+
+
+def _yaml_steps(steps: list[dict[str, object]], indent: str) -> Iterator[str]:
+    for one in steps:
+        ((verb, value),) = one.items()
+        if isinstance(value, list):
+            yield f"{indent}- {verb}:"
+            yield from _yaml_steps(value, indent + "  ")
+        else:
+            yield f"{indent}- {verb}: {_yaml(value)}"
+
+
+def _yaml(value: object) -> str:
+    """One value, in one line."""
+    text = yaml.safe_dump(
+        value, default_flow_style=True, sort_keys=False, width=float("inf"), allow_unicode=True
+    )
+    return text.removesuffix("\n").removesuffix("\n...")
+
+
+# -- adaptations that ended -----------------------------------------------------------------------
+
+
+@adapt.command()
+def history(run: Run = None, json: Json = False) -> None:
+    """The adaptations of the run that have ended, and how."""
+    found = ask.ask(rundir.find(run), ask.Adaptations())
+    ended = msgspec.convert(found["adaptations"], list[EndedAdaptation])
+    print("\n".join([dumps(found)] if json else history_lines(ended)))

@@ -1,0 +1,317 @@
+"""`aftbed run`: check all options, start the run, show it, judge it.
+
+The command forks the supervisor, so a module that is imported before the launch costs memory in every
+process of the run and delays its first reply. What only some runs need is imported where it is used, and
+what judges is imported after the run.
+"""
+
+import json
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Final
+
+import msgspec
+import typer
+
+from aftbed.cli.options import RATE_HZ_MAX, Json, check_seed, takes
+from aftbed.cli.views import RunView, open_view
+from aftbed.core.errors import ConfigError, unknown
+from aftbed.core.fault import Fault, FlipMemory
+from aftbed.core.graph import Graph
+from aftbed.core.messages import Scheduled
+from aftbed.core.script import RECIPES
+from aftbed.ftm.compose import build
+from aftbed.inject.parts import refuse_unsafe
+from aftbed.inject.words import parse
+from aftbed.runtime import targets
+from aftbed.runtime.control import Report
+from aftbed.runtime.unix.launch import Launched, launch, options_for
+from aftbed.runtime.unix.options import CarRun, LoadRun, ReplayRun, Work
+
+if TYPE_CHECKING:
+    from aftbed.runtime.unix.closedloop import ClosedLoop
+
+POLICIES: Final = ("hold", "release", "latch")
+PACE_MIN, PACE_MAX = 0.01, 100.0
+LOAD_MAX: Final = 10_000_000
+PROCESSES_LOG_SHOWN: Final = 4000  # characters
+
+
+class RunArguments(msgspec.Struct, frozen=True):
+    """The options of `aftbed run`."""
+
+    ftm: Annotated[str, typer.Option(help="none, pbr, lfr, tr, pbr+tr, ...: aftbed ftm list.")] = "pbr"
+    scenario: Annotated[str, typer.Option(help="Name of a scenario, or a YAML file.")] = "ccrs-50"
+    placement: Annotated[str, typer.Option(help="process (one per brick) or replica.")] = "process"
+    pace: Annotated[str, typer.Option(help="real, a factor (4), or max (lockstep).")] = "real"
+    seed: Annotated[int, typer.Option(help="Seed of all random numbers of the run.")] = 0
+    faults: Annotated[
+        tuple[str, ...], typer.Option("--inject", help='E.g. "crash primary at checkpoint.sent nth 100".')
+    ] = ()
+    adaptations: Annotated[
+        tuple[str, ...], typer.Option("--adapt", help='E.g. "compose lfr+tr at request 120".')
+    ] = ()
+    recipe: Annotated[str, typer.Option(help="How each --adapt is carried out: drained or paper.")] = (
+        "drained"
+    )
+    force: Annotated[
+        bool, typer.Option("--force", help="Carry out --adapt even where it does not suit the function.")
+    ] = False
+    policy: Annotated[
+        str | None, typer.Option(help="When the run adapts by itself: name of a policy, or a YAML file.")
+    ] = None
+    approve: Annotated[str, typer.Option(help="What --policy proposes: auto (do it) or ask.")] = "auto"
+    brake_policy: Annotated[
+        str, typer.Option(help="What the brake ECU does on lost requests: hold, release or latch.")
+    ] = "latch"
+    record: Annotated[str | None, typer.Option(help="Keep the record of the run in this new directory.")] = (
+        None
+    )
+    replay: Annotated[str | None, typer.Option(help="A candump log to replay instead of a drive.")] = None
+    dbc: Annotated[str | None, typer.Option(help="The DBC of the replayed log.")] = None
+    map_file: Annotated[str | None, typer.Option("--map", help="What the log's signals mean.")] = None
+    load: Annotated[
+        str | None, typer.Option(help="COUNT[@RATE]: synthetic requests (per second) instead of a drive.")
+    ] = None
+    bus_port: Annotated[int, typer.Option(help="TCP port of the bus on 127.0.0.1; 0 is any free one.")] = 0
+    pin: Annotated[bool, typer.Option(help="Keep each replica's chain on one core.")] = True
+    unsafe_memory: Annotated[
+        bool, typer.Option("--unsafe-memory", help='Allow --inject "bitflip memory ...".')
+    ] = False
+    mcap: Annotated[Path | None, typer.Option(help="Write the run to this file, for Foxglove.")] = None
+    trace: Annotated[Path | None, typer.Option(help="Write its nodes to this file, for Perfetto.")] = None
+    json: Json = False
+
+
+@takes(RunArguments)
+def run(given: RunArguments) -> None:
+    """Drive a car at an obstacle, under a fault tolerance mechanism; end with a verdict.
+
+    Exit code: 0 pass, 1 a promise was broken, 2 usage, 3 inconclusive, 130 interrupted and cleaned.
+    """
+    raise typer.Exit(execute(given))
+
+
+def execute(given: RunArguments) -> int:
+    """Run, show, judge; the exit code. Raises ConfigError before anything is started."""
+    graph = build(given.ftm, given.placement)
+    faults = tuple(_fault(text, graph, unsafe=given.unsafe_memory) for text in given.faults)
+    adaptations = _adaptations(given, graph)
+    make_loop = _closed_loop(given)
+    work = _work(given)
+    check_seed(given.seed)
+    if not 0 <= given.bus_port <= 65535:
+        raise ConfigError(f"--bus-port {given.bus_port}: 0 to 65535 are allowed")
+    write_files = _files(given)
+    options, listener = options_for(
+        ftm=given.ftm,
+        placement=given.placement,
+        work=work,
+        seed=given.seed,
+        record=given.record,
+        faults=faults,
+        adaptations=adaptations,
+        pin=given.pin,
+        bus_port=given.bus_port,
+    )
+    launched = launch(options, listener)
+    view = open_view(options, quiet=given.json)
+    interrupted = _follow(launched, view, make_loop(launched) if make_loop is not None else None)
+    launched.wait()
+    from aftbed.cli.check import judge_and_show  # noqa: PLC0415 - after the launch
+    from aftbed.judge.verdict import EXIT_CODES, EXIT_INTERRUPTED  # noqa: PLC0415 - after the launch
+
+    try:
+        verdict = judge_and_show(launched.record, as_json=given.json)
+        if verdict.verdict == "inconclusive" and not given.json:
+            _show_log(launched.record / "processes.log")
+        written = write_files is None or _write(write_files, launched.record, as_json=given.json)
+    finally:
+        launched.remove()
+    code = EXIT_CODES[verdict.verdict]
+    return EXIT_INTERRUPTED if interrupted else code or (0 if written else EXIT_CODES["inconclusive"])
+
+
+# -- what the options mean ------------------------------------------------------------------------
+
+
+def _fault(text: str, graph: Graph, *, unsafe: bool) -> Fault:
+    fault = parse(text)
+    if isinstance(fault.action, FlipMemory):
+        refuse_unsafe(str(fault), unsafe=unsafe)
+    targets.check(fault, graph)
+    return fault
+
+
+def _adaptations(given: RunArguments, graph: Graph) -> tuple[Scheduled, ...]:
+    if not given.adaptations:
+        if given.recipe != RECIPES[0] or given.force:
+            raise ConfigError("--recipe and --force say how --adapt is carried out: give --adapt too")
+        return ()
+    from aftbed.cli.adapt import scheduled  # noqa: PLC0415 - only with --adapt
+
+    return scheduled(given.adaptations, graph, given.recipe, force=given.force)
+
+
+def _closed_loop(given: RunArguments) -> "Callable[[Launched], ClosedLoop] | None":
+    """What makes the closed loop of a launched run; None without `--policy`."""
+    if given.policy is None and given.approve == "auto":
+        return None
+    from aftbed.runtime.unix.closedloop import ClosedLoop, asked_for  # noqa: PLC0415 - only with --policy
+
+    policy = asked_for(given.policy, given.approve, given.ftm, as_json=given.json)
+    if policy is None:
+        return None
+    return lambda run: ClosedLoop(policy, given.ftm, run.private, run.record, given.approve)
+
+
+def _work(given: RunArguments) -> Work:
+    if given.replay is not None and given.load is not None:
+        raise ConfigError("--replay and --load: one of them is allowed")
+    if given.load is not None:
+        return _load(given.load)
+    pace = _pace(given.pace)
+    if given.replay is not None:
+        return _replay(given.replay, given.dbc, given.map_file, pace)
+    if given.dbc is not None or given.map_file is not None:
+        raise ConfigError("--dbc and --map say what a replayed log means: give --replay LOG too")
+    from aftbed.vehicle.scenarios.library import load_scenario  # noqa: PLC0415 - only for a drive: PyYAML
+
+    load_scenario(given.scenario)
+    if given.brake_policy not in POLICIES:
+        raise unknown("brake policy", given.brake_policy, POLICIES)
+    scenario = given.scenario
+    if scenario.endswith((".yaml", ".yml")):
+        scenario = str(Path(scenario).resolve())
+    return CarRun(scenario, pace, given.brake_policy)
+
+
+def _replay(log: str, dbc_name: str | None, map_name: str | None, pace: float | None) -> ReplayRun:
+    if dbc_name is None or map_name is None:
+        raise ConfigError("--replay LOG needs --dbc FILE and --map FILE, which say what its frames mean")
+    from aftbed.vehicle.can.candump import read_log  # noqa: PLC0415 - only with --replay
+    from aftbed.vehicle.replay.map_file import (  # noqa: PLC0415 - only with --replay
+        bind,
+        find_dbc,
+        find_map,
+    )
+
+    dbc, map_path = find_dbc(dbc_name), find_map(map_name)
+    bind(map_path, dbc)
+    read_log(Path(log))
+    return ReplayRun(str(Path(log).resolve()), str(dbc.resolve()), str(map_path), pace)
+
+
+def _pace(text: str) -> float | None:
+    """The pace as a factor; None is lockstep."""
+    if text == "max":
+        return None
+    if text == "real":
+        return 1.0
+    try:
+        pace = float(text)
+    except ValueError:
+        pace = 0.0
+    if not PACE_MIN <= pace <= PACE_MAX:
+        raise ConfigError(f"--pace {text}: real, max, or a factor from {PACE_MIN} to {PACE_MAX} is allowed")
+    return pace
+
+
+def _load(text: str) -> LoadRun:
+    count, _, rate = text.partition("@")
+    try:
+        load = LoadRun(int(count), float(rate or 0))
+    except ValueError:
+        load = LoadRun(0, 0.0)
+    if not (1 <= load.count <= LOAD_MAX and 0 <= load.rate_hz <= RATE_HZ_MAX):
+        raise ConfigError(
+            f"--load {text}: COUNT or COUNT@RATE is allowed, 1 to {LOAD_MAX} requests,"
+            f" up to {RATE_HZ_MAX:.0f} a second (without a rate: each follows the reply before)"
+        )
+    return load
+
+
+# -- while it runs --------------------------------------------------------------------------------
+
+
+def _follow(launched: Launched, view: RunView, closed: "ClosedLoop | None") -> bool:
+    """Show the reports until the run ends; True if the user interrupted it. A second Ctrl-C kills the run."""
+    interrupted = False
+
+    def interrupt(signum: int, frame: object) -> None:
+        nonlocal interrupted
+        if interrupted:
+            os.kill(launched.supervisor, signal.SIGKILL)
+        interrupted = True
+        launched.stop()
+
+    before = {s: signal.signal(s, interrupt) for s in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        with view:
+            if closed is not None:
+                closed.show(view.event)
+            for report in _reports(launched, closed):
+                if report.kind == "telemetry":
+                    view.telemetry(report.data)
+                elif report.kind == "cycle":
+                    view.cycle(json.loads(report.data))
+                elif report.kind == "event":
+                    event = json.loads(report.data)
+                    view.event(event)
+                    if closed is not None:
+                        closed.told(event)
+            if closed is not None:
+                closed.close()
+    finally:
+        for sig, handler in before.items():
+            signal.signal(sig, handler)
+    return interrupted
+
+
+def _reports(launched: Launched, closed: "ClosedLoop | None") -> Iterator[Report]:
+    """The reports of the run; between two of them, a closed loop observes."""
+    reports = launched.reports()
+    while True:
+        if closed is not None:
+            closed.wait(launched.line.fileno())
+        report = next(reports, None)
+        if report is None:
+            return
+        yield report
+
+
+# -- when it has ended ----------------------------------------------------------------------------
+
+
+def _files(given: RunArguments) -> Callable[[Path], list[str]] | None:
+    """What writes `--mcap` and `--trace` from a record; None without them. Checked before the run."""
+    if given.mcap is None and given.trace is None:
+        return None
+    from aftbed.campaign.runfiles.export import Wanted, check, export  # noqa: PLC0415 - the same
+    from aftbed.judge.record import read_record  # noqa: PLC0415 - only with --mcap or --trace
+
+    wanted = Wanted(given.mcap, given.trace)
+    check(wanted)
+    return lambda record: export(read_record(record), wanted)
+
+
+def _write(write_files: Callable[[Path], list[str]], record: Path, *, as_json: bool) -> bool:
+    """False if a file could not be written. The verdict is printed all the same."""
+    try:
+        lines = write_files(record)
+    except ConfigError as error:
+        print(f"aftbed: trouble: {error}", file=sys.stderr)
+        return False
+    if not as_json:
+        print("\n".join(lines))
+    return True
+
+
+def _show_log(log: Path) -> None:
+    """What the processes printed: the first place to look when the harness is in trouble."""
+    text = log.read_text(errors="replace").strip() if log.exists() else ""
+    if text:
+        print("what the processes printed:\n" + text[-PROCESSES_LOG_SHOWN:], file=sys.stderr)

@@ -1,0 +1,310 @@
+"""What several commands print: a run while it lives, a verdict, adaptations that ended, a progress bar.
+
+rich is imported only where the output is a terminal. `aftbed run` imports this module before it forks the
+supervisor, so nothing else that is large is imported here.
+"""
+
+import sys
+import time
+from collections import deque
+from collections.abc import Iterator
+from types import TracebackType
+from typing import TYPE_CHECKING, Final, Protocol, Self
+
+import msgspec
+
+from aftbed.runtime.unix.options import RunOptions
+from aftbed.vehicle.plant import Telemetry
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+    from rich.live import Live
+    from rich.progress import Progress
+
+    from aftbed.judge.verdict import Verdict
+
+EVENTS_SHOWN: Final = 10
+STAGES: Final = ("-", "WARN", "PARTIAL", "FULL")
+PLAIN_PERIOD_MS: Final = 500
+KMH_PER_MS: Final = 3.6
+ROAD_M: Final = 60  # drawn, one character a metre
+BAR_PERIOD_S: Final = 0.1
+
+
+# -- a run while it lives -------------------------------------------------------------------------
+
+
+class RunView(Protocol):
+    """Shows a live run, as a context manager: on a terminal a live view, elsewhere plain lines."""
+
+    def __enter__(self) -> Self: ...
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None: ...
+    def telemetry(self, data: bytes) -> None: ...
+    def event(self, event: dict[str, object]) -> None: ...
+    def cycle(self, cycle_us: float | None) -> None: ...
+
+
+def open_view(options: RunOptions, *, quiet: bool) -> RunView:
+    """The view that suits standard output; `quiet` shows nothing."""
+    if quiet:
+        return QuietView()
+    return LiveView(options) if sys.stdout.isatty() else PlainView(options)
+
+
+class QuietView:
+    """Shows nothing."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        return None
+
+    def telemetry(self, data: bytes) -> None:
+        """A `Telemetry`, encoded."""
+
+    def cycle(self, cycle_us: float | None) -> None:
+        """The latest cycle time at the client, from request to reply."""
+
+    def event(self, event: dict[str, object]) -> None:
+        """An event of the run: `t_ms`, `event`, `text`."""
+
+
+class PlainView(QuietView):
+    """A line per event, and one for the car every PLAIN_PERIOD_MS."""
+
+    def __init__(self, options: RunOptions) -> None:
+        print(f"run {options.run}: {options.ftm}, {options.placement}, seed {options.seed}", flush=True)
+        self._next_ms = 0
+
+    def telemetry(self, data: bytes) -> None:
+        telemetry = msgspec.msgpack.decode(data, type=Telemetry)
+        if telemetry.t_ms >= self._next_ms:
+            self._next_ms = telemetry.t_ms + PLAIN_PERIOD_MS
+            print(_car(telemetry), flush=True)
+
+    def event(self, event: dict[str, object]) -> None:
+        print(f"[{event['t_ms']:>10} ms] {event['event']}: {event['text']}", flush=True)
+
+
+class LiveView(QuietView):
+    """Speed, gap, TTC, stage, the roles of the replicas, and the last events; redrawn 20 times a second."""
+
+    def __init__(self, options: RunOptions) -> None:
+        self._options = options
+        self._events: deque[str] = deque(maxlen=EVENTS_SHOWN)
+        self._telemetry: Telemetry | None = None
+        self._roles = "a leads, b backs up" if options.ftm != "none" else "a alone"
+        self._cycle = ""
+        self._live: Live | None = None
+
+    def __enter__(self) -> Self:
+        from rich.live import Live  # noqa: PLC0415 - only on a terminal
+
+        self._live = Live(get_renderable=self._render, refresh_per_second=20, transient=False)
+        self._live.__enter__()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._live is not None:
+            self._live.__exit__(kind, error, trace)
+
+    def telemetry(self, data: bytes) -> None:
+        self._telemetry = msgspec.msgpack.decode(data, type=Telemetry)
+
+    def cycle(self, cycle_us: float | None) -> None:
+        self._cycle = "" if cycle_us is None else f"    cycle {cycle_us:.0f} us"
+
+    def event(self, event: dict[str, object]) -> None:
+        self._events.append(f"{event['t_ms']:>10} ms  {event['event']:<13} {event['text']}")
+        if event["event"] == "roles":
+            self._roles = str(event["text"])
+
+    def _render(self) -> "RenderableType":
+        from rich.panel import Panel  # noqa: PLC0415 - only on a terminal
+        from rich.text import Text  # noqa: PLC0415 - only on a terminal
+
+        car = _car(self._telemetry) if self._telemetry else "waiting for the car"
+        road = _road(self._telemetry.gap_m if self._telemetry else None)
+        lines = [car, road, f"replicas: {self._roles}{self._cycle}", "", *self._events]
+        options = self._options
+        title = f"aftbed run {options.run}: {options.ftm}, {options.placement}"
+        return Panel(
+            Text("\n".join(lines), no_wrap=True, overflow="ellipsis"), title=title, height=EVENTS_SHOWN + 6
+        )
+
+
+def _car(t: Telemetry) -> str:
+    gap = "no target" if t.gap_m is None else f"gap {t.gap_m:6.2f} m"
+    ttc = "" if t.ttc_s is None else f"  TTC {t.ttc_s:5.2f} s"
+    return (
+        f"{t.t_ms / 1e3:6.2f} s  {t.speed_ms * KMH_PER_MS:5.1f} km/h  {gap}{ttc}"
+        f"  {STAGES[t.stage]:7}  {t.deceleration_ms2:4.1f} m/s2"
+    )
+
+
+def _road(gap_m: float | None) -> str:
+    """The car, the gap and the obstacle."""
+    if gap_m is None:
+        return ">" + "." * ROAD_M
+    return ">" + "." * min(ROAD_M, max(0, round(gap_m))) + "#"
+
+
+# -- a verdict ------------------------------------------------------------------------------------
+
+
+def show_verdict(verdict: "Verdict", *, as_json: bool) -> None:
+    """Print it to standard output."""
+    if as_json:
+        print(msgspec.json.encode(verdict).decode())
+        return
+    requests = verdict.requests
+    print(f"{verdict.scenario} under {verdict.ftm} ({verdict.placement}), seed {verdict.seed}")
+    print(
+        f"  requests   {requests.sent} sent, {requests.answered} answered, {requests.lost} lost,"
+        f" {requests.duplicated} duplicated, {requests.late} late, {requests.wrong} wrong"
+    )
+    _show_vehicle(verdict)
+    for f in verdict.failovers:
+        print(
+            f"  failover   to epoch {f.epoch}: detected {_ms(f.detected_ms)}, fenced {_ms(f.fenced_ms)},"
+            f" promoted {_ms(f.promoted_ms)}, next good reply {_ms(f.recovered_ms)},"
+            f" blackout {_ms(f.blackout_ms)}"
+        )
+    if verdict.proposals:
+        from aftbed.runtime.unix.closedloop import proposed_line  # noqa: PLC0415 - only with a policy
+
+        for proposal in verdict.proposals:
+            print(f"  proposal   {proposed_line(proposal)}")
+    for fault in verdict.faults:
+        print(f"  fault      {fault['fault']}: {fault['receipt']}")
+    print("  checks     " + ", ".join(f"{name} {found}" for name, found in verdict.checks.items()))
+    for reason in verdict.reasons:
+        print(f"  because    {reason}")
+    print(f"verdict: {verdict.verdict}")
+
+
+def _show_vehicle(verdict: "Verdict") -> None:
+    car = verdict.vehicle
+    if car is None:
+        if verdict.replay is not None:
+            print(f"  replay     {msgspec.json.encode(verdict.replay).decode()}")
+        return
+    if car.collision:
+        print(f"  car        COLLISION at {car.impact_speed_kmh:.1f} km/h")
+    elif car.stop_gap_m is not None:
+        print(
+            f"  car        stopped {car.stop_gap_m:.2f} m short, {car.max_deceleration_ms2:.1f} m/s2 at most"
+        )
+    else:
+        braked = "braked" if car.braked else "never braked"
+        print(
+            f"  car        {braked}"
+            + ("" if car.min_gap_m is None else f", gap {car.min_gap_m:.2f} m at least")
+        )
+
+
+def _ms(value: float | None) -> str:
+    return "unknown" if value is None else f"{value:.2f} ms"
+
+
+# -- adaptations that ended -----------------------------------------------------------------------
+
+
+class EndedAdaptation(msgspec.Struct, frozen=True):
+    """One adaptation of a run, as the run reports it; times in milliseconds."""
+
+    number: int
+    purpose: str
+    recipe: str
+    ftm: str
+    outcome: str
+    reason: str
+    asked_ms: float
+    prepare_ms: float
+    blackout_ms: float
+    total_ms: float
+    bricks_changed: int
+    bricks_total: int
+
+    def __str__(self) -> str:
+        why = f": {self.reason}" if self.reason else ""
+        return f"{self.purpose}: {self.outcome}{why}"
+
+
+def history_lines(ended: list[EndedAdaptation]) -> Iterator[str]:
+    """A table with a line for each adaptation."""
+    yield "  #     ASKED    PREPARE   BLACKOUT      TOTAL  BRICKS RECIPE  WHAT"
+    for one in ended:
+        took = " ".join(f"{ms:>7.2f} ms" for ms in (one.prepare_ms, one.blackout_ms, one.total_ms))
+        bricks = f"{one.bricks_changed}/{one.bricks_total}"
+        yield f"{one.number:>3} {one.asked_ms / 1e3:>7.2f} s {took} {bricks:>7} {one.recipe:7} {one}"
+    yield f"{len(ended)} adaptation{'s' if len(ended) != 1 else ''}"
+
+
+# -- progress -------------------------------------------------------------------------------------
+
+
+def spaced(number: float) -> str:
+    """A whole number in groups of three digits, as `8 867`."""
+    return f"{number:,.0f}".replace(",", " ")
+
+
+class Bar:
+    """A progress bar with the rate and the failures, on standard error if that is a terminal."""
+
+    def __init__(self, what: str, total: float, *, quiet: bool) -> None:
+        self._what, self._total = what, total
+        self._progress: Progress | None = None
+        self._shown_s = self._began_s = time.monotonic()
+        self._shows = sys.stderr.isatty() and not quiet
+
+    def __enter__(self) -> Self:
+        if self._shows:
+            self._progress = self._open()
+            self._progress.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._progress is not None:
+            self._progress.stop()
+
+    def _open(self) -> "Progress":
+        from rich.console import Console  # noqa: PLC0415 - only on a terminal
+        from rich.progress import (  # noqa: PLC0415 - only on a terminal
+            BarColumn,
+            Progress,
+            TextColumn,
+            TimeRemainingColumn,
+        )
+
+        progress = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TextColumn("{task.fields[count]}"),
+            TimeRemainingColumn(),
+            console=Console(stderr=True),
+            auto_refresh=False,  # a thread of rich would be forked with the processes that simulate
+            transient=True,
+            redirect_stdout=sys.stdout.isatty(),
+        )
+        progress.add_task(self._what, total=self._total, count="")
+        return progress
+
+    def show(self, done: float, runs: int, broken: int) -> None:
+        """Show `done` of the total; redraws at most every BAR_PERIOD_S."""
+        now_s = time.monotonic()
+        if self._progress is None or now_s < self._shown_s + BAR_PERIOD_S:
+            return
+        self._shown_s = now_s
+        rate = runs / max(now_s - self._began_s, 1e-9)
+        count = f"{spaced(runs)} runs, {spaced(rate)}/s, {broken} broken"
+        self._progress.update(self._progress.task_ids[0], completed=done, count=count, refresh=True)

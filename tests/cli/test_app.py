@@ -1,0 +1,101 @@
+"""The table of all commands: lazy loading, the help, exit codes; and commands whose options are a struct."""
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import pytest
+import typer
+from liveruns import Home
+from playedrun import Call
+from typer.testing import CliRunner
+
+from aftbed.cli.app import COMMANDS, LazyCommand, app
+from aftbed.cli.options import takes
+from aftbed.runtime.unix import rundir
+
+# -- the table
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_help_in_the_table_is_that_of_the_command(name: str) -> None:
+    lazy = typer.main.get_group(app).commands[name]
+    assert isinstance(lazy, LazyCommand)
+    loaded = lazy.load()
+    assert loaded.help is not None and loaded.help.split("\n\n")[0] == lazy.help
+
+
+def test_the_help_of_all_commands_imports_no_command() -> None:
+    code = (
+        "import sys; from aftbed.cli import main; sys.argv = ['aftbed', '--help']\n"
+        "try: main()\n"
+        "finally: print(*sorted(name for name in sys.modules), file=sys.stderr)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    modules = set(done.stderr.split())
+    ours = {name for name in modules if name.partition(".")[0] == "aftbed"}
+    assert ours == {"aftbed", "aftbed.cli", "aftbed.cli.app", "aftbed.core", "aftbed.core.errors"}
+    assert not modules & {"msgspec", "rich", "yaml", "can", "cantools", "psutil", "scipy", "numpy", "jinja2"}
+    assert all(f"  {name} " in done.stdout for name in COMMANDS)
+
+
+def test_a_mistyped_command_is_refused_with_the_one_that_is_near(call: Call) -> None:
+    code, _, err = call("campain")
+    assert code == 2
+    assert "No such command 'campain'" in err and "campaign" in err
+
+
+def test_help_of_a_command_and_of_a_subcommand(call: Call) -> None:
+    code, out, _ = call("run", "--help")
+    assert code == 0 and " run [OPTIONS]\n" in out and "--unsafe-memory" in out
+    code, out, _ = call("campaign", "run", "--help")
+    assert code == 0 and " campaign run [OPTIONS]" in out and "--shard" in out
+
+
+def test_trouble_is_exit_code_3(home: Home, call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Here: a directory for runs that other users could read."""
+    root = rundir.root()
+    root.chmod(0o755)
+    code, _, err = call("status")
+    root.chmod(0o700)
+    assert code == 3
+    assert err.startswith("aftbed: trouble: ") and "must be a directory of this user alone" in err
+
+
+# -- commands whose options are a struct
+
+
+class Wheel(msgspec.Struct, frozen=True, kw_only=True):
+    size: Annotated[int, typer.Argument(help="In inches.")]
+    colour: Annotated[str, typer.Option(help="Any.")] = "black"
+    nuts: Annotated[tuple[Path, ...], typer.Option("--nut")] = ()
+    spare: Annotated[bool, typer.Option("--spare")] = False
+    brand: Annotated[str | None, typer.Option()] = None
+
+
+@pytest.mark.parametrize(
+    ("words", "wheel"),
+    [
+        (["17"], Wheel(size=17)),
+        (["17", "--colour", "red", "--spare"], Wheel(size=17, colour="red", spare=True)),
+        (["9", "--nut", "a", "--nut", "b"], Wheel(size=9, nuts=(Path("a"), Path("b")))),
+        (["9", "--brand", ""], Wheel(size=9, brand="")),
+    ],
+)
+def test_the_fields_of_a_struct_are_options(words: list[str], wheel: Wheel) -> None:
+    found: list[Wheel] = []
+
+    @takes(Wheel)
+    def fit(given: Wheel) -> None:
+        """Fit a wheel."""
+        found.append(given)
+
+    car = typer.Typer(rich_markup_mode=None)
+    car.command()(fit)
+    assert CliRunner().invoke(car, words).exit_code == 0
+    assert found == [wheel]
+    shown = CliRunner().invoke(car, ["--help"]).output
+    assert "Fit a wheel." in shown and "In inches." in shown and "[default: black]" in shown
+    assert CliRunner().invoke(car, []).exit_code == 2, "an argument without a default is required"
