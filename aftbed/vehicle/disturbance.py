@@ -28,7 +28,6 @@ brake ECU in its fallback has noticed whatever there is to notice.
 from random import Random
 from typing import Final
 
-import msgspec
 from e2e.p11 import e2e_p11_protect
 
 from aftbed.core.busfault import (
@@ -51,6 +50,7 @@ from aftbed.core.busfault import (
 )
 from aftbed.core.persistence import Chance, Every, Lasting, Permanent, Transient
 from aftbed.core.valuefault import flipped
+from aftbed.vehicle.can.bus_model import CarriedFrame
 from aftbed.vehicle.can.frame import Frame
 
 REORDER_US_MAX: Final = 1_000_000  # a frame without a successor is not swallowed
@@ -58,14 +58,6 @@ FLOOD_US: Final = 1000
 FLOOD_ID: Final = 0
 FLOOD_FRAMES_MAX: Final = 100  # in one release: a bus that was away for long does not make up for it
 COUNTER_MASK: Final = 0x0F
-
-
-class Sent(msgspec.Struct, frozen=True):
-    """A frame that comes onto the bus, from `sender`; `by` are the faults that struck it."""
-
-    frame: Frame
-    sender: str
-    by: tuple[int, ...] = ()
 
 
 class _Armed:
@@ -81,9 +73,9 @@ class _Armed:
         self.over = False
         self.seen = 0
         self.counters: dict[int, int] = {}  # of the frames before
-        self.swapped: Sent | None = None
+        self.swapped: CarriedFrame | None = None
         self.swap_due_us = 0
-        self.starved: dict[int, Sent] = {}
+        self.starved: dict[int, CarriedFrame] = {}
         self.flood_us = 0
         self.frames = self.first_us = self.first_id = 0
         self.ids: set[int] = set()
@@ -172,7 +164,7 @@ class Disturber:
 
     def __init__(self) -> None:
         self._armed: dict[int, _Armed] = {}
-        self._held: list[tuple[int, Sent]] = []  # due, in the order of their coming
+        self._held: list[tuple[int, CarriedFrame]] = []  # due, in the order of their coming
 
     def arm(self, number: int, fault: BusFault, draw: int, now_us: int) -> None:
         """`fault` is aimed; `draw` seeds its chance."""
@@ -208,9 +200,9 @@ class Disturber:
 
     # -- frames -------------------------------------------------------------------------------
 
-    def carry(self, frame: Frame, sender: str) -> list[Sent]:
+    def carry(self, frame: Frame, sender: str) -> list[CarriedFrame]:
         """What comes onto the bus now, since `sender` has sent `frame`; `t_us` of it is now."""
-        sent = [Sent(frame, sender)]
+        sent = [CarriedFrame(frame, sender)]
         for armed in self._armed.values():
             if armed.on_nodes:
                 sent = [one for one in sent if self._gets_through(armed, one)]
@@ -218,7 +210,7 @@ class Disturber:
                 sent = [out for one in sent for out in self._struck(armed, one)]
         return sent
 
-    def release(self, now_us: int) -> list[Sent]:
+    def release(self, now_us: int) -> list[CarriedFrame]:
         """What comes onto the bus now without being sent now."""
         for armed in self._armed.values():
             self._let_go(armed, now_us)
@@ -267,7 +259,7 @@ class Disturber:
 
     # -- acts ---------------------------------------------------------------------------------
 
-    def _gets_through(self, armed: _Armed, sent: Sent) -> bool:
+    def _gets_through(self, armed: _Armed, sent: CarriedFrame) -> bool:
         """Whether the frame comes onto the bus in spite of what has hold of a node."""
         frame = sent.frame
         if not armed.holds(frame.t_us):
@@ -285,7 +277,7 @@ class Disturber:
                     armed.count(frame)
         return True
 
-    def _struck(self, armed: _Armed, sent: Sent) -> list[Sent]:
+    def _struck(self, armed: _Armed, sent: CarriedFrame) -> list[CarriedFrame]:
         """What `armed` makes of a frame that it is aimed at."""
         frame, by = sent.frame, (*sent.by, armed.number)
         if armed.swapped is not None:
@@ -300,7 +292,7 @@ class Disturber:
                 armed.counters[frame.can_id] = frame.data[1] & COUNTER_MASK
             return [sent]
         armed.count(frame)
-        struck = Sent(changed, sent.sender, by)
+        struck = CarriedFrame(changed, sent.sender, by)
         match armed.fault.act:
             case Omission():
                 return []
@@ -329,7 +321,7 @@ class Disturber:
             armed.starved = {}
             self._held += [(now_us, sent) for _, sent in waiting]
 
-    def _flood(self, armed: _Armed, now_us: int) -> list[Sent]:
+    def _flood(self, armed: _Armed, now_us: int) -> list[CarriedFrame]:
         if not isinstance(armed.fault.act, Babble) or not armed.holds(now_us):
             return []
         node = armed.fault.act.node
@@ -338,13 +330,13 @@ class Disturber:
         off = [a.fault.act for a in self._armed.values() if a.on_nodes and a.holds(now_us)]
         if BusOff(node) in off:
             return []
-        flood = Sent(Frame(now_us, FLOOD_ID, bytes(8)), node)
+        flood = CarriedFrame(Frame(now_us, FLOOD_ID, bytes(8)), node)
         return [flood] * min(max(0, missed), FLOOD_FRAMES_MAX)
 
 
-def _at(now_us: int, sent: Sent) -> Sent:
+def _at(now_us: int, sent: CarriedFrame) -> CarriedFrame:
     frame = sent.frame
-    return Sent(Frame(now_us, frame.can_id, frame.data), sent.sender, sent.by)
+    return CarriedFrame(Frame(now_us, frame.can_id, frame.data), sent.sender, sent.by)
 
 
 def _cuts(armed: _Armed, sender: str, node: str) -> bool:

@@ -111,7 +111,7 @@ class _Car:
         self._sent = {RADAR: 0, BRAKE: 0}
         line = buses.line if options.pace is None else None
         answer_id = codec.can_id("AEB_REQ")
-        self._watch = AnswerWatch(buses.brake, answer_id, self._body.hear, self._track_id, line)
+        self._watch = AnswerWatch(buses.brake, answer_id, self._body.receive, self._track_id, line)
 
     def run(self, report: Callable[[Telemetry], None], stop: Callable[[], bool]) -> DriveReport:
         schedule = None if self._options.pace is None else Schedule(self._options.pace)
@@ -150,7 +150,7 @@ class _Car:
     def _look(self, line: HubLine) -> None:
         """Tell the hub which conditions hold now."""
         for number, condition in list(line.conditions.items()):
-            if self._body.is_so(condition):
+            if self._body.holds(condition):
                 if self._options.pace is None:
                     line.set_time(self._body.t_us)
                 line.met(number, self._body.t_us)

@@ -283,8 +283,8 @@ class CarBody:
         """What the radar ECU has to send, after the brake ECU. Call once for each step."""
         return self._radar.frames(self._plant)
 
-    def hear(self, frame: Frame) -> None:
-        """A frame has come to the brake ECU, which takes it to be of this step."""
+    def receive(self, frame: Frame) -> None:
+        """A frame has come to the brake ECU, which takes it as of this step."""
         self._brake.on_frame(Frame(self._plant.t_us, frame.can_id, frame.data))
 
     def noticed(self) -> list[tuple[int, str]]:
@@ -293,7 +293,7 @@ class CarBody:
         self._brake.noticed.clear()
         return found
 
-    def is_so(self, condition: Condition) -> bool:
+    def holds(self, condition: Condition) -> bool:
         """Whether `condition` holds in this instant."""
         return condition.holds(self._plant.ttc_s(), self._plant.gap_m, self._plant.speed_ms)
 

@@ -12,13 +12,14 @@ from pathlib import Path
 
 import msgspec
 
-from aftbed.core.busfault import Struck
+from aftbed.core.busfault import BusFault, Struck
 from aftbed.core.errors import HarnessError
 from aftbed.vehicle.aeb.function import default_application
 from aftbed.vehicle.can.bus import Bus, BusOptions, open_bus
 from aftbed.vehicle.can.dbc_file import Codec
 from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.can.hub import Hub, HubCounts, HubOptions, serve
+from aftbed.vehicle.disturbance import Disturber
 from aftbed.vehicle.ecus import Sender
 from aftbed.vehicle.gateway import ClientGateway, Gateway
 
@@ -26,22 +27,29 @@ DEADLINE_S = 5.0
 
 
 class TestDesk:
-    """Whom a hub in a thread works for: a byte on its life descriptor is an order in the queue."""
+    """The supervisor of a hub in a thread: a byte on its life descriptor is an order in the queue."""
 
     __test__ = False
 
     def __init__(self, life: int) -> None:
         self._life = life
         self.orders: queue.SimpleQueue[Callable[[Hub], None]] = queue.SimpleQueue()
-        self.reports: list[list[Struck]] = []
+        self.faults = Disturber()
+        self.receipts: list[str] = []  # of the first fault, each time that it changed
+        self.conditions_met: list[tuple[int, int, int]] = []
 
     def attend(self, hub: Hub) -> bool:
         for _ in (got := os.read(self._life, 4096)):
             self.orders.get()(hub)
         return bool(got)
 
-    def report(self, news: list[Struck]) -> None:
-        self.reports.append(news)
+    def faults_acted(self) -> None:
+        receipt = self.faults.struck()[0].receipt
+        if self.receipts[-1:] != [receipt]:
+            self.receipts.append(receipt)
+
+    def met(self, fault_number: int, t_us: int, since_ns: int) -> None:
+        self.conditions_met.append((fault_number, t_us, since_ns))
 
 
 class RunningHub:
@@ -80,9 +88,19 @@ class RunningHub:
         os.write(self._life_write, b".")
         assert done.wait(DEADLINE_S), "the hub does not take orders"
 
+    def arm(self, number: int, fault: BusFault, draw: int = 0) -> None:
+        def carry_out(hub: Hub) -> None:
+            self.desk.faults.arm(number, fault, draw, hub.now_us())
+            hub.disturb(self.desk.faults)
+
+        self.order(carry_out)
+
+    def forget(self, number: int) -> None:
+        self.order(lambda hub: self.desk.faults.forget(number, hub.now_us()))
+
     def struck(self) -> list[Struck]:
         found: list[Struck] = []
-        self.order(lambda hub: found.extend(hub.struck()))
+        self.order(lambda _: found.extend(self.desk.faults.struck()))
         return found
 
     def stop(self) -> HubCounts:

@@ -16,6 +16,7 @@ from aftbed.vehicle.aim import aimed
 from aftbed.vehicle.can.candump import read_log
 from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.can.hub import HubOptions
+from aftbed.vehicle.disturbance import Disturber
 from aftbed.vehicle.drive_real import CarBuses, DriveOptions, DriveReport, drive
 from aftbed.vehicle.drive_virtual import VirtualCar
 from aftbed.vehicle.plant import VehicleResult
@@ -49,8 +50,7 @@ class Disturbed(msgspec.Struct):
 
 def arm(hub: RunningHub, faults: tuple[str, ...]) -> None:
     for number, words in enumerate(faults, FIRST_NUMBER):
-        one = fault(words)
-        hub.order(lambda it, number=number, one=one: it.disturb(number, one, SEED))  # type: ignore[misc]
+        hub.arm(number, fault(words), SEED)
 
 
 def real(
@@ -83,8 +83,10 @@ def virtual(*faults: str, late_ns: int = 0, tick_ns: int | None = None) -> Distu
     """In virtual time; each reply comes that late. `tick_ns` advances the car that often as well."""
     frames: list[Frame] = []
     car = VirtualCar(load_scenario("ccrs-50"), seed=SEED, codec=CODEC, witness=frames.append)
+    disturber = Disturber()
     for number, words in enumerate(faults, FIRST_NUMBER):
-        car.disturb(number, parse(words), SEED, 0)
+        disturber.arm(number, fault(words), SEED, car.before(0))
+        car.disturb(disturber)
     function, now_ns = default_application(), 0
     replies: deque[tuple[int, bytes]] = deque()
     while (due_ns := car.due_ns()) is not None:
@@ -98,4 +100,4 @@ def virtual(*faults: str, late_ns: int = 0, tick_ns: int | None = None) -> Distu
                 replies.append((now_ns + late_ns, reply))
             else:
                 car.deliver(reply, now_ns)
-    return Disturbed(frames, car.result(), car.struck(), dict(car.counts.refused))
+    return Disturbed(frames, car.result(), disturber.struck(), dict(car.counts.refused))

@@ -11,10 +11,11 @@ from aftbed.core.busfault import BusFault, Condition, Struck
 from aftbed.core.errors import ConfigError
 from aftbed.inject.buswords import parse
 from aftbed.vehicle.aim import aimed
+from aftbed.vehicle.can.bus_model import CarriedFrame
 from aftbed.vehicle.can.dbc_file import load_dbc
 from aftbed.vehicle.can.e2e import intact, protect
 from aftbed.vehicle.can.frame import Frame
-from aftbed.vehicle.disturbance import FLOOD_ID, REORDER_US_MAX, Disturber, Sent
+from aftbed.vehicle.disturbance import FLOOD_ID, REORDER_US_MAX, Disturber
 
 TRACK, AEB_REQ, EGO = (CODEC.can_id(name) for name in ("RADAR_TRACK", "AEB_REQ", "EGO_STATE"))
 DATA_ID, EGO_DATA_ID = CODEC.data_id("RADAR_TRACK"), CODEC.data_id("EGO_STATE")
@@ -63,7 +64,7 @@ def test_an_omitted_frame_does_not_come_and_the_next_one_does() -> None:
 def test_other_frames_are_left_alone_and_not_counted() -> None:
     disturber = armed("omission bus RADAR_TRACK nth 1 permanent")
     other = Frame(0, EGO, bytes(8))
-    assert disturber.carry(other, "brake") == [Sent(other, "brake")]
+    assert disturber.carry(other, "brake") == [CarriedFrame(other, "brake")]
     assert disturber.struck() == [Struck(1)]
 
 
@@ -190,7 +191,7 @@ def test_a_babbling_idiot_lets_nobody_through_and_ends_with_the_latest_of_each()
     assert disturber.carry(own, "brake") == [], "its own frames do not get through either"
     waited = [sent.frame for sent in disturber.release(60_000)]
     assert waited == [Frame(60_000, EGO, bytes(8)), track(2, 60_000)], "the latest of each, by priority"
-    assert disturber.carry(track(3), "radar") == [Sent(track(3), "radar")]
+    assert disturber.carry(track(3), "radar") == [CarriedFrame(track(3), "radar")]
     assert disturber.struck()[0].frames == 3
 
 
@@ -223,7 +224,7 @@ def test_what_is_forgotten_gives_back_what_it_holds() -> None:
     assert disturber.carry(track(0), "radar") == []
     disturber.forget(1, 100)
     assert [sent.frame for sent in disturber.release(100)] == [track(0, 100)]
-    assert disturber.carry(track(1), "radar") == [Sent(track(1), "radar")] and disturber.idle
+    assert disturber.carry(track(1), "radar") == [CarriedFrame(track(1), "radar")] and disturber.idle
 
 
 def test_two_faults_strike_one_behind_the_other() -> None:

@@ -11,7 +11,9 @@ from typing import Final
 from aftbed.core.busfault import BusFault, Condition, Struck
 from aftbed.runtime.interface import Met
 from aftbed.runtime.sim.clock import Clock
-from aftbed.runtime.sim.givens import car_in
+from aftbed.runtime.sim.givens import car_in, own_codec
+from aftbed.vehicle.aim import aimed
+from aftbed.vehicle.disturbance import Disturber
 from aftbed.vehicle.drive_virtual import VirtualCar
 from aftbed.vehicle.plant import STEP_US, VehicleResult
 
@@ -23,6 +25,7 @@ class Drive:
 
     def __init__(self, scenario: str, seed: int, clock: Clock) -> None:
         self._car, self._clock = car_in(scenario, seed), clock
+        self._faults = Disturber()  # of its bus
         self._began_ns = 0
         self._wake: Callable[[], None] = lambda: None
         self._under_way = self._stepping = False
@@ -42,20 +45,23 @@ class Drive:
         return self._car.result()
 
     def disturb(self, number: int, fault: BusFault, draw: int) -> None:
-        """In the car's own bus."""
-        self._car.disturb(number, fault, draw, self._t_ns() if self._under_way else 0)
+        """Arm `fault` in the car's bus. Raises ConfigError where it names what does not exist."""
+        fault = fault if fault.aim is not None else aimed(fault, [own_codec()])
+        now_us = self._car.before(self._t_ns() if self._under_way else 0)
+        self._faults.arm(number, fault, draw, now_us)
+        self._car.disturb(self._faults)
 
     def struck_by(self, number: int) -> Struck | None:
-        """By the car's bus."""
-        return self._car.struck_by(number)
+        """What has become of a fault of the car's bus."""
+        return next((struck for struck in self._faults.struck() if struck.number == number), None)
 
-    def watch(self, condition: Condition, met: Callable[[Met], None]) -> None:
+    def watch(self, number: int, condition: Condition, met: Callable[[Met], None]) -> None:
         """See `runtime.interface.Support`."""
 
         def held(t_us: int) -> None:  # somebody is at work now, perhaps the one who is to be struck
             self._clock.at(self._clock.ns, lambda: self._met(met, t_us))
 
-        self._car.watch(condition, held)
+        self._car.watch(number, condition, held)
         if self._under_way:
             self._step_by_step()
 

@@ -32,11 +32,12 @@ def graph_of(ftm: str, placement: str) -> Graph:
 
 def car_in(scenario: str, seed: int) -> VirtualCar:
     """A car, and what comes towards it."""
-    return VirtualCar(load_scenario(scenario), seed=seed, codec=_codec())
+    return VirtualCar(load_scenario(scenario), seed=seed, codec=own_codec())
 
 
 @lru_cache(maxsize=1)
-def _codec() -> Codec:
+def own_codec() -> Codec:
+    """aftbed's own DBC."""
     return load_dbc()
 
 

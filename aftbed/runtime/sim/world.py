@@ -187,7 +187,7 @@ class World:
     def watch(self, number: int, condition: Condition, met: Callable[[Met], None]) -> Keys:
         """By the car itself."""
         assert self._drive is not None, condition
-        self._drive.watch(condition, met)
+        self._drive.watch(number, condition, met)
         yield Wait(frozenset())
 
     def flip_memory(self, process: object, flip: FlipMemory, draw: int) -> NoReturn:

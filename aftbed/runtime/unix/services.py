@@ -4,6 +4,7 @@ import os
 import select
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
 
@@ -15,6 +16,9 @@ from aftbed.runtime.unix.line import Line
 from aftbed.runtime.unix.options import PlayerOptions, VehicleOptions
 from aftbed.vehicle.can.hub import Hub, HubOptions
 from aftbed.vehicle.can.hub import serve as serve_hub
+
+if TYPE_CHECKING:
+    from aftbed.vehicle.disturbance import Disturber
 
 
 def serve(line: Line[control.ToNode], order: control.Serve, fds: list[int]) -> None:
@@ -29,10 +33,12 @@ def serve(line: Line[control.ToNode], order: control.Serve, fds: list[int]) -> N
 
 
 class _Desk:
-    """What the hub is told, and what it tells: see `vehicle.can.hub.Desk`."""
+    """The hub's link to the supervisor, and the faults of its bus (see `vehicle.can.hub.Desk`)."""
 
     def __init__(self, line: Line[control.ToNode]) -> None:
         self._line = line
+        self._faults: Disturber | None = None
+        self._reported: dict[int, str] = {}  # the receipts, by the number of the fault
 
     def attend(self, hub: Hub) -> bool:
         """Carry out the next order; False when the line has ended."""
@@ -41,24 +47,38 @@ class _Desk:
             return False
         order = got[0]
         if isinstance(order, control.DisturbBus):
-            hub.disturb(order.token, order.fault, order.draw)
+            self._disturb(hub, order)
             self._line.send(control.Report(bus.DISTURBED, str(order.token).encode()))
         elif isinstance(order, control.WatchCar):
-            hub.watches.watch(order.token, order.condition)
+            hub.watch(order.token, order.condition)
             self._line.send(control.Report(bus.WATCHED, str(order.token).encode()))
         elif isinstance(order, control.Ack):
-            hub.watches.go_on(order.token)
+            hub.go_on(order.token)
         elif isinstance(order, control.Stats):
-            self._line.send(control.Report(bus.ASKED, msgspec.msgpack.encode(hub.struck())))
+            self._line.send(control.Report(bus.ASKED, msgspec.msgpack.encode(self._struck())))
         return True
 
-    def report(self, news: list[Struck]) -> None:
-        """To the supervisor."""
-        self._line.send(control.Report(bus.STRUCK, msgspec.msgpack.encode(news)))
+    def faults_acted(self) -> None:
+        """Report the faults whose receipt is another one than before."""
+        news = [s for s in self._struck() if self._reported.get(s.number, "armed") != s.receipt]
+        if news:
+            self._reported |= {s.number: s.receipt for s in news}
+            self._line.send(control.Report(bus.STRUCK, msgspec.msgpack.encode(news)))
 
     def met(self, fault_number: int, t_us: int, since_ns: int) -> None:
         """To the supervisor."""
         self._line.send(control.Report(bus.MET, msgspec.msgpack.encode((fault_number, t_us, since_ns))))
+
+    def _disturb(self, hub: Hub, order: control.DisturbBus) -> None:
+        from aftbed.vehicle.disturbance import Disturber  # noqa: PLC0415 - it needs the CRC, and few runs it
+
+        if self._faults is None:
+            self._faults = Disturber()
+        self._faults.arm(order.token, order.fault, order.draw, hub.now_us())
+        hub.disturb(self._faults)
+
+    def _struck(self) -> list[Struck]:
+        return [] if self._faults is None else self._faults.struck()
 
 
 def _hub(line: Line[control.ToNode], order: control.Serve, fds: list[int]) -> None:

@@ -5,7 +5,6 @@ Who judges whether one has bitten are the receivers: the gateway's E2E checks, t
 
 import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -209,10 +208,9 @@ def test_a_paced_drive_meets_its_condition_and_heals(tmp_path: Path) -> None:
 def test_a_fault_is_armed_and_forgotten_while_the_car_drives(tmp_path: Path) -> None:
     def then(hub: RunningHub, t_ms: int) -> None:
         if t_ms == 500:
-            one = fault("omission bus AEB_REQ permanent")
-            hub.order(lambda it: it.disturb(FIRST_NUMBER, one, 0))
+            hub.arm(FIRST_NUMBER, fault("omission bus AEB_REQ permanent"))
         if t_ms == 1000:
-            hub.order(lambda it: it.forget(FIRST_NUMBER))
+            hub.forget(FIRST_NUMBER)
 
     drive = real(tmp_path / "bus.log", then=then)
     times_us = [frame.t_us for frame in drive.of(AEB_REQ)]
@@ -225,15 +223,8 @@ def test_a_fault_is_armed_and_forgotten_while_the_car_drives(tmp_path: Path) -> 
 # -- the hub itself
 
 
-@pytest.fixture
-def hub(tmp_path: Path) -> Iterator[RunningHub]:
-    with running_hub(tmp_path / "bus.log") as running:
-        yield running
-
-
 def arm(hub: RunningHub, words: str, number: int = FIRST_NUMBER) -> None:
-    one = fault(words)
-    hub.order(lambda it: it.disturb(number, one, 0))
+    hub.arm(number, fault(words))
 
 
 class Node(RawClient):
@@ -272,7 +263,7 @@ def test_a_partition_that_ends_gives_all_their_traffic_back(hub: RunningHub) -> 
         gateway.send(0x100)
         assert (radar.heard(), gateway.heard(), brake.heard()) == ([], [], [0x130, 0x100])
         assert [tool.read().split()[2] for _ in range(2)] == ["130", "100"], "a tool hears both sides"
-        hub.order(lambda it: it.forget(FIRST_NUMBER))
+        hub.forget(FIRST_NUMBER)
         radar.send(0x130)
         gateway.send(0x100)
         assert (radar.heard(), gateway.heard(), brake.heard()) == ([0x100], [0x130], [0x130, 0x100])
@@ -323,8 +314,8 @@ def test_the_hub_reports_what_becomes_of_a_fault(hub: RunningHub) -> None:
             radar.send(0x130)
         gateway.write("< aftbed noticed 130 lost >")
         gateway.fence()
-        receipts = [struck.receipt for report in hub.desk.reports for struck in report]
-    assert receipts == ["applied", "activated"]
+    hub.stop()
+    assert hub.desk.receipts == ["armed", "applied", "activated"]
 
 
 def test_the_latest_who_says_a_name_has_it(hub: RunningHub) -> None:

@@ -6,6 +6,7 @@ import can
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from puredrive import TOYOTA_LOG
 
 from aftbed.core.errors import ConfigError
 from aftbed.vehicle.can.candump import (
@@ -20,7 +21,7 @@ from aftbed.vehicle.can.candump import (
 from aftbed.vehicle.can.frame import Frame
 
 GOOD = b"(0000000012.345678) can0 130#0102030405060708"
-REAL_LOG = Path(__file__).resolve().parents[3] / "shared" / "data" / "rav4_following_50kmh.log"
+REAL_LOG = TOYOTA_LOG
 
 frames = st.builds(
     Frame,

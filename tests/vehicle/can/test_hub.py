@@ -15,16 +15,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aftbed.core.errors import ConfigError, PeerError
+from aftbed.vehicle.can.bus_model import frame_bits
 from aftbed.vehicle.can.candump import LogCounts, Refusal, parse_lines, read_log
-from aftbed.vehicle.can.hub import CLIENTS_MAX, ELEMENT_BYTES_MAX, HubOptions, frame_bits, parse_send
+from aftbed.vehicle.can.hub import CLIENTS_MAX, ELEMENT_BYTES_MAX, HubOptions, parse_send
 
 LOCKSTEP = HubOptions(lockstep=True)
-
-
-@pytest.fixture
-def hub(tmp_path: Path) -> Iterator[RunningHub]:
-    with running_hub(tmp_path / "bus.log") as running:
-        yield running
 
 
 def attach(port: int) -> can.BusABC:
