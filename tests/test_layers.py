@@ -236,9 +236,13 @@ def test_every_row_that_exists_is_looked_at() -> None:
     [
         ("aftbed.core.wire", "import aftbed.ftm.proxy", "a lower row imports an upper one"),
         ("aftbed.core.wire", "from aftbed import ftm", "a lower row imports an upper one"),
-        ("aftbed.ftm.proxy", "from aftbed.runtime.unix import node", "a lower row imports an upper one"),
+        ("aftbed.ftm.proxy", "from aftbed.runtime.unix import node_io", "a lower row imports an upper one"),
         ("aftbed.inject.words", "from aftbed.runtime import control", "a lower row imports an upper one"),
-        ("aftbed.runtime.unix.node", "from aftbed.judge import record", "a lower row imports an upper one"),
+        (
+            "aftbed.runtime.unix.node_io",
+            "from aftbed.judge import record",
+            "a lower row imports an upper one",
+        ),
         ("aftbed.search.swarm", "from aftbed.campaign import plan", "a lower row imports an upper one"),
         ("aftbed.campaign.plan", "from aftbed.bench import runs", "a lower row imports an upper one"),
         ("aftbed.report.html", "from aftbed.interop import mcap", "report and interop are strangers"),
@@ -269,7 +273,7 @@ def test_a_planted_breach_is_found(module: str, source: str, reason: str) -> Non
     [
         ("aftbed.cli.app", "from aftbed.core import wire\nimport aftbed.campaign.plan, time"),
         ("aftbed.bench.runs", "from aftbed.campaign.statistics import quantile"),
-        ("aftbed.runtime.unix.node", "import socket\nfrom aftbed.vehicle.function import AebFunction"),
+        ("aftbed.runtime.unix.node_io", "import socket\nfrom aftbed.vehicle.function import AebFunction"),
         ("aftbed.runtime.sim.world", "from random import Random"),
         ("aftbed.ftm.proxy", "import msgspec\nfrom collections.abc import Callable"),
         ("aftbed.__main__", "from aftbed.cli import main"),

@@ -1,69 +1,189 @@
-"""What becomes of an `Assign`: the bricks of a node, made, tried where they are strangers, and joined."""
+"""What becomes of an `Assign`: the bricks of a node, made, tried where they are not built in, joined and
+bound.
 
+The self-test sends recorded requests through a whole replica in memory. It runs in the process that will host
+the new brick, before that gets any channel: so whatever the brick does there harms nothing, and a brick that
+never ends is killed by the deadline of its preparation. Every request must be answered. Where the function is
+the one that runs, the replies must be those of the built-in bricks, byte for byte; a new function must give
+its own state back (`restore(capture())`).
+"""
+
+from collections import defaultdict
 from collections.abc import Callable
-from typing import Protocol
+from typing import Final, TypeVar
 
-from aftbed.adapt import selftest
+import msgspec
+
 from aftbed.adapt.bricks import LoadModule, load_application, make_brick
 from aftbed.core.application import Application
-from aftbed.core.brick import Brick
-from aftbed.core.graph import BrickSpec
-from aftbed.ftm.compose import REPLICAS
+from aftbed.core.brick import Brick, Effect
+from aftbed.core.errors import ConfigError
+from aftbed.core.graph import BrickSpec, Graph
+from aftbed.core.messages import AnyMessage, Message, Reply, Request
+from aftbed.ftm.compose import REPLICAS, chain
 from aftbed.ftm.registry import Setting
 from aftbed.runtime import control
+from aftbed.runtime.devices import Device
+from aftbed.runtime.node import MemoryIO, Node, Stopped, nowhere
 
-Make = Callable[[BrickSpec, Setting], Brick]
+STEPS_MAX: Final = 500  # of a self-test, for one request; the longest mechanism takes 40
+TEST_EPOCH: Final = 1
 
-
-class Assembled(Protocol):
-    """A node in the making."""
-
-    def add(self, name: str, brick: Brick) -> None:
-        """Host `brick`."""
-        ...
-
-    def link_inside(self, local: control.Local, epoch: int) -> None:
-        """A channel between two bricks of this node; the source is told."""
-        ...
+MakeSetting = Callable[[BrickSpec, Setting], Brick]
+MakeBrick = Callable[[BrickSpec], Brick]
+In = TypeVar("In")
+Out = TypeVar("Out")
 
 
 class Assembler:
     """`function`: what is protected if the graph names nothing else; `load`: how a class is found."""
 
     def __init__(
-        self, function: Callable[[], Application], load: LoadModule, make: Make | None = None
+        self, function: Callable[[], Application], load: LoadModule, make: MakeSetting | None = None
     ) -> None:
         self._function, self._load = function, load
-        self._make: Make = make or (lambda spec, setting: make_brick(spec, setting, load))
+        self._make: MakeSetting = make or (lambda spec, setting: make_brick(spec, setting, load))
 
-    def fill(self, node: Assembled, order: control.Assign) -> None:
-        """Make the bricks of `order`. Raises ConfigError where one that was written off line is no good."""
+    def build(
+        self, node: Node[In, Out], order: control.Assign, fds: list[int], make_device: Callable[[], Device]
+    ) -> None:
+        """Make of `node` what `order` describes; answer it. Raises ConfigError where a class is no good."""
+        node.suspended = order.held
         for spec in order.bricks:
             node.add(spec.name, self._make(spec, self._setting(spec, order)))
         if order.trial is not None:
             self._try_out(order, order.trial)
         for local in order.locals:
             node.link_inside(local, order.epoch)
+        if order.device:
+            node.attach(make_device(), order.bricks[0].name)
+        for port in order.inputs:
+            node.bind_input(port.brick, port.port, fds[port.index])
+        node.ack(order.token)
+        for port in order.outputs:
+            node.bind_output(port.brick, port.port, fds[port.index], order.epoch)
 
     def _setting(self, spec: BrickSpec, order: control.Assign, leader: str = "") -> Setting:
-        """What a brick is made for: whose it is, whether it leads, and the function if that is not ours."""
+        """What a brick is made for: its replica, whether that leads, and the function if it is not the
+        default.
+        """
         number = REPLICAS.index(spec.replica) + 1 if spec.replica else 0
         named = load_application(spec.application, self._load) if spec.application else self._function
-        epoch = selftest.EPOCH if leader else order.epoch
+        epoch = TEST_EPOCH if leader else order.epoch
         return Setting(number, epoch, spec.replica == (leader or order.leader), named)
 
     def _try_out(self, order: control.Assign, trial: control.Trial) -> None:
-        """The self-test of what was written off line."""
+        """The self-test of bricks that are not built in."""
         replica = next(s.replica for s in order.bricks if s.replica)
         server = next(b for b in trial.graph.bricks if b.part == "server")
 
         def setting(spec: BrickSpec) -> Setting:
             return self._setting(spec, order, leader=replica)
 
-        selftest.run(
+        self_test(
             trial.graph,
             replica,
             lambda spec: self._make(spec, setting(spec)),
             trial.requests,
             deterministic=setting(server).application().characteristics.deterministic,
         )
+
+
+# -- the self-test --------------------------------------------------------------------------------
+
+
+def self_test(
+    graph: Graph, replica: str, make: MakeBrick, requests: tuple[bytes, ...], *, deterministic: bool = True
+) -> None:
+    """Raises ConfigError, naming the brick and the request, if the new bricks of `graph` do not work.
+
+    The replies of a function that is not `deterministic` cannot be compared.
+    """
+    plain = msgspec.structs.replace(
+        graph, bricks=tuple(msgspec.structs.replace(b, source="") for b in graph.bricks)
+    )
+    found = _TestedChain(graph, replica, make).replies(requests)
+    if not deterministic:
+        return
+    wanted = _TestedChain(plain, replica, make).replies(requests)
+    for number, (reply, expected) in enumerate(zip(found, wanted, strict=True), 1):
+        if reply != expected:
+            raise ConfigError(
+                f"self-test: {_suspects(graph)}: recorded request {number}: the reply is"
+                f" {reply.hex() or 'empty'}, wanted is {expected.hex() or 'empty'}"
+            )
+
+
+def _suspects(graph: Graph) -> str:
+    """What is not built in."""
+    return ", ".join(sorted({b.source or b.application for b in graph.bricks if b.source or b.application}))
+
+
+class _Checked(Brick):
+    """A brick whose steps must not raise."""
+
+    def __init__(self, name: str, brick: Brick) -> None:
+        self._name, self._brick = name, brick
+
+    def open_ports(self) -> tuple[str, ...]:
+        """Those of the brick."""
+        return self._brick.open_ports()
+
+    def quiescent(self) -> bool:
+        """As the brick is."""
+        return self._brick.quiescent()
+
+    def step(self, port: str, msg: AnyMessage, now_ns: int) -> list[Effect]:
+        """As the brick does. Raises ConfigError."""
+        try:
+            return self._brick.step(port, msg, now_ns)
+        except Exception as error:
+            raise ConfigError(
+                f"self-test: {self._name}: {type(msg).__name__} on {port}: {type(error).__name__}: {error}"
+            ) from error
+
+
+class _TestedChain:
+    """The bricks of one replica, which leads, in one node in memory. What leaves it is dropped, but for
+    replies.
+    """
+
+    def __init__(self, graph: Graph, replica: str, make: MakeBrick) -> None:
+        self._graph, self._entry = graph, f"{replica}/protocol"
+        names = chain(graph, replica)
+        bricks = {name: make(graph.brick(name)) for name in names}
+        self._server = bricks[names[-1]]
+        self._replies: list[bytes] = []
+        self._node = Node("self-test", MemoryIO())
+        for name, brick in bricks.items():
+            hosted = self._node.add(name, _Checked(name, brick))
+            hosted.outputs = defaultdict(lambda: nowhere, hosted.outputs)
+        for link in graph.links:
+            if link.source in bricks and link.sink in bricks:
+                local = control.Local(link.source, link.source_port, link.sink, link.sink_port)
+                self._node.link_inside(local, TEST_EPOCH)
+        self._node.bricks[self._entry].outputs["pro2pxy"] = self._keep_reply
+
+    def _keep_reply(self, message: Message) -> None:
+        assert isinstance(message, Reply)
+        self._replies.append(message.payload)
+
+    def replies(self, requests: tuple[bytes, ...]) -> list[bytes]:
+        """The reply to each of `requests`. Raises ConfigError."""
+        for number, payload in enumerate(requests, 1):
+            self._node.post(self._entry, "pxy2pro", Request(TEST_EPOCH, number, payload))
+            try:
+                for _ in range(STEPS_MAX):
+                    if not self._node.turn():
+                        break
+            except Stopped as stop:
+                raise ConfigError(f"self-test: {stop}") from stop
+            if len(self._replies) != number:
+                raise ConfigError(
+                    f"self-test: {_suspects(self._graph)}: recorded request {number} is never answered"
+                )
+        state = self._server.capture()
+        self._server.restore(state)
+        if self._server.capture() != state:
+            raise ConfigError(f"self-test: {_suspects(self._graph)}: it does not restore what it captures")
+        return self._replies

@@ -26,11 +26,9 @@ from aftbed.core.events import Event
 from aftbed.core.fault import mark
 from aftbed.core.valuefault import Byte, Flip, Stuck, hit
 from aftbed.ftm.server import Server
-from aftbed.runtime import control
-from aftbed.runtime.host import Host
+from aftbed.runtime.host import AgentHost
 
 CELL_BYTES: Final = 1 << 16  # memory that nobody touches costs nothing
-OFF_THE_FAST_WAY: Final = control.Arm(control.UNANSWERED, Event.NODE_DIED.label, ())  # no brick emits it
 
 Found = Callable[[list[int], PeerError | None], None]
 
@@ -116,35 +114,36 @@ def differing(one: bytes, other: bytes) -> list[int]:
     return [bit for bit in range(8 * len(one)) if change >> bit & 1]
 
 
-def move_in(node: Host, order: control.KeepInCell, memory: memoryview) -> bytes:
-    """Have the function of a Server live in `memory`. Raises PeerError where its fields are none."""
-    server = node.hosted(order.brick).brick
+def move_in(host: AgentHost, brick: str, number: int, memory: memoryview) -> bytes:
+    """Have the function of a Server live in `memory`, for cell `number`. Raises PeerError where it has no
+    fields.
+    """
+    server = host.brick(brick)
     if not isinstance(server, Server):
-        raise PeerError(f"{order.brick} has no function")
+        raise PeerError(f"{brick} has no function")
     fields = fields_of(server.application)
     if isinstance(server.application, InCell) or not fields:
-        return msgspec.msgpack.encode(Layout(fields))  # told twice, or there is nothing to move
+        return msgspec.msgpack.encode(Layout(fields))  # a repeated order, or there is nothing to move
     size_bytes = len(server.application.capture())
     last_bytes = max(field.offset_bytes + field.size_bits // 8 for field in fields)
     if not last_bytes <= size_bytes <= CELL_BYTES:
         raise PeerError(f"a state of {size_bytes} bytes with fields up to byte {last_bytes}")
 
     def found(bits: list[int], refusal: PeerError | None) -> None:
-        _tell(node, order, bits, refusal)
+        event = Event.FAULT_APPLIED if refusal is None else Event.PEER_REFUSED
+        for bit in bits:
+            host.record(event, 0, mark(number, bit))
+        if refusal is not None:
+            host.record(Event.DETECTED_STOP, 0, 0)
+            host.stop_detected(brick, f"the state in memory is refused: {refusal}")
 
     server.application = InCell(server.application, memory, found)
-    node.armed[Event.NODE_DIED] = OFF_THE_FAST_WAY  # what is found is written down within a step
     return msgspec.msgpack.encode(Layout(fields))
 
 
-def _tell(node: Host, order: control.KeepInCell, bits: list[int], refusal: PeerError | None) -> None:
-    """Write down what was found in the cell; a function that refuses it has detected it."""
-    said = Event.FAULT_APPLIED if refusal is None else Event.PEER_REFUSED
-    for bit in bits:
-        node.record(said, 0, mark(order.cell, bit))
-    if refusal is not None:
-        node.record(Event.DETECTED_STOP, 0, 0)
-        node.stop_detected(order.brick, f"the state in memory is refused: {refusal}")
+def is_shared(brick: Brick) -> bool:
+    """Whether `brick` is a Server whose function lives in a cell."""
+    return isinstance(brick, Server) and isinstance(brick.application, InCell)
 
 
 def look(brick: Brick) -> bytes:

@@ -6,8 +6,8 @@ where it is the fault to break it, and nothing that is held back stays so for ev
 """
 
 from collections import deque
-from collections.abc import Callable, Container, Mapping
-from typing import Final, NamedTuple, Protocol, assert_never
+from collections.abc import Callable
+from typing import Final, NamedTuple, assert_never
 
 from aftbed.core.fault import Disturb, How
 from aftbed.core.messages import Message
@@ -162,27 +162,6 @@ class Diversion:
         for meddler in list(self._meddlers.values())[place:]:
             messages = [out for message in messages for out in meddler.take(message, now_ns)]
         return messages
-
-
-class Way(Protocol):
-    """Where a node lays diversions, and lifts them again."""
-
-    def lay(self, brick: str, port: str) -> None:
-        """Have what is sent there go through its diversion."""
-        ...
-
-    def lift(self, brick: str, port: str) -> None:
-        """Have it go there directly, what was held back first."""
-        ...
-
-
-def follow(diverted: Mapping[Sender, Diversion], sender: Sender, laid: Container[Sender], way: Way) -> None:
-    """Lay or lift, as `diverted` has it for this sender by now."""
-    diversion = diverted.get(sender)
-    if diversion is None or diversion.over:
-        way.lift(*sender)
-    elif sender not in laid:
-        way.lay(*sender)
 
 
 def request_of(message: Message) -> int:

@@ -21,10 +21,10 @@ from aftbed.core.journal import Record, records
 from aftbed.core.messages import AnyMessage, CaptureState, Message, Reply, Request, StateCaptured, Tried
 from aftbed.core.valuefault import EXECUTED, Bit, Flip, Place, flipped
 from aftbed.runtime import control
-from aftbed.runtime.orders import carry_out
+from aftbed.runtime.node import Node
 from aftbed.runtime.unix.journal import Journal
 from aftbed.runtime.unix.line import Line, decode_order, decode_report
-from aftbed.runtime.unix.node import Node
+from aftbed.runtime.unix.node_io import UnixIO
 
 STATE: Final = b"\x00\x01\x02\x03"
 REFUSED: Final = 0x80  # in the last byte of a state: no state has it
@@ -81,17 +81,17 @@ class Host:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self.line = Line(ours, decode_report)
         ours.setblocking(False)
-        self.node = Node("a", Line(theirs, decode_order), Journal(path, "a"))
+        self.io = UnixIO(Line(theirs, decode_order), Journal(path, "a"))
+        self.node = Node("a", self.io)
         for name in ("a/server", "b/server"):  # as in placement `single`
-            self.node.add(name, brick)
-            self.node.wiring.hosted[name].outs["out"] = self.out.append
+            self.node.add(name, brick).outputs["out"] = self.out.append
 
     def arm(self, *blows: control.Blow, event: str = EXIT) -> None:
-        assert carry_out(self.node.host, control.Arm(1, event, blows), []) == b""
+        assert self.node.carry_out(control.Arm(1, event, blows), []) == b""
 
     def execute(self, request_id: int, name: str = "a/server") -> Message:
         """The answer to one request."""
-        self.node.step(self.node.wiring.hosted[name], "prd2srv", Request(1, request_id, b"\x02\x01"))
+        self.node.step(self.node.bricks[name], "prd2srv", Request(1, request_id, b"\x02\x01"))
         return self.out[-1]
 
     def told(self) -> list[Record]:
@@ -112,7 +112,7 @@ class Host:
 
     def close(self) -> None:
         self.line.close()
-        self.node.line.close()
+        self.io.line.close()
 
 
 @pytest.fixture
@@ -138,7 +138,7 @@ def test_a_bit_of_the_result_is_flipped_in_one_execution(host: Host) -> None:
     (record,) = host.told()
     assert (record.event, record.request_id, marked(record.detail)) == (Event.FAULT_APPLIED, 2, (7, 9))
     assert host.fired() == [7]
-    assert host.node.armed == {}, "the host is on its fast way again"
+    assert not host.node.agent.active, "the host is on its fast way again"
 
 
 def test_the_state_is_not_what_a_flip_of_the_result_hits(host: Host) -> None:
@@ -172,7 +172,7 @@ def test_a_trial_carries_the_result_that_was_hit(host: Host) -> None:
 def test_a_captured_state_shows_the_hit(host: Host) -> None:
     host.arm(flip(Place.STATE, 16), event=CAPTURED)
     host.execute(1)
-    host.node.step(host.node.wiring.hosted["a/server"], "aft2srv", CaptureState(1, 1))
+    host.node.step(host.node.bricks["a/server"], "aft2srv", CaptureState(1, 1))
     assert host.out[-1] == StateCaptured(1, 1, b"\x01\x01\x03\x03")
     assert host.brick.state == b"\x01\x01\x03\x03"
 
@@ -188,7 +188,7 @@ def test_a_bit_beyond_the_end_is_not_flipped(host: Host, place: Place) -> None:
     (record,) = host.told()
     bits = 16 if place is Place.RESULT else 32
     assert (record.event, record.request_id, marked(record.detail)) == (Event.PEER_REFUSED, 1, (7, bits))
-    assert host.fired() == [7] and host.node.armed == {}
+    assert host.fired() == [7] and not host.node.agent.active
 
 
 @pytest.mark.parametrize("bit", [31, 8 * IGNORED], ids=["no state", "without a meaning"])
@@ -247,7 +247,7 @@ def test_what_is_told_not_to_wait_any_more_does_not_strike(host: Host) -> None:
     host.arm(structs.replace(flip(Place.RESULT, 0, fault=7), nth=0))
     assert host.execute(1) == Reply(1, 1, 1, b"\x03\x02")
     host.arm(flip(Place.RESULT, 0, nth=0))
-    assert host.node.armed == {}
+    assert not host.node.agent.active
 
 
 def test_a_fault_that_is_told_of_again_begins_anew(host: Host) -> None:

@@ -22,10 +22,10 @@ from aftbed.core.journal import FLAG_OFFSET, records
 from aftbed.core.messages import AnyMessage, Request
 from aftbed.core.persistence import Permanent
 from aftbed.runtime import control
-from aftbed.runtime.orders import carry_out
+from aftbed.runtime.node import Node
 from aftbed.runtime.unix.journal import Journal
 from aftbed.runtime.unix.line import Line, decode_order, decode_report
-from aftbed.runtime.unix.node import Node
+from aftbed.runtime.unix.node_io import UnixIO
 
 FILLER: Final = Request(1, 0, bytes(2000))
 BRICK, PORT = "a/after", "aft2aft"
@@ -75,7 +75,8 @@ class Host:
         for end in (writer, self.reader):
             end.setblocking(False)
         self.brick = Passing(self.reader)
-        self.node = Node("a", Line(theirs, decode_order), Journal(path, "a"))
+        self.io = UnixIO(Line(theirs, decode_order), Journal(path, "a"))
+        self.node = Node("a", self.io)
         self.node.add(BRICK, self.brick)
         self.writer = writer.detach()
         self.node.bind_output(BRICK, PORT, self.writer, 1)
@@ -90,7 +91,7 @@ class Host:
 
     def order(self, order: control.ToNode) -> None:
         self.line.send(order)
-        self.node.journal.mapping[FLAG_OFFSET] = 1
+        self.io.journal.mapping[FLAG_OFFSET] = 1
 
     def drain(self) -> None:
         """Once the node looks at its orders, there is room."""
@@ -103,17 +104,17 @@ class Host:
         return control.Interfere(control.UNANSWERED, blow)
 
     def send(self, request_id: int) -> None:
-        self.node.step(self.node.wiring.hosted[BRICK], "in", Request(1, request_id, b""))
+        self.node.step(self.node.bricks[BRICK], "in", Request(1, request_id, b""))
 
     def out(self) -> list[int]:
         return list(self.brick.capture())
 
     def direct(self) -> bool:
         """Whether the port leads to its channel, with nothing in between."""
-        return self.node.wiring.hosted[BRICK].outs[PORT] == self.writer
+        return (BRICK, PORT) not in self.node.agent.filters
 
     def close(self) -> None:
-        for end in (self.line, self.node.line, self.reader):
+        for end in (self.line, self.io.line, self.reader):
             end.close()
         os.close(self.writer)
 
@@ -149,7 +150,7 @@ def test_a_fault_that_is_armed_while_its_sender_waits_for_room_strikes_what_come
 
 
 def test_a_fault_that_is_lifted_while_what_it_let_through_waits_for_room_loses_none_of_it(host: Host) -> None:
-    carry_out(host.node.host, host.disturb(How.DUPLICATE, permanent=True), [])
+    host.node.carry_out(host.disturb(How.DUPLICATE, permanent=True), [])
     host.fill()
     host.order(host.disturb(How.DUPLICATE, nth=0))
     host.drain()
@@ -159,7 +160,7 @@ def test_a_fault_that_is_lifted_while_what_it_let_through_waits_for_room_loses_n
 
 
 def test_what_is_disturbed_waits_for_room_as_anything_does(host: Host) -> None:
-    carry_out(host.node.host, host.disturb(How.OMISSION, nth=2), [])
+    host.node.carry_out(host.disturb(How.OMISSION, nth=2), [])
     host.fill()
     host.drain()
     for request_id in (1, 2, 3):
@@ -169,7 +170,7 @@ def test_what_is_disturbed_waits_for_room_as_anything_does(host: Host) -> None:
 
 def test_where_the_port_is_bound_elsewhere_meanwhile_it_is_not_sent(host: Host) -> None:
     """As without a fault: the brick has heard of it, and asks again for what it wants."""
-    carry_out(host.node.host, host.disturb(How.DUPLICATE), [])
+    host.node.carry_out(host.disturb(How.DUPLICATE), [])
     host.fill()
     other, reader = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     bind = control.BindOutput(control.UNANSWERED, BRICK, PORT, 2)
@@ -182,7 +183,7 @@ def test_where_the_port_is_bound_elsewhere_meanwhile_it_is_not_sent(host: Host) 
     host.send(2)
     assert messages.decode(reader.recv(messages.PACKET_BYTES_MAX)) == Request(1, 2, b"")
     reader.close()
-    host.writer = host.node.wiring.hosted[BRICK].outs[PORT]  # type: ignore[assignment]
+    host.writer = host.node.bricks[BRICK].outputs[PORT]  # type: ignore[assignment]
 
 
 # -- a share of a CPU -----------------------------------------------------------------------------
@@ -190,7 +191,7 @@ def test_where_the_port_is_bound_elsewhere_meanwhile_it_is_not_sent(host: Host) 
 
 def slowed(host: Host, share: float, by_ns: int = 0) -> None:
     order = control.SlowDown(control.UNANSWERED, FAULT, by_ns, share)
-    assert carry_out(host.node.host, order, []) == b""
+    assert host.node.carry_out(order, []) == b""
 
 
 def took_ns(host: Host, steps: int) -> tuple[int, int]:
@@ -223,8 +224,7 @@ def test_when_it_is_over_nothing_is_left_of_it(host: Host) -> None:
     slowed(host, 0.25)
     host.send(1)
     slowed(host, control.WHOLE)
-    assert host.node.host.slowed == {} and host.node.armed == {}
-    assert not {"step", "perform"} & vars(host.node).keys(), "the node is on its fast way again"
+    assert not host.node.agent.active, "the node may use its fast loop again"
 
 
 def test_it_is_written_down_when_it_is_felt_and_once(host: Host) -> None:

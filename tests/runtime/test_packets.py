@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from aftbed.core.errors import PeerError
 from aftbed.core.messages import PACKET_BYTES_MAX
 from aftbed.runtime.unix import packets
-from aftbed.runtime.unix.node import NUDGE
+from aftbed.runtime.unix.node_io import NUDGE
 from aftbed.runtime.unix.packets import ANNOUNCED, READ_BYTES_MAX, put, take
 
 Pair = tuple[socket.socket, socket.socket]

@@ -12,10 +12,11 @@ import pytest
 
 from aftbed.core.brick import Brick, Effect
 from aftbed.core.messages import AnyMessage
+from aftbed.runtime.node import Node
 from aftbed.runtime.unix.journal import Header, Journal
 from aftbed.runtime.unix.line import Line, decode_order
 from aftbed.runtime.unix.linux import set_timeouts
-from aftbed.runtime.unix.node import Node
+from aftbed.runtime.unix.node_io import UnixIO
 
 SECONDS_MAX: Final = 5.0
 BEATS: Final = 4
@@ -43,12 +44,13 @@ def waiting(journal: Path, *, suspended: bool) -> Iterator[int]:
     if not pid:
         ours.close()
         set_timeouts(theirs, 60.0, 2.0)  # so that it is nowhere else while it waits
-        node = Node("idle", Line(theirs, decode_order), Journal(journal, "idle"))
+        io = UnixIO(Line(theirs, decode_order), Journal(journal, "idle"))
+        node = Node("idle", io)
         node.add("idle", Idle())
-        node.wiring.bind_input("idle", "in", os.dup(mail[0].fileno()))
+        node.bind_input("idle", "in", os.dup(mail[0].fileno()))
         node.suspended = suspended
-        node.start_pulse()
-        node.run()
+        io.start_pulse()
+        io.serve()
     theirs.close()
     try:
         yield pid

@@ -24,7 +24,7 @@ from whiteboard import Whiteboard
 from aftbed.core.messages import Goal, NodeDied
 from aftbed.inject.words import parse
 from aftbed.judge import checks
-from aftbed.runtime.sim.node import Node
+from aftbed.runtime.sim.node_io import SimNode
 from aftbed.runtime.sim.processes import Process
 
 GOLDEN: Final = Path(__file__).parents[1] / "golden"
@@ -74,7 +74,7 @@ class Stage:
                 self.world.until(self._request)
             case "mistake":
                 watchdog = self._node(f"{rest[0]}/watchdog")
-                watchdog.step(watchdog.hosted(watchdog.name), "sense", NodeDied(rest))
+                watchdog.step(watchdog.bricks[watchdog.name], "sense", NodeDied(rest))
             case "end":
                 self.world.end()
                 self._judge()
@@ -84,7 +84,7 @@ class Stage:
         self._said = len(self.world.said)
         return said
 
-    def _node(self, name: str) -> Node:
+    def _node(self, name: str) -> SimNode:
         process = self.world.conductor.deployment.nodes[name]
         assert isinstance(process, Process) and process.node is not None
         return process.node

@@ -111,7 +111,7 @@ class Interference(RuleBasedStateMachine):
         if not replica or not isinstance(watchdog, Process) or watchdog.dead or watchdog.node is None:
             return
         self.world.struck.append((self.world.loop.ns, name))  # as good as
-        watchdog.node.step(watchdog.node.hosted(watchdog.name), "sense", NodeDied(name))
+        watchdog.node.step(watchdog.node.bricks[watchdog.name], "sense", NodeDied(name))
 
     @precondition(lambda self: self._votes and self._sent() - self._flipped_at >= FLIPS_APART)
     @rule(place=st.sampled_from(EXECUTED), bit=st.integers(0, RESULT_BITS - 1))

@@ -7,7 +7,7 @@ import pytest
 from aftbed.core.events import Event
 from aftbed.core.journal import EntryKind
 from aftbed.inject.words import parse
-from aftbed.runtime.sim.hindrance import STEP_NS
+from aftbed.runtime.sim.node_io import STEP_NS
 from aftbed.runtime.sim.world import Run, Setup, World
 
 COUNT: Final = 40

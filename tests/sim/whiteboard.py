@@ -23,7 +23,7 @@ from aftbed.core.script import Phase
 from aftbed.runtime import control
 from aftbed.runtime.sim.channels import Channel
 from aftbed.runtime.sim.clock import Clock
-from aftbed.runtime.sim.node import Node
+from aftbed.runtime.sim.node_io import SimNode
 from aftbed.runtime.sim.processes import Process
 from aftbed.runtime.sim.world import Setup, World
 
@@ -200,7 +200,7 @@ class Whiteboard(World):
         first_ns = self.dialogue[0].t_ns if self.dialogue else self.loop.ns + PERIOD_NS
         return first_ns + request_id * PERIOD_NS - GAP_NS
 
-    def nodes(self) -> Iterator[Node]:
+    def nodes(self) -> Iterator[SimNode]:
         """Those that live."""
         for process in self.conductor.deployment.nodes.values():
             if isinstance(process, Process) and process.node is not None and not process.dead:

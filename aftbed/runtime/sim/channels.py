@@ -1,24 +1,32 @@
 """Channels in virtual time, with the semantics of those of sockets (see `runtime.unix.channels`).
 
-Order is kept; what is queued survives both nodes; a fence lets what was sent through and then ends; who
-writes behind a fence, or to nobody, dies (EPIPE); a full channel holds its writer up. The executive has a
-hold on both ends until it closes them, the nodes at the ends have theirs.
+Order is kept; what is queued survives both nodes; a fence lets what was sent through and then ends; a node
+that writes behind a fence, or where no node will ever read, dies (EPIPE); a full channel holds its writer up.
+The executive has a hold on both ends until it closes them, the nodes at the ends have theirs.
 """
 
 import heapq
 from collections import deque
-from typing import TYPE_CHECKING, Final
+from typing import Final, Protocol
 
 from aftbed.core.graph import Link
 from aftbed.core.messages import Message
 from aftbed.runtime.sim.clock import Clock
 
-if TYPE_CHECKING:
-    from aftbed.runtime.sim.node import Node
-
-COLD_AFTER_NS: Final = 20_000_000  # who has done nothing for so long,
-COLD_NS: Final = (10_000, 50_000)  # takes so much longer: its pages and caches are another's
+IDLE_BEFORE_COLD_NS: Final = 20_000_000  # a reader that was idle for so long has lost its caches
+COLD_PENALTY_NS: Final = (10_000, 50_000)  # added to its next read: from, to
 QUEUE_MAX: Final = 128  # messages; a socket pair holds about as many small ones
+
+
+class ChannelUser(Protocol):
+    """A node at an end of a channel."""
+
+    name: str
+    ran_ns: int  # when it last did anything
+
+    def run(self) -> None:
+        """Handle all that can be handled now."""
+        ...
 
 
 class End:
@@ -41,8 +49,8 @@ class Channel:
         self.link, self._clock = link, clock
         self.write, self.read = End(self, first_number), End(self, first_number + 1)
         self.mail: deque[tuple[int, Message]] = deque()
-        self.readers: list[Node] = []
-        self.writers: list[Node] = []
+        self.readers: list[ChannelUser] = []
+        self.writers: list[ChannelUser] = []
         self.ended = self.refused = self.closed = False
         self._last_ns = 0  # of an arrival
 
@@ -51,24 +59,23 @@ class Channel:
         """Of its writing end."""
         return self.write.number
 
-    @property
-    def beneath(self) -> "Channel":
-        """Itself: what may be laid over it is another."""
-        return self
-
     def heard_by(self) -> frozenset[str]:
         """Who reads it."""
         return frozenset([node.name for node in self.readers])
 
+    def has_room(self) -> bool:
+        """Whether `put` would succeed now."""
+        return not (self.ended or self.refused or len(self.mail) >= QUEUE_MAX)
+
     def put(self, message: Message) -> bool:
-        """Send. False if there is no room now, or nobody will ever read it: the writer waits for orders."""
+        """Send. False if there is no room now, or no node will ever read it: the writer waits for orders."""
         mail = self.mail
         if self.ended or self.refused or len(mail) >= QUEUE_MAX:
             return False
         clock = self._clock
         t_ns = clock.ns + clock.hop_ns()
-        if self.readers and t_ns - self.readers[0].ran_ns > COLD_AFTER_NS:
-            t_ns += clock.between_ns(*COLD_NS)
+        if self.readers and t_ns - self.readers[0].ran_ns > IDLE_BEFORE_COLD_NS:
+            t_ns += clock.between_ns(*COLD_PENALTY_NS)
         if t_ns <= self._last_ns:
             t_ns = self._last_ns + 1
         self._last_ns = t_ns
@@ -125,7 +132,7 @@ class Channel:
         self.closed = True
         self._look()
 
-    def leave(self, node: "Node") -> None:
+    def leave(self, node: ChannelUser) -> None:
         """`node` has no end of it any more."""
         if node in self.readers:
             self.readers.remove(node)

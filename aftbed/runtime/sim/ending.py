@@ -11,11 +11,11 @@ from aftbed.ftm.compose import replication_of
 from aftbed.runtime.cell import look
 from aftbed.runtime.conductor import Conductor
 from aftbed.runtime.deployment import Deployment
+from aftbed.runtime.devices import CarDevice, Load
 from aftbed.runtime.hosting import digest
-from aftbed.runtime.sim.devices import Car
-from aftbed.runtime.sim.node import Node
+from aftbed.runtime.sim.devices import VirtualCarLink
+from aftbed.runtime.sim.node_io import SimNode
 from aftbed.runtime.sim.processes import Process
-from aftbed.runtime.source import Load
 
 
 def states_of(deployment: Deployment) -> dict[str, str]:
@@ -25,12 +25,12 @@ def states_of(deployment: Deployment) -> dict[str, str]:
         process = deployment.nodes.get(deployment.graph.node_of(f"{replica}/server"))
         if isinstance(process, Process) and process.node is not None and not process.stopped():
             with contextlib.suppress(PeerError):
-                state = look(process.node.hosted(f"{replica}/server").brick)
+                state = look(process.node.brick(f"{replica}/server"))
                 found |= {replica: digest(state)} if state else {}
     return found
 
 
-def _client(deployment: Deployment) -> Node | None:
+def _client(deployment: Deployment) -> SimNode | None:
     process = deployment.nodes.get("client")
     return process.node if isinstance(process, Process) and not process.dead else None
 
@@ -40,10 +40,15 @@ def source_ended(deployment: Deployment, count: int) -> bool:
     node = _client(deployment)
     if node is None or node.device is None:
         return False
-    if isinstance(node.device, Car):
-        return node.device.over
-    client = node.hosted("client").brick
+    if isinstance(node.device, CarDevice):
+        return _drive_over(node.device)
+    client = node.brick("client")
     return isinstance(client, Client) and client.next_id > count
+
+
+def _drive_over(car: CarDevice) -> bool:
+    assert isinstance(car.link, VirtualCarLink)
+    return car.link.over
 
 
 def unrest(conductor: Conductor) -> list[str]:
@@ -51,9 +56,9 @@ def unrest(conductor: Conductor) -> list[str]:
     deployment, found = conductor.deployment, []
     node = _client(deployment)
     device = node.device if node is not None else None
-    if not isinstance(device, Load | Car):
+    if not isinstance(device, Load | CarDevice):
         found.append("no client")
-    elif not device.done:
+    elif not (device.done if isinstance(device, Load) else _drive_over(device) and device.idle):
         found.append("requests wait")
     if conductor.executor.busy or conductor.adaptations.busy or conductor.adaptations.to_come:
         found.append("a script is under way")

@@ -17,7 +17,7 @@ from typing import Final
 
 from aftbed.core.graph import Link
 from aftbed.core.messages import Message
-from aftbed.runtime.sim.channels import QUEUE_MAX, Channel
+from aftbed.runtime.sim.channels import Channel
 from aftbed.runtime.sim.clock import Call, Clock, Line
 
 STEP_NS: Final = 1_000  # of virtual time, per delivery
@@ -39,7 +39,7 @@ class HeldChannel(Channel):
         """Send."""
         if not self._chooser.chooses:
             return super().put(message)
-        if self.ended or self.refused or len(self.mail) >= QUEUE_MAX:
+        if not self.has_room():
             return False
         self.mail.append((ON_ITS_WAY, message))
         self._chooser.message(self._chooser.ns, self, self._come)

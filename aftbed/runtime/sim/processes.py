@@ -13,13 +13,14 @@ from aftbed.core.errors import ConfigError
 from aftbed.core.journal import Record
 from aftbed.runtime import control, interface
 from aftbed.runtime.assembly import Assembler
+from aftbed.runtime.devices import Device
 from aftbed.runtime.interface import ProcessKind
 from aftbed.runtime.jobs import Key, StepFailed, Wait
+from aftbed.runtime.node import Node
 from aftbed.runtime.sim.cells import Cell
 from aftbed.runtime.sim.channels import Channel
 from aftbed.runtime.sim.clock import Clock
-from aftbed.runtime.sim.devices import Device
-from aftbed.runtime.sim.node import Node
+from aftbed.runtime.sim.node_io import SimIO, SimNode
 
 SIGNAL_NS: Final = (5_000, 60_000)
 LIFELINE_NS: Final = (100_000, 300_000)
@@ -30,7 +31,7 @@ ROUSED_NS: Final = (200_000, 450_000)  # the executive sleeps while requests flo
 SLEEPS_AFTER_NS: Final = 5_000_000
 BIRTH_NS: Final = (500_000, 3_000_000)
 
-MakeDevice = Callable[[control.Assign, Node], Device]
+MakeDevice = Callable[[control.Assign, SimIO], Device]
 
 
 class Wire:
@@ -41,9 +42,9 @@ class Wire:
 
     def heard_by(self) -> frozenset[str] | None:
         """The process, where one was named; else the executive."""
-        if self._process is None or self._process.node is None:
+        if self._process is None or self._process.io is None:
             return None
-        return frozenset((self._process.node.name,))
+        return frozenset((self._process.io.name,))
 
 
 class Process:
@@ -53,7 +54,7 @@ class Process:
         self.name, self.kind, self.journal, self.incarnation = "spare", ProcessKind.SPARE, "", 0
         self.pid = self.pidfd = number
         self.alive = True  # as far as the executive knows
-        self.node: Node | None = None
+        self.io: SimIO | None = None
         self.bricks: tuple[tuple[str, str], ...] = ()
         self.dead = self._still = False
         self._nursery, self._clock = nursery, nursery.clock
@@ -67,6 +68,11 @@ class Process:
             Wire(4 * number + 1, None),
             Wire(4 * number + 2, None),
         )
+
+    @property
+    def node(self) -> SimNode | None:
+        """The node that it has become."""
+        return self.io.node if self.io is not None else None
 
     # -- signals ------------------------------------------------------------------------------
 
@@ -82,8 +88,8 @@ class Process:
         if self.dead:
             return False
         self._still = True
-        if self.node is not None:
-            self.node.freeze()
+        if self.io is not None:
+            self.io.freeze()
         self._nursery.on_freeze(self)
         return True
 
@@ -92,13 +98,13 @@ class Process:
         if self.dead:
             return False
         self._still = False
-        if self.node is not None:
-            self.node.thaw()
+        if self.io is not None:
+            self.io.thaw()
         return True
 
     def stopped(self) -> bool:
         """Whether it runs no more."""
-        return self.dead or self._still or (self.node is not None and bool(self.node.frozen_ns))
+        return self.dead or self._still or (self.io is not None and bool(self.io.frozen_ns))
 
     def silent(self, now_ns: int, deadline_ns: int) -> bool:
         """Whether it lives, as far as is known, and its pulse is older than `deadline_ns`."""
@@ -110,14 +116,14 @@ class Process:
 
     def pulse_ns(self, now_ns: int) -> int:
         """When it was last seen running."""
-        return now_ns if self.node is None else self.node.pulse_ns(now_ns)
+        return now_ns if self.io is None else self.io.pulse_ns(now_ns)
 
     # -- death --------------------------------------------------------------------------------
 
     def die(self) -> None:
         """Dead here and now."""
-        if self.node is not None:
-            self.node.die()
+        if self.io is not None:
+            self.io.die()
         else:
             self.ended("")
 
@@ -167,20 +173,20 @@ class Process:
             born_ns = self._clock.ns + self._clock.between_ns(*BIRTH_NS)
             self._order_ns = max(self._order_ns, born_ns)
             self._clock.at(born_ns, lambda: self._become(order, fds))
-        elif self.node is not None:
-            self.node.order(order, fds)
+        elif self.io is not None:
+            self.io.order(order, fds)
 
     def _become(self, order: control.Assign, fds: tuple[int, ...]) -> None:
         if self.dead:
             return
         try:
-            self.node = self._nursery.build(self, order, fds)
+            self.io = self._nursery.build(self, order, fds)
         except ConfigError as error:
             self.say(control.Ack(order.token, error=str(error)))
             self.die()
         else:
             if self._still:
-                self.node.freeze()
+                self.io.freeze()
 
     def say(self, report: control.FromNode) -> None:
         """The executive will hear this."""
@@ -253,18 +259,10 @@ class Nursery:
         assert isinstance(process, Process)
         process.order(order, fds)
 
-    def build(self, process: Process, order: control.Assign, fds: tuple[int, ...]) -> Node:
+    def build(self, process: Process, order: control.Assign, fds: tuple[int, ...]) -> SimIO:
         """The node that `order` describes. Raises ConfigError where a class is no good."""
         records = self._records(order.journal)
-        node = Node(order.node, self.clock, records, self._end, process.say, process.ended)
-        node.suspended, node.cells = order.held, self.cells
-        self._assembler.fill(node, order)
-        if order.device:
-            node.attach(self._make_device(order, node), order.bricks[0].name)
-        for port in order.inputs:
-            node.bind_input(port.brick, port.port, fds[port.index])
-        process.say(control.Ack(order.token))
-        for port in order.outputs:
-            node.bind_output(port.brick, port.port, fds[port.index], order.epoch)
-        self.clock.at(self.clock.ns, node.run)
-        return node
+        io = SimIO(order.node, self.clock, records, self._end, process.say, process.ended, self.cells)
+        self._assembler.build(Node(order.node, io), order, list(fds), lambda: self._make_device(order, io))
+        self.clock.at(self.clock.ns, io.run)
+        return io

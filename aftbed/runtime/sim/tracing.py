@@ -19,7 +19,7 @@ import msgspec
 from aftbed.core.graph import Link
 from aftbed.core.journal import Entry, EntryKind, Record
 from aftbed.core.messages import Message
-from aftbed.runtime.assembly import Make
+from aftbed.runtime.assembly import MakeSetting
 from aftbed.runtime.sim.channels import Channel
 from aftbed.runtime.sim.clock import START_NS, Clock
 from aftbed.runtime.sim.world import Run, Setup, World
@@ -57,7 +57,7 @@ class Trace(msgspec.Struct, frozen=True):
     happened: tuple[Happening, ...]
 
 
-def traced(setup: Setup, make: Make | None = None) -> Trace:
+def traced(setup: Setup, make: MakeSetting | None = None) -> Trace:
     """Run `setup` and keep all that happens; `make` makes other bricks than the catalog's."""
     world = _Traced(setup, make)
     run = world.run()
@@ -82,7 +82,7 @@ class _Records(list[Record]):
 class _Traced(World):
     """A world that keeps what happens."""
 
-    def __init__(self, setup: Setup, make: Make | None) -> None:
+    def __init__(self, setup: Setup, make: MakeSetting | None) -> None:
         self.happened: list[Happening] = []
         super().__init__(setup, make=make, channel=_recording(self.happened))
 

@@ -23,9 +23,10 @@ from aftbed.core.valuefault import Flip
 from aftbed.ftm.client import Client
 from aftbed.runtime import control, targets
 from aftbed.runtime.adaptations import Outcome
-from aftbed.runtime.assembly import Assembler, Make
+from aftbed.runtime.assembly import Assembler, MakeSetting
 from aftbed.runtime.conductor import Conductor, ScriptRun
 from aftbed.runtime.deployment import Keys
+from aftbed.runtime.devices import CarDevice, Device, Load, Sensor, resume_client
 from aftbed.runtime.hosting import Hosted, hosted
 from aftbed.runtime.interface import Met, ProcessKind
 from aftbed.runtime.jobs import Wait
@@ -33,12 +34,11 @@ from aftbed.runtime.sim import ending
 from aftbed.runtime.sim.cells import Cell
 from aftbed.runtime.sim.channels import Channel
 from aftbed.runtime.sim.clock import START_NS, Clock
-from aftbed.runtime.sim.devices import Car, Device, Sensor
+from aftbed.runtime.sim.devices import SimSenses, VirtualCarLink
 from aftbed.runtime.sim.drive import Drive
 from aftbed.runtime.sim.givens import Journal, check, graph_of, nothing_off_line, requests_of
-from aftbed.runtime.sim.node import Node
+from aftbed.runtime.sim.node_io import SimIO, SimNode
 from aftbed.runtime.sim.processes import Nursery, Process
-from aftbed.runtime.source import Load, resume_client
 from aftbed.vehicle.aeb.function import default_application
 from aftbed.vehicle.plant import VehicleResult
 
@@ -112,7 +112,7 @@ class World:
         *,
         function: Callable[[], Application] = default_application,
         requests: list[bytes] | None = None,
-        make: Make | None = None,
+        make: MakeSetting | None = None,
         load: LoadModule = nothing_off_line,
         channel: type[Channel] = Channel,
         clock: Callable[[Random], Clock] = Clock,
@@ -213,23 +213,23 @@ class World:
     def _journal_for(self, name: str) -> list[Record]:
         return self.journals.setdefault(name, [])
 
-    def _make_device(self, order: control.Assign, node: Node) -> Device:
+    def _make_device(self, order: control.Assign, io: SimIO) -> Device:
         if order.device == "sensor":
             by_number = self.nursery.by_number
 
             def notice(number: int, call: Callable[[], None]) -> None:
                 def noticed() -> None:
                     call()
-                    node.run()
+                    io.run()
 
                 by_number[number].notice(noticed)
 
-            return Sensor(by_number.__getitem__, notice)
-        client = node.hosted(order.bricks[0].name).brick
+            return Sensor(SimSenses(by_number.__getitem__, notice))
+        client = io.node.brick(order.bricks[0].name)
         assert isinstance(client, Client)
         resume_client(client, self.dialogue)
         if self._drive is not None:
-            return Car(client, self, *self._drive.seat(node.run))
+            return CarDevice(client, self, VirtualCarLink(*self._drive.seat(io.run)))
         return Load(client, self, self._requests, self.setup.count, self.setup.rate_hz)
 
     def write(self, now_ns: int, request_id: int, epoch: int, kind: EntryKind, payload: bytes) -> None:
@@ -254,9 +254,9 @@ class World:
             self.failures.append(f"{process.name}: {reason}")
             self.tell("assert", f"{process.name}: {reason}")
 
-    def _count(self, node: Node) -> None:
+    def _count(self, node: SimNode) -> None:
         for brick in node.bricks.values():
-            self.effects.setdefault(brick.name, brick.effects)
+            self.effects.setdefault(brick.name, brick.performed)
 
     def _on_loss(self) -> None:
         self.lost = True
@@ -274,8 +274,8 @@ class World:
     def _doom(self, doom: Doom) -> None:
         deployment = self.conductor.deployment
         process = deployment.nodes.get(deployment.graph.node_of(doom.brick))
-        assert isinstance(process, Process) and process.node is not None
-        process.node.performer.doom = (doom.brick, doom.effect)
+        assert isinstance(process, Process) and process.io is not None
+        process.io.die_before(doom.brick, doom.effect)
 
     def _on_launched(self, failure: str) -> None:
         assert not failure, f"the launch of {self.setup}: {failure}"

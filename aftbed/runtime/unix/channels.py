@@ -11,7 +11,7 @@ from typing import Final
 
 from aftbed.core.graph import Link
 from aftbed.runtime.unix.linux import set_timeouts
-from aftbed.runtime.unix.node import NUDGE, PULSE_SECONDS, WRITE_SECONDS_MAX
+from aftbed.runtime.unix.node_io import NUDGE, PULSE_SECONDS, WRITE_SECONDS_MAX
 
 WRITE_PATIENCE_SECONDS: Final = PULSE_SECONDS
 assert WRITE_PATIENCE_SECONDS < WRITE_SECONDS_MAX

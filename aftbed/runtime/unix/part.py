@@ -15,12 +15,14 @@ from aftbed.core.errors import ConfigError
 from aftbed.ftm.client import Client
 from aftbed.runtime import control
 from aftbed.runtime.assembly import Assembler
+from aftbed.runtime.devices import Device, Sensor
+from aftbed.runtime.node import Node
 from aftbed.runtime.unix import linux
-from aftbed.runtime.unix.devices import Device, LoadOptions, Sensor, make_load
+from aftbed.runtime.unix.devices import LoadOptions, ProcessSenses, make_load
 from aftbed.runtime.unix.journal import Journal
 from aftbed.runtime.unix.lifeline import Held
 from aftbed.runtime.unix.line import Line
-from aftbed.runtime.unix.node import EXIT_ASSERT, PULSE_SECONDS, Node
+from aftbed.runtime.unix.node_io import EXIT_ASSERT, PULSE_SECONDS, UnixIO, UnixNode
 from aftbed.runtime.unix.options import GatewayOptions
 from aftbed.vehicle.aeb.function import default_application, sample_requests
 
@@ -36,7 +38,7 @@ def become(line: Line[control.ToNode], order: control.Assign | control.Serve, fd
             linux.set_name(f"aftbed-{order.service}")
             serve(line, order, fds)
             os._exit(0)
-        node = _build(line, order, fds)
+        io = _build(line, order, fds)
     except BaseException as error:  # noqa: BLE001 - the last frame of this process
         known = isinstance(error, ConfigError)
         reason = str(error) if known else f"{type(error).__name__}: {error}"
@@ -45,10 +47,10 @@ def become(line: Line[control.ToNode], order: control.Assign | control.Serve, fd
             os._exit(0)
         sys.excepthook(type(error), error, error.__traceback__)
         os._exit(EXIT_ASSERT)
-    node.run()
+    io.serve()
 
 
-def _build(line: Line[control.ToNode], order: control.Assign, fds: list[int]) -> Node:
+def _build(line: Line[control.ToNode], order: control.Assign, fds: list[int]) -> UnixIO:
     linux.set_name(order.node)
     if order.staged and order.aside is not None:
         os.sched_setaffinity(0, {order.aside})  # requests are served on the other one
@@ -59,21 +61,14 @@ def _build(line: Line[control.ToNode], order: control.Assign, fds: list[int]) ->
     else:
         linux.hand_over()
     linux.set_timeouts(line.sock, PULSE_SECONDS, 2.0)
-    node = Node(order.node, line, Journal(Path(order.journal), order.node))
-    node.start_pulse()
-    node.lifeline = Held(Path(order.journal))
+    io = UnixIO(line, Journal(Path(order.journal), order.node))
+    node = Node(order.node, io)
+    io.start_pulse()
+    io.lifeline = Held(Path(order.journal))
     if order.bricks[0].kind == "engine":
         gc.enable()  # a plan leaves cycles behind, and nobody waits for the Engine on the request path
-    node.suspended = order.held
-    Assembler(default_application, load_module).fill(node, order)
-    if order.device:
-        node.attach(_device(order, node), order.bricks[0].name)
-    for port in order.inputs:
-        node.wiring.bind_input(port.brick, port.port, fds[port.index])
-    line.send(control.Ack(order.token))
-    for port in order.outputs:
-        node.bind_output(port.brick, port.port, fds[port.index], order.epoch)
-    return node
+    Assembler(default_application, load_module).build(node, order, fds, lambda: _device(order, node))
+    return io
 
 
 def load_module(place: str) -> ModuleType:
@@ -88,15 +83,15 @@ def load_module(place: str) -> ModuleType:
     return module
 
 
-def _device(order: control.Assign, node: Node) -> Device:
+def _device(order: control.Assign, node: UnixNode) -> Device:
     if order.device == "sensor":
-        return Sensor()
-    client = node.wiring.hosted[order.bricks[0].name].brick
+        return Sensor(ProcessSenses())
+    client = node.brick(order.bricks[0].name)
     assert isinstance(client, Client)
     if order.device == "load":
         options = msgspec.msgpack.decode(order.options, type=LoadOptions)
         return make_load(client, options, sample_requests(options.seed, LOAD_REQUESTS))
     assert order.device == "gateway", order.device
-    from aftbed.runtime.unix.gateway import GatewayDevice  # noqa: PLC0415 - see above
+    from aftbed.runtime.unix.gateway import make_car  # noqa: PLC0415 - see above
 
-    return GatewayDevice(client, msgspec.msgpack.decode(order.options, type=GatewayOptions))
+    return make_car(client, msgspec.msgpack.decode(order.options, type=GatewayOptions))

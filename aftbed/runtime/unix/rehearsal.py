@@ -1,17 +1,20 @@
 """The rehearsal: requests through a whole chain in memory, before there are real ones.
 
 In the zygote it warms up the interpreter (specialised code, filled caches), which its children inherit. Then
-a child of it that is thrown away shows which pages a step writes to, for the others to have from their birth.
+a child that is thrown away shows which pages a step writes to: those that the other children make their own
+at birth.
 """
 
 import gc
 import os
 import socket
+from collections import defaultdict
 from functools import lru_cache
 from typing import Final
 
 from aftbed.core import messages
-from aftbed.core.brick import CONTROL, Brick, Send
+from aftbed.core import messages as core_messages
+from aftbed.core.brick import CONTROL, Brick
 from aftbed.core.journal import FLAG_OFFSET, HEADER_BYTES, RECORD
 from aftbed.core.messages import (
     CaptureState,
@@ -31,10 +34,11 @@ from aftbed.ftm.pbr import PbrAfter
 from aftbed.ftm.registry import Setting, make
 from aftbed.ftm.server import Server
 from aftbed.runtime import control
+from aftbed.runtime.node import MemoryIO, Node, nowhere
 from aftbed.runtime.unix import linux
 from aftbed.runtime.unix.journal import Journal
 from aftbed.runtime.unix.line import Line, decode_order, decode_report
-from aftbed.runtime.unix.node import NUDGE, Node
+from aftbed.runtime.unix.node_io import NUDGE, UnixIO
 from aftbed.runtime.unix.pages import Area, written_by
 from aftbed.vehicle.aeb.function import default_application, sample_requests
 
@@ -67,21 +71,35 @@ def _once() -> None:
 def rehearse(rounds: int) -> None:
     """`rounds` requests through both replicas, then the backup takes over and serves as many."""
     kinds, ways, requests = _scene()
-    bricks: dict[str, Brick] = {}
+    node = Node("rehearsal", MemoryIO())
     for name, kind in kinds.items():
-        bricks[name] = make(kind, Setting(1, 1, not name.startswith("b/"), default_application))
-    for name, port in ways:
-        bricks[name].step(CONTROL, Rebound(port, True, 1), 0)
-    _serve(bricks, ways, requests[:rounds])
-    mail = [("b/after", CONTROL, Promote(2)), ("b/after", "aft2aft", ChannelEnded())]
-    for name, port, message in mail:
-        _deliver(bricks, ways, [(name, port, message)])
-    ways = ways | {
-        ("proxy", "pxy2pro"): ("b/protocol", "pxy2pro"),
-        ("b/protocol", "pro2pxy"): ("proxy", "pro2pxy"),
-    }
-    bricks["proxy"].step(CONTROL, Rebound("pxy2pro", True, 2), 0)
-    _serve(bricks, ways, requests[:rounds])
+        hosted = node.add(name, make(kind, Setting(1, 1, not name.startswith("b/"), default_application)))
+        hosted.outputs = defaultdict(lambda: nowhere, hosted.outputs)
+    for way in ways.items():
+        _link(node, *way, epoch=1)
+    _serve(node, requests[:rounds])
+    after = node.bricks["b/after"]
+    node.step(after, CONTROL, Promote(2))
+    node.step(after, "aft2aft", ChannelEnded())
+    _link(node, ("b/protocol", "pro2pxy"), ("proxy", "pro2pxy"), epoch=2)
+    _link(node, ("proxy", "pxy2pro"), ("b/protocol", "pxy2pro"), epoch=2)
+    _serve(node, requests[:rounds])
+
+
+def _link(node: Node[int, int], source: tuple[str, str], sink: tuple[str, str], epoch: int) -> None:
+    """A channel in memory, whose messages are encoded and decoded as on a socket."""
+    hosted = node.bricks[source[0]]
+    hosted.outputs[source[1]] = lambda message: node.post(
+        *sink, core_messages.decode(core_messages.encode(message))
+    )
+    node.step(hosted, CONTROL, Rebound(source[1], True, epoch))
+
+
+def _serve(node: Node[int, int], requests: list[bytes]) -> None:
+    for payload in requests:
+        node.post("client", "submit", Submit(payload))
+        while node.turn():
+            pass
 
 
 @lru_cache(maxsize=1)
@@ -103,14 +121,15 @@ class _Scratch:
     def __init__(self, brick: Brick, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> None:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self.line = Line(ours, decode_report)
-        self.node = Node("rehearsal", Line(theirs, decode_order), Journal(None, "rehearsal"))
+        self.io = UnixIO(Line(theirs, decode_order), Journal(None, "rehearsal"))
+        self.node = Node("rehearsal", self.io)
         self.node.add("brick", brick)
         self._ends = [ours, theirs]
         self.into = {port: self.channel() for port in inputs}
-        self._outs = {port: self.channel() for port in outputs}
+        self._outputs = {port: self.channel() for port in outputs}
         for port, (_, read) in self.into.items():
-            self.node.wiring.bind_input("brick", port, os.dup(read.fileno()))
-        for port, (write, _) in self._outs.items():
+            self.node.bind_input("brick", port, os.dup(read.fileno()))
+        for port, (write, _) in self._outputs.items():
             self.node.bind_output("brick", port, os.dup(write.fileno()), 1)
 
     def channel(self) -> tuple[socket.socket, socket.socket]:
@@ -122,20 +141,20 @@ class _Scratch:
     def order(self, order: control.ToNode, fds: tuple[int, ...] = ()) -> None:
         """What the supervisor does to be heard."""
         self.line.send(order, fds)
-        self.node.journal.mapping[FLAG_OFFSET] = 1
+        self.io.journal.mapping[FLAG_OFFSET] = 1
         for write, _ in self.into.values():
             write.send(NUDGE, socket.MSG_DONTWAIT)
 
     def turns(self, count: int) -> None:
         """Let the host work off what has come, as `Node.run` does."""
         for _ in range(count):
-            self.node.turn()
+            self.io.turn()
 
     def close(self) -> None:
         """Close everything."""
         for port in self.into:
-            self.node.wiring.bind_input("brick", port, None)
-        for port in self._outs:
+            self.node.bind_input("brick", port, None)
+        for port in self._outputs:
             self.node.bind_output("brick", port, None, 1)
         for end in self._ends:
             end.close()
@@ -172,8 +191,8 @@ def _rehearse_mail() -> None:
             into.send(messages.encode(Request(1, request_id, b"")))
         scratch.order(control.Resume(request_id))
         scratch.turns(1)  # the order, then the first request
-        scratch.node.serve_hot(scratch.node.wiring.hosted["brick"])  # until it meets the nudge
-        assert scratch.node.journal.at == HEADER_BYTES + request_id * RECORD.size, "a rehearsal went wrong"
+        scratch.io.serve_fast(scratch.node.bricks["brick"])  # until it meets the nudge
+        assert scratch.io.journal.at == HEADER_BYTES + request_id * RECORD.size, "a rehearsal went wrong"
         scratch.line.recv()
     scratch.close()
 
@@ -208,17 +227,3 @@ def _rehearse_following() -> None:
     for fd in fds:
         os.close(fd)
     scratch.close()
-
-
-def _serve(bricks: dict[str, Brick], ways: Ways, requests: list[bytes]) -> None:
-    for payload in requests:
-        _deliver(bricks, ways, [("client", "submit", Submit(payload))])
-
-
-def _deliver(bricks: dict[str, Brick], ways: Ways, mail: list[tuple[str, str, Message]]) -> None:
-    while mail:
-        name, port, message = mail.pop(0)
-        for effect in bricks[name].step(port, message, 0):  # type: ignore[arg-type]
-            if isinstance(effect, Send) and (name, effect.port) in ways:
-                sink, sink_port = ways[name, effect.port]
-                mail.append((sink, sink_port, messages.decode(messages.encode(effect.message))))

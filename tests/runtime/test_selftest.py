@@ -3,7 +3,6 @@
 import msgspec
 import pytest
 
-from aftbed.adapt import selftest
 from aftbed.adapt.bricks import load, load_application, make_brick
 from aftbed.core.brick import Brick, Effect, Send
 from aftbed.core.errors import ConfigError
@@ -12,6 +11,7 @@ from aftbed.core.messages import AnyMessage, Reply
 from aftbed.ftm.chain import Compute
 from aftbed.ftm.compose import EXPRESSIONS, NONE, build
 from aftbed.ftm.registry import KINDS, Setting
+from aftbed.runtime.assembly import TEST_EPOCH, MakeBrick, self_test
 from aftbed.vehicle.aeb.function import default_application, sample_requests
 
 REQUESTS = tuple(sample_requests(0, 8))
@@ -65,13 +65,13 @@ def _another(effect: Effect) -> Effect:
     return effect
 
 
-def _with(graph: Graph, kind: type) -> tuple[Graph, selftest.Make]:
+def _with(graph: Graph, kind: type) -> tuple[Graph, MakeBrick]:
     bricks = tuple(
         msgspec.structs.replace(b, source=SOURCE) if b.part == "proceed" else b for b in graph.bricks
     )
 
     def make(spec: BrickSpec) -> Brick:
-        setting = Setting(1, selftest.EPOCH, True, default_application)
+        setting = Setting(1, TEST_EPOCH, True, default_application)
         if spec.source:
             found: Brick = kind(setting)
             return found
@@ -90,12 +90,12 @@ def test_every_mechanism_passes_its_own_test(expression: str) -> None:
     plain = msgspec.structs.replace(
         graph, bricks=tuple(msgspec.structs.replace(b, source="") for b in graph.bricks)
     )
-    selftest.run(plain, "a", make, REQUESTS)
+    self_test(plain, "a", make, REQUESTS)
 
 
 def test_a_sound_brick_passes() -> None:
     graph, make = _with(build("pbr", "process"), Wrapped)
-    selftest.run(graph, "a", make, REQUESTS)
+    self_test(graph, "a", make, REQUESTS)
 
 
 @pytest.mark.parametrize(
@@ -109,7 +109,7 @@ def test_a_sound_brick_passes() -> None:
 def test_what_is_wrong_is_named(kind: type, words: str) -> None:
     graph, make = _with(build("pbr", "process"), kind)
     with pytest.raises(ConfigError, match="self-test: ") as refusal:
-        selftest.run(graph, "a", make, REQUESTS)
+        self_test(graph, "a", make, REQUESTS)
     assert words in str(refusal.value)
 
 

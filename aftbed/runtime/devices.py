@@ -1,0 +1,350 @@
+"""Devices: what joins a brick's port to the world outside of the graph, for every runtime.
+
+A brick is pure, so its node has to hold what a Watchdog senses with and where the Client's requests come
+from: a `Load`, a list of requests in a closed loop or at a fixed rate; a `CarDevice`, a car on its bus; a
+`Sensor`.
+
+The dialogue of a source of requests is written ahead of each request and behind each reply. So the successor
+of a dead Client knows what was asked, and asks again for every reply that may not have arrived.
+"""
+
+from collections import deque
+from collections.abc import Callable, Iterable
+from typing import Final, Protocol
+
+import msgspec
+
+from aftbed.core.journal import Entry, EntryKind
+from aftbed.core.messages import NodeDied, Pulses, Reply, Request, Submit
+from aftbed.ftm.client import BACKLOG_MAX, Client
+from aftbed.ftm.failover import PERIOD_NS
+from aftbed.runtime import control
+
+CATCH_UP: Final = 10  # periods: a load that was held up makes good for no more
+
+
+class Device(Protocol):
+    """What a node needs of its device. `port` is the brick's port that it feeds."""
+
+    port: str
+    polled: bool  # it has descriptors to poll, or deadlines
+
+    def fds(self) -> tuple[int, ...]:
+        """Descriptors that make `ready` worth calling when they are readable."""
+        ...
+
+    def ready(self, fd: int, now_ns: int) -> None:
+        """`fd` is readable."""
+        ...
+
+    def take(self, now_ns: int) -> Submit | NodeDied | Pulses | None:
+        """The next message for the brick, or None."""
+        ...
+
+    def wait(self, now_ns: int) -> None:
+        """The brick's port is closed, and time goes on."""
+        ...
+
+    def accept(self, reply: Reply, now_ns: int) -> None:
+        """What the brick sent to `deliver`."""
+        ...
+
+    def quiet(self) -> None:
+        """Hand in nothing more."""
+        ...
+
+    def deadline_ns(self) -> int | None:
+        """When `take` is worth calling again at the latest."""
+        ...
+
+    def stats(self) -> bytes:
+        """Counts, as MessagePack."""
+        ...
+
+
+class Dialogue(Protocol):
+    """Requests and replies with their bytes, as the client saw them."""
+
+    def write(self, now_ns: int, request_id: int, epoch: int, kind: EntryKind, payload: bytes) -> None:
+        """Append an entry."""
+        ...
+
+
+def resume_client(client: Client, history: Iterable[Entry]) -> None:
+    """Give a new Client the state that its predecessors' dialogues tell."""
+    waiting: dict[int, Request] = {}
+    answered = set()
+    next_id = 1
+    for entry in history:
+        if entry.kind is EntryKind.SENT:
+            waiting[entry.request_id] = Request(0, entry.request_id, entry.payload)
+            next_id = max(next_id, entry.request_id + 1)
+        else:
+            answered.add(entry.request_id)
+    left = [request for number, request in waiting.items() if number not in answered]
+    client.restore(msgspec.msgpack.encode((next_id, left)))
+
+
+class Load:
+    """Requests out of a list. `rate_hz` 0 is a closed loop: the next request follows the reply. Stops after
+    `count`.
+    """
+
+    port = "submit"
+
+    def __init__(
+        self, client: Client, dialogue: Dialogue, requests: list[bytes], count: int, rate_hz: float
+    ) -> None:
+        self._client, self._dialogue, self._requests, self._count = client, dialogue, requests, count
+        self._period_ns = round(1e9 / rate_hz) if rate_hz else 0
+        self._next_ns = 0
+        self.polled = self._period_ns > 0
+
+    def fds(self) -> tuple[int, ...]:
+        """None: the load comes from within."""
+        return ()
+
+    def ready(self, fd: int, now_ns: int) -> None:
+        """Never called."""
+        raise AssertionError(f"no descriptor {fd}")
+
+    def _due(self, now_ns: int) -> bool:
+        if self._client.next_id > self._count:
+            return False
+        return now_ns >= self._next_ns if self._period_ns else not self._client.unanswered
+
+    def take(self, now_ns: int) -> Submit | None:
+        """The next request, if it is due. Written ahead: a successor knows it even if we die now."""
+        if not self._due(now_ns):
+            return None
+        request_id = self._client.next_id
+        payload = self._requests[(request_id - 1) % len(self._requests)]
+        if self._period_ns:
+            earliest_ns = now_ns - CATCH_UP * self._period_ns
+            self._next_ns = max(self._next_ns or now_ns, earliest_ns) + self._period_ns
+        self._dialogue.write(now_ns, request_id, 0, EntryKind.SENT, payload)
+        return Submit(payload)
+
+    def wait(self, now_ns: int) -> None:
+        """A load that is held up makes good for it later, as far as it does."""
+
+    def accept(self, reply: Reply, now_ns: int) -> None:
+        """Keep the reply in the dialogue."""
+        self._dialogue.write(now_ns, reply.request_id, reply.epoch, EntryKind.ANSWERED, reply.payload)
+
+    def quiet(self) -> None:
+        """The load is at its end now."""
+        self._count = self._client.next_id - 1
+
+    def deadline_ns(self) -> int | None:
+        """When the next request is due."""
+        if not self._period_ns or self._client.next_id > self._count:
+            return None
+        return self._next_ns
+
+    @property
+    def done(self) -> bool:
+        """All is asked and answered."""
+        return self._client.next_id > self._count and not self._client.unanswered
+
+    def stats(self) -> bytes:
+        """How far the load is."""
+        waiting = len(self._client.unanswered)
+        return msgspec.msgpack.encode(
+            {"sent": self._client.next_id - 1, "unanswered": waiting, "done": self.done}
+        )
+
+
+class CarLink(Protocol):
+    """How a runtime reaches a car: by frames on a bus, or by calls in virtual time."""
+
+    def fds(self) -> tuple[int, ...]:
+        """Descriptors that are readable when `read` is worth calling."""
+        ...
+
+    def read(self) -> Iterable[bytes]:
+        """The requests that have come."""
+        ...
+
+    def advance(self, now_ns: int) -> Iterable[bytes]:
+        """The requests that are made as time goes on to `now_ns`."""
+        ...
+
+    def deliver(self, reply: Reply, now_ns: int) -> None:
+        """To the brakes."""
+        ...
+
+    def deadline_ns(self) -> int | None:
+        """When `advance` is worth calling again at the latest."""
+        ...
+
+    def counts(self) -> dict[str, object]:
+        """What it counts."""
+        ...
+
+
+class CarDevice:
+    """The device of a Client between a car's radar and its brakes. Of `BACKLOG_MAX` waiting requests the
+    oldest, whose track is worth least, gives way.
+    """
+
+    port = "submit"
+    polled = True
+
+    def __init__(self, client: Client, dialogue: Dialogue, link: CarLink) -> None:
+        self._client, self._dialogue, self.link = client, dialogue, link
+        self._payloads: deque[bytes] = deque()
+        self._overrun = 0
+        self._quiet = False
+        self._sent_ns = 0
+        self._cycle_us = 0.0  # of the last request
+
+    def fds(self) -> tuple[int, ...]:
+        """Those of the bus."""
+        return self.link.fds()
+
+    def ready(self, fd: int, now_ns: int) -> None:
+        """Keep the requests that have come."""
+        self._keep(self.link.read())
+
+    def _keep(self, payloads: Iterable[bytes]) -> None:
+        for payload in payloads:
+            if len(self._payloads) >= BACKLOG_MAX:
+                self._payloads.popleft()
+                self._overrun += 1
+            self._payloads.append(payload)
+
+    def take(self, now_ns: int) -> Submit | None:
+        """The next request. Written ahead: a successor knows it even if this node dies now."""
+        self.wait(now_ns)
+        if not self._payloads or self._quiet:
+            return None
+        payload = self._payloads.popleft()
+        self._dialogue.write(now_ns, self._client.next_id, 0, EntryKind.SENT, payload)
+        self._sent_ns = now_ns
+        return Submit(payload)
+
+    def wait(self, now_ns: int) -> None:
+        """Let the car drive on."""
+        self._keep(self.link.advance(now_ns))
+
+    def accept(self, reply: Reply, now_ns: int) -> None:
+        """To the brakes; then written, so that a reply that did not get there is asked for again."""
+        self._cycle_us = round((now_ns - self._sent_ns) / 1e3, 1)
+        self.link.deliver(reply, now_ns)
+        self._dialogue.write(now_ns, reply.request_id, reply.epoch, EntryKind.ANSWERED, reply.payload)
+
+    def quiet(self) -> None:
+        """No more requests."""
+        self._quiet = True
+        self._payloads.clear()
+
+    def deadline_ns(self) -> int | None:
+        """When the link has to look again."""
+        return self.link.deadline_ns()
+
+    @property
+    def idle(self) -> bool:
+        """Every request that was made is answered."""
+        return not self._payloads and not self._client.unanswered
+
+    def stats(self) -> bytes:
+        """How far the requests are, and what the link counts."""
+        counts: dict[str, object] = {
+            "sent": self._client.next_id - 1,
+            "unanswered": len(self._client.unanswered) + len(self._payloads),
+            "overrun": self._overrun,
+            "cycle_us": self._cycle_us,
+        }
+        return msgspec.msgpack.encode(counts | self.link.counts())
+
+
+class Senses(Protocol):
+    """How a runtime sees deaths and pulses of nodes."""
+
+    def watch(self, order: control.WatchNodes, fds: list[int], died: Callable[[str], None]) -> None:
+        """Watch these nodes and no others; `died` may be called for each."""
+        ...
+
+    def forget(self) -> None:
+        """Watch no node."""
+        ...
+
+    def fds(self) -> tuple[int, ...]:
+        """Descriptors that are readable when a node has died."""
+        ...
+
+    def died(self, fd: int) -> list[str]:
+        """`fd` is readable: the nodes that have died."""
+        ...
+
+    def pulse_ns(self, node: str, now_ns: int) -> int:
+        """When `node` was last seen running. A node that the machine does not let run counts as seen now."""
+        ...
+
+
+class Sensor:
+    """The device of a Watchdog: deaths and pulses of the nodes of its replica.
+
+    A replica whose first node has died is lost: the deaths that follow are not looked at.
+    """
+
+    port = "sense"
+    polled = True
+
+    def __init__(self, senses: Senses) -> None:
+        self._senses = senses
+        self._nodes: tuple[str, ...] = ()
+        self._died: deque[str] = deque()
+        self._alarmed = False
+        self._next_ns = 0
+
+    def watch(self, order: control.WatchNodes, fds: list[int]) -> None:
+        """Watch these nodes and no others."""
+        self.quiet()
+        self._nodes = order.nodes
+        self._senses.watch(order, fds, self._see_death)
+
+    def _see_death(self, node: str) -> None:
+        if not self._alarmed:
+            self._died.append(node)
+            self._alarmed = True
+
+    def fds(self) -> tuple[int, ...]:
+        """None after the first death."""
+        return () if self._alarmed else self._senses.fds()
+
+    def ready(self, fd: int, now_ns: int) -> None:
+        """`fd` is readable: somebody has died."""
+        self._died += self._senses.died(fd)
+        self._alarmed = bool(self._died)
+
+    def take(self, now_ns: int) -> NodeDied | Pulses | None:
+        """Deaths first."""
+        if self._died:
+            return NodeDied(self._died.popleft())
+        if now_ns < self._next_ns or not self._nodes or self._alarmed:
+            return None
+        self._next_ns = now_ns + PERIOD_NS
+        return Pulses({node: self._senses.pulse_ns(node, now_ns) for node in self._nodes})
+
+    def wait(self, now_ns: int) -> None:
+        """Deaths are kept until they are taken."""
+
+    def accept(self, reply: Reply, now_ns: int) -> None:
+        """Nothing is delivered to a sensor."""
+        raise AssertionError("a reply delivered to a Watchdog's sensor")
+
+    def quiet(self) -> None:
+        """Watch no node any more."""
+        self._senses.forget()
+        self._nodes, self._alarmed = (), False
+        self._died.clear()
+
+    def deadline_ns(self) -> int | None:
+        """The next look at the pulses."""
+        return self._next_ns if self._nodes and not self._alarmed else None
+
+    def stats(self) -> bytes:
+        """Nothing is counted."""
+        return msgspec.msgpack.encode({})

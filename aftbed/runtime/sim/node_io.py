@@ -1,0 +1,400 @@
+"""The NodeIO of a simulated node: channels and journal in memory, virtual time, and its life.
+
+All that a step asks for happens in its instant; what takes time is the way to the next node, in which the
+step of the reader is counted. A node can die between any two effects (`die_before`), can be stopped, can be
+held up by a full channel, by a fault that the executive has to see applied, or by a slow step. Then the
+effects that are left are performed later, before anything but orders is handled, or never.
+
+What a step takes of a CPU is the time of a hop, in which there is little else: with a share of a CPU, a step
+takes so many times that.
+"""
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import Final, NamedTuple, NoReturn
+
+from aftbed.core.brick import Effect, Send
+from aftbed.core.events import Event
+from aftbed.core.journal import Record
+from aftbed.core.messages import ChannelEnded, Message
+from aftbed.runtime import control
+from aftbed.runtime.node import HostedBrick, Node, NodeIO
+from aftbed.runtime.sim.cells import Cell
+from aftbed.runtime.sim.channels import Channel
+from aftbed.runtime.sim.clock import Clock
+from aftbed.runtime.sim.hops import HOP_QUANTILES_NS
+
+NEVER: Final = 1 << 62
+PULSE_NS: Final = 20_000_000  # an idle node looks up so often
+WRITE_NS_MAX: Final = (
+    2_000_000_000  # a node that cannot write for so long takes itself for fenced, as on unix
+)
+STEP_NS: Final = HOP_QUANTILES_NS[len(HOP_QUANTILES_NS) // 2]  # of CPU time
+FULL_NS: Final = 100_000  # between two looks whether a full channel has room
+
+SimBrick = HostedBrick[Channel, Channel]
+SimNode = Node[Channel, Channel]
+
+
+class Died(BaseException):
+    """The node has died in the middle of a step. Not an Exception: nothing may take it for an error."""
+
+
+class _Held(NamedTuple):
+    """Effects from `at` on that wait: for room at `end` until `limit_ns`, or, without an end, for leave to go
+    on.
+
+    `filtered`: the message there goes through the fault on its channel; else a fault that came later does not
+    see it.
+    """
+
+    hosted: SimBrick
+    effects: list[Effect]
+    at: int
+    end: Channel | None
+    filtered: bool
+    limit_ns: int
+
+
+class SimIO(NodeIO[Channel, Channel]):
+    """Of one node. `ends` finds a channel by the number of an end; `on_end` is called when the node dies,
+    with why.
+    """
+
+    output = Channel
+    node: SimNode
+
+    def __init__(
+        self,
+        name: str,
+        clock: Clock,
+        records: list[Record],
+        ends: Callable[[int], Channel],
+        report: Callable[[control.FromNode], None],
+        on_end: Callable[[str], None],
+        cells: Sequence[Cell],
+    ) -> None:
+        self.name, self._clock, self._records, self._ends = name, clock, records, ends
+        self._report, self._on_end, self._cells = report, on_end, cells
+        self.alive, self.frozen_ns, self._pulse_ns = True, 0, 0
+        self.ran_ns = 0  # when it last did anything
+        self.careful = False
+        self._doom: tuple[str, int] | None = None  # a brick, and before which of its effects the node dies
+        self._orders: deque[tuple[control.ToNode, tuple[int, ...]]] = deque()
+        self._held: list[_Held] = []  # the last one is gone on with first: its step came in between
+        self._awaited = 0  # the fault that has to be applied before the node goes on, or 0
+        self._slow_until_ns = 0
+        self._backlog: dict[Channel, deque[Message]] = {}  # came out of a channel fault, and waits for room
+        self._only: SimBrick | None = None  # the brick of a node that hosts one, without a device
+        self._timer_ns = NEVER
+        self._running = False
+
+    def join(self, node: SimNode) -> None:
+        """Work for `node`."""
+        self.node = node
+
+    def now_ns(self) -> int:
+        """Virtual time."""
+        return self._clock.ns
+
+    def record(self, now_ns: int, event: Event, request_id: int, detail: int, brick: int = 0) -> None:
+        """Append to the journal."""
+        self._records.append(Record(now_ns, event, request_id, detail, self.name, brick))
+
+    def report(self, report: control.FromNode) -> None:
+        """Send to the executive."""
+        self._report(report)
+
+    def memory(self, number: int) -> memoryview:
+        """That of the cell with that number."""
+        return self._cells[number].memory
+
+    # -- its life -----------------------------------------------------------------------------
+
+    def freeze(self) -> None:
+        """Stop it wherever it is; its last pulse was some time before."""
+        if not self.frozen_ns:
+            self.frozen_ns = self._clock.ns
+            self._pulse_ns = self._clock.ns - self._clock.between_ns(0, PULSE_NS)
+
+    def thaw(self) -> None:
+        """Let it go on from there."""
+        self.frozen_ns = 0
+        self.run()
+
+    def pulse_ns(self, now_ns: int) -> int:
+        """When it was last seen running."""
+        return self._pulse_ns if self.frozen_ns else now_ns
+
+    def die_before(self, brick: str, effect: int) -> None:
+        """Have the node die before that effect of `brick`, counted from 0."""
+        self._doom, self.careful = (brick, effect), True
+
+    def die(self, reason: str = "") -> None:
+        """End it; its ends of channels are the kernel's to close."""
+        if not self.alive:
+            return
+        self.alive = False
+        for hosted in self.node.bricks.values():
+            for channel in (*hosted.inputs.values(), *hosted.outputs.values()):
+                if isinstance(channel, Channel):
+                    channel.leave(self)
+        self._on_end(reason)
+
+    def order(self, order: control.ToNode, fds: tuple[int, ...]) -> None:
+        """An order has arrived."""
+        self._orders.append((order, fds))
+        self.run()
+
+    def run(self) -> None:
+        """Handle all that can be handled now."""
+        if self._running or not self.alive or self.frozen_ns:
+            return
+        self._running = True
+        self.ran_ns = self._clock.ns
+        try:
+            while self.alive and not self.frozen_ns and self._turn():
+                pass
+        except Died as death:
+            self.die(str(death))
+        except AssertionError as error:
+            self.die(f"assertion failed: {error}")
+        finally:
+            self._running = False
+        if self.alive:
+            self._set_timer()
+
+    def _turn(self) -> bool:
+        """One thing, orders first; False if there is none."""
+        if self._orders:
+            self._serve(*self._orders.popleft())
+            return True
+        if self._awaited or self._clock.ns < self._slow_until_ns or (self._held and not self._go_on()):
+            self.node.release_due(self._clock.ns)
+            return False
+        return self.node.turn()
+
+    def _serve(self, order: control.ToNode, fds: tuple[int, ...]) -> None:
+        if not isinstance(order, control.Ack):
+            self.node.obey(order, list(fds))
+        elif order.token == self._awaited:
+            self._awaited = 0
+
+    def _set_timer(self) -> None:
+        """Be woken when something is due."""
+        due = self.node.deadline_ns()
+        if due is not None and due < self._timer_ns and due > self._clock.ns:
+            self._timer_ns = due
+            self._clock.at(due, self._on_timer)
+
+    def _on_timer(self) -> None:
+        self._timer_ns = NEVER
+        self.run()
+
+    # -- reading ------------------------------------------------------------------------------
+
+    def open_input(self, hosted: SimBrick, port: str, number: int) -> Channel:
+        """The channel with that end, which has one reader more."""
+        channel = self._ends(number)
+        channel.readers.append(self)
+        return channel
+
+    def close_input(self, end: Channel) -> None:
+        """Read it no more."""
+        end.leave(self)
+
+    def rewired(self) -> None:
+        """See whether the node hosts one brick, without a device."""
+        self._only = self.node.only if self.node.device is None else None
+
+    def receive(self) -> bool:
+        """Handle the mail that came first, or the end of a channel, or what is due."""
+        only = self._only
+        if only is None:
+            return self._read_any() or self.node.wake_due(self._clock.ns)
+        return self._read(only) or (only.timed and self.node.wake_due(self._clock.ns))
+
+    def _read(self, hosted: SimBrick) -> bool:
+        """The hot path: mail at an open port of the only brick."""
+        ports = hosted.brick.open_ports()
+        if len(ports) != 1:
+            return self._read_any()
+        channel = hosted.inputs.get(ports[0])
+        if channel is None:
+            return False
+        if channel.mail:
+            if channel.mail[0][0] > self._clock.ns:
+                return False
+            self.node.step(hosted, ports[0], channel.take())
+            return True
+        if channel.ended and channel.over():
+            self._handle_end(hosted, ports[0])
+            return True
+        return False
+
+    def _read_any(self) -> bool:
+        found = self._oldest()
+        if found is not None:
+            hosted, port = found
+            self.node.step(hosted, port, hosted.inputs[port].take())
+            return True
+        for hosted in self.node.bricks.values():
+            for port in hosted.brick.open_ports():
+                channel = hosted.inputs.get(port)
+                if channel is not None and channel.over():
+                    self._handle_end(hosted, port)
+                    return True
+        return False
+
+    def _oldest(self) -> tuple[SimBrick, str] | None:
+        """The open port with the mail that came first."""
+        best_ns, best = self._clock.ns + 1, None
+        for hosted in self.node.bricks.values():
+            if not hosted.inputs:
+                continue
+            for port in hosted.brick.open_ports():
+                channel = hosted.inputs.get(port)
+                if channel is not None and channel.mail and channel.mail[0][0] < best_ns:
+                    best_ns, best = channel.mail[0][0], (hosted, port)
+        return best
+
+    def _handle_end(self, hosted: SimBrick, port: str) -> None:
+        """The channel is drained to its end."""
+        self.node.bind_input(hosted.name, port, None)
+        self.node.step(hosted, port, ChannelEnded())
+
+    def mail_waits(self) -> bool:
+        """Whether there is mail at an open port."""
+        return self._oldest() is not None
+
+    def wait_for_order(self) -> bool:
+        """An order makes the node run again."""
+        return False
+
+    # -- writing ------------------------------------------------------------------------------
+
+    def open_output(self, number: int) -> Channel:
+        """The channel with that end, which has one writer more."""
+        channel = self._ends(number)
+        channel.writers.append(self)
+        return channel
+
+    def close_output(self, end: Channel) -> None:
+        """Write to it no more."""
+        self._backlog.pop(end, None)
+        end.leave(self)
+
+    def has_room(self, end: Channel) -> bool:
+        """Whether a write can succeed now."""
+        return end not in self._backlog and end.has_room()
+
+    def write(self, hosted: SimBrick, port: str, end: Channel, message: Message, raw: bytes | None) -> bool:
+        """Send. False if there is no room now."""
+        return not (self._backlog and end in self._backlog) and end.put(message)
+
+    def write_in_turn(self, hosted: SimBrick, port: str, end: Channel, message: Message) -> None:
+        """Send, behind what waits for room."""
+        if not self.write(hosted, port, end, message, None):
+            if end not in self._backlog:
+                self._backlog[end] = deque()
+                self._clock.at(self._clock.ns + FULL_NS, lambda: self._write_backlog(end))
+            self._backlog[end].append(message)
+
+    def _write_backlog(self, end: Channel) -> None:
+        """Send what waits, as far as there is room, and look again for the rest."""
+        backlog = self._backlog.get(end)
+        if backlog is None or not self.alive:
+            return
+        while backlog and not self.frozen_ns and end.put(backlog[0]):
+            backlog.popleft()
+        if backlog:
+            self._clock.at(self._clock.ns + FULL_NS, lambda: self._write_backlog(end))
+        else:
+            del self._backlog[end]
+            self.run()
+
+    def write_or_drop(self, end: Channel, message: Message) -> None:
+        """Send if there is room."""
+        if self.has_room(end):
+            end.put(message)
+
+    # -- stopping between two effects ---------------------------------------------------------
+
+    def stops(self, hosted: SimBrick) -> bool:
+        """Whether the next effect has to wait; or the node dies here."""
+        if self._awaited or self.frozen_ns or self._clock.ns < self._slow_until_ns:
+            return True
+        self.step_done(hosted)
+        return False
+
+    def step_done(self, hosted: SimBrick) -> None:
+        """Die, if the node was to die here."""
+        if self._doom == (hosted.name, hosted.performed):
+            raise Died
+
+    def hold(
+        self, hosted: SimBrick, effects: list[Effect], at: int, end: Channel | None, *, filtered: bool
+    ) -> None:
+        """Go on from there later. A write that is held up too long ends the node."""
+        limit_ns = self._clock.ns + WRITE_NS_MAX if end is not None else NEVER
+        self._held.append(_Held(hosted, effects, at, end, filtered, limit_ns))
+        if end is not None:
+            self._clock.at(limit_ns, self.run)
+
+    def _go_on(self) -> bool:
+        """Perform what was held. True if all is done."""
+        while self._held:
+            held = self._held[-1]
+            at = held.at
+            if held.end is not None:
+                if not self._write_held(held, held.end):
+                    if self._clock.ns >= held.limit_ns:
+                        raise Died("fenced")
+                    return False
+                at += 1
+                held.hosted.performed += 1
+            self._held.pop()
+            before = len(self._held)
+            self.node.perform_from(held.hosted, held.effects, at)
+            if len(self._held) > before:
+                return False
+        return True
+
+    def _write_held(self, held: _Held, end: Channel) -> bool:
+        """Send what waited for room. What is bound elsewhere is not sent: the brick was told, and has asked
+        again.
+        """
+        effect = held.effects[held.at]
+        assert isinstance(effect, Send)
+        if held.hosted.outputs[effect.port] is not end:
+            return True
+        if held.filtered:
+            return self.node.send(held.hosted, effect.port, effect.message)
+        return self.write(held.hosted, effect.port, end, effect.message, None)
+
+    # -- faults and ends ----------------------------------------------------------------------
+
+    def kill(self) -> None:
+        """Die, here and now."""
+        raise Died
+
+    def stop_detected(self, brick: str, reason: str) -> NoReturn:
+        """Die, here and now, with a reason."""
+        raise Died(f"{brick}: detected stop: {reason}")
+
+    def wait_until_applied(self, fault: int) -> None:
+        """Hold the effects that are left until the executive has acknowledged `fault`."""
+        self._awaited = fault
+
+    def delay(self, by_ns: int) -> None:
+        """Hold the effects of this step for that long."""
+        if by_ns:
+            self._slow_until_ns = max(self._slow_until_ns, self._clock.ns) + by_ns
+            self._clock.at(self._slow_until_ns, self.run)
+
+    def begin_throttle(self) -> None:
+        """Every step takes the same of a CPU."""
+
+    def throttle(self, stretch_ns: Callable[[int], int]) -> None:
+        """Hold the effects of this step for as long as its share of a CPU makes it longer."""
+        self.delay(stretch_ns(STEP_NS))

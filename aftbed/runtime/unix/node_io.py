@@ -1,0 +1,484 @@
+"""The NodeIO of a node that is a process: sockets, the journal, the kernel's clock. This is the hot path.
+
+Blocking, never spinning. A node whose bricks have one open port, which is the rule on the request path,
+blocks in a plain read of that port: a poll before each read costs 1.4 us a hop (measured, 20 % of a hop). So
+the control socket is not polled there; the supervisor raises a flag in the header of the node's journal and
+puts a *nudge*, a packet of one byte, into the node's inputs. A node looks at the flag after each wake-up,
+before it looks at the mail: control is served before data. It is also served where the node cannot go on:
+while it is suspended, while a channel has no room, while a fault is being applied.
+
+Two loops. `Node.turn` is the general one. `serve_fast` is the same for a node that hosts one brick without
+deadlines and has nothing to poll, with all look-ups in front of the loop. It is left whenever something else
+than mail on the one open port is to be done: an order, the end of a channel, a large packet, a suspend, or a
+fault (`FaultAgent.active`). tests/runtime/test_node_loops.py drives both with the same mail and compares.
+
+The pulse is an interval timer's signal: its handler writes the time into the journal's header, but only if it
+interrupted the host and not a brick, or if the journal has grown since. So a brick that loops for ever stops
+the pulse. (A receive timeout on the sockets would do too; it costs 0.3 us a hop.)
+
+What is read from a channel is handled before anything else is read, so mail is either in the kernel, where it
+outlives this process, or inside a request that the client will ask again.
+
+A slow node waits in the host and not in a brick, so its pulse goes on: it is not taken for a hung one. With a
+share of a CPU, it waits between a step and its effects for as long as the CPU time that it used would have
+taken longer: with 25 %, three times that. What it sleeps too long is waited less the next time, so the share
+is exact in the long run, and nothing outside of the node has to be undone.
+"""
+
+import contextlib
+import os
+import select
+import signal
+import sys
+import time
+import traceback
+from collections.abc import Callable
+from types import FrameType
+from typing import Final, NoReturn
+
+from aftbed.core import messages
+from aftbed.core.brick import Note, Send
+from aftbed.core.errors import PeerError
+from aftbed.core.events import Event
+from aftbed.core.fault import SLOW_MS_MAX
+from aftbed.core.journal import FLAG_OFFSET, PULSE_OFFSET, RECORD
+from aftbed.core.messages import ChannelEnded, Message
+from aftbed.runtime import control
+from aftbed.runtime import node as node_module
+from aftbed.runtime.node import HostedBrick, Node, NodeIO
+from aftbed.runtime.unix import cells, packets
+from aftbed.runtime.unix.journal import Journal
+from aftbed.runtime.unix.lifeline import Held
+from aftbed.runtime.unix.line import Line
+from aftbed.runtime.unix.packets import READ_BYTES_MAX
+
+PULSE_SECONDS: Final = 0.02
+WRITE_SECONDS_MAX: Final = 2.0  # a node that cannot write for so long takes itself for fenced
+APPLY_NS_MAX: Final = 5_000_000_000  # the executive has so long to apply a fault
+PAUSE_NS_MAX: Final = round(SLOW_MS_MAX * 1e6)  # of one step; the rest is waited behind the next one
+CREDIT_NS_MAX: Final = 1_000_000  # of a sleep that was too long: more is the machine's doing
+NUDGE: Final = b"\0"
+WAITING_FILES: Final = (  # a node that is interrupted in one of these is in no brick
+    __file__,
+    node_module.__file__,
+    Line.recv.__code__.co_filename,
+    packets.__file__,
+)
+EXIT_FENCED: Final = 3
+EXIT_ASSERT: Final = 70
+EXIT_DETECTED: Final = 71  # a detected stop
+
+_now, _read, _write = time.monotonic_ns, os.read, os.write
+_encode, _decode = messages.encode_unchecked, messages.decode_unchecked
+_put, _LARGE = packets.put, messages.PACKET_BYTES_MAX
+_pack = RECORD.pack_into
+RECORD_BYTES: Final = RECORD.size
+
+
+class Inlet:
+    """The reading end of a channel."""
+
+    __slots__ = ("fd", "hosted", "port")
+
+    def __init__(self, hosted: "UnixBrick", port: str, fd: int) -> None:
+        self.hosted, self.port, self.fd = hosted, port, fd
+
+
+UnixBrick = HostedBrick[Inlet, int]
+UnixNode = Node[Inlet, int]
+
+
+class PollSet:
+    """What to wait for while the same ports are open: a single inlet, or a poll."""
+
+    __slots__ = ("by_fd", "poll", "single")
+
+    def __init__(self, inlets: list[Inlet], others: tuple[int, ...], may_block: bool) -> None:
+        self.single = inlets[0] if may_block and len(inlets) == 1 else None
+        self.by_fd = {inlet.fd: inlet for inlet in inlets}
+        self.poll = select.poll()
+        for fd in (*self.by_fd, *others):
+            self.poll.register(fd, select.POLLIN)
+
+
+class UnixIO(NodeIO[Inlet, int]):
+    """Of one process of the graph. `serve` never returns."""
+
+    output = int
+    careful = False
+
+    def __init__(self, line: Line[control.ToNode], journal: Journal) -> None:
+        self.line, self.journal = line, journal
+        self.lifeline: Held | None = None  # kept, not used: the kernel reads it when this process dies
+        self._pulse_at = 0  # where the journal was at the last pulse
+        self._announced: Inlet | None = None  # the next packet there is a large one
+        self._used_ns = self._owed_ns = 0  # CPU time at the last throttle; what is left to wait
+        self._fast: UnixBrick | None = None  # served by the fast loop
+        self._fronts: list[UnixBrick] = []  # bricks with inlets
+        self._polls: dict[tuple[tuple[str, ...], ...], PollSet] = {}  # by open ports
+        self._inlets: dict[tuple[str, ...], Inlet] = {}  # of a node with one brick, by its open ports
+
+    def join(self, node: UnixNode) -> None:
+        """Work for `node`."""
+        self._node = node
+
+    def now_ns(self) -> int:
+        """The kernel's monotonic clock."""
+        return _now()
+
+    def record(self, now_ns: int, event: Event, request_id: int, detail: int, brick: int = 0) -> None:
+        """Append to the journal."""
+        self.journal.write(now_ns, event, request_id, detail, brick)
+
+    def report(self, report: control.FromNode) -> None:
+        """Send to the supervisor."""
+        self.line.send(report)
+
+    def memory(self, number: int) -> memoryview:
+        """The memory behind that descriptor, which is closed."""
+        return cells.mapped(number)
+
+    # -- the pulse ----------------------------------------------------------------------------
+
+    def start_pulse(self) -> None:
+        """From now on, show that the host runs. A blocked read goes on after the signal (PEP 475)."""
+        signal.signal(signal.SIGALRM, self._on_timer)
+        signal.setitimer(signal.ITIMER_REAL, PULSE_SECONDS, PULSE_SECONDS)
+        self._pulse(_now())
+
+    def _on_timer(self, signum: int, frame: FrameType | None) -> None:
+        at = self.journal.at
+        if at != self._pulse_at or (frame is not None and frame.f_code.co_filename in WAITING_FILES):
+            self._pulse_at = at
+            self._pulse(_now())
+
+    def _pulse(self, now_ns: int) -> None:
+        self.journal.mapping[PULSE_OFFSET : PULSE_OFFSET + 8] = now_ns.to_bytes(8, "little")
+
+    # -- the loop -----------------------------------------------------------------------------
+
+    def serve(self) -> NoReturn:
+        """Serve until the supervisor ends it; a failed assert ends the process (fail-silence)."""
+        try:
+            while True:
+                self.serve_turns()
+        except BrokenPipeError:
+            os._exit(EXIT_FENCED)
+        except BaseException:  # noqa: BLE001 - the last frame of this process: nothing may leak out of it
+            print(f"{self._node.name} (pid {os.getpid()}):", file=sys.stderr)
+            traceback.print_exc()
+            sys.stderr.flush()
+            os._exit(EXIT_ASSERT)
+
+    def serve_turns(self) -> None:
+        """Handle one thing, then, where the fast loop may serve this node, mail for as long as there is
+        nothing else.
+        """
+        self.turn()
+        if self._fast is not None and self._announced is None:
+            self.serve_fast(self._fast)
+
+    def turn(self) -> None:
+        """Handle one thing, or wait for one, on the general path."""
+        if self._announced is not None:
+            self._take_announced(self._announced)
+        else:
+            self._node.turn()
+
+    def serve_fast(self, hosted: UnixBrick) -> None:
+        """The same as `turn`, with all at hand, for a node that hosts one brick and polls nothing.
+
+        Returns for whatever is not mail on the one open port: `turn` handles it.
+        """
+        node, agent, device, inlets, outputs = (
+            self._node,
+            self._node.agent,
+            self._node.device,
+            self._inlets,
+            hosted.outputs,
+        )
+        step, open_ports, journal = hosted.brick.step, hosted.brick.open_ports, self.journal
+        mapping = journal.mapping
+        while not (node.suspend_token or node.suspended or agent.active):
+            inlet = inlets.get(open_ports())
+            if inlet is None or (device is not None and node.step_device(device)):
+                return
+            raw = _read(inlet.fd, READ_BYTES_MAX)
+            at = journal.at
+            if not 2 <= len(raw) < READ_BYTES_MAX or mapping[FLAG_OFFSET] or at > journal.end:
+                self._handle_packet(inlet, raw)
+                return
+            try:
+                message = _decode(raw)
+                now_ns = _now()
+                effects = step(inlet.port, message, now_ns)
+            except PeerError:
+                self._refuse(getattr(message, "request_id", 0))
+                continue
+            except messages.UNREADABLE:
+                self._refuse()
+                continue
+            for effect in effects:
+                if type(effect) is Send:
+                    out = outputs[effect.port]
+                    if type(out) is not int:
+                        out(effect.message)  # type: ignore[operator]
+                        continue
+                    data = raw if effect.message is message else _encode(effect.message)
+                    try:
+                        (_write if len(data) <= _LARGE else _put)(out, data)
+                    except OSError:
+                        journal.at = at  # orders that are served meanwhile may write records
+                        self._write_hard(hosted, effect.port, out, data)
+                        at = journal.at
+                elif type(effect) is Note:
+                    _pack(mapping, at, now_ns, effect.request_id, effect.detail, 0, effect.event.code)
+                    at += RECORD_BYTES
+                else:
+                    journal.at = at
+                    node.order_or_halt(hosted, effect)
+            journal.at = at
+
+    # -- reading ------------------------------------------------------------------------------
+
+    def open_input(self, hosted: UnixBrick, port: str, number: int) -> Inlet:
+        """The reading end."""
+        return Inlet(hosted, port, number)
+
+    def close_input(self, end: Inlet) -> None:
+        """Close it."""
+        os.close(end.fd)
+
+    def rewired(self) -> None:
+        """Make poll sets anew, and see whether the fast loop may serve this node."""
+        node, device = self._node, self._node.device
+        self._fronts = [hosted for hosted in node.bricks.values() if hosted.inputs]
+        self._polls.clear()
+        self._inlets.clear()
+        polled = node.timed or (device is not None and device.polled)
+        self._fast = None if polled else node.only
+
+    def _poll_set(self, others: tuple[int, ...], *, may_block: bool) -> PollSet:
+        """What to wait for now; `others` are descriptors beside the inlets.
+
+        `may_block`: these are the same every time, and nothing is due at a time.
+        """
+        key = tuple([hosted.brick.open_ports() for hosted in self._fronts])
+        found = self._polls.get(key) if may_block else None
+        if found is not None:
+            return found
+        inlets = [
+            hosted.inputs[port]
+            for hosted, ports in zip(self._fronts, key, strict=True)
+            for port in ports
+            if port in hosted.inputs
+        ]
+        found = PollSet(inlets, others, may_block)
+        if may_block:
+            self._polls[key] = found
+            if found.single is not None and len(key) == 1:
+                self._inlets[key[0]] = found.single
+        return found
+
+    def mail_waits(self) -> bool:
+        """Whether there is mail at an open port."""
+        return bool(self._poll_set((), may_block=False).poll.poll(0))
+
+    def receive(self) -> bool:
+        """Handle one packet of an open port, or what the device has to read, or what is due; wait for it."""
+        node, device = self._node, self._node.device
+        fds = device.fds() if device is not None else ()
+        may_block = not (node.timed or fds or node.agent.filters) and (
+            device is None or device.deadline_ns() is None
+        )
+        found = self._poll_set((self.line.fileno(), *fds), may_block=may_block)
+        if found.single is not None:
+            self._handle_packet(found.single, _read(found.single.fd, READ_BYTES_MAX))
+        else:
+            self._poll(found)
+        return True
+
+    def _poll(self, found: PollSet) -> None:
+        """Wait for several things; orders go first."""
+        node = self._node
+        ready = found.poll.poll(self._patience_ms())
+        now_ns = _now()
+        fds = [fd for fd, _ in ready]
+        if self.journal.mapping[FLAG_OFFSET] or self.line.fileno() in fds:
+            self.serve_orders()
+            return  # what is open may be another set now
+        for fd in fds:
+            inlet = found.by_fd.get(fd)
+            if inlet is not None:
+                self._handle_packet(inlet, _read(inlet.fd, READ_BYTES_MAX))
+                return  # one step may close the other ports
+            if node.device is not None:
+                node.device.ready(fd, now_ns)
+        node.wake_due(now_ns)
+
+    def _patience_ms(self) -> float:
+        """How long to wait at most."""
+        due, limit = self._node.deadline_ns(), PULSE_SECONDS * 1e3
+        return limit if due is None else min(limit, max(0.0, (due - _now()) / 1e6 + 0.999))
+
+    def _handle_packet(self, inlet: Inlet, raw: bytes) -> None:
+        """Orders first."""
+        if self.journal.mapping[FLAG_OFFSET]:
+            self.serve_orders()
+        if raw == b"":
+            self._handle_end(inlet)
+        elif raw == packets.ANNOUNCED:
+            self._announced = inlet
+        elif raw != NUDGE:
+            try:
+                message = _decode(raw)
+            except messages.UNREADABLE:
+                self._refuse()
+                return
+            self._node.step(inlet.hosted, inlet.port, message, raw)
+
+    def _take_announced(self, inlet: Inlet) -> None:
+        """Read the large packet that is next, or what has come in between."""
+        try:
+            raw = packets.take(inlet.fd)
+        except PeerError:
+            self._announced = None
+            self._refuse()
+            return
+        if raw != NUDGE:
+            self._announced = None
+        self._handle_packet(inlet, raw)
+        if self._announced is not None and inlet.hosted.inputs.get(inlet.port) is not inlet:
+            self._announced = None  # the order that has just been served has taken the channel away
+
+    def _handle_end(self, inlet: Inlet) -> None:
+        """The channel is drained to its end: nothing more will come from it."""
+        if inlet.hosted.inputs.get(inlet.port) is inlet:
+            self._node.bind_input(inlet.hosted.name, inlet.port, None)
+            self._node.step(inlet.hosted, inlet.port, ChannelEnded())
+
+    def _refuse(self, request_id: int = 0) -> None:
+        """A message that the brick does not take, or a packet that is no message."""
+        self.record(_now(), Event.PEER_REFUSED, request_id, 0)
+
+    # -- writing ------------------------------------------------------------------------------
+
+    def open_output(self, number: int) -> int:
+        """The descriptor itself."""
+        return number
+
+    def close_output(self, end: int) -> None:
+        """Close it."""
+        os.close(end)
+
+    def write(self, hosted: UnixBrick, port: str, end: int, message: Message, raw: bytes | None) -> bool:
+        """Send `message`, and wait for room. Raises BrokenPipeError: see `_write_hard`."""
+        data = _encode(message) if raw is None else raw
+        try:
+            (_write if len(data) <= _LARGE else _put)(end, data)
+        except OSError:
+            self._write_hard(hosted, port, end, data)
+        return True
+
+    def write_or_drop(self, end: int, message: Message) -> None:
+        """Send `message` if there is room and a reader: the brick asks again for what it wants."""
+        with contextlib.suppress(OSError):
+            _put(end, _encode(message))
+
+    def _write_hard(self, hosted: UnixBrick, port: str, end: int, data: bytes) -> None:
+        """The channel is full or shut: serve orders meanwhile, since one may be about this channel.
+
+        Where the port is bound elsewhere meanwhile the data is not sent: the brick was told, and has asked
+        again for what it wants. A fault that is armed at the channel meanwhile strikes what is sent later.
+        Raises BrokenPipeError where this node is fenced, or nothing reads the channel for
+        `WRITE_SECONDS_MAX`.
+        """
+        limit = _now() + int(WRITE_SECONDS_MAX * 1e9)
+        while _now() < limit:
+            if hosted.outputs[port] is not end:
+                return
+            try:
+                _put(end, data)
+            except BlockingIOError:
+                self.serve_orders()
+            except BrokenPipeError:
+                if not self.serve_orders(wait=True):
+                    continue
+            else:
+                return
+        raise BrokenPipeError(f"{hosted.name}: {port} is shut or nobody reads it")
+
+    # -- orders -------------------------------------------------------------------------------
+
+    def wait_for_order(self) -> bool:
+        """Suspended: wait for an order, for a pulse at most."""
+        self.serve_orders(wait=True)
+        return True
+
+    def serve_orders(self, wait: bool = False, until: int = 0) -> bool:
+        """Carry out the orders that have come; with `wait`, wait for one, for a pulse at most. True if there
+        was any.
+
+        With `until`: True if the Ack of that fault was among them.
+        """
+        self.journal.mapping[FLAG_OFFSET] = 0
+        served = False
+        while True:
+            try:
+                got = self._next_order(wait and not served)
+            except BlockingIOError:
+                return served
+            if got is None:
+                os._exit(0)  # the supervisor is gone, and this run with it
+            order, fds = got
+            if isinstance(order, control.Ack):
+                served = served or order.token == until
+                continue
+            self._node.obey(order, fds)
+            served = served or not until
+
+    def _next_order(self, wait: bool) -> tuple[control.ToNode, list[int]] | None:
+        line = self.line
+        if wait:
+            return line.recv()
+        line.sock.setblocking(False)
+        try:
+            return line.recv()
+        finally:
+            line.sock.setblocking(True)
+
+    # -- faults and ends ----------------------------------------------------------------------
+
+    def kill(self) -> None:
+        """Die of SIGKILL."""
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    def stop_detected(self, brick: str, reason: str) -> NoReturn:
+        """Exit, with the reason on stderr."""
+        print(f"{brick} (pid {os.getpid()}): detected stop: {reason}", file=sys.stderr, flush=True)
+        os._exit(EXIT_DETECTED)
+
+    def wait_until_applied(self, fault: int) -> None:
+        """Serve orders until the supervisor has acknowledged `fault`."""
+        limit_ns = _now() + APPLY_NS_MAX
+        while _now() < limit_ns:
+            if self.serve_orders(wait=True, until=fault):
+                return
+        raise AssertionError(f"fault {fault} was not applied within {APPLY_NS_MAX / 1e9} s")
+
+    def delay(self, by_ns: int) -> None:
+        """Sleep."""
+        time.sleep(by_ns / 1e9)
+
+    def begin_throttle(self) -> None:
+        """CPU time counts from now on."""
+        self._used_ns, self._owed_ns = time.thread_time_ns(), 0
+
+    def throttle(self, stretch_ns: Callable[[int], int]) -> None:
+        """Sleep for `stretch_ns` of the CPU time that was used since the last call."""
+        before_ns, self._used_ns = self._used_ns, time.thread_time_ns()
+        self._owed_ns += stretch_ns(self._used_ns - before_ns)
+        if self._owed_ns > 0:
+            began_ns = _now()
+            time.sleep(min(self._owed_ns, PAUSE_NS_MAX) / 1e9)
+            self._owed_ns = max(self._owed_ns - (_now() - began_ns), -CREDIT_NS_MAX)

@@ -1,0 +1,222 @@
+"""The fast loop of a node that is a process does what the general one does: same mail, same effects, same
+records.
+
+Both loops read from real sockets. The brick answers, passes on, notes, and refuses; mail that is no message,
+nudges, large packets and orders come in between. An order is laid into the control line by the step before
+it, so that it comes at the same place in both.
+"""
+
+import os
+import socket
+from collections.abc import Callable
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Final
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from aftbed.core import messages
+from aftbed.core.brick import Brick, Effect, Note, Order, Send
+from aftbed.core.errors import PeerError
+from aftbed.core.events import Event
+from aftbed.core.fault import Disturb, How
+from aftbed.core.journal import FLAG_OFFSET, records
+from aftbed.core.messages import AnyMessage, Rebound, Reply, Request
+from aftbed.core.script import Script
+from aftbed.core.valuefault import Bit, Flip, Place
+from aftbed.runtime import control
+from aftbed.runtime.node import Node
+from aftbed.runtime.unix import packets
+from aftbed.runtime.unix.journal import Journal
+from aftbed.runtime.unix.line import Line, decode_order, decode_report
+from aftbed.runtime.unix.node_io import NUDGE, UnixIO, UnixNode
+
+FLIP: Final = control.Blow(7, "brick", 1, Flip(Place.RESULT, Bit(0)), False)
+OMISSION: Final = control.Blow(8, "brick", 1, Disturb(How.OMISSION, "out"), False)
+KINDS: Final = ("answer", "pass on", "note", "order", "refuse", "nothing")
+ORDERS: Final[dict[str, tuple[control.ToNode, ...]]] = {
+    "capture": (control.Capture(1, "brick"),),
+    "suspend": (control.Suspend(2), control.Resume(3)),
+    "flip": (control.Arm(4, Event.SERVER_EXIT.label, (FLIP,)),),
+    "omit": (control.Interfere(5, OMISSION),),
+}
+LAST: Final = messages.encode(Request(1, 0, b"last"))
+
+Loop = Callable[[UnixIO], None]
+
+
+class Done(BaseException):
+    """The last message has been read."""
+
+
+class Scripted(Brick):
+    """Does what the payload of a request says. It has two inputs, of which one is open at a time, in turn."""
+
+    def __init__(self, give: Callable[[str], None]) -> None:
+        self._give, self.seen = give, list[str]()
+
+    def open_ports(self) -> tuple[str, ...]:
+        return ("in", "other")[len(self.seen) % 2 :][:1]
+
+    def quiescent(self) -> bool:
+        return True
+
+    def step(self, port: str, msg: AnyMessage, now_ns: int) -> list[Effect]:
+        if isinstance(msg, Rebound):
+            return []
+        what = msg.payload.rstrip(b"\0").decode() if isinstance(msg, Request) else "ended"
+        if what == "refuse":
+            raise PeerError("not now")
+        if what == "last":
+            raise Done
+        self.seen.append(f"{port} {what}")
+        if what in ORDERS:
+            self._give(what)
+        number = len(self.seen)
+        match what:
+            case "answer":
+                return [Note(Event.SERVER_EXIT, number, 5), Send("out", Reply(1, number, 1, b"ab"))]
+            case "pass on":
+                assert isinstance(msg, Request)
+                return [Send("out", msg), Note(Event.REPLY_STORED, number), Send("inside", msg)]
+            case "note":
+                notes = [Note(Event.SERVER_ENTER, number), Note(Event.SERVER_EXIT, number)]
+                return [*notes, Send("out", Reply(1, number, 1, b"c"))]
+            case "order":
+                return [Order(Script("nothing", "", (), ()))]
+            case _:
+                return []
+
+    def capture(self) -> bytes:
+        return repr(self.seen).encode()
+
+
+class Harness:
+    """A node with such a brick, all its ends, and what came out of it."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._inside = path, list[AnyMessage]()
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._line = Line(ours, decode_report)
+        self._journal = Journal(path, "node")
+        self.io = UnixIO(Line(theirs, decode_order), self._journal)
+        self.node: UnixNode = Node("node", self.io)
+        self.brick = Scripted(self._order)
+        hosted = self.node.add("brick", self.brick)
+        hosted.outputs["inside"] = self._inside.append  # type: ignore[assignment]
+        self._ends = [ours, theirs]
+        self._writers = {port: self._input(port) for port in ("in", "other")}
+        write, self._out = self._pair()
+        self.node.bind_output("brick", "out", os.dup(write.fileno()), 1)
+        self._out.setblocking(False)
+        ours.setblocking(False)
+
+    def _pair(self) -> tuple[socket.socket, socket.socket]:
+        pair = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._ends += pair
+        return pair
+
+    def _input(self, port: str) -> socket.socket:
+        write, read = self._pair()
+        self.node.bind_input("brick", port, os.dup(read.fileno()))
+        return write
+
+    def _order(self, name: str) -> None:
+        for order in ORDERS[name]:
+            self._line.send(order)
+        self._journal.mapping[FLAG_OFFSET] = 1
+
+    def run(self, mail: list[bytes], loop: Loop) -> tuple[object, ...]:
+        """What came of `mail`: what was sent, noted, reported, and what the brick saw."""
+        for writer in self._writers.values():
+            for packet in (*mail, LAST):
+                packets.put(writer.fileno(), packet)
+        with pytest.raises(Done):
+            while True:
+                loop(self.io)
+        noted = [(r.event, r.request_id, r.detail, r.brick) for r in records(self._path.read_bytes())]
+        return self._sent(), self._inside, noted, self._reported(), self.brick.seen
+
+    def _sent(self) -> list[bytes]:
+        found = []
+        while True:
+            try:
+                found.append(self._out.recv(messages.PACKET_BYTES_MAX))
+            except BlockingIOError:
+                return found
+
+    def _reported(self) -> list[control.FromNode]:
+        found = []
+        while True:
+            try:
+                got = self._line.recv()
+            except BlockingIOError:
+                return found
+            assert got is not None
+            found.append(got[0])
+
+    def close(self) -> None:
+        for port in self._writers:
+            self.node.bind_input("brick", port, None)
+        self.node.bind_output("brick", "out", None, 1)
+        for end in self._ends:
+            end.close()
+
+
+def outcome(mail: list[str], loop: Loop) -> tuple[object, ...]:
+    with TemporaryDirectory() as directory:
+        harness = Harness(Path(directory) / "journal")
+        try:
+            return harness.run([packet(what) for what in mail], loop)
+        finally:
+            harness.close()
+
+
+PACKETS: Final = (*KINDS, *ORDERS, "nudge", "no message", "unasked", "large")
+
+
+def packet(what: str) -> bytes:
+    match what:
+        case "nudge":
+            return NUDGE
+        case "no message":
+            return b"\xc0nothing"
+        case "unasked":
+            return messages.encode(Reply(1, 1, 1, b"unasked"))
+        case "large":
+            return messages.encode_unchecked(Request(1, 1, b"answer".ljust(messages.PACKET_BYTES_MAX, b"\0")))
+        case _:
+            return messages.encode(Request(1, 1, what.encode()))
+
+
+@given(st.lists(st.sampled_from(PACKETS), max_size=12).filter(lambda mail: mail.count("large") < 2))
+def test_both_loops_do_the_same(mail: list[str]) -> None:
+    assert outcome(mail, UnixIO.serve_turns) == outcome(mail, UnixIO.turn)
+
+
+def test_the_fast_loop_is_the_one_that_is_tested() -> None:
+    """Mail that needs nothing else is handled by one call; the general loop handles one packet a call."""
+    mail = ["answer", "pass on", "note"] * 3
+    calls = {"fast": 0, "general": 0}
+
+    def fast(io: UnixIO) -> None:
+        calls["fast"] += 1
+        io.serve_turns()
+
+    def general(io: UnixIO) -> None:
+        calls["general"] += 1
+        io.turn()
+
+    assert outcome(mail, fast) == outcome(mail, general)
+    assert calls["fast"] == 2, "the general loop finds out about either set of open ports"
+    assert calls["general"] > len(mail)
+
+
+def test_a_fault_that_is_armed_leaves_the_fast_loop_until_it_has_struck() -> None:
+    sent, _, noted, *_ = outcome(["flip", "answer", "answer"], UnixIO.serve_turns)
+    assert isinstance(sent, list) and isinstance(noted, list)
+    replies = [messages.decode(packet) for packet in sent]
+    assert [r.payload for r in replies if isinstance(r, Reply)][:2] == [b"`b", b"ab"]
+    assert [event for event, *_ in noted].count(Event.FAULT_APPLIED) == 1, "given twice, it began anew"
