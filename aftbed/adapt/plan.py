@@ -47,8 +47,8 @@ from aftbed.core.script import (
     Unbind,
 )
 from aftbed.ftm.compose import NONE, STATEFUL, build, chain, parse, replication_of
+from aftbed.ftm.registry import REPLY_CHECKERS
 
-JUDGES: Final = ("assert.after",)  # kinds that ask the function whether a reply can be right
 APPLICATION: Final = "app"  # what `adapt update` calls the protected function
 
 
@@ -122,7 +122,7 @@ def _servers(graph: Graph) -> list[BrickSpec]:
 
 def _with_function(graph: Graph, application: str) -> Graph:
     """`graph` with another function, for those that call it and for those that judge what it says."""
-    concerned = [b for b in graph.bricks if b.part == "server" or b.kind in JUDGES]
+    concerned = [b for b in graph.bricks if b.part == "server" or b.kind in REPLY_CHECKERS]
     return _with(graph, {b.name: msgspec.structs.replace(b, application=application) for b in concerned})
 
 

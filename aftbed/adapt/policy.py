@@ -30,7 +30,8 @@ import msgspec
 from msgspec import Meta
 
 from aftbed.core.errors import ConfigError, unknown
-from aftbed.ftm.compose import DUPLEX, EXPRESSIONS, MECHANISMS, NONE, SIMPLEX, parse
+from aftbed.ftm.compose import DUPLEX, EXPRESSIONS, NONE, SIMPLEX, parse
+from aftbed.ftm.registry import MECHANISMS
 
 # What is observed of a run; `observer.symptoms` says by which events.
 Symptom = Literal["crash", "hang", "value_fault", "divergence", "detected_stop"]

@@ -23,21 +23,21 @@ have it: after a failover the survivor stays alone. That is no reason to refuse 
 
 from collections import Counter
 from collections.abc import Iterable
-from typing import Annotated, Final, Literal
+from typing import Annotated, Final
 
 import msgspec
 from msgspec import Meta
 
 from aftbed.core.application import Characteristics
 from aftbed.core.errors import ConfigError, unknown
-from aftbed.ftm.compose import DUPLEX, EXPRESSIONS, MECHANISMS, parse
+from aftbed.ftm.compose import DUPLEX, EXPRESSIONS, parse
+from aftbed.ftm.declaration import FaultClass, Level, Suitability
+from aftbed.ftm.registry import MECHANISMS
 
-Fault = Literal["crash", "value", "implausible"]
-Level = Literal["none", "low", "high"]
 Part = Annotated[float, Meta(ge=0, le=1)]
 Rate = Annotated[float, Meta(ge=0, le=1e9)]
 
-FAULTS: Final[dict[Fault, str]] = {
+FAULTS: Final[dict[FaultClass, str]] = {
     "crash": "crashes",
     "value": "value faults",
     "implausible": "implausible value faults",
@@ -53,9 +53,9 @@ class FaultModel(msgspec.Struct, frozen=True):
     value: bool = False
     implausible: bool = False
 
-    def asked(self) -> tuple[Fault, ...]:
+    def asked(self) -> tuple[FaultClass, ...]:
         """Their names."""
-        given: dict[Fault, bool] = {
+        given: dict[FaultClass, bool] = {
             "crash": self.crash,
             "value": self.value,
             "implausible": self.implausible,
@@ -77,17 +77,10 @@ class Resources(msgspec.Struct, frozen=True):
 AMPLE: Final = Resources(cpus=1024)  # where R is not at stake
 
 
-class Row(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What one mechanism tolerates and needs. `deterministic`, `state_access`: why; empty: not needed."""
+class Row(Suitability, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What one mechanism tolerates and needs."""
 
     mechanism: str
-    tolerates: tuple[Fault, ...] = ()
-    detects: tuple[Fault, ...] = ()
-    deterministic: str = ""
-    state_access: str = ""
-    cpus: Annotated[int, Meta(ge=1, le=1024)] = 1
-    cpu_load: Level = "low"
-    bandwidth: Level = "none"
 
 
 class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -124,8 +117,8 @@ class Demand(msgspec.Struct, frozen=True):
     """
 
     ftm: str
-    tolerates: tuple[Fault, ...]
-    detects: tuple[Fault, ...]
+    tolerates: tuple[FaultClass, ...]
+    detects: tuple[FaultClass, ...]
     deterministic: tuple[str, ...]
     state_access: tuple[str, ...]
     cpus: int
@@ -133,33 +126,8 @@ class Demand(msgspec.Struct, frozen=True):
     bandwidth: Level
 
 
-ROWS: Final = (  # reconstructed: see the top
-    Row(
-        "pbr",
-        tolerates=("crash",),
-        state_access="each checkpoint carries the whole state to the backup",
-        cpus=2,
-        cpu_load="low",
-        bandwidth="high",
-    ),
-    Row(
-        "lfr",
-        tolerates=("crash",),
-        deterministic="two replicas execute every request",
-        cpus=2,
-        cpu_load="high",
-        bandwidth="low",
-    ),
-    Row(
-        "tr",
-        tolerates=("value", "implausible"),
-        deterministic="executions of one request are compared",
-        state_access="every execution starts from the same state",
-        cpus=1,
-        cpu_load="high",
-        bandwidth="none",
-    ),
-    Row("assert", detects=("implausible",), cpus=1, cpu_load="low", bandwidth="none"),
+ROWS: Final = tuple(
+    Row(mechanism=one.name, **msgspec.structs.asdict(one.suitability)) for one in MECHANISMS.values()
 )
 TABLE: Final = Table({row.mechanism: row for row in ROWS})
 
@@ -272,7 +240,7 @@ def unsuitable(expression: str, characteristics: Characteristics) -> str:
     return refusal(expression, FaultModel(crash=_replicates(parse(expression))), characteristics, AMPLE)
 
 
-def _united(faults: Iterable[tuple[Fault, ...]]) -> tuple[Fault, ...]:
+def _united(faults: Iterable[tuple[FaultClass, ...]]) -> tuple[FaultClass, ...]:
     """All of them once, in the order of FAULTS."""
     found = {fault for some in faults for fault in some}
     return tuple(fault for fault in FAULTS if fault in found)
@@ -288,7 +256,7 @@ def _cost(expression: str, table: Table) -> tuple[int, int, int]:
     return demand(expression, table).cpus, cpu_load, sum(LEVELS.index(row.bandwidth) for row in rows)
 
 
-def _not_tolerated(wanted: Demand, fault: Fault) -> str:
+def _not_tolerated(wanted: Demand, fault: FaultClass) -> str:
     if fault in wanted.detects:
         return (
             f"{wanted.ftm} detects {FAULTS[fault]} and can only stop:"

@@ -10,18 +10,12 @@ from aftbed.bench.statistics import summary
 from aftbed.campaign.statistics import quantile
 from aftbed.core.graph import Graph
 from aftbed.ftm.compose import NONE, build, chain
+from aftbed.ftm.registry import BRICKS
 from aftbed.runtime.unix.options import LoadRun
 from aftbed.vehicle.aeb.function import sample_requests
 
 ROUNDS: Final = 5
 WARM_UP: Final = 200
-
-_ASKS_SERVER: Final = {  # how often a kind of brick asks the Server and waits, for one request
-    "compute.proceed": 1,
-    "tr.before": 1,
-    "tr.proceed": 2,
-    "pbr.after": 1,
-}
 
 
 def path(graph: Graph) -> list[str]:
@@ -30,7 +24,7 @@ def path(graph: Graph) -> list[str]:
         return ["client", "proxy", "a/server", "proxy", "client"]
     found = ["client", "proxy"]
     for name in chain(graph, "a")[:-1]:
-        found += [name, *["a/server", name] * _ASKS_SERVER.get(graph.brick(name).kind, 0)]
+        found += [name, *["a/server", name] * BRICKS[graph.brick(name).kind].asks_server]
         if name.endswith("after"):
             found.append(f"{name.removesuffix('after')}protocol")
     return [*found, "proxy", "client"]

@@ -41,6 +41,7 @@ from aftbed.core.errors import HarnessError
 from aftbed.core.events import Event
 from aftbed.core.graph import Graph
 from aftbed.ftm.compose import build
+from aftbed.ftm.registry import BRICKS
 from aftbed.judge.record import RunRecord
 from aftbed.runtime.unix.options import LoadRun
 
@@ -49,24 +50,6 @@ STEPS: Final = 128  # of `quantiles_ns`, evenly spaced
 RUNS_MAX: Final = 5  # until one without an alarm
 PERCENTS: Final = (*map(float, range(100)), 99.9, 100.0)
 SHOWN: Final = {"p1": 1.0, "p10": 10.0, "p50": 50.0, "p90": 90.0, "p99": 99.0, "p99.9": 99.9, "max": 100.0}
-
-_NOTES: Final[dict[str, tuple[Event | None, ...]]] = {  # what a kind of brick notes: first visit, second, ...
-    "client": (Event.REQUEST_SENT, Event.REPLY_DELIVERED),
-    "proxy": (None, Event.REPLY_ACCEPTED),
-    "protocol": (Event.REQUEST_RECEIVED, Event.REPLY_STORED),
-    "pass.before": (Event.BEFORE_EXIT,),
-    "lfr.before": (Event.BEFORE_EXIT,),
-    "assert.before": (Event.BEFORE_EXIT,),
-    "tr.before": (None, Event.BEFORE_EXIT),
-    "compute.proceed": (Event.PROCEED_ENTER,),
-    "tr.proceed": (Event.PROCEED_ENTER,),
-    "pbr.after": (None, Event.CHECKPOINT_SENT),
-    "lfr.after": (Event.FOLLOWER_NOTIFIED,),
-    "tr.after": (Event.VOTE_COMPARED,),
-}
-_SENDS_MORE: Final = frozenset(  # than one message in the step of its note
-    ("pbr.after", "lfr.before", "lfr.after", "assert.before", "tr.proceed")
-)
 
 
 class Place(msgspec.Struct, frozen=True):
@@ -155,7 +138,7 @@ def single_hops(graph: Graph) -> tuple[tuple[Pair, ...], tuple[Pair, ...]]:
     beside: list[Pair] = []
     for source, sink in itertools.pairwise(visits):
         if source is not None and sink is not None and {source, sink} <= once:
-            more = graph.brick(source.brick).kind in _SENDS_MORE
+            more = BRICKS[graph.brick(source.brick).kind].sends_beside
             (beside if more else pairs).append((source, sink))
     return tuple(pairs), tuple(beside)
 
@@ -171,7 +154,7 @@ def _visits(graph: Graph) -> list[Place | None]:
             asks_state = asker.endswith(("before", "after"))
             event: Event | None = Event.STATE_CAPTURED if asks_state else Event.SERVER_ENTER
         else:
-            notes = _NOTES.get(kind, ())
+            notes = BRICKS[kind].visits
             event = notes[seen[brick]] if seen[brick] < len(notes) else None
         found.append(Place(brick, event) if event else None)
         seen[brick] += 1

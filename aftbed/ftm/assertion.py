@@ -16,7 +16,8 @@ from aftbed.core.brick import SAME_STATE, BrickState, Effect, Halt, Machine, Mov
 from aftbed.core.errors import PeerError
 from aftbed.core.events import Event
 from aftbed.core.messages import Reply, Request, TakeOver
-from aftbed.ftm.chain import PassState
+from aftbed.ftm.chain import COMPUTE, PassState
+from aftbed.ftm.declaration import BrickKind, Emits, Mechanism, Suitability
 
 _EXIT: Final = Event.BEFORE_EXIT  # bound once: a look-up in an enumeration is slow on the hot path
 
@@ -91,3 +92,29 @@ class AssertAfter(Machine):
         (_S.IDLE, "prd2aft", TakeOver): (hand_on, SAME_STATE),
         (_S.HOLDING, "bfr2aft", Request): (check, _S.IDLE),
     }
+
+
+ASSERT: Final = Mechanism(
+    name="assert",
+    before=BrickKind(
+        "assert.before",
+        ("pro2bfr",),
+        ("bfr2prd", "bfr2aft"),
+        make=lambda setting: AssertBefore(),
+        events=(Emits(Event.BEFORE_EXIT),),
+        visits=(Event.BEFORE_EXIT,),
+        sends_beside=True,
+    ),
+    proceed=COMPUTE,
+    after=BrickKind(
+        "assert.after",
+        ("prd2aft", "bfr2aft"),
+        ("aft2pro",),
+        # It emits `detected.stop` too; a fault is aimed at that of TR's After, since one kind stands for it.
+        make=lambda setting: AssertAfter(setting.application().acceptable),
+        checks_replies=True,
+    ),
+    links=(("before", "bfr2aft", "after"),),
+    suitability=Suitability(detects=("implausible",), cpus=1, cpu_load="low", bandwidth="none"),
+    adaptations_explored=False,
+)

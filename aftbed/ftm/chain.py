@@ -26,6 +26,7 @@ from aftbed.core.brick import (
 from aftbed.core.errors import PeerError
 from aftbed.core.events import Event
 from aftbed.core.messages import Promoted, Reply, Request, StoreReply, TakeOver
+from aftbed.ftm.declaration import BrickKind, Emits
 
 REPLIES_KEPT: Final = 256  # at least the client's backlog: what can be asked again can be answered again
 
@@ -254,3 +255,41 @@ class InnerProtocol(Machine):
         (InnerState.BUSY, "aft2pro", Reply): (release, InnerState.IDLE),
         (InnerState.HANDING_ON, "aft2pro", TakeOver): (release_take_over, InnerState.IDLE),
     }
+
+
+PROTOCOL: Final = BrickKind(
+    "protocol",
+    ("pxy2pro", "aft2pro"),
+    ("pro2bfr", "pro2pxy"),
+    make=lambda setting: Protocol(setting.replica, setting.epoch, setting.leads),
+    events=(
+        Emits(Event.REQUEST_RECEIVED),
+        Emits(Event.REPLY_STORED),
+        Emits(Event.REPLY_SENT),
+        Emits(Event.DEDUPE_HIT),
+    ),
+    visits=(Event.REQUEST_RECEIVED, Event.REPLY_STORED),
+)
+INNER_PROTOCOL: Final = BrickKind(
+    "inner.protocol",
+    ("pxy2pro", "aft2pro"),
+    ("pro2bfr", "pro2pxy"),
+    make=lambda setting: InnerProtocol(),
+)
+PASS_BEFORE: Final = BrickKind(
+    "pass.before",
+    ("pro2bfr",),
+    ("bfr2prd",),
+    make=lambda setting: PassBefore(),
+    events=(Emits(Event.BEFORE_EXIT),),
+    visits=(Event.BEFORE_EXIT,),
+)
+COMPUTE: Final = BrickKind(
+    "compute.proceed",
+    ("bfr2prd", "srv2prd"),
+    ("prd2srv", "prd2aft"),
+    make=lambda setting: Compute(),
+    events=(Emits(Event.PROCEED_ENTER),),
+    visits=(Event.PROCEED_ENTER,),
+    asks_server=1,
+)

@@ -29,6 +29,7 @@ from aftbed.core.brick import (
 from aftbed.core.errors import PeerError
 from aftbed.core.events import Event
 from aftbed.core.messages import AnyMessage, HoldAt, Rebound, Release, Reply, Request, RequestHeld, Submit
+from aftbed.ftm.declaration import BrickKind, Emits
 
 BACKLOG_MAX: Final = 64  # unanswered requests; beyond it the port `submit` is closed
 _WAITING: Final = ("submit", "pxy2clt")
@@ -235,3 +236,21 @@ class Proxy(Machine):
         ),
         (_S.WAITING, CONTROL, Rebound): _REBOUND_UNDER_WAY,
     }
+
+
+CLIENT: Final = BrickKind(
+    "client",
+    ("pxy2clt",),
+    ("clt2pxy",),
+    make=lambda setting: Client(),
+    events=(Emits(Event.REQUEST_SENT), Emits(Event.REPLY_DELIVERED)),
+    visits=(Event.REQUEST_SENT, Event.REPLY_DELIVERED),
+)
+PROXY: Final = BrickKind(
+    "proxy",
+    ("clt2pxy", "pro2pxy"),
+    ("pxy2pro", "pxy2clt"),
+    make=lambda setting: Proxy(),
+    events=(Emits(Event.REPLY_ACCEPTED),),
+    visits=(None, Event.REPLY_ACCEPTED),
+)

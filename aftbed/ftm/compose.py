@@ -12,61 +12,15 @@ has the place of the ROS master.
 
 from typing import Final
 
-import msgspec
-
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.graph import PLACEMENTS, BrickSpec, Graph, Link
-from aftbed.ftm.registry import KINDS
+from aftbed.ftm.declaration import FaultClass
+from aftbed.ftm.registry import KINDS, MECHANISMS
 
 REPLICAS: Final = ("a", "b")
 NONE: Final = "none"
 
 
-class Mechanism(msgspec.Struct, frozen=True):
-    """A row of the design's table "Before | Proceed | After".
-
-    `own`: links of this mechanism only, from part to part through a port that both ends call the same.
-    `replication`: parts and ports by which a leader speaks to its backup; none: one replica.
-    `innermost`: its Proceed is part of what it does, so nothing can take that place.
-    """
-
-    before: str
-    proceed: str
-    after: str
-    own: tuple[tuple[str, str, str], ...] = ()
-    replication: tuple[tuple[str, str], ...] = ()
-    innermost: bool = False
-
-
-MECHANISMS: Final = {
-    "pbr": Mechanism(
-        "pass.before",
-        "compute.proceed",
-        "pbr.after",
-        own=(("after", "aft2srv", "server"), ("server", "srv2aft", "after")),
-        replication=(("after", "aft2aft"),),
-    ),
-    "lfr": Mechanism(
-        "lfr.before",
-        "compute.proceed",
-        "lfr.after",
-        replication=(("before", "bfr2bfr"), ("after", "aft2aft")),
-    ),
-    "tr": Mechanism(
-        "tr.before",
-        "tr.proceed",
-        "tr.after",
-        own=(
-            ("before", "bfr2srv", "server"),
-            ("server", "srv2bfr", "before"),
-            ("after", "aft2prd", "proceed"),
-        ),
-        innermost=True,
-    ),
-    "assert": Mechanism(
-        "assert.before", "compute.proceed", "assert.after", own=(("before", "bfr2aft", "after"),)
-    ),
-}
 DUPLEX: Final = tuple(name for name, row in MECHANISMS.items() if row.replication)
 SIMPLEX: Final = tuple(name for name, row in MECHANISMS.items() if not row.replication)
 STATEFUL: Final = ("protocol", "server")  # the parts whose state a new backup needs
@@ -135,6 +89,14 @@ def _makes_sense(expression: str) -> bool:
 
 
 EXPRESSIONS: Final = expressions()
+DUPLEX_EXPRESSIONS: Final = tuple(  # each mechanism that replicates, alone and around each other one
+    "+".join((outer, *inner)) for inner in ((), *((name,) for name in SIMPLEX)) for outer in DUPLEX
+)
+
+
+def tolerates(expression: str, fault: FaultClass) -> bool:
+    """Whether a mechanism in `expression` tolerates `fault` by itself."""
+    return any(fault in MECHANISMS[name].suitability.tolerates for name in parse(expression))
 
 
 def replication_of(expression: str) -> tuple[tuple[str, str], ...]:
@@ -218,7 +180,7 @@ def _stage(names: tuple[str, ...], at: str, prefix: str, replica: str) -> tuple[
         return server if part == "server" else f"{at}{prefix}{part}"
 
     protocol = BrickSpec(brick("protocol"), "inner.protocol" if prefix else "protocol")
-    before, after = BrickSpec(brick("before"), row.before), BrickSpec(brick("after"), row.after)
+    before, after = BrickSpec(brick("before"), row.before.name), BrickSpec(brick("after"), row.after.name)
     links = [Link(protocol.name, "pro2bfr", before.name, "pro2bfr")]
     if rest:
         inner, inner_links = _stage(rest, at, f"{rest[0]}.", replica)
@@ -228,13 +190,13 @@ def _stage(names: tuple[str, ...], at: str, prefix: str, replica: str) -> tuple[
             Link(inner[0].name, "pro2pxy", after.name, "prd2aft"),
         ]
     else:
-        inner = [BrickSpec(brick("proceed"), row.proceed)]
+        inner = [BrickSpec(brick("proceed"), row.proceed.name)]
         links += [
             Link(before.name, "bfr2prd", inner[0].name, "bfr2prd"),
             Link(inner[0].name, "prd2srv", server, "prd2srv"),
             Link(server, "srv2prd", inner[0].name, "srv2prd"),
             Link(inner[0].name, "prd2aft", after.name, "prd2aft"),
         ]
-    links += [Link(brick(source), port, brick(sink), port) for source, port, sink in row.own]
+    links += [Link(brick(source), port, brick(sink), port) for source, port, sink in row.links]
     links.append(Link(after.name, "aft2pro", protocol.name, "aft2pro"))
     return [protocol, before, *inner, after], links

@@ -1,9 +1,17 @@
-"""Watchdog: tells Recovery that a node of its replica is dead or hangs. One per replica.
+"""Watchdog and Recovery: a replica that is dead or hangs is found, and redundancy is restored.
 
-A death comes as a message (the host holds the pidfds). A hang is a node whose pulse is older than a
-deadline. The deadline only counts while this Watchdog itself runs on time: if the pulses, which the
-host hands in every `PERIOD_NS`, come late, the machine was stalled, and every node gets the whole
-deadline again. That is what keeps a busy machine from a false failover.
+Paper, III-A: the Watchdog's alarm makes Recovery promote the backup. Recovery's decision is a function of
+the situation that the runtime reports and of the suspicions against it. So a Recovery that died in the middle
+of a failover is replaced by one that knows as much.
+
+| leader    | backup            | script                          |
+|-----------|-------------------|---------------------------------|
+| suspected | there             | failover: the backup leads      |
+| any       | suspected         | drop backup: the leader alone   |
+| sound     | none, slot vacant | new backup, by state transfer   |
+
+By which ports a leader speaks to its backup, and whose state a new backup needs, depends on the mechanism:
+the situation says it. Without such a port there is one replica, and nothing to be done about its death.
 """
 
 from typing import Final
@@ -27,6 +35,7 @@ from aftbed.core.script import (
     Transfer,
     Unbind,
 )
+from aftbed.ftm.declaration import BrickKind, Emits
 
 PERIOD_NS: Final = 10_000_000
 HANG_DEADLINE_NS: Final = 60_000_000
@@ -35,7 +44,13 @@ _OPEN: Final = ("sense",)
 
 
 class Watchdog(Brick):
-    """`nodes` are watched from `since_ns` on; one suspicion per generation is enough."""
+    """Reports to Recovery that a node of its replica is dead or hangs. One per replica.
+
+    A death comes as a message (the host holds the pidfds). A hang is a node whose pulse is older than
+    `HANG_DEADLINE_NS`. The deadline only counts while this Watchdog itself runs on time: if the pulses, which
+    the host hands in every `PERIOD_NS`, come late, the machine was stalled, and every node gets the whole
+    deadline again. That keeps a busy machine from a false failover. One suspicion per generation is enough.
+    """
 
     def __init__(self) -> None:
         self.replica, self.generation = "", 0
@@ -53,7 +68,7 @@ class Watchdog(Brick):
         return True
 
     def step(self, port: str, msg: AnyMessage, now_ns: int) -> list[Effect]:
-        """Be told whom to watch, that a node died, or how the pulses are."""
+        """Watch other nodes, or judge a death or the pulses."""
         if isinstance(msg, Watch):
             self.replica, self.generation, self.nodes = msg.replica, msg.generation, msg.nodes
             self.suspect, self._last_ns = None, now_ns
@@ -63,7 +78,7 @@ class Watchdog(Brick):
             return self._suspect(msg.node, "crash", now_ns) if msg.node in self.nodes else []
         if isinstance(msg, Pulses):
             return self._judge(msg, now_ns)
-        if isinstance(msg, Rebound):  # Recovery is a new one: it knows nothing yet
+        if isinstance(msg, Rebound):  # a new Recovery, which knows of no suspicion yet
             return [Send("wdg2rec", self.suspect)] if self.suspect and msg.bound else []
         raise PeerError(f"{type(msg).__name__} on {port}")
 
@@ -86,23 +101,6 @@ class Watchdog(Brick):
             Send("wdg2rec", self.suspect),
             Note(Event.WATCHDOG_SUSPECT, detail=self.generation),
         ]
-
-
-# -- Recovery: decides what to do about a replica that is dead or hangs, and restores redundancy.
-#
-# Paper, III-A: the Watchdog's alarm makes Recovery promote the backup. The decision is a function of
-# the situation that the runtime reports and of the suspicions against it; so a Recovery that died in
-# the middle of a failover is replaced by one that knows as much.
-#
-# | leader    | backup            | script                          |
-# |-----------|-------------------|---------------------------------|
-# | suspected | there             | failover: the backup leads      |
-# | any       | suspected         | drop backup: the leader alone   |
-# | sound     | none, slot vacant | new backup, by state transfer   |
-#
-# By which ports a leader speaks to its backup, and whose state a new backup needs, is the mechanism's
-# business: the runtime says so with the situation. Where there is no such port, there is one replica, and
-# nothing to be done about it.
 
 
 _ALARM_PORTS: Final = ("wdg2rec", "wdg2rec.b")
@@ -173,17 +171,17 @@ class Recovery(Brick):
         return self.ordered is None
 
     def step(self, port: str, msg: AnyMessage, now_ns: int) -> list[Effect]:
-        """Hear an alarm, or how things stand."""
+        """Take an alarm, or the situation."""
         if isinstance(msg, Suspect):
             self.suspects.add((msg.replica, msg.generation))
             return self._order(now_ns)
         if isinstance(msg, Situation):
-            return self._heard(msg, now_ns)
+            return self._update(msg, now_ns)
         if isinstance(msg, Rebound):
             return []
         raise PeerError(f"{type(msg).__name__} on {port}")
 
-    def _heard(self, msg: Situation, now_ns: int) -> list[Effect]:
+    def _update(self, msg: Situation, now_ns: int) -> list[Effect]:
         done, self.ordered, self.situation = self.ordered, None, msg
         present = {(msg.leader, msg.leader_generation), (msg.backup, msg.backup_generation)}
         self.suspects = {s for s in present if s in self.suspects or s[0] in msg.lost}
@@ -219,3 +217,20 @@ class Recovery(Brick):
         """Try again."""
         self._retry_ns = None
         return self._order(now_ns)
+
+
+WATCHDOG: Final = BrickKind(
+    "watchdog",
+    (),
+    ("wdg2rec",),
+    make=lambda setting: Watchdog(),
+    events=(Emits(Event.WATCHDOG_SUSPECT),),
+)
+RECOVERY: Final = BrickKind(
+    "recovery",
+    ("wdg2rec", "wdg2rec.b"),
+    (),
+    ("wdg2rec", "wdg2rec.b"),
+    make=lambda setting: Recovery(),
+    events=(Emits(Event.RECOVERY_ENTER), Emits(Event.RECOVERY_EXIT), Emits(Event.BACKUP_READY)),
+)

@@ -35,6 +35,8 @@ from aftbed.core.messages import (
     StoreReply,
     TakeOver,
 )
+from aftbed.ftm.chain import COMPUTE
+from aftbed.ftm.declaration import BrickKind, Emits, Mechanism, Suitability
 
 DIGEST_BYTES: Final = 16
 
@@ -212,3 +214,38 @@ class LfrAfter(Machine):
         (_A.ALONE, "prd2aft", TakeOver): (take_over, _A.LEADING),
         (ANY_STATE, CONTROL, Rebound): (rebound, SAME_STATE),
     }
+
+
+LFR: Final = Mechanism(
+    name="lfr",
+    before=BrickKind(
+        "lfr.before",
+        ("pro2bfr", "bfr2bfr"),
+        ("bfr2prd", "bfr2bfr"),
+        ("bfr2bfr",),
+        make=lambda setting: LfrBefore(setting.epoch, setting.leads),
+        events=(Emits(Event.BEFORE_EXIT), Emits(Event.FOLLOWER_FORWARDED)),
+        visits=(Event.BEFORE_EXIT,),
+        sends_beside=True,
+        backup_executes=True,
+    ),
+    proceed=COMPUTE,
+    after=BrickKind(
+        "lfr.after",
+        ("prd2aft", "aft2aft"),
+        ("aft2pro", "aft2aft"),
+        ("aft2aft",),
+        make=lambda setting: LfrAfter(setting.epoch, setting.leads),
+        events=(Emits(Event.FOLLOWER_NOTIFIED), Emits(Event.FOLLOWER_DIVERGED, of_backup=True)),
+        visits=(Event.FOLLOWER_NOTIFIED,),
+        sends_beside=True,
+    ),
+    replication=(("before", "bfr2bfr"), ("after", "aft2aft")),
+    suitability=Suitability(
+        tolerates=("crash",),
+        deterministic="two replicas execute every request",
+        cpus=2,
+        cpu_load="high",
+        bandwidth="low",
+    ),
+)

@@ -27,6 +27,8 @@ from aftbed.core.messages import (
     StoreReply,
     TakeOver,
 )
+from aftbed.ftm.chain import COMPUTE, PASS_BEFORE
+from aftbed.ftm.declaration import BrickKind, Emits, Mechanism, Suitability
 
 
 class PbrAfterState(BrickState):
@@ -150,3 +152,35 @@ class PbrAfter(Machine):
         (_S.ENDED, "aft2aft", ChannelEnded): (end_of_channel, SAME_STATE),
         (ANY_STATE, CONTROL, Rebound): (rebound, SAME_STATE),
     }
+
+
+PBR: Final = Mechanism(
+    name="pbr",
+    before=PASS_BEFORE,
+    proceed=COMPUTE,
+    after=BrickKind(
+        "pbr.after",
+        ("prd2aft", "srv2aft", "aft2aft"),
+        ("aft2srv", "aft2pro", "aft2aft"),
+        ("aft2aft",),
+        make=lambda setting: PbrAfter(setting.epoch, setting.leads),
+        events=(
+            Emits(Event.STATE_CAPTURED, by_server=True),
+            Emits(Event.CHECKPOINT_SENT),
+            Emits(Event.CHECKPOINT_APPLIED, of_backup=True),
+            Emits(Event.STATE_RESTORED, of_backup=True, by_server=True),
+        ),
+        visits=(None, Event.CHECKPOINT_SENT),
+        asks_server=1,
+        sends_beside=True,
+    ),
+    links=(("after", "aft2srv", "server"), ("server", "srv2aft", "after")),
+    replication=(("after", "aft2aft"),),
+    suitability=Suitability(
+        tolerates=("crash",),
+        state_access="each checkpoint carries the whole state to the backup",
+        cpus=2,
+        cpu_load="low",
+        bandwidth="high",
+    ),
+)

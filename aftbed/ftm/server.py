@@ -46,6 +46,7 @@ from aftbed.core.messages import (
     Trial,
     Tried,
 )
+from aftbed.ftm.declaration import BrickKind, Emits
 
 
 class ServerState(BrickState):
@@ -255,3 +256,20 @@ class Server(Machine):
         STATE_BEFORE: MOVES_STATE_BEFORE,
         STATE_BEFORE_AND_AFTER: MOVES_BOTH,
     }
+
+
+SERVER: Final = BrickKind(
+    "server",
+    ("prd2srv", "aft2srv", "bfr2srv"),
+    ("srv2prd", "srv2aft", "srv2bfr"),
+    ("aft2srv", "bfr2srv", "srv2aft", "srv2bfr"),
+    make=lambda setting: Server(setting.application(), setting.replica),
+    events=(Emits(Event.SERVER_ENTER), Emits(Event.SERVER_EXIT)),
+)
+BARE_SERVER: Final = BrickKind(  # without a mechanism
+    "bare.server",
+    ("prd2srv",),
+    ("srv2prd",),
+    make=lambda setting: Server(setting.application(), setting.replica),
+    events=(Emits(Event.SERVER_ENTER), Emits(Event.SERVER_EXIT)),
+)

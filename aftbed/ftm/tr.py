@@ -47,6 +47,7 @@ from aftbed.core.messages import (
     Trials,
     Tried,
 )
+from aftbed.ftm.declaration import BrickKind, Emits, Mechanism, Suitability
 
 UNDECIDED: Final = 0  # detail of `vote.compared`: no majority; else how many trials it took
 
@@ -275,3 +276,49 @@ class TrAfter(Machine):
             vote, {Vote.MAJORITY: (reply_by_third, _A.IDLE), Vote.NONE: (stop, SAME_STATE)}
         ),
     }
+
+
+TR: Final = Mechanism(
+    name="tr",
+    before=BrickKind(
+        "tr.before",
+        ("pro2bfr", "srv2bfr"),
+        ("bfr2srv", "bfr2prd"),
+        make=lambda setting: TrBefore(),
+        events=(Emits(Event.BEFORE_EXIT), Emits(Event.STATE_CAPTURED, by_server=True)),
+        visits=(None, Event.BEFORE_EXIT),
+        asks_server=1,
+    ),
+    proceed=BrickKind(
+        "tr.proceed",
+        ("bfr2prd", "srv2prd", "aft2prd"),
+        ("prd2srv", "prd2aft"),
+        make=lambda setting: TrProceed(),
+        events=(Emits(Event.PROCEED_ENTER),),
+        visits=(Event.PROCEED_ENTER,),
+        asks_server=2,
+        sends_beside=True,
+    ),
+    after=BrickKind(
+        "tr.after",
+        ("prd2aft",),
+        ("aft2prd", "aft2pro"),
+        make=lambda setting: TrAfter(),
+        events=(Emits(Event.VOTE_COMPARED), Emits(Event.DETECTED_STOP)),
+        visits=(Event.VOTE_COMPARED,),
+    ),
+    links=(
+        ("before", "bfr2srv", "server"),
+        ("server", "srv2bfr", "before"),
+        ("after", "aft2prd", "proceed"),
+    ),
+    innermost=True,
+    suitability=Suitability(
+        tolerates=("value", "implausible"),
+        deterministic="executions of one request are compared",
+        state_access="every execution starts from the same state",
+        cpus=1,
+        cpu_load="high",
+        bandwidth="none",
+    ),
+)

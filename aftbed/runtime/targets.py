@@ -26,7 +26,7 @@ from aftbed.core.valuefault import (
 )
 from aftbed.core.words import DURATION_MS_MAX
 from aftbed.ftm.compose import EXPRESSIONS, build
-from aftbed.ftm.registry import EMITTERS
+from aftbed.ftm.registry import EMITTERS, server_emits
 from aftbed.runtime.cell import check_field
 from aftbed.vehicle.aeb.function import AebFunction
 
@@ -182,7 +182,7 @@ def _emits(graph: Graph, event: Event, *, backs_up: bool) -> bool:
     """Whether a replica that leads, or `backs_up`, comes to `event`."""
     part, of_backup = EMITTERS[event]
     if part == "server":
-        return _server_emits(graph, event, backs_up=backs_up)
+        return server_emits(graph, event, backs_up=backs_up)
     return backs_up is of_backup and any(_is(brick, part) for brick in graph.bricks)
 
 
@@ -193,17 +193,6 @@ def sender(graph: Graph, channel: str, replica: str, leader: str) -> str | None:
     found = [graph.brick(k.source) for k in links if kin[k.source] == replica]
     first = min(found, key=_depth, default=None)
     return None if first is None else first.name
-
-
-def _server_emits(graph: Graph, event: Event, *, backs_up: bool) -> bool:
-    """Whether the Server of a replica that leads, or `backs_up`, comes to `event`."""
-    ports = {link.source_port for link in graph.links}
-    executes = not backs_up or "bfr2bfr" in ports  # its Before gets what the leader's Before gets
-    if event is Event.STATE_CAPTURED:
-        return executes and bool(ports & {"aft2srv", "bfr2srv"})
-    if event is Event.STATE_RESTORED:
-        return backs_up and "aft2srv" in ports
-    return executes
 
 
 def emitter(graph: Graph, event: str, leader: str, backup: str) -> str | None:
@@ -227,7 +216,7 @@ def waits_in(fault: Fault, graph: Graph, leader: str, backup: str) -> str | None
     if replica not in replicas(graph):
         return None
     if _part(event) == "server":
-        return f"{replica}/server" if _server_emits(graph, event, backs_up=replica != leader) else None
+        return f"{replica}/server" if server_emits(graph, event, backs_up=replica != leader) else None
     brick = _emitting(graph, event, leader, backup)
     return brick.name if brick is not None and brick.replica == replica else None
 
@@ -243,7 +232,7 @@ def _emitting(graph: Graph, event: Event, leader: str, backup: str) -> BrickSpec
     if found is None:
         return None
     part, of_backup = found
-    if part == "server" and not _server_emits(graph, event, backs_up=of_backup):
+    if part == "server" and not server_emits(graph, event, backs_up=of_backup):
         return None
     replica = backup if of_backup else leader
     bricks = [b for b in graph.bricks if _is(b, part) and b.replica in (None, replica)]

@@ -24,7 +24,8 @@ from aftbed.core.journal import EntryKind
 from aftbed.core.messages import Goal, Scheduled
 from aftbed.core.script import Stage, flat
 from aftbed.core.valuefault import EXECUTED, Bit, Flip, Place
-from aftbed.ftm.compose import build
+from aftbed.ftm.compose import DUPLEX_EXPRESSIONS, build, parse, tolerates
+from aftbed.ftm.registry import MECHANISMS, server_emits
 from aftbed.judge.verdict import ASSERT, Breach, breaches
 from aftbed.runtime.sim.clock import Clock
 from aftbed.runtime.sim.interleaving import HeldChannel, orders
@@ -34,8 +35,9 @@ from aftbed.runtime.unix.worker_pool import SECONDS_MAX, Alone, each
 from aftbed.vehicle.scenarios.library import load_scenario
 from aftbed.vehicle.scenarios.scenario import broken_expectations
 
-DUPLEX: Final = ("pbr", "lfr", "pbr+tr", "lfr+tr", "pbr+assert", "lfr+assert")
-ADAPTABLE: Final = ("pbr", "lfr", "pbr+tr", "lfr+tr")
+ADAPTABLE: Final = tuple(
+    ftm for ftm in DUPLEX_EXPRESSIONS if all(MECHANISMS[name].adaptations_explored for name in parse(ftm))
+)
 PLACEMENTS: Final = ("process", "replica")
 WHEN: Final = (Event.ADAPT_STEP_ENTER, Event.ADAPT_STEP_ACT, Event.ADAPT_STEP_EXIT)
 ELSEWHERE: Final = ("client", "a/watchdog", "b/watchdog")  # take no part in an adaptation
@@ -111,18 +113,19 @@ PAIR_REQUESTS: Final = 40
 def pairs(ftms: Iterable[str], placements: Iterable[str]) -> Iterator[Setup]:
     """Each second fault while the first one is being recovered from, and some time after."""
     for ftm, placement in itertools.product(ftms, placements):
-        nodes = list(build(ftm, placement).nodes)
+        graph = build(ftm, placement)
+        nodes = list(graph.nodes)
         firsts = [
             Fault(act, "primary", Trigger(event.label, 3))
             for act, event in itertools.product(STRIKES, FIRST_EVENTS)
         ]
-        if "tr" in ftm.split("+"):
+        if tolerates(ftm, "value"):
             places = itertools.product(EXECUTED, (0, 100))
             firsts += [
                 Fault(Flip(place, Bit(bit)), "primary", Trigger(Event.SERVER_EXIT.label, 3))
                 for place, bit in places
             ]
-        if ftm.startswith("pbr"):  # in the backup's checkpoint
+        if server_emits(graph, Event.STATE_RESTORED, backs_up=True):  # in the backup's checkpoint
             firsts += [
                 Fault(Flip(Place.STATE, Bit(bit)), "backup", Trigger(Event.STATE_RESTORED.label, 3))
                 for bit in (0, 100)
@@ -160,9 +163,9 @@ class Selection(msgspec.Struct, frozen=True):
 
 
 EXPLORERS: Final = {
-    "crash": Explorer(DUPLEX, lambda s: crashes(s.ftms, s.placements, s.requests)),
+    "crash": Explorer(DUPLEX_EXPRESSIONS, lambda s: crashes(s.ftms, s.placements, s.requests)),
     "adapt": Explorer(ADAPTABLE, lambda s: adaptations(itertools.permutations(s.ftms, 2), s.placements)),
-    "pairs": Explorer(DUPLEX, lambda s: pairs(s.ftms, s.placements)),
+    "pairs": Explorer(DUPLEX_EXPRESSIONS, lambda s: pairs(s.ftms, s.placements)),
 }
 
 

@@ -30,7 +30,7 @@ from aftbed.core.errors import ConfigError
 from aftbed.core.fault import Fault, Hang, Slow
 from aftbed.core.messages import Scheduled
 from aftbed.core.valuefault import Flip
-from aftbed.ftm.compose import build, parse, replication_of
+from aftbed.ftm.compose import DUPLEX, build, parse, replication_of
 from aftbed.judge.verdict import Breach
 from aftbed.runtime import targets
 from aftbed.runtime.sim.givens import check
@@ -139,8 +139,8 @@ def _smaller_graphs(setup: Setup) -> Iterator[Setup]:
     flips = any(isinstance(fault.action, Flip) for fault in setup.faults)
     if len(names) > 1 and not flips:
         yield replace(setup, ftm=names[0])
-    if replication_of(setup.ftm) and names[0] != "pbr":
-        yield replace(setup, ftm="+".join(("pbr", *names[1:])))
+    if replication_of(setup.ftm) and names[0] != DUPLEX[0]:
+        yield replace(setup, ftm="+".join((DUPLEX[0], *names[1:])))
     if setup.placement != "process":
         yield replace(setup, placement="process")
 

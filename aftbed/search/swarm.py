@@ -33,8 +33,8 @@ from aftbed.core.fault import Crash, Disturb, Fault, Hang, How, Slow, Trigger
 from aftbed.core.graph import PLACEMENTS
 from aftbed.core.messages import Goal, Scheduled
 from aftbed.core.valuefault import EXECUTED, Bit, Flip
-from aftbed.ftm.compose import EXPRESSIONS, NONE, build, parse, replication_of
-from aftbed.ftm.registry import EMITTERS
+from aftbed.ftm.compose import EXPRESSIONS, NONE, build, replication_of, tolerates
+from aftbed.ftm.registry import EMITTERS, MECHANISMS, server_emits
 from aftbed.runtime import targets
 from aftbed.runtime.rewiring import replica_of
 from aftbed.runtime.sim.world import Setup
@@ -42,6 +42,7 @@ from aftbed.vehicle.scenarios.library import scenario_names
 
 DUPLEX: Final = tuple(e for e in EXPRESSIONS if replication_of(e))
 SIMPLEX: Final = tuple(e for e in EXPRESSIONS if not replication_of(e))
+ALONE: Final = next(name for name, one in MECHANISMS.items() if name in SIMPLEX and one.suitability.tolerates)
 DUPLEX_PART: Final = 0.85
 NONE_PART: Final = 0.04
 SINGLE_PART: Final = 0.3  # of those with one replica
@@ -136,7 +137,9 @@ class _Draw:
             self._rate_hz = float(round(low * (high / low) ** chance.random()))
         faults_max = 0 if self._ftm == NONE else CAR_FAULTS_MAX if self._scenario else FAULTS_MAX
         self._faults_wanted = chance.randint(0, faults_max)
-        self._flips = "tr" in parse(self._ftm) and self._faults_wanted > 0 and chance.random() < FLIPS_PART
+        self._flips = (
+            tolerates(self._ftm, "value") and self._faults_wanted > 0 and chance.random() < FLIPS_PART
+        )
 
     def setup(self) -> Setup:
         """All of it."""
@@ -159,7 +162,7 @@ class _Draw:
         which = self._chance.random()
         if which < DUPLEX_PART or self._scenario:
             return self._chance.choice(DUPLEX)
-        return NONE if which > 1 - NONE_PART else "tr"
+        return NONE if which > 1 - NONE_PART else ALONE
 
     def _draw_placement(self) -> str:
         if not replication_of(self._ftm) and self._chance.random() < SINGLE_PART:
@@ -171,7 +174,7 @@ class _Draw:
         if chance.random() >= ADAPTED_PART:
             return ()
         ways = DUPLEX if self._scenario else SIMPLEX if self._placement == "single" else EXPRESSIONS
-        ways = tuple(e for e in ways if e != NONE and ("tr" in parse(e) or not self._flips))
+        ways = tuple(e for e in ways if e != NONE and (tolerates(e, "value") or not self._flips))
         found = [
             Scheduled(Goal(expression=chance.choice(ways)), chance.randint(1, self._requests()))
             for _ in range(chance.randint(1, ADAPTATIONS_MAX))
@@ -193,8 +196,9 @@ class _Draw:
     def _draw_flips(self, count: int) -> list[Fault]:
         """All in one role, and far enough from each other."""
         chance = self._chance
-        lfr = parse(self._ftm)[0] == "lfr"  # whose follower executes too
-        role = chance.choice(targets.ROLES if lfr else targets.ROLES[:1])
+        graph = build(self._ftm, self._placement)
+        executes = server_emits(graph, Event.SERVER_EXIT, backs_up=True)  # the backup, too
+        role = chance.choice(targets.ROLES if executes else targets.ROLES[:1])
         found = []
         nth = chance.randint(1, self._nth_max())
         for _ in range(count):

@@ -30,7 +30,8 @@ from aftbed.core import messages
 from aftbed.core.application import Characteristics
 from aftbed.core.errors import ConfigError
 from aftbed.core.messages import Checkpoint, Notification, Request
-from aftbed.ftm.compose import DUPLEX, EXPRESSIONS, MECHANISMS, parse
+from aftbed.ftm.compose import DUPLEX, EXPRESSIONS, parse
+from aftbed.ftm.registry import MECHANISMS
 from aftbed.vehicle.aeb.function import default_application, sample_requests
 from aftbed.vehicle.yamlfile import read_yaml
 

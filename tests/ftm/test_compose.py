@@ -13,8 +13,8 @@ from aftbed.core.brick import Brick
 from aftbed.core.errors import ConfigError
 from aftbed.core.events import REQUEST_PATH
 from aftbed.core.graph import PLACEMENTS, BrickSpec, Graph, Kind, Link, ends
-from aftbed.ftm.compose import EXPRESSIONS, MECHANISMS, build, chain, parse, replication_of
-from aftbed.ftm.registry import EMITTERS, KINDS, Setting, make
+from aftbed.ftm.compose import EXPRESSIONS, build, chain, parse, replication_of
+from aftbed.ftm.registry import EMITTERS, KINDS, MECHANISMS, Setting, make
 
 CHANNELS: Final = frozenset(  # the paper's names
     ("clt2pxy", "pxy2pro", "pro2bfr", "bfr2prd", "prd2srv")
@@ -319,4 +319,4 @@ def test_an_emitter_is_a_part_or_a_kind_that_exists() -> None:
 
 def test_a_mechanism_names_kinds_of_the_catalog() -> None:
     for row in MECHANISMS.values():
-        assert {row.before, row.proceed, row.after} <= set(KINDS)
+        assert {row.before.name, row.proceed.name, row.after.name} <= set(KINDS)
