@@ -133,6 +133,7 @@ def _after(first: Handler, moves: Mapping[object, Move]) -> dict[object, Move]:
         def handle(engine: "AdaptationEngine", msg: TakeUp) -> list[Effect]:
             return [*first(engine, msg), *then(engine, msg)]
 
+        handle.__qualname__ = then.__qualname__  # in a diagram
         return handle
 
     return {answer: (both(do), state) for answer, (do, state) in moves.items()}

@@ -1,7 +1,7 @@
 """Every point at which a fault can be aimed, as one closed enumeration.
 
-Bricks emit them with `Note`, hosts with their journal; the injector, the checkers and the reports
-use the same names. `REQUEST_PATH` are the events of one request under PBR, in their order.
+Bricks emit them with `Note`, hosts with their journal. The injector, the checkers and the reports use the
+same names.
 """
 
 from enum import Enum
@@ -10,49 +10,58 @@ from typing import Final
 from aftbed.core.errors import unknown
 
 
+class Weight(Enum):
+    """What an event says of a run, to a reader."""
+
+    ROUTINE = "routine"  # a request leaves it where nothing goes wrong
+    NOTABLE = "notable"
+    TURNING_POINT = "turning point"  # the run is another one after it
+
+
 class Event(Enum):
     """A named event; `code` is its number in a journal, and is never reused for another."""
 
-    REQUEST_SENT = (1, "request.sent")
-    REQUEST_RECEIVED = (2, "request.received")
-    BEFORE_EXIT = (3, "before.exit")
-    PROCEED_ENTER = (4, "proceed.enter")
-    SERVER_ENTER = (5, "server.enter")
-    SERVER_EXIT = (6, "server.exit")
-    STATE_CAPTURED = (7, "state.captured")
-    CHECKPOINT_SENT = (8, "checkpoint.sent")
-    REPLY_STORED = (9, "reply.stored")
-    REPLY_SENT = (10, "reply.sent")
-    REPLY_DELIVERED = (11, "reply.delivered")
+    REQUEST_SENT = (1, "request.sent", Weight.ROUTINE)
+    REQUEST_RECEIVED = (2, "request.received", Weight.ROUTINE)
+    BEFORE_EXIT = (3, "before.exit", Weight.ROUTINE)
+    PROCEED_ENTER = (4, "proceed.enter", Weight.ROUTINE)
+    SERVER_ENTER = (5, "server.enter", Weight.ROUTINE)
+    SERVER_EXIT = (6, "server.exit", Weight.ROUTINE)
+    STATE_CAPTURED = (7, "state.captured", Weight.ROUTINE)
+    CHECKPOINT_SENT = (8, "checkpoint.sent", Weight.ROUTINE)
+    REPLY_STORED = (9, "reply.stored", Weight.ROUTINE)
+    REPLY_SENT = (10, "reply.sent", Weight.ROUTINE)
+    REPLY_DELIVERED = (11, "reply.delivered", Weight.ROUTINE)
     DEDUPE_HIT = (12, "dedupe.hit")
-    CHECKPOINT_APPLIED = (13, "checkpoint.applied")
-    REPLY_ACCEPTED = (14, "reply.accepted")
+    CHECKPOINT_APPLIED = (13, "checkpoint.applied", Weight.ROUTINE)
+    REPLY_ACCEPTED = (14, "reply.accepted", Weight.ROUTINE)
     REPLY_REFUSED = (15, "reply.refused")
-    FOLLOWER_FORWARDED = (16, "follower.forwarded")
-    FOLLOWER_NOTIFIED = (17, "follower.notified")
-    FOLLOWER_DIVERGED = (18, "follower.diverged")
-    VOTE_COMPARED = (19, "vote.compared")
-    WATCHDOG_SUSPECT = (20, "watchdog.suspect")
-    RECOVERY_ENTER = (21, "recovery.enter")
-    RECOVERY_EXIT = (22, "recovery.exit")
+    FOLLOWER_FORWARDED = (16, "follower.forwarded", Weight.ROUTINE)
+    FOLLOWER_NOTIFIED = (17, "follower.notified", Weight.ROUTINE)
+    FOLLOWER_DIVERGED = (18, "follower.diverged", Weight.TURNING_POINT)
+    VOTE_COMPARED = (19, "vote.compared", Weight.ROUTINE)
+    WATCHDOG_SUSPECT = (20, "watchdog.suspect", Weight.TURNING_POINT)
+    RECOVERY_ENTER = (21, "recovery.enter", Weight.TURNING_POINT)
+    RECOVERY_EXIT = (22, "recovery.exit", Weight.TURNING_POINT)
     REPLICA_FENCED = (23, "replica.fenced")
-    REPLICA_PROMOTED = (24, "replica.promoted")
-    BACKUP_READY = (25, "backup.ready")
-    DETECTED_STOP = (26, "detected.stop")
+    REPLICA_PROMOTED = (24, "replica.promoted", Weight.TURNING_POINT)
+    BACKUP_READY = (25, "backup.ready", Weight.TURNING_POINT)
+    DETECTED_STOP = (26, "detected.stop", Weight.TURNING_POINT)
     NODE_DIED = (31, "node.died")
-    STATE_RESTORED = (32, "state.restored")
+    STATE_RESTORED = (32, "state.restored", Weight.ROUTINE)
     PEER_REFUSED = (35, "peer.refused")
-    FAULT_APPLIED = (40, "fault.applied")
-    ADAPT_PLAN = (50, "adapt.plan")
+    FAULT_APPLIED = (40, "fault.applied", Weight.TURNING_POINT)
+    ADAPT_PLAN = (50, "adapt.plan", Weight.TURNING_POINT)
     ADAPT_STEP_ENTER = (51, "adapt.step.enter")
     ADAPT_STEP_EXIT = (52, "adapt.step.exit")
-    ADAPT_COMMIT = (53, "adapt.commit")
-    ADAPT_ROLLBACK = (54, "adapt.rollback")
+    ADAPT_COMMIT = (53, "adapt.commit", Weight.TURNING_POINT)
+    ADAPT_ROLLBACK = (54, "adapt.rollback", Weight.TURNING_POINT)
     ADAPT_STEP_ACT = (55, "adapt.step.act")
 
-    def __init__(self, code: int, label: str) -> None:
+    def __init__(self, code: int, label: str, weight: Weight = Weight.NOTABLE) -> None:
         self.code = code
         self.label = label
+        self.weight = weight
 
     def __str__(self) -> str:
         return self.label
@@ -63,7 +72,7 @@ BY_LABEL: Final = {event.label: event for event in Event}
 
 RERUN: Final = 1  # detail of `server.enter` and `server.exit`: the request ran again, from the same state
 
-REQUEST_PATH: Final = (
+REQUEST_PATH: Final = (  # one request under PBR
     Event.REQUEST_SENT,
     Event.REQUEST_RECEIVED,
     Event.BEFORE_EXIT,
@@ -76,10 +85,8 @@ REQUEST_PATH: Final = (
     Event.REPLY_SENT,
     Event.REPLY_DELIVERED,
 )
-REQUEST_EVENTS: Final = frozenset(  # records that a request leaves when nothing goes wrong
-    (*REQUEST_PATH, Event.REPLY_ACCEPTED, Event.CHECKPOINT_APPLIED, Event.STATE_RESTORED)
-    + (Event.FOLLOWER_FORWARDED, Event.FOLLOWER_NOTIFIED, Event.VOTE_COMPARED)
-)
+REQUEST_EVENTS: Final = frozenset(event for event in Event if event.weight is Weight.ROUTINE)
+TURNING_POINTS: Final = frozenset(event for event in Event if event.weight is Weight.TURNING_POINT)
 STEP_EVENTS: Final = frozenset((Event.ADAPT_STEP_ENTER, Event.ADAPT_STEP_ACT, Event.ADAPT_STEP_EXIT))
 FIRST_FAULT: Final = 1_000_001  # number of the first fault of a run, in the detail of `fault.applied`
 

@@ -1,12 +1,16 @@
-"""What bricks say to each other, as one closed union of frozen structs.
+"""The messages between bricks, and between a brick and the runtime: closed unions of frozen structs.
 
-Every message on the request path carries the `epoch`: the number of the mastership under which it
-was sent. It grows by one at each failover; whoever receives an older one refuses it (G6).
-`Request`s and `Reply`s are opaque bytes inside: the mechanism never looks into them.
+Every message on the request path carries the `epoch`: the number of the mastership under which it was sent.
+It grows by one at each failover; a brick that receives an older one refuses it (G6). The payloads of requests
+and replies are opaque bytes: no mechanism looks into them.
+
+A message between nodes is one packet: MessagePack, tagged, typed, limited in size; never pickle. A packet
+over the limit, truncated, of an unknown tag or of a wrong type raises PeerError; nothing is half decoded.
 """
 
 from collections.abc import Callable
-from typing import Final
+from enum import Enum
+from typing import ClassVar, Final
 
 import msgspec
 
@@ -15,13 +19,25 @@ from aftbed.core.graph import Graph
 from aftbed.core.script import Phase, Script
 
 
+class Traffic(Enum):
+    """What kind of traffic a message is, to a reader of a trace."""
+
+    REQUEST = "request"
+    REPLY = "reply"
+    STATE = "state"
+    CONTROL = "control"
+
+
 class Message(msgspec.Struct, frozen=True, array_like=True, gc=False):
     """Base of all messages: an array on the wire, its tag first."""
+
+    TRAFFIC: ClassVar[Traffic] = Traffic.CONTROL
 
 
 class Request(Message, frozen=True, array_like=True, gc=False, tag=1):
     """`payload` for the protected function. Ids start at 1 and grow by 1."""
 
+    TRAFFIC = Traffic.REQUEST
     epoch: int
     request_id: int
     payload: bytes
@@ -30,6 +46,7 @@ class Request(Message, frozen=True, array_like=True, gc=False, tag=1):
 class Reply(Message, frozen=True, array_like=True, gc=False, tag=2):
     """The answer to request `request_id`, given by replica number `replica` (1 or 2)."""
 
+    TRAFFIC = Traffic.REPLY
     epoch: int
     request_id: int
     replica: int
@@ -37,8 +54,9 @@ class Reply(Message, frozen=True, array_like=True, gc=False, tag=2):
 
 
 class CaptureState(Message, frozen=True, array_like=True, gc=False, tag=3):
-    """After asks the Server for its state after exactly request `request_id`."""
+    """Asks the Server for its state: after exactly request `request_id`, or before it."""
 
+    TRAFFIC = Traffic.STATE
     epoch: int
     request_id: int
 
@@ -46,6 +64,7 @@ class CaptureState(Message, frozen=True, array_like=True, gc=False, tag=3):
 class StateCaptured(Message, frozen=True, array_like=True, gc=False, tag=4):
     """The Server's answer to CaptureState."""
 
+    TRAFFIC = Traffic.STATE
     epoch: int
     request_id: int
     state: bytes
@@ -54,6 +73,7 @@ class StateCaptured(Message, frozen=True, array_like=True, gc=False, tag=4):
 class Checkpoint(Message, frozen=True, array_like=True, gc=False, tag=5):
     """Primary to backup: the state after `request_id`, and the reply that the client will get."""
 
+    TRAFFIC = Traffic.STATE
     epoch: int
     request_id: int
     reply: bytes
@@ -61,8 +81,9 @@ class Checkpoint(Message, frozen=True, array_like=True, gc=False, tag=5):
 
 
 class RestoreState(Message, frozen=True, array_like=True, gc=False, tag=6):
-    """After of the backup hands its Server the state of a checkpoint."""
+    """After of the backup to its Server: the state of a checkpoint."""
 
+    TRAFFIC = Traffic.STATE
     epoch: int
     request_id: int
     state: bytes
@@ -71,13 +92,15 @@ class RestoreState(Message, frozen=True, array_like=True, gc=False, tag=6):
 class StateRestored(Message, frozen=True, array_like=True, gc=False, tag=7):
     """The Server's answer to RestoreState."""
 
+    TRAFFIC = Traffic.STATE
     epoch: int
     request_id: int
 
 
 class StoreReply(Message, frozen=True, array_like=True, gc=False, tag=8):
-    """After of the backup hands its Protocol the reply of an applied checkpoint."""
+    """After of a backup to its Protocol: a reply to keep."""
 
+    TRAFFIC = Traffic.REPLY
     epoch: int
     request_id: int
     payload: bytes
@@ -86,7 +109,7 @@ class StoreReply(Message, frozen=True, array_like=True, gc=False, tag=8):
 class TakeOver(Message, frozen=True, array_like=True, gc=False, tag=9):
     """All that came before in this channel is applied: lead, under this epoch.
 
-    It goes the way of a request, from the brick that was promoted on, and each brick hands it on.
+    It goes the way of a request, from the brick that was promoted on. Each brick hands it on.
     """
 
     epoch: int
@@ -105,14 +128,16 @@ class Suspect(Message, frozen=True, array_like=True, gc=False, tag=10):
 class Notification(Message, frozen=True, array_like=True, gc=False, tag=11):
     """LFR, leader to follower: the client gets the reply to `request_id`, which has this digest."""
 
+    TRAFFIC = Traffic.REPLY
     epoch: int
     request_id: int
     digest: bytes
 
 
 class Trial(Message, frozen=True, array_like=True, gc=False, tag=12):
-    """TR: one execution of `payload`. A `rerun` starts from `state`, which the first run started from."""
+    """TR: one execution of `payload`. A `rerun` starts from `state`, from which the first run started."""
 
+    TRAFFIC = Traffic.REQUEST
     epoch: int
     request_id: int
     payload: bytes
@@ -121,8 +146,9 @@ class Trial(Message, frozen=True, array_like=True, gc=False, tag=12):
 
 
 class Tried(Message, frozen=True, array_like=True, gc=False, tag=13):
-    """What one Trial came to: the reply, and the state after it."""
+    """The result of one Trial: the reply, and the state after it."""
 
+    TRAFFIC = Traffic.REPLY
     epoch: int
     request_id: int
     replica: int
@@ -131,8 +157,9 @@ class Tried(Message, frozen=True, array_like=True, gc=False, tag=13):
 
 
 class Trials(Message, frozen=True, array_like=True, gc=False, tag=14):
-    """TR, Proceed to After: two trials to compare, or the third one that was asked for."""
+    """TR, Proceed to After: two results to compare, or the third one."""
 
+    TRAFFIC = Traffic.REPLY
     epoch: int
     request_id: int
     tried: tuple[Tried, ...]
@@ -141,12 +168,13 @@ class Trials(Message, frozen=True, array_like=True, gc=False, tag=14):
 class Again(Message, frozen=True, array_like=True, gc=False, tag=15):
     """TR, After to Proceed: two trials differ, run a third."""
 
+    TRAFFIC = Traffic.REQUEST
     epoch: int
     request_id: int
 
 
 class Promote(Message, frozen=True, array_like=True, gc=False, tag=20):
-    """Runtime to the first brick of a backup that hears of its leader: drain to the end, then take over."""
+    """Runtime to the brick of a backup that receives from its leader: drain to the end, then take over."""
 
     epoch: int
 
@@ -158,7 +186,7 @@ class Promoted(Message, frozen=True, array_like=True, gc=False, tag=21):
 
 
 class Rebound(Message, frozen=True, array_like=True, gc=False, tag=22):
-    """Runtime to a brick: `port` now leads elsewhere (`bound`) or nowhere; the epoch from here on."""
+    """Runtime to a brick: output `port` is bound to another channel, or to none; the epoch from here on."""
 
     port: str
     bound: bool
@@ -176,7 +204,7 @@ class Submit(Message, frozen=True, array_like=True, gc=False, tag=24):
 
 
 class Watch(Message, frozen=True, array_like=True, gc=False, tag=25):
-    """Runtime to a Watchdog: these nodes make up this generation of the replica."""
+    """Runtime to a Watchdog: the nodes of this generation of the replica."""
 
     replica: str
     generation: int
@@ -196,12 +224,11 @@ class Pulses(Message, frozen=True, array_like=True, gc=False, tag=27):
 
 
 class Situation(Message, frozen=True, array_like=True, gc=False, tag=28):
-    """Runtime to Recovery: who leads, who backs up, which slots are empty. `""` is nobody.
+    """Runtime to Recovery: which replica leads, which backs up (`""`: none), which slots are empty.
 
-    Sent at the start and after each script, done or `failed`; so a new Recovery needs no memory of
-    the old one. `replication` are the parts and ports by which a leader speaks to its backup;
-    `stateful` the parts whose state a new backup needs; `lost` the replicas that are as good as dead,
-    though no Watchdog may say so.
+    Sent at the start and after each script, done or `failed`; so a new Recovery needs no memory of the old
+    one. `replication`: parts and ports by which a leader sends to its backup. `stateful`: the parts whose
+    state a new backup needs. `lost`: replicas that are to be treated as dead, though no Watchdog reports it.
     """
 
     leader: str
@@ -217,7 +244,7 @@ class Situation(Message, frozen=True, array_like=True, gc=False, tag=28):
 
 
 class Goal(msgspec.Struct, frozen=True):
-    """What an adaptation is to come to: one of `expression`, `part` with `source`, or `script`."""
+    """The goal of an adaptation: one of `expression`, `part` with `source`, or `script`."""
 
     expression: str = ""
     part: str = ""
@@ -235,7 +262,7 @@ class Scheduled(msgspec.Struct, frozen=True):
 
 
 class Adapt(Message, frozen=True, array_like=True, gc=False, tag=40):
-    """Runtime to the Engine: adaptation `number`, from the graph that runs."""
+    """Runtime to the Engine: adaptation `number`, from the graph that runs now."""
 
     number: int
     goal: Goal
@@ -243,7 +270,7 @@ class Adapt(Message, frozen=True, array_like=True, gc=False, tag=40):
 
 
 class Progress(Message, frozen=True, array_like=True, gc=False, tag=41):
-    """Runtime to the Engine: a phase that it ordered has ended; `failure` is `""` or the reason."""
+    """Runtime to the Engine: a phase that it ordered has ended. `failure`: `""` or the reason."""
 
     number: int
     phase: Phase
@@ -251,7 +278,7 @@ class Progress(Message, frozen=True, array_like=True, gc=False, tag=41):
 
 
 class TakeUp(Message, frozen=True, array_like=True, gc=False, tag=42):
-    """Runtime to a new Engine: what the dead one had ordered last, and how it ended if it has."""
+    """Runtime to a new Engine: what the dead one had ordered last, and how that ended, if it has."""
 
     number: int
     script: Script
@@ -286,7 +313,7 @@ class Release(Message, frozen=True, array_like=True, gc=False, tag=46):
     request_id: int
 
 
-AnyMessage = (
+WireMessage = (  # between bricks
     Request
     | Reply
     | CaptureState
@@ -302,6 +329,9 @@ AnyMessage = (
     | Tried
     | Trials
     | Again
+)
+AnyMessage = (  # all that a brick may receive
+    WireMessage
     | Promote
     | Promoted
     | Rebound
@@ -318,35 +348,13 @@ AnyMessage = (
     | Release
 )
 
-WireMessage = (
-    Request
-    | Reply
-    | CaptureState
-    | StateCaptured
-    | Checkpoint
-    | RestoreState
-    | StateRestored
-    | StoreReply
-    | TakeOver
-    | Suspect
-    | Notification
-    | Trial
-    | Tried
-    | Trials
-    | Again
-)
 
-
-# -- Messages to bytes and back: msgspec MessagePack, tagged, typed, limited in size; never pickle.
-#
-# The unchecked halves are for the hot path of a host, which checks the size and the errors itself.
-# A packet is one message. What is over the limit, truncated, of an unknown tag or of a wrong type
-# raises PeerError; nothing is half decoded.
-
+# -- packets --------------------------------------------------------------------------------------
 
 PACKET_BYTES_MAX: Final = 64 * 1024
 UNREADABLE: Final = (msgspec.DecodeError, UnicodeDecodeError, RecursionError)  # all that a decoder raises
 
+# For the hot path of a host, which checks the size and the errors itself.
 encode_unchecked: Callable[[Message], bytes] = msgspec.msgpack.Encoder().encode
 decode_unchecked: Callable[[bytes], WireMessage] = msgspec.msgpack.Decoder(WireMessage).decode
 

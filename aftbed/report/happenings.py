@@ -10,7 +10,7 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Final, NamedTuple
 
-from aftbed.core.events import FIRST_FAULT, REQUEST_EVENTS, STEP_EVENTS, Event
+from aftbed.core.events import FIRST_FAULT, REQUEST_EVENTS, STEP_EVENTS, TURNING_POINTS, Event
 from aftbed.core.fault import marked
 from aftbed.core.journal import Record
 from aftbed.core.messages import Message
@@ -24,28 +24,6 @@ EXECUTIVE: Final = sequence.EXECUTIVE
 GAP_PX: Final = 98.0
 WAIT_NS, WAIT_PX = 30_000, 14.0  # a longer one takes so much more room for each power of ten
 LEFT: Final = 14.0
-
-TURNS: Final = frozenset(
-    (Event.FAULT_APPLIED, Event.WATCHDOG_SUSPECT, Event.RECOVERY_ENTER, Event.REPLICA_PROMOTED)
-    + (Event.RECOVERY_EXIT, Event.DETECTED_STOP, Event.FOLLOWER_DIVERGED, Event.BACKUP_READY)
-    + (Event.ADAPT_PLAN, Event.ADAPT_COMMIT, Event.ADAPT_ROLLBACK)
-)
-KINDS: Final = {  # of messages: the class of their arrow
-    "Request": "request",
-    "Trial": "request",
-    "Again": "request",
-    "Reply": "reply",
-    "StoreReply": "reply",
-    "Notification": "reply",
-    "Tried": "reply",
-    "Trials": "reply",
-    "CaptureState": "state",
-    "StateCaptured": "state",
-    "Checkpoint": "state",
-    "RestoreState": "state",
-    "StateRestored": "state",
-}
-CONTROL: Final = "control"
 
 
 class Placed(NamedTuple):
@@ -65,7 +43,7 @@ def _turns(one: Happening) -> bool:
         case Told(event=event):
             return event == STRUCK
         case Record(event=event):
-            return event in TURNS
+            return event in TURNING_POINTS
         case _:
             return False
 
@@ -185,4 +163,4 @@ def struck(one: Happening) -> str:
 
 
 def kind_of(message: Message) -> str:
-    return KINDS.get(type(message).__name__, CONTROL)
+    return message.TRAFFIC.value

@@ -11,12 +11,11 @@ import math
 from collections.abc import Iterable, Iterator
 from typing import Final, NamedTuple
 
-from aftbed.core.events import REQUEST_EVENTS, STEP_EVENTS
+from aftbed.core.events import REQUEST_EVENTS, STEP_EVENTS, TURNING_POINTS
 from aftbed.core.journal import Entry, Record
 from aftbed.report import sequence, svg
 from aftbed.report.happenings import (
     GAP_PX,
-    TURNS,
     Placed,
     class_of,
     hosts_of,
@@ -85,7 +84,7 @@ def _labels(trace: Trace, placed: Iterable[Placed]) -> Iterator[_Label]:
 def _labelled(one: Record | Told) -> bool:
     if isinstance(one, Told):
         return one.event in ("roles", "adapted", "script.done")
-    return one.event in TURNS
+    return one.event in TURNING_POINTS
 
 
 # -- drawing --------------------------------------------------------------------------------------
