@@ -34,10 +34,10 @@ from msgspec import Meta
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.graph import PLACEMENTS
 from aftbed.core.script import RECIPES
+from aftbed.core.yaml_file import read_yaml
 from aftbed.ftm.compose import EXPRESSIONS
 from aftbed.judge.outcome import OUTCOMES
 from aftbed.vehicle.scenarios.library import load_scenario
-from aftbed.vehicle.yamlfile import read_yaml
 
 SHIPPED: Final = Path(__file__).resolve().parent.parent / "campaigns"
 ANY: Final = "*"

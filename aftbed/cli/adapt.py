@@ -33,11 +33,11 @@ from aftbed.core.errors import ConfigError
 from aftbed.core.graph import PLACEMENTS, BrickSpec, Graph
 from aftbed.core.messages import Goal, Scheduled
 from aftbed.core.script import Script, Stage, Step, Together
+from aftbed.core.yaml_file import read_yaml
 from aftbed.ftm.compose import build
 from aftbed.runtime.unix import ask, rundir
 from aftbed.runtime.unix.part import load_module
 from aftbed.vehicle.aeb.function import default_application
-from aftbed.vehicle.yamlfile import read_yaml
 
 EXIT_CODES: Final = {"done": 0, "rolled back": 1, "refused": 2}
 WIDTH: Final = 100

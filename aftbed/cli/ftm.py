@@ -30,10 +30,10 @@ from aftbed.cli.options import Json
 from aftbed.core.application import Characteristics
 from aftbed.core.errors import ConfigError
 from aftbed.core.graph import Graph
+from aftbed.core.yaml_file import read_yaml
 from aftbed.ftm.compose import EXPRESSIONS, build
 from aftbed.runtime.unix.part import load_module
 from aftbed.vehicle.aeb.function import default_application
-from aftbed.vehicle.yamlfile import read_yaml
 
 ftm = typer.Typer(
     help="What each mechanism tolerates and needs, and which one suits.",
@@ -149,6 +149,7 @@ def _print_verdict(expression: str | None, found: list[str], notes: list[str], o
 def _table(path: str | None) -> Table:
     if path is None:
         return TABLE
+
     return table_from(read_yaml(Path(path), TableFile), path)
 
 

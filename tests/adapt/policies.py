@@ -6,8 +6,8 @@ from typing import Final
 from hypothesis import strategies as st
 
 from aftbed.adapt.policy import ADAPTABLE, NS_PER_S, Action, Beyond, Policy, PolicyFile, policy_from
+from aftbed.core.yaml_file import read_yaml
 from aftbed.ftm.compose import DUPLEX, SIMPLEX
-from aftbed.vehicle.yamlfile import read_yaml
 
 S: Final = NS_PER_S
 COMPOSE, DECOMPOSE = Action("compose", "tr"), Action("decompose")

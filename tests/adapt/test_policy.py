@@ -25,8 +25,8 @@ from aftbed.adapt.policy import (
 )
 from aftbed.core.errors import ConfigError
 from aftbed.core.events import Event
+from aftbed.core.yaml_file import read_yaml
 from aftbed.ftm.compose import EXPRESSIONS, parse
-from aftbed.vehicle.yamlfile import read_yaml
 
 # -- actions
 

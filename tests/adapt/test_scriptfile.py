@@ -37,9 +37,9 @@ from aftbed.core.script import (
     Transfer,
     Unbind,
 )
+from aftbed.core.yaml_file import read_yaml
 from aftbed.ftm.compose import EXPRESSIONS
 from aftbed.ftm.registry import KINDS
-from aftbed.vehicle.yamlfile import read_yaml
 
 SWITCH: Final = Case("pbr", "lfr").plan().script
 

@@ -30,10 +30,10 @@ from aftbed.core import messages
 from aftbed.core.application import Characteristics
 from aftbed.core.errors import ConfigError
 from aftbed.core.messages import Checkpoint, Notification, Request
-from aftbed.ftm.compose import DUPLEX, EXPRESSIONS, parse
+from aftbed.core.yaml_file import read_yaml
+from aftbed.ftm.compose import DUPLEX, EXPRESSIONS, MECHANISMS, parse
 from aftbed.ftm.registry import MECHANISMS
 from aftbed.vehicle.aeb.function import default_application, sample_requests
-from aftbed.vehicle.yamlfile import read_yaml
 
 OPEN: Final = Characteristics(deterministic=True, state_access=True)
 CLOSED: Final = Characteristics(deterministic=True, state_access=False)

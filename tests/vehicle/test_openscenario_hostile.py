@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 from xoscfiles import LEAD_BRAKES, SLOW_LEAD, VALUES, imported
 
 from aftbed.core.errors import ConfigError
+from aftbed.core.yaml_file import read_yaml
 from aftbed.vehicle.openscenario import Wanted, import_scenario
 from aftbed.vehicle.scenarios.scenario import ScenarioKeys
 from aftbed.vehicle.xosc import tree
 from aftbed.vehicle.xosc.expression import EXPRESSION_CHARACTERS_MAX, FUNCTIONS, evaluate
 from aftbed.vehicle.xosc.tree import parse_tree
-from aftbed.vehicle.yamlfile import read_yaml
 
 LAUGHS = """<?xml version="1.0"?>
 <!DOCTYPE lolz [<!ENTITY lol "lol"><!ENTITY lol2 "&lol;&lol;&lol;&lol;&lol;&lol;&lol;&lol;&lol;">]>

@@ -84,7 +84,7 @@ def policy_names() -> list[str]:
 
 def load_policy(name_or_path: str) -> Policy:
     """A shipped policy by name, or a file by path: whatever has a slash or ends in .yaml or .yml."""
-    from aftbed.vehicle.yamlfile import read_yaml  # noqa: PLC0415 - PyYAML costs 15 ms
+    from aftbed.core.yaml_file import read_yaml  # noqa: PLC0415 - PyYAML costs 15 ms
 
     if "/" in name_or_path or name_or_path.endswith((".yaml", ".yml")):
         path = Path(name_or_path)

@@ -28,6 +28,7 @@ import msgspec
 from msgspec import Meta
 
 from aftbed.core.errors import ConfigError, unknown
+from aftbed.core.yaml_file import read_yaml
 from aftbed.vehicle.aeb.messages import SLOTS
 from aftbed.vehicle.can.dbc_file import Codec, load_dbc
 from aftbed.vehicle.can.e2e import (
@@ -46,7 +47,6 @@ from aftbed.vehicle.can.e2e import (
     counter_count,
 )
 from aftbed.vehicle.can.frame import CAN_ID_MAX
-from aftbed.vehicle.yamlfile import read_yaml
 
 SpeedUnit = Literal["m/s", "km/h"]
 DistanceUnit = Literal["m", "cm"]

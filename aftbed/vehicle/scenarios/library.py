@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Final
 
 from aftbed.core.errors import unknown
+from aftbed.core.yaml_file import read_yaml
 from aftbed.vehicle.scenarios.scenario import Scenario, ScenarioKeys, scenario_of
 from aftbed.vehicle.scenarios.tables import SEPARATOR, case_scenario
-from aftbed.vehicle.yamlfile import read_yaml
 
 _FOLDER: Final = Path(__file__).resolve().parent
 

@@ -22,6 +22,7 @@ import msgspec
 from msgspec import Meta
 
 from aftbed.core.errors import ConfigError, unknown
+from aftbed.core.yaml_file import read_yaml
 from aftbed.vehicle.plant import VehicleResult
 from aftbed.vehicle.scenarios.scenario import (
     BrakesKeys,
@@ -37,7 +38,6 @@ from aftbed.vehicle.scenarios.scenario import (
     Speed,
     scenario_of,
 )
-from aftbed.vehicle.yamlfile import read_yaml
 
 SEPARATOR: Final = ":"  # between table and row, in the name of a case
 COLOURS: Final = ((5.0, "green"), (15.0, "yellow"), (30.0, "orange"), (40.0, "brown"))  # below, in km/h

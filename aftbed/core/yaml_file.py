@@ -1,12 +1,14 @@
-"""The user's YAML files, read strictly: scenarios and maps.
+"""Reads the user's YAML files strictly: scenarios, maps, campaigns, policies, scripts.
 
-What a file may hold is said once, as a msgspec struct whose field names carry their units and whose types
-carry their ranges. Reading is converting to it. What msgspec refuses is told to the user in full: the
-file, the key, what was found, what is allowed, and for a key that does not exist the nearest that does.
+A msgspec struct declares what a file may hold: its field names carry the units, its types the ranges. Reading
+is converting to that struct. Where msgspec refuses a file, the error names the file, the line, the key, what
+was found and what is allowed; for an unknown key it suggests the nearest known one.
+
+Lines come from PyYAML's node tree, from which the values are made as well: each node knows where it starts.
 """
 
 import re
-from collections.abc import Hashable
+from collections.abc import Hashable, Iterator
 from pathlib import Path
 from typing import Final, TypeVar
 
@@ -25,7 +27,7 @@ S = TypeVar("S", bound=msgspec.Struct)
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML lets a key stand twice, and the last one wins: not here."""
+    """Refuses a key that stands twice in a mapping; PyYAML would take the last one."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, object]:
         seen: set[Hashable] = set()
@@ -41,15 +43,13 @@ class _Loader(yaml.SafeLoader):
 
 def read_yaml(path: Path, shape: type[S]) -> S:
     """The file as a `shape`. Raises ConfigError naming file, key, what was found and what is allowed."""
-    data = _read(path)
-    found = _parse(path, data)
+    root, found = _parse(path, _read(path))
     if found is None:
         found = {}
     try:
         return msgspec.convert(found, shape)
     except msgspec.ValidationError as error:
-        line = _line(data, str(error))
-        raise ConfigError(f"{path}: {line}{_explain(str(error), found, shape)}") from error
+        raise ConfigError(f"{path}: {_explain(str(error), root, found, shape)}") from error
 
 
 def _read(path: Path) -> bytes:
@@ -62,50 +62,47 @@ def _read(path: Path) -> bytes:
     return data
 
 
-def _parse(path: Path, data: bytes) -> object:
+def _parse(path: Path, data: bytes) -> tuple[yaml.Node | None, object]:
+    """The root node and the value made from it; both are None in a file without content."""
     try:
-        found: object = yaml.load(data, Loader=_Loader)  # a SafeLoader
+        loader = _Loader(data)
+        root = loader.get_single_node()
+        found: object = None if root is None else loader.construct_document(root)
     except yaml.MarkedYAMLError as error:
         line = f"line {error.problem_mark.line + 1}: " if error.problem_mark else ""
         raise ConfigError(f"{path}: {line}{error.problem}") from error
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise ConfigError(f"{path}: not YAML: {error}") from error
-    return found
+    return root, found
 
 
-def _line(data: bytes, reason: str) -> str:
-    """`line N: `, where in the file what msgspec refuses stands; `""` for a file without any content."""
-    node: yaml.Node | None = yaml.compose(data, Loader=_Loader)
-    strange = _UNKNOWN.search(reason)
-    at = _WHERE.search(reason)
-    keys = [key for key in re.split(r"[.\[\]]+", at["path"] if at else "") if key]
-    for key in (*keys, *([strange["key"]] if strange else [])):
-        if isinstance(node, yaml.MappingNode):
-            pairs = {str(name.value): (name, value) for name, value in node.value}
-            if key in pairs and strange is not None and key == strange["key"]:
-                node = pairs[key][0]
-            elif key in pairs:
-                node = pairs[key][1]
-        elif isinstance(node, yaml.SequenceNode) and key.isdigit():
-            node = node.value[int(key)]
-    return f"line {node.start_mark.line + 1}: " if node is not None else ""
-
-
-def _explain(reason: str, found: object, shape: type[msgspec.Struct]) -> str:
-    """msgspec's reason, in the user's terms."""
-    at = _WHERE.search(reason)
+def _explain(error: str, root: yaml.Node | None, found: object, shape: type[msgspec.Struct]) -> str:
+    """msgspec's error in the user's terms, with the line if the file has any content."""
+    at = _WHERE.search(error)
     path = at["path"].removeprefix(".") if at else ""
-    reason = reason[: at.start()] if at else reason
-    keys = [key for key in re.split(r"[.\[\]]+", path) if key]
-    node, allowed = found, inspect.type_info(shape)
-    for key in keys:
-        node, allowed = _descend(node, allowed, key)
-    where = f"{path}: " if path else ""
-    if strange := _UNKNOWN.search(reason):
+    reason = error[: at.start()] if at else error
+    node, value, allowed = root, found, inspect.type_info(shape)
+    for key in filter(None, re.split(r"[.\[\]]+", path)):
+        node = next((inner for name, inner in _items(node) if name == key), node)
+        value, allowed = _descend(value, allowed, key)
+    strange = _UNKNOWN.search(reason)
+    if strange and isinstance(node, yaml.MappingNode):
+        node = next((name for name, _ in node.value if str(name.value) == strange["key"]), node)
+    where = f"line {node.start_mark.line + 1}: " if node is not None else ""
+    where += f"{path}: " if path else ""
+    if strange:
         return f"{where}{unknown('key', strange['key'], _keys(allowed))}"
     if missing := _MISSING.search(reason):
         return f"{where}key {missing['key']!r} is missing"
-    return f"{where}found {node!r}, allowed is {_describe(allowed)}"
+    return f"{where}found {value!r}, allowed is {_describe(allowed)}"
+
+
+def _items(node: yaml.Node | None) -> Iterator[tuple[str, yaml.Node]]:
+    """Key or index, and node, of each value in a mapping or sequence. The last of equal keys comes first."""
+    if isinstance(node, yaml.MappingNode):
+        yield from ((str(name.value), value) for name, value in reversed(node.value))
+    elif isinstance(node, yaml.SequenceNode):
+        yield from ((str(index), value) for index, value in enumerate(node.value))
 
 
 def _descend(node: object, allowed: inspect.Type, key: str) -> tuple[object, inspect.Type]:

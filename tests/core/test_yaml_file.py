@@ -1,0 +1,77 @@
+"""A YAML file that is refused: the error names file, line and key."""
+
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import pytest
+
+from aftbed.core.errors import ConfigError
+from aftbed.core.yaml_file import YAML_BYTES_MAX, read_yaml
+
+
+class Wheel(msgspec.Struct, forbid_unknown_fields=True):
+    size_mm: Annotated[int, msgspec.Meta(ge=100)]
+    tyre: str | None = None
+
+
+class Cart(msgspec.Struct, forbid_unknown_fields=True):
+    name: str
+    wheels: list[Wheel] = []
+
+
+GOOD = "name: x\nwheels:\n  - size_mm: 200\n    tyre: winter\n"
+
+
+def refusal(path: Path, text: str | bytes) -> str:
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    with pytest.raises(ConfigError) as refused:
+        read_yaml(path, Cart)
+    assert str(refused.value).startswith(f"{path}: ")
+    return str(refused.value).removeprefix(f"{path}: ")
+
+
+def test_a_file_is_read_as_the_struct_that_declares_it(tmp_path: Path) -> None:
+    path = tmp_path / "a.yaml"
+    path.write_text(GOOD)
+    assert read_yaml(path, Cart) == Cart("x", [Wheel(200, "winter")])
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("", "key 'name' is missing"),
+        ("# nothing\n", "key 'name' is missing"),
+        ("wheels: []\n", "line 1: key 'name' is missing"),
+        (
+            GOOD.replace("200", "20"),
+            "line 3: wheels[0].size_mm: found 20, allowed is a whole number at least 100",
+        ),
+        (GOOD.replace("winter", "7"), "line 4: wheels[0].tyre: found 7, allowed is a text or nothing"),
+        (GOOD.replace("tyre", "tire"), "line 4: wheels[0]: unknown key 'tire'; did you mean 'tyre'?"),
+        (GOOD + "  - tyre: summer\n", "line 5: wheels[1]: key 'size_mm' is missing"),
+        (GOOD + "nome: y\n", "line 5: unknown key 'nome'; did you mean 'name'?"),
+        (GOOD + "name: y\n", "line 5: key 'name' stands twice"),
+        ("name: x\nwheels: 3\n", "line 2: wheels: found 3, allowed is a list"),
+        ("- 1\n", "line 1: found [1], allowed is keys and values: name, wheels"),
+        ("name: {\n", "line 2: expected the node content, but found '<stream end>'"),
+        (
+            "name: x\nwheels:\n  - &a {size_mm: 200}\n  - {<<: *a}\n",
+            "line 4: could not determine a constructor",
+        ),
+        ("&a name: x\n<<: *b\n", "line 2: found undefined alias 'b'"),
+        (b"\xff\xfe\x00\xd8", "not YAML: "),
+        ("[" * 5000, "not YAML: "),
+        ("name: !!python/object:os.system {}\n", "line 1: could not determine a constructor for the tag"),
+        ("x" * (YAML_BYTES_MAX + 1), f"{YAML_BYTES_MAX + 1} bytes, allowed are {YAML_BYTES_MAX}"),
+    ],
+)
+def test_a_bad_file_is_refused_with_the_line_of_the_error(
+    text: str | bytes, reason: str, tmp_path: Path
+) -> None:
+    assert refusal(tmp_path / "a.yaml", text).startswith(reason)
+
+
+def test_a_file_that_cannot_be_read_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"none\.yaml: cannot be read: No such file"):
+        read_yaml(tmp_path / "none.yaml", Cart)
