@@ -24,12 +24,12 @@ from aftbed.core.graph import Graph
 from aftbed.core.words import milliseconds, whole_milliseconds
 from aftbed.ftm.compose import build
 from aftbed.inject.words import parse
+from aftbed.interop.openscenario.importer import ImportedFile, ImportOptions, import_scenario, write
 from aftbed.judge.verdict import EXIT_INTERRUPTED
 from aftbed.report.roadplot import Curve, Point, road_plot
 from aftbed.runtime import targets
 from aftbed.search.road_table import NONE, PRIMARY, Line, Row, driven, drives, outage
 from aftbed.search.worst_instant import STEP_CYCLES
-from aftbed.vehicle.openscenario import Imported, Wanted, import_scenario, write
 from aftbed.vehicle.plant import KMH_PER_MS, Lead
 from aftbed.vehicle.scenarios import tables
 from aftbed.vehicle.scenarios.library import load_scenario, scenario_names
@@ -470,8 +470,8 @@ def import_(
     json: Json = False,
 ) -> None:
     """Make scenario files of an OpenSCENARIO 1.0 to 1.3 file; all or nothing."""
-    wanted = Wanted(ego, expect, duration, replace_controller, seed)
-    imported = import_scenario(file, variations, wanted)
+    options = ImportOptions(ego, expect, duration, replace_controller, seed)
+    imported = import_scenario(file, variations, options)
     paths = write(imported, out, force=force)
     if json:
         _print_json(imported, paths)
@@ -479,7 +479,7 @@ def import_(
         _print_text(imported, paths)
 
 
-def _print_json(imported: Imported, paths: list[Path]) -> None:
+def _print_json(imported: ImportedFile, paths: list[Path]) -> None:
     document = {
         "file": imported.path,
         "version": imported.version,
@@ -495,7 +495,7 @@ def _print_json(imported: Imported, paths: list[Path]) -> None:
     print(msgspec.json.encode(document).decode())
 
 
-def _print_text(imported: Imported, paths: list[Path]) -> None:
+def _print_text(imported: ImportedFile, paths: list[Path]) -> None:
     print(f"{imported.path}: OpenSCENARIO {imported.version}: {' '.join(imported.description.split())}")
     print("taken")
     for taken in imported.taken:

@@ -31,7 +31,7 @@ from aftbed.core.application import Characteristics
 from aftbed.core.errors import ConfigError
 from aftbed.core.messages import Checkpoint, Notification, Request
 from aftbed.core.yaml_file import read_yaml
-from aftbed.ftm.compose import DUPLEX, EXPRESSIONS, MECHANISMS, parse
+from aftbed.ftm.compose import DUPLEX, EXPRESSIONS, parse
 from aftbed.ftm.registry import MECHANISMS
 from aftbed.vehicle.aeb.function import default_application, sample_requests
 

@@ -11,7 +11,7 @@ from aftbed.cli.scenario import TableArguments, table_drive
 from aftbed.vehicle.scenarios.library import load_scenario, scenario_names
 from aftbed.vehicle.scenarios.tables import table_names
 
-FOLDER = Path(__file__).resolve().parents[1] / "vehicle" / "xosc"
+FOLDER = Path(__file__).resolve().parents[1] / "interop" / "xosc"
 LEAD_BRAKES = FOLDER / "lead_brakes.xosc"
 VALUES = FOLDER / "lead_brakes_values.xosc"
 SLOW_LEAD = FOLDER / "slow_lead.xosc"

@@ -12,11 +12,11 @@ from xoscfiles import LEAD_BRAKES, SLOW_LEAD, VALUES, imported
 
 from aftbed.core.errors import ConfigError
 from aftbed.core.yaml_file import read_yaml
-from aftbed.vehicle.openscenario import Wanted, import_scenario
+from aftbed.interop.openscenario import document
+from aftbed.interop.openscenario.document import parse_tree
+from aftbed.interop.openscenario.expression import EXPRESSION_CHARACTERS_MAX, FUNCTIONS, evaluate
+from aftbed.interop.openscenario.importer import ImportOptions, import_scenario
 from aftbed.vehicle.scenarios.scenario import ScenarioKeys
-from aftbed.vehicle.xosc import tree
-from aftbed.vehicle.xosc.expression import EXPRESSION_CHARACTERS_MAX, FUNCTIONS, evaluate
-from aftbed.vehicle.xosc.tree import parse_tree
 
 LAUGHS = """<?xml version="1.0"?>
 <!DOCTYPE lolz [<!ENTITY lol "lol"><!ENTITY lol2 "&lol;&lol;&lol;&lol;&lol;&lol;&lol;&lol;&lol;">]>
@@ -56,7 +56,7 @@ def test_hostile_and_broken_xml_is_refused(data: bytes, reason: str) -> None:
 
 def test_the_limits_are_limits_of_both_sides(monkeypatch: pytest.MonkeyPatch) -> None:
     assert parse_tree(b"<a>" * 60 + b"</a>" * 60, "f").tag == "a"
-    monkeypatch.setattr(tree, "ELEMENTS_MAX", 3)
+    monkeypatch.setattr(document, "ELEMENTS_MAX", 3)
     assert len(list(parse_tree(b"<a><b/><b/></a>", "f").walk())) == 3
     with pytest.raises(ConfigError, match="more than the 3 elements"):
         parse_tree(b"<a><b/><b/><b/></a>", "f")
@@ -75,9 +75,9 @@ def test_any_bytes(data: bytes) -> None:
 
 def import_bytes(folder: Path, name: str, data: bytes) -> None:
     """Import a changed file; what it becomes can be read as a scenario."""
-    source, wanted = (LEAD_BRAKES, Wanted(expect="stop"))
+    source, wanted = (LEAD_BRAKES, ImportOptions(expect="stop"))
     if name == SLOW_LEAD.name:
-        source, wanted = SLOW_LEAD, Wanted(ego="Host", replace_controller=True)
+        source, wanted = SLOW_LEAD, ImportOptions(ego="Host", replace_controller=True)
     path = folder / name
     path.write_bytes(data)
     try:

@@ -7,7 +7,7 @@ import pytest
 from xoscfiles import FOLDER, LEAD_BRAKES, VALUES, changed
 
 from aftbed.core.errors import ConfigError
-from aftbed.vehicle.openscenario import Imported, Wanted, import_scenario, write
+from aftbed.interop.openscenario.importer import ImportedFile, ImportOptions, import_scenario, write
 from aftbed.vehicle.scenarios.library import load_scenario
 
 GAPS = '<Element value="12"/>'
@@ -16,8 +16,8 @@ STEP = '<DistributionRange stepWidth="2">'
 SINGLES = VALUES.read_text().partition("<Deterministic>")[2].partition("</Deterministic>")[0]
 
 
-def varied(path: Path, seed: int = 0) -> Imported:
-    return import_scenario(LEAD_BRAKES, path, Wanted(seed=seed))
+def varied(path: Path, seed: int = 0) -> ImportedFile:
+    return import_scenario(LEAD_BRAKES, path, ImportOptions(seed=seed))
 
 
 def distribution(folder: Path, inner: str) -> Path:
@@ -36,7 +36,7 @@ def stochastic(folder: Path, inner: str, attributes: str = 'numberOfTestRuns="50
     return path
 
 
-def values(found: Imported, name: str) -> list[float]:
+def values(found: ImportedFile, name: str) -> list[float]:
     return [float(one.parameters[name]) for one in found.variations]
 
 
@@ -275,7 +275,7 @@ def test_names_are_fit_for_files(tmp_path: Path) -> None:
         '<DeterministicSingleParameterDistribution parameterName="Note"><DistributionSet>'
         f"{elements}</DistributionSet></DeterministicSingleParameterDistribution>"
     )
-    found = import_scenario(scenario, distribution(tmp_path, inner), Wanted())
+    found = import_scenario(scenario, distribution(tmp_path, inner), ImportOptions())
     names = sorted(one.name for one in found.variations)
     assert len(names) == len(notes)
     assert all(first != second for first, second in pairwise(names))

@@ -1,14 +1,27 @@
-"""The storyboard, read as one drive: where the cars begin, and when the one ahead brakes.
+"""Reads a storyboard as one drive: where the cars start, when the car ahead brakes, when the drive ends.
 
-    Init     for each car a place and a speed; for the world, the friction of the road
-    Story    one event at most: the car ahead brakes to a standstill, from a moment that is known beforehand
+    Init     a place and a speed for each car; the friction of the road
+    Story    at most one event: the car ahead brakes to a standstill, at a time that is known beforehand
     Stop     when the drive ends
 
-The friction is OpenSCENARIO's `frictionScaleFactor` times the nominal 0.9 of a scenario of ours.
+The friction is OpenSCENARIO's `frictionScaleFactor` times the nominal 0.9 of aftbed's scenarios. Refused is
+what a scenario of aftbed cannot express: a speed change without duration or along a curve, a target speed
+other than 0, a second speed change, an act that may stop while the car ahead still brakes, anything that
+moves the ego after its start.
 
-What cannot be expressed is refused: a speed that is reached in no time or along a curve, a target speed
-other than 0, a second change of speed, an act that is stopped while the car ahead still brakes, anything
-that moves the ego after its start.
+**Triggers** become seconds from the start, in closed form. Until the car ahead brakes, both cars keep their
+speed, so each supported condition compares its limit with a linear function of the time t:
+
+    SimulationTimeCondition                    t
+    TraveledDistanceCondition                  v t
+    RelativeDistanceCondition                  d - (ve - vl) t
+    TimeHeadwayCondition of the ego           (d - (ve - vl) t) / ve
+    TimeToCollisionCondition                  (d - (ve - vl) t) / (ve - vl)
+
+`d` is the gap between the bumpers, or the distance of the reference points without `freespace`. Limits: if
+the function brakes the ego before the computed time of a distance, headway or time to collision, the
+condition would be met later than computed; the printed meaning says so. A trigger may have one condition; an
+edge may be `rising` or `none`. An empty or missing trigger is met at once.
 """
 
 from collections.abc import Mapping
@@ -17,11 +30,9 @@ from typing import Final, NamedTuple
 import msgspec
 
 from aftbed.core.errors import unknown
+from aftbed.interop.openscenario.document import IGNORED, TRIGGER_UNKNOWN, Element
+from aftbed.interop.openscenario.placing import CarShape, distance_m, gap_m
 from aftbed.vehicle.plant import KMH_PER_MS
-from aftbed.vehicle.xosc.placing import Car, distance_m, gap_m
-from aftbed.vehicle.xosc.tree import Element
-from aftbed.vehicle.xosc.trigger import Motion, moment, only_condition, time_limit_s
-from aftbed.vehicle.xosc.words import IGNORED
 
 FRICTION_NOMINAL: Final = 0.9
 DURATION_S_DEFAULT: Final = 30.0
@@ -30,10 +41,156 @@ _DIMENSIONS: Final = ("rate", "time", "distance")
 _PRIORITIES: Final = ("parallel", "override", "overwrite", "skip")
 _OVERRIDING: Final = ("override", "overwrite")
 _OWN_END: Final = "the drive ends by itself then, at a standstill or on contact"
+_EDGES: Final = ("rising", "none")
+_UPWARD: Final = ("greaterThan", "greaterOrEqual")
+_DOWNWARD: Final = ("lessThan", "lessOrEqual")
+_ALONG: Final = ("longitudinal", "euclidianDistance", "cartesianDistance")
+_FRAMES: Final = ("entity", "lane", "road", "world")
+_CONDITIONS: Final = ("RelativeDistanceCondition", "TimeHeadwayCondition", "TimeToCollisionCondition") + (
+    "TraveledDistanceCondition",
+)
+
+_BY_VALUE: Final = ("SimulationTimeCondition",)
+_BY_ENTITY: Final = ("TriggeringEntities", "EntityCondition")
 
 
-class Taken(msgspec.Struct, frozen=True):
-    """What an element of the file became."""
+class Motion(msgspec.Struct, frozen=True):
+    """Both cars until one of them brakes: names, speeds, and their distance at the start."""
+
+    ego: str
+    lead: str
+    ego_ms: float
+    lead_ms: float
+    gap_m: float
+    distance_m: float
+
+    @property
+    def closing_ms(self) -> float:
+        return self.ego_ms - self.lead_ms
+
+
+class TriggerTime(msgspec.Struct, frozen=True):
+    """When a trigger is met, by which condition, and whether that assumes that both cars keep their speed."""
+
+    at_s: float
+    condition: Element | None
+    assumes_speeds: bool = False
+
+
+class _Linear(msgspec.Struct, frozen=True):
+    """A quantity over the time t: `start + slope t`."""
+
+    start: float
+    slope: float
+    assumes_speeds: bool = True
+
+
+def trigger_time(trigger: Element | None, begin_s: float, motion: Motion) -> TriggerTime:
+    """When `trigger`, evaluated from `begin_s` on, is met for the first time."""
+    condition = only_condition(trigger)
+    if condition is None:
+        return TriggerTime(begin_s, None)
+    edge = condition.choice("conditionEdge", _EDGES, "none")
+    delay_s = condition.number("delay", 0.0)
+    if delay_s < 0.0:
+        raise condition.wrong("delay", "0 or more")
+    by, line = _quantity(condition, motion)
+    allowed = (*_UPWARD, *_DOWNWARD)
+    travelled = by.tag == "TraveledDistanceCondition"
+    rule = "greaterOrEqual" if travelled else by.choice("rule", allowed)
+    at_s = _crossing_s(by, line, rule, by.number("value"), begin_s)
+    if at_s is None:
+        raise by.error("never met while both cars keep their speed")
+    if at_s < begin_s and edge == "rising":
+        late = f"met before it is looked at, at {begin_s:g} s"
+        raise by.error(f"{late}: with conditionEdge 'rising' it never triggers")
+    return TriggerTime(max(at_s, begin_s) + delay_s, by, line.assumes_speeds)
+
+
+def only_condition(trigger: Element | None) -> Element | None:
+    """The condition of a trigger, or None if it has none. Raises ConfigError if it has several."""
+    groups = trigger.every("ConditionGroup") if trigger else []
+    conditions = [condition for group in groups for condition in group.every("Condition")]
+    if len(conditions) > 1:
+        raise conditions[1].error("a second condition; a trigger may have one")
+    return conditions[0] if conditions else None
+
+
+def time_limit_s(condition: Element) -> float | None:
+    """When a condition on the simulation time is met; None for any other condition."""
+    value = condition.maybe("ByValueCondition")
+    time = value.maybe("SimulationTimeCondition") if value else None
+    if time is None:
+        return None
+    condition.choice("conditionEdge", _EDGES, "none")
+    time.choice("rule", _UPWARD)
+    return time.number("value") + condition.number("delay", 0.0)
+
+
+def _quantity(condition: Element, motion: Motion) -> tuple[Element, _Linear]:
+    """The element of the condition, and the quantity that it compares with its limit."""
+    kind = condition.one("ByValueCondition", "ByEntityCondition")
+    for child in kind.children:
+        if child.tag not in _BY_VALUE and child.tag not in _BY_ENTITY:
+            raise child.error(TRIGGER_UNKNOWN)
+    if kind.tag == "ByValueCondition":
+        return kind.one("SimulationTimeCondition"), _Linear(0.0, 1.0, assumes_speeds=False)
+    entities = kind.one("TriggeringEntities")
+    entities.choice("triggeringEntitiesRule", ("any", "all"))
+    name = entities.one("EntityRef").choice("entityRef", (motion.ego, motion.lead))
+    (by,) = kind.one("EntityCondition").children[:1] or [kind]
+    if by.tag not in _CONDITIONS:
+        raise by.error(TRIGGER_UNKNOWN)
+    by = kind.one("EntityCondition").one(*_CONDITIONS)
+    if by.tag == "TraveledDistanceCondition":
+        return by, _Linear(0.0, motion.ego_ms if name == motion.ego else motion.lead_ms)
+    _check_other(by, name, motion)
+    distance_m = motion.gap_m if by.flag("freespace") else motion.distance_m
+    match by.tag:
+        case "RelativeDistanceCondition":
+            return by, _Linear(distance_m, -motion.closing_ms)
+        case "TimeHeadwayCondition":
+            if name != motion.ego or motion.ego_ms == 0.0:
+                raise by.error(f"allowed is the headway of {motion.ego!r}, which moves, to the car ahead")
+            return by, _Linear(distance_m / motion.ego_ms, -motion.closing_ms / motion.ego_ms)
+        case _:
+            assert by.tag == "TimeToCollisionCondition", by.tag
+            if motion.closing_ms <= 0.0:
+                raise by.error("never met: the gap does not close while both cars keep their speed")
+            return by, _Linear(distance_m / motion.closing_ms, -1.0)
+
+
+def _check_other(by: Element, name: str, motion: Motion) -> None:
+    """Check that the condition looks at the distance between the two cars, along the lane."""
+    holder = by
+    if by.tag == "TimeToCollisionCondition":
+        holder = by.one("TimeToCollisionConditionTarget").one("EntityRef")
+    holder.choice("entityRef", (motion.lead if name == motion.ego else motion.ego,))
+    by.choice("relativeDistanceType", _ALONG, "longitudinal")
+    by.choice("coordinateSystem", _FRAMES, "entity")  # on a straight road they are all one
+    by.word("routingAlgorithm", "")
+    if by.has("alongRoute"):
+        by.flag("alongRoute")
+
+
+def _crossing_s(by: Element, line: _Linear, rule: str, limit: float, begin_s: float) -> float | None:
+    """The first time at which the rule holds (before `begin_s` if it holds then already); None: never."""
+    sign = 1.0 if rule in _UPWARD else -1.0
+    missing = sign * (limit - line.start)
+    slope = sign * line.slope
+    at_begin = missing - slope * begin_s
+    if at_begin < 0.0 or (at_begin == 0.0 and slope == 0.0 and rule.endswith("OrEqual")):
+        return begin_s - 1.0
+    if slope <= 0.0:
+        return None
+    return max(begin_s, missing / slope)
+
+
+# -- the storyboard
+
+
+class UsedElement(msgspec.Struct, frozen=True):
+    """An element of the file and its meaning for the drive."""
 
     path: str
     line: int
@@ -49,7 +206,7 @@ class Braking(msgspec.Struct, frozen=True):
 
 
 class LeadDrive(msgspec.Struct, frozen=True):
-    """The car ahead: how far from bumper to bumper at the start, how fast, and when it brakes."""
+    """The car ahead: gap from bumper to bumper and speed at the start, and when it brakes."""
 
     name: str
     gap_m: float
@@ -57,19 +214,19 @@ class LeadDrive(msgspec.Struct, frozen=True):
     braking: Braking | None
 
 
-class Drive(msgspec.Struct, frozen=True):
-    """All that a scenario of ours says about a drive."""
+class ImportedDrive(msgspec.Struct, frozen=True):
+    """What a scenario file of aftbed says about a drive, without the expected outcome."""
 
     ego: str
     speed_ms: float
     lead: LeadDrive | None
     friction: float
     duration_s: float
-    taken: tuple[Taken, ...]
+    taken: tuple[UsedElement, ...]
 
 
-class Change(NamedTuple):
-    """An action of the story that may move a car, with what it is in."""
+class MovingAction(NamedTuple):
+    """An action of the story that may move a car, with the elements that contain it."""
 
     act: Element
     group: Element
@@ -77,10 +234,10 @@ class Change(NamedTuple):
     action: Element
 
 
-class Reader:
-    """Reads one file, for one ego; `taken` grows as it goes."""
+class StoryboardReader:
+    """Reads the storyboard of one file for one ego."""
 
-    def __init__(self, cars: Mapping[str, Car], ego: str, duration_s: float | None) -> None:
+    def __init__(self, cars: Mapping[str, CarShape], ego: str, duration_s: float | None) -> None:
         self._cars = cars
         self._ego = cars[ego]
         self._lead = next((car for name, car in cars.items() if name != ego), None)
@@ -88,10 +245,10 @@ class Reader:
         self._friction = FRICTION_NOMINAL
         self._places: dict[str, Element] = {}
         self._speeds: dict[str, Element] = {}
-        self._taken: list[Taken] = []
+        self._taken: list[UsedElement] = []
 
-    def read(self, storyboard: Element) -> Drive:
-        """The drive. Raises ConfigError with the first thing that cannot be expressed."""
+    def read(self, storyboard: Element) -> ImportedDrive:
+        """The drive. Raises ConfigError with the first element that a scenario of aftbed cannot express."""
         init = storyboard.one("Init")
         self._read_init(init.one("Actions"))
         for name in self._cars:
@@ -107,10 +264,10 @@ class Reader:
         if lead and lead.braking and lead.braking.after_s >= duration_s:
             begin = f"braking begins at {lead.braking.after_s:g} s"
             raise storyboard.error(f"{begin}, the drive ends at {duration_s:g} s")
-        return Drive(self._ego.name, speed_ms, lead, self._friction, duration_s, tuple(self._taken))
+        return ImportedDrive(self._ego.name, speed_ms, lead, self._friction, duration_s, tuple(self._taken))
 
     def _take(self, element: Element, meaning: str) -> None:
-        self._taken.append(Taken(element.path, element.line, element.tag, meaning))
+        self._taken.append(UsedElement(element.path, element.line, element.tag, meaning))
 
     # -- Init
 
@@ -141,7 +298,7 @@ class Reader:
             return
         if any(taken.element == road.tag for taken in self._taken):
             raise road.error("a second one")
-        road.word("wetness", "")  # what it does to the tyres is the factor
+        road.word("wetness", "")  # the friction factor includes its effect
         factor = road.number("frictionScaleFactor")
         self._friction = round(factor * FRICTION_NOMINAL, 6)
         if not 0.0 < self._friction <= 1.2:
@@ -149,7 +306,7 @@ class Reader:
         self._take(road, f"friction {self._friction:g}, {factor:g} times {FRICTION_NOMINAL:g}")
 
     def _speed_ms(self, name: str, asking: tuple[str, ...]) -> float:
-        """How fast a car is at the start; without a word about it, it stands."""
+        """Speed of a car at the start, 0 without a SpeedAction. `asking`: cars whose speed depends on it."""
         action = self._speeds.get(name)
         if action is None:
             return 0.0
@@ -202,7 +359,7 @@ class Reader:
         for change in self._changes(storyboard):
             raise change.event.error("there is no car ahead that it could move")
 
-    def _changes(self, storyboard: Element) -> list[Change]:
+    def _changes(self, storyboard: Element) -> list[MovingAction]:
         found = []
         for story in storyboard.every("Story"):
             for act in story.every("Act"):
@@ -234,11 +391,11 @@ class Reader:
         return Braking(start, deceleration_ms2)
 
     def _begin(self, element: Element, begin_s: float, motion: Motion) -> float:
-        """When an act or event begins that is looked at from `begin_s` on."""
+        """When an act or event begins whose trigger is evaluated from `begin_s` on."""
         trigger = element.maybe("StartTrigger")
-        found = moment(trigger, begin_s, motion)
+        found = trigger_time(trigger, begin_s, motion)
         if found.condition is not None:
-            kept = ", if no car has braked by then" if found.foreseen else ""
+            kept = ", if no car has braked by then" if found.assumes_speeds else ""
             self._take(found.condition, f"met at {found.at_s:g} s{kept}")
         elif trigger is not None:
             self._take(trigger, f"has no condition: met at {found.at_s:g} s")
@@ -248,11 +405,11 @@ class Reader:
         actors = group.one("Actors")
         if actors.flag("selectTriggeringEntities", False):
             raise actors.wrong("selectTriggeringEntities", "false")
-        who = actors.one("EntityRef")
+        actor = actors.one("EntityRef")
         assert self._lead is not None
-        if who.word("entityRef") != self._lead.name:
+        if actor.word("entityRef") != self._lead.name:
             moved = f"only the car ahead, {self._lead.name!r}, is moved by the storyboard"
-            raise who.error(f"found {who.word('entityRef')!r}; {moved}")
+            raise actor.error(f"found {actor.word('entityRef')!r}; {moved}")
 
     def _deceleration_ms2(self, action: Element, speed_ms: float) -> float:
         dynamics = action.one("SpeedActionDynamics")
@@ -264,7 +421,7 @@ class Reader:
             raise target.wrong("value", "0: the car ahead brakes to a standstill")
         if speed_ms == 0.0:
             raise action.error("the car ahead stands already")
-        value = abs(dynamics.number("value"))  # a rate is written as -6 by some
+        value = abs(dynamics.number("value"))  # some files write a rate as -6
         dimension = dynamics.choice("dynamicsDimension", _DIMENSIONS)
         if value == 0.0:
             raise dynamics.wrong("value", "more than 0")
@@ -280,7 +437,7 @@ class Reader:
         return found
 
     def _check_act_stop(self, act: Element, end_s: float) -> None:
-        """Nothing may stop the act while the car ahead brakes. That its events have ended is no matter."""
+        """Check that nothing stops the act while the car ahead brakes."""
         stop = act.maybe("StopTrigger")
         condition = only_condition(stop)
         if stop is None or condition is None:
@@ -314,14 +471,14 @@ class Reader:
 
 
 def idle(holder: Element) -> bool:
-    """Whether nothing in `holder` can change the drive."""
+    """Whether all children of `holder` are ignored."""
     return bool(holder.children) and all(
         child.ignored is not None or child.tag in IGNORED for child in holder.children
     )
 
 
-def _changes(act: Element) -> list[Change]:
-    """What the events of an act do to the cars. Triggers and actors of what does nothing are ignored."""
+def _changes(act: Element) -> list[MovingAction]:
+    """The moving actions of an act. Triggers and actors of events without any are marked as ignored."""
     found = []
     for group in act.every("ManeuverGroup"):
         group.word("maximumExecutionCount", "")
@@ -338,7 +495,7 @@ def _changes(act: Element) -> list[Change]:
     return found
 
 
-def _in_maneuver(act: Element, group: Element, maneuver: Element) -> list[Change]:
+def _in_maneuver(act: Element, group: Element, maneuver: Element) -> list[MovingAction]:
     found, quiet = [], []
     for event in maneuver.every("Event"):
         event.word("maximumExecutionCount", "")
@@ -347,7 +504,7 @@ def _in_maneuver(act: Element, group: Element, maneuver: Element) -> list[Change
             kind for action in event.every("Action") for kind in action.every("PrivateAction", "GlobalAction")
         ]
         moving = [kind for kind in inner if not idle(kind)]
-        found += [Change(act, group, event, kind) for kind in moving]
+        found += [MovingAction(act, group, event, kind) for kind in moving]
         if not moving:
             quiet.append(event)
             _ignore_below(event, "StartTrigger")

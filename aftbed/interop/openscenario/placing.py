@@ -1,14 +1,18 @@
-"""Where the cars stand at the start: positions and lengths in, the gap between the bumpers out.
+"""The cars at the start: the gap between their bumpers, from positions and vehicle lengths; the road's shape.
 
-A position of OpenSCENARIO is that of a car's reference point, the middle of its rear axle. The gap that
-matters to a radar is from bumper to bumper, so the bounding boxes are needed: in the file itself, or in
-the vehicle catalog that it refers to.
+A position in OpenSCENARIO is that of a car's reference point, the middle of its rear axle. A radar sees the
+gap from bumper to bumper, so the bounding boxes are needed: from the file itself, or from the vehicle catalog
+that it refers to.
 
-Positions are compared in the frame in which they are given: along one lane, along one road, or in the
-world, along the heading of the ego. Relative ones are taken from the other car. Two cars of different
-frames, beside each other, turned against each other or on different levels are refused: the road is one
-straight, level lane. Lanes that run against their road (`laneId` above 0) are refused too, because which
-way "ahead" is there depends on the side of traffic, which only the road's own file knows.
+Positions are compared in the frame in which they are given: along one lane, along one road, or in the world,
+along the heading of the ego. Relative positions are resolved from the other car. Two cars in different
+frames, beside each other, with different headings or on different levels are refused: the road is one
+straight, level lane. Lanes that run against their road (`laneId` above 0) are refused too: which way is
+"ahead" on them depends on the side of traffic, which is only in the road's own file.
+
+Of the road's own file (OpenDRIVE), if it exists, only one thing is checked: the roads on which cars are
+placed consist of lines in one direction and have no slope. A file that is missing or too large is not read;
+the road then counts as straight and level, and the import prints that.
 """
 
 import math
@@ -19,13 +23,13 @@ from typing import Final
 import msgspec
 
 from aftbed.core.errors import unknown
-from aftbed.vehicle.xosc.parameters import replaced_below
-from aftbed.vehicle.xosc.tree import Element, read_tree
-from aftbed.vehicle.xosc.words import refuse
+from aftbed.interop.openscenario.document import FILE_BYTES_MAX, Element, read_tree, refuse
+from aftbed.interop.openscenario.expression import replaced_below
 
 VEHICLES: Final = ("car", "van", "truck", "bus", "motorbike")
-BESIDE_M_MAX: Final = 0.01  # rounding of positions, not a place beside the lane
+BESIDE_M_MAX: Final = 0.01  # tolerance for rounded positions
 TURNED_RAD_MAX: Final = 0.001
+_SLOPES: Final = ("b", "c", "d")  # of height = a + b s + c s^2 + d s^3
 LENGTH_M_MAX: Final = 100.0
 CATALOG_FILES_MAX: Final = 100
 
@@ -39,16 +43,16 @@ _POSITIONS: Final = (
 ) + ("RelativeObjectPosition", "RelativeWorldPosition")
 
 
-class Car(msgspec.Struct, frozen=True):
-    """A car by its name; its bumpers are so far from its reference point."""
+class CarShape(msgspec.Struct, frozen=True):
+    """Name of a car, and the distances of its bumpers from its reference point."""
 
     name: str
     front_m: float
     rear_m: float
 
 
-class Place(msgspec.Struct, frozen=True):
-    """A reference point: metres along, across and above a frame, and where the car heads to in it."""
+class RoadPlace(msgspec.Struct, frozen=True):
+    """Position of a reference point in a frame, and the heading of the car in it."""
 
     frame: str
     along_m: float
@@ -60,9 +64,9 @@ class Place(msgspec.Struct, frozen=True):
 # -- the cars
 
 
-def read_cars(root: Element) -> tuple[dict[str, Car], list[Element]]:
-    """The cars of the file by name, in its order, and the entries of catalogs that were read for them."""
-    found: dict[str, Car] = {}
+def read_cars(root: Element) -> tuple[dict[str, CarShape], list[Element]]:
+    """The cars by name, in the order of the file, and the catalog entries that were read for them."""
+    found: dict[str, CarShape] = {}
     entries = []
     for thing in root.one("Entities").every("ScenarioObject"):
         name = thing.word("name")
@@ -77,24 +81,24 @@ def read_cars(root: Element) -> tuple[dict[str, Car], list[Element]]:
     return found, entries
 
 
-def _car(name: str, vehicle: Element) -> Car:
+def _car(name: str, vehicle: Element) -> CarShape:
     vehicle.choice("vehicleCategory", VEHICLES)
     for label in ("mass", "role"):
         vehicle.word(label, "")
     box = vehicle.one("BoundingBox")
     centre, size = box.one("Center"), box.one("Dimensions")
     for element, names in ((centre, ("y", "z")), (size, ("width", "height"))):
-        for across in names:  # of no meaning ahead
+        for across in names:  # without effect along the lane
             element.number(across, 0.0)
     length_m = size.number("length")
     if not 0.0 < length_m <= LENGTH_M_MAX:
         raise size.wrong("length", f"more than 0 and at most {LENGTH_M_MAX:g}")
     ahead_m = centre.number("x")
-    return Car(name, ahead_m + length_m / 2, length_m / 2 - ahead_m)
+    return CarShape(name, ahead_m + length_m / 2, length_m / 2 - ahead_m)
 
 
 def _entry(root: Element, reference: Element) -> Element:
-    """The vehicle of a catalog to which `reference` refers."""
+    """The catalog vehicle to which `reference` refers."""
     catalog, name = reference.word("catalogName"), reference.word("entryName")
     assigned = reference.maybe("ParameterAssignments")
     values = {
@@ -135,12 +139,12 @@ def _catalog_files(root: Element, reference: Element) -> list[Path]:
 # -- the places
 
 
-def gap_m(ego: Car, lead: Car, positions: Mapping[str, Element]) -> float:
+def gap_m(ego: CarShape, lead: CarShape, positions: Mapping[str, Element]) -> float:
     """Metres from the ego's front bumper to the rear bumper of the car ahead."""
     return distance_m(ego, lead, positions) - ego.front_m - lead.rear_m
 
 
-def distance_m(ego: Car, lead: Car, positions: Mapping[str, Element]) -> float:
+def distance_m(ego: CarShape, lead: CarShape, positions: Mapping[str, Element]) -> float:
     """Metres from reference point to reference point, along the lane."""
     behind = _place(ego.name, positions, ())
     ahead = _place(lead.name, positions, ())
@@ -159,8 +163,8 @@ def distance_m(ego: Car, lead: Car, positions: Mapping[str, Element]) -> float:
     return x_m * cos + y_m * sin
 
 
-def _place(name: str, positions: Mapping[str, Element], asking: tuple[str, ...]) -> Place:
-    """Where the car `name` is; `asking` are the cars whose places depend on it."""
+def _place(name: str, positions: Mapping[str, Element], asking: tuple[str, ...]) -> RoadPlace:
+    """The place of the car `name`; `asking` are the cars whose places depend on it."""
     position = positions[name].one(*_POSITIONS)
     _check_orientation(position)
     match position.tag:
@@ -169,15 +173,15 @@ def _place(name: str, positions: Mapping[str, Element], asking: tuple[str, ...])
                 if position.number(turn, 0.0) != 0.0:
                     raise position.wrong(turn, "0, the road is level")
             number = position.number
-            return Place(_WORLD, number("x"), number("y"), number("z", 0.0), number("h", 0.0))
+            return RoadPlace(_WORLD, number("x"), number("y"), number("z", 0.0), number("h", 0.0))
         case "LanePosition":
             road, lane = position.word("roadId"), position.word("laneId")
             if not lane.startswith("-") or not lane[1:].isdecimal():
                 raise position.wrong("laneId", "a lane that runs with its road, -1 or less")
             frame = f"lane {lane} of road {road}"
-            return Place(frame, position.number("s"), position.number("offset", 0.0))
+            return RoadPlace(frame, position.number("s"), position.number("offset", 0.0))
         case "RoadPosition":
-            return Place(f"road {position.word('roadId')}", position.number("s"), position.number("t"))
+            return RoadPlace(f"road {position.word('roadId')}", position.number("s"), position.number("t"))
         case _:
             other = position.word("entityRef")
             if other not in positions or other == name:
@@ -187,7 +191,7 @@ def _place(name: str, positions: Mapping[str, Element], asking: tuple[str, ...])
             return _beside(position, _place(other, positions, (*asking, name)))
 
 
-def _beside(position: Element, other: Place) -> Place:
+def _beside(position: Element, other: RoadPlace) -> RoadPlace:
     """The place that `position` gives relative to `other`."""
     match position.tag:
         case "RelativeLanePosition":
@@ -206,10 +210,10 @@ def _beside(position: Element, other: Place) -> Place:
                 raise position.error(f"the other car is in {other.frame}, allowed is a WorldPosition")
             moved_m = (other.along_m + position.number("dx"), other.across_m + position.number("dy"))
             above_m = other.above_m + position.number("dz", 0.0)
-            return Place(other.frame, *moved_m, above_m, other.heading_rad)
+            return RoadPlace(other.frame, *moved_m, above_m, other.heading_rad)
     above_m = position.number("dz", 0.0) if position.tag == "RelativeObjectPosition" else 0.0
     cos, sin = math.cos(other.heading_rad), math.sin(other.heading_rad)
-    return Place(
+    return RoadPlace(
         other.frame,
         other.along_m + along_m * cos - across_m * sin,
         other.across_m + along_m * sin + across_m * cos,
@@ -226,3 +230,50 @@ def _check_orientation(position: Element) -> None:
     for angle in ("h", "p", "r"):
         if turned.number(angle, 0.0) != 0.0:
             raise turned.wrong(angle, "0, along the lane")
+
+
+# -- the road
+
+
+def check_road(root: Element) -> None:
+    """Raise ConfigError if a road on which a car stands is known to be curved or to climb."""
+    network = root.maybe("RoadNetwork")
+    if network is None:
+        return
+    signals = network.maybe("TrafficSignals")
+    if signals is not None and not signals.children:
+        signals.ignore("there are none")
+    logic = network.maybe("LogicFile")
+    if logic is None:
+        return
+    path = Path(root.path).parent / logic.word("filepath")
+    roads = {one.attributes["roadId"] for one in root.walk() if one.visited() and one.has("roadId")}
+    if not roads or not _at_hand(path):
+        logic.ignore("not read: the road is taken to be straight and level")
+        return
+    for road in read_tree(path).children:
+        if road.tag == "road" and road.attributes.get("id") in roads:
+            _check(road)
+    logic.ignore("nothing but its being straight and level was looked at")
+
+
+def _at_hand(path: Path) -> bool:
+    try:
+        return path.is_file() and path.stat().st_size <= FILE_BYTES_MAX
+    except (OSError, ValueError):
+        return False
+
+
+def _check(road: Element) -> None:
+    headings = []
+    for geometry in (one for one in road.walk() if one.tag == "geometry"):
+        for shape in geometry.children:
+            if shape.tag not in ("line", "userData"):
+                raise shape.error("a curve; the road has to be straight")
+        headings.append(geometry.number("hdg"))
+        if abs(headings[-1] - headings[0]) > TURNED_RAD_MAX:
+            raise geometry.error("another direction; the road has to be straight")
+    for elevation in (one for one in road.walk() if one.tag == "elevation"):
+        for slope in _SLOPES:
+            if elevation.number(slope, 0.0) != 0.0:
+                raise elevation.wrong(slope, "0; the road has to be level")

@@ -1,22 +1,19 @@
-"""OpenSCENARIO XML 1.0 to 1.3 in, scenarios of ours out: one car behind another on a straight road.
+"""Imports OpenSCENARIO XML 1.0 to 1.3 as scenarios of aftbed: one car behind another on a straight road.
 
-The reading is in `xosc`: a tree that knows its lines (`tree`), parameters replaced by their values
-(`parameters`, `expression`), places and lengths (`placing`), the road (`road`), triggers (`trigger`), the
-storyboard (`storyboard`), a distribution's variations (`variations`), the words that are refused or of no
-meaning (`words`). Here the parts meet, in this order:
+`document` has the tree with line numbers and the account of unused elements, `expression` the parameters,
+`placing` the cars and the road, `storyboard` the drive. An import runs in this order:
 
-    1. what is refused for what it is: all of it, with line and reason, in one error
-    2. what is read, with its meaning for the drive
-    3. what was not read: of no meaning (`ignored`, printed), or refused
+    1. elements that are refused for their tag: all of them, with line and reason, in one error
+    2. elements that are read, with their meaning for the drive
+    3. elements that were not read: ignored (printed with the reason), or refused
 
-Nothing is written before all of it has worked, for every variation, and each scenario has been read
-back as `aftbed run` reads it.
+No file is written before every variation has been converted, and each scenario has been read back in the way
+in which `aftbed run` reads it. The file does not contain the expected outcome of the drive; the caller gives
+it.
 
-What a drive has to come to is not in such a file; the caller says it.
-
-No library does the reading. The one that is well kept, scenariogeneration, is made to write such files:
-its objects hold no line numbers, and what they do not know is skipped, the opposite of what is needed
-here. A guard against hostile XML (defusedxml) comes down to refusing a DOCTYPE, which expat can do.
+No library reads the files. The well-kept one, scenariogeneration, is made to write them: its objects have no
+line numbers, and it skips elements that it does not know; here both matter. The protection of defusedxml
+against hostile XML would amount to refusing a DOCTYPE, which expat can do.
 """
 
 import json
@@ -27,15 +24,25 @@ from typing import Final
 import msgspec
 
 from aftbed.core.errors import ConfigError, unknown
+from aftbed.interop.openscenario.document import (
+    CONTROLLERS,
+    Element,
+    IgnoredElement,
+    account,
+    read_tree,
+    refuse,
+)
+from aftbed.interop.openscenario.expression import (
+    Values,
+    declared,
+    substituted,
+    variation_name,
+    variations_of,
+)
+from aftbed.interop.openscenario.placing import check_road, read_cars
+from aftbed.interop.openscenario.storyboard import ImportedDrive, StoryboardReader, UsedElement
 from aftbed.vehicle.plant import KMH_PER_MS
 from aftbed.vehicle.scenarios.scenario import ScenarioKeys, scenario_of
-from aftbed.vehicle.xosc.parameters import Values, declared, substituted
-from aftbed.vehicle.xosc.placing import read_cars
-from aftbed.vehicle.xosc.road import check_road
-from aftbed.vehicle.xosc.storyboard import Drive, Reader, Taken
-from aftbed.vehicle.xosc.tree import Element, read_tree
-from aftbed.vehicle.xosc.variations import check_distribution, variation_name, variations_of
-from aftbed.vehicle.xosc.words import CONTROLLERS, Ignored, account, refuse
 
 EXPECTATIONS: Final = ("stop", "no_collision", "no_braking")
 VERSIONS: Final = ("1.0", "1.1", "1.2", "1.3")
@@ -45,8 +52,8 @@ CARS_MAX: Final = 2
 _ROOTS: Final = ("OpenSCENARIO", "OpenScenario")
 
 
-class Wanted(msgspec.Struct, frozen=True):
-    """What the file does not say. `ego` None is the car called Ego; `duration_s` None, what the file says."""
+class ImportOptions(msgspec.Struct, frozen=True):
+    """What the caller adds to the file. None for `ego`: the car called Ego; for `duration_s`: the file's."""
 
     ego: str | None = None
     expect: str = "no_collision"
@@ -55,57 +62,57 @@ class Wanted(msgspec.Struct, frozen=True):
     seed: int = 0
 
 
-class Variation(msgspec.Struct, frozen=True):
-    """A scenario of ours, as YAML, and the values that were given to the file's parameters for it."""
+class ScenarioVariation(msgspec.Struct, frozen=True):
+    """A scenario of aftbed, as YAML in `text`, and the values of the file's parameters for it."""
 
     name: str
     parameters: Values
-    drive: Drive
+    drive: ImportedDrive
     text: str
 
 
-class Imported(msgspec.Struct, frozen=True):
-    """What became of a file. `taken` and `ignored` are those of the first variation.
+class ImportedFile(msgspec.Struct, frozen=True):
+    """The result of an import. `taken` and `ignored` are those of the first variation.
 
-    `sets` counts the sets of values; where a draw gives one of them again, it is the same variation.
+    `sets` counts the sets of values. Equal sets, as random draws may give, are one variation.
     """
 
     path: str
     version: str
     description: str
     sets: int
-    variations: tuple[Variation, ...]
-    taken: tuple[Taken, ...]
-    ignored: tuple[Ignored, ...]
+    variations: tuple[ScenarioVariation, ...]
+    taken: tuple[UsedElement, ...]
+    ignored: tuple[IgnoredElement, ...]
 
 
-def import_scenario(path: Path, distribution: Path | None, wanted: Wanted) -> Imported:
-    """The scenarios that a file describes. Raises ConfigError naming file, line and element."""
-    if wanted.expect not in EXPECTATIONS:
-        raise ConfigError(f"--expect: {unknown('outcome', wanted.expect, EXPECTATIONS)}")
-    if wanted.duration_s is not None and not 0.0 < wanted.duration_s <= DURATION_S_MAX:
+def import_scenario(path: Path, distribution: Path | None, options: ImportOptions) -> ImportedFile:
+    """The scenarios that the file at `path` describes. Raises ConfigError naming file, line and element."""
+    if options.expect not in EXPECTATIONS:
+        raise ConfigError(f"--expect: {unknown('outcome', options.expect, EXPECTATIONS)}")
+    if options.duration_s is not None and not 0.0 < options.duration_s <= DURATION_S_MAX:
         allowed = f"allowed is more than 0 and at most {DURATION_S_MAX:g}"
-        raise ConfigError(f"--duration: found {wanted.duration_s:g}, {allowed}")
+        raise ConfigError(f"--duration: found {options.duration_s:g}, {allowed}")
     root = read_tree(path)
     version = _check_root(root)
     sets: list[Values] = [{}]
     if distribution is not None:
-        sets = _read_distribution(distribution, path, declared(root), wanted.seed)
-    found: dict[str, Variation] = {}
-    accounts: list[tuple[tuple[Taken, ...], tuple[Ignored, ...]]] = []
+        sets = _read_distribution(distribution, path, declared(root), options.seed)
+    found: dict[str, ScenarioVariation] = {}
+    accounts: list[tuple[tuple[UsedElement, ...], tuple[IgnoredElement, ...]]] = []
     for values in sets:
         name = variation_name(path.stem, values)
         try:
-            drive, ignored, description = _read(substituted(root, values), wanted)
-            found[name] = _variation(name, values, drive, description, wanted)
+            drive, ignored, description = _read(substituted(root, values), options)
+            found[name] = _variation(name, values, drive, description, options)
         except ConfigError as error:
             raise _of_variation(error, values) from error
         accounts.append((drive.taken, ignored))
-    return Imported(str(path), version, description, len(sets), tuple(found.values()), *accounts[0])
+    return ImportedFile(str(path), version, description, len(sets), tuple(found.values()), *accounts[0])
 
 
-def write(imported: Imported, folder: Path, *, force: bool) -> list[Path]:
-    """Write every scenario as a file into `folder`. A file that says something else stays, but by force."""
+def write(imported: ImportedFile, folder: Path, *, force: bool) -> list[Path]:
+    """Write every scenario into `folder`. Only `force` overwrites a file with other content."""
     paths = [folder / f"{variation.name}.yaml" for variation in imported.variations]
     try:
         for path, variation in zip(paths, imported.variations, strict=True):
@@ -120,7 +127,7 @@ def write(imported: Imported, folder: Path, *, force: bool) -> list[Path]:
 
 
 def _check_root(root: Element) -> str:
-    """The version of OpenSCENARIO."""
+    """Check root and header; the version of OpenSCENARIO."""
     if root.tag not in _ROOTS:
         raise root.error(f"allowed is {_ROOTS[0]}")
     header = root.one("FileHeader")
@@ -139,7 +146,8 @@ def _check_root(root: Element) -> str:
 
 def _read_distribution(path: Path, scenario: Path, parameters: list[str], seed: int) -> list[Values]:
     root = read_tree(path)
-    check_distribution(root)
+    if not any(child.tag == "ParameterValueDistribution" for child in root.children):
+        raise ConfigError(f"{root.path}: no ParameterValueDistribution in it")
     header = root.one("FileHeader")
     for label in ("revMajor", "revMinor"):
         header.word(label)
@@ -148,20 +156,20 @@ def _read_distribution(path: Path, scenario: Path, parameters: list[str], seed: 
     return found
 
 
-def _read(root: Element, wanted: Wanted) -> tuple[Drive, tuple[Ignored, ...], str]:
+def _read(root: Element, options: ImportOptions) -> tuple[ImportedDrive, tuple[IgnoredElement, ...], str]:
     header = root.one("FileHeader")
     for label in ("revMajor", "revMinor"):
         header.word(label)
     description = header.word("description", "") or root.path
-    ego = _find_ego(root, wanted.ego)
-    _set_aside(root, ego, wanted)
+    ego = _find_ego(root, options.ego)
+    _set_aside(root, ego, options)
     refuse(root)
     cars, entries = read_cars(root)
     if len(cars) > CARS_MAX:
         raise root.one("Entities").error(
             f"{len(cars)} vehicles, allowed are {CARS_MAX}: the ego and one ahead"
         )
-    drive = Reader(cars, ego, wanted.duration_s).read(root.one("Storyboard"))
+    drive = StoryboardReader(cars, ego, options.duration_s).read(root.one("Storyboard"))
     check_road(root)
     return drive, tuple(one for tree in (root, *entries) for one in account(tree)), description
 
@@ -178,31 +186,33 @@ def _find_ego(root: Element, asked: str | None) -> str:
     return egos[0]
 
 
-def _set_aside(root: Element, ego: str, wanted: Wanted) -> None:
-    """Mark what the caller has said to be replaced."""
+def _set_aside(root: Element, ego: str, options: ImportOptions) -> None:
+    """Mark the elements that `options` replaces as ignored."""
     for element in root.walk():
         of_ego = ego in (element.attributes.get("entityRef"), element.attributes.get("name"))
-        if wanted.replace_controller and of_ego and element.tag in ("Private", "ScenarioObject"):
+        if options.replace_controller and of_ego and element.tag in ("Private", "ScenarioObject"):
             for inner in element.walk():
                 if inner.tag in CONTROLLERS:
                     inner.ignore("replaced by aftbed's function, as asked for")
-        if wanted.duration_s is not None and element.tag == "Storyboard":
+        if options.duration_s is not None and element.tag == "Storyboard":
             for child in element.children:
                 if child.tag == "StopTrigger":
                     child.ignore("the length of the drive was asked for")
 
 
-def _variation(name: str, values: Values, drive: Drive, description: str, wanted: Wanted) -> Variation:
-    keys = _keys(drive, description, wanted.expect)
+def _variation(
+    name: str, values: Values, drive: ImportedDrive, description: str, options: ImportOptions
+) -> ScenarioVariation:
+    keys = _keys(drive, description, options.expect)
     try:
         scenario_of(name, name, msgspec.convert(keys, ScenarioKeys))
     except msgspec.ValidationError as error:
         raise ConfigError(f"the scenario would be out of range: {error}") from error
-    return Variation(name, values, drive, _yaml(keys))
+    return ScenarioVariation(name, values, drive, _yaml(keys))
 
 
-def _keys(drive: Drive, description: str, expect: str) -> dict[str, object]:
-    """The keys of the scenario file, in the order of the page that describes them."""
+def _keys(drive: ImportedDrive, description: str, expect: str) -> dict[str, object]:
+    """The keys of the scenario file, in the order in which docs/scenarios.md describes them."""
     printable = "".join(one if one.isprintable() else " " for one in description)
     shown = " ".join(printable.split())[:DESCRIPTION_CHARACTERS_MAX]
     keys: dict[str, object] = {"description": shown, "duration_s": _round(drive.duration_s)}
@@ -215,7 +225,7 @@ def _keys(drive: Drive, description: str, expect: str) -> dict[str, object]:
             lead["braking"] = {
                 "after_s": _round(braking.after_s),
                 "deceleration_ms2": _round(braking.deceleration_ms2),
-                "ramp_s": 0.0,  # a linear SpeedAction has its rate from its first moment on
+                "ramp_s": 0.0,  # a linear SpeedAction has its full rate from its start
             }
         keys["lead"] = lead
     keys["road"] = {"friction": drive.friction}
@@ -224,12 +234,12 @@ def _keys(drive: Drive, description: str, expect: str) -> dict[str, object]:
 
 
 def _round(value: float) -> float:
-    """To the micrometre, and no -0."""
+    """Rounded to 6 decimals, without -0."""
     return round(value, 6) + 0.0
 
 
 def _yaml(keys: Mapping[str, object]) -> str:
-    """One key in a line; what JSON says of a text or a number, YAML says too."""
+    """One key a line. A text or number in JSON notation is valid YAML."""
     return "".join(f"{key}: {_flow(value)}\n" for key, value in keys.items())
 
 

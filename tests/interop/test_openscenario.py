@@ -19,20 +19,20 @@ from xoscfiles import (
     refused,
 )
 
+from aftbed.interop.openscenario.importer import ImportedFile, ImportOptions, import_scenario, write
+from aftbed.interop.openscenario.storyboard import ImportedDrive
 from aftbed.runtime.sim.world import Setup, simulate
-from aftbed.vehicle.openscenario import Imported, Wanted, import_scenario, write
 from aftbed.vehicle.plant import Lead, LeadBraking
 from aftbed.vehicle.scenarios.library import load_scenario
 from aftbed.vehicle.scenarios.scenario import Scenario
-from aftbed.vehicle.xosc.storyboard import Drive
 
 
-def only_drive(found: Imported) -> Drive:
+def only_drive(found: ImportedFile) -> ImportedDrive:
     (variation,) = found.variations
     return variation.drive
 
 
-def scenario(found: Imported, folder: Path) -> Scenario:
+def scenario(found: ImportedFile, folder: Path) -> Scenario:
     (path,) = write(found, folder, force=False)
     return load_scenario(str(path))
 
@@ -52,7 +52,7 @@ def test_the_car_ahead_brakes(tmp_path: Path) -> None:
 
 
 def test_a_slow_car_ahead_of_a_catalog_in_the_world_on_a_wet_road(tmp_path: Path) -> None:
-    wanted = Wanted(ego="Host", expect="no_collision", replace_controller=True)
+    wanted = ImportOptions(ego="Host", expect="no_collision", replace_controller=True)
     found = scenario(import_scenario(SLOW_LEAD, None, wanted), tmp_path)
     assert found.plant.speed_ms == pytest.approx(15)
     assert found.plant.lead is not None
@@ -65,7 +65,7 @@ def test_a_slow_car_ahead_of_a_catalog_in_the_world_on_a_wet_road(tmp_path: Path
 
 
 def test_what_was_imported_drives_and_stops(tmp_path: Path) -> None:
-    wanted = Wanted(expect="stop")
+    wanted = ImportOptions(expect="stop")
     (path,) = write(import_scenario(LEAD_BRAKES, None, wanted), tmp_path, force=False)
     result = simulate(Setup("none", seed=1, scenario=str(path))).vehicle
     assert result is not None

@@ -22,7 +22,7 @@ from xoscfiles import (
 )
 
 from aftbed.core.errors import ConfigError
-from aftbed.vehicle.openscenario import Imported, Wanted, import_scenario
+from aftbed.interop.openscenario.importer import ImportedFile, ImportOptions, import_scenario
 
 # -- what is refused
 
@@ -219,11 +219,11 @@ def test_what_is_assumed_is_said(tmp_path: Path) -> None:
 def test_a_controller_on_the_ego_is_refused_unless_the_function_replaces_it() -> None:
     with pytest.raises(ConfigError, match="line 23: ObjectController: controllers"):
         imported(SLOW_LEAD, ego="Host")
-    found = import_scenario(SLOW_LEAD, None, Wanted(ego="Host", replace_controller=True))
+    found = import_scenario(SLOW_LEAD, None, ImportOptions(ego="Host", replace_controller=True))
     replaced = [one.element for one in found.ignored if "replaced" in one.reason]
     assert replaced == ["ObjectController", "ActivateControllerAction"]
     with pytest.raises(ConfigError, match="line 23: ObjectController: controllers"):
-        import_scenario(SLOW_LEAD, None, Wanted(ego="Target", replace_controller=True))
+        import_scenario(SLOW_LEAD, None, ImportOptions(ego="Target", replace_controller=True))
 
 
 @pytest.mark.parametrize(
@@ -250,7 +250,7 @@ def test_a_vehicle_that_no_catalog_has(old: str, new: str, reason: str, tmp_path
     (tmp_path / "catalogs").symlink_to(SLOW_LEAD.parent / "catalogs")
     path = changed(tmp_path, (old, new), source=SLOW_LEAD)
     with pytest.raises(ConfigError) as error:
-        import_scenario(path, None, Wanted(ego="Host", replace_controller=True))
+        import_scenario(path, None, ImportOptions(ego="Host", replace_controller=True))
     assert reason in str(error.value)
 
 
@@ -304,7 +304,7 @@ def test_wishes_that_cannot_be_met() -> None:
     with pytest.raises(ConfigError, match="--ego: unknown vehicle 'Leader'; did you mean 'Lead'"):
         imported(LEAD_BRAKES, ego="Leader")
     with pytest.raises(ConfigError, match="--expect: unknown outcome 'impact'"):
-        import_scenario(LEAD_BRAKES, None, Wanted(expect="impact"))
+        import_scenario(LEAD_BRAKES, None, ImportOptions(expect="impact"))
     for duration_s in (0.0, -1.0, 3601.0, float("nan")):
         with pytest.raises(
             ConfigError, match=r"--duration: found .*, allowed is more than 0 and at most 3600"
@@ -375,7 +375,7 @@ def _lines_inside(text: str, begins: set[int]) -> set[int]:
     return found
 
 
-def _import_text(folder: Path, text: str) -> Imported | None:
+def _import_text(folder: Path, text: str) -> ImportedFile | None:
     """The import of a file with this text; None if it is refused."""
     path = folder / LEAD_BRAKES.name
     path.write_text(text)

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from aftbed.core.errors import ConfigError
-from aftbed.vehicle.openscenario import Imported, Wanted, import_scenario
+from aftbed.interop.openscenario.importer import ImportedFile, ImportOptions, import_scenario
 
 FOLDER = Path(__file__).resolve().parent / "xosc"
 LEAD_BRAKES = FOLDER / "lead_brakes.xosc"
@@ -48,9 +48,9 @@ def changed(folder: Path, *changes: tuple[str, str], source: Path = LEAD_BRAKES)
 
 def imported(
     path: Path, distribution: Path | None = None, *, ego: str | None = None, duration_s: float | None = None
-) -> Imported:
+) -> ImportedFile:
     """The file, imported with what else is wanted left as it is."""
-    return import_scenario(path, distribution, Wanted(ego=ego, duration_s=duration_s))
+    return import_scenario(path, distribution, ImportOptions(ego=ego, duration_s=duration_s))
 
 
 def refused(path: Path) -> str:

@@ -1,0 +1,1 @@
+"""Import of OpenSCENARIO XML: `importer` has the entry points."""

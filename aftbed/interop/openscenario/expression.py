@@ -1,0 +1,454 @@
+"""Parameters of OpenSCENARIO files: their values, arithmetic over them, and the variations of a distribution.
+
+**Expressions**, `${$EgoSpeed / 3.6}` or `${max($Gap - 2, 0) * 1.5}`. The standard (ASAM OpenSCENARIO XML 1.3,
+9.2) has + - * / %, parentheses, and the functions below. `ast` parses the text and `evaluate` walks the tree
+over a closed list of nodes: everything else of Python (a name, an attribute, another call, `**`, a string, a
+lambda) is refused by its name. Nothing is evaluated by Python itself. Before parsing, the text may contain
+only numbers in XML notation, names, operators and parentheses, and its length is limited. Numbers only: the
+standard's booleans (`and`, `or`, `not`) are refused. Angles are in radians.
+
+**Parameters.** `substituted` makes a new tree without any `$name` or `${expression}`, so the rest of the
+importer does not deal with parameters. The scope of a parameter is the element that holds its
+`ParameterDeclarations` (the file, a story, a maneuver, a vehicle, an environment); the innermost declaration
+wins. A variation gives other values to the parameters of the file; their types and constraints are checked in
+the same way. A name may be declared with a leading `$`, as files of OpenSCENARIO 1.0 do. A `$` that starts no
+name (`costs $5`) is an ordinary character.
+
+**Variations.** A parameter value distribution gives one scenario file many sets of values. Deterministic
+distributions are combined: each value of one with each of the others, the last one changing fastest (9.3):
+
+    DistributionSet        the values listed
+    DistributionRange      from `lowerLimit` to `upperLimit` in steps of `stepWidth`, both ends included
+    ValueSetDistribution   values of several parameters that belong together
+
+Stochastic distributions (uniform, normal, histogram, weighted set) are drawn `numberOfTestRuns` times from a
+generator seeded with the file's `randomSeed` or, without one, with the seed of the command. The same seed
+gives the same draws. Others (log-normal, Poisson, user-defined) are refused. The name of a variation is made
+of the names and values of its parameters, so it stays the same when the distribution gets more values.
+"""
+
+import ast
+import hashlib
+import itertools
+import math
+import operator
+import random
+import re
+from collections.abc import Callable, Mapping
+from pathlib import PurePosixPath
+from typing import Final
+
+from aftbed.core.errors import ConfigError, unknown
+from aftbed.interop.openscenario.document import SHOWN_CHARACTERS_MAX, Element, finite
+
+EXPRESSION_CHARACTERS_MAX: Final = 200
+VARIATIONS_MAX: Final = 1_000
+NAME_CHARACTERS_MAX: Final = 100
+_DRAWS_MAX: Final = 1_000  # tries to draw a normal value within its range
+_STEP_EPSILON: Final = 1e-9  # steps: an upper limit that is a multiple of the step belongs to the range
+
+_NUMBER: Final = r"(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?(?![A-Za-z0-9_.])"
+_NAME: Final = r"\$?[A-Za-z_][A-Za-z0-9_]*(?![A-Za-z0-9_])"
+_TOKENS: Final = re.compile(rf"(?: *(?:{_NUMBER}|{_NAME}|[-+*/%(),]))* *")
+_PLACEHOLDER: Final = "é"  # stands for a parameter while Python parses; `_TOKENS` keeps it out of the input
+_DECLARED_NAME: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+_PARAMETER: Final = re.compile(rf"\$({_DECLARED_NAME.pattern})")
+_EXPRESSION: Final = re.compile(r"\$\{(.*)\}", re.DOTALL)
+_NOT_IN_FILE_NAMES: Final = re.compile(r"[^A-Za-z0-9.+-]+")
+
+Values = Mapping[str, str]
+
+_INTEGERS: Final = ("integer", "int", "unsignedInt", "unsignedShort")
+_TYPES: Final = ("double", *_INTEGERS, "boolean", "string", "dateTime")
+_RULES: Final[Mapping[str, Callable[[float, float], bool]]] = {
+    "equalTo": operator.eq,
+    "greaterThan": operator.gt,
+    "lessThan": operator.lt,
+    "greaterOrEqual": operator.ge,
+    "lessOrEqual": operator.le,
+    "notEqualTo": operator.ne,
+}
+
+
+def _round(value: float) -> float:
+    """Rounds halves away from zero; Python's `round` rounds them to even."""
+    return math.copysign(math.floor(abs(value) + 0.5), value)
+
+
+def _sign(value: float) -> float:
+    return 0.0 if value == 0.0 else math.copysign(1.0, value)
+
+
+_UNARY: Final[Mapping[str, Callable[[float], float]]] = {
+    "round": _round,
+    "floor": lambda value: float(math.floor(value)),
+    "ceil": lambda value: float(math.ceil(value)),
+    "sqrt": math.sqrt,
+    "sin": math.sin,
+    "cos": math.cos,
+    "tan": math.tan,
+    "asin": math.asin,
+    "acos": math.acos,
+    "atan": math.atan,
+    "sign": _sign,
+    "abs": abs,
+}
+_BINARY: Final[Mapping[str, Callable[[float, float], float]]] = {"max": max, "min": min, "pow": math.pow}
+FUNCTIONS: Final = (*_UNARY, *_BINARY)
+
+
+# -- expressions
+
+
+def evaluate(text: str, values: Mapping[str, str]) -> float:
+    """The value of the text between `${` and `}`. Raises ConfigError with the reason, but without a place."""
+    if len(text) > EXPRESSION_CHARACTERS_MAX:
+        raise ConfigError(f"{len(text)} characters, allowed are {EXPRESSION_CHARACTERS_MAX}")
+    if not _TOKENS.fullmatch(text):
+        raise ConfigError("allowed are numbers, $parameters, + - * / % ( ) and functions")
+    names: list[str] = []
+
+    def placeholder(found: re.Match[str]) -> str:
+        names.append(found[1])
+        return f" {_PLACEHOLDER}{len(names) - 1} "
+
+    try:
+        tree = ast.parse(_PARAMETER.sub(placeholder, text).strip(), mode="eval")
+        found = _value(
+            tree.body, {f"{_PLACEHOLDER}{i}": _number(name, values) for i, name in enumerate(names)}
+        )
+    except (SyntaxError, ValueError, OverflowError, ZeroDivisionError, RecursionError, MemoryError) as error:
+        raise ConfigError(_reason(error)) from error
+    if not math.isfinite(found):
+        raise ConfigError("the result is not a finite number")
+    return found
+
+
+def _reason(error: Exception) -> str:
+    match error:
+        case ZeroDivisionError():
+            return "division by zero"
+        case OverflowError():
+            return "the result is too large"
+        case ValueError():
+            return "outside of the function's domain"
+        case _:
+            return "not understood as arithmetic"
+
+
+def _number(name: str, values: Mapping[str, str]) -> float:
+    if name not in values:
+        raise unknown("parameter", name, values)
+    found = finite(values[name])
+    if found is None:
+        raise ConfigError(f"${name} is {values[name]!r}, allowed is a number")
+    return found
+
+
+def _value(node: ast.expr, places: Mapping[str, float]) -> float:
+    match node:
+        case ast.Constant(value=int() | float() as value) if not isinstance(value, bool):
+            return float(value)
+        case ast.Name(id=name) if name in places:
+            return places[name]
+        case ast.Name(id=name):
+            raise ConfigError(f"the name {name!r}: a parameter is written ${name}")
+        case ast.UnaryOp(op=ast.USub(), operand=operand):
+            return -_value(operand, places)
+        case ast.UnaryOp(op=ast.UAdd(), operand=operand):
+            return _value(operand, places)
+        case ast.BinOp(left=left, op=operator, right=right):
+            return _binary(operator, _value(left, places), _value(right, places))
+        case ast.Call(func=ast.Name(id=name), args=arguments, keywords=[]):
+            return _call(name, [_value(argument, places) for argument in arguments])
+        case _:
+            raise ConfigError(f"{type(node).__name__} is no arithmetic")
+
+
+def _binary(operator: ast.operator, left: float, right: float) -> float:
+    match operator:
+        case ast.Add():
+            return left + right
+        case ast.Sub():
+            return left - right
+        case ast.Mult():
+            return left * right
+        case ast.Div():
+            return left / right
+        case ast.Mod():
+            if right == 0.0:
+                raise ZeroDivisionError
+            return math.fmod(left, right)
+        case _:
+            raise ConfigError(f"the operator {type(operator).__name__} is none of + - * / %")
+
+
+def _call(name: str, arguments: list[float]) -> float:
+    match arguments:
+        case [value] if name in _UNARY:
+            return _UNARY[name](value)
+        case [left, right] if name in _BINARY:
+            return _BINARY[name](left, right)
+    if name not in FUNCTIONS:
+        raise unknown("function", name, FUNCTIONS)
+    raise ConfigError(f"{name} takes {1 if name in _UNARY else 2} arguments, found {len(arguments)}")
+
+
+# -- parameters
+
+
+def declared(root: Element) -> list[str]:
+    """The names of the parameters declared at the root of the file. A variation may set these."""
+    found = [group for group in root.children if group.tag == "ParameterDeclarations"]
+    return [_name(one) for group in found for one in group.children if one.has("name")]
+
+
+def substituted(element: Element, variation: Values, outer: Values | None = None) -> Element:
+    """A copy of the tree with every parameter replaced by its value.
+
+    `variation` overrules the values declared in `element` itself; `outer` are the values of its surroundings.
+    """
+    outer = outer or {}
+    values = outer
+    for group in element.children:
+        if group.tag == "ParameterDeclarations":
+            values = _declared_values(group, values, variation)
+    copy = Element(element.path, element.line, element.tag, {})
+    copy.text = element.text
+    copy.attributes = {name: _replaced(element, name, outer) for name in element.attributes}
+    copy.children = [
+        substituted(child, {}, values) for child in element.children if child.tag != "ParameterDeclarations"
+    ]
+    return copy
+
+
+def replaced_below(entry: Element, assigned: Values) -> Element:
+    """A catalog entry with its own parameters replaced by the values that the reference to it assigns."""
+    strange = sorted(set(assigned) - set(declared(entry)))
+    if strange:
+        raise entry.error(str(unknown("parameter", strange[0], declared(entry))))
+    return substituted(entry, assigned)
+
+
+def _declared_values(group: Element, outer: Values, variation: Values) -> Values:
+    values = dict(outer)
+    for one in group.children:
+        if one.tag != "ParameterDeclaration":
+            raise one.error("allowed is ParameterDeclaration")
+        one.visit()
+        name = _name(one)
+        values[name] = variation.get(name, _replaced(one, "value", values) if one.has("value") else "")
+        if not one.has("value"):
+            raise one.error("attribute 'value' is missing")
+        _check(one, name, values[name], values)
+    return values
+
+
+def _name(one: Element) -> str:
+    name = one.word("name").removeprefix("$")
+    if not _DECLARED_NAME.fullmatch(name):
+        raise one.wrong("name", "letters, digits and _, with no digit in front")
+    return name
+
+
+def _check(one: Element, name: str, value: str, values: Values) -> None:
+    """Check that the value is of the declared type and satisfies at least one ConstraintGroup."""
+    kind = one.choice("parameterType", _TYPES)
+    number = finite(value)
+    shown = f"{name} = {value[:SHOWN_CHARACTERS_MAX]!r}"
+    if kind in ("double", *_INTEGERS) and number is None:
+        raise one.error(f"{shown}, allowed is a number")
+    if kind in _INTEGERS and number is not None and number != int(number):
+        raise one.error(f"{shown}, allowed is a whole number")
+    if kind.startswith("unsigned") and number is not None and number < 0:
+        raise one.error(f"{shown}, allowed is 0 or more")
+    for other in one.children:
+        if other.tag != "ConstraintGroup":
+            raise other.error("allowed is ConstraintGroup")
+    if one.children and not any(_holds(group, value, values) for group in one.children):
+        raise one.error(f"{shown} keeps to no ConstraintGroup")
+
+
+def _holds(group: Element, value: str, values: Values) -> bool:
+    for constraint in group.children:
+        if constraint.tag != "ValueConstraint":
+            raise constraint.error("allowed is ValueConstraint")
+    return all(
+        _obeys(value, one.choice("rule", tuple(_RULES)), _replaced(one, "value", values))
+        for one in group.children
+    )
+
+
+def _obeys(value: str, rule: str, limit: str) -> bool:
+    """Numbers are compared as numbers; texts can only be equal or not."""
+    left, right = finite(value), finite(limit)
+    if left is None or right is None:
+        return value == limit if rule == "equalTo" else rule == "notEqualTo" and value != limit
+    return _RULES[rule](left, right)
+
+
+def _replaced(element: Element, name: str, values: Values) -> str:
+    text = element.word(name)
+    if reference := _PARAMETER.fullmatch(text):
+        if reference[1] not in values:
+            raise element.error(f"{name}: {unknown('parameter', reference[1], values)}")
+        return values[reference[1]]
+    if expression := _EXPRESSION.fullmatch(text):
+        try:
+            return repr(evaluate(expression[1], values))
+        except ConfigError as error:
+            shown = text[:SHOWN_CHARACTERS_MAX]
+            raise element.error(f"{name}: {shown!r}: {error}") from error
+    return text
+
+
+# -- variations
+
+
+def variations_of(root: Element, scenario: str, parameters: list[str], seed: int) -> list[Values]:
+    """The sets of values that the distribution `root` gives to the `parameters` of the file `scenario`."""
+    definition = root.one("ParameterValueDistribution")
+    file = definition.one("ScenarioFile")
+    if PurePosixPath(file.word("filepath").replace("\\", "/")).name != scenario:
+        raise file.wrong("filepath", f"a path to {scenario}")
+    kind = definition.one("Deterministic", "Stochastic")
+    found = _deterministic(kind) if kind.tag == "Deterministic" else _stochastic(kind, seed)
+    for name in found[0]:
+        if name not in parameters:
+            raise kind.error(str(unknown(f"parameter of {scenario}", name, parameters)))
+    return found
+
+
+def variation_name(stem: str, values: Values) -> str:
+    """The name of a scenario with these values: `brake-EgoSpeed-50-Gap-12`."""
+    full = "-".join([stem, *(f"{name}-{value.removesuffix('.0')}" for name, value in values.items())])
+    name = _NOT_IN_FILE_NAMES.sub("_", full)
+    if len(name) > NAME_CHARACTERS_MAX or name != full:
+        name = (
+            f"{name[: NAME_CHARACTERS_MAX - 9]}-{hashlib.blake2b(full.encode(), digest_size=4).hexdigest()}"
+        )
+    return name
+
+
+# -- deterministic
+
+
+def _deterministic(kind: Element) -> list[Values]:
+    axes: list[list[dict[str, str]]] = []
+    for one in kind.every(
+        "DeterministicSingleParameterDistribution", "DeterministicMultiParameterDistribution"
+    ):
+        if one.tag == "DeterministicSingleParameterDistribution":
+            name = one.word("parameterName").removeprefix("$")
+            axes.append([{name: value} for value in _values(one)])
+        else:
+            sets = one.one("ValueSetDistribution").every("ParameterValueSet")
+            axes.append([_assigned(group) for group in sets])
+    if not axes or not all(axes):
+        raise kind.error("no distribution, or one without values")
+    count = math.prod(len(axis) for axis in axes)
+    if count > VARIATIONS_MAX:
+        raise kind.error(f"{count} variations, allowed are {VARIATIONS_MAX}")
+    names = [sorted({name for values in axis for name in values}) for axis in axes]
+    for first, second in itertools.combinations(names, 2):
+        if twice := sorted(set(first) & set(second)):
+            raise kind.error(f"parameter {twice[0]!r} stands in two distributions")
+    return [
+        {name: value for values in choice for name, value in values.items()}
+        for choice in itertools.product(*axes)
+    ]
+
+
+def _values(one: Element) -> list[str]:
+    kind = one.one("DistributionSet", "DistributionRange")
+    if kind.tag == "DistributionSet":
+        return [element.word("value") for element in kind.every("Element")]
+    lower, upper = _limits(kind.one("Range"))
+    step = kind.number("stepWidth")
+    if step <= 0.0:
+        raise kind.wrong("stepWidth", "more than 0")
+    steps = (upper - lower) / step
+    if steps >= VARIATIONS_MAX:
+        raise kind.error(f"{steps + 1:.0f} values, allowed are {VARIATIONS_MAX}")
+    return [_decimal(lower + i * step) for i in range(math.floor(steps + _STEP_EPSILON) + 1)]
+
+
+def _limits(limits: Element) -> tuple[float, float]:
+    lower, upper = limits.number("lowerLimit"), limits.number("upperLimit")
+    if upper < lower or not math.isfinite(upper - lower):
+        raise limits.wrong("upperLimit", f"{lower:g}, the lowerLimit, or more")
+    return lower, upper
+
+
+def _assigned(group: Element) -> dict[str, str]:
+    assigned: dict[str, str] = {}
+    for one in group.every("ParameterAssignment"):
+        name = one.word("parameterRef").removeprefix("$")
+        if name in assigned:
+            raise one.error(f"parameter {name!r} stands twice")
+        assigned[name] = one.word("value")
+    return assigned
+
+
+def _decimal(value: float) -> str:
+    """Rounded to 9 decimals; a whole number without a point."""
+    rounded = round(value, 9)
+    return str(int(rounded)) if rounded == int(rounded) else repr(rounded)
+
+
+# -- stochastic
+
+
+def _stochastic(kind: Element, seed: int) -> list[Values]:
+    runs = kind.number("numberOfTestRuns")
+    if not 1 <= runs <= VARIATIONS_MAX or runs != int(runs):
+        raise kind.wrong("numberOfTestRuns", f"a whole number, 1 to {VARIATIONS_MAX}")
+    chance = random.Random(repr(kind.number("randomSeed", float(seed))))
+    distributions = kind.every("StochasticDistribution")
+    if not distributions:
+        raise kind.error("no StochasticDistribution")
+    names = [one.word("parameterName").removeprefix("$") for one in distributions]
+    if len(set(names)) < len(names):
+        raise kind.error("a parameter stands in two distributions")
+    return [
+        {name: _draw(one, chance) for name, one in zip(names, distributions, strict=True)}
+        for _ in range(int(runs))
+    ]
+
+
+def _draw(one: Element, chance: random.Random) -> str:
+    kind = one.one("UniformDistribution", "NormalDistribution", "ProbabilityDistributionSet", "Histogram")
+    match kind.tag:
+        case "UniformDistribution":
+            return _decimal(chance.uniform(*_limits(kind.one("Range"))))
+        case "NormalDistribution":
+            return _decimal(_draw_normal(kind, chance))
+        case "ProbabilityDistributionSet":
+            elements = kind.every("Element")
+            words = [element.word("value") for element in elements]
+            return words[_weighted(kind, elements, chance)]
+        case _:
+            bins = kind.every("Bin")
+            limits = [_limits(one.one("Range")) for one in bins]
+            return _decimal(chance.uniform(*limits[_weighted(kind, bins, chance)]))
+
+
+def _draw_normal(kind: Element, chance: random.Random) -> float:
+    mean, variance = kind.number("expectedValue"), kind.number("variance")
+    if variance < 0.0:
+        raise kind.wrong("variance", "0 or more")
+    limits = kind.maybe("Range")
+    lower, upper = _limits(limits) if limits else (-math.inf, math.inf)
+    for _ in range(_DRAWS_MAX):
+        value = chance.gauss(mean, math.sqrt(variance))
+        if lower <= value <= upper and math.isfinite(value):
+            return value
+    raise kind.error(f"none of {_DRAWS_MAX} draws falls into the range")
+
+
+def _weighted(kind: Element, choices: list[Element], chance: random.Random) -> int:
+    """The index of the choice that is drawn."""
+    weights = [one.number("weight") for one in choices]
+    if not weights or min(weights) < 0.0 or not 0.0 < sum(weights) < math.inf:
+        raise kind.error("weights have to be 0 or more, and not all 0")
+    return chance.choices(range(len(weights)), weights)[0]

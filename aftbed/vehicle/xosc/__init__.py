@@ -1,1 +1,0 @@
-"""OpenSCENARIO XML files, read: the parts of `aftbed.vehicle.openscenario`."""
