@@ -39,7 +39,7 @@ import msgspec
 from aftbed.core.busfault import FALLBACK, Condition
 from aftbed.vehicle.aeb.messages import STAGE_WARN
 from aftbed.vehicle.can.dbc_file import Codec
-from aftbed.vehicle.can.e2e import COUNTER_COUNT, ChannelState, Receiver, Status, Supervision, protect
+from aftbed.vehicle.can.e2e import P11, ChannelState, FrameStatus, Receiver, Supervision
 from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.plant import STEP_US, Driver, Plant, Telemetry, VehicleResult
 from aftbed.vehicle.scenarios.scenario import Scenario
@@ -77,7 +77,7 @@ class Sender:
         self._codec = codec
         self._name = name
         self._can_id = codec.can_id(name)
-        self._data_id = codec.data_id(name)
+        self._protection = P11(codec.data_id(name))
         self._cycle_us = codec.cycle_us(name)
         self._offset_us = offset_us
         self._counter = 0
@@ -93,8 +93,8 @@ class Sender:
     def frame(self, t_us: int, signals: Mapping[str, float]) -> Frame:
         """The next frame of this message; CRC and counter are filled in."""
         data = self._codec.encode(self._name, {"CRC": 0, "COUNTER": 0, **signals})
-        data = protect(data, self._data_id, self._counter)
-        self._counter = (self._counter + 1) % COUNTER_COUNT
+        data = self._protection.protect(data, self._counter)
+        self._counter = (self._counter + 1) % P11.counter_count
         return Frame(t_us, self._can_id, data)
 
 
@@ -164,7 +164,7 @@ class BrakeEcu:
         self._policy = policy
         self._aeb_req_id = codec.can_id("AEB_REQ")
         self._receiver = Receiver(
-            Supervision(codec.data_id("AEB_REQ"), codec.cycle_us("AEB_REQ"), AEB_REQ_TIMEOUT_US)
+            Supervision(P11(codec.data_id("AEB_REQ")), codec.cycle_us("AEB_REQ"), AEB_REQ_TIMEOUT_US)
         )
         self._status = Sender(codec, "BRAKE_STATUS")
         self._ego = Sender(codec, "EGO_STATE")
@@ -178,7 +178,7 @@ class BrakeEcu:
             return
         first = self._receiver.state is ChannelState.NODATA
         status = self._receiver.check(frame.data, frame.t_us)
-        if status is not Status.OK and not (first and status is Status.WRONGSEQUENCE):
+        if status is not FrameStatus.OK and not (first and status is FrameStatus.WRONGSEQUENCE):
             self.noticed.append((frame.can_id, status.name.lower()))
         if not self._receiver.usable(status):
             self.refused += 1

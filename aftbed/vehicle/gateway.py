@@ -30,7 +30,7 @@ from aftbed.vehicle.aeb.messages import (
     encode_request,
 )
 from aftbed.vehicle.can.dbc_file import Codec
-from aftbed.vehicle.can.e2e import ChannelState, Receiver, Status, Supervision, protect
+from aftbed.vehicle.can.e2e import P11, ChannelState, FrameStatus, Receiver, Supervision
 from aftbed.vehicle.can.frame import Frame
 
 LANE_HALF_M: Final = 1.5  # half a lane, less half of what a car may stick into it without being in our way
@@ -122,7 +122,7 @@ class ReplySender:
     def __init__(self, codec: Codec) -> None:
         self._codec = codec
         self._aeb_req_id = codec.can_id("AEB_REQ")
-        self._data_id = codec.data_id("AEB_REQ")
+        self._protection = P11(codec.data_id("AEB_REQ"))
         self._heartbeats = {replica: f"FTM_HEARTBEAT_{replica}" for replica in REPLICAS}
         self._heartbeat_cycle_us = codec.cycle_us(self._heartbeats[1])
         self._heartbeat_us: int | None = None
@@ -141,7 +141,7 @@ class ReplySender:
             "TTC": min(output.ttc_s or 0.0, TTC_MAX_S),
             "SEQUENCE": answered & 0xFFFF,
         }
-        data = protect(self._codec.encode("AEB_REQ", signals), self._data_id, output.counter)
+        data = self._protection.protect(self._codec.encode("AEB_REQ", signals), output.counter)
         return [*self._heartbeat(t_us, replica, epoch, answered), Frame(t_us, self._aeb_req_id, data)]
 
     def _heartbeat(self, t_us: int, replica: int, epoch: int, answered: int) -> list[Frame]:
@@ -242,15 +242,16 @@ class Gateway:
         status = receiver.check(frame.data, frame.t_us)
         reason = receiver.refusal(frame.data, status)
         if reason is None:
-            if status is Status.OK_SOMELOST:
+            if status is FrameStatus.OK_SOMELOST:
                 self.noticed.append((frame.can_id, "lost"))
             return True
         self.counts.refuse(reason)
-        if not first or status is not Status.WRONGSEQUENCE:  # which is all that a first frame can be
+        if not first or status is not FrameStatus.WRONGSEQUENCE:  # which is all that a first frame can be
             self.noticed.append((frame.can_id, reason))
         return False
 
 
 def _receiver(codec: Codec, name: str) -> Receiver:
     cycle_us = codec.cycle_us(name)
-    return Receiver(Supervision(codec.data_id(name), cycle_us, TIMEOUT_CYCLES * cycle_us, codec.length(name)))
+    profile, length = P11(codec.data_id(name)), codec.length(name)
+    return Receiver(Supervision(profile, cycle_us, TIMEOUT_CYCLES * cycle_us, length))

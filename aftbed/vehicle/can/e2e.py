@@ -39,14 +39,14 @@ the next frame can only start a new sequence (WRONGSEQUENCE). Time is passed in.
 
 Limits: P01 and P11 may, by the specification, have CRC and counter apart; the library has them side by side,
 so we do. In `alt` of P01 and in P02 a flipped bit of the counter changes which byte of the data id is meant
-as well: for one pair of bytes in 256 the two errors cancel out (`ambiguous`), and a frame seems lost or
+as well: for one pair of bytes in 256 the two errors cancel out, and a frame seems lost or
 repeated. In all others every single flipped bit is found.
 """
 
+from abc import abstractmethod
 from collections import deque
 from enum import Enum, auto
-from itertools import combinations
-from typing import Final, Literal, assert_never
+from typing import ClassVar, Final, Literal, assert_never
 
 import msgspec
 from e2e.p01 import (
@@ -78,7 +78,58 @@ _P01_MODES: Final = {
 _P11_MODES: Final = {"both": E2E_P11_DATAID_BOTH, "nibble": E2E_P11_DATAID_NIBBLE}
 
 
-class P01(msgspec.Struct, frozen=True):
+# -- profiles -----------------------------------------------------------------------------------
+
+
+class Profile(msgspec.Struct, frozen=True):
+    """How one message is protected: where its header is, and the CRC over it."""
+
+    counter_count: ClassVar[int] = 15  # values of the counter, from 0; in P01 and P11, 15 is never sent
+    counter_mask: ClassVar[int] = 0x0F  # of the byte with the counter
+
+    @property
+    @abstractmethod
+    def counter_place(self) -> int:
+        """The byte of the data that has the counter, the last one of the header."""
+
+    @abstractmethod
+    def _write_crc(self, frame: bytearray) -> None:
+        """Put in the CRC, and a nibble of the data id where one is sent."""
+
+    @abstractmethod
+    def _check(self, frame: bytearray) -> bool:
+        """Whether CRC, counter value and sent nibble are right. The library needs it writable."""
+
+    @property
+    def bytes_min(self) -> int:
+        """The least number of data bytes that have room for the header."""
+        return self.counter_place + 1
+
+    def counter_of(self, data: bytes) -> int:
+        """The counter in `data`, which is long enough; right or wrong."""
+        return data[self.counter_place] & self.counter_mask
+
+    def protect(self, data: bytes, counter: int) -> bytes:
+        """`data` with the header in its place; its other bits stay as they are."""
+        assert 0 <= counter < self.counter_count
+        assert len(data) >= self.bytes_min
+        frame = bytearray(data)
+        frame[self.counter_place] = data[self.counter_place] & ~self.counter_mask | counter
+        self._write_crc(frame)
+        return bytes(frame)
+
+    def is_intact(self, data: bytes) -> bool:
+        """True if CRC, counter value and a sent nibble are right; says nothing about the sequence."""
+        return len(data) >= self.bytes_min and self._check(bytearray(data))
+
+
+def _check_data_id(data_id: int, mode: str, offset: int) -> None:
+    """All of these are ours, or were checked."""
+    assert 0 <= data_id <= (NIBBLE_ID_MAX if mode == "nibble" else DATA_ID_MAX)
+    assert offset >= 0
+
+
+class P01(Profile, frozen=True):
     """Profile 1. `offset`, of the header, is in bytes."""
 
     data_id: int
@@ -86,34 +137,65 @@ class P01(msgspec.Struct, frozen=True):
     offset: int = 0
 
     def __post_init__(self) -> None:
-        """All of these are ours, or were checked."""
-        assert 0 <= self.data_id <= (NIBBLE_ID_MAX if self.mode == "nibble" else DATA_ID_MAX)
-        assert self.offset >= 0
+        _check_data_id(self.data_id, self.mode, self.offset)
+
+    @property
+    def counter_place(self) -> int:
+        return self.offset + 1
+
+    def _write_crc(self, frame: bytearray) -> None:
+        mode = _P01_MODES[self.mode]
+        e2e_p01_protect(frame, self.data_id, data_id_mode=mode, offset=self.offset, increment_counter=False)
+
+    def _check(self, frame: bytearray) -> bool:
+        return e2e_p01_check(frame, self.data_id, data_id_mode=_P01_MODES[self.mode], offset=self.offset)
 
 
-class P02(msgspec.Struct, frozen=True):
+class P02(Profile, frozen=True):
     """Profile 2, with the list of sixteen data ids of a byte each."""
+
+    counter_count: ClassVar[int] = 16
 
     data_ids: bytes
 
     def __post_init__(self) -> None:
-        """All of these are ours, or were checked."""
         assert len(self.data_ids) == LIST_IDS
 
+    @property
+    def counter_place(self) -> int:
+        return 1
 
-class P05(msgspec.Struct, frozen=True):
+    def _write_crc(self, frame: bytearray) -> None:
+        e2e_p02_protect(frame, self.data_ids, increment_counter=False)
+
+    def _check(self, frame: bytearray) -> bool:
+        return e2e_p02_check(frame, self.data_ids)
+
+
+class P05(Profile, frozen=True):
     """Profile 5. `offset`, of the header, is in bytes."""
+
+    counter_count: ClassVar[int] = 256
+    counter_mask: ClassVar[int] = 0xFF
 
     data_id: int
     offset: int = 0
 
     def __post_init__(self) -> None:
-        """All of these are ours, or were checked."""
-        assert 0 <= self.data_id <= DATA_ID_MAX
-        assert self.offset >= 0
+        _check_data_id(self.data_id, "both", self.offset)
+
+    @property
+    def counter_place(self) -> int:
+        return self.offset + 2
+
+    def _write_crc(self, frame: bytearray) -> None:
+        e2e_p05_protect(frame, self.data_id, offset=self.offset, increment_counter=False)
+
+    def _check(self, frame: bytearray) -> bool:
+        return e2e_p05_check(frame, self.data_id, offset=self.offset)
 
 
-class P11(msgspec.Struct, frozen=True):
+class P11(Profile, frozen=True):
     """Profile 11. `offset`, of the header, is in bytes."""
 
     data_id: int
@@ -121,119 +203,35 @@ class P11(msgspec.Struct, frozen=True):
     offset: int = 0
 
     def __post_init__(self) -> None:
-        """All of these are ours, or were checked."""
-        assert 0 <= self.data_id <= (NIBBLE_ID_MAX if self.mode == "nibble" else DATA_ID_MAX)
-        assert self.offset >= 0
+        _check_data_id(self.data_id, self.mode, self.offset)
+
+    @property
+    def counter_place(self) -> int:
+        return self.offset + 1
+
+    def _write_crc(self, frame: bytearray) -> None:
+        mode = _P11_MODES[self.mode]
+        e2e_p11_protect(frame, self.data_id, data_id_mode=mode, offset=self.offset, increment_counter=False)
+
+    def _check(self, frame: bytearray) -> bool:
+        return e2e_p11_check(frame, self.data_id, data_id_mode=_P11_MODES[self.mode], offset=self.offset)
 
 
-Profile = P01 | P02 | P05 | P11
+def protect(data: bytes, data_id: int, counter: int) -> bytes:
+    """`data` with counter and CRC by profile 11, as on our own bus."""
+    return P11(data_id).protect(data, counter)
 
 
-def counter_count(profile: Profile) -> int:
-    """How many values the counter has, from 0: after so many frames it is as it was."""
-    match profile:
-        case P01() | P11():
-            return 15  # 15 is never sent
-        case P02():
-            return 16
-        case P05():
-            return 256
-        case _:
-            assert_never(profile)
+def intact(data: bytes, data_id: int) -> bool:
+    """True if CRC and counter are right by profile 11, as on our own bus."""
+    return P11(data_id).is_intact(data)
 
 
-def counter_place(profile: Profile) -> int:
-    """The byte of the data that has the counter: all of it in P05, else in its low nibble."""
-    match profile:
-        case P01() | P11():
-            return profile.offset + 1
-        case P02():
-            return 1
-        case P05():
-            return profile.offset + 2
-        case _:
-            assert_never(profile)
+# -- supervision --------------------------------------------------------------------------------
 
 
-def bytes_min(profile: Profile) -> int:
-    """The least number of data bytes in which the header has its place: it ends with the counter."""
-    return counter_place(profile) + 1
-
-
-def counter_of(profile: Profile, data: bytes) -> int:
-    """The counter in `data`, which is long enough; right or wrong."""
-    byte = data[counter_place(profile)]
-    return byte if isinstance(profile, P05) else byte & 0x0F
-
-
-def with_e2e(profile: Profile, data: bytes, counter: int) -> bytes:
-    """`data` with the header in its place; its other bits stay as they are."""
-    assert 0 <= counter < counter_count(profile)
-    assert len(data) >= bytes_min(profile)
-    frame = bytearray(_with_counter(profile, data, counter))
-    match profile:
-        case P01(data_id, mode, at):
-            e2e_p01_protect(frame, data_id, data_id_mode=_P01_MODES[mode], offset=at, increment_counter=False)
-        case P02(data_ids):
-            e2e_p02_protect(frame, data_ids, increment_counter=False)
-        case P05(data_id, at):
-            e2e_p05_protect(frame, data_id, offset=at, increment_counter=False)
-        case P11(data_id, mode, at):
-            e2e_p11_protect(frame, data_id, data_id_mode=_P11_MODES[mode], offset=at, increment_counter=False)
-        case _:
-            assert_never(profile)
-    return bytes(frame)
-
-
-def is_intact(profile: Profile, data: bytes) -> bool:
-    """True if the CRC, the counter's value and a sent nibble are right; says nothing about the sequence."""
-    if len(data) < bytes_min(profile):
-        return False
-    frame = bytearray(data)  # the library wants to be able to write, and does not
-    match profile:
-        case P01(data_id, mode, at):
-            return e2e_p01_check(frame, data_id, data_id_mode=_P01_MODES[mode], offset=at)
-        case P02(data_ids):
-            return e2e_p02_check(frame, data_ids)
-        case P05(data_id, at):
-            return e2e_p05_check(frame, data_id, offset=at)
-        case P11(data_id, mode, at):
-            return e2e_p11_check(frame, data_id, data_id_mode=_P11_MODES[mode], offset=at)
-        case _:
-            assert_never(profile)
-
-
-def ambiguous(profile: Profile, length: int) -> list[tuple[int, int]]:
-    """Pairs of counters one bit apart that these data ids do not tell apart in frames of `length` bytes.
-
-    A frame with one of a pair whose counter becomes the other on its way is still taken for whole. Its
-    other bits are as they were sent, so what remains is that a frame seems lost or repeated. A CRC is
-    linear, so what is true of one content is true of all. Only `alt` of P01 and P02 can have such pairs.
-    """
-    counters = range(counter_count(profile))
-    frames = [with_e2e(profile, bytes(length), counter) for counter in counters]
-    return [
-        (one, other)
-        for one, other in combinations(counters, 2)
-        if (one ^ other).bit_count() == 1 and is_intact(profile, _with_counter(profile, frames[one], other))
-    ]
-
-
-def _with_counter(profile: Profile, data: bytes, counter: int) -> bytes:
-    """`data` with another counter, and the CRC as it was."""
-    place = counter_place(profile)
-    byte = counter if isinstance(profile, P05) else (data[place] & 0xF0) | counter
-    return data[:place] + bytes([byte]) + data[place + 1 :]
-
-
-# -- supervision ----------------------------------------------------------------------------
-
-
-COUNTER_COUNT: Final = 15  # of profile 11, 0 to 14: 15 is never sent
-
-
-class Status(Enum):
-    """What is said of one frame, or of its absence."""
+class FrameStatus(Enum):
+    """The judgement of one frame, or of its absence."""
 
     OK = auto()
     OK_SOMELOST = auto()
@@ -243,11 +241,11 @@ class Status(Enum):
     NONEWDATA = auto()
 
 
-GOOD: Final = frozenset({Status.OK, Status.OK_SOMELOST})
+GOOD: Final = frozenset({FrameStatus.OK, FrameStatus.OK_SOMELOST})
 
 
 class ChannelState(Enum):
-    """What is said of one message's channel as a whole."""
+    """The judgement of one message's channel as a whole."""
 
     NODATA = auto()
     INIT = auto()
@@ -256,12 +254,9 @@ class ChannelState(Enum):
 
 
 class Supervision(msgspec.Struct, frozen=True):
-    """How one message is watched. The counter must not be able to wrap within `timeout_us`.
+    """How one message is supervised. The counter must not be able to wrap within `timeout_us`."""
 
-    `protection` is its profile; a data id alone is profile 11 with it, as all of our own messages have.
-    """
-
-    protection: Profile | int
+    profile: Profile
     cycle_us: int
     timeout_us: int
     length: int = 8
@@ -272,27 +267,12 @@ class Supervision(msgspec.Struct, frozen=True):
 
     def __post_init__(self) -> None:
         """All of these are ours, never a peer's."""
-        count = counter_count(self.profile)
-        assert self.length >= bytes_min(self.profile)
+        count = self.profile.counter_count
+        assert self.length >= self.profile.bytes_min
         assert 1 <= self.delta_max < count
         assert self.cycle_us < self.timeout_us < count * self.cycle_us
         assert 1 <= self.ok_min <= self.window_size
         assert 0 <= self.errors_max < self.window_size
-
-    @property
-    def profile(self) -> Profile:
-        """What the frames are protected by."""
-        return P11(self.protection) if isinstance(self.protection, int) else self.protection
-
-
-def protect(data: bytes, data_id: int, counter: int) -> bytes:
-    """`data` with counter and CRC by profile 11, as on our own bus; its other bits stay as they are."""
-    return with_e2e(P11(data_id), data, counter)
-
-
-def intact(data: bytes, data_id: int) -> bool:
-    """True if CRC and counter are right by profile 11, as on our own bus; says nothing about the sequence."""
-    return is_intact(P11(data_id), data)
 
 
 class Receiver:
@@ -302,52 +282,52 @@ class Receiver:
         self.supervision = supervision
         self.state = ChannelState.NODATA
         self._profile = supervision.profile
-        self._counter_count = counter_count(self._profile)
+        self._counter_count = self._profile.counter_count
         self._counter: int | None = None  # None: no sequence to compare with
         self._good_us = 0  # when the last frame with a right CRC came
         self._looked_us = 0  # when time was last accounted for, by a frame or by NONEWDATA
-        self._window: deque[Status] = deque(maxlen=supervision.window_size)
+        self._window: deque[FrameStatus] = deque(maxlen=supervision.window_size)
 
-    def check(self, data: bytes, now_us: int) -> Status:
+    def check(self, data: bytes, now_us: int) -> FrameStatus:
         """Judge one frame that arrived at `now_us`, and move the channel's state."""
         self._expire(now_us)
         status = self._judge(data)
-        if status is not Status.ERROR:
-            self._counter = counter_of(self._profile, data)
+        if status is not FrameStatus.ERROR:
+            self._counter = self._profile.counter_of(data)
             self._good_us = now_us
         self._looked_us = now_us
         self._add(status)
         return status
 
-    def poll(self, now_us: int) -> Status | None:
+    def poll(self, now_us: int) -> FrameStatus | None:
         """NONEWDATA, counted once for each whole cycle without a frame; None if it is not due yet."""
         if self.state is ChannelState.NODATA:
-            return Status.NONEWDATA  # nothing has ever come: there is no cycle to miss
+            return FrameStatus.NONEWDATA  # nothing has ever come: there is no cycle to miss
         missed = (now_us - self._looked_us) // self.supervision.cycle_us
         if missed < 1:
             return None
         for _ in range(min(missed, self.supervision.window_size)):
-            self._add(Status.NONEWDATA)
+            self._add(FrameStatus.NONEWDATA)
         self._looked_us += missed * self.supervision.cycle_us
         self._expire(now_us)
-        return Status.NONEWDATA
+        return FrameStatus.NONEWDATA
 
-    def usable(self, status: Status) -> bool:
+    def usable(self, status: FrameStatus) -> bool:
         """True if the frame that was just judged `status` may be believed."""
         return status in GOOD and self.state is ChannelState.VALID
 
-    def refusal(self, data: bytes, status: Status) -> str | None:
+    def refusal(self, data: bytes, status: FrameStatus) -> str | None:
         """Why the frame that was just judged `status` may not be believed, in a word; None if it may."""
         if self.usable(status):
             return None
         match status:
-            case Status.ERROR:
+            case FrameStatus.ERROR:
                 return "length" if len(data) != self.supervision.length else "checksum"
-            case Status.REPEATED:
+            case FrameStatus.REPEATED:
                 return "repeated"
-            case Status.WRONGSEQUENCE:
+            case FrameStatus.WRONGSEQUENCE:
                 return "sequence"
-            case Status.OK | Status.OK_SOMELOST | Status.NONEWDATA:
+            case FrameStatus.OK | FrameStatus.OK_SOMELOST | FrameStatus.NONEWDATA:
                 return "channel"
             case _:
                 assert_never(status)
@@ -356,17 +336,17 @@ class Receiver:
         """True if no good frame came for longer than the timeout, or none ever."""
         return self._counter is None or now_us - self._good_us > self.supervision.timeout_us
 
-    def _judge(self, data: bytes) -> Status:
-        if len(data) != self.supervision.length or not is_intact(self._profile, data):
-            return Status.ERROR
+    def _judge(self, data: bytes) -> FrameStatus:
+        if len(data) != self.supervision.length or not self._profile.is_intact(data):
+            return FrameStatus.ERROR
         if self._counter is None:
-            return Status.WRONGSEQUENCE
-        delta = (counter_of(self._profile, data) - self._counter) % self._counter_count
+            return FrameStatus.WRONGSEQUENCE
+        delta = (self._profile.counter_of(data) - self._counter) % self._counter_count
         if delta == 0:
-            return Status.REPEATED
+            return FrameStatus.REPEATED
         if delta == 1:
-            return Status.OK
-        return Status.OK_SOMELOST if delta <= self.supervision.delta_max else Status.WRONGSEQUENCE
+            return FrameStatus.OK
+        return FrameStatus.OK_SOMELOST if delta <= self.supervision.delta_max else FrameStatus.WRONGSEQUENCE
 
     def _expire(self, now_us: int) -> None:
         """Void the sequence after a silence in which the counter may have wrapped unseen."""
@@ -375,15 +355,15 @@ class Receiver:
             self._window.clear()
             self.state = ChannelState.INVALID
 
-    def _add(self, status: Status) -> None:
+    def _add(self, status: FrameStatus) -> None:
         """The window state machine of the PRS, with one set of limits for all states."""
         if self.state is ChannelState.NODATA:
-            if status is Status.ERROR:
+            if status is FrameStatus.ERROR:
                 return
             self.state = ChannelState.INIT
         self._window.append(status)
         good = sum(entry in GOOD for entry in self._window)
-        errors = self._window.count(Status.ERROR)
+        errors = self._window.count(FrameStatus.ERROR)
         if errors > self.supervision.errors_max:
             self.state = ChannelState.INVALID
         elif good >= self.supervision.ok_min:

@@ -43,8 +43,6 @@ from aftbed.vehicle.can.e2e import (
     P01Mode,
     Profile,
     Supervision,
-    bytes_min,
-    counter_count,
 )
 from aftbed.vehicle.can.frame import CAN_ID_MAX
 
@@ -404,12 +402,12 @@ class _Binding:
     def _watch(self, key: str, given: E2EMap, length: int, number: int, of: int) -> Supervision:
         """The supervision of one message by E2E."""
         profile = self._profile(key, given, number, of)
-        if length < bytes_min(profile):
-            allowed = f"at most {given.offset - bytes_min(profile) + length}, by the length"
+        if length < profile.bytes_min:
+            allowed = f"at most {given.offset - profile.bytes_min + length}, by the length"
             raise self._error(f"{key}.offset", str(given.offset), allowed)
         cycle_ms = given.cycle_ms or self._file.cycle_ms
         timeout_ms = given.timeout_ms or E2E_TIMEOUT_CYCLES * cycle_ms
-        turn_ms = counter_count(profile) * cycle_ms
+        turn_ms = profile.counter_count * cycle_ms
         if not cycle_ms < timeout_ms < turn_ms:
             allowed = (
                 f"more than {cycle_ms}, a cycle, and less than {turn_ms}, in which the counter comes round"

@@ -5,11 +5,11 @@ from e2e.crc import calculate_crc8
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aftbed.vehicle.can.e2e import COUNTER_COUNT, ChannelState, Receiver, Status, Supervision, intact, protect
+from aftbed.vehicle.can.e2e import P11, ChannelState, FrameStatus, Receiver, Supervision, intact, protect
 
 ID = 0x1130
 CYCLE_US = 20_000
-WATCH = Supervision(ID, CYCLE_US, 6 * CYCLE_US)
+WATCH = Supervision(P11(ID), CYCLE_US, 6 * CYCLE_US)
 
 
 def crc8_j1850(data: bytes, start: int = 0xFF, end: int = 0xFF) -> int:
@@ -69,27 +69,27 @@ def synchronised() -> Receiver:
 @pytest.mark.parametrize(
     ("data", "status"),
     [
-        (frame(5), Status.OK),
-        (frame(6), Status.OK_SOMELOST),
-        (frame(7), Status.OK_SOMELOST),
-        (frame(8), Status.WRONGSEQUENCE),
-        (frame(3), Status.WRONGSEQUENCE),
-        (frame(4), Status.REPEATED),
-        (protect(bytes(8), ID + 1, 5), Status.ERROR),  # masquerade: right, but another message's
-        (frame(5)[:7], Status.ERROR),
-        (frame(5) + b"\0", Status.ERROR),
-        (protect(bytes(7), ID, 5), Status.ERROR),  # right, but of another length
-        (b"", Status.ERROR),
+        (frame(5), FrameStatus.OK),
+        (frame(6), FrameStatus.OK_SOMELOST),
+        (frame(7), FrameStatus.OK_SOMELOST),
+        (frame(8), FrameStatus.WRONGSEQUENCE),
+        (frame(3), FrameStatus.WRONGSEQUENCE),
+        (frame(4), FrameStatus.REPEATED),
+        (protect(bytes(8), ID + 1, 5), FrameStatus.ERROR),  # masquerade: right, but another message's
+        (frame(5)[:7], FrameStatus.ERROR),
+        (frame(5) + b"\0", FrameStatus.ERROR),
+        (protect(bytes(7), ID, 5), FrameStatus.ERROR),  # right, but of another length
+        (b"", FrameStatus.ERROR),
     ],
 )
-def test_status_of_the_frame_after_counter_4(data: bytes, status: Status) -> None:
+def test_status_of_the_frame_after_counter_4(data: bytes, status: FrameStatus) -> None:
     assert synchronised().check(data, 5 * CYCLE_US) is status
 
 
 def test_the_counter_goes_from_14_to_0() -> None:
     receiver = Receiver(WATCH)
-    statuses = [receiver.check(frame(n % COUNTER_COUNT), n * CYCLE_US) for n in range(40)]
-    assert statuses == [Status.WRONGSEQUENCE] + [Status.OK] * 39
+    statuses = [receiver.check(frame(n % P11.counter_count), n * CYCLE_US) for n in range(40)]
+    assert statuses == [FrameStatus.WRONGSEQUENCE] + [FrameStatus.OK] * 39
 
 
 @pytest.mark.parametrize("lost", range(3, 40))
@@ -97,16 +97,16 @@ def test_no_loss_is_overlooked_however_the_counter_wraps(lost: int) -> None:
     """15 frames lost are one whole wrap: the counter says OK, so the timeout has to see it."""
     receiver = synchronised()
     gap_us = (lost + 1) * CYCLE_US
-    status = receiver.check(frame((5 + lost) % COUNTER_COUNT), 4 * CYCLE_US + gap_us)
+    status = receiver.check(frame((5 + lost) % P11.counter_count), 4 * CYCLE_US + gap_us)
     assert not receiver.usable(status)
     if gap_us > WATCH.timeout_us:
-        assert (status, receiver.state) == (Status.WRONGSEQUENCE, ChannelState.INVALID)
+        assert (status, receiver.state) == (FrameStatus.WRONGSEQUENCE, ChannelState.INVALID)
 
 
 def test_the_counter_alone_would_overlook_one_wrap() -> None:
     """The reason for the timeout, and proof that the test above can fail."""
     receiver = synchronised()
-    assert receiver.check(frame((5 + 15) % COUNTER_COUNT), 5 * CYCLE_US) is Status.OK
+    assert receiver.check(frame((5 + 15) % P11.counter_count), 5 * CYCLE_US) is FrameStatus.OK
 
 
 def test_after_a_silence_the_second_frame_is_believed_again() -> None:
@@ -117,7 +117,7 @@ def test_after_a_silence_the_second_frame_is_believed_again() -> None:
 
 
 def test_the_timeout_has_its_edge_where_it_says() -> None:
-    for beyond_us, expected in ((0, Status.OK), (1, Status.WRONGSEQUENCE)):
+    for beyond_us, expected in ((0, FrameStatus.OK), (1, FrameStatus.WRONGSEQUENCE)):
         receiver = synchronised()
         assert receiver.check(frame(5), 4 * CYCLE_US + WATCH.timeout_us + beyond_us) is expected
 
@@ -149,15 +149,15 @@ def test_window_state_machine(story: str, state: ChannelState) -> None:
 
     A letter is a cycle: Error, Far counter, Ok, Repeated, No new data.
     """
-    receiver = Receiver(Supervision(ID, CYCLE_US, 14 * CYCLE_US, window_size=5, ok_min=2, errors_max=2))
+    receiver = Receiver(Supervision(P11(ID), CYCLE_US, 14 * CYCLE_US, window_size=5, ok_min=2, errors_max=2))
     counter = 0
     for number, letter in enumerate(story):
         now_us = (number + 1) * CYCLE_US
         if letter == "N":
-            assert receiver.poll(now_us) is Status.NONEWDATA
+            assert receiver.poll(now_us) is FrameStatus.NONEWDATA
             continue
         counter += {"E": 0, "F": 7, "O": 1, "R": 0}[letter]
-        receiver.check(bytes(8) if letter == "E" else frame(counter % COUNTER_COUNT), now_us)
+        receiver.check(bytes(8) if letter == "E" else frame(counter % P11.counter_count), now_us)
     assert receiver.state is state
 
 
@@ -165,9 +165,9 @@ def test_poll_counts_each_missed_cycle_once() -> None:
     receiver = synchronised()
     last_us = 4 * CYCLE_US
     assert receiver.poll(last_us + CYCLE_US - 1) is None
-    assert receiver.poll(last_us + CYCLE_US) is Status.NONEWDATA
+    assert receiver.poll(last_us + CYCLE_US) is FrameStatus.NONEWDATA
     assert receiver.poll(last_us + CYCLE_US + 1) is None
-    assert receiver.poll(last_us + 4 * CYCLE_US) is Status.NONEWDATA
+    assert receiver.poll(last_us + 4 * CYCLE_US) is FrameStatus.NONEWDATA
     assert _state_after_poll(receiver, last_us + 4 * CYCLE_US) is ChannelState.VALID
     assert _state_after_poll(receiver, last_us + 5 * CYCLE_US) is ChannelState.INVALID
 
@@ -193,9 +193,9 @@ def test_noise_is_an_error_unless_it_is_whole_by_chance(noise: list[tuple[bytes,
     for data, gap_us in noise:
         now_us += gap_us
         status = receiver.check(data, now_us)
-        assert (status is Status.ERROR) == (len(data) != 8 or not intact(data, ID))
+        assert (status is FrameStatus.ERROR) == (len(data) != 8 or not intact(data, ID))
 
 
 def test_supervision_refuses_a_timeout_in_which_the_counter_can_wrap() -> None:
     with pytest.raises(AssertionError):
-        Supervision(ID, CYCLE_US, 15 * CYCLE_US)
+        Supervision(P11(ID), CYCLE_US, 15 * CYCLE_US)

@@ -7,7 +7,7 @@ from puredrive import CODEC
 
 from aftbed.core.errors import ConfigError
 from aftbed.vehicle.aeb.messages import decode_request
-from aftbed.vehicle.can.e2e import P01, P02, P05, P11, Profile, counter_count, with_e2e
+from aftbed.vehicle.can.e2e import P01, P02, P05, P11, Profile
 from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.replay.mapped_gateway import MappedGateway
 
@@ -79,7 +79,7 @@ def sealed(t_ms: float, can_id: int, profile: Profile, counter: int, range_m: fl
     payload = round(range_m * 100).to_bytes(2, "big") + bytes(
         [-5 & 0xFF, 0]
     )  # -2 m/s, in the middle, not valid
-    data = with_e2e(profile, bytes(4) + payload, counter % counter_count(profile))
+    data = profile.protect(bytes(4) + payload, counter % profile.counter_count)
     return Frame(round(t_ms * 1000), can_id, data)
 
 
