@@ -24,13 +24,18 @@ from aftbed.core.graph import Graph
 from aftbed.core.words import milliseconds, whole_milliseconds
 from aftbed.ftm.compose import build
 from aftbed.inject.words import parse
-from aftbed.interop.openscenario.importer import ImportedFile, ImportOptions, import_scenario, write
+from aftbed.interop.openscenario.importer import (
+    ImportedFile,
+    ImportOptions,
+    import_scenario,
+    write,
+)
 from aftbed.judge.verdict import EXIT_INTERRUPTED
 from aftbed.report.roadplot import Curve, Point, road_plot
 from aftbed.runtime import targets
 from aftbed.search.road_table import NONE, PRIMARY, Line, Row, driven, drives, outage
 from aftbed.search.worst_instant import STEP_CYCLES
-from aftbed.vehicle.plant import KMH_PER_MS, Lead
+from aftbed.vehicle.plant import KMH_PER_MS, LeadCar
 from aftbed.vehicle.scenarios import tables
 from aftbed.vehicle.scenarios.library import load_scenario, scenario_names
 from aftbed.vehicle.scenarios.scenario import Scenario
@@ -112,7 +117,7 @@ def _case(name: str) -> tables.Case | None:
     return next((case for case in tables.cases(table) if case.name == name), None)
 
 
-def _ahead(lead: Lead | None) -> str:
+def _ahead(lead: LeadCar | None) -> str:
     if lead is None:
         return "an empty road"
     words = [f"a car {lead.gap_m:.1f} m ahead at {lead.speed_ms * KMH_PER_MS:.1f} km/h"]

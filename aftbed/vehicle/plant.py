@@ -82,7 +82,7 @@ class CutIn(msgspec.Struct, frozen=True):
     over_ms: int
 
 
-class Lead(msgspec.Struct, frozen=True):
+class LeadCar(msgspec.Struct, frozen=True):
     """The car ahead at the start of the drive; `lateral_m` is to the left of the middle of our lane."""
 
     gap_m: float
@@ -112,7 +112,7 @@ class PlantSetup(msgspec.Struct, frozen=True):
     """The start of a drive. `lead` None is an empty road, `driver` None one who heeds no warning."""
 
     speed_ms: float
-    lead: Lead | None = None
+    lead: LeadCar | None = None
     friction: float = 0.9
     brakes: Brakes = Brakes()
     driver: Driver | None = None

@@ -12,7 +12,7 @@ from roads import sudden_course
 from aftbed.core.fault import Hang
 from aftbed.search.road_table import closing_speed_ms, impact_kmh, residual_kmh
 from aftbed.search.worst_instant import worst_instant
-from aftbed.vehicle.plant import KMH_PER_MS, Lead, Plant, PlantSetup, VehicleResult
+from aftbed.vehicle.plant import KMH_PER_MS, LeadCar, Plant, PlantSetup, VehicleResult
 from aftbed.vehicle.scenarios.library import load_scenario
 
 FULL_MS2: Final = 9.0
@@ -22,7 +22,7 @@ FUNCTION_KMH: Final = 0.1
 
 def last_moment(speed_ms: float, gap_m: float, brake_at_ms: int) -> VehicleResult:
     """Full braking from that millisecond on, without any function."""
-    plant = Plant(PlantSetup(speed_ms, Lead(gap_m)))
+    plant = Plant(PlantSetup(speed_ms, LeadCar(gap_m)))
     for t_ms in range(20_000):
         if plant.stopped():
             return plant.result()

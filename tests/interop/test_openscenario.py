@@ -19,10 +19,15 @@ from xoscfiles import (
     refused,
 )
 
-from aftbed.interop.openscenario.importer import ImportedFile, ImportOptions, import_scenario, write
+from aftbed.interop.openscenario.importer import (
+    ImportedFile,
+    ImportOptions,
+    import_scenario,
+    write,
+)
 from aftbed.interop.openscenario.storyboard import ImportedDrive
 from aftbed.runtime.sim.world import Setup, simulate
-from aftbed.vehicle.plant import Lead, LeadBraking
+from aftbed.vehicle.plant import LeadBraking, LeadCar
 from aftbed.vehicle.scenarios.library import load_scenario
 from aftbed.vehicle.scenarios.scenario import Scenario
 
@@ -46,7 +51,7 @@ def test_the_car_ahead_brakes(tmp_path: Path) -> None:
     assert found.description == "the car ahead brakes"
     assert found.duration_ms == 12_000
     assert found.plant.speed_ms == pytest.approx(50 / 3.6)
-    assert found.plant.lead == Lead(40.0, found.plant.speed_ms, LeadBraking(1000, 6.0, 0))
+    assert found.plant.lead == LeadCar(40.0, found.plant.speed_ms, LeadBraking(1000, 6.0, 0))
     assert found.plant.friction == 0.9
     assert found.expect.outcome == "no_collision"
 

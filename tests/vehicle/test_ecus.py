@@ -6,7 +6,7 @@ from puredrive import CODEC
 from aftbed.vehicle.can.e2e import protect
 from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.ecus import BrakeEcu, BrakePolicy, Fallback, RadarEcu, Sender
-from aftbed.vehicle.plant import Lead, Plant, PlantSetup
+from aftbed.vehicle.plant import LeadCar, Plant, PlantSetup
 
 FULL, WARN, NONE = (3, 9.0), (1, 0.0), (0, 0.0)
 
@@ -15,7 +15,7 @@ class Bench:
     """A brake ECU on a car at 20 m/s; `request` sends AEB_REQ, `run` lets time pass."""
 
     def __init__(self, policy: BrakePolicy = "latch", speed_ms: float = 20.0) -> None:
-        self.plant = Plant(PlantSetup(speed_ms, Lead(200.0)))
+        self.plant = Plant(PlantSetup(speed_ms, LeadCar(200.0)))
         self.brake = BrakeEcu(CODEC, policy)
         self.counter = 0
 
@@ -133,7 +133,7 @@ def test_the_status_says_what_the_brakes_do() -> None:
 
 
 def test_every_message_comes_in_its_cycle_and_the_track_last() -> None:
-    plant = Plant(PlantSetup(10.0, Lead(100.0)))
+    plant = Plant(PlantSetup(10.0, LeadCar(100.0)))
     brake, radar = BrakeEcu(CODEC, "latch"), RadarEcu(CODEC, 1)
     seen: dict[int, list[int]] = {}
     for _ in range(1000):
@@ -151,7 +151,7 @@ def test_every_message_comes_in_its_cycle_and_the_track_last() -> None:
 
 
 def test_the_radar_sees_the_truth_through_bounded_noise_and_says_what_is_new() -> None:
-    plant, radar = Plant(PlantSetup(10.0, Lead(155.0))), RadarEcu(CODEC, 3)
+    plant, radar = Plant(PlantSetup(10.0, LeadCar(155.0))), RadarEcu(CODEC, 3)
     new_at_m = []
     while plant.gap_m is not None and plant.gap_m > 20.0:
         for frame in radar.frames(plant):
@@ -169,7 +169,7 @@ def test_the_radar_sees_the_truth_through_bounded_noise_and_says_what_is_new() -
 
 
 def test_the_noise_comes_from_the_seed_alone() -> None:
-    plant = Plant(PlantSetup(10.0, Lead(50.0)))
+    plant = Plant(PlantSetup(10.0, LeadCar(50.0)))
     same, again, other = (RadarEcu(CODEC, seed).frames(plant) for seed in (1, 1, 2))
     assert same == again != other
 

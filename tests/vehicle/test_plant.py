@@ -2,7 +2,7 @@
 
 import pytest
 
-from aftbed.vehicle.plant import GRAVITY_MS2, Brakes, CutIn, Lead, LeadBraking, Plant, PlantSetup
+from aftbed.vehicle.plant import GRAVITY_MS2, Brakes, CutIn, LeadBraking, LeadCar, Plant, PlantSetup
 
 
 def run(plant: Plant, steps: int, demand_ms2: float) -> Plant:
@@ -42,7 +42,7 @@ def test_no_tyre_gives_more_than_its_grip(friction: float) -> None:
 
 
 def test_stopping_distance() -> None:
-    plant = run(Plant(PlantSetup(50 / 3.6, Lead(100.0))), 4000, 9.0)
+    plant = run(Plant(PlantSetup(50 / 3.6, LeadCar(100.0))), 4000, 9.0)
     result = plant.result()
     speed_ms, grip_ms2 = 50 / 3.6, 0.9 * GRAVITY_MS2
     distance_m = speed_ms * 0.2 + speed_ms**2 / (2 * grip_ms2)  # dead time and lag, then full grip
@@ -53,7 +53,7 @@ def test_stopping_distance() -> None:
 
 @pytest.mark.parametrize(("gap_m", "speed_ms"), [(10.0, 13.89), (10.005, 13.89), (0.001, 30.0), (7.77, 5.0)])
 def test_contact_is_found_inside_the_step(gap_m: float, speed_ms: float) -> None:
-    plant = run(Plant(PlantSetup(speed_ms, Lead(gap_m))), 3000, 0.0)
+    plant = run(Plant(PlantSetup(speed_ms, LeadCar(gap_m))), 3000, 0.0)
     result = plant.result()
     assert result.collision
     assert result.impact_speed_kmh == pytest.approx(speed_ms * 3.6)
@@ -61,7 +61,7 @@ def test_contact_is_found_inside_the_step(gap_m: float, speed_ms: float) -> None
 
 
 def test_impact_speed_while_braking_is_that_of_energy() -> None:
-    plant = run(Plant(PlantSetup(20.0, Lead(25.0), friction=0.8)), 3000, 9.0)
+    plant = run(Plant(PlantSetup(20.0, LeadCar(25.0), friction=0.8)), 3000, 9.0)
     braked_m = 25.0 - 20.0 * 0.2
     expected_ms = (20.0**2 - 2 * (0.8 * GRAVITY_MS2 + 0.2) * braked_m) ** 0.5
     assert plant.result().impact_speed_kmh == pytest.approx(expected_ms * 3.6, rel=0.03)
@@ -69,7 +69,7 @@ def test_impact_speed_while_braking_is_that_of_energy() -> None:
 
 def test_the_gap_changes_by_the_mean_speeds_and_contact_is_interpolated() -> None:
     """Every step of a drive into a braking car, against the trapezoids worked out here."""
-    plant = run(Plant(PlantSetup(20.0, Lead(30.0, 15.0, LeadBraking(0, 8.0)), friction=0.3)), 1, 9.0)
+    plant = run(Plant(PlantSetup(20.0, LeadCar(30.0, 15.0, LeadBraking(0, 8.0)), friction=0.3)), 1, 9.0)
     while True:
         gap_m, ego_ms, lead_ms = plant.gap_m, plant.speed_ms, plant.lead_speed_ms
         assert gap_m is not None
@@ -85,7 +85,7 @@ def test_the_gap_changes_by_the_mean_speeds_and_contact_is_interpolated() -> Non
 
 
 def test_a_lead_brakes_with_its_ramp_and_stops() -> None:
-    plant = Plant(PlantSetup(10.0, Lead(50.0, 12.0, LeadBraking(1000, 6.0, 500))))
+    plant = Plant(PlantSetup(10.0, LeadCar(50.0, 12.0, LeadBraking(1000, 6.0, 500))))
     assert run(plant, 1000, 0.0).lead_speed_ms == 12.0
     assert run(plant, 500, 0.0).lead_speed_ms == pytest.approx(12.0 - 6.0 * 0.5 / 2, abs=0.01)
     assert run(plant, 1000, 0.0).lead_speed_ms == pytest.approx(12.0 - 1.5 - 6.0, abs=0.01)
@@ -126,7 +126,7 @@ def test_after_one_lag_of_any_length_the_brakes_give_63_percent(lag_ms: int) -> 
 
 
 def test_a_car_beside_our_lane_is_passed_and_not_hit() -> None:
-    plant = run(Plant(PlantSetup(10.0, Lead(20.0, lateral_m=3.5))), 1999, 0.0)
+    plant = run(Plant(PlantSetup(10.0, LeadCar(20.0, lateral_m=3.5))), 1999, 0.0)
     assert plant.gap_m == pytest.approx(0.01)
     assert plant.ttc_s() == pytest.approx(0.001)
     run(plant, 2, 0.0)
@@ -137,7 +137,7 @@ def test_a_car_beside_our_lane_is_passed_and_not_hit() -> None:
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_a_car_cuts_in_evenly_and_its_gap_counts_from_when_it_is_in_the_way(side: float) -> None:
-    lead = Lead(30.0, 10.0, lateral_m=3.6 * side, cut_in=CutIn(1000, 2000))
+    lead = LeadCar(30.0, 10.0, lateral_m=3.6 * side, cut_in=CutIn(1000, 2000))
     plant = run(Plant(PlantSetup(12.0, lead)), 1000, 0.0)
     assert plant.lateral_m == 3.6 * side
     assert run(plant, 1000, 0.0).lateral_m == pytest.approx(1.8 * side)
@@ -147,15 +147,15 @@ def test_a_car_cuts_in_evenly_and_its_gap_counts_from_when_it_is_in_the_way(side
 
 
 def test_a_car_that_has_cut_in_is_hit_like_any_other() -> None:
-    lead = Lead(10.0, 10.0, lateral_m=3.0, cut_in=CutIn(0, 500))
+    lead = LeadCar(10.0, 10.0, lateral_m=3.0, cut_in=CutIn(0, 500))
     result = run(Plant(PlantSetup(20.0, lead)), 2000, 0.0).result()
     assert result.collision
     assert result.impact_speed_kmh == pytest.approx(36.0)
 
 
 def test_time_to_collision() -> None:
-    assert Plant(PlantSetup(10.0, Lead(20.0))).ttc_s() == 2.0
-    assert Plant(PlantSetup(10.0, Lead(20.0, 10.0))).ttc_s() is None
+    assert Plant(PlantSetup(10.0, LeadCar(20.0))).ttc_s() == 2.0
+    assert Plant(PlantSetup(10.0, LeadCar(20.0, 10.0))).ttc_s() is None
     assert Plant(PlantSetup(10.0)).ttc_s() is None
 
 

@@ -16,8 +16,8 @@ from aftbed.vehicle.plant import (
     STEP_US,
     Brakes,
     CutIn,
-    Lead,
     LeadBraking,
+    LeadCar,
     Plant,
     PlantSetup,
     VehicleResult,
@@ -96,7 +96,7 @@ def test_a_longer_outage_never_lowers_the_impact_speed(
 ) -> None:
     lead_ms = min(lead_ms, speed_ms / 2)
     ahead_m = gap_m(speed_ms - lead_ms, room, min(demand_ms2, friction * GRAVITY_MS2), onset_ms)
-    setup = PlantSetup(speed_ms, Lead(ahead_m, lead_ms), friction, able)
+    setup = PlantSetup(speed_ms, LeadCar(ahead_m, lead_ms), friction, able)
     start_ms = onset_ms + after_ms
     short = drive_by_clock(setup, demand_ms2, onset_ms, (start_ms, start_ms + outage_ms))
     long = drive_by_clock(setup, demand_ms2, onset_ms, (start_ms, start_ms + outage_ms + longer_ms))
@@ -113,7 +113,7 @@ def test_more_friction_never_raises_the_impact_speed(
     able: Brakes,
     onset_ms: int,
 ) -> None:
-    lead = Lead(gap_m(speed_ms, room, min(demand_ms2, friction * GRAVITY_MS2), onset_ms))
+    lead = LeadCar(gap_m(speed_ms, room, min(demand_ms2, friction * GRAVITY_MS2), onset_ms))
     slippery = drive_by_clock(PlantSetup(speed_ms, lead, friction, able), demand_ms2, onset_ms)
     rough = drive_by_clock(PlantSetup(speed_ms, lead, friction + more, able), demand_ms2, onset_ms)
     assert impact_kmh(rough) <= impact_kmh(slippery) + 1e-6
@@ -131,10 +131,10 @@ def test_a_later_start_changes_nothing(
 ) -> None:
     """The same approach, begun farther away, with all that happens by the clock that much later."""
 
-    def lead(begun_ms: int) -> Lead:
+    def lead(begun_ms: int) -> LeadCar:
         before_m = (speed_ms - lead_ms) * begun_ms / 1000
         braking = LeadBraking(500 + begun_ms, lead_ms2, 1000)
-        return Lead(gap_m + max(0.0, before_m), lead_ms, braking, 3.0, CutIn(begun_ms, 200))
+        return LeadCar(gap_m + max(0.0, before_m), lead_ms, braking, 3.0, CutIn(begun_ms, 200))
 
     lead_ms = min(lead_ms, speed_ms)
     now = drive_by_clock(PlantSetup(speed_ms, lead(0)), demand_ms2, onset_ms)
@@ -149,7 +149,7 @@ def test_a_later_start_changes_nothing(
 def test_half_the_step_changes_the_drive_by_less_than_three_centimetres(
     speed_ms: float, gap_m: float, demand_ms2: float, friction: float, onset_ms: int
 ) -> None:
-    setup = PlantSetup(speed_ms, Lead(gap_m), friction)
+    setup = PlantSetup(speed_ms, LeadCar(gap_m), friction)
     whole, half = (
         drive_by_clock(setup, demand_ms2, onset_ms, step_us=step_us) for step_us in (STEP_US, STEP_US // 2)
     )
@@ -188,7 +188,7 @@ def test_more_friction_never_raises_the_impact_speed_of_the_function(
     speed_ms = speed_kmh / 3.6
 
     def on(rough: float) -> float:
-        setup = PlantSetup(speed_ms, Lead(speed_ms * 4.0), rough)
+        setup = PlantSetup(speed_ms, LeadCar(speed_ms * 4.0), rough)
         return impact_kmh(drive(setup, 10_000, seed=seed).result)
 
     assert on(friction + more) <= on(friction) + 0.5  # km/h: the radar's noise meets another drive

@@ -240,7 +240,7 @@ def _open_hub(options: BusOptions) -> Bus:
     return Bus(bus, sock, sock.fileno())
 
 
-class Changes(Protocol):
+class ReceiptChanges(Protocol):
     """Who knows of frames that were got more or less often than they were sent: a `HubLine`."""
 
     disturbed: bool
@@ -274,7 +274,7 @@ class AnswerWatch:
         answer_id: int,
         on_frame: Callable[[Frame], None],
         question_id: int = -1,
-        line: Changes | None = None,
+        line: ReceiptChanges | None = None,
     ) -> None:
         self.answered = 0
         self.missing = 0
@@ -324,7 +324,7 @@ class AnswerWatch:
             self._change(self._line)
         return self._outstanding > 0
 
-    def _change(self, line: Changes) -> None:
+    def _change(self, line: ReceiptChanges) -> None:
         change = sum(change for can_id, change in line.changes() if can_id in self._ids)
         self._outstanding = max(0, min(self._outstanding + change, OUTSTANDING_MAX))
 

@@ -137,7 +137,7 @@ class Desk(Protocol):
         ...
 
 
-class Client(BusNode):
+class HubConnection(BusNode):
     """One connection: how far its handshake is, and what waits in either direction."""
 
     __slots__ = ("inbox", "interest", "opened", "outbox", "raw", "sock")
@@ -152,7 +152,7 @@ class Client(BusNode):
         self.interest = select.EPOLLIN
 
 
-class Hub(BusModel[Client]):
+class Hub(BusModel[HubConnection]):
     """The bus. `serve` makes one and runs it; it owns the connections, not the descriptors given."""
 
     def __init__(
@@ -168,13 +168,13 @@ class Hub(BusModel[Client]):
         self._desk = desk
         self._origin_ns = time.monotonic_ns() if options.origin_ns is None else options.origin_ns
         self._virtual_us = 0
-        self._time_master: Client | None = None
-        self._plant: Client | None = None  # the car
-        self._awaiting: tuple[Client, str, int] | None = (
+        self._time_master: HubConnection | None = None
+        self._plant: HubConnection | None = None  # the car
+        self._awaiting: tuple[HubConnection, str, int] | None = (
             None  # a client that waits for so many frames of a node
         )
-        self._held: dict[int, Client] = {}  # the car, by the number of the fault for which it waits
-        self._clients: dict[int, Client] = {}  # by descriptor
+        self._held: dict[int, HubConnection] = {}  # the car, by the number of the fault for which it waits
+        self._clients: dict[int, HubConnection] = {}  # by descriptor
         self._epoll = select.epoll()
         listener.setblocking(False)
         self._epoll.register(listener.fileno(), select.EPOLLIN)
@@ -253,7 +253,7 @@ class Hub(BusModel[Client]):
 
     # -- what the rules of the bus ask for ------------------------------------------------------
 
-    def deliver(self, frame: Frame, sender: str, receivers: Sequence[Client]) -> None:
+    def deliver(self, frame: Frame, sender: str, receivers: Sequence[HubConnection]) -> None:
         """The one place through which every frame passes: relay it, then record it."""
         self.counts.frames += 1
         seconds, micros = divmod(frame.t_us, 1_000_000)
@@ -268,7 +268,7 @@ class Hub(BusModel[Client]):
         if write(self._log_fd, line) != len(line):
             raise HarnessError("the bus log took only a part of a line: is the disk full?")
 
-    def dequeued(self, node: Client) -> None:
+    def dequeued(self, node: HubConnection) -> None:
         """It may have been too full to read more."""
         self._update_interest(node)
 
@@ -289,7 +289,7 @@ class Hub(BusModel[Client]):
 
     # -- elements -------------------------------------------------------------------------------
 
-    def _take(self, client: Client, element: bytes) -> None:
+    def _take(self, client: HubConnection, element: bytes) -> None:
         """Act on one element (without its `>`), or refuse it, having changed nothing."""
         try:
             if client.raw and element.startswith(b"< send "):
@@ -299,7 +299,7 @@ class Hub(BusModel[Client]):
         except PeerError as error:
             self._refuse(client, str(error))
 
-    def _command(self, client: Client, element: bytes) -> None:
+    def _command(self, client: HubConnection, element: bytes) -> None:
         """Everything but a frame."""
         if element == b"< echo ":
             self._send(client, b"< echo >")
@@ -317,7 +317,7 @@ class Hub(BusModel[Client]):
         else:
             raise PeerError("unknown command, or not now")
 
-    def _command_of_ours(self, client: Client, element: bytes) -> None:
+    def _command_of_ours(self, client: HubConnection, element: bytes) -> None:
         if (match := _TIME.fullmatch(element)) is not None:
             self._set_time(client, int(match[1]))
             self._send(client, self._ok())
@@ -339,7 +339,7 @@ class Hub(BusModel[Client]):
         else:
             raise PeerError("unknown command, or not now")
 
-    def _condition_met(self, car: Client, fault_number: int, t_us: int, since_ns: int) -> None:
+    def _condition_met(self, car: HubConnection, fault_number: int, t_us: int, since_ns: int) -> None:
         if not self.met(fault_number, self.now_us()) or self._desk is None:
             self._send(car, self._ok())
         elif self._options.lockstep:
@@ -356,12 +356,12 @@ class Hub(BusModel[Client]):
         due_us = self.disturber.due_us()
         return f"< ok {'-' if due_us is None else due_us} >".encode("ascii")
 
-    def _answer_await(self, client: Client, node: str, frames: int) -> None:
+    def _answer_await(self, client: HubConnection, node: str, frames: int) -> None:
         if any(c.name == node and c.carried >= frames for c in self._clients.values()):
             self._awaiting = None
             self._send(client, self._ok())
 
-    def _set_time(self, client: Client, t_us: int) -> None:
+    def _set_time(self, client: HubConnection, t_us: int) -> None:
         if not self._options.lockstep:
             raise PeerError("this bus runs in real time")
         if self._time_master not in (None, client):
@@ -373,7 +373,7 @@ class Hub(BusModel[Client]):
         self._time_master, self._virtual_us = client, t_us
         self.release(t_us)
 
-    def _refuse(self, client: Client, reason: str) -> None:
+    def _refuse(self, client: HubConnection, reason: str) -> None:
         self.counts.refused += 1
         seconds, micros = divmod(self.now_us(), 1_000_000)
         self._send(client, f"< error 20000000 {seconds}.{micros:06d} {reason} >".encode("ascii"))
@@ -391,11 +391,11 @@ class Hub(BusModel[Client]):
             return
         sock.setblocking(False)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        client = self._clients[sock.fileno()] = Client(sock)
+        client = self._clients[sock.fileno()] = HubConnection(sock)
         self._epoll.register(sock.fileno(), client.interest)
         self._send(client, b"< hi >")
 
-    def _drop(self, client: Client) -> None:
+    def _drop(self, client: HubConnection) -> None:
         """Disconnect. Frames that the node had handed over before still get their turn on the wire."""
         if self._clients.pop(client.sock.fileno(), None) is None:
             return
@@ -403,7 +403,7 @@ class Hub(BusModel[Client]):
         self._epoll.unregister(client.sock.fileno())
         client.sock.close()
 
-    def _receive(self, client: Client) -> None:
+    def _receive(self, client: HubConnection) -> None:
         try:
             data = client.sock.recv(READ_BYTES_MAX)
         except BlockingIOError:
@@ -422,7 +422,7 @@ class Hub(BusModel[Client]):
             self._drop(client)
         self._update_interest(client)
 
-    def _send(self, client: Client, data: bytes, flags: int = 0) -> None:
+    def _send(self, client: HubConnection, data: bytes, flags: int = 0) -> None:
         """Send, or queue what the socket does not take; a client with too much queued is disconnected."""
         sent = 0
         if not client.outbox:
@@ -440,7 +440,7 @@ class Hub(BusModel[Client]):
                 self._drop(client)
             self._update_interest(client)
 
-    def _flush(self, client: Client) -> None:
+    def _flush(self, client: HubConnection) -> None:
         try:
             del client.outbox[: client.sock.send(client.outbox, socket.MSG_NOSIGNAL)]
         except BlockingIOError:
@@ -450,7 +450,7 @@ class Hub(BusModel[Client]):
             return
         self._update_interest(client)
 
-    def _update_interest(self, client: Client) -> None:
+    def _update_interest(self, client: HubConnection) -> None:
         """Ask only for the events that can be served: a client with a full queue is not read."""
         interest = select.EPOLLOUT if client.outbox else 0
         if len(client.frames) < FRAMES_QUEUED_MAX:

@@ -170,7 +170,7 @@ class Flag(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     values: Annotated[tuple[int, ...], Meta(min_length=1)]
 
 
-class Count(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class ObjectCount(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How many objects follow, said by a message that comes before them."""
 
     message: str
@@ -199,7 +199,7 @@ class TrackMap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     lateral_offset: Distance | None = None
     angle: Angle | None = None
     slot: str | None = None
-    count: Count | None = None
+    count: ObjectCount | None = None
     valid: str | Flag | None = None
     new: str | Flag | None = None
     checksum: Checksum = "none"
@@ -232,7 +232,7 @@ SHIPPED: Final = Path(__file__).resolve().parent / "maps"  # maps, and the DBCs 
 E2E_TIMEOUT_CYCLES: Final = 6  # as on our own bus
 
 
-class Rule(msgspec.Struct, frozen=True):
+class FrameRule(msgspec.Struct, frozen=True):
     """How to judge the frames of one CAN id.
 
     `name` None: not in the DBC. `watch`: by E2E, and then there is neither checksum nor counter beside it.
@@ -258,7 +258,7 @@ class BoundMap(msgspec.Struct, frozen=True):
 
     map: MapFile
     codec: Codec
-    rules: dict[int, Rule]
+    rules: dict[int, FrameRule]
     ego_id: int
     cycle_end_id: int | None
     count_id: int | None
@@ -304,7 +304,7 @@ class _Binding:
         self._path = path
         self._codec = codec
         self._file = file
-        self._rules: dict[int, Rule] = {}
+        self._rules: dict[int, FrameRule] = {}
 
     def bound(self) -> BoundMap:
         file, tracks = self._file, self._file.tracks
@@ -391,13 +391,13 @@ class _Binding:
         slot: int | None,
         number: int,
         of: int,
-    ) -> Rule:
+    ) -> FrameRule:
         if not isinstance(given.checksum, E2EMap):
-            return Rule(can_id, name, given.length, given.checksum, given.counter, None, slot)
+            return FrameRule(can_id, name, given.length, given.checksum, given.counter, None, slot)
         if given.counter is not None:
             raise self._error(f"{key}.counter", "a signal", f"none, as {given.checksum.profile} has its own")
         watch = self._watch(f"{key}.checksum", given.checksum, given.length, number, of)
-        return Rule(can_id, name, given.length, "none", None, watch, slot)
+        return FrameRule(can_id, name, given.length, "none", None, watch, slot)
 
     def _watch(self, key: str, given: E2EMap, length: int, number: int, of: int) -> Supervision:
         """The supervision of one message by E2E."""

@@ -23,7 +23,7 @@ from aftbed.vehicle.can.dbc_file import Codec
 from aftbed.vehicle.can.e2e import Receiver
 from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.gateway import GatewayCounts, ReplySender, target_of
-from aftbed.vehicle.replay.map_file import TO_SI, Flag, Quantity, Rule, bind
+from aftbed.vehicle.replay.map_file import TO_SI, Flag, FrameRule, Quantity, bind
 from aftbed.vehicle.replay.slots import SlotBook
 
 FRESH_CYCLES: Final = 1.5  # a log's time stamps come in batches, so a cycle may look longer than it was
@@ -85,7 +85,7 @@ class MappedGateway:
         """See `BusGateway.on_reply`."""
         return self._sender.frames(reply, t_us, replica, epoch, answered)
 
-    def _accept(self, frame: Frame, rule: Rule) -> str | None:
+    def _accept(self, frame: Frame, rule: FrameRule) -> str | None:
         """Take what the frame says, or say why not; then nothing has changed."""
         if frame.t_us < self._t_us:
             return "time"
@@ -112,7 +112,7 @@ class MappedGateway:
         """True unless it is the same frame again. Lost frames are no reason to refuse the next."""
         return counter is not None and counter < modulo and counter != self._counters.get(can_id)
 
-    def _take(self, frame: Frame, rule: Rule, signals: dict[str, float]) -> bool:
+    def _take(self, frame: Frame, rule: FrameRule, signals: dict[str, float]) -> bool:
         """Keep a track or the ego speed. False, and nothing kept, if a value is beyond any sensor."""
         if frame.can_id == self._bound.ego_id:
             speed_ms = _si(self._bound.map.ego.speed, signals, frame.data)

@@ -18,8 +18,8 @@ from aftbed.vehicle.plant import (
     Brakes,
     CutIn,
     Driver,
-    Lead,
     LeadBraking,
+    LeadCar,
     PlantSetup,
     VehicleResult,
 )
@@ -138,8 +138,8 @@ def _brakes(keys: BrakesKeys) -> Brakes:
     return Brakes(_ms(keys.dead_time_s), _ms(keys.lag_s), keys.jerk_max_ms3, keys.deceleration_max_ms2)
 
 
-def _lead(where: str, keys: LeadKeys, ego_kmh: float) -> Lead:
-    return Lead(
+def _lead(where: str, keys: LeadKeys, ego_kmh: float) -> LeadCar:
+    return LeadCar(
         gap_m=_gap_m(where, keys, ego_kmh),
         speed_ms=keys.speed_kmh / KMH_PER_MS,
         braking=_braking(keys.braking) if keys.braking else None,

@@ -11,7 +11,7 @@ from aftbed.core.errors import ConfigError
 from aftbed.vehicle.aeb.messages import STAGE_FULL, STAGE_NONE, STAGE_WARN
 from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.ecus import Fallback
-from aftbed.vehicle.plant import Brakes, CutIn, Driver, Lead, LeadBraking, PlantSetup, VehicleResult
+from aftbed.vehicle.plant import Brakes, CutIn, Driver, LeadBraking, LeadCar, PlantSetup, VehicleResult
 from aftbed.vehicle.scenarios.library import load_scenario, scenario_names
 from aftbed.vehicle.scenarios.scenario import broken_expectations
 
@@ -19,7 +19,7 @@ NAMES = ["ccrb-50-12m", "ccrb-50-40m", "ccrm-50", "ccrs-20", "ccrs-42", "ccrs-50
 
 
 def standing(speed_kmh: float, ttc_s: float = 4.0) -> PlantSetup:
-    return PlantSetup(speed_kmh / 3.6, Lead(speed_kmh / 3.6 * ttc_s))
+    return PlantSetup(speed_kmh / 3.6, LeadCar(speed_kmh / 3.6 * ttc_s))
 
 
 # -- the shipped scenarios
@@ -81,7 +81,7 @@ def test_car_to_standing_car(speed_kmh: float, impact_kmh_max: float) -> None:
 @pytest.mark.parametrize(("speed_kmh", "lead_kmh"), [(30, 20), (60, 20), (60, 40), (80, 50)])
 def test_car_to_moving_car(speed_kmh: float, lead_kmh: float) -> None:
     closing_ms = (speed_kmh - lead_kmh) / 3.6
-    driven = drive(PlantSetup(speed_kmh / 3.6, Lead(closing_ms * 4.0, lead_kmh / 3.6)), 10_000)
+    driven = drive(PlantSetup(speed_kmh / 3.6, LeadCar(closing_ms * 4.0, lead_kmh / 3.6)), 10_000)
     assert not driven.result.collision
     assert driven.result.stop_gap_m is None, "braked to a stop behind a car that drives on"
 
@@ -90,9 +90,9 @@ def test_car_to_moving_car(speed_kmh: float, lead_kmh: float) -> None:
 def test_following_another_car_is_no_reason_to_brake(seed: int) -> None:
     """At 0.9 s of headway, the car ahead easing off and going on."""
     gentle = LeadBraking(2000, 0.5, 1000)
-    driven = drive(PlantSetup(50 / 3.6, Lead(12.5, 50 / 3.6)), 10_000, seed=seed)
+    driven = drive(PlantSetup(50 / 3.6, LeadCar(12.5, 50 / 3.6)), 10_000, seed=seed)
     assert {decision.output.stage for decision in driven.decisions} == {STAGE_NONE}
-    driven = drive(PlantSetup(50 / 3.6, Lead(30.0, 50 / 3.6, gentle)), 6_000, seed=seed)
+    driven = drive(PlantSetup(50 / 3.6, LeadCar(30.0, 50 / 3.6, gentle)), 6_000, seed=seed)
     assert not driven.result.braked
 
 
@@ -168,7 +168,7 @@ def write(folder: Path, text: str) -> str:
 
 def test_a_file_becomes_a_scenario_in_si_units(tmp_path: Path) -> None:
     scenario = load_scenario(write(tmp_path, GOOD))
-    lead = Lead(40.0, 5.0, LeadBraking(1000, 6.0, 500))
+    lead = LeadCar(40.0, 5.0, LeadBraking(1000, 6.0, 500))
     assert scenario.plant == PlantSetup(10.0, lead, 0.5, Brakes(jerk_max_ms3=30.0), Driver(1200, 4.0))
     assert (scenario.name, scenario.duration_ms, scenario.expect.outcome) == ("mine", 5000, "impact")
 
@@ -178,7 +178,7 @@ def test_what_is_left_out_has_the_values_of_the_plant(tmp_path: Path) -> None:
     for key in ("road", "brakes", "driver"):
         text = "\n".join(line for line in text.splitlines() if not line.startswith(key))
     scenario = load_scenario(write(tmp_path, text))
-    assert scenario.plant == PlantSetup(10.0, Lead(40.0, 5.0, LeadBraking(1000, 6.0, 1000)))
+    assert scenario.plant == PlantSetup(10.0, LeadCar(40.0, 5.0, LeadBraking(1000, 6.0, 1000)))
     assert scenario.plant.brakes == Brakes(dead_time_ms=100, lag_ms=100)
 
 
