@@ -4,23 +4,23 @@
     brake ECU <---AEB_REQ----- gateway <---reply---
     brake ECU --BRAKE_STATUS, EGO_STATE--> gateway
 
-In each step the brake ECU takes what has arrived, both ECUs send what is due, and the plant moves by
-1 ms under the brakes: `body` has them, and the end of the drive; here is what carries their frames.
+In each step the brake ECU takes what has arrived, both ECUs send what is due, and the plant moves by 1 ms
+under the brakes (`ecus.CarBody`). This module carries their frames.
 
 *Paced* (`pace` 1.0 is real time, N is N times faster): steps stand on a fixed schedule of the wall
-clock. After a hiccup they are made up for, never skipped, so the car drives the same road however
-loaded the machine is; only the answers come later.
+clock. Late steps are made up for, never skipped, so the car drives the same road on a loaded machine; only
+the answers come later.
 
 *Lockstep* (`pace` None, "max"): virtual time, as fast as it goes. When frames are due, the hub is
 given the time of the step; the brake ECU sends, and the radar sends only after those frames have been
 over the wire, so they come in this order; then time stands still until the AEB_REQ that answers the
-RADAR_TRACK has come to the brake ECU. Where the bus has faults, the hub says what more or less there is
-to wait for, and when something comes of them by itself (`HubLine`). Nothing depends on the machine: the
+RADAR_TRACK has come to the brake ECU. Where the bus has faults, the hub sends what more or less there is
+to wait for, and when a fault acts next by itself (`HubLine`). Nothing depends on the machine: the
 same seed gives the same frames, byte for byte in the bus log. A function that does not answer is waited for
 3 s once, then shortly (`AnswerWatch`), and its misses are counted: a dead function does not hang the run.
 
-In either, the conditions at which faults of the bus open are looked at in every step, before its frames are
-sent; and what the brake ECU has found wrong with a frame is said beside the bus.
+In both, the conditions at which faults open are checked in every step, before its frames are sent; and what
+the brake ECU has found wrong with a frame is reported beside the bus.
 """
 
 from collections.abc import Callable, Sequence
@@ -64,13 +64,13 @@ class DriveReport(msgspec.Struct, frozen=True):
 
 
 class CarBuses:
-    """The car's attachments. When this exists they are complete: the drive may begin."""
+    """The car's attachments to the bus, complete: the drive may begin."""
 
-    def __init__(self, options: BusOptions, *, lockstep: bool, hears: tuple[int, ...] = ()) -> None:
-        """`hears` are the identifiers of the frames that the brake ECU follows."""
+    def __init__(self, options: BusOptions, *, lockstep: bool, follows: tuple[int, ...] = ()) -> None:
+        """`follows` are the identifiers of the frames that the brake ECU follows."""
         on_hub = lockstep or options.interface == "socketcand"
         self.line = HubLine(options) if on_hub else None
-        self.brake = open_bus(msgspec.structs.replace(options, node=BRAKE, uses=hears))
+        self.brake = open_bus(msgspec.structs.replace(options, node=BRAKE, uses=follows))
         self.radar = open_bus(msgspec.structs.replace(options, node=RADAR))
         if self.line is not None:
             self.line.drives_the_car()
@@ -136,19 +136,19 @@ class _Car:
     def _exchange(self) -> None:
         """Paced: take what has come, send what is due."""
         if self._buses.line is not None:
-            self._buses.line.changes()  # of no concern: time does not wait
-            self._look(self._buses.line)
+            self._buses.line.changes()  # not used: time does not wait
+            self._report_conditions(self._buses.line)
         for frame in self._buses.brake.drain():
             self._watch.take(frame)
         for frame in self._body.brake_frames():
             self._buses.brake.send(frame)
         for frame in self._body.radar_frames():
-            self._buses.radar.drain()  # it listens to nothing, but who does not read is put out
+            self._buses.radar.drain()  # not used, but the hub disconnects clients that do not read
             self._buses.radar.send(frame)
             self._tracks += frame.can_id == self._track_id
 
-    def _look(self, line: HubLine) -> None:
-        """Tell the hub which conditions hold now."""
+    def _report_conditions(self, line: HubLine) -> None:
+        """Report to the hub which conditions hold now."""
         for number, condition in list(line.conditions.items()):
             if self._body.holds(condition):
                 if self._options.pace is None:
@@ -160,7 +160,7 @@ class _Car:
         line, t_us = self._buses.line, self._body.t_us
         assert line is not None
         if line.conditions:
-            self._look(line)
+            self._report_conditions(line)
         brake_frames, radar_frames = self._body.brake_frames(), self._body.radar_frames()
         due = line.due_us is not None and line.due_us <= t_us
         if not (brake_frames or radar_frames or due):

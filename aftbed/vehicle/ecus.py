@@ -187,7 +187,7 @@ class BrakeEcu:
         self._request, self._request_us = self._codec.decode("AEB_REQ", frame.data), frame.t_us
 
     def demand_ms2(self, plant: Plant) -> float:
-        """What the brakes are told in this step: m/s2, 0 or more. Call once per plant step."""
+        """The demand on the brakes in this step: m/s2, 0 or more. Call once per plant step."""
         if self._request is None:
             return 0.0
         self._receiver.poll(plant.t_us)
@@ -264,7 +264,7 @@ class CarBody:
         return self._plant.t_us
 
     def ended(self) -> End | None:
-        """Why the drive is over, None while it is not; "stopped" is for the driver to say."""
+        """Why the drive is over, None while it is not; "stopped" is left to `drive_real`."""
         if self._plant.collided:
             return "collision"
         if self._still_us >= STANDSTILL_US:
@@ -343,7 +343,7 @@ class CarBody:
         self._demand_max_ms2 = max(self._demand_max_ms2, demand_ms2)
 
     def _pedal_ms2(self, driver: Driver) -> float:
-        """What the driver asks of the brakes, who has been warned, or not."""
+        """What the driver asks of the brakes, which is nothing before the warning."""
         if self._warned_us is None or self._plant.t_us - self._warned_us < driver.reaction_ms * 1000:
             return 0.0
         return driver.deceleration_ms2

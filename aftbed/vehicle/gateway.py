@@ -3,11 +3,11 @@
 Nothing in a frame is believed before its E2E protection is checked. Each RADAR_TRACK makes one
 request, and the reply to it becomes one AEB_REQ: the radar is the clock of the function.
 
-A RADAR_TRACK that is refused is counted, and nothing in it is used. It still makes a request, one that says
-that the radar is not to be believed now; not one with no targets, for "unknown" must never look like
-"the road is empty", which would end a braking. Such a request is made only where the radar's cycle has a
+A RADAR_TRACK that is refused is counted, and nothing in it is used. It still makes a request,
+with `radar_valid` False; not one with no targets, because "unknown" must never look like "the road is empty",
+which would end a braking. Such a request is made only where the radar's cycle has a
 place for it: a repeated frame, or a flood of bad ones, does not drive the function faster. An EGO_STATE that
-is missing or refused makes the next request say that the ego speed is unknown.
+is missing or refused makes the ego speed of the next request unknown.
 
 The first frame of a run, or after a silence, only starts the E2E sequence, and is refused too.
 

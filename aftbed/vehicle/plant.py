@@ -29,8 +29,8 @@ class VehicleResult(msgspec.Struct, frozen=True):
 
     `warning_s` is the time from the first warning to the first braking that the function asks for, however
     little: UN R152 calls every such demand emergency braking. 0.0 if the two came together, None without
-    braking. `demand_max_ms2` is the greatest deceleration that it asks for. `braked` is true also of a driver
-    who has heeded the warning.
+    braking. `demand_max_ms2` is the greatest deceleration that it asks for. `braked` is true also when the
+    driver has braked after the warning.
     """
 
     collision: bool
@@ -109,7 +109,7 @@ class Driver(msgspec.Struct, frozen=True):
 
 
 class PlantSetup(msgspec.Struct, frozen=True):
-    """The start of a drive. `lead` None is an empty road, `driver` None one who heeds no warning."""
+    """The start of a drive. `lead` None is an empty road, `driver` None a driver that ignores the warning."""
 
     speed_ms: float
     lead: LeadCar | None = None
@@ -121,7 +121,7 @@ class PlantSetup(msgspec.Struct, frozen=True):
 class Plant:
     """The state of both cars at `t_us`, microseconds of bus time since the start.
 
-    `step_us` is for tests of what the step does to a drive: everybody else has `STEP_US`.
+    `step_us` is for tests of the influence of the step: all other plants have `STEP_US`.
     """
 
     def __init__(self, setup: PlantSetup, step_us: int = STEP_US) -> None:

@@ -125,8 +125,8 @@ def _vehicle(line: Line[control.ToNode], options: VehicleOptions) -> None:
     from aftbed.vehicle.scenarios.library import load_scenario  # noqa: PLC0415
 
     scenario, codec = load_scenario(options.scenario), load_dbc()
-    hears = (codec.can_id("AEB_REQ"),)
-    buses = CarBuses(BusOptions(port=options.port), lockstep=options.pace is None, hears=hears)
+    follows = (codec.can_id("AEB_REQ"),)
+    buses = CarBuses(BusOptions(port=options.port), lockstep=options.pace is None, follows=follows)
     if not _wait_for_go(line):
         return
     try:

@@ -2,7 +2,7 @@
 
 A request is one radar cycle, a reply is one braking demand. Both are MessagePack arrays without field
 names, because they lie on the measured path. To the mechanism that carries them they are opaque bytes;
-whoever opens one checks it here, whole, before anything is done with it.
+`decode_request` and `decode_reply` check a whole payload before any of it is used.
 """
 
 from typing import Final

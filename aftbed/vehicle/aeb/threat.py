@@ -1,7 +1,7 @@
 """How bad a track is: the deceleration that it takes, and the stage of braking that this calls for.
 
 Two measures, because each is blind where the other sees. Time to collision (TTC) at present speeds is
-what a warning goes by; it says nothing of a car ahead that brakes at our own speed. The required
+what a warning goes by; it is blind to a car ahead that brakes at our own speed. The required
 deceleration is the least constant one that leaves `MARGIN_M`, after the time our brakes take to bite;
 at 10 km/h it stays small until the last moment, where a warning would come too late.
 """

@@ -2,8 +2,8 @@
 
 Over ground, and not relative to us, because then our own braking does not look like the target's: a
 standing car stays a standing car while we brake towards it. The filter also estimates the target's
-acceleration, out of what its speed does unpredicted: a car ahead that brakes is a threat before the gap
-says so.
+acceleration, from the unpredicted part of its change of speed: a car ahead that brakes is a threat before the
+gap shows it.
 
 A measurement that no target can reach from the last one belongs to another target: the track starts anew.
 Every field stays in the ranges below, so whatever the function can capture it can restore.

@@ -6,8 +6,8 @@
 | `NonDeterministic`   | determinism  | TR's executions differ without a fault; LFR's replicas diverge     |
 | `Cautious`           | decisions    | nothing breaks: version 2 warns earlier; its state is another form |
 
-Each wraps the function and declares what it is (`characteristics`), so that the wrong mechanism is refused
-beforehand; forced all the same, it breaks where the table above says. Named as
+Each wraps the function and declares its `characteristics`, so that an unsuitable mechanism is refused
+beforehand; forced all the same, it fails as in the table above. Named as
 `aftbed.vehicle.aeb.variants:Cautious`.
 """
 
@@ -29,7 +29,7 @@ CAUTIOUS_BYTES: Final = 2 + STATE_BYTES  # version, whether it warns early, vers
 
 
 class WithoutStateAccess:
-    """The function with its state locked in, as of a supplier who does not open it."""
+    """The function with its state locked in, like that of a supplier that gives no access."""
 
     characteristics = Characteristics(deterministic=True, state_access=False)
 

@@ -1,4 +1,4 @@
-"""How a node of ours attaches to the CAN bus: python-can with types, and with its quirks handled.
+"""How a node of aftbed attaches to the CAN bus: python-can with types, and with its quirks handled.
 
 `socketcand` is the hub between processes, `virtual` is python-can's bus inside one process, `socketcan`
 is the kernel's (vcan, hardware). Quirks of the socketcand client of python-can 4.6:
@@ -19,7 +19,7 @@ sockets). A client of our own would not be worth it.
 order, those of two do not: a node that sends all frames itself uses `Bus.set_time`, which waits for no
 answer; where several nodes send, a `HubLine` sets the time from a connection of its own and waits until
 the hub has taken it. `AnswerWatch` is the other half: time stands still until the protected function has
-answered. In real time, `Schedule` says when a step is due.
+answered. In real time, `Schedule` waits until a step is due.
 """
 
 import logging
@@ -56,8 +56,8 @@ Interface = Literal["socketcand", "virtual", "socketcan"]
 class BusOptions(msgspec.Struct, frozen=True):
     """Which bus to attach to. `port` is the hub's, for `socketcand` only.
 
-    `node` is the name that the hub is told, so that it can be cut off, and `uses` are the identifiers
-    that it makes something of.
+    `node` is the name by which a fault can cut this node off, and `uses` are the identifiers of the frames
+    that it evaluates; both are sent to the hub.
     """
 
     interface: Interface = "socketcand"
@@ -125,14 +125,14 @@ class Bus:
         self._socket.sendall(f"< aftbed time {t_us} >".encode("ascii"))
 
     def notice(self, can_id: int, word: str) -> None:
-        """Say beside the bus what is wrong with these frames, where there is somebody to say it to."""
-        self._aside(f"noticed {can_id:03X} {word}")
+        """Report beside the bus what is wrong with these frames; only the hub takes such reports."""
+        self._send_beside(f"noticed {can_id:03X} {word}")
 
     def unasked(self, can_id: int) -> None:
-        """Say beside the bus that no request was made of a frame of which one might be expected."""
-        self._aside(f"unasked {can_id:03X}")
+        """Report beside the bus that no request was made of a frame of which one is expected."""
+        self._send_beside(f"unasked {can_id:03X}")
 
-    def _aside(self, words: str) -> None:
+    def _send_beside(self, words: str) -> None:
         if self._socket is None:
             return
         try:
@@ -143,7 +143,7 @@ class Bus:
     def close(self) -> None:
         """Leave the bus, once the hub has taken all that was sent."""
         if self._socket is not None:
-            _say_goodbye(self._socket)
+            _close_gracefully(self._socket)
         self._bus.shutdown()
 
     def _fill(self) -> None:
@@ -184,7 +184,7 @@ class Bus:
             self._ready.append(Frame(t_us, message.arbitration_id, bytes(message.data)))
 
 
-def _say_goodbye(sock: socket.socket) -> None:
+def _close_gracefully(sock: socket.socket) -> None:
     """End our direction and read to the end of the other: to close on unread data is a reset, and
     would take what the hub has not read yet with it."""
     end_s = time.monotonic() + GOODBYE_S_MAX
@@ -198,7 +198,7 @@ def _say_goodbye(sock: socket.socket) -> None:
 def open_bus(options: BusOptions) -> Bus:
     """Attach. When this returns, every frame that the bus carries from here on arrives."""
     lean()
-    import can  # noqa: PLC0415 - a tenth of a second, for those who drive only
+    import can  # noqa: PLC0415 - a tenth of a second that only a drive needs
 
     if options.interface == "socketcand":
         return _open_hub(options)
@@ -241,7 +241,7 @@ def _open_hub(options: BusOptions) -> Bus:
 
 
 class ReceiptChanges(Protocol):
-    """Who knows of frames that were got more or less often than they were sent: a `HubLine`."""
+    """Knows of frames that were received more or less often than they were sent: a `HubLine`."""
 
     disturbed: bool
 
@@ -259,13 +259,13 @@ class ReceiptChanges(Protocol):
 
 
 class AnswerWatch:
-    """Holds time until the protected function has answered what it was asked; counts.
+    """Waits until the protected function has answered all requests, and counts answers and misses.
 
-    A first miss is waited for `FIRST_ANSWER_S_MAX`. From then on the function is thought dead and
-    costs `NEXT_ANSWER_S_MAX` per question, until it answers again; then it gets the same short time
-    to catch up with the questions it still owes, so that later answers are matched to the right ones.
+    The first missing answer is waited for `FIRST_ANSWER_S_MAX`. From then on the function is taken to be dead
+    and costs `NEXT_ANSWER_S_MAX` per request, until it answers again; then it gets the same short time to
+    answer what is outstanding, so that later answers are matched to the right requests.
 
-    Where the bus has faults, `line` tells of questions and answers that are more or fewer than were sent.
+    Where the bus has faults, `line` reports requests and answers that were lost or came more than once.
     """
 
     def __init__(
@@ -287,13 +287,13 @@ class AnswerWatch:
         self._mute = False
 
     def asked(self) -> None:
-        """A question is being sent: take what arrived before it."""
+        """A request is about to be sent: take what arrived before it."""
         for frame in self._bus.drain():
             self.take(frame)
         self._outstanding = min(self._outstanding + 1, OUTSTANDING_MAX)
 
     def wait(self, stop: Callable[[], bool]) -> None:
-        """Return when nothing is owed, when the deadline has passed, or when `stop()` says so."""
+        """Return when no answer is outstanding, when the deadline has passed, or when `stop()` is true."""
         before, mute = self.answered, self._mute
         end_s = time.monotonic() + (NEXT_ANSWER_S_MAX if mute else FIRST_ANSWER_S_MAX)
         while self._owed() and not stop():
@@ -315,11 +315,11 @@ class AnswerWatch:
         return True
 
     def _owed(self) -> bool:
-        """Whether an answer is owed, by all that is known about the bus."""
+        """Whether an answer is outstanding, by all that is known about the bus."""
         if self._line is None:
             return self._outstanding > 0
         self._change(self._line)
-        if self._outstanding == 0 and self._line.disturbed:  # does more come than was asked for?
+        if self._outstanding == 0 and self._line.disturbed:  # more may come than was sent
             self._line.settle()
             self._change(self._line)
         return self._outstanding > 0
@@ -329,7 +329,7 @@ class AnswerWatch:
         self._outstanding = max(0, min(self._outstanding + change, OUTSTANDING_MAX))
 
     def _next(self, rest_s: float) -> Frame | None:
-        """The next frame; None after a while, or when there is news of the bus."""
+        """The next frame; None after `rest_s`, or when the hub has reported a change."""
         if self._line is None or not self._line.disturbed:
             return self._bus.recv(rest_s)
         frame = self._bus.recv(0.0)
@@ -337,8 +337,8 @@ class AnswerWatch:
             select.select([self._bus.fileno(), self._line.fileno()], [], [], rest_s)
         return frame
 
-    def _judge(self, heard: bool, *, stopped: bool) -> None:
-        if self._outstanding == 0 or heard:  # what is still owed by one who speaks again is lost
+    def _judge(self, answered: bool, *, stopped: bool) -> None:
+        if self._outstanding == 0 or answered:  # older answers of a function that answers again are lost
             self._outstanding, self._mute = 0, False
         elif not stopped:
             self.missing += 1
@@ -346,7 +346,7 @@ class AnswerWatch:
 
 
 class Schedule:
-    """A fixed schedule on the wall clock. After a hiccup it is kept up with, and nothing is skipped."""
+    """A fixed schedule on the wall clock. Late steps are made up for, none is skipped."""
 
     def __init__(self, pace: float) -> None:
         if not pace > 0:
@@ -356,7 +356,7 @@ class Schedule:
         self._start_ns = time.monotonic_ns()
 
     def wait_until(self, t_us: int, stop: Callable[[], bool]) -> None:
-        """Return when `t_us` of bus time have passed since the start, or when `stop()` says so."""
+        """Return when `t_us` of bus time have passed since the start, or when `stop()` is true."""
         due_ns = self._start_ns + int(t_us * self._ns_per_us)
         while (rest_ns := due_ns - time.monotonic_ns()) > 0:
             if stop():

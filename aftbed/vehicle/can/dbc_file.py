@@ -1,14 +1,14 @@
 """The DBC is the only truth about frames; this is the one place that reads it.
 
-`Codec` is a thin typed face over cantools: raw numbers in physical units, no names for values, and
+`Codec` is a thin typed layer over cantools: raw numbers in physical units, no names for values, and
 aftbed's own errors. A frame that does not decode is a `PeerError`; a DBC that does not parse, or
-lacks a message or a signal that somebody asked for, is the user's: `ConfigError`, with the file,
-cantools' reason, the line, and the nearest name that exists.
+lacks a message or a signal that is asked for, is the user's error: `ConfigError`, with the file, cantools'
+reason, the line, and the nearest name that exists.
 
-A DBC whose signals overlap or lie outside their message contradicts itself, so it is refused. There are
-such files of real cars, most often wrong in messages that nobody here needs. Who knows that asks for
-`strict` False: then the file is read, a message with overlapping signals is decoded signal by signal,
-each as the file has it, and a signal outside its message is not there for anybody (`misfits`).
+A DBC whose signals overlap or lie outside their message contradicts itself, so it is refused. Files of real
+cars do that, most often in messages that are not needed here. With `strict` False such a file is read: a
+message with overlapping signals is decoded signal by signal, each as the file has it, and a signal outside
+its message does not exist (`misfits`).
 
 cantools is imported when a DBC is loaded and not before: the mechanism's processes never need it,
 and `aftbed --help` must not wait for it.
@@ -195,7 +195,7 @@ def _parsed(text: str, *, strict: bool) -> Database:
 
 
 def _explain(error: Exception, text: str) -> str:
-    """The line, where cantools does not say it, and its reason in one line."""
+    """cantools' reason in one line, with the line of the file where cantools does not give it."""
     reason = " ".join(str(error).split())
     if isinstance(error, KeyError):
         reason = f"{reason} is not defined"

@@ -1,6 +1,6 @@
 """AUTOSAR E2E protection: profiles 1, 2, 5 and 11, and the supervision of a message by its counter.
 
-No signal of a safety frame is believed before `Receiver` says so. After the E2E Protocol Specification
+No signal of a safety frame is believed unless `Receiver.usable` holds. After the E2E Protocol Specification
 (AUTOSAR PRS); the CRCs are those of the `autosar-e2e` library. A profile protects one message by a CRC, a
 counter, and a data id that is part of the CRC and, except for a nibble, not in the frame: so an intact
 frame of another message has a wrong CRC.

@@ -17,7 +17,7 @@ ends the connection. Frames follow the rules of `bus_model`.
 *Time.* Stamps are microseconds since the start of the run times the pace. In lockstep they are the
 virtual time that one client, the first that asks for it, sets by `aftbed time`; it never runs backwards.
 
-*Beside the bus* nodes of ours send elements of their own. A client that gives its name can be cut off by
+*Beside the bus* aftbed's nodes send elements of their own. A client that gives its name can be cut off by
 a fault, and its reports are believed; one that does not is a tool: it receives all frames, and all receive
 its frames.
 
@@ -32,8 +32,8 @@ its frames.
 
 In lockstep time stands still until the protected function has answered what it was asked. A fault makes
 that a matter of the bus: a RADAR_TRACK that was lost is not answered, one that comes twice may be answered
-twice. So the time master is told, before any node receives the frame, by how many the number of receivers
-that use it differs from what was sent:
+twice. So the hub sends the time master, before any node receives the frame, by how many the number of
+receivers that use it differs from the number without faults:
 
     > < change 130 -1 >        lost, or no request was made of it
     > < change 100 +1 >        one more: held back before, or a second time
@@ -273,17 +273,17 @@ class Hub(BusModel[HubConnection]):
         self._update_interest(node)
 
     def receipts_changed(self, can_id: int, change: int) -> None:
-        """Tell the time master."""
+        """It counts the answers that it waits for."""
         if self._time_master is not None:
             self._send(self._time_master, f"< change {can_id:03X} {change:+d} >".encode("ascii"))
 
     def condition_added(self, number: int, condition: Condition) -> None:
-        """Tell the car; one that is not here yet is told when it comes."""
+        """Send it to the car; a car that comes later gets it when it comes."""
         if self._plant is not None:
             self._send(self._plant, _watch_element(number, condition))
 
     def faults_acted(self) -> None:
-        """Tell the supervisor."""
+        """The supervisor keeps the receipts."""
         if self._desk is not None:
             self._desk.faults_acted()
 

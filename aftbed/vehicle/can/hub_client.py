@@ -1,18 +1,18 @@
-"""The car's line to the hub: a connection that hears no frames, only what is said beside the bus.
+"""The car's line to the hub: a connection that receives no frames, only what is sent beside the bus.
 
-In lockstep it has the hand on the hub's virtual time. In real time, too, the car looks for the conditions at
-which faults open (`when ttc < 1.2`), since nobody else knows the truth about it: the hub says what
-to look for, and is told when it is so.
+In lockstep it sets the hub's virtual time. In real time, too, the car looks for the conditions at which
+faults open (`when ttc < 1.2`), since only the car knows its true state: the hub sends the conditions, the car
+reports when one holds.
 
-    > < aftbed plant >            < < ok >              here is the car
+    > < aftbed plant >            < < ok >              this is the car
                                   < < watch 7 ttc below 1.2 >
-    > < aftbed time 20000 >       < < ok >              with faults about, when one is due: < ok 31000 >
-    > < aftbed await radar 12 >   < < ok >              once twelve frames of the radar have been carried
+    > < aftbed time 20000 >       < < ok >              after a fault with the time of the next: < ok 31000 >
+    > < aftbed await radar 12 >   < < ok >              when twelve frames of the radar have been carried
     > < aftbed met 7 3240 5678 >  < < ok - >            at 3240 us of the drive, 5678 ns by the clock
-                                  < < change 130 -1 >   see `hubfaults`
+                                  < < change 130 -1 >   see `hub`
 
-What the hub says of its own accord comes before the answer that it would concern: so who has the answer to
-`await` knows all about those frames.
+What the hub sends of its own accord comes before the answer that it concerns: after the answer to `await`,
+all changes for those frames are known.
 """
 
 import re
@@ -46,7 +46,7 @@ class HubLine:
         self._poll = select.poll()
         self._poll.register(self._socket, select.POLLIN)
         self.conditions: dict[int, Condition] = {}
-        self.disturbed = False  # as far as the hub has said
+        self.disturbed = False  # by the latest from the hub
         self.due_us: int | None = None  # when something comes of a fault by itself
         self._changes: deque[tuple[int, int]] = deque()
         self._buffer = b""
@@ -63,7 +63,7 @@ class HubLine:
         return self._socket.fileno()
 
     def drives_the_car(self) -> None:
-        """Ask to be told of conditions."""
+        """Ask the hub for conditions to look for."""
         self._ask("< aftbed plant >")
 
     def set_time(self, t_us: int) -> None:
@@ -83,13 +83,13 @@ class HubLine:
         self._ask(f"< aftbed met {number} {t_us} {time.monotonic_ns()} >")
 
     def settle(self) -> None:
-        """Return when all that the hub has said by now is here."""
-        self._say("< echo >")
+        """Return when all that the hub has sent by now is here."""
+        self._send("< echo >")
         self._expect("< echo >")
 
     def changes(self) -> list[tuple[int, int]]:
         """By how many more or fewer a frame was got, by its identifier, as far as it is known."""
-        self._take_in()
+        self._read_asides()
         found = list(self._changes)
         self._changes.clear()
         return found
@@ -101,10 +101,10 @@ class HubLine:
     # -- reading and writing
 
     def _ask(self, line: str) -> None:
-        self._say(line)
+        self._send(line)
         self._expect("< ok >")
 
-    def _say(self, line: str) -> None:
+    def _send(self, line: str) -> None:
         try:
             self._socket.sendall(line.encode("ascii"))
         except OSError as error:
@@ -114,7 +114,7 @@ class HubLine:
         while True:
             while self._elements:
                 element = self._elements.popleft()
-                if self._is_aside(element):
+                if self._take_aside(element):
                     continue
                 answer = _OK.fullmatch(element) if line == "< ok >" else None
                 if answer is None and element != line:
@@ -125,14 +125,14 @@ class HubLine:
                 return
             self._read()
 
-    def _take_in(self) -> None:
-        """What has come by itself."""
+    def _read_asides(self) -> None:
+        """Take what the hub has sent of its own accord."""
         while self._poll.poll(0):
             self._read()
         while self._elements:
             element = self._elements.popleft()
-            if not self._is_aside(element):
-                raise HarnessError(f"the CAN hub said {element!r}, unasked")
+            if not self._take_aside(element):
+                raise HarnessError(f"the CAN hub sent {element!r}, unasked")
 
     def _read(self) -> None:
         try:
@@ -144,7 +144,7 @@ class HubLine:
         *elements, self._buffer = (self._buffer + data).split(b">")
         self._elements += [element.decode("ascii", "replace").lstrip() + ">" for element in elements]
 
-    def _is_aside(self, element: str) -> bool:
+    def _take_aside(self, element: str) -> bool:
         if (found := _WATCH.fullmatch(element)) is not None:
             quantity = cast("Quantity", found[2])
             self.conditions[int(found[1])] = Condition(quantity, found[3] == "below", float(found[4]))

@@ -1,4 +1,4 @@
-"""The libraries of the bus, all of them: imported by importing this, by whoever forks those who drive."""
+"""Importing this imports all libraries of the bus: for the zygote that forks the processes on the bus."""
 
 import importlib
 from typing import Final

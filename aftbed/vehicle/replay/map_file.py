@@ -171,7 +171,7 @@ class Flag(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class ObjectCount(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How many objects follow, said by a message that comes before them."""
+    """Where a message that comes before the objects announces how many there are."""
 
     message: str
     signal: str
@@ -207,7 +207,7 @@ class TrackMap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class OtherMap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Messages of the radar that say nothing that is needed, or only how many objects there are."""
+    """Messages of the radar that are not needed, or only for the number of objects."""
 
     messages: Messages
     length: Length
@@ -298,7 +298,7 @@ def bind(path: Path, dbc: Path) -> BoundMap:
 
 
 class _Binding:
-    """The checks; each says the file, the key, what was found and what is allowed."""
+    """The checks; each error names the file, the key, what was found and what is allowed."""
 
     def __init__(self, path: Path, codec: Codec, file: MapFile) -> None:
         self._path = path

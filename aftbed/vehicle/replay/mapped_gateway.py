@@ -1,4 +1,4 @@
-"""The gateway on somebody else's bus: real frames in, by a map; our own AEB_REQ out.
+"""The gateway on another car's bus: real frames in, by a map; our own AEB_REQ out.
 
 Each frame is judged by the rule of its id, in this order: time, length, checksum, counter, range. A frame
 that is refused is counted by the reason and changes nothing at all. Where a message is protected by E2E,
@@ -35,7 +35,7 @@ def toyota_checksum(can_id: int, data: bytes) -> int:
 
 
 class SeenTrack(msgspec.Struct, frozen=True):
-    """What an object's last frame said, at `t_us`; no target if it was not valid or not in our path."""
+    """The content of an object's last frame, at `t_us`; no target if it was not valid or not in our path."""
 
     t_us: int
     target: AebTarget | None
@@ -86,7 +86,7 @@ class MappedGateway:
         return self._sender.frames(reply, t_us, replica, epoch, answered)
 
     def _accept(self, frame: Frame, rule: FrameRule) -> str | None:
-        """Take what the frame says, or say why not; then nothing has changed."""
+        """Take the content of the frame, or return the reason to refuse it; then nothing has changed."""
         if frame.t_us < self._t_us:
             return "time"
         receiver = self._receivers.get(rule.can_id)
@@ -130,8 +130,8 @@ class MappedGateway:
         if tracks.slot is not None:
             number = int(signals[tracks.slot])
         target = None
-        if tracks.valid is None or _said(tracks.valid, signals):
-            new = tracks.new is not None and _said(tracks.new, signals)
+        if tracks.valid is None or _is_set(tracks.valid, signals):
+            new = tracks.new is not None and _is_set(tracks.new, signals)
             distance_m, lateral_m = self._place(signals, frame.data)
             target = target_of(0, distance_m, _si(tracks.relative_speed, signals, frame.data), new)
             if target is None or not isfinite(lateral_m):
@@ -159,7 +159,7 @@ class MappedGateway:
         return made if self._awaited else self._request(t_us, empty=True)
 
     def _request(self, t_us: int, *, empty: bool = False) -> bytes:
-        """`empty`: the radar has said that there is nothing, which is not the same as to say nothing."""
+        """`empty`: the radar has announced no objects, which is not the same as no frame of the radar."""
         fresh_us = round(FRESH_CYCLES * self._bound.map.cycle_ms * 1000)
         fresh = {number: seen for number, seen in self._tracks.items() if t_us - seen.t_us <= fresh_us}
         targets = self._slotted({n: seen.target for n, seen in fresh.items() if seen.target is not None})
@@ -175,8 +175,8 @@ class MappedGateway:
         return tuple(msgspec.structs.replace(found[number], slot=number) for number in sorted(found))
 
 
-def _said(flag: str | Flag, signals: dict[str, float]) -> bool:
-    """Whether a flag of the map says yes."""
+def _is_set(flag: str | Flag, signals: dict[str, float]) -> bool:
+    """Whether a flag of the map is set."""
     if isinstance(flag, Flag):
         return int(signals[flag.signal]) in flag.values
     return bool(signals[flag])

@@ -5,9 +5,9 @@ The frames of all interfaces of the log go to the one bus, in the order of the l
 virtual time of the hub in lockstep (`pace` None). All goes through one connection, so the hub takes
 times and frames in the order in which they are sent.
 
-Which frame ends a radar cycle, and so asks the protected function, is known to the caller only: most
-simply to a second gateway, which is asked the same frames and is of the same mind as the first. In
-lockstep time stands still after such a frame until the AEB_REQ that answers it.
+Only the caller knows which frame ends a radar cycle and so makes a request: most simply by a second gateway
+that gets the same frames and decides as the first does. In lockstep time stands still after such a frame
+until the AEB_REQ that answers it.
 """
 
 from collections.abc import Callable, Sequence
@@ -25,7 +25,7 @@ STAGE_PARTIAL: Final = 2
 
 
 class PlayReport(msgspec.Struct):
-    """What was played, and what the function said to it.
+    """What was played, and what the function answered.
 
     `refused` frames were not taken by the hub. `missing_answers` of lockstep are the waits that were
     given up. `complete` is False when the caller's `stop` ended it.

@@ -4,7 +4,7 @@ The function has `SLOTS` of them, and remembers in each what it saw there. A rad
 objects that come under numbers of their own, needs an allotment: of the objects in our path the nearest
 ones get a slot each. The others cannot be hit before these are. An object keeps its slot while it is seen,
 and until another needs it, so a moment in which it is not seen costs it nothing; the one that was not
-seen for longest gives way. In a slot that has changed hands the target is said to be new.
+seen for longest gives way. In a slot that went to another object the target is marked as new.
 """
 
 from collections.abc import Mapping

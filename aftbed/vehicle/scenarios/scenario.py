@@ -1,8 +1,7 @@
 """What a scenario file may hold, key by key, and the `Scenario` that is made of it.
 
-The same keys describe a file of the user's, a shipped scenario, and the rows of a published table
-(`tables`): whatever one of them can say, the others can. Units are in the keys, ranges in the types;
-what is refused names the file, the key, what was found and what is allowed.
+The same keys describe a user's file, a shipped scenario, and the rows of a published table (`tables`). Units
+are in the keys, ranges in the types; an error names the file, the key, what was found and what is allowed.
 """
 
 from typing import Annotated, Literal
@@ -99,7 +98,7 @@ class BrakesKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class DriverKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """`driver:`, one who brakes when warned."""
+    """`driver:`, who brakes when warned."""
 
     reaction_s: Annotated[float, Meta(ge=0, le=10)]
     deceleration_ms2: Deceleration

@@ -1,9 +1,9 @@
 """Published tables of what an emergency brake must do, row by row, as data: `cases/*.yaml`.
 
 A table has groups (one target, one state of the car), a group has rows: a speed, and the greatest speed
-at impact with which the row is passed. Each group says where its numbers are from, and where one of them
-is not from the text of a regulation or a protocol, it says that too. A row is a scenario like any
-other: `load_scenario("r152:m1-60")`, and so every `--scenario`.
+at impact with which the row is passed. Each group names the source of its numbers, and marks those
+that are not from the text of a regulation or a protocol. A row is a scenario like any other:
+`load_scenario("r152:m1-60")`, and so every `--scenario`.
 
     r152      UN Regulation No. 152: the speed is the relative one
     ncap      Euro NCAP, car-to-car rear: the speed is the ego's
@@ -62,7 +62,7 @@ class Case(msgspec.Struct, frozen=True):
 
 
 class _Group(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Rows of one kind. The rows are pairs: speed, limit. `speed` says whose the first one is."""
+    """Rows of one kind. The rows are pairs: speed, limit. `speed`: which speed the first one is."""
 
     description: str
     source: str
