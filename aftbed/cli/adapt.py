@@ -26,7 +26,7 @@ from aftbed.adapt.scriptcheck import refusals
 from aftbed.adapt.scriptfile import ScriptFile, mapping, phases, refuse, script_from, step
 from aftbed.adapt.suitability import remarks, unsuitable
 from aftbed.adapt.words import Wish
-from aftbed.cli.options import Json, Recipe, Run
+from aftbed.cli.options import Json, Recipe, Run, takes
 from aftbed.cli.views import EndedAdaptation, history_lines
 from aftbed.core.application import Characteristics
 from aftbed.core.errors import ConfigError
@@ -47,11 +47,7 @@ WHEN: Final = {
     "finish": "when nothing has broken",
 }
 
-adapt = typer.Typer(
-    help="Change the mechanism of a live run: update, switch, compose.",
-    no_args_is_help=True,
-    rich_markup_mode=None,
-)
+adapt = typer.Typer()
 
 Expr = Annotated[str, typer.Argument(help="The whole new expression, the outer mechanism first: lfr+tr.")]
 Force = Annotated[bool, typer.Option("--force", help="Even where it does not suit the function.")]
@@ -60,31 +56,38 @@ Force = Annotated[bool, typer.Option("--force", help="Even where it does not sui
 # -- change a live run ----------------------------------------------------------------------------
 
 
+class ChangeArguments(msgspec.Struct, frozen=True, kw_only=True):
+    """The options of `aftbed adapt to`, `switch` and `compose`."""
+
+    expr: Expr
+    recipe: Recipe = "drained"
+    force: Force = False
+    run: Run = None
+    json: Json = False
+
+
 @adapt.command()
-def to(
-    expr: Expr, recipe: Recipe = "drained", force: Force = False, run: Run = None, json: Json = False
-) -> None:
+@takes(ChangeArguments)
+def to(given: ChangeArguments) -> None:
     """Replace what runs by EXPR.
 
     Exit code of all that adapts: 0 done, 1 rolled back, 2 refused.
     """
-    _change(Wish("to", expr), run, recipe, force=force, as_json=json)
+    _change(Wish("to", given.expr), given.run, given.recipe, force=given.force, as_json=given.json)
 
 
 @adapt.command()
-def switch(
-    expr: Expr, recipe: Recipe = "drained", force: Force = False, run: Run = None, json: Json = False
-) -> None:
+@takes(ChangeArguments)
+def switch(given: ChangeArguments) -> None:
     """Replace the outer mechanism by another one."""
-    _change(Wish("switch", expr), run, recipe, force=force, as_json=json)
+    _change(Wish("switch", given.expr), given.run, given.recipe, force=given.force, as_json=given.json)
 
 
 @adapt.command()
-def compose(
-    expr: Expr, recipe: Recipe = "drained", force: Force = False, run: Run = None, json: Json = False
-) -> None:
+@takes(ChangeArguments)
+def compose(given: ChangeArguments) -> None:
     """Keep the outer mechanism, and add mechanisms inside it."""
-    _change(Wish("compose", expr), run, recipe, force=force, as_json=json)
+    _change(Wish("compose", given.expr), given.run, given.recipe, force=given.force, as_json=given.json)
 
 
 @adapt.command()

@@ -22,11 +22,7 @@ from aftbed.cli.options import Recipe
 from aftbed.core.errors import ConfigError
 from aftbed.ftm.compose import DUPLEX, replication_of
 
-bench = typer.Typer(
-    help="Measure, with the bare limit measured beside each figure.",
-    no_args_is_help=True,
-    rich_markup_mode=None,
-)
+bench = typer.Typer()
 REQUESTS_MIN: Final = 5000
 KILLS_MIN: Final = 1
 PROGRESS: Final = "  measuring: "

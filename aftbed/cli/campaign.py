@@ -33,11 +33,7 @@ JUNIT: Final = "junit.xml"
 HTML: Final = "report.html"
 _SHARD: Final = re.compile(r"([0-9]{1,6})/([0-9]{1,6})")
 
-campaign = typer.Typer(
-    help="Many experiments from one file, judged with statistics, ended by a gate.",
-    no_args_is_help=True,
-    rich_markup_mode=None,
-)
+campaign = typer.Typer()
 
 Folder = Annotated[Path, typer.Argument(help="The directory of a campaign (its --out).")]
 ExperimentName = Annotated[str, typer.Argument(help="Id of the experiment, its beginning, or its number.")]
@@ -70,6 +66,7 @@ class CampaignArguments(msgspec.Struct, frozen=True, kw_only=True):
         int | None, typer.Option("--experiments", help="In each stratum; overrides that of the file.")
     ] = None
     runtime: Annotated[str | None, typer.Option(help="unix or sim; overrides that of the file.")] = None
+    json: Json = False
 
 
 def planned(given: CampaignArguments) -> Plan:
@@ -100,7 +97,6 @@ class PlanArguments(CampaignArguments, frozen=True, kw_only=True):
     """The options of `aftbed campaign plan`."""
 
     out: Annotated[Path | None, typer.Option(help="Write every experiment to this file, a line each.")] = None
-    json: Json = False
 
 
 @campaign.command()
@@ -156,7 +152,6 @@ class CampaignRunArguments(CampaignArguments, frozen=True, kw_only=True):
         0
     ]
     scheduler: Annotated[str | None, typer.Option(help="Address of a Dask scheduler.")] = None
-    json: Json = False
 
 
 @campaign.command()

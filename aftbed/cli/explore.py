@@ -7,7 +7,7 @@ from typing import Annotated, Final
 import msgspec
 import typer
 
-from aftbed.cli.options import Json, jobs_of, separated
+from aftbed.cli.options import Json, jobs_of, separated, takes
 from aftbed.cli.sim import described, event_lines, picture
 from aftbed.cli.views import Bar, spaced
 from aftbed.core.errors import ConfigError
@@ -33,67 +33,79 @@ BOUND: Final = 2_000
 BOUND_MAX: Final = 10_000_000
 LISTED_MAX: Final = 20  # broken experiments that are printed; --json has all of them
 
-explore = typer.Typer(
-    help="Simulate every experiment of one kind, with an exact count.",
-    no_args_is_help=True,
-    rich_markup_mode=None,
-)
+explore = typer.Typer()
 
-Ftms = Annotated[
-    list[str] | None,
-    typer.Option("--ftm", help="Mechanisms, separated by commas or given one by one; all if left out."),
-]
-Placements = Annotated[
-    list[str] | None, typer.Option("--placement", help="process or replica, likewise; both if left out.")
-]
-Jobs = Annotated[int | None, typer.Option(help="Processes; one per CPU if left out.")]
-Only = Annotated[int | None, typer.Option(help="One experiment of this selection, by its number.")]
+
+class ExploreArguments(msgspec.Struct, frozen=True, kw_only=True):
+    """The options of all explorers."""
+
+    ftm: Annotated[
+        tuple[str, ...],
+        typer.Option(help="Mechanisms, separated by commas or given one by one; all if left out."),
+    ] = ()
+    placement: Annotated[
+        tuple[str, ...], typer.Option(help="process or replica, likewise; both if left out.")
+    ] = ()
+    jobs: Annotated[int | None, typer.Option(help="Processes; one per CPU if left out.")] = None
+    json: Json = False
+
+
+class NumberedArguments(ExploreArguments, frozen=True, kw_only=True):
+    """The options of `aftbed explore adapt` and `pairs`."""
+
+    only: Annotated[int | None, typer.Option(help="One experiment of this selection, by its number.")] = None
+
+
+class CrashArguments(NumberedArguments, frozen=True, kw_only=True):
+    """The options of `aftbed explore crash`."""
+
+    requests: Annotated[int, typer.Option(help="Requests of each run.")] = REQUESTS
+
+
+class OrderArguments(ExploreArguments, frozen=True, kw_only=True):
+    """The options of `aftbed explore order`."""
+
+    requests: Annotated[
+        int, typer.Option(help="Requests of an undisturbed run, at most; one with a crash.")
+    ] = ORDER_REQUESTS
+    bound: Annotated[int, typer.Option(help="Runs of one experiment, at most.")] = BOUND
 
 
 # -- crash, adapt, pairs: each experiment is one run ----------------------------------------------
 
 
 @explore.command()
-def crash(
-    ftm: Ftms = None,
-    placement: Placements = None,
-    requests: Annotated[int, typer.Option(help="Requests of each run.")] = REQUESTS,
-    jobs: Jobs = None,
-    only: Only = None,
-    json: Json = False,
-) -> None:
+@takes(CrashArguments)
+def crash(given: CrashArguments) -> None:
     """A crash before each effect of each brick, and after its last.
 
     Exit code of all explorers: 0 all survived, 1 a promise was broken, 2 usage, 130 interrupted.
     """
-    workers = jobs_of(jobs)
-    _check("--requests", requests, REQUESTS_MAX)
-    _explore(selected("crash", separated(ftm), separated(placement), requests), workers, only, as_json=json)
+    _check("--requests", given.requests, REQUESTS_MAX)
+    _explore("crash", given, given.requests)
 
 
 @explore.command()
-def adapt(
-    ftm: Ftms = None, placement: Placements = None, jobs: Jobs = None, only: Only = None, json: Json = False
-) -> None:
+@takes(NumberedArguments)
+def adapt(given: NumberedArguments) -> None:
     """A crash before, during and after each step of each adaptation, of each node that takes part."""
-    workers = jobs_of(jobs)
-    _explore(selected("adapt", separated(ftm), separated(placement)), workers, only, as_json=json)
+    _explore("adapt", given)
 
 
 @explore.command()
-def pairs(
-    ftm: Ftms = None, placement: Placements = None, jobs: Jobs = None, only: Only = None, json: Json = False
-) -> None:
+@takes(NumberedArguments)
+def pairs(given: NumberedArguments) -> None:
     """Each first fault of a few, then the crash of each node, after each delay of a grid."""
-    workers = jobs_of(jobs)
-    _explore(selected("pairs", separated(ftm), separated(placement)), workers, only, as_json=json)
+    _explore("pairs", given)
 
 
-def _explore(selection: Selection, jobs: int, only: int | None, *, as_json: bool) -> None:
+def _explore(explorer: str, given: NumberedArguments, requests: int = 0) -> None:
+    jobs = jobs_of(given.jobs)
+    selection = selected(explorer, separated(given.ftm), separated(given.placement), requests)
     setups = list(selection.setups())
-    if only is not None:
-        raise typer.Exit(_explore_one(selection, setups, only, as_json=as_json))
-    raise typer.Exit(_Exploration(selection, setups, as_json=as_json).run(jobs))
+    if given.only is not None:
+        raise typer.Exit(_explore_one(selection, setups, given.only, as_json=given.json))
+    raise typer.Exit(_Exploration(selection, setups, as_json=given.json).run(jobs))
 
 
 def _explore_one(selection: Selection, setups: list[Setup], number: int, *, as_json: bool) -> int:
@@ -206,30 +218,23 @@ def _check(name: str, value: int, most: int) -> None:
 
 
 @explore.command()
-def order(
-    ftm: Ftms = None,
-    placement: Placements = None,
-    requests: Annotated[
-        int, typer.Option(help="Requests of an undisturbed run, at most; one with a crash.")
-    ] = ORDER_REQUESTS,
-    bound: Annotated[int, typer.Option(help="Runs of one experiment, at most.")] = BOUND,
-    jobs: Jobs = None,
-    json: Json = False,
-) -> None:
+@takes(OrderArguments)
+def order(given: OrderArguments) -> None:
     """Every order in which messages can arrive, without those that make no difference."""
-    workers = jobs_of(jobs)
-    _check("--requests", requests, REQUESTS_MAX)
+    jobs, bound = jobs_of(given.jobs), given.bound
+    _check("--requests", given.requests, REQUESTS_MAX)
     _check("--bound", bound, BOUND_MAX)
-    chosen = selected("crash", separated(ftm), separated(placement), requests)  # the same mechanisms
-    setups = list(experiments(chosen.ftms, chosen.placements, requests))
+    # The same mechanisms as those of `crash`.
+    chosen = selected("crash", separated(given.ftm), separated(given.placement), given.requests)
+    setups = list(experiments(chosen.ftms, chosen.placements, given.requests))
     began_s, found = time.monotonic(), list[Ordered]()
-    with Bar("explore order", len(setups), quiet=json) as bar:
-        for one in explore_orders(setups, bound, workers):
+    with Bar("explore order", len(setups), quiet=given.json) as bar:
+        for one in explore_orders(setups, bound, jobs):
             found.append(one)
             bar.show(len(found), len(found), sum(bool(o.broken) for o in found))
-            if not json:
+            if not given.json:
                 print(_order_lines(one), flush=True)
-    _show_orders(found, bound, _since(began_s), as_json=json)
+    _show_orders(found, bound, _since(began_s), as_json=given.json)
     raise typer.Exit(EXIT_CODES["fail" if any(one.broken for one in found) else "pass"])
 
 

@@ -35,11 +35,7 @@ from aftbed.ftm.compose import EXPRESSIONS, build
 from aftbed.runtime.unix.part import load_module
 from aftbed.vehicle.aeb.function import default_application
 
-ftm = typer.Typer(
-    help="What each mechanism tolerates and needs, and which one suits.",
-    no_args_is_help=True,
-    rich_markup_mode=None,
-)
+ftm = typer.Typer()
 EXIT_INCONSISTENT: Final = 1
 CPUS_MAX: Final = 1024
 BANDWIDTH_KBIT_S_MAX: Final = 1e9

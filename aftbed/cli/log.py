@@ -11,11 +11,7 @@ from aftbed.core.errors import ConfigError
 from aftbed.judge.record import read_record
 from aftbed.vehicle.logs.convert import convert as convert_log
 
-log = typer.Typer(
-    help="Convert a log of the bus or the record of a run for other tools.",
-    no_args_is_help=True,
-    rich_markup_mode=None,
-)
+log = typer.Typer()
 
 
 @log.command()

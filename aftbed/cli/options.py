@@ -17,6 +17,7 @@ JOBS_MAX: Final = 256
 
 Run = Annotated[str | None, typer.Option("--run", help="Id of the run; needed if several are alive.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else.")]
+Seed = Annotated[int, typer.Option(help="Seed of all random numbers.")]
 Recipe = Annotated[str, typer.Option(help="drained, or paper: SIGSTOP, kill, launch, link, SIGCONT.")]
 
 Arguments = TypeVar("Arguments", bound=msgspec.Struct)
@@ -25,14 +26,18 @@ Arguments = TypeVar("Arguments", bound=msgspec.Struct)
 class StructCommand(Generic[Arguments]):
     """A function of one struct, as a command whose options are the fields of the struct.
 
-    typer reads the options from `__signature__` and `__annotations__`, as it does for a plain function. A
-    field of type `tuple[T, ...]` is an option that can be given several times.
+    typer reads the options from `__signature__` and `__annotations__`, as it does for a plain function.
+    Inherited fields come last. A field of type `tuple[T, ...]` is an option that can be given several times.
     """
 
     def __init__(self, function: Callable[[Arguments], None], arguments: type[Arguments]) -> None:
         functools.update_wrapper(self, function)
         self._function, self._arguments = function, arguments
-        parameters = [_parameter(field) for field in msgspec.structs.fields(arguments)]
+        fields = {field.name: _parameter(field) for field in msgspec.structs.fields(arguments)}
+        names = [
+            name for kind in arguments.__mro__ for name in inspect.get_annotations(kind) if name in fields
+        ]
+        parameters = [fields[name] for name in dict.fromkeys(names)]
         self.__signature__ = inspect.Signature(parameters)
         self.__annotations__ = {one.name: one.annotation for one in parameters}
 
@@ -61,9 +66,9 @@ def _parameter(field: msgspec.structs.FieldInfo) -> inspect.Parameter:
     )
 
 
-def separated(given: tuple[str, ...] | list[str] | None) -> tuple[str, ...]:
+def separated(given: tuple[str, ...]) -> tuple[str, ...]:
     """The values of an option that takes several, separated by commas or given one by one."""
-    return tuple(name for text in given or () for name in text.split(","))
+    return tuple(name for text in given for name in text.split(","))
 
 
 def jobs_of(jobs: int | None) -> int:

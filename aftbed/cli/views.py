@@ -9,7 +9,7 @@ import time
 from collections import deque
 from collections.abc import Iterator
 from types import TracebackType
-from typing import TYPE_CHECKING, Final, Protocol, Self
+from typing import TYPE_CHECKING, Final, Self
 
 import msgspec
 
@@ -34,27 +34,8 @@ BAR_PERIOD_S: Final = 0.1
 # -- a run while it lives -------------------------------------------------------------------------
 
 
-class RunView(Protocol):
-    """Shows a live run, as a context manager: on a terminal a live view, elsewhere plain lines."""
-
-    def __enter__(self) -> Self: ...
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None: ...
-    def telemetry(self, data: bytes) -> None: ...
-    def event(self, event: dict[str, object]) -> None: ...
-    def cycle(self, cycle_us: float | None) -> None: ...
-
-
-def open_view(options: RunOptions, *, quiet: bool) -> RunView:
-    """The view that suits standard output; `quiet` shows nothing."""
-    if quiet:
-        return QuietView()
-    return LiveView(options) if sys.stdout.isatty() else PlainView(options)
-
-
-class QuietView:
-    """Shows nothing."""
+class RunView:
+    """Follows a live run, as a context manager. This one shows nothing."""
 
     def __enter__(self) -> Self:
         return self
@@ -74,7 +55,14 @@ class QuietView:
         """An event of the run: `t_ms`, `event`, `text`."""
 
 
-class PlainView(QuietView):
+def open_view(options: RunOptions, *, quiet: bool) -> RunView:
+    """The view that suits standard output; `quiet` shows nothing."""
+    if quiet:
+        return RunView()
+    return LiveView(options) if sys.stdout.isatty() else PlainView(options)
+
+
+class PlainView(RunView):
     """A line per event, and one for the car every PLAIN_PERIOD_MS."""
 
     def __init__(self, options: RunOptions) -> None:
@@ -91,7 +79,7 @@ class PlainView(QuietView):
         print(f"[{event['t_ms']:>10} ms] {event['event']}: {event['text']}", flush=True)
 
 
-class LiveView(QuietView):
+class LiveView(RunView):
     """Speed, gap, TTC, stage, the roles of the replicas, and the last events; redrawn 20 times a second."""
 
     def __init__(self, options: RunOptions) -> None:

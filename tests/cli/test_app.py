@@ -12,17 +12,20 @@ from liveruns import Home
 from playedrun import Call
 from typer.testing import CliRunner
 
-from aftbed.cli.app import COMMANDS, LazyCommand, app
+from aftbed.cli.app import COMMANDS
+from aftbed.cli.lazy import CommandTable, LazyCommand
 from aftbed.cli.options import takes
+from aftbed.cli.scenario import SUBCOMMANDS
 from aftbed.runtime.unix import rundir
 
 # -- the table
 
 
-@pytest.mark.parametrize("name", COMMANDS)
-def test_the_help_in_the_table_is_that_of_the_command(name: str) -> None:
-    lazy = typer.main.get_group(app).commands[name]
-    assert isinstance(lazy, LazyCommand)
+@pytest.mark.parametrize(
+    ("table", "name"), [(table, name) for table in (COMMANDS, SUBCOMMANDS) for name in table]
+)
+def test_the_help_in_the_table_is_that_of_the_command(table: CommandTable, name: str) -> None:
+    lazy = LazyCommand(name, *table[name])
     loaded = lazy.load()
     assert loaded.help is not None and loaded.help.split("\n\n")[0] == lazy.help
 
@@ -36,7 +39,14 @@ def test_the_help_of_all_commands_imports_no_command() -> None:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     modules = set(done.stderr.split())
     ours = {name for name in modules if name.partition(".")[0] == "aftbed"}
-    assert ours == {"aftbed", "aftbed.cli", "aftbed.cli.app", "aftbed.core", "aftbed.core.errors"}
+    assert ours == {
+        "aftbed",
+        "aftbed.cli",
+        "aftbed.cli.app",
+        "aftbed.cli.lazy",
+        "aftbed.core",
+        "aftbed.core.errors",
+    }
     assert not modules & {"msgspec", "rich", "yaml", "can", "cantools", "psutil", "scipy", "numpy", "jinja2"}
     assert all(f"  {name} " in done.stdout for name in COMMANDS)
 

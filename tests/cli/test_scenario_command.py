@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from playedrun import Call, Run
 
-from aftbed.cli.scenario import TableArguments, table_drive
+from aftbed.cli.scenario_table import TableArguments, table_drive
 from aftbed.vehicle.scenarios.library import load_scenario, scenario_names
 from aftbed.vehicle.scenarios.tables import table_names
 

@@ -8,7 +8,8 @@ import pytest
 import typer
 from pages import PAGES, ROOT, anchors, blocks, links, names, prose, sections, table
 
-from aftbed.cli.app import LazyCommand, app
+from aftbed.cli.app import app
+from aftbed.cli.lazy import LazyCommand
 from aftbed.core.events import BY_LABEL, REQUEST_PATH
 from aftbed.core.graph import PLACEMENTS
 from aftbed.ftm.compose import EXPRESSIONS, build

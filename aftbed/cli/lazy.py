@@ -1,0 +1,50 @@
+"""Commands whose module is imported when they are called: the help of a group imports none of them."""
+
+import importlib
+from collections.abc import Mapping
+from typing import Any
+
+import typer
+from typer.core import TyperCommand, TyperGroup
+
+CommandTable = Mapping[
+    str, tuple[str, str]
+]  # name of a command: MODULE:ATTRIBUTE below aftbed.cli, help in one line
+
+
+class LazyCommand(TyperCommand):
+    """A name and a help text. The attribute is a function, or a typer.Typer that holds subcommands."""
+
+    def __init__(self, name: str, place: str, about: str) -> None:
+        super().__init__(name, help=about, rich_markup_mode=None)
+        self._place = place
+
+    def make_context(self, *arguments: Any, **settings: Any) -> Any:
+        """The context of the command that is loaded, so that typer goes on with that one."""
+        return self.load().make_context(*arguments, **settings)
+
+    def load(self) -> TyperCommand | TyperGroup:
+        """The command, with its options or its subcommands."""
+        module, _, attribute = self._place.partition(":")
+        found = getattr(importlib.import_module(f"aftbed.cli.{module}"), attribute)
+        parent = typer.Typer(rich_markup_mode=None)
+        if isinstance(found, typer.Typer):
+            parent.add_typer(found, name=self.name, help=self.help, no_args_is_help=True)
+        else:
+            parent.command(self.name)(found)
+        assert self.name is not None
+        loaded = typer.main.get_group(parent).commands[self.name]
+        assert isinstance(loaded, TyperCommand | TyperGroup)
+        return loaded
+
+
+def group_of(table: CommandTable) -> type[TyperGroup]:
+    """A group that has, after the commands that it defines, those of `table`."""
+
+    class LazyGroup(TyperGroup):
+        def __init__(self, **settings: Any) -> None:
+            super().__init__(**settings)
+            for name, (place, about) in table.items():
+                self.add_command(LazyCommand(name, place, about))
+
+    return LazyGroup

@@ -1,0 +1,297 @@
+"""`aftbed scenario table`: the drives of a published table, on the simulator, perhaps with a fault."""
+
+import sys
+import time
+from collections.abc import Sequence
+from contextlib import closing
+from itertools import groupby
+from json import dumps
+from pathlib import Path
+from typing import Annotated, Final
+
+import msgspec
+import rich.table
+import typer
+from rich.console import Console
+
+from aftbed.cli.options import Json, Seed, check_seed, jobs_of, separated, takes
+from aftbed.cli.sim import read_fault
+from aftbed.cli.views import Bar
+from aftbed.core.errors import ConfigError
+from aftbed.core.fault import Crash, Fault, Hang, Slow, Trigger
+from aftbed.core.graph import Graph
+from aftbed.core.words import milliseconds, whole_milliseconds
+from aftbed.ftm.compose import build
+from aftbed.inject.words import parse
+from aftbed.judge.verdict import EXIT_INTERRUPTED
+from aftbed.report.roadplot import Curve, Point, road_plot
+from aftbed.runtime import targets
+from aftbed.search.road_table import NONE, PRIMARY, Line, Row, driven, drives, outage
+from aftbed.search.worst_instant import STEP_CYCLES
+from aftbed.vehicle.scenarios import tables
+from aftbed.vehicle.scenarios.library import load_scenario
+
+EXIT_PASS, EXIT_FAIL, EXIT_NO_FAULT = 0, 1, 3
+WORST: Final = "worst-instant"
+PLOT_SUFFIX: Final = ".svg"
+WIDTH: Final = 150  # characters, if standard output is no terminal
+CYCLE_S: Final = 0.02
+HEADS: Final = ("row", "km/h", "allowed", "impact", "gap", "warned")
+FAULT_HEADS: Final = ("struck at", "worst of", "lost")
+OUTAGE_HEADS: Final = ("at most",)
+
+
+class TableArguments(msgspec.Struct, frozen=True):
+    """The options of `aftbed scenario table`."""
+
+    name: Annotated[str, typer.Argument(help="r152, ncap or negative.")]
+    group: Annotated[str | None, typer.Option(help="One group of its rows; all if left out.")] = None
+    ftm: Annotated[
+        tuple[str, ...], typer.Option(help="Mechanisms, separated by commas; none if left out.")
+    ] = ()
+    fault: Annotated[
+        str | None,
+        typer.Option(
+            help='worst-instant (a crash of the primary), "FAULT WORDS at worst-instant",'
+            ' or "FAULT WORDS at EVENT nth N".'
+        ),
+    ] = None
+    outage: Annotated[
+        tuple[str, ...],
+        typer.Option(
+            help="How long the function does not answer (300ms), at the worst instant, with no FTM."
+            " May be given several times."
+        ),
+    ] = ()
+    seed: Seed = 0
+    jobs: Annotated[int | None, typer.Option(help="Processes that simulate; one per CPU if left out.")] = None
+    plot: Annotated[Path | None, typer.Option(help="Draw the speeds at impact to this SVG file.")] = None
+    json: Json = False
+
+
+class TableDrive(msgspec.Struct, frozen=True):
+    """What is to be driven: each case under each line."""
+
+    cases: tuple[tables.Case, ...]
+    lines: tuple[Line, ...]
+    seed: int
+    jobs: int
+
+
+def table_drive(given: TableArguments) -> TableDrive:
+    """Check the options. Raises ConfigError naming the argument, before anything is driven."""
+    rows = tables.cases(given.name, given.group)
+    check_seed(given.seed)
+    _check_plot(given.plot)
+    lines = (*_mechanism_lines(given), *(_outage_line(text, rows) for text in dict.fromkeys(given.outage)))
+    return TableDrive(rows, lines, given.seed, jobs_of(given.jobs))
+
+
+def _check_plot(plot: Path | None) -> None:
+    """Raise ConfigError if `--plot` cannot be written."""
+    if plot is None:
+        return
+    if plot.suffix != PLOT_SUFFIX or plot.is_dir() or not plot.absolute().parent.is_dir():
+        raise ConfigError(f"--plot {plot}: a file {PLOT_SUFFIX} in a directory that exists is allowed")
+
+
+def _mechanism_lines(given: TableArguments) -> tuple[Line, ...]:
+    """A line for each mechanism; with outages and no fault, only for those that are named."""
+    named = tuple(dict.fromkeys(separated(given.ftm)))
+    if not named:
+        named = () if given.outage and given.fault is None else (NONE,)
+    return tuple(_mechanism_line(ftm, given.fault) for ftm in named)
+
+
+def _mechanism_line(ftm: str, fault: str | None) -> Line:
+    graph = build(ftm, "process")
+    if fault is None:
+        return Line(ftm, ftm)
+    words = fault.split()
+    if words[-1:] != [WORST]:
+        return Line(f"{ftm}, {fault}", ftm, read_fault(fault, graph))
+    found = _searched(fault, words, graph)
+    return Line(f"{ftm}, {found} at the worst instant", ftm, found, searched=True)
+
+
+def _searched(text: str, words: list[str], graph: Graph) -> Fault:
+    """`worst-instant` alone, a crash of the primary; or `hang primary for 50ms at worst-instant`."""
+    if len(words) == 1:
+        return Fault(Crash(), PRIMARY, Trigger())
+    if words[-2] != "at":
+        raise ConfigError(f"--fault {text!r}: {WORST}, or FAULT WORDS at {WORST} is allowed")
+    fault = parse(" ".join(words[:-2]))
+    if not isinstance(fault.action, Crash | Hang | Slow) or fault.trigger != Trigger():
+        raise ConfigError(f"--fault {text!r}: a crash, a hang or a slow without any other time is searched")
+    targets.check(fault, graph)
+    return fault
+
+
+def _outage_line(text: str, rows: tuple[tables.Case, ...]) -> Line:
+    """Raises ConfigError if the outage is longer than one of the drives."""
+    if milliseconds("--outage", text) < 1.0:
+        raise ConfigError(f"--outage {text}: 1ms is the shortest that is allowed")
+    length_ms = whole_milliseconds("--outage", text)
+    for case in rows:
+        lasts_ms = load_scenario(case.name).duration_ms
+        if length_ms >= lasts_ms:
+            raise ConfigError(
+                f"--outage {text}: {case.name} lasts {lasts_ms / 1000:g} s; a shorter one is allowed"
+            )
+    return outage(length_ms)
+
+
+# -- the drives --------------------------------------------------------------------------------------
+
+
+@takes(TableArguments)
+def table(given: TableArguments) -> None:
+    """Drive a whole table on the simulator, without a fault or with one at its worst.
+
+    Exit code: 0 all rows pass, 1 a row fails, 2 usage, 3 a fault never struck, 130 interrupted.
+    """
+    found = table_drive(given)
+    began_s = time.monotonic()
+    try:
+        rows = _drive(found, quiet=given.json)
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        raise typer.Exit(EXIT_INTERRUPTED) from None
+    seconds = round(time.monotonic() - began_s, 2)
+    if given.plot is not None:
+        _plot(given.plot, given.name, found, rows)
+    if given.json:
+        about = {"table": given.name, "group": given.group, "seed": given.seed, "seconds": seconds}
+        passed = all(row.passed for row in rows)
+        print(dumps({**about, "pass": passed, "rows": [msgspec.to_builtins(row) for row in rows]}))
+    else:
+        where = f", {given.group}" if given.group else ""
+        print(f"{given.name}{where}: {tables.title(given.name)}; seed {given.seed}")
+        _show_lines(found.lines, rows)
+        print(f"\n{_counted(rows)} in {seconds:.1f} s")
+    raise typer.Exit(_exit_code(rows))
+
+
+def _drive(found: TableDrive, *, quiet: bool) -> list[Row]:
+    """All rows, in the order of the lines and of the table."""
+    todo = drives(found.cases, found.lines, found.seed)
+    rows: dict[tuple[str, str], Row] = {}
+    with closing(driven(todo, found.jobs)) as coming, Bar("driving", len(todo), quiet=quiet) as bar:
+        for done, these in enumerate(coming, 1):
+            rows |= {(row.line, row.case): row for row in these}
+            bar.show(done, len(rows), sum(not row.passed for row in rows.values()))
+    return [rows[line.name, case.name] for line in found.lines for case in found.cases]
+
+
+def _counted(rows: Sequence[Row]) -> str:
+    passed, struck = sum(row.passed for row in rows), all(row.struck for row in rows)
+    tail = "" if struck else f"; the fault never struck in {sum(not row.struck for row in rows)}"
+    return f"{passed} of {len(rows)} rows pass{tail}"
+
+
+def _exit_code(rows: Sequence[Row]) -> int:
+    if any(row.struck and not row.passed for row in rows):
+        return EXIT_FAIL
+    return EXIT_PASS if all(row.struck for row in rows) else EXIT_NO_FAULT
+
+
+def _plot(path: Path, table: str, found: TableDrive, rows: Sequence[Row]) -> None:
+    """A picture for each group."""
+    groups = {case.name: case.group for case in found.cases}
+    curves = [
+        Curve(group, line, tuple(_point(row) for row in sorted(of, key=lambda row: row.speed_kmh)))
+        for (line, group), of in groupby(rows, key=lambda row: (row.line, groups[row.case]))
+    ]
+    try:
+        path.write_text(road_plot(f"{table}: speed left at impact", curves), encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"--plot {path}: {error.strerror}") from None
+
+
+def _point(row: Row) -> Point:
+    return Point(row.speed_kmh, row.impact_kmh, row.limit_kmh, row.closed_form_kmh)
+
+
+# -- what is printed ---------------------------------------------------------------------------------
+
+
+def _show_lines(lines: Sequence[Line], rows: Sequence[Row]) -> None:
+    """For each line a table, why rows fail, and the command that repeats the worst row."""
+    by_line = {name: list(of) for name, of in groupby(rows, key=lambda row: row.line)}
+    for line in lines:
+        found = by_line[line.name]
+        print(f"\n{line.name}" + (f" (under {line.ftm})" if line.outage_ms is not None else ""))
+        _print_rows(line, found)
+        for text in (*_failures(line, found), *_search(line, found), *_repeat(line, found)):
+            print(f"  {text}")
+
+
+def _print_rows(line: Line, rows: Sequence[Row]) -> None:
+    heads = (*HEADS, *(FAULT_HEADS if line.fault else ()), *(OUTAGE_HEADS if line.outage_ms else ()), "")
+    grid = rich.table.Table(box=None, pad_edge=False, padding=(0, 3, 0, 0), header_style="")
+    for at, head in enumerate(heads):
+        grid.add_column(head, no_wrap=True, justify="left" if at in (0, len(heads) - 1) else "right")
+    for row in rows:
+        style = "" if row.passed else "red"
+        grid.add_row(*_cells(line, row), style=style)
+    console = Console(width=None if sys.stdout.isatty() else WIDTH, highlight=False)
+    with console.capture() as captured:
+        console.print(grid)
+    print("\n".join(line.rstrip() for line in captured.get().splitlines()))
+
+
+def _cells(line: Line, row: Row) -> list[str]:
+    cells = [
+        row.case,
+        f"{row.speed_kmh:g}",
+        f"{row.limit_kmh:g}" if row.limit_kmh else "none",
+        f"{row.impact_kmh:.1f} km/h" if row.impact_kmh else "-",
+        "-" if row.min_gap_m is None else f"{row.min_gap_m:.2f} m",
+        "-" if row.warning_s is None else f"{row.warning_s:.2f} s",
+    ]
+    if line.fault is not None:
+        cells.append("-" if row.at_s is None else f"{row.at_s:.3f} s")
+        cells.append("-" if row.instants is None else f"{row.instants}")
+        cells.append(_lost(row))
+    if line.outage_ms is not None:
+        cells.append("-" if row.closed_form_kmh is None else f"{row.closed_form_kmh:.1f} km/h")
+    verdict = "pass" if row.passed else "fail" if row.struck else "no fault"
+    return [*cells, verdict + (f", {row.colour}" if row.colour else "")]
+
+
+def _lost(row: Row) -> str:
+    if row.loss_kmh:
+        return f"{row.loss_kmh:.1f} km/h"
+    return "-" if row.loss_m is None else f"{row.loss_m:.3f} m"
+
+
+def _failures(line: Line, rows: Sequence[Row]) -> list[str]:
+    """Each row that fails, with why; of an outage, also that it must."""
+    failed = [row for row in rows if not row.passed]
+    found = [f"{row.case}: {'; '.join(row.because)}" for row in failed]
+    must = [f"{row.case}: {row.must_fail}" for row in failed if row.must_fail]
+    if must:
+        found += [f"{len(must)} of these must fail, since nothing stands in for the function:", *must]
+    if line.outage_ms is not None and not failed:
+        found.append(f"no row fails: {line.outage_ms} ms are less than what the function keeps in hand")
+    return found
+
+
+def _search(line: Line, rows: Sequence[Row]) -> list[str]:
+    """How the worst instants were found."""
+    if not line.searched:
+        return []
+    runs = sum(row.instants or 0 for row in rows)
+    step = f"every {STEP_CYCLES * CYCLE_S:g} s and at each change of stage, then down to 1 ms"
+    return [f"worst of {runs} instants: {step}"]
+
+
+def _repeat(line: Line, rows: Sequence[Row]) -> list[str]:
+    """The commands that repeat the row that lost most."""
+    if line.fault is None:
+        return []
+    struck = [row for row in rows if row.struck]
+    if not struck:
+        return []
+    worst = max(struck, key=lambda row: (not row.passed, row.loss_kmh or 0.0, row.loss_m or 0.0))
+    return [f"{'repeat' if at == 0 else '      '}  {text}" for at, text in enumerate(worst.repeat)]
