@@ -22,6 +22,7 @@ from aftbed.core.messages import Goal
 from aftbed.core.script import RECIPES
 from aftbed.judge import checks
 from aftbed.judge.record import RunRecord
+from aftbed.judge.reference import reference_of
 from aftbed.runtime.unix import ask
 from aftbed.runtime.unix.options import LoadRun
 from aftbed.vehicle.aeb.function import default_application
@@ -79,7 +80,7 @@ def _times(outcomes: Outcomes) -> dict[str, object]:
 
 
 def _requests(records: list[RunRecord]) -> dict[str, int]:
-    counts = [checks.requests(r.history, default_application()) for r in records]
+    counts = [checks.requests(r.history, reference_of(r, default_application)) for r in records]
     return {
         "sent": sum(c.sent for c in counts),
         "lost": sum(c.lost for c in counts),
@@ -97,7 +98,7 @@ def _reordered(record: RunRecord) -> int:
 
 
 def _is_stuck(record: RunRecord) -> bool:
-    return checks.requests(record.history, default_application()).lost > 0
+    return checks.requests(record.history, reference_of(record, default_application)).lost > 0
 
 
 def _there_and_back(

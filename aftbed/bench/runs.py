@@ -23,8 +23,8 @@ def finish(launched: Launched, ends: tuple[str, ...] = ("",)) -> RunRecord:
             pass
         launched.wait()
         record = read_record(launched.record)
-        if record.end is None or record.end.get("reason") not in ends:
-            reason = "the supervisor died" if record.end is None else record.end.get("reason")
+        if record.end is None or record.end.reason not in ends:
+            reason = "the supervisor died" if record.end is None else record.end.reason
             raise HarnessError(f"a run of the bench ended early: {reason}")
         return record
     finally:

@@ -16,23 +16,18 @@ from typing import Final
 import msgspec
 
 from aftbed.adapt.schedule import scheduled
-from aftbed.core.application import Application
 from aftbed.core.errors import ConfigError
 from aftbed.core.fault import FIRED, Fault
 from aftbed.core.graph import Graph
-from aftbed.core.history import History
 from aftbed.core.messages import Scheduled
 from aftbed.core.script import RECIPES
 from aftbed.ftm.compose import build
 from aftbed.inject.words import parse
-from aftbed.judge import checks
-from aftbed.judge.checks import Requests, half_a_graph
+from aftbed.judge.checks import Evidence, Requests
 from aftbed.judge.outcome import FAILED, OUTCOMES, UNKNOWN, outcome_of, worst
-from aftbed.judge.record import RunRecord, read_record
-from aftbed.judge.reference import bare_server
-from aftbed.judge.verdict import Breach, Verdict, expected_of, judge
+from aftbed.judge.record import RunEnd, RunRecord, read_record, record_of
+from aftbed.judge.verdict import Breach, Verdict, evidence_of, judge
 from aftbed.runtime import targets
-from aftbed.runtime.hosting import Hosted
 from aftbed.runtime.sim.world import Setup, simulate
 from aftbed.runtime.unix import linux, spawn
 from aftbed.runtime.unix.busaim import aim
@@ -268,29 +263,10 @@ def setup_of(experiment: Experiment) -> Setup:
 
 
 def _simulated(experiment: Experiment, standing: ExitStack) -> Result:
-    run = simulate(setup_of(experiment))
-    outcome, reasons = outcome_of(
-        run.history,
-        default_application,
-        lost=run.rest.lost,
-        living=run.rest.hosted,
-        digests=run.rest.states.values(),
-    )
-    reasons += tuple(f"an assertion failed: {failure}" for failure in run.failures)
-    broken = checks.one_master(run.history).reasons
-    if not run.rest.lost and not run.rest.why_not:
-        broken += tuple(half_a_graph(run.rest.hosted, expected_of(run)))
-    return _result(
-        experiment,
-        run.history,
-        (outcome, reasons),
-        broken,
-        run.faults,
-        default_application,
-        tuple(a.outcome for a in run.adaptations),
-        max((a.blackout_ms for a in run.adaptations), default=None),
-        run.vehicle,
-    )
+    evidence = evidence_of(record_of(simulate(setup_of(experiment))), default_application)
+    outcome, reasons = outcome_of(evidence)
+    reasons += tuple(f"an assertion failed: {failure}" for failure in evidence.record.failures)
+    return _result(experiment, evidence, (outcome, reasons))
 
 
 # -- real processes -------------------------------------------------------------------------------
@@ -320,37 +296,10 @@ def _real(experiment: Experiment, standing: ExitStack) -> Result:
 
 
 def _judged(experiment: Experiment, record: RunRecord) -> Result:
-    verdict, bare = judge(record), bare_server(record)
-    end = record.end or {}
-    living = msgspec.convert(end["hosted"], Hosted) if "hosted" in end else None
-    states = msgspec.convert(end.get("states", {}), dict[str, str])
-    found = outcome_of(
-        record.history,
-        bare,
-        lost=_lost(end),
-        living=living,
-        digests=states.values(),
-        golden=bare().deterministic,
-    )
-    history = record.adaptations
-    blackouts = [float(str(a["blackout_ms"])) for a in history]
-    result = _result(
-        experiment,
-        record.history,
-        _honest(found, verdict),
-        tuple(reason for reason in verdict.reasons if reason.partition(":")[0] in UNEXCUSED),
-        tuple(verdict.faults),
-        bare,
-        tuple(str(a["outcome"]) for a in history),
-        max(blackouts, default=None),
-        verdict.vehicle,
-    )
-    noisy = starved(float(str(end.get("starved_ms", 0.0))), float(str(end.get("seconds", 0.0))))
-    return msgspec.structs.replace(result, noisy=noisy)
-
-
-def _lost(end: dict[str, object]) -> bool:
-    return bool(end.get("lost")) or not end.get("leader", "")
+    evidence = evidence_of(record)
+    result = _result(experiment, evidence, outcome_of(evidence))
+    end = record.end or RunEnd()
+    return msgspec.structs.replace(result, noisy=starved(end.starved_ms, end.seconds or 0.0))
 
 
 def _honest(found: tuple[str, tuple[str, ...]], verdict: Verdict) -> tuple[str, tuple[str, ...]]:
@@ -372,19 +321,13 @@ def _asked(experiment: Experiment) -> tuple[tuple[Fault, ...], tuple[Scheduled, 
     return faults_of(experiment, graph), scheduled(experiment.adaptations, graph, recipe)
 
 
-def _result(
-    experiment: Experiment,
-    history: History,
-    found: tuple[str, tuple[str, ...]],
-    broken: tuple[str, ...],
-    faults: tuple[dict[str, str], ...],
-    function: Callable[[], Application],
-    adapted: tuple[str, ...],
-    adapt_blackout_ms: float | None,
-    vehicle: VehicleResult | None,
-) -> Result:
-    outcome, reasons = found
-    failovers = checks.failovers(history)
+def _result(experiment: Experiment, evidence: Evidence, found: tuple[str, tuple[str, ...]]) -> Result:
+    record, verdict = evidence.record, judge(evidence.record, evidence)
+    outcome, reasons = found if record.simulated else _honest(found, verdict)
+    broken = tuple(reason for reason in verdict.reasons if reason.partition(":")[0] in UNEXCUSED)
+    adapted = tuple(str(a["outcome"]) for a in record.adaptations)
+    blackouts = [float(str(a["blackout_ms"])) for a in record.adaptations]
+    faults, vehicle, failovers = record.faults, record.vehicle, verdict.failovers
     recovery_ms = _longest([f.recovered_ms for f in failovers])
     if recovery_ms is not None and recovery_ms > (experiment.budget_ms or recovery_ms):
         outcome = worst([outcome, "degraded"])
@@ -403,13 +346,13 @@ def _result(
         broken=tuple(reason[:REASON_MAX] for reason in broken[:REASONS_MAX]),
         reasons=tuple(reason[:REASON_MAX] for reason in reasons[:REASONS_MAX]),
         faults=faults,
-        requests=checks.requests(history, function()),
+        requests=verdict.requests,
         failovers=len(failovers),
         detected_ms=_longest([f.detected_ms for f in failovers]),
         recovery_ms=recovery_ms,
         blackout_ms=_longest([f.blackout_ms for f in failovers]),
         adapted=adapted,
-        adapt_blackout_ms=adapt_blackout_ms,
+        adapt_blackout_ms=max(blackouts, default=None),
         collision=vehicle.collision if vehicle is not None else None,
         impact_kmh=vehicle.impact_speed_kmh if vehicle is not None else None,
         gap_m=vehicle.stop_gap_m if vehicle is not None else None,

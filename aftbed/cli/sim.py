@@ -29,11 +29,11 @@ from aftbed.core.fault import Fault
 from aftbed.core.graph import Graph
 from aftbed.core.messages import Goal, Scheduled
 from aftbed.core.script import RECIPES
-from aftbed.core.valuefault import Flip
 from aftbed.ftm.compose import build
 from aftbed.inject.words import parse
-from aftbed.judge import checks
-from aftbed.judge.verdict import ASSERT, EXIT_CODES, EXIT_INTERRUPTED, REST, Breach, Verdict, Word, outcome
+from aftbed.judge.outcome import outcome_of
+from aftbed.judge.record import record_of
+from aftbed.judge.verdict import EXIT_CODES, EXIT_INTERRUPTED, Breach, Verdict, Word, evidence_of, judge
 from aftbed.report import sequence
 from aftbed.runtime import targets
 from aftbed.runtime.sim.clock import START_NS
@@ -42,7 +42,7 @@ from aftbed.runtime.sim.tracing import traced
 from aftbed.runtime.sim.world import Run, Setup
 from aftbed.runtime.unix.worker_pool import each
 from aftbed.search.agreement import SEEDS, Agreement, Times, against
-from aftbed.search.explore import CAR, Found, attempt, missed, tried
+from aftbed.search.explore import Found, attempt, missed, tried
 from aftbed.search.shrink import shrink
 from aftbed.search.swarm import drawn
 from aftbed.vehicle.aeb.function import default_application
@@ -447,7 +447,7 @@ def _show(setup: Setup, done: Run | None, verdict: Word, reasons: tuple[str, ...
         return
     print("\n".join((*event_lines(done), *_adaptation_lines(done))))
     virtual_ms = (done.rest.ended_ns - START_NS) / 1e6
-    found = f"; outcome: {outcome(done)}" if setup.faults else ""
+    found = f"; outcome: {_outcome(done)}" if setup.faults else ""
     print(f"{virtual_ms:.1f} ms of virtual time in {wall_ms:.1f} ms{found}")
     show_verdict(_verdict(done, verdict, reasons), as_json=False)
 
@@ -465,32 +465,11 @@ def _adaptation_lines(run: Run) -> list[str]:
 
 
 def _verdict(done: Run, verdict: Word, reasons: tuple[str, ...]) -> Verdict:
-    setup, broken = done.setup, {reason.partition(":")[0] for reason in reasons}
-    return Verdict(
-        run="",
-        seed=setup.seed,
-        ftm=setup.ftm,
-        placement=setup.placement,
-        scenario=setup.scenario or "load",
-        verdict=verdict,
-        requests=checks.requests(done.history, default_application()),
-        vehicle=done.vehicle,
-        failovers=checks.failovers(done.history),
-        checks={name: "fail" if name in broken else "pass" for name in _checked(done)},
-        reasons=list(reasons),
-        faults=list(done.faults),
-        replay=None,
-        seconds=None,
-        launch_ms=None,
-    )
+    return msgspec.structs.replace(judge(record_of(done)), verdict=verdict, reasons=list(reasons))
 
 
-def _checked(done: Run) -> list[str]:
-    """The promises that were checked; if the service was lost, some cannot be."""
-    flips = any(isinstance(fault.action, Flip) for fault in done.setup.faults)
-    names = ["G1", "G2", "G4" if flips else "G3", "G6", ASSERT]
-    names += [] if done.rest.lost else ["G5", REST]
-    return names + ([CAR] if done.vehicle is not None and not done.rest.lost else [])
+def _outcome(done: Run) -> str:
+    return outcome_of(evidence_of(record_of(done), default_application))[0]
 
 
 def _document(
@@ -505,7 +484,7 @@ def _document(
     if done is not None:
         judged = _verdict(done, verdict, ())
         ran = {
-            "outcome": outcome(done),
+            "outcome": _outcome(done),
             "requests": judged.requests,
             "failovers": judged.failovers,
             "adaptations": done.adaptations,

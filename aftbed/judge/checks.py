@@ -6,13 +6,12 @@ has a broken history in the tests that it must refuse.
 """
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from itertools import starmap
-from typing import Final, Literal
+from typing import Final, Literal, NamedTuple
 
 import msgspec
 
-from aftbed.core.application import Application
 from aftbed.core.errors import PeerError
 from aftbed.core.events import RERUN, Event
 from aftbed.core.fault import FIRED
@@ -21,10 +20,18 @@ from aftbed.core.history import History
 from aftbed.core.journal import Entry, EntryKind, Record
 from aftbed.core.valuefault import BITFLIP
 from aftbed.ftm.compose import build, replication_of
+from aftbed.judge.record import Excuses, RunRecord
+from aftbed.judge.reference import ReferenceRun
 from aftbed.runtime.hosting import Hosted
+from aftbed.runtime.unix.options import COMMAND_GONE, CarRun
 from aftbed.vehicle.aeb.messages import AebOutput, decode_reply
+from aftbed.vehicle.scenarios.library import load_scenario
+from aftbed.vehicle.scenarios.scenario import broken_expectations
 
 REASONS_MAX: Final = 5
+REQUESTED_ENDS: Final = ("", "interrupted", "stopped")  # ends of a run that its user asked for
+VEHICLE: Final = "vehicle"  # the name of the check of what a scenario expects of the car
+NOTHING_EXCUSED: Final = Excuses()
 LATE_NS: Final = 60_000_000  # as long as the brake ECU holds the last request
 
 Finding = Literal["pass", "fail", "unknown"]
@@ -107,9 +114,10 @@ def exactly_one_answer(history: History, *, cut_off: bool = False) -> Check:
     return _check(reasons) if answers else Check("unknown", ("no request was sent",))
 
 
-def one_history(history: History, bare: Application) -> Check:
+def one_history(history: History, reference: ReferenceRun) -> Check:
     """G3: the replies are those of the bare server over the same requests in the order of ids."""
-    reasons = [f"request {i}: the reply is not the bare server's" for i in wrong_replies(history, bare)]
+    wrong = wrong_replies(history, reference)
+    reasons = [f"request {i}: the reply is not the bare server's" for i in wrong]
     sent = [e.request_id for e in _sent(history)]
     if sent != list(range(1, len(sent) + 1)):
         reasons.append("the ids of the requests are not 1, 2, 3, ...")
@@ -139,21 +147,13 @@ def one_master(history: History) -> Check:
     return _check(reasons) if masters else Check("unknown", ("no reply was accepted",))
 
 
-def wrong_replies(history: History, bare: Application) -> list[int]:
-    """The ids whose reply differs from the bare server's; `bare` is a fresh one."""
+def wrong_replies(history: History, reference: ReferenceRun) -> list[int]:
+    """The ids whose reply differs from the bare server's."""
     answers = _answers(history)
-    wrong = []
-    for entry in _sent(history):
-        try:
-            expected = bare.execute(entry.payload)
-        except PeerError:
-            expected = b""
-        if any(a.payload != expected for a in answers[entry.request_id]):
-            wrong.append(entry.request_id)
-    return wrong
+    return [i for i, expected in reference.replies if any(a.payload != expected for a in answers[i])]
 
 
-def requests(history: History, bare: Application) -> Requests:
+def requests(history: History, reference: ReferenceRun) -> Requests:
     """The client's account of its requests."""
     answers = _answers(history)
     sent_ns = {e.request_id: e.t_ns for e in _sent(history)}
@@ -165,7 +165,7 @@ def requests(history: History, bare: Application) -> Requests:
         lost=sum(i not in firsts for i in sent_ns),
         duplicated=sum(len(a) > 1 for a in answers.values()) + refused,
         late=sum(t_ns - sent_ns[i] > LATE_NS for i, t_ns in firsts.items() if i in sent_ns),
-        wrong=len(wrong_replies(history, bare)),
+        wrong=len(wrong_replies(history, reference)),
     )
 
 
@@ -237,41 +237,14 @@ def missing(hosted: Iterable[tuple[str, str]], whole: Graph) -> list[str]:
     return reasons + [f"{name} ({kind}) should not be there" for name, kind in sorted(found - wanted)]
 
 
-# -- G4: a value fault never reaches the client. And where one does: what it asks the brakes for.
-#
-# Judged by the replies alone, whatever mechanism there was: only TR promises it, without TR a flipped bit
-# is expected to come through, as silent data corruption (sdc). A run without a flipped bit proves nothing.
-
-
-def value(history: History, bare: Application, faults: list[dict[str, str]]) -> Check | None:
-    """The check, by the receipts of a run; None where no value fault was asked for. `bare` is a fresh one."""
-    flips = [f for f in faults if f["fault"].split()[0] == BITFLIP]
-    if not flips:
-        return None
-    wrong = corruptions(history, bare)
-    if wrong:
-        return Check("fail", tuple(wrong[:REASONS_MAX]))
-    if not any(f["receipt"] in FIRED for f in flips):
-        return Check("unknown", ("no value fault was applied",))
-    return Check("pass")
-
-
-def corruptions(history: History, bare: Application) -> list[str]:
+def corruptions(history: History, reference: ReferenceRun) -> list[str]:
     """Each reply that is not the bare server's, and what it says instead; in the order of the requests."""
-    answers: dict[int, list[bytes]] = defaultdict(list)
-    for entry in history.dialogue:
-        if entry.kind is EntryKind.ANSWERED:
-            answers[entry.request_id].append(entry.payload)
+    answers = _answers(history)
     found = []
-    for entry in history.dialogue:
-        if entry.kind is EntryKind.SENT:
-            try:
-                right = bare.execute(entry.payload)
-            except PeerError:
-                right = b""
-            wrong = next((a for a in answers[entry.request_id] if a != right), None)
-            if wrong is not None:
-                found.append(f"request {entry.request_id}: sdc: {_difference(wrong, right)}")
+    for request_id, expected in reference.replies:
+        wrong = next((a.payload for a in answers[request_id] if a.payload != expected), None)
+        if wrong is not None:
+            found.append(f"request {request_id}: sdc: {_difference(wrong, expected)}")
     return found
 
 
@@ -299,20 +272,186 @@ def _text(output: AebOutput | None, reply: bytes) -> str:
     return f"stage {output.stage} at {output.deceleration_ms2} m/s2"
 
 
-# -- G5: what lives at the end of a run is a whole graph, the one to which its adaptations came.
-#
-# "An adaptation either completes or leaves the graph that was there: never half of one" (design 3). Of a
-# run
-# that ended before redundancy was back, the backup's bricks are not asked for.
-
-
 def half_a_graph(hosted: Hosted, expected: str) -> list[str]:
-    """What is missing, or should not be there, where `expected` is the FTM that should run; [] if whole."""
+    """What of the graph of FTM `expected` is missing, or should not be there; [] if it is whole.
+
+    Of a run that ended before redundancy was back, the bricks of the backup are not required.
+    """
     if not hosted.leader:
-        return ["nobody leads"]
+        return ["no replica leads"]
     if hosted.ftm != expected:
         return [f"{hosted.ftm} runs, though the adaptations came to {expected}"]
     duplex = bool(replication_of(expected))
     whole = build(expected, hosted.placement, hosted.leader if duplex else "a")
     joining = "" if hosted.backup or not duplex else ("b" if hosted.leader == "a" else "a")
     return [r for r in missing(hosted.bricks, whole) if not joining or not r.startswith(f"{joining}/")]
+
+
+# -- The checks of a run: each says what of its promise holds in a record.
+
+
+class Evidence(msgspec.Struct, frozen=True):
+    """What a check looks at: the record of a run, and what the bare server made of the same requests."""
+
+    record: RunRecord
+    reference: ReferenceRun
+
+    @property
+    def excuses(self) -> Excuses:
+        """What the faults of this run allow."""
+        return self.record.excuses or NOTHING_EXCUSED
+
+
+class Checker(NamedTuple):
+    """A check by its name in the verdict, and the promise that it is about ("" of none of G1 to G8).
+
+    `check` gives None where a run of this kind says nothing about it.
+    """
+
+    name: str
+    promise: str
+    check: Callable[[Evidence], Check | None]
+
+    def __str__(self) -> str:
+        return f"{self.name} ({self.promise})" if self.promise else self.name
+
+
+def _at_most_once(evidence: Evidence) -> Check:
+    return at_most_once(evidence.record.history)
+
+
+def _exactly_one_answer(evidence: Evidence) -> Check:
+    record = evidence.record
+    cut_off = record.end is None or record.end.reason == COMMAND_GONE or evidence.excuses.service_lost
+    if record.simulated and record.lost and not cut_off:
+        names = ", ".join(evidence.excuses.struck)
+        struck = f"only {names}" if names else "no node"
+        return Check("fail", (f"the service is lost, though {struck} was struck",))
+    found = exactly_one_answer(record.history, cut_off=cut_off)
+    if found.finding == "unknown" and evidence.excuses.service_lost:
+        return Check("pass")  # what waited when the last replica was struck is promised to no client
+    return found
+
+
+def _one_history(evidence: Evidence) -> Check | None:
+    if evidence.excuses.values:
+        return None
+    return one_history(evidence.record.history, evidence.reference)
+
+
+def _value(evidence: Evidence) -> Check | None:
+    """G4, judged by the replies alone, whatever mechanism ran.
+
+    Only TR promises it: without TR a flipped bit is expected to come through, as silent data corruption
+    (sdc). Without a flipped bit there is nothing to say.
+    """
+    record = evidence.record
+    flips = [f for f in record.faults if f["fault"].split()[0] == BITFLIP]
+    if not flips or evidence.excuses.values:
+        return None
+    wrong = corruptions(record.history, evidence.reference)
+    if wrong:
+        return Check("fail", tuple(wrong[:REASONS_MAX]))
+    if not any(f["receipt"] in FIRED for f in flips):
+        return Check("unknown", ("no value fault was applied",))
+    return Check("pass")
+
+
+def _one_master(evidence: Evidence) -> Check:
+    return one_master(evidence.record.history)
+
+
+def _whole_graph(evidence: Evidence) -> Check:
+    """G5: at the end lives a whole graph, the one to which the adaptations came, unless none is left."""
+    record = evidence.record
+    if record.end is None or record.end.hosted is None:
+        return Check("unknown", ("the supervisor did not live to say what lived",))
+    if record.lost or evidence.excuses.service_lost:
+        return Check("pass")  # there is no service left; what that means, the other checks say
+    if record.end.unfinished and not record.simulated:
+        under_way = list(record.end.unfinished)
+        return Check("unknown", (f"the run ended while this was under way: {under_way}",))
+    return _check(half_a_graph(record.end.hosted, record.ftm))
+
+
+def _at_rest(evidence: Evidence) -> Check | None:
+    """A simulated run lasts until nothing is under way, or so long that it never will."""
+    record = evidence.record
+    if not record.simulated or record.end is None or record.lost or evidence.excuses.service_lost:
+        return None
+    return _check(["; ".join(record.end.unfinished)] if record.end.unfinished else [])
+
+
+def _assertions(evidence: Evidence) -> Check | None:
+    """An assert that failed in a brick of a simulated run is a bug, whatever came of it."""
+    if not evidence.record.simulated:
+        return None
+    return _check(list(evidence.record.failures[:1]))
+
+
+def _clean_exit(evidence: Evidence) -> Check | None:
+    """G7, as far as the supervisor saw it; a run without its end is trouble of the harness."""
+    end = evidence.record.end
+    if evidence.record.simulated:
+        return None
+    if end is None:
+        return Check("unknown", ("the supervisor did not live to end the run",))
+    if end.left:
+        return Check("fail", (f"left behind: {list(end.left)}",))
+    if end.reason not in REQUESTED_ENDS:
+        return Check("unknown", (end.reason,))
+    return Check("pass")
+
+
+def _faults_applied(evidence: Evidence) -> Check:
+    """G8: a fault that did not fire proves nothing."""
+    missing = [f for f in evidence.record.faults if f["receipt"] not in FIRED]
+    return Check("unknown" if missing else "pass", tuple(map(_missed, missing)))
+
+
+def _missed(fault: dict[str, str]) -> str:
+    detail = fault.get("detail")
+    return f"{fault['receipt']}: {fault['fault']}: {detail}" if detail else f"never fired: {fault['fault']}"
+
+
+def _whole_history(evidence: Evidence) -> Check:
+    """G8: a journal that was full has not seen everything."""
+    lost = evidence.record.history.dropped
+    return Check("unknown", (f"{lost} records found no room in the journals",)) if lost else Check("pass")
+
+
+def _vehicle(evidence: Evidence) -> Check | None:
+    """What the scenario expects of the car; a drive that was broken off is judged by what it did."""
+    record = evidence.record
+    work = record.options.work
+    if not isinstance(work, CarRun) or (record.simulated and record.lost):
+        return None  # without a service no drive is promised to end well
+    if record.vehicle is None:
+        return Check("unknown", ("the car did not report",))
+    result = record.end.result if record.end is not None else None
+    if result is not None and result.get("end") == "stopped" and not record.vehicle.collision:
+        return Check("pass")
+    broken = broken_expectations(load_scenario(work.scenario), record.vehicle)
+    return Check("fail" if broken else "pass", tuple(broken))
+
+
+CHECKERS: Final = (  # a new check is a function and a line here; its name is its key in every verdict
+    Checker("at_most_once", "G1", _at_most_once),
+    Checker("exactly_one_answer", "G2", _exactly_one_answer),
+    Checker("one_history", "G3", _one_history),
+    Checker("one_master", "G6", _one_master),
+    Checker("whole_graph", "G5", _whole_graph),
+    Checker("clean_exit", "G7", _clean_exit),
+    Checker("faults_applied", "G8", _faults_applied),
+    Checker("whole_history", "G8", _whole_history),
+    Checker("value", "G4", _value),
+    Checker("at_rest", "", _at_rest),
+    Checker("assertions", "", _assertions),
+    Checker(VEHICLE, "", _vehicle),
+)
+
+
+def findings(evidence: Evidence) -> dict[Checker, Check]:
+    """The answer of every check that has one, in the order of `CHECKERS`."""
+    answers = ((checker, checker.check(evidence)) for checker in CHECKERS)
+    return {checker: found for checker, found in answers if found is not None}

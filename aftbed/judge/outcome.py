@@ -7,19 +7,15 @@ that a corruption that has not yet come out is seen too (`latent`). A car is com
 without a fault.
 """
 
-from collections.abc import Callable, Iterable
 from typing import Final
 
 from aftbed.adapt.observer import VOTE_MASKED
-from aftbed.core.application import Application
-from aftbed.core.errors import PeerError
 from aftbed.core.events import Event
 from aftbed.core.history import History
 from aftbed.core.journal import EntryKind
 from aftbed.ftm.compose import replication_of
 from aftbed.judge import checks
-from aftbed.judge.checks import Requests, corruptions
-from aftbed.runtime.hosting import Hosted, digest
+from aftbed.judge.checks import Evidence, Requests, corruptions
 
 OUTCOMES: Final = (  # from the best to the worst
     "masked",
@@ -47,25 +43,19 @@ def worst(outcomes: list[str]) -> str:
     return max(outcomes, key=OUTCOMES.index, default=OUTCOMES[0])
 
 
-def outcome_of(
-    history: History,
-    function: Callable[[], Application],
-    *,
-    lost: bool,
-    living: Hosted | None,
-    digests: Iterable[str] = (),
-    golden: bool = True,
-) -> tuple[str, tuple[str, ...]]:
-    """The class and its reasons. `digests`: of the replicas' states at the end, as far as they are known.
+def outcome_of(evidence: Evidence) -> tuple[str, tuple[str, ...]]:
+    """The class and its reasons, the worst first.
 
-    Not `golden`: the function is not deterministic, so nobody can say what it should have answered.
+    Where the function is not deterministic, its replies and its states are not compared.
     """
-    counts = checks.requests(history, function())
+    record, reference = evidence.record, evidence.reference
+    history, living = record.history, record.end.hosted if record.end is not None else None
+    counts = checks.requests(history, reference)
     found: dict[str, str] = {}
-    wrong = corruptions(history, function()) if golden else []
+    wrong = corruptions(history, reference) if reference.deterministic else []
     if wrong:
         found["sdc"] = wrong[0]
-    unanswered(history, counts, found, lost=lost)
+    unanswered(history, counts, found, lost=record.lost)
     doubled = checks.at_most_once(history).reasons
     if doubled or counts.duplicated:
         found["duplicate_effect"] = doubled[0] if doubled else f"doubled replies: {counts.duplicated}"
@@ -73,15 +63,15 @@ def outcome_of(
         found["detected_stop"] = "a replica ended itself rather than answer"
     if counts.late:
         found["degraded"] = f"late replies: {counts.late}"
-    if living is not None and not lost and replication_of(living.ftm) and not living.backup:
-        found["degraded"] = "nobody backs up at the end"
+    if living is not None and not record.lost and replication_of(living.ftm) and not living.backup:
+        found["degraded"] = "no replica backs up at the end"
     acted = [event.label for event in ACTED if history.events(event)] + _outvoted(history)
     if acted:
         found["tolerated"] = f"the mechanism acted: {', '.join(acted)}"
-    states = set(digests)
+    states = set(record.end.states.values()) if record.end is not None else set()
     if history.events(Event.FOLLOWER_DIVERGED) or len(states) > 1:
         found["latent"] = "the replicas differ"
-    elif states and golden and not wrong and states != {golden_digest(history, function())}:
+    elif states and reference.deterministic and not wrong and states != {reference.digest}:
         found["latent"] = "the state of the replicas is not the bare server's"
     word = worst(list(found))
     return word, tuple(found[name] for name in sorted(found, key=OUTCOMES.index, reverse=True))
@@ -102,14 +92,3 @@ def _outvoted(history: History) -> list[str]:
     """Third executions: two that differed were compared before."""
     votes = history.events(Event.VOTE_COMPARED)
     return ["a third execution"] if any(vote.detail == VOTE_MASKED for vote in votes) else []
-
-
-def golden_digest(history: History, bare: Application) -> str:
-    """Of the state of the bare server after the same requests; `bare` is a fresh one."""
-    for entry in history.dialogue:
-        if entry.kind is EntryKind.SENT:
-            try:
-                bare.execute(entry.payload)
-            except PeerError:
-                continue
-    return digest(bare.capture())

@@ -1,27 +1,99 @@
-"""A run's record, read back: what `--record DIR` leaves, also after a `kill -9`."""
+"""The record of a run: one type, of real processes (what `--record DIR` leaves) and of the simulator.
 
+The directory of a real run can be read after a `kill -9`, too.
+"""
+
+import itertools
 import json
 from pathlib import Path
+from typing import Final
 
 import msgspec
 
 from aftbed.core.errors import ConfigError, PeerError
+from aftbed.core.events import Event
+from aftbed.core.fault import Fault
 from aftbed.core.history import History
 from aftbed.core.journal import dropped, entries, records
+from aftbed.core.script import ScriptKind
+from aftbed.core.valuefault import Flip
+from aftbed.ftm.compose import replication_of
+from aftbed.runtime.hosting import Hosted
+from aftbed.runtime.rewiring import replica_of
+from aftbed.runtime.sim.world import Run
 from aftbed.runtime.unix.journal import contents
-from aftbed.runtime.unix.options import RunOptions
+from aftbed.runtime.unix.options import CarRun, LoadRun, RunOptions, Work
 from aftbed.runtime.unix.support import HISTORY_NAME
+from aftbed.vehicle.plant import VehicleResult
+
+
+class RunEnd(msgspec.Struct, frozen=True):
+    """How a run ended, as `end.json` says it. `hosted` is None where it was not looked at.
+
+    `left`: processes that outlived it. `unfinished`: scripts that were under way. `lost`: no replica lived.
+    `starved_ms`: how long the node that waited longest was ready to run and had no CPU.
+    """
+
+    reason: str = ""
+    left: tuple[str, ...] = ()
+    unfinished: tuple[str, ...] = ()
+    lost: bool = False
+    leader: str = ""
+    hosted: Hosted | None = None
+    states: dict[str, str] = {}
+    faults: tuple[dict[str, str], ...] = ()
+    result: dict[str, object] | None = None
+    seconds: float | None = None
+    starved_ms: float = 0.0
+
+
+class Excuses(msgspec.Struct, frozen=True):
+    """What the faults of a run allow, although a promise is broken by it; only the simulator knows this.
+
+    `service_lost`: a fault struck each replica, the second before redundancy was back from the first.
+    `values`: a bit was flipped that no mechanism outvotes (of a checkpoint, or of a reply that is kept).
+    """
+
+    service_lost: bool = False
+    values: bool = False
+    struck: tuple[str, ...] = ()  # the nodes that faults killed or stopped
 
 
 class RunRecord(msgspec.Struct, frozen=True):
-    """`end` is None where the supervisor did not live to write it."""
+    """What a run left behind: of real processes, read from its directory, or of the simulator.
 
-    path: Path
+    `end` is None where the supervisor did not live to write it. `failures`: asserts that failed in nodes, as
+    far as they are known. `excuses` is None of a real run, of which nothing is excused.
+    """
+
     options: RunOptions
-    started_ns: int
-    end: dict[str, object] | None
     history: History
+    end: RunEnd | None
+    faults: tuple[dict[str, str], ...] = ()  # each with its receipt
     adaptations: tuple[dict[str, object], ...] = ()  # how each one ended, in order
+    vehicle: VehicleResult | None = None
+    path: Path = Path()
+    started_ns: int = 0
+    failures: tuple[str, ...] = ()
+    excuses: Excuses | None = None
+
+    @property
+    def simulated(self) -> bool:
+        """Whether the simulator made it."""
+        return self.excuses is not None
+
+    @property
+    def ftm(self) -> str:
+        """The FTM that the adaptations, as they ended, have come to."""
+        done = [str(a["ftm"]) for a in self.adaptations if a["outcome"] == "done"]
+        return done[-1] if done else self.options.ftm
+
+    @property
+    def lost(self) -> bool:
+        """Whether no replica lived at the end, as far as it is known."""
+        if self.end is None or self.end.lost:
+            return True
+        return not (self.end.hosted.leader if self.end.hosted is not None else self.end.leader)
 
 
 def read_record(path: Path) -> RunRecord:
@@ -41,8 +113,85 @@ def read_record(path: Path) -> RunRecord:
         lost = sum(dropped(contents(p)) for p in (*files, *dialogues))
     except PeerError as error:
         raise ConfigError(f"{folder}: {error}") from None
-    end = _json(path / "end.json") if (path / "end.json").exists() else None
-    return RunRecord(path, options, started, end, History(journals, dialogue, lost), _adaptations(path))
+    history = History(journals, dialogue, lost)
+    end = _end(path / "end.json") if (path / "end.json").exists() else None
+    faults = end.faults if end is not None else tuple(_unknown(fault) for fault in options.faults)
+    vehicle = _vehicle(options, end)
+    return RunRecord(options, history, end, faults, _adaptations(path), vehicle, path, started)
+
+
+def _end(path: Path) -> RunEnd:
+    try:
+        return msgspec.convert(_json(path), RunEnd)
+    except msgspec.ValidationError as error:
+        raise ConfigError(f"{path}: not the end of a run: {error}") from None
+
+
+def _unknown(fault: Fault) -> dict[str, str]:
+    return {"fault": str(fault), "receipt": "unknown"}
+
+
+def _vehicle(options: RunOptions, end: RunEnd | None) -> VehicleResult | None:
+    if end is None or end.result is None or not isinstance(options.work, CarRun):
+        return None
+    return msgspec.convert(end.result["result"], VehicleResult)
+
+
+# Events of faults that no mechanism outvotes: bits of a checkpoint, or of a reply that is kept.
+UNPROMISED_VALUES: Final = frozenset(
+    event.label
+    for event in (Event.STATE_CAPTURED, Event.STATE_RESTORED, Event.CHECKPOINT_SENT)
+    + (Event.CHECKPOINT_APPLIED, Event.REPLY_STORED, Event.DEDUPE_HIT)
+)
+SINGLE: Final = "single"  # the node of that placement hosts both replicas
+
+
+def record_of(run: Run) -> RunRecord:
+    """The record of a simulated run."""
+    setup, rest = run.setup, run.rest
+    work: Work = CarRun(setup.scenario, None, "") if setup.scenario else LoadRun(setup.count, setup.rate_hz)
+    options = RunOptions("", "", "", setup.ftm, setup.placement, setup.seed, work, setup.faults)
+    end = RunEnd(
+        unfinished=rest.why_not,
+        lost=rest.lost,
+        leader=rest.leader,
+        hosted=rest.hosted,
+        states=rest.states,
+        faults=run.faults,
+    )
+    flips = [f for f in setup.faults if isinstance(f.action, Flip)]
+    # A switch of the mechanism brings the Servers in line, so with adaptations the values are promised again.
+    values = not setup.adaptations and any(f.event in UNPROMISED_VALUES for f in flips)
+    return RunRecord(
+        options,
+        run.history,
+        end,
+        run.faults,
+        tuple(msgspec.to_builtins(outcome) for outcome in run.adaptations),
+        run.vehicle,
+        failures=run.failures,
+        excuses=Excuses(service_struck_down(run), values, tuple(name for _, name in run.struck)),
+    )
+
+
+def service_struck_down(run: Run) -> bool:
+    """Whether faults struck each replica, the second before redundancy was back from the first."""
+    replicas = {b.replica for b in run.rest.graph.bricks if b.replica and b.part == "server"}
+    renewed = [
+        (s.began_ns, s.ended_ns)
+        for s in run.scripts
+        if s.kind is ScriptKind.NEW_BACKUP and s.ended_ns and not s.failure
+    ]
+    strikes = sorted((t_ns, replica_of(name)) for t_ns, name in run.struck if replica_of(name))
+    if any(name == SINGLE for _, name in run.struck):
+        return True
+    simplex = any(a.goal.expression and not replication_of(a.goal.expression) for a in run.setup.adaptations)
+    if len(replicas) < 2 or simplex:  # for a time there may have been one replica only
+        return bool(strikes)
+    return any(
+        other != replica and not any(first_ns < began and done < second_ns for began, done in renewed)
+        for (first_ns, replica), (second_ns, other) in itertools.combinations(strikes, 2)
+    )
 
 
 def _adaptations(path: Path) -> tuple[dict[str, object], ...]:

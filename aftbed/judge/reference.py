@@ -20,7 +20,9 @@ from aftbed.core.application import Application
 from aftbed.core.errors import PeerError
 from aftbed.core.events import Event
 from aftbed.core.history import History
+from aftbed.core.journal import EntryKind
 from aftbed.judge.record import RunRecord
+from aftbed.runtime.hosting import digest
 from aftbed.runtime.rewiring import replica_of
 from aftbed.runtime.unix.part import load_module
 from aftbed.vehicle.aeb.function import default_application
@@ -31,8 +33,8 @@ BUILT_IN: Final = ""
 DONE: Final = "done"
 
 
-class Told(msgspec.Struct, frozen=True):
-    """What counts of an adaptation's outcome: see `runtime.adaptations.Outcome`."""
+class AppliedUpdate(msgspec.Struct, frozen=True):
+    """What an adaptation's outcome says of the version that served: see `runtime.adaptations.Outcome`."""
 
     outcome: str
     application: str = BUILT_IN
@@ -103,22 +105,22 @@ def succession(history: History, adaptations: Iterable[object]) -> Callable[[], 
     changes: list[Change] = []
     running = BUILT_IN
     for outcome in adaptations:
-        told = msgspec.convert(outcome, Told, from_attributes=True)
-        function = told.application if told.outcome == DONE else told.tried
-        if not told.opened_ns or function == running:
+        update = msgspec.convert(outcome, AppliedUpdate, from_attributes=True)
+        function = update.application if update.outcome == DONE else update.tried
+        if not update.opened_ns or function == running:
             continue
-        stored = (r.request_id for r in history.events(Event.REPLY_STORED) if r.t_ns < told.opened_ns)
+        stored = (r.request_id for r in history.events(Event.REPLY_STORED) if r.t_ns < update.opened_ns)
         first = 1 + max(stored, default=0)
         make = load_application(function, load_module) if function else default_application
         changes.append((first, make))
-        if told.undone_ns:
-            changes.append((max(first, _first_behind(history, told)), None))
+        if update.undone_ns:
+            changes.append((max(first, _first_behind(history, update)), None))
         else:
             running = function
     return lambda: Succession(changes)
 
 
-def _first_behind(history: History, undone: Told) -> int:
+def _first_behind(history: History, undone: AppliedUpdate) -> int:
     """The first request that is the old version's again."""
     lost = undone.lost.split()
     known = (
@@ -127,3 +129,40 @@ def _first_behind(history: History, undone: Told) -> int:
         if undone.opened_ns <= r.t_ns < undone.undone_ns and replica_of(r.node) not in lost
     )
     return 1 + max(known, default=0)
+
+
+class ReferenceRun(msgspec.Struct, frozen=True):
+    """What the bare server makes of the requests of a run: its replies, by id, and its state behind them.
+
+    A request that it refuses has an empty reply. Where the function is not `deterministic` its replies say
+    nothing of those of a run.
+    """
+
+    replies: tuple[tuple[int, bytes], ...]
+    state: bytes
+    deterministic: bool = True
+
+    @property
+    def digest(self) -> str:
+        """Of its last state: see `RunEnd.states`."""
+        return digest(self.state)
+
+
+def reference_run(history: History, bare: Application) -> ReferenceRun:
+    """`bare` is a fresh one: it executes each request that was sent, in their order."""
+    replies = []
+    for entry in history.dialogue:
+        if entry.kind is EntryKind.SENT:
+            try:
+                replies.append((entry.request_id, bare.execute(entry.payload)))
+            except PeerError:
+                replies.append((entry.request_id, b""))
+    return ReferenceRun(tuple(replies), bare.capture(), getattr(bare, "deterministic", True))
+
+
+def reference_of(record: RunRecord, function: Callable[[], Application] | None = None) -> ReferenceRun:
+    """Of the versions of the function that served the run; of `function`, where one is given.
+
+    Raises ConfigError where a version of the function is gone.
+    """
+    return reference_run(record.history, (function or bare_server(record))())

@@ -18,9 +18,9 @@ from aftbed.core import history as core_history
 from aftbed.core.errors import ConfigError
 from aftbed.core.messages import Scheduled
 from aftbed.judge import checks
-from aftbed.judge.record import RunRecord, read_record
-from aftbed.judge.reference import bare_server
-from aftbed.judge.verdict import class_of
+from aftbed.judge.outcome import outcome_of
+from aftbed.judge.record import RunRecord, read_record, record_of
+from aftbed.judge.verdict import evidence_of
 from aftbed.runtime.sim.world import Setup, simulate
 from aftbed.runtime.unix.options import CarRun, LoadRun
 from aftbed.vehicle.aeb.function import default_application
@@ -76,13 +76,12 @@ def setup_of(record: RunRecord) -> Setup:
 def _compare(setup: Setup, records: list[RunRecord], seeds: int) -> Agreement:
     real_classes, real_ms = Counter[str](), list[float]()
     for record in records:
-        lost = record.end is None or bool(record.end.get("lost")) or not record.end.get("leader")
-        real_classes[class_of(record.history, bare_server(record), lost=lost)] += 1
+        real_classes[outcome_of(evidence_of(record))[0]] += 1
         real_ms += _recoveries(record.history)
     sim_classes, sim_ms = Counter[str](), list[float]()
     for seed in range(seeds):
         run = simulate(msgspec.structs.replace(setup, seed=seed))
-        sim_classes[class_of(run.history, default_application, lost=run.rest.lost)] += 1
+        sim_classes[outcome_of(evidence_of(record_of(run), default_application))[0]] += 1
         sim_ms += _recoveries(run.history)
     real_times, sim_times = _times(real_ms), _times(sim_ms)
     found = [

@@ -52,7 +52,7 @@ def shrink(setup: Setup, broken: Broken, tries_max: int = TRIES_MAX) -> Setup:
     """
     first = broken(setup)
     assert first, f"nothing is broken by {setup}"
-    promise, tried = first[0].promise, {_key(setup)}
+    check, tried = first[0].check, {_key(setup)}
     tries = 1
     while tries < tries_max:
         for simpler in _simpler(setup):
@@ -63,7 +63,7 @@ def shrink(setup: Setup, broken: Broken, tries_max: int = TRIES_MAX) -> Setup:
             tries += 1
             tried.add(_key(simpler))
             found = broken(simpler)
-            if found and found[0].promise == promise:
+            if found and found[0].check == check:
                 setup = simpler
                 break
         else:

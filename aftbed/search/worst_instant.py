@@ -26,6 +26,7 @@ from aftbed.core.fault import FIRED, Action, Crash, Fault, Hang, Slow, Trigger
 from aftbed.core.journal import Entry, EntryKind
 from aftbed.ftm.compose import build
 from aftbed.ftm.registry import EMITTERS
+from aftbed.judge.checks import VEHICLE
 from aftbed.judge.verdict import breaches
 from aftbed.runtime.sim.world import Run, Setup, World, simulate
 from aftbed.runtime.targets import emitter
@@ -125,7 +126,8 @@ def _result(run: Run) -> VehicleResult:
 
 
 def _promises(run: Run) -> tuple[str, ...]:
-    return tuple(str(breach) for breach in breaches(run))
+    """What the run breaks beside what its scenario expects of the car."""
+    return tuple(str(breach) for breach in breaches(run) if breach.check != VEHICLE)
 
 
 def _entries(run: Run, kind: EntryKind) -> list[Entry]:

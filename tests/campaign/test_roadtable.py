@@ -96,7 +96,7 @@ def test_a_broken_promise_fails_a_row_whatever_the_car_does() -> None:
     line = Line("flip", "pbr", parse("bitflip result bit 60 nth 3"))
     found = row(R152["r152:m1-10"], line)
     assert not found.passed and found.struck
-    assert found.because[0].startswith("G4: ")
+    assert found.because[0].startswith("one_history (G3): ")
 
 
 def test_colours_are_those_of_euro_ncap_only() -> None:

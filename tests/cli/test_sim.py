@@ -107,14 +107,14 @@ def test_a_service_whose_every_replica_was_struck_is_unavailable_and_nothing_is_
 def test_a_failure_is_shrunk_and_its_commands_repeat_it(sim: Call, call: Call) -> None:
     code, out, _ = sim("--seed", "5", *FLIP)
     assert code == 1
-    assert "  because    G4: request 3: the reply is not the bare server's" in out
+    assert "  because    one_history (G3): request 3: the reply is not the bare server's" in out
     assert out.splitlines()[0] == out.splitlines()[-1] == "seed 5"
     original, shrunk = re.findall(r"^  repeat +(aftbed sim .*)$", out, re.MULTILINE)
     assert "--count 10" in original and "nth 3" in original
     assert "--seed 5" in shrunk and "--count 1 " in shrunk and "nth 1" in shrunk
     for command in (original, shrunk):
         code, again, _ = call(*shlex.split(command)[1:])
-        assert code == 1 and "because    G4: request" in again
+        assert code == 1 and "because    value (G4): request" in again
 
 
 def test_the_document_of_a_failure(sim: Call) -> None:
@@ -122,7 +122,7 @@ def test_the_document_of_a_failure(sim: Call) -> None:
     found = json.loads(out)
     assert code == 1
     assert (found["seed"], found["verdict"], found["outcome"]) == (5, "fail", "sdc")
-    assert found["breaches"] == ["G4: request 3: the reply is not the bare server's"]
+    assert found["breaches"][0] == "one_history (G3): request 3: the reply is not the bare server's"
     assert found["command"].startswith("aftbed sim --seed 5 --ftm pbr --count 10 --faults ")
     assert "--count 1 " in found["shrunk"]
 
@@ -131,7 +131,9 @@ def test_a_failure_shows_its_last_messages_and_draws_them(sim: Call, tmp_path: P
     _, out, _ = sim(*FLIP, "--diagram", tmp_path / "last.md")
     drawn_text = out.partition("verdict: fail\n")[2].partition("found: ")[0]
     assert "pxy2pro" in drawn_text and "fault.applied: bitflip result bit 60 in primary" in drawn_text
-    assert drawn_text.splitlines()[-1] == "broken: G4: request 3: the reply is not the bare server's"
+    assert (
+        "broken: one_history (G3): request 3: the reply is not the bare server's" in drawn_text.splitlines()
+    )
     assert (tmp_path / "last.md").read_text().startswith("sequenceDiagram\n")
 
 

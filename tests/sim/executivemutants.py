@@ -173,7 +173,7 @@ EXECUTIVE: Final = (
         instead(Recovery, "deadline_ns", lambda self: None),
         PAIRS,
         pairs("pbr", ("b/server", "a/server"), (2.0, 3.0, 4.0)),
-        "rest",
+        "at_rest",
     ),
     Mutant(
         "no fencing",
@@ -205,7 +205,7 @@ EXECUTIVE: Final = (
         instead(Executor, "_kill", lambda self, replica: None),
         CRASH,
         crashes("pbr", "a/proceed"),
-        "rest",
+        "at_rest",
     ),
     Mutant(
         "leader not resumed",
@@ -349,7 +349,7 @@ EXECUTIVE: Final = (
         answer(AdaptationEngine, TakeUp, lambda effects: []),
         ADAPT,
         adapts("pbr", "pbr+tr", "engine"),
-        "rest",
+        "at_rest",
     ),
     Mutant(
         "unbind forgotten",
@@ -365,7 +365,7 @@ EXECUTIVE: Final = (
         instead(failover, "new_backup", lambda *args: None),
         CRASH,
         crashes("pbr", "b/after"),
-        "rest",
+        "at_rest",
     ),
     Mutant(
         "staged not ended",

@@ -17,10 +17,13 @@ from aftbed.core.script import ScriptKind
 from aftbed.core.valuefault import Place
 from aftbed.ftm.compose import build
 from aftbed.judge.checks import half_a_graph, missing
-from aftbed.judge.verdict import ASSERT, REST, breaches, outcome, struck_down
+from aftbed.judge.outcome import outcome_of
+from aftbed.judge.record import record_of, service_struck_down
+from aftbed.judge.verdict import breaches, evidence_of
 from aftbed.runtime.adaptations import Outcome
 from aftbed.runtime.conductor import ScriptRun
 from aftbed.runtime.sim.world import Run, Setup, simulate
+from aftbed.vehicle.aeb.function import default_application
 
 Broken = Callable[[Run], Run]
 
@@ -91,8 +94,10 @@ def renewed(ms: float) -> Broken:
 
 
 def with_a_flip(run: Run) -> Run:
-    """A value fault was asked for."""
-    return replace(run, setup=replace(run.setup, faults=(flip(Place.RESULT, 0, "server.exit", 1),)))
+    """A value fault was asked for, and applied."""
+    fault = flip(Place.RESULT, 0, "server.exit", 1)
+    setup = replace(run.setup, faults=(fault,))
+    return replace(run, setup=setup, faults=({"fault": str(fault), "receipt": "applied"},))
 
 
 def all_of(*broken: Broken) -> Broken:
@@ -106,8 +111,12 @@ def all_of(*broken: Broken) -> Broken:
     return every
 
 
-def said(run: Run) -> list[str]:
+def reasons(run: Run) -> list[str]:
     return [str(breach) for breach in breaches(run)]
+
+
+def outcome(run: Run) -> str:
+    return outcome_of(evidence_of(record_of(run), default_application))[0]
 
 
 WRONG: Final = retold(lambda e: [replace(e, payload=e.payload[:-1] + b"\xff")])
@@ -123,69 +132,85 @@ def test_an_unbroken_run_breaks_no_promise(run: Run) -> None:
 @pytest.mark.parametrize(
     ("broken", "found"),
     [
-        (noted("a.server.1", Event.SERVER_EXIT, 6), "G1: a.server.1: request 6 (server.exit) after 6"),
-        (noted("b.server.1", Event.STATE_RESTORED, 2), "G1: b.server.1: request 2 (state.restored) after 6"),
-        (retold(lambda e: [e, e]), "G2: request 3: 2 replies"),
-        (retold(lambda e: []), "G2: request 3: 0 replies"),
-        (WRONG, "G3: request 3: the reply is not the bare server's"),
-        (all_of(with_a_flip, WRONG), "G4: request 3: the reply is not the bare server's"),
+        (
+            noted("a.server.1", Event.SERVER_EXIT, 6),
+            "at_most_once (G1): a.server.1: request 6 (server.exit) after 6",
+        ),
+        (
+            noted("b.server.1", Event.STATE_RESTORED, 2),
+            "at_most_once (G1): b.server.1: request 2 (state.restored) after 6",
+        ),
+        (retold(lambda e: [e, e]), "exactly_one_answer (G2): request 3: 2 replies"),
+        (retold(lambda e: []), "exactly_one_answer (G2): request 3: 0 replies"),
+        (WRONG, "one_history (G3): request 3: the reply is not the bare server's"),
         (
             hosting(lambda bricks: bricks - {("b/after", "pbr.after")}),
-            "G5: b/after (pbr.after) is missing",
+            "whole_graph (G5): b/after (pbr.after) is missing",
         ),
         (
             hosting(lambda bricks: bricks | {("a/tr.after", "tr.after")}),
-            "G5: a/tr.after (tr.after) should not be there",
+            "whole_graph (G5): a/tr.after (tr.after) should not be there",
         ),
         (
             hosting(lambda bricks: bricks - {("b/after", "pbr.after")} | {("b/after", "lfr.after")}),
-            "G5: b/after (pbr.after) is missing",
+            "whole_graph (G5): b/after (pbr.after) is missing",
         ),
-        (living(ftm="lfr"), "G5: lfr runs, though the adaptations came to pbr"),
-        (adapted(SWITCHED), "G5: pbr runs, though the adaptations came to lfr"),
+        (living(ftm="lfr"), "whole_graph (G5): lfr runs, though the adaptations came to pbr"),
+        (adapted(SWITCHED), "whole_graph (G5): pbr runs, though the adaptations came to lfr"),
         (
             all_of(adapted(UNDONE), living(ftm="lfr")),
-            "G5: lfr runs, though the adaptations came to pbr",
+            "whole_graph (G5): lfr runs, though the adaptations came to pbr",
         ),
-        (living(leader=""), "G5: nobody leads"),
-        (noted("proxy.1", Event.REPLY_ACCEPTED, 6, 1 << 8 | 2), "G6: epoch 1: replies of replicas 1 and 2"),
+        (
+            living(leader=""),
+            "exactly_one_answer (G2): the service is lost, though no node was struck",
+        ),
+        (
+            noted("proxy.1", Event.REPLY_ACCEPTED, 6, 1 << 8 | 2),
+            "one_master (G6): epoch 1: replies of replicas 1 and 2",
+        ),
         (
             noted("proxy.1", Event.REPLY_ACCEPTED, 6, 2 << 8 | 2),
-            "G6: replica 1 was not fenced between epochs 1 and 2",
+            "one_master (G6): replica 1 was not fenced between epochs 1 and 2",
         ),
         (
             rested(why_not=("requests wait", "no redundancy")),
-            f"{REST}: requests wait; no redundancy",
+            "at_rest: requests wait; no redundancy",
         ),
         (
             lambda run: replace(run, failures=("a/after: assertion failed", "b/after: assertion failed")),
-            f"{ASSERT}: a/after: assertion failed",
+            "assertions: a/after: assertion failed",
         ),
-        (LOST, "G2: the service is lost, though only nobody was struck"),
+        (LOST, "exactly_one_answer (G2): the service is lost, though no node was struck"),
         (
             all_of(LOST, struck("a/server", "a/after")),
-            "G2: the service is lost, though only a/server, a/after was struck",
+            "exactly_one_answer (G2): the service is lost, though only a/server, a/after was struck",
         ),
         (
             all_of(LOST, struck("proxy", "a/watchdog", "b")),
-            "G2: the service is lost, though only proxy, a/watchdog, b was struck",
+            "exactly_one_answer (G2): the service is lost, though only proxy, a/watchdog, b was struck",
         ),
         (
             all_of(LOST, struck("a/server", "b/server"), renewed(1.5)),
-            "G2: the service is lost, though only a/server, b/server was struck",
+            "exactly_one_answer (G2): the service is lost, though only a/server, b/server was struck",
         ),
     ],
 )
 def test_a_broken_run_is_refused_for_what_is_broken(broken: Broken, found: str) -> None:
     """And for nothing else: each differs from an unbroken run in one thing."""
-    assert said(broken(UNBROKEN)) == [found]
+    assert reasons(broken(UNBROKEN)) == [found]
+
+
+def test_a_wrong_value_under_a_value_fault_breaks_the_promise_of_values_too() -> None:
+    found = breaches(all_of(with_a_flip, WRONG)(UNBROKEN))
+    assert [(breach.check, breach.promise) for breach in found] == [("one_history", "G3"), ("value", "G4")]
 
 
 def test_every_promise_of_a_run_is_told() -> None:
     run = all_of(WRONG, noted("a.server.1", Event.SERVER_EXIT, 6), rested(why_not=("no redundancy",)))(
         UNBROKEN
     )
-    assert [breach.promise for breach in breaches(run)] == ["G1", "G3", REST]
+    assert [breach.promise for breach in breaches(run)] == ["G1", "G3", ""]
 
 
 def test_a_service_is_not_lost_in_vain() -> None:
@@ -217,12 +242,12 @@ def test_a_service_is_not_lost_in_vain() -> None:
     ],
 )
 def test_a_duplex_is_struck_down_by_two_faults_with_no_redundancy_between(broken: Broken, down: bool) -> None:
-    assert struck_down(broken(UNBROKEN)) is down
+    assert service_struck_down(broken(UNBROKEN)) is down
 
 
 def test_a_single_replica_is_struck_down_by_one_fault() -> None:
-    assert not struck_down(struck("client", "a/watchdog")(SIMPLEX))
-    assert struck_down(struck("a/server")(SIMPLEX))
+    assert not service_struck_down(struck("client", "a/watchdog")(SIMPLEX))
+    assert service_struck_down(struck("a/server")(SIMPLEX))
 
 
 def test_what_lives_must_be_the_graph_of_who_leads() -> None:
@@ -263,8 +288,8 @@ def test_all_that_differs_from_a_whole_graph_is_told() -> None:
         (WRONG, "sdc"),
         (all_of(WRONG, LOST), "sdc"),  # the worst one wins
         (LOST, "unavailable"),
-        (retold(lambda e: [replace(e, t_ns=e.t_ns + 100 * MS)]), "tolerated"),
-        (noted("b.protocol.1", Event.REPLICA_PROMOTED, 0, 2), "tolerated"),
+        (retold(lambda e: [replace(e, t_ns=e.t_ns + 100 * MS)]), "degraded"),
+        (noted("recovery.1", Event.RECOVERY_ENTER, 0), "tolerated"),
     ],
 )
 def test_the_outcome_of_a_run_is_the_worst_that_happened(broken: Broken, word: str) -> None:

@@ -72,11 +72,7 @@ def words_of(one: Record, record: RunRecord) -> str:
 
 def _fault(at: int, record: RunRecord) -> str:
     """The end of a run tells of faults that were asked for while it lived, too."""
-    told = (record.end or {}).get("faults")
-    if isinstance(told, list) and 0 <= at < len(told) and isinstance(told[at], dict):
-        return str(told[at].get("fault", "a fault"))
-    faults = record.options.faults
-    return str(faults[at]) if 0 <= at < len(faults) else "a fault"
+    return record.faults[at]["fault"] if 0 <= at < len(record.faults) else "a fault"
 
 
 def told_in(record: RunRecord) -> Iterator[Told]:

@@ -9,7 +9,10 @@ from hypothesis import strategies as st
 from aftbed.core.history import History
 from aftbed.core.journal import Entry, EntryKind
 from aftbed.core.valuefault import flipped
-from aftbed.judge.checks import REASONS_MAX, corruptions, value, wrong_replies
+from aftbed.judge.checks import CHECKERS, REASONS_MAX, Check, Evidence, corruptions, wrong_replies
+from aftbed.judge.record import RunRecord
+from aftbed.judge.reference import ReferenceRun, reference_run
+from aftbed.runtime.unix.options import LoadRun, RunOptions
 from aftbed.vehicle.aeb.function import default_application, sample_requests
 from aftbed.vehicle.aeb.messages import AebOutput, encode_reply
 
@@ -29,18 +32,34 @@ def history(wrong: dict[int, bytes]) -> History:
     return History({}, dialogue)
 
 
+def reference(history: History) -> ReferenceRun:
+    return reference_run(history, default_application())
+
+
+def corruptions_of(history: History) -> list[str]:
+    return corruptions(history, reference(history))
+
+
+def value(history: History, receipts: list[dict[str, str]]) -> Check | None:
+    """The check of G4 over a run of this history and these faults."""
+    options = RunOptions("", "", "", "pbr", "process", 0, LoadRun(COUNT, 0.0))
+    record = RunRecord(options, history, None, tuple(receipts))
+    (checker,) = [checker for checker in CHECKERS if checker.name == "value"]
+    return checker.check(Evidence(record, reference(history)))
+
+
 def right(request_id: int) -> bytes:
     bare = default_application()
     return [bare.execute(payload) for payload in sample_requests(3, COUNT)][request_id - 1]
 
 
 def test_a_history_without_a_wrong_reply_has_no_corruption() -> None:
-    assert corruptions(history({}), default_application()) == []
+    assert corruptions_of(history({})) == []
 
 
 def test_what_differs_is_named() -> None:
     braking = encode_reply(AebOutput(3, 9.0, 0.5, 0, 0))
-    (found,) = corruptions(history({1: braking}), default_application())
+    (found,) = corruptions_of(history({1: braking}))
     assert found == (
         "request 1: sdc: stage 3 instead of 0, deceleration_ms2 9.0 instead of 0.0,"
         " ttc_s 0.5 instead of None, slot 0 instead of None"
@@ -55,33 +74,33 @@ def test_what_differs_is_named() -> None:
     ],
 )
 def test_what_is_no_demand_is_named(reply: bytes, words: str) -> None:
-    assert corruptions(history({3: reply}), default_application()) == [f"request 3: sdc: {words}"]
+    assert corruptions_of(history({3: reply})) == [f"request 3: sdc: {words}"]
 
 
 def test_the_same_demand_in_other_bytes_is_wrong_too() -> None:
     longer = right(3).replace(b"\x95\x00", b"\x95\xcc\x00", 1)  # the stage as an uint8 of two bytes
-    (found,) = corruptions(history({3: longer}), default_application())
+    (found,) = corruptions_of(history({3: longer}))
     assert found == f"request 3: sdc: the same demand in other bytes ({longer.hex()})"
 
 
 def test_a_second_answer_that_is_wrong_counts() -> None:
     tale = history({})
     tale.dialogue.append(Entry(99, 3, 1, EntryKind.ANSWERED, b""))
-    assert len(corruptions(tale, default_application())) == 1
+    assert len(corruptions_of(tale)) == 1
 
 
 def test_a_request_that_waits_is_not_wrong() -> None:
     tale = history({})
-    assert corruptions(History({}, tale.dialogue[:-1]), default_application()) == []
+    assert corruptions_of(History({}, tale.dialogue[:-1])) == []
 
 
 @given(st.dictionaries(st.integers(1, COUNT), st.integers(0, 8 * 12 - 1), max_size=COUNT))
 def test_as_many_as_the_checker_of_one_history_counts(bits: dict[int, int]) -> None:
     tale = history({i: flipped(right(i), bit) for i, bit in bits.items()})
-    found = corruptions(tale, default_application())
+    found = corruptions_of(tale)
     assert [line.split(":")[0] for line in found] == [f"request {i}" for i in sorted(bits)]
-    assert wrong_replies(tale, default_application()) == sorted(bits)
-    check = value(tale, default_application(), FLIPPED)
+    assert wrong_replies(tale, reference(tale)) == sorted(bits)
+    check = value(tale, FLIPPED)
     assert check is not None and (check.finding == "fail") == bool(bits)
     assert len(check.reasons) == min(len(bits), REASONS_MAX)
 
@@ -97,5 +116,5 @@ def test_as_many_as_the_checker_of_one_history_counts(bits: dict[int, int]) -> N
     ],
 )
 def test_no_bit_flipped_proves_nothing(receipts: list[dict[str, str]], finding: str | None) -> None:
-    check = value(history({}), default_application(), receipts)
+    check = value(history({}), receipts)
     assert (check.finding if check is not None else None) == finding

@@ -11,7 +11,10 @@ from aftbed.core.events import Event
 from aftbed.core.history import History
 from aftbed.core.journal import Entry, EntryKind, Record
 from aftbed.judge.checks import LATE_NS
-from aftbed.judge.outcome import OUTCOMES, golden_digest, outcome_of, worst
+from aftbed.judge.outcome import OUTCOMES, outcome_of, worst
+from aftbed.judge.record import record_of
+from aftbed.judge.reference import reference_run
+from aftbed.judge.verdict import evidence_of
 from aftbed.runtime.hosting import Hosted
 from aftbed.runtime.sim.world import Run, Setup, simulate
 from aftbed.vehicle.aeb.function import default_application
@@ -21,7 +24,7 @@ Entries = Callable[[list[Entry]], list[Entry]]
 
 
 @dataclass
-class Found:
+class Changed:
     """How a clean run is judged, once something in it is changed."""
 
     history: History = CLEAN.history
@@ -30,9 +33,12 @@ class Found:
     digests: tuple[str, ...] = tuple(CLEAN.rest.states.values())
 
     def word(self) -> str:
-        return outcome_of(
-            self.history, default_application, lost=self.lost, living=self.living, digests=self.digests
-        )[0]
+        record = record_of(CLEAN)
+        assert record.end is not None
+        states = dict(zip("ab", self.digests, strict=True))
+        end = msgspec.structs.replace(record.end, lost=self.lost, hosted=self.living, states=states)
+        record = msgspec.structs.replace(record, history=self.history, end=end)
+        return outcome_of(evidence_of(record, default_application))[0]
 
 
 def dialogue(change: Entries) -> History:
@@ -60,38 +66,39 @@ def answered(change: Callable[[Entry], list[Entry]]) -> History:
 @pytest.mark.parametrize(
     ("found", "word"),
     [
-        (Found(), "masked"),
-        (Found(digests=("0" * 16, CLEAN.rest.states["a"])), "latent"),
-        (Found(noted(Event.RECOVERY_ENTER)), "tolerated"),
-        (Found(noted(Event.VOTE_COMPARED, 3)), "tolerated"),
-        (Found(noted(Event.VOTE_COMPARED, 2)), "masked"),
+        (Changed(), "masked"),
+        (Changed(digests=("0" * 16, CLEAN.rest.states["a"])), "latent"),
+        (Changed(noted(Event.RECOVERY_ENTER)), "tolerated"),
+        (Changed(noted(Event.VOTE_COMPARED, 3)), "tolerated"),
+        (Changed(noted(Event.VOTE_COMPARED, 2)), "masked"),
         (
-            Found(answered(lambda e: [msgspec.structs.replace(e, t_ns=e.t_ns + LATE_NS + 1)])),
+            Changed(answered(lambda e: [msgspec.structs.replace(e, t_ns=e.t_ns + LATE_NS + 1)])),
             "degraded",
         ),
-        (Found(living=msgspec.structs.replace(CLEAN.rest.hosted, backup="")), "degraded"),
-        (Found(noted(Event.DETECTED_STOP)), "detected_stop"),
-        (Found(without(3)), "omission"),
-        (Found(answered(lambda e: [e, e])), "duplicate_effect"),
-        (Found(without(6, 7, 8), lost=True), "unavailable"),
-        (Found(without(6, 7, 8)), "hang"),
-        (Found(answered(lambda e: [msgspec.structs.replace(e, payload=b"x")])), "sdc"),
+        (Changed(living=msgspec.structs.replace(CLEAN.rest.hosted, backup="")), "degraded"),
+        (Changed(noted(Event.DETECTED_STOP)), "detected_stop"),
+        (Changed(without(3)), "omission"),
+        (Changed(answered(lambda e: [e, e])), "duplicate_effect"),
+        (Changed(without(6, 7, 8), lost=True), "unavailable"),
+        (Changed(without(6, 7, 8)), "hang"),
+        (Changed(answered(lambda e: [msgspec.structs.replace(e, payload=b"x")])), "sdc"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_each_class_has_its_history(found: Found, word: str) -> None:
+def test_each_class_has_its_history(found: Changed, word: str) -> None:
     assert found.word() == word
 
 
 def test_the_worst_wins() -> None:
-    found = Found(answered(lambda e: [msgspec.structs.replace(e, payload=b"x")]), lost=True)
+    found = Changed(answered(lambda e: [msgspec.structs.replace(e, payload=b"x")]), lost=True)
     assert found.word() == "sdc"
     assert worst(["tolerated", "omission", "masked"]) == "omission"
     assert worst([]) == OUTCOMES[0] == "masked"
 
 
-def test_a_golden_run_ends_in_the_state_of_both_replicas() -> None:
-    assert {golden_digest(CLEAN.history, default_application())} == set(CLEAN.rest.states.values())
+def test_the_bare_server_ends_in_the_state_of_both_replicas() -> None:
+    reference = reference_run(CLEAN.history, default_application())
+    assert {reference.digest} == set(CLEAN.rest.states.values())
     assert set(CLEAN.rest.states) == {"a", "b"}
 
 

@@ -8,6 +8,7 @@ from aftbed.core.history import History
 from aftbed.core.journal import Entry, EntryKind, Record
 from aftbed.judge import checks
 from aftbed.judge.checks import Check
+from aftbed.judge.reference import reference_run
 
 MS = 1_000_000
 FIRST_GENERATION = 1 << 8
@@ -101,6 +102,6 @@ def judged(tale: Tale) -> dict[str, Check]:
     return {
         "at_most_once": checks.at_most_once(history),
         "exactly_one_answer": checks.exactly_one_answer(history),
-        "one_history": checks.one_history(history, Sums()),
+        "one_history": checks.one_history(history, reference_run(history, Sums())),
         "one_master": checks.one_master(history),
     }

@@ -8,10 +8,15 @@ from aftbed.core.history import History
 from aftbed.core.journal import Entry, EntryKind, Record
 from aftbed.judge import checks
 from aftbed.judge.checks import LATE_NS, Failover, Requests
+from aftbed.judge.reference import reference_run
+
+
+def account_of(history: History) -> Requests:
+    return checks.requests(history, reference_run(history, Sums()))
 
 
 def test_the_clients_account_of_a_good_history() -> None:
-    account = checks.requests(good().history(), Sums())
+    account = account_of(good().history())
     assert account == Requests(sent=3, answered=3, lost=0, duplicated=0, late=0, wrong=0)
 
 
@@ -20,12 +25,12 @@ def test_the_clients_account_of_a_bad_one() -> None:
     tale.sent(3).wait(LATE_NS / MS).answered(3, payload=b"wrong and late")
     tale.sent(4).answered(4, payload=b"").answered(4, payload=b"")  # wrong, twice
     tale.note("client.1", Event.PEER_REFUSED, 1)  # a second one, refused by the client
-    account = checks.requests(tale.history(), Sums())
+    account = account_of(tale.history())
     assert account == Requests(sent=4, answered=3, lost=1, duplicated=2, late=1, wrong=2)
 
 
 def test_an_answer_to_what_was_never_asked_makes_no_request_lost() -> None:
-    account = checks.requests(good().answered(4, epoch=2).history(), Sums())
+    account = account_of(good().answered(4, epoch=2).history())
     assert (account.sent, account.lost) == (3, 0)
 
 
@@ -35,7 +40,7 @@ def test_how_late_is_late(more_ns: int, late: int) -> None:
         Entry(5, 1, 0, EntryKind.SENT, b"request 1"),
         Entry(5 + LATE_NS + more_ns, 1, 1, EntryKind.ANSWERED, Sums().execute(b"request 1")),
     ]
-    assert checks.requests(History({}, entries), Sums()).late == late
+    assert account_of(History({}, entries)).late == late
 
 
 def a_failover(*, fault: bool, alarm: bool = True) -> Tale:
