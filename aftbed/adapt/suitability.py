@@ -1,10 +1,10 @@
-"""Whether a mechanism suits: FT, A and R against what it tolerates and needs (paper, II; design 4).
+"""Whether a mechanism suits: FT, A and R against what it tolerates and needs (paper, II).
 
-FT is the fault model asked for, A what the protected function declares, R the resources that there are. A
-mechanism is *consistent* with the three if it tolerates every fault asked for and finds all that it needs.
-ROWS says so per mechanism, as data. It is **reconstructed**: the paper's Fig. 1 is an image, so it was made
-from the text, from the related work of its authors, and from what our own bricks do. `table_from` lays a
-user's file over it.
+FT is the fault model asked for, A what the protected function declares, R the available resources. A
+mechanism is *consistent* with the three if it tolerates every fault asked for and has all that it needs.
+Each mechanism declares both. The declarations are **reconstructed**: the paper's Fig. 1 is an image, so
+they were made from the text, from the related work of its authors, and from what our own bricks do. Rows of
+a user's file replace them (`table_from`).
 
 An expression follows from its parts, and has no row of its own:
 
@@ -13,12 +13,13 @@ An expression follows from its parts, and has no row of its own:
     detects                     becomes tolerates under a mechanism that replicates: where one replica
                                 stops, the other one executes the request
 
-The two kinds of value fault. `value` is any wrong reply or state of one execution: TR compares, so it needs
-no idea of what is right. `implausible` is the part of it that the function's own assertion refuses: that is
-all that `assert` can see, so it covers `implausible` and never `value`.
+There are two classes of value faults. `value` is any wrong reply or state of one execution; a mechanism
+that compares executions covers it. `implausible` is the part of it that the function's own assertion
+refuses; that is all that an assertion covers.
 
-State access under LFR: a follower executes, so normal service needs none. A *new* follower does, and cannot
-have it: after a failover the survivor stays alone. That is no reason to refuse LFR; `remarks` says it.
+State access where a backup executes every request: normal service needs none. A *new* backup needs it:
+without, the survivor of a failover stays alone. That is no reason to refuse the mechanism; `remarks` says
+it.
 """
 
 from collections import Counter
@@ -200,7 +201,7 @@ def problems(
 def consistent(
     faults: FaultModel, characteristics: Characteristics, resources: Resources, table: Table = TABLE
 ) -> list[str]:
-    """The expressions that would do, the cheapest first; [] is "no consistent FTM".
+    """The consistent expressions, the cheapest first; [] is "no consistent FTM".
 
     Cheap is little of, in this order: CPUs, CPU load, bandwidth; the last two summed over the parts.
     """
@@ -209,7 +210,7 @@ def consistent(
 
 
 def remarks(expression: str, characteristics: Characteristics) -> list[str]:
-    """What to know of an expression that is consistent all the same."""
+    """Limits of an expression that is consistent."""
     if _replicates(parse(expression)) and not characteristics.state_access:
         return [f"{expression} without state access: after a failover the survivor stays alone"]
     return []

@@ -1,1 +1,1 @@
-"""The mechanisms, as tables of bricks. They know nothing of the car, and do no I/O."""
+"""The mechanisms: bricks, their tables, their declarations. Nothing of the car, and no I/O."""

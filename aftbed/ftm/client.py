@@ -1,12 +1,4 @@
-"""Client: numbers the requests, and asks again what is unanswered when its Proxy is replaced.
-
-Paper, III-A: the client sends requests to the Proxy and knows nothing of replicas. The source of the
-requests (the gateway of the car, or a load) hands them in on `submit` and takes replies from `deliver`.
-
-The runtime can have the Client stop at requests of given ids (`HoldAt`): it reports such a request instead of
-sending it, closes `submit`, and sends it when the runtime says `Release`. So an adaptation begins at an exact
-request.
-"""
+"""Client and Proxy: the two bricks in front of the replicas (paper, III-A)."""
 
 from enum import auto
 from typing import ClassVar, Final
@@ -37,14 +29,24 @@ _FULL: Final = ("pxy2clt",)
 
 
 class Client(Brick):
-    """`next_id` is the id of the next request; `unanswered` maps ids to requests, ascending."""
+    """Numbers the requests, and sends the unanswered ones again when its Proxy is replaced.
+
+    It knows nothing of replicas. The source of the requests (the gateway of the car, or a load) hands them
+    in on `submit` and takes replies from `deliver`. The runtime can have it stop at requests of given ids
+    (`HoldAt`): it reports such a request instead of sending it, closes `submit`, and sends it on `Release`.
+    So an adaptation begins at an exact request.
+
+    `next_id` is the id of the next request; `unanswered` maps ids to requests, ascending.
+    """
 
     def __init__(self) -> None:
         self.next_id = 1
         self.unanswered: dict[int, Request] = {}
         self._hold_at: frozenset[int] = frozenset()
         self._held: Request | None = None
-        self._again: frozenset[int] = frozenset()  # asked twice, by a predecessor perhaps: may come twice
+        self._again: frozenset[int] = (
+            frozenset()
+        )  # sent twice, perhaps by a predecessor: two replies may come
 
     def open_ports(self) -> tuple[str, ...]:
         """No new request while one is held, or the backlog is full."""

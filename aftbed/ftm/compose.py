@@ -1,13 +1,12 @@
 """From an FTM expression to a graph: `pbr` in placement `process` is the paper's graph (III-A).
 
-An expression names mechanisms, the outermost first: `pbr+tr`. A mechanism is a row of MECHANISMS: kinds of
-bricks for Before, Proceed and After, and the links beyond those that every mechanism has. There is one rule
-for any depth: **the inner mechanism's Protocol-Before-Proceed-After stands where the outer one's Proceed
-stood**. The bricks of an inner mechanism carry its name: `a/tr.before`.
+An expression names mechanisms, the outermost first: `pbr+tr`. One rule holds for any depth: **the inner
+mechanism's Protocol-Before-Proceed-After stands where the outer one's Proceed stood**. The bricks of an inner
+mechanism carry its name: `a/tr.before`.
 
-What replicates (`pbr`, `lfr`) can only be outermost; what repeats the computation (`tr`) only innermost.
-The paper's 17 processes of a duplex (23 when composed) are the nodes made here and the supervisor, which
-has the place of the ROS master.
+A mechanism that replicates can only be outermost, one that repeats the computation only innermost. The
+paper's 17 processes of a duplex (23 when composed) are the nodes made here and the supervisor, which has
+the place of the ROS master.
 """
 
 from typing import Final
@@ -19,8 +18,6 @@ from aftbed.ftm.registry import KINDS, MECHANISMS
 
 REPLICAS: Final = ("a", "b")
 NONE: Final = "none"
-
-
 DUPLEX: Final = tuple(name for name, row in MECHANISMS.items() if row.replication)
 SIMPLEX: Final = tuple(name for name, row in MECHANISMS.items() if not row.replication)
 STATEFUL: Final = ("protocol", "server")  # the parts whose state a new backup needs
@@ -61,7 +58,7 @@ def expressions() -> tuple[str, ...]:
 def chain(graph: Graph, replica: str) -> tuple[str, ...]:
     """The bricks of `replica` that a request meets, in their order, the Server last; no Watchdog.
 
-    The order is read off the links: that of the bricks is another one after an adaptation.
+    The order is read off the links, since an adaptation changes the order of the bricks.
     """
     server = f"{replica}/server"
     bricks = {b.name for b in graph.bricks if b.replica == replica and b.kind != "watchdog"}

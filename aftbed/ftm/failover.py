@@ -69,18 +69,20 @@ class Watchdog(Brick):
 
     def step(self, port: str, msg: AnyMessage, now_ns: int) -> list[Effect]:
         """Watch other nodes, or judge a death or the pulses."""
-        if isinstance(msg, Watch):
-            self.replica, self.generation, self.nodes = msg.replica, msg.generation, msg.nodes
-            self.suspect, self._last_ns = None, now_ns
-            self._grace_until_ns = now_ns + HANG_DEADLINE_NS
-            return []
-        if isinstance(msg, NodeDied):
-            return self._suspect(msg.node, "crash", now_ns) if msg.node in self.nodes else []
-        if isinstance(msg, Pulses):
-            return self._judge(msg, now_ns)
-        if isinstance(msg, Rebound):  # a new Recovery, which knows of no suspicion yet
-            return [Send("wdg2rec", self.suspect)] if self.suspect and msg.bound else []
-        raise PeerError(f"{type(msg).__name__} on {port}")
+        match msg:
+            case Watch():
+                self.replica, self.generation, self.nodes = msg.replica, msg.generation, msg.nodes
+                self.suspect, self._last_ns = None, now_ns
+                self._grace_until_ns = now_ns + HANG_DEADLINE_NS
+                return []
+            case NodeDied():
+                return self._suspect(msg.node, "crash", now_ns) if msg.node in self.nodes else []
+            case Pulses():
+                return self._judge(msg, now_ns)
+            case Rebound():  # a new Recovery, which knows of no suspicion yet
+                return [Send("wdg2rec", self.suspect)] if self.suspect and msg.bound else []
+            case _:
+                raise PeerError(f"{type(msg).__name__} on {port}")
 
     def _judge(self, pulses: Pulses, now_ns: int) -> list[Effect]:
         if now_ns - self._last_ns > PERIOD_NS + LATE_NS_MAX:
@@ -172,14 +174,16 @@ class Recovery(Brick):
 
     def step(self, port: str, msg: AnyMessage, now_ns: int) -> list[Effect]:
         """Take an alarm, or the situation."""
-        if isinstance(msg, Suspect):
-            self.suspects.add((msg.replica, msg.generation))
-            return self._order(now_ns)
-        if isinstance(msg, Situation):
-            return self._update(msg, now_ns)
-        if isinstance(msg, Rebound):
-            return []
-        raise PeerError(f"{type(msg).__name__} on {port}")
+        match msg:
+            case Suspect():
+                self.suspects.add((msg.replica, msg.generation))
+                return self._order(now_ns)
+            case Situation():
+                return self._update(msg, now_ns)
+            case Rebound():
+                return []
+            case _:
+                raise PeerError(f"{type(msg).__name__} on {port}")
 
     def _update(self, msg: Situation, now_ns: int) -> list[Effect]:
         done, self.ordered, self.situation = self.ordered, None, msg

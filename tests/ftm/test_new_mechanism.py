@@ -1,0 +1,174 @@
+"""A new mechanism is one new file and one name in the registry: everything else reads its declaration.
+
+The package is copied, a mechanism is added to the copy, and the copy is used as a user would use it.
+"""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Final
+
+import pytest
+
+import aftbed
+
+PACKAGE: Final = Path(aftbed.__file__).parent
+SECONDS_MAX: Final = 100
+LIMIT: Final = '''\
+"""Limit: no reply leaves that is longer than the frame that has to carry it."""
+
+from enum import auto
+from typing import ClassVar, Final
+
+from aftbed.core.brick import SAME_STATE, BrickState, Effect, Halt, Machine, Moves, Note, Send
+from aftbed.core.events import Event
+from aftbed.core.messages import Reply, TakeOver
+from aftbed.ftm.chain import COMPUTE, PASS_BEFORE
+from aftbed.ftm.declaration import BrickKind, Mechanism, Suitability
+
+REPLY_BYTES_MAX: Final = 64
+
+
+class LimitState(BrickState):
+    READY = auto()  # never holds a reply
+
+
+class LimitAfter(Machine):
+    """After: lets a short reply pass, and stops the replica at a long one."""
+
+    AT_REST = (LimitState.READY,)
+
+    def __init__(self) -> None:
+        super().__init__(LimitState.READY)
+
+    def check(self, msg: Reply) -> list[Effect]:
+        if len(msg.payload) <= REPLY_BYTES_MAX:
+            return [Send("aft2pro", msg)]
+        return [Note(Event.DETECTED_STOP, msg.request_id), Halt(f"a reply of {len(msg.payload)} bytes")]
+
+    def hand_on(self, msg: TakeOver) -> list[Effect]:
+        return [Send("aft2pro", msg)]
+
+    MOVES: ClassVar[Moves] = {
+        (LimitState.READY, "prd2aft", Reply): (check, SAME_STATE),
+        (LimitState.READY, "prd2aft", TakeOver): (hand_on, SAME_STATE),
+    }
+
+
+LIMIT: Final = Mechanism(
+    name="limit",
+    before=PASS_BEFORE,
+    proceed=COMPUTE,
+    after=BrickKind("limit.after", ("prd2aft",), ("aft2pro",), make=lambda setting: LimitAfter()),
+    suitability=Suitability(detects=("implausible",)),
+)
+'''
+REGISTRATION: Final = (
+    (
+        "from aftbed.ftm.lfr import LFR\n",
+        "from aftbed.ftm.lfr import LFR\nfrom aftbed.ftm.limit import LIMIT\n",
+    ),
+    ("(PBR, LFR, TR, ASSERT)", "(PBR, LFR, TR, ASSERT, LIMIT)"),
+)
+
+
+@pytest.fixture(scope="module")
+def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of the package with one mechanism more."""
+    root = tmp_path_factory.mktemp("project")
+    shutil.copytree(PACKAGE, root / "aftbed", ignore=shutil.ignore_patterns("__pycache__"))
+    if (PACKAGE.parent / "dbc").is_dir():
+        shutil.copytree(PACKAGE.parent / "dbc", root / "dbc")
+    (root / "aftbed" / "ftm" / "limit.py").write_text(LIMIT)
+    registry = root / "aftbed" / "ftm" / "registry.py"
+    text = registry.read_text()
+    for old, new in REGISTRATION:
+        assert text.count(old) == 1
+        text = text.replace(old, new)
+    registry.write_text(text)
+    return root
+
+
+def python(project: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    environment = os.environ | {"PYTHONPATH": str(project)}
+    command = [sys.executable, *arguments]
+    return subprocess.run(
+        command,
+        cwd=project,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=SECONDS_MAX,
+        check=False,
+    )
+
+
+def run(project: Path, *arguments: str, code: int = 0) -> str:
+    """What `aftbed ...` of the copy prints."""
+    done = python(project, "-m", "aftbed", *arguments)
+    assert done.returncode == code, done.stdout + done.stderr
+    return done.stdout + done.stderr
+
+
+def test_its_brick_does_what_its_table_says(project: Path) -> None:
+    done = python(
+        project,
+        "-c",
+        "from aftbed.core.brick import Halt, Send\n"
+        "from aftbed.core.messages import Reply\n"
+        "from aftbed.ftm.registry import Setting, make\n"
+        "after = make('limit.after', Setting(1, 1, True, None))\n"
+        "assert after.open_ports() == ('prd2aft',) and after.quiescent()\n"
+        "for size, last in ((64, Send), (65, Halt)):\n"
+        "    assert type(after.step('prd2aft', Reply(1, 1, 1, bytes(size)), 0)[-1]) is last\n",
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_it_composes(project: Path) -> None:
+    assert "node a/limit.after: a/limit.after (limit.after)" in run(project, "graph", "--ftm", "pbr+limit")
+    assert "ftm limit+tr" in run(project, "graph", "--ftm", "limit+tr")
+    assert "limit within limit adds nothing" in run(project, "graph", "--ftm", "limit+limit", code=2)
+
+
+def test_the_suitability_table_has_it(project: Path) -> None:
+    listed = run(project, "ftm", "list")
+    assert all(name in listed for name in ("limit", "pbr+limit", "lfr+limit", "limit+tr"))
+    alone = run(project, "ftm", "check", "--ftm", "limit", "--faults", "implausible", code=1)
+    assert "limit detects implausible value faults and can only stop" in alone
+
+
+def test_faults_are_aimed_at_its_events(project: Path) -> None:
+    load = ("--ftm", "pbr+limit", "--count", "100", "--rate", "500")
+    first = ("--faults", "crash backup at state.restored nth 2")
+    second = ("--faults", "crash primary at proceed.enter nth 80")
+    found = json.loads(run(project, "sim", *load, *first, *second, "--json"))
+    assert found["verdict"] == "pass" and len(found["failovers"]) == 1
+    refused = run(project, "sim", "--ftm", "limit", "--faults", "crash primary at vote.compared", code=2)
+    assert "cannot trigger a fault under --ftm limit" in refused
+
+
+def test_it_is_adapted_to_and_from(project: Path) -> None:
+    load = ("--ftm", "pbr", "--count", "200", "--rate", "500")
+    there = ("--adapt", "to pbr+limit at request 10", "--adapt", "to lfr at request 150")
+    found = json.loads(run(project, "sim", *load, *there, "--json"))
+    assert found["verdict"] == "pass" and len(found["adaptations"]) == 2
+
+
+def test_it_is_explored(project: Path) -> None:
+    chosen = ("--ftm", "lfr+limit", "--placement", "replica", "--requests", "1", "--jobs", "1", "--json")
+    found = json.loads(run(project, "explore", "crash", *chosen))
+    assert found["explored"] > 50 and found["survived"] == found["explored"]
+
+
+def test_its_hops_are_known_to_the_bench(project: Path) -> None:
+    done = python(
+        project,
+        "-c",
+        "from aftbed.bench.cycle import hops\nfrom aftbed.ftm.compose import build\n"
+        "assert hops(build('pbr+limit', 'process')) == hops(build('pbr', 'process')) + 4\n",
+    )
+    assert done.returncode == 0, done.stderr
