@@ -13,7 +13,7 @@ from aftbed.core.valuefault import Bit, Flip, Place, flipped
 from aftbed.ftm.compose import build
 from aftbed.judge.record import read_record
 from aftbed.judge.verdict import Verdict, judge
-from aftbed.runtime.unix.journal import Dialogue, Journal
+from aftbed.runtime.unix.journal_files import Dialogue, Journal
 from aftbed.runtime.unix.options import CarRun, LoadRun, RunOptions, Work
 from aftbed.vehicle.aeb.function import default_application, sample_requests
 from aftbed.vehicle.plant import VehicleResult

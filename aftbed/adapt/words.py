@@ -24,7 +24,7 @@ import msgspec
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.messages import Goal
 from aftbed.core.script import RECIPES
-from aftbed.core.words import milliseconds
+from aftbed.core.units import milliseconds
 from aftbed.ftm.compose import DUPLEX, SIMPLEX, parse
 
 VERBS: Final = ("to", "switch", "compose", "decompose", "update")

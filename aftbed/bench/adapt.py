@@ -23,7 +23,7 @@ from aftbed.core.script import RECIPES
 from aftbed.judge import checks
 from aftbed.judge.record import RunRecord
 from aftbed.judge.reference import reference_of
-from aftbed.runtime.unix import ask
+from aftbed.runtime.unix import control_client
 from aftbed.runtime.unix.options import LoadRun
 from aftbed.vehicle.aeb.function import default_application
 
@@ -140,7 +140,7 @@ def _one_by_one(
 
 def adapted(private: Path, goal: Goal) -> dict[str, object]:
     """How the adaptation ended. Raises HarnessError unless it is done."""
-    outcome = ask.ask(private, ask.Adapt(goal), ask.ADAPT_SECONDS_MAX)
+    outcome = control_client.ask(private, control_client.Adapt(goal), control_client.ADAPT_SECONDS_MAX)
     if outcome["outcome"] != "done":
         raise HarnessError(f"an adaptation of the bench ended {outcome['outcome']}: {outcome['reason']}")
     return outcome
@@ -151,7 +151,7 @@ def ready(private: Path) -> None:
     limit = time.monotonic() + READY_SECONDS_MAX
     while time.monotonic() < limit:
         try:
-            status = ask.ask(private, ask.Status())
+            status = control_client.ask(private, control_client.Status())
         except ConfigError:
             status = {"busy": True}  # still starting
         if not status["busy"]:

@@ -10,7 +10,7 @@ from typing import Final
 
 from aftbed.bench.runs import finish
 from aftbed.core.errors import ConfigError, HarnessError
-from aftbed.runtime.unix import ask
+from aftbed.runtime.unix import control_client
 from aftbed.runtime.unix.launch import launch, options_for
 from aftbed.runtime.unix.options import CarRun
 from aftbed.runtime.unix.resources import Row, measured
@@ -49,12 +49,12 @@ def _look(private: Path) -> list[Row]:
     limit = time.monotonic() + START_SECONDS_MAX
     while time.monotonic() < limit:
         try:
-            status = ask.ask(private, ask.Status())
+            status = control_client.ask(private, control_client.Status())
         except ConfigError:
             status = {}
         if status.get("vehicle"):
             time.sleep(SETTLE_SECONDS)
-            rows = ask.processes(private)
+            rows = control_client.processes(private)
             rows.append(Row("command", "command", os.getpid(), False))
             return measured(rows)
         time.sleep(0.02)

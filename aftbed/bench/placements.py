@@ -22,7 +22,7 @@ from aftbed.core.errors import HarnessError
 from aftbed.core.events import Event
 from aftbed.ftm.compose import build
 from aftbed.judge.record import RunRecord
-from aftbed.runtime.unix import ask
+from aftbed.runtime.unix import control_client
 from aftbed.runtime.unix.options import LoadRun
 
 RADAR_HZ: Final = 50.0
@@ -104,7 +104,7 @@ def processes(ftm: str, placement: str) -> int:
     launched = start(ftm, placement, LoadRun(REQUESTS_ENDLESS, RADAR_HZ))
     try:
         ready(launched.private)
-        return sum(row.node for row in ask.processes(launched.private))
+        return sum(row.node for row in control_client.processes(launched.private))
     finally:
         launched.stop()
         finish(launched, ends=ENDS)

@@ -13,7 +13,7 @@ from aftbed.bench.statistics import summary
 from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.core.fault import Crash, Fault, Trigger
 from aftbed.judge.checks import failovers
-from aftbed.runtime.unix import ask
+from aftbed.runtime.unix import control_client
 from aftbed.runtime.unix.options import LoadRun
 
 REQUESTS_ENDLESS: Final = 10_000_000
@@ -29,7 +29,7 @@ def bench_recovery(ftm: str, placement: str, kills: int, *, pin: bool = True) ->
         epoch = 0
         for _ in range(kills):
             epoch = _wait_for_redundancy(launched.private, epoch)
-            ask.ask(launched.private, ask.Inject(Fault(Crash(), "primary", Trigger())))
+            control_client.ask(launched.private, control_client.Inject(Fault(Crash(), "primary", Trigger())))
         _wait_for_redundancy(launched.private, epoch)
         launched.stop()
     except BaseException:
@@ -67,7 +67,7 @@ def _wait_for_redundancy(private: Path, epoch: int) -> int:
     limit = time.monotonic() + REDUNDANCY_SECONDS_MAX
     while time.monotonic() < limit:
         try:
-            status = ask.ask(private, ask.Status())
+            status = control_client.ask(private, control_client.Status())
         except ConfigError:
             status = {}  # still starting
         now = int(str(status.get("epoch", 0)))

@@ -12,7 +12,7 @@ from typing import Final
 import msgspec
 
 from aftbed.core.errors import HarnessError
-from aftbed.runtime.unix import ask
+from aftbed.runtime.unix import control_client
 from aftbed.runtime.unix.resources import Row, measured
 
 ASLEEP_PERCENT: Final = 0.5  # of one core: a node that takes less does next to nothing
@@ -37,7 +37,7 @@ class Usage(msgspec.Struct, frozen=True):
 
 def usage(private: Path, seconds: float) -> tuple[Usage, int, int]:
     """What the run in `private` takes in the next `seconds`; and when that began and ended (monotonic ns)."""
-    rows = ask.processes(private)
+    rows = control_client.processes(private)
     before, began_ns = _cpu_ns(rows), time.monotonic_ns()
     time.sleep(seconds)  # what is measured, not what is waited for
     after, ended_ns = _cpu_ns(rows), time.monotonic_ns()

@@ -35,7 +35,7 @@ from aftbed.core.messages import Goal, Scheduled
 from aftbed.core.script import Script, Stage, Step, Together
 from aftbed.core.yaml_file import read_yaml
 from aftbed.ftm.compose import build
-from aftbed.runtime.unix import ask, rundir
+from aftbed.runtime.unix import control_client, rundir
 from aftbed.runtime.unix.part import load_module
 from aftbed.vehicle.aeb.function import default_application
 
@@ -135,12 +135,12 @@ def _change(wish: Wish, run: str | None, recipe: str, *, force: bool, as_json: b
 
 
 def _graph_of(private: Path) -> Graph:
-    return msgspec.convert(ask.ask(private, ask.GraphNow()), Graph)
+    return msgspec.convert(control_client.ask(private, control_client.GraphNow()), Graph)
 
 
 def _ask(private: Path, goal: Goal, *, as_json: bool) -> int:
     """Have the run adapt, print how it ended; the exit code."""
-    found = ask.ask(private, ask.Adapt(goal), ask.ADAPT_SECONDS_MAX)
+    found = control_client.ask(private, control_client.Adapt(goal), control_client.ADAPT_SECONDS_MAX)
     ended = msgspec.convert(found, EndedAdaptation)
     if as_json:
         print(dumps(found))
@@ -363,6 +363,6 @@ def _yaml(value: object) -> str:
 @adapt.command()
 def history(run: Run = None, json: Json = False) -> None:
     """The adaptations of the run that have ended, and how."""
-    found = ask.ask(rundir.find(run), ask.Adaptations())
+    found = control_client.ask(rundir.find(run), control_client.Adaptations())
     ended = msgspec.convert(found["adaptations"], list[EndedAdaptation])
     print("\n".join([dumps(found)] if json else history_lines(ended)))

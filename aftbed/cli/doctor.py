@@ -9,7 +9,7 @@ import typer
 from aftbed.cli.options import Json
 from aftbed.core.errors import HarnessError
 from aftbed.runtime.unix import leftovers
-from aftbed.runtime.unix.inspection import Check, inspect
+from aftbed.runtime.unix.doctor import Check, inspect
 from aftbed.runtime.unix.leftovers import Left
 
 

@@ -15,7 +15,7 @@ from aftbed.core.fault import MEMORY, Fault, on_bus
 from aftbed.inject import buswords
 from aftbed.inject.parts import refuse_unsafe
 from aftbed.inject.words import read
-from aftbed.runtime.unix import ask, rundir
+from aftbed.runtime.unix import control_client, rundir
 from aftbed.runtime.unix.busaim import aim
 from aftbed.runtime.unix.options import Work
 
@@ -239,7 +239,7 @@ class _RecordHead(msgspec.Struct, frozen=True):
 def _arm(run: str | None, fault: Fault) -> None:
     """Have the run arm the fault. The messages and signals it may name are those of the run's work."""
     private = rundir.find(run)
-    record = Path(str(ask.ask(private, ask.Status())["record"]))
+    record = Path(str(control_client.ask(private, control_client.Status())["record"]))
     head = msgspec.json.decode((record / "run.json").read_bytes(), type=_RecordHead)
-    ask.ask(private, ask.Inject(aim(fault, head.work)))
+    control_client.ask(private, control_client.Inject(aim(fault, head.work)))
     print(f"run {private.name}: {fault}", file=sys.stderr)

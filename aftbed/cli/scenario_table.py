@@ -20,7 +20,7 @@ from aftbed.cli.views import Bar
 from aftbed.core.errors import ConfigError
 from aftbed.core.fault import Crash, Fault, Hang, Slow, Trigger
 from aftbed.core.graph import Graph
-from aftbed.core.words import milliseconds, whole_milliseconds
+from aftbed.core.units import milliseconds, whole_milliseconds
 from aftbed.ftm.compose import build
 from aftbed.inject.words import parse
 from aftbed.judge.verdict import EXIT_INTERRUPTED

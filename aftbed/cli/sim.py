@@ -38,7 +38,7 @@ from aftbed.report import sequence
 from aftbed.runtime import targets
 from aftbed.runtime.sim.clock import START_NS
 from aftbed.runtime.sim.givens import check as check_fault
-from aftbed.runtime.sim.tracing import traced
+from aftbed.runtime.sim.trace import traced
 from aftbed.runtime.sim.world import Run, Setup
 from aftbed.runtime.unix.worker_pool import each
 from aftbed.search.agreement import SEEDS, Agreement, Times, against

@@ -22,7 +22,7 @@ from typing import Final, Literal
 import msgspec
 
 from aftbed.core.persistence import ONCE, Chance, Every, Lasting, Permanent, Transient
-from aftbed.core.words import duration, number
+from aftbed.core.units import duration, number
 
 SECOND_US: Final = 1_000_000
 NODES: Final = ("radar", "brake", "gateway")  # that a car's bus has

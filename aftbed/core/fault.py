@@ -26,8 +26,8 @@ import msgspec
 
 from aftbed.core.busfault import BusFault, Condition
 from aftbed.core.persistence import ONCE, Persistence
+from aftbed.core.units import duration, number
 from aftbed.core.valuefault import BITFLIP, FLIPPED_AT, Flip, Place
-from aftbed.core.words import duration, number
 
 HANG_FOREVER_MS: Final = 0
 SLOW_MS: Final = 2.0

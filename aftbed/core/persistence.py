@@ -14,8 +14,8 @@ from typing import Final, assert_never
 
 import msgspec
 
+from aftbed.core.units import duration, number
 from aftbed.core.valuefault import next_success
-from aftbed.core.words import duration, number
 
 PERMANENT, INTERMITTENT, EVERY, CHANCE, FOR = "permanent", "intermittent", "every", "p", "for"
 

@@ -41,7 +41,7 @@ from aftbed.core.busfault import (
 )
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.persistence import ONCE, Chance, Every, Lasting, Permanent
-from aftbed.core.words import milliseconds
+from aftbed.core.units import milliseconds
 from aftbed.inject import parts
 
 GRAMMAR: Final = (

@@ -46,6 +46,7 @@ from aftbed.core.fault import (
     on_bus,
 )
 from aftbed.core.persistence import INTERMITTENT, ONCE, PERMANENT, Permanent, Persistence
+from aftbed.core.units import milliseconds, whole_milliseconds
 from aftbed.core.valuefault import (
     BIT_MAX,
     BITFLIP,
@@ -60,7 +61,6 @@ from aftbed.core.valuefault import (
     Place,
     Stuck,
 )
-from aftbed.core.words import milliseconds, whole_milliseconds
 from aftbed.inject import buswords
 from aftbed.inject.parts import condition, intermittent, whole
 

@@ -21,7 +21,7 @@ from aftbed.ftm.compose import replication_of
 from aftbed.runtime.hosting import Hosted
 from aftbed.runtime.rewiring import replica_of
 from aftbed.runtime.sim.world import Run
-from aftbed.runtime.unix.journal import contents
+from aftbed.runtime.unix.journal_files import contents
 from aftbed.runtime.unix.options import CarRun, LoadRun, RunOptions, Work
 from aftbed.runtime.unix.support import HISTORY_NAME
 from aftbed.vehicle.plant import VehicleResult

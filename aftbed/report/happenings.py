@@ -16,7 +16,7 @@ from aftbed.core.journal import Record
 from aftbed.core.messages import Message
 from aftbed.ftm.compose import build
 from aftbed.report import sequence
-from aftbed.runtime.sim.tracing import STRUCK, Happening, Sent, Told, Trace
+from aftbed.runtime.sim.trace import STRUCK, Happening, Sent, Told, Trace
 
 BEFORE, AFTER = 14, 30  # happenings around a turning point
 KEPT_MAX: Final = 330  # happenings of a diagram

@@ -17,7 +17,7 @@ from aftbed.core.fault import Fault, marked
 from aftbed.core.journal import Entry, Record
 from aftbed.ftm.compose import build
 from aftbed.judge.verdict import Breach
-from aftbed.runtime.sim.tracing import STRUCK, Happening, Sent, Told, Trace, brief, digest, milliseconds
+from aftbed.runtime.sim.trace import STRUCK, Happening, Sent, Told, Trace, brief, digest, milliseconds
 
 LAST: Final = 40  # lines of a listing; arrows and notes of a diagram
 EXECUTIVE: Final = "supervisor"

@@ -27,7 +27,7 @@ from aftbed.report.happenings import (
     said,
     struck,
 )
-from aftbed.runtime.sim.tracing import Happening, Sent, Told, Trace, brief, milliseconds
+from aftbed.runtime.sim.trace import Happening, Sent, Told, Trace, brief, milliseconds
 
 ROW_PX, LANE_PX, LANES_MAX = 20.0, 15.0, 7
 RIGHT: Final = 60.0

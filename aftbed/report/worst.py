@@ -17,7 +17,7 @@ import msgspec
 from aftbed.campaign.experiment import Experiment, Result, carry_out, setup_of
 from aftbed.core.errors import AftbedError
 from aftbed.judge.outcome import OUTCOMES
-from aftbed.runtime.sim.tracing import Trace, traced
+from aftbed.runtime.sim.trace import Trace, traced
 
 REASON_MAX: Final = 300  # characters
 

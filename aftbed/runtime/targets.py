@@ -12,6 +12,7 @@ from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.events import Event, event_named
 from aftbed.core.fault import SHARE_MAX, SHARE_MIN, SLOW_MS_MAX, Disturb, Fault, FlipMemory, Slow
 from aftbed.core.graph import BrickSpec, Graph
+from aftbed.core.units import DURATION_MS_MAX
 from aftbed.core.valuefault import (
     BIT_MAX,
     BITS_MAX,
@@ -24,7 +25,6 @@ from aftbed.core.valuefault import (
     Pattern,
     Stuck,
 )
-from aftbed.core.words import DURATION_MS_MAX
 from aftbed.ftm.compose import EXPRESSIONS, build
 from aftbed.ftm.registry import EMITTERS, server_emits
 from aftbed.runtime.cell import check_field

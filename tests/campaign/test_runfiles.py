@@ -19,7 +19,7 @@ from aftbed.core.errors import ConfigError
 from aftbed.core.events import Event
 from aftbed.core.journal import EntryKind
 from aftbed.judge.record import RunRecord, read_record
-from aftbed.runtime.unix.journal import Dialogue
+from aftbed.runtime.unix.journal_files import Dialogue
 from aftbed.runtime.unix.options import CarRun, LoadRun, ReplayRun, Work
 from aftbed.vehicle.aeb.messages import AebInput, AebTarget, encode_request
 from aftbed.vehicle.can.candump import log_line

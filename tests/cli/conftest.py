@@ -7,7 +7,7 @@ import pytest
 from playedrun import Call, PlayedRun, Run
 
 from aftbed.cli import main
-from aftbed.runtime.unix import ask, rundir
+from aftbed.runtime.unix import control_client, rundir
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "process"))
 
@@ -20,7 +20,7 @@ __all__ = ["home"]
 def played(monkeypatch: pytest.MonkeyPatch) -> PlayedRun:
     """The only run that is alive."""
     run = PlayedRun()
-    monkeypatch.setattr(ask, "ask", run.ask)
+    monkeypatch.setattr(control_client, "ask", run.ask)
     monkeypatch.setattr(rundir, "find", lambda name: Path("/nowhere/abc123"))
     return run
 

@@ -10,7 +10,7 @@ from aftbed.core.errors import ConfigError
 from aftbed.core.graph import Graph
 from aftbed.core.messages import Goal
 from aftbed.ftm.compose import build
-from aftbed.runtime.unix import ask
+from aftbed.runtime.unix import control_client
 
 Call = Callable[..., tuple[int, str, str]]  # `aftbed` with these arguments: exit code, output, errors
 Run = Callable[..., str]
@@ -44,15 +44,17 @@ class PlayedRun:
         self.goals: list[Goal] = []
         self.seconds = 0.0
 
-    def ask(self, private: Path, question: ask.Question, seconds: float = 0.0) -> dict[str, object]:
+    def ask(
+        self, private: Path, question: control_client.Question, seconds: float = 0.0
+    ) -> dict[str, object]:
         """In the place of `ask.ask`."""
         assert private.name == "abc123"
         match question:
-            case ask.GraphNow():
+            case control_client.GraphNow():
                 return msgspec.json.decode(msgspec.json.encode(self.graph))  # type: ignore[no-any-return]
-            case ask.Adaptations():
+            case control_client.Adaptations():
                 return {"adaptations": self.history}
-            case ask.Adapt(goal):
+            case control_client.Adapt(goal):
                 self.goals.append(goal)
                 self.seconds = seconds
                 if self.outcome["outcome"] == "refused" and self.outcome["reason"]:

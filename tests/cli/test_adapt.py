@@ -17,7 +17,7 @@ from aftbed.cli.adapt import WIDTH
 from aftbed.core.messages import Goal
 from aftbed.core.script import Script, Stage, flat
 from aftbed.ftm.compose import build
-from aftbed.runtime.unix import ask
+from aftbed.runtime.unix import control_client
 
 # -- what is asked for
 
@@ -45,7 +45,9 @@ def test_a_verb_asks_for_its_goal(
     played.graph = build(running, "process")
     assert told("adapt", *arguments).startswith("run abc123: pbr to lfr: done\n")
     assert played.goals == [goal]
-    assert played.seconds == ask.ADAPT_SECONDS_MAX, "an adaptation takes longer than other questions"
+    assert played.seconds == control_client.ADAPT_SECONDS_MAX, (
+        "an adaptation takes longer than other questions"
+    )
 
 
 def test_a_file_is_named_with_its_whole_path(

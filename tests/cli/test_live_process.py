@@ -10,7 +10,7 @@ import pytest
 from liveruns import Command, Home, aftbed, until
 
 from aftbed.ftm.compose import build
-from aftbed.runtime.unix import ask, rundir
+from aftbed.runtime.unix import control_client, rundir
 
 pytestmark = pytest.mark.process
 
@@ -172,7 +172,7 @@ def test_an_interrupt_ends_the_run_with_its_verdict(home: Home, sig: signal.Sign
 def test_an_interrupt_of_json_gives_the_document(home: Home) -> None:
     with Command("--load", "100000@200", "--json") as command:
         private = rundir.root() / until(rundir.live, "the run")[0]
-        until(lambda: ask.ask(private, ask.Status())["backup"], "redundancy")
+        until(lambda: control_client.ask(private, control_client.Status())["backup"], "redundancy")
         command.popen.send_signal(signal.SIGINT)
         done = command.done()
     assert done.code == 130, done.out + done.err

@@ -7,7 +7,7 @@ from typing import Final
 import pytest
 
 from aftbed.core.errors import ConfigError
-from aftbed.core.words import DURATION_MS_MAX, milliseconds, whole_milliseconds
+from aftbed.core.units import DURATION_MS_MAX, milliseconds, whole_milliseconds
 
 
 @pytest.mark.parametrize(

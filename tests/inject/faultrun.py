@@ -17,8 +17,8 @@ from aftbed.runtime import control
 from aftbed.runtime.faults import Faults
 from aftbed.runtime.interface import ProcessKind
 from aftbed.runtime.jobs import StepFailed, Wait
-from aftbed.runtime.unix.journal import Journal
-from aftbed.runtime.unix.loop import Loop
+from aftbed.runtime.unix.event_loop import Loop
+from aftbed.runtime.unix.journal_files import Journal
 from aftbed.runtime.unix.support import Support
 
 FIRST: Final = 1_000_001  # the number of a run's first fault

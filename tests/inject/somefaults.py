@@ -20,8 +20,8 @@ from aftbed.core.fault import (
     Trigger,
 )
 from aftbed.core.persistence import ONCE, Chance, Every, Permanent
+from aftbed.core.units import DURATION_MS_MAX
 from aftbed.core.valuefault import BIT_MAX, BITS_MAX, Bit, Bits, Burst, Byte, Flip, Place, Stuck
-from aftbed.core.words import DURATION_MS_MAX
 
 durations = st.integers(1, DURATION_MS_MAX)
 after = st.builds(Trigger, after_ms=durations)

@@ -23,7 +23,7 @@ from aftbed.core.messages import AnyMessage, Request
 from aftbed.core.persistence import Permanent
 from aftbed.runtime import control
 from aftbed.runtime.node import Node
-from aftbed.runtime.unix.journal import Journal
+from aftbed.runtime.unix.journal_files import Journal
 from aftbed.runtime.unix.line import Line, decode_order, decode_report
 from aftbed.runtime.unix.node_io import UnixIO
 

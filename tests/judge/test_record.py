@@ -7,7 +7,7 @@ from records import whole
 
 from aftbed.core.errors import ConfigError
 from aftbed.judge.record import read_record
-from aftbed.runtime.unix.journal import Dialogue
+from aftbed.runtime.unix.journal_files import Dialogue
 
 
 def test_several_incarnations_of_the_client_are_one_dialogue(path: Path) -> None:

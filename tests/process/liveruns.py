@@ -34,7 +34,7 @@ from aftbed.core.fault import Fault
 from aftbed.core.journal import EntryKind, entries
 from aftbed.judge.record import RunRecord, read_record
 from aftbed.judge.verdict import Verdict, judge
-from aftbed.runtime.unix import ask, rundir
+from aftbed.runtime.unix import control_client, rundir
 from aftbed.runtime.unix.launch import launch, options_for
 from aftbed.runtime.unix.options import LoadRun, Work
 from aftbed.runtime.unix.resources import Row
@@ -178,7 +178,7 @@ class Started:
 
     def rows(self) -> list[Row]:
         """Its processes."""
-        return ask.processes(self.private)
+        return control_client.processes(self.private)
 
     def pid(self, name: str) -> int:
         """The pid of the process called `name`."""
@@ -186,7 +186,7 @@ class Started:
 
     def status(self) -> dict[str, object]:
         """What `aftbed status` would show."""
-        return ask.ask(self.private, ask.Status())
+        return control_client.ask(self.private, control_client.Status())
 
     def redundant(self) -> bool:
         """Whether a backup stands and no script is under way."""

@@ -17,7 +17,7 @@ from aftbed.core.fault import Fault
 from aftbed.core.journal import EntryKind
 from aftbed.core.messages import Goal
 from aftbed.ftm.compose import EXPRESSIONS, NONE, build
-from aftbed.runtime.unix import ask
+from aftbed.runtime.unix import control_client
 from aftbed.runtime.unix.options import LoadRun
 
 pytestmark = pytest.mark.process
@@ -44,7 +44,7 @@ def trail(mechanisms: tuple[str, ...]) -> list[str]:
 
 def adapt(run: Started, goal: Goal) -> dict[str, object]:
     """What the one who asks hears."""
-    return ask.ask(run.private, ask.Adapt(goal), ask.ADAPT_SECONDS_MAX)
+    return control_client.ask(run.private, control_client.Adapt(goal), control_client.ADAPT_SECONDS_MAX)
 
 
 def serving(home: Home, ftm: str, placement: str, *faults: Fault) -> Started:
@@ -58,7 +58,7 @@ def serving(home: Home, ftm: str, placement: str, *faults: Fault) -> Started:
 def ended(run: Started) -> Outcome:
     """The run, stopped after some more requests have been answered."""
     run.wait_for_answers(run.answered() + 20)
-    ask.ask(run.private, ask.Stop())
+    control_client.ask(run.private, control_client.Stop())
     return run.finish()
 
 
@@ -75,7 +75,7 @@ def assert_nothing_happened_to_requests(outcome: Outcome) -> None:
 
 def graph_of(run: Started) -> set[tuple[str, str]]:
     """The bricks that run, with their kinds."""
-    bricks = ask.ask(run.private, ask.GraphNow())["bricks"]
+    bricks = control_client.ask(run.private, control_client.GraphNow())["bricks"]
     assert isinstance(bricks, list)
     return {(str(b["name"]), str(b["kind"])) for b in bricks}
 
@@ -186,10 +186,10 @@ def test_a_brick_that_crashes_while_it_is_observed_is_rolled_back(
 
 def test_a_second_adaptation_meanwhile_is_refused(home: Home) -> None:
     with serving(home, "pbr", "process") as run:
-        line = ask.send(run.private, ask.Adapt(Goal(expression="lfr")))
+        line = control_client.send(run.private, control_client.Adapt(Goal(expression="lfr")))
         until(lambda: run.status()["adapting"], "an adaptation under way")
         with pytest.raises(ConfigError, match=r"adaptation 1 .* is under way"):
             adapt(run, Goal(expression="pbr+tr"))
-        assert ask.receive(line)["outcome"] == "done"
+        assert control_client.receive(line)["outcome"] == "done"
         outcome = ended(run)
     assert_nothing_happened_to_requests(outcome)

@@ -8,9 +8,9 @@ from liveruns import Home, Started, until
 from aftbed.core.events import Event
 from aftbed.core.journal import EntryKind
 from aftbed.inject.words import parse
-from aftbed.runtime.unix import ask
+from aftbed.runtime.unix import control_client
 from aftbed.runtime.unix.options import LoadRun
-from aftbed.runtime.unix.processes import Process
+from aftbed.runtime.unix.process_pool import Process
 
 pytestmark = pytest.mark.process
 
@@ -36,7 +36,7 @@ def test_what_is_under_way_when_it_is_stopped_is_answered(home: Home) -> None:
         run.wait_for_answers(1)
         sent = run.entries(EntryKind.SENT)
         until(lambda: run.entries(EntryKind.SENT) > sent, "another request")
-        ask.ask(run.private, ask.Stop())
+        control_client.ask(run.private, control_client.Stop())
         outcome = run.finish()
     requests = outcome.verdict.requests
     assert outcome.verdict.verdict == "pass", outcome.verdict.reasons

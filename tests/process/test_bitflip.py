@@ -22,7 +22,7 @@ from aftbed.ftm.compose import EXPRESSIONS, replication_of
 from aftbed.inject.words import parse
 from aftbed.judge.record import RunRecord, read_record
 from aftbed.judge.verdict import Verdict
-from aftbed.runtime.unix import ask, rundir
+from aftbed.runtime.unix import control_client, rundir
 from aftbed.runtime.unix.options import LoadRun
 
 pytestmark = pytest.mark.process
@@ -239,7 +239,7 @@ def test_a_live_run_is_hit_from_a_second_command(home: Home) -> None:
         assert done.code == 0, done.err
         assert "bitflip result bit 8 in primary at server.exit nth 5" in done.err
         told = started.wait_for("fault", "activated")
-        ask.ask(started.private, ask.Stop())
+        control_client.ask(started.private, control_client.Stop())
         outcome = started.finish()
     assert outcome.verdict.requests.wrong == 1 and outcome.verdict.verdict == "fail"
     (fault,) = outcome.verdict.faults
@@ -263,15 +263,15 @@ def held_in_its_launch(home: Home) -> Iterator[tuple[Started, int]]:
 
 def test_what_is_asked_while_a_run_starts_is_done_when_it_has(home: Home) -> None:
     with held_in_its_launch(home) as (started, zygote):
-        given_up = ask.send(started.private, ask.Inject(parse("crash primary")))
+        given_up = control_client.send(started.private, control_client.Inject(parse("crash primary")))
         started.status()
         given_up.close()
-        asked = ask.send(started.private, ask.Inject(parse("bitflip result bit 8")))
+        asked = control_client.send(started.private, control_client.Inject(parse("bitflip result bit 8")))
         started.status()
         os.kill(zygote, signal.SIGCONT)
-        ask.receive(asked)
+        control_client.receive(asked)
         started.wait_for("fault", "activated")
-        ask.ask(started.private, ask.Stop())
+        control_client.ask(started.private, control_client.Stop())
         outcome = started.finish()
     ((fault, receipt),) = [(fault["fault"], fault["receipt"]) for fault in outcome.verdict.faults]
     assert fault.startswith("bitflip") and receipt == "activated", "who has given up is not obeyed"
@@ -282,7 +282,7 @@ def test_after_a_while_the_next_execution_is_hit(home: Home) -> None:
         done = aftbed("inject", "bitflip", "result", "--replica", "a", "--bit", "8", "--after", "100ms")
         assert done.code == 0, done.err
         started.wait_for_answers(started.answered() + 75)  # at 200 a second: that is behind the hit
-        ask.ask(started.private, ask.Stop())
+        control_client.ask(started.private, control_client.Stop())
         outcome = started.finish()
     (fault,) = outcome.verdict.faults
     assert fault["receipt"] == "activated"

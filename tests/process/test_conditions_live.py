@@ -16,7 +16,7 @@ from aftbed.core.journal import EntryKind
 from aftbed.inject.words import parse
 from aftbed.runtime.jobs import StepFailed
 from aftbed.runtime.sim.world import Setup, simulate
-from aftbed.runtime.unix import ask, memory, rundir
+from aftbed.runtime.unix import control_client, memory, rundir
 from aftbed.runtime.unix.options import CarRun, LoadRun
 
 pytestmark = pytest.mark.process
@@ -70,7 +70,7 @@ def test_a_live_run_is_given_one_from_a_second_command(home: Home) -> None:
         done = aftbed("inject", "hang", "primary", "--for", "20ms", "--when", "speed>5")
         assert done.code == 0 and "hang primary for 20ms when speed > 5" in done.err, done.err
         run.wait_for("met")
-        ask.ask(run.private, ask.Stop())
+        control_client.ask(run.private, control_client.Stop())
         (found,) = run.finish().verdict.faults
     assert found["receipt"] == "activated" and "speed > 5 at " in found["detail"]
 
@@ -108,7 +108,7 @@ def test_a_replica_with_a_small_share_takes_longer_and_then_no_longer(home: Home
 
 def flipped(run: Started, text: str) -> re.Match[str]:
     """What the run says of the bit that it has flipped."""
-    ask.ask(run.private, ask.Inject(parse(text)))
+    control_client.ask(run.private, control_client.Inject(parse(text)))
     said = str(run.wait_for("fault", "bitflip memory")["text"])
     found = _WHERE.search(said)
     assert found is not None, said
@@ -128,7 +128,7 @@ def test_a_bit_of_a_nodes_memory_is_another_one_and_of_no_other_node(home: Home)
         assert memory.peek(owner, address) == before ^ 0x20
         other = memory.Owner("b/server", run.pid("b/server"), private)
         assert memory.peek(other, address) == before, "forked from the same zygote, and not the same memory"
-        ask.ask(run.private, ask.Stop())
+        control_client.ask(run.private, control_client.Stop())
         outcome = run.finish()
     assert outcome.verdict.faults[0]["receipt"] == "applied"
 
@@ -157,7 +157,9 @@ def test_what_is_no_memory_of_the_process_is_the_injectors_failure(home: Home) -
             if " r-xp " in line
         )
         first = int(code.partition("-")[0], 16)
-        ask.ask(run.private, ask.Inject(parse(f"bitflip memory address {first:#x} in a/server")))
+        control_client.ask(
+            run.private, control_client.Inject(parse(f"bitflip memory address {first:#x} in a/server"))
+        )
         said = str(run.wait_for("fault", "inject_error")["text"])
         assert f"address {first:#x}: in no private memory that a/server (pid" in said
         run.launched.stop()

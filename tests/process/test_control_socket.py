@@ -16,7 +16,7 @@ from aftbed.core.fault import Crash, Fault, Hang, Trigger
 from aftbed.core.messages import PACKET_BYTES_MAX
 from aftbed.ftm.compose import build
 from aftbed.runtime import targets
-from aftbed.runtime.unix import ask, rundir
+from aftbed.runtime.unix import control_client, rundir
 
 pytestmark = pytest.mark.process
 
@@ -37,7 +37,7 @@ questions = st.one_of(
     ),
     st.builds(
         lambda target, event, nth, after_ms, for_ms: msgspec.msgpack.encode(
-            ask.Inject(Fault(Hang(for_ms), target, Trigger(event, nth, after_ms)))
+            control_client.Inject(Fault(Hang(for_ms), target, Trigger(event, nth, after_ms)))
         ),
         HARMLESS_TARGETS,
         st.sampled_from(["", "request.sent", "checkpoint.applied", "nonsense"]),
@@ -106,7 +106,7 @@ def test_garbage_changes_nothing(run: Started) -> None:
 
 def test_truncated_questions_change_nothing(run: Started) -> None:
     fault = Fault(Crash(), "primary", Trigger())
-    for question in (ask.Inject(fault), ask.Stop(), ask.Processes()):
+    for question in (control_client.Inject(fault), control_client.Stop(), control_client.Processes()):
         whole = msgspec.msgpack.encode(question)
         for length in range(1, len(whole)):
             tell(run, whole[:length])
@@ -114,7 +114,7 @@ def test_truncated_questions_change_nothing(run: Started) -> None:
 
 
 def test_oversized_packets_change_nothing(run: Started) -> None:
-    whole = msgspec.msgpack.encode(ask.Stop())
+    whole = msgspec.msgpack.encode(control_client.Stop())
     for size in (PACKET_BYTES_MAX - 1, PACKET_BYTES_MAX, PACKET_BYTES_MAX + 1, 2 * PACKET_BYTES_MAX):
         tell(run, whole.ljust(size, b"\0"))
     finish(run)
@@ -126,7 +126,7 @@ def test_descriptors_that_come_along_are_closed(run: Started) -> None:
     with Path("/dev/null").open() as null:
         for _ in range(30):
             tell(run, b"\xc1", fds=(null.fileno(),))
-            tell(run, msgspec.msgpack.encode(ask.Status()), fds=(null.fileno(),) * 3)
+            tell(run, msgspec.msgpack.encode(control_client.Status()), fds=(null.fileno(),) * 3)
     until(lambda: run.descriptors(supervisor) <= before, "the descriptors to be closed", 5.0)
     finish(run)
 
@@ -151,7 +151,7 @@ def _answers(run: Started) -> bool:
 
 
 def test_a_closed_end_before_the_answer_is_nobodys_trouble(run: Started) -> None:
-    for question in (ask.Status(), ask.Processes(), ask.GraphNow()):
+    for question in (control_client.Status(), control_client.Processes(), control_client.GraphNow()):
         for _ in range(20):
             tell(run, msgspec.msgpack.encode(question), listen=False)
     finish(run)
@@ -160,5 +160,5 @@ def test_a_closed_end_before_the_answer_is_nobodys_trouble(run: Started) -> None
 @pytest.mark.parametrize("number", [0, -1, 2**32, 2**63, 2**64 - 1])
 def test_a_fault_with_absurd_numbers_does_not_end_the_run(run: Started, number: int) -> None:
     for trigger in (Trigger("request.sent", nth=number), Trigger(after_ms=number)):
-        tell(run, msgspec.msgpack.encode(ask.Inject(Fault(Hang(number), "engine", trigger))))
+        tell(run, msgspec.msgpack.encode(control_client.Inject(Fault(Hang(number), "engine", trigger))))
         run.status()

@@ -15,7 +15,7 @@ import pytest
 from liveruns import Command, Home, Started, aftbed, ended, only_run, state_of, under_load, until
 
 from aftbed.cli.doctor import Diagnosis
-from aftbed.runtime.unix import ask, leftovers, members, rundir
+from aftbed.runtime.unix import control_client, leftovers, members, rundir
 from aftbed.runtime.unix.leftovers import LeftDirectory, LeftProcess
 from aftbed.runtime.unix.options import LoadRun
 
@@ -94,7 +94,7 @@ def test_the_processes_of_a_dead_run_are_named_and_removed_and_a_live_run_goes_o
         until(lambda: len(rundir.live()) == 2, "two runs")
         command.started()
         run = next(path for path in home.runs() if path != alive.private)
-        engine = next(row.pid for row in ask.processes(run) if row.name == "engine")
+        engine = next(row.pid for row in control_client.processes(run) if row.name == "engine")
         supervisor, warden = parts(run)
         stopped(supervisor)
         stopped(engine)  # nobody is there to replace it
@@ -123,7 +123,7 @@ def test_the_processes_of_a_dead_run_are_named_and_removed_and_a_live_run_goes_o
         assert home.runs() == [alive.private]
         assert doctor("--clean")[1].removed == []
         assert alive.status()["leader"] == "a"
-        ask.ask(alive.private, ask.Stop())
+        control_client.ask(alive.private, control_client.Stop())
         outcome = alive.finish()
         assert outcome.verdict.verdict == "pass"
         assert outcome.told("died") == outcome.told("replaced") == []

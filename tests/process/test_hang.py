@@ -15,7 +15,7 @@ from sampling import every
 from aftbed.core.events import Event
 from aftbed.core.fault import Fault, Hang, Trigger
 from aftbed.ftm.compose import build
-from aftbed.runtime.unix import ask
+from aftbed.runtime.unix import control_client
 from aftbed.runtime.unix.options import LoadRun
 
 pytestmark = pytest.mark.process
@@ -97,7 +97,7 @@ def test_a_death_while_the_supervisor_is_stopped_is_dealt_with_afterwards(home: 
 def test_a_short_pause_of_a_replica_is_not_a_failover(home: Home) -> None:
     """Below the deadline nothing may happen; what was stopped goes on by itself."""
     with under_load(home, 150, RATE_HZ) as run:
-        ask.ask(run.private, ask.Inject(Fault(Hang(10), "primary", Trigger())))
+        control_client.ask(run.private, control_client.Inject(Fault(Hang(10), "primary", Trigger())))
         assert_promises(run.finish(), failovers=0)
 
 

@@ -10,7 +10,7 @@ from aftbed.core.events import Event
 from aftbed.core.fault import marked
 from aftbed.core.journal import EntryKind
 from aftbed.inject.words import parse
-from aftbed.runtime.unix import ask
+from aftbed.runtime.unix import control_client
 from aftbed.runtime.unix.options import LoadRun
 
 pytestmark = pytest.mark.process
@@ -94,7 +94,7 @@ def test_an_omission_loses_one_reply_and_no_other(home: Home) -> None:
     fault = parse("omission pxy2clt nth 10")
     with Started(home, LoadRun(COUNT, RATE_HZ), faults=(fault,)) as run:
         run.wait_for_answers(COUNT - 1)
-        ask.ask(run.private, ask.Stop())
+        control_client.ask(run.private, control_client.Stop())
         outcome = run.finish()
     assert set(range(1, COUNT + 1)) - set(latencies_ms(outcome)) == {10}
     assert_healed(outcome, 10)

@@ -24,7 +24,7 @@ from sampling import every
 
 from aftbed.core.journal import EntryKind
 from aftbed.ftm.compose import build
-from aftbed.runtime.unix import ask
+from aftbed.runtime.unix import control_client
 from aftbed.runtime.unix.options import LoadRun
 from aftbed.vehicle.can.candump import LogCounts, Refusal, parse_lines
 
@@ -129,7 +129,7 @@ def test_a_node_beside_the_replicas_may_die_again_and_again(home: Home, name: st
 def test_the_death_of_the_supervisor_ends_everything_and_is_inconclusive(home: Home) -> None:
     with Command("--load", "100000@200") as command:
         command.started()
-        pid = next(row.pid for row in ask.processes(only_run()) if row.name == "supervisor")
+        pid = next(row.pid for row in control_client.processes(only_run()) if row.name == "supervisor")
         os.kill(pid, signal.SIGKILL)
         assert ended(pid)
         done = command.done()
@@ -161,7 +161,7 @@ def test_command_and_supervisor_killed_at_once_leave_nothing_but_the_record(
     with Command("--scenario", "free-drive", "--record", record) as command:
         command.started()
         until(lambda: _frames(record).frames > 100, "frames in the log")
-        supervisor = next(row.pid for row in ask.processes(only_run()) if row.name == "supervisor")
+        supervisor = next(row.pid for row in control_client.processes(only_run()) if row.name == "supervisor")
         command.popen.kill()
         os.kill(supervisor, signal.SIGKILL)
         command.popen.wait()
@@ -174,7 +174,7 @@ def test_a_killed_command_takes_a_stopped_supervisor_with_it(home: Home) -> None
     """Nobody else could tell it: it does not read."""
     with Command("--load", "100000@200") as command:
         command.started()
-        supervisor = next(row.pid for row in ask.processes(only_run()) if row.name == "supervisor")
+        supervisor = next(row.pid for row in control_client.processes(only_run()) if row.name == "supervisor")
         os.kill(supervisor, signal.SIGSTOP)
         until(lambda: state_of(supervisor) == "T", "the supervisor to stop")
         command.popen.kill()

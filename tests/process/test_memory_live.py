@@ -9,7 +9,7 @@ from liveruns import Home, Outcome, Started, aftbed, under_load, until
 
 from aftbed.core.events import Event
 from aftbed.inject.words import parse
-from aftbed.runtime.unix import ask
+from aftbed.runtime.unix import control_client
 from aftbed.runtime.unix.cells import NAME
 from aftbed.runtime.unix.options import LoadRun
 
@@ -83,19 +83,23 @@ def test_it_is_memory_of_that_process_and_of_no_other(home: Home) -> None:
     """Without a fault there is none; a replica that takes the place of a dead one gets a fresh one."""
     with under_load(home, 4000, RATE_HZ) as run:
         assert not held(run)
-        ask.ask(run.private, ask.Inject(parse(f"{FLIP} in a at request.received {NEVER}")))
+        control_client.ask(
+            run.private, control_client.Inject(parse(f"{FLIP} in a at request.received {NEVER}"))
+        )
         old = cells(run.pid("a/server"))
         assert len(old) == 1 and old == cells(run.launched.supervisor)
         assert held(run) == {"a/server": old}
 
-        ask.ask(run.private, ask.Inject(parse("crash a/server")))
+        control_client.ask(run.private, control_client.Inject(parse("crash a/server")))
         until(lambda: run.status()["leader"] == "b" and run.redundant(), "a new backup")
         assert not held(run) and not cells(run.launched.supervisor), "nobody has the dead one's"
-        ask.ask(run.private, ask.Inject(parse(f"{FLIP} in a at request.received {NEVER}")))
+        control_client.ask(
+            run.private, control_client.Inject(parse(f"{FLIP} in a at request.received {NEVER}"))
+        )
         fresh = cells(run.pid("a/server"))
         assert len(fresh) == 1 and not fresh & old and held(run) == {"a/server": fresh}
         assert cells(run.launched.supervisor) == fresh
-        ask.ask(run.private, ask.Stop())
+        control_client.ask(run.private, control_client.Stop())
         assert run.finish().verdict.requests.wrong == 0
 
 
@@ -108,7 +112,7 @@ def test_a_bit_is_flipped_from_outside(home: Home) -> None:
         flip = ("inject", "bitflip", "state.counter", "--bit", "7", "--at", "request.received")
         assert aftbed(*flip).code == 0  # any counter is refused then, whatever it is at this moment
         until(lambda: run.status()["leader"] == "b" and run.redundant(), "a new backup")
-        ask.ask(run.private, ask.Stop())
+        control_client.ask(run.private, control_client.Stop())
         outcome = run.finish()
     assert receipts(outcome) == ["activated"]
     assert outcome.verdict.verdict == "pass", outcome.verdict.reasons

@@ -15,7 +15,7 @@ from liveruns import LOOK_SECONDS, Home, Started, until
 
 from aftbed.core.fault import Crash, Fault, Trigger
 from aftbed.core.messages import Goal
-from aftbed.runtime.unix import ask
+from aftbed.runtime.unix import control_client
 from aftbed.runtime.unix.options import LoadRun
 
 pytestmark = pytest.mark.process
@@ -61,7 +61,7 @@ def fail_over(run: Started, count: int) -> None:
     """Crash the primary `count` times, each time when a backup stands."""
     for _ in range(count):
         leader = run.status()["leader"]
-        ask.ask(run.private, ask.Inject(Fault(Crash(), "primary", Trigger())))
+        control_client.ask(run.private, control_client.Inject(Fault(Crash(), "primary", Trigger())))
         until(lambda led=leader: run.status()["leader"] not in ("", led), "another leader")
         until(run.redundant, "redundancy")
 
@@ -93,7 +93,9 @@ def test_many_failovers_leave_no_trace(home: Home, placement: str, count: int) -
 def adapt_back_and_forth(run: Started, count: int) -> None:
     """`count` adaptations: a composition, its end, and so on."""
     for expression in itertools.islice(itertools.cycle(("pbr+tr", "pbr")), count):
-        found = ask.ask(run.private, ask.Adapt(Goal(expression=expression)), ask.ADAPT_SECONDS_MAX)
+        found = control_client.ask(
+            run.private, control_client.Adapt(Goal(expression=expression)), control_client.ADAPT_SECONDS_MAX
+        )
         assert (found["outcome"], found["reason"]) == ("done", "")
 
 

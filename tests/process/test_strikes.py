@@ -31,7 +31,7 @@ from aftbed.core.events import Event
 from aftbed.core.fault import Crash, Fault, Trigger
 from aftbed.core.messages import Goal
 from aftbed.runtime.targets import STAGED
-from aftbed.runtime.unix import ask
+from aftbed.runtime.unix import control_client
 from aftbed.search.explore import WHEN, Strike, strikes
 
 pytestmark = pytest.mark.process
@@ -56,7 +56,7 @@ def strike(run: Started, struck: Strike, placement: str) -> str:
     """One adaptation with one death; the mechanism that runs after it."""
     leader = str(run.status()["leader"])
     fault = Fault(Crash(), mirrored(struck.node, leader), Trigger(struck.when.label, struck.step))
-    ask.ask(run.private, ask.Inject(fault))
+    control_client.ask(run.private, control_client.Inject(fault))
     came_to = struck.new if how_it_ended(run, Goal(expression=struck.new)) == "done" else struck.old
     until(run.redundant, f"redundancy after {struck}")
     assert graph_of(run) == whole(came_to, placement, str(run.status()["leader"])), struck

@@ -5,7 +5,7 @@ import signal
 import pytest
 from liveruns import Command, Home, aftbed, under_load, until
 
-from aftbed.runtime.unix import ask, rundir
+from aftbed.runtime.unix import control_client, rundir
 
 pytestmark = pytest.mark.process
 
@@ -30,7 +30,7 @@ def test_a_crash_in_one_run_is_none_in_the_other(home: Home) -> None:
         one.strike("a/server", signal.SIGKILL)
         one.wait_for("script.done", "new backup", after=seen)
         for run in rundir.live():
-            ask.ask(rundir.find(run), ask.Stop())
+            control_client.ask(rundir.find(run), control_client.Stop())
         assert len(one.finish().verdict.failovers) == 1
         spared = other.done()
     assert spared.code == 0, spared.out + spared.err
@@ -74,5 +74,5 @@ def test_the_directory_of_a_run_is_private(home: Home) -> None:
     with under_load(home, 100) as run:
         assert run.private.stat().st_mode & 0o777 == 0o700
         assert rundir.root().stat().st_mode & 0o777 == 0o700
-        ask.ask(run.private, ask.Stop())
+        control_client.ask(run.private, control_client.Stop())
         assert run.finish().verdict.verdict == "pass"

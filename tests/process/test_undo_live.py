@@ -9,7 +9,7 @@ import pytest
 from liveruns import GONE_SECONDS_MAX, Home, Started, state_of, under_load, until
 
 from aftbed.core.fault import Fault, Hang, Trigger
-from aftbed.runtime.unix import ask, members, undo
+from aftbed.runtime.unix import control_client, members, undo
 from aftbed.runtime.unix.options import LoadRun
 
 pytestmark = pytest.mark.process
@@ -18,8 +18,8 @@ FOR_MS: Final = 200
 BUSY_SECONDS: Final = 0.15  # what a machine with something else to do may add
 
 
-def hang(target: str, for_ms: int = 0) -> ask.Inject:
-    return ask.Inject(Fault(Hang(for_ms), target, Trigger()))
+def hang(target: str, for_ms: int = 0) -> control_client.Inject:
+    return control_client.Inject(Fault(Hang(for_ms), target, Trigger()))
 
 
 def entries(run: Started) -> list[undo.Entry]:
@@ -32,7 +32,7 @@ def test_a_stop_is_written_before_it_is_done_and_its_undo_behind_it(home: Home) 
     with under_load(home, 200) as run:
         pid = run.pid("engine")
         began_ns = time.monotonic_ns()
-        ask.ask(run.private, hang("engine", 60))
+        control_client.ask(run.private, hang("engine", 60))
         stopped = entries(run)
         assert state_of(pid) == "T"
         assert len(stopped) == 1 and isinstance(stopped[0], undo.Stopped)
@@ -48,7 +48,7 @@ def test_what_a_stopped_supervisor_stopped_is_thawed_by_the_warden_in_time(home:
     with under_load(home, 300) as run:
         pid = run.pid("engine")
         began = time.monotonic()
-        ask.ask(run.private, hang("engine", FOR_MS))
+        control_client.ask(run.private, hang("engine", FOR_MS))
         run.strike("supervisor", signal.SIGSTOP)
         assert state_of(pid) == "T"
         until(lambda: state_of(pid) != "T", "the stopped node to go on")

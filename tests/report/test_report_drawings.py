@@ -14,7 +14,7 @@ from aftbed.inject.words import parse
 from aftbed.report.happenings import KEPT_MAX
 from aftbed.report.plots import POINTS_MAX, Limit, axis_of, ecdf
 from aftbed.report.spacetime import space_time
-from aftbed.runtime.sim.tracing import Trace, traced
+from aftbed.runtime.sim.trace import Trace, traced
 from aftbed.runtime.sim.world import Setup
 
 TIMES = st.lists(st.floats(0, 1e6), min_size=1, max_size=60)

@@ -7,7 +7,7 @@ import pytest
 from aftbed.core.fault import Crash, Fault, Trigger
 from aftbed.judge.verdict import Breach
 from aftbed.report.sequence import escaped, mermaid, text
-from aftbed.runtime.sim.tracing import Trace, traced
+from aftbed.runtime.sim.trace import Trace, traced
 from aftbed.runtime.sim.world import Setup
 from aftbed.search.swarm import drawn
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from aftbed.runtime.unix import inspection, rundir
-from aftbed.runtime.unix.inspection import Check, inspect
+from aftbed.runtime.unix import doctor, rundir
+from aftbed.runtime.unix.doctor import Check, inspect
 
 
 @pytest.fixture
@@ -49,7 +49,7 @@ def test_a_call_that_is_refused_is_missing() -> None:
     def refused() -> None:
         raise PermissionError(1, "Operation not permitted")
 
-    check = inspection._tried("pidfd", "deaths", "allow it", refused)
+    check = doctor._tried("pidfd", "deaths", "allow it", refused)
     assert (check.status, check.remedy) == ("missing", "allow it")
     assert "Operation not permitted" in check.found
 
@@ -79,7 +79,7 @@ def test_a_path_that_is_too_long_for_a_socket(runtime: Path, monkeypatch: pytest
 
 
 def test_a_package_that_is_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(inspection.OPTIONAL, "no-such-package-of-aftbed", "nothing")
+    monkeypatch.setitem(doctor.OPTIONAL, "no-such-package-of-aftbed", "nothing")
     check = found("no-such-package-of-aftbed")
     assert (check.status, check.found) == ("warning", "not installed")
     assert check.remedy == "pip install no-such-package-of-aftbed"

@@ -19,8 +19,8 @@ from aftbed.core.journal import (
     node_name,
     records,
 )
-from aftbed.runtime.unix import journal as mapped
-from aftbed.runtime.unix.journal import CHUNK_BYTES, Dialogue, Header, Journal
+from aftbed.runtime.unix import journal_files as mapped
+from aftbed.runtime.unix.journal_files import CHUNK_BYTES, Dialogue, Header, Journal
 
 PER_CHUNK: Final = (CHUNK_BYTES - HEADER_BYTES) // RECORD.size
 

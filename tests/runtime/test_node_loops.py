@@ -29,7 +29,7 @@ from aftbed.core.valuefault import Bit, Flip, Place
 from aftbed.runtime import control
 from aftbed.runtime.node import Node
 from aftbed.runtime.unix import packets
-from aftbed.runtime.unix.journal import Journal
+from aftbed.runtime.unix.journal_files import Journal
 from aftbed.runtime.unix.line import Line, decode_order, decode_report
 from aftbed.runtime.unix.node_io import NUDGE, UnixIO, UnixNode
 

@@ -13,7 +13,7 @@ import pytest
 from aftbed.core.brick import Brick, Effect
 from aftbed.core.messages import AnyMessage
 from aftbed.runtime.node import Node
-from aftbed.runtime.unix.journal import Header, Journal
+from aftbed.runtime.unix.journal_files import Header, Journal
 from aftbed.runtime.unix.line import Line, decode_order
 from aftbed.runtime.unix.linux import set_timeouts
 from aftbed.runtime.unix.node_io import UnixIO

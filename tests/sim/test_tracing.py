@@ -9,7 +9,7 @@ import pytest
 
 from aftbed.core.fault import Crash, Fault, Trigger
 from aftbed.core.messages import Checkpoint, Goal, Scheduled, Trials, Tried
-from aftbed.runtime.sim.tracing import Sent, brief, lines, milliseconds, traced
+from aftbed.runtime.sim.trace import Sent, brief, lines, milliseconds, traced
 from aftbed.runtime.sim.world import Setup, simulate
 from aftbed.search.swarm import drawn
 
@@ -20,7 +20,7 @@ HASH_SEEDS = ("0", "1", "12345")
 HASHED = f"""
 import hashlib
 from aftbed.search.swarm import drawn
-from aftbed.runtime.sim.tracing import lines, traced
+from aftbed.runtime.sim.trace import lines, traced
 found = hashlib.sha256()
 for seed in {SWARM!r}:
     for line in lines(traced(drawn(seed))):

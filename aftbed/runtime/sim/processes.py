@@ -2,7 +2,7 @@
 
 A signal is not instant: for some microseconds its target goes on. A death is seen first by who holds the
 lifeline (the Watchdog), later by the executive, as on Linux: 0.1 to 0.3 ms, and 0.5 to 0.8 ms (see
-`runtime.unix.lifeline`).
+`runtime.unix.death_notice`).
 """
 
 from collections import deque

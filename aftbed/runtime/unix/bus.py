@@ -13,7 +13,7 @@ from aftbed.core.busfault import BusFault, Condition, Struck
 from aftbed.runtime import control
 from aftbed.runtime.interface import Met
 from aftbed.runtime.jobs import Key, StepFailed, Wait
-from aftbed.runtime.unix.processes import Nursery, Process
+from aftbed.runtime.unix.process_pool import Nursery, Process
 
 HUB: Final = "hub"
 DISTURBED: Final = "disturbed"  # the hub to us: that fault is armed

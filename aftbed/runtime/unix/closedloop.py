@@ -44,7 +44,7 @@ from aftbed.core.journal import Record
 from aftbed.core.messages import Goal
 from aftbed.ftm.compose import NONE
 from aftbed.runtime.adaptations import Outcome
-from aftbed.runtime.unix import ask
+from aftbed.runtime.unix import control_client
 from aftbed.runtime.unix.observation import MEASURED, Journals, Lines, Meter, lost
 from aftbed.runtime.unix.support import HISTORY_NAME
 
@@ -152,7 +152,7 @@ class ClosedLoop:
         self._application = ""
         self._blind = self._deaf = self._timed = False
         self._open: Proposal | None = None  # waits for a person, or for the run
-        self._waiting: ask.Waiting | None = None
+        self._waiting: control_client.Waiting | None = None
         self._due_ns = self._asked_ns = self._started_ns
 
     def show(self, tell: Tell) -> None:
@@ -211,7 +211,7 @@ class ClosedLoop:
 
     def _look(self, now_ns: int) -> None:
         """Tell the Observer what is new. The history first: it says what runs."""
-        if self.state == "adapting" and now_ns - self._asked_ns > ask.ADAPT_SECONDS_MAX * 1e9:
+        if self.state == "adapting" and now_ns - self._asked_ns > control_client.ADAPT_SECONDS_MAX * 1e9:
             self._answered()
         for outcome in self._history.new():
             self._application = outcome.application
@@ -280,7 +280,9 @@ class ClosedLoop:
         try:
             if reason := _unsuitable(proposal.target, self._application):
                 raise ConfigError(reason)
-            self._waiting = ask.send(self._private, ask.Adapt(Goal(expression=proposal.target)))
+            self._waiting = control_client.send(
+                self._private, control_client.Adapt(Goal(expression=proposal.target))
+            )
             self._asked_ns = time.monotonic_ns()
         except AftbedError as error:
             self._end(proposal, "refused", str(error))
@@ -290,7 +292,7 @@ class ClosedLoop:
         proposal, line, self._waiting = self._open, self._waiting, None
         assert proposal is not None and line is not None
         try:
-            outcome = msgspec.convert(ask.receive(line, PERIOD_SECONDS), Outcome)
+            outcome = msgspec.convert(control_client.receive(line, PERIOD_SECONDS), Outcome)
         except ConfigError as error:
             self._end(proposal, "refused", str(error))
         except AftbedError as error:

@@ -12,8 +12,8 @@ from aftbed.ftm.client import Client
 from aftbed.runtime import control
 from aftbed.runtime.devices import Load, resume_client
 from aftbed.runtime.unix import linux
-from aftbed.runtime.unix.journal import Dialogue, Header
-from aftbed.runtime.unix.lifeline import Watcher
+from aftbed.runtime.unix.death_notice import Watcher
+from aftbed.runtime.unix.journal_files import Dialogue, Header
 
 STALE_NS: Final = 35_000_000  # a pulse older than this is looked into; it comes every 20 ms
 

@@ -10,7 +10,7 @@ from aftbed.core.messages import Reply
 from aftbed.ftm.client import Client
 from aftbed.runtime.devices import CarDevice, resume_client
 from aftbed.runtime.unix.devices import entries_of
-from aftbed.runtime.unix.journal import Dialogue
+from aftbed.runtime.unix.journal_files import Dialogue
 from aftbed.runtime.unix.options import GatewayOptions
 from aftbed.vehicle.can.bus import BusOptions, open_bus
 from aftbed.vehicle.can.dbc_file import load_dbc

@@ -47,8 +47,8 @@ from aftbed.runtime import control
 from aftbed.runtime import node as node_module
 from aftbed.runtime.node import HostedBrick, Node, NodeIO
 from aftbed.runtime.unix import cells, packets
-from aftbed.runtime.unix.journal import Journal
-from aftbed.runtime.unix.lifeline import Held
+from aftbed.runtime.unix.death_notice import Held
+from aftbed.runtime.unix.journal_files import Journal
 from aftbed.runtime.unix.line import Line
 from aftbed.runtime.unix.packets import READ_BYTES_MAX
 

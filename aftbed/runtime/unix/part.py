@@ -18,9 +18,9 @@ from aftbed.runtime.assembly import Assembler
 from aftbed.runtime.devices import Device, Sensor
 from aftbed.runtime.node import Node
 from aftbed.runtime.unix import linux
+from aftbed.runtime.unix.death_notice import Held
 from aftbed.runtime.unix.devices import LoadOptions, ProcessSenses, make_load
-from aftbed.runtime.unix.journal import Journal
-from aftbed.runtime.unix.lifeline import Held
+from aftbed.runtime.unix.journal_files import Journal
 from aftbed.runtime.unix.line import Line
 from aftbed.runtime.unix.node_io import EXIT_ASSERT, PULSE_SECONDS, UnixIO, UnixNode
 from aftbed.runtime.unix.options import GatewayOptions
@@ -33,7 +33,7 @@ def become(line: Line[control.ToNode], order: control.Assign | control.Serve, fd
     """Be what `order` says. Never returns."""
     try:
         if isinstance(order, control.Serve):
-            from aftbed.runtime.unix.services import serve  # noqa: PLC0415 - the bus costs 150 ms to import
+            from aftbed.runtime.unix.bus_services import serve  # noqa: PLC0415 - the bus costs 150 ms to import
 
             linux.set_name(f"aftbed-{order.service}")
             serve(line, order, fds)

@@ -36,7 +36,7 @@ from aftbed.ftm.server import Server
 from aftbed.runtime import control
 from aftbed.runtime.node import MemoryIO, Node, nowhere
 from aftbed.runtime.unix import linux
-from aftbed.runtime.unix.journal import Journal
+from aftbed.runtime.unix.journal_files import Journal
 from aftbed.runtime.unix.line import Line, decode_order, decode_report
 from aftbed.runtime.unix.node_io import NUDGE, UnixIO
 from aftbed.runtime.unix.pages import Area, written_by

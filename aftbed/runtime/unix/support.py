@@ -18,9 +18,9 @@ from aftbed.runtime.unix import memory
 from aftbed.runtime.unix.bus import BusFaults
 from aftbed.runtime.unix.cells import Cell
 from aftbed.runtime.unix.channels import Channel
-from aftbed.runtime.unix.journal import Journal, contents, recorded_requests
-from aftbed.runtime.unix.loop import Loop
-from aftbed.runtime.unix.processes import Nursery
+from aftbed.runtime.unix.event_loop import Loop
+from aftbed.runtime.unix.journal_files import Journal, contents, recorded_requests
+from aftbed.runtime.unix.process_pool import Nursery
 
 HISTORY_NAME: Final = "adaptations.jsonl"
 DRAW_BITS: Final = 63

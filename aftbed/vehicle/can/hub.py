@@ -67,7 +67,7 @@ import msgspec
 
 from aftbed.core.busfault import Condition
 from aftbed.core.errors import ConfigError, HarnessError, PeerError
-from aftbed.core.words import number
+from aftbed.core.units import number
 from aftbed.vehicle.can.bus_model import BusModel, BusNode
 from aftbed.vehicle.can.candump import log_line
 from aftbed.vehicle.can.frame import Frame

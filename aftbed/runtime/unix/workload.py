@@ -17,7 +17,7 @@ from aftbed.runtime.jobs import STATS_JOB, Key, Wait
 from aftbed.runtime.unix import bus
 from aftbed.runtime.unix.bus import BusFaults
 from aftbed.runtime.unix.devices import LoadOptions
-from aftbed.runtime.unix.loop import Loop
+from aftbed.runtime.unix.event_loop import Loop
 from aftbed.runtime.unix.options import (
     CarRun,
     GatewayOptions,
@@ -27,7 +27,7 @@ from aftbed.runtime.unix.options import (
     RunOptions,
     VehicleOptions,
 )
-from aftbed.runtime.unix.processes import Nursery, Process
+from aftbed.runtime.unix.process_pool import Nursery, Process
 from aftbed.runtime.zygotes import BUS, LIGHT
 
 ATTACH_SECONDS_MAX: Final = 10.0

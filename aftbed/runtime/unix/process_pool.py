@@ -18,9 +18,9 @@ from aftbed.runtime import control, interface
 from aftbed.runtime.interface import ProcessKind
 from aftbed.runtime.jobs import Key, StepFailed, Wait
 from aftbed.runtime.unix import linux, members
-from aftbed.runtime.unix.journal import Header
+from aftbed.runtime.unix.event_loop import Loop
+from aftbed.runtime.unix.journal_files import Header
 from aftbed.runtime.unix.line import Line, decode_report
-from aftbed.runtime.unix.loop import Loop
 from aftbed.runtime.unix.spawn import Started, start_zygote
 from aftbed.runtime.unix.undo import Ledger
 

@@ -21,12 +21,12 @@ from aftbed.runtime.adaptations import Adaptations, Outcome
 from aftbed.runtime.deployment import Deployment
 from aftbed.runtime.faults import Faults
 from aftbed.runtime.interface import ProcessKind
-from aftbed.runtime.unix import ask, rundir
+from aftbed.runtime.unix import control_client, rundir
+from aftbed.runtime.unix.event_loop import Loop
 from aftbed.runtime.unix.line import Line
-from aftbed.runtime.unix.loop import Loop
 from aftbed.runtime.unix.options import RunOptions
 from aftbed.runtime.unix.resources import Row
-from aftbed.runtime.unix.work import Work
+from aftbed.runtime.unix.workload import Work
 
 BESIDE: Final = (ProcessKind.ZYGOTE, ProcessKind.SPARE, ProcessKind.SERVICE, ProcessKind.STAGED)
 QUESTIONS_MAX: Final = 16  # connections at once, and questions that wait for the launch
@@ -49,8 +49,9 @@ class Questions:
         self._faults, self._work, self._finish = faults, work, finish
         self._adaptations = adaptations
         self._started_ns = time.monotonic_ns()
-        self._lines: dict[int, Line[ask.Question]] = {}
-        self._early: list[tuple[Line[ask.Question], ask.Question]] | None = []  # what waits for the launch
+        self._lines: dict[int, Line[control_client.Question]] = {}
+        # Questions that came before the graph stood; None since then.
+        self._early: list[tuple[Line[control_client.Question], control_client.Question]] | None = []
 
     def launched(self) -> None:
         """The graph is whole, and the function works: from here on it can be disturbed and changed."""
@@ -72,13 +73,13 @@ class Questions:
         except OSError:
             return
         sock.setblocking(False)
-        if not ask.same_user(sock, os.getuid()) or len(self._lines) >= QUESTIONS_MAX:
+        if not control_client.same_user(sock, os.getuid()) or len(self._lines) >= QUESTIONS_MAX:
             sock.close()
             return
-        line = self._lines[sock.fileno()] = Line(sock, ask.decode_question)
+        line = self._lines[sock.fileno()] = Line(sock, control_client.decode_question)
         self._loop.read(sock.fileno(), lambda: self._answer(line))
 
-    def _answer(self, line: Line[ask.Question]) -> None:
+    def _answer(self, line: Line[control_client.Question]) -> None:
         try:
             got = line.recv()
         except BlockingIOError:
@@ -94,44 +95,44 @@ class Questions:
         self._lines.pop(line.fileno(), None)
         line.close()
 
-    def _send_answer(self, line: Line[ask.Question], answer: ask.Answer) -> None:
+    def _send_answer(self, line: Line[control_client.Question], answer: control_client.Answer) -> None:
         try:
             line.send(answer)
         except OSError:
             return
 
-    def _reply(self, line: Line[ask.Question], question: ask.Question) -> None:
+    def _reply(self, line: Line[control_client.Question], question: control_client.Question) -> None:
         answer = partial(self._send_answer, line)
         try:
             match question:
-                case ask.Inject() | ask.Adapt() if self._early is not None:
+                case control_client.Inject() | control_client.Adapt() if self._early is not None:
                     if len(self._early) >= QUESTIONS_MAX:
                         raise ConfigError("the run has not started yet: ask again when it has")
                     self._early.append((line, question))
-                case ask.Status():
-                    answer(ask.Answer(json.dumps(self.status()).encode()))
-                case ask.Processes():
-                    answer(ask.Answer(msgspec.json.encode({"processes": self.processes()})))
-                case ask.GraphNow():
-                    answer(ask.Answer(msgspec.json.encode(self._deployment.graph)))
-                case ask.Inject(fault):
+                case control_client.Status():
+                    answer(control_client.Answer(json.dumps(self.status()).encode()))
+                case control_client.Processes():
+                    answer(control_client.Answer(msgspec.json.encode({"processes": self.processes()})))
+                case control_client.GraphNow():
+                    answer(control_client.Answer(msgspec.json.encode(self._deployment.graph)))
+                case control_client.Inject(fault):
                     targets.check(fault, self._deployment.graph)
                     self._loop.jobs.start(
                         "inject",
                         self._faults.arm(fault),
                         lambda failure: answer(
-                            ask.Answer(json.dumps({"armed": str(fault)}).encode(), error=failure)
+                            control_client.Answer(json.dumps({"armed": str(fault)}).encode(), error=failure)
                         ),
                     )
-                case ask.Adapt(goal):
+                case control_client.Adapt(goal):
                     self._adaptations.ask(goal, lambda outcome: answer(_told(outcome)))
-                case ask.Adaptations():
-                    answer(ask.Answer(self._adaptations.to_json()))
-                case ask.Stop():
+                case control_client.Adaptations():
+                    answer(control_client.Answer(self._adaptations.to_json()))
+                case control_client.Stop():
                     self._finish("stopped")
-                    answer(ask.Answer(b'{"stopping": true}'))
+                    answer(control_client.Answer(b'{"stopping": true}'))
         except ConfigError as error:
-            answer(ask.Answer(error=str(error)))
+            answer(control_client.Answer(error=str(error)))
 
     def status(self) -> dict[str, object]:
         """How the run is, for `aftbed status`."""
@@ -164,7 +165,7 @@ class Questions:
         return rows + [Row(p.name, p.kind.value, p.pid, False) for p in others]
 
 
-def _told(outcome: Outcome) -> ask.Answer:
+def _told(outcome: Outcome) -> control_client.Answer:
     """What the one who asked for an adaptation hears: only what was refused is an error."""
     refused = outcome.outcome == "refused"
-    return ask.Answer(msgspec.json.encode(outcome), error=outcome.reason if refused else "")
+    return control_client.Answer(msgspec.json.encode(outcome), error=outcome.reason if refused else "")
