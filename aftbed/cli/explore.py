@@ -56,13 +56,13 @@ class NumberedArguments(ExploreArguments, frozen=True, kw_only=True):
     only: Annotated[int | None, typer.Option(help="One experiment of this selection, by its number.")] = None
 
 
-class CrashArguments(NumberedArguments, frozen=True, kw_only=True):
+class ExploreCrashArguments(NumberedArguments, frozen=True, kw_only=True):
     """The options of `aftbed explore crash`."""
 
     requests: Annotated[int, typer.Option(help="Requests of each run.")] = REQUESTS
 
 
-class OrderArguments(ExploreArguments, frozen=True, kw_only=True):
+class ExploreOrderArguments(ExploreArguments, frozen=True, kw_only=True):
     """The options of `aftbed explore order`."""
 
     requests: Annotated[
@@ -75,8 +75,8 @@ class OrderArguments(ExploreArguments, frozen=True, kw_only=True):
 
 
 @explore.command()
-@takes(CrashArguments)
-def crash(given: CrashArguments) -> None:
+@takes(ExploreCrashArguments)
+def crash(given: ExploreCrashArguments) -> None:
     """A crash before each effect of each brick, and after its last.
 
     Exit code of all explorers: 0 all survived, 1 a promise was broken, 2 usage, 130 interrupted.
@@ -218,8 +218,8 @@ def _check(name: str, value: int, most: int) -> None:
 
 
 @explore.command()
-@takes(OrderArguments)
-def order(given: OrderArguments) -> None:
+@takes(ExploreOrderArguments)
+def order(given: ExploreOrderArguments) -> None:
     """Every order in which messages can arrive, without those that make no difference."""
     jobs, bound = jobs_of(given.jobs), given.bound
     _check("--requests", given.requests, REQUESTS_MAX)

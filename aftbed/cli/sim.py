@@ -406,7 +406,7 @@ class BrokenRun(NamedTuple):
 
 
 def broken_run(setup: Setup, broken: tuple[Breach, ...], *, swarm: bool, shrinks: bool = True) -> BrokenRun:
-    """Shrink it, unless told otherwise, and find the commands that repeat it."""
+    """Shrink it if `shrinks`, and find the commands that repeat it."""
     original = repeating_drawn(setup, swarm=swarm)
     if not shrinks:
         return BrokenRun(setup, broken, original, None, "")

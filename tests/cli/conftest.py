@@ -1,10 +1,10 @@
-"""How a command is called inside this process, in the same homes as in `tests/process`."""
+"""Fixtures that call a command in this process, with the same temporary home as in `tests/process`."""
 
 import sys
 from pathlib import Path
 
 import pytest
-from playedrun import Call, PlayedRun, Run
+from fakerun import Call, FakeRun, Output
 
 from aftbed.cli import main
 from aftbed.runtime.unix import control_client, rundir
@@ -17,9 +17,9 @@ __all__ = ["home"]
 
 
 @pytest.fixture
-def played(monkeypatch: pytest.MonkeyPatch) -> PlayedRun:
-    """The only run that is alive."""
-    run = PlayedRun()
+def fake(monkeypatch: pytest.MonkeyPatch) -> FakeRun:
+    """The only live run."""
+    run = FakeRun()
     monkeypatch.setattr(control_client, "ask", run.ask)
     monkeypatch.setattr(rundir, "find", lambda name: Path("/nowhere/abc123"))
     return run
@@ -40,7 +40,7 @@ def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) ->
 
 
 @pytest.fixture
-def told(call: Call) -> Run:
+def output(call: Call) -> Output:
     """The output of a command that must succeed."""
 
     def aftbed(*arguments: str | Path) -> str:
@@ -52,7 +52,7 @@ def told(call: Call) -> Run:
 
 
 @pytest.fixture
-def refused(home: Home, call: Call) -> Run:
+def refused(home: Home, call: Call) -> Output:
     """The error of a command that must be refused: one message, nothing printed, nothing left."""
 
     def aftbed(*arguments: str | Path) -> str:

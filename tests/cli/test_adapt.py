@@ -1,6 +1,6 @@
 """`aftbed adapt`: what the run is asked for, what is shown, and what is refused before the run is asked.
 
-The run that answers the commands is a `PlayedRun`; real ones are in `tests/process/test_adapt_cli.py`.
+The run that answers the commands is a `FakeRun`; real ones are in `tests/process/test_adapt_cli.py`.
 """
 
 import json
@@ -9,7 +9,7 @@ from pathlib import Path
 import msgspec
 import pytest
 import yaml
-from playedrun import CAUTIOUS, CLOSED, OUTCOME, RANDOM, VARIANTS, Call, PlayedRun, Run
+from fakerun import CAUTIOUS, CLOSED, OUTCOME, RANDOM, VARIANTS, Call, FakeRun, Output
 
 from aftbed.adapt.plan import APPLICATION, plan, updated
 from aftbed.adapt.scriptfile import ScriptFile, mapping, script_from
@@ -39,70 +39,68 @@ from aftbed.runtime.unix import control_client
         ("pbr", ("update", "app", "--to", CAUTIOUS), Goal(part="app", source=CAUTIOUS)),
     ],
 )
-def test_a_verb_asks_for_its_goal(
-    played: PlayedRun, told: Run, running: str, arguments: tuple[str, ...], goal: Goal
+def test_each_command_asks_for_its_goal(
+    fake: FakeRun, output: Output, running: str, arguments: tuple[str, ...], goal: Goal
 ) -> None:
-    played.graph = build(running, "process")
-    assert told("adapt", *arguments).startswith("run abc123: pbr to lfr: done\n")
-    assert played.goals == [goal]
-    assert played.seconds == control_client.ADAPT_SECONDS_MAX, (
-        "an adaptation takes longer than other questions"
-    )
+    fake.graph = build(running, "process")
+    assert output("adapt", *arguments).startswith("run abc123: pbr to lfr: done\n")
+    assert fake.goals == [goal]
+    assert fake.seconds == control_client.ADAPT_SECONDS_MAX, "an adaptation takes longer than other questions"
 
 
-def test_a_file_is_named_with_its_whole_path(
-    played: PlayedRun, told: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_file_is_sent_with_its_absolute_path(
+    fake: FakeRun, output: Output, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The run lives in another directory than the command."""
+    """The run may have another working directory than the command."""
     (tmp_path / "mine.py").write_text("class Mine: pass\n")
     monkeypatch.chdir(tmp_path)
-    told("adapt", "update", "proceed", "--to", "mine.py:Mine")
-    assert played.goals == [Goal(part="proceed", source=f"{tmp_path}/mine.py:Mine")]
+    output("adapt", "update", "proceed", "--to", "mine.py:Mine")
+    assert fake.goals == [Goal(part="proceed", source=f"{tmp_path}/mine.py:Mine")]
 
 
 # -- what is shown
 
 
-def test_the_outcome_is_shown(played: PlayedRun, told: Run) -> None:
-    assert told("adapt", "to", "lfr") == (
+def test_the_outcome_is_shown(fake: FakeRun, output: Output) -> None:
+    assert output("adapt", "to", "lfr") == (
         "run abc123: pbr to lfr: done\n"
         "  prepare 12.25 ms, blackout 0.75 ms, total 118.50 ms; 4 of 16 bricks\n"
     )
 
 
-def test_the_outcome_as_json_is_the_document_of_the_run(played: PlayedRun, told: Run) -> None:
-    assert json.loads(told("adapt", "to", "lfr", "--json")) == OUTCOME
+def test_the_outcome_as_json_is_the_document_of_the_run(fake: FakeRun, output: Output) -> None:
+    assert json.loads(output("adapt", "to", "lfr", "--json")) == OUTCOME
 
 
-def test_what_was_rolled_back_ends_with_code_1(played: PlayedRun, call: Call) -> None:
-    played.outcome |= {"outcome": "rolled back", "reason": "b/after died"}
+def test_a_rollback_is_exit_code_1(fake: FakeRun, call: Call) -> None:
+    fake.outcome |= {"outcome": "rolled back", "reason": "b/after died"}
     for options in ((), ("--json",)):
         code, out, _ = call("adapt", "to", "lfr", *options)
         assert code == 1
         assert "rolled back" in out and "b/after died" in out
 
 
-def test_what_the_run_refuses_ends_with_code_2(played: PlayedRun, refused: Run) -> None:
-    played.outcome |= {"outcome": "refused", "reason": "adaptation 2 (pbr to lfr) is under way"}
+def test_a_refusal_of_the_run_is_exit_code_2(fake: FakeRun, refused: Output) -> None:
+    fake.outcome |= {"outcome": "refused", "reason": "adaptation 2 (pbr to lfr) is under way"}
     assert "adaptation 2 (pbr to lfr) is under way" in refused("adapt", "to", "lfr")
-    assert len(played.goals) == 1
+    assert len(fake.goals) == 1
 
 
-def test_what_is_refused_without_a_reason_is_refused_all_the_same(played: PlayedRun, call: Call) -> None:
-    played.outcome |= {"outcome": "refused"}
+def test_a_refusal_without_a_reason_is_exit_code_2(fake: FakeRun, call: Call) -> None:
+    fake.outcome |= {"outcome": "refused"}
     assert call("adapt", "to", "lfr")[0] == 2
 
 
-def test_the_history_is_a_line_for_each(played: PlayedRun, told: Run) -> None:
-    assert told("adapt", "history").splitlines()[1:] == ["0 adaptations"]
+def test_the_history_has_a_line_for_each_adaptation(fake: FakeRun, output: Output) -> None:
+    assert output("adapt", "history").splitlines()[1:] == ["0 adaptations"]
     failed = {"number": 4, "outcome": "rolled back", "reason": "b/after died"}
-    played.history = [OUTCOME, OUTCOME | failed]
-    head, first, second, count = told("adapt", "history").splitlines()
+    fake.history = [OUTCOME, OUTCOME | failed]
+    head, first, second, count = output("adapt", "history").splitlines()
     assert head.split() == ["#", "ASKED", "PREPARE", "BLACKOUT", "TOTAL", "BRICKS", "RECIPE", "WHAT"]
     assert first == "  3    1.23 s   12.25 ms    0.75 ms  118.50 ms    4/16 drained pbr to lfr: done"
     assert second.endswith("pbr to lfr: rolled back: b/after died")
     assert count == "2 adaptations"
-    assert json.loads(told("adapt", "history", "--json")) == {"adaptations": played.history}
+    assert json.loads(output("adapt", "history", "--json")) == {"adaptations": fake.history}
 
 
 # -- what is refused before the run is asked
@@ -144,17 +142,17 @@ def test_the_history_is_a_line_for_each(played: PlayedRun, told: Run) -> None:
         ),
     ],
 )
-def test_a_wrong_word(
-    played: PlayedRun, refused: Run, running: str, arguments: tuple[str, ...], words: tuple[str, ...]
+def test_wrong_words_are_refused(
+    fake: FakeRun, refused: Output, running: str, arguments: tuple[str, ...], words: tuple[str, ...]
 ) -> None:
-    played.graph = build(running, "process")
+    fake.graph = build(running, "process")
     error = refused("adapt", *arguments)
     assert all(word in error for word in words), error
-    assert played.goals == []
+    assert fake.goals == []
 
 
-def test_the_recipe_of_the_paper_is_for_one_brick_per_process(played: PlayedRun, refused: Run) -> None:
-    played.graph = build("pbr", "replica")
+def test_the_recipe_of_the_paper_needs_placement_process(fake: FakeRun, refused: Output) -> None:
+    fake.graph = build("pbr", "replica")
     assert "placement process, not replica" in refused("adapt", "to", "lfr", "--recipe", "paper")
 
 
@@ -175,9 +173,9 @@ def test_the_recipe_of_the_paper_is_for_one_brick_per_process(played: PlayedRun,
         ("pbr", RANDOM, ("to", "lfr"), "lfr needs a deterministic function", "pbr, pbr+assert"),
     ],
 )
-def test_what_does_not_suit_the_function_is_refused_unless_forced(
-    played: PlayedRun,
-    refused: Run,
+def test_an_unsuitable_mechanism_is_refused_unless_forced(
+    fake: FakeRun,
+    refused: Output,
     call: Call,
     running: str,
     function: str,
@@ -185,25 +183,25 @@ def test_what_does_not_suit_the_function_is_refused_unless_forced(
     reason: str,
     instead: str,
 ) -> None:
-    played.graph = updated(build(running, "process"), APPLICATION, function)
+    fake.graph = updated(build(running, "process"), APPLICATION, function)
     error = refused("adapt", *arguments)
     assert reason in error and f"(consistent: {instead})" in error and "--force" in error
-    assert played.goals == []
+    assert fake.goals == []
     code, _, notes = call("adapt", *arguments, "--force")
-    assert code == 0 and len(played.goals) == 1
+    assert code == 0 and len(fake.goals) == 1
     assert notes.startswith("aftbed: forced: ") and reason in notes
 
 
-def test_to_take_away_is_not_refused(played: PlayedRun, call: Call) -> None:
-    """What is left needs no more than what runs; so it is with a brick."""
-    played.graph = updated(build("pbr+tr", "process"), APPLICATION, CLOSED)
+def test_removing_mechanisms_is_not_refused(fake: FakeRun, call: Call) -> None:
+    """The smaller mechanism needs no more of the function than the larger one; neither does a new brick."""
+    fake.graph = updated(build("pbr+tr", "process"), APPLICATION, CLOSED)
     assert call("adapt", "decompose")[::2] == (0, "")
     assert call("adapt", "update", "after", "--to", "m:C")[::2] == (0, "")
-    assert len(played.goals) == 2
+    assert len(fake.goals) == 2
 
 
-def test_where_nothing_suits_it_says_so(played: PlayedRun, refused: Run, tmp_path: Path) -> None:
-    """Under a mechanism that replicates, with a function that has neither characteristic."""
+def test_a_function_that_no_mechanism_suits(fake: FakeRun, refused: Output, tmp_path: Path) -> None:
+    """It is not deterministic and has no state access."""
     (tmp_path / "neither.py").write_text(
         "from aftbed.core.application import Characteristics\n"
         f"from {VARIANTS} import WithoutStateAccess\n"
@@ -213,7 +211,9 @@ def test_where_nothing_suits_it_says_so(played: PlayedRun, refused: Run, tmp_pat
     assert "(no consistent FTM)" in refused("adapt", "update", "app", "--to", tmp_path / "neither.py:Neither")
 
 
-def test_a_function_that_does_not_say_what_it_is(played: PlayedRun, refused: Run, tmp_path: Path) -> None:
+def test_a_function_without_characteristics_is_refused(
+    fake: FakeRun, refused: Output, tmp_path: Path
+) -> None:
     (tmp_path / "mute.py").write_text(
         f"from {VARIANTS} import Cautious\nclass Mute(Cautious):\n    characteristics = 'good'\n"
     )
@@ -221,8 +221,8 @@ def test_a_function_that_does_not_say_what_it_is(played: PlayedRun, refused: Run
     assert "mute.py:Mute: characteristics: found 'good', allowed is Characteristics(...)" in error
 
 
-def test_what_suits_with_a_reservation_is_done_with_a_note(played: PlayedRun, call: Call) -> None:
-    played.graph = build("lfr", "process")
+def test_a_remark_on_a_suitable_mechanism_is_printed(fake: FakeRun, call: Call) -> None:
+    fake.graph = build("lfr", "process")
     code, _, notes = call("adapt", "update", "app", "--to", CLOSED)
     assert code == 0
     assert notes == "aftbed: note: lfr without state access: after a failover the survivor stays alone\n"
@@ -232,7 +232,7 @@ def test_what_suits_with_a_reservation_is_done_with_a_note(played: PlayedRun, ca
     "arguments",
     [("to", "lfr"), ("decompose",), ("update", "after", "--to", "m:C"), ("history",), ("plan", "lfr")],
 )
-def test_no_run_is_alive(refused: Run, arguments: tuple[str, ...]) -> None:
+def test_no_run_is_alive(refused: Output, arguments: tuple[str, ...]) -> None:
     assert "no run is alive; start one with `aftbed run`" in refused("adapt", *arguments)
     assert "--run abcdef: no such run is alive" in refused("adapt", *arguments, "--run", "abcdef")
 
@@ -240,8 +240,8 @@ def test_no_run_is_alive(refused: Run, arguments: tuple[str, ...]) -> None:
 # -- a plan
 
 
-def test_a_plan_as_a_person_reads_it(told: Run) -> None:
-    lines = told("adapt", "plan", "pbr+tr", "--from", "pbr").splitlines()
+def test_a_plan_as_text(output: Output) -> None:
+    lines = output("adapt", "plan", "pbr+tr", "--from", "pbr").splitlines()
     assert lines[0] == "pbr to pbr+tr: 10 of 22 bricks (placement process, recipe drained)"
     text = "\n".join(lines)
     assert "  removed   a/proceed b/proceed\n" in text
@@ -257,24 +257,24 @@ def test_a_plan_as_a_person_reads_it(told: Run) -> None:
     assert max(len(line) for line in lines if line.startswith("  ")) <= WIDTH
 
 
-def test_a_plan_names_what_is_staged_and_how(told: Run) -> None:
-    text = told("adapt", "plan", "lfr", "--from", "pbr", "--placement", "replica")
+def test_a_plan_names_the_staged_bricks(output: Output) -> None:
+    text = output("adapt", "plan", "lfr", "--from", "pbr", "--placement", "replica")
     assert "  stage    a: a/protocol (protocol), a/before (lfr.before)" in text and ", held\n" in text
-    paper = told("adapt", "plan", "lfr", "--from", "pbr", "--recipe", "paper")
+    paper = output("adapt", "plan", "lfr", "--from", "pbr", "--recipe", "paper")
     assert "  freeze   a/protocol\n" in paper and "recipe paper" in paper
 
 
 @pytest.mark.parametrize("arguments", [(), ("--recipe", "paper"), ("--placement", "single")])
-def test_a_plan_as_yaml_is_its_script(told: Run, arguments: tuple[str, ...]) -> None:
-    text = told("adapt", "plan", "lfr+tr", "--from", "pbr", "--yaml", *arguments)
+def test_a_plan_as_yaml_is_its_script(output: Output, arguments: tuple[str, ...]) -> None:
+    text = output("adapt", "plan", "lfr+tr", "--from", "pbr", "--yaml", *arguments)
     script = script_from(msgspec.convert(yaml.safe_load(text), ScriptFile), "x")
     placement = "single" if "single" in arguments else "process"
     recipe = "paper" if "paper" in arguments else "drained"
     assert script == plan(build("pbr", placement), build("lfr+tr", placement), recipe).script
 
 
-def test_a_plan_as_json(told: Run) -> None:
-    found = json.loads(told("adapt", "plan", "pbr+tr", "--from", "pbr", "--json"))
+def test_a_plan_as_json(output: Output) -> None:
+    found = json.loads(output("adapt", "plan", "pbr+tr", "--from", "pbr", "--json"))
     assert (found["from"], found["to"], found["placement"], found["recipe"]) == (
         "pbr",
         "pbr+tr",
@@ -288,12 +288,12 @@ def test_a_plan_as_json(told: Run) -> None:
     assert found["way_back"]["script"] == mapping(plan(there.new, there.old).script)
 
 
-def test_a_plan_from_what_runs(played: PlayedRun, told: Run) -> None:
-    played.graph = build("lfr", "process").led_by("b")
-    text = told("adapt", "plan", "lfr+tr")
+def test_a_plan_from_what_runs(fake: FakeRun, output: Output) -> None:
+    fake.graph = build("lfr", "process").led_by("b")
+    text = output("adapt", "plan", "lfr+tr")
     assert text.startswith("lfr to lfr+tr: 10 of 22 bricks")
     assert "  suspend  b/protocol\n" in text
-    assert played.goals == [], "nothing is changed"
+    assert fake.goals == [], "nothing is changed"
 
 
 @pytest.mark.parametrize(
@@ -309,7 +309,9 @@ def test_a_plan_from_what_runs(played: PlayedRun, told: Run) -> None:
         (("lfr", "--from", "pbr", "--recipe", "papr"), ("did you mean 'paper'",)),
     ],
 )
-def test_a_plan_that_cannot_be_made(refused: Run, arguments: tuple[str, ...], words: tuple[str, ...]) -> None:
+def test_a_plan_that_cannot_be_made(
+    refused: Output, arguments: tuple[str, ...], words: tuple[str, ...]
+) -> None:
     error = refused("adapt", "plan", *arguments)
     assert all(word in error for word in words), error
 
@@ -318,28 +320,28 @@ def test_a_plan_that_cannot_be_made(refused: Run, arguments: tuple[str, ...], wo
 
 
 @pytest.fixture
-def lfr(told: Run, tmp_path: Path) -> Path:
+def lfr(output: Output, tmp_path: Path) -> Path:
     """The file of a script from pbr to lfr."""
     path = tmp_path / "lfr.yaml"
-    path.write_text(told("adapt", "plan", "lfr", "--from", "pbr", "--yaml"))
+    path.write_text(output("adapt", "plan", "lfr", "--from", "pbr", "--yaml"))
     return path
 
 
-def test_a_script_is_asked_for_as_it_is_written(played: PlayedRun, told: Run, lfr: Path) -> None:
-    told("adapt", "script", lfr)
-    (goal,) = played.goals
+def test_a_script_is_sent_as_it_is_written(fake: FakeRun, output: Output, lfr: Path) -> None:
+    output("adapt", "script", lfr)
+    (goal,) = fake.goals
     assert goal.script == plan(build("pbr", "process"), build("lfr", "process")).script
     assert goal.recipe == "drained"
 
 
-def test_a_script_names_files_beside_itself(played: PlayedRun, told: Run, lfr: Path) -> None:
+def test_a_script_names_files_relative_to_itself(fake: FakeRun, output: Output, lfr: Path) -> None:
     (lfr.parent / "mine.py").write_text("")
     text = lfr.read_text()
     wanted = "{a/before: {kind: lfr.before, source: mine.py:Mine}}"
     assert "{a/before: lfr.before}" in text
     lfr.write_text(text.replace("{a/before: lfr.before}", wanted))
-    told("adapt", "script", lfr)
-    script = played.goals[0].script
+    output("adapt", "script", lfr)
+    script = fake.goals[0].script
     assert isinstance(script, Script)
     sources = {b.name: b.source for v in flat(script.prepare) if isinstance(v, Stage) for b in v.bricks}
     assert sources["a/before"] == f"{lfr.parent}/mine.py:Mine" and sources["a/after"] == ""
@@ -363,7 +365,7 @@ def test_a_script_names_files_beside_itself(played: PlayedRun, told: Run, lfr: P
     ],
 )
 def test_a_script_with_a_mistake(
-    played: PlayedRun, refused: Run, lfr: Path, old: str, new: str, words: tuple[str, ...]
+    fake: FakeRun, refused: Output, lfr: Path, old: str, new: str, words: tuple[str, ...]
 ) -> None:
     text = lfr.read_text()
     if old == new:
@@ -374,28 +376,26 @@ def test_a_script_with_a_mistake(
     error = refused("adapt", "script", lfr)
     assert str(lfr) in error or old == new
     assert all(word in error for word in words), error
-    assert played.goals == []
+    assert fake.goals == []
 
 
-def test_a_script_with_many_mistakes_is_told_them_all(played: PlayedRun, refused: Run, lfr: Path) -> None:
+def test_all_mistakes_of_a_script_are_printed(fake: FakeRun, refused: Output, lfr: Path) -> None:
     lfr.write_text(lfr.read_text().replace("drain:", "drane:").replace("align:", "allign:"))
     lines = refused("adapt", "script", lfr).splitlines()
     assert lines[0] == f"aftbed: error: {lfr}: 2 problems:"
     assert [line.strip().partition(":")[0] for line in lines[1:]] == ["commit[1]", "commit[2]"]
 
 
-def test_a_script_for_another_graph_than_the_one_that_runs(
-    played: PlayedRun, refused: Run, lfr: Path
-) -> None:
-    played.graph = build("pbr", "replica")
+def test_a_script_that_does_not_fit_the_running_graph(fake: FakeRun, refused: Output, lfr: Path) -> None:
+    fake.graph = build("pbr", "replica")
     assert "unknown node 'a/before'" in refused("adapt", "script", lfr)
-    played.graph = build("pbr", "process").led_by("b")
+    fake.graph = build("pbr", "process").led_by("b")
     error = refused("adapt", "script", lfr)
     assert "commit[2]: changed while b/protocol lets requests in: align a/server -> b/server" in error
 
 
 @pytest.mark.parametrize("content", ["", "[]", "5", "\0", "commit: [", "purpose: x"])
-def test_a_file_that_is_no_script(played: PlayedRun, refused: Run, tmp_path: Path, content: str) -> None:
+def test_a_file_that_is_no_script(fake: FakeRun, refused: Output, tmp_path: Path, content: str) -> None:
     path = tmp_path / "x.yaml"
     path.write_text(content)
     assert str(path) in refused("adapt", "script", path)

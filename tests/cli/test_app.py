@@ -8,8 +8,8 @@ from typing import Annotated
 import msgspec
 import pytest
 import typer
+from fakerun import Call
 from liveruns import Home
-from playedrun import Call
 from typer.testing import CliRunner
 
 from aftbed.cli.app import COMMANDS
@@ -51,7 +51,7 @@ def test_the_help_of_all_commands_imports_no_command() -> None:
     assert all(f"  {name} " in done.stdout for name in COMMANDS)
 
 
-def test_a_mistyped_command_is_refused_with_the_one_that_is_near(call: Call) -> None:
+def test_a_mistyped_command_is_refused_with_a_suggestion(call: Call) -> None:
     code, _, err = call("campain")
     assert code == 2
     assert "No such command 'campain'" in err and "campaign" in err
@@ -65,7 +65,7 @@ def test_help_of_a_command_and_of_a_subcommand(call: Call) -> None:
 
 
 def test_trouble_is_exit_code_3(home: Home, call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Here: a directory for runs that other users could read."""
+    """The example is a directory of runs that other users could read."""
     root = rundir.root()
     root.chmod(0o755)
     code, _, err = call("status")

@@ -73,8 +73,8 @@ def test_usage_is_exit_code_2(home: Home, option: tuple[str, ...]) -> None:
     assert home.left() == []
 
 
-def test_a_log_with_spoilt_lines_is_replayed_without_them(home: Home, tmp_path: Path) -> None:
-    """Counted and refused; the frames around them are believed."""
+def test_a_log_is_replayed_without_its_damaged_lines(home: Home, tmp_path: Path) -> None:
+    """They are counted and refused; the frames around them are replayed."""
     good = [f"(000000000{n}.000000) can0 210#{n:02X}00000000000000\n" for n in range(1, 6)]
     lines = [*good[:3], "garbage\n", "(0000000001.000000) can0 210#00\n", *good[3:], good[4][:-9]]
     log, dbc, mapped = tmp_path / "x.log", tmp_path / "x.dbc", tmp_path / "x.yaml"

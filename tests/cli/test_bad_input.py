@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Final
 
 import pytest
-from playedrun import Run
+from fakerun import Output
 
 SCENARIO: Final = """
 description: a car that stands
@@ -84,7 +84,7 @@ def all_words(error: str, *words: str) -> bool:
         (("--replay", "x.log", "--dbc", "x.dbc"), ("needs --dbc FILE and --map FILE",)),
     ],
 )
-def test_options_of_run(refused: Run, arguments: tuple[str, ...], words: tuple[str, ...]) -> None:
+def test_options_of_run(refused: Output, arguments: tuple[str, ...], words: tuple[str, ...]) -> None:
     assert all_words(refused("run", *arguments), *words)
 
 
@@ -117,11 +117,11 @@ def test_options_of_run(refused: Run, arguments: tuple[str, ...], words: tuple[s
         ("crash primary after 5ms after 6ms", ("'after' twice",)),
     ],
 )
-def test_faults(refused: Run, fault: str, words: tuple[str, ...]) -> None:
+def test_faults(refused: Output, fault: str, words: tuple[str, ...]) -> None:
     assert all_words(refused("run", "--inject", fault), *words)
 
 
-def test_a_fault_that_this_mechanism_does_not_know(refused: Run) -> None:
+def test_a_fault_that_this_mechanism_does_not_know(refused: Output) -> None:
     assert "unknown target 'backup'" in refused("run", "--ftm", "none", "--inject", "crash backup")
     at = "crash primary at checkpoint.sent"
     assert "under --ftm none" in refused("run", "--ftm", "none", "--inject", at)
@@ -147,7 +147,7 @@ def test_a_fault_that_this_mechanism_does_not_know(refused: Run) -> None:
         ("duration_s: 9", "duration_s: 9\nduration_s: 8", ("duration_s",)),
     ],
 )
-def test_scenario_files(refused: Run, tmp_path: Path, old: str, new: str, words: tuple[str, ...]) -> None:
+def test_scenario_files(refused: Output, tmp_path: Path, old: str, new: str, words: tuple[str, ...]) -> None:
     path = tmp_path / "mine.yaml"
     assert old in SCENARIO
     path.write_text(SCENARIO.replace(old, new, 1))
@@ -155,14 +155,14 @@ def test_scenario_files(refused: Run, tmp_path: Path, old: str, new: str, words:
 
 
 @pytest.mark.parametrize("content", [b"", b"\xff\xfe\x00", b"- a list\n", b"42\n", b"\0" * 100])
-def test_files_that_are_no_scenario(refused: Run, tmp_path: Path, content: bytes) -> None:
+def test_files_that_are_no_scenario(refused: Output, tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "mine.yaml"
     path.write_bytes(content)
     assert str(path) in refused("run", "--scenario", path)
 
 
 class Replay:
-    """The three files of a replay, each of which may be spoilt."""
+    """The three files of a replay; a test damages one of them."""
 
     def __init__(self, folder: Path) -> None:
         self.log, self.dbc, self.map = folder / "x.log", folder / "x.dbc", folder / "x.yaml"
@@ -182,19 +182,19 @@ def replay(tmp_path: Path) -> Replay:
 
 
 @pytest.mark.parametrize("content", ["BO_ 528 TRACK", 'VERSION "1', "not a DBC at all\n", "\0\1\2"])
-def test_a_dbc_that_does_not_parse(refused: Run, replay: Replay, content: str) -> None:
+def test_a_dbc_that_does_not_parse(refused: Output, replay: Replay, content: str) -> None:
     replay.dbc.write_text(content)
     assert str(replay.dbc) in refused(*replay.arguments())
 
 
-def test_a_dbc_that_lacks_what_is_mapped(refused: Run, replay: Replay) -> None:
+def test_a_dbc_that_lacks_what_is_mapped(refused: Output, replay: Replay) -> None:
     replay.dbc.write_text(DBC.replace("RANGE", "DISTANCE"))
     assert all_words(refused(*replay.arguments()), str(replay.map), "RANGE")
     replay.dbc.write_text(DBC.replace("TRACK_0", "TRACK_9"))
     assert all_words(refused(*replay.arguments()), "TRACK_0")
 
 
-def test_a_dbc_that_is_not_there(refused: Run, replay: Replay) -> None:
+def test_a_dbc_that_is_not_there(refused: Output, replay: Replay) -> None:
     replay.dbc.unlink()
     assert all_words(refused(*replay.arguments()), str(replay.dbc), "No such file")
 
@@ -211,13 +211,13 @@ def test_a_dbc_that_is_not_there(refused: Run, replay: Replay) -> None:
         ("length: 8", "length: 9", ("length",)),
     ],
 )
-def test_map_files(refused: Run, replay: Replay, old: str, new: str, words: tuple[str, ...]) -> None:
+def test_map_files(refused: Output, replay: Replay, old: str, new: str, words: tuple[str, ...]) -> None:
     assert old in MAP
     replay.map.write_text(MAP.replace(old, new, 1))
     assert all_words(refused(*replay.arguments()), str(replay.map), *words)
 
 
-def test_a_map_that_does_not_exist(refused: Run, replay: Replay) -> None:
+def test_a_map_that_does_not_exist(refused: Output, replay: Replay) -> None:
     arguments = ("run", "--replay", replay.log, "--dbc", replay.dbc, "--map")
     assert all_words(refused(*arguments, "toyotta"), "toyotta", "toyota")
     replay.map.unlink()
@@ -225,17 +225,17 @@ def test_a_map_that_does_not_exist(refused: Run, replay: Replay) -> None:
 
 
 @pytest.mark.parametrize("content", ["", "garbage\n", LOG.rstrip("\n"), "\0" * 500, "(1.0) can0 210#01\n"])
-def test_a_log_without_a_frame(refused: Run, replay: Replay, content: str) -> None:
+def test_a_log_without_a_frame(refused: Output, replay: Replay, content: str) -> None:
     replay.log.write_text(content)
     assert all_words(refused(*replay.arguments()), str(replay.log), "no line is a CAN frame")
 
 
-def test_a_log_that_is_not_there(refused: Run, replay: Replay) -> None:
+def test_a_log_that_is_not_there(refused: Output, replay: Replay) -> None:
     replay.log.unlink()
     assert all_words(refused(*replay.arguments()), str(replay.log), "No such file")
 
 
-def test_a_record_directory_that_exists(refused: Run, tmp_path: Path) -> None:
+def test_a_record_directory_that_exists(refused: Output, tmp_path: Path) -> None:
     assert all_words(refused("run", "--record", tmp_path), f"--record {tmp_path}: exists already")
     file = tmp_path / "file"
     file.touch()
@@ -243,7 +243,7 @@ def test_a_record_directory_that_exists(refused: Run, tmp_path: Path) -> None:
     assert all_words(refused("run", "--record", file / "below"), str(file))
 
 
-def test_a_port_in_use(refused: Run) -> None:
+def test_a_port_in_use(refused: Output) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
@@ -251,6 +251,6 @@ def test_a_port_in_use(refused: Run) -> None:
         assert all_words(refused("run", "--bus-port", str(port)), f"--bus-port {port}", "in use", "0 for any")
 
 
-def test_a_run_that_could_not_write_its_files_does_not_start(refused: Run) -> None:
+def test_a_run_that_could_not_write_its_files_does_not_start(refused: Output) -> None:
     assert "--mcap no/run.mcap: " in refused("run", "--load", "5", "--mcap", "no/run.mcap")
     assert "--trace .: is a directory" in refused("run", "--load", "5", "--trace", ".")

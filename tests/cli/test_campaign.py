@@ -1,11 +1,11 @@
-"""`aftbed campaign`, in the simulator: the way of a user from a file to a gate."""
+"""`aftbed campaign`, in the simulator: from a campaign file to reports and a gate."""
 
 import json
 import re
 from pathlib import Path
 
 import pytest
-from playedrun import Call, Run
+from fakerun import Call, Output
 
 SPEC = """
 campaign: try
@@ -44,7 +44,7 @@ def test_from_a_file_to_a_gate(spec: Path, call: Call) -> None:
     assert {p.name for p in folder.iterdir()} == {"records.jsonl", "summary.json", "junit.xml", "report.html"}
 
 
-def test_a_gate_that_is_not_kept_fails_the_build(spec: Path, call: Call) -> None:
+def test_a_failed_gate_is_exit_code_1(spec: Path, call: Call) -> None:
     spec.write_text(SPEC.replace("pbr: [tolerated]", "pbr: [masked]"))
     code, out, _ = call("campaign", "run", spec, "--jobs", "1", "--out", "out")
     assert code == 1
@@ -53,7 +53,6 @@ def test_a_gate_that_is_not_kept_fails_the_build(spec: Path, call: Call) -> None
 
 
 def test_a_campaign_whose_faults_cannot_fire_fails(spec: Path, call: Call) -> None:
-    """Whatever else is well: everything in it is as it should be."""
     text = (
         SPEC.replace("[1, 25]", "[100, 200]")
         .replace("[pbr, none]", "[pbr]")
@@ -67,45 +66,45 @@ def test_a_campaign_whose_faults_cannot_fire_fails(spec: Path, call: Call) -> No
     assert failed["not_activated"] == "none of 12 faults struck: this stratum could not have failed"
 
 
-def test_what_is_there_is_reported_again(spec: Path, told: Run) -> None:
-    first = json.loads(told("campaign", "run", spec, "--out", "out", "--json"))
-    again = json.loads(told("campaign", "report", "out", "--json"))
+def test_a_report_from_records_equals_the_first(spec: Path, output: Output) -> None:
+    first = json.loads(output("campaign", "run", spec, "--out", "out", "--json"))
+    again = json.loads(output("campaign", "report", "out", "--json"))
     assert first | {"seconds": 0} == again | {"seconds": 0}
 
 
-def test_shards_are_merged(spec: Path, told: Run, call: Call) -> None:
-    whole = json.loads(told("campaign", "run", spec, "--out", "whole", "--json"))
+def test_shards_are_merged(spec: Path, output: Output, call: Call) -> None:
+    whole = json.loads(output("campaign", "run", spec, "--out", "whole", "--json"))
     for shard in (1, 2):
         call("campaign", "run", spec, "--shard", f"{shard}/2", "--out", f"part{shard}")
-    merged = json.loads(told("campaign", "merge", "part1", "part2", "--out", "merged", "--json"))
+    merged = json.loads(output("campaign", "merge", "part1", "part2", "--out", "merged", "--json"))
     assert merged["strata"] == whole["strata"] and merged["gates"] == whole["gates"]
 
 
-def test_a_plan_runs_nothing(spec: Path, told: Run) -> None:
-    shown = told("campaign", "plan", spec, "--experiments", "3", "--out", "plan.jsonl")
+def test_a_plan_runs_nothing(spec: Path, output: Output) -> None:
+    shown = output("campaign", "plan", spec, "--experiments", "3", "--out", "plan.jsonl")
     assert "6 experiments at most" in shown
     assert len((spec.parent / "plan.jsonl").read_text().splitlines()) == 6
     assert not (spec.parent / "campaign-try").exists()
 
 
-def test_an_experiment_is_replayed(spec: Path, told: Run) -> None:
-    told("campaign", "run", spec, "--out", "out", "--json")
-    found = json.loads(told("campaign", "replay", "out", "1", "--json"))
+def test_an_experiment_is_replayed(spec: Path, output: Output) -> None:
+    output("campaign", "run", spec, "--out", "out", "--json")
+    found = json.loads(output("campaign", "replay", "out", "1", "--json"))
     assert found["before"]["outcome"] == found["after"]["outcome"] == "unavailable"
-    shown = told("campaign", "replay", "out", "1")
+    shown = output("campaign", "replay", "out", "1")
     assert "aftbed sim --ftm none --placement process --seed" in shown
 
 
-def test_an_experiment_is_shrunk(spec: Path, told: Run) -> None:
-    told("campaign", "run", spec, "--out", "out", "--json")
-    found = json.loads(told("campaign", "shrink", "out", "1", "--json"))
+def test_an_experiment_is_shrunk(spec: Path, output: Output) -> None:
+    output("campaign", "run", spec, "--out", "out", "--json")
+    found = json.loads(output("campaign", "shrink", "out", "1", "--json"))
     assert found["ftm"] == "none" and found["requests"] == 1
     assert found["faults"] == ["crash primary at server.exit nth 1"]
 
 
-def test_two_campaigns_are_compared(spec: Path, told: Run, call: Call) -> None:
-    told("campaign", "run", spec, "--out", "base", "--json")
-    same = json.loads(told("campaign", "compare", "base", "base", "--json"))
+def test_two_campaigns_are_compared(spec: Path, output: Output, call: Call) -> None:
+    output("campaign", "run", spec, "--out", "base", "--json")
+    same = json.loads(output("campaign", "compare", "base", "base", "--json"))
     assert not same["worse"] and [c["pairs"] for c in same["changes"]] == [12, 12]
     records = spec.parent / "base" / "records.jsonl"
     worse = records.read_text().replace('"outcome":"tolerated"', '"outcome":"sdc"')
@@ -117,23 +116,23 @@ def test_two_campaigns_are_compared(spec: Path, told: Run, call: Call) -> None:
 
 
 @pytest.mark.parametrize("name", ["out.csv", "out.parquet"])
-def test_results_are_exported(spec: Path, told: Run, name: str) -> None:
-    told("campaign", "run", spec, "--out", "out", "--json")
-    told("campaign", "export", "out", "--out", name)
+def test_results_are_exported(spec: Path, output: Output, name: str) -> None:
+    output("campaign", "run", spec, "--out", "out", "--json")
+    output("campaign", "export", "out", "--out", name)
     assert (spec.parent / name).stat().st_size > 1000
 
 
-def test_the_schema_is_for_editors(told: Run) -> None:
-    assert json.loads(told("campaign", "schema"))["$ref"] == "#/$defs/Spec"
+def test_the_schema_is_for_editors(output: Output) -> None:
+    assert json.loads(output("campaign", "schema"))["$ref"] == "#/$defs/Spec"
 
 
-def test_the_shipped_campaigns_are_listed(told: Run) -> None:
-    names = [line.split()[0] for line in told("campaign", "list").splitlines()]
+def test_the_shipped_campaigns_are_listed(output: Output) -> None:
+    names = [line.split()[0] for line in output("campaign", "list").splitlines()]
     assert names == ["adaptation", "assumptions", "bitflip", "bus", "ci-smoke", "crash", "paper-recipe"]
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (("run", "none-such"), "unknown campaign 'none-such'"),
         (("run", "nowhere.yaml"), "nowhere.yaml: cannot be read: No such file"),
@@ -154,8 +153,8 @@ def test_the_shipped_campaigns_are_listed(told: Run) -> None:
     ],
 )
 def test_bad_input_is_refused_and_nothing_is_run(
-    refused: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], said: str
+    refused: Output, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], message: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert said in refused("campaign", *arguments)
+    assert message in refused("campaign", *arguments)
     assert list(tmp_path.iterdir()) == []

@@ -8,7 +8,7 @@ from functools import partial
 from typing import Final
 
 import pytest
-from playedrun import Call, Run
+from fakerun import Call, Output
 
 from aftbed.judge.verdict import Breach
 from aftbed.runtime.sim.world import Setup
@@ -26,7 +26,7 @@ def explore(call: Call) -> Call:
 
 @pytest.fixture
 def broken(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[Setup], bool]], None]:
-    """Have experiments break G1."""
+    """Makes experiments break G1."""
 
     def breaks(which: Callable[[Setup], bool]) -> None:
         def judged(setup: Setup) -> tuple[bool, tuple[Breach, ...]]:
@@ -44,7 +44,7 @@ def test_the_count_is_exact(explore: Call) -> None:
     assert re.fullmatch(rf"{number} of {number} survived \(0 unavailable\) in [0-9.]+ s\n", out)
 
 
-def test_the_document_counts_the_same_with_one_process_and_with_two(explore: Call) -> None:
+def test_one_process_and_two_count_the_same(explore: Call) -> None:
     found = [json.loads(explore(*SMALL, "--jobs", jobs, "--json")[1]) for jobs in ("1", "2")]
     for document in found:
         assert set(document) == {"explored", "survived", "unavailable", "seconds", "broken"}
@@ -61,7 +61,7 @@ def test_names_are_separated_by_commas_or_given_one_by_one(explore: Call) -> Non
     assert together == apart == len(list(selected("crash", ("pbr", "lfr"), ("replica",), 1).setups()))
 
 
-def test_one_that_broke_is_told_with_the_command_that_repeats_it(
+def test_a_broken_experiment_is_printed_with_the_command_that_repeats_it(
     explore: Call, call: Call, broken: Callable[[Callable[[Setup], bool]], None]
 ) -> None:
     numbered = list(selected("crash", ("lfr",), ("replica",), 1).setups())
@@ -78,7 +78,7 @@ def test_one_that_broke_is_told_with_the_command_that_repeats_it(
     assert "1 of 1 survived" in again
 
 
-def test_of_many_that_broke_some_are_told_and_all_are_in_the_document(
+def test_of_many_broken_experiments_the_first_are_printed_and_json_has_all(
     explore: Call, broken: Callable[[Callable[[Setup], bool]], None]
 ) -> None:
     broken(lambda setup: True)
@@ -108,7 +108,7 @@ def test_one_experiment_by_its_number(explore: Call, words: tuple[str, ...], exp
 
 
 @pytest.mark.parametrize("explorer", EXPLORERS)
-def test_a_selection_of_all_holds_that_of_each(explorer: str) -> None:
+def test_a_selection_without_names_has_all_mechanisms_and_placements(explorer: str) -> None:
     whole = selected(explorer, (), (), 1)
     assert whole.placements == PLACEMENTS and whole.ftms == EXPLORERS[explorer].ftms
 
@@ -116,7 +116,7 @@ def test_a_selection_of_all_holds_that_of_each(explorer: str) -> None:
 # -- order
 
 
-def test_every_order_is_counted_and_the_bound_is_said(explore: Call) -> None:
+def test_every_order_is_counted_up_to_the_bound(explore: Call) -> None:
     code, out, _ = explore(*ORDER, "--requests", "2", "--bound", "20")
     lines = out.splitlines()
     assert code == 0
@@ -126,7 +126,7 @@ def test_every_order_is_counted_and_the_bound_is_said(explore: Call) -> None:
     assert "all orders of 2 of " in lines[-1] and "the others up to 20 runs each" in lines[-1]
 
 
-def test_as_one_document(explore: Call) -> None:
+def test_the_orders_as_json(explore: Call) -> None:
     code, out, _ = explore(*ORDER, "--requests", "1", "--bound", "5", "--json")
     found = json.loads(out)
     assert code == 0 and found["explored"] == found["survived"] > 0
@@ -155,6 +155,8 @@ def test_as_one_document(explore: Call) -> None:
         (("order", "--ftm", "lfrr"), ("unknown FTM 'lfrr'",)),
     ],
 )
-def test_options_that_are_refused(refused: Run, arguments: tuple[str, ...], words: tuple[str, ...]) -> None:
+def test_options_that_are_refused(
+    refused: Output, arguments: tuple[str, ...], words: tuple[str, ...]
+) -> None:
     error = refused("explore", *arguments)
     assert all(word in error for word in words), error

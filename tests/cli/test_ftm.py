@@ -1,18 +1,16 @@
-"""`aftbed ftm`: what is printed, the exit codes, and that no word of the user's goes unexplained.
+"""`aftbed ftm`: what is printed, the exit codes, and the messages about wrong words.
 
 The command is called inside this process; see `test_bad_input`.
 """
 
 import json
-import subprocess
-import sys
 from functools import partial
 from pathlib import Path
 from typing import Final
 
 import psutil
 import pytest
-from playedrun import Call
+from fakerun import Call
 
 from aftbed.ftm.compose import EXPRESSIONS, build
 
@@ -37,13 +35,6 @@ class Half:
 def call(call: Call) -> Call:
     """Call `aftbed ftm` with these arguments: exit code, output, errors."""
     return partial(call, "ftm")
-
-
-def test_the_command_line_is_imported_without_what_its_commands_need() -> None:
-    code = "import sys, aftbed.cli.app; print(*sorted(m for m in sys.modules if m in sys.argv[1:]))"
-    heavy = ("aftbed.adapt.suitability", "aftbed.ftm.compose", "aftbed.runtime.unix.part", "psutil", "yaml")
-    done = subprocess.run([sys.executable, "-c", code, *heavy], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == ""
 
 
 # -- list and show
@@ -107,7 +98,9 @@ def test_an_expression_is_shown_with_all_its_bricks_and_channels(call: Call, exp
         ("lfr+assert+tr", ("29, one per brick",)),
     ],
 )
-def test_what_is_shown_of_an_expression(call: Call, expression: str, words: tuple[str, ...]) -> None:
+def test_the_requirements_of_an_expression_are_shown(
+    call: Call, expression: str, words: tuple[str, ...]
+) -> None:
     code, out, _ = call("show", expression)
     assert code == 0
     assert [word for word in words if word not in out] == []
@@ -164,7 +157,7 @@ def test_the_last_line_and_the_exit_code_are_the_answer(
     assert found == code
 
 
-def test_the_reasons_and_what_they_rest_on_are_printed(call: Call) -> None:
+def test_reasons_and_measured_resources_are_printed(call: Call) -> None:
     arguments = ("--ftm", "pbr+tr", "--app", f"{VARIANTS}:WithoutStateAccess", "--bandwidth", "10")
     _, out, _ = call("check", *arguments, "--faults", "crash,value", "--cpus", "1", "--cpu-load", "0.75")
     assert out.splitlines() == [
@@ -180,7 +173,7 @@ def test_the_reasons_and_what_they_rest_on_are_printed(call: Call) -> None:
     ]
 
 
-def test_a_follower_that_cannot_be_renewed_is_said(call: Call) -> None:
+def test_a_remark_on_a_follower_that_cannot_be_replaced(call: Call) -> None:
     code, out, _ = call("check", "--ftm", "lfr", "--app", f"{VARIANTS}:WithoutStateAccess", *AMPLE)
     assert code == 0
     assert "remark     lfr without state access: after a failover the survivor stays alone\n" in out
@@ -202,7 +195,7 @@ def test_the_answer_as_a_document(call: Call) -> None:
     }
 
 
-def test_what_is_not_given_is_measured(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_resources_that_are_not_given_are_measured(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
     _, out, _ = call("check", "--json")
     found = json.loads(out)["resources"]
     assert found["cpus"] == len(psutil.Process().cpu_affinity())
@@ -216,14 +209,14 @@ def test_what_is_not_given_is_measured(call: Call, monkeypatch: pytest.MonkeyPat
     assert json.loads(out)["resources"]["cpus"] == 4
 
 
-def test_a_function_out_of_a_file(call: Call, tmp_path: Path) -> None:
+def test_a_function_from_a_file(call: Call, tmp_path: Path) -> None:
     path = tmp_path / "mine.py"
     path.write_text(MINE)
     code, out, _ = call("check", "--app", f"{path}:Mine", *AMPLE)
     assert code == 1 and out.endswith("no consistent FTM\n")
 
 
-def test_a_table_of_the_users_decides(call: Call, tmp_path: Path) -> None:
+def test_a_table_of_the_user_replaces_rows(call: Call, tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text("rows: [{mechanism: pbr, tolerates: [crash, value], cpus: 1}]\n")
     arguments = ("--ftm", "pbr", "--app", f"{VARIANTS}:WithoutStateAccess", "--faults", "value")
@@ -282,7 +275,7 @@ def test_a_class_that_is_no_function(call: Call, tmp_path: Path, name: str, word
     assert [word for word in words if word not in err] == []
 
 
-def test_a_table_that_is_none(call: Call, tmp_path: Path) -> None:
+def test_a_file_that_is_no_table(call: Call, tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text("rows: [{mechanism: pbt}]\n")
     code, _, err = call("list", "--table", str(path))

@@ -1,4 +1,4 @@
-"""The commands of a second terminal, against a run that lives; and the ways in which a run ends."""
+"""The commands of a second terminal against a live run, and the ways in which a run ends."""
 
 import json
 import re
@@ -39,28 +39,28 @@ def ended_well(command: Command, *words: str) -> None:
         assert word in done.out
 
 
-def told(command: Command, *arguments: str) -> str:
+def output(*arguments: str) -> str:
     """The output of a command that must succeed."""
     done = aftbed(*arguments)
     assert done.code == 0, done.err
     return done.out
 
 
-def test_status_says_how_the_run_is(drive: Command) -> None:
+def test_status_shows_the_state_of_the_run(drive: Command) -> None:
     run = rundir.live()[0]
-    status = json.loads(told(drive, "status", "--json"))
+    status = json.loads(output("status", "--json"))
     assert status["run"] == run
     assert (status["ftm"], status["placement"]) == ("pbr", "process")
     assert (status["leader"], status["backup"], status["epoch"]) == ("a", "b", 1)
     assert status["vehicle"]["speed_ms"] > 0
-    text = told(drive, "status")
+    text = output("status")
     assert re.search(rf"^run +{run}$", text, re.MULTILINE)
     assert re.search(r"^leader +a$", text, re.MULTILINE)
     ended_well(drive)
 
 
 def test_ps_lists_the_seventeen_processes(drive: Command) -> None:
-    rows = json.loads(told(drive, "ps", "--json"))
+    rows = json.loads(output("ps", "--json"))
     nodes = [row for row in rows if row["node"]]
     assert [row["name"] for row in nodes] == ["supervisor", *NODES]
     roles = {row["name"]: row["role"] for row in nodes}
@@ -71,7 +71,7 @@ def test_ps_lists_the_seventeen_processes(drive: Command) -> None:
     for row in rows:
         assert Path(f"/proc/{row['pid']}").exists()
         assert 0 < row["pss_mb"] <= row["rss_mb"] < 200
-    lines = told(drive, "ps").splitlines()
+    lines = output("ps").splitlines()
     assert lines[0].split() == ["NAME", "ROLE", "PID", "CPU%", "PSS", "MB"]
     assert lines[-1].startswith("17 processes, ")
     assert [line.split()[0] for line in lines[1:18]] == ["supervisor", *NODES]
@@ -79,33 +79,33 @@ def test_ps_lists_the_seventeen_processes(drive: Command) -> None:
 
 
 def test_graph_shows_the_live_graph_in_every_format(drive: Command) -> None:
-    text = told(drive, "graph")
-    assert text == told(drive, "graph", "--ftm", "pbr", "--placement", "process")
+    text = output("graph")
+    assert text == output("graph", "--ftm", "pbr", "--placement", "process")
     assert text.startswith("ftm pbr, placement process: 16 nodes\n")
     assert "aft2aft  a/after -> b/after" in text
-    dot = told(drive, "graph", "--format", "dot")
+    dot = output("graph", "--format", "dot")
     assert dot.startswith("digraph aftbed {")
     assert dot.rstrip().endswith("}")
     assert '"a/after" -> "b/after" [label="aft2aft"]' in dot
-    mermaid = told(drive, "graph", "--format", "mermaid")
+    mermaid = output("graph", "--format", "mermaid")
     assert mermaid.startswith("flowchart LR")
     assert "a_after -->|aft2aft| b_after" in mermaid
     ended_well(drive)
 
 
 def test_inject_crash_of_the_primary(drive: Command) -> None:
-    told(drive, "inject", "crash", "primary")
+    output("inject", "crash", "primary")
     drive.wait_for_line("script.done: new backup")
-    status = json.loads(told(drive, "status", "--json"))
+    status = json.loads(output("status", "--json"))
     assert (status["leader"], status["backup"], status["epoch"]) == ("b", "a", 2)
-    roles = {row["name"]: row["role"] for row in json.loads(told(drive, "ps", "--json"))}
+    roles = {row["name"]: row["role"] for row in json.loads(output("ps", "--json"))}
     assert (roles["a/server"], roles["b/server"]) == ("backup", "primary")
     ended_well(drive, "failover   to epoch 2", "crash primary: activated")
 
 
 @pytest.mark.parametrize("target", ["backup", "proxy", "a/before", "a/watchdog", "engine"])
 def test_inject_crash_of_another(drive: Command, target: str) -> None:
-    told(drive, "inject", "crash", target)
+    output("inject", "crash", target)
     drive.wait_for_line(
         "script.done: new backup" if target in ("backup", "a/before") else f"replaced: {target}"
     )
@@ -113,20 +113,20 @@ def test_inject_crash_of_another(drive: Command, target: str) -> None:
 
 
 def test_inject_crash_at_the_nth_event(drive: Command) -> None:
-    told(drive, "inject", "crash", "a/server", "--at", "checkpoint.sent", "--nth", "5")
+    output("inject", "crash", "a/server", "--at", "checkpoint.sent", "--nth", "5")
     drive.wait_for_line("armed: crash a/server at checkpoint.sent nth 5")
     drive.wait_for_line("script.done: new backup")
     ended_well(drive, "crash a/server at checkpoint.sent nth 5: activated")
 
 
 def test_inject_a_short_hang(drive: Command) -> None:
-    told(drive, "inject", "hang", "engine", "--for", "50ms")
-    assert json.loads(told(drive, "status", "--json"))["epoch"] == 1
+    output("inject", "hang", "engine", "--for", "50ms")
+    assert json.loads(output("status", "--json"))["epoch"] == 1
     ended_well(drive, "hang engine for 50ms: activated")
 
 
-def test_inject_after_a_while(drive: Command) -> None:
-    told(drive, "inject", "crash", "primary", "--after", "200ms")
+def test_inject_after_a_delay(drive: Command) -> None:
+    output("inject", "crash", "primary", "--after", "200ms")
     drive.wait_for_line("script.done: failover")
     ended_well(drive, "crash primary after 200ms: activated")
 
@@ -188,7 +188,7 @@ def test_a_run_that_is_stopped_by_another_command_passes(home: Home) -> None:
     assert done.code == 0, done.out + done.err
 
 
-def test_a_recorded_run_is_judged_alike_again(home: Home, tmp_path: Path) -> None:
+def test_check_of_a_record_equals_the_first_verdict(home: Home, tmp_path: Path) -> None:
     record = tmp_path / "record"
     fault = "crash primary at checkpoint.sent nth 60"
     drive = ("--scenario", "ccrs-20", "--pace", "max", "--inject", fault, "--record", record)
@@ -201,7 +201,7 @@ def test_a_recorded_run_is_judged_alike_again(home: Home, tmp_path: Path) -> Non
     assert "verdict: pass" in aftbed("check", record).out
 
 
-def test_a_plain_run_says_what_happens_in_lines(home: Home) -> None:
+def test_a_run_without_a_terminal_prints_lines(home: Home) -> None:
     fault = "crash primary at checkpoint.sent nth 60"
     done = aftbed("run", "--scenario", "ccrs-20", "--pace", "max", "--inject", fault)
     assert done.code == 0, done.err

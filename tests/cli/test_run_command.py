@@ -4,8 +4,8 @@ import sys
 from pathlib import Path
 
 import pytest
+from fakerun import CLOSED, Output
 from liveruns import Home
-from playedrun import CLOSED, Run
 
 from aftbed.cli import main, run
 from aftbed.cli.adapt import scheduled
@@ -50,7 +50,7 @@ from aftbed.runtime.unix.options import RunOptions
     ],
 )
 def test_an_adaptation_of_a_run_is_refused_before_it_starts(
-    refused: Run, arguments: tuple[str, ...], words: tuple[str, ...]
+    refused: Output, arguments: tuple[str, ...], words: tuple[str, ...]
 ) -> None:
     error = refused("run", "--load", "10", *arguments)
     assert all(word in error for word in words), error
@@ -65,7 +65,7 @@ def test_each_adaptation_of_a_run_begins_where_the_one_before_ends() -> None:
     )
 
 
-def test_an_update_of_the_function_counts_for_what_comes_after_it() -> None:
+def test_later_adaptations_are_checked_with_the_updated_function() -> None:
     graph = build("lfr", "process")
     texts = (f"update app to {CLOSED} at request 5", "switch pbr at request 9")
     with pytest.raises(ConfigError, match="--adapt 'switch pbr at request 9': pbr is not consistent"):

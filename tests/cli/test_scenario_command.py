@@ -5,7 +5,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from playedrun import Call, Run
+from fakerun import Call, Output
 
 from aftbed.cli.scenario_table import TableArguments, table_drive
 from aftbed.vehicle.scenarios.library import load_scenario, scenario_names
@@ -33,26 +33,26 @@ def table(call: Call) -> Call:
     return aftbed
 
 
-def test_the_list_has_every_scenario_and_every_table(told: Run) -> None:
-    found = json.loads(told("scenario", "list", "--json"))
+def test_the_list_has_every_scenario_and_every_table(output: Output) -> None:
+    found = json.loads(output("scenario", "list", "--json"))
     assert list(found["scenarios"]) == scenario_names()
     assert [one["table"] for one in found["tables"]] == table_names()
-    lines = told("scenario", "list").splitlines()
+    lines = output("scenario", "list").splitlines()
     assert any(line.split()[:3] == ["m1", "9", "rows"] for line in lines)
 
 
-def test_a_row_is_shown_with_what_its_table_demands(told: Run) -> None:
-    out = told("scenario", "show", "r152:m1-60")
+def test_a_row_is_shown_with_what_its_table_demands(output: Output) -> None:
+    out = output("scenario", "show", "r152:m1-60")
     assert out.startswith("r152:m1-60: ")
     assert "impact at 35 km/h at most, a warning 0.8 s before braking, a demand of 5 m/s2 at least" in out
-    found = json.loads(told("scenario", "show", "r152:m1-60", "--json"))
+    found = json.loads(output("scenario", "show", "r152:m1-60", "--json"))
     assert found["row"]["limit_kmh"] == 35
     assert found["scenario"]["plant"]["speed_ms"] == pytest.approx(60 / 3.6)
 
 
-def test_a_scenario_of_no_table_is_shown_without_a_row(told: Run) -> None:
-    assert "row of" not in told("scenario", "show", "ccrb-50-12m")
-    assert json.loads(told("scenario", "show", "ccrb-50-12m", "--json"))["row"] is None
+def test_a_scenario_of_no_table_is_shown_without_a_row(output: Output) -> None:
+    assert "row of" not in output("scenario", "show", "ccrb-50-12m")
+    assert json.loads(output("scenario", "show", "ccrb-50-12m", "--json"))["row"] is None
 
 
 def test_a_table_that_passes_is_one_document_and_exit_code_0(table: Call) -> None:
@@ -75,7 +75,7 @@ def test_a_row_that_fails_is_exit_code_1_and_says_why(table: Call, tmp_path: Pat
     assert "0 of 1 rows pass" in out
 
 
-def test_the_same_fault_is_survived_under_a_mechanism_beside(table: Call) -> None:
+def test_the_same_fault_is_survived_under_a_mechanism(table: Call) -> None:
     fault = "crash primary at server.enter nth 100"
     code, out, _ = table("ncap", "--group", "ccrb-12m-6", "--fault", fault, "--ftm", "none,pbr", "--json")
     rows = json.loads(out)["rows"]
@@ -90,7 +90,7 @@ def test_a_fault_that_never_strikes_is_exit_code_3(table: Call) -> None:
     assert out.rstrip().split("\n")[-1].startswith("0 of 1 rows pass; the fault never struck in 1")
 
 
-def test_outages_are_lines_of_their_own_and_are_drawn(table: Call, tmp_path: Path) -> None:
+def test_outages_have_lines_of_their_own_and_are_plotted(table: Call, tmp_path: Path) -> None:
     plot = tmp_path / "road.svg"
     arguments = ("ncap", "--group", "ccrb-12m-6", "--ftm", "none", "--outage", "2s", "--plot", plot)
     code, out, _ = table(*arguments)
@@ -102,7 +102,7 @@ def test_outages_are_lines_of_their_own_and_are_drawn(table: Call, tmp_path: Pat
     assert drawing.startswith("<svg xmlns=") and "outage 2000ms" in drawing
 
 
-def test_what_is_driven_is_a_line_for_each_mechanism_and_each_outage() -> None:
+def test_each_mechanism_and_each_outage_is_a_line() -> None:
     given = TableArguments("r152", "m1", ("pbr", "lfr", "pbr"), "worst-instant", ("2ms", "0.3s", "2ms"))
     lines = table_drive(given).lines
     crash = "crash primary at the worst instant"
@@ -123,7 +123,7 @@ def test_what_is_driven_is_a_line_for_each_mechanism_and_each_outage() -> None:
         ),
     ],
 )
-def test_what_is_left_out_is_the_bare_function(given: TableArguments, names: list[str]) -> None:
+def test_without_a_mechanism_the_bare_function_is_driven(given: TableArguments, names: list[str]) -> None:
     assert [line.name for line in table_drive(given).lines] == names
 
 
@@ -142,7 +142,7 @@ def test_a_hang_can_be_searched_and_any_fault_aimed() -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (["r125"], "unknown table 'r125'; did you mean 'r152'?"),
         (["r152", "--group", "m2"], "unknown group of table r152 'm2'"),
@@ -169,20 +169,20 @@ def test_a_hang_can_be_searched_and_any_fault_aimed() -> None:
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
-def test_bad_input_names_the_argument(refused: Run, arguments: list[str], said: str) -> None:
-    assert said in refused("scenario", "table", *arguments)
+def test_bad_input_names_the_argument(refused: Output, arguments: list[str], message: str) -> None:
+    assert message in refused("scenario", "table", *arguments)
 
 
 @pytest.mark.parametrize("command", ["show", "run"])
 @pytest.mark.parametrize(
-    ("name", "said"),
+    ("name", "message"),
     [("ccrs-51", "unknown scenario 'ccrs-51'; did you mean"), ("r152:m1-61", "unknown case 'r152:m1-61'")],
 )
-def test_a_drive_that_does_not_exist(refused: Run, command: str, name: str, said: str) -> None:
-    assert said in refused("scenario", command, name)
+def test_a_drive_that_does_not_exist(refused: Output, command: str, name: str, message: str) -> None:
+    assert message in refused("scenario", command, name)
 
 
-def test_run_is_aftbed_run(refused: Run) -> None:
+def test_run_is_aftbed_run(refused: Output) -> None:
     error = partial(refused, "scenario", "run", "ccrs-20")
     assert "--pace fast: real, max, or a factor" in error("--pace", "fast")
     assert "unknown fault 'explode'" in error("--inject", "explode primary")
@@ -191,8 +191,8 @@ def test_run_is_aftbed_run(refused: Run) -> None:
 # -- import
 
 
-def test_what_was_taken_ignored_and_written_is_printed(told: Run, tmp_path: Path) -> None:
-    out = told("scenario", "import", LEAD_BRAKES, "--expect", "stop").splitlines()
+def test_import_prints_what_it_took_ignored_and_wrote(output: Output, tmp_path: Path) -> None:
+    out = output("scenario", "import", LEAD_BRAKES, "--expect", "stop").splitlines()
     assert out[0] == f"{LEAD_BRAKES}: OpenSCENARIO 1.2: the car ahead brakes"
     taken, ignored, written = (out.index(word) for word in ("taken", "ignored", "written"))
     assert "  line 123   SpeedAction                Lead brakes at 6 m/s2 from 1 s on" in out[taken:ignored]
@@ -201,8 +201,8 @@ def test_what_was_taken_ignored_and_written_is_printed(told: Run, tmp_path: Path
     assert load_scenario(str(tmp_path / "lead_brakes.yaml")).expect.outcome == "stop"
 
 
-def test_one_document_for_many_variations(told: Run, tmp_path: Path) -> None:
-    out = told("scenario", "import", LEAD_BRAKES, "--variations", VALUES, "--out", "made", "--json")
+def test_one_document_for_many_variations(output: Output, tmp_path: Path) -> None:
+    out = output("scenario", "import", LEAD_BRAKES, "--variations", VALUES, "--out", "made", "--json")
     found = json.loads(out)
     assert set(found) == {
         *("file", "version", "description", "sets", "scenarios", "taken", "ignored"),
@@ -218,8 +218,8 @@ def test_one_document_for_many_variations(told: Run, tmp_path: Path) -> None:
     assert {"path", "line", "element", "meaning"} == set(found["taken"][0])
 
 
-def test_an_entry_of_a_catalog_says_in_which_file_it_stands(told: Run) -> None:
-    out = told("scenario", "import", SLOW_LEAD, "--ego", "Host", "--replace-controller", "--duration", "9")
+def test_an_entry_of_a_catalog_is_printed_with_its_file(output: Output) -> None:
+    out = output("scenario", "import", SLOW_LEAD, "--ego", "Host", "--replace-controller", "--duration", "9")
     assert f"({FOLDER / 'catalogs' / 'cars.xosc'})" in out
     assert "replaced by aftbed's function, as asked for" in out
     assert load_scenario("./slow_lead.yaml").duration_ms == 9000
@@ -239,17 +239,19 @@ def test_an_entry_of_a_catalog_says_in_which_file_it_stands(told: Run) -> None:
         (["nowhere.xosc"], "nowhere.xosc: cannot be read: No such file or directory"),
     ],
 )
-def test_a_bad_wish_writes_nothing(
-    arguments: list[str | Path], reason: str, refused: Run, tmp_path: Path
+def test_a_refused_import_writes_nothing(
+    arguments: list[str | Path], reason: str, refused: Output, tmp_path: Path
 ) -> None:
     assert reason in refused("scenario", "import", *arguments)
     assert not list(tmp_path.glob("*.yaml"))
 
 
-def test_a_file_of_somebody_elses_stays(told: Run, refused: Run, tmp_path: Path) -> None:
+def test_import_overwrites_a_different_file_only_with_force(
+    output: Output, refused: Output, tmp_path: Path
+) -> None:
     mine = tmp_path / "lead_brakes.yaml"
     mine.write_text("mine")
     assert "exists, and says something else; --force" in refused("scenario", "import", LEAD_BRAKES)
     assert mine.read_text() == "mine"
-    told("scenario", "import", LEAD_BRAKES, "--force")
+    output("scenario", "import", LEAD_BRAKES, "--force")
     assert mine.read_text() != "mine"

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Final
 
 import pytest
+from fakerun import Call, Output
 from msgspec.structs import replace
-from playedrun import Call, Run
 
 from aftbed.cli.sim import SHRUNK_MAX, repeating
 from aftbed.core.fault import Crash, Fault, Trigger
@@ -46,7 +46,7 @@ def sim(call: Call) -> Call:
 # -- one run
 
 
-def test_a_run_is_told_from_seed_to_seed(sim: Call) -> None:
+def test_one_run_is_printed_between_its_seeds(sim: Call) -> None:
     code, out, err = sim("--seed", "7", "--count", "20", "--faults", "crash primary at server.exit nth 3")
     lines = out.splitlines()
     assert (code, err) == (0, "")
@@ -59,13 +59,13 @@ def test_a_run_is_told_from_seed_to_seed(sim: Call) -> None:
     assert lines[-2] == "verdict: pass"
 
 
-def test_the_same_seed_tells_the_same(sim: Call) -> None:
+def test_the_same_seed_prints_the_same(sim: Call) -> None:
     arguments = ("--seed", "3", "--count", "20", "--rate", "900", "--faults", "crash backup after 4ms")
     first, second = (re.sub(r" in [0-9.]+ ms", "", sim(*arguments)[1]) for _ in range(2))
     assert first == second
 
 
-def test_an_adaptation_is_told_with_its_blackout(sim: Call) -> None:
+def test_an_adaptation_is_printed_with_its_blackout(sim: Call) -> None:
     words = ("--ftm", "lfr", "--count", "30", "--rate", "500", "--adapt", "compose lfr+tr at request 5")
     code, out, _ = sim(*words)
     assert code == 0
@@ -83,7 +83,7 @@ def test_a_car_stops_short(sim: Call) -> None:
     assert "vehicle pass" in out
 
 
-def test_what_was_asked_for_and_never_came_about_is_no_pass(sim: Call) -> None:
+def test_a_fault_or_adaptation_that_never_happened_is_inconclusive(sim: Call) -> None:
     fault = ("--count", "10", "--faults", "crash primary at server.exit nth 11")
     code, out, _ = sim(*fault)
     assert code == 3
@@ -96,7 +96,7 @@ def test_what_was_asked_for_and_never_came_about_is_no_pass(sim: Call) -> None:
     assert "inconclusive: in 3 runs" in out and "seed 0: never fired" in out
 
 
-def test_a_service_whose_every_replica_was_struck_is_unavailable_and_nothing_is_broken(sim: Call) -> None:
+def test_a_service_is_unavailable_if_every_replica_was_struck(sim: Call) -> None:
     code, out, _ = sim("--ftm", "none", "--count", "10", "--faults", "crash primary at server.exit nth 3")
     assert code == 0 and "outcome: unavailable" in out
 
@@ -146,7 +146,7 @@ def test_a_diagram_of_many_is_of_the_first_that_broke(sim: Call, tmp_path: Path)
     assert (code, err) == (1, "") and "sequenceDiagram" in path.read_text()
 
 
-def test_a_breakdown_of_the_executive_is_a_failure(sim: Call, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_exception_in_the_executive_is_a_failure(sim: Call, monkeypatch: pytest.MonkeyPatch) -> None:
     def breaks_down(setup: Setup) -> None:
         raise KeyError("a/server")
 
@@ -156,7 +156,7 @@ def test_a_breakdown_of_the_executive_is_a_failure(sim: Call, monkeypatch: pytes
     assert code == 1 and json.loads(out)["verdict"] == "fail"
 
 
-def test_every_experiment_of_a_swarm_has_a_command_of_its_own() -> None:
+def test_every_setup_of_a_swarm_has_a_command() -> None:
     for setup in map(drawn, range(300)):
         assert repeating(setup).startswith(f"aftbed sim --seed {setup.seed} --ftm {setup.ftm} "), setup
 
@@ -168,7 +168,7 @@ def test_what_an_engine_would_refuse_needs_force() -> None:
     assert repeating(other).endswith('--adapt "to lfr after 2.5ms"')
 
 
-def test_a_time_in_a_command_is_exact_and_what_no_command_says_has_none() -> None:
+def test_times_in_a_command_are_exact_and_some_setups_have_no_command() -> None:
     early = Setup(faults=(Fault(Crash(), "primary", Trigger(after_ms=0.125)),))
     assert repeating(early).endswith('--faults "crash primary after 0.125ms"')
     assert repeating(replace(early, dooms=(Doom("a/server", 1),))) == ""
@@ -196,7 +196,7 @@ def test_the_document_of_many(sim: Call) -> None:
     assert found["runs_per_second"] > 0 and found["requests_per_second"] > 0
 
 
-def test_of_many_that_break_only_the_first_are_shrunk(sim: Call) -> None:
+def test_of_many_broken_runs_the_first_are_shrunk(sim: Call) -> None:
     last = SHRUNK_MAX
     broken = json.loads(sim("--seeds", f"0..{last}", *FLIP, "--json")[1])["broken"]
     assert [bool(one["shrunk"]) for one in broken] == [True] * last + [False]
@@ -212,13 +212,13 @@ def test_two_processes_find_the_same_as_one_in_the_same_order() -> None:
     assert [(number, setup.seed) for number, setup, _ in alone] == [(n, n) for n in range(40)]
 
 
-def test_what_has_no_end_is_not_handed_out_all_at_once() -> None:
+def test_endless_setups_are_simulated_as_results_are_read() -> None:
     endless = (Setup("none", seed=seed, count=1) for seed in itertools.count())
     with closing(each(tried, endless, 2)) as found:
         assert [number for number, _, _ in itertools.islice(found, 20)] == list(range(20))
 
 
-def test_minutes_go_on_from_the_seed(sim: Call) -> None:
+def test_minutes_simulate_from_the_seed_on(sim: Call) -> None:
     code, out, _ = sim("--seed", "4", "--minutes", "0.001", "--count", "5", "--json")
     found = json.loads(out)
     assert code == 0 and found["runs"] >= 1
@@ -244,12 +244,12 @@ FAST: Final = Times(20, 0.2, 0.4, 0.6)
         (None, "only one of them has failovers"),
     ],
 )
-def test_times_agree_where_a_median_lies_within_the_other(real: Times | None, words: str) -> None:
+def test_times_agree_if_a_median_lies_within_the_other_range(real: Times | None, words: str) -> None:
     assert apart(real, FAST) == ([words] if words else [])
 
 
 @pytest.mark.parametrize(("why_not", "code"), [((), 0), (("not alike",), 1)])
-def test_what_does_not_agree_is_an_exit_code(
+def test_a_disagreement_is_exit_code_1(
     sim: Call, monkeypatch: pytest.MonkeyPatch, why_not: tuple[str, ...], code: int
 ) -> None:
     one = Agreement("pbr process", {"masked": 1}, {"masked": 20}, FAST, None, why_not)
@@ -307,6 +307,8 @@ def test_what_does_not_agree_is_an_exit_code(
         (("--diagram", "/nowhere/at/all.md"), ("--diagram /nowhere/at/all.md", "a directory that exists")),
     ],
 )
-def test_options_that_are_refused(refused: Run, arguments: tuple[str, ...], words: tuple[str, ...]) -> None:
+def test_options_that_are_refused(
+    refused: Output, arguments: tuple[str, ...], words: tuple[str, ...]
+) -> None:
     error = refused("sim", *arguments)
     assert all(word in error for word in words), error

@@ -1,4 +1,4 @@
-"""A run that is played, for the commands that speak to one; real ones are in `tests/process`."""
+"""A fake live run that answers the commands of a second terminal; real ones are in `tests/process`."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -7,13 +7,14 @@ from typing import Final
 import msgspec
 
 from aftbed.core.errors import ConfigError
+from aftbed.core.fault import Fault
 from aftbed.core.graph import Graph
 from aftbed.core.messages import Goal
 from aftbed.ftm.compose import build
 from aftbed.runtime.unix import control_client
 
 Call = Callable[..., tuple[int, str, str]]  # `aftbed` with these arguments: exit code, output, errors
-Run = Callable[..., str]
+Output = Callable[..., str]
 VARIANTS: Final = "aftbed.vehicle.aeb.variants"
 CLOSED: Final = f"{VARIANTS}:WithoutStateAccess"
 RANDOM: Final = f"{VARIANTS}:NonDeterministic"
@@ -34,24 +35,31 @@ OUTCOME: Final = {
 }
 
 
-class PlayedRun:
-    """A run that tells its graph, remembers what it was asked for, and answers `outcome`."""
+class FakeRun:
+    """A run that answers questions, and keeps the goals and faults that it was asked for."""
 
     def __init__(self) -> None:
         self.graph: Graph = build("pbr", "process")
         self.outcome: dict[str, object] = dict(OUTCOME)
         self.history: list[dict[str, object]] = []
         self.goals: list[Goal] = []
+        self.faults: list[Fault] = []
         self.seconds = 0.0
+        self.record = Path("/nowhere/record")
 
     def ask(
         self, private: Path, question: control_client.Question, seconds: float = 0.0
     ) -> dict[str, object]:
-        """In the place of `ask.ask`."""
+        """Replaces `ask.ask`."""
         assert private.name == "abc123"
         match question:
             case control_client.GraphNow():
                 return msgspec.json.decode(msgspec.json.encode(self.graph))  # type: ignore[no-any-return]
+            case control_client.Status():
+                return {"record": str(self.record)}
+            case control_client.Inject(fault):
+                self.faults.append(fault)
+                return {}
             case control_client.Adaptations():
                 return {"adaptations": self.history}
             case control_client.Adapt(goal):
