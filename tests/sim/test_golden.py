@@ -24,6 +24,7 @@ from whiteboard import Whiteboard
 from aftbed.core.messages import Goal, NodeDied
 from aftbed.inject.words import parse
 from aftbed.judge import checks
+from aftbed.judge.reference import reference_run
 from aftbed.runtime.sim.node_io import SimNode
 from aftbed.runtime.sim.processes import Process
 
@@ -94,7 +95,7 @@ class Stage:
         judges = {
             "at_most_once": checks.at_most_once(history),
             "exactly_one_answer": checks.exactly_one_answer(history),
-            "one_history": checks.one_history(history, Counting()),
+            "one_history": checks.one_history(history, reference_run(history, Counting())),
             "one_master": checks.one_master(history),
         }
         for name, found in judges.items():
