@@ -27,7 +27,7 @@ help:
 	@echo "make fast     the tests without real runs"
 	@echo "make process  the tests that start real runs: a sample of their combinations"
 	@echo "make deep     the exhaustive tests, one after the other: hours"
-	@echo "make bench    every number of the README"
+	@echo "make bench    every figure of docs/numbers.md"
 
 # Where the tests are installed, the package is too: then the demo needs nothing more.
 demo: $(if $(wildcard $(EDITABLE)),$(EDITABLE),$(PLAIN))

@@ -316,11 +316,11 @@ class Checker(NamedTuple):
         return f"{self.name} ({self.promise})" if self.promise else self.name
 
 
-def _at_most_once(evidence: Evidence) -> Check:
+def check_at_most_once(evidence: Evidence) -> Check:
     return at_most_once(evidence.record.history)
 
 
-def _exactly_one_answer(evidence: Evidence) -> Check:
+def check_exactly_one_answer(evidence: Evidence) -> Check:
     record = evidence.record
     cut_off = record.end is None or record.end.reason == COMMAND_GONE or evidence.excuses.service_lost
     if record.simulated and record.lost and not cut_off:
@@ -333,13 +333,13 @@ def _exactly_one_answer(evidence: Evidence) -> Check:
     return found
 
 
-def _one_history(evidence: Evidence) -> Check | None:
+def check_one_history(evidence: Evidence) -> Check | None:
     if evidence.excuses.values:
         return None
     return one_history(evidence.record.history, evidence.reference)
 
 
-def _value(evidence: Evidence) -> Check | None:
+def check_value(evidence: Evidence) -> Check | None:
     """G4, judged by the replies alone, whatever mechanism ran.
 
     Only TR promises it: without TR a flipped bit is expected to come through, as silent data corruption
@@ -357,11 +357,11 @@ def _value(evidence: Evidence) -> Check | None:
     return Check("pass")
 
 
-def _one_master(evidence: Evidence) -> Check:
+def check_one_master(evidence: Evidence) -> Check:
     return one_master(evidence.record.history)
 
 
-def _whole_graph(evidence: Evidence) -> Check:
+def check_whole_graph(evidence: Evidence) -> Check:
     """G5: at the end lives a whole graph, the one to which the adaptations came, unless none is left."""
     record = evidence.record
     if record.end is None or record.end.hosted is None:
@@ -374,7 +374,7 @@ def _whole_graph(evidence: Evidence) -> Check:
     return _check(half_a_graph(record.end.hosted, record.ftm))
 
 
-def _at_rest(evidence: Evidence) -> Check | None:
+def check_at_rest(evidence: Evidence) -> Check | None:
     """A simulated run lasts until nothing is under way, or so long that it never will."""
     record = evidence.record
     if not record.simulated or record.end is None or record.lost or evidence.excuses.service_lost:
@@ -382,14 +382,14 @@ def _at_rest(evidence: Evidence) -> Check | None:
     return _check(["; ".join(record.end.unfinished)] if record.end.unfinished else [])
 
 
-def _assertions(evidence: Evidence) -> Check | None:
+def check_assertions(evidence: Evidence) -> Check | None:
     """An assert that failed in a brick of a simulated run is a bug, whatever came of it."""
     if not evidence.record.simulated:
         return None
     return _check(list(evidence.record.failures[:1]))
 
 
-def _clean_exit(evidence: Evidence) -> Check | None:
+def check_clean_exit(evidence: Evidence) -> Check | None:
     """G7, as far as the supervisor saw it; a run without its end is trouble of the harness."""
     end = evidence.record.end
     if evidence.record.simulated:
@@ -403,7 +403,7 @@ def _clean_exit(evidence: Evidence) -> Check | None:
     return Check("pass")
 
 
-def _faults_applied(evidence: Evidence) -> Check:
+def check_faults_applied(evidence: Evidence) -> Check:
     """G8: a fault that did not fire proves nothing."""
     missing = [f for f in evidence.record.faults if f["receipt"] not in FIRED]
     return Check("unknown" if missing else "pass", tuple(map(_missed, missing)))
@@ -414,13 +414,13 @@ def _missed(fault: dict[str, str]) -> str:
     return f"{fault['receipt']}: {fault['fault']}: {detail}" if detail else f"never fired: {fault['fault']}"
 
 
-def _whole_history(evidence: Evidence) -> Check:
+def check_whole_history(evidence: Evidence) -> Check:
     """G8: a journal that was full has not seen everything."""
     lost = evidence.record.history.dropped
     return Check("unknown", (f"{lost} records found no room in the journals",)) if lost else Check("pass")
 
 
-def _vehicle(evidence: Evidence) -> Check | None:
+def check_vehicle(evidence: Evidence) -> Check | None:
     """What the scenario expects of the car; a drive that was broken off is judged by what it did."""
     record = evidence.record
     work = record.options.work
@@ -433,25 +433,3 @@ def _vehicle(evidence: Evidence) -> Check | None:
         return Check("pass")
     broken = broken_expectations(load_scenario(work.scenario), record.vehicle)
     return Check("fail" if broken else "pass", tuple(broken))
-
-
-CHECKERS: Final = (  # a new check is a function and a line here; its name is its key in every verdict
-    Checker("at_most_once", "G1", _at_most_once),
-    Checker("exactly_one_answer", "G2", _exactly_one_answer),
-    Checker("one_history", "G3", _one_history),
-    Checker("one_master", "G6", _one_master),
-    Checker("whole_graph", "G5", _whole_graph),
-    Checker("clean_exit", "G7", _clean_exit),
-    Checker("faults_applied", "G8", _faults_applied),
-    Checker("whole_history", "G8", _whole_history),
-    Checker("value", "G4", _value),
-    Checker("at_rest", "", _at_rest),
-    Checker("assertions", "", _assertions),
-    Checker(VEHICLE, "", _vehicle),
-)
-
-
-def findings(evidence: Evidence) -> dict[Checker, Check]:
-    """The answer of every check that has one, in the order of `CHECKERS`."""
-    answers = ((checker, checker.check(evidence)) for checker in CHECKERS)
-    return {checker: found for checker, found in answers if found is not None}

@@ -10,7 +10,7 @@ import msgspec
 
 from aftbed.core.application import Application
 from aftbed.judge import checks
-from aftbed.judge.checks import Check, Evidence, Failover, Requests, findings
+from aftbed.judge.checks import Check, Checker, Evidence, Failover, Requests
 from aftbed.judge.record import RunRecord, record_of
 from aftbed.judge.reference import reference_of
 from aftbed.runtime.sim.world import Run
@@ -22,6 +22,28 @@ from aftbed.vehicle.plant import VehicleResult
 Word = Literal["pass", "fail", "inconclusive"]
 EXIT_CODES: Final[dict[Word, int]] = {"pass": 0, "fail": 1, "inconclusive": 3}
 EXIT_INTERRUPTED: Final = 130
+
+
+CHECKERS: Final = (  # a new check is one line here; its name is its key in every verdict
+    Checker("at_most_once", "G1", checks.check_at_most_once),
+    Checker("exactly_one_answer", "G2", checks.check_exactly_one_answer),
+    Checker("one_history", "G3", checks.check_one_history),
+    Checker("one_master", "G6", checks.check_one_master),
+    Checker("whole_graph", "G5", checks.check_whole_graph),
+    Checker("clean_exit", "G7", checks.check_clean_exit),
+    Checker("faults_applied", "G8", checks.check_faults_applied),
+    Checker("whole_history", "G8", checks.check_whole_history),
+    Checker("value", "G4", checks.check_value),
+    Checker("at_rest", "", checks.check_at_rest),
+    Checker("assertions", "", checks.check_assertions),
+    Checker(checks.VEHICLE, "", checks.check_vehicle),
+)
+
+
+def findings(evidence: Evidence) -> dict[Checker, Check]:
+    """The answer of every check that has one, in the order of `CHECKERS`."""
+    answers = ((checker, checker.check(evidence)) for checker in CHECKERS)
+    return {checker: found for checker, found in answers if found is not None}
 
 
 class Verdict(msgspec.Struct, frozen=True):

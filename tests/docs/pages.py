@@ -8,6 +8,7 @@ A fenced block's first line says what it is, and what a test does with it:
     ```console live            run it against a live run, which the test starts
     ```console norun           do not run it
     ```yaml file=NAME          write it to NAME before what follows is run
+    ```diff file=NAME          see `test_contributing`
 """
 
 import re

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from aftbed.core.history import History
 from aftbed.core.journal import Entry, EntryKind
 from aftbed.core.valuefault import flipped
-from aftbed.judge.checks import CHECKERS, REASONS_MAX, Check, Evidence, corruptions, wrong_replies
+from aftbed.judge.checks import REASONS_MAX, Check, Evidence, check_value, corruptions, wrong_replies
 from aftbed.judge.record import RunRecord
 from aftbed.judge.reference import ReferenceRun, reference_run
 from aftbed.runtime.unix.options import LoadRun, RunOptions
@@ -44,8 +44,7 @@ def value(history: History, receipts: list[dict[str, str]]) -> Check | None:
     """The check of G4 over a run of this history and these faults."""
     options = RunOptions("", "", "", "pbr", "process", 0, LoadRun(COUNT, 0.0))
     record = RunRecord(options, history, None, tuple(receipts))
-    (checker,) = [checker for checker in CHECKERS if checker.name == "value"]
-    return checker.check(Evidence(record, reference(history)))
+    return check_value(Evidence(record, reference(history)))
 
 
 def right(request_id: int) -> bytes:
