@@ -31,7 +31,7 @@ from aftbed.vehicle.can.bus_model import BusDisturber, BusModel, BusNode
 from aftbed.vehicle.can.dbc_file import Codec, load_dbc
 from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.ecus import BrakePolicy, CarBody, End
-from aftbed.vehicle.gateway import ClientGateway, Gateway, GatewayCounts
+from aftbed.vehicle.gateway import Gateway, GatewayCounts
 from aftbed.vehicle.plant import STEP_US, VehicleResult
 from aftbed.vehicle.scenarios.scenario import Scenario
 
@@ -43,14 +43,14 @@ class VirtualBus(BusModel[BusNode]):
 
     def __init__(self, codec: Codec, body: CarBody, witness: Callable[[Frame], None] | None) -> None:
         super().__init__()
-        self.gateway = ClientGateway(Gateway(codec))
+        self.gateway = Gateway(codec)
         self.requests: list[bytes] = []  # that the gateway has made, and that were not fetched yet
         self._body = body
         self._witness = witness
         self._arriving: deque[tuple[Frame, bool]] = deque()  # at the brake ECU, and whether it receives them
         self.radar_node = BusNode(RADAR)
         self.brake_node = BusNode(BRAKE, frozenset({codec.can_id("AEB_REQ")}))
-        self.gateway_node = BusNode(GATEWAY, frozenset(self.gateway.uses()))
+        self.gateway_node = BusNode(GATEWAY, frozenset(self.gateway.uses))
         self.add_receiver(self.gateway_node)
         self.add_receiver(self.brake_node)  # the radar follows no frame
 

@@ -1,4 +1,4 @@
-"""The gateway: frames in, requests out; replies in, frames out. The paper's Client, less its sockets.
+"""The gateway: frames in, requests out; replies in, frames out. The paper's Client, without its sockets.
 
 Nothing in a frame is believed before its E2E protection is checked. Each RADAR_TRACK makes one
 request, and the reply to it becomes one AEB_REQ: the radar is the clock of the function.
@@ -15,8 +15,9 @@ The lateral selection is made here: a target farther than `LANE_HALF_M` from the
 not in our path and not in the request. The function knows range and speed only.
 """
 
+from abc import ABC, abstractmethod
 from collections import deque
-from typing import Final, Protocol
+from typing import Final
 
 import msgspec
 
@@ -53,82 +54,62 @@ class GatewayCounts(msgspec.Struct):
         self.refused[reason] = self.refused.get(reason, 0) + 1
 
 
-class BusGateway(Protocol):
-    """What the client process needs of a gateway; `Gateway` and `MappedGateway` are two."""
+class BusGateway(ABC):
+    """The gateway as the client process has it: frames in, requests out, replies in, frames out.
 
-    counts: GatewayCounts
-
-    def on_frame(self, frame: Frame) -> bytes | None:
-        """Judge a frame off the bus. A request payload if it ends a radar cycle, else None."""
-        ...
-
-    def on_reply(self, reply: bytes, t_us: int, replica: int, epoch: int, answered: int) -> list[Frame]:
-        """The frames that the reply becomes, sent at `t_us`. Raises PeerError if it is not a reply."""
-        ...
-
-
-class ClientGateway:
-    """A gateway as its client has it: it knows the bus time, counts the replies, and raises nothing.
-
-    `replies_refused` are not replies to the brakes: the function refused the request, so there is
-    nothing to ask for.
+    A subclass reads frames (`_request_of`); what it sends is the same for all: FTM_HEARTBEAT_n if one is due,
+    then AEB_REQ. `replies_refused` are not replies to the brakes: the function refused the request, so there
+    is nothing to ask for.
     """
 
-    def __init__(self, gateway: BusGateway) -> None:
-        self.answered = 0
-        self.replies_refused = 0
-        self._gateway = gateway
-        self._t_us = 0  # of the latest frame
-
-    @property
-    def counts(self) -> GatewayCounts:
-        """Of the frames."""
-        return self._gateway.counts
-
-    def noticed(self) -> list[tuple[int, str]]:
-        """What was found wrong since this was last asked: of which frames, and what."""
-        if not isinstance(self._gateway, Gateway) or not self._gateway.noticed:
-            return []
-        found = list(self._gateway.noticed)
-        self._gateway.noticed.clear()
-        return found
-
-    def makes_requests(self, can_id: int) -> bool:
-        """Whether a request is made of a frame with this identifier, if it is believed."""
-        return isinstance(self._gateway, Gateway) and can_id == self._gateway.track_id
-
-    def uses(self) -> tuple[int, ...]:
-        """The identifiers that it makes something of."""
-        return self._gateway.uses if isinstance(self._gateway, Gateway) else ()
-
-    def on_frame(self, frame: Frame) -> bytes | None:
-        """See `BusGateway.on_frame`."""
-        self._t_us = max(self._t_us, frame.t_us)
-        return self._gateway.on_frame(frame)
-
-    def on_reply(self, reply: bytes, replica: int, epoch: int) -> list[Frame]:
-        """The frames that the reply becomes; none, and counted, if it is not one to the brakes."""
-        self.answered += 1
-        try:
-            return self._gateway.on_reply(reply, self._t_us, replica, epoch, self.answered)
-        except PeerError:
-            self.replies_refused += 1
-            return []
-
-
-class ReplySender:
-    """The way out, the same for both gateways: FTM_HEARTBEAT_n if one is due, then AEB_REQ."""
+    uses: tuple[int, ...] = ()  # identifiers of the frames that it evaluates, for the faults of the bus
+    request_id: int | None = None  # of the frame that makes a request each time, where there is one
 
     def __init__(self, codec: Codec) -> None:
+        """`codec` is aftbed's own DBC."""
+        self.counts = GatewayCounts()
+        self.answered = 0
+        self.replies_refused = 0
         self._codec = codec
+        self._noticed: deque[tuple[int, str]] = deque(maxlen=NOTICED_MAX)
+        self._bus_us = 0  # of the latest frame
         self._aeb_req_id = codec.can_id("AEB_REQ")
         self._protection = P11(codec.data_id("AEB_REQ"))
         self._heartbeats = {replica: f"FTM_HEARTBEAT_{replica}" for replica in REPLICAS}
         self._heartbeat_cycle_us = codec.cycle_us(self._heartbeats[1])
         self._heartbeat_us: int | None = None
 
-    def frames(self, reply: bytes, t_us: int, replica: int, epoch: int, answered: int) -> list[Frame]:
-        """See `BusGateway.on_reply`. The E2E counter is the reply's own, so a failover leaves no gap."""
+    @abstractmethod
+    def _request_of(self, frame: Frame) -> bytes | None:
+        """Judge a frame off the bus. A request payload if it ends a radar cycle, else None."""
+
+    def on_frame(self, frame: Frame) -> bytes | None:
+        """Judge a frame off the bus. A request payload if it ends a radar cycle, else None."""
+        self._bus_us = max(self._bus_us, frame.t_us)
+        return self._request_of(frame)
+
+    def noticed(self) -> list[tuple[int, str]]:
+        """The identifiers of frames with something wrong since the last call, and what was wrong."""
+        if not self._noticed:
+            return []
+        found = list(self._noticed)
+        self._noticed.clear()
+        return found
+
+    def on_reply(self, reply: bytes, replica: int, epoch: int) -> list[Frame]:
+        """The frames that the reply becomes; none, and counted, if it is not one to the brakes."""
+        self.answered += 1
+        try:
+            return self.reply_frames(reply, self._bus_us, replica, epoch, self.answered)
+        except PeerError:
+            self.replies_refused += 1
+            return []
+
+    def reply_frames(self, reply: bytes, t_us: int, replica: int, epoch: int, answered: int) -> list[Frame]:
+        """The frames that the reply becomes, sent at `t_us`. Raises PeerError if it is not a reply.
+
+        The E2E counter is the reply's own, so a failover leaves no gap.
+        """
         assert replica in REPLICAS
         output = decode_reply(reply)
         signals = {
@@ -160,25 +141,21 @@ def target_of(slot: int, range_m: float, rel_speed_ms: float, new: bool) -> AebT
     return None
 
 
-class Gateway:
-    """The gateway on aftbed's own bus: RADAR_TRACK and EGO_STATE in."""
+class Gateway(BusGateway):
+    """The gateway on aftbed's own bus: RADAR_TRACK, which makes the requests, and EGO_STATE in."""
 
     def __init__(self, codec: Codec) -> None:
-        self.counts = GatewayCounts()
-        self._codec = codec
-        self._sender = ReplySender(codec)
+        super().__init__(codec)
         self._ego_id, self._ego = codec.can_id("EGO_STATE"), _receiver(codec, "EGO_STATE")
-        self.track_id, self._track = codec.can_id("RADAR_TRACK"), _receiver(codec, "RADAR_TRACK")
-        self.uses = (self._ego_id, self.track_id)
-        self.noticed: deque[tuple[int, str]] = deque(maxlen=NOTICED_MAX)  # of which frames, what is wrong
+        self.request_id, self._track = codec.can_id("RADAR_TRACK"), _receiver(codec, "RADAR_TRACK")
+        self.uses = (self._ego_id, self.request_id)
         self._t_us = 0
         self._ego_us = 0
         self._ego_speed_ms: float | None = None  # the last one believed
         self._request_us: int | None = None  # when the last request was made
         self._blind_after_us = round(BLIND_PART * codec.cycle_us("RADAR_TRACK"))
 
-    def on_frame(self, frame: Frame) -> bytes | None:
-        """See `BusGateway.on_frame`: a request for each RADAR_TRACK that is believed."""
+    def _request_of(self, frame: Frame) -> bytes | None:
         if frame.can_id not in self.uses:
             self.counts.ignored += 1
             return None
@@ -189,10 +166,6 @@ class Gateway:
             self._on_ego(frame)
             return None
         return self._on_track(frame)
-
-    def on_reply(self, reply: bytes, t_us: int, replica: int, epoch: int, answered: int) -> list[Frame]:
-        """See `BusGateway.on_reply`."""
-        return self._sender.frames(reply, t_us, replica, epoch, answered)
 
     def _on_ego(self, frame: Frame) -> None:
         if self._believed(self._ego, frame):
@@ -221,7 +194,7 @@ class Gateway:
         target = target_of(slot, signals["RANGE"], signals["RELATIVE_SPEED"], new)
         if signals["VALID"] and target is None:
             self.counts.refuse("range")
-            self.noticed.append((frame.can_id, "range"))
+            self._noticed.append((frame.can_id, "range"))
             return None
         self.counts.accepted += 1
         in_path = signals["VALID"] and abs(signals["LATERAL_OFFSET"]) <= LANE_HALF_M
@@ -231,7 +204,7 @@ class Gateway:
         """The ego speed, and whether it is to be believed now."""
         timeout_us = self._ego.supervision.timeout_us
         if self._ego_speed_ms is None or t_us - self._ego_us > timeout_us:
-            self.noticed.append((self._ego_id, "timeout"))
+            self._noticed.append((self._ego_id, "timeout"))
             return 0.0, False
         return self._ego_speed_ms, True
 
@@ -243,11 +216,11 @@ class Gateway:
         reason = receiver.refusal(frame.data, status)
         if reason is None:
             if status is FrameStatus.OK_SOMELOST:
-                self.noticed.append((frame.can_id, "lost"))
+                self._noticed.append((frame.can_id, "lost"))
             return True
         self.counts.refuse(reason)
         if not first or status is not FrameStatus.WRONGSEQUENCE:  # which is all that a first frame can be
-            self.noticed.append((frame.can_id, reason))
+            self._noticed.append((frame.can_id, reason))
         return False
 
 

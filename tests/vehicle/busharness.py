@@ -21,7 +21,7 @@ from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.can.hub import Hub, HubCounts, HubOptions, serve
 from aftbed.vehicle.disturbance import Disturber
 from aftbed.vehicle.ecus import Sender
-from aftbed.vehicle.gateway import ClientGateway, Gateway
+from aftbed.vehicle.gateway import Gateway
 
 DEADLINE_S = 5.0
 
@@ -283,11 +283,11 @@ class FunctionGateway:
     """
 
     def __init__(self, options: BusOptions, codec: Codec, *, named: bool = False) -> None:
-        self.gateway = ClientGateway(Gateway(codec))
+        self.gateway = Gateway(codec)
         self._function = default_application()
         self._named = named
         if named:
-            options = msgspec.structs.replace(options, node="gateway", uses=self.gateway.uses())
+            options = msgspec.structs.replace(options, node="gateway", uses=self.gateway.uses)
         self._listener = Listener(options, self._hear)
 
     def __enter__(self) -> "FunctionGateway":
@@ -305,7 +305,7 @@ class FunctionGateway:
         if payload is not None:
             for answer in self.gateway.on_reply(self._function.execute(payload), 1, 1):
                 bus.send(answer)
-        elif self._named and self.gateway.makes_requests(frame.can_id):
+        elif self._named and frame.can_id == self.gateway.request_id:
             bus.unasked(frame.can_id)
         for can_id, word in self.gateway.noticed() if self._named else ():
             bus.notice(can_id, word)

@@ -69,7 +69,7 @@ def drive(
                     continue
                 reply = function.execute(request)
                 decisions.append(Decision(frame.t_us, decode_reply(reply)))
-                for answer in gateway.on_reply(reply, frame.t_us, 1, 1, len(decisions)):
+                for answer in gateway.reply_frames(reply, frame.t_us, 1, 1, len(decisions)):
                     for arriving in bus(answer):
                         frames.append(arriving)
                         brake.on_frame(arriving)

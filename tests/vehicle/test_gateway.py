@@ -9,7 +9,7 @@ from aftbed.core.errors import PeerError
 from aftbed.vehicle.aeb.messages import AebInput, AebOutput, AebTarget, decode_request, encode_reply
 from aftbed.vehicle.can.e2e import intact, protect
 from aftbed.vehicle.can.frame import Frame
-from aftbed.vehicle.gateway import LANE_HALF_M, ClientGateway, Gateway
+from aftbed.vehicle.gateway import LANE_HALF_M, Gateway
 
 EGO = {"SPEED_VALID": 1.0, "SPEED": 14.0}
 TRACK = {"VALID": 1.0, "TRACK_ID": 5.0, "RANGE": 40.0, "RELATIVE_SPEED": -3.0}
@@ -180,7 +180,7 @@ REPLY = encode_reply(AebOutput(2, 4.0, 1.25, 5, 7))
 
 def test_a_reply_becomes_a_protected_request_to_the_brakes() -> None:
     gateway = Gateway(CODEC)
-    heartbeat, request = gateway.on_reply(REPLY, 100_000, 2, 3, 0x1_0004)
+    heartbeat, request = gateway.reply_frames(REPLY, 100_000, 2, 3, 0x1_0004)
     assert (heartbeat.can_id, request.can_id) == (0x702, 0x100)
     assert CODEC.decode("FTM_HEARTBEAT_2", heartbeat.data) == {"REPLICA": 2, "EPOCH": 3, "ANSWERED": 0x1_0004}
     assert intact(request.data, CODEC.data_id("AEB_REQ"))
@@ -191,20 +191,22 @@ def test_a_reply_becomes_a_protected_request_to_the_brakes() -> None:
 
 def test_without_a_threat_there_is_no_time_to_collision() -> None:
     reply = encode_reply(AebOutput(0, 0.0, None, None, 0))
-    told = CODEC.decode("AEB_REQ", Gateway(CODEC).on_reply(reply, 0, 1, 1, 1)[-1].data)
+    told = CODEC.decode("AEB_REQ", Gateway(CODEC).reply_frames(reply, 0, 1, 1, 1)[-1].data)
     assert (told["TTC_VALID"], told["TTC"], told["TARGET"]) == (0, 0, 0)
 
 
 @pytest.mark.parametrize("ttc_s", [40.95, 1e6])
 def test_a_time_to_collision_beyond_the_signal_is_cut(ttc_s: float) -> None:
     reply = encode_reply(AebOutput(0, 0.0, ttc_s, 0, 0))
-    told = CODEC.decode("AEB_REQ", Gateway(CODEC).on_reply(reply, 0, 1, 1, 1)[-1].data)
+    told = CODEC.decode("AEB_REQ", Gateway(CODEC).reply_frames(reply, 0, 1, 1, 1)[-1].data)
     assert told["TTC"] == pytest.approx(40.95)
 
 
 def test_heartbeats_come_50_ms_apart_and_before_the_request() -> None:
     gateway = Gateway(CODEC)
-    ids = [[f.can_id for f in gateway.on_reply(REPLY, t_us, 1, 1, 1)] for t_us in range(0, 120_000, 10_000)]
+    ids = [
+        [f.can_id for f in gateway.reply_frames(REPLY, t_us, 1, 1, 1)] for t_us in range(0, 120_000, 10_000)
+    ]
     assert ids == [[0x701, 0x100] if n in (0, 5, 10) else [0x100] for n in range(12)]
 
 
@@ -224,12 +226,12 @@ def test_heartbeats_come_50_ms_apart_and_before_the_request() -> None:
 def test_a_reply_that_is_none_is_refused_and_sends_nothing(reply: bytes, reason: str) -> None:
     gateway = Gateway(CODEC)
     with pytest.raises(PeerError, match=reason):
-        gateway.on_reply(reply, 0, 1, 1, 1)
-    assert len(gateway.on_reply(REPLY, 0, 1, 1, 1)) == 2  # the heartbeat is still due
+        gateway.reply_frames(reply, 0, 1, 1, 1)
+    assert len(gateway.reply_frames(REPLY, 0, 1, 1, 1)) == 2  # the heartbeat is still due
 
 
 def test_a_client_s_gateway_stamps_and_counts_the_replies_and_raises_nothing() -> None:
-    gateway = ClientGateway(Gateway(CODEC))
+    gateway = Gateway(CODEC)
     gateway.on_frame(frame("EGO_STATE", 40, 0, EGO))
     gateway.on_frame(frame("EGO_STATE", 30, 1, EGO))
     assert gateway.on_reply(b"", 1, 1) == []

@@ -14,7 +14,7 @@ from aftbed.runtime.unix.journal_files import Dialogue
 from aftbed.runtime.unix.options import GatewayOptions
 from aftbed.vehicle.can.bus import BusOptions, open_bus
 from aftbed.vehicle.can.dbc_file import load_dbc
-from aftbed.vehicle.gateway import ClientGateway, Gateway
+from aftbed.vehicle.gateway import BusGateway, Gateway
 from aftbed.vehicle.replay.map_file import find_map
 from aftbed.vehicle.replay.mapped_gateway import MappedGateway
 
@@ -24,9 +24,9 @@ from aftbed.vehicle.replay.mapped_gateway import MappedGateway
 class BusLink:
     """The `CarLink` over a bus."""
 
-    def __init__(self, gateway: ClientGateway, port: int) -> None:
+    def __init__(self, gateway: BusGateway, port: int) -> None:
         self._gateway = gateway
-        self._bus = open_bus(BusOptions(port=port, node=GATEWAY, uses=gateway.uses()))
+        self._bus = open_bus(BusOptions(port=port, node=GATEWAY, uses=gateway.uses))
 
     def fds(self) -> tuple[int, ...]:
         """The bus."""
@@ -38,7 +38,7 @@ class BusLink:
             payload = self._gateway.on_frame(frame)
             if payload is not None:
                 yield payload
-            elif self._gateway.makes_requests(frame.can_id):
+            elif frame.can_id == self._gateway.request_id:
                 self._bus.unasked(frame.can_id)
         for can_id, word in self._gateway.noticed():
             self._bus.notice(can_id, word)
@@ -74,7 +74,7 @@ def make_car(client: Client, options: GatewayOptions) -> CarDevice:
     return CarDevice(client, dialogue, BusLink(_gateway(options), options.port))
 
 
-def _gateway(options: GatewayOptions) -> ClientGateway:
+def _gateway(options: GatewayOptions) -> BusGateway:
     if options.map:
-        return ClientGateway(MappedGateway(load_dbc(), Path(options.dbc), find_map(options.map)))
-    return ClientGateway(Gateway(load_dbc()))
+        return MappedGateway(load_dbc(), Path(options.dbc), find_map(options.map))
+    return Gateway(load_dbc())

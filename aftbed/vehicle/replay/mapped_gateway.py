@@ -22,7 +22,7 @@ from aftbed.vehicle.aeb.messages import SPEED_MAX_MS, AebInput, AebTarget, encod
 from aftbed.vehicle.can.dbc_file import Codec
 from aftbed.vehicle.can.e2e import Receiver
 from aftbed.vehicle.can.frame import Frame
-from aftbed.vehicle.gateway import GatewayCounts, ReplySender, target_of
+from aftbed.vehicle.gateway import BusGateway, target_of
 from aftbed.vehicle.replay.map_file import TO_SI, Flag, FrameRule, Quantity, bind
 from aftbed.vehicle.replay.slots import SlotBook
 
@@ -41,13 +41,12 @@ class SeenTrack(msgspec.Struct, frozen=True):
     target: AebTarget | None
 
 
-class MappedGateway:
-    """A `BusGateway` that reads frames by a user's DBC and map; `codec` is aftbed's own, for the way out."""
+class MappedGateway(BusGateway):
+    """Reads frames by a user's DBC and map; `codec` is aftbed's own, for what it sends."""
 
     def __init__(self, codec: Codec, dbc: Path, map_file: Path) -> None:
         """Raises ConfigError if the DBC does not parse, or the map does not fit it."""
-        self.counts = GatewayCounts()
-        self._sender = ReplySender(codec)
+        super().__init__(codec)
         self._bound = bind(map_file, dbc)
         self._receivers = {
             rule.can_id: Receiver(rule.watch) for rule in self._bound.rules.values() if rule.watch is not None
@@ -60,8 +59,7 @@ class MappedGateway:
         self._awaited = 0  # so many objects make the cycle whole; 0 is none that is open
         self._ego: tuple[int, float] | None = None  # bus time and speed, last accepted
 
-    def on_frame(self, frame: Frame) -> bytes | None:
-        """See `BusGateway.on_frame`: a request for each frame that ends a cycle and is believed."""
+    def _request_of(self, frame: Frame) -> bytes | None:
         rule = self._bound.rules.get(frame.can_id)
         if rule is None:
             self.counts.ignored += 1
@@ -80,10 +78,6 @@ class MappedGateway:
             self._awaited = 0
             return self._request(frame.t_us)
         return None
-
-    def on_reply(self, reply: bytes, t_us: int, replica: int, epoch: int, answered: int) -> list[Frame]:
-        """See `BusGateway.on_reply`."""
-        return self._sender.frames(reply, t_us, replica, epoch, answered)
 
     def _accept(self, frame: Frame, rule: FrameRule) -> str | None:
         """Take the content of the frame, or return the reason to refuse it; then nothing has changed."""
