@@ -7,10 +7,13 @@ from typing import Final
 import msgspec
 
 from aftbed.core.events import Event
-from aftbed.core.fault import Crash, Fault, Trigger
 from aftbed.core.journal import DROPPED_OFFSET, EntryKind
-from aftbed.core.valuefault import Bit, Flip, Place, flipped
 from aftbed.ftm.compose import build
+from aftbed.inject.bit_patterns import Bit, flipped
+from aftbed.inject.crash import Crash
+from aftbed.inject.model import Fault
+from aftbed.inject.timing import Trigger
+from aftbed.inject.value import ValueFlip, ValuePlace
 from aftbed.judge.record import read_record
 from aftbed.judge.verdict import Verdict, judge
 from aftbed.runtime.unix.journal_files import Dialogue, Journal
@@ -23,7 +26,7 @@ START_NS: Final = 10**12
 CAR: Final = CarRun("ccrs-50", None, "latch")
 STOPPED: Final = VehicleResult(False, None, 2.5, 2.5, 9.0, True)
 CRASH: Final = Fault(Crash(), "primary", Trigger("checkpoint.sent", 2))
-FLIP: Final = Fault(Flip(Place.RESULT, Bit(8)), "primary", Trigger("server.exit", 2))
+FLIP: Final = Fault(ValueFlip(ValuePlace.RESULT, Bit(8)), "primary", Trigger("server.exit", 2))
 FIRST_GENERATION: Final = 1 << 8
 
 

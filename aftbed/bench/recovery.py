@@ -11,7 +11,9 @@ from typing import Final
 from aftbed.bench.runs import finish, start
 from aftbed.bench.statistics import summary
 from aftbed.core.errors import ConfigError, HarnessError
-from aftbed.core.fault import Crash, Fault, Trigger
+from aftbed.inject.crash import Crash
+from aftbed.inject.model import Fault
+from aftbed.inject.timing import Trigger
 from aftbed.judge.checks import failovers
 from aftbed.runtime.unix import control_client
 from aftbed.runtime.unix.options import LoadRun

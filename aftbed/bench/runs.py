@@ -2,7 +2,7 @@
 
 from aftbed.core.errors import HarnessError
 from aftbed.core.events import Event
-from aftbed.core.fault import Fault
+from aftbed.inject.model import Fault
 from aftbed.judge.record import RunRecord, read_record
 from aftbed.runtime.unix.launch import Launched, launch, options_for
 from aftbed.runtime.unix.options import LoadRun

@@ -22,10 +22,8 @@ from aftbed.campaign.experiment import Result
 from aftbed.campaign.ledger import Ledger
 from aftbed.campaign.statistics import Interval, proportion
 from aftbed.core.application import Application, Characteristics
-from aftbed.core.fault import Action, Crash, FlipMemory, Hang
-from aftbed.core.persistence import Permanent
-from aftbed.core.valuefault import Flip
-from aftbed.inject.words import parse
+from aftbed.inject.model import parse
+from aftbed.inject.timing import Permanent
 from aftbed.judge.outcome import FAILED, UNKNOWN
 from aftbed.runtime.unix.part import load_module
 from aftbed.vehicle.aeb.function import default_application
@@ -80,22 +78,17 @@ def assumed_wrongly(result: Result) -> str:
     """What the table says against this mechanism, for these faults and this function; "" for nothing."""
     experiment = result.experiment
     faults = [parse(text) for text in experiment.faults]
-    flips = [fault for fault in faults if isinstance(fault.action, Flip | FlipMemory)]
+    flips = [fault for fault in faults if fault.action.alters_value]
     asked = FaultModel(
-        crash=any(isinstance(fault.action, Crash | Hang) for fault in faults),
+        crash=any(fault.action.stops_process for fault in faults),
         value=bool(flips),
     )
     found = problems(experiment.ftm, asked, _characteristics(experiment.adaptations), AMPLE)
     if not found and any(isinstance(fault.persistence, Permanent) for fault in flips):
         found = [f"{experiment.ftm} takes a value fault for transient: this one is in every execution"]
-    if not found and any(_at_rest(fault.action) for fault in flips):
+    if not found and any(fault.action.strikes_stored_state for fault in flips):
         found = [f"{experiment.ftm} compares executions: a state that is wrong before is in all of them"]
     return "; ".join(found)
-
-
-def _at_rest(action: Action) -> bool:
-    """Whether it strikes what no execution has in hand."""
-    return isinstance(action, FlipMemory) or (isinstance(action, Flip) and bool(action.field))
 
 
 def _characteristics(adaptations: tuple[str, ...]) -> Characteristics:

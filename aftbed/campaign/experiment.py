@@ -17,17 +17,15 @@ import msgspec
 
 from aftbed.adapt.schedule import scheduled
 from aftbed.core.errors import ConfigError
-from aftbed.core.fault import FIRED, Fault
 from aftbed.core.graph import Graph
 from aftbed.core.messages import Scheduled
 from aftbed.core.script import RECIPES
 from aftbed.ftm.compose import build
-from aftbed.inject.words import parse
+from aftbed.inject.model import Fault, FaultReport, parse
 from aftbed.judge.checks import Evidence, Requests
 from aftbed.judge.outcome import FAILED, OUTCOMES, UNKNOWN, outcome_of, worst
 from aftbed.judge.record import RunEnd, RunRecord, read_record, record_of
 from aftbed.judge.verdict import Breach, Verdict, evidence_of, judge
-from aftbed.runtime import targets
 from aftbed.runtime.sim.world import Setup, simulate
 from aftbed.runtime.unix import linux, spawn
 from aftbed.runtime.unix.busaim import aim
@@ -95,7 +93,7 @@ class Result(msgspec.Struct, frozen=True, omit_defaults=True):
     activated: bool = True  # every fault of it happened
     broken: tuple[str, ...] = ()
     reasons: tuple[str, ...] = ()
-    faults: tuple[dict[str, str], ...] = ()
+    faults: tuple[FaultReport, ...] = ()
     requests: Requests | None = None
     failovers: int = 0
     detected_ms: float | None = None
@@ -239,7 +237,7 @@ def faults_of(experiment: Experiment, graph: Graph) -> tuple[Fault, ...]:
     work: Work = CarRun(experiment.scenario, None, "") if experiment.scenario else LoadRun(1, 0.0)
     found = tuple(parse(text) for text in experiment.faults)
     for fault in found:
-        targets.check(fault, graph)
+        fault.check(graph)
         aim(fault, work)
     return found
 
@@ -336,7 +334,7 @@ def _result(experiment: Experiment, evidence: Evidence, found: tuple[str, tuple[
     if vehicle is not None and golden is not None and vehicle.collision and not golden.collision:
         outcome = worst([outcome, "unavailable"])
         reasons = (f"the car hit something at {vehicle.impact_speed_kmh} km/h", *reasons)
-    applied = all(f["receipt"] in FIRED for f in faults)
+    applied = all(f.fired for f in faults)
     activated = applied and len(adapted) == len(experiment.adaptations)
     return Result(
         experiment,

@@ -22,9 +22,9 @@ from aftbed.adapt.schedule import scheduled
 from aftbed.campaign.experiment import Experiment, faults_of
 from aftbed.campaign.spec import ANY, AdaptationEntry, FaultEntry, Spec, System, Value
 from aftbed.core.errors import ConfigError, unknown
-from aftbed.core.fault import Fault, FlipMemory
 from aftbed.ftm.compose import build
-from aftbed.inject.parts import refuse_unsafe
+from aftbed.inject.memory import refuse_unsafe
+from aftbed.inject.model import Fault
 
 ID_DIGITS: Final = 16
 SEED_BITS: Final = 31
@@ -171,10 +171,10 @@ def population(entry: FaultEntry) -> int:
 def _check_memory(faults: tuple[Fault, ...], system: System) -> None:
     """Raise ConfigError where a fault strikes memory that there is not, or that nobody has opened to it."""
     for fault in faults:
-        if isinstance(fault.action, FlipMemory):
+        if fault.action.unsafe:
             if system.runtime == "sim":
                 raise ConfigError(f"{fault}: under system.runtime sim processes have no memory of their own")
-            refuse_unsafe(str(fault), unsafe=system.unsafe_memory, say="system.unsafe_memory: true")
+            refuse_unsafe(str(fault), agreed=system.unsafe_memory, option="system.unsafe_memory: true")
 
 
 def _check(made: Plan, stratum: Stratum) -> None:

@@ -11,10 +11,10 @@ import typer
 
 from aftbed.cli.options import Run, takes
 from aftbed.core.errors import ConfigError, unknown
-from aftbed.core.fault import MEMORY, Fault, on_bus
-from aftbed.inject import buswords
-from aftbed.inject.parts import refuse_unsafe
-from aftbed.inject.words import read
+from aftbed.inject.bus import read_bus_fault
+from aftbed.inject.memory import refuse_unsafe
+from aftbed.inject.model import Fault, on_bus, read
+from aftbed.inject.value import MEMORY
 from aftbed.runtime.unix import control_client, rundir
 from aftbed.runtime.unix.busaim import aim
 from aftbed.runtime.unix.options import Work
@@ -189,7 +189,7 @@ def bitflip(given: BitflipArguments) -> None:
             raise ConfigError(
                 f"--replica {given.replica}: with --level {MEMORY} the target is {given.place!r} already"
             )
-        refuse_unsafe(f"--level {MEMORY}", unsafe=given.unsafe_memory)
+        refuse_unsafe(f"--level {MEMORY}", agreed=given.unsafe_memory)
         what, given = MEMORY, msgspec.structs.replace(given, replica=given.place)
     byte = [] if given.byte is None else ["byte"] if given.byte == DRAWN else ["byte", given.byte]
     persistence = _persistence(given.permanent, given.every, given.chance)
@@ -202,7 +202,7 @@ def bus(
     run: Run = None,
 ) -> None:
     """Disturb frames on the CAN bus, or disconnect nodes from it."""
-    _arm(run, on_bus(buswords.parse(words)))
+    _arm(run, on_bus(read_bus_fault(words)))
 
 
 # -- options to words, words to the run -----------------------------------------------------------

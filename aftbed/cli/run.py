@@ -19,14 +19,12 @@ import typer
 from aftbed.cli.options import RATE_HZ_MAX, Json, check_seed, takes
 from aftbed.cli.views import RunView, open_view
 from aftbed.core.errors import ConfigError, unknown
-from aftbed.core.fault import Fault, FlipMemory
 from aftbed.core.graph import Graph
 from aftbed.core.messages import Scheduled
 from aftbed.core.script import RECIPES
 from aftbed.ftm.compose import build
-from aftbed.inject.parts import refuse_unsafe
-from aftbed.inject.words import parse
-from aftbed.runtime import targets
+from aftbed.inject.memory import refuse_unsafe
+from aftbed.inject.model import Fault, parse
 from aftbed.runtime.control import Report
 from aftbed.runtime.unix.launch import Launched, launch, options_for
 from aftbed.runtime.unix.options import CarRun, LoadRun, ReplayRun, Work
@@ -140,9 +138,9 @@ def execute(given: RunArguments) -> int:
 
 def _fault(text: str, graph: Graph, *, unsafe: bool) -> Fault:
     fault = parse(text)
-    if isinstance(fault.action, FlipMemory):
-        refuse_unsafe(str(fault), unsafe=unsafe)
-    targets.check(fault, graph)
+    if fault.action.unsafe:
+        refuse_unsafe(str(fault), agreed=unsafe)
+    fault.check(graph)
     return fault
 
 

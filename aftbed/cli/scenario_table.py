@@ -18,14 +18,14 @@ from aftbed.cli.options import Json, Seed, check_seed, jobs_of, separated, takes
 from aftbed.cli.sim import read_fault
 from aftbed.cli.views import Bar
 from aftbed.core.errors import ConfigError
-from aftbed.core.fault import Crash, Fault, Hang, Slow, Trigger
 from aftbed.core.graph import Graph
 from aftbed.core.units import milliseconds, whole_milliseconds
 from aftbed.ftm.compose import build
-from aftbed.inject.words import parse
+from aftbed.inject.crash import Crash
+from aftbed.inject.model import Fault, parse
+from aftbed.inject.timing import Trigger
 from aftbed.judge.verdict import EXIT_INTERRUPTED
 from aftbed.report.roadplot import Curve, Point, road_plot
-from aftbed.runtime import targets
 from aftbed.search.road_table import NONE, PRIMARY, Line, Row, driven, drives, outage
 from aftbed.search.worst_instant import STEP_CYCLES
 from aftbed.vehicle.scenarios import tables
@@ -121,9 +121,9 @@ def _searched(text: str, words: list[str], graph: Graph) -> Fault:
     if words[-2] != "at":
         raise ConfigError(f"--fault {text!r}: {WORST}, or FAULT WORDS at {WORST} is allowed")
     fault = parse(" ".join(words[:-2]))
-    if not isinstance(fault.action, Crash | Hang | Slow) or fault.trigger != Trigger():
+    if not fault.action.has_worst_instant or fault.trigger != Trigger():
         raise ConfigError(f"--fault {text!r}: a crash, a hang or a slow without any other time is searched")
-    targets.check(fault, graph)
+    fault.check(graph)
     return fault
 
 

@@ -25,17 +25,24 @@ from aftbed.cli.adapt import scheduled
 from aftbed.cli.options import RATE_HZ_MAX, SEED_MAX, Json, check_seed, jobs_of, takes
 from aftbed.cli.views import Bar, EndedAdaptation, history_lines, show_verdict, spaced
 from aftbed.core.errors import ConfigError, unknown
-from aftbed.core.fault import Fault
 from aftbed.core.graph import Graph
 from aftbed.core.messages import Goal, Scheduled
 from aftbed.core.script import RECIPES
 from aftbed.ftm.compose import build
-from aftbed.inject.words import parse
+from aftbed.inject.model import Fault, parse
+from aftbed.inject.targets import OTHERS
 from aftbed.judge.outcome import outcome_of
 from aftbed.judge.record import record_of
-from aftbed.judge.verdict import EXIT_CODES, EXIT_INTERRUPTED, Breach, Verdict, Word, evidence_of, judge
+from aftbed.judge.verdict import (
+    EXIT_CODES,
+    EXIT_INTERRUPTED,
+    Breach,
+    Verdict,
+    Word,
+    evidence_of,
+    judge,
+)
 from aftbed.report import sequence
-from aftbed.runtime import targets
 from aftbed.runtime.sim.clock import START_NS
 from aftbed.runtime.sim.givens import check as check_fault
 from aftbed.runtime.sim.trace import traced
@@ -223,8 +230,8 @@ def _load(given: SimArguments) -> Setup:
 def read_fault(text: str, graph: Graph) -> Fault:
     """A fault in the words of `aftbed run --inject`. Raises ConfigError."""
     fault = parse(text)
-    targets.check(fault, graph)
-    if fault.target in targets.OTHERS:
+    fault.check(graph)
+    if fault.target in OTHERS:
         raise ConfigError(f"{text!r}: the simulator has no {fault.target}: it simulates what is in the graph")
     return fault
 

@@ -171,7 +171,7 @@ def show_verdict(verdict: "Verdict", *, as_json: bool) -> None:
         for proposal in verdict.proposals:
             print(f"  proposal   {proposed_line(proposal)}")
     for fault in verdict.faults:
-        print(f"  fault      {fault['fault']}: {fault['receipt']}")
+        print(f"  fault      {fault.fault}: {fault.receipt.value}")
     print("  checks     " + ", ".join(f"{name} {found}" for name, found in verdict.checks.items()))
     for reason in verdict.reasons:
         print(f"  because    {reason}")

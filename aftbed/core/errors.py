@@ -30,6 +30,10 @@ class AdaptationError(AftbedError):
     """An adaptation that was rolled back; the graph that was there goes on."""
 
 
+class StepFailed(Exception):  # noqa: N818 - a situation within a task, never shown as it is
+    """Within a task of the runtime: a step was refused, its process died, or its deadline passed."""
+
+
 class HarnessError(AftbedError):
     """The testbed itself is in trouble: the verdict is inconclusive, exit code 3."""
 

@@ -12,6 +12,7 @@ from typing import Final
 import msgspec
 
 PLACEMENTS: Final = ("process", "replica", "single")
+STAGED: Final = "'"  # behind the name of a process that is to become that node, or was it before
 
 
 class Kind(msgspec.Struct, frozen=True):

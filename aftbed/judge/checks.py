@@ -14,12 +14,11 @@ import msgspec
 
 from aftbed.core.errors import PeerError
 from aftbed.core.events import RERUN, Event
-from aftbed.core.fault import FIRED
 from aftbed.core.graph import Graph
 from aftbed.core.history import History
 from aftbed.core.journal import Entry, EntryKind, Record
-from aftbed.core.valuefault import BITFLIP
 from aftbed.ftm.compose import build, replication_of
+from aftbed.inject.model import FaultReport
 from aftbed.judge.record import Excuses, RunRecord
 from aftbed.judge.reference import ReferenceRun
 from aftbed.runtime.hosting import Hosted
@@ -346,13 +345,13 @@ def check_value(evidence: Evidence) -> Check | None:
     (sdc). Without a flipped bit there is nothing to say.
     """
     record = evidence.record
-    flips = [f for f in record.faults if f["fault"].split()[0] == BITFLIP]
+    flips = [f for f in record.faults if f.action.alters_value]
     if not flips or evidence.excuses.values:
         return None
     wrong = corruptions(record.history, evidence.reference)
     if wrong:
         return Check("fail", tuple(wrong[:REASONS_MAX]))
-    if not any(f["receipt"] in FIRED for f in flips):
+    if not any(f.fired for f in flips):
         return Check("unknown", ("no value fault was applied",))
     return Check("pass")
 
@@ -405,13 +404,14 @@ def check_clean_exit(evidence: Evidence) -> Check | None:
 
 def check_faults_applied(evidence: Evidence) -> Check:
     """G8: a fault that did not fire proves nothing."""
-    missing = [f for f in evidence.record.faults if f["receipt"] not in FIRED]
+    missing = [f for f in evidence.record.faults if not f.fired]
     return Check("unknown" if missing else "pass", tuple(map(_missed, missing)))
 
 
-def _missed(fault: dict[str, str]) -> str:
-    detail = fault.get("detail")
-    return f"{fault['receipt']}: {fault['fault']}: {detail}" if detail else f"never fired: {fault['fault']}"
+def _missed(fault: FaultReport) -> str:
+    if not fault.detail:
+        return f"never fired: {fault.fault}"
+    return f"{fault.receipt.value}: {fault.fault}: {fault.detail}"
 
 
 def check_whole_history(evidence: Evidence) -> Check:

@@ -12,12 +12,12 @@ import msgspec
 
 from aftbed.core.errors import ConfigError, PeerError
 from aftbed.core.events import Event
-from aftbed.core.fault import Fault
 from aftbed.core.history import History
 from aftbed.core.journal import dropped, entries, records
 from aftbed.core.script import ScriptKind
-from aftbed.core.valuefault import Flip
 from aftbed.ftm.compose import replication_of
+from aftbed.inject.model import FaultReport
+from aftbed.inject.receipts import ReceiptState
 from aftbed.runtime.hosting import Hosted
 from aftbed.runtime.rewiring import replica_of
 from aftbed.runtime.sim.world import Run
@@ -41,7 +41,7 @@ class RunEnd(msgspec.Struct, frozen=True):
     leader: str = ""
     hosted: Hosted | None = None
     states: dict[str, str] = {}
-    faults: tuple[dict[str, str], ...] = ()
+    faults: tuple[FaultReport, ...] = ()
     result: dict[str, object] | None = None
     seconds: float | None = None
     starved_ms: float = 0.0
@@ -69,7 +69,7 @@ class RunRecord(msgspec.Struct, frozen=True):
     options: RunOptions
     history: History
     end: RunEnd | None
-    faults: tuple[dict[str, str], ...] = ()  # each with its receipt
+    faults: tuple[FaultReport, ...] = ()  # each with its receipt
     adaptations: tuple[dict[str, object], ...] = ()  # how each one ended, in order
     vehicle: VehicleResult | None = None
     path: Path = Path()
@@ -115,7 +115,11 @@ def read_record(path: Path) -> RunRecord:
         raise ConfigError(f"{folder}: {error}") from None
     history = History(journals, dialogue, lost)
     end = _end(path / "end.json") if (path / "end.json").exists() else None
-    faults = end.faults if end is not None else tuple(_unknown(fault) for fault in options.faults)
+    faults = (
+        end.faults
+        if end is not None
+        else tuple(FaultReport(str(fault), ReceiptState.UNKNOWN) for fault in options.faults)
+    )
     vehicle = _vehicle(options, end)
     return RunRecord(options, history, end, faults, _adaptations(path), vehicle, path, started)
 
@@ -125,10 +129,6 @@ def _end(path: Path) -> RunEnd:
         return msgspec.convert(_json(path), RunEnd)
     except msgspec.ValidationError as error:
         raise ConfigError(f"{path}: not the end of a run: {error}") from None
-
-
-def _unknown(fault: Fault) -> dict[str, str]:
-    return {"fault": str(fault), "receipt": "unknown"}
 
 
 def _vehicle(options: RunOptions, end: RunEnd | None) -> VehicleResult | None:
@@ -159,7 +159,7 @@ def record_of(run: Run) -> RunRecord:
         states=rest.states,
         faults=run.faults,
     )
-    flips = [f for f in setup.faults if isinstance(f.action, Flip)]
+    flips = [f for f in setup.faults if f.action.alters_value]
     # A switch of the mechanism brings the Servers in line, so with adaptations the values are promised again.
     values = not setup.adaptations and any(f.event in UNPROMISED_VALUES for f in flips)
     return RunRecord(

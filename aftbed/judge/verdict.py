@@ -9,8 +9,15 @@ from typing import Final, Literal
 import msgspec
 
 from aftbed.core.application import Application
+from aftbed.inject.model import FaultReport
 from aftbed.judge import checks
-from aftbed.judge.checks import Check, Checker, Evidence, Failover, Requests
+from aftbed.judge.checks import (
+    Check,
+    Checker,
+    Evidence,
+    Failover,
+    Requests,
+)
 from aftbed.judge.record import RunRecord, record_of
 from aftbed.judge.reference import reference_of
 from aftbed.runtime.sim.world import Run
@@ -60,7 +67,7 @@ class Verdict(msgspec.Struct, frozen=True):
     failovers: list[Failover]
     checks: dict[str, str]
     reasons: list[str]
-    faults: list[dict[str, str]]
+    faults: list[FaultReport]
     replay: dict[str, object] | None
     seconds: float | None
     launch_ms: float | None

@@ -130,7 +130,7 @@ def _found(result: Result) -> dict[str, Value]:
         "outcome": result.outcome,
         "unexpected": result.unexpected,
         "activated": result.activated,
-        "receipts": PARTED.join(fault.get("receipt", "") for fault in result.faults),
+        "receipts": PARTED.join(fault.receipt.value for fault in result.faults),
         "reasons": PARTED.join(result.reasons),
         "sent": counts.sent if counts else None,
         "answered": counts.answered if counts else None,

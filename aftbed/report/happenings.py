@@ -11,10 +11,10 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import Final, NamedTuple
 
 from aftbed.core.events import FIRST_FAULT, REQUEST_EVENTS, STEP_EVENTS, TURNING_POINTS, Event
-from aftbed.core.fault import marked
 from aftbed.core.journal import Record
 from aftbed.core.messages import Message
 from aftbed.ftm.compose import build
+from aftbed.inject.receipts import fault_and_bits
 from aftbed.report import sequence
 from aftbed.runtime.sim.trace import STRUCK, Happening, Sent, Told, Trace
 
@@ -140,7 +140,7 @@ def said(one: Record | Told, trace: Trace) -> str:
     """A mark in words; a fault in its own."""
     if isinstance(one, Told):
         return f"{one.text} was hit" if one.event == STRUCK else f"{one.event}: {one.text}"
-    faults, at = trace.run.setup.faults, marked(one.detail)[0] - FIRST_FAULT
+    faults, at = trace.run.setup.faults, fault_and_bits(one.detail)[0] - FIRST_FAULT
     if one.event is Event.FAULT_APPLIED:
         return str(faults[at])
     words = [str(one.event), *([f"#{one.request_id}"] if one.request_id else [])]

@@ -13,9 +13,10 @@ from collections.abc import Iterable, Sequence
 from typing import Final, NamedTuple, assert_never
 
 from aftbed.core.events import FIRST_FAULT, REQUEST_EVENTS, Event
-from aftbed.core.fault import Fault, marked
 from aftbed.core.journal import Entry, Record
 from aftbed.ftm.compose import build
+from aftbed.inject.model import Fault
+from aftbed.inject.receipts import fault_and_bits
 from aftbed.judge.verdict import Breach
 from aftbed.runtime.sim.trace import STRUCK, Happening, Sent, Told, Trace, brief, digest, milliseconds
 
@@ -106,7 +107,7 @@ def _row(one: Happening, faults: Sequence[Fault]) -> tuple[str, str, str, str]:
 
 def _noted(record: Record, faults: Sequence[Fault]) -> str:
     """A record in words; a fault that was applied by its own."""
-    at = marked(record.detail)[0] - FIRST_FAULT
+    at = fault_and_bits(record.detail)[0] - FIRST_FAULT
     if record.event is Event.FAULT_APPLIED and 0 <= at < len(faults):
         return f"{record.event}: {faults[at]}"
     found = [str(record.event)]

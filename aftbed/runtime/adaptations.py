@@ -13,15 +13,15 @@ from typing import Final
 import msgspec
 
 from aftbed.core import messages
-from aftbed.core.errors import ConfigError
+from aftbed.core.errors import ConfigError, StepFailed
 from aftbed.core.events import Event
 from aftbed.core.graph import Graph
 from aftbed.core.script import Phase, Script, bricks_changed
 from aftbed.runtime import control
 from aftbed.runtime.deployment import Deployment, Keys
 from aftbed.runtime.exchange import Exchange
-from aftbed.runtime.faults import Faults
-from aftbed.runtime.jobs import StepFailed, Wait
+from aftbed.runtime.fault_controller import FaultController
+from aftbed.runtime.jobs import Wait
 from aftbed.runtime.verbs import Executor
 
 CLIENT: Final = "client"
@@ -90,7 +90,7 @@ class Adaptations:
         self,
         deployment: Deployment,
         executor: Executor,
-        faults: Faults,
+        faults: FaultController,
         inform_recovery: Callable[[], None],
     ) -> None:
         self._deployment, self._executor, self._faults = deployment, executor, faults

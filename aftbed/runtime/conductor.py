@@ -12,15 +12,15 @@ from typing import Final
 import msgspec
 
 from aftbed.core import messages, script
+from aftbed.core.errors import StepFailed
 from aftbed.core.events import Event
 from aftbed.core.graph import Graph
 from aftbed.core.script import LOSSES, Phase, ScriptKind
 from aftbed.runtime import control
 from aftbed.runtime.adaptations import CLIENT, ENGINE, REPLACE, Adaptations
 from aftbed.runtime.deployment import WATCHED_KINDS, Deployment
-from aftbed.runtime.faults import Faults
+from aftbed.runtime.fault_controller import FaultController
 from aftbed.runtime.interface import Process, ProcessKind, Support
-from aftbed.runtime.jobs import StepFailed
 from aftbed.runtime.verbs import Executor
 from aftbed.runtime.zygotes import LIGHT
 
@@ -51,7 +51,7 @@ class Conductor:
         self._support, self._loop, self._on_loss = support, support.loop, on_loss
         self.deployment = Deployment(graph, support, cpus)
         self.executor = Executor(self.deployment)
-        self.faults = Faults(self.deployment)
+        self.faults = FaultController(self.deployment)
         self.adaptations = Adaptations(
             self.deployment, self.executor, self.faults, lambda: self.inform_recovery(failed=False)
         )

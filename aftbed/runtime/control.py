@@ -8,8 +8,7 @@ from typing import Final
 
 import msgspec
 
-from aftbed.core.busfault import BusFault, Condition
-from aftbed.core.fault import Action
+from aftbed.core.busfault import Condition
 from aftbed.core.graph import BrickSpec, Graph
 from aftbed.core.messages import (
     Adapt,
@@ -25,8 +24,9 @@ from aftbed.core.messages import (
     TakeUp,
     Watch,
 )
-from aftbed.core.persistence import ONCE, Persistence
 from aftbed.core.script import Phase, Script
+from aftbed.inject.bus import BusFault
+from aftbed.inject.model import ArmedFault
 
 WHOLE: Final = 1.0  # of a CPU
 UNANSWERED: Final = 0  # the token of an order that gets no Ack
@@ -172,34 +172,17 @@ class WatchNodes(Order, frozen=True):
     pids: tuple[int, ...]
 
 
-class Blow(msgspec.Struct, frozen=True):
-    """At the `nth` time that `brick` comes to the event: do `action` to yourself, or ask for it.
-
-    `draw` is the chance by which is chosen what `action` and `persistence` leave open; `struck`: how often
-    it has struck here so far.
-    """
-
-    fault: int
-    brick: str
-    nth: int
-    action: Action
-    itself: bool
-    draw: int = 0
-    persistence: Persistence = ONCE
-    struck: int = 0
-
-
 class Arm(Order, frozen=True):
     """These wait for `event` here, counted from now, beside those that do already; `nth` 0: no longer."""
 
     event: str
-    blows: tuple[Blow, ...]
+    faults: tuple[ArmedFault, ...]
 
 
 class Interfere(Order, frozen=True):
-    """Disturb what `blow.brick` sends on the channel, from the `nth` message on; `nth` 0: no longer."""
+    """Disturb what `fault.brick` sends on the channel, from the `nth` message on; `nth` 0: no longer."""
 
-    blow: Blow
+    fault: ArmedFault
 
 
 class SlowDown(Order, frozen=True):

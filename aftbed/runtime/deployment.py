@@ -9,15 +9,15 @@ from typing import Final
 
 import msgspec
 
-from aftbed.core.graph import Graph
+from aftbed.core.errors import StepFailed
+from aftbed.core.graph import STAGED, Graph
 from aftbed.ftm.compose import REPLICAS
 from aftbed.ftm.failover import HANG_DEADLINE_NS
 from aftbed.runtime import control
 from aftbed.runtime.channels import Channels
 from aftbed.runtime.cores import Cores
 from aftbed.runtime.interface import Channel, Process, ProcessKind, Support
-from aftbed.runtime.jobs import STEP_SECONDS_MAX, Key, StepFailed, Wait
-from aftbed.runtime.targets import STAGED
+from aftbed.runtime.jobs import STEP_SECONDS_MAX, Key, Wait
 from aftbed.runtime.zygotes import BUS, LIGHT
 
 WATCHED_KINDS: Final = ("client", "proxy", "watchdog", "recovery", "engine")

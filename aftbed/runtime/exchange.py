@@ -15,15 +15,16 @@ from typing import Final
 
 from aftbed.adapt.plan import drains
 from aftbed.core import script
+from aftbed.core.errors import StepFailed
 from aftbed.core.events import Event
-from aftbed.core.graph import Graph
+from aftbed.core.graph import STAGED, Graph
 from aftbed.core.script import Script, flat
 from aftbed.ftm.compose import REPLICAS, replication_of
 from aftbed.ftm.registry import KINDS
 from aftbed.runtime import control
 from aftbed.runtime.deployment import Deployment, Keys, Slot
 from aftbed.runtime.interface import Channel, Process, ProcessKind
-from aftbed.runtime.jobs import Key, StepFailed, Wait, amid
+from aftbed.runtime.jobs import Key, Wait, amid
 from aftbed.runtime.rewiring import (
     Changes,
     Wires,
@@ -34,7 +35,6 @@ from aftbed.runtime.rewiring import (
     tell_whoever_lives,
     way_back,
 )
-from aftbed.runtime.targets import STAGED
 from aftbed.runtime.transfer import Seat, align, answered, ask, end, migrate, seen_dead, transfer
 from aftbed.runtime.zygotes import LIGHT
 

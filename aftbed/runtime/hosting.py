@@ -6,10 +6,10 @@ from typing import Final
 
 import msgspec
 
+from aftbed.core.errors import StepFailed
 from aftbed.runtime import control
 from aftbed.runtime.deployment import Deployment, Keys
 from aftbed.runtime.interface import ProcessKind
-from aftbed.runtime.jobs import StepFailed
 
 DIGEST_DIGITS: Final = 16
 

@@ -9,11 +9,11 @@ from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from enum import Enum
 from typing import NamedTuple, Protocol
 
-from aftbed.core.busfault import BusFault, Condition, Struck
+from aftbed.core.busfault import Condition
 from aftbed.core.events import Event
-from aftbed.core.fault import FlipMemory
 from aftbed.core.graph import Link
 from aftbed.core.journal import Record
+from aftbed.inject.kind import BusReceipt, FaultKind
 from aftbed.runtime.control import ToNode
 from aftbed.runtime.jobs import Jobs, Key, Wait
 
@@ -58,7 +58,7 @@ class Channel(Protocol):
         ...
 
 
-class Cell(Protocol):
+class SharedMemory(Protocol):
     """Memory that a node keeps the state of a function in."""
 
     memory: memoryview
@@ -228,7 +228,7 @@ class Support(Protocol):
         """A fresh one."""
         ...
 
-    def cell(self) -> Cell:
+    def shared_memory(self) -> SharedMemory:
         """A fresh one, all zero."""
         ...
 
@@ -252,7 +252,7 @@ class Support(Protocol):
         """Chance for fault `number`, the same whenever this seed is used: 63 bits."""
         ...
 
-    def disturb(self, number: int, fault: BusFault, draw: int) -> Generator[Wait, dict[Key, bytes], None]:
+    def disturb(self, number: int, fault: FaultKind, draw: int) -> Generator[Wait, dict[Key, bytes], None]:
         """Arm a fault of the bus; it is armed when this ends. Raises StepFailed where there is no bus."""
         ...
 
@@ -265,11 +265,14 @@ class Support(Protocol):
         """
         ...
 
-    def flip_memory(self, process: Process, flip: FlipMemory, draw: int) -> str:
-        """Flip a bit of the memory of `process`; which it was, in words. Raises StepFailed."""
+    def flip_memory(self, process: Process, bit: int | None, address: int | None, draw: int) -> str:
+        """Flip that bit of the byte at `address` of `process`; which it was, in words. What is None is drawn.
+
+        Raises StepFailed.
+        """
         ...
 
-    def bus_fault(self, number: int) -> Struck | None:
+    def bus_fault(self, number: int) -> BusReceipt | None:
         """What has become of it, as far as is known."""
         ...
 

@@ -11,15 +11,13 @@ from typing import Final
 
 import msgspec
 
+from aftbed.core.errors import StepFailed
+
 STEP_SECONDS_MAX: Final = 2.0
 EARLY_MAX: Final = 256
 STATS_JOB: Final = "stats"
 
 Key = tuple[str, str, int]
-
-
-class StepFailed(Exception):  # noqa: N818 - a situation within a job, never shown as it is
-    """A step was refused, its process died, or its deadline passed."""
 
 
 class Wait(msgspec.Struct, frozen=True):

@@ -22,9 +22,9 @@ from aftbed.core.brick import CONTROL, Brick, Effect, Halt, Note, Order, Send
 from aftbed.core.errors import PeerError
 from aftbed.core.events import Event
 from aftbed.core.messages import AnyMessage, Message, Rebound, Reply, Watch
+from aftbed.inject.agent import FaultAgent
+from aftbed.inject.shared_state import look
 from aftbed.runtime import control
-from aftbed.runtime.blows import FaultAgent
-from aftbed.runtime.cell import look
 from aftbed.runtime.devices import Device, Sensor
 
 WATCHDOG: Final = "{}/watchdog"
@@ -464,7 +464,7 @@ class Node(Generic[In, Out]):
         assert isinstance(effect, Halt)
         self.io.stop_detected(hosted.name, effect.reason)
 
-    # -- what the fault agent asks for: see `host.AgentHost` ------------------------------------
+    # -- what the fault agent asks for: see `inject.agent.AgentHost` ------------------------------------
 
     def brick(self, name: str) -> Brick:
         """The brick of that name. Raises KeyError."""
@@ -588,14 +588,14 @@ class Node(Generic[In, Out]):
         """Hand an order about a fault to the fault agent."""
         agent = self.agent
         match order:
-            case control.Arm(_, event, blows):
-                agent.arm(event, blows)
-            case control.Interfere(_, blow):
-                agent.disturb(blow)
-            case control.SlowDown():
+            case control.Arm(_, event, faults):
+                agent.arm(event, faults)
+            case control.Interfere(_, armed):
+                agent.disturb(armed)
+            case control.SlowDown(_, fault, by_ns, share):
                 if not agent.slowed:
                     self.io.begin_throttle()
-                agent.slow_down(order)
+                agent.slow_down(fault, by_ns, share)
             case control.KeepInCell(_, brick, number):
                 return agent.share_state(brick, number, self.io.memory(fds.pop()))
             case _:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Final
 
 from aftbed.core import script
+from aftbed.core.errors import StepFailed
 from aftbed.core.graph import Graph, Link, ends
 from aftbed.ftm.compose import REPLICAS, replication_of
 from aftbed.ftm.registry import KINDS
@@ -17,7 +18,6 @@ from aftbed.runtime import control
 from aftbed.runtime.channels import Channels
 from aftbed.runtime.deployment import Deployment, Keys
 from aftbed.runtime.interface import Channel, Process
-from aftbed.runtime.jobs import StepFailed
 from aftbed.runtime.transfer import answered, ask
 
 Ends = dict[tuple[str, str], int]  # brick, port -> descriptor, or NOWHERE

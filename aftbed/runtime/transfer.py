@@ -10,11 +10,12 @@ from collections.abc import Callable, Generator, Iterable
 from hashlib import blake2b
 from typing import Final
 
+from aftbed.core.errors import StepFailed
 from aftbed.core.graph import Graph
 from aftbed.runtime import control
 from aftbed.runtime.deployment import Deployment, Keys
 from aftbed.runtime.interface import Process, ProcessKind
-from aftbed.runtime.jobs import Key, StepFailed, Wait
+from aftbed.runtime.jobs import Key, Wait
 
 EXCHANGE_SECONDS_MAX: Final = 0.5
 

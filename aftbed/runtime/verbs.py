@@ -9,6 +9,7 @@ import contextlib
 from typing import Final
 
 from aftbed.core import messages, script
+from aftbed.core.errors import StepFailed
 from aftbed.core.events import Event
 from aftbed.core.graph import Link
 from aftbed.ftm.compose import STATEFUL, replication_of
@@ -16,7 +17,7 @@ from aftbed.runtime import control
 from aftbed.runtime.cores import BESIDE_LEADER
 from aftbed.runtime.deployment import Deployment, Keys
 from aftbed.runtime.interface import Channel, ProcessKind
-from aftbed.runtime.jobs import StepFailed, Wait
+from aftbed.runtime.jobs import Wait
 
 FIRST_REPLY_SECONDS: Final = 0.001
 

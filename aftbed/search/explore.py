@@ -19,18 +19,22 @@ import msgspec
 from aftbed.adapt.plan import plan, target
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.events import Event
-from aftbed.core.fault import FIRED, Action, Crash, Fault, Hang, Trigger
+from aftbed.core.graph import STAGED
 from aftbed.core.journal import EntryKind
 from aftbed.core.messages import Goal, Scheduled
 from aftbed.core.script import Stage, flat
-from aftbed.core.valuefault import EXECUTED, Bit, Flip, Place
 from aftbed.ftm.compose import DUPLEX_EXPRESSIONS, build, parse, tolerates
 from aftbed.ftm.registry import MECHANISMS, server_emits
+from aftbed.inject.bit_patterns import Bit
+from aftbed.inject.crash import Crash
+from aftbed.inject.hang import Hang
+from aftbed.inject.model import Fault, FaultAction
+from aftbed.inject.timing import Trigger
+from aftbed.inject.value import EXECUTED, ValueFlip, ValuePlace
 from aftbed.judge.verdict import Breach, breaches
 from aftbed.runtime.sim.clock import Clock
 from aftbed.runtime.sim.interleaving import HeldChannel, orders
 from aftbed.runtime.sim.world import Doom, Run, Setup, World, simulate
-from aftbed.runtime.targets import STAGED
 from aftbed.runtime.unix.worker_pool import SECONDS_MAX, Alone, each
 
 ADAPTABLE: Final = tuple(
@@ -96,7 +100,7 @@ def adaptations(pairs: Iterable[tuple[str, str]], placements: Iterable[str]) -> 
             )
 
 
-STRIKES: Final[tuple[Action, ...]] = (Crash(), Hang())
+STRIKES: Final[tuple[FaultAction, ...]] = (Crash(), Hang())
 FIRST_EVENTS: Final = (  # where the first fault of a pair strikes the leader's side
     Event.REQUEST_RECEIVED,
     Event.BEFORE_EXIT,
@@ -120,12 +124,12 @@ def pairs(ftms: Iterable[str], placements: Iterable[str]) -> Iterator[Setup]:
         if tolerates(ftm, "value"):
             places = itertools.product(EXECUTED, (0, 100))
             firsts += [
-                Fault(Flip(place, Bit(bit)), "primary", Trigger(Event.SERVER_EXIT.label, 3))
+                Fault(ValueFlip(place, Bit(bit)), "primary", Trigger(Event.SERVER_EXIT.label, 3))
                 for place, bit in places
             ]
         if server_emits(graph, Event.STATE_RESTORED, backs_up=True):  # in the backup's checkpoint
             firsts += [
-                Fault(Flip(Place.STATE, Bit(bit)), "backup", Trigger(Event.STATE_RESTORED.label, 3))
+                Fault(ValueFlip(ValuePlace.STATE, Bit(bit)), "backup", Trigger(Event.STATE_RESTORED.label, 3))
                 for bit in (0, 100)
             ]
         for first, node, delay_ms in itertools.product(firsts, nodes, DELAYS_MS):
@@ -237,7 +241,7 @@ def tried(setup: Setup) -> Found:
 
 def missed(run: Run) -> tuple[str, ...]:
     """G8: what was to happen in `run` and did not, so that it proves nothing about it."""
-    found = [f"never fired: {f['fault']}" for f in run.faults if f["receipt"] not in FIRED]
+    found = [f"never fired: {f.fault}" for f in run.faults if not f.fired]
     begun = len(run.adaptations)
     late = run.setup.adaptations[begun:]
     return (*found, *(f"never began: the adaptation to {s.goal.expression or s.goal.part}" for s in late))

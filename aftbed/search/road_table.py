@@ -18,7 +18,9 @@ from typing import Final
 import msgspec
 from msgspec.structs import replace
 
-from aftbed.core.fault import Fault, Hang, Slow, Trigger
+from aftbed.inject.hang import Hang
+from aftbed.inject.model import Fault
+from aftbed.inject.timing import Trigger
 from aftbed.runtime.sim.world import Setup
 from aftbed.runtime.unix.worker_pool import each
 from aftbed.search.worst_instant import Course, Struck, course_of, strike, worst_instant
@@ -185,7 +187,7 @@ def repeat(setup: Setup) -> tuple[str, ...]:
     simulated = f'aftbed sim {asked} --faults "{fault}"'
     if fault.trigger.after_ms:
         return (simulated,)
-    pace = "real" if isinstance(fault.action, Hang | Slow) else "max"
+    pace = "real" if fault.action.takes_real_time else "max"
     return simulated, f'aftbed run {asked} --pace {pace} --inject "{fault}"'
 
 

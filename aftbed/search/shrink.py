@@ -27,12 +27,10 @@ from msgspec import json
 from msgspec.structs import replace
 
 from aftbed.core.errors import ConfigError
-from aftbed.core.fault import Fault, Hang, Slow
 from aftbed.core.messages import Scheduled
-from aftbed.core.valuefault import Flip
 from aftbed.ftm.compose import DUPLEX, build, parse, replication_of
+from aftbed.inject.model import Fault
 from aftbed.judge.verdict import Breach
-from aftbed.runtime import targets
 from aftbed.runtime.sim.givens import check
 from aftbed.runtime.sim.world import Doom, Setup
 
@@ -85,7 +83,7 @@ def _makes_sense(setup: Setup) -> bool:
     graph = build(setup.ftm, setup.placement)
     try:
         for fault in setup.faults:
-            targets.check(fault, graph)
+            fault.check(graph)
             check(fault, setup.scenario)
     except ConfigError:
         return False
@@ -136,7 +134,7 @@ def _smaller_loads(setup: Setup) -> Iterator[Setup]:
 def _smaller_graphs(setup: Setup) -> Iterator[Setup]:
     """A duplex stays one, and where a bit is flipped TR stays."""
     names = parse(setup.ftm)
-    flips = any(isinstance(fault.action, Flip) for fault in setup.faults)
+    flips = any(fault.action.alters_value for fault in setup.faults)
     if len(names) > 1 and not flips:
         yield replace(setup, ftm=names[0])
     if replication_of(setup.ftm) and names[0] != DUPLEX[0]:
@@ -178,9 +176,8 @@ def _earlier_fault(fault: Fault) -> Iterator[Fault]:
         yield replace(fault, trigger=replace(trigger, nth=nth))
     for after_ms in _sooner(trigger.after_ms):
         yield replace(fault, trigger=replace(trigger, after_ms=after_ms))
-    if isinstance(fault.action, Hang | Slow):
-        for for_ms in _smaller(fault.action.for_ms):
-            yield replace(fault, action=replace(fault.action, for_ms=for_ms))
+    for lasts_ms in _smaller(fault.action.lasts_ms):
+        yield replace(fault, action=fault.action.lasting(lasts_ms))
 
 
 def _earlier_adaptations(setup: Setup) -> Iterator[Setup]:

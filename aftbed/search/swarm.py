@@ -29,13 +29,19 @@ from typing import Final
 
 from aftbed.core.errors import ConfigError
 from aftbed.core.events import REQUEST_PATH, Event
-from aftbed.core.fault import Crash, Disturb, Fault, Hang, How, Slow, Trigger
-from aftbed.core.graph import PLACEMENTS
+from aftbed.core.graph import PLACEMENTS, STAGED
 from aftbed.core.messages import Goal, Scheduled
-from aftbed.core.valuefault import EXECUTED, Bit, Flip
 from aftbed.ftm.compose import EXPRESSIONS, NONE, build, replication_of, tolerates
 from aftbed.ftm.registry import EMITTERS, MECHANISMS, server_emits
-from aftbed.runtime import targets
+from aftbed.inject import targets
+from aftbed.inject.bit_patterns import Bit
+from aftbed.inject.channel import ChannelFault, Disturbance
+from aftbed.inject.crash import Crash
+from aftbed.inject.hang import Hang
+from aftbed.inject.model import Fault
+from aftbed.inject.slow import Slow
+from aftbed.inject.timing import Trigger
+from aftbed.inject.value import EXECUTED, ValueFlip
 from aftbed.runtime.rewiring import replica_of
 from aftbed.runtime.sim.world import Setup
 from aftbed.vehicle.scenarios.library import scenario_names
@@ -96,7 +102,7 @@ def _events(ftm: str, placement: str) -> tuple[Event, ...]:
     found = []
     for event in EMITTERS:
         try:
-            targets.check(Fault(Crash(), targets.ROLES[0], Trigger(event.label)), graph)
+            Fault(Crash(), targets.PRIMARY, Trigger(event.label)).check(graph)
         except ConfigError:
             continue
         found.append(event)
@@ -114,7 +120,7 @@ def _channels(ftm: str, placement: str) -> tuple[str, ...]:
     found = []
     for channel in sorted({link.name for link in graph.links} - {CHECKPOINTS}):
         try:
-            targets.check(Fault(Disturb(How.DELAY, channel), targets.ROLES[0], Trigger()), graph)
+            Fault(ChannelFault(Disturbance.DELAY, channel), targets.PRIMARY, Trigger()).check(graph)
         except ConfigError:
             continue
         found.append(channel)
@@ -203,7 +209,7 @@ class _Draw:
         nth = chance.randint(1, self._nth_max())
         for _ in range(count):
             bit = chance.choice((None, chance.randrange(BIT_DRAWN_MAX)))
-            flip = Flip(chance.choice(EXECUTED), Bit(bit))
+            flip = ValueFlip(chance.choice(EXECUTED), Bit(bit))
             found.append(Fault(flip, role, Trigger(Event.SERVER_EXIT.label, nth)))
             nth += FLIPS_APART + chance.randrange(FLIPS_APART)
         return found
@@ -215,7 +221,7 @@ class _Draw:
         trigger = self._draw_trigger(adapted)
         steps = trigger.event in {event.label for event in _STEPS}
         target = self._draw_target(staged=steps)
-        if chance.random() < 0.6 or target.endswith(targets.STAGED):
+        if chance.random() < 0.6 or target.endswith(STAGED):
             return Fault(Crash(), target, trigger)
         watched = target in targets.ROLES or replica_of(target)
         hang_ms = 0 if watched and chance.random() < 0.4 else chance.randint(1, HANG_MS_MAX)
@@ -233,17 +239,17 @@ class _Draw:
             )
         channel = chance.choice(_channels(self._ftm, self._placement))
         return Fault(
-            Disturb(How.DELAY, channel, by_ms),
-            targets.ROLES[0],
+            ChannelFault(Disturbance.DELAY, channel, by_ms),
+            targets.PRIMARY,
             Trigger(nth=chance.randint(1, self._nth_max())),
         )
 
     def _draw_target(self, *, staged: bool) -> str:
         chance, graph = self._chance, build(self._ftm, self._placement)
         if chance.random() < 0.4:
-            return chance.choice(targets.roles(graph))
+            return chance.choice(targets.roles_in(graph))
         node = chance.choice(list(graph.nodes))
-        return f"{node}{targets.STAGED}" if staged and replica_of(node) and chance.random() < 0.3 else node
+        return f"{node}{STAGED}" if staged and replica_of(node) and chance.random() < 0.3 else node
 
     def _draw_trigger(self, adapted: bool) -> Trigger:
         chance = self._chance

@@ -22,14 +22,16 @@ from msgspec.structs import replace
 
 from aftbed.core.errors import HarnessError
 from aftbed.core.events import Event
-from aftbed.core.fault import FIRED, Action, Crash, Fault, Hang, Slow, Trigger
 from aftbed.core.journal import Entry, EntryKind
 from aftbed.ftm.compose import build
 from aftbed.ftm.registry import EMITTERS
+from aftbed.inject.crash import Crash
+from aftbed.inject.model import Fault, FaultAction
+from aftbed.inject.targets import Roles, emitting_node
+from aftbed.inject.timing import Trigger
 from aftbed.judge.checks import VEHICLE
 from aftbed.judge.verdict import breaches
 from aftbed.runtime.sim.world import Run, Setup, World, simulate
-from aftbed.runtime.targets import emitter
 from aftbed.runtime.unix import linux
 from aftbed.vehicle.aeb.messages import STAGE_NONE, decode_reply, decode_request
 from aftbed.vehicle.plant import VehicleResult
@@ -104,7 +106,7 @@ def strike(course: Course, fault: Fault) -> Struck:
     """The drive of `course` with `fault`. Raises HarnessError if the simulator breaks down."""
     setup = replace(course.setup, faults=(fault,))
     run = _run(setup)
-    fired = all(found["receipt"] in FIRED for found in run.faults)
+    fired = all(found.fired for found in run.faults)
     records = (record for journal in run.history.journals.values() for record in journal)
     struck_ns = min((r.t_ns for r in records if r.event is Event.FAULT_APPLIED), default=None)
     t_ms = (struck_ns - course.began_ns) / 1e6 if fired and struck_ns is not None else None
@@ -138,13 +140,13 @@ def _events(setup: Setup) -> Iterator[str]:
     """What is emitted on the leader's side under this mechanism."""
     graph = build(setup.ftm, setup.placement)
     for event, (_, of_backup) in EMITTERS.items():
-        if not of_backup and emitter(graph, event.label, LEADER, BACKUP) is not None:
+        if not of_backup and emitting_node(Roles(graph, LEADER, BACKUP), event.label) is not None:
             yield event.label
 
 
 def _counted(run: Run, event: str) -> Iterator[tuple[int, int]]:
     """Each request with the how manieth of these events its first one is."""
-    node = emitter(run.rest.graph, event, LEADER, BACKUP)
+    node = emitting_node(Roles(run.rest.graph, LEADER, BACKUP), event)
     records = (record for journal in run.history.journals.values() for record in journal)
     found = sorted((r for r in records if r.node == node and r.event.label == event), key=lambda r: r.t_ns)
     seen: set[int] = set()
@@ -245,7 +247,7 @@ def _decided(world: World, fault: Fault, last_ns: int) -> Outcome:
         result = found.vehicle
         assert result is not None, "a course has a car"
         if result.collision or result.stop_gap_m is not None or until_ns > last_ns:
-            return Outcome(result, all(told["receipt"] in FIRED for told in found.faults))
+            return Outcome(result, all(told.fired for told in found.faults))
 
 
 # -- The worst instant: when a fault harms the car most, searched on the simulator.
@@ -304,7 +306,7 @@ class Instant(msgspec.Struct, frozen=True):
     place: int
 
 
-def worst_instant(course: Course, action: Action, target: str) -> Worst | None:
+def worst_instant(course: Course, action: FaultAction, target: str) -> Worst | None:
     """Search; None if the fault struck at none of the instants. Raises HarnessError."""
     return _Search(course, action, target).run()
 
@@ -322,7 +324,7 @@ class _Tried(NamedTuple):
 
 
 class _Search:
-    def __init__(self, course: Course, action: Action, target: str) -> None:
+    def __init__(self, course: Course, action: FaultAction, target: str) -> None:
         self._course, self._action, self._target = course, action, target
         self._over_ms = _over_ms(course, action)
         self._tried: dict[Trigger, _Tried | None] = {}  # None where the fault did not strike
@@ -431,7 +433,7 @@ def _changes(course: Course) -> list[int]:
     return [at for at, (a, b) in enumerate(pairwise(course.cycles), 1) if a.stage != b.stage]
 
 
-def _over_ms(course: Course, action: Action) -> float:
+def _over_ms(course: Course, action: FaultAction) -> float:
     """When all is over: after the last instant of the search the fault ends, and what it led to."""
-    length_ms = action.for_ms if isinstance(action, Hang | Slow) else 0
+    length_ms = action.lasts_ms
     return course.cycles[span(course)[1]].t_ms + length_ms + AFTER_MS

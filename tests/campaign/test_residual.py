@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from roads import sudden_course
 
-from aftbed.core.fault import Hang
+from aftbed.inject.hang import Hang
 from aftbed.search.road_table import closing_speed_ms, impact_kmh, residual_kmh
 from aftbed.search.worst_instant import worst_instant
 from aftbed.vehicle.plant import KMH_PER_MS, LeadCar, Plant, PlantSetup, VehicleResult

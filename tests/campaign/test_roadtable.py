@@ -5,8 +5,9 @@ from typing import Final
 import pytest
 from msgspec.structs import replace
 
-from aftbed.core.fault import Crash, Fault, Trigger
-from aftbed.inject.words import parse
+from aftbed.inject.crash import Crash
+from aftbed.inject.model import Fault, parse
+from aftbed.inject.timing import Trigger
 from aftbed.search.road_table import PRIMARY, Drive, Line, Row, drive, driven, drives, outage
 from aftbed.vehicle.scenarios.tables import Case, cases
 

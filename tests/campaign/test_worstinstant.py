@@ -12,8 +12,10 @@ from msgspec.structs import replace
 from roads import near_course, sudden_course
 
 from aftbed.core.errors import HarnessError
-from aftbed.core.fault import Action, Crash, Fault, Hang, Trigger
-from aftbed.inject.words import parse
+from aftbed.inject.crash import Crash
+from aftbed.inject.hang import Hang
+from aftbed.inject.model import Fault, FaultAction, parse
+from aftbed.inject.timing import Trigger
 from aftbed.runtime.sim.world import Setup, simulate
 from aftbed.search import worst_instant as search_worst_instant
 from aftbed.search.worst_instant import (
@@ -40,7 +42,7 @@ def near(tmp_path_factory: pytest.TempPathFactory) -> Course:
     return near_course(tmp_path_factory.mktemp("near"), "none")
 
 
-def every_cycle(course: Course, action: Action) -> list[float]:
+def every_cycle(course: Course, action: FaultAction) -> list[float]:
     """The gap that is left by a fault at each cycle of the search, without any clever choice."""
 
     def branches() -> Iterator[Branch]:

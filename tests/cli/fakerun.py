@@ -7,10 +7,10 @@ from typing import Final
 import msgspec
 
 from aftbed.core.errors import ConfigError
-from aftbed.core.fault import Fault
 from aftbed.core.graph import Graph
 from aftbed.core.messages import Goal
 from aftbed.ftm.compose import build
+from aftbed.inject.model import Fault
 from aftbed.runtime.unix import control_client
 
 Call = Callable[..., tuple[int, str, str]]  # `aftbed` with these arguments: exit code, output, errors

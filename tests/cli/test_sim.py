@@ -14,8 +14,10 @@ from fakerun import Call, Output
 from msgspec.structs import replace
 
 from aftbed.cli.sim import SHRUNK_MAX, repeating
-from aftbed.core.fault import Crash, Fault, Trigger
 from aftbed.core.messages import Goal, Scheduled
+from aftbed.inject.crash import Crash
+from aftbed.inject.model import Fault
+from aftbed.inject.timing import Trigger
 from aftbed.runtime.sim.world import Doom, Setup
 from aftbed.runtime.unix.worker_pool import each
 from aftbed.search.agreement import Agreement, Times, apart

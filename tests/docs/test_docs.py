@@ -14,8 +14,8 @@ from aftbed.core.events import BY_LABEL, REQUEST_PATH
 from aftbed.core.graph import PLACEMENTS
 from aftbed.ftm.compose import EXPRESSIONS, build
 from aftbed.ftm.registry import EMITTERS
+from aftbed.inject import targets
 from aftbed.judge.verdict import EXIT_CODES, EXIT_INTERRUPTED
-from aftbed.runtime import targets
 from aftbed.vehicle.can.candump import Refusal
 from aftbed.vehicle.can.dbc_file import load_dbc
 from aftbed.vehicle.ecus import BRAKE_POLICIES

@@ -9,14 +9,15 @@ from typing import Final
 
 import pytest
 
+from aftbed.core.errors import StepFailed
 from aftbed.core.events import Event
-from aftbed.core.fault import Fault
 from aftbed.ftm.compose import build
-from aftbed.inject.words import parse
+from aftbed.inject import model
+from aftbed.inject.model import Fault, parse
 from aftbed.runtime import control
-from aftbed.runtime.faults import Faults
+from aftbed.runtime.fault_controller import FaultController
 from aftbed.runtime.interface import ProcessKind
-from aftbed.runtime.jobs import StepFailed, Wait
+from aftbed.runtime.jobs import Wait
 from aftbed.runtime.unix.event_loop import Loop
 from aftbed.runtime.unix.journal_files import Journal
 from aftbed.runtime.unix.support import Support
@@ -126,7 +127,7 @@ class Run:
             seed,
         )
         self.deployment.support = support
-        self.faults = Faults(self.deployment)  # type: ignore[arg-type]
+        self.faults = FaultController(self.deployment)  # type: ignore[arg-type]
 
     def do(self, steps: Generator[Wait, object, None]) -> list[Wait]:
         """Run a job to its end; what it waited for, all of which is so."""
@@ -143,12 +144,16 @@ class Run:
         self.do(self.faults.arm(fault))
         return fault
 
-    def blow(self) -> tuple[str, control.Blow]:
-        """The node and the blow of the last order."""
+    def reports(self) -> list[tuple[str, str, str]]:
+        """The words, the receipt and the detail of each fault."""
+        return [(one.fault, one.receipt.value, one.detail) for one in self.faults.reports()]
+
+    def last_armed(self) -> tuple[str, model.ArmedFault]:
+        """The node and the fault of the last order."""
         node, order = self.deployment.told[-1]
         assert not isinstance(order, control.SlowDown)
-        (blow,) = order.blows if isinstance(order, control.Arm) else (order.blow,)
-        return node, blow
+        (armed,) = order.faults if isinstance(order, control.Arm) else (order.fault,)
+        return node, armed
 
     def happened(self, node: str, event: Event, times: int, detail: int = 0, t_ns: int = 2**62) -> None:
         for request_id in range(1, times + 1):

@@ -4,24 +4,17 @@ from hypothesis import strategies as st
 
 from aftbed.core.busfault import QUANTITIES, Condition
 from aftbed.core.events import Event
-from aftbed.core.fault import (
-    HANG_FOREVER_MS,
-    LATER,
-    SHARE_MAX,
-    SHARE_MIN,
-    SLOW_MS_MAX,
-    Crash,
-    Disturb,
-    Fault,
-    FlipMemory,
-    Hang,
-    How,
-    Slow,
-    Trigger,
-)
-from aftbed.core.persistence import ONCE, Chance, Every, Permanent
 from aftbed.core.units import DURATION_MS_MAX
-from aftbed.core.valuefault import BIT_MAX, BITS_MAX, Bit, Bits, Burst, Byte, Flip, Place, Stuck
+from aftbed.inject.bit_patterns import BIT_MAX, BITS_MAX, Bit, BitBurst, Bits, Byte, StuckBit
+from aftbed.inject.channel import HOLDING, ChannelFault, Disturbance
+from aftbed.inject.crash import Crash
+from aftbed.inject.hang import FOREVER_MS, Hang
+from aftbed.inject.memory import MemoryFlip
+from aftbed.inject.model import Fault
+from aftbed.inject.slow import SHARE_MAX, SHARE_MIN, SLOW_MS_MAX, Slow
+from aftbed.inject.state import StateFlip
+from aftbed.inject.timing import ONCE, Chance, Every, Permanent, Trigger
+from aftbed.inject.value import ValueFlip, ValuePlace
 
 durations = st.integers(1, DURATION_MS_MAX)
 after = st.builds(Trigger, after_ms=durations)
@@ -47,8 +40,8 @@ patterns = st.one_of(
     st.builds(Bit, st.none() | bits),
     st.builds(Bits, st.integers(1, BITS_MAX)),
     st.builds(Byte, st.none() | st.integers(0, BIT_MAX // 8)),
-    st.builds(Burst, st.integers(1, BITS_MAX), st.none() | bits),
-    st.builds(Stuck, bits, st.integers(0, 1)),
+    st.builds(BitBurst, st.integers(1, BITS_MAX), st.none() | bits),
+    st.builds(StuckBit, bits, st.integers(0, 1)),
 )
 persistences = st.one_of(
     st.just(ONCE),
@@ -57,14 +50,16 @@ persistences = st.one_of(
     st.builds(Chance, st.integers(1, 10**6).map(lambda millionths: millionths / 1e6)),
 )
 disturbances = st.one_of(
-    st.builds(Disturb, st.sampled_from(LATER), st.sampled_from(("pxy2pro", "aft2aft")), durations),
-    st.builds(Disturb, st.sampled_from([how for how in How if how not in LATER]), st.just("aft2pro")),
+    st.builds(ChannelFault, st.sampled_from(HOLDING), st.sampled_from(("pxy2pro", "aft2aft")), durations),
+    st.builds(
+        ChannelFault, st.sampled_from([how for how in Disturbance if how not in HOLDING]), st.just("aft2pro")
+    ),
 )
 fields = st.from_regex(r"[A-Za-z0-9_]{1,20}(\.[A-Za-z0-9_]{1,20})?", fullmatch=True)
 replicas = st.sampled_from(("primary", "backup", "a", "b"))
 faults = st.one_of(
     st.builds(Fault, st.just(Crash()), st.sampled_from(("primary", "b/after")), triggers),
-    st.builds(Fault, st.builds(Hang, st.just(HANG_FOREVER_MS) | durations), st.just("backup"), triggers),
+    st.builds(Fault, st.builds(Hang, st.just(FOREVER_MS) | durations), st.just("backup"), triggers),
     st.builds(
         Fault,
         st.builds(Slow, st.integers(1, round(SLOW_MS_MAX)), st.just(0) | durations),
@@ -91,10 +86,12 @@ faults = st.one_of(
     ),
     st.builds(
         Fault,
-        st.builds(FlipMemory, st.none() | st.integers(0, 7), st.none() | st.integers(0, 2**48 - 1)),
+        st.builds(MemoryFlip, st.none() | st.integers(0, 7), st.none() | st.integers(0, 2**48 - 1)),
         st.sampled_from(("primary", "b/after")),
         triggers,
     ),
-    st.builds(Fault, st.builds(Flip, st.sampled_from(Place), patterns), replicas, triggers, persistences),
-    st.builds(Fault, st.builds(Flip, st.just(Place.STATE), patterns, fields), replicas, triggers),
+    st.builds(
+        Fault, st.builds(ValueFlip, st.sampled_from(ValuePlace), patterns), replicas, triggers, persistences
+    ),
+    st.builds(Fault, st.builds(StateFlip, fields, patterns), replicas, triggers),
 )

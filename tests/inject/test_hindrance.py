@@ -17,10 +17,12 @@ import pytest
 from aftbed.core import messages
 from aftbed.core.brick import Brick, Effect, Send
 from aftbed.core.events import Event
-from aftbed.core.fault import Disturb, How, marked
 from aftbed.core.journal import FLAG_OFFSET, records
 from aftbed.core.messages import AnyMessage, Request
-from aftbed.core.persistence import Permanent
+from aftbed.inject import model
+from aftbed.inject.channel import ChannelFault, Disturbance
+from aftbed.inject.receipts import fault_and_bits
+from aftbed.inject.timing import Permanent
 from aftbed.runtime import control
 from aftbed.runtime.node import Node
 from aftbed.runtime.unix.journal_files import Journal
@@ -97,10 +99,12 @@ class Host:
         """Once the node looks at its orders, there is room."""
         self.order(control.Capture(control.UNANSWERED, BRICK))
 
-    def disturb(self, how: How, nth: int = 1, *, permanent: bool = False) -> control.Interfere:
-        blow = control.Blow(FAULT, BRICK, nth, Disturb(how, PORT), False)
+    def disturb(self, how: Disturbance, nth: int = 1, *, permanent: bool = False) -> control.Interfere:
+        blow = model.ArmedFault(FAULT, BRICK, nth, ChannelFault(how, PORT), False)
         if permanent:
-            blow = control.Blow(FAULT, BRICK, nth, Disturb(how, PORT), False, persistence=Permanent())
+            blow = model.ArmedFault(
+                FAULT, BRICK, nth, ChannelFault(how, PORT), False, persistence=Permanent()
+            )
         return control.Interfere(control.UNANSWERED, blow)
 
     def send(self, request_id: int) -> None:
@@ -129,9 +133,9 @@ def host(tmp_path: Path) -> Iterator[Host]:
 # -- full channels --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("how", How)
+@pytest.mark.parametrize("how", Disturbance)
 def test_a_fault_that_is_armed_while_its_sender_waits_for_room_strikes_what_comes_later(
-    host: Host, how: How
+    host: Host, how: Disturbance
 ) -> None:
     host.fill()
     host.order(host.disturb(how))
@@ -141,18 +145,18 @@ def test_a_fault_that_is_armed_while_its_sender_waits_for_room_strikes_what_come
     host.send(2)
     host.send(3)
     expected = {
-        How.OMISSION: [1, 3],
-        How.DELAY: [1],  # the rest is held back
-        How.DUPLICATE: [1, 2, 2, 3],
-        How.REORDER: [1, 3, 2],
+        Disturbance.OMISSION: [1, 3],
+        Disturbance.DELAY: [1],  # the rest is held back
+        Disturbance.DUPLICATE: [1, 2, 2, 3],
+        Disturbance.REORDER: [1, 3, 2],
     }
     assert host.out() == expected[how]
 
 
 def test_a_fault_that_is_lifted_while_what_it_let_through_waits_for_room_loses_none_of_it(host: Host) -> None:
-    host.node.carry_out(host.disturb(How.DUPLICATE, permanent=True), [])
+    host.node.carry_out(host.disturb(Disturbance.DUPLICATE, permanent=True), [])
     host.fill()
-    host.order(host.disturb(How.DUPLICATE, nth=0))
+    host.order(host.disturb(Disturbance.DUPLICATE, nth=0))
     host.drain()
     host.send(1)
     host.send(2)
@@ -160,7 +164,7 @@ def test_a_fault_that_is_lifted_while_what_it_let_through_waits_for_room_loses_n
 
 
 def test_what_is_disturbed_waits_for_room_as_anything_does(host: Host) -> None:
-    host.node.carry_out(host.disturb(How.OMISSION, nth=2), [])
+    host.node.carry_out(host.disturb(Disturbance.OMISSION, nth=2), [])
     host.fill()
     host.drain()
     for request_id in (1, 2, 3):
@@ -170,7 +174,7 @@ def test_what_is_disturbed_waits_for_room_as_anything_does(host: Host) -> None:
 
 def test_where_the_port_is_bound_elsewhere_meanwhile_it_is_not_sent(host: Host) -> None:
     """As without a fault: the brick has heard of it, and asks again for what it wants."""
-    host.node.carry_out(host.disturb(How.DUPLICATE), [])
+    host.node.carry_out(host.disturb(Disturbance.DUPLICATE), [])
     host.fill()
     other, reader = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     bind = control.BindOutput(control.UNANSWERED, BRICK, PORT, 2)
@@ -234,4 +238,4 @@ def test_it_is_written_down_when_it_is_felt_and_once(host: Host) -> None:
     for request_id in (1, 2):
         host.send(request_id)
     (word,) = [r for r in records(host.path.read_bytes()) if r.event is Event.FAULT_APPLIED]
-    assert marked(word.detail)[0] == FAULT
+    assert fault_and_bits(word.detail)[0] == FAULT

@@ -8,15 +8,24 @@ from hypothesis import strategies as st
 
 from aftbed.core.history import History
 from aftbed.core.journal import Entry, EntryKind
-from aftbed.core.valuefault import flipped
-from aftbed.judge.checks import REASONS_MAX, Check, Evidence, check_value, corruptions, wrong_replies
+from aftbed.inject.bit_patterns import flipped
+from aftbed.inject.model import FaultReport
+from aftbed.inject.receipts import ReceiptState
+from aftbed.judge.checks import (
+    REASONS_MAX,
+    Check,
+    Evidence,
+    check_value,
+    corruptions,
+    wrong_replies,
+)
 from aftbed.judge.record import RunRecord
 from aftbed.judge.reference import ReferenceRun, reference_run
 from aftbed.runtime.unix.options import LoadRun, RunOptions
 from aftbed.vehicle.aeb.function import default_application, sample_requests
 from aftbed.vehicle.aeb.messages import AebOutput, encode_reply
 
-FLIPPED: Final = [{"fault": "bitflip result in primary", "receipt": "applied"}]
+FLIPPED: Final = [FaultReport("bitflip result in primary", ReceiptState.APPLIED)]
 COUNT: Final = 8
 
 
@@ -108,10 +117,10 @@ def test_as_many_as_the_checker_of_one_history_counts(bits: dict[int, int]) -> N
     ("receipts", "finding"),
     [
         ([], None),
-        ([{"fault": "crash primary", "receipt": "applied"}], None),
+        ([FaultReport("crash primary", ReceiptState.APPLIED)], None),
         (FLIPPED, "pass"),
-        ([{"fault": "bitflip state in b", "receipt": "refused"}], "unknown"),
-        ([{"fault": "bitflip state in b", "receipt": "refused"}, *FLIPPED], "pass"),
+        ([FaultReport("bitflip state in b", ReceiptState.NOT_ACTIVATED)], "unknown"),
+        ([FaultReport("bitflip state in b", ReceiptState.NOT_ACTIVATED), *FLIPPED], "pass"),
     ],
 )
 def test_no_bit_flipped_proves_nothing(receipts: list[dict[str, str]], finding: str | None) -> None:

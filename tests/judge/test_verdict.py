@@ -9,6 +9,8 @@ from records import CRASH, FLIP, RecordInTheMaking, whole
 
 from aftbed.core.events import Event
 from aftbed.ftm.compose import build
+from aftbed.inject.model import FaultReport
+from aftbed.inject.receipts import ReceiptState
 from aftbed.judge.record import read_record
 from aftbed.judge.verdict import EXIT_CODES
 from aftbed.runtime.unix.options import COMMAND_GONE
@@ -41,7 +43,7 @@ def test_a_fault_that_was_survived_passes_and_is_told(path: Path) -> None:
     record.request(epoch=2, replica=2)
     verdict = record.verdict()
     assert (verdict.verdict, verdict.reasons) == ("pass", [])
-    assert verdict.faults == [{"fault": str(CRASH), "receipt": "applied"}]
+    assert verdict.faults == [FaultReport(str(CRASH), ReceiptState.APPLIED)]
     assert [(f.epoch, f.cause, f.detected_ms) for f in verdict.failovers] == [(2, "fault", 1.0)]
 
 
@@ -177,7 +179,7 @@ def test_an_end_that_somebody_wanted_is_none(path: Path, reason: str) -> None:
     assert record.verdict().verdict == "pass"
 
 
-@pytest.mark.parametrize("receipt", ["not_activated", "failed", "unknown"])
+@pytest.mark.parametrize("receipt", ["not_activated", "inject_error", "unknown"])
 def test_a_fault_that_did_not_fire_is_inconclusive(path: Path, receipt: str) -> None:
     record = whole(path, faults=(CRASH,))
     assert record.end is not None
@@ -191,7 +193,7 @@ def test_without_an_end_the_receipts_of_faults_are_not_known(path: Path) -> None
     record = whole(path, faults=(CRASH,))
     record.end = None
     verdict = record.verdict()
-    assert verdict.faults == [{"fault": str(CRASH), "receipt": "unknown"}]
+    assert verdict.faults == [FaultReport(str(CRASH), ReceiptState.UNKNOWN)]
     assert verdict.checks["faults_applied"] == "unknown"
 
 
@@ -248,7 +250,7 @@ def hit(path: Path, receipt: str = "applied", detail: str = "bit 8 of the result
 def test_a_value_fault_that_never_reached_the_client_passes(path: Path) -> None:
     verdict = hit(path).verdict()
     assert (verdict.verdict, verdict.checks["value"], verdict.requests.wrong) == ("pass", "pass", 0)
-    assert verdict.faults == [{"fault": str(FLIP), "receipt": "applied", "detail": "bit 8 of the result"}]
+    assert verdict.faults == [FaultReport(str(FLIP), ReceiptState.APPLIED, "bit 8 of the result")]
 
 
 def test_a_value_fault_that_did_fails_and_says_what_it_asked_of_the_brakes(path: Path) -> None:

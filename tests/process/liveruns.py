@@ -30,8 +30,8 @@ from homes import (
 )
 
 from aftbed.core.errors import ConfigError
-from aftbed.core.fault import Fault
 from aftbed.core.journal import EntryKind, entries
+from aftbed.inject.model import Fault
 from aftbed.judge.record import RunRecord, read_record
 from aftbed.judge.verdict import Verdict, judge
 from aftbed.runtime.unix import control_client, rundir

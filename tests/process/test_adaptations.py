@@ -13,10 +13,10 @@ import pytest
 from liveruns import Home, Outcome, Started, until
 
 from aftbed.core.errors import ConfigError
-from aftbed.core.fault import Fault
 from aftbed.core.journal import EntryKind
 from aftbed.core.messages import Goal
 from aftbed.ftm.compose import EXPRESSIONS, NONE, build
+from aftbed.inject.model import Fault
 from aftbed.runtime.unix import control_client
 from aftbed.runtime.unix.options import LoadRun
 

@@ -7,7 +7,7 @@ from liveruns import Home, Started, until
 
 from aftbed.core.events import Event
 from aftbed.core.journal import EntryKind
-from aftbed.inject.words import parse
+from aftbed.inject.model import parse
 from aftbed.runtime.unix import control_client
 from aftbed.runtime.unix.options import LoadRun
 from aftbed.runtime.unix.process_pool import Process
@@ -22,7 +22,7 @@ def test_a_follower_that_is_behind_is_waited_for(home: Home) -> None:
     fault = parse(f"slow backup by 20ms at server.exit nth {COUNT - 2}")
     outcome = Started(home, LoadRun(COUNT, 200.0), ftm="lfr", faults=(fault,)).finish()
     assert outcome.verdict.verdict == "pass", outcome.verdict.reasons
-    assert outcome.verdict.faults[0]["receipt"] in ("applied", "activated")
+    assert outcome.verdict.faults[0].receipt.value in ("applied", "activated")
     assert outcome.record.end is not None
     states = outcome.record.end["states"]
     assert isinstance(states, dict) and set(states) == {"a", "b"}

@@ -19,7 +19,7 @@ from aftbed.core.events import Event
 from aftbed.core.graph import PLACEMENTS
 from aftbed.core.journal import Record
 from aftbed.ftm.compose import EXPRESSIONS, replication_of
-from aftbed.inject.words import parse
+from aftbed.inject.model import parse
 from aftbed.judge.record import RunRecord, read_record
 from aftbed.judge.verdict import Verdict
 from aftbed.runtime.unix import control_client, rundir
@@ -45,8 +45,8 @@ class Ran:
     def __init__(self, done: Done, record: RunRecord) -> None:
         self.code, self.record = done.code, record
         self.verdict: Verdict = done.verdict()
-        self.receipts = [fault["receipt"] for fault in self.verdict.faults]
-        self.details = [fault.get("detail", "") for fault in self.verdict.faults]
+        self.receipts = [fault.receipt.value for fault in self.verdict.faults]
+        self.details = [fault.detail for fault in self.verdict.faults]
 
     def events(self, *wanted: Event) -> list[Record]:
         return self.record.history.events(*wanted)
@@ -273,7 +273,7 @@ def test_what_is_asked_while_a_run_starts_is_done_when_it_has(home: Home) -> Non
         started.wait_for("fault", "activated")
         control_client.ask(started.private, control_client.Stop())
         outcome = started.finish()
-    ((fault, receipt),) = [(fault["fault"], fault["receipt"]) for fault in outcome.verdict.faults]
+    ((fault, receipt),) = [(fault.fault, fault.receipt.value) for fault in outcome.verdict.faults]
     assert fault.startswith("bitflip") and receipt == "activated", "who has given up is not obeyed"
 
 
@@ -285,8 +285,8 @@ def test_after_a_while_the_next_execution_is_hit(home: Home) -> None:
         control_client.ask(started.private, control_client.Stop())
         outcome = started.finish()
     (fault,) = outcome.verdict.faults
-    assert fault["receipt"] == "activated"
-    assert fault["fault"] == "bitflip result bit 8 in a after 100ms"
+    assert fault.receipt.value == "activated"
+    assert fault.fault == "bitflip result bit 8 in a after 100ms"
     assert outcome.verdict.requests.wrong == 1
 
 

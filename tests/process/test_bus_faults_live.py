@@ -6,6 +6,8 @@ from typing import Final
 import pytest
 from liveruns import Command, Home, Started, aftbed
 
+from aftbed.inject.model import FaultReport
+from aftbed.inject.receipts import ReceiptState
 from aftbed.runtime.unix.options import CarRun
 
 pytestmark = pytest.mark.process
@@ -21,7 +23,7 @@ def test_a_drive_is_disturbed_and_the_receipt_says_how(tmp_path: Path) -> None:
         done = aftbed("run", *DRIVE, "--inject", words, "--record", record)
         assert done.code == 0, done.out + done.err
         detail = "1 frame, at 0.980000 s, id 130; noticed by gateway (checksum)"
-        expected = {"fault": words, "receipt": "activated", "detail": detail}
+        expected = FaultReport(words, ReceiptState.ACTIVATED, detail)
         assert done.verdict().faults == [expected]
         logs.append([line for line in (record / "bus.log").read_text().splitlines() if " 70" not in line])
     assert logs[0] == logs[1] and logs[0]
@@ -30,7 +32,7 @@ def test_a_drive_is_disturbed_and_the_receipt_says_how(tmp_path: Path) -> None:
 def test_the_end_counts_all_that_was_struck() -> None:
     done = aftbed("run", *DRIVE, "--inject", "duplicate bus EGO_STATE after 1s for 205ms")
     (found,) = done.verdict().faults
-    assert found["receipt"] == "activated" and found["detail"].startswith(
+    assert found.receipt.value == "activated" and found.detail.startswith(
         "21 frames, the first at 1.000000 s"
     )
 
@@ -39,21 +41,21 @@ def test_a_silence_is_noticed_by_a_brake_that_falls_back() -> None:
     done = aftbed("run", *DRIVE, "--inject", "omission bus AEB_REQ after 1s for 100ms")
     (found,) = done.verdict().faults
     detail = "5 frames, the first at 1.000000 s, id 100; noticed by brake (fallback)"
-    assert (found["receipt"], found["detail"]) == ("activated", detail)
+    assert (found.receipt.value, found.detail) == ("activated", detail)
 
 
 def test_a_fault_on_a_condition_in_real_time() -> None:
     words = "bus-off gateway when gap < 15 for 100ms"
     done = aftbed("run", "--scenario", "ccrs-20", "--pace", "4", "--json", "--inject", words)
     (found,) = done.verdict().faults
-    assert found["receipt"] == "activated", done.out
+    assert found.receipt.value == "activated", done.out
     assert done.verdict().vehicle is not None and done.code == 0, done.out
 
 
 def test_a_fault_that_never_strikes_proves_nothing() -> None:
     done = aftbed("run", *DRIVE, "--inject", "omission bus RADAR_TRACK nth 100000")
     assert done.code == 3
-    assert [fault["receipt"] for fault in done.verdict().faults] in (["armed"], ["not_activated"])
+    assert [fault.receipt.value for fault in done.verdict().faults] in (["armed"], ["not_activated"])
 
 
 def test_a_live_run_is_disturbed_from_a_second_command(home: Home) -> None:
@@ -65,8 +67,8 @@ def test_a_live_run_is_disturbed_from_a_second_command(home: Home) -> None:
         started.wait_for("fault", "activated")
         outcome = started.finish()
     (found,) = outcome.verdict.faults
-    assert found["receipt"] == "activated", found
-    assert "noticed by brake (" in found["detail"], found  # the sign depends on who is late
+    assert found.receipt.value == "activated", found
+    assert "noticed by brake (" in found.detail, found  # the sign depends on who is late
     assert outcome.verdict.verdict == "pass"
 
 

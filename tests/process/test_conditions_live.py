@@ -10,11 +10,12 @@ from typing import Final
 import pytest
 from liveruns import Home, Started, aftbed, under_load, until
 
+from aftbed.core.errors import StepFailed
 from aftbed.core.events import Event
-from aftbed.core.fault import FlipMemory
 from aftbed.core.journal import EntryKind
-from aftbed.inject.words import parse
-from aftbed.runtime.jobs import StepFailed
+from aftbed.inject.memory import MemoryFlip
+from aftbed.inject.model import FaultReport, parse
+from aftbed.inject.receipts import ReceiptState
 from aftbed.runtime.sim.world import Setup, simulate
 from aftbed.runtime.unix import control_client, memory, rundir
 from aftbed.runtime.unix.options import CarRun, LoadRun
@@ -46,10 +47,10 @@ def test_in_lockstep_faults_begin_at_the_very_steps_of_the_simulator() -> None:
     run = simulate(Setup(scenario=SCENARIO, faults=tuple(map(parse, WORDS))))
     assert done.verdict().faults == list(run.faults)
     delayed, slowed, crashed, never = done.verdict().faults
-    assert delayed["detail"] == "a message of client about request 76; ttc < 2.5 at 1.500000 s"
-    assert slowed["detail"] == "ttc < 2.2 at 1.800000 s"
-    assert crashed["detail"] == "ttc < 1.995 at 2.005000 s" and crashed["receipt"] == "activated"
-    assert never == {"fault": NEVER, "receipt": "not_activated", "detail": "gap < 0.1 never held"}
+    assert delayed.detail == "a message of client about request 76; ttc < 2.5 at 1.500000 s"
+    assert slowed.detail == "ttc < 2.2 at 1.800000 s"
+    assert crashed.detail == "ttc < 1.995 at 2.005000 s" and crashed.receipt.value == "activated"
+    assert never == FaultReport(NEVER, ReceiptState.NOT_ACTIVATED, "gap < 0.1 never held")
 
 
 def test_in_real_time_the_car_drives_on_and_the_receipt_says_how_far_behind_the_effect_was(
@@ -59,8 +60,8 @@ def test_in_real_time_the_car_drives_on_and_the_receipt_says_how_far_behind_the_
     with Started(home, CarRun(SCENARIO, 4.0, "latch"), faults=faults) as run:
         outcome = run.finish()
     (found,) = outcome.verdict.faults
-    lag = re.fullmatch(r"gap < 15 at 1\.3\d+ s, (\d+\.\d\d) ms before", found["detail"])
-    assert found["receipt"] == "activated" and lag is not None and 0 < float(lag[1]) < 1000, found
+    lag = re.fullmatch(r"gap < 15 at 1\.3\d+ s, (\d+\.\d\d) ms before", found.detail)
+    assert found.receipt.value == "activated" and lag is not None and 0 < float(lag[1]) < 1000, found
     assert len(outcome.verdict.failovers) == 1
 
 
@@ -72,7 +73,7 @@ def test_a_live_run_is_given_one_from_a_second_command(home: Home) -> None:
         run.wait_for("met")
         control_client.ask(run.private, control_client.Stop())
         (found,) = run.finish().verdict.faults
-    assert found["receipt"] == "activated" and "speed > 5 at " in found["detail"]
+    assert found.receipt.value == "activated" and "speed > 5 at " in found.detail
 
 
 def test_a_load_has_no_car(home: Home) -> None:
@@ -98,7 +99,7 @@ def test_a_replica_with_a_small_share_takes_longer_and_then_no_longer(home: Home
     slow = sorted(took[n] for n in range(first + 5, first + 15))[5]
     healed = sorted(took[n] for n in range(last, count + 1))[10]
     assert slow > 3 * calm and healed < slow / 2, (calm, slow, healed)
-    assert outcome.verdict.faults[0]["receipt"] == "activated"
+    assert outcome.verdict.faults[0].receipt.value == "activated"
     assert outcome.verdict.requests.answered == count
     assert not outcome.record.history.events(Event.WATCHDOG_SUSPECT)
 
@@ -130,7 +131,7 @@ def test_a_bit_of_a_nodes_memory_is_another_one_and_of_no_other_node(home: Home)
         assert memory.peek(other, address) == before, "forked from the same zygote, and not the same memory"
         control_client.ask(run.private, control_client.Stop())
         outcome = run.finish()
-    assert outcome.verdict.faults[0]["receipt"] == "applied"
+    assert outcome.verdict.faults[0].receipt.value == "applied"
 
 
 def unused(owner: memory.Owner) -> int:
@@ -163,14 +164,14 @@ def test_what_is_no_memory_of_the_process_is_the_injectors_failure(home: Home) -
         said = str(run.wait_for("fault", "inject_error")["text"])
         assert f"address {first:#x}: in no private memory that a/server (pid" in said
         run.launched.stop()
-        assert run.finish().verdict.faults[0]["receipt"] == "inject_error"
+        assert run.finish().verdict.faults[0].receipt.value == "inject_error"
 
 
 def test_a_process_of_another_run_is_not_struck(home: Home) -> None:
     with under_load(home, 4000, 200.0) as run:
         owner = memory.Owner("a/server", run.pid("a/server"), rundir.root() / "000000")
         with pytest.raises(StepFailed, match=r"a/server \(pid \d+\) is no process of this run"):
-            memory.flip(owner, FlipMemory(), 1)
+            memory.flip(owner, MemoryFlip(), 1)
         run.launched.stop()
         run.finish()
 
@@ -200,4 +201,4 @@ def test_memory_is_struck_from_a_second_command(home: Home) -> None:
         until(lambda: any("bit 0 of byte" in str(e["text"]) for e in run.heard()), "the flip")
         run.launched.stop()
         (found,) = run.finish().verdict.faults
-    assert found["receipt"] == "applied" and " in b/" in found["detail"]
+    assert found.receipt.value == "applied" and " in b/" in found.detail

@@ -12,10 +12,13 @@ from hypothesis import strategies as st
 from liveruns import Home, Started, under_load, until
 
 from aftbed.core.errors import ConfigError, HarnessError
-from aftbed.core.fault import Crash, Fault, Hang, Trigger
 from aftbed.core.messages import PACKET_BYTES_MAX
 from aftbed.ftm.compose import build
-from aftbed.runtime import targets
+from aftbed.inject import targets
+from aftbed.inject.crash import Crash
+from aftbed.inject.hang import Hang
+from aftbed.inject.model import Fault
+from aftbed.inject.timing import Trigger
 from aftbed.runtime.unix import control_client, rundir
 
 pytestmark = pytest.mark.process

@@ -44,7 +44,7 @@ def assert_masked(verdict: Verdict, failovers: int, faults: int = 1) -> None:
     assert verdict.vehicle is not None
     assert not verdict.vehicle.collision
     assert len(verdict.failovers) == failovers
-    assert [fault["receipt"] for fault in verdict.faults] == ["activated"] * faults
+    assert [fault.receipt.value for fault in verdict.faults] == ["activated"] * faults
 
 
 @pytest.mark.parametrize("event", POINTS)
@@ -122,4 +122,4 @@ def test_a_fault_that_never_fires_is_no_pass() -> None:
     done = aftbed(*DRIVE, "--inject", "crash primary at checkpoint.sent nth 100000")
     assert done.code == 3, done.out
     assert done.verdict().verdict == "inconclusive"
-    assert done.verdict().faults[0]["receipt"] == "armed"
+    assert done.verdict().faults[0].receipt.value == "armed"

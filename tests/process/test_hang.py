@@ -13,8 +13,10 @@ from liveruns import Home, Outcome, Started, ended, state_of, under_load, until
 from sampling import every
 
 from aftbed.core.events import Event
-from aftbed.core.fault import Fault, Hang, Trigger
 from aftbed.ftm.compose import build
+from aftbed.inject.hang import Hang
+from aftbed.inject.model import Fault
+from aftbed.inject.timing import Trigger
 from aftbed.runtime.unix import control_client
 from aftbed.runtime.unix.options import LoadRun
 

@@ -7,9 +7,9 @@ import pytest
 from liveruns import Home, Outcome, Started, aftbed, under_load
 
 from aftbed.core.events import Event
-from aftbed.core.fault import marked
 from aftbed.core.journal import EntryKind
-from aftbed.inject.words import parse
+from aftbed.inject.model import parse
+from aftbed.inject.receipts import fault_and_bits
 from aftbed.runtime.unix import control_client
 from aftbed.runtime.unix.options import LoadRun
 
@@ -41,7 +41,7 @@ def latencies_ms(outcome: Outcome) -> dict[int, float]:
 
 
 def receipts(outcome: Outcome) -> list[str]:
-    return [fault["receipt"] for fault in outcome.verdict.faults]
+    return [fault.receipt.value for fault in outcome.verdict.faults]
 
 
 def struck(outcome: Outcome) -> list[int]:
@@ -150,7 +150,9 @@ def test_a_bit_that_lasts_is_of_the_process_that_it_hit(home: Home) -> None:
     crash = "crash primary at reply.sent nth 20"
     outcome = ran(home, "pbr", "bitflip result nth 5 permanent", crash)
     assert struck(outcome) == list(range(5, 21)) and outcome.verdict.requests.wrong == 16
-    bits = [marked(r.detail) for r in outcome.record.history.events(Event.FAULT_APPLIED) if r.request_id]
+    bits = [
+        fault_and_bits(r.detail) for r in outcome.record.history.events(Event.FAULT_APPLIED) if r.request_id
+    ]
     assert len(set(bits)) == 1
     assert receipts(outcome) == ["activated", "activated"] and len(outcome.verdict.failovers) == 1
     assert_healed(outcome, 5)
@@ -186,7 +188,7 @@ def test_a_live_run_is_struck_from_a_second_command(
         done = aftbed("inject", *arguments)
         assert done.code == 0 and f": {fault}" in done.err, done.err
         outcome = run.finish()
-    assert outcome.verdict.faults[0]["fault"] == fault
+    assert outcome.verdict.faults[0].fault == fault
     assert receipts(outcome)[0] in ("activated", "applied")
     assert outcome.verdict.requests.answered == STRUCK
 

@@ -8,7 +8,7 @@ import pytest
 from liveruns import Home, Outcome, Started, aftbed, under_load, until
 
 from aftbed.core.events import Event
-from aftbed.inject.words import parse
+from aftbed.inject.model import parse
 from aftbed.runtime.unix import control_client
 from aftbed.runtime.unix.cells import NAME
 from aftbed.runtime.unix.options import LoadRun
@@ -31,7 +31,7 @@ def ran(home: Home, ftm: str, *texts: str, placement: str = "process") -> Outcom
 
 
 def receipts(outcome: Outcome) -> list[str]:
-    return [fault["receipt"] for fault in outcome.verdict.faults]
+    return [fault.receipt.value for fault in outcome.verdict.faults]
 
 
 def cells(pid: int) -> set[str]:
@@ -49,7 +49,7 @@ def held(run: Started) -> dict[str, set[str]]:
 def test_under_pbr_it_is_wrong_from_there_on(home: Home, placement: str) -> None:
     outcome = ran(home, "pbr", f"{FLIP} at request.received nth {HIT}", placement=placement)
     assert receipts(outcome) == ["activated"]
-    assert outcome.verdict.faults[0]["detail"] == "bit 0 of state.counter in a/server, taken over"
+    assert outcome.verdict.faults[0].detail == "bit 0 of state.counter in a/server, taken over"
     assert outcome.verdict.requests.wrong == COUNT - HIT + 1
     assert outcome.verdict.checks["value"] == "fail" and outcome.verdict.failovers == []
 
@@ -65,7 +65,7 @@ def test_under_pbr_and_tr_it_is_outvoted(home: Home) -> None:
 def test_a_state_that_is_refused_ends_its_node_and_the_backup_takes_over(home: Home) -> None:
     outcome = ran(home, "pbr", f"{REFUSED} at reply.sent nth {HIT}")
     assert receipts(outcome) == ["activated"]
-    assert "refused: its node has ended itself" in outcome.verdict.faults[0]["detail"]
+    assert "refused: its node has ended itself" in outcome.verdict.faults[0].detail
     assert outcome.verdict.verdict == "pass", outcome.verdict.reasons
     assert len(outcome.verdict.failovers) == 1
     assert len(outcome.record.history.events(Event.DETECTED_STOP)) == 1

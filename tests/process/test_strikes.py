@@ -28,9 +28,11 @@ from test_adaptations import (
 
 from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.core.events import Event
-from aftbed.core.fault import Crash, Fault, Trigger
+from aftbed.core.graph import STAGED
 from aftbed.core.messages import Goal
-from aftbed.runtime.targets import STAGED
+from aftbed.inject.crash import Crash
+from aftbed.inject.model import Fault
+from aftbed.inject.timing import Trigger
 from aftbed.runtime.unix import control_client
 from aftbed.search.explore import WHEN, Strike, strikes
 
@@ -88,7 +90,7 @@ def walk(home: Home, placement: str, todo: Iterable[Strike]) -> int:
                     at = strike(run, done[-1], placement)
                 outcome = ended(run)
                 assert_nothing_happened_to_requests(outcome)
-                receipts = [f["receipt"] for f in outcome.verdict.faults]
+                receipts = [f.receipt.value for f in outcome.verdict.faults]
                 assert receipts == ["activated"] * len(done), list(zip(receipts, done, strict=True))
             except (AssertionError, HarnessError, pytest.fail.Exception) as error:
                 print(f"BROKEN at {done[-1]}, the last of {len(done)}: {error}")

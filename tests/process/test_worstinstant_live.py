@@ -6,7 +6,9 @@ from typing import Final
 import pytest
 from liveruns import aftbed
 
-from aftbed.core.fault import Action, Crash, Hang
+from aftbed.inject.crash import Crash
+from aftbed.inject.hang import Hang
+from aftbed.inject.model import FaultAction
 from aftbed.runtime.sim.world import Setup
 from aftbed.search.road_table import PRIMARY, repeat
 from aftbed.search.worst_instant import course_of, worst_instant
@@ -19,7 +21,7 @@ LOST_M_MAX: Final = 0.05
 OUTAGE_M: Final = 300 / 1000 * 20 / 3.6
 
 
-def searched(ftm: str, action: Action) -> tuple[list[str], VehicleResult, VehicleResult]:
+def searched(ftm: str, action: FaultAction) -> tuple[list[str], VehicleResult, VehicleResult]:
     """The command for real processes; what the drive is without the fault, and with it, simulated."""
     course = course_of(Setup(ftm, scenario=SCENARIO))
     worst = worst_instant(course, action, PRIMARY)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from aftbed.adapt.schedule import scheduled
 from aftbed.core.script import RECIPES
 from aftbed.ftm.compose import build
-from aftbed.inject.words import parse
+from aftbed.inject.model import parse
 from aftbed.report.happenings import KEPT_MAX
 from aftbed.report.plots import POINTS_MAX, Limit, axis_of, ecdf
 from aftbed.report.spacetime import space_time

@@ -4,7 +4,9 @@ import re
 
 import pytest
 
-from aftbed.core.fault import Crash, Fault, Trigger
+from aftbed.inject.crash import Crash
+from aftbed.inject.model import Fault
+from aftbed.inject.timing import Trigger
 from aftbed.judge.verdict import Breach
 from aftbed.report.sequence import escaped, mermaid, text
 from aftbed.runtime.sim.trace import Trace, traced

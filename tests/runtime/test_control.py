@@ -15,11 +15,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from aftbed.core import script
-from aftbed.core.busfault import BusFault, Condition
+from aftbed.core.busfault import Condition
 from aftbed.core.errors import PeerError
-from aftbed.core.fault import Crash, Fault, Hang, Trigger
 from aftbed.core.messages import PACKET_BYTES_MAX
-from aftbed.inject.buswords import parse
+from aftbed.inject.bus import BusFault, read_bus_fault
+from aftbed.inject.crash import Crash
+from aftbed.inject.hang import Hang
+from aftbed.inject.model import Fault
+from aftbed.inject.timing import Trigger
 from aftbed.runtime import control
 from aftbed.runtime.unix.line import FDS_MAX, Line, decode_order, decode_report
 from aftbed.runtime.unix.packets import STATE_BYTES_MAX
@@ -76,7 +79,7 @@ def any_of(kind: Any) -> st.SearchStrategy[Any]:
 
 BUS_FAULTS: Final = tuple(
     map(
-        parse,
+        read_bus_fault,
         (
             "omission bus A nth 5",
             "corrupt bus from radar signal B=-1.5 crc good when ttc < 1.2 for 3ms",

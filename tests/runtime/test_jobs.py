@@ -6,7 +6,8 @@ from typing import Final
 
 import pytest
 
-from aftbed.runtime.jobs import EARLY_MAX, STEP_SECONDS_MAX, Jobs, Key, StepFailed, Steps, Wait
+from aftbed.core.errors import StepFailed
+from aftbed.runtime.jobs import EARLY_MAX, STEP_SECONDS_MAX, Jobs, Key, Steps, Wait
 
 ONE: Final[Key] = ("ack", "a/after", 1)
 TWO: Final[Key] = ("ack", "b/after", 2)

@@ -21,11 +21,13 @@ from aftbed.core import messages
 from aftbed.core.brick import Brick, Effect, Note, Order, Send
 from aftbed.core.errors import PeerError
 from aftbed.core.events import Event
-from aftbed.core.fault import Disturb, How
 from aftbed.core.journal import FLAG_OFFSET, records
 from aftbed.core.messages import AnyMessage, Rebound, Reply, Request
 from aftbed.core.script import Script
-from aftbed.core.valuefault import Bit, Flip, Place
+from aftbed.inject import model
+from aftbed.inject.bit_patterns import Bit
+from aftbed.inject.channel import ChannelFault, Disturbance
+from aftbed.inject.value import ValueFlip, ValuePlace
 from aftbed.runtime import control
 from aftbed.runtime.node import Node
 from aftbed.runtime.unix import packets
@@ -33,8 +35,8 @@ from aftbed.runtime.unix.journal_files import Journal
 from aftbed.runtime.unix.line import Line, decode_order, decode_report
 from aftbed.runtime.unix.node_io import NUDGE, UnixIO, UnixNode
 
-FLIP: Final = control.Blow(7, "brick", 1, Flip(Place.RESULT, Bit(0)), False)
-OMISSION: Final = control.Blow(8, "brick", 1, Disturb(How.OMISSION, "out"), False)
+FLIP: Final = model.ArmedFault(7, "brick", 1, ValueFlip(ValuePlace.RESULT, Bit(0)), False)
+OMISSION: Final = model.ArmedFault(8, "brick", 1, ChannelFault(Disturbance.OMISSION, "out"), False)
 KINDS: Final = ("answer", "pass on", "note", "order", "refuse", "nothing")
 ORDERS: Final[dict[str, tuple[control.ToNode, ...]]] = {
     "capture": (control.Capture(1, "brick"),),

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aftbed.runtime.jobs import StepFailed
+from aftbed.core.errors import StepFailed
 from aftbed.runtime.unix import members, undo
 from aftbed.runtime.unix.undo import LATE_NS_MAX, Book, Ending, Ledger, Stopped, Undone
 

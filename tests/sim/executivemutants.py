@@ -34,9 +34,9 @@ from aftbed.adapt.engine import AdaptationEngine
 from aftbed.core import script
 from aftbed.core.graph import Graph
 from aftbed.core.messages import Rebound, TakeUp
-from aftbed.core.valuefault import Place
 from aftbed.ftm import failover
 from aftbed.ftm.failover import Recovery, Watchdog
+from aftbed.inject.value import ValuePlace
 from aftbed.runtime import exchange, transfer
 from aftbed.runtime.adaptations import Adaptations
 from aftbed.runtime.deployment import Deployment, Keys
@@ -141,7 +141,7 @@ def _backup_wrong() -> list[Setup]:
         adapted(
             "pbr",
             "lfr",
-            flip(Place.STATE, bit, "state.restored", nth, "backup"),
+            flip(ValuePlace.STATE, bit, "state.restored", nth, "backup"),
             crash_after("primary", 150),
             count=80,
         )

@@ -47,7 +47,6 @@ from aftbed.core.messages import (
     Trials,
     Watch,
 )
-from aftbed.core.valuefault import Place
 from aftbed.ftm import tr
 from aftbed.ftm.assertion import Acceptable, AssertAfter
 from aftbed.ftm.chain import Protocol, ProtocolState, RequestAge
@@ -57,6 +56,7 @@ from aftbed.ftm.lfr import LfrAfter, LfrBefore, LfrBeforeState
 from aftbed.ftm.pbr import PbrAfter, PbrAfterState
 from aftbed.ftm.server import Server
 from aftbed.ftm.tr import TrAfter, Vote
+from aftbed.inject.value import ValuePlace
 from aftbed.runtime.sim.world import Setup
 
 _IDLE, _BUSY = ProtocolState.IDLE, ProtocolState.BUSY
@@ -148,7 +148,7 @@ def _asked_meanwhile() -> list[Setup]:
     ]
 
 
-def _flips(ftm: str, place: Place, *bits: int) -> list[Setup]:
+def _flips(ftm: str, place: ValuePlace, *bits: int) -> list[Setup]:
     """In the first trial of a request, and in the second."""
     return [
         Setup(ftm, count=6, faults=(flip(place, bit, "server.exit", nth),)) for bit in bits for nth in (3, 4)
@@ -301,7 +301,7 @@ MECHANISMS: Final = (
         "TrAfter compares what is the same object, and never sees a difference",
         instead(tr, "equal", lambda one, other: True),
         OWN,
-        lambda: _flips("pbr+tr", Place.RESULT, 0),
+        lambda: _flips("pbr+tr", ValuePlace.RESULT, 0),
         "G4",
     ),
     Mutant(
@@ -309,7 +309,7 @@ MECHANISMS: Final = (
         "TrAfter sees no fault that hits only what the function remembers",
         instead(tr, "equal", lambda one, other: one.payload == other.payload),
         OWN,
-        lambda: _flips("pbr+tr", Place.STATE, *range(0, 400, 40)),
+        lambda: _flips("pbr+tr", ValuePlace.STATE, *range(0, 400, 40)),
         "G4",
     ),
     Mutant(
@@ -325,7 +325,7 @@ MECHANISMS: Final = (
         "TrAfter answers with the second trial where the first two differ",
         instead(TrAfter, "vote", lambda self, msg: Vote.MAJORITY),
         OWN,
-        lambda: _flips("lfr+tr", Place.RESULT, 0),
+        lambda: _flips("lfr+tr", ValuePlace.RESULT, 0),
         "G4",
     ),
     Mutant(
@@ -333,7 +333,7 @@ MECHANISMS: Final = (
         "TrAfter answers with the trial that no other one is equal to",
         wrapped(TrAfter, "reply_by_third", _minority),
         OWN,
-        lambda: _flips("tr", Place.RESULT, 0),
+        lambda: _flips("tr", ValuePlace.RESULT, 0),
         "G4",
     ),
     Mutant(
@@ -341,7 +341,7 @@ MECHANISMS: Final = (
         "AssertAfter lets any reply pass",
         wrapped(AssertAfter, "__init__", _gullible),
         OWN,
-        lambda: _flips("pbr+assert", Place.RESULT, 0, 1, 2),
+        lambda: _flips("pbr+assert", ValuePlace.RESULT, 0, 1, 2),
         "G4",
     ),
     Mutant(

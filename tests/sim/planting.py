@@ -11,9 +11,13 @@ from typing import Final, NamedTuple
 import msgspec
 
 from aftbed.core.brick import Brick, Effect, Machine, Moves
-from aftbed.core.fault import Crash, Fault, Hang, Trigger
 from aftbed.core.messages import Goal, Scheduled
-from aftbed.core.valuefault import Bit, Flip, Place
+from aftbed.inject.bit_patterns import Bit
+from aftbed.inject.crash import Crash
+from aftbed.inject.hang import Hang
+from aftbed.inject.model import Fault
+from aftbed.inject.timing import Trigger
+from aftbed.inject.value import ValueFlip, ValuePlace
 from aftbed.runtime.sim.world import Setup
 from aftbed.search import explore
 
@@ -215,6 +219,6 @@ def hang(target: str, for_ms: int, event: str, nth: int = 1) -> Fault:
     return Fault(Hang(for_ms), target, Trigger(event, nth))
 
 
-def flip(place: Place, bit: int, event: str, nth: int, target: str = "primary") -> Fault:
+def flip(place: ValuePlace, bit: int, event: str, nth: int, target: str = "primary") -> Fault:
     """One bit of one execution."""
-    return Fault(Flip(place, Bit(bit)), target, Trigger(event, nth))
+    return Fault(ValueFlip(place, Bit(bit)), target, Trigger(event, nth))

@@ -4,7 +4,8 @@ from typing import Final
 
 import pytest
 
-from aftbed.inject.words import parse
+from aftbed.inject.model import FaultReport, parse
+from aftbed.inject.receipts import ReceiptState
 from aftbed.runtime.sim.world import Run, Setup, World, simulate
 
 DRIVE: Final = "ccrs-20"
@@ -34,7 +35,7 @@ def drive(*faults: str, ftm: str = "pbr", seed: int = 1) -> Run:
 )
 def test_a_frame_is_struck_and_who_noticed_is_said(words: str, noticed: str, ftm: str) -> None:
     run = drive(words, ftm=ftm)
-    assert run.faults == ({"fault": words, "receipt": "activated", "detail": noticed},)
+    assert run.faults == (FaultReport(words, ReceiptState.ACTIVATED, noticed),)
     assert run.rest.why_not == ()
     assert run.vehicle is not None and not run.vehicle.collision
 
@@ -52,12 +53,12 @@ def test_a_held_back_track_makes_its_request_when_it_comes() -> None:
     sent = [e.t_ns for e in run.history.dialogue if e.kind.name == "SENT"]
     offsets = {round((t_ns - sent[-1]) / 1e6) % 20 for t_ns in sent}
     assert offsets == {0, 7}
-    assert run.faults[0]["receipt"] == "activated"
+    assert run.faults[0].receipt.value == "activated"
 
 
 def test_a_bus_that_is_cut_for_a_while_leaves_a_run_that_comes_to_rest() -> None:
     run = drive("bus-off gateway after 1s for 300ms", "partition radar|gateway after 2s for 300ms")
-    assert [fault["receipt"] for fault in run.faults] == ["activated", "activated"]
+    assert [fault.receipt.value for fault in run.faults] == ["activated", "activated"]
     assert run.rest.why_not == () and run.vehicle is not None and not run.vehicle.collision
 
 
@@ -68,9 +69,9 @@ def test_a_live_run_is_disturbed() -> None:
     world.inject(parse("omission bus AEB_REQ for 100ms"))
     world.end()
     (fault,) = world.outcome().faults
-    assert fault["receipt"] == "activated" and fault["detail"].startswith("5 frames")
+    assert fault.receipt.value == "activated" and fault.detail.startswith("5 frames")
 
 
 def test_a_fault_that_is_never_due_stays_armed() -> None:
     (fault,) = drive("omission bus RADAR_TRACK nth 100000").faults
-    assert fault["receipt"] in ("armed", "not_activated")
+    assert fault.receipt.value in ("armed", "not_activated")

@@ -7,7 +7,8 @@ import pytest
 from aftbed.core.errors import ConfigError
 from aftbed.core.events import Event
 from aftbed.core.journal import EntryKind
-from aftbed.inject.words import parse
+from aftbed.inject.model import FaultReport, parse
+from aftbed.inject.receipts import ReceiptState
 from aftbed.judge.verdict import Breach
 from aftbed.runtime.sim.world import Run, Setup, World, simulate
 from aftbed.search.shrink import shrink
@@ -32,7 +33,7 @@ def began_ns(run: Run) -> int:
 @pytest.mark.parametrize("ftm", ["pbr", "lfr", "pbr+tr"])
 def test_a_crash_strikes_at_the_step_of_its_condition(ftm: str, placement: str) -> None:
     run = drive("crash primary when ttc < 2", ftm=ftm, placement=placement)
-    words = {"fault": "crash primary when ttc < 2", "receipt": "activated", "detail": "ttc < 2 at 2.000000 s"}
+    words = FaultReport("crash primary when ttc < 2", ReceiptState.ACTIVATED, "ttc < 2 at 2.000000 s")
     assert run.faults == (words,)
     died_ns = {t_ns for t_ns, _ in run.struck}
     step_ns = began_ns(run) + HELD_US * 1000
@@ -44,7 +45,7 @@ def test_a_crash_strikes_at_the_step_of_its_condition(ftm: str, placement: str) 
 def test_a_step_between_two_cycles_of_the_radar_is_met_as_well() -> None:
     """Frames come each 20 ms, and nobody else would look at the car meanwhile."""
     (fault,) = drive("crash primary when ttc < 1.995").faults
-    assert fault["detail"] == "ttc < 1.995 at 2.005000 s"
+    assert fault.detail == "ttc < 1.995 at 2.005000 s"
 
 
 @pytest.mark.parametrize(
@@ -64,7 +65,7 @@ def test_a_step_between_two_cycles_of_the_radar_is_met_as_well() -> None:
 def test_every_fault_can_wait_for_one(words: str, struck: int) -> None:
     run = drive(words)
     (fault,) = run.faults
-    assert fault["receipt"] == "activated" and fault["detail"].endswith("ttc < 2 at 2.000000 s"), fault
+    assert fault.receipt.value == "activated" and fault.detail.endswith("ttc < 2 at 2.000000 s"), fault
     applied = run.history.events(Event.FAULT_APPLIED)
     requests = [r.request_id for r in applied if r.request_id]
     assert requests[:1] == ([struck] if struck else []), "counted from the step on"
@@ -73,8 +74,8 @@ def test_every_fault_can_wait_for_one(words: str, struck: int) -> None:
 
 def test_a_condition_that_holds_from_the_start_is_met_at_once() -> None:
     (fault,) = drive("delay pxy2pro by 3ms when speed > 1").faults
-    assert fault["receipt"] == "activated"
-    assert fault["detail"] == "a message of proxy about request 1; speed > 1 at 0.000000 s"
+    assert fault.receipt.value == "activated"
+    assert fault.detail == "a message of proxy about request 1; speed > 1 at 0.000000 s"
 
 
 @pytest.mark.parametrize(
@@ -88,18 +89,14 @@ def test_a_condition_that_holds_from_the_start_is_met_at_once() -> None:
 def test_a_condition_that_never_holds_activates_nothing(words: str) -> None:
     run = drive(words)
     assert run.faults == (
-        {
-            "fault": str(parse(words)),
-            "receipt": "not_activated",
-            "detail": f"{words.split(' when ')[1]} never held",
-        },
+        FaultReport(str(parse(words)), ReceiptState.NOT_ACTIVATED, f"{words.split(' when ')[1]} never held"),
     )
     assert run.history.dialogue == drive().history.dialogue, "to be looked at is nothing to the car"
 
 
 def test_who_drives_on_without_a_client_is_looked_at_too() -> None:
     run = drive("crash client when ttc < 2", "crash primary when ttc < 1.999")
-    assert [fault["detail"] for fault in run.faults] == ["ttc < 2 at 2.000000 s", "ttc < 1.999 at 2.001000 s"]
+    assert [fault.detail for fault in run.faults] == ["ttc < 2 at 2.000000 s", "ttc < 1.999 at 2.001000 s"]
     assert run.rest.why_not == ()
 
 
@@ -110,7 +107,7 @@ def test_a_live_run_is_struck_at_its_step() -> None:
     world.inject(parse("crash primary when ttc < 2"))
     world.end()
     (fault,) = world.outcome().faults
-    assert fault["detail"] == "ttc < 2 at 2.000000 s" and fault["receipt"] == "activated"
+    assert fault.detail == "ttc < 2 at 2.000000 s" and fault.receipt.value == "activated"
 
 
 @pytest.mark.parametrize(

@@ -18,10 +18,13 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from aftbed.core.events import Event
-from aftbed.core.fault import FIRED, Crash, Fault, Trigger
 from aftbed.core.journal import EntryKind
-from aftbed.core.valuefault import EXECUTED, Bit, Flip, Place
 from aftbed.ftm.compose import EXPRESSIONS, build, chain, parse, replication_of
+from aftbed.inject.bit_patterns import Bit
+from aftbed.inject.crash import Crash
+from aftbed.inject.model import Fault
+from aftbed.inject.timing import Trigger
+from aftbed.inject.value import EXECUTED, ValueFlip, ValuePlace
 from aftbed.judge import checks
 from aftbed.judge.verdict import breaches
 from aftbed.runtime.sim.clock import Clock
@@ -36,7 +39,10 @@ DETECTING: Final = tuple(e for e in DUPLEX if "assert" in parse(e) and "tr" not 
 ANY: Final = 10_000  # a number of an effect, modulo how many there are
 SLOW: Final = 16  # one of so many messages takes so many times longer
 SEEN: Final = 6  # the highest bit of a digit: flipped, it is none
-BITS: Final = {Place.RESULT: (0, 16), Place.STATE: (8, 15)}  # of the first digits; of the number of requests
+BITS: Final = {
+    ValuePlace.RESULT: (0, 16),
+    ValuePlace.STATE: (8, 15),
+}  # of the first digits; of the number of requests
 FEW: Final = settings.default.max_examples // 8
 
 seeds = st.integers(0, 2**32)
@@ -163,7 +169,7 @@ def test_one_replica_after_the_other_may_die(ftm: str, seed: int, event: Event) 
     faults = tuple(Fault(Crash(), "primary", Trigger(event.label, nth)) for nth in nths)
     world, run = played(Setup(ftm, "process", seed, 80, 2000.0, faults))
     assert_promises(world, run)
-    assert world.conductor.deployment.epoch == 1 + sum(f["receipt"] in FIRED for f in run.faults) > 1
+    assert world.conductor.deployment.epoch == 1 + sum(f.fired for f in run.faults) > 1
 
 
 def transient(ftm: str, role: str, count: int, random: Random) -> tuple[Fault, ...]:
@@ -173,7 +179,7 @@ def transient(ftm: str, role: str, count: int, random: Random) -> tuple[Fault, .
         if random.random() < 0.4:
             nth = 2 * request + len(found) + random.choice((1, 2))
             place = random.choice(EXECUTED)
-            flip = Flip(place, Bit(random.randrange(*BITS[place])))
+            flip = ValueFlip(place, Bit(random.randrange(*BITS[place])))
             found.append(Fault(flip, role, Trigger(Event.SERVER_EXIT.label, nth)))
     return tuple(found)
 
@@ -188,7 +194,7 @@ def test_one_value_fault_per_request_never_reaches_the_client(ftm: str, seed: in
     faults = tuple(f for role in roles for f in transient(ftm, role, count, random))
     world, run = played(Setup(ftm, "process", seed, count, faults=faults))
     assert_promises(world, run)
-    applied = sum(f["receipt"] in FIRED for f in run.faults)
+    applied = sum(f.fired for f in run.faults)
     votes = [r.detail for r in run.history.events(Event.VOTE_COMPARED)]
     assert (votes.count(3), votes.count(2)) == (applied, len(roles) * count - applied)
     assert run.history.events(Event.DETECTED_STOP) == [] and world.conductor.deployment.epoch == 1
@@ -203,7 +209,7 @@ def test_what_an_assertion_finds_stops_one_replica_and_the_other_goes_on(
 ) -> None:
     if role == "backup" and not ftm.startswith("lfr"):
         return  # it executes nothing
-    fault = Fault(Flip(Place.RESULT, Bit(SEEN)), role, Trigger(Event.SERVER_EXIT.label, nth))
+    fault = Fault(ValueFlip(ValuePlace.RESULT, Bit(SEEN)), role, Trigger(Event.SERVER_EXIT.label, nth))
     world, run = played(Setup(ftm, "process", seed, 5, faults=(fault,)))
     assert_promises(world, run)
     assert len(run.history.events(Event.DETECTED_STOP)) == 1
@@ -213,7 +219,7 @@ def test_what_an_assertion_finds_stops_one_replica_and_the_other_goes_on(
 @pytest.mark.parametrize("ftm", ["none", "pbr", "lfr"])
 def test_without_a_mechanism_against_it_a_value_fault_reaches_the_client(ftm: str) -> None:
     """What the tests above do is done: where nothing is there to find it, it is found by the check."""
-    fault = Fault(Flip(Place.RESULT, Bit(0)), "primary", Trigger(Event.SERVER_EXIT.label, 2))
+    fault = Fault(ValueFlip(ValuePlace.RESULT, Bit(0)), "primary", Trigger(Event.SERVER_EXIT.label, 2))
     _, run = played(Setup(ftm, count=3, faults=(fault,)))
     assert checks.wrong_replies(run.history, Counting()) == [2]
 

@@ -4,9 +4,14 @@ from typing import Final
 
 import pytest
 
-from aftbed.core.fault import Crash, Disturb, Fault, Hang, How, Trigger
 from aftbed.core.messages import Goal, Scheduled
-from aftbed.core.valuefault import Bit, Flip, Place
+from aftbed.inject.bit_patterns import Bit
+from aftbed.inject.channel import ChannelFault, Disturbance
+from aftbed.inject.crash import Crash
+from aftbed.inject.hang import Hang
+from aftbed.inject.model import Fault
+from aftbed.inject.timing import Trigger
+from aftbed.inject.value import ValueFlip, ValuePlace
 from aftbed.runtime.sim.world import Setup
 from aftbed.search.explore import attempt
 
@@ -30,7 +35,7 @@ FOUND: Final = {
         count=300,
         rate_hz=2000.0,
         faults=(
-            Fault(Flip(Place.CHECKPOINT, Bit(0)), "primary", Trigger("checkpoint.sent", 5)),
+            Fault(ValueFlip(ValuePlace.CHECKPOINT, Bit(0)), "primary", Trigger("checkpoint.sent", 5)),
             Fault(Crash(), "primary", Trigger("reply.sent", 200)),
         ),
     ),
@@ -73,7 +78,7 @@ FOUND: Final = {
         count=40,
         rate_hz=500.0,
         faults=(
-            Fault(Disturb(How.DELAY, "aft2aft", 2.0), "primary", Trigger(nth=3)),
+            Fault(ChannelFault(Disturbance.DELAY, "aft2aft", 2.0), "primary", Trigger(nth=3)),
             Fault(Crash(), "a/after", Trigger("server.enter", 1)),
         ),
     ),

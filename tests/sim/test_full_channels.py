@@ -10,7 +10,7 @@ import pytest
 
 from aftbed.core.events import Event
 from aftbed.core.journal import EntryKind
-from aftbed.inject.words import parse
+from aftbed.inject.model import parse
 from aftbed.runtime.sim.channels import QUEUE_MAX
 from aftbed.runtime.sim.world import Run, Setup, simulate
 
@@ -58,7 +58,7 @@ def test_what_is_late_is_not_lost_where_there_is_no_room_for_it(when: str) -> No
     run = played(f"delay aft2aft by 8ms {when}")
     found = applied(run)
     assert found == list(range(1, len(found) + 1)) and len(found) > COUNT - LATE, "in order, and no gap"
-    assert run.faults[1]["receipt"] == "activated"
+    assert run.faults[1].receipt.value == "activated"
     assert answered(run) == COUNT and run.rest.leader == "a" and run.rest.why_not == ()
 
 

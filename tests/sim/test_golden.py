@@ -22,7 +22,7 @@ from counting import Counting
 from whiteboard import Whiteboard
 
 from aftbed.core.messages import Goal, NodeDied
-from aftbed.inject.words import parse
+from aftbed.inject.model import parse
 from aftbed.judge import checks
 from aftbed.judge.reference import reference_run
 from aftbed.runtime.sim.node_io import SimNode

@@ -10,12 +10,12 @@ from typing import Final
 import pytest
 
 from aftbed.core.events import Event
-from aftbed.core.fault import marked
 from aftbed.core.journal import EntryKind
 from aftbed.core.messages import Goal, Scheduled
-from aftbed.inject.words import parse
+from aftbed.inject.model import parse
+from aftbed.inject.receipts import fault_and_bits
 from aftbed.judge.checks import corruptions
-from aftbed.runtime import targets
+from aftbed.judge.reference import reference_run
 from aftbed.runtime.sim.givens import graph_of
 from aftbed.runtime.sim.world import Run, Setup, World
 from aftbed.vehicle.aeb.function import default_application
@@ -31,7 +31,7 @@ PLACEMENTS: Final = ("process", "replica")
 def played(ftm: str, *texts: str, placement: str = "process", seed: int = 1, count: int = COUNT) -> Run:
     faults = tuple(map(parse, texts))
     for fault in faults:
-        targets.check(fault, graph_of(ftm, placement))
+        fault.check(graph_of(ftm, placement))
     return World(Setup(ftm, placement, seed, count, RATE_HZ, faults)).run()
 
 
@@ -46,7 +46,7 @@ def latencies_ms(run: Run) -> dict[int, float]:
 
 
 def receipts(run: Run) -> list[str]:
-    return [fault["receipt"] for fault in run.faults]
+    return [fault.receipt.value for fault in run.faults]
 
 
 def replies_to(run: Run, request_id: int) -> list[bytes]:
@@ -56,7 +56,10 @@ def replies_to(run: Run, request_id: int) -> list[bytes]:
 
 def wrong(run: Run) -> list[int]:
     """The requests with a reply that is not the bare server's."""
-    return [int(text.split()[1].rstrip(":")) for text in corruptions(run.history, default_application())]
+    return [
+        int(text.split()[1].rstrip(":"))
+        for text in corruptions(run.history, reference_run(run.history, default_application()))
+    ]
 
 
 def strikes(run: Run) -> list[int]:
@@ -143,7 +146,7 @@ def test_an_omission_loses_one_reply_and_no_other() -> None:
     assert set(range(1, COUNT + 1)) - set(latencies_ms(run)) == {5}
     assert_healed(run)
     assert receipts(run) == ["activated"]
-    assert run.faults[0]["detail"] == "a message of proxy about request 5"
+    assert run.faults[0].detail == "a message of proxy about request 5"
 
 
 @pytest.mark.parametrize("placement", PLACEMENTS)
@@ -173,7 +176,7 @@ def test_a_message_without_a_successor_is_late_and_not_swallowed() -> None:
     run = played("pbr", "reorder pxy2pro by 3ms nth 5")
     took = latencies_ms(run)
     assert 3 < took[5] < 3 + CALM_MS
-    assert receipts(run) == ["applied"] and "late at most" in run.faults[0]["detail"]
+    assert receipts(run) == ["applied"] and "late at most" in run.faults[0].detail
     assert_healed(run)
 
 
@@ -190,7 +193,7 @@ def test_a_fault_of_a_channel_comes_again(again: str, hit: set[int]) -> None:
     assert set(range(1, COUNT + 1)) - set(latencies_ms(run)) == hit
     assert strikes(run) == sorted(hit)
     times = f", and {len(hit) - 1} more times" if len(hit) > 1 else ""
-    assert run.faults[0]["detail"] == f"a message of proxy about request 5{times}"
+    assert run.faults[0].detail == f"a message of proxy about request 5{times}"
 
 
 def test_chance_is_of_the_seed() -> None:
@@ -202,7 +205,7 @@ def test_chance_is_of_the_seed() -> None:
 def test_a_channel_of_who_takes_over_is_disturbed_there() -> None:
     run = played("pbr", "delay aft2pro by 3ms nth 30", "crash primary at reply.sent nth 5")
     (struck, bitten) = [
-        r for r in run.history.events(Event.FAULT_APPLIED) if marked(r.detail)[0] == 1_000_001
+        r for r in run.history.events(Event.FAULT_APPLIED) if fault_and_bits(r.detail)[0] == 1_000_001
     ]
     assert (struck.node, bitten.node) == ("b/after", "b/after")
     assert receipts(run) == ["activated", "activated"]
@@ -245,7 +248,7 @@ def test_a_lasting_fault_of_a_living_sender_goes_on_at_its_new_channel() -> None
 def test_a_flipped_request_is_executed_and_the_client_has_asked_for_something_else() -> None:
     run = played("pbr", "bitflip request byte 4 nth 5")
     assert wrong(run)[:1] == [5] and receipts(run) == ["activated"]
-    assert strikes(run)[0] == 5 and "of the request of request 5 in a/server" in run.faults[0]["detail"]
+    assert strikes(run)[0] == 5 and "of the request of request 5 in a/server" in run.faults[0].detail
 
 
 def test_a_request_that_one_trial_was_handed_wrong_is_outvoted() -> None:
@@ -300,17 +303,19 @@ def test_so_many_bits_of_a_result_are_hit(pattern: str, bits: int) -> None:
     run = played("pbr", f"bitflip result {pattern} nth 5")
     assert wrong(run) == [5]
     assert strikes(run) == [5] * bits
-    found = [marked(r.detail)[1] for r in run.history.events(Event.FAULT_APPLIED) if r.request_id == 5]
-    assert run.faults[0]["detail"].startswith(
-        f"bit{'s' * (bits > 1)} {', '.join(map(str, sorted(found)))} of"
-    )
+    found = [
+        fault_and_bits(r.detail)[1] for r in run.history.events(Event.FAULT_APPLIED) if r.request_id == 5
+    ]
+    assert run.faults[0].detail.startswith(f"bit{'s' * (bits > 1)} {', '.join(map(str, sorted(found)))} of")
     assert_healed(run)
 
 
 def test_a_byte_has_another_value() -> None:
     run = played("pbr", "bitflip result byte 1 nth 5")
     assert wrong(run) == [5]
-    assert {marked(r.detail)[1] // 8 for r in run.history.events(Event.FAULT_APPLIED) if r.request_id} == {1}
+    assert {
+        fault_and_bits(r.detail)[1] // 8 for r in run.history.events(Event.FAULT_APPLIED) if r.request_id
+    } == {1}
 
 
 def test_a_stuck_bit_is_activated_only_where_it_changes_something() -> None:
@@ -329,9 +334,9 @@ def test_a_stuck_bit_that_lasts_has_its_value_in_all_results() -> None:
 def test_a_bit_that_lasts_hits_the_same_place_each_time_and_the_new_leader_is_sound() -> None:
     run = played("pbr", "bitflip result nth 3 permanent", "crash primary at reply.sent nth 9")
     assert wrong(run) == list(range(3, 10)) and run.rest.leader == "b"
-    flips = [marked(r.detail) for r in run.history.events(Event.FAULT_APPLIED) if r.request_id]
+    flips = [fault_and_bits(r.detail) for r in run.history.events(Event.FAULT_APPLIED) if r.request_id]
     assert len(flips) == 7 and len(set(flips)) == 1
-    assert ", and 6 more times" in run.faults[0]["detail"]
+    assert ", and 6 more times" in run.faults[0].detail
     assert_healed(run)
 
 

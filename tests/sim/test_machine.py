@@ -18,16 +18,20 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 
 from aftbed.core.errors import ConfigError
 from aftbed.core.events import Event
-from aftbed.core.fault import Crash, Fault, Hang, Trigger
 from aftbed.core.journal import EntryKind
 from aftbed.core.messages import Goal, NodeDied
-from aftbed.core.valuefault import EXECUTED, Bit, Flip, Place
 from aftbed.ftm.compose import EXPRESSIONS, NONE, parse, replication_of
+from aftbed.inject.bit_patterns import Bit
+from aftbed.inject.crash import Crash
+from aftbed.inject.hang import Hang
+from aftbed.inject.model import Fault
+from aftbed.inject.targets import roles_in
+from aftbed.inject.timing import Trigger
+from aftbed.inject.value import EXECUTED, ValueFlip, ValuePlace
 from aftbed.judge.verdict import breaches
 from aftbed.runtime.rewiring import replica_of
 from aftbed.runtime.sim.processes import Process
 from aftbed.runtime.sim.world import Setup, World
-from aftbed.runtime.targets import roles
 
 REQUESTS: Final = 96
 RATES_HZ: Final = (500.0, 2000.0)
@@ -99,7 +103,7 @@ class Interference(RuleBasedStateMachine):
 
     @rule(role=st.sampled_from(("primary", "backup")))
     def a_replica_hangs_for_good(self, role: str) -> None:
-        if role in roles(self.world.conductor.deployment.graph):
+        if role in roles_in(self.world.conductor.deployment.graph):
             self.world.inject(Fault(Hang(), role, Trigger()))
 
     @rule(node=whom)
@@ -115,9 +119,9 @@ class Interference(RuleBasedStateMachine):
 
     @precondition(lambda self: self._votes and self._sent() - self._flipped_at >= FLIPS_APART)
     @rule(place=st.sampled_from(EXECUTED), bit=st.integers(0, RESULT_BITS - 1))
-    def a_bit_flips(self, place: Place, bit: int) -> None:
+    def a_bit_flips(self, place: ValuePlace, bit: int) -> None:
         self._flipped_at = self._sent()
-        flip = Flip(place, Bit(bit % STATE_BITS if place is Place.STATE else bit))
+        flip = ValueFlip(place, Bit(bit % STATE_BITS if place is ValuePlace.STATE else bit))
         self.world.inject(Fault(flip, "primary", Trigger()))
 
     @rule(expression=st.sampled_from(SOUND))

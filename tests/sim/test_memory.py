@@ -5,9 +5,9 @@ from typing import Final
 import pytest
 
 from aftbed.core.events import Event
-from aftbed.inject.words import parse
+from aftbed.inject.model import parse
 from aftbed.judge.checks import corruptions
-from aftbed.runtime import targets
+from aftbed.judge.reference import reference_run
 from aftbed.runtime.sim.givens import graph_of
 from aftbed.runtime.sim.world import Run, Setup, World
 from aftbed.vehicle.aeb.function import default_application
@@ -21,17 +21,20 @@ PLACEMENTS: Final = ("process", "replica", "single")
 def played(ftm: str, *texts: str, placement: str = "process") -> Run:
     faults = tuple(map(parse, texts))
     for fault in faults:
-        targets.check(fault, graph_of(ftm, placement))
+        fault.check(graph_of(ftm, placement))
     return World(Setup(ftm, placement, 1, COUNT, 200.0, faults)).run()
 
 
 def wrong(run: Run) -> list[int]:
     """The requests with a reply that is not the bare server's."""
-    return [int(text.split()[1].rstrip(":")) for text in corruptions(run.history, default_application())]
+    return [
+        int(text.split()[1].rstrip(":"))
+        for text in corruptions(run.history, reference_run(run.history, default_application()))
+    ]
 
 
 def receipts(run: Run) -> list[tuple[str, str]]:
-    return [(fault["receipt"], fault.get("detail", "")) for fault in run.faults]
+    return [(fault.receipt.value, fault.detail) for fault in run.faults]
 
 
 def from_(request: int) -> list[int]:

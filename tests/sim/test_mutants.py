@@ -13,8 +13,8 @@ from mutants import MECHANISMS
 from planting import EXPLORERS, Mutant, flip, instead
 
 from aftbed.core.events import Event
-from aftbed.core.valuefault import Place
 from aftbed.ftm import lfr
+from aftbed.inject.value import ValuePlace
 from aftbed.judge.verdict import Breach, breaches
 from aftbed.runtime.sim.world import Setup, simulate
 
@@ -70,7 +70,7 @@ def test_a_planted_bug_is_taken_out_again() -> None:
 
 def test_digests_that_are_not_compared_break_no_promise_but_leave_no_word() -> None:
     """A divergence is only reported (nobody can tell who is right): the bug shows in the journal alone."""
-    setup = Setup("lfr", count=6, faults=(flip(Place.RESULT, 0, "server.exit", 3, "backup"),))
+    setup = Setup("lfr", count=6, faults=(flip(ValuePlace.RESULT, 0, "server.exit", 3, "backup"),))
     with instead(lfr, "digest", lambda payload: b"")():
         wrong = simulate(setup)
     right = simulate(setup)

@@ -7,7 +7,7 @@ import pytest
 from aftbed.core.messages import Goal, Scheduled
 from aftbed.ftm.compose import STATEFUL, replication_of
 from aftbed.ftm.failover import drop_backup, failover, new_backup
-from aftbed.inject.words import parse
+from aftbed.inject.model import parse
 from aftbed.judge.verdict import breaches
 from aftbed.runtime import control
 from aftbed.runtime.sim.world import Doom, Setup, World, simulate

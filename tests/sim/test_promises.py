@@ -14,8 +14,10 @@ from planting import flip
 from aftbed.core.events import Event
 from aftbed.core.journal import Entry, EntryKind, Record
 from aftbed.core.script import ScriptKind
-from aftbed.core.valuefault import Place
 from aftbed.ftm.compose import build
+from aftbed.inject.model import FaultReport
+from aftbed.inject.receipts import ReceiptState
+from aftbed.inject.value import ValuePlace
 from aftbed.judge.checks import half_a_graph, missing
 from aftbed.judge.outcome import outcome_of
 from aftbed.judge.record import record_of, service_struck_down
@@ -95,9 +97,9 @@ def renewed(ms: float) -> Broken:
 
 def with_a_flip(run: Run) -> Run:
     """A value fault was asked for, and applied."""
-    fault = flip(Place.RESULT, 0, "server.exit", 1)
+    fault = flip(ValuePlace.RESULT, 0, "server.exit", 1)
     setup = replace(run.setup, faults=(fault,))
-    return replace(run, setup=setup, faults=({"fault": str(fault), "receipt": "applied"},))
+    return replace(run, setup=setup, faults=(FaultReport(str(fault), ReceiptState.APPLIED),))
 
 
 def all_of(*broken: Broken) -> Broken:

@@ -6,7 +6,7 @@ import pytest
 
 from aftbed.core.events import Event
 from aftbed.core.journal import EntryKind
-from aftbed.inject.words import parse
+from aftbed.inject.model import parse
 from aftbed.runtime.sim.node_io import STEP_NS
 from aftbed.runtime.sim.world import Run, Setup, World
 
@@ -35,7 +35,7 @@ def test_each_step_takes_so_many_times_as_long_and_then_no_longer(
     took, calm = latencies_ns(run), latencies_ns(played(placement=placement))
     longer = took[FROM + 1] - calm[FROM + 1]
     assert longer == pytest.approx(STEPS * (times - 1) * STEP_NS, abs=5 * STEP_NS)
-    assert [fault["receipt"] for fault in run.faults] == ["activated"]
+    assert [fault.receipt.value for fault in run.faults] == ["activated"]
     assert len(took) == COUNT and max(took[n] for n in range(12, COUNT + 1)) < 500_000, "it healed"
     assert not run.history.events(Event.WATCHDOG_SUSPECT)
 
@@ -49,4 +49,4 @@ def test_two_shares_of_one_node_are_a_share_of_a_share() -> None:
 
 def test_without_a_step_there_is_no_share_to_feel() -> None:
     (fault,) = played("slow engine share 10% after 20ms").faults
-    assert fault["receipt"] == "applied"
+    assert fault.receipt.value == "applied"

@@ -9,12 +9,15 @@ from msgspec.structs import replace
 
 from aftbed.adapt.engine import AdaptationEngine
 from aftbed.core.brick import Brick, Effect
-from aftbed.core.fault import Crash, Fault, Hang, Trigger
 from aftbed.core.graph import BrickSpec
 from aftbed.core.messages import Goal, Scheduled, StateCaptured
-from aftbed.core.valuefault import Flip, Place
 from aftbed.ftm.pbr import PbrAfter
 from aftbed.ftm.registry import Setting, make
+from aftbed.inject.crash import Crash
+from aftbed.inject.hang import Hang
+from aftbed.inject.model import Fault
+from aftbed.inject.timing import Trigger
+from aftbed.inject.value import ValueFlip, ValuePlace
 from aftbed.judge.verdict import Breach, breaches
 from aftbed.runtime.sim.world import Doom, Setup, World
 from aftbed.search.shrink import shrink
@@ -24,7 +27,7 @@ Broken = Callable[[Setup], tuple[Breach, ...]]
 
 CRASH = Fault(Crash(), "a/after", Trigger("server.exit", 30))
 HANG = Fault(Hang(90), "b/server", Trigger(after_ms=20.0))
-FLIP = Fault(Flip(Place.RESULT), "primary", Trigger("server.exit", 60))
+FLIP = Fault(ValueFlip(ValuePlace.RESULT), "primary", Trigger("server.exit", 60))
 TO_PBR = Scheduled(Goal(expression="pbr"), 80)
 TO_LFR = Scheduled(Goal(expression="lfr+tr"), 150)
 LARGE = Setup("lfr+tr", "process", 5, 200, 1000.0, (HANG, CRASH, FLIP), (TO_PBR, TO_LFR))
@@ -60,7 +63,7 @@ def test_what_it_takes_stays() -> None:
 
 
 def test_where_a_bit_is_flipped_tr_stays() -> None:
-    found = shrink(LARGE, where(lambda setup: any(isinstance(f.action, Flip) for f in setup.faults)))
+    found = shrink(LARGE, where(lambda setup: any(isinstance(f.action, ValueFlip) for f in setup.faults)))
     assert found == Setup("pbr+tr", "process", 5, 1, 0.0, (replace(FLIP, trigger=Trigger("server.exit", 1)),))
 
 

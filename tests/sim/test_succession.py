@@ -6,8 +6,10 @@ from typing import Final
 import pytest
 import versions
 
-from aftbed.core.fault import Crash, Fault, Trigger
 from aftbed.core.messages import Goal, Scheduled
+from aftbed.inject.crash import Crash
+from aftbed.inject.model import Fault
+from aftbed.inject.timing import Trigger
 from aftbed.judge.checks import wrong_replies
 from aftbed.judge.reference import succession
 from aftbed.judge.verdict import breaches

@@ -9,10 +9,14 @@ import pytest
 from msgspec import json
 
 from aftbed.core.events import Event
-from aftbed.core.fault import Crash, Disturb, Hang, Slow
-from aftbed.core.valuefault import Flip
+from aftbed.core.graph import STAGED
 from aftbed.ftm.compose import build, parse, replication_of
-from aftbed.runtime import targets
+from aftbed.inject import targets
+from aftbed.inject.channel import ChannelFault
+from aftbed.inject.crash import Crash
+from aftbed.inject.hang import Hang
+from aftbed.inject.slow import Slow
+from aftbed.inject.value import ValueFlip
 from aftbed.runtime.rewiring import replica_of
 from aftbed.runtime.sim.world import Setup, simulate
 from aftbed.search import swarm
@@ -41,9 +45,9 @@ def test_of_everything_there_is_some() -> None:
     assert Counter(len(s.faults) for s in many()).keys() == {0, 1, 2, 3}
     assert Counter(len(s.adaptations) for s in many()).keys() == {0, 1, 2}
     faults = [fault for s in many() for fault in s.faults]
-    assert {type(fault.action) for fault in faults} == {Crash, Hang, Flip, Slow, Disturb}
+    assert {type(fault.action) for fault in faults} == {Crash, Hang, ValueFlip, Slow, ChannelFault}
     assert {bool(fault.action.for_ms) for fault in faults if isinstance(fault.action, Hang)} == {True, False}
-    assert any(fault.target.endswith(targets.STAGED) for fault in faults)
+    assert any(fault.target.endswith(STAGED) for fault in faults)
     assert any(fault.trigger.after_ms for fault in faults)
     assert {Event.CHECKPOINT_SENT.label, Event.ADAPT_STEP_ACT.label} <= {f.trigger.event for f in faults}
 
@@ -59,7 +63,7 @@ def test_the_load_is_as_asked_for() -> None:
 def test_what_is_aimed_at_is_there() -> None:
     for setup in many():
         for fault in setup.faults:
-            targets.check(fault, build(setup.ftm, setup.placement))
+            fault.check(build(setup.ftm, setup.placement))
 
 
 def test_nobody_is_asked_for_what_he_does_not_promise() -> None:
@@ -72,13 +76,13 @@ def test_nobody_is_asked_for_what_he_does_not_promise() -> None:
             for_good = isinstance(fault.action, Hang) and not fault.action.for_ms
             watched = fault.target in targets.ROLES or replica_of(fault.target)
             assert watched or not for_good, setup
-            assert not fault.target.endswith(targets.STAGED) or isinstance(fault.action, Crash)
+            assert not fault.target.endswith(STAGED) or isinstance(fault.action, Crash)
 
 
 def test_a_bit_is_flipped_only_where_tr_will_see_it() -> None:
     flipped = 0
     for setup in many():
-        flips = [fault for fault in setup.faults if isinstance(fault.action, Flip)]
+        flips = [fault for fault in setup.faults if isinstance(fault.action, ValueFlip)]
         if not flips:
             continue
         flipped += 1
@@ -97,7 +101,7 @@ def test_what_is_planned_comes_before_the_end_of_the_load() -> None:
         assert all(1 <= a.at_request <= setup.count for a in setup.adaptations)
         last_ms = (setup.count - 1) * (1e3 / setup.rate_hz if setup.rate_hz else swarm.REQUEST_MS_MIN)
         assert all(f.trigger.after_ms <= swarm.LAUNCH_MS + last_ms for f in setup.faults)
-        timed = [f for f in setup.faults if not f.trigger.event and not isinstance(f.action, Disturb)]
+        timed = [f for f in setup.faults if not f.trigger.event and not isinstance(f.action, ChannelFault)]
         assert all(f.trigger.after_ms >= swarm.LAUNCH_MS for f in timed)
 
 

@@ -16,10 +16,10 @@ from counting import Counting
 
 from aftbed.core import script
 from aftbed.core.events import Event
-from aftbed.core.fault import marked
 from aftbed.core.journal import EntryKind, Record
 from aftbed.core.messages import Message, Notification, Suspect, TakeOver, Trial, Trials
 from aftbed.core.script import Phase
+from aftbed.inject.receipts import fault_and_bits
 from aftbed.runtime import control
 from aftbed.runtime.sim.channels import Channel
 from aftbed.runtime.sim.clock import Clock
@@ -159,7 +159,7 @@ class Whiteboard(World):
 
     def _noted(self, record: Record) -> None:
         if record.event is Event.FAULT_APPLIED:
-            bit = marked(record.detail)[1]
+            bit = fault_and_bits(record.detail)[1]
             if record.request_id:  # who strikes itself is seen to die
                 self.say(record.node, f"bit {bit} flips in what it makes of {record.request_id}")
         elif record.event is Event.VOTE_COMPARED:

@@ -12,14 +12,14 @@ from pathlib import Path
 
 import msgspec
 
-from aftbed.core.busfault import BusFault, Struck
 from aftbed.core.errors import HarnessError
+from aftbed.inject.bus import BusFault, BusReport
+from aftbed.inject.bus_disturber import Disturber
 from aftbed.vehicle.aeb.function import default_application
 from aftbed.vehicle.can.bus import Bus, BusOptions, open_bus
 from aftbed.vehicle.can.dbc_file import Codec
 from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.can.hub import Hub, HubCounts, HubOptions, serve
-from aftbed.vehicle.disturbance import Disturber
 from aftbed.vehicle.ecus import Sender
 from aftbed.vehicle.gateway import Gateway
 
@@ -44,7 +44,7 @@ class TestDesk:
         return bool(got)
 
     def faults_acted(self) -> None:
-        receipt = self.faults.struck()[0].receipt
+        receipt = self.faults.reports()[0].receipt.state.value
         if self.receipts[-1:] != [receipt]:
             self.receipts.append(receipt)
 
@@ -98,9 +98,9 @@ class RunningHub:
     def forget(self, number: int) -> None:
         self.order(lambda hub: self.desk.faults.forget(number, hub.now_us()))
 
-    def struck(self) -> list[Struck]:
-        found: list[Struck] = []
-        self.order(lambda _: found.extend(self.desk.faults.struck()))
+    def struck(self) -> list[BusReport]:
+        found: list[BusReport] = []
+        self.order(lambda _: found.extend(self.desk.faults.reports()))
         return found
 
     def stop(self) -> HubCounts:

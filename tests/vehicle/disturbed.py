@@ -9,14 +9,12 @@ import msgspec
 from busharness import FunctionGateway, RunningHub, running_hub
 from puredrive import CODEC
 
-from aftbed.core.busfault import BusFault, Struck
-from aftbed.inject.buswords import parse
+from aftbed.inject.bus import BusFault, BusReport, read_bus_fault
+from aftbed.inject.bus_disturber import Disturber
 from aftbed.vehicle.aeb.function import default_application
-from aftbed.vehicle.aim import aimed
 from aftbed.vehicle.can.candump import read_log
 from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.can.hub import HubOptions
-from aftbed.vehicle.disturbance import Disturber
 from aftbed.vehicle.drive_real import CarBuses, DriveOptions, DriveReport, drive
 from aftbed.vehicle.drive_virtual import VirtualCar
 from aftbed.vehicle.plant import VehicleResult
@@ -27,7 +25,7 @@ SEED = 5
 
 
 def fault(words: str) -> BusFault:
-    return aimed(parse(words), [CODEC])
+    return read_bus_fault(words).resolved([CODEC])
 
 
 class Disturbed(msgspec.Struct):
@@ -35,7 +33,7 @@ class Disturbed(msgspec.Struct):
 
     frames: list[Frame]
     result: VehicleResult
-    struck: list[Struck]
+    struck: list[BusReport]
     refused: dict[str, int]
     report: DriveReport | None = None
 
@@ -100,4 +98,4 @@ def virtual(*faults: str, late_ns: int = 0, tick_ns: int | None = None) -> Distu
                 replies.append((now_ns + late_ns, reply))
             else:
                 car.deliver(reply, now_ns)
-    return Disturbed(frames, car.result(), disturber.struck(), dict(car.counts.refused))
+    return Disturbed(frames, car.result(), disturber.reports(), dict(car.counts.refused))

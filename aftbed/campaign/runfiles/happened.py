@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from aftbed.core.events import FIRST_FAULT, REQUEST_EVENTS, STEP_EVENTS, Event
-from aftbed.core.fault import marked
 from aftbed.core.journal import Record
+from aftbed.inject.receipts import fault_and_bits
 from aftbed.judge.record import RunRecord
 
 DUE: Final = "an adaptation is due"  # its trigger is armed as a fault is
@@ -63,7 +63,7 @@ def kind_of(one: Record) -> Kind:
 def words_of(one: Record, record: RunRecord) -> str:
     """A record in words; a fault in its own."""
     if one.event is Event.FAULT_APPLIED:
-        return _fault(marked(one.detail)[0] - FIRST_FAULT, record)
+        return _fault(fault_and_bits(one.detail)[0] - FIRST_FAULT, record)
     if one.event is Event.NODE_DIED:
         return f"{one.event}: process {one.detail}"
     words = [str(one.event), *([f"#{one.request_id}"] if one.request_id else [])]
@@ -72,7 +72,7 @@ def words_of(one: Record, record: RunRecord) -> str:
 
 def _fault(at: int, record: RunRecord) -> str:
     """The end of a run tells of faults that were asked for while it lived, too."""
-    return record.faults[at]["fault"] if 0 <= at < len(record.faults) else "a fault"
+    return record.faults[at].fault if 0 <= at < len(record.faults) else "a fault"
 
 
 def told_in(record: RunRecord) -> Iterator[Told]:

@@ -1,6 +1,6 @@
 """Cells in virtual time: some bytes that the executive and a node both have."""
 
-from aftbed.runtime.cell import CELL_BYTES
+from aftbed.inject.shared_state import SHARED_BYTES
 
 
 class Cell:
@@ -8,7 +8,7 @@ class Cell:
 
     def __init__(self, number: int) -> None:
         self._number = number
-        self.memory = memoryview(bytearray(CELL_BYTES))
+        self.memory = memoryview(bytearray(SHARED_BYTES))
 
     def fileno(self) -> int:
         """The number."""

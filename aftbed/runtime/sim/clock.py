@@ -9,7 +9,8 @@ from collections.abc import Callable
 from random import Random
 from typing import Final, Protocol
 
-from aftbed.runtime.jobs import Jobs, StepFailed
+from aftbed.core.errors import StepFailed
+from aftbed.runtime.jobs import Jobs
 from aftbed.runtime.sim.hops import HOP_QUANTILES_NS
 
 START_NS: Final = 1_000_000_000  # so that no time is 0, which means "never" in some places

@@ -8,12 +8,13 @@ time of that step and, as in lockstep, before anything else that belongs to the 
 from collections.abc import Callable
 from typing import Final
 
-from aftbed.core.busfault import BusFault, Condition, Struck
+from aftbed.core.busfault import Condition
+from aftbed.inject.bus import BusFault, BusReport
+from aftbed.inject.bus_disturber import Disturber
+from aftbed.inject.kind import FaultKind
 from aftbed.runtime.interface import Met
 from aftbed.runtime.sim.clock import Clock
 from aftbed.runtime.sim.givens import car_in, own_codec
-from aftbed.vehicle.aim import aimed
-from aftbed.vehicle.disturbance import Disturber
 from aftbed.vehicle.drive_virtual import VirtualCar
 from aftbed.vehicle.plant import STEP_US, VehicleResult
 
@@ -44,16 +45,17 @@ class Drive:
         """What it came to, so far."""
         return self._car.result()
 
-    def disturb(self, number: int, fault: BusFault, draw: int) -> None:
+    def disturb(self, number: int, fault: FaultKind, draw: int) -> None:
         """Arm `fault` in the car's bus. Raises ConfigError where it names what does not exist."""
-        fault = fault if fault.aim is not None else aimed(fault, [own_codec()])
+        assert isinstance(fault, BusFault), fault
+        fault = fault if fault.targets is not None else fault.resolved([own_codec()])
         now_us = self._car.before(self._t_ns() if self._under_way else 0)
         self._faults.arm(number, fault, draw, now_us)
         self._car.disturb(self._faults)
 
-    def struck_by(self, number: int) -> Struck | None:
+    def report(self, number: int) -> BusReport | None:
         """What has become of a fault of the car's bus."""
-        return next((struck for struck in self._faults.struck() if struck.number == number), None)
+        return next((one for one in self._faults.reports() if one.number == number), None)
 
     def watch(self, number: int, condition: Condition, met: Callable[[Met], None]) -> None:
         """See `runtime.interface.Support`."""

@@ -8,7 +8,7 @@ import contextlib
 from aftbed.core.errors import PeerError
 from aftbed.ftm.client import Client
 from aftbed.ftm.compose import replication_of
-from aftbed.runtime.cell import look
+from aftbed.inject.shared_state import look
 from aftbed.runtime.conductor import Conductor
 from aftbed.runtime.deployment import Deployment
 from aftbed.runtime.devices import CarDevice, Load

@@ -3,13 +3,12 @@
 from functools import lru_cache
 from typing import Final, NoReturn
 
-from aftbed.core.busfault import BusFault
 from aftbed.core.errors import ConfigError
 from aftbed.core.events import Event
-from aftbed.core.fault import Fault, FlipMemory
 from aftbed.core.graph import Graph
 from aftbed.core.journal import Record
 from aftbed.ftm.compose import build
+from aftbed.inject.model import Fault
 from aftbed.vehicle.aeb.function import sample_requests
 from aftbed.vehicle.can.dbc_file import Codec, load_dbc
 from aftbed.vehicle.drive_virtual import VirtualCar
@@ -43,11 +42,11 @@ def own_codec() -> Codec:
 
 def check(fault: Fault, scenario: str) -> None:
     """Raise ConfigError where there is nothing here that `fault` could strike, or wait for."""
-    if isinstance(fault.action, FlipMemory):
+    if not fault.action.simulated:
         raise ConfigError(f"{fault}: simulated processes have no memory of their own; use real ones")
     if scenario:
         return
-    if isinstance(fault.action, BusFault):
+    if fault.action.needs_bus:
         raise ConfigError(f"{fault}: without a scenario there is no bus")
     if fault.trigger.when is not None:
         raise ConfigError(f"{fault}: 'when' looks at the car, and without a scenario there is none")

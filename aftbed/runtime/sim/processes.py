@@ -9,13 +9,13 @@ from collections import deque
 from collections.abc import Callable, Generator
 from typing import Final
 
-from aftbed.core.errors import ConfigError
+from aftbed.core.errors import ConfigError, StepFailed
 from aftbed.core.journal import Record
 from aftbed.runtime import control, interface
 from aftbed.runtime.assembly import Assembler
 from aftbed.runtime.devices import Device
 from aftbed.runtime.interface import ProcessKind
-from aftbed.runtime.jobs import Key, StepFailed, Wait
+from aftbed.runtime.jobs import Key, Wait
 from aftbed.runtime.node import Node
 from aftbed.runtime.sim.cells import Cell
 from aftbed.runtime.sim.channels import Channel

@@ -13,15 +13,16 @@ import msgspec
 
 from aftbed.adapt.bricks import LoadModule
 from aftbed.core.application import Application
-from aftbed.core.busfault import BusFault, Condition, Struck
-from aftbed.core.fault import Fault, FlipMemory
+from aftbed.core.busfault import Condition
 from aftbed.core.graph import Graph, Link
 from aftbed.core.history import History
 from aftbed.core.journal import Entry, EntryKind, Record
 from aftbed.core.messages import Goal, Scheduled
-from aftbed.core.valuefault import Flip
 from aftbed.ftm.client import Client
-from aftbed.runtime import control, targets
+from aftbed.inject.bus import BusReport
+from aftbed.inject.kind import FaultKind
+from aftbed.inject.model import Fault, FaultReport
+from aftbed.runtime import control
 from aftbed.runtime.adaptations import Outcome
 from aftbed.runtime.assembly import Assembler, MakeSetting
 from aftbed.runtime.conductor import Conductor, ScriptRun
@@ -96,7 +97,7 @@ class Run(msgspec.Struct, frozen=True):
     told: tuple[tuple[int, str, str], ...]  # time, event, text
     scripts: tuple[ScriptRun, ...]  # of Recovery
     adaptations: tuple[Outcome, ...]
-    faults: tuple[dict[str, str], ...]
+    faults: tuple[FaultReport, ...]
     failures: tuple[str, ...]  # of asserts, in nodes
     vehicle: VehicleResult | None
     effects: dict[str, int]  # by brick: how many it has performed in its first life
@@ -152,7 +153,7 @@ class World:
             self._ends[end.number] = channel
         return channel
 
-    def cell(self) -> Cell:
+    def shared_memory(self) -> Cell:
         """A fresh one."""
         cell = Cell(len(self.nursery.cells))
         self.nursery.cells.append(cell)
@@ -178,7 +179,7 @@ class World:
         """Of the run's seed."""
         return Random(f"{self.setup.seed}/{number}").getrandbits(DRAW_BITS)
 
-    def disturb(self, number: int, fault: BusFault, draw: int) -> Keys:
+    def disturb(self, number: int, fault: FaultKind, draw: int) -> Keys:
         """In the car's own bus."""
         assert self._drive is not None, fault
         self._drive.disturb(number, fault, draw)
@@ -190,13 +191,13 @@ class World:
         self._drive.watch(number, condition, met)
         yield Wait(frozenset())
 
-    def flip_memory(self, process: object, flip: FlipMemory, draw: int) -> NoReturn:
+    def flip_memory(self, process: object, bit: int | None, address: int | None, draw: int) -> NoReturn:
         """Nobody asks for it: see `givens.check`."""
         raise AssertionError(f"{process} has no memory")
 
-    def bus_fault(self, number: int) -> Struck | None:
+    def bus_fault(self, number: int) -> BusReport | None:
         """By the car's bus."""
-        return self._drive.struck_by(number) if self._drive is not None else None
+        return self._drive.report(number) if self._drive is not None else None
 
     def pin(self, pid: int, cpu: int) -> None:
         """There are no cores here."""
@@ -247,7 +248,7 @@ class World:
     def _on_end(self, process: Process, reason: str) -> None:
         if process.node is not None and process.incarnation == 1:
             self._count(process.node)
-        flipped = STOPPED in reason and any(isinstance(fault.action, Flip) for fault in self.setup.faults)
+        flipped = STOPPED in reason and any(fault.action.alters_value for fault in self.setup.faults)
         if (not reason or flipped) and process.kind is not ProcessKind.KILLED:
             self.struck.append((self.loop.ns, process.name))
         if reason.startswith("assertion"):
@@ -315,7 +316,7 @@ class World:
     def inject(self, fault: Fault) -> None:
         """Arm one more, now. Raises ConfigError where there is no such fault."""
         check(fault, self.setup.scenario)
-        targets.check(fault, self.conductor.deployment.graph)
+        fault.check(self.conductor.deployment.graph)
         self.loop.jobs.start("inject", self.conductor.faults.arm(fault), lambda failure: None)
         self.loop.watch_jobs()
 
@@ -371,7 +372,7 @@ class World:
             tuple(self.told),
             tuple(self.conductor.scripts),
             tuple(self.conductor.adaptations.history),
-            tuple(self.conductor.faults.receipts()),
+            tuple(self.conductor.faults.reports()),
             tuple(self.failures),
             self._drive.result() if self._drive is not None else None,
             self.effects,

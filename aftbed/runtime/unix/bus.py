@@ -9,10 +9,14 @@ from typing import Final
 
 import msgspec
 
-from aftbed.core.busfault import BusFault, Condition, Struck
+from aftbed.core.busfault import Condition
+from aftbed.core.errors import StepFailed
+from aftbed.inject.bus import BusFault, BusReport
+from aftbed.inject.kind import FaultKind
+from aftbed.inject.receipts import ReceiptState
 from aftbed.runtime import control
 from aftbed.runtime.interface import Met
-from aftbed.runtime.jobs import Key, StepFailed, Wait
+from aftbed.runtime.jobs import Key, Wait
 from aftbed.runtime.unix.process_pool import Nursery, Process
 
 HUB: Final = "hub"
@@ -35,18 +39,19 @@ class BusFaults:
         self._nursery, self._settle, self._tell = nursery, settle, tell
         self._hub: Process | None = None
         self._faults: dict[int, BusFault] = {}
-        self._struck: dict[int, Struck] = {}
+        self._struck: dict[int, BusReport] = {}
         self._met: dict[int, Callable[[Met], None]] = {}
 
     def serve(self, hub: Process) -> None:
         """There is a hub."""
         self._hub = hub
 
-    def disturb(self, number: int, fault: BusFault, draw: int) -> Steps:
+    def disturb(self, number: int, fault: FaultKind, draw: int) -> Steps:
         """Return when the hub has armed the fault. Raises StepFailed."""
+        assert isinstance(fault, BusFault), fault
         if self._hub is None or not self._hub.alive:
             raise StepFailed(f"{fault}: this run has no bus")
-        if fault.aim is None:
+        if fault.targets is None:
             raise StepFailed(f"{fault}: it was not aimed at the messages of this bus")
         self._faults[number] = fault
         self._nursery.order(self._hub, control.DisturbBus(number, fault, draw))
@@ -80,13 +85,15 @@ class BusFaults:
         if kind == MET:
             self._is_met(*msgspec.msgpack.decode(data, type=tuple[int, int, int]))
             return
-        for struck in msgspec.msgpack.decode(data, type=list[Struck]):
+        for struck in msgspec.msgpack.decode(data, type=list[BusReport]):
             before, self._struck[struck.number] = self._struck.get(struck.number), struck
-            if struck.receipt != (before.receipt if before is not None else "armed"):
-                self._tell("fault", f"{self._faults[struck.number]}: {struck.receipt}, {struck.detail}")
+            state = before.receipt.state if before is not None else ReceiptState.ARMED
+            if struck.receipt.state is not state:
+                found = struck.receipt
+                self._tell("fault", f"{self._faults[struck.number]}: {found.state.value}, {found.detail}")
         if kind == ASKED:
             self._settle((ASKED, HUB, 0))
 
-    def struck(self, number: int) -> Struck | None:
+    def struck(self, number: int) -> BusReport | None:
         """The latest that is known of a fault."""
         return self._struck.get(number)

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from aftbed.core.busfault import Struck
 from aftbed.core.errors import HarnessError
+from aftbed.inject.bus import BusReport
+from aftbed.inject.receipts import ReceiptState
 from aftbed.runtime import control
 from aftbed.runtime.unix import bus
 from aftbed.runtime.unix.line import Line
@@ -18,7 +19,7 @@ from aftbed.vehicle.can.hub import Hub, HubOptions
 from aftbed.vehicle.can.hub import serve as serve_hub
 
 if TYPE_CHECKING:
-    from aftbed.vehicle.disturbance import Disturber
+    from aftbed.inject.bus_disturber import Disturber
 
 
 def serve(line: Line[control.ToNode], order: control.Serve, fds: list[int]) -> None:
@@ -38,7 +39,7 @@ class _Desk:
     def __init__(self, line: Line[control.ToNode]) -> None:
         self._line = line
         self._faults: Disturber | None = None
-        self._reported: dict[int, str] = {}  # the receipts, by the number of the fault
+        self._reported: dict[int, ReceiptState] = {}  # by the number of the fault
 
     def attend(self, hub: Hub) -> bool:
         """Carry out the next order; False when the line has ended."""
@@ -55,14 +56,16 @@ class _Desk:
         elif isinstance(order, control.Ack):
             hub.go_on(order.token)
         elif isinstance(order, control.Stats):
-            self._line.send(control.Report(bus.ASKED, msgspec.msgpack.encode(self._struck())))
+            self._line.send(control.Report(bus.ASKED, msgspec.msgpack.encode(self._reports())))
         return True
 
     def faults_acted(self) -> None:
         """Report the faults whose receipt is another one than before."""
-        news = [s for s in self._struck() if self._reported.get(s.number, "armed") != s.receipt]
+        armed = ReceiptState.ARMED
+        found = self._reports()
+        news = [one for one in found if self._reported.get(one.number, armed) is not one.receipt.state]
         if news:
-            self._reported |= {s.number: s.receipt for s in news}
+            self._reported |= {one.number: one.receipt.state for one in news}
             self._line.send(control.Report(bus.STRUCK, msgspec.msgpack.encode(news)))
 
     def met(self, fault_number: int, t_us: int, since_ns: int) -> None:
@@ -70,15 +73,15 @@ class _Desk:
         self._line.send(control.Report(bus.MET, msgspec.msgpack.encode((fault_number, t_us, since_ns))))
 
     def _disturb(self, hub: Hub, order: control.DisturbBus) -> None:
-        from aftbed.vehicle.disturbance import Disturber  # noqa: PLC0415 - it needs the CRC, and few runs it
+        from aftbed.inject.bus_disturber import Disturber  # noqa: PLC0415 - it needs the CRC, and few runs it
 
         if self._faults is None:
             self._faults = Disturber()
         self._faults.arm(order.token, order.fault, order.draw, hub.now_us())
         hub.disturb(self._faults)
 
-    def _struck(self) -> list[Struck]:
-        return [] if self._faults is None else self._faults.struck()
+    def _reports(self) -> list[BusReport]:
+        return [] if self._faults is None else self._faults.reports()
 
 
 def _hub(line: Line[control.ToNode], order: control.Serve, fds: list[int]) -> None:

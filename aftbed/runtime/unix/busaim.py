@@ -8,9 +8,10 @@ from typing import Final
 
 import msgspec
 
-from aftbed.core.busfault import NODES, BusFault
+from aftbed.core.busfault import NODES
 from aftbed.core.errors import ConfigError
-from aftbed.core.fault import Fault
+from aftbed.inject.bus import BusFault
+from aftbed.inject.model import Fault
 from aftbed.runtime.unix.options import CarRun, LoadRun, ReplayRun, Work
 
 PLAYER: Final = "player"
@@ -30,14 +31,13 @@ def aim(fault: Fault, work: Work) -> Fault:
         return fault
     if isinstance(work, LoadRun):
         raise ConfigError(f"{fault}: a run of --load has no bus")
-    from aftbed.vehicle.aim import aimed  # noqa: PLC0415 - a tenth of a second, for those who need it
-    from aftbed.vehicle.can.dbc_file import load_dbc  # noqa: PLC0415
+    from aftbed.vehicle.can.dbc_file import load_dbc  # noqa: PLC0415 - a tenth of a second, for those who need it
     from aftbed.vehicle.replay.map_file import find_map, load_mapped  # noqa: PLC0415
 
     codecs = [load_dbc()]
     if isinstance(work, ReplayRun):
         theirs = load_mapped(find_map(work.map), Path(work.dbc))
-        bus = aimed(action, [theirs, *codecs], (PLAYER, GATEWAY), car=False)
+        bus = action.resolved([theirs, *codecs], (PLAYER, GATEWAY), car=False)
     else:
-        bus = aimed(action, codecs)
+        bus = action.resolved(codecs)
     return msgspec.structs.replace(fault, action=bus)

@@ -4,7 +4,7 @@ import mmap
 import os
 from typing import Final
 
-from aftbed.runtime.cell import CELL_BYTES
+from aftbed.inject.shared_state import SHARED_BYTES
 
 NAME: Final = "aftbed-cell"  # as /proc/PID/maps shows it
 
@@ -12,7 +12,7 @@ NAME: Final = "aftbed-cell"  # as /proc/PID/maps shows it
 def mapped(descriptor: int) -> memoryview:
     """The memory behind `descriptor`, which is closed. Whoever is forked from here does not inherit it."""
     try:
-        memory = mmap.mmap(descriptor, CELL_BYTES)
+        memory = mmap.mmap(descriptor, SHARED_BYTES)
     finally:
         os.close(descriptor)
     memory.madvise(mmap.MADV_DONTFORK)
@@ -24,7 +24,7 @@ class Cell:
 
     def __init__(self) -> None:
         self._descriptor = os.memfd_create(NAME)
-        os.ftruncate(self._descriptor, CELL_BYTES)
+        os.ftruncate(self._descriptor, SHARED_BYTES)
         self.memory = mapped(os.dup(self._descriptor))
 
     def fileno(self) -> int:

@@ -10,8 +10,8 @@ from typing import Final
 import msgspec
 
 from aftbed.core.errors import ConfigError, HarnessError
-from aftbed.core.fault import Fault
 from aftbed.core.messages import Goal
+from aftbed.inject.model import Fault
 from aftbed.runtime.unix import rundir
 from aftbed.runtime.unix.line import Line
 from aftbed.runtime.unix.resources import Row

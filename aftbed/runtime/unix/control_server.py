@@ -16,10 +16,9 @@ from typing import Final
 import msgspec
 
 from aftbed.core.errors import AftbedError, ConfigError
-from aftbed.runtime import targets
 from aftbed.runtime.adaptations import Adaptations, Outcome
 from aftbed.runtime.deployment import Deployment
-from aftbed.runtime.faults import Faults
+from aftbed.runtime.fault_controller import FaultController
 from aftbed.runtime.interface import ProcessKind
 from aftbed.runtime.unix import control_client, rundir
 from aftbed.runtime.unix.event_loop import Loop
@@ -40,7 +39,7 @@ class Questions:
         options: RunOptions,
         loop: Loop,
         deployment: Deployment,
-        faults: Faults,
+        faults: FaultController,
         adaptations: Adaptations,
         work: Work,
         finish: Callable[[str], None],
@@ -116,7 +115,7 @@ class Questions:
                 case control_client.GraphNow():
                     answer(control_client.Answer(msgspec.json.encode(self._deployment.graph)))
                 case control_client.Inject(fault):
-                    targets.check(fault, self._deployment.graph)
+                    fault.check(self._deployment.graph)
                     self._loop.jobs.start(
                         "inject",
                         self._faults.arm(fault),

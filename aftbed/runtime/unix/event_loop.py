@@ -7,7 +7,8 @@ import select
 import time
 from collections.abc import Callable
 
-from aftbed.runtime.jobs import Jobs, StepFailed
+from aftbed.core.errors import StepFailed
+from aftbed.runtime.jobs import Jobs
 
 
 def _call(call: Callable[[], None]) -> None:

@@ -22,8 +22,8 @@ import msgspec
 
 from aftbed import __version__
 from aftbed.core.errors import ConfigError
-from aftbed.core.fault import Fault
 from aftbed.core.messages import Scheduled
+from aftbed.inject.model import Fault
 from aftbed.runtime import control
 from aftbed.runtime.unix import linux, members, rundir
 from aftbed.runtime.unix.busaim import aim

@@ -24,10 +24,8 @@ import re
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from aftbed.core.errors import HarnessError
-from aftbed.core.fault import BYTE_BITS, FlipMemory
-from aftbed.core.valuefault import drawn
-from aftbed.runtime.jobs import StepFailed
+from aftbed.core.errors import HarnessError, StepFailed
+from aftbed.inject.bit_patterns import BYTE_BITS, drawn
 from aftbed.runtime.unix import members
 
 YAMA: Final = Path("/proc/sys/kernel/yama/ptrace_scope")
@@ -64,7 +62,7 @@ class _Span(ctypes.Structure):
     _fields_ = (("base", ctypes.c_void_p), ("length", ctypes.c_size_t))
 
 
-def flip(owner: Owner, what: FlipMemory, draw: int) -> str:
+def flip(owner: Owner, bit: int | None, address: int | None, draw: int) -> str:
     """Flip one bit of one byte; which, in words. Raises StepFailed, naming what is in the way."""
     try:
         pidfd = os.pidfd_open(owner.pid)
@@ -73,21 +71,21 @@ def flip(owner: Owner, what: FlipMemory, draw: int) -> str:
     try:
         if members.run_of(owner.pid) != owner.run:
             raise StepFailed(f"{owner.name} (pid {owner.pid}) is no process of this run")
-        return _flip(owner, what, draw)
+        return _flip(owner, bit, address, draw)
     finally:
         os.close(pidfd)
 
 
-def _flip(owner: Owner, what: FlipMemory, draw: int) -> str:
+def _flip(owner: Owner, bit: int | None, address: int | None, draw: int) -> str:
     found = mappings(owner.pid)
-    address = _draw(owner, found, draw) if what.address is None else what.address
+    address = _draw(owner, found, draw) if address is None else address
     mapping = next((one for one in found if one.start <= address < one.end), None)
     if mapping is None:
         raise StepFailed(
             f"address {address:#x}: in no private memory that {owner.name} (pid {owner.pid}) can write:"
             f" the heap, or anonymous, as /proc/{owner.pid}/maps shows it"
         )
-    bit = drawn(draw, 1) % BYTE_BITS if what.bit is None else what.bit
+    bit = drawn(draw, 1) % BYTE_BITS if bit is None else bit
     before = peek(owner, address)
     poke(owner, address, after := before ^ 1 << bit)
     there = peek(owner, address)

@@ -40,9 +40,9 @@ from aftbed.core import messages
 from aftbed.core.brick import Note, Send
 from aftbed.core.errors import PeerError
 from aftbed.core.events import Event
-from aftbed.core.fault import SLOW_MS_MAX
 from aftbed.core.journal import FLAG_OFFSET, PULSE_OFFSET, RECORD
 from aftbed.core.messages import ChannelEnded, Message
+from aftbed.inject.slow import SLOW_MS_MAX
 from aftbed.runtime import control
 from aftbed.runtime import node as node_module
 from aftbed.runtime.node import HostedBrick, Node, NodeIO

@@ -4,8 +4,8 @@ from typing import Final
 
 import msgspec
 
-from aftbed.core.fault import Fault
 from aftbed.core.messages import Scheduled
+from aftbed.inject.model import Fault
 
 COMMAND_GONE: Final = "the command is gone"  # a reason to end at once, whatever waits for an answer
 

@@ -14,9 +14,10 @@ from typing import Final
 
 import msgspec
 
+from aftbed.core.errors import StepFailed
 from aftbed.runtime import control, interface
 from aftbed.runtime.interface import ProcessKind
-from aftbed.runtime.jobs import Key, StepFailed, Wait
+from aftbed.runtime.jobs import Key, Wait
 from aftbed.runtime.unix import linux, members
 from aftbed.runtime.unix.event_loop import Loop
 from aftbed.runtime.unix.journal_files import Header

@@ -226,7 +226,7 @@ class Supervisor:
             "states": self._states,
             "starved_ms": round(max(waits, default=0) / 1e6, 3),  # of the node that waited longest for a CPU
             "epoch": self.deployment.epoch,
-            "faults": self.faults.receipts(),
+            "faults": msgspec.to_builtins(self.faults.reports()),
             **self.work.end(),
         }
         unfinished = self.record / "end.json.new"

@@ -6,14 +6,15 @@ from pathlib import Path
 from random import Random
 from typing import Final
 
-from aftbed.core.busfault import BusFault, Condition, Struck
-from aftbed.core.fault import FlipMemory
+from aftbed.core.busfault import Condition
+from aftbed.core.errors import StepFailed
 from aftbed.core.graph import Link
 from aftbed.core.journal import Record, records
+from aftbed.inject.bus import BusReport
+from aftbed.inject.kind import FaultKind
 from aftbed.runtime.deployment import Keys
 from aftbed.runtime.interface import Met
 from aftbed.runtime.interface import Process as AnyProcess
-from aftbed.runtime.jobs import StepFailed
 from aftbed.runtime.unix import memory
 from aftbed.runtime.unix.bus import BusFaults
 from aftbed.runtime.unix.cells import Cell
@@ -48,7 +49,7 @@ class Support:
         """A fresh pair of sockets."""
         return Channel(link)
 
-    def cell(self) -> Cell:
+    def shared_memory(self) -> Cell:
         """A fresh memfd."""
         return Cell()
 
@@ -71,7 +72,7 @@ class Support:
         """Of the run's seed."""
         return Random(f"{self._seed}/{number}").getrandbits(DRAW_BITS)
 
-    def disturb(self, number: int, fault: BusFault, draw: int) -> Keys:
+    def disturb(self, number: int, fault: FaultKind, draw: int) -> Keys:
         """By the hub."""
         if self._bus is None:
             raise StepFailed(f"{fault}: this run has no bus")
@@ -83,13 +84,13 @@ class Support:
             raise StepFailed(f"when {condition}: this run has no car")
         yield from self._bus.watch(number, condition, met)
 
-    def flip_memory(self, process: AnyProcess, flip: FlipMemory, draw: int) -> str:
+    def flip_memory(self, process: AnyProcess, bit: int | None, address: int | None, draw: int) -> str:
         """By process_vm_writev(2)."""
         if self._private is None:
             raise StepFailed("nothing tells which processes are of this run")
-        return memory.flip(memory.Owner(process.name, process.pid, self._private), flip, draw)
+        return memory.flip(memory.Owner(process.name, process.pid, self._private), bit, address, draw)
 
-    def bus_fault(self, number: int) -> Struck | None:
+    def bus_fault(self, number: int) -> BusReport | None:
         """As the hub has said."""
         return self._bus.struck(number) if self._bus is not None else None
 

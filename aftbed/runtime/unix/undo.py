@@ -29,7 +29,7 @@ from typing import Final
 
 import msgspec
 
-from aftbed.runtime.jobs import StepFailed
+from aftbed.core.errors import StepFailed
 from aftbed.runtime.unix import members
 
 LEDGER_NAME: Final = "undo"

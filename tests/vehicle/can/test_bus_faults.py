@@ -68,7 +68,7 @@ def test_a_hub_in_lockstep_and_a_bus_in_virtual_time_are_alike(words: str, tmp_p
         assert over_hub.of(can_id) == in_virtual_time.of(can_id), hex(can_id)
     assert over_hub.result == in_virtual_time.result
     assert over_hub.struck == in_virtual_time.struck
-    assert over_hub.struck[0].receipt == "activated"
+    assert over_hub.struck[0].receipt.state.value == "activated"
     assert over_hub.refused == in_virtual_time.refused
     assert over_hub.report is not None and over_hub.report.missing_answers == 0
 
@@ -85,7 +85,7 @@ def test_several_at_once_are_alike_too(tmp_path: Path) -> None:
 def test_a_drive_whose_fault_never_comes_is_the_sound_one(sound: Disturbed, tmp_path: Path) -> None:
     drive = real(tmp_path / "bus.log", "omission bus RADAR_TRACK nth 100000")
     assert drive.result == sound.result
-    assert drive.struck[0].receipt == "armed"
+    assert drive.struck[0].receipt.state.value == "armed"
     assert {i: drive.of(i) for i in drive.ids} == {i: sound.of(i) for i in sound.ids}
 
 
@@ -124,7 +124,7 @@ def test_what_has_a_good_crc_is_believed_by_all(words: str, node: str) -> None:
     drive = virtual(words)
     assert drive.refused == FIRST
     assert (drive.struck[0].noticed, drive.struck[0].believed) == ("", node)
-    assert drive.struck[0].receipt == "activated"
+    assert drive.struck[0].receipt.state.value == "activated"
 
 
 def test_a_radar_that_sees_far_and_well_protected_is_a_crash(sound: Disturbed) -> None:
@@ -134,8 +134,8 @@ def test_a_radar_that_sees_far_and_well_protected_is_a_crash(sound: Disturbed) -
 
 def test_a_frame_that_nobody_uses_is_struck_and_that_is_all() -> None:
     drive = virtual("corrupt bus BRAKE_STATUS bit 40 permanent")
-    assert drive.struck[0].receipt == "applied"
-    assert drive.struck[0].detail.endswith("noticed by nobody")
+    assert drive.struck[0].receipt.state.value == "applied"
+    assert drive.struck[0].receipt.detail.endswith("noticed by nobody")
 
 
 def test_the_brake_ecu_refuses_a_stuck_counter_and_falls_back() -> None:
@@ -200,7 +200,7 @@ def test_a_paced_drive_meets_its_condition_and_heals(tmp_path: Path) -> None:
     (struck,) = drive.struck
     gap = virtual("omission bus AEB_REQ when ttc < 2.5 for 100ms").struck[0]
     assert gap.first_us - 10_000 <= struck.first_us <= gap.first_us + 400_000
-    assert 1 <= struck.frames <= 8 and struck.receipt == "activated"
+    assert 1 <= struck.frames <= 8 and struck.receipt.state.value == "activated"
     assert drive.of(AEB_REQ)[-1].t_us > struck.first_us + 1_000_000
     assert not drive.result.collision
 

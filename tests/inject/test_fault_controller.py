@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 from faultrun import FIRST, Run, run
 
+from aftbed.core.errors import StepFailed
 from aftbed.core.events import Event
 from aftbed.runtime import control
-from aftbed.runtime.jobs import StepFailed
 
 __all__ = ["run"]  # a fixture
 
@@ -32,16 +32,16 @@ __all__ = ["run"]  # a fixture
 )
 def test_a_fault_waits_where_its_event_is_emitted(run: Run, text: str, node: str, itself: bool) -> None:
     fault = run.arm(text)
-    host, blow = run.blow()
-    assert (host, blow.brick, blow.nth, blow.itself) == (node, node, 5, itself)
-    assert (blow.fault, blow.action, blow.persistence) == (FIRST, fault.action, fault.persistence)
-    assert run.faults.receipts() == [{"fault": str(fault), "receipt": "armed"}]
+    host, armed = run.last_armed()
+    assert (host, armed.brick, armed.nth, armed.by_itself) == (node, node, 5, itself)
+    assert (armed.fault, armed.action, armed.persistence) == (FIRST, fault.action, fault.persistence)
+    assert run.reports() == [(str(fault), "armed", "")]
 
 
 def test_a_bitflip_without_an_event_waits_for_the_next_execution(run: Run) -> None:
     run.arm("bitflip result bit 3")
     order = run.deployment.told[-1][1]
-    assert isinstance(order, control.Arm) and order.event == "server.exit" and run.blow()[1].nth == 1
+    assert isinstance(order, control.Arm) and order.event == "server.exit" and run.last_armed()[1].nth == 1
 
 
 def test_a_fault_that_nobody_can_wait_for_is_refused_and_stays_so(run: Run) -> None:
@@ -50,7 +50,7 @@ def test_a_fault_that_nobody_can_wait_for_is_refused_and_stays_so(run: Run) -> N
         run.arm("crash backup at checkpoint.applied")
     run.deployment.backup = "b"
     run.do(run.faults.rearm())
-    assert run.deployment.told == [] and run.faults.receipts() == []
+    assert run.deployment.told == [] and run.reports() == []
 
 
 def test_the_bit_that_is_not_named_hangs_on_the_seed_and_on_the_fault(tmp_path: Path) -> None:
@@ -60,7 +60,7 @@ def test_the_bit_that_is_not_named_hangs_on_the_seed_and_on_the_fault(tmp_path: 
         other = Run(tmp_path / name, seed=seed)
         for _ in range(2):
             other.arm("bitflip result")
-            draws.append(other.blow()[1].draw)
+            draws.append(other.last_armed()[1].draw)
     assert draws[:2] == draws[4:] and len(set(draws)) == 4
 
 
@@ -73,23 +73,23 @@ def test_after_a_failover_a_fault_moves_to_the_new_leader_with_what_was_counted(
     run.happened("a/server", Event.SERVER_EXIT, 40)
     run.deployment.fail_over()
     run.do(run.faults.rearm())
-    node, blow = run.blow()
-    assert (node, blow.brick, blow.nth) == ("b/server", "b/server", 60)
+    node, armed = run.last_armed()
+    assert (node, armed.brick, armed.nth) == ("b/server", "b/server", 60)
     run.happened("b/server", Event.SERVER_EXIT, 25)
     run.deployment.renew("b/server")  # another process takes the place: an adaptation
     run.do(run.faults.rearm())
-    assert run.blow()[1].nth == 35
+    assert run.last_armed()[1].nth == 35
 
 
 def test_what_two_bricks_of_a_node_emit_is_counted_once(tmp_path: Path) -> None:
     run = Run(tmp_path, "pbr+tr", placement="replica")
     run.arm("crash proxy at before.exit nth 100")
-    assert (run.blow()[0], run.blow()[1].brick) == ("a", "a/before")
+    assert (run.last_armed()[0], run.last_armed()[1].brick) == ("a", "a/before")
     run.happened("a", Event.BEFORE_EXIT, 80)  # of 40 requests
     run.deployment.nodes["a"].kill()
     run.deployment.leader, run.deployment.backup = "b", ""
     run.do(run.faults.rearm())
-    assert (run.blow()[0], run.blow()[1].brick, run.blow()[1].nth) == ("b", "b/before", 60)
+    assert (run.last_armed()[0], run.last_armed()[1].brick, run.last_armed()[1].nth) == ("b", "b/before", 60)
 
 
 def test_what_has_not_changed_stays_where_it_is(run: Run) -> None:
@@ -102,17 +102,17 @@ def test_what_has_not_changed_stays_where_it_is(run: Run) -> None:
 def test_a_backup_that_leads_is_no_longer_hit_as_a_backup(tmp_path: Path) -> None:
     run = Run(tmp_path, "lfr")
     run.arm("bitflip result in backup nth 100")
-    assert run.blow()[0] == "b/server"
+    assert run.last_armed()[0] == "b/server"
     run.happened("b/server", Event.SERVER_EXIT, 10)
     run.deployment.fail_over()
     run.do(run.faults.rearm())
-    node, blow = run.blow()
-    assert (node, blow.nth) == ("b/server", 0), "it does not wait there any more"
+    node, armed = run.last_armed()
+    assert (node, armed.nth) == ("b/server", 0), "it does not wait there any more"
     run.deployment.renew(*(n for n in run.deployment.graph.nodes if n.startswith("a/")))
     run.deployment.backup = "a"
     run.do(run.faults.rearm())
-    node, blow = run.blow()
-    assert (node, blow.brick, blow.nth) == ("a/server", "a/server", 90)
+    node, armed = run.last_armed()
+    assert (node, armed.brick, armed.nth) == ("a/server", "a/server", 90)
 
 
 # -- what an adaptation comes through
@@ -129,7 +129,7 @@ def test_at_a_step_of_an_adaptation_the_target_is_dead_before_it_goes_on(run: Ru
     (wait,) = run.do(run.faults.at(Event.ADAPT_STEP_ENTER))
     assert wait.keys == {("died", name, run.deployment.nodes[name].pid) for name in victims}
     assert not any(map(run.deployment.lives, victims))
-    assert run.faults.receipts() == [{"fault": str(fault), "receipt": "activated"}]
+    assert run.reports() == [(str(fault), "activated", "")]
     assert run.do(run.faults.at(Event.ADAPT_STEP_ENTER)) == [], "once"
 
 
@@ -149,4 +149,4 @@ def test_each_fault_at_the_same_step_strikes(run: Run) -> None:
 def test_an_adaptation_that_never_comes_activates_nothing(run: Run) -> None:
     fault = run.arm("crash engine at adapt.commit")
     run.do(run.faults.rearm())
-    assert run.faults.receipts() == [{"fault": str(fault), "receipt": "armed"}]
+    assert run.reports() == [(str(fault), "armed", "")]

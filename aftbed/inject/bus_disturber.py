@@ -1,28 +1,29 @@
-"""What a fault of the bus does to its frames. Pure: frames in, frames out; time is the frames' own.
+"""What faults of the bus do to its frames. Pure: frames in, frames out; time is the frames' own.
 
 The hub between processes and the bus of the car in virtual time both let a frame pass through a `Disturber`
-at the moment at which it has the bus to itself:
+at the moment at which it has the bus to itself (`vehicle`'s protocol for it has the calls that a bus
+makes):
 
     carry(frame, sender)     what comes onto the bus in its place, now: the frame, another one, two, or none
     release(now_us)          what comes now without being sent now: held back before, or a babbling idiot's
     due_us()                 when `release` is worth calling next
     deaf(sender, node, ...)  whether the node does not hear that sender now: bus-off, partition
 
-Several faults are armed at once: what one lets through, the next one gets, in the order of arming. What
-is released is not struck again.
+Several faults are armed at once: what one lets through, the next one gets, in the order of arming. What is
+released is not struck again.
 
-*Time.* A fault opens at its time, and ends by time where it lasts: both are looked at when a frame or a
-`release` comes, and compared with bus time, so it makes no difference when anybody looks.
+*Time.* A fault opens at its time, and ends by time where it lasts. Both are looked at when a frame or a
+`release` comes, and compared with bus time, so it makes no difference when it is looked at.
 
-*Babbling idiot.* One that sends identifier 0 without a pause wins every arbitration. So nobody else gets a
-frame through: a node's controller holds the latest of each message, as a transmit buffer does, and these go
-out in the order of arbitration when it ends. The flood itself is carried as one frame in each millisecond,
-which stands for the three or four that 500 kbit/s would allow: who reads the bus has to see it, not to drown
-in it.
+*Babbling idiot.* A node that sends identifier 0 without a pause wins every arbitration. So no other frame
+gets through: a controller holds the latest of each message, as a transmit buffer does, and these go out in
+the order of arbitration when the babbling ends. The flood itself is carried as one frame in each
+millisecond, which stands for the three or four that 500 kbit/s would allow: readers of the bus have to see
+it, not to drown in it.
 
 *Who noticed.* A receiver that finds something wrong with a frame, or misses one, says so beside the bus, by
-the identifier (`noticed`); who takes a struck frame in (`reached`), and says nothing, has believed it. A
-brake ECU in its fallback has noticed whatever there is to notice.
+the identifier (`noticed`). A receiver that takes a struck frame in (`reached`), and says nothing, has
+believed it. A brake ECU in its fallback has noticed whatever there is to notice.
 """
 
 from random import Random
@@ -30,13 +31,14 @@ from typing import Final
 
 from e2e.p11 import e2e_p11_protect
 
-from aftbed.core.busfault import (
-    FALLBACK,
+from aftbed.core.busfault import FALLBACK, Condition
+from aftbed.inject.bit_patterns import with_flipped
+from aftbed.inject.bus import (
     NODE_ACTS,
     Babble,
     BusFault,
     BusOff,
-    Condition,
+    BusReport,
     Delay,
     Duplicate,
     FlipBit,
@@ -45,11 +47,9 @@ from aftbed.core.busfault import (
     Partition,
     Reorder,
     SetSignal,
-    Struck,
     StuckCounter,
 )
-from aftbed.core.persistence import Chance, Every, Lasting, Permanent, Transient
-from aftbed.core.valuefault import flipped
+from aftbed.inject.timing import Chance, Every, Lasting, Permanent, Transient
 from aftbed.vehicle.can.bus_model import CarriedFrame
 from aftbed.vehicle.can.frame import Frame
 
@@ -60,14 +60,14 @@ FLOOD_FRAMES_MAX: Final = 100  # in one release: a bus that was away for long do
 COUNTER_MASK: Final = 0x0F
 
 
-class _Armed:
+class _ArmedBusFault:
     """A fault, and what it has come to."""
 
     def __init__(self, number: int, fault: BusFault, chance: Random, now_us: int) -> None:
-        assert fault.aim is not None, f"{fault} is not aimed"
+        assert fault.targets is not None, f"the names of {fault} are not resolved"
         opening = fault.opening
         self.number, self.fault, self.chance = number, fault, chance
-        self.marks = {mark.can_id: mark for mark in fault.aim.marks}
+        self.targets = {target.can_id: target for target in fault.targets}
         self.opens_us = now_us + opening.after_us if opening.when is None else None
         self.since_us: int | None = None  # when it first struck, or took hold
         self.over = False
@@ -83,9 +83,11 @@ class _Armed:
 
     @property
     def on_nodes(self) -> bool:
-        return isinstance(self.fault.act, NODE_ACTS)
+        """Whether it takes hold of nodes, not of frames."""
+        return isinstance(self.fault.effect, NODE_ACTS)
 
     def open(self, now_us: int) -> bool:
+        """Whether it may strike."""
         return not self.over and self.opens_us is not None and self.opens_us <= now_us
 
     def ends_us(self) -> int | None:
@@ -96,7 +98,7 @@ class _Armed:
         return since_us + persistence.for_us
 
     def holds(self, now_us: int) -> bool:
-        """An act on nodes: whether it has hold of them. It takes hold when that is first asked in time."""
+        """Whether it has hold of its nodes. It takes hold when that is first asked in time."""
         if not self.open(now_us):
             return False
         if self.since_us is None:
@@ -110,7 +112,7 @@ class _Armed:
         return self.over
 
     def strikes(self, now_us: int) -> bool:
-        """Whether the fault strikes the frame of now, which is one of those that it is aimed at."""
+        """Whether it strikes the frame of now, which is one of its targets."""
         if not self.open(now_us):
             return False
         self.seen += 1
@@ -136,14 +138,15 @@ class _Armed:
             self.over = False
 
     def count(self, frame: Frame) -> None:
-        """It was struck."""
+        """The frame was struck."""
         if not self.frames:
             self.first_us, self.first_id = frame.t_us, frame.can_id
         self.frames += 1
         self.ids.add(frame.can_id)
 
-    def struck(self) -> Struck:
-        return Struck(
+    def report(self) -> BusReport:
+        """What has become of it."""
+        return BusReport(
             self.number,
             self.frames,
             self.first_us,
@@ -163,12 +166,12 @@ class Disturber:
     """All faults of one bus."""
 
     def __init__(self) -> None:
-        self._armed: dict[int, _Armed] = {}
+        self._armed: dict[int, _ArmedBusFault] = {}
         self._held: list[tuple[int, CarriedFrame]] = []  # due, in the order of their coming
 
     def arm(self, number: int, fault: BusFault, draw: int, now_us: int) -> None:
-        """`fault` is aimed; `draw` seeds its chance."""
-        self._armed[number] = _Armed(number, fault, Random(draw), now_us)
+        """From now on. The names of `fault` are resolved; `draw` seeds its chance."""
+        self._armed[number] = _ArmedBusFault(number, fault, Random(draw), now_us)
 
     def forget(self, number: int, now_us: int) -> None:
         """It ends now; what it holds back is due."""
@@ -179,7 +182,7 @@ class Disturber:
             self._held = [(now_us if number in sent.by else due_us, sent) for due_us, sent in self._held]
 
     def conditions(self) -> list[tuple[int, Condition]]:
-        """What somebody has to look at the car for, by the number of the fault."""
+        """The conditions of the car that are waited for, by the number of the fault."""
         waiting = [a for a in self._armed.values() if a.opens_us is None and not a.over]
         return [(a.number, a.fault.opening.when) for a in waiting if a.fault.opening.when is not None]
 
@@ -189,16 +192,16 @@ class Disturber:
         if armed is not None and armed.opens_us is None:
             armed.opens_us = now_us
 
-    def struck(self) -> list[Struck]:
+    def reports(self) -> list[BusReport]:
         """What has become of each."""
-        return [armed.struck() for armed in self._armed.values()]
+        return [armed.report() for armed in self._armed.values()]
 
     @property
     def idle(self) -> bool:
         """Whether the bus is as it was, and stays so."""
         return not self._held and all(armed.quiet() for armed in self._armed.values())
 
-    # -- frames -------------------------------------------------------------------------------
+    # -- frames -----------------------------------------------------------------------------------
 
     def carry(self, frame: Frame, sender: str) -> list[CarriedFrame]:
         """What comes onto the bus now, since `sender` has sent `frame`; `t_us` of it is now."""
@@ -206,7 +209,7 @@ class Disturber:
         for armed in self._armed.values():
             if armed.on_nodes:
                 sent = [one for one in sent if self._gets_through(armed, one)]
-            elif frame.can_id in armed.marks:
+            elif frame.can_id in armed.targets:
                 sent = [out for one in sent for out in self._struck(armed, one)]
         return sent
 
@@ -221,17 +224,16 @@ class Disturber:
         ]
 
     def due_us(self) -> int | None:
-        """When something is to happen next of which no frame will tell."""
+        """When something is to happen next that no frame brings about."""
         due = [due_us for due_us, _ in self._held]
         for armed in self._armed.values():
             due += [armed.swap_due_us] if armed.swapped is not None else []
             due += [0] if armed.starved and armed.over else []
             due += [ends_us] if (ends_us := armed.ends_us()) is not None else []
             if armed.on_nodes and not armed.over and armed.opens_us is not None:
-                babbles = isinstance(armed.fault.act, Babble)
                 if armed.since_us is None:
                     due.append(armed.opens_us)
-                elif babbles:
+                elif isinstance(armed.fault.effect, Babble):
                     due.append(armed.flood_us)
         return min(due, default=None)
 
@@ -243,7 +245,7 @@ class Disturber:
             if armed.on_nodes and armed.holds(now_us)
         )
 
-    # -- who noticed --------------------------------------------------------------------------
+    # -- who noticed ------------------------------------------------------------------------------
 
     def noticed(self, node: str, can_id: int, word: str) -> None:
         """`node` finds something wrong with the frames of `can_id`."""
@@ -252,19 +254,19 @@ class Disturber:
                 armed.noticed = f"{node} ({word})"
 
     def reached(self, by: tuple[int, ...], node: str) -> None:
-        """A frame that these have struck has come to `node`, which makes something of it."""
+        """A frame that these faults have struck has come to `node`, which makes something of it."""
         for number in by:
             armed = self._armed[number]
             armed.believed = armed.believed or node
 
-    # -- acts ---------------------------------------------------------------------------------
+    # -- acts -------------------------------------------------------------------------------------
 
-    def _gets_through(self, armed: _Armed, sent: CarriedFrame) -> bool:
+    def _gets_through(self, armed: _ArmedBusFault, sent: CarriedFrame) -> bool:
         """Whether the frame comes onto the bus in spite of what has hold of a node."""
         frame = sent.frame
         if not armed.holds(frame.t_us):
             return True
-        match armed.fault.act:
+        match armed.fault.effect:
             case Babble():
                 armed.count(frame)
                 armed.starved[frame.can_id] = sent
@@ -277,8 +279,8 @@ class Disturber:
                     armed.count(frame)
         return True
 
-    def _struck(self, armed: _Armed, sent: CarriedFrame) -> list[CarriedFrame]:
-        """What `armed` makes of a frame that it is aimed at."""
+    def _struck(self, armed: _ArmedBusFault, sent: CarriedFrame) -> list[CarriedFrame]:
+        """What `armed` makes of one of its frames."""
         frame, by = sent.frame, (*sent.by, armed.number)
         if armed.swapped is not None:
             late, armed.swapped = armed.swapped, None
@@ -293,7 +295,7 @@ class Disturber:
             return [sent]
         armed.count(frame)
         struck = CarriedFrame(changed, sent.sender, by)
-        match armed.fault.act:
+        match armed.fault.effect:
             case Omission():
                 return []
             case Delay(by_us):
@@ -307,8 +309,8 @@ class Disturber:
             case _:
                 return [struck]
 
-    def _let_go(self, armed: _Armed, now_us: int) -> None:
-        """What is over lets go of what it had."""
+    def _let_go(self, armed: _ArmedBusFault, now_us: int) -> None:
+        """A fault that is over lets go of what it had."""
         if armed.on_nodes:
             armed.holds(now_us)
         elif (ends_us := armed.ends_us()) is not None and now_us >= ends_us:
@@ -321,13 +323,13 @@ class Disturber:
             armed.starved = {}
             self._held += [(now_us, sent) for _, sent in waiting]
 
-    def _flood(self, armed: _Armed, now_us: int) -> list[CarriedFrame]:
-        if not isinstance(armed.fault.act, Babble) or not armed.holds(now_us):
+    def _flood(self, armed: _ArmedBusFault, now_us: int) -> list[CarriedFrame]:
+        if not isinstance(armed.fault.effect, Babble) or not armed.holds(now_us):
             return []
-        node = armed.fault.act.node
+        node = armed.fault.effect.node
         missed = (now_us - armed.flood_us) // FLOOD_US + 1
         armed.flood_us += max(0, missed) * FLOOD_US
-        off = [a.fault.act for a in self._armed.values() if a.on_nodes and a.holds(now_us)]
+        off = [a.fault.effect for a in self._armed.values() if a.on_nodes and a.holds(now_us)]
         if BusOff(node) in off:
             return []
         flood = CarriedFrame(Frame(now_us, FLOOD_ID, bytes(8)), node)
@@ -339,8 +341,8 @@ def _at(now_us: int, sent: CarriedFrame) -> CarriedFrame:
     return CarriedFrame(Frame(now_us, frame.can_id, frame.data), sent.sender, sent.by)
 
 
-def _cuts(armed: _Armed, sender: str, node: str) -> bool:
-    match armed.fault.act:
+def _cuts(armed: _ArmedBusFault, sender: str, node: str) -> bool:
+    match armed.fault.effect:
         case BusOff(off):
             return node == off
         case Partition(side, other):
@@ -349,31 +351,31 @@ def _cuts(armed: _Armed, sender: str, node: str) -> bool:
             return False
 
 
-def _changed(armed: _Armed, frame: Frame) -> Frame | None:
+def _changed(armed: _ArmedBusFault, frame: Frame) -> Frame | None:
     """The frame as the act makes it; None where there is nothing to change: then it is not struck."""
-    mark, data = armed.marks[frame.can_id], frame.data
-    match armed.fault.act:
+    target, data = armed.targets[frame.can_id], frame.data
+    match armed.fault.effect:
         case FlipBit(bit):
-            data = flipped(data, bit) if bit < 8 * len(data) else data
+            data = with_flipped(data, [bit]) if bit < 8 * len(data) else data
         case SetSignal():
-            if len(data) == len(mark.mask):
-                parts = zip(data, mark.mask, mark.bits, strict=True)
+            if len(data) == len(target.mask):
+                parts = zip(data, target.mask, target.bits, strict=True)
                 data = bytes(byte & ~where | bits for byte, where, bits in parts)
         case StuckCounter():
             counter = armed.counters.get(frame.can_id)
             if counter is not None and len(data) > 1:
                 data = bytes([data[0], data[1] & ~COUNTER_MASK | counter, *data[2:]])
         case Masquerade():
-            return Frame(frame.t_us, frame.can_id, resealed(data, mark.data_id)) if len(data) > 1 else None
+            return Frame(frame.t_us, frame.can_id, resealed(data, target.data_id)) if len(data) > 1 else None
         case _:
             return frame
     if data == frame.data:
         return None
-    return Frame(frame.t_us, frame.can_id, resealed(data, mark.data_id) if mark.data_id >= 0 else data)
+    return Frame(frame.t_us, frame.can_id, resealed(data, target.data_id) if target.data_id >= 0 else data)
 
 
 def resealed(data: bytes, data_id: int) -> bytes:
-    """`data` with a CRC that fits it and `data_id`; the counter stays, whatever it is."""
+    """`data` with a CRC that fits it and `data_id`; the counter stays as it is."""
     frame = bytearray(data)
     e2e_p11_protect(frame, data_id, increment_counter=False)
     return bytes(frame)

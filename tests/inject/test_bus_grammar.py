@@ -4,11 +4,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aftbed.core.busfault import (
+from aftbed.core.busfault import Condition
+from aftbed.core.errors import ConfigError
+from aftbed.inject.bus import (
+    VERBS,
     Babble,
     BusFault,
     BusOff,
-    Condition,
     Delay,
     Duplicate,
     FlipBit,
@@ -20,12 +22,10 @@ from aftbed.core.busfault import (
     Reorder,
     SetSignal,
     StuckCounter,
+    read_bus_fault,
 )
-from aftbed.core.errors import ConfigError
-from aftbed.core.fault import Fault, on_bus
-from aftbed.core.persistence import Chance, Every, Lasting, Permanent, Transient
-from aftbed.inject import words
-from aftbed.inject.buswords import VERBS, parse
+from aftbed.inject.model import Fault, on_bus, parse
+from aftbed.inject.timing import Chance, Every, Lasting, Permanent, Transient
 
 NAMES = st.from_regex(r"[A-Za-z_][A-Za-z0-9_]{0,20}", fullmatch=True).filter(lambda name: name != "from")
 NODES = st.from_regex(r"[a-z_][a-z0-9_]{0,10}", fullmatch=True)
@@ -66,8 +66,8 @@ FAULTS = st.builds(
 
 @given(FAULTS)
 def test_a_fault_reads_back_as_it_was(fault: BusFault) -> None:
-    assert parse(str(fault)) == fault
-    assert words.parse(str(fault)) == on_bus(fault)
+    assert read_bus_fault(str(fault)) == fault
+    assert parse(str(fault)) == on_bus(fault)
     assert str(on_bus(fault)) == str(fault)
 
 
@@ -83,10 +83,10 @@ def test_a_fault_reads_back_as_it_was(fault: BusFault) -> None:
 )
 def test_whatever_is_typed_is_a_fault_or_refused(typed: list[str]) -> None:
     try:
-        fault = parse(" ".join(typed))
+        fault = read_bus_fault(" ".join(typed))
     except ConfigError:
         return
-    assert parse(str(fault)) == fault
+    assert read_bus_fault(str(fault)) == fault
 
 
 @pytest.mark.parametrize(
@@ -118,8 +118,8 @@ def test_whatever_is_typed_is_a_fault_or_refused(typed: list[str]) -> None:
     ],
 )
 def test_the_grammar(text: str, fault: BusFault) -> None:
-    assert parse(text) == fault
-    assert words.parse(text) == on_bus(fault)
+    assert read_bus_fault(text) == fault
+    assert parse(text) == on_bus(fault)
 
 
 @pytest.mark.parametrize(
@@ -155,12 +155,12 @@ def test_the_grammar(text: str, fault: BusFault) -> None:
 )
 def test_what_is_wrong_is_named(text: str, says: str) -> None:
     with pytest.raises(ConfigError) as refused:
-        parse(text)
+        read_bus_fault(text)
     assert says in str(refused.value)
 
 
 def test_faults_of_channels_keep_their_words() -> None:
-    assert not isinstance(words.parse("omission pxy2pro nth 3").action, BusFault)
+    assert not isinstance(parse("omission pxy2pro nth 3").action, BusFault)
 
 
 @pytest.mark.parametrize(
@@ -171,7 +171,10 @@ def test_faults_of_channels_keep_their_words() -> None:
         (lambda: BusFault(BusOff("radar")), "BusOff lasts"),
         (Frames, "frames of message ''"),
         (lambda: Opening(1, Condition("gap", True, 1.0)), "after a time and on a condition"),
-        (lambda: Fault(parse("bus-off radar"), "a", words.parse("crash a").trigger), "its own words"),
+        (
+            lambda: Fault(read_bus_fault("bus-off radar"), "a", parse("crash a").trigger),
+            "its own words",
+        ),
     ],
 )
 def test_what_means_nothing_cannot_be_made(made: object, says: str) -> None:

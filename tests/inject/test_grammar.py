@@ -10,18 +10,24 @@ from somefaults import faults
 
 from aftbed.core.busfault import Condition
 from aftbed.core.errors import ConfigError
-from aftbed.core.fault import Crash, Disturb, Fault, FlipMemory, Hang, How, Slow, Trigger
-from aftbed.core.persistence import Chance, Every, Permanent
-from aftbed.core.valuefault import Bit, Bits, Burst, Byte, Flip, Place, Stuck
-from aftbed.inject.words import KINDS, parse, read
+from aftbed.inject.bit_patterns import Bit, BitBurst, Bits, Byte, StuckBit
+from aftbed.inject.channel import ChannelFault, Disturbance
+from aftbed.inject.crash import Crash
+from aftbed.inject.hang import Hang
+from aftbed.inject.memory import MemoryFlip
+from aftbed.inject.model import NAMES, Fault, parse, read
+from aftbed.inject.slow import Slow
+from aftbed.inject.state import StateFlip
+from aftbed.inject.timing import Chance, Every, Permanent, Trigger
+from aftbed.inject.value import ValueFlip, ValuePlace
 
 TTC: Final = Condition("ttc", True, 1.2)
 
 
 def bitflip(
-    place: Place, bit: int | None = None, target: str = "primary", trigger: Trigger | None = None
+    place: ValuePlace, bit: int | None = None, target: str = "primary", trigger: Trigger | None = None
 ) -> Fault:
-    return Fault(Flip(place, Bit(bit)), target, trigger or Trigger())
+    return Fault(ValueFlip(place, Bit(bit)), target, trigger or Trigger())
 
 
 @given(faults)
@@ -42,18 +48,18 @@ def test_a_fault_reads_back_as_it_was(fault: Fault) -> None:
         (
             "omission pxy2pro when gap > 30 nth 2",
             Fault(
-                Disturb(How.OMISSION, "pxy2pro"),
+                ChannelFault(Disturbance.OMISSION, "pxy2pro"),
                 "primary",
                 Trigger(nth=2, when=Condition("gap", False, 30)),
             ),
         ),
-        ("bitflip result when ttc < 1.2", bitflip(Place.RESULT, trigger=Trigger(when=TTC))),
+        ("bitflip result when ttc < 1.2", bitflip(ValuePlace.RESULT, trigger=Trigger(when=TTC))),
         ("slow primary share 25%", Fault(Slow(0.0, 0, 0.25), "primary", Trigger())),
         ("slow a/server share 2.5% for 1s", Fault(Slow(0.0, 1000, 0.025), "a/server", Trigger())),
-        ("bitflip memory", Fault(FlipMemory(), "primary", Trigger())),
+        ("bitflip memory", Fault(MemoryFlip(), "primary", Trigger())),
         (
             "bitflip memory bit 3 address 0x7f00 in a/server at reply.sent",
-            Fault(FlipMemory(3, 0x7F00), "a/server", Trigger("reply.sent")),
+            Fault(MemoryFlip(3, 0x7F00), "a/server", Trigger("reply.sent")),
         ),
         ("  crash   b/after ", Fault(Crash(), "b/after", Trigger())),
         ("crash primary at checkpoint.sent", Fault(Crash(), "primary", Trigger("checkpoint.sent", 1))),
@@ -73,58 +79,66 @@ def test_a_fault_reads_back_as_it_was(fault: Fault) -> None:
             "hang a/server for 50ms at server.exit nth 3",
             Fault(Hang(50), "a/server", Trigger("server.exit", 3)),
         ),
-        ("bitflip result", bitflip(Place.RESULT)),
-        ("bitflip state bit 0", bitflip(Place.STATE, 0)),
-        ("bitflip result in backup", bitflip(Place.RESULT, target="backup")),
-        ("bitflip result nth 7", bitflip(Place.RESULT, trigger=Trigger("server.exit", 7))),
-        ("bitflip result after 200ms", bitflip(Place.RESULT, trigger=Trigger(after_ms=200))),
+        ("bitflip result", bitflip(ValuePlace.RESULT)),
+        ("bitflip state bit 0", bitflip(ValuePlace.STATE, 0)),
+        ("bitflip result in backup", bitflip(ValuePlace.RESULT, target="backup")),
+        ("bitflip result nth 7", bitflip(ValuePlace.RESULT, trigger=Trigger("server.exit", 7))),
+        ("bitflip result after 200ms", bitflip(ValuePlace.RESULT, trigger=Trigger(after_ms=200))),
         (
             "bitflip result bit 60 at server.exit nth 100",
-            bitflip(Place.RESULT, 60, trigger=Trigger("server.exit", 100)),
+            bitflip(ValuePlace.RESULT, 60, trigger=Trigger("server.exit", 100)),
         ),
         (
             "bitflip state in b nth 3 at state.restored bit 9",
-            bitflip(Place.STATE, 9, "b", Trigger("state.restored", 3)),
+            bitflip(ValuePlace.STATE, 9, "b", Trigger("state.restored", 3)),
         ),
-        ("bitflip state.ego_ms", Fault(Flip(Place.STATE, Bit(), "ego_ms"), "primary", Trigger())),
+        ("bitflip state.ego_ms", Fault(StateFlip("ego_ms"), "primary", Trigger())),
         (
             "bitflip state.track0.range_m bit 52 in b nth 7",
-            Fault(Flip(Place.STATE, Bit(52), "track0.range_m"), "b", Trigger("server.exit", 7)),
+            Fault(StateFlip("track0.range_m", Bit(52)), "b", Trigger("server.exit", 7)),
         ),
         (
             "bitflip state.t_ms byte 1 after 20ms",
-            Fault(Flip(Place.STATE, Byte(1), "t_ms"), "primary", Trigger(after_ms=20)),
+            Fault(StateFlip("t_ms", Byte(1)), "primary", Trigger(after_ms=20)),
         ),
         ("slow primary", Fault(Slow(2.0, 0), "primary", Trigger())),
         (
             "slow b/after for 500ms by 0.5ms at checkpoint.applied",
             Fault(Slow(0.5, 500), "b/after", Trigger("checkpoint.applied")),
         ),
-        ("omission pxy2pro", Fault(Disturb(How.OMISSION, "pxy2pro"), "primary", Trigger())),
-        ("delay aft2aft", Fault(Disturb(How.DELAY, "aft2aft", 20.0), "primary", Trigger())),
+        ("omission pxy2pro", Fault(ChannelFault(Disturbance.OMISSION, "pxy2pro"), "primary", Trigger())),
+        ("delay aft2aft", Fault(ChannelFault(Disturbance.DELAY, "aft2aft", 20.0), "primary", Trigger())),
         (
             "delay aft2aft nth 3 by 5ms in b permanent",
-            Fault(Disturb(How.DELAY, "aft2aft", 5.0), "b", Trigger(nth=3), Permanent()),
+            Fault(ChannelFault(Disturbance.DELAY, "aft2aft", 5.0), "b", Trigger(nth=3), Permanent()),
         ),
         (
             "duplicate pro2pxy after 2s intermittent p 0.25",
-            Fault(Disturb(How.DUPLICATE, "pro2pxy"), "primary", Trigger(after_ms=2000), Chance(0.25)),
+            Fault(
+                ChannelFault(Disturbance.DUPLICATE, "pro2pxy"),
+                "primary",
+                Trigger(after_ms=2000),
+                Chance(0.25),
+            ),
         ),
         (
             "reorder clt2pxy intermittent every 3",
-            Fault(Disturb(How.REORDER, "clt2pxy", 20.0), "primary", Trigger(), Every(3)),
+            Fault(ChannelFault(Disturbance.REORDER, "clt2pxy", 20.0), "primary", Trigger(), Every(3)),
         ),
-        ("bitflip request nth 2", bitflip(Place.REQUEST, trigger=Trigger("server.enter", 2))),
-        ("bitflip checkpoint nth 2", bitflip(Place.CHECKPOINT, trigger=Trigger("checkpoint.sent", 2))),
-        ("bitflip log nth 2", bitflip(Place.LOG, trigger=Trigger("reply.stored", 2))),
-        ("bitflip result bits 3", Fault(Flip(Place.RESULT, Bits(3)), "primary", Trigger())),
-        ("bitflip result byte", Fault(Flip(Place.RESULT, Byte()), "primary", Trigger())),
-        ("bitflip result byte 4 in b", Fault(Flip(Place.RESULT, Byte(4)), "b", Trigger())),
-        ("bitflip result burst 5", Fault(Flip(Place.RESULT, Burst(5)), "primary", Trigger())),
-        ("bitflip result bit 9 burst 5", Fault(Flip(Place.RESULT, Burst(5, 9)), "primary", Trigger())),
+        ("bitflip request nth 2", bitflip(ValuePlace.REQUEST, trigger=Trigger("server.enter", 2))),
+        ("bitflip checkpoint nth 2", bitflip(ValuePlace.CHECKPOINT, trigger=Trigger("checkpoint.sent", 2))),
+        ("bitflip log nth 2", bitflip(ValuePlace.LOG, trigger=Trigger("reply.stored", 2))),
+        ("bitflip result bits 3", Fault(ValueFlip(ValuePlace.RESULT, Bits(3)), "primary", Trigger())),
+        ("bitflip result byte", Fault(ValueFlip(ValuePlace.RESULT, Byte()), "primary", Trigger())),
+        ("bitflip result byte 4 in b", Fault(ValueFlip(ValuePlace.RESULT, Byte(4)), "b", Trigger())),
+        ("bitflip result burst 5", Fault(ValueFlip(ValuePlace.RESULT, BitBurst(5)), "primary", Trigger())),
+        (
+            "bitflip result bit 9 burst 5",
+            Fault(ValueFlip(ValuePlace.RESULT, BitBurst(5, 9)), "primary", Trigger()),
+        ),
         (
             "bitflip state permanent stuck 60=1",
-            Fault(Flip(Place.STATE, Stuck(60, 1)), "primary", Trigger(), Permanent()),
+            Fault(ValueFlip(ValuePlace.STATE, StuckBit(60, 1)), "primary", Trigger(), Permanent()),
         ),
     ],
 )
@@ -251,7 +265,7 @@ def test_any_text_is_a_fault_or_a_config_error(text: str) -> None:
 
 
 SOME_WORDS: Final = (
-    *KINDS,
+    *NAMES,
     "result",
     "bit",
     "byte",

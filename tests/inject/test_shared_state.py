@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 
 from aftbed.core.application import Application, Characteristics, Field, Width, field_named, fields_of
 from aftbed.core.errors import ConfigError, PeerError
-from aftbed.core.valuefault import Bit, Bits, Burst, Byte, Flip, Pattern, Place, Stuck, flipped
 from aftbed.ftm.compose import build
-from aftbed.inject.words import parse
-from aftbed.runtime.cell import CELL_BYTES, InCell, check_field, differing
-from aftbed.runtime.targets import check, waits_in
+from aftbed.inject.bit_patterns import Bit, BitBurst, BitPattern, Bits, Byte, StuckBit, flipped
+from aftbed.inject.model import parse
+from aftbed.inject.shared_state import SHARED_BYTES, SharedFunction, differing_bits, field_with_bits
+from aftbed.inject.targets import Roles
 from aftbed.vehicle.aeb.function import STATE_BYTES, AebFunction, sample_requests
 from aftbed.vehicle.aeb.messages import decode_reply, decode_request
 from aftbed.vehicle.aeb.variants import Cautious, NonDeterministic, WithoutStateAccess
@@ -29,9 +29,11 @@ class Kept:
     """A function in a cell, and what it was found to have taken over or refused."""
 
     def __init__(self) -> None:
-        self.memory = memoryview(bytearray(CELL_BYTES))
+        self.memory = memoryview(bytearray(SHARED_BYTES))
         self.found: list[tuple[list[int], PeerError | None]] = []
-        self.application = InCell(AebFunction(), self.memory, lambda b, error: self.found.append((b, error)))
+        self.application = SharedFunction(
+            AebFunction(), self.memory, lambda b, error: self.found.append((b, error))
+        )
 
     def flip(self, bit: int) -> None:
         self.memory[bit // 8] ^= 1 << bit % 8
@@ -84,17 +86,17 @@ def test_a_field_is_what_its_name_says(make: Callable[[], Application]) -> None:
         (Bit(8), "stage", "bit 8 of state.stage: it is u8, and has bits 0 to 7"),
         (Byte(4), "warned_ms", "byte 4 of state.warned_ms: it is u32, and has bytes 0 to 3"),
         (Bits(9), "track3.hits", "bits 9 of state.track3.hits: it is u8, and has bits 0 to 7"),
-        (Burst(2, 63), "t_ms", "burst 2 bit 63 of state.t_ms: it is i64, and has bits 0 to 63"),
-        (Stuck(8, 0), "stage", "stuck 8=0 of state.stage: it is u8, and has bits 0 to 7"),
+        (BitBurst(2, 63), "t_ms", "burst 2 bit 63 of state.t_ms: it is i64, and has bits 0 to 63"),
+        (StuckBit(8, 0), "stage", "stuck 8=0 of state.stage: it is u8, and has bits 0 to 7"),
         (Bit(), "ego", "unknown field of the state 'ego'; did you mean 'ego_ms'? (one of: blind_ms, "),
         (Bit(), "track3.range", "did you mean 'trackN.range_m'?"),
     ],
 )
 def test_what_is_no_part_of_a_field_is_refused_with_what_is(
-    pattern: Pattern, name: str, message: str
+    pattern: BitPattern, name: str, message: str
 ) -> None:
     with pytest.raises(ConfigError, match=re.escape(message)):
-        check_field(Flip(Place.STATE, pattern, name), fields_of(AebFunction))
+        field_with_bits(name, pattern, fields_of(AebFunction))
 
 
 def test_a_function_that_declares_nothing_has_no_fields() -> None:
@@ -115,14 +117,14 @@ def test_a_function_that_declares_nothing_has_no_fields() -> None:
 )
 def test_what_cannot_be_flipped_is_refused_before_the_run(text: str, message: str) -> None:
     with pytest.raises(ConfigError, match=re.escape(message)):
-        check(parse(text), build("pbr", "process"))
+        parse(text).check(build("pbr", "process"))
 
 
 def test_a_flip_in_memory_waits_for_any_event_at_whoever_emits_it() -> None:
     graph = build("pbr", "process")
     fault = parse("bitflip state.ego_ms in backup at checkpoint.sent nth 3")
-    check(fault, graph)
-    assert waits_in(fault, graph, "a", "b") == "a/after"
+    fault.check(graph)
+    assert fault.action.waits_in(fault, Roles(graph, "a", "b")) == "a/after"
 
 
 # -- living in a cell -----------------------------------------------------------------------------
@@ -168,4 +170,4 @@ def test_the_bits_that_differ_are_those_that_were_flipped(data: bytes, bits: set
     there, wanted = data, sorted(bit for bit in bits if bit < 8 * len(data))
     for bit in wanted:
         there = flipped(there, bit)
-    assert differing(there, data) == wanted
+    assert differing_bits(there, data) == wanted

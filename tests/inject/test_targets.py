@@ -6,12 +6,20 @@ import pytest
 
 from aftbed.core.errors import ConfigError
 from aftbed.core.events import REQUEST_PATH, Event
-from aftbed.core.fault import Crash, Disturb, Fault, How, Slow, Trigger
-from aftbed.core.graph import PLACEMENTS
-from aftbed.core.valuefault import BIT_MAX, EXECUTED, Bit, Bits, Burst, Byte, Flip, Place, Stuck
+from aftbed.core.graph import PLACEMENTS, Graph
 from aftbed.ftm.compose import DUPLEX, EXPRESSIONS, build
-from aftbed.inject.words import parse
-from aftbed.runtime.targets import OTHERS, SUPERVISOR, check, emitter, emitters_in, waits_in
+from aftbed.inject.bit_patterns import BIT_MAX, Bit, BitBurst, Bits, Byte, StuckBit
+from aftbed.inject.channel import ChannelFault, Disturbance
+from aftbed.inject.crash import Crash
+from aftbed.inject.model import Fault, parse
+from aftbed.inject.slow import Slow
+from aftbed.inject.targets import OTHERS, SUPERVISOR, Roles, emitters_in, emitting_node
+from aftbed.inject.timing import Trigger
+from aftbed.inject.value import EXECUTED, ValueFlip, ValuePlace
+
+
+def waits_in(fault: Fault, graph: Graph, leader: str, backup: str) -> str | None:
+    return fault.action.waits_in(fault, Roles(graph, leader, backup))
 
 
 def crash(target: str, trigger: Trigger | None = None) -> Fault:
@@ -19,22 +27,22 @@ def crash(target: str, trigger: Trigger | None = None) -> Fault:
 
 
 def bitflip(
-    place: Place, target: str = "primary", event: str = "", nth: int = 1, bit: int | None = None
+    place: ValuePlace, target: str = "primary", event: str = "", nth: int = 1, bit: int | None = None
 ) -> Fault:
-    return Fault(Flip(place, Bit(bit)), target, Trigger(event, nth))
+    return Fault(ValueFlip(place, Bit(bit)), target, Trigger(event, nth))
 
 
 @pytest.mark.parametrize("placement", PLACEMENTS)
 def test_every_node_and_role_and_everything_beside_can_be_hit(placement: str) -> None:
     graph = build("pbr", placement)
     for target in ("primary", "backup", *graph.nodes, *OTHERS):
-        check(crash(target), graph)
+        crash(target).check(graph)
 
 
 @pytest.mark.parametrize("event", REQUEST_PATH)
 @pytest.mark.parametrize("placement", PLACEMENTS)
 def test_every_event_of_the_request_path_can_trigger(placement: str, event: Event) -> None:
-    check(crash("primary", Trigger(event.label, 100)), build("pbr", placement))
+    crash("primary", Trigger(event.label, 100)).check(build("pbr", placement))
 
 
 @pytest.mark.parametrize(
@@ -76,12 +84,12 @@ def test_what_cannot_happen_is_refused_with_what_can(
     ftm: str, placement: str, fault: Fault, message: str
 ) -> None:
     with pytest.raises(ConfigError, match=re.escape(message)):
-        check(fault, build(ftm, placement))
+        fault.check(build(ftm, placement))
 
 
 def test_the_allowed_events_are_listed() -> None:
     with pytest.raises(ConfigError) as caught:
-        check(crash("primary", Trigger("node.died")), build("none", "process"))
+        crash("primary", Trigger("node.died")).check(build("none", "process"))
     listed = str(caught.value).partition("(one of: ")[2].rstrip(")").split(", ")
     assert listed == sorted(listed)
     assert {"request.sent", "server.enter", "server.exit", "reply.delivered"} <= set(listed)
@@ -107,7 +115,7 @@ def test_who_emits_an_event_depends_on_who_leads(
     placement: str, event: str, leader: str, node: str | None
 ) -> None:
     backup = "b" if leader == "a" else "a"
-    assert emitter(build("pbr", placement), event, leader, backup) == node
+    assert emitting_node(Roles(build("pbr", placement), leader, backup), event) == node
 
 
 # -- composed graphs
@@ -141,7 +149,7 @@ def test_who_emits_an_event_depends_on_who_leads(
     ],
 )
 def test_the_outermost_emitter_is_meant(ftm: str, placement: str, event: str, node: str | None) -> None:
-    assert emitter(build(ftm, placement), event, "a", "b") == node
+    assert emitting_node(Roles(build(ftm, placement), "a", "b"), event) == node
 
 
 @pytest.mark.parametrize("ftm", EXPRESSIONS)
@@ -149,7 +157,7 @@ def test_a_fault_waits_in_a_brick_of_the_emitting_node(ftm: str) -> None:
     for placement in PLACEMENTS:
         graph = build(ftm, placement)
         for event in Event:
-            node = emitter(graph, event.label, "a", "b")
+            node = emitting_node(Roles(graph, "a", "b"), event.label)
             brick = waits_in(crash("primary", Trigger(event.label)), graph, "a", "b")
             if node is None or node == SUPERVISOR:
                 assert brick is None
@@ -179,18 +187,18 @@ def test_how_many_bricks_of_a_node_emit_an_event(
 def test_what_an_adaptation_comes_through_is_the_supervisors(event: Event) -> None:
     for ftm in EXPRESSIONS:
         expected = None if ftm == "none" else SUPERVISOR  # which has no Engine
-        assert emitter(build(ftm, "process"), event.label, "a", "") == expected
-    check(crash("engine", Trigger(event.label, 3)), build("pbr", "process"))
+        assert emitting_node(Roles(build(ftm, "process"), "a", ""), event.label) == expected
+    crash("engine", Trigger(event.label, 3)).check(build("pbr", "process"))
 
 
 def test_in_an_adaptation_the_nodes_of_any_mechanism_can_be_hit() -> None:
     graph = build("pbr", "process")
-    check(crash("a/tr.proceed", Trigger("adapt.step.enter", 3)), graph)
-    check(crash("a/tr.proceed'", Trigger("adapt.step.act", 3)), graph)
+    crash("a/tr.proceed", Trigger("adapt.step.enter", 3)).check(graph)
+    crash("a/tr.proceed'", Trigger("adapt.step.act", 3)).check(graph)
     with pytest.raises(ConfigError, match=r"unknown target 'a/tr\.proced'; did you mean 'a/tr\.proceed'\?"):
-        check(crash("a/tr.proced", Trigger("adapt.step.enter", 3)), graph)
+        crash("a/tr.proced", Trigger("adapt.step.enter", 3)).check(graph)
     with pytest.raises(ConfigError, match=r"unknown target 'a/tr\.proceed'"):
-        check(crash("a/tr.proceed", Trigger("server.exit", 3)), graph)
+        crash("a/tr.proceed", Trigger("server.exit", 3)).check(graph)
 
 
 # -- bitflips
@@ -202,8 +210,8 @@ def test_a_bit_of_the_leader_can_be_flipped_under_every_mechanism(ftm: str, plac
     graph = build(ftm, placement)
     for target in ("primary", "a", *(["b"] if ftm.startswith(DUPLEX) else [])):
         for place in EXECUTED:
-            check(bitflip(place, target), graph)
-            check(bitflip(place, target, "server.exit", 100, BIT_MAX), graph)
+            bitflip(place, target).check(graph)
+            bitflip(place, target, "server.exit", 100, BIT_MAX).check(graph)
 
 
 @pytest.mark.parametrize(
@@ -211,58 +219,62 @@ def test_a_bit_of_the_leader_can_be_flipped_under_every_mechanism(ftm: str, plac
     [
         (
             "pbr",
-            bitflip(Place.RESULT, "primry"),
+            bitflip(ValuePlace.RESULT, "primry"),
             "unknown replica 'primry'; did you mean 'primary'? (one of: a, b, backup, primary)",
         ),
-        ("pbr", bitflip(Place.RESULT, "a/server"), "unknown replica 'a/server'"),
-        ("pbr", bitflip(Place.RESULT, "hub"), "unknown replica 'hub'"),
-        ("tr", bitflip(Place.RESULT, "backup"), "unknown replica 'backup' (one of: a, primary)"),
-        ("tr", bitflip(Place.RESULT, "b"), "unknown replica 'b'"),
-        ("none", bitflip(Place.RESULT, "b"), "unknown replica 'b'"),
-        ("pbr", bitflip(Place.RESULT, bit=-1), f"bit -1: 0 to {BIT_MAX} are allowed"),
-        ("pbr", bitflip(Place.RESULT, bit=BIT_MAX + 1), f"bit {BIT_MAX + 1}: 0 to {BIT_MAX} are allowed"),
-        ("pbr", bitflip(Place.RESULT, nth=0), "nth 0: the first occurrence is nth 1"),
-        ("pbr", bitflip(Place.RESULT, event="server.exits"), "did you mean 'server.exit'?"),
+        ("pbr", bitflip(ValuePlace.RESULT, "a/server"), "unknown replica 'a/server'"),
+        ("pbr", bitflip(ValuePlace.RESULT, "hub"), "unknown replica 'hub'"),
+        ("tr", bitflip(ValuePlace.RESULT, "backup"), "unknown replica 'backup' (one of: a, primary)"),
+        ("tr", bitflip(ValuePlace.RESULT, "b"), "unknown replica 'b'"),
+        ("none", bitflip(ValuePlace.RESULT, "b"), "unknown replica 'b'"),
+        ("pbr", bitflip(ValuePlace.RESULT, bit=-1), f"bit -1: 0 to {BIT_MAX} are allowed"),
         (
             "pbr",
-            bitflip(Place.RESULT, event="server.enter"),
+            bitflip(ValuePlace.RESULT, bit=BIT_MAX + 1),
+            f"bit {BIT_MAX + 1}: 0 to {BIT_MAX} are allowed",
+        ),
+        ("pbr", bitflip(ValuePlace.RESULT, nth=0), "nth 0: the first occurrence is nth 1"),
+        ("pbr", bitflip(ValuePlace.RESULT, event="server.exits"), "did you mean 'server.exit'?"),
+        (
+            "pbr",
+            bitflip(ValuePlace.RESULT, event="server.enter"),
             "unknown event for a bit of the result in primary: 'server.enter'; did you mean 'server.exit'?",
         ),
-        ("pbr", bitflip(Place.STATE, event="server.enter"), "(one of: server.exit, state.captured)"),
+        ("pbr", bitflip(ValuePlace.STATE, event="server.enter"), "(one of: server.exit, state.captured)"),
         (
             "pbr",
-            bitflip(Place.STATE, "b", "reply.sent"),
+            bitflip(ValuePlace.STATE, "b", "reply.sent"),
             "(one of: server.exit, state.captured, state.restored)",
         ),
-        ("pbr", bitflip(Place.STATE, event="adapt.commit"), "unknown event for a bit of the state"),
-        ("lfr", bitflip(Place.STATE, event="state.captured"), "(one of: server.exit)"),
-        ("none", bitflip(Place.STATE, event="state.captured"), "(one of: server.exit)"),
+        ("pbr", bitflip(ValuePlace.STATE, event="adapt.commit"), "unknown event for a bit of the state"),
+        ("lfr", bitflip(ValuePlace.STATE, event="state.captured"), "(one of: server.exit)"),
+        ("none", bitflip(ValuePlace.STATE, event="state.captured"), "(one of: server.exit)"),
         (
             "pbr",
-            bitflip(Place.RESULT, "backup"),
+            bitflip(ValuePlace.RESULT, "backup"),
             "bitflip result in backup: under --ftm pbr the Server of a backup executes nothing",
         ),
-        ("pbr", bitflip(Place.STATE, "backup"), "'server.exit' (one of: state.restored)"),
+        ("pbr", bitflip(ValuePlace.STATE, "backup"), "'server.exit' (one of: state.restored)"),
     ],
 )
 def test_a_bit_that_cannot_be_flipped_is_refused_with_what_can(ftm: str, fault: Fault, message: str) -> None:
     with pytest.raises(ConfigError, match=re.escape(message)):
-        check(fault, build(ftm, "process"))
+        fault.check(build(ftm, "process"))
 
 
 @pytest.mark.parametrize(
     ("ftm", "fault", "leader", "brick"),
     [
-        ("pbr", bitflip(Place.RESULT), "a", "a/server"),
-        ("pbr", bitflip(Place.RESULT), "b", "b/server"),
-        ("pbr", bitflip(Place.RESULT, "b"), "a", None),  # executes nothing until it leads
-        ("pbr", bitflip(Place.RESULT, "b"), "b", "b/server"),
-        ("pbr", bitflip(Place.STATE, "backup", "state.restored"), "a", "b/server"),
-        ("pbr", bitflip(Place.STATE, "primary", "state.restored"), "a", None),
-        ("lfr", bitflip(Place.RESULT, "backup"), "a", "b/server"),
-        ("lfr+tr", bitflip(Place.STATE, "backup", "state.captured"), "b", "a/server"),
-        ("tr", bitflip(Place.STATE), "a", "a/server"),
-        ("none", bitflip(Place.RESULT, "a"), "a", "a/server"),
+        ("pbr", bitflip(ValuePlace.RESULT), "a", "a/server"),
+        ("pbr", bitflip(ValuePlace.RESULT), "b", "b/server"),
+        ("pbr", bitflip(ValuePlace.RESULT, "b"), "a", None),  # executes nothing until it leads
+        ("pbr", bitflip(ValuePlace.RESULT, "b"), "b", "b/server"),
+        ("pbr", bitflip(ValuePlace.STATE, "backup", "state.restored"), "a", "b/server"),
+        ("pbr", bitflip(ValuePlace.STATE, "primary", "state.restored"), "a", None),
+        ("lfr", bitflip(ValuePlace.RESULT, "backup"), "a", "b/server"),
+        ("lfr+tr", bitflip(ValuePlace.STATE, "backup", "state.captured"), "b", "a/server"),
+        ("tr", bitflip(ValuePlace.STATE), "a", "a/server"),
+        ("none", bitflip(ValuePlace.RESULT, "a"), "a", "a/server"),
     ],
 )
 def test_a_bitflip_waits_in_the_server_that_it_hits(
@@ -273,8 +285,8 @@ def test_a_bitflip_waits_in_the_server_that_it_hits(
 
 
 def test_while_nobody_backs_up_no_bit_of_a_backup_can_be_flipped() -> None:
-    assert waits_in(bitflip(Place.RESULT, "backup"), build("lfr", "process"), "a", "") is None
-    assert waits_in(bitflip(Place.RESULT), build("lfr", "process"), "", "") is None
+    assert waits_in(bitflip(ValuePlace.RESULT, "backup"), build("lfr", "process"), "a", "") is None
+    assert waits_in(bitflip(ValuePlace.RESULT), build("lfr", "process"), "", "") is None
 
 
 # -- the other values, channels, and who is slow
@@ -317,7 +329,7 @@ def test_a_fault_waits_in_the_brick_that_has_it_in_hand(
 def test_every_channel_of_every_graph_can_be_disturbed(ftm: str, placement: str) -> None:
     graph = build(ftm, placement)
     for link in graph.links:
-        check(parse(f"omission {link.name}"), graph)
+        parse(f"omission {link.name}").check(graph)
 
 
 @pytest.mark.parametrize(
@@ -344,7 +356,7 @@ def test_every_channel_of_every_graph_can_be_disturbed(ftm: str, placement: str)
 )
 def test_what_is_not_there_is_refused_with_what_is(ftm: str, text: str, message: str) -> None:
     with pytest.raises(ConfigError, match=re.escape(message)):
-        check(parse(text), build(ftm, "process"))
+        parse(text).check(build(ftm, "process"))
 
 
 @pytest.mark.parametrize(
@@ -352,14 +364,19 @@ def test_what_is_not_there_is_refused_with_what_is(ftm: str, text: str, message:
     [
         (Slow(0.0), "by 0ms: up to 500ms are allowed"),
         (Slow(501.0), "by 501ms: up to 500ms are allowed"),
-        (Disturb(How.DELAY, "aft2aft", -1.0), "by -1ms: up to 3600000ms are allowed"),
-        (Flip(Place.RESULT, Bits(65)), "65 bits: 1 to 64 are allowed"),
-        (Flip(Place.RESULT, Burst(0, 3)), "0 bits: 1 to 64 are allowed"),
-        (Flip(Place.RESULT, Burst(3, -1)), "bit -1: 0 to 4294967295 are allowed"),
-        (Flip(Place.RESULT, Byte(-1)), "byte -1: 0 to 536870911 are allowed"),
-        (Flip(Place.RESULT, Stuck(3, 2)), "stuck 3=2: a bit from 0 to 4294967295, and 0 or 1, are allowed"),
+        (ChannelFault(Disturbance.DELAY, "aft2aft", -1.0), "by -1ms: up to 3600000ms are allowed"),
+        (ValueFlip(ValuePlace.RESULT, Bits(65)), "65 bits: 1 to 64 are allowed"),
+        (ValueFlip(ValuePlace.RESULT, BitBurst(0, 3)), "0 bits: 1 to 64 are allowed"),
+        (ValueFlip(ValuePlace.RESULT, BitBurst(3, -1)), "bit -1: 0 to 4294967295 are allowed"),
+        (ValueFlip(ValuePlace.RESULT, Byte(-1)), "byte -1: 0 to 536870911 are allowed"),
+        (
+            ValueFlip(ValuePlace.RESULT, StuckBit(3, 2)),
+            "stuck 3=2: a bit from 0 to 4294967295, and 0 or 1, are allowed",
+        ),
     ],
 )
-def test_a_number_that_words_cannot_say_is_refused_too(action: Slow | Disturb | Flip, message: str) -> None:
+def test_a_number_that_words_cannot_say_is_refused_too(
+    action: Slow | ChannelFault | ValueFlip, message: str
+) -> None:
     with pytest.raises(ConfigError, match=re.escape(message)):
-        check(Fault(action, "primary", Trigger()), build("pbr", "process"))
+        Fault(action, "primary", Trigger()).check(build("pbr", "process"))

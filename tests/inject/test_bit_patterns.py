@@ -6,33 +6,36 @@ from hypothesis import given
 from hypothesis import strategies as st
 from somefaults import faults, patterns
 
-from aftbed.core.fault import Crash, Disturb, Fault, How, Slow, Trigger, mark, marked
-from aftbed.core.persistence import ONCE, Chance, Every, Permanent, Persistence, Transient, gap
-from aftbed.core.valuefault import (
+from aftbed.inject.bit_patterns import (
     BIT_MAX,
     Bit,
+    BitBurst,
+    BitPattern,
     Bits,
-    Burst,
     Byte,
-    Flip,
-    Pattern,
-    Place,
-    Stuck,
-    changed,
+    StuckBit,
+    bits_to_flip,
     flipped,
-    hit,
 )
+from aftbed.inject.bit_patterns import with_flipped as changed
+from aftbed.inject.channel import ChannelFault, Disturbance
+from aftbed.inject.crash import Crash
+from aftbed.inject.model import Fault
+from aftbed.inject.receipts import fault_and_bits, record_detail
+from aftbed.inject.slow import Slow
+from aftbed.inject.timing import ONCE, Chance, Every, Permanent, Persistence, Transient, Trigger, gap
+from aftbed.inject.value import ValueFlip, ValuePlace
 
 
 @pytest.mark.parametrize(
     ("fault", "event"),
     [
-        (Fault(Flip(Place.RESULT), "primary", Trigger()), "server.exit"),
-        (Fault(Flip(Place.STATE), "primary", Trigger("state.captured", 2)), "state.captured"),
-        (Fault(Flip(Place.RESULT), "primary", Trigger(after_ms=5)), "server.exit"),
+        (Fault(ValueFlip(ValuePlace.RESULT), "primary", Trigger()), "server.exit"),
+        (Fault(ValueFlip(ValuePlace.STATE), "primary", Trigger("state.captured", 2)), "state.captured"),
+        (Fault(ValueFlip(ValuePlace.RESULT), "primary", Trigger(after_ms=5)), "server.exit"),
         (Fault(Crash(), "primary", Trigger()), ""),
         (Fault(Crash(), "primary", Trigger("reply.sent")), "reply.sent"),
-        (Fault(Disturb(How.DELAY, "aft2aft"), "primary", Trigger(nth=3)), ""),
+        (Fault(ChannelFault(Disturbance.DELAY, "aft2aft"), "primary", Trigger(nth=3)), ""),
     ],
 )
 def test_a_bitflip_waits_for_an_execution_at_least(fault: Fault, event: str) -> None:
@@ -44,11 +47,16 @@ def test_a_bitflip_waits_for_an_execution_at_least(fault: Fault, event: str) -> 
     [
         (Crash(), Trigger(), Permanent(), "a crash strikes once"),
         (Slow(), Trigger(), Every(3), "a slow strikes once"),
-        (Disturb(How.DELAY, "aft2aft"), Trigger("reply.sent"), ONCE, "waits for no event: reply.sent"),
+        (
+            ChannelFault(Disturbance.DELAY, "aft2aft"),
+            Trigger("reply.sent"),
+            ONCE,
+            "waits for no event: reply.sent",
+        ),
     ],
 )
 def test_a_mixture_of_two_faults_is_none(
-    action: Crash | Slow | Disturb, trigger: Trigger, persistence: Persistence, message: str
+    action: Crash | Slow | ChannelFault, trigger: Trigger, persistence: Persistence, message: str
 ) -> None:
     with pytest.raises(ValueError, match=message):
         Fault(action, "primary", trigger, persistence)
@@ -85,17 +93,17 @@ def test_a_bit_that_is_not_there_is_our_mistake(bit: int) -> None:
 
 @given(st.integers(0, 2**32 - 1), st.integers(0, BIT_MAX))
 def test_a_mark_keeps_both_its_numbers(number: int, bits: int) -> None:
-    assert marked(mark(number, bits)) == (number, bits)
-    assert 0 <= mark(number, bits) < 2**64
+    assert fault_and_bits(record_detail(number, bits)) == (number, bits)
+    assert 0 <= record_detail(number, bits) < 2**64
 
 
 # -- which bits
 
 
 @given(patterns, st.binary(max_size=80), st.integers(0, 2**63 - 1))
-def test_a_pattern_and_a_draw_tell_the_bits(pattern: Pattern, data: bytes, draw: int) -> None:
-    found = hit(pattern, data, draw)
-    assert hit(pattern, data, draw) == found
+def test_a_pattern_and_a_draw_tell_the_bits(pattern: BitPattern, data: bytes, draw: int) -> None:
+    found = bits_to_flip(pattern, data, draw)
+    assert bits_to_flip(pattern, data, draw) == found
     if found is None:
         return
     assert list(found) == sorted(set(found)) and all(0 <= bit < 8 * len(data) for bit in found)
@@ -108,15 +116,15 @@ def test_a_pattern_and_a_draw_tell_the_bits(pattern: Pattern, data: bytes, draw:
         case Byte(at):
             places = [i for i, (a, b) in enumerate(zip(data, other, strict=True)) if a != b]
             assert len(places) == 1 and at in (None, *places)
-        case Burst(count, at):
+        case BitBurst(count, at):
             assert found == tuple(range(found[0], found[0] + count)) and at in (None, found[0])
-        case Stuck(at, value):
+        case StuckBit(at, value):
             assert other[at // 8] >> at % 8 & 1 == value
             assert found == () or data != other
 
 
 def test_a_byte_always_has_another_value_and_it_may_be_any() -> None:
-    values = {changed(b"\x00\x55", hit(Byte(1), b"\x00\x55", draw) or ())[1] for draw in range(3000)}
+    values = {changed(b"\x00\x55", bits_to_flip(Byte(1), b"\x00\x55", draw) or ())[1] for draw in range(3000)}
     assert values == set(range(256)) - {0x55}
 
 
@@ -128,17 +136,17 @@ def test_a_byte_always_has_another_value_and_it_may_be_any() -> None:
         (Bits(17), 2),
         (Byte(2), 2),
         (Byte(), 0),
-        (Burst(17), 2),
-        (Burst(2, 15), 2),
-        (Stuck(16, 1), 2),
+        (BitBurst(17), 2),
+        (BitBurst(2, 15), 2),
+        (StuckBit(16, 1), 2),
     ],
 )
-def test_where_there_are_no_such_bits_none_are_hit(pattern: Pattern, size: int) -> None:
-    assert hit(pattern, bytes(size), 7) is None
+def test_where_there_are_no_such_bits_none_are_hit(pattern: BitPattern, size: int) -> None:
+    assert bits_to_flip(pattern, bytes(size), 7) is None
 
 
 def test_a_bit_that_is_stuck_at_what_it_is_changes_nothing() -> None:
-    assert hit(Stuck(1, 1), b"\x02", 0) == () and hit(Stuck(1, 0), b"\x02", 0) == (1,)
+    assert bits_to_flip(StuckBit(1, 1), b"\x02", 0) == () and bits_to_flip(StuckBit(1, 0), b"\x02", 0) == (1,)
 
 
 # -- how often

@@ -5,18 +5,17 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from puredrive import CODEC
 
-from aftbed.core.busfault import BusFault, Condition, Struck
+from aftbed.core.busfault import Condition
 from aftbed.core.errors import ConfigError
-from aftbed.inject.buswords import parse
-from aftbed.vehicle.aim import aimed
+from aftbed.inject.bus import BusFault, BusReport, read_bus_fault
+from aftbed.inject.bus_disturber import FLOOD_ID, REORDER_US_MAX, Disturber
 from aftbed.vehicle.can.bus_model import CarriedFrame
 from aftbed.vehicle.can.dbc_file import load_dbc
 from aftbed.vehicle.can.e2e import intact, protect
 from aftbed.vehicle.can.frame import Frame
-from aftbed.vehicle.disturbance import FLOOD_ID, REORDER_US_MAX, Disturber
 
+CODEC = load_dbc()
 TRACK, AEB_REQ, EGO = (CODEC.can_id(name) for name in ("RADAR_TRACK", "AEB_REQ", "EGO_STATE"))
 DATA_ID, EGO_DATA_ID = CODEC.data_id("RADAR_TRACK"), CODEC.data_id("EGO_STATE")
 CYCLE_US = 20_000
@@ -25,7 +24,7 @@ CYCLE_US = 20_000
 def armed(*faults: str, now_us: int = 0) -> Disturber:
     disturber = Disturber()
     for number, words in enumerate(faults, 1):
-        disturber.arm(number, aimed(parse(words), [CODEC]), 7, now_us)
+        disturber.arm(number, read_bus_fault(words).resolved([CODEC]), 7, now_us)
     return disturber
 
 
@@ -52,8 +51,8 @@ def test_an_omitted_frame_does_not_come_and_the_next_one_does() -> None:
     disturber = armed("omission bus RADAR_TRACK nth 3")
     assert lengths(disturber, 6) == [1, 1, 0, 1, 1, 1]
     assert disturber.idle
-    (struck,) = disturber.struck()
-    assert (struck.frames, struck.first_us, struck.first_id, struck.receipt) == (
+    (struck,) = disturber.reports()
+    assert (struck.frames, struck.first_us, struck.first_id, struck.receipt.state.value) == (
         1,
         2 * CYCLE_US,
         TRACK,
@@ -65,7 +64,7 @@ def test_other_frames_are_left_alone_and_not_counted() -> None:
     disturber = armed("omission bus RADAR_TRACK nth 1 permanent")
     other = Frame(0, EGO, bytes(8))
     assert disturber.carry(other, "brake") == [CarriedFrame(other, "brake")]
-    assert disturber.struck() == [Struck(1)]
+    assert disturber.reports() == [BusReport(1)]
 
 
 def test_a_delayed_frame_comes_when_it_is_due() -> None:
@@ -126,7 +125,7 @@ def test_a_signal_has_the_value_that_it_is_given() -> None:
 def test_a_signal_that_has_the_value_already_is_not_struck() -> None:
     disturber = armed("corrupt bus RADAR_TRACK signal VALID=1 crc good")
     assert passed(disturber, 1) == [[track(0)]]
-    assert disturber.struck()[0].receipt == "armed" and not disturber.idle
+    assert disturber.reports()[0].receipt.state.value == "armed" and not disturber.idle
 
 
 def test_a_masquerade_is_right_for_another_message_and_wrong_for_this_one() -> None:
@@ -192,7 +191,7 @@ def test_a_babbling_idiot_lets_nobody_through_and_ends_with_the_latest_of_each()
     waited = [sent.frame for sent in disturber.release(60_000)]
     assert waited == [Frame(60_000, EGO, bytes(8)), track(2, 60_000)], "the latest of each, by priority"
     assert disturber.carry(track(3), "radar") == [CarriedFrame(track(3), "radar")]
-    assert disturber.struck()[0].frames == 3
+    assert disturber.reports()[0].frames == 3
 
 
 def test_the_flood_is_one_frame_in_each_millisecond() -> None:
@@ -235,28 +234,30 @@ def test_two_faults_strike_one_behind_the_other() -> None:
 def test_who_notices_makes_it_activated() -> None:
     disturber = armed("omission bus RADAR_TRACK nth 2", "omission bus AEB_REQ nth 9")
     disturber.noticed("gateway", TRACK, "lost")
-    assert [s.receipt for s in disturber.struck()] == ["armed", "armed"], "it was not because of the fault"
+    assert [s.receipt.state.value for s in disturber.reports()] == ["armed", "armed"], (
+        "it was not because of the fault"
+    )
     passed(disturber, 3)
     disturber.noticed("gateway", EGO, "lost")
-    assert disturber.struck()[0].receipt == "applied"
+    assert disturber.reports()[0].receipt.state.value == "applied"
     disturber.noticed("gateway", TRACK, "lost")
-    first, second = disturber.struck()
-    assert (first.receipt, second.receipt) == ("activated", "armed")
-    assert first.detail == "1 frame, at 0.020000 s, id 130; noticed by gateway (lost)"
+    first, second = disturber.reports()
+    assert (first.receipt.state.value, second.receipt.state.value) == ("activated", "armed")
+    assert first.receipt.detail == "1 frame, at 0.020000 s, id 130; noticed by gateway (lost)"
 
 
 def test_a_fallback_has_noticed_whatever_there_was() -> None:
     disturber = armed("omission bus RADAR_TRACK")
     passed(disturber, 1)
     disturber.noticed("brake", AEB_REQ, "fallback")
-    assert disturber.struck()[0].receipt == "activated"
+    assert disturber.reports()[0].receipt.state.value == "activated"
 
 
 def test_who_takes_a_struck_frame_in_has_believed_it() -> None:
     disturber = armed("corrupt bus RADAR_TRACK bit 40 crc good")
     (sent,) = disturber.carry(track(0), "radar")
     disturber.reached(sent.by, "gateway")
-    assert disturber.struck()[0].detail == "1 frame, at 0.000000 s, id 130; believed by gateway"
+    assert disturber.reports()[0].receipt.detail == "1 frame, at 0.000000 s, id 130; believed by gateway"
 
 
 FAULTS = st.sampled_from(
@@ -318,7 +319,7 @@ def test_no_frame_is_lost_for_good_by_what_only_holds_it_back(faults: list[str],
 )
 def test_a_name_that_does_not_exist_is_refused(words: str, says: str) -> None:
     with pytest.raises(ConfigError) as refused:
-        aimed(parse(words), [CODEC])
+        read_bus_fault(words).resolved([CODEC])
     assert says in str(refused.value)
 
 
@@ -326,18 +327,18 @@ def test_a_bit_that_a_short_message_lacks_is_refused(tmp_path: Path) -> None:
     dbc = tmp_path / "short.dbc"
     dbc.write_text('VERSION ""\nBU_: X\nBO_ 256 SHORT: 2 X\n SG_ A : 0|8@1+ (1,0) [0|255] "" X\n')
     with pytest.raises(ConfigError, match="bit 16: SHORT has the bits 0 to 15"):
-        aimed(parse("corrupt bus SHORT bit 16"), [load_dbc(dbc)])
+        read_bus_fault("corrupt bus SHORT bit 16").resolved([load_dbc(dbc)])
 
 
 def test_a_replay_has_no_car_to_look_at_and_other_nodes() -> None:
     with pytest.raises(ConfigError, match="'when' looks at the car, and a replay has none"):
-        aimed(parse("omission bus RADAR_TRACK when gap < 3"), [CODEC], ("player",), car=False)
+        read_bus_fault("omission bus RADAR_TRACK when gap < 3").resolved([CODEC], ("player",), car=False)
     with pytest.raises(ConfigError, match="unknown node of the bus 'radar'"):
-        aimed(parse("bus-off radar"), [CODEC], ("player",), car=False)
+        read_bus_fault("bus-off radar").resolved([CODEC], ("player",), car=False)
 
 
 def test_an_aim_is_no_part_of_the_words() -> None:
-    fault: BusFault = aimed(parse("omission bus from radar nth 5"), [CODEC])
-    assert fault.aim is not None
-    assert {mark.can_id for mark in fault.aim.marks} == {TRACK, CODEC.can_id("RADAR_STATUS")}
+    fault: BusFault = read_bus_fault("omission bus from radar nth 5").resolved([CODEC])
+    assert fault.targets is not None
+    assert {mark.can_id for mark in fault.targets} == {TRACK, CODEC.can_id("RADAR_STATUS")}
     assert str(fault) == "omission bus from radar nth 5"

@@ -1,0 +1,245 @@
+"""The fault agent of a node: the faults that wait in it, and what it does when they are due.
+
+It is the half of the injector that sits in the target, the same for all runtimes. Most faults wait for a
+Note: its record is written, all effects before it are done, none behind it is. Where that is too late (what
+a Server was handed, what has gone to the backup), the fault strikes within the step whose event is the next
+one.
+
+A node in which no fault waits (`active` is False) calls nothing of this. The agent reads no clock, never
+sleeps and does no I/O: the node does that for it.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple, Protocol
+
+from msgspec import structs
+
+from aftbed.core.brick import Brick, Effect, Note
+from aftbed.core.events import Event, event_named
+from aftbed.core.messages import AnyMessage, Message
+from aftbed.inject.channel import ALTERED, ChannelFault, ChannelFilter, FilterStage
+from aftbed.inject.kind import Alteration
+from aftbed.inject.model import ArmedFault
+from aftbed.inject.receipts import record_detail
+from aftbed.inject.shared_state import is_shared, share
+from aftbed.inject.slow import WHOLE_CPU
+from aftbed.inject.timing import gap
+
+Sender = tuple[str, str]  # a brick and its port
+
+
+class AgentHost(Protocol):
+    """The node, as its fault agent sees it."""
+
+    def brick(self, name: str) -> Brick:
+        """The brick of that name. Raises KeyError."""
+        ...
+
+    def record(self, event: Event, request_id: int, detail: int) -> None:
+        """Write a record, now."""
+        ...
+
+    def report_fired(self, fault: int) -> None:
+        """Tell the supervisor that `fault` is due, or has struck."""
+        ...
+
+    def wait_until_applied(self, fault: int) -> None:
+        """Perform no further effect until the supervisor has acknowledged `fault`."""
+        ...
+
+    def kill(self) -> None:
+        """End this node with SIGKILL, here and now."""
+        ...
+
+    def stop_detected(self, brick: str, reason: str) -> None:
+        """A detected stop: end this node here and now."""
+        ...
+
+
+class _SlowDown(NamedTuple):
+    by_ns: int
+    share: float  # of a CPU
+
+
+class FaultAgent:
+    """Of one node. The node reads `active`, `slowed` and `filters`; it never changes them."""
+
+    def __init__(self, host: AgentHost) -> None:
+        self._host = host
+        self.active = False  # a fault waits here: the node calls the methods below
+        self.slowed = False  # steps take longer
+        self.filters: dict[Sender, ChannelFilter] = {}  # what lies on the channel that a brick writes to
+        self._armed: dict[Event, tuple[ArmedFault, ...]] = {}
+        self._in_step: dict[str, list[ArmedFault]] = {}  # by brick: due in its next step with that event
+        self._slow: dict[int, _SlowDown] = {}
+        self._felt: set[int] = set()  # slow-downs whose effect is recorded
+        self._shares_state = False
+
+    # -- orders of the supervisor ------------------------------------------------------------------
+
+    def arm(self, event: str, faults: Sequence[ArmedFault]) -> None:
+        """Wait for `event`. Faults that already wait for it go on counting; one that is given again begins
+        anew.
+
+        `nth` 0: wait no longer.
+        """
+        self._arm(event_named(event), faults)
+
+    def disturb(self, fault: ArmedFault) -> None:
+        """Have a fault of a channel wait at its sender; with `nth` 0, wait there no longer."""
+        action = fault.action
+        assert isinstance(action, ChannelFault), action
+        key = (fault.brick, action.channel)
+        if fault.nth:
+            record = _StrikeRecorder(self._host, fault.fault)
+            stage = FilterStage(action, fault.nth, fault.persistence, fault.draw, record)
+            self.filters.setdefault(key, ChannelFilter()).add(fault.fault, stage)
+        elif key in self.filters:
+            self.filters[key].stop(fault.fault)
+        self.settle()
+
+    def slow_down(self, fault: int, by_ns: int, share_of_cpu: float) -> None:
+        """Have each step take longer; by nothing, with the whole CPU: no longer."""
+        self._slow.pop(fault, None)
+        if by_ns or share_of_cpu < WHOLE_CPU:
+            self._slow[fault] = _SlowDown(by_ns, share_of_cpu)
+        self._update()
+
+    def share_state(self, brick: str, number: int, memory: memoryview) -> bytes:
+        """Have the function of the Server `brick` keep its state in `memory`. Raises PeerError."""
+        answer = share(self._host, brick, number, memory)
+        self._shares_state = self._shares_state or is_shared(self._host.brick(brick))
+        self._update()  # what the supervisor changes is recorded within a step: not on the fast path
+        return answer
+
+    def settle(self) -> None:
+        """Drop the filters that do nothing any more."""
+        for key in [key for key, found in self.filters.items() if found.over]:
+            del self.filters[key]
+        self._update()
+
+    def _update(self) -> None:
+        self.slowed = bool(self._slow)
+        self.active = bool(self._armed or self._slow or self.filters or self._shares_state)
+
+    def _arm(self, event: Event, faults: Sequence[ArmedFault]) -> None:
+        given = {fault.fault for fault in faults}
+        kept = [fault for fault in self._armed.pop(event, ()) if fault.fault not in given]
+        waiting = (*kept, *(fault for fault in faults if fault.nth))
+        if waiting:
+            self._armed[event] = waiting
+        self._in_step = {}
+        for fault in (fault for armed in self._armed.values() for fault in armed if fault.nth == 1):
+            if fault.action.alters_step:
+                self._in_step.setdefault(fault.brick, []).append(fault)
+        self._update()
+
+    # -- in a step --------------------------------------------------------------------------------
+
+    def step(
+        self, name: str, brick: Brick, port: str, message: AnyMessage | Message, now_ns: int
+    ) -> list[Effect]:
+        """Have `brick` handle `message`, with both altered by the faults that are due.
+
+        Raises PeerError as it does.
+        """
+        due = self._in_step.get(name, ())
+        handed, hits = message, list[tuple[ArmedFault, Alteration]]()
+        for fault in reversed(due):
+            handed, hit = fault.action.alter_input(handed, fault.draw)
+            if hit is not None:
+                hits.append((fault, hit))
+        effects = brick.step(port, handed, now_ns)  # type: ignore[arg-type]
+        for fault, hit in reversed(hits):  # only now: a brick that refuses the request was not hit
+            self._record(fault, hit)
+        for fault in due:
+            effects, hit = fault.action.alter_output(effects, fault.draw)
+            if hit is not None:
+                self._record(fault, hit)
+        return effects
+
+    # -- at a Note --------------------------------------------------------------------------------
+
+    def noted(self, name: str, brick: Brick, effects: list[Effect], at: int) -> None:
+        """The record of the Note `effects[at]` of `name` is written: what waits for it and is due happens
+        now.
+
+        A value is altered in what is sent behind the Note, so effects behind `at` may be replaced.
+        """
+        note = effects[at]
+        assert isinstance(note, Note)
+        armed = self._armed.get(note.event)
+        if armed is None:
+            return
+        counted = [f if f.brick != name else structs.replace(f, nth=f.nth - 1) for f in armed]
+        self._arm(note.event, tuple(map(_next_strike, counted)))
+        for fault in counted:
+            if fault.nth or fault.action.alters_step:
+                continue
+            if fault.action.acts_in_node:
+                self._record(fault, fault.action.alter_at(brick, effects, at, fault.draw))
+            else:
+                self._strike(fault)
+
+    def _strike(self, fault: ArmedFault) -> None:
+        """End this node, or wait until the supervisor has done what the fault says."""
+        self._host.record(Event.FAULT_APPLIED, 0, record_detail(fault.fault))
+        if fault.by_itself:
+            self._host.kill()
+            return
+        self._host.report_fired(fault.fault)
+        self._host.wait_until_applied(fault.fault)
+
+    def _record(self, fault: ArmedFault, hit: Alteration) -> None:
+        """Record which bits were altered, or, where none was, how many there were.
+
+        Of a fault that strikes again and again, only the first attempt that fails is recorded.
+        """
+        for bit in hit.bits:
+            self._host.record(Event.FAULT_APPLIED, hit.request_id, record_detail(fault.fault, bit))
+        if not hit.bits and not fault.strikes:
+            self._host.record(Event.PEER_REFUSED, hit.request_id, record_detail(fault.fault, hit.size))
+        if not fault.strikes:
+            self._host.report_fired(fault.fault)
+
+    # -- slow steps -------------------------------------------------------------------------------
+
+    def delay_ns(self) -> int:
+        """By how many ns the step that is being taken is slower.
+
+        The first such step of a fault is recorded.
+        """
+        return sum(self._feel(fault, slow).by_ns for fault, slow in list(self._slow.items()) if slow.by_ns)
+
+    def stretch_ns(self, used_ns: int) -> int:
+        """How many ns more `used_ns` of CPU time would have taken with no more than the given share."""
+        slow = [(fault, slow) for fault, slow in self._slow.items() if slow.share < WHOLE_CPU]
+        return round(used_ns * (1 / math.prod(self._feel(*one).share for one in slow) - 1))
+
+    def _feel(self, fault: int, slow: _SlowDown) -> _SlowDown:
+        if fault not in self._felt:
+            self._felt.add(fault)
+            self._host.record(Event.FAULT_APPLIED, 0, record_detail(fault))
+        return slow
+
+
+class _StrikeRecorder:
+    """Records what a fault of a channel did; reports once that it fired."""
+
+    def __init__(self, host: AgentHost, fault: int) -> None:
+        self._host, self._fault, self._reported = host, fault, False
+
+    def __call__(self, what: int, about: int) -> None:
+        self._host.record(Event.FAULT_APPLIED, about, record_detail(self._fault, what))
+        if what == ALTERED and not self._reported:
+            self._reported = True
+            self._host.report_fired(self._fault)
+
+
+def _next_strike(fault: ArmedFault) -> ArmedFault:
+    """The fault as it waits from here on; one that is due counts to its next strike, if there is one."""
+    if fault.nth:
+        return fault
+    strikes = fault.strikes + 1
+    return structs.replace(fault, nth=gap(fault.persistence, fault.draw, strikes), strikes=strikes)

@@ -1,0 +1,615 @@
+"""Faults of the CAN bus: what is done, to which frames or nodes, from when, and for how long.
+
+    omission | duplicate | reorder | stuck-counter   bus FRAMES
+    delay        bus FRAMES by 40ms
+    corrupt      bus FRAMES bit K | signal NAME=VALUE   [crc good]
+    masquerade   bus FRAMES as MESSAGE
+                 ... [after 2s | when ttc|gap|speed <|> VALUE] [nth N]
+                     [for 500ms | intermittent p 0.1 | intermittent every N | permanent]
+    babbling NODE | bus-off NODE | partition NODE,...|NODE,...
+                 ... [after 2s | when ttc|gap|speed <|> VALUE] [for 500ms | permanent]
+
+FRAMES is the name of a message of the DBC, or `from NODE`. Without a word about how long, one frame is
+struck; a babbling node, a bus-off and a partition last for good. A fault opens at once, after some bus
+time, or when the car is in a condition; from there on its `nth` frame is the first that is struck. Times
+are bus time, in whole microseconds.
+
+The hub knows no DBC. The command resolves the names (`resolved`) before anything runs, so a name that does
+not exist is the user's error and costs the run nothing. What a fault does to the frames is in
+`bus_disturber`.
+"""
+
+import re
+from collections import deque
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, ClassVar, Final
+
+import msgspec
+
+from aftbed.core.busfault import NODES, Condition
+from aftbed.core.errors import ConfigError, unknown
+from aftbed.core.graph import Graph
+from aftbed.core.units import duration, milliseconds, number
+from aftbed.inject import timing
+from aftbed.inject.grammar import NUMBER, whole
+from aftbed.inject.kind import AnyFault, FaultKind, Injection, ReadFault, RunControl, Steps
+from aftbed.inject.receipts import Receipt, ReceiptState
+from aftbed.inject.timing import ONCE, Chance, Every, Lasting, Permanent, Transient, Trigger
+
+if TYPE_CHECKING:
+    from aftbed.vehicle.can.dbc_file import Codec
+
+BUS: Final = "bus"  # the target of a fault of the bus
+SECOND_US: Final = 1_000_000
+FRAME_BITS: Final = 64
+CRC_BITS: Final = 8  # of E2E profile 11: the first byte
+NTH_MAX: Final = 999_999_999
+VERBS: Final = (
+    "omission",
+    "delay",
+    "duplicate",
+    "reorder",
+    "corrupt",
+    "masquerade",
+    "stuck-counter",
+    "babbling",
+    "bus-off",
+    "partition",
+)
+GRAMMAR: Final = (
+    "omission|duplicate|reorder|stuck-counter bus FRAMES, delay bus FRAMES by 40ms,"
+    " corrupt bus FRAMES bit K|signal NAME=VALUE [crc good], masquerade bus FRAMES as MESSAGE,"
+    " each with [after 2s | when ttc < 1.2] [nth N] [for 500ms | intermittent p 0.1 | permanent],"
+    " or babbling|bus-off NODE, partition NODE,...|NODE,... with [after 2s | when ttc < 1.2] [for 500ms]"
+)
+_NAME: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,127}")
+_NODE: Final = re.compile(r"[a-z_][a-z0-9_]{0,31}")
+
+
+# -- what is done, to frames ----------------------------------------------------------------------
+
+
+class Omission(msgspec.Struct, frozen=True, tag=True):
+    """The frame does not come."""
+
+    VERB: ClassVar = "omission"
+
+    def __str__(self) -> str:
+        return ""
+
+
+class Delay(msgspec.Struct, frozen=True, tag=True):
+    """The frame comes later."""
+
+    by_us: int
+
+    VERB: ClassVar = "delay"
+
+    def __str__(self) -> str:
+        return f"by {duration(self.by_us / 1000)}"
+
+
+class Duplicate(msgspec.Struct, frozen=True, tag=True):
+    """The frame comes twice."""
+
+    VERB: ClassVar = "duplicate"
+
+    def __str__(self) -> str:
+        return ""
+
+
+class Reorder(msgspec.Struct, frozen=True, tag=True):
+    """The frame comes after the next one of those that the fault is aimed at."""
+
+    VERB: ClassVar = "reorder"
+
+    def __str__(self) -> str:
+        return ""
+
+
+class FlipBit(msgspec.Struct, frozen=True, tag=True):
+    """Bit `bit`, counted from bit 0 of byte 0, is inverted; `crc_good`: the CRC is made to fit."""
+
+    bit: int
+    crc_good: bool = False
+
+    VERB: ClassVar = "corrupt"
+
+    def __str__(self) -> str:
+        return f"bit {self.bit}{' crc good' if self.crc_good else ''}"
+
+
+class SetSignal(msgspec.Struct, frozen=True, tag=True):
+    """The signal has that value, in the units of the DBC; `crc_good`: the CRC is made to fit."""
+
+    signal: str
+    value: float
+    crc_good: bool = False
+
+    VERB: ClassVar = "corrupt"
+
+    def __str__(self) -> str:
+        return f"signal {self.signal}={number(self.value)}{' crc good' if self.crc_good else ''}"
+
+
+class Masquerade(msgspec.Struct, frozen=True, tag=True):
+    """The CRC is right for the data id of another message."""
+
+    message: str
+
+    VERB: ClassVar = "masquerade"
+
+    def __str__(self) -> str:
+        return f"as {self.message}"
+
+
+class StuckCounter(msgspec.Struct, frozen=True, tag=True):
+    """The counter stays as in the frame before; the CRC fits."""
+
+    VERB: ClassVar = "stuck-counter"
+
+    def __str__(self) -> str:
+        return ""
+
+
+# -- what is done, to nodes -----------------------------------------------------------------------
+
+
+class Babble(msgspec.Struct, frozen=True, tag=True):
+    """The node sends the highest priority without a pause: no other frame gets through, and none of its
+    own.
+    """
+
+    node: str
+
+    VERB: ClassVar = "babbling"
+
+    def __str__(self) -> str:
+        return self.node
+
+
+class BusOff(msgspec.Struct, frozen=True, tag=True):
+    """Nothing of the node reaches the bus, and nothing of the bus the node."""
+
+    node: str
+
+    VERB: ClassVar = "bus-off"
+
+    def __str__(self) -> str:
+        return self.node
+
+
+class Partition(msgspec.Struct, frozen=True, tag=True):
+    """The bus is cut: neither side hears the other. A node on neither side hears both."""
+
+    side: tuple[str, ...]
+    other: tuple[str, ...]
+
+    VERB: ClassVar = "partition"
+
+    def __str__(self) -> str:
+        return f"{','.join(self.side)}|{','.join(self.other)}"
+
+
+FrameAct = Omission | Delay | Duplicate | Reorder | FlipBit | SetSignal | Masquerade | StuckCounter
+NodeAct = Babble | BusOff | Partition
+BusAct = FrameAct | NodeAct
+NODE_ACTS: Final = (Babble, BusOff, Partition)
+BusPersistence = Transient | Lasting | Chance | Every | Permanent
+
+_PLAIN: Final[dict[str, BusAct]] = {
+    act.VERB: act for act in (Omission(), Duplicate(), Reorder(), StuckCounter())
+}
+ON_FRAMES: Final = ("omission", "delay", "duplicate", "reorder", "corrupt", "masquerade", "stuck-counter")
+ON_NODES: Final = tuple(act.VERB for act in NODE_ACTS)
+ONLY_ON_BUS: Final = (*ON_NODES, "corrupt", "masquerade", "stuck-counter")  # no channel has these
+
+
+# -- to which frames, from when -------------------------------------------------------------------
+
+
+class Frames(msgspec.Struct, frozen=True):
+    """The frames called `message`, or those that `sender` sends: exactly one of the two is given."""
+
+    message: str = ""
+    sender: str = ""
+
+    def __post_init__(self) -> None:
+        if bool(self.message) == bool(self.sender):
+            raise ValueError(f"frames of message {self.message!r} and of node {self.sender!r}")
+
+    def __str__(self) -> str:
+        return f"bus {self.message or f'from {self.sender}'}"
+
+
+class Opening(msgspec.Struct, frozen=True):
+    """At once, after `after_us` of bus time, or when the condition holds; from there on the `nth` frame."""
+
+    after_us: int = 0
+    when: Condition | None = None
+    nth: int = 1
+
+    def __post_init__(self) -> None:
+        if self.after_us and self.when is not None:
+            raise ValueError("a fault that opens after a time and on a condition")
+
+    def __str__(self) -> str:
+        words = [f"after {duration(self.after_us / 1000)}"] if self.after_us else []
+        words += [f"when {self.when}"] if self.when is not None else []
+        return " ".join([*words, *([f"nth {self.nth}"] if self.nth != 1 else [])])
+
+
+class TargetFrame(msgspec.Struct, frozen=True):
+    """What the name of a message means. `data_id` -1: it has no E2E protection, or the act needs none of it.
+
+    Of a signal that is set: the bits of it in the data, and what they are to be.
+    """
+
+    can_id: int
+    data_id: int = -1
+    mask: bytes = b""
+    bits: bytes = b""
+
+
+class BusFault(FaultKind, frozen=True, tag="bus"):
+    """One fault of the bus. `frames` is None for an act on nodes, which lasts, for a time or for good.
+
+    `targets`: what its names mean; None until they are resolved, and none for an act on nodes.
+    """
+
+    effect: BusAct
+    frames: Frames | None = None
+    opening: Opening = Opening()
+    persistence: BusPersistence = ONCE
+    targets: tuple[TargetFrame, ...] | None = None
+
+    NAMES: ClassVar = (*ON_FRAMES, *ON_NODES)
+
+    needs_bus: ClassVar = True
+
+    def __post_init__(self) -> None:
+        """Refuse, with a ValueError, what means nothing."""
+        on_nodes = isinstance(self.effect, NODE_ACTS)
+        name = type(self.effect).__name__
+        if on_nodes != (self.frames is None):
+            raise ValueError(f"{name} {'with' if on_nodes else 'without'} frames")
+        if on_nodes and (self.opening.nth != 1 or not isinstance(self.persistence, Lasting | Permanent)):
+            raise ValueError(f"{name} lasts, and strikes no nth frame")
+
+    # -- words
+
+    @classmethod
+    def claims(cls, words: Sequence[str]) -> bool:
+        """Channels have omissions, delays, ... as well."""
+        return bool(words) and (words[0] in ONLY_ON_BUS or BUS in words[1:2])
+
+    @classmethod
+    def read(cls, words: Sequence[str]) -> ReadFault:
+        """See the top of this file."""
+        return ReadFault(read_bus_fault(" ".join(words)), BUS)
+
+    @property
+    def name(self) -> str:
+        """One for each act; `corrupt` for two."""
+        return self.effect.VERB
+
+    def subject(self, target: str) -> list[str]:
+        """All the rest: a fault of the bus has words of its own for when and how often."""
+        frames = "" if self.frames is None else str(self.frames)
+        return [frames, str(self.effect), str(self.opening), str(self.persistence)]
+
+    def __str__(self) -> str:
+        return " ".join(filter(None, [self.name, *self.subject(BUS)]))
+
+    # -- checks
+
+    def validate(self, fault: AnyFault) -> None:
+        """It has its own target and its own opening."""
+        if (fault.trigger, fault.target) != (Trigger(), BUS):
+            raise ValueError("a fault of the bus has its own words for when")
+        super().validate(fault)
+
+    def check(self, fault: AnyFault, graph: Graph) -> None:
+        """It names what is on the bus, not in the graph."""
+
+    def resolved(
+        self, codecs: "Sequence[Codec]", nodes: Sequence[str] = NODES, *, car: bool = True
+    ) -> "BusFault":
+        """The same with what its names mean on a bus of these messages and `nodes`. `car`: there is one.
+
+        Raises ConfigError naming the message, signal, bit or node that does not exist.
+        """
+        if self.opening.when is not None and not car:
+            raise ConfigError(f"{self}: 'when' looks at the car, and a replay has none")
+        for node in _nodes(self.effect):
+            if node not in nodes:
+                raise unknown("node of the bus", node, nodes)
+        found = _messages(self.frames, codecs) if self.frames is not None else []
+        targets = tuple(_target(self.effect, codec, name) for codec, name in found)
+        return msgspec.structs.replace(self, targets=targets)
+
+    # -- in the run
+
+    def act(self, injection: Injection, run: RunControl) -> Steps[None]:
+        """The bus does it; it has its own conditions and times."""
+        yield from run.disturb_bus(injection)
+
+    def receipt(self, injection: Injection, run: RunControl) -> Receipt:
+        """As the bus has reported."""
+        report = run.bus_report(injection)
+        if report is None:
+            return injection.receipt
+        injection.unmet = self.opening.when if report.waits else None
+        return report.receipt
+
+
+class BusReport(msgspec.Struct, frozen=True):
+    """What has become of a fault: how many frames it struck, the first of them, which node noticed it and
+    how.
+
+    `believed`: a node that took in a struck frame without an objection. `error` is of the injector itself.
+    """
+
+    number: int
+    frames: int = 0
+    first_us: int = 0
+    first_id: int = 0
+    noticed: str = ""
+    believed: str = ""
+    began: bool = False  # an act on nodes took hold, whatever frames there were
+    error: str = ""
+    waits: bool = False  # for its condition, which has not held yet
+
+    @property
+    def receipt(self) -> Receipt:
+        """A fault that has not struck yet is armed."""
+        return Receipt(self._state(), self._detail())
+
+    def _state(self) -> ReceiptState:
+        if self.error:
+            return ReceiptState.INJECT_ERROR
+        if not self.frames and not self.began:
+            return ReceiptState.ARMED
+        return ReceiptState.ACTIVATED if self.noticed or self.believed else ReceiptState.APPLIED
+
+    def _detail(self) -> str:
+        if self.error:
+            return self.error
+        if not self.frames:
+            return "took hold, of no frame" if self.began else ""
+        many = f"{self.frames} frame{'s' if self.frames > 1 else ''}"
+        first = f"{'the first ' if self.frames > 1 else ''}at {self.first_us / SECOND_US:.6f} s"
+        known = f"noticed by {self.noticed}" if self.noticed else "noticed by nobody"
+        if self.believed and not self.noticed:
+            known = f"believed by {self.believed}"
+        return f"{many}, {first}, id {self.first_id:03X}; {known}"
+
+
+# -- names ----------------------------------------------------------------------------------------
+
+
+def _nodes(act: BusAct) -> tuple[str, ...]:
+    match act:
+        case Babble(node) | BusOff(node):
+            return (node,)
+        case Partition(side, other):
+            return (*side, *other)
+        case _:
+            return ()
+
+
+def _messages(frames: Frames, codecs: "Sequence[Codec]") -> "list[tuple[Codec, str]]":
+    if frames.message:
+        return [(_codec_of(frames.message, codecs), frames.message)]
+    found = [(codec, name) for codec in codecs for name in codec.sent_by(frames.sender)]
+    if not found:
+        raise unknown("sender of frames", frames.sender, {s for codec in codecs for s in codec.senders()})
+    return found
+
+
+def _codec_of(message: str, codecs: "Sequence[Codec]") -> "Codec":
+    for codec in codecs:
+        if message in codec.names():
+            return codec
+    raise unknown("message", message, {name for codec in codecs for name in codec.names()})
+
+
+def _target(act: BusAct, codec: "Codec", name: str) -> TargetFrame:
+    can_id = codec.can_id(name)
+    match act:
+        case FlipBit(bit, crc_good):
+            if bit >= 8 * codec.length(name):
+                raise ConfigError(f"bit {bit}: {name} has the bits 0 to {8 * codec.length(name) - 1}")
+            if crc_good and bit < CRC_BITS:
+                raise ConfigError(
+                    f"bit {bit} crc good: bits 0 to {CRC_BITS - 1} of {name} are the CRC itself"
+                )
+            return TargetFrame(can_id, codec.data_id(name) if crc_good else -1)
+        case SetSignal(signal, value, crc_good):
+            mask, bits = codec.patch(name, signal, value)
+            return TargetFrame(can_id, codec.data_id(name) if crc_good else -1, mask, bits)
+        case Masquerade(message):
+            own, other = codec.data_id(name), codec.data_id(message)
+            if own == other:
+                raise ConfigError(f"{name} as {message}: both have the data id {own}")
+            return TargetFrame(can_id, other)
+        case StuckCounter():
+            return TargetFrame(can_id, codec.data_id(name))
+        case _:
+            return TargetFrame(can_id)
+
+
+# -- reading the words ----------------------------------------------------------------------------
+
+
+def read_bus_fault(text: str) -> BusFault:
+    """The fault that `text` means, its names not resolved.
+
+    Raises ConfigError naming the word that is wrong.
+    """
+    words = _WordReader(text)
+    verb = words.next("a fault of the bus")
+    if verb in ON_NODES:
+        act, frames, permanent = _node_act(verb, words), None, True
+    elif verb in ON_FRAMES:
+        frames = _frames(words)
+        act, permanent = _frame_act(verb, words), False
+    else:
+        raise unknown("fault of the bus", verb, BusFault.NAMES)
+    opening, persistence = _opening_and_persistence(words, on_nodes=permanent)
+    return BusFault(act, frames, opening, persistence)
+
+
+class _WordReader:
+    """Takes the words of the text one by one."""
+
+    def __init__(self, text: str) -> None:
+        self.text, self._left = text, deque(text.split())
+
+    def next(self, what: str) -> str:
+        """The next word, which is `what`."""
+        if not self._left:
+            raise self.wrong(f"{what} is missing")
+        return self._left.popleft()
+
+    def take(self, word: str) -> bool:
+        """Take `word` if it is the next one."""
+        if self._left and self._left[0] == word:
+            self._left.popleft()
+            return True
+        return False
+
+    def demand(self, word: str) -> None:
+        """The next word has to be `word`."""
+        found = self.next(repr(word))
+        if found != word:
+            raise self.wrong(f"found {found[:40]!r} where {word!r} is expected")
+
+    def more(self) -> bool:
+        """Whether words are left."""
+        return bool(self._left)
+
+    def whole(self, what: str, least: int, most: int) -> int:
+        """The next word, a whole number in its limits."""
+        found = self.next(f"the number of {what!r}")
+        with self.blaming():
+            return whole(what, found, least, most)
+
+    def duration_us(self) -> int:
+        """The next word, a time."""
+        found = self.next("a duration")
+        value = round(milliseconds("duration", found) * 1000)
+        if value == 0:
+            raise self.wrong(f"duration {found[:40]!r}: a microsecond is the least")
+        return value
+
+    def message(self) -> str:
+        """The next word, the name of a message."""
+        found = self.next("the name of a message")
+        if not _NAME.fullmatch(found):
+            raise self.wrong(f"{found[:40]!r} is no name of a message")
+        return found
+
+    def node(self) -> str:
+        """The next word, the name of a node."""
+        found = self.next("the name of a node").lower()
+        if not _NODE.fullmatch(found):
+            raise self.wrong(f"{found[:40]!r} is no name of a node")
+        return found
+
+    @contextmanager
+    def blaming(self) -> Iterator[None]:
+        """Add the text and the grammar to an error."""
+        try:
+            yield
+        except ConfigError as error:
+            raise self.wrong(str(error)) from None
+
+    def wrong(self, why: str) -> ConfigError:
+        """The error, with what is allowed."""
+        return ConfigError(f"fault {self.text[:200]!r}: {why}; allowed is: {GRAMMAR}")
+
+
+def _frames(words: _WordReader) -> Frames:
+    words.demand("bus")
+    return Frames(sender=words.node()) if words.take("from") else Frames(message=words.message())
+
+
+def _frame_act(verb: str, words: _WordReader) -> BusAct:
+    if verb == Delay.VERB:
+        words.demand("by")
+        return Delay(words.duration_us())
+    if verb == Masquerade.VERB:
+        words.demand("as")
+        return Masquerade(words.message())
+    return _corruption(words) if verb == FlipBit.VERB else _PLAIN[verb]
+
+
+def _corruption(words: _WordReader) -> BusAct:
+    what = words.next("'bit K' or 'signal NAME=VALUE'")
+    if what == "bit":
+        bit = words.whole("bit", 0, FRAME_BITS - 1)
+        return FlipBit(bit, _crc_good(words))
+    if what == "signal":
+        text = words.next("NAME=VALUE")
+        name, _, value = text.partition("=")
+        if not _NAME.fullmatch(name) or not NUMBER.fullmatch(value):
+            raise words.wrong(f"signal {text[:40]!r}: NAME=VALUE is allowed, with up to six decimals")
+        return SetSignal(name, float(value), _crc_good(words))
+    raise words.wrong(f"found {what[:40]!r} where 'bit' or 'signal' is expected")
+
+
+def _crc_good(words: _WordReader) -> bool:
+    if not words.take("crc"):
+        return False
+    words.demand("good")
+    return True
+
+
+def _node_act(verb: str, words: _WordReader) -> BusAct:
+    if verb != Partition.VERB:
+        return Babble(words.node()) if verb == Babble.VERB else BusOff(words.node())
+    text = words.next("NODE,...|NODE,...")
+    sides = [side.split(",") for side in text.split("|")]
+    nodes = [node for side in sides for node in side]
+    if len(sides) != 2 or not all(map(_NODE.fullmatch, nodes)) or len(set(nodes)) != len(nodes):
+        raise words.wrong(
+            f"partition {text[:80]!r}: two sides, and each node once, is allowed: radar|brake,gateway"
+        )
+    return Partition(tuple(sides[0]), tuple(sides[1]))
+
+
+def _opening_and_persistence(words: _WordReader, *, on_nodes: bool) -> tuple[Opening, BusPersistence]:
+    """Each of these words once, in any order."""
+    after_us, when, nth = 0, None, 1
+    persistence: BusPersistence = Permanent() if on_nodes else ONCE
+    seen: set[str] = set()
+    while words.more():
+        word = words.next("")
+        kind = "opening" if word in ("after", "when") else "nth" if word == "nth" else "persistence"
+        if kind in seen:
+            raise words.wrong(f"{word!r} says again what has been said")
+        seen.add(kind)
+        match word:
+            case "after":
+                after_us = words.duration_us()
+            case "when":
+                found = [words.next(what) for what in ("ttc, gap or speed", "'<' or '>'", "a value")]
+                with words.blaming():
+                    when = timing.condition(*found)
+            case "nth" if not on_nodes:
+                nth = words.whole("nth", 1, NTH_MAX)
+            case "for":
+                persistence = Lasting(words.duration_us())
+            case "intermittent" if not on_nodes:
+                which, value = words.next("'every' or 'p'"), words.next("a number")
+                with words.blaming():
+                    persistence = timing.intermittent(which, value)
+            case "permanent":
+                persistence = Permanent()
+            case "nth" | "intermittent":
+                raise words.wrong(f"{word!r} is about frames; this fault takes hold of nodes, and lasts")
+            case _:
+                raise words.wrong(f"unknown word {word[:40]!r}")
+    return Opening(after_us, when, nth), persistence

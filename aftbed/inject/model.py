@@ -1,0 +1,135 @@
+"""A fault: what is done, to what, when, and how often again.
+
+    crash primary at checkpoint.sent nth 100            hang backup for 50ms after 200ms
+    delay aft2aft by 5ms in b permanent                 bitflip state.ego_ms bit 52 when ttc < 1.2
+    corrupt bus RADAR_TRACK bit 21 crc good for 500ms
+
+`FaultAction` registers the kinds, one line each; each has its grammar at the top of its file.
+"""
+
+from collections.abc import Sequence
+from typing import Final, cast, get_args
+
+import msgspec
+
+from aftbed.core.errors import ConfigError, unknown
+from aftbed.core.graph import Graph
+from aftbed.inject.bus import BUS, BusFault
+from aftbed.inject.channel import ChannelFault
+from aftbed.inject.crash import Crash
+from aftbed.inject.hang import Hang
+from aftbed.inject.kind import FaultKind
+from aftbed.inject.memory import MemoryFlip
+from aftbed.inject.receipts import ReceiptState
+from aftbed.inject.slow import Slow
+from aftbed.inject.state import StateFlip
+from aftbed.inject.timing import ONCE, Persistence, Trigger
+from aftbed.inject.value import ValueFlip
+
+FaultAction = (  # the registry: the first kind that claims the words of a fault reads them
+    BusFault  # before the channels, which share some of its words
+    | Crash
+    | Hang
+    | Slow
+    | ChannelFault
+    | MemoryFlip  # before all other bit flips
+    | StateFlip  # before those without a field
+    | ValueFlip
+)
+KINDS: Final[tuple[type[FaultKind], ...]] = get_args(FaultAction)
+NAMES: Final = tuple(dict.fromkeys(name for kind in KINDS for name in kind.NAMES))
+GRAMMAR: Final = (
+    "crash|hang|slow TARGET [by 2ms | share 25%] [for 50ms] [at EVENT [nth N] | after 200ms],"
+    " omission|delay|duplicate|reorder CHANNEL [by 20ms] [in primary|backup|a|b] [nth N | after 200ms],"
+    " or bitflip PLACE|state.FIELD|memory [bit K] [in primary|backup|a|b] [at EVENT] [nth N] | [after 200ms],"
+    " each with [when ttc < 1.2] in place of after"
+)
+
+
+class Fault(msgspec.Struct, frozen=True):
+    """`target` is a role, a replica, a node, or another process, as the kind allows.
+
+    Raises ValueError on a combination that means nothing.
+    """
+
+    action: FaultAction
+    target: str
+    trigger: Trigger
+    persistence: Persistence = ONCE
+
+    def __post_init__(self) -> None:
+        self.action.validate(self)
+
+    @property
+    def event(self) -> str:
+        """The label of the event that it waits for, "" for none."""
+        return self.action.event(self.trigger)
+
+    def check(self, graph: Graph) -> None:
+        """Raise ConfigError, naming what is allowed, if it cannot happen in `graph`."""
+        if self.trigger.nth < 1:
+            raise ConfigError(f"nth {self.trigger.nth}: the first occurrence is nth 1")
+        self.action.check(self, graph)
+
+    def __str__(self) -> str:
+        action = self.action
+        when = self.trigger.words(counts_messages=action.counts_messages)
+        words = [action.name, *action.subject(self.target), *when, str(self.persistence)]
+        return " ".join(filter(None, words))
+
+
+def on_bus(action: BusFault) -> Fault:
+    """A fault of the bus, among the others."""
+    return Fault(action, BUS, Trigger())
+
+
+class ArmedFault(msgspec.Struct, frozen=True):
+    """What a node is told of a fault: the `nth` time that `brick` comes to the point, do it, or ask for it.
+
+    `by_itself`: the node does it to itself. `draw` decides what `action` and `persistence` leave open.
+    `strikes`: how often it has struck here so far.
+    """
+
+    fault: int
+    brick: str
+    nth: int
+    action: FaultAction
+    by_itself: bool
+    draw: int = 0
+    persistence: Persistence = ONCE
+    strikes: int = 0
+
+
+class FaultReport(msgspec.Struct, frozen=True, omit_defaults=True):
+    """A fault of a run in its words, with its receipt, as it stands in records and documents."""
+
+    fault: str
+    receipt: ReceiptState
+    detail: str = ""
+
+    @property
+    def fired(self) -> bool:
+        """Whether the fault happened."""
+        return self.receipt.fired
+
+    @property
+    def action(self) -> FaultKind:
+        """What it does."""
+        return parse(self.fault).action
+
+
+def parse(text: str) -> Fault:
+    """The fault that `text` means. Raises ConfigError naming the word that is wrong."""
+    return read(text.split())
+
+
+def read(words: Sequence[str]) -> Fault:
+    """The same of words that were told apart already: one of them may have spaces."""
+    for kind in KINDS:
+        if kind.claims(words):
+            found = kind.read(words)
+            action = cast("FaultAction", found.action)
+            return Fault(action, found.target, found.trigger, found.persistence)
+    if len(words) < 2:
+        raise ConfigError(f"fault {' '.join(words)!r}: expected {GRAMMAR}")
+    raise unknown("fault", words[0], NAMES)

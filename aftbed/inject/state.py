@@ -1,0 +1,110 @@
+"""Bit flips of one field of the function's state, in memory, at any moment.
+
+    bitflip state.FIELD [BITS] [in REPLICA] [at EVENT] [nth N] | [after 200ms] | [when ttc < 1.2]
+
+Unlike a flip of the whole state (`value`), it needs no moment at which a brick has the state in hand: the
+state is in memory that the supervisor shares (`shared_state`). Without a word about when, it strikes at
+once.
+"""
+
+import re
+from collections.abc import Sequence
+from typing import ClassVar, Final
+
+from aftbed.core.application import fields_of
+from aftbed.core.errors import ConfigError, StepFailed, unknown
+from aftbed.core.events import Event
+from aftbed.core.graph import Graph
+from aftbed.inject import targets
+from aftbed.inject.bit_patterns import Bit, BitPattern, check_pattern, read_pattern
+from aftbed.inject.grammar import REPEAT_KEYS, FaultWords
+from aftbed.inject.kind import AnyFault, FaultKind, Injection, ReadFault, RunControl, Steps
+from aftbed.inject.receipts import Receipt, ReceiptState
+from aftbed.inject.shared_state import SharedState, field_with_bits
+from aftbed.inject.timing import read_trigger
+from aftbed.inject.value import BITFLIP, BITFLIP_KEYS, MEMORY, PLACES, no_address
+from aftbed.vehicle.aeb.function import AebFunction
+
+STATE: Final = "state"
+FIELD_CHARACTERS_MAX: Final = 60
+_FIELD: Final = re.compile(r"[A-Za-z0-9_]+(\.[A-Za-z0-9_]+)*")
+
+
+class StateFlip(FaultKind, frozen=True, tag="state"):
+    """Bits of the field of that name are flipped, as `pattern` says."""
+
+    field: str
+    pattern: BitPattern = Bit()
+
+    NAMES: ClassVar = (BITFLIP,)
+    KEYS: ClassVar = BITFLIP_KEYS
+
+    alters_value: ClassVar = True
+    shares_state: ClassVar = True
+
+    @classmethod
+    def claims(cls, words: Sequence[str]) -> bool:
+        """A bit flip of a PLACE.FIELD."""
+        return super().claims(words) and "." in words[1]
+
+    @classmethod
+    def read(cls, words: Sequence[str]) -> ReadFault:
+        """See the top of this file."""
+        found = FaultWords(words, cls.KEYS)
+        place, _, field = found.subject.partition(".")
+        if place not in PLACES:
+            raise unknown("place of a bitflip", place, (*PLACES, MEMORY))
+        no_address(found)
+        if place != STATE:
+            raise ConfigError(f"{place + '.' + field[:40]!r}: only the state has fields, as state.ego_ms")
+        if not _FIELD.fullmatch(field) or len(field) > FIELD_CHARACTERS_MAX:
+            named = f"letters, digits, _ and . are allowed, {FIELD_CHARACTERS_MAX} at most"
+            raise ConfigError(f"field {field[:40]!r} of the state: {named}")
+        lasting = found.first_of(REPEAT_KEYS)
+        if lasting is not None:
+            raise ConfigError(
+                f"{lasting!r}: a bitflip of a field strikes once; that of a whole state can last"
+            )
+        action = cls(field, read_pattern(found))
+        found.not_both("nth", "after")
+        trigger = read_trigger(found, Event.SERVER_EXIT.label)
+        return ReadFault(action, found.get("in", targets.DEFAULT), trigger)
+
+    def subject(self, target: str) -> list[str]:
+        """The field, the bits, and the replica."""
+        return [f"{STATE}.{self.field}", str(self.pattern), "in", target]
+
+    @property
+    def strikes_stored_state(self) -> bool:
+        """Always."""
+        return True
+
+    def check(self, fault: AnyFault, graph: Graph) -> None:
+        """The fields of a function that was written off line are known only in its node."""
+        check_pattern(self.pattern)
+        targets.possible_roles(fault.target, graph)
+        targets.check_event(fault.event, graph)
+        if not any(brick.application for brick in graph.bricks):
+            field_with_bits(self.field, self.pattern, fields_of(AebFunction))
+
+    def check_state(self, shared: SharedState) -> None:
+        """The function declares its fields once it is there."""
+        field_with_bits(self.field, self.pattern, shared.fields)
+
+    def act(self, injection: Injection, run: RunControl) -> Steps[None]:
+        """Flip the bits where the state is now: another replica may lead since the arming."""
+        try:
+            shared = yield from run.shared_state(injection)
+            run.record_strike(injection)
+            hit = shared.flip(self.field, self.pattern, run.now_ns(), injection.draw)
+        except (StepFailed, ConfigError) as error:
+            injection.receipt = Receipt(ReceiptState.NOT_ACTIVATED, str(error))
+        else:
+            injection.evidence = hit
+            injection.receipt = hit.receipt(())
+        run.log(injection)
+
+    def receipt(self, injection: Injection, run: RunControl) -> Receipt:
+        """Activated when the function has used the bits, or refused them."""
+        hit = injection.evidence
+        return injection.receipt if hit is None else hit.receipt(run.journal(hit.journal))

@@ -1,0 +1,283 @@
+"""Bit flips of a value that a brick has in hand: a request, a result, the state, a checkpoint, a kept reply.
+
+    bitflip PLACE [BITS] [in REPLICA] [at EVENT] [nth N] | [after 200ms] [AGAIN]     [when ttc < 1.2]
+
+    PLACE = result | state | request | checkpoint | log
+    BITS  = bit K | bits N | byte [K] | burst N [bit K] | stuck K=0|1
+    AGAIN = permanent | intermittent every N | intermittent p 0.1
+
+It strikes where the value is in hand: without a word about when, at the next such event. A fault that lasts
+belongs to the process that it struck first, as a broken part of the hardware does: a process that takes its
+place is sound.
+"""
+
+from collections.abc import Sequence
+from enum import Enum
+from typing import ClassVar, Final
+
+import msgspec
+from msgspec import structs
+
+from aftbed.core.brick import Brick, Effect, Note, Send
+from aftbed.core.errors import ConfigError, PeerError, unknown
+from aftbed.core.events import Event, event_named
+from aftbed.core.graph import Graph
+from aftbed.core.journal import Record
+from aftbed.core.messages import Checkpoint, Message, Reply, Request, StateCaptured, StoreReply, Trial, Tried
+from aftbed.inject import targets
+from aftbed.inject.bit_patterns import (
+    PATTERN_KEYS,
+    Bit,
+    BitPattern,
+    Byte,
+    StuckBit,
+    bit_names,
+    bits_to_flip,
+    check_pattern,
+    read_pattern,
+    with_flipped,
+)
+from aftbed.inject.grammar import REPEAT_KEYS, WHEN_KEYS, FaultWords
+from aftbed.inject.kind import Alteration, AnyFault, FaultKind, Injection, ReadFault, RunControl
+from aftbed.inject.receipts import Receipt, ReceiptState, fault_and_bits, more_times
+from aftbed.inject.timing import Trigger, read_persistence, read_trigger
+
+BITFLIP: Final = "bitflip"
+MEMORY: Final = "memory"  # the place of a bit flip outside of all values: see `memory`
+BITFLIP_KEYS: Final = (*PATTERN_KEYS, "address", "in", *WHEN_KEYS, *REPEAT_KEYS)
+
+
+class ValuePlace(Enum):
+    """What is hit."""
+
+    RESULT = "result"  # what one execution answers
+    STATE = "state"  # what the function remembers
+    REQUEST = "request"  # what the Server is handed
+    CHECKPOINT = "checkpoint"  # the state, and behind it the reply, on their way to the backup
+    LOG = "log"  # the reply that a Protocol keeps, to answer with once more
+
+
+PLACES: Final = tuple(place.value for place in ValuePlace)
+EXECUTED: Final = (ValuePlace.RESULT, ValuePlace.STATE)  # what one execution leaves behind: what TR compares
+FLIPPED_AT: Final = {  # the events at which the value is in hand; the first is meant where none is named
+    ValuePlace.RESULT: (Event.SERVER_EXIT,),
+    ValuePlace.STATE: (Event.SERVER_EXIT, Event.STATE_CAPTURED, Event.STATE_RESTORED),
+    ValuePlace.REQUEST: (Event.SERVER_ENTER,),
+    ValuePlace.CHECKPOINT: (Event.CHECKPOINT_SENT,),
+    ValuePlace.LOG: (Event.REPLY_STORED, Event.DEDUPE_HIT, Event.CHECKPOINT_APPLIED),
+}
+LoggedReplies = tuple[int, list[tuple[int, bytes]]]  # as a Protocol captures it: the last id, ids and replies
+_USES: Final = (Event.SERVER_ENTER, Event.STATE_CAPTURED)  # of a state that was hit
+
+
+class ValueFlip(FaultKind, frozen=True, tag=BITFLIP):
+    """Bits of the value at `place` are flipped, as `pattern` says."""
+
+    place: ValuePlace
+    pattern: BitPattern = Bit()
+
+    NAMES: ClassVar = (BITFLIP,)
+    KEYS: ClassVar = BITFLIP_KEYS
+
+    alters_value: ClassVar = True
+    repeats: ClassVar = True
+    acts_in_node: ClassVar = True
+
+    @classmethod
+    def read(cls, words: Sequence[str]) -> ReadFault:
+        """See the top of this file."""
+        found = FaultWords(words, cls.KEYS)
+        if found.subject not in PLACES:
+            raise unknown("place of a bitflip", found.subject, (*PLACES, MEMORY))
+        no_address(found)
+        action = cls(ValuePlace(found.subject), read_pattern(found))
+        found.not_both("nth", "after")
+        trigger = read_trigger(found, FLIPPED_AT[action.place][0].label)
+        return ReadFault(action, found.get("in", targets.DEFAULT), trigger, read_persistence(found))
+
+    def subject(self, target: str) -> list[str]:
+        """The place, the bits, and the replica."""
+        return [self.place.value, str(self.pattern), "in", target]
+
+    def event(self, trigger: Trigger) -> str:
+        """The named one, or the first at which the value is in hand."""
+        return trigger.event or FLIPPED_AT[self.place][0].label
+
+    def check(self, fault: AnyFault, graph: Graph) -> None:
+        """The target has to have the value in hand at the event, in the roles that it can have."""
+        check_pattern(self.pattern)
+        roles = targets.possible_roles(fault.target, graph)
+        event = event_named(fault.event)
+        places = FLIPPED_AT[self.place]
+        emitted = {e.label for e in places for role in roles if targets.emits(graph, e, role)}
+        if not emitted:
+            executes = f"the Server of a {fault.target} executes nothing"
+            all_of_server = all(targets.emitting_part(e) == "server" for e in places)
+            nothing = executes if all_of_server else f"{fault.target} has none"
+            raise ConfigError(f"{fault}: under --ftm {graph.ftm} {nothing}")
+        if event.label not in emitted:
+            raise unknown(
+                f"event for a bit of the {self.place.value} in {fault.target}:", event.label, emitted
+            )
+
+    def waits_in(self, fault: AnyFault, roles: targets.Roles) -> str | None:
+        """The brick of the target that has the value in hand."""
+        return targets.emitting_brick_of(roles, fault.event, roles.replica(fault.target))
+
+    # -- in the node ------------------------------------------------------------------------------
+
+    @property
+    def alters_step(self) -> bool:
+        """A Note comes too late for what the Server was handed, and for what has gone to the backup."""
+        return self.place in (ValuePlace.REQUEST, ValuePlace.CHECKPOINT)
+
+    def alter_input(self, message: Message, draw: int) -> tuple[Message, Alteration | None]:
+        """The request, as the Server is handed it."""
+        if self.place is not ValuePlace.REQUEST or not isinstance(message, Request | Trial):
+            return message, None
+        payload, bits = self._flip(message.payload, draw)
+        handed = structs.replace(message, payload=payload) if bits else message
+        return handed, Alteration(message.request_id, bits, 8 * len(payload))
+
+    def alter_output(self, effects: list[Effect], draw: int) -> tuple[list[Effect], Alteration | None]:
+        """The checkpoint among the effects."""
+        if self.place is not ValuePlace.CHECKPOINT:
+            return effects, None
+        for at, effect in enumerate(effects):
+            if isinstance(effect, Send) and isinstance(effect.message, Checkpoint):
+                sent = effect.message
+                data, bits = self._flip(sent.state + sent.reply, draw)
+                length = len(sent.state)
+                other = structs.replace(sent, state=data[:length], reply=data[length:])
+                effects = [*effects[:at], Send(effect.port, other), *effects[at + 1 :]]
+                return effects, Alteration(sent.request_id, bits, 8 * len(data))
+        return effects, None
+
+    def alter_at(self, brick: Brick, effects: list[Effect], at: int, draw: int) -> Alteration:
+        """What the brick has in hand, and the message behind the Note that carries it away."""
+        note = effects[at]
+        assert isinstance(note, Note)
+        index, send = next((i, e) for i, e in enumerate(effects) if i > at and isinstance(e, Send))
+        data = self._in_hand(brick, send.message, note)
+        altered, bits = self._flip(data, draw)
+        message = self._with(brick, send.message, note, altered) if bits else None
+        if message is not None:
+            effects[index] = Send(send.port, message)
+        return Alteration(note.request_id, bits if message is not None else (), 8 * len(data))
+
+    def _flip(self, data: bytes, draw: int) -> tuple[bytes, tuple[int, ...]]:
+        """The data with its bits flipped, and which; none where it has no such bits, or they are so
+        already.
+        """
+        bits = bits_to_flip(self.pattern, data, draw) or ()
+        return with_flipped(data, bits), bits
+
+    def _in_hand(self, brick: Brick, message: Message, note: Note) -> bytes:
+        """The bytes that have the bits; none where the brick does not hand them out."""
+        if self.place is ValuePlace.LOG and note.event is Event.REPLY_STORED:
+            log = _logged(brick)
+            return dict(log[1]).get(note.request_id, b"") if log is not None else b""
+        if self.place is not ValuePlace.STATE:
+            assert isinstance(message, Reply | Tried | StoreReply), message
+            return message.payload
+        try:
+            return brick.capture()
+        except PeerError:
+            return b""
+
+    def _with(self, brick: Brick, message: Message, note: Note, data: bytes) -> Message | None:
+        """What `message` is with `data`; None where the brick refuses such a state, or ignores the bits."""
+        if self.place is ValuePlace.LOG:
+            if note.event is not Event.CHECKPOINT_APPLIED and not _relog(brick, note, data):
+                return None
+            if note.event is Event.REPLY_STORED:
+                return message  # the reply itself is as it should be
+        if self.place is not ValuePlace.STATE:
+            return structs.replace(message, payload=data)
+        before = brick.capture()
+        try:
+            brick.restore(data)
+        except PeerError:
+            return None
+        state = brick.capture()
+        if state == before:
+            return None
+        carries_state = isinstance(message, Tried | StateCaptured)
+        return structs.replace(message, state=state) if carries_state else message
+
+    # -- what became of it ------------------------------------------------------------------------
+
+    def receipt(self, injection: Injection, run: RunControl) -> Receipt:
+        """Activated when somebody worked with what was hit: see `docs/faults.md`."""
+        about = run.records_about(injection)
+        if not about:
+            return injection.receipt
+        strikes = [r for r in about if r.event is Event.FAULT_APPLIED]
+        if not strikes:
+            return self._missed(injection, about[0])
+        request = strikes[0].request_id
+        bits = sorted({fault_and_bits(r.detail)[1] for r in strikes if r.request_id == request})
+        keeper = f"{injection.brick.partition('/')[0]}/protocol" if self.place is ValuePlace.LOG else ""
+        journal = run.records_of(injection, keeper)
+        used = any(self._is_used(injection.fault, record, journal) for record in strikes)
+        state = ReceiptState.ACTIVATED if used else ReceiptState.APPLIED
+        where = self._where(injection, request)
+        return Receipt(state, f"{bit_names(bits)} {where}{more_times(len(strikes) // len(bits))}")
+
+    def _is_used(self, fault: AnyFault, struck: Record, journal: Sequence[Record]) -> bool:
+        """Whether a brick worked with what was hit. Most values leave with the message that shows them."""
+        if self.place is ValuePlace.STATE and fault.event != Event.STATE_CAPTURED.label:
+            after = (r for r in journal if r.t_ns >= struck.t_ns and r.node == struck.node)
+            next_ = (r for r in after if r.event in (*_USES, Event.STATE_RESTORED))
+            first = next((r for r in next_ if r.t_ns > struck.t_ns or r.event in _USES), None)
+            return first is not None and first.event in _USES
+        if self.place is ValuePlace.LOG and fault.event != Event.DEDUPE_HIT.label:
+            hits = (r for r in journal if r.event is Event.DEDUPE_HIT and r.request_id == struck.request_id)
+            return any(r.t_ns >= struck.t_ns for r in hits)
+        return True
+
+    def _missed(self, injection: Injection, record: Record) -> Receipt:
+        """Nothing was hit: there are no such bits, they are so already, or the function refuses such a
+        state.
+        """
+        _, size = fault_and_bits(record.detail)
+        where = self._where(injection, record.request_id)
+        if isinstance(self.pattern, StuckBit) and self.pattern.at < size:
+            detail = f"bit {self.pattern.at} {where} is {self.pattern.value} as it is, or was refused"
+            return Receipt(ReceiptState.NOT_ACTIVATED, detail)
+        bits = bits_to_flip(self.pattern, bytes(size // 8), injection.draw)
+        if bits is None:
+            unit, count = ("bytes", size // 8) if isinstance(self.pattern, Byte) else ("bits", size)
+            return Receipt(ReceiptState.NOT_ACTIVATED, f"there are {count} {unit} {where}")
+        return Receipt(ReceiptState.NOT_ACTIVATED, f"the function refused {bit_names(bits)} {where}")
+
+    def _where(self, injection: Injection, request_id: int) -> str:
+        return f"of the {self.place.value} of request {request_id} in {injection.brick}"
+
+
+def _logged(brick: Brick) -> LoggedReplies | None:
+    """The replies that a Protocol keeps; None where the brick captures something else."""
+    try:
+        log: LoggedReplies = msgspec.msgpack.decode(brick.capture(), type=LoggedReplies)
+    except (msgspec.DecodeError, PeerError):
+        return None
+    return log
+
+
+def _relog(brick: Brick, note: Note, reply: bytes) -> bool:
+    """Keep `reply` for the request of `note`; False if the Protocol does not take it."""
+    log = _logged(brick)
+    if log is None:
+        return False
+    kept = [(number, reply if number == note.request_id else payload) for number, payload in log[1]]
+    try:
+        brick.restore(msgspec.msgpack.encode((log[0], kept)))
+    except PeerError:
+        return False
+    return True
+
+
+def no_address(words: FaultWords) -> None:
+    """Raise ConfigError where an address is given."""
+    if "address" in words:
+        raise ConfigError(f"'address {words['address'][:40]}': only memory has addresses: 'bitflip {MEMORY}'")
