@@ -16,6 +16,7 @@ Mail for a closed port stays in its channel, which outlives this node.
 
 from collections import deque
 from collections.abc import Callable
+from operator import length_hint
 from typing import Final, Generic, NoReturn, Protocol, TypeVar, assert_never
 
 from aftbed.core.brick import CONTROL, Brick, Effect, Halt, Note, Order, Send
@@ -47,6 +48,14 @@ class HostedBrick(Generic[In, Out]):
         self.performed = 0  # effects so far, but for those of the fast loop of unix
 
 
+class Recorder(Protocol):
+    """Appends a record to a journal."""
+
+    def __call__(
+        self, now_ns: int, event: Event, request_id: int, detail: int, brick: int = 0, /
+    ) -> None: ...
+
+
 class NodeIO(Protocol[In, Out]):
     """What a node needs of its runtime. A class that names this contract as its base gets the defaults of a
     NodeIO without channels to other nodes and without faults; one whose writes wait for room, and whose node
@@ -54,7 +63,6 @@ class NodeIO(Protocol[In, Out]):
     """
 
     output: type[Out]
-    careful: bool  # effects must be performed one by one: the node may have to stop between two of them
 
     def join(self, node: "Node[In, Out]") -> None:
         """Work for `node`. Called once."""
@@ -66,8 +74,9 @@ class NodeIO(Protocol[In, Out]):
         """Monotonic."""
         ...
 
-    def record(self, now_ns: int, event: Event, request_id: int, detail: int, brick: int = 0) -> None:
-        """Append to the journal."""
+    @property
+    def record(self) -> Recorder:
+        """What appends to the journal."""
         ...
 
     def report(self, report: control.FromNode) -> None:
@@ -190,6 +199,7 @@ class Node(Generic[In, Out]):
         self.timed: list[HostedBrick[In, Out]] = []  # bricks with deadlines
         self.only: HostedBrick[In, Out] | None = None  # the brick of a node that hosts one
         self.agent = FaultAgent(self)
+        self.careful = False  # set by a NodeIO that may have to stop between two effects, without a fault
         self.device: Device | None = None
         self._device_brick: HostedBrick[In, Out] | None = None
         self._mail: deque[tuple[HostedBrick[In, Out], str, Message]] = deque()  # from brick to brick
@@ -332,7 +342,11 @@ class Node(Generic[In, Out]):
         for hosted in self.timed:
             due = hosted.brick.deadline_ns()
             if due is not None and due <= now_ns:
-                self.perform(hosted, hosted.brick.wake(now_ns), now_ns)
+                effects = hosted.brick.wake(now_ns)
+                if self.agent.active or self.careful:
+                    self.perform_from(hosted, effects, 0)
+                else:
+                    self._perform(hosted, effects, now_ns)
                 return True
         return False
 
@@ -354,25 +368,36 @@ class Node(Generic[In, Out]):
         raw: bytes | None = None,
     ) -> None:
         """Have the brick handle `message`, which came as the bytes `raw`, and perform what it asks for."""
+        if self.agent.active or self.careful:
+            self._step_carefully(hosted, port, message)
+            return
+        now_ns = self._now_ns()
+        try:
+            effects = hosted.brick.step(port, message, now_ns)  # type: ignore[arg-type]
+        except PeerError:
+            self._record(now_ns, Event.PEER_REFUSED, getattr(message, "request_id", 0), 0)
+            return
+        if effects:
+            self._perform(hosted, effects, now_ns, message, raw)
+
+    def _step_carefully(self, hosted: HostedBrick[In, Out], port: str, message: AnyMessage | Message) -> None:
+        """The same with the fault agent around it, effects one by one."""
         agent = self.agent
         slowed = agent.slowed and port != CONTROL
         if slowed:
             self.io.delay(agent.delay_ns())
         now_ns = self._now_ns()
         try:
-            if agent.active:
-                effects = agent.step(hosted.name, hosted.brick, port, message, now_ns)
-            else:
-                effects = hosted.brick.step(port, message, now_ns)  # type: ignore[arg-type]
+            effects = agent.step(hosted.name, hosted.brick, port, message, now_ns)
         except PeerError:
             self._record(now_ns, Event.PEER_REFUSED, getattr(message, "request_id", 0), 0)
             return
         if slowed:
             self.io.throttle(agent.stretch_ns)
         if effects:
-            self.perform(hosted, effects, now_ns, message, raw)
+            self.perform_from(hosted, effects, 0)
 
-    def perform(
+    def _perform(
         self,
         hosted: HostedBrick[In, Out],
         effects: list[Effect],
@@ -383,12 +408,9 @@ class Node(Generic[In, Out]):
         """The effects of a step at `now_ns`, in their order. `message`, passed on as it is, is not encoded
         again.
         """
-        if self.agent.active or self.io.careful:
-            self.perform_from(hosted, effects, 0)
-            return
         hosted.performed += len(effects)
-        outputs, output = hosted.outputs, self._output
-        for at, effect in enumerate(effects):
+        outputs, output, left = hosted.outputs, self._output, iter(effects)
+        for effect in left:
             kind = type(effect)
             if kind is Send:
                 out = outputs[effect.port]  # type: ignore[union-attr]
@@ -396,6 +418,7 @@ class Node(Generic[In, Out]):
                 if not isinstance(out, output):
                     out(sent)  # type: ignore[operator]
                 elif not self._write(hosted, effect.port, out, sent, raw if sent is message else None):  # type: ignore[union-attr]
+                    at = len(effects) - length_hint(left) - 1
                     hosted.performed -= len(effects) - at
                     self.io.hold(hosted, effects, at, out, filtered=False)
                     return
@@ -609,7 +632,6 @@ class MemoryIO(NodeIO[int, int]):
     """
 
     output = int
-    careful = False
 
     def join(self, node: Node[int, int]) -> None:
         """Nothing to set up."""
@@ -618,8 +640,10 @@ class MemoryIO(NodeIO[int, int]):
         """Always the same."""
         return 0
 
-    def record(self, now_ns: int, event: Event, request_id: int, detail: int, brick: int = 0) -> None:
-        """Not kept."""
+    @property
+    def record(self) -> Recorder:
+        """Nothing is kept."""
+        return lambda now_ns, event, request_id, detail, brick=0: None
 
     def report(self, report: control.FromNode) -> None:
         """No executive reads it."""

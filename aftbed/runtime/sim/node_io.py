@@ -18,7 +18,7 @@ from aftbed.core.events import Event
 from aftbed.core.journal import Record
 from aftbed.core.messages import ChannelEnded, Message
 from aftbed.runtime import control
-from aftbed.runtime.node import HostedBrick, Node, NodeIO
+from aftbed.runtime.node import HostedBrick, Node, NodeIO, Recorder
 from aftbed.runtime.sim.cells import Cell
 from aftbed.runtime.sim.channels import Channel
 from aftbed.runtime.sim.clock import Clock
@@ -78,7 +78,6 @@ class SimIO(NodeIO[Channel, Channel]):
         self._report, self._on_end, self._cells = report, on_end, cells
         self.alive, self.frozen_ns, self._pulse_ns = True, 0, 0
         self.ran_ns = 0  # when it last did anything
-        self.careful = False
         self._doom: tuple[str, int] | None = None  # a brick, and before which of its effects the node dies
         self._orders: deque[tuple[control.ToNode, tuple[int, ...]]] = deque()
         self._held: list[_Held] = []  # the last one is gone on with first: its step came in between
@@ -97,8 +96,12 @@ class SimIO(NodeIO[Channel, Channel]):
         """Virtual time."""
         return self._clock.ns
 
-    def record(self, now_ns: int, event: Event, request_id: int, detail: int, brick: int = 0) -> None:
-        """Append to the journal."""
+    @property
+    def record(self) -> Recorder:
+        """Appends to the list that is the journal."""
+        return self._append_record
+
+    def _append_record(self, now_ns: int, event: Event, request_id: int, detail: int, brick: int = 0) -> None:
         self._records.append(Record(now_ns, event, request_id, detail, self.name, brick))
 
     def report(self, report: control.FromNode) -> None:
@@ -128,7 +131,7 @@ class SimIO(NodeIO[Channel, Channel]):
 
     def die_before(self, brick: str, effect: int) -> None:
         """Have the node die before that effect of `brick`, counted from 0."""
-        self._doom, self.careful = (brick, effect), True
+        self._doom, self.node.careful = (brick, effect), True
 
     def die(self, reason: str = "") -> None:
         """End it; its ends of channels are the kernel's to close."""

@@ -45,7 +45,7 @@ from aftbed.core.messages import ChannelEnded, Message
 from aftbed.inject.slow import SLOW_MS_MAX
 from aftbed.runtime import control
 from aftbed.runtime import node as node_module
-from aftbed.runtime.node import HostedBrick, Node, NodeIO
+from aftbed.runtime.node import HostedBrick, Node, NodeIO, Recorder
 from aftbed.runtime.unix import cells, packets
 from aftbed.runtime.unix.death_notice import Held
 from aftbed.runtime.unix.journal_files import Journal
@@ -105,7 +105,7 @@ class UnixIO(NodeIO[Inlet, int]):
     """Of one process of the graph. `serve` never returns."""
 
     output = int
-    careful = False
+    now_ns = staticmethod(time.monotonic_ns)
 
     def __init__(self, line: Line[control.ToNode], journal: Journal) -> None:
         self.line, self.journal = line, journal
@@ -122,13 +122,10 @@ class UnixIO(NodeIO[Inlet, int]):
         """Work for `node`."""
         self._node = node
 
-    def now_ns(self) -> int:
-        """The kernel's monotonic clock."""
-        return _now()
-
-    def record(self, now_ns: int, event: Event, request_id: int, detail: int, brick: int = 0) -> None:
-        """Append to the journal."""
-        self.journal.write(now_ns, event, request_id, detail, brick)
+    @property
+    def record(self) -> Recorder:
+        """The journal's own."""
+        return self.journal.write
 
     def report(self, report: control.FromNode) -> None:
         """Send to the supervisor."""
@@ -160,8 +157,7 @@ class UnixIO(NodeIO[Inlet, int]):
     def serve(self) -> NoReturn:
         """Serve until the supervisor ends it; a failed assert ends the process (fail-silence)."""
         try:
-            while True:
-                self.serve_turns()
+            self.loop()
         except BrokenPipeError:
             os._exit(EXIT_FENCED)
         except BaseException:  # noqa: BLE001 - the last frame of this process: nothing may leak out of it
@@ -170,13 +166,16 @@ class UnixIO(NodeIO[Inlet, int]):
             sys.stderr.flush()
             os._exit(EXIT_ASSERT)
 
-    def serve_turns(self) -> None:
-        """Handle one thing, then, where the fast loop may serve this node, mail for as long as there is
-        nothing else.
-        """
-        self.turn()
-        if self._fast is not None and self._announced is None:
-            self.serve_fast(self._fast)
+    def loop(self) -> NoReturn:
+        """Handle one thing after the other, mail on the fast loop where that may serve this node."""
+        turn = self._node.turn
+        while True:
+            if self._announced is not None:
+                self._take_announced(self._announced)
+                continue
+            turn()
+            if self._fast is not None and self._announced is None:
+                self.serve_fast(self._fast)
 
     def turn(self) -> None:
         """Handle one thing, or wait for one, on the general path."""
