@@ -193,7 +193,7 @@ class Node(Generic[In, Out]):
 
     def __init__(self, name: str, io: NodeIO[In, Out]) -> None:
         self.name, self.io = name, io
-        self._now_ns, self._record, self._write = io.now_ns, io.record, io.write
+        self._now_ns, self._record, self._write, self._receive = io.now_ns, io.record, io.write, io.receive
         self._output = io.output
         self.bricks: dict[str, HostedBrick[In, Out]] = {}
         self.timed: list[HostedBrick[In, Out]] = []  # bricks with deadlines
@@ -278,8 +278,6 @@ class Node(Generic[In, Out]):
 
     def turn(self) -> bool:
         """Handle one thing, the first in the order above; False if there is none."""
-        if self.agent.filters:
-            self.release_due(self._now_ns())
         if self._mail and self._step_inside():
             return True
         if self.suspend_token or self.suspended:
@@ -291,7 +289,7 @@ class Node(Generic[In, Out]):
                 return self.io.wait_for_order()
         if self.device is not None and self.step_device(self.device):
             return True
-        return self.io.receive()
+        return self._receive()
 
     def _step_inside(self) -> bool:
         hosted, port, message = self._mail[0]
@@ -351,7 +349,7 @@ class Node(Generic[In, Out]):
         return False
 
     def release_due(self, now_ns: int) -> None:
-        """Send what channel faults have held back long enough."""
+        """Send what channel faults have held back long enough. The NodeIO calls it when it wakes up."""
         for (name, port), found in list(self.agent.filters.items()):
             due = found.due_ns()
             if due is not None and due <= now_ns:

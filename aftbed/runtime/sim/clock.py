@@ -90,6 +90,16 @@ class Clock:
         call()
         return True
 
+    def steps(self, count: int) -> bool:
+        """The next `count` events; False if there are not as many."""
+        heap, pop = self.heap, heapq.heappop
+        for _ in range(count):
+            if not heap:
+                return False
+            self.ns, _count, call = pop(heap)
+            call()
+        return True
+
     def watch_jobs(self) -> None:
         """Have what is past its deadline fail: planned anew whenever a job has begun to wait."""
         due = self.jobs.deadline_ns()

@@ -95,6 +95,10 @@ class Chooser(Clock):
             return
         self._lines.setdefault(line.number, (line, deque()))[1].append(call)
 
+    def steps(self, count: int) -> bool:
+        """The next `count` events, each one chosen."""
+        return all(self.step() for _ in range(count))
+
     def step(self) -> bool:
         """What is due at this very moment, else a delivery, else the next deadline."""
         if not self.chooses or (self.heap and self.heap[0][0] <= self.ns):

@@ -81,10 +81,12 @@ class SimIO(NodeIO[Channel, Channel]):
         self._doom: tuple[str, int] | None = None  # a brick, and before which of its effects the node dies
         self._orders: deque[tuple[control.ToNode, tuple[int, ...]]] = deque()
         self._held: list[_Held] = []  # the last one is gone on with first: its step came in between
+        self._held_up = False  # one of the three below
         self._awaited = 0  # the fault that has to be applied before the node goes on, or 0
         self._slow_until_ns = 0
         self._backlog: dict[Channel, deque[Message]] = {}  # came out of a channel fault, and waits for room
         self._only: SimBrick | None = None  # the brick of a node that hosts one, without a device
+        self._has_deadlines = False
         self._timer_ns = NEVER
         self._running = False
 
@@ -99,10 +101,12 @@ class SimIO(NodeIO[Channel, Channel]):
     @property
     def record(self) -> Recorder:
         """Appends to the list that is the journal."""
-        return self._append_record
+        append, name = self._records.append, self.name
 
-    def _append_record(self, now_ns: int, event: Event, request_id: int, detail: int, brick: int = 0) -> None:
-        self._records.append(Record(now_ns, event, request_id, detail, self.name, brick))
+        def record(now_ns: int, event: Event, request_id: int, detail: int, brick: int = 0, /) -> None:
+            append(Record(now_ns, event, request_id, detail, name, brick))
+
+        return record
 
     def report(self, report: control.FromNode) -> None:
         """Send to the executive."""
@@ -154,28 +158,23 @@ class SimIO(NodeIO[Channel, Channel]):
         if self._running or not self.alive or self.frozen_ns:
             return
         self._running = True
-        self.ran_ns = self._clock.ns
+        self.ran_ns, turn = self._clock.ns, self.node.turn
         try:
-            while self.alive and not self.frozen_ns and self._turn():
-                pass
+            if self.node.agent.filters:
+                self.node.release_due(self._clock.ns)
+            while self.alive and not self.frozen_ns:
+                if self._orders:  # before anything else
+                    self._serve(*self._orders.popleft())
+                elif (self._held_up and not self._go_on()) or not turn():
+                    break
         except Died as death:
             self.die(str(death))
         except AssertionError as error:
             self.die(f"assertion failed: {error}")
         finally:
             self._running = False
-        if self.alive:
+        if self.alive and (self._has_deadlines or self.node.agent.filters):
             self._set_timer()
-
-    def _turn(self) -> bool:
-        """One thing, orders first; False if there is none."""
-        if self._orders:
-            self._serve(*self._orders.popleft())
-            return True
-        if self._awaited or self._clock.ns < self._slow_until_ns or (self._held and not self._go_on()):
-            self.node.release_due(self._clock.ns)
-            return False
-        return self.node.turn()
 
     def _serve(self, order: control.ToNode, fds: tuple[int, ...]) -> None:
         if not isinstance(order, control.Ack):
@@ -207,33 +206,26 @@ class SimIO(NodeIO[Channel, Channel]):
         end.leave(self)
 
     def rewired(self) -> None:
-        """See whether the node hosts one brick, without a device."""
+        """See whether the node hosts one brick, without a device, and whether there are deadlines."""
         self._only = self.node.only if self.node.device is None else None
+        self._has_deadlines = bool(self.node.timed) or self.node.device is not None
 
     def receive(self) -> bool:
         """Handle the mail that came first, or the end of a channel, or what is due."""
         only = self._only
-        if only is None:
+        ports = only.brick.open_ports() if only is not None else ()
+        if only is None or len(ports) != 1:
             return self._read_any() or self.node.wake_due(self._clock.ns)
-        return self._read(only) or (only.timed and self.node.wake_due(self._clock.ns))
-
-    def _read(self, hosted: SimBrick) -> bool:
-        """The hot path: mail at an open port of the only brick."""
-        ports = hosted.brick.open_ports()
-        if len(ports) != 1:
-            return self._read_any()
-        channel = hosted.inputs.get(ports[0])
-        if channel is None:
-            return False
-        if channel.mail:
-            if channel.mail[0][0] > self._clock.ns:
-                return False
-            self.node.step(hosted, ports[0], channel.take())
-            return True
-        if channel.ended and channel.over():
-            self._handle_end(hosted, ports[0])
-            return True
-        return False
+        channel = only.inputs.get(ports[0])  # from here on the hot path: one open port of the only brick
+        if channel is not None:
+            if channel.mail:
+                if channel.mail[0][0] <= self._clock.ns:
+                    self.node.step(only, ports[0], channel.take())
+                    return True
+            elif channel.ended and channel.over():
+                self._handle_end(only, ports[0])
+                return True
+        return only.timed and self.node.wake_due(self._clock.ns)
 
     def _read_any(self) -> bool:
         found = self._oldest()
@@ -325,7 +317,7 @@ class SimIO(NodeIO[Channel, Channel]):
 
     def stops(self, hosted: SimBrick) -> bool:
         """Whether the next effect has to wait; or the node dies here."""
-        if self._awaited or self.frozen_ns or self._clock.ns < self._slow_until_ns:
+        if self._awaited or self.frozen_ns or self._slow_until_ns > self._clock.ns:
             return True
         self.step_done(hosted)
         return False
@@ -341,11 +333,15 @@ class SimIO(NodeIO[Channel, Channel]):
         """Go on from there later. A write that is held up too long ends the node."""
         limit_ns = self._clock.ns + WRITE_NS_MAX if end is not None else NEVER
         self._held.append(_Held(hosted, effects, at, end, filtered, limit_ns))
+        self._held_up = True
         if end is not None:
             self._clock.at(limit_ns, self.run)
 
     def _go_on(self) -> bool:
-        """Perform what was held. True if all is done."""
+        """Perform what was held, unless something holds the node up still. True if all is done."""
+        if self._awaited or self._slow_until_ns > self._clock.ns:
+            return False
+        self._held_up = False
         while self._held:
             held = self._held[-1]
             at = held.at
@@ -353,6 +349,7 @@ class SimIO(NodeIO[Channel, Channel]):
                 if not self._write_held(held, held.end):
                     if self._clock.ns >= held.limit_ns:
                         raise Died("fenced")
+                    self._held_up = True
                     return False
                 at += 1
                 held.hosted.performed += 1
@@ -387,12 +384,12 @@ class SimIO(NodeIO[Channel, Channel]):
 
     def wait_until_applied(self, fault: int) -> None:
         """Hold the effects that are left until the executive has acknowledged `fault`."""
-        self._awaited = fault
+        self._awaited, self._held_up = fault, True
 
     def delay(self, by_ns: int) -> None:
         """Hold the effects of this step for that long."""
         if by_ns:
-            self._slow_until_ns = max(self._slow_until_ns, self._clock.ns) + by_ns
+            self._slow_until_ns, self._held_up = max(self._slow_until_ns, self._clock.ns) + by_ns, True
             self._clock.at(self._slow_until_ns, self.run)
 
     def begin_throttle(self) -> None:

@@ -330,9 +330,8 @@ class World:
         loop = self.loop
         rested_ns = done_ns = 0
         for _ in range(EVENTS_MAX // LOOK_EVERY):
-            for _ in range(LOOK_EVERY):
-                if not loop.step():
-                    return
+            if not loop.steps(LOOK_EVERY):
+                return
             loop.watch_jobs()
             ended = ending.source_ended(self.conductor.deployment, self.setup.count)
             if not done_ns and (ended or (self.lost and self._drive is None)):

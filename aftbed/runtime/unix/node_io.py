@@ -302,6 +302,8 @@ class UnixIO(NodeIO[Inlet, int]):
         node = self._node
         ready = found.poll.poll(self._patience_ms())
         now_ns = _now()
+        if node.agent.filters:
+            node.release_due(now_ns)
         fds = [fd for fd, _ in ready]
         if self.journal.mapping[FLAG_OFFSET] or self.line.fileno() in fds:
             self.serve_orders()
@@ -412,6 +414,7 @@ class UnixIO(NodeIO[Inlet, int]):
     def wait_for_order(self) -> bool:
         """Suspended: wait for an order, for a pulse at most."""
         self.serve_orders(wait=True)
+        self._node.release_due(_now())
         return True
 
     def serve_orders(self, wait: bool = False, until: int = 0) -> bool:
