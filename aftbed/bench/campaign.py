@@ -14,7 +14,7 @@ from typing import Final, Literal
 
 from aftbed.campaign import runner
 from aftbed.campaign.plan import plan
-from aftbed.campaign.spec import FaultEntry, Spec, Stop, System, check
+from aftbed.campaign.spec import FaultEntry, Spec, StopRule, System, check
 
 CRASH: Final = FaultEntry("crash primary", "crash primary at server.exit nth {nth}", draw={"nth": (1, 90)})
 
@@ -24,12 +24,12 @@ def bench_campaign(
 ) -> dict[str, object]:
     """`per_minute`, `seconds`, `cpu_ms` per experiment, and `outcomes`. Raises ConfigError."""
     system = System(placements=(placement,), runtime=runtime)
-    spec = Spec("bench", (ftm,), (CRASH,), system=system, stop=Stop(experiments))
+    spec = Spec("bench", (ftm,), (CRASH,), system=system, stop=StopRule(experiments))
     check(spec)
     planned = plan(spec)
     with tempfile.TemporaryDirectory(prefix="aftbed-bench-") as folder:
         began_s, began_cpu_s = time.monotonic(), _cpu_s()
-        asked = runner.Asked(Path(folder) / "campaign", jobs)
+        asked = runner.CampaignRunOptions(Path(folder) / "campaign", jobs)
         outcomes = Counter(result.outcome for result in runner.run(planned, asked))
         seconds, cpu_s = time.monotonic() - began_s, _cpu_s() - began_cpu_s
     return {

@@ -33,7 +33,7 @@ ROLLED_BACK: Final = "rolled back"
 REFUSED: Final = "refused by the self-test"
 
 
-class Cell(msgspec.Struct, frozen=True):
+class AssumptionCell(msgspec.Struct, frozen=True):
     """`assumption`: what the table says is broken there, `""` where it says that the mechanism holds."""
 
     stratum: str
@@ -45,7 +45,7 @@ class Cell(msgspec.Struct, frozen=True):
     agrees: bool
 
 
-def cells(ledger: Ledger) -> Iterator[Cell]:
+def cells(ledger: Ledger) -> Iterator[AssumptionCell]:
     """One for each stratum, of the experiments whose faults happened and of which something is known.
 
     Where an update was rolled back, some requests were served by one version and some by the other: left out.
@@ -59,7 +59,7 @@ def cells(ledger: Ledger) -> Iterator[Cell]:
         outcomes = Counter(_came_to(result) for result in group)
         broken = sum(count for outcome, count in outcomes.items() if outcome in BROKEN)
         assumption = assumed_wrongly(group[0])
-        yield Cell(
+        yield AssumptionCell(
             name,
             assumption,
             len(group),

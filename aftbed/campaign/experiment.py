@@ -1,7 +1,7 @@
 """An experiment of a campaign, and what came of it: two values, and the order of what can come of it.
 
 The classes are those of the design (section 2), the worst one wins. A run that breaks nothing is `masked`
-if nobody could notice the fault, `tolerated` if the mechanism had to act in sight: a failover, a third
+if the fault had no visible effect, `tolerated` if the mechanism had to act in sight: a failover, a third
 execution, a refused adaptation. `inconclusive` and `harness_error` say nothing of the mechanism, and are
 never a pass (G8).
 """

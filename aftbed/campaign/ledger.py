@@ -17,7 +17,7 @@ from typing import Final, TypeVar
 import msgspec
 
 from aftbed.campaign.experiment import Experiment, Result
-from aftbed.campaign.plan import Plan
+from aftbed.campaign.plan import CampaignPlan
 from aftbed.campaign.spec import Spec
 from aftbed.core.errors import ConfigError, HarnessError
 
@@ -82,7 +82,7 @@ class Ledger(msgspec.Struct, frozen=True):
     results: tuple[Result, ...]
 
 
-def head_of(plan: Plan, shard: int = 1, shards: int = 1) -> Head:
+def head_of(plan: CampaignPlan, shard: int = 1, shards: int = 1) -> Head:
     """Of the ledger of `plan`."""
     return Head(plan.digest, plan.code, plan.spec, here(), shard, shards)
 

@@ -42,7 +42,7 @@ class Stratum(msgspec.Struct, frozen=True):
     expected: tuple[str, ...]
 
 
-class Plan(msgspec.Struct, frozen=True):
+class CampaignPlan(msgspec.Struct, frozen=True):
     """`digest` of the spec: what belongs to another one is not mixed with this."""
 
     spec: Spec
@@ -88,13 +88,13 @@ class Plan(msgspec.Struct, frozen=True):
         )
 
 
-def plan(spec: Spec) -> Plan:
+def plan(spec: Spec) -> CampaignPlan:
     """The plan of `spec`, every experiment of it checked. Raises ConfigError naming the key."""
     _check_left_out(spec)
     strata = tuple(strata_of(spec))
     if not strata:
         raise ConfigError("mechanisms: no entry of faults and adaptations is left for any of them")
-    made = Plan(spec, digest_of(spec), code_version(), strata)
+    made = CampaignPlan(spec, digest_of(spec), code_version(), strata)
     for stratum in strata:
         _check(made, stratum)
     return made
@@ -169,7 +169,7 @@ def population(entry: FaultEntry) -> int:
 
 
 def _check_memory(faults: tuple[Fault, ...], system: System) -> None:
-    """Raise ConfigError where a fault strikes memory that there is not, or that nobody has opened to it."""
+    """Raise ConfigError where a fault strikes memory that does not exist, or that was not opened to it."""
     for fault in faults:
         if fault.action.unsafe:
             if system.runtime == "sim":
@@ -177,7 +177,7 @@ def _check_memory(faults: tuple[Fault, ...], system: System) -> None:
             refuse_unsafe(str(fault), agreed=system.unsafe_memory, option="system.unsafe_memory: true")
 
 
-def _check(made: Plan, stratum: Stratum) -> None:
+def _check(made: CampaignPlan, stratum: Stratum) -> None:
     """Every point of the matrix, before anything runs."""
     where = f"faults: {stratum.fault.name!r} under {stratum.ftm}"
     graph = build(stratum.ftm, stratum.placement)

@@ -17,12 +17,12 @@ import msgspec
 
 from aftbed.campaign import ledger
 from aftbed.campaign.experiment import REQUESTS_PER_SECOND_MIN, Experiment, Result, carry_out
-from aftbed.campaign.plan import Plan
+from aftbed.campaign.plan import CampaignPlan
 from aftbed.core.errors import ConfigError
 from aftbed.runtime.unix.worker_pool import SECONDS_MAX, each
 
 
-class Asked(msgspec.Struct, frozen=True):
+class CampaignRunOptions(msgspec.Struct, frozen=True):
     """How to go about it; `out` is the directory of the campaign."""
 
     out: Path
@@ -38,7 +38,7 @@ class Asked(msgspec.Struct, frozen=True):
         return (number + place) % self.shards == self.shard - 1
 
 
-def run(plan: Plan, asked: Asked) -> Generator[Result, None, None]:
+def run(plan: CampaignPlan, asked: CampaignRunOptions) -> Generator[Result, None, None]:
     """Each result as soon as it is in the ledger. Raises ConfigError before anything runs."""
     stop = plan.spec.stop
     if asked.shards > 1 and (stop.half_width is not None or stop.first_failure):
@@ -60,7 +60,7 @@ def run(plan: Plan, asked: Asked) -> Generator[Result, None, None]:
     return _results(plan, asked, path)
 
 
-def _results(plan: Plan, asked: Asked, path: Path) -> Generator[Result, None, None]:
+def _results(plan: CampaignPlan, asked: CampaignRunOptions, path: Path) -> Generator[Result, None, None]:
     stop = plan.spec.stop
     limit_s = time.monotonic() + stop.minutes * 60 if stop.minutes is not None else None
     state = _Progress(plan, path)
@@ -74,13 +74,15 @@ def _results(plan: Plan, asked: Asked, path: Path) -> Generator[Result, None, No
                 return
 
 
-def _seconds_max(plan: Plan) -> float:
+def _seconds_max(plan: CampaignPlan) -> float:
     """An experiment that takes more hangs; real ones have deadlines of their own, and end before."""
     system = plan.spec.system
     return SECONDS_MAX + 2 * system.requests / (system.rate_hz or REQUESTS_PER_SECOND_MIN)
 
 
-def performed(todo: Iterator[Experiment], path: Path, asked: Asked, plan: Plan) -> Iterator[Result]:
+def performed(
+    todo: Iterator[Experiment], path: Path, asked: CampaignRunOptions, plan: CampaignPlan
+) -> Iterator[Result]:
     """Each result, which is in the ledger by then."""
     if not asked.scheduler:
         perform = partial(_perform, os.fspath(path))
@@ -109,7 +111,7 @@ def _perform(path: str, experiment: Experiment) -> Result:
         os.close(descriptor)
 
 
-def _looks(plan: Plan) -> Iterator[tuple[int, int]]:
+def _looks(plan: CampaignPlan) -> Iterator[tuple[int, int]]:
     """The parts of the numbers of each stratum, with a look at the results after each."""
     stop = plan.spec.stop
     looks = min(stop.looks, stop.experiments) if stop.half_width is not None else 1
@@ -120,7 +122,7 @@ def _looks(plan: Plan) -> Iterator[tuple[int, int]]:
 class _Progress:
     """What has been done, and which strata are known well enough."""
 
-    def __init__(self, plan: Plan, path: Path) -> None:
+    def __init__(self, plan: CampaignPlan, path: Path) -> None:
         self._plan = plan
         results = ledger.read(path).results
         self._earlier = frozenset(result.experiment.id for result in results)

@@ -104,7 +104,7 @@ class AdaptationEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return (self.adapt,) if isinstance(self.adapt, str) else self.adapt
 
 
-class Stop(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class StopRule(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """When enough is known: whichever comes first.
 
     `half_width`: of the interval of `unexpected` in a stratum, looked at after each of `looks` equal parts
@@ -142,7 +142,7 @@ class Spec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     system: System = System()
     adaptations: tuple[AdaptationEntry, ...] = (AdaptationEntry("none"),)
     leave_out: tuple[str, ...] = ()  # strata, by patterns as of file names
-    stop: Stop = Stop()
+    stop: StopRule = StopRule()
     gates: tuple[Gate, ...] = ()
     confidence: Annotated[float, Meta(gt=0.5, lt=1)] = 0.95
     recovery_budget_ms: Annotated[float, Meta(gt=0)] | None = None  # longer is `degraded`

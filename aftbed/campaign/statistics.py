@@ -24,7 +24,7 @@ Quantiles of times, of which little can be assumed (two modes, a long tail):
 Both are None where no value can bound the quantile: of 367 values all are below the p99 with more than
 2.5 % probability, so nothing that was measured is an upper bound, at 95 %. `quantile_needs` says how many.
 
-Looks: whoever looks K times whether it is enough, and stops when it is, is wrong more often than he says.
+Looks: a campaign that looks K times and stops when it has enough errs more often than stated.
 `look_confidence` is Bonferroni's (Dunn, JASA 56, 1961): at each of K looks, declared beforehand, the
 intervals have confidence 1 - (1 - confidence) / K, so that all K hold at once with `confidence`, and the one
 at which the campaign stops is among them, whatever made it stop. Pocock's and O'Brien and Fleming's bounds
@@ -263,7 +263,7 @@ _METHODS: Final[dict[str, Callable[[float, int, float], Interval]]] = {
 # left.
 
 
-class Stratum(msgspec.Struct, frozen=True):
+class StratumCounts(msgspec.Struct, frozen=True):
     """`failures` of `sampled` experiments failed, which were drawn out of `population` faults."""
 
     failures: int
@@ -271,7 +271,7 @@ class Stratum(msgspec.Struct, frozen=True):
     population: int
 
 
-class Count(msgspec.Struct, frozen=True):
+class FailureCount(msgspec.Struct, frozen=True):
     """How many faults of the fault space do harm; `failures` is None if a stratum was not sampled."""
 
     failures: float | None
@@ -292,14 +292,17 @@ def extrapolated(
     confidence: float = CONFIDENCE,
     method: str = METHOD,
     distinct: bool = False,
-) -> Count:
+) -> FailureCount:
     """The failures in a fault space that was sampled as one."""
-    return extrapolated_sum([Stratum(failures, sampled, population)], confidence, method, distinct)
+    return extrapolated_sum([StratumCounts(failures, sampled, population)], confidence, method, distinct)
 
 
 def extrapolated_sum(
-    strata: Sequence[Stratum], confidence: float = CONFIDENCE, method: str = METHOD, distinct: bool = False
-) -> Count:
+    strata: Sequence[StratumCounts],
+    confidence: float = CONFIDENCE,
+    method: str = METHOD,
+    distinct: bool = False,
+) -> FailureCount:
     """The failures in a fault space that was sampled by strata."""
     known = [stratum for stratum in strata if stratum.sampled > 0]
     intervals = [_failures(stratum, confidence, method, distinct) for stratum in known]
@@ -310,11 +313,14 @@ def extrapolated_sum(
     high = total + math.hypot(*(interval.high - estimate for estimate, interval in pairs)) + unknown
     population = sum(stratum.population for stratum in strata)
     within = Interval(max(0.0, low), min(float(population), high))
-    return Count(None if unknown else total, within)
+    return FailureCount(None if unknown else total, within)
 
 
 def coverage(
-    strata: Sequence[Stratum], confidence: float = CONFIDENCE, method: str = METHOD, distinct: bool = False
+    strata: Sequence[StratumCounts],
+    confidence: float = CONFIDENCE,
+    method: str = METHOD,
+    distinct: bool = False,
 ) -> Coverage:
     """The share of a fault space, sampled by strata, that does no harm; of no faults at all, it is 0 to 1."""
     population = sum(stratum.population for stratum in strata)
@@ -325,7 +331,7 @@ def coverage(
     return Coverage(None if count.failures is None else 1 - count.failures / population, within)
 
 
-def _failures(stratum: Stratum, confidence: float, method: str, distinct: bool) -> Interval:
+def _failures(stratum: StratumCounts, confidence: float, method: str, distinct: bool) -> Interval:
     """How many faults of one stratum do harm."""
     assert 0 <= stratum.failures <= stratum.sampled and stratum.population >= 0, stratum
     share = proportion(stratum.failures, stratum.sampled, confidence, method)

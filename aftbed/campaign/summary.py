@@ -19,7 +19,7 @@ from aftbed.campaign.ledger import Ledger
 from aftbed.campaign.plan import population, strata_of
 from aftbed.campaign.spec import ANY, Gate, Spec
 from aftbed.campaign.statistics import (
-    Count,
+    FailureCount,
     Interval,
     extrapolated,
     look_confidence,
@@ -50,7 +50,7 @@ OF: Final[dict[str, Callable[[Result], bool]]] = {  # which experiments a share 
 }
 
 
-class Times(msgspec.Struct, frozen=True):
+class TimeSummary(msgspec.Struct, frozen=True):
     """Milliseconds; `p99_interval` is None where there are too few values to bound it."""
 
     count: int
@@ -71,12 +71,12 @@ class StratumSummary(msgspec.Struct, frozen=True):
     expected: tuple[str, ...]
     failed: int
     population: int
-    failures: Count  # extrapolated to the population
+    failures: FailureCount  # extrapolated to the population
     unexpected: int
     unexpected_interval: Interval
-    recovery_ms: Times | None
-    blackout_ms: Times | None
-    adapt_blackout_ms: Times | None
+    recovery_ms: TimeSummary | None
+    blackout_ms: TimeSummary | None
+    adapt_blackout_ms: TimeSummary | None
 
 
 class GateResult(msgspec.Struct, frozen=True):
@@ -157,12 +157,12 @@ def _stratum(name: str, group: list[Result], size: int, confidence: float) -> St
     )
 
 
-def times(values: Iterable[float | None], confidence: float) -> Times | None:
+def times(values: Iterable[float | None], confidence: float) -> TimeSummary | None:
     """Quantiles with their intervals; None of nothing."""
     found = sorted(v for v in values if v is not None)
     if not found:
         return None
-    return Times(
+    return TimeSummary(
         len(found),
         quantile(found, 0.5),
         quantile(found, 0.99),

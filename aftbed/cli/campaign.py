@@ -16,7 +16,7 @@ import typer
 
 from aftbed.campaign import ledger, runner
 from aftbed.campaign.experiment import Result, carry_out, smallest
-from aftbed.campaign.plan import Plan
+from aftbed.campaign.plan import CampaignPlan
 from aftbed.campaign.plan import plan as plan_of
 from aftbed.campaign.spec import EXPERIMENTS_MAX, Spec, check, read_spec, shipped
 from aftbed.cli.options import Json, jobs_of, takes
@@ -69,7 +69,7 @@ class CampaignArguments(msgspec.Struct, frozen=True, kw_only=True):
     json: Json = False
 
 
-def planned(given: CampaignArguments) -> Plan:
+def planned(given: CampaignArguments) -> CampaignPlan:
     """The plan. Raises ConfigError before anything runs."""
     spec = read_spec(given.name)
     if given.seed is not None:
@@ -169,7 +169,7 @@ def run(given: CampaignRunArguments) -> None:
     raise typer.Exit(EXIT_INTERRUPTED if interrupted else code)
 
 
-def _asked(found: Plan, given: CampaignRunArguments) -> runner.Asked:
+def _asked(found: CampaignPlan, given: CampaignRunArguments) -> runner.CampaignRunOptions:
     if given.executor not in EXECUTORS:
         raise unknown("executor", given.executor, EXECUTORS)
     if (given.executor == "dask") != (given.scheduler is not None):
@@ -178,7 +178,9 @@ def _asked(found: Plan, given: CampaignRunArguments) -> runner.Asked:
         raise ConfigError("--jobs: how many there are is the scheduler's to say")
     number, of = _shard(given.shard)
     folder = given.out if given.out is not None else Path(f"campaign-{found.spec.campaign}")
-    return runner.Asked(folder, jobs_of(given.jobs), number, of, given.resume, given.scheduler or "")
+    return runner.CampaignRunOptions(
+        folder, jobs_of(given.jobs), number, of, given.resume, given.scheduler or ""
+    )
 
 
 def _shard(text: str) -> tuple[int, int]:
@@ -189,7 +191,7 @@ def _shard(text: str) -> tuple[int, int]:
     return number, of
 
 
-def _follow(found: Plan, asked: runner.Asked, *, as_json: bool) -> bool:
+def _follow(found: CampaignPlan, asked: runner.CampaignRunOptions, *, as_json: bool) -> bool:
     """Run, and show each result; True if the user interrupted it."""
     from aftbed.report.terminal import Progress  # noqa: PLC0415 - scipy
 

@@ -17,7 +17,7 @@ from aftbed.search.explore import (
     PLACEMENTS,
     Broken,
     Explored,
-    Ordered,
+    OrderedRuns,
     Selection,
     attempt,
     experiments,
@@ -227,7 +227,7 @@ def order(given: ExploreOrderArguments) -> None:
     # The same mechanisms as those of `crash`.
     chosen = selected("crash", separated(given.ftm), separated(given.placement), given.requests)
     setups = list(experiments(chosen.ftms, chosen.placements, given.requests))
-    began_s, found = time.monotonic(), list[Ordered]()
+    began_s, found = time.monotonic(), list[OrderedRuns]()
     with Bar("explore order", len(setups), quiet=given.json) as bar:
         for one in explore_orders(setups, bound, jobs):
             found.append(one)
@@ -238,14 +238,14 @@ def order(given: ExploreOrderArguments) -> None:
     raise typer.Exit(EXIT_CODES["fail" if any(one.broken for one in found) else "pass"])
 
 
-def _order_lines(one: Ordered) -> str:
+def _order_lines(one: OrderedRuns) -> str:
     whole = "all" if one.complete else "at least"
     lines = [f"{whole} {spaced(one.orders)} orders ({spaced(one.cut)} cut): {described(one.setup)}"]
     lines += [f"  broken in {spaced(one.broken)}: {reason}" for reason in one.breaches]
     return "\n".join(lines)
 
 
-def _show_orders(found: list[Ordered], bound: int, seconds: float, *, as_json: bool) -> None:
+def _show_orders(found: list[OrderedRuns], bound: int, seconds: float, *, as_json: bool) -> None:
     orders, broken = sum(o.orders for o in found), sum(o.broken for o in found)
     complete = sum(o.complete for o in found)
     if as_json:

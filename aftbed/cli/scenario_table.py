@@ -26,7 +26,7 @@ from aftbed.inject.model import Fault, parse
 from aftbed.inject.timing import Trigger
 from aftbed.judge.verdict import EXIT_INTERRUPTED
 from aftbed.report.roadplot import Curve, Point, road_plot
-from aftbed.search.road_table import NONE, PRIMARY, Line, Row, driven, drives, outage
+from aftbed.search.road_table import NONE, PRIMARY, DrivenRow, RoadLine, driven, drives, outage
 from aftbed.search.worst_instant import STEP_CYCLES
 from aftbed.vehicle.scenarios import tables
 from aftbed.vehicle.scenarios.library import load_scenario
@@ -73,7 +73,7 @@ class TableDrive(msgspec.Struct, frozen=True):
     """What is to be driven: each case under each line."""
 
     cases: tuple[tables.Case, ...]
-    lines: tuple[Line, ...]
+    lines: tuple[RoadLine, ...]
     seed: int
     jobs: int
 
@@ -95,7 +95,7 @@ def _check_plot(plot: Path | None) -> None:
         raise ConfigError(f"--plot {plot}: a file {PLOT_SUFFIX} in a directory that exists is allowed")
 
 
-def _mechanism_lines(given: TableArguments) -> tuple[Line, ...]:
+def _mechanism_lines(given: TableArguments) -> tuple[RoadLine, ...]:
     """A line for each mechanism; with outages and no fault, only for those that are named."""
     named = tuple(dict.fromkeys(separated(given.ftm)))
     if not named:
@@ -103,15 +103,15 @@ def _mechanism_lines(given: TableArguments) -> tuple[Line, ...]:
     return tuple(_mechanism_line(ftm, given.fault) for ftm in named)
 
 
-def _mechanism_line(ftm: str, fault: str | None) -> Line:
+def _mechanism_line(ftm: str, fault: str | None) -> RoadLine:
     graph = build(ftm, "process")
     if fault is None:
-        return Line(ftm, ftm)
+        return RoadLine(ftm, ftm)
     words = fault.split()
     if words[-1:] != [WORST]:
-        return Line(f"{ftm}, {fault}", ftm, read_fault(fault, graph))
+        return RoadLine(f"{ftm}, {fault}", ftm, read_fault(fault, graph))
     found = _searched(fault, words, graph)
-    return Line(f"{ftm}, {found} at the worst instant", ftm, found, searched=True)
+    return RoadLine(f"{ftm}, {found} at the worst instant", ftm, found, searched=True)
 
 
 def _searched(text: str, words: list[str], graph: Graph) -> Fault:
@@ -127,7 +127,7 @@ def _searched(text: str, words: list[str], graph: Graph) -> Fault:
     return fault
 
 
-def _outage_line(text: str, rows: tuple[tables.Case, ...]) -> Line:
+def _outage_line(text: str, rows: tuple[tables.Case, ...]) -> RoadLine:
     """Raises ConfigError if the outage is longer than one of the drives."""
     if milliseconds("--outage", text) < 1.0:
         raise ConfigError(f"--outage {text}: 1ms is the shortest that is allowed")
@@ -172,10 +172,10 @@ def table(given: TableArguments) -> None:
     raise typer.Exit(_exit_code(rows))
 
 
-def _drive(found: TableDrive, *, quiet: bool) -> list[Row]:
+def _drive(found: TableDrive, *, quiet: bool) -> list[DrivenRow]:
     """All rows, in the order of the lines and of the table."""
     todo = drives(found.cases, found.lines, found.seed)
-    rows: dict[tuple[str, str], Row] = {}
+    rows: dict[tuple[str, str], DrivenRow] = {}
     with closing(driven(todo, found.jobs)) as coming, Bar("driving", len(todo), quiet=quiet) as bar:
         for done, these in enumerate(coming, 1):
             rows |= {(row.line, row.case): row for row in these}
@@ -183,19 +183,19 @@ def _drive(found: TableDrive, *, quiet: bool) -> list[Row]:
     return [rows[line.name, case.name] for line in found.lines for case in found.cases]
 
 
-def _counted(rows: Sequence[Row]) -> str:
+def _counted(rows: Sequence[DrivenRow]) -> str:
     passed, struck = sum(row.passed for row in rows), all(row.struck for row in rows)
     tail = "" if struck else f"; the fault never struck in {sum(not row.struck for row in rows)}"
     return f"{passed} of {len(rows)} rows pass{tail}"
 
 
-def _exit_code(rows: Sequence[Row]) -> int:
+def _exit_code(rows: Sequence[DrivenRow]) -> int:
     if any(row.struck and not row.passed for row in rows):
         return EXIT_FAIL
     return EXIT_PASS if all(row.struck for row in rows) else EXIT_NO_FAULT
 
 
-def _plot(path: Path, table: str, found: TableDrive, rows: Sequence[Row]) -> None:
+def _plot(path: Path, table: str, found: TableDrive, rows: Sequence[DrivenRow]) -> None:
     """A picture for each group."""
     groups = {case.name: case.group for case in found.cases}
     curves = [
@@ -208,14 +208,14 @@ def _plot(path: Path, table: str, found: TableDrive, rows: Sequence[Row]) -> Non
         raise ConfigError(f"--plot {path}: {error.strerror}") from None
 
 
-def _point(row: Row) -> Point:
+def _point(row: DrivenRow) -> Point:
     return Point(row.speed_kmh, row.impact_kmh, row.limit_kmh, row.closed_form_kmh)
 
 
 # -- what is printed ---------------------------------------------------------------------------------
 
 
-def _show_lines(lines: Sequence[Line], rows: Sequence[Row]) -> None:
+def _show_lines(lines: Sequence[RoadLine], rows: Sequence[DrivenRow]) -> None:
     """For each line a table, why rows fail, and the command that repeats the worst row."""
     by_line = {name: list(of) for name, of in groupby(rows, key=lambda row: row.line)}
     for line in lines:
@@ -226,7 +226,7 @@ def _show_lines(lines: Sequence[Line], rows: Sequence[Row]) -> None:
             print(f"  {text}")
 
 
-def _print_rows(line: Line, rows: Sequence[Row]) -> None:
+def _print_rows(line: RoadLine, rows: Sequence[DrivenRow]) -> None:
     heads = (*HEADS, *(FAULT_HEADS if line.fault else ()), *(OUTAGE_HEADS if line.outage_ms else ()), "")
     grid = rich.table.Table(box=None, pad_edge=False, padding=(0, 3, 0, 0), header_style="")
     for at, head in enumerate(heads):
@@ -240,7 +240,7 @@ def _print_rows(line: Line, rows: Sequence[Row]) -> None:
     print("\n".join(line.rstrip() for line in captured.get().splitlines()))
 
 
-def _cells(line: Line, row: Row) -> list[str]:
+def _cells(line: RoadLine, row: DrivenRow) -> list[str]:
     cells = [
         row.case,
         f"{row.speed_kmh:g}",
@@ -259,13 +259,13 @@ def _cells(line: Line, row: Row) -> list[str]:
     return [*cells, verdict + (f", {row.colour}" if row.colour else "")]
 
 
-def _lost(row: Row) -> str:
+def _lost(row: DrivenRow) -> str:
     if row.loss_kmh:
         return f"{row.loss_kmh:.1f} km/h"
     return "-" if row.loss_m is None else f"{row.loss_m:.3f} m"
 
 
-def _failures(line: Line, rows: Sequence[Row]) -> list[str]:
+def _failures(line: RoadLine, rows: Sequence[DrivenRow]) -> list[str]:
     """Each row that fails, with why; of an outage, also that it must."""
     failed = [row for row in rows if not row.passed]
     found = [f"{row.case}: {'; '.join(row.because)}" for row in failed]
@@ -277,7 +277,7 @@ def _failures(line: Line, rows: Sequence[Row]) -> list[str]:
     return found
 
 
-def _search(line: Line, rows: Sequence[Row]) -> list[str]:
+def _search(line: RoadLine, rows: Sequence[DrivenRow]) -> list[str]:
     """How the worst instants were found."""
     if not line.searched:
         return []
@@ -286,7 +286,7 @@ def _search(line: Line, rows: Sequence[Row]) -> list[str]:
     return [f"worst of {runs} instants: {step}"]
 
 
-def _repeat(line: Line, rows: Sequence[Row]) -> list[str]:
+def _repeat(line: RoadLine, rows: Sequence[DrivenRow]) -> list[str]:
     """The commands that repeat the row that lost most."""
     if line.fault is None:
         return []

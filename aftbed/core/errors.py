@@ -1,4 +1,4 @@
-"""Error classes by situation: who has to act on it decides the class.
+"""Error classes by who has to act: the user, a peer, or us.
 
 `ConfigError` and `ScriptError` are for the user (exit code 2), `PeerError` is for a frame or a
 message that must not be believed, `AdaptationError` for an adaptation that did not complete,

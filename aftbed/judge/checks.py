@@ -57,7 +57,7 @@ class Requests(msgspec.Struct, frozen=True):
 class Failover(msgspec.Struct, frozen=True):
     """One change of master. Times count from the fault if that is in the history, else from the alarm.
 
-    `blackout_ms` is the time without service: from when a request waited and nobody could answer it,
+    `blackout_ms` is the time without service: from when a request waited and no replica could answer it,
     to the first reply of the new master.
     """
 

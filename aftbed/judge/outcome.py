@@ -1,4 +1,4 @@
-"""What came of an experiment, as a class (design 2); the worst of all that applies.
+"""The outcome of an experiment: the worst class that applies.
 
 Two kinds of evidence: the client's dialogue against the bare server (what it saw), and the run's own
 records (what had to happen so that it saw no more). A *golden run* is that bare server over the same
@@ -78,7 +78,7 @@ def outcome_of(evidence: Evidence) -> tuple[str, tuple[str, ...]]:
 
 
 def unanswered(history: History, counts: Requests, found: dict[str, str], *, lost: bool) -> None:
-    """Requests without a reply: nobody was there, nobody spoke any more, or single ones got lost."""
+    """Adds the class of requests without a reply: no replica left, none answering, or single losses."""
     if lost:
         found["unavailable"] = "no replica was left"
     elif counts.lost:

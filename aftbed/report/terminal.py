@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final, Self
 
 from aftbed.campaign.experiment import Result
 from aftbed.campaign.statistics import Interval
-from aftbed.campaign.summary import GateResult, StratumSummary, Summary, Times
+from aftbed.campaign.summary import GateResult, StratumSummary, Summary, TimeSummary
 from aftbed.judge.outcome import OUTCOMES
 
 if TYPE_CHECKING:
@@ -77,7 +77,7 @@ def _share(interval: Interval) -> str:
     return f"{100 * interval.low:.1f} to {100 * interval.high:.1f} %"
 
 
-def _times(times: Times | None) -> str:
+def _times(times: TimeSummary | None) -> str:
     return "-" if times is None else f"{times.p50:.3g}, {times.p99:.3g} ms"
 
 

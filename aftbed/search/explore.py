@@ -51,7 +51,7 @@ REASON_MAX: Final = 300  # characters of an error of our own
 
 
 class Strike(NamedTuple):
-    """Who dies at which step of an adaptation, and on which side of it."""
+    """A node that dies at a step of an adaptation, before or behind it."""
 
     old: str
     new: str
@@ -274,7 +274,7 @@ RUNS_MAX: Final = 2_000  # per experiment, unless another bound is given
 CRASHED: Final = ("protocol", "before", "proceed", "after", "server")  # parts whose death is a crash here
 
 
-class Ordered(msgspec.Struct, frozen=True):
+class OrderedRuns(msgspec.Struct, frozen=True):
     """What came of an experiment: `orders` were run to their end, `cut` runs turned out to equal others."""
 
     setup: Setup
@@ -296,7 +296,7 @@ def experiments(ftms: Iterable[str], placements: Iterable[str], requests: int) -
                 yield msgspec.structs.replace(one, dooms=(Doom(brick, effects // 2),))
 
 
-def all_orders(setup: Setup, runs_max: int = RUNS_MAX) -> Ordered:
+def all_orders(setup: Setup, runs_max: int = RUNS_MAX) -> OrderedRuns:
     """Run them, up to the bound."""
     first: tuple[Breach, ...] = ()
     broken = whole = cut = 0
@@ -310,10 +310,10 @@ def all_orders(setup: Setup, runs_max: int = RUNS_MAX) -> Ordered:
     for complete in itertools.islice(found, runs_max):
         whole, cut = whole + complete, cut + (not complete)
     left = next(found, None) is not None if whole + cut == runs_max else False
-    return Ordered(setup, whole, cut, not left, tuple(map(str, first)), broken)
+    return OrderedRuns(setup, whole, cut, not left, tuple(map(str, first)), broken)
 
 
-def explore_orders(setups: Iterable[Setup], runs_max: int = RUNS_MAX, jobs: int = 1) -> Iterator[Ordered]:
+def explore_orders(setups: Iterable[Setup], runs_max: int = RUNS_MAX, jobs: int = 1) -> Iterator[OrderedRuns]:
     """Every experiment, in order."""
     seconds_max = max(SECONDS_MAX, runs_max * RUN_SECONDS_MAX)
     judge = partial(all_orders, runs_max=runs_max)

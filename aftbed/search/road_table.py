@@ -5,7 +5,7 @@ the function does not answer for so long and nobody notices. It is stopped under
 adaptation stops the Protocol (SIGSTOP, then SIGCONT): what is asked meanwhile waits, and is answered then.
 The paper's 1 to 2 ms of recovery and 300 ms of adaptation are such outages, to be seen beside ours.
 
-A row fails if the car breaks what the table asks for, or if the run breaks a promise (design 3). A row whose
+A row fails if the car breaks what the table asks for, or if the run breaks a promise. A row whose
 fault never struck proves nothing (G8): it is no pass, and is told apart.
 
 Rows that begin alike are driven once: the tables ask for different things of the same drive.
@@ -23,7 +23,7 @@ from aftbed.inject.model import Fault
 from aftbed.inject.timing import Trigger
 from aftbed.runtime.sim.world import Setup
 from aftbed.runtime.unix.worker_pool import each
-from aftbed.search.worst_instant import Course, Struck, course_of, strike, worst_instant
+from aftbed.search.worst_instant import Course, StruckDrive, course_of, strike, worst_instant
 from aftbed.vehicle.plant import KMH_PER_MS, VehicleResult
 from aftbed.vehicle.scenarios.library import load_scenario
 from aftbed.vehicle.scenarios.scenario import Scenario
@@ -34,7 +34,7 @@ NONE: Final = "none"
 PRIMARY: Final = "primary"
 
 
-class Line(msgspec.Struct, frozen=True):
+class RoadLine(msgspec.Struct, frozen=True):
     """How a table is driven. `searched`: at the worst instant, whatever the trigger of the fault says."""
 
     name: str
@@ -44,15 +44,15 @@ class Line(msgspec.Struct, frozen=True):
     outage_ms: int | None = None
 
 
-class Drive(msgspec.Struct, frozen=True):
+class RoadDrive(msgspec.Struct, frozen=True):
     """A drive, and the rows that it is for: they begin alike."""
 
     cases: tuple[Case, ...]
-    line: Line
+    line: RoadLine
     seed: int
 
 
-class Row(msgspec.Struct, frozen=True):
+class DrivenRow(msgspec.Struct, frozen=True):
     """A row that was driven. `impact_kmh` is 0 without contact.
 
     With a fault: its words, when it struck, the worst of how many instants that is, and what was lost against
@@ -81,28 +81,28 @@ class Row(msgspec.Struct, frozen=True):
     repeat: tuple[str, ...] = ()
 
 
-def outage(length_ms: int) -> Line:
+def outage(length_ms: int) -> RoadLine:
     """The function is stopped for so long, and nothing stands in for it."""
     fault = Fault(Hang(length_ms), PRIMARY, Trigger())
-    return Line(f"outage {length_ms}ms", NONE, fault, searched=True, outage_ms=length_ms)
+    return RoadLine(f"outage {length_ms}ms", NONE, fault, searched=True, outage_ms=length_ms)
 
 
-def drives(cases: Sequence[Case], lines: Iterable[Line], seed: int) -> list[Drive]:
+def drives(cases: Sequence[Case], lines: Iterable[RoadLine], seed: int) -> list[RoadDrive]:
     """What is to be driven for all rows of all lines."""
     alike: dict[object, list[Case]] = {}
     for case in cases:
         scenario = load_scenario(case.name)
         alike.setdefault((scenario.plant, scenario.duration_ms), []).append(case)
-    return [Drive(tuple(rows), line, seed) for line in lines for rows in alike.values()]
+    return [RoadDrive(tuple(rows), line, seed) for line in lines for rows in alike.values()]
 
 
-def driven(todo: Sequence[Drive], jobs: int) -> Generator[tuple[Row, ...], None, None]:
+def driven(todo: Sequence[RoadDrive], jobs: int) -> Generator[tuple[DrivenRow, ...], None, None]:
     """The rows of each drive, in order. Raises HarnessError if the simulator breaks down."""
     for _, _, rows in each(drive, todo, jobs):
         yield rows
 
 
-def drive(todo: Drive) -> tuple[Row, ...]:
+def drive(todo: RoadDrive) -> tuple[DrivenRow, ...]:
     """Drive, and judge it as each of its rows."""
     line = todo.line
     course = course_of(Setup(line.ftm, seed=todo.seed, scenario=todo.cases[0].name))
@@ -118,11 +118,11 @@ def drive(todo: Drive) -> tuple[Row, ...]:
 # -- rows -----------------------------------------------------------------------------------------
 
 
-def _row(case: Case, line: Line, of: Course | Struck) -> Row:
+def _row(case: Case, line: RoadLine, of: Course | StruckDrive) -> DrivenRow:
     """What came of it, judged as `case`."""
     result, impact = of.result, impact_kmh(of.result)
     because = (*of.broken, *broken(case, result))
-    return Row(
+    return DrivenRow(
         case=case.name,
         line=line.name,
         ftm=line.ftm,
@@ -138,7 +138,9 @@ def _row(case: Case, line: Line, of: Course | Struck) -> Row:
     )
 
 
-def _with_fault(case: Case, line: Line, course: Course, struck: Struck | None, instants: int | None) -> Row:
+def _with_fault(
+    case: Case, line: RoadLine, course: Course, struck: StruckDrive | None, instants: int | None
+) -> DrivenRow:
     """The same, and what the fault took. Of one that never struck, there is the drive alone."""
     if struck is None or not struck.fired:
         words = str(line.fault)
@@ -155,7 +157,7 @@ def _with_fault(case: Case, line: Line, course: Course, struck: Struck | None, i
     return row if line.outage_ms is None else _of_outage(case, row, course.result, line.outage_ms)
 
 
-def _of_outage(case: Case, row: Row, free: VehicleResult, outage_ms: int) -> Row:
+def _of_outage(case: Case, row: DrivenRow, free: VehicleResult, outage_ms: int) -> DrivenRow:
     """What it can take at most, and whether it has to fail."""
     closing_ms = closing_speed_ms(load_scenario(case.name))
     if closing_ms is None:

@@ -1,14 +1,14 @@
-"""Swarm: a whole experiment out of one seed, so that what nobody thought of is tried too.
+"""Swarm: a whole experiment out of one seed, so that combinations that no list has are tried too.
 
 Explorers try all there is of one kind. A swarm draws of every kind at once: mechanism, placement, load,
 faults, adaptations, and by the same seed the delays. As in swarm testing (Groce et al., 2012), a run leaves
 out most of what there is: one with no adaptation, or with no fault, comes to where the others do not.
 
-What is drawn is within what is promised (design 3), so that **every breach is a bug**:
+What is drawn is within what is promised, so that **every breach is a bug**:
 
 | drawn                                   | but never                                                        |
 |-----------------------------------------|------------------------------------------------------------------|
-| a crash of any node or role             | under `none`, which has nobody to replace what died              |
+| a crash of any node or role             | under `none`, which replaces nothing that died                   |
 | a hang for a time, of any node or role  | the same                                                         |
 | a hang for good, of a role or a replica | of a node that no Watchdog watches                               |
 | a slow node, a message that comes late  | so slow or late that the run cannot come to rest in time         |

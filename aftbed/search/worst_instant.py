@@ -41,7 +41,7 @@ LATER: Final = Fault(Crash(), "primary", Trigger(after_ms=3_600_000.0))
 ARMED: Final = "armed"
 
 
-class Cycle(msgspec.Struct, frozen=True):
+class DriveCycle(msgspec.Struct, frozen=True):
     """A radar cycle; `stage` is what its reply asked for."""
 
     request_id: int
@@ -60,13 +60,13 @@ class Course(msgspec.Struct, frozen=True):
     setup: Setup
     result: VehicleResult
     broken: tuple[str, ...]
-    cycles: tuple[Cycle, ...]
+    cycles: tuple[DriveCycle, ...]
     nths: dict[str, dict[int, int]]
     began_ns: int
     armed_ms: float  # when faults are armed
 
 
-class Struck(msgspec.Struct, frozen=True):
+class StruckDrive(msgspec.Struct, frozen=True):
     """A drive with a fault. `t_ms` is when it struck, if a record says so."""
 
     setup: Setup
@@ -93,7 +93,7 @@ def course_of(setup: Setup) -> Course:
         result=_result(run),
         broken=_promises(run),
         cycles=tuple(
-            Cycle(name, of.t_ms, stages.get(name, STAGE_NONE), bool(of.targets), of.ego_speed_ms > 0.0)
+            DriveCycle(name, of.t_ms, stages.get(name, STAGE_NONE), bool(of.targets), of.ego_speed_ms > 0.0)
             for name, of in sorted(asked.items())
         ),
         nths={event: dict(_counted(run, event)) for event in _events(setup)},
@@ -102,7 +102,7 @@ def course_of(setup: Setup) -> Course:
     )
 
 
-def strike(course: Course, fault: Fault) -> Struck:
+def strike(course: Course, fault: Fault) -> StruckDrive:
     """The drive of `course` with `fault`. Raises HarnessError if the simulator breaks down."""
     setup = replace(course.setup, faults=(fault,))
     run = _run(setup)
@@ -110,7 +110,7 @@ def strike(course: Course, fault: Fault) -> Struck:
     records = (record for journal in run.history.journals.values() for record in journal)
     struck_ns = min((r.t_ns for r in records if r.event is Event.FAULT_APPLIED), default=None)
     t_ms = (struck_ns - course.began_ns) / 1e6 if fired and struck_ns is not None else None
-    return Struck(setup, _result(run), _promises(run), fired, t_ms)
+    return StruckDrive(setup, _result(run), _promises(run), fired, t_ms)
 
 
 def _run(setup: Setup) -> Run:
@@ -187,14 +187,14 @@ class Branch(msgspec.Struct, frozen=True):
     fault: Fault
 
 
-class Outcome(msgspec.Struct, frozen=True):
+class BranchOutcome(msgspec.Struct, frozen=True):
     """What came of it."""
 
     result: VehicleResult
     fired: bool
 
 
-def branched(course: Course, branches: Iterable[Branch], over_ms: float) -> Iterator[Outcome]:
+def branched(course: Course, branches: Iterable[Branch], over_ms: float) -> Iterator[BranchOutcome]:
     """The outcome of each, at `over_ms` of bus time or before; the earliest comes first.
 
     Raises HarnessError if a copy dies, or does not come to an end.
@@ -207,7 +207,7 @@ def branched(course: Course, branches: Iterable[Branch], over_ms: float) -> Iter
         yield _branch(world, branch.fault, last_ns)
 
 
-def _branch(world: World, fault: Fault, last_ns: int) -> Outcome:
+def _branch(world: World, fault: Fault, last_ns: int) -> BranchOutcome:
     """In a copy of this process, which dies with it."""
     reader, writer = os.pipe()
     parent, pid = os.getpid(), os.fork()
@@ -233,10 +233,10 @@ def _branch(world: World, fault: Fault, last_ns: int) -> Outcome:
     if not said:
         what = f"is not decided after {DECIDED_SECONDS_MAX:g} s" if late else "died"
         raise HarnessError(f"{fault}: the copy of the simulator {what}, {world.setup.scenario}")
-    return msgspec.msgpack.decode(said, type=Outcome)
+    return msgspec.msgpack.decode(said, type=BranchOutcome)
 
 
-def _decided(world: World, fault: Fault, last_ns: int) -> Outcome:
+def _decided(world: World, fault: Fault, last_ns: int) -> BranchOutcome:
     """Strike, and drive on until nothing can become worse: in contact, at rest, or at the end."""
     world.inject(fault)
     until_ns = world.loop.ns
@@ -247,7 +247,7 @@ def _decided(world: World, fault: Fault, last_ns: int) -> Outcome:
         result = found.vehicle
         assert result is not None, "a course has a car"
         if result.collision or result.stop_gap_m is not None or until_ns > last_ns:
-            return Outcome(result, all(told.fired for told in found.faults))
+            return BranchOutcome(result, all(told.fired for told in found.faults))
 
 
 # -- The worst instant: when a fault harms the car most, searched on the simulator.
@@ -290,7 +290,7 @@ Harm = tuple[bool, float, float, float]
 class Worst(msgspec.Struct, frozen=True):
     """The worst of the `instants` at which the fault was tried, and struck."""
 
-    struck: Struck
+    struck: StruckDrive
     instants: int
 
 
@@ -406,7 +406,7 @@ class _Search:
             return None
         return Worst(max(whole, key=lambda one: harm(one.result, one.broken)), len(struck))
 
-    def _strike(self, words: Trigger) -> Struck:
+    def _strike(self, words: Trigger) -> StruckDrive:
         return strike(self._course, Fault(self._action, self._target, words))
 
 

@@ -8,7 +8,7 @@ import msgspec
 from aftbed.campaign import ledger, runner
 from aftbed.campaign.experiment import Experiment, Result
 from aftbed.campaign.ledger import Ledger
-from aftbed.campaign.plan import Plan, plan
+from aftbed.campaign.plan import CampaignPlan, plan
 from aftbed.campaign.spec import read_spec
 
 CRASHES: Final = """
@@ -36,14 +36,14 @@ def written(folder: Path, text: str = CRASHES) -> Path:
     return path
 
 
-def planned(folder: Path, text: str = CRASHES) -> Plan:
+def planned(folder: Path, text: str = CRASHES) -> CampaignPlan:
     """Its plan."""
     return plan(read_spec(str(written(folder, text))))
 
 
-def ran(found: Plan, out: Path, jobs: int = 1, **asked: object) -> Ledger:
+def ran(found: CampaignPlan, out: Path, jobs: int = 1, **asked: object) -> Ledger:
     """Run it; its ledger."""
-    for _ in runner.run(found, msgspec.structs.replace(runner.Asked(out, jobs), **asked)):
+    for _ in runner.run(found, msgspec.structs.replace(runner.CampaignRunOptions(out, jobs), **asked)):
         pass
     return ledger.read(out / ledger.NAME)
 

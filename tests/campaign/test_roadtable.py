@@ -8,22 +8,22 @@ from msgspec.structs import replace
 from aftbed.inject.crash import Crash
 from aftbed.inject.model import Fault, parse
 from aftbed.inject.timing import Trigger
-from aftbed.search.road_table import PRIMARY, Drive, Line, Row, drive, driven, drives, outage
+from aftbed.search.road_table import PRIMARY, DrivenRow, RoadDrive, RoadLine, drive, driven, drives, outage
 from aftbed.vehicle.scenarios.tables import Case, cases
 
-BARE: Final = Line("none", "none")
+BARE: Final = RoadLine("none", "none")
 LOST_M_MAX: Final = 0.05
 R152: Final = {case.name: case for case in cases("r152")}
 
 
-def crash(ftm: str) -> Line:
+def crash(ftm: str) -> RoadLine:
     """A crash of the primary at the worst instant."""
-    return Line(f"{ftm}, crash", ftm, Fault(Crash(), PRIMARY, Trigger()), searched=True)
+    return RoadLine(f"{ftm}, crash", ftm, Fault(Crash(), PRIMARY, Trigger()), searched=True)
 
 
-def row(case: Case, line: Line) -> Row:
+def row(case: Case, line: RoadLine) -> DrivenRow:
     """That one, driven."""
-    (found,) = drive(Drive((case,), line, 0))
+    (found,) = drive(RoadDrive((case,), line, 0))
     return found
 
 
@@ -42,7 +42,9 @@ def test_rows_that_begin_alike_are_driven_once_and_judged_each_by_its_own() -> N
     todo = drives(laden, (BARE, outage(500)), 0)
     assert [len(one.cases) for one in todo] == [2, 2]
     strict, mild = drive(
-        Drive(tuple(laden), Line("late", "none", parse("hang primary for 400ms at server.enter nth 152")), 0)
+        RoadDrive(
+            tuple(laden), RoadLine("late", "none", parse("hang primary for 400ms at server.enter nth 152")), 0
+        )
     )
     assert strict.impact_kmh == mild.impact_kmh
     assert [strict.case, mild.case] == ["r152:m1-laden-40", "r152:n1-laden-40"]
@@ -61,7 +63,7 @@ def test_every_row_of_m1_passes_under_a_crash_at_the_worst_instant(ftm: str) -> 
 
 def test_a_row_passes_under_a_crash_at_the_worst_instant_as_without_it() -> None:
     case = R152["r152:m1-42"]
-    found, free = row(case, crash("pbr")), row(case, Line("pbr", "pbr"))
+    found, free = row(case, crash("pbr")), row(case, RoadLine("pbr", "pbr"))
     assert found.passed and free.passed
     assert found.loss_m is not None and 0.0 <= found.loss_m <= LOST_M_MAX
     assert found.min_gap_m is not None and free.min_gap_m is not None
@@ -85,7 +87,7 @@ def test_an_outage_that_fails_a_row_says_that_it_must() -> None:
 
 
 def test_a_fault_that_never_strikes_is_no_pass() -> None:
-    line = Line("never", "pbr", parse("crash primary at server.enter nth 100000"))
+    line = RoadLine("never", "pbr", parse("crash primary at server.enter nth 100000"))
     found = row(R152["r152:m1-10"], line)
     assert (found.struck, found.passed) == (False, False)
     assert found.because == ("never struck: crash primary at server.enter nth 100000",)
@@ -94,7 +96,7 @@ def test_a_fault_that_never_strikes_is_no_pass() -> None:
 
 def test_a_broken_promise_fails_a_row_whatever_the_car_does() -> None:
     # No TR: a flipped bit of a reply that was due reaches the brakes. Here it is one that asks for nothing.
-    line = Line("flip", "pbr", parse("bitflip result bit 60 nth 3"))
+    line = RoadLine("flip", "pbr", parse("bitflip result bit 60 nth 3"))
     found = row(R152["r152:m1-10"], line)
     assert not found.passed and found.struck
     assert found.because[0].startswith("one_history (G3): ")
@@ -114,5 +116,5 @@ def test_a_negative_row_fails_if_anything_brakes() -> None:
 
 
 def test_the_rows_are_the_same_over_several_processes() -> None:
-    todo = drives([R152["r152:m1-10"], R152["r152:m1-20"]], (BARE, Line("pbr", "pbr")), 3)
+    todo = drives([R152["r152:m1-10"], R152["r152:m1-20"]], (BARE, RoadLine("pbr", "pbr")), 3)
     assert list(driven(todo, 1)) == list(driven(todo, 2))

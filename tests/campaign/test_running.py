@@ -56,13 +56,13 @@ def test_a_stratum_that_is_known_well_enough_is_left(tmp_path: Path) -> None:
 def test_a_shard_cannot_stop_by_what_it_does_not_see(tmp_path: Path) -> None:
     text = CRASHES.replace("stop: {experiments: 4}", "stop: {experiments: 4, half_width: 0.1}")
     with pytest.raises(ConfigError, match=r"--shard: stop\.half_width looks at all results"):
-        runner.run(planned(tmp_path, text), runner.Asked(tmp_path / "out", shard=1, shards=2))
+        runner.run(planned(tmp_path, text), runner.CampaignRunOptions(tmp_path / "out", shard=1, shards=2))
     assert not (tmp_path / "out").exists()
 
 
 def test_a_result_is_in_the_ledger_before_it_is_told(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    results = runner.run(planned(tmp_path), runner.Asked(out))
+    results = runner.run(planned(tmp_path), runner.CampaignRunOptions(out))
     first = next(results)
     assert [r.experiment for r in ledger.read(out / ledger.NAME).results] == [first.experiment]
     results.close()

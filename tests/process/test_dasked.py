@@ -81,7 +81,7 @@ def test_a_cluster_comes_to_the_same_results(tmp_path: Path) -> None:
 def test_a_worker_that_is_killed_loses_nothing_and_counts_nothing_twice(tmp_path: Path) -> None:
     found = planned(tmp_path, CRASHES.replace("experiments: 4", "experiments: 40"))
     with cluster(tmp_path, 2) as (address, workers):
-        asked = runner.Asked(tmp_path / "out", scheduler=address)
+        asked = runner.CampaignRunOptions(tmp_path / "out", scheduler=address)
         told = []
         for result in runner.run(found, asked):
             told.append(result.experiment.id)
@@ -104,7 +104,7 @@ def test_a_worker_that_dies_in_the_midst_of_a_real_run_leaves_nothing(tmp_path: 
     found = planned(tmp_path, text.replace("experiments: 4", "experiments: 2"))
     with cluster(tmp_path, 2) as (address, workers):
         told = []
-        for result in runner.run(found, runner.Asked(tmp_path / "out", scheduler=address)):
+        for result in runner.run(found, runner.CampaignRunOptions(tmp_path / "out", scheduler=address)):
             told.append(result.experiment.id)
             if len(told) == 1:
                 under_way = new_run_below(workers[0].pid)
@@ -161,5 +161,7 @@ def test_a_local_cluster_comes_to_the_same_results(tmp_path: Path) -> None:
 
 def test_a_scheduler_that_is_not_there_is_refused_before_anything_is_written(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"--scheduler tcp://127.0.0.1:9: cannot be reached"):
-        runner.run(planned(tmp_path), runner.Asked(tmp_path / "out", scheduler="tcp://127.0.0.1:9"))
+        runner.run(
+            planned(tmp_path), runner.CampaignRunOptions(tmp_path / "out", scheduler="tcp://127.0.0.1:9")
+        )
     assert not (tmp_path / "out").exists()
