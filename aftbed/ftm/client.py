@@ -6,9 +6,9 @@ from typing import ClassVar, Final
 import msgspec
 
 from aftbed.core.brick import (
+    ANY_STATE,
     CONTROL,
     SAME_STATE,
-    Brick,
     BrickAnswer,
     BrickState,
     Choice,
@@ -20,77 +20,130 @@ from aftbed.core.brick import (
 )
 from aftbed.core.errors import PeerError
 from aftbed.core.events import Event
-from aftbed.core.messages import AnyMessage, HoldAt, Rebound, Release, Reply, Request, RequestHeld, Submit
+from aftbed.core.messages import HoldAt, Rebound, Release, Reply, Request, RequestHeld, Submit
 from aftbed.ftm.declaration import BrickKind, Emits
 
 BACKLOG_MAX: Final = 64  # unanswered requests; beyond it the port `submit` is closed
-_WAITING: Final = ("submit", "pxy2clt")
-_FULL: Final = ("pxy2clt",)
 
 
-class Client(Brick):
+class ClientState(BrickState):
+    READY = auto()  # takes the next request
+    FULL = auto()  # the backlog is full: takes none before a reply
+    HOLDING = auto()  # a request waits for its Release: takes none before that
+
+
+class NextRequest(BrickAnswer):
+    GOES = auto()
+    FILLS_BACKLOG = auto()
+    IS_HELD = auto()
+
+
+class ReleaseOf(BrickAnswer):
+    HELD = auto()  # of the request that is held
+    HELD_AND_LAST = auto()  # the same, and the backlog is full
+    OTHER = auto()
+
+
+_C: Final = ClientState
+_GOES: Final = NextRequest.GOES
+
+
+class Client(Machine):
     """Numbers the requests, and sends the unanswered ones again when its Proxy is replaced.
 
-    It knows nothing of replicas. The source of the requests (the gateway of the car, or a load) hands them
-    in on `submit` and takes replies from `deliver`. The runtime can have it stop at requests of given ids
+    It knows nothing of replicas. The source of the requests (the gateway of the car, or a load) hands them in
+    on `submit` and takes replies from `deliver`. The runtime can have it stop at requests of given ids
     (`HoldAt`): it reports such a request instead of sending it, closes `submit`, and sends it on `Release`.
     So an adaptation begins at an exact request.
 
     `next_id` is the id of the next request; `unanswered` maps ids to requests, ascending.
     """
 
+    AT_REST = (_C.READY,)
+
     def __init__(self) -> None:
+        super().__init__(_C.READY)
         self.next_id = 1
         self.unanswered: dict[int, Request] = {}
         self._hold_at: frozenset[int] = frozenset()
         self._held: Request | None = None
-        self._again: frozenset[int] = (
-            frozenset()
-        )  # sent twice, perhaps by a predecessor: two replies may come
-
-    def open_ports(self) -> tuple[str, ...]:
-        """No new request while one is held, or the backlog is full."""
-        return _WAITING if self._held is None and len(self.unanswered) < BACKLOG_MAX else _FULL
+        # Sent twice, perhaps by a predecessor: two replies may come.
+        self._again: frozenset[int] = frozenset()
 
     def quiescent(self) -> bool:
         """All is answered."""
         return not self.unanswered
 
-    def step(self, port: str, msg: AnyMessage, now_ns: int) -> list[Effect]:
-        """A request from the source, a reply from the Proxy, a new Proxy, or an order of the runtime."""
-        if isinstance(msg, Submit) and self._held is None and len(self.unanswered) < BACKLOG_MAX:
-            request = Request(0, self.next_id, msg.payload)
-            self.unanswered[self.next_id] = request
-            self.next_id += 1
-            sent = Note(Event.REQUEST_SENT, request.request_id)
-            if request.request_id in self._hold_at:
-                self._held = request
-                return [sent, Send(CONTROL, RequestHeld(request.request_id))]
-            return [sent, Send("clt2pxy", request)]
-        if isinstance(msg, Reply):
-            if self.unanswered.pop(msg.request_id, None) is None:
-                if msg.request_id in self._again:
-                    self._again -= {msg.request_id}
-                    return []
-                raise PeerError(f"reply to request {msg.request_id}, which is not unanswered")
-            return [Note(Event.REPLY_DELIVERED, msg.request_id, msg.replica), Send("deliver", msg)]
-        if isinstance(msg, Rebound):
-            # Ascending ids on a fresh channel: the order of ids is the order of execution (G3).
-            sent_before = [request for request in self.unanswered.values() if request is not self._held]
-            self._again = frozenset(request.request_id for request in sent_before)
-            return [Send("clt2pxy", request) for request in sent_before]
-        if isinstance(msg, HoldAt):
-            self._hold_at = frozenset(msg.requests)
-            # A successor of the Client that had come to them has sent them again by now.
-            passed = [number for number in msg.requests if number < self.next_id]
-            return [Send(CONTROL, RequestHeld(number)) for number in passed]
-        if isinstance(msg, Release):
-            held = self._held
-            if held is None or held.request_id != msg.request_id:
-                return []
-            self._held = None
-            return [Send("clt2pxy", held)]
-        raise PeerError(f"{type(msg).__name__} on {port}")
+    def which_next(self, msg: Submit) -> NextRequest:
+        """What becomes of the next request."""
+        if self.next_id in self._hold_at:
+            return NextRequest.IS_HELD
+        return NextRequest.FILLS_BACKLOG if len(self.unanswered) + 1 >= BACKLOG_MAX else _GOES
+
+    def send(self, msg: Submit) -> list[Effect]:
+        """Give it its number."""
+        request = self._numbered(msg)
+        return [Note(Event.REQUEST_SENT, request.request_id), Send("clt2pxy", request)]
+
+    def hold(self, msg: Submit) -> list[Effect]:
+        """The same, but the runtime decides when it goes."""
+        request = self._held = self._numbered(msg)
+        held = RequestHeld(request.request_id)
+        return [Note(Event.REQUEST_SENT, request.request_id), Send(CONTROL, held)]
+
+    def _numbered(self, msg: Submit) -> Request:
+        request = self.unanswered[self.next_id] = Request(0, self.next_id, msg.payload)
+        self.next_id += 1
+        return request
+
+    def is_first_reply(self, msg: Reply) -> bool:
+        """False for the second reply to a request that was sent twice. Raises PeerError for any other."""
+        if msg.request_id in self.unanswered:
+            return True
+        if msg.request_id in self._again:
+            return False
+        raise PeerError(f"reply to request {msg.request_id}, which is not unanswered")
+
+    def deliver(self, msg: Reply) -> list[Effect]:
+        """The source has its answer."""
+        del self.unanswered[msg.request_id]
+        return [Note(Event.REPLY_DELIVERED, msg.request_id, msg.replica), Send("deliver", msg)]
+
+    def drop(self, msg: Reply) -> list[Effect]:
+        """The source has it already."""
+        self._again -= {msg.request_id}
+        return []
+
+    def send_again(self, msg: Rebound) -> list[Effect]:
+        """The Proxy is a new one. Ascending ids: the order of ids is the order of execution (G3)."""
+        if msg.port != "clt2pxy":
+            return []
+        sent_before = [request for request in self.unanswered.values() if request is not self._held]
+        self._again = frozenset(request.request_id for request in sent_before)
+        return [Send("clt2pxy", request) for request in sent_before]
+
+    def hold_at(self, msg: HoldAt) -> list[Effect]:
+        """A predecessor may have come to some of them: this Client has sent those again by now."""
+        self._hold_at = frozenset(msg.requests)
+        passed = [number for number in msg.requests if number < self.next_id]
+        return [Send(CONTROL, RequestHeld(number)) for number in passed]
+
+    def which_release(self, msg: Release) -> ReleaseOf:
+        """Whether it is of the request that is held."""
+        assert self._held is not None
+        if msg.request_id != self._held.request_id:
+            return ReleaseOf.OTHER
+        return ReleaseOf.HELD_AND_LAST if len(self.unanswered) >= BACKLOG_MAX else ReleaseOf.HELD
+
+    def send_held(self, msg: Release) -> list[Effect]:
+        """Now it goes."""
+        held, self._held = self._held, None
+        assert held is not None
+        return [Send("clt2pxy", held)]
+
+    def ignore(self, msg: Release) -> list[Effect]:
+        """It was sent already."""
+        return []
 
     def capture(self) -> bytes:
         """The ids and the unanswered requests."""
@@ -103,6 +156,38 @@ class Client(Brick):
         except msgspec.DecodeError as error:
             raise PeerError(f"not a state of a Client: {error}") from error
         self.next_id, self.unanswered = next_id, {r.request_id: r for r in waiting}
+        self.state = _C.FULL if len(waiting) >= BACKLOG_MAX else _C.READY
+
+    MOVES: ClassVar[Moves] = {
+        (_C.READY, "submit", Submit): Choice(
+            which_next,
+            {
+                NextRequest.GOES: (send, SAME_STATE),
+                NextRequest.FILLS_BACKLOG: (send, _C.FULL),
+                NextRequest.IS_HELD: (hold, _C.HOLDING),
+            },
+        ),
+        (_C.READY, "pxy2clt", Reply): Choice(
+            is_first_reply, {True: (deliver, SAME_STATE), False: (drop, SAME_STATE)}
+        ),
+        (_C.FULL, "pxy2clt", Reply): Choice(
+            is_first_reply, {True: (deliver, _C.READY), False: (drop, SAME_STATE)}
+        ),
+        (_C.HOLDING, "pxy2clt", Reply): Choice(
+            is_first_reply, {True: (deliver, SAME_STATE), False: (drop, SAME_STATE)}
+        ),
+        (_C.HOLDING, CONTROL, Release): Choice(
+            which_release,
+            {
+                ReleaseOf.HELD: (send_held, _C.READY),
+                ReleaseOf.HELD_AND_LAST: (send_held, _C.FULL),
+                ReleaseOf.OTHER: (ignore, SAME_STATE),
+            },
+        ),
+        (ANY_STATE, CONTROL, Release): (ignore, SAME_STATE),
+        (ANY_STATE, CONTROL, HoldAt): (hold_at, SAME_STATE),
+        (ANY_STATE, CONTROL, Rebound): (send_again, SAME_STATE),
+    }
 
 
 class ProxyState(BrickState):

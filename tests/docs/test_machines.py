@@ -17,7 +17,7 @@ HEAD: Final = """# The state machines of the bricks
 Made from the tables that the bricks execute ([how to read one](bricks.md#how-to-read-one)); do not edit.
 An arrow is a row: `port message [question = answer] / handler`. A message from the runtime has no port. A
 message without an arrow is refused. A Rebound that changes no state is left out: every brick receives it. The
-Client, the Watchdogs and Recovery have no states.
+Watchdogs and Recovery have no states.
 """
 
 

@@ -36,7 +36,6 @@ from aftbed.core.messages import (
     Promote,
     Pulses,
     Rebound,
-    Release,
     Reply,
     Request,
     Situation,
@@ -60,7 +59,7 @@ from aftbed.ftm.tr import TrAfter, TrBefore, TrProceed
 
 Mail = tuple[tuple[str, type | AnyMessage], ...]
 MACHINES: Final = (
-    *(Protocol, InnerProtocol, Proxy, PassBefore, Compute, Server, PbrAfter, LfrBefore, LfrAfter),
+    *(Client, Protocol, InnerProtocol, Proxy, PassBefore, Compute, Server, PbrAfter, LfrBefore, LfrAfter),
     *(TrBefore, TrProceed, TrAfter, AssertBefore, AssertAfter),
 )
 OTHER: Final = Tried(1, 1, 1, b"this", STATE)  # differs from TRIED
@@ -127,6 +126,9 @@ def tried(mail: Mail) -> Iterator[Case]:
 
 
 CASES: Final = (
+    Case(Client, (("submit", Submit),)),
+    Case(Client, (("submit", Submit),) * BACKLOG_MAX),
+    Case(Client, ((CONTROL, HoldAt), ("submit", Submit))),
     Case(protocol(leads=False)),
     Case(protocol(leads=True)),
     Case(protocol(leads=True), (("pxy2pro", Request),)),
@@ -344,12 +346,6 @@ def test_the_end_of_a_deadline_is_a_row_too() -> None:
 # -- the bricks without a table -------------------------------------------------------------------
 
 
-def client_that_waits() -> Brick:
-    brick = Client()
-    brick.step("submit", Submit(b"what"), 0)
-    return brick
-
-
 class Plain(NamedTuple):
     """A brick without states, after these messages, and the types that it takes then."""
 
@@ -364,9 +360,6 @@ def by_hand(name: str, make: Callable[[], Brick], mail: tuple[type, ...], *legal
 
 
 PLAIN: Final = (
-    by_hand("Client", Client, (), Rebound, HoldAt, Release, Submit),
-    by_hand("Client waiting", client_that_waits, (), Rebound, HoldAt, Release, Submit, Reply),
-    by_hand("Client full", Client, (Submit,) * BACKLOG_MAX, Rebound, HoldAt, Release, Reply),
     by_hand("Watchdog", Watchdog, (Watch,), Watch, NodeDied, Pulses, Rebound),
     by_hand("Recovery", Recovery, (), Suspect, Situation, Rebound),
 )
