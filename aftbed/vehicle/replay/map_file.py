@@ -46,9 +46,6 @@ from aftbed.vehicle.can.e2e import (
 )
 from aftbed.vehicle.can.frame import CAN_ID_MAX
 
-SpeedUnit = Literal["m/s", "km/h"]
-DistanceUnit = Literal["m", "cm"]
-AngleUnit = Literal["deg", "rad"]
 Sum = Literal["toyota", "none"]
 Length = Annotated[int, Meta(ge=1, le=8)]
 DataId = Annotated[int, Meta(ge=0, le=DATA_ID_MAX)]
@@ -92,31 +89,37 @@ class RawSignal(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return number * self.scale + self.offset
 
 
-class Speed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A speed: a signal of the DBC, or raw."""
+class MappedQuantity(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A quantity: a signal of the DBC, or raw."""
 
-    unit: SpeedUnit
+    unit: str
     signal: str | None = None
     raw: RawSignal | None = None
 
-
-class Distance(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A distance: a signal of the DBC, or raw."""
-
-    unit: DistanceUnit
-    signal: str | None = None
-    raw: RawSignal | None = None
-
-
-class Angle(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """An angle from straight ahead, to either side: a signal of the DBC, or raw."""
-
-    unit: AngleUnit
-    signal: str | None = None
-    raw: RawSignal | None = None
+    def si(self, signals: Mapping[str, float], data: bytes) -> float:
+        """Its value in a message, in metres, metres per second, or radians."""
+        if self.raw is not None:
+            return self.raw.read(data) * TO_SI[self.unit]
+        assert self.signal is not None
+        return signals[self.signal] * TO_SI[self.unit]
 
 
-Quantity = Speed | Distance | Angle
+class Speed(MappedQuantity, frozen=True):
+    """A speed."""
+
+    unit: Literal["m/s", "km/h"]
+
+
+class Distance(MappedQuantity, frozen=True):
+    """A distance."""
+
+    unit: Literal["m", "cm"]
+
+
+class Angle(MappedQuantity, frozen=True):
+    """An angle from straight ahead, to either side."""
+
+    unit: Literal["deg", "rad"]
 
 
 class Counter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -463,7 +466,7 @@ class _Binding:
             self._message(f"{key}.name", name)
         return messages.names()
 
-    def _quantity(self, key: str, quantity: Quantity, name: str | None, length: int) -> None:
+    def _quantity(self, key: str, quantity: MappedQuantity, name: str | None, length: int) -> None:
         if (quantity.signal is None) == (quantity.raw is None):
             raise self._error(key, "signal and raw", "exactly one of them")
         if quantity.raw is not None:

@@ -23,7 +23,7 @@ from aftbed.vehicle.can.dbc_file import Codec
 from aftbed.vehicle.can.e2e import Receiver
 from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.gateway import BusGateway, target_of
-from aftbed.vehicle.replay.map_file import TO_SI, Flag, FrameRule, Quantity, bind
+from aftbed.vehicle.replay.map_file import Flag, FrameRule, bind
 from aftbed.vehicle.replay.slots import SlotBook
 
 FRESH_CYCLES: Final = 1.5  # a log's time stamps come in batches, so a cycle may look longer than it was
@@ -109,7 +109,7 @@ class MappedGateway(BusGateway):
     def _take(self, frame: Frame, rule: FrameRule, signals: dict[str, float]) -> bool:
         """Keep a track or the ego speed. False, and nothing kept, if a value is beyond any sensor."""
         if frame.can_id == self._bound.ego_id:
-            speed_ms = _si(self._bound.map.ego.speed, signals, frame.data)
+            speed_ms = self._bound.map.ego.speed.si(signals, frame.data)
             if not 0.0 <= speed_ms <= SPEED_MAX_MS:
                 return False
             self._ego = (frame.t_us, speed_ms)
@@ -127,7 +127,7 @@ class MappedGateway(BusGateway):
         if tracks.valid is None or _is_set(tracks.valid, signals):
             new = tracks.new is not None and _is_set(tracks.new, signals)
             distance_m, lateral_m = self._place(signals, frame.data)
-            target = target_of(0, distance_m, _si(tracks.relative_speed, signals, frame.data), new)
+            target = target_of(0, distance_m, tracks.relative_speed.si(signals, frame.data), new)
             if target is None or not isfinite(lateral_m):
                 return False
             if abs(lateral_m) > self._bound.map.lane_half_width_m:
@@ -138,11 +138,11 @@ class MappedGateway(BusGateway):
     def _place(self, signals: dict[str, float], data: bytes) -> tuple[float, float]:
         """How far ahead and how far beside us, in metres."""
         tracks = self._bound.map.tracks
-        range_m = _si(tracks.range, signals, data)
+        range_m = tracks.range.si(signals, data)
         if tracks.angle is None:
             assert tracks.lateral_offset is not None
-            return range_m, _si(tracks.lateral_offset, signals, data)
-        angle = _si(tracks.angle, signals, data)
+            return range_m, tracks.lateral_offset.si(signals, data)
+        angle = tracks.angle.si(signals, data)
         return (range_m * cos(angle), range_m * sin(angle)) if isfinite(angle) else (range_m, angle)
 
     def _announce(self, t_us: int) -> bytes | None:
@@ -174,11 +174,3 @@ def _is_set(flag: str | Flag, signals: dict[str, float]) -> bool:
     if isinstance(flag, Flag):
         return int(signals[flag.signal]) in flag.values
     return bool(signals[flag])
-
-
-def _si(quantity: Quantity, signals: dict[str, float], data: bytes) -> float:
-    """A mapped quantity in metres, metres per second, or as an angle in radians."""
-    if quantity.raw is not None:
-        return quantity.raw.read(data) * TO_SI[quantity.unit]
-    assert quantity.signal is not None
-    return signals[quantity.signal] * TO_SI[quantity.unit]
