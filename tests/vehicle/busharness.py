@@ -279,7 +279,7 @@ class TestGateway:
 class FunctionGateway:
     """The client process, as `runtime.unix.gateway` is: the gateway, with the bare function as its server.
 
-    `named`: it says its name to the bus, what it uses, and what it notices; else it is nobody in particular.
+    `named`: it gives the bus its name, what it uses, and what it notices; else it is an unnamed client.
     """
 
     def __init__(self, options: BusOptions, codec: Codec, *, named: bool = False) -> None:

@@ -245,7 +245,7 @@ def test_the_longer_an_outage_the_smaller_the_gap_until_it_is_none(seed: int) ->
     assert [one.car.end for one in (drives[0], drives[-1])] == ["standstill", "collision"]
 
 
-def test_while_nobody_answers_the_brake_policy_decides() -> None:
+def test_without_answers_the_brake_policy_decides() -> None:
     latched, released = (
         drive(when=outage(FULL_BRAKING_MS, 60_000), policy=policy) for policy in ("latch", "release")
     )
@@ -259,7 +259,7 @@ def test_without_any_reply_the_car_drives_on() -> None:
     assert AEB_REQ not in {frame.can_id for frame in done.frames}
 
 
-def test_a_reply_between_two_steps_is_heard_in_the_next() -> None:
+def test_a_reply_between_two_steps_is_received_in_the_next() -> None:
     """So a delay of 0.2 ms and one of 1 ms are the same drive but for the time stamps; none is not."""
     between, one_ms = drive(when=after(200_000)), drive(when=after(MS))
     assert between.result == one_ms.result != drive().result
@@ -285,7 +285,7 @@ def test_what_is_no_reply_to_the_brakes_sends_nothing() -> None:
     assert AEB_REQ not in {frame.can_id for frame in frames}
 
 
-def test_a_heartbeat_tells_the_replica_and_the_epoch_of_the_reply() -> None:
+def test_a_heartbeat_has_the_replica_and_the_epoch_of_the_reply() -> None:
     frames: list[Frame] = []
     car = VirtualCar(load_scenario("ccrs-20"), codec=CODEC, witness=frames.append)
     function = default_application()

@@ -120,7 +120,7 @@ def test_no_latch_where_full_braking_was_only_asked_for_at_standstill() -> None:
     assert (bench.run(100), bench.brake.fallback) == (0.0, Fallback.RELEASE)
 
 
-def test_the_status_says_what_the_brakes_do() -> None:
+def test_the_status_has_what_the_brakes_do() -> None:
     bench = Bench()
     bench.requests(FULL, 20)
     status, ego = bench.brake.frames(bench.plant)
@@ -150,7 +150,7 @@ def test_every_message_comes_in_its_cycle_and_the_track_last() -> None:
     }
 
 
-def test_the_radar_sees_the_truth_through_bounded_noise_and_says_what_is_new() -> None:
+def test_the_radar_sees_the_truth_through_bounded_noise_and_marks_what_is_new() -> None:
     plant, radar = Plant(PlantSetup(10.0, LeadCar(155.0))), RadarEcu(CODEC, 3)
     new_at_m = []
     while plant.gap_m is not None and plant.gap_m > 20.0:

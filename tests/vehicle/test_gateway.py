@@ -50,7 +50,7 @@ def test_a_believed_track_makes_a_request() -> None:
     assert running().request() == AebInput(80, 14.0, True, True, (AebTarget(5, 40.0, -3.0, False),))
 
 
-def test_the_first_track_only_starts_the_sequence_and_its_request_says_so() -> None:
+def test_the_first_track_only_starts_the_sequence_and_its_request_has_no_radar() -> None:
     feed = Feed()
     first, second = feed.request(), feed.request()
     assert first == AebInput(20, 14.0, True, False, ())

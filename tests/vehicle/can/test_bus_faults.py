@@ -62,7 +62,7 @@ ALIKE = [
 
 @pytest.mark.parametrize("words", ALIKE)
 def test_a_hub_in_lockstep_and_a_bus_in_virtual_time_are_alike(words: str, tmp_path: Path) -> None:
-    """Each frame to the last bit, by identifier and time, the car, who noticed; and without a wait."""
+    """Each frame to the last bit, by identifier and time, the car, what was noticed; without a wait."""
     over_hub, in_virtual_time = real(tmp_path / "bus.log", words), virtual(words)
     for can_id in sorted(over_hub.ids | in_virtual_time.ids):
         assert over_hub.of(can_id) == in_virtual_time.of(can_id), hex(can_id)
@@ -132,7 +132,7 @@ def test_a_radar_that_sees_far_and_well_protected_is_a_crash(sound: Disturbed) -
     assert drive.result.collision and not sound.result.collision
 
 
-def test_a_frame_that_nobody_uses_is_struck_and_that_is_all() -> None:
+def test_a_frame_that_no_node_uses_is_struck_and_that_is_all() -> None:
     drive = virtual("corrupt bus BRAKE_STATUS bit 40 permanent")
     assert drive.struck[0].receipt.state.value == "applied"
     assert drive.struck[0].receipt.detail.endswith("noticed by nobody")
@@ -318,7 +318,7 @@ def test_the_hub_reports_what_becomes_of_a_fault(hub: RunningHub) -> None:
     assert hub.desk.receipts == ["armed", "applied", "activated"]
 
 
-def test_the_latest_who_says_a_name_has_it(hub: RunningHub) -> None:
+def test_the_latest_client_with_a_name_has_it(hub: RunningHub) -> None:
     """A gateway that was replaced is cut off like the one before it."""
     with Node(hub.port, "gateway"), Node(hub.port, "gateway") as successor, Node(hub.port, "radar") as radar:
         arm(hub, "bus-off gateway")
@@ -326,7 +326,7 @@ def test_the_latest_who_says_a_name_has_it(hub: RunningHub) -> None:
         assert successor.heard() == []
 
 
-def test_the_car_is_told_what_to_look_for_whenever_it_comes(tmp_path: Path) -> None:
+def test_the_car_gets_the_conditions_whenever_it_comes(tmp_path: Path) -> None:
     with running_hub(tmp_path / "bus.log", HubOptions(lockstep=True)) as hub:
         arm(hub, "omission bus RADAR_TRACK when ttc < 1.2")
         line = HubLine(hub.options)

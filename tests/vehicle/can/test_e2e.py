@@ -116,7 +116,7 @@ def test_after_a_silence_the_second_frame_is_believed_again() -> None:
     assert receiver.usable(receiver.check(frame(10), late_us + CYCLE_US))
 
 
-def test_the_timeout_has_its_edge_where_it_says() -> None:
+def test_the_timeout_has_its_edge_where_it_is_set() -> None:
     for beyond_us, expected in ((0, FrameStatus.OK), (1, FrameStatus.WRONGSEQUENCE)):
         receiver = synchronised()
         assert receiver.check(frame(5), 4 * CYCLE_US + WATCH.timeout_us + beyond_us) is expected

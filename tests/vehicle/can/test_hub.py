@@ -1,4 +1,4 @@
-"""The hub over real sockets: what it relays, in which order, at which time, and whom it puts out."""
+"""The hub over real sockets: what it relays, in which order, at which time; which clients it disconnects."""
 
 import signal
 import socket
@@ -255,7 +255,7 @@ def test_malformed_is_answered_and_changes_nothing(hub: RunningHub, element: str
     assert len(hub.log.read_bytes().splitlines()) == 1
 
 
-def test_nothing_is_sent_or_heard_before_the_handshake(hub: RunningHub) -> None:
+def test_nothing_is_sent_or_received_before_the_handshake(hub: RunningHub) -> None:
     with RawClient(hub.port, raw=False) as a, RawClient(hub.port) as b:
         assert "unknown command" in a.ask("< send 130 0  >")
         assert "unknown command" in a.ask("< rawmode >")

@@ -34,7 +34,7 @@ def test_an_unknown_map_comes_with_the_nearest() -> None:
     assert find_map("./my.yaml") == Path("./my.yaml")
 
 
-def test_the_shipped_map_is_found_and_says_what_it_is() -> None:
+def test_the_shipped_map_is_found_and_described() -> None:
     assert yaml.safe_load(find_map("toyota").read_text())["cycle_end"] == "TRACK_B_15"
 
 

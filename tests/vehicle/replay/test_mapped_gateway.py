@@ -367,7 +367,7 @@ OVERLAPPING = ("NEW : 49|1@0+ (1,0) [0|1]", "NEW : 48|1@0+ (1,0) [0|1]")
 OUTSIDE = ("SG_ NEW : 49|1@0+", "SG_ NEW : 64|1@0+")
 
 
-def test_a_dbc_that_contradicts_itself_is_read_if_the_map_says_so(make: Make) -> None:
+def test_a_dbc_that_contradicts_itself_is_read_if_the_map_allows_it(make: Make) -> None:
     with pytest.raises(
         ConfigError, match=r"radar\.dbc: line 9: .*NEW and VALID are overlapping in message TRACK_0"
     ):

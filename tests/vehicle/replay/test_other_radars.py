@@ -101,7 +101,7 @@ def test_polar_tracks_are_where_they_are() -> None:
     assert target.rel_speed_ms == pytest.approx(-5.0, abs=0.02)
 
 
-def test_the_status_says_what_is_valid_and_what_is_new() -> None:
+def test_the_status_marks_what_is_valid_and_what_is_new() -> None:
     names = codec("esr-like").signal_names("ESR_Track01")
     base = dict.fromkeys(names, 0.0) | {"CAN_TX_TRACK_RANGE": 50.0}
     gateway = gateway_of("esr-like")

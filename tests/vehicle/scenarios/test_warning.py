@@ -1,4 +1,4 @@
-"""What a drive tells of the warning and of the demand, and a driver who heeds it."""
+"""Warning and demand in the result of a drive, and a driver that brakes after the warning."""
 
 import msgspec
 import pytest
