@@ -27,7 +27,6 @@ from typing import TYPE_CHECKING, ClassVar, Final
 
 import msgspec
 
-from aftbed.core.busfault import NODES, Condition
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.graph import Graph
 from aftbed.core.units import duration, milliseconds, number
@@ -36,6 +35,8 @@ from aftbed.inject.grammar import NUMBER, whole
 from aftbed.inject.kind import AnyFault, FaultKind, Injection, ReadFault, RunControl, Steps
 from aftbed.inject.receipts import Receipt, ReceiptState
 from aftbed.inject.timing import ONCE, Chance, Every, Lasting, Permanent, Transient, Trigger
+from aftbed.vehicle.can.bus_model import NODES
+from aftbed.vehicle.condition import Condition
 
 if TYPE_CHECKING:
     from aftbed.vehicle.can.dbc_file import Codec

@@ -31,7 +31,6 @@ from typing import Final
 
 from e2e.p11 import e2e_p11_protect
 
-from aftbed.core.busfault import FALLBACK, Condition
 from aftbed.inject.bit_patterns import with_flipped
 from aftbed.inject.bus import (
     NODE_ACTS,
@@ -50,8 +49,9 @@ from aftbed.inject.bus import (
     StuckCounter,
 )
 from aftbed.inject.timing import Chance, Every, Lasting, Permanent, Transient
-from aftbed.vehicle.can.bus_model import CarriedFrame
+from aftbed.vehicle.can.bus_model import FALLBACK, CarriedFrame
 from aftbed.vehicle.can.frame import Frame
+from aftbed.vehicle.condition import Condition
 
 REORDER_US_MAX: Final = 1_000_000  # a frame without a successor is not swallowed
 FLOOD_US: Final = 1000

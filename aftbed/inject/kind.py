@@ -20,7 +20,6 @@ from typing import Any, ClassVar, NamedTuple, Protocol, Self, TypeVar
 import msgspec
 
 from aftbed.core.brick import Brick, Effect
-from aftbed.core.busfault import Condition
 from aftbed.core.graph import Graph
 from aftbed.core.journal import Record
 from aftbed.core.messages import Message
@@ -29,6 +28,7 @@ from aftbed.inject.receipts import Receipt, ReceiptState
 from aftbed.inject.shared_state import SharedState
 from aftbed.inject.targets import TargetProcess
 from aftbed.inject.timing import ONCE, Persistence, Trigger
+from aftbed.vehicle.condition import Condition
 
 T = TypeVar("T")
 Steps = Generator[Any, Any, T]  # a task of the runtime: what it yields is the runtime's affair

@@ -20,12 +20,12 @@ from typing import Final, assert_never, cast
 
 import msgspec
 
-from aftbed.core.busfault import QUANTITIES, Condition, Quantity
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.events import event_named
 from aftbed.core.units import duration, milliseconds, number
 from aftbed.inject.bit_patterns import WORD, drawn
 from aftbed.inject.grammar import INTERMITTENT, NUMBER, PERMANENT, FaultWords, whole
+from aftbed.vehicle.condition import QUANTITIES, Condition, Quantity
 
 EVERY, CHANCE, FOR = "every", "p", "for"
 COUNT_MAX: Final = 10**12 - 1

@@ -8,7 +8,6 @@ from typing import Final
 
 import msgspec
 
-from aftbed.core.busfault import Condition
 from aftbed.core.graph import BrickSpec, Graph
 from aftbed.core.messages import (
     Adapt,
@@ -27,6 +26,7 @@ from aftbed.core.messages import (
 from aftbed.core.script import Phase, Script
 from aftbed.inject.bus import BusFault
 from aftbed.inject.model import ArmedFault
+from aftbed.vehicle.condition import Condition
 
 WHOLE: Final = 1.0  # of a CPU
 UNANSWERED: Final = 0  # the token of an order that gets no Ack

@@ -9,13 +9,13 @@ from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from enum import Enum
 from typing import NamedTuple, Protocol
 
-from aftbed.core.busfault import Condition
 from aftbed.core.events import Event
 from aftbed.core.graph import Link
 from aftbed.core.journal import Record
 from aftbed.inject.kind import BusReceipt, FaultKind
 from aftbed.runtime.control import ToNode
 from aftbed.runtime.jobs import Jobs, Key, Wait
+from aftbed.vehicle.condition import Condition
 
 
 class End(Protocol):

@@ -27,8 +27,8 @@ from collections.abc import Callable, Sequence
 
 import msgspec
 
-from aftbed.core.busfault import NODES
 from aftbed.vehicle.can.bus import AnswerWatch, Bus, BusOptions, Schedule, open_bus
+from aftbed.vehicle.can.bus_model import NODES
 from aftbed.vehicle.can.dbc_file import Codec
 from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.can.hub_client import HubLine

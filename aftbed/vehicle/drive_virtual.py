@@ -26,10 +26,10 @@ Limits: except for its faults the bus is ideal. It takes no time, loses nothing,
 from collections import deque
 from collections.abc import Callable, Sequence
 
-from aftbed.core.busfault import NODES, Condition
-from aftbed.vehicle.can.bus_model import BusDisturber, BusModel, BusNode
+from aftbed.vehicle.can.bus_model import NODES, BusDisturber, BusModel, BusNode
 from aftbed.vehicle.can.dbc_file import Codec, load_dbc
 from aftbed.vehicle.can.frame import Frame
+from aftbed.vehicle.condition import Condition
 from aftbed.vehicle.ecus import BrakePolicy, CarBody, End
 from aftbed.vehicle.gateway import Gateway, GatewayCounts
 from aftbed.vehicle.plant import STEP_US, VehicleResult

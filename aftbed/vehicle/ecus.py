@@ -36,11 +36,12 @@ from typing import Final, Literal
 
 import msgspec
 
-from aftbed.core.busfault import FALLBACK, Condition
 from aftbed.vehicle.aeb.messages import STAGE_WARN
+from aftbed.vehicle.can.bus_model import FALLBACK
 from aftbed.vehicle.can.dbc_file import Codec
 from aftbed.vehicle.can.e2e import P11, ChannelState, FrameStatus, Receiver, Supervision
 from aftbed.vehicle.can.frame import Frame
+from aftbed.vehicle.condition import Condition
 from aftbed.vehicle.plant import STEP_US, Driver, Plant, Telemetry, VehicleResult
 from aftbed.vehicle.scenarios.scenario import Scenario
 

@@ -2,7 +2,6 @@
 
 from hypothesis import strategies as st
 
-from aftbed.core.busfault import QUANTITIES, Condition
 from aftbed.core.events import Event
 from aftbed.core.units import DURATION_MS_MAX
 from aftbed.inject.bit_patterns import BIT_MAX, BITS_MAX, Bit, BitBurst, Bits, Byte, StuckBit
@@ -15,6 +14,7 @@ from aftbed.inject.slow import SHARE_MAX, SHARE_MIN, SLOW_MS_MAX, Slow
 from aftbed.inject.state import StateFlip
 from aftbed.inject.timing import ONCE, Chance, Every, Permanent, Trigger
 from aftbed.inject.value import ValueFlip, ValuePlace
+from aftbed.vehicle.condition import QUANTITIES, Condition
 
 durations = st.integers(1, DURATION_MS_MAX)
 after = st.builds(Trigger, after_ms=durations)

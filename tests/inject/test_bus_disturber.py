@@ -6,7 +6,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aftbed.core.busfault import Condition
 from aftbed.core.errors import ConfigError
 from aftbed.inject.bus import BusFault, BusReport, read_bus_fault
 from aftbed.inject.bus_disturber import FLOOD_ID, REORDER_US_MAX, Disturber
@@ -14,6 +13,7 @@ from aftbed.vehicle.can.bus_model import CarriedFrame
 from aftbed.vehicle.can.dbc_file import load_dbc
 from aftbed.vehicle.can.e2e import intact, protect
 from aftbed.vehicle.can.frame import Frame
+from aftbed.vehicle.condition import Condition
 
 CODEC = load_dbc()
 TRACK, AEB_REQ, EGO = (CODEC.can_id(name) for name in ("RADAR_TRACK", "AEB_REQ", "EGO_STATE"))

@@ -4,7 +4,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aftbed.core.busfault import Condition
 from aftbed.core.errors import ConfigError
 from aftbed.inject.bus import (
     VERBS,
@@ -26,6 +25,7 @@ from aftbed.inject.bus import (
 )
 from aftbed.inject.model import Fault, on_bus, parse
 from aftbed.inject.timing import Chance, Every, Lasting, Permanent, Transient
+from aftbed.vehicle.condition import Condition
 
 NAMES = st.from_regex(r"[A-Za-z_][A-Za-z0-9_]{0,20}", fullmatch=True).filter(lambda name: name != "from")
 NODES = st.from_regex(r"[a-z_][a-z0-9_]{0,10}", fullmatch=True)

@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from somefaults import faults
 
-from aftbed.core.busfault import Condition
 from aftbed.core.errors import ConfigError
 from aftbed.inject.bit_patterns import Bit, BitBurst, Bits, Byte, StuckBit
 from aftbed.inject.channel import ChannelFault, Disturbance
@@ -20,6 +19,7 @@ from aftbed.inject.slow import Slow
 from aftbed.inject.state import StateFlip
 from aftbed.inject.timing import Chance, Every, Permanent, Trigger
 from aftbed.inject.value import ValueFlip, ValuePlace
+from aftbed.vehicle.condition import Condition
 
 TTC: Final = Condition("ttc", True, 1.2)
 

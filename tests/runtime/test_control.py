@@ -15,7 +15,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from aftbed.core import script
-from aftbed.core.busfault import Condition
 from aftbed.core.errors import PeerError
 from aftbed.core.messages import PACKET_BYTES_MAX
 from aftbed.inject.bus import BusFault, read_bus_fault
@@ -26,6 +25,7 @@ from aftbed.inject.timing import Trigger
 from aftbed.runtime import control
 from aftbed.runtime.unix.line import FDS_MAX, Line, decode_order, decode_report
 from aftbed.runtime.unix.packets import STATE_BYTES_MAX
+from aftbed.vehicle.condition import Condition
 
 ORDERS: Final[tuple[type[msgspec.Struct], ...]] = get_args(control.ToNode)
 REPORTS: Final[tuple[type[msgspec.Struct], ...]] = get_args(control.FromNode)

@@ -8,13 +8,13 @@ time of that step and, as in lockstep, before anything else that belongs to the 
 from collections.abc import Callable
 from typing import Final
 
-from aftbed.core.busfault import Condition
 from aftbed.inject.bus import BusFault, BusReport
 from aftbed.inject.bus_disturber import Disturber
 from aftbed.inject.kind import FaultKind
 from aftbed.runtime.interface import Met
 from aftbed.runtime.sim.clock import Clock
 from aftbed.runtime.sim.givens import car_in, own_codec
+from aftbed.vehicle.condition import Condition
 from aftbed.vehicle.drive_virtual import VirtualCar
 from aftbed.vehicle.plant import STEP_US, VehicleResult
 

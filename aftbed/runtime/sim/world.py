@@ -13,7 +13,6 @@ import msgspec
 
 from aftbed.adapt.bricks import LoadModule
 from aftbed.core.application import Application
-from aftbed.core.busfault import Condition
 from aftbed.core.graph import Graph, Link
 from aftbed.core.history import History
 from aftbed.core.journal import Entry, EntryKind, Record
@@ -41,6 +40,7 @@ from aftbed.runtime.sim.givens import Journal, check, graph_of, nothing_off_line
 from aftbed.runtime.sim.node_io import SimIO, SimNode
 from aftbed.runtime.sim.processes import Nursery, Process
 from aftbed.vehicle.aeb.function import default_application
+from aftbed.vehicle.condition import Condition
 from aftbed.vehicle.plant import VehicleResult
 
 STOPPED: Final = "detected stop"  # in the reason of a death

@@ -9,7 +9,6 @@ from typing import Final
 
 import msgspec
 
-from aftbed.core.busfault import Condition
 from aftbed.core.errors import StepFailed
 from aftbed.inject.bus import BusFault, BusReport
 from aftbed.inject.kind import FaultKind
@@ -18,6 +17,7 @@ from aftbed.runtime import control
 from aftbed.runtime.interface import Met
 from aftbed.runtime.jobs import Key, Wait
 from aftbed.runtime.unix.process_pool import Nursery, Process
+from aftbed.vehicle.condition import Condition
 
 HUB: Final = "hub"
 DISTURBED: Final = "disturbed"  # the hub to us: that fault is armed

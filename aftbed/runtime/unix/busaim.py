@@ -8,11 +8,11 @@ from typing import Final
 
 import msgspec
 
-from aftbed.core.busfault import NODES
 from aftbed.core.errors import ConfigError
 from aftbed.inject.bus import BusFault
 from aftbed.inject.model import Fault
 from aftbed.runtime.unix.options import CarRun, LoadRun, ReplayRun, Work
+from aftbed.vehicle.can.bus_model import NODES
 
 PLAYER: Final = "player"
 *_, GATEWAY = NODES

@@ -5,7 +5,6 @@ AEB_REQ.
 from collections.abc import Iterator
 from pathlib import Path
 
-from aftbed.core.busfault import NODES
 from aftbed.core.messages import Reply
 from aftbed.ftm.client import Client
 from aftbed.runtime.devices import CarDevice, resume_client
@@ -13,6 +12,7 @@ from aftbed.runtime.unix.devices import entries_of
 from aftbed.runtime.unix.journal_files import Dialogue
 from aftbed.runtime.unix.options import GatewayOptions
 from aftbed.vehicle.can.bus import BusOptions, open_bus
+from aftbed.vehicle.can.bus_model import NODES
 from aftbed.vehicle.can.dbc_file import load_dbc
 from aftbed.vehicle.gateway import BusGateway, Gateway
 from aftbed.vehicle.replay.map_file import find_map

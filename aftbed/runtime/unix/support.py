@@ -6,7 +6,6 @@ from pathlib import Path
 from random import Random
 from typing import Final
 
-from aftbed.core.busfault import Condition
 from aftbed.core.errors import StepFailed
 from aftbed.core.graph import Link
 from aftbed.core.journal import Record, records
@@ -22,6 +21,7 @@ from aftbed.runtime.unix.channels import Channel
 from aftbed.runtime.unix.event_loop import Loop
 from aftbed.runtime.unix.journal_files import Journal, contents, recorded_requests
 from aftbed.runtime.unix.process_pool import Nursery
+from aftbed.vehicle.condition import Condition
 
 HISTORY_NAME: Final = "adaptations.jsonl"
 DRAW_BITS: Final = 63

@@ -22,12 +22,15 @@ knows whether it holds: it is asked for `conditions`, and reports the first mome
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Sequence
-from typing import Generic, Protocol, TypeVar
+from typing import Final, Generic, Protocol, TypeVar
 
 import msgspec
 
-from aftbed.core.busfault import Condition
 from aftbed.vehicle.can.frame import Frame
+from aftbed.vehicle.condition import Condition
+
+NODES: Final = ("radar", "brake", "gateway")  # of a car's bus
+FALLBACK: Final = "fallback"  # the word with which the brake ECU reports that it misses its requests
 
 
 class CarriedFrame(msgspec.Struct, frozen=True):

@@ -65,12 +65,12 @@ from typing import Final, Protocol
 
 import msgspec
 
-from aftbed.core.busfault import Condition
 from aftbed.core.errors import ConfigError, HarnessError, PeerError
 from aftbed.core.units import number
 from aftbed.vehicle.can.bus_model import BusModel, BusNode
 from aftbed.vehicle.can.candump import log_line
 from aftbed.vehicle.can.frame import Frame
+from aftbed.vehicle.condition import Condition
 
 EVENTS_MAX: Final = 32  # in one round; the rest comes in the next
 READ_BYTES_MAX: Final = 4096

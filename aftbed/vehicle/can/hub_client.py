@@ -22,9 +22,9 @@ import time
 from collections import deque
 from typing import Final, cast
 
-from aftbed.core.busfault import Condition, Quantity
 from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.vehicle.can.bus import HOST, HUB_ANSWER_S_MAX, BusOptions
+from aftbed.vehicle.condition import Condition, Quantity
 
 READ_BYTES_MAX: Final = 4096
 _OK: Final = re.compile(r"< ok (?:(-|[0-9]+) )?>")

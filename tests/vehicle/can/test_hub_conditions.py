@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 from busharness import RawClient, RunningHub, running_hub
 
-from aftbed.core.busfault import Condition
 from aftbed.vehicle.can.hub import HubOptions
+from aftbed.vehicle.condition import Condition
 
 TTC = Condition("ttc", True, 1.2)
 WATCH_7 = "< watch 7 ttc below 1.2 >"

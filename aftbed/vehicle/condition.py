@@ -1,4 +1,4 @@
-"""Conditions of the car, and the names of a car's bus."""
+"""Conditions of the car at which a fault begins: of the plant itself, not of what a sensor measures."""
 
 from typing import Final, Literal
 
@@ -6,22 +6,20 @@ import msgspec
 
 from aftbed.core.units import number
 
-NODES: Final = ("radar", "brake", "gateway")  # that a car's bus has
-FALLBACK: Final = "fallback"  # what a brake ECU that misses its requests says that it has noticed
 QUANTITIES: Final = ("ttc", "gap", "speed")
 
-Quantity = Literal["ttc", "gap", "speed"]  # s, m, m/s: of the plant itself, not of what a sensor says
+Quantity = Literal["ttc", "gap", "speed"]  # s, m, m/s
 
 
 class Condition(msgspec.Struct, frozen=True):
-    """A quantity of the car is below, or else above, a value. What is not known is neither."""
+    """A quantity of the car is below, or else above, a value. An unknown quantity is neither."""
 
     quantity: Quantity
     below: bool
     value: float
 
     def holds(self, ttc_s: float | None, gap_m: float | None, speed_ms: float) -> bool:
-        """Whether it is so, in a car with these."""
+        """Whether it holds in a car with these."""
         found = {"ttc": ttc_s, "gap": gap_m, "speed": speed_ms}[self.quantity]
         if found is None:
             return False
