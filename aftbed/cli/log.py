@@ -5,11 +5,7 @@ from typing import Annotated
 
 import typer
 
-from aftbed.campaign.runfiles.export import Wanted, check
-from aftbed.campaign.runfiles.export import export as write_files
 from aftbed.core.errors import ConfigError
-from aftbed.judge.record import read_record
-from aftbed.vehicle.logs.convert import convert as convert_log
 
 log = typer.Typer()
 
@@ -31,6 +27,8 @@ def convert(
     ] = None,
 ) -> None:
     """Write a log of a CAN bus in another format."""
+    from aftbed.interop.logs import convert as convert_log  # noqa: PLC0415 - imports python-can
+
     done = convert_log(source, sink, from_format, to_format, dbc)
     print(f"{sink}: {done.frames} frames, {done.source} to {done.sink}")
     for reason, count in done.left_out.items():
@@ -44,9 +42,13 @@ def export(
     trace: Annotated[Path | None, typer.Option(help="Write its nodes to this file, for Perfetto.")] = None,
 ) -> None:
     """Write the record of a run as files that other tools open."""
-    wanted = Wanted(mcap, trace)
-    if wanted == Wanted():
+    from aftbed.interop.export import ExportFiles, check  # noqa: PLC0415 - imports the simulator, 200 ms
+    from aftbed.interop.export import export as write_files  # noqa: PLC0415 - the same
+    from aftbed.judge.record import read_record  # noqa: PLC0415 - the same
+
+    files = ExportFiles(mcap, trace)
+    if files == ExportFiles():
         raise ConfigError("nothing to write: give --mcap FILE, --trace FILE, or both")
-    check(wanted)
-    for line in write_files(read_record(record), wanted):
+    check(files)
+    for line in write_files(read_record(record), files):
         print(line)

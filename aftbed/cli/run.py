@@ -288,12 +288,12 @@ def _files(given: RunArguments) -> Callable[[Path], list[str]] | None:
     """What writes `--mcap` and `--trace` from a record; None without them. Checked before the run."""
     if given.mcap is None and given.trace is None:
         return None
-    from aftbed.campaign.runfiles.export import Wanted, check, export  # noqa: PLC0415 - the same
+    from aftbed.interop.export import ExportFiles, check, export  # noqa: PLC0415 - the same
     from aftbed.judge.record import read_record  # noqa: PLC0415 - only with --mcap or --trace
 
-    wanted = Wanted(given.mcap, given.trace)
-    check(wanted)
-    return lambda record: export(read_record(record), wanted)
+    files = ExportFiles(given.mcap, given.trace)
+    check(files)
+    return lambda record: export(read_record(record), files)
 
 
 def _write(write_files: Callable[[Path], list[str]], record: Path, *, as_json: bool) -> bool:

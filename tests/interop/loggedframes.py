@@ -4,8 +4,8 @@ from typing import Final
 
 from hypothesis import strategies as st
 
+from aftbed.interop.logs import EXTENDED_ID_MAX, TIME_US_MAX, FrameKind, LoggedFrame
 from aftbed.vehicle.can.frame import CAN_ID_MAX
-from aftbed.vehicle.logs.frames import EXTENDED_ID_MAX, TIME_US_MAX, Kind, LoggedFrame
 
 NOW_US: Final = 1_790_000_000_000_000
 TIMES_US: Final = st.one_of(
@@ -19,17 +19,17 @@ INTERFACES: Final = st.sampled_from(("can0", "can1", "can7"))
 @st.composite
 def frames(draw: st.DrawFn) -> LoggedFrame:
     """Any one."""
-    kind = draw(st.sampled_from(Kind))
-    extended = kind is Kind.ERROR or draw(st.booleans())
+    kind = draw(st.sampled_from(FrameKind))
+    extended = kind is FrameKind.ERROR or draw(st.booleans())
     return LoggedFrame(
         t_us=draw(TIMES_US),
         interface=draw(INTERFACES),
         can_id=draw(st.integers(0, EXTENDED_ID_MAX if extended else CAN_ID_MAX)),
-        data=b"" if kind is Kind.REMOTE else draw(st.binary(max_size=8)),
+        data=b"" if kind is FrameKind.REMOTE else draw(st.binary(max_size=8)),
         extended=extended,
         kind=kind,
-        length=draw(st.integers(0, 8)) if kind is Kind.REMOTE else 0,
-        sent=kind is not Kind.ERROR and draw(st.booleans()),  # nobody sends an error frame
+        length=draw(st.integers(0, 8)) if kind is FrameKind.REMOTE else 0,
+        sent=kind is not FrameKind.ERROR and draw(st.booleans()),  # nobody sends an error frame
     )
 
 

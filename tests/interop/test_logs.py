@@ -12,11 +12,11 @@ from hypothesis import HealthCheck, assume, given, settings
 from loggedframes import LOGS, NOW_US
 
 from aftbed.core.errors import ConfigError, PeerError
+from aftbed.interop import logs
+from aftbed.interop.logs import READERS, WRITERS, CanLog, FrameKind, LoggedFrame, channels_of, convert
 from aftbed.vehicle.can.candump import read_log
 from aftbed.vehicle.can.frame import Frame
-from aftbed.vehicle.logs import candumpfile
-from aftbed.vehicle.logs.convert import READERS, WRITERS, convert
-from aftbed.vehicle.logs.frames import Kind, Log, LoggedFrame, numbers
+from aftbed.vehicle.can.python_can import with_asammdf
 
 REAL_LOG: Final = Path(__file__).resolve().parents[3] / "shared" / "data" / "rav4_following_50kmh.log"
 KEPT_IN_FIXTURE: Final = (HealthCheck.function_scoped_fixture, HealthCheck.too_slow)
@@ -33,19 +33,19 @@ def without_direction(frames: Frames) -> Frames:
 
 def without_errors_content(frames: Frames) -> Frames:
     def bare(frame: LoggedFrame) -> LoggedFrame:
-        if frame.kind is not Kind.ERROR:
+        if frame.kind is not FrameKind.ERROR:
             return frame
-        return LoggedFrame(frame.t_us, frame.interface, 0, extended=True, kind=Kind.ERROR)
+        return LoggedFrame(frame.t_us, frame.interface, 0, extended=True, kind=FrameKind.ERROR)
 
     return tuple(bare(frame) for frame in frames)
 
 
 def data_only(frames: Frames) -> Frames:
-    return tuple(frame for frame in frames if frame.kind is Kind.DATA)
+    return tuple(frame for frame in frames if frame.kind is FrameKind.DATA)
 
 
 def by_time(frames: Frames) -> Frames:
-    order = (Kind.DATA, Kind.ERROR, Kind.REMOTE)
+    order = (FrameKind.DATA, FrameKind.ERROR, FrameKind.REMOTE)
     return tuple(sorted(frames, key=lambda frame: (frame.t_us, order.index(frame.kind))))
 
 
@@ -75,7 +75,7 @@ def test_every_frame_of_an_mf4_comes_back_too(frames: Frames, tmp_path: Path) ->
 
 def comes_back(name: str, frames: Frames, tmp_path: Path) -> None:
     path = tmp_path / "there"
-    WRITERS[name](Log(frames), path)
+    WRITERS[name](CanLog(frames), path)
     assert READERS[name](path).frames == COMES_BACK[name](frames)
 
 
@@ -92,7 +92,7 @@ def zone(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Ite
 @pytest.mark.parametrize("t_us", [0, 5_123_456, NOW_US + 5_001])
 def test_a_log_of_any_zone_comes_back(name: str, t_us: int, tmp_path: Path, zone: None) -> None:
     frames = (LoggedFrame(t_us, "can0", 0x123, b"\x01"), LoggedFrame(t_us + 1, "can0", 0x124, b""))
-    WRITERS[name](Log(frames), tmp_path / "there")
+    WRITERS[name](CanLog(frames), tmp_path / "there")
     assert READERS[name](tmp_path / "there").frames == frames
 
 
@@ -100,7 +100,7 @@ def test_a_log_without_a_date_has_none_in_another_zone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     frames = (LoggedFrame(1_500_000, "can0", 0x123, b"\x01"),)
-    WRITERS["asc"](Log(frames), tmp_path / "there")
+    WRITERS["asc"](CanLog(frames), tmp_path / "there")
     monkeypatch.setenv("TZ", "Pacific/Auckland")
     time.tzset()
     try:
@@ -112,7 +112,7 @@ def test_a_log_without_a_date_has_none_in_another_zone(
 
 def test_interfaces_keep_their_numbers_and_names_get_free_ones() -> None:
     def seen(*names: str) -> dict[str, int]:
-        return numbers(LoggedFrame(0, name, 1) for name in names)
+        return channels_of(LoggedFrame(0, name, 1) for name in names)
 
     assert seen("can3", "can0") == {"can3": 3, "can0": 0}
     assert seen("vcan0", "can0", "bus", "can1") == {"vcan0": 2, "can0": 0, "bus": 3, "can1": 1}
@@ -128,17 +128,17 @@ def test_interfaces_keep_their_numbers_and_names_get_free_ones() -> None:
         (b"(1.000002) vcan0 130# T", LoggedFrame(1_000_002, "vcan0", 0x130, sent=True)),
         (b"(1.000002) can0 00000130#ff R\r", LoggedFrame(1_000_002, "can0", 0x130, b"\xff", extended=True)),
         (b"(1.1000000) can0 130# R", LoggedFrame(2_000_000, "can0", 0x130)),  # of asc2log
-        (b"(1.000002) can0 130#R", LoggedFrame(1_000_002, "can0", 0x130, kind=Kind.REMOTE)),
-        (b"(1.000002) can0 130#r8", LoggedFrame(1_000_002, "can0", 0x130, kind=Kind.REMOTE, length=8)),
+        (b"(1.000002) can0 130#R", LoggedFrame(1_000_002, "can0", 0x130, kind=FrameKind.REMOTE)),
+        (b"(1.000002) can0 130#r8", LoggedFrame(1_000_002, "can0", 0x130, kind=FrameKind.REMOTE, length=8)),
         (
             b"(1.000002) can0 20000004#0010000000000000",
-            LoggedFrame(1_000_002, "can0", 4, bytes.fromhex("0010000000000000"), True, Kind.ERROR),
+            LoggedFrame(1_000_002, "can0", 4, bytes.fromhex("0010000000000000"), True, FrameKind.ERROR),
         ),
         (b"(1.000002) can0 130##1AABB", None),
     ],
 )
 def test_a_line_of_candump_means_what_can_utils_mean(line: bytes, found: LoggedFrame | None) -> None:
-    assert candumpfile.parse(line) == found
+    assert logs.parse_candump(line) == found
 
 
 @pytest.mark.parametrize(
@@ -158,15 +158,30 @@ def test_a_line_of_candump_means_what_can_utils_mean(line: bytes, found: LoggedF
 )
 def test_a_line_that_is_no_candump_is_refused_with_its_reason(line: bytes, reason: str) -> None:
     with pytest.raises(PeerError, match=re.escape(reason)):
-        candumpfile.parse(line)
+        logs.parse_candump(line)
 
 
 def test_what_aftbed_logs_is_read_as_a_replay_reads_it(tmp_path: Path) -> None:
     path = tmp_path / "bus.log"
     path.write_text("(0000000000.005000) can0 131#1410010100000000\n(0000000000.010000) can0 110#85\n")
     replayed, _ = read_log(path)
-    read = candumpfile.read(path).frames
+    read = logs.read_candump(path).frames
     assert [Frame(f.t_us, f.can_id, f.data) for f in read] == [logged.frame for logged in replayed]
+
+
+@pytest.mark.parametrize(("first_us", "date_s"), [(5_123_456, 0), (NOW_US + 5_001, NOW_US // 1_000_000)])
+def test_an_mf4_has_the_date_of_its_log_and_times_from_there(
+    first_us: int, date_s: int, tmp_path: Path
+) -> None:
+    """python-can's own writer dates it with the time of writing: older frames lie before its beginning."""
+    with_asammdf()
+    from asammdf import MDF  # noqa: PLC0415
+
+    WRITERS["mf4"](CanLog((LoggedFrame(first_us, "can0", 0x123, b"\x01"),)), tmp_path / "a.mf4")
+    with MDF(tmp_path / "a.mf4") as mdf:
+        assert mdf.header.start_time.timestamp() == date_s
+        times_s = mdf.get("CAN_DataFrame", group=0).timestamps
+        assert times_s.tolist() == [pytest.approx(first_us / 1e6 - date_s, abs=1e-6)]
 
 
 @pytest.mark.skipif(not REAL_LOG.exists(), reason="the real drive is not on this machine")

@@ -15,12 +15,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from aftbed.core.errors import ConfigError
-from aftbed.vehicle.logs.convert import READERS, WRITERS, convert
-from aftbed.vehicle.logs.frames import Log, LoggedFrame
+from aftbed.interop.logs import READERS, WRITERS, CanLog, LoggedFrame, convert
 
 FRAMES: Final = tuple(LoggedFrame(1000 * n, "can0", 0x100 + n % 64, bytes(8)) for n in range(200))
 WITH_FILES: Final = (HealthCheck.function_scoped_fixture, HealthCheck.too_slow)
-MF4: Final = Log(FRAMES[:20])
+MF4: Final = CanLog(FRAMES[:20])
 
 
 def refusal(source: Path, sink: Path, **options: str) -> str:
@@ -158,7 +157,7 @@ def test_a_disk_that_is_full_leaves_no_half_of_a_file(name: str, tmp_path: Path)
 
 
 def blf(tmp_path: Path) -> bytes:
-    WRITERS["blf"](Log(FRAMES), tmp_path / "whole.blf")
+    WRITERS["blf"](CanLog(FRAMES), tmp_path / "whole.blf")
     return (tmp_path / "whole.blf").read_bytes()
 
 
@@ -194,7 +193,7 @@ def test_an_object_of_no_length_does_not_go_on_for_ever(size: int, head: int, tm
 
 @pytest.mark.parametrize("packed", [b"\0\0", b"x\x9c\xff"], ids=["no zlib", "no deflate"])
 def test_an_mf4_whose_blocks_cannot_be_unpacked_is_malformed(packed: bytes, tmp_path: Path) -> None:
-    WRITERS["mf4"](Log(FRAMES), tmp_path / "whole.mf4")
+    WRITERS["mf4"](CanLog(FRAMES), tmp_path / "whole.mf4")
     whole = bytearray((tmp_path / "whole.mf4").read_bytes())
     data = whole.index(b"##DZ") + 48  # behind the head of a block of packed data (ASAM MDF 4.1, DZBLOCK)
     whole[data : data + len(packed)] = packed
@@ -206,7 +205,7 @@ def test_an_mf4_whose_reader_goes_on_for_ever_is_malformed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As it may where asammdf follows a pointer to nowhere; here it is given no time."""
-    monkeypatch.setattr("aftbed.vehicle.logs.mf4file.READ_SECONDS_MAX", 0.001)
+    monkeypatch.setattr("aftbed.interop.logs.MF4_READ_SECONDS_MAX", 0.001)
     WRITERS["mf4"](MF4, tmp_path / "a.mf4")
     with pytest.raises(ConfigError, match=r"malformed: it takes more than 0\.001 s"):
         READERS["mf4"](tmp_path / "a.mf4")

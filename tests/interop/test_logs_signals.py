@@ -7,10 +7,8 @@ from typing import Final
 import pytest
 
 from aftbed.core.errors import ConfigError
+from aftbed.interop.logs import LoggedFrame, candump_line, convert
 from aftbed.vehicle.can.dbc_file import Codec, load_dbc
-from aftbed.vehicle.logs.candumpfile import line_of
-from aftbed.vehicle.logs.convert import convert
-from aftbed.vehicle.logs.frames import LoggedFrame
 
 CODEC: Final[Codec] = load_dbc()
 MULTIPLEXED: Final = """VERSION ""
@@ -31,7 +29,7 @@ def frame(t_us: int, name: str, interface: str = "can0", **signals: float) -> Lo
 
 def table(tmp_path: Path, *frames: LoggedFrame, dbc: Path | None = None) -> tuple[list[dict[str, str]], str]:
     """The rows without their empty fields, and the head line."""
-    (tmp_path / "bus.log").write_text("".join(map(line_of, frames)))
+    (tmp_path / "bus.log").write_text("".join(map(candump_line, frames)))
     convert(tmp_path / "bus.log", tmp_path / "bus.csv", dbc=dbc)
     with (tmp_path / "bus.csv").open(newline="") as file:
         rows = [{key: value for key, value in row.items() if value} for row in csv.DictReader(file)]
@@ -89,7 +87,7 @@ def test_what_the_dbc_does_not_have_is_counted(tmp_path: Path) -> None:
     other = LoggedFrame(2, "can0", 0x7FF)
     long = LoggedFrame(4, "can0", CODEC.can_id("EGO_STATE"), bytes(8), extended=True)
     log = tmp_path / "bus.log"
-    log.write_text("".join(map(line_of, (frame(1, "EGO_STATE"), other, short, long))))
+    log.write_text("".join(map(candump_line, (frame(1, "EGO_STATE"), other, short, long))))
     done = convert(log, tmp_path / "bus.csv")
     assert done.frames == 1
     assert done.left_out == {

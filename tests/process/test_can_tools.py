@@ -21,11 +21,8 @@ import msgspec
 import pytest
 from liveruns import Home, home
 
+from aftbed.interop.logs import READERS, CanLog, LoggedFrame, convert, read_candump, write_candump
 from aftbed.vehicle.can.bus import BusOptions, open_bus
-from aftbed.vehicle.logs.candumpfile import read as read_candump
-from aftbed.vehicle.logs.candumpfile import write as write_candump
-from aftbed.vehicle.logs.convert import READERS, convert
-from aftbed.vehicle.logs.frames import Log, LoggedFrame
 
 __all__ = ["home"]
 
@@ -98,7 +95,7 @@ def test_log2asc_reads_what_the_hub_logged_and_we_read_what_it_wrote(record: Pat
     ours = read_candump(record / "rec" / "bus.log").frames
     log, asc = record / "dated.log", record / "by-can-utils.asc"
     dated = tuple(msgspec.structs.replace(f, t_us=f.t_us + 1_700_000_000_000_000) for f in ours)
-    write_candump(Log(dated), log)
+    write_candump(CanLog(dated), log)
     tool("log2asc", "-I", str(log), "-O", str(asc), "can0")
     assert seen(READERS["asc"](asc).frames) == seen(ours)
     tool("log2asc", "-I", str(record / "rec" / "bus.log"), "-O", str(asc), "can0")
@@ -121,12 +118,12 @@ def test_canplayer_plays_what_the_hub_logged(record: Path, home: Home) -> None:
 
 
 def test_a_run_leaves_the_files_that_it_was_asked_for(record: Path, home: Home) -> None:
-    """What is in them, `tests/campaign/test_runfiles.py` says; here, that a real run has it."""
+    """tests/interop/test_exported_runs.py checks the contents; here a real run has them."""
     import json  # noqa: PLC0415
 
     from mcap.reader import make_reader  # noqa: PLC0415
 
-    sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "campaign"))
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "interop"))
     from tracechecks import problems  # noqa: PLC0415
 
     events = json.loads((record / "run.json").read_text())["traceEvents"]

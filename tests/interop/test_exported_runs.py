@@ -1,4 +1,4 @@
-"""A run as a trace and as MCAP: what a person sees there is what the record says."""
+"""A run as a trace and as MCAP: a viewer shows what the record says."""
 
 import copy
 import json
@@ -8,154 +8,25 @@ from typing import Any, Final
 
 import pytest
 from mcap.reader import make_reader
-from records import CAR, CRASH, MS, RecordInTheMaking
+from recordedruns import asking, finished, run_of
+from records import CAR, MS
 from tracechecks import problems
 
-from aftbed.campaign.runfiles import tracefile
-from aftbed.campaign.runfiles.axis import Axis
-from aftbed.campaign.runfiles.export import Wanted, check, export
-from aftbed.campaign.runfiles.steps import between_processes, ends_ns, followed, steps_of
 from aftbed.core.errors import ConfigError
-from aftbed.core.events import Event
-from aftbed.core.journal import EntryKind
-from aftbed.judge.record import RunRecord, read_record
-from aftbed.runtime.unix.journal_files import Dialogue
-from aftbed.runtime.unix.options import CarRun, LoadRun, ReplayRun, Work
-from aftbed.vehicle.aeb.messages import AebInput, AebTarget, encode_request
+from aftbed.core.events import FIRST_FAULT, Event
+from aftbed.interop import perfetto
+from aftbed.interop.export import ExportFiles, check, export
+from aftbed.judge.record import RunRecord
+from aftbed.runtime.unix.options import ReplayRun
 from aftbed.vehicle.can.candump import log_line
 from aftbed.vehicle.can.dbc_file import Codec, load_dbc
 from aftbed.vehicle.can.e2e import protect
 from aftbed.vehicle.can.frame import Frame
 
 CODEC: Final[Codec] = load_dbc()
-FIRST_FAULT: Final = 1_000_001
-PBR_PATH: Final = (  # journal, event: one request under PBR, as it happens
-    ("client.1", Event.REQUEST_SENT),
-    ("a-protocol.1", Event.REQUEST_RECEIVED),
-    ("a-before.1", Event.BEFORE_EXIT),
-    ("a-proceed.1", Event.PROCEED_ENTER),
-    ("a-server.1", Event.SERVER_ENTER),
-    ("a-server.1", Event.SERVER_EXIT),
-    ("a-server.1", Event.STATE_CAPTURED),
-    ("a-after.1", Event.CHECKPOINT_SENT),
-    ("b-server.1", Event.STATE_RESTORED),
-    ("a-protocol.1", Event.REPLY_STORED),
-    ("b-after.1", Event.CHECKPOINT_APPLIED),
-    ("a-protocol.1", Event.REPLY_SENT),
-    ("proxy.1", Event.REPLY_ACCEPTED),
-    ("client.1", Event.REPLY_DELIVERED),
-)
 
 
-def run_of(path: Path, work: Work | None = None, requests: int = 2) -> RecordInTheMaking:
-    """A run whose journals have the whole path of each request; it has to be `finished`."""
-    run = RecordInTheMaking(path, work, (CRASH,))
-    for number in range(1, requests + 1):
-        for journal, event in PBR_PATH:
-            run.note(journal, event, number)
-    return run
-
-
-def finished(run: RecordInTheMaking) -> RunRecord:
-    run.verdict()
-    return read_record(run.path)
-
-
-def arrows(record: RunRecord) -> list[tuple[str, str, str]]:
-    steps = steps_of(record)
-    found = between_processes(steps, followed(steps))
-    return [(steps[one.cause].node, one.channel, steps[one.effect].node) for one in found]
-
-
-# -- the trace ------------------------------------------------------------------------------------
-
-
-def test_the_messages_of_a_request_are_those_of_the_paper(tmp_path: Path) -> None:
-    assert arrows(finished(run_of(tmp_path, requests=1))) == [
-        ("client", "pxy2pro", "a/protocol"),
-        ("a/protocol", "pro2bfr", "a/before"),
-        ("a/before", "bfr2prd", "a/proceed"),
-        ("a/proceed", "prd2srv", "a/server"),
-        ("a/server", "srv2aft", "a/after"),
-        ("a/after", "aft2aft", "b/server"),
-        ("a/after", "aft2pro", "a/protocol"),
-        ("b/server", "srv2aft", "b/after"),
-        ("a/protocol", "pro2pxy", "proxy"),
-        ("proxy", "pxy2clt", "client"),
-    ]
-
-
-def test_a_request_that_is_asked_again_is_answered_by_who_leads_then(tmp_path: Path) -> None:
-    run = RecordInTheMaking(tmp_path)
-    for journal, event in PBR_PATH[:8]:
-        run.note(journal, event, 1)
-    run.note("b-protocol.1", Event.DEDUPE_HIT, 1)
-    run.note("proxy.1", Event.REPLY_ACCEPTED, 1)
-    assert arrows(finished(run))[-2:] == [
-        ("client", "pxy2pro", "b/protocol"),
-        ("b/protocol", "pro2pxy", "proxy"),
-    ]
-
-
-LFR_PATH: Final = (
-    *PBR_PATH[:2],
-    ("a-before.1", Event.FOLLOWER_FORWARDED),
-    ("a-proceed.1", Event.PROCEED_ENTER),
-    ("b-before.1", Event.BEFORE_EXIT),
-    ("b-proceed.1", Event.PROCEED_ENTER),
-    ("a-server.1", Event.SERVER_ENTER),
-    ("b-server.1", Event.SERVER_ENTER),
-    ("a-server.1", Event.SERVER_EXIT),
-    ("b-server.1", Event.SERVER_EXIT),
-    ("a-after.1", Event.FOLLOWER_NOTIFIED),
-    ("a-protocol.1", Event.REPLY_STORED),
-)
-
-
-def test_the_replicas_of_lfr_execute_each_for_itself(tmp_path: Path) -> None:
-    run = RecordInTheMaking(tmp_path)
-    for journal, event in LFR_PATH:
-        run.note(journal, event, 1)
-    assert arrows(finished(run)) == [
-        ("client", "pxy2pro", "a/protocol"),
-        ("a/protocol", "pro2bfr", "a/before"),
-        ("a/before", "bfr2bfr", "b/before"),
-        ("b/before", "bfr2prd", "b/proceed"),
-        ("a/proceed", "prd2srv", "a/server"),
-        ("b/proceed", "prd2srv", "b/server"),
-        ("a/server", "prd2aft", "a/after"),
-        ("a/after", "aft2pro", "a/protocol"),
-    ]
-
-
-def test_arrows_belong_to_one_request(tmp_path: Path) -> None:
-    run = RecordInTheMaking(tmp_path)
-    run.note("client.1", Event.REQUEST_SENT, 1)
-    run.note("client.1", Event.REQUEST_SENT, 2)
-    run.note("a-protocol.1", Event.REQUEST_RECEIVED, 1)
-    steps = steps_of(finished(run))
-    assert [(steps[f.cause].request_id, steps[f.effect].request_id) for f in followed(steps)] == [(1, 1)]
-
-
-def test_a_step_ends_when_what_followed_begins_and_before_the_next_of_its_process(tmp_path: Path) -> None:
-    run = RecordInTheMaking(tmp_path)
-    run.t_ns -= MS  # each note is a ms behind the one before
-    run.note("client.1", Event.REQUEST_SENT, 1)
-    run.t_ns -= MS - 50_000
-    run.note("a-protocol.1", Event.REQUEST_RECEIVED, 1)
-    run.t_ns -= MS - 500
-    run.note("a-protocol.1", Event.DEDUPE_HIT, 2)
-    steps = steps_of(finished(run))
-    lengths = [end - step.t_ns for step, end in zip(steps, ends_ns(steps, followed(steps)), strict=True)]
-    assert lengths == [50_000, 500, 1_000]
-
-
-def test_a_step_of_which_nothing_came_for_long_is_not_drawn_as_long(tmp_path: Path) -> None:
-    run = RecordInTheMaking(tmp_path)
-    run.note("client.1", Event.REQUEST_SENT, 1)
-    run.note("a-protocol.1", Event.REQUEST_RECEIVED, 1)  # a ms later: the first was hung
-    steps = steps_of(finished(run))
-    assert ends_ns(steps, followed(steps))[0] - steps[0].t_ns == 200_000
+# -- the trace ---
 
 
 @pytest.fixture
@@ -179,7 +50,7 @@ def eventful(tmp_path: Path) -> RunRecord:
 def traced(record: RunRecord) -> list[dict[str, Any]]:
     """As the file has it."""
     path = record.path / "trace.json"
-    assert tracefile.write(record, path) == len(json.loads(path.read_text())["traceEvents"])
+    assert perfetto.write(record, path) == len(json.loads(path.read_text())["traceEvents"])
     document = json.loads(path.read_text())
     assert document["otherData"]["ftm"] == "pbr"
     return document["traceEvents"]  # type: ignore[no-any-return]
@@ -240,50 +111,6 @@ def test_the_checker_of_traces_refuses_a_broken_one(
     assert any(said in problem for problem in problems(events)), problems(events)
 
 
-# -- the axis of time -----------------------------------------------------------------------------
-
-
-def asking(path: Path, work: Work, *pairs: tuple[int, int]) -> RunRecord:
-    """A run with a request at each (t_ns, t_ms)."""
-    run = RecordInTheMaking(path, work)
-    dialogue = Dialogue(path / "journal" / "client.2.dialogue", "client")
-    for number, (t_ns, t_ms) in enumerate(pairs, 1):
-        target = AebTarget(0, 40.0, -10.0)
-        payload = encode_request(AebInput(t_ms, 14.0, True, True, (target,)))
-        dialogue.write(t_ns, number, 0, EntryKind.SENT, payload)
-    dialogue.write(pairs[-1][0], 99, 0, EntryKind.SENT, b"\xff struck by a fault")
-    return finished(run)
-
-
-def test_in_real_time_the_axis_is_the_monotonic_clock_less_one_offset(tmp_path: Path) -> None:
-    begin = 5_000 * MS
-    late = ((begin + 20 * MS + 900_000, 20), (begin + 40 * MS + 100_000, 40), (begin + 130 * MS, 60))
-    axis = Axis(asking(tmp_path, CarRun("ccrs-50", 1.0, "latch"), *late))
-    assert axis.at(begin + 50 * MS) == 50 * MS - 100_000, "by the fastest request"
-    assert axis.at(begin - 1_000 * MS) == 0, "what was before the car's run lies at its beginning"
-
-
-def test_at_another_pace_bus_time_goes_faster(tmp_path: Path) -> None:
-    axis = Axis(asking(tmp_path, CarRun("ccrs-50", 4.0, "latch"), (1_005 * MS, 20), (1_010 * MS, 40)))
-    assert axis.at(1_020 * MS) == 80 * MS
-
-
-def test_in_lockstep_time_stands_still_while_the_function_works(tmp_path: Path) -> None:
-    axis = Axis(asking(tmp_path, CAR, (1_000 * MS, 20), (1_002 * MS, 40)))
-    assert [axis.at(t * MS) for t in (999, 1_000, 1_001, 1_002, 1_999)] == [
-        0,
-        20 * MS,
-        20 * MS,
-        40 * MS,
-        40 * MS,
-    ]
-
-
-def test_without_a_bus_the_axis_is_the_time_since_the_launch(tmp_path: Path) -> None:
-    record = finished(run_of(tmp_path, LoadRun(2, 0.0)))
-    assert Axis(record).at(record.started_ns + 7) == 7
-
-
 # -- MCAP -----------------------------------------------------------------------------------------
 
 
@@ -298,7 +125,7 @@ def frame(t_us: int, name: str, broken: bool = False, **signals: float) -> str:
 def mcap_of(record: RunRecord) -> dict[str, list[tuple[int, dict[str, Any]]]]:
     """What the reader of the format finds: time and message, by topic."""
     path = record.path / "run.mcap"
-    lines = export(record, Wanted(mcap=path))
+    lines = export(record, ExportFiles(mcap=path))
     found: dict[str, list[tuple[int, dict[str, Any]]]] = {}
     times = []
     with path.open("rb") as file:
@@ -385,9 +212,12 @@ def test_a_replay_shows_what_the_function_was_told(tmp_path: Path) -> None:
 
 def test_a_file_that_cannot_be_written_is_refused_before_the_run(tmp_path: Path) -> None:
     for wanted, said in (
-        (Wanted(mcap=tmp_path), f"--mcap {tmp_path}: is a directory, a file is allowed"),
-        (Wanted(trace=tmp_path / "no" / "a"), f"--trace {tmp_path}/no/a: {tmp_path}/no is no directory"),
-        (Wanted(tmp_path / "a", tmp_path / "a"), f"--mcap and --trace: {tmp_path}/a is asked for as both"),
+        (ExportFiles(mcap=tmp_path), f"--mcap {tmp_path}: is a directory, a file is allowed"),
+        (ExportFiles(trace=tmp_path / "no" / "a"), f"--trace {tmp_path}/no/a: {tmp_path}/no is no directory"),
+        (
+            ExportFiles(tmp_path / "a", tmp_path / "a"),
+            f"--mcap and --trace: {tmp_path}/a is asked for as both",
+        ),
     ):
         with pytest.raises(ConfigError) as refused:
             check(wanted)
@@ -398,6 +228,6 @@ def test_a_file_that_cannot_be_written_is_refused_before_the_run(tmp_path: Path)
 def test_a_file_for_which_there_is_no_room_is_an_error(kind: str, tmp_path: Path) -> None:
     """Here: in a directory that takes no new file."""
     record = finished(run_of(tmp_path / "run"))
-    wanted = Wanted(**{kind: Path("/proc/file")})
+    wanted = ExportFiles(**{kind: Path("/proc/file")})
     with pytest.raises(ConfigError, match=r"^/proc/file: cannot be written: "):
         export(record, wanted)

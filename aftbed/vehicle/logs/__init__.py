@@ -1,1 +1,0 @@
-"""Logs of a CAN bus in the formats that other tools open."""
