@@ -1,4 +1,4 @@
-"""Logs made by chance: every kind of frame that a log may hold."""
+"""Generated logs with every kind of frame."""
 
 from typing import Final
 
@@ -29,7 +29,7 @@ def frames(draw: st.DrawFn) -> LoggedFrame:
         extended=extended,
         kind=kind,
         length=draw(st.integers(0, 8)) if kind is FrameKind.REMOTE else 0,
-        sent=kind is not FrameKind.ERROR and draw(st.booleans()),  # nobody sends an error frame
+        sent=kind is not FrameKind.ERROR and draw(st.booleans()),
     )
 
 

@@ -31,7 +31,7 @@ CODEC: Final[Codec] = load_dbc()
 
 @pytest.fixture
 def eventful(tmp_path: Path) -> RunRecord:
-    """A crash, a failover, an adaptation, requests, and words for people."""
+    """A crash, a failover, an adaptation, requests, and printed lines."""
     run = run_of(tmp_path)
     run.request()
     run.note("a-after.1", Event.FAULT_APPLIED, detail=FIRST_FAULT)
@@ -56,13 +56,13 @@ def traced(record: RunRecord) -> list[dict[str, Any]]:
     return document["traceEvents"]  # type: ignore[no-any-return]
 
 
-def test_a_trace_is_one_that_a_viewer_can_show(eventful: RunRecord) -> None:
+def test_a_viewer_can_show_the_trace(eventful: RunRecord) -> None:
     events = traced(eventful)
     assert problems(events) == []
     assert {"X", "s", "f", "i", "b", "e", "M"} == {event["ph"] for event in events}
 
 
-def test_faults_and_steps_of_adaptations_are_instants_in_their_own_words(eventful: RunRecord) -> None:
+def test_faults_and_adaptation_steps_are_instants(eventful: RunRecord) -> None:
     instants = {e["name"]: e["cat"] for e in traced(eventful) if e["ph"] == "i"}
     assert instants == {
         "crash primary at checkpoint.sent nth 2": "fault",
@@ -76,7 +76,7 @@ def test_faults_and_steps_of_adaptations_are_instants_in_their_own_words(eventfu
     }
 
 
-def test_who_takes_the_place_of_a_dead_process_has_a_track_of_its_own(eventful: RunRecord) -> None:
+def test_a_replacement_process_has_its_own_track(eventful: RunRecord) -> None:
     threads = [e["args"]["name"] for e in traced(eventful) if e["name"] == "thread_name"]
     assert {"a/after", "a/after (2)"} < set(threads)
     assert threads[0] == "client"
@@ -142,7 +142,7 @@ def mcap_of(record: RunRecord) -> dict[str, list[tuple[int, dict[str, Any]]]]:
     return found
 
 
-def test_what_is_on_the_bus_is_on_the_topics(tmp_path: Path) -> None:
+def test_the_frames_of_the_bus_are_on_the_topics(tmp_path: Path) -> None:
     run = run_of(tmp_path, CAR)
     (tmp_path / "bus.log").write_text(
         frame(1_000, "EGO_STATE", SPEED=15, ACCELERATION=-2.0, SPEED_VALID=1)
@@ -196,7 +196,7 @@ def test_faults_and_adaptations_are_on_a_topic_apart_from_the_path_of_requests(e
     assert found["/log"][0][1]["timestamp"] == {"sec": 0, "nsec": 1_500_000}
 
 
-def test_a_replay_shows_what_the_function_was_told(tmp_path: Path) -> None:
+def test_a_replay_shows_the_requests_to_the_function(tmp_path: Path) -> None:
     work = ReplayRun("/gone.log", "/gone.dbc", "/gone.yaml", None)
     record = asking(tmp_path, work, (1_000 * MS, 20))
     (tmp_path / "bus.log").write_text(
@@ -225,7 +225,7 @@ def test_a_file_that_cannot_be_written_is_refused_before_the_run(tmp_path: Path)
 
 
 @pytest.mark.parametrize("kind", ["mcap", "trace"])
-def test_a_file_for_which_there_is_no_room_is_an_error(kind: str, tmp_path: Path) -> None:
+def test_a_full_disk_is_an_error(kind: str, tmp_path: Path) -> None:
     """Here: in a directory that takes no new file."""
     record = finished(run_of(tmp_path / "run"))
     wanted = ExportFiles(**{kind: Path("/proc/file")})

@@ -1,4 +1,4 @@
-"""A log comes back as it was, through every format, but for what the format does not have."""
+"""A log survives the way through every format, except for what the format lacks."""
 
 import re
 import time
@@ -66,7 +66,7 @@ def test_every_frame_comes_back_to_the_microsecond(name: str, frames: Frames, tm
     comes_back(name, frames, tmp_path)
 
 
-@pytest.mark.process  # each is read by one of its own
+@pytest.mark.process  # each MF4 is read by a process of its own
 @settings(max_examples=40, suppress_health_check=KEPT_IN_FIXTURE, deadline=None)
 @given(frames=LOGS)
 def test_every_frame_of_an_mf4_comes_back_too(frames: Frames, tmp_path: Path) -> None:
@@ -137,7 +137,7 @@ def test_interfaces_keep_their_numbers_and_names_get_free_ones() -> None:
         (b"(1.000002) can0 130##1AABB", None),
     ],
 )
-def test_a_line_of_candump_means_what_can_utils_mean(line: bytes, found: LoggedFrame | None) -> None:
+def test_a_candump_line_is_parsed_as_by_can_utils(line: bytes, found: LoggedFrame | None) -> None:
     assert logs.parse_candump(line) == found
 
 
@@ -161,7 +161,7 @@ def test_a_line_that_is_no_candump_is_refused_with_its_reason(line: bytes, reaso
         logs.parse_candump(line)
 
 
-def test_what_aftbed_logs_is_read_as_a_replay_reads_it(tmp_path: Path) -> None:
+def test_a_log_of_the_hub_is_read_as_by_a_replay(tmp_path: Path) -> None:
     path = tmp_path / "bus.log"
     path.write_text("(0000000000.005000) can0 131#1410010100000000\n(0000000000.010000) can0 110#85\n")
     replayed, _ = read_log(path)
@@ -194,7 +194,7 @@ def test_a_real_drive_comes_back_byte_for_byte(name: str, tmp_path: Path) -> Non
     assert back.read_bytes() == REAL_LOG.read_bytes()
 
 
-def test_what_is_left_out_is_counted(tmp_path: Path) -> None:
+def test_frames_left_out_are_counted(tmp_path: Path) -> None:
     log = tmp_path / "all.log"
     log.write_text(
         "(1.000000) can0 130#01\n(1.000001) can0 130#R2\n(1.000002) can0 20000080#\n"

@@ -1,4 +1,4 @@
-"""What is no log, or only a part of one, is one clear error, and leaves the disk as it was."""
+"""A file that is no log, or a torn one, is one clear error; no file is written."""
 
 import re
 import resource
@@ -66,7 +66,7 @@ TRC_HEAD: Final = ";$FILEVERSION=2.1\n;$STARTTIME=25569.0\n;$COLUMNS=N,O,T,B,I,d
         ("a.mf4", b"MDF     4.10    " + bytes(50), "a.mf4: not an MF4 that can be read"),
     ],
 )
-def test_what_is_no_log_is_named_with_its_place(
+def test_a_malformed_log_is_refused_with_file_and_position(
     name: str, content: bytes | str, reason: str, tmp_path: Path
 ) -> None:
     assert reason in refusal(made(tmp_path / name, content), tmp_path / "out.log2", to_format="candump")
@@ -114,7 +114,7 @@ def test_what_is_no_log_is_named_with_its_place(
         ("a.log", "a.log/b.asc", {}, "a.log/b.asc: cannot be written: Not a directory"),
     ],
 )
-def test_a_conversion_that_cannot_be_is_refused(
+def test_an_impossible_conversion_is_refused(
     source: str,
     sink: str,
     options: dict[str, str],
@@ -128,7 +128,7 @@ def test_a_conversion_that_cannot_be_is_refused(
     assert reason in refusal(Path(source), Path(sink), **paths)  # type: ignore[arg-type]
 
 
-def test_what_was_there_before_an_error_is_still_there(tmp_path: Path) -> None:
+def test_an_error_keeps_the_previous_file(tmp_path: Path) -> None:
     sink = made(tmp_path / "out.asc", "of yesterday")
     refusal(made(tmp_path / "a.log", "hello\n"), sink)
     assert sink.read_text() == "of yesterday"
@@ -146,7 +146,7 @@ def small_disk() -> Iterator[None]:
 
 
 @pytest.mark.parametrize("name", ["candump", "asc", "blf", "trc", "csv"])
-def test_a_disk_that_is_full_leaves_no_half_of_a_file(name: str, tmp_path: Path) -> None:
+def test_a_full_disk_leaves_no_partial_file(name: str, tmp_path: Path) -> None:
     source = made(tmp_path / "a.log", "(1.000000) can0 120#1B10413600000000\n" * 20)
     with small_disk():
         said = refusal(source, tmp_path / "out", to_format=name)
@@ -179,7 +179,7 @@ def test_a_blf_whose_header_was_never_completed_is_walked_to_where_it_is_torn(tm
 
 
 @pytest.mark.parametrize(("size", "head"), [(0, 16), (8, 16), (48, 60)])
-def test_an_object_of_no_length_does_not_go_on_for_ever(size: int, head: int, tmp_path: Path) -> None:
+def test_a_blf_object_of_length_0_is_refused(size: int, head: int, tmp_path: Path) -> None:
     inner = struct.pack("<4sHHLL", b"LOBJ", head, 1, size, 1) + bytes(32)
     packed = zlib.compress(inner)
     outer = struct.pack("<4sHHLL", b"LOBJ", 16, 1, 32 + len(packed), 10)
@@ -201,10 +201,10 @@ def test_an_mf4_whose_blocks_cannot_be_unpacked_is_malformed(packed: bytes, tmp_
         READERS["mf4"](made(tmp_path / "a.mf4", bytes(whole)))
 
 
-def test_an_mf4_whose_reader_goes_on_for_ever_is_malformed(
+def test_an_mf4_reader_that_exceeds_its_deadline_is_killed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As it may where asammdf follows a pointer to nowhere; here it is given no time."""
+    """asammdf may follow a wild pointer in a malformed file; here the deadline is 1 ms."""
     monkeypatch.setattr("aftbed.interop.logs.MF4_READ_SECONDS_MAX", 0.001)
     WRITERS["mf4"](MF4, tmp_path / "a.mf4")
     with pytest.raises(ConfigError, match=r"malformed: it takes more than 0\.001 s"):
@@ -214,16 +214,14 @@ def test_an_mf4_whose_reader_goes_on_for_ever_is_malformed(
 @pytest.mark.parametrize("name", sorted(READERS.keys() - {"mf4"}))
 @settings(max_examples=60, suppress_health_check=WITH_FILES, deadline=None)
 @given(data=st.data())
-def test_a_reader_answers_any_bytes_with_frames_or_one_error(
-    name: str, data: st.DataObject, tmp_path: Path
-) -> None:
+def test_any_bytes_give_frames_or_one_error(name: str, data: st.DataObject, tmp_path: Path) -> None:
     answers_any_bytes(name, data, tmp_path)
 
 
-@pytest.mark.process  # each is read by one of its own
+@pytest.mark.process  # each MF4 is read by a process of its own
 @settings(max_examples=60, suppress_health_check=WITH_FILES, deadline=None)
 @given(data=st.data())
-def test_the_reader_of_mf4_too(data: st.DataObject, tmp_path: Path) -> None:
+def test_any_bytes_of_an_mf4_give_frames_or_one_error(data: st.DataObject, tmp_path: Path) -> None:
     answers_any_bytes("mf4", data, tmp_path)
 
 
@@ -242,7 +240,7 @@ def answers_any_bytes(name: str, data: st.DataObject, tmp_path: Path) -> None:
         assert str(error).startswith(f"{path}: ")
 
 
-def test_an_extra_that_is_missing_says_how_to_get_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "asammdf", None)
     source = made(tmp_path / "a.log", "(1.000000) can0 130#01\n")
     said = re.escape('MF4 needs asammdf: pip install "aftbed[mf4]"')

@@ -1,4 +1,4 @@
-"""CSV by signal: what a plotting program finds in it is what the frames say."""
+"""CSV by signal: its columns have the values of the frames."""
 
 import csv
 from pathlib import Path
@@ -82,7 +82,7 @@ def test_a_multiplexed_message_fills_the_signals_that_it_has(tmp_path: Path) -> 
     assert rows[1] == {"time": "0.000002", "LONG.MODE": "1", "LONG.FAST": "32"}
 
 
-def test_what_the_dbc_does_not_have_is_counted(tmp_path: Path) -> None:
+def test_frames_that_are_not_in_the_dbc_are_counted(tmp_path: Path) -> None:
     short = LoggedFrame(3, "can0", CODEC.can_id("EGO_STATE"), b"\x00")
     other = LoggedFrame(2, "can0", 0x7FF)
     long = LoggedFrame(4, "can0", CODEC.can_id("EGO_STATE"), bytes(8), extended=True)
@@ -96,7 +96,7 @@ def test_what_the_dbc_does_not_have_is_counted(tmp_path: Path) -> None:
     }
 
 
-def test_a_log_of_which_the_dbc_knows_nothing_is_an_error(tmp_path: Path) -> None:
+def test_a_log_without_any_message_of_the_dbc_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "bus.log").write_text("(1.000000) can0 7FF#\n")
     with pytest.raises(ConfigError, match=r"aftbed.dbc: describes none of the 1 frames"):
         convert(tmp_path / "bus.log", tmp_path / "bus.csv")

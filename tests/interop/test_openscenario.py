@@ -1,5 +1,4 @@
-"""OpenSCENARIO files become scenarios that say the same, or are refused with line and reason; no word of a
-file is dropped unseen."""
+"""An OpenSCENARIO file becomes scenarios with the same drive."""
 
 from pathlib import Path
 
@@ -69,7 +68,7 @@ def test_a_slow_car_ahead_of_a_catalog_in_the_world_on_a_wet_road(tmp_path: Path
     assert found.duration_ms == 30_000, "no StopTrigger says it"
 
 
-def test_what_was_imported_drives_and_stops(tmp_path: Path) -> None:
+def test_an_imported_scenario_drives_and_stops(tmp_path: Path) -> None:
     wanted = ImportOptions(expect="stop")
     (path,) = write(import_scenario(LEAD_BRAKES, None, wanted), tmp_path, force=False)
     result = simulate(Setup("none", seed=1, scenario=str(path))).vehicle
@@ -95,7 +94,7 @@ def test_one_car_alone_is_a_free_drive(tmp_path: Path) -> None:
     assert only_drive(imported(path)).lead is None
 
 
-def test_what_is_taken_and_what_is_ignored_is_said_with_its_line() -> None:
+def test_used_and_ignored_elements_have_their_lines() -> None:
     found = imported(LEAD_BRAKES)
     lines = LEAD_BRAKES.read_text().splitlines()
     places = [(one.line, one.element) for one in found.taken]

@@ -1,5 +1,4 @@
-"""Whatever a file holds, the import ends in scenarios or in a ConfigError: hostile XML, broken XML, files
-that were changed at random, expressions that want to be more than arithmetic."""
+"""Hostile or broken XML, random changes, expressions that are no arithmetic: scenarios or a ConfigError."""
 
 import math
 import re
@@ -271,7 +270,7 @@ def test_arithmetic(text: str, value: float) -> None:
         ("é0", "allowed are numbers"),
     ],
 )
-def test_what_is_no_arithmetic_is_refused(text: str, reason: str) -> None:
+def test_an_expression_that_is_no_arithmetic_is_refused(text: str, reason: str) -> None:
     with pytest.raises(ConfigError) as error:
         evaluate(text, {"a": "10", "text": "fast"})
     assert reason in str(error.value)

@@ -1,5 +1,4 @@
-"""What a drive of ours cannot express is refused with file, line and reason, and no word of a file is dropped
-unseen."""
+"""An OpenSCENARIO file that a scenario cannot express is refused with file, line and reason."""
 
 from pathlib import Path
 
@@ -153,7 +152,7 @@ from aftbed.interop.openscenario.importer import ImportedFile, ImportOptions, im
         ),
     ],
 )
-def test_what_cannot_be_expressed_is_refused(
+def test_an_inexpressible_element_is_refused(
     changes: list[tuple[str, str]], reason: str, tmp_path: Path
 ) -> None:
     path = changed(tmp_path, *changes)
@@ -165,7 +164,7 @@ def test_what_cannot_be_expressed_is_refused(
 @pytest.mark.parametrize(
     "value", ["", "nan", "INF", "1e999", "1_0", "0x5", "\N{ARABIC-INDIC DIGIT FIVE}", "5 m/s"]
 )
-def test_what_is_no_number_in_xml_is_none_here(value: str, tmp_path: Path) -> None:
+def test_a_number_that_xml_does_not_have_is_refused(value: str, tmp_path: Path) -> None:
     path = changed(tmp_path, (LEAD_SPEED, f'<AbsoluteTargetSpeed value="{value}"/>'))
     assert f"AbsoluteTargetSpeed: value: found {value!r}, allowed is a number" in refused(path)
 
@@ -200,7 +199,7 @@ def test_the_world_is_said_once(tmp_path: Path) -> None:
     assert reason in refused(with_world(world.replace("0.5", "0")))
 
 
-def test_what_is_assumed_is_said(tmp_path: Path) -> None:
+def test_assumptions_are_printed(tmp_path: Path) -> None:
     text = LEAD_BRAKES.read_text()
     begin = text.index("<PrivateAction>", text.index("RelativeLanePosition"))
     end = text.index("</PrivateAction>", begin) + len("</PrivateAction>")
@@ -318,7 +317,7 @@ def test_wishes_that_cannot_be_met() -> None:
 
 
 def test_every_element_is_read_or_ignored_with_a_word_or_refused(tmp_path: Path) -> None:
-    """Each element in turn gets a name that nobody knows: the import fails, or says that it is ignored."""
+    """Each element in turn gets an unknown name: the import fails, or says that it is ignored."""
     text = LEAD_BRAKES.read_text()
     ignored = {one.line for one in imported(LEAD_BRAKES).ignored}
     inside = _lines_inside(text, ignored)
@@ -339,7 +338,7 @@ def test_every_element_is_read_or_ignored_with_a_word_or_refused(tmp_path: Path)
 
 
 def test_every_attribute_is_read_or_a_label_or_refused(tmp_path: Path) -> None:
-    """Each attribute in turn gets a name that nobody knows: the import fails."""
+    """Each attribute in turn gets an unknown name: the import fails."""
     text = LEAD_BRAKES.read_text()
     inside = _lines_inside(text, {one.line for one in imported(LEAD_BRAKES).ignored})
     lines = text.splitlines(keepends=True)

@@ -249,7 +249,7 @@ def test_a_scenario_is_no_distribution() -> None:
 # -- what is written
 
 
-def test_what_says_something_else_is_not_written_over(tmp_path: Path) -> None:
+def test_a_different_file_is_not_overwritten(tmp_path: Path) -> None:
     found = varied(VALUES)
     paths = write(found, tmp_path / "new" / "folder", force=False)
     assert write(found, tmp_path / "new" / "folder", force=False) == paths, "the same text again is no matter"

@@ -42,7 +42,7 @@ def test_the_messages_of_a_request_are_those_of_the_paper(tmp_path: Path) -> Non
     ]
 
 
-def test_a_request_that_is_asked_again_is_answered_by_who_leads_then(tmp_path: Path) -> None:
+def test_a_repeated_request_is_answered_by_the_new_leader(tmp_path: Path) -> None:
     run = RecordInTheMaking(tmp_path)
     for journal, event in PBR_PATH[:8]:
         run.note(journal, event, 1)
@@ -69,7 +69,7 @@ LFR_PATH: Final = (
 )
 
 
-def test_the_replicas_of_lfr_execute_each_for_itself(tmp_path: Path) -> None:
+def test_both_replicas_of_lfr_execute(tmp_path: Path) -> None:
     run = RecordInTheMaking(tmp_path)
     for journal, event in LFR_PATH:
         run.note(journal, event, 1)
@@ -94,7 +94,7 @@ def test_arrows_belong_to_one_request(tmp_path: Path) -> None:
     assert [(steps[f.cause].request_id, steps[f.effect].request_id) for f in links_of(steps)] == [(1, 1)]
 
 
-def test_a_step_ends_when_what_followed_begins_and_before_the_next_of_its_process(tmp_path: Path) -> None:
+def test_a_step_ends_when_its_effect_begins_and_before_the_next_step_of_its_process(tmp_path: Path) -> None:
     run = RecordInTheMaking(tmp_path)
     run.t_ns -= MS  # each note is a ms behind the one before
     run.note("client.1", Event.REQUEST_SENT, 1)
@@ -107,7 +107,7 @@ def test_a_step_ends_when_what_followed_begins_and_before_the_next_of_its_proces
     assert lengths == [50_000, 500, 1_000]
 
 
-def test_a_step_of_which_nothing_came_for_long_is_not_drawn_as_long(tmp_path: Path) -> None:
+def test_a_step_with_a_late_effect_is_drawn_short(tmp_path: Path) -> None:
     run = RecordInTheMaking(tmp_path)
     run.note("client.1", Event.REQUEST_SENT, 1)
     run.note("a-protocol.1", Event.REQUEST_RECEIVED, 1)  # a ms later: the first was hung
@@ -124,7 +124,8 @@ def test_a_fault_is_described_in_the_words_of_its_user(tmp_path: Path) -> None:
     assert describe(applied, record) == str(CRASH)
     injected_later = msgspec.structs.replace(applied, detail=FIRST_FAULT + 1)
     assert describe(injected_later, record) == "a fault"
-    record = msgspec.structs.replace(record, faults=(*record.faults, {"fault": "hang backup"}))
+    hang = msgspec.structs.replace(record.faults[0], fault="hang backup")
+    record = msgspec.structs.replace(record, faults=(*record.faults, hang))
     assert describe(injected_later, record) == "hang backup"
 
 
