@@ -47,17 +47,17 @@ def _emitters() -> dict[Event, Emitter]:
     declared: dict[Event, list[tuple[str, bool]]] = {}
     for kind in BRICKS.values():
         for one in kind.events:
-            who = SERVER.name if one.by_server else kind.name
-            declared.setdefault(one.event, []).append((who, one.of_backup))
-    return {event: _emitter(event, who) for event, who in declared.items()}
+            name = SERVER.name if one.by_server else kind.name
+            declared.setdefault(one.event, []).append((name, one.of_backup))
+    return {event: _emitter(event, kinds) for event, kinds in declared.items()}
 
 
-def _emitter(event: Event, who: list[tuple[str, bool]]) -> Emitter:
-    names, of_backup = {name for name, _ in who}, who[0][1]
-    word = last_word(who[0][0])
+def _emitter(event: Event, kinds: list[tuple[str, bool]]) -> Emitter:
+    names, of_backup = {name for name, _ in kinds}, kinds[0][1]
+    word = last_word(kinds[0][0])
     silent = {name for name in BRICKS if last_word(name) == word} - names
     assert len(names) == 1 or not silent, f"{sorted(silent)} do not declare {event}, as all others do"
-    assert {(last_word(name), backup) for name, backup in who} == {(word, of_backup)}, f"{event}: {who}"
+    assert {(last_word(name), backup) for name, backup in kinds} == {(word, of_backup)}, f"{event}: {kinds}"
     return Emitter(names.pop() if len(names) == 1 else word, of_backup)
 
 

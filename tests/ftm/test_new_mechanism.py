@@ -1,10 +1,12 @@
 """A new mechanism is one new file and one name in the registry: everything else reads its declaration.
 
-The package is copied, a mechanism is added to the copy, and the copy is used as a user would use it.
+The package is copied, the mechanism of docs/contributing.md is added to the copy, and the copy is used as a
+user would use it.
 """
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -17,55 +19,8 @@ import aftbed
 
 PACKAGE: Final = Path(aftbed.__file__).parent
 SECONDS_MAX: Final = 100
-LIMIT: Final = '''\
-"""Limit: no reply leaves that is longer than the frame that has to carry it."""
-
-from enum import auto
-from typing import ClassVar, Final
-
-from aftbed.core.brick import SAME_STATE, BrickState, Effect, Halt, Machine, Moves, Note, Send
-from aftbed.core.events import Event
-from aftbed.core.messages import Reply, TakeOver
-from aftbed.ftm.chain import COMPUTE, PASS_BEFORE
-from aftbed.ftm.declaration import BrickKind, Mechanism, Suitability
-
-REPLY_BYTES_MAX: Final = 64
-
-
-class LimitState(BrickState):
-    READY = auto()  # never holds a reply
-
-
-class LimitAfter(Machine):
-    """After: lets a short reply pass, and stops the replica at a long one."""
-
-    AT_REST = (LimitState.READY,)
-
-    def __init__(self) -> None:
-        super().__init__(LimitState.READY)
-
-    def check(self, msg: Reply) -> list[Effect]:
-        if len(msg.payload) <= REPLY_BYTES_MAX:
-            return [Send("aft2pro", msg)]
-        return [Note(Event.DETECTED_STOP, msg.request_id), Halt(f"a reply of {len(msg.payload)} bytes")]
-
-    def hand_on(self, msg: TakeOver) -> list[Effect]:
-        return [Send("aft2pro", msg)]
-
-    MOVES: ClassVar[Moves] = {
-        (LimitState.READY, "prd2aft", Reply): (check, SAME_STATE),
-        (LimitState.READY, "prd2aft", TakeOver): (hand_on, SAME_STATE),
-    }
-
-
-LIMIT: Final = Mechanism(
-    name="limit",
-    before=PASS_BEFORE,
-    proceed=COMPUTE,
-    after=BrickKind("limit.after", ("prd2aft",), ("aft2pro",), make=lambda setting: LimitAfter()),
-    suitability=Suitability(detects=("implausible",)),
-)
-'''
+PAGE: Final = PACKAGE.parent / "docs" / "contributing.md"
+EXAMPLE: Final = re.compile(r"```python file=aftbed/ftm/limit\.py\n(.*?)```", re.DOTALL)
 REGISTRATION: Final = (
     (
         "from aftbed.ftm.lfr import LFR\n",
@@ -82,7 +37,8 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
     shutil.copytree(PACKAGE, root / "aftbed", ignore=shutil.ignore_patterns("__pycache__"))
     if (PACKAGE.parent / "dbc").is_dir():
         shutil.copytree(PACKAGE.parent / "dbc", root / "dbc")
-    (root / "aftbed" / "ftm" / "limit.py").write_text(LIMIT)
+    (example,) = EXAMPLE.findall(PAGE.read_text())
+    (root / "aftbed" / "ftm" / "limit.py").write_text(example)
     registry = root / "aftbed" / "ftm" / "registry.py"
     text = registry.read_text()
     for old, new in REGISTRATION:
