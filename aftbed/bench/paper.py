@@ -1,51 +1,221 @@
-"""`aftbed bench paper`: every figure of the paper's Section IV that is sourced here, beside ours, measured
-now.
+"""`aftbed bench paper`: every figure of the paper's Section IV whose source is known here, beside ours,
+measured now.
+
+M. Amy, *Adaptive Fault Tolerance: Is ROS a Relevant Executive Support?* (DSN 2016 Student Forum,
+hal-01318364).
 
 A row is one figure: the paper's range, our quantiles, and the bare ring of 12 hops (the hops of a request
-under `pbr`) measured in the same run. The ratio of our median to the ring's is the one number that another
-machine can be compared by. Each time is told as what it is on the road (`road`).
+under `pbr`) measured in the same run. The ratio of our median to the ring's is the one number that can be
+compared between machines. Each time is also given as what it is on the road (`on_road`).
 
-Differences in method, said openly: their recovery does not count detection, so ours is told with it and
-without it; their adaptation stops the service while it lasts, so their one figure stands beside our
-blackout and beside our whole duration, in which requests are served but for the blackout (and 0.1 s of
-which is the observation that may still undo it); they measured on a machine of 2014.
+The methods differ. Their recovery does not count detection, so ours is given with and without it. Their
+adaptation stops the Protocol while it lasts, so their one figure stands beside our blackout and beside our
+whole duration, in which requests are served except during the blackout (0.1 s of it is the observation
+after which it can no longer be undone). They measured on a machine of 2014. What has no source here is left
+out rather than guessed.
 
-A measurement that fails, as it may on a machine that is busy with other things, is begun anew, TRIES times
-at most.
+A measurement that fails, as it may on a busy machine, is repeated, TRIES times at most. The document
+(`Paper`) is printed as JSON; tables, markdown and page are made of `tables`, where the words of each cell
+are decided once.
 """
 
 import time
 from collections import Counter
-from collections.abc import Callable
-from functools import partial
-from typing import Final, TypeVar
+from collections.abc import Callable, Iterator
+from typing import Final, ParamSpec, TypeVar
 
 import msgspec
 
-from aftbed.bench import placements, published
-from aftbed.bench.adapt import bench_adapt
+from aftbed.bench.adaptation import bench_adapt
+from aftbed.bench.cycle import bench_cycle, ring_p50_us
 from aftbed.bench.launch import bench_launch
-from aftbed.bench.paperdocument import Count, Figure, Paper, figure
-from aftbed.bench.placements import Cycle, Loaded, Placed, Times, times
 from aftbed.bench.recovery import bench_recovery
-from aftbed.bench.road import DECELERATION_MS2, SPEED_KMH
-from aftbed.bench.sweep import PLACEMENT, Sized, sized, sweep_sizes
-from aftbed.campaign.ledger import here
+from aftbed.bench.resources import (
+    IDLE_HZ,
+    NO_CRASH,
+    RADAR_HZ,
+    LoadResult,
+    Usage,
+    process_count,
+    under_load,
+)
+from aftbed.bench.runs import Percentiles, percentiles
+from aftbed.bench.sweep import PLACEMENT, StateResult, sized, sweep_sizes
+from aftbed.campaign.ledger import Environment, here
 from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.core.graph import PLACEMENTS
 from aftbed.core.script import RECIPES
+from aftbed.search.road_table import speed_left_ms
+from aftbed.vehicle.plant import GRAVITY_MS2, KMH_PER_MS
 
 TRIES: Final = 3
 CYCLES: Final = ("pbr", "lfr", "pbr+tr", "lfr+tr")
-BASE: Final = "pbr"
-COMPOSED: Final = "pbr+tr"
-SWITCHED: Final = "lfr"
+BASE, COMPOSED, SWITCHED = "pbr", "pbr+tr", "lfr"
 UPDATED_BYTES: Final = 1000  # the state that moves when the function is updated
 STATE_FTMS: Final = ("pbr", "lfr")
 LOAD_PLACEMENTS: Final = PLACEMENTS[:2]
 
-Tell = Callable[[str], None]
+Log = Callable[[str], None]
 Found = TypeVar("Found")
+Params = ParamSpec("Params")
+
+
+class PublishedFigure(msgspec.Struct, frozen=True):
+    """A range of times of the paper (ms), and what is to be known of it."""
+
+    low: float
+    high: float
+    note: str = ""
+
+
+CYCLE_PBR: Final = PublishedFigure(4.0, 5.0)
+CYCLE_ANY: Final = PublishedFigure(4.0, 10.0, "of all mechanisms together")
+RECOVERY: Final = PublishedFigure(1.0, 2.0, "without detection")
+ADAPTATION: Final = PublishedFigure(300.0, 300.0, "of any kind")
+PROCESSES: Final = {"pbr": 17, "pbr+tr": 23}
+# Not of the paper: its graph on ROS 1 with rospy, measured by this project on two cores of 2026.
+ROSPY_CYCLE_MS: Final = 0.6
+
+NOT_SOURCED: Final = (
+    "Initialisation: the paper has a figure, which is not sourced here; ours stands alone.",
+    "Cycles of LFR and of the compositions: only their common range is sourced, 4 to 10 ms.",
+)
+
+# -- on the road --------------------------------------------------------------------------------------
+
+SPEED_KMH: Final = 50.0  # as in the paper
+FRICTION: Final = 0.9  # nominal peak braking coefficient of UN R152
+DECELERATION_MS2: Final = FRICTION * GRAVITY_MS2
+
+
+class OnRoad(msgspec.Struct, frozen=True):
+    """A time, in metres travelled and in km/h left at contact where it comes at the worst instant."""
+
+    ms: float
+    metres: float
+    worst_kmh: float
+
+
+def metres(speed_kmh: float, delay_ms: float) -> float:
+    """The distance that the car travels in that time."""
+    return speed_kmh / KMH_PER_MS * delay_ms / 1e3
+
+
+def residual_kmh(speed_kmh: float, delay_ms: float, deceleration_ms2: float = DECELERATION_MS2) -> float:
+    """The speed at contact of a car that brakes so much too late, and otherwise would just have stopped.
+
+    The distance v0 tau is missing at the end of its way; with a constant deceleration a it has left at
+    contact
+
+        v = sqrt(2 a v0 tau),    at most v0
+
+    A delay that is over before the last moment to brake costs nothing, and one that comes later meets a
+    slower car. Limits: the deceleration is there at once (dead time, lag and jerk of the brakes cost the
+    same with and without the delay), and the brakes do not work during the delay.
+    """
+    assert speed_kmh >= 0 and delay_ms >= 0 and deceleration_ms2 > 0
+    missing_m = metres(speed_kmh, delay_ms)
+    left_kmh = speed_left_ms(speed_kmh / KMH_PER_MS, missing_m, deceleration_ms2) * KMH_PER_MS
+    return min(speed_kmh, left_kmh)  # 3.6 there and back may be more by the last bit
+
+
+def on_road(delay_ms: float, speed_kmh: float = SPEED_KMH) -> OnRoad:
+    """Both, rounded to a tenth of a millimetre and a hundredth of a km/h."""
+    left_kmh = residual_kmh(speed_kmh, delay_ms)
+    return OnRoad(delay_ms, round(metres(speed_kmh, delay_ms), 4), round(left_kmh, 2))
+
+
+# -- the document -------------------------------------------------------------------------------------
+
+
+class Figure(msgspec.Struct, frozen=True):
+    """One time. `ratio` is its p50 in rounds of the bare ring; `road` has our p50 and p99.
+
+    `road` is None for a time in which the service goes on.
+    """
+
+    name: str
+    what: str
+    samples: int
+    ours_ms: Percentiles
+    ring_us: float
+    ratio: float
+    road: tuple[OnRoad, OnRoad] | None
+    paper: PublishedFigure | None = None
+    paper_road: tuple[OnRoad, OnRoad] | None = None
+    note: str = ""
+
+
+def figure(
+    name: str,
+    what: str,
+    ours_ms: Percentiles,
+    samples: int,
+    ring_us: float,
+    paper: PublishedFigure | None = None,
+    note: str = "",
+    *,
+    served: bool = False,
+) -> Figure:
+    """A row, with what follows from its times; `served`: requests are served during this time."""
+    ratio = round(ours_ms.p50 * 1e3 / ring_us, 2)
+    road = None if served else (on_road(ours_ms.p50), on_road(ours_ms.p99))
+    paper_road = (on_road(paper.low), on_road(paper.high)) if paper else None
+    return Figure(name, what, samples, ours_ms, ring_us, ratio, road, paper, paper_road, note)
+
+
+class ProcessCount(msgspec.Struct, frozen=True):
+    """Processes of a graph, with the supervisor in the place of the ROS master."""
+
+    ftm: str
+    placement: str
+    ours: int
+    paper: int | None
+
+
+class CycleResult(msgspec.Struct, frozen=True):
+    """The document of `aftbed bench cycle`."""
+
+    ftm: str
+    placement: str
+    requests: int
+    hops: int
+    cycle_us: Percentiles
+    ring_us: Percentiles
+    ratio_p50: float
+
+
+class PlacementResult(msgspec.Struct, frozen=True):
+    """What a placement costs in time, CPU and memory, and whether the crash of a replica is survived."""
+
+    placement: str
+    survives_crash: bool
+    cycle: CycleResult
+    loaded: Usage
+    idle: Usage
+
+
+class Paper(msgspec.Struct, frozen=True):
+    """The whole document."""
+
+    title: str
+    source: str
+    their_machine: str
+    environment: Environment
+    quick: bool
+    seconds: float
+    speed_kmh: float
+    deceleration_ms2: float
+    rospy_cycle_ms: float
+    figures: tuple[Figure, ...]
+    processes: tuple[ProcessCount, ...]
+    placements: tuple[PlacementResult, ...]
+    state: tuple[StateResult, ...]
+    load: tuple[LoadResult, ...]
+    notes: tuple[str, ...]
+
+
+# -- measurement ----------------------------------------------------------------------------------------
 
 
 class Effort(msgspec.Struct, frozen=True):
@@ -92,42 +262,39 @@ QUICK: Final = Effort(
 )
 
 
-def bench_paper(effort: Effort, tell: Tell) -> Paper:
-    """Measure all of it; `tell` hears what is measured next. Raises HarnessError."""
+def bench_paper(effort: Effort, log: Log) -> Paper:
+    """Measure everything; `log` gets the name of each measurement. Raises HarnessError."""
     began = time.monotonic()
-    cycles = {ftm: _cycle(ftm, PLACEMENT, effort, tell) for ftm in CYCLES}
-    figures = [
-        *_launch(effort, tell),
-        *(_of_cycle(cycle) for cycle in cycles.values()),
-        *_recoveries(effort, tell),
-        *_adaptations(effort, tell),
-    ]
-    by_recipe, fate = _recipe(effort.recipe_runs, tell)
-    side_by_side = tuple(_placed(name, cycles[BASE], effort, tell) for name in PLACEMENTS)
+    bench = _Measurements(effort, log)
+    cycles = {ftm: bench.cycle(ftm, PLACEMENT) for ftm in CYCLES}
+    figures = [*bench.launch(), *map(_cycle_figure, cycles.values())]
+    figures += [*bench.recoveries(), *bench.adaptations()]
+    by_recipe, fate = bench.recipe()
+    placements = tuple(bench.placement(name, cycles[BASE]) for name in PLACEMENTS)
     return Paper(
-        title=published.TITLE,
-        source=f"{published.PLACE}, {published.IDENTIFIER}",
-        their_machine=published.MACHINE,
+        title="M. Amy, Adaptive Fault Tolerance: Is ROS a Relevant Executive Support?",
+        source="DSN 2016 Student Forum, hal-01318364",
+        their_machine="dual core of 2.5 GHz, 2014, ROS 1",
         environment=here(),
         quick=effort is QUICK,
         figures=(*figures, *by_recipe),
-        processes=_processes(side_by_side, tell),
-        placements=side_by_side,
-        state=tuple(row for ftm in STATE_FTMS for row in _sizes(ftm, effort, tell)),
-        load=tuple(_load(p, hz, effort, tell) for p in LOAD_PLACEMENTS for hz in effort.rates_hz),
+        processes=bench.processes(placements),
+        placements=placements,
+        state=tuple(row for ftm in STATE_FTMS for row in bench.sizes(ftm)),
+        load=tuple(bench.load(placement, hz) for placement in LOAD_PLACEMENTS for hz in effort.rates_hz),
         speed_kmh=SPEED_KMH,
         deceleration_ms2=DECELERATION_MS2,
-        rospy_cycle_ms=published.ROSPY_CYCLE_MS,
-        notes=(*published.NOT_SOURCED, fate),
+        rospy_cycle_ms=ROSPY_CYCLE_MS,
+        notes=(*NOT_SOURCED, fate),
         seconds=round(time.monotonic() - began, 1),
     )
 
 
-def tried(what: str, measure: Callable[[], Found], tell: Tell) -> Found:
-    """What `measure` gives. Raises HarnessError when it has failed TRIES times."""
+def tried(what: str, measure: Callable[[], Found], log: Log) -> Found:
+    """What `measure` gives. Raises HarnessError after TRIES failures."""
     reason = ""
     for _ in range(TRIES):
-        tell(f"{what}, again ({reason})" if reason else what)
+        log(f"{what}, again ({reason})" if reason else what)
         try:
             return measure()
         except (HarnessError, ConfigError) as error:  # a run that died refuses like one that never was
@@ -135,135 +302,126 @@ def tried(what: str, measure: Callable[[], Found], tell: Tell) -> Found:
     raise HarnessError(f"{what}: failed {TRIES} times, the last time: {reason}")
 
 
-# -- the figures ----------------------------------------------------------------------------------
+class _Measurements:
+    def __init__(self, effort: Effort, log: Log) -> None:
+        self._effort, self._log = effort, log
+
+    def _tried(
+        self, what: str, measure: Callable[Params, Found], *args: Params.args, **options: Params.kwargs
+    ) -> Found:
+        return tried(what, lambda: measure(*args, **options), self._log)
+
+    def launch(self) -> list[Figure]:
+        count = self._effort.launches
+        found = self._tried("initialisation", bench_launch, BASE, PLACEMENT, count)
+        ring_us = ring_p50_us(BASE, PLACEMENT)
+        graph, whole = (_times(found, key) for key in ("graph_ms", "launch_ms"))
+        warm = "its zygote is warm and its spares are parked"
+        what = "initialisation"
+        return [
+            figure(f"{what}.graph", f"{what}: the whole graph", graph, count, ring_us, note=warm),
+            figure(f"{what}.reply", f"{what}: command to first reply", whole, count, ring_us),
+        ]
+
+    def cycle(self, ftm: str, placement: str) -> CycleResult:
+        requests, rounds = self._effort.requests, self._effort.rounds
+        what = f"cycle of {ftm}, placement {placement}"
+        found = self._tried(what, bench_cycle, ftm, placement, requests, rounds=rounds)
+        return msgspec.convert(found, CycleResult)
+
+    def recoveries(self) -> Iterator[Figure]:
+        kills = self._effort.kills
+        for ftm in STATE_FTMS:
+            what, name = f"recovery under {ftm}", f"recovery.{ftm}"
+            found = self._tried(what, bench_recovery, ftm, PLACEMENT, kills)
+            ring_us = ring_p50_us(BASE, PLACEMENT)
+            whole, after = (_times(found, key) for key in ("recovery_ms", "after_detection_ms"))
+            detected = f"{what}, detection to the next good reply"
+            yield figure(f"{name}.after_detection", detected, after, kills, ring_us, RECOVERY)
+            yield figure(name, f"{what}, SIGKILL to the next good reply", whole, kills, ring_us)
+
+    def adaptations(self) -> list[Figure]:
+        count, seconds = self._effort.adaptations, self._effort.state_seconds
+        figures = []
+        for name, kind, new in (("compose", "composition", COMPOSED), ("switch", "switch", SWITCHED)):
+            what = f"{kind} {BASE} to {new}"
+            found = self._tried(what, bench_adapt, BASE, new, PLACEMENT, RECIPES[0], count)
+            times = _times(found, "blackout_ms"), _times(found, "total_ms")
+            figures += _both(name, what, *times, count, _fate(found))
+        what = f"update of the function, {UPDATED_BYTES} bytes of state"
+        update = self._tried(what, sized, BASE, UPDATED_BYTES, count, seconds)
+        assert update.blackout_ms is not None and update.total_ms is not None, update.refused
+        times = update.blackout_ms, update.total_ms
+        return figures + _both("update", what, *times, count, "under a closed loop")
+
+    def recipe(self) -> tuple[list[Figure], str]:
+        """Its figures, and how its runs ended: the paper's recipe kills bricks that are in use."""
+        what, runs = f"composition {BASE} to {COMPOSED} by the paper's recipe", self._effort.recipe_runs
+        if not runs:
+            return [], f"{what}: not measured in a quick run."
+        self._log(what)
+        blackouts, totals, ends = [], [], Counter[str]()
+        for _ in range(runs):
+            try:
+                found = bench_adapt(BASE, COMPOSED, PLACEMENT, RECIPES[1], 1)
+            except (HarnessError, ConfigError):
+                ends["failed"] += 1
+                continue
+            blackouts.append(_times(found, "blackout_ms").p50)
+            totals.append(_times(found, "total_ms").p50)
+            ends["never served again"] += bool(found["stuck"])
+        words = ", ".join(f"{count} {end}" for end, count in ends.items() if count) or "all served again"
+        count = len(blackouts)
+        times = (percentiles(blackouts), percentiles(totals)) if count else None
+        return _both("recipe", what, *times, count, "") if times else [], f"{what}: {runs} runs: {words}."
+
+    def placement(self, placement: str, base: CycleResult) -> PlacementResult:
+        cycle = base if placement == PLACEMENT else self.cycle(BASE, placement)
+        seconds = self._effort.placement_seconds
+        loaded, idle = self._tried(
+            f"CPU and memory, placement {placement}",
+            lambda: [under_load(BASE, placement, hz, seconds).usage for hz in (RADAR_HZ, IDLE_HZ)],
+        )
+        return PlacementResult(placement, placement != NO_CRASH, cycle, loaded, idle)
+
+    def processes(self, placements: tuple[PlacementResult, ...]) -> tuple[ProcessCount, ...]:
+        composed = self._tried(f"processes of {COMPOSED}", process_count, COMPOSED, PLACEMENT)
+        counts = [(BASE, p.placement, p.loaded.processes) for p in placements]
+        return tuple(
+            ProcessCount(ftm, placement, ours, PROCESSES[ftm] if placement == PLACEMENT else None)
+            for ftm, placement, ours in (*counts, (COMPOSED, PLACEMENT, composed))
+        )
+
+    def sizes(self, ftm: str) -> list[StateResult]:
+        updates, seconds = max(2, self._effort.adaptations // 4), self._effort.state_seconds
+
+        def measure(size_bytes: int) -> StateResult:
+            what = f"state of {size_bytes} bytes under {ftm}"
+            return self._tried(what, sized, ftm, size_bytes, updates, seconds)
+
+        return sweep_sizes(ftm, self._effort.sizes_bytes, measure)
+
+    def load(self, placement: str, rate_hz: float) -> LoadResult:
+        what, seconds = f"{rate_hz:g} requests a second, placement {placement}", self._effort.load_seconds
+        return self._tried(what, under_load, BASE, placement, rate_hz, seconds)
 
 
-def _ring_us() -> float:
-    return placements.ring_p50_us(BASE, PLACEMENT)
-
-
-def _launch(effort: Effort, tell: Tell) -> list[Figure]:
-    found = tried("initialisation", lambda: bench_launch(BASE, PLACEMENT, effort.launches), tell)
-    ring_us = _ring_us()
-    graph, whole = (_times(found, key) for key in ("graph_ms", "launch_ms"))
-    warm = "its zygote is warm and its spares are parked"
-    return [
-        figure(
-            "initialisation.graph",
-            "initialisation: the whole graph",
-            graph,
-            effort.launches,
-            ring_us,
-            note=warm,
-        ),
-        figure(
-            "initialisation.reply", "initialisation: command to first reply", whole, effort.launches, ring_us
-        ),
-    ]
-
-
-def _cycle(ftm: str, placement: str, effort: Effort, tell: Tell) -> Cycle:
-    return tried(
-        f"cycle of {ftm}, placement {placement}",
-        lambda: placements.cycle(ftm, placement, effort.requests, effort.rounds),
-        tell,
-    )
-
-
-def _of_cycle(cycle: Cycle) -> Figure:
-    ours_ms = Times(*(round(us / 1e3, 4) for us in msgspec.structs.astuple(cycle.cycle_us)))
-    paper = published.CYCLE_PBR if cycle.ftm == BASE else published.CYCLE
+def _cycle_figure(cycle: CycleResult) -> Figure:
+    ours_ms = Percentiles(*(round(us / 1e3, 4) for us in msgspec.structs.astuple(cycle.cycle_us)))
+    paper = CYCLE_PBR if cycle.ftm == BASE else CYCLE_ANY
     what = f"cycle of {cycle.ftm}, {cycle.hops} hops"
     return figure(f"cycle.{cycle.ftm}", what, ours_ms, cycle.requests, cycle.ring_us.p50, paper)
 
 
-def _recoveries(effort: Effort, tell: Tell) -> list[Figure]:
-    figures = []
-    for ftm in STATE_FTMS:
-        what = f"recovery under {ftm}"
-        found = tried(what, partial(bench_recovery, ftm, PLACEMENT, effort.kills), tell)
-        ring_us = _ring_us()
-        whole, after = (_times(found, key) for key in ("recovery_ms", "after_detection_ms"))
-        figures += [
-            figure(
-                f"recovery.{ftm}.after_detection",
-                f"{what}, detection to the next good reply",
-                after,
-                effort.kills,
-                ring_us,
-                published.RECOVERY,
-            ),
-            figure(
-                f"recovery.{ftm}", f"{what}, SIGKILL to the next good reply", whole, effort.kills, ring_us
-            ),
-        ]
-    return figures
-
-
-def _adaptations(effort: Effort, tell: Tell) -> list[Figure]:
-    compose, switch = f"composition {BASE} to {COMPOSED}", f"switch {BASE} to {SWITCHED}"
+def _both(
+    name: str, what: str, blackout: Percentiles, total: Percentiles, count: int, note: str
+) -> list[Figure]:
+    """Blackout and whole duration of an adaptation, each beside the paper's one figure."""
+    ring_us, name = ring_p50_us(BASE, PLACEMENT), f"adapt.{name}"
+    dark, whole = f"{what}: no service", f"{what}: from order to end"
     return [
-        *_adaptation("compose", compose, COMPOSED, effort.adaptations, tell),
-        *_adaptation("switch", switch, SWITCHED, effort.adaptations, tell),
-        *_update(effort, tell),
-    ]
-
-
-def _adaptation(name: str, what: str, new: str, count: int, tell: Tell) -> list[Figure]:
-    found = tried(what, lambda: bench_adapt(BASE, new, PLACEMENT, RECIPES[0], count), tell)
-    return _both(name, what, _times(found, "blackout_ms"), _times(found, "total_ms"), count, _fate(found))
-
-
-def _recipe(runs: int, tell: Tell) -> tuple[list[Figure], str]:
-    """Each in a run of its own: it kills what is in use, so what became of it is part of the figure."""
-    what = f"composition {BASE} to {COMPOSED} by the paper's recipe"
-    if not runs:
-        return [], f"{what}: not measured in a quick run."
-    tell(what)
-    blackouts, totals, ends = [], [], Counter[str]()
-    for _ in range(runs):
-        try:
-            found = bench_adapt(BASE, COMPOSED, PLACEMENT, RECIPES[1], 1)
-        except (HarnessError, ConfigError):
-            ends["failed"] += 1
-            continue
-        blackouts.append(_times(found, "blackout_ms").p50)
-        totals.append(_times(found, "total_ms").p50)
-        ends["never served again"] += bool(found["stuck"])
-    said = ", ".join(f"{count} {end}" for end, count in ends.items() if count) or "all served again"
-    figures = _both("recipe", what, times(blackouts), times(totals), len(blackouts), "") if blackouts else []
-    return figures, f"{what}: {runs} runs: {said}."
-
-
-def _update(effort: Effort, tell: Tell) -> list[Figure]:
-    what = f"update of the function, {UPDATED_BYTES} bytes of state"
-    count = effort.adaptations
-    found = tried(what, lambda: sized(BASE, UPDATED_BYTES, count, effort.state_seconds), tell)
-    assert found.blackout_ms is not None and found.total_ms is not None, found.refused
-    return _both("update", what, found.blackout_ms, found.total_ms, count, "under a closed loop")
-
-
-def _both(name: str, what: str, blackout: Times, total: Times, count: int, note: str) -> list[Figure]:
-    ring_us = _ring_us()
-    return [
-        figure(
-            f"adapt.{name}.blackout",
-            f"{what}: nobody is served",
-            blackout,
-            count,
-            ring_us,
-            published.ADAPTATION,
-            note,
-        ),
-        figure(
-            f"adapt.{name}.total",
-            f"{what}: from order to end",
-            total,
-            count,
-            ring_us,
-            published.ADAPTATION,
-            served=True,
-        ),
+        figure(f"{name}.blackout", dark, blackout, count, ring_us, ADAPTATION, note),
+        figure(f"{name}.total", whole, total, count, ring_us, ADAPTATION, served=True),
     ]
 
 
@@ -271,58 +429,12 @@ def _fate(found: dict[str, object]) -> str:
     """What became of the requests meanwhile."""
     counts = msgspec.convert(found["requests"], dict[str, int])
     bad = {name: n for name, n in counts.items() if n and name != "sent"}
-    said = ", ".join(f"{n} {name}" for name, n in bad.items()) or "none lost, doubled, out of order or wrong"
+    words = ", ".join(f"{n} {name}" for name, n in bad.items()) or "none lost, doubled, out of order or wrong"
     stuck = f"; {found['stuck']} of {found['adaptations']} never served again" if found["stuck"] else ""
-    return f"{counts['sent']} requests: {said}{stuck}"
+    return f"{counts['sent']} requests: {words}{stuck}"
 
 
-def _times(found: dict[str, object], key: str) -> Times:
-    """Of a bench's document. Of the starts it has p50 and max alone: of so few the p95 is the max."""
+def _times(found: dict[str, object], key: str) -> Percentiles:
+    """Of a bench's document. A launch has p50 and max alone: of so few values the p95 is the max."""
     given = msgspec.convert(found[key], dict[str, float])
-    return msgspec.convert({"p95": given["max"], "p99": given["max"], **given}, Times)
-
-
-# -- side by side, and the sweeps -----------------------------------------------------------------
-
-
-def _placed(placement: str, base: Cycle, effort: Effort, tell: Tell) -> Placed:
-    cycle = base if placement == PLACEMENT else _cycle(BASE, placement, effort, tell)
-    seconds = effort.placement_seconds
-    return tried(
-        f"CPU and memory, placement {placement}",
-        lambda: placements.placed(BASE, placement, seconds, cycle),
-        tell,
-    )
-
-
-def _processes(side_by_side: tuple[Placed, ...], tell: Tell) -> tuple[Count, ...]:
-    composed = tried(f"processes of {COMPOSED}", lambda: placements.processes(COMPOSED, PLACEMENT), tell)
-    theirs = published.PROCESSES
-    return (
-        *(
-            Count(BASE, p.placement, p.loaded.processes, theirs[BASE] if p.placement == PLACEMENT else None)
-            for p in side_by_side
-        ),
-        Count(COMPOSED, PLACEMENT, composed, theirs[COMPOSED]),
-    )
-
-
-def _sizes(ftm: str, effort: Effort, tell: Tell) -> list[Sized]:
-    updates = max(2, effort.adaptations // 4)
-    return sweep_sizes(
-        ftm,
-        effort.sizes_bytes,
-        lambda size_bytes: tried(
-            f"state of {size_bytes} bytes under {ftm}",
-            lambda: sized(ftm, size_bytes, updates, effort.state_seconds),
-            tell,
-        ),
-    )
-
-
-def _load(placement: str, rate_hz: float, effort: Effort, tell: Tell) -> Loaded:
-    return tried(
-        f"{rate_hz:g} requests a second, placement {placement}",
-        lambda: placements.under_load(BASE, placement, rate_hz, effort.load_seconds),
-        tell,
-    )
+    return msgspec.convert({"p95": given["max"], "p99": given["max"], **given}, Percentiles)

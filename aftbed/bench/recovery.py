@@ -1,47 +1,36 @@
-"""From SIGKILL of the primary to the next good reply, under a closed-loop load: one request always waits.
+"""From SIGKILL of the primary to the next good reply, in a closed loop: one request always waits.
 
-Each kill takes the whole replica (all nodes of its chain), as the crash of an ECU would. The next one
-waits until redundancy is back. Times are out of the journals, whose clock is common to all processes.
+Each kill takes the whole replica (all nodes of its chain), as the crash of an ECU would. The next kill
+waits until redundancy is back. Times are from the journals, whose clock is common to all processes.
 """
 
 import time
 from pathlib import Path
 from typing import Final
 
-from aftbed.bench.runs import finish, start
-from aftbed.bench.statistics import summary
+from aftbed.bench.runs import POLL_SECONDS, endless_run, summary
 from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.inject.crash import Crash
 from aftbed.inject.model import Fault
 from aftbed.inject.timing import Trigger
 from aftbed.judge.checks import failovers
 from aftbed.runtime.unix import control_client
-from aftbed.runtime.unix.options import LoadRun
 
-REQUESTS_ENDLESS: Final = 10_000_000
 REDUNDANCY_SECONDS_MAX: Final = 5.0
-POLL_SECONDS: Final = 0.005
 PAUSE_SECONDS: Final = 0.02  # of undisturbed service between two kills
 
 
 def bench_recovery(ftm: str, placement: str, kills: int, *, pin: bool = True) -> dict[str, object]:
     """`recovery_ms{p50,p99,max}`, the same without detection, and its parts: see `docs/commands.md`."""
-    launched = start(ftm, placement, LoadRun(REQUESTS_ENDLESS, 0.0), pin=pin)
-    try:
+    with endless_run(ftm, placement, pin=pin) as run:
         epoch = 0
         for _ in range(kills):
-            epoch = _wait_for_redundancy(launched.private, epoch)
-            control_client.ask(launched.private, control_client.Inject(Fault(Crash(), "primary", Trigger())))
-        _wait_for_redundancy(launched.private, epoch)
-        launched.stop()
-    except BaseException:
-        launched.stop()
-        finish(launched)
-        raise
-    found = failovers(finish(launched, ends=("interrupted",)).history)
+            epoch = _wait_for_redundancy(run.private, epoch)
+            control_client.ask(run.private, control_client.Inject(Fault(Crash(), "primary", Trigger())))
+        _wait_for_redundancy(run.private, epoch)
     parts: dict[str, list[float]] = {"detection": [], "fencing": [], "promotion": [], "first_reply": []}
     recovered = []
-    for f in found:
+    for f in failovers(run.record.history):
         if f.detected_ms is None or f.fenced_ms is None or f.promoted_ms is None or f.recovered_ms is None:
             continue
         recovered.append(f.recovered_ms)
@@ -62,9 +51,9 @@ def bench_recovery(ftm: str, placement: str, kills: int, *, pin: bool = True) ->
 
 
 def _wait_for_redundancy(private: Path, epoch: int) -> int:
-    """Until two replicas serve under a later epoch than `epoch`; which.
+    """Until two replicas serve under a later epoch than `epoch`; returns that epoch.
 
-    Before, a kill may hit a leader that has no backup yet.
+    An earlier kill may hit a leader that has no backup yet.
     """
     limit = time.monotonic() + REDUNDANCY_SECONDS_MAX
     while time.monotonic() < limit:

@@ -1,23 +1,90 @@
-"""Runs for a bench: a synthetic load, no car, and the record of it."""
+"""Runs under a synthetic load, without a car, and the times in their records: what the benches share."""
 
-from aftbed.core.errors import HarnessError
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from aftbed.campaign.statistics import quantile
+from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.core.events import Event
-from aftbed.inject.model import Fault
 from aftbed.judge.record import RunRecord, read_record
+from aftbed.runtime.unix import control_client
 from aftbed.runtime.unix.launch import Launched, launch, options_for
 from aftbed.runtime.unix.options import LoadRun
 
+REQUESTS_ENDLESS: Final = 10_000_000
+READY_SECONDS_MAX: Final = 10.0
+POLL_SECONDS: Final = 0.005
+PAUSE_SECONDS: Final = 0.05  # of undisturbed service, between two things that are measured
+STOPPED: Final = ("interrupted", "")  # how an endless run may end
 
-def start(
-    ftm: str, placement: str, load: LoadRun, faults: tuple[Fault, ...] = (), pin: bool = True
-) -> Launched:
-    """Start a run under `load`."""
-    options, listener = options_for(ftm=ftm, placement=placement, work=load, faults=faults, pin=pin)
+
+class Percentiles(msgspec.Struct, frozen=True):
+    """Quantiles of a sample, by nearest rank."""
+
+    p50: float
+    p95: float
+    p99: float
+    max: float
+
+
+def percentiles(values: list[float], digits: int = 3) -> Percentiles:
+    """Of `values`, rounded."""
+    return Percentiles(*(round(quantile(values, share), digits) for share in (0.5, 0.95, 0.99, 1.0)))
+
+
+def summary(values: list[float], digits: int = 1) -> dict[str, float]:
+    """The same for a JSON document."""
+    return msgspec.structs.asdict(percentiles(values, digits))
+
+
+# -- runs -----------------------------------------------------------------------------------------
+
+
+def limited_run(ftm: str, placement: str, count: int, *, pin: bool) -> RunRecord:
+    """The record of a run of `count` requests in a closed loop."""
+    return finished(_start(ftm, placement, LoadRun(count, 0.0), pin), ends=("",))
+
+
+class EndlessRun:
+    """A run under an endless load; `record` is there when it has ended."""
+
+    def __init__(self, launched: Launched) -> None:
+        self.private: Path = launched.private
+        self._record: RunRecord | None = None
+
+    @property
+    def record(self) -> RunRecord:
+        assert self._record is not None, "the run goes on"
+        return self._record
+
+    def end(self, record: RunRecord) -> None:
+        self._record = record
+
+
+@contextmanager
+def endless_run(ftm: str, placement: str, rate_hz: float = 0.0, *, pin: bool = True) -> Iterator[EndlessRun]:
+    """A run at `rate_hz` requests a second (0: a closed loop), stopped at the end of the block."""
+    launched = _start(ftm, placement, LoadRun(REQUESTS_ENDLESS, rate_hz), pin)
+    run = EndlessRun(launched)
+    try:
+        yield run
+    finally:
+        launched.stop()
+        run.end(finished(launched, STOPPED))
+
+
+def _start(ftm: str, placement: str, load: LoadRun, pin: bool) -> Launched:
+    options, listener = options_for(ftm=ftm, placement=placement, work=load, faults=(), pin=pin)
     return launch(options, listener)
 
 
-def finish(launched: Launched, ends: tuple[str, ...] = ("",)) -> RunRecord:
-    """Follow the run to its end; its record. Raises HarnessError where it did not end well."""
+def finished(launched: Launched, ends: tuple[str, ...]) -> RunRecord:
+    """Follow the run to its end; its record. Raises HarnessError if it ended for another reason."""
     try:
         for _ in launched.reports():
             pass
@@ -31,13 +98,35 @@ def finish(launched: Launched, ends: tuple[str, ...] = ("",)) -> RunRecord:
         launched.remove()
 
 
-def cycles_us(record: RunRecord, skip: int) -> list[float]:
-    """From request.sent to reply.delivered at the client (us), without the first `skip` requests."""
+def wait_until_ready(private: Path) -> None:
+    """Until the run serves with all its replicas. Raises HarnessError."""
+    limit = time.monotonic() + READY_SECONDS_MAX
+    while time.monotonic() < limit:
+        try:
+            status = control_client.ask(private, control_client.Status())
+        except ConfigError:
+            status = {"busy": True}  # still starting
+        if not status["busy"]:
+            time.sleep(PAUSE_SECONDS)
+            return
+        time.sleep(POLL_SECONDS)
+    raise HarnessError(f"no service within {READY_SECONDS_MAX:.0f} s")
+
+
+def latencies_us(
+    record: RunRecord, *, skip: int = 0, began_ns: int = 0, ended_ns: int | None = None
+) -> list[float]:
+    """From request.sent to reply.delivered at the client, of the requests that were sent in that time.
+
+    Without the first `skip` requests, and without those that were not answered.
+    """
     sent: dict[int, int] = {}
-    times = []
+    found = []
     for event in record.history.events(Event.REQUEST_SENT, Event.REPLY_DELIVERED):
         if event.event is Event.REQUEST_SENT:
-            sent[event.request_id] = event.t_ns
-        elif event.request_id > skip:
-            times.append((event.t_ns - sent[event.request_id]) / 1e3)
-    return times
+            within = began_ns <= event.t_ns and (ended_ns is None or event.t_ns < ended_ns)
+            if within and event.request_id > skip:
+                sent[event.request_id] = event.t_ns
+        elif event.request_id in sent:
+            found.append((event.t_ns - sent[event.request_id]) / 1e3)
+    return found

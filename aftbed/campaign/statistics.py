@@ -156,7 +156,7 @@ def bootstrap_interval(
 
 
 def place(size: int, q: float) -> int:
-    """The index of the q-quantile among `size` values in order: that of `bench.statistics.quantile`."""
+    """The index of the q-quantile among `size` values in order: that of `bench.runs.quantile`."""
     return round(quantile([float(index) for index in range(size)], q))
 
 

@@ -12,12 +12,11 @@ from typing import Annotated, Final
 import msgspec
 import typer
 
-from aftbed.bench.adapt import bench_adapt
-from aftbed.bench.cycle import bench_cycle
-from aftbed.bench.hops import bench_hops
+from aftbed.bench.adaptation import bench_adapt
+from aftbed.bench.cycle import bench_cycle, bench_hops
 from aftbed.bench.launch import bench_launch
-from aftbed.bench.memory import bench_memory
 from aftbed.bench.recovery import bench_recovery
+from aftbed.bench.resources import bench_memory
 from aftbed.cli.options import Recipe
 from aftbed.core.errors import ConfigError
 from aftbed.ftm.compose import DUPLEX, replication_of
@@ -151,12 +150,12 @@ def paper(
     if json:
         print(msgspec.json.encode(found).decode())
     else:
-        from aftbed.bench import papertext  # noqa: PLC0415 - after the measurement
+        from aftbed.bench import paper_page  # noqa: PLC0415 - after the measurement
 
-        for line in papertext.markdown(found) if markdown else papertext.text(found):
+        for line in paper_page.markdown(found) if markdown else paper_page.text(found):
             print(line)
     if html is not None:
-        from aftbed.bench.paperpage import html_page  # noqa: PLC0415 - after the measurement
+        from aftbed.bench.paper_page import html_page  # noqa: PLC0415 - after the measurement
 
         html.write_text(html_page(found), encoding="utf-8")
 

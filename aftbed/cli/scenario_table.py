@@ -25,7 +25,7 @@ from aftbed.inject.crash import Crash
 from aftbed.inject.model import Fault, parse
 from aftbed.inject.timing import Trigger
 from aftbed.judge.verdict import EXIT_INTERRUPTED
-from aftbed.report.roadplot import Curve, Point, road_plot
+from aftbed.report.plots import RoadCurve, RoadPoint, road_plot
 from aftbed.search.road_table import NONE, PRIMARY, DrivenRow, RoadLine, driven, drives, outage
 from aftbed.search.worst_instant import STEP_CYCLES
 from aftbed.vehicle.scenarios import tables
@@ -199,7 +199,7 @@ def _plot(path: Path, table: str, found: TableDrive, rows: Sequence[DrivenRow]) 
     """A picture for each group."""
     groups = {case.name: case.group for case in found.cases}
     curves = [
-        Curve(group, line, tuple(_point(row) for row in sorted(of, key=lambda row: row.speed_kmh)))
+        RoadCurve(group, line, tuple(_point(row) for row in sorted(of, key=lambda row: row.speed_kmh)))
         for (line, group), of in groupby(rows, key=lambda row: (row.line, groups[row.case]))
     ]
     try:
@@ -208,8 +208,8 @@ def _plot(path: Path, table: str, found: TableDrive, rows: Sequence[DrivenRow]) 
         raise ConfigError(f"--plot {path}: {error.strerror}") from None
 
 
-def _point(row: DrivenRow) -> Point:
-    return Point(row.speed_kmh, row.impact_kmh, row.limit_kmh, row.closed_form_kmh)
+def _point(row: DrivenRow) -> RoadPoint:
+    return RoadPoint(row.speed_kmh, row.impact_kmh, row.limit_kmh, row.closed_form_kmh)
 
 
 # -- what is printed ---------------------------------------------------------------------------------

@@ -376,7 +376,7 @@ def picture(setup: Setup, broken: tuple[Breach, ...]) -> Picture:
     if attempt(setup)[0] is None:
         return Picture("", "")
     trace = traced(setup)
-    return Picture(sequence.text(trace, broken), sequence.mermaid(trace, broken))
+    return Picture(sequence.listing(trace, broken), sequence.mermaid(trace, broken))
 
 
 class BrokenRun(NamedTuple):

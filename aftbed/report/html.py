@@ -1,9 +1,9 @@
 """The HTML report: one file, which needs neither network nor script nor anything beside it.
 
-The page is made by a Jinja2 template that escapes whatever it is given; what is drawn is SVG in the page
-itself. Tooltips are `title` elements and links are anchors, so all of it works in a browser that runs no
-script, in a mail, and on paper. Its size depends on the strata and not on the experiments: of ten thousand
-runs the worst are told, the rest is counted.
+The page is made by a Jinja2 template that escapes what it is given; drawings are SVG in the page itself.
+Tooltips are `title` elements and links are anchors, so all of it works in a browser that runs no script, in a
+mail, and on paper. Its size depends on the number of strata and not on that of experiments: of ten thousand
+runs the worst are listed and the others are counted.
 """
 
 import re
@@ -18,115 +18,99 @@ from markupsafe import Markup
 
 from aftbed.campaign.experiment import Result
 from aftbed.campaign.ledger import Ledger
+from aftbed.campaign.plan import JOINED, strata_of
 from aftbed.campaign.spec import Gate, Spec
 from aftbed.campaign.statistics import Interval
-from aftbed.campaign.summary import Summary, confidence_of
+from aftbed.campaign.summary import StratumSummary, Summary, confidence_of
 from aftbed.judge.outcome import OUTCOMES
 from aftbed.report import plots
-from aftbed.report.matrix import MEANINGS, Places, anchor_of, matrix, shares
 from aftbed.report.plots import Limit, milliseconds
-from aftbed.report.spacetime import space_time
+from aftbed.report.sequence import SpaceTime, space_time
 from aftbed.report.worst import by_badness, rerun, slowness_ms
 
 TEMPLATES: Final = Path(__file__).resolve().parent / "templates"
 DRAWN_MAX: Final = 3  # runs that are simulated again
 LISTED_MAX: Final = 20
-PANELS_MAX: Final = 6  # of one kind of time
+PANELS_MAX: Final = 6  # plots of one kind of time
 METRICS: Final = {
     "recovery_ms": ("Recovery", "from the fault to the first good reply of the new master"),
-    "blackout_ms": ("Blackout of a failover", "while a request waited and nobody could answer it"),
+    "blackout_ms": ("Blackout of a failover", "while a request waited and no replica could answer it"),
     "adapt_blackout_ms": ("Blackout of an adaptation", "while an adaptation kept the client waiting"),
 }
+MEANINGS: Final = {
+    "masked": "the client could not notice the fault",
+    "latent": "right replies, but the state of a replica is wrong at the end",
+    "tolerated": "the mechanism had to act: a failover, a third execution",
+    "degraded": "late replies, a recovery over its budget, or no redundancy at the end",
+    "detected_stop": "a replica ended itself rather than answer",
+    "omission": "requests without a reply, then replies again",
+    "duplicate_effect": "a request took effect twice, or was answered twice",
+    "unavailable": "no replica was left",
+    "hang": "a replica was left, but no reply came any more",
+    "sdc": "a wrong reply reached the client",
+    "inconclusive": "the record is not whole: nothing is known of the mechanism",
+    "harness_error": "trouble of the testbed: nothing is known of the mechanism",
+}
+assert tuple(MEANINGS) == OUTCOMES
 _UNREADABLE: Final = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")
-
-
-class Panel(msgspec.Struct, frozen=True):
-    """A plot: of the runs with one kind of fault; `lines` are named by the rows of the matrix."""
-
-    fault: str
-    lines: tuple[str, ...]
-    count: int
-    drawing: Markup
-
-
-class Times(msgspec.Struct, frozen=True):
-    """One kind of time, and the plots of it."""
-
-    anchor: str
-    title: str
-    meaning: str
-    panels: tuple[Panel, ...]
-    left_out: int  # kinds of fault
-
-
-class Line(msgspec.Struct, frozen=True):
-    """An entry of the plots' legend."""
-
-    name: str
-    swatch: Markup
-
-
-class Told(msgspec.Struct, frozen=True):
-    """A run to look at. `names`, `body` and `text` of its diagram are empty where it is not drawn."""
-
-    result: Result
-    anchor: str
-    stratum: str
-    slowness_ms: float
-    command: str
-    names: Markup = Markup()
-    body: Markup = Markup()
-    text: str = ""
-    note: str = ""
 
 
 def html_report(summary: Summary, ledger: Ledger, *, drawn: int = DRAWN_MAX) -> str:
     """The whole page; `drawn` of the worst runs are simulated once more, to draw them."""
-    spec, place = ledger.head.spec, Places(ledger.head.spec)
-    rows = dict.fromkeys(place(stratum.name)[0] for stratum in summary.strata)
-    styles = {row: number for number, row in enumerate(rows)}
-    anchors = {stratum.name: anchor_of(number) for number, stratum in enumerate(summary.strata)}
+    spec = ledger.head.spec
+    places = {stratum.name: place_of(stratum.name, spec) for stratum in summary.strata}
+    styles = {row: number for number, row in enumerate(dict.fromkeys(row for row, _ in places.values()))}
+    anchors = {stratum.name: f"stratum-{number}" for number, stratum in enumerate(summary.strata)}
     worst = by_badness(ledger.results)
-    times = [_times(metric, ledger.results, spec, styles) for metric in METRICS]
+    times = [_time_plots(metric, ledger.results, spec, styles) for metric in METRICS]
     timed = {name for kind in times for panel in kind.panels for name in panel.lines}
-    page = _engine().get_template("report.html.j2")
-    said = page.render(
+    page = engine(TEMPLATES).get_template("report.html.j2")
+    return page_text(
+        page,
         summary=summary,
         spec=spec,
         head=ledger.head,
-        matrix=matrix(spec, summary.strata),
+        faults=list(dict.fromkeys(fault for _, fault in places.values())),
+        matrix=_matrix(summary.strata, places),
+        shares={stratum.name: shares(stratum) for stratum in summary.strata},
+        anchors=anchors,
         outcomes=[name for name in OUTCOMES if name in summary.outcomes],
         meanings=MEANINGS,
         times=times,
-        lines=[Line(name, Markup(plots.swatch(styles[name]))) for name in rows if name in timed],
-        worst=list(_told(worst[:LISTED_MAX], anchors, drawn)),
+        lines=[(name, style) for name, style in styles.items() if name in timed],
+        worst=list(_worst_runs(worst[:LISTED_MAX], drawn)),
         worst_count=len(worst),
-        strata=[(anchors[s.name], s, shares(s)) for s in summary.strata],
         failed_gates=sum(gate.word == "fail" for gate in summary.gates),
-        unexpected=sum(s.unexpected for s in summary.strata),
+        unexpected=sum(stratum.unexpected for stratum in summary.strata),
         confidence=confidence_of(spec),
         environment=ledger.head.environment,
     )
-    return _UNREADABLE.sub("�", said)
 
 
-def _engine() -> jinja2.Environment:
-    engine = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(TEMPLATES),
+def engine(*folders: Path) -> jinja2.Environment:
+    """For pages whose templates are in `folders`: it escapes all values, and refuses unknown names."""
+    found = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(folders),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    engine.filters |= {"ms": milliseconds, "percent": percent, "interval": interval, "count": _count}
-    return engine
+    found.filters |= {"ms": milliseconds, "percent": percent, "interval": interval, "count": _count}
+    found.filters |= {"px": _px, "line_style": plots.line_style}
+    return found
+
+
+def page_text(page: jinja2.Template, **values: object) -> str:
+    """The page without characters that no HTML may contain."""
+    return _UNREADABLE.sub("�", page.render(**values))
 
 
 # -- figures --------------------------------------------------------------------------------------
 
 
 def percent(share: float) -> str:
-    """`8.8 %`, `0 %`; what is not quite all, or not quite nothing, is never rounded to it."""
+    """`8.8 %`, `0 %`; a share that is almost all, or almost nothing, is never rounded to it."""
     if share in (0, 1):
         return f"{100 * share:.0f} %"
     if share < 0.0005 or share > 0.9995:
@@ -144,26 +128,85 @@ def _count(value: float) -> str:
     return f"{value:,.0f}".replace(",", " ")
 
 
+def _px(value: float) -> str:
+    return f"{value:.1f}".removesuffix(".0")
+
+
+# -- the matrix of outcomes -------------------------------------------------------------------------
+
+
+class OutcomeShare(msgspec.Struct, frozen=True):
+    """A piece of a stratum's bar."""
+
+    outcome: str
+    count: int
+    percent: float
+
+
+def place_of(stratum: str, spec: Spec) -> tuple[str, str]:
+    """Row (mechanism, placement and adaptation) and column (fault) of a stratum, by its name."""
+    faults = {found.name: found.fault.name for found in strata_of(spec)}
+    fault = faults.get(stratum, stratum.rpartition(JOINED)[2])
+    return stratum.removesuffix(f"{JOINED}{fault}"), fault
+
+
+def shares(stratum: StratumSummary) -> list[OutcomeShare]:
+    """Its outcomes, the best first."""
+    counts = stratum.outcomes.items()
+    return [OutcomeShare(name, count, 100 * count / stratum.experiments) for name, count in counts]
+
+
+def _matrix(
+    strata: Iterable[StratumSummary], places: dict[str, tuple[str, str]]
+) -> dict[str, dict[str, StratumSummary]]:
+    """The strata by row and column."""
+    found: dict[str, dict[str, StratumSummary]] = {}
+    for stratum in strata:
+        row, fault = places[stratum.name]
+        found.setdefault(row, {})[fault] = stratum
+    return found
+
+
 # -- times ----------------------------------------------------------------------------------------
 
 
-def _times(metric: str, results: Iterable[Result], spec: Spec, styles: dict[str, int]) -> Times:
-    place = Places(spec)
+class TimePanel(msgspec.Struct, frozen=True):
+    """A plot of the runs with one kind of fault; `lines` are named by the rows of the matrix."""
+
+    fault: str
+    lines: tuple[str, ...]
+    count: int
+    drawing: Markup
+
+
+class TimePlots(msgspec.Struct, frozen=True):
+    """One kind of time, and its plots."""
+
+    anchor: str
+    title: str
+    meaning: str
+    panels: tuple[TimePanel, ...]
+    left_out: int  # kinds of fault
+
+
+def _time_plots(metric: str, results: Iterable[Result], spec: Spec, styles: dict[str, int]) -> TimePlots:
     found: dict[str, dict[str, list[float]]] = {}
-    names: dict[str, dict[str, None]] = {}
+    strata: dict[str, dict[str, None]] = {}
+    places: dict[str, tuple[str, str]] = {}
     for result in results:
         value: float | None = getattr(result, metric)
+        name = result.experiment.stratum
         if value is not None:
-            row, fault = place(result.experiment.stratum)
+            row, fault = places.setdefault(name, place_of(name, spec))
             found.setdefault(fault, {}).setdefault(row, []).append(value)
-            names.setdefault(fault, {})[result.experiment.stratum] = None
+            strata.setdefault(fault, {})[name] = None
     title, meaning = METRICS[metric]
     panels = []
     for fault, lines in list(found.items())[:PANELS_MAX]:
-        limits = list(_limits(metric, spec, names[fault]))
+        limits = list(_limits(metric, spec, strata[fault]))
         drawing = plots.ecdf(f"{title}, {fault}", lines, styles, limits)
-        panels.append(Panel(fault, tuple(lines), sum(map(len, lines.values())), Markup(drawing)))
-    return Times(f"times-{metric}", title, meaning, tuple(panels), max(0, len(found) - PANELS_MAX))
+        panels.append(TimePanel(fault, tuple(lines), sum(map(len, lines.values())), Markup(drawing)))
+    return TimePlots(f"times-{metric}", title, meaning, tuple(panels), max(0, len(found) - PANELS_MAX))
 
 
 def _limits(metric: str, spec: Spec, strata: Iterable[str]) -> Iterator[Limit]:
@@ -174,39 +217,36 @@ def _limits(metric: str, spec: Spec, strata: Iterable[str]) -> Iterator[Limit]:
     for gate in spec.gates:
         of, _, which = gate.metric.rpartition("_")
         if of == metric and any(fnmatch(name, gate.strata) for name in names):
-            yield Limit(
-                f"gate: {which} {_asked(gate)} ms", gate.max if gate.max is not None else gate.min or 0.0
-            )
+            limit_ms = gate.max if gate.max is not None else gate.min or 0.0
+            yield Limit(f"gate: {which} {_allowed(gate)} ms", limit_ms)
 
 
-def _asked(gate: Gate) -> str:
+def _allowed(gate: Gate) -> str:
     return f"at most {gate.max:g}" if gate.max is not None else f"at least {gate.min:g}"
 
 
 # -- the worst runs -------------------------------------------------------------------------------
 
 
-def _told(worst: Sequence[Result], anchors: dict[str, str], drawn: int) -> Iterator[Told]:
+class WorstRun(msgspec.Struct, frozen=True):
+    """A run to look at; `note` says of the first few what is drawn, or why nothing is."""
+
+    result: Result
+    slowness_ms: float
+    diagram: SpaceTime | None = None
+    note: str = ""
+
+
+def _worst_runs(worst: Sequence[Result], drawn: int) -> Iterator[WorstRun]:
     for number, result in enumerate(worst):
-        experiment = result.experiment
-        told = Told(
-            result,
-            f"run-{experiment.id}",
-            anchors.get(experiment.stratum, ""),
-            slowness_ms(result),
-            experiment.command(),
-        )
-        yield _drawn(told) if number < drawn else told
-
-
-def _drawn(told: Told) -> Told:
-    result = told.result
-    again = rerun(result.experiment)
-    if again.trace is None:
-        return msgspec.structs.replace(told, note=f"Not drawn: it cannot be simulated: {again.why_not}")
-    picture = space_time(again.trace)
-    same = again.outcome == result.outcome
-    note = "As simulated." if same else f"As simulated, where it came out otherwise: {again.outcome}."
-    return msgspec.structs.replace(
-        told, names=Markup(picture.names), body=Markup(picture.body), text=picture.text, note=note
-    )
+        if number >= drawn:
+            yield WorstRun(result, slowness_ms(result))
+            continue
+        again = rerun(result.experiment)
+        if again.trace is None:
+            note = f"Not drawn: it cannot be simulated: {again.why_not}"
+            yield WorstRun(result, slowness_ms(result), note=note)
+            continue
+        same = again.outcome == result.outcome
+        note = "As simulated." if same else f"As simulated, where it came out otherwise: {again.outcome}."
+        yield WorstRun(result, slowness_ms(result), space_time(again.trace), note)

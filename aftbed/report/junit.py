@@ -1,24 +1,27 @@
 """JUnit XML: what a CI shows of a campaign without knowing what a campaign is.
 
 A test suite is the campaign; a test case is a stratum, or a gate. The text of a failure says why, and ends
-with the command that repeats the worst experiment, for whoever reads it in the log of a build.
+with the command that repeats the worst experiment, so that it stands in the log of a build.
 
-A stratum fails where
-- experiments came out otherwise than expected, unless a gate on `unexpected` that holds covers it: then the
-  campaign's author has said how many are too many, and they were not;
-- or its faults never struck.
-A gate fails where it does. So a campaign that fails has a test case that does, and one that passes without
-unexpected outcomes has none.
+A stratum fails if
+- it has unexpected outcomes, unless a gate on `unexpected` that passes covers it: then the campaign's author
+  has set how many are too many, and there were fewer;
+- or none of its faults struck.
+A gate fails as it does in the summary. So a campaign that fails has a failed test case, and a campaign that
+passes without unexpected outcomes has none.
 
-The schema is `junit-10.xsd` of the Jenkins xUnit plugin, which pytest keeps to as well, in the part of it
-that the older `jenkins-junit.xsd` allows too. XML 1.0 has no control characters: they come as U+FFFD.
+The schema is `junit-10.xsd` of the Jenkins xUnit plugin, which pytest keeps to as well, in the part that the
+older `jenkins-junit.xsd` allows too. XML 1.0 has no control characters: they become U+FFFD.
 """
 
+import io
 import re
 from collections.abc import Iterable, Mapping
 from fnmatch import fnmatch
 from typing import Final
 from xml.etree import ElementTree
+
+from junitparser import Failure, JUnitXml, TestCase, TestSuite
 
 from aftbed.campaign.experiment import Result
 from aftbed.campaign.ledger import Ledger
@@ -36,27 +39,43 @@ def junit_xml(summary: Summary, ledger: Ledger) -> str:
     groups: dict[str, list[Result]] = {}
     for result in ledger.results:
         groups.setdefault(result.experiment.stratum, []).append(result)
-    suite = ElementTree.Element("testsuite")
-    suite.append(_properties(summary, ledger))
+    suite = TestSuite(_readable(summary.campaign))
+    for name, value in _properties(summary, ledger).items():
+        suite.add_property(name, _readable(value))
+    group = f"aftbed.{summary.campaign}"
+    cases = []
     for stratum in summary.strata:
-        why = _why(stratum, summary.gates, groups[stratum.name])
-        seconds = sum(result.seconds for result in groups[stratum.name])
-        suite.append(_case(f"aftbed.{summary.campaign}", stratum.name, seconds, why))
+        results = groups[stratum.name]
+        seconds = sum(result.seconds for result in results)
+        cases.append(_case(group, stratum.name, seconds, _why(stratum, summary.gates, results)))
     for gate in summary.gates:
         why = (GATE, _gate_text(gate, groups)) if gate.word == "fail" else None
-        suite.append(_case(f"aftbed.{summary.campaign}.gates", _gate_name(gate), 0.0, why))
-    counts = {"tests": len(suite.findall("testcase")), "failures": len(suite.findall("testcase/failure"))}
-    told = {name: str(count) for name, count in counts.items()} | {"errors": "0"}
-    _attributes(suite, {"name": summary.campaign, **told, "skipped": "0", "time": f"{summary.seconds:.3f}"})
-    root = ElementTree.Element("testsuites")
-    _attributes(root, {"name": "aftbed campaign", **told, "time": f"{summary.seconds:.3f}"})
-    root.append(suite)
+        cases.append(_case(f"{group}.gates", _gate_name(gate), 0.0, why))
+    suite.add_testcases(cases)  # counts them
+    suite.time = round(summary.seconds, 3)
+    document = JUnitXml("aftbed campaign")
+    document.add_testsuite(suite)
+    document.tests, document.failures, document.errors = suite.tests, suite.failures, suite.errors
+    document.time = suite.time  # its other count, `skipped`, is none of the schema's
+    file = io.BytesIO()
+    document.write(file)
+    root = ElementTree.fromstring(file.getvalue())
     ElementTree.indent(root)
     return f"<?xml version='1.0' encoding='utf-8'?>\n{ElementTree.tostring(root, encoding='unicode')}\n"
 
 
-def _properties(summary: Summary, ledger: Ledger) -> ElementTree.Element:
-    found = {
+def _case(group: str, name: str, seconds: float, why: tuple[str, str] | None) -> TestCase:
+    case = TestCase(_readable(name), _readable(group), round(seconds, 3))
+    if why is not None:
+        kind, text = why
+        failure = Failure(_readable(text.partition("\n")[0]), kind)
+        failure.text = _readable(text)
+        case.result = [failure]
+    return case
+
+
+def _properties(summary: Summary, ledger: Ledger) -> dict[str, str]:
+    return {
         "campaign": summary.campaign,
         "seed": str(summary.seed),
         "code": summary.code,
@@ -67,27 +86,12 @@ def _properties(summary: Summary, ledger: Ledger) -> ElementTree.Element:
         "gate": summary.gate,
         **{f"outcome.{name}": str(count) for name, count in summary.outcomes.items()},
     }
-    element = ElementTree.Element("properties")
-    for name, value in found.items():
-        _attributes(ElementTree.SubElement(element, "property"), {"name": name, "value": value})
-    return element
-
-
-def _case(group: str, name: str, seconds: float, why: tuple[str, str] | None) -> ElementTree.Element:
-    case = ElementTree.Element("testcase")
-    _attributes(case, {"classname": group, "name": name, "time": f"{seconds:.3f}"})
-    if why is not None:
-        kind, text = why
-        failure = ElementTree.SubElement(case, "failure")
-        _attributes(failure, {"type": kind, "message": text.partition("\n")[0]})
-        failure.text = _readable(text)
-    return case
 
 
 def _why(
     stratum: StratumSummary, gates: Iterable[GateResult], results: list[Result]
 ) -> tuple[str, str] | None:
-    """Kind and text of its failure, if it fails."""
+    """Kind and text of the stratum's failure, if it fails."""
     if stratum.unexpected and not _allowed(stratum.name, gates):
         came = ", ".join(f"{name} {count}" for name, count in stratum.outcomes.items())
         text = f"{stratum.unexpected} of {stratum.experiments} unexpected: {came};"
@@ -99,7 +103,7 @@ def _why(
 
 
 def _allowed(name: str, gates: Iterable[GateResult]) -> bool:
-    """Whether a gate says how many unexpected outcomes are too many here, and it holds."""
+    """Whether a gate limits the unexpected outcomes of this stratum, and passes."""
     words = [gate.word for gate in gates if gate.metric == UNEXPECTED and fnmatch(name, gate.strata)]
     return bool(words) and "fail" not in words
 
@@ -108,8 +112,7 @@ def _worst_text(results: list[Result]) -> str:
     worst = worst_of(results)
     experiment = worst.experiment
     head = f"the worst: experiment {experiment.id}: {worst.outcome}"
-    lines = [head, *worst.broken, *worst.reasons, experiment.command()]
-    return "\n".join(lines)
+    return "\n".join((head, *worst.broken, *worst.reasons, experiment.command()))
 
 
 def _gate_name(gate: GateResult) -> str:
@@ -117,20 +120,15 @@ def _gate_name(gate: GateResult) -> str:
 
 
 def _gate_text(gate: GateResult, groups: Mapping[str, list[Result]]) -> str:
-    """The worst is that of the strata which the gate is about."""
-    meant = [
-        r
+    """With the worst experiment of the strata that the gate is about."""
+    covered = [
+        result
         for name, results in groups.items()
         if name == gate.strata or fnmatch(name, gate.strata)
-        for r in results
+        for result in results
     ]
     text = f"{_gate_name(gate)}: {gate.reason}"
-    return f"{text}\n{_worst_text(meant)}" if meant else text
-
-
-def _attributes(element: ElementTree.Element, values: Mapping[str, str]) -> None:
-    for name, value in values.items():
-        element.set(name, _readable(value))
+    return f"{text}\n{_worst_text(covered)}" if covered else text
 
 
 def _readable(text: str) -> str:

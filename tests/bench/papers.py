@@ -1,15 +1,26 @@
-"""A document of `aftbed bench paper` that nobody measured, for tests of what is made of it."""
+"""A made-up document of `aftbed bench paper`, for tests of what is made of it."""
 
-from aftbed.bench.paperdocument import Count, Paper, figure
-from aftbed.bench.placements import Cycle, Loaded, Placed, times
-from aftbed.bench.published import CYCLE_PBR, Published
-from aftbed.bench.sweep import Sized
-from aftbed.bench.usage import Usage
+from aftbed.bench.paper import (
+    CYCLE_PBR,
+    CycleResult,
+    Paper,
+    PlacementResult,
+    ProcessCount,
+    PublishedFigure,
+    figure,
+)
+from aftbed.bench.resources import LoadResult, Usage
+from aftbed.bench.runs import percentiles
+from aftbed.bench.sweep import StateResult
 from aftbed.campaign.ledger import Environment
 
 USAGE = Usage(1.0, 17, 6, 13.15, 83.4, 7, 0.5, 26.6)
-TIMES = times([0.1, 0.2, 0.4])
-CYCLE = Cycle("pbr", "process", 3, 12, times([100.0, 110.0, 180.0]), times([75.0, 76.0, 90.0]), 1.4)
+TIMES = percentiles([0.1, 0.2, 0.4])
+CYCLE = CycleResult(
+    "pbr", "process", 3, 12, percentiles([100.0, 110.0, 180.0]), percentiles([75.0, 76.0, 90.0]), 1.4
+)
+
+STILL = PublishedFigure(300, 300, "still")
 
 
 def made_up(note: str = "", refused: str = "too large") -> Paper:
@@ -26,19 +37,27 @@ def made_up(note: str = "", refused: str = "too large") -> Paper:
         rospy_cycle_ms=0.6,
         figures=(
             figure("cycle.pbr", "cycle of pbr", TIMES, 3, 75.0, CYCLE_PBR),
-            figure("start", "start", times([408.0]), 1, 75.0, note=note),
-            figure("whole", "whole", times([130.0]), 1, 75.0, Published(300, 300, "still"), served=True),
+            figure("start", "start", percentiles([408.0]), 1, 75.0, note=note),
+            figure(
+                "whole",
+                "whole",
+                percentiles([130.0]),
+                1,
+                75.0,
+                PublishedFigure(300, 300, "still"),
+                served=True,
+            ),
         ),
-        processes=(Count("pbr", "process", 17, 17), Count("pbr", "replica", 9, None)),
-        placements=(Placed("process", True, CYCLE, USAGE, USAGE),),
+        processes=(ProcessCount("pbr", "process", 17, 17), ProcessCount("pbr", "replica", 9, None)),
+        placements=(PlacementResult("process", True, CYCLE, USAGE, USAGE),),
         state=(
-            Sized("pbr", 100, 900, times([110.0, 120.0]), 75.0, 2, TIMES, TIMES),
-            Sized("pbr", 60_000, 900, times([310.0, 320.0]), 75.0, 2, TIMES, TIMES),
-            Sized("pbr", 10_000_000, refused=refused),
+            StateResult("pbr", 100, 900, percentiles([110.0, 120.0]), 75.0, 2, TIMES, TIMES),
+            StateResult("pbr", 60_000, 900, percentiles([310.0, 320.0]), 75.0, 2, TIMES, TIMES),
+            StateResult("pbr", 10_000_000, refused=refused),
         ),
         load=(
-            Loaded("pbr", "process", 10.0, 30, 10.0, TIMES, 75.0, USAGE),
-            Loaded("pbr", "process", 2000.0, 6000, 1999.7, TIMES, 75.0, USAGE),
+            LoadResult("pbr", "process", 10.0, 30, 10.0, TIMES, 75.0, USAGE),
+            LoadResult("pbr", "process", 2000.0, 6000, 1999.7, TIMES, 75.0, USAGE),
         ),
         notes=("something is missing",),
     )

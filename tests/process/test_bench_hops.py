@@ -10,7 +10,7 @@ from typing import Final
 import pytest
 from liveruns import Home, aftbed
 
-from aftbed.bench.hops import PLACEMENT, Pair, delays_ns, nearest, single_hops, undisturbed
+from aftbed.bench.cycle import PLACEMENT, NotePair, delays_ns, nearest, single_hops, undisturbed
 from aftbed.core.events import Event
 from aftbed.ftm.compose import EXPRESSIONS, build
 
@@ -26,17 +26,17 @@ PBR_PAIRS: Final = [
 PBR_BESIDE: Final = [("a/after checkpoint.sent", "a/protocol reply.stored")]
 
 
-def pairs(ftm: str) -> tuple[Pair, ...]:
+def pairs(ftm: str) -> tuple[NotePair, ...]:
     """Those that are used."""
     return single_hops(build(ftm, PLACEMENT))[0]
 
 
-def beside(ftm: str) -> tuple[Pair, ...]:
+def beside(ftm: str) -> tuple[NotePair, ...]:
     """Those that are shown apart."""
     return single_hops(build(ftm, PLACEMENT))[1]
 
 
-def named(found: tuple[Pair, ...]) -> list[tuple[str, str]]:
+def named(found: tuple[NotePair, ...]) -> list[tuple[str, str]]:
     return [(str(source), str(sink)) for source, sink in found]
 
 

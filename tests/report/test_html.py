@@ -188,4 +188,9 @@ def test_the_templates_are_part_of_the_package() -> None:
     import aftbed.report as package  # noqa: PLC0415
 
     folder = Path(package.__file__).parent / "templates"
-    assert {path.name for path in folder.iterdir()} == {"report.html.j2", "report.css"}
+    assert {path.name for path in folder.iterdir()} == {
+        "report.html.j2",
+        "report.css",
+        "spacetime.html.j2",
+        "swatch.html.j2",
+    }

@@ -1,14 +1,19 @@
-"""The last messages before a breach: as people read them, and in Mermaid's grammar."""
+"""A simulated run as a listing, in Mermaid's grammar, and as a space-time diagram."""
 
 import re
+from xml.etree import ElementTree
 
 import pytest
 
+from aftbed.adapt.schedule import scheduled
+from aftbed.core.script import RECIPES
+from aftbed.ftm.compose import build
 from aftbed.inject.crash import Crash
-from aftbed.inject.model import Fault
+from aftbed.inject.model import Fault, parse
 from aftbed.inject.timing import Trigger
 from aftbed.judge.verdict import Breach
-from aftbed.report.sequence import escaped, mermaid, text
+from aftbed.report.html import TEMPLATES, engine
+from aftbed.report.sequence import KEPT_MAX, Shape, SpaceTime, escaped, listing, mermaid, space_time
 from aftbed.runtime.sim.trace import Trace, traced
 from aftbed.runtime.sim.world import Setup
 from aftbed.search.swarm import drawn
@@ -50,7 +55,7 @@ def check_grammar(diagram: str) -> tuple[set[str], int]:
 
 
 def test_a_listing_ends_with_what_happened_to_the_request_last(trace: Trace) -> None:
-    found = text(trace, (LOST,), 8).splitlines()
+    found = listing(trace, (LOST,), 8).splitlines()
     assert len(found) == 9 and found[-1] == "broken: G2: request 2: 0 replies"
     assert "answered" in found[-2] and "#2 " in found[-2]
     columns = r" *\d+\.\d{3} ms  \S+ +(\*|\S+|\w+ -> \S+)  .+"
@@ -58,14 +63,14 @@ def test_a_listing_ends_with_what_happened_to_the_request_last(trace: Trace) -> 
 
 
 def test_without_a_request_it_ends_with_the_run(trace: Trace) -> None:
-    whole = [line.split() for line in text(trace, last=100_000).splitlines()]
+    whole = [line.split() for line in listing(trace, last=100_000).splitlines()]
     assert len(whole) == len(trace.happened)
-    found = [line.split() for line in text(trace, (UNREST,), 10).splitlines()]
+    found = [line.split() for line in listing(trace, (UNREST,), 10).splitlines()]
     assert found == [*whole[-10:], f"broken: {UNREST}".split()]
 
 
 def test_a_listing_tells_faults_and_what_the_executive_said(trace: Trace) -> None:
-    found = text(trace, last=100_000)
+    found = listing(trace, last=100_000)
     assert "fault.applied: crash primary at checkpoint.sent nth 2" in found
     assert re.search(r"supervisor +struck +a/after\n", found)
     assert re.search(r"supervisor +script +failover \(a\)\n", found)
@@ -95,7 +100,7 @@ def test_bricks_that_share_a_node_are_one_participant() -> None:
 def test_a_run_in_which_nothing_was_said_is_a_diagram_too(trace: Trace) -> None:
     empty = Trace(trace.run, ())
     assert check_grammar(mermaid(empty, (UNREST,))) == ({"supervisor"}, 0)
-    assert text(empty) == ""
+    assert listing(empty) == ""
 
 
 def test_what_means_something_to_mermaid_is_escaped() -> None:
@@ -109,4 +114,85 @@ def test_what_means_something_to_mermaid_is_escaped() -> None:
 def test_whatever_a_swarm_does_can_be_drawn(seed: int) -> None:
     trace = traced(drawn(seed))
     check_grammar(mermaid(trace, (LOST, UNREST), 200))
-    assert len(text(trace, (UNREST,), 200).splitlines()) == 201
+    assert len(listing(trace, (UNREST,), 200).splitlines()) == 201
+
+
+# -- space-time
+
+
+def trace_of(ftm: str = "pbr", placement: str = "process", fault: str = "", adapt: str = "") -> Trace:
+    graph = build(ftm, placement)
+    faults = (parse(fault),) if fault else ()
+    changes = scheduled((adapt,) if adapt else (), graph, RECIPES[0])
+    return traced(Setup(ftm, placement, 3, 40, 0.0, faults, changes))
+
+
+@pytest.fixture(scope="module")
+def failover() -> Trace:
+    return trace_of(fault="crash primary at server.exit nth 8")
+
+
+def words(shapes: list[Shape]) -> list[str]:
+    return [shape.text for shape in shapes]
+
+
+def marks(diagram: SpaceTime) -> list[Shape]:
+    return [*diagram.arrows, *diagram.dots, *diagram.crosses, *diagram.diamonds]
+
+
+def test_nodes_are_rows_in_the_order_of_a_request(failover: Trace) -> None:
+    rows = words(space_time(failover).rows)
+    assert rows[:7] == ["client", "proxy", "a/protocol", "a/before", "a/proceed", "a/server", "a/after"]
+    assert rows[-2:] == ["recovery", "supervisor"]
+    assert rows.index("a/watchdog") < rows.index("b/protocol")
+
+
+def test_the_fault_and_the_steps_of_the_failover_are_marked(failover: Trace) -> None:
+    diagram = space_time(failover)
+    fault = "crash primary at server.exit nth 8"
+    assert {fault, "watchdog.suspect", "replica.promoted", "backup.ready"} <= set(words(diagram.labels))
+    assert any(text.endswith("a/server was hit") for text in words(diagram.crosses))
+    assert any(life.css == "hit" for life in diagram.lives)
+
+
+def test_the_steps_of_an_adaptation_are_marked() -> None:
+    diagram = space_time(trace_of(adapt="compose pbr+tr at request 20"))
+    assert {"adapt.plan", "adapt.commit"} <= set(words(diagram.labels))
+    assert any("adapt.step.enter 1" in text for text in words(diagram.diamonds))
+    assert not diagram.crosses
+
+
+def test_an_arrow_per_message_that_is_kept_and_the_rest_is_counted(failover: Trace) -> None:
+    diagram = space_time(failover)
+    left_out = sum(int(text.split()[0]) for text in words(diagram.gaps))
+    assert len(diagram.arrows) == diagram.text.count(" -> ") > 20
+    lines = len(diagram.text.splitlines())
+    assert lines <= KEPT_MAX and lines + left_out <= len(failover.happened) and left_out > 0
+
+
+@pytest.mark.parametrize("placement", ["process", "replica", "single"])
+@pytest.mark.parametrize("ftm", ["none", "pbr", "lfr+tr"])
+def test_any_run_can_be_drawn(ftm: str, placement: str) -> None:
+    diagram = space_time(trace_of(ftm, placement))
+    assert len(diagram.rows) >= 2
+    assert diagram.arrows or placement == "single"
+
+
+def test_nothing_lies_outside_of_the_picture() -> None:
+    diagram = space_time(trace_of(fault="hang primary for 90ms at server.exit nth 8"))
+    shapes = [*marks(diagram), *diagram.lives, *diagram.bands, *diagram.gaps, *diagram.labels]
+    assert all(0 <= x <= diagram.width for shape in shapes for x in (shape.x, shape.x2))
+    assert all(0 <= y <= diagram.height for shape in shapes for y in (shape.y, shape.y2))
+    assert all(label.y > 0 and diagram.top <= label.y2 for label in diagram.labels)
+
+
+def test_the_drawing_has_every_mark_with_its_tooltip(failover: Trace) -> None:
+    diagram = space_time(failover)
+    macros = engine(TEMPLATES).get_template("spacetime.html.j2").module
+    names, body = (ElementTree.fromstring(str(macro(diagram))) for macro in (macros.names, macros.body))
+    assert [element.text for element in names.iter("text")] == words(diagram.rows)
+    gaps = ["left out: no turning point here"] * len(diagram.gaps)
+    assert sorted(words(marks(diagram)) + gaps) == sorted(title.text for title in body.iter("title"))
+    arrows = [group for group in body.iter("g") if group.get("class", "").startswith("message ")]
+    assert len(arrows) == len(diagram.arrows)
+    assert body.get("aria-label") == f"space-time diagram: {len(diagram.rows)} nodes"

@@ -1,6 +1,6 @@
 """The delay of one hop between two processes, as measured: what the simulator draws from.
 
-The `quantiles_ns` of `aftbed bench hops --json` (`aftbed/bench/hops.py` says what a hop is): `pbr`, one
+The `quantiles_ns` of `aftbed bench hops --json` (`aftbed/bench/cycle.py` says what a hop is): `pbr`, one
 process per brick, 30 000 samples, on a virtual machine of two cores under CPython 3.11, 2026-11-21. Other
 work ran on that machine meanwhile; of 83 runs this is the one with the lowest median.
 

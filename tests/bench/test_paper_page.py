@@ -1,16 +1,17 @@
 """What is made of the document of `aftbed bench paper`: tables, markdown, the page."""
 
 import re
+import subprocess
+import sys
+from pathlib import Path
 
 import msgspec
 import pytest
+from browser import in_browser, measured, needs_browser
 from papers import made_up
 
-from aftbed.bench import curves
-from aftbed.bench.curves import Range
-from aftbed.bench.paperdocument import Paper
-from aftbed.bench.paperpage import html_page
-from aftbed.bench.papertext import markdown, notes, size, tables, text
+from aftbed.bench.paper import Paper
+from aftbed.bench.paper_page import html_page, markdown, notes, size, tables, text
 
 
 def row(name: str, first: str) -> tuple[str, ...]:
@@ -92,22 +93,17 @@ def test_a_sweep_without_points_is_no_plot() -> None:
     assert html_page(bare).count('class="plot"') == 1
 
 
-def numbers(drawing: str, name: str) -> list[float]:
-    return [float(found) for found in re.findall(rf' {name}="([-0-9.]+)"', drawing)]
+@needs_browser
+@pytest.mark.process
+def test_the_page_in_a_browser_has_all_in_its_place(tmp_path: Path) -> None:
+    dom, console = in_browser(tmp_path, measured(html_page(made_up())))
+    assert console == [] and "<title>measured 0 0 0 1 0</title>" in dom and dom.count('class="plot"') == 5
 
 
-def test_every_point_lies_in_the_drawing() -> None:
-    drawing = curves.curves("t", {"a": [(1, 5.0), (10_000, 0.5)], "b": [(20, 700.0)]}, "x", "y")
-    assert drawing.count("<circle") == 3
-    assert all(0 <= x <= 560 for x in numbers(drawing, "cx"))
-    assert all(0 <= y <= 250 for y in numbers(drawing, "cy"))
-    left, right, _ = numbers(drawing, "cx")
-    low, high, highest = numbers(drawing, "cy")
-    assert left < right and low < high and highest < low  # up is less in SVG
-
-
-def test_a_range_has_a_bar_for_each_side_that_is_known() -> None:
-    rows = [Range("both", (4, 5), (0.1, 0.2)), Range("ours alone", None, (400, 400))]
-    drawing = curves.ranges("t", rows)
-    assert drawing.count('class="range"') == 3
-    assert "both: the paper: 4 to 5 ms" in drawing and "ours alone: here, p50 to p99: 400 ms" in drawing
+def test_the_benches_leave_the_libraries_of_pages_alone() -> None:
+    """They fork the processes whose memory they measure."""
+    code = "import sys, aftbed.bench.paper as p, aftbed.bench.campaign; print(*sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
+    )
+    assert not {"matplotlib", "jinja2", "scipy", "numpy", "rich"} & set(done.stdout.split())

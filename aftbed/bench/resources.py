@@ -1,0 +1,185 @@
+"""CPU, memory and processes of a run at work: of its graph with the supervisor, and of all others apart.
+
+Placements are compared side by side, because the paper's complaint is processes that do almost nothing. In
+`process` each brick is a process, as in the paper; in `replica` a replica is one; in `single` both replicas
+are one process, so that no replica survives its crash. CPU and memory are measured at the rate of the radar,
+and at one request a second, which is as good as idle (a load that pauses for longer is taken for dead).
+
+CPU is the time that the scheduler has given to each process over a window, in nanoseconds
+(/proc/PID/schedstat): the ticks of /proc/PID/stat are 10 ms long, which is more than most nodes use in a
+second. Memory is PSS (proc(5), smaps_rollup), which shares a page among the processes that map it, so that a
+sum over processes is honest.
+"""
+
+import os
+import time
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from aftbed.bench.cycle import ring_p50_us
+from aftbed.bench.runs import (
+    STOPPED,
+    Percentiles,
+    endless_run,
+    finished,
+    latencies_us,
+    percentiles,
+    wait_until_ready,
+)
+from aftbed.core.errors import ConfigError, HarnessError
+from aftbed.runtime.unix import control_client
+from aftbed.runtime.unix.launch import launch, options_for
+from aftbed.runtime.unix.options import CarRun
+from aftbed.runtime.unix.resources import Row, measured
+
+RADAR_HZ: Final = 50.0
+IDLE_HZ: Final = 1.0
+WINDOW_PERIODS_MIN: Final = 1.2
+START_SECONDS_MAX: Final = 10.0
+SETTLE_SECONDS: Final = 1.5  # of driving before the look, so that the pages that work touches are counted
+ASLEEP_PERCENT: Final = 0.5  # of one core: a node below it does almost nothing
+NO_CRASH: Final = "single"  # the placement in which both replicas die at once
+
+
+class Usage(msgspec.Struct, frozen=True):
+    """`cpu_percent` is of one core, over `seconds`.
+
+    `processes` are those of the graph and the supervisor: the paper's count. `asleep` is how many of them
+    used less than ASLEEP_PERCENT. `others_*` are the zygotes and spares.
+    """
+
+    seconds: float
+    processes: int
+    asleep: int
+    cpu_percent: float
+    pss_mb: float
+    others: int
+    others_cpu_percent: float
+    others_pss_mb: float
+
+
+class LoadResult(msgspec.Struct, frozen=True):
+    """A window of a run at a fixed rate. Latency is of the requests sent in it, as the client saw them."""
+
+    ftm: str
+    placement: str
+    rate_hz: float
+    requests: int
+    sent_hz: float
+    latency_ms: Percentiles
+    ring_us: float  # p50 of a ring of as many hops, in a closed loop
+    usage: Usage
+
+
+def bench_memory(ftm: str, placement: str) -> dict[str, object]:
+    """`processes, pss_mb, rss_mb` of the graph and the supervisor, `others{}` by name."""
+    options, listener = options_for(ftm=ftm, placement=placement, work=CarRun("free-drive", 1.0, "latch"))
+    launched = launch(options, listener)
+    try:
+        rows = _rows_of_drive(launched.private)
+    finally:
+        launched.stop()
+        finished(launched, STOPPED[:1])
+    nodes = [row for row in rows if row.node]
+    others: dict[str, dict[str, float]] = {}
+    for row in rows:
+        if not row.node:
+            found = others.setdefault(row.name, {"processes": 0, "pss_mb": 0.0})
+            found["processes"] += 1
+            found["pss_mb"] = round(found["pss_mb"] + row.pss_mb, 1)
+    return {
+        "ftm": ftm,
+        "placement": placement,
+        "processes": len(nodes),
+        "pss_mb": round(sum(row.pss_mb for row in nodes), 1),
+        "rss_mb": round(sum(row.rss_mb for row in nodes), 1),
+        "others": others,
+    }
+
+
+def _rows_of_drive(private: Path) -> list[Row]:
+    limit = time.monotonic() + START_SECONDS_MAX
+    while time.monotonic() < limit:
+        try:
+            status = control_client.ask(private, control_client.Status())
+        except ConfigError:
+            status = {}
+        if status.get("vehicle"):
+            time.sleep(SETTLE_SECONDS)
+            rows = control_client.processes(private)
+            rows.append(Row("command", "command", os.getpid(), False))
+            return measured(rows)
+        time.sleep(0.02)
+    raise HarnessError(f"the car does not drive after {START_SECONDS_MAX} s")
+
+
+def process_count(ftm: str, placement: str) -> int:
+    """The nodes and the supervisor of a run that serves: the paper's count."""
+    with endless_run(ftm, placement, RADAR_HZ) as run:
+        wait_until_ready(run.private)
+        return sum(row.node for row in control_client.processes(run.private))
+
+
+def under_load(ftm: str, placement: str, rate_hz: float, seconds: float) -> LoadResult:
+    """Run `ftm` at `rate_hz` requests a second, and measure `seconds` of it."""
+    bare_us = ring_p50_us(ftm, placement)
+    with endless_run(ftm, placement, rate_hz) as run:
+        wait_until_ready(run.private)
+        found, began_ns, ended_ns = _usage(run.private, max(seconds, WINDOW_PERIODS_MIN / rate_hz))
+    latency_us = latencies_us(run.record, began_ns=began_ns, ended_ns=ended_ns)
+    if not latency_us:
+        raise HarnessError(f"{ftm} ({placement}) answered nothing in {found.seconds} s at {rate_hz:g} Hz")
+    return LoadResult(
+        ftm,
+        placement,
+        rate_hz,
+        len(latency_us),
+        round(len(latency_us) / found.seconds, 1),
+        percentiles([us / 1e3 for us in latency_us]),
+        bare_us,
+        found,
+    )
+
+
+def _usage(private: Path, seconds: float) -> tuple[Usage, int, int]:
+    """The usage of the run in the next `seconds`; and when that began and ended (monotonic ns)."""
+    rows = control_client.processes(private)
+    before, began_ns = _cpu_ns(rows), time.monotonic_ns()
+    time.sleep(seconds)  # the measured window
+    after, ended_ns = _cpu_ns(rows), time.monotonic_ns()
+    shares = {pid: 100 * (after[pid] - before[pid]) / (ended_ns - began_ns) for pid in after if pid in before}
+    nodes = [row for row in rows if row.node]
+    if missing := [row.name for row in nodes if row.pid not in shares]:
+        raise HarnessError(f"died while it was measured: {', '.join(missing)}")
+    pss_mb = {row.pid: row.pss_mb for row in measured(rows)}
+    others = [row for row in rows if not row.node and row.pid in shares]
+    found = Usage(
+        seconds=round((ended_ns - began_ns) / 1e9, 3),
+        processes=len(nodes),
+        asleep=sum(shares[row.pid] < ASLEEP_PERCENT for row in nodes),
+        cpu_percent=_sum(shares, nodes, 2),
+        pss_mb=_sum(pss_mb, nodes, 1),
+        others=len(others),
+        others_cpu_percent=_sum(shares, others, 2),
+        others_pss_mb=_sum(pss_mb, others, 1),
+    )
+    return found, began_ns, ended_ns
+
+
+def _sum(values: dict[int, float], rows: list[Row], digits: int) -> float:
+    return round(sum(values.get(row.pid, 0.0) for row in rows), digits)
+
+
+def _cpu_ns(rows: list[Row]) -> dict[int, int]:
+    """The CPU time of each process that is still there; each has one thread."""
+    found = {}
+    for row in rows:
+        try:
+            found[row.pid] = int(Path(f"/proc/{row.pid}/schedstat").read_text().split()[0])
+        except (FileNotFoundError, ProcessLookupError):
+            continue
+    if rows and not found:
+        raise HarnessError("no /proc/PID/schedstat: this kernel does not tell CPU times (CONFIG_SCHED_INFO)")
+    return found
