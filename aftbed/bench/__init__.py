@@ -1,1 +1,1 @@
-"""Measurements, each beside its bare limit in the same run: only the ratio survives a noisy machine."""
+"""Measurements, each beside its bare limit in the same run: on a noisy machine only the ratio is stable."""

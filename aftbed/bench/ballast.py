@@ -1,12 +1,13 @@
-"""A protected function whose state is of any size, for the sweep over it.
+"""A protected function whose state has any size, for the sweep over it.
 
-It computes next to nothing, and the same for each size: it counts its requests in the first bytes of its
-state, and answers with a digest of the count and the request. All the rest of the state is ballast, which
-is captured, sent and restored with it. A class of any size is there under its name, `Ballast1000v2` being
-version 2 of the one whose state has 1000 bytes, so that an update of the function puts it into a run
-(`source_of`). Two versions of a size differ in nothing: they are there to be exchanged for each other.
+It computes almost nothing, and the same for each size: it counts its requests in the first bytes of its
+state, and answers with a digest of the count and the request. The rest of the state is ballast, which is
+captured, sent and restored with it. The name of a class has its size: `Ballast1000v2` is version 2 of the
+class whose state has 1000 bytes; an update of the function brings it into a run (`source_of`). Two versions
+of one size are equal: they exist to be exchanged for each other.
 
-No field is declared, so its state lies in no shared memory.
+The nodes import this module, so it imports nothing heavy. No field is declared, so the state is in no shared
+memory.
 """
 
 import re
@@ -41,26 +42,26 @@ class Ballast:
         return blake2b(self._state[:COUNT_BYTES] + request, digest_size=REPLY_BYTES).digest()
 
     def capture(self) -> bytes:
-        """All of it."""
+        """The whole state."""
         return bytes(self._state)
 
     def restore(self, state: bytes) -> None:
-        """Replace all of it. Raises PeerError, state unchanged, on another size."""
+        """Replace the whole state. Raises PeerError, state unchanged, on another size."""
         if len(state) != self.size_bytes:
             raise PeerError(f"state of {len(state)} bytes, expected {self.size_bytes}")
         self._state[:] = state
 
     def migrate(self, old_state: bytes) -> None:
-        """Take over from a version of the same size; after any other function, begin anew."""
+        """Take the state of a version of the same size; after any other function, start with zeros."""
         self._state[:] = old_state if len(old_state) == self.size_bytes else bytes(self.size_bytes)
 
     def acceptable(self, request: bytes, reply: bytes) -> bool:
-        """Whether it has the size of a reply."""
+        """Whether the reply has the size of one."""
         return len(reply) == REPLY_BYTES
 
 
 def source_of(size_bytes: int, version: int) -> str:
-    """What `aftbed adapt update app --to` takes; the size lies within the limits above."""
+    """The argument of `aftbed adapt update app --to`; the size is within the limits above."""
     assert SIZE_BYTES_MIN <= size_bytes <= SIZE_BYTES_MAX, size_bytes
     assert version in VERSIONS, version
     return f"{__name__}:Ballast{size_bytes}v{version}"

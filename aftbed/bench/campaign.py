@@ -1,7 +1,7 @@
-"""How many experiments a minute a campaign does: 100 requests, one crash of the primary, and the verdict.
+"""The number of experiments a minute of a campaign: 100 requests, one crash of the primary, and the verdict.
 
-Everything counts, from the start of the workers to the last line in the ledger. `cpu_ms` is what all
-processes of an experiment took together: it tells a slow machine from one that has other work, too.
+Everything counts, from the start of the workers to the last line in the ledger. `cpu_ms` is the CPU time of
+all processes of an experiment: it distinguishes a slow machine from one that has other work, too.
 """
 
 import os
@@ -47,6 +47,6 @@ def bench_campaign(
 
 
 def _cpu_s() -> float:
-    """Of this process, and of all below it that have ended."""
-    used = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    """Of this process, and of all its descendants that have ended."""
+    used = (resource.getrusage(scope) for scope in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
     return sum(each.ru_utime + each.ru_stime for each in used)

@@ -1,7 +1,7 @@
-"""How long it takes from the command's start to the first reply, and how long the graph alone takes.
+"""The time from the start of the command to the first reply, and that of the graph alone.
 
-The command is started as a user would start it, in an interpreter of its own. `graph_ms` is the time
-from a warm zygote with parked spares to the last node's answer.
+The command is started as a user would start it, in an interpreter of its own. `graph_ms` is the time from a
+warm zygote with parked spares to the answer of the last node.
 """
 
 import json
@@ -21,7 +21,7 @@ RUN_SECONDS_MAX: Final = 30.0
 
 
 def bench_launch(ftm: str, placement: str, runs: int) -> dict[str, object]:
-    """`launch_ms{p50,max}` and `graph_ms{p50,max}` over `runs` starts of `aftbed run`."""
+    """`launch_ms{p50,max}` and `graph_ms{p50,max}` of `runs` starts of `aftbed run`."""
     launches: list[float] = []
     graphs: list[float] = []
     for _ in range(runs):

@@ -1,11 +1,15 @@
-"""The reports of a campaign: the same records, told to four readers.
+"""The reports of a campaign, and the drawings of a run, for people and for other programs.
 
-- a person at the terminal (`table`): how it goes while it runs, and what it came to;
-- a CI (`junit`): a test case per stratum and per gate, with the command that repeats the worst experiment;
-- a person who wants to understand (`html`): one file that needs neither network nor script;
-- another program (`export`): a row per experiment, as CSV or Parquet.
+- `terminal`: progress while a campaign runs, and its summary;
+- `junit`: for a CI, a test case per stratum and per gate, with the command that repeats the worst
+  experiment;
+- `html`: one file for a person, which needs neither network nor script; `worst` chooses the runs that it
+  shows;
+- `export`: a row per experiment, as CSV or Parquet;
+- `sequence`: a simulated run as a listing, in Mermaid, and as a space-time diagram;
+- `plots`: SVG, by matplotlib.
 
-All of them are made from the ledger and its summary, and from nothing else, so they can be made again at any
-time. What is judged is judged in `campaign.summary`; here it is only shown. The HTML report alone runs
-something: the few runs that it draws are simulated once more, since a ledger keeps no messages.
+The reports of a campaign are made from its ledger and its summary alone, so they can be made again at any
+time. `campaign.summary` judges; this package only shows. The HTML report alone runs something: it simulates
+the few runs that it draws once more, because a ledger keeps no messages.
 """

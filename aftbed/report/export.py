@@ -1,11 +1,11 @@
 """The results as a table for other programs: a row per experiment, in CSV or in Parquet.
 
-The columns are the same in both, their types too where a format has types; the unit stands at the end of a
-name. What is unknown (no failover, no car) is an empty field in CSV and a null in Parquet. What there can be
-several of, such as faults and reasons, is one text, parted by `; `.
+The columns are the same in both, and so are their types where a format has types; the unit is at the end of
+a name. An unknown value (no failover, no car) is an empty field in CSV and a null in Parquet. Several
+values, such as faults and reasons, are one text, separated by `; `.
 
-Limits: CSV knows no types, so a reader guesses them. A text that a spreadsheet would take for a formula is
-exported as it is: the records are the user's own.
+Limits: CSV has no types, so a reader guesses them. A text that a spreadsheet would take for a formula is
+exported unchanged: the records are the user's own.
 """
 
 import csv
@@ -18,7 +18,7 @@ from aftbed.campaign.ledger import Ledger
 from aftbed.core.errors import ConfigError
 
 Value = str | int | float | bool | None
-PARTED: Final = "; "
+SEPARATOR: Final = "; "
 
 COLUMNS: Final = {  # name: type
     "experiment": str,
@@ -63,13 +63,13 @@ COLUMNS: Final = {  # name: type
 
 
 def rows(ledger: Ledger) -> Iterator[dict[str, Value]]:
-    """A value for each of `COLUMNS`, for each result."""
+    """For each result, a value for each of `COLUMNS`."""
     for result in ledger.results:
         yield _asked(result) | _found(result)
 
 
 def write_csv(ledger: Ledger, path: Path) -> None:
-    """With a head line; UTF-8. Raises ConfigError where `path` cannot be written."""
+    """With a header line, in UTF-8. Raises ConfigError if `path` cannot be written."""
     try:
         with path.open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, list(COLUMNS), lineterminator="\n")
@@ -80,7 +80,7 @@ def write_csv(ledger: Ledger, path: Path) -> None:
 
 
 def write_parquet(ledger: Ledger, path: Path) -> None:
-    """Raises ConfigError where `path` cannot be written, or pyarrow is not there."""
+    """Raises ConfigError if `path` cannot be written, or pyarrow is not installed."""
     try:
         import pyarrow  # noqa: PLC0415 - an extra, and slow to import
         from pyarrow import parquet  # noqa: PLC0415
@@ -116,10 +116,10 @@ def _asked(result: Result) -> dict[str, Value]:
         "scenario": experiment.scenario,
         "requests": experiment.requests,
         "rate_hz": experiment.rate_hz,
-        "faults": PARTED.join(experiment.faults),
-        "adaptations": PARTED.join(experiment.adaptations),
+        "faults": SEPARATOR.join(experiment.faults),
+        "adaptations": SEPARATOR.join(experiment.adaptations),
         "recipe": experiment.recipe,
-        "expected": PARTED.join(experiment.expected),
+        "expected": SEPARATOR.join(experiment.expected),
         "command": experiment.command(),
     }
 
@@ -130,8 +130,8 @@ def _found(result: Result) -> dict[str, Value]:
         "outcome": result.outcome,
         "unexpected": result.unexpected,
         "activated": result.activated,
-        "receipts": PARTED.join(fault.receipt.value for fault in result.faults),
-        "reasons": PARTED.join(result.reasons),
+        "receipts": SEPARATOR.join(fault.receipt.value for fault in result.faults),
+        "reasons": SEPARATOR.join(result.reasons),
         "sent": counts.sent if counts else None,
         "answered": counts.answered if counts else None,
         "lost": counts.lost if counts else None,
@@ -139,7 +139,7 @@ def _found(result: Result) -> dict[str, Value]:
         "late": counts.late if counts else None,
         "wrong": counts.wrong if counts else None,
         "failovers": result.failovers,
-        "adapted": PARTED.join(result.adapted),
+        "adapted": SEPARATOR.join(result.adapted),
         "collision": result.collision,
         "noisy": result.noisy,
         "detected_ms": result.detected_ms,

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 POINTS_MAX: Final = 400
 LOG_FROM: Final = 20.0  # an axis whose values differ by a larger factor is logarithmic
 LEAST_MS: Final = 0.001  # times are kept to the microsecond
-LINES: Final = (  # colour and dashes, so that no line is told apart by its colour alone
+LINES: Final = (  # colour and dashes, because colour alone does not distinguish lines for all readers
     ("#0072b2", ""),
     ("#d55e00", "7 3"),
     ("#008f68", "2 2"),
@@ -57,6 +57,7 @@ LEFT, RIGHT, TOP, BOTTOM = 46.0, 14.0, 18.0, 40.0
 LIMIT_PX: Final = 14.0  # from the name of a limit to that of the next
 CHARACTER_PX: Final = 6.3  # mean width of a character at 11 px
 RANGE_PX: Final = 46.0  # of a row of `ranges`
+RANGE_PX_MIN: Final = 6.0  # width of a bar; a narrower one gets caps
 GROUP_PX, ROAD_PX = 300.0, 620.0  # height of a picture of `road_plot`, and its width
 ROAD_TOP_KMH, ROAD_SPAN_KMH = 10.0, 1.0  # least height of the upright axis; least width of the level one
 DOTS_PER_INCH: Final = 72  # so that a point of matplotlib is a pixel of the SVG
@@ -156,8 +157,8 @@ def ecdf(
         for place, limit in enumerate(limits):
             _limit(drawing, axes, limit, 4 + LIMIT_PX * place)
         for name, values in drawn.items():
-            said = ", ".join(f"p{q} {milliseconds(quantile(values, q / 100))} ms" for q in (50, 99))
-            tip = f"{name}: {len(values)} runs, {said}, max {milliseconds(values[-1])} ms"
+            words = ", ".join(f"p{q} {milliseconds(quantile(values, q / 100))} ms" for q in (50, 99))
+            tip = f"{name}: {len(values)} runs, {words}, max {milliseconds(values[-1])} ms"
             line = drawing.line(axes, _steps(values), styles[name])
             line.set_drawstyle("steps-post")
             drawing.tip(line, tip, "line")
@@ -227,10 +228,11 @@ def ranges(title: str, rows: Sequence[TimeRange]) -> str:
             bars = [(row.ours, 34, 0, "here, p50 to p99")]
             bars += [(row.theirs, 22, 1, "the paper")] if row.theirs is not None else []
             for (low, high), down, style, side in bars:
-                said = " to ".join(dict.fromkeys(map(milliseconds, (low, high))))
+                words = " to ".join(dict.fromkeys(map(milliseconds, (low, high))))
                 bar = axes.plot((low, high), (top + down,) * 2, color=LINES[style][0], linewidth=8)[0]
-                bar.set(solid_capstyle="projecting" if low == high else "butt")
-                drawing.tip(bar, f"{row.name}: {side}: {said} ms", "range")
+                width_px = axes.transData.transform((high, 0))[0] - axes.transData.transform((low, 0))[0]
+                bar.set(solid_capstyle="butt" if width_px >= RANGE_PX_MIN else "projecting")
+                drawing.tip(bar, f"{row.name}: {side}: {words} ms", "range")
         return drawing.svg()
 
 

@@ -310,12 +310,12 @@ def _room(one: Happening) -> float:
 
 
 def _style(one: Record | Told) -> str:
-    """The class of a mark and of its label: `fault`, `adapt` or `told`."""
+    """The class of a mark and of its label: `fault`, `adapt` or `step`."""
     if isinstance(one, Told):
-        return "fault" if one.event == STRUCK else "adapt" if one.event.startswith("adapt") else "told"
+        return "fault" if one.event == STRUCK else "adapt" if one.event.startswith("adapt") else "step"
     if one.event in (Event.FAULT_APPLIED, Event.DETECTED_STOP, Event.FOLLOWER_DIVERGED):
         return "fault"
-    return "adapt" if str(one.event).startswith("adapt") else "told"
+    return "adapt" if str(one.event).startswith("adapt") else "step"
 
 
 def _width_of(words: str) -> float:
@@ -379,9 +379,7 @@ class _Layout:
         ends = [-math.inf] * LANES_MAX
         for place in self._places:
             one = place.one
-            if (isinstance(one, Told) and one.event in _LABELLED) or (
-                isinstance(one, Record) and is_turn(one)
-            ):
+            if isinstance(one, Record | Told) and _is_labelled(one):
                 words = _mark_words(one, self._trace.run.setup.faults)
                 lane = next((n for n, end in enumerate(ends) if end + 10 < place.x), None)
                 if lane is not None:

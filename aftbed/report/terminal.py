@@ -1,8 +1,8 @@
-"""A campaign at the terminal: how it goes while it runs, and what it came to.
+"""A campaign at the terminal: its progress while it runs, and its summary at the end.
 
 While it runs, a terminal shows one picture that is redrawn in place: progress, rate, time left, and a line
-per stratum. Anything else (a pipe, the log of a CI) gets a plain line now and then. The picture is drawn by
-who adds a result, never by a thread: a thread would be forked with the processes that do the experiments.
+per stratum. Anything else (a pipe, the log of a CI) gets a plain line now and then. `add` redraws the
+picture, not a thread: a thread would be forked with the processes that do the experiments.
 """
 
 import sys
@@ -24,7 +24,7 @@ REDRAW_S: Final = 0.1
 LINE_S: Final = 10.0  # between two plain lines
 ROWS_MAX: Final = 30  # strata in the picture
 BAR: Final = 30  # characters
-STYLES: Final = {  # of the words of outcomes; whatever is not here is red
+STYLES: Final = {  # of outcomes; all others are red
     "masked": "green",
     "latent": "yellow",
     "tolerated": "green",
@@ -39,7 +39,7 @@ STYLES: Final = {  # of the words of outcomes; whatever is not here is red
 
 
 def summary_lines(summary: Summary) -> list[str]:
-    """What it came to, the verdict last."""
+    """Strata and gates as tables, the verdict last."""
     lines = [_head(summary)]
     lines += ["", *_aligned([_STRATUM, *map(_stratum, summary.strata)])] if summary.strata else []
     lines += ["", *_aligned([_GATE, *map(_gate, summary.gates)])] if summary.gates else []
@@ -98,7 +98,7 @@ def _figure(value: float | None) -> str:
 
 
 def _aligned(rows: list[tuple[str, ...]]) -> list[str]:
-    """Columns as wide as they have to be."""
+    """Columns as wide as their widest cell."""
     widths = [max(len(row[at]) for row in rows) for at in range(len(rows[0]))]
     return ["  ".join(f"{word:<{n}}" for word, n in zip(row, widths, strict=True)).rstrip() for row in rows]
 
@@ -107,7 +107,7 @@ def _aligned(rows: list[tuple[str, ...]]) -> list[str]:
 
 
 class Progress:
-    """A context manager that is told each result. `total` experiments there will be at most."""
+    """A context manager; `add` takes each result. There are at most `total` experiments."""
 
     def __init__(self, campaign: str, total: int, *, quiet: bool = False) -> None:
         self._campaign, self._total, self._quiet = campaign, total, quiet
@@ -119,7 +119,7 @@ class Progress:
 
     def __enter__(self) -> Self:
         if not self._quiet and sys.stdout.isatty():
-            from rich.live import Live  # noqa: PLC0415 - only where somebody looks
+            from rich.live import Live  # noqa: PLC0415 - for a terminal only
 
             self._live = Live(get_renderable=self._picture, auto_refresh=False, transient=True)
             self._live.start(refresh=True)
@@ -132,7 +132,7 @@ class Progress:
             self._live.stop()
 
     def add(self, result: Result) -> None:
-        """One more."""
+        """Count one more result, and show it if it is time."""
         self._done += 1
         self._unexpected += result.unexpected
         self._outcomes[result.outcome] += 1
@@ -148,7 +148,7 @@ class Progress:
             print(self.line(), flush=True)
 
     def line(self) -> str:
-        """How far it is, in one line."""
+        """The progress in one line."""
         counts = ", ".join(f"{name} {self._outcomes[name]}" for name in OUTCOMES if self._outcomes[name])
         unexpected = f"; {self._unexpected} unexpected" if self._unexpected else ""
         return f"{self._pace()}: {counts}{unexpected}"

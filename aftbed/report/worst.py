@@ -1,12 +1,11 @@
 """The runs that a person should look at first, and what happened in one of them.
 
-First come those that broke what no fault excuses, then the unexpected ones; then, among these and behind
-them, the worst outcome; then the slowest. One run of a stratum stands for it: forty runs that fail in the
-same way are one thing to know.
+Runs that broke a promise come first, then the unexpected ones; among these and after them, the worst outcome;
+then the slowest. One run of a stratum represents it: forty runs that fail in the same way are one finding.
 
-A ledger keeps no messages, so a run is simulated to draw it: same bricks, scripts, faults and seed. A run of
-real processes need not come to the same there (the times are others, so a fault may strike another request);
-then the report says so, and the drawing shows what the simulator saw.
+A ledger keeps no messages, so a run is simulated to draw it: with the same bricks, scripts, faults and
+seed. A run of real processes need not have the same outcome there (the times differ, so a fault may strike
+another request); then the report says so, and the drawing shows what the simulator did.
 """
 
 from collections.abc import Iterable
@@ -23,7 +22,7 @@ REASON_MAX: Final = 300  # characters
 
 
 class Rerun(msgspec.Struct, frozen=True):
-    """A run simulated once more: what came of it there, and all that happened; or why it cannot be."""
+    """A run simulated once more: its outcome and its trace; or why it cannot be simulated."""
 
     outcome: str
     trace: Trace | None
@@ -31,7 +30,7 @@ class Rerun(msgspec.Struct, frozen=True):
 
 
 def by_badness(results: Iterable[Result]) -> list[Result]:
-    """One of each stratum, the worst first. A run that came out at its best and as expected is left out."""
+    """One of each stratum, the worst first. A run with the best outcome, as expected, is left out."""
     found: dict[str, Result] = {}
     for result in sorted(results, key=_badness, reverse=True):
         if result.broken or result.unexpected or result.outcome != OUTCOMES[0] or not result.activated:
@@ -46,12 +45,12 @@ def slowness_ms(result: Result) -> float:
 
 
 def worst_of(results: Iterable[Result]) -> Result:
-    """The first to look at; there is one."""
+    """The first to look at. `results` are not empty."""
     return max(results, key=_badness)
 
 
 def rerun(experiment: Experiment) -> Rerun:
-    """In the simulator, whatever it ran on."""
+    """Simulate it, whatever runtime it had."""
     simulated = msgspec.structs.replace(experiment, runtime="sim")
     again = carry_out(simulated, lambda _: None)
     try:
@@ -61,6 +60,6 @@ def rerun(experiment: Experiment) -> Rerun:
 
 
 def _badness(result: Result) -> tuple[bool, bool, int, float, int]:
-    """Of two that are equally bad the earlier comes first."""
+    """For sorting; of two that are equally bad the earlier is the worse."""
     place = OUTCOMES.index(result.outcome) if result.outcome in OUTCOMES else len(OUTCOMES)
     return bool(result.broken), result.unexpected, place, slowness_ms(result), -result.experiment.index
