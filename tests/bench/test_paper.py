@@ -101,7 +101,7 @@ def test_a_longer_delay_is_never_better(speed_kmh: float, one: float, other: flo
 
 
 @given(SPEEDS, DELAYS)
-def test_who_brakes_harder_loses_more_by_braking_late(speed_kmh: float, delay_ms: float) -> None:
+def test_a_car_that_brakes_harder_loses_more_by_braking_late(speed_kmh: float, delay_ms: float) -> None:
     """The last moment is later: from there on each metre takes more of the speed."""
     assert residual_kmh(speed_kmh, delay_ms, 5.0) <= residual_kmh(speed_kmh, delay_ms, 8.0)
 

@@ -71,7 +71,7 @@ def test_a_line_per_mechanism_with_its_figures_in_its_tooltip() -> None:
     assert len(lines_of(drawing)) == 2
 
 
-def test_who_does_not_see_it_is_told_what_it_shows() -> None:
+def test_a_reader_that_does_not_see_it_gets_its_title() -> None:
     root = ElementTree.fromstring(ecdf("Recovery", {"a": [1.0]}, {"a": 0}, []))
     assert root.get("role") == "img"
     assert root.get("aria-label") == "Recovery: share of runs over time in ms"

@@ -1,6 +1,6 @@
-"""`aftbed bench hops`: which pairs of notes lie one hop apart, and a distribution that is one.
+"""`aftbed bench hops`: which pairs of notes are one hop apart, and the distribution of their delay.
 
-Nothing here is said about speed: a busy machine is no failing test.
+No test depends on speed: it must hold on a busy machine.
 """
 
 import itertools
@@ -48,7 +48,7 @@ def test_the_pairs_of_pbr_are_those_of_the_table() -> None:
     assert named(beside("pbr")) == PBR_BESIDE
 
 
-def test_who_sends_two_messages_in_a_step_is_beside() -> None:
+def test_a_brick_that_sends_two_messages_in_a_step_is_beside() -> None:
     assert [source.event for source, _ in beside("lfr")] == [Event.BEFORE_EXIT, Event.FOLLOWER_NOTIFIED]
     assert beside("none") == ()
 

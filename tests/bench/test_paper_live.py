@@ -1,6 +1,6 @@
 """`aftbed bench paper`: one document of figures that were measured, and a page of it.
 
-Nothing here is said about speed: a busy machine is no failing test.
+No test depends on speed: it must hold on a busy machine.
 """
 
 import subprocess
