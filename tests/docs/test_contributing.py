@@ -87,6 +87,7 @@ def test_an_example_works(section: str, project: Path) -> None:
 def test_every_kind_of_addition_has_its_example() -> None:
     assert set(SECTIONS) == {
         "A mechanism",
+        "A fault kind",
         "An event",
         "A check",
         "A scenario",
