@@ -28,7 +28,7 @@ from aftbed.judge.record import RunEnd, RunRecord, read_record, record_of
 from aftbed.judge.verdict import Breach, Verdict, evidence_of, judge
 from aftbed.runtime.sim.world import Setup, simulate
 from aftbed.runtime.unix import linux, spawn
-from aftbed.runtime.unix.busaim import aim
+from aftbed.runtime.unix.bus_fault_names import with_names_resolved
 from aftbed.runtime.unix.launch import launch, options_for
 from aftbed.runtime.unix.options import CarRun, LoadRun, Work
 from aftbed.runtime.unix.pages import Area
@@ -238,7 +238,7 @@ def faults_of(experiment: Experiment, graph: Graph) -> tuple[Fault, ...]:
     found = tuple(parse(text) for text in experiment.faults)
     for fault in found:
         fault.check(graph)
-        aim(fault, work)
+        with_names_resolved(fault, work)
     return found
 
 

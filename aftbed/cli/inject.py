@@ -16,7 +16,7 @@ from aftbed.inject.memory import refuse_unsafe
 from aftbed.inject.model import Fault, on_bus, read
 from aftbed.inject.value import MEMORY
 from aftbed.runtime.unix import control_client, rundir
-from aftbed.runtime.unix.busaim import aim
+from aftbed.runtime.unix.bus_fault_names import with_names_resolved
 from aftbed.runtime.unix.options import Work
 
 inject = typer.Typer()
@@ -241,5 +241,5 @@ def _arm(run: str | None, fault: Fault) -> None:
     private = rundir.find(run)
     record = Path(str(control_client.ask(private, control_client.Status())["record"]))
     head = msgspec.json.decode((record / "run.json").read_bytes(), type=_RecordHead)
-    control_client.ask(private, control_client.Inject(aim(fault, head.work)))
+    control_client.ask(private, control_client.Inject(with_names_resolved(fault, head.work)))
     print(f"run {private.name}: {fault}", file=sys.stderr)

@@ -179,16 +179,16 @@ class Arm(Order, frozen=True):
     faults: tuple[ArmedFault, ...]
 
 
-class Interfere(Order, frozen=True):
+class ArmOnChannel(Order, frozen=True):
     """Disturb what `fault.brick` sends on the channel, from the `nth` message on; `nth` 0: no longer."""
 
     fault: ArmedFault
 
 
 class SlowDown(Order, frozen=True):
-    """Each step takes so much longer from now on, for the sake of `fault`, and as with a `share` of a CPU.
+    """Because of `fault`, each step takes `by_ns` longer, and as much longer as with that share of a CPU.
 
-    By nothing, with the whole CPU: no longer.
+    0 ns and the whole CPU: no longer.
     """
 
     fault: int
@@ -196,11 +196,14 @@ class SlowDown(Order, frozen=True):
     share: float = WHOLE
 
 
-class KeepInCell(Order, frozen=True):
-    """Keep the state of a Server's function in the memory that came along; the answer is its Layout."""
+class ShareState(Order, frozen=True):
+    """Keep the state of a Server's function in the memory that came along; the answer is its StateLayout.
+
+    `number` is in the records of what is found changed there.
+    """
 
     brick: str
-    cell: int
+    number: int
 
 
 class DisturbBus(Order, frozen=True):
@@ -273,7 +276,7 @@ class Report(msgspec.Struct, frozen=True, tag=True):
 
 ToNode = (
     Park | Assign | Serve | BindInput | BindOutput | Follow | Rewire | Suspend | Resume | Capture | Restore
-    | Tell | WatchNodes | Arm | Interfere | SlowDown | KeepInCell | DisturbBus | WatchCar | Stop | Quiet
+    | Tell | WatchNodes | Arm | ArmOnChannel | SlowDown | ShareState | DisturbBus | WatchCar | Stop | Quiet
     | Stats | Ack
 )  # fmt: skip
 FromNode = Hello | Ack | Said | Ordered | Fired | Report

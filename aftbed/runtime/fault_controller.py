@@ -73,14 +73,14 @@ class RunInjection(Injection):
             self.left = max(1, self.left - happened // self._emitters)
         self.host = self.process = None
 
-    def order(self, token: int, nth: int) -> control.Arm | control.Interfere:
+    def order(self, token: int, nth: int) -> control.Arm | control.ArmOnChannel:
         """What the host is told; `nth` 0: to wait no longer."""
         fault = self.fault
         armed = ArmedFault(
             self.number, self.brick, nth, fault.action, self.by_itself, self.draw, fault.persistence
         )
         if fault.action.counts_messages:
-            return control.Interfere(token, armed)
+            return control.ArmOnChannel(token, armed)
         return control.Arm(token, fault.event, (armed,))
 
     def begun(self, now_ns: int) -> None:
@@ -361,7 +361,7 @@ class FaultController:
         if shared.layout is None:
             number, ends = shared.number, (memory.fileno(),)
             data = yield from self._deployment.ask(
-                process.name, lambda token: control.KeepInCell(token, brick, number), ends
+                process.name, lambda token: control.ShareState(token, brick, number), ends
             )
             shared.layout = msgspec.msgpack.decode(data, type=StateLayout)
             memory.seal()

@@ -561,7 +561,7 @@ class Node(Generic[In, Out]):
                 self.step(self.bricks[brick], CONTROL, message)
             case control.WatchNodes():
                 self._watch(order, fds)
-            case control.Arm() | control.Interfere() | control.SlowDown() | control.KeepInCell():
+            case control.Arm() | control.ArmOnChannel() | control.SlowDown() | control.ShareState():
                 return self._take_fault(order, fds)
             case control.Stats():
                 return self.device.stats() if self.device is not None else b""
@@ -603,7 +603,7 @@ class Node(Generic[In, Out]):
 
     def _take_fault(
         self,
-        order: control.Arm | control.Interfere | control.SlowDown | control.KeepInCell,
+        order: control.Arm | control.ArmOnChannel | control.SlowDown | control.ShareState,
         fds: list[int],
     ) -> bytes:
         """Hand an order about a fault to the fault agent."""
@@ -611,13 +611,13 @@ class Node(Generic[In, Out]):
         match order:
             case control.Arm(_, event, faults):
                 agent.arm(event, faults)
-            case control.Interfere(_, armed):
+            case control.ArmOnChannel(_, armed):
                 agent.disturb(armed)
             case control.SlowDown(_, fault, by_ns, share):
                 if not agent.slowed:
                     self.io.begin_throttle()
                 agent.slow_down(fault, by_ns, share)
-            case control.KeepInCell(_, brick, number):
+            case control.ShareState(_, brick, number):
                 return agent.share_state(brick, number, self.io.memory(fds.pop()))
             case _:
                 assert_never(order)

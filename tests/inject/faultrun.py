@@ -64,7 +64,7 @@ class FakeDeployment:
         self.graph, self.folder = build(ftm, placement), folder
         self.leader, self.backup = "a", "b"
         self.nodes: dict[str, FakeProcess] = {}
-        self.told: list[tuple[str, control.Arm | control.Interfere | control.SlowDown]] = []
+        self.told: list[tuple[str, control.Arm | control.ArmOnChannel | control.SlowDown]] = []
         self.refuses = False
         self.nursery = self
         self.made = 0
@@ -84,7 +84,7 @@ class FakeDeployment:
         return node in self.nodes and self.nodes[node].alive
 
     def ask(
-        self, node: str, make: Callable[[int], control.Arm | control.Interfere]
+        self, node: str, make: Callable[[int], control.Arm | control.ArmOnChannel]
     ) -> Generator[Wait, object, bytes]:
         self.told.append((node, make(1)))
         yield Wait(frozenset())

@@ -24,7 +24,7 @@ def test_a_follower_that_is_behind_is_waited_for(home: Home) -> None:
     assert outcome.verdict.verdict == "pass", outcome.verdict.reasons
     assert outcome.verdict.faults[0].receipt.value in ("applied", "activated")
     assert outcome.record.end is not None
-    states = outcome.record.end["states"]
+    states = outcome.record.end.states
     assert isinstance(states, dict) and set(states) == {"a", "b"}
     assert states["a"] == states["b"]
 

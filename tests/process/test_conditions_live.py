@@ -13,11 +13,10 @@ from liveruns import Home, Started, aftbed, under_load, until
 from aftbed.core.errors import StepFailed
 from aftbed.core.events import Event
 from aftbed.core.journal import EntryKind
-from aftbed.inject.memory import MemoryFlip
 from aftbed.inject.model import FaultReport, parse
 from aftbed.inject.receipts import ReceiptState
 from aftbed.runtime.sim.world import Setup, simulate
-from aftbed.runtime.unix import control_client, memory, rundir
+from aftbed.runtime.unix import control_client, process_memory, rundir
 from aftbed.runtime.unix.options import CarRun, LoadRun
 
 pytestmark = pytest.mark.process
@@ -120,29 +119,31 @@ def test_a_bit_of_a_nodes_memory_is_another_one_and_of_no_other_node(home: Home)
     """An address that the node does not use: it holds a node's bits for as long as the run lasts."""
     with under_load(home, 4000, 200.0) as run:
         pid, private = run.pid("a/server"), run.private
-        owner = memory.Owner("a/server", pid, private)
+        owner = process_memory.Owner("a/server", pid, private)
         address = unused(owner)
-        before = memory.peek(owner, address)
+        before = process_memory.peek(owner, address)
         found = flipped(run, f"bitflip memory bit 5 address {address:#x} in a/server")
         assert (found[1], int(found[2], 16), int(found[4])) == ("5", address, pid)
         assert (int(found[5], 16), int(found[6], 16)) == (before, before ^ 0x20)
-        assert memory.peek(owner, address) == before ^ 0x20
-        other = memory.Owner("b/server", run.pid("b/server"), private)
-        assert memory.peek(other, address) == before, "forked from the same zygote, and not the same memory"
+        assert process_memory.peek(owner, address) == before ^ 0x20
+        other = process_memory.Owner("b/server", run.pid("b/server"), private)
+        assert process_memory.peek(other, address) == before, (
+            "forked from the same zygote, and not the same memory"
+        )
         control_client.ask(run.private, control_client.Stop())
         outcome = run.finish()
     assert outcome.verdict.faults[0].receipt.value == "applied"
 
 
-def unused(owner: memory.Owner) -> int:
+def unused(owner: process_memory.Owner) -> int:
     """The last byte of the heap: malloc gives it to somebody only where the heap grows."""
-    heap = next(one for one in memory.mappings(owner.pid) if one.name == memory.HEAP)
+    heap = next(one for one in process_memory.mappings(owner.pid) if one.name == process_memory.HEAP)
     return heap.end - 1
 
 
 def test_a_byte_that_is_drawn_is_one_that_the_process_can_write(home: Home) -> None:
     with under_load(home, 4000, 200.0) as run:
-        mapped = memory.mappings(run.pid("a/server"))
+        mapped = process_memory.mappings(run.pid("a/server"))
         found = flipped(run, "bitflip memory in a/server")
         assert any(one.start <= int(found[2], 16) < one.end for one in mapped)
         assert int(found[5], 16) ^ int(found[6], 16) == 1 << int(found[1])
@@ -169,9 +170,9 @@ def test_what_is_no_memory_of_the_process_is_the_injectors_failure(home: Home) -
 
 def test_a_process_of_another_run_is_not_struck(home: Home) -> None:
     with under_load(home, 4000, 200.0) as run:
-        owner = memory.Owner("a/server", run.pid("a/server"), rundir.root() / "000000")
+        owner = process_memory.Owner("a/server", run.pid("a/server"), rundir.root() / "000000")
         with pytest.raises(StepFailed, match=r"a/server \(pid \d+\) is no process of this run"):
-            memory.flip(owner, MemoryFlip(), 1)
+            process_memory.flip(owner, None, None, 1)
         run.launched.stop()
         run.finish()
 

@@ -45,7 +45,7 @@ def assert_served(outcome: Outcome, failovers: int) -> None:
     assert (requests.lost, requests.duplicated, requests.wrong) == (0, 0, 0)
     assert len(outcome.verdict.failovers) == failovers, outcome.events
     assert outcome.record.end is not None
-    assert outcome.record.end["epoch"] == 1 + failovers
+    assert outcome.record.end.epoch == 1 + failovers
 
 
 def load_over_a_kill(home: Home, name: str, placement: str = "process") -> Outcome:
@@ -70,7 +70,7 @@ def test_the_death_of_any_node_of_the_primary_is_one_failover(home: Home, part: 
     outcome = load_over_a_kill(home, f"a/{part}")
     assert_served(outcome, failovers=1)
     assert outcome.record.end is not None
-    assert (outcome.record.end["leader"], outcome.record.end["backup"]) == ("b", "a")
+    assert (outcome.record.end.leader, outcome.record.end.backup) == ("b", "a")
 
 
 @pytest.mark.parametrize("part", CHAIN)
@@ -78,7 +78,7 @@ def test_the_death_of_any_node_of_the_backup_costs_nothing(home: Home, part: str
     outcome = load_over_a_kill(home, f"b/{part}")
     assert_served(outcome, failovers=0)
     assert outcome.record.end is not None
-    assert (outcome.record.end["leader"], outcome.record.end["backup"]) == ("a", "b")
+    assert (outcome.record.end.leader, outcome.record.end.backup) == ("a", "b")
 
 
 @pytest.mark.parametrize("name", OUTSIDE)

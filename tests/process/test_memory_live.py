@@ -10,8 +10,8 @@ from liveruns import Home, Outcome, Started, aftbed, under_load, until
 from aftbed.core.events import Event
 from aftbed.inject.model import parse
 from aftbed.runtime.unix import control_client
-from aftbed.runtime.unix.cells import NAME
 from aftbed.runtime.unix.options import LoadRun
+from aftbed.runtime.unix.shared_memory import NAME
 
 pytestmark = pytest.mark.process
 
@@ -75,7 +75,7 @@ def test_what_nobody_reads_any_more_is_latent(home: Home) -> None:
     outcome = ran(home, "pbr", f"{FLIP} at reply.delivered nth {COUNT}")
     assert receipts(outcome) == ["applied"] and outcome.verdict.verdict == "pass"
     assert outcome.record.end is not None
-    states = outcome.record.end["states"]
+    states = outcome.record.end.states
     assert isinstance(states, dict) and states["a"] != states["b"], "seen at the end, and not by looking"
 
 

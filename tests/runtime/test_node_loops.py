@@ -43,7 +43,7 @@ ORDERS: Final[dict[str, tuple[control.ToNode, ...]]] = {
     "capture": (control.Capture(1, "brick"),),
     "suspend": (control.Suspend(2), control.Resume(3)),
     "flip": (control.Arm(4, Event.SERVER_EXIT.label, (FLIP,)),),
-    "omit": (control.Interfere(5, OMISSION),),
+    "omit": (control.ArmOnChannel(5, OMISSION),),
 }
 LAST: Final = messages.encode(Request(1, 0, b"last"))
 

@@ -19,10 +19,10 @@ from aftbed.core.journal import Record
 from aftbed.core.messages import ChannelEnded, Message
 from aftbed.runtime import control
 from aftbed.runtime.node import HostedBrick, Node, NodeIO, Recorder
-from aftbed.runtime.sim.cells import Cell
 from aftbed.runtime.sim.channels import Channel
 from aftbed.runtime.sim.clock import Clock
 from aftbed.runtime.sim.hops import HOP_QUANTILES_NS
+from aftbed.runtime.sim.shared_memory import SimulatedMemory
 
 NEVER: Final = 1 << 62
 PULSE_NS: Final = 20_000_000  # an idle node looks up so often
@@ -72,7 +72,7 @@ class SimIO(NodeIO[Channel, Channel]):
         ends: Callable[[int], Channel],
         report: Callable[[control.FromNode], None],
         on_end: Callable[[str], None],
-        cells: Sequence[Cell],
+        cells: Sequence[SimulatedMemory],
     ) -> None:
         self.name, self._clock, self._records, self._ends = name, clock, records, ends
         self._report, self._on_end, self._cells = report, on_end, cells

@@ -17,10 +17,10 @@ from aftbed.runtime.devices import Device
 from aftbed.runtime.interface import ProcessKind
 from aftbed.runtime.jobs import Key, Wait
 from aftbed.runtime.node import Node
-from aftbed.runtime.sim.cells import Cell
 from aftbed.runtime.sim.channels import Channel
 from aftbed.runtime.sim.clock import Clock
 from aftbed.runtime.sim.node_io import SimIO, SimNode
+from aftbed.runtime.sim.shared_memory import SimulatedMemory
 
 SIGNAL_NS: Final = (5_000, 60_000)
 LIFELINE_NS: Final = (100_000, 300_000)
@@ -226,7 +226,7 @@ class Nursery:
         self.processes: list[Process] = []
         self.by_number: dict[int, Process] = {}
         self.zygotes: dict[str, Process] = {}
-        self.cells: list[Cell] = []
+        self.cells: list[SimulatedMemory] = []
         self._heard_ns = 0
         self.on_report: Callable[[Process, control.FromNode], None] = lambda process, report: None
         self.on_death: Callable[[Process], None] = lambda process: None

@@ -31,7 +31,6 @@ from aftbed.runtime.hosting import Hosted, hosted
 from aftbed.runtime.interface import Met, ProcessKind
 from aftbed.runtime.jobs import Wait
 from aftbed.runtime.sim import ending
-from aftbed.runtime.sim.cells import Cell
 from aftbed.runtime.sim.channels import Channel
 from aftbed.runtime.sim.clock import START_NS, Clock
 from aftbed.runtime.sim.devices import SimSenses, VirtualCarLink
@@ -39,6 +38,7 @@ from aftbed.runtime.sim.drive import Drive
 from aftbed.runtime.sim.givens import Journal, check, graph_of, nothing_off_line, requests_of
 from aftbed.runtime.sim.node_io import SimIO, SimNode
 from aftbed.runtime.sim.processes import Nursery, Process
+from aftbed.runtime.sim.shared_memory import SimulatedMemory
 from aftbed.vehicle.aeb.function import default_application
 from aftbed.vehicle.condition import Condition
 from aftbed.vehicle.plant import VehicleResult
@@ -153,9 +153,9 @@ class World:
             self._ends[end.number] = channel
         return channel
 
-    def shared_memory(self) -> Cell:
+    def shared_memory(self) -> SimulatedMemory:
         """A fresh one."""
-        cell = Cell(len(self.nursery.cells))
+        cell = SimulatedMemory(len(self.nursery.cells))
         self.nursery.cells.append(cell)
         return cell
 

@@ -26,7 +26,7 @@ import msgspec
 from aftbed.core.errors import HarnessError
 from aftbed.runtime.unix import rundir
 from aftbed.runtime.unix.death_notice import SYS_FUTEX_WAITV
-from aftbed.runtime.unix.memory import YAMA, try_on_a_child
+from aftbed.runtime.unix.process_memory import YAMA, try_on_a_child
 
 Status = Literal["ok", "warning", "missing"]
 

@@ -26,7 +26,7 @@ from aftbed.core.messages import Scheduled
 from aftbed.inject.model import Fault
 from aftbed.runtime import control
 from aftbed.runtime.unix import linux, members, rundir
-from aftbed.runtime.unix.busaim import aim
+from aftbed.runtime.unix.bus_fault_names import with_names_resolved
 from aftbed.runtime.unix.line import Line, decode_report
 from aftbed.runtime.unix.options import LoadRun, RunOptions, Work
 from aftbed.runtime.unix.pages import Area
@@ -269,7 +269,7 @@ def options_for(
     bus_port: int = 0,
 ) -> tuple[RunOptions, socket.socket | None]:
     """What a run needs; where there is a bus, its socket too. Raises ConfigError, leaving nothing."""
-    faults = tuple(aim(fault, work) for fault in faults)
+    faults = tuple(with_names_resolved(fault, work) for fault in faults)
     listener = None if isinstance(work, LoadRun) else bind_hub(bus_port)
     private = rundir.free()
     try:

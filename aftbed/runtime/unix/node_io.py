@@ -46,7 +46,7 @@ from aftbed.inject.slow import SLOW_MS_MAX
 from aftbed.runtime import control
 from aftbed.runtime import node as node_module
 from aftbed.runtime.node import HostedBrick, Node, NodeIO, Recorder
-from aftbed.runtime.unix import cells, packets
+from aftbed.runtime.unix import packets, shared_memory
 from aftbed.runtime.unix.death_notice import Held
 from aftbed.runtime.unix.journal_files import Journal
 from aftbed.runtime.unix.line import Line
@@ -133,7 +133,7 @@ class UnixIO(NodeIO[Inlet, int]):
 
     def memory(self, number: int) -> memoryview:
         """The memory behind that descriptor, which is closed."""
-        return cells.mapped(number)
+        return shared_memory.mapped(number)
 
     # -- the pulse ----------------------------------------------------------------------------
 

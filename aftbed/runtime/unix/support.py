@@ -14,13 +14,13 @@ from aftbed.inject.kind import FaultKind
 from aftbed.runtime.deployment import Keys
 from aftbed.runtime.interface import Met
 from aftbed.runtime.interface import Process as AnyProcess
-from aftbed.runtime.unix import memory
-from aftbed.runtime.unix.bus import BusFaults
-from aftbed.runtime.unix.cells import Cell
+from aftbed.runtime.unix import process_memory
+from aftbed.runtime.unix.bus_faults import BusFaults
 from aftbed.runtime.unix.channels import Channel
 from aftbed.runtime.unix.event_loop import Loop
 from aftbed.runtime.unix.journal_files import Journal, contents, recorded_requests
 from aftbed.runtime.unix.process_pool import Nursery
+from aftbed.runtime.unix.shared_memory import MemfdMemory
 from aftbed.vehicle.condition import Condition
 
 HISTORY_NAME: Final = "adaptations.jsonl"
@@ -49,9 +49,9 @@ class Support:
         """A fresh pair of sockets."""
         return Channel(link)
 
-    def shared_memory(self) -> Cell:
+    def shared_memory(self) -> MemfdMemory:
         """A fresh memfd."""
-        return Cell()
+        return MemfdMemory()
 
     def journal_of(self, node: str, incarnation: int) -> str:
         """A file for each life of a node."""
@@ -88,7 +88,9 @@ class Support:
         """By process_vm_writev(2)."""
         if self._private is None:
             raise StepFailed("nothing tells which processes are of this run")
-        return memory.flip(memory.Owner(process.name, process.pid, self._private), bit, address, draw)
+        return process_memory.flip(
+            process_memory.Owner(process.name, process.pid, self._private), bit, address, draw
+        )
 
     def bus_fault(self, number: int) -> BusReport | None:
         """As the hub has said."""

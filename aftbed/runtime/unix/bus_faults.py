@@ -1,6 +1,6 @@
-"""The supervisor's hold on the hub: faults of the bus go there, and what has become of them comes back.
+"""Faults of the bus, as the supervisor has them: the hub arms them, and reports what has become of them.
 
-Conditions of the car at which other faults begin go there, too: who knows the car is connected to it.
+The hub also passes on the conditions of the car at which other faults begin: the car is connected to it.
 """
 
 import contextlib
@@ -20,11 +20,11 @@ from aftbed.runtime.unix.process_pool import Nursery, Process
 from aftbed.vehicle.condition import Condition
 
 HUB: Final = "hub"
-DISTURBED: Final = "disturbed"  # the hub to us: that fault is armed
-STRUCK: Final = "struck"  # the hub to us: what has become of these
-ASKED: Final = "struck.all"  # the same, of all, since we asked
-WATCHED: Final = "watched"  # the hub to us: that condition is looked at
-MET: Final = "met"  # the hub to us: it holds
+DISTURBED: Final = "disturbed"  # from the hub: that fault is armed
+STRUCK: Final = "struck"  # from the hub: what has become of these faults
+ASKED: Final = "struck.all"  # from the hub: of all faults, as the answer to `ask`
+WATCHED: Final = "watched"  # from the hub: that condition is watched
+MET: Final = "met"  # from the hub: that condition holds
 KINDS: Final = (DISTURBED, STRUCK, ASKED, WATCHED, MET)
 
 Steps = Generator[Wait, dict[Key, bytes], None]
@@ -43,7 +43,7 @@ class BusFaults:
         self._met: dict[int, Callable[[Met], None]] = {}
 
     def serve(self, hub: Process) -> None:
-        """There is a hub."""
+        """The hub is there."""
         self._hub = hub
 
     def disturb(self, number: int, fault: FaultKind, draw: int) -> Steps:
@@ -52,13 +52,13 @@ class BusFaults:
         if self._hub is None or not self._hub.alive:
             raise StepFailed(f"{fault}: this run has no bus")
         if fault.targets is None:
-            raise StepFailed(f"{fault}: it was not aimed at the messages of this bus")
+            raise StepFailed(f"{fault}: its names were not resolved")
         self._faults[number] = fault
         self._nursery.order(self._hub, control.DisturbBus(number, fault, draw))
         yield Wait(frozenset({(DISTURBED, HUB, number)}), frozenset({HUB}))
 
     def watch(self, number: int, condition: Condition, met: Callable[[Met], None]) -> Steps:
-        """Return when the car looks for it. Raises StepFailed."""
+        """Return when the car watches for it. Raises StepFailed."""
         if self._hub is None or not self._hub.alive:
             raise StepFailed(f"when {condition}: this run has no car")
         self._met[number] = met
@@ -71,7 +71,7 @@ class BusFaults:
             met(Met(t_us, since_ns, lambda: self._nursery.order(hub, control.Ack(number))))
 
     def ask(self) -> Steps:
-        """Hear what has become of all faults by now."""
+        """Ask the hub what has become of all faults by now."""
         if self._faults and self._hub is not None and self._hub.alive:
             with contextlib.suppress(StepFailed):  # then what it has said before has to do
                 self._nursery.order(self._hub, control.Stats(control.UNANSWERED))

@@ -1,15 +1,15 @@
-"""A bit of a process's own memory, flipped from outside: process_vm_writev(2), of processes of this run only.
+"""Flip a bit of the memory of a process of this run, from outside: process_vm_writev(2).
 
-Where no address is named, one is drawn: of a byte that the process can write, that is its alone (a private
-mapping: the heap, or anonymous memory), and that is there (`/proc/PID/pagemap`), since a page that was never
-used is nobody's memory. One bit of it is flipped, written, and read back. Nothing is stopped for that: the
-process works on, and may write the byte in the same microsecond; then what is read back is its own.
+Where no address is given, one is drawn: of a byte that the process can write, in a private mapping (the heap,
+or anonymous memory), in a page that is present (`/proc/PID/pagemap`). One bit of it is flipped, written, and
+read back. The process is not stopped for that: it may write the byte in the same microsecond; then what is
+read back is what the process wrote.
 
-What comes of it is anything: a crash, a wrong value, a reference count that matters in an hour, or nothing.
-There is no undo, and none is needed: it goes with the process.
+The consequence can be anything: a crash, a wrong value, a reference count that matters in an hour, or
+nothing. There is no undo, and none is needed: the bit goes with the process.
 
-*Who is struck* is asked as `runtime.unix.undo` asks it: with a pidfd open on the process, its mark tells that
-it is of this run; so the pid is that of no other process.
+*The process* is verified as in `runtime.unix.undo`: while a pidfd is open on it, its mark shows that it
+belongs to this run; so the pid cannot mean another process.
 
 Limits: addresses differ from run to run (ASLR), so a draw repeats the choice and not the byte. The kernel
 asks for the rights of ptrace(2) (PTRACE_MODE_ATTACH): under Yama's `ptrace_scope` 0 and 1 a supervisor has

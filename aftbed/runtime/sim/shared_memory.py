@@ -1,10 +1,10 @@
-"""Cells in virtual time: some bytes that the executive and a node both have."""
+"""Shared memory in virtual time: some bytes that the executive and a node both have."""
 
 from aftbed.inject.shared_state import SHARED_BYTES
 
 
-class Cell:
-    """The executive's hold on one; `number` is what travels with an order."""
+class SimulatedMemory:
+    """See `runtime.interface.SharedMemory`. An order to the node carries its `number`."""
 
     def __init__(self, number: int) -> None:
         self._number = number
@@ -15,7 +15,7 @@ class Cell:
         return self._number
 
     def seal(self) -> None:
-        """Nobody else asks for it."""
+        """Nothing is open."""
 
     def close(self) -> None:
-        """The node that has it keeps it."""
+        """The node keeps its view."""

@@ -1,4 +1,6 @@
-"""Cells as shared memory: a memfd without a name in any directory, which its last process takes with it."""
+"""Memory that the supervisor shares with a node: a memfd, which has no name in any directory and goes with
+its processes.
+"""
 
 import mmap
 import os
@@ -10,7 +12,10 @@ NAME: Final = "aftbed-cell"  # as /proc/PID/maps shows it
 
 
 def mapped(descriptor: int) -> memoryview:
-    """The memory behind `descriptor`, which is closed. Whoever is forked from here does not inherit it."""
+    """The memory behind `descriptor`, which is closed.
+
+    A process that is forked from here does not inherit it.
+    """
     try:
         memory = mmap.mmap(descriptor, SHARED_BYTES)
     finally:
@@ -19,8 +24,8 @@ def mapped(descriptor: int) -> memoryview:
     return memoryview(memory)
 
 
-class Cell:
-    """The executive's hold on one."""
+class MemfdMemory:
+    """The supervisor's end: see `runtime.interface.SharedMemory`."""
 
     def __init__(self) -> None:
         self._descriptor = os.memfd_create(NAME)
@@ -28,16 +33,16 @@ class Cell:
         self.memory = mapped(os.dup(self._descriptor))
 
     def fileno(self) -> int:
-        """The descriptor that travels."""
+        """The descriptor that is passed to the node."""
         return self._descriptor
 
     def seal(self) -> None:
-        """Nobody else is to have it: only the mappings are left."""
+        """Close the descriptor: from here on only the two mappings are left."""
         if self._descriptor >= 0:
             os.close(self._descriptor)
             self._descriptor = -1
 
     def close(self) -> None:
-        """Let go of the memory as well."""
+        """Unmap it as well."""
         self.seal()
         self.memory.release()

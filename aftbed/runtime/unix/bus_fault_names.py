@@ -1,6 +1,7 @@
-"""A fault, aimed at the bus and the car of a run: in the command, before anything is started or asked.
+"""What the names in a fault mean on the bus of a run, and whether the run has a bus and a car for it.
 
-The DBC is read here and not in the supervisor, whose failovers must not wait for it, nor in the hub.
+The command resolves them before it starts or asks anything. The supervisor does not read the DBC, because its
+failovers must not wait for that; nor does the hub.
 """
 
 from pathlib import Path
@@ -18,8 +19,8 @@ PLAYER: Final = "player"
 *_, GATEWAY = NODES
 
 
-def aim(fault: Fault, work: Work) -> Fault:
-    """`fault`, with its names resolved if it is of the bus.
+def with_names_resolved(fault: Fault, work: Work) -> Fault:
+    """`fault`, with its names resolved if it is a fault of the bus.
 
     Raises ConfigError, also where there is no bus, or no car for its condition.
     """
