@@ -27,11 +27,12 @@ from aftbed.judge.outcome import FAILED, OUTCOMES, UNKNOWN, outcome_of, worst
 from aftbed.judge.record import RunEnd, RunRecord, read_record, record_of
 from aftbed.judge.verdict import Breach, Verdict, evidence_of, judge
 from aftbed.runtime.sim.world import Setup, simulate
-from aftbed.runtime.unix import linux, spawn
+from aftbed.runtime.unix import launch as unix_launch
+from aftbed.runtime.unix import linux
 from aftbed.runtime.unix.bus_fault_names import with_names_resolved
 from aftbed.runtime.unix.launch import launch, options_for
 from aftbed.runtime.unix.options import CarRun, LoadRun, Work
-from aftbed.runtime.unix.pages import Area
+from aftbed.runtime.unix.prefault import Area
 from aftbed.runtime.zygotes import BUS, LIGHT
 from aftbed.search.shrink import shrink
 from aftbed.vehicle.aeb.function import default_application
@@ -211,7 +212,7 @@ def _probe() -> Probe:
 @lru_cache(maxsize=2)
 def _warm_up(name: str) -> tuple[Area, ...]:
     """Once in this process: its zygotes are forks of it."""
-    return spawn.warm_up(name)
+    return unix_launch.warm_up(name)
 
 
 def without_times(result: Result) -> Result:

@@ -35,7 +35,7 @@ from aftbed.core.messages import Goal, Scheduled
 from aftbed.core.script import Script, Stage, Step, Together
 from aftbed.core.yaml_file import read_yaml
 from aftbed.ftm.compose import build
-from aftbed.runtime.unix import control_client, rundir
+from aftbed.runtime.unix import control_client, run_directory
 from aftbed.runtime.unix.part import load_module
 from aftbed.vehicle.aeb.function import default_application
 
@@ -118,7 +118,7 @@ def script(
     """Carry out a script from a file; all of it is checked before its first step."""
     path = Path(file)
     wanted = _absolute(script_from(read_yaml(path, ScriptFile), file), path.parent)
-    private = rundir.find(run)
+    private = run_directory.find(run)
     graph = _graph_of(private)
     refuse(file, refusals(graph, wanted))
     goal = Goal(script=wanted, recipe=wanted.recipe)
@@ -127,7 +127,7 @@ def script(
 
 
 def _change(wish: Wish, run: str | None, recipe: str, *, force: bool, as_json: bool) -> None:
-    private = rundir.find(run)
+    private = run_directory.find(run)
     graph = _graph_of(private)
     goal = goal_of(wish, graph, recipe, _source_here)
     _refuse_unsuitable(led_to(graph, goal), wish, force=force)
@@ -248,7 +248,7 @@ def plan(
         raise ConfigError("--yaml and --json: one of them is allowed")
     if start is None and placement is not None:
         raise ConfigError("--placement says where --from stands: give --from EXPR too")
-    old = _graph_of(rundir.find(run)) if start is None else build(start, placement or PLACEMENTS[0])
+    old = _graph_of(run_directory.find(run)) if start is None else build(start, placement or PLACEMENTS[0])
     there = plan_between(old, target(old, expr), recipe)
     back = plan_between(there.new, old, recipe)
     if as_yaml:
@@ -363,6 +363,6 @@ def _yaml(value: object) -> str:
 @adapt.command()
 def history(run: Run = None, json: Json = False) -> None:
     """The adaptations of the run that have ended, and how."""
-    found = control_client.ask(rundir.find(run), control_client.Adaptations())
+    found = control_client.ask(run_directory.find(run), control_client.Adaptations())
     ended = msgspec.convert(found["adaptations"], list[EndedAdaptation])
     print("\n".join([dumps(found)] if json else history_lines(ended)))

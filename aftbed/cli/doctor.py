@@ -8,9 +8,9 @@ import typer
 
 from aftbed.cli.options import Json
 from aftbed.core.errors import HarnessError
-from aftbed.runtime.unix import leftovers
+from aftbed.runtime.unix import cleanup
+from aftbed.runtime.unix.cleanup import Left
 from aftbed.runtime.unix.doctor import Check, inspect
-from aftbed.runtime.unix.leftovers import Left
 
 
 class Diagnosis(msgspec.Struct, frozen=True):
@@ -44,9 +44,9 @@ def _diagnose(*, clean: bool) -> Diagnosis:
     removed: list[Left] = []
     left: list[Left] = []
     try:
-        left = leftovers.find()
+        left = cleanup.find()
         if clean:
-            removed, left = leftovers.clean(left)
+            removed, left = cleanup.clean(left)
     except HarnessError:  # runs have no directory here: one of the checks reports it
         assert any(c.status == "missing" for c in checks)
     ok = not left and all(c.status != "missing" for c in checks)

@@ -15,7 +15,7 @@ from aftbed.inject.bus import read_bus_fault
 from aftbed.inject.memory import refuse_unsafe
 from aftbed.inject.model import Fault, on_bus, read
 from aftbed.inject.value import MEMORY
-from aftbed.runtime.unix import control_client, rundir
+from aftbed.runtime.unix import control_client, run_directory
 from aftbed.runtime.unix.bus_fault_names import with_names_resolved
 from aftbed.runtime.unix.options import Work
 
@@ -238,7 +238,7 @@ class _RecordHead(msgspec.Struct, frozen=True):
 
 def _arm(run: str | None, fault: Fault) -> None:
     """Have the run arm the fault. The messages and signals it may name are those of the run's work."""
-    private = rundir.find(run)
+    private = run_directory.find(run)
     record = Path(str(control_client.ask(private, control_client.Status())["record"]))
     head = msgspec.json.decode((record / "run.json").read_bytes(), type=_RecordHead)
     control_client.ask(private, control_client.Inject(with_names_resolved(fault, head.work)))

@@ -10,13 +10,13 @@ from aftbed.cli.options import Json, Run
 from aftbed.core.errors import unknown
 from aftbed.core.graph import Graph
 from aftbed.ftm.compose import build
-from aftbed.runtime.unix import control_client, rundir
+from aftbed.runtime.unix import control_client, run_directory
 from aftbed.runtime.unix.resources import measured
 
 
 def status(run: Run = None, json: Json = False) -> None:
     """Show the state of a live run."""
-    found = control_client.ask(rundir.find(run), control_client.Status())
+    found = control_client.ask(run_directory.find(run), control_client.Status())
     if json:
         print(dumps(found))
         return
@@ -26,7 +26,7 @@ def status(run: Run = None, json: Json = False) -> None:
 
 def ps(run: Run = None, json: Json = False) -> None:
     """The processes of a live run: name, role, pid, CPU, memory (PSS)."""
-    rows = measured(control_client.processes(rundir.find(run)))
+    rows = measured(control_client.processes(run_directory.find(run)))
     if json:
         print(dumps(msgspec.to_builtins(rows)))
         return
@@ -40,7 +40,7 @@ def ps(run: Run = None, json: Json = False) -> None:
 
 def stop(run: Run = None) -> None:
     """End a live run; its command prints the verdict so far."""
-    private = rundir.find(run)
+    private = run_directory.find(run)
     control_client.ask(private, control_client.Stop())
     print(f"run {private.name}: stopping")
 
@@ -60,7 +60,7 @@ def graph(
     if ftm is not None:
         shown = build(ftm, placement)
     else:
-        shown = msgspec.convert(control_client.ask(rundir.find(run), control_client.GraphNow()), Graph)
+        shown = msgspec.convert(control_client.ask(run_directory.find(run), control_client.GraphNow()), Graph)
     print(FORMATS[style](shown))
 
 

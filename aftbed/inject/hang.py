@@ -2,7 +2,7 @@
 while.
 
 Without `for` the target stays stopped. The end of a stop is recorded in the run's undo log before the stop,
-so the cleanup process thaws the target even if the supervisor has died (`runtime.unix.undo`).
+so the cleanup process thaws the target even if the supervisor has died (`runtime.unix.cleanup`).
 """
 
 from collections.abc import Sequence

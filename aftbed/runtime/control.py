@@ -267,6 +267,16 @@ class Fired(msgspec.Struct, frozen=True, tag=True):
     fault: int
 
 
+# Kinds of reports of the hub's process about faults of the bus and conditions of the car.
+HUB: Final = "hub"
+BUS_FAULT_ARMED: Final = "disturbed"
+BUS_FAULTS_CHANGED: Final = "struck"  # the receipts that are new
+BUS_FAULTS_ASKED: Final = "struck.all"  # the receipts of all, as asked
+CONDITION_WATCHED: Final = "watched"
+CONDITION_MET: Final = "met"
+BUS_REPORTS: Final = (BUS_FAULT_ARMED, BUS_FAULTS_CHANGED, BUS_FAULTS_ASKED, CONDITION_WATCHED, CONDITION_MET)
+
+
 class Report(msgspec.Struct, frozen=True, tag=True):
     """A service to the runtime: `kind` says what `data` is."""
 

@@ -7,7 +7,7 @@ import pytest
 from fakerun import Call, FakeRun, Output
 
 from aftbed.cli import main
-from aftbed.runtime.unix import control_client, rundir
+from aftbed.runtime.unix import control_client, run_directory
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "process"))
 
@@ -21,7 +21,7 @@ def fake(monkeypatch: pytest.MonkeyPatch) -> FakeRun:
     """The only live run."""
     run = FakeRun()
     monkeypatch.setattr(control_client, "ask", run.ask)
-    monkeypatch.setattr(rundir, "find", lambda name: Path("/nowhere/abc123"))
+    monkeypatch.setattr(run_directory, "find", lambda name: Path("/nowhere/abc123"))
     return run
 
 

@@ -16,7 +16,7 @@ from aftbed.cli.app import COMMANDS
 from aftbed.cli.lazy import CommandTable, LazyCommand
 from aftbed.cli.options import takes
 from aftbed.cli.scenario import SUBCOMMANDS
-from aftbed.runtime.unix import rundir
+from aftbed.runtime.unix import run_directory
 
 # -- the table
 
@@ -66,7 +66,7 @@ def test_help_of_a_command_and_of_a_subcommand(call: Call) -> None:
 
 def test_trouble_is_exit_code_3(home: Home, call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
     """The example is a directory of runs that other users could read."""
-    root = rundir.root()
+    root = run_directory.root()
     root.chmod(0o755)
     code, _, err = call("status")
     root.chmod(0o700)

@@ -10,7 +10,7 @@ import pytest
 from liveruns import Command, Home, aftbed, until
 
 from aftbed.ftm.compose import build
-from aftbed.runtime.unix import control_client, rundir
+from aftbed.runtime.unix import control_client, run_directory
 
 pytestmark = pytest.mark.process
 
@@ -47,7 +47,7 @@ def output(*arguments: str) -> str:
 
 
 def test_status_shows_the_state_of_the_run(drive: Command) -> None:
-    run = rundir.live()[0]
+    run = run_directory.live()[0]
     status = json.loads(output("status", "--json"))
     assert status["run"] == run
     assert (status["ftm"], status["placement"]) == ("pbr", "process")
@@ -171,7 +171,7 @@ def test_an_interrupt_ends_the_run_with_its_verdict(home: Home, sig: signal.Sign
 
 def test_an_interrupt_of_json_gives_the_document(home: Home) -> None:
     with Command("--load", "100000@200", "--json") as command:
-        private = rundir.root() / until(rundir.live, "the run")[0]
+        private = run_directory.root() / until(run_directory.live, "the run")[0]
         until(lambda: control_client.ask(private, control_client.Status())["backup"], "redundancy")
         command.popen.send_signal(signal.SIGINT)
         done = command.done()

@@ -12,7 +12,7 @@ from aftbed.cli.adapt import scheduled
 from aftbed.core.errors import ConfigError
 from aftbed.core.messages import Goal, Scheduled
 from aftbed.ftm.compose import build
-from aftbed.runtime.unix import rundir
+from aftbed.runtime.unix import run_directory
 from aftbed.runtime.unix.options import RunOptions
 
 
@@ -81,7 +81,7 @@ def test_the_adaptations_of_a_run_are_among_its_options(home: Home, monkeypatch:
 
     def launch(options: RunOptions, listener: object) -> None:
         started.append(options)
-        rundir.remove(Path(options.private))
+        run_directory.remove(Path(options.private))
         raise StartedError
 
     monkeypatch.setattr(run, "launch", launch)

@@ -27,8 +27,8 @@ from aftbed.inject.value import EXECUTED, ValueFlip, ValuePlace
 from aftbed.runtime import control
 from aftbed.runtime.node import Node
 from aftbed.runtime.unix.journal_files import Journal
-from aftbed.runtime.unix.line import Line, decode_order, decode_report
 from aftbed.runtime.unix.node_io import UnixIO
+from aftbed.runtime.unix.transport import Line, decode_order, decode_report
 
 STATE: Final = b"\x00\x01\x02\x03"
 REFUSED: Final = 0x80  # in the last byte of a state: no state has it

@@ -26,8 +26,8 @@ from aftbed.inject.timing import Permanent
 from aftbed.runtime import control
 from aftbed.runtime.node import Node
 from aftbed.runtime.unix.journal_files import Journal
-from aftbed.runtime.unix.line import Line, decode_order, decode_report
 from aftbed.runtime.unix.node_io import UnixIO
+from aftbed.runtime.unix.transport import Line, decode_order, decode_report
 
 FILLER: Final = Request(1, 0, bytes(2000))
 BRICK, PORT = "a/after", "aft2aft"

@@ -34,7 +34,7 @@ from aftbed.core.journal import EntryKind, entries
 from aftbed.inject.model import Fault
 from aftbed.judge.record import RunRecord, read_record
 from aftbed.judge.verdict import Verdict, judge
-from aftbed.runtime.unix import control_client, rundir
+from aftbed.runtime.unix import control_client, run_directory
 from aftbed.runtime.unix.launch import launch, options_for
 from aftbed.runtime.unix.options import LoadRun, Work
 from aftbed.runtime.unix.resources import Row
@@ -343,4 +343,4 @@ class Command:
 
 def only_run() -> Path:
     """The private directory of the only live run, as soon as it answers."""
-    return rundir.root() / until(rundir.live, "a run")[0]
+    return run_directory.root() / until(run_directory.live, "a run")[0]

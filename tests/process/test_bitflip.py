@@ -22,7 +22,7 @@ from aftbed.ftm.compose import EXPRESSIONS, replication_of
 from aftbed.inject.model import parse
 from aftbed.judge.record import RunRecord, read_record
 from aftbed.judge.verdict import Verdict
-from aftbed.runtime.unix import control_client, rundir
+from aftbed.runtime.unix import control_client, run_directory
 from aftbed.runtime.unix.options import LoadRun
 
 pytestmark = pytest.mark.process
@@ -251,7 +251,10 @@ def held_in_its_launch(home: Home) -> Iterator[tuple[Started, int]]:
     """A run, and the zygote that its launch waits for: it is stopped. A launch may be quicker than we are."""
     for _ in range(5):
         with Started(home, LoadRun(ENDLESS, 200.0)) as started:
-            until(lambda: rundir.live() and any(row.role == "zygote" for row in started.rows()), "a zygote")
+            until(
+                lambda: run_directory.live() and any(row.role == "zygote" for row in started.rows()),
+                "a zygote",
+            )
             zygote = next(row.pid for row in started.rows() if row.role == "zygote")
             os.kill(zygote, signal.SIGSTOP)
             until(lambda: state_of(zygote) == "T", "it to stop")  # noqa: B023

@@ -16,7 +16,7 @@ from aftbed.core.journal import EntryKind
 from aftbed.inject.model import FaultReport, parse
 from aftbed.inject.receipts import ReceiptState
 from aftbed.runtime.sim.world import Setup, simulate
-from aftbed.runtime.unix import control_client, process_memory, rundir
+from aftbed.runtime.unix import control_client, process_memory, run_directory
 from aftbed.runtime.unix.options import CarRun, LoadRun
 
 pytestmark = pytest.mark.process
@@ -170,7 +170,7 @@ def test_what_is_no_memory_of_the_process_is_the_injectors_failure(home: Home) -
 
 def test_a_process_of_another_run_is_not_struck(home: Home) -> None:
     with under_load(home, 4000, 200.0) as run:
-        owner = process_memory.Owner("a/server", run.pid("a/server"), rundir.root() / "000000")
+        owner = process_memory.Owner("a/server", run.pid("a/server"), run_directory.root() / "000000")
         with pytest.raises(StepFailed, match=r"a/server \(pid \d+\) is no process of this run"):
             process_memory.flip(owner, None, None, 1)
         run.launched.stop()

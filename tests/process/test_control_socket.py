@@ -19,7 +19,7 @@ from aftbed.inject.crash import Crash
 from aftbed.inject.hang import Hang
 from aftbed.inject.model import Fault
 from aftbed.inject.timing import Trigger
-from aftbed.runtime.unix import control_client, rundir
+from aftbed.runtime.unix import control_client, run_directory
 
 pytestmark = pytest.mark.process
 
@@ -63,7 +63,7 @@ def connected(run: Started) -> socket.socket:
 
     def attempt() -> socket.socket | None:
         try:
-            return rundir.connect(run.private)
+            return run_directory.connect(run.private)
         except BlockingIOError:
             return None
 

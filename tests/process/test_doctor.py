@@ -15,8 +15,8 @@ import pytest
 from liveruns import Command, Home, Started, aftbed, ended, only_run, state_of, under_load, until
 
 from aftbed.cli.doctor import Diagnosis
-from aftbed.runtime.unix import control_client, leftovers, members, rundir
-from aftbed.runtime.unix.leftovers import LeftDirectory, LeftProcess
+from aftbed.runtime.unix import cleanup, control_client, run_directory
+from aftbed.runtime.unix.cleanup import LeftDirectory, LeftProcess
 from aftbed.runtime.unix.options import LoadRun
 
 pytestmark = pytest.mark.process
@@ -32,9 +32,9 @@ def doctor(*arguments: str) -> tuple[int, Diagnosis]:
     return done.code, msgspec.json.decode(done.out, type=Diagnosis)
 
 
-def of_run(run: Path) -> list[members.Member]:
+def of_run(run: Path) -> list[run_directory.Member]:
     """All of its processes but the command."""
-    return [m for m in members.members() if m.run == str(run)]
+    return [m for m in run_directory.members() if m.run == str(run)]
 
 
 def parts(run: Path) -> tuple[int, int]:
@@ -91,7 +91,7 @@ def test_a_run_killed_with_all_its_keepers_leaves_its_directory(home: Home) -> N
 def test_the_processes_of_a_dead_run_are_named_and_removed_and_a_live_run_goes_on(home: Home) -> None:
     """The worst: the supervisor is stopped, so with nobody left its nodes, one of them stopped, live on."""
     with under_load(home, 100_000) as alive, Command(*ENDLESS) as command:
-        until(lambda: len(rundir.live()) == 2, "two runs")
+        until(lambda: len(run_directory.live()) == 2, "two runs")
         command.started()
         run = next(path for path in home.runs() if path != alive.private)
         engine = next(row.pid for row in control_client.processes(run) if row.name == "engine")
@@ -131,12 +131,12 @@ def test_the_processes_of_a_dead_run_are_named_and_removed_and_a_live_run_goes_o
 
 def test_a_run_is_alive_from_its_first_moment_to_the_last(home: Home) -> None:
     """Its directory is there before a process is, and after the last one."""
-    private = rundir.create()
+    private = run_directory.create()
     try:
         assert doctor("--clean")[1].removed == []
         assert private.exists()
     finally:
-        rundir.remove(private)
+        run_directory.remove(private)
     with Started(home, LoadRun(50, 1000.0)) as run:
         until(lambda: ended(run.launched.supervisor), "the end of the supervisor")
         assert doctor("--clean")[1].removed == []
@@ -172,13 +172,13 @@ def test_a_run_that_is_just_ending_is_given_its_second(home: Home) -> None:
         stopped(parts(only_run())[0])
         command.popen.kill()
         command.popen.wait()
-        assert leftovers.find() == []
+        assert cleanup.find() == []
 
 
 @pytest.fixture
 def stranger(home: Home) -> Iterator[subprocess.Popen[bytes]]:
     """A process with a name like ours, whose output is in the directory of a dead run."""
-    run = rundir.root() / "abcdef"
+    run = run_directory.root() / "abcdef"
     run.mkdir(mode=0o700)
     words = ["-c", "import sys; sys.stdin.read()", "aftbed-supervis", str(run)]
     with open(run / "events.jsonl", "w") as file:
@@ -191,19 +191,19 @@ def stranger(home: Home) -> Iterator[subprocess.Popen[bytes]]:
 
 
 def test_a_process_without_the_mark_is_not_touched(home: Home, stranger: subprocess.Popen[bytes]) -> None:
-    (rundir.root() / "notes").mkdir()
-    (rundir.root() / "fedcba").write_text("a file")
+    (run_directory.root() / "notes").mkdir()
+    (run_directory.root() / "fedcba").write_text("a file")
     code, found = doctor("--clean")
     assert code == 0
-    assert [left.run for left in found.removed] == [str(rundir.root() / "abcdef")]
+    assert [left.run for left in found.removed] == [str(run_directory.root() / "abcdef")]
     assert stranger.poll() is None
-    assert {path.name for path in rundir.root().iterdir()} == {"notes", "fedcba"}
-    (rundir.root() / "notes").rmdir()
-    (rundir.root() / "fedcba").unlink()
+    assert {path.name for path in run_directory.root().iterdir()} == {"notes", "fedcba"}
+    (run_directory.root() / "notes").rmdir()
+    (run_directory.root() / "fedcba").unlink()
 
 
 def test_a_place_that_others_can_enter_is_missing_and_nothing_is_cleaned(home: Home) -> None:
-    root = rundir.root()
+    root = run_directory.root()
     (root / "abcdef").mkdir()
     root.chmod(0o755)
     try:

@@ -9,7 +9,7 @@ from typing import Final
 import pytest
 from liveruns import GONE_SECONDS_MAX, PATIENCE_SECONDS, Home, Started, ended, readable, state_of, until
 
-from aftbed.runtime.unix import members
+from aftbed.runtime.unix import run_directory
 from aftbed.runtime.unix.options import LoadRun
 
 pytestmark = pytest.mark.process
@@ -35,8 +35,8 @@ def test_the_runs_of_a_killed_command_do_not_wait_for_each_other(home: Home) -> 
     with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as command:
         assert command.stdout is not None
         pids = [int(word) for word in command.stdout.readline().split()]
-        *others, last = [members.run_of(pid) for pid in pids]
-        keepers = [m for m in members.members() if m.run == str(last) and m.name in KEEPERS]
+        *others, last = [run_directory.run_of(pid) for pid in pids]
+        keepers = [m for m in run_directory.members() if m.run == str(last) and m.name in KEEPERS]
         assert len(keepers) == len(KEEPERS)
         for keeper in keepers:
             os.kill(keeper.pid, signal.SIGSTOP)

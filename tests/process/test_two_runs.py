@@ -5,7 +5,7 @@ import signal
 import pytest
 from liveruns import Command, Home, aftbed, under_load, until
 
-from aftbed.runtime.unix import control_client, rundir
+from aftbed.runtime.unix import control_client, run_directory
 
 pytestmark = pytest.mark.process
 
@@ -25,12 +25,12 @@ def test_two_drives_at_once_both_pass(home: Home) -> None:
 
 def test_a_crash_in_one_run_is_none_in_the_other(home: Home) -> None:
     with under_load(home, LONG) as one, Command("--load", f"{LONG}@200", "--json") as other:
-        until(lambda: len(rundir.live()) == 2, "two runs")
+        until(lambda: len(run_directory.live()) == 2, "two runs")
         seen = len(one.events)
         one.strike("a/server", signal.SIGKILL)
         one.wait_for("script.done", "new backup", after=seen)
-        for run in rundir.live():
-            control_client.ask(rundir.find(run), control_client.Stop())
+        for run in run_directory.live():
+            control_client.ask(run_directory.find(run), control_client.Stop())
         assert len(one.finish().verdict.failovers) == 1
         spared = other.done()
     assert spared.code == 0, spared.out + spared.err
@@ -40,7 +40,7 @@ def test_a_crash_in_one_run_is_none_in_the_other(home: Home) -> None:
 def test_with_two_runs_alive_a_command_must_name_one(home: Home) -> None:
     with Command("--load", "100000@200") as first, Command("--load", "100000@200") as second:
         ids = {first.started(), second.started()}
-        until(lambda: len(rundir.live()) == 2, "two runs")
+        until(lambda: len(run_directory.live()) == 2, "two runs")
         for command in ("status", "ps", "graph", "stop"):
             refused = aftbed(command)
             assert refused.code == 2
@@ -51,7 +51,7 @@ def test_with_two_runs_alive_a_command_must_name_one(home: Home) -> None:
             assert named.code == 0, named.err
             assert run in named.out
         assert aftbed("stop", "--run", ids.pop()).code == 0
-        until(lambda: len(rundir.live()) == 1, "one run to end")
+        until(lambda: len(run_directory.live()) == 1, "one run to end")
         alone = aftbed("stop")
         assert alone.code == 0, alone.err
         for command in (first, second):
@@ -62,17 +62,17 @@ def test_with_two_runs_alive_a_command_must_name_one(home: Home) -> None:
 
 def test_the_directory_of_a_dead_run_is_no_run(home: Home) -> None:
     """What a crash of the machine may leave: a directory, and a socket that nobody serves."""
-    private = rundir.create()
+    private = run_directory.create()
     with pytest.raises(OSError, match=r"No such file|refused"):
-        rundir.connect(private)
-    assert rundir.live() == []
+        run_directory.connect(private)
+    assert run_directory.live() == []
     assert aftbed("status").err.startswith("aftbed: error: no run is alive")
-    rundir.remove(private)
+    run_directory.remove(private)
 
 
 def test_the_directory_of_a_run_is_private(home: Home) -> None:
     with under_load(home, 100) as run:
         assert run.private.stat().st_mode & 0o777 == 0o700
-        assert rundir.root().stat().st_mode & 0o777 == 0o700
+        assert run_directory.root().stat().st_mode & 0o777 == 0o700
         control_client.ask(run.private, control_client.Stop())
         assert run.finish().verdict.verdict == "pass"

@@ -10,8 +10,7 @@ import pytest
 
 from aftbed.core.graph import Link
 from aftbed.runtime.channels import Channels
-from aftbed.runtime.unix.channels import Channel
-from aftbed.runtime.unix.node_io import NUDGE
+from aftbed.runtime.unix.transport import NUDGE, Channel
 
 LINK: Final = Link("a/after", "aft2aft", "b/after", "aft2aft")
 

@@ -23,8 +23,7 @@ from aftbed.inject.hang import Hang
 from aftbed.inject.model import Fault
 from aftbed.inject.timing import Trigger
 from aftbed.runtime import control
-from aftbed.runtime.unix.line import FDS_MAX, Line, decode_order, decode_report
-from aftbed.runtime.unix.packets import STATE_BYTES_MAX
+from aftbed.runtime.unix.transport import FDS_MAX, STATE_BYTES_MAX, Line, decode_order, decode_report
 from aftbed.vehicle.condition import Condition
 
 ORDERS: Final[tuple[type[msgspec.Struct], ...]] = get_args(control.ToNode)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from aftbed.runtime.unix import doctor, rundir
+from aftbed.runtime.unix import doctor, run_directory
 from aftbed.runtime.unix.doctor import Check, inspect
 
 
@@ -36,7 +36,7 @@ def test_a_machine_that_runs_the_tests_has_what_a_run_needs() -> None:
     for name in ("pidfd", "memfd", "parent death signal", "packet sockets", "loopback", "/proc"):
         assert (checks[name].status, checks[name].found) == ("ok", "works")
     assert checks["asserts"].found == "on"
-    assert checks["run directory"].found == f"{rundir.root()}, mode 0700"
+    assert checks["run directory"].found == f"{run_directory.root()}, mode 0700"
 
 
 def test_what_is_not_well_has_a_remedy() -> None:

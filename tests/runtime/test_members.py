@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from aftbed.runtime.unix import members
+from aftbed.runtime.unix import run_directory
 
 pytestmark = pytest.mark.process
 
@@ -45,23 +45,23 @@ def forked() -> Iterator[Forked]:
 
 def test_who_is_not_marked_belongs_to_no_run(forked: Forked) -> None:
     child = forked(lambda: None)
-    assert members.run_of(child) is members.run_of(os.getpid()) is None
-    assert child not in {m.pid for m in members.members()}
+    assert run_directory.run_of(child) is run_directory.run_of(os.getpid()) is None
+    assert child not in {m.pid for m in run_directory.members()}
 
 
 def test_a_mark_is_known_by_its_directory(forked: Forked, tmp_path: Path) -> None:
     run = tmp_path / "a directory with a space (deleted)"
-    child = forked(lambda: members.mark(run))
-    assert members.run_of(child) == run
-    found = {m.pid: m for m in members.members()}[child]
-    assert (found.run, found.start) == (str(run), members.started(child))
+    child = forked(lambda: run_directory.mark(run))
+    assert run_directory.run_of(child) == run
+    found = {m.pid: m for m in run_directory.members()}[child]
+    assert (found.run, found.start) == (str(run), run_directory.started(child))
 
 
 def test_a_mark_stays_where_all_descriptors_are_closed(forked: Forked, tmp_path: Path) -> None:
     """A zygote closes what it does not know."""
 
     def act() -> None:
-        members.mark(tmp_path)
+        run_directory.mark(tmp_path)
         for descriptor in range(3, 20):
             try:
                 if not _is_pipe(os.fstat(descriptor)):
@@ -69,7 +69,7 @@ def test_a_mark_stays_where_all_descriptors_are_closed(forked: Forked, tmp_path:
             except OSError:
                 continue
 
-    assert members.run_of(forked(act)) == tmp_path
+    assert run_directory.run_of(forked(act)) == tmp_path
 
 
 def _is_pipe(state: os.stat_result) -> bool:
@@ -78,18 +78,18 @@ def _is_pipe(state: os.stat_result) -> bool:
 
 def test_what_is_executed_is_marked_by_its_environment(tmp_path: Path) -> None:
     words = [sys.executable, "-c", "print(flush=True); input()"]
-    environment = os.environ | {members.VARIABLE: str(tmp_path)}
+    environment = os.environ | {run_directory.VARIABLE: str(tmp_path)}
     with subprocess.Popen(words, stdin=-1, stdout=-1, env=environment) as process:
         assert process.stdout is not None and process.stdout.readline() == b"\n"
-        assert members.run_of(process.pid) == tmp_path
+        assert run_directory.run_of(process.pid) == tmp_path
         process.kill()
 
 
 def test_a_process_is_ended_only_if_it_still_is_that_one(forked: Forked, tmp_path: Path) -> None:
-    child = forked(lambda: members.mark(tmp_path))
-    found = {m.pid: m for m in members.members()}[child]
-    other = members.Member(child, found.start + 1, found.run, found.name, found.state)
+    child = forked(lambda: run_directory.mark(tmp_path))
+    found = {m.pid: m for m in run_directory.members()}[child]
+    other = run_directory.Member(child, found.start + 1, found.run, found.name, found.state)
     assert other.end(1.0), "that one is gone"
-    assert members.state_of(child) == "S"
+    assert run_directory.state_of(child) == "S"
     assert found.end(1.0)
-    assert members.state_of(child) == "Z"
+    assert run_directory.state_of(child) == "Z"

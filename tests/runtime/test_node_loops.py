@@ -31,10 +31,10 @@ from aftbed.inject.channel import ChannelFault, Disturbance
 from aftbed.inject.value import ValueFlip, ValuePlace
 from aftbed.runtime import control
 from aftbed.runtime.node import Node
-from aftbed.runtime.unix import packets
+from aftbed.runtime.unix import transport
 from aftbed.runtime.unix.journal_files import Journal
-from aftbed.runtime.unix.line import Line, decode_order, decode_report
-from aftbed.runtime.unix.node_io import NUDGE, UnixIO, UnixNode
+from aftbed.runtime.unix.node_io import UnixIO, UnixNode
+from aftbed.runtime.unix.transport import NUDGE, Line, decode_order, decode_report
 
 FLIP: Final = model.ArmedFault(7, "brick", 1, ValueFlip(ValuePlace.RESULT, Bit(0)), False)
 OMISSION: Final = model.ArmedFault(8, "brick", 1, ChannelFault(Disturbance.OMISSION, "out"), False)
@@ -135,7 +135,7 @@ class Harness:
         """What came of `mail`: what was sent, noted, reported, and what the brick saw."""
         for writer in self._writers.values():
             for packet in (*mail, LAST):
-                packets.put(writer.fileno(), packet)
+                transport.put(writer.fileno(), packet)
         with pytest.raises(Done):
             while True:
                 loop(self.io)

@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 
 from aftbed.core.errors import PeerError
 from aftbed.core.messages import PACKET_BYTES_MAX
-from aftbed.runtime.unix import packets
-from aftbed.runtime.unix.node_io import NUDGE
-from aftbed.runtime.unix.packets import ANNOUNCED, READ_BYTES_MAX, put, take
+from aftbed.runtime.unix import transport
+from aftbed.runtime.unix.transport import ANNOUNCED, NUDGE, READ_BYTES_MAX, put, take
 
 Pair = tuple[socket.socket, socket.socket]
 
@@ -76,7 +75,7 @@ def test_a_descriptor_that_is_no_file_is_refused_and_closed(pair: Pair) -> None:
     with pytest.raises(PeerError, match="not a memfd"):
         take(sink.fileno())
     with open(os.memfd_create("large"), "wb") as file:
-        file.truncate(packets.STATE_BYTES_MAX + 1)
+        file.truncate(transport.STATE_BYTES_MAX + 1)
         socket.send_fds(source, [ANNOUNCED], [file.fileno()])
         with pytest.raises(PeerError, match="at most 67108864 are allowed"):
             take(sink.fileno())

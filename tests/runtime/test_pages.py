@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from aftbed.runtime.unix.pages import PAGE, Area, own, written_by
+from aftbed.runtime.unix.prefault import PAGE, Area, own, written_by
 
 PAGES = 16
 

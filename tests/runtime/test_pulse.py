@@ -14,9 +14,9 @@ from aftbed.core.brick import Brick, Effect
 from aftbed.core.messages import AnyMessage
 from aftbed.runtime.node import Node
 from aftbed.runtime.unix.journal_files import Header, Journal
-from aftbed.runtime.unix.line import Line, decode_order
 from aftbed.runtime.unix.linux import set_timeouts
 from aftbed.runtime.unix.node_io import UnixIO
+from aftbed.runtime.unix.transport import Line, decode_order
 
 SECONDS_MAX: Final = 5.0
 BEATS: Final = 4

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from aftbed.runtime.unix.pages import PAGE, written_by
+from aftbed.runtime.unix.prefault import PAGE, written_by
 
 SCRIPT = """
 import resource

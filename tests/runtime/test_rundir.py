@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from aftbed.core.errors import ConfigError, HarnessError
-from aftbed.runtime.unix import rundir
+from aftbed.runtime.unix import run_directory
 from aftbed.runtime.unix.launch import launch, options_for
 from aftbed.runtime.unix.options import LoadRun
 
@@ -31,9 +31,9 @@ def listeners() -> Iterator[list[socket.socket]]:
 
 def alive(listeners: list[socket.socket]) -> Path:
     """A run whose supervisor listens."""
-    private = rundir.create()
+    private = run_directory.create()
     sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    sock.bind(str(private / rundir.SOCKET_NAME))
+    sock.bind(str(private / run_directory.SOCKET_NAME))
     sock.listen()
     listeners.append(sock)
     return private
@@ -44,21 +44,21 @@ def mode(path: Path) -> int:
 
 
 def test_a_runs_directory_is_private(runtime: Path) -> None:
-    private = rundir.create()
-    assert private.parent == runtime == rundir.root()
+    private = run_directory.create()
+    assert private.parent == runtime == run_directory.root()
     assert mode(private) == mode(runtime) == 0o700
 
 
 def test_each_run_has_its_own(runtime: Path) -> None:
-    assert len({rundir.create() for _ in range(20)}) == 20
+    assert len({run_directory.create() for _ in range(20)}) == 20
 
 
 def test_a_run_that_has_just_taken_the_place_is_left_alone(runtime: Path) -> None:
     """Two commands that drew the same name: one of them says so, and removes nothing of the other's."""
     options, _ = options_for(ftm="none", placement="single", work=LoadRun(1, 0.0))
     taken = Path(options.private)
-    rundir.make(taken)
-    rundir._owned.pop(taken)  # as if by another process
+    run_directory.make(taken)
+    run_directory._owned.pop(taken)  # as if by another process
     with pytest.raises(HarnessError, match=f"{taken}: cannot be made: File exists; start the run again"):
         launch(options, None)
     assert taken.is_dir()
@@ -73,7 +73,7 @@ def test_without_a_runtime_directory_it_lies_under_tmp(
             monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
         else:
             monkeypatch.setenv("XDG_RUNTIME_DIR", missing)
-        assert rundir.root().parent == tmp_path and rundir.root().name.startswith("aftbed-")
+        assert run_directory.root().parent == tmp_path and run_directory.root().name.startswith("aftbed-")
 
 
 @pytest.mark.parametrize("wide", [0o755, 0o770, 0o701, 0o777])
@@ -83,45 +83,45 @@ def test_a_directory_that_others_can_enter_is_refused(runtime: Path, wide: int) 
     with pytest.raises(
         HarnessError, match=re.escape(f"{runtime}: must be a directory of this user alone (mode 0700)")
     ):
-        rundir.create()
+        run_directory.create()
 
 
 def test_a_directory_of_another_user_is_refused(runtime: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    another = rundir.root().stat().st_uid + 1
+    another = run_directory.root().stat().st_uid + 1
     monkeypatch.setattr("os.getuid", lambda: another)
     with pytest.raises(HarnessError, match="must be a directory of this user alone"):
-        rundir.root()
+        run_directory.root()
 
 
 def test_a_file_in_its_place_is_refused(runtime: Path) -> None:
     runtime.write_text("")
     with pytest.raises(HarnessError, match="must be a directory of this user alone"):
-        rundir.root()
+        run_directory.root()
 
 
 def test_a_link_to_a_directory_is_refused(runtime: Path, tmp_path: Path) -> None:
     (tmp_path / "elsewhere").mkdir(mode=0o700)
     runtime.symlink_to(tmp_path / "elsewhere")
     with pytest.raises(HarnessError, match="must be a directory of this user alone"):
-        rundir.root()
+        run_directory.root()
 
 
 # -- the record
 
 
 def test_without_a_wish_the_record_goes_with_the_run(runtime: Path) -> None:
-    private = rundir.create()
-    record = rundir.record_directory(private / "record")
+    private = run_directory.create()
+    record = run_directory.record_directory(private / "record")
     assert record == private / "record" and (record / "journal").is_dir()
-    rundir.remove(private)
+    run_directory.remove(private)
     assert not private.exists() and runtime.exists()
 
 
 def test_a_wished_record_stays(runtime: Path, tmp_path: Path) -> None:
-    private = rundir.create()
-    record = rundir.record_directory(tmp_path / "new" / "record")
+    private = run_directory.create()
+    record = run_directory.record_directory(tmp_path / "new" / "record")
     assert record == tmp_path / "new" / "record" and (record / "journal").is_dir()
-    rundir.remove(private)
+    run_directory.remove(private)
     assert record.exists()
 
 
@@ -130,16 +130,16 @@ def test_a_record_directory_that_exists_is_refused(runtime: Path, tmp_path: Path
     Path(wanted).mkdir()
     message = re.escape(f"--record {wanted}: exists already; name a directory that does not")
     with pytest.raises(ConfigError, match=message):
-        rundir.record_directory(Path(wanted))
+        run_directory.record_directory(Path(wanted))
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match="exists already"):
-        rundir.record_directory(tmp_path / "file")
+        run_directory.record_directory(tmp_path / "file")
 
 
 def test_a_record_directory_that_cannot_be_made_is_refused(runtime: Path, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match=r"--record .*/file/record: cannot be made: Not a directory"):
-        rundir.record_directory(tmp_path / "file" / "record")
+        run_directory.record_directory(tmp_path / "file" / "record")
 
 
 # -- finding runs
@@ -147,49 +147,49 @@ def test_a_record_directory_that_cannot_be_made_is_refused(runtime: Path, tmp_pa
 
 def test_the_only_run_is_found_by_itself(runtime: Path, listeners: list[socket.socket]) -> None:
     private = alive(listeners)
-    rundir.create()  # a run whose supervisor is gone: nobody listens
-    assert rundir.live() == [private.name]
-    assert rundir.find(None) == rundir.find(private.name) == private
+    run_directory.create()  # a run whose supervisor is gone: nobody listens
+    assert run_directory.live() == [private.name]
+    assert run_directory.find(None) == run_directory.find(private.name) == private
 
 
 def test_no_run_is_alive(runtime: Path) -> None:
     with pytest.raises(ConfigError, match="no run is alive; start one with `aftbed run`"):
-        rundir.find(None)
+        run_directory.find(None)
     with pytest.raises(ConfigError, match=r"--run abc: no such run is alive \(alive: none\)"):
-        rundir.find("abc")
+        run_directory.find("abc")
 
 
 def test_several_runs_are_alive(runtime: Path, listeners: list[socket.socket]) -> None:
     names = {alive(listeners).name, alive(listeners).name}
     with pytest.raises(ConfigError, match=r"2 runs are alive: name one with --run \(alive: ") as caught:
-        rundir.find(None)
+        run_directory.find(None)
     assert all(name in str(caught.value) for name in names)
     with pytest.raises(ConfigError, match="--run abc: no such run is alive") as caught:
-        rundir.find("abc")
+        run_directory.find("abc")
     assert all(name in str(caught.value) for name in names)
 
 
 def test_a_dead_run_is_no_run(runtime: Path, listeners: list[socket.socket]) -> None:
     private = alive(listeners)
     listeners[0].close()
-    assert (private / rundir.SOCKET_NAME).exists() and rundir.live() == []
+    assert (private / run_directory.SOCKET_NAME).exists() and run_directory.live() == []
     with pytest.raises(OSError, match="refused"):
-        rundir.connect(private)
+        run_directory.connect(private)
 
 
 # -- whose it is
 
 
 def test_a_run_has_an_owner_until_it_is_removed(runtime: Path) -> None:
-    private = rundir.create()
-    assert rundir.owned(private)
-    rundir.remove(private)
-    assert not rundir.owned(private)
+    private = run_directory.create()
+    assert run_directory.owned(private)
+    run_directory.remove(private)
+    assert not run_directory.owned(private)
 
 
 def test_a_child_of_its_owner_does_not_own_it(runtime: Path) -> None:
     """Else a run would seem alive as long as any other run of the same command."""
-    private = rundir.create()
+    private = run_directory.create()
     end, life = os.pipe()
     told, telling = os.pipe()
     child = os.fork()
@@ -200,8 +200,8 @@ def test_a_child_of_its_owner_does_not_own_it(runtime: Path) -> None:
         os._exit(0)
     try:
         assert os.read(told, 1) == b"!"
-        os.close(rundir._owned.pop(private))  # as at the owner's death
-        assert not rundir.owned(private)
+        os.close(run_directory._owned.pop(private))  # as at the owner's death
+        assert not run_directory.owned(private)
     finally:
         for descriptor in (life, end, told, telling):
             os.close(descriptor)

@@ -14,13 +14,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from aftbed.core.errors import StepFailed
-from aftbed.runtime.unix import members, undo
-from aftbed.runtime.unix.undo import LATE_NS_MAX, Book, Ending, Ledger, Stopped, Undone
+from aftbed.runtime.unix import cleanup, run_directory
+from aftbed.runtime.unix.cleanup import LATE_NS_MAX, Book, Ending, Ledger, Stopped, Undone
 
 MS = 1_000_000
 
 
-def book_of(*entries: undo.Entry) -> Book:
+def book_of(*entries: cleanup.Entry) -> Book:
     book = Book(Path("nowhere"))
     for entry in entries:
         book.take(msgspec.json.encode(entry))
@@ -45,7 +45,7 @@ def test_what_was_undone_is_not_due(tmp_path: Path, waker: int) -> None:
     ledger, book = Ledger(tmp_path, waker), Book(tmp_path)
     book.read()
     assert book.open == {}, "nothing has been written yet"
-    me, start = os.getpid(), members.started(os.getpid())
+    me, start = os.getpid(), run_directory.started(os.getpid())
     before_ns = time.monotonic_ns()
     ledger.ahead("a/server", me, 50)
     assert os.eventfd_read(waker) == 1, "the warden is woken"
@@ -58,7 +58,7 @@ def test_what_was_undone_is_not_due(tmp_path: Path, waker: int) -> None:
 
 
 def test_the_later_of_two_ends_counts() -> None:
-    def due(*entries: undo.Entry) -> list[int]:
+    def due(*entries: cleanup.Entry) -> list[int]:
         return [entry.due_ns // MS for entry in book_of(*entries).open.values()]
 
     assert due(stopped(100), stopped(30)) == due(stopped(30), stopped(100)) == [100]
@@ -89,7 +89,7 @@ def test_what_lasts_as_long_as_the_run_wakes_nobody() -> None:
 def test_a_torn_line_is_read_when_it_is_whole(tmp_path: Path) -> None:
     line = msgspec.json.encode(stopped(100)) + b"\n"
     book = Book(tmp_path)
-    with open(tmp_path / undo.LEDGER_NAME, "ab", buffering=0) as file:
+    with open(tmp_path / cleanup.LEDGER_NAME, "ab", buffering=0) as file:
         file.write(line[:20])
         book.read()
         assert book.open == {}
@@ -136,13 +136,13 @@ def victim() -> Iterator[Victim]:
 
     def start(run: Path | None) -> Stopped:
         words = [sys.executable, "-c", "print(flush=True); input()"]
-        environment = os.environ | ({members.VARIABLE: str(run)} if run else {})
+        environment = os.environ | ({run_directory.VARIABLE: str(run)} if run else {})
         process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment)
         started.append(process)
         assert process.stdout is not None and process.stdout.readline() == b"\n"
         os.kill(process.pid, signal.SIGSTOP)
         os.waitid(os.P_PID, process.pid, os.WSTOPPED)
-        return Stopped("a/server", process.pid, members.started(process.pid), 1)
+        return Stopped("a/server", process.pid, run_directory.started(process.pid), 1)
 
     yield start
     for process in started:
@@ -153,43 +153,43 @@ def victim() -> Iterator[Victim]:
 @pytest.mark.process
 def test_a_stopped_process_of_the_run_goes_on(tmp_path: Path, victim: Victim) -> None:
     found = victim(tmp_path)
-    assert undo.thaw(found, tmp_path) is Ending.THAWED
-    assert members.state_of(found.pid) != "T"
-    assert undo.thaw(found, tmp_path) is Ending.RAN
+    assert cleanup.thaw(found, tmp_path) is Ending.THAWED
+    assert run_directory.state_of(found.pid) != "T"
+    assert cleanup.thaw(found, tmp_path) is Ending.RAN
 
 
 @pytest.mark.process
 def test_a_process_of_another_run_or_of_none_is_not_touched(tmp_path: Path, victim: Victim) -> None:
     for found in (victim(tmp_path / "another"), victim(None)):
-        assert undo.thaw(found, tmp_path) is Ending.GONE
-        undo.kill_open(book_of(found), tmp_path)
-        assert members.state_of(found.pid) == "T"
+        assert cleanup.thaw(found, tmp_path) is Ending.GONE
+        cleanup.kill_open(book_of(found), tmp_path)
+        assert run_directory.state_of(found.pid) == "T"
 
 
 @pytest.mark.process
 def test_a_process_that_got_the_pid_later_is_not_touched(tmp_path: Path, victim: Victim) -> None:
     found = victim(tmp_path)
     earlier = msgspec.structs.replace(found, start=found.start - 1)
-    assert undo.thaw(earlier, tmp_path) is Ending.GONE
-    undo.kill_open(book_of(earlier), tmp_path)
-    assert members.state_of(found.pid) == "T"
+    assert cleanup.thaw(earlier, tmp_path) is Ending.GONE
+    cleanup.kill_open(book_of(earlier), tmp_path)
+    assert run_directory.state_of(found.pid) == "T"
 
 
 @pytest.mark.process
 def test_what_is_overdue_is_undone_once_and_told(tmp_path: Path, victim: Victim, waker: int) -> None:
     found = victim(tmp_path)
     book = book_of(found)
-    told = list(undo.undo_overdue(book, Ledger(tmp_path, waker, "warden"), tmp_path))
+    told = list(cleanup.undo_overdue(book, Ledger(tmp_path, waker, "warden"), tmp_path))
     assert len(told) == 1 and told[0].startswith(f"a/server ({found.pid}), stopped ")
     assert told[0].endswith(" ms over its time: thawed")
     assert book.open == {}
-    line = (tmp_path / undo.LEDGER_NAME).read_bytes()
-    assert undo._decode(line) == Undone(found.pid, found.start, "warden")
+    line = (tmp_path / cleanup.LEDGER_NAME).read_bytes()
+    assert cleanup._decode(line) == Undone(found.pid, found.start, "warden")
 
 
 @pytest.mark.process
 def test_what_is_stopped_for_good_ends_with_its_run(tmp_path: Path, victim: Victim) -> None:
     found = victim(tmp_path)
-    undo.kill_open(book_of(found), tmp_path)
+    cleanup.kill_open(book_of(found), tmp_path)
     ending = os.waitid(os.P_PID, found.pid, os.WEXITED | os.WNOWAIT)
     assert ending is not None and ending.si_status == signal.SIGKILL

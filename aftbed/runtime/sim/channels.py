@@ -1,4 +1,4 @@
-"""Channels in virtual time, with the semantics of those of sockets (see `runtime.unix.channels`).
+"""Channels in virtual time, with the semantics of those of sockets (see `runtime.unix.transport`).
 
 Order is kept; what is queued survives both nodes; a fence lets what was sent through and then ends; a node
 that writes behind a fence, or where no node will ever read, dies (EPIPE); a full channel holds its writer up.

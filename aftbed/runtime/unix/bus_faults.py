@@ -5,7 +5,6 @@ The hub also passes on the conditions of the car at which other faults begin: th
 
 import contextlib
 from collections.abc import Callable, Generator
-from typing import Final
 
 import msgspec
 
@@ -18,14 +17,6 @@ from aftbed.runtime.interface import Met
 from aftbed.runtime.jobs import Key, Wait
 from aftbed.runtime.unix.process_pool import Nursery, Process
 from aftbed.vehicle.condition import Condition
-
-HUB: Final = "hub"
-DISTURBED: Final = "disturbed"  # from the hub: that fault is armed
-STRUCK: Final = "struck"  # from the hub: what has become of these faults
-ASKED: Final = "struck.all"  # from the hub: of all faults, as the answer to `ask`
-WATCHED: Final = "watched"  # from the hub: that condition is watched
-MET: Final = "met"  # from the hub: that condition holds
-KINDS: Final = (DISTURBED, STRUCK, ASKED, WATCHED, MET)
 
 Steps = Generator[Wait, dict[Key, bytes], None]
 
@@ -55,7 +46,7 @@ class BusFaults:
             raise StepFailed(f"{fault}: its names were not resolved")
         self._faults[number] = fault
         self._nursery.order(self._hub, control.DisturbBus(number, fault, draw))
-        yield Wait(frozenset({(DISTURBED, HUB, number)}), frozenset({HUB}))
+        yield Wait(frozenset({(control.BUS_FAULT_ARMED, control.HUB, number)}), frozenset({control.HUB}))
 
     def watch(self, number: int, condition: Condition, met: Callable[[Met], None]) -> Steps:
         """Return when the car watches for it. Raises StepFailed."""
@@ -63,7 +54,7 @@ class BusFaults:
             raise StepFailed(f"when {condition}: this run has no car")
         self._met[number] = met
         self._nursery.order(self._hub, control.WatchCar(number, condition))
-        yield Wait(frozenset({(WATCHED, HUB, number)}), frozenset({HUB}))
+        yield Wait(frozenset({(control.CONDITION_WATCHED, control.HUB, number)}), frozenset({control.HUB}))
 
     def _is_met(self, number: int, t_us: int, since_ns: int) -> None:
         hub, met = self._hub, self._met.pop(number, None)
@@ -75,14 +66,14 @@ class BusFaults:
         if self._faults and self._hub is not None and self._hub.alive:
             with contextlib.suppress(StepFailed):  # then what it has said before has to do
                 self._nursery.order(self._hub, control.Stats(control.UNANSWERED))
-                yield Wait(frozenset({(ASKED, HUB, 0)}), frozenset({HUB}))
+                yield Wait(frozenset({(control.BUS_FAULTS_ASKED, control.HUB, 0)}), frozenset({control.HUB}))
 
     def on_report(self, kind: str, data: bytes) -> None:
         """What the hub says."""
-        if kind in (DISTURBED, WATCHED):
-            self._settle((kind, HUB, int(data)))
+        if kind in (control.BUS_FAULT_ARMED, control.CONDITION_WATCHED):
+            self._settle((kind, control.HUB, int(data)))
             return
-        if kind == MET:
+        if kind == control.CONDITION_MET:
             self._is_met(*msgspec.msgpack.decode(data, type=tuple[int, int, int]))
             return
         for struck in msgspec.msgpack.decode(data, type=list[BusReport]):
@@ -91,8 +82,8 @@ class BusFaults:
             if struck.receipt.state is not state:
                 found = struck.receipt
                 self._tell("fault", f"{self._faults[struck.number]}: {found.state.value}, {found.detail}")
-        if kind == ASKED:
-            self._settle((ASKED, HUB, 0))
+        if kind == control.BUS_FAULTS_ASKED:
+            self._settle((control.BUS_FAULTS_ASKED, control.HUB, 0))
 
     def struck(self, number: int) -> BusReport | None:
         """The latest that is known of a fault."""

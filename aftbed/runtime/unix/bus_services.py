@@ -12,9 +12,8 @@ from aftbed.core.errors import HarnessError
 from aftbed.inject.bus import BusReport
 from aftbed.inject.receipts import ReceiptState
 from aftbed.runtime import control
-from aftbed.runtime.unix import bus_faults
-from aftbed.runtime.unix.line import Line
 from aftbed.runtime.unix.options import PlayerOptions, VehicleOptions
+from aftbed.runtime.unix.transport import Line
 from aftbed.vehicle.can.hub import Hub, HubOptions
 from aftbed.vehicle.can.hub import serve as serve_hub
 
@@ -49,14 +48,14 @@ class _Desk:
         order = got[0]
         if isinstance(order, control.DisturbBus):
             self._disturb(hub, order)
-            self._line.send(control.Report(bus_faults.DISTURBED, str(order.token).encode()))
+            self._line.send(control.Report(control.BUS_FAULT_ARMED, str(order.token).encode()))
         elif isinstance(order, control.WatchCar):
             hub.watch(order.token, order.condition)
-            self._line.send(control.Report(bus_faults.WATCHED, str(order.token).encode()))
+            self._line.send(control.Report(control.CONDITION_WATCHED, str(order.token).encode()))
         elif isinstance(order, control.Ack):
             hub.go_on(order.token)
         elif isinstance(order, control.Stats):
-            self._line.send(control.Report(bus_faults.ASKED, msgspec.msgpack.encode(self._reports())))
+            self._line.send(control.Report(control.BUS_FAULTS_ASKED, msgspec.msgpack.encode(self._reports())))
         return True
 
     def faults_acted(self) -> None:
@@ -66,12 +65,12 @@ class _Desk:
         news = [one for one in found if self._reported.get(one.number, armed) is not one.receipt.state]
         if news:
             self._reported |= {one.number: one.receipt.state for one in news}
-            self._line.send(control.Report(bus_faults.STRUCK, msgspec.msgpack.encode(news)))
+            self._line.send(control.Report(control.BUS_FAULTS_CHANGED, msgspec.msgpack.encode(news)))
 
     def met(self, fault_number: int, t_us: int, since_ns: int) -> None:
         """To the supervisor."""
         self._line.send(
-            control.Report(bus_faults.MET, msgspec.msgpack.encode((fault_number, t_us, since_ns)))
+            control.Report(control.CONDITION_MET, msgspec.msgpack.encode((fault_number, t_us, since_ns)))
         )
 
     def _disturb(self, hub: Hub, order: control.DisturbBus) -> None:

@@ -12,9 +12,9 @@ import msgspec
 from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.core.messages import Goal
 from aftbed.inject.model import Fault
-from aftbed.runtime.unix import rundir
-from aftbed.runtime.unix.line import Line
+from aftbed.runtime.unix import run_directory
 from aftbed.runtime.unix.resources import Row
+from aftbed.runtime.unix.transport import Line
 
 ANSWER_SECONDS_MAX: Final = 2.0
 ADAPT_SECONDS_MAX: Final = 15.0  # to prepare, commit, observe and finish, on a busy machine
@@ -86,7 +86,7 @@ def ask(private: Path, question: Question, seconds: float = ANSWER_SECONDS_MAX) 
 def send(private: Path, question: Question) -> Waiting:
     """Ask; the answer is for `receive`. Raises ConfigError where nobody listens."""
     try:
-        line = Line(rundir.connect(private), decode_answer)
+        line = Line(run_directory.connect(private), decode_answer)
     except OSError as error:
         raise ConfigError(f"run {private.name} does not answer: {error.strerror}") from None
     try:

@@ -20,11 +20,11 @@ from aftbed.runtime.adaptations import Adaptations, Outcome
 from aftbed.runtime.deployment import Deployment
 from aftbed.runtime.fault_controller import FaultController
 from aftbed.runtime.interface import ProcessKind
-from aftbed.runtime.unix import control_client, rundir
+from aftbed.runtime.unix import control_client, run_directory
 from aftbed.runtime.unix.event_loop import Loop
-from aftbed.runtime.unix.line import Line
 from aftbed.runtime.unix.options import RunOptions
 from aftbed.runtime.unix.resources import Row
+from aftbed.runtime.unix.transport import Line
 from aftbed.runtime.unix.workload import Work
 
 BESIDE: Final = (ProcessKind.ZYGOTE, ProcessKind.SPARE, ProcessKind.SERVICE, ProcessKind.STAGED)
@@ -62,7 +62,7 @@ class Questions:
     def listen(self) -> None:
         """Open the socket; from here on the run is found by other commands."""
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
-        self._listener.bind(str(Path(self._options.private) / rundir.SOCKET_NAME))
+        self._listener.bind(str(Path(self._options.private) / run_directory.SOCKET_NAME))
         self._listener.listen(QUESTIONS_MAX)
         self._loop.read(self._listener.fileno(), self._accept)
 

@@ -24,7 +24,7 @@ from typing import Final, Literal
 import msgspec
 
 from aftbed.core.errors import HarnessError
-from aftbed.runtime.unix import rundir
+from aftbed.runtime.unix import run_directory
 from aftbed.runtime.unix.death_notice import SYS_FUTEX_WAITV
 from aftbed.runtime.unix.process_memory import YAMA, try_on_a_child
 
@@ -209,11 +209,11 @@ def place() -> list[Check]:
     """The directory of all runs."""
     serves = "control sockets and records of runs, closed to others"
     try:
-        root = rundir.root()
+        root = run_directory.root()
     except (HarnessError, OSError) as error:
         remedy = "remove it, or set XDG_RUNTIME_DIR or TMPDIR to a directory of yours"
         return [Check("run directory", "missing", str(error), serves, remedy)]
-    longest = len(os.fsencode(root / ("0" * 2 * rundir.ID_BYTES) / rundir.SOCKET_NAME))
+    longest = len(os.fsencode(root / ("0" * 2 * run_directory.ID_BYTES) / run_directory.SOCKET_NAME))
     if longest > SOCKET_PATH_MAX:
         found = f"{root}: {longest - SOCKET_PATH_MAX} bytes too long for a socket's path"
         remedy = "set XDG_RUNTIME_DIR or TMPDIR to a shorter path"

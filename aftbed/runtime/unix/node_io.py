@@ -46,23 +46,19 @@ from aftbed.inject.slow import SLOW_MS_MAX
 from aftbed.runtime import control
 from aftbed.runtime import node as node_module
 from aftbed.runtime.node import HostedBrick, Node, NodeIO, Recorder
-from aftbed.runtime.unix import packets, shared_memory
+from aftbed.runtime.unix import shared_memory, transport
 from aftbed.runtime.unix.death_notice import Held
 from aftbed.runtime.unix.journal_files import Journal
-from aftbed.runtime.unix.line import Line
-from aftbed.runtime.unix.packets import READ_BYTES_MAX
+from aftbed.runtime.unix.transport import NUDGE, PULSE_SECONDS, READ_BYTES_MAX, WRITE_SECONDS_MAX, Line
 
-PULSE_SECONDS: Final = 0.02
-WRITE_SECONDS_MAX: Final = 2.0  # a node that cannot write for so long takes itself for fenced
 APPLY_NS_MAX: Final = 5_000_000_000  # the executive has so long to apply a fault
 PAUSE_NS_MAX: Final = round(SLOW_MS_MAX * 1e6)  # of one step; the rest is waited behind the next one
 CREDIT_NS_MAX: Final = 1_000_000  # of a sleep that was too long: more is the machine's doing
-NUDGE: Final = b"\0"
 WAITING_FILES: Final = (  # a node that is interrupted in one of these is in no brick
     __file__,
     node_module.__file__,
     Line.recv.__code__.co_filename,
-    packets.__file__,
+    transport.__file__,
 )
 EXIT_FENCED: Final = 3
 EXIT_ASSERT: Final = 70
@@ -70,7 +66,7 @@ EXIT_DETECTED: Final = 71  # a detected stop
 
 _now, _read, _write = time.monotonic_ns, os.read, os.write
 _encode, _decode = messages.encode_unchecked, messages.decode_unchecked
-_put, _LARGE = packets.put, messages.PACKET_BYTES_MAX
+_put, _LARGE = transport.put, messages.PACKET_BYTES_MAX
 _pack = RECORD.pack_into
 RECORD_BYTES: Final = RECORD.size
 
@@ -328,7 +324,7 @@ class UnixIO(NodeIO[Inlet, int]):
             self.serve_orders()
         if raw == b"":
             self._handle_end(inlet)
-        elif raw == packets.ANNOUNCED:
+        elif raw == transport.ANNOUNCED:
             self._announced = inlet
         elif raw != NUDGE:
             try:
@@ -341,7 +337,7 @@ class UnixIO(NodeIO[Inlet, int]):
     def _take_announced(self, inlet: Inlet) -> None:
         """Read the large packet that is next, or what has come in between."""
         try:
-            raw = packets.take(inlet.fd)
+            raw = transport.take(inlet.fd)
         except PeerError:
             self._announced = None
             self._refuse()

@@ -21,9 +21,9 @@ from aftbed.runtime.unix import linux
 from aftbed.runtime.unix.death_notice import Held
 from aftbed.runtime.unix.devices import LoadOptions, ProcessSenses, make_load
 from aftbed.runtime.unix.journal_files import Journal
-from aftbed.runtime.unix.line import Line
-from aftbed.runtime.unix.node_io import EXIT_ASSERT, PULSE_SECONDS, UnixIO, UnixNode
+from aftbed.runtime.unix.node_io import EXIT_ASSERT, UnixIO, UnixNode
 from aftbed.runtime.unix.options import GatewayOptions
+from aftbed.runtime.unix.transport import PULSE_SECONDS, Line
 from aftbed.vehicle.aeb.function import default_application, sample_requests
 
 LOAD_REQUESTS: Final = 512

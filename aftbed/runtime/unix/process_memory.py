@@ -8,12 +8,12 @@ read back is what the process wrote.
 The consequence can be anything: a crash, a wrong value, a reference count that matters in an hour, or
 nothing. There is no undo, and none is needed: the bit goes with the process.
 
-*The process* is verified as in `runtime.unix.undo`: while a pidfd is open on it, its mark shows that it
+*The process* is verified as in `runtime.unix.cleanup`: while a pidfd is open on it, its mark shows that it
 belongs to this run; so the pid cannot mean another process.
 
 Limits: addresses differ from run to run (ASLR), so a draw repeats the choice and not the byte. The kernel
 asks for the rights of ptrace(2) (PTRACE_MODE_ATTACH): under Yama's `ptrace_scope` 0 and 1 a supervisor has
-them over its nodes; under 2 only with CAP_SYS_PTRACE; under 3 nobody has.
+them over its nodes; under 2 only with CAP_SYS_PTRACE; under 3 no process has.
 """
 
 import ctypes
@@ -26,7 +26,7 @@ from typing import Final, NamedTuple
 
 from aftbed.core.errors import HarnessError, StepFailed
 from aftbed.inject.bit_patterns import BYTE_BITS, drawn
-from aftbed.runtime.unix import members
+from aftbed.runtime.unix import run_directory
 
 YAMA: Final = Path("/proc/sys/kernel/yama/ptrace_scope")
 HEAP: Final = "[heap]"
@@ -69,7 +69,7 @@ def flip(owner: Owner, bit: int | None, address: int | None, draw: int) -> str:
     except OSError:
         raise StepFailed(f"{owner.name} (pid {owner.pid}) is gone") from None
     try:
-        if members.run_of(owner.pid) != owner.run:
+        if run_directory.run_of(owner.pid) != owner.run:
             raise StepFailed(f"{owner.name} (pid {owner.pid}) is no process of this run")
         return _flip(owner, bit, address, draw)
     finally:

@@ -18,12 +18,12 @@ from aftbed.core.errors import StepFailed
 from aftbed.runtime import control, interface
 from aftbed.runtime.interface import ProcessKind
 from aftbed.runtime.jobs import Key, Wait
-from aftbed.runtime.unix import linux, members
+from aftbed.runtime.unix import linux, run_directory
+from aftbed.runtime.unix.cleanup import Ledger
 from aftbed.runtime.unix.event_loop import Loop
 from aftbed.runtime.unix.journal_files import Header
-from aftbed.runtime.unix.line import Line, decode_report
 from aftbed.runtime.unix.spawn import Started, start_zygote
-from aftbed.runtime.unix.undo import Ledger
+from aftbed.runtime.unix.transport import Line, decode_report
 
 REAP_SECONDS: Final = 0.01
 SPARE_SECONDS_MAX: Final = 5.0  # a zygote imports first
@@ -65,7 +65,7 @@ class Process:
         return self._signal(signal.SIGKILL)
 
     def freeze(self, for_ms: int = 0) -> bool:
-        """SIGSTOP, once its undo is written (`runtime.unix.undo`); False if it is gone.
+        """SIGSTOP, once its undo is written (`runtime.unix.cleanup`); False if it is gone.
 
         Raises StepFailed, having stopped nothing, if it cannot be written.
         """
@@ -77,7 +77,7 @@ class Process:
     def thaw(self) -> bool:
         """SIGCONT; False if it is gone. One that is not seen to go on is left to the warden."""
         sent = self._signal(signal.SIGCONT)
-        if sent and members.state_of(self.pid) != "T":
+        if sent and run_directory.state_of(self.pid) != "T":
             self._ledger.undone(self.pid)
         return sent
 

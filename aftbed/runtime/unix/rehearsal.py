@@ -37,9 +37,9 @@ from aftbed.runtime import control
 from aftbed.runtime.node import MemoryIO, Node, nowhere
 from aftbed.runtime.unix import linux
 from aftbed.runtime.unix.journal_files import Journal
-from aftbed.runtime.unix.line import Line, decode_order, decode_report
-from aftbed.runtime.unix.node_io import NUDGE, UnixIO
-from aftbed.runtime.unix.pages import Area, written_by
+from aftbed.runtime.unix.node_io import UnixIO
+from aftbed.runtime.unix.prefault import Area, written_by
+from aftbed.runtime.unix.transport import NUDGE, Line, decode_order, decode_report
 from aftbed.vehicle.aeb.function import default_application, sample_requests
 
 ROUNDS_WARM: Final = 16

@@ -1,6 +1,5 @@
 """Starting zygotes: the first thing that a supervisor does, before it imports what it needs itself."""
 
-import importlib
 import os
 import site
 import socket
@@ -8,7 +7,6 @@ import sys
 from pathlib import Path
 from typing import Final
 
-from aftbed.runtime.unix.pages import Area
 from aftbed.runtime.zygotes import BUS, LIGHT
 
 ZYGOTE: Final = "aftbed.runtime.unix.zygote"
@@ -30,37 +28,6 @@ def start_zygote(name: str, cpus: list[int]) -> Started:
     """Start the zygote called `name` as a child of this process."""
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     pid = start(theirs.fileno(), os.getpid(), cpus, PRELOADS[name])
-    theirs.close()
-    return pid, ours
-
-
-def warm_up(name: str) -> tuple[Area, ...]:
-    """Import and rehearse what `fork_zygote` hands on: once, in a process that starts many runs.
-
-    Returns where a node will write to.
-    """
-    from aftbed.runtime.unix import rehearsal, supervisor, zygote  # noqa: PLC0415 - for who starts many
-
-    assert supervisor and zygote
-    for module in PRELOADS[name]:
-        importlib.import_module(module)
-    return rehearsal.warm_up()
-
-
-def fork_zygote(cpus: list[int], areas: tuple[Area, ...]) -> Started:
-    """The same out of this process, which has been warmed up: 0.2 s of imports less, for some pages more."""
-    from aftbed.runtime.unix import zygote  # noqa: PLC0415
-
-    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    supervisor = os.getpid()
-    pid = os.fork()
-    if pid == 0:
-        try:
-            os.dup2(theirs.fileno(), CONTROL_FD)
-            os.closerange(CONTROL_FD + 1, 1 << 16)
-            zygote.run(supervisor, cpus, (), areas)
-        finally:
-            os._exit(1)
     theirs.close()
     return pid, ours
 

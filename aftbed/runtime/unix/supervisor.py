@@ -23,14 +23,14 @@ from aftbed.runtime.hosting import hosted, look_at_states
 from aftbed.runtime.interface import ProcessKind
 from aftbed.runtime.jobs import STATS_JOB
 from aftbed.runtime.unix import linux
+from aftbed.runtime.unix.cleanup import Ledger
 from aftbed.runtime.unix.control_server import Questions
 from aftbed.runtime.unix.event_loop import Loop
-from aftbed.runtime.unix.line import Line, decode_order
 from aftbed.runtime.unix.options import COMMAND_GONE, LoadRun, RunOptions
 from aftbed.runtime.unix.process_pool import Nursery, Process
 from aftbed.runtime.unix.spawn import Started
 from aftbed.runtime.unix.support import Support
-from aftbed.runtime.unix.undo import Ledger
+from aftbed.runtime.unix.transport import Line, decode_order
 from aftbed.runtime.unix.workload import Work
 from aftbed.runtime.zygotes import BUS, LIGHT
 

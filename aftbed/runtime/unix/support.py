@@ -16,11 +16,11 @@ from aftbed.runtime.interface import Met
 from aftbed.runtime.interface import Process as AnyProcess
 from aftbed.runtime.unix import process_memory
 from aftbed.runtime.unix.bus_faults import BusFaults
-from aftbed.runtime.unix.channels import Channel
 from aftbed.runtime.unix.event_loop import Loop
 from aftbed.runtime.unix.journal_files import Journal, contents, recorded_requests
 from aftbed.runtime.unix.process_pool import Nursery
 from aftbed.runtime.unix.shared_memory import MemfdMemory
+from aftbed.runtime.unix.transport import Channel
 from aftbed.vehicle.condition import Condition
 
 HISTORY_NAME: Final = "adaptations.jsonl"

@@ -14,7 +14,6 @@ from aftbed.runtime import control
 from aftbed.runtime.deployment import Deployment, Keys
 from aftbed.runtime.interface import ProcessKind
 from aftbed.runtime.jobs import STATS_JOB, Key, Wait
-from aftbed.runtime.unix import bus_faults
 from aftbed.runtime.unix.bus_faults import BusFaults
 from aftbed.runtime.unix.devices import LoadOptions
 from aftbed.runtime.unix.event_loop import Loop
@@ -142,7 +141,7 @@ class Work:
         """What a service says."""
         if kind == "ready":
             self._loop.jobs.settle(("ready", process.name, 0))
-        elif kind in bus_faults.KINDS:
+        elif kind in control.BUS_REPORTS:
             self.bus.on_report(kind, data)
         elif kind == "telemetry":
             self.telemetry = msgspec.msgpack.decode(data)

@@ -15,11 +15,11 @@ import sys
 from typing import NoReturn
 
 from aftbed.runtime import control
-from aftbed.runtime.unix import linux, pages, rehearsal
-from aftbed.runtime.unix.line import Line, decode_order
-from aftbed.runtime.unix.pages import Area
+from aftbed.runtime.unix import linux, prefault, rehearsal
 from aftbed.runtime.unix.part import become
+from aftbed.runtime.unix.prefault import Area
 from aftbed.runtime.unix.spawn import CONTROL_FD
+from aftbed.runtime.unix.transport import Line, decode_order
 
 
 def run(
@@ -27,7 +27,7 @@ def run(
 ) -> NoReturn:
     """Be a zygote, serving `CONTROL_FD`, until it ends.
 
-    `areas`: where a node writes to, if the parent of this process has found it out (`spawn.warm_up`).
+    `areas`: where a node writes to, if the parent of this process has found it out (`launch.warm_up`).
     """
     os.set_inheritable(CONTROL_FD, False)
     os.sched_setaffinity(0, cpus)
@@ -73,7 +73,7 @@ def _wait_for_a_part(supervisor: int, areas: tuple[Area, ...]) -> NoReturn:
     """A spare: adopted, parked, then what it is told to be."""
     linux.die_with(supervisor)
     linux.set_name("aftbed-spare")
-    pages.own(areas)
+    prefault.own(areas)
     line = Line(socket.socket(fileno=CONTROL_FD), decode_order)
     line.send(control.Hello(os.getpid()))
     got = line.recv()

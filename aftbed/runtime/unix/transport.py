@@ -1,0 +1,210 @@
+"""How packets travel between processes of a run: on control lines and on channels.
+
+Both are `AF_UNIX SOCK_SEQPACKET` pairs (unix(7)): order kept, packets whole, a bounded queue in the kernel.
+A packet over the limit travels as a memfd (memfd_create(2)).
+
+A channel is read with read(2), which is fast and drops descriptors. So the writer of a large packet
+*announces* it with a packet of one byte, and the next packet is read with recvmsg(2). The kernel may put a
+nudge between the two, and a writer that found no room announces again: neither does any harm.
+
+The queue of a channel is bounded in bytes, and a memfd is not counted. So the packet that comes with it is
+padded to the largest size: that bounds how many large packets wait in a channel, and blocks a writer that
+is faster than its reader.
+"""
+
+import array
+import contextlib
+import os
+import socket
+import stat
+from collections.abc import Callable
+from typing import Final, Generic, TypeVar
+
+import msgspec
+
+from aftbed.core.errors import PeerError
+from aftbed.core.graph import Link
+from aftbed.core.messages import PACKET_BYTES_MAX, UNREADABLE
+from aftbed.runtime.control import FromNode, ToNode
+from aftbed.runtime.unix.linux import set_timeouts
+
+STATE_BYTES_MAX: Final = 64 << 20
+ANNOUNCED: Final = b"\xc1"  # a byte that MessagePack never uses
+READ_BYTES_MAX: Final = PACKET_BYTES_MAX + 1  # one byte more than is allowed, so that it is noticed
+_WEIGHT: Final = ANNOUNCED * PACKET_BYTES_MAX
+_RIGHTS_BYTES: Final = socket.CMSG_SPACE(4)
+NUDGE: Final = b"\0"
+PULSE_SECONDS: Final = 0.02
+WRITE_SECONDS_MAX: Final = 2.0  # a node that cannot write for so long takes itself for fenced
+
+
+def put(descriptor: int, data: bytes) -> None:
+    """Send `data`, however large. Raises OSError as write(2) does; then all of it has to be sent again."""
+    if len(data) <= PACKET_BYTES_MAX:
+        os.write(descriptor, data)
+        return
+    os.write(descriptor, ANNOUNCED)
+    with _borrowed(descriptor) as sock:
+        send_in_file(sock.socket, data, _WEIGHT)
+
+
+def take(descriptor: int) -> bytes:
+    """The next packet, behind an announcement; one without a memfd is given as it is. Raises PeerError."""
+    with _borrowed(descriptor) as sock:
+        data, ancillary, _, _ = sock.socket.recvmsg(READ_BYTES_MAX, _RIGHTS_BYTES, socket.MSG_CMSG_CLOEXEC)
+    fds = descriptors_in(ancillary)
+    return read_file(fds[0]) if fds else data
+
+
+def send_in_file(sock: socket.socket, data: bytes, beside: bytes = ANNOUNCED) -> None:
+    """`data` as a memfd, in a packet of `beside`. Raises OSError as sendmsg(2) does."""
+    assert len(data) <= STATE_BYTES_MAX, f"{len(data)} bytes"
+    with open(os.memfd_create("aftbed-state"), "wb", buffering=0) as file:
+        left = memoryview(data)
+        while left:
+            left = left[file.write(left) :]
+        sock.sendmsg([beside], [(socket.SOL_SOCKET, socket.SCM_RIGHTS, array.array("i", [file.fileno()]))])
+
+
+def read_file(descriptor: int) -> bytes:
+    """The packet in a memfd, which is closed. Raises PeerError if it is no file or too large."""
+    try:
+        state = os.fstat(descriptor)
+        if not stat.S_ISREG(state.st_mode):
+            raise PeerError("the descriptor of a large packet is not a memfd")
+        if state.st_size > STATE_BYTES_MAX:
+            raise PeerError(f"a packet of {state.st_size} bytes, at most {STATE_BYTES_MAX} are allowed")
+        return os.pread(descriptor, state.st_size, 0)
+    finally:
+        os.close(descriptor)
+
+
+def descriptors_in(ancillary: list[tuple[int, int, bytes]]) -> list[int]:
+    """What came with a packet; ours to close."""
+    fds = array.array("i")
+    for level, kind, payload in ancillary:
+        if (level, kind) == (socket.SOL_SOCKET, socket.SCM_RIGHTS):
+            fds.frombytes(payload[: len(payload) - len(payload) % fds.itemsize])
+    return list(fds)
+
+
+class _borrowed:  # noqa: N801 - a context
+    """A socket out of a descriptor, which is not closed with it."""
+
+    __slots__ = ("socket",)
+
+    def __init__(self, descriptor: int) -> None:
+        self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET, 0, fileno=descriptor)
+
+    def __enter__(self) -> "_borrowed":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.socket.detach()
+
+
+# -- Control lines: one pair between the supervisor and each process; `runtime.control` has the messages.
+
+
+FDS_MAX: Final = 64
+_LINE_RIGHTS_BYTES: Final = socket.CMSG_SPACE(FDS_MAX * 4)
+
+decode_order: Callable[[bytes], ToNode] = msgspec.msgpack.Decoder(ToNode).decode
+decode_report: Callable[[bytes], FromNode] = msgspec.msgpack.Decoder(FromNode).decode
+_encode = msgspec.msgpack.Encoder().encode
+Incoming = TypeVar("Incoming")
+
+
+class Line(Generic[Incoming]):
+    """One end of a control pair. Blocking or not as the socket is."""
+
+    def __init__(self, sock: socket.socket, decode: Callable[[bytes], Incoming]) -> None:
+        self.sock, self._decode = sock, decode
+
+    def fileno(self) -> int:
+        """For polling."""
+        return self.sock.fileno()
+
+    def send(self, message: msgspec.Struct, fds: tuple[int, ...] = ()) -> None:
+        """Send one message and descriptors. Raises OSError as sendmsg(2) does."""
+        data = _encode(message)
+        assert len(fds) <= FDS_MAX, f"{len(fds)} descriptors"
+        if len(data) > PACKET_BYTES_MAX:
+            assert not fds, f"{len(data)} bytes, and descriptors"
+            send_in_file(self.sock, data)
+        else:
+            self._sendmsg(data, fds)
+
+    def _sendmsg(self, data: bytes, fds: tuple[int, ...]) -> None:
+        rights = [(socket.SOL_SOCKET, socket.SCM_RIGHTS, array.array("i", fds))] if fds else []
+        self.sock.sendmsg([data], rights)
+
+    def recv(self) -> tuple[Incoming, list[int]] | None:
+        """The next message with its descriptors; None at the end.
+
+        Raises BlockingIOError where there is none, PeerError on what is not a message (its
+        descriptors are closed).
+        """
+        data, ancillary, flags, _ = self.sock.recvmsg(
+            PACKET_BYTES_MAX, _LINE_RIGHTS_BYTES, socket.MSG_CMSG_CLOEXEC
+        )
+        fds = descriptors_in(ancillary)
+        if not data:
+            for fd in fds:
+                os.close(fd)
+            return None
+        try:
+            if flags & (socket.MSG_TRUNC | socket.MSG_CTRUNC):
+                raise PeerError(f"truncated control message of {len(data)} bytes, {len(fds)} descriptors")
+            if data == ANNOUNCED and len(fds) == 1:
+                data = read_file(fds.pop())
+            return self._decode(data), fds
+        except (*UNREADABLE, PeerError, OSError) as error:
+            for fd in fds:
+                os.close(fd)
+            raise PeerError(f"not a control message ({len(data)} bytes): {error}") from error
+
+    def close(self) -> None:
+        """Close the socket."""
+        with contextlib.suppress(OSError):
+            self.sock.close()
+
+
+# -- Channels outlive nodes: the supervisor owns both ends of each, and hands them out.
+#
+# `fence` shuts the writing end behind all of its descriptors: what was sent stays readable, then the
+# channel ends; a later write gets EPIPE.
+
+
+WRITE_PATIENCE_SECONDS: Final = PULSE_SECONDS
+assert WRITE_PATIENCE_SECONDS < WRITE_SECONDS_MAX
+
+
+class Channel:
+    """Both ends of `link`."""
+
+    def __init__(self, link: Link) -> None:
+        self.link = link
+        self.write, self.read = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        for end in (self.write, self.read):
+            set_timeouts(end, 0.0, WRITE_PATIENCE_SECONDS)
+
+    def fence(self) -> None:
+        """No more mail through this channel."""
+        with contextlib.suppress(OSError):
+            self.write.shutdown(socket.SHUT_WR)
+
+    def refuse(self) -> None:
+        """Nobody will read: a writer that waits for room gets EPIPE."""
+        with contextlib.suppress(OSError):
+            self.read.shutdown(socket.SHUT_RD)
+
+    def nudge(self) -> None:
+        """Wake the reader, so that it looks for control mail. A full queue wakes it just as well."""
+        with contextlib.suppress(OSError):
+            self.write.send(NUDGE, socket.MSG_DONTWAIT)
+
+    def close(self) -> None:
+        """Let go of both ends; nodes keep theirs."""
+        self.write.close()
+        self.read.close()
