@@ -46,18 +46,6 @@ SECOND_US: Final = 1_000_000
 FRAME_BITS: Final = 64
 CRC_BITS: Final = 8  # of E2E profile 11: the first byte
 NTH_MAX: Final = 999_999_999
-VERBS: Final = (
-    "omission",
-    "delay",
-    "duplicate",
-    "reorder",
-    "corrupt",
-    "masquerade",
-    "stuck-counter",
-    "babbling",
-    "bus-off",
-    "partition",
-)
 GRAMMAR: Final = (
     "omission|duplicate|reorder|stuck-counter bus FRAMES, delay bus FRAMES by 40ms,"
     " corrupt bus FRAMES bit K|signal NAME=VALUE [crc good], masquerade bus FRAMES as MESSAGE,"
