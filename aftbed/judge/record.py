@@ -18,8 +18,8 @@ from aftbed.core.script import ScriptKind
 from aftbed.ftm.compose import replication_of
 from aftbed.inject.model import FaultReport
 from aftbed.inject.receipts import ReceiptState
+from aftbed.runtime.deployment import replica_of
 from aftbed.runtime.hosting import Hosted
-from aftbed.runtime.rewiring import replica_of
 from aftbed.runtime.sim.world import Run
 from aftbed.runtime.unix.journal_files import contents
 from aftbed.runtime.unix.options import CarRun, LoadRun, RunOptions, Work

@@ -22,8 +22,8 @@ from aftbed.core.events import Event
 from aftbed.core.history import History
 from aftbed.core.journal import EntryKind
 from aftbed.judge.record import RunRecord
+from aftbed.runtime.deployment import replica_of
 from aftbed.runtime.hosting import digest
-from aftbed.runtime.rewiring import replica_of
 from aftbed.runtime.unix.part import load_module
 from aftbed.vehicle.aeb.function import default_application
 

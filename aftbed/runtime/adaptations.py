@@ -19,10 +19,9 @@ from aftbed.core.graph import Graph
 from aftbed.core.script import Phase, Script, bricks_changed
 from aftbed.runtime import control
 from aftbed.runtime.deployment import Deployment, Keys
-from aftbed.runtime.exchange import Exchange
 from aftbed.runtime.fault_controller import FaultController
 from aftbed.runtime.jobs import Wait
-from aftbed.runtime.verbs import Executor
+from aftbed.runtime.script_executor import Execution, ScriptExecutor
 
 CLIENT: Final = "client"
 ENGINE: Final = "engine"
@@ -80,7 +79,7 @@ class _Current:
         self.ended, self.failure = False, ""
         self.lost = ""  # a replica
         self.spoiled = ""  # why what has been prepared must not be committed
-        self.exchange: Exchange | None = None
+        self.execution: Execution | None = None
 
 
 class Adaptations:
@@ -89,7 +88,7 @@ class Adaptations:
     def __init__(
         self,
         deployment: Deployment,
-        executor: Executor,
+        executor: ScriptExecutor,
         faults: FaultController,
         inform_recovery: Callable[[], None],
     ) -> None:
@@ -208,25 +207,25 @@ class Adaptations:
             return
         if phase is Phase.FINISH and now.lost:
             return  # it was said before the Engine heard of the loss
-        if now.exchange is None and (now.epoch != self._deployment.epoch or self._executor.busy):
+        if now.execution is None and (now.epoch != self._deployment.epoch or self._executor.busy):
             now.spoiled = now.spoiled or "the leader has changed since it was planned"
-        if now.exchange is None and now.spoiled:
+        if now.execution is None and now.spoiled:
             now.phase, now.ended = phase, True
             now.failure = "" if phase is Phase.UNDO else now.spoiled
             self._say(messages.Progress(number, phase, now.failure))
             return
-        if now.exchange is None or now.script is None:
-            now.exchange, now.script = Exchange(self._deployment, todo, self._step), todo
+        if now.execution is None or now.script is None:
+            now.execution, now.script = Execution(self._deployment, todo, self._step), todo
             now.outcome.purpose, now.outcome.ftm = todo.purpose, todo.ftm or self._deployment.graph.ftm
-            now.outcome.bricks_total = max(len(g.bricks) for g in (now.exchange.old, now.exchange.new))
+            now.outcome.bricks_total = max(len(g.bricks) for g in (now.execution.old, now.execution.new))
             self._tell("adapt", f"{number}: {todo.purpose} ({todo.recipe})")
         now.phase, now.ended, now.phase_ns = phase, False, self._loop.now_ns()
-        exchange = now.exchange
+        execution = now.execution
         phases: dict[Phase, Callable[[], Keys]] = {
-            Phase.PREPARE: exchange.prepare,
-            Phase.COMMIT: functools.partial(_spoiled, now.spoiled) if now.spoiled else exchange.commit,
-            Phase.FINISH: exchange.finish,
-            Phase.UNDO: functools.partial(exchange.undo, now.lost),
+            Phase.PREPARE: execution.prepare,
+            Phase.COMMIT: functools.partial(_spoiled, now.spoiled) if now.spoiled else execution.commit,
+            Phase.FINISH: execution.finish,
+            Phase.UNDO: functools.partial(execution.undo, now.lost),
         }
         if phase in (Phase.COMMIT, Phase.UNDO):
             self._executor.held = True
@@ -243,11 +242,11 @@ class Adaptations:
         took_ms = round((self._loop.now_ns() - now.phase_ns) / 1e6, 3)
         now.ended, now.failure = True, failure
         self._tell("adapt.phase", f"{now.phase.value}: {failure or f'{took_ms:.2f} ms'}")
-        assert now.exchange is not None
+        assert now.execution is not None
         if now.phase is Phase.PREPARE:
             now.outcome.prepare_ms = took_ms
         if now.phase is Phase.COMMIT and not failure:
-            closed = now.exchange.opened_ns - now.exchange.closed_ns
+            closed = now.execution.opened_ns - now.execution.closed_ns
             now.outcome.blackout_ms = round(closed / 1e6, 3)
         if not (now.phase is Phase.COMMIT and failure):
             self._executor.held = False
@@ -268,11 +267,11 @@ class Adaptations:
         outcome.total_ms = round((self._loop.now_ns() - now.began_ns) / 1e6, 3)
         outcome.ftm = self._deployment.graph.ftm
         outcome.application = function_of(self._deployment.graph)
-        if now.exchange is not None:
+        if now.execution is not None:
             assert now.script is not None
-            outcome.bricks_changed = bricks_changed(now.exchange.old, now.exchange.new, now.script)
-            outcome.tried, outcome.opened_ns = function_of(now.exchange.new), now.exchange.turned_ns
-            outcome.undone_ns, outcome.lost = now.exchange.undone_ns, " ".join(sorted(now.exchange.lost))
+            outcome.bricks_changed = bricks_changed(now.execution.old, now.execution.new, now.script)
+            outcome.tried, outcome.opened_ns = function_of(now.execution.new), now.execution.turned_ns
+            outcome.undone_ns, outcome.lost = now.execution.undone_ns, " ".join(sorted(now.execution.lost))
         self.history.append(outcome)
         self._support.keep(msgspec.json.encode(outcome))
         self._tell("adapted", f"{outcome.number}: {outcome.purpose}: {told.outcome} {told.reason}".rstrip())
@@ -296,11 +295,11 @@ class Adaptations:
     def interrupted(self, replica: str) -> bool:
         """Recovery wants to act on `replica`. True if it must wait, and will be told when it may."""
         now = self._current
-        if now is None or now.exchange is None:
+        if now is None or now.execution is None:
             return False
         self.give_up_preparing(f"replica {replica} is lost")  # its undoing touches nothing that serves
         if now.phase is Phase.COMMIT and now.ended and not now.failure:
-            if not now.exchange.can_go_back(replica):
+            if not now.execution.can_go_back(replica):
                 return False  # what is new is all that there is
             self._executor.held = True
             now.lost = replica

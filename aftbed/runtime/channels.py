@@ -3,19 +3,21 @@
 So channels outlive nodes: what is queued while a node is suspended, killed or replaced stays queued.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 from aftbed.core.graph import Link
 from aftbed.runtime.interface import Channel
+
+ChannelKey = tuple[str, str, str]  # source, its port, sink
 
 
 class Channels:
     """All channels between nodes, found by their ends."""
 
     def __init__(self, make: Callable[[Link], Channel]) -> None:
-        self.make = make
-        self.fresh: dict[tuple[str, str, str], Channel] = {}  # of the graph to be: some read them already
-        self._all: dict[tuple[str, str, str], Channel] = {}
+        self._make = make
+        self.beside: dict[ChannelKey, Channel] = {}  # of the graph to be, or of the one before
+        self._all: dict[ChannelKey, Channel] = {}
 
     def renew(self, link: Link) -> Channel:
         """A fresh channel for `link`; the old one is let go."""
@@ -23,8 +25,28 @@ class Channels:
         old = self._all.pop(key, None)
         if old is not None:
             old.close()
-        channel = self._all[key] = self.make(link)
+        channel = self._all[key] = self._make(link)
         return channel
+
+    def make_beside(self, link: Link) -> Channel:
+        """The channel of `link`, which the graph that runs does not have; a fresh one, if need be."""
+        key = (link.source, link.source_port, link.sink)
+        if key not in self.beside:
+            self.beside[key] = self._make(link)
+        return self.beside[key]
+
+    def adopt(self, links: Iterable[Link]) -> None:
+        """From now on the graph that runs has these links; what it does not have stays beside, open."""
+        kept = {(k.source, k.source_port, k.sink) for k in links}
+        known = self._all | self.beside
+        self._all = {key: channel for key, channel in known.items() if key in kept}
+        self.beside = {key: channel for key, channel in known.items() if key not in kept}
+
+    def close_beside(self) -> None:
+        """Let go of all that the graph that runs does not have."""
+        for channel in self.beside.values():
+            channel.close()
+        self.beside = {}
 
     def touching(self, bricks: frozenset[str]) -> list[Channel]:
         """Those with an end at one of `bricks`."""
@@ -41,15 +63,6 @@ class Channels:
     def items(self) -> list[tuple[tuple[str, str, str], Channel]]:
         """All of them, each with its source, port and sink."""
         return list(self._all.items())
-
-    def take(self, key: tuple[str, str, str]) -> Channel:
-        """Take a channel out, open as it is."""
-        return self._all.pop(key)
-
-    def put(self, channel: Channel) -> None:
-        """Put a channel in."""
-        link = channel.link
-        self._all[link.source, link.source_port, link.sink] = channel
 
     def drop(self, channel: Channel) -> None:
         """Let go of `channel`."""

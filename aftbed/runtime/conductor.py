@@ -18,10 +18,10 @@ from aftbed.core.graph import Graph
 from aftbed.core.script import LOSSES, Phase, ScriptKind
 from aftbed.runtime import control
 from aftbed.runtime.adaptations import CLIENT, ENGINE, REPLACE, Adaptations
-from aftbed.runtime.deployment import WATCHED_KINDS, Deployment
+from aftbed.runtime.deployment import HANG_NS, WATCHED_KINDS, Deployment
 from aftbed.runtime.fault_controller import FaultController
 from aftbed.runtime.interface import Process, ProcessKind, Support
-from aftbed.runtime.verbs import Executor
+from aftbed.runtime.script_executor import ScriptExecutor
 from aftbed.runtime.zygotes import LIGHT
 
 RETRY_SECONDS: Final = 0.002
@@ -29,7 +29,6 @@ AGAIN_SECONDS: Final = 0.02
 SETTLE_SECONDS: Final = 0.002
 RESTOCK_SECONDS: Final = 0.05  # from a new backup until spares are forked anew: the next loss may be near
 LOSS_SECONDS: Final = 0.5  # a failover is done long before
-HANG_NS: Final = 150_000_000  # of what no Watchdog watches; a channel's pulse is 20 ms
 
 
 class ScriptRun(msgspec.Struct):
@@ -50,7 +49,7 @@ class Conductor:
     ) -> None:
         self._support, self._loop, self._on_loss = support, support.loop, on_loss
         self.deployment = Deployment(graph, support, cpus)
-        self.executor = Executor(self.deployment)
+        self.executor = ScriptExecutor(self.deployment)
         self.faults = FaultController(self.deployment)
         self.adaptations = Adaptations(
             self.deployment, self.executor, self.faults, lambda: self.inform_recovery(failed=False)

@@ -22,10 +22,17 @@ from aftbed.runtime.zygotes import BUS, LIGHT
 
 WATCHED_KINDS: Final = ("client", "proxy", "watchdog", "recovery", "engine")
 
+HANG_NS: Final = 150_000_000  # where no Watchdog watches: a process with an older pulse hangs
 BIRTH_SECONDS_MAX: Final = 10.0  # each makes its journal first, and a disk may be busy
 
 Keys = Generator[Wait, dict[Key, bytes], None]
 Staged = tuple[Process, tuple[Key, str]]  # a process, and the key of its Ack with its name
+
+
+def replica_of(name: str) -> str:
+    """The replica that is lost with a node or brick, `""` for one of none, such as a Watchdog."""
+    head, _, part = name.partition("/")
+    return head if head in REPLICAS and part != "watchdog" else ""
 
 
 class Slot:
@@ -80,14 +87,18 @@ class Deployment:
 
     # -- orders -------------------------------------------------------------------------------
 
+    def process(self, node: str) -> Process:
+        """The process that is `node` now. Raises StepFailed if it is gone."""
+        process = self.nodes.get(node)
+        if process is None:
+            raise StepFailed(f"{node} is gone")
+        return process
+
     def order(
         self, node: str, make: Callable[[int], control.ToNode], fds: tuple[int, ...] = ()
     ) -> tuple[Key, str]:
         """Send an order to `node`, waking it; the key of its Ack. Raises StepFailed if it is gone."""
-        process = self.nodes.get(node)
-        if process is None:
-            raise StepFailed(f"{node} is gone")
-        return self.order_to(process, make, fds)
+        return self.order_to(self.process(node), make, fds)
 
     def order_to(
         self, process: Process, make: Callable[[int], control.ToNode], fds: tuple[int, ...] = ()
@@ -103,8 +114,8 @@ class Deployment:
 
     def leave(self, node: str, order: control.ToNode, fds: tuple[int, ...] = ()) -> None:
         """Leave an order, unanswered, for when `node` wakes up next. Raises StepFailed if it is gone."""
-        process = self.nodes.get(node)
-        if process is None or not process.alive:
+        process = self.process(node)
+        if not process.alive:
             raise StepFailed(f"{node} is gone")
         assert order.token == control.UNANSWERED
         self._announce(process, order, fds)
@@ -115,7 +126,7 @@ class Deployment:
 
     def _nudge(self, node: str) -> None:
         for brick in self.graph.nodes.get(node, ()):
-            for channel in (*self.channels.into(brick), *self.channels.fresh.values()):
+            for channel in (*self.channels.into(brick), *self.channels.beside.values()):
                 if channel.link.sink == brick:
                     channel.nudge()
 
@@ -126,20 +137,29 @@ class Deployment:
                 self._nudge(node)
 
     def ask(
-        self, node: str, make: Callable[[int], control.ToNode], fds: tuple[int, ...] = ()
+        self,
+        host: str | Process,
+        make: Callable[[int], control.ToNode],
+        fds: tuple[int, ...] = (),
+        seconds: float = STEP_SECONDS_MAX,
     ) -> Generator[Wait, dict[Key, bytes], bytes]:
-        """Send an order and wait for its answer."""
-        key, name = self.order(node, make, fds)
-        got = yield Wait(frozenset({key}), frozenset({name}))
+        """Send an order to a node, or to any process, and wait for its answer.
+
+        Raises StepFailed if it is gone, dies, refuses, or takes too long.
+        """
+        process = self.process(host) if isinstance(host, str) else host
+        key, name = self.order_to(process, make, fds)
+        got = yield Wait(frozenset({key}), frozenset({name}), seconds)
         return got[key]
 
-    def all_of(self, sent: Iterable[tuple[Key, str]], seconds: float = STEP_SECONDS_MAX) -> Keys:
-        """Wait for the answers to several orders. Raises StepFailed if a process has died before."""
+    def answers(self, sent: Iterable[tuple[Key, str]], seconds: float = STEP_SECONDS_MAX) -> Keys:
+        """Wait for the answers to several orders. Raises StepFailed, also if a node has died before."""
         pairs = list(sent)
-        for _, node in pairs:
-            if not self.lives(node):
-                raise StepFailed(f"{node} died")
-        yield Wait(frozenset(k for k, _ in pairs), frozenset(n for _, n in pairs), seconds)
+        for _, name in pairs:
+            if name in self.nodes and not self.lives(name):
+                raise StepFailed(f"{name} died")
+        if pairs:
+            yield Wait(frozenset(k for k, _ in pairs), frozenset(n for _, n in pairs), seconds)
 
     # -- processes ----------------------------------------------------------------------------
 
@@ -150,7 +170,7 @@ class Deployment:
         sent = []
         for node in self.graph.nodes:
             sent.append((yield from self._assign(node, held=node in held)))
-        yield from self.all_of(sent, BIRTH_SECONDS_MAX)
+        yield from self.answers(sent, BIRTH_SECONDS_MAX)
         if len(self.slots) > 1:
             self.backup = REPLICAS[1]
         self.pin_watchers()
@@ -169,7 +189,7 @@ class Deployment:
         sent = []
         for node in slot.nodes:
             sent.append((yield from self._assign(node)))
-        yield from self.all_of(sent, BIRTH_SECONDS_MAX)
+        yield from self.answers(sent, BIRTH_SECONDS_MAX)
         self.assert_whole(slot)
         yield from self.watch(slot)
 
@@ -221,7 +241,7 @@ class Deployment:
         touching = [c.link for c in self.channels.touching(frozenset({brick})) if not self._held(c)]
         for link in touching:
             self.channels.renew(link)
-        yield from self.all_of([(yield from self._assign(node, held=held))])
+        yield from self.answers([(yield from self._assign(node, held=held))])
         channels = [c for c in self.channels.touching(frozenset({brick})) if not self._held(c)]
         # The way back stands before anything is asked on the way there: a new Client asks as soon as it is
         # read, an old one asks again as soon as it may write.
@@ -229,7 +249,7 @@ class Deployment:
         sent = [self._rebind_output(c) for c in into if c.link.source != "client"]
         sent += [self._rebind_input(c) for c in channels if c.link.source == brick]
         sent += [self._rebind_output(c) for c in into if c.link.source == "client"]
-        yield from self.all_of(pair for pair in sent if pair is not None)
+        yield from self.answers(pair for pair in sent if pair is not None)
         for slot in self.slots.values():
             if node == f"{slot.name}/watchdog":
                 yield from self.watch(slot)

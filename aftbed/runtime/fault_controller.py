@@ -307,7 +307,7 @@ class FaultController:
 
     def until_answered(self, orders: Iterable[tuple[Key, str]]) -> Steps[None]:
         """Wait for the answers."""
-        yield from self._deployment.all_of(orders)
+        yield from self._deployment.answers(orders)
 
     def flip_memory(self, process: TargetProcess, bit: int | None, address: int | None, draw: int) -> str:
         """By the runtime."""

@@ -31,14 +31,14 @@ class Wait(msgspec.Struct, frozen=True):
 Steps = Generator[Wait, dict[Key, bytes], None]
 
 
-def amid(steps: Steps, between: Steps) -> Steps:
-    """`steps`, and `between` after the first thing that they ask for, before it is waited for."""
-    wait = next(steps, None)
-    yield from between
+def run_after_first_yield(task: Steps, hook: Steps) -> Steps:
+    """Start `task` up to its first wait, run `hook`, then wait and continue."""
+    wait = next(task, None)
+    yield from hook
     while wait is not None:
         got = yield wait
         try:
-            wait = steps.send(got)
+            wait = task.send(got)
         except StopIteration:
             return
 

@@ -42,7 +42,7 @@ from aftbed.inject.model import Fault
 from aftbed.inject.slow import Slow
 from aftbed.inject.timing import Trigger
 from aftbed.inject.value import EXECUTED, ValueFlip
-from aftbed.runtime.rewiring import replica_of
+from aftbed.runtime.deployment import replica_of
 from aftbed.runtime.sim.world import Setup
 from aftbed.vehicle.scenarios.library import scenario_names
 

@@ -98,7 +98,7 @@ class FakeDeployment:
         self.told.append((process.name, make(1)))
         return ("ack", process.name, 1), process.name
 
-    def all_of(self, sent: Iterable[object]) -> Generator[Wait, object, None]:
+    def answers(self, sent: Iterable[object]) -> Generator[Wait, object, None]:
         list(sent)
         yield Wait(frozenset())
         if self.refuses:

@@ -37,18 +37,18 @@ from aftbed.core.messages import Rebound, TakeUp
 from aftbed.ftm import failover
 from aftbed.ftm.failover import Recovery, Watchdog
 from aftbed.inject.value import ValuePlace
-from aftbed.runtime import exchange, transfer
+from aftbed.runtime import script_executor
 from aftbed.runtime.adaptations import Adaptations
+from aftbed.runtime.control import NOWHERE
 from aftbed.runtime.deployment import Deployment, Keys
-from aftbed.runtime.exchange import Exchange
 from aftbed.runtime.interface import Process
-from aftbed.runtime.rewiring import Wires
+from aftbed.runtime.rebinding import Changes, Rebinding
+from aftbed.runtime.script_executor import Execution
 from aftbed.runtime.sim import world
 from aftbed.runtime.sim.world import Setup
-from aftbed.runtime.verbs import Executor
 
 
-def _unfenced(self: Executor, replica: str) -> None:
+def _unfenced(self: Execution, replica: str) -> None:
     if replica == self._deployment.leader:
         self._deployment.leader = ""
 
@@ -63,30 +63,31 @@ def _is(*verbs: type) -> Callable[..., bool]:
 
 
 def _log_left_behind(right: Callable[..., object]) -> object:
-    def migrate(
-        deployment: Deployment, given: Graph, giver: Process, taken: Graph, taker: Process, node: str
-    ) -> object:
+    def migrate(self: Execution, given: Graph, taken: Graph, node: str, takers: dict[str, Process]) -> object:
         others = tuple(b for b in given.nodes[node] if not b.endswith("/protocol"))
         thinner = replace(given, nodes=given.nodes | {node: others})
-        return right(deployment, thinner, giver, taken, taker, node)
+        return right(self, thinner, taken, node, takers)
 
     return migrate
 
 
-def _state_left_there(right: Callable[..., object]) -> object:
-    def reverse(self: Exchange) -> object:
-        self._migrated = []
-        return right(self)
-
-    return reverse
-
-
 def _unnoticed(right: Callable[..., Keys]) -> object:
-    def resume(self: Exchange, bricks: Iterable[str]) -> Keys:
-        yield from right(self, bricks)
-        self._opened = False
+    def resume(self: Execution, steps: Iterable[script.Resume]) -> Keys:
+        try:
+            yield from right(self, steps)
+        finally:
+            self.done = [step for step in self.done if not isinstance(step, script.Resume)]
 
     return resume
+
+
+def _without(kind: type) -> Callable[..., object]:
+    """The inverse of what was done, less the steps of that type."""
+
+    def make(right: Callable[..., list[script.Step]]) -> object:
+        return lambda *args: [step for step in right(*args) if not isinstance(step, kind)]
+
+    return make
 
 
 def _of_the_old_graph(right: Callable[..., object]) -> object:
@@ -96,12 +97,19 @@ def _of_the_old_graph(right: Callable[..., object]) -> object:
     return stage
 
 
-def _not_rebound(right: Callable[..., object]) -> object:
-    def undo(self: Exchange, lost: str = "") -> object:
-        self._rewired = False
-        return right(self, lost)
+def _not_rebound(right: Callable[..., Changes]) -> object:
+    def changes(self: Rebinding, steps: object, *, committing: bool) -> Changes:
+        return right(self, steps, committing=committing) if self._lost is None else {}
 
-    return undo
+    return changes
+
+
+def _bound_still(right: Callable[..., None]) -> object:
+    def change(self: Rebinding, changes: Changes, brick: str, port: str, side: str, fd: int) -> None:
+        if fd != NOWHERE:
+            right(self, changes, brick, port, side, fd)
+
+    return change
 
 
 def _same_epoch(right: Callable[..., script.Script]) -> object:
@@ -177,8 +185,8 @@ EXECUTIVE: Final = (
     ),
     Mutant(
         "no fencing",
-        "Executor does not shut the channels of a replica that was declared dead",
-        instead(Executor, "_fence", _unfenced),
+        "ScriptExecutor does not shut the channels of a replica that was declared dead",
+        instead(Execution, "_fence", _unfenced),
         CRASH,
         crashes("pbr", "a/proceed"),
         "G2",
@@ -193,40 +201,40 @@ EXECUTIVE: Final = (
     ),
     Mutant(
         "proxy not told",
-        "Executor does not bind the Proxy to the new leader",
-        skipped(Executor, "_attach"),
+        "ScriptExecutor does not bind the Proxy to the new leader",
+        skipped(Execution, "_attach"),
         CRASH,
         crashes("pbr", "a/proceed"),
         "G2",
     ),
     Mutant(
         "dead replica not buried",
-        "Executor leaves the other nodes of a dead replica alive, in its slot",
-        instead(Executor, "_kill", lambda self, replica: None),
+        "ScriptExecutor leaves the other nodes of a dead replica alive, in its slot",
+        instead(Execution, "_kill", lambda self, replica: None),
         CRASH,
         crashes("pbr", "a/proceed"),
         "at_rest",
     ),
     Mutant(
         "leader not resumed",
-        "Executor forgets to resume the leader's Protocol when the new backup has its state",
-        skipped(Executor, "_do", _is(script.Resume)),
+        "ScriptExecutor forgets to resume the leader's Protocol when the new backup has its state",
+        skipped(Execution, "do", _is(script.Resume)),
         PAIRS,
         pairs("pbr", ("client",), (9.0,)),
         "G2",
     ),
     Mutant(
         "new backup without state",
-        "Executor binds a new backup, and transfers nothing to it",
-        skipped(Executor, "_transfer"),
+        "ScriptExecutor binds a new backup, and transfers nothing to it",
+        skipped(Execution, "_transfer"),
         PAIRS,
         pairs("lfr", ("b/server",), (6.0, 9.0)),
         "G3",
     ),
     Mutant(
         "new backup without the reply log",
-        "Executor transfers the Server's state to a new backup, and not the replies",
-        skipped(Executor, "_transfer", _of("/protocol")),
+        "ScriptExecutor transfers the Server's state to a new backup, and not the replies",
+        skipped(Execution, "_transfer", _of("/protocol")),
         OWN,
         _reply_under_way,
         "G3",
@@ -242,7 +250,7 @@ EXECUTIVE: Final = (
     Mutant(
         "reply log lost in a switch",
         "a Protocol that is exchanged starts with an empty log",
-        wrapped(exchange, "migrate", _log_left_behind),
+        wrapped(Execution, "_migrate", _log_left_behind),
         ADAPT,
         adapts("pbr", "lfr", "proxy", placement="replica", load=(150, 0.0), seeds=6),
         "G3",
@@ -250,55 +258,55 @@ EXECUTIVE: Final = (
     Mutant(
         "state lost in a switch",
         "what is exchanged starts without the state of its predecessor",
-        skipped(Exchange, "_do", _is(script.Migrate)),
+        skipped(Execution, "do", _is(script.Migrate)),
         CLEAN,
         clean(adapted("pbr", "lfr", placement="replica")),
         "G3",
     ),
     Mutant(
         "switch never resumed",
-        "Exchange forgets to resume whom it suspended",
-        instead(Exchange, "_resume", lambda self, bricks: nothing()),
+        "ScriptExecutor forgets to resume whom it suspended",
+        instead(Execution, "_resume", lambda self, steps: nothing()),
         CLEAN,
         clean(adapted("pbr", "lfr"), adapted("pbr", "pbr+tr")),
         "G2",
     ),
     Mutant(
         "undone and not resumed",
-        "Exchange forgets to resume whom it suspended, on the way back",
-        instead(Exchange, "_let_serve", lambda self: None),
+        "ScriptExecutor forgets to resume whom it suspended, on the way back",
+        instead(Execution, "_resume_living", lambda self, bricks: None),
         ADAPT,
         adapts("pbr", "lfr", "b/after"),
         "G2",
     ),
     Mutant(
         "undone and not rebound",
-        "Exchange forgets to give the old bricks their channels back",
-        wrapped(Exchange, "undo", _not_rebound),
+        "ScriptExecutor forgets to give the old bricks their channels back",
+        wrapped(Rebinding, "changes", _not_rebound),
         ADAPT,
         adapts("pbr", "lfr", "b/after"),
         "G2",
     ),
     Mutant(
         "undone without the state",
-        "Exchange goes back to the bricks of before, and leaves them the state of before",
-        wrapped(Exchange, "_reverse_adoption", _state_left_there),
+        "ScriptExecutor goes back to the bricks of before, and leaves them the state of before",
+        wrapped(script_executor, "inverse", _without(script.Migrate)),
         ADAPT,
         adapts("pbr", "pbr+tr", "a", placement="replica"),
         "G3",
     ),
     Mutant(
         "not adopted once it serves",
-        "Exchange goes back as if no request had passed, where a commit fails after it let them on",
-        wrapped(Exchange, "_resume", _unnoticed),
+        "ScriptExecutor goes back as if no request had passed, where a commit fails after it let them on",
+        wrapped(Execution, "_resume", _unnoticed),
         ADAPT,
         adapts("pbr", "pbr+tr", "a", placement="replica"),
         "G3",
     ),
     Mutant(
         "committed over the dead",
-        "Exchange does not look whether all that is to serve is alive",
-        instead(Exchange, "_assert_whole", lambda self: None),
+        "ScriptExecutor does not look whether all that is to serve is alive",
+        instead(Execution, "_assert_whole", lambda self: None),
         ADAPT,
         adapts("pbr", "lfr", "a/before"),
         "G5",
@@ -321,24 +329,24 @@ EXECUTIVE: Final = (
     ),
     Mutant(
         "undone in word only",
-        "Exchange leaves everything as far as it has come, and says that it has gone back",
-        instead(Exchange, "undo", lambda self, lost="": nothing()),
+        "ScriptExecutor leaves everything as far as it has come, and says that it has gone back",
+        instead(Execution, "undo", lambda self, lost="": nothing()),
         ADAPT,
         adapts("pbr", "pbr+tr", "b/after"),
         "G5",
     ),
     Mutant(
         "not drained",
-        "Exchange replaces bricks of the backup while requests wait in front of them",
-        skipped(Exchange, "_do", _is(script.Drain)),
+        "ScriptExecutor replaces bricks of the backup while requests wait in front of them",
+        skipped(Execution, "do", _is(script.Drain)),
         OWN,
         _backup_behind,
         "G3",
     ),
     Mutant(
         "not aligned",
-        "Exchange switches to another replication over two Servers that differ",
-        skipped(Exchange, "_do", _is(script.Align)),
+        "ScriptExecutor switches to another replication over two Servers that differ",
+        skipped(Execution, "do", _is(script.Align)),
         OWN,
         _backup_wrong,
         "G4",
@@ -353,8 +361,8 @@ EXECUTIVE: Final = (
     ),
     Mutant(
         "unbind forgotten",
-        "Exchange leaves a brick that stays bound to one that goes",
-        instead(Wires, "_unbind", lambda self, brick, port, of: None),
+        "ScriptExecutor leaves a brick that stays bound to one that goes",
+        wrapped(Rebinding, "_change", _bound_still),
         CLEAN,
         clean(adapted("pbr", "lfr")),
         "G2",
@@ -369,15 +377,15 @@ EXECUTIVE: Final = (
     ),
     Mutant(
         "staged not ended",
-        "Exchange leaves alive what it does not need any more",
-        instead(transfer, "end", lambda process: None),
+        "ScriptExecutor leaves alive what it does not need any more",
+        instead(script_executor, "end", lambda process: None),
         ADAPT,
         adapts("pbr", "pbr+tr", "a/tr.before'"),
         "G5",
     ),
     Mutant(
         "old class staged",
-        "Exchange stages a Before of the old mechanism where the new one's should be",
+        "ScriptExecutor stages a Before of the old mechanism where the new one's should be",
         wrapped(Deployment, "stage", _of_the_old_graph),
         CLEAN,
         clean(adapted("pbr", "lfr")),

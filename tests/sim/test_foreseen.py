@@ -6,10 +6,10 @@ from typing import Final
 import pytest
 from planting import adapted, crash_after
 
-from aftbed.core import script
 from aftbed.core.messages import Goal, Scheduled
+from aftbed.core.script import Step
 from aftbed.judge.verdict import breaches
-from aftbed.runtime.rewiring import Told, Wires
+from aftbed.runtime.rebinding import Changes, Rebinding
 from aftbed.runtime.sim.world import Setup, simulate
 
 WAYS: Final = [
@@ -21,26 +21,26 @@ WAYS: Final = [
 
 @pytest.fixture
 def worked_out(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, bool]]:
-    """By whom it was asked for (`foresee`, `prepare`, `commit`), and whether the answer was there already."""
+    """When it was asked for (`ahead`, `prepare`, `commit`), and whether the answer was there already."""
     found: list[tuple[str, bool]] = []
-    told, foresee = Wires.told, Wires.foresee
-    foreseeing = False
+    changes, prepare = Rebinding.changes, Rebinding.prepare
+    ahead = False
 
-    def watched_told(self: Wires, verbs: Sequence[script.Step], *, committing: bool) -> Told:
-        known = self._foreseen
-        answer = told(self, verbs, committing=committing)
-        who = "foresee" if foreseeing else "commit" if committing else "prepare"
-        found.append((who, known is not None and answer is known[2]))
+    def watched_changes(self: Rebinding, steps: Sequence[Step], *, committing: bool) -> Changes:
+        known = self._prepared
+        answer = changes(self, steps, committing=committing)
+        when = "ahead" if ahead else "commit" if committing else "prepare"
+        found.append((when, known is not None and answer is known[2]))
         return answer
 
-    def watched_foresee(self: Wires, verbs: Sequence[script.Step]) -> None:
-        nonlocal foreseeing
-        foreseeing = True
-        foresee(self, verbs)
-        foreseeing = False
+    def watched_prepare(self: Rebinding, steps: Sequence[Step]) -> None:
+        nonlocal ahead
+        ahead = True
+        prepare(self, steps)
+        ahead = False
 
-    monkeypatch.setattr(Wires, "told", watched_told)
-    monkeypatch.setattr(Wires, "foresee", watched_foresee)
+    monkeypatch.setattr(Rebinding, "changes", watched_changes)
+    monkeypatch.setattr(Rebinding, "prepare", watched_prepare)
     return found
 
 
@@ -50,7 +50,7 @@ def test_nothing_is_worked_out_while_the_client_waits(
 ) -> None:
     run = simulate(adapted(old, new, placement=placement))
     assert [a.outcome for a in run.adaptations] == ["done"] and breaches(run) == ()
-    assert worked_out == [("prepare", False), ("foresee", False), ("commit", True)]
+    assert worked_out == [("prepare", False), ("ahead", False), ("commit", True)]
 
 
 def test_after_a_node_was_replaced_it_is_worked_out_again(worked_out: list[tuple[str, bool]]) -> None:

@@ -17,7 +17,7 @@ from aftbed.inject.crash import Crash
 from aftbed.inject.hang import Hang
 from aftbed.inject.slow import Slow
 from aftbed.inject.value import ValueFlip
-from aftbed.runtime.rewiring import replica_of
+from aftbed.runtime.deployment import replica_of
 from aftbed.runtime.sim.world import Setup, simulate
 from aftbed.search import swarm
 from aftbed.search.explore import attempt

@@ -17,8 +17,8 @@ import msgspec
 from aftbed.core.errors import AftbedError
 from aftbed.ftm.compose import build
 from aftbed.runtime import control
-from aftbed.runtime.conductor import HANG_NS, Conductor
-from aftbed.runtime.deployment import Keys
+from aftbed.runtime.conductor import Conductor
+from aftbed.runtime.deployment import HANG_NS, Keys
 from aftbed.runtime.hosting import hosted, look_at_states
 from aftbed.runtime.interface import ProcessKind
 from aftbed.runtime.jobs import STATS_JOB

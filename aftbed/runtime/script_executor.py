@@ -1,0 +1,656 @@
+"""The script executor: carries out failovers, new backups and adaptations, and takes back what fails.
+
+A step is a generator that waits for the answers of processes. Where one fails, the script stops, and the
+executor runs the inverse of what was done (`core.script.inverse`), leaving out replicas that are lost.
+
+An adaptation is a transaction of phases that the Engine orders one by one. Its new processes are *staged*
+beside those that serve; what is replaced stands beside the new ones, suspended, until the script is finished.
+"""
+
+import functools
+from collections.abc import Callable, Generator, Iterable
+from contextlib import suppress
+from hashlib import blake2b
+from typing import Final, assert_never
+
+from aftbed.adapt.plan import drains
+from aftbed.core import messages
+from aftbed.core.errors import StepFailed
+from aftbed.core.events import Event
+from aftbed.core.graph import STAGED, Graph
+from aftbed.core.script import (
+    RECIPES,
+    Align,
+    Attach,
+    Bind,
+    Destroy,
+    Drain,
+    Exchange,
+    Fence,
+    Freeze,
+    Kill,
+    Migrate,
+    Promote,
+    Resume,
+    Retire,
+    Script,
+    ScriptKind,
+    Spawn,
+    Stage,
+    Step,
+    Suspend,
+    Thaw,
+    Together,
+    Transfer,
+    Unbind,
+    after,
+    flat,
+    inverse,
+    problems,
+    reversible,
+)
+from aftbed.ftm.compose import REPLICAS, STATEFUL, replication_of
+from aftbed.ftm.registry import KINDS
+from aftbed.runtime import control
+from aftbed.runtime.cores import BESIDE_LEADER
+from aftbed.runtime.deployment import HANG_NS, Deployment, Keys, Slot, replica_of
+from aftbed.runtime.interface import Channel, Process, ProcessKind
+from aftbed.runtime.jobs import Key, Wait, run_after_first_yield
+from aftbed.runtime.rebinding import Rebinding
+from aftbed.runtime.zygotes import LIGHT
+
+# How long a step may take. Birth has a limit of its own (`deployment`).
+STAGE_SECONDS_MAX: Final = 5.0  # a module of the user is imported and tested meanwhile
+SUSPEND_SECONDS_MAX: Final = 0.25  # for longer, the client is better off with the old graph
+PROMOTE_SECONDS_MAX: Final = 2.0  # nothing else is left to serve
+STEP_SECONDS_MAX: Final = 0.5  # all other steps
+FIRST_REPLY_SECONDS: Final = 0.001
+
+Observe = Callable[[Event, int], Keys]  # called before and after each step of an adaptation, with its number
+
+
+class ScriptExecutor:
+    """Carries out scripts, one at a time."""
+
+    def __init__(self, deployment: Deployment) -> None:
+        self._deployment = deployment
+        self._running = False
+        self.held = False  # an adaptation acts on what serves
+
+    @property
+    def busy(self) -> bool:
+        """No other script may begin."""
+        return self._running or self.held
+
+    def execute(self, script: Script) -> Keys:
+        """A whole script of Recovery. Raises StepFailed, after what was done has been taken back."""
+        found = problems(script)
+        if found:
+            raise StepFailed("; ".join(found))
+        self._running = True
+        execution = Execution(self._deployment, script)
+        try:
+            for step in (*script.prepare, *script.commit):
+                yield from execution.do(step)
+        except StepFailed:
+            yield from execution.take_back()
+            raise
+        finally:
+            self._running = False
+
+    def stale(self, script: Script) -> bool:
+        """Whether `script` was ordered before Recovery heard of what has changed since.
+
+        The situation that is on its way to it will make it decide anew.
+        """
+        deployment = self._deployment
+        epochs = [step.epoch for step in script.commit if isinstance(step, Promote)]
+        if any(epoch != deployment.epoch + 1 for epoch in epochs):
+            return True
+        match script.kind:
+            case ScriptKind.FAILOVER:
+                return script.replica != deployment.leader or not deployment.backup
+            case ScriptKind.DROP_BACKUP:
+                return script.replica != deployment.backup
+            case ScriptKind.NEW_BACKUP | ScriptKind.ADAPTATION:
+                return bool(deployment.backup) or not deployment.leader
+            case _:
+                assert_never(script.kind)
+
+    def situation(self, *, failed: bool) -> messages.Situation:
+        """What Recovery must know to order the next script."""
+        deployment = self._deployment
+        slots, leader, backup = deployment.slots, deployment.leader, deployment.backup
+        return messages.Situation(
+            leader,
+            slots[leader].generation if leader else 0,
+            backup,
+            slots[backup].generation if backup else 0,
+            deployment.epoch,
+            tuple(s.name for s in slots.values() if not s.nodes),
+            failed,
+            replication_of(deployment.graph.ftm),
+            STATEFUL,
+            tuple(sorted(deployment.lost)),
+        )
+
+
+class Execution:
+    """One script on its way: what of it was done, and what stands beside the nodes that serve."""
+
+    def __init__(self, deployment: Deployment, script: Script, observe: Observe | None = None) -> None:
+        self._deployment, self._support, self.script = deployment, deployment.support, script
+        self._observe = observe
+        adapts = script.kind is ScriptKind.ADAPTATION
+        self.old: Graph = deployment.graph
+        self.new: Graph = after(self.old, script, KINDS) if adapts else self.old
+        self.done: list[Step] = []
+        self._staged: dict[str, Process] = {}  # of the new graph, by node: they do not serve
+        self._replaced: dict[str, Process] = {}  # of the old graph: they do not serve any more
+        self._rebinding = Rebinding(deployment, self.old if adapts else None, self.new, self._staged)
+        self._promoting: Wait | None = None  # Attach waits for it
+        self._last_replies: Channel | None = None  # from a fenced leader to the Proxy
+        self._number = 0  # of the step under way
+        self._one_way = False  # what is replaced cannot go on from the state of what is new
+        self.committed = False  # the new graph is the one that runs
+        self.lost: set[str] = set()  # replicas that are left to Recovery
+        self.closed_ns = self.opened_ns = 0  # when no request was served, and when again
+        self.turned_ns = self.undone_ns = 0  # requests after it are the new graph's; the old one's again
+
+    # -- the phases of an adaptation ----------------------------------------------------------
+
+    def prepare(self) -> Keys:
+        """Stage and bind what is new."""
+        sent = []
+        for step in flat(self.script.prepare):
+            if isinstance(step, Stage):
+                yield from self._enter()
+                self.done.append(step)
+                sent.append((yield from self._stage(step)))
+                yield from self._note(Event.ADAPT_STEP_ACT, self._number)
+        yield from self._deployment.answers(sent, STAGE_SECONDS_MAX)
+        for number in range(1, self._number + 1):
+            yield from self._note(Event.ADAPT_STEP_EXIT, number)
+        binds = [step for step in flat(self.script.prepare) if isinstance(step, Bind)]
+        self.done += binds
+        changes = self._rebinding.changes(binds, committing=False)
+        yield from self._rebinding.send(changes, STEP_SECONDS_MAX)
+        rebinds = [step for step in self.script.commit if _rebinds(step)]
+        # The paper's recipe stages in the commit; of several, the later ones depend on the first.
+        if self.script.recipe == RECIPES[0] and len(rebinds) == 1:
+            self._rebinding.prepare(tuple(flat(rebinds)))
+        yield from self._deployment.nursery.calm(LIGHT)
+
+    def commit(self) -> Keys:
+        """All that the client waits for."""
+        deployment = self._deployment
+        if self.script.recipe != RECIPES[0]:
+            for slot in deployment.slots.values():  # it kills what they watch
+                yield from deployment.watch(slot, nobody=True)
+        self.closed_ns = self._support.loop.now_ns()
+        try:
+            for step in self.script.commit:
+                yield from self._enter()
+                act = self._note(Event.ADAPT_STEP_ACT, self._number)
+                yield from run_after_first_yield(self.do(step), act)
+                yield from self._note(Event.ADAPT_STEP_EXIT, self._number)
+            self._assert_whole()
+        except StepFailed:
+            if self._opened():  # requests may have passed: the state that counts is in what is new
+                self._adopt(self.new)
+                yield from self._probe_way_back()
+            if not self._one_way:
+                raise
+        self.opened_ns = self._support.loop.now_ns()
+        if not self.committed:
+            self._adopt(self.new)
+        yield from self._watch()
+        if not self._one_way:
+            yield from self._probe_way_back()
+        for slot in deployment.slots.values():
+            if self._one_way:
+                self._leave_if_dead(slot)
+            else:
+                deployment.assert_whole(slot)
+
+    def finish(self) -> Keys:
+        """End what does not serve any more."""
+        for process in self._replaced.values():
+            end(process)
+        self._replaced.clear()
+        self._deployment.channels.close_beside()
+        yield Wait(frozenset())
+
+    def undo(self, lost: str = "") -> Keys:
+        """Run the inverse of what was done. The replica that is `lost`, or has a dead node, is left out.
+
+        Until requests are let on, the old processes count, since a new one may be dead. Afterwards both do:
+        the old ones are to serve, with the state of the new ones.
+        """
+        deployment = self._deployment
+        serving = list((deployment.nodes | self._replaced).items())
+        serving += list(deployment.nodes.items()) if self.committed else []
+        now_ns = self._support.loop.now_ns()
+        self.lost = {replica_of(name) for name, p in serving if not p.alive or p.hangs(now_ns, HANG_NS)}
+        self.lost = (self.lost | {lost}) - {""}
+        if self.committed:  # else the Watchdogs have seen it
+            deployment.lost |= self.lost
+            yield from self._shut_lost()
+        self._rebinding = Rebinding(deployment, self.new, self.old, self._exchanged(), self.lost)
+        for step in inverse(self.old, self.done, KINDS, drains(self.new, self.old)):
+            yield from self._do_back(step)
+        yield from self._end_staged(list(self._staged))
+        deployment.channels.close_beside()
+        self.undone_ns = self.undone_ns or self._support.loop.now_ns()
+        yield Wait(frozenset())
+
+    def can_go_back(self, without: str) -> bool:
+        """Whether what is replaced lives, but for that replica's, and can take the state."""
+        replaced = self._replaced.items()
+        return not self._one_way and all(p.alive for n, p in replaced if replica_of(n) != without)
+
+    def _exchanged(self) -> dict[str, Process]:
+        return {node: process for node, process in self._replaced.items() if node in self.new.nodes}
+
+    def _enter(self) -> Keys:
+        self._number += 1
+        yield from self._note(Event.ADAPT_STEP_ENTER, self._number)
+
+    def _note(self, event: Event, number: int) -> Keys:
+        assert self._observe is not None
+        return self._observe(event, number)
+
+    def _opened(self) -> bool:
+        """Whether the leader's Protocol has been let on."""
+        return Resume(f"{self._deployment.leader}/protocol") in self.done
+
+    def _leave_if_dead(self, slot: Slot) -> None:
+        """There is no way back, so it is Recovery's, as at any other time."""
+        if not all(map(self._deployment.lives, self._deployment.nodes_of(slot))):
+            self._deployment.lost.add(slot.name)
+
+    def _assert_whole(self) -> None:
+        """Raise StepFailed if a node of a replica is dead: not every step asks every node."""
+        for node in self.new.nodes:
+            process = self._staged.get(node) or self._deployment.nodes.get(node)
+            if replica_of(node) and (process is None or not process.alive):
+                raise StepFailed(f"{node} died")
+
+    def _watch(self) -> Keys:
+        for slot in self._deployment.slots.values():
+            if slot.name not in self.lost:
+                with suppress(StepFailed):  # a Watchdog that is dead is replaced, and told then
+                    yield from self._deployment.watch(slot)
+
+    def _probe_way_back(self) -> Keys:
+        """Find out whether a class of before takes the state of the one that has its place: it need not.
+
+        Done when requests have been let on, so that the client does not wait for it.
+        """
+        deployment = self._deployment
+        for node, brick in self._another_class():
+            giver, taker = deployment.process(node), self._replaced[node]
+            try:
+                state = yield from self._capture(giver, brick)
+                if state:
+                    yield from self._restore(taker, brick, state, migrate=True)
+            except StepFailed:
+                self._one_way = self._one_way or (giver.alive and taker.alive)  # else it was a death
+
+    def _another_class(self) -> list[tuple[str, str]]:
+        """Where state was handed to a brick of another class, or with another function: nodes and bricks."""
+
+        def written(graph: Graph, brick: str) -> tuple[str, str]:
+            return graph.brick(brick).source, graph.brick(brick).application
+
+        migrated = [step.node for step in flat(self.done) if isinstance(step, Migrate)]
+        moved = [(n, b) for n in migrated for b in self.old.nodes[n] if b in self.new.nodes[n]]
+        return [(n, b) for n, b in moved if written(self.old, b) != written(self.new, b)]
+
+    # -- steps --------------------------------------------------------------------------------
+
+    def do(self, step: Step) -> Keys:  # noqa: PLR0912 - a case for each type of step
+        """One step. Raises StepFailed."""
+        resumes = [one for one in flat((step,)) if isinstance(one, Resume)]
+        if not resumes:  # each of them is done when it is sent
+            self.done.append(step)
+        match step:
+            case Spawn(replica):
+                yield from self._deployment.spawn(self._deployment.slots[replica])
+            case Fence(replica):
+                self._fence(replica)
+            case Kill(replica):
+                self._kill(replica)
+            case Promote(replica, epoch):
+                self._promote(replica, epoch)
+            case Attach(replica, epoch):
+                yield from self._attach(replica, epoch)
+            case Suspend(brick):
+                yield from self._suspend(brick, drain=False)
+            case Drain(brick):
+                yield from self._suspend(brick, drain=True)
+            case Resume():
+                yield from self._resume(resumes)
+            case Transfer(source, sink):
+                yield from self._transfer(source, sink)
+            case Align(source, sink):
+                yield from self._align(source, sink)
+            case Migrate(node):
+                yield from self._migrate(self.old, self.new, node, self._staged)
+            case Bind() | Unbind() | Exchange():
+                yield from self._rebind((step,))
+            case Together(steps) if len(resumes) == len(steps):
+                self._assert_whole()
+                yield from self._resume(resumes)
+            case Together():
+                yield from self._rebind(tuple(flat((step,))))
+            case Stage():
+                yield from self._deployment.answers([(yield from self._stage(step))], STAGE_SECONDS_MAX)
+            case Retire(node):
+                end(self._replaced.pop(node))
+            case Freeze(brick):
+                self._rebinding.host(brick).freeze()
+            case Thaw(brick):
+                self.turned_ns = self._support.loop.now_ns()
+                self._rebinding.host(brick).thaw()
+            case Destroy(node):
+                process = self._deployment.process(node)
+                del self._deployment.nodes[node]
+                end(process)
+            case _:
+                assert_never(step)
+
+    def _stage(self, step: Stage) -> Generator[Wait, dict[Key, bytes], tuple[Key, str]]:
+        process, sent = yield from self._deployment.stage(step.node, self.new, held=step.held)
+        self._staged[step.node] = process
+        return sent
+
+    def _suspend(self, brick: str, *, drain: bool) -> Keys:
+        order = functools.partial(control.Suspend, drain=drain)
+        yield from self._deployment.ask(self._rebinding.host(brick), order, seconds=SUSPEND_SECONDS_MAX)
+
+    def _resume(self, steps: Iterable[Resume]) -> Keys:
+        sent = []
+        for step in steps:
+            before_ns = self._support.loop.now_ns()
+            sent.append(self._deployment.order_to(self._rebinding.host(step.brick), control.Resume))
+            self.done.append(step)
+            if step.brick == f"{self._deployment.leader}/protocol":
+                self.turned_ns = before_ns
+        yield from self._deployment.answers(sent, STEP_SECONDS_MAX)
+
+    # -- steps that move state ----------------------------------------------------------------
+
+    def _capture(self, process: Process, brick: str) -> Generator[Wait, dict[Key, bytes], bytes]:
+        order = functools.partial(control.Capture, brick=brick)
+        return (yield from self._deployment.ask(process, order, seconds=STEP_SECONDS_MAX))
+
+    def _restore(self, process: Process, brick: str, state: bytes, *, migrate: bool = False) -> Keys:
+        order = functools.partial(control.Restore, brick=brick, state=state, migrate=migrate)
+        yield from self._deployment.ask(process, order, seconds=STEP_SECONDS_MAX)
+
+    def _transfer(self, source: str, sink: str) -> Keys:
+        state = yield from self._capture(self._rebinding.host(source), source)
+        yield from self._restore(self._rebinding.host(sink), sink, state)
+
+    def _align(self, source: str, sink: str) -> Keys:
+        """Both are asked at once."""
+        deployment, host = self._deployment, self._rebinding.host
+        sent = [
+            deployment.order_to(host(brick), functools.partial(control.Capture, brick=brick))
+            for brick in (source, sink)
+        ]
+        got = yield Wait(frozenset(k for k, _ in sent), frozenset(n for _, n in sent), STEP_SECONDS_MAX)
+        states = [got[key] for key, _ in sent]
+        if blake2b(states[0]).digest() != blake2b(states[1]).digest():
+            yield from self._restore(host(sink), sink, states[0])
+
+    def _migrate(self, given: Graph, taken: Graph, node: str, takers: dict[str, Process]) -> Keys:
+        """The state of every brick that `node` has in both graphs. One that has no state needs no taker."""
+        giver, taker = self._deployment.process(node), takers[node]
+        for brick in given.nodes[node]:
+            if brick in taken.nodes[node]:
+                state = yield from self._capture(giver, brick)
+                if state:
+                    changed = given.brick(brick) != taken.brick(brick)
+                    yield from self._restore(taker, brick, state, migrate=changed)
+
+    # -- steps of a failover ------------------------------------------------------------------
+
+    def _fence(self, replica: str) -> None:
+        deployment = self._deployment
+        slot = deployment.slots[replica]
+        leads = replica == deployment.leader
+        self._last_replies = None
+        if leads:
+            # Move Proxy and Client while they sleep: the fence wakes them, and a core that takes dead
+            # processes down neither runs them nor lets them go for some milliseconds.
+            deployment.leader = ""
+            deployment.pin(BESIDE_LEADER)
+        for channel in deployment.channels.touching(slot.bricks):
+            link = channel.link
+            if leads and link.source in slot.bricks and link.sink == "proxy":
+                self._last_replies = channel
+            elif link.source in slot.bricks and link.sink not in slot.bricks:
+                channel.fence()
+            elif "/" in link.source and link.source not in slot.bricks:
+                channel.refuse()  # a leader that waits for a dead backup to read must not wait on
+        # A reply is on its way to the Proxy only if its checkpoint was on its way to the backup before,
+        # so the shut checkpoint channel is what counts. The other one is shut as soon as the Proxy
+        # follows the new leader: to wake it twice costs 0.1 ms of the blackout.
+        detail = slot.generation << 8 | slot.number
+        self._support.journal.write(self._support.loop.now_ns(), Event.REPLICA_FENCED, 0, detail)
+
+    def _kill(self, replica: str) -> None:
+        """The nodes of the slot die; their deaths are reaped later, the slot is free at once."""
+        deployment = self._deployment
+        slot = deployment.slots[replica]
+        for node in slot.nodes:
+            process = deployment.nodes.pop(node, None)
+            if process is not None:
+                end(process)
+        for channel in deployment.channels.touching(slot.bricks):
+            deployment.channels.drop(channel)
+        slot.nodes = []
+        deployment.lost.discard(replica)
+        if deployment.backup == replica:
+            deployment.backup = ""
+
+    def _promote(self, replica: str, epoch: int) -> None:
+        """Send it, and go on: until it leads, its Protocol takes no request. Attach waits for it."""
+        deployment = self._deployment
+        slot = deployment.slots[replica]
+        part, _ = replication_of(deployment.graph.ftm)[0]  # the first to hear of the leader
+        brick = f"{replica}/{part}"
+        # The end of the channel from the leader, which the fence made, wakes it.
+        promote = control.Tell(control.UNANSWERED, brick, messages.Promote(epoch))
+        deployment.leave(deployment.graph.node_of(brick), promote)
+        promoted = ("promoted", f"{replica}/protocol", epoch)
+        self._promoting = Wait(frozenset({promoted}), frozenset(slot.nodes), PROMOTE_SECONDS_MAX)
+
+    def _attach(self, replica: str, epoch: int) -> Keys:
+        """A Proxy that is being replaced needs nothing: the new one is bound to the leader."""
+        deployment = self._deployment
+        deployment.leader, deployment.backup, deployment.epoch = replica, "", epoch
+        into = deployment.channels.get("proxy", "pxy2pro", f"{replica}/protocol")
+        back = deployment.channels.get(f"{replica}/protocol", "pro2pxy", "proxy")
+        assert into is not None and back is not None, replica
+        with suppress(StepFailed):
+            deployment.leave(
+                "proxy",
+                control.Follow(control.UNANSWERED, "proxy", "pro2pxy", "pxy2pro", epoch),
+                (back.read.fileno(), into.write.fileno()),
+            )
+        if self._last_replies is not None:
+            self._last_replies.fence()  # wakes a Proxy that waits for a reply
+        for channel in deployment.channels.into("proxy"):
+            if channel.link.source == "client":
+                channel.nudge()  # wakes one that waits for a request
+        # The new leader's core is for the first reply now: nothing is urgent here, and to wake up for
+        # each report from there would take it 0.1 ms.
+        self._support.loop.rest(FIRST_REPLY_SECONDS)
+        promoting, self._promoting = self._promoting, None
+        if promoting is not None:
+            deployment.assert_whole(deployment.slots[replica])
+            yield promoting
+        deployment.graph = deployment.graph.led_by(replica)
+        deployment.pin_watchers()
+
+    # -- channels and places ------------------------------------------------------------------
+
+    def _rebind(self, steps: tuple[Step, ...]) -> Keys:
+        """Each process is told of all that concerns it at once; then what is staged takes its place."""
+        if self.script.kind is not ScriptKind.ADAPTATION:
+            self._note_backup(steps)
+        yield from self._rebinding.send(self._rebinding.changes(steps, committing=True), STEP_SECONDS_MAX)
+        for step in steps:
+            if isinstance(step, Exchange):
+                self._put_beside(step.node, self._replaced)
+                self._put_in_place(step.node, self._staged.pop(step.node))
+
+    def _note_backup(self, steps: tuple[Step, ...]) -> None:
+        """Once a new backup is bound, it holds all that the leader holds; unbound, no more."""
+        deployment = self._deployment
+        for step in steps:
+            match step:
+                case Bind(brick, _, target) if replica_of(brick) == deployment.leader != replica_of(target):
+                    deployment.backup = replica_of(target)
+                case Unbind(brick, port):
+                    if (brick.partition("/")[2], port) in replication_of(deployment.graph.ftm):
+                        deployment.backup = ""
+                case _:
+                    pass
+
+    def _put_beside(self, node: str, others: dict[str, Process]) -> None:
+        """The process that is `node` stands beside what serves from now on."""
+        process = others[node] = self._deployment.nodes.pop(node)
+        process.name, process.kind = f"{node}{STAGED}", ProcessKind.STAGED
+
+    def _put_in_place(self, node: str, process: Process) -> None:
+        """`process` is `node` from now on."""
+        process.name, process.kind = node, ProcessKind.NODE
+        self._deployment.nodes[node] = process
+
+    def _adopt(self, graph: Graph) -> None:
+        """The old or the new graph runs from now on; what only the other one has stands beside it."""
+        deployment = self._deployment
+        self.committed = graph is self.new
+        coming, leaving = self._staged, self._replaced
+        if not self.committed:
+            coming, leaving = leaving, coming
+        for node, process in list(coming.items()):
+            if node in deployment.nodes:
+                self._put_beside(node, leaving)
+            self._put_in_place(node, process)
+        coming.clear()
+        for node in [n for n in deployment.nodes if n not in graph.nodes]:
+            self._put_beside(node, leaving)
+        deployment.channels.adopt(graph.links)
+        deployment.adopt(graph, self.lost)
+        other = next(r for r in REPLICAS if r != deployment.leader)
+        deployment.backup = other if replication_of(graph.ftm) and other in deployment.slots else ""
+
+    # -- the way back -------------------------------------------------------------------------
+
+    def take_back(self) -> Keys:
+        """After a script of Recovery has failed. A failover cannot be: there is no replica left."""
+        deployment, done = self._deployment, self.done
+        if self.script.kind is ScriptKind.FAILOVER:
+            for slot in deployment.slots.values():
+                self._kill(slot.name)
+            deployment.leader = deployment.backup = ""
+        elif reversible(done):
+            if deployment.backup == self.script.replica:  # it can lead already
+                done = [step for step in done if isinstance(step, Suspend)]
+            for step in inverse(self.old, done, KINDS):
+                yield from self._do_back(step)
+
+    def _do_back(self, step: Step) -> Keys:
+        """A step of an inverse. What is dead is left out."""
+        match step:
+            case Suspend(brick):
+                yield from self._unless_lost(brick, self._suspend(brick, drain=False))
+            case Drain(brick):
+                yield from self._unless_lost(brick, self._suspend(brick, drain=True))
+            case Migrate(node):
+                yield from self._unless_lost(node, self._migrate(self.new, self.old, node, self._replaced))
+            case Kill(replica):
+                self._kill(replica)
+            case Together(steps) if isinstance(steps[0], Retire):
+                yield from self._end_staged([one.node for one in steps if isinstance(one, Retire)])
+            case Together(steps) if isinstance(steps[0], Resume):
+                self._resume_living([one.brick for one in steps if isinstance(one, Resume)])
+            case Together(steps):
+                yield from self._rebind_back(steps)
+            case _:
+                raise AssertionError(f"{step} in an inverse")
+
+    def _unless_lost(self, name: str, task: Keys) -> Keys:
+        """A replica that cannot be stopped, or gives its state back to no process, must not serve."""
+        if replica_of(name) in self.lost:
+            return
+        try:
+            yield from task
+        except StepFailed:
+            self.lost.add(replica_of(name))
+            self._deployment.lost.add(replica_of(name))
+
+    def _rebind_back(self, steps: tuple[Step, ...]) -> Keys:
+        committed = self.committed
+        if committed:
+            self._adopt(self.old)
+        else:
+            for node, process in list(self._replaced.items()):
+                self._put_beside(node, self._staged)
+                self._put_in_place(node, process)
+            self._replaced.clear()
+        yield from self._rebinding.send(self._rebinding.changes(steps, committing=True), STEP_SECONDS_MAX)
+        if committed:
+            yield from self._watch()  # before those die that are watched now
+
+    def _shut_lost(self) -> Keys:
+        """Before the way back from a graph that serves: what is lost may live and serve, and must not."""
+        deployment = self._deployment
+        if deployment.leader in self.lost and not replication_of(self.new.ftm):
+            self.lost |= set(REPLICAS)  # no other replica has its state
+            deployment.lost |= self.lost
+        for replica in sorted(self.lost & deployment.slots.keys()):
+            deployment.shut_replication(deployment.slots[replica])
+        if deployment.leader not in self.lost and self.lost:
+            # A leader that waits for a lost backup to read must not wait on.
+            unbinds = [Unbind(f"{deployment.leader}/{p}", port) for p, port in replication_of(self.new.ftm)]
+            rebinding = Rebinding(deployment, None, self.new, {}, self.lost)
+            yield from rebinding.send(rebinding.changes(unbinds, committing=True), STEP_SECONDS_MAX)
+
+    def _end_staged(self, nodes: Iterable[str]) -> Keys:
+        """End them, and wait: one that lived a moment longer would take mail that is for others.
+
+        One that does not die within the time is let be.
+        """
+        processes = [self._staged.pop(node) for node in nodes if node in self._staged]
+        living = [process for process in processes if process.alive]
+        for process in living:
+            end(process)
+        with suppress(StepFailed):
+            yield Wait(frozenset(("died", p.name, p.pid) for p in living), seconds=STEP_SECONDS_MAX)
+
+    def _resume_living(self, bricks: Iterable[str]) -> None:
+        """What was suspended goes on, but for a lost replica."""
+        self.undone_ns = self._support.loop.now_ns()
+        for brick in bricks:
+            if replica_of(brick) not in self.lost:
+                with suppress(StepFailed):
+                    self._deployment.order_to(self._rebinding.host(brick), control.Resume)
+
+
+def end(process: Process) -> None:
+    """It dies, and its death is no news."""
+    process.kind = ProcessKind.KILLED
+    process.kill()
+
+
+def _rebinds(step: Step) -> bool:
+    """Whether `step` is about channels and places."""
+    if isinstance(step, Together):
+        return not all(isinstance(inner, Resume) for inner in step.steps)
+    return isinstance(step, Bind | Unbind | Exchange)
