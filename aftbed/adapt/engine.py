@@ -20,8 +20,8 @@ from collections.abc import Mapping
 from enum import auto
 from typing import ClassVar, Final
 
-from aftbed.adapt.plan import plan, target, updated
-from aftbed.adapt.scriptcheck import refusals
+from aftbed.adapt.planner import plan, target, updated
+from aftbed.adapt.script_check import refusals
 from aftbed.core.brick import (
     CONTROL,
     DEADLINE_PASSED,

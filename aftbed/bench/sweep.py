@@ -17,7 +17,7 @@ from typing import Final
 
 import msgspec
 
-from aftbed.adapt.plan import APPLICATION
+from aftbed.adapt.planner import APPLICATION
 from aftbed.bench import ballast
 from aftbed.bench.adaptation import adapted
 from aftbed.bench.cycle import ring_p50_us

@@ -14,10 +14,10 @@ from typing import Final
 
 import msgspec
 
-from aftbed.adapt.bricks import load_application
-from aftbed.adapt.plan import APPLICATION
+from aftbed.adapt.commands import read
+from aftbed.adapt.planner import APPLICATION
+from aftbed.adapt.plugins import load_application
 from aftbed.adapt.suitability import AMPLE, FaultModel, problems
-from aftbed.adapt.words import read
 from aftbed.campaign.experiment import Result
 from aftbed.campaign.ledger import Ledger
 from aftbed.campaign.statistics import Interval, proportion

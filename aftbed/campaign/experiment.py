@@ -15,7 +15,7 @@ from typing import Final
 
 import msgspec
 
-from aftbed.adapt.schedule import scheduled
+from aftbed.adapt.commands import scheduled
 from aftbed.core.errors import ConfigError
 from aftbed.core.graph import Graph
 from aftbed.core.messages import Scheduled
@@ -26,6 +26,7 @@ from aftbed.judge.checks import Evidence, Requests
 from aftbed.judge.outcome import FAILED, OUTCOMES, UNKNOWN, outcome_of, worst
 from aftbed.judge.record import RunEnd, RunRecord, read_record, record_of
 from aftbed.judge.verdict import Breach, Verdict, evidence_of, judge
+from aftbed.runtime.interface import BUS, LIGHT
 from aftbed.runtime.sim.world import Setup, simulate
 from aftbed.runtime.unix import launch as unix_launch
 from aftbed.runtime.unix import linux
@@ -33,7 +34,6 @@ from aftbed.runtime.unix.bus_fault_names import with_names_resolved
 from aftbed.runtime.unix.launch import launch, options_for
 from aftbed.runtime.unix.options import CarRun, LoadRun, Work
 from aftbed.runtime.unix.prefault import Area
-from aftbed.runtime.zygotes import BUS, LIGHT
 from aftbed.search.shrink import shrink
 from aftbed.vehicle.aeb.function import default_application
 from aftbed.vehicle.plant import VehicleResult

@@ -18,7 +18,7 @@ from typing import Final
 import msgspec
 
 import aftbed
-from aftbed.adapt.schedule import scheduled
+from aftbed.adapt.commands import scheduled
 from aftbed.campaign.experiment import Experiment, faults_of
 from aftbed.campaign.spec import ANY, AdaptationEntry, FaultEntry, Spec, System, Value
 from aftbed.core.errors import ConfigError, unknown

@@ -16,16 +16,15 @@ import msgspec
 import typer
 import yaml
 
-from aftbed.adapt import schedule
-from aftbed.adapt.bricks import load_application
+from aftbed.adapt import commands
+from aftbed.adapt.commands import Wish, goal_of, led_to
 from aftbed.adapt.engine import script_for
-from aftbed.adapt.plan import APPLICATION, Plan, target
-from aftbed.adapt.plan import plan as plan_between
-from aftbed.adapt.schedule import goal_of, led_to
-from aftbed.adapt.scriptcheck import refusals
-from aftbed.adapt.scriptfile import ScriptFile, mapping, phases, refuse, script_from, step
+from aftbed.adapt.planner import APPLICATION, Plan, target
+from aftbed.adapt.planner import plan as plan_between
+from aftbed.adapt.plugins import load_application
+from aftbed.adapt.script_check import refusals
+from aftbed.adapt.script_file import ScriptFile, mapping, phases, refuse, script_from, step
 from aftbed.adapt.suitability import remarks, unsuitable
-from aftbed.adapt.words import Wish
 from aftbed.cli.options import Json, Recipe, Run, takes
 from aftbed.cli.views import EndedAdaptation, history_lines
 from aftbed.core.application import Characteristics
@@ -160,7 +159,7 @@ def scheduled(texts: tuple[str, ...], start: Graph, recipe: str, *, force: bool)
     """The adaptations of `--adapt`, each checked on the graph that it will find. Raises ConfigError."""
     judge = functools.partial(_refuse_unsuitable, force=force)
     try:
-        return schedule.scheduled(texts, start, recipe, resolve=_source_here, judge=judge)
+        return commands.scheduled(texts, start, recipe, resolve=_source_here, judge=judge)
     except ConfigError as error:
         raise ConfigError(f"--adapt {error}") from error
 

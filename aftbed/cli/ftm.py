@@ -12,7 +12,7 @@ import msgspec
 import psutil
 import typer
 
-from aftbed.adapt.bricks import load_application
+from aftbed.adapt.plugins import load_application
 from aftbed.adapt.suitability import (
     TABLE,
     Demand,

@@ -20,7 +20,7 @@ from msgspec.structs import replace
 from rich.console import Console
 from rich.table import Table
 
-from aftbed.adapt import words
+from aftbed.adapt import commands
 from aftbed.cli.adapt import scheduled
 from aftbed.cli.options import RATE_HZ_MAX, SEED_MAX, Json, check_seed, jobs_of, takes
 from aftbed.cli.views import Bar, EndedAdaptation, history_lines, show_verdict, spaced
@@ -254,7 +254,7 @@ def _adaptations(given: SimArguments, graph: Graph) -> tuple[Scheduled, ...]:
 
 def _forced(text: str, recipe: str) -> Scheduled:
     """An adaptation that is not checked here: the Engine may refuse it when it begins."""
-    timed = words.read(text)
+    timed = commands.read(text)
     if timed.wish.verb == "decompose":
         raise ConfigError(f"--adapt {text!r}: with --force, the whole of what will run is named: to EXPR")
     build(timed.wish.name, DEFAULT.placement)

@@ -15,7 +15,7 @@ from typing import Final
 
 import msgspec
 
-from aftbed.adapt.bricks import load_application
+from aftbed.adapt.plugins import load_application
 from aftbed.core.application import Application
 from aftbed.core.errors import PeerError
 from aftbed.core.events import Event

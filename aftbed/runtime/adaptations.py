@@ -20,12 +20,12 @@ from aftbed.core.script import Phase, Script, bricks_changed
 from aftbed.runtime import control
 from aftbed.runtime.deployment import Deployment, Keys
 from aftbed.runtime.fault_controller import FaultController
-from aftbed.runtime.jobs import Wait
 from aftbed.runtime.script_executor import Execution, ScriptExecutor
+from aftbed.runtime.tasks import Wait
 
 CLIENT: Final = "client"
 ENGINE: Final = "engine"
-REPLACE: Final = "replace "  # begins the names of jobs that hand channels out
+REPLACE: Final = "replace "  # begins the names of tasks that hand channels out
 RETRY_SECONDS: Final = 0.01
 RETRIES_MAX: Final = 100
 
@@ -123,7 +123,7 @@ class Adaptations:
         if now is not None and now.phase is Phase.PREPARE:
             now.spoiled = reason
             if not now.ended:
-                self._loop.jobs.cancel(f"adapt {now.phase.value}", reason)
+                self._loop.tasks.cancel(f"adapt {now.phase.value}", reason)
 
     # -- asked for ----------------------------------------------------------------------------
 
@@ -136,7 +136,7 @@ class Adaptations:
                 " wait for its end (aftbed adapt history)"
             )
         alone = len(deployment.slots) > 1 and not deployment.backup
-        replacing = any(job.startswith(REPLACE) for job in self._loop.jobs.names())
+        replacing = any(job.startswith(REPLACE) for job in self._loop.tasks.names())
         if self._executor.busy or alone or replacing or not deployment.lives(ENGINE):
             if deployment.graph.ftm == "none" or not retries or not deployment.leader:
                 raise ConfigError(
@@ -229,7 +229,7 @@ class Adaptations:
         }
         if phase in (Phase.COMMIT, Phase.UNDO):
             self._executor.held = True
-        self._loop.jobs.start(
+        self._loop.tasks.start(
             f"adapt {phase.value}", phases[phase](), lambda failure: self._ended(now, failure)
         )
 

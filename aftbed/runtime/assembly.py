@@ -14,7 +14,7 @@ from typing import Final, TypeVar
 
 import msgspec
 
-from aftbed.adapt.bricks import LoadModule, load_application, make_brick
+from aftbed.adapt.plugins import LoadModule, load_application, make_brick
 from aftbed.core.application import Application
 from aftbed.core.brick import Brick, Effect
 from aftbed.core.errors import ConfigError

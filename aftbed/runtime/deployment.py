@@ -1,24 +1,116 @@
-"""The deployed graph: which process hosts which bricks, which channels there are, and who leads.
+"""The deployed graph: which process hosts which bricks, which channels there are, which replica leads.
 
-It knows how to give a new process its ends of the channels, which is all that "binding" means here,
-and how to replace a process that belongs to no replica.
+The executive owns both ends of every channel and hands them out, so channels outlive nodes: what is queued
+while a node is suspended, killed or replaced stays queued. To bind a process is to give it its ends. A
+process that belongs to no replica (Client, Proxy, Watchdogs, Recovery, Engine) is replaced in its place.
+
+A chain is sequential, so the nodes of a replica share a core; the other replica has another one. Client and
+Proxy are pinned beside the leader, a Watchdog to another core than the replica that it watches, and Recovery
+to another one than the leader: a core on which a replica has died is busy with taking it down for a while.
 """
 
+import itertools
 from collections.abc import Callable, Container, Generator, Iterable
 from typing import Final
 
 import msgspec
 
 from aftbed.core.errors import StepFailed
-from aftbed.core.graph import STAGED, Graph
+from aftbed.core.graph import STAGED, Graph, Link
 from aftbed.ftm.compose import REPLICAS
 from aftbed.ftm.failover import HANG_DEADLINE_NS
 from aftbed.runtime import control
-from aftbed.runtime.channels import Channels
-from aftbed.runtime.cores import Cores
-from aftbed.runtime.interface import Channel, Process, ProcessKind, Support
-from aftbed.runtime.jobs import STEP_SECONDS_MAX, Key, Wait
-from aftbed.runtime.zygotes import BUS, LIGHT
+from aftbed.runtime.interface import BUS, LIGHT, Channel, Process, ProcessKind, Support
+from aftbed.runtime.tasks import STEP_SECONDS_MAX, Key, Wait
+
+ChannelKey = tuple[str, str, str]  # source, its port, sink
+
+
+class Channels:
+    """All channels between nodes, found by their ends."""
+
+    def __init__(self, make: Callable[[Link], Channel]) -> None:
+        self._make = make
+        self.beside: dict[ChannelKey, Channel] = {}  # of the graph to be, or of the one before
+        self._all: dict[ChannelKey, Channel] = {}
+
+    def renew(self, link: Link) -> Channel:
+        """A fresh channel for `link`; the old one is let go."""
+        key = (link.source, link.source_port, link.sink)
+        old = self._all.pop(key, None)
+        if old is not None:
+            old.close()
+        channel = self._all[key] = self._make(link)
+        return channel
+
+    def make_beside(self, link: Link) -> Channel:
+        """The channel of `link`, which the graph that runs does not have; a fresh one, if need be."""
+        key = (link.source, link.source_port, link.sink)
+        if key not in self.beside:
+            self.beside[key] = self._make(link)
+        return self.beside[key]
+
+    def adopt(self, links: Iterable[Link]) -> None:
+        """From now on the graph that runs has these links; what it does not have stays beside, open."""
+        kept = {(k.source, k.source_port, k.sink) for k in links}
+        known = self._all | self.beside
+        self._all = {key: channel for key, channel in known.items() if key in kept}
+        self.beside = {key: channel for key, channel in known.items() if key not in kept}
+
+    def close_beside(self) -> None:
+        """Let go of all that the graph that runs does not have."""
+        for channel in self.beside.values():
+            channel.close()
+        self.beside = {}
+
+    def touching(self, bricks: frozenset[str]) -> list[Channel]:
+        """Those with an end at one of `bricks`."""
+        return [c for c in self._all.values() if c.link.source in bricks or c.link.sink in bricks]
+
+    def into(self, brick: str) -> list[Channel]:
+        """Those that lead to `brick`."""
+        return [c for c in self._all.values() if c.link.sink == brick]
+
+    def get(self, source: str, port: str, sink: str) -> Channel | None:
+        """The channel from `port` of `source` to `sink`."""
+        return self._all.get((source, port, sink))
+
+    def items(self) -> list[tuple[tuple[str, str, str], Channel]]:
+        """All of them, each with its source, port and sink."""
+        return list(self._all.items())
+
+    def drop(self, channel: Channel) -> None:
+        """Let go of `channel`."""
+        link = channel.link
+        self._all.pop((link.source, link.source_port, link.sink), None)
+        channel.close()
+
+    def __len__(self) -> int:
+        return len(self._all)
+
+
+BESIDE_LEADER: Final = ("client", "proxy")
+
+
+class Cores:
+    """`cpus` are those that may be used; None leaves it all to the kernel."""
+
+    def __init__(self, cpus: list[int] | None) -> None:
+        self._of_replica = dict(zip(REPLICAS, itertools.cycle(cpus), strict=False)) if cpus else {}
+
+    def of(self, node: str, hosted: tuple[str, ...], leader: str) -> int | None:
+        """The core of `node`, which hosts these bricks, while `leader` leads."""
+        if node.endswith("/watchdog"):
+            return self._other_than(node.partition("/")[0])
+        if hosted and all("/" in brick for brick in hosted):
+            return self._of_replica.get(hosted[0].partition("/")[0])
+        if node in BESIDE_LEADER:
+            return self._of_replica.get(leader)
+        return self._other_than(leader)
+
+    def _other_than(self, replica: str) -> int | None:
+        return next((cpu for name, cpu in self._of_replica.items() if name != replica), None)
+
 
 WATCHED_KINDS: Final = ("client", "proxy", "watchdog", "recovery", "engine")
 

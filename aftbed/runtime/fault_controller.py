@@ -31,7 +31,7 @@ from aftbed.inject.targets import Roles, TargetProcess
 from aftbed.runtime import control
 from aftbed.runtime.deployment import Deployment, Keys
 from aftbed.runtime.interface import Met, Process, SharedMemory
-from aftbed.runtime.jobs import Key, Wait
+from aftbed.runtime.tasks import Key, Wait
 
 FIRST_FAULT: Final = 1_000_001  # numbers of faults are apart from the tokens of orders
 
@@ -141,7 +141,7 @@ class FaultController:
         self._run(injection, self._begin(injection), lambda failure: None)
 
     def _run(self, injection: RunInjection, steps: Keys, on_end: Callable[[str], None]) -> None:
-        self._loop.jobs.start(f"fault {injection.fault}", steps, on_end)
+        self._loop.tasks.start(f"fault {injection.fault}", steps, on_end)
 
     def _met(self, injection: RunInjection, met: Met) -> None:
         """Its condition holds."""

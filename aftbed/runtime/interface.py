@@ -7,15 +7,19 @@ made, how mail travels, what a moment is.
 
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from enum import Enum
-from typing import NamedTuple, Protocol
+from typing import Final, NamedTuple, Protocol
 
 from aftbed.core.events import Event
 from aftbed.core.graph import Link
 from aftbed.core.journal import Record
 from aftbed.inject.kind import BusReceipt, FaultKind
 from aftbed.runtime.control import ToNode
-from aftbed.runtime.jobs import Jobs, Key, Wait
+from aftbed.runtime.tasks import Key, Tasks, Wait
 from aftbed.vehicle.condition import Condition
+
+# Zygotes, by what their spares can host: a node's modules must be imported before it is forked.
+LIGHT: Final = "zygote"  # bricks
+BUS: Final = "zygote.bus"  # and CAN
 
 
 class End(Protocol):
@@ -180,7 +184,7 @@ class Journal(Protocol):
 class Loop(Protocol):
     """Time, and what is to happen in it."""
 
-    jobs: Jobs
+    tasks: Tasks
 
     def now_ns(self) -> int:
         """Monotonic."""

@@ -18,7 +18,7 @@ from aftbed.ftm.registry import KINDS
 from aftbed.runtime import control
 from aftbed.runtime.deployment import Deployment, Keys, replica_of
 from aftbed.runtime.interface import Channel, Process
-from aftbed.runtime.jobs import Key
+from aftbed.runtime.tasks import Key
 
 Ends = dict[tuple[str, str], int]  # brick, port -> descriptor, or NOWHERE
 PortOrder = tuple[tuple[control.Port, ...], tuple[control.Port, ...], tuple[int, ...]]  # in, out, descriptors

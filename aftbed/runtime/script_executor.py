@@ -13,7 +13,7 @@ from contextlib import suppress
 from hashlib import blake2b
 from typing import Final, assert_never
 
-from aftbed.adapt.plan import drains
+from aftbed.adapt.planner import drains
 from aftbed.core import messages
 from aftbed.core.errors import StepFailed
 from aftbed.core.events import Event
@@ -52,12 +52,10 @@ from aftbed.core.script import (
 from aftbed.ftm.compose import REPLICAS, STATEFUL, replication_of
 from aftbed.ftm.registry import KINDS
 from aftbed.runtime import control
-from aftbed.runtime.cores import BESIDE_LEADER
-from aftbed.runtime.deployment import HANG_NS, Deployment, Keys, Slot, replica_of
-from aftbed.runtime.interface import Channel, Process, ProcessKind
-from aftbed.runtime.jobs import Key, Wait, run_after_first_yield
+from aftbed.runtime.deployment import BESIDE_LEADER, HANG_NS, Deployment, Keys, Slot, replica_of
+from aftbed.runtime.interface import LIGHT, Channel, Process, ProcessKind
 from aftbed.runtime.rebinding import Rebinding
-from aftbed.runtime.zygotes import LIGHT
+from aftbed.runtime.tasks import Key, Wait, run_after_first_yield
 
 # How long a step may take. Birth has a limit of its own (`deployment`).
 STAGE_SECONDS_MAX: Final = 5.0  # a module of the user is imported and tested meanwhile

@@ -16,7 +16,7 @@ from typing import Final, NamedTuple
 
 import msgspec
 
-from aftbed.adapt.plan import plan, target
+from aftbed.adapt.planner import plan, target
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.events import Event
 from aftbed.core.graph import STAGED

@@ -4,7 +4,7 @@ from functools import cache
 from itertools import product
 from typing import Final, NamedTuple
 
-from aftbed.adapt.plan import Plan, plan
+from aftbed.adapt.planner import Plan, plan
 from aftbed.core.graph import PLACEMENTS
 from aftbed.core.script import RECIPES
 from aftbed.ftm.compose import EXPRESSIONS, NONE, REPLICAS, build, replication_of

@@ -6,7 +6,7 @@ import msgspec
 import pytest
 from plans import CASES, Case
 
-from aftbed.adapt.plan import drains
+from aftbed.adapt.planner import drains
 from aftbed.core.graph import BrickSpec, Graph, Link
 from aftbed.core.script import RECIPES, Layout, Step, applied, flat, inverse, reversible
 from aftbed.ftm.registry import KINDS

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aftbed.adapt.bricks import load_application
+from aftbed.adapt.plugins import load_application
 from aftbed.bench import ballast
 from aftbed.core.application import Application
 from aftbed.core.errors import ConfigError, PeerError

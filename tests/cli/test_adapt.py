@@ -11,8 +11,8 @@ import pytest
 import yaml
 from fakerun import CAUTIOUS, CLOSED, OUTCOME, RANDOM, VARIANTS, Call, FakeRun, Output
 
-from aftbed.adapt.plan import APPLICATION, plan, updated
-from aftbed.adapt.scriptfile import ScriptFile, mapping, script_from
+from aftbed.adapt.planner import APPLICATION, plan, updated
+from aftbed.adapt.script_file import ScriptFile, mapping, script_from
 from aftbed.cli.adapt import WIDTH
 from aftbed.core.messages import Goal
 from aftbed.core.script import Script, Stage, flat

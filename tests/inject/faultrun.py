@@ -17,7 +17,7 @@ from aftbed.inject.model import Fault, parse
 from aftbed.runtime import control
 from aftbed.runtime.fault_controller import FaultController
 from aftbed.runtime.interface import ProcessKind
-from aftbed.runtime.jobs import Wait
+from aftbed.runtime.tasks import Wait
 from aftbed.runtime.unix.event_loop import Loop
 from aftbed.runtime.unix.journal_files import Journal
 from aftbed.runtime.unix.support import Support

@@ -76,9 +76,7 @@ def test_without_pyarrow_the_error_says_what_to_install() -> None:
 import sys
 sys.modules["pyarrow"] = None  # as if it were not installed
 from pathlib import Path
-from aftbed.campaign.ledger import Ledger
 from aftbed.report.export import write_parquet
-from aftbed.core.errors import ConfigError
 try:
     write_parquet(None, Path("r.parquet"))
 except ConfigError as error:

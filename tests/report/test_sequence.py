@@ -5,7 +5,7 @@ from xml.etree import ElementTree
 
 import pytest
 
-from aftbed.adapt.schedule import scheduled
+from aftbed.adapt.commands import scheduled
 from aftbed.core.script import RECIPES
 from aftbed.ftm.compose import build
 from aftbed.inject.crash import Crash

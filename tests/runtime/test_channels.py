@@ -9,7 +9,7 @@ from typing import Final
 import pytest
 
 from aftbed.core.graph import Link
-from aftbed.runtime.channels import Channels
+from aftbed.runtime.deployment import Channels
 from aftbed.runtime.unix.transport import NUDGE, Channel
 
 LINK: Final = Link("a/after", "aft2aft", "b/after", "aft2aft")

@@ -3,7 +3,7 @@
 import msgspec
 import pytest
 
-from aftbed.adapt.bricks import load, load_application, make_brick
+from aftbed.adapt.plugins import load, load_application, make_brick
 from aftbed.core.brick import Brick, Effect, Send
 from aftbed.core.errors import ConfigError
 from aftbed.core.graph import BrickSpec, Graph, Kind

@@ -5,7 +5,7 @@ from random import Random
 
 import pytest
 
-from aftbed.adapt.bricks import make_brick
+from aftbed.adapt.plugins import make_brick
 from aftbed.core.brick import Brick, Effect, Note
 from aftbed.core.graph import BrickSpec
 from aftbed.core.messages import AnyMessage

@@ -23,7 +23,7 @@ from aftbed.judge.outcome import outcome_of
 from aftbed.judge.record import record_of, service_struck_down
 from aftbed.judge.verdict import breaches, evidence_of
 from aftbed.runtime.adaptations import Outcome
-from aftbed.runtime.conductor import ScriptRun
+from aftbed.runtime.run_controller import ScriptRun
 from aftbed.runtime.sim.world import Run, Setup, simulate
 from aftbed.vehicle.aeb.function import default_application
 

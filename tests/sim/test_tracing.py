@@ -21,7 +21,6 @@ SWARM = range(8)
 HASH_SEEDS = ("0", "1", "12345")
 HASHED = f"""
 import hashlib
-from aftbed.search.swarm import drawn
 from aftbed.runtime.sim.trace import lines, traced
 found = hashlib.sha256()
 for seed in {SWARM!r}:

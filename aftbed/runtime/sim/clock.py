@@ -10,8 +10,8 @@ from random import Random
 from typing import Final, Protocol
 
 from aftbed.core.errors import StepFailed
-from aftbed.runtime.jobs import Jobs
 from aftbed.runtime.sim.hops import HOP_QUANTILES_NS
+from aftbed.runtime.tasks import Tasks
 
 START_NS: Final = 1_000_000_000  # so that no time is 0, which means "never" in some places
 HOP_BITS: Final = 7
@@ -41,7 +41,7 @@ class Clock:
         self.heap: list[tuple[int, int, Call]] = []
         self.count = 0  # events planned so far: breaks ties
         self.chance = chance
-        self.jobs = Jobs(self.now_ns)
+        self.tasks = Tasks(self.now_ns)
         self._expiry_ns: int | None = None
 
     def now_ns(self) -> int:
@@ -102,7 +102,7 @@ class Clock:
 
     def watch_jobs(self) -> None:
         """Have what is past its deadline fail: planned anew whenever a job has begun to wait."""
-        due = self.jobs.deadline_ns()
+        due = self.tasks.deadline_ns()
         if due is None or (self._expiry_ns is not None and self._expiry_ns <= due):
             return
         self._expiry_ns = due
@@ -110,5 +110,5 @@ class Clock:
 
     def _expire(self) -> None:
         self._expiry_ns = None
-        self.jobs.expire(self.ns)
+        self.tasks.expire(self.ns)
         self.watch_jobs()

@@ -9,10 +9,10 @@ from aftbed.core.errors import PeerError
 from aftbed.ftm.client import Client
 from aftbed.ftm.compose import replication_of
 from aftbed.inject.shared_state import look
-from aftbed.runtime.conductor import Conductor
 from aftbed.runtime.deployment import Deployment
 from aftbed.runtime.devices import CarDevice, Load
 from aftbed.runtime.hosting import digest
+from aftbed.runtime.run_controller import RunController
 from aftbed.runtime.sim.devices import VirtualCarLink
 from aftbed.runtime.sim.node_io import SimNode
 from aftbed.runtime.sim.processes import Process
@@ -51,7 +51,7 @@ def _drive_over(car: CarDevice) -> bool:
     return car.link.over
 
 
-def unrest(conductor: Conductor) -> list[str]:
+def unrest(conductor: RunController) -> list[str]:
     """Why the run has not come to rest."""
     deployment, found = conductor.deployment, []
     node = _client(deployment)
@@ -64,7 +64,7 @@ def unrest(conductor: Conductor) -> list[str]:
         found.append("a script is under way")
     if replication_of(deployment.graph.ftm) and not deployment.backup:
         found.append("no redundancy")
-    found += [f"{name} is under way" for name in deployment.support.loop.jobs.names()]
+    found += [f"{name} is under way" for name in deployment.support.loop.tasks.names()]
     processes = [p for p in deployment.nodes.values() if isinstance(p, Process)]
     found += [f"{p.name} is dead or stopped" for p in processes if p.stopped()][:1]
     return found

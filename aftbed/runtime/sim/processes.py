@@ -15,12 +15,12 @@ from aftbed.runtime import control, interface
 from aftbed.runtime.assembly import Assembler
 from aftbed.runtime.devices import Device
 from aftbed.runtime.interface import ProcessKind
-from aftbed.runtime.jobs import Key, Wait
 from aftbed.runtime.node import Node
 from aftbed.runtime.sim.channels import Channel
 from aftbed.runtime.sim.clock import Clock
 from aftbed.runtime.sim.node_io import SimIO, SimNode
 from aftbed.runtime.sim.shared_memory import SimulatedMemory
+from aftbed.runtime.tasks import Key, Wait
 
 SIGNAL_NS: Final = (5_000, 60_000)
 LIFELINE_NS: Final = (100_000, 300_000)

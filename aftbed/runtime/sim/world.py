@@ -11,7 +11,7 @@ from typing import Final, NoReturn
 
 import msgspec
 
-from aftbed.adapt.bricks import LoadModule
+from aftbed.adapt.plugins import LoadModule
 from aftbed.core.application import Application
 from aftbed.core.graph import Graph, Link
 from aftbed.core.history import History
@@ -24,12 +24,11 @@ from aftbed.inject.model import Fault, FaultReport
 from aftbed.runtime import control
 from aftbed.runtime.adaptations import Outcome
 from aftbed.runtime.assembly import Assembler, MakeSetting
-from aftbed.runtime.conductor import Conductor, ScriptRun
 from aftbed.runtime.deployment import Keys
 from aftbed.runtime.devices import CarDevice, Device, Load, Sensor, resume_client
 from aftbed.runtime.hosting import Hosted, hosted
 from aftbed.runtime.interface import Met, ProcessKind
-from aftbed.runtime.jobs import Wait
+from aftbed.runtime.run_controller import RunController, ScriptRun
 from aftbed.runtime.sim import ending
 from aftbed.runtime.sim.channels import Channel
 from aftbed.runtime.sim.clock import START_NS, Clock
@@ -39,6 +38,7 @@ from aftbed.runtime.sim.givens import Journal, check, graph_of, nothing_off_line
 from aftbed.runtime.sim.node_io import SimIO, SimNode
 from aftbed.runtime.sim.processes import Nursery, Process
 from aftbed.runtime.sim.shared_memory import SimulatedMemory
+from aftbed.runtime.tasks import Wait
 from aftbed.vehicle.aeb.function import default_application
 from aftbed.vehicle.condition import Condition
 from aftbed.vehicle.plant import VehicleResult
@@ -137,7 +137,7 @@ class World:
         self.nursery = Nursery(
             self.loop, assembler, self._make_device, self._ends.__getitem__, self._journal_for
         )
-        self.conductor = Conductor(graph_of(setup.ftm, setup.placement), self, None, self._on_loss)
+        self.conductor = RunController(graph_of(setup.ftm, setup.placement), self, None, self._on_loss)
         self.nursery.on_report = self._on_report
         self.nursery.on_death = self._on_death
         self.nursery.on_end = self._on_end
@@ -300,7 +300,7 @@ class World:
 
     def start(self) -> None:
         """Launch; requests come from here on."""
-        self.loop.jobs.start("launch", self._launch(), self._on_launched)
+        self.loop.tasks.start("launch", self._launch(), self._on_launched)
         self.loop.watch_jobs()
         while not self._launched:
             assert self.loop.step(), f"the launch of {self.setup} ends nowhere"
@@ -317,7 +317,7 @@ class World:
         """Arm one more, now. Raises ConfigError where there is no such fault."""
         check(fault, self.setup.scenario)
         fault.check(self.conductor.deployment.graph)
-        self.loop.jobs.start("inject", self.conductor.faults.arm(fault), lambda failure: None)
+        self.loop.tasks.start("inject", self.conductor.faults.arm(fault), lambda failure: None)
         self.loop.watch_jobs()
 
     def adapt(self, goal: Goal) -> None:

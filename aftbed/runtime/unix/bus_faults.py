@@ -14,7 +14,7 @@ from aftbed.inject.kind import FaultKind
 from aftbed.inject.receipts import ReceiptState
 from aftbed.runtime import control
 from aftbed.runtime.interface import Met
-from aftbed.runtime.jobs import Key, Wait
+from aftbed.runtime.tasks import Key, Wait
 from aftbed.runtime.unix.process_pool import Nursery, Process
 from aftbed.vehicle.condition import Condition
 
@@ -22,7 +22,7 @@ Steps = Generator[Wait, dict[Key, bytes], None]
 
 
 class BusFaults:
-    """Of one run. `settle` wakes the jobs that wait for the hub; `tell` is a line for people."""
+    """Of one run. `settle` wakes the tasks that wait for the hub; `tell` is a line for people."""
 
     def __init__(
         self, nursery: Nursery, settle: Callable[[Key], None], tell: Callable[[str, str], None]

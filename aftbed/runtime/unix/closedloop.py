@@ -121,7 +121,7 @@ def asked_for(policy: str | None, approve: str, ftm: str, *, as_json: bool) -> P
 
 def _unsuitable(expression: str, application: str) -> str:
     """Why `expression` does not suit the function that is protected now; "" if it does."""
-    from aftbed.adapt.bricks import load_application  # noqa: PLC0415 - at the first proposal
+    from aftbed.adapt.plugins import load_application  # noqa: PLC0415 - at the first proposal
     from aftbed.runtime.unix.part import load_module  # noqa: PLC0415
     from aftbed.vehicle.aeb.function import default_application  # noqa: PLC0415
 

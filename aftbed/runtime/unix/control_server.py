@@ -116,7 +116,7 @@ class Questions:
                     answer(control_client.Answer(msgspec.json.encode(self._deployment.graph)))
                 case control_client.Inject(fault):
                     fault.check(self._deployment.graph)
-                    self._loop.jobs.start(
+                    self._loop.tasks.start(
                         "inject",
                         self._faults.arm(fault),
                         lambda failure: answer(
@@ -146,7 +146,7 @@ class Questions:
             "leader": deployment.leader,
             "backup": deployment.backup,
             "epoch": deployment.epoch,
-            "busy": self._loop.jobs.names(),
+            "busy": self._loop.tasks.names(),
             "record": self._options.record,
             "port": self._options.port,
             "vehicle": self._work.telemetry,

@@ -1,4 +1,4 @@
-"""The supervisor's loop: one thread, one epoll, timers, jobs. Off the request path."""
+"""The supervisor's loop: one thread, one epoll, timers, tasks. Off the request path."""
 
 import contextlib
 import heapq
@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 
 from aftbed.core.errors import StepFailed
-from aftbed.runtime.jobs import Jobs
+from aftbed.runtime.tasks import Tasks
 
 
 def _call(call: Callable[[], None]) -> None:
@@ -26,7 +26,7 @@ class Loop:
         self._timers: list[tuple[int, int, Callable[[], None]]] = []
         self._order = itertools.count()
         self._ended = False
-        self.jobs = Jobs(self.now_ns)
+        self.tasks = Tasks(self.now_ns)
 
     def read(self, fd: int, call: Callable[[], None], *, patient: bool = False) -> None:
         """Call `call` whenever `fd` is readable or has ended; if `patient`, after those that are not."""
@@ -66,13 +66,13 @@ class Loop:
                     # A call before this one may have closed `fd`, and its number may be another's now.
                     if reader[0] is turn and self._readers.get(fd) is reader:
                         _call(reader[1])
-            self.jobs.expire(now_ns)
+            self.tasks.expire(now_ns)
             while self._timers and self._timers[0][0] <= now_ns:
                 _call(heapq.heappop(self._timers)[2])
 
     def _patience_seconds(self) -> float:
         dues = [self._timers[0][0]] if self._timers else []
-        job = self.jobs.deadline_ns()
+        job = self.tasks.deadline_ns()
         if job is not None:
             dues.append(job)
         if not dues:

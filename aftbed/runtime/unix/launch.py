@@ -26,6 +26,7 @@ from aftbed.core.errors import ConfigError
 from aftbed.core.messages import Scheduled
 from aftbed.inject.model import Fault
 from aftbed.runtime import control
+from aftbed.runtime.interface import BUS, LIGHT
 from aftbed.runtime.unix import linux, run_directory
 from aftbed.runtime.unix.bus_fault_names import with_names_resolved
 from aftbed.runtime.unix.cleanup import Ledger, Watched, watch
@@ -33,7 +34,6 @@ from aftbed.runtime.unix.options import LoadRun, RunOptions, Work
 from aftbed.runtime.unix.prefault import Area
 from aftbed.runtime.unix.spawn import CONTROL_FD, PRELOADS, Started, start_zygote
 from aftbed.runtime.unix.transport import Line, decode_report
-from aftbed.runtime.zygotes import BUS, LIGHT
 
 END_SECONDS_MAX: Final = 8.0
 KILL_SECONDS_MAX: Final = 1.0

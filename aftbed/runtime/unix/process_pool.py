@@ -17,7 +17,7 @@ import msgspec
 from aftbed.core.errors import StepFailed
 from aftbed.runtime import control, interface
 from aftbed.runtime.interface import ProcessKind
-from aftbed.runtime.jobs import Key, Wait
+from aftbed.runtime.tasks import Key, Wait
 from aftbed.runtime.unix import linux, run_directory
 from aftbed.runtime.unix.cleanup import Ledger
 from aftbed.runtime.unix.event_loop import Loop
@@ -252,7 +252,7 @@ class Nursery:
                 unborn.remove(process)
                 self.parked[name].append(process)
                 self._fill(name)
-                self._loop.jobs.settle(("spare", name, 0))
+                self._loop.tasks.settle(("spare", name, 0))
 
     # -- death --------------------------------------------------------------------------------
 

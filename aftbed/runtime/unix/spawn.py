@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import Final
 
-from aftbed.runtime.zygotes import BUS, LIGHT
+from aftbed.runtime.interface import BUS, LIGHT
 
 ZYGOTE: Final = "aftbed.runtime.unix.zygote"
 CONTROL_FD: Final = 3

@@ -17,11 +17,11 @@ import msgspec
 from aftbed.core.errors import AftbedError
 from aftbed.ftm.compose import build
 from aftbed.runtime import control
-from aftbed.runtime.conductor import Conductor
 from aftbed.runtime.deployment import HANG_NS, Keys
 from aftbed.runtime.hosting import hosted, look_at_states
-from aftbed.runtime.interface import ProcessKind
-from aftbed.runtime.jobs import STATS_JOB
+from aftbed.runtime.interface import BUS, LIGHT, ProcessKind
+from aftbed.runtime.run_controller import RunController
+from aftbed.runtime.tasks import STATS_TASK
 from aftbed.runtime.unix import linux
 from aftbed.runtime.unix.cleanup import Ledger
 from aftbed.runtime.unix.control_server import Questions
@@ -32,7 +32,6 @@ from aftbed.runtime.unix.spawn import Started
 from aftbed.runtime.unix.support import Support
 from aftbed.runtime.unix.transport import Line, decode_order
 from aftbed.runtime.unix.workload import Work
-from aftbed.runtime.zygotes import BUS, LIGHT
 
 TICK_SECONDS: Final = 0.02
 TELL_SECONDS: Final = 0.005
@@ -82,7 +81,7 @@ class Supervisor:
             self.work.bus,
             Path(options.private),
         )
-        self.conductor = Conductor(graph, support, pinned, self._on_loss)
+        self.conductor = RunController(graph, support, pinned, self._on_loss)
         self.deployment, self.faults = self.conductor.deployment, self.conductor.faults
         self.adaptations = self.conductor.adaptations
         self.questions = Questions(
@@ -104,7 +103,7 @@ class Supervisor:
             self.nursery.park(BUS, 2)
         self.questions.listen()
         self.loop.read(self.owner.fileno(), self._on_owner)
-        self.loop.jobs.start("launch", self._launch(), self._launched)
+        self.loop.tasks.start("launch", self._launch(), self._launched)
         self._tick()
         self.loop.run()
         self._teardown()
@@ -174,7 +173,7 @@ class Supervisor:
         self._ending = reason or "done"
         self._finish_reason = reason
         limit_ns = time.monotonic_ns() + round(DRAIN_SECONDS_MAX * 1e9)
-        self.loop.jobs.start("stop", self.work.stop_source(self.deployment), lambda _: None)
+        self.loop.tasks.start("stop", self.work.stop_source(self.deployment), lambda _: None)
         self._drain(limit_ns)
 
     def _drain(self, limit_ns: int) -> None:
@@ -182,16 +181,16 @@ class Supervisor:
         settled = self.work.settled and (self._lost or self.conductor.at_rest())
         if settled and self._looks_left:
             look = look_at_states(self.deployment, self._states)
-            self.loop.jobs.start("states", look, lambda _: self._looked(limit_ns))
+            self.loop.tasks.start("states", look, lambda _: self._looked(limit_ns))
             return
         if self.owner_gone() or settled or time.monotonic_ns() > limit_ns:
             if not settled and not self.owner_gone():
-                self._incomplete = self.loop.jobs.names()
+                self._incomplete = self.loop.tasks.names()
             self.conductor.ending = True
             self.loop.end()
             return
-        if not len(self.loop.jobs):
-            self.loop.jobs.start(STATS_JOB, self.work.wind_up(self.deployment), lambda _: None)
+        if not len(self.loop.tasks):
+            self.loop.tasks.start(STATS_TASK, self.work.wind_up(self.deployment), lambda _: None)
         self.loop.after(DRAIN_SECONDS, lambda: self._drain(limit_ns))
 
     def _looked(self, limit_ns: int) -> None:

@@ -12,8 +12,8 @@ import msgspec
 
 from aftbed.runtime import control
 from aftbed.runtime.deployment import Deployment, Keys
-from aftbed.runtime.interface import ProcessKind
-from aftbed.runtime.jobs import STATS_JOB, Key, Wait
+from aftbed.runtime.interface import BUS, LIGHT, ProcessKind
+from aftbed.runtime.tasks import STATS_TASK, Key, Wait
 from aftbed.runtime.unix.bus_faults import BusFaults
 from aftbed.runtime.unix.devices import LoadOptions
 from aftbed.runtime.unix.event_loop import Loop
@@ -27,7 +27,6 @@ from aftbed.runtime.unix.options import (
     VehicleOptions,
 )
 from aftbed.runtime.unix.process_pool import Nursery, Process
-from aftbed.runtime.zygotes import BUS, LIGHT
 
 ATTACH_SECONDS_MAX: Final = 10.0
 LOAD_POLL_SECONDS: Final = 0.02
@@ -50,7 +49,7 @@ class Work:
         self._options, self._nursery, self._loop = options, nursery, loop
         self._tell, self._finish, self._report_owner = tell, finish, report_owner
         self._services: dict[str, Process] = {}
-        self.bus = BusFaults(nursery, loop.jobs.settle, tell)
+        self.bus = BusFaults(nursery, loop.tasks.settle, tell)
         self._result: object = None
         self._stats: dict[str, object] = {}
         self.telemetry: dict[str, object] | None = None
@@ -140,7 +139,7 @@ class Work:
     def on_report(self, process: Process, kind: str, data: bytes) -> None:
         """What a service says."""
         if kind == "ready":
-            self._loop.jobs.settle(("ready", process.name, 0))
+            self._loop.tasks.settle(("ready", process.name, 0))
         elif kind in control.BUS_REPORTS:
             self.bus.on_report(kind, data)
         elif kind == "telemetry":
@@ -148,7 +147,7 @@ class Work:
             self._report_owner("telemetry", data)
             self._telemetries += 1
             if self._telemetries % CYCLE_EVERY == 0:
-                self._loop.jobs.start(STATS_JOB, self.ask_stats(self._deployment), self._report_cycle)
+                self._loop.tasks.start(STATS_TASK, self.ask_stats(self._deployment), self._report_cycle)
         elif kind == "trouble":
             self._tell("trouble", f"{process.name}: {data.decode()}")
             self._finish(f"{process.name}: {data.decode()}")
@@ -192,7 +191,7 @@ class Work:
             else:
                 self._loop.after(LOAD_POLL_SECONDS, lambda: self._watch_load(deployment))
 
-        self._loop.jobs.start(STATS_JOB, self.ask_stats(deployment), asked)
+        self._loop.tasks.start(STATS_TASK, self.ask_stats(deployment), asked)
 
     def ask_stats(self, deployment: Deployment) -> Keys:
         """Ask the client how far it is."""

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from plans import CASES, RUNNABLE, Case
 
-from aftbed.adapt.plan import APPLICATION, drains, leader_of, plan, target, updated
+from aftbed.adapt.planner import APPLICATION, drains, leader_of, plan, target, updated
 from aftbed.core.errors import ConfigError
 from aftbed.core.graph import PLACEMENTS, Graph
 from aftbed.core.script import (

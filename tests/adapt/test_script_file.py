@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from plans import CASES, Case
 
-from aftbed.adapt.scriptcheck import refusals
-from aftbed.adapt.scriptfile import PORTS, RECOVERY, VERBS, ScriptFile, mapping, refuse, script_from
+from aftbed.adapt.script_check import refusals
+from aftbed.adapt.script_file import PORTS, RECOVERY, VERBS, ScriptFile, mapping, refuse, script_from
 from aftbed.cli.adapt import yaml_lines
 from aftbed.core.errors import ConfigError, ScriptError
 from aftbed.core.graph import BrickSpec

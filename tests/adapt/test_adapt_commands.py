@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aftbed.adapt.words import VERBS, Timed, Wish, goal, read, verb_for
+from aftbed.adapt.commands import VERBS, Timed, Wish, goal, read, verb_for
 from aftbed.core.errors import ConfigError
 from aftbed.core.messages import Goal
 from aftbed.core.script import RECIPES

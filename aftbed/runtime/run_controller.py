@@ -1,8 +1,8 @@
-"""The conductor: what a run does when a brick orders something, or a process speaks or dies.
+"""The controller of a run: handles orders of bricks, reports of processes, and their deaths.
 
-Recovery orders scripts, the Engine the phases of adaptations: they are carried out here, one at a time,
-and whoever ordered hears how it ended. What belongs to no replica (Client, Proxy, Watchdogs, Recovery,
-Engine) is replaced when it dies. None of it is on the request path: while it sleeps, requests flow.
+Recovery orders scripts, the Engine phases of adaptations. They are executed one at a time, and the brick is
+told how each ended. A node of no replica (Client, Proxy, Watchdog, Recovery, Engine) is replaced when it
+dies. The controller is not on the request path: while it sleeps, requests flow.
 """
 
 from collections.abc import Callable
@@ -20,9 +20,8 @@ from aftbed.runtime import control
 from aftbed.runtime.adaptations import CLIENT, ENGINE, REPLACE, Adaptations
 from aftbed.runtime.deployment import HANG_NS, WATCHED_KINDS, Deployment
 from aftbed.runtime.fault_controller import FaultController
-from aftbed.runtime.interface import Process, ProcessKind, Support
+from aftbed.runtime.interface import LIGHT, Process, ProcessKind, Support
 from aftbed.runtime.script_executor import ScriptExecutor
-from aftbed.runtime.zygotes import LIGHT
 
 RETRY_SECONDS: Final = 0.002
 AGAIN_SECONDS: Final = 0.02
@@ -41,7 +40,7 @@ class ScriptRun(msgspec.Struct):
     failure: str = ""
 
 
-class Conductor:
+class RunController:
     """One run. `on_loss` is called when no replica is left and none will come."""
 
     def __init__(
@@ -59,8 +58,8 @@ class Conductor:
 
     def at_rest(self) -> bool:
         """Nothing is under way, and nobody who should serve is missing, as far as is known."""
-        deployment, jobs = self.deployment, self._loop.jobs
-        if self.executor.busy or self.adaptations.busy or len(jobs):
+        deployment, tasks = self.deployment, self._loop.tasks
+        if self.executor.busy or self.adaptations.busy or len(tasks):
             return False
         absent = {
             n for slot in deployment.slots.values() if slot.name != deployment.leader for n in slot.nodes
@@ -77,18 +76,18 @@ class Conductor:
 
     def on_report(self, process: Process, report: msgspec.Struct) -> None:
         """A node has said something."""
-        jobs = self._loop.jobs
+        tasks = self._loop.tasks
         match report:
             case control.Ack(token, data, error):
                 process.assigned()
                 key = ("ack", process.name, token)
                 if error:
                     self._support.tell("refused", f"{process.name}: {error}")
-                    jobs.fail(key, f"{process.name}: {error}")
+                    tasks.fail(key, f"{process.name}: {error}")
                 else:
-                    jobs.settle(key, data)
+                    tasks.settle(key, data)
             case control.Said(brick, messages.Promoted(epoch)):
-                jobs.settle(("promoted", brick, epoch))
+                tasks.settle(("promoted", brick, epoch))
             case control.Said(_, messages.RequestHeld(request_id)):
                 self.adaptations.request_held(request_id)
             case control.Said(_, messages.Adapted() as told):
@@ -122,7 +121,7 @@ class Conductor:
             if failure:
                 self._loop.after(LOSS_SECONDS, self._look_for_loss)
 
-        self._loop.jobs.start(ordered.purpose, self.executor.execute(ordered), ended)
+        self._loop.tasks.start(ordered.purpose, self.executor.execute(ordered), ended)
         if ordered.kind in LOSSES:  # its nodes are killed only when the new leader serves
             tell("alarm", f"{ordered.replica}: {self.deployment.cause_of_loss(ordered.replica)}")
         tell("script", f"{ordered.purpose} ({ordered.replica})")
@@ -135,7 +134,7 @@ class Conductor:
 
     def _rearm(self) -> None:
         if not self.ending:
-            self._loop.jobs.start("rearm", self.faults.rearm(), lambda _: None)
+            self._loop.tasks.start("rearm", self.faults.rearm(), lambda _: None)
 
     def _restock_after(self, scripts: int) -> None:
         """Unless something is under way again: who takes part in that needs the CPUs."""
@@ -164,11 +163,11 @@ class Conductor:
     def on_death(self, process: Process) -> None:
         """A process is dead, and nobody meant it to be unless its kind is `killed`."""
         self._support.journal.write(self._loop.now_ns(), Event.NODE_DIED, 0, process.pid)
-        self._loop.jobs.settle(("died", process.name, process.pid))
+        self._loop.tasks.settle(("died", process.name, process.pid))
         if process.kind is ProcessKind.KILLED or self.ending:
             return
         self._support.tell("died", f"{process.name} (pid {process.pid})")
-        self._loop.jobs.died(process.name)
+        self._loop.tasks.died(process.name)
         if process.kind is ProcessKind.SPARE:
             self._support.nursery.level(LIGHT, self.spares())
         elif process.kind is ProcessKind.NODE and self.replaceable(process.name):
@@ -207,7 +206,7 @@ class Conductor:
         return bool(bricks) and self.deployment.graph.brick(bricks[0]).kind in WATCHED_KINDS
 
     def _replace(self, node: str) -> None:
-        under_way = f"{REPLACE}{node}" in self._loop.jobs.names()
+        under_way = f"{REPLACE}{node}" in self._loop.tasks.names()
         if not self.replaceable(node) or under_way or self.deployment.lives(node):
             return  # the graph that runs by now has no place for it, or it is taken
         if self.adaptations.acting:  # both hand channels out
@@ -228,8 +227,8 @@ class Conductor:
             if node == ENGINE and not failure:
                 self.adaptations.engine_is_new()
             if node == CLIENT and not failure:
-                self._loop.jobs.start("rearm", self.adaptations.client_is_new(), lambda _: None)
+                self._loop.tasks.start("rearm", self.adaptations.client_is_new(), lambda _: None)
             self._support.nursery.level(LIGHT, self.spares())
 
         held = node == CLIENT and self.adaptations.to_come  # until it knows what waits for its requests
-        self._loop.jobs.start(f"{REPLACE}{node}", self.deployment.respawn(node, held=held), ended)
+        self._loop.tasks.start(f"{REPLACE}{node}", self.deployment.respawn(node, held=held), ended)

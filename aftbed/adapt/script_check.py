@@ -20,8 +20,8 @@ from typing import Final
 
 import msgspec
 
-from aftbed.adapt.plan import drains, leader_of
-from aftbed.adapt.scriptfile import ARROW, phases, words
+from aftbed.adapt.planner import drains, leader_of
+from aftbed.adapt.script_file import ARROW, phases, words
 from aftbed.core.errors import unknown
 from aftbed.core.graph import PLACEMENTS, Graph, Link, ends
 from aftbed.core.script import (

@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from plans import CASES, Case
 
-from aftbed.adapt.plan import plan, updated
-from aftbed.adapt.scriptcheck import refusals
+from aftbed.adapt.planner import plan, updated
+from aftbed.adapt.script_check import refusals
 from aftbed.core.script import (
     RECIPES,
     Bind,
