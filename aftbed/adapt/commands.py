@@ -21,13 +21,16 @@ from typing import Final
 
 import msgspec
 
-from aftbed.adapt.planner import plan, target, updated
-from aftbed.core.errors import ConfigError, unknown
+from aftbed.adapt.planner import Plan, plan, plan_of, target, updated
+from aftbed.adapt.script_check import refusals
+from aftbed.adapt.script_file import refuse
+from aftbed.core.errors import ConfigError, ScriptError, unknown
 from aftbed.core.graph import Graph
 from aftbed.core.messages import Goal, Scheduled
-from aftbed.core.script import RECIPES
+from aftbed.core.script import RECIPES, after
 from aftbed.core.units import milliseconds
 from aftbed.ftm.compose import DUPLEX, SIMPLEX, parse
+from aftbed.ftm.registry import KINDS
 
 VERBS: Final = ("to", "switch", "compose", "decompose", "update")
 GRAMMAR: Final = (
@@ -148,8 +151,7 @@ def _within(some: Iterable[str], names: Iterable[str]) -> bool:
     return all(name in rest for name in some)
 
 
-# -- Adaptations that are asked for with a run: words, each for the graph that it will find.
-
+# -- what commands come to ------------------------------------------------------------------------
 
 Resolve = Callable[[str], str]
 Judge = Callable[[Graph, Wish], None]
@@ -183,7 +185,7 @@ def scheduled(
         try:
             timed = read(text)
             goal = goal_of(timed.wish, graph, recipe, resolve)
-            graph = led_to(graph, goal)
+            graph = plan_goal(graph, goal).new
             judge(graph, timed.wish)
         except ConfigError as error:
             raise ConfigError(f"{text!r}: {error}") from error
@@ -207,8 +209,13 @@ def before(one: Scheduled, other: Scheduled) -> bool:
     return not one.at_request and not other.at_request and one.after_ms < other.after_ms
 
 
-def led_to(graph: Graph, goal: Goal) -> Graph:
-    """The graph that `goal` leads to. Raises ConfigError if nothing leads there."""
+def plan_goal(graph: Graph, goal: Goal) -> Plan:
+    """The plan that leads from `graph` to `goal`. Raises ConfigError, with all that is wrong in a script."""
+    if goal.script is not None:
+        found = refusals(graph, goal.script)
+        if found and not goal.file:
+            raise ScriptError(f"the script {goal.script.purpose!r} is refused: {'; '.join(found)}")
+        refuse(goal.file, found)
+        return plan_of(graph, after(graph, goal.script, KINDS), goal.script)
     new = updated(graph, goal.part, goal.source) if goal.part else target(graph, goal.expression)
-    plan(graph, new, goal.recipe)
-    return new
+    return plan(graph, new, goal.recipe)

@@ -1,8 +1,8 @@
 """Adaptation Engine: exchanges bricks while the service runs, as a transaction (paper, III-B).
 
-It plans (graph difference to script), orders one phase after the other from the runtime, and decides after
-each. It keeps nothing that only it knows: the runtime sends a new Engine what the dead one had ordered last,
-and the table goes on from there.
+It is given a plan that was checked (`commands.plan_goal`), orders one phase after the other from the runtime,
+and decides after each. It keeps nothing that only it knows: the runtime sends a new Engine what the dead one
+had ordered last, and the table goes on from there.
 
 | phase that ended | well                                   | not well                     |
 |------------------|----------------------------------------|------------------------------|
@@ -20,12 +20,9 @@ from collections.abc import Mapping
 from enum import auto
 from typing import ClassVar, Final
 
-from aftbed.adapt.planner import plan, target, updated
-from aftbed.adapt.script_check import refusals
 from aftbed.core.brick import (
     CONTROL,
     DEADLINE_PASSED,
-    SAME_STATE,
     BrickAnswer,
     BrickState,
     Choice,
@@ -39,12 +36,9 @@ from aftbed.core.brick import (
     Order,
     Send,
 )
-from aftbed.core.errors import ConfigError
 from aftbed.core.events import Event
-from aftbed.core.graph import Graph
-from aftbed.core.messages import Adapt, Adapted, AnyMessage, Goal, Progress, TakeUp
-from aftbed.core.script import RECIPES, Phase, Script, after, problems
-from aftbed.ftm.registry import KINDS
+from aftbed.core.messages import Adapt, Adapted, AnyMessage, Progress, TakeUp
+from aftbed.core.script import RECIPES, Phase, Script
 
 WINDOW_NS: Final = 100_000_000
 DONE: Final = "done"
@@ -107,22 +101,6 @@ def end_of(phase: Phase, failure: str, script: Script) -> PhaseEnd | None:
     return (_FAILED if failure else _WELL).get(phase)
 
 
-def script_for(graph: Graph, goal: Goal) -> Script:
-    """The script that leads from `graph` to `goal`, checked whole. Raises ConfigError."""
-    if goal.script is not None:
-        found = refusals(graph, goal.script)
-        if found:
-            raise ConfigError(f"the script {goal.script.purpose!r} is refused: {'; '.join(found)}")
-        return goal.script
-    if goal.part:
-        script = plan(graph, updated(graph, goal.part, goal.source), goal.recipe).script
-    else:
-        script = plan(graph, target(graph, goal.expression), goal.recipe).script
-    found = [*problems(script), *after(graph, script, KINDS).problems(KINDS)]
-    assert not found, f"a plan that cannot be carried out: {found}"
-    return script
-
-
 Ended = Progress | TakeUp  # messages that say how a phase ended
 
 
@@ -150,7 +128,6 @@ class AdaptationEngine(Machine):
         self.script: Script | None = None
         self.reason = ""  # of what is being undone
         self.outcome = REFUSED
-        self._refusal = ""
         self._until_ns: int | None = None
 
     def step(self, port: str, msg: AnyMessage | DeadlinePassed, now_ns: int) -> list[Effect]:
@@ -164,14 +141,6 @@ class AdaptationEngine(Machine):
         return effects
 
     # -- questions ----------------------------------------------------------------------------
-
-    def can_be_planned(self, msg: Adapt) -> bool:
-        """Make the script; False, with the reason kept, if there is none."""
-        try:
-            self.script, self._refusal = script_for(msg.graph, msg.goal), ""
-        except ConfigError as error:
-            self._refusal = str(error)
-        return not self._refusal
 
     def phase_end(self, msg: Progress) -> PhaseEnd | None:
         """How the phase ended."""
@@ -190,12 +159,8 @@ class AdaptationEngine(Machine):
 
     def prepare(self, msg: Adapt) -> list[Effect]:
         """Begin adaptation `msg.number`."""
-        self.number, self.reason = msg.number, ""
+        self.number, self.script, self.reason = msg.number, msg.script, ""
         return [Note(Event.ADAPT_PLAN, detail=msg.number), *self._order(Phase.PREPARE)]
-
-    def refuse(self, msg: Adapt) -> list[Effect]:
-        """Nothing was begun."""
-        return [Send(CONTROL, Adapted(msg.number, REFUSED, self._refusal))]
 
     def wait(self, msg: TakeUp) -> list[Effect]:
         """Go on where another Engine ended."""
@@ -264,9 +229,7 @@ class AdaptationEngine(Machine):
     _FINISHED: ClassVar[dict[object, Move]] = {PhaseEnd.FINISHED: (end_done, _S.IDLE)}
     _UNDONE: ClassVar[dict[object, Move]] = {PhaseEnd.UNDONE: (end_undone, _S.IDLE)}
     MOVES: ClassVar[Moves] = {
-        (_S.IDLE, CONTROL, Adapt): Choice(
-            can_be_planned, {True: (prepare, _S.PREPARING), False: (refuse, SAME_STATE)}
-        ),
+        (_S.IDLE, CONTROL, Adapt): (prepare, _S.PREPARING),
         (_S.IDLE, CONTROL, TakeUp): Choice(
             taken_up,
             {

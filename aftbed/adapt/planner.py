@@ -157,6 +157,11 @@ def plan(old: Graph, new: Graph, recipe: str = RECIPES[0]) -> Plan:
     return Plan(old, new, script, *change.names())
 
 
+def plan_of(old: Graph, new: Graph, script: Script) -> Plan:
+    """The Plan of a script that leads from `old` to `new`."""
+    return Plan(old, new, script, *_Change(old, new).names())
+
+
 class _Change:
     """What differs between two graphs."""
 

@@ -1,11 +1,9 @@
 """`aftbed adapt`: change the mechanism, a brick or the function of a live run; and `aftbed run --adapt`.
 
-What can be refused is refused here, before the run is asked: an unknown word, a mechanism that does not suit
-the function (`suitability`), a script with an error. The Engine plans and checks once more when it begins,
-on the graph that runs then.
+An unknown word, and a mechanism that does not suit the function (`suitability`), are refused here. The run
+plans the change on the graph that runs when it begins, checks it, and carries it out or refuses it.
 """
 
-import functools
 import sys
 from collections.abc import Iterator
 from json import dumps
@@ -17,13 +15,11 @@ import typer
 import yaml
 
 from aftbed.adapt import commands
-from aftbed.adapt.commands import Wish, goal_of, led_to
-from aftbed.adapt.engine import script_for
+from aftbed.adapt.commands import Wish, goal_of
 from aftbed.adapt.planner import APPLICATION, Plan, target
 from aftbed.adapt.planner import plan as plan_between
 from aftbed.adapt.plugins import load_application
-from aftbed.adapt.script_check import refusals
-from aftbed.adapt.script_file import ScriptFile, mapping, phases, refuse, script_from, step
+from aftbed.adapt.script_file import ScriptFile, mapping, phases, script_from, step
 from aftbed.adapt.suitability import remarks, unsuitable
 from aftbed.cli.options import Json, Recipe, Run, takes
 from aftbed.cli.views import EndedAdaptation, history_lines
@@ -117,19 +113,16 @@ def script(
     """Carry out a script from a file; all of it is checked before its first step."""
     path = Path(file)
     wanted = _absolute(script_from(read_yaml(path, ScriptFile), file), path.parent)
-    private = run_directory.find(run)
-    graph = _graph_of(private)
-    refuse(file, refusals(graph, wanted))
-    goal = Goal(script=wanted, recipe=wanted.recipe)
-    script_for(graph, goal)
-    raise typer.Exit(_ask(private, goal, as_json=json))
+    goal = Goal(script=wanted, recipe=wanted.recipe, file=file)
+    raise typer.Exit(_ask(run_directory.find(run), goal, as_json=json))
 
 
 def _change(wish: Wish, run: str | None, recipe: str, *, force: bool, as_json: bool) -> None:
     private = run_directory.find(run)
     graph = _graph_of(private)
     goal = goal_of(wish, graph, recipe, _source_here)
-    _refuse_unsuitable(led_to(graph, goal), wish, force=force)
+    application = goal.source if goal.part == APPLICATION else _function_of(graph)
+    _refuse_unsuitable(goal.expression or graph.ftm, application, wish, force=force)
     raise typer.Exit(_ask(private, goal, as_json=as_json))
 
 
@@ -157,29 +150,38 @@ def _ask(private: Path, goal: Goal, *, as_json: bool) -> int:
 
 def scheduled(texts: tuple[str, ...], start: Graph, recipe: str, *, force: bool) -> tuple[Scheduled, ...]:
     """The adaptations of `--adapt`, each checked on the graph that it will find. Raises ConfigError."""
-    judge = functools.partial(_refuse_unsuitable, force=force)
+
+    def judge(new: Graph, wish: Wish) -> None:
+        _refuse_unsuitable(new.ftm, _function_of(new), wish, force=force)
+
     try:
         return commands.scheduled(texts, start, recipe, resolve=_source_here, judge=judge)
     except ConfigError as error:
         raise ConfigError(f"--adapt {error}") from error
 
 
-def _refuse_unsuitable(new: Graph, wish: Wish, *, force: bool) -> None:
-    """Raise ConfigError if the mechanism of `new` does not suit its function, unless `force`."""
+def _function_of(graph: Graph) -> str:
+    return next(b.application for b in graph.bricks if b.part == "server")
+
+
+def _refuse_unsuitable(ftm: str, application: str, wish: Wish, *, force: bool) -> None:
+    """Raise ConfigError if `ftm` does not suit the function, unless `force`.
+
+    This is judged in the command: a class of the user is never loaded in the supervisor.
+    """
     if wish.verb == "decompose" or (wish.verb == "update" and wish.name != APPLICATION):
         return  # the new graph needs no more of the function than the old one
-    declared = _characteristics(new)
-    if reason := unsuitable(new.ftm, declared):
+    declared = _characteristics(application)
+    if reason := unsuitable(ftm, declared):
         if not force:
             raise ConfigError(f"{reason}; --force does it all the same")
         print(f"aftbed: forced: {reason}", file=sys.stderr)
-    for remark in remarks(new.ftm, declared):
+    for remark in remarks(ftm, declared):
         print(f"aftbed: note: {remark}", file=sys.stderr)
 
 
-def _characteristics(graph: Graph) -> Characteristics:
-    """What the function of `graph` declares. Raises ConfigError if it declares nothing."""
-    source = next(b.application for b in graph.bricks if b.part == "server")
+def _characteristics(source: str) -> Characteristics:
+    """What a function declares, `""` for the built-in one. Raises ConfigError if it declares nothing."""
     function = load_application(source, load_module) if source else default_application()
     declared: object = getattr(function, "characteristics", None)
     if not isinstance(declared, Characteristics):
@@ -247,9 +249,14 @@ def plan(
         raise ConfigError("--yaml and --json: one of them is allowed")
     if start is None and placement is not None:
         raise ConfigError("--placement says where --from stands: give --from EXPR too")
-    old = _graph_of(run_directory.find(run)) if start is None else build(start, placement or PLACEMENTS[0])
-    there = plan_between(old, target(old, expr), recipe)
-    back = plan_between(there.new, old, recipe)
+    if start is None:
+        goal = control_client.PlanFor(Goal(expression=expr, recipe=recipe))
+        planned = msgspec.convert(control_client.ask(run_directory.find(run), goal), control_client.Planned)
+        there, back = planned.there, planned.back
+    else:
+        old = build(start, placement or PLACEMENTS[0])
+        there = plan_between(old, target(old, expr), recipe)
+        back = plan_between(there.new, old, recipe)
     if as_yaml:
         print("\n".join(yaml_lines(mapping(there.script))))
     elif json:

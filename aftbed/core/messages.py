@@ -15,7 +15,6 @@ from typing import ClassVar, Final
 import msgspec
 
 from aftbed.core.errors import PeerError
-from aftbed.core.graph import Graph
 from aftbed.core.script import Phase, Script
 
 
@@ -244,13 +243,17 @@ class Situation(Message, frozen=True, array_like=True, gc=False, tag=28):
 
 
 class Goal(msgspec.Struct, frozen=True):
-    """The goal of an adaptation: one of `expression`, `part` with `source`, or `script`."""
+    """The goal of an adaptation: one of `expression`, `part` with `source`, or `script`.
+
+    `file`: where the script was read, for messages to the user.
+    """
 
     expression: str = ""
     part: str = ""
     source: str = ""
     script: Script | None = None
     recipe: str = "drained"
+    file: str = ""
 
 
 class Scheduled(msgspec.Struct, frozen=True):
@@ -262,11 +265,10 @@ class Scheduled(msgspec.Struct, frozen=True):
 
 
 class Adapt(Message, frozen=True, array_like=True, gc=False, tag=40):
-    """Runtime to the Engine: adaptation `number`, from the graph that runs now."""
+    """Runtime to the Engine: adaptation `number`, as it was planned."""
 
     number: int
-    goal: Goal
-    graph: Graph
+    script: Script
 
 
 class Progress(Message, frozen=True, array_like=True, gc=False, tag=41):

@@ -1,8 +1,9 @@
-"""Adaptations of a run: who asks for one, what the Engine orders, how it ended.
+"""Adaptations of a run: requests for them, their plans, the orders of the Engine, how they ended.
 
-The Engine decides, phase by phase; here its orders are carried out, and what it must not forget is kept:
-a new Engine is told what the dead one had ordered last. While a phase acts on what serves, Recovery
-waits; a replica that is lost before the end of the observation undoes the adaptation, then it fails over.
+An adaptation is planned and checked once, when it begins. The Engine decides, phase by phase; its orders are
+executed here, and what it must not forget is kept: a new Engine is told what the dead one had ordered last.
+While a phase acts on what serves, Recovery waits; a replica that is lost before the end of the observation
+undoes the adaptation, then it fails over.
 """
 
 import contextlib
@@ -12,6 +13,9 @@ from typing import Final
 
 import msgspec
 
+from aftbed.adapt.commands import plan_goal
+from aftbed.adapt.engine import REFUSED
+from aftbed.adapt.planner import Plan
 from aftbed.core import messages
 from aftbed.core.errors import ConfigError, StepFailed
 from aftbed.core.events import Event
@@ -54,6 +58,14 @@ class Outcome(msgspec.Struct):
     lost: str = ""  # the replicas that did not serve again, and were left to Recovery, as "a" or "a b"
 
 
+class PlanError(ConfigError):
+    """Nothing leads from the graph that runs to the goal, or its script is refused."""
+
+
+def _named(goal: messages.Goal) -> str:
+    return goal.expression or goal.part or "script"
+
+
 def function_of(graph: Graph) -> str:
     """The protected function of `graph`, "" for the built-in one."""
     return next(b.application for b in graph.bricks if b.part == "server")
@@ -71,10 +83,10 @@ def _spoiled(reason: str) -> Keys:
 class _Current:
     """The one under way."""
 
-    def __init__(self, outcome: Outcome, answer: Answer, began_ns: int, epoch: int) -> None:
+    def __init__(self, outcome: Outcome, answer: Answer, began_ns: int, epoch: int, plan: Plan) -> None:
         self.outcome, self.answer, self.began_ns, self.epoch = outcome, answer, began_ns, epoch
+        self.plan = plan
         self.phase_ns = 0
-        self.script: Script | None = None
         self.phase = Phase.PREPARE
         self.ended, self.failure = False, ""
         self.lost = ""  # a replica
@@ -146,11 +158,22 @@ class Adaptations:
                 )
             self._loop.after(RETRY_SECONDS, lambda: self._ask_again(goal, answer, retries - 1))
             return
-        number = len(self.history) + 1
-        outcome = Outcome(number, goal.expression or goal.part or "script", goal.recipe, deployment.graph.ftm)
+        try:
+            plan = plan_goal(deployment.graph, goal)
+        except ConfigError as error:
+            raise PlanError(str(error)) from error
+        outcome = self._asked(goal)
+        self._current = _Current(outcome, answer, self._loop.now_ns(), deployment.epoch, plan)
+        self._say(messages.Adapt(outcome.number, plan.script))
+
+    def plan(self, goal: messages.Goal) -> Plan:
+        """What would be done, from the graph that runs now. Raises ConfigError."""
+        return plan_goal(self._deployment.graph, goal)
+
+    def _asked(self, goal: messages.Goal) -> Outcome:
+        outcome = Outcome(len(self.history) + 1, _named(goal), goal.recipe, self._deployment.graph.ftm)
         outcome.asked_ms = round((self._loop.now_ns() - self._started_ns) / 1e6, 3)
-        self._current = _Current(outcome, answer, self._loop.now_ns(), deployment.epoch)
-        self._say(messages.Adapt(number, goal, deployment.graph))
+        return outcome
 
     def schedule(self, scheduled: tuple[messages.Scheduled, ...]) -> Keys:
         """Those that were asked for with the run. The Client sends their requests when they have begun."""
@@ -186,11 +209,15 @@ class Adaptations:
     def _ask_again(self, goal: messages.Goal, answer: Answer, retries: int) -> None:
         try:
             self.ask(goal, answer, retries)
-        except ConfigError as error:
-            what = goal.expression or goal.part or "script"
-            outcome = Outcome(0, what, goal.recipe, self._deployment.graph.ftm, "refused", str(error))
-            self._tell("adapted", f"{what}: refused: {error}")
+        except PlanError as error:
+            outcome = self._asked(goal)
+            outcome.outcome, outcome.reason = REFUSED, str(error)
+            self._keep(outcome)
             answer(outcome)
+        except ConfigError as error:
+            ftm = self._deployment.graph.ftm
+            self._tell("adapted", f"{_named(goal)}: refused: {error}")
+            answer(Outcome(0, _named(goal), goal.recipe, ftm, REFUSED, str(error)))
 
     def _say(self, told: messages.Adapt | messages.Progress | messages.TakeUp) -> None:
         try:
@@ -214,8 +241,8 @@ class Adaptations:
             now.failure = "" if phase is Phase.UNDO else now.spoiled
             self._say(messages.Progress(number, phase, now.failure))
             return
-        if now.execution is None or now.script is None:
-            now.execution, now.script = Execution(self._deployment, todo, self._step), todo
+        if now.execution is None:
+            now.execution = Execution(self._deployment, todo, now.plan.new, self._step)
             now.outcome.purpose, now.outcome.ftm = todo.purpose, todo.ftm or self._deployment.graph.ftm
             now.outcome.bricks_total = max(len(g.bricks) for g in (now.execution.old, now.execution.new))
             self._tell("adapt", f"{number}: {todo.purpose} ({todo.recipe})")
@@ -268,14 +295,17 @@ class Adaptations:
         outcome.ftm = self._deployment.graph.ftm
         outcome.application = function_of(self._deployment.graph)
         if now.execution is not None:
-            assert now.script is not None
-            outcome.bricks_changed = bricks_changed(now.execution.old, now.execution.new, now.script)
+            outcome.bricks_changed = bricks_changed(now.execution.old, now.execution.new, now.plan.script)
             outcome.tried, outcome.opened_ns = function_of(now.execution.new), now.execution.turned_ns
             outcome.undone_ns, outcome.lost = now.execution.undone_ns, " ".join(sorted(now.execution.lost))
+        self._keep(outcome)
+        now.answer(outcome)
+
+    def _keep(self, outcome: Outcome) -> None:
         self.history.append(outcome)
         self._support.keep(msgspec.json.encode(outcome))
-        self._tell("adapted", f"{outcome.number}: {outcome.purpose}: {told.outcome} {told.reason}".rstrip())
-        now.answer(outcome)
+        ended = f"{outcome.number}: {outcome.purpose}: {outcome.outcome} {outcome.reason}"
+        self._tell("adapted", ended.rstrip())
 
     # -- what happens meanwhile ---------------------------------------------------------------
 
@@ -284,13 +314,11 @@ class Adaptations:
         now = self._current
         if now is None:
             return
-        if now.script is None:  # it had not even planned
-            self._current = None
-            outcome = now.outcome
-            outcome.outcome, outcome.reason = "refused", "the engine died while it planned: ask again"
-            now.answer(outcome)
+        number, script = now.outcome.number, now.plan.script
+        if now.execution is None and not now.ended:  # it had ordered nothing
+            self._say(messages.Adapt(number, script))
             return
-        self._say(messages.TakeUp(now.outcome.number, now.script, now.phase, now.ended, now.failure))
+        self._say(messages.TakeUp(number, script, now.phase, now.ended, now.failure))
 
     def interrupted(self, replica: str) -> bool:
         """Recovery wants to act on `replica`. True if it must wait, and will be told when it may."""

@@ -43,7 +43,6 @@ from aftbed.core.script import (
     Together,
     Transfer,
     Unbind,
-    after,
     flat,
     inverse,
     problems,
@@ -134,14 +133,23 @@ class ScriptExecutor:
 
 
 class Execution:
-    """One script on its way: what of it was done, and what stands beside the nodes that serve."""
+    """One script on its way: what of it was done, and what stands beside the nodes that serve.
 
-    def __init__(self, deployment: Deployment, script: Script, observe: Observe | None = None) -> None:
+    `new`: the graph that an adaptation leads to. `observe` is called at each of its steps.
+    """
+
+    def __init__(
+        self,
+        deployment: Deployment,
+        script: Script,
+        new: Graph | None = None,
+        observe: Observe | None = None,
+    ) -> None:
         self._deployment, self._support, self.script = deployment, deployment.support, script
         self._observe = observe
         adapts = script.kind is ScriptKind.ADAPTATION
         self.old: Graph = deployment.graph
-        self.new: Graph = after(self.old, script, KINDS) if adapts else self.old
+        self.new: Graph = new or self.old
         self.done: list[Step] = []
         self._staged: dict[str, Process] = {}  # of the new graph, by node: they do not serve
         self._replaced: dict[str, Process] = {}  # of the old graph: they do not serve any more

@@ -2,17 +2,21 @@
 
 from typing import Final
 
+import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from plans import CASES, Case
 
-from aftbed.adapt.commands import VERBS, Timed, Wish, goal, read, verb_for
-from aftbed.core.errors import ConfigError
+from aftbed.adapt.commands import VERBS, Timed, Wish, goal, plan_goal, read, verb_for
+from aftbed.core.errors import ConfigError, ScriptError
 from aftbed.core.messages import Goal
-from aftbed.core.script import RECIPES
-from aftbed.ftm.compose import EXPRESSIONS, NONE, parse
+from aftbed.core.script import RECIPES, Bind, Destroy, Resume, Script, Suspend
+from aftbed.ftm.compose import EXPRESSIONS, NONE, build, parse
 
 RUNNABLE: Final = tuple(e for e in EXPRESSIONS if e != NONE)
+PBR: Final = build("pbr", "process")
+SCRIPT: Final = Case("pbr", "pbr+tr").plan().script
 
 
 # -- reading
@@ -210,3 +214,62 @@ def test_for_every_pair_the_verb_that_is_named_does_it(pair: tuple[str, str]) ->
         assert "aftbed adapt " in str(error.value) and named in str(error.value)
     if right == "decompose":
         assert goal(Wish("decompose"), running).expression == wanted
+
+
+# -- the plan that leads to a goal
+
+
+@given(st.sampled_from(CASES))
+def test_the_plan_to_an_expression_and_the_plan_of_its_script_lead_to_one_graph(case: Case) -> None:
+    plan = case.plan()
+    assert plan_goal(plan.old, Goal(expression=case.new, recipe=case.recipe)) == plan
+    by_hand = plan_goal(plan.old, Goal(script=plan.script))
+    assert by_hand.script == plan.script
+    assert set(by_hand.new.links) == set(plan.new.links) and by_hand.new.nodes == plan.new.nodes
+
+
+@pytest.mark.parametrize(
+    ("goal", "words"),
+    [
+        (Goal(expression="pbrr"), "unknown FTM 'pbrr'; did you mean 'pbr'?"),
+        (Goal(expression="tr+pbr"), "innermost"),
+        (Goal(expression="pbr"), "pbr is what runs already"),
+        (Goal(expression="none"), "neither starts nor ends"),
+        (Goal(expression="lfr", recipe="papr"), "did you mean 'paper'"),
+        (Goal(part="proced", source="x.py:X"), "did you mean 'proceed'"),
+        (Goal(script=msgspec.structs.replace(SCRIPT, commit=SCRIPT.commit[1:])), "resumed, not suspended"),
+        (Goal(script=msgspec.structs.replace(SCRIPT, finish=())), "is not bound"),
+    ],
+)
+def test_a_goal_that_leads_nowhere_is_refused(goal: Goal, words: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        plan_goal(PBR, goal)
+    assert words in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("script", "words"),
+    [
+        (Script("x", "", (), (Suspend("a/protocol"),)), "suspended, not resumed: a/protocol"),
+        (Script("x", "", (), (Destroy("a/proceed"),)), "killed with a request inside: a/proceed"),
+        (
+            Script(
+                "x",
+                "",
+                (),
+                (
+                    Suspend("a/protocol"),
+                    Bind("a/before", "bfr2prd", "b/proceed"),
+                    Resume("a/protocol"),
+                ),
+            ),
+            "a/proceed:bfr2prd is not bound; commit[1]: b/before:bfr2prd is not bound",
+        ),
+    ],
+)
+def test_a_script_written_by_hand_is_checked_whole(script: Script, words: str) -> None:
+    with pytest.raises(ScriptError) as error:
+        plan_goal(PBR, Goal(script=script))
+    assert str(error.value).startswith("the script 'x' is refused: ") and words in str(error.value)
+    with pytest.raises(ScriptError, match=r"^mine\.yaml: "):
+        plan_goal(PBR, Goal(script=script, file="mine.yaml"))

@@ -3,11 +3,10 @@
 from itertools import product
 from typing import Final
 
-import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from plans import CASES, Case
+from plans import Case
 
 from aftbed.adapt.engine import (
     DONE,
@@ -16,21 +15,18 @@ from aftbed.adapt.engine import (
     WINDOW_NS,
     AdaptationEngine,
     EngineState,
-    script_for,
 )
 from aftbed.core.brick import CONTROL, Effect, Note, Order, Send
-from aftbed.core.errors import ConfigError, PeerError
+from aftbed.core.errors import PeerError
 from aftbed.core.events import Event
-from aftbed.core.graph import Graph
-from aftbed.core.messages import Adapt, Adapted, AnyMessage, Goal, Progress, Promote, Rebound, TakeUp
-from aftbed.core.script import Bind, Destroy, Phase, Resume, Script, Suspend
+from aftbed.core.messages import Adapt, Adapted, AnyMessage, Progress, Promote, Rebound, TakeUp
+from aftbed.core.script import Phase
 from aftbed.ftm.compose import build
 
 NUMBER: Final = 7
 NOW_NS: Final = 1_000_000_000
 PBR: Final = build("pbr", "process")
 SCRIPT: Final = Case("pbr", "pbr+tr").plan().script
-GOAL: Final = Goal(expression="pbr+tr")
 PHASES: Final = (Phase.PREPARE, Phase.COMMIT, Phase.FINISH, Phase.UNDO)
 STATES: Final = {
     Phase.PREPARE: EngineState.PREPARING,
@@ -59,7 +55,7 @@ def went(engine: AdaptationEngine, phase: Phase, failure: str = "") -> list[Effe
 def begun() -> AdaptationEngine:
     """An Engine that prepares."""
     engine = AdaptationEngine()
-    tell(engine, Adapt(NUMBER, GOAL, PBR))
+    tell(engine, Adapt(NUMBER, SCRIPT))
     return engine
 
 
@@ -84,7 +80,7 @@ def in_state(state: EngineState) -> AdaptationEngine:
 def test_an_adaptation_that_goes_well() -> None:
     engine = AdaptationEngine()
     assert engine.quiescent()
-    assert tell(engine, Adapt(NUMBER, GOAL, PBR)) == [
+    assert tell(engine, Adapt(NUMBER, SCRIPT)) == [
         Note(Event.ADAPT_PLAN, detail=NUMBER),
         order(Phase.PREPARE),
     ]
@@ -129,36 +125,14 @@ def test_one_that_is_refused_leaves_no_trace_in_the_next() -> None:
     engine = in_state(EngineState.COMMITTING)
     went(engine, Phase.COMMIT, "it broke")
     went(engine, Phase.UNDO)
-    tell(engine, Adapt(NUMBER, GOAL, PBR))
+    tell(engine, Adapt(NUMBER, SCRIPT))
     went(engine, Phase.PREPARE, "no room")
     assert went(engine, Phase.UNDO) == [ended(REFUSED, "no room")]
-    tell(engine, Adapt(NUMBER, GOAL, PBR))
+    tell(engine, Adapt(NUMBER, SCRIPT))
     for phase in (Phase.PREPARE, Phase.COMMIT):
         went(engine, phase)
     engine.wake(NOW_NS)
     assert went(engine, Phase.FINISH) == [ended(DONE)]
-
-
-@pytest.mark.parametrize(
-    ("goal", "words"),
-    [
-        (Goal(expression="pbrr"), "unknown FTM 'pbrr'; did you mean 'pbr'?"),
-        (Goal(expression="tr+pbr"), "innermost"),
-        (Goal(expression="pbr"), "pbr is what runs already"),
-        (Goal(expression="none"), "neither starts nor ends"),
-        (Goal(expression="lfr", recipe="papr"), "did you mean 'paper'"),
-        (Goal(part="proced", source="x.py:X"), "did you mean 'proceed'"),
-        (Goal(script=msgspec.structs.replace(SCRIPT, commit=SCRIPT.commit[1:])), "resumed, not suspended"),
-        (Goal(script=msgspec.structs.replace(SCRIPT, finish=())), "is not bound"),
-    ],
-)
-def test_a_goal_that_leads_nowhere_is_refused_at_once(goal: Goal, words: str) -> None:
-    engine = AdaptationEngine()
-    (send,) = tell(engine, Adapt(NUMBER, goal, PBR))
-    assert isinstance(send, Send) and isinstance(send.message, Adapted)
-    assert (send.message.number, send.message.outcome) == (NUMBER, REFUSED)
-    assert words in send.message.reason
-    assert engine.quiescent()
 
 
 # -- illegal messages
@@ -179,7 +153,7 @@ ANOTHER_PHASE: Final = [
 ILLEGAL: Final = [
     *((EngineState.IDLE, Progress(NUMBER, phase, "")) for phase in PHASES),
     *((state, Progress(NUMBER + 1, phase, "")) for state, phase in product(EngineState, PHASES)),
-    *((state, Adapt(NUMBER + 1, GOAL, PBR)) for state in EngineState if state is not EngineState.IDLE),
+    *((state, Adapt(NUMBER + 1, SCRIPT)) for state in EngineState if state is not EngineState.IDLE),
     *(
         (state, TakeUp(NUMBER, SCRIPT, Phase.COMMIT, False, ""))
         for state in EngineState
@@ -289,40 +263,3 @@ def test_however_often_it_dies_it_ends_once_and_only_as_the_table_says(
                 ends.append(effect.message.outcome)
     assert len(ends) == 1
     assert (ends[0] == DONE) == (not failed)
-
-
-# -- the script that it makes of a goal
-
-
-@given(st.sampled_from(CASES))
-def test_the_script_of_an_expression_is_its_plan(case: Case) -> None:
-    plan = case.plan()
-    assert script_for(plan.old, Goal(expression=case.new, recipe=case.recipe)) == plan.script
-    assert script_for(plan.old, Goal(script=plan.script)) == plan.script
-
-
-@pytest.mark.parametrize(
-    ("script", "words"),
-    [
-        (Script("x", "", (), (Suspend("a/protocol"),)), "suspended, not resumed: a/protocol"),
-        (Script("x", "", (), (Destroy("a/proceed"),)), "killed with a request inside: a/proceed"),
-        (
-            Script(
-                "x",
-                "",
-                (),
-                (
-                    Suspend("a/protocol"),
-                    Bind("a/before", "bfr2prd", "b/proceed"),
-                    Resume("a/protocol"),
-                ),
-            ),
-            "a/proceed:bfr2prd is not bound; commit[1]: b/before:bfr2prd is not bound",
-        ),
-    ],
-)
-def test_a_script_written_by_hand_is_checked_whole(script: Script, words: str) -> None:
-    graph: Graph = PBR
-    with pytest.raises(ConfigError) as error:
-        script_for(graph, Goal(script=script))
-    assert str(error.value).startswith("the script 'x' is refused: ") and words in str(error.value)

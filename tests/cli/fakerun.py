@@ -6,6 +6,8 @@ from typing import Final
 
 import msgspec
 
+from aftbed.adapt.commands import plan_goal
+from aftbed.adapt.planner import plan
 from aftbed.core.errors import ConfigError
 from aftbed.core.graph import Graph
 from aftbed.core.messages import Goal
@@ -62,7 +64,12 @@ class FakeRun:
                 return {}
             case control_client.Adaptations():
                 return {"adaptations": self.history}
+            case control_client.PlanFor(goal):
+                there = plan_goal(self.graph, goal)
+                found = control_client.Planned(there, plan(there.new, there.old, goal.recipe))
+                return msgspec.json.decode(msgspec.json.encode(found))  # type: ignore[no-any-return]
             case control_client.Adapt(goal):
+                plan_goal(self.graph, goal)
                 self.goals.append(goal)
                 self.seconds = seconds
                 if self.outcome["outcome"] == "refused" and self.outcome["reason"]:

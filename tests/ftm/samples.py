@@ -5,7 +5,6 @@ from typing import Final, get_args
 
 from aftbed.core.brick import Brick, Effect, Note, Send
 from aftbed.core.events import Event
-from aftbed.core.graph import Graph
 from aftbed.core.messages import (
     Adapt,
     Again,
@@ -13,7 +12,6 @@ from aftbed.core.messages import (
     CaptureState,
     ChannelEnded,
     Checkpoint,
-    Goal,
     HoldAt,
     Message,
     NodeDied,
@@ -74,7 +72,7 @@ SAMPLES: Final[dict[type, AnyMessage]] = {
         NodeDied("a/after"),
         Pulses({"a/after": 0}),
         Situation("a", 1, "b", 1, 1, (), False),
-        Adapt(1, Goal("lfr"), Graph("pbr", "process", (), (), {})),
+        Adapt(1, Script("pbr to lfr", "", (), ())),
         Progress(1, Phase.PREPARE, ""),
         TakeUp(1, Script("pbr to lfr", "", (), ()), Phase.COMMIT, False, ""),
         HoldAt((1,)),

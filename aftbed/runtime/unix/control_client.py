@@ -9,6 +9,7 @@ from typing import Final
 
 import msgspec
 
+from aftbed.adapt.planner import Plan
 from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.core.messages import Goal
 from aftbed.inject.model import Fault
@@ -44,6 +45,19 @@ class Adapt(msgspec.Struct, frozen=True, tag=True):
     goal: Goal
 
 
+class PlanFor(msgspec.Struct, frozen=True, tag=True):
+    """The plan of an adaptation to `goal`, and that of the way back; nothing is changed. See `Planned`."""
+
+    goal: Goal
+
+
+class Planned(msgspec.Struct, frozen=True):
+    """The answer to PlanFor."""
+
+    there: Plan
+    back: Plan
+
+
 class Adaptations(msgspec.Struct, frozen=True, tag=True):
     """Those that have ended."""
 
@@ -59,7 +73,7 @@ class Answer(msgspec.Struct, frozen=True, tag=True):
     error: str = ""
 
 
-Question = Status | Processes | GraphNow | Inject | Adapt | Adaptations | Stop
+Question = Status | Processes | GraphNow | Inject | Adapt | PlanFor | Adaptations | Stop
 decode_question: Callable[[bytes], Question] = msgspec.msgpack.Decoder(Question).decode
 decode_answer: Callable[[bytes], Answer] = msgspec.msgpack.Decoder(Answer).decode
 

@@ -15,6 +15,7 @@ from typing import Final
 
 import msgspec
 
+from aftbed.adapt.planner import plan
 from aftbed.core.errors import AftbedError, ConfigError
 from aftbed.runtime.adaptations import Adaptations, Outcome
 from aftbed.runtime.deployment import Deployment
@@ -125,6 +126,10 @@ class Questions:
                     )
                 case control_client.Adapt(goal):
                     self._adaptations.ask(goal, lambda outcome: answer(_told(outcome)))
+                case control_client.PlanFor(goal):
+                    there = self._adaptations.plan(goal)
+                    back = plan(there.new, there.old, goal.recipe)
+                    answer(control_client.Answer(msgspec.json.encode(control_client.Planned(there, back))))
                 case control_client.Adaptations():
                     answer(control_client.Answer(self._adaptations.to_json()))
                 case control_client.Stop():
