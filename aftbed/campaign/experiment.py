@@ -24,7 +24,8 @@ from aftbed.ftm.compose import build
 from aftbed.inject.model import Fault, FaultReport, parse
 from aftbed.judge.checks import Evidence, Requests
 from aftbed.judge.outcome import FAILED, OUTCOMES, UNKNOWN, outcome_of, worst
-from aftbed.judge.record import RunEnd, RunRecord, read_record, record_of
+from aftbed.judge.record import RunEnd, RunRecord, read_record
+from aftbed.judge.simulated import record_of
 from aftbed.judge.verdict import Breach, Verdict, evidence_of, judge
 from aftbed.runtime.interface import BUS, LIGHT
 from aftbed.runtime.sim.world import Setup, simulate

@@ -32,7 +32,7 @@ from aftbed.ftm.compose import build
 from aftbed.inject.model import Fault, parse
 from aftbed.inject.targets import OTHERS
 from aftbed.judge.outcome import outcome_of
-from aftbed.judge.record import record_of
+from aftbed.judge.simulated import record_of
 from aftbed.judge.verdict import (
     EXIT_CODES,
     EXIT_INTERRUPTED,

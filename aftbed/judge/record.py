@@ -3,26 +3,19 @@
 The directory of a real run can be read after a `kill -9`, too.
 """
 
-import itertools
 import json
 from pathlib import Path
-from typing import Final
 
 import msgspec
 
 from aftbed.core.errors import ConfigError, PeerError
-from aftbed.core.events import Event
 from aftbed.core.history import History
 from aftbed.core.journal import dropped, entries, records
-from aftbed.core.script import ScriptKind
-from aftbed.ftm.compose import replication_of
 from aftbed.inject.model import FaultReport
 from aftbed.inject.receipts import ReceiptState
-from aftbed.runtime.deployment import replica_of
 from aftbed.runtime.hosting import Hosted
-from aftbed.runtime.sim.world import Run
 from aftbed.runtime.unix.journal_files import contents
-from aftbed.runtime.unix.options import CarRun, LoadRun, RunOptions, Work
+from aftbed.runtime.unix.options import CarRun, RunOptions
 from aftbed.runtime.unix.support import HISTORY_NAME
 from aftbed.vehicle.plant import VehicleResult
 
@@ -137,63 +130,6 @@ def _vehicle(options: RunOptions, end: RunEnd | None) -> VehicleResult | None:
     if end is None or end.result is None or not isinstance(options.work, CarRun):
         return None
     return msgspec.convert(end.result["result"], VehicleResult)
-
-
-# Events of faults that no mechanism outvotes: bits of a checkpoint, or of a reply that is kept.
-UNPROMISED_VALUES: Final = frozenset(
-    event.label
-    for event in (Event.STATE_CAPTURED, Event.STATE_RESTORED, Event.CHECKPOINT_SENT)
-    + (Event.CHECKPOINT_APPLIED, Event.REPLY_STORED, Event.DEDUPE_HIT)
-)
-SINGLE: Final = "single"  # the node of that placement hosts both replicas
-
-
-def record_of(run: Run) -> RunRecord:
-    """The record of a simulated run."""
-    setup, rest = run.setup, run.rest
-    work: Work = CarRun(setup.scenario, None, "") if setup.scenario else LoadRun(setup.count, setup.rate_hz)
-    options = RunOptions("", "", "", setup.ftm, setup.placement, setup.seed, work, setup.faults)
-    end = RunEnd(
-        unfinished=rest.why_not,
-        lost=rest.lost,
-        leader=rest.leader,
-        hosted=rest.hosted,
-        states=rest.states,
-        faults=run.faults,
-    )
-    flips = [f for f in setup.faults if f.action.alters_value]
-    # A switch of the mechanism brings the Servers in line, so with adaptations the values are promised again.
-    values = not setup.adaptations and any(f.event in UNPROMISED_VALUES for f in flips)
-    return RunRecord(
-        options,
-        run.history,
-        end,
-        run.faults,
-        tuple(msgspec.to_builtins(outcome) for outcome in run.adaptations),
-        run.vehicle,
-        failures=run.failures,
-        excuses=Excuses(service_struck_down(run), values, tuple(name for _, name in run.struck)),
-    )
-
-
-def service_struck_down(run: Run) -> bool:
-    """Whether faults struck each replica, the second before redundancy was back from the first."""
-    replicas = {b.replica for b in run.rest.graph.bricks if b.replica and b.part == "server"}
-    renewed = [
-        (s.began_ns, s.ended_ns)
-        for s in run.scripts
-        if s.kind is ScriptKind.NEW_BACKUP and s.ended_ns and not s.failure
-    ]
-    strikes = sorted((t_ns, replica_of(name)) for t_ns, name in run.struck if replica_of(name))
-    if any(name == SINGLE for _, name in run.struck):
-        return True
-    simplex = any(a.goal.expression and not replication_of(a.goal.expression) for a in run.setup.adaptations)
-    if len(replicas) < 2 or simplex:  # for a time there may have been one replica only
-        return bool(strikes)
-    return any(
-        other != replica and not any(first_ns < began and done < second_ns for began, done in renewed)
-        for (first_ns, replica), (second_ns, other) in itertools.combinations(strikes, 2)
-    )
 
 
 def _adaptations(path: Path) -> tuple[dict[str, object], ...]:

@@ -18,12 +18,10 @@ from aftbed.judge.checks import (
     Failover,
     Requests,
 )
-from aftbed.judge.record import RunRecord, record_of
+from aftbed.judge.record import RunRecord
 from aftbed.judge.reference import reference_of
-from aftbed.runtime.sim.world import Run
 from aftbed.runtime.unix.closedloop import Proposed, read_proposals
 from aftbed.runtime.unix.options import CarRun, ReplayRun
-from aftbed.vehicle.aeb.function import default_application
 from aftbed.vehicle.plant import VehicleResult
 
 Word = Literal["pass", "fail", "inconclusive"]
@@ -131,11 +129,6 @@ def _word(found: dict[str, Check]) -> Word:
     if "fail" in words:
         return "fail"
     return "inconclusive" if "unknown" in words else "pass"
-
-
-def breaches(run: Run, function: Callable[[], Application] = default_application) -> tuple[Breach, ...]:
-    """All that a simulated run breaks; `function` makes the bare server."""
-    return broken(evidence_of(record_of(run), function))
 
 
 def broken(evidence: Evidence) -> tuple[Breach, ...]:

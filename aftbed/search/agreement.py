@@ -19,7 +19,8 @@ from aftbed.core.errors import ConfigError
 from aftbed.core.messages import Scheduled
 from aftbed.judge import checks
 from aftbed.judge.outcome import outcome_of
-from aftbed.judge.record import RunRecord, read_record, record_of
+from aftbed.judge.record import RunRecord, read_record
+from aftbed.judge.simulated import record_of
 from aftbed.judge.verdict import evidence_of
 from aftbed.runtime.sim.world import Setup, simulate
 from aftbed.runtime.unix.options import CarRun, LoadRun

@@ -31,7 +31,8 @@ from aftbed.inject.hang import Hang
 from aftbed.inject.model import Fault, FaultAction
 from aftbed.inject.timing import Trigger
 from aftbed.inject.value import EXECUTED, ValueFlip, ValuePlace
-from aftbed.judge.verdict import Breach, breaches
+from aftbed.judge.simulated import breaches
+from aftbed.judge.verdict import Breach
 from aftbed.runtime.sim.clock import Clock
 from aftbed.runtime.sim.interleaving import HeldChannel, orders
 from aftbed.runtime.sim.world import Doom, Run, Setup, World, simulate

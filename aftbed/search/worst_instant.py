@@ -30,7 +30,7 @@ from aftbed.inject.model import Fault, FaultAction
 from aftbed.inject.targets import Roles, emitting_node
 from aftbed.inject.timing import Trigger
 from aftbed.judge.checks import VEHICLE
-from aftbed.judge.verdict import breaches
+from aftbed.judge.simulated import breaches
 from aftbed.runtime.sim.world import Run, Setup, World, simulate
 from aftbed.runtime.unix import linux
 from aftbed.vehicle.aeb.messages import STAGE_NONE, decode_reply, decode_request

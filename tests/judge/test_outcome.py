@@ -12,8 +12,8 @@ from aftbed.core.history import History
 from aftbed.core.journal import Entry, EntryKind, Record
 from aftbed.judge.checks import LATE_NS
 from aftbed.judge.outcome import OUTCOMES, outcome_of, worst
-from aftbed.judge.record import record_of
 from aftbed.judge.reference import reference_run
+from aftbed.judge.simulated import record_of
 from aftbed.judge.verdict import evidence_of
 from aftbed.runtime.hosting import Hosted
 from aftbed.runtime.sim.world import Run, Setup, simulate

@@ -27,7 +27,7 @@ from aftbed.inject.timing import Trigger
 from aftbed.inject.value import EXECUTED, ValueFlip, ValuePlace
 from aftbed.judge import checks
 from aftbed.judge.reference import reference_run
-from aftbed.judge.verdict import breaches
+from aftbed.judge.simulated import breaches
 from aftbed.runtime.sim.clock import Clock
 from aftbed.runtime.sim.processes import Process
 from aftbed.runtime.sim.world import Doom, Run, Setup, World

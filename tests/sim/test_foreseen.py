@@ -8,7 +8,7 @@ from planting import adapted, crash_after
 
 from aftbed.core.messages import Goal, Scheduled
 from aftbed.core.script import Step
-from aftbed.judge.verdict import breaches
+from aftbed.judge.simulated import breaches
 from aftbed.runtime.rebinding import Changes, Rebinding
 from aftbed.runtime.sim.world import Setup, simulate
 

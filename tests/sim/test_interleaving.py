@@ -10,7 +10,7 @@ from aftbed.core.brick import Brick, Effect, Note
 from aftbed.core.graph import BrickSpec
 from aftbed.core.messages import AnyMessage
 from aftbed.ftm.registry import Setting
-from aftbed.judge.verdict import breaches
+from aftbed.judge.simulated import breaches
 from aftbed.runtime.sim.clock import Clock
 from aftbed.runtime.sim.interleaving import Chooser, HeldChannel, orders
 from aftbed.runtime.sim.world import Doom, Setup, World

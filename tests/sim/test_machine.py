@@ -28,7 +28,7 @@ from aftbed.inject.model import Fault
 from aftbed.inject.targets import roles_in
 from aftbed.inject.timing import Trigger
 from aftbed.inject.value import EXECUTED, ValueFlip, ValuePlace
-from aftbed.judge.verdict import breaches
+from aftbed.judge.simulated import breaches
 from aftbed.runtime.deployment import replica_of
 from aftbed.runtime.sim.processes import Process
 from aftbed.runtime.sim.world import Setup, World

@@ -15,7 +15,8 @@ from planting import EXPLORERS, Mutant, flip, instead
 from aftbed.core.events import Event
 from aftbed.ftm import lfr
 from aftbed.inject.value import ValuePlace
-from aftbed.judge.verdict import Breach, breaches
+from aftbed.judge.simulated import breaches
+from aftbed.judge.verdict import Breach
 from aftbed.runtime.sim.world import Setup, simulate
 
 MUTANTS: Final = (*MECHANISMS, *EXECUTIVE)

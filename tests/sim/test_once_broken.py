@@ -8,7 +8,7 @@ from aftbed.core.messages import Goal, Scheduled
 from aftbed.ftm.compose import STATEFUL, replication_of
 from aftbed.ftm.failover import drop_backup, failover, new_backup
 from aftbed.inject.model import parse
-from aftbed.judge.verdict import breaches
+from aftbed.judge.simulated import breaches
 from aftbed.runtime import control
 from aftbed.runtime.sim.world import Doom, Setup, World, simulate
 

@@ -20,8 +20,8 @@ from aftbed.inject.receipts import ReceiptState
 from aftbed.inject.value import ValuePlace
 from aftbed.judge.checks import half_a_graph, missing
 from aftbed.judge.outcome import outcome_of
-from aftbed.judge.record import record_of, service_struck_down
-from aftbed.judge.verdict import breaches, evidence_of
+from aftbed.judge.simulated import breaches, record_of, service_struck_down
+from aftbed.judge.verdict import evidence_of
 from aftbed.runtime.adaptations import Outcome
 from aftbed.runtime.run_controller import ScriptRun
 from aftbed.runtime.sim.world import Run, Setup, simulate

@@ -18,7 +18,8 @@ from aftbed.inject.hang import Hang
 from aftbed.inject.model import Fault
 from aftbed.inject.timing import Trigger
 from aftbed.inject.value import ValueFlip, ValuePlace
-from aftbed.judge.verdict import Breach, breaches
+from aftbed.judge.simulated import breaches
+from aftbed.judge.verdict import Breach
 from aftbed.runtime.sim.world import Doom, Setup, World
 from aftbed.search.shrink import shrink
 from aftbed.search.swarm import drawn, experiments

@@ -12,7 +12,7 @@ from aftbed.inject.model import Fault
 from aftbed.inject.timing import Trigger
 from aftbed.judge.checks import wrong_replies
 from aftbed.judge.reference import reference_run, succession
-from aftbed.judge.verdict import breaches
+from aftbed.judge.simulated import breaches
 from aftbed.runtime.sim.world import Doom, Run, Setup, World
 from aftbed.runtime.unix.part import load_module
 from aftbed.vehicle.aeb.function import default_application

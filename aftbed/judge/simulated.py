@@ -1,0 +1,79 @@
+"""The record of a simulated run, and what it breaks. Only this module of the judge imports the simulator."""
+
+import itertools
+from collections.abc import Callable
+from typing import Final
+
+import msgspec
+
+from aftbed.core.application import Application
+from aftbed.core.events import Event
+from aftbed.core.script import ScriptKind
+from aftbed.ftm.compose import replication_of
+from aftbed.judge.record import Excuses, RunEnd, RunRecord
+from aftbed.judge.verdict import Breach, broken, evidence_of
+from aftbed.runtime.deployment import replica_of
+from aftbed.runtime.sim.world import Run
+from aftbed.runtime.unix.options import CarRun, LoadRun, RunOptions, Work
+from aftbed.vehicle.aeb.function import default_application
+
+# Events of faults that no mechanism outvotes: bits of a checkpoint, or of a reply that is kept.
+UNPROMISED_VALUES: Final = frozenset(
+    event.label
+    for event in (Event.STATE_CAPTURED, Event.STATE_RESTORED, Event.CHECKPOINT_SENT)
+    + (Event.CHECKPOINT_APPLIED, Event.REPLY_STORED, Event.DEDUPE_HIT)
+)
+SINGLE: Final = "single"  # the node of that placement hosts both replicas
+
+
+def record_of(run: Run) -> RunRecord:
+    """The record of a simulated run."""
+    setup, rest = run.setup, run.rest
+    work: Work = CarRun(setup.scenario, None, "") if setup.scenario else LoadRun(setup.count, setup.rate_hz)
+    options = RunOptions("", "", "", setup.ftm, setup.placement, setup.seed, work, setup.faults)
+    end = RunEnd(
+        unfinished=rest.why_not,
+        lost=rest.lost,
+        leader=rest.leader,
+        hosted=rest.hosted,
+        states=rest.states,
+        faults=run.faults,
+    )
+    flips = [f for f in setup.faults if f.action.alters_value]
+    # A switch of the mechanism brings the Servers in line, so with adaptations the values are promised again.
+    values = not setup.adaptations and any(f.event in UNPROMISED_VALUES for f in flips)
+    return RunRecord(
+        options,
+        run.history,
+        end,
+        run.faults,
+        tuple(msgspec.to_builtins(outcome) for outcome in run.adaptations),
+        run.vehicle,
+        failures=run.failures,
+        excuses=Excuses(service_struck_down(run), values, tuple(name for _, name in run.struck)),
+    )
+
+
+def service_struck_down(run: Run) -> bool:
+    """Whether faults struck each replica, the second before redundancy was back from the first."""
+    replicas = {b.replica for b in run.rest.graph.bricks if b.replica and b.part == "server"}
+    renewed = [
+        (s.began_ns, s.ended_ns)
+        for s in run.scripts
+        if s.kind is ScriptKind.NEW_BACKUP and s.ended_ns and not s.failure
+    ]
+    strikes = sorted((t_ns, replica_of(name)) for t_ns, name in run.struck if replica_of(name))
+    if any(name == SINGLE for _, name in run.struck):
+        return True
+    simplex = any(a.goal.expression and not replication_of(a.goal.expression) for a in run.setup.adaptations)
+    if len(replicas) < 2 or simplex:  # for a time there may have been one replica only
+        return bool(strikes)
+    return any(
+        other != replica and not any(first_ns < began and done < second_ns for began, done in renewed)
+        for (first_ns, replica), (second_ns, other) in itertools.combinations(strikes, 2)
+    )
+
+
+def breaches(run: Run, function: Callable[[], Application] = default_application) -> tuple[Breach, ...]:
+    """All that a simulated run breaks; `function` makes the bare server."""
+    return broken(evidence_of(record_of(run), function))
