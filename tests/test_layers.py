@@ -63,7 +63,7 @@ IMPURE_CALLS: Final = frozenset({"open", "input", "print", "exec", "eval", "__im
 PENDING_ROWS: Final = frozenset({"interop"})
 PENDING_IMPORTS: Final[frozenset[str]] = frozenset()
 PENDING_CYCLES: Final = 0
-PENDING_DOUBLE_NAMES: Final = 40
+PENDING_DOUBLE_NAMES: Final = 26
 
 
 class Import(NamedTuple):

@@ -29,7 +29,7 @@ from aftbed.judge import checks
 from aftbed.judge.reference import reference_run
 from aftbed.judge.simulated import breaches
 from aftbed.runtime.sim.clock import Clock
-from aftbed.runtime.sim.processes import Process
+from aftbed.runtime.sim.processes import SimProcess
 from aftbed.runtime.sim.world import Doom, Run, Setup, World
 
 NESTED: Final = ("pbr+assert+tr", "lfr+assert+tr")
@@ -81,7 +81,7 @@ def assert_promises(world: World, run: Run) -> None:
     assert run.history.events(Event.FOLLOWER_DIVERGED) == []
     servers = 0
     for process in world.conductor.deployment.nodes.values():
-        assert isinstance(process, Process) and process.node is not None
+        assert isinstance(process, SimProcess) and process.node is not None
         for hosted in process.node.bricks.values():
             assert hosted.brick.quiescent(), f"something is left inside of {hosted.name}"
             if hosted.name.endswith("/server"):

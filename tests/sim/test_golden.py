@@ -26,7 +26,7 @@ from aftbed.inject.model import parse
 from aftbed.judge import checks
 from aftbed.judge.reference import reference_run
 from aftbed.runtime.sim.node_io import SimNode
-from aftbed.runtime.sim.processes import Process
+from aftbed.runtime.sim.processes import SimProcess
 
 GOLDEN: Final = Path(__file__).parents[1] / "golden"
 ARMED_NS: Final = 1_000_000  # a fault is in its place long before
@@ -87,7 +87,7 @@ class Stage:
 
     def _node(self, name: str) -> SimNode:
         process = self.world.conductor.deployment.nodes[name]
-        assert isinstance(process, Process) and process.node is not None
+        assert isinstance(process, SimProcess) and process.node is not None
         return process.node
 
     def _judge(self) -> None:

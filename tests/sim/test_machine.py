@@ -30,7 +30,7 @@ from aftbed.inject.timing import Trigger
 from aftbed.inject.value import EXECUTED, ValueFlip, ValuePlace
 from aftbed.judge.simulated import breaches
 from aftbed.runtime.deployment import replica_of
-from aftbed.runtime.sim.processes import Process
+from aftbed.runtime.sim.processes import SimProcess
 from aftbed.runtime.sim.world import Setup, World
 
 REQUESTS: Final = 96
@@ -112,7 +112,7 @@ class Interference(RuleBasedStateMachine):
         name = self._node(node)
         replica = replica_of(name)
         watchdog = self.world.conductor.deployment.nodes.get(f"{replica}/watchdog")
-        if not replica or not isinstance(watchdog, Process) or watchdog.dead or watchdog.node is None:
+        if not replica or not isinstance(watchdog, SimProcess) or watchdog.dead or watchdog.node is None:
             return
         self.world.struck.append((self.world.loop.ns, name))  # as good as
         watchdog.node.step(watchdog.node.bricks[watchdog.name], "sense", NodeDied(name))

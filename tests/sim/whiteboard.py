@@ -21,10 +21,10 @@ from aftbed.core.messages import Message, Notification, Suspect, TakeOver, Trial
 from aftbed.core.script import Phase
 from aftbed.inject.receipts import fault_and_bits
 from aftbed.runtime import control
-from aftbed.runtime.sim.channels import Channel
+from aftbed.runtime.sim.channels import SimChannel
 from aftbed.runtime.sim.clock import Clock
 from aftbed.runtime.sim.node_io import SimNode
-from aftbed.runtime.sim.processes import Process
+from aftbed.runtime.sim.processes import SimProcess
 from aftbed.runtime.sim.world import Setup, World
 
 EXECUTIVE: Final = "executive"
@@ -69,10 +69,10 @@ class Steady(Clock):
         return (low_ns + high_ns) // 2
 
 
-def _speaking(say: Say) -> type[Channel]:
+def _speaking(say: Say) -> type[SimChannel]:
     """Channels that tell what is put into them."""
 
-    class Speaking(Channel):
+    class Speaking(SimChannel):
         def put(self, message: Message) -> bool:
             """Send, and say so."""
             done = super().put(message)
@@ -122,15 +122,15 @@ class Whiteboard(World):
         nursery = self.nursery
         heard, ended, frozen = nursery.on_report, nursery.on_end, nursery.on_freeze
 
-        def on_report(process: Process, report: control.FromNode) -> None:
+        def on_report(process: SimProcess, report: control.FromNode) -> None:
             self._ordered(report)
             heard(process, report)
 
-        def on_end(process: Process, reason: str) -> None:
+        def on_end(process: SimProcess, reason: str) -> None:
             self.say(process.name, "dies" + (f": {reason.partition(': ')[2]}" if ": " in reason else ""))
             ended(process, reason)
 
-        def on_freeze(process: Process) -> None:
+        def on_freeze(process: SimProcess) -> None:
             self.say(process.name, "stops where it is")
             frozen(process)
 
@@ -203,7 +203,7 @@ class Whiteboard(World):
     def nodes(self) -> Iterator[SimNode]:
         """Those that live."""
         for process in self.conductor.deployment.nodes.values():
-            if isinstance(process, Process) and process.node is not None and not process.dead:
+            if isinstance(process, SimProcess) and process.node is not None and not process.dead:
                 yield process.node
 
 

@@ -29,12 +29,12 @@ class ChannelUser(Protocol):
         ...
 
 
-class End:
+class SimEnd:
     """One end, by its number."""
 
     __slots__ = ("channel", "number")
 
-    def __init__(self, channel: "Channel", number: int) -> None:
+    def __init__(self, channel: "SimChannel", number: int) -> None:
         self.channel, self.number = channel, number
 
     def fileno(self) -> int:
@@ -42,12 +42,12 @@ class End:
         return self.number
 
 
-class Channel:
+class SimChannel:
     """`mail`: times of arrival and messages; `readers` and `writers`: the nodes that have an end."""
 
     def __init__(self, link: Link, clock: Clock, first_number: int) -> None:
         self.link, self._clock = link, clock
-        self.write, self.read = End(self, first_number), End(self, first_number + 1)
+        self.write, self.read = SimEnd(self, first_number), SimEnd(self, first_number + 1)
         self.mail: deque[tuple[int, Message]] = deque()
         self.readers: list[ChannelUser] = []
         self.writers: list[ChannelUser] = []

@@ -20,7 +20,7 @@ assert len(HOP_QUANTILES_NS) > 1 << HOP_BITS
 Call = Callable[[], None]
 
 
-class Line(Protocol):
+class Carrier(Protocol):
     """Something on which messages travel, in order."""
 
     @property
@@ -53,7 +53,7 @@ class Clock:
         self.count += 1
         heapq.heappush(self.heap, (t_ns, self.count, call))
 
-    def message(self, t_ns: int, line: "Line", call: Call) -> None:
+    def message(self, t_ns: int, line: "Carrier", call: Call) -> None:
         """The same, for what travels on a line: never before what was put on it earlier."""
         self.at(t_ns, call)
 

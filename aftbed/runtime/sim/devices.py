@@ -12,7 +12,7 @@ from aftbed.vehicle.drive_virtual import VirtualCar
 Notice = Callable[[int, Callable[[], None]], None]
 
 
-class Watched(Protocol):
+class PulseSource(Protocol):
     """A node, as a Watchdog senses it."""
 
     def pulse_ns(self, now_ns: int) -> int:
@@ -25,9 +25,9 @@ class SimSenses:
     death.
     """
 
-    def __init__(self, find: Callable[[int], Watched], notice: Notice) -> None:
+    def __init__(self, find: Callable[[int], PulseSource], notice: Notice) -> None:
         self._find, self._notice = find, notice
-        self._nodes: dict[str, Watched] = {}
+        self._nodes: dict[str, PulseSource] = {}
 
     def watch(self, order: control.WatchNodes, fds: list[int], died: Callable[[str], None]) -> None:
         """Watch these nodes and no others; a node that is dead already is noticed at once."""

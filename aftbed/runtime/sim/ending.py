@@ -15,7 +15,7 @@ from aftbed.runtime.hosting import digest
 from aftbed.runtime.run_controller import RunController
 from aftbed.runtime.sim.devices import VirtualCarLink
 from aftbed.runtime.sim.node_io import SimNode
-from aftbed.runtime.sim.processes import Process
+from aftbed.runtime.sim.processes import SimProcess
 
 
 def states_of(deployment: Deployment) -> dict[str, str]:
@@ -23,7 +23,7 @@ def states_of(deployment: Deployment) -> dict[str, str]:
     found: dict[str, str] = {}
     for replica in filter(None, (deployment.leader, deployment.backup)):
         process = deployment.nodes.get(deployment.graph.node_of(f"{replica}/server"))
-        if isinstance(process, Process) and process.node is not None and not process.stopped():
+        if isinstance(process, SimProcess) and process.node is not None and not process.stopped():
             with contextlib.suppress(PeerError):
                 state = look(process.node.brick(f"{replica}/server"))
                 found |= {replica: digest(state)} if state else {}
@@ -32,7 +32,7 @@ def states_of(deployment: Deployment) -> dict[str, str]:
 
 def _client(deployment: Deployment) -> SimNode | None:
     process = deployment.nodes.get("client")
-    return process.node if isinstance(process, Process) and not process.dead else None
+    return process.node if isinstance(process, SimProcess) and not process.dead else None
 
 
 def source_ended(deployment: Deployment, count: int) -> bool:
@@ -65,6 +65,6 @@ def unrest(conductor: RunController) -> list[str]:
     if replication_of(deployment.graph.ftm) and not deployment.backup:
         found.append("no redundancy")
     found += [f"{name} is under way" for name in deployment.support.loop.tasks.names()]
-    processes = [p for p in deployment.nodes.values() if isinstance(p, Process)]
+    processes = [p for p in deployment.nodes.values() if isinstance(p, SimProcess)]
     found += [f"{p.name} is dead or stopped" for p in processes if p.stopped()][:1]
     return found

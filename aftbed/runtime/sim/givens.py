@@ -57,7 +57,7 @@ def nothing_off_line(place: str) -> NoReturn:
     raise ConfigError(f"{place}: the simulator loads nothing that was written off line")
 
 
-class Journal:
+class SimJournal:
     """The executive's records."""
 
     def __init__(self, records: list[Record]) -> None:

@@ -17,8 +17,8 @@ from typing import Final
 
 from aftbed.core.graph import Link
 from aftbed.core.messages import Message
-from aftbed.runtime.sim.channels import Channel
-from aftbed.runtime.sim.clock import Call, Clock, Line
+from aftbed.runtime.sim.channels import SimChannel
+from aftbed.runtime.sim.clock import Call, Carrier, Clock
 
 STEP_NS: Final = 1_000  # of virtual time, per delivery
 ON_ITS_WAY: Final = 1 << 62
@@ -27,7 +27,7 @@ Heard = frozenset[str] | None
 Sleep = dict[int, Heard]  # lines whose delivery would make no difference now, with who hears them
 
 
-class HeldChannel(Channel):
+class HeldChannel(SimChannel):
     """A channel whose messages arrive when they are chosen to."""
 
     def __init__(self, link: Link, clock: Clock, first_number: int) -> None:
@@ -54,7 +54,7 @@ class HeldChannel(Channel):
         self.arrive()
 
 
-class Point:
+class ChoicePoint:
     """A moment with a choice: what could arrive, and what need not be tried."""
 
     def __init__(self, enabled: dict[int, Heard], sleep: Sleep, chosen: int) -> None:
@@ -77,18 +77,18 @@ class Pruned(Exception):  # noqa: N818 - not an error: an order that is another 
 class Chooser(Clock):
     """`points`: the choices of a run so far; the first ones are given, then comes the first that may be."""
 
-    def __init__(self, chance: Random, given: list[Point]) -> None:
+    def __init__(self, chance: Random, given: list[ChoicePoint]) -> None:
         super().__init__(chance)
         self.points = list(given)
         self._at = 0
         self.chooses = False
-        self._lines: dict[int, tuple[Line, deque[Call]]] = {}
+        self._lines: dict[int, tuple[Carrier, deque[Call]]] = {}
 
     def begin(self) -> None:
         """From now on."""
         self.chooses = True
 
-    def message(self, t_ns: int, line: Line, call: Call) -> None:
+    def message(self, t_ns: int, line: Carrier, call: Call) -> None:
         """It waits to be chosen."""
         if not self.chooses:
             super().message(t_ns, line, call)
@@ -111,7 +111,7 @@ class Chooser(Clock):
             awake = [number for number in enabled if number not in sleep]
             if not awake:
                 raise Pruned
-            self.points.append(Point(enabled, sleep, awake[0]))
+            self.points.append(ChoicePoint(enabled, sleep, awake[0]))
         chosen = self.points[self._at].chosen
         self._at += 1
         self.ns += STEP_NS
@@ -121,11 +121,11 @@ class Chooser(Clock):
 
 def orders(run: Callable[[Callable[[Random], Clock]], object]) -> Iterator[bool]:
     """Run `run` with a clock for every order. True for each order, False for each run that was cut short."""
-    given: list[Point] = []
+    given: list[ChoicePoint] = []
     while True:
         made: list[Chooser] = []
 
-        def clock(chance: Random, given: list[Point] = given, made: list[Chooser] = made) -> Clock:
+        def clock(chance: Random, given: list[ChoicePoint] = given, made: list[Chooser] = made) -> Clock:
             made.append(Chooser(chance, given))
             return made[0]
 
@@ -141,12 +141,12 @@ def orders(run: Callable[[Callable[[Random], Clock]], object]) -> Iterator[bool]
         given = following
 
 
-def _following(points: list[Point]) -> list[Point] | None:
+def _following(points: list[ChoicePoint]) -> list[ChoicePoint] | None:
     """The choices that lead to the next order: the last one that has an alternative takes it."""
     for depth in range(len(points) - 1, -1, -1):
         point = points[depth]
         sleep = point.sleep | {point.chosen: point.enabled[point.chosen]}
         awake = [number for number in point.enabled if number not in sleep]
         if awake:
-            return [*points[:depth], Point(point.enabled, sleep, awake[0])]
+            return [*points[:depth], ChoicePoint(point.enabled, sleep, awake[0])]
     return None

@@ -19,7 +19,7 @@ from aftbed.core.journal import Record
 from aftbed.core.messages import ChannelEnded, Message
 from aftbed.runtime import control
 from aftbed.runtime.node import HostedBrick, Node, NodeIO, Recorder
-from aftbed.runtime.sim.channels import Channel
+from aftbed.runtime.sim.channels import SimChannel
 from aftbed.runtime.sim.clock import Clock
 from aftbed.runtime.sim.hops import HOP_QUANTILES_NS
 from aftbed.runtime.sim.shared_memory import SimulatedMemory
@@ -32,8 +32,8 @@ WRITE_NS_MAX: Final = (
 STEP_NS: Final = HOP_QUANTILES_NS[len(HOP_QUANTILES_NS) // 2]  # of CPU time
 FULL_NS: Final = 100_000  # between two looks whether a full channel has room
 
-SimBrick = HostedBrick[Channel, Channel]
-SimNode = Node[Channel, Channel]
+SimBrick = HostedBrick[SimChannel, SimChannel]
+SimNode = Node[SimChannel, SimChannel]
 
 
 class Died(BaseException):
@@ -51,17 +51,17 @@ class _Held(NamedTuple):
     hosted: SimBrick
     effects: list[Effect]
     at: int
-    end: Channel | None
+    end: SimChannel | None
     filtered: bool
     limit_ns: int
 
 
-class SimIO(NodeIO[Channel, Channel]):
+class SimIO(NodeIO[SimChannel, SimChannel]):
     """Of one node. `ends` finds a channel by the number of an end; `on_end` is called when the node dies,
     with why.
     """
 
-    output = Channel
+    output = SimChannel
     node: SimNode
 
     def __init__(
@@ -69,7 +69,7 @@ class SimIO(NodeIO[Channel, Channel]):
         name: str,
         clock: Clock,
         records: list[Record],
-        ends: Callable[[int], Channel],
+        ends: Callable[[int], SimChannel],
         report: Callable[[control.FromNode], None],
         on_end: Callable[[str], None],
         cells: Sequence[SimulatedMemory],
@@ -84,7 +84,9 @@ class SimIO(NodeIO[Channel, Channel]):
         self._held_up = False  # one of the three below
         self._awaited = 0  # the fault that has to be applied before the node goes on, or 0
         self._slow_until_ns = 0
-        self._backlog: dict[Channel, deque[Message]] = {}  # came out of a channel fault, and waits for room
+        self._backlog: dict[
+            SimChannel, deque[Message]
+        ] = {}  # came out of a channel fault, and waits for room
         self._only: SimBrick | None = None  # the brick of a node that hosts one, without a device
         self._has_deadlines = False
         self._timer_ns = NEVER
@@ -144,7 +146,7 @@ class SimIO(NodeIO[Channel, Channel]):
         self.alive = False
         for hosted in self.node.bricks.values():
             for channel in (*hosted.inputs.values(), *hosted.outputs.values()):
-                if isinstance(channel, Channel):
+                if isinstance(channel, SimChannel):
                     channel.leave(self)
         self._on_end(reason)
 
@@ -195,13 +197,13 @@ class SimIO(NodeIO[Channel, Channel]):
 
     # -- reading ------------------------------------------------------------------------------
 
-    def open_input(self, hosted: SimBrick, port: str, number: int) -> Channel:
+    def open_input(self, hosted: SimBrick, port: str, number: int) -> SimChannel:
         """The channel with that end, which has one reader more."""
         channel = self._ends(number)
         channel.readers.append(self)
         return channel
 
-    def close_input(self, end: Channel) -> None:
+    def close_input(self, end: SimChannel) -> None:
         """Read it no more."""
         end.leave(self)
 
@@ -268,26 +270,28 @@ class SimIO(NodeIO[Channel, Channel]):
 
     # -- writing ------------------------------------------------------------------------------
 
-    def open_output(self, number: int) -> Channel:
+    def open_output(self, number: int) -> SimChannel:
         """The channel with that end, which has one writer more."""
         channel = self._ends(number)
         channel.writers.append(self)
         return channel
 
-    def close_output(self, end: Channel) -> None:
+    def close_output(self, end: SimChannel) -> None:
         """Write to it no more."""
         self._backlog.pop(end, None)
         end.leave(self)
 
-    def has_room(self, end: Channel) -> bool:
+    def has_room(self, end: SimChannel) -> bool:
         """Whether a write can succeed now."""
         return end not in self._backlog and end.has_room()
 
-    def write(self, hosted: SimBrick, port: str, end: Channel, message: Message, raw: bytes | None) -> bool:
+    def write(
+        self, hosted: SimBrick, port: str, end: SimChannel, message: Message, raw: bytes | None
+    ) -> bool:
         """Send. False if there is no room now."""
         return not (self._backlog and end in self._backlog) and end.put(message)
 
-    def write_in_turn(self, hosted: SimBrick, port: str, end: Channel, message: Message) -> None:
+    def write_in_turn(self, hosted: SimBrick, port: str, end: SimChannel, message: Message) -> None:
         """Send, behind what waits for room."""
         if not self.write(hosted, port, end, message, None):
             if end not in self._backlog:
@@ -295,7 +299,7 @@ class SimIO(NodeIO[Channel, Channel]):
                 self._clock.at(self._clock.ns + FULL_NS, lambda: self._write_backlog(end))
             self._backlog[end].append(message)
 
-    def _write_backlog(self, end: Channel) -> None:
+    def _write_backlog(self, end: SimChannel) -> None:
         """Send what waits, as far as there is room, and look again for the rest."""
         backlog = self._backlog.get(end)
         if backlog is None or not self.alive:
@@ -308,7 +312,7 @@ class SimIO(NodeIO[Channel, Channel]):
             del self._backlog[end]
             self.run()
 
-    def write_or_drop(self, end: Channel, message: Message) -> None:
+    def write_or_drop(self, end: SimChannel, message: Message) -> None:
         """Send if there is room."""
         if self.has_room(end):
             end.put(message)
@@ -328,7 +332,7 @@ class SimIO(NodeIO[Channel, Channel]):
             raise Died
 
     def hold(
-        self, hosted: SimBrick, effects: list[Effect], at: int, end: Channel | None, *, filtered: bool
+        self, hosted: SimBrick, effects: list[Effect], at: int, end: SimChannel | None, *, filtered: bool
     ) -> None:
         """Go on from there later. A write that is held up too long ends the node."""
         limit_ns = self._clock.ns + WRITE_NS_MAX if end is not None else NEVER
@@ -360,7 +364,7 @@ class SimIO(NodeIO[Channel, Channel]):
                 return False
         return True
 
-    def _write_held(self, held: _Held, end: Channel) -> bool:
+    def _write_held(self, held: _Held, end: SimChannel) -> bool:
         """Send what waited for room. What is bound elsewhere is not sent: the brick was told, and has asked
         again.
         """

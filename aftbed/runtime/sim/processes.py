@@ -16,7 +16,7 @@ from aftbed.runtime.assembly import Assembler
 from aftbed.runtime.devices import Device
 from aftbed.runtime.interface import ProcessKind
 from aftbed.runtime.node import Node
-from aftbed.runtime.sim.channels import Channel
+from aftbed.runtime.sim.channels import SimChannel
 from aftbed.runtime.sim.clock import Clock
 from aftbed.runtime.sim.node_io import SimIO, SimNode
 from aftbed.runtime.sim.shared_memory import SimulatedMemory
@@ -37,7 +37,7 @@ MakeDevice = Callable[[control.Assign, SimIO], Device]
 class Wire:
     """One direction between the executive and a process, or the news of its death."""
 
-    def __init__(self, number: int, process: "Process | None") -> None:
+    def __init__(self, number: int, process: "SimProcess | None") -> None:
         self.number, self._process = -number, process
 
     def heard_by(self) -> frozenset[str] | None:
@@ -47,10 +47,10 @@ class Wire:
         return frozenset((self._process.io.name,))
 
 
-class Process:
+class SimProcess:
     """A child of the executive, which becomes one node."""
 
-    def __init__(self, number: int, nursery: "Nursery") -> None:
+    def __init__(self, number: int, nursery: "SimProcessPool") -> None:
         self.name, self.kind, self.journal, self.incarnation = "spare", ProcessKind.SPARE, "", 0
         self.pid = self.pidfd = number
         self.alive = True  # as far as the executive knows
@@ -210,7 +210,7 @@ class Process:
         return False
 
 
-class Nursery:
+class SimProcessPool:
     """Spares without end, at once: what a birth costs is in `BIRTH_NS`."""
 
     def __init__(
@@ -218,20 +218,20 @@ class Nursery:
         clock: Clock,
         assembler: Assembler,
         make_device: MakeDevice,
-        end: Callable[[int], Channel],
+        end: Callable[[int], SimChannel],
         records: Callable[[str], list[Record]],
     ) -> None:
         self.clock = clock
         self._assembler, self._make_device, self._end, self._records = assembler, make_device, end, records
-        self.processes: list[Process] = []
-        self.by_number: dict[int, Process] = {}
-        self.zygotes: dict[str, Process] = {}
+        self.processes: list[SimProcess] = []
+        self.by_number: dict[int, SimProcess] = {}
+        self.zygotes: dict[str, SimProcess] = {}
         self.cells: list[SimulatedMemory] = []
         self._heard_ns = 0
-        self.on_report: Callable[[Process, control.FromNode], None] = lambda process, report: None
-        self.on_death: Callable[[Process], None] = lambda process: None
-        self.on_end: Callable[[Process, str], None] = lambda process, reason: None
-        self.on_freeze: Callable[[Process], None] = lambda process: None
+        self.on_report: Callable[[SimProcess, control.FromNode], None] = lambda process, report: None
+        self.on_death: Callable[[SimProcess], None] = lambda process: None
+        self.on_end: Callable[[SimProcess, str], None] = lambda process, reason: None
+        self.on_freeze: Callable[[SimProcess], None] = lambda process: None
 
     def rouse_ns(self) -> int:
         """How much longer the executive takes to hear what is said to it now."""
@@ -239,9 +239,9 @@ class Nursery:
         self._heard_ns = self.clock.ns
         return self.clock.between_ns(*ROUSED_NS) if asleep else 0
 
-    def spare(self, zygote: str) -> Generator[Wait, dict[Key, bytes], Process]:
+    def spare(self, zygote: str) -> Generator[Wait, dict[Key, bytes], SimProcess]:
         """A fresh one."""
-        process = Process(len(self.by_number) + 1, self)
+        process = SimProcess(len(self.by_number) + 1, self)
         self.by_number[process.pid] = process
         self.processes.append(process)
         yield Wait(frozenset())
@@ -256,10 +256,10 @@ class Nursery:
 
     def order(self, process: interface.Process, order: control.ToNode, fds: tuple[int, ...] = ()) -> None:
         """Send an order. Raises StepFailed if the process is gone."""
-        assert isinstance(process, Process)
+        assert isinstance(process, SimProcess)
         process.order(order, fds)
 
-    def build(self, process: Process, order: control.Assign, fds: tuple[int, ...]) -> SimIO:
+    def build(self, process: SimProcess, order: control.Assign, fds: tuple[int, ...]) -> SimIO:
         """The node that `order` describes. Raises ConfigError where a class is no good."""
         records = self._records(order.journal)
         io = SimIO(order.node, self.clock, records, self._end, process.say, process.ended, self.cells)

@@ -20,7 +20,7 @@ from aftbed.core.graph import Link
 from aftbed.core.journal import Entry, EntryKind, Record
 from aftbed.core.messages import Message
 from aftbed.runtime.assembly import MakeSetting
-from aftbed.runtime.sim.channels import Channel
+from aftbed.runtime.sim.channels import SimChannel
 from aftbed.runtime.sim.clock import START_NS, Clock
 from aftbed.runtime.sim.world import Run, Setup, World
 
@@ -100,10 +100,10 @@ class _Traced(World):
         self.happened.append(self.dialogue[-1])
 
 
-def _recording(happened: list[Happening]) -> type[Channel]:
+def _recording(happened: list[Happening]) -> type[SimChannel]:
     """A kind of channel that appends to `happened` whatever is put into it."""
 
-    class Recorded(Channel):
+    class Recorded(SimChannel):
         def __init__(self, link: Link, clock: Clock, first_number: int) -> None:
             super().__init__(link, clock, first_number)
             self._now = clock

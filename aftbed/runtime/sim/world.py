@@ -30,13 +30,13 @@ from aftbed.runtime.hosting import Hosted, hosted
 from aftbed.runtime.interface import Met, ProcessKind
 from aftbed.runtime.run_controller import RunController, ScriptRun
 from aftbed.runtime.sim import ending
-from aftbed.runtime.sim.channels import Channel
+from aftbed.runtime.sim.channels import SimChannel
 from aftbed.runtime.sim.clock import START_NS, Clock
 from aftbed.runtime.sim.devices import SimSenses, VirtualCarLink
 from aftbed.runtime.sim.drive import Drive
-from aftbed.runtime.sim.givens import Journal, check, graph_of, nothing_off_line, requests_of
+from aftbed.runtime.sim.givens import SimJournal, check, graph_of, nothing_off_line, requests_of
 from aftbed.runtime.sim.node_io import SimIO, SimNode
-from aftbed.runtime.sim.processes import Nursery, Process
+from aftbed.runtime.sim.processes import SimProcess, SimProcessPool
 from aftbed.runtime.sim.shared_memory import SimulatedMemory
 from aftbed.runtime.tasks import Wait
 from aftbed.vehicle.aeb.function import default_application
@@ -115,7 +115,7 @@ class World:
         requests: list[bytes] | None = None,
         make: MakeSetting | None = None,
         load: LoadModule = nothing_off_line,
-        channel: type[Channel] = Channel,
+        channel: type[SimChannel] = SimChannel,
         clock: Callable[[Random], Clock] = Clock,
     ) -> None:
         self.setup, self._channel = setup, channel
@@ -127,14 +127,14 @@ class World:
         self.journals: dict[str, list[Record]] = {}
         self.dialogue: list[Entry] = []
         self.told: list[tuple[int, str, str]] = []
-        self._ends: dict[int, Channel] = {}
+        self._ends: dict[int, SimChannel] = {}
         self.failures: list[str] = []
         self.struck: list[tuple[int, str]] = []  # who died, or was stopped, of a fault, and when
         self.effects: dict[str, int] = {}
         self.lost = False
-        self.journal = Journal(self.journals.setdefault("supervisor.1", []))
+        self.journal = SimJournal(self.journals.setdefault("supervisor.1", []))
         assembler = Assembler(function, load, make)
-        self.nursery = Nursery(
+        self.nursery = SimProcessPool(
             self.loop, assembler, self._make_device, self._ends.__getitem__, self._journal_for
         )
         self.conductor = RunController(graph_of(setup.ftm, setup.placement), self, None, self._on_loss)
@@ -146,7 +146,7 @@ class World:
 
     # -- the runtime, as the executive sees it: see `runtime.interface.Support` ------------------
 
-    def channel(self, link: Link) -> Channel:
+    def channel(self, link: Link) -> SimChannel:
         """A fresh one."""
         channel = self._channel(link, self.loop, len(self._ends) + 1)
         for end in (channel.write, channel.read):
@@ -237,15 +237,15 @@ class World:
         """An entry of the dialogue."""
         self.dialogue.append(Entry(now_ns, request_id, epoch, kind, payload))
 
-    def _on_report(self, process: Process, report: control.FromNode) -> None:
+    def _on_report(self, process: SimProcess, report: control.FromNode) -> None:
         self.conductor.on_report(process, report)
         self.loop.watch_jobs()
 
-    def _on_death(self, process: Process) -> None:
+    def _on_death(self, process: SimProcess) -> None:
         self.conductor.on_death(process)
         self.loop.watch_jobs()
 
-    def _on_end(self, process: Process, reason: str) -> None:
+    def _on_end(self, process: SimProcess, reason: str) -> None:
         if process.node is not None and process.incarnation == 1:
             self._count(process.node)
         flipped = STOPPED in reason and any(fault.action.alters_value for fault in self.setup.faults)
@@ -275,7 +275,7 @@ class World:
     def _doom(self, doom: Doom) -> None:
         deployment = self.conductor.deployment
         process = deployment.nodes.get(deployment.graph.node_of(doom.brick))
-        assert isinstance(process, Process) and process.io is not None
+        assert isinstance(process, SimProcess) and process.io is not None
         process.io.die_before(doom.brick, doom.effect)
 
     def _on_launched(self, failure: str) -> None:
@@ -353,7 +353,7 @@ class World:
         """What there is to judge."""
         deployment = self.conductor.deployment
         for process in deployment.nodes.values():
-            if isinstance(process, Process) and process.node is not None and process.incarnation == 1:
+            if isinstance(process, SimProcess) and process.node is not None and process.incarnation == 1:
                 self._count(process.node)
         rest = Rest(
             () if self.lost else tuple(ending.unrest(self.conductor)),
