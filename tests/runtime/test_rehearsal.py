@@ -9,7 +9,7 @@ from aftbed.runtime.unix.prefault import PAGE, written_by
 
 SCRIPT = """
 import resource
-from aftbed.runtime.unix import pages, rehearsal
+from aftbed.runtime.unix import prefault, rehearsal
 
 areas = rehearsal.warm_up()
 
@@ -17,12 +17,12 @@ def faults():
     return resource.getrusage(resource.RUSAGE_SELF).ru_minflt
 
 def prepared():
-    pages.own(areas)
+    prefault.own(areas)
     before = faults()
     rehearsal.rehearse_host()
-    print(sum(size for _, size in areas) // pages.PAGE, faults() - before, flush=True)
+    print(sum(size for _, size in areas) // prefault.PAGE, faults() - before, flush=True)
 
-pages.written_by(prepared)
+prefault.written_by(prepared)
 """
 
 
