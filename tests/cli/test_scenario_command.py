@@ -99,7 +99,11 @@ def test_outages_have_lines_of_their_own_and_are_plotted(table: Call, tmp_path: 
     assert "none" in lines and "outage 2000ms (under none)" in lines
     assert sum(" instants: every 0.4 s" in line for line in lines) == 1
     drawing = plot.read_text()
-    assert drawing.startswith("<svg xmlns=") and "outage 2000ms" in drawing
+    assert (
+        drawing.startswith("<svg ")
+        and 'xmlns="http://www.w3.org/2000/svg"' in drawing
+        and "outage 2000ms" in drawing
+    )
 
 
 def test_each_mechanism_and_each_outage_is_a_line() -> None:

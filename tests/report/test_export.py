@@ -76,6 +76,7 @@ def test_without_pyarrow_the_error_says_what_to_install() -> None:
 import sys
 sys.modules["pyarrow"] = None  # as if it were not installed
 from pathlib import Path
+from aftbed.core.errors import ConfigError
 from aftbed.report.export import write_parquet
 try:
     write_parquet(None, Path("r.parquet"))

@@ -75,6 +75,7 @@ LIVE = """
 import sys, threading
 sys.path.insert(0, {folder!r})
 from campaigns import result
+from aftbed.report import terminal
 terminal.REDRAW_S = 0.0
 with terminal.Progress("try", 40) as progress:
     for index in range(40):

@@ -22,6 +22,7 @@ HASH_SEEDS = ("0", "1", "12345")
 HASHED = f"""
 import hashlib
 from aftbed.runtime.sim.trace import lines, traced
+from aftbed.search.swarm import drawn
 found = hashlib.sha256()
 for seed in {SWARM!r}:
     for line in lines(traced(drawn(seed))):
