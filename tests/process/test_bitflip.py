@@ -243,7 +243,7 @@ def test_a_live_run_is_hit_from_a_second_command(home: Home) -> None:
         outcome = started.finish()
     assert outcome.verdict.requests.wrong == 1 and outcome.verdict.verdict == "fail"
     (fault,) = outcome.verdict.faults
-    assert str(told["text"]) == f"{fault['fault']}: activated, {fault['detail']}"
+    assert str(told["text"]) == f"{fault.fault}: activated, {fault.detail}"
 
 
 @contextmanager
