@@ -21,7 +21,7 @@ from aftbed.inject.value import ValuePlace
 from aftbed.judge.checks import half_a_graph, missing
 from aftbed.judge.outcome import outcome_of
 from aftbed.judge.simulated import breaches, record_of, service_struck_down
-from aftbed.judge.verdict import evidence_of
+from aftbed.judge.verdict import evidence_of, judge
 from aftbed.runtime.adaptations import Outcome
 from aftbed.runtime.run_controller import ScriptRun
 from aftbed.runtime.sim.world import Run, Setup, simulate
@@ -221,6 +221,7 @@ def test_a_service_is_not_lost_in_vain() -> None:
     unanswered = all_of(gone, retold(lambda e: []))(UNBROKEN)
     assert breaches(unanswered) == ()
     assert outcome(unanswered) == "unavailable"
+    assert judge(record_of(unanswered)).checks["exactly_one_answer"] == "unknown", "an excuse is no pass"
     assert [b.promise for b in breaches(all_of(gone, WRONG)(UNBROKEN))] == ["G3"]
     doubled = all_of(gone, noted("a.server.1", Event.SERVER_EXIT, 6))(UNBROKEN)
     assert [b.promise for b in breaches(doubled)] == ["G1"]
