@@ -16,7 +16,7 @@ from aftbed.inject.timing import Trigger
 from aftbed.inject.value import ValueFlip, ValuePlace
 from aftbed.judge.record import read_record
 from aftbed.judge.verdict import Verdict, judge
-from aftbed.runtime.unix.journal_files import Dialogue, Journal
+from aftbed.runtime.unix.journal_files import DialogueFile, JournalFile
 from aftbed.runtime.unix.options import CarRun, LoadRun, RunOptions, Work
 from aftbed.vehicle.aeb.function import default_application, sample_requests
 from aftbed.vehicle.plant import VehicleResult
@@ -50,15 +50,15 @@ class RecordInTheMaking:
         }
         self.t_ns = START_NS
         (path / "journal").mkdir(parents=True)
-        self._journals: dict[str, Journal] = {}
-        self._dialogue = Dialogue(path / "journal" / "client.1.dialogue", "client")
+        self._journals: dict[str, JournalFile] = {}
+        self._dialogue = DialogueFile(path / "journal" / "client.1.dialogue", "client")
         self._bare = default_application()
         self.sent = 0
 
     def note(self, journal: str, event: Event, request_id: int = 0, detail: int = 0) -> None:
         if journal not in self._journals:
             node = journal.rpartition(".")[0].replace("-", "/")
-            self._journals[journal] = Journal(self.path / "journal" / f"{journal}.journal", node)
+            self._journals[journal] = JournalFile(self.path / "journal" / f"{journal}.journal", node)
         self.t_ns += MS
         self._journals[journal].write(self.t_ns, event, request_id, detail)
 

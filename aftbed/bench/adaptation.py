@@ -102,7 +102,7 @@ def _reordered(record: RunRecord) -> int:
 
 def adapted(private: Path, goal: Goal) -> dict[str, object]:
     """How the adaptation ended. Raises HarnessError unless it is done."""
-    outcome = control_client.ask(private, control_client.Adapt(goal), control_client.ADAPT_SECONDS_MAX)
+    outcome = control_client.ask(private, control_client.AdaptCommand(goal), control_client.ADAPT_SECONDS_MAX)
     if outcome["outcome"] != "done":
         raise HarnessError(f"an adaptation of the bench ended {outcome['outcome']}: {outcome['reason']}")
     return outcome

@@ -26,7 +26,9 @@ def bench_recovery(ftm: str, placement: str, kills: int, *, pin: bool = True) ->
         epoch = 0
         for _ in range(kills):
             epoch = _wait_for_redundancy(run.private, epoch)
-            control_client.ask(run.private, control_client.Inject(Fault(Crash(), "primary", Trigger())))
+            control_client.ask(
+                run.private, control_client.InjectCommand(Fault(Crash(), "primary", Trigger()))
+            )
         _wait_for_redundancy(run.private, epoch)
     parts: dict[str, list[float]] = {"detection": [], "fencing": [], "promotion": [], "first_reply": []}
     recovered = []
@@ -58,7 +60,7 @@ def _wait_for_redundancy(private: Path, epoch: int) -> int:
     limit = time.monotonic() + REDUNDANCY_SECONDS_MAX
     while time.monotonic() < limit:
         try:
-            status = control_client.ask(private, control_client.Status())
+            status = control_client.ask(private, control_client.StatusQuery())
         except ConfigError:
             status = {}  # still starting
         now = int(str(status.get("epoch", 0)))

@@ -32,7 +32,7 @@ from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.runtime.unix import control_client
 from aftbed.runtime.unix.launch import launch, options_for
 from aftbed.runtime.unix.options import CarRun
-from aftbed.runtime.unix.resources import Row, measured
+from aftbed.runtime.unix.resources import ProcessRow, measured
 
 RADAR_HZ: Final = 50.0
 IDLE_HZ: Final = 1.0
@@ -99,17 +99,17 @@ def bench_memory(ftm: str, placement: str) -> dict[str, object]:
     }
 
 
-def _rows_of_drive(private: Path) -> list[Row]:
+def _rows_of_drive(private: Path) -> list[ProcessRow]:
     limit = time.monotonic() + START_SECONDS_MAX
     while time.monotonic() < limit:
         try:
-            status = control_client.ask(private, control_client.Status())
+            status = control_client.ask(private, control_client.StatusQuery())
         except ConfigError:
             status = {}
         if status.get("vehicle"):
             time.sleep(SETTLE_SECONDS)
             rows = control_client.processes(private)
-            rows.append(Row("command", "command", os.getpid(), False))
+            rows.append(ProcessRow("command", "command", os.getpid(), False))
             return measured(rows)
         time.sleep(0.02)
     raise HarnessError(f"the car does not drive after {START_SECONDS_MAX} s")
@@ -168,11 +168,11 @@ def _usage(private: Path, seconds: float) -> tuple[Usage, int, int]:
     return found, began_ns, ended_ns
 
 
-def _sum(values: dict[int, float], rows: list[Row], digits: int) -> float:
+def _sum(values: dict[int, float], rows: list[ProcessRow], digits: int) -> float:
     return round(sum(values.get(row.pid, 0.0) for row in rows), digits)
 
 
-def _cpu_ns(rows: list[Row]) -> dict[int, int]:
+def _cpu_ns(rows: list[ProcessRow]) -> dict[int, int]:
     """The CPU time of each process that is still there; each has one thread."""
     found = {}
     for row in rows:

@@ -103,7 +103,7 @@ def wait_until_ready(private: Path) -> None:
     limit = time.monotonic() + READY_SECONDS_MAX
     while time.monotonic() < limit:
         try:
-            status = control_client.ask(private, control_client.Status())
+            status = control_client.ask(private, control_client.StatusQuery())
         except ConfigError:
             status = {"busy": True}  # still starting
         if not status["busy"]:

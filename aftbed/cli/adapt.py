@@ -127,12 +127,12 @@ def _change(wish: Wish, run: str | None, recipe: str, *, force: bool, as_json: b
 
 
 def _graph_of(private: Path) -> Graph:
-    return msgspec.convert(control_client.ask(private, control_client.GraphNow()), Graph)
+    return msgspec.convert(control_client.ask(private, control_client.GraphQuery()), Graph)
 
 
 def _ask(private: Path, goal: Goal, *, as_json: bool) -> int:
     """Have the run adapt, print how it ended; the exit code."""
-    found = control_client.ask(private, control_client.Adapt(goal), control_client.ADAPT_SECONDS_MAX)
+    found = control_client.ask(private, control_client.AdaptCommand(goal), control_client.ADAPT_SECONDS_MAX)
     ended = msgspec.convert(found, EndedAdaptation)
     if as_json:
         print(dumps(found))
@@ -250,8 +250,10 @@ def plan(
     if start is None and placement is not None:
         raise ConfigError("--placement says where --from stands: give --from EXPR too")
     if start is None:
-        goal = control_client.PlanFor(Goal(expression=expr, recipe=recipe))
-        planned = msgspec.convert(control_client.ask(run_directory.find(run), goal), control_client.Planned)
+        goal = control_client.PlanQuery(Goal(expression=expr, recipe=recipe))
+        planned = msgspec.convert(
+            control_client.ask(run_directory.find(run), goal), control_client.PlanAnswer
+        )
         there, back = planned.there, planned.back
     else:
         old = build(start, placement or PLACEMENTS[0])
@@ -369,6 +371,6 @@ def _yaml(value: object) -> str:
 @adapt.command()
 def history(run: Run = None, json: Json = False) -> None:
     """The adaptations of the run that have ended, and how."""
-    found = control_client.ask(run_directory.find(run), control_client.Adaptations())
+    found = control_client.ask(run_directory.find(run), control_client.AdaptationsQuery())
     ended = msgspec.convert(found["adaptations"], list[EndedAdaptation])
     print("\n".join([dumps(found)] if json else history_lines(ended)))

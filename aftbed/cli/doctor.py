@@ -10,13 +10,13 @@ from aftbed.cli.options import Json
 from aftbed.core.errors import HarnessError
 from aftbed.runtime.unix import cleanup
 from aftbed.runtime.unix.cleanup import Left
-from aftbed.runtime.unix.doctor import Check, inspect
+from aftbed.runtime.unix.doctor import HostCheck, inspect
 
 
 class Diagnosis(msgspec.Struct, frozen=True):
     """The document of --json. `left` is what remains when the command ends; `ok` decides the exit code."""
 
-    checks: list[Check]
+    checks: list[HostCheck]
     left: list[Left]
     removed: list[Left]
     ok: bool

@@ -239,7 +239,7 @@ class _RecordHead(msgspec.Struct, frozen=True):
 def _arm(run: str | None, fault: Fault) -> None:
     """Have the run arm the fault. The messages and signals it may name are those of the run's work."""
     private = run_directory.find(run)
-    record = Path(str(control_client.ask(private, control_client.Status())["record"]))
+    record = Path(str(control_client.ask(private, control_client.StatusQuery())["record"]))
     head = msgspec.json.decode((record / "run.json").read_bytes(), type=_RecordHead)
-    control_client.ask(private, control_client.Inject(with_names_resolved(fault, head.work)))
+    control_client.ask(private, control_client.InjectCommand(with_names_resolved(fault, head.work)))
     print(f"run {private.name}: {fault}", file=sys.stderr)

@@ -16,7 +16,7 @@ from aftbed.runtime.unix.resources import measured
 
 def status(run: Run = None, json: Json = False) -> None:
     """Show the state of a live run."""
-    found = control_client.ask(run_directory.find(run), control_client.Status())
+    found = control_client.ask(run_directory.find(run), control_client.StatusQuery())
     if json:
         print(dumps(found))
         return
@@ -41,7 +41,7 @@ def ps(run: Run = None, json: Json = False) -> None:
 def stop(run: Run = None) -> None:
     """End a live run; its command prints the verdict so far."""
     private = run_directory.find(run)
-    control_client.ask(private, control_client.Stop())
+    control_client.ask(private, control_client.StopCommand())
     print(f"run {private.name}: stopping")
 
 
@@ -60,7 +60,9 @@ def graph(
     if ftm is not None:
         shown = build(ftm, placement)
     else:
-        shown = msgspec.convert(control_client.ask(run_directory.find(run), control_client.GraphNow()), Graph)
+        shown = msgspec.convert(
+            control_client.ask(run_directory.find(run), control_client.GraphQuery()), Graph
+        )
     print(FORMATS[style](shown))
 
 

@@ -105,8 +105,8 @@ class Adaptations:
         inform_recovery: Callable[[], None],
     ) -> None:
         self._deployment, self._executor, self._faults = deployment, executor, faults
-        self._support, self._loop = deployment.support, deployment.support.loop
-        self._tell = self._support.tell
+        self._runtime, self._loop = deployment.runtime, deployment.runtime.loop
+        self._log = self._runtime.log
         self._inform_recovery = inform_recovery
         self._started_ns = self._loop.now_ns()
         self._current: _Current | None = None
@@ -216,7 +216,7 @@ class Adaptations:
             answer(outcome)
         except ConfigError as error:
             ftm = self._deployment.graph.ftm
-            self._tell("adapted", f"{_named(goal)}: refused: {error}")
+            self._log("adapted", f"{_named(goal)}: refused: {error}")
             answer(Outcome(0, _named(goal), goal.recipe, ftm, REFUSED, str(error)))
 
     def _say(self, told: messages.Adapt | messages.Progress | messages.TakeUp) -> None:
@@ -245,7 +245,7 @@ class Adaptations:
             now.execution = Execution(self._deployment, todo, now.plan.new, self._step)
             now.outcome.purpose, now.outcome.ftm = todo.purpose, todo.ftm or self._deployment.graph.ftm
             now.outcome.bricks_total = max(len(g.bricks) for g in (now.execution.old, now.execution.new))
-            self._tell("adapt", f"{number}: {todo.purpose} ({todo.recipe})")
+            self._log("adapt", f"{number}: {todo.purpose} ({todo.recipe})")
         now.phase, now.ended, now.phase_ns = phase, False, self._loop.now_ns()
         execution = now.execution
         phases: dict[Phase, Callable[[], Keys]] = {
@@ -262,13 +262,13 @@ class Adaptations:
 
     def _step(self, event: Event, number: int) -> Keys:
         """Journal a step before it acts; whatever fault waits for it strikes first."""
-        self._support.journal.write(self._loop.now_ns(), event, 0, number)
+        self._runtime.journal.write(self._loop.now_ns(), event, 0, number)
         yield from self._faults.at(event)
 
     def _ended(self, now: _Current, failure: str) -> None:
         took_ms = round((self._loop.now_ns() - now.phase_ns) / 1e6, 3)
         now.ended, now.failure = True, failure
-        self._tell("adapt.phase", f"{now.phase.value}: {failure or f'{took_ms:.2f} ms'}")
+        self._log("adapt.phase", f"{now.phase.value}: {failure or f'{took_ms:.2f} ms'}")
         assert now.execution is not None
         if now.phase is Phase.PREPARE:
             now.outcome.prepare_ms = took_ms
@@ -303,9 +303,9 @@ class Adaptations:
 
     def _keep(self, outcome: Outcome) -> None:
         self.history.append(outcome)
-        self._support.keep(msgspec.json.encode(outcome))
+        self._runtime.record_adaptation(msgspec.json.encode(outcome))
         ended = f"{outcome.number}: {outcome.purpose}: {outcome.outcome} {outcome.reason}"
-        self._tell("adapted", ended.rstrip())
+        self._log("adapted", ended.rstrip())
 
     # -- what happens meanwhile ---------------------------------------------------------------
 

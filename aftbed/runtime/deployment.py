@@ -20,7 +20,7 @@ from aftbed.core.graph import STAGED, Graph, Link
 from aftbed.ftm.compose import REPLICAS
 from aftbed.ftm.failover import HANG_DEADLINE_NS
 from aftbed.runtime import control
-from aftbed.runtime.interface import BUS, LIGHT, Channel, Process, ProcessKind, Support
+from aftbed.runtime.interface import BUS, LIGHT, Channel, Process, ProcessKind, Runtime
 from aftbed.runtime.tasks import STEP_SECONDS_MAX, Key, Wait
 
 ChannelKey = tuple[str, str, str]  # source, its port, sink
@@ -140,9 +140,9 @@ class Slot:
 class Deployment:
     """`leader` and `backup` are names of slots, or `""`."""
 
-    def __init__(self, graph: Graph, support: Support, cpus: list[int] | None) -> None:
-        self.support, self.nursery = support, support.nursery
-        self.channels = Channels(support.channel)
+    def __init__(self, graph: Graph, runtime: Runtime, cpus: list[int] | None) -> None:
+        self.runtime, self.pool = runtime, runtime.pool
+        self.channels = Channels(runtime.channel)
         self.nodes: dict[str, Process] = {}
         self.incarnations: dict[str, int] = {}
         self.epoch, self.leader, self.backup = 1, REPLICAS[0], ""
@@ -213,7 +213,7 @@ class Deployment:
         self._announce(process, order, fds)
 
     def _announce(self, process: Process, order: control.ToNode, fds: tuple[int, ...]) -> None:
-        self.nursery.order(process, order, fds)
+        self.pool.order(process, order, fds)
         process.announce()
 
     def _nudge(self, node: str) -> None:
@@ -375,10 +375,10 @@ class Deployment:
     ) -> Generator[Wait, dict[Key, bytes], Staged]:
         specs = tuple(graph.brick(name) for name in graph.nodes[node])
         incarnation = self.incarnations[node] = self.incarnations.get(node, 0) + 1
-        device, options = self.support.device(specs[0].kind, incarnation)
-        process = yield from self.nursery.spare(BUS if device == "gateway" else LIGHT)
+        device, options = self.runtime.device(specs[0].kind, incarnation)
+        process = yield from self.pool.spare(BUS if device == "gateway" else LIGHT)
         process.name, process.kind, process.incarnation = name, ProcessKind.STAGED, incarnation
-        process.journal = self.support.journal_of(node, incarnation)
+        process.journal = self.runtime.journal_of(node, incarnation)
         process.bricks = tuple((spec.name, spec.kind) for spec in specs)
         names = {s.name for s in specs}
         locals_ = tuple(
@@ -400,7 +400,7 @@ class Deployment:
             held,
             name != node,
             self.cpu_of("recovery"),
-            control.Trial(graph, self.support.recorded_requests()) if trial else None,
+            control.Trial(graph, self.runtime.recorded_requests()) if trial else None,
             device,
             options,
         )
@@ -417,14 +417,14 @@ class Deployment:
         for node in nodes:
             cpu, process = self.cpu_of(node), self.nodes.get(node)
             if cpu is not None and process is not None and process.alive:
-                self.support.pin(process.pid, cpu)
+                self.runtime.pin(process.pid, cpu)
 
     def pin_watchers(self) -> None:
         """Move who watches, recovers or forks, this process included, to the core that does not lead."""
         cpu = self.cpu_of("recovery")
         if cpu is not None:
-            for pid in (0, *(zygote.pid for zygote in self.nursery.zygotes.values() if zygote.alive)):
-                self.support.pin(pid, cpu)
+            for pid in (0, *(zygote.pid for zygote in self.pool.zygotes.values() if zygote.alive)):
+                self.runtime.pin(pid, cpu)
         self.pin(b.name for b in self.graph.bricks if b.kind in WATCHED_KINDS)
 
     # -- channels -----------------------------------------------------------------------------
@@ -492,7 +492,7 @@ class Deployment:
 
         A lifeline tells of a death before the pidfd does, so to ask whether all are alive would not do.
         """
-        now_ns = self.support.loop.now_ns()
+        now_ns = self.runtime.loop.now_ns()
         nodes = [self.nodes[node] for node in self.slots[replica].nodes if node in self.nodes]
         dead = any(not node.alive for node in nodes)
         silent = any(node.silent(now_ns, HANG_DEADLINE_NS) for node in nodes)

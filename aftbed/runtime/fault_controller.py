@@ -105,8 +105,8 @@ class FaultController:
     """All faults of a run. It is the `RunControl` of their kinds."""
 
     def __init__(self, deployment: Deployment) -> None:
-        self._deployment, self._support = deployment, deployment.support
-        self._loop, self._tell = self._support.loop, self._support.tell
+        self._deployment, self._runtime = deployment, deployment.runtime
+        self._loop, self._log = self._runtime.loop, self._runtime.log
         self._numbers = itertools.count(FIRST_FAULT)
         self._injections: list[RunInjection] = []
         self._shared: dict[Process, tuple[SharedState, SharedMemory]] = {}
@@ -119,13 +119,13 @@ class FaultController:
         Raises StepFailed; NoHost is a refusal: nothing has been armed, and the run is not judged by it.
         """
         number = next(self._numbers)
-        injection = RunInjection(number, fault, self._support.draw(number))
+        injection = RunInjection(number, fault, self._runtime.draw(number))
         self._injections.append(injection)
-        self._tell("armed", str(fault))
+        self._log("armed", str(fault))
         if fault.action.shares_state:
             yield from self._share_early(injection)
         if fault.trigger.when is not None:
-            yield from self._support.watch(number, fault.trigger.when, lambda met: self._met(injection, met))
+            yield from self._runtime.watch(number, fault.trigger.when, lambda met: self._met(injection, met))
             return
         if fault.trigger.after_ms and not fault.trigger.event:
             self._loop.after(fault.trigger.after_ms / 1e3, lambda: self._start(injection))
@@ -134,7 +134,7 @@ class FaultController:
             yield from self._begin(injection)
         except NoHost as refusal:
             self._injections.remove(injection)
-            self._tell("refused", str(refusal))
+            self._log("refused", str(refusal))
             raise
 
     def _start(self, injection: RunInjection) -> None:
@@ -146,7 +146,7 @@ class FaultController:
     def _met(self, injection: RunInjection, met: Met) -> None:
         """Its condition holds."""
         injection.met, injection.unmet = met, None
-        self._tell("met", f"{injection.fault}: at {met.t_us / 1e6:.6f} s")
+        self._log("met", f"{injection.fault}: at {met.t_us / 1e6:.6f} s")
         self._run(injection, self._begin(injection), lambda failure: injection.begun(self._loop.now_ns()))
 
     def _begin(self, injection: RunInjection) -> Keys:
@@ -194,7 +194,7 @@ class FaultController:
 
     def _withdraw(self, injection: RunInjection, host: Process) -> Keys:
         """Its host no longer emits its event, or is dead."""
-        injection.move_out(self._support.records(host.journal))
+        injection.move_out(self._runtime.records(host.journal))
         if host.alive and self._deployment.nodes.get(host.name) is host:
             yield from self._deployment.ask(host.name, lambda token: injection.order(token, 0))
 
@@ -243,7 +243,7 @@ class FaultController:
 
         def answer(failure: str) -> None:
             with contextlib.suppress(StepFailed):  # it may be among those that were hit
-                self._deployment.nursery.order(process, control.Ack(number))
+                self._deployment.pool.order(process, control.Ack(number))
 
         self._run(injection, self._act(injection), answer)
 
@@ -275,7 +275,7 @@ class FaultController:
         deployment, target = self._deployment, injection.fault.target
         nodes = self._nodes_of(target)
         found = [p for n, p in deployment.nodes.items() if n in nodes and p.alive]
-        return found or [p for p in deployment.nursery.processes if p.name == target and p.pid]
+        return found or [p for p in deployment.pool.processes if p.name == target and p.pid]
 
     def now_ns(self) -> int:
         """Monotonic."""
@@ -288,11 +288,11 @@ class FaultController:
     def log(self, injection: Injection) -> None:
         """A line for people."""
         said = ", ".join(filter(None, (injection.receipt.state.value, injection.receipt.detail)))
-        self._tell("fault", f"{injection.fault}: {said}")
+        self._log("fault", f"{injection.fault}: {said}")
 
     def record_strike(self, injection: Injection) -> None:
         """In the supervisor's journal."""
-        self._support.journal.write(self._loop.now_ns(), Event.FAULT_APPLIED, 0, injection.number)
+        self._runtime.journal.write(self._loop.now_ns(), Event.FAULT_APPLIED, 0, injection.number)
 
     def until_dead(self, processes: Iterable[TargetProcess]) -> Steps[None]:
         """Wait for their deaths."""
@@ -311,15 +311,15 @@ class FaultController:
 
     def flip_memory(self, process: TargetProcess, bit: int | None, address: int | None, draw: int) -> str:
         """By the runtime."""
-        return self._support.flip_memory(cast("Process", process), bit, address, draw)
+        return self._runtime.flip_memory(cast("Process", process), bit, address, draw)
 
     def disturb_bus(self, injection: Injection) -> Steps[None]:
         """By the runtime."""
-        yield from self._support.disturb(injection.number, injection.fault.action, injection.draw)
+        yield from self._runtime.disturb(injection.number, injection.fault.action, injection.draw)
 
     def bus_report(self, injection: Injection) -> BusReceipt | None:
         """By the runtime."""
-        return self._support.bus_fault(injection.number)
+        return self._runtime.bus_fault(injection.number)
 
     def records_about(self, injection: Injection) -> list[Record]:
         """Of its hosts and of what it struck."""
@@ -331,11 +331,11 @@ class FaultController:
         process = self._process_of(brick)
         if process is not None:
             paths.add(process.journal)
-        return [record for path in paths for record in self._support.records(path)]
+        return [record for path in paths for record in self._runtime.records(path)]
 
     def journal(self, path: str) -> Iterable[Record]:
         """The records there."""
-        return self._support.records(path)
+        return self._runtime.records(path)
 
     def _process_of(self, brick: str) -> Process | None:
         node = next((n for n, hosted in self._deployment.graph.nodes.items() if brick in hosted), "")
@@ -354,7 +354,7 @@ class FaultController:
         if process is None or not process.alive:
             raise StepFailed("nobody to hit")
         if process not in self._shared:
-            memory = self._support.shared_memory()
+            memory = self._runtime.shared_memory()
             shared = SharedState(injection.number, brick, process.journal, memory.memory)
             self._shared[process] = shared, memory
         shared, memory = self._shared[process]

@@ -27,7 +27,7 @@ class Hosted(msgspec.Struct, frozen=True):
 def hosted(deployment: Deployment) -> Hosted:
     """As the executive sees it at this moment: a node that is dead, and not yet seen dead, lives."""
     graph = deployment.graph
-    living = [p for p in deployment.nursery.processes if p.alive and p.kind is not ProcessKind.KILLED]
+    living = [p for p in deployment.pool.processes if p.alive and p.kind is not ProcessKind.KILLED]
     bricks = tuple(sorted(brick for process in living for brick in process.bricks))
     return Hosted(graph.ftm, graph.placement, deployment.leader, deployment.backup, bricks)
 

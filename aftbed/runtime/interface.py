@@ -143,7 +143,7 @@ class Process(Protocol):
         ...
 
 
-class Nursery(Protocol):
+class ProcessPool(Protocol):
     """Where processes come from."""
 
     @property
@@ -160,11 +160,11 @@ class Nursery(Protocol):
         """A process that can become anything; waits for one if there is none."""
         ...
 
-    def calm(self, zygote: str) -> Generator[Wait, dict[Key, bytes], None]:
+    def wait_for_forks(self, zygote: str) -> Generator[Wait, dict[Key, bytes], None]:
         """Wait until no spare is in the making."""
         ...
 
-    def level(self, zygote: str, count: int) -> None:
+    def refill(self, zygote: str, count: int) -> None:
         """Have `count` spares, in the end."""
         ...
 
@@ -210,7 +210,7 @@ class Met(NamedTuple):
     go_on: Callable[[], None]
 
 
-class Support(Protocol):
+class Runtime(Protocol):
     """A runtime, whole."""
 
     @property
@@ -219,7 +219,7 @@ class Support(Protocol):
         ...
 
     @property
-    def nursery(self) -> Nursery:
+    def pool(self) -> ProcessPool:
         """Processes."""
         ...
 
@@ -284,10 +284,10 @@ class Support(Protocol):
         """Have the process `pid` run on `cpu` only."""
         ...
 
-    def keep(self, adaptation: bytes) -> None:
+    def record_adaptation(self, adaptation: bytes) -> None:
         """Write down how an adaptation ended, as JSON."""
         ...
 
-    def tell(self, event: str, text: str) -> None:
+    def log(self, event: str, text: str) -> None:
         """A line for people."""
         ...

@@ -20,7 +20,7 @@ from aftbed.runtime import control
 from aftbed.runtime.adaptations import CLIENT, ENGINE, REPLACE, Adaptations
 from aftbed.runtime.deployment import HANG_NS, WATCHED_KINDS, Deployment
 from aftbed.runtime.fault_controller import FaultController
-from aftbed.runtime.interface import LIGHT, Process, ProcessKind, Support
+from aftbed.runtime.interface import LIGHT, Process, ProcessKind, Runtime
 from aftbed.runtime.script_executor import ScriptExecutor
 
 RETRY_SECONDS: Final = 0.002
@@ -44,10 +44,10 @@ class RunController:
     """One run. `on_loss` is called when no replica is left and none will come."""
 
     def __init__(
-        self, graph: Graph, support: Support, cpus: list[int] | None, on_loss: Callable[[], None]
+        self, graph: Graph, runtime: Runtime, cpus: list[int] | None, on_loss: Callable[[], None]
     ) -> None:
-        self._support, self._loop, self._on_loss = support, support.loop, on_loss
-        self.deployment = Deployment(graph, support, cpus)
+        self._runtime, self._loop, self._on_loss = runtime, runtime.loop, on_loss
+        self.deployment = Deployment(graph, runtime, cpus)
         self.executor = ScriptExecutor(self.deployment)
         self.faults = FaultController(self.deployment)
         self.adaptations = Adaptations(
@@ -82,7 +82,7 @@ class RunController:
                 process.assigned()
                 key = ("ack", process.name, token)
                 if error:
-                    self._support.tell("refused", f"{process.name}: {error}")
+                    self._runtime.log("refused", f"{process.name}: {error}")
                     tasks.fail(key, f"{process.name}: {error}")
                 else:
                     tasks.settle(key, data)
@@ -101,7 +101,7 @@ class RunController:
             case control.Fired(fault):
                 self.faults.fired(process, fault)
             case _:
-                self._support.tell("refused", f"{process.name} said {type(report).__name__}")
+                self._runtime.log("refused", f"{process.name} said {type(report).__name__}")
 
     def _on_script(self, ordered: script.Script) -> None:
         if self.executor.busy or self.ending or self.executor.stale(ordered):
@@ -110,12 +110,12 @@ class RunController:
             return  # the way back first
         run = ScriptRun(ordered.kind, ordered.replica, self._loop.now_ns())
         self.scripts.append(run)
-        tell = self._support.tell
+        log = self._runtime.log
 
         def ended(failure: str) -> None:
             run.ended_ns, run.failure = self._loop.now_ns(), failure
             ms = f"{(run.ended_ns - run.began_ns) / 1e6:.2f} ms"
-            tell("script.failed" if failure else "script.done", f"{ordered.purpose}: {failure or ms}")
+            log("script.failed" if failure else "script.done", f"{ordered.purpose}: {failure or ms}")
             self.inform_recovery(failed=bool(failure))
             self._loop.after(SETTLE_SECONDS, lambda: self._settle_after(ordered))
             if failure:
@@ -123,8 +123,8 @@ class RunController:
 
         self._loop.tasks.start(ordered.purpose, self.executor.execute(ordered), ended)
         if ordered.kind in LOSSES:  # its nodes are killed only when the new leader serves
-            tell("alarm", f"{ordered.replica}: {self.deployment.cause_of_loss(ordered.replica)}")
-        tell("script", f"{ordered.purpose} ({ordered.replica})")
+            log("alarm", f"{ordered.replica}: {self.deployment.cause_of_loss(ordered.replica)}")
+        log("script", f"{ordered.purpose} ({ordered.replica})")
 
     def _settle_after(self, ordered: script.Script) -> None:
         """What can wait until after a script: spares, and faults that are still to come."""
@@ -143,33 +143,33 @@ class RunController:
 
     def _restock(self) -> None:
         if not self.ending:
-            self._support.nursery.level(LIGHT, self.spares())
+            self._runtime.pool.refill(LIGHT, self.spares())
 
     def inform_recovery(self, *, failed: bool) -> None:
         """Tell it how things are; it may act again."""
         deployment = self.deployment
         roles = f"{deployment.leader or 'nobody'} leads, {deployment.backup or 'nobody'} backs up"
-        self._support.tell("roles", f"{roles}, epoch {deployment.epoch}")
+        self._runtime.log("roles", f"{roles}, epoch {deployment.epoch}")
         if self.executor.busy or not deployment.lives("recovery") or self.ending:
             return
         situation = self.executor.situation(failed=failed)
         try:
             deployment.order("recovery", lambda token: control.Tell(token, "recovery", situation))
         except StepFailed as error:
-            self._support.tell("refused", str(error))
+            self._runtime.log("refused", str(error))
 
     # -- deaths and hangs -------------------------------------------------------------------------------
 
     def on_death(self, process: Process) -> None:
         """A process is dead, and nobody meant it to be unless its kind is `killed`."""
-        self._support.journal.write(self._loop.now_ns(), Event.NODE_DIED, 0, process.pid)
+        self._runtime.journal.write(self._loop.now_ns(), Event.NODE_DIED, 0, process.pid)
         self._loop.tasks.settle(("died", process.name, process.pid))
         if process.kind is ProcessKind.KILLED or self.ending:
             return
-        self._support.tell("died", f"{process.name} (pid {process.pid})")
+        self._runtime.log("died", f"{process.name} (pid {process.pid})")
         self._loop.tasks.died(process.name)
         if process.kind is ProcessKind.SPARE:
-            self._support.nursery.level(LIGHT, self.spares())
+            self._runtime.pool.refill(LIGHT, self.spares())
         elif process.kind is ProcessKind.NODE and self.replaceable(process.name):
             if process.name != ENGINE:
                 self.adaptations.give_up_preparing(f"{process.name} died")
@@ -180,10 +180,10 @@ class RunController:
     def look_for_hangs(self) -> None:
         """What no Watchdog watches and shows no pulse is killed, and so replaced."""
         now_ns = self._loop.now_ns()
-        for process in list(self._support.nursery.processes):
+        for process in list(self._runtime.pool.processes):
             watched = process.kind is ProcessKind.NODE and self.replaceable(process.name)
             if watched and process.hangs(now_ns, HANG_NS):
-                self._support.tell("hangs", f"{process.name} (pid {process.pid}): killed, to be replaced")
+                self._runtime.log("hangs", f"{process.name} (pid {process.pid}): killed, to be replaced")
                 process.kill()
 
     def _look_for_loss(self) -> None:
@@ -197,7 +197,7 @@ class RunController:
         nodes = slot.nodes if slot is not None and deployment.leader not in deployment.lost else []
         if nodes and all(deployment.lives(node) for node in nodes):
             return
-        self._support.tell("lost", "no replica is left: the service is gone")
+        self._runtime.log("lost", "no replica is left: the service is gone")
         self._on_loss()
 
     def replaceable(self, node: str) -> bool:
@@ -216,7 +216,7 @@ class RunController:
 
         def ended(failure: str) -> None:
             ms = (self._loop.now_ns() - began_ns) / 1e6
-            self._support.tell("replaced", f"{node}: {failure or f'{ms:.2f} ms'}")
+            self._runtime.log("replaced", f"{node}: {failure or f'{ms:.2f} ms'}")
             half = self.deployment.nodes.get(node)
             if failure and not self.ending and half is not None and half.alive:
                 half.kill()  # half bound: its death is heard, and replaced in turn
@@ -228,7 +228,7 @@ class RunController:
                 self.adaptations.engine_is_new()
             if node == CLIENT and not failure:
                 self._loop.tasks.start("rearm", self.adaptations.client_is_new(), lambda _: None)
-            self._support.nursery.level(LIGHT, self.spares())
+            self._runtime.pool.refill(LIGHT, self.spares())
 
         held = node == CLIENT and self.adaptations.to_come  # until it knows what waits for its requests
         self._loop.tasks.start(f"{REPLACE}{node}", self.deployment.respawn(node, held=held), ended)

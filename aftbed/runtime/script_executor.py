@@ -145,7 +145,7 @@ class Execution:
         new: Graph | None = None,
         observe: Observe | None = None,
     ) -> None:
-        self._deployment, self._support, self.script = deployment, deployment.support, script
+        self._deployment, self._runtime, self.script = deployment, deployment.runtime, script
         self._observe = observe
         adapts = script.kind is ScriptKind.ADAPTATION
         self.old: Graph = deployment.graph
@@ -185,7 +185,7 @@ class Execution:
         # The paper's recipe stages in the commit; of several, the later ones depend on the first.
         if self.script.recipe == RECIPES[0] and len(rebinds) == 1:
             self._rebinding.prepare(tuple(flat(rebinds)))
-        yield from self._deployment.nursery.calm(LIGHT)
+        yield from self._deployment.pool.wait_for_forks(LIGHT)
 
     def commit(self) -> Keys:
         """All that the client waits for."""
@@ -193,7 +193,7 @@ class Execution:
         if self.script.recipe != RECIPES[0]:
             for slot in deployment.slots.values():  # it kills what they watch
                 yield from deployment.watch(slot, nobody=True)
-        self.closed_ns = self._support.loop.now_ns()
+        self.closed_ns = self._runtime.loop.now_ns()
         try:
             for step in self.script.commit:
                 yield from self._enter()
@@ -207,7 +207,7 @@ class Execution:
                 yield from self._probe_way_back()
             if not self._one_way:
                 raise
-        self.opened_ns = self._support.loop.now_ns()
+        self.opened_ns = self._runtime.loop.now_ns()
         if not self.committed:
             self._adopt(self.new)
         yield from self._watch()
@@ -236,7 +236,7 @@ class Execution:
         deployment = self._deployment
         serving = list((deployment.nodes | self._replaced).items())
         serving += list(deployment.nodes.items()) if self.committed else []
-        now_ns = self._support.loop.now_ns()
+        now_ns = self._runtime.loop.now_ns()
         self.lost = {replica_of(name) for name, p in serving if not p.alive or p.hangs(now_ns, HANG_NS)}
         self.lost = (self.lost | {lost}) - {""}
         if self.committed:  # else the Watchdogs have seen it
@@ -247,7 +247,7 @@ class Execution:
             yield from self._do_back(step)
         yield from self._end_staged(list(self._staged))
         deployment.channels.close_beside()
-        self.undone_ns = self.undone_ns or self._support.loop.now_ns()
+        self.undone_ns = self.undone_ns or self._runtime.loop.now_ns()
         yield Wait(frozenset())
 
     def can_go_back(self, without: str) -> bool:
@@ -357,7 +357,7 @@ class Execution:
             case Freeze(brick):
                 self._rebinding.host(brick).freeze()
             case Thaw(brick):
-                self.turned_ns = self._support.loop.now_ns()
+                self.turned_ns = self._runtime.loop.now_ns()
                 self._rebinding.host(brick).thaw()
             case Destroy(node):
                 process = self._deployment.process(node)
@@ -378,7 +378,7 @@ class Execution:
     def _resume(self, steps: Iterable[Resume]) -> Keys:
         sent = []
         for step in steps:
-            before_ns = self._support.loop.now_ns()
+            before_ns = self._runtime.loop.now_ns()
             sent.append(self._deployment.order_to(self._rebinding.host(step.brick), control.Resume))
             self.done.append(step)
             if step.brick == f"{self._deployment.leader}/protocol":
@@ -445,7 +445,7 @@ class Execution:
         # so the shut checkpoint channel is what counts. The other one is shut as soon as the Proxy
         # follows the new leader: to wake it twice costs 0.1 ms of the blackout.
         detail = slot.generation << 8 | slot.number
-        self._support.journal.write(self._support.loop.now_ns(), Event.REPLICA_FENCED, 0, detail)
+        self._runtime.journal.write(self._runtime.loop.now_ns(), Event.REPLICA_FENCED, 0, detail)
 
     def _kill(self, replica: str) -> None:
         """The nodes of the slot die; their deaths are reaped later, the slot is free at once."""
@@ -494,7 +494,7 @@ class Execution:
                 channel.nudge()  # wakes one that waits for a request
         # The new leader's core is for the first reply now: nothing is urgent here, and to wake up for
         # each report from there would take it 0.1 ms.
-        self._support.loop.rest(FIRST_REPLY_SECONDS)
+        self._runtime.loop.rest(FIRST_REPLY_SECONDS)
         promoting, self._promoting = self._promoting, None
         if promoting is not None:
             deployment.assert_whole(deployment.slots[replica])
@@ -642,7 +642,7 @@ class Execution:
 
     def _resume_living(self, bricks: Iterable[str]) -> None:
         """What was suspended goes on, but for a lost replica."""
-        self.undone_ns = self._support.loop.now_ns()
+        self.undone_ns = self._runtime.loop.now_ns()
         for brick in bricks:
             if replica_of(brick) not in self.lost:
                 with suppress(StepFailed):

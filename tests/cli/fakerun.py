@@ -55,20 +55,20 @@ class FakeRun:
         """Replaces `ask.ask`."""
         assert private.name == "abc123"
         match question:
-            case control_client.GraphNow():
+            case control_client.GraphQuery():
                 return msgspec.json.decode(msgspec.json.encode(self.graph))  # type: ignore[no-any-return]
-            case control_client.Status():
+            case control_client.StatusQuery():
                 return {"record": str(self.record)}
-            case control_client.Inject(fault):
+            case control_client.InjectCommand(fault):
                 self.faults.append(fault)
                 return {}
-            case control_client.Adaptations():
+            case control_client.AdaptationsQuery():
                 return {"adaptations": self.history}
-            case control_client.PlanFor(goal):
+            case control_client.PlanQuery(goal):
                 there = plan_goal(self.graph, goal)
-                found = control_client.Planned(there, plan(there.new, there.old, goal.recipe))
+                found = control_client.PlanAnswer(there, plan(there.new, there.old, goal.recipe))
                 return msgspec.json.decode(msgspec.json.encode(found))  # type: ignore[no-any-return]
-            case control_client.Adapt(goal):
+            case control_client.AdaptCommand(goal):
                 plan_goal(self.graph, goal)
                 self.goals.append(goal)
                 self.seconds = seconds

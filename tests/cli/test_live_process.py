@@ -172,7 +172,7 @@ def test_an_interrupt_ends_the_run_with_its_verdict(home: Home, sig: signal.Sign
 def test_an_interrupt_of_json_gives_the_document(home: Home) -> None:
     with Command("--load", "100000@200", "--json") as command:
         private = run_directory.root() / until(run_directory.live, "the run")[0]
-        until(lambda: control_client.ask(private, control_client.Status())["backup"], "redundancy")
+        until(lambda: control_client.ask(private, control_client.StatusQuery())["backup"], "redundancy")
         command.popen.send_signal(signal.SIGINT)
         done = command.done()
     assert done.code == 130, done.out + done.err

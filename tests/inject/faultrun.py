@@ -18,9 +18,9 @@ from aftbed.runtime import control
 from aftbed.runtime.fault_controller import FaultController
 from aftbed.runtime.interface import ProcessKind
 from aftbed.runtime.tasks import Wait
-from aftbed.runtime.unix.event_loop import Loop
-from aftbed.runtime.unix.journal_files import Journal
-from aftbed.runtime.unix.support import Support
+from aftbed.runtime.unix.event_loop import EventLoop
+from aftbed.runtime.unix.journal_files import JournalFile
+from aftbed.runtime.unix.support import UnixRuntime
 
 FIRST: Final = 1_000_001  # the number of a run's first fault
 
@@ -31,7 +31,7 @@ class FakeProcess:
     def __init__(self, name: str, folder: Path, incarnation: int) -> None:
         self.name, self.pid, self.pidfd, self.kind = name, 10_000 + incarnation, -1, ProcessKind.NODE
         path = folder / f"{name.replace('/', '.')}.{incarnation}.journal"
-        self.journal, self.wrote = str(path), Journal(path, name)
+        self.journal, self.wrote = str(path), JournalFile(path, name)
         self.alive = self.thaws = True
         self.signals: list[int] = []
 
@@ -66,7 +66,7 @@ class FakeDeployment:
         self.nodes: dict[str, FakeProcess] = {}
         self.told: list[tuple[str, control.Arm | control.ArmOnChannel | control.SlowDown]] = []
         self.refuses = False
-        self.nursery = self
+        self.pool = self
         self.made = 0
         self.renew(*self.graph.nodes)
         self.slots = {r: FakeSlot([n for n in self.nodes if n.startswith(f"{r}/")]) for r in "ab"}
@@ -118,15 +118,15 @@ class Run:
         self.deployment = FakeDeployment(folder, ftm, placement)
         self.said: list[str] = []
         (folder / "journal").mkdir()
-        support = Support(
+        runtime = UnixRuntime(
             folder,
-            Loop(),
+            EventLoop(),
             self.deployment,  # type: ignore[arg-type]
             lambda kind, incarnation: ("", b""),
             lambda event, text: self.said.append(f"{event}: {text}"),
             seed,
         )
-        self.deployment.support = support
+        self.deployment.runtime = runtime
         self.faults = FaultController(self.deployment)  # type: ignore[arg-type]
 
     def do(self, steps: Generator[Wait, object, None]) -> list[Wait]:

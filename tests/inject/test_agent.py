@@ -26,7 +26,7 @@ from aftbed.inject.receipts import fault_and_bits, record_detail
 from aftbed.inject.value import EXECUTED, ValueFlip, ValuePlace
 from aftbed.runtime import control
 from aftbed.runtime.node import Node
-from aftbed.runtime.unix.journal_files import Journal
+from aftbed.runtime.unix.journal_files import JournalFile
 from aftbed.runtime.unix.node_io import UnixIO
 from aftbed.runtime.unix.transport import Line, decode_order, decode_report
 
@@ -85,7 +85,7 @@ class Host:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self.line = Line(ours, decode_report)
         ours.setblocking(False)
-        self.io = UnixIO(Line(theirs, decode_order), Journal(path, "a"))
+        self.io = UnixIO(Line(theirs, decode_order), JournalFile(path, "a"))
         self.node = Node("a", self.io)
         for name in ("a/server", "b/server"):  # as in placement `single`
             self.node.add(name, brick).outputs["out"] = self.out.append

@@ -134,7 +134,7 @@ def test_all_nodes_of_a_slow_replica_are_told_and_told_again(run: Run) -> None:
     assert run.deployment.told == [(n, control.SlowDown(1, FIRST, 3_000_000)) for n in nodes]
     assert run.reports()[0][1] == "applied"
     run.deployment.told.clear()
-    loop = run.deployment.support.loop
+    loop = run.deployment.runtime.loop
     loop.after(0.002, loop.end)
     loop.run()
     assert run.deployment.told == [(n, control.SlowDown(1, FIRST, 0)) for n in nodes]
@@ -171,7 +171,7 @@ def test_a_hang_is_activated_when_its_target_runs_on(run: Run, thawed: bool, rec
     assert run.reports()[0][1] == "applied"
     for process in run.deployment.processes:
         process.thaws = thawed
-    loop = run.deployment.support.loop
+    loop = run.deployment.runtime.loop
     loop.after(0.002, loop.end)
     loop.run()
     assert run.reports()[0][1] == receipt

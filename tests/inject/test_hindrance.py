@@ -25,7 +25,7 @@ from aftbed.inject.receipts import fault_and_bits
 from aftbed.inject.timing import Permanent
 from aftbed.runtime import control
 from aftbed.runtime.node import Node
-from aftbed.runtime.unix.journal_files import Journal
+from aftbed.runtime.unix.journal_files import JournalFile
 from aftbed.runtime.unix.node_io import UnixIO
 from aftbed.runtime.unix.transport import Line, decode_order, decode_report
 
@@ -77,7 +77,7 @@ class Host:
         for end in (writer, self.reader):
             end.setblocking(False)
         self.brick = Passing(self.reader)
-        self.io = UnixIO(Line(theirs, decode_order), Journal(path, "a"))
+        self.io = UnixIO(Line(theirs, decode_order), JournalFile(path, "a"))
         self.node = Node("a", self.io)
         self.node.add(BRICK, self.brick)
         self.writer = writer.detach()

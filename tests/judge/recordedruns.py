@@ -8,7 +8,7 @@ from records import CRASH, RecordInTheMaking
 from aftbed.core.events import Event
 from aftbed.core.journal import EntryKind
 from aftbed.judge.record import RunRecord, read_record
-from aftbed.runtime.unix.journal_files import Dialogue
+from aftbed.runtime.unix.journal_files import DialogueFile
 from aftbed.runtime.unix.options import Work
 from aftbed.vehicle.aeb.messages import AebInput, AebTarget, encode_request
 
@@ -47,7 +47,7 @@ def finished(run: RecordInTheMaking) -> RunRecord:
 def asking(path: Path, work: Work, *pairs: tuple[int, int]) -> RunRecord:
     """A run with a request at each (t_ns, t_ms)."""
     run = RecordInTheMaking(path, work)
-    dialogue = Dialogue(path / "journal" / "client.2.dialogue", "client")
+    dialogue = DialogueFile(path / "journal" / "client.2.dialogue", "client")
     for number, (t_ns, t_ms) in enumerate(pairs, 1):
         target = AebTarget(0, 40.0, -10.0)
         payload = encode_request(AebInput(t_ms, 14.0, True, True, (target,)))

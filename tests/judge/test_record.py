@@ -7,14 +7,14 @@ from records import whole
 
 from aftbed.core.errors import ConfigError
 from aftbed.judge.record import read_record
-from aftbed.runtime.unix.journal_files import Dialogue
+from aftbed.runtime.unix.journal_files import DialogueFile
 
 
 def test_several_incarnations_of_the_client_are_one_dialogue(path: Path) -> None:
     """In the order of their numbers, not of their names: 10 comes after 9."""
     record = whole(path)
     for incarnation in range(2, 11):
-        record._dialogue = Dialogue(path / "journal" / f"client.{incarnation}.dialogue", "client")
+        record._dialogue = DialogueFile(path / "journal" / f"client.{incarnation}.dialogue", "client")
         record.request()
     verdict = record.verdict()
     assert verdict.verdict == "pass" and verdict.requests.sent == 12

@@ -37,7 +37,7 @@ from aftbed.judge.verdict import Verdict, judge
 from aftbed.runtime.unix import control_client, run_directory
 from aftbed.runtime.unix.launch import launch, options_for
 from aftbed.runtime.unix.options import LoadRun, Work
-from aftbed.runtime.unix.resources import Row
+from aftbed.runtime.unix.resources import ProcessRow
 
 RUN_SECONDS_MAX: Final = 60.0
 
@@ -176,7 +176,7 @@ class Started:
 
     # -- what it does -------------------------------------------------------------------------
 
-    def rows(self) -> list[Row]:
+    def rows(self) -> list[ProcessRow]:
         """Its processes."""
         return control_client.processes(self.private)
 
@@ -186,7 +186,7 @@ class Started:
 
     def status(self) -> dict[str, object]:
         """What `aftbed status` would show."""
-        return control_client.ask(self.private, control_client.Status())
+        return control_client.ask(self.private, control_client.StatusQuery())
 
     def redundant(self) -> bool:
         """Whether a backup stands and no script is under way."""

@@ -44,7 +44,9 @@ def trail(mechanisms: tuple[str, ...]) -> list[str]:
 
 def adapt(run: Started, goal: Goal) -> dict[str, object]:
     """What the one who asks hears."""
-    return control_client.ask(run.private, control_client.Adapt(goal), control_client.ADAPT_SECONDS_MAX)
+    return control_client.ask(
+        run.private, control_client.AdaptCommand(goal), control_client.ADAPT_SECONDS_MAX
+    )
 
 
 def serving(home: Home, ftm: str, placement: str, *faults: Fault) -> Started:
@@ -58,7 +60,7 @@ def serving(home: Home, ftm: str, placement: str, *faults: Fault) -> Started:
 def ended(run: Started) -> Outcome:
     """The run, stopped after some more requests have been answered."""
     run.wait_for_answers(run.answered() + 20)
-    control_client.ask(run.private, control_client.Stop())
+    control_client.ask(run.private, control_client.StopCommand())
     return run.finish()
 
 
@@ -75,7 +77,7 @@ def assert_nothing_happened_to_requests(outcome: Outcome) -> None:
 
 def graph_of(run: Started) -> set[tuple[str, str]]:
     """The bricks that run, with their kinds."""
-    bricks = control_client.ask(run.private, control_client.GraphNow())["bricks"]
+    bricks = control_client.ask(run.private, control_client.GraphQuery())["bricks"]
     assert isinstance(bricks, list)
     return {(str(b["name"]), str(b["kind"])) for b in bricks}
 
@@ -186,7 +188,7 @@ def test_a_brick_that_crashes_while_it_is_observed_is_rolled_back(
 
 def test_a_second_adaptation_meanwhile_is_refused(home: Home) -> None:
     with serving(home, "pbr", "process") as run:
-        line = control_client.send(run.private, control_client.Adapt(Goal(expression="lfr")))
+        line = control_client.send(run.private, control_client.AdaptCommand(Goal(expression="lfr")))
         until(lambda: run.status()["adapting"], "an adaptation under way")
         with pytest.raises(ConfigError, match=r"adaptation 1 .* is under way"):
             adapt(run, Goal(expression="pbr+tr"))

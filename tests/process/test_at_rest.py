@@ -10,7 +10,7 @@ from aftbed.core.journal import EntryKind
 from aftbed.inject.model import parse
 from aftbed.runtime.unix import control_client
 from aftbed.runtime.unix.options import LoadRun
-from aftbed.runtime.unix.process_pool import Process
+from aftbed.runtime.unix.process_pool import UnixProcess
 
 pytestmark = pytest.mark.process
 
@@ -36,7 +36,7 @@ def test_what_is_under_way_when_it_is_stopped_is_answered(home: Home) -> None:
         run.wait_for_answers(1)
         sent = run.entries(EntryKind.SENT)
         until(lambda: run.entries(EntryKind.SENT) > sent, "another request")
-        control_client.ask(run.private, control_client.Stop())
+        control_client.ask(run.private, control_client.StopCommand())
         outcome = run.finish()
     requests = outcome.verdict.requests
     assert outcome.verdict.verdict == "pass", outcome.verdict.reasons
@@ -48,14 +48,14 @@ def test_the_end_of_a_run_is_nothing_to_recover_from(
     home: Home, monkeypatch: pytest.MonkeyPatch, ftm: str
 ) -> None:
     """Nobody acts on the deaths, though the supervisor is held up after each kill."""
-    kill = Process.kill
+    kill = UnixProcess.kill
 
-    def slowly(process: Process) -> bool:
+    def slowly(process: UnixProcess) -> bool:
         killed = kill(process)
         time.sleep(0.005)  # not to wait for anything: it is what happens here
         return killed
 
-    monkeypatch.setattr(Process, "kill", slowly)  # the supervisor is a fork of this process
+    monkeypatch.setattr(UnixProcess, "kill", slowly)  # the supervisor is a fork of this process
     outcome = Started(home, LoadRun(COUNT, 0.0), ftm=ftm).finish()
     assert outcome.verdict.verdict == "pass", outcome.verdict.reasons
     assert not outcome.record.history.events(Event.WATCHDOG_SUSPECT, Event.RECOVERY_ENTER)

@@ -239,7 +239,7 @@ def test_a_live_run_is_hit_from_a_second_command(home: Home) -> None:
         assert done.code == 0, done.err
         assert "bitflip result bit 8 in primary at server.exit nth 5" in done.err
         told = started.wait_for("fault", "activated")
-        control_client.ask(started.private, control_client.Stop())
+        control_client.ask(started.private, control_client.StopCommand())
         outcome = started.finish()
     assert outcome.verdict.requests.wrong == 1 and outcome.verdict.verdict == "fail"
     (fault,) = outcome.verdict.faults
@@ -266,15 +266,17 @@ def held_in_its_launch(home: Home) -> Iterator[tuple[Started, int]]:
 
 def test_what_is_asked_while_a_run_starts_is_done_when_it_has(home: Home) -> None:
     with held_in_its_launch(home) as (started, zygote):
-        given_up = control_client.send(started.private, control_client.Inject(parse("crash primary")))
+        given_up = control_client.send(started.private, control_client.InjectCommand(parse("crash primary")))
         started.status()
         given_up.close()
-        asked = control_client.send(started.private, control_client.Inject(parse("bitflip result bit 8")))
+        asked = control_client.send(
+            started.private, control_client.InjectCommand(parse("bitflip result bit 8"))
+        )
         started.status()
         os.kill(zygote, signal.SIGCONT)
         control_client.receive(asked)
         started.wait_for("fault", "activated")
-        control_client.ask(started.private, control_client.Stop())
+        control_client.ask(started.private, control_client.StopCommand())
         outcome = started.finish()
     ((fault, receipt),) = [(fault.fault, fault.receipt.value) for fault in outcome.verdict.faults]
     assert fault.startswith("bitflip") and receipt == "activated", "who has given up is not obeyed"
@@ -285,7 +287,7 @@ def test_after_a_while_the_next_execution_is_hit(home: Home) -> None:
         done = aftbed("inject", "bitflip", "result", "--replica", "a", "--bit", "8", "--after", "100ms")
         assert done.code == 0, done.err
         started.wait_for_answers(started.answered() + 75)  # at 200 a second: that is behind the hit
-        control_client.ask(started.private, control_client.Stop())
+        control_client.ask(started.private, control_client.StopCommand())
         outcome = started.finish()
     (fault,) = outcome.verdict.faults
     assert fault.receipt.value == "activated"

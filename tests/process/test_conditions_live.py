@@ -70,7 +70,7 @@ def test_a_live_run_is_given_one_from_a_second_command(home: Home) -> None:
         done = aftbed("inject", "hang", "primary", "--for", "20ms", "--when", "speed>5")
         assert done.code == 0 and "hang primary for 20ms when speed > 5" in done.err, done.err
         run.wait_for("met")
-        control_client.ask(run.private, control_client.Stop())
+        control_client.ask(run.private, control_client.StopCommand())
         (found,) = run.finish().verdict.faults
     assert found.receipt.value == "activated" and "speed > 5 at " in found.detail
 
@@ -108,7 +108,7 @@ def test_a_replica_with_a_small_share_takes_longer_and_then_no_longer(home: Home
 
 def flipped(run: Started, text: str) -> re.Match[str]:
     """What the run says of the bit that it has flipped."""
-    control_client.ask(run.private, control_client.Inject(parse(text)))
+    control_client.ask(run.private, control_client.InjectCommand(parse(text)))
     said = str(run.wait_for("fault", "bitflip memory")["text"])
     found = _WHERE.search(said)
     assert found is not None, said
@@ -130,7 +130,7 @@ def test_a_bit_of_a_nodes_memory_is_another_one_and_of_no_other_node(home: Home)
         assert process_memory.peek(other, address) == before, (
             "forked from the same zygote, and not the same memory"
         )
-        control_client.ask(run.private, control_client.Stop())
+        control_client.ask(run.private, control_client.StopCommand())
         outcome = run.finish()
     assert outcome.verdict.faults[0].receipt.value == "applied"
 
@@ -160,7 +160,7 @@ def test_what_is_no_memory_of_the_process_is_the_injectors_failure(home: Home) -
         )
         first = int(code.partition("-")[0], 16)
         control_client.ask(
-            run.private, control_client.Inject(parse(f"bitflip memory address {first:#x} in a/server"))
+            run.private, control_client.InjectCommand(parse(f"bitflip memory address {first:#x} in a/server"))
         )
         said = str(run.wait_for("fault", "inject_error")["text"])
         assert f"address {first:#x}: in no private memory that a/server (pid" in said

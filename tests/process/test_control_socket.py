@@ -40,7 +40,7 @@ questions = st.one_of(
     ),
     st.builds(
         lambda target, event, nth, after_ms, for_ms: msgspec.msgpack.encode(
-            control_client.Inject(Fault(Hang(for_ms), target, Trigger(event, nth, after_ms)))
+            control_client.InjectCommand(Fault(Hang(for_ms), target, Trigger(event, nth, after_ms)))
         ),
         HARMLESS_TARGETS,
         st.sampled_from(["", "request.sent", "checkpoint.applied", "nonsense"]),
@@ -109,7 +109,11 @@ def test_garbage_changes_nothing(run: Started) -> None:
 
 def test_truncated_questions_change_nothing(run: Started) -> None:
     fault = Fault(Crash(), "primary", Trigger())
-    for question in (control_client.Inject(fault), control_client.Stop(), control_client.Processes()):
+    for question in (
+        control_client.InjectCommand(fault),
+        control_client.StopCommand(),
+        control_client.ProcessesQuery(),
+    ):
         whole = msgspec.msgpack.encode(question)
         for length in range(1, len(whole)):
             tell(run, whole[:length])
@@ -117,7 +121,7 @@ def test_truncated_questions_change_nothing(run: Started) -> None:
 
 
 def test_oversized_packets_change_nothing(run: Started) -> None:
-    whole = msgspec.msgpack.encode(control_client.Stop())
+    whole = msgspec.msgpack.encode(control_client.StopCommand())
     for size in (PACKET_BYTES_MAX - 1, PACKET_BYTES_MAX, PACKET_BYTES_MAX + 1, 2 * PACKET_BYTES_MAX):
         tell(run, whole.ljust(size, b"\0"))
     finish(run)
@@ -129,7 +133,7 @@ def test_descriptors_that_come_along_are_closed(run: Started) -> None:
     with Path("/dev/null").open() as null:
         for _ in range(30):
             tell(run, b"\xc1", fds=(null.fileno(),))
-            tell(run, msgspec.msgpack.encode(control_client.Status()), fds=(null.fileno(),) * 3)
+            tell(run, msgspec.msgpack.encode(control_client.StatusQuery()), fds=(null.fileno(),) * 3)
     until(lambda: run.descriptors(supervisor) <= before, "the descriptors to be closed", 5.0)
     finish(run)
 
@@ -154,7 +158,11 @@ def _answers(run: Started) -> bool:
 
 
 def test_a_closed_end_before_the_answer_is_nobodys_trouble(run: Started) -> None:
-    for question in (control_client.Status(), control_client.Processes(), control_client.GraphNow()):
+    for question in (
+        control_client.StatusQuery(),
+        control_client.ProcessesQuery(),
+        control_client.GraphQuery(),
+    ):
         for _ in range(20):
             tell(run, msgspec.msgpack.encode(question), listen=False)
     finish(run)
@@ -163,5 +171,7 @@ def test_a_closed_end_before_the_answer_is_nobodys_trouble(run: Started) -> None
 @pytest.mark.parametrize("number", [0, -1, 2**32, 2**63, 2**64 - 1])
 def test_a_fault_with_absurd_numbers_does_not_end_the_run(run: Started, number: int) -> None:
     for trigger in (Trigger("request.sent", nth=number), Trigger(after_ms=number)):
-        tell(run, msgspec.msgpack.encode(control_client.Inject(Fault(Hang(number), "engine", trigger))))
+        tell(
+            run, msgspec.msgpack.encode(control_client.InjectCommand(Fault(Hang(number), "engine", trigger)))
+        )
         run.status()

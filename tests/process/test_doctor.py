@@ -123,7 +123,7 @@ def test_the_processes_of_a_dead_run_are_named_and_removed_and_a_live_run_goes_o
         assert home.runs() == [alive.private]
         assert doctor("--clean")[1].removed == []
         assert alive.status()["leader"] == "a"
-        control_client.ask(alive.private, control_client.Stop())
+        control_client.ask(alive.private, control_client.StopCommand())
         outcome = alive.finish()
         assert outcome.verdict.verdict == "pass"
         assert outcome.told("died") == outcome.told("replaced") == []

@@ -99,7 +99,7 @@ def test_a_death_while_the_supervisor_is_stopped_is_dealt_with_afterwards(home: 
 def test_a_short_pause_of_a_replica_is_not_a_failover(home: Home) -> None:
     """Below the deadline nothing may happen; what was stopped goes on by itself."""
     with under_load(home, 150, RATE_HZ) as run:
-        control_client.ask(run.private, control_client.Inject(Fault(Hang(10), "primary", Trigger())))
+        control_client.ask(run.private, control_client.InjectCommand(Fault(Hang(10), "primary", Trigger())))
         assert_promises(run.finish(), failovers=0)
 
 

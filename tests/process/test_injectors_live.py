@@ -94,7 +94,7 @@ def test_an_omission_loses_one_reply_and_no_other(home: Home) -> None:
     fault = parse("omission pxy2clt nth 10")
     with Started(home, LoadRun(COUNT, RATE_HZ), faults=(fault,)) as run:
         run.wait_for_answers(COUNT - 1)
-        control_client.ask(run.private, control_client.Stop())
+        control_client.ask(run.private, control_client.StopCommand())
         outcome = run.finish()
     assert set(range(1, COUNT + 1)) - set(latencies_ms(outcome)) == {10}
     assert_healed(outcome, 10)

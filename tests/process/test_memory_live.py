@@ -84,22 +84,22 @@ def test_it_is_memory_of_that_process_and_of_no_other(home: Home) -> None:
     with under_load(home, 4000, RATE_HZ) as run:
         assert not held(run)
         control_client.ask(
-            run.private, control_client.Inject(parse(f"{FLIP} in a at request.received {NEVER}"))
+            run.private, control_client.InjectCommand(parse(f"{FLIP} in a at request.received {NEVER}"))
         )
         old = cells(run.pid("a/server"))
         assert len(old) == 1 and old == cells(run.launched.supervisor)
         assert held(run) == {"a/server": old}
 
-        control_client.ask(run.private, control_client.Inject(parse("crash a/server")))
+        control_client.ask(run.private, control_client.InjectCommand(parse("crash a/server")))
         until(lambda: run.status()["leader"] == "b" and run.redundant(), "a new backup")
         assert not held(run) and not cells(run.launched.supervisor), "nobody has the dead one's"
         control_client.ask(
-            run.private, control_client.Inject(parse(f"{FLIP} in a at request.received {NEVER}"))
+            run.private, control_client.InjectCommand(parse(f"{FLIP} in a at request.received {NEVER}"))
         )
         fresh = cells(run.pid("a/server"))
         assert len(fresh) == 1 and not fresh & old and held(run) == {"a/server": fresh}
         assert cells(run.launched.supervisor) == fresh
-        control_client.ask(run.private, control_client.Stop())
+        control_client.ask(run.private, control_client.StopCommand())
         assert run.finish().verdict.requests.wrong == 0
 
 
@@ -112,7 +112,7 @@ def test_a_bit_is_flipped_from_outside(home: Home) -> None:
         flip = ("inject", "bitflip", "state.counter", "--bit", "7", "--at", "request.received")
         assert aftbed(*flip).code == 0  # any counter is refused then, whatever it is at this moment
         until(lambda: run.status()["leader"] == "b" and run.redundant(), "a new backup")
-        control_client.ask(run.private, control_client.Stop())
+        control_client.ask(run.private, control_client.StopCommand())
         outcome = run.finish()
     assert receipts(outcome) == ["activated"]
     assert outcome.verdict.verdict == "pass", outcome.verdict.reasons

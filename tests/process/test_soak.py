@@ -63,7 +63,7 @@ def fail_over(run: Started, count: int) -> None:
     """Crash the primary `count` times, each time when a backup stands."""
     for _ in range(count):
         leader = run.status()["leader"]
-        control_client.ask(run.private, control_client.Inject(Fault(Crash(), "primary", Trigger())))
+        control_client.ask(run.private, control_client.InjectCommand(Fault(Crash(), "primary", Trigger())))
         until(lambda led=leader: run.status()["leader"] not in ("", led), "another leader")
         until(run.redundant, "redundancy")
 
@@ -96,7 +96,9 @@ def adapt_back_and_forth(run: Started, count: int) -> None:
     """`count` adaptations: a composition, its end, and so on."""
     for expression in itertools.islice(itertools.cycle(("pbr+tr", "pbr")), count):
         found = control_client.ask(
-            run.private, control_client.Adapt(Goal(expression=expression)), control_client.ADAPT_SECONDS_MAX
+            run.private,
+            control_client.AdaptCommand(Goal(expression=expression)),
+            control_client.ADAPT_SECONDS_MAX,
         )
         assert (found["outcome"], found["reason"]) == ("done", "")
 

@@ -30,7 +30,7 @@ def test_a_crash_in_one_run_is_none_in_the_other(home: Home) -> None:
         one.strike("a/server", signal.SIGKILL)
         one.wait_for("script.done", "new backup", after=seen)
         for run in run_directory.live():
-            control_client.ask(run_directory.find(run), control_client.Stop())
+            control_client.ask(run_directory.find(run), control_client.StopCommand())
         assert len(one.finish().verdict.failovers) == 1
         spared = other.done()
     assert spared.code == 0, spared.out + spared.err
@@ -74,5 +74,5 @@ def test_the_directory_of_a_run_is_private(home: Home) -> None:
     with under_load(home, 100) as run:
         assert run.private.stat().st_mode & 0o777 == 0o700
         assert run_directory.root().stat().st_mode & 0o777 == 0o700
-        control_client.ask(run.private, control_client.Stop())
+        control_client.ask(run.private, control_client.StopCommand())
         assert run.finish().verdict.verdict == "pass"

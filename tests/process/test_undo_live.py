@@ -20,8 +20,8 @@ FOR_MS: Final = 200
 BUSY_SECONDS: Final = 0.15  # what a machine with something else to do may add
 
 
-def hang(target: str, for_ms: int = 0) -> control_client.Inject:
-    return control_client.Inject(Fault(Hang(for_ms), target, Trigger()))
+def hang(target: str, for_ms: int = 0) -> control_client.InjectCommand:
+    return control_client.InjectCommand(Fault(Hang(for_ms), target, Trigger()))
 
 
 def entries(run: Started) -> list[cleanup.Entry]:
@@ -37,7 +37,7 @@ def test_a_stop_is_written_before_it_is_done_and_its_undo_behind_it(home: Home) 
         control_client.ask(run.private, hang("engine", 60))
         stopped = entries(run)
         assert state_of(pid) == "T"
-        assert len(stopped) == 1 and isinstance(stopped[0], cleanup.Stopped)
+        assert len(stopped) == 1 and isinstance(stopped[0], cleanup.StoppedProcess)
         assert (stopped[0].name, stopped[0].pid, stopped[0].start) == (
             "engine",
             pid,

@@ -10,26 +10,26 @@ import pytest
 
 from aftbed.core.graph import Link
 from aftbed.runtime.deployment import Channels
-from aftbed.runtime.unix.transport import NUDGE, Channel
+from aftbed.runtime.unix.transport import NUDGE, UnixChannel
 
 LINK: Final = Link("a/after", "aft2aft", "b/after", "aft2aft")
 
 
 @pytest.fixture
-def channel() -> Iterator[Channel]:
-    found = Channel(LINK)
+def channel() -> Iterator[UnixChannel]:
+    found = UnixChannel(LINK)
     yield found
     found.close()
 
 
-def at_once(channel: Channel) -> Channel:
+def at_once(channel: UnixChannel) -> UnixChannel:
     """Neither end waits."""
     channel.write.setblocking(False)
     channel.read.setblocking(False)
     return channel
 
 
-def filled(channel: Channel) -> int:
+def filled(channel: UnixChannel) -> int:
     """Fill the queue; how many packets it took."""
     count = 0
     while True:
@@ -40,20 +40,20 @@ def filled(channel: Channel) -> int:
         count += 1
 
 
-def test_packets_stay_whole_and_in_order(channel: Channel) -> None:
+def test_packets_stay_whole_and_in_order(channel: UnixChannel) -> None:
     for packet in (b"one", b"the second", b"3"):
         channel.write.send(packet)
     assert [channel.read.recv(100) for _ in range(3)] == [b"one", b"the second", b"3"]
 
 
-def test_what_was_sent_before_a_fence_stays_readable_and_then_ends(channel: Channel) -> None:
+def test_what_was_sent_before_a_fence_stays_readable_and_then_ends(channel: UnixChannel) -> None:
     channel.write.send(b"one")
     channel.write.send(b"two")
     channel.fence()
     assert [channel.read.recv(100) for _ in range(4)] == [b"one", b"two", b"", b""]
 
 
-def test_who_writes_after_a_fence_gets_epipe_through_whichever_descriptor(channel: Channel) -> None:
+def test_who_writes_after_a_fence_gets_epipe_through_whichever_descriptor(channel: UnixChannel) -> None:
     of_a_node = os.dup(channel.write.fileno())  # what a node was handed refers to the same socket
     channel.fence()
     for descriptor in (of_a_node, channel.write.fileno()):
@@ -63,7 +63,7 @@ def test_who_writes_after_a_fence_gets_epipe_through_whichever_descriptor(channe
     assert channel.read.recv(100) == b"", "nothing of it arrived"
 
 
-def test_a_fence_holds_for_a_writer_in_another_process(channel: Channel) -> None:
+def test_a_fence_holds_for_a_writer_in_another_process(channel: UnixChannel) -> None:
     """The child has its own descriptor; it tells what became of its write after the fence."""
     told, tell = os.pipe()
     go, start = os.pipe()
@@ -83,7 +83,7 @@ def test_a_fence_holds_for_a_writer_in_another_process(channel: Channel) -> None
         os.close(descriptor)
 
 
-def test_a_fence_may_come_twice_and_after_the_end(channel: Channel) -> None:
+def test_a_fence_may_come_twice_and_after_the_end(channel: UnixChannel) -> None:
     channel.fence()
     channel.fence()
     channel.close()
@@ -92,7 +92,7 @@ def test_a_fence_may_come_twice_and_after_the_end(channel: Channel) -> None:
     channel.nudge()
 
 
-def test_mail_outlives_its_writer_and_its_reader(channel: Channel) -> None:
+def test_mail_outlives_its_writer_and_its_reader(channel: UnixChannel) -> None:
     """Whatever ends a node had are closed; the runtime's keep the queue."""
     of_writer, of_reader = os.dup(channel.write.fileno()), os.dup(channel.read.fileno())
     os.write(of_writer, b"mail")
@@ -101,7 +101,7 @@ def test_mail_outlives_its_writer_and_its_reader(channel: Channel) -> None:
     assert channel.read.recv(100) == b"mail"
 
 
-def test_a_writer_that_nobody_will_read_gets_epipe(channel: Channel) -> None:
+def test_a_writer_that_nobody_will_read_gets_epipe(channel: UnixChannel) -> None:
     at_once(channel)
     assert filled(channel) > 0
     channel.refuse()
@@ -109,14 +109,14 @@ def test_a_writer_that_nobody_will_read_gets_epipe(channel: Channel) -> None:
         channel.write.send(b"more")
 
 
-def test_a_nudge_wakes_the_reader_and_is_no_message(channel: Channel) -> None:
+def test_a_nudge_wakes_the_reader_and_is_no_message(channel: UnixChannel) -> None:
     channel.nudge()
     assert channel.read.recv(100) == NUDGE
     assert len(NUDGE) == 1, "a message has at least two bytes"
 
 
 @pytest.mark.timeout(5)
-def test_a_nudge_into_a_full_queue_does_not_wait(channel: Channel) -> None:
+def test_a_nudge_into_a_full_queue_does_not_wait(channel: UnixChannel) -> None:
     channel.write.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, bytes(16))  # a send waits for ever
     count = filled(channel)
     channel.nudge()
@@ -127,7 +127,7 @@ def test_a_nudge_into_a_full_queue_does_not_wait(channel: Channel) -> None:
         channel.read.recv(100)
 
 
-def test_a_nudge_behind_a_fence_is_not_missed(channel: Channel) -> None:
+def test_a_nudge_behind_a_fence_is_not_missed(channel: UnixChannel) -> None:
     channel.fence()
     channel.nudge()
     assert channel.read.recv(100) == b"", "the end wakes the reader as well"
@@ -138,7 +138,7 @@ def test_a_nudge_behind_a_fence_is_not_missed(channel: Channel) -> None:
 
 @pytest.fixture
 def channels() -> Iterator[Channels]:
-    found = Channels(Channel)
+    found = Channels(UnixChannel)
     for link in (
         LINK,
         Link("a/after", "aft2pro", "a/protocol", "aft2pro"),

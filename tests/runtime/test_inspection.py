@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from aftbed.runtime.unix import doctor, run_directory
-from aftbed.runtime.unix.doctor import Check, inspect
+from aftbed.runtime.unix.doctor import HostCheck, inspect
 
 
 @pytest.fixture
@@ -26,7 +26,7 @@ def runtime(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def found(name: str) -> Check:
+def found(name: str) -> HostCheck:
     return next(check for check in inspect() if check.name == name)
 
 

@@ -20,14 +20,14 @@ from aftbed.core.journal import (
     records,
 )
 from aftbed.runtime.unix import journal_files as mapped
-from aftbed.runtime.unix.journal_files import CHUNK_BYTES, Dialogue, Header, Journal
+from aftbed.runtime.unix.journal_files import CHUNK_BYTES, DialogueFile, Header, JournalFile
 
 PER_CHUNK: Final = (CHUNK_BYTES - HEADER_BYTES) // RECORD.size
 
 
 def test_a_new_journal_is_empty_private_and_has_a_name(tmp_path: Path) -> None:
     path = tmp_path / "a.journal"
-    Journal(path, "a/after")
+    JournalFile(path, "a/after")
     data = path.read_bytes()
     assert node_name(data) == "a/after" and list(records(data)) == []
     assert path.stat().st_mode & 0o777 == 0o600
@@ -35,7 +35,7 @@ def test_a_new_journal_is_empty_private_and_has_a_name(tmp_path: Path) -> None:
 
 def test_a_record_is_in_the_file_as_soon_as_it_is_written(tmp_path: Path) -> None:
     path = tmp_path / "a.journal"
-    journal = Journal(path, "a/after")
+    journal = JournalFile(path, "a/after")
     journal.write(5, Event.CHECKPOINT_SENT, 7, 9)
     (found,) = records(path.read_bytes())
     assert (found.t_ns, found.event, found.request_id, found.detail) == (5, Event.CHECKPOINT_SENT, 7, 9)
@@ -45,7 +45,7 @@ def test_a_record_is_in_the_file_as_soon_as_it_is_written(tmp_path: Path) -> Non
 @pytest.mark.parametrize("count", [PER_CHUNK - 1, PER_CHUNK, PER_CHUNK + 1, 2 * PER_CHUNK + 500])
 def test_a_journal_grows_past_a_chunk(tmp_path: Path, count: int) -> None:
     path = tmp_path / "a.journal"
-    journal = Journal(path, "a")
+    journal = JournalFile(path, "a")
     for number in range(count):
         journal.write(number, Event.SERVER_EXIT, number, 0)
     assert [r.request_id for r in records(path.read_bytes())] == list(range(count))
@@ -53,7 +53,7 @@ def test_a_journal_grows_past_a_chunk(tmp_path: Path, count: int) -> None:
 
 def test_a_dialogue_grows_past_a_chunk_and_takes_an_entry_larger_than_one(tmp_path: Path) -> None:
     path = tmp_path / "client.dialogue"
-    dialogue = Dialogue(path, "client")
+    dialogue = DialogueFile(path, "client")
     payloads = [bytes([number]) * (CHUNK_BYTES // 3) for number in range(7)] + [b"", b"x" * (3 * CHUNK_BYTES)]
     for number, payload in enumerate(payloads):
         dialogue.write(number, number, 1, EntryKind.SENT, payload)
@@ -65,7 +65,7 @@ def test_a_dialogue_grows_past_a_chunk_and_takes_an_entry_larger_than_one(tmp_pa
 def test_a_record_that_finds_no_room_is_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mapped, "FILE_BYTES_MAX", 2 * CHUNK_BYTES)
     path = tmp_path / "a.journal"
-    journal = Journal(path, "a")
+    journal = JournalFile(path, "a")
     for number in range(3 * PER_CHUNK):
         journal.write(number, Event.SERVER_EXIT, number, 0)
     data = path.read_bytes()
@@ -77,7 +77,7 @@ def test_a_record_that_finds_no_room_is_counted(tmp_path: Path, monkeypatch: pyt
 def test_an_entry_that_finds_no_room_is_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mapped, "FILE_BYTES_MAX", CHUNK_BYTES)
     path = tmp_path / "client.dialogue"
-    dialogue = Dialogue(path, "client")
+    dialogue = DialogueFile(path, "client")
     for number in range(5):
         dialogue.write(number, number, 1, EntryKind.SENT, bytes(CHUNK_BYTES // 3))
     data = path.read_bytes()
@@ -85,9 +85,9 @@ def test_an_entry_that_finds_no_room_is_counted(tmp_path: Path, monkeypatch: pyt
 
 
 def test_a_journal_is_made_once(tmp_path: Path) -> None:
-    Journal(tmp_path / "a.journal", "a")
+    JournalFile(tmp_path / "a.journal", "a")
     with pytest.raises(FileExistsError):
-        Journal(tmp_path / "a.journal", "a")
+        JournalFile(tmp_path / "a.journal", "a")
 
 
 def test_what_was_written_outlives_a_kill(tmp_path: Path) -> None:
@@ -95,7 +95,7 @@ def test_what_was_written_outlives_a_kill(tmp_path: Path) -> None:
     path = tmp_path / "a.journal"
     child = os.fork()
     if child == 0:
-        journal = Journal(path, "a")
+        journal = JournalFile(path, "a")
         for number in range(1000):
             journal.write(number, Event.REPLY_SENT, number, 0)
         os.kill(os.getpid(), signal.SIGKILL)
@@ -106,7 +106,7 @@ def test_what_was_written_outlives_a_kill(tmp_path: Path) -> None:
 
 def test_the_header_carries_a_pulse_and_a_flag_between_processes(tmp_path: Path) -> None:
     path = tmp_path / "a.journal"
-    journal, header = Journal(path, "a"), Header(path)
+    journal, header = JournalFile(path, "a"), Header(path)
     assert header.pulse_ns() == 0
     journal.mapping[PULSE_OFFSET : PULSE_OFFSET + 8] = (2**63 + 5).to_bytes(8, "little")
     assert header.pulse_ns() == 2**63 + 5
@@ -120,7 +120,7 @@ def test_the_header_carries_a_pulse_and_a_flag_between_processes(tmp_path: Path)
 
 def test_the_header_is_still_seen_after_the_journal_has_grown(tmp_path: Path) -> None:
     path = tmp_path / "a.journal"
-    journal, header = Journal(path, "a"), Header(path)
+    journal, header = JournalFile(path, "a"), Header(path)
     for number in range(PER_CHUNK + 1):
         journal.write(number, Event.SERVER_EXIT, number, 0)
     journal.mapping[PULSE_OFFSET] = 7

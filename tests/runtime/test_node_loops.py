@@ -32,7 +32,7 @@ from aftbed.inject.value import ValueFlip, ValuePlace
 from aftbed.runtime import control
 from aftbed.runtime.node import Node
 from aftbed.runtime.unix import transport
-from aftbed.runtime.unix.journal_files import Journal
+from aftbed.runtime.unix.journal_files import JournalFile
 from aftbed.runtime.unix.node_io import UnixIO, UnixNode
 from aftbed.runtime.unix.transport import NUDGE, Line, decode_order, decode_report
 
@@ -103,7 +103,7 @@ class Harness:
         self._path, self._inside = path, list[AnyMessage]()
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._line = Line(ours, decode_report)
-        self._journal = Journal(path, "node")
+        self._journal = JournalFile(path, "node")
         self.io = UnixIO(Line(theirs, decode_order), self._journal)
         self.node: UnixNode = Node("node", self.io)
         self.brick = Scripted(self._order)

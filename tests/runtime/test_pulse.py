@@ -13,7 +13,7 @@ import pytest
 from aftbed.core.brick import Brick, Effect
 from aftbed.core.messages import AnyMessage
 from aftbed.runtime.node import Node
-from aftbed.runtime.unix.journal_files import Header, Journal
+from aftbed.runtime.unix.journal_files import Header, JournalFile
 from aftbed.runtime.unix.linux import set_timeouts
 from aftbed.runtime.unix.node_io import UnixIO
 from aftbed.runtime.unix.transport import Line, decode_order
@@ -44,7 +44,7 @@ def waiting(journal: Path, *, suspended: bool) -> Iterator[int]:
     if not pid:
         ours.close()
         set_timeouts(theirs, 60.0, 2.0)  # so that it is nowhere else while it waits
-        io = UnixIO(Line(theirs, decode_order), Journal(journal, "idle"))
+        io = UnixIO(Line(theirs, decode_order), JournalFile(journal, "idle"))
         node = Node("idle", io)
         node.add("idle", Idle())
         node.bind_input("idle", "in", os.dup(mail[0].fileno()))

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from aftbed.core.errors import StepFailed
 from aftbed.runtime.unix import cleanup, run_directory
-from aftbed.runtime.unix.cleanup import LATE_NS_MAX, Book, Ending, Ledger, Stopped, Undone
+from aftbed.runtime.unix.cleanup import LATE_NS_MAX, Book, Ending, StoppedProcess, UndoLedger, Undone
 
 MS = 1_000_000
 
@@ -27,8 +27,8 @@ def book_of(*entries: cleanup.Entry) -> Book:
     return book
 
 
-def stopped(due_ms: int, pid: int = 7, start: int = 1) -> Stopped:
-    return Stopped("a/server", pid, start, due_ms * MS)
+def stopped(due_ms: int, pid: int = 7, start: int = 1) -> StoppedProcess:
+    return StoppedProcess("a/server", pid, start, due_ms * MS)
 
 
 @pytest.fixture
@@ -42,7 +42,7 @@ def waker() -> Iterator[int]:
 
 
 def test_what_was_undone_is_not_due(tmp_path: Path, waker: int) -> None:
-    ledger, book = Ledger(tmp_path, waker), Book(tmp_path)
+    ledger, book = UndoLedger(tmp_path, waker), Book(tmp_path)
     book.read()
     assert book.open == {}, "nothing has been written yet"
     me, start = os.getpid(), run_directory.started(os.getpid())
@@ -117,7 +117,7 @@ def test_open_is_what_was_stopped_since_its_last_undo(steps: list[tuple[bool, in
 
 
 def test_what_cannot_be_written_is_not_done(tmp_path: Path, waker: int) -> None:
-    ledger = Ledger(tmp_path / "gone", waker)
+    ledger = UndoLedger(tmp_path / "gone", waker)
     message = "a/server is not stopped: its undo cannot be written: No such file or directory"
     with pytest.raises(StepFailed, match=message):
         ledger.ahead("a/server", os.getpid(), 50)
@@ -126,7 +126,7 @@ def test_what_cannot_be_written_is_not_done(tmp_path: Path, waker: int) -> None:
 # -- whom it is done to
 
 
-Victim = Callable[[Path | None], Stopped]
+Victim = Callable[[Path | None], StoppedProcess]
 
 
 @pytest.fixture
@@ -134,7 +134,7 @@ def victim() -> Iterator[Victim]:
     """Starts a process, of a run or of none, and stops it."""
     started: list[subprocess.Popen[bytes]] = []
 
-    def start(run: Path | None) -> Stopped:
+    def start(run: Path | None) -> StoppedProcess:
         words = [sys.executable, "-c", "print(flush=True); input()"]
         environment = os.environ | ({run_directory.VARIABLE: str(run)} if run else {})
         process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment)
@@ -142,7 +142,7 @@ def victim() -> Iterator[Victim]:
         assert process.stdout is not None and process.stdout.readline() == b"\n"
         os.kill(process.pid, signal.SIGSTOP)
         os.waitid(os.P_PID, process.pid, os.WSTOPPED)
-        return Stopped("a/server", process.pid, run_directory.started(process.pid), 1)
+        return StoppedProcess("a/server", process.pid, run_directory.started(process.pid), 1)
 
     yield start
     for process in started:
@@ -179,7 +179,7 @@ def test_a_process_that_got_the_pid_later_is_not_touched(tmp_path: Path, victim:
 def test_what_is_overdue_is_undone_once_and_told(tmp_path: Path, victim: Victim, waker: int) -> None:
     found = victim(tmp_path)
     book = book_of(found)
-    told = list(cleanup.undo_overdue(book, Ledger(tmp_path, waker, "warden"), tmp_path))
+    told = list(cleanup.undo_overdue(book, UndoLedger(tmp_path, waker, "warden"), tmp_path))
     assert len(told) == 1 and told[0].startswith(f"a/server ({found.pid}), stopped ")
     assert told[0].endswith(" ms over its time: thawed")
     assert book.open == {}

@@ -80,7 +80,7 @@ def assert_promises(world: World, run: Run) -> None:
             bare.execute(entry.payload)
     assert run.history.events(Event.FOLLOWER_DIVERGED) == []
     servers = 0
-    for process in world.conductor.deployment.nodes.values():
+    for process in world.controller.deployment.nodes.values():
         assert isinstance(process, SimProcess) and process.node is not None
         for hosted in process.node.bricks.values():
             assert hosted.brick.quiescent(), f"something is left inside of {hosted.name}"
@@ -138,7 +138,7 @@ def test_a_replica_may_die_between_any_two_effects(
     assert_promises(world, run)
     died = any(name.startswith(role) for _, name in run.struck)
     assert run.rest.leader == ("b" if died and role == "a" else "a")
-    assert world.conductor.deployment.epoch == (2 if died and role == "a" else 1)
+    assert world.controller.deployment.epoch == (2 if died and role == "a" else 1)
 
 
 @pytest.mark.parametrize("ftm", DUPLEX)
@@ -170,7 +170,7 @@ def test_one_replica_after_the_other_may_die(ftm: str, seed: int, event: Event) 
     faults = tuple(Fault(Crash(), "primary", Trigger(event.label, nth)) for nth in nths)
     world, run = played(Setup(ftm, "process", seed, 80, 2000.0, faults))
     assert_promises(world, run)
-    assert world.conductor.deployment.epoch == 1 + sum(f.fired for f in run.faults) > 1
+    assert world.controller.deployment.epoch == 1 + sum(f.fired for f in run.faults) > 1
 
 
 def transient(ftm: str, role: str, count: int, random: Random) -> tuple[Fault, ...]:
@@ -198,7 +198,7 @@ def test_one_value_fault_per_request_never_reaches_the_client(ftm: str, seed: in
     applied = sum(f.fired for f in run.faults)
     votes = [r.detail for r in run.history.events(Event.VOTE_COMPARED)]
     assert (votes.count(3), votes.count(2)) == (applied, len(roles) * count - applied)
-    assert run.history.events(Event.DETECTED_STOP) == [] and world.conductor.deployment.epoch == 1
+    assert run.history.events(Event.DETECTED_STOP) == [] and world.controller.deployment.epoch == 1
     assert applied == len(faults)
 
 

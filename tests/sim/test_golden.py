@@ -86,7 +86,7 @@ class Stage:
         return said
 
     def _node(self, name: str) -> SimNode:
-        process = self.world.conductor.deployment.nodes[name]
+        process = self.world.controller.deployment.nodes[name]
         assert isinstance(process, SimProcess) and process.node is not None
         return process.node
 

@@ -69,7 +69,7 @@ class Interference(RuleBasedStateMachine):
         self._read = 0
 
     def _node(self, number: int) -> str:
-        nodes = list(self.world.conductor.deployment.graph.nodes)
+        nodes = list(self.world.controller.deployment.graph.nodes)
         return nodes[number % len(nodes)]
 
     def _sent(self) -> int:
@@ -103,7 +103,7 @@ class Interference(RuleBasedStateMachine):
 
     @rule(role=st.sampled_from(("primary", "backup")))
     def a_replica_hangs_for_good(self, role: str) -> None:
-        if role in roles_in(self.world.conductor.deployment.graph):
+        if role in roles_in(self.world.controller.deployment.graph):
             self.world.inject(Fault(Hang(), role, Trigger()))
 
     @rule(node=whom)
@@ -111,7 +111,7 @@ class Interference(RuleBasedStateMachine):
         """It takes a node of its replica for dead, which lives, and will be fenced."""
         name = self._node(node)
         replica = replica_of(name)
-        watchdog = self.world.conductor.deployment.nodes.get(f"{replica}/watchdog")
+        watchdog = self.world.controller.deployment.nodes.get(f"{replica}/watchdog")
         if not replica or not isinstance(watchdog, SimProcess) or watchdog.dead or watchdog.node is None:
             return
         self.world.struck.append((self.world.loop.ns, name))  # as good as

@@ -163,7 +163,7 @@ def test_a_script_that_was_ordered_before_the_last_one_was_done_is_not_carried_o
     world = World(Setup("pbr", count=40, rate_hz=400.0, faults=(parse("crash primary after 5ms"),)))
     world.start()
     world.advance(world.loop.ns + 20 * MS)
-    deployment = world.conductor.deployment
+    deployment = world.controller.deployment
     assert (deployment.leader, deployment.backup, deployment.epoch) == ("b", "a", 2)
     recovery = deployment.nodes["recovery"]
     for old_news in (
@@ -172,7 +172,7 @@ def test_a_script_that_was_ordered_before_the_last_one_was_done_is_not_carried_o
         drop_backup("a", "b", replication_of("pbr")),
         new_backup("b", "a", replication_of("pbr"), STATEFUL),
     ):
-        world.conductor.on_report(recovery, control.Ordered("recovery", old_news))
+        world.controller.on_report(recovery, control.Ordered("recovery", old_news))
     world.end()
     run = world.outcome()
     assert breaches(run) == () and run.rest.leader == "b"

@@ -119,8 +119,8 @@ class Whiteboard(World):
             setup, function=Counting, requests=payloads, channel=_speaking(self.say), clock=Steady
         )
         self.journal = _Executive(self.journal, self._of_the_executive)  # type: ignore[assignment]
-        nursery = self.nursery
-        heard, ended, frozen = nursery.on_report, nursery.on_end, nursery.on_freeze
+        pool = self.pool
+        heard, ended, frozen = pool.on_report, pool.on_end, pool.on_freeze
 
         def on_report(process: SimProcess, report: control.FromNode) -> None:
             self._ordered(report)
@@ -134,7 +134,7 @@ class Whiteboard(World):
             self.say(process.name, "stops where it is")
             frozen(process)
 
-        nursery.on_report, nursery.on_end, nursery.on_freeze = on_report, on_end, on_freeze
+        pool.on_report, pool.on_end, pool.on_freeze = on_report, on_end, on_freeze
 
     # -- what happens, in words ----------------------------------------------------------------
 
@@ -142,9 +142,9 @@ class Whiteboard(World):
         """Another line."""
         self.said.append(f"{who:<17} {what}")
 
-    def tell(self, event: str, text: str) -> None:
+    def log(self, event: str, text: str) -> None:
         """For the outcome; and some of it is said."""
-        super().tell(event, text)
+        super().log(event, text)
         if event in TOLD:
             self.say(EXECUTIVE, ("a new " if event == "replaced" else "") + _MEASURED.sub(" is done", text))
 
@@ -202,7 +202,7 @@ class Whiteboard(World):
 
     def nodes(self) -> Iterator[SimNode]:
         """Those that live."""
-        for process in self.conductor.deployment.nodes.values():
+        for process in self.controller.deployment.nodes.values():
             if isinstance(process, SimProcess) and process.node is not None and not process.dead:
                 yield process.node
 

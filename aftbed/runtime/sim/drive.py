@@ -58,7 +58,7 @@ class Drive:
         return next((one for one in self._faults.reports() if one.number == number), None)
 
     def watch(self, number: int, condition: Condition, met: Callable[[Met], None]) -> None:
-        """See `runtime.interface.Support`."""
+        """See `runtime.interface.Runtime`."""
 
         def held(t_us: int) -> None:  # somebody is at work now, perhaps the one who is to be struck
             self._clock.at(self._clock.ns, lambda: self._met(met, t_us))

@@ -51,20 +51,20 @@ def _drive_over(car: CarDevice) -> bool:
     return car.link.over
 
 
-def unrest(conductor: RunController) -> list[str]:
+def unrest(controller: RunController) -> list[str]:
     """Why the run has not come to rest."""
-    deployment, found = conductor.deployment, []
+    deployment, found = controller.deployment, []
     node = _client(deployment)
     device = node.device if node is not None else None
     if not isinstance(device, Load | CarDevice):
         found.append("no client")
     elif not (device.done if isinstance(device, Load) else _drive_over(device) and device.idle):
         found.append("requests wait")
-    if conductor.executor.busy or conductor.adaptations.busy or conductor.adaptations.to_come:
+    if controller.executor.busy or controller.adaptations.busy or controller.adaptations.to_come:
         found.append("a script is under way")
     if replication_of(deployment.graph.ftm) and not deployment.backup:
         found.append("no redundancy")
-    found += [f"{name} is under way" for name in deployment.support.loop.tasks.names()]
+    found += [f"{name} is under way" for name in deployment.runtime.loop.tasks.names()]
     processes = [p for p in deployment.nodes.values() if isinstance(p, SimProcess)]
     found += [f"{p.name} is dead or stopped" for p in processes if p.stopped()][:1]
     return found

@@ -50,14 +50,14 @@ class Wire:
 class SimProcess:
     """A child of the executive, which becomes one node."""
 
-    def __init__(self, number: int, nursery: "SimProcessPool") -> None:
+    def __init__(self, number: int, pool: "SimProcessPool") -> None:
         self.name, self.kind, self.journal, self.incarnation = "spare", ProcessKind.SPARE, "", 0
         self.pid = self.pidfd = number
         self.alive = True  # as far as the executive knows
         self.io: SimIO | None = None
         self.bricks: tuple[tuple[str, str], ...] = ()
         self.dead = self._still = False
-        self._nursery, self._clock = nursery, nursery.clock
+        self._pool, self._clock = pool, pool.clock
         self._order_ns = self._say_ns = 0  # of the last one that is under way
         self._orders: deque[tuple[control.ToNode, tuple[int, ...]]] = deque()
         self._known: set[type[control.ToNode]] = set()  # kinds of orders that it has had
@@ -90,7 +90,7 @@ class SimProcess:
         self._still = True
         if self.io is not None:
             self.io.freeze()
-        self._nursery.on_freeze(self)
+        self._pool.on_freeze(self)
         return True
 
     def thaw(self) -> bool:
@@ -132,7 +132,7 @@ class SimProcess:
         if self.dead:
             return
         self.dead = True
-        self._nursery.on_end(self, reason)
+        self._pool.on_end(self, reason)
         for call in self._noticed:
             self._clock.message(self._clock.ns + self._clock.between_ns(*LIFELINE_NS), self._news, call)
         seen_ns = max(self._say_ns, self._clock.ns + self._clock.between_ns(*PIDFD_NS))
@@ -147,8 +147,8 @@ class SimProcess:
 
     def _seen(self) -> None:
         self.alive = False
-        self._nursery.processes.remove(self)
-        self._nursery.on_death(self)
+        self._pool.processes.remove(self)
+        self._pool.on_death(self)
 
     # -- the line -----------------------------------------------------------------------------
 
@@ -180,7 +180,7 @@ class SimProcess:
         if self.dead:
             return
         try:
-            self.io = self._nursery.build(self, order, fds)
+            self.io = self._pool.build(self, order, fds)
         except ConfigError as error:
             self.say(control.Ack(order.token, error=str(error)))
             self.die()
@@ -190,14 +190,14 @@ class SimProcess:
 
     def say(self, report: control.FromNode) -> None:
         """The executive will hear this."""
-        delay_ns = self._clock.between_ns(*LINE_NS) + self._nursery.rouse_ns()
+        delay_ns = self._clock.between_ns(*LINE_NS) + self._pool.rouse_ns()
         self._say_ns = max(self._say_ns + 1, self._clock.ns + delay_ns)
         self._reports.append(report)
         self._clock.message(self._say_ns, self._to_us, self.heard)
 
     def heard(self) -> None:
         """The oldest report is at the executive."""
-        self._nursery.on_report(self, self._reports.popleft())
+        self._pool.on_report(self, self._reports.popleft())
 
     def assigned(self) -> None:
         """Nothing to open."""
@@ -247,11 +247,11 @@ class SimProcessPool:
         yield Wait(frozenset())
         return process
 
-    def calm(self, zygote: str) -> Generator[Wait, dict[Key, bytes], None]:
+    def wait_for_forks(self, zygote: str) -> Generator[Wait, dict[Key, bytes], None]:
         """It always is."""
         yield Wait(frozenset())
 
-    def level(self, zygote: str, count: int) -> None:
+    def refill(self, zygote: str, count: int) -> None:
         """There are always enough."""
 
     def order(self, process: interface.Process, order: control.ToNode, fds: tuple[int, ...] = ()) -> None:

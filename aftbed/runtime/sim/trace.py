@@ -89,9 +89,9 @@ class _Traced(World):
     def _journal_for(self, name: str) -> list[Record]:
         return self.journals.setdefault(name, _Records(self.happened))
 
-    def tell(self, event: str, text: str) -> None:
+    def log(self, event: str, text: str) -> None:
         """For the outcome, and in its place."""
-        super().tell(event, text)
+        super().log(event, text)
         self.happened.append(Told(self.loop.ns, event, text))
 
     def write(self, now_ns: int, request_id: int, epoch: int, kind: EntryKind, payload: bytes) -> None:

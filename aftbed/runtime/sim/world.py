@@ -134,17 +134,17 @@ class World:
         self.lost = False
         self.journal = SimJournal(self.journals.setdefault("supervisor.1", []))
         assembler = Assembler(function, load, make)
-        self.nursery = SimProcessPool(
+        self.pool = SimProcessPool(
             self.loop, assembler, self._make_device, self._ends.__getitem__, self._journal_for
         )
-        self.conductor = RunController(graph_of(setup.ftm, setup.placement), self, None, self._on_loss)
-        self.nursery.on_report = self._on_report
-        self.nursery.on_death = self._on_death
-        self.nursery.on_end = self._on_end
-        self.nursery.on_freeze = lambda process: self.struck.append((self.loop.ns, process.name))
+        self.controller = RunController(graph_of(setup.ftm, setup.placement), self, None, self._on_loss)
+        self.pool.on_report = self._on_report
+        self.pool.on_death = self._on_death
+        self.pool.on_end = self._on_end
+        self.pool.on_freeze = lambda process: self.struck.append((self.loop.ns, process.name))
         self._launched = False
 
-    # -- the runtime, as the executive sees it: see `runtime.interface.Support` ------------------
+    # -- the runtime, as the executive sees it: see `runtime.interface.Runtime` ------------------
 
     def channel(self, link: Link) -> SimChannel:
         """A fresh one."""
@@ -155,8 +155,8 @@ class World:
 
     def shared_memory(self) -> SimulatedMemory:
         """A fresh one."""
-        cell = SimulatedMemory(len(self.nursery.cells))
-        self.nursery.cells.append(cell)
+        cell = SimulatedMemory(len(self.pool.cells))
+        self.pool.cells.append(cell)
         return cell
 
     def device(self, kind: str, incarnation: int) -> tuple[str, bytes]:
@@ -202,10 +202,10 @@ class World:
     def pin(self, pid: int, cpu: int) -> None:
         """There are no cores here."""
 
-    def keep(self, adaptation: bytes) -> None:
+    def record_adaptation(self, adaptation: bytes) -> None:
         """The outcome has them all."""
 
-    def tell(self, event: str, text: str) -> None:
+    def log(self, event: str, text: str) -> None:
         """For the outcome."""
         self.told.append((self.loop.ns, event, text))
 
@@ -216,7 +216,7 @@ class World:
 
     def _make_device(self, order: control.Assign, io: SimIO) -> Device:
         if order.device == "sensor":
-            by_number = self.nursery.by_number
+            by_number = self.pool.by_number
 
             def notice(number: int, call: Callable[[], None]) -> None:
                 def noticed() -> None:
@@ -238,11 +238,11 @@ class World:
         self.dialogue.append(Entry(now_ns, request_id, epoch, kind, payload))
 
     def _on_report(self, process: SimProcess, report: control.FromNode) -> None:
-        self.conductor.on_report(process, report)
+        self.controller.on_report(process, report)
         self.loop.watch_jobs()
 
     def _on_death(self, process: SimProcess) -> None:
-        self.conductor.on_death(process)
+        self.controller.on_death(process)
         self.loop.watch_jobs()
 
     def _on_end(self, process: SimProcess, reason: str) -> None:
@@ -253,7 +253,7 @@ class World:
             self.struck.append((self.loop.ns, process.name))
         if reason.startswith("assertion"):
             self.failures.append(f"{process.name}: {reason}")
-            self.tell("assert", f"{process.name}: {reason}")
+            self.log("assert", f"{process.name}: {reason}")
 
     def _count(self, node: SimNode) -> None:
         for brick in node.bricks.values():
@@ -265,15 +265,15 @@ class World:
     # -- the run ------------------------------------------------------------------------------
 
     def _launch(self) -> Keys:
-        yield from self.conductor.deployment.launch(held=("client",))
+        yield from self.controller.deployment.launch(held=("client",))
         for fault in self.setup.faults:
-            yield from self.conductor.faults.arm(fault)
-        yield from self.conductor.adaptations.schedule(self.setup.adaptations)
+            yield from self.controller.faults.arm(fault)
+        yield from self.controller.adaptations.schedule(self.setup.adaptations)
         for doom in self.setup.dooms:
             self._doom(doom)
 
     def _doom(self, doom: Doom) -> None:
-        deployment = self.conductor.deployment
+        deployment = self.controller.deployment
         process = deployment.nodes.get(deployment.graph.node_of(doom.brick))
         assert isinstance(process, SimProcess) and process.io is not None
         process.io.die_before(doom.brick, doom.effect)
@@ -283,13 +283,13 @@ class World:
         self._launched = True
         if self._drive is not None:
             self._drive.go()
-        self.conductor.inform_recovery(failed=False)
+        self.controller.inform_recovery(failed=False)
         self.loop.after(TICK_SECONDS, self._tick)
         self.loop.begin()
-        self.conductor.deployment.leave("client", control.Resume(control.UNANSWERED))
+        self.controller.deployment.leave("client", control.Resume(control.UNANSWERED))
 
     def _tick(self) -> None:
-        self.conductor.look_for_hangs()
+        self.controller.look_for_hangs()
         self.loop.after(TICK_SECONDS, self._tick)
 
     def run(self) -> Run:
@@ -316,13 +316,13 @@ class World:
     def inject(self, fault: Fault) -> None:
         """Arm one more, now. Raises ConfigError where there is no such fault."""
         check(fault, self.setup.scenario)
-        fault.check(self.conductor.deployment.graph)
-        self.loop.tasks.start("inject", self.conductor.faults.arm(fault), lambda failure: None)
+        fault.check(self.controller.deployment.graph)
+        self.loop.tasks.start("inject", self.controller.faults.arm(fault), lambda failure: None)
         self.loop.watch_jobs()
 
     def adapt(self, goal: Goal) -> None:
         """Ask for an adaptation, now. Raises ConfigError where it is refused at once."""
-        self.conductor.adaptations.ask(goal, lambda outcome: None)
+        self.controller.adaptations.ask(goal, lambda outcome: None)
         self.loop.watch_jobs()
 
     def end(self) -> None:
@@ -333,11 +333,11 @@ class World:
             if not loop.steps(LOOK_EVERY):
                 return
             loop.watch_jobs()
-            ended = ending.source_ended(self.conductor.deployment, self.setup.count)
+            ended = ending.source_ended(self.controller.deployment, self.setup.count)
             if not done_ns and (ended or (self.lost and self._drive is None)):
                 done_ns = loop.ns
             if done_ns:
-                rested_ns = (rested_ns or loop.ns) if self.lost or not ending.unrest(self.conductor) else 0
+                rested_ns = (rested_ns or loop.ns) if self.lost or not ending.unrest(self.controller) else 0
             late = loop.ns > self._limit_ns() or (done_ns and loop.ns > done_ns + REST_NS_MAX)
             if late or (rested_ns and loop.ns > rested_ns + STRAY_NS):
                 return
@@ -351,12 +351,12 @@ class World:
 
     def outcome(self) -> Run:
         """What there is to judge."""
-        deployment = self.conductor.deployment
+        deployment = self.controller.deployment
         for process in deployment.nodes.values():
             if isinstance(process, SimProcess) and process.node is not None and process.incarnation == 1:
                 self._count(process.node)
         rest = Rest(
-            () if self.lost else tuple(ending.unrest(self.conductor)),
+            () if self.lost else tuple(ending.unrest(self.controller)),
             self.lost,
             self.loop.ns,
             deployment.leader,
@@ -369,9 +369,9 @@ class World:
             History(self.journals, self.dialogue),
             rest,
             tuple(self.told),
-            tuple(self.conductor.scripts),
-            tuple(self.conductor.adaptations.history),
-            tuple(self.conductor.faults.reports()),
+            tuple(self.controller.scripts),
+            tuple(self.controller.adaptations.history),
+            tuple(self.controller.faults.reports()),
             tuple(self.failures),
             self._drive.result() if self._drive is not None else None,
             self.effects,

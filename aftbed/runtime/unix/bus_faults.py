@@ -15,25 +15,25 @@ from aftbed.inject.receipts import ReceiptState
 from aftbed.runtime import control
 from aftbed.runtime.interface import Met
 from aftbed.runtime.tasks import Key, Wait
-from aftbed.runtime.unix.process_pool import Nursery, Process
+from aftbed.runtime.unix.process_pool import UnixProcess, UnixProcessPool
 from aftbed.vehicle.condition import Condition
 
 Steps = Generator[Wait, dict[Key, bytes], None]
 
 
 class BusFaults:
-    """Of one run. `settle` wakes the tasks that wait for the hub; `tell` is a line for people."""
+    """Of one run. `settle` wakes the tasks that wait for the hub; `log` writes a line for people."""
 
     def __init__(
-        self, nursery: Nursery, settle: Callable[[Key], None], tell: Callable[[str, str], None]
+        self, pool: UnixProcessPool, settle: Callable[[Key], None], log: Callable[[str, str], None]
     ) -> None:
-        self._nursery, self._settle, self._tell = nursery, settle, tell
-        self._hub: Process | None = None
+        self._pool, self._settle, self._log = pool, settle, log
+        self._hub: UnixProcess | None = None
         self._faults: dict[int, BusFault] = {}
         self._struck: dict[int, BusReport] = {}
         self._met: dict[int, Callable[[Met], None]] = {}
 
-    def serve(self, hub: Process) -> None:
+    def serve(self, hub: UnixProcess) -> None:
         """The hub is there."""
         self._hub = hub
 
@@ -45,7 +45,7 @@ class BusFaults:
         if fault.targets is None:
             raise StepFailed(f"{fault}: its names were not resolved")
         self._faults[number] = fault
-        self._nursery.order(self._hub, control.DisturbBus(number, fault, draw))
+        self._pool.order(self._hub, control.DisturbBus(number, fault, draw))
         yield Wait(frozenset({(control.BUS_FAULT_ARMED, control.HUB, number)}), frozenset({control.HUB}))
 
     def watch(self, number: int, condition: Condition, met: Callable[[Met], None]) -> Steps:
@@ -53,19 +53,19 @@ class BusFaults:
         if self._hub is None or not self._hub.alive:
             raise StepFailed(f"when {condition}: this run has no car")
         self._met[number] = met
-        self._nursery.order(self._hub, control.WatchCar(number, condition))
+        self._pool.order(self._hub, control.WatchCar(number, condition))
         yield Wait(frozenset({(control.CONDITION_WATCHED, control.HUB, number)}), frozenset({control.HUB}))
 
     def _is_met(self, number: int, t_us: int, since_ns: int) -> None:
         hub, met = self._hub, self._met.pop(number, None)
         if met is not None and hub is not None:
-            met(Met(t_us, since_ns, lambda: self._nursery.order(hub, control.Ack(number))))
+            met(Met(t_us, since_ns, lambda: self._pool.order(hub, control.Ack(number))))
 
     def ask(self) -> Steps:
         """Ask the hub what has become of all faults by now."""
         if self._faults and self._hub is not None and self._hub.alive:
             with contextlib.suppress(StepFailed):  # then what it has said before has to do
-                self._nursery.order(self._hub, control.Stats(control.UNANSWERED))
+                self._pool.order(self._hub, control.Stats(control.UNANSWERED))
                 yield Wait(frozenset({(control.BUS_FAULTS_ASKED, control.HUB, 0)}), frozenset({control.HUB}))
 
     def on_report(self, kind: str, data: bytes) -> None:
@@ -81,7 +81,7 @@ class BusFaults:
             state = before.receipt.state if before is not None else ReceiptState.ARMED
             if struck.receipt.state is not state:
                 found = struck.receipt
-                self._tell("fault", f"{self._faults[struck.number]}: {found.state.value}, {found.detail}")
+                self._log("fault", f"{self._faults[struck.number]}: {found.state.value}, {found.detail}")
         if kind == control.BUS_FAULTS_ASKED:
             self._settle((control.BUS_FAULTS_ASKED, control.HUB, 0))
 

@@ -43,7 +43,7 @@ SEEN_SECONDS_MAX: Final = 0.2
 LOOK_SECONDS: Final = 0.001
 
 
-class Stopped(msgspec.Struct, frozen=True, tag=True):
+class StoppedProcess(msgspec.Struct, frozen=True, tag=True):
     """The process is about to get SIGSTOP; `due_ns` is monotonic, 0 for as long as the run lasts."""
 
     name: str
@@ -60,11 +60,11 @@ class Undone(msgspec.Struct, frozen=True, tag=True):
     by: str
 
 
-Entry = Stopped | Undone
+Entry = StoppedProcess | Undone
 _decode: Final = msgspec.json.Decoder(Entry).decode
 
 
-class Ledger:
+class UndoLedger:
     """What is to be undone, as the supervisor or the warden writes it; `waker` is the warden's eventfd."""
 
     def __init__(self, private: Path, waker: int, by: str = "supervisor") -> None:
@@ -74,7 +74,7 @@ class Ledger:
         """Before SIGSTOP of `pid`, a child of this process. Raises StepFailed if it cannot be written."""
         due_ns = time.monotonic_ns() + for_ms * 1_000_000 if for_ms else 0
         try:
-            self._write(Stopped(name, pid, run_directory.started(pid), due_ns))
+            self._write(StoppedProcess(name, pid, run_directory.started(pid), due_ns))
             os.eventfd_write(self._waker, 1)
         except OSError as error:
             raise StepFailed(f"{name} is not stopped: its undo cannot be written: {error.strerror}") from None
@@ -98,7 +98,7 @@ class Book:
 
     def __init__(self, private: Path) -> None:
         self._path, self._at = private / LEDGER_NAME, 0
-        self.open: dict[tuple[int, int], Stopped] = {}
+        self.open: dict[tuple[int, int], StoppedProcess] = {}
 
     def read(self) -> None:
         """Take in what has been written since the last call."""
@@ -127,7 +127,7 @@ class Book:
         if earlier is None or (earlier.due_ns and (not entry.due_ns or entry.due_ns > earlier.due_ns)):
             self.open[key] = entry  # stopped twice: the longer one counts
 
-    def overdue(self, now_ns: int) -> list[Stopped]:
+    def overdue(self, now_ns: int) -> list[StoppedProcess]:
         """What the supervisor should have undone by now."""
         return [s for s in self.open.values() if s.due_ns and s.due_ns + LATE_NS_MAX <= now_ns]
 
@@ -146,7 +146,7 @@ class Ending(Enum):
     STUCK = "does not go on"
 
 
-def thaw(stopped: Stopped, private: Path) -> Ending:
+def thaw(stopped: StoppedProcess, private: Path) -> Ending:
     """Let the very process that was stopped go on, if it is of the run in `private`, and see it run."""
     if run_directory.started(stopped.pid) != stopped.start:
         return Ending.GONE
@@ -166,7 +166,7 @@ def _seen_running(pid: int) -> bool:
     return True
 
 
-def undo_overdue(book: Book, ledger: Ledger, private: Path) -> Iterator[str]:
+def undo_overdue(book: Book, ledger: UndoLedger, private: Path) -> Iterator[str]:
     """Undo what the supervisor did not; what was done, for people."""
     now_ns = time.monotonic_ns()
     for stopped in book.overdue(now_ns):
@@ -350,7 +350,7 @@ def _undo_until_command_ends(run: Watched, book: Book) -> None:
     poll = select.poll()
     poll.register(run.command_end, 0)  # only POLLHUP: nothing is ever written
     poll.register(run.waker, select.POLLIN)
-    ledger = Ledger(run.private, run.waker, "warden")
+    ledger = UndoLedger(run.private, run.waker, "warden")
     while True:
         ready = {fd for fd, _ in poll.poll(book.patience_ms(time.monotonic_ns()))}
         if run.waker in ready:

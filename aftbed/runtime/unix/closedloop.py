@@ -281,7 +281,7 @@ class ClosedLoop:
             if reason := _unsuitable(proposal.target, self._application):
                 raise ConfigError(reason)
             self._waiting = control_client.send(
-                self._private, control_client.Adapt(Goal(expression=proposal.target))
+                self._private, control_client.AdaptCommand(Goal(expression=proposal.target))
             )
             self._asked_ns = time.monotonic_ns()
         except AftbedError as error:

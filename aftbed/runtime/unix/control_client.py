@@ -14,55 +14,55 @@ from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.core.messages import Goal
 from aftbed.inject.model import Fault
 from aftbed.runtime.unix import run_directory
-from aftbed.runtime.unix.resources import Row
+from aftbed.runtime.unix.resources import ProcessRow
 from aftbed.runtime.unix.transport import Line
 
 ANSWER_SECONDS_MAX: Final = 2.0
 ADAPT_SECONDS_MAX: Final = 15.0  # to prepare, commit, observe and finish, on a busy machine
 
 
-class Status(msgspec.Struct, frozen=True, tag=True):
+class StatusQuery(msgspec.Struct, frozen=True, tag=True):
     """How the run is."""
 
 
-class Processes(msgspec.Struct, frozen=True, tag=True):
+class ProcessesQuery(msgspec.Struct, frozen=True, tag=True):
     """Names, roles and pids."""
 
 
-class GraphNow(msgspec.Struct, frozen=True, tag=True):
+class GraphQuery(msgspec.Struct, frozen=True, tag=True):
     """The graph, as JSON."""
 
 
-class Inject(msgspec.Struct, frozen=True, tag=True):
+class InjectCommand(msgspec.Struct, frozen=True, tag=True):
     """Arm or apply a fault."""
 
     fault: Fault
 
 
-class Adapt(msgspec.Struct, frozen=True, tag=True):
+class AdaptCommand(msgspec.Struct, frozen=True, tag=True):
     """Adapt; answered when it has ended."""
 
     goal: Goal
 
 
-class PlanFor(msgspec.Struct, frozen=True, tag=True):
+class PlanQuery(msgspec.Struct, frozen=True, tag=True):
     """The plan of an adaptation to `goal`, and that of the way back; nothing is changed. See `Planned`."""
 
     goal: Goal
 
 
-class Planned(msgspec.Struct, frozen=True):
+class PlanAnswer(msgspec.Struct, frozen=True):
     """The answer to PlanFor."""
 
     there: Plan
     back: Plan
 
 
-class Adaptations(msgspec.Struct, frozen=True, tag=True):
+class AdaptationsQuery(msgspec.Struct, frozen=True, tag=True):
     """Those that have ended."""
 
 
-class Stop(msgspec.Struct, frozen=True, tag=True):
+class StopCommand(msgspec.Struct, frozen=True, tag=True):
     """End the run."""
 
 
@@ -73,7 +73,16 @@ class Answer(msgspec.Struct, frozen=True, tag=True):
     error: str = ""
 
 
-Question = Status | Processes | GraphNow | Inject | Adapt | PlanFor | Adaptations | Stop
+Question = (
+    StatusQuery
+    | ProcessesQuery
+    | GraphQuery
+    | InjectCommand
+    | AdaptCommand
+    | PlanQuery
+    | AdaptationsQuery
+    | StopCommand
+)
 decode_question: Callable[[bytes], Question] = msgspec.msgpack.Decoder(Question).decode
 decode_answer: Callable[[bytes], Answer] = msgspec.msgpack.Decoder(Answer).decode
 
@@ -84,9 +93,9 @@ def same_user(sock: socket.socket, uid: int) -> bool:
     return bool(struct.unpack("3i", raw)[1] == uid)
 
 
-def processes(private: Path) -> list[Row]:
+def processes(private: Path) -> list[ProcessRow]:
     """The processes of the run in `private`."""
-    return msgspec.convert(ask(private, Processes())["processes"], list[Row])
+    return msgspec.convert(ask(private, ProcessesQuery())["processes"], list[ProcessRow])
 
 
 Waiting = Line[Answer]

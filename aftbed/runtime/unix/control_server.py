@@ -22,9 +22,9 @@ from aftbed.runtime.deployment import Deployment
 from aftbed.runtime.fault_controller import FaultController
 from aftbed.runtime.interface import ProcessKind
 from aftbed.runtime.unix import control_client, run_directory
-from aftbed.runtime.unix.event_loop import Loop
+from aftbed.runtime.unix.event_loop import EventLoop
 from aftbed.runtime.unix.options import RunOptions
-from aftbed.runtime.unix.resources import Row
+from aftbed.runtime.unix.resources import ProcessRow
 from aftbed.runtime.unix.transport import Line
 from aftbed.runtime.unix.workload import Work
 
@@ -32,13 +32,13 @@ BESIDE: Final = (ProcessKind.ZYGOTE, ProcessKind.SPARE, ProcessKind.SERVICE, Pro
 QUESTIONS_MAX: Final = 16  # connections at once, and questions that wait for the launch
 
 
-class Questions:
+class ControlServer:
     """The control socket of the run."""
 
     def __init__(
         self,
         options: RunOptions,
-        loop: Loop,
+        loop: EventLoop,
         deployment: Deployment,
         faults: FaultController,
         adaptations: Adaptations,
@@ -50,7 +50,7 @@ class Questions:
         self._adaptations = adaptations
         self._started_ns = time.monotonic_ns()
         self._lines: dict[int, Line[control_client.Question]] = {}
-        # Questions that came before the graph stood; None since then.
+        # Requests that came before the graph stood; None since then.
         self._early: list[tuple[Line[control_client.Question], control_client.Question]] | None = []
 
     def launched(self) -> None:
@@ -105,17 +105,19 @@ class Questions:
         answer = partial(self._send_answer, line)
         try:
             match question:
-                case control_client.Inject() | control_client.Adapt() if self._early is not None:
+                case control_client.InjectCommand() | control_client.AdaptCommand() if (
+                    self._early is not None
+                ):
                     if len(self._early) >= QUESTIONS_MAX:
                         raise ConfigError("the run has not started yet: ask again when it has")
                     self._early.append((line, question))
-                case control_client.Status():
+                case control_client.StatusQuery():
                     answer(control_client.Answer(json.dumps(self.status()).encode()))
-                case control_client.Processes():
+                case control_client.ProcessesQuery():
                     answer(control_client.Answer(msgspec.json.encode({"processes": self.processes()})))
-                case control_client.GraphNow():
+                case control_client.GraphQuery():
                     answer(control_client.Answer(msgspec.json.encode(self._deployment.graph)))
-                case control_client.Inject(fault):
+                case control_client.InjectCommand(fault):
                     fault.check(self._deployment.graph)
                     self._loop.tasks.start(
                         "inject",
@@ -124,15 +126,15 @@ class Questions:
                             control_client.Answer(json.dumps({"armed": str(fault)}).encode(), error=failure)
                         ),
                     )
-                case control_client.Adapt(goal):
+                case control_client.AdaptCommand(goal):
                     self._adaptations.ask(goal, lambda outcome: answer(_told(outcome)))
-                case control_client.PlanFor(goal):
+                case control_client.PlanQuery(goal):
                     there = self._adaptations.plan(goal)
                     back = plan(there.new, there.old, goal.recipe)
-                    answer(control_client.Answer(msgspec.json.encode(control_client.Planned(there, back))))
-                case control_client.Adaptations():
+                    answer(control_client.Answer(msgspec.json.encode(control_client.PlanAnswer(there, back))))
+                case control_client.AdaptationsQuery():
                     answer(control_client.Answer(self._adaptations.to_json()))
-                case control_client.Stop():
+                case control_client.StopCommand():
                     self._finish("stopped")
                     answer(control_client.Answer(b'{"stopping": true}'))
         except ConfigError as error:
@@ -157,16 +159,16 @@ class Questions:
             "vehicle": self._work.telemetry,
         }
 
-    def processes(self) -> list[Row]:
+    def processes(self) -> list[ProcessRow]:
         """Every process of the run; the nodes and the supervisor are the paper's count."""
         deployment = self._deployment
-        rows = [Row("supervisor", "master", os.getpid(), True)]
+        rows = [ProcessRow("supervisor", "master", os.getpid(), True)]
         for node in deployment.graph.nodes:
             process = deployment.nodes.get(node)
             if process is not None and process.alive:
-                rows.append(Row(node, deployment.role_of(node), process.pid, True))
-        others = [p for p in deployment.nursery.processes if p.kind in BESIDE and p.pid]
-        return rows + [Row(p.name, p.kind.value, p.pid, False) for p in others]
+                rows.append(ProcessRow(node, deployment.role_of(node), process.pid, True))
+        others = [p for p in deployment.pool.processes if p.kind in BESIDE and p.pid]
+        return rows + [ProcessRow(p.name, p.kind.value, p.pid, False) for p in others]
 
 
 def _told(outcome: Outcome) -> control_client.Answer:

@@ -13,7 +13,7 @@ from aftbed.runtime import control
 from aftbed.runtime.devices import Load, resume_client
 from aftbed.runtime.unix import linux
 from aftbed.runtime.unix.death_notice import Watcher
-from aftbed.runtime.unix.journal_files import Dialogue, Header
+from aftbed.runtime.unix.journal_files import DialogueFile, Header
 
 STALE_NS: Final = 35_000_000  # a pulse older than this is looked into; it comes every 20 ms
 
@@ -85,5 +85,5 @@ class LoadOptions(msgspec.Struct, frozen=True):
 def make_load(client: Client, options: LoadOptions, requests: list[bytes]) -> Load:
     """A load for a Client that may have had predecessors."""
     resume_client(client, entries_of(options.earlier))
-    dialogue = Dialogue(Path(options.dialogue), "client")
+    dialogue = DialogueFile(Path(options.dialogue), "client")
     return Load(client, dialogue, requests, options.count, options.rate_hz)

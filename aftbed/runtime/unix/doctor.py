@@ -48,7 +48,7 @@ BROWSERS: Final = ("chromium", "chromium-browser", "google-chrome", "chrome")
 _libc: Final = ctypes.CDLL(None, use_errno=True)
 
 
-class Check(msgspec.Struct, frozen=True):
+class HostCheck(msgspec.Struct, frozen=True):
     """One thing looked at: what was found, what it is for, and what to do unless it is `ok`."""
 
     name: str
@@ -58,25 +58,25 @@ class Check(msgspec.Struct, frozen=True):
     remedy: str = ""
 
 
-def inspect() -> list[Check]:
+def inspect() -> list[HostCheck]:
     """Every check, in the order in which a run needs them."""
     return [*kernel(), *limits(), *place(), *python(), *extras(), foreign_memory(), *measuring()]
 
 
-def _check(name: str, status: Status, found: str, serves: str, remedy: str) -> Check:
-    return Check(name, status, found, serves, "" if status == "ok" else remedy)
+def _check(name: str, status: Status, found: str, serves: str, remedy: str) -> HostCheck:
+    return HostCheck(name, status, found, serves, "" if status == "ok" else remedy)
 
 
 # -- the kernel -----------------------------------------------------------------------------------
 
 
-def _tried(name: str, serves: str, remedy: str, call: Callable[[], object]) -> Check:
+def _tried(name: str, serves: str, remedy: str, call: Callable[[], object]) -> HostCheck:
     """Missing if the kernel refuses `call`."""
     try:
         call()
     except (OSError, AttributeError, HarnessError) as error:
-        return Check(name, "missing", str(error), serves, remedy)
-    return Check(name, "ok", "works", serves)
+        return HostCheck(name, "missing", str(error), serves, remedy)
+    return HostCheck(name, "ok", "works", serves)
 
 
 def _pidfd() -> None:
@@ -119,7 +119,7 @@ def _process_files() -> None:
     os.listdir("/proc/self/fd")  # noqa: PTH208 - its names are all that is wanted
 
 
-def kernel() -> list[Check]:
+def kernel() -> list[HostCheck]:
     """System calls without which there is no run, and those without which it is slower."""
     sandbox = "Linux 5.4 or later, and a sandbox (container, seccomp) that allows it"
     return [
@@ -133,7 +133,7 @@ def kernel() -> list[Check]:
     ]
 
 
-def _futexes() -> Check:
+def _futexes() -> HostCheck:
     ctypes.set_errno(0)
     _libc.syscall(SYS_FUTEX_WAITV, None, 0, 0, None, 0)  # nothing to wait for: EINVAL where it exists
     there = ctypes.get_errno() != errno.ENOSYS
@@ -145,32 +145,32 @@ def _futexes() -> Check:
 # -- limits ---------------------------------------------------------------------------------------
 
 
-def limits() -> list[Check]:
+def limits() -> list[HostCheck]:
     """CPUs, descriptors, processes."""
     return [_cpus(), _pinning(), _files(), _processes()]
 
 
-def _cpus() -> Check:
+def _cpus() -> HostCheck:
     count = len(os.sched_getaffinity(0))
     remedy = "give it two: on one, the replicas wait for each other, and figures mean little"
     found = f"{count} usable of {os.cpu_count()}"
     return _check("CPUs", "ok" if count > 1 else "warning", found, "a core for each replica", remedy)
 
 
-def _pinning() -> Check:
+def _pinning() -> HostCheck:
     serves = "a replica's chain stays on its core"
     try:
         os.sched_setaffinity(0, os.sched_getaffinity(0))
     except OSError as error:
-        return Check("pinning", "missing", str(error), serves, "allow sched_setaffinity(2)")
-    return Check("pinning", "ok", "allowed", serves)
+        return HostCheck("pinning", "missing", str(error), serves, "allow sched_setaffinity(2)")
+    return HostCheck("pinning", "ok", "allowed", serves)
 
 
 def _limit(number: int) -> str:
     return "unlimited" if number == resource.RLIM_INFINITY else str(number)
 
 
-def _files() -> Check:
+def _files() -> HostCheck:
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     room = float("inf") if soft == resource.RLIM_INFINITY else soft
     status: Status = "missing" if room < FILES_MIN else "warning" if room < FILES_GOOD else "ok"
@@ -179,11 +179,11 @@ def _files() -> Check:
     return _check("open files", status, found, serves, f"ulimit -n {FILES_GOOD}")
 
 
-def _processes() -> Check:
+def _processes() -> HostCheck:
     soft, _ = resource.getrlimit(resource.RLIMIT_NPROC)
     serves = "a run has up to 40"
     if soft == resource.RLIM_INFINITY or os.getuid() == 0:
-        return Check("processes", "ok", "unlimited", serves)
+        return HostCheck("processes", "ok", "unlimited", serves)
     mine = sum(p.name.isdigit() and p.stat().st_uid == os.getuid() for p in _there(Path("/proc")))
     status: Status = "ok" if soft - mine >= PROCESSES_MIN else "missing"
     found = f"{max(0, soft - mine)} more allowed"
@@ -205,23 +205,23 @@ def _there(folder: Path) -> list[os.DirEntry[str]]:
 # -- where runs live ------------------------------------------------------------------------------
 
 
-def place() -> list[Check]:
+def place() -> list[HostCheck]:
     """The directory of all runs."""
     serves = "control sockets and records of runs, closed to others"
     try:
         root = run_directory.root()
     except (HarnessError, OSError) as error:
         remedy = "remove it, or set XDG_RUNTIME_DIR or TMPDIR to a directory of yours"
-        return [Check("run directory", "missing", str(error), serves, remedy)]
+        return [HostCheck("run directory", "missing", str(error), serves, remedy)]
     longest = len(os.fsencode(root / ("0" * 2 * run_directory.ID_BYTES) / run_directory.SOCKET_NAME))
     if longest > SOCKET_PATH_MAX:
         found = f"{root}: {longest - SOCKET_PATH_MAX} bytes too long for a socket's path"
         remedy = "set XDG_RUNTIME_DIR or TMPDIR to a shorter path"
-        return [Check("run directory", "missing", found, serves, remedy)]
-    return [Check("run directory", "ok", f"{root}, mode 0700", serves), _space(root)]
+        return [HostCheck("run directory", "missing", found, serves, remedy)]
+    return [HostCheck("run directory", "ok", f"{root}, mode 0700", serves), _space(root)]
 
 
-def _space(root: Path) -> Check:
+def _space(root: Path) -> HostCheck:
     free = shutil.disk_usage(root).free
     status: Status = "missing" if free < FREE_BYTES_MIN else "warning" if free < FREE_BYTES_GOOD else "ok"
     remedy = "make room, or keep records elsewhere: aftbed run --record"
@@ -231,21 +231,21 @@ def _space(root: Path) -> Check:
 # -- Python ---------------------------------------------------------------------------------------
 
 
-def python() -> list[Check]:
+def python() -> list[HostCheck]:
     """The interpreter, and the packages that aftbed cannot do without."""
     serves = "a failed assert ends a node: fail-silence"
     status: Status = "ok" if __debug__ else "missing"
     asserts = _check("asserts", status, "on" if __debug__ else "off", serves, "no -O, no PYTHONOPTIMIZE")
-    version = Check("Python", "ok", platform.python_version(), "the interpreter of all nodes")
+    version = HostCheck("Python", "ok", platform.python_version(), "the interpreter of all nodes")
     return [version, asserts, _packages()]
 
 
-def _packages() -> Check:
+def _packages() -> HostCheck:
     serves = "the bus, the wire format, the command line"
     try:
         wanted = [r for r in importlib.metadata.requires("aftbed") or [] if "extra ==" not in r]
     except importlib.metadata.PackageNotFoundError:
-        return Check("packages", "warning", "aftbed is not installed", serves, "pip install .")
+        return HostCheck("packages", "warning", "aftbed is not installed", serves, "pip install .")
     names = [match[0] for match in (re.match(r"[\w.-]+", r) for r in wanted) if match]
     lacking = [name for name in names if not _version(name)]
     found = f"without {', '.join(lacking)}" if lacking else f"all {len(names)}"
@@ -260,7 +260,7 @@ def _version(package: str) -> str:
         return ""
 
 
-def extras() -> list[Check]:
+def extras() -> list[HostCheck]:
     """What single commands need."""
     found = []
     for package, serves in OPTIONAL.items():
@@ -274,7 +274,7 @@ def extras() -> list[Check]:
     return found
 
 
-def foreign_memory() -> Check:
+def foreign_memory() -> HostCheck:
     """Whether the memory of a child can be written, by trying it."""
     serves = "aftbed inject bitflip --level memory"
     try:
@@ -285,19 +285,19 @@ def foreign_memory() -> Check:
         try_on_a_child()
     except (OSError, HarnessError) as error:
         remedy = f"echo 1 > {YAMA}, or CAP_SYS_PTRACE; in a container, allow process_vm_writev"
-        return Check("memory of nodes", "warning", f"{error} (Yama scope: {scope})", serves, remedy)
-    return Check("memory of nodes", "ok", f"can be written (Yama scope: {scope})", serves)
+        return HostCheck("memory of nodes", "warning", f"{error} (Yama scope: {scope})", serves, remedy)
+    return HostCheck("memory of nodes", "ok", f"can be written (Yama scope: {scope})", serves)
 
 
 # -- what spoils figures --------------------------------------------------------------------------
 
 
-def measuring() -> list[Check]:
+def measuring() -> list[HostCheck]:
     """What makes times larger, or scatter; verdicts do not depend on it."""
     return [_governor(), _steal(), _load()]
 
 
-def _governor() -> Check:
+def _governor() -> HostCheck:
     serves = "benches: a clock that stays as it is"
     files = sorted(Path("/sys/devices/system/cpu").glob("cpu[0-9]*/cpufreq/scaling_governor"))
     kinds = {file.read_text().strip() for file in files}
@@ -310,7 +310,7 @@ def _jiffies() -> list[int]:
     return [int(word) for word in Path("/proc/stat").read_text().splitlines()[0].split()[1:9]]
 
 
-def _steal() -> Check:
+def _steal() -> HostCheck:
     before = _jiffies()
     time.sleep(STEAL_SECONDS)  # what is sampled, not what is waited for
     passed = [b - a for a, b in zip(before, _jiffies(), strict=True)]
@@ -321,7 +321,7 @@ def _steal() -> Check:
     return _check("CPU steal", status, f"{share:.1%}", serves, remedy)
 
 
-def _load() -> Check:
+def _load() -> HostCheck:
     load, count = os.getloadavg()[0], os.cpu_count() or 1
     status: Status = "ok" if load < count else "warning"
     serves = "benches: nobody else runs"

@@ -17,7 +17,7 @@ def _call(call: Callable[[], None]) -> None:
         call()
 
 
-class Loop:
+class EventLoop:
     """Call what is registered for a descriptor when it is readable, and timers when they are due."""
 
     def __init__(self) -> None:

@@ -9,7 +9,7 @@ from aftbed.core.messages import Reply
 from aftbed.ftm.client import Client
 from aftbed.runtime.devices import CarDevice, resume_client
 from aftbed.runtime.unix.devices import entries_of
-from aftbed.runtime.unix.journal_files import Dialogue
+from aftbed.runtime.unix.journal_files import DialogueFile
 from aftbed.runtime.unix.options import GatewayOptions
 from aftbed.vehicle.can.bus import BusOptions, open_bus
 from aftbed.vehicle.can.bus_model import NODES
@@ -70,7 +70,7 @@ class BusLink:
 def make_car(client: Client, options: GatewayOptions) -> CarDevice:
     """A car for a Client that may have had predecessors."""
     resume_client(client, entries_of(options.earlier))
-    dialogue = Dialogue(Path(options.dialogue), "client")
+    dialogue = DialogueFile(Path(options.dialogue), "client")
     return CarDevice(client, dialogue, BusLink(_gateway(options), options.port))
 
 

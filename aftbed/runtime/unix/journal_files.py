@@ -57,7 +57,7 @@ def _grow(mapping: mmap.mmap) -> bool:
     return True
 
 
-class Journal:
+class JournalFile:
     """The records of one node. All is public for the host's hot path, which packs records itself.
 
     `at` is where the next record goes; beyond `end` the file must grow before another step.
@@ -80,7 +80,7 @@ class Journal:
         self.at = at + layout.RECORD.size
 
 
-class Dialogue:
+class DialogueFile:
     """Requests and replies with their bytes, as the client saw them."""
 
     def __init__(self, path: Path, node: str) -> None:

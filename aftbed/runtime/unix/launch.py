@@ -29,7 +29,7 @@ from aftbed.runtime import control
 from aftbed.runtime.interface import BUS, LIGHT
 from aftbed.runtime.unix import linux, run_directory
 from aftbed.runtime.unix.bus_fault_names import with_names_resolved
-from aftbed.runtime.unix.cleanup import Ledger, Watched, watch
+from aftbed.runtime.unix.cleanup import UndoLedger, Watched, watch
 from aftbed.runtime.unix.options import LoadRun, RunOptions, Work
 from aftbed.runtime.unix.prefault import Area
 from aftbed.runtime.unix.spawn import CONTROL_FD, PRELOADS, Started, start_zygote
@@ -198,7 +198,7 @@ class Launched:
                 zygotes = {name: start_zygote(name, cpus)}
             from aftbed.runtime.unix.supervisor import supervise  # noqa: PLC0415
 
-            supervise(self.options, owner, zygotes, Ledger(self.private, waker))
+            supervise(self.options, owner, zygotes, UndoLedger(self.private, waker))
             code = 0
         except BaseException:  # noqa: BLE001 - the last frame of this process
             import traceback  # noqa: PLC0415

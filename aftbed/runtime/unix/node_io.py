@@ -48,7 +48,7 @@ from aftbed.runtime import node as node_module
 from aftbed.runtime.node import HostedBrick, Node, NodeIO, Recorder
 from aftbed.runtime.unix import shared_memory, transport
 from aftbed.runtime.unix.death_notice import Held
-from aftbed.runtime.unix.journal_files import Journal
+from aftbed.runtime.unix.journal_files import JournalFile
 from aftbed.runtime.unix.transport import NUDGE, PULSE_SECONDS, READ_BYTES_MAX, WRITE_SECONDS_MAX, Line
 
 APPLY_NS_MAX: Final = 5_000_000_000  # the executive has so long to apply a fault
@@ -103,7 +103,7 @@ class UnixIO(NodeIO[Inlet, int]):
     output = int
     now_ns = staticmethod(time.monotonic_ns)
 
-    def __init__(self, line: Line[control.ToNode], journal: Journal) -> None:
+    def __init__(self, line: Line[control.ToNode], journal: JournalFile) -> None:
         self.line, self.journal = line, journal
         self.lifeline: Held | None = None  # kept, not used: the kernel reads it when this process dies
         self._pulse_at = 0  # where the journal was at the last pulse

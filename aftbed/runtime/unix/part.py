@@ -20,7 +20,7 @@ from aftbed.runtime.node import Node
 from aftbed.runtime.unix import linux
 from aftbed.runtime.unix.death_notice import Held
 from aftbed.runtime.unix.devices import LoadOptions, ProcessSenses, make_load
-from aftbed.runtime.unix.journal_files import Journal
+from aftbed.runtime.unix.journal_files import JournalFile
 from aftbed.runtime.unix.node_io import EXIT_ASSERT, UnixIO, UnixNode
 from aftbed.runtime.unix.options import GatewayOptions
 from aftbed.runtime.unix.transport import PULSE_SECONDS, Line
@@ -61,7 +61,7 @@ def _build(line: Line[control.ToNode], order: control.Assign, fds: list[int]) ->
     else:
         linux.hand_over()
     linux.set_timeouts(line.sock, PULSE_SECONDS, 2.0)
-    io = UnixIO(line, Journal(Path(order.journal), order.node))
+    io = UnixIO(line, JournalFile(Path(order.journal), order.node))
     node = Node(order.node, io)
     io.start_pulse()
     io.lifeline = Held(Path(order.journal))

@@ -19,8 +19,8 @@ from aftbed.runtime import control, interface
 from aftbed.runtime.interface import ProcessKind
 from aftbed.runtime.tasks import Key, Wait
 from aftbed.runtime.unix import linux, run_directory
-from aftbed.runtime.unix.cleanup import Ledger
-from aftbed.runtime.unix.event_loop import Loop
+from aftbed.runtime.unix.cleanup import UndoLedger
+from aftbed.runtime.unix.event_loop import EventLoop
 from aftbed.runtime.unix.journal_files import Header
 from aftbed.runtime.unix.spawn import Started, start_zygote
 from aftbed.runtime.unix.transport import Line, decode_report
@@ -32,10 +32,12 @@ PARK_BATCH: Final = 8  # spares per order: the first of them start while the nex
 WATCHING_KINDS: Final = ("watchdog", "recovery")
 
 
-class Process:
+class UnixProcess:
     """A child of the supervisor."""
 
-    def __init__(self, name: str, kind: ProcessKind, line: Line[control.FromNode], ledger: Ledger) -> None:
+    def __init__(
+        self, name: str, kind: ProcessKind, line: Line[control.FromNode], ledger: UndoLedger
+    ) -> None:
         self.name, self.kind, self.line, self._ledger = name, kind, line, ledger
         self.pid, self.pidfd = 0, -1
         self.journal = ""
@@ -127,23 +129,23 @@ class Process:
             self.header = None
 
 
-class Nursery:
+class UnixProcessPool:
     """Two zygotes, and what they park. `on_report` and `on_death` are the supervisor's."""
 
     def __init__(
         self,
-        loop: Loop,
-        on_report: Callable[[Process, msgspec.Struct], None],
-        on_death: Callable[[Process], None],
-        ledger: Ledger,
+        loop: EventLoop,
+        on_report: Callable[[UnixProcess, msgspec.Struct], None],
+        on_death: Callable[[UnixProcess], None],
+        ledger: UndoLedger,
     ) -> None:
         self._loop, self._ledger = loop, ledger
         self._cpus = sorted(os.sched_getaffinity(0))
         self._on_report, self._on_death = on_report, on_death
-        self.processes: list[Process] = []
-        self.zygotes: dict[str, Process] = {}
-        self.parked: dict[str, deque[Process]] = {}
-        self._unborn: dict[str, list[Process]] = {}
+        self.processes: list[UnixProcess] = []
+        self.zygotes: dict[str, UnixProcess] = {}
+        self.parked: dict[str, deque[UnixProcess]] = {}
+        self._unborn: dict[str, list[UnixProcess]] = {}
         self._levels: dict[str, int] = {}
 
     # -- zygotes ------------------------------------------------------------------------------
@@ -182,7 +184,7 @@ class Nursery:
                 theirs.close()
             count -= batch
 
-    def spare(self, zygote: str) -> Generator[Wait, dict[Key, bytes], Process]:
+    def spare(self, zygote: str) -> Generator[Wait, dict[Key, bytes], UnixProcess]:
         """A parked spare; waits for one to be forked if there is none."""
         while True:
             while not self.parked[zygote]:
@@ -198,12 +200,12 @@ class Nursery:
         while len(self.parked[zygote]) < count:
             yield Wait(frozenset({("spare", zygote, 0)}), seconds=SPARE_SECONDS_MAX)
 
-    def calm(self, zygote: str) -> Generator[Wait, dict[Key, bytes], None]:
+    def wait_for_forks(self, zygote: str) -> Generator[Wait, dict[Key, bytes], None]:
         """Wait until no spare is being forked: what comes next shall have the CPUs."""
         while self._unborn[zygote]:
             yield Wait(frozenset({("spare", zygote, 0)}), seconds=SPARE_SECONDS_MAX)
 
-    def level(self, zygote: str, count: int) -> None:
+    def refill(self, zygote: str, count: int) -> None:
         """Have `count` spares parked, in the end: one after the other, since others need the CPUs, too."""
         self._levels[zygote] = count
         self._fill(zygote)
@@ -215,17 +217,17 @@ class Nursery:
         elif not self._unborn[zygote]:
             self.park(zygote, 1)
 
-    def _adopt(self, name: str, kind: ProcessKind, sock: socket.socket) -> Process:
+    def _adopt(self, name: str, kind: ProcessKind, sock: socket.socket) -> UnixProcess:
         sock.setblocking(False)
-        process = Process(name, kind, Line(sock, decode_report), self._ledger)
+        process = UnixProcess(name, kind, Line(sock, decode_report), self._ledger)
         self.processes.append(process)
         self._loop.read(sock.fileno(), lambda: self._heard(process))
         return process
 
-    def _watch(self, process: Process) -> None:
+    def _watch(self, process: UnixProcess) -> None:
         self._loop.read(process.pidfd, lambda: self._died(process), patient=True)
 
-    def _heard(self, process: Process) -> None:
+    def _heard(self, process: UnixProcess) -> None:
         """Read what the process says; its death is the pidfd's business, not the line's."""
         while process.alive:
             try:
@@ -244,7 +246,7 @@ class Nursery:
             elif not isinstance(message, control.Hello):
                 self._on_report(process, message)
 
-    def _hello(self, process: Process, pid: int) -> None:
+    def _hello(self, process: UnixProcess, pid: int) -> None:
         process.born(pid)
         self._watch(process)
         for name, unborn in self._unborn.items():
@@ -256,7 +258,7 @@ class Nursery:
 
     # -- death --------------------------------------------------------------------------------
 
-    def _died(self, process: Process) -> None:
+    def _died(self, process: UnixProcess) -> None:
         """It can be reaped at leisure: others wait for a failover just now."""
         self._heard(process)  # its last words are still in the line
         self._loop.forget(process.pidfd)
@@ -264,12 +266,12 @@ class Nursery:
         self._on_death(process)
         self._loop.after(REAP_SECONDS, lambda: self._reap(process))
 
-    def _reap(self, process: Process) -> None:
+    def _reap(self, process: UnixProcess) -> None:
         if process in self.processes:
             linux.reap(process.pid)
             self._forget(process)
 
-    def _forget(self, process: Process) -> None:
+    def _forget(self, process: UnixProcess) -> None:
         if process.pidfd >= 0:
             self._loop.forget(process.pidfd)
         self._loop.forget(process.line.fileno())
@@ -281,7 +283,7 @@ class Nursery:
 
     def order(self, process: interface.Process, order: control.ToNode, fds: tuple[int, ...] = ()) -> None:
         """Send `order`. Raises StepFailed if the process is gone or does not read its line."""
-        assert isinstance(process, Process)
+        assert isinstance(process, UnixProcess)
         try:
             process.line.send(order, fds)
         except OSError as error:

@@ -36,7 +36,7 @@ from aftbed.ftm.server import Server
 from aftbed.runtime import control
 from aftbed.runtime.node import MemoryIO, Node, nowhere
 from aftbed.runtime.unix import linux
-from aftbed.runtime.unix.journal_files import Journal
+from aftbed.runtime.unix.journal_files import JournalFile
 from aftbed.runtime.unix.node_io import UnixIO
 from aftbed.runtime.unix.prefault import Area, written_by
 from aftbed.runtime.unix.transport import NUDGE, Line, decode_order, decode_report
@@ -121,7 +121,7 @@ class _Scratch:
     def __init__(self, brick: Brick, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> None:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self.line = Line(ours, decode_report)
-        self.io = UnixIO(Line(theirs, decode_order), Journal(None, "rehearsal"))
+        self.io = UnixIO(Line(theirs, decode_order), JournalFile(None, "rehearsal"))
         self.node = Node("rehearsal", self.io)
         self.node.add("brick", brick)
         self._ends = [ours, theirs]

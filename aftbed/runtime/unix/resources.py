@@ -8,7 +8,7 @@ import msgspec
 CPU_SAMPLE_SECONDS: Final = 0.2
 
 
-class Row(msgspec.Struct, frozen=True):
+class ProcessRow(msgspec.Struct, frozen=True):
     """A process of a run; `node`: one of the graph, or the supervisor."""
 
     name: str
@@ -20,7 +20,7 @@ class Row(msgspec.Struct, frozen=True):
     rss_mb: float = 0.0
 
 
-def measured(rows: list[Row]) -> list[Row]:
+def measured(rows: list[ProcessRow]) -> list[ProcessRow]:
     """`rows` with CPU over a short while, PSS and RSS; those that have gone meanwhile are left out."""
     import psutil  # noqa: PLC0415 - 15 ms that nobody else needs
 

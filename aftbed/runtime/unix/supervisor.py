@@ -23,13 +23,13 @@ from aftbed.runtime.interface import BUS, LIGHT, ProcessKind
 from aftbed.runtime.run_controller import RunController
 from aftbed.runtime.tasks import STATS_TASK
 from aftbed.runtime.unix import linux
-from aftbed.runtime.unix.cleanup import Ledger
-from aftbed.runtime.unix.control_server import Questions
-from aftbed.runtime.unix.event_loop import Loop
+from aftbed.runtime.unix.cleanup import UndoLedger
+from aftbed.runtime.unix.control_server import ControlServer
+from aftbed.runtime.unix.event_loop import EventLoop
 from aftbed.runtime.unix.options import COMMAND_GONE, LoadRun, RunOptions
-from aftbed.runtime.unix.process_pool import Nursery, Process
+from aftbed.runtime.unix.process_pool import UnixProcess, UnixProcessPool
 from aftbed.runtime.unix.spawn import Started
-from aftbed.runtime.unix.support import Support
+from aftbed.runtime.unix.support import UnixRuntime
 from aftbed.runtime.unix.transport import Line, decode_order
 from aftbed.runtime.unix.workload import Work
 
@@ -46,15 +46,15 @@ class Supervisor:
     """One run. `owner` is the line to the command; its end is the command's."""
 
     def __init__(
-        self, options: RunOptions, owner: socket.socket, zygotes: dict[str, Started], ledger: Ledger
+        self, options: RunOptions, owner: socket.socket, zygotes: dict[str, Started], ledger: UndoLedger
     ) -> None:
         self.options, self._zygotes = options, zygotes
         self.record = Path(options.record)
         self.started_ns = time.monotonic_ns()
         self.owner = Line(owner, decode_order)
         self.owner.sock.setblocking(False)
-        self.loop = Loop()
-        self.nursery = Nursery(self.loop, self._on_report, self._on_death, ledger)
+        self.loop = EventLoop()
+        self.pool = UnixProcessPool(self.loop, self._on_report, self._on_death, ledger)
         self._events = open(self.record / "events.jsonl", "ab", buffering=0)  # noqa: SIM115 - for the whole run
         self._ending = ""
         self._told: list[bytes] = []
@@ -70,21 +70,21 @@ class Supervisor:
         graph = build(options.ftm, options.placement)
         cpus = sorted(os.sched_getaffinity(0))
         pinned = cpus if options.pin and len(cpus) > 1 else None
-        self.work = Work(options, self.nursery, self.loop, self.tell, self._finish, self._report_owner)
-        support = Support(
+        self.work = Work(options, self.pool, self.loop, self.log, self._finish, self._report_owner)
+        runtime = UnixRuntime(
             self.record,
             self.loop,
-            self.nursery,
+            self.pool,
             self.work.device_of,
-            self.tell,
+            self.log,
             options.seed,
             self.work.bus,
             Path(options.private),
         )
-        self.conductor = RunController(graph, support, pinned, self._on_loss)
-        self.deployment, self.faults = self.conductor.deployment, self.conductor.faults
-        self.adaptations = self.conductor.adaptations
-        self.questions = Questions(
+        self.controller = RunController(graph, runtime, pinned, self._on_loss)
+        self.deployment, self.faults = self.controller.deployment, self.controller.faults
+        self.adaptations = self.controller.adaptations
+        self.questions = ControlServer(
             options, self.loop, self.deployment, self.faults, self.adaptations, self.work, self._finish
         )
 
@@ -97,10 +97,10 @@ class Supervisor:
         linux.answer_soon()
         wants_bus = BUS in self._zygotes
         for name in (BUS, LIGHT) if wants_bus else (LIGHT,):
-            self.nursery.start_zygote(name, self._zygotes.get(name))
-        self.nursery.park(LIGHT, len(self.deployment.graph.nodes) + self.conductor.spares() + wants_bus)
+            self.pool.start_zygote(name, self._zygotes.get(name))
+        self.pool.park(LIGHT, len(self.deployment.graph.nodes) + self.controller.spares() + wants_bus)
         if wants_bus:
-            self.nursery.park(BUS, 2)
+            self.pool.park(BUS, 2)
         self.questions.listen()
         self.loop.read(self.owner.fileno(), self._on_owner)
         self.loop.tasks.start("launch", self._launch(), self._launched)
@@ -111,7 +111,7 @@ class Supervisor:
     def _launch(self) -> Keys:
         yield from self.work.before(self.deployment)
         for zygote, count in self.work.spares_for(self.deployment).items():
-            yield from self.nursery.parked_at_least(zygote, count)
+            yield from self.pool.parked_at_least(zygote, count)
         began_ns = time.monotonic_ns()
         yield from self.deployment.launch(held=self.work.held)
         self.graph_ms = (time.monotonic_ns() - began_ns) / 1e6
@@ -122,12 +122,12 @@ class Supervisor:
 
     def _launched(self, failure: str) -> None:
         if failure:
-            self.tell("launch.failed", failure)
+            self.log("launch.failed", failure)
             self._finish(f"launch failed: {failure}")
             return
         self._waited_ns = {p.pid: linux.waited_ns(p.pid) for p in self.deployment.nodes.values()}
-        self.tell("started", f"{len(self.deployment.nodes)} nodes in {self.graph_ms:.1f} ms")
-        self.conductor.inform_recovery(failed=False)
+        self.log("started", f"{len(self.deployment.nodes)} nodes in {self.graph_ms:.1f} ms")
+        self.controller.inform_recovery(failed=False)
         self.questions.launched()
 
     def _on_owner(self) -> None:
@@ -151,7 +151,7 @@ class Supervisor:
         except OSError:
             return
 
-    def tell(self, event: str, text: str) -> None:
+    def log(self, event: str, text: str) -> None:
         """A line for people: to the record, and to the command. Soon, since a failover does not wait."""
         t_ms = round((time.monotonic_ns() - self.started_ns) / 1e6, 3)
         self._told.append(json.dumps({"t_ms": t_ms, "event": event, "text": text}).encode())
@@ -178,7 +178,7 @@ class Supervisor:
 
     def _drain(self, limit_ns: int) -> None:
         """Wait until all is answered, and what fails or changes has come to its end; or to the limit."""
-        settled = self.work.settled and (self._lost or self.conductor.at_rest())
+        settled = self.work.settled and (self._lost or self.controller.at_rest())
         if settled and self._looks_left:
             look = look_at_states(self.deployment, self._states)
             self.loop.tasks.start("states", look, lambda _: self._looked(limit_ns))
@@ -186,7 +186,7 @@ class Supervisor:
         if self.owner_gone() or settled or time.monotonic_ns() > limit_ns:
             if not settled and not self.owner_gone():
                 self._incomplete = self.loop.tasks.names()
-            self.conductor.ending = True
+            self.controller.ending = True
             self.loop.end()
             return
         if not len(self.loop.tasks):
@@ -238,12 +238,12 @@ class Supervisor:
 
         Whoever watches is killed first: the end of the run is nothing to recover from.
         """
-        dying = self.nursery.processes
+        dying = self.pool.processes
         starvation = {p.pid: linux.Starvation(p.pid) for p in dying if p.pid}
         began_ns = time.monotonic_ns()
         for watch in starvation.values():
             watch.starves(began_ns)  # counts from here
-        for process in sorted(dying, key=Process.watches, reverse=True):
+        for process in sorted(dying, key=UnixProcess.watches, reverse=True):
             process.kill()
         while dying:
             before = len(dying)
@@ -260,20 +260,20 @@ class Supervisor:
 
     # -- what processes say -------------------------------------------------------------------
 
-    def _on_report(self, process: Process, report: msgspec.Struct) -> None:
+    def _on_report(self, process: UnixProcess, report: msgspec.Struct) -> None:
         if isinstance(report, control.Report):
             self.work.on_report(process, report.kind, report.data)
         else:
-            self.conductor.on_report(process, report)
+            self.controller.on_report(process, report)
 
     # -- deaths and hangs ---------------------------------------------------------------------
 
-    def _on_death(self, process: Process) -> None:
-        self.conductor.on_death(process)
+    def _on_death(self, process: UnixProcess) -> None:
+        self.controller.on_death(process)
         if process.kind is ProcessKind.KILLED or self._ending:
             return
         if process.kind is ProcessKind.ZYGOTE:
-            self.nursery.restart_zygote(process.name)
+            self.pool.restart_zygote(process.name)
         elif process.kind is ProcessKind.SERVICE:
             self._finish(f"{process.name} died")
 
@@ -292,15 +292,17 @@ class Supervisor:
         self._last_tick_ns = now_ns
         self.deployment.nudge_late()
         if self.graph_ms and now_ns > self._grace_until_ns:  # births have a limit
-            self.conductor.look_for_hangs()
+            self.controller.look_for_hangs()
         self.loop.after(TICK_SECONDS, self._tick)
 
 
-def supervise(options: RunOptions, owner: socket.socket, zygotes: dict[str, Started], ledger: Ledger) -> None:
+def supervise(
+    options: RunOptions, owner: socket.socket, zygotes: dict[str, Started], ledger: UndoLedger
+) -> None:
     """Be the supervisor of a run, in a process of its own; the first zygote has been started."""
     supervisor = Supervisor(options, owner, zygotes, ledger)
     try:
         supervisor.run()
     finally:
-        for process in supervisor.nursery.processes:
+        for process in supervisor.pool.processes:
             process.kill()

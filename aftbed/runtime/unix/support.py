@@ -16,38 +16,38 @@ from aftbed.runtime.interface import Met
 from aftbed.runtime.interface import Process as AnyProcess
 from aftbed.runtime.unix import process_memory
 from aftbed.runtime.unix.bus_faults import BusFaults
-from aftbed.runtime.unix.event_loop import Loop
-from aftbed.runtime.unix.journal_files import Journal, contents, recorded_requests
-from aftbed.runtime.unix.process_pool import Nursery
+from aftbed.runtime.unix.event_loop import EventLoop
+from aftbed.runtime.unix.journal_files import JournalFile, contents, recorded_requests
+from aftbed.runtime.unix.process_pool import UnixProcessPool
 from aftbed.runtime.unix.shared_memory import MemfdMemory
-from aftbed.runtime.unix.transport import Channel
+from aftbed.runtime.unix.transport import UnixChannel
 from aftbed.vehicle.condition import Condition
 
 HISTORY_NAME: Final = "adaptations.jsonl"
 DRAW_BITS: Final = 63
 
 
-class Support:
+class UnixRuntime:
     """Of one run; `record` is its directory."""
 
     def __init__(
         self,
         record: Path,
-        loop: Loop,
-        nursery: Nursery,
+        loop: EventLoop,
+        pool: UnixProcessPool,
         device: Callable[[str, int], tuple[str, bytes]],
-        tell: Callable[[str, str], None],
+        log: Callable[[str, str], None],
         seed: int = 0,
         bus: BusFaults | None = None,
         private: Path | None = None,
     ) -> None:
         self._record, self._seed, self._bus, self._private = record, seed, bus, private
-        self.loop, self.nursery, self.device, self.tell = loop, nursery, device, tell
-        self.journal = Journal(record / "journal" / "supervisor.1.journal", "supervisor")
+        self.loop, self.pool, self.device, self.log = loop, pool, device, log
+        self.journal = JournalFile(record / "journal" / "supervisor.1.journal", "supervisor")
 
-    def channel(self, link: Link) -> Channel:
+    def channel(self, link: Link) -> UnixChannel:
         """A fresh pair of sockets."""
-        return Channel(link)
+        return UnixChannel(link)
 
     def shared_memory(self) -> MemfdMemory:
         """A fresh memfd."""
@@ -100,7 +100,7 @@ class Support:
         """See sched_setaffinity(2)."""
         os.sched_setaffinity(pid, {cpu})
 
-    def keep(self, adaptation: bytes) -> None:
+    def record_adaptation(self, adaptation: bytes) -> None:
         """One line in the record."""
         with open(self._record / HISTORY_NAME, "ab") as file:
             file.write(adaptation + b"\n")

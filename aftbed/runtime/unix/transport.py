@@ -180,7 +180,7 @@ WRITE_PATIENCE_SECONDS: Final = PULSE_SECONDS
 assert WRITE_PATIENCE_SECONDS < WRITE_SECONDS_MAX
 
 
-class Channel:
+class UnixChannel:
     """Both ends of `link`."""
 
     def __init__(self, link: Link) -> None:

@@ -16,7 +16,7 @@ from aftbed.runtime.interface import BUS, LIGHT, ProcessKind
 from aftbed.runtime.tasks import STATS_TASK, Key, Wait
 from aftbed.runtime.unix.bus_faults import BusFaults
 from aftbed.runtime.unix.devices import LoadOptions
-from aftbed.runtime.unix.event_loop import Loop
+from aftbed.runtime.unix.event_loop import EventLoop
 from aftbed.runtime.unix.options import (
     CarRun,
     GatewayOptions,
@@ -26,7 +26,7 @@ from aftbed.runtime.unix.options import (
     RunOptions,
     VehicleOptions,
 )
-from aftbed.runtime.unix.process_pool import Nursery, Process
+from aftbed.runtime.unix.process_pool import UnixProcess, UnixProcessPool
 
 ATTACH_SECONDS_MAX: Final = 10.0
 LOAD_POLL_SECONDS: Final = 0.02
@@ -40,16 +40,16 @@ class Work:
     def __init__(
         self,
         options: RunOptions,
-        nursery: Nursery,
-        loop: Loop,
-        tell: Callable[[str, str], None],
+        pool: UnixProcessPool,
+        loop: EventLoop,
+        log: Callable[[str, str], None],
         finish: Callable[[str], None],
         report_owner: Callable[[str, bytes], None],
     ) -> None:
-        self._options, self._nursery, self._loop = options, nursery, loop
-        self._tell, self._finish, self._report_owner = tell, finish, report_owner
-        self._services: dict[str, Process] = {}
-        self.bus = BusFaults(nursery, loop.tasks.settle, tell)
+        self._options, self._pool, self._loop = options, pool, loop
+        self._log, self._finish, self._report_owner = log, finish, report_owner
+        self._services: dict[str, UnixProcess] = {}
+        self.bus = BusFaults(pool, loop.tasks.settle, log)
         self._result: object = None
         self._stats: dict[str, object] = {}
         self.telemetry: dict[str, object] | None = None
@@ -124,19 +124,19 @@ class Work:
                 ),
             )
         yield from self._serve(BUS, name, options, ())
-        self._nursery.order(self._services[name], control.Resume(0))
-        self._nursery.level(BUS, 1)
+        self._pool.order(self._services[name], control.Resume(0))
+        self._pool.refill(BUS, 1)
 
     def _serve(
         self, zygote: str, name: str, options: bytes, fds: tuple[int, ...]
     ) -> Generator[Wait, dict[Key, bytes], None]:
-        process = yield from self._nursery.spare(zygote)
+        process = yield from self._pool.spare(zygote)
         process.name, process.kind = name, ProcessKind.SERVICE
         self._services[name] = process
-        self._nursery.order(process, control.Serve(0, name, options), fds)
+        self._pool.order(process, control.Serve(0, name, options), fds)
         yield Wait(frozenset({("ready", name, 0)}), frozenset({name}), ATTACH_SECONDS_MAX)
 
-    def on_report(self, process: Process, kind: str, data: bytes) -> None:
+    def on_report(self, process: UnixProcess, kind: str, data: bytes) -> None:
         """What a service says."""
         if kind == "ready":
             self._loop.tasks.settle(("ready", process.name, 0))
@@ -149,7 +149,7 @@ class Work:
             if self._telemetries % CYCLE_EVERY == 0:
                 self._loop.tasks.start(STATS_TASK, self.ask_stats(self._deployment), self._report_cycle)
         elif kind == "trouble":
-            self._tell("trouble", f"{process.name}: {data.decode()}")
+            self._log("trouble", f"{process.name}: {data.decode()}")
             self._finish(f"{process.name}: {data.decode()}")
         elif kind == "result" and process.name in ("vehicle", "player"):
             self._result = json.loads(data)
@@ -165,7 +165,7 @@ class Work:
         for name in ("vehicle", "player"):
             process = self._services.get(name)
             if process is not None and process.alive and process.kind is ProcessKind.SERVICE:
-                self._nursery.order(process, control.Stop(0))
+                self._pool.order(process, control.Stop(0))
         yield from self.bus.ask()
         yield from self.wind_up(deployment)
 
@@ -186,7 +186,7 @@ class Work:
             if self._stats.get("done"):
                 self._finish("")
             elif now_ns - self._moved_ns > STALL_SECONDS_MAX * 1e9:
-                self._tell("stalled", f"no request was sent or answered for {STALL_SECONDS_MAX:g} s")
+                self._log("stalled", f"no request was sent or answered for {STALL_SECONDS_MAX:g} s")
                 self._finish("")
             else:
                 self._loop.after(LOAD_POLL_SECONDS, lambda: self._watch_load(deployment))
