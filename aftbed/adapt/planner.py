@@ -176,8 +176,8 @@ class _Change:
         self.added_nodes = [n for n in new.nodes if n not in old.nodes]
         self.removed_nodes = [n for n in old.nodes if n not in new.nodes]
         self.staged = {b for n in (*self.exchanged, *self.added_nodes) for b in new.nodes[n]}
-        self.old_links = {_key(k): k for k in old.links}
-        self.new_links = {_key(k): k for k in new.links}
+        self.old_links = {k.key: k for k in old.links}
+        self.new_links = {k.key: k for k in new.links}
 
     @staticmethod
     def _content(graph: Graph, node: str) -> tuple[tuple[BrickSpec, ...], frozenset[Link]]:
@@ -217,7 +217,7 @@ class _Change:
         if node in self.exchanged or waits:
             return True
         hosted = set(self.new.nodes[node])
-        return any(k.sink in hosted and _key(k) in self.old_links for k in self.new.links)
+        return any(k.sink in hosted and k.key in self.old_links for k in self.new.links)
 
     def binds(self) -> Iterator[Link]:
         """The links that staged bricks or changed ends need."""
@@ -285,10 +285,6 @@ def drains(old: Graph, new: Graph, staged: Iterable[str] = ()) -> list[str]:
     return change.drains()
 
 
-def _key(link: Link) -> tuple[str, str, str, str]:
-    return link.source, link.source_port, link.sink, link.sink_port
-
-
 def _one_per_node(graph: Graph, bricks: Iterable[str]) -> list[str]:
     """The first of `bricks` in each node."""
     firsts: dict[str, str] = {}
@@ -337,7 +333,7 @@ def _exchanges(change: _Change) -> list[Step]:
     moved = [
         _bind(k)
         for k in change.binds()
-        if not k.standby and not {k.source, k.sink} <= change.staged and _key(k) not in change.old_links
+        if not k.standby and not {k.source, k.sink} <= change.staged and k.key not in change.old_links
     ]
     return [*(Exchange(node) for node in change.exchanged), *moved, *change.unbinds()]
 

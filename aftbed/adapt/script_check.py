@@ -3,7 +3,8 @@
 Four looks, each only where those before found nothing:
 
 1. are there such bricks and nodes;
-2. is the script sound by itself (`core.script.problems`), and can the runtime carry out each verb;
+2. is the script sound by itself (`problems`: all that is asked of a script of Recovery), and can the runtime
+   carry out each verb;
 3. is the graph that it leads to one that can run: each required port bound once, by a channel that carries
    what it takes, no loop in the request path, the leader the same, replicas that speak as `ftm` says;
 4. is nothing lost on the way: the leader's Protocol suspended and the backup drained while anything
@@ -21,21 +22,27 @@ from typing import Final
 import msgspec
 
 from aftbed.adapt.planner import drains, leader_of
-from aftbed.adapt.script_file import ARROW, phases, words
+from aftbed.adapt.script_file import link_words, phases, step_words
 from aftbed.core.errors import unknown
-from aftbed.core.graph import PLACEMENTS, Graph, Link, ends
+from aftbed.core.graph import PLACEMENTS, Graph
 from aftbed.core.script import (
     RECIPES,
+    STEPS_MAX,
     Align,
+    Attach,
     Bind,
     Destroy,
     Drain,
     Exchange,
+    Fence,
     Freeze,
+    Kill,
     Migrate,
+    Promote,
     Resume,
     Retire,
     Script,
+    Spawn,
     Stage,
     Step,
     Suspend,
@@ -45,7 +52,6 @@ from aftbed.core.script import (
     after,
     flat,
     names,
-    problems,
 )
 from aftbed.ftm.compose import EXPRESSIONS, NONE, REPLICAS, STATEFUL, build, replication_of
 from aftbed.ftm.registry import KINDS
@@ -95,11 +101,96 @@ def _strangers(graph: Graph, script: Script) -> Iterator[str]:
                     yield f"{here}: {unknown('node' if is_node else 'brick', name, allowed)}"
 
 
+# -- by itself ------------------------------------------------------------------------------------
+
+
+def problems(script: Script) -> list[str]:
+    """Every reason to refuse `script` by itself, or []. What it makes of a graph is judged by `after`."""
+    found = _prepare_problems(script) + _suspension_problems(script) + _mastership_problems(script)
+    if len(script.prepare) + len(script.commit) + len(script.finish) > STEPS_MAX:
+        found.append(f"more than {STEPS_MAX} steps")
+    wrong = [s for s in flat(script.finish) if not isinstance(s, Retire)]
+    return found + [f"finish only retires: {step}" for step in wrong]
+
+
+def _suspension_problems(script: Script) -> list[str]:
+    """What is suspended is resumed, and nothing is changed while requests flow."""
+    staged = {s.node for s in flat(script.prepare) if isinstance(s, Stage)}
+    waiting = {b.name for s in flat(script.prepare) if isinstance(s, Stage) and s.held for b in s.bricks}
+    held: set[str] = set()
+    found: list[str] = []
+    for step in flat(script.commit):
+        match step:
+            case Suspend(brick) | Drain(brick) | Freeze(brick):
+                held.add(brick)
+            case Resume(brick) | Thaw(brick) if brick in held:
+                held.remove(brick)
+            case Resume(brick) | Thaw(brick) if brick not in waiting:
+                found.append(f"resumed, not suspended: {brick}")
+            case Transfer() | Align() | Bind() | Migrate() | Exchange() if not held:
+                found.append(f"changed while requests flow: {step}")
+            case Exchange(node) | Migrate(node) if node not in staged:
+                found.append(f"nothing is staged to take the place of {node}")
+            case Destroy(node) if script.recipe == RECIPES[0]:
+                found.append(f"killed with a request inside: {node}")
+            case Spawn(node) | Stage(node) if script.recipe == RECIPES[0]:
+                found.append(f"spawned while the client waits: {node}")
+            case _:
+                pass
+    exchanged = {s.node for s in flat(script.commit) if isinstance(s, Exchange)}
+    ended = {s.node for s in flat(script.finish) if isinstance(s, Retire)} - exchanged
+    left = sorted(brick for brick in held if brick not in ended and _head(brick) not in ended)
+    return found + [f"suspended, not resumed: {brick}" for brick in left]
+
+
+def _mastership_problems(script: Script) -> list[str]:
+    """The old master is fenced before there is a new one, and before it is killed."""
+    fenced: set[str] = set()
+    found = []
+    for step in flat(script.commit):
+        match step:
+            case Fence(replica):
+                fenced.add(replica)
+            case Kill(replica) if replica not in fenced:
+                found.append(f"killed before it was fenced: {replica}")
+            case Promote(replica) | Attach(replica) if not fenced - {replica}:
+                found.append(f"a new master while the old one is not fenced: {step}")
+            case Promote(replica) | Attach(replica) if replica in fenced:
+                found.append(f"a master that is fenced: {step}")
+            case _:
+                pass
+    return found
+
+
+def _prepare_problems(script: Script) -> list[str]:
+    """Prepare acts on nothing but what it has made before."""
+    new: set[str] = set()
+    found = []
+    for step in flat(script.prepare):
+        match step:
+            case Spawn(replica):
+                new.add(replica)
+            case Stage(node, bricks):
+                new |= {node, *(b.name for b in bricks)}
+            case Bind(brick, _, target) if {brick, target} & new or {_head(brick), _head(target)} <= new:
+                pass
+            case _ if not {_head(name) for name in names(step)} <= new:
+                found.append(f"prepare touches what already serves: {step}")
+            case _:
+                pass
+    return found
+
+
+def _head(name: str) -> str:
+    """The replica of a brick, or the name of a node itself."""
+    return name.partition("/")[0]
+
+
 # -- what a script may do -------------------------------------------------------------------------
 
 
 def _forms(graph: Graph, script: Script) -> list[str]:
-    """What `problems` leaves to the runtime that carries the script out."""
+    """Verbs that the runtime cannot carry out on `graph`."""
     verbs = list(flat((*script.prepare, *script.commit, *script.finish)))
     staged = [v.node for v in verbs if isinstance(v, Stage)]
     replaced = {v.node for v in verbs if isinstance(v, Exchange | Destroy)}
@@ -113,11 +204,11 @@ def _forms(graph: Graph, script: Script) -> list[str]:
     found += [
         f"unbinds what is new: {v.brick}.{v.port}" for v in verbs if isinstance(v, Unbind) and v.brick in new
     ]
-    standby = {_key(k) for k in graph.links if k.standby}
+    standby = {k.key for k in graph.links if k.standby}
     found += [
-        f"an adaptation does not change the leader: {_words(v.link)} is on standby"
+        f"an adaptation does not change the leader: {link_words(v.link)} is on standby"
         for v in flat(script.commit)
-        if isinstance(v, Bind) and _key(v.link) in standby
+        if isinstance(v, Bind) and v.link.key in standby
     ]
     if script.recipe == RECIPES[0]:
         paper = [v for v in verbs if isinstance(v, Freeze | Thaw)]
@@ -132,14 +223,6 @@ def _staged_bricks(script: Script) -> set[str]:
     return {b.name for v in staged if isinstance(v, Stage) for b in v.bricks}
 
 
-def _key(link: Link) -> tuple[str, str, str, str]:
-    return link.source, link.source_port, link.sink, link.sink_port
-
-
-def _words(link: Link) -> str:
-    return f"{link.source}.{link.source_port} {ARROW} {link.sink}.{link.sink_port}"
-
-
 # -- where it leads -------------------------------------------------------------------------------
 
 
@@ -148,13 +231,14 @@ def _led_to(graph: Graph, script: Script) -> list[str]:
     new = after(graph, script, KINDS)
     found = new.problems(KINDS)
     found += [
-        f"prepared, and not bound in commit: {_words(k)}"
+        f"prepared, and not bound in commit: {link_words(k)}"
         for k in new.links
         if k.standby and "proxy" not in (k.source, k.sink)
     ]
     found += [
         f"{k.source}.{k.source_port} does not carry what {k.sink}.{k.sink_port} takes"
-        for k in _mismatched(new)
+        for k in new.links
+        if (k.source_port, k.sink_port) not in _linked_ports()
     ]
     found += _loops(new)
     if NONE in (graph.ftm, script.ftm):
@@ -162,13 +246,9 @@ def _led_to(graph: Graph, script: Script) -> list[str]:
     return found + _masters(graph, new)
 
 
-def _mismatched(graph: Graph) -> list[Link]:
-    """Links between ports that no mechanism links."""
-    return [k for k in graph.links if (k.source_port, k.sink_port) not in _linked_ports()]
-
-
 @cache
 def _linked_ports() -> frozenset[tuple[str, str]]:
+    """Pairs of ports that some mechanism links."""
     graphs = [build(e, PLACEMENTS[0]) for e in EXPRESSIONS if e != NONE]
     return frozenset((k.source_port, k.sink_port) for g in graphs for k in g.links)
 
@@ -235,9 +315,11 @@ def _flow(graph: Graph, script: Script) -> list[str]:
                 resumed.add(brick)
             case Transfer() | Align() | Bind() | Unbind() | Migrate() | Exchange():
                 if not suspended:
-                    found.append(f"changed while {leads} lets requests in: {words(verb)}")
+                    found.append(f"changed while {leads} lets requests in: {step_words(verb)}")
                 if undrained and backups & {name.partition("/")[0] for name in names(verb)}:
-                    found.append(f"changed before {', '.join(sorted(undrained))} is drained: {words(verb)}")
+                    found.append(
+                        f"changed before {', '.join(sorted(undrained))} is drained: {step_words(verb)}"
+                    )
             case _:
                 pass
     held = [v for v in flat(script.prepare) if isinstance(v, Stage) and v.held]
@@ -247,15 +329,13 @@ def _flow(graph: Graph, script: Script) -> list[str]:
 
 
 def _loose_ends(graph: Graph, script: Script) -> list[str]:
-    """Ends at bricks that stay, whose channel goes: their bricks have to hear of it."""
+    """Ends at bricks that stay, whose channel goes and is not unbound."""
     new = after(graph, script, KINDS)
     stay = {b.name for b in new.bricks} & {b.name for b in graph.bricks} - _staged_bricks(script)
-    kept = {end for k in new.links if not k.standby for end in ends(k)}
-    told = {(v.brick, v.port) for v in flat(script.commit) if isinstance(v, Unbind)}
-    gone = [
-        end for k in graph.links if not k.standby for end in ends(k) if end[0] in stay and end not in kept
-    ]
-    return [f"leads nowhere, and is not unbound: {b}.{p}" for b, p, _ in gone if (b, p) not in told]
+    kept = {end for k in new.links if not k.standby for end in k.ends}
+    unbound = {(v.brick, v.port) for v in flat(script.commit) if isinstance(v, Unbind)}
+    gone = [end for k in graph.links if not k.standby for end in k.ends if end[0] in stay and end not in kept]
+    return [f"leads nowhere, and is not unbound: {b}.{p}" for b, p, _ in gone if (b, p) not in unbound]
 
 
 def _states(graph: Graph, script: Script) -> list[str]:
@@ -285,16 +365,10 @@ def _placed(script: Script, rule: Rule) -> list[str]:
         left = [reason for reason in reasons if reason not in places]
         if not left:
             break
-        before = rule(_beginning(script, count))
+        rest, beginning = count, dict[str, tuple[Step, ...]]()
+        for phase, verbs in phases(script).items():
+            beginning[phase] = verbs[:rest]
+            rest -= len(beginning[phase])
+        before = rule(msgspec.structs.replace(script, **beginning))
         places |= {reason: f"{steps[count][0]}: " for reason in left if reason not in before}
     return [places.get(reason, "") + reason for reason in reasons]
-
-
-def _beginning(script: Script, count: int) -> Script:
-    """`script` with its first `count` steps."""
-    rest, kept = count, []
-    for verbs in phases(script).values():
-        kept.append(verbs[:rest])
-        rest -= len(kept[-1])
-    prepare, commit, finish = kept
-    return msgspec.structs.replace(script, prepare=prepare, commit=commit, finish=finish)

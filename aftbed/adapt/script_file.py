@@ -19,42 +19,28 @@ both names may have dots, and the longest end that is the name of a port is the 
 its kind, or, where its class or its function was written off line, with `{kind, source, application}`.
 
 `script_from` and `mapping` are inverse to each other. The verbs of Recovery (fence, promote, ...) have no
-place in an adaptation, so they have none here. What a script would do to a graph is not judged here: see
-`scriptcheck`.
+place in an adaptation, so they have none here. Whether the script suits a graph is for `script_check`.
 """
 
 from collections.abc import Callable, Iterable
-from typing import Annotated, Final, Literal
+from typing import Annotated, Final, Literal, cast, get_args
 
 import msgspec
 from msgspec import Meta
 
 from aftbed.core.errors import ConfigError, ScriptError, unknown
-from aftbed.core.graph import BrickSpec
+from aftbed.core.graph import BrickSpec, Link
 from aftbed.core.script import (
     RECIPES,
     Align,
-    Attach,
     Bind,
-    Destroy,
-    Drain,
-    Exchange,
-    Fence,
-    Freeze,
-    Kill,
-    Migrate,
-    Promote,
-    Resume,
-    Retire,
     Script,
-    Spawn,
     Stage,
     Step,
-    Suspend,
-    Thaw,
     Together,
     Transfer,
     Unbind,
+    names,
 )
 from aftbed.ftm.compose import parse
 from aftbed.ftm.registry import KINDS
@@ -62,20 +48,9 @@ from aftbed.ftm.registry import KINDS
 ARROW: Final = "->"
 PORTS: Final = tuple(dict.fromkeys(p for kind in KINDS.values() for p in (*kind.inputs, *kind.outputs)))
 RECOVERY: Final = ("spawn", "fence", "kill", "promote", "attach")
-
-_ON_ONE: Final[dict[str, Callable[[str], Step]]] = {
-    "suspend": Suspend,
-    "drain": Drain,
-    "resume": Resume,
-    "migrate": Migrate,
-    "exchange": Exchange,
-    "retire": Retire,
-    "freeze": Freeze,
-    "thaw": Thaw,
-    "destroy": Destroy,
+VERBS: Final[dict[str, type[Step]]] = {
+    step.__name__.lower(): step for step in get_args(Step) if step.__name__.lower() not in RECOVERY
 }
-_ON_TWO: Final[dict[str, Callable[[str, str], Step]]] = {"transfer": Transfer, "align": Align}
-VERBS: Final = ("stage", "bind", "unbind", *_ON_TWO, *_ON_ONE, "together")
 
 StepEntry = dict[str, object]  # one verb, and what it acts on
 
@@ -91,14 +66,6 @@ class ScriptFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     recipe: Literal["drained", "paper"] = "drained"
 
 
-class BrickFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A brick whose class or function was written off line."""
-
-    kind: str
-    source: str = ""
-    application: str = ""
-
-
 # -- from a script to a file ----------------------------------------------------------------------
 
 
@@ -109,9 +76,9 @@ def mapping(script: Script) -> dict[str, object]:
         found["ftm"] = script.ftm
     if script.recipe != RECIPES[0]:
         found["recipe"] = script.recipe
-    for name, verbs in phases(script).items():
-        if verbs or name == "commit":
-            found[name] = [step(verb) for verb in verbs]
+    for phase, steps in phases(script).items():
+        if steps or phase == "commit":
+            found[phase] = [entry(step) for step in steps]
     return found
 
 
@@ -120,44 +87,42 @@ def phases(script: Script) -> dict[str, tuple[Step, ...]]:
     return {"prepare": script.prepare, "commit": script.commit, "finish": script.finish}
 
 
-def step(verb: Step) -> StepEntry:
-    """One verb as a step of a file."""
-    name = type(verb).__name__.lower()
-    match verb:
-        case Stage():
-            return {name: _stage(verb)}
-        case Bind(brick, port, target):
-            return {name: f"{brick}.{port} {ARROW} {target}.{verb.target_port or port}"}
+def entry(step: Step) -> StepEntry:
+    """One step as a file holds it."""
+    verb = type(step).__name__.lower()
+    assert verb in VERBS, f"{verb} has no place in an adaptation"
+    value: object
+    match step:
+        case Stage(node, bricks, held):
+            kinds = {b.name: _brick(b) for b in bricks}
+            value = {"node": node, "bricks": kinds, **({"held": True} if held else {})}
+        case Bind():
+            value = link_words(step.link)
         case Unbind(brick, port):
-            return {name: f"{brick}.{port}"}
-        case Transfer(source, sink) | Align(source, sink):
-            return {name: f"{source} {ARROW} {sink}"}
-        case Together(verbs):
-            return {name: [step(inner) for inner in verbs]}
-        case Suspend(one) | Drain(one) | Resume(one) | Freeze(one) | Thaw(one):
-            return {name: one}
-        case Migrate(one) | Exchange(one) | Retire(one) | Destroy(one):
-            return {name: one}
-        case Spawn() | Fence() | Kill() | Promote() | Attach():
-            raise AssertionError(f"{name} has no place in an adaptation")
+            value = f"{brick}.{port}"
+        case Together(steps):
+            value = [entry(inner) for inner in steps]
+        case _:
+            value = f" {ARROW} ".join(names(step))
+    return {verb: value}
 
 
-def words(verb: Step) -> str:
-    """One verb in a line, as `suspend a/protocol`."""
-    ((name, value),) = step(verb).items()
-    return f"{name} {value}"
+def step_words(step: Step) -> str:
+    """One step in a line, as `suspend a/protocol`."""
+    ((verb, value),) = entry(step).items()
+    return f"{verb} {value}"
 
 
-def _stage(verb: Stage) -> StepEntry:
-    found: StepEntry = {"node": verb.node, "bricks": {b.name: _brick(b) for b in verb.bricks}}
-    return found | {"held": True} if verb.held else found
+def link_words(link: Link) -> str:
+    """As behind `bind`."""
+    return f"{link.source}.{link.source_port} {ARROW} {link.sink}.{link.sink_port}"
 
 
 def _brick(spec: BrickSpec) -> str | dict[str, str]:
-    if not spec.source and not spec.application:
-        return spec.kind
     given = {"kind": spec.kind, "source": spec.source, "application": spec.application}
-    return {key: value for key, value in given.items() if value}
+    return (
+        {key: text for key, text in given.items() if text} if spec.source or spec.application else spec.kind
+    )
 
 
 # -- from a file to a script ----------------------------------------------------------------------
@@ -165,16 +130,16 @@ def _brick(spec: BrickSpec) -> str | dict[str, str]:
 
 def script_from(file: ScriptFile, where: str) -> Script:
     """The script in `file`; `where` names the file. Raises ScriptError with all that is wrong in it."""
-    found: list[str] = []
+    problems: list[str] = []
     if file.ftm:
         try:
             parse(file.ftm)
         except ConfigError as error:
-            found.append(f"ftm: {error}")
-    prepare = _steps(file.prepare, "prepare", found)
-    commit = _steps(file.commit, "commit", found)
-    finish = _steps(file.finish, "finish", found)
-    refuse(where, found)
+            problems.append(f"ftm: {error}")
+    prepare = _steps(file.prepare, "prepare", problems)
+    commit = _steps(file.commit, "commit", problems)
+    finish = _steps(file.finish, "finish", problems)
+    refuse(where, problems)
     return Script(file.purpose, "", prepare, commit, finish, file.ftm, file.recipe)
 
 
@@ -186,65 +151,64 @@ def refuse(where: str, problems: list[str]) -> None:
         raise ScriptError("\n  ".join((f"{where}: {len(problems)} problems:", *problems)))
 
 
-def _steps(steps: Iterable[object], where: str, found: list[str]) -> tuple[Step, ...]:
-    verbs = []
-    for index, entry in enumerate(steps):
+def _steps(entries: Iterable[object], where: str, problems: list[str]) -> tuple[Step, ...]:
+    """Adds what is wrong to `problems`."""
+    found = []
+    for index, one in enumerate(entries):
         try:
-            verbs.append(_verb(entry, f"{where}[{index}]", found))
+            found.append(_step(one, f"{where}[{index}]", problems))
         except ConfigError as error:
-            found.append(str(error))
-    return tuple(verbs)
+            problems.append(str(error))
+    return tuple(found)
 
 
-def _verb(entry: object, where: str, found: list[str]) -> Step:
-    """The verb of one step. What is wrong inside of `together` is added to `found`."""
-    if not isinstance(entry, dict) or len(entry) != 1:
-        raise ConfigError(f"{where}: found {entry!r}, allowed is one verb with what it acts on")
-    ((verb, value),) = entry.items()
+def _step(found: object, where: str, problems: list[str]) -> Step:
+    if not isinstance(found, dict) or len(found) != 1:
+        raise ConfigError(f"{where}: found {found!r}, allowed is one verb with what it acts on")
+    ((verb, value),) = found.items()
     if verb in RECOVERY:
         raise ConfigError(f"{where}: {verb} is Recovery's; an adaptation has {', '.join(VERBS)}")
     if verb not in VERBS:
         raise ConfigError(f"{where}: {unknown('verb', str(verb), VERBS)}")
-    here = f"{where}.{verb}"
-    match verb:
-        case "stage":
-            return _stage_from(value, here)
-        case "together":
-            return Together(_steps(_list(value, here), here, found))
-        case "bind":
-            source, sink = _pair(value, here, "BRICK.PORT")
-            (brick, port), (target, target_port) = _end(source, here), _end(sink, here)
-            return Bind(brick, port, target, "" if port == target_port else target_port)
-        case "unbind":
-            return Unbind(*_end(_text(value, here, "BRICK.PORT"), here))
-        case _ if verb in _ON_TWO:
-            return _ON_TWO[verb](*_pair(value, here, "BRICK"))
-        case _:
-            return _ON_ONE[verb](_text(value, here, "the name of a brick or a node"))
+    kind, where = VERBS[verb], f"{where}.{verb}"
+    if kind is Stage:
+        return _stage(value, where)
+    if kind is Together:
+        if not isinstance(value, list) or not value:
+            raise ConfigError(f"{where}: found {value!r}, allowed is a list of steps")
+        return Together(_steps(value, where, problems))
+    if kind is Bind:
+        ends = _pair(value, where, "BRICK.PORT")
+        (brick, port), (target, target_port) = (_end(text, where) for text in ends)
+        return Bind(brick, port, target, "" if port == target_port else target_port)
+    if kind is Unbind:
+        return Unbind(*_end(_text(value, where, "BRICK.PORT"), where))
+    if kind is Transfer or kind is Align:
+        return kind(*_pair(value, where, "BRICK"))
+    return cast("Callable[[str], Step]", kind)(_text(value, where, "the name of a brick or a node"))
 
 
-def _stage_from(value: object, where: str) -> Stage:
+def _stage(value: object, where: str) -> Stage:
     given = _keys(value, where, ("node", "bricks", "held"), needed=("node", "bricks"))
-    node = _text(given["node"], f"{where}.node", "the name of a node")
-    held = given.get("held", False)
+    node, bricks, held = given["node"], given["bricks"], given.get("held", False)
+    node = _text(node, f"{where}.node", "the name of a node")
     if not isinstance(held, bool):
         raise ConfigError(f"{where}.held: found {held!r}, allowed is true or false")
-    bricks = given["bricks"]
     if not isinstance(bricks, dict) or not bricks:
         raise ConfigError(f"{where}.bricks: found {bricks!r}, allowed is BRICK: KIND, once or more")
-    return Stage(node, tuple(_brick_from(str(b), v, f"{where}.bricks.{b}") for b, v in bricks.items()), held)
+    specs = [_brick_spec(str(name), one, f"{where}.bricks.{name}") for name, one in bricks.items()]
+    return Stage(node, tuple(specs), held)
 
 
-def _brick_from(name: str, value: object, where: str) -> BrickSpec:
+def _brick_spec(name: str, value: object, where: str) -> BrickSpec:
     if isinstance(value, dict):
-        given = _keys(value, where, BrickFile.__struct_fields__, needed=("kind",))
+        given = _keys(value, where, ("kind", "source", "application"), needed=("kind",))
         texts = {key: _text(one, f"{where}.{key}", "a text") for key, one in given.items()}
-        file = BrickFile(**texts)
     else:
-        file = BrickFile(_text(value, where, "a kind of brick"))
-    if file.kind not in KINDS:
-        raise ConfigError(f"{where}: {unknown('kind of brick', file.kind, KINDS)}")
-    return BrickSpec(name, file.kind, file.source, file.application)
+        texts = {"kind": _text(value, where, "a kind of brick")}
+    if texts["kind"] not in KINDS:
+        raise ConfigError(f"{where}: {unknown('kind of brick', texts['kind'], KINDS)}")
+    return BrickSpec(name, **texts)
 
 
 def _keys(value: object, where: str, allowed: tuple[str, ...], needed: tuple[str, ...]) -> StepEntry:
@@ -256,12 +220,6 @@ def _keys(value: object, where: str, allowed: tuple[str, ...], needed: tuple[str
     for key in needed:
         if key not in value:
             raise ConfigError(f"{where}: key {key!r} is missing")
-    return value
-
-
-def _list(value: object, where: str) -> list[object]:
-    if not isinstance(value, list) or not value:
-        raise ConfigError(f"{where}: found {value!r}, allowed is a list of steps")
     return value
 
 

@@ -19,7 +19,7 @@ from aftbed.adapt.commands import Wish, goal_of
 from aftbed.adapt.planner import APPLICATION, Plan, target
 from aftbed.adapt.planner import plan as plan_between
 from aftbed.adapt.plugins import load_application
-from aftbed.adapt.script_file import ScriptFile, mapping, phases, script_from, step
+from aftbed.adapt.script_file import ScriptFile, entry, mapping, phases, script_from
 from aftbed.adapt.suitability import remarks, unsuitable
 from aftbed.cli.options import Json, Recipe, Run, takes
 from aftbed.cli.views import EndedAdaptation, history_lines
@@ -329,7 +329,7 @@ def _step_lines(verb: Step, indent: str) -> Iterator[str]:
         for inner in verb.steps:
             yield from _step_lines(inner, indent + "  ")
         return
-    ((name, value),) = step(verb).items()
+    ((name, value),) = entry(verb).items()
     if isinstance(verb, Stage):
         kinds = ", ".join(f"{b.name} ({b.source or b.application or b.kind})" for b in verb.bricks)
         value = (f"{verb.node}: " if (verb.node,) != tuple(b.name for b in verb.bricks) else "") + kinds
@@ -338,7 +338,7 @@ def _step_lines(verb: Step, indent: str) -> Iterator[str]:
 
 
 def yaml_lines(script: dict[str, object]) -> Iterator[str]:
-    """A script (`scriptfile.mapping`) as a YAML file: a line for each key and each step."""
+    """A script (`script_file.mapping`) as a YAML file: a line for each key and each step."""
     for key, value in script.items():
         if isinstance(value, list):
             yield f"{key}:" if value else f"{key}: []"

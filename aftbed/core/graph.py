@@ -12,6 +12,8 @@ from typing import Final
 import msgspec
 
 PLACEMENTS: Final = ("process", "replica", "single")
+End = tuple[str, str, str]  # brick, port, side: one port name may be both an input and an output
+LinkKey = tuple[str, str, str, str]
 STAGED: Final = "'"  # behind the name of a process that is to become that node, or was it before
 
 
@@ -62,10 +64,15 @@ class Link(msgspec.Struct, frozen=True):
         """As in the paper: the port at its source."""
         return self.source_port
 
+    @property
+    def key(self) -> LinkKey:
+        """What it links, on standby or not."""
+        return self.source, self.source_port, self.sink, self.sink_port
 
-def ends(link: Link) -> tuple[tuple[str, str, str], tuple[str, str, str]]:
-    """Both ends of `link` as (brick, port, side): one port name may be both an input and an output."""
-    return (link.source, link.source_port, "out"), (link.sink, link.sink_port, "in")
+    @property
+    def ends(self) -> tuple[End, End]:
+        """Both ends, the source first."""
+        return (self.source, self.source_port, "out"), (self.sink, self.sink_port, "in")
 
 
 class Graph(msgspec.Struct, frozen=True):
@@ -129,8 +136,8 @@ class Graph(msgspec.Struct, frozen=True):
         return found
 
     def _binding_problems(self, ports: dict[str, Kind]) -> list[str]:
-        bound = Counter(end for k in self.links if not k.standby for end in ends(k))
-        standby = {end for k in self.links if k.standby for end in ends(k)}
+        bound = Counter(end for k in self.links if not k.standby for end in k.ends)
+        standby = {end for k in self.links if k.standby for end in k.ends}
         found = [f"{b}:{p} is bound {n} times" for (b, p, _), n in bound.items() if n > 1]
         for name, kind in ports.items():
             wanted = [(name, port, "out") for port in kind.outputs]

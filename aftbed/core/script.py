@@ -14,7 +14,7 @@ from typing import Final
 
 import msgspec
 
-from aftbed.core.graph import BrickSpec, Graph, Kind, Link, ends
+from aftbed.core.graph import BrickSpec, End, Graph, Kind, Link, LinkKey
 
 
 class ScriptStep(msgspec.Struct, frozen=True, tag=True):
@@ -219,87 +219,6 @@ def flat(steps: Iterable[Step]) -> Iterator[Step]:
             yield step
 
 
-def problems(script: Script) -> list[str]:
-    """Every reason to refuse `script` by itself, or []. What it makes of a graph is judged by `after`."""
-    found = _prepare_problems(script) + _suspension_problems(script) + _mastership_problems(script)
-    if len(script.prepare) + len(script.commit) + len(script.finish) > STEPS_MAX:
-        found.append(f"more than {STEPS_MAX} steps")
-    wrong = [s for s in flat(script.finish) if not isinstance(s, Retire)]
-    return found + [f"finish only retires: {step}" for step in wrong]
-
-
-def _suspension_problems(script: Script) -> list[str]:
-    """What is suspended is resumed, and nothing is changed while requests flow."""
-    staged = {s.node for s in flat(script.prepare) if isinstance(s, Stage)}
-    waiting = {b.name for s in flat(script.prepare) if isinstance(s, Stage) and s.held for b in s.bricks}
-    held: set[str] = set()
-    found: list[str] = []
-    for step in flat(script.commit):
-        match step:
-            case Suspend(brick) | Drain(brick) | Freeze(brick):
-                held.add(brick)
-            case Resume(brick) | Thaw(brick) if brick in held:
-                held.remove(brick)
-            case Resume(brick) | Thaw(brick) if brick not in waiting:
-                found.append(f"resumed, not suspended: {brick}")
-            case Transfer() | Align() | Bind() | Migrate() | Exchange() if not held:
-                found.append(f"changed while requests flow: {step}")
-            case Exchange(node) | Migrate(node) if node not in staged:
-                found.append(f"nothing is staged to take the place of {node}")
-            case Destroy(node) if script.recipe == RECIPES[0]:
-                found.append(f"killed with a request inside: {node}")
-            case Spawn(node) | Stage(node) if script.recipe == RECIPES[0]:
-                found.append(f"spawned while the client waits: {node}")
-            case _:
-                pass
-    exchanged = {s.node for s in flat(script.commit) if isinstance(s, Exchange)}
-    ended = {s.node for s in flat(script.finish) if isinstance(s, Retire)} - exchanged
-    left = sorted(brick for brick in held if brick not in ended and _head(brick) not in ended)
-    return found + [f"suspended, not resumed: {brick}" for brick in left]
-
-
-def _mastership_problems(script: Script) -> list[str]:
-    """The old master is fenced before there is a new one, and before it is killed."""
-    fenced: set[str] = set()
-    found = []
-    for step in flat(script.commit):
-        match step:
-            case Fence(replica):
-                fenced.add(replica)
-            case Kill(replica) if replica not in fenced:
-                found.append(f"killed before it was fenced: {replica}")
-            case Promote(replica) | Attach(replica) if not fenced - {replica}:
-                found.append(f"a new master while the old one is not fenced: {step}")
-            case Promote(replica) | Attach(replica) if replica in fenced:
-                found.append(f"a master that is fenced: {step}")
-            case _:
-                pass
-    return found
-
-
-def _prepare_problems(script: Script) -> list[str]:
-    """Prepare acts on nothing but what it has made before."""
-    new: set[str] = set()
-    found = []
-    for step in flat(script.prepare):
-        match step:
-            case Spawn(replica):
-                new.add(replica)
-            case Stage(node, bricks):
-                new |= {node, *(b.name for b in bricks)}
-            case Bind(brick, _, target) if {brick, target} & new or {_head(brick), _head(target)} <= new:
-                pass
-            case _ if not {_head(name) for name in names(step)} <= new:
-                found.append(f"prepare touches what already serves: {step}")
-            case _:
-                pass
-    return found
-
-
-def _head(name: str) -> str:
-    return name.partition("/")[0]
-
-
 def names(step: Step) -> tuple[str, ...]:
     """The replicas, nodes and bricks that `step` acts on."""
     match step:
@@ -318,9 +237,6 @@ def names(step: Step) -> tuple[str, ...]:
 
 
 # -- against a graph ------------------------------------------------------------------------------
-
-End = tuple[str, str, str]  # brick, port, side: one port name may be both an input and an output
-LinkKey = tuple[str, str, str, str]
 
 
 class Layout(msgspec.Struct, frozen=True):
@@ -371,10 +287,10 @@ class _Fold:
         self._made: set[LinkKey] = set()  # links that these steps have made: no later one takes their ends
         self.bricks = {b.name: b for b in layout.graph.bricks}
         self.nodes = dict(layout.graph.nodes)
-        self.links = {_key(k): k for k in layout.graph.links}
+        self.links = {k.key: k for k in layout.graph.links}
         self.staged, self.replaced = dict(layout.staged), dict(layout.replaced)
         self.added, self.suspended = set(layout.added), set(layout.suspended)
-        self.prepared = {_key(k): k for k in layout.prepared}
+        self.prepared = {k.key: k for k in layout.prepared}
 
     def layout(self) -> Layout:
         graph = msgspec.structs.replace(
@@ -432,7 +348,7 @@ class _Fold:
         return {b.name for bricks in self.staged.values() for b in bricks}
 
     def _bind(self, link: Link) -> None:
-        key, bricks, staged = _key(link), {link.source, link.sink}, self._staged_bricks()
+        key, bricks, staged = link.key, {link.source, link.sink}, self._staged_bricks()
         new = staged | {b for node in self.added for b in self.nodes[node]}
         waits = not self._committing and not bricks <= new
         if waits or bricks & staged:
@@ -444,15 +360,15 @@ class _Fold:
 
     def _put_in_force(self, link: Link) -> None:
         if not link.standby:
-            self._free(set(ends(link)))
-        self.links[_key(link)] = link
-        self._made.add(_key(link))
+            self._free(set(link.ends))
+        self.links[link.key] = link
+        self._made.add(link.key)
 
     def _free(self, freed: set[End]) -> None:
         self.links = {
             key: k
             for key, k in self.links.items()
-            if k.standby or key in self._made or freed.isdisjoint(ends(k))
+            if k.standby or key in self._made or freed.isdisjoint(k.ends)
         }
 
     def _end(self, brick: str, port: str) -> End:
@@ -502,10 +418,6 @@ class _Fold:
 
 def _apart_from(bricks: set[str], links: dict[LinkKey, Link]) -> dict[LinkKey, Link]:
     return {key: k for key, k in links.items() if bricks.isdisjoint((k.source, k.sink))}
-
-
-def _key(link: Link) -> LinkKey:
-    return link.source, link.source_port, link.sink, link.sink_port
 
 
 # -- the way back ---------------------------------------------------------------------------------
@@ -567,14 +479,14 @@ def _links_back(graph: Graph, reached: Layout) -> list[Step]:
     """What leads from the links of `reached` to those of `graph`, and each node to its place."""
     returning = {name for node in reached.replaced for name in graph.nodes[node]}
     stay = {b.name for b in graph.bricks} & {b.name for b in reached.graph.bricks} - returning
-    there, wanted = ({_key(k): k for k in links} for links in (reached.graph.links, graph.links))
-    taken = {end for k in graph.links if not k.standby for end in ends(k)}
+    there, wanted = ({k.key: k for k in links} for links in (reached.graph.links, graph.links))
+    taken = {end for k in graph.links if not k.standby for end in k.ends}
     binds = [
         Bind(k.source, k.source_port, k.sink, k.sink_port, k.standby)
         for key, k in wanted.items()
         if returning & {k.source, k.sink} or (key not in there and not k.standby)
     ]
-    loose = [end for key, k in there.items() if key not in wanted and not k.standby for end in ends(k)]
+    loose = [end for key, k in there.items() if key not in wanted and not k.standby for end in k.ends]
     unbinds = [
         Unbind(brick, port)
         for brick, port, side in loose

@@ -12,8 +12,8 @@ from functools import cached_property
 from typing import Final
 
 from aftbed.core.errors import StepFailed
-from aftbed.core.graph import Graph, Link
-from aftbed.core.script import Bind, End, Exchange, Step, Unbind
+from aftbed.core.graph import End, Graph, Link
+from aftbed.core.script import Bind, Exchange, Step, Unbind
 from aftbed.ftm.registry import KINDS
 from aftbed.runtime import control
 from aftbed.runtime.deployment import Deployment, Keys, replica_of

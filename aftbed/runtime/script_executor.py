@@ -14,6 +14,7 @@ from hashlib import blake2b
 from typing import Final, assert_never
 
 from aftbed.adapt.planner import drains
+from aftbed.adapt.script_check import problems
 from aftbed.core import messages
 from aftbed.core.errors import StepFailed
 from aftbed.core.events import Event
@@ -45,7 +46,6 @@ from aftbed.core.script import (
     Unbind,
     flat,
     inverse,
-    problems,
     reversible,
 )
 from aftbed.ftm.compose import REPLICAS, STATEFUL, replication_of

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from plans import CASES, RUNNABLE, Case
 
 from aftbed.adapt.planner import APPLICATION, drains, leader_of, plan, target, updated
+from aftbed.adapt.script_check import problems
 from aftbed.core.errors import ConfigError
 from aftbed.core.graph import PLACEMENTS, Graph
 from aftbed.core.script import (
@@ -31,7 +32,6 @@ from aftbed.core.script import (
     Transfer,
     after,
     flat,
-    problems,
 )
 from aftbed.ftm.compose import NONE, REPLICAS, STATEFUL, build, chain, replication_of
 from aftbed.ftm.registry import KINDS

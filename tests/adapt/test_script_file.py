@@ -174,7 +174,7 @@ def test_what_is_of_recovery_cannot_be_written(verb: Step) -> None:
         ("{drane: a/x}", "commit[0]: unknown verb 'drane'; did you mean 'drain'?"),
         ("{Suspend: a/x}", "did you mean 'suspend'?"),
         ("{7: a/x}", "commit[0]: unknown verb '7'"),
-        ("{kill: a}", "commit[0]: kill is Recovery's; an adaptation has stage, bind"),
+        ("{kill: a}", "commit[0]: kill is Recovery's; an adaptation has suspend, drain"),
         ("{promote: b}", "commit[0]: promote is Recovery's"),
         ("{suspend: }", "commit[0].suspend: found None, allowed is the name of a brick or a node"),
         ("{suspend: [a/x]}", "commit[0].suspend: found ['a/x'], allowed is the name"),

@@ -12,7 +12,7 @@ from counting import Counting
 from aftbed.core.brick import Brick
 from aftbed.core.errors import ConfigError
 from aftbed.core.events import REQUEST_PATH
-from aftbed.core.graph import PLACEMENTS, BrickSpec, Graph, Kind, Link, ends
+from aftbed.core.graph import PLACEMENTS, BrickSpec, Graph, Kind, Link
 from aftbed.ftm.compose import EXPRESSIONS, build, chain, parse, replication_of
 from aftbed.ftm.registry import EMITTERS, KINDS, MECHANISMS, Setting, make
 
@@ -141,7 +141,7 @@ def test_a_graph_uses_every_port_of_its_bricks_that_its_mechanism_has(expression
     """Unbound are only ports of a Server that nobody captures, and of an alarm that nobody gives."""
     graph = build(expression, "process", leader)
     assert graph.problems(KINDS) == []
-    bound = {end for link in graph.links for end in ends(link)}
+    bound = {end for link in graph.links for end in link.ends}
     names = parse(expression)
     unbound = {
         (b.part, port)

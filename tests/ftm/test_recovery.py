@@ -6,6 +6,7 @@ import msgspec
 import pytest
 from samples import notes
 
+from aftbed.adapt.script_check import problems
 from aftbed.core.brick import CONTROL, Effect, Order
 from aftbed.core.events import Event
 from aftbed.core.messages import Rebound, Situation, Suspect
@@ -21,7 +22,6 @@ from aftbed.core.script import (
     Suspend,
     Transfer,
     Unbind,
-    problems,
 )
 from aftbed.ftm.failover import FAILURES_MAX, RETRY_NS, Recovery, decide, drop_backup, failover, new_backup
 

@@ -3,6 +3,7 @@
 import msgspec
 import pytest
 
+from aftbed.adapt.script_check import problems
 from aftbed.core.script import (
     STEPS_MAX,
     Attach,
@@ -17,7 +18,6 @@ from aftbed.core.script import (
     Suspend,
     Transfer,
     Unbind,
-    problems,
 )
 
 
