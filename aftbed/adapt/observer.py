@@ -1,20 +1,20 @@
-"""The closed loop: told what is observed, it says when which mechanism should run. Pure.
+"""The closed loop: proposes, from what is observed of a run, which mechanism should run. Pure.
 
-**Deciding.** Rules are asked from the top. One is silent while a rule above it holds that wants something
-else; of the others, the first that would change what runs is proposed. What counts is what holds now, not
-what was proposed before: an adaptation that was rolled back is proposed again, one that a person did not want
-(`Declined`) not before its condition has ended.
+**Deciding.** Rules are read from the top. A rule is passed over while a rule above it holds that wants
+something else; of the others, the first that would change what runs is proposed. What counts is what holds
+now, not what was proposed before: an adaptation that was rolled back is proposed again, one that the user
+declined (`Declined`) not before its condition has ended.
 
 **Dwell.** After a proposal, and after any change of what runs, nothing is proposed for `dwell_s`. A burst of
-events in that time is not forgotten, because it holds for longer.
+events in that time still counts afterwards, because it holds for longer.
 
-The caller observes, asks, adapts, and tells what runs then (`Running`). Measured from `Proposal.since_ns` to
-that, it has the time from the change to consistency.
+The caller observes, asks the user, adapts, and reports what runs then (`Running`). From `Proposal.since_ns`
+to that report is the time from the change to consistency.
 """
 
 from collections import deque
 from collections.abc import Iterator
-from typing import Final, Protocol
+from typing import Final
 
 import msgspec
 
@@ -25,7 +25,7 @@ VOTE_MASKED: Final = 3  # detail of `vote.compared`: it took a third trial, so o
 
 
 def symptoms(event: Event, detail: int) -> tuple[Symptom, ...]:
-    """What a recorded event is a symptom of. A crash or a hang is told by the cause of a Watchdog's alarm.
+    """What a recorded event is a symptom of. Crashes and hangs are reported by a Watchdog, with their cause.
 
     A value fault shows as a divergence, as a detected stop (no majority, an assertion that failed), or as a
     vote that masked it. Under PBR alone it does not show at all.
@@ -48,19 +48,19 @@ class Seen(msgspec.Struct, frozen=True):
 
 
 class Measured(msgspec.Struct, frozen=True):
-    """The resources as they are now. To be told regularly; what is left out is not known."""
+    """The resources as they are now, measured regularly; what is left out is not known."""
 
     values: dict[Resource, float]
 
 
 class Running(msgspec.Struct, frozen=True):
-    """From now on this runs, whoever wanted it."""
+    """From now on this expression runs."""
 
     expression: str
 
 
 class Declined(msgspec.Struct, frozen=True):
-    """The last proposal was not wanted."""
+    """The user did not want the last proposal."""
 
 
 Observation = Seen | Measured | Running | Declined
@@ -79,22 +79,19 @@ class Proposal(msgspec.Struct, frozen=True):
 
 
 class Observer:
-    """Told what is observed, it says what should be done. See the module's theory.
-
-    `deadline_ns` and `wake` are as in the brick contract: what is due without an observation.
-    """
+    """`deadline_ns` and `wake` are as in the brick contract: what is due without an observation."""
 
     def __init__(self, policy: Policy, running: str, now_ns: int) -> None:
         self.running = running
         self._policy = policy
-        self._watches: tuple[Watch, ...] = tuple(_watch(rule.when, now_ns) for rule in policy.rules)
+        self._watches = tuple(_watch(rule.when, now_ns) for rule in policy.rules)
         self._rest_until_ns = now_ns
         self._now_ns = now_ns
         self._last: Proposal | None = None
         self._declined: dict[str, int] = {}  # by rule: since when the condition holds that was declined
 
     def step(self, observation: Observation, now_ns: int) -> Proposal | None:
-        """Take one observation; what it leads to, if anything. One that comes late counts as of now."""
+        """The proposal that `observation` leads to, if any. A late observation counts as of now."""
         now_ns = max(now_ns, self._now_ns)
         match observation:
             case Running():
@@ -110,7 +107,6 @@ class Observer:
         return self.wake(now_ns)
 
     def wake(self, now_ns: int) -> Proposal | None:
-        """What is to be proposed now, if anything."""
         now_ns = max(now_ns, self._now_ns)
         self._now_ns = now_ns
         if now_ns < self._rest_until_ns:
@@ -133,7 +129,7 @@ class Observer:
         return min([t_ns for t_ns in due if t_ns is not None], default=None)
 
     def _deciding(self, now_ns: int) -> Iterator[tuple[Rule, int]]:
-        """The rules that hold, and since when, less those against which one above them holds."""
+        """The rules that hold, and since when, without those that a rule above them conflicts with."""
         held: list[Rule] = []
         for rule, watch in zip(self._policy.rules, self._watches, strict=True):
             if watch.holds(now_ns):
@@ -142,22 +138,10 @@ class Observer:
                 held.append(rule)
 
 
-class Watch(Protocol):
-    """Follows one condition. `since_ns` means something while it holds."""
-
-    since_ns: int
-
-    def see(self, observation: Seen | Measured, now_ns: int) -> None:
-        """Take an observation."""
-        ...
-
-    def holds(self, now_ns: int) -> bool:
-        """Whether the condition holds now."""
-        ...
-
-    def deadline_ns(self, now_ns: int) -> int | None:
-        """When it will change by itself, if it will; later than `now_ns`."""
-        ...
+# -- watches: each follows one condition ----------------------------------------------------------
+#
+# `see` takes an observation; `holds` is whether the condition holds now, which it does since `since_ns`;
+# `deadline_ns` is when that will change without an observation, if it will.
 
 
 class BurstWatch:
@@ -170,7 +154,6 @@ class BurstWatch:
         self._held = False
 
     def see(self, observation: Seen | Measured, now_ns: int) -> None:
-        """Count an event; it may complete a burst."""
         if not isinstance(observation, Seen) or observation.event != self._when.event:
             return
         held = self.holds(now_ns)
@@ -180,13 +163,11 @@ class BurstWatch:
             self._held, self.since_ns = True, self._seen_ns[0]
 
     def holds(self, now_ns: int) -> bool:
-        """From a burst on, until the event has stayed away."""
         if self._held and now_ns - self._seen_ns[-1] > self._when.hold_ns:
             self._held = False
         return self._held
 
     def deadline_ns(self, now_ns: int) -> int | None:
-        """Its end."""
         return self._seen_ns[-1] + self._when.hold_ns + 1 if self.holds(now_ns) else None
 
 
@@ -198,21 +179,18 @@ class QuietWatch:
         self._when = when
 
     def see(self, observation: Seen | Measured, now_ns: int) -> None:
-        """An event ends the quiet."""
         if isinstance(observation, Seen) and observation.event == self._when.event:
             self.since_ns = now_ns
 
     def holds(self, now_ns: int) -> bool:
-        """Long enough without an event."""
         return now_ns - self.since_ns > self._when.quiet_ns
 
     def deadline_ns(self, now_ns: int) -> int | None:
-        """Its beginning."""
         return None if self.holds(now_ns) else self.since_ns + self._when.quiet_ns + 1
 
 
 class BeyondWatch:
-    """Judges samples; what was between two of them is taken to be like both."""
+    """Between two samples the resource is taken to be as in both. Only samples change what holds."""
 
     def __init__(self, when: Beyond, now_ns: int) -> None:
         self.since_ns = now_ns
@@ -221,7 +199,7 @@ class BeyondWatch:
         self._held = False
 
     def see(self, observation: Seen | Measured, now_ns: int) -> None:
-        """Judge a sample. One that is not known is beyond nothing."""
+        """A resource that is not known is beyond nothing."""
         if not isinstance(observation, Measured):
             return
         value = observation.values.get(self._when.resource)
@@ -236,15 +214,13 @@ class BeyondWatch:
             self._held = now_ns - self.since_ns >= self._when.for_ns
 
     def holds(self, now_ns: int) -> bool:
-        """As of the last sample."""
         return self._held
 
     def deadline_ns(self, now_ns: int) -> int | None:
-        """Only samples change it."""
         return None
 
 
-def _watch(when: Condition, now_ns: int) -> Watch:
+def _watch(when: Condition, now_ns: int) -> BurstWatch | QuietWatch | BeyondWatch:
     match when:
         case Burst():
             return BurstWatch(when, now_ns)

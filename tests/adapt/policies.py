@@ -39,16 +39,13 @@ def beyonds(draw: st.DrawFn) -> Beyond:
 
 
 def beyond_oracle(when: Beyond, samples: list[tuple[int, float]]) -> list[bool]:
-    """After each sample, whether the condition holds; by looking at all samples so far."""
-    found = []
-    for index in range(len(samples)):
-        held = False
-        for t_ns, value in samples[: index + 1]:
-            run = 0
-            past = [s for s in samples[: index + 1] if s[0] <= t_ns]
-            while run < len(past) and when.begins(past[-1 - run][1]):
-                run += 1
-            begun = run > 0 and t_ns - past[-run][0] >= when.for_ns
-            held = not when.ends(value) if held else begun
+    """After each sample, whether the condition holds; samples of one instant count in their order."""
+    found, held = list[bool](), False
+    for count, (t_ns, value) in enumerate(samples, 1):
+        run = 0
+        while run < count and when.begins(samples[count - 1 - run][1]):
+            run += 1
+        begun = run > 0 and t_ns - samples[count - run][0] >= when.for_ns
+        held = not when.ends(value) if held else begun
         found.append(held)
     return found

@@ -146,6 +146,14 @@ def test_what_was_not_measured_is_beyond_nothing() -> None:
     assert loop.step(load(0.9), 2 * S) is None
 
 
+def test_a_load_that_has_begun_ends_at_its_until_also_within_one_instant() -> None:
+    loop = observer((Beyond("cpu_load", True, 0.8, 0.5, 0), TO_LFR))
+    assert loop.step(Running("lfr"), 0) is None
+    assert [loop.step(load(v), 0) for v in (0.9, 0.6)] == [None, None]
+    assert loop.step(Running("pbr"), 1 * S) is None, "it dwells"
+    assert loop.wake(6 * S) is not None, "0.6 is not back at 0.5"
+
+
 def test_an_observation_that_comes_late_counts_as_of_now() -> None:
     loop = observer((TWO_FAULTS, COMPOSE))
     loop.step(FAULT, 20 * S)
