@@ -9,7 +9,7 @@ import msgspec
 from aftbed.core.events import Event
 from aftbed.core.journal import DROPPED_OFFSET, EntryKind
 from aftbed.ftm.compose import build
-from aftbed.inject.bit_patterns import Bit, flipped
+from aftbed.inject.bit_patterns import Bit, with_flipped
 from aftbed.inject.crash import Crash
 from aftbed.inject.model import Fault
 from aftbed.inject.timing import Trigger
@@ -74,7 +74,7 @@ class RecordInTheMaking:
         self.note("proxy.1", Event.REPLY_ACCEPTED, self.sent, epoch << 8 | replica)
         reply = self._bare.execute(payload)
         if flipped_bit is not None:
-            reply = flipped(reply, flipped_bit)
+            reply = with_flipped(reply, [flipped_bit])
         for _ in range(answers):
             self._dialogue.write(self.t_ns, self.sent, epoch, EntryKind.ANSWERED, reply)
 

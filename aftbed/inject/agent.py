@@ -13,16 +13,20 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
+import msgspec
 from msgspec import structs
 
+from aftbed.core.application import fields_of
 from aftbed.core.brick import Brick, Effect, Note
+from aftbed.core.errors import PeerError
 from aftbed.core.events import Event, event_named
 from aftbed.core.messages import AnyMessage, Message
-from aftbed.inject.channel import ALTERED, ChannelFault, ChannelFilter, FilterStage
+from aftbed.ftm.server import Server
+from aftbed.inject.channel import ALTERED, ChannelFault, ChannelFilter, FilterStage, RecordStrike
 from aftbed.inject.kind import Alteration
 from aftbed.inject.model import ArmedFault
 from aftbed.inject.receipts import record_detail
-from aftbed.inject.shared_state import is_shared, share
+from aftbed.inject.shared_state import SHARED_BYTES, SharedFunction, StateLayout
 from aftbed.inject.slow import WHOLE_CPU
 from aftbed.inject.timing import gap
 
@@ -41,7 +45,7 @@ class AgentHost(Protocol):
         ...
 
     def report_fired(self, fault: int) -> None:
-        """Tell the supervisor that `fault` is due, or has struck."""
+        """Report to the supervisor that `fault` is due, or has struck."""
         ...
 
     def wait_until_applied(self, fault: int) -> None:
@@ -49,11 +53,11 @@ class AgentHost(Protocol):
         ...
 
     def kill(self) -> None:
-        """End this node with SIGKILL, here and now."""
+        """End this node with SIGKILL, at once."""
         ...
 
     def stop_detected(self, brick: str, reason: str) -> None:
-        """A detected stop: end this node here and now."""
+        """A detected stop: end this node at once."""
         ...
 
 
@@ -79,10 +83,9 @@ class FaultAgent:
     # -- orders of the supervisor ------------------------------------------------------------------
 
     def arm(self, event: str, faults: Sequence[ArmedFault]) -> None:
-        """Wait for `event`. Faults that already wait for it go on counting; one that is given again begins
-        anew.
+        """Wait for `event`; with `nth` 0, wait no longer.
 
-        `nth` 0: wait no longer.
+        Faults that already wait for it go on counting; one that is given again begins anew.
         """
         self._arm(event_named(event), faults)
 
@@ -92,12 +95,26 @@ class FaultAgent:
         assert isinstance(action, ChannelFault), action
         key = (fault.brick, action.channel)
         if fault.nth:
-            record = _StrikeRecorder(self._host, fault.fault)
-            stage = FilterStage(action, fault.nth, fault.persistence, fault.draw, record)
+            stage = FilterStage(
+                action, fault.nth, fault.persistence, fault.draw, self._strike_recorder(fault.fault)
+            )
             self.filters.setdefault(key, ChannelFilter()).add(fault.fault, stage)
         elif key in self.filters:
             self.filters[key].stop(fault.fault)
         self.settle()
+
+    def _strike_recorder(self, fault: int) -> RecordStrike:
+        """Records what a fault of a channel did; reports once that it fired."""
+        reported = False
+
+        def record(what: int, about: int) -> None:
+            nonlocal reported
+            self._host.record(Event.FAULT_APPLIED, about, record_detail(fault, what))
+            if what == ALTERED and not reported:
+                reported = True
+                self._host.report_fired(fault)
+
+        return record
 
     def slow_down(self, fault: int, by_ns: int, share_of_cpu: float) -> None:
         """Have each step take longer; by nothing, with the whole CPU: no longer."""
@@ -106,12 +123,36 @@ class FaultAgent:
             self._slow[fault] = _SlowDown(by_ns, share_of_cpu)
         self._update()
 
-    def share_state(self, brick: str, number: int, memory: memoryview) -> bytes:
-        """Have the function of the Server `brick` keep its state in `memory`. Raises PeerError."""
-        answer = share(self._host, brick, number, memory)
-        self._shares_state = self._shares_state or is_shared(self._host.brick(brick))
+    def share_state(self, name: str, number: int, memory: memoryview) -> bytes:
+        """Have the function of the Server `name` keep its state in `memory`; the answer is its StateLayout.
+
+        `number` is in the records of what is found changed. Raises PeerError where there is no function, or
+        the fields are not in the state.
+        """
+        server = self._host.brick(name)
+        if not isinstance(server, Server):
+            raise PeerError(f"{name} has no function")
+        fields = fields_of(server.application)
+        if fields and not isinstance(server.application, SharedFunction):  # else a repeated order
+            size_bytes = len(server.application.capture())
+            last_bytes = max(field.offset_bytes + field.size_bits // 8 for field in fields)
+            if not last_bytes <= size_bytes <= SHARED_BYTES:
+                raise PeerError(f"a state of {size_bytes} bytes with fields up to byte {last_bytes}")
+            server.application = SharedFunction(
+                server.application, memory, lambda bits, refusal: self._changed(name, number, bits, refusal)
+            )
+        self._shares_state = self._shares_state or bool(fields)
         self._update()  # what the supervisor changes is recorded within a step: not on the fast path
-        return answer
+        return msgspec.msgpack.encode(StateLayout(fields))
+
+    def _changed(self, name: str, number: int, bits: list[int], refusal: PeerError | None) -> None:
+        """The function of `name` has found these bits of its state changed."""
+        event = Event.FAULT_APPLIED if refusal is None else Event.PEER_REFUSED
+        for bit in bits:
+            self._host.record(event, 0, record_detail(number, bit))
+        if refusal is not None:
+            self._host.record(Event.DETECTED_STOP, 0, 0)
+            self._host.stop_detected(name, f"the state in memory is refused: {refusal}")
 
     def settle(self) -> None:
         """Drop the filters that do nothing any more."""
@@ -162,8 +203,7 @@ class FaultAgent:
     # -- at a Note --------------------------------------------------------------------------------
 
     def noted(self, name: str, brick: Brick, effects: list[Effect], at: int) -> None:
-        """The record of the Note `effects[at]` of `name` is written: what waits for it and is due happens
-        now.
+        """Strike what waits for the Note `effects[at]` of `name`, whose record is written, and is due.
 
         A value is altered in what is sent behind the Note, so effects behind `at` may be replaced.
         """
@@ -222,19 +262,6 @@ class FaultAgent:
             self._felt.add(fault)
             self._host.record(Event.FAULT_APPLIED, 0, record_detail(fault))
         return slow
-
-
-class _StrikeRecorder:
-    """Records what a fault of a channel did; reports once that it fired."""
-
-    def __init__(self, host: AgentHost, fault: int) -> None:
-        self._host, self._fault, self._reported = host, fault, False
-
-    def __call__(self, what: int, about: int) -> None:
-        self._host.record(Event.FAULT_APPLIED, about, record_detail(self._fault, what))
-        if what == ALTERED and not self._reported:
-            self._reported = True
-            self._host.report_fired(self._fault)
 
 
 def _next_strike(fault: ArmedFault) -> ArmedFault:

@@ -171,8 +171,3 @@ def drawn(draw: int, index: int) -> int:
     mixed = (mixed ^ mixed >> 30) * 0xBF58476D1CE4E5B9 % WORD
     mixed = (mixed ^ mixed >> 27) * 0x94D049BB133111EB % WORD
     return mixed ^ mixed >> 31
-
-
-def flipped(data: bytes, bit: int) -> bytes:
-    """`data` with this bit inverted; `data` has it."""
-    return with_flipped(data, [bit])

@@ -21,8 +21,7 @@ not exist is the user's error and costs the run nothing. What a fault does to th
 
 import re
 from collections import deque
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, ClassVar, Final
 
 import msgspec
@@ -32,8 +31,8 @@ from aftbed.core.graph import Graph
 from aftbed.core.units import duration, milliseconds, number
 from aftbed.inject import timing
 from aftbed.inject.grammar import NUMBER, whole
-from aftbed.inject.kind import AnyFault, FaultKind, Injection, ReadFault, RunControl, Steps
-from aftbed.inject.receipts import Receipt, ReceiptState
+from aftbed.inject.kind import AnyFault, FaultKind, Injection, RunControl, Steps
+from aftbed.inject.receipts import Receipt
 from aftbed.inject.timing import ONCE, Chance, Every, Lasting, Permanent, Transient, Trigger
 from aftbed.vehicle.can.bus_model import NODES
 from aftbed.vehicle.condition import Condition
@@ -42,7 +41,6 @@ if TYPE_CHECKING:
     from aftbed.vehicle.can.dbc_file import Codec
 
 BUS: Final = "bus"  # the target of a fault of the bus
-SECOND_US: Final = 1_000_000
 FRAME_BITS: Final = 64
 CRC_BITS: Final = 8  # of E2E profile 11: the first byte
 NTH_MAX: Final = 999_999_999
@@ -56,126 +54,120 @@ _NAME: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,127}")
 _NODE: Final = re.compile(r"[a-z_][a-z0-9_]{0,31}")
 
 
-# -- what is done, to frames ----------------------------------------------------------------------
+# -- what is done ---------------------------------------------------------------------------------
 
 
-class Omission(msgspec.Struct, frozen=True, tag=True):
-    """The frame does not come."""
+class BusEffect(msgspec.Struct, frozen=True, tag=True):
+    """Base of what a fault does to frames or nodes. As text: the words behind the frames."""
 
-    VERB: ClassVar = "omission"
+    VERB: ClassVar = ""
 
     def __str__(self) -> str:
         return ""
 
 
-class Delay(msgspec.Struct, frozen=True, tag=True):
+class Omission(BusEffect, frozen=True):
+    """The frame does not come."""
+
+    VERB = "omission"
+
+
+class Delay(BusEffect, frozen=True):
     """The frame comes later."""
 
     by_us: int
 
-    VERB: ClassVar = "delay"
+    VERB = "delay"
 
     def __str__(self) -> str:
         return f"by {duration(self.by_us / 1000)}"
 
 
-class Duplicate(msgspec.Struct, frozen=True, tag=True):
+class Duplicate(BusEffect, frozen=True):
     """The frame comes twice."""
 
-    VERB: ClassVar = "duplicate"
-
-    def __str__(self) -> str:
-        return ""
+    VERB = "duplicate"
 
 
-class Reorder(msgspec.Struct, frozen=True, tag=True):
+class Reorder(BusEffect, frozen=True):
     """The frame comes after the next one of those that the fault is aimed at."""
 
-    VERB: ClassVar = "reorder"
-
-    def __str__(self) -> str:
-        return ""
+    VERB = "reorder"
 
 
-class FlipBit(msgspec.Struct, frozen=True, tag=True):
+class FlipBit(BusEffect, frozen=True):
     """Bit `bit`, counted from bit 0 of byte 0, is inverted; `crc_good`: the CRC is made to fit."""
 
     bit: int
     crc_good: bool = False
 
-    VERB: ClassVar = "corrupt"
+    VERB = "corrupt"
 
     def __str__(self) -> str:
         return f"bit {self.bit}{' crc good' if self.crc_good else ''}"
 
 
-class SetSignal(msgspec.Struct, frozen=True, tag=True):
+class SetSignal(BusEffect, frozen=True):
     """The signal has that value, in the units of the DBC; `crc_good`: the CRC is made to fit."""
 
     signal: str
     value: float
     crc_good: bool = False
 
-    VERB: ClassVar = "corrupt"
+    VERB = "corrupt"
 
     def __str__(self) -> str:
         return f"signal {self.signal}={number(self.value)}{' crc good' if self.crc_good else ''}"
 
 
-class Masquerade(msgspec.Struct, frozen=True, tag=True):
+class Masquerade(BusEffect, frozen=True):
     """The CRC is right for the data id of another message."""
 
     message: str
 
-    VERB: ClassVar = "masquerade"
+    VERB = "masquerade"
 
     def __str__(self) -> str:
         return f"as {self.message}"
 
 
-class StuckCounter(msgspec.Struct, frozen=True, tag=True):
+class StuckCounter(BusEffect, frozen=True):
     """The counter stays as in the frame before; the CRC fits."""
 
-    VERB: ClassVar = "stuck-counter"
-
-    def __str__(self) -> str:
-        return ""
+    VERB = "stuck-counter"
 
 
-# -- what is done, to nodes -----------------------------------------------------------------------
-
-
-class Babble(msgspec.Struct, frozen=True, tag=True):
-    """The node sends the highest priority without a pause: no other frame gets through, and none of its
-    own.
+class Babble(BusEffect, frozen=True):
+    """The node sends the highest priority without a pause: no other frame gets through, none of its own
+    either.
     """
 
     node: str
 
-    VERB: ClassVar = "babbling"
+    VERB = "babbling"
 
     def __str__(self) -> str:
         return self.node
 
 
-class BusOff(msgspec.Struct, frozen=True, tag=True):
+class BusOff(BusEffect, frozen=True):
     """Nothing of the node reaches the bus, and nothing of the bus the node."""
 
     node: str
 
-    VERB: ClassVar = "bus-off"
+    VERB = "bus-off"
 
     def __str__(self) -> str:
         return self.node
 
 
-class Partition(msgspec.Struct, frozen=True, tag=True):
-    """The bus is cut: neither side hears the other. A node on neither side hears both."""
+class Partition(BusEffect, frozen=True):
+    """The bus is cut: neither side receives the other. A node on neither side receives both."""
 
     side: tuple[str, ...]
     other: tuple[str, ...]
 
-    VERB: ClassVar = "partition"
+    VERB = "partition"
 
     def __str__(self) -> str:
         return f"{','.join(self.side)}|{','.join(self.other)}"
@@ -187,7 +179,7 @@ BusAct = FrameAct | NodeAct
 NODE_ACTS: Final = (Babble, BusOff, Partition)
 BusPersistence = Transient | Lasting | Chance | Every | Permanent
 
-_PLAIN: Final[dict[str, BusAct]] = {
+_WITHOUT_WORDS: Final[dict[str, BusAct]] = {
     act.VERB: act for act in (Omission(), Duplicate(), Reorder(), StuckCounter())
 }
 ON_FRAMES: Final = ("omission", "delay", "duplicate", "reorder", "corrupt", "masquerade", "stuck-counter")
@@ -270,17 +262,14 @@ class BusFault(FaultKind, frozen=True, tag="bus"):
 
     @classmethod
     def claims(cls, words: Sequence[str]) -> bool:
-        """Channels have omissions, delays, ... as well."""
         return bool(words) and (words[0] in ONLY_ON_BUS or BUS in words[1:2])
 
     @classmethod
-    def read(cls, words: Sequence[str]) -> ReadFault:
-        """See the top of this file."""
-        return ReadFault(read_bus_fault(" ".join(words)), BUS)
+    def read(cls, words: Sequence[str]) -> AnyFault:
+        return AnyFault(read_bus_fault(" ".join(words)), BUS)
 
     @property
     def name(self) -> str:
-        """One for each act; `corrupt` for two."""
         return self.effect.VERB
 
     def subject(self, target: str) -> list[str]:
@@ -294,7 +283,6 @@ class BusFault(FaultKind, frozen=True, tag="bus"):
     # -- checks
 
     def validate(self, fault: AnyFault) -> None:
-        """It has its own target and its own opening."""
         if (fault.trigger, fault.target) != (Trigger(), BUS):
             raise ValueError("a fault of the bus has its own words for when")
         super().validate(fault)
@@ -311,7 +299,14 @@ class BusFault(FaultKind, frozen=True, tag="bus"):
         """
         if self.opening.when is not None and not car:
             raise ConfigError(f"{self}: 'when' looks at the car, and a replay has none")
-        for node in _nodes(self.effect):
+        match self.effect:
+            case Babble(node) | BusOff(node):
+                named: tuple[str, ...] = (node,)
+            case Partition(side, other):
+                named = (*side, *other)
+            case _:
+                named = ()
+        for node in named:
             if node not in nodes:
                 raise unknown("node of the bus", node, nodes)
         found = _messages(self.frames, codecs) if self.frames is not None else []
@@ -321,11 +316,9 @@ class BusFault(FaultKind, frozen=True, tag="bus"):
     # -- in the run
 
     def act(self, injection: Injection, run: RunControl) -> Steps[None]:
-        """The bus does it; it has its own conditions and times."""
         yield from run.disturb_bus(injection)
 
     def receipt(self, injection: Injection, run: RunControl) -> Receipt:
-        """As the bus has reported."""
         report = run.bus_report(injection)
         if report is None:
             return injection.receipt
@@ -333,75 +326,20 @@ class BusFault(FaultKind, frozen=True, tag="bus"):
         return report.receipt
 
 
-class BusReport(msgspec.Struct, frozen=True):
-    """What has become of a fault: how many frames it struck, the first of them, which node noticed it and
-    how.
-
-    `believed`: a node that took in a struck frame without an objection. `error` is of the injector itself.
-    """
-
-    number: int
-    frames: int = 0
-    first_us: int = 0
-    first_id: int = 0
-    noticed: str = ""
-    believed: str = ""
-    began: bool = False  # an act on nodes took hold, whatever frames there were
-    error: str = ""
-    waits: bool = False  # for its condition, which has not held yet
-
-    @property
-    def receipt(self) -> Receipt:
-        """A fault that has not struck yet is armed."""
-        return Receipt(self._state(), self._detail())
-
-    def _state(self) -> ReceiptState:
-        if self.error:
-            return ReceiptState.INJECT_ERROR
-        if not self.frames and not self.began:
-            return ReceiptState.ARMED
-        return ReceiptState.ACTIVATED if self.noticed or self.believed else ReceiptState.APPLIED
-
-    def _detail(self) -> str:
-        if self.error:
-            return self.error
-        if not self.frames:
-            return "took hold, of no frame" if self.began else ""
-        many = f"{self.frames} frame{'s' if self.frames > 1 else ''}"
-        first = f"{'the first ' if self.frames > 1 else ''}at {self.first_us / SECOND_US:.6f} s"
-        known = f"noticed by {self.noticed}" if self.noticed else "noticed by nobody"
-        if self.believed and not self.noticed:
-            known = f"believed by {self.believed}"
-        return f"{many}, {first}, id {self.first_id:03X}; {known}"
-
-
 # -- names ----------------------------------------------------------------------------------------
 
 
-def _nodes(act: BusAct) -> tuple[str, ...]:
-    match act:
-        case Babble(node) | BusOff(node):
-            return (node,)
-        case Partition(side, other):
-            return (*side, *other)
-        case _:
-            return ()
-
-
 def _messages(frames: Frames, codecs: "Sequence[Codec]") -> "list[tuple[Codec, str]]":
+    """The messages that `frames` means, each with the codec that has it."""
     if frames.message:
-        return [(_codec_of(frames.message, codecs), frames.message)]
+        found = [(codec, frames.message) for codec in codecs if frames.message in codec.names()][:1]
+        if not found:
+            raise unknown("message", frames.message, {name for codec in codecs for name in codec.names()})
+        return found
     found = [(codec, name) for codec in codecs for name in codec.sent_by(frames.sender)]
     if not found:
         raise unknown("sender of frames", frames.sender, {s for codec in codecs for s in codec.senders()})
     return found
-
-
-def _codec_of(message: str, codecs: "Sequence[Codec]") -> "Codec":
-    for codec in codecs:
-        if message in codec.names():
-            return codec
-    raise unknown("message", message, {name for codec in codecs for name in codec.names()})
 
 
 def _target(act: BusAct, codec: "Codec", name: str) -> TargetFrame:
@@ -438,132 +376,115 @@ def read_bus_fault(text: str) -> BusFault:
     Raises ConfigError naming the word that is wrong.
     """
     words = _WordReader(text)
-    verb = words.next("a fault of the bus")
-    if verb in ON_NODES:
-        act, frames, permanent = _node_act(verb, words), None, True
-    elif verb in ON_FRAMES:
-        frames = _frames(words)
-        act, permanent = _frame_act(verb, words), False
-    else:
-        raise unknown("fault of the bus", verb, BusFault.NAMES)
-    opening, persistence = _opening_and_persistence(words, on_nodes=permanent)
+    try:
+        verb = words.next("a fault of the bus")
+        if verb not in BusFault.NAMES:
+            raise unknown("fault of the bus", verb, BusFault.NAMES)
+        on_nodes = verb in ON_NODES
+        frames = None if on_nodes else words.frames()
+        act = _act(verb, words)
+        opening, persistence = _opening_and_persistence(words, on_nodes=on_nodes)
+    except ConfigError as error:
+        raise ConfigError(f"fault {text[:200]!r}: {error}; allowed is: {GRAMMAR}") from None
     return BusFault(act, frames, opening, persistence)
 
 
 class _WordReader:
-    """Takes the words of the text one by one."""
+    """Takes the words of the text one by one. All raise ConfigError on a word that is missing or wrong."""
 
     def __init__(self, text: str) -> None:
-        self.text, self._left = text, deque(text.split())
+        self.left = deque(text.split())
 
     def next(self, what: str) -> str:
         """The next word, which is `what`."""
-        if not self._left:
-            raise self.wrong(f"{what} is missing")
-        return self._left.popleft()
+        if not self.left:
+            raise ConfigError(f"{what} is missing")
+        return self.left.popleft()
 
     def take(self, word: str) -> bool:
-        """Take `word` if it is the next one."""
-        if self._left and self._left[0] == word:
-            self._left.popleft()
+        """Whether the next word is `word`; then it is taken."""
+        if self.left and self.left[0] == word:
+            self.left.popleft()
             return True
         return False
 
     def demand(self, word: str) -> None:
-        """The next word has to be `word`."""
         found = self.next(repr(word))
         if found != word:
-            raise self.wrong(f"found {found[:40]!r} where {word!r} is expected")
-
-    def more(self) -> bool:
-        """Whether words are left."""
-        return bool(self._left)
+            raise ConfigError(f"found {found[:40]!r} where {word!r} is expected")
 
     def whole(self, what: str, least: int, most: int) -> int:
-        """The next word, a whole number in its limits."""
-        found = self.next(f"the number of {what!r}")
-        with self.blaming():
-            return whole(what, found, least, most)
+        return whole(what, self.next(f"the number of {what!r}"), least, most)
 
     def duration_us(self) -> int:
-        """The next word, a time."""
         found = self.next("a duration")
         value = round(milliseconds("duration", found) * 1000)
         if value == 0:
-            raise self.wrong(f"duration {found[:40]!r}: a microsecond is the least")
+            raise ConfigError(f"duration {found[:40]!r}: a microsecond is the least")
         return value
 
     def message(self) -> str:
-        """The next word, the name of a message."""
-        found = self.next("the name of a message")
-        if not _NAME.fullmatch(found):
-            raise self.wrong(f"{found[:40]!r} is no name of a message")
-        return found
+        return self._name(_NAME, "message", self.next("the name of a message"))
 
     def node(self) -> str:
-        """The next word, the name of a node."""
-        found = self.next("the name of a node").lower()
-        if not _NODE.fullmatch(found):
-            raise self.wrong(f"{found[:40]!r} is no name of a node")
+        return self._name(_NODE, "node", self.next("the name of a node").lower())
+
+    @staticmethod
+    def _name(pattern: re.Pattern[str], of: str, found: str) -> str:
+        if not pattern.fullmatch(found):
+            raise ConfigError(f"{found[:40]!r} is no name of a {of}")
         return found
 
-    @contextmanager
-    def blaming(self) -> Iterator[None]:
-        """Add the text and the grammar to an error."""
-        try:
-            yield
-        except ConfigError as error:
-            raise self.wrong(str(error)) from None
+    def frames(self) -> Frames:
+        self.demand("bus")
+        return Frames(sender=self.node()) if self.take("from") else Frames(message=self.message())
 
-    def wrong(self, why: str) -> ConfigError:
-        """The error, with what is allowed."""
-        return ConfigError(f"fault {self.text[:200]!r}: {why}; allowed is: {GRAMMAR}")
+    def crc_good(self) -> bool:
+        if not self.take("crc"):
+            return False
+        self.demand("good")
+        return True
 
 
-def _frames(words: _WordReader) -> Frames:
-    words.demand("bus")
-    return Frames(sender=words.node()) if words.take("from") else Frames(message=words.message())
-
-
-def _frame_act(verb: str, words: _WordReader) -> BusAct:
-    if verb == Delay.VERB:
-        words.demand("by")
-        return Delay(words.duration_us())
-    if verb == Masquerade.VERB:
-        words.demand("as")
-        return Masquerade(words.message())
-    return _corruption(words) if verb == FlipBit.VERB else _PLAIN[verb]
+def _act(verb: str, words: _WordReader) -> BusAct:
+    """What `verb` does, with the words behind the frames."""
+    match verb:
+        case Delay.VERB:
+            words.demand("by")
+            return Delay(words.duration_us())
+        case FlipBit.VERB:
+            return _corruption(words)
+        case Masquerade.VERB:
+            words.demand("as")
+            return Masquerade(words.message())
+        case Babble.VERB:
+            return Babble(words.node())
+        case BusOff.VERB:
+            return BusOff(words.node())
+        case Partition.VERB:
+            return _partition(words.next("NODE,...|NODE,..."))
+        case _:
+            return _WITHOUT_WORDS[verb]
 
 
 def _corruption(words: _WordReader) -> BusAct:
     what = words.next("'bit K' or 'signal NAME=VALUE'")
     if what == "bit":
-        bit = words.whole("bit", 0, FRAME_BITS - 1)
-        return FlipBit(bit, _crc_good(words))
+        return FlipBit(words.whole("bit", 0, FRAME_BITS - 1), words.crc_good())
     if what == "signal":
         text = words.next("NAME=VALUE")
         name, _, value = text.partition("=")
         if not _NAME.fullmatch(name) or not NUMBER.fullmatch(value):
-            raise words.wrong(f"signal {text[:40]!r}: NAME=VALUE is allowed, with up to six decimals")
-        return SetSignal(name, float(value), _crc_good(words))
-    raise words.wrong(f"found {what[:40]!r} where 'bit' or 'signal' is expected")
+            raise ConfigError(f"signal {text[:40]!r}: NAME=VALUE is allowed, with up to six decimals")
+        return SetSignal(name, float(value), words.crc_good())
+    raise ConfigError(f"found {what[:40]!r} where 'bit' or 'signal' is expected")
 
 
-def _crc_good(words: _WordReader) -> bool:
-    if not words.take("crc"):
-        return False
-    words.demand("good")
-    return True
-
-
-def _node_act(verb: str, words: _WordReader) -> BusAct:
-    if verb != Partition.VERB:
-        return Babble(words.node()) if verb == Babble.VERB else BusOff(words.node())
-    text = words.next("NODE,...|NODE,...")
+def _partition(text: str) -> Partition:
     sides = [side.split(",") for side in text.split("|")]
     nodes = [node for side in sides for node in side]
     if len(sides) != 2 or not all(map(_NODE.fullmatch, nodes)) or len(set(nodes)) != len(nodes):
-        raise words.wrong(
+        raise ConfigError(
             f"partition {text[:80]!r}: two sides, and each node once, is allowed: radar|brake,gateway"
         )
     return Partition(tuple(sides[0]), tuple(sides[1]))
@@ -574,31 +495,29 @@ def _opening_and_persistence(words: _WordReader, *, on_nodes: bool) -> tuple[Ope
     after_us, when, nth = 0, None, 1
     persistence: BusPersistence = Permanent() if on_nodes else ONCE
     seen: set[str] = set()
-    while words.more():
-        word = words.next("")
+    while words.left:
+        word = words.left.popleft()
         kind = "opening" if word in ("after", "when") else "nth" if word == "nth" else "persistence"
         if kind in seen:
-            raise words.wrong(f"{word!r} says again what has been said")
+            raise ConfigError(f"{word!r} says again what has been said")
         seen.add(kind)
         match word:
             case "after":
                 after_us = words.duration_us()
             case "when":
-                found = [words.next(what) for what in ("ttc, gap or speed", "'<' or '>'", "a value")]
-                with words.blaming():
-                    when = timing.condition(*found)
+                when = timing.condition(
+                    *(words.next(what) for what in ("ttc, gap or speed", "'<' or '>'", "a value"))
+                )
             case "nth" if not on_nodes:
                 nth = words.whole("nth", 1, NTH_MAX)
             case "for":
                 persistence = Lasting(words.duration_us())
             case "intermittent" if not on_nodes:
-                which, value = words.next("'every' or 'p'"), words.next("a number")
-                with words.blaming():
-                    persistence = timing.intermittent(which, value)
+                persistence = timing.intermittent(words.next("'every' or 'p'"), words.next("a number"))
             case "permanent":
                 persistence = Permanent()
             case "nth" | "intermittent":
-                raise words.wrong(f"{word!r} is about frames; this fault takes hold of nodes, and lasts")
+                raise ConfigError(f"{word!r} is about frames; this fault takes hold of nodes, and lasts")
             case _:
-                raise words.wrong(f"unknown word {word[:40]!r}")
+                raise ConfigError(f"unknown word {word[:40]!r}")
     return Opening(after_us, when, nth), persistence

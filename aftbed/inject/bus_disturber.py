@@ -37,7 +37,6 @@ from aftbed.inject.bus import (
     Babble,
     BusFault,
     BusOff,
-    BusReport,
     Delay,
     Duplicate,
     FlipBit,
@@ -48,6 +47,7 @@ from aftbed.inject.bus import (
     SetSignal,
     StuckCounter,
 )
+from aftbed.inject.receipts import BusReport
 from aftbed.inject.timing import Chance, Every, Lasting, Permanent, Transient
 from aftbed.vehicle.can.bus_model import FALLBACK, CarriedFrame
 from aftbed.vehicle.can.frame import Frame

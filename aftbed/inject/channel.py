@@ -11,9 +11,9 @@ is kept except where it is the fault to break it, and nothing is held back for e
 """
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from enum import Enum
-from typing import ClassVar, Final, NamedTuple, assert_never
+from typing import ClassVar, Final, NamedTuple, Self, assert_never
 
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.graph import Graph
@@ -21,9 +21,9 @@ from aftbed.core.messages import Message
 from aftbed.core.units import DURATION_MS_MAX, duration, milliseconds
 from aftbed.inject import targets
 from aftbed.inject.grammar import REPEAT_KEYS, FaultWords
-from aftbed.inject.kind import AnyFault, FaultKind, Injection, ReadFault, RunControl
+from aftbed.inject.kind import AnyFault, FaultKind, Injection, RunControl
 from aftbed.inject.receipts import Receipt, ReceiptState, fault_and_bits, more_times
-from aftbed.inject.timing import Persistence, gap, read_persistence, read_trigger
+from aftbed.inject.timing import Persistence, gap
 
 HOLD_MS: Final = 20.0
 HELD: Final = 0  # the detail of a record: a message was held back
@@ -57,26 +57,18 @@ class ChannelFault(FaultKind, frozen=True, tag="disturb"):
     acts_in_node: ClassVar = True
 
     @classmethod
-    def read(cls, words: Sequence[str]) -> ReadFault:
-        """See the top of this file."""
-        found = FaultWords(words, cls.KEYS)
-        how = Disturbance(found.name)
-        if "by" in found and how not in HOLDING:
+    def from_words(cls, words: FaultWords) -> Self:
+        how = Disturbance(words.name)
+        if "by" in words and how not in HOLDING:
             later = " and a ".join(h.value for h in HOLDING)
-            raise ConfigError(f"'by {found['by']}': {how.value} holds nothing back; a {later} does")
-        found.not_both("nth", "after")
-        by_ms = milliseconds("delay", found["by"]) if "by" in found else HOLD_MS
-        action = cls(how, found.subject, by_ms)
-        target = found.get("in", targets.DEFAULT)
-        return ReadFault(action, target, read_trigger(found), read_persistence(found))
+            raise ConfigError(f"'by {words['by']}': {how.value} holds nothing back; a {later} does")
+        return cls(how, words.subject, milliseconds("delay", words["by"]) if "by" in words else HOLD_MS)
 
     @property
     def name(self) -> str:
-        """One for each disturbance."""
         return self.how.value
 
     def subject(self, target: str) -> list[str]:
-        """The channel, how long a message is held back, and in which replica."""
         return [self.channel, f"by {duration(self.by_ms)}" if self.how in HOLDING else "", "in", target]
 
     def validate(self, fault: AnyFault) -> None:
@@ -96,10 +88,6 @@ class ChannelFault(FaultKind, frozen=True, tag="disturb"):
             raise ConfigError(
                 f"{fault}: under --ftm {graph.ftm} {fault.target} sends nothing on {self.channel}"
             )
-
-    def waits(self, fault: AnyFault) -> bool:
-        """Always: for a message."""
-        return True
 
     def waits_in(self, fault: AnyFault, roles: targets.Roles) -> str | None:
         """The brick of the target that sends there."""

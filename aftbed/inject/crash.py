@@ -4,16 +4,14 @@ A node that emits the event and belongs to the target kills itself, so the point
 waits until the supervisor has seen the target dead.
 """
 
-from collections.abc import Sequence
-from typing import ClassVar
+from typing import ClassVar, Self
 
 from aftbed.core.errors import ConfigError
 from aftbed.core.graph import Graph
 from aftbed.inject import targets
 from aftbed.inject.grammar import WHEN_KEYS, FaultWords
-from aftbed.inject.kind import AnyFault, FaultKind, Injection, ReadFault, RunControl, Steps, strike
+from aftbed.inject.kind import AnyFault, FaultKind, Injection, RunControl, Steps, strike
 from aftbed.inject.receipts import Receipt, ReceiptState
-from aftbed.inject.timing import read_trigger
 
 
 class Crash(FaultKind, frozen=True, tag="crash"):
@@ -27,20 +25,15 @@ class Crash(FaultKind, frozen=True, tag="crash"):
     emitter_may_act: ClassVar = True
 
     @classmethod
-    def read(cls, words: Sequence[str]) -> ReadFault:
-        """See the top of this file."""
-        found = FaultWords(words, cls.KEYS)
-        if "for" in found:
-            raise ConfigError(f"'for {found['for']}': a crash has no duration; a hang and a slow have")
-        found.nth_needs_event()
-        return ReadFault(cls(), found.subject, read_trigger(found))
+    def from_words(cls, words: FaultWords) -> Self:
+        if "for" in words:
+            raise ConfigError(f"'for {words['for']}': a crash has no duration; a hang and a slow have")
+        return cls()
 
     def subject(self, target: str) -> list[str]:
-        """The target alone."""
         return [target]
 
     def check(self, fault: AnyFault, graph: Graph) -> None:
-        """Any process of the run can be killed."""
         targets.check_process(fault.target, fault.event, graph)
 
     def act(self, injection: Injection, run: RunControl) -> Steps[None]:

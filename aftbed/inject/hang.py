@@ -5,7 +5,6 @@ Without `for` the target stays stopped. The end of a stop is recorded in the run
 so the cleanup process thaws the target even if the supervisor has died (`runtime.unix.cleanup`).
 """
 
-from collections.abc import Sequence
 from typing import ClassVar, Final, Self
 
 from msgspec import structs
@@ -14,9 +13,8 @@ from aftbed.core.graph import Graph
 from aftbed.core.units import whole_milliseconds
 from aftbed.inject import targets
 from aftbed.inject.grammar import WHEN_KEYS, FaultWords
-from aftbed.inject.kind import AnyFault, FaultKind, Injection, ReadFault, RunControl, Steps, strike
+from aftbed.inject.kind import AnyFault, FaultKind, Injection, RunControl, Steps, strike
 from aftbed.inject.receipts import Receipt, ReceiptState
-from aftbed.inject.timing import read_trigger
 
 FOREVER_MS: Final = 0
 STOP_NS_MAX: Final = 500_000_000  # from the signal until the process is seen stopped
@@ -35,19 +33,13 @@ class Hang(FaultKind, frozen=True, tag="hang"):
     has_worst_instant: ClassVar = True
 
     @classmethod
-    def read(cls, words: Sequence[str]) -> ReadFault:
-        """See the top of this file."""
-        found = FaultWords(words, cls.KEYS)
-        found.nth_needs_event()
-        for_ms = whole_milliseconds("duration", found["for"]) if "for" in found else FOREVER_MS
-        return ReadFault(cls(for_ms), found.subject, read_trigger(found))
+    def from_words(cls, words: FaultWords) -> Self:
+        return cls(whole_milliseconds("duration", words["for"]) if "for" in words else FOREVER_MS)
 
     def subject(self, target: str) -> list[str]:
-        """The target, and for how long."""
         return [target, f"for {self.for_ms}ms" if self.for_ms else ""]
 
     def check(self, fault: AnyFault, graph: Graph) -> None:
-        """Any process of the run can be stopped."""
         targets.check_process(fault.target, fault.event, graph)
 
     @property
@@ -56,13 +48,10 @@ class Hang(FaultKind, frozen=True, tag="hang"):
         return self.for_ms
 
     def lasting(self, lasts_ms: int) -> Self:
-        """For so long."""
         return structs.replace(self, for_ms=lasts_ms)
 
     def act(self, injection: Injection, run: RunControl) -> Steps[None]:
-        """Stop, and wait until the target is seen stopped: the state change takes the kernel some
-        microseconds.
-        """
+        """Stop, and wait until the target is seen stopped: that takes the kernel some microseconds."""
         processes = strike(injection, run)
         for process in processes:
             process.freeze(self.for_ms)
@@ -78,7 +67,7 @@ class Hang(FaultKind, frozen=True, tag="hang"):
         yield from ()
 
     def undo(self, injection: Injection, run: RunControl) -> None:
-        """Let go on what is still stopped."""
+        """Continue what is still stopped."""
         ran_on = [process.thaw() for process in injection.struck]
         if any(ran_on) and injection.receipt.state is ReceiptState.APPLIED:
             injection.receipt = Receipt(ReceiptState.ACTIVATED)

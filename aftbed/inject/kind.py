@@ -3,7 +3,7 @@
 A kind is one file and one line in `model.FaultAction`. The file has the rule of its words, what it may
 target, where it waits, what it does, what its receipt shows, and how it is undone:
 
-    words            read       `run --inject "..."`, `aftbed inject`, campaigns
+    words            from_words `run --inject "..."`, `aftbed inject`, campaigns
     fault            check      before a run starts, and in it
     armed            waits_in   the brick that comes to its point; none: it strikes at once
     at its point     act        what the supervisor does, as a task of the runtime
@@ -20,52 +20,53 @@ from typing import Any, ClassVar, NamedTuple, Protocol, Self, TypeVar
 import msgspec
 
 from aftbed.core.brick import Brick, Effect
+from aftbed.core.errors import ConfigError
 from aftbed.core.graph import Graph
 from aftbed.core.journal import Record
 from aftbed.core.messages import Message
 from aftbed.inject import targets
-from aftbed.inject.receipts import Receipt, ReceiptState
-from aftbed.inject.shared_state import SharedState
+from aftbed.inject.grammar import FaultWords
+from aftbed.inject.receipts import BusReport, Receipt, ReceiptState
+from aftbed.inject.shared_state import SharedState, StateHit
 from aftbed.inject.targets import TargetProcess
-from aftbed.inject.timing import ONCE, Persistence, Trigger
+from aftbed.inject.timing import ONCE, Persistence, Trigger, read_persistence, read_trigger
 from aftbed.vehicle.condition import Condition
 
 T = TypeVar("T")
 Steps = Generator[Any, Any, T]  # a task of the runtime: what it yields is the runtime's affair
 
 
-class AnyFault(Protocol):
-    """A fault of any kind: see `model.Fault`."""
+class AnyFault(msgspec.Struct, frozen=True):
+    """A fault of any kind: what is done, to what, when, and how often again. `model.Fault` travels.
 
-    @property
-    def action(self) -> "FaultKind": ...
-    @property
-    def target(self) -> str: ...
-    @property
-    def trigger(self) -> Trigger: ...
-    @property
-    def persistence(self) -> Persistence: ...
-    @property
-    def event(self) -> str: ...
-
-
-class ReadFault(NamedTuple):
-    """What the words of a fault say."""
+    `target` is a role, a replica, a node, or another process, as the kind allows.
+    Raises ValueError on a combination that means nothing.
+    """
 
     action: "FaultKind"
     target: str
     trigger: Trigger = Trigger()
     persistence: Persistence = ONCE
 
-
-class Evidence(Protocol):
-    """What a strike from outside left behind; `journal` is that of the process that was struck."""
+    def __post_init__(self) -> None:
+        self.action.validate(self)
 
     @property
-    def journal(self) -> str: ...
-    def receipt(self, records: Iterable[Record]) -> Receipt:
-        """By what the process has recorded since."""
-        ...
+    def event(self) -> str:
+        """The label of the event that it waits for, "" for none."""
+        return self.action.event(self.trigger)
+
+    def check(self, graph: Graph) -> None:
+        """Raise ConfigError, naming what is allowed, if it cannot happen in `graph`."""
+        if self.trigger.nth < 1:
+            raise ConfigError(f"nth {self.trigger.nth}: the first occurrence is nth 1")
+        self.action.check(self, graph)
+
+    def __str__(self) -> str:
+        action = self.action
+        when = self.trigger.words(counts_messages=action.counts_messages)
+        words = [action.name, *action.subject(self.target), *when, str(self.persistence)]
+        return " ".join(filter(None, words))
 
 
 class Injection:
@@ -79,19 +80,8 @@ class Injection:
         self.brick = ""  # of the host: it comes to the point
         self.by_itself = False  # the host does it to itself
         self.journals: set[str] = set()  # of all hosts so far
-        self.evidence: Evidence | None = None
+        self.state_hit: StateHit | None = None  # what was flipped in a shared state
         self.unmet: Condition | None = fault.trigger.when  # the condition that it still waits for
-
-
-class BusReceipt(Protocol):
-    """What the bus says of a fault."""
-
-    @property
-    def receipt(self) -> Receipt: ...
-    @property
-    def waits(self) -> bool:
-        """For its condition, which has not held yet."""
-        ...
 
 
 class RunControl(Protocol):
@@ -102,11 +92,11 @@ class RunControl(Protocol):
         ...
 
     def pause(self) -> None:
-        """Let others run for a moment."""
+        """Let other processes run for a moment."""
         ...
 
     def log(self, injection: Injection) -> None:
-        """Show people the receipt."""
+        """Log the receipt."""
         ...
 
     def processes(self, injection: Injection) -> Sequence[TargetProcess]:
@@ -141,7 +131,7 @@ class RunControl(Protocol):
         """Arm it on the bus. Raises StepFailed where there is no bus."""
         ...
 
-    def bus_report(self, injection: Injection) -> BusReceipt | None:
+    def bus_report(self, injection: Injection) -> BusReport | None:
         """The latest that is known."""
         ...
 
@@ -174,6 +164,7 @@ class FaultKind(msgspec.Struct, frozen=True):
 
     stops_process: ClassVar[bool] = False  # the fault model "crash": the process no longer serves
     alters_value: ClassVar[bool] = False  # the fault model "value"
+    strikes_stored_state: ClassVar[bool] = False  # the value lies in memory, in no execution's hands
     takes_real_time: ClassVar[bool] = False  # its length means nothing in lockstep, where time waits
     has_worst_instant: ClassVar[bool] = False  # it may be tried at each instant of a drive
     unsafe: ClassVar[bool] = False  # it strikes whatever is there; the user has to agree to it
@@ -181,9 +172,7 @@ class FaultKind(msgspec.Struct, frozen=True):
     needs_bus: ClassVar[bool] = False
     repeats: ClassVar[bool] = False  # it can be permanent or intermittent
     counts_messages: ClassVar[bool] = False  # it waits for messages on a channel, not for an event
-    acts_in_node: ClassVar[bool] = (
-        False  # the agent of the node does all of it: nothing is asked of the supervisor
-    )
+    acts_in_node: ClassVar[bool] = False  # the agent of the node does all of it
     emitter_may_act: ClassVar[bool] = False  # a node that emits the event and is the target does it to itself
     shares_state: ClassVar[bool] = False  # the state of the target's function is shared from the arming on
 
@@ -195,9 +184,26 @@ class FaultKind(msgspec.Struct, frozen=True):
         return len(words) > 1 and words[0] in cls.NAMES
 
     @classmethod
-    def read(cls, words: Sequence[str]) -> ReadFault:
+    def read(cls, words: Sequence[str]) -> AnyFault:
         """The fault that the words mean. Raises ConfigError naming the word that is wrong."""
+        found = FaultWords(words, cls.KEYS)
+        action = cls.from_words(found)
+        if action.nth_event or cls.counts_messages:
+            found.not_both("nth", "after")
+        else:
+            found.nth_needs_event()
+        target = found.get("in", targets.DEFAULT) if "in" in cls.KEYS else found.subject
+        return AnyFault(action, target, read_trigger(found, action.nth_event), read_persistence(found))
+
+    @classmethod
+    def from_words(cls, words: FaultWords) -> Self:
+        """The action in `words`. Raises ConfigError."""
         raise NotImplementedError
+
+    @property
+    def nth_event(self) -> str:
+        """The event that a `nth` counts which stands without `at`."""
+        return ""
 
     @property
     def name(self) -> str:
@@ -228,11 +234,6 @@ class FaultKind(msgspec.Struct, frozen=True):
         """The same with another length. Only where there is one."""
         raise NotImplementedError
 
-    @property
-    def strikes_stored_state(self) -> bool:
-        """Whether the value it alters lies in memory, where no execution has it in hand."""
-        return False
-
     def check_state(self, shared: SharedState) -> None:
         """Raise ConfigError where the shared state has no such bits."""
 
@@ -244,7 +245,7 @@ class FaultKind(msgspec.Struct, frozen=True):
 
     def waits(self, fault: AnyFault) -> bool:
         """Whether it waits in a node, and does not strike as soon as it is armed."""
-        return bool(fault.event)
+        return bool(fault.event) or self.counts_messages
 
     def waits_in(self, fault: AnyFault, roles: targets.Roles) -> str | None:
         """The brick that comes to its point as the roles are now; None where none does."""
@@ -258,9 +259,7 @@ class FaultKind(msgspec.Struct, frozen=True):
 
     @property
     def alters_step(self) -> bool:
-        """In a node: whether it strikes within the step whose event is the one to strike at, not at its
-        Note.
-        """
+        """In a node: it strikes within the step whose event is the one to strike at, not at its Note."""
         return False
 
     def alter_input(self, message: Message, draw: int) -> tuple[Message, Alteration | None]:
@@ -276,7 +275,7 @@ class FaultKind(msgspec.Struct, frozen=True):
         raise AssertionError(f"{self.name} is done by the supervisor")
 
     def undo(self, injection: Injection, run: RunControl) -> None:
-        """Its time is over."""
+        """End it after `lasts_ms`."""
 
     def receipt(self, injection: Injection, run: RunControl) -> Receipt:
         """What has become of it, by what is known now."""

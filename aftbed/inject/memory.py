@@ -10,16 +10,15 @@ is lost with the process. How the memory of another process is reached is in `ru
 
 import re
 from collections.abc import Sequence
-from typing import ClassVar, Final
+from typing import ClassVar, Final, Self
 
 from aftbed.core.errors import ConfigError, StepFailed
 from aftbed.core.graph import Graph
 from aftbed.inject import targets
 from aftbed.inject.bit_patterns import BYTE_BITS, PATTERN_KEYS
 from aftbed.inject.grammar import REPEAT_KEYS, FaultWords, whole
-from aftbed.inject.kind import AnyFault, FaultKind, Injection, ReadFault, RunControl, Steps, strike
+from aftbed.inject.kind import AnyFault, FaultKind, Injection, RunControl, Steps, strike
 from aftbed.inject.receipts import Receipt, ReceiptState
-from aftbed.inject.timing import read_trigger
 from aftbed.inject.value import BITFLIP, BITFLIP_KEYS, MEMORY
 
 _ADDRESS: Final = re.compile(r"0x[0-9a-fA-F]{1,12}")
@@ -35,36 +34,26 @@ class MemoryFlip(FaultKind, frozen=True, tag="memory"):
     KEYS: ClassVar = BITFLIP_KEYS
 
     alters_value: ClassVar = True
+    strikes_stored_state: ClassVar = True
     unsafe: ClassVar = True
     simulated: ClassVar = False
 
     @classmethod
     def claims(cls, words: Sequence[str]) -> bool:
-        """A bit flip of memory."""
         return super().claims(words) and words[1] == MEMORY
 
     @classmethod
-    def read(cls, words: Sequence[str]) -> ReadFault:
-        """See the top of this file."""
-        found = FaultWords(words, cls.KEYS)
-        other = found.first_of([key for key in (*PATTERN_KEYS, *REPEAT_KEYS) if key != "bit"])
+    def from_words(cls, words: FaultWords) -> Self:
+        other = words.first_of([key for key in (*PATTERN_KEYS, *REPEAT_KEYS) if key != "bit"])
         if other is not None:
             raise ConfigError(f"{other!r}: of memory one bit is flipped, once: 'bit 0' to 'bit 7' of a byte")
-        found.nth_needs_event()
-        bit = whole("bit", found["bit"], 0, BYTE_BITS - 1) if "bit" in found else None
-        address = _address(found["address"]) if "address" in found else None
-        return ReadFault(cls(bit, address), found.get("in", targets.DEFAULT), read_trigger(found))
+        bit = whole("bit", words["bit"], 0, BYTE_BITS - 1) if "bit" in words else None
+        return cls(bit, _address(words["address"]) if "address" in words else None)
 
     def subject(self, target: str) -> list[str]:
-        """The bit, the address, and the target."""
         bit = "" if self.bit is None else f"bit {self.bit}"
         address = "" if self.address is None else f"address {self.address:#x}"
         return [MEMORY, bit, address, "in", target]
-
-    @property
-    def strikes_stored_state(self) -> bool:
-        """Always."""
-        return True
 
     def check(self, fault: AnyFault, graph: Graph) -> None:
         """Nodes only: what the command itself or the hub keeps is not the system under test."""

@@ -1,4 +1,4 @@
-"""A fault: what is done, to what, when, and how often again.
+"""The registry of the kinds of faults, and a fault as it is typed and as it travels.
 
     crash primary at checkpoint.sent nth 100            hang backup for 50ms after 200ms
     delay aft2aft by 5ms in b permanent                 bitflip state.ego_ms bit 52 when ttc < 1.2
@@ -13,12 +13,11 @@ from typing import Final, cast, get_args
 import msgspec
 
 from aftbed.core.errors import ConfigError, unknown
-from aftbed.core.graph import Graph
 from aftbed.inject.bus import BUS, BusFault
 from aftbed.inject.channel import ChannelFault
 from aftbed.inject.crash import Crash
 from aftbed.inject.hang import Hang
-from aftbed.inject.kind import FaultKind
+from aftbed.inject.kind import AnyFault, FaultKind
 from aftbed.inject.memory import MemoryFlip
 from aftbed.inject.receipts import ReceiptState
 from aftbed.inject.slow import Slow
@@ -46,45 +45,14 @@ GRAMMAR: Final = (
 )
 
 
-class Fault(msgspec.Struct, frozen=True):
-    """`target` is a role, a replica, a node, or another process, as the kind allows.
-
-    Raises ValueError on a combination that means nothing.
-    """
+class Fault(AnyFault, frozen=True):
+    """A fault of one of the registered kinds, which can be decoded."""
 
     action: FaultAction
-    target: str
-    trigger: Trigger
-    persistence: Persistence = ONCE
-
-    def __post_init__(self) -> None:
-        self.action.validate(self)
-
-    @property
-    def event(self) -> str:
-        """The label of the event that it waits for, "" for none."""
-        return self.action.event(self.trigger)
-
-    def check(self, graph: Graph) -> None:
-        """Raise ConfigError, naming what is allowed, if it cannot happen in `graph`."""
-        if self.trigger.nth < 1:
-            raise ConfigError(f"nth {self.trigger.nth}: the first occurrence is nth 1")
-        self.action.check(self, graph)
-
-    def __str__(self) -> str:
-        action = self.action
-        when = self.trigger.words(counts_messages=action.counts_messages)
-        words = [action.name, *action.subject(self.target), *when, str(self.persistence)]
-        return " ".join(filter(None, words))
-
-
-def on_bus(action: BusFault) -> Fault:
-    """A fault of the bus, among the others."""
-    return Fault(action, BUS, Trigger())
 
 
 class ArmedFault(msgspec.Struct, frozen=True):
-    """What a node is told of a fault: the `nth` time that `brick` comes to the point, do it, or ask for it.
+    """The order to a node: the `nth` time that `brick` comes to the point, do `action`, or ask for it.
 
     `by_itself`: the node does it to itself. `draw` decides what `action` and `persistence` leave open.
     `strikes`: how often it has struck here so far.
@@ -118,6 +86,11 @@ class FaultReport(msgspec.Struct, frozen=True, omit_defaults=True):
         return parse(self.fault).action
 
 
+def on_bus(action: BusFault) -> Fault:
+    """A fault of the bus, among the others."""
+    return Fault(action, BUS, Trigger())
+
+
 def parse(text: str) -> Fault:
     """The fault that `text` means. Raises ConfigError naming the word that is wrong."""
     return read(text.split())
@@ -128,8 +101,7 @@ def read(words: Sequence[str]) -> Fault:
     for kind in KINDS:
         if kind.claims(words):
             found = kind.read(words)
-            action = cast("FaultAction", found.action)
-            return Fault(action, found.target, found.trigger, found.persistence)
+            return Fault(cast("FaultAction", found.action), found.target, found.trigger, found.persistence)
     if len(words) < 2:
         raise ConfigError(f"fault {' '.join(words)!r}: expected {GRAMMAR}")
     raise unknown("fault", words[0], NAMES)

@@ -66,3 +66,40 @@ def records_about(number: int, records: Iterable[Record]) -> list[Record]:
 def more_times(times: int) -> str:
     """For the end of a detail: how often a lasting fault has struck beyond the first time."""
     return f", and {times - 1} more times" if times > 1 else ""
+
+
+class BusReport(msgspec.Struct, frozen=True):
+    """What the bus reports of a fault: how many frames it struck, the first, which node noticed it, and how.
+
+    `believed`: a node that took in a struck frame without an objection. `error` is of the injector itself.
+    """
+
+    number: int
+    frames: int = 0
+    first_us: int = 0
+    first_id: int = 0
+    noticed: str = ""
+    believed: str = ""
+    began: bool = False  # an act on nodes took hold, whatever frames there were
+    error: str = ""
+    waits: bool = False  # for its condition, which has not held yet
+
+    @property
+    def receipt(self) -> Receipt:
+        """A fault that has not struck yet is armed."""
+        if self.error:
+            return Receipt(ReceiptState.INJECT_ERROR, self.error)
+        if not self.frames and not self.began:
+            return Receipt()
+        seen = self.noticed or self.believed
+        return Receipt(ReceiptState.ACTIVATED if seen else ReceiptState.APPLIED, self._detail())
+
+    def _detail(self) -> str:
+        if not self.frames:
+            return "took hold, of no frame"
+        many = f"{self.frames} frame{'s' if self.frames > 1 else ''}"
+        first = f"{'the first ' if self.frames > 1 else ''}at {self.first_us / 1e6:.6f} s"
+        known = f"noticed by {self.noticed}" if self.noticed else "noticed by nobody"
+        if self.believed and not self.noticed:
+            known = f"believed by {self.believed}"
+        return f"{many}, {first}, id {self.first_id:03X}; {known}"

@@ -16,7 +16,7 @@ write a byte back as it was a microsecond ago. The records say which bits the no
 """
 
 from collections.abc import Callable, Iterable
-from typing import Final, NamedTuple, Protocol
+from typing import Final, NamedTuple
 
 import msgspec
 
@@ -27,7 +27,7 @@ from aftbed.core.events import Event
 from aftbed.core.journal import Record
 from aftbed.ftm.server import Server
 from aftbed.inject.bit_patterns import BitPattern, Byte, StuckBit, bit_names, bits_to_flip
-from aftbed.inject.receipts import Receipt, ReceiptState, fault_and_bits, record_detail
+from aftbed.inject.receipts import Receipt, ReceiptState, fault_and_bits
 
 SHARED_BYTES: Final = 1 << 16  # memory that is never touched costs nothing
 
@@ -35,7 +35,7 @@ Found = Callable[[list[int], PeerError | None], None]
 
 
 class StateLayout(msgspec.Struct, frozen=True):
-    """A node's answer: the fields that the function declares; none, and its state is not shared."""
+    """A node's answer: the fields that the function declares. Without any, its state is not shared."""
 
     fields: tuple[Field, ...] = ()
 
@@ -118,7 +118,7 @@ class StateHit(NamedTuple):
 class SharedFunction:
     """The application around one whose state is in `memory`.
 
-    `found` is told of each bit that was changed there.
+    `found` is called with the bits that were changed there, and with the function's refusal of them, if any.
     """
 
     def __init__(self, function: Application, memory: memoryview, found: Found) -> None:
@@ -128,29 +128,25 @@ class SharedFunction:
         self._write()
 
     def execute(self, request: bytes) -> bytes:
-        """Execute `request` from the state in memory."""
         self._take_over()
         reply = self._function.execute(request)
         self._write()
         return reply
 
     def capture(self) -> bytes:
-        """The state in memory, taken over."""
         self._take_over()
         return self._function.capture()
 
     def restore(self, state: bytes) -> None:
-        """Replace the state in memory, whatever it is."""
         self._function.restore(state)
         self._write()
 
     def migrate(self, state: bytes) -> None:
-        """Replace it by another function's state."""
+        """Replace the state by that of another function."""
         getattr(self._function, "migrate", self._function.restore)(state)
         self._write()
 
     def acceptable(self, request: bytes, reply: bytes) -> bool:
-        """The assertion of the function."""
         return self._function.acceptable(request, reply)
 
     def peek(self) -> bytes:
@@ -179,48 +175,6 @@ def differing_bits(one: bytes, other: bytes) -> list[int]:
     """The bits in which two values of the same length differ."""
     change = int.from_bytes(one, "little") ^ int.from_bytes(other, "little")
     return [bit for bit in range(8 * len(one)) if change >> bit & 1]
-
-
-class Host(Protocol):
-    """What sharing needs of the node: see `agent.AgentHost`."""
-
-    def brick(self, name: str) -> Brick: ...
-    def record(self, event: Event, request_id: int, detail: int) -> None: ...
-    def stop_detected(self, brick: str, reason: str) -> None: ...
-
-
-def share(host: Host, brick: str, number: int, memory: memoryview) -> bytes:
-    """Have the function of the Server `brick` keep its state in `memory`; the answer is its StateLayout.
-
-    `number` is in the records of what is found changed. Raises PeerError where the fields are not in the
-    state.
-    """
-    server = host.brick(brick)
-    if not isinstance(server, Server):
-        raise PeerError(f"{brick} has no function")
-    fields = fields_of(server.application)
-    if isinstance(server.application, SharedFunction) or not fields:
-        return msgspec.msgpack.encode(StateLayout(fields))  # a repeated order, or there is nothing to share
-    size_bytes = len(server.application.capture())
-    last_bytes = max(field.offset_bytes + field.size_bits // 8 for field in fields)
-    if not last_bytes <= size_bytes <= SHARED_BYTES:
-        raise PeerError(f"a state of {size_bytes} bytes with fields up to byte {last_bytes}")
-
-    def found(bits: list[int], refusal: PeerError | None) -> None:
-        event = Event.FAULT_APPLIED if refusal is None else Event.PEER_REFUSED
-        for bit in bits:
-            host.record(event, 0, record_detail(number, bit))
-        if refusal is not None:
-            host.record(Event.DETECTED_STOP, 0, 0)
-            host.stop_detected(brick, f"the state in memory is refused: {refusal}")
-
-    server.application = SharedFunction(server.application, memory, found)
-    return msgspec.msgpack.encode(StateLayout(fields))
-
-
-def is_shared(brick: Brick) -> bool:
-    """Whether `brick` is a Server whose function has its state in shared memory."""
-    return isinstance(brick, Server) and isinstance(brick.application, SharedFunction)
 
 
 def look(brick: Brick) -> bytes:

@@ -7,7 +7,6 @@ a CPU. The agent in the node delays the steps; the node's pulse goes on, because
 
 import contextlib
 import re
-from collections.abc import Sequence
 from typing import ClassVar, Final, Self
 
 from msgspec import structs
@@ -17,9 +16,8 @@ from aftbed.core.graph import Graph
 from aftbed.core.units import duration, milliseconds, number, whole_milliseconds
 from aftbed.inject import targets
 from aftbed.inject.grammar import WHEN_KEYS, FaultWords
-from aftbed.inject.kind import AnyFault, FaultKind, Injection, ReadFault, RunControl, Steps, strike
+from aftbed.inject.kind import AnyFault, FaultKind, Injection, RunControl, Steps, strike
 from aftbed.inject.receipts import Receipt, ReceiptState
-from aftbed.inject.timing import read_trigger
 
 SLOW_MS: Final = 2.0
 SLOW_MS_MAX: Final = 500.0  # a step: orders are answered between two steps, and within 2 s
@@ -42,22 +40,17 @@ class Slow(FaultKind, frozen=True, tag="slow"):
     has_worst_instant: ClassVar = True
 
     @classmethod
-    def read(cls, words: Sequence[str]) -> ReadFault:
-        """See the top of this file."""
-        found = FaultWords(words, cls.KEYS)
-        found.nth_needs_event()
-        trigger = read_trigger(found)
-        for_ms = whole_milliseconds("duration", found["for"]) if "for" in found else 0
-        found.not_both("by", "share")
-        if "share" in found:
-            return ReadFault(cls(0.0, for_ms, _share(found["share"])), found.subject, trigger)
-        by_ms = milliseconds("delay", found["by"]) if "by" in found else SLOW_MS
+    def from_words(cls, words: FaultWords) -> Self:
+        for_ms = whole_milliseconds("duration", words["for"]) if "for" in words else 0
+        words.not_both("by", "share")
+        if "share" in words:
+            return cls(0.0, for_ms, _share(words["share"]))
+        by_ms = milliseconds("delay", words["by"]) if "by" in words else SLOW_MS
         if by_ms > SLOW_MS_MAX:
-            raise ConfigError(f"'by {found['by']}': a step can be slower by {SLOW_MS_MAX:g}ms at most")
-        return ReadFault(cls(by_ms, for_ms), found.subject, trigger)
+            raise ConfigError(f"'by {words['by']}': a step can be slower by {SLOW_MS_MAX:g}ms at most")
+        return cls(by_ms, for_ms)
 
     def subject(self, target: str) -> list[str]:
-        """The target, how slow, and for how long."""
         how = f"by {duration(self.by_ms)}" if self.share is None else f"share {number(100 * self.share)}%"
         return [target, how, f"for {self.for_ms}ms" if self.for_ms else ""]
 
@@ -77,11 +70,10 @@ class Slow(FaultKind, frozen=True, tag="slow"):
         return self.for_ms
 
     def lasting(self, lasts_ms: int) -> Self:
-        """For so long."""
         return structs.replace(self, for_ms=lasts_ms)
 
     def act(self, injection: Injection, run: RunControl) -> Steps[None]:
-        """Tell all nodes of the target, and wait for their answers."""
+        """Order all nodes of the target to be slower, and wait for their answers."""
         processes = strike(injection, run)
         if not processes:
             return
@@ -91,7 +83,6 @@ class Slow(FaultKind, frozen=True, tag="slow"):
         injection.receipt = Receipt(ReceiptState.APPLIED)
 
     def undo(self, injection: Injection, run: RunControl) -> None:
-        """Full speed again."""
         for process in injection.struck:
             with contextlib.suppress(StepFailed):  # the process is gone
                 run.slow_down(process, injection.number, 0, WHOLE_CPU)

@@ -9,7 +9,7 @@ once.
 
 import re
 from collections.abc import Sequence
-from typing import ClassVar, Final
+from typing import ClassVar, Final, Self
 
 from aftbed.core.application import fields_of
 from aftbed.core.errors import ConfigError, StepFailed, unknown
@@ -18,10 +18,9 @@ from aftbed.core.graph import Graph
 from aftbed.inject import targets
 from aftbed.inject.bit_patterns import Bit, BitPattern, check_pattern, read_pattern
 from aftbed.inject.grammar import REPEAT_KEYS, FaultWords
-from aftbed.inject.kind import AnyFault, FaultKind, Injection, ReadFault, RunControl, Steps
+from aftbed.inject.kind import AnyFault, FaultKind, Injection, RunControl, Steps
 from aftbed.inject.receipts import Receipt, ReceiptState
 from aftbed.inject.shared_state import SharedState, field_with_bits
-from aftbed.inject.timing import read_trigger
 from aftbed.inject.value import BITFLIP, BITFLIP_KEYS, MEMORY, PLACES, no_address
 from aftbed.vehicle.aeb.function import AebFunction
 
@@ -40,44 +39,37 @@ class StateFlip(FaultKind, frozen=True, tag="state"):
     KEYS: ClassVar = BITFLIP_KEYS
 
     alters_value: ClassVar = True
+    strikes_stored_state: ClassVar = True
     shares_state: ClassVar = True
 
     @classmethod
     def claims(cls, words: Sequence[str]) -> bool:
-        """A bit flip of a PLACE.FIELD."""
         return super().claims(words) and "." in words[1]
 
     @classmethod
-    def read(cls, words: Sequence[str]) -> ReadFault:
-        """See the top of this file."""
-        found = FaultWords(words, cls.KEYS)
-        place, _, field = found.subject.partition(".")
+    def from_words(cls, words: FaultWords) -> Self:
+        place, _, field = words.subject.partition(".")
         if place not in PLACES:
             raise unknown("place of a bitflip", place, (*PLACES, MEMORY))
-        no_address(found)
+        no_address(words)
         if place != STATE:
             raise ConfigError(f"{place + '.' + field[:40]!r}: only the state has fields, as state.ego_ms")
         if not _FIELD.fullmatch(field) or len(field) > FIELD_CHARACTERS_MAX:
             named = f"letters, digits, _ and . are allowed, {FIELD_CHARACTERS_MAX} at most"
             raise ConfigError(f"field {field[:40]!r} of the state: {named}")
-        lasting = found.first_of(REPEAT_KEYS)
+        lasting = words.first_of(REPEAT_KEYS)
         if lasting is not None:
             raise ConfigError(
                 f"{lasting!r}: a bitflip of a field strikes once; that of a whole state can last"
             )
-        action = cls(field, read_pattern(found))
-        found.not_both("nth", "after")
-        trigger = read_trigger(found, Event.SERVER_EXIT.label)
-        return ReadFault(action, found.get("in", targets.DEFAULT), trigger)
-
-    def subject(self, target: str) -> list[str]:
-        """The field, the bits, and the replica."""
-        return [f"{STATE}.{self.field}", str(self.pattern), "in", target]
+        return cls(field, read_pattern(words))
 
     @property
-    def strikes_stored_state(self) -> bool:
-        """Always."""
-        return True
+    def nth_event(self) -> str:
+        return Event.SERVER_EXIT.label
+
+    def subject(self, target: str) -> list[str]:
+        return [f"{STATE}.{self.field}", str(self.pattern), "in", target]
 
     def check(self, fault: AnyFault, graph: Graph) -> None:
         """The fields of a function that was written off line are known only in its node."""
@@ -100,11 +92,11 @@ class StateFlip(FaultKind, frozen=True, tag="state"):
         except (StepFailed, ConfigError) as error:
             injection.receipt = Receipt(ReceiptState.NOT_ACTIVATED, str(error))
         else:
-            injection.evidence = hit
+            injection.state_hit = hit
             injection.receipt = hit.receipt(())
         run.log(injection)
 
     def receipt(self, injection: Injection, run: RunControl) -> Receipt:
         """Activated when the function has used the bits, or refused them."""
-        hit = injection.evidence
+        hit = injection.state_hit
         return injection.receipt if hit is None else hit.receipt(run.journal(hit.journal))

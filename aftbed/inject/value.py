@@ -13,7 +13,7 @@ place is sound.
 
 from collections.abc import Sequence
 from enum import Enum
-from typing import ClassVar, Final
+from typing import ClassVar, Final, Self
 
 import msgspec
 from msgspec import structs
@@ -38,9 +38,9 @@ from aftbed.inject.bit_patterns import (
     with_flipped,
 )
 from aftbed.inject.grammar import REPEAT_KEYS, WHEN_KEYS, FaultWords
-from aftbed.inject.kind import Alteration, AnyFault, FaultKind, Injection, ReadFault, RunControl
+from aftbed.inject.kind import Alteration, AnyFault, FaultKind, Injection, RunControl
 from aftbed.inject.receipts import Receipt, ReceiptState, fault_and_bits, more_times
-from aftbed.inject.timing import Trigger, read_persistence, read_trigger
+from aftbed.inject.timing import Trigger
 
 BITFLIP: Final = "bitflip"
 MEMORY: Final = "memory"  # the place of a bit flip outside of all values: see `memory`
@@ -84,24 +84,22 @@ class ValueFlip(FaultKind, frozen=True, tag=BITFLIP):
     acts_in_node: ClassVar = True
 
     @classmethod
-    def read(cls, words: Sequence[str]) -> ReadFault:
-        """See the top of this file."""
-        found = FaultWords(words, cls.KEYS)
-        if found.subject not in PLACES:
-            raise unknown("place of a bitflip", found.subject, (*PLACES, MEMORY))
-        no_address(found)
-        action = cls(ValuePlace(found.subject), read_pattern(found))
-        found.not_both("nth", "after")
-        trigger = read_trigger(found, FLIPPED_AT[action.place][0].label)
-        return ReadFault(action, found.get("in", targets.DEFAULT), trigger, read_persistence(found))
+    def from_words(cls, words: FaultWords) -> Self:
+        if words.subject not in PLACES:
+            raise unknown("place of a bitflip", words.subject, (*PLACES, MEMORY))
+        no_address(words)
+        return cls(ValuePlace(words.subject), read_pattern(words))
+
+    @property
+    def nth_event(self) -> str:
+        """The first at which the value is in hand."""
+        return FLIPPED_AT[self.place][0].label
 
     def subject(self, target: str) -> list[str]:
-        """The place, the bits, and the replica."""
         return [self.place.value, str(self.pattern), "in", target]
 
     def event(self, trigger: Trigger) -> str:
-        """The named one, or the first at which the value is in hand."""
-        return trigger.event or FLIPPED_AT[self.place][0].label
+        return trigger.event or self.nth_event
 
     def check(self, fault: AnyFault, graph: Graph) -> None:
         """The target has to have the value in hand at the event, in the roles that it can have."""

@@ -23,9 +23,9 @@ from aftbed.core.errors import ConfigError, StepFailed
 from aftbed.core.events import Event, event_named
 from aftbed.core.journal import Record
 from aftbed.inject import targets
-from aftbed.inject.kind import BusReceipt, Injection, Steps
+from aftbed.inject.kind import Injection, Steps
 from aftbed.inject.model import ArmedFault, Fault, FaultReport
-from aftbed.inject.receipts import Receipt, ReceiptState, records_about
+from aftbed.inject.receipts import BusReport, Receipt, ReceiptState, records_about
 from aftbed.inject.shared_state import SharedState, StateLayout
 from aftbed.inject.targets import Roles, TargetProcess
 from aftbed.runtime import control
@@ -317,7 +317,7 @@ class FaultController:
         """By the runtime."""
         yield from self._runtime.disturb(injection.number, injection.fault.action, injection.draw)
 
-    def bus_report(self, injection: Injection) -> BusReceipt | None:
+    def bus_report(self, injection: Injection) -> BusReport | None:
         """By the runtime."""
         return self._runtime.bus_fault(injection.number)
 

@@ -12,7 +12,8 @@ from typing import Final, NamedTuple, Protocol
 from aftbed.core.events import Event
 from aftbed.core.graph import Link
 from aftbed.core.journal import Record
-from aftbed.inject.kind import BusReceipt, FaultKind
+from aftbed.inject.kind import FaultKind
+from aftbed.inject.receipts import BusReport
 from aftbed.runtime.control import ToNode
 from aftbed.runtime.tasks import Key, Tasks, Wait
 from aftbed.vehicle.condition import Condition
@@ -276,7 +277,7 @@ class Runtime(Protocol):
         """
         ...
 
-    def bus_fault(self, number: int) -> BusReceipt | None:
+    def bus_fault(self, number: int) -> BusReport | None:
         """What has become of it, as far as is known."""
         ...
 

@@ -19,7 +19,7 @@ from aftbed.core.events import Event
 from aftbed.core.journal import Record, records
 from aftbed.core.messages import AnyMessage, CaptureState, Message, Reply, Request, StateCaptured, Tried
 from aftbed.inject import model
-from aftbed.inject.bit_patterns import Bit, flipped
+from aftbed.inject.bit_patterns import Bit, with_flipped
 from aftbed.inject.crash import Crash
 from aftbed.inject.hang import Hang
 from aftbed.inject.receipts import fault_and_bits, record_detail
@@ -237,7 +237,7 @@ def test_where_there_is_no_state_access_there_are_no_bits(host: Host) -> None:
 def test_a_bit_that_is_not_named_is_drawn(host: Host, draw: int) -> None:
     host.arm(flip(ValuePlace.RESULT, None, draw=draw))
     answer = host.execute(1)
-    assert isinstance(answer, Reply) and answer.payload == flipped(b"\x01\x02", draw % 16)
+    assert isinstance(answer, Reply) and answer.payload == with_flipped(b"\x01\x02", [draw % 16])
     assert [fault_and_bits(r.detail) for r in host.told()] == [(7, draw % 16)]
 
 

@@ -15,9 +15,8 @@ from aftbed.inject.bit_patterns import (
     Byte,
     StuckBit,
     bits_to_flip,
-    flipped,
+    with_flipped,
 )
-from aftbed.inject.bit_patterns import with_flipped as changed
 from aftbed.inject.channel import ChannelFault, Disturbance
 from aftbed.inject.crash import Crash
 from aftbed.inject.model import Fault
@@ -71,24 +70,24 @@ def test_a_fault_travels_as_it_is(fault: Fault) -> None:
 
 
 def test_bits_count_from_bit_0_of_byte_0() -> None:
-    assert flipped(b"\x00\x00", 0) == b"\x01\x00"
-    assert flipped(b"\x00\x00", 7) == b"\x80\x00"
-    assert flipped(b"\x00\x00", 8) == b"\x00\x01"
-    assert flipped(b"\xff\xff", 15) == b"\xff\x7f"
+    assert with_flipped(b"\x00\x00", [0]) == b"\x01\x00"
+    assert with_flipped(b"\x00\x00", [7]) == b"\x80\x00"
+    assert with_flipped(b"\x00\x00", [8]) == b"\x00\x01"
+    assert with_flipped(b"\xff\xff", [15]) == b"\xff\x7f"
 
 
 @given(st.binary(min_size=1, max_size=40), st.data())
 def test_a_flip_changes_one_bit_and_a_second_one_undoes_it(data: bytes, more: st.DataObject) -> None:
     bit = more.draw(st.integers(0, 8 * len(data) - 1))
-    changed = flipped(data, bit)
-    assert int.from_bytes(data, "little") ^ int.from_bytes(changed, "little") == 1 << bit
-    assert len(changed) == len(data) and flipped(changed, bit) == data
+    other = with_flipped(data, [bit])
+    assert int.from_bytes(data, "little") ^ int.from_bytes(other, "little") == 1 << bit
+    assert len(other) == len(data) and with_flipped(other, [bit]) == data
 
 
 @pytest.mark.parametrize("bit", [16, -1])
 def test_a_bit_that_is_not_there_is_our_mistake(bit: int) -> None:
     with pytest.raises(AssertionError):
-        flipped(b"\x00\x00", bit)
+        with_flipped(b"\x00\x00", [bit])
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(0, BIT_MAX))
@@ -107,7 +106,7 @@ def test_a_pattern_and_a_draw_tell_the_bits(pattern: BitPattern, data: bytes, dr
     if found is None:
         return
     assert list(found) == sorted(set(found)) and all(0 <= bit < 8 * len(data) for bit in found)
-    other = changed(data, found)
+    other = with_flipped(data, found)
     match pattern:
         case Bit(at):
             assert len(found) == 1 and at in (None, *found)
@@ -124,7 +123,9 @@ def test_a_pattern_and_a_draw_tell_the_bits(pattern: BitPattern, data: bytes, dr
 
 
 def test_a_byte_always_has_another_value_and_it_may_be_any() -> None:
-    values = {changed(b"\x00\x55", bits_to_flip(Byte(1), b"\x00\x55", draw) or ())[1] for draw in range(3000)}
+    values = {
+        with_flipped(b"\x00\x55", bits_to_flip(Byte(1), b"\x00\x55", draw) or ())[1] for draw in range(3000)
+    }
     assert values == set(range(256)) - {0x55}
 
 

@@ -7,8 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from aftbed.core.errors import ConfigError
-from aftbed.inject.bus import BusFault, BusReport, read_bus_fault
+from aftbed.inject.bus import BusFault, read_bus_fault
 from aftbed.inject.bus_disturber import FLOOD_ID, REORDER_US_MAX, Disturber
+from aftbed.inject.receipts import BusReport
 from aftbed.vehicle.can.bus_model import CarriedFrame
 from aftbed.vehicle.can.dbc_file import load_dbc
 from aftbed.vehicle.can.e2e import intact, protect

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from aftbed.core.application import Application, Characteristics, Field, Width, field_named, fields_of
 from aftbed.core.errors import ConfigError, PeerError
 from aftbed.ftm.compose import build
-from aftbed.inject.bit_patterns import Bit, BitBurst, BitPattern, Bits, Byte, StuckBit, flipped
+from aftbed.inject.bit_patterns import Bit, BitBurst, BitPattern, Bits, Byte, StuckBit, with_flipped
 from aftbed.inject.model import parse
 from aftbed.inject.shared_state import SHARED_BYTES, SharedFunction, differing_bits, field_with_bits
 from aftbed.inject.targets import Roles
@@ -141,7 +141,7 @@ def test_in_a_cell_that_nobody_touches_nothing_changes() -> None:
 @given(bits)
 def test_the_function_goes_on_with_what_it_finds_or_refuses_it(bit: int) -> None:
     bare, kept = served(20)
-    wrong = flipped(bare.capture(), bit)
+    wrong = with_flipped(bare.capture(), [bit])
     kept.flip(bit)
     assert kept.application.peek() == wrong, "to look at it is no use of it"
     assert not kept.found
@@ -169,5 +169,5 @@ def test_a_state_that_is_replaced_covers_up_what_was_flipped() -> None:
 def test_the_bits_that_differ_are_those_that_were_flipped(data: bytes, bits: set[int]) -> None:
     there, wanted = data, sorted(bit for bit in bits if bit < 8 * len(data))
     for bit in wanted:
-        there = flipped(there, bit)
+        there = with_flipped(there, [bit])
     assert differing_bits(there, data) == wanted

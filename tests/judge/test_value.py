@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from aftbed.core.history import History
 from aftbed.core.journal import Entry, EntryKind
-from aftbed.inject.bit_patterns import flipped
+from aftbed.inject.bit_patterns import with_flipped
 from aftbed.inject.model import FaultReport
 from aftbed.inject.receipts import ReceiptState
 from aftbed.judge.checks import (
@@ -104,7 +104,7 @@ def test_a_request_that_waits_is_not_wrong() -> None:
 
 @given(st.dictionaries(st.integers(1, COUNT), st.integers(0, 8 * 12 - 1), max_size=COUNT))
 def test_as_many_as_the_checker_of_one_history_counts(bits: dict[int, int]) -> None:
-    tale = history({i: flipped(right(i), bit) for i, bit in bits.items()})
+    tale = history({i: with_flipped(right(i), [bit]) for i, bit in bits.items()})
     found = corruptions_of(tale)
     assert [line.split(":")[0] for line in found] == [f"request {i}" for i in sorted(bits)]
     assert wrong_replies(tale, reference(tale)) == sorted(bits)

@@ -13,8 +13,9 @@ from pathlib import Path
 import msgspec
 
 from aftbed.core.errors import HarnessError
-from aftbed.inject.bus import BusFault, BusReport
+from aftbed.inject.bus import BusFault
 from aftbed.inject.bus_disturber import Disturber
+from aftbed.inject.receipts import BusReport
 from aftbed.vehicle.aeb.function import default_application
 from aftbed.vehicle.can.bus import Bus, BusOptions, open_bus
 from aftbed.vehicle.can.dbc_file import Codec

@@ -9,8 +9,9 @@ import msgspec
 from busharness import FunctionGateway, RunningHub, running_hub
 from puredrive import CODEC
 
-from aftbed.inject.bus import BusFault, BusReport, read_bus_fault
+from aftbed.inject.bus import BusFault, read_bus_fault
 from aftbed.inject.bus_disturber import Disturber
+from aftbed.inject.receipts import BusReport
 from aftbed.vehicle.aeb.function import default_application
 from aftbed.vehicle.can.candump import read_log
 from aftbed.vehicle.can.frame import Frame

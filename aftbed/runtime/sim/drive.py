@@ -8,9 +8,10 @@ time of that step and, as in lockstep, before anything else that belongs to the 
 from collections.abc import Callable
 from typing import Final
 
-from aftbed.inject.bus import BusFault, BusReport
+from aftbed.inject.bus import BusFault
 from aftbed.inject.bus_disturber import Disturber
 from aftbed.inject.kind import FaultKind
+from aftbed.inject.receipts import BusReport
 from aftbed.runtime.interface import Met
 from aftbed.runtime.sim.clock import Clock
 from aftbed.runtime.sim.givens import car_in, own_codec

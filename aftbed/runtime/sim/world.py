@@ -18,9 +18,9 @@ from aftbed.core.history import History
 from aftbed.core.journal import Entry, EntryKind, Record
 from aftbed.core.messages import Goal, Scheduled
 from aftbed.ftm.client import Client
-from aftbed.inject.bus import BusReport
 from aftbed.inject.kind import FaultKind
 from aftbed.inject.model import Fault, FaultReport
+from aftbed.inject.receipts import BusReport
 from aftbed.runtime import control
 from aftbed.runtime.adaptations import Outcome
 from aftbed.runtime.assembly import Assembler, MakeSetting

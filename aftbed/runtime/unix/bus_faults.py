@@ -9,9 +9,9 @@ from collections.abc import Callable, Generator
 import msgspec
 
 from aftbed.core.errors import StepFailed
-from aftbed.inject.bus import BusFault, BusReport
+from aftbed.inject.bus import BusFault
 from aftbed.inject.kind import FaultKind
-from aftbed.inject.receipts import ReceiptState
+from aftbed.inject.receipts import BusReport, ReceiptState
 from aftbed.runtime import control
 from aftbed.runtime.interface import Met
 from aftbed.runtime.tasks import Key, Wait

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from aftbed.core.errors import HarnessError
-from aftbed.inject.bus import BusReport
-from aftbed.inject.receipts import ReceiptState
+from aftbed.inject.receipts import BusReport, ReceiptState
 from aftbed.runtime import control
 from aftbed.runtime.unix.options import PlayerOptions, VehicleOptions
 from aftbed.runtime.unix.transport import Line

@@ -9,8 +9,8 @@ from typing import Final
 from aftbed.core.errors import StepFailed
 from aftbed.core.graph import Link
 from aftbed.core.journal import Record, records
-from aftbed.inject.bus import BusReport
 from aftbed.inject.kind import FaultKind
+from aftbed.inject.receipts import BusReport
 from aftbed.runtime.deployment import Keys
 from aftbed.runtime.interface import Met
 from aftbed.runtime.interface import Process as AnyProcess

@@ -10,7 +10,7 @@ from aebcycles import EGO_MS, braking, cycles
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aftbed.inject.bit_patterns import flipped
+from aftbed.inject.bit_patterns import with_flipped
 from aftbed.vehicle.aeb.function import DEMAND_MS2, AebFunction, sample_requests
 from aftbed.vehicle.aeb.messages import (
     STAGE_FULL,
@@ -99,10 +99,10 @@ def test_flipped_bits_are_noticed_as_often_as_is_said_and_always_in_the_demand()
             reply = function.execute(request)
             output = decode_reply(reply)
             for bit in range(8 * len(reply)):
-                found = not function.acceptable(request, flipped(reply, bit))
+                found = not function.acceptable(request, with_flipped(reply, [bit]))
                 noticed[output.slot is not None][found] += 1
                 if not found:
-                    changed = decode_reply(flipped(reply, bit))
+                    changed = decode_reply(with_flipped(reply, [bit]))
                     assert changed.deceleration_ms2 == output.deceleration_ms2
     shares = {threat: round(100 * n[True] / n.total()) for threat, n in noticed.items()}
     said = AebFunction.acceptable.__doc__
