@@ -58,11 +58,8 @@ from aftbed.runtime.unix import linux
 from aftbed.vehicle.can.candump import LINE_SHOWN_CHARACTERS_MAX, LOG_BYTES_MAX, Refusal
 from aftbed.vehicle.can.dbc_file import Codec, load_dbc
 from aftbed.vehicle.can.frame import CAN_ID_MAX, DATA_LENGTH_MAX
-from aftbed.vehicle.can.python_can import lean, with_asammdf
+from aftbed.vehicle.can.python_can import can, with_asammdf
 from aftbed.vehicle.replay.map_file import find_dbc
-
-lean()
-import can  # noqa: E402 - without asammdf, see `lean`
 
 EXTENDED_ID_MAX: Final = 0x1FFFFFFF
 TIME_US_MAX: Final = 2**32 * 1_000_000 - 1  # in 2106

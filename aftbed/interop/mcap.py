@@ -44,7 +44,6 @@ from aftbed.vehicle.aeb.messages import AebInput
 from aftbed.vehicle.can.candump import LogCounts, LogFrame, parse_lines
 from aftbed.vehicle.can.dbc_file import Codec, load_dbc
 from aftbed.vehicle.can.e2e import intact
-from aftbed.vehicle.can.python_can import lean
 
 BUS_NAME: Final = "bus.log"
 STAGES: Final = ("NONE", "WARN", "PARTIAL", "FULL")
@@ -223,7 +222,6 @@ def messages_of(run: RunRecord) -> Iterator[TimedMessage]:
     """All messages, source by source."""
     axis, work = TimeAxis(run), run.options.work
     if isinstance(work, CarRun | ReplayRun):
-        lean()
         yield from _bus(run.path / BUS_NAME, load_dbc(), own=isinstance(work, CarRun))
     if isinstance(work, ReplayRun):
         for _, request in sent_requests(run):

@@ -27,11 +27,10 @@ from collections.abc import Callable, Sequence
 
 import msgspec
 
-from aftbed.vehicle.can.bus import AnswerWatch, Bus, BusOptions, Schedule, open_bus
+from aftbed.vehicle.can.bus import AnswerWatch, Bus, BusOptions, HubLine, Schedule, open_bus
 from aftbed.vehicle.can.bus_model import NODES
 from aftbed.vehicle.can.dbc_file import Codec
 from aftbed.vehicle.can.frame import Frame
-from aftbed.vehicle.can.hub_client import HubLine
 from aftbed.vehicle.ecus import BrakePolicy, CarBody, End
 from aftbed.vehicle.plant import Telemetry, VehicleResult
 from aftbed.vehicle.scenarios.scenario import Scenario

@@ -14,10 +14,10 @@ CONTROL_FD: Final = 3
 PRELOADS: Final[dict[str, tuple[str, ...]]] = {
     LIGHT: (),
     BUS: (
-        "aftbed.vehicle.can.libraries",
         "aftbed.runtime.unix.gateway",
         "aftbed.vehicle.drive_real",
         "aftbed.vehicle.replay.player",
+        "cantools",
     ),
 }
 

@@ -1,7 +1,8 @@
-"""How a node of aftbed attaches to the CAN bus: python-can with types, and with its quirks handled.
+"""How a process of aftbed attaches to the CAN bus: `Bus` for frames, `HubLine` for what goes beside them.
 
-`socketcand` is the hub between processes, `virtual` is python-can's bus inside one process, `socketcan`
-is the kernel's (vcan, hardware). Quirks of the socketcand client of python-can 4.6:
+`Bus` is python-can with types, and with its quirks handled. `socketcand` is the hub between processes,
+`virtual` is python-can's bus inside one process, `socketcan` is the kernel's (vcan, hardware). Quirks of the
+socketcand client of python-can 4.6:
 
 1. One read of its socket may yield several frames; it keeps the rest in a buffer of its own. Waiting on
    the descriptor alone misses them. `drain` empties that buffer, so the rule for a node is: drain first,
@@ -23,22 +24,21 @@ answered. In real time, `Schedule` waits until a step is due.
 """
 
 import logging
+import re
 import select
 import socket
 import time
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
-from typing import TYPE_CHECKING, Final, Literal, Protocol
+from typing import Final, Literal, cast
 
 import msgspec
 
 from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.vehicle.can.frame import Frame
-from aftbed.vehicle.can.python_can import lean
-
-if TYPE_CHECKING:
-    import can
+from aftbed.vehicle.can.python_can import can
+from aftbed.vehicle.condition import Condition, Quantity
 
 HOST: Final = "127.0.0.1"
 ATTACH_S_MAX: Final = 5.0
@@ -48,7 +48,11 @@ NEXT_ANSWER_S_MAX: Final = 0.005  # of a function that has just missed one
 GOODBYE_S_MAX: Final = 0.5
 STOP_CHECK_S: Final = 0.05
 OUTSTANDING_MAX: Final = 16
+READ_BYTES_MAX: Final = 4096
 _SOCKET_NAME: Final = "_SocketCanDaemonBus__socket"
+_OK: Final = re.compile(r"< ok (?:(-|[0-9]+) )?>")
+_WATCH: Final = re.compile(r"< watch ([0-9]+) (ttc|gap|speed) (below|above) (-?[0-9.]+) >")
+_CHANGE: Final = re.compile(r"< change ([0-9A-F]{3}) ([+-][0-9]+) >")
 
 Interface = Literal["socketcand", "virtual", "socketcan"]
 
@@ -70,7 +74,7 @@ class BusOptions(msgspec.Struct, frozen=True):
 class Bus:
     """One attachment. Not for use from two threads."""
 
-    def __init__(self, bus: "can.BusABC", sock: socket.socket | None, fd: int | None) -> None:
+    def __init__(self, bus: can.BusABC, sock: socket.socket | None, fd: int | None) -> None:
         self.refused = 0  # frames that cannot be ours: extended, remote, FD
         self.errors = 0  # error frames: the hub refused what we sent
         self._bus = bus
@@ -89,12 +93,10 @@ class Bus:
 
     def send(self, frame: Frame) -> None:
         """Hand `frame` to the bus; its `t_us` stays here, the bus stamps it."""
-        from can import CanError, Message  # noqa: PLC0415 - see open_bus
-
-        message = Message(arbitration_id=frame.can_id, data=frame.data, is_extended_id=False)
+        message = can.Message(arbitration_id=frame.can_id, data=frame.data, is_extended_id=False)
         try:
             self._bus.send(message)
-        except (OSError, CanError) as error:
+        except (OSError, can.CanError) as error:
             raise HarnessError(f"the CAN bus took no frame: {error}") from error
 
     def recv(self, timeout_s: float) -> Frame | None:
@@ -111,7 +113,7 @@ class Bus:
         return self._ready.popleft() if self._ready else None
 
     def drain(self) -> list[Frame]:
-        """All frames that have arrived; nothing is left behind in python-can's buffer."""
+        """All frames that have arrived; none is left in python-can's buffer."""
         if self._fd is None or self._poll.poll(0):
             self._fill()
         frames = list(self._ready)
@@ -141,9 +143,18 @@ class Bus:
             raise HarnessError(f"the CAN bus took no word: {error}") from error
 
     def close(self) -> None:
-        """Leave the bus, once the hub has taken all that was sent."""
+        """Leave the bus, once the hub has taken all that was sent.
+
+        To close on unread data is a reset, which discards what the hub has not read yet: so our direction
+        ends first, and the other is read to its end.
+        """
         if self._socket is not None:
-            _close_gracefully(self._socket)
+            end_s = time.monotonic() + GOODBYE_S_MAX
+            with suppress(OSError):  # gone already, or too slow
+                self._socket.shutdown(socket.SHUT_WR)
+                self._socket.settimeout(GOODBYE_S_MAX)
+                while time.monotonic() < end_s and self._socket.recv(65536):
+                    pass
         self._bus.shutdown()
 
     def _fill(self) -> None:
@@ -151,30 +162,25 @@ class Bus:
         found = False
         while self._take_next(0.0):
             found = True
-        if not found and self._socket is not None and self._ended(self._socket):
-            raise HarnessError("the CAN bus hung up: the hub is gone, or found this node too slow")
-
-    def _ended(self, sock: socket.socket) -> bool:
+        if found or self._socket is None:
+            return
         try:
-            return not sock.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT)
+            ended = not self._socket.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT)
         except BlockingIOError:
-            return False
+            return
         except OSError:
-            return True
+            ended = True
+        if ended:
+            raise HarnessError("the CAN bus hung up: the hub is gone, or found this node too slow")
 
     def _take_next(self, timeout_s: float) -> bool:
         """Take one message from python-can; False if there was none."""
-        from can import CanError  # noqa: PLC0415 - see open_bus
-
         try:
             message = self._bus.recv(timeout_s)
-        except CanError as error:
+        except can.CanError as error:
             raise HarnessError(f"the CAN bus gave no frame: {error}") from error
-        if message is not None:
-            self._sort(message)
-        return message is not None
-
-    def _sort(self, message: "can.Message") -> None:
+        if message is None:
+            return False
         if message.is_error_frame:
             self.errors += 1
         elif message.is_extended_id or message.is_remote_frame or message.is_fd:
@@ -182,24 +188,11 @@ class Bus:
         else:
             t_us = round(message.timestamp * 1e6)
             self._ready.append(Frame(t_us, message.arbitration_id, bytes(message.data)))
-
-
-def _close_gracefully(sock: socket.socket) -> None:
-    """End our direction and read to the end of the other: to close on unread data is a reset, and
-    would take what the hub has not read yet with it."""
-    end_s = time.monotonic() + GOODBYE_S_MAX
-    with suppress(OSError):  # gone already, or too slow to be waited for
-        sock.shutdown(socket.SHUT_WR)
-        sock.settimeout(GOODBYE_S_MAX)
-        while time.monotonic() < end_s and sock.recv(65536):
-            pass
+        return True
 
 
 def open_bus(options: BusOptions) -> Bus:
     """Attach. When this returns, every frame that the bus carries from here on arrives."""
-    lean()
-    import can  # noqa: PLC0415 - a tenth of a second that only a drive needs
-
     if options.interface == "socketcand":
         return _open_hub(options)
     if options.interface == "virtual":
@@ -212,16 +205,11 @@ def open_bus(options: BusOptions) -> Bus:
 
 
 def _open_hub(options: BusOptions) -> Bus:
-    import can  # noqa: PLC0415
-
-    try:  # python-can would knock for ten seconds, without a pause
-        socket.create_connection((HOST, options.port), ATTACH_S_MAX).close()
-    except OSError as error:
-        raise HarnessError(f"no CAN hub at {HOST}:{options.port}: {error}") from error
+    _connect(options, ATTACH_S_MAX).close()  # python-can would retry for ten seconds, without a pause
     # What it logs is either harmless (a frame cut by the end of a read) or raised as well.
     logging.getLogger("can.interfaces.socketcand.socketcand").setLevel(logging.CRITICAL)
     before_s = socket.getdefaulttimeout()
-    socket.setdefaulttimeout(ATTACH_S_MAX)  # its handshake knows no other deadline
+    socket.setdefaulttimeout(ATTACH_S_MAX)  # its handshake has no other deadline
     try:
         bus = can.Bus(
             interface="socketcand", host=HOST, port=options.port, channel=options.channel, tcp_tune=True
@@ -240,22 +228,135 @@ def _open_hub(options: BusOptions) -> Bus:
     return Bus(bus, sock, sock.fileno())
 
 
-class ReceiptChanges(Protocol):
-    """Knows of frames that were received more or less often than they were sent: a `HubLine`."""
+def _connect(options: BusOptions, seconds_max: float) -> socket.socket:
+    try:
+        return socket.create_connection((HOST, options.port), seconds_max)
+    except OSError as error:
+        raise HarnessError(f"no CAN hub at {HOST}:{options.port}: {error}") from error
 
-    disturbed: bool
+
+class HubLine:
+    """The car's line to the hub: it receives no frames, only what is sent beside the bus.
+
+    In lockstep it sets the hub's virtual time. In real time, too, the car looks for the conditions at which
+    faults open (`when ttc < 1.2`), since only the car knows its true state: the hub sends the conditions,
+    the car reports when one holds. The dialogue is described in `hub`.
+
+    What the hub sends of its own accord comes before the answer that it concerns: after the answer to
+    `await`, all changes for those frames are known.
+    """
+
+    def __init__(self, options: BusOptions) -> None:
+        if options.interface != "socketcand":
+            raise ConfigError(f"lockstep needs the hub, interface socketcand, not {options.interface}")
+        self.conditions: dict[int, Condition] = {}  # still to be met, by the number of their faults
+        self.disturbed = False  # by the latest from the hub
+        self.due_us: int | None = None  # when something comes of a fault by itself
+        self._changes: deque[tuple[int, int]] = deque()
+        self._buffer = b""
+        self._elements: deque[str] = deque()
+        self._socket = _connect(options, HUB_ANSWER_S_MAX)
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._poll = select.poll()
+        self._poll.register(self._socket, select.POLLIN)
+        try:
+            self._expect("< hi >")
+            self._ask(f"< open {options.channel} >")
+        except HarnessError:
+            self.close()
+            raise
 
     def fileno(self) -> int:
-        """What to wait on."""
-        ...
+        """What to wait on for changes."""
+        return self._socket.fileno()
 
-    def changes(self) -> list[tuple[int, int]]:
-        """By identifier, by how many."""
-        ...
+    def drives_the_car(self) -> None:
+        """Ask the hub for conditions to look for."""
+        self._ask("< aftbed plant >")
+
+    def set_time(self, t_us: int) -> None:
+        """Return when the hub has taken `t_us` as its time. HarnessError if it does not."""
+        self._ask(f"< aftbed time {t_us} >")
+
+    def carried(self, node: str, frames: int) -> None:
+        """Return when that many frames of `node` have been over the wire since it came."""
+        self._ask(f"< aftbed await {node} {frames} >")
+
+    def met(self, number: int, t_us: int) -> None:
+        """The condition of that fault holds at `t_us` of the drive: return when the hub knows.
+
+        In lockstep, when what begins with it has begun.
+        """
+        self.conditions.pop(number, None)
+        self._ask(f"< aftbed met {number} {t_us} {time.monotonic_ns()} >")
 
     def settle(self) -> None:
-        """Wait for what is on its way."""
-        ...
+        """Return when all that the hub has sent by now is here."""
+        self._send("< echo >")
+        self._expect("< echo >")
+
+    def changes(self) -> list[tuple[int, int]]:
+        """By how many more or fewer nodes a frame was received, by its identifier, as far as it is known."""
+        while self._poll.poll(0):
+            self._read()
+        while self._elements:
+            element = self._elements.popleft()
+            if not self._take_aside(element):
+                raise HarnessError(f"the CAN hub sent {element!r}, unasked")
+        found = list(self._changes)
+        self._changes.clear()
+        return found
+
+    def close(self) -> None:
+        """Disconnect; the time of the hub then stays as it is."""
+        self._socket.close()
+
+    def _ask(self, line: str) -> None:
+        self._send(line)
+        self._expect("< ok >")
+
+    def _send(self, line: str) -> None:
+        try:
+            self._socket.sendall(line.encode("ascii"))
+        except OSError as error:
+            raise HarnessError(f"the CAN hub did not take {line}: {error}") from error
+
+    def _expect(self, line: str) -> None:
+        while True:
+            while not self._elements:
+                self._read()
+            element = self._elements.popleft()
+            if self._take_aside(element):
+                continue
+            answer = _OK.fullmatch(element) if line == "< ok >" else None
+            if answer is None and element != line:
+                raise HarnessError(f"the CAN hub answered {element!r}, expected {line!r}")
+            if answer is not None:
+                self.disturbed = answer[1] is not None
+                self.due_us = int(answer[1]) if answer[1] not in (None, "-") else None
+            return
+
+    def _read(self) -> None:
+        try:
+            data = self._socket.recv(READ_BYTES_MAX)
+        except OSError as error:
+            raise HarnessError(f"the CAN hub gave no answer: {error}") from error
+        if not data:
+            raise HarnessError("the CAN hub hung up")
+        *elements, self._buffer = (self._buffer + data).split(b">")
+        self._elements += [element.decode("ascii", "replace").lstrip() + ">" for element in elements]
+
+    def _take_aside(self, element: str) -> bool:
+        """Take what the hub sends of its own accord; False if `element` is an answer."""
+        if (found := _WATCH.fullmatch(element)) is not None:
+            quantity = cast("Quantity", found[2])
+            self.conditions[int(found[1])] = Condition(quantity, found[3] == "below", float(found[4]))
+        elif (found := _CHANGE.fullmatch(element)) is not None:
+            self._changes.append((int(found[1], 16), int(found[2])))
+        else:
+            return False
+        self.disturbed = True
+        return True
 
 
 class AnswerWatch:
@@ -274,7 +375,7 @@ class AnswerWatch:
         answer_id: int,
         on_frame: Callable[[Frame], None],
         question_id: int = -1,
-        line: ReceiptChanges | None = None,
+        line: HubLine | None = None,
     ) -> None:
         self.answered = 0
         self.missing = 0
@@ -303,7 +404,14 @@ class AnswerWatch:
             frame = self._next(min(rest_s, STOP_CHECK_S))
             if frame is not None and self.take(frame) and mute:
                 end_s = time.monotonic() + NEXT_ANSWER_S_MAX
-        self._judge(self.answered > before, stopped=self._outstanding > 0 and time.monotonic() < end_s)
+        if self._outstanding == 0 or self.answered > before:
+            self._outstanding, self._mute = (
+                0,
+                False,
+            )  # older answers of a function that answers again are lost
+        elif time.monotonic() >= end_s:  # not stopped before
+            self.missing += 1
+            self._mute = True
 
     def take(self, frame: Frame) -> bool:
         """Hand on a frame that was received on the bus; True if it is an answer."""
@@ -316,15 +424,14 @@ class AnswerWatch:
 
     def _owed(self) -> bool:
         """Whether an answer is outstanding, by all that is known about the bus."""
-        if self._line is None:
-            return self._outstanding > 0
-        self._change(self._line)
-        if self._outstanding == 0 and self._line.disturbed:  # more may come than was sent
-            self._line.settle()
-            self._change(self._line)
+        if self._line is not None:
+            self._apply_changes(self._line)
+            if self._outstanding == 0 and self._line.disturbed:  # more may come than was sent
+                self._line.settle()
+                self._apply_changes(self._line)
         return self._outstanding > 0
 
-    def _change(self, line: ReceiptChanges) -> None:
+    def _apply_changes(self, line: HubLine) -> None:
         change = sum(change for can_id, change in line.changes() if can_id in self._ids)
         self._outstanding = max(0, min(self._outstanding + change, OUTSTANDING_MAX))
 
@@ -337,13 +444,6 @@ class AnswerWatch:
             select.select([self._bus.fileno(), self._line.fileno()], [], [], rest_s)
         return frame
 
-    def _judge(self, answered: bool, *, stopped: bool) -> None:
-        if self._outstanding == 0 or answered:  # older answers of a function that answers again are lost
-            self._outstanding, self._mute = 0, False
-        elif not stopped:
-            self.missing += 1
-            self._mute = True
-
 
 class Schedule:
     """A fixed schedule on the wall clock. Late steps are made up for, none is skipped."""
@@ -351,7 +451,7 @@ class Schedule:
     def __init__(self, pace: float) -> None:
         if not pace > 0:
             raise ConfigError(f"pace {pace}, allowed is more than 0")
-        self.lag_ms_max = 0.0  # how late a step was at worst, by the wall clock
+        self.lag_ms_max = 0.0  # the greatest delay of a step, by the wall clock
         self._ns_per_us = 1000 / pace
         self._start_ns = time.monotonic_ns()
 

@@ -143,15 +143,10 @@ class BusModel(ABC, Generic[Node]):
     # -- receivers ------------------------------------------------------------------------------
 
     def add_receiver(self, node: Node) -> None:
-        """From now on `node` receives frames."""
-        self._set_receivers((*self._receivers, node))
+        self._receivers, self._others = (*self._receivers, node), {}
 
     def remove_receiver(self, node: Node) -> None:
-        """`node` receives no frame any more."""
-        self._set_receivers(tuple(other for other in self._receivers if other is not node))
-
-    def _set_receivers(self, receivers: tuple[Node, ...]) -> None:
-        self._receivers, self._others = receivers, {}
+        self._receivers, self._others = tuple(one for one in self._receivers if one is not node), {}
 
     # -- the wire -------------------------------------------------------------------------------
 

@@ -18,12 +18,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, cast
 
 from aftbed.core.errors import ConfigError, PeerError, unknown
 from aftbed.vehicle.can.frame import DATA_LENGTH_MAX
-from aftbed.vehicle.can.python_can import lean
 
 if TYPE_CHECKING:
     from cantools.database.can import Database, Message
@@ -167,31 +167,40 @@ def load_dbc(path: Path | None = None, *, strict: bool = True) -> Codec:
 
     With `strict` False also one whose signals overlap, or lie outside their message: see above.
     """
-    chosen = path or _own_dbc()
-    text = _read(chosen)
+    chosen = path or next((candidate for candidate in _CANDIDATES if candidate.is_file()), None)
+    if chosen is None:
+        raise ConfigError(f"aftbed.dbc is missing, looked at: {', '.join(map(str, _CANDIDATES))}")
     try:
-        database = _parsed(text, strict=strict)
-    except _refusals() as error:
-        raise ConfigError(f"{chosen}: {_explain(error, text)}{_way_out(text, strict=strict)}") from error
+        if chosen.stat().st_size > DBC_BYTES_MAX:
+            raise ConfigError(f"{chosen}: more than {DBC_BYTES_MAX} bytes, not a DBC")
+        text = chosen.read_text(encoding="cp1252")  # what DBC files are written in
+    except OSError as error:
+        raise ConfigError(f"{chosen}: cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{chosen}: not text, at byte {error.start}") from error
+    database, failure = _parse(text, strict=strict)
+    if database is None:
+        assert failure is not None
+        way_out = strict and _parse(text, strict=False)[0] is not None
+        offer = " (a map with `strict: false` takes it as it is)" if way_out else ""
+        raise ConfigError(f"{chosen}: {_explain(failure, text)}{offer}") from failure
     _check_messages(database, chosen, text)
     return Codec(database, chosen, {} if strict else _contradictions(database))
 
 
-def _refusals() -> tuple[type[Exception], ...]:
-    """What cantools raises about a file; the general ones were found by feeding it damaged files."""
+def _parse(text: str, *, strict: bool) -> tuple[Database | None, Exception | None]:
+    """The database, or what cantools raises; the general classes were found by feeding it damaged files."""
+    import_module("aftbed.vehicle.can.python_can")  # before cantools, which imports python-can
+    from cantools.database.can import Database  # noqa: PLC0415 - lazily, see above
     from cantools.errors import Error  # noqa: PLC0415
-    from textparser import ParseError  # noqa: PLC0415  # what cantools' parser raises: has line and column
-
-    return (Error, ParseError, ValueError, LookupError, ArithmeticError, AttributeError, TypeError)
-
-
-def _parsed(text: str, *, strict: bool) -> Database:
-    lean()  # cantools imports python-can
-    from cantools.database.can import Database  # noqa: PLC0415  # lazily, see above
+    from textparser import ParseError  # noqa: PLC0415 - what cantools' parser raises: has line and column
 
     database = Database(strict=strict)
-    database.add_dbc_string(text)
-    return database
+    try:
+        database.add_dbc_string(text)
+    except (Error, ParseError, ValueError, LookupError, ArithmeticError, AttributeError, TypeError) as error:
+        return None, error
+    return database, None
 
 
 def _explain(error: Exception, text: str) -> str:
@@ -206,9 +215,8 @@ def _explain(error: Exception, text: str) -> str:
 
 
 def _line(error: Exception, text: str) -> int:
-    """Where in the file that stands what the reason names: signal, message, attribute, entry; 0: nowhere."""
-    message = re.search(r"message (\w+)", str(error))
-    if message is not None:
+    """The line of the signal, message, attribute or entry that the error names; 0 if there is none."""
+    if message := re.search(r"message (\w+)", str(error)):
         signals = re.search(r"signals? (\w+)(?: and (\w+))?", str(error))
         return _line_of(text, message[1], signals.groups() if signals is not None else ())
     named = str(error.args[0]) if isinstance(error, KeyError) else str(error).rpartition("\n")[2].strip()
@@ -227,67 +235,34 @@ def _line_of(text: str, message: str, signals: tuple[str | None, ...] = ()) -> i
     return found
 
 
-def _way_out(text: str, *, strict: bool) -> str:
-    """What the user can do about it, if anything."""
-    if not strict:
-        return ""
-    try:
-        _parsed(text, strict=False)
-    except _refusals():
-        return ""
-    return " (a map with `strict: false` takes it as it is)"
-
-
 def _contradictions(database: Database) -> dict[str, frozenset[str]]:
     """The messages with signals that overlap or lie outside, each with those that lie outside."""
     from cantools.errors import Error  # noqa: PLC0415
 
-    found: dict[str, frozenset[str]] = {}
-    for message in database.messages:
+    def fits(message: Message) -> bool:
         try:
             message.refresh(strict=True)
         except Error:
-            signals = () if message.is_multiplexed() else message.signals
-            found[message.name] = frozenset(s.name for s in signals if not _fits(message, s))
-    return found
+            return False
+        return True
 
-
-def _fits(message: Message, signal: Signal) -> bool:
-    from cantools.errors import Error  # noqa: PLC0415
-
-    try:
-        _alone(message, signal).refresh(strict=True)
-    except Error:
-        return False
-    return True
+    return {
+        message.name: frozenset(
+            signal.name
+            for signal in (() if message.is_multiplexed() else message.signals)
+            if not fits(_alone(message, signal))
+        )
+        for message in database.messages
+        if not fits(message)
+    }
 
 
 def _alone(message: Message, signal: Signal) -> Message:
-    """The message as if it had this one signal only: so no other can be in its way."""
-    from cantools.database.can import Message as CanMessage  # noqa: PLC0415
-
+    """The message with this signal only, so that no other overlaps it."""
     wide = message.is_extended_frame
-    return CanMessage(
+    return type(message)(
         message.frame_id, message.name, message.length, [signal], is_extended_frame=wide, strict=False
     )
-
-
-def _own_dbc() -> Path:
-    for candidate in _CANDIDATES:
-        if candidate.is_file():
-            return candidate
-    raise ConfigError(f"aftbed.dbc is missing, looked at: {', '.join(map(str, _CANDIDATES))}")
-
-
-def _read(path: Path) -> str:
-    try:
-        if path.stat().st_size > DBC_BYTES_MAX:
-            raise ConfigError(f"{path}: more than {DBC_BYTES_MAX} bytes, not a DBC")
-        return path.read_text(encoding="cp1252")  # what DBC files are written in
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{path}: not text, at byte {error.start}") from error
 
 
 def _check_messages(database: Database, path: Path, text: str) -> None:

@@ -82,12 +82,18 @@ OUTPUT_BYTES_MAX: Final = 256 * 1024
 FRAMES_QUEUED_MAX: Final = 256  # of one client
 
 _SEND: Final = re.compile(rb"< send ([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8}) ([0-9]) ((?:[0-9A-Fa-f]{1,2} ){0,8}) ?")
-_TIME: Final = re.compile(rb"< aftbed time ([0-9]{1,16}) ")
-_NODE: Final = re.compile(rb"< aftbed node ([a-z_][a-z0-9_]{0,31})((?: [0-9A-F]{3}){0,16}) ")
-_AWAIT: Final = re.compile(rb"< aftbed await ([a-z_][a-z0-9_]{0,31}) ([0-9]{1,12}) ")
-_MET: Final = re.compile(rb"< aftbed met ([0-9]{1,12}) ([0-9]{1,16}) ([0-9]{1,20}) ")
-_UNASKED: Final = re.compile(rb"< aftbed unasked ([0-9A-F]{3}) ")
-_NOTICED: Final = re.compile(rb"< aftbed noticed ([0-9A-F]{3}) ([a-z_]{1,32}) ")
+_OURS: Final = {  # elements of aftbed's nodes
+    word: re.compile(rb"< aftbed %b %b" % (word, arguments))
+    for word, arguments in {
+        b"time": rb"([0-9]{1,16}) ",
+        b"node": rb"([a-z_][a-z0-9_]{0,31})((?: [0-9A-F]{3}){0,16}) ",
+        b"await": rb"([a-z_][a-z0-9_]{0,31}) ([0-9]{1,12}) ",
+        b"plant": rb"",
+        b"met": rb"([0-9]{1,12}) ([0-9]{1,16}) ([0-9]{1,20}) ",
+        b"unasked": rb"([0-9A-F]{3}) ",
+        b"noticed": rb"([0-9A-F]{3}) ([a-z_]{1,32}) ",
+    }.items()
+}
 _READABLE: Final = select.EPOLLIN | select.EPOLLHUP | select.EPOLLERR
 
 
@@ -170,9 +176,7 @@ class Hub(BusModel[HubConnection]):
         self._virtual_us = 0
         self._time_master: HubConnection | None = None
         self._plant: HubConnection | None = None  # the car
-        self._awaiting: tuple[HubConnection, str, int] | None = (
-            None  # a client that waits for so many frames of a node
-        )
+        self._awaiting: tuple[HubConnection, str, int] | None = None  # for so many frames of a node
         self._held: dict[int, HubConnection] = {}  # the car, by the number of the fault for which it waits
         self._clients: dict[int, HubConnection] = {}  # by descriptor
         self._epoll = select.epoll()
@@ -187,7 +191,7 @@ class Hub(BusModel[HubConnection]):
             alive = self._attend_all(self._wait())
             if self.disturbed and not self._options.lockstep:
                 self.release(self.now_us())
-            self._carry_due()
+            self.carry(None if self._options.lockstep else self.now_us())
             if self._awaiting is not None:
                 self._answer_await(*self._awaiting)
         self._epoll.unregister(self._life_fd)
@@ -195,7 +199,7 @@ class Hub(BusModel[HubConnection]):
         end_s = time.monotonic() + LAST_FRAMES_S_MAX
         while time.monotonic() < end_s and (events := self._epoll.poll(0, EVENTS_MAX)):
             self._attend_all(events)
-            self._carry_due()
+            self.carry(None if self._options.lockstep else self.now_us())
         return self.counts
 
     def close(self) -> None:
@@ -205,7 +209,7 @@ class Hub(BusModel[HubConnection]):
         self._epoll.close()
 
     def go_on(self, fault_number: int) -> None:
-        """What was to be done at the condition of that fault is done: answer the car that waits for it."""
+        """All actions at the condition of that fault are done: answer the car that waits for it."""
         car = self._held.pop(fault_number, None)
         if car is not None:
             self._send(car, self._ok())
@@ -231,9 +235,6 @@ class Hub(BusModel[HubConnection]):
         if rest_us > 0:  # epoll counts milliseconds, select microseconds, and an epoll can be selected
             select.select([self._epoll], [], [], rest_us / (1e6 * self._options.pace))
         return self._epoll.poll(0, EVENTS_MAX)
-
-    def _carry_due(self) -> None:
-        self.carry(None if self._options.lockstep else self.now_us())
 
     def _attend_all(self, events: list[tuple[int, int]]) -> bool:
         """Serve these events; False when the life of the hub has ended."""
@@ -269,21 +270,18 @@ class Hub(BusModel[HubConnection]):
             raise HarnessError("the bus log took only a part of a line: is the disk full?")
 
     def dequeued(self, node: HubConnection) -> None:
-        """It may have been too full to read more."""
         self._update_interest(node)
 
     def receipts_changed(self, can_id: int, change: int) -> None:
-        """It counts the answers that it waits for."""
         if self._time_master is not None:
             self._send(self._time_master, f"< change {can_id:03X} {change:+d} >".encode("ascii"))
 
     def condition_added(self, number: int, condition: Condition) -> None:
-        """Send it to the car; a car that comes later gets it when it comes."""
+        """Send it to the car; one that attaches later gets it then."""
         if self._plant is not None:
             self._send(self._plant, _watch_element(number, condition))
 
     def faults_acted(self) -> None:
-        """The supervisor keeps the receipts."""
         if self._desk is not None:
             self._desk.faults_acted()
 
@@ -294,59 +292,58 @@ class Hub(BusModel[HubConnection]):
         try:
             if client.raw and element.startswith(b"< send "):
                 self.send(client, parse_send(element, self.now_us()))
+            elif element == b"< echo ":
+                self._send(client, b"< echo >")
+            elif element.startswith(b"< open ") and not client.opened:
+                if element != b"< open %b " % self._options.channel.encode("ascii"):
+                    raise PeerError(f"could not open bus: only {self._options.channel} is here")
+                client.opened = True
+                self._send(client, b"< ok >")
+            elif element == b"< rawmode " and client.opened and not client.raw:
+                client.raw = True
+                self.add_receiver(client)
+                self._send(client, b"< ok >\n", socket.MSG_OOB)
+            elif element.startswith(b"< aftbed ") and client.opened:
+                self._take_ours(client, element)
             else:
-                self._command(client, element)
+                raise PeerError("unknown command, or not now")
         except PeerError as error:
             self._refuse(client, str(error))
 
-    def _command(self, client: HubConnection, element: bytes) -> None:
-        """Everything but a frame."""
-        if element == b"< echo ":
-            self._send(client, b"< echo >")
-        elif element.startswith(b"< open ") and not client.opened:
-            if element != b"< open %b " % self._options.channel.encode("ascii"):
-                raise PeerError(f"could not open bus: only {self._options.channel} is here")
-            client.opened = True
-            self._send(client, b"< ok >")
-        elif element == b"< rawmode " and client.opened and not client.raw:
-            client.raw = True
-            self.add_receiver(client)
-            self._send(client, b"< ok >\n", socket.MSG_OOB)
-        elif element.startswith(b"< aftbed ") and client.opened:
-            self._command_of_ours(client, element)
-        else:
-            raise PeerError("unknown command, or not now")
-
-    def _command_of_ours(self, client: HubConnection, element: bytes) -> None:
-        if (match := _TIME.fullmatch(element)) is not None:
-            self._set_time(client, int(match[1]))
-            self._send(client, self._ok())
-        elif (match := _NODE.fullmatch(element)) is not None:
-            client.name = match[1].decode("ascii")
-            client.uses = frozenset(int(word, 16) for word in match[2].split())
-        elif (match := _AWAIT.fullmatch(element)) is not None:
-            self._awaiting = (client, match[1].decode("ascii"), int(match[2]))
-        elif element == b"< aftbed plant ":
-            self._plant = client
-            self._send(client, b"< ok >" + b"".join(_watch_element(*one) for one in self.conditions()))
-        elif (match := _MET.fullmatch(element)) is not None:
-            self._condition_met(client, *map(int, match.groups()))
-        elif (match := _UNASKED.fullmatch(element)) is not None:
-            if self.disturber is not None:
-                self.receipts_changed(int(match[1], 16), -1)
-        elif (match := _NOTICED.fullmatch(element)) is not None:
-            self.noticed(client.name, int(match[1], 16), match[2].decode("ascii"))
-        else:
-            raise PeerError("unknown command, or not now")
+    def _take_ours(self, client: HubConnection, element: bytes) -> None:
+        word = element.removeprefix(b"< aftbed ").partition(b" ")[0]
+        found = _OURS[word].fullmatch(element) if word in _OURS else None
+        arguments = [text.decode("ascii") for text in found.groups()] if found is not None else []
+        match word, arguments:
+            case b"time", [t_us]:
+                self._set_time(client, int(t_us))
+                self._send(client, self._ok())
+            case b"node", [name, uses]:
+                client.name = name
+                client.uses = frozenset(int(can_id, 16) for can_id in uses.split())
+            case b"await", [node, frames]:
+                self._awaiting = (client, node, int(frames))
+            case b"plant", [] if found is not None:
+                self._plant = client
+                self._send(client, b"< ok >" + b"".join(_watch_element(*one) for one in self.conditions()))
+            case b"met", [number, t_us, since_ns]:
+                self._condition_met(client, int(number), int(t_us), int(since_ns))
+            case b"unasked", [can_id]:
+                if self.disturber is not None:
+                    self.receipts_changed(int(can_id, 16), -1)
+            case b"noticed", [can_id, reason]:
+                self.noticed(client.name, int(can_id, 16), reason)
+            case _:
+                raise PeerError("unknown command, or not now")
 
     def _condition_met(self, car: HubConnection, fault_number: int, t_us: int, since_ns: int) -> None:
-        if not self.met(fault_number, self.now_us()) or self._desk is None:
-            self._send(car, self._ok())
-        elif self._options.lockstep:
+        met = self.met(fault_number, self.now_us())
+        if met and self._desk is not None and self._options.lockstep:
             self._held[fault_number] = car
             self._desk.met(fault_number, t_us, 0)
-        else:
-            self._send(car, self._ok())
+            return
+        self._send(car, self._ok())
+        if met and self._desk is not None:
             self._desk.met(fault_number, t_us, since_ns)
 
     def _ok(self) -> bytes:
@@ -451,7 +448,7 @@ class Hub(BusModel[HubConnection]):
         self._update_interest(client)
 
     def _update_interest(self, client: HubConnection) -> None:
-        """Ask only for the events that can be served: a client with a full queue is not read."""
+        """Wait only for events that can be served: a client with a full queue is not read."""
         interest = select.EPOLLOUT if client.outbox else 0
         if len(client.frames) < FRAMES_QUEUED_MAX:
             interest |= select.EPOLLIN

@@ -10,7 +10,16 @@ from hypothesis import strategies as st
 
 from aftbed.core.application import Characteristics
 from aftbed.core.errors import PeerError
-from aftbed.vehicle.aeb.function import BLIND_MS, AebFunction, default_application, sample_requests
+from aftbed.vehicle.aeb.function import (
+    BLIND_MS,
+    HITS_CONFIRMED,
+    MISSES_MAX,
+    AebFunction,
+    Track,
+    default_application,
+    required_deceleration_ms2,
+    sample_requests,
+)
 from aftbed.vehicle.aeb.messages import (
     STAGE_FULL,
     STAGE_NONE,
@@ -22,8 +31,6 @@ from aftbed.vehicle.aeb.messages import (
     decode_request,
     encode_request,
 )
-from aftbed.vehicle.aeb.threat import required_deceleration_ms2
-from aftbed.vehicle.aeb.tracker import HITS_CONFIRMED, MISSES_MAX, Track
 
 # -- requests
 

@@ -9,10 +9,9 @@ from busharness import DEADLINE_S, RawClient, RunningHub, running_hub
 
 from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.vehicle.can import bus as bus_module
-from aftbed.vehicle.can.bus import AnswerWatch, Bus, BusOptions, Schedule, open_bus
+from aftbed.vehicle.can.bus import AnswerWatch, Bus, BusOptions, HubLine, Schedule, open_bus
 from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.can.hub import HubOptions
-from aftbed.vehicle.can.hub_client import HubLine
 
 ANSWER_ID = 0x100
 

@@ -12,10 +12,9 @@ from busharness import DEADLINE_S, RawClient, RunningHub, running_hub
 from disturbed import FIRST_NUMBER, Disturbed, fault, real, virtual
 from puredrive import CODEC
 
-from aftbed.vehicle.can.bus import BusOptions, open_bus
+from aftbed.vehicle.can.bus import BusOptions, HubLine, open_bus
 from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.can.hub import HubOptions
-from aftbed.vehicle.can.hub_client import HubLine
 
 TRACK, AEB_REQ, EGO, STATUS = (
     CODEC.can_id(name) for name in ("RADAR_TRACK", "AEB_REQ", "EGO_STATE", "BRAKE_STATUS")

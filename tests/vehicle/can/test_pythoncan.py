@@ -18,7 +18,7 @@ print("asammdf" in sys.modules)
 @pytest.mark.parametrize(
     ("module", "act"),
     [
-        ("aftbed.vehicle.can.libraries", ""),
+        ("aftbed.vehicle.can.python_can", ""),
         ("aftbed.vehicle.can.dbc_file", "from aftbed.vehicle.can.dbc_file import load_dbc; load_dbc()"),
         (
             "aftbed.vehicle.can.bus",
