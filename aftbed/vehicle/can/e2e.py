@@ -32,10 +32,10 @@ and per message a window of the last statuses, from which the state of the chann
 
 A frame may be used if it is OK or OK_SOMELOST *and* the channel is VALID: `Receiver.usable`.
 
-The counter alone is not enough. It wraps after 15 frames (16 in P02, 256 in P05), so a loss of exactly
-15 (300 ms at 20 ms) looks like perfect continuity. A timeout in bus time closes the gap: after
-`timeout_us` without a good frame the sequence is void, the window is cleared, the channel is INVALID, and
-the next frame can only start a new sequence (WRONGSEQUENCE). Time is passed in.
+The counter wraps after 15 frames (16 in P02, 256 in P05), so a loss of exactly 15 (300 ms at 20 ms) looks
+like perfect continuity. A timeout in bus time covers that: after `timeout_us` without a good frame the
+sequence is void, the window is cleared, the channel is INVALID, and the next frame can only start a new
+sequence (WRONGSEQUENCE). Time is passed in.
 
 Limits: P01 and P11 may, by the specification, have CRC and counter apart; the library has them side by side,
 so we do. In `alt` of P01 and in P02 a flipped bit of the counter changes which byte of the data id is meant
@@ -45,6 +45,7 @@ repeated. In all others every single flipped bit is found.
 
 from abc import abstractmethod
 from collections import deque
+from collections.abc import Callable, Mapping
 from enum import Enum, auto
 from typing import ClassVar, Final, Literal, assert_never
 
@@ -62,7 +63,6 @@ from e2e.p05 import e2e_p05_check, e2e_p05_protect
 from e2e.p11 import E2E_P11_DATAID_BOTH, E2E_P11_DATAID_NIBBLE, e2e_p11_check, e2e_p11_protect
 
 P01Mode = Literal["both", "alt", "low", "nibble"]
-P11Mode = Literal["both", "nibble"]
 
 DATA_ID_MAX: Final = 0xFFFF
 NIBBLE_ID_MAX: Final = 0x0FFF  # the high nibble would be neither sent nor in the CRC
@@ -86,11 +86,12 @@ class Profile(msgspec.Struct, frozen=True):
 
     counter_count: ClassVar[int] = 15  # values of the counter, from 0; in P01 and P11, 15 is never sent
     counter_mask: ClassVar[int] = 0x0F  # of the byte with the counter
+    crc_bytes: ClassVar[int] = 1
 
     @property
-    @abstractmethod
     def counter_place(self) -> int:
         """The byte of the data that has the counter, the last one of the header."""
+        return self.crc_bytes
 
     @abstractmethod
     def _write_crc(self, frame: bytearray) -> None:
@@ -113,36 +114,34 @@ class Profile(msgspec.Struct, frozen=True):
         """`data` with the header in its place; its other bits stay as they are."""
         assert 0 <= counter < self.counter_count
         assert len(data) >= self.bytes_min
-        frame = bytearray(data)
-        frame[self.counter_place] = data[self.counter_place] & ~self.counter_mask | counter
+        frame, place = bytearray(data), self.counter_place
+        frame[place] = data[place] & ~self.counter_mask | counter
         self._write_crc(frame)
         return bytes(frame)
 
     def is_intact(self, data: bytes) -> bool:
-        """True if CRC, counter value and a sent nibble are right; says nothing about the sequence."""
+        """True if CRC, counter value and a sent nibble are right; the sequence is not checked."""
         return len(data) >= self.bytes_min and self._check(bytearray(data))
 
 
-def _check_data_id(data_id: int, mode: str, offset: int) -> None:
-    """All of these are ours, or were checked."""
-    assert 0 <= data_id <= (NIBBLE_ID_MAX if mode == "nibble" else DATA_ID_MAX)
-    assert offset >= 0
-
-
-class P01(Profile, frozen=True):
-    """Profile 1. `offset`, of the header, is in bytes."""
+class _ProfileWithId(Profile, frozen=True):
+    """`offset`, of the header, is in bytes."""
 
     data_id: int
     mode: P01Mode = "both"
     offset: int = 0
 
     def __post_init__(self) -> None:
-        _check_data_id(self.data_id, self.mode, self.offset)
+        """All of these are ours, or were checked."""
+        assert 0 <= self.data_id <= (NIBBLE_ID_MAX if self.mode == "nibble" else DATA_ID_MAX)
+        assert self.offset >= 0
 
     @property
     def counter_place(self) -> int:
-        return self.offset + 1
+        return self.offset + self.crc_bytes
 
+
+class P01(_ProfileWithId, frozen=True):
     def _write_crc(self, frame: bytearray) -> None:
         mode = _P01_MODES[self.mode]
         e2e_p01_protect(frame, self.data_id, data_id_mode=mode, offset=self.offset, increment_counter=False)
@@ -152,7 +151,7 @@ class P01(Profile, frozen=True):
 
 
 class P02(Profile, frozen=True):
-    """Profile 2, with the list of sixteen data ids of a byte each."""
+    """With the list of sixteen data ids of a byte each."""
 
     counter_count: ClassVar[int] = 16
 
@@ -161,10 +160,6 @@ class P02(Profile, frozen=True):
     def __post_init__(self) -> None:
         assert len(self.data_ids) == LIST_IDS
 
-    @property
-    def counter_place(self) -> int:
-        return 1
-
     def _write_crc(self, frame: bytearray) -> None:
         e2e_p02_protect(frame, self.data_ids, increment_counter=False)
 
@@ -172,21 +167,12 @@ class P02(Profile, frozen=True):
         return e2e_p02_check(frame, self.data_ids)
 
 
-class P05(Profile, frozen=True):
-    """Profile 5. `offset`, of the header, is in bytes."""
+class P05(_ProfileWithId, frozen=True):
+    """Its mode is `both`."""
 
     counter_count: ClassVar[int] = 256
     counter_mask: ClassVar[int] = 0xFF
-
-    data_id: int
-    offset: int = 0
-
-    def __post_init__(self) -> None:
-        _check_data_id(self.data_id, "both", self.offset)
-
-    @property
-    def counter_place(self) -> int:
-        return self.offset + 2
+    crc_bytes: ClassVar[int] = 2
 
     def _write_crc(self, frame: bytearray) -> None:
         e2e_p05_protect(frame, self.data_id, offset=self.offset, increment_counter=False)
@@ -195,19 +181,8 @@ class P05(Profile, frozen=True):
         return e2e_p05_check(frame, self.data_id, offset=self.offset)
 
 
-class P11(Profile, frozen=True):
-    """Profile 11. `offset`, of the header, is in bytes."""
-
-    data_id: int
-    mode: P11Mode = "both"
-    offset: int = 0
-
-    def __post_init__(self) -> None:
-        _check_data_id(self.data_id, self.mode, self.offset)
-
-    @property
-    def counter_place(self) -> int:
-        return self.offset + 1
+class P11(_ProfileWithId, frozen=True):
+    """Its mode is `both` or `nibble`."""
 
     def _write_crc(self, frame: bytearray) -> None:
         mode = _P11_MODES[self.mode]
@@ -215,6 +190,13 @@ class P11(Profile, frozen=True):
 
     def _check(self, frame: bytearray) -> bool:
         return e2e_p11_check(frame, self.data_id, data_id_mode=_P11_MODES[self.mode], offset=self.offset)
+
+
+WITH_ONE_ID: Final[Mapping[str, tuple[Callable[[int, P01Mode, int], Profile], tuple[P01Mode, ...]]]] = {
+    "p01": (P01, ("both", "alt", "low", "nibble")),  # and their modes
+    "p05": (P05, ("both",)),
+    "p11": (P11, ("both", "nibble")),
+}
 
 
 def protect(data: bytes, data_id: int, counter: int) -> bytes:

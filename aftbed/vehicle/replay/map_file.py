@@ -14,15 +14,15 @@ quantity, the length of each message, and the rules for its checksum and counter
 A quantity that the DBC does not have may be given by its place in the data (`raw`), in the DBC's own way of
 counting bits. A target's place beside our path is its `lateral_offset`, or follows from its `angle`.
 
-`bind` checks the whole map against the DBC, so a map that binds cannot fail later: the result has one `Rule`
-per CAN id.
+`bind` checks the whole map against the DBC, so a map that binds cannot fail later: the result has one
+`FrameRule` per CAN id.
 """
 
 import re
 from collections.abc import Mapping
 from math import radians
 from pathlib import Path
-from typing import Annotated, Final, Literal, assert_never
+from typing import Annotated, Final, Literal
 
 import msgspec
 from msgspec import Meta
@@ -36,10 +36,8 @@ from aftbed.vehicle.can.e2e import (
     LIST_ID_MAX,
     LIST_IDS,
     NIBBLE_ID_MAX,
-    P01,
     P02,
-    P05,
-    P11,
+    WITH_ONE_ID,
     P01Mode,
     Profile,
     Supervision,
@@ -270,23 +268,22 @@ class BoundMap(msgspec.Struct, frozen=True):
 
 def find_map(name_or_path: str) -> Path:
     """A shipped map by name, or the path as it is: whatever has a slash or ends in .yaml or .yml."""
-    if "/" in name_or_path or name_or_path.endswith((".yaml", ".yml")):
-        return Path(name_or_path)
-    names = sorted(path.stem for path in SHIPPED.glob("*.yaml"))
-    if name_or_path not in names:
-        raise unknown("map", name_or_path, names)
-    return SHIPPED / f"{name_or_path}.yaml"
+    is_path = "/" in name_or_path or name_or_path.endswith((".yaml", ".yml"))
+    return Path(name_or_path) if is_path else _shipped("map", name_or_path, ".yaml")
 
 
 def find_dbc(name_or_path: str) -> Path:
     """A shipped DBC by name, or the path as it is: whatever has a slash or a dot in it, or is a file."""
     path = Path(name_or_path)
-    if "/" in name_or_path or "." in name_or_path or path.is_file():
-        return path
-    names = sorted(shipped.stem for shipped in SHIPPED.glob("*.dbc"))
-    if name_or_path not in names:
-        raise unknown("DBC", name_or_path, names)
-    return SHIPPED / f"{name_or_path}.dbc"
+    is_path = "/" in name_or_path or "." in name_or_path or path.is_file()
+    return path if is_path else _shipped("DBC", name_or_path, ".dbc")
+
+
+def _shipped(what: str, name: str, ending: str) -> Path:
+    names = sorted(path.stem for path in SHIPPED.glob(f"*{ending}"))
+    if name not in names:
+        raise unknown(what, name, names)
+    return SHIPPED / f"{name}{ending}"
 
 
 def load_mapped(path: Path, dbc: Path) -> Codec:
@@ -300,6 +297,9 @@ def bind(path: Path, dbc: Path) -> BoundMap:
     return _Binding(path, load_dbc(dbc, strict=file.strict), file).bound()
 
 
+Source = EgoMap | TrackMap | OtherMap
+
+
 class _Binding:
     """The checks; each error names the file, the key, what was found and what is allowed."""
 
@@ -311,68 +311,65 @@ class _Binding:
 
     def bound(self) -> BoundMap:
         file, tracks = self._file, self._file.tracks
-        ego = self._ego(file.ego)
-        self._tracks(tracks)
+        ego = self._bind_ego(file.ego)
+        self._bind_tracks(tracks)
         for index, other in enumerate(file.others):
             names = self._names(f"others[{index}].messages", other.messages)
             for number, name in enumerate(names):
-                self._add(f"others[{index}]", other, name, None, number, len(names))
-        if (file.cycle_end is None) == (tracks.count is None):
-            raise self._error("cycle_end", "cycle_end and tracks.count", "exactly one of them")
+                self._add(f"others[{index}]", other, name, number, len(names))
+        self._check_one("cycle_end", "cycle_end and tracks.count", file.cycle_end, tracks.count)
         end = None if file.cycle_end is None else self._mapped("cycle_end", file.cycle_end)
         count = None
         if tracks.count is not None:
             count = self._mapped("tracks.count.message", tracks.count.message)
-            self._whole("tracks.count.signal", tracks.count.message, tracks.count.signal)
+            self._check_whole("tracks.count.signal", tracks.count.message, tracks.count.signal)
         allots = tracks.slot is not None or len(tracks.messages.names()) > SLOTS
         return BoundMap(file, self._codec, self._rules, ego, end, count, allots)
 
-    def _ego(self, ego: EgoMap) -> int:
-        if (ego.message is None) == (ego.can_id is None):
-            raise self._error("ego", "message and can_id", "exactly one of them")
-        if ego.can_id is None:
-            assert ego.message is not None
-            self._message("ego.message", ego.message)
-            can_id = self._add("ego", ego, ego.message, None, 0, 1)
+    def _bind_ego(self, ego: EgoMap) -> int:
+        self._check_one("ego", "message and can_id", ego.message, ego.can_id)
+        if ego.message is not None:
+            self._check_message("ego.message", ego.message)
+            can_id = self._add("ego", ego, ego.message, 0, 1)
         else:
+            assert ego.can_id is not None
             can_id = ego.can_id
             if ego.counter is not None:
                 raise self._error("ego.counter", "a signal", "none, as ego is given by can_id")
-            self._rules[can_id] = self._rule("ego", ego, can_id, None, None, 0, 1)
-        self._quantity("ego.speed", ego.speed, ego.message, ego.length)
+            self._rules[can_id] = self._rule("ego", ego, can_id, None, 0, 1)
+        self._check_quantity("ego.speed", ego.speed, ego.message, ego.length)
         return can_id
 
-    def _tracks(self, tracks: TrackMap) -> None:
+    def _bind_tracks(self, tracks: TrackMap) -> None:
         names = self._names("tracks.messages", tracks.messages)
         if tracks.slot is not None and len(names) > 1:
             raise self._error("tracks.slot", f"a signal, for {len(names)} messages", "one for one message")
         if tracks.count is not None and tracks.slot is None:
             raise self._error("tracks.count", "count without slot", "both, or neither")
-        if (tracks.lateral_offset is None) == (tracks.angle is None):
-            raise self._error("tracks", "lateral_offset and angle", "exactly one of them")
+        self._check_one("tracks", "lateral_offset and angle", tracks.lateral_offset, tracks.angle)
         for number, name in enumerate(names):
-            self._add("tracks", tracks, name, number, number, len(names))
-            self._quantity("tracks.range", tracks.range, name, tracks.length)
-            self._quantity("tracks.relative_speed", tracks.relative_speed, name, tracks.length)
-            if tracks.lateral_offset is not None:
-                self._quantity("tracks.lateral_offset", tracks.lateral_offset, name, tracks.length)
-            if tracks.angle is not None:
-                self._quantity("tracks.angle", tracks.angle, name, tracks.length)
+            self._add("tracks", tracks, name, number, len(names))
+            quantities: tuple[tuple[str, MappedQuantity | None], ...] = (
+                ("range", tracks.range),
+                ("relative_speed", tracks.relative_speed),
+                ("lateral_offset", tracks.lateral_offset),
+                ("angle", tracks.angle),
+            )
+            for key, quantity in quantities:
+                if quantity is not None:
+                    self._check_quantity(f"tracks.{key}", quantity, name, tracks.length)
             if tracks.slot is not None:
-                self._whole("tracks.slot", name, tracks.slot)
-            self._flag("tracks.valid", name, tracks.valid)
-            self._flag("tracks.new", name, tracks.new)
+                self._check_whole("tracks.slot", name, tracks.slot)
+            for key, flag in (("tracks.valid", tracks.valid), ("tracks.new", tracks.new)):
+                if isinstance(flag, Flag):
+                    self._check_whole(f"{key}.signal", name, flag.signal)
+                elif flag is not None:
+                    self._check_signal(key, name, flag)
 
-    def _add(
-        self,
-        key: str,
-        given: EgoMap | TrackMap | OtherMap,
-        name: str,
-        slot: int | None,
-        number: int,
-        of: int,
-    ) -> int:
-        """Make the rule of one message of the DBC, `number` of as many with the same."""
+    # -- rules
+
+    def _add(self, key: str, given: Source, name: str, number: int, of: int) -> int:
+        """Make the rule of one message of the DBC, `number` of as many with the same; its id."""
         can_id, length = self._codec.can_id(name), self._codec.length(name)
         if given.length != length:
             raise self._error(f"{key}.length", str(given.length), f"{length}, as {name} has in the DBC")
@@ -381,20 +378,14 @@ class _Binding:
         if self._codec.multiplexed(name):
             raise self._error(key, f"{name}, which is multiplexed", "a message with the same signals always")
         if given.counter is not None:
-            self._whole(f"{key}.counter.signal", name, given.counter.signal)
-        self._rules[can_id] = self._rule(key, given, can_id, name, slot, number, of)
+            self._check_whole(f"{key}.counter.signal", name, given.counter.signal)
+        self._rules[can_id] = self._rule(key, given, can_id, name, number, of)
         return can_id
 
     def _rule(
-        self,
-        key: str,
-        given: EgoMap | TrackMap | OtherMap,
-        can_id: int,
-        name: str | None,
-        slot: int | None,
-        number: int,
-        of: int,
+        self, key: str, given: Source, can_id: int, name: str | None, number: int, of: int
     ) -> FrameRule:
+        slot = number if isinstance(given, TrackMap) else None
         if not isinstance(given.checksum, E2EMap):
             return FrameRule(can_id, name, given.length, given.checksum, given.counter, None, slot)
         if given.counter is not None:
@@ -419,77 +410,29 @@ class _Binding:
         return Supervision(profile, cycle_ms * 1000, timeout_ms * 1000, length)
 
     def _profile(self, key: str, given: E2EMap, number: int, of: int) -> Profile:
-        mode = given.mode
-        match given.profile:
-            case "p01":
-                data_id = self._data_id(key, given, number, of)
-                return P01(data_id, mode, given.offset)
-            case "p02":
-                ids = given.data_ids
-                if given.data_id is not None or ids is None or len(ids) != LIST_IDS or max(ids) > LIST_ID_MAX:
-                    found = "data_id" if given.data_id is not None else str(list(ids or ()))
-                    raise self._error(f"{key}.data_ids", found, "a list of 16 numbers from 0 to 255")
-                if mode != "both" or given.offset:
-                    raise self._error(key, "mode or offset", "neither, in p02")
-                return P02(bytes(ids))
-            case "p05":
-                if mode != "both":
-                    raise self._error(f"{key}.mode", mode, "both, in p05")
-                return P05(self._data_id(key, given, number, of), given.offset)
-            case "p11":
-                if mode not in ("both", "nibble"):
-                    raise self._error(f"{key}.mode", mode, "both or nibble, in p11")
-                return P11(self._data_id(key, given, number, of), mode, given.offset)
-            case _:
-                assert_never(given.profile)
-
-    def _data_id(self, key: str, given: E2EMap, number: int, of: int) -> int:
-        """Of the one of `of` messages with this number."""
-        if (given.data_id is None) == (given.data_ids is None):
-            raise self._error(key, "data_id and data_ids", "exactly one of them")
-        if given.data_ids is not None and len(given.data_ids) != of:
-            raise self._error(
-                f"{key}.data_ids", f"{len(given.data_ids)} numbers", f"{of}, one for each message"
-            )
-        data_id = given.data_id if given.data_ids is None else given.data_ids[number]
+        """That of the one of `of` messages with this number."""
+        if given.profile == "p02":
+            ids = given.data_ids
+            if given.data_id is not None or ids is None or len(ids) != LIST_IDS or max(ids) > LIST_ID_MAX:
+                found = "data_id" if given.data_id is not None else str(list(ids or ()))
+                raise self._error(f"{key}.data_ids", found, "a list of 16 numbers from 0 to 255")
+            if given.mode != "both" or given.offset:
+                raise self._error(key, "mode or offset", "neither, in p02")
+            return P02(bytes(ids))
+        make, modes = WITH_ONE_ID[given.profile]
+        if given.mode not in modes:
+            raise self._error(f"{key}.mode", given.mode, f"{' or '.join(modes)}, in {given.profile}")
+        self._check_one(key, "data_id and data_ids", given.data_id, given.data_ids)
+        ids = given.data_ids
+        if ids is not None and len(ids) != of:
+            raise self._error(f"{key}.data_ids", f"{len(ids)} numbers", f"{of}, one for each message")
+        data_id = given.data_id if ids is None else ids[number]
         assert data_id is not None
         if given.mode == "nibble" and data_id > NIBBLE_ID_MAX:
             raise self._error(
                 key, f"data id {data_id:#06x}", f"at most {NIBBLE_ID_MAX:#06x} with mode nibble"
             )
-        return data_id
-
-    def _names(self, key: str, messages: Messages) -> list[str]:
-        if messages.last < messages.first:
-            raise self._error(f"{key}.last", str(messages.last), f"{messages.first} (first) or more")
-        for name in messages.names():
-            self._message(f"{key}.name", name)
-        return messages.names()
-
-    def _quantity(self, key: str, quantity: MappedQuantity, name: str | None, length: int) -> None:
-        if (quantity.signal is None) == (quantity.raw is None):
-            raise self._error(key, "signal and raw", "exactly one of them")
-        if quantity.raw is not None:
-            self._raw(f"{key}.raw", quantity.raw, length)
-            return
-        assert quantity.signal is not None
-        if name is None:
-            raise self._error(f"{key}.signal", quantity.signal, "raw, as the message is given by can_id")
-        self._signal(f"{key}.signal", name, quantity.signal)
-        unit = self._codec.unit(name, quantity.signal)
-        if unit not in ("", quantity.unit):
-            raise self._error(f"{key}.unit", quantity.unit, f"{unit}, as {quantity.signal} has in the DBC")
-
-    def _raw(self, key: str, raw: RawSignal, length: int) -> None:
-        end_bit = raw.first_bit() + raw.length_bits
-        if end_bit > 8 * length:
-            raise self._error(key, f"{end_bit} bits", f"at most {8 * length}, by the length")
-
-    def _flag(self, key: str, name: str, flag: str | Flag | None) -> None:
-        if isinstance(flag, Flag):
-            self._whole(f"{key}.signal", name, flag.signal)
-        elif flag is not None:
-            self._signal(key, name, flag)
+        return make(data_id, given.mode, given.offset)
 
     def _mapped(self, key: str, message: str) -> int:
         """The id of a message that has a rule."""
@@ -498,22 +441,50 @@ class _Binding:
             raise ConfigError(f"{self._path}: {key}: {unknown('mapped message', message, ids)}")
         return ids[message]
 
-    def _message(self, key: str, name: str) -> None:
+    # -- names and places
+
+    def _names(self, key: str, messages: Messages) -> list[str]:
+        if messages.last < messages.first:
+            raise self._error(f"{key}.last", str(messages.last), f"{messages.first} (first) or more")
+        for name in messages.names():
+            self._check_message(f"{key}.name", name)
+        return messages.names()
+
+    def _check_quantity(self, key: str, quantity: MappedQuantity, name: str | None, length: int) -> None:
+        self._check_one(key, "signal and raw", quantity.signal, quantity.raw)
+        if quantity.raw is not None:
+            end_bit = quantity.raw.first_bit() + quantity.raw.length_bits
+            if end_bit > 8 * length:
+                raise self._error(f"{key}.raw", f"{end_bit} bits", f"at most {8 * length}, by the length")
+            return
+        assert quantity.signal is not None
+        if name is None:
+            raise self._error(f"{key}.signal", quantity.signal, "raw, as the message is given by can_id")
+        self._check_signal(f"{key}.signal", name, quantity.signal)
+        unit = self._codec.unit(name, quantity.signal)
+        if unit not in ("", quantity.unit):
+            raise self._error(f"{key}.unit", quantity.unit, f"{unit}, as {quantity.signal} has in the DBC")
+
+    def _check_message(self, key: str, name: str) -> None:
         if name not in self._codec.names():
             reason = unknown("message", name, self._codec.names())
             raise ConfigError(f"{self._path}: {key}: {reason}, by {self._codec.path}")
 
-    def _signal(self, key: str, name: str, signal: str) -> None:
+    def _check_signal(self, key: str, name: str, signal: str) -> None:
         if signal not in self._codec.signal_names(name):
             reason = unknown(f"signal of {name}", signal, self._codec.signal_names(name))
             raise ConfigError(f"{self._path}: {key}: {reason}, by {self._codec.path}")
         if signal in self._codec.misfits(name):
             raise self._error(key, f"{signal}, which does not lie in {name}", "a signal that does")
 
-    def _whole(self, key: str, name: str, signal: str) -> None:
-        self._signal(key, name, signal)
+    def _check_whole(self, key: str, name: str, signal: str) -> None:
+        self._check_signal(key, name, signal)
         if not self._codec.whole(name, signal):
             raise self._error(key, f"{signal}, which has a scale", "a whole number")
+
+    def _check_one(self, key: str, names: str, first: object, second: object) -> None:
+        if (first is None) == (second is None):
+            raise self._error(key, names, "exactly one of them")
 
     def _error(self, key: str, found: str, allowed: str) -> ConfigError:
         return ConfigError(f"{self._path}: {key}: found {found}, allowed is {allowed}")

@@ -12,19 +12,19 @@ the cycle ends with the last of them, or at once if there are none; one that lac
 announcement, and makes its request out of what came.
 """
 
+from collections.abc import Mapping
 from math import cos, isfinite, sin
 from pathlib import Path
 from typing import Final
 
 import msgspec
 
-from aftbed.vehicle.aeb.messages import SPEED_MAX_MS, AebInput, AebTarget, encode_request
+from aftbed.vehicle.aeb.messages import SLOTS, SPEED_MAX_MS, AebInput, AebTarget, encode_request
 from aftbed.vehicle.can.dbc_file import Codec
 from aftbed.vehicle.can.e2e import Receiver
 from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.gateway import BusGateway, target_of
 from aftbed.vehicle.replay.map_file import Flag, FrameRule, bind
-from aftbed.vehicle.replay.slots import SlotBook
 
 FRESH_CYCLES: Final = 1.5  # a log's time stamps come in batches, so a cycle may look longer than it was
 
@@ -32,6 +32,36 @@ FRESH_CYCLES: Final = 1.5  # a log's time stamps come in batches, so a cycle may
 def toyota_checksum(can_id: int, data: bytes) -> int:
     """Of a frame of Toyota's: the sum of its length, the bytes of its id and all data but the last byte."""
     return (len(data) + (can_id >> 8) + (can_id & 0xFF) + sum(data[:-1])) & 0xFF
+
+
+class SlotBook:
+    """Which of the function's `SLOTS` slots an object has, where the radar numbers more objects than slots.
+
+    Of the objects in our path the nearest ones get a slot each: the others cannot be hit before them. An
+    object keeps its slot while it is seen, and until another needs it, so a moment in which it is not seen
+    has no effect; the one that was not seen for longest gives way. A target in a slot of another object is
+    marked new.
+    """
+
+    def __init__(self) -> None:
+        self._slots: dict[int, int] = {}  # by object; those not seen for longest come first
+
+    def assign(self, seen: Mapping[int, AebTarget]) -> tuple[AebTarget, ...]:
+        """The targets of one cycle, by object; those that get a slot, by slot."""
+        nearest = sorted(seen, key=lambda number: (seen[number].range_m, number))[:SLOTS]
+        known = [number for number in nearest if number in self._slots]
+        for number in known:
+            self._slots[number] = self._slots.pop(number)
+        found = {self._slots[number]: seen[number] for number in known}
+        for number in nearest:
+            if number not in known:
+                taken = set(self._slots.values())
+                slot = next((slot for slot in range(SLOTS) if slot not in taken), None)
+                if slot is None:
+                    slot = self._slots.pop(next(iter(self._slots)))
+                self._slots[number] = slot
+                found[slot] = msgspec.structs.replace(seen[number], new=True)
+        return tuple(msgspec.structs.replace(found[slot], slot=slot) for slot in sorted(found))
 
 
 class SeenTrack(msgspec.Struct, frozen=True):
@@ -94,17 +124,14 @@ class MappedGateway(BusGateway):
             return "checksum"
         signals = self._bound.codec.decode(rule.name, frame.data) if rule.name is not None else {}
         counter = int(signals[rule.counter.signal]) if rule.counter else None
-        if rule.counter and not self._continues(rule.can_id, counter, rule.counter.modulo):
+        last = self._counters.get(rule.can_id)  # lost frames between them are no reason to refuse this one
+        if rule.counter and counter is not None and (counter >= rule.counter.modulo or counter == last):
             return "repeated"
         if not self._take(frame, rule, signals):
             return "range"
         if counter is not None:
             self._counters[rule.can_id] = counter
         return None
-
-    def _continues(self, can_id: int, counter: int | None, modulo: int) -> bool:
-        """True unless it is the same frame again. Lost frames are no reason to refuse the next."""
-        return counter is not None and counter < modulo and counter != self._counters.get(can_id)
 
     def _take(self, frame: Frame, rule: FrameRule, signals: dict[str, float]) -> bool:
         """Keep a track or the ego speed. False, and nothing kept, if a value is beyond any sensor."""
@@ -126,24 +153,21 @@ class MappedGateway(BusGateway):
         target = None
         if tracks.valid is None or _is_set(tracks.valid, signals):
             new = tracks.new is not None and _is_set(tracks.new, signals)
-            distance_m, lateral_m = self._place(signals, frame.data)
-            target = target_of(0, distance_m, tracks.relative_speed.si(signals, frame.data), new)
-            if target is None or not isfinite(lateral_m):
+            ahead_m = tracks.range.si(signals, frame.data)
+            if tracks.angle is None:
+                assert tracks.lateral_offset is not None
+                beside_m = tracks.lateral_offset.si(signals, frame.data)
+            elif isfinite(angle := tracks.angle.si(signals, frame.data)):
+                ahead_m, beside_m = ahead_m * cos(angle), ahead_m * sin(angle)
+            else:
                 return False
-            if abs(lateral_m) > self._bound.map.lane_half_width_m:
+            target = target_of(0, ahead_m, tracks.relative_speed.si(signals, frame.data), new)
+            if target is None or not isfinite(beside_m):
+                return False
+            if abs(beside_m) > self._bound.map.lane_half_width_m:
                 target = None
         self._tracks[number] = SeenTrack(frame.t_us, target)
         return True
-
-    def _place(self, signals: dict[str, float], data: bytes) -> tuple[float, float]:
-        """How far ahead and how far beside us, in metres."""
-        tracks = self._bound.map.tracks
-        range_m = tracks.range.si(signals, data)
-        if tracks.angle is None:
-            assert tracks.lateral_offset is not None
-            return range_m, tracks.lateral_offset.si(signals, data)
-        angle = tracks.angle.si(signals, data)
-        return (range_m * cos(angle), range_m * sin(angle)) if isfinite(angle) else (range_m, angle)
 
     def _announce(self, t_us: int) -> bytes | None:
         """A new cycle: the one before ends now if it lacks something, the new one if it will have nothing."""
@@ -156,17 +180,15 @@ class MappedGateway(BusGateway):
         """`empty`: the radar has announced no objects, which is not the same as no frame of the radar."""
         fresh_us = round(FRESH_CYCLES * self._bound.map.cycle_ms * 1000)
         fresh = {number: seen for number, seen in self._tracks.items() if t_us - seen.t_us <= fresh_us}
-        targets = self._slotted({n: seen.target for n, seen in fresh.items() if seen.target is not None})
+        found = {number: seen.target for number, seen in fresh.items() if seen.target is not None}
+        if self._book is not None:
+            targets = self._book.assign(found)
+        else:
+            targets = tuple(msgspec.structs.replace(found[number], slot=number) for number in sorted(found))
         self._tracks.clear()
         known = self._ego is not None and t_us - self._ego[0] <= self._bound.map.ego.timeout_ms * 1000
         speed_ms = self._ego[1] if self._ego is not None and known else 0.0
         return encode_request(AebInput(t_us // 1000, speed_ms, known, bool(fresh) or empty, targets))
-
-    def _slotted(self, found: dict[int, AebTarget]) -> tuple[AebTarget, ...]:
-        """The targets, by number, in the function's slots."""
-        if self._book is not None:
-            return self._book.assign(found)
-        return tuple(msgspec.structs.replace(found[number], slot=number) for number in sorted(found))
 
 
 def _is_set(flag: str | Flag, signals: dict[str, float]) -> bool:

@@ -24,7 +24,7 @@ PROFILES: list[Profile] = [
     *(P01(0x123, mode, offset) for mode in ("both", "alt", "low", "nibble") for offset in (0, 6)),
     P02(LIST),
     P05(0x1234),
-    P05(0x1234, 5),
+    P05(0x1234, offset=5),
     *(P11(0x123, mode, offset) for mode in ("both", "nibble") for offset in (0, 3)),
 ]
 MARKED = [pytest.param(profile, id=repr(profile)) for profile in PROFILES]
@@ -67,10 +67,10 @@ def test_check_values_of_the_standards() -> None:
         (P11(0x123, "nibble"), 8, 1, "7711000000000000"),
         # PRS E2E R20-11, 6.6.5, tables 6.47 and 6.48: data id 0x1234, header at byte 0 and at byte 8.
         (P05(0x1234), 8, 0, "1cca000000000000"),
-        (P05(0x1234, 8), 16, 0, "00000000000000002891000000000000"),
+        (P05(0x1234, offset=8), 16, 0, "00000000000000002891000000000000"),
         # The library's own tests: the counter 1; and P02, with sixteen zeros for data ids.
         (P05(0x1234), 8, 1, "cf8d010000000000"),
-        (P05(0x1234, 8), 16, 1, "0000000000000000fbd6010000000000"),
+        (P05(0x1234, offset=8), 16, 1, "0000000000000000fbd6010000000000"),
         (P02(bytes(16)), 8, 1, "4501000000000000"),
     ],
 )

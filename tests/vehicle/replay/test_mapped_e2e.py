@@ -54,7 +54,7 @@ PROFILES: list[tuple[str, tuple[Profile, Profile]]] = [
     ("{profile: p01, data_id: 0x9, mode: alt, offset: 2}", (P01(9, "alt", 2),) * 2),
     ("{profile: p01, data_id: 0x9, mode: low}", (P01(9, "low"),) * 2),
     (f"{{profile: p02, data_ids: {list(IDS)}}}", (P02(IDS),) * 2),
-    ("{profile: p05, data_id: 65535, offset: 1}", (P05(65535, 1),) * 2),
+    ("{profile: p05, data_id: 65535, offset: 1}", (P05(65535, offset=1),) * 2),
     ("{profile: p11, data_id: 0x123, mode: nibble, offset: 1}", (P11(0x123, "nibble", 1),) * 2),
     ("{profile: p11, data_id: 0x123, timeout_ms: 700}", (P11(0x123),) * 2),
 ]

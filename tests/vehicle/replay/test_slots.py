@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from aftbed.vehicle.aeb.messages import SLOTS, AebInput, AebTarget, decode_request, encode_request
-from aftbed.vehicle.replay.slots import SlotBook
+from aftbed.vehicle.replay.mapped_gateway import SlotBook
 
 
 def seen(*numbers: int, start_m: float = 10.0) -> dict[int, AebTarget]:
