@@ -80,7 +80,7 @@ def leader_of(graph: Graph) -> str:
     for link in graph.links:
         if link.source == "proxy" and link.source_port == "pxy2pro" and not link.standby:
             return link.sink.partition("/")[0]
-    raise AssertionError("a graph whose Proxy is bound to nobody")
+    raise AssertionError("a graph whose Proxy is bound to no replica")
 
 
 def target(graph: Graph, expression: str) -> Graph:

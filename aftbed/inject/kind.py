@@ -288,6 +288,6 @@ def strike(injection: Injection, run: RunControl) -> Sequence[TargetProcess]:
     if found:
         run.record_strike(injection)
     else:
-        injection.receipt = Receipt(ReceiptState.NOT_ACTIVATED, "nobody to hit")
+        injection.receipt = Receipt(ReceiptState.NOT_ACTIVATED, "no process to hit")
         run.log(injection)
     return found

@@ -99,7 +99,7 @@ class BusReport(msgspec.Struct, frozen=True):
             return "took hold, of no frame"
         many = f"{self.frames} frame{'s' if self.frames > 1 else ''}"
         first = f"{'the first ' if self.frames > 1 else ''}at {self.first_us / 1e6:.6f} s"
-        known = f"noticed by {self.noticed}" if self.noticed else "noticed by nobody"
+        known = f"noticed by {self.noticed}" if self.noticed else "not noticed"
         if self.believed and not self.noticed:
             known = f"believed by {self.believed}"
         return f"{many}, {first}, id {self.first_id:03X}; {known}"

@@ -152,8 +152,8 @@ class Adaptations:
         if self._executor.busy or alone or replacing or not deployment.lives(ENGINE):
             if deployment.graph.ftm == "none" or not retries or not deployment.leader:
                 raise ConfigError(
-                    f"{deployment.graph.ftm}: no adaptation now: leader {deployment.leader or 'nobody'},"
-                    f" backup {deployment.backup or 'nobody'}, engine"
+                    f"{deployment.graph.ftm}: no adaptation now: leader {deployment.leader or 'none'},"
+                    f" backup {deployment.backup or 'none'}, engine"
                     f" {'there' if deployment.lives(ENGINE) else 'not there'}"
                 )
             self._loop.after(RETRY_SECONDS, lambda: self._ask_again(goal, answer, retries - 1))

@@ -178,7 +178,7 @@ class FaultController:
         node = "" if brick is None else roles.graph.node_of(brick)
         if brick is None or not deployment.lives(node):
             does = f"emits {fault.event}" if fault.event else "sends there"
-            raise NoHost(f"{fault}: nobody {does} now")
+            raise NoHost(f"{fault}: no process {does} now")
         by_itself = fault.action.emitter_may_act and node in self._nodes_of(fault.target)
         emitters = targets.emitters_in(roles.graph, fault.event, node) if fault.event else 1
         injection.move_in(deployment.nodes[node], brick, emitters, self._loop.now_ns(), by_itself=by_itself)
@@ -352,7 +352,7 @@ class FaultController:
         self._forget_dead()
         process = self._process_of(brick)
         if process is None or not process.alive:
-            raise StepFailed("nobody to hit")
+            raise StepFailed("no process to hit")
         if process not in self._shared:
             memory = self._runtime.shared_memory()
             shared = SharedState(injection.number, brick, process.journal, memory.memory)

@@ -148,8 +148,9 @@ class RunController:
     def inform_recovery(self, *, failed: bool) -> None:
         """Tell it how things are; it may act again."""
         deployment = self.deployment
-        roles = f"{deployment.leader or 'nobody'} leads, {deployment.backup or 'nobody'} backs up"
-        self._runtime.log("roles", f"{roles}, epoch {deployment.epoch}")
+        leads = f"{deployment.leader} leads" if deployment.leader else "no leader"
+        backs_up = f"{deployment.backup} backs up" if deployment.backup else "no backup"
+        self._runtime.log("roles", f"{leads}, {backs_up}, epoch {deployment.epoch}")
         if self.executor.busy or not deployment.lives("recovery") or self.ending:
             return
         situation = self.executor.situation(failed=failed)

@@ -46,7 +46,7 @@ def test_a_bitflip_without_an_event_waits_for_the_next_execution(run: Run) -> No
 
 def test_a_fault_that_nobody_can_wait_for_is_refused_and_stays_so(run: Run) -> None:
     run.deployment.backup = ""
-    with pytest.raises(StepFailed, match=r"nobody emits checkpoint\.applied now"):
+    with pytest.raises(StepFailed, match=r"no process emits checkpoint\.applied now"):
         run.arm("crash backup at checkpoint.applied")
     run.deployment.backup = "b"
     run.do(run.faults.rearm())

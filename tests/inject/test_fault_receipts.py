@@ -188,4 +188,4 @@ def test_a_crash_is_activated_when_its_target_is_seen_dead(run: Run) -> None:
 def test_nobody_to_hit_is_said(run: Run) -> None:
     run.deployment.backup = ""
     fault = run.arm("crash backup")
-    assert run.reports() == [(str(fault), "not_activated", "nobody to hit")]
+    assert run.reports() == [(str(fault), "not_activated", "no process to hit")]

@@ -163,7 +163,7 @@ def test_a_bad_policy_starts_nothing(home: Home, tmp_path: Path, text: str, word
         (("--policy", "absent.yaml"), "absent.yaml: cannot be read"),
         (("--policy", "value-faults", "--approve", "auto-matic"), "unknown approval"),
         (("--policy", "value-faults", "--approve", "ask"), "standard input is no terminal"),
-        (("--policy", "value-faults", "--approve", "ask", "--json"), "nobody would see the question"),
+        (("--policy", "value-faults", "--approve", "ask", "--json"), "--json prints no question"),
         (("--policy", "value-faults", "--ftm", "none"), "none has no Engine"),
         (("--approve", "ask"), "give --policy too"),
     ],

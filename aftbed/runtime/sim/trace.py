@@ -127,7 +127,7 @@ def lines(trace: Trace) -> Iterator[str]:
     for one in trace.happened:
         yield f"{milliseconds(one.t_ns):.6f} {_line(one)}"
     rest = trace.run.rest
-    ended = (f"end leader={rest.leader or 'nobody'}", "lost" if rest.lost else "", "; ".join(rest.why_not))
+    ended = (f"end leader={rest.leader or 'none'}", "lost" if rest.lost else "", "; ".join(rest.why_not))
     yield f"{milliseconds(rest.ended_ns):.6f} {' '.join(filter(None, ended))}"
 
 

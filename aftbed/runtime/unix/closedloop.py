@@ -108,14 +108,14 @@ def asked_for(policy: str | None, approve: str, ftm: str, *, as_json: bool) -> P
         raise unknown("approval", approve, APPROVALS)
     if policy is None:
         if approve != APPROVALS[0]:
-            raise ConfigError("--approve says who decides on what a policy proposes: give --policy too")
+            raise ConfigError("--approve says what becomes of the proposals of a policy: give --policy too")
         return None
     if ftm == NONE:
         raise ConfigError(f"--policy {policy}: {NONE} has no Engine, so nothing leads away from it")
     if approve == "ask" and as_json:
-        raise ConfigError("--approve ask: with --json nobody would see the question")
+        raise ConfigError("--approve ask: --json prints no question; leave one of them out")
     if approve == "ask" and not sys.stdin.isatty():
-        raise ConfigError("--approve ask: standard input is no terminal, so nobody can be asked")
+        raise ConfigError("--approve ask: standard input is no terminal, so no question can be answered")
     return load_policy(policy)
 
 

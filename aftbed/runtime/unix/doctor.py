@@ -324,5 +324,5 @@ def _steal() -> HostCheck:
 def _load() -> HostCheck:
     load, count = os.getloadavg()[0], os.cpu_count() or 1
     status: Status = "ok" if load < count else "warning"
-    serves = "benches: nobody else runs"
+    serves = "benches: nothing else runs"
     return _check("load", status, f"{load:.1f} on {count} CPUs", serves, "measure when nothing else runs")

@@ -403,7 +403,7 @@ class UnixIO(NodeIO[Inlet, int]):
                     continue
             else:
                 return
-        raise BrokenPipeError(f"{hosted.name}: {port} is shut or nobody reads it")
+        raise BrokenPipeError(f"{hosted.name}: {port} is shut or has no reader")
 
     # -- orders -------------------------------------------------------------------------------
 

@@ -226,7 +226,7 @@ class _Worker:
         os.close(self.pidfd)
 
     def _asked(self) -> int:
-        assert self.number is not None, "somebody has asked it"
+        assert self.number is not None, "only a process that was given work is named"
         return self.number
 
 

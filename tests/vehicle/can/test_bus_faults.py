@@ -134,7 +134,7 @@ def test_a_radar_that_sees_far_and_well_protected_is_a_crash(sound: Disturbed) -
 def test_a_frame_that_no_node_uses_is_struck_and_that_is_all() -> None:
     drive = virtual("corrupt bus BRAKE_STATUS bit 40 permanent")
     assert drive.struck[0].receipt.state.value == "applied"
-    assert drive.struck[0].receipt.detail.endswith("noticed by nobody")
+    assert drive.struck[0].receipt.detail.endswith("not noticed")
 
 
 def test_the_brake_ecu_refuses_a_stuck_counter_and_falls_back() -> None:
