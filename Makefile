@@ -27,7 +27,7 @@ help:
 	@echo "make fast     the tests without real runs"
 	@echo "make process  the tests that start real runs: a sample of their combinations"
 	@echo "make deep     the exhaustive tests, one after the other: hours"
-	@echo "make bench    every figure of docs/numbers.md"
+	@echo "make bench    every figure of docs/numbers.md, written into its table: ten minutes"
 
 # Where the tests are installed, the package is too: then the demo needs nothing more.
 demo: $(if $(wildcard $(EDITABLE)),$(EDITABLE),$(PLAIN))
@@ -50,23 +50,7 @@ deep: $(EDITABLE)
 	$(BIN)/python -m pytest -m deep
 
 bench: $(EDITABLE)
-	$(BIN)/aftbed bench cycle --ftm pbr --json
-	$(BIN)/aftbed bench cycle --ftm pbr --placement replica --json
-	$(BIN)/aftbed bench cycle --ftm none --json
-	$(BIN)/aftbed bench cycle --ftm lfr --json
-	$(BIN)/aftbed bench cycle --ftm pbr+tr --json
-	$(BIN)/aftbed bench cycle --ftm lfr+tr --json
-	$(BIN)/aftbed bench adapt --from pbr --to pbr+tr --json
-	$(BIN)/aftbed bench adapt --from pbr --to lfr --json
-	$(BIN)/aftbed bench adapt --from pbr --to pbr+tr --recipe paper --json
-	$(BIN)/aftbed bench recovery --ftm pbr --json
-	$(BIN)/aftbed bench recovery --ftm pbr --placement replica --json
-	$(BIN)/aftbed bench recovery --ftm lfr --json
-	$(BIN)/aftbed bench launch --ftm pbr --json
-	$(BIN)/aftbed bench memory --ftm pbr --json
-	$(BIN)/aftbed bench hops --ftm pbr --json
-	$(BIN)/aftbed bench campaign --json
-	$(BIN)/aftbed bench campaign --sim --experiments 4000 --json
+	$(BIN)/aftbed bench all --into docs/numbers.md
 
 # -- installation: a stamp each, so that a second `make` installs only what has changed ------------
 

@@ -1,7 +1,8 @@
 """The time from the start of the command to the first reply, and that of the graph alone.
 
 The command is started as a user would start it, in an interpreter of its own. `graph_ms` is the time from a
-warm zygote with parked spares to the answer of the last node.
+warm zygote with parked spares to the answer of the last node. `imports_ms` is the limit: an interpreter that
+only imports the libraries that a run needs, started in turn with the command.
 """
 
 import json
@@ -18,23 +19,23 @@ from aftbed.core.journal import EntryKind
 from aftbed.judge.record import read_record
 
 RUN_SECONDS_MAX: Final = 30.0
+IMPORTS: Final = "import can, cantools, msgspec, typer"
 
 
 def bench_launch(ftm: str, placement: str, runs: int) -> dict[str, object]:
-    """`launch_ms{p50,max}` and `graph_ms{p50,max}` of `runs` starts of `aftbed run`."""
-    launches: list[float] = []
-    graphs: list[float] = []
+    """`launch_ms{p50,max}`, `graph_ms{...}` and `imports_ms{...}` of `runs` starts of `aftbed run`."""
+    found: dict[str, list[float]] = {"launch_ms": [], "graph_ms": [], "imports_ms": []}
     for _ in range(runs):
-        launch_ms, graph_ms = _once(ftm, placement)
-        launches.append(launch_ms)
-        graphs.append(graph_ms)
-    return {
-        "ftm": ftm,
-        "placement": placement,
-        "runs": runs,
-        "launch_ms": _p50_max(launches),
-        "graph_ms": _p50_max(graphs),
-    }
+        for name, value in zip(found, (*_once(ftm, placement), _imports_ms()), strict=True):
+            found[name].append(value)
+    about: dict[str, object] = {"ftm": ftm, "placement": placement, "runs": runs}
+    return about | {name: _p50_max(values) for name, values in found.items()}
+
+
+def _imports_ms() -> float:
+    began_ns = time.monotonic_ns()
+    subprocess.run([sys.executable, "-c", IMPORTS], timeout=RUN_SECONDS_MAX, check=True)
+    return (time.monotonic_ns() - began_ns) / 1e6
 
 
 def _p50_max(values: list[float]) -> dict[str, float]:

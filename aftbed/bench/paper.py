@@ -22,7 +22,7 @@ are decided once.
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from typing import Final, ParamSpec, TypeVar
+from typing import Final, ParamSpec
 
 import msgspec
 
@@ -39,7 +39,7 @@ from aftbed.bench.resources import (
     process_count,
     under_load,
 )
-from aftbed.bench.runs import Percentiles, percentiles
+from aftbed.bench.runs import Found, Log, Percentiles, percentiles, tried
 from aftbed.bench.sweep import PLACEMENT, StateResult, sized, sweep_sizes
 from aftbed.campaign.ledger import Environment, here
 from aftbed.core.errors import ConfigError, HarnessError
@@ -48,15 +48,12 @@ from aftbed.core.script import RECIPES
 from aftbed.search.road_table import speed_left_ms
 from aftbed.vehicle.plant import GRAVITY_MS2, KMH_PER_MS
 
-TRIES: Final = 3
 CYCLES: Final = ("pbr", "lfr", "pbr+tr", "lfr+tr")
 BASE, COMPOSED, SWITCHED = "pbr", "pbr+tr", "lfr"
 UPDATED_BYTES: Final = 1000  # the state that moves when the function is updated
 STATE_FTMS: Final = ("pbr", "lfr")
 LOAD_PLACEMENTS: Final = PLACEMENTS[:2]
 
-Log = Callable[[str], None]
-Found = TypeVar("Found")
 Params = ParamSpec("Params")
 
 
@@ -288,18 +285,6 @@ def bench_paper(effort: Effort, log: Log) -> Paper:
         notes=(*NOT_SOURCED, fate),
         seconds=round(time.monotonic() - began, 1),
     )
-
-
-def tried(what: str, measure: Callable[[], Found], log: Log) -> Found:
-    """What `measure` gives. Raises HarnessError after TRIES failures."""
-    reason = ""
-    for _ in range(TRIES):
-        log(f"{what}, again ({reason})" if reason else what)
-        try:
-            return measure()
-        except (HarnessError, ConfigError) as error:  # a run that died refuses like one that never was
-            reason = str(error)
-    raise HarnessError(f"{what}: failed {TRIES} times, the last time: {reason}")
 
 
 class _Measurements:

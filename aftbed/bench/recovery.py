@@ -2,8 +2,14 @@
 
 Each kill takes the whole replica (all nodes of its chain), as the crash of an ECU would. The next kill
 waits until redundancy is back. Times are from the journals, whose clock is common to all processes.
+
+`death_ms` is the limit of any detection: from SIGKILL of a process to the moment at which another one that
+polls its pidfd sees that it is dead. It is measured in the same command, before and after the kills.
 """
 
+import os
+import select
+import signal
 import time
 from pathlib import Path
 from typing import Final
@@ -14,14 +20,16 @@ from aftbed.inject.crash import Crash
 from aftbed.inject.model import Fault
 from aftbed.inject.timing import Trigger
 from aftbed.judge.checks import failovers
-from aftbed.runtime.unix import control_client
+from aftbed.runtime.unix import control_client, linux
 
 REDUNDANCY_SECONDS_MAX: Final = 5.0
 PAUSE_SECONDS: Final = 0.02  # of undisturbed service between two kills
+DEATHS: Final = 25  # before the kills, and as many after them
 
 
 def bench_recovery(ftm: str, placement: str, kills: int, *, pin: bool = True) -> dict[str, object]:
     """`recovery_ms{p50,p99,max}`, the same without detection, and its parts: see `docs/commands.md`."""
+    deaths = [death_ms() for _ in range(DEATHS)]
     with endless_run(ftm, placement, pin=pin) as run:
         epoch = 0
         for _ in range(kills):
@@ -30,6 +38,7 @@ def bench_recovery(ftm: str, placement: str, kills: int, *, pin: bool = True) ->
                 run.private, control_client.InjectCommand(Fault(Crash(), "primary", Trigger()))
             )
         _wait_for_redundancy(run.private, epoch)
+    deaths += [death_ms() for _ in range(DEATHS)]
     parts: dict[str, list[float]] = {"detection": [], "fencing": [], "promotion": [], "first_reply": []}
     recovered = []
     for f in failovers(run.record.history):
@@ -49,7 +58,46 @@ def bench_recovery(ftm: str, placement: str, kills: int, *, pin: bool = True) ->
         "recovery_ms": summary(recovered, 3),
         "after_detection_ms": summary([r - d for r, d in zip(recovered, parts["detection"], strict=True)], 3),
         "parts_ms": {name: summary(values, 3) for name, values in parts.items()},
+        "death_ms": summary(deaths, 3),
     }
+
+
+def death_ms() -> float:
+    """From SIGKILL of a process to the death that another process reads from its pidfd."""
+    parent = os.getpid()
+    victim = os.fork()
+    if victim == 0:
+        try:
+            linux.die_with(parent)
+            signal.pause()
+        finally:
+            os._exit(0)
+    reader, writer = os.pipe()
+    watcher = os.fork()
+    if watcher == 0:
+        try:
+            linux.die_with(parent)
+            poll = select.poll()
+            poll.register(os.pidfd_open(victim), select.POLLIN)
+            os.write(writer, bytes(8))  # it is ready
+            poll.poll()
+            os.write(writer, time.monotonic_ns().to_bytes(8, "little"))
+        finally:
+            os._exit(0)
+    os.close(writer)
+    try:
+        ready = os.read(reader, 8)
+        time.sleep(POLL_SECONDS)  # until it polls
+        killed_ns = time.monotonic_ns()
+        os.kill(victim, signal.SIGKILL)
+        seen = os.read(reader, 8) if ready else b""
+    finally:
+        os.close(reader)
+        os.waitpid(watcher, 0)
+        os.waitpid(victim, 0)
+    if not seen:
+        raise HarnessError("the process that waited for the death of another died")
+    return (int.from_bytes(seen, "little") - killed_ns) / 1e6
 
 
 def _wait_for_redundancy(private: Path, epoch: int) -> int:

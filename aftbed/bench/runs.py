@@ -1,10 +1,10 @@
 """Runs under a synthetic load, without a car, and the times in their records: what the benches share."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeVar
 
 import msgspec
 
@@ -21,6 +21,10 @@ READY_SECONDS_MAX: Final = 10.0
 POLL_SECONDS: Final = 0.005
 PAUSE_SECONDS: Final = 0.05  # of undisturbed service, between two things that are measured
 STOPPED: Final = ("interrupted", "")  # how an endless run may end
+TRIES: Final = 3
+
+Log = Callable[[str], None]
+Found = TypeVar("Found")
 
 
 class Percentiles(msgspec.Struct, frozen=True):
@@ -40,6 +44,18 @@ def percentiles(values: list[float], digits: int = 3) -> Percentiles:
 def summary(values: list[float], digits: int = 1) -> dict[str, float]:
     """The same for a JSON document."""
     return msgspec.structs.asdict(percentiles(values, digits))
+
+
+def tried(what: str, measure: Callable[[], Found], log: Log) -> Found:
+    """What `measure` gives; a busy machine may fail it. Raises HarnessError after TRIES failures."""
+    reason = ""
+    for _ in range(TRIES):
+        log(f"{what}, again ({reason})" if reason else what)
+        try:
+            return measure()
+        except (HarnessError, ConfigError) as error:  # a run that died refuses like one that never was
+            reason = str(error)
+    raise HarnessError(f"{what}: failed {TRIES} times, the last time: {reason}")
 
 
 # -- runs -----------------------------------------------------------------------------------------

@@ -130,6 +130,25 @@ def hops(
         print(f"p50 {pair.p50_ns / 1e3:9.2f} us  {pair.source} -> {pair.sink}{apart}")
 
 
+@bench.command(name="all")
+def every(
+    quick: Annotated[bool, typer.Option("--quick", help="Two minutes: too few samples to quote.")] = False,
+    into: Annotated[
+        Path | None, typer.Option(help="Write the table into this page, between its two markers.")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Every figure of docs/numbers.md in one table, each beside its limit and its command."""
+    from aftbed.bench import numbers  # noqa: PLC0415 - campaigns, see above
+
+    if into is not None:
+        numbers.check_page(into)
+    found = numbers.bench_all(_show_progress, quick=quick)
+    print(msgspec.json.encode(found).decode() if json else "\n".join(numbers.markdown(found)))
+    if into is not None:
+        numbers.write_into(into, found)
+
+
 @bench.command()
 def paper(
     quick: Annotated[bool, typer.Option("--quick", help="Half a minute: too few samples to quote.")] = False,

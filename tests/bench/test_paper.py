@@ -4,7 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aftbed.bench.paper import DECELERATION_MS2, TRIES, metres, on_road, residual_kmh, tried
+from aftbed.bench.paper import DECELERATION_MS2, metres, on_road, residual_kmh
+from aftbed.bench.runs import TRIES, tried
 from aftbed.bench.sweep import StateResult, sweep_sizes
 from aftbed.core.errors import ConfigError, HarnessError
 

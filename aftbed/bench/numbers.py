@@ -1,0 +1,269 @@
+"""`aftbed bench all`: every figure of docs/numbers.md in one table, by one command on one day.
+
+A line names the command that measures it. Each command is run once, in an interpreter of its own, as a user
+would start it; several lines may read its document. A figure stands beside its limit, which was measured by
+the same command or by that of another line. The speed of a machine changes from day to day, so what can be
+compared is the ratio of the two.
+"""
+
+import datetime
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from aftbed.bench.runs import Log, tried
+from aftbed.campaign.ledger import Environment, here
+from aftbed.campaign.plan import code_version
+from aftbed.core.errors import ConfigError, HarnessError
+
+COMMAND_SECONDS_MAX: Final = 1200.0
+BEGIN, END = "<!-- numbers: begin -->", "<!-- numbers: end -->"  # of the table in a page
+QUICK: Final = {  # what makes a command short; too few samples to quote
+    "cycle": "--requests 200",
+    "hops": "--requests 200",
+    "recovery": "--kills 2",
+    "adapt": "--adaptations 2",
+    "launch": "--runs 1",
+    "campaign": "--experiments 4",
+}
+
+Document = dict[str, object]
+
+
+class Limit(msgspec.Struct, frozen=True):
+    """What a figure is compared with: the path in a document, of the same command if none is given."""
+
+    name: str
+    path: str
+    command: str = ""
+
+
+class Line(msgspec.Struct, frozen=True):
+    """A line of the table. `figure` is a path in the document of `aftbed bench COMMAND`.
+
+    `goal`: the greatest value of each quantile's ratio to the limit; without a limit, of the figure itself;
+    the least one where `more_is_better`. `ratio`: path of a ratio that the document has already.
+    """
+
+    what: str
+    command: str
+    figure: str
+    unit: str = ""
+    limit: Limit | None = None
+    ratio: str = ""
+    goal: dict[str, float] = {}
+    more_is_better: bool = False
+
+
+def _cycle(what: str, options: str, limit: Limit, **goal: float) -> Line:
+    ratio = "ratio_p50" if limit is RING else ""
+    return Line(what, f"cycle --ftm {options}", "cycle_us", "us", limit, ratio, goal)
+
+
+def _cycle_of(ftm: str) -> Limit:
+    return Limit(f"cycle under `{ftm}`", "cycle_us", f"cycle --ftm {ftm}")
+
+
+def _recovery(what: str, options: str) -> Line:
+    return Line(what, f"recovery {options}", "recovery_ms", "ms", DEATH, goal={"p50": 1.5, "p99": 3.0})
+
+
+def _adaptation(what: str, options: str, **goal: float) -> tuple[Line, ...]:
+    command = f"adapt {options}"
+    kept = dict.fromkeys(("lost", "duplicated", "reordered", "wrong"), 0.0)
+    return (
+        Line(f"{what}: no request is served for", command, "blackout_ms", "ms", DEATH, goal=goal),
+        Line("and back", command, "back.blackout_ms", "ms", DEATH, goal=goal),
+        Line("the requests meanwhile", command, "requests", goal=kept),
+    )
+
+
+def _rate(what: str, command: str, least: float) -> Line:
+    return Line(what, command, "per_minute", goal={"": least}, more_is_better=True)
+
+
+RING: Final = Limit("bare ring of as many hops", "ring_us")
+DEATH: Final = Limit("SIGKILL to its pidfd readable in another process", "death_ms", "recovery --ftm pbr")
+IMPORTS: Final = Limit("import of its libraries", "imports_ms")
+RECIPE: Final = "adapt --from pbr --to pbr+tr --recipe paper"
+LINES: Final = (
+    _cycle("cycle under `pbr`, a process per brick", "pbr", RING, p50=1.35),
+    _cycle("cycle under `pbr`, a process per replica", "pbr --placement replica", RING, p50=2.0),
+    _cycle("the same beside a process per brick", "pbr --placement replica", _cycle_of("pbr"), p50=0.5),
+    _cycle("cycle of the bare server", "none", RING),
+    _cycle("cycle under `lfr`", "lfr", _cycle_of("pbr"), p50=0.9),
+    _cycle("cycle under `pbr+tr`", "pbr+tr", _cycle_of("pbr"), p50=1.8),
+    _cycle("cycle under `lfr+tr`", "lfr+tr", _cycle_of("lfr"), p50=1.8),
+    Line("delay of one hop under `pbr`", "hops --ftm pbr", "hop_ns", "ns"),
+    _recovery("SIGKILL of the primary to the next good reply, `pbr`", "--ftm pbr"),
+    Line("its parts, p50", "recovery --ftm pbr", "parts_ms.*.p50", "ms"),
+    _recovery("the same, a process per replica", "--ftm pbr --placement replica"),
+    _recovery("the same under `lfr`", "--ftm lfr"),
+    *_adaptation("composition `pbr` to `pbr+tr`", "--from pbr --to pbr+tr", p50=1.2, p99=3.0),
+    *_adaptation("switch `pbr` to `lfr`", "--from pbr --to lfr", p50=1.5, p99=4.0),
+    Line("the composition by the paper's recipe (the paper: 300 ms)", RECIPE, "blackout_ms", "ms", DEATH),
+    Line("of these, never served again", RECIPE, "stuck"),
+    Line("start of a run to its reply", "launch --ftm pbr", "launch_ms", "ms", IMPORTS, goal={"p50": 2}),
+    Line("the graph from a warm zygote", "launch --ftm pbr", "graph_ms", "ms", goal={"p50": 40}),
+    Line("memory of the 17 processes (PSS)", "memory --ftm pbr", "pss_mb", "MB", goal={"": 70}),
+    Line("beside them (PSS)", "memory --ftm pbr", "others.*.pss_mb", "MB"),
+    _rate("experiments a minute on real processes, each a crash in 100 requests", "campaign", 600),
+    Line("CPU time of one of them", "campaign", "cpu_ms", "ms"),
+    _rate("experiments a minute in the simulator", "campaign --sim --experiments 4000", 3000),
+)
+
+
+# -- the document ---------------------------------------------------------------------------------
+
+
+class Number(msgspec.Struct, frozen=True):
+    """A line, measured. A figure without quantiles has the name "". `met`: None where there is no goal."""
+
+    what: str
+    command: str
+    unit: str
+    measured: dict[str, float]
+    limit: str
+    limit_p50: float | None
+    ratios: dict[str, float]
+    goal: dict[str, float]
+    more_is_better: bool
+    met: bool | None
+
+
+class Numbers(msgspec.Struct, frozen=True):
+    """The document of `aftbed bench all --json`."""
+
+    date: str
+    code: str
+    quick: bool
+    seconds: float
+    environment: Environment
+    numbers: tuple[Number, ...]
+
+
+def bench_all(log: Log, *, quick: bool = False, measure: Callable[[str], Document] | None = None) -> Numbers:
+    """Measure every line; `log` gets each command. Raises HarnessError if one fails again and again."""
+    began_s = time.monotonic()
+    run = measure or _measured
+    commands = dict.fromkeys(line.command for line in LINES)
+    words = {one: f"{one} {QUICK.get(one.split()[0], '')}".strip() if quick else one for one in commands}
+    found = {one: tried(f"aftbed bench {words[one]}", partial(run, words[one]), log) for one in words}
+    return Numbers(
+        datetime.datetime.now(datetime.UTC).date().isoformat(),
+        code_version(),
+        quick,
+        round(time.monotonic() - began_s, 1),
+        here(),
+        tuple(_number(line, found) for line in LINES),
+    )
+
+
+def _measured(command: str) -> Document:
+    """What `aftbed bench COMMAND --json` prints."""
+    arguments = [sys.executable, "-m", "aftbed", "bench", *command.split(), "--json"]
+    try:
+        done = subprocess.run(arguments, capture_output=True, timeout=COMMAND_SECONDS_MAX, check=False)
+    except subprocess.TimeoutExpired:
+        raise HarnessError(f"no result after {COMMAND_SECONDS_MAX:g} s") from None
+    if done.returncode != 0:
+        raise HarnessError(f"exit code {done.returncode}: {done.stderr.decode()[-500:].strip()}")
+    return msgspec.json.decode(done.stdout, type=Document)
+
+
+def _number(line: Line, found: dict[str, Document]) -> Number:
+    document, measured = found[line.command], figure_at(found[line.command], line.figure)
+    ratios, limit_p50 = {}, None
+    if line.limit is not None:
+        limit_p50 = figure_at(found[line.limit.command or line.command], line.limit.path)["p50"]
+        names = dict.fromkeys(("p50", *line.goal))
+        ratios = {name: round(measured[name] / limit_p50, 2) for name in names}
+        if line.ratio:
+            ratios["p50"] = round(figure_at(document, line.ratio)[""], 2)
+    judged = ratios or measured
+    kept = [judged[name] >= g if line.more_is_better else judged[name] <= g for name, g in line.goal.items()]
+    return Number(
+        line.what,
+        f"aftbed bench {line.command}",
+        line.unit,
+        measured,
+        line.limit.name if line.limit is not None else "",
+        limit_p50,
+        ratios,
+        line.goal,
+        line.more_is_better,
+        all(kept) if kept else None,
+    )
+
+
+def figure_at(document: object, path: str) -> dict[str, float]:
+    """The numbers at `path` by name, where `*` is each of some names; a single number has the name ""."""
+    here, _, rest = path.partition(".")
+    if not here:
+        return document if isinstance(document, dict) else {"": msgspec.convert(document, float)}
+    assert isinstance(document, dict), path
+    if here == "*":
+        return {name: figure_at(value, rest)[""] for name, value in document.items()}
+    return figure_at(document[here], rest)
+
+
+# -- for people -----------------------------------------------------------------------------------
+
+
+def markdown(found: Numbers) -> Iterator[str]:
+    """The table, and the day and the machine above it."""
+    about = found.environment
+    yield (
+        f"Measured on {found.date} by `aftbed bench all{' --quick' if found.quick else ''}` in"
+        f" {found.seconds:.0f} s: {about.cpus}; {about.kernel.partition('-')[0]}; {about.python};"
+        f" aftbed {found.code}."
+    )
+    yield ""
+    yield "| what | measured | limit beside it | ratio to its p50 | goal | command |"
+    yield "|---|---|---|---|---|---|"
+    for one in found.numbers:
+        limit = f"{one.limit}: {one.limit_p50:g} {one.unit}" if one.limit_p50 is not None else ""
+        goal = _words(one.goal)
+        if goal:
+            goal = (
+                f"{'at least' if one.more_is_better else 'at most'} {goal}{'' if one.met else ': **missed**'}"
+            )
+        cells = (
+            one.what,
+            _words(one.measured, one.unit),
+            limit,
+            _words(one.ratios),
+            goal,
+            f"`{one.command}`",
+        )
+        yield f"| {' | '.join(cells)} |"
+
+
+def _words(values: dict[str, float], unit: str = "") -> str:
+    """`p50 1.5, p99 3.1 ms`."""
+    words = ", ".join(f"{name} {value:g}".strip() for name, value in values.items())
+    return f"{words} {unit}".strip()
+
+
+def check_page(page: Path) -> None:
+    """Raise ConfigError unless `page` has the two lines between which the table stands."""
+    try:
+        lines = page.read_text(encoding="utf-8").splitlines()
+    except OSError as error:
+        raise ConfigError(f"--into {page}: {error.strerror}") from None
+    if lines.count(BEGIN) != 1 or lines.count(END) != 1 or lines.index(BEGIN) > lines.index(END):
+        raise ConfigError(f"--into {page}: it needs the lines {BEGIN} and {END}, once each and in this order")
+
+
+def write_into(page: Path, found: Numbers) -> None:
+    """Put the table between the two lines of `page`, in the place of the one that is there."""
+    before, _, rest = page.read_text(encoding="utf-8").partition(f"{BEGIN}\n")
+    after = rest.partition(END)[2]
+    table = "\n".join(markdown(found))
+    page.write_text(f"{before}{BEGIN}\n{table}\n{END}{after}", encoding="utf-8")

@@ -1,0 +1,196 @@
+"""`aftbed bench all`: each line finds its figure and its limit, and the table is put into a page."""
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Final
+
+import msgspec
+import pytest
+from liveruns import Home
+
+from aftbed.bench.numbers import (
+    BEGIN,
+    END,
+    LINES,
+    QUICK,
+    Document,
+    Number,
+    Numbers,
+    bench_all,
+    check_page,
+    figure_at,
+    markdown,
+    write_into,
+)
+from aftbed.core.errors import ConfigError, HarnessError
+
+TIMES: Final = {"p50": 2.0, "p95": 3.0, "p99": 4.0, "max": 5.0}
+DOCUMENTS: Final[dict[str, Document]] = {  # by the first word of a command
+    "cycle": {"cycle_us": TIMES, "ring_us": {"p50": 1.0}, "ratio_p50": 1.234},
+    "hops": {"hop_ns": {"p1": 5, "p50": 9}},
+    "recovery": {
+        "recovery_ms": TIMES,
+        "death_ms": {"p50": 2.5},
+        "parts_ms": {"detection": TIMES, "fencing": TIMES},
+    },
+    "adapt": {
+        "blackout_ms": TIMES,
+        "back": {"blackout_ms": TIMES},
+        "requests": {"sent": 100, "lost": 1, "duplicated": 0, "reordered": 0, "wrong": 0},
+        "stuck": 2,
+    },
+    "launch": {
+        "launch_ms": {"p50": 700, "max": 800},
+        "graph_ms": {"p50": 38, "max": 40},
+        "imports_ms": {"p50": 200},
+    },
+    "memory": {"pss_mb": 80.0, "others": {"zygote": {"processes": 2, "pss_mb": 20.0}}},
+    "campaign": {"per_minute": 700, "cpu_ms": 230},
+}
+
+
+def fake(command: str) -> Document:
+    return DOCUMENTS[command.split(maxsplit=1)[0]]
+
+
+def measured() -> Numbers:
+    return bench_all(lambda _: None, measure=fake)
+
+
+def line(what: str, command: str = "") -> Number:
+    return next(
+        one for one in measured().numbers if one.what.startswith(what) and one.command.endswith(command)
+    )
+
+
+def test_each_command_is_run_once() -> None:
+    logged: list[str] = []
+    bench_all(logged.append, measure=fake)
+    assert len(logged) == len(set(logged)) == len({one.command for one in LINES})
+    assert logged[0] == "aftbed bench cycle --ftm pbr"
+
+
+def test_a_quick_run_measures_less() -> None:
+    logged: list[str] = []
+    found = bench_all(logged.append, quick=True, measure=fake)
+    assert logged[0] == "aftbed bench cycle --ftm pbr --requests 200"
+    assert found.quick and found.numbers[0].command == "aftbed bench cycle --ftm pbr"
+    assert set(QUICK) <= set(DOCUMENTS)
+
+
+def test_a_command_that_fails_is_tried_again() -> None:
+    logged: list[str] = []
+
+    def flaky(command: str) -> Document:
+        if len(logged) == 1:
+            raise HarnessError("the machine is too busy")
+        return fake(command)
+
+    assert bench_all(logged.append, measure=flaky).numbers == measured().numbers
+    assert logged[1] == "aftbed bench cycle --ftm pbr, again (the machine is too busy)"
+
+
+def test_a_cycle_stands_beside_its_ring() -> None:
+    found = line("cycle under `pbr`, a process per brick")
+    assert found.measured == TIMES and found.limit_p50 == 1.0
+    assert found.ratios == {"p50": 1.23} and found.goal == {"p50": 1.35} and found.met
+
+
+def test_a_cycle_stands_beside_that_of_another_mechanism() -> None:
+    found = line("cycle under `lfr`", "--ftm lfr")
+    assert found.ratios == {"p50": 1.0} and found.met is False
+
+
+def test_a_recovery_stands_beside_the_death_that_the_kernel_reports() -> None:
+    assert line("SIGKILL").ratios == {"p50": 0.8, "p99": 1.6}
+    assert line("its parts").measured == {"detection": 2.0, "fencing": 2.0}
+
+
+def test_requests_that_are_lost_miss_the_goal() -> None:
+    found = line("the requests meanwhile")
+    assert found.measured["sent"] == 100 and found.met is False
+
+
+def test_more_experiments_a_minute_are_better() -> None:
+    assert line("experiments a minute on real").met
+    assert line("experiments a minute in the sim").met is False
+
+
+def test_what_has_no_goal_is_not_judged() -> None:
+    assert line("cycle of the bare server").met is None
+
+
+def test_the_figures_at_a_path() -> None:
+    document = {"a": {"x": {"p50": 1}, "y": {"p50": 2}}, "n": 3}
+    assert figure_at(document, "n") == {"": 3.0}
+    assert figure_at(document, "a.x") == {"p50": 1}
+    assert figure_at(document, "a.*.p50") == {"x": 1.0, "y": 2.0}
+
+
+def test_a_row_of_the_table() -> None:
+    rows = [row for row in markdown(measured()) if row.startswith("| memory of")]
+    goal = "at most 70: **missed** | `aftbed bench memory --ftm pbr` |"
+    assert rows == [f"| memory of the 17 processes (PSS) | 80 MB |  |  | {goal}"]
+    rows = [row for row in markdown(measured()) if row.startswith("| start of")]
+    assert rows[0].startswith(
+        "| start of a run to its reply | p50 700, max 800 ms | import of its libraries: 200 ms | p50 3.5 |"
+    )
+
+
+def test_every_row_has_as_many_cells_as_the_head() -> None:
+    rows = [row for row in markdown(measured()) if row.startswith("|")]
+    assert len(rows) == len(LINES) + 2 and {row.count("|") for row in rows} == {7}
+
+
+# -- into a page
+
+
+def test_the_table_takes_the_place_of_the_last_one(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text(f"# A\n\n{BEGIN}\nold\n{END}\n\nafter\n")
+    check_page(page)
+    write_into(page, measured())
+    write_into(page, measured())
+    text = page.read_text()
+    assert text.startswith(f"# A\n\n{BEGIN}\nMeasured on 2") and text.endswith(f"|\n{END}\n\nafter\n")
+    assert text.count(BEGIN) == 1 and "old" not in text
+
+
+@pytest.mark.parametrize("text", ["", f"{BEGIN}\n", f"{END}\n{BEGIN}\n", f"{BEGIN}\n{BEGIN}\n{END}\n"])
+def test_a_page_without_its_markers_is_refused(text: str, tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text(text)
+    with pytest.raises(ConfigError, match=f"--into {page}: it needs the lines"):
+        check_page(page)
+
+
+def test_a_page_that_is_not_there_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"gone\.md: No such file"):
+        check_page(tmp_path / "gone.md")
+
+
+def test_the_page_of_the_project_has_its_markers() -> None:
+    check_page(Path(__file__).resolve().parents[2] / "docs" / "numbers.md")
+
+
+# -- real runs
+
+
+@pytest.mark.process
+@pytest.mark.deep
+@pytest.mark.timeout(1200)
+def test_every_line_is_measured(home: Home) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "aftbed", "bench", "all", "--quick", "--json"],
+        capture_output=True,
+        text=True,
+        timeout=1100,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    found = msgspec.json.decode(done.stdout, type=Numbers)
+    assert [one.what for one in found.numbers] == [one.what for one in LINES]
+    for one in found.numbers:
+        assert one.measured and all(value >= 0 for value in one.measured.values()), one
+        assert not one.limit or one.ratios["p50"] > 0, one
