@@ -13,8 +13,17 @@ import time
 from pathlib import Path
 from typing import Final
 
+import msgspec
+
 from aftbed.bench.cycle import ring_us
-from aftbed.bench.runs import PAUSE_SECONDS, endless_run, latencies_us, summary, wait_until_ready
+from aftbed.bench.runs import (
+    PAUSE_SECONDS,
+    Percentiles,
+    endless_run,
+    latencies_us,
+    percentiles,
+    wait_until_ready,
+)
 from aftbed.core.errors import HarnessError
 from aftbed.core.journal import EntryKind
 from aftbed.core.messages import Goal
@@ -31,10 +40,36 @@ RING_COUNT: Final = 500
 Outcomes = list[dict[str, object]]
 
 
+class AdaptationTimes(msgspec.Struct, frozen=True):
+    """Of the adaptations in one direction."""
+
+    prepare_ms: Percentiles
+    blackout_ms: Percentiles
+    total_ms: Percentiles
+    bricks_changed: int
+    bricks_total: int
+
+
+class AdaptationResult(AdaptationTimes, frozen=True, kw_only=True):
+    """The document of `aftbed bench adapt`. `requests`: counts by what became of them."""
+
+    old: str = msgspec.field(name="from")
+    new: str = msgspec.field(name="to")
+    placement: str
+    recipe: str
+    adaptations: int
+    rate_hz: float
+    back: AdaptationTimes | msgspec.UnsetType = msgspec.UNSET  # the paper's recipe goes one way
+    requests: dict[str, int]
+    stuck: int
+    worst_request_ms: float
+    ring_us: Percentiles
+
+
 def bench_adapt(
     old: str, new: str, placement: str, recipe: str, count: int, *, pin: bool = True
-) -> dict[str, object]:
-    """`prepare_ms, blackout_ms{p50,p99,max}, total_ms, bricks_changed, bricks_total, requests{...}`."""
+) -> AdaptationResult:
+    """Adapt `count` times, and back as often. Raises HarnessError."""
     ring = ring_us(12, 64, RING_COUNT, None)
     there: Outcomes = []
     back: Outcomes = []
@@ -51,53 +86,44 @@ def bench_adapt(
                     time.sleep(PAUSE_SECONDS)
         records.append(run.record)
     ring += ring_us(12, 64, RING_COUNT, None)
-    found: dict[str, object] = {
-        "from": old,
-        "to": new,
-        "placement": placement,
-        "recipe": recipe,
-        "adaptations": len(there) + len(back),
-        "rate_hz": RATE_HZ,
-    }
-    found |= _times(there)
-    if back:
-        found["back"] = _times(back)
-    requests = _requests(records)
-    found["requests"] = requests
-    found["stuck"] = sum(_counts(record).lost > 0 for record in records)
-    found["worst_request_ms"] = round(max(max(latencies_us(r), default=0.0) for r in records) / 1e3, 3)
-    found["ring_us"] = summary(ring)
-    return found
+    counts = [_requests(record) for record in records]
+    return AdaptationResult(
+        **msgspec.structs.asdict(_times(there)),
+        old=old,
+        new=new,
+        placement=placement,
+        recipe=recipe,
+        adaptations=len(there) + len(back),
+        rate_hz=RATE_HZ,
+        back=_times(back) if back else msgspec.UNSET,
+        requests={name: sum(count[name] for count in counts) for name in counts[0]},
+        stuck=sum(count["lost"] > 0 for count in counts),
+        worst_request_ms=round(max(max(latencies_us(r), default=0.0) for r in records) / 1e3, 3),
+        ring_us=percentiles(ring, 1),
+    )
 
 
-def _times(outcomes: Outcomes) -> dict[str, object]:
-    parts = ("prepare_ms", "blackout_ms", "total_ms")
-    found: dict[str, object] = {
-        part: summary([float(str(outcome[part])) for outcome in outcomes], 3) for part in parts
-    }
-    return found | {name: outcomes[0][name] for name in ("bricks_changed", "bricks_total")}
+def _times(outcomes: Outcomes) -> AdaptationTimes:
+    def part(name: str) -> Percentiles:
+        return percentiles([float(str(outcome[name])) for outcome in outcomes])
+
+    changed, total = (int(str(outcomes[0][name])) for name in ("bricks_changed", "bricks_total"))
+    return AdaptationTimes(part("prepare_ms"), part("blackout_ms"), part("total_ms"), changed, total)
 
 
-def _counts(record: RunRecord) -> checks.Requests:
-    return checks.requests(record.history, reference_of(record, default_application))
-
-
-def _requests(records: list[RunRecord]) -> dict[str, int]:
-    counts = [_counts(record) for record in records]
-    return {
-        "sent": sum(c.sent for c in counts),
-        "lost": sum(c.lost for c in counts),
-        "duplicated": sum(c.duplicated for c in counts),
-        "reordered": sum(map(_reordered, records)),
-        "late": sum(c.late for c in counts),
-        "wrong": sum(c.wrong for c in counts),
-    }
-
-
-def _reordered(record: RunRecord) -> int:
-    """The number of replies that came after one of a later request."""
+def _requests(record: RunRecord) -> dict[str, int]:
+    """What became of the requests of a run; `reordered`: replies that came after one of a later request."""
+    counts = checks.requests(record.history, reference_of(record, default_application))
     ids = [e.request_id for e in record.history.dialogue if e.kind is EntryKind.ANSWERED]
-    return sum(after < before for before, after in itertools.pairwise(ids))
+    reordered = sum(after < before for before, after in itertools.pairwise(ids))
+    return {
+        "sent": counts.sent,
+        "lost": counts.lost,
+        "duplicated": counts.duplicated,
+        "reordered": reordered,
+        "late": counts.late,
+        "wrong": counts.wrong,
+    }
 
 
 def adapted(private: Path, goal: Goal) -> dict[str, object]:

@@ -12,6 +12,8 @@ from collections import Counter
 from pathlib import Path
 from typing import Final, Literal
 
+import msgspec
+
 from aftbed.campaign import runner
 from aftbed.campaign.plan import plan
 from aftbed.campaign.spec import FaultEntry, Spec, StopRule, System, check
@@ -19,10 +21,25 @@ from aftbed.campaign.spec import FaultEntry, Spec, StopRule, System, check
 CRASH: Final = FaultEntry("crash primary", "crash primary at server.exit nth {nth}", draw={"nth": (1, 90)})
 
 
+class CampaignResult(msgspec.Struct, frozen=True):
+    """The document of `aftbed bench campaign`; `cpu_ms` per experiment."""
+
+    ftm: str
+    placement: str
+    runtime: str
+    jobs: int
+    cpus: int
+    experiments: int
+    outcomes: dict[str, int]
+    seconds: float
+    per_minute: int
+    cpu_ms: float
+
+
 def bench_campaign(
     ftm: str, placement: str, runtime: Literal["unix", "sim"], experiments: int, jobs: int
-) -> dict[str, object]:
-    """`per_minute`, `seconds`, `cpu_ms` per experiment, and `outcomes`. Raises ConfigError."""
+) -> CampaignResult:
+    """Carry out a campaign of one stratum. Raises ConfigError."""
     system = System(placements=(placement,), runtime=runtime)
     spec = Spec("bench", (ftm,), (CRASH,), system=system, stop=StopRule(experiments))
     check(spec)
@@ -32,21 +49,21 @@ def bench_campaign(
         asked = runner.CampaignRunOptions(Path(folder) / "campaign", jobs)
         outcomes = Counter(result.outcome for result in runner.run(planned, asked))
         seconds, cpu_s = time.monotonic() - began_s, _cpu_s() - began_cpu_s
-    return {
-        "ftm": ftm,
-        "placement": placement,
-        "runtime": runtime,
-        "jobs": jobs,
-        "cpus": len(os.sched_getaffinity(0)),
-        "experiments": experiments,
-        "outcomes": dict(outcomes),
-        "seconds": round(seconds, 1),
-        "per_minute": round(60 * experiments / seconds),
-        "cpu_ms": round(cpu_s / experiments * 1e3, 1),
-    }
+    return CampaignResult(
+        ftm,
+        placement,
+        runtime,
+        jobs,
+        cpus=len(os.sched_getaffinity(0)),
+        experiments=experiments,
+        outcomes=dict(outcomes),
+        seconds=round(seconds, 1),
+        per_minute=round(60 * experiments / seconds),
+        cpu_ms=round(cpu_s / experiments * 1e3, 1),
+    )
 
 
 def _cpu_s() -> float:
     """Of this process, and of all its descendants that have ended."""
     used = (resource.getrusage(scope) for scope in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
-    return sum(each.ru_utime + each.ru_stime for each in used)
+    return sum(one.ru_utime + one.ru_stime for one in used)

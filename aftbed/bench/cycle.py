@@ -35,7 +35,6 @@ Limits: other work on the machine is in the upper quantiles. The journal's write
 """
 
 import itertools
-import math
 import os
 import socket
 import time
@@ -44,7 +43,7 @@ from typing import Final
 
 import msgspec
 
-from aftbed.bench.runs import latencies_us, limited_run, summary
+from aftbed.bench.runs import Percentiles, latencies_us, limited_run, percentiles
 from aftbed.campaign.statistics import quantile
 from aftbed.core.errors import HarnessError
 from aftbed.core.events import Event
@@ -82,10 +81,23 @@ def hops(graph: Graph) -> int:
     return sum(a != b for a, b in itertools.pairwise(graph.node_of(name) for name in path(graph)))
 
 
+class CycleResult(msgspec.Struct, frozen=True):
+    """The document of `aftbed bench cycle`; `ratio_p50` is the median of `ratio_rounds`."""
+
+    ftm: str
+    placement: str
+    requests: int
+    cycle_us: Percentiles
+    ring_us: Percentiles
+    hops: int
+    ratio_p50: float
+    ratio_rounds: tuple[float, ...]
+
+
 def bench_cycle(
     ftm: str, placement: str, count: int, *, pin: bool = True, rounds: int = ROUNDS
-) -> dict[str, object]:
-    """`cycle_us{p50,p95,p99,max}, ring_us{...}, hops, ratio_p50`."""
+) -> CycleResult:
+    """Cycle and ring in turn, `rounds` times."""
     wanted = hops(build(ftm, placement))
     cpu = _pinned_cpu() if pin else None
     size = sum(map(len, sample_requests(0, 64))) // 64
@@ -99,16 +111,16 @@ def bench_cycle(
         ratios.append(quantile(ours, 0.5) / quantile(bare, 0.5))
         cycles += ours
         ring += bare
-    return {
-        "ftm": ftm,
-        "placement": placement,
-        "requests": len(cycles),
-        "cycle_us": summary(cycles),
-        "ring_us": summary(ring),
-        "hops": wanted,
-        "ratio_p50": round(quantile(ratios, 0.5), 3),
-        "ratio_rounds": [round(r, 3) for r in ratios],
-    }
+    return CycleResult(
+        ftm,
+        placement,
+        len(cycles),
+        percentiles(cycles, 1),
+        percentiles(ring, 1),
+        wanted,
+        round(quantile(ratios, 0.5), 3),
+        tuple(round(ratio, 3) for ratio in ratios),
+    )
 
 
 # -- ring -------------------------------------------------------------------------------------------
@@ -135,7 +147,14 @@ def ring_us(hops: int, packet_bytes: int, count: int, cpu: int | None) -> list[f
     parent = os.getpid()
     children = [_node(parent, pairs, i) for i in range(hops - 1)]
     try:
-        return _rounds(pairs[0][0].fileno(), pairs[-1][1].fileno(), packet_bytes, count)
+        write_fd, read_fd = pairs[0][0].fileno(), pairs[-1][1].fileno()
+        packet, times = bytes(packet_bytes), []
+        for _ in range(WARM_UP + count):
+            began_ns = time.perf_counter_ns()
+            os.write(write_fd, packet)
+            os.read(read_fd, READ_BYTES_MAX)
+            times.append((time.perf_counter_ns() - began_ns) / 1e3)
+        return times[WARM_UP:]
     finally:
         for write, read in pairs:
             write.close()
@@ -164,16 +183,6 @@ def _node(parent: int, pairs: list[tuple[socket.socket, socket.socket]], index: 
             os.write(sink, packet)
     finally:
         os._exit(0)
-
-
-def _rounds(write: int, read: int, packet_bytes: int, count: int) -> list[float]:
-    packet, times = bytes(packet_bytes), []
-    for _ in range(WARM_UP + count):
-        began_ns = time.perf_counter_ns()
-        os.write(write, packet)
-        os.read(read, READ_BYTES_MAX)
-        times.append((time.perf_counter_ns() - began_ns) / 1e3)
-    return times[WARM_UP:]
 
 
 # -- hops -------------------------------------------------------------------------------------------
@@ -235,15 +244,19 @@ def bench_hops(ftm: str, count: int, *, pin: bool = True) -> HopDelays:
         if len(found) != count:
             raise HarnessError(f"{len(found)} of {count} requests have both notes: {source}, {sink}")
     ordered = sorted(itertools.chain.from_iterable(delays[pair] for pair in pairs))
+
+    def delay(pair: NotePair) -> PairDelay:
+        return PairDelay(str(pair[0]), str(pair[1]), quantile(delays[pair], 0.5))
+
     return HopDelays(
         ftm=ftm,
         requests=count,
         samples=len(ordered),
-        hop_ns={name: nearest(ordered, percent / 100) for name, percent in SHOWN.items()},
-        percentiles_ns=tuple((percent, nearest(ordered, percent / 100)) for percent in PERCENTS),
-        quantiles_ns=tuple(nearest(ordered, step / STEPS) for step in range(STEPS + 1)),
-        pairs=tuple(_pair_delay(pair, delays[pair]) for pair in pairs),
-        beside=tuple(_pair_delay(pair, delays[pair]) for pair in beside),
+        hop_ns={name: quantile(ordered, percent / 100) for name, percent in SHOWN.items()},
+        percentiles_ns=tuple((percent, quantile(ordered, percent / 100)) for percent in PERCENTS),
+        quantiles_ns=tuple(quantile(ordered, step / STEPS) for step in range(STEPS + 1)),
+        pairs=tuple(map(delay, pairs)),
+        beside=tuple(map(delay, beside)),
     )
 
 
@@ -297,25 +310,8 @@ def _visits(graph: Graph) -> list[NotePlace | None]:
 
 def delays_ns(record: RunRecord, pair: NotePair, skip: int) -> list[int]:
     """The time between the notes of `pair` (ns), of each request behind the first `skip` that has both."""
-    source, sink = (_times_ns(record, place) for place in pair)
+    source, sink = (
+        {r.request_id: r.t_ns for r in record.history.events(place.event) if r.node == place.brick}
+        for place in pair
+    )
     return [t_ns - source[i] for i, t_ns in sink.items() if i in source and i > skip]
-
-
-def _times_ns(record: RunRecord, place: NotePlace) -> dict[int, int]:
-    """When each request came to `place` (ns, monotonic)."""
-    return {
-        r.request_id: r.t_ns
-        for records in record.history.journals.values()
-        for r in records
-        if r.node == place.brick and r.event is place.event
-    }
-
-
-def _pair_delay(pair: NotePair, found: list[int]) -> PairDelay:
-    return PairDelay(str(pair[0]), str(pair[1]), nearest(sorted(found), 0.5))
-
-
-def nearest(ordered: list[int], share: float) -> int:
-    """The value that `share` of the ascending `ordered` do not exceed (nearest rank); 0 is the least one."""
-    assert ordered and 0 <= share <= 1
-    return ordered[max(0, math.ceil(share * len(ordered)) - 1)]

@@ -36,7 +36,7 @@ QUICK: Final = {  # what makes a command short; too few samples to quote
 Document = dict[str, object]
 
 
-class Limit(msgspec.Struct, frozen=True):
+class FigureLimit(msgspec.Struct, frozen=True):
     """What a figure is compared with: the path in a document, of the same command if none is given."""
 
     name: str
@@ -44,7 +44,7 @@ class Limit(msgspec.Struct, frozen=True):
     command: str = ""
 
 
-class Line(msgspec.Struct, frozen=True):
+class TableLine(msgspec.Struct, frozen=True):
     """A line of the table. `figure` is a path in the document of `aftbed bench COMMAND`.
 
     `goal`: the greatest value of each quantile's ratio to the limit; without a limit, of the figure itself;
@@ -55,42 +55,42 @@ class Line(msgspec.Struct, frozen=True):
     command: str
     figure: str
     unit: str = ""
-    limit: Limit | None = None
+    limit: FigureLimit | None = None
     ratio: str = ""
     goal: dict[str, float] = {}
     more_is_better: bool = False
 
 
-def _cycle(what: str, options: str, limit: Limit, **goal: float) -> Line:
+def _cycle(what: str, options: str, limit: FigureLimit, **goal: float) -> TableLine:
     ratio = "ratio_p50" if limit is RING else ""
-    return Line(what, f"cycle --ftm {options}", "cycle_us", "us", limit, ratio, goal)
+    return TableLine(what, f"cycle --ftm {options}", "cycle_us", "us", limit, ratio, goal)
 
 
-def _cycle_of(ftm: str) -> Limit:
-    return Limit(f"cycle under `{ftm}`", "cycle_us", f"cycle --ftm {ftm}")
+def _cycle_of(ftm: str) -> FigureLimit:
+    return FigureLimit(f"cycle under `{ftm}`", "cycle_us", f"cycle --ftm {ftm}")
 
 
-def _recovery(what: str, options: str) -> Line:
-    return Line(what, f"recovery {options}", "recovery_ms", "ms", DEATH, goal={"p50": 1.5, "p99": 3.0})
+def _recovery(what: str, options: str) -> TableLine:
+    return TableLine(what, f"recovery {options}", "recovery_ms", "ms", DEATH, goal={"p50": 1.5, "p99": 3.0})
 
 
-def _adaptation(what: str, options: str, **goal: float) -> tuple[Line, ...]:
+def _adaptation(what: str, options: str, **goal: float) -> tuple[TableLine, ...]:
     command = f"adapt {options}"
     kept = dict.fromkeys(("lost", "duplicated", "reordered", "wrong"), 0.0)
     return (
-        Line(f"{what}: no request is served for", command, "blackout_ms", "ms", DEATH, goal=goal),
-        Line("and back", command, "back.blackout_ms", "ms", DEATH, goal=goal),
-        Line("the requests meanwhile", command, "requests", goal=kept),
+        TableLine(f"{what}: no request is served for", command, "blackout_ms", "ms", DEATH, goal=goal),
+        TableLine("and back", command, "back.blackout_ms", "ms", DEATH, goal=goal),
+        TableLine("the requests meanwhile", command, "requests", goal=kept),
     )
 
 
-def _rate(what: str, command: str, least: float) -> Line:
-    return Line(what, command, "per_minute", goal={"": least}, more_is_better=True)
+def _rate(what: str, command: str, least: float) -> TableLine:
+    return TableLine(what, command, "per_minute", goal={"": least}, more_is_better=True)
 
 
-RING: Final = Limit("bare ring of as many hops", "ring_us")
-DEATH: Final = Limit("SIGKILL to its pidfd readable in another process", "death_ms", "recovery --ftm pbr")
-IMPORTS: Final = Limit("import of its libraries", "imports_ms")
+RING: Final = FigureLimit("bare ring of as many hops", "ring_us")
+DEATH: Final = FigureLimit("SIGKILL to a pidfd readable elsewhere", "death_ms", "recovery --ftm pbr")
+IMPORTS: Final = FigureLimit("import of its libraries", "imports_ms")
 RECIPE: Final = "adapt --from pbr --to pbr+tr --recipe paper"
 LINES: Final = (
     _cycle("cycle under `pbr`, a process per brick", "pbr", RING, p50=1.35),
@@ -100,21 +100,21 @@ LINES: Final = (
     _cycle("cycle under `lfr`", "lfr", _cycle_of("pbr"), p50=0.9),
     _cycle("cycle under `pbr+tr`", "pbr+tr", _cycle_of("pbr"), p50=1.8),
     _cycle("cycle under `lfr+tr`", "lfr+tr", _cycle_of("lfr"), p50=1.8),
-    Line("delay of one hop under `pbr`", "hops --ftm pbr", "hop_ns", "ns"),
+    TableLine("delay of one hop under `pbr`", "hops --ftm pbr", "hop_ns", "ns"),
     _recovery("SIGKILL of the primary to the next good reply, `pbr`", "--ftm pbr"),
-    Line("its parts, p50", "recovery --ftm pbr", "parts_ms.*.p50", "ms"),
+    TableLine("its parts, p50", "recovery --ftm pbr", "parts_ms.*.p50", "ms"),
     _recovery("the same, a process per replica", "--ftm pbr --placement replica"),
     _recovery("the same under `lfr`", "--ftm lfr"),
     *_adaptation("composition `pbr` to `pbr+tr`", "--from pbr --to pbr+tr", p50=1.2, p99=3.0),
     *_adaptation("switch `pbr` to `lfr`", "--from pbr --to lfr", p50=1.5, p99=4.0),
-    Line("the composition by the paper's recipe (the paper: 300 ms)", RECIPE, "blackout_ms", "ms", DEATH),
-    Line("of these, never served again", RECIPE, "stuck"),
-    Line("start of a run to its reply", "launch --ftm pbr", "launch_ms", "ms", IMPORTS, goal={"p50": 2}),
-    Line("the graph from a warm zygote", "launch --ftm pbr", "graph_ms", "ms", goal={"p50": 40}),
-    Line("memory of the 17 processes (PSS)", "memory --ftm pbr", "pss_mb", "MB", goal={"": 70}),
-    Line("beside them (PSS)", "memory --ftm pbr", "others.*.pss_mb", "MB"),
+    TableLine("the same by the paper's recipe (the paper: 300 ms)", RECIPE, "blackout_ms", "ms", DEATH),
+    TableLine("of these, never served again", RECIPE, "stuck"),
+    TableLine("start of a run to a reply", "launch --ftm pbr", "launch_ms", "ms", IMPORTS, goal={"p50": 2}),
+    TableLine("the graph from a warm zygote", "launch --ftm pbr", "graph_ms", "ms", goal={"p50": 40}),
+    TableLine("memory of the 17 processes (PSS)", "memory --ftm pbr", "pss_mb", "MB", goal={"": 70}),
+    TableLine("beside them (PSS)", "memory --ftm pbr", "others.*.pss_mb", "MB"),
     _rate("experiments a minute on real processes, each a crash in 100 requests", "campaign", 600),
-    Line("CPU time of one of them", "campaign", "cpu_ms", "ms"),
+    TableLine("CPU time of one of them", "campaign", "cpu_ms", "ms"),
     _rate("experiments a minute in the simulator", "campaign --sim --experiments 4000", 3000),
 )
 
@@ -177,7 +177,7 @@ def _measured(command: str) -> Document:
     return msgspec.json.decode(done.stdout, type=Document)
 
 
-def _number(line: Line, found: dict[str, Document]) -> Number:
+def _number(line: TableLine, found: dict[str, Document]) -> Number:
     document, measured = found[line.command], figure_at(found[line.command], line.figure)
     ratios, limit_p50 = {}, None
     if line.limit is not None:

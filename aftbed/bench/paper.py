@@ -14,21 +14,22 @@ whole duration, in which requests are served except during the blackout (0.1 s o
 after which it can no longer be undone). They measured on a machine of 2014. What has no source here is left
 out rather than guessed.
 
-A measurement that fails, as it may on a busy machine, is repeated, TRIES times at most. The document
-(`Paper`) is printed as JSON; tables, markdown and page are made of `tables`, where the words of each cell
-are decided once.
+The document (`Paper`) is printed as JSON; text, markdown and page are made of `tables`, where the words of
+each cell are decided once. The page is one file, which needs neither network nor script; its style sheet is
+that of a campaign's report.
 """
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
-from typing import Final, ParamSpec
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Final
 
 import msgspec
 
-from aftbed.bench.adaptation import bench_adapt
-from aftbed.bench.cycle import bench_cycle, ring_p50_us
-from aftbed.bench.launch import bench_launch
+from aftbed.bench.adaptation import AdaptationResult, bench_adapt
+from aftbed.bench.cycle import CycleResult, bench_cycle, ring_p50_us
 from aftbed.bench.recovery import bench_recovery
 from aftbed.bench.resources import (
     IDLE_HZ,
@@ -36,6 +37,7 @@ from aftbed.bench.resources import (
     RADAR_HZ,
     LoadResult,
     Usage,
+    bench_launch,
     process_count,
     under_load,
 )
@@ -45,6 +47,8 @@ from aftbed.campaign.ledger import Environment, here
 from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.core.graph import PLACEMENTS
 from aftbed.core.script import RECIPES
+from aftbed.report import plots
+from aftbed.report.plots import milliseconds
 from aftbed.search.road_table import speed_left_ms
 from aftbed.vehicle.plant import GRAVITY_MS2, KMH_PER_MS
 
@@ -53,8 +57,8 @@ BASE, COMPOSED, SWITCHED = "pbr", "pbr+tr", "lfr"
 UPDATED_BYTES: Final = 1000  # the state that moves when the function is updated
 STATE_FTMS: Final = ("pbr", "lfr")
 LOAD_PLACEMENTS: Final = PLACEMENTS[:2]
-
-Params = ParamSpec("Params")
+TEMPLATES: Final = Path(__file__).resolve().parent / "templates"
+NOTHING: Final = "-"  # not known, or not measured
 
 
 class PublishedFigure(msgspec.Struct, frozen=True):
@@ -170,18 +174,6 @@ class ProcessCount(msgspec.Struct, frozen=True):
     paper: int | None
 
 
-class CycleResult(msgspec.Struct, frozen=True):
-    """The document of `aftbed bench cycle`."""
-
-    ftm: str
-    placement: str
-    requests: int
-    hops: int
-    cycle_us: Percentiles
-    ring_us: Percentiles
-    ratio_p50: float
-
-
 class PlacementResult(msgspec.Struct, frozen=True):
     """What a placement costs in time, CPU and memory, and whether the crash of a replica is survived."""
 
@@ -291,18 +283,17 @@ class _Measurements:
     def __init__(self, effort: Effort, log: Log) -> None:
         self._effort, self._log = effort, log
 
-    def _tried(
-        self, what: str, measure: Callable[Params, Found], *args: Params.args, **options: Params.kwargs
-    ) -> Found:
-        return tried(what, lambda: measure(*args, **options), self._log)
+    def _tried(self, what: str, measure: Callable[[], Found]) -> Found:
+        return tried(what, measure, self._log)
 
     def launch(self) -> list[Figure]:
         count = self._effort.launches
-        found = self._tried("initialisation", bench_launch, BASE, PLACEMENT, count)
-        ring_us = ring_p50_us(BASE, PLACEMENT)
-        graph, whole = (_times(found, key) for key in ("graph_ms", "launch_ms"))
+        found = self._tried("initialisation", partial(bench_launch, BASE, PLACEMENT, count))
+        graph, whole = (  # of so few values the p95 and the p99 are the greatest
+            Percentiles(one.p50, one.max, one.max, one.max) for one in (found.graph_ms, found.launch_ms)
+        )
+        ring_us, what = ring_p50_us(BASE, PLACEMENT), "initialisation"
         warm = "its zygote is warm and its spares are parked"
-        what = "initialisation"
         return [
             figure(f"{what}.graph", f"{what}: the whole graph", graph, count, ring_us, note=warm),
             figure(f"{what}.reply", f"{what}: command to first reply", whole, count, ring_us),
@@ -311,30 +302,29 @@ class _Measurements:
     def cycle(self, ftm: str, placement: str) -> CycleResult:
         requests, rounds = self._effort.requests, self._effort.rounds
         what = f"cycle of {ftm}, placement {placement}"
-        found = self._tried(what, bench_cycle, ftm, placement, requests, rounds=rounds)
-        return msgspec.convert(found, CycleResult)
+        return self._tried(what, partial(bench_cycle, ftm, placement, requests, rounds=rounds))
 
     def recoveries(self) -> Iterator[Figure]:
         kills = self._effort.kills
         for ftm in STATE_FTMS:
             what, name = f"recovery under {ftm}", f"recovery.{ftm}"
-            found = self._tried(what, bench_recovery, ftm, PLACEMENT, kills)
+            found = self._tried(what, partial(bench_recovery, ftm, PLACEMENT, kills))
             ring_us = ring_p50_us(BASE, PLACEMENT)
-            whole, after = (_times(found, key) for key in ("recovery_ms", "after_detection_ms"))
             detected = f"{what}, detection to the next good reply"
-            yield figure(f"{name}.after_detection", detected, after, kills, ring_us, RECOVERY)
-            yield figure(name, f"{what}, SIGKILL to the next good reply", whole, kills, ring_us)
+            yield figure(
+                f"{name}.after_detection", detected, found.after_detection_ms, kills, ring_us, RECOVERY
+            )
+            yield figure(name, f"{what}, SIGKILL to the next good reply", found.recovery_ms, kills, ring_us)
 
     def adaptations(self) -> list[Figure]:
         count, seconds = self._effort.adaptations, self._effort.state_seconds
         figures = []
         for name, kind, new in (("compose", "composition", COMPOSED), ("switch", "switch", SWITCHED)):
             what = f"{kind} {BASE} to {new}"
-            found = self._tried(what, bench_adapt, BASE, new, PLACEMENT, RECIPES[0], count)
-            times = _times(found, "blackout_ms"), _times(found, "total_ms")
-            figures += _both(name, what, *times, count, _fate(found))
+            found = self._tried(what, partial(bench_adapt, BASE, new, PLACEMENT, RECIPES[0], count))
+            figures += _both(name, what, found.blackout_ms, found.total_ms, count, _fate(found))
         what = f"update of the function, {UPDATED_BYTES} bytes of state"
-        update = self._tried(what, sized, BASE, UPDATED_BYTES, count, seconds)
+        update = self._tried(what, partial(sized, BASE, UPDATED_BYTES, count, seconds))
         assert update.blackout_ms is not None and update.total_ms is not None, update.refused
         times = update.blackout_ms, update.total_ms
         return figures + _both("update", what, *times, count, "under a closed loop")
@@ -352,13 +342,14 @@ class _Measurements:
             except (HarnessError, ConfigError):
                 ends["failed"] += 1
                 continue
-            blackouts.append(_times(found, "blackout_ms").p50)
-            totals.append(_times(found, "total_ms").p50)
-            ends["never served again"] += bool(found["stuck"])
+            blackouts.append(found.blackout_ms.p50)
+            totals.append(found.total_ms.p50)
+            ends["never served again"] += bool(found.stuck)
         words = ", ".join(f"{count} {end}" for end, count in ends.items() if count) or "all served again"
-        count = len(blackouts)
-        times = (percentiles(blackouts), percentiles(totals)) if count else None
-        return _both("recipe", what, *times, count, "") if times else [], f"{what}: {runs} runs: {words}."
+        fate = f"{what}: {runs} runs: {words}."
+        if not blackouts:
+            return [], fate
+        return _both("recipe", what, percentiles(blackouts), percentiles(totals), len(blackouts), ""), fate
 
     def placement(self, placement: str, base: CycleResult) -> PlacementResult:
         cycle = base if placement == PLACEMENT else self.cycle(BASE, placement)
@@ -370,7 +361,7 @@ class _Measurements:
         return PlacementResult(placement, placement != NO_CRASH, cycle, loaded, idle)
 
     def processes(self, placements: tuple[PlacementResult, ...]) -> tuple[ProcessCount, ...]:
-        composed = self._tried(f"processes of {COMPOSED}", process_count, COMPOSED, PLACEMENT)
+        composed = self._tried(f"processes of {COMPOSED}", partial(process_count, COMPOSED, PLACEMENT))
         counts = [(BASE, p.placement, p.loaded.processes) for p in placements]
         return tuple(
             ProcessCount(ftm, placement, ours, PROCESSES[ftm] if placement == PLACEMENT else None)
@@ -382,13 +373,13 @@ class _Measurements:
 
         def measure(size_bytes: int) -> StateResult:
             what = f"state of {size_bytes} bytes under {ftm}"
-            return self._tried(what, sized, ftm, size_bytes, updates, seconds)
+            return self._tried(what, partial(sized, ftm, size_bytes, updates, seconds))
 
         return sweep_sizes(ftm, self._effort.sizes_bytes, measure)
 
     def load(self, placement: str, rate_hz: float) -> LoadResult:
         what, seconds = f"{rate_hz:g} requests a second, placement {placement}", self._effort.load_seconds
-        return self._tried(what, under_load, BASE, placement, rate_hz, seconds)
+        return self._tried(what, partial(under_load, BASE, placement, rate_hz, seconds))
 
 
 def _cycle_figure(cycle: CycleResult) -> Figure:
@@ -410,16 +401,270 @@ def _both(
     ]
 
 
-def _fate(found: dict[str, object]) -> str:
+def _fate(found: AdaptationResult) -> str:
     """What became of the requests meanwhile."""
-    counts = msgspec.convert(found["requests"], dict[str, int])
-    bad = {name: n for name, n in counts.items() if n and name != "sent"}
+    bad = {name: n for name, n in found.requests.items() if n and name != "sent"}
     words = ", ".join(f"{n} {name}" for name, n in bad.items()) or "none lost, doubled, out of order or wrong"
-    stuck = f"; {found['stuck']} of {found['adaptations']} never served again" if found["stuck"] else ""
-    return f"{counts['sent']} requests: {words}{stuck}"
+    stuck = f"; {found.stuck} of {found.adaptations} never served again" if found.stuck else ""
+    return f"{found.requests['sent']} requests: {words}{stuck}"
 
 
-def _times(found: dict[str, object], key: str) -> Percentiles:
-    """Of a bench's document. A launch has p50 and max alone: of so few values the p95 is the max."""
-    given = msgspec.convert(found[key], dict[str, float])
-    return msgspec.convert({"p95": given["max"], "p99": given["max"], **given}, Percentiles)
+# -- tables -------------------------------------------------------------------------------------------
+
+
+class PaperTable(msgspec.Struct, frozen=True):
+    """The first column is words, all others are aligned to the right."""
+
+    name: str
+    title: str
+    about: str
+    head: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+
+def tables(paper: Paper) -> tuple[PaperTable, ...]:
+    """All of it, in the order in which it is read."""
+    ring = paper.placements[0].cycle
+    bare_ms = [milliseconds(us / 1e3) for us in (ring.ring_us.p50, ring.ring_us.p99)]
+    return (
+        PaperTable(
+            "times",
+            "Times",
+            "ms. In rounds: our p50 in median rounds of the bare ring of as many hops as a request has under"
+            " pbr, or, for a cycle, as it has itself.",
+            ("figure", "the paper", "here, p50", "p99", "in rounds", "of"),
+            (
+                (f"the bare ring of {ring.hops} hops", NOTHING, *bare_ms, "1", str(ring.requests)),
+                *map(_time, paper.figures),
+            ),
+        ),
+        PaperTable(
+            "road",
+            "On the road",
+            f"At {paper.speed_kmh:g} km/h: how far the car travels in that time, and with what speed it meets"
+            " the obstacle before which it would just have stopped, braking with"
+            f" {paper.deceleration_ms2:.2f} m/s2, if it begins so much too late.",
+            ("figure", "the paper, way", "speed", "here, p50, way", "speed", "p99, way", "speed"),
+            tuple(map(_road, paper.figures)),
+        ),
+        PaperTable(
+            "processes",
+            "Processes",
+            "The nodes, and the supervisor in the place of the ROS master.",
+            ("graph", "the paper", "here"),
+            tuple((f"{p.ftm}, {p.placement}", str(p.paper or NOTHING), str(p.ours)) for p in paper.processes),
+        ),
+        PaperTable(
+            "placements",
+            "Placements",
+            "Under pbr. CPU in percent of one core, at 50 requests a second and at one, which is as good as"
+            " none; asleep: processes that took less than half a percent at 50; memory is PSS.",
+            ("placement", "crash", "processes", "asleep", "cycle p50", "p99", "CPU", "CPU, idle", "memory")
+            + ("beside: memory",),
+            tuple(map(_placement, paper.placements)),
+        ),
+        PaperTable(
+            "state",
+            "Size of the state",
+            "Cycle in a closed loop, us; blackout of an update of the function, which moves the state, ms.",
+            ("state", "under", "cycle p50", "p99", "in rounds", "blackout p50", "p99", "updates"),
+            tuple(map(_state, paper.state)),
+        ),
+        PaperTable(
+            "load",
+            "Load",
+            "Under pbr, at a fixed rate. Latency as the client saw it, ms; CPU in percent of one core.",
+            ("requests a second", "placement", "sent", "p50", "p99", "in rounds", "CPU", "of"),
+            tuple(map(_load, paper.load)),
+        ),
+    )
+
+
+def _time(row: Figure) -> tuple[str, ...]:
+    p50, p99 = milliseconds(row.ours_ms.p50), milliseconds(row.ours_ms.p99)
+    return row.what, _published(row.paper), p50, p99, milliseconds(row.ratio), str(row.samples)
+
+
+def _road(row: Figure) -> tuple[str, ...]:
+    theirs = (NOTHING, NOTHING)
+    if row.paper_road:
+        theirs = _range(map(distance, row.paper_road)), _range(map(_speed, row.paper_road))
+    ours = [cell for found in row.road or () for cell in (distance(found), _speed(found))]
+    return row.what, *theirs, *(ours or ["served meanwhile", NOTHING, NOTHING, NOTHING])
+
+
+def _placement(row: PlacementResult) -> tuple[str, ...]:
+    cycle, loaded = row.cycle.cycle_us, row.loaded
+    return (
+        row.placement,
+        "survived" if row.survives_crash else "the end",
+        *(str(count) for count in (loaded.processes, loaded.asleep)),
+        *(f"{us:g} us" for us in (cycle.p50, cycle.p99)),
+        *(f"{percent:g} %" for percent in (loaded.cpu_percent, row.idle.cpu_percent)),
+        *(f"{mb:g} MB" for mb in (loaded.pss_mb, loaded.others_pss_mb)),
+    )
+
+
+def _state(row: StateResult) -> tuple[str, ...]:
+    found = (size(row.state_bytes), row.ftm)
+    if row.cycle_us is None or row.blackout_ms is None:
+        return *found, *([NOTHING] * 5), "not carried"
+    cycle = (f"{row.cycle_us.p50:g}", f"{row.cycle_us.p99:g}", milliseconds(row.cycle_us.p50 / row.ring_us))
+    return *found, *cycle, *map(milliseconds, (row.blackout_ms.p50, row.blackout_ms.p99)), str(row.updates)
+
+
+def _load(row: LoadResult) -> tuple[str, ...]:
+    p50_ms, p99_ms = row.latency_ms.p50, row.latency_ms.p99
+    times = map(milliseconds, (p50_ms, p99_ms, p50_ms * 1e3 / row.ring_us))
+    cpu = f"{row.usage.cpu_percent:g} %"
+    return f"{row.rate_hz:g}", row.placement, f"{row.sent_hz:g}", *times, cpu, str(row.requests)
+
+
+def size(count_bytes: float) -> str:
+    """`100 B`, `60 kB`, `10 MB`."""
+    for unit, name in ((1e6, "MB"), (1e3, "kB")):
+        if count_bytes >= unit:
+            return f"{count_bytes / unit:g} {name}"
+    return f"{count_bytes:g} B"
+
+
+def distance(on_road: OnRoad) -> str:
+    """`0.15 cm`, `4.17 m`."""
+    return f"{on_road.metres:.3g} m" if on_road.metres >= 1 else f"{on_road.metres * 100:.2g} cm"
+
+
+def _speed(on_road: OnRoad) -> str:
+    return f"{on_road.worst_kmh:.1f} km/h"
+
+
+def _published(paper: PublishedFigure | None) -> str:
+    return _range((f"{paper.low:g}", f"{paper.high:g}")) if paper else NOTHING
+
+
+def _range(words: Iterable[str]) -> str:
+    return " to ".join(dict.fromkeys(words))
+
+
+# -- text and markdown --------------------------------------------------------------------------------
+
+
+def text(paper: Paper) -> Iterator[str]:
+    """Lines for a terminal."""
+    yield f"{paper.title} ({paper.source})"
+    yield f"theirs: {paper.their_machine}"
+    yield f"here: {machine(paper)}"
+    for table in tables(paper):
+        yield ""
+        yield f"{table.title}. {table.about}"
+        widths = [max(map(len, column)) for column in zip(table.head, *table.rows, strict=True)]
+        for first, *others in (table.head, *table.rows):
+            cells = [first.ljust(widths[0]), *map(str.rjust, others, widths[1:])]
+            yield "  ".join(cells).rstrip()
+    yield ""
+    yield from notes(paper)
+
+
+def markdown(paper: Paper) -> Iterator[str]:
+    """The same for a page."""
+    yield f"Measured here: {machine(paper)}, in {paper.seconds:.0f} s{', quickly' if paper.quick else ''}."
+    for table in tables(paper):
+        yield from ("", f"### {table.title}", "", table.about, "")
+        yield _piped(table.head)
+        yield _piped(["---", *["---:"] * (len(table.head) - 1)])
+        yield from map(_piped, table.rows)
+    yield ""
+    yield from (f"- {note}" for note in notes(paper))
+
+
+def notes(paper: Paper) -> list[str]:
+    """What is to be known of single figures, and what is missing."""
+    published = [(f.paper, f.paper.note) for f in paper.figures if f.paper and f.paper.note]
+    theirs = [f"The paper's {_published(figure)} ms: {note}." for figure, note in published]
+    ours = [f"{figure.what}: {figure.note}." for figure in paper.figures if figure.note]
+    missing = [row for row in paper.state if row.refused]
+    refused = [f"State of {size(row.state_bytes)} under {row.ftm}: {row.refused}." for row in missing]
+    rospy_ms = f"{paper.rospy_cycle_ms:g}"
+    rospy = f"The paper's graph on ROS 1 with rospy, on two cores of today: {rospy_ms} ms a cycle."
+    return [*dict.fromkeys(theirs), rospy, *paper.notes, *ours, *refused]
+
+
+def machine(paper: Paper) -> str:
+    """The machine of this measurement, without what the builder of its kernel appended."""
+    environment = paper.environment
+    return f"{environment.cpus}; {environment.kernel.partition('-')[0]}; {environment.python}"
+
+
+def _piped(cells: Iterable[str]) -> str:
+    return f"| {' | '.join(cells)} |"
+
+
+# -- page -----------------------------------------------------------------------------------------------
+
+
+class PaperPlot(msgspec.Struct, frozen=True):
+    """A drawing, and the names of its lines in the order of their styles."""
+
+    title: str
+    drawing: str
+    lines: tuple[str, ...]
+
+
+def html_page(paper: Paper) -> str:
+    """The whole page."""
+    from aftbed.report.html import TEMPLATES as STYLES  # noqa: PLC0415 - jinja2
+    from aftbed.report.html import engine, page_text  # noqa: PLC0415
+
+    return page_text(
+        engine(TEMPLATES, STYLES).get_template("paper.html.j2"),
+        paper=paper,
+        tables=tables(paper),
+        here=machine(paper),
+        notes=notes(paper),
+        plots=_plots(paper),
+    )
+
+
+def _plots(paper: Paper) -> dict[str, list[PaperPlot]]:
+    """By the name of the table above which they stand."""
+    ranges = [
+        plots.TimeRange(
+            f.what, (f.paper.low, f.paper.high) if f.paper else None, (f.ours_ms.p50, f.ours_ms.p99)
+        )
+        for f in paper.figures
+    ]
+    title, rate = "The paper, and here from p50 to p99", "requests a second"
+    cycles = [(row.ftm, row.state_bytes, row.cycle_us.p50) for row in paper.state if row.cycle_us]
+    updates = [(row.ftm, row.state_bytes, row.blackout_ms.p50) for row in paper.state if row.blackout_ms]
+    latencies = [
+        (f"{row.placement}, {name}", row.rate_hz, ms)
+        for row in paper.load
+        for name, ms in (("p50", row.latency_ms.p50), ("p99", row.latency_ms.p99))
+    ]
+    cpu = [(row.placement, row.rate_hz, row.usage.cpu_percent) for row in paper.load]
+    return {
+        "times": [PaperPlot(title, plots.ranges(title, ranges), ("here", "the paper"))],
+        "state": [
+            *_sweep("Cycle, p50", cycles, "state", "us", size),
+            *_sweep("Blackout of an update, p50", updates, "state", "ms", size),
+        ],
+        "load": [
+            *_sweep("Latency", latencies, rate, "ms"),
+            *_sweep("CPU, all processes of the graph", cpu, rate, "% of one core"),
+        ],
+    }
+
+
+def _sweep(
+    title: str,
+    points: Iterable[tuple[str, float, float]],
+    x_name: str,
+    y_name: str,
+    format_x: plots.Format = milliseconds,
+) -> list[PaperPlot]:
+    """One plot of points, each with the name of its line; none where nothing was measured."""
+    lines: dict[str, list[tuple[float, float]]] = {}
+    for name, x, y in points:
+        lines.setdefault(name, []).append((x, y))
+    if not lines:
+        return []
+    return [PaperPlot(title, plots.curves(title, lines, x_name, y_name, format_x), tuple(lines))]

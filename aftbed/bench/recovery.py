@@ -14,8 +14,10 @@ import time
 from pathlib import Path
 from typing import Final
 
-from aftbed.bench.runs import POLL_SECONDS, endless_run, summary
-from aftbed.core.errors import ConfigError, HarnessError
+import msgspec
+
+from aftbed.bench.runs import POLL_SECONDS, Percentiles, endless_run, percentiles, wait_for
+from aftbed.core.errors import HarnessError
 from aftbed.inject.crash import Crash
 from aftbed.inject.model import Fault
 from aftbed.inject.timing import Trigger
@@ -27,17 +29,30 @@ PAUSE_SECONDS: Final = 0.02  # of undisturbed service between two kills
 DEATHS: Final = 25  # before the kills, and as many after them
 
 
-def bench_recovery(ftm: str, placement: str, kills: int, *, pin: bool = True) -> dict[str, object]:
-    """`recovery_ms{p50,p99,max}`, the same without detection, and its parts: see `docs/commands.md`."""
+class RecoveryResult(msgspec.Struct, frozen=True):
+    """The document of `aftbed bench recovery`; `after_detection_ms`: from the alarm on."""
+
+    ftm: str
+    placement: str
+    kills: int
+    recovery_ms: Percentiles
+    after_detection_ms: Percentiles
+    parts_ms: dict[str, Percentiles]
+    death_ms: Percentiles
+
+
+def bench_recovery(ftm: str, placement: str, kills: int, *, pin: bool = True) -> RecoveryResult:
+    """Kill the primary `kills` times. Raises HarnessError."""
     deaths = [death_ms() for _ in range(DEATHS)]
     with endless_run(ftm, placement, pin=pin) as run:
         epoch = 0
-        for _ in range(kills):
-            epoch = _wait_for_redundancy(run.private, epoch)
-            control_client.ask(
-                run.private, control_client.InjectCommand(Fault(Crash(), "primary", Trigger()))
-            )
-        _wait_for_redundancy(run.private, epoch)
+        for number in range(kills + 1):
+            epoch = _redundant_epoch(run.private, epoch)
+            time.sleep(PAUSE_SECONDS)
+            if number < kills:
+                control_client.ask(
+                    run.private, control_client.InjectCommand(Fault(Crash(), "primary", Trigger()))
+                )
     deaths += [death_ms() for _ in range(DEATHS)]
     parts: dict[str, list[float]] = {"detection": [], "fencing": [], "promotion": [], "first_reply": []}
     recovered = []
@@ -51,15 +66,27 @@ def bench_recovery(ftm: str, placement: str, kills: int, *, pin: bool = True) ->
         parts["first_reply"].append(f.recovered_ms - f.promoted_ms)
     if len(recovered) < kills:
         raise HarnessError(f"{kills} kills, but only {len(recovered)} recoveries in the journals")
-    return {
-        "ftm": ftm,
-        "placement": placement,
-        "kills": kills,
-        "recovery_ms": summary(recovered, 3),
-        "after_detection_ms": summary([r - d for r, d in zip(recovered, parts["detection"], strict=True)], 3),
-        "parts_ms": {name: summary(values, 3) for name, values in parts.items()},
-        "death_ms": summary(deaths, 3),
-    }
+    return RecoveryResult(
+        ftm,
+        placement,
+        kills,
+        percentiles(recovered),
+        percentiles([r - d for r, d in zip(recovered, parts["detection"], strict=True)]),
+        {name: percentiles(values) for name, values in parts.items()},
+        percentiles(deaths),
+    )
+
+
+def _redundant_epoch(private: Path, after: int) -> int:
+    """The epoch in which two replicas serve, a later one than `after`.
+
+    An earlier kill may have hit a leader that had no backup yet.
+    """
+
+    def reached(status: dict[str, object]) -> bool:
+        return int(str(status["epoch"])) > after and bool(status["backup"]) and not status["busy"]
+
+    return int(str(wait_for(private, reached, REDUNDANCY_SECONDS_MAX, "redundancy")["epoch"]))
 
 
 def death_ms() -> float:
@@ -98,22 +125,3 @@ def death_ms() -> float:
     if not seen:
         raise HarnessError("the process that waited for the death of another died")
     return (int.from_bytes(seen, "little") - killed_ns) / 1e6
-
-
-def _wait_for_redundancy(private: Path, epoch: int) -> int:
-    """Until two replicas serve under a later epoch than `epoch`; returns that epoch.
-
-    An earlier kill may hit a leader that has no backup yet.
-    """
-    limit = time.monotonic() + REDUNDANCY_SECONDS_MAX
-    while time.monotonic() < limit:
-        try:
-            status = control_client.ask(private, control_client.StatusQuery())
-        except ConfigError:
-            status = {}  # still starting
-        now = int(str(status.get("epoch", 0)))
-        if now > epoch and status.get("backup") and not status.get("busy"):
-            time.sleep(PAUSE_SECONDS)
-            return now
-        time.sleep(POLL_SECONDS)
-    raise HarnessError(f"no redundancy within {REDUNDANCY_SECONDS_MAX} s")

@@ -1,4 +1,6 @@
-"""CPU, memory and processes of a run at work: of its graph with the supervisor, and of all others apart.
+"""What a run costs: its start, and at work its CPU, memory and processes.
+
+CPU and memory are those of the graph with the supervisor, and those of all other processes apart.
 
 Placements are compared side by side, because the paper's complaint is processes that do almost nothing. In
 `process` each brick is a process, as in the paper; in `replica` a replica is one; in `single` both replicas
@@ -9,9 +11,17 @@ CPU is the time that the scheduler has given to each process over a window, in n
 (/proc/PID/schedstat): the ticks of /proc/PID/stat are 10 ms long, which is more than most nodes use in a
 second. Memory is PSS (proc(5), smaps_rollup), which shares a page among the processes that map it, so that a
 sum over processes is honest.
+
+A start is measured as a user would make it, in an interpreter of its own: `launch_ms` to the first reply, and
+`graph_ms` of it from a warm zygote with parked spares to the answer of the last node. `imports_ms` is the
+limit: an interpreter that only imports the libraries that a run needs, started in turn with the command.
 """
 
+import json
 import os
+import subprocess
+import sys
+import tempfile
 import time
 from pathlib import Path
 from typing import Final
@@ -26,9 +36,13 @@ from aftbed.bench.runs import (
     finished,
     latencies_us,
     percentiles,
+    wait_for,
     wait_until_ready,
 )
-from aftbed.core.errors import ConfigError, HarnessError
+from aftbed.campaign.statistics import quantile
+from aftbed.core.errors import HarnessError
+from aftbed.core.journal import EntryKind
+from aftbed.judge.record import read_record
 from aftbed.runtime.unix import control_client
 from aftbed.runtime.unix.launch import launch, options_for
 from aftbed.runtime.unix.options import CarRun
@@ -41,6 +55,8 @@ START_SECONDS_MAX: Final = 10.0
 SETTLE_SECONDS: Final = 1.5  # of driving before the look, so that the pages that work touches are counted
 ASLEEP_PERCENT: Final = 0.5  # of one core: a node below it does almost nothing
 NO_CRASH: Final = "single"  # the placement in which both replicas die at once
+RUN_SECONDS_MAX: Final = 30.0
+IMPORTS: Final = "import can, cantools, msgspec, typer"
 
 
 class Usage(msgspec.Struct, frozen=True):
@@ -73,46 +89,45 @@ class LoadResult(msgspec.Struct, frozen=True):
     usage: Usage
 
 
-def bench_memory(ftm: str, placement: str) -> dict[str, object]:
-    """`processes, pss_mb, rss_mb` of the graph and the supervisor, `others{}` by name."""
+class MemoryOfOthers(msgspec.Struct):
+    """Of all processes of one name."""
+
+    processes: int = 0
+    pss_mb: float = 0.0
+
+
+class MemoryResult(msgspec.Struct, frozen=True):
+    """The document of `aftbed bench memory`; `others`: zygotes, spares, hub, vehicle and command."""
+
+    ftm: str
+    placement: str
+    processes: int
+    pss_mb: float
+    rss_mb: float
+    others: dict[str, MemoryOfOthers]
+
+
+def bench_memory(ftm: str, placement: str) -> MemoryResult:
+    """Of a car's drive, when it has settled. Raises HarnessError."""
     options, listener = options_for(ftm=ftm, placement=placement, work=CarRun("free-drive", 1.0, "latch"))
     launched = launch(options, listener)
     try:
-        rows = _rows_of_drive(launched.private)
+        wait_for(launched.private, lambda status: status.get("vehicle"), START_SECONDS_MAX, "drive")
+        time.sleep(SETTLE_SECONDS)
+        rows = control_client.processes(launched.private)
+        rows = measured([*rows, ProcessRow("command", "command", os.getpid(), False)])
     finally:
         launched.stop()
         finished(launched, STOPPED[:1])
     nodes = [row for row in rows if row.node]
-    others: dict[str, dict[str, float]] = {}
+    others: dict[str, MemoryOfOthers] = {}
     for row in rows:
         if not row.node:
-            found = others.setdefault(row.name, {"processes": 0, "pss_mb": 0.0})
-            found["processes"] += 1
-            found["pss_mb"] = round(found["pss_mb"] + row.pss_mb, 1)
-    return {
-        "ftm": ftm,
-        "placement": placement,
-        "processes": len(nodes),
-        "pss_mb": round(sum(row.pss_mb for row in nodes), 1),
-        "rss_mb": round(sum(row.rss_mb for row in nodes), 1),
-        "others": others,
-    }
-
-
-def _rows_of_drive(private: Path) -> list[ProcessRow]:
-    limit = time.monotonic() + START_SECONDS_MAX
-    while time.monotonic() < limit:
-        try:
-            status = control_client.ask(private, control_client.StatusQuery())
-        except ConfigError:
-            status = {}
-        if status.get("vehicle"):
-            time.sleep(SETTLE_SECONDS)
-            rows = control_client.processes(private)
-            rows.append(ProcessRow("command", "command", os.getpid(), False))
-            return measured(rows)
-        time.sleep(0.02)
-    raise HarnessError(f"the car does not drive after {START_SECONDS_MAX} s")
+            found = others.setdefault(row.name, MemoryOfOthers())
+            found.processes += 1
+            found.pss_mb = round(found.pss_mb + row.pss_mb, 1)
+    pss_mb, rss_mb = sum(row.pss_mb for row in nodes), sum(row.rss_mb for row in nodes)
+    return MemoryResult(ftm, placement, len(nodes), round(pss_mb, 1), round(rss_mb, 1), others)
 
 
 def process_count(ftm: str, placement: str) -> int:
@@ -183,3 +198,53 @@ def _cpu_ns(rows: list[ProcessRow]) -> dict[int, int]:
     if rows and not found:
         raise HarnessError("no /proc/PID/schedstat: this kernel does not tell CPU times (CONFIG_SCHED_INFO)")
     return found
+
+
+# -- start ----------------------------------------------------------------------------------------
+
+
+class StartTime(msgspec.Struct, frozen=True):
+    """ms."""
+
+    p50: float
+    max: float
+
+
+class LaunchResult(msgspec.Struct, frozen=True):
+    """The document of `aftbed bench launch`."""
+
+    ftm: str
+    placement: str
+    runs: int
+    launch_ms: StartTime
+    graph_ms: StartTime
+    imports_ms: StartTime
+
+
+def bench_launch(ftm: str, placement: str, runs: int) -> LaunchResult:
+    """Start `aftbed run` so many times. Raises HarnessError."""
+    starts = [(*_launched_ms(ftm, placement), _imported_ms()) for _ in range(runs)]
+    times = [StartTime(round(quantile(ms, 0.5), 1), round(max(ms), 1)) for ms in zip(*starts, strict=True)]
+    return LaunchResult(ftm, placement, runs, *times)
+
+
+def _launched_ms(ftm: str, placement: str) -> tuple[float, float]:
+    """To the first reply, and of the graph alone."""
+    with tempfile.TemporaryDirectory(prefix="aftbed-bench-") as folder:
+        directory = Path(folder) / "record"
+        began_ns = time.monotonic_ns()
+        arguments = [sys.executable, "-m", "aftbed", "run", "--ftm", ftm, "--placement", placement]
+        arguments += ["--pace", "max", "--scenario", "ccrs-20", "--record", str(directory), "--json"]
+        done = subprocess.run(arguments, capture_output=True, timeout=RUN_SECONDS_MAX, check=False)
+        if done.returncode != 0:
+            raise HarnessError(f"aftbed run ended with {done.returncode}: {done.stderr.decode()[-500:]}")
+        dialogue = read_record(directory).history.dialogue
+        first_ns = next(e.t_ns for e in dialogue if e.kind is EntryKind.ANSWERED)
+        graph_ms = json.loads((directory / "end.json").read_text())["graph_ms"]
+    return (first_ns - began_ns) / 1e6, float(graph_ms)
+
+
+def _imported_ms() -> float:
+    began_ns = time.monotonic_ns()
+    subprocess.run([sys.executable, "-c", IMPORTS], timeout=RUN_SECONDS_MAX, check=True)
+    return (time.monotonic_ns() - began_ns) / 1e6

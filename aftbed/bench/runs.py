@@ -1,8 +1,8 @@
 """Runs under a synthetic load, without a car, and the times in their records: what the benches share."""
 
+import contextlib
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Final, TypeVar
 
@@ -41,11 +41,6 @@ def percentiles(values: list[float], digits: int = 3) -> Percentiles:
     return Percentiles(*(round(quantile(values, share), digits) for share in (0.5, 0.95, 0.99, 1.0)))
 
 
-def summary(values: list[float], digits: int = 1) -> dict[str, float]:
-    """The same for a JSON document."""
-    return msgspec.structs.asdict(percentiles(values, digits))
-
-
 def tried(what: str, measure: Callable[[], Found], log: Log) -> Found:
     """What `measure` gives; a busy machine may fail it. Raises HarnessError after TRIES failures."""
     reason = ""
@@ -69,29 +64,22 @@ def limited_run(ftm: str, placement: str, count: int, *, pin: bool) -> RunRecord
 class EndlessRun:
     """A run under an endless load; `record` is there when it has ended."""
 
-    def __init__(self, launched: Launched) -> None:
-        self.private: Path = launched.private
-        self._record: RunRecord | None = None
+    record: RunRecord
 
-    @property
-    def record(self) -> RunRecord:
-        assert self._record is not None, "the run goes on"
-        return self._record
-
-    def end(self, record: RunRecord) -> None:
-        self._record = record
+    def __init__(self, private: Path) -> None:
+        self.private = private
 
 
-@contextmanager
+@contextlib.contextmanager
 def endless_run(ftm: str, placement: str, rate_hz: float = 0.0, *, pin: bool = True) -> Iterator[EndlessRun]:
     """A run at `rate_hz` requests a second (0: a closed loop), stopped at the end of the block."""
     launched = _start(ftm, placement, LoadRun(REQUESTS_ENDLESS, rate_hz), pin)
-    run = EndlessRun(launched)
+    run = EndlessRun(launched.private)
     try:
         yield run
     finally:
         launched.stop()
-        run.end(finished(launched, STOPPED))
+        run.record = finished(launched, STOPPED)
 
 
 def _start(ftm: str, placement: str, load: LoadRun, pin: bool) -> Launched:
@@ -114,19 +102,24 @@ def finished(launched: Launched, ends: tuple[str, ...]) -> RunRecord:
         launched.remove()
 
 
+def wait_for(
+    private: Path, reached: Callable[[dict[str, object]], object], seconds: float, what: str
+) -> dict[str, object]:
+    """Poll the status of a run until it is `reached`; returns it. Raises HarnessError."""
+    limit = time.monotonic() + seconds
+    while time.monotonic() < limit:
+        with contextlib.suppress(ConfigError):  # still starting
+            status = control_client.ask(private, control_client.StatusQuery())
+            if reached(status):
+                return status
+        time.sleep(POLL_SECONDS)
+    raise HarnessError(f"no {what} within {seconds:g} s")
+
+
 def wait_until_ready(private: Path) -> None:
     """Until the run serves with all its replicas. Raises HarnessError."""
-    limit = time.monotonic() + READY_SECONDS_MAX
-    while time.monotonic() < limit:
-        try:
-            status = control_client.ask(private, control_client.StatusQuery())
-        except ConfigError:
-            status = {"busy": True}  # still starting
-        if not status["busy"]:
-            time.sleep(PAUSE_SECONDS)
-            return
-        time.sleep(POLL_SECONDS)
-    raise HarnessError(f"no service within {READY_SECONDS_MAX:.0f} s")
+    wait_for(private, lambda status: not status["busy"], READY_SECONDS_MAX, "service")
+    time.sleep(PAUSE_SECONDS)
 
 
 def latencies_us(

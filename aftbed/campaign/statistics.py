@@ -41,7 +41,7 @@ from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from random import Random
 from statistics import NormalDist
-from typing import Final
+from typing import Final, TypeVar
 
 import msgspec
 
@@ -52,6 +52,8 @@ METHOD: Final = "clopper-pearson"
 RESAMPLES: Final = 2000
 BEYOND_MIN: Final = 5  # resamples beyond each bound of a bootstrap interval; fewer say nothing
 HALF_WIDTH_MIN: Final = 1e-5  # narrower takes up to 10^10 experiments and more
+
+Value = TypeVar("Value", int, float)
 
 
 class Interval(msgspec.Struct, frozen=True):
@@ -103,13 +105,13 @@ def look_confidence(confidence: float, looks: int) -> float:
     return 1 - beyond / looks
 
 
-def quantile(values: Sequence[float], share: float) -> float:
+def quantile(values: Sequence[Value], share: float) -> Value:
     """The value that `share` of `values` do not exceed, by nearest rank: always one of the values.
 
-    The benches take it too, and they fork the supervisors that they measure. So this module imports scipy
-    (30 MB) only inside of the functions that need it.
+    Of share 0 it is the least one. The benches take it too, and they fork the supervisors that they measure.
+    So this module imports scipy (30 MB) only inside of the functions that need it.
     """
-    assert values and 0 < share <= 1
+    assert values and 0 <= share <= 1
     ordered = sorted(values)
     return ordered[max(0, math.ceil(share * len(ordered)) - 1)]
 
@@ -156,8 +158,8 @@ def bootstrap_interval(
 
 
 def place(size: int, q: float) -> int:
-    """The index of the q-quantile among `size` values in order: that of `bench.runs.quantile`."""
-    return round(quantile([float(index) for index in range(size)], q))
+    """The index of the q-quantile among `size` values in order: that of `quantile`."""
+    return quantile(range(size), q)
 
 
 def tail(confidence: float) -> float:

@@ -5,7 +5,6 @@ imported where it is used.
 """
 
 import sys
-from json import dumps
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -14,9 +13,8 @@ import typer
 
 from aftbed.bench.adaptation import bench_adapt
 from aftbed.bench.cycle import bench_cycle, bench_hops
-from aftbed.bench.launch import bench_launch
 from aftbed.bench.recovery import bench_recovery
-from aftbed.bench.resources import bench_memory
+from aftbed.bench.resources import bench_launch, bench_memory
 from aftbed.cli.options import Recipe
 from aftbed.core.errors import ConfigError
 from aftbed.ftm.compose import DUPLEX, replication_of
@@ -120,9 +118,9 @@ def hops(
     """The delay of one hop between two bricks in processes of their own, as a distribution."""
     found = bench_hops(ftm, requests, pin=pin)
     if json:
-        _print(msgspec.to_builtins(found), as_json=True)
+        _print(found, as_json=True)
         return
-    _print({"ftm": found.ftm, "requests": found.requests, "samples": found.samples}, as_json=False)
+    print(f"ftm            {found.ftm}\nrequests       {found.requests}\nsamples        {found.samples}")
     for name, delay_ns in found.hop_ns.items():
         print(f"{name:14} {delay_ns / 1e3:9.2f} us")
     for pair in (*found.pairs, *found.beside):
@@ -157,7 +155,7 @@ def paper(
     json: Json = False,
 ) -> None:
     """Every figure of the paper's Section IV beside ours, measured now; placements; sweeps."""
-    from aftbed.bench.paper import FULL, QUICK, bench_paper  # noqa: PLC0415 - see above
+    from aftbed.bench import paper as again  # noqa: PLC0415 - see above
 
     if json and markdown:
         raise ConfigError("--json and --markdown: one of them is allowed")
@@ -165,28 +163,24 @@ def paper(
         raise ConfigError(f"--html {html}: {html.parent} is no directory")
     if html is not None and html.is_dir():
         raise ConfigError(f"--html {html}: a directory; the name of a file is allowed")
-    found = bench_paper(QUICK if quick else FULL, _show_progress)
+    found = again.bench_paper(again.QUICK if quick else again.FULL, _show_progress)
     if json:
         print(msgspec.json.encode(found).decode())
     else:
-        from aftbed.bench import paper_page  # noqa: PLC0415 - after the measurement
-
-        for line in paper_page.markdown(found) if markdown else paper_page.text(found):
+        for line in again.markdown(found) if markdown else again.text(found):
             print(line)
     if html is not None:
-        from aftbed.bench.paper_page import html_page  # noqa: PLC0415 - after the measurement
-
-        html.write_text(html_page(found), encoding="utf-8")
+        html.write_text(again.html_page(found), encoding="utf-8")
 
 
 def _show_progress(what: str) -> None:
     print(f"{PROGRESS}{what}", file=sys.stderr, flush=True)
 
 
-def _print(found: dict[str, object], *, as_json: bool) -> None:
+def _print(document: msgspec.Struct, *, as_json: bool) -> None:
     if as_json:
-        print(dumps(found))
+        print(msgspec.json.encode(document).decode())
         return
-    for key, value in found.items():
+    for key, value in msgspec.to_builtins(document).items():
         parts = value.items() if isinstance(value, dict) else [("", value)]
         print(f"{key:14} " + "  ".join(f"{name} {part}".strip() for name, part in parts))

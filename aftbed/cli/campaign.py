@@ -193,12 +193,12 @@ def _shard(text: str) -> tuple[int, int]:
 
 def _follow(found: CampaignPlan, asked: runner.CampaignRunOptions, *, as_json: bool) -> bool:
     """Run, and show each result; True if the user interrupted it."""
-    from aftbed.report.terminal import Progress  # noqa: PLC0415 - scipy
+    from aftbed.report.terminal import CampaignProgress  # noqa: PLC0415 - scipy
 
     results = runner.run(found, asked)  # raises ConfigError here, before the progress is shown
     todo = sum(asked.has(index, len(found.strata)) for index in range(found.size))
     try:
-        with closing(results), Progress(found.spec.campaign, todo, quiet=as_json) as progress:
+        with closing(results), CampaignProgress(found.spec.campaign, todo, quiet=as_json) as progress:
             for result in results:
                 progress.add(result)
     except KeyboardInterrupt:

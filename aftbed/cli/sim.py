@@ -48,7 +48,7 @@ from aftbed.runtime.sim.givens import check as check_fault
 from aftbed.runtime.sim.trace import traced
 from aftbed.runtime.sim.world import Run, Setup
 from aftbed.runtime.unix.worker_pool import each
-from aftbed.search.agreement import SEEDS, Agreement, TimeRange, against
+from aftbed.search.agreement import SEEDS, Agreement, RecoveryRange, against
 from aftbed.search.explore import Found, attempt, missed, tried
 from aftbed.search.shrink import shrink
 from aftbed.search.swarm import drawn
@@ -647,7 +647,7 @@ def _classes(found: dict[str, int]) -> str:
     return ", ".join(f"{word} {count}" for word, count in found.items())
 
 
-def _times(found: TimeRange | None) -> str:
+def _times(found: RecoveryRange | None) -> str:
     if found is None:
         return "-"
     return f"{found.low_ms:.2f}  {found.median_ms:.2f}  {found.high_ms:.2f}  (of {found.count})"

@@ -192,7 +192,7 @@ def _limit(drawing: "_Drawing", axes: "Axes", limit: Limit, above_px: float) -> 
 
 def curves(
     title: str,
-    lines: Mapping[str, Points],
+    lines: Mapping[str, Sequence[tuple[float, float]]],
     x_name: str,
     y_name: str,
     format_x: Format = milliseconds,

@@ -106,7 +106,7 @@ def _aligned(rows: list[tuple[str, ...]]) -> list[str]:
 # -- while it runs --------------------------------------------------------------------------------
 
 
-class Progress:
+class CampaignProgress:
     """A context manager; `add` takes each result. There are at most `total` experiments."""
 
     def __init__(self, campaign: str, total: int, *, quiet: bool = False) -> None:

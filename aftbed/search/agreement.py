@@ -29,7 +29,7 @@ from aftbed.vehicle.aeb.function import default_application
 SEEDS: Final = 20
 
 
-class TimeRange(msgspec.Struct, frozen=True):
+class RecoveryRange(msgspec.Struct, frozen=True):
     """Of recoveries: fault to the first reply of the new master, in ms."""
 
     count: int
@@ -44,8 +44,8 @@ class Agreement(msgspec.Struct, frozen=True):
     experiment: str
     real: dict[str, int]  # classes, and how many runs have each
     simulated: dict[str, int]
-    real_recovery: TimeRange | None
-    simulated_recovery: TimeRange | None
+    real_recovery: RecoveryRange | None
+    simulated_recovery: RecoveryRange | None
     why_not: tuple[str, ...]
 
 
@@ -104,14 +104,14 @@ def _recoveries(history: core_history.History) -> list[float]:
     return [f.recovered_ms for f in checks.failovers(history) if f.recovered_ms is not None]
 
 
-def _times(found: list[float]) -> TimeRange | None:
+def _times(found: list[float]) -> RecoveryRange | None:
     if not found:
         return None
     ordered = sorted(found)
-    return TimeRange(len(ordered), ordered[0], ordered[len(ordered) // 2], ordered[-1])
+    return RecoveryRange(len(ordered), ordered[0], ordered[len(ordered) // 2], ordered[-1])
 
 
-def apart(real: TimeRange | None, simulated: TimeRange | None) -> list[str]:
+def apart(real: RecoveryRange | None, simulated: RecoveryRange | None) -> list[str]:
     """Why the times do not agree; empty if they do."""
     if real is None or simulated is None:
         return [] if real is simulated else ["only one of them has failovers"]

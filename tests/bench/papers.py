@@ -1,8 +1,8 @@
 """A made-up document of `aftbed bench paper`, for tests of what is made of it."""
 
+from aftbed.bench.cycle import CycleResult
 from aftbed.bench.paper import (
     CYCLE_PBR,
-    CycleResult,
     Paper,
     PlacementResult,
     ProcessCount,
@@ -16,9 +16,8 @@ from aftbed.campaign.ledger import Environment
 
 USAGE = Usage(1.0, 17, 6, 13.15, 83.4, 7, 0.5, 26.6)
 TIMES = percentiles([0.1, 0.2, 0.4])
-CYCLE = CycleResult(
-    "pbr", "process", 3, 12, percentiles([100.0, 110.0, 180.0]), percentiles([75.0, 76.0, 90.0]), 1.4
-)
+RING, OURS = percentiles([75.0, 76.0, 90.0]), percentiles([100.0, 110.0, 180.0])
+CYCLE = CycleResult("pbr", "process", 3, OURS, RING, 12, 1.4, (1.4,))
 
 STILL = PublishedFigure(300, 300, "still")
 

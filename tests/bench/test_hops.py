@@ -10,7 +10,8 @@ from typing import Final
 import pytest
 from liveruns import Home, aftbed
 
-from aftbed.bench.cycle import PLACEMENT, NotePair, delays_ns, nearest, single_hops, undisturbed
+from aftbed.bench.cycle import PLACEMENT, NotePair, delays_ns, single_hops, undisturbed
+from aftbed.campaign.statistics import quantile
 from aftbed.core.events import Event
 from aftbed.ftm.compose import EXPRESSIONS, build
 
@@ -73,7 +74,7 @@ def test_what_is_noted_twice_is_left_out() -> None:
 
 def test_the_nearest_rank() -> None:
     ordered = [10, 20, 30, 40]
-    assert [nearest(ordered, share) for share in (0.0, 0.25, 0.26, 0.5, 0.99, 1.0)] == [
+    assert [quantile(ordered, share) for share in (0.0, 0.25, 0.26, 0.5, 0.99, 1.0)] == [
         10,
         10,
         20,

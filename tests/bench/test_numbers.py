@@ -134,7 +134,7 @@ def test_a_row_of_the_table() -> None:
     assert rows == [f"| memory of the 17 processes (PSS) | 80 MB |  |  | {goal}"]
     rows = [row for row in markdown(measured()) if row.startswith("| start of")]
     assert rows[0].startswith(
-        "| start of a run to its reply | p50 700, max 800 ms | import of its libraries: 200 ms | p50 3.5 |"
+        "| start of a run to a reply | p50 700, max 800 ms | import of its libraries: 200 ms | p50 3.5 |"
     )
 
 

@@ -13,8 +13,7 @@ import pytest
 from liveruns import Home
 
 from aftbed.bench import resources, sweep
-from aftbed.bench.paper import CYCLES, QUICK, Paper
-from aftbed.bench.paper_page import tables
+from aftbed.bench.paper import CYCLES, QUICK, Paper, tables
 from aftbed.core.graph import PLACEMENTS
 
 QUICK_SECONDS_MAX: Final = 240.0  # of half a minute on a machine with nothing else to do

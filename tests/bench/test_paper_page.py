@@ -10,8 +10,7 @@ import pytest
 from browser import in_browser, measured, needs_browser
 from papers import made_up
 
-from aftbed.bench.paper import Paper
-from aftbed.bench.paper_page import html_page, markdown, notes, size, tables, text
+from aftbed.bench.paper import Paper, html_page, markdown, notes, size, tables, text
 
 
 def row(name: str, first: str) -> tuple[str, ...]:

@@ -20,7 +20,7 @@ from aftbed.inject.model import Fault
 from aftbed.inject.timing import Trigger
 from aftbed.runtime.sim.world import Doom, Setup
 from aftbed.runtime.unix.worker_pool import each
-from aftbed.search.agreement import Agreement, TimeRange, apart
+from aftbed.search.agreement import Agreement, RecoveryRange, apart
 from aftbed.search.explore import tried
 from aftbed.search.swarm import drawn
 
@@ -234,19 +234,19 @@ def test_a_swarm_is_drawn_from_the_seed(sim: Call) -> None:
 
 # -- real records beside their simulation
 
-FAST: Final = TimeRange(20, 0.2, 0.4, 0.6)
+FAST: Final = RecoveryRange(20, 0.2, 0.4, 0.6)
 
 
 @pytest.mark.parametrize(
     ("real", "words"),
     [
-        (TimeRange(3, 0.5, 0.55, 3.0), ""),  # the real median lies among the simulated times
-        (TimeRange(3, 0.3, 0.7, 3.0), ""),  # the simulated median lies among the real ones
-        (TimeRange(3, 0.7, 0.9, 3.0), "recovery: real median 0.9 ms, simulated 0.2 to 0.6 ms"),
+        (RecoveryRange(3, 0.5, 0.55, 3.0), ""),  # the real median lies among the simulated times
+        (RecoveryRange(3, 0.3, 0.7, 3.0), ""),  # the simulated median lies among the real ones
+        (RecoveryRange(3, 0.7, 0.9, 3.0), "recovery: real median 0.9 ms, simulated 0.2 to 0.6 ms"),
         (None, "only one of them has failovers"),
     ],
 )
-def test_times_agree_if_a_median_lies_within_the_other_range(real: TimeRange | None, words: str) -> None:
+def test_times_agree_if_a_median_lies_within_the_other_range(real: RecoveryRange | None, words: str) -> None:
     assert apart(real, FAST) == ([words] if words else [])
 
 

@@ -14,7 +14,7 @@ from reported import summary_of, with_results
 
 from aftbed.campaign.ledger import Ledger
 from aftbed.report import terminal
-from aftbed.report.terminal import Progress, summary_lines
+from aftbed.report.terminal import CampaignProgress, summary_lines
 
 
 def test_the_lines_name_strata_gates_and_last_the_verdict(ledger: Ledger) -> None:
@@ -50,7 +50,7 @@ def test_plain_lines_where_stdout_is_no_terminal(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(terminal, "LINE_S", 0.0)
-    with Progress("try", 3) as progress:
+    with CampaignProgress("try", 3) as progress:
         progress.add(result("tolerated"))
         progress.add(result("sdc", index=1, unexpected=True))
     first, second = capsys.readouterr().out.splitlines()
@@ -60,13 +60,13 @@ def test_plain_lines_where_stdout_is_no_terminal(
 
 def test_quiet_is_quiet(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(terminal, "LINE_S", 0.0)
-    with Progress("try", 1, quiet=True) as progress:
+    with CampaignProgress("try", 1, quiet=True) as progress:
         progress.add(result())
     assert capsys.readouterr().out == ""
 
 
 def test_no_lines_before_it_is_time(capsys: pytest.CaptureFixture[str]) -> None:
-    with Progress("try", 1) as progress:
+    with CampaignProgress("try", 1) as progress:
         progress.add(result())
     assert capsys.readouterr().out == ""
 
@@ -77,7 +77,7 @@ sys.path.insert(0, {folder!r})
 from campaigns import result
 from aftbed.report import terminal
 terminal.REDRAW_S = 0.0
-with terminal.Progress("try", 40) as progress:
+with terminal.CampaignProgress("try", 40) as progress:
     for index in range(40):
         progress.add(result("tolerated", f"pbr {{index}}", index, unexpected=index == 7))
     assert threading.active_count() == 1, "a thread would be forked with the workers"
