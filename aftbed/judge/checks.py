@@ -7,7 +7,6 @@ has a broken history in the tests that it must refuse.
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable
-from itertools import starmap
 from typing import Final, Literal, NamedTuple
 
 import msgspec
@@ -18,7 +17,6 @@ from aftbed.core.graph import Graph
 from aftbed.core.history import History
 from aftbed.core.journal import Entry, EntryKind, Record
 from aftbed.ftm.compose import build, replication_of
-from aftbed.inject.model import FaultReport
 from aftbed.judge.record import Excuses, RunRecord
 from aftbed.judge.reference import ReferenceRun
 from aftbed.runtime.hosting import Hosted
@@ -32,6 +30,7 @@ REQUESTED_ENDS: Final = ("", "interrupted", "stopped")  # ends of a run that its
 VEHICLE: Final = "vehicle"  # the name of the check of what a scenario expects of the car
 NOTHING_EXCUSED: Final = Excuses()
 LATE_NS: Final = 60_000_000  # as long as the brake ECU holds the last request
+CAUSE_NS_MAX: Final = 1_000_000_000  # an older fault is not the cause of an alarm
 
 Finding = Literal["pass", "fail", "unknown"]
 
@@ -44,7 +43,7 @@ class Check(msgspec.Struct, frozen=True):
 
 
 class Requests(msgspec.Struct, frozen=True):
-    """The client's account. `late`: answered after `LATE_NS`; `wrong`: not what the bare server says."""
+    """The client's account. `late`: answered after `LATE_NS`; `wrong`: not the bare server's."""
 
     sent: int
     answered: int
@@ -146,10 +145,14 @@ def one_master(history: History) -> Check:
     return _check(reasons) if masters else Check("unknown", ("no reply was accepted",))
 
 
-def wrong_replies(history: History, reference: ReferenceRun) -> list[int]:
-    """The ids whose reply differs from the bare server's."""
+def wrong_replies(history: History, reference: ReferenceRun) -> dict[int, bytes]:
+    """The replies that differ from the bare server's, by request."""
     answers = _answers(history)
-    return [i for i, expected in reference.replies if any(a.payload != expected for a in answers[i])]
+    return {
+        i: wrong[0]
+        for i, expected in reference.replies
+        if (wrong := [a.payload for a in answers[i] if a.payload != expected])
+    }
 
 
 def requests(history: History, reference: ReferenceRun) -> Requests:
@@ -171,40 +174,30 @@ def requests(history: History, reference: ReferenceRun) -> Requests:
 def failovers(history: History) -> list[Failover]:
     """Each change of master, in order."""
     accepted = history.events(Event.REPLY_ACCEPTED)
-    firsts: dict[int, int] = {}
-    lasts: dict[int, int] = {}
-    for record in accepted:
-        firsts.setdefault(record.detail >> 8, record.t_ns)
-        lasts[record.detail >> 8] = record.t_ns
-    promotions = history.events(Event.REPLICA_PROMOTED)
-    return [_failover(history, p, firsts, lasts) for p in promotions]
-
-
-def _failover(history: History, promoted: Record, firsts: dict[int, int], lasts: dict[int, int]) -> Failover:
-    fence = _last_before(history.events(Event.REPLICA_FENCED), promoted.t_ns)
-    alarm = _last_before(history.events(Event.WATCHDOG_SUSPECT), (fence or promoted).t_ns)
-    epoch = promoted.detail
-    before_ns = max((t for e, t in lasts.items() if e < epoch), default=0)
-    faults = [f for f in history.events(Event.FAULT_APPLIED) if f.t_ns <= (alarm or fence or promoted).t_ns]
-    fault = faults[-1] if faults and (alarm or fence or promoted).t_ns - faults[-1].t_ns < 10**9 else None
-    start_ns = fault.t_ns if fault else (alarm or fence or promoted).t_ns
-    reply_ns = firsts.get(epoch)
     sent_ns = {e.request_id: e.t_ns for e in _sent(history)}
-    first_id = next((r.request_id for r in history.events(Event.REPLY_ACCEPTED) if r.detail >> 8 == epoch), 0)
-    waiting_ns = max(start_ns, sent_ns.get(first_id, start_ns))
-
-    def ms(t_ns: int | None) -> float | None:
-        return None if t_ns is None else round((t_ns - start_ns) / 1e6, 3)
-
-    return Failover(
-        epoch=epoch,
-        cause="fault" if fault else ("alarm" if alarm else "unknown"),
-        detected_ms=ms(alarm.t_ns) if alarm and fault else None,
-        fenced_ms=ms(fence.t_ns) if fence else None,
-        promoted_ms=ms(promoted.t_ns),
-        recovered_ms=ms(reply_ns),
-        blackout_ms=None if reply_ns is None else round((reply_ns - max(waiting_ns, before_ns)) / 1e6, 3),
-    )
+    found = []
+    for promoted in history.events(Event.REPLICA_PROMOTED):
+        epoch = promoted.detail
+        fence = _last_before(history.events(Event.REPLICA_FENCED), promoted.t_ns)
+        alarm = _last_before(history.events(Event.WATCHDOG_SUSPECT), (fence or promoted).t_ns)
+        first = alarm or fence or promoted
+        fault = _last_before(history.events(Event.FAULT_APPLIED), first.t_ns)
+        if fault is not None and first.t_ns - fault.t_ns >= CAUSE_NS_MAX:
+            fault = None
+        start_ns = (fault or first).t_ns
+        reply = next((r for r in accepted if r.detail >> 8 == epoch), None)
+        blackout_ms = None
+        if reply is not None:  # no service from when a request waited, and the last master replied no more
+            waiting_ns = max(start_ns, sent_ns.get(reply.request_id, start_ns))
+            before_ns = max((r.t_ns for r in accepted if r.detail >> 8 < epoch), default=0)
+            blackout_ms = round((reply.t_ns - max(waiting_ns, before_ns)) / 1e6, 3)
+        detected_ms, fenced_ms, promoted_ms, recovered_ms = (
+            None if one is None else round((one.t_ns - start_ns) / 1e6, 3)
+            for one in (alarm if fault else None, fence, promoted, reply)
+        )
+        cause = "fault" if fault else "alarm" if alarm else "unknown"
+        found.append(Failover(epoch, cause, detected_ms, fenced_ms, promoted_ms, recovered_ms, blackout_ms))
+    return found
 
 
 def _last_before(records: Iterable[Record], t_ns: int) -> Record | None:
@@ -237,38 +230,33 @@ def missing(hosted: Iterable[tuple[str, str]], whole: Graph) -> list[str]:
 
 
 def corruptions(history: History, reference: ReferenceRun) -> list[str]:
-    """Each reply that is not the bare server's, and what it says instead; in the order of the requests."""
-    answers = _answers(history)
-    found = []
-    for request_id, expected in reference.replies:
-        wrong = next((a.payload for a in answers[request_id] if a.payload != expected), None)
-        if wrong is not None:
-            found.append(f"request {request_id}: sdc: {_difference(wrong, expected)}")
-    return found
+    """Each reply that is not the bare server's, and what it asks for instead, by request."""
+    right = dict(reference.replies)
+    wrong = wrong_replies(history, reference).items()
+    return [f"request {i}: sdc: {_difference(reply, right[i])}" for i, reply in wrong]
 
 
 def _difference(wrong: bytes, right: bytes) -> str:
     """What the brake ECU is asked for, and what it should have been asked for."""
-    expected, found = _read(right), _read(wrong)
-    if expected is None or found is None:
-        return f"{_text(found, wrong)} instead of {_text(expected, right)}"
+    found, expected = _decoded(wrong), _decoded(right)
+    if isinstance(found, str) or isinstance(expected, str):
+        texts = [one if isinstance(one, str) else _demand(one) for one in (found, expected)]
+        return " instead of ".join(texts)
     fields = [(f, getattr(found, f), getattr(expected, f)) for f in AebOutput.__struct_fields__]
-    differing = [(f, a, b) for f, a, b in fields if a != b]
-    said = starmap("{} {} instead of {}".format, differing)
-    return ", ".join(said) or f"the same demand in other bytes ({wrong.hex()})"
+    differing = [f"{name} {a} instead of {b}" for name, a, b in fields if a != b]
+    return ", ".join(differing) or f"the same demand in other bytes ({wrong.hex()})"
 
 
-def _read(reply: bytes) -> AebOutput | None:
+def _demand(output: AebOutput) -> str:
+    return f"stage {output.stage} at {output.deceleration_ms2} m/s2"
+
+
+def _decoded(reply: bytes) -> AebOutput | str:
+    """The demand; or words for what is none."""
     try:
         return decode_reply(reply)
     except PeerError:
-        return None
-
-
-def _text(output: AebOutput | None, reply: bytes) -> str:
-    if output is None:
         return f"what is no demand ({reply.hex() or 'empty'})"
-    return f"stage {output.stage} at {output.deceleration_ms2} m/s2"
 
 
 def half_a_graph(hosted: Hosted, expected: str) -> list[str]:
@@ -286,7 +274,7 @@ def half_a_graph(hosted: Hosted, expected: str) -> list[str]:
     return [r for r in missing(hosted.bricks, whole) if not joining or not r.startswith(f"{joining}/")]
 
 
-# -- The checks of a run: each says what of its promise holds in a record.
+# -- The checks of a run: whether each promise holds in its record.
 
 
 class Evidence(msgspec.Struct, frozen=True):
@@ -304,7 +292,7 @@ class Evidence(msgspec.Struct, frozen=True):
 class Checker(NamedTuple):
     """A check by its name in the verdict, and the promise that it is about ("" of none of G1 to G8).
 
-    `check` gives None where a run of this kind says nothing about it.
+    `check` gives None where it does not apply to a run of this kind.
     """
 
     name: str
@@ -313,10 +301,6 @@ class Checker(NamedTuple):
 
     def __str__(self) -> str:
         return f"{self.name} ({self.promise})" if self.promise else self.name
-
-
-def check_at_most_once(evidence: Evidence) -> Check:
-    return at_most_once(evidence.record.history)
 
 
 def check_exactly_one_answer(evidence: Evidence) -> Check:
@@ -339,7 +323,7 @@ def check_value(evidence: Evidence) -> Check | None:
     """G4, judged by the replies alone, whatever mechanism ran.
 
     Only TR promises it: without TR a flipped bit is expected to come through, as silent data corruption
-    (sdc). Without a flipped bit there is nothing to say.
+    (sdc). Without a flipped bit the check does not apply.
     """
     record = evidence.record
     flips = [f for f in record.faults if f.action.alters_value]
@@ -353,17 +337,13 @@ def check_value(evidence: Evidence) -> Check | None:
     return Check("pass")
 
 
-def check_one_master(evidence: Evidence) -> Check:
-    return one_master(evidence.record.history)
-
-
 def check_whole_graph(evidence: Evidence) -> Check:
     """G5: at the end lives a whole graph, the one to which the adaptations came, unless none is left."""
     record = evidence.record
     if record.end is None or record.end.hosted is None:
         return Check("unknown", ("the supervisor did not live to say what lived",))
     if record.lost or evidence.excuses.service_lost:
-        return Check("pass")  # there is no service left; what that means, the other checks say
+        return Check("pass")  # no service is left: the other checks judge that
     if record.end.unfinished and not record.simulated:
         under_way = list(record.end.unfinished)
         return Check("unknown", (f"the run ended while this was under way: {under_way}",))
@@ -401,14 +381,12 @@ def check_clean_exit(evidence: Evidence) -> Check | None:
 
 def check_faults_applied(evidence: Evidence) -> Check:
     """G8: a fault that did not fire proves nothing."""
-    missing = [f for f in evidence.record.faults if not f.fired]
-    return Check("unknown" if missing else "pass", tuple(map(_missed, missing)))
-
-
-def _missed(fault: FaultReport) -> str:
-    if not fault.detail:
-        return f"never fired: {fault.fault}"
-    return f"{fault.receipt.value}: {fault.fault}: {fault.detail}"
+    reasons = tuple(
+        f"{f.receipt.value}: {f.fault}: {f.detail}" if f.detail else f"never fired: {f.fault}"
+        for f in evidence.record.faults
+        if not f.fired
+    )
+    return Check("unknown" if reasons else "pass", reasons)
 
 
 def check_whole_history(evidence: Evidence) -> Check:

@@ -11,11 +11,10 @@ from typing import Final
 
 from aftbed.adapt.observer import VOTE_MASKED
 from aftbed.core.events import Event
-from aftbed.core.history import History
 from aftbed.core.journal import EntryKind
 from aftbed.ftm.compose import replication_of
 from aftbed.judge import checks
-from aftbed.judge.checks import Evidence, Requests, corruptions
+from aftbed.judge.checks import Evidence, corruptions
 
 OUTCOMES: Final = (  # from the best to the worst
     "masked",
@@ -55,7 +54,12 @@ def outcome_of(evidence: Evidence) -> tuple[str, tuple[str, ...]]:
     wrong = corruptions(history, reference) if reference.deterministic else []
     if wrong:
         found["sdc"] = wrong[0]
-    unanswered(history, counts, found, lost=record.lost)
+    if record.lost:
+        found["unavailable"] = "no replica was left"
+    elif counts.lost:
+        answered = {e.request_id for e in history.dialogue if e.kind is EntryKind.ANSWERED}
+        last = max((e.request_id for e in history.dialogue if e.kind is EntryKind.SENT), default=0)
+        found["omission" if last in answered else "hang"] = f"requests without a reply: {counts.lost}"
     doubled = checks.at_most_once(history).reasons
     if doubled or counts.duplicated:
         found["duplicate_effect"] = doubled[0] if doubled else f"doubled replies: {counts.duplicated}"
@@ -65,7 +69,9 @@ def outcome_of(evidence: Evidence) -> tuple[str, tuple[str, ...]]:
         found["degraded"] = f"late replies: {counts.late}"
     if living is not None and not record.lost and replication_of(living.ftm) and not living.backup:
         found["degraded"] = "no replica backs up at the end"
-    acted = [event.label for event in ACTED if history.events(event)] + _outvoted(history)
+    acted = [event.label for event in ACTED if history.events(event)]
+    if any(vote.detail == VOTE_MASKED for vote in history.events(Event.VOTE_COMPARED)):
+        acted.append("a third execution")
     if acted:
         found["tolerated"] = f"the mechanism acted: {', '.join(acted)}"
     states = set(record.end.states.values()) if record.end is not None else set()
@@ -75,20 +81,3 @@ def outcome_of(evidence: Evidence) -> tuple[str, tuple[str, ...]]:
         found["latent"] = "the state of the replicas is not the bare server's"
     word = worst(list(found))
     return word, tuple(found[name] for name in sorted(found, key=OUTCOMES.index, reverse=True))
-
-
-def unanswered(history: History, counts: Requests, found: dict[str, str], *, lost: bool) -> None:
-    """Adds the class of requests without a reply: no replica left, none answering, or single losses."""
-    if lost:
-        found["unavailable"] = "no replica was left"
-    elif counts.lost:
-        answered = {e.request_id for e in history.dialogue if e.kind is EntryKind.ANSWERED}
-        last = max((e.request_id for e in history.dialogue if e.kind is EntryKind.SENT), default=0)
-        word = "omission" if last in answered else "hang"
-        found[word] = f"requests without a reply: {counts.lost}"
-
-
-def _outvoted(history: History) -> list[str]:
-    """Third executions: two that differed were compared before."""
-    votes = history.events(Event.VOTE_COMPARED)
-    return ["a third execution"] if any(vote.detail == VOTE_MASKED for vote in votes) else []

@@ -21,7 +21,7 @@ from aftbed.vehicle.plant import VehicleResult
 
 
 class RunEnd(msgspec.Struct, frozen=True):
-    """How a run ended, as `end.json` says it. `hosted` is None where it was not looked at.
+    """How a run ended, by `end.json`. `hosted` is None where no snapshot of the graph was taken.
 
     `left`: processes that outlived it. `unfinished`: scripts that were under way. `lost`: no replica lived.
     `starved_ms`: how long the node that waited longest was ready to run and had no CPU.

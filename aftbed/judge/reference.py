@@ -5,7 +5,7 @@ in place, the bare server is updated too, before the same request: the first tha
 the adaptation let requests through again.
 
 An update that was rolled back may have served meanwhile. Then the version of before goes on, with the state
-of the new one, behind the last request that a replica had executed, or heard the outcome of, which served
+of the new one, behind the last request that a replica had executed, or restored the state of, which served
 again. What only a lost replica had executed was executed once more, by the version of before.
 """
 
@@ -34,7 +34,7 @@ DONE: Final = "done"
 
 
 class AppliedUpdate(msgspec.Struct, frozen=True):
-    """What an adaptation's outcome says of the version that served: see `runtime.adaptations.Outcome`."""
+    """The part of `runtime.adaptations.Outcome` that is about the version that served."""
 
     outcome: str
     application: str = BUILT_IN
@@ -45,19 +45,21 @@ class AppliedUpdate(msgspec.Struct, frozen=True):
 
 
 class Succession:
-    """`changes`, in their order."""
+    """An application whose requests are executed by several versions in turn, as `changes` have it."""
 
     def __init__(self, changes: list[Change]) -> None:
-        self._function: Application = default_application()
+        self._serve(default_application())
         self._before: list[Application] = []
         self._changes = list(changes)
         self._count = 0
-        self.characteristics = self._function.characteristics
         versions = (self._function, *(make() for _, make in changes if make is not None))
         self.deterministic = all(version.characteristics.deterministic for version in versions)
 
+    def _serve(self, function: Application) -> None:
+        self._function = function
+        self.characteristics = function.characteristics
+
     def execute(self, request: bytes) -> bytes:
-        """By the version whose turn it is."""
         self._count += 1
         while self._changes and self._count >= self._changes[0][0]:
             _, make = self._changes.pop(0)
@@ -69,10 +71,10 @@ class Succession:
 
     def _update(self, new: Application) -> None:
         state = self._function.capture()
-        if state:  # as in the run: what has none to give lets its successor begin anew
+        if state:  # as in the run: without a state the next version begins anew
             getattr(new, "migrate", new.restore)(state)
         self._before.append(self._function)
-        self._function, self.characteristics = new, new.characteristics
+        self._serve(new)
 
     def _go_back(self) -> None:
         """The version of before was kept as it was; it takes the state of the other, if there is one."""
@@ -80,28 +82,23 @@ class Succession:
         with contextlib.suppress(PeerError):  # no replica went on that refused it
             if state:
                 getattr(old, "migrate", old.restore)(state)
-        self._function, self.characteristics = old, old.characteristics
+        self._serve(old)
 
     def capture(self) -> bytes:
-        """Of the present version."""
         return self._function.capture()
 
     def restore(self, state: bytes) -> None:
-        """Of the present version."""
         self._function.restore(state)
 
     def acceptable(self, request: bytes, reply: bytes) -> bool:
-        """To the present version."""
         return self._function.acceptable(request, reply)
 
 
-def bare_server(record: RunRecord) -> Callable[[], Succession]:
-    """Makes the bare server of this run. Raises ConfigError where a version of the function is gone."""
-    return succession(record.history, record.adaptations)
-
-
 def succession(history: History, adaptations: Iterable[object]) -> Callable[[], Succession]:
-    """The same, of outcomes or of what was written of them. Raises ConfigError."""
+    """Makes the bare server of a run, from the outcomes of its adaptations, or from what was written of them.
+
+    Raises ConfigError where a version of the function is gone.
+    """
     changes: list[Change] = []
     running = BUILT_IN
     for outcome in adaptations:
@@ -114,28 +111,23 @@ def succession(history: History, adaptations: Iterable[object]) -> Callable[[], 
         make = load_application(function, load_module) if function else default_application
         changes.append((first, make))
         if update.undone_ns:
-            changes.append((max(first, _first_behind(history, update)), None))
+            lost = update.lost.split()
+            known = (
+                r.request_id
+                for r in history.events(Event.SERVER_EXIT, Event.STATE_RESTORED)
+                if update.opened_ns <= r.t_ns < update.undone_ns and replica_of(r.node) not in lost
+            )
+            changes.append((max(first, 1 + max(known, default=0)), None))
         else:
             running = function
     return lambda: Succession(changes)
 
 
-def _first_behind(history: History, undone: AppliedUpdate) -> int:
-    """The first request that is the old version's again."""
-    lost = undone.lost.split()
-    known = (
-        r.request_id
-        for r in history.events(Event.SERVER_EXIT, Event.STATE_RESTORED)
-        if undone.opened_ns <= r.t_ns < undone.undone_ns and replica_of(r.node) not in lost
-    )
-    return 1 + max(known, default=0)
-
-
 class ReferenceRun(msgspec.Struct, frozen=True):
     """What the bare server makes of the requests of a run: its replies, by id, and its state behind them.
 
-    A request that it refuses has an empty reply. Where the function is not `deterministic` its replies say
-    nothing of those of a run.
+    A request that it refuses has an empty reply. Where the function is not `deterministic`, its replies
+    need not be those of a run.
     """
 
     replies: tuple[tuple[int, bytes], ...]
@@ -165,4 +157,5 @@ def reference_of(record: RunRecord, function: Callable[[], Application] | None =
 
     Raises ConfigError where a version of the function is gone.
     """
-    return reference_run(record.history, (function or bare_server(record))())
+    make = function or succession(record.history, record.adaptations)
+    return reference_run(record.history, make())

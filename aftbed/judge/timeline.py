@@ -23,6 +23,7 @@ nothing (a Proxy that passes a request on, an After that asks for the state) are
 them; it has the name of the last of its channels that is known.
 """
 
+import itertools
 import json
 from bisect import bisect_right
 from collections import defaultdict
@@ -246,31 +247,29 @@ def steps_of(run: RunRecord) -> list[NodeStep]:
 
 
 def links_of(steps: list[NodeStep]) -> list[StepLink]:
-    """For each step with a known cause, the link from that cause."""
+    """For each step with a known cause, the link from the last step that can be its cause."""
     before: defaultdict[int, list[int]] = defaultdict(list)
     found: list[StepLink] = []
     for at, step in enumerate(steps):
-        cause = max(_causes(steps, before[step.request_id], step), default=None)
+        for cause in reversed(before[step.request_id]):
+            if channel := _channel(steps[cause], step):
+                found.append(StepLink(cause, at, channel))
+                break
         before[step.request_id].append(at)
-        if cause is not None:
-            found.append(StepLink(cause[0], at, cause[1]))
     return found
+
+
+def _channel(cause: NodeStep, effect: NodeStep) -> str:
+    """The channel from one step to the other; "" if the one did not lead to the other."""
+    across = bool(cause.replica and effect.replica and cause.replica != effect.replica)
+    table = ACROSS if across else LED_TO
+    pairs = itertools.product(cause.events, effect.events)
+    return max((table.get(pair, "") for pair in pairs), default="")
 
 
 def between_processes(steps: list[NodeStep], links: list[StepLink]) -> list[StepLink]:
     """The links that were messages between processes."""
     return [one for one in links if steps[one.cause].process != steps[one.effect].process]
-
-
-def _causes(steps: list[NodeStep], before: list[int], step: NodeStep) -> Iterator[tuple[int, str]]:
-    for at in before:
-        other = steps[at]
-        across = bool(step.replica and other.replica and step.replica != other.replica)
-        table = ACROSS if across else LED_TO
-        for cause in other.events:
-            for effect in step.events:
-                if (channel := table.get((cause, effect))) is not None:
-                    yield at, channel
 
 
 def ends_ns(steps: list[NodeStep], links: list[StepLink]) -> list[int]:
@@ -279,16 +278,12 @@ def ends_ns(steps: list[NodeStep], links: list[StepLink]) -> list[int]:
     first: dict[int, int] = {}
     for one in links:
         cause, effect = steps[one.cause], steps[one.effect]
-        if (cause.process, cause.brick) != (
-            effect.process,
-            effect.brick,
-        ):  # a Server waits for its next request
+        if (*cause.process, cause.brick) != (*effect.process, effect.brick):  # a Server's next is no effect
             first.setdefault(one.cause, effect.t_ns)
     for at, t_ns in first.items():
         ends[at] = min(max(ends[at], t_ns), steps[at].t_ns + MOST_NS)
     later: dict[tuple[str, int], int] = {}
-    for at in range(len(steps) - 1, -1, -1):
-        process = steps[at].process
-        ends[at] = min(ends[at], later.get(process, ends[at]))
-        later[process] = steps[at].t_ns
+    for at, step in reversed(list(enumerate(steps))):
+        ends[at] = min(ends[at], later.get(step.process, ends[at]))
+        later[step.process] = step.t_ns
     return ends

@@ -11,13 +11,7 @@ import msgspec
 from aftbed.core.application import Application
 from aftbed.inject.model import FaultReport
 from aftbed.judge import checks
-from aftbed.judge.checks import (
-    Check,
-    Checker,
-    Evidence,
-    Failover,
-    Requests,
-)
+from aftbed.judge.checks import Check, Checker, Evidence, Failover, Requests
 from aftbed.judge.record import RunRecord
 from aftbed.judge.reference import reference_of
 from aftbed.runtime.unix.closedloop import Proposed, read_proposals
@@ -30,10 +24,10 @@ EXIT_INTERRUPTED: Final = 130
 
 
 CHECKERS: Final = (  # a new check is one line here; its name is its key in every verdict
-    Checker("at_most_once", "G1", checks.check_at_most_once),
+    Checker("at_most_once", "G1", lambda e: checks.at_most_once(e.record.history)),
     Checker("exactly_one_answer", "G2", checks.check_exactly_one_answer),
     Checker("one_history", "G3", checks.check_one_history),
-    Checker("one_master", "G6", checks.check_one_master),
+    Checker("one_master", "G6", lambda e: checks.one_master(e.record.history)),
     Checker("whole_graph", "G5", checks.check_whole_graph),
     Checker("clean_exit", "G7", checks.check_clean_exit),
     Checker("faults_applied", "G8", checks.check_faults_applied),
@@ -94,6 +88,7 @@ def judge(record: RunRecord, evidence: Evidence | None = None) -> Verdict:
     options, history = record.options, record.history
     evidence = evidence or evidence_of(record)
     found = {checker.name: check for checker, check in findings(evidence).items()}
+    words = {check.finding for check in found.values()}
     replay = None
     match options.work:
         case CarRun() as car:
@@ -110,7 +105,7 @@ def judge(record: RunRecord, evidence: Evidence | None = None) -> Verdict:
         ftm=options.ftm,
         placement=options.placement,
         scenario=scenario,
-        verdict=_word(found),
+        verdict="fail" if "fail" in words else "inconclusive" if "unknown" in words else "pass",
         requests=checks.requests(history, evidence.reference),
         vehicle=record.vehicle,
         failovers=checks.failovers(history),
@@ -122,13 +117,6 @@ def judge(record: RunRecord, evidence: Evidence | None = None) -> Verdict:
         launch_ms=None if record.simulated or not sent else round((min(sent) - record.started_ns) / 1e6, 3),
         proposals=msgspec.UNSET if proposals is None else proposals,
     )
-
-
-def _word(found: dict[str, Check]) -> Word:
-    words = {check.finding for check in found.values()}
-    if "fail" in words:
-        return "fail"
-    return "inconclusive" if "unknown" in words else "pass"
 
 
 def broken(evidence: Evidence) -> tuple[Breach, ...]:

@@ -107,7 +107,7 @@ def test_as_many_as_the_checker_of_one_history_counts(bits: dict[int, int]) -> N
     tale = history({i: with_flipped(right(i), [bit]) for i, bit in bits.items()})
     found = corruptions_of(tale)
     assert [line.split(":")[0] for line in found] == [f"request {i}" for i in sorted(bits)]
-    assert wrong_replies(tale, reference(tale)) == sorted(bits)
+    assert list(wrong_replies(tale, reference(tale))) == sorted(bits)
     check = value(tale, FLIPPED)
     assert check is not None and (check.finding == "fail") == bool(bits)
     assert len(check.reasons) == min(len(bits), REASONS_MAX)

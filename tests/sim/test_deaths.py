@@ -222,7 +222,7 @@ def test_without_a_mechanism_against_it_a_value_fault_reaches_the_client(ftm: st
     """What the tests above do is done: where nothing is there to find it, it is found by the check."""
     fault = Fault(ValueFlip(ValuePlace.RESULT, Bit(0)), "primary", Trigger(Event.SERVER_EXIT.label, 2))
     _, run = played(Setup(ftm, count=3, faults=(fault,)))
-    assert checks.wrong_replies(run.history, reference_run(run.history, Counting())) == [2]
+    assert checks.wrong_replies(run.history, reference_run(run.history, Counting())).keys() == {2}
 
 
 @pytest.mark.parametrize("ftm", (*EXPRESSIONS, *NESTED))

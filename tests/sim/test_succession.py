@@ -44,7 +44,7 @@ def test_an_update_is_compared_with_the_version_that_served(ftm: str) -> None:
     run = updated(ftm, "process", "Firm")
     assert [a.outcome for a in run.adaptations] == ["done"]
     assert breaches(run, succession(run.history, run.adaptations)) == ()
-    wrong = wrong_replies(run.history, reference_run(run.history, default_application()))
+    wrong = list(wrong_replies(run.history, reference_run(run.history, default_application())))
     assert wrong == list(range(wrong[0], 61)) and FIRST <= wrong[0] < FIRST + 8, "from the update to the end"
 
 
@@ -60,7 +60,7 @@ def test_an_update_that_is_undone_served_only_meanwhile(
     run = updated(ftm, placement, source, Fault(Crash(), target, Trigger(after_ms=60)))
     assert [a.outcome for a in run.adaptations] == ["rolled back"]
     assert breaches(run, succession(run.history, run.adaptations)) == ()
-    wrong = wrong_replies(run.history, reference_run(run.history, default_application()))
+    wrong = list(wrong_replies(run.history, reference_run(run.history, default_application())))
     assert wrong, "the second version served"
     if source == "Firm":  # else the first one goes on with the state that it had left
         assert wrong == list(range(wrong[0], wrong[-1] + 1)) and wrong[-1] < 60
@@ -102,4 +102,4 @@ def test_what_never_served_is_no_version() -> None:
     run = updated("pbr", "process", "Firm", Fault(Crash(), "a/protocol", Trigger("adapt.step.enter", 4)))
     assert [(a.outcome, a.opened_ns) for a in run.adaptations] == [("rolled back", 0)]
     assert breaches(run, succession(run.history, run.adaptations)) == ()
-    assert wrong_replies(run.history, reference_run(run.history, default_application())) == []
+    assert wrong_replies(run.history, reference_run(run.history, default_application())) == {}
