@@ -10,6 +10,7 @@ import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from loops import for_each
 from plans import CASES, RUNNABLE, Case
 
 from aftbed.adapt.planner import APPLICATION, drains, leader_of, plan, target, updated
@@ -36,6 +37,7 @@ from aftbed.core.script import (
 from aftbed.ftm.compose import NONE, REPLICAS, STATEFUL, build, chain, replication_of
 from aftbed.ftm.registry import KINDS
 
+OURS: Final = [case for case in CASES if case.recipe == RECIPES[0]]
 DUPLEX_PAIRS: Final = list(permutations([e for e in RUNNABLE if replication_of(e)], 2))
 PARTS: Final = ("protocol", "before", "proceed", "after", "server", APPLICATION)
 
@@ -49,7 +51,7 @@ def meaning(graph: Graph) -> tuple[object, ...]:
 # -- every pair
 
 
-@pytest.mark.parametrize("case", CASES, ids="-".join)
+@for_each(CASES)
 def test_every_plan_is_sound_and_leads_where_it_should(case: Case) -> None:
     there = case.plan()
     assert problems(there.script) == []
@@ -59,7 +61,7 @@ def test_every_plan_is_sound_and_leads_where_it_should(case: Case) -> None:
     assert there.script.ftm == case.new and there.script.recipe == case.recipe
 
 
-@pytest.mark.parametrize("case", CASES, ids="-".join)
+@for_each(CASES)
 def test_the_way_back_leads_back(case: Case) -> None:
     there = case.plan()
     back = plan(there.new, there.old, case.recipe)
@@ -69,7 +71,7 @@ def test_the_way_back_leads_back(case: Case) -> None:
     assert back.bricks_changed == there.bricks_changed and back.bricks_total == there.bricks_total
 
 
-@pytest.mark.parametrize("case", CASES, ids="-".join)
+@for_each(CASES)
 def test_the_names_of_a_plan_are_the_difference_of_its_graphs(case: Case) -> None:
     there = case.plan()
     old, new = ({b.name: b for b in graph.bricks} for graph in (there.old, there.new))
@@ -101,7 +103,7 @@ def test_one_adaptation_after_the_other_leads_where_each_should(names: list[str]
 # -- the order
 
 
-@pytest.mark.parametrize("case", CASES, ids="-".join)
+@for_each(CASES)
 def test_the_client_waits_from_the_first_step_to_the_last(case: Case) -> None:
     """The leader's Protocol is suspended first and resumed last; what is slow is done before."""
     there = case.plan()
@@ -121,7 +123,7 @@ def test_the_client_waits_from_the_first_step_to_the_last(case: Case) -> None:
         assert not any(isinstance(v, Suspend | Drain | Exchange | Align | Migrate) for v in commit)
 
 
-@pytest.mark.parametrize("case", [c for c in CASES if c.recipe == RECIPES[0]], ids="-".join)
+@for_each(OURS)
 def test_what_is_new_is_there_before_it_is_needed_and_what_is_old_until_it_is_not(case: Case) -> None:
     script = case.plan().script
     staged = {v.node for v in flat(script.prepare) if isinstance(v, Stage)}
@@ -132,7 +134,7 @@ def test_what_is_new_is_there_before_it_is_needed_and_what_is_old_until_it_is_no
     assert migrated <= exchanged
 
 
-@pytest.mark.parametrize("case", [c for c in CASES if c.recipe == RECIPES[0]], ids="-".join)
+@for_each(OURS)
 def test_who_must_not_read_yet_is_held_until_the_end(case: Case) -> None:
     """Whoever shares its channels with a predecessor, or gets a state first."""
     there = case.plan()
@@ -145,7 +147,7 @@ def test_who_must_not_read_yet_is_held_until_the_end(case: Case) -> None:
         assert not stage.held or resumed & {b.name for b in stage.bricks}
 
 
-@pytest.mark.parametrize("case", CASES, ids="-".join)
+@for_each(CASES)
 def test_states_move_as_the_mechanisms_need_it(case: Case) -> None:
     """PBR to LFR hands the follower a state equal to the leader's; a replica that is new gets both."""
     there = case.plan()
