@@ -16,6 +16,9 @@ REAL := -n 2 --dist loadfile -m "process and not deep"
 
 FAULT := crash primary at checkpoint.sent nth 100
 
+# Hundreds of interpreters start in the tests; without bytecode each would compile all that it imports.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: help demo test lint fast process deep bench
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
@@ -48,6 +51,7 @@ process: $(EDITABLE)
 
 deep: $(EDITABLE)
 	$(BIN)/python -m pytest -m deep
+	$(BIN)/python -m pytest -n auto --hypothesis-profile deep --timeout 0 -m "hypothesis and not process and not deep"
 
 bench: $(EDITABLE)
 	$(BIN)/aftbed bench all --into docs/numbers.md

@@ -1,7 +1,7 @@
 """What all tests share: how long hypothesis looks, and how golden files are rewritten.
 
-Profiles: `dev` (default), `ci` (the same examples each time; taken where `CI` is set), `deep` (`pytest
---hypothesis-profile deep`: minutes). None has a deadline per example: a busy machine is no failing test.
+Profiles: `dev` (default: few examples), `ci` (the same few each time; taken where `CI` is set), `deep` (many;
+`make deep`). None has a deadline per example: a busy machine is no failing test.
 A failing example prints the line that repeats it.
 """
 
@@ -14,7 +14,9 @@ from hypothesis import HealthCheck, settings
 ID_MAX: Final = 60  # characters of a parameter in the name of its test: some are megabytes
 _SLOW_IS_FINE = (HealthCheck.too_slow,)
 
-settings.register_profile("dev", deadline=None, print_blob=True, suppress_health_check=_SLOW_IS_FINE)
+settings.register_profile(
+    "dev", max_examples=25, deadline=None, print_blob=True, suppress_health_check=_SLOW_IS_FINE
+)
 settings.register_profile("ci", settings.get_profile("dev"), derandomize=True)
 settings.register_profile("deep", settings.get_profile("dev"), max_examples=5_000)
 settings.load_profile("ci" if os.environ.get("CI") else "dev")

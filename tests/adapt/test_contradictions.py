@@ -120,7 +120,7 @@ def test_where_a_condition_begins_and_ends(when: Beyond, value: float, begins: b
 
 
 @given(beyonds(), beyonds(), st.lists(st.integers(-1, 17).map(lambda n: n / 2), max_size=30))
-@settings(max_examples=300)
+@settings(max_examples=4 * settings.default.max_examples)
 def test_opposite_rules_that_may_stand_together_never_hold_together(
     one: Beyond, other: Beyond, samples: list[float]
 ) -> None:

@@ -7,7 +7,7 @@ import pytest
 from plans import CASES, Case
 
 from aftbed.adapt.planner import drains
-from aftbed.core.graph import BrickSpec, Graph, Link
+from aftbed.core.graph import PLACEMENTS, BrickSpec, Graph, Link
 from aftbed.core.script import RECIPES, Layout, Step, applied, flat, inverse, reversible
 from aftbed.ftm.registry import KINDS
 
@@ -51,18 +51,20 @@ def undone(old: Graph, new: Graph, part: Part) -> Layout:
     return applied(there, inverse(old, (*prepare, *commit), KINDS, drains(new, old)), KINDS)
 
 
-@pytest.mark.parametrize("placement", sorted({case.placement for case in PLANS}))
-def test_every_part_of_every_plan_and_its_inverse_lead_back_to_the_graph(placement: str) -> None:
+@pytest.mark.parametrize(
+    "plans",
+    [pytest.param(PLANS[::5], id="a fifth"), pytest.param(PLANS, id="all", marks=pytest.mark.deep)],
+)
+def test_every_part_of_every_plan_and_its_inverse_lead_back_to_the_graph(plans: list[Case]) -> None:
     """All pairs of expressions, both leaders. Nothing is left staged, prepared or suspended."""
-    tried = 0
-    for case in PLANS:
-        if case.placement == placement:
-            plan = case.plan()
-            start = in_order(Layout(plan.old))
-            for part in parts(plan.script.prepare, plan.script.commit):
-                assert in_order(undone(plan.old, plan.new, part)) == start, (case, part)
-                tried += 1
-    assert tried > 100
+    assert {case.placement for case in plans} == set(PLACEMENTS)
+    for case in plans:
+        plan = case.plan()
+        start = in_order(Layout(plan.old))
+        found = parts(plan.script.prepare, plan.script.commit)
+        assert len(found) > 1
+        for part in found:
+            assert in_order(undone(plan.old, plan.new, part)) == start, (case, part)
 
 
 def test_the_finish_of_a_plan_is_one_way_and_what_is_before_it_is_not() -> None:

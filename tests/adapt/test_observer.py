@@ -212,7 +212,7 @@ def expected(policy: Policy, running: str, past: list[tuple[Observation | None, 
 
 
 @given(policies, st.sampled_from(ADAPTABLE), histories, st.booleans())
-@settings(max_examples=400)
+@settings(max_examples=4 * settings.default.max_examples)
 def test_what_is_proposed_is_what_the_whole_history_says(
     policy: Policy, running: str, history: list[tuple[Observation | None, int]], obeyed: bool
 ) -> None:
@@ -237,7 +237,7 @@ def test_what_is_proposed_is_what_the_whole_history_says(
 
 
 @given(policies, st.sampled_from(ADAPTABLE), histories)
-@settings(max_examples=200)
+@settings(max_examples=2 * settings.default.max_examples)
 def test_whoever_wakes_it_at_its_deadlines_misses_nothing(
     policy: Policy, running: str, history: list[tuple[Observation | None, int]]
 ) -> None:

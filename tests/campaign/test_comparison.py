@@ -87,7 +87,7 @@ def test_the_tail_alone_can_be_worse() -> None:
     assert median.low <= 0.02 and p99.low > 1
 
 
-@pytest.mark.parametrize("q", [0.5, 0.9])
+@pytest.mark.parametrize("q", [0.5, pytest.param(0.9, marks=pytest.mark.deep)])
 def test_simulated_pairs_of_a_known_shift_are_held(q: float) -> None:
     chance = Random(SEED)
 

@@ -62,7 +62,7 @@ def test_every_row_of_m1_passes_under_a_crash_at_the_worst_instant(ftm: str) -> 
 
 
 def test_a_row_passes_under_a_crash_at_the_worst_instant_as_without_it() -> None:
-    case = R152["r152:m1-42"]
+    case = R152["r152:m1-20"]
     found, free = row(case, crash("pbr")), row(case, RoadLine("pbr", "pbr"))
     assert found.passed and free.passed
     assert found.loss_m is not None and 0.0 <= found.loss_m <= LOST_M_MAX
@@ -72,17 +72,17 @@ def test_a_row_passes_under_a_crash_at_the_worst_instant_as_without_it() -> None
     assert found.fault is not None and found.fault.startswith("crash primary at ")
     assert (
         found.repeat[1]
-        == f'aftbed run --scenario r152:m1-42 --ftm pbr --seed 0 --pace max --inject "{found.fault}"'
+        == f'aftbed run --scenario r152:m1-20 --ftm pbr --seed 0 --pace max --inject "{found.fault}"'
     )
 
 
 def test_an_outage_that_fails_a_row_says_that_it_must() -> None:
-    found = row(R152["r152:m1-42"], outage(1000))
+    found = row(R152["r152:m1-20"], outage(1000))
     assert not found.passed
     assert found.because[0] == f"impact at {found.impact_kmh:.1f} km/h, allowed is none"
     assert found.closed_form_kmh is not None and 0.0 < found.impact_kmh <= found.closed_form_kmh
-    left_m = row(R152["r152:m1-42"], BARE).min_gap_m
-    assert found.must_fail == f"1000 ms take 11.67 m of the braking distance; {left_m:.2f} m were left"
+    left_m = row(R152["r152:m1-20"], BARE).min_gap_m
+    assert found.must_fail == f"1000 ms take 5.56 m of the braking distance; {left_m:.2f} m were left"
     assert "--pace real" in found.repeat[1], "in lockstep the drive would wait for the function"
 
 

@@ -39,9 +39,8 @@ SECTIONS: Final = sections()
 
 @pytest.fixture
 def project(tmp_path: Path) -> Path:
-    """A copy of the package."""
-    unused = shutil.ignore_patterns("__pycache__")
-    shutil.copytree(ROOT / "aftbed", tmp_path / "aftbed", ignore=unused)
+    """A copy of the package, with its bytecode."""
+    shutil.copytree(ROOT / "aftbed", tmp_path / "aftbed")
     shutil.copytree(ROOT / "dbc", tmp_path / "dbc")
     return tmp_path
 

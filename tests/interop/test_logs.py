@@ -10,6 +10,7 @@ import msgspec
 import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from loggedframes import LOGS, NOW_US
+from sampling import sampled
 
 from aftbed.core.errors import ConfigError, PeerError
 from aftbed.interop import logs
@@ -21,6 +22,9 @@ from aftbed.vehicle.can.python_can import with_asammdf
 REAL_LOG: Final = Path(__file__).resolve().parents[3] / "shared" / "data" / "rav4_following_50kmh.log"
 KEPT_IN_FIXTURE: Final = (HealthCheck.function_scoped_fixture, HealthCheck.too_slow)
 FORMATS: Final = ("candump", "asc", "blf", "trc", "mf4")
+FEW: Final = settings.default.max_examples // 3  # of what takes half a second
+ZONES: Final = ("America/New_York", "Asia/Kolkata", "Pacific/Auckland")
+DATES_US: Final = (0, 5_123_456, NOW_US + 5_001)
 # python-can has seconds as floats. A time is rounded four times on its way through a BLF: until 2038 by less
 # than half a microsecond in all; later, if the log spans decades, by more.
 BLF_EXACT_US_MAX: Final = 2**31 * 1_000_000 - 1
@@ -59,7 +63,7 @@ COMES_BACK: Final[dict[str, Callable[[Frames], Frames]]] = {
 
 
 @pytest.mark.parametrize("name", [name for name in FORMATS if name != "mf4"])
-@settings(max_examples=40, suppress_health_check=KEPT_IN_FIXTURE, deadline=None)
+@settings(suppress_health_check=KEPT_IN_FIXTURE, deadline=None)
 @given(frames=LOGS)
 def test_every_frame_comes_back_to_the_microsecond(name: str, frames: Frames, tmp_path: Path) -> None:
     assume(name != "blf" or max(frame.t_us for frame in frames) <= BLF_EXACT_US_MAX)
@@ -67,7 +71,7 @@ def test_every_frame_comes_back_to_the_microsecond(name: str, frames: Frames, tm
 
 
 @pytest.mark.process  # each MF4 is read by a process of its own
-@settings(max_examples=40, suppress_health_check=KEPT_IN_FIXTURE, deadline=None)
+@settings(max_examples=FEW, suppress_health_check=KEPT_IN_FIXTURE, deadline=None)
 @given(frames=LOGS)
 def test_every_frame_of_an_mf4_comes_back_too(frames: Frames, tmp_path: Path) -> None:
     comes_back("mf4", frames, tmp_path)
@@ -79,35 +83,35 @@ def comes_back(name: str, frames: Frames, tmp_path: Path) -> None:
     assert READERS[name](path).frames == COMES_BACK[name](frames)
 
 
-@pytest.fixture(params=["America/New_York", "Asia/Kolkata", "Pacific/Auckland"])
-def zone(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setenv("TZ", request.param)
-    time.tzset()
-    yield
+@pytest.fixture
+def set_zone(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str], None]]:
+    def to(name: str) -> None:
+        monkeypatch.setenv("TZ", name)
+        time.tzset()
+
+    yield to
     monkeypatch.undo()
     time.tzset()
 
 
+@pytest.mark.parametrize(("zone", "t_us"), sampled(ZONES, DATES_US))
 @pytest.mark.parametrize("name", FORMATS)
-@pytest.mark.parametrize("t_us", [0, 5_123_456, NOW_US + 5_001])
-def test_a_log_of_any_zone_comes_back(name: str, t_us: int, tmp_path: Path, zone: None) -> None:
+def test_a_log_of_any_zone_comes_back(
+    name: str, t_us: int, zone: str, tmp_path: Path, set_zone: Callable[[str], None]
+) -> None:
+    set_zone(zone)
     frames = (LoggedFrame(t_us, "can0", 0x123, b"\x01"), LoggedFrame(t_us + 1, "can0", 0x124, b""))
     WRITERS[name](CanLog(frames), tmp_path / "there")
     assert READERS[name](tmp_path / "there").frames == frames
 
 
 def test_a_log_without_a_date_has_none_in_another_zone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, set_zone: Callable[[str], None]
 ) -> None:
     frames = (LoggedFrame(1_500_000, "can0", 0x123, b"\x01"),)
     WRITERS["asc"](CanLog(frames), tmp_path / "there")
-    monkeypatch.setenv("TZ", "Pacific/Auckland")
-    time.tzset()
-    try:
-        assert READERS["asc"](tmp_path / "there").frames == frames
-    finally:
-        monkeypatch.undo()
-        time.tzset()
+    set_zone("Pacific/Auckland")
+    assert READERS["asc"](tmp_path / "there").frames == frames
 
 
 def test_interfaces_keep_their_numbers_and_names_get_free_ones() -> None:

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from aftbed.core.errors import PeerError
@@ -32,7 +32,6 @@ def read(sink: socket.socket) -> bytes:
     return data
 
 
-@settings(max_examples=30)
 @given(st.lists(st.sampled_from((2, 1000, PACKET_BYTES_MAX, PACKET_BYTES_MAX + 1, 300_000)), max_size=8))
 def test_packets_of_all_sizes_keep_their_order(sizes: list[int]) -> None:
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)

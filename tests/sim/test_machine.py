@@ -164,7 +164,7 @@ PHASES: Final = (Phase.explicit, Phase.reuse, Phase.generate, *((Phase.shrink,) 
 
 TestInterference = Interference.TestCase
 TestInterference.settings = settings(
-    max_examples=settings.default.max_examples * 6 // 10, stateful_step_count=20, phases=PHASES
+    max_examples=settings.default.max_examples, stateful_step_count=20, phases=PHASES
 )
 TestInterference.pytestmark = [
     pytest.mark.timeout(900),  # in profile `deep`; seconds in the others

@@ -5,6 +5,7 @@ from typing import Final
 
 import pytest
 import versions
+from sampling import sampled
 
 from aftbed.core.messages import Goal, Scheduled
 from aftbed.inject.crash import Crash
@@ -66,8 +67,9 @@ def test_an_update_that_is_undone_served_only_meanwhile(
         assert wrong == list(range(wrong[0], wrong[-1] + 1)) and wrong[-1] < 60
 
 
-@pytest.mark.parametrize("brick", ["a/protocol", "a/before", "a/after"])
-@pytest.mark.parametrize("ftm", ["pbr", "lfr", "pbr+tr"])
+@pytest.mark.parametrize(
+    ("ftm", "brick"), sampled(("pbr", "lfr", "pbr+tr"), ("a/protocol", "a/before", "a/after"))
+)
 def test_wherever_in_a_request_the_leader_dies(ftm: str, brick: str) -> None:
     """What only the dead one had executed is done again by the first version; what the other knew is not."""
     undone = 0
@@ -78,9 +80,9 @@ def test_wherever_in_a_request_the_leader_dies(ftm: str, brick: str) -> None:
     assert undone == EFFECTS
 
 
-@pytest.mark.parametrize("target", ["primary", "backup"])
-@pytest.mark.parametrize("placement", ["process", "replica"])
-@pytest.mark.parametrize("ftm", ["pbr", "lfr"])
+@pytest.mark.parametrize(
+    ("ftm", "placement", "target"), sampled(("pbr", "lfr"), ("process", "replica"), ("primary", "backup"))
+)
 def test_where_the_first_version_takes_no_state_back_the_second_goes_on(
     ftm: str, placement: str, target: str
 ) -> None:

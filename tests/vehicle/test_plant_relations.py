@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from puredrive import drive
+from sampling import sampled
 
 from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.plant import (
@@ -160,8 +161,9 @@ def test_half_the_step_changes_the_drive_by_less_than_three_centimetres(
 # -- with the function in the loop
 
 
-@pytest.mark.parametrize("name", ["r152:m1-40", "r152:m1-60", "ncap:ccrm-60"])
-@pytest.mark.parametrize("from_ms", [2000, 2400, 2700, 3000])
+@pytest.mark.parametrize(
+    ("from_ms", "name"), sampled((2000, 2400, 2700, 3000), ("r152:m1-40", "r152:m1-60", "ncap:ccrm-60"))
+)
 def test_a_longer_silence_of_the_function_never_lowers_the_impact_speed(name: str, from_ms: int) -> None:
     """Of the impact speed this is so, not of the gap: a silence that swallows the partial braking makes the
     full one begin farther away."""
@@ -180,7 +182,7 @@ def test_a_longer_silence_of_the_function_never_lowers_the_impact_speed(name: st
     assert impacts_kmh == sorted(impacts_kmh)
 
 
-@settings(max_examples=15)
+@settings(max_examples=settings.default.max_examples // 3)
 @given(st.floats(10.0, 60.0), st.floats(0.55, 0.9), st.floats(0.0, 0.3), st.integers(0, 1000))
 def test_more_friction_never_raises_the_impact_speed_of_the_function(
     speed_kmh: float, friction: float, more: float, seed: int

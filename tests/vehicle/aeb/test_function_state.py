@@ -16,7 +16,6 @@ def test_the_state_has_one_size_in_the_range_that_was_asked_for() -> None:
 
 
 @given(st.lists(cycles, max_size=12), st.lists(cycles, max_size=4))
-@settings(max_examples=60)
 def test_a_restored_function_goes_on_bit_for_bit(before: list[AebInput], after: list[AebInput]) -> None:
     first, second = AebFunction(), AebFunction()
     for cycle in before:
@@ -65,7 +64,7 @@ def test_a_state_of_another_size_is_refused(length: int) -> None:
 
 
 @given(st.integers(0, STATE_BYTES * 8 - 1), cycles)
-@settings(max_examples=200)
+@settings(max_examples=4 * settings.default.max_examples)
 def test_a_flipped_bit_is_refused_or_gives_a_function_that_works(bit: int, cycle: AebInput) -> None:
     function, _ = braking()
     before = function.capture()

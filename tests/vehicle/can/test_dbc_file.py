@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from aftbed.core.errors import ConfigError, PeerError
@@ -198,7 +198,6 @@ WORDS = Path(CODEC.path).read_text().split(" ")
     st.lists(st.tuples(st.integers(0, len(WORDS) - 1), st.sampled_from(["", *PIECES])), max_size=4),
     st.booleans(),
 )
-@settings(max_examples=40)
 def test_a_damaged_dbc_is_loaded_or_refused(changes: list[tuple[int, str]], strict: bool) -> None:
     words = list(WORDS)
     for place, word in changes:
