@@ -16,7 +16,6 @@ While the Engine observes, and until the old bricks are gone, the runtime report
 the failure of the commit: undo. The paper's recipe kills first, so there is nothing to go back to.
 """
 
-from collections.abc import Mapping
 from enum import auto
 from typing import ClassVar, Final
 
@@ -28,7 +27,6 @@ from aftbed.core.brick import (
     Choice,
     DeadlinePassed,
     Effect,
-    Handler,
     Machine,
     Move,
     Moves,
@@ -69,15 +67,6 @@ class PhaseEnd(BrickAnswer):
     OF_ANOTHER = auto()  # of another adaptation
 
 
-class TakenUp(BrickAnswer):
-    """The phase that a dead Engine had ordered last, and that has not ended."""
-
-    PREPARE = auto()
-    COMMIT = auto()
-    FINISH = auto()
-    UNDO = auto()
-
-
 _S: Final = EngineState
 _WELL: Final = {
     Phase.PREPARE: PhaseEnd.PREPARED,
@@ -86,35 +75,6 @@ _WELL: Final = {
     Phase.UNDO: PhaseEnd.UNDONE,
 }
 _FAILED: Final = _WELL | {Phase.PREPARE: PhaseEnd.NOT_PREPARED, Phase.COMMIT: PhaseEnd.NOT_COMMITTED}
-_UNDER_WAY: Final = {
-    Phase.PREPARE: TakenUp.PREPARE,
-    Phase.COMMIT: TakenUp.COMMIT,
-    Phase.FINISH: TakenUp.FINISH,
-    Phase.UNDO: TakenUp.UNDO,
-}
-
-
-def end_of(phase: Phase, failure: str, script: Script) -> PhaseEnd | None:
-    """How `phase` of `script` ended; None for what is no phase of an adaptation."""
-    if failure and phase is Phase.COMMIT and script.recipe != RECIPES[0]:
-        return PhaseEnd.LOST
-    return (_FAILED if failure else _WELL).get(phase)
-
-
-Ended = Progress | TakeUp  # messages that say how a phase ended
-
-
-def _after(first: Handler, moves: Mapping[object, Move]) -> dict[object, Move]:
-    """`moves` with `first` before each of their handlers: what it does is part of the same step."""
-
-    def both(then: Handler) -> Handler:
-        def handle(engine: "AdaptationEngine", msg: TakeUp) -> list[Effect]:
-            return [*first(engine, msg), *then(engine, msg)]
-
-        handle.__qualname__ = then.__qualname__  # in a diagram
-        return handle
-
-    return {answer: (both(do), state) for answer, (do, state) in moves.items()}
 
 
 class AdaptationEngine(Machine):
@@ -131,8 +91,13 @@ class AdaptationEngine(Machine):
         self._until_ns: int | None = None
 
     def step(self, port: str, msg: AnyMessage | DeadlinePassed, now_ns: int) -> list[Effect]:
-        """As every Machine; the observation begins with its state."""
+        """As every Machine; the observation begins with its state.
+
+        A phase of which the dead Engine did not see the end is taken up as under way, then ended.
+        """
         effects = super().step(port, msg, now_ns)
+        if isinstance(msg, TakeUp) and msg.ended:
+            effects += super().step(port, Progress(msg.number, msg.phase, msg.failure), now_ns)
         if self.state is _S.OBSERVING:
             if self._until_ns is None:
                 self._until_ns = now_ns + WINDOW_NS
@@ -143,17 +108,17 @@ class AdaptationEngine(Machine):
     # -- questions ----------------------------------------------------------------------------
 
     def phase_end(self, msg: Progress) -> PhaseEnd | None:
-        """How the phase ended."""
+        """None for what is no phase of an adaptation."""
         if msg.number != self.number:
             return PhaseEnd.OF_ANOTHER
         assert self.script is not None
-        return end_of(msg.phase, msg.failure, self.script)
+        if msg.failure and msg.phase is Phase.COMMIT and self.script.recipe != RECIPES[0]:
+            return PhaseEnd.LOST
+        return (_FAILED if msg.failure else _WELL).get(msg.phase)
 
-    def taken_up(self, msg: TakeUp) -> TakenUp | PhaseEnd | None:
-        """The phase that is under way, or how it ended."""
-        if not msg.ended:
-            return _UNDER_WAY.get(msg.phase)
-        return end_of(msg.phase, msg.failure, msg.script)
+    def phase(self, msg: TakeUp) -> Phase:
+        """The one that was ordered last."""
+        return msg.phase
 
     # -- handlers -----------------------------------------------------------------------------
 
@@ -163,16 +128,15 @@ class AdaptationEngine(Machine):
         return [Note(Event.ADAPT_PLAN, detail=msg.number), *self._order(Phase.PREPARE)]
 
     def wait(self, msg: TakeUp) -> list[Effect]:
-        """Go on where another Engine ended."""
+        """Go on where the dead Engine ended."""
         self.number, self.script = msg.number, msg.script
         self.outcome = REFUSED if msg.phase is Phase.PREPARE else ROLLED_BACK
         return []
 
-    def commit(self, msg: Ended) -> list[Effect]:
-        """All that is slow is done."""
+    def commit(self, msg: Progress) -> list[Effect]:
         return self._order(Phase.COMMIT)
 
-    def observe(self, msg: Ended) -> list[Effect]:
+    def observe(self, msg: Progress) -> list[Effect]:
         """The new graph serves; the old bricks stay for `WINDOW_NS`."""
         self._until_ns = None
         return [Note(Event.ADAPT_COMMIT, detail=self.number)]
@@ -181,21 +145,21 @@ class AdaptationEngine(Machine):
         """Nothing failed: the old bricks may go."""
         return self._order(Phase.FINISH)
 
-    def undo(self, msg: Ended) -> list[Effect]:
+    def undo(self, msg: Progress) -> list[Effect]:
         """Go back to the graph that was there."""
         self.reason = msg.failure
         self.outcome = REFUSED if msg.phase is Phase.PREPARE else ROLLED_BACK
         return [Note(Event.ADAPT_ROLLBACK, detail=self.number), *self._order(Phase.UNDO)]
 
-    def end_lost(self, msg: Ended) -> list[Effect]:
+    def end_lost(self, msg: Progress) -> list[Effect]:
         """Neither the old graph nor the new one."""
         return self._end(FAILED, msg.failure)
 
-    def end_done(self, msg: Ended) -> list[Effect]:
+    def end_done(self, msg: Progress) -> list[Effect]:
         """The new graph serves, even if an old brick could not be ended."""
         return self._end(DONE, msg.failure)
 
-    def end_undone(self, msg: Ended) -> list[Effect]:
+    def end_undone(self, msg: Progress) -> list[Effect]:
         """With the reason of the undo, and that of its failure."""
         return self._end(self.outcome, "; ".join(r for r in (self.reason, msg.failure) if r))
 
@@ -208,11 +172,9 @@ class AdaptationEngine(Machine):
         return [Send(CONTROL, Adapted(self.number, outcome, reason))]
 
     def deadline_ns(self) -> int | None:
-        """The end of the observation."""
         return self._until_ns
 
     def wake(self, now_ns: int) -> list[Effect]:
-        """The observation is over."""
         return self.step(CONTROL, DEADLINE_PASSED, now_ns)
 
     # -- the table ----------------------------------------------------------------------------
@@ -231,13 +193,12 @@ class AdaptationEngine(Machine):
     MOVES: ClassVar[Moves] = {
         (_S.IDLE, CONTROL, Adapt): (prepare, _S.PREPARING),
         (_S.IDLE, CONTROL, TakeUp): Choice(
-            taken_up,
+            phase,
             {
-                TakenUp.PREPARE: (wait, _S.PREPARING),
-                TakenUp.COMMIT: (wait, _S.COMMITTING),
-                TakenUp.FINISH: (wait, _S.FINISHING),
-                TakenUp.UNDO: (wait, _S.UNDOING),
-                **_after(wait, _PREPARED | _COMMITTED | _FINISHED | _UNDONE),
+                Phase.PREPARE: (wait, _S.PREPARING),
+                Phase.COMMIT: (wait, _S.COMMITTING),
+                Phase.FINISH: (wait, _S.FINISHING),
+                Phase.UNDO: (wait, _S.UNDOING),
             },
         ),
         (_S.PREPARING, CONTROL, Progress): Choice(phase_end, _PREPARED),

@@ -179,7 +179,7 @@ class Table:
                 for state in self.states:
                     self.rows.setdefault((state, port, kind), _row(owner, state, move))
         for state in self.states:  # the runtime sends a Rebound to every brick; most of them need none
-            self.rows.setdefault((state, CONTROL, Rebound), (_ignore, state, None))
+            self.rows.setdefault((state, CONTROL, Rebound), (ignore, state, None))
             ports = (port for at, port, _ in self.rows if at is state and port != CONTROL)
             self.open_ports[state] = tuple(dict.fromkeys(ports))
 
@@ -200,8 +200,18 @@ def _method(owner: type, method: Callable[[Any, Any], Any]) -> Callable[[Any, An
     return getattr(owner, method.__name__, method)
 
 
-def _ignore(brick: Brick, msg: Rebound) -> list[Effect]:
+def ignore(brick: Any, msg: object) -> list[Effect]:
+    """A handler: nothing is to be done."""
     return []
+
+
+def hand_on(port: str) -> Handler:
+    """A handler: the message goes on through `port`, as it is."""
+
+    def hand_on(brick: Any, msg: Message) -> list[Effect]:
+        return [Send(port, msg)]
+
+    return hand_on
 
 
 class Machine(Brick):

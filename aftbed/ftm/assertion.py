@@ -12,7 +12,7 @@ from collections.abc import Callable
 from enum import auto
 from typing import ClassVar, Final
 
-from aftbed.core.brick import SAME_STATE, BrickState, Effect, Halt, Machine, Moves, Note, Send
+from aftbed.core.brick import SAME_STATE, BrickState, Effect, Halt, Machine, Moves, Note, Send, hand_on
 from aftbed.core.errors import PeerError
 from aftbed.core.events import Event
 from aftbed.core.messages import Reply, Request, TakeOver
@@ -36,13 +36,9 @@ class AssertBefore(Machine):
         """After has the request before there can be a reply."""
         return [Send("bfr2aft", msg), Note(_EXIT, msg.request_id), Send("bfr2prd", msg)]
 
-    def pass_take_over(self, msg: TakeOver) -> list[Effect]:
-        """One way only: behind the replies."""
-        return [Send("bfr2prd", msg)]
-
     MOVES: ClassVar[Moves] = {
         (PassState.READY, "pro2bfr", Request): (pass_on_twice, SAME_STATE),
-        (PassState.READY, "pro2bfr", TakeOver): (pass_take_over, SAME_STATE),
+        (PassState.READY, "pro2bfr", TakeOver): (hand_on("bfr2prd"), SAME_STATE),  # behind the requests
     }
 
 
@@ -83,13 +79,9 @@ class AssertAfter(Machine):
             Halt(f"reply to request {reply.request_id} is not acceptable"),
         ]
 
-    def hand_on(self, msg: TakeOver) -> list[Effect]:
-        """Behind all replies."""
-        return [Send("aft2pro", msg)]
-
     MOVES: ClassVar[Moves] = {
         (_S.IDLE, "prd2aft", Reply): (hold, _S.HOLDING),
-        (_S.IDLE, "prd2aft", TakeOver): (hand_on, SAME_STATE),
+        (_S.IDLE, "prd2aft", TakeOver): (hand_on("aft2pro"), SAME_STATE),
         (_S.HOLDING, "bfr2aft", Request): (check, _S.IDLE),
     }
 

@@ -6,7 +6,7 @@ Protocol. A mechanism brings its own Before, Proceed and After where it does som
 """
 
 from enum import auto
-from typing import ClassVar, Final
+from typing import Any, ClassVar, Final
 
 import msgspec
 
@@ -18,14 +18,25 @@ from aftbed.core.brick import (
     BrickState,
     Choice,
     Effect,
+    Handler,
     Machine,
     Moves,
     Note,
     Send,
+    hand_on,
 )
 from aftbed.core.errors import PeerError
 from aftbed.core.events import Event
-from aftbed.core.messages import Promoted, Reply, Request, StoreReply, TakeOver
+from aftbed.core.messages import (
+    ChannelEnded,
+    Promote,
+    Promoted,
+    Rebound,
+    Reply,
+    Request,
+    StoreReply,
+    TakeOver,
+)
 from aftbed.ftm.declaration import BrickKind, Emits
 
 REPLIES_KEPT: Final = 256  # at least the client's backlog: what can be asked again can be answered again
@@ -119,11 +130,9 @@ class Protocol(Machine):
             del self.log[next(iter(self.log))]
 
     def capture(self) -> bytes:
-        """The reply log."""
         return msgspec.msgpack.encode((self.last_id, list(self.log.items())))
 
     def restore(self, state: bytes) -> None:
-        """Take over a reply log."""
         try:
             last_id, items = msgspec.msgpack.decode(state, type=tuple[int, list[tuple[int, bytes]]])
         except msgspec.DecodeError as error:
@@ -160,16 +169,11 @@ class PassBefore(Machine):
         super().__init__(PassState.READY)
 
     def pass_on(self, msg: Request) -> list[Effect]:
-        """The very request."""
         return [Note(_BEFORE_EXIT, msg.request_id), Send("bfr2prd", msg)]
-
-    def pass_take_over(self, msg: TakeOver) -> list[Effect]:
-        """TakeOver goes the way of a request, behind those before it."""
-        return [Send("bfr2prd", msg)]
 
     MOVES: ClassVar[Moves] = {
         (PassState.READY, "pro2bfr", Request): (pass_on, SAME_STATE),
-        (PassState.READY, "pro2bfr", TakeOver): (pass_take_over, SAME_STATE),
+        (PassState.READY, "pro2bfr", TakeOver): (hand_on("bfr2prd"), SAME_STATE),
     }
 
 
@@ -187,17 +191,12 @@ class Compute(Machine):
         super().__init__(ComputeState.IDLE)
 
     def compute(self, msg: Request) -> list[Effect]:
-        """Have the Server execute the request."""
         return [Note(_PROCEED_ENTER, msg.request_id), Send("prd2srv", msg)]
-
-    def hand_on(self, msg: Reply | TakeOver) -> list[Effect]:
-        """A result; or a TakeOver, behind the results of all requests before it."""
-        return [Send("prd2aft", msg)]
 
     MOVES: ClassVar[Moves] = {
         (ComputeState.IDLE, "bfr2prd", Request): (compute, ComputeState.COMPUTING),
-        (ComputeState.IDLE, "bfr2prd", TakeOver): (hand_on, SAME_STATE),
-        (ComputeState.COMPUTING, "srv2prd", Reply): (hand_on, ComputeState.IDLE),
+        (ComputeState.IDLE, "bfr2prd", TakeOver): (hand_on("prd2aft"), SAME_STATE),
+        (ComputeState.COMPUTING, "srv2prd", Reply): (hand_on("prd2aft"), ComputeState.IDLE),
     }
 
 
@@ -233,7 +232,6 @@ class InnerProtocol(Machine):
         return [Send("pro2bfr", msg)]
 
     def release(self, msg: Reply) -> list[Effect]:
-        """Its reply leaves."""
         if msg.request_id != self.busy_id:
             raise PeerError(f"reply to request {msg.request_id}, expected {self.busy_id}")
         return [Send("pro2pxy", msg)]
@@ -255,6 +253,50 @@ class InnerProtocol(Machine):
         (InnerState.BUSY, "aft2pro", Reply): (release, InnerState.IDLE),
         (InnerState.HANDING_ON, "aft2pro", TakeOver): (release_take_over, InnerState.IDLE),
     }
+
+
+# -- handlers of the bricks through which a leader speaks to its backup ---------------------------
+#
+# Such a brick has an `epoch`, knows whether it is `duplex` (there is a backup), and, once promoted, the
+# `promote_epoch` to lead under. A promoted backup leads when the channel from its leader is drained.
+
+
+def learn_duplex(port: str) -> Handler:
+    """There is a backup while `port` is bound."""
+
+    def learn_duplex(brick: Any, msg: Rebound) -> list[Effect]:
+        if msg.port == port:
+            brick.duplex = msg.bound
+        return []
+
+    return learn_duplex
+
+
+def promote(brick: Any, msg: Promote) -> list[Effect]:
+    """Remember the epoch to lead under; the channel is still to be drained."""
+    if msg.epoch <= brick.epoch:
+        raise PeerError(f"promoted to epoch {msg.epoch} while {brick.state.name} in epoch {brick.epoch}")
+    brick.promote_epoch = msg.epoch
+    return []
+
+
+def lead(port: str) -> Handler:
+    """The channel is drained, and this replica is promoted: TakeOver goes behind all that came from there."""
+
+    def lead(brick: Any, msg: ChannelEnded | Promote) -> list[Effect]:
+        brick.epoch, brick.promote_epoch, brick.duplex = brick.promote_epoch, 0, False
+        return [Send(port, TakeOver(brick.epoch))]
+
+    return lead
+
+
+def promote_at_once(port: str) -> Handler:
+    """The channel is drained already."""
+
+    def promote_at_once(brick: Any, msg: Promote) -> list[Effect]:
+        return promote(brick, msg) + lead(port)(brick, msg)
+
+    return promote_at_once
 
 
 PROTOCOL: Final = BrickKind(

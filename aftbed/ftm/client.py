@@ -17,6 +17,7 @@ from aftbed.core.brick import (
     Moves,
     Note,
     Send,
+    ignore,
 )
 from aftbed.core.errors import PeerError
 from aftbed.core.events import Event
@@ -71,11 +72,9 @@ class Client(Machine):
         self._again: frozenset[int] = frozenset()
 
     def quiescent(self) -> bool:
-        """All is answered."""
         return not self.unanswered
 
     def which_next(self, msg: Submit) -> NextRequest:
-        """What becomes of the next request."""
         if self.next_id in self._hold_at:
             return NextRequest.IS_HELD
         return NextRequest.FILLS_BACKLOG if len(self.unanswered) + 1 >= BACKLOG_MAX else _GOES
@@ -129,28 +128,20 @@ class Client(Machine):
         return [Send(CONTROL, RequestHeld(number)) for number in passed]
 
     def which_release(self, msg: Release) -> ReleaseOf:
-        """Whether it is of the request that is held."""
         assert self._held is not None
         if msg.request_id != self._held.request_id:
             return ReleaseOf.OTHER
         return ReleaseOf.HELD_AND_LAST if len(self.unanswered) >= BACKLOG_MAX else ReleaseOf.HELD
 
     def send_held(self, msg: Release) -> list[Effect]:
-        """Now it goes."""
         held, self._held = self._held, None
         assert held is not None
         return [Send("clt2pxy", held)]
 
-    def ignore(self, msg: Release) -> list[Effect]:
-        """It was sent already."""
-        return []
-
     def capture(self) -> bytes:
-        """The ids and the unanswered requests."""
         return msgspec.msgpack.encode((self.next_id, list(self.unanswered.values())))
 
     def restore(self, state: bytes) -> None:
-        """Go on where another Client ended."""
         try:
             next_id, waiting = msgspec.msgpack.decode(state, type=tuple[int, list[Request]])
         except msgspec.DecodeError as error:
@@ -184,7 +175,7 @@ class Client(Machine):
                 ReleaseOf.OTHER: (ignore, SAME_STATE),
             },
         ),
-        (ANY_STATE, CONTROL, Release): (ignore, SAME_STATE),
+        (ANY_STATE, CONTROL, Release): (ignore, SAME_STATE),  # it was sent already
         (ANY_STATE, CONTROL, HoldAt): (hold_at, SAME_STATE),
         (ANY_STATE, CONTROL, Rebound): (send_again, SAME_STATE),
     }
@@ -234,12 +225,10 @@ class Proxy(Machine):
         self.waiting: Request | None = None
 
     def pass_on(self, msg: Request) -> list[Effect]:
-        """Under the epoch of the leader."""
         self.waiting = request = Request(self.epoch, msg.request_id, msg.payload)
         return [Send("pxy2pro", request)]
 
     def which_reply(self, msg: Reply) -> ReplyIs:
-        """Whether it is the one that is waited for."""
         waiting = self.waiting
         assert waiting is not None
         if msg.epoch != self.epoch:
@@ -286,10 +275,6 @@ class Proxy(Machine):
     def unbind(self, msg: Rebound) -> list[Effect]:
         """No replica leads: a later one may have any epoch."""
         self.epoch = 0
-        return []
-
-    def ignore(self, msg: Rebound) -> list[Effect]:
-        """The way to the client is nothing to it."""
         return []
 
     _REBOUND_AT_REST: ClassVar[Choice] = Choice(

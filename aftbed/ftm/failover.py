@@ -60,15 +60,12 @@ class Watchdog(Brick):
         self._grace_until_ns = 0
 
     def open_ports(self) -> tuple[str, ...]:
-        """What the host senses."""
         return _OPEN
 
     def quiescent(self) -> bool:
-        """It holds no request."""
         return True
 
     def step(self, port: str, msg: AnyMessage, now_ns: int) -> list[Effect]:
-        """Watch other nodes, or judge a death or the pulses."""
         match msg:
             case Watch():
                 self.replica, self.generation, self.nodes = msg.replica, msg.generation, msg.nodes
@@ -165,15 +162,12 @@ class Recovery(Brick):
         self._retry_ns: int | None = None
 
     def open_ports(self) -> tuple[str, ...]:
-        """The alarms of both Watchdogs."""
         return _ALARM_PORTS
 
     def quiescent(self) -> bool:
-        """No script under way."""
         return self.ordered is None
 
     def step(self, port: str, msg: AnyMessage, now_ns: int) -> list[Effect]:
-        """Take an alarm, or the situation."""
         match msg:
             case Suspect():
                 self.suspects.add((msg.replica, msg.generation))
@@ -218,7 +212,6 @@ class Recovery(Brick):
         return self._retry_ns if self.ordered is None else None
 
     def wake(self, now_ns: int) -> list[Effect]:
-        """Try again."""
         self._retry_ns = None
         return self._order(now_ns)
 

@@ -22,7 +22,18 @@ from enum import auto
 from hashlib import blake2b
 from typing import ClassVar, Final
 
-from aftbed.core.brick import ANY_STATE, CONTROL, SAME_STATE, BrickState, Effect, Machine, Moves, Note, Send
+from aftbed.core.brick import (
+    ANY_STATE,
+    CONTROL,
+    SAME_STATE,
+    BrickState,
+    Effect,
+    Machine,
+    Moves,
+    Note,
+    Send,
+    ignore,
+)
 from aftbed.core.errors import PeerError
 from aftbed.core.events import Event
 from aftbed.core.messages import (
@@ -35,7 +46,7 @@ from aftbed.core.messages import (
     StoreReply,
     TakeOver,
 )
-from aftbed.ftm.chain import COMPUTE
+from aftbed.ftm.chain import COMPUTE, lead, learn_duplex, promote, promote_at_once
 from aftbed.ftm.declaration import BrickKind, Emits, Mechanism, Suitability
 
 DIGEST_BYTES: Final = 16
@@ -86,48 +97,18 @@ class LfrBefore(Machine):
             raise PeerError(f"request {msg.request_id} under epoch {msg.epoch}, expected {self.epoch}")
         return [Note(_EXIT, msg.request_id), Send("bfr2prd", msg)]
 
-    def rebound(self, msg: Rebound) -> list[Effect]:
-        """Learn whether there is a follower."""
-        if msg.port == "bfr2bfr":
-            self.duplex = msg.bound
-        return []
-
-    def end_of_channel(self, msg: ChannelEnded) -> list[Effect]:
-        """All that the old leader had forwarded is passed on."""
-        return []
-
-    def promote(self, msg: Promote) -> list[Effect]:
-        """Remember the epoch to lead under; the channel is still to be drained."""
-        if msg.epoch <= self.epoch:
-            raise PeerError(f"promoted to epoch {msg.epoch} while {self.state.name} in epoch {self.epoch}")
-        self.promote_epoch = msg.epoch
-        return []
-
-    def promote_at_once(self, msg: Promote) -> list[Effect]:
-        """The channel is drained already."""
-        self.promote(msg)
-        return self._lead()
-
-    def lead(self, msg: ChannelEnded) -> list[Effect]:
-        """The channel is drained, and this replica is promoted."""
-        return self._lead()
-
-    def _lead(self) -> list[Effect]:
-        self.epoch, self.promote_epoch, self.duplex = self.promote_epoch, 0, False
-        return [Send("bfr2prd", TakeOver(self.epoch))]
-
     MOVES: ClassVar[Moves] = {
         (_B.LEADING, "pro2bfr", Request): (forward, SAME_STATE),
         (_B.FOLLOWING, "bfr2bfr", Request): (follow, SAME_STATE),
-        (_B.FOLLOWING, "bfr2bfr", ChannelEnded): (end_of_channel, _B.ENDED),
+        (_B.FOLLOWING, "bfr2bfr", ChannelEnded): (ignore, _B.ENDED),
         (_B.FOLLOWING, CONTROL, Promote): (promote, _B.PROMOTED),
         (_B.PROMOTED, "bfr2bfr", Request): (follow, SAME_STATE),
-        (_B.PROMOTED, "bfr2bfr", ChannelEnded): (lead, _B.LEADING),
+        (_B.PROMOTED, "bfr2bfr", ChannelEnded): (lead("bfr2prd"), _B.LEADING),
         (_B.PROMOTED, CONTROL, Promote): (promote, SAME_STATE),
-        (_B.ENDED, CONTROL, Promote): (promote_at_once, _B.LEADING),
+        (_B.ENDED, CONTROL, Promote): (promote_at_once("bfr2prd"), _B.LEADING),
         (_B.ENDED, "bfr2bfr", Request): (follow, _B.FOLLOWING),  # another channel was bound since
-        (_B.ENDED, "bfr2bfr", ChannelEnded): (end_of_channel, SAME_STATE),
-        (ANY_STATE, CONTROL, Rebound): (rebound, SAME_STATE),
+        (_B.ENDED, "bfr2bfr", ChannelEnded): (ignore, SAME_STATE),
+        (ANY_STATE, CONTROL, Rebound): (learn_duplex("bfr2bfr"), SAME_STATE),
     }
 
 
@@ -163,7 +144,6 @@ class LfrAfter(Machine):
         ]
 
     def hold(self, msg: Reply) -> list[Effect]:
-        """Keep the own reply until the leader's is known."""
         self._held = msg
         return []
 
@@ -198,12 +178,6 @@ class LfrAfter(Machine):
         self.epoch, self.duplex = msg.epoch, False
         return [Send("aft2pro", msg)]
 
-    def rebound(self, msg: Rebound) -> list[Effect]:
-        """Learn whether there is a follower."""
-        if msg.port == "aft2aft":
-            self.duplex = msg.bound
-        return []
-
     MOVES: ClassVar[Moves] = {
         (_A.LEADING, "prd2aft", Reply): (notify_then_reply, SAME_STATE),
         (_A.FOLLOWING, "prd2aft", Reply): (hold, _A.HOLDING),
@@ -212,7 +186,7 @@ class LfrAfter(Machine):
         (_A.HOLDING, "aft2aft", ChannelEnded): (store_held, _A.ALONE),
         (_A.ALONE, "prd2aft", Reply): (store, SAME_STATE),
         (_A.ALONE, "prd2aft", TakeOver): (take_over, _A.LEADING),
-        (ANY_STATE, CONTROL, Rebound): (rebound, SAME_STATE),
+        (ANY_STATE, CONTROL, Rebound): (learn_duplex("aft2aft"), SAME_STATE),
     }
 
 

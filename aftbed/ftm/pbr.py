@@ -11,7 +11,18 @@ the backup is promoted, it drains that channel to its end, and only then lets it
 from enum import auto
 from typing import ClassVar, Final
 
-from aftbed.core.brick import ANY_STATE, CONTROL, SAME_STATE, BrickState, Effect, Machine, Moves, Note, Send
+from aftbed.core.brick import (
+    ANY_STATE,
+    CONTROL,
+    SAME_STATE,
+    BrickState,
+    Effect,
+    Machine,
+    Moves,
+    Note,
+    Send,
+    ignore,
+)
 from aftbed.core.errors import PeerError
 from aftbed.core.events import Event
 from aftbed.core.messages import (
@@ -25,9 +36,8 @@ from aftbed.core.messages import (
     StateCaptured,
     StateRestored,
     StoreReply,
-    TakeOver,
 )
-from aftbed.ftm.chain import COMPUTE, PASS_BEFORE
+from aftbed.ftm.chain import COMPUTE, PASS_BEFORE, lead, learn_duplex, promote, promote_at_once
 from aftbed.ftm.declaration import BrickKind, Emits, Mechanism, Suitability
 
 
@@ -81,12 +91,6 @@ class PbrAfter(Machine):
             Send("aft2pro", reply),
         ]
 
-    def rebound(self, msg: Rebound) -> list[Effect]:
-        """Learn whether there is a backup."""
-        if msg.port == "aft2aft":
-            self.duplex = msg.bound
-        return []
-
     # -- the backup ---------------------------------------------------------------------------
 
     def apply(self, msg: Checkpoint) -> list[Effect]:
@@ -108,49 +112,23 @@ class PbrAfter(Machine):
             Send("aft2pro", StoreReply(held.epoch, held.request_id, held.reply)),
         ]
 
-    # -- taking over --------------------------------------------------------------------------
-
-    def end_of_channel(self, msg: ChannelEnded) -> list[Effect]:
-        """All checkpoints of the old leader are applied."""
-        return []
-
-    def promote(self, msg: Promote) -> list[Effect]:
-        """Remember the epoch to lead under; the channel is still to be drained."""
-        if msg.epoch <= self.epoch:
-            raise PeerError(f"promoted to epoch {msg.epoch} while {self.state.name} in epoch {self.epoch}")
-        self.promote_epoch = msg.epoch
-        return []
-
-    def promote_at_once(self, msg: Promote) -> list[Effect]:
-        """The channel is drained already."""
-        self.promote(msg)
-        return self._lead()
-
-    def lead(self, msg: ChannelEnded) -> list[Effect]:
-        """The channel is drained, and this replica is promoted."""
-        return self._lead()
-
-    def _lead(self) -> list[Effect]:
-        self.epoch, self.promote_epoch, self.duplex = self.promote_epoch, 0, False
-        return [Send("aft2pro", TakeOver(self.epoch))]
-
     MOVES: ClassVar[Moves] = {
         (_S.IDLE, "prd2aft", Reply): (hold_reply, _S.CAPTURING),
         (_S.CAPTURING, "srv2aft", StateCaptured): (checkpoint_then_reply, _S.IDLE),
         (_S.STANDBY, "aft2aft", Checkpoint): (apply, _S.APPLYING),
-        (_S.STANDBY, "aft2aft", ChannelEnded): (end_of_channel, _S.ENDED),
+        (_S.STANDBY, "aft2aft", ChannelEnded): (ignore, _S.ENDED),
         (_S.STANDBY, CONTROL, Promote): (promote, _S.PROMOTED),
         (_S.APPLYING, "srv2aft", StateRestored): (store_reply, _S.STANDBY),
         (_S.APPLYING, CONTROL, Promote): (promote, _S.PROMOTED_APPLYING),
         (_S.PROMOTED, "aft2aft", Checkpoint): (apply, _S.PROMOTED_APPLYING),
-        (_S.PROMOTED, "aft2aft", ChannelEnded): (lead, _S.IDLE),
+        (_S.PROMOTED, "aft2aft", ChannelEnded): (lead("aft2pro"), _S.IDLE),
         (_S.PROMOTED, CONTROL, Promote): (promote, SAME_STATE),
         (_S.PROMOTED_APPLYING, "srv2aft", StateRestored): (store_reply, _S.PROMOTED),
         (_S.PROMOTED_APPLYING, CONTROL, Promote): (promote, SAME_STATE),
-        (_S.ENDED, CONTROL, Promote): (promote_at_once, _S.IDLE),
+        (_S.ENDED, CONTROL, Promote): (promote_at_once("aft2pro"), _S.IDLE),
         (_S.ENDED, "aft2aft", Checkpoint): (apply, _S.APPLYING),  # another channel was bound since
-        (_S.ENDED, "aft2aft", ChannelEnded): (end_of_channel, SAME_STATE),
-        (ANY_STATE, CONTROL, Rebound): (rebound, SAME_STATE),
+        (_S.ENDED, "aft2aft", ChannelEnded): (ignore, SAME_STATE),
+        (ANY_STATE, CONTROL, Rebound): (learn_duplex("aft2aft"), SAME_STATE),
     }
 
 

@@ -32,6 +32,7 @@ from aftbed.core.brick import (
     Moves,
     Note,
     Send,
+    ignore,
 )
 from aftbed.core.errors import PeerError
 from aftbed.core.events import RERUN, Event
@@ -96,7 +97,6 @@ class Server(Machine):
         self._state_after = self._state_before = False  # whether the outputs for it are bound
 
     def execute(self, msg: Request) -> list[Effect]:
-        """Compute the reply."""
         payload = self._execute(msg.payload)
         return [
             Note(_ENTER, msg.request_id),
@@ -105,7 +105,6 @@ class Server(Machine):
         ]
 
     def which_run(self, msg: Trial) -> TrialRun:
-        """The first trial of a request, or another one."""
         return _RERUN if msg.rerun else _FIRST
 
     def try_first(self, msg: Trial) -> list[Effect]:
@@ -151,10 +150,6 @@ class Server(Machine):
         self._state_before = msg.bound
         return self._go_by_bindings()
 
-    def rebind_other(self, msg: Rebound) -> list[Effect]:
-        """Where replies go changes nothing here."""
-        return []
-
     def _go_by_bindings(self) -> list[Effect]:
         self.go_by(_TABLES[self._state_after, self._state_before])
         return []
@@ -180,11 +175,9 @@ class Server(Machine):
         return [Note(_CAPTURED, msg.request_id), Send(port, captured)]
 
     def capture(self) -> bytes:
-        """The function's state."""
         return self.application.capture()
 
     def restore(self, state: bytes) -> None:
-        """Take over a function's state."""
         self.application.restore(state)
 
     def migrate(self, state: bytes) -> None:
@@ -200,7 +193,7 @@ class Server(Machine):
             {
                 BoundOutput.STATE_AFTER: (rebind_after, _S.STANDBY),
                 BoundOutput.STATE_BEFORE: (rebind_before, SAME_STATE),
-                BoundOutput.OTHER: (rebind_other, SAME_STATE),
+                BoundOutput.OTHER: (ignore, SAME_STATE),
             },
         ),
         (_S.TRYING, CONTROL, Rebound): Choice(
@@ -208,7 +201,7 @@ class Server(Machine):
             {
                 BoundOutput.STATE_AFTER: (rebind_after, _S.STANDBY),
                 BoundOutput.STATE_BEFORE: (rebind_before, _S.STANDBY),  # that Before's trials will not come
-                BoundOutput.OTHER: (rebind_other, SAME_STATE),
+                BoundOutput.OTHER: (ignore, SAME_STATE),
             },
         ),
     }

@@ -33,6 +33,7 @@ from aftbed.core.brick import (
     Moves,
     Note,
     Send,
+    hand_on,
 )
 from aftbed.core.errors import PeerError
 from aftbed.core.events import Event
@@ -85,7 +86,6 @@ class TrBefore(Machine):
         return [Send("bfr2srv", CaptureState(msg.epoch, msg.request_id))]
 
     def begin_trial(self, msg: StateCaptured) -> list[Effect]:
-        """Request and state go on together."""
         request = self._request
         assert request is not None
         if msg.request_id != request.request_id:
@@ -94,13 +94,9 @@ class TrBefore(Machine):
         trial = Trial(request.epoch, request.request_id, request.payload, msg.state, rerun=False)
         return [Note(_BEFORE_EXIT, request.request_id), Send("bfr2prd", trial)]
 
-    def hand_on(self, msg: TakeOver) -> list[Effect]:
-        """Behind all requests."""
-        return [Send("bfr2prd", msg)]
-
     MOVES: ClassVar[Moves] = {
         (_B.IDLE, "pro2bfr", Request): (ask_for_state, _B.CAPTURING),
-        (_B.IDLE, "pro2bfr", TakeOver): (hand_on, SAME_STATE),
+        (_B.IDLE, "pro2bfr", TakeOver): (hand_on("bfr2prd"), SAME_STATE),
         (_B.CAPTURING, "srv2bfr", StateCaptured): (begin_trial, _B.IDLE),
     }
 
@@ -137,7 +133,6 @@ class TrProceed(Machine):
         return [Note(_PROCEED_ENTER, msg.request_id), Send("prd2srv", msg), Send("prd2srv", self._rerun(msg))]
 
     def hold_first(self, msg: Tried) -> list[Effect]:
-        """One result of two."""
         self._expect(msg)
         self._first = msg
         return []
@@ -149,23 +144,16 @@ class TrProceed(Machine):
         return equal(self._first, msg)
 
     def send_both(self, msg: Tried) -> list[Effect]:
-        """After has two results to compare."""
         first, self._first = self._first, None
         assert first is not None
         return [Send("prd2aft", Trials(msg.epoch, msg.request_id, (first, msg)))]
 
     def run_again(self, msg: Again) -> list[Effect]:
-        """The third trial."""
         return [Send("prd2srv", self._rerun(self._expect(msg)))]
 
     def send_third(self, msg: Tried) -> list[Effect]:
-        """After has a third result."""
         self._expect(msg)
         return [Send("prd2aft", Trials(msg.epoch, msg.request_id, (msg,)))]
-
-    def hand_on(self, msg: TakeOver) -> list[Effect]:
-        """Behind all results."""
-        return [Send("prd2aft", msg)]
 
     def _expect(self, msg: Tried | Again) -> Trial:
         """The trial under way; raises PeerError if `msg` is about another one."""
@@ -180,13 +168,13 @@ class TrProceed(Machine):
 
     MOVES: ClassVar[Moves] = {
         (_P.IDLE, "bfr2prd", Trial): (run_twice, _P.FIRST),
-        (_P.IDLE, "bfr2prd", TakeOver): (hand_on, SAME_STATE),
+        (_P.IDLE, "bfr2prd", TakeOver): (hand_on("prd2aft"), SAME_STATE),
         (_P.FIRST, "srv2prd", Tried): (hold_first, _P.SECOND),
         (_P.SECOND, "srv2prd", Tried): Choice(
             agrees, {True: (send_both, _P.IDLE), False: (send_both, _P.VOTING)}
         ),
         (_P.VOTING, "bfr2prd", Trial): (run_twice, _P.FIRST),
-        (_P.VOTING, "bfr2prd", TakeOver): (hand_on, SAME_STATE),
+        (_P.VOTING, "bfr2prd", TakeOver): (hand_on("prd2aft"), SAME_STATE),
         (_P.VOTING, "aft2prd", Again): (run_again, _P.THIRD),
         (_P.THIRD, "srv2prd", Tried): (send_third, _P.IDLE),
     }
@@ -247,21 +235,15 @@ class TrAfter(Machine):
         return self._reply(msg.tried[-1], 3)
 
     def ask_for_third(self, msg: Trials) -> list[Effect]:
-        """Two trials differ."""
         self._held = msg.tried
         return [Send("aft2prd", Again(msg.epoch, msg.request_id))]
 
     def stop(self, msg: Trials) -> list[Effect]:
-        """No majority."""
         return [
             Note(_COMPARED, msg.request_id, UNDECIDED),
             Note(Event.DETECTED_STOP, msg.request_id),
             Halt(f"no majority for request {msg.request_id}: three trials, no two of them equal"),
         ]
-
-    def hand_on(self, msg: TakeOver) -> list[Effect]:
-        """Behind all replies."""
-        return [Send("aft2pro", msg)]
 
     def _reply(self, tried: Tried, trials: int) -> list[Effect]:
         reply = Reply(tried.epoch, tried.request_id, tried.replica, tried.payload)
@@ -271,7 +253,7 @@ class TrAfter(Machine):
         (_A.IDLE, "prd2aft", Trials): Choice(
             vote, {Vote.MAJORITY: (reply, SAME_STATE), Vote.OPEN: (ask_for_third, _A.ASKED)}
         ),
-        (_A.IDLE, "prd2aft", TakeOver): (hand_on, SAME_STATE),
+        (_A.IDLE, "prd2aft", TakeOver): (hand_on("aft2pro"), SAME_STATE),
         (_A.ASKED, "prd2aft", Trials): Choice(
             vote, {Vote.MAJORITY: (reply_by_third, _A.IDLE), Vote.NONE: (stop, SAME_STATE)}
         ),

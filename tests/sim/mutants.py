@@ -49,7 +49,7 @@ from aftbed.core.messages import (
 )
 from aftbed.ftm import tr
 from aftbed.ftm.assertion import Acceptable, AssertAfter
-from aftbed.ftm.chain import Protocol, ProtocolState, RequestAge
+from aftbed.ftm.chain import Protocol, ProtocolState, RequestAge, promote_at_once
 from aftbed.ftm.client import Client, Proxy, ReplyIs
 from aftbed.ftm.failover import Watchdog
 from aftbed.ftm.lfr import LfrAfter, LfrBefore, LfrBeforeState
@@ -70,10 +70,10 @@ _TWO_AT_ONCE: Final = {
     )
 }
 _CHECKPOINTS_NOT_DRAINED: Final = {
-    (PbrAfterState.STANDBY, CONTROL, Promote): (PbrAfter.promote_at_once, PbrAfterState.IDLE)
+    (PbrAfterState.STANDBY, CONTROL, Promote): (promote_at_once("aft2pro"), PbrAfterState.IDLE)
 }
 _REQUESTS_NOT_DRAINED: Final = {
-    (LfrBeforeState.FOLLOWING, CONTROL, Promote): (LfrBefore.promote_at_once, LfrBeforeState.LEADING)
+    (LfrBeforeState.FOLLOWING, CONTROL, Promote): (promote_at_once("bfr2prd"), LfrBeforeState.LEADING)
 }
 
 
