@@ -82,12 +82,14 @@ class FaultAgent:
 
     # -- orders of the supervisor ------------------------------------------------------------------
 
-    def arm(self, event: str, faults: Sequence[ArmedFault]) -> None:
-        """Wait for `event`; with `nth` 0, wait no longer.
+    def arm(self, label: str, faults: Sequence[ArmedFault]) -> None:
+        """Wait for the event with that label; with `nth` 0, wait no longer.
 
         Faults that already wait for it go on counting; one that is given again begins anew.
         """
-        self._arm(event_named(event), faults)
+        event, given = event_named(label), {fault.fault for fault in faults}
+        kept = [fault for fault in self._armed.get(event, ()) if fault.fault not in given]
+        self._set(event, (*kept, *faults))
 
     def disturb(self, fault: ArmedFault) -> None:
         """Have a fault of a channel wait at its sender; with `nth` 0, wait there no longer."""
@@ -164,11 +166,10 @@ class FaultAgent:
         self.slowed = bool(self._slow)
         self.active = bool(self._armed or self._slow or self.filters or self._shares_state)
 
-    def _arm(self, event: Event, faults: Sequence[ArmedFault]) -> None:
-        given = {fault.fault for fault in faults}
-        kept = [fault for fault in self._armed.pop(event, ()) if fault.fault not in given]
-        waiting = (*kept, *(fault for fault in faults if fault.nth))
-        if waiting:
+    def _set(self, event: Event, faults: Sequence[ArmedFault]) -> None:
+        """These wait for `event`, where their `nth` is not 0."""
+        self._armed.pop(event, None)
+        if waiting := tuple(fault for fault in faults if fault.nth):
             self._armed[event] = waiting
         self._in_step = {}
         for fault in (fault for armed in self._armed.values() for fault in armed if fault.nth == 1):
@@ -213,7 +214,7 @@ class FaultAgent:
         if armed is None:
             return
         counted = [f if f.brick != name else structs.replace(f, nth=f.nth - 1) for f in armed]
-        self._arm(note.event, tuple(map(_next_strike, counted)))
+        self._set(note.event, tuple(map(_next_strike, counted)))
         for fault in counted:
             if fault.nth or fault.action.alters_step:
                 continue

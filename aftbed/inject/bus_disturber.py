@@ -1,29 +1,28 @@
 """What faults of the bus do to its frames. Pure: frames in, frames out; time is the frames' own.
 
 The hub between processes and the bus of the car in virtual time both let a frame pass through a `Disturber`
-at the moment at which it has the bus to itself (`vehicle`'s protocol for it has the calls that a bus
-makes):
+at the moment at which it wins the bus (`vehicle`'s protocol for it has the calls that a bus makes):
 
     carry(frame, sender)     what comes onto the bus in its place, now: the frame, another one, two, or none
     release(now_us)          what comes now without being sent now: held back before, or a babbling idiot's
-    due_us()                 when `release` is worth calling next
-    deaf(sender, node, ...)  whether the node does not hear that sender now: bus-off, partition
+    due_us()                 when to call `release` next
+    deaf(sender, node, ...)  whether the node receives nothing of that sender now: bus-off, partition
 
 Several faults are armed at once: what one lets through, the next one gets, in the order of arming. What is
 released is not struck again.
 
-*Time.* A fault opens at its time, and ends by time where it lasts. Both are looked at when a frame or a
-`release` comes, and compared with bus time, so it makes no difference when it is looked at.
+*Time.* A fault opens at its time, and ends by time where it lasts. Both are compared with bus time when a
+frame or a `release` comes, so how often the bus calls makes no difference.
 
 *Babbling idiot.* A node that sends identifier 0 without a pause wins every arbitration. So no other frame
 gets through: a controller holds the latest of each message, as a transmit buffer does, and these go out in
 the order of arbitration when the babbling ends. The flood itself is carried as one frame in each
-millisecond, which stands for the three or four that 500 kbit/s would allow: readers of the bus have to see
-it, not to drown in it.
+millisecond, which stands for the three or four that 500 kbit/s would allow, so that readers of the bus can
+keep up.
 
-*Who noticed.* A receiver that finds something wrong with a frame, or misses one, says so beside the bus, by
-the identifier (`noticed`). A receiver that takes a struck frame in (`reached`), and says nothing, has
-believed it. A brake ECU in its fallback has noticed whatever there is to notice.
+*Detection.* A receiver that finds something wrong with a frame, or misses one, reports it beside the bus, by
+the identifier (`noticed`). A receiver that takes a struck frame in (`reached`) without a report has believed
+it. A brake ECU in its fallback counts as having noticed any fault.
 """
 
 from random import Random
@@ -83,11 +82,9 @@ class _ArmedBusFault:
 
     @property
     def on_nodes(self) -> bool:
-        """Whether it takes hold of nodes, not of frames."""
         return isinstance(self.fault.effect, NODE_ACTS)
 
-    def open(self, now_us: int) -> bool:
-        """Whether it may strike."""
+    def is_open(self, now_us: int) -> bool:
         return not self.over and self.opens_us is not None and self.opens_us <= now_us
 
     def ends_us(self) -> int | None:
@@ -98,22 +95,22 @@ class _ArmedBusFault:
         return since_us + persistence.for_us
 
     def holds(self, now_us: int) -> bool:
-        """Whether it has hold of its nodes. It takes hold when that is first asked in time."""
-        if not self.open(now_us):
+        """Whether it has hold of its nodes, from the first call in its time on."""
+        if not self.is_open(now_us):
             return False
         if self.since_us is None:
             assert self.opens_us is not None
             self.since_us = self.flood_us = self.opens_us
-        return not self._ended(now_us)
+        return not self.ended(now_us)
 
-    def _ended(self, now_us: int) -> bool:
+    def ended(self, now_us: int) -> bool:
         ends_us = self.ends_us()
         self.over = self.over or (ends_us is not None and now_us >= ends_us)
         return self.over
 
     def strikes(self, now_us: int) -> bool:
         """Whether it strikes the frame of now, which is one of its targets."""
-        if not self.open(now_us):
+        if not self.is_open(now_us):
             return False
         self.seen += 1
         if self.seen < self.fault.opening.nth:
@@ -124,7 +121,7 @@ class _ArmedBusFault:
                 self.over = True
                 return True
             case Lasting():
-                return not self._ended(now_us)
+                return not self.ended(now_us)
             case Chance(p):
                 return self.chance.random() < p
             case Every(count):
@@ -132,20 +129,14 @@ class _ArmedBusFault:
             case Permanent():
                 return True
 
-    def spare(self) -> None:
-        """There was nothing to change in the frame: the next one is due."""
-        if isinstance(self.fault.persistence, Transient):
-            self.over = False
-
     def count(self, frame: Frame) -> None:
-        """The frame was struck."""
+        """`frame` was struck."""
         if not self.frames:
             self.first_us, self.first_id = frame.t_us, frame.can_id
         self.frames += 1
         self.ids.add(frame.can_id)
 
     def report(self) -> BusReport:
-        """What has become of it."""
         return BusReport(
             self.number,
             self.frames,
@@ -156,10 +147,6 @@ class _ArmedBusFault:
             began=self.on_nodes and self.since_us is not None,
             waits=self.opens_us is None,
         )
-
-    def quiet(self) -> bool:
-        """Whether nothing will come of it any more."""
-        return self.over and self.swapped is None and not self.starved
 
 
 class Disturber:
@@ -174,7 +161,7 @@ class Disturber:
         self._armed[number] = _ArmedBusFault(number, fault, Random(draw), now_us)
 
     def forget(self, number: int, now_us: int) -> None:
-        """It ends now; what it holds back is due."""
+        """End it now; what it holds back is due."""
         armed = self._armed.get(number)
         if armed is not None:
             armed.over = True
@@ -183,23 +170,27 @@ class Disturber:
 
     def conditions(self) -> list[tuple[int, Condition]]:
         """The conditions of the car that are waited for, by the number of the fault."""
-        waiting = [a for a in self._armed.values() if a.opens_us is None and not a.over]
-        return [(a.number, a.fault.opening.when) for a in waiting if a.fault.opening.when is not None]
+        return [
+            (armed.number, armed.fault.opening.when)
+            for armed in self._armed.values()
+            if armed.opens_us is None and not armed.over and armed.fault.opening.when is not None
+        ]
 
     def met(self, number: int, now_us: int) -> None:
-        """The condition holds now."""
+        """Open the fault: its condition holds now."""
         armed = self._armed.get(number)
         if armed is not None and armed.opens_us is None:
             armed.opens_us = now_us
 
     def reports(self) -> list[BusReport]:
-        """What has become of each."""
         return [armed.report() for armed in self._armed.values()]
 
     @property
     def idle(self) -> bool:
-        """Whether the bus is as it was, and stays so."""
-        return not self._held and all(armed.quiet() for armed in self._armed.values())
+        """Whether the bus is undisturbed, and stays so."""
+        return not self._held and all(
+            armed.over and armed.swapped is None and not armed.starved for armed in self._armed.values()
+        )
 
     # -- frames -----------------------------------------------------------------------------------
 
@@ -224,7 +215,7 @@ class Disturber:
         ]
 
     def due_us(self) -> int | None:
-        """When something is to happen next that no frame brings about."""
+        """When to call `release` next, whatever frames there are."""
         due = [due_us for due_us, _ in self._held]
         for armed in self._armed.values():
             due += [armed.swap_due_us] if armed.swapped is not None else []
@@ -238,23 +229,29 @@ class Disturber:
         return min(due, default=None)
 
     def deaf(self, sender: str, node: str, now_us: int) -> bool:
-        """Whether `node` hears nothing of `sender` now."""
-        return any(
-            _cuts(armed, sender, node)
-            for armed in self._armed.values()
-            if armed.on_nodes and armed.holds(now_us)
-        )
+        """Whether `node` receives nothing of `sender` now."""
+        for armed in self._armed.values():
+            if not armed.on_nodes or not armed.holds(now_us):
+                continue
+            match armed.fault.effect:
+                case BusOff(off) if node == off:
+                    return True
+                case Partition(side, other) if (sender in side and node in other) or (
+                    sender in other and node in side
+                ):
+                    return True
+        return False
 
-    # -- who noticed ------------------------------------------------------------------------------
+    # -- detection --------------------------------------------------------------------------------
 
     def noticed(self, node: str, can_id: int, word: str) -> None:
-        """`node` finds something wrong with the frames of `can_id`."""
+        """`node` reports something wrong with the frames of `can_id`."""
         for armed in self._armed.values():
             if armed.frames and not armed.noticed and (can_id in armed.ids or word == FALLBACK):
                 armed.noticed = f"{node} ({word})"
 
     def reached(self, by: tuple[int, ...], node: str) -> None:
-        """A frame that these faults have struck has come to `node`, which makes something of it."""
+        """`node` has taken in a frame that these faults have struck."""
         for number in by:
             armed = self._armed[number]
             armed.believed = armed.believed or node
@@ -288,8 +285,8 @@ class Disturber:
         strikes = armed.strikes(frame.t_us)
         changed = _changed(armed, frame) if strikes else None
         if changed is None:
-            if strikes:
-                armed.spare()
+            if strikes and isinstance(armed.fault.persistence, Transient):
+                armed.over = False  # nothing to change in this frame: the next one is due
             if len(frame.data) > 1:
                 armed.counters[frame.can_id] = frame.data[1] & COUNTER_MASK
             return [sent]
@@ -310,11 +307,11 @@ class Disturber:
                 return [struck]
 
     def _let_go(self, armed: _ArmedBusFault, now_us: int) -> None:
-        """A fault that is over lets go of what it had."""
+        """Let go of what a fault that is over holds back."""
         if armed.on_nodes:
             armed.holds(now_us)
-        elif (ends_us := armed.ends_us()) is not None and now_us >= ends_us:
-            armed.over = True
+        else:
+            armed.ended(now_us)
         if armed.swapped is not None and now_us >= armed.swap_due_us:
             self._held.append((armed.swap_due_us, armed.swapped))
             armed.swapped = None
@@ -339,16 +336,6 @@ class Disturber:
 def _at(now_us: int, sent: CarriedFrame) -> CarriedFrame:
     frame = sent.frame
     return CarriedFrame(Frame(now_us, frame.can_id, frame.data), sent.sender, sent.by)
-
-
-def _cuts(armed: _ArmedBusFault, sender: str, node: str) -> bool:
-    match armed.fault.effect:
-        case BusOff(off):
-            return node == off
-        case Partition(side, other):
-            return (sender in side and node in other) or (sender in other and node in side)
-        case _:
-            return False
 
 
 def _changed(armed: _ArmedBusFault, frame: Frame) -> Frame | None:

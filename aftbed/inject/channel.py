@@ -90,7 +90,6 @@ class ChannelFault(FaultKind, frozen=True, tag="disturb"):
             )
 
     def waits_in(self, fault: AnyFault, roles: targets.Roles) -> str | None:
-        """The brick of the target that sends there."""
         return targets.sender(roles, self.channel, roles.replica(fault.target))
 
     def receipt(self, injection: Injection, run: RunControl) -> Receipt:
@@ -137,11 +136,9 @@ class FilterStage:
         return self._left <= 0 and not self._held
 
     def due_ns(self) -> int | None:
-        """When what it holds back has to be sent."""
         return self._held[0].due_ns if self._held else None
 
     def stop(self) -> None:
-        """Strike no more."""
         self._left = 0
 
     def take(self, message: Message, now_ns: int) -> list[Message]:
@@ -160,7 +157,7 @@ class FilterStage:
         return found
 
     def flush(self) -> list[Message]:
-        """All that is held back: the channel is another one from now on."""
+        """All that is held back, since another channel is bound."""
         return self.release(self._held[-1].due_ns) if self._held else []
 
     def _is_hit(self) -> bool:
@@ -224,16 +221,13 @@ class ChannelFilter:
         return all(stage.over for stage in self._stages.values())
 
     def due_ns(self) -> int | None:
-        """When something has to be sent."""
         dues = (stage.due_ns() for stage in self._stages.values())
         return min((due for due in dues if due is not None), default=None)
 
     def take(self, message: Message, now_ns: int) -> list[Message]:
-        """What is sent when the sender sends `message`."""
         return self._through(0, [message], now_ns)
 
     def release(self, now_ns: int) -> list[Message]:
-        """What is due."""
         return self._let(lambda stage: stage.release(now_ns), now_ns)
 
     def flush(self, now_ns: int) -> list[Message]:

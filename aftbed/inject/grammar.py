@@ -38,16 +38,11 @@ class FaultWords:
                 raise unknown(f"word in fault {self.text!r}:", key, keys)
             if key in self._values:
                 raise ConfigError(f"fault {self.text!r}: {key!r} twice")
-            self._values[key] = self._value(key, rest)
-
-    def _value(self, key: str, rest: list[str]) -> str:
-        """The value of `key`, taken from `rest`."""
-        if key == PERMANENT or (key == BYTE and (not rest or rest[0].isalpha())):
-            return ""
-        count = _VALUE_WORDS.get(key, 1)
-        if len(rest) < count:
-            raise ConfigError(f"fault {self.text!r}: {key!r} lacks its value")
-        return " ".join(rest.pop(0) for _ in range(count))
+            alone = key == PERMANENT or (key == BYTE and (not rest or rest[0].isalpha()))
+            count = 0 if alone else _VALUE_WORDS.get(key, 1)
+            if len(rest) < count:
+                raise ConfigError(f"fault {self.text!r}: {key!r} lacks its value")
+            self._values[key] = " ".join(rest.pop(0) for _ in range(count))
 
     def __contains__(self, key: str) -> bool:
         return key in self._values
@@ -56,11 +51,9 @@ class FaultWords:
         return self._values[key]
 
     def get(self, key: str, default: str = "") -> str:
-        """The value of `key`, or `default` where it is not given."""
         return self._values.get(key, default)
 
     def first_of(self, keys: Sequence[str]) -> str | None:
-        """The first of `keys` that is given."""
         return next((key for key in keys if key in self._values), None)
 
     def not_both(self, one: str, other: str) -> None:

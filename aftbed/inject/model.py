@@ -77,17 +77,14 @@ class FaultReport(msgspec.Struct, frozen=True, omit_defaults=True):
 
     @property
     def fired(self) -> bool:
-        """Whether the fault happened."""
         return self.receipt.fired
 
     @property
     def action(self) -> FaultKind:
-        """What it does."""
         return parse(self.fault).action
 
 
 def on_bus(action: BusFault) -> Fault:
-    """A fault of the bus, among the others."""
     return Fault(action, BUS, Trigger())
 
 

@@ -37,7 +37,6 @@ class ReceiptState(Enum):
 
     @property
     def fired(self) -> bool:
-        """Whether the fault happened."""
         return self in (ReceiptState.APPLIED, ReceiptState.ACTIVATED)
 
 

@@ -67,7 +67,6 @@ class SharedState:
 
     @property
     def fields(self) -> tuple[Field, ...]:
-        """Those that the function declares."""
         return () if self.layout is None else self.layout.fields
 
     def flip(self, name: str, pattern: BitPattern, now_ns: int, draw: int) -> "StateHit":

@@ -41,7 +41,7 @@ class TargetProcess(Protocol):
         ...
 
     def stopped(self) -> bool:
-        """Whether it is seen to run no more."""
+        """Whether it is seen stopped."""
         ...
 
 
@@ -165,7 +165,6 @@ def emitting_brick_of(roles: Roles, event: str, replica: str) -> str | None:
 
 
 def emitting_part(event: Event) -> str:
-    """The part or the kind of brick that emits `event`."""
     return EMITTERS[event][0]
 
 

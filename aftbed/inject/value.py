@@ -119,7 +119,6 @@ class ValueFlip(FaultKind, frozen=True, tag=BITFLIP):
             )
 
     def waits_in(self, fault: AnyFault, roles: targets.Roles) -> str | None:
-        """The brick of the target that has the value in hand."""
         return targets.emitting_brick_of(roles, fault.event, roles.replica(fault.target))
 
     # -- in the node ------------------------------------------------------------------------------
@@ -130,7 +129,6 @@ class ValueFlip(FaultKind, frozen=True, tag=BITFLIP):
         return self.place in (ValuePlace.REQUEST, ValuePlace.CHECKPOINT)
 
     def alter_input(self, message: Message, draw: int) -> tuple[Message, Alteration | None]:
-        """The request, as the Server is handed it."""
         if self.place is not ValuePlace.REQUEST or not isinstance(message, Request | Trial):
             return message, None
         payload, bits = self._flip(message.payload, draw)
@@ -138,7 +136,6 @@ class ValueFlip(FaultKind, frozen=True, tag=BITFLIP):
         return handed, Alteration(message.request_id, bits, 8 * len(payload))
 
     def alter_output(self, effects: list[Effect], draw: int) -> tuple[list[Effect], Alteration | None]:
-        """The checkpoint among the effects."""
         if self.place is not ValuePlace.CHECKPOINT:
             return effects, None
         for at, effect in enumerate(effects):
@@ -164,9 +161,7 @@ class ValueFlip(FaultKind, frozen=True, tag=BITFLIP):
         return Alteration(note.request_id, bits if message is not None else (), 8 * len(data))
 
     def _flip(self, data: bytes, draw: int) -> tuple[bytes, tuple[int, ...]]:
-        """The data with its bits flipped, and which; none where it has no such bits, or they are so
-        already.
-        """
+        """The data with its bits flipped, and which; none where there are none, or they are so already."""
         bits = bits_to_flip(self.pattern, data, draw) or ()
         return with_flipped(data, bits), bits
 
@@ -206,7 +201,7 @@ class ValueFlip(FaultKind, frozen=True, tag=BITFLIP):
     # -- what became of it ------------------------------------------------------------------------
 
     def receipt(self, injection: Injection, run: RunControl) -> Receipt:
-        """Activated when somebody worked with what was hit: see `docs/faults.md`."""
+        """Activated when a brick worked with what was hit: see `docs/faults.md`."""
         about = run.records_about(injection)
         if not about:
             return injection.receipt
@@ -235,9 +230,7 @@ class ValueFlip(FaultKind, frozen=True, tag=BITFLIP):
         return True
 
     def _missed(self, injection: Injection, record: Record) -> Receipt:
-        """Nothing was hit: there are no such bits, they are so already, or the function refuses such a
-        state.
-        """
+        """Nothing was hit: no such bits, a bit stuck at its value, or a state that the function refuses."""
         _, size = fault_and_bits(record.detail)
         where = self._where(injection, record.request_id)
         if isinstance(self.pattern, StuckBit) and self.pattern.at < size:
