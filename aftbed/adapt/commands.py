@@ -16,7 +16,7 @@ Without a word about when, an adaptation begins at once.
 """
 
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Final
 
 import msgspec
@@ -72,12 +72,8 @@ def read(text: str) -> Timed:
         raise ConfigError(f"adaptation {text!r}: expected {GRAMMAR}")
     name = rest[0] if length else ""
     source = rest[2] if verb == "update" else ""
-    return _timed(text, Wish(verb, name, source), rest[length:])
-
-
-def _timed(text: str, wish: Wish, words: list[str]) -> Timed:
-    """The rest of an adaptation: when it begins."""
-    match words:
+    wish = Wish(verb, name, source)
+    match rest[length:]:
         case []:
             return Timed(wish)
         case ["at", "request", number]:
@@ -86,7 +82,7 @@ def _timed(text: str, wish: Wish, words: list[str]) -> Timed:
             return Timed(wish, at_request=int(number))
         case ["after", duration]:
             return Timed(wish, after_ms=milliseconds("after", duration))
-        case _:
+        case words:
             found = " ".join(words)
             raise ConfigError(
                 f"adaptation {text!r}: found {found!r}, allowed is 'at request N' or 'after 500ms'"
@@ -99,19 +95,15 @@ def goal(wish: Wish, running: str, recipe: str = RECIPES[0]) -> Goal:
         raise unknown("recipe", recipe, RECIPES)
     if wish.verb == "update":
         return Goal(part=wish.name, source=wish.source, recipe=recipe)
+    old = parse(running)
     if wish.verb == "decompose":
-        return Goal(expression=_decomposed(running), recipe=recipe)
-    new, old = parse(wish.name), parse(running)
+        if len(old) < 2:
+            raise ConfigError(f"there is nothing inside {running}: decompose takes away what is")
+        return Goal(expression=old[0], recipe=recipe)
+    new = parse(wish.name)
     if wish.verb != "to" and new and old:  # what begins or ends at `none` is refused by the plan, with a word
         _check_verb(wish, running, old, new)
     return Goal(expression=wish.name, recipe=recipe)
-
-
-def _decomposed(running: str) -> str:
-    names = parse(running)
-    if len(names) < 2:
-        raise ConfigError(f"there is nothing inside {running}: decompose takes away what is")
-    return names[0]
 
 
 def _check_verb(wish: Wish, running: str, old: tuple[str, ...], new: tuple[str, ...]) -> None:
@@ -125,15 +117,11 @@ def _check_verb(wish: Wish, running: str, old: tuple[str, ...], new: tuple[str, 
         raise ConfigError(f"{new[0]} is the outer mechanism already ({running} runs): {command}")
     if new[0] == old[0]:
         raise ConfigError(f"{wish.name} is not all of {running}, and more inside: {command}")
-    raise ConfigError(f"{new[0]} is not what runs ({running}): {_instead(wish.name, running, old, new)}")
-
-
-def _instead(expression: str, running: str, old: tuple[str, ...], new: tuple[str, ...]) -> str:
-    """What to do where the expression to compose begins with another mechanism than the running one."""
     if old[0] in DUPLEX and set(new) <= set(SIMPLEX) and not set(new) & set(old):
-        return f"aftbed adapt compose {running}+{expression}, or to {expression}"
-    first = f", or switch {new[0]} first" if len(new) > 1 else ""
-    return f"aftbed adapt to {expression}{first}"
+        instead = f"compose {running}+{wish.name}, or to {wish.name}"
+    else:
+        instead = f"to {wish.name}" + (f", or switch {new[0]} first" if len(new) > 1 else "")
+    raise ConfigError(f"{new[0]} is not what runs ({running}): aftbed adapt {instead}")
 
 
 def verb_for(old: tuple[str, ...], new: tuple[str, ...]) -> str:
@@ -142,28 +130,22 @@ def verb_for(old: tuple[str, ...], new: tuple[str, ...]) -> str:
         return "switch"
     if new == old[:1]:
         return "decompose"
-    return "compose" if _within(old, new) else "to"
-
-
-def _within(some: Iterable[str], names: Iterable[str]) -> bool:
-    """Whether `names` has `some` in this order, whatever stands between them."""
-    rest = iter(names)
-    return all(name in rest for name in some)
+    rest = iter(new)
+    return "compose" if all(name in rest for name in old) else "to"  # all of `old` in its order
 
 
 # -- what commands come to ------------------------------------------------------------------------
 
-Resolve = Callable[[str], str]
+Resolve = Callable[[str], str]  # the text of a brick's source -> where it is found
 Judge = Callable[[Graph, Wish], None]
 
 
 def as_written(source: str) -> str:
-    """A source is found where its text says."""
     return source
 
 
 def whatever_suits(graph: Graph, wish: Wish) -> None:
-    """An experiment may want to see what comes of a mechanism that does not suit its function."""
+    """Nothing is refused: an experiment may show what comes of a mechanism that does not suit."""
 
 
 def scheduled(

@@ -16,10 +16,10 @@ A condition begins and ends at different points (hysteresis), so that noise does
 | Beyond    | samples beyond the threshold for `for_s`   | a sample at `until`, else at the threshold  |
 
 Two rules that want different things (`conflict`) must not be able to hold at once, nor so nearly that a value
-between them sends us to and fro; `policy_from` finds such a pair before anything runs. Of rules on different
-resources and events, which may well hold together, the upper one decides: see `observer`. What no file can
-tell is a loop through the world (LFR raises the CPU load that a rule takes for a reason to leave it): dwell
-bounds it.
+between them leads to and fro; `policy_from` finds such a pair before anything runs. Of rules on different
+resources and events, which may well hold together, the upper one decides: see `observer`. No check of a file
+finds a loop through the environment (LFR raises the CPU load that a rule takes for a reason to leave it);
+dwell bounds it.
 """
 
 from functools import cache
@@ -35,7 +35,7 @@ from aftbed.ftm.registry import MECHANISMS
 
 # What is observed of a run; `observer.symptoms` says by which events.
 Symptom = Literal["crash", "hang", "value_fault", "divergence", "detected_stop"]
-# The first three as in `consistency.Resources`; `traffic_kbit_s` is what the replicas say to each other now.
+# The first three as in `suitability.Resources`; `traffic_kbit_s` is what the replicas send to each other now.
 Resource = Literal["cpus", "cpu_load", "bandwidth_kbit_s", "traffic_kbit_s"]
 Seconds = Annotated[float, Meta(ge=0.001, le=86_400)]
 Value = Annotated[float, Meta(ge=0, le=1e9)]
@@ -140,7 +140,8 @@ class Action(msgspec.Struct, frozen=True):
     def applied(self, running: str) -> str:
         """What should run instead of `running`; `running` itself where that is so already.
 
-        switch: what replicates is exchanged, what is inside of it stays. compose: one more inside.
+        switch: what replicates is exchanged, what is inside of it stays. compose: one more inside, before
+        what can only be innermost.
         decompose: the outermost alone.
         """
         names = parse(running)
@@ -152,7 +153,8 @@ class Action(msgspec.Struct, frozen=True):
             case "switch":
                 return "+".join((self.name, *(n for n in names if n not in DUPLEX)))
             case "compose":
-                return _composed(names, self.name)
+                inside = names if self.name in names else (*names, self.name)
+                return "+".join(sorted(inside, key=lambda n: MECHANISMS[n].innermost))
             case _:
                 return names[0]
 
@@ -197,7 +199,11 @@ def action(text: str, where: str) -> Action:
     if verb not in VERBS:
         raise ConfigError(f"{where}: {unknown('action', verb, VERBS)}")
     if verb == "to":
-        _check_target(found.name, where)
+        try:
+            if not parse(found.name):
+                raise ConfigError("`none` has no engine: nothing leads to it")
+        except ConfigError as error:
+            raise ConfigError(f"{where}: {error}") from error
     elif verb == "decompose":
         if name:
             raise ConfigError(f"{where}: found {text!r}, allowed is `decompose`: all that is inside goes")
@@ -225,35 +231,28 @@ def contradiction(first: Rule, second: Rule) -> str:
         case (Burst() as burst, Quiet() as quiet) | (Quiet() as quiet, Burst() as burst):
             if burst.event == quiet.event and quiet.quiet_ns < burst.hold_ns:
                 return f"both can hold at once; quiet_s must be {_s(burst.hold_ns)} at least"
-        case _:
-            pass
     return ""
 
 
 @cache
 def conflict(one: Action, other: Action) -> bool:
     """Whether the two, each carried out whenever it would change something, never come to rest."""
-    pairs = ((one, other), (other, one))
-    return not all(_settle(*pair, running) for pair in pairs for running in ADAPTABLE)
-
-
-def _settle(one: Action, other: Action, running: str) -> bool:
-    for _ in range(SETTLE_ROUNDS):
-        running = other.applied(one.applied(running))
-    return one.applied(running) == other.applied(running) == running
+    for first, second in ((one, other), (other, one)):
+        for running in ADAPTABLE:
+            for _ in range(SETTLE_ROUNDS):
+                running = second.applied(first.applied(running))  # noqa: PLW2901 - towards a fixed point
+            if not first.applied(running) == second.applied(running) == running:
+                return True
+    return False
 
 
 # -- reading
 
 
 def _condition(when: When, where: str, dwell_ns: int) -> Condition:
-    if (when.event is None) == (when.resource is None):
-        found = "none of them" if when.event is None else "both"
-        raise ConfigError(f"{where}: found {found}, allowed is one of event, resource")
-    return _of_event(when, where, dwell_ns) if when.event else _of_resource(when, where)
-
-
-def _of_event(when: When, where: str, dwell_ns: int) -> Condition:
+    _only_one(when, where, "event", "resource")
+    if when.resource is not None:
+        return _beyond(when, when.resource, where)
     assert when.event is not None
     _refuse(when, where, "event", ("above", "below", "until", "for_s"))
     if when.quiet_s is not None:
@@ -265,41 +264,31 @@ def _of_event(when: When, where: str, dwell_ns: int) -> Condition:
     return Burst(when.event, when.count, within_ns, within_ns + dwell_ns)
 
 
-def _of_resource(when: When, where: str) -> Beyond:
-    assert when.resource is not None
+def _beyond(when: When, resource: Resource, where: str) -> Beyond:
     _refuse(when, where, "resource", ("count", "within_s", "quiet_s"))
-    if (when.above is None) == (when.below is None):
-        found = "none of them" if when.above is None else "both"
-        raise ConfigError(f"{where}: found {found}, allowed is one of above, below")
+    _only_one(when, where, "above", "below")
     above = when.above is not None
     threshold = when.above if when.above is not None else when.below
     assert threshold is not None
     until = threshold if when.until is None else when.until
-    condition = Beyond(when.resource, above, threshold, until, _ns(when.for_s or 0.0))
+    condition = Beyond(resource, above, threshold, until, _ns(when.for_s or 0.0))
     if condition.begins(until):
         side = "at most" if above else "at least"
         raise ConfigError(f"{where}.until: found {until:g}, allowed is {side} {threshold:g}")
     return condition
 
 
+def _only_one(when: When, where: str, one: str, other: str) -> None:
+    given = [key for key in (one, other) if getattr(when, key) is not None]
+    if len(given) != 1:
+        found = "both" if given else "none of them"
+        raise ConfigError(f"{where}: found {found}, allowed is one of {one}, {other}")
+
+
 def _refuse(when: When, where: str, given: str, keys: tuple[str, ...]) -> None:
     for key in keys:
         if getattr(when, key) is not None:
             raise ConfigError(f"{where}: {key} does not go with {given}")
-
-
-def _check_target(name: str, where: str) -> None:
-    try:
-        if not parse(name):
-            raise ConfigError("`none` has no engine: nothing leads to it")
-    except ConfigError as error:
-        raise ConfigError(f"{where}: {error}") from error
-
-
-def _composed(names: tuple[str, ...], name: str) -> str:
-    """`names` with `name` inside; what can only be innermost stays so."""
-    found = names if name in names else (*names, name)
-    return "+".join(sorted(found, key=lambda n: MECHANISMS[n].innermost))
 
 
 def _beyond_contradiction(first: Beyond, second: Beyond) -> str:

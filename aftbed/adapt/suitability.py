@@ -55,13 +55,7 @@ class FaultModel(msgspec.Struct, frozen=True):
     implausible: bool = False
 
     def asked(self) -> tuple[FaultClass, ...]:
-        """Their names."""
-        given: dict[FaultClass, bool] = {
-            "crash": self.crash,
-            "value": self.value,
-            "implausible": self.implausible,
-        }
-        return tuple(fault for fault in FAULTS if given[fault])
+        return tuple(fault for fault in FAULTS if getattr(self, fault))
 
 
 class Resources(msgspec.Struct, frozen=True):
@@ -151,7 +145,7 @@ def fault_model(text: str) -> FaultModel:
     for name in names:
         if name not in FAULTS:
             raise unknown("fault", name, ("none", *FAULTS))
-    return FaultModel("crash" in names, "value" in names, "implausible" in names)
+    return FaultModel(**{fault: fault in names for fault in FAULTS})
 
 
 def demand(expression: str, table: Table = TABLE) -> Demand:
@@ -190,7 +184,15 @@ def problems(
     Raises ConfigError if it is no expression.
     """
     wanted = demand(expression, table)
-    found = [_not_tolerated(wanted, fault) for fault in faults.asked() if fault not in wanted.tolerates]
+    known = ", ".join(wanted.tolerates) or "nothing"
+    found = [
+        f"{expression} detects {FAULTS[fault]} and can only stop:"
+        " there is no second replica to execute instead"
+        if fault in wanted.detects
+        else f"{expression} does not tolerate {FAULTS[fault]} (it tolerates {known})"
+        for fault in faults.asked()
+        if fault not in wanted.tolerates
+    ]
     if not characteristics.deterministic:
         found += wanted.deterministic
     if not characteristics.state_access:
@@ -205,8 +207,14 @@ def consistent(
 
     Cheap is little of, in this order: CPUs, CPU load, bandwidth; the last two summed over the parts.
     """
+
+    def cost(expression: str) -> tuple[int, int, int]:
+        rows = [table.rows[name] for name in parse(expression)]
+        cpu_load = sum(LEVELS.index(row.cpu_load) for row in rows)
+        return demand(expression, table).cpus, cpu_load, sum(LEVELS.index(row.bandwidth) for row in rows)
+
     found = [e for e in EXPRESSIONS if not problems(e, faults, characteristics, resources, table)]
-    return sorted(found, key=lambda expression: _cost(expression, table))
+    return sorted(found, key=cost)
 
 
 def remarks(expression: str, characteristics: Characteristics) -> list[str]:
@@ -251,24 +259,7 @@ def _replicates(names: tuple[str, ...]) -> bool:
     return bool(names) and names[0] in DUPLEX
 
 
-def _cost(expression: str, table: Table) -> tuple[int, int, int]:
-    rows = [table.rows[name] for name in parse(expression)]
-    cpu_load = sum(LEVELS.index(row.cpu_load) for row in rows)
-    return demand(expression, table).cpus, cpu_load, sum(LEVELS.index(row.bandwidth) for row in rows)
-
-
-def _not_tolerated(wanted: Demand, fault: FaultClass) -> str:
-    if fault in wanted.detects:
-        return (
-            f"{wanted.ftm} detects {FAULTS[fault]} and can only stop:"
-            " there is no second replica to execute instead"
-        )
-    known = ", ".join(wanted.tolerates) or "nothing"
-    return f"{wanted.ftm} does not tolerate {FAULTS[fault]} (it tolerates {known})"
-
-
 def _short_of(wanted: Demand, resources: Resources, limits: Limits) -> list[str]:
-    """The resources that do not suffice."""
     found = []
     if resources.cpus < wanted.cpus:
         found.append(f"{wanted.ftm} needs {wanted.cpus} CPUs, found {resources.cpus}")
