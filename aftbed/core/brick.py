@@ -158,18 +158,21 @@ class Table:
     """A table of moves made ready for execution.
 
     `rows`: handler, next state, None; or question, None, moves by answer. A row for a state goes before one
-    for `ANY_STATE`. `open_ports`: by state, in the order of the rows; without `CONTROL`, always open.
+    for `ANY_STATE`. `moves` are the same by state, port and type: three look-ups by identity or a cached hash
+    take half the time of one by a tuple. `open_ports`: by state, in the order of the rows; without `CONTROL`,
+    always open.
     """
 
     def __init__(self, owner: type["Machine"], moves: Moves) -> None:
         """A handler that a subclass overrides is the subclass's own."""
         self.states = type(owner.AT_REST[0])
         self.rows: dict[tuple[BrickState, str, type], _Row] = {}
+        self.moves: dict[BrickState, dict[str, dict[type, _Row]]] = {}
         self.open_ports: dict[BrickState, tuple[str, ...]] = {}
         self.fill(owner, moves)
 
     def fill(self, owner: type["Machine"], moves: Moves) -> None:
-        """Make `rows` and `open_ports` anew, in place."""
+        """Make `rows`, `moves` and `open_ports` anew, in place."""
         self.rows.clear()
         for (at, port, kind), move in moves.items():
             if isinstance(at, BrickState):
@@ -182,6 +185,9 @@ class Table:
             self.rows.setdefault((state, CONTROL, Rebound), (ignore, state, None))
             ports = (port for at, port, _ in self.rows if at is state and port != CONTROL)
             self.open_ports[state] = tuple(dict.fromkeys(ports))
+            self.moves[state] = {}
+        for (state, port, kind), row in self.rows.items():
+            self.moves[state].setdefault(port, {})[kind] = row
 
 
 def _row(owner: type, state: BrickState, move: Move | Choice) -> _Row:
@@ -244,14 +250,14 @@ class Machine(Brick):
     def go_by(self, table: str) -> None:
         """The table of that name holds from the next message on."""
         chosen = self.TABLES[table]
-        self._rows, self._open = chosen.rows, chosen.open_ports
+        self._moves, self._open = chosen.moves, chosen.open_ports
 
     def step(self, port: str, msg: AnyMessage | DeadlinePassed, now_ns: int) -> list[Effect]:
         """Look the move up, run its handler, enter the next state."""
-        row = self._rows.get((self.state, port, type(msg)))
-        if row is None:
-            raise self._illegal(port, msg)
-        do, then, answers = row
+        try:
+            do, then, answers = self._moves[self.state][port][type(msg)]
+        except KeyError:
+            raise self._illegal(port, msg) from None
         if answers is not None:
             move = answers.get(do(self, msg))
             if move is None:

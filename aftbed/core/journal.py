@@ -33,7 +33,7 @@ RECORD: Final = struct.Struct("<QQQII")  # time ns, request id, detail, brick, e
 ENTRY: Final = struct.Struct("<QQIHH")  # time ns, request id, payload length, epoch, kind
 
 
-class Record(msgspec.Struct, frozen=True):
+class Record(msgspec.Struct, frozen=True, gc=False):
     """One event of one node; `t_ns` is monotonic and common to all nodes of a host.
 
     `brick` tells the bricks of a node apart: 0 for the first that it hosts, 1 for the next.
@@ -54,7 +54,7 @@ class EntryKind(IntEnum):
     ANSWERED = 2
 
 
-class Entry(msgspec.Struct, frozen=True):
+class Entry(msgspec.Struct, frozen=True, gc=False):
     """A request that was sent, or a reply that was delivered, with its bytes."""
 
     t_ns: int

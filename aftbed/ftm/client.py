@@ -26,6 +26,11 @@ from aftbed.ftm.declaration import BrickKind, Emits
 
 BACKLOG_MAX: Final = 64  # unanswered requests; beyond it the port `submit` is closed
 
+# Bound once: a look-up in an enumeration is slow on the hot path.
+_SENT: Final = Event.REQUEST_SENT
+_DELIVERED: Final = Event.REPLY_DELIVERED
+_ACCEPTED: Final = Event.REPLY_ACCEPTED
+
 
 class ClientState(BrickState):
     READY = auto()  # takes the next request
@@ -82,13 +87,13 @@ class Client(Machine):
     def send(self, msg: Submit) -> list[Effect]:
         """Give it its number."""
         request = self._numbered(msg)
-        return [Note(Event.REQUEST_SENT, request.request_id), Send("clt2pxy", request)]
+        return [Note(_SENT, request.request_id), Send("clt2pxy", request)]
 
     def hold(self, msg: Submit) -> list[Effect]:
         """The same, but the runtime decides when it goes."""
         request = self._held = self._numbered(msg)
         held = RequestHeld(request.request_id)
-        return [Note(Event.REQUEST_SENT, request.request_id), Send(CONTROL, held)]
+        return [Note(_SENT, request.request_id), Send(CONTROL, held)]
 
     def _numbered(self, msg: Submit) -> Request:
         request = self.unanswered[self.next_id] = Request(0, self.next_id, msg.payload)
@@ -106,7 +111,7 @@ class Client(Machine):
     def deliver(self, msg: Reply) -> list[Effect]:
         """The source has its answer."""
         del self.unanswered[msg.request_id]
-        return [Note(Event.REPLY_DELIVERED, msg.request_id, msg.replica), Send("deliver", msg)]
+        return [Note(_DELIVERED, msg.request_id, msg.replica), Send("deliver", msg)]
 
     def drop(self, msg: Reply) -> list[Effect]:
         """The source has it already."""
@@ -201,10 +206,7 @@ class LeaderIs(BrickAnswer):
 
 
 _S: Final = ProxyState
-
-# Bound once: a look-up in an enumeration is slow on the hot path.
 _WANTED: Final = ReplyIs.WANTED
-_ACCEPTED: Final = Event.REPLY_ACCEPTED
 
 
 class Proxy(Machine):

@@ -52,7 +52,9 @@ class PbrAfterState(BrickState):
 
 
 _S: Final = PbrAfterState
-_SENT: Final = Event.CHECKPOINT_SENT  # bound once: a look-up in an enumeration is slow on the hot path
+# Bound once: a look-up in an enumeration is slow on the hot path.
+_SENT: Final = Event.CHECKPOINT_SENT
+_APPLIED: Final = Event.CHECKPOINT_APPLIED
 
 
 class PbrAfter(Machine):
@@ -108,7 +110,7 @@ class PbrAfter(Machine):
             raise PeerError(f"restored {msg.request_id}, expected {held.request_id}")
         self._checkpoint = None
         return [
-            Note(Event.CHECKPOINT_APPLIED, held.request_id),
+            Note(_APPLIED, held.request_id),
             Send("aft2pro", StoreReply(held.epoch, held.request_id, held.reply)),
         ]
 

@@ -84,6 +84,7 @@ _FIRST, _RERUN = TrialRun.FIRST, TrialRun.RERUN
 _ENTER: Final = Event.SERVER_ENTER
 _EXIT: Final = Event.SERVER_EXIT
 _CAPTURED: Final = Event.STATE_CAPTURED
+_RESTORED: Final = Event.STATE_RESTORED
 
 
 class Server(Machine):
@@ -132,7 +133,7 @@ class Server(Machine):
             reason = f"the state after request {msg.request_id} is refused: {error}"
             return [Note(Event.DETECTED_STOP, msg.request_id), Halt(reason)]
         return [
-            Note(Event.STATE_RESTORED, msg.request_id),
+            Note(_RESTORED, msg.request_id),
             Send("srv2aft", StateRestored(msg.epoch, msg.request_id)),
         ]
 

@@ -20,6 +20,7 @@ from aftbed.ftm.client import BACKLOG_MAX, Client
 from aftbed.ftm.failover import PERIOD_NS
 from aftbed.runtime import control
 
+_SENT, _ANSWERED = EntryKind.SENT, EntryKind.ANSWERED
 CATCH_UP: Final = 10  # periods: a load that was held up makes good for no more
 
 
@@ -76,7 +77,7 @@ def resume_client(client: Client, history: Iterable[Entry]) -> None:
     answered = set()
     next_id = 1
     for entry in history:
-        if entry.kind is EntryKind.SENT:
+        if entry.kind is _SENT:
             waiting[entry.request_id] = Request(0, entry.request_id, entry.payload)
             next_id = max(next_id, entry.request_id + 1)
         else:
@@ -108,21 +109,18 @@ class Load:
         """Never called."""
         raise AssertionError(f"no descriptor {fd}")
 
-    def _due(self, now_ns: int) -> bool:
-        if self._client.next_id > self._count:
-            return False
-        return now_ns >= self._next_ns if self._period_ns else not self._client.unanswered
-
     def take(self, now_ns: int) -> Submit | None:
-        """The next request, if it is due. Written ahead: a successor knows it even if we die now."""
-        if not self._due(now_ns):
-            return None
+        """The next request, if it is due. Written ahead: a successor knows it even if this node dies now."""
         request_id = self._client.next_id
+        if request_id > self._count or (
+            now_ns < self._next_ns if self._period_ns else self._client.unanswered
+        ):
+            return None
         payload = self._requests[(request_id - 1) % len(self._requests)]
         if self._period_ns:
             earliest_ns = now_ns - CATCH_UP * self._period_ns
             self._next_ns = max(self._next_ns or now_ns, earliest_ns) + self._period_ns
-        self._dialogue.write(now_ns, request_id, 0, EntryKind.SENT, payload)
+        self._dialogue.write(now_ns, request_id, 0, _SENT, payload)
         return Submit(payload)
 
     def wait(self, now_ns: int) -> None:
@@ -130,7 +128,7 @@ class Load:
 
     def accept(self, reply: Reply, now_ns: int) -> None:
         """Keep the reply in the dialogue."""
-        self._dialogue.write(now_ns, reply.request_id, reply.epoch, EntryKind.ANSWERED, reply.payload)
+        self._dialogue.write(now_ns, reply.request_id, reply.epoch, _ANSWERED, reply.payload)
 
     def quiet(self) -> None:
         """The load is at its end now."""
@@ -220,7 +218,7 @@ class CarDevice:
         if not self._payloads or self._quiet:
             return None
         payload = self._payloads.popleft()
-        self._dialogue.write(now_ns, self._client.next_id, 0, EntryKind.SENT, payload)
+        self._dialogue.write(now_ns, self._client.next_id, 0, _SENT, payload)
         self._sent_ns = now_ns
         return Submit(payload)
 
@@ -232,7 +230,7 @@ class CarDevice:
         """To the brakes; then written, so that a reply that did not get there is asked for again."""
         self._cycle_us = round((now_ns - self._sent_ns) / 1e3, 1)
         self.link.deliver(reply, now_ns)
-        self._dialogue.write(now_ns, reply.request_id, reply.epoch, EntryKind.ANSWERED, reply.payload)
+        self._dialogue.write(now_ns, reply.request_id, reply.epoch, _ANSWERED, reply.payload)
 
     def quiet(self) -> None:
         """No more requests."""

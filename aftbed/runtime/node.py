@@ -70,8 +70,9 @@ class NodeIO(Protocol[In, Out]):
 
     # -- time, records, the executive
 
-    def now_ns(self) -> int:
-        """Monotonic."""
+    @property
+    def now_ns(self) -> Callable[[], int]:
+        """The clock: monotonic."""
         ...
 
     @property
@@ -277,7 +278,7 @@ class Node(Generic[In, Out]):
     # -- turns --------------------------------------------------------------------------------
 
     def turn(self) -> bool:
-        """Handle one thing, the first in the order above; False if there is none."""
+        """Handle what is first in the order above; False if nothing is left."""
         if self._mail and self._step_inside():
             return True
         if self.suspend_token or self.suspended:
@@ -634,9 +635,10 @@ class MemoryIO(NodeIO[int, int]):
     def join(self, node: Node[int, int]) -> None:
         """Nothing to set up."""
 
-    def now_ns(self) -> int:
+    @property
+    def now_ns(self) -> Callable[[], int]:
         """Always the same."""
-        return 0
+        return lambda: 0
 
     @property
     def record(self) -> Recorder:

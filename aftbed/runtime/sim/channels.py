@@ -5,8 +5,8 @@ that writes behind a fence, or where no node will ever read, dies (EPIPE); a ful
 The executive has a hold on both ends until it closes them, the nodes at the ends have theirs.
 """
 
-import heapq
 from collections import deque
+from heapq import heappush
 from typing import Final, Protocol
 
 from aftbed.core.graph import Link
@@ -81,7 +81,7 @@ class SimChannel:
         self._last_ns = t_ns
         mail.append((t_ns, message))
         clock.count += 1
-        heapq.heappush(clock.heap, (t_ns, clock.count, self.arrive))
+        heappush(clock.heap, (t_ns, clock.count, self.arrive))
         return True
 
     def arrive(self) -> None:

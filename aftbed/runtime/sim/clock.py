@@ -34,13 +34,13 @@ class Carrier(Protocol):
 
 
 class Clock:
-    """The loop of a run (see `runtime.interface.Loop`); `chance` is seeded by whoever makes it."""
+    """The loop of a run (see `runtime.interface.Loop`)."""
 
     def __init__(self, chance: Random) -> None:
         self.ns = START_NS
         self.heap: list[tuple[int, int, Call]] = []
         self.count = 0  # events planned so far: breaks ties
-        self.chance = chance
+        self.chance, self._bits = chance, chance.getrandbits
         self.tasks = Tasks(self.now_ns)
         self._expiry_ns: int | None = None
 
@@ -76,11 +76,11 @@ class Clock:
 
     def hop_ns(self) -> int:
         """How long a message takes, the step of its reader included: as measured."""
-        return HOP_QUANTILES_NS[self.chance.getrandbits(HOP_BITS)]
+        return HOP_QUANTILES_NS[self._bits(HOP_BITS)]
 
     def between_ns(self, low_ns: int, high_ns: int) -> int:
         """A delay, each as likely as the other."""
-        return low_ns + self.chance.getrandbits(30) * (high_ns - low_ns) // (1 << 30)
+        return low_ns + self._bits(30) * (high_ns - low_ns) // (1 << 30)
 
     def step(self) -> bool:
         """The next event; False if there is none."""

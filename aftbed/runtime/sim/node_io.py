@@ -11,6 +11,8 @@ takes so many times that.
 
 from collections import deque
 from collections.abc import Callable, Sequence
+from functools import partial
+from operator import attrgetter
 from typing import Final, NamedTuple, NoReturn
 
 from aftbed.core.brick import Effect, Send
@@ -88,6 +90,7 @@ class SimIO(NodeIO[SimChannel, SimChannel]):
             SimChannel, deque[Message]
         ] = {}  # came out of a channel fault, and waits for room
         self._only: SimBrick | None = None  # the brick of a node that hosts one, without a device
+        self._fronts: list[SimBrick] = []  # bricks with inputs
         self._has_deadlines = False
         self._timer_ns = NEVER
         self._running = False
@@ -96,9 +99,10 @@ class SimIO(NodeIO[SimChannel, SimChannel]):
         """Work for `node`."""
         self.node = node
 
-    def now_ns(self) -> int:
+    @property
+    def now_ns(self) -> Callable[[], int]:
         """Virtual time."""
-        return self._clock.ns
+        return partial(attrgetter("ns"), self._clock)
 
     @property
     def record(self) -> Recorder:
@@ -160,10 +164,11 @@ class SimIO(NodeIO[SimChannel, SimChannel]):
         if self._running or not self.alive or self.frozen_ns:
             return
         self._running = True
-        self.ran_ns, turn = self._clock.ns, self.node.turn
+        node = self.node
+        self.ran_ns, turn, filters = self._clock.ns, node.turn, node.agent.filters
         try:
-            if self.node.agent.filters:
-                self.node.release_due(self._clock.ns)
+            if filters:
+                node.release_due(self._clock.ns)
             while self.alive and not self.frozen_ns:
                 if self._orders:  # before anything else
                     self._serve(*self._orders.popleft())
@@ -175,7 +180,7 @@ class SimIO(NodeIO[SimChannel, SimChannel]):
             self.die(f"assertion failed: {error}")
         finally:
             self._running = False
-        if self.alive and (self._has_deadlines or self.node.agent.filters):
+        if self.alive and (self._has_deadlines or filters):
             self._set_timer()
 
     def _serve(self, order: control.ToNode, fds: tuple[int, ...]) -> None:
@@ -210,50 +215,53 @@ class SimIO(NodeIO[SimChannel, SimChannel]):
     def rewired(self) -> None:
         """See whether the node hosts one brick, without a device, and whether there are deadlines."""
         self._only = self.node.only if self.node.device is None else None
-        self._has_deadlines = bool(self.node.timed) or self.node.device is not None
+        self._fronts = [hosted for hosted in self.node.bricks.values() if hosted.inputs]
+        device = self.node.device
+        self._has_deadlines = bool(self.node.timed) or (device is not None and device.polled)
 
     def receive(self) -> bool:
-        """Handle the mail that came first, or the end of a channel, or what is due."""
-        only = self._only
-        ports = only.brick.open_ports() if only is not None else ()
-        if only is None or len(ports) != 1:
-            return self._read_any() or self.node.wake_due(self._clock.ns)
-        channel = only.inputs.get(ports[0])  # from here on the hot path: one open port of the only brick
-        if channel is not None:
-            if channel.mail:
-                if channel.mail[0][0] <= self._clock.ns:
-                    self.node.step(only, ports[0], channel.take())
-                    return True
-            elif channel.ended and channel.over():
-                self._handle_end(only, ports[0])
-                return True
-        return only.timed and self.node.wake_due(self._clock.ns)
+        """Handle the mail that came first, or the end of a channel, or what is due; False if nothing is left.
+
+        On the hot path, which is one open port of the only brick, all mail that has arrived is handled, one
+        after the other, as long as no order and no hold comes in between.
+        """
+        only, node = self._only, self.node
+        if only is None:
+            return self._read_any() or node.wake_due(self._clock.ns)
+        now_ns, open_ports, inputs = self._clock.ns, only.brick.open_ports, only.inputs
+        while not (self._orders or self._held_up):
+            ports = open_ports()
+            if len(ports) != 1:
+                return self._read_any() or node.wake_due(now_ns)
+            port = ports[0]
+            channel = inputs.get(port)
+            if channel is not None and channel.mail and channel.mail[0][0] <= now_ns:
+                node.step(only, port, channel.take())
+            elif channel is not None and channel.ended and channel.over():
+                self._handle_end(only, port)
+            else:
+                return only.timed and node.wake_due(now_ns)
+        return True
 
     def _read_any(self) -> bool:
-        found = self._oldest()
-        if found is not None:
-            hosted, port = found
-            self.node.step(hosted, port, hosted.inputs[port].take())
-            return True
-        for hosted in self.node.bricks.values():
+        """Handle the mail that came first; where there is none, the end of a channel."""
+        first_ns, first, ended = self._clock.ns + 1, None, None
+        for hosted in self._fronts:
             for port in hosted.brick.open_ports():
                 channel = hosted.inputs.get(port)
-                if channel is not None and channel.over():
-                    self._handle_end(hosted, port)
-                    return True
-        return False
-
-    def _oldest(self) -> tuple[SimBrick, str] | None:
-        """The open port with the mail that came first."""
-        best_ns, best = self._clock.ns + 1, None
-        for hosted in self.node.bricks.values():
-            if not hosted.inputs:
-                continue
-            for port in hosted.brick.open_ports():
-                channel = hosted.inputs.get(port)
-                if channel is not None and channel.mail and channel.mail[0][0] < best_ns:
-                    best_ns, best = channel.mail[0][0], (hosted, port)
-        return best
+                if channel is None:
+                    continue
+                if channel.mail:
+                    if channel.mail[0][0] < first_ns:
+                        first_ns, first = channel.mail[0][0], (hosted, port, channel)
+                elif channel.ended and ended is None and channel.over():
+                    ended = hosted, port
+        if first is not None:
+            hosted, port, channel = first
+            self.node.step(hosted, port, channel.take())
+        elif ended is not None:
+            self._handle_end(*ended)
+        return first is not None or ended is not None
 
     def _handle_end(self, hosted: SimBrick, port: str) -> None:
         """The channel is drained to its end."""
@@ -262,7 +270,12 @@ class SimIO(NodeIO[SimChannel, SimChannel]):
 
     def mail_waits(self) -> bool:
         """Whether there is mail at an open port."""
-        return self._oldest() is not None
+        return any(
+            channel.mail and channel.mail[0][0] <= self._clock.ns
+            for hosted in self._fronts
+            for channel in map(hosted.inputs.get, hosted.brick.open_ports())
+            if channel is not None
+        )
 
     def wait_for_order(self) -> bool:
         """An order makes the node run again."""

@@ -101,7 +101,6 @@ class UnixIO(NodeIO[Inlet, int]):
     """Of one process of the graph. `serve` never returns."""
 
     output = int
-    now_ns = staticmethod(time.monotonic_ns)
 
     def __init__(self, line: Line[control.ToNode], journal: JournalFile) -> None:
         self.line, self.journal = line, journal
@@ -117,6 +116,11 @@ class UnixIO(NodeIO[Inlet, int]):
     def join(self, node: UnixNode) -> None:
         """Work for `node`."""
         self._node = node
+
+    @property
+    def now_ns(self) -> Callable[[], int]:
+        """The kernel's."""
+        return time.monotonic_ns
 
     @property
     def record(self) -> Recorder:
