@@ -5,8 +5,8 @@ plans the change on the graph that runs when it begins, checks it, and carries i
 """
 
 import sys
+import textwrap
 from collections.abc import Iterator
-from json import dumps
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -21,7 +21,7 @@ from aftbed.adapt.planner import plan as plan_between
 from aftbed.adapt.plugins import load_application
 from aftbed.adapt.script_file import ScriptFile, entry, mapping, phases, script_from
 from aftbed.adapt.suitability import remarks, unsuitable
-from aftbed.cli.options import Json, Recipe, Run, takes
+from aftbed.cli.options import Json, Recipe, Run, print_json, takes
 from aftbed.cli.views import EndedAdaptation, history_lines
 from aftbed.core.application import Characteristics
 from aftbed.core.errors import ConfigError
@@ -61,34 +61,24 @@ class ChangeArguments(msgspec.Struct, frozen=True, kw_only=True):
     json: Json = False
 
 
-@adapt.command()
-@takes(ChangeArguments)
-def to(given: ChangeArguments) -> None:
-    """Replace what runs by EXPR.
-
-    Exit code of all that adapts: 0 done, 1 rolled back, 2 refused.
-    """
-    _change(Wish("to", given.expr), given.run, given.recipe, force=given.force, as_json=given.json)
+def _change_command(verb: str, about: str) -> None:
+    @adapt.command(verb, help=about)
+    @takes(ChangeArguments)
+    def change(given: ChangeArguments) -> int:
+        wish = Wish(verb, given.expr)
+        return _change(wish, given.run, given.recipe, force=given.force, as_json=given.json)
 
 
-@adapt.command()
-@takes(ChangeArguments)
-def switch(given: ChangeArguments) -> None:
-    """Replace the outer mechanism by another one."""
-    _change(Wish("switch", given.expr), given.run, given.recipe, force=given.force, as_json=given.json)
-
-
-@adapt.command()
-@takes(ChangeArguments)
-def compose(given: ChangeArguments) -> None:
-    """Keep the outer mechanism, and add mechanisms inside it."""
-    _change(Wish("compose", given.expr), given.run, given.recipe, force=given.force, as_json=given.json)
+EXIT_HELP: Final = "Exit code of all that adapts: 0 done, 1 rolled back, 2 refused."
+_change_command("to", f"Replace what runs by EXPR.\n\n{EXIT_HELP}")
+_change_command("switch", "Replace the outer mechanism by another one.")
+_change_command("compose", "Keep the outer mechanism, and add mechanisms inside it.")
 
 
 @adapt.command()
 def decompose(recipe: Recipe = "drained", run: Run = None, json: Json = False) -> None:
     """Keep the outer mechanism, and remove those inside it."""
-    _change(Wish("decompose", ""), run, recipe, force=False, as_json=json)
+    raise typer.Exit(_change(Wish("decompose"), run, recipe, force=False, as_json=json))
 
 
 @adapt.command()
@@ -101,7 +91,7 @@ def update(
     json: Json = False,
 ) -> None:
     """Replace the class of one brick on every replica; the class may be newer than the run."""
-    _change(Wish("update", brick, source), run, recipe, force=force, as_json=json)
+    raise typer.Exit(_change(Wish("update", brick, source), run, recipe, force=force, as_json=json))
 
 
 @adapt.command()
@@ -117,17 +107,13 @@ def script(
     raise typer.Exit(_ask(run_directory.find(run), goal, as_json=json))
 
 
-def _change(wish: Wish, run: str | None, recipe: str, *, force: bool, as_json: bool) -> None:
+def _change(wish: Wish, run: str | None, recipe: str, *, force: bool, as_json: bool) -> int:
     private = run_directory.find(run)
-    graph = _graph_of(private)
-    goal = goal_of(wish, graph, recipe, _source_here)
+    graph = msgspec.convert(control_client.ask(private, control_client.GraphQuery()), Graph)
+    goal = goal_of(wish, graph, recipe, _source)
     application = goal.source if goal.part == APPLICATION else _function_of(graph)
     _refuse_unsuitable(goal.expression or graph.ftm, application, wish, force=force)
-    raise typer.Exit(_ask(private, goal, as_json=as_json))
-
-
-def _graph_of(private: Path) -> Graph:
-    return msgspec.convert(control_client.ask(private, control_client.GraphQuery()), Graph)
+    return _ask(private, goal, as_json=as_json)
 
 
 def _ask(private: Path, goal: Goal, *, as_json: bool) -> int:
@@ -135,7 +121,7 @@ def _ask(private: Path, goal: Goal, *, as_json: bool) -> int:
     found = control_client.ask(private, control_client.AdaptCommand(goal), control_client.ADAPT_SECONDS_MAX)
     ended = msgspec.convert(found, EndedAdaptation)
     if as_json:
-        print(dumps(found))
+        print_json(found)
     else:
         print(f"run {private.name}: {ended}")
         print(
@@ -155,7 +141,7 @@ def scheduled(texts: tuple[str, ...], start: Graph, recipe: str, *, force: bool)
         _refuse_unsuitable(new.ftm, _function_of(new), wish, force=force)
 
     try:
-        return commands.scheduled(texts, start, recipe, resolve=_source_here, judge=judge)
+        return commands.scheduled(texts, start, recipe, resolve=_source, judge=judge)
     except ConfigError as error:
         raise ConfigError(f"--adapt {error}") from error
 
@@ -189,18 +175,17 @@ def _characteristics(source: str) -> Characteristics:
     return declared
 
 
-def _source_here(text: str) -> str:
-    return _source(text, Path.cwd())
+def _source(text: str, folder: Path | None = None) -> str:
+    """`FILE.py:CLASS` with the absolute path of the file, which is looked up in `folder`, here if left out.
 
-
-def _source(text: str, folder: Path) -> str:
-    """`FILE.py:CLASS` with the absolute path of the file. Raises ConfigError if there is no such file."""
+    Raises ConfigError if there is no such file.
+    """
     place, colon, name = text.rpartition(":")
     if not (colon and place and name.isidentifier()):
         raise ConfigError(f"{text!r} names no class; MODULE:CLASS or FILE.py:CLASS is allowed")
     if not place.endswith(".py"):
         return text
-    path = (folder / place).resolve()
+    path = ((folder or Path.cwd()) / place).resolve()
     if not path.is_file():
         raise ConfigError(f"{text}: {path}: no such file")
     return f"{path}:{name}"
@@ -262,9 +247,12 @@ def plan(
     if as_yaml:
         print("\n".join(yaml_lines(mapping(there.script))))
     elif json:
-        print(dumps({**_document(there), "way_back": _document(back)}))
+        print_json({**_document(there), "way_back": _document(back)})
     else:
         print("\n".join(_plan_lines(there, back)))
+
+
+PLAN_PARTS: Final = ("replaced", "added", "removed", "rebound", "kept")  # bricks of a plan
 
 
 def _document(plan: Plan) -> dict[str, object]:
@@ -275,11 +263,7 @@ def _document(plan: Plan) -> dict[str, object]:
         "recipe": plan.script.recipe,
         "bricks_changed": plan.bricks_changed,
         "bricks_total": plan.bricks_total,
-        "replaced": plan.replaced,
-        "added": plan.added,
-        "removed": plan.removed,
-        "kept": plan.kept,
-        "rebound": plan.rebound,
+        **{name: getattr(plan, name) for name in PLAN_PARTS},
         "script": mapping(plan.script),
     }
 
@@ -287,7 +271,7 @@ def _document(plan: Plan) -> dict[str, object]:
 def _plan_lines(there: Plan, back: Plan) -> Iterator[str]:
     """The plan, its steps, and the commit of the way back."""
     yield _headline(there)
-    for name in ("replaced", "added", "removed", "rebound", "kept"):
+    for name in PLAN_PARTS:
         yield from _wrapped(name, getattr(there, name))
     for name, verbs in phases(there.script).items():
         yield from _phase(name, verbs)
@@ -302,17 +286,21 @@ def _headline(plan: Plan) -> str:
     )
 
 
-def _wrapped(name: str, bricks: tuple[str, ...]) -> Iterator[str]:
+def _wrapped(name: str, bricks: tuple[str, ...]) -> list[str]:
     """`name` and its bricks, in lines of at most WIDTH characters."""
-    if not bricks:
-        return
-    line = f"  {name:9}"
-    for brick in bricks:
-        if len(line) + len(brick) + 1 > WIDTH:
-            yield line
-            line = " " * 11
-        line += f" {brick}"
-    yield line
+    indent = " " * 12
+    return (
+        textwrap.wrap(
+            f"  {name:9} {' '.join(bricks)}",
+            WIDTH,
+            subsequent_indent=indent,
+            drop_whitespace=True,
+            break_on_hyphens=False,
+            break_long_words=False,
+        )
+        if bricks
+        else []
+    )
 
 
 def _phase(name: str, verbs: tuple[Step, ...]) -> Iterator[str]:
@@ -373,4 +361,7 @@ def history(run: Run = None, json: Json = False) -> None:
     """The adaptations of the run that have ended, and how."""
     found = control_client.ask(run_directory.find(run), control_client.AdaptationsQuery())
     ended = msgspec.convert(found["adaptations"], list[EndedAdaptation])
-    print("\n".join([dumps(found)] if json else history_lines(ended)))
+    if json:
+        print_json(found)
+    else:
+        print("\n".join(history_lines(ended)))

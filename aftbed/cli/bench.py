@@ -15,7 +15,7 @@ from aftbed.bench.adaptation import bench_adapt
 from aftbed.bench.cycle import bench_cycle, bench_hops
 from aftbed.bench.recovery import bench_recovery
 from aftbed.bench.resources import bench_launch, bench_memory
-from aftbed.cli.options import Recipe
+from aftbed.cli.options import Recipe, print_json
 from aftbed.core.errors import ConfigError
 from aftbed.ftm.compose import DUPLEX, replication_of
 
@@ -165,7 +165,7 @@ def paper(
         raise ConfigError(f"--html {html}: a directory; the name of a file is allowed")
     found = again.bench_paper(again.QUICK if quick else again.FULL, _show_progress)
     if json:
-        print(msgspec.json.encode(found).decode())
+        print_json(found)
     else:
         for line in again.markdown(found) if markdown else again.text(found):
             print(line)
@@ -179,7 +179,7 @@ def _show_progress(what: str) -> None:
 
 def _print(document: msgspec.Struct, *, as_json: bool) -> None:
     if as_json:
-        print(msgspec.json.encode(document).decode())
+        print_json(document)
         return
     for key, value in msgspec.to_builtins(document).items():
         parts = value.items() if isinstance(value, dict) else [("", value)]

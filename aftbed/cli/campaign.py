@@ -13,13 +13,14 @@ from typing import Annotated, Final
 
 import msgspec
 import typer
+from msgspec.structs import replace
 
 from aftbed.campaign import ledger, runner
 from aftbed.campaign.experiment import Result, carry_out, smallest
 from aftbed.campaign.plan import CampaignPlan
 from aftbed.campaign.plan import plan as plan_of
 from aftbed.campaign.spec import EXPERIMENTS_MAX, Spec, check, read_spec, shipped
-from aftbed.cli.options import Json, jobs_of, takes
+from aftbed.cli.options import Json, check_range, jobs_of, print_json, takes
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.judge.verdict import EXIT_INTERRUPTED
 from aftbed.report.export import write_csv, write_parquet
@@ -75,17 +76,14 @@ def planned(given: CampaignArguments) -> CampaignPlan:
     if given.seed is not None:
         if given.seed < 0:
             raise ConfigError(f"--seed {given.seed}: 0 or more is allowed")
-        spec = msgspec.structs.replace(spec, seed=given.seed)
+        spec = replace(spec, seed=given.seed)
     if given.experiments is not None:
-        if not 1 <= given.experiments <= EXPERIMENTS_MAX:
-            raise ConfigError(f"--experiments {given.experiments}: 1 to {EXPERIMENTS_MAX} are allowed")
-        stop = msgspec.structs.replace(spec.stop, experiments=given.experiments)
-        spec = msgspec.structs.replace(spec, stop=stop)
+        check_range("--experiments", given.experiments, 1, EXPERIMENTS_MAX)
+        spec = replace(spec, stop=replace(spec.stop, experiments=given.experiments))
     if given.runtime is not None:
         if given.runtime not in RUNTIMES:
             raise unknown("runtime", given.runtime, RUNTIMES)
-        system = msgspec.structs.replace(spec.system, runtime=given.runtime)
-        spec = msgspec.structs.replace(spec, system=system)
+        spec = replace(spec, system=replace(spec.system, runtime=given.runtime))
     try:
         check(spec)
         return plan_of(spec)
@@ -114,22 +112,19 @@ def plan(given: PlanArguments) -> None:
     seconds = round(found.size * SECONDS_EACH[spec.system.runtime], 1)
     if given.json:
         strata = [
-            {"name": s.name, "experiments": spec.stop.experiments, "expected": list(s.expected)}
+            {"name": s.name, "experiments": spec.stop.experiments, "expected": s.expected}
             for s in found.strata
         ]
         about = {"campaign": spec.campaign, "seed": spec.seed, "digest": found.digest, "code": found.code}
-        print(dumps(about | {"experiments": found.size, "seconds": seconds, "strata": strata}))
+        print_json(about | {"experiments": found.size, "seconds": seconds, "strata": strata})
         return
     print(f"{spec.campaign}: {spec.about}" if spec.about else spec.campaign)
     width = max(len(s.name) for s in found.strata)
     for stratum in found.strata:
         expected = f"expected {', '.join(stratum.expected)}" if stratum.expected else ""
         print(f"  {stratum.name:<{width}}  {spec.stop.experiments:>6}  {expected}".rstrip())
-    print(f"{found.size} experiments at most, about {_duration(seconds)} on one core")
-
-
-def _duration(seconds: float) -> str:
-    return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"
+    duration = f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"
+    print(f"{found.size} experiments at most, about {duration} on one core")
 
 
 # -- running --------------------------------------------------------------------------------------
@@ -156,55 +151,44 @@ class CampaignRunArguments(CampaignArguments, frozen=True, kw_only=True):
 
 @campaign.command()
 @takes(CampaignRunArguments)
-def run(given: CampaignRunArguments) -> None:
+def run(given: CampaignRunArguments) -> int:
     """Run the experiments, judge the campaign, write its reports.
 
     Exit code: 0 all gates pass, 1 one does not, 2 usage, 3 trouble of the harness, 130 interrupted.
     """
+    from aftbed.report.terminal import CampaignProgress  # noqa: PLC0415 - scipy
+
     found = planned(given)
-    asked = _asked(found, given)
-    began_s = time.monotonic()
-    interrupted = _follow(found, asked, as_json=given.json)
-    code = _judge(asked.out, found.size, time.monotonic() - began_s, as_json=given.json)
-    raise typer.Exit(EXIT_INTERRUPTED if interrupted else code)
+    options = _run_options(found, given)
+    began_s, interrupted = time.monotonic(), False
+    results = runner.run(found, options)  # raises ConfigError here, before the progress is shown
+    todo = sum(options.has(index, len(found.strata)) for index in range(found.size))
+    try:
+        with closing(results), CampaignProgress(found.spec.campaign, todo, quiet=given.json) as progress:
+            for result in results:
+                progress.add(result)
+    except KeyboardInterrupt:
+        print("interrupted: --resume goes on from here", file=sys.stderr)
+        interrupted = True
+    code = _judge(options.out, found.size, time.monotonic() - began_s, as_json=given.json)
+    return EXIT_INTERRUPTED if interrupted else code
 
 
-def _asked(found: CampaignPlan, given: CampaignRunArguments) -> runner.CampaignRunOptions:
+def _run_options(found: CampaignPlan, given: CampaignRunArguments) -> runner.CampaignRunOptions:
     if given.executor not in EXECUTORS:
         raise unknown("executor", given.executor, EXECUTORS)
     if (given.executor == "dask") != (given.scheduler is not None):
         raise ConfigError("--executor dask and --scheduler ADDRESS go together")
     if given.scheduler is not None and given.jobs is not None:
         raise ConfigError("--jobs: how many there are is the scheduler's to say")
-    number, of = _shard(given.shard)
+    match = _SHARD.fullmatch(given.shard)
+    number, of = (int(match[1]), int(match[2])) if match else (0, 0)
+    if not 1 <= number <= of:
+        raise ConfigError(f"--shard {given.shard[:40]!r}: I/N is allowed, I from 1 to N")
     folder = given.out if given.out is not None else Path(f"campaign-{found.spec.campaign}")
     return runner.CampaignRunOptions(
         folder, jobs_of(given.jobs), number, of, given.resume, given.scheduler or ""
     )
-
-
-def _shard(text: str) -> tuple[int, int]:
-    match = _SHARD.fullmatch(text)
-    number, of = (int(match[1]), int(match[2])) if match else (0, 0)
-    if not 1 <= number <= of:
-        raise ConfigError(f"--shard {text[:40]!r}: I/N is allowed, I from 1 to N")
-    return number, of
-
-
-def _follow(found: CampaignPlan, asked: runner.CampaignRunOptions, *, as_json: bool) -> bool:
-    """Run, and show each result; True if the user interrupted it."""
-    from aftbed.report.terminal import CampaignProgress  # noqa: PLC0415 - scipy
-
-    results = runner.run(found, asked)  # raises ConfigError here, before the progress is shown
-    todo = sum(asked.has(index, len(found.strata)) for index in range(found.size))
-    try:
-        with closing(results), CampaignProgress(found.spec.campaign, todo, quiet=as_json) as progress:
-            for result in results:
-                progress.add(result)
-    except KeyboardInterrupt:
-        print("interrupted: --resume goes on from here", file=sys.stderr)
-        return True
-    return False
 
 
 def _judge(folder: Path, size: int, seconds: float, *, as_json: bool) -> int:
@@ -291,7 +275,7 @@ def compare(base: Folder, new: Folder, json: Json = False) -> None:
 
     found = compared(ledger.read(base / ledger.NAME), ledger.read(new / ledger.NAME))
     if json:
-        print(msgspec.json.encode(found).decode())
+        print_json(found)
     else:
         print(f"base {found.base}, new {found.new}; {found.unpaired} experiments without their pair")
         width = max(len(change.stratum) for change in found.changes)
@@ -316,15 +300,12 @@ def replay(folder: Folder, experiment: ExperimentName, json: Json = False) -> No
 
     Exit code: 0 the outcome is the same, 1 it is not, 2 usage.
     """
-    before = _result(folder, experiment)
+    before = ledger.find(ledger.read(folder / ledger.NAME), experiment)
     after = carry_out(before.experiment, lambda result: None)
     if json:
-        document = {"before": msgspec.to_builtins(before), "after": msgspec.to_builtins(after)}
-        print(dumps(document))
+        print_json({"before": before, "after": after})
     else:
-        print(_title(before))
-        print(f"  then  {_outcome(before)}")
-        print(f"  now   {_outcome(after)}")
+        print(f"{_title(before)}\n  then  {_outcome(before)}\n  now   {_outcome(after)}")
         print(before.experiment.command())
     raise typer.Exit(0 if after.outcome == before.outcome else 1)
 
@@ -335,18 +316,12 @@ def shrink(folder: Folder, experiment: ExperimentName, json: Json = False) -> No
 
     A real experiment is shrunk in the simulator, too: there a run is repeated to the last event.
     """
-    before = _result(folder, experiment)
+    before = ledger.find(ledger.read(folder / ledger.NAME), experiment)
     found = smallest(before)
     if json:
-        print(msgspec.json.encode(found).decode())
+        print_json(found)
     else:
-        print(_title(before))
-        print(f"  outcome  {_outcome(before)}")
-        print(f"  smallest  {found.command()}")
-
-
-def _result(folder: Path, name: str) -> Result:
-    return ledger.find(ledger.read(folder / ledger.NAME), name)
+        print(f"{_title(before)}\n  outcome  {_outcome(before)}\n  smallest  {found.command()}")
 
 
 def _title(result: Result) -> str:

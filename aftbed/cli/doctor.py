@@ -1,12 +1,11 @@
 """`aftbed doctor`: what the machine lacks, and what dead runs left behind."""
 
-from json import dumps
 from typing import Annotated
 
 import msgspec
 import typer
 
-from aftbed.cli.options import Json
+from aftbed.cli.options import Json, print_json
 from aftbed.core.errors import HarnessError
 from aftbed.runtime.unix import cleanup
 from aftbed.runtime.unix.cleanup import Left
@@ -32,7 +31,7 @@ def doctor(
     """
     diagnosis = _diagnose(clean=clean)
     if json:
-        print(dumps(msgspec.to_builtins(diagnosis)))
+        print_json(diagnosis)
     else:
         _show(diagnosis, clean=clean)
     raise typer.Exit(0 if diagnosis.ok else 1)

@@ -8,7 +8,6 @@ between two replicas on one host is that of its memory, so it is unlimited unles
 from pathlib import Path
 from typing import Annotated, Final
 
-import msgspec
 import psutil
 import typer
 
@@ -26,7 +25,7 @@ from aftbed.adapt.suitability import (
     remarks,
     table_from,
 )
-from aftbed.cli.options import Json
+from aftbed.cli.options import Json, check_range, print_json
 from aftbed.core.application import Characteristics
 from aftbed.core.errors import ConfigError
 from aftbed.core.graph import Graph
@@ -54,7 +53,7 @@ def list_(table: TableOption = None, json: Json = False) -> None:
     rules = _table(table)
     found = [(demand(name, rules), build(name, "process")) for name in EXPRESSIONS]
     if json:
-        _print_json([_summary(*one) for one in found])
+        print_json([_summary(*one) for one in found])
         return
     line = "{:<12}{:<28}{:<15}{:<14}{:>4}  {:<10}{:<11}{:>9}".format
     print(line("FTM", "TOLERATES", *COLUMNS))
@@ -76,7 +75,7 @@ def show(
     if json:
         bricks = [{"name": brick.name, "kind": brick.kind} for brick in graph.bricks]
         channels = [{"name": k.name, "source": k.source, "sink": k.sink} for k in graph.links]
-        _print_json({**_summary(wanted, graph), "bricks": bricks, "channels": channels})
+        print_json({**_summary(wanted, graph), "bricks": bricks, "channels": channels})
         return
     _print_block("tolerates", [", ".join(wanted.tolerates) or "nothing"])
     if set(wanted.detects) - set(wanted.tolerates):
@@ -121,7 +120,7 @@ def check(
     if json:
         judged = {"problems": found, "remarks": notes, "consistent_ftms": others}
         given = {"faults": model.asked(), "app": app, "characteristics": declared, "resources": resources}
-        _print_json({"ftm": expression, "consistent": suits, **judged, **given})
+        print_json({"ftm": expression, "consistent": suits, **judged, **given})
     else:
         _print_block("faults", [", ".join(model.asked()) or "none"])
         _print_block("function", [_function(declared, app)])
@@ -162,8 +161,8 @@ def _declared(app: str | None) -> Characteristics:
 
 def _resources(cpus: int | None, cpu_load: float | None, bandwidth: float | None) -> Resources:
     """The resources that are given; the others are measured."""
-    if cpus is not None and not 1 <= cpus <= CPUS_MAX:
-        raise ConfigError(f"--cpus {cpus}: 1 to {CPUS_MAX} are allowed")
+    if cpus is not None:
+        check_range("--cpus", cpus, 1, CPUS_MAX)
     if cpu_load is not None and not 0.0 <= cpu_load <= 1.0:
         raise ConfigError(f"--cpu-load {cpu_load:g}: 0 to 1 is allowed")
     if bandwidth is not None and not 0.0 <= bandwidth <= BANDWIDTH_KBIT_S_MAX:
@@ -233,7 +232,3 @@ def _cpus(count: int) -> str:
 def _print_block(head: str, lines: list[str]) -> None:
     for index, line in enumerate(lines):
         print(f"{'' if index else head:<10} {line}")
-
-
-def _print_json(found: object) -> None:
-    print(msgspec.json.encode(found).decode())

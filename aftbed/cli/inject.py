@@ -8,6 +8,7 @@ from typing import Annotated, Final
 
 import msgspec
 import typer
+from msgspec.structs import asdict, replace
 
 from aftbed.cli.options import Run, takes
 from aftbed.core.errors import ConfigError, unknown
@@ -80,27 +81,6 @@ class SlowArguments(HangArguments, frozen=True, kw_only=True):
     share: Annotated[str | None, typer.Option(help="Or: as if it had this share of a CPU, as 25%.")] = None
 
 
-@inject.command()
-@takes(CrashArguments)
-def crash(given: CrashArguments) -> None:
-    """SIGKILL the target's processes."""
-    _send(given.run, "crash", given.target, _words(given))
-
-
-@inject.command()
-@takes(HangArguments)
-def hang(given: HangArguments) -> None:
-    """SIGSTOP the target's processes, and SIGCONT them after a while."""
-    _send(given.run, "hang", given.target, _words(given))
-
-
-@inject.command()
-@takes(SlowArguments)
-def slow(given: SlowArguments) -> None:
-    """Make each step of the target's bricks take longer."""
-    _send(given.run, "slow", given.target, _words(given))
-
-
 # -- faults of a channel --------------------------------------------------------------------------
 
 
@@ -122,20 +102,6 @@ class DelayArguments(ChannelArguments, frozen=True, kw_only=True):
     """The options of a fault that holds messages back."""
 
     by: Annotated[str | None, typer.Option(help="How long it is held back, as 5ms; 20ms if left out.")] = None
-
-
-def _channel_command(kind: str, arguments: type[ChannelArguments], about: str) -> None:
-    @inject.command(kind, help=about)
-    @takes(arguments)
-    def strike(given: ChannelArguments) -> None:
-        persistence = _persistence(given.permanent, given.every, given.chance)
-        _send(given.run, kind, given.channel, [*_words(given), *persistence])
-
-
-_channel_command("omission", ChannelArguments, "Lose a message.")
-_channel_command("delay", DelayArguments, "Hold a message back, and those behind it.")
-_channel_command("duplicate", ChannelArguments, "Send a message twice.")
-_channel_command("reorder", DelayArguments, "Send a message after its successor, or late if none comes.")
 
 
 # -- bitflip, bus ---------------------------------------------------------------------------------
@@ -177,6 +143,25 @@ class BitflipArguments(msgspec.Struct, frozen=True, kw_only=True):
     run: Run = None
 
 
+def _command(kind: str, arguments: type[CrashArguments] | type[ChannelArguments], about: str) -> None:
+    """A command whose only argument is what is hit."""
+
+    @inject.command(kind, help=about)
+    @takes(arguments)
+    def strike(given: CrashArguments | ChannelArguments) -> None:
+        subject = given.target if isinstance(given, CrashArguments) else given.channel
+        _arm(given.run, read([kind, subject, *_words(given)]))
+
+
+_command("crash", CrashArguments, "SIGKILL the target's processes.")
+_command("hang", HangArguments, "SIGSTOP the target's processes, and SIGCONT them after a while.")
+_command("slow", SlowArguments, "Make each step of the target's bricks take longer.")
+_command("omission", ChannelArguments, "Lose a message.")
+_command("delay", DelayArguments, "Hold a message back, and those behind it.")
+_command("duplicate", ChannelArguments, "Send a message twice.")
+_command("reorder", DelayArguments, "Send a message after its successor, or late if none comes.")
+
+
 @inject.command()
 @takes(BitflipArguments)
 def bitflip(given: BitflipArguments) -> None:
@@ -190,10 +175,9 @@ def bitflip(given: BitflipArguments) -> None:
                 f"--replica {given.replica}: with --level {MEMORY} the target is {given.place!r} already"
             )
         refuse_unsafe(f"--level {MEMORY}", agreed=given.unsafe_memory)
-        what, given = MEMORY, msgspec.structs.replace(given, replica=given.place)
+        what, given = MEMORY, replace(given, replica=given.place)
     byte = [] if given.byte is None else ["byte"] if given.byte == DRAWN else ["byte", given.byte]
-    persistence = _persistence(given.permanent, given.every, given.chance)
-    _send(given.run, "bitflip", what, [*_words(given), *byte, *persistence])
+    _arm(given.run, read(["bitflip", what, *_words(given, byte)]))
 
 
 @inject.command()
@@ -208,26 +192,18 @@ def bus(
 # -- options to words, words to the run -----------------------------------------------------------
 
 
-def _words(given: msgspec.Struct) -> list[str]:
-    """The words of the options that are given; a condition is three words, with or without spaces."""
-    options = msgspec.structs.asdict(given)
-    found: list[str] = []
+def _words(given: msgspec.Struct, others: Sequence[str] = ()) -> list[str]:
+    """The words of the options that are given, and `others` before those for how it is repeated."""
+    options, found = asdict(given), list[str]()
     for option, word in WORDS.items():
         value = options.get(option)
-        if value is not None:
+        if value is not None:  # a condition is three words, with or without spaces
             found += [word, *(_COMPARISON.sub(r" \1 ", value).split() if word == "when" else [value])]
+    found += [*others, *(["permanent"] if options.get("permanent") else [])]
+    for key, option in (("every", "every"), ("p", "chance")):
+        if options.get(option) is not None:
+            found += ["intermittent", key, options[option]]
     return found
-
-
-def _persistence(permanent: bool, every: str | None, chance: str | None) -> list[str]:
-    found = ["permanent"] if permanent else []
-    for key, value in (("every", every), ("p", chance)):
-        found += ["intermittent", key, value] if value is not None else []
-    return found
-
-
-def _send(run: str | None, kind: str, what: str, words: Sequence[str]) -> None:
-    _arm(run, read([kind, what, *words]))
 
 
 class _RecordHead(msgspec.Struct, frozen=True):

@@ -1,12 +1,11 @@
 """Commands for a live run, from a second terminal: `aftbed status`, `ps`, `graph`, `stop`."""
 
-from json import dumps
 from typing import Annotated, Final
 
 import msgspec
 import typer
 
-from aftbed.cli.options import Json, Run
+from aftbed.cli.options import Json, Run, print_json
 from aftbed.core.errors import unknown
 from aftbed.core.graph import Graph
 from aftbed.ftm.compose import build
@@ -18,7 +17,7 @@ def status(run: Run = None, json: Json = False) -> None:
     """Show the state of a live run."""
     found = control_client.ask(run_directory.find(run), control_client.StatusQuery())
     if json:
-        print(dumps(found))
+        print_json(found)
         return
     for key, value in found.items():
         print(f"{key:10} {value}")
@@ -28,7 +27,7 @@ def ps(run: Run = None, json: Json = False) -> None:
     """The processes of a live run: name, role, pid, CPU, memory (PSS)."""
     rows = measured(control_client.processes(run_directory.find(run)))
     if json:
-        print(dumps(msgspec.to_builtins(rows)))
+        print_json(rows)
         return
     print(f"{'NAME':14} {'ROLE':10} {'PID':>7} {'CPU%':>6} {'PSS MB':>7}")
     for row in rows:

@@ -1,9 +1,10 @@
-"""Options that several commands share, and commands whose options are declared as one struct."""
+"""What commands share: options, checks of their values, options declared as one struct, JSON output."""
 
 import functools
 import inspect
 import os
 from collections.abc import Callable
+from pathlib import Path
 from typing import Annotated, Final, Generic, TypeVar, get_args, get_origin
 
 import msgspec
@@ -28,28 +29,27 @@ class StructCommand(Generic[Arguments]):
 
     typer reads the options from `__signature__` and `__annotations__`, as it does for a plain function.
     Inherited fields come last. A field of type `tuple[T, ...]` is an option that can be given several times.
+    The function returns the exit code; None is 0.
     """
 
-    def __init__(self, function: Callable[[Arguments], None], arguments: type[Arguments]) -> None:
+    def __init__(self, function: Callable[[Arguments], int | None], arguments: type[Arguments]) -> None:
         functools.update_wrapper(self, function)
         self._function, self._arguments = function, arguments
         fields = {field.name: _parameter(field) for field in msgspec.structs.fields(arguments)}
-        names = [
-            name for kind in arguments.__mro__ for name in inspect.get_annotations(kind) if name in fields
-        ]
-        parameters = [fields[name] for name in dict.fromkeys(names)]
+        names = [name for kind in arguments.__mro__ for name in inspect.get_annotations(kind)]
+        parameters = [fields[name] for name in dict.fromkeys(names) if name in fields]
         self.__signature__ = inspect.Signature(parameters)
         self.__annotations__ = {one.name: one.annotation for one in parameters}
 
     def __call__(self, **given: object) -> None:
         """Called by typer, with a list for each option that can be given several times."""
         values = {name: tuple(v) if isinstance(v, list) else v for name, v in given.items() if v is not None}
-        self._function(self._arguments(**values))
+        raise typer.Exit(self._function(self._arguments(**values)) or 0)
 
 
 def takes(
     arguments: type[Arguments],
-) -> Callable[[Callable[[Arguments], None]], StructCommand[Arguments]]:
+) -> Callable[[Callable[[Arguments], int | None]], StructCommand[Arguments]]:
     """Decorator below `@app.command()`: the options are the fields of `arguments`."""
     return lambda function: StructCommand(function, arguments)
 
@@ -71,14 +71,33 @@ def separated(given: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(name for text in given for name in text.split(","))
 
 
-def jobs_of(jobs: int | None) -> int:
-    """How many processes `--jobs` asks for; one per usable CPU if left out. Raises ConfigError."""
-    if jobs is not None and not 1 <= jobs <= JOBS_MAX:
-        raise ConfigError(f"--jobs {jobs}: 1 to {JOBS_MAX} are allowed")
-    return jobs or len(os.sched_getaffinity(0))
+def check_range(option: str, value: int, least: int, most: int) -> None:
+    """Raise ConfigError if the value of `option` is not in the range."""
+    if not least <= value <= most:
+        raise ConfigError(f"{option} {value}: {least} to {most} are allowed")
 
 
 def check_seed(seed: int) -> None:
     """Raise ConfigError if `--seed` is out of range."""
-    if not 0 <= seed <= SEED_MAX:
-        raise ConfigError(f"--seed {seed}: 0 to {SEED_MAX} are allowed")
+    check_range("--seed", seed, 0, SEED_MAX)
+
+
+def jobs_of(jobs: int | None) -> int:
+    """How many processes `--jobs` asks for; one per usable CPU if left out. Raises ConfigError."""
+    if jobs is not None:
+        check_range("--jobs", jobs, 1, JOBS_MAX)
+    return jobs or len(os.sched_getaffinity(0))
+
+
+def check_file(option: str, path: Path | None, suffix: str = "") -> None:
+    """Raise ConfigError if `path` cannot be written, before the work whose result goes there."""
+    if path is None:
+        return
+    if path.suffix != (suffix or path.suffix) or path.is_dir() or not path.absolute().parent.is_dir():
+        kind = f"file {suffix}" if suffix else "file"
+        raise ConfigError(f"{option} {path}: a {kind} in a directory that exists is allowed")
+
+
+def print_json(document: object) -> None:
+    """Print one JSON document, in one line."""
+    print(msgspec.json.encode(document).decode())

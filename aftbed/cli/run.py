@@ -10,13 +10,14 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
 import msgspec
 import typer
 
-from aftbed.cli.options import RATE_HZ_MAX, Json, check_seed, takes
+from aftbed.cli.options import RATE_HZ_MAX, Json, check_range, check_seed, takes
 from aftbed.cli.views import RunView, open_view
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.graph import Graph
@@ -85,12 +86,12 @@ class RunArguments(msgspec.Struct, frozen=True):
 
 
 @takes(RunArguments)
-def run(given: RunArguments) -> None:
+def run(given: RunArguments) -> int:
     """Drive a car at an obstacle, under a fault tolerance mechanism; end with a verdict.
 
     Exit code: 0 pass, 1 a promise was broken, 2 usage, 3 inconclusive, 130 interrupted and cleaned.
     """
-    raise typer.Exit(execute(given))
+    return execute(given)
 
 
 def execute(given: RunArguments) -> int:
@@ -101,8 +102,7 @@ def execute(given: RunArguments) -> int:
     make_loop = _closed_loop(given)
     work = _work(given)
     check_seed(given.seed)
-    if not 0 <= given.bus_port <= 65535:
-        raise ConfigError(f"--bus-port {given.bus_port}: 0 to 65535 are allowed")
+    check_range("--bus-port", given.bus_port, 0, 65535)
     write_files = _files(given)
     options, listener = options_for(
         ftm=given.ftm,
@@ -116,8 +116,8 @@ def execute(given: RunArguments) -> int:
         bus_port=given.bus_port,
     )
     launched = launch(options, listener)
-    view = open_view(options, quiet=given.json)
-    interrupted = _follow(launched, view, make_loop(launched) if make_loop is not None else None)
+    closed = make_loop(launched) if make_loop is not None else None
+    interrupted = _follow(launched, open_view(options, quiet=given.json), closed)
     launched.wait()
     from aftbed.cli.check import judge_and_show  # noqa: PLC0415 - after the launch
     from aftbed.judge.verdict import EXIT_CODES, EXIT_INTERRUPTED  # noqa: PLC0415 - after the launch
@@ -235,7 +235,7 @@ def _load(text: str) -> LoadRun:
 # -- while it runs --------------------------------------------------------------------------------
 
 
-def _follow(launched: Launched, view: RunView, closed: "ClosedLoop | None") -> bool:
+def _follow(launched: Launched, view: AbstractContextManager[RunView], closed: "ClosedLoop | None") -> bool:
     """Show the reports until the run ends; True if the user interrupted it. A second Ctrl-C kills the run."""
     interrupted = False
 
@@ -248,19 +248,20 @@ def _follow(launched: Launched, view: RunView, closed: "ClosedLoop | None") -> b
 
     before = {s: signal.signal(s, interrupt) for s in (signal.SIGINT, signal.SIGTERM)}
     try:
-        with view:
+        with view as shown:
             if closed is not None:
-                closed.show(view.event)
+                closed.show(shown.event)
             for report in _reports(launched, closed):
-                if report.kind == "telemetry":
-                    view.telemetry(report.data)
-                elif report.kind == "cycle":
-                    view.cycle(json.loads(report.data))
-                elif report.kind == "event":
-                    event = json.loads(report.data)
-                    view.event(event)
-                    if closed is not None:
-                        closed.told(event)
+                match report.kind:
+                    case "telemetry":
+                        shown.telemetry(report.data)
+                    case "cycle":
+                        shown.cycle(json.loads(report.data))
+                    case "event":
+                        event = json.loads(report.data)
+                        shown.event(event)
+                        if closed is not None:
+                            closed.told(event)
             if closed is not None:
                 closed.close()
     finally:

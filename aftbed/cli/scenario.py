@@ -3,14 +3,12 @@
 `scenario run` forks the supervisor, as `aftbed run` does: `table` and `import` are modules of their own.
 """
 
-from json import dumps
 from typing import Annotated, Final
 
-import msgspec
 import typer
 
 from aftbed.cli.lazy import CommandTable, group_of
-from aftbed.cli.options import Json, Seed
+from aftbed.cli.options import Json, Seed, print_json
 from aftbed.cli.run import RunArguments, execute
 from aftbed.vehicle.plant import KMH_PER_MS, LeadCar
 from aftbed.vehicle.scenarios import tables
@@ -46,7 +44,7 @@ def list_(json: Json = False) -> None:
     }
     if json:
         listed = [{"table": name, "title": tables.title(name), "groups": groups[name]} for name in groups]
-        print(dumps({"scenarios": scenarios, "tables": listed}))
+        print_json({"scenarios": scenarios, "tables": listed})
         return
     width = max(map(len, (*scenarios, *(group for counted in groups.values() for group in counted))))
     print("scenarios")
@@ -65,15 +63,15 @@ def show(name: Name, json: Json = False) -> None:
     """How a drive begins, and what its outcome must be."""
     drive, case = load_scenario(name), _case(name)
     if json:
-        row = None if case is None else msgspec.to_builtins(case)
-        print(dumps({"scenario": msgspec.to_builtins(drive), "row": row}))
+        print_json({"scenario": drive, "row": case})
         return
     lines = [
         ("ego", f"{drive.plant.speed_ms * KMH_PER_MS:.1f} km/h"),
         ("ahead", _ahead(drive.plant.lead)),
+        ("road", f"friction {drive.plant.friction:g}"),
+        ("lasts", f"{drive.duration_ms / 1000:g} s at most"),
+        ("expected", _expected(drive)),
     ]
-    lines += [("road", f"friction {drive.plant.friction:g}"), ("lasts", _lasts(drive))]
-    lines += [("expected", _expected(drive))]
     if case is not None:
         lines += [
             ("row of", f"{case.table}, {case.group}"),
@@ -103,10 +101,6 @@ def _ahead(lead: LeadCar | None) -> str:
     elif lead.lateral_m:
         words.append(f"{abs(lead.lateral_m):g} m beside our lane's middle")
     return ", ".join(words)
-
-
-def _lasts(scenario: Scenario) -> str:
-    return f"{scenario.duration_ms / 1000:g} s at most"
 
 
 def _expected(scenario: Scenario) -> str:
@@ -146,13 +140,4 @@ def run(
 
     Exit code: 0 pass, 1 a promise was broken, 2 usage, 3 inconclusive, 130 interrupted and cleaned.
     """
-    arguments = RunArguments(
-        ftm=ftm,
-        scenario=name,
-        placement=placement,
-        pace=pace,
-        seed=seed,
-        faults=tuple(faults or ()),
-        json=json,
-    )
-    raise typer.Exit(execute(arguments))
+    raise typer.Exit(execute(RunArguments(ftm, name, placement, pace, seed, tuple(faults or ()), json=json)))

@@ -3,11 +3,10 @@
 from pathlib import Path
 from typing import Annotated
 
-import msgspec
 import typer
 
-from aftbed.cli.options import Json
-from aftbed.interop.openscenario.importer import ImportedFile, ImportOptions, import_scenario, write
+from aftbed.cli.options import Json, print_json
+from aftbed.interop.openscenario.importer import ImportOptions, import_scenario, write
 
 
 def import_(
@@ -41,28 +40,20 @@ def import_(
     imported = import_scenario(file, variations, options)
     paths = write(imported, out, force=force)
     if json:
-        _print_json(imported, paths)
-    else:
-        _print_text(imported, paths)
-
-
-def _print_json(imported: ImportedFile, paths: list[Path]) -> None:
-    document = {
-        "file": imported.path,
-        "version": imported.version,
-        "description": imported.description,
-        "sets": imported.sets,
-        "scenarios": [
-            {"name": one.name, "path": str(path), "parameters": one.parameters}
-            for one, path in zip(imported.variations, paths, strict=True)
-        ],
-        "taken": msgspec.to_builtins(imported.taken),
-        "ignored": msgspec.to_builtins(imported.ignored),
-    }
-    print(msgspec.json.encode(document).decode())
-
-
-def _print_text(imported: ImportedFile, paths: list[Path]) -> None:
+        document = {
+            "file": imported.path,
+            "version": imported.version,
+            "description": imported.description,
+            "sets": imported.sets,
+            "scenarios": [
+                {"name": one.name, "path": str(path), "parameters": one.parameters}
+                for one, path in zip(imported.variations, paths, strict=True)
+            ],
+            "taken": imported.taken,
+            "ignored": imported.ignored,
+        }
+        print_json(document)
+        return
     print(f"{imported.path}: OpenSCENARIO {imported.version}: {' '.join(imported.description.split())}")
     print("taken")
     for taken in imported.taken:
@@ -73,6 +64,4 @@ def _print_text(imported: ImportedFile, paths: list[Path]) -> None:
         print(f"  line {ignored.line:<5} {ignored.element:26} {ignored.reason}{elsewhere}")
     if imported.sets > len(paths):
         print(f"{imported.sets} sets of values, {len(paths)} of them different")
-    print("written")
-    for path in paths:
-        print(f"  {path}")
+    print("\n  ".join(("written", *map(str, paths))))

@@ -5,7 +5,6 @@ import time
 from collections.abc import Sequence
 from contextlib import closing
 from itertools import groupby
-from json import dumps
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -14,24 +13,31 @@ import rich.table
 import typer
 from rich.console import Console
 
-from aftbed.cli.options import Json, Seed, check_seed, jobs_of, separated, takes
+from aftbed.cli.options import (
+    Json,
+    Seed,
+    check_file,
+    check_seed,
+    jobs_of,
+    print_json,
+    separated,
+    takes,
+)
 from aftbed.cli.sim import read_fault
-from aftbed.cli.views import Bar
+from aftbed.cli.views import progress_bar
 from aftbed.core.errors import ConfigError
-from aftbed.core.graph import Graph
 from aftbed.core.units import milliseconds, whole_milliseconds
 from aftbed.ftm.compose import build
 from aftbed.inject.crash import Crash
 from aftbed.inject.model import Fault, parse
 from aftbed.inject.timing import Trigger
-from aftbed.judge.verdict import EXIT_INTERRUPTED
+from aftbed.judge.verdict import EXIT_CODES, EXIT_INTERRUPTED
 from aftbed.report.plots import RoadCurve, RoadPoint, road_plot
 from aftbed.search.road_table import NONE, PRIMARY, DrivenRow, RoadLine, driven, drives, outage
 from aftbed.search.worst_instant import STEP_CYCLES
 from aftbed.vehicle.scenarios import tables
 from aftbed.vehicle.scenarios.library import load_scenario
 
-EXIT_PASS, EXIT_FAIL, EXIT_NO_FAULT = 0, 1, 3
 WORST: Final = "worst-instant"
 PLOT_SUFFIX: Final = ".svg"
 WIDTH: Final = 150  # characters, if standard output is no terminal
@@ -82,49 +88,35 @@ def table_drive(given: TableArguments) -> TableDrive:
     """Check the options. Raises ConfigError naming the argument, before anything is driven."""
     rows = tables.cases(given.name, given.group)
     check_seed(given.seed)
-    _check_plot(given.plot)
-    lines = (*_mechanism_lines(given), *(_outage_line(text, rows) for text in dict.fromkeys(given.outage)))
-    return TableDrive(rows, lines, given.seed, jobs_of(given.jobs))
-
-
-def _check_plot(plot: Path | None) -> None:
-    """Raise ConfigError if `--plot` cannot be written."""
-    if plot is None:
-        return
-    if plot.suffix != PLOT_SUFFIX or plot.is_dir() or not plot.absolute().parent.is_dir():
-        raise ConfigError(f"--plot {plot}: a file {PLOT_SUFFIX} in a directory that exists is allowed")
-
-
-def _mechanism_lines(given: TableArguments) -> tuple[RoadLine, ...]:
-    """A line for each mechanism; with outages and no fault, only for those that are named."""
+    check_file("--plot", given.plot, PLOT_SUFFIX)
     named = tuple(dict.fromkeys(separated(given.ftm)))
-    if not named:
-        named = () if given.outage and given.fault is None else (NONE,)
-    return tuple(_mechanism_line(ftm, given.fault) for ftm in named)
+    if not named and (given.fault is not None or not given.outage):
+        named = (NONE,)
+    mechanisms = (_mechanism_line(ftm, given.fault) for ftm in named)
+    outages = (_outage_line(text, rows) for text in dict.fromkeys(given.outage))
+    return TableDrive(rows, (*mechanisms, *outages), given.seed, jobs_of(given.jobs))
 
 
-def _mechanism_line(ftm: str, fault: str | None) -> RoadLine:
+def _mechanism_line(ftm: str, text: str | None) -> RoadLine:
+    """Under `ftm`, with the fault of `--fault`: at its own time, or at the worst instant."""
     graph = build(ftm, "process")
-    if fault is None:
+    if text is None:
         return RoadLine(ftm, ftm)
-    words = fault.split()
-    if words[-1:] != [WORST]:
-        return RoadLine(f"{ftm}, {fault}", ftm, read_fault(fault, graph))
-    found = _searched(fault, words, graph)
-    return RoadLine(f"{ftm}, {found} at the worst instant", ftm, found, searched=True)
-
-
-def _searched(text: str, words: list[str], graph: Graph) -> Fault:
-    """`worst-instant` alone, a crash of the primary; or `hang primary for 50ms at worst-instant`."""
-    if len(words) == 1:
-        return Fault(Crash(), PRIMARY, Trigger())
-    if words[-2] != "at":
-        raise ConfigError(f"--fault {text!r}: {WORST}, or FAULT WORDS at {WORST} is allowed")
-    fault = parse(" ".join(words[:-2]))
-    if not fault.action.has_worst_instant or fault.trigger != Trigger():
-        raise ConfigError(f"--fault {text!r}: a crash, a hang or a slow without any other time is searched")
-    fault.check(graph)
-    return fault
+    match text.split():
+        case [word] if word == WORST:
+            fault = Fault(Crash(), PRIMARY, Trigger())
+        case [*words, "at", last] if last == WORST:
+            fault = parse(" ".join(words))
+            if not fault.action.has_worst_instant or fault.trigger != Trigger():
+                raise ConfigError(
+                    f"--fault {text!r}: a crash, a hang or a slow without any other time is searched"
+                )
+            fault.check(graph)
+        case [*_, last] if last == WORST:
+            raise ConfigError(f"--fault {text!r}: {WORST}, or FAULT WORDS at {WORST} is allowed")
+        case _:
+            return RoadLine(f"{ftm}, {text}", ftm, read_fault(text, graph))
+    return RoadLine(f"{ftm}, {fault} at the worst instant", ftm, fault, searched=True)
 
 
 def _outage_line(text: str, rows: tuple[tables.Case, ...]) -> RoadLine:
@@ -145,7 +137,7 @@ def _outage_line(text: str, rows: tuple[tables.Case, ...]) -> RoadLine:
 
 
 @takes(TableArguments)
-def table(given: TableArguments) -> None:
+def table(given: TableArguments) -> int:
     """Drive a whole table on the simulator, without a fault or with one at its worst.
 
     Exit code: 0 all rows pass, 1 a row fails, 2 usage, 3 a fault never struck, 130 interrupted.
@@ -156,74 +148,73 @@ def table(given: TableArguments) -> None:
         rows = _drive(found, quiet=given.json)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
-        raise typer.Exit(EXIT_INTERRUPTED) from None
+        return EXIT_INTERRUPTED
     seconds = round(time.monotonic() - began_s, 2)
     if given.plot is not None:
         _plot(given.plot, given.name, found, rows)
+    passed, struck = sum(row.passed for row in rows), sum(row.struck for row in rows)
     if given.json:
         about = {"table": given.name, "group": given.group, "seed": given.seed, "seconds": seconds}
-        passed = all(row.passed for row in rows)
-        print(dumps({**about, "pass": passed, "rows": [msgspec.to_builtins(row) for row in rows]}))
+        print_json({**about, "pass": passed == len(rows), "rows": rows})
     else:
         where = f", {given.group}" if given.group else ""
         print(f"{given.name}{where}: {tables.title(given.name)}; seed {given.seed}")
         _show_lines(found.lines, rows)
-        print(f"\n{_counted(rows)} in {seconds:.1f} s")
-    raise typer.Exit(_exit_code(rows))
+        tail = f"; the fault never struck in {len(rows) - struck}" if struck < len(rows) else ""
+        print(f"\n{passed} of {len(rows)} rows pass{tail} in {seconds:.1f} s")
+    if any(row.struck and not row.passed for row in rows):
+        return EXIT_CODES["fail"]
+    return EXIT_CODES["pass" if struck == len(rows) else "inconclusive"]
 
 
 def _drive(found: TableDrive, *, quiet: bool) -> list[DrivenRow]:
     """All rows, in the order of the lines and of the table."""
     todo = drives(found.cases, found.lines, found.seed)
     rows: dict[tuple[str, str], DrivenRow] = {}
-    with closing(driven(todo, found.jobs)) as coming, Bar("driving", len(todo), quiet=quiet) as bar:
+    with closing(driven(todo, found.jobs)) as coming, progress_bar("driving", len(todo), quiet=quiet) as show:
         for done, these in enumerate(coming, 1):
             rows |= {(row.line, row.case): row for row in these}
-            bar.show(done, len(rows), sum(not row.passed for row in rows.values()))
+            show(done, len(rows), sum(not row.passed for row in rows.values()))
     return [rows[line.name, case.name] for line in found.lines for case in found.cases]
-
-
-def _counted(rows: Sequence[DrivenRow]) -> str:
-    passed, struck = sum(row.passed for row in rows), all(row.struck for row in rows)
-    tail = "" if struck else f"; the fault never struck in {sum(not row.struck for row in rows)}"
-    return f"{passed} of {len(rows)} rows pass{tail}"
-
-
-def _exit_code(rows: Sequence[DrivenRow]) -> int:
-    if any(row.struck and not row.passed for row in rows):
-        return EXIT_FAIL
-    return EXIT_PASS if all(row.struck for row in rows) else EXIT_NO_FAULT
 
 
 def _plot(path: Path, table: str, found: TableDrive, rows: Sequence[DrivenRow]) -> None:
     """A picture for each group."""
     groups = {case.name: case.group for case in found.cases}
-    curves = [
-        RoadCurve(group, line, tuple(_point(row) for row in sorted(of, key=lambda row: row.speed_kmh)))
-        for (line, group), of in groupby(rows, key=lambda row: (row.line, groups[row.case]))
-    ]
+    curves = []
+    for (line, group), of in groupby(rows, key=lambda row: (row.line, groups[row.case])):
+        points = (
+            RoadPoint(row.speed_kmh, row.impact_kmh, row.limit_kmh, row.closed_form_kmh)
+            for row in sorted(of, key=lambda row: row.speed_kmh)
+        )
+        curves.append(RoadCurve(group, line, tuple(points)))
     try:
         path.write_text(road_plot(f"{table}: speed left at impact", curves), encoding="utf-8")
     except OSError as error:
         raise ConfigError(f"--plot {path}: {error.strerror}") from None
 
 
-def _point(row: DrivenRow) -> RoadPoint:
-    return RoadPoint(row.speed_kmh, row.impact_kmh, row.limit_kmh, row.closed_form_kmh)
-
-
 # -- what is printed ---------------------------------------------------------------------------------
 
 
 def _show_lines(lines: Sequence[RoadLine], rows: Sequence[DrivenRow]) -> None:
-    """For each line a table, why rows fail, and the command that repeats the worst row."""
+    """For each line a table, why rows fail, how instants were searched, and what repeats the worst row."""
     by_line = {name: list(of) for name, of in groupby(rows, key=lambda row: row.line)}
     for line in lines:
         found = by_line[line.name]
         print(f"\n{line.name}" + (f" (under {line.ftm})" if line.outage_ms is not None else ""))
         _print_rows(line, found)
-        for text in (*_failures(line, found), *_search(line, found), *_repeat(line, found)):
+        for text in _failures(line, found):
             print(f"  {text}")
+        if line.searched:
+            runs = sum(row.instants or 0 for row in found)
+            step = f"every {STEP_CYCLES * CYCLE_S:g} s and at each change of stage, then down to 1 ms"
+            print(f"  worst of {runs} instants: {step}")
+        struck = [row for row in found if row.struck]
+        if line.fault is not None and struck:
+            worst = max(struck, key=lambda row: (not row.passed, row.loss_kmh or 0.0, row.loss_m or 0.0))
+            for at, command in enumerate(worst.repeat):
+                print(f"  {'      ' if at else 'repeat'}  {command}")
 
 
 def _print_rows(line: RoadLine, rows: Sequence[DrivenRow]) -> None:
@@ -232,8 +223,7 @@ def _print_rows(line: RoadLine, rows: Sequence[DrivenRow]) -> None:
     for at, head in enumerate(heads):
         grid.add_column(head, no_wrap=True, justify="left" if at in (0, len(heads) - 1) else "right")
     for row in rows:
-        style = "" if row.passed else "red"
-        grid.add_row(*_cells(line, row), style=style)
+        grid.add_row(*_cells(line, row), style="" if row.passed else "red")
     console = Console(width=None if sys.stdout.isatty() else WIDTH, highlight=False)
     with console.capture() as captured:
         console.print(grid)
@@ -241,28 +231,24 @@ def _print_rows(line: RoadLine, rows: Sequence[DrivenRow]) -> None:
 
 
 def _cells(line: RoadLine, row: DrivenRow) -> list[str]:
+    def figure(value: float | None, form: str, unit: str) -> str:
+        return "-" if value is None else f"{value:{form}}{unit}"
+
     cells = [
         row.case,
         f"{row.speed_kmh:g}",
         f"{row.limit_kmh:g}" if row.limit_kmh else "none",
-        f"{row.impact_kmh:.1f} km/h" if row.impact_kmh else "-",
-        "-" if row.min_gap_m is None else f"{row.min_gap_m:.2f} m",
-        "-" if row.warning_s is None else f"{row.warning_s:.2f} s",
+        figure(row.impact_kmh or None, ".1f", " km/h"),
+        figure(row.min_gap_m, ".2f", " m"),
+        figure(row.warning_s, ".2f", " s"),
     ]
     if line.fault is not None:
-        cells.append("-" if row.at_s is None else f"{row.at_s:.3f} s")
-        cells.append("-" if row.instants is None else f"{row.instants}")
-        cells.append(_lost(row))
+        lost = figure(row.loss_kmh, ".1f", " km/h") if row.loss_kmh else figure(row.loss_m, ".3f", " m")
+        cells += [figure(row.at_s, ".3f", " s"), figure(row.instants, "", ""), lost]
     if line.outage_ms is not None:
-        cells.append("-" if row.closed_form_kmh is None else f"{row.closed_form_kmh:.1f} km/h")
+        cells.append(figure(row.closed_form_kmh, ".1f", " km/h"))
     verdict = "pass" if row.passed else "fail" if row.struck else "no fault"
     return [*cells, verdict + (f", {row.colour}" if row.colour else "")]
-
-
-def _lost(row: DrivenRow) -> str:
-    if row.loss_kmh:
-        return f"{row.loss_kmh:.1f} km/h"
-    return "-" if row.loss_m is None else f"{row.loss_m:.3f} m"
 
 
 def _failures(line: RoadLine, rows: Sequence[DrivenRow]) -> list[str]:
@@ -275,23 +261,3 @@ def _failures(line: RoadLine, rows: Sequence[DrivenRow]) -> list[str]:
     if line.outage_ms is not None and not failed:
         found.append(f"no row fails: {line.outage_ms} ms are less than what the function keeps in hand")
     return found
-
-
-def _search(line: RoadLine, rows: Sequence[DrivenRow]) -> list[str]:
-    """How the worst instants were found."""
-    if not line.searched:
-        return []
-    runs = sum(row.instants or 0 for row in rows)
-    step = f"every {STEP_CYCLES * CYCLE_S:g} s and at each change of stage, then down to 1 ms"
-    return [f"worst of {runs} instants: {step}"]
-
-
-def _repeat(line: RoadLine, rows: Sequence[DrivenRow]) -> list[str]:
-    """The commands that repeat the row that lost most."""
-    if line.fault is None:
-        return []
-    struck = [row for row in rows if row.struck]
-    if not struck:
-        return []
-    worst = max(struck, key=lambda row: (not row.passed, row.loss_kmh or 0.0, row.loss_m or 0.0))
-    return [f"{'repeat' if at == 0 else '      '}  {text}" for at, text in enumerate(worst.repeat)]

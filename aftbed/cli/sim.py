@@ -10,20 +10,28 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
-from json import dumps
 from pathlib import Path
 from typing import Annotated, Final, NamedTuple
 
 import msgspec
 import typer
-from msgspec.structs import replace
+from msgspec.structs import asdict, replace
 from rich.console import Console
 from rich.table import Table
 
 from aftbed.adapt import commands
 from aftbed.cli.adapt import scheduled
-from aftbed.cli.options import RATE_HZ_MAX, SEED_MAX, Json, check_seed, jobs_of, takes
-from aftbed.cli.views import Bar, EndedAdaptation, history_lines, show_verdict, spaced
+from aftbed.cli.options import (
+    RATE_HZ_MAX,
+    SEED_MAX,
+    Json,
+    check_file,
+    check_seed,
+    jobs_of,
+    print_json,
+    takes,
+)
+from aftbed.cli.views import EndedAdaptation, history_lines, progress_bar, show_verdict, spaced
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.graph import Graph
 from aftbed.core.messages import Goal, Scheduled
@@ -33,22 +41,14 @@ from aftbed.inject.model import Fault, parse
 from aftbed.inject.targets import OTHERS
 from aftbed.judge.outcome import outcome_of
 from aftbed.judge.simulated import record_of
-from aftbed.judge.verdict import (
-    EXIT_CODES,
-    EXIT_INTERRUPTED,
-    Breach,
-    Verdict,
-    Word,
-    evidence_of,
-    judge,
-)
+from aftbed.judge.verdict import EXIT_CODES, EXIT_INTERRUPTED, Breach, Verdict, Word, evidence_of, judge
 from aftbed.report import sequence
 from aftbed.runtime.sim.clock import START_NS
 from aftbed.runtime.sim.givens import check as check_fault
 from aftbed.runtime.sim.trace import traced
 from aftbed.runtime.sim.world import Run, Setup
 from aftbed.runtime.unix.worker_pool import each
-from aftbed.search.agreement import SEEDS, Agreement, RecoveryRange, against
+from aftbed.search.agreement import SEEDS, RecoveryRange, against
 from aftbed.search.explore import Found, attempt, missed, tried
 from aftbed.search.shrink import shrink
 from aftbed.search.swarm import drawn
@@ -65,7 +65,7 @@ NO_COMMAND: Final = "(no command line says it: repeat the original)"
 DEFAULT: Final = Setup()
 _RANGE: Final = re.compile(r"([0-9]{1,19})\.\.([0-9]{1,19})")
 
-MakeSetup = Callable[[int], Setup]
+MakeSetup = Callable[[int], Setup]  # the setup of a seed
 
 
 class SimArguments(msgspec.Struct, frozen=True):
@@ -115,28 +115,32 @@ class SimArguments(msgspec.Struct, frozen=True):
 
 
 @takes(SimArguments)
-def sim(given: SimArguments) -> None:
+def sim(given: SimArguments) -> int:
     """Simulate runs in virtual time; the same seed gives the same run.
 
     The bricks, scripts and faults are those of real runs.
 
     Exit code: 0 pass, 1 a promise was broken, 2 usage, 3 a fault did not fire, 130 interrupted.
     """
-    raise typer.Exit(_simulate(given))
-
-
-def _simulate(given: SimArguments) -> int:
     if given.against:
-        return _compare(given.against, _seeds_against(given), as_json=given.json)
+        return _compare(given)
     first, last = _seeds(given)
     jobs, make = jobs_of(given.jobs), _setup_maker(given)
-    _check_diagram(given.diagram)
+    check_file("--diagram", None if given.diagram is None else Path(given.diagram))
     if given.seeds is None and given.minutes is None:
         return _simulate_one(given, make(first))
-    return _ManyRuns(given, make, first, last).run(jobs)
+    return _ManyRuns(given).simulate(make, first, last, jobs)
 
 
 # -- what the options mean ------------------------------------------------------------------------
+
+
+def _used(given: SimArguments, *but: str) -> list[str]:
+    """The options that were given, except those of the fields `but`."""
+    names = {"adaptations": "adapt"}
+    values = asdict(given).items()
+    used = [name for name, value in values if value is not None and value is not False and value != ()]
+    return [f"--{names.get(name, name)}" for name in used if name not in but]
 
 
 def _seeds(given: SimArguments) -> tuple[int, int]:
@@ -147,31 +151,29 @@ def _seeds(given: SimArguments) -> tuple[int, int]:
         raise ConfigError(f"{' and '.join(used)}: --seeds stands alone")
     if given.minutes is not None and not 0 < given.minutes <= MINUTES_MAX:
         raise ConfigError(f"--minutes {given.minutes}: more than 0, up to {MINUTES_MAX:.0f} are allowed")
-    if given.seeds is not None:
-        return _range(given.seeds)
-    seed = given.seed or 0
-    check_seed(seed)
-    return seed, SEED_MAX
-
-
-def _range(text: str) -> tuple[int, int]:
-    found = _RANGE.fullmatch(text)
+    if given.seeds is None:
+        seed = given.seed or 0
+        check_seed(seed)
+        return seed, SEED_MAX
+    found = _RANGE.fullmatch(given.seeds)
     if found is None:
-        raise ConfigError(f"--seeds {text[:60]!r}: A..B is allowed, as 0..99, both ends included")
+        raise ConfigError(f"--seeds {given.seeds[:60]!r}: A..B is allowed, as 0..99, both ends included")
     first, last = int(found[1]), int(found[2])
     if first > last:
         raise ConfigError(
-            f"--seeds {text}: no seed is in it; A..B with A up to B is allowed, as {last}..{first}"
+            f"--seeds {given.seeds}: no seed is in it; A..B with A up to B is allowed, as {last}..{first}"
         )
     if last > SEED_MAX:
-        raise ConfigError(f"--seeds {text}: 0 to {SEED_MAX} are allowed")
+        raise ConfigError(f"--seeds {given.seeds}: 0 to {SEED_MAX} are allowed")
     return first, last
 
 
 def _setup_maker(given: SimArguments) -> MakeSetup:
     """What makes the setup of a seed. Raises ConfigError."""
     if given.swarm:
-        _check_swarm(given)
+        kept = ("seed", "seeds", "swarm", "minutes", "jobs", "diagram", "json")
+        if used := _used(given, *kept):
+            raise ConfigError(f"--swarm draws everything from the seed: leave out {', '.join(used)}")
         return drawn
     graph = build(given.ftm or DEFAULT.ftm, given.placement or DEFAULT.placement)
     faults = tuple(read_fault(text, graph) for text in given.faults)
@@ -187,23 +189,6 @@ def _setup_maker(given: SimArguments) -> MakeSetup:
                 f"--adapt: at request {adaptation.at_request}: there are {setup.count} requests (--count)"
             )
     return lambda seed: replace(setup, seed=seed)
-
-
-def _check_swarm(given: SimArguments) -> None:
-    drawn_too = {
-        "--ftm": given.ftm,
-        "--placement": given.placement,
-        "--count": given.count,
-        "--rate": given.rate,
-        "--scenario": given.scenario,
-        "--faults": given.faults or None,
-        "--adapt": given.adaptations or None,
-        "--recipe": given.recipe,
-        "--force": given.force or None,
-    }
-    used = [name for name, value in drawn_too.items() if value is not None]
-    if used:
-        raise ConfigError(f"--swarm draws everything from the seed: leave out {', '.join(used)}")
 
 
 def _load(given: SimArguments) -> Setup:
@@ -261,92 +246,75 @@ def _forced(text: str, recipe: str) -> Scheduled:
     return Scheduled(Goal(expression=timed.wish.name, recipe=recipe), timed.at_request, timed.after_ms)
 
 
-def _check_diagram(path: str | None) -> None:
-    """Raise ConfigError if `--diagram` cannot be written, before anything is simulated."""
-    if path is None:
-        return
-    file = Path(path)
-    if file.is_dir() or not file.absolute().parent.is_dir():
-        raise ConfigError(f"--diagram {path}: a file in a directory that exists is allowed")
-
-
 # -- a setup in words, and as a command -----------------------------------------------------------
 
 
 def described(setup: Setup) -> str:
     """For people."""
-    load = f"a car in {setup.scenario}" if setup.scenario else _load_words(setup)
+    if setup.scenario:
+        load = f"a car in {setup.scenario}"
+    else:
+        load = f"{setup.count} request{'s' if setup.count > 1 else ''}"
+        load += f" at {_number(setup.rate_hz)}/s" if setup.rate_hz else ""
     parts = [f"{setup.ftm} ({setup.placement}), seed {setup.seed}, {load}"]
     parts += [f"{doom.brick} dies before its effect {doom.effect}" for doom in setup.dooms]
-    parts += [str(fault) for fault in setup.faults]
-    return "; ".join([*parts, *map(_adaptation_words, setup.adaptations)])
-
-
-def _load_words(setup: Setup) -> str:
-    requests = f"{setup.count} request{'s' if setup.count > 1 else ''}"
-    return f"{requests} at {_number(setup.rate_hz)}/s" if setup.rate_hz else requests
+    return "; ".join([*parts, *map(str, setup.faults), *map(_adaptation_words, setup.adaptations)])
 
 
 def _adaptation_words(adaptation: Scheduled) -> str:
     """As `--adapt` reads them."""
     goal = adaptation.goal
-    found = [f"to {goal.expression}" if goal.expression else f"update {goal.part} to {goal.source}"]
+    words = f"to {goal.expression}" if goal.expression else f"update {goal.part} to {goal.source}"
     if adaptation.at_request:
-        found.append(f"at request {adaptation.at_request}")
-    elif adaptation.after_ms:
-        found.append(f"after {_number(adaptation.after_ms)}ms")
-    return " ".join(found)
+        return f"{words} at request {adaptation.at_request}"
+    return f"{words} after {_number(adaptation.after_ms)}ms" if adaptation.after_ms else words
 
 
-def repeating(setup: Setup) -> str:
-    """The command that repeats `setup`; "" if none does. Checked: reading it back gives `setup`."""
+def repeating(setup: Setup, *, swarm: bool = False) -> str:
+    """The command that repeats `setup`, "" if none does; if a swarm drew it, its seed is enough.
+
+    Checked: reading the command back gives `setup`.
+    """
+    if swarm:
+        return f"aftbed sim --swarm --seed {setup.seed}"
     if setup.dooms:
         return ""
     exact = replace(setup, count=DEFAULT.count, rate_hz=DEFAULT.rate_hz) if setup.scenario else setup
-    for force in (False, True):
+    given = SimArguments(
+        seed=setup.seed,
+        ftm=setup.ftm,
+        placement=setup.placement if setup.placement != DEFAULT.placement else None,
+        count=None if setup.scenario else setup.count,
+        rate=None if setup.scenario else setup.rate_hz or None,
+        scenario=setup.scenario or None,
+        faults=tuple(map(str, setup.faults)),
+        adaptations=tuple(map(_adaptation_words, setup.adaptations)),
+        recipe=next((a.goal.recipe for a in setup.adaptations if a.goal.recipe != RECIPES[0]), None),
+    )
+    for force in (False, True)[: 1 + bool(setup.adaptations)]:
+        given = replace(given, force=force)
         try:
-            if _setup_maker(_arguments(exact, force=force and bool(setup.adaptations)))(setup.seed) == exact:
-                return _command(setup, force=force)
+            if _setup_maker(given)(setup.seed) == exact:
+                return _command(given)
         except ConfigError:
             continue
     return ""
 
 
-def repeating_drawn(setup: Setup, *, swarm: bool) -> str:
-    """The same; if `setup` was drawn by a swarm, its seed is enough."""
-    return f"aftbed sim --swarm --seed {setup.seed}" if swarm else repeating(setup)
-
-
-def _arguments(setup: Setup, *, force: bool) -> SimArguments:
-    car = bool(setup.scenario)
-    return SimArguments(
-        seed=setup.seed,
-        ftm=setup.ftm,
-        placement=setup.placement,
-        count=None if car else setup.count,
-        rate=None if car else setup.rate_hz or None,
-        scenario=setup.scenario or None,
-        faults=tuple(map(str, setup.faults)),
-        adaptations=tuple(map(_adaptation_words, setup.adaptations)),
-        recipe=next((a.goal.recipe for a in setup.adaptations), None),
-        force=force,
-    )
-
-
-def _command(setup: Setup, *, force: bool) -> str:
-    found = [f"aftbed sim --seed {setup.seed} --ftm {setup.ftm}"]
-    if setup.placement != DEFAULT.placement:
-        found.append(f"--placement {setup.placement}")
-    if setup.scenario:
-        found.append(f"--scenario {_quoted(setup.scenario)}")
-    else:
-        found.append(f"--count {setup.count}")
-        found += [f"--rate {_number(setup.rate_hz)}"] if setup.rate_hz else []
-    found += [f"--faults {_quoted(str(fault))}" for fault in setup.faults]
-    found += [f"--adapt {_quoted(_adaptation_words(a))}" for a in setup.adaptations]
-    recipes = {a.goal.recipe for a in setup.adaptations} - {RECIPES[0]}
-    found += [f"--recipe {recipe}" for recipe in recipes]
-    return " ".join([*found, *(["--force"] if force else [])])
+def _command(given: SimArguments) -> str:
+    """The command whose options are `given`."""
+    options: list[tuple[str, str | None]] = [
+        ("--ftm", given.ftm),
+        ("--placement", given.placement),
+        ("--scenario", given.scenario),
+        ("--count", None if given.count is None else str(given.count)),
+        ("--rate", None if given.rate is None else _number(given.rate)),
+        *(("--faults", text) for text in given.faults),
+        *(("--adapt", text) for text in given.adaptations),
+        ("--recipe", given.recipe),
+    ]
+    words = [f"{name} {_quoted(value)}" for name, value in options if value is not None]
+    return " ".join([f"aftbed sim --seed {given.seed}", *words, *(["--force"] if given.force else [])])
 
 
 def _number(value: float) -> str:
@@ -361,22 +329,21 @@ def _quoted(text: str) -> str:
 
 
 class Picture(NamedTuple):
-    """The last messages of a run before its first breach, as text and as Mermaid."""
+    """The last messages of a run before its first breach, as lines of text and as Mermaid."""
 
-    text: str
+    lines: list[str]
     mermaid: str
-
-    def lines(self) -> list[str]:
-        """For a terminal."""
-        return self.text.rstrip().splitlines()
 
 
 def picture(setup: Setup, broken: tuple[Breach, ...]) -> Picture:
     """Simulates `setup` again, traced. Empty if the executive itself failed."""
     if attempt(setup)[0] is None:
-        return Picture("", "")
+        return Picture([], "")
     trace = traced(setup)
-    return Picture(sequence.listing(trace, broken), sequence.mermaid(trace, broken))
+    return Picture(
+        sequence.listing(trace, broken).rstrip().splitlines(),
+        sequence.mermaid(trace, broken),
+    )
 
 
 class BrokenRun(NamedTuple):
@@ -397,24 +364,19 @@ class BrokenRun(NamedTuple):
             "shrunk": self.shrunk_command or None,
         }
 
-    def drawn_lines(self) -> list[str]:
-        """The last messages; none if it was not shrunk."""
-        return picture(self.setup, self.breaches).lines() if self.shrunk is not None else []
-
     def lines(self) -> Iterator[str]:
         """For people."""
         yield f"found: {described(self.setup)}"
         yield from (f"  because    {breach}" for breach in self.breaches)
         yield f"  repeat     {self.command or NO_COMMAND}"
-        if self.shrunk not in (None, self.setup):
-            assert self.shrunk is not None
+        if self.shrunk is not None and self.shrunk != self.setup:
             yield f"shrunk: {described(self.shrunk)}"
             yield f"  repeat     {self.shrunk_command or NO_COMMAND}"
 
 
 def broken_run(setup: Setup, broken: tuple[Breach, ...], *, swarm: bool, shrinks: bool = True) -> BrokenRun:
     """Shrink it if `shrinks`, and find the commands that repeat it."""
-    original = repeating_drawn(setup, swarm=swarm)
+    original = repeating(setup, swarm=swarm)
     if not shrinks:
         return BrokenRun(setup, broken, original, None, "")
     smaller = shrink(setup, lambda simpler: attempt(simpler)[1])
@@ -424,39 +386,71 @@ def broken_run(setup: Setup, broken: tuple[Breach, ...], *, swarm: bool, shrinks
 # -- one run --------------------------------------------------------------------------------------
 
 
+class _DoneRun(NamedTuple):
+    """A run that came to its end, as it is shown."""
+
+    run: Run
+    verdict: Verdict
+    outcome: str
+    virtual_ms: float
+
+    def lines(self, wall_ms: float) -> Iterator[str]:
+        """The events, the adaptations and the outcome of its faults."""
+        yield from event_lines(self.run)
+        ended = msgspec.convert(msgspec.to_builtins(self.run.adaptations), list[EndedAdaptation])
+        yield from history_lines(ended) if ended else ()
+        outcome = f"; outcome: {self.outcome}" if self.run.setup.faults else ""
+        yield f"{self.virtual_ms:.1f} ms of virtual time in {wall_ms:.1f} ms{outcome}"
+
+    def document(self) -> dict[str, object]:
+        """For `--json`."""
+        return {
+            "outcome": self.outcome,
+            "requests": self.verdict.requests,
+            "failovers": self.verdict.failovers,
+            "adaptations": self.run.adaptations,
+            "faults": self.run.faults,
+            "vehicle": self.run.vehicle,
+            "virtual_ms": round(self.virtual_ms, 3),
+        }
+
+
+def _judged(run: Run, word: Word, reasons: list[str]) -> _DoneRun:
+    evidence = evidence_of(record_of(run), default_application)
+    verdict = replace(judge(evidence.record, evidence), verdict=word, reasons=reasons)
+    return _DoneRun(run, verdict, outcome_of(evidence)[0], (run.rest.ended_ns - START_NS) / 1e6)
+
+
 def _simulate_one(given: SimArguments, setup: Setup) -> int:
     began_s = time.perf_counter()
-    done, broken = attempt(setup)
+    run, broken = attempt(setup)
     wall_ms = round((time.perf_counter() - began_s) * 1e3, 3)
-    lacking = missed(done) if done is not None and not given.swarm else ()
-    verdict: Word = "fail" if broken else "inconclusive" if lacking else "pass"
+    lacking = missed(run) if run is not None and not given.swarm else ()
+    word: Word = "fail" if broken else "inconclusive" if lacking else "pass"
+    reasons = [*map(str, broken), *lacking]
+    done = _judged(run, word, reasons) if run is not None else None
     if not given.json:
-        print(f"seed {setup.seed}")
-        _show(setup, done, verdict, (*map(str, broken), *lacking), wall_ms)
+        print(f"seed {setup.seed}\n{described(setup)}")
+        if done is None:
+            print("\n".join((*(f"  because    {reason}" for reason in reasons), f"verdict: {word}")))
+        else:
+            print("\n".join(done.lines(wall_ms)))
+            show_verdict(done.verdict, as_json=False)
     found = broken_run(setup, broken, swarm=given.swarm) if broken else None
-    drawing = picture(setup, broken) if found is not None or given.diagram is not None else None
-    if given.diagram is not None and drawing is not None:
+    drawing = picture(setup, broken) if broken or given.diagram is not None else Picture([], "")
+    if given.diagram is not None:
         Path(given.diagram).write_text(drawing.mermaid)
-    if given.json:
-        print(dumps(_document(setup, done, verdict, found, lacking, wall_ms)))
-        return EXIT_CODES[verdict]
-    if found is not None and drawing is not None:
-        print("\n".join((*drawing.lines(), *found.lines())))
-    print(f"seed {setup.seed}")
-    return EXIT_CODES[verdict]
-
-
-def _show(setup: Setup, done: Run | None, verdict: Word, reasons: tuple[str, ...], wall_ms: float) -> None:
-    """The events and the verdict, as `aftbed run` shows them."""
-    print(described(setup))
-    if done is None:
-        print("\n".join((*(f"  because    {reason}" for reason in reasons), f"verdict: {verdict}")))
-        return
-    print("\n".join((*event_lines(done), *_adaptation_lines(done))))
-    virtual_ms = (done.rest.ended_ns - START_NS) / 1e6
-    found = f"; outcome: {_outcome(done)}" if setup.faults else ""
-    print(f"{virtual_ms:.1f} ms of virtual time in {wall_ms:.1f} ms{found}")
-    show_verdict(_verdict(done, verdict, reasons), as_json=False)
+    if not given.json:
+        print(
+            "\n".join(
+                (*(drawing.lines if found else ()), *(found.lines() if found else ()), f"seed {setup.seed}")
+            )
+        )
+        return EXIT_CODES[word]
+    about = {"seed": setup.seed, "verdict": word, "setup": described(setup), "missed": lacking}
+    breach = found.document() if found is not None else {"breaches": [], "command": None, "shrunk": None}
+    print_json({**about, **breach, **(done.document() if done is not None else {}), "wall_ms": wall_ms})
+    return EXIT_CODES[word]
 
 
 def event_lines(run: Run) -> Iterator[str]:
@@ -465,92 +459,48 @@ def event_lines(run: Run) -> Iterator[str]:
         yield f"[{(t_ns - START_NS) / 1e6:>10.3f} ms] {event}: {text}"
 
 
-def _adaptation_lines(run: Run) -> list[str]:
-    """As `aftbed adapt history` shows them; none if there are none."""
-    ended = msgspec.convert(msgspec.to_builtins(run.adaptations), list[EndedAdaptation])
-    return list(history_lines(ended)) if ended else []
-
-
-def _verdict(done: Run, verdict: Word, reasons: tuple[str, ...]) -> Verdict:
-    return msgspec.structs.replace(judge(record_of(done)), verdict=verdict, reasons=list(reasons))
-
-
-def _outcome(done: Run) -> str:
-    return outcome_of(evidence_of(record_of(done), default_application))[0]
-
-
-def _document(
-    setup: Setup,
-    done: Run | None,
-    verdict: Word,
-    found: BrokenRun | None,
-    lacking: tuple[str, ...],
-    wall_ms: float,
-) -> dict[str, object]:
-    ran: dict[str, object] = {}
-    if done is not None:
-        judged = _verdict(done, verdict, ())
-        ran = {
-            "outcome": _outcome(done),
-            "requests": judged.requests,
-            "failovers": judged.failovers,
-            "adaptations": done.adaptations,
-            "faults": done.faults,
-            "vehicle": done.vehicle,
-            "virtual_ms": round((done.rest.ended_ns - START_NS) / 1e6, 3),
-        }
-    broken = found.document() if found is not None else {"breaches": [], "command": None, "shrunk": None}
-    about = {"seed": setup.seed, "verdict": verdict, "setup": described(setup), "missed": lacking}
-    document = msgspec.to_builtins({**about, **broken, **ran, "wall_ms": wall_ms})
-    assert isinstance(document, dict)
-    return document
-
-
 # -- many runs ------------------------------------------------------------------------------------
 
 
 class _ManyRuns:
-    """The runs of the seeds from `first` to `last`; with --minutes, as many as there is time for."""
+    """The runs of a range of seeds; with --minutes, as many as there is time for."""
 
-    def __init__(self, given: SimArguments, make: MakeSetup, first: int, last: int) -> None:
-        self._given, self._make, self._first, self._last = given, make, first, last
-        self._seconds = (given.minutes or 0.0) * 60
-        self._began_s, self._took_s = time.monotonic(), 0.0
+    def __init__(self, given: SimArguments) -> None:
+        self._given = given
         self._runs = self._unavailable = self._requests = self._inconclusive = 0
         self._broken: list[tuple[Setup, tuple[Breach, ...]]] = []
         self._missed: list[str] = []
 
-    def run(self, jobs: int) -> int:
-        """Simulate them in `jobs` processes, show the result; the exit code."""
-        if not self._given.json:
-            print(f"seeds {self._first}..{'' if self._seconds else self._last}", flush=True)
+    def simulate(self, make: MakeSetup, first: int, last: int, jobs: int) -> int:
+        """Simulate the seeds from `first` to `last` in `jobs` processes, show the result; the exit code."""
+        given, began_s, took_s = self._given, time.monotonic(), 0.0
+        seconds = (given.minutes or 0.0) * 60
+        if not given.json:
+            print(f"seeds {first}..{'' if seconds else last}", flush=True)
+        setups = map(make, range(first, last + 1))
+        results = each(tried, setups, jobs, alone=lambda _, setup: repeating(setup, swarm=given.swarm))
         interrupted = False
         try:
-            self._simulate(jobs)
+            with progress_bar("sim", seconds or last - first + 1, quiet=given.json) as show, closing(results):
+                for number, setup, found in results:
+                    self._count(setup, found)
+                    took_s = time.monotonic() - began_s
+                    show(took_s if seconds else number + 1, self._runs, len(self._broken))
+                    if seconds and took_s >= seconds:
+                        break
         except KeyboardInterrupt:
             interrupted = True
-        swarm = self._given.swarm
-        found = [
-            broken_run(setup, broken, swarm=swarm, shrinks=number < SHRUNK_MAX and not interrupted)
-            for number, (setup, broken) in enumerate(self._broken)
+        broken = [
+            broken_run(setup, found, swarm=given.swarm, shrinks=number < SHRUNK_MAX and not interrupted)
+            for number, (setup, found) in enumerate(self._broken)
         ]
-        self._draw()
-        self._show(found)
+        if given.diagram is not None and self._broken:
+            Path(given.diagram).write_text(picture(*self._broken[0]).mermaid)
+        elif given.diagram is not None:
+            print(f"aftbed: note: nothing broke: {given.diagram} is not written", file=sys.stderr)
+        self._show(broken, (first, first + self._runs - 1), max(took_s, 1e-9))
         word: Word = "fail" if self._broken else "inconclusive" if self._inconclusive else "pass"
         return EXIT_INTERRUPTED if interrupted else EXIT_CODES[word]
-
-    def _simulate(self, jobs: int) -> None:
-        total = self._seconds or self._last - self._first + 1
-        setups = map(self._make, range(self._first, self._last + 1))
-        swarm = self._given.swarm
-        results = each(tried, setups, jobs, alone=lambda _, setup: repeating_drawn(setup, swarm=swarm))
-        with Bar("sim", total, quiet=self._given.json) as bar, closing(results) as found:
-            for number, setup, what in found:
-                self._count(setup, what)
-                self._took_s = time.monotonic() - self._began_s
-                bar.show(self._took_s if self._seconds else number + 1, self._runs, len(self._broken))
-                if self._seconds and self._took_s >= self._seconds:
-                    break
 
     def _count(self, setup: Setup, found: Found) -> None:
         self._runs += 1
@@ -558,29 +508,17 @@ class _ManyRuns:
         self._unavailable += found.lost and not found.breaches
         if found.missed and not self._given.swarm:
             self._inconclusive += 1
-            self._missed += [f"seed {setup.seed}: {missed}" for missed in found.missed[:1]]
+            self._missed.append(f"seed {setup.seed}: {found.missed[0]}")
         if found.breaches:
             self._broken.append((setup, found.breaches))
             if not self._given.json and len(self._broken) <= LISTED_MAX:
                 print(f"seed {setup.seed}: {found.breaches[0]}", flush=True)
 
-    def _draw(self) -> None:
-        """Write the diagram of the first run that broke a promise."""
-        path = self._given.diagram
-        if path is None:
-            return
-        if self._broken:
-            Path(path).write_text(picture(*self._broken[0]).mermaid)
-        else:
-            print(f"aftbed: note: nothing broke: {path} is not written", file=sys.stderr)
-
-    def _show(self, broken: list[BrokenRun]) -> None:
-        took_s = max(self._took_s, 1e-9)
-        last = self._first + self._runs - 1
-        survived = self._runs - len(self._broken)
+    def _show(self, broken: list[BrokenRun], seeds: tuple[int, int], took_s: float) -> None:
+        survived = self._runs - len(broken)
         if self._given.json:
             document = {
-                "seeds": [self._first, last],
+                "seeds": seeds,
                 "runs": self._runs,
                 "survived": survived,
                 "unavailable": self._unavailable,
@@ -590,10 +528,11 @@ class _ManyRuns:
                 "requests_per_second": round(self._requests / took_s, 1),
                 "seconds": round(took_s, 3),
             }
-            print(dumps(document))
+            print_json(document)
             return
         for found in broken[:SHRUNK_MAX]:
-            print("\n".join((*found.drawn_lines(), *found.lines())))
+            messages = picture(found.setup, found.breaches).lines if found.shrunk is not None else []
+            print("\n".join((*messages, *found.lines())))
         if len(broken) > SHRUNK_MAX:
             print(f"{spaced(len(broken))} broke in all; --json lists them, each with its command")
         for reason in self._missed[:MISSED_MAX]:
@@ -605,34 +544,22 @@ class _ManyRuns:
             f" in {took_s:.1f} s: {spaced(self._runs / took_s)} runs/s,"
             f" {spaced(self._requests / took_s)} requests/s"
         )
-        print(f"seeds {self._first}..{last}")
+        print(f"seeds {seeds[0]}..{seeds[1]}")
 
 
 # -- real records beside their simulation ---------------------------------------------------------
 
 
-def _seeds_against(given: SimArguments) -> int:
-    """The number of simulations of each record. Raises ConfigError if other options are given."""
-    others = [name for name in given.__struct_fields__ if name not in ("seeds", "against", "json")]
-    if any(getattr(given, name) not in (None, (), False) for name in others):
+def _compare(given: SimArguments) -> int:
+    """Compare each record with its simulations; the exit code is 1 if one does not agree."""
+    if _used(given, "seeds", "against", "json"):
         raise ConfigError("--against: the experiments are the records'; only --seeds and --json go with it")
     first, last = _seeds(given) if given.seeds is not None else (0, SEEDS - 1)
-    return last - first + 1
-
-
-def _compare(records: tuple[Path, ...], seeds: int, *, as_json: bool) -> int:
-    """Compare each record with its simulations; the exit code is 1 if one does not agree."""
-    found = against(records, seeds)
+    found = against(given.against, last - first + 1)
     disagreeing = sum(bool(one.why_not) for one in found)
-    if as_json:
-        print(msgspec.json.encode({"agree": not disagreeing, "experiments": found}).decode())
-    else:
-        _show_agreement(found)
-        print(f"{len(found) - disagreeing} of {len(found)} experiments agree")
-    return EXIT_CODES["fail" if disagreeing else "pass"]
-
-
-def _show_agreement(found: list[Agreement]) -> None:
+    if given.json:
+        print_json({"agree": not disagreeing, "experiments": found})
+        return EXIT_CODES["fail" if disagreeing else "pass"]
     table = Table("", "classes", "recovery: low, median, high (ms)", box=None, pad_edge=False)
     for one in found:
         table.add_row(one.experiment, "", "")
@@ -641,6 +568,8 @@ def _show_agreement(found: list[Agreement]) -> None:
         for reason in one.why_not:
             table.add_row(f"  [red]not alike[/red]: {reason}", "", "")
     Console().print(table)
+    print(f"{len(found) - disagreeing} of {len(found)} experiments agree")
+    return EXIT_CODES["fail" if disagreeing else "pass"]
 
 
 def _classes(found: dict[str, int]) -> str:

@@ -7,19 +7,18 @@ supervisor, so nothing else that is large is imported here.
 import sys
 import time
 from collections import deque
-from collections.abc import Iterator
-from types import TracebackType
-from typing import TYPE_CHECKING, Final, Self
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Final
 
 import msgspec
 
+from aftbed.cli.options import print_json
 from aftbed.runtime.unix.options import RunOptions
 from aftbed.vehicle.plant import Telemetry
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
-    from rich.live import Live
-    from rich.progress import Progress
 
     from aftbed.judge.verdict import Verdict
 
@@ -35,15 +34,7 @@ BAR_PERIOD_S: Final = 0.1
 
 
 class RunView:
-    """Follows a live run, as a context manager. This one shows nothing."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        return None
+    """Shows a live run. This one shows nothing."""
 
     def telemetry(self, data: bytes) -> None:
         """A `Telemetry`, encoded."""
@@ -55,11 +46,19 @@ class RunView:
         """An event of the run: `t_ms`, `event`, `text`."""
 
 
-def open_view(options: RunOptions, *, quiet: bool) -> RunView:
+@contextmanager
+def open_view(options: RunOptions, *, quiet: bool) -> Iterator[RunView]:
     """The view that suits standard output; `quiet` shows nothing."""
     if quiet:
-        return RunView()
-    return LiveView(options) if sys.stdout.isatty() else PlainView(options)
+        yield RunView()
+    elif not sys.stdout.isatty():
+        yield PlainView(options)
+    else:
+        from rich.live import Live  # noqa: PLC0415 - only on a terminal
+
+        view = LiveView(options)
+        with Live(get_renderable=view.render, refresh_per_second=20):
+            yield view
 
 
 class PlainView(RunView):
@@ -83,25 +82,11 @@ class LiveView(RunView):
     """Speed, gap, TTC, stage, the roles of the replicas, and the last events; redrawn 20 times a second."""
 
     def __init__(self, options: RunOptions) -> None:
-        self._options = options
+        self._title = f"aftbed run {options.run}: {options.ftm}, {options.placement}"
         self._events: deque[str] = deque(maxlen=EVENTS_SHOWN)
         self._telemetry: Telemetry | None = None
         self._roles = "a leads, b backs up" if options.ftm != "none" else "a alone"
         self._cycle = ""
-        self._live: Live | None = None
-
-    def __enter__(self) -> Self:
-        from rich.live import Live  # noqa: PLC0415 - only on a terminal
-
-        self._live = Live(get_renderable=self._render, refresh_per_second=20, transient=False)
-        self._live.__enter__()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self._live is not None:
-            self._live.__exit__(kind, error, trace)
 
     def telemetry(self, data: bytes) -> None:
         self._telemetry = msgspec.msgpack.decode(data, type=Telemetry)
@@ -114,18 +99,16 @@ class LiveView(RunView):
         if event["event"] == "roles":
             self._roles = str(event["text"])
 
-    def _render(self) -> "RenderableType":
+    def render(self) -> "RenderableType":
+        """The panel as it is now."""
         from rich.panel import Panel  # noqa: PLC0415 - only on a terminal
         from rich.text import Text  # noqa: PLC0415 - only on a terminal
 
         car = _car(self._telemetry) if self._telemetry else "waiting for the car"
         road = _road(self._telemetry.gap_m if self._telemetry else None)
         lines = [car, road, f"replicas: {self._roles}{self._cycle}", "", *self._events]
-        options = self._options
-        title = f"aftbed run {options.run}: {options.ftm}, {options.placement}"
-        return Panel(
-            Text("\n".join(lines), no_wrap=True, overflow="ellipsis"), title=title, height=EVENTS_SHOWN + 6
-        )
+        text = Text("\n".join(lines), no_wrap=True, overflow="ellipsis")
+        return Panel(text, title=self._title, height=EVENTS_SHOWN + 6)
 
 
 def _car(t: Telemetry) -> str:
@@ -150,7 +133,7 @@ def _road(gap_m: float | None) -> str:
 def show_verdict(verdict: "Verdict", *, as_json: bool) -> None:
     """Print it to standard output."""
     if as_json:
-        print(msgspec.json.encode(verdict).decode())
+        print_json(verdict)
         return
     requests = verdict.requests
     print(f"{verdict.scenario} under {verdict.ftm} ({verdict.placement}), seed {verdict.seed}")
@@ -183,19 +166,14 @@ def _show_vehicle(verdict: "Verdict") -> None:
     if car is None:
         if verdict.replay is not None:
             print(f"  replay     {msgspec.json.encode(verdict.replay).decode()}")
-        return
-    if car.collision:
+    elif car.collision:
         print(f"  car        COLLISION at {car.impact_speed_kmh:.1f} km/h")
     elif car.stop_gap_m is not None:
-        print(
-            f"  car        stopped {car.stop_gap_m:.2f} m short, {car.max_deceleration_ms2:.1f} m/s2 at most"
-        )
+        most = f"{car.max_deceleration_ms2:.1f} m/s2 at most"
+        print(f"  car        stopped {car.stop_gap_m:.2f} m short, {most}")
     else:
-        braked = "braked" if car.braked else "never braked"
-        print(
-            f"  car        {braked}"
-            + ("" if car.min_gap_m is None else f", gap {car.min_gap_m:.2f} m at least")
-        )
+        gap = "" if car.min_gap_m is None else f", gap {car.min_gap_m:.2f} m at least"
+        print(f"  car        {'braked' if car.braked else 'never braked'}{gap}")
 
 
 def _ms(value: float | None) -> str:
@@ -244,55 +222,49 @@ def spaced(number: float) -> str:
     return f"{number:,.0f}".replace(",", " ")
 
 
-class Bar:
-    """A progress bar with the rate and the failures, on standard error if that is a terminal."""
+@contextmanager
+def progress_bar(what: str, total: float, *, quiet: bool) -> Iterator[Callable[[float, int, int], None]]:
+    """A progress bar with the rate and the failures, on standard error if that is a terminal.
 
-    def __init__(self, what: str, total: float, *, quiet: bool) -> None:
-        self._what, self._total = what, total
-        self._progress: Progress | None = None
-        self._shown_s = self._began_s = time.monotonic()
-        self._shows = sys.stderr.isatty() and not quiet
+    What it yields shows how much of `total` is done, the runs and those that broke a promise. It redraws at
+    most every BAR_PERIOD_S, and without a thread: a thread would be forked with the processes that simulate.
+    """
+    if quiet or not sys.stderr.isatty():
+        yield lambda done, runs, broken: None
+        return
+    from rich.console import Console  # noqa: PLC0415 - only on a terminal
+    from rich.progress import (  # noqa: PLC0415 - only on a terminal
+        BarColumn,
+        Progress,
+        TextColumn,
+        TimeRemainingColumn,
+    )
 
-    def __enter__(self) -> Self:
-        if self._shows:
-            self._progress = self._open()
-            self._progress.start()
-        return self
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.fields[count]}"),
+        TimeRemainingColumn(),
+    )
+    bar = Progress(
+        *columns,
+        console=Console(stderr=True),
+        auto_refresh=False,
+        transient=True,
+        redirect_stdout=sys.stdout.isatty(),
+    )
+    task = bar.add_task(what, total=total, count="")
+    began_s = shown_s = time.monotonic()
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self._progress is not None:
-            self._progress.stop()
-
-    def _open(self) -> "Progress":
-        from rich.console import Console  # noqa: PLC0415 - only on a terminal
-        from rich.progress import (  # noqa: PLC0415 - only on a terminal
-            BarColumn,
-            Progress,
-            TextColumn,
-            TimeRemainingColumn,
-        )
-
-        progress = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(),
-            TextColumn("{task.fields[count]}"),
-            TimeRemainingColumn(),
-            console=Console(stderr=True),
-            auto_refresh=False,  # a thread of rich would be forked with the processes that simulate
-            transient=True,
-            redirect_stdout=sys.stdout.isatty(),
-        )
-        progress.add_task(self._what, total=self._total, count="")
-        return progress
-
-    def show(self, done: float, runs: int, broken: int) -> None:
-        """Show `done` of the total; redraws at most every BAR_PERIOD_S."""
+    def show(done: float, runs: int, broken: int) -> None:
+        nonlocal shown_s
         now_s = time.monotonic()
-        if self._progress is None or now_s < self._shown_s + BAR_PERIOD_S:
+        if now_s < shown_s + BAR_PERIOD_S:
             return
-        self._shown_s = now_s
-        rate = runs / max(now_s - self._began_s, 1e-9)
+        shown_s = now_s
+        rate = runs / max(now_s - began_s, 1e-9)
         count = f"{spaced(runs)} runs, {spaced(rate)}/s, {broken} broken"
-        self._progress.update(self._progress.task_ids[0], completed=done, count=count, refresh=True)
+        bar.update(task, completed=done, count=count, refresh=True)
+
+    with bar:
+        yield show
