@@ -1,4 +1,4 @@
-"""The plan of an adaptation: the difference of two graphs, as a script (paper, III-B; design 4).
+"""The plan of an adaptation: the difference of two graphs, as a script (paper, III-B).
 
 The smallest set of bricks: a brick that is in both graphs with the same kind stays as it is, where it is. A
 node is exchanged if what it hosts changes (in placement `process` a node is a brick, so the set is
@@ -12,7 +12,7 @@ smallest; in `replica` and `single` the node is the unit, since its bricks share
 | a node that only the old one has      | Retire                                                         |
 
 All that is slow is in `prepare`. While the client waits: the leader's Protocol is suspended (one request at
-a time, so its chain is empty then), the backup is drained, state moves, each node hears of its new
+a time, so its chain is empty then), the backup is drained, state moves, each node is given its new
 channels at once, and the Protocol is resumed.
 
 The paper's recipe (III-B) is here too, as a script of the same kind: SIGSTOP the Protocol, kill, launch,
@@ -97,7 +97,8 @@ def target(graph: Graph, expression: str) -> Graph:
     new = _with(new, {b.name: msgspec.structs.replace(b, source=updates[b.name, b.kind]) for b in kept})
     if not application:
         return new
-    return _with_function(new, application)
+    concerned = [b for b in new.bricks if b.part == "server" or b.kind in REPLY_CHECKERS]  # call it, judge it
+    return _with(new, {b.name: msgspec.structs.replace(b, application=application) for b in concerned})
 
 
 def updated(graph: Graph, part: str, source: str) -> Graph:
@@ -120,12 +121,6 @@ def _servers(graph: Graph) -> list[BrickSpec]:
     return [b for b in graph.bricks if b.part == "server"]
 
 
-def _with_function(graph: Graph, application: str) -> Graph:
-    """`graph` with another function, for those that call it and for those that judge what it says."""
-    concerned = [b for b in graph.bricks if b.part == "server" or b.kind in REPLY_CHECKERS]
-    return _with(graph, {b.name: msgspec.structs.replace(b, application=application) for b in concerned})
-
-
 def _with(graph: Graph, bricks: dict[str, BrickSpec]) -> Graph:
     return msgspec.structs.replace(graph, bricks=tuple(bricks.get(b.name, b) for b in graph.bricks))
 
@@ -145,14 +140,15 @@ def plan(old: Graph, new: Graph, recipe: str = RECIPES[0]) -> Plan:
         )
     assert leader_of(old) == leader_of(new), "an adaptation does not change the leader"
     change = _Change(old, new)
-    make = _drained if recipe == RECIPES[0] else _paper
-    prepare, commit = make(change)
-    finish = tuple(Retire(node) for node in (*change.exchanged, *change.removed_nodes))
-    if recipe != RECIPES[0]:
-        finish = ()
-    purpose = (
-        f"{old.ftm} to {new.ftm}" if old.ftm != new.ftm else f"update {', '.join(change.updated_parts())}"
+    if recipe == RECIPES[0]:
+        prepare, commit = _drained(change)
+        finish = tuple(Retire(node) for node in (*change.exchanged, *change.removed_nodes))
+    else:
+        prepare, commit, finish = [], _paper(change), ()
+    updated_parts = dict.fromkeys(
+        b.part for b in change.new_bricks.values() if b != change.old_bricks.get(b.name)
     )
+    purpose = f"{old.ftm} to {new.ftm}" if old.ftm != new.ftm else f"update {', '.join(updated_parts)}"
     script = Script(purpose, "", tuple(prepare), tuple(commit), finish, new.ftm, recipe)
     return Plan(old, new, script, *change.names())
 
@@ -190,7 +186,8 @@ class _Change:
         both = [b for b in self.new_bricks if b in self.old_bricks]
         replaced = [b for b in both if b in self.staged]
         kept = [b for b in both if b not in self.staged]
-        touched = {b for k in self._changed_links() for b in (k.source, k.sink)}
+        changed = self.old_links.keys() ^ self.new_links.keys()
+        touched = {brick for source, _, sink, _ in changed for brick in (source, sink)}
         return (
             tuple(replaced),
             tuple(b for b in self.new_bricks if b not in self.old_bricks),
@@ -198,15 +195,6 @@ class _Change:
             tuple(kept),
             tuple(b for b in kept if b in touched),
         )
-
-    def updated_parts(self) -> list[str]:
-        """The parts whose class, or whose function, is another one."""
-        changed = [b for b in self.new_bricks.values() if b != self.old_bricks.get(b.name)]
-        return list(dict.fromkeys(b.part for b in changed))
-
-    def _changed_links(self) -> list[Link]:
-        gone = [k for key, k in self.old_links.items() if key not in self.new_links]
-        return gone + [k for key, k in self.new_links.items() if key not in self.old_links]
 
     def held(self, node: str) -> bool:
         """Whether a new node must not read yet: it shares an input with an old one, or waits for state."""
@@ -227,21 +215,17 @@ class _Change:
 
     def unbinds(self) -> Iterator[Unbind]:
         """Ends at bricks that stay, which lead nowhere from now on."""
-        taken = {(k.source, k.source_port, "out") for k in self.new.links if not k.standby}
-        taken |= {(k.sink, k.sink_port, "in") for k in self.new.links if not k.standby}
+        taken = {end for k in self.new.links if not k.standby for end in k.ends}
         for key, link in self.old_links.items():
             if key in self.new_links or link.standby:
                 continue
-            for brick, port, side in (
-                (link.source, link.source_port, "out"),
-                (link.sink, link.sink_port, "in"),
-            ):
+            for brick, port, side in link.ends:
                 stays = brick in self.new_bricks and brick not in self.staged
                 if stays and (brick, port, side) not in taken:
                     yield Unbind(brick, port)
 
     def drains(self) -> list[str]:
-        """Of the backup, from the brick that hears of the leader on: what may still hold a request.
+        """Of the backup, from the brick that receives from the leader on: what may still hold a request.
 
         Nothing of it changes if only what no request passes through does: a PBR backup does not compute.
         """
@@ -256,8 +240,12 @@ class _Change:
             n for n in path[first:] if self.old.node_of(n) != self.old.node_of(f"{self.leader}/protocol")
         ]
         concerned = {*apart, *(f"{backup}/{part}" for part in STATEFUL)}
-        stays = self.new_bricks.keys() - self.staged
-        return _one_per_node(self.old, apart) if concerned - stays else []
+        if not concerned - (self.new_bricks.keys() - self.staged):
+            return []
+        firsts: dict[str, str] = {}  # by node
+        for brick in apart:
+            firsts.setdefault(self.old.node_of(brick), brick)
+        return list(firsts.values())
 
     def stateful(self, node: str) -> bool:
         """Whether the old node holds state that the new one needs."""
@@ -285,78 +273,55 @@ def drains(old: Graph, new: Graph, staged: Iterable[str] = ()) -> list[str]:
     return change.drains()
 
 
-def _one_per_node(graph: Graph, bricks: Iterable[str]) -> list[str]:
-    """The first of `bricks` in each node."""
-    firsts: dict[str, str] = {}
-    for brick in bricks:
-        firsts.setdefault(graph.node_of(brick), brick)
-    return list(firsts.values())
+def _drained(change: _Change) -> tuple[list[Step], list[Step]]:
+    """Prepare and commit: nothing is inside when anything is exchanged."""
+    new, staged = change.new, change.staged
+    stages = [_stage(change, n, held=change.held(n)) for n in (*change.exchanged, *change.added_nodes)]
+    prepare: list[Step] = [*stages, *(_bind(k) for k in change.binds() if {k.source, k.sink} & staged)]
 
-
-Steps = tuple[list[Step], list[Step]]  # prepare, commit
-
-
-def _drained(change: _Change) -> Steps:
-    """Nothing is inside when anything is exchanged."""
     leads = f"{change.leader}/protocol"
     drains = change.drains()
     commit: list[Step] = [Suspend(leads), *(Drain(brick) for brick in drains)]
-    if replication_of(change.old.ftm) and replication_of(change.new.ftm) != replication_of(change.old.ftm):
+    if replication_of(change.old.ftm) and replication_of(new.ftm) != replication_of(change.old.ftm):
         commit += [
             Align(f"{change.leader}/server", s.name)
-            for s in _servers(change.new)
+            for s in _servers(new)
             if s.replica != change.leader and s.name in change.old_bricks
         ]
     commit += [Migrate(node) for node in change.exchanged if change.stateful(node)]
     for replica in change.born():
         commit += [Transfer(f"{change.leader}/{part}", f"{replica}/{part}") for part in STATEFUL]
-    commit.append(Together(tuple(_exchanges(change))))
-    # Whoever took a place begins only when its predecessor has stopped: they read the same channels.
-    commit.append(Together((*_resumes(change, drains), Resume(leads))))
-    return _prepare(change), commit
-
-
-def _prepare(change: _Change) -> list[Step]:
-    """Stage what is new, and give it its ends of channels."""
-    stages = [_stage_of(change, node) for node in (*change.exchanged, *change.added_nodes)]
-    binds = [_bind(k) for k in change.binds() if {k.source, k.sink} & change.staged]
-    return [*stages, *binds]
-
-
-def _stage_of(change: _Change, node: str, *, held: bool | None = None) -> Step:
-    bricks = tuple(change.new_bricks[b] for b in change.new.nodes[node])
-    return Stage(node, bricks, change.held(node) if held is None else held)
-
-
-def _exchanges(change: _Change) -> list[Step]:
-    """What the nodes hear of at once: who takes whose place, and the channels of those that stay."""
     moved = [
         _bind(k)
         for k in change.binds()
-        if not k.standby and not {k.source, k.sink} <= change.staged and k.key not in change.old_links
+        if not k.standby and not {k.source, k.sink} <= staged and k.key not in change.old_links
     ]
-    return [*(Exchange(node) for node in change.exchanged), *moved, *change.unbinds()]
+    commit.append(Together((*map(Exchange, change.exchanged), *moved, *change.unbinds())))
 
-
-def _resumes(change: _Change, drains: list[str]) -> list[Resume]:
-    """Whoever waits, but the leader's Protocol."""
-    first = change.new.node_of(f"{change.leader}/protocol")
-    kept = [b for b in drains if b in change.new_bricks and b not in change.staged]
-    drained = {change.new.node_of(b): b for b in drains if b in change.new_bricks}
+    # What took a place begins only when its predecessor has stopped: they read the same channels.
+    first = new.node_of(leads)
+    drained = {new.node_of(b): b for b in drains if b in change.new_bricks}
     held = [n for n in (*change.exchanged, *change.added_nodes) if change.held(n) and n != first]
-    return [Resume(drained.get(n, change.new.nodes[n][0])) for n in held] + [Resume(b) for b in kept]
+    kept = [b for b in drains if b in change.new_bricks and b not in staged]
+    resumed = [*(drained.get(n, new.nodes[n][0]) for n in held), *kept, leads]
+    commit.append(Together(tuple(map(Resume, resumed))))
+    return prepare, commit
+
+
+def _paper(change: _Change) -> list[Step]:
+    """SIGSTOP the Protocol, kill, launch, link, SIGCONT (paper, III-B). All of it while the client waits."""
+    frozen = [p for s in _servers(change.old) if (p := f"{s.replica}/protocol") not in change.staged]
+    commit: list[Step] = [Freeze(brick) for brick in frozen]
+    commit += [Destroy(node) for node in (*change.exchanged, *change.removed_nodes)]
+    commit += [_stage(change, n, held=False) for n in (*change.exchanged, *change.added_nodes)]
+    linked = [_bind(k) for k in change.binds() if not k.standby]
+    return [*commit, Together((*linked, *change.unbinds())), *(Thaw(brick) for brick in frozen)]
+
+
+def _stage(change: _Change, node: str, *, held: bool) -> Stage:
+    return Stage(node, tuple(change.new_bricks[b] for b in change.new.nodes[node]), held)
 
 
 def _bind(link: Link) -> Bind:
     same = link.source_port == link.sink_port
     return Bind(link.source, link.source_port, link.sink, "" if same else link.sink_port)
-
-
-def _paper(change: _Change) -> Steps:
-    """SIGSTOP the Protocol, kill, launch, link, SIGCONT (paper, III-B). All of it while the client waits."""
-    frozen = [p for s in _servers(change.old) if (p := f"{s.replica}/protocol") not in change.staged]
-    commit: list[Step] = [Freeze(brick) for brick in frozen]
-    commit += [Destroy(node) for node in (*change.exchanged, *change.removed_nodes)]
-    commit += [_stage_of(change, n, held=False) for n in (*change.exchanged, *change.added_nodes)]
-    linked = [_bind(k) for k in change.binds() if not k.standby]
-    return [], [*commit, Together((*linked, *change.unbinds())), *(Thaw(brick) for brick in frozen)]

@@ -91,7 +91,7 @@ class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     high_bandwidth_kbit_s_min: Rate = 256.0
 
 
-class Table(msgspec.Struct, frozen=True):
+class SuitabilityTable(msgspec.Struct, frozen=True):
     """The rows, by mechanism, and the limits."""
 
     rows: dict[str, Row]
@@ -124,10 +124,10 @@ class Demand(msgspec.Struct, frozen=True):
 ROWS: Final = tuple(
     Row(mechanism=one.name, **msgspec.structs.asdict(one.suitability)) for one in MECHANISMS.values()
 )
-TABLE: Final = Table({row.mechanism: row for row in ROWS})
+TABLE: Final = SuitabilityTable({row.mechanism: row for row in ROWS})
 
 
-def table_from(file: TableFile, where: str) -> Table:
+def table_from(file: TableFile, where: str) -> SuitabilityTable:
     """The shipped table with the rows of `file` in it; `where` names the file. Raises ConfigError."""
     for index, row in enumerate(file.rows):
         if row.mechanism not in MECHANISMS:
@@ -136,7 +136,7 @@ def table_from(file: TableFile, where: str) -> Table:
     for name, times in Counter(row.mechanism for row in file.rows).items():
         if times > 1:
             raise ConfigError(f"{where}: rows: found {times} for {name}, allowed is one")
-    return Table(TABLE.rows | {row.mechanism: row for row in file.rows}, file.limits)
+    return SuitabilityTable(TABLE.rows | {row.mechanism: row for row in file.rows}, file.limits)
 
 
 def fault_model(text: str) -> FaultModel:
@@ -148,7 +148,7 @@ def fault_model(text: str) -> FaultModel:
     return FaultModel(**{fault: fault in names for fault in FAULTS})
 
 
-def demand(expression: str, table: Table = TABLE) -> Demand:
+def demand(expression: str, table: SuitabilityTable = TABLE) -> Demand:
     """What `expression` tolerates and needs. Raises ConfigError if it is none."""
     names = parse(expression)
     rows = [table.rows[name] for name in names]
@@ -177,7 +177,7 @@ def problems(
     faults: FaultModel,
     characteristics: Characteristics,
     resources: Resources,
-    table: Table = TABLE,
+    table: SuitabilityTable = TABLE,
 ) -> list[str]:
     """Every assumption of `expression` that does not hold, a sentence each; [] if it is consistent.
 
@@ -201,7 +201,10 @@ def problems(
 
 
 def consistent(
-    faults: FaultModel, characteristics: Characteristics, resources: Resources, table: Table = TABLE
+    faults: FaultModel,
+    characteristics: Characteristics,
+    resources: Resources,
+    table: SuitabilityTable = TABLE,
 ) -> list[str]:
     """The consistent expressions, the cheapest first; [] is "no consistent FTM".
 
@@ -229,7 +232,7 @@ def refusal(
     faults: FaultModel,
     characteristics: Characteristics,
     resources: Resources,
-    table: Table = TABLE,
+    table: SuitabilityTable = TABLE,
 ) -> str:
     """Why `expression` must not run here, with the expressions that may; "" if it may."""
     found = problems(expression, faults, characteristics, resources, table)

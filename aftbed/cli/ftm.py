@@ -16,7 +16,7 @@ from aftbed.adapt.suitability import (
     TABLE,
     Demand,
     Resources,
-    Table,
+    SuitabilityTable,
     TableFile,
     consistent,
     demand,
@@ -141,7 +141,7 @@ def _print_verdict(expression: str | None, found: list[str], notes: list[str], o
         print(f"{expression} is not consistent; {would_do}" if found else f"{expression} is consistent")
 
 
-def _table(path: str | None) -> Table:
+def _table(path: str | None) -> SuitabilityTable:
     if path is None:
         return TABLE
 

@@ -172,7 +172,7 @@ class Again(Message, frozen=True, array_like=True, gc=False, tag=15):
     request_id: int
 
 
-class Promote(Message, frozen=True, array_like=True, gc=False, tag=20):
+class Promotion(Message, frozen=True, array_like=True, gc=False, tag=20):
     """Runtime to the brick of a backup that receives from its leader: drain to the end, then take over."""
 
     epoch: int
@@ -334,7 +334,7 @@ WireMessage = (  # between bricks
 )
 AnyMessage = (  # all that a brick may receive
     WireMessage
-    | Promote
+    | Promotion
     | Promoted
     | Rebound
     | ChannelEnded

@@ -29,8 +29,8 @@ from aftbed.core.errors import PeerError
 from aftbed.core.events import Event
 from aftbed.core.messages import (
     ChannelEnded,
-    Promote,
     Promoted,
+    Promotion,
     Rebound,
     Reply,
     Request,
@@ -272,7 +272,7 @@ def learn_duplex(port: str) -> Handler:
     return learn_duplex
 
 
-def promote(brick: Any, msg: Promote) -> list[Effect]:
+def promote(brick: Any, msg: Promotion) -> list[Effect]:
     """Remember the epoch to lead under; the channel is still to be drained."""
     if msg.epoch <= brick.epoch:
         raise PeerError(f"promoted to epoch {msg.epoch} while {brick.state.name} in epoch {brick.epoch}")
@@ -283,7 +283,7 @@ def promote(brick: Any, msg: Promote) -> list[Effect]:
 def lead(port: str) -> Handler:
     """The channel is drained, and this replica is promoted: TakeOver goes behind all that came from there."""
 
-    def lead(brick: Any, msg: ChannelEnded | Promote) -> list[Effect]:
+    def lead(brick: Any, msg: ChannelEnded | Promotion) -> list[Effect]:
         brick.epoch, brick.promote_epoch, brick.duplex = brick.promote_epoch, 0, False
         return [Send(port, TakeOver(brick.epoch))]
 
@@ -293,7 +293,7 @@ def lead(port: str) -> Handler:
 def promote_at_once(port: str) -> Handler:
     """The channel is drained already."""
 
-    def promote_at_once(brick: Any, msg: Promote) -> list[Effect]:
+    def promote_at_once(brick: Any, msg: Promotion) -> list[Effect]:
         return promote(brick, msg) + lead(port)(brick, msg)
 
     return promote_at_once

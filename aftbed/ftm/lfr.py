@@ -39,7 +39,7 @@ from aftbed.core.events import Event
 from aftbed.core.messages import (
     ChannelEnded,
     Notification,
-    Promote,
+    Promotion,
     Rebound,
     Reply,
     Request,
@@ -101,11 +101,11 @@ class LfrBefore(Machine):
         (_B.LEADING, "pro2bfr", Request): (forward, SAME_STATE),
         (_B.FOLLOWING, "bfr2bfr", Request): (follow, SAME_STATE),
         (_B.FOLLOWING, "bfr2bfr", ChannelEnded): (ignore, _B.ENDED),
-        (_B.FOLLOWING, CONTROL, Promote): (promote, _B.PROMOTED),
+        (_B.FOLLOWING, CONTROL, Promotion): (promote, _B.PROMOTED),
         (_B.PROMOTED, "bfr2bfr", Request): (follow, SAME_STATE),
         (_B.PROMOTED, "bfr2bfr", ChannelEnded): (lead("bfr2prd"), _B.LEADING),
-        (_B.PROMOTED, CONTROL, Promote): (promote, SAME_STATE),
-        (_B.ENDED, CONTROL, Promote): (promote_at_once("bfr2prd"), _B.LEADING),
+        (_B.PROMOTED, CONTROL, Promotion): (promote, SAME_STATE),
+        (_B.ENDED, CONTROL, Promotion): (promote_at_once("bfr2prd"), _B.LEADING),
         (_B.ENDED, "bfr2bfr", Request): (follow, _B.FOLLOWING),  # another channel was bound since
         (_B.ENDED, "bfr2bfr", ChannelEnded): (ignore, SAME_STATE),
         (ANY_STATE, CONTROL, Rebound): (learn_duplex("bfr2bfr"), SAME_STATE),

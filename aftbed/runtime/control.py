@@ -14,8 +14,8 @@ from aftbed.core.messages import (
     Adapted,
     HoldAt,
     Progress,
-    Promote,
     Promoted,
+    Promotion,
     Rebound,
     Release,
     RequestHeld,
@@ -31,7 +31,7 @@ from aftbed.vehicle.condition import Condition
 WHOLE: Final = 1.0  # of a CPU
 UNANSWERED: Final = 0  # the token of an order that gets no Ack
 
-Told = Promote | Rebound | Watch | Situation | Adapt | Progress | TakeUp | HoldAt | Release
+Told = Promotion | Rebound | Watch | Situation | Adapt | Progress | TakeUp | HoldAt | Release
 Spoken = Promoted | Adapted | RequestHeld  # what bricks say to the runtime
 NOWHERE: Final = -1  # the index of a port that is to lead nowhere
 

@@ -469,7 +469,7 @@ class Execution:
         part, _ = replication_of(deployment.graph.ftm)[0]  # the first to hear of the leader
         brick = f"{replica}/{part}"
         # The end of the channel from the leader, which the fence made, wakes it.
-        promote = control.Tell(control.UNANSWERED, brick, messages.Promote(epoch))
+        promote = control.Tell(control.UNANSWERED, brick, messages.Promotion(epoch))
         deployment.leave(deployment.graph.node_of(brick), promote)
         promoted = ("promoted", f"{replica}/protocol", epoch)
         self._promoting = Wait(frozenset({promoted}), frozenset(slot.nodes), PROMOTE_SECONDS_MAX)

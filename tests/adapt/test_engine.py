@@ -19,7 +19,7 @@ from aftbed.adapt.engine import (
 from aftbed.core.brick import CONTROL, Effect, Note, Order, Send
 from aftbed.core.errors import PeerError
 from aftbed.core.events import Event
-from aftbed.core.messages import Adapt, Adapted, AnyMessage, Progress, Promote, Rebound, TakeUp
+from aftbed.core.messages import Adapt, Adapted, AnyMessage, Progress, Promotion, Rebound, TakeUp
 from aftbed.core.script import Phase
 from aftbed.ftm.compose import build
 
@@ -159,7 +159,7 @@ ILLEGAL: Final = [
         for state in EngineState
         if state is not EngineState.IDLE
     ),
-    *((state, Promote(2)) for state in EngineState),
+    *((state, Promotion(2)) for state in EngineState),
 ]
 
 

@@ -96,7 +96,7 @@ def test_the_sender_of_a_packet_over_the_limit_is_us() -> None:
     "value",
     [
         [99, 1, 1],  # no such tag
-        [20, 2],  # Promote: between the runtime and a brick, never on a channel
+        [20, 2],  # Promotion: between the runtime and a brick, never on a channel
         [1, 1, "one", b""],  # a wrong type
         [1, 1],  # too short
         {"epoch": 1},  # not an array

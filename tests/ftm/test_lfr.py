@@ -11,7 +11,7 @@ from aftbed.core.events import Event
 from aftbed.core.messages import (
     ChannelEnded,
     Notification,
-    Promote,
+    Promotion,
     Rebound,
     Reply,
     Request,
@@ -160,7 +160,7 @@ def test_when_the_leader_is_gone_what_is_held_and_what_comes_is_stored() -> None
 
 def test_promoted_it_works_off_what_was_forwarded_before_it_leads() -> None:
     brick = following_before()
-    assert brick.step(CONTROL, Promote(2), 0) == []
+    assert brick.step(CONTROL, Promotion(2), 0) == []
     assert brick.open_ports() == ("bfr2bfr",)
     assert [type(m) for _, m in sends(brick.step("bfr2bfr", REQUEST, 0))] == [Request]
     assert brick.step("bfr2bfr", ChannelEnded(), 0) == [Send("bfr2prd", TakeOver(2))]
@@ -171,7 +171,7 @@ def test_the_channel_may_end_before_the_promotion() -> None:
     brick = following_before()
     assert brick.step("bfr2bfr", ChannelEnded(), 0) == []
     assert brick.state is LfrBeforeState.ENDED
-    assert brick.step(CONTROL, Promote(2), 0) == [Send("bfr2prd", TakeOver(2))]
+    assert brick.step(CONTROL, Promotion(2), 0) == [Send("bfr2prd", TakeOver(2))]
 
 
 @pytest.mark.parametrize("epoch", [0, 1])
@@ -179,14 +179,14 @@ def test_a_promotion_to_an_epoch_that_does_not_grow_is_refused(epoch: int) -> No
     brick = following_before()
     before = inspected(brick)
     with pytest.raises(PeerError, match=f"promoted to epoch {epoch} while FOLLOWING in epoch 1"):
-        brick.step(CONTROL, Promote(epoch), 0)
+        brick.step(CONTROL, Promotion(epoch), 0)
     assert inspected(brick) == before
 
 
 def test_who_leads_is_not_promoted() -> None:
     brick = leading_before()
-    with pytest.raises(PeerError, match="Promote on control while LEADING"):
-        brick.step(CONTROL, Promote(2), 0)
+    with pytest.raises(PeerError, match="Promotion on control while LEADING"):
+        brick.step(CONTROL, Promotion(2), 0)
 
 
 def test_after_leads_behind_all_replies_and_says_so() -> None:
@@ -214,7 +214,7 @@ def test_who_took_over_serves_alone_until_it_is_given_a_follower() -> None:
     before.step(CONTROL, Rebound("bfr2bfr", True, 1), 0)  # of their time as followers: it counts no more
     after.step(CONTROL, Rebound("aft2aft", True, 1), 0)
     before.step("bfr2bfr", ChannelEnded(), 0)
-    before.step(CONTROL, Promote(2), 0)
+    before.step(CONTROL, Promotion(2), 0)
     after.step("prd2aft", TakeOver(2), 0)
     request, reply = Request(2, 8, b"what"), Reply(2, 8, 2, b"more")
     assert sends(before.step("pro2bfr", request, 0)) == [("bfr2prd", request)]

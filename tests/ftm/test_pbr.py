@@ -10,7 +10,7 @@ from aftbed.core.messages import (
     CaptureState,
     ChannelEnded,
     Checkpoint,
-    Promote,
+    Promotion,
     Rebound,
     Reply,
     RestoreState,
@@ -98,8 +98,8 @@ def test_who_leads_is_not_promoted(capturing: bool) -> None:
     if capturing:
         brick.step("prd2aft", REPLY, 0)
     before = inspected(brick)
-    with pytest.raises(PeerError, match="Promote on control while"):
-        brick.step(CONTROL, Promote(2), 0)
+    with pytest.raises(PeerError, match="Promotion on control while"):
+        brick.step(CONTROL, Promotion(2), 0)
     assert inspected(brick) == before
 
 
@@ -147,7 +147,7 @@ def test_the_restoring_of_another_request_is_refused() -> None:
 
 def test_promoted_it_drains_its_channel_to_the_end_before_it_leads() -> None:
     brick = backup()
-    assert brick.step(CONTROL, Promote(2), 0) == []
+    assert brick.step(CONTROL, Promotion(2), 0) == []
     assert brick.state is PbrAfterState.PROMOTED and brick.open_ports() == ("aft2aft",)
     brick.step("aft2aft", CHECKPOINT, 0)  # was still in the channel
     stored = brick.step("srv2aft", StateRestored(1, 7), 0)
@@ -160,13 +160,13 @@ def test_the_channel_may_end_before_the_promotion() -> None:
     brick = backup()
     assert brick.step("aft2aft", ChannelEnded(), 0) == []
     assert brick.state is PbrAfterState.ENDED
-    assert brick.step(CONTROL, Promote(2), 0) == [Send("aft2pro", TakeOver(2))]
+    assert brick.step(CONTROL, Promotion(2), 0) == [Send("aft2pro", TakeOver(2))]
 
 
 def test_promoted_while_it_applies_a_checkpoint_it_waits_for_that_and_for_the_end() -> None:
     brick = backup()
     brick.step("aft2aft", CHECKPOINT, 0)
-    assert brick.step(CONTROL, Promote(2), 0) == []
+    assert brick.step(CONTROL, Promotion(2), 0) == []
     applied = brick.step("srv2aft", StateRestored(1, 7), 0)
     assert notes(applied) == [Event.CHECKPOINT_APPLIED]
     assert brick.state is PbrAfterState.PROMOTED
@@ -178,23 +178,23 @@ def test_a_promotion_to_an_epoch_that_does_not_grow_is_refused(epoch: int) -> No
     brick = backup()
     before = inspected(brick)
     with pytest.raises(PeerError, match=f"promoted to epoch {epoch} while STANDBY in epoch 1"):
-        brick.step(CONTROL, Promote(epoch), 0)
+        brick.step(CONTROL, Promotion(epoch), 0)
     assert inspected(brick) == before
 
 
 def test_it_leads_once() -> None:
     brick = backup()
     brick.step("aft2aft", ChannelEnded(), 0)
-    brick.step(CONTROL, Promote(2), 0)
-    with pytest.raises(PeerError, match="Promote on control while IDLE"):
-        brick.step(CONTROL, Promote(3), 0)
+    brick.step(CONTROL, Promotion(2), 0)
+    with pytest.raises(PeerError, match="Promotion on control while IDLE"):
+        brick.step(CONTROL, Promotion(3), 0)
 
 
 def test_who_took_over_serves_alone_until_it_is_given_a_backup() -> None:
     brick = backup()
     brick.step(CONTROL, Rebound("aft2aft", True, 1), 0)  # of its time as a backup: it counts no more
     brick.step("aft2aft", ChannelEnded(), 0)
-    brick.step(CONTROL, Promote(2), 0)
+    brick.step(CONTROL, Promotion(2), 0)
     reply = Reply(2, 8, 2, b"more")
     brick.step("prd2aft", reply, 0)
     assert sends(brick.step("srv2aft", StateCaptured(2, 8, STATE), 0)) == [("aft2pro", reply)]

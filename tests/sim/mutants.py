@@ -38,7 +38,7 @@ from aftbed.core.brick import CONTROL, Choice, Effect, Send
 from aftbed.core.messages import (
     ChannelEnded,
     Checkpoint,
-    Promote,
+    Promotion,
     Rebound,
     Reply,
     Request,
@@ -70,10 +70,10 @@ _TWO_AT_ONCE: Final = {
     )
 }
 _CHECKPOINTS_NOT_DRAINED: Final = {
-    (PbrAfterState.STANDBY, CONTROL, Promote): (promote_at_once("aft2pro"), PbrAfterState.IDLE)
+    (PbrAfterState.STANDBY, CONTROL, Promotion): (promote_at_once("aft2pro"), PbrAfterState.IDLE)
 }
 _REQUESTS_NOT_DRAINED: Final = {
-    (LfrBeforeState.FOLLOWING, CONTROL, Promote): (promote_at_once("bfr2prd"), LfrBeforeState.LEADING)
+    (LfrBeforeState.FOLLOWING, CONTROL, Promotion): (promote_at_once("bfr2prd"), LfrBeforeState.LEADING)
 }
 
 

@@ -20,7 +20,7 @@ from aftbed.core.messages import (
     CaptureState,
     ChannelEnded,
     Message,
-    Promote,
+    Promotion,
     Rebound,
     Reply,
     Request,
@@ -79,7 +79,7 @@ def rehearse(rounds: int) -> None:
         _link(node, *way, epoch=1)
     _serve(node, requests[:rounds])
     after = node.bricks["b/after"]
-    node.step(after, CONTROL, Promote(2))
+    node.step(after, CONTROL, Promotion(2))
     node.step(after, "aft2aft", ChannelEnded())
     _link(node, ("b/protocol", "pro2pxy"), ("proxy", "pro2pxy"), epoch=2)
     _link(node, ("proxy", "pxy2pro"), ("b/protocol", "pxy2pro"), epoch=2)
@@ -200,7 +200,7 @@ def _rehearse_mail() -> None:
 def _rehearse_promotion() -> None:
     scratch = _Scratch(PbrAfter(1, leads=False), ("aft2aft", "srv2aft"), ("aft2srv", "aft2pro", "aft2aft"))
     into, _ = scratch.into["aft2aft"]
-    scratch.order(control.Tell(control.UNANSWERED, "brick", Promote(2)))
+    scratch.order(control.Tell(control.UNANSWERED, "brick", Promotion(2)))
     into.shutdown(socket.SHUT_WR)
     scratch.turns(2)  # the nudge and the order with it, then the end
     scratch.close()
