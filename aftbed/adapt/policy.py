@@ -24,7 +24,7 @@ dwell bounds it.
 
 from functools import cache
 from itertools import combinations
-from typing import Annotated, Final, Literal, get_args
+from typing import Annotated, Final, Literal
 
 import msgspec
 from msgspec import Meta
@@ -40,7 +40,6 @@ Resource = Literal["cpus", "cpu_load", "bandwidth_kbit_s", "traffic_kbit_s"]
 Seconds = Annotated[float, Meta(ge=0.001, le=86_400)]
 Value = Annotated[float, Meta(ge=0, le=1e9)]
 
-SYMPTOMS: Final[tuple[str, ...]] = get_args(Symptom)
 VERBS: Final = ("to", "switch", "compose", "decompose")
 COUNT_MAX: Final = 1000
 RULES_MAX: Final = 64

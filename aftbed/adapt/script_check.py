@@ -27,7 +27,6 @@ from aftbed.core.errors import unknown
 from aftbed.core.graph import PLACEMENTS, Graph
 from aftbed.core.script import (
     RECIPES,
-    STEPS_MAX,
     Align,
     Attach,
     Bind,
@@ -57,6 +56,7 @@ from aftbed.ftm.compose import EXPRESSIONS, NONE, REPLICAS, STATEFUL, build, rep
 from aftbed.ftm.registry import KINDS
 
 REQUEST_PORTS: Final = ("pxy2pro", "pro2bfr", "bfr2prd", "prd2srv")  # the way of a request, as outputs
+STEPS_MAX: Final = 1024
 _OF_NODES: Final = (Migrate, Exchange, Retire, Destroy)
 
 Rule = Callable[[Script], list[str]]

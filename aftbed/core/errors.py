@@ -1,9 +1,8 @@
-"""Error classes by who has to act: the user, a peer, or us.
+"""Error classes by what has to change: the input of the user, a peer, or our code.
 
-`ConfigError` and `ScriptError` are for the user (exit code 2), `PeerError` is for a frame or a
-message that must not be believed, `AdaptationError` for an adaptation that did not complete,
-`HarnessError` for trouble of the testbed itself (exit code 3, never a pass: G8). A failed `assert`
-is ours: it ends the node, because fail-silence is the fault model.
+`ConfigError` and `ScriptError` are for the user (exit code 2), `PeerError` is for a frame or a message that
+must not be believed, `HarnessError` for trouble of the testbed itself (exit code 3, never a pass: G8). A
+failed `assert` is a bug of ours: it ends the node, because fail-silence is the fault model.
 """
 
 import difflib
@@ -24,10 +23,6 @@ class ScriptError(ConfigError):
 
 class PeerError(AftbedError):
     """A peer sent what it may not send. The receiver's state is unchanged."""
-
-
-class AdaptationError(AftbedError):
-    """An adaptation that was rolled back; the graph that was there goes on."""
 
 
 class StepFailed(Exception):  # noqa: N818 - a situation within a task, never shown as it is

@@ -86,7 +86,6 @@ REQUEST_PATH: Final = (  # one request under PBR
     Event.REPLY_DELIVERED,
 )
 REQUEST_EVENTS: Final = frozenset(event for event in Event if event.weight is Weight.ROUTINE)
-TURNING_POINTS: Final = frozenset(event for event in Event if event.weight is Weight.TURNING_POINT)
 STEP_EVENTS: Final = frozenset((Event.ADAPT_STEP_ENTER, Event.ADAPT_STEP_ACT, Event.ADAPT_STEP_EXIT))
 FIRST_FAULT: Final = 1_000_001  # number of the first fault of a run, in the detail of `fault.applied`
 

@@ -48,7 +48,7 @@ class Record(msgspec.Struct, frozen=True, gc=False):
 
 
 class EntryKind(IntEnum):
-    """What an entry of a dialogue tells."""
+    """What an entry of a dialogue is about."""
 
     SENT = 1
     ANSWERED = 2
@@ -62,6 +62,22 @@ class Entry(msgspec.Struct, frozen=True, gc=False):
     epoch: int
     kind: EntryKind
     payload: bytes
+
+
+class History(msgspec.Struct, frozen=True):
+    """What a run leaves behind: the records of all its nodes, by journal, and the dialogue of its client.
+
+    Real processes and the simulator produce the same type, so one judge reads both.
+    """
+
+    journals: dict[str, list[Record]]
+    dialogue: list[Entry]
+    dropped: int = 0  # records that found no room, whose content is not known
+
+    def events(self, *wanted: Event) -> list[Record]:
+        """The records of these events, of all nodes, by time."""
+        found = [r for records in self.journals.values() for r in records if r.event in wanted]
+        return sorted(found, key=lambda record: record.t_ns)
 
 
 Data = bytes | memoryview  # of a whole file, or of its beginning

@@ -168,7 +168,6 @@ Step = (
     | Stage | Migrate | Exchange | Retire | Freeze | Thaw | Destroy | Together
 )  # fmt: skip
 RECIPES: Final = ("drained", "paper")
-STEPS_MAX: Final = 1024
 
 
 class Phase(Enum):

@@ -14,8 +14,7 @@ import msgspec
 from aftbed.core.errors import PeerError
 from aftbed.core.events import RERUN, Event
 from aftbed.core.graph import Graph
-from aftbed.core.history import History
-from aftbed.core.journal import Entry, EntryKind, Record
+from aftbed.core.journal import Entry, EntryKind, History, Record
 from aftbed.ftm.compose import build, replication_of
 from aftbed.judge.record import Excuses, RunRecord
 from aftbed.judge.reference import ReferenceRun

@@ -9,8 +9,7 @@ from pathlib import Path
 import msgspec
 
 from aftbed.core.errors import ConfigError, PeerError
-from aftbed.core.history import History
-from aftbed.core.journal import dropped, entries, records
+from aftbed.core.journal import History, dropped, entries, records
 from aftbed.inject.model import FaultReport
 from aftbed.inject.receipts import ReceiptState
 from aftbed.runtime.hosting import Hosted

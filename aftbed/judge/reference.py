@@ -19,8 +19,7 @@ from aftbed.adapt.plugins import load_application
 from aftbed.core.application import Application
 from aftbed.core.errors import PeerError
 from aftbed.core.events import Event
-from aftbed.core.history import History
-from aftbed.core.journal import EntryKind
+from aftbed.core.journal import EntryKind, History
 from aftbed.judge.record import RunRecord
 from aftbed.runtime.deployment import replica_of
 from aftbed.runtime.hosting import digest

@@ -14,8 +14,8 @@ from typing import Final
 
 import msgspec
 
-from aftbed.core import history as core_history
 from aftbed.core.errors import ConfigError
+from aftbed.core.journal import History
 from aftbed.core.messages import Scheduled
 from aftbed.judge import checks
 from aftbed.judge.outcome import outcome_of
@@ -100,7 +100,7 @@ def _compare(setup: Setup, records: list[RunRecord], seeds: int) -> Agreement:
     )
 
 
-def _recoveries(history: core_history.History) -> list[float]:
+def _recoveries(history: History) -> list[float]:
     return [f.recovered_ms for f in checks.failovers(history) if f.recovered_ms is not None]
 
 

@@ -11,7 +11,6 @@ from policies import ACTIONS, COMPOSE, DECOMPOSE, TO_LFR, TO_PBR, S, read
 
 from aftbed.adapt.observer import symptoms
 from aftbed.adapt.policy import (
-    SYMPTOMS,
     Action,
     Beyond,
     Burst,
@@ -19,6 +18,7 @@ from aftbed.adapt.policy import (
     PolicyFile,
     Quiet,
     Resource,
+    Symptom,
     action,
     conflict,
     policy_from,
@@ -211,12 +211,12 @@ def test_a_file_that_is_no_policy_is_refused(tmp_path: Path, text: str, reason: 
 )
 def test_what_an_event_is_a_symptom_of(event: Event, detail: int, found: tuple[str, ...]) -> None:
     assert symptoms(event, detail) == found
-    assert set(found) <= set(SYMPTOMS)
+    assert set(found) <= set(get_args(Symptom))
 
 
 def test_the_page_names_every_symptom_and_resource_and_its_policy_can_be_read(tmp_path: Path) -> None:
     page = (Path(__file__).resolve().parents[2] / "docs" / "ftar.md").read_text()
-    for name in (*SYMPTOMS, *get_args(Resource)):
+    for name in (*get_args(Symptom), *get_args(Resource)):
         assert f"`{name}`" in page, name
     text = page.split("```yaml file=policy.yaml\n")[1].split("```")[0]
     path = tmp_path / "policy.yaml"

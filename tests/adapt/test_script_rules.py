@@ -3,9 +3,8 @@
 import msgspec
 import pytest
 
-from aftbed.adapt.script_check import problems
+from aftbed.adapt.script_check import STEPS_MAX, problems
 from aftbed.core.script import (
-    STEPS_MAX,
     Attach,
     Bind,
     Fence,

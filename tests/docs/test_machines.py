@@ -2,12 +2,12 @@
 
 from typing import Final
 
+from diagram import mermaid
 from pages import ROOT
 
 from aftbed.adapt.engine import AdaptationEngine
 from aftbed.core.application import Application
 from aftbed.core.brick import Machine
-from aftbed.ftm.diagram import mermaid
 from aftbed.ftm.registry import BRICKS, Setting
 from aftbed.vehicle.aeb.function import default_application
 

@@ -4,8 +4,7 @@ import zlib
 
 from aftbed.core.errors import PeerError
 from aftbed.core.events import RERUN, Event
-from aftbed.core.history import History
-from aftbed.core.journal import Entry, EntryKind, Record
+from aftbed.core.journal import Entry, EntryKind, History, Record
 from aftbed.judge import checks
 from aftbed.judge.checks import Check
 from aftbed.judge.reference import reference_run

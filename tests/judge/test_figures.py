@@ -4,8 +4,7 @@ import pytest
 from tales import MS, Sums, Tale, good
 
 from aftbed.core.events import Event
-from aftbed.core.history import History
-from aftbed.core.journal import Entry, EntryKind, Record
+from aftbed.core.journal import Entry, EntryKind, History, Record
 from aftbed.judge import checks
 from aftbed.judge.checks import LATE_NS, Failover, Requests
 from aftbed.judge.reference import reference_run

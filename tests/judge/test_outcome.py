@@ -8,8 +8,7 @@ import pytest
 
 from aftbed.campaign.experiment import Experiment, carry_out
 from aftbed.core.events import Event
-from aftbed.core.history import History
-from aftbed.core.journal import Entry, EntryKind, Record
+from aftbed.core.journal import Entry, EntryKind, History, Record
 from aftbed.judge.checks import LATE_NS
 from aftbed.judge.outcome import OUTCOMES, outcome_of, worst
 from aftbed.judge.reference import reference_run

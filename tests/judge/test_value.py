@@ -6,8 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aftbed.core.history import History
-from aftbed.core.journal import Entry, EntryKind
+from aftbed.core.journal import Entry, EntryKind, History
 from aftbed.inject.bit_patterns import with_flipped
 from aftbed.inject.model import FaultReport
 from aftbed.inject.receipts import ReceiptState

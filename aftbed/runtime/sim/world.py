@@ -14,8 +14,7 @@ import msgspec
 from aftbed.adapt.plugins import LoadModule
 from aftbed.core.application import Application
 from aftbed.core.graph import Graph, Link
-from aftbed.core.history import History
-from aftbed.core.journal import Entry, EntryKind, Record
+from aftbed.core.journal import Entry, EntryKind, History, Record
 from aftbed.core.messages import Goal, Scheduled
 from aftbed.ftm.client import Client
 from aftbed.inject.kind import FaultKind
