@@ -200,8 +200,10 @@ def test_a_paced_drive_meets_its_condition_and_heals(tmp_path: Path) -> None:
     (struck,) = drive.struck
     gap = virtual("omission bus AEB_REQ when ttc < 2.5 for 100ms").struck[0]
     assert gap.first_us - 10_000 <= struck.first_us <= gap.first_us + 400_000
-    assert 1 <= struck.frames <= 8 and struck.receipt.state.value == "activated"
-    assert drive.of(AEB_REQ)[-1].t_us > struck.first_us + 1_000_000
+    assert struck.frames >= 1 and struck.receipt.state.value == "activated"
+    carried_us = [frame.t_us for frame in drive.of(AEB_REQ)]
+    assert not [t for t in carried_us if struck.first_us <= t < struck.first_us + 100_000]
+    assert carried_us[-1] > struck.first_us + 1_000_000, "healed"
     assert not drive.result.collision
 
 
