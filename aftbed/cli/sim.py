@@ -44,9 +44,9 @@ from aftbed.judge.simulated import record_of
 from aftbed.judge.verdict import EXIT_CODES, EXIT_INTERRUPTED, Breach, Verdict, Word, evidence_of, judge
 from aftbed.report import sequence
 from aftbed.runtime.sim.clock import START_NS
-from aftbed.runtime.sim.givens import check as check_fault
 from aftbed.runtime.sim.trace import traced
 from aftbed.runtime.sim.world import Run, Setup
+from aftbed.runtime.sim.world import check as check_fault
 from aftbed.runtime.unix.worker_pool import each
 from aftbed.search.agreement import SEEDS, RecoveryRange, against
 from aftbed.search.explore import Found, attempt, missed, tried

@@ -18,7 +18,7 @@ from aftbed.core.journal import Entry, EntryKind, History, Record
 from aftbed.ftm.compose import build, replication_of
 from aftbed.judge.record import Excuses, RunRecord
 from aftbed.judge.reference import ReferenceRun
-from aftbed.runtime.hosting import Hosted
+from aftbed.runtime.deployment import Hosted
 from aftbed.runtime.unix.options import COMMAND_GONE, CarRun
 from aftbed.vehicle.aeb.messages import AebOutput, decode_reply
 from aftbed.vehicle.scenarios.library import load_scenario

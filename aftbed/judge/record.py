@@ -12,7 +12,7 @@ from aftbed.core.errors import ConfigError, PeerError
 from aftbed.core.journal import History, dropped, entries, records
 from aftbed.inject.model import FaultReport
 from aftbed.inject.receipts import ReceiptState
-from aftbed.runtime.hosting import Hosted
+from aftbed.runtime.deployment import Hosted
 from aftbed.runtime.unix.journal_files import contents
 from aftbed.runtime.unix.options import CarRun, RunOptions
 from aftbed.runtime.unix.support import HISTORY_NAME

@@ -21,8 +21,7 @@ from aftbed.core.errors import PeerError
 from aftbed.core.events import Event
 from aftbed.core.journal import EntryKind, History
 from aftbed.judge.record import RunRecord
-from aftbed.runtime.deployment import replica_of
-from aftbed.runtime.hosting import digest
+from aftbed.runtime.deployment import digest, replica_of
 from aftbed.runtime.unix.part import load_module
 from aftbed.vehicle.aeb.function import default_application
 

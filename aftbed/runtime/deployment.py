@@ -9,6 +9,9 @@ Proxy are pinned beside the leader, a Watchdog to another core than the replica 
 to another one than the leader: a core on which a replica has died is busy with taking it down for a while.
 """
 
+import contextlib
+import functools
+import hashlib
 import itertools
 from collections.abc import Callable, Container, Generator, Iterable
 from typing import Final
@@ -26,6 +29,11 @@ from aftbed.runtime.tasks import STEP_SECONDS_MAX, Key, Wait
 ChannelKey = tuple[str, str, str]  # source, its port, sink
 
 
+def key_of(link: Link) -> ChannelKey:
+    """By which a channel is found."""
+    return link.source, link.source_port, link.sink
+
+
 class Channels:
     """All channels between nodes, found by their ends."""
 
@@ -36,7 +44,7 @@ class Channels:
 
     def renew(self, link: Link) -> Channel:
         """A fresh channel for `link`; the old one is let go."""
-        key = (link.source, link.source_port, link.sink)
+        key = key_of(link)
         old = self._all.pop(key, None)
         if old is not None:
             old.close()
@@ -45,14 +53,14 @@ class Channels:
 
     def make_beside(self, link: Link) -> Channel:
         """The channel of `link`, which the graph that runs does not have; a fresh one, if need be."""
-        key = (link.source, link.source_port, link.sink)
+        key = key_of(link)
         if key not in self.beside:
             self.beside[key] = self._make(link)
         return self.beside[key]
 
     def adopt(self, links: Iterable[Link]) -> None:
         """From now on the graph that runs has these links; what it does not have stays beside, open."""
-        kept = {(k.source, k.source_port, k.sink) for k in links}
+        kept = set(map(key_of, links))
         known = self._all | self.beside
         self._all = {key: channel for key, channel in known.items() if key in kept}
         self.beside = {key: channel for key, channel in known.items() if key not in kept}
@@ -68,21 +76,20 @@ class Channels:
         return [c for c in self._all.values() if c.link.source in bricks or c.link.sink in bricks]
 
     def into(self, brick: str) -> list[Channel]:
-        """Those that lead to `brick`."""
-        return [c for c in self._all.values() if c.link.sink == brick]
+        """Those that lead to `brick`, in the graph that runs or beside it."""
+        return [c for c in (*self._all.values(), *self.beside.values()) if c.link.sink == brick]
 
     def get(self, source: str, port: str, sink: str) -> Channel | None:
         """The channel from `port` of `source` to `sink`."""
         return self._all.get((source, port, sink))
 
-    def items(self) -> list[tuple[tuple[str, str, str], Channel]]:
+    def items(self) -> list[tuple[ChannelKey, Channel]]:
         """All of them, each with its source, port and sink."""
         return list(self._all.items())
 
     def drop(self, channel: Channel) -> None:
         """Let go of `channel`."""
-        link = channel.link
-        self._all.pop((link.source, link.source_port, link.sink), None)
+        self._all.pop(key_of(channel.link), None)
         channel.close()
 
     def __len__(self) -> int:
@@ -100,6 +107,8 @@ class Cores:
 
     def of(self, node: str, hosted: tuple[str, ...], leader: str) -> int | None:
         """The core of `node`, which hosts these bricks, while `leader` leads."""
+        if not self._of_replica:
+            return None
         if node.endswith("/watchdog"):
             return self._other_than(node.partition("/")[0])
         if hosted and all("/" in brick for brick in hosted):
@@ -117,8 +126,11 @@ WATCHED_KINDS: Final = ("client", "proxy", "watchdog", "recovery", "engine")
 HANG_NS: Final = 150_000_000  # where no Watchdog watches: a process with an older pulse hangs
 BIRTH_SECONDS_MAX: Final = 10.0  # each makes its journal first, and a disk may be busy
 
+DIGEST_DIGITS: Final = 16
+
 Keys = Generator[Wait, dict[Key, bytes], None]
-Staged = tuple[Process, tuple[Key, str]]  # a process, and the key of its Ack with its name
+Sent = tuple[Key, str]  # an order: the key of its Ack, the name of its process
+Staged = tuple[Process, Sent]
 
 
 def replica_of(name: str) -> str:
@@ -137,8 +149,23 @@ class Slot:
         self.nodes: list[str] = []
 
 
+class Hosted(msgspec.Struct, frozen=True):
+    """What lives of a graph. `leader` and `backup`: replicas, or `""`; `bricks`: names with their kinds."""
+
+    ftm: str
+    placement: str
+    leader: str
+    backup: str
+    bricks: tuple[tuple[str, str], ...]
+
+
+def digest(state: bytes) -> str:
+    """Short, for a record; equal states have the same."""
+    return hashlib.sha256(state).hexdigest()[:DIGEST_DIGITS]
+
+
 class Deployment:
-    """`leader` and `backup` are names of slots, or `""`."""
+    """`leader` and `backup` are names of slots, or `""`; `singles`: the nodes that belong to no replica."""
 
     def __init__(self, graph: Graph, runtime: Runtime, cpus: list[int] | None) -> None:
         self.runtime, self.pool = runtime, runtime.pool
@@ -158,16 +185,16 @@ class Deployment:
         what was suspected of its predecessor means nothing. What is suspected of a `lost` one stands.
         """
         self.graph = graph
-        for slot in self.slots.values():
-            self._generations[slot.name] = slot.generation
+        self._generations |= {slot.name: slot.generation for slot in self.slots.values()}
         self.slots = {}
+        of_replicas = {b.name: b.replica for b in graph.bricks if b.replica and b.kind not in WATCHED_KINDS}
+        watched = {b.name for b in graph.bricks if b.kind in WATCHED_KINDS}
+        self.singles = {n for n, hosted in graph.nodes.items() if watched & set(hosted[:1])}
         for name in REPLICAS:
-            bricks = frozenset(
-                b.name for b in graph.bricks if b.replica == name and b.kind not in WATCHED_KINDS
-            )
-            if graph.placement == "single":  # one node, so one fate: whoever leads in it
-                bricks = frozenset(b.name for b in graph.bricks if b.replica and b.kind not in WATCHED_KINDS)
-                bricks = bricks if name == self.leader else frozenset()
+            if graph.placement == "single":  # one node, so one fate: that of the replica that leads in it
+                bricks = frozenset(of_replicas if name == self.leader else ())
+            else:
+                bricks = frozenset(brick for brick, replica in of_replicas.items() if replica == name)
             if bricks:
                 slot = self.slots[name] = Slot(name, bricks)
                 slot.nodes = [n for n in self.nodes_of(slot) if self.lives(n)]
@@ -175,7 +202,7 @@ class Deployment:
 
     def nodes_of(self, slot: Slot) -> list[str]:
         """The nodes of the graph that make up a replica."""
-        return [n for n, hosted in self.graph.nodes.items() if set(hosted) <= slot.bricks]
+        return [n for n, hosted in self.graph.nodes.items() if slot.bricks.issuperset(hosted)]
 
     # -- orders -------------------------------------------------------------------------------
 
@@ -187,43 +214,36 @@ class Deployment:
         return process
 
     def order(
-        self, node: str, make: Callable[[int], control.ToNode], fds: tuple[int, ...] = ()
-    ) -> tuple[Key, str]:
-        """Send an order to `node`, waking it; the key of its Ack. Raises StepFailed if it is gone."""
-        return self.order_to(self.process(node), make, fds)
+        self, host: str | Process, make: Callable[[int], control.ToNode], fds: tuple[int, ...] = ()
+    ) -> Sent:
+        """Send an order to a node, or to a process that is staged or was exchanged, and wake it.
 
-    def order_to(
-        self, process: Process, make: Callable[[int], control.ToNode], fds: tuple[int, ...] = ()
-    ) -> tuple[Key, str]:
-        """The same to a process that may serve or not: one that is staged, or was exchanged."""
-        if not process.alive:
-            raise StepFailed(f"{process.name} is gone")
+        Raises StepFailed if it is gone.
+        """
+        process = self.process(host) if isinstance(host, str) else host
         self._tokens += 1
-        token = self._tokens
-        self._announce(process, make(token), fds)
+        self._send(process, make(self._tokens), fds)
         self._nudge(process.name)
-        return ("ack", process.name, token), process.name
+        return ("ack", process.name, self._tokens), process.name
 
     def leave(self, node: str, order: control.ToNode, fds: tuple[int, ...] = ()) -> None:
         """Leave an order, unanswered, for when `node` wakes up next. Raises StepFailed if it is gone."""
-        process = self.process(node)
-        if not process.alive:
-            raise StepFailed(f"{node} is gone")
         assert order.token == control.UNANSWERED
-        self._announce(process, order, fds)
+        self._send(self.process(node), order, fds)
 
-    def _announce(self, process: Process, order: control.ToNode, fds: tuple[int, ...]) -> None:
+    def _send(self, process: Process, order: control.ToNode, fds: tuple[int, ...]) -> None:
+        if not process.alive:
+            raise StepFailed(f"{process.name} is gone")
         self.pool.order(process, order, fds)
         process.announce()
 
     def _nudge(self, node: str) -> None:
         for brick in self.graph.nodes.get(node, ()):
-            for channel in (*self.channels.into(brick), *self.channels.beside.values()):
-                if channel.link.sink == brick:
-                    channel.nudge()
+            for channel in self.channels.into(brick):
+                channel.nudge()
 
     def nudge_late(self) -> None:
-        """Nudge again whoever has not looked at its control mail: it may have changed its inputs since."""
+        """Nudge again each node that has not read its orders: it may have changed its inputs since."""
         for node, process in self.nodes.items():
             if process.alive and process.announced():
                 self._nudge(node)
@@ -235,16 +255,15 @@ class Deployment:
         fds: tuple[int, ...] = (),
         seconds: float = STEP_SECONDS_MAX,
     ) -> Generator[Wait, dict[Key, bytes], bytes]:
-        """Send an order to a node, or to any process, and wait for its answer.
+        """Send an order and wait for its answer.
 
-        Raises StepFailed if it is gone, dies, refuses, or takes too long.
+        Raises StepFailed if the process is gone, dies, refuses, or takes too long.
         """
-        process = self.process(host) if isinstance(host, str) else host
-        key, name = self.order_to(process, make, fds)
+        key, name = self.order(host, make, fds)
         got = yield Wait(frozenset({key}), frozenset({name}), seconds)
         return got[key]
 
-    def answers(self, sent: Iterable[tuple[Key, str]], seconds: float = STEP_SECONDS_MAX) -> Keys:
+    def answers(self, sent: Iterable[Sent], seconds: float = STEP_SECONDS_MAX) -> Keys:
         """Wait for the answers to several orders. Raises StepFailed, also if a node has died before."""
         pairs = list(sent)
         for _, name in pairs:
@@ -330,81 +349,75 @@ class Deployment:
     def respawn(self, node: str, *, held: bool = False) -> Keys:
         """Replace a dead node of no replica: fresh channels, and its neighbours are told."""
         (brick,) = self.graph.nodes[node]
-        touching = [c.link for c in self.channels.touching(frozenset({brick})) if not self._held(c)]
-        for link in touching:
-            self.channels.renew(link)
+        for channel in self.channels.touching(frozenset({brick})):
+            if not self._held(channel):
+                self.channels.renew(channel.link)
         yield from self.answers([(yield from self._assign(node, held=held))])
         channels = [c for c in self.channels.touching(frozenset({brick})) if not self._held(c)]
         # The way back stands before anything is asked on the way there: a new Client asks as soon as it is
         # read, an old one asks again as soon as it may write.
         into = [c for c in channels if c.link.sink == brick]
-        sent = [self._rebind_output(c) for c in into if c.link.source != "client"]
-        sent += [self._rebind_input(c) for c in channels if c.link.source == brick]
-        sent += [self._rebind_output(c) for c in into if c.link.source == "client"]
-        yield from self.answers(pair for pair in sent if pair is not None)
+        sent = [one for c in into if c.link.source != "client" for one in self._hand(c, reading=False)]
+        sent += [one for c in channels if c.link.source == brick for one in self._hand(c, reading=True)]
+        sent += [one for c in into if c.link.source == "client" for one in self._hand(c, reading=False)]
+        yield from self.answers(sent)
         for slot in self.slots.values():
             if node == f"{slot.name}/watchdog":
                 yield from self.watch(slot)
 
-    def _assign(self, node: str, *, held: bool = False) -> Generator[Wait, dict[Key, bytes], tuple[Key, str]]:
-        """Make a spare this node, with its ends of channels. Returns the key of its Ack."""
-        bricks = frozenset(self.graph.nodes[node])
-        inputs, outputs, fds = self._ends(bricks)
-        process, sent = yield from self._make(node, node, self.graph, inputs, outputs, fds, held=held)
+    def _assign(self, node: str, *, held: bool = False) -> Generator[Wait, dict[Key, bytes], Sent]:
+        """Make a spare this node, with its ends of channels."""
+        process, sent = yield from self._make(node, self.graph, staged=False, held=held)
         process.kind = ProcessKind.NODE
         self.nodes[node] = process
         return sent
 
     def stage(self, node: str, graph: Graph, *, held: bool) -> Generator[Wait, dict[Key, bytes], Staged]:
-        """Make a spare this node of `graph`, beside what serves, without any channel."""
-        stranger = any(graph.brick(b).source or graph.brick(b).application for b in graph.nodes[node])
-        name = f"{node}{STAGED}"
-        return (yield from self._make(name, node, graph, [], [], [], held=held, trial=stranger))
+        """Make a spare this node of `graph`, beside the nodes that serve, without any channel."""
+        return (yield from self._make(node, graph, staged=True, held=held))
 
     def _make(
-        self,
-        name: str,
-        node: str,
-        graph: Graph,
-        inputs: list[control.Port],
-        outputs: list[control.Port],
-        fds: list[int],
-        *,
-        held: bool,
-        trial: bool = False,
+        self, node: str, graph: Graph, *, staged: bool, held: bool
     ) -> Generator[Wait, dict[Key, bytes], Staged]:
-        specs = tuple(graph.brick(name) for name in graph.nodes[node])
+        names = frozenset(graph.nodes[node])
+        specs = tuple(map(graph.brick, graph.nodes[node]))
+        inputs, outputs, fds = ([], [], []) if staged else self._ends(names)
         incarnation = self.incarnations[node] = self.incarnations.get(node, 0) + 1
         device, options = self.runtime.device(specs[0].kind, incarnation)
         process = yield from self.pool.spare(BUS if device == "gateway" else LIGHT)
-        process.name, process.kind, process.incarnation = name, ProcessKind.STAGED, incarnation
+        process.name = f"{node}{STAGED}" if staged else node
+        process.kind, process.incarnation = ProcessKind.STAGED, incarnation
         process.journal = self.runtime.journal_of(node, incarnation)
         process.bricks = tuple((spec.name, spec.kind) for spec in specs)
-        names = {s.name for s in specs}
-        locals_ = tuple(
-            control.Local(k.source, k.source_port, k.sink, k.sink_port)
-            for k in graph.links
-            if {k.source, k.sink} <= names
+        trial = None
+        if staged and any(spec.source or spec.application for spec in specs):
+            trial = control.Trial(graph, self.runtime.recorded_requests())
+        sent = self.order(
+            process,
+            lambda token: control.Assign(
+                token,
+                node,
+                process.journal,
+                specs,
+                self.epoch,
+                self.leader,
+                tuple(inputs),
+                tuple(outputs),
+                tuple(
+                    control.Local(k.source, k.source_port, k.sink, k.sink_port)
+                    for k in graph.links
+                    if k.source in names and k.sink in names
+                ),
+                self.cpu_of(node, graph),
+                held,
+                staged,
+                self.cpu_of("recovery"),
+                trial,
+                device,
+                options,
+            ),
+            tuple(fds),
         )
-        order = control.Assign(
-            0,
-            node,
-            process.journal,
-            specs,
-            self.epoch,
-            self.leader,
-            tuple(inputs),
-            tuple(outputs),
-            locals_,
-            self.cpu_of(node, graph),
-            held,
-            name != node,
-            self.cpu_of("recovery"),
-            control.Trial(graph, self.runtime.recorded_requests()) if trial else None,
-            device,
-            options,
-        )
-        sent = self.order_to(process, lambda token: msgspec.structs.replace(order, token=token), tuple(fds))
         return process, sent
 
     def cpu_of(self, node: str, graph: Graph | None = None) -> int | None:
@@ -454,33 +467,37 @@ class Deployment:
                 fds.append(channel.write.fileno())
         return inputs, outputs, fds
 
-    def _rebind_input(self, channel: Channel) -> tuple[Key, str] | None:
-        """Hand the reading end to its brick, if that lives."""
+    def _hand(self, channel: Channel, *, reading: bool) -> list[Sent]:
+        """Hand an end of `channel` to its brick, if that lives."""
         link = channel.link
-        node = self.graph.node_of(link.sink)
+        node = self.graph.node_of(link.sink if reading else link.source)
         if not self.lives(node):
-            return None
-        return self.order(
-            node,
-            lambda token: control.BindInput(token, link.sink, link.sink_port),
-            (channel.read.fileno(),),
-        )
+            return []
 
-    def _rebind_output(self, channel: Channel) -> tuple[Key, str] | None:
-        """Hand the writing end to its brick, if that lives."""
-        link = channel.link
-        node = self.graph.node_of(link.source)
-        if not self.lives(node):
-            return None
-        return self.order(
-            node,
-            lambda token: control.BindOutput(token, link.source, link.source_port, self.epoch),
-            (channel.write.fileno(),),
-        )
+        def order(token: int) -> control.BindInput | control.BindOutput:
+            if reading:
+                return control.BindInput(token, link.sink, link.sink_port)
+            return control.BindOutput(token, link.source, link.source_port, self.epoch)
 
-    def rebind(self, channel: Channel) -> list[tuple[Key, str]]:
-        """Both ends, the reading one first."""
-        return [p for p in (self._rebind_input(channel), self._rebind_output(channel)) if p is not None]
+        return [self.order(node, order, ((channel.read if reading else channel.write).fileno(),))]
+
+    # -- what there is ------------------------------------------------------------------------
+
+    def hosted(self) -> Hosted:
+        """What lives now, as far as is known: a node that is dead, and not yet seen dead, lives."""
+        living = [p for p in self.pool.processes if p.alive and p.kind is not ProcessKind.KILLED]
+        bricks = tuple(sorted(brick for process in living for brick in process.bricks))
+        return Hosted(self.graph.ftm, self.graph.placement, self.leader, self.backup, bricks)
+
+    def ask_states(self, found: dict[str, str]) -> Keys:
+        """Put the digest of each Server's state into `found`, by replica; a function may hand out none."""
+        for replica in (self.leader, self.backup):
+            server = f"{replica}/server"
+            if any(brick.name == server for brick in self.graph.bricks):
+                order = functools.partial(control.Capture, brick=server, look=True)
+                with contextlib.suppress(StepFailed):
+                    state = yield from self.ask(self.graph.node_of(server), order)
+                    found |= {replica: digest(state)} if state else {}
 
     def lives(self, node: str) -> bool:
         """Whether the process of `node` is there."""

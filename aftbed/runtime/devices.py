@@ -242,7 +242,7 @@ class CarDevice:
         return self.link.deadline_ns()
 
     @property
-    def idle(self) -> bool:
+    def done(self) -> bool:
         """Every request that was made is answered."""
         return not self._payloads and not self._client.unanswered
 

@@ -301,7 +301,7 @@ class FaultController:
 
     def slow_down(self, process: TargetProcess, number: int, by_ns: int, share: float) -> tuple[Key, str]:
         """Order it."""
-        return self._deployment.order_to(
+        return self._deployment.order(
             cast("Process", process), lambda token: control.SlowDown(token, number, by_ns, share)
         )
 

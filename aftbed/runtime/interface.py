@@ -22,6 +22,8 @@ from aftbed.vehicle.condition import Condition
 LIGHT: Final = "zygote"  # bricks
 BUS: Final = "zygote.bus"  # and CAN
 
+DRAW_BITS: Final = 63  # of the chance of a fault
+
 
 class End(Protocol):
     """An end of a channel; its number is what travels with an order."""

@@ -16,7 +16,7 @@ from aftbed.core.graph import End, Graph, Link
 from aftbed.core.script import Bind, Exchange, Step, Unbind
 from aftbed.ftm.registry import KINDS
 from aftbed.runtime import control
-from aftbed.runtime.deployment import Deployment, Keys, replica_of
+from aftbed.runtime.deployment import ChannelKey, Deployment, Keys, key_of, replica_of
 from aftbed.runtime.interface import Channel, Process
 from aftbed.runtime.tasks import Key
 
@@ -81,8 +81,8 @@ class Rebinding:
         self._prepared: tuple[Sequence[Step], Present, Changes] | None = None
 
     @cached_property
-    def _bound(self) -> set[tuple[str, str, str]]:
-        return {_key(link) for link in self._origin.links} if self._origin is not None else set()
+    def _bound(self) -> set[ChannelKey]:
+        return {key_of(link) for link in self._origin.links} if self._origin is not None else set()
 
     @cached_property
     def _bricks(self) -> set[str]:
@@ -141,7 +141,7 @@ class Rebinding:
         if target.node_of(link.source) == target.node_of(link.sink):
             return  # within one node, which knows of it
         channel = self._channel(link)
-        known = _key(link) in self._bound
+        known = key_of(link) in self._bound
         for brick, port, side, fd in (
             (link.sink, link.sink_port, INPUT, channel.read.fileno()),
             (link.source, link.source_port, OUTPUT, channel.write.fileno()),
@@ -169,7 +169,7 @@ class Rebinding:
         channels = self._deployment.channels
         if self._origin is None:
             return channels.renew(link)
-        return channels.get(*_key(link)) or channels.make_beside(link)
+        return channels.get(*key_of(link)) or channels.make_beside(link)
 
     # -- sending ------------------------------------------------------------------------------
 
@@ -189,14 +189,10 @@ class Rebinding:
     def _order(self, change: PortChanges) -> tuple[Key, str]:
         inputs, outputs, fds = change.order
         epoch, suspend = self._deployment.epoch, change.suspend
-        return self._deployment.order_to(
+        return self._deployment.order(
             change.process, lambda token: control.Rewire(token, inputs, outputs, epoch, suspend), fds
         )
 
 
 def _of(changes: Changes, process: Process) -> PortChanges:
     return changes.setdefault(id(process), PortChanges(process))
-
-
-def _key(link: Link) -> tuple[str, str, str]:
-    return link.source, link.source_port, link.sink

@@ -18,7 +18,7 @@ from aftbed.core.graph import Graph
 from aftbed.core.script import LOSSES, Phase, ScriptKind
 from aftbed.runtime import control
 from aftbed.runtime.adaptations import CLIENT, ENGINE, REPLACE, Adaptations
-from aftbed.runtime.deployment import HANG_NS, WATCHED_KINDS, Deployment
+from aftbed.runtime.deployment import HANG_NS, Deployment
 from aftbed.runtime.fault_controller import FaultController
 from aftbed.runtime.interface import LIGHT, Process, ProcessKind, Runtime
 from aftbed.runtime.script_executor import ScriptExecutor
@@ -56,15 +56,16 @@ class RunController:
         self.ending = False
         self.scripts: list[ScriptRun] = []  # of Recovery
 
-    def at_rest(self) -> bool:
-        """Nothing is under way, and nobody who should serve is missing, as far as is known."""
-        deployment, tasks = self.deployment, self._loop.tasks
-        if self.executor.busy or self.adaptations.busy or len(tasks):
-            return False
-        absent = {
-            n for slot in deployment.slots.values() if slot.name != deployment.leader for n in slot.nodes
-        }
-        return all(deployment.lives(node) for node in deployment.graph.nodes if node not in absent)
+    def unrest(self) -> list[str]:
+        """Why the run is not at rest, as far as is known; a backup may be missing."""
+        deployment = self.deployment
+        found = ["a script is under way"] if self.executor.busy or self.adaptations.busy else []
+        found += [f"{name} is under way" for name in self._loop.tasks.names()]
+        needed = set(deployment.graph.nodes)
+        for slot in deployment.slots.values():
+            if slot.name != deployment.leader:
+                needed -= set(slot.nodes)
+        return found + [f"{node} is missing" for node in sorted(needed) if not deployment.lives(node)]
 
     def spares(self) -> int:
         """Enough for a replica and for one node beside it."""
@@ -171,7 +172,7 @@ class RunController:
         self._loop.tasks.died(process.name)
         if process.kind is ProcessKind.SPARE:
             self._runtime.pool.refill(LIGHT, self.spares())
-        elif process.kind is ProcessKind.NODE and self.replaceable(process.name):
+        elif process.kind is ProcessKind.NODE and process.name in self.deployment.singles:
             if process.name != ENGINE:
                 self.adaptations.give_up_preparing(f"{process.name} died")
             self._replace(process.name)
@@ -182,8 +183,8 @@ class RunController:
         """What no Watchdog watches and shows no pulse is killed, and so replaced."""
         now_ns = self._loop.now_ns()
         for process in list(self._runtime.pool.processes):
-            watched = process.kind is ProcessKind.NODE and self.replaceable(process.name)
-            if watched and process.hangs(now_ns, HANG_NS):
+            single = process.kind is ProcessKind.NODE and process.name in self.deployment.singles
+            if single and process.hangs(now_ns, HANG_NS):
                 self._runtime.log("hangs", f"{process.name} (pid {process.pid}): killed, to be replaced")
                 process.kill()
 
@@ -201,14 +202,9 @@ class RunController:
         self._runtime.log("lost", "no replica is left: the service is gone")
         self._on_loss()
 
-    def replaceable(self, node: str) -> bool:
-        """Whether `node` is one of the graph that belongs to no replica."""
-        bricks = self.deployment.graph.nodes.get(node, ())
-        return bool(bricks) and self.deployment.graph.brick(bricks[0]).kind in WATCHED_KINDS
-
     def _replace(self, node: str) -> None:
         under_way = f"{REPLACE}{node}" in self._loop.tasks.names()
-        if not self.replaceable(node) or under_way or self.deployment.lives(node):
+        if node not in self.deployment.singles or under_way or self.deployment.lives(node):
             return  # the graph that runs by now has no place for it, or it is taken
         if self.adaptations.acting:  # both hand channels out
             self._loop.after(RETRY_SECONDS, lambda: self._replace(node))

@@ -379,7 +379,7 @@ class Execution:
         sent = []
         for step in steps:
             before_ns = self._runtime.loop.now_ns()
-            sent.append(self._deployment.order_to(self._rebinding.host(step.brick), control.Resume))
+            sent.append(self._deployment.order(self._rebinding.host(step.brick), control.Resume))
             self.done.append(step)
             if step.brick == f"{self._deployment.leader}/protocol":
                 self.turned_ns = before_ns
@@ -403,7 +403,7 @@ class Execution:
         """Both are asked at once."""
         deployment, host = self._deployment, self._rebinding.host
         sent = [
-            deployment.order_to(host(brick), functools.partial(control.Capture, brick=brick))
+            deployment.order(host(brick), functools.partial(control.Capture, brick=brick))
             for brick in (source, sink)
         ]
         got = yield Wait(frozenset(k for k, _ in sent), frozenset(n for _, n in sent), STEP_SECONDS_MAX)
@@ -646,7 +646,7 @@ class Execution:
         for brick in bricks:
             if replica_of(brick) not in self.lost:
                 with suppress(StepFailed):
-                    self._deployment.order_to(self._rebinding.host(brick), control.Resume)
+                    self._deployment.order(self._rebinding.host(brick), control.Resume)
 
 
 def end(process: Process) -> None:

@@ -31,8 +31,7 @@ from aftbed.core.messages import Scheduled
 from aftbed.ftm.compose import DUPLEX, build, parse, replication_of
 from aftbed.inject.model import Fault
 from aftbed.judge.verdict import Breach
-from aftbed.runtime.sim.givens import check
-from aftbed.runtime.sim.world import Doom, Setup
+from aftbed.runtime.sim.world import Doom, Setup, check
 
 TRIES_MAX: Final = 400
 CAR_COUNT: Final = 100  # requests in the place of a car

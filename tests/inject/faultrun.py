@@ -92,7 +92,7 @@ class FakeDeployment:
             raise StepFailed(f"{node}: no")
         return b""
 
-    def order_to(
+    def order(
         self, process: FakeProcess, make: Callable[[int], control.SlowDown]
     ) -> tuple[tuple[str, str, int], str]:
         self.told.append((process.name, make(1)))

@@ -14,7 +14,7 @@ from aftbed.judge.outcome import OUTCOMES, outcome_of, worst
 from aftbed.judge.reference import reference_run
 from aftbed.judge.simulated import record_of
 from aftbed.judge.verdict import evidence_of
-from aftbed.runtime.hosting import Hosted
+from aftbed.runtime.deployment import Hosted
 from aftbed.runtime.sim.world import Run, Setup, simulate
 from aftbed.vehicle.aeb.function import default_application
 

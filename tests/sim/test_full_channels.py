@@ -11,7 +11,7 @@ import pytest
 from aftbed.core.events import Event
 from aftbed.core.journal import EntryKind
 from aftbed.inject.model import parse
-from aftbed.runtime.sim.channels import QUEUE_MAX
+from aftbed.runtime.sim.node_io import QUEUE_MAX
 from aftbed.runtime.sim.world import Run, Setup, simulate
 
 COUNT: Final = 500

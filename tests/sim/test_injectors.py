@@ -16,8 +16,7 @@ from aftbed.inject.model import parse
 from aftbed.inject.receipts import fault_and_bits
 from aftbed.judge.checks import corruptions
 from aftbed.judge.reference import reference_run
-from aftbed.runtime.sim.givens import graph_of
-from aftbed.runtime.sim.world import Run, Setup, World
+from aftbed.runtime.sim.world import Run, Setup, World, graph_of
 from aftbed.vehicle.aeb.function import default_application
 
 COUNT: Final = 40

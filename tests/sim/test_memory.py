@@ -8,8 +8,7 @@ from aftbed.core.events import Event
 from aftbed.inject.model import parse
 from aftbed.judge.checks import corruptions
 from aftbed.judge.reference import reference_run
-from aftbed.runtime.sim.givens import graph_of
-from aftbed.runtime.sim.world import Run, Setup, World
+from aftbed.runtime.sim.world import Run, Setup, World, graph_of
 from aftbed.vehicle.aeb.function import default_application
 
 COUNT: Final = 40

@@ -21,9 +21,8 @@ from aftbed.core.messages import Message, Notification, Suspect, TakeOver, Trial
 from aftbed.core.script import Phase
 from aftbed.inject.receipts import fault_and_bits
 from aftbed.runtime import control
-from aftbed.runtime.sim.channels import SimChannel
 from aftbed.runtime.sim.clock import Clock
-from aftbed.runtime.sim.node_io import SimNode
+from aftbed.runtime.sim.node_io import SimChannel, SimNode
 from aftbed.runtime.sim.processes import SimProcess
 from aftbed.runtime.sim.world import Setup, World
 

@@ -17,8 +17,8 @@ from typing import Final
 
 from aftbed.core.graph import Link
 from aftbed.core.messages import Message
-from aftbed.runtime.sim.channels import SimChannel
 from aftbed.runtime.sim.clock import Call, Carrier, Clock
+from aftbed.runtime.sim.node_io import SimChannel
 
 STEP_NS: Final = 1_000  # of virtual time, per delivery
 ON_ITS_WAY: Final = 1 << 62

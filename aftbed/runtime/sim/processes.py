@@ -5,6 +5,7 @@ lifeline (the Watchdog), later by the executive, as on Linux: 0.1 to 0.3 ms, and
 `runtime.unix.death_notice`).
 """
 
+import functools
 from collections import deque
 from collections.abc import Callable, Generator
 from typing import Final
@@ -16,10 +17,8 @@ from aftbed.runtime.assembly import Assembler
 from aftbed.runtime.devices import Device
 from aftbed.runtime.interface import ProcessKind
 from aftbed.runtime.node import Node
-from aftbed.runtime.sim.channels import SimChannel
 from aftbed.runtime.sim.clock import Clock
-from aftbed.runtime.sim.node_io import SimIO, SimNode
-from aftbed.runtime.sim.shared_memory import SimulatedMemory
+from aftbed.runtime.sim.node_io import SimChannel, SimIO, SimNode, SimulatedMemory
 from aftbed.runtime.tasks import Key, Wait
 
 SIGNAL_NS: Final = (5_000, 60_000)
@@ -208,6 +207,42 @@ class SimProcess:
     def announced(self) -> bool:
         """Whether an order is under way."""
         return False
+
+
+class SimSenses:
+    """The `Senses` of a Watchdog, which is woken by `wake`. `find`: a process by the number in an order."""
+
+    def __init__(self, find: Callable[[int], SimProcess], wake: Callable[[], None]) -> None:
+        self._find, self._wake = find, wake
+        self._nodes: dict[str, SimProcess] = {}
+
+    def watch(self, order: control.WatchNodes, fds: list[int], died: Callable[[str], None]) -> None:
+        """Watch these nodes and no others; a node that is dead already is noticed at once."""
+        watched = self._nodes = dict(zip(order.nodes, map(self._find, fds), strict=True))
+
+        def noticed(node: str) -> None:
+            if watched is self._nodes:
+                died(node)
+            self._wake()
+
+        for node, process in watched.items():
+            process.notice(functools.partial(noticed, node))
+
+    def forget(self) -> None:
+        """Watch no node."""
+        self._nodes = {}
+
+    def fds(self) -> tuple[int, ...]:
+        """None: deaths are noticed."""
+        return ()
+
+    def died(self, fd: int) -> list[str]:
+        """Never called."""
+        raise AssertionError(f"no descriptor {fd}")
+
+    def pulse_ns(self, node: str, now_ns: int) -> int:
+        """When `node` was last seen running."""
+        return self._nodes[node].pulse_ns(now_ns)
 
 
 class SimProcessPool:

@@ -20,8 +20,8 @@ from aftbed.core.graph import Link
 from aftbed.core.journal import Entry, EntryKind, Record
 from aftbed.core.messages import Message
 from aftbed.runtime.assembly import MakeSetting
-from aftbed.runtime.sim.channels import SimChannel
 from aftbed.runtime.sim.clock import START_NS, Clock
+from aftbed.runtime.sim.node_io import SimChannel
 from aftbed.runtime.sim.world import Run, Setup, World
 
 EXECUTIVE: Final = "supervisor.1"  # its journal

@@ -5,7 +5,9 @@ or out of order). When all of them have been, the run must come to rest within a
 answer, no script is under way, redundancy is back. It leaves a history, for the checkers of real runs.
 """
 
+import contextlib
 from collections.abc import Callable, Iterable
+from functools import lru_cache
 from random import Random
 from typing import Final, NoReturn
 
@@ -13,42 +15,45 @@ import msgspec
 
 from aftbed.adapt.plugins import LoadModule
 from aftbed.core.application import Application
+from aftbed.core.errors import ConfigError, PeerError
+from aftbed.core.events import Event
 from aftbed.core.graph import Graph, Link
 from aftbed.core.journal import Entry, EntryKind, History, Record
-from aftbed.core.messages import Goal, Scheduled
+from aftbed.core.messages import Goal, Reply, Scheduled
 from aftbed.ftm.client import Client
+from aftbed.ftm.compose import build, replication_of
+from aftbed.inject.bus import BusFault
+from aftbed.inject.bus_disturber import Disturber
 from aftbed.inject.kind import FaultKind
 from aftbed.inject.model import Fault, FaultReport
 from aftbed.inject.receipts import BusReport
+from aftbed.inject.shared_state import look
 from aftbed.runtime import control
 from aftbed.runtime.adaptations import Outcome
 from aftbed.runtime.assembly import Assembler, MakeSetting
-from aftbed.runtime.deployment import Keys
+from aftbed.runtime.deployment import Hosted, Keys, digest
 from aftbed.runtime.devices import CarDevice, Device, Load, Sensor, resume_client
-from aftbed.runtime.hosting import Hosted, hosted
-from aftbed.runtime.interface import Met, ProcessKind
+from aftbed.runtime.interface import DRAW_BITS, Met, ProcessKind
 from aftbed.runtime.run_controller import RunController, ScriptRun
-from aftbed.runtime.sim import ending
-from aftbed.runtime.sim.channels import SimChannel
 from aftbed.runtime.sim.clock import START_NS, Clock
-from aftbed.runtime.sim.devices import SimSenses, VirtualCarLink
-from aftbed.runtime.sim.drive import Drive
-from aftbed.runtime.sim.givens import SimJournal, check, graph_of, nothing_off_line, requests_of
-from aftbed.runtime.sim.node_io import SimIO, SimNode
-from aftbed.runtime.sim.processes import SimProcess, SimProcessPool
-from aftbed.runtime.sim.shared_memory import SimulatedMemory
+from aftbed.runtime.sim.node_io import SimChannel, SimIO, SimNode, SimulatedMemory
+from aftbed.runtime.sim.processes import SimProcess, SimProcessPool, SimSenses
 from aftbed.runtime.tasks import Wait
-from aftbed.vehicle.aeb.function import default_application
+from aftbed.vehicle.aeb.function import default_application, sample_requests
+from aftbed.vehicle.can.dbc_file import Codec, load_dbc
 from aftbed.vehicle.condition import Condition
-from aftbed.vehicle.plant import VehicleResult
+from aftbed.vehicle.drive_virtual import VirtualCar
+from aftbed.vehicle.plant import STEP_US, VehicleResult
+from aftbed.vehicle.scenarios.library import load_scenario
 
+REQUESTS: Final = 512  # of a load; then they repeat
+STEP_NS: Final = STEP_US * 1000  # of a car
 STOPPED: Final = "detected stop"  # in the reason of a death
 REST_NS_MAX: Final = 3_000_000_000  # from the last fault to the rest, in virtual time
 TICK_SECONDS: Final = 0.02  # as the supervisor looks after what no Watchdog watches
 STRAY_NS: Final = 5_000_000  # so long after the rest, what comes too late would still be seen
 LOOK_EVERY: Final = 32  # events between two looks at whether all is done
 EVENTS_MAX: Final = 20_000_000
-DRAW_BITS: Final = 63
 
 
 class Doom(msgspec.Struct, frozen=True):
@@ -100,11 +105,166 @@ class Run(msgspec.Struct, frozen=True):
     failures: tuple[str, ...]  # of asserts, in nodes
     vehicle: VehicleResult | None
     effects: dict[str, int]  # by brick: how many it has performed in its first life
-    struck: tuple[tuple[int, str], ...]  # who died, or was stopped, of a fault, and when
+    struck: tuple[tuple[int, str], ...]  # nodes that died, or were stopped, of a fault, and when
+
+
+@lru_cache(maxsize=8)
+def requests_of(seed: int) -> list[bytes]:
+    """The load of a seed."""
+    return sample_requests(seed, REQUESTS)
+
+
+@lru_cache(maxsize=64)
+def graph_of(ftm: str, placement: str) -> Graph:
+    """The graph that a run begins with."""
+    return build(ftm, placement)
+
+
+@lru_cache(maxsize=1)
+def own_codec() -> Codec:
+    """aftbed's own DBC."""
+    return load_dbc()
+
+
+def check(fault: Fault, scenario: str) -> None:
+    """Raise ConfigError if a simulated run has nothing that `fault` could strike, or wait for."""
+    if not fault.action.simulated:
+        raise ConfigError(f"{fault}: simulated processes have no memory of their own; use real ones")
+    if scenario:
+        return
+    if fault.action.needs_bus:
+        raise ConfigError(f"{fault}: without a scenario there is no bus")
+    if fault.trigger.when is not None:
+        raise ConfigError(f"{fault}: 'when' looks at the car, and without a scenario there is none")
+
+
+def nothing_off_line(place: str) -> NoReturn:
+    """No module is found. Raises ConfigError."""
+    raise ConfigError(f"{place}: the simulator loads nothing that was written off line")
+
+
+class ExecutiveJournal:
+    """The executive's records."""
+
+    def __init__(self, records: list[Record]) -> None:
+        self._records = records
+
+    def write(self, now_ns: int, event: Event, request_id: int, detail: int, brick: int = 0) -> None:
+        """Append one."""
+        self._records.append(Record(now_ns, event, request_id, detail, "supervisor", brick))
+
+
+class Drive:
+    """The car of a simulated run, and the `CarLink` of its client. It begins with the first client.
+
+    The car (`vehicle.drive_virtual`) is advanced on demand, which is once in a cycle of its radar. While a
+    condition is waited for, it is driven step by step: what begins on that condition begins at the very
+    virtual time of that step and, as in lockstep, before anything else that belongs to the step.
+    """
+
+    def __init__(self, scenario: str, seed: int, clock: Clock) -> None:
+        self._clock = clock
+        self._car = VirtualCar(load_scenario(scenario), seed=seed, codec=own_codec())
+        self._faults = Disturber()  # of its bus
+        self._began_ns = 0
+        self._wake: Callable[[], None] = lambda: None
+        self._under_way = self._stepping = False
+
+    def join(self, wake: Callable[[], None]) -> "Drive":
+        """Serve a client, which is woken where there may be requests."""
+        self._wake, self._began_ns = wake, self._began_ns or self._clock.ns
+        return self
+
+    # -- for the client: see `runtime.devices.CarLink` --------------------------------------------
+
+    def fds(self) -> tuple[int, ...]:
+        """None."""
+        return ()
+
+    def read(self) -> Iterable[bytes]:
+        """Never called."""
+        raise AssertionError("no descriptor")
+
+    def advance(self, now_ns: int) -> Iterable[bytes]:
+        """Drive up to `now_ns`: the requests that are made on the way."""
+        return self._car.advance(now_ns - self._began_ns)
+
+    def deliver(self, reply: Reply, now_ns: int) -> None:
+        """To the brakes."""
+        self._car.deliver(reply.payload, now_ns - self._began_ns, replica=reply.replica, epoch=reply.epoch)
+
+    def deadline_ns(self) -> int | None:
+        """The next frame of the radar."""
+        due = self._car.due_ns()
+        return None if due is None else due + self._began_ns
+
+    def counts(self) -> dict[str, object]:
+        """None."""
+        return {}
+
+    # -- for the run ------------------------------------------------------------------------------
+
+    @property
+    def over(self) -> bool:
+        """The car makes no more requests."""
+        return self._car.due_ns() is None
+
+    def go(self) -> None:
+        """The run is launched."""
+        self._under_way = True
+        self._step_by_step()
+
+    def result(self) -> VehicleResult:
+        """So far."""
+        return self._car.result()
+
+    def disturb(self, number: int, fault: FaultKind, draw: int) -> None:
+        """Arm `fault` in the car's bus. Raises ConfigError where it names what does not exist."""
+        assert isinstance(fault, BusFault), fault
+        fault = fault if fault.targets is not None else fault.resolved([own_codec()])
+        now_us = self._car.before(self._t_ns() if self._under_way else 0)
+        self._faults.arm(number, fault, draw, now_us)
+        self._car.disturb(self._faults)
+
+    def report(self, number: int) -> BusReport | None:
+        """What has become of a fault of the car's bus."""
+        return next((one for one in self._faults.reports() if one.number == number), None)
+
+    def watch(self, number: int, condition: Condition, met: Callable[[Met], None]) -> None:
+        """See `runtime.interface.Runtime`."""
+
+        def held(t_us: int) -> None:  # in the middle of a step, perhaps of the fault's target
+            self._clock.at(self._clock.ns, lambda: self._met(met, t_us))
+
+        self._car.watch(number, condition, held)
+        if self._under_way:
+            self._step_by_step()
+
+    def _met(self, met: Callable[[Met], None], t_us: int) -> None:
+        met(Met(t_us, 0, self._go_on))
+        self._clock.watch_jobs()
+
+    def _go_on(self) -> None:
+        self._car.go_on(self._t_ns())
+        self._clock.at(self._clock.ns, self._wake)
+
+    def _t_ns(self) -> int:
+        return self._clock.ns - self._began_ns
+
+    def _step_by_step(self) -> None:
+        if self._car.watched and not self._stepping:
+            self._stepping = True
+            self._clock.at(self._began_ns + -(-self._t_ns() // STEP_NS) * STEP_NS, self._step)
+
+    def _step(self) -> None:
+        self._car.pass_time(self._t_ns())
+        self._stepping = self._car.watched
+        if self._stepping:
+            self._clock.at(self._clock.ns + STEP_NS, self._step)
 
 
 class World:
-    """The `Support` of a simulated run, and the run itself."""
+    """The `Runtime` of a simulated run, and the run itself."""
 
     def __init__(
         self,
@@ -128,15 +288,16 @@ class World:
         self.told: list[tuple[int, str, str]] = []
         self._ends: dict[int, SimChannel] = {}
         self.failures: list[str] = []
-        self.struck: list[tuple[int, str]] = []  # who died, or was stopped, of a fault, and when
+        self.struck: list[tuple[int, str]] = []  # nodes that died, or were stopped, of a fault, and when
         self.effects: dict[str, int] = {}
         self.lost = False
-        self.journal = SimJournal(self.journals.setdefault("supervisor.1", []))
+        self.journal = ExecutiveJournal(self.journals.setdefault("supervisor.1", []))
         assembler = Assembler(function, load, make)
         self.pool = SimProcessPool(
             self.loop, assembler, self._make_device, self._ends.__getitem__, self._journal_for
         )
-        self.controller = RunController(graph_of(setup.ftm, setup.placement), self, None, self._on_loss)
+        graph = graph_of(setup.ftm, setup.placement)
+        self.controller = RunController(graph, self, None, lambda: setattr(self, "lost", True))
         self.pool.on_report = self._on_report
         self.pool.on_death = self._on_death
         self.pool.on_end = self._on_end
@@ -191,7 +352,7 @@ class World:
         yield Wait(frozenset())
 
     def flip_memory(self, process: object, bit: int | None, address: int | None, draw: int) -> NoReturn:
-        """Nobody asks for it: see `givens.check`."""
+        """Never called: see `check`."""
         raise AssertionError(f"{process} has no memory")
 
     def bus_fault(self, number: int) -> BusReport | None:
@@ -215,21 +376,12 @@ class World:
 
     def _make_device(self, order: control.Assign, io: SimIO) -> Device:
         if order.device == "sensor":
-            by_number = self.pool.by_number
-
-            def notice(number: int, call: Callable[[], None]) -> None:
-                def noticed() -> None:
-                    call()
-                    io.run()
-
-                by_number[number].notice(noticed)
-
-            return Sensor(SimSenses(by_number.__getitem__, notice))
+            return Sensor(SimSenses(self.pool.by_number.__getitem__, io.run))
         client = io.node.brick(order.bricks[0].name)
         assert isinstance(client, Client)
         resume_client(client, self.dialogue)
         if self._drive is not None:
-            return CarDevice(client, self, VirtualCarLink(*self._drive.seat(io.run)))
+            return CarDevice(client, self, self._drive.join(io.run))
         return Load(client, self, self._requests, self.setup.count, self.setup.rate_hz)
 
     def write(self, now_ns: int, request_id: int, epoch: int, kind: EntryKind, payload: bytes) -> None:
@@ -258,9 +410,6 @@ class World:
         for brick in node.bricks.values():
             self.effects.setdefault(brick.name, brick.performed)
 
-    def _on_loss(self) -> None:
-        self.lost = True
-
     # -- the run ------------------------------------------------------------------------------
 
     def _launch(self) -> Keys:
@@ -269,13 +418,9 @@ class World:
             yield from self.controller.faults.arm(fault)
         yield from self.controller.adaptations.schedule(self.setup.adaptations)
         for doom in self.setup.dooms:
-            self._doom(doom)
-
-    def _doom(self, doom: Doom) -> None:
-        deployment = self.controller.deployment
-        process = deployment.nodes.get(deployment.graph.node_of(doom.brick))
-        assert isinstance(process, SimProcess) and process.io is not None
-        process.io.die_before(doom.brick, doom.effect)
+            io = self._io_of(doom.brick)
+            assert io is not None, doom
+            io.die_before(doom.brick, doom.effect)
 
     def _on_launched(self, failure: str) -> None:
         assert not failure, f"the launch of {self.setup}: {failure}"
@@ -332,15 +477,59 @@ class World:
             if not loop.steps(LOOK_EVERY):
                 return
             loop.watch_jobs()
-            ended = ending.source_ended(self.controller.deployment, self.setup.count)
-            if not done_ns and (ended or (self.lost and self._drive is None)):
+            if not done_ns and (self._source_ended() or (self.lost and self._drive is None)):
                 done_ns = loop.ns
             if done_ns:
-                rested_ns = (rested_ns or loop.ns) if self.lost or not ending.unrest(self.controller) else 0
+                rested_ns = (rested_ns or loop.ns) if self.lost or not self._unrest() else 0
             late = loop.ns > self._limit_ns() or (done_ns and loop.ns > done_ns + REST_NS_MAX)
             if late or (rested_ns and loop.ns > rested_ns + STRAY_NS):
                 return
         raise AssertionError(f"no end in sight: {self.setup}")
+
+    def _io_of(self, brick: str) -> SimIO | None:
+        """That of the node that hosts `brick`, if it is not dead."""
+        deployment = self.controller.deployment
+        process = deployment.nodes.get(deployment.graph.node_of(brick))
+        return process.io if isinstance(process, SimProcess) and not process.dead else None
+
+    def _source_ended(self) -> bool:
+        """Whether all requests have been made, be they answered or not."""
+        io = self._io_of("client")
+        if io is None or io.node.device is None:
+            return False
+        if self._drive is not None:
+            return self._drive.over
+        client = io.node.brick("client")
+        return isinstance(client, Client) and client.next_id > self.setup.count
+
+    def _unrest(self) -> list[str]:
+        """Why the run has not come to rest."""
+        controller, deployment = self.controller, self.controller.deployment
+        io = self._io_of("client")
+        device = io.node.device if io is not None else None
+        found = []
+        if not isinstance(device, Load | CarDevice):
+            found.append("no client")
+        elif not device.done or not self._source_ended():
+            found.append("requests wait")
+        found += controller.unrest()
+        if controller.adaptations.to_come:
+            found.append("an adaptation is to come")
+        if replication_of(deployment.graph.ftm) and not deployment.backup:
+            found.append("no redundancy")
+        processes = [p for p in deployment.nodes.values() if isinstance(p, SimProcess)]
+        return found + [f"{p.name} is dead or stopped" for p in processes if p.stopped()][:1]
+
+    def _states(self) -> dict[str, str]:
+        """Digests by replica; none of one that is stopped, or whose function hands out no state."""
+        deployment, found = self.controller.deployment, dict[str, str]()
+        for replica in filter(None, (deployment.leader, deployment.backup)):
+            io = self._io_of(f"{replica}/server")
+            if io is not None and not io.frozen_ns:
+                with contextlib.suppress(PeerError):
+                    state = look(io.node.brick(f"{replica}/server"))
+                    found |= {replica: digest(state)} if state else {}
+        return found
 
     def _limit_ns(self) -> int:
         """A source that is held up for ever must not hold up the simulator."""
@@ -355,13 +544,13 @@ class World:
             if isinstance(process, SimProcess) and process.node is not None and process.incarnation == 1:
                 self._count(process.node)
         rest = Rest(
-            () if self.lost else tuple(ending.unrest(self.controller)),
+            () if self.lost else tuple(self._unrest()),
             self.lost,
             self.loop.ns,
             deployment.leader,
             deployment.graph,
-            hosted(deployment),
-            ending.states_of(deployment),
+            deployment.hosted(),
+            self._states(),
         )
         return Run(
             self.setup,

@@ -18,7 +18,6 @@ from aftbed.core.errors import AftbedError
 from aftbed.ftm.compose import build
 from aftbed.runtime import control
 from aftbed.runtime.deployment import HANG_NS, Keys
-from aftbed.runtime.hosting import hosted, look_at_states
 from aftbed.runtime.interface import BUS, LIGHT, ProcessKind
 from aftbed.runtime.run_controller import RunController
 from aftbed.runtime.tasks import STATS_TASK
@@ -178,10 +177,10 @@ class Supervisor:
 
     def _drain(self, limit_ns: int) -> None:
         """Wait until all is answered, and what fails or changes has come to its end; or to the limit."""
-        settled = self.work.settled and (self._lost or self.controller.at_rest())
+        settled = self.work.settled and (self._lost or not self.controller.unrest())
         if settled and self._looks_left:
-            look = look_at_states(self.deployment, self._states)
-            self.loop.tasks.start("states", look, lambda _: self._looked(limit_ns))
+            ask = self.deployment.ask_states(self._states)
+            self.loop.tasks.start("states", ask, lambda _: self._looked(limit_ns))
             return
         if self.owner_gone() or settled or time.monotonic_ns() > limit_ns:
             if not settled and not self.owner_gone():
@@ -208,7 +207,7 @@ class Supervisor:
     def _teardown(self) -> None:
         """Kill what is left, reap it, say how it ended, and leave."""
         self._tell_all()
-        living = hosted(self.deployment)
+        living = self.deployment.hosted()
         waits = [linux.waited_ns(pid) - before for pid, before in self._waited_ns.items()]
         left = self._bury()
         end = {

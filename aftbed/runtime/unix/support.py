@@ -12,7 +12,7 @@ from aftbed.core.journal import Record, records
 from aftbed.inject.kind import FaultKind
 from aftbed.inject.receipts import BusReport
 from aftbed.runtime.deployment import Keys
-from aftbed.runtime.interface import Met
+from aftbed.runtime.interface import DRAW_BITS, Met
 from aftbed.runtime.interface import Process as AnyProcess
 from aftbed.runtime.unix import process_memory
 from aftbed.runtime.unix.bus_faults import BusFaults
@@ -24,7 +24,6 @@ from aftbed.runtime.unix.transport import UnixChannel
 from aftbed.vehicle.condition import Condition
 
 HISTORY_NAME: Final = "adaptations.jsonl"
-DRAW_BITS: Final = 63
 
 
 class UnixRuntime:
