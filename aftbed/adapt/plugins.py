@@ -10,7 +10,7 @@ from types import ModuleType
 from typing import Final
 
 from aftbed.adapt.engine import AdaptationEngine
-from aftbed.core.application import Application
+from aftbed.core.application import Application, Characteristics
 from aftbed.core.brick import Brick
 from aftbed.core.errors import ConfigError
 from aftbed.core.graph import BrickSpec, Kind
@@ -50,6 +50,14 @@ def load_application(source: str, load_module: LoadModule) -> Callable[[], Appli
     if missing:
         raise ConfigError(f"{source} is no protected function: it lacks {', '.join(missing)}")
     return found
+
+
+def characteristics_of(source: str, load_module: LoadModule) -> Characteristics:
+    """What the protected function of `source` declares. Raises ConfigError if it declares nothing."""
+    declared: object = getattr(load_application(source, load_module), "characteristics", None)
+    if not isinstance(declared, Characteristics):
+        raise ConfigError(f"{source}: characteristics: found {declared!r}, allowed is Characteristics(...)")
+    return declared
 
 
 def make_brick(spec: BrickSpec, setting: Setting, load_module: LoadModule) -> Brick:

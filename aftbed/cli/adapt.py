@@ -18,12 +18,11 @@ from aftbed.adapt import commands
 from aftbed.adapt.commands import Wish, goal_of
 from aftbed.adapt.planner import APPLICATION, Plan, target
 from aftbed.adapt.planner import plan as plan_between
-from aftbed.adapt.plugins import load_application
+from aftbed.adapt.plugins import characteristics_of
 from aftbed.adapt.script_file import ScriptFile, entry, mapping, phases, script_from
 from aftbed.adapt.suitability import remarks, unsuitable
 from aftbed.cli.options import Json, Recipe, Run, print_json, takes
 from aftbed.cli.views import EndedAdaptation, history_lines
-from aftbed.core.application import Characteristics
 from aftbed.core.errors import ConfigError
 from aftbed.core.graph import PLACEMENTS, BrickSpec, Graph
 from aftbed.core.messages import Goal, Scheduled
@@ -157,22 +156,14 @@ def _refuse_unsuitable(ftm: str, application: str, wish: Wish, *, force: bool) -
     """
     if wish.verb == "decompose" or (wish.verb == "update" and wish.name != APPLICATION):
         return  # the new graph needs no more of the function than the old one
-    declared = _characteristics(application)
+    built_in = default_application().characteristics
+    declared = characteristics_of(application, load_module) if application else built_in
     if reason := unsuitable(ftm, declared):
         if not force:
             raise ConfigError(f"{reason}; --force does it all the same")
         print(f"aftbed: forced: {reason}", file=sys.stderr)
     for remark in remarks(ftm, declared):
         print(f"aftbed: note: {remark}", file=sys.stderr)
-
-
-def _characteristics(source: str) -> Characteristics:
-    """What a function declares, `""` for the built-in one. Raises ConfigError if it declares nothing."""
-    function = load_application(source, load_module) if source else default_application()
-    declared: object = getattr(function, "characteristics", None)
-    if not isinstance(declared, Characteristics):
-        raise ConfigError(f"{source}: characteristics: found {declared!r}, allowed is Characteristics(...)")
-    return declared
 
 
 def _source(text: str, folder: Path | None = None) -> str:

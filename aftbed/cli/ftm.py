@@ -11,7 +11,7 @@ from typing import Annotated, Final
 import psutil
 import typer
 
-from aftbed.adapt.plugins import load_application
+from aftbed.adapt.plugins import characteristics_of
 from aftbed.adapt.suitability import (
     TABLE,
     Demand,
@@ -112,7 +112,9 @@ def check(
     Exit code: 0 consistent, 1 not consistent, 2 usage.
     """
     model, rules = fault_model(faults), _table(table)
-    declared, resources = _declared(app), _resources(cpus, cpu_load, bandwidth)
+    built_in = default_application().characteristics
+    declared = built_in if app is None else characteristics_of(app, load_module)
+    resources = _resources(cpus, cpu_load, bandwidth)
     others = consistent(model, declared, resources, rules)
     found = [] if expression is None else problems(expression, model, declared, resources, rules)
     notes = [] if expression is None or found else remarks(expression, declared)
@@ -146,17 +148,6 @@ def _table(path: str | None) -> SuitabilityTable:
         return TABLE
 
     return table_from(read_yaml(Path(path), TableFile), path)
-
-
-def _declared(app: str | None) -> Characteristics:
-    """What the protected function declares."""
-    if app is None:
-        return default_application().characteristics
-    found: object = getattr(load_application(app, load_module), "characteristics", None)
-    if not isinstance(found, Characteristics):
-        kind = type(found).__name__
-        raise ConfigError(f"--app {app}: its characteristics are a {kind}, allowed is a Characteristics")
-    return found
 
 
 def _resources(cpus: int | None, cpu_load: float | None, bandwidth: float | None) -> Resources:

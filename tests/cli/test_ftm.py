@@ -263,7 +263,7 @@ def test_bad_input_is_exit_code_2(call: Call, arguments: tuple[str, ...], words:
     ("name", "words"),
     [
         ("Half", ("no protected function", "capture, restore, acceptable, characteristics")),
-        ("Odd", ("characteristics are a dict", "allowed is a Characteristics")),
+        ("Odd", ("Odd: characteristics: found {", "allowed is Characteristics(...)")),
         ("Mien", ("no class Mien", "Half, Mine, Odd")),
     ],
 )
