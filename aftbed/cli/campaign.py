@@ -156,10 +156,10 @@ def run(given: CampaignRunArguments) -> int:
 
     Exit code: 0 all gates pass, 1 one does not, 2 usage, 3 trouble of the harness, 130 interrupted.
     """
-    from aftbed.report.terminal import CampaignProgress  # noqa: PLC0415 - scipy
-
     found = planned(given)
     options = _run_options(found, given)
+    from aftbed.report.terminal import CampaignProgress  # noqa: PLC0415 - scipy, after the options
+
     began_s, interrupted = time.monotonic(), False
     results = runner.run(found, options)  # raises ConfigError here, before the progress is shown
     todo = sum(options.has(index, len(found.strata)) for index in range(found.size))
