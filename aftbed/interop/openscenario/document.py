@@ -35,7 +35,11 @@ _FLAGS: Final = {"true": True, "1": True, "false": False, "0": False}
 
 
 class Element:
-    """An element of the file `path` that starts in `line`. `text` is its character data, stripped."""
+    """An element of the file `path` that starts in `line`. `text` is its character data, stripped.
+
+    `visited`: it was read, but perhaps not its attributes and children. `ignored`: why it cannot, with all
+    below it, change the drive.
+    """
 
     def __init__(self, path: str, line: int, tag: str, attributes: dict[str, str]) -> None:
         self.path = path
@@ -45,8 +49,8 @@ class Element:
         self.children: list[Element] = []
         self.text = ""
         self.ignored: str | None = None
+        self.visited = False
         self._read: set[str] = set()
-        self._visited = False
 
     def error(self, reason: str) -> ConfigError:
         """An error at this element; the message has file, line and tag."""
@@ -54,7 +58,10 @@ class Element:
 
     def wrong(self, name: str, allowed: str) -> ConfigError:
         """An error about the value of the attribute `name`."""
-        return self.error(f"{name}: found {_shown(self.attributes.get(name))}, allowed is {allowed}")
+        found = self.attributes.get(name)
+        shown = "nothing" if found is None else repr(found[:SHOWN_CHARACTERS_MAX])
+        more = "..." if found is not None and len(found) > SHOWN_CHARACTERS_MAX else ""
+        return self.error(f"{name}: found {shown}{more}, allowed is {allowed}")
 
     # -- attributes
 
@@ -77,8 +84,7 @@ class Element:
         return found
 
     def number(self, name: str, default: float | None = None) -> float:
-        found = self.word(name, None if default is None else repr(default))
-        number = finite(found)
+        number = finite(self.word(name, None if default is None else repr(default)))
         if number is None:
             raise self.wrong(name, "a number")
         return number
@@ -95,7 +101,7 @@ class Element:
         """The children with these tags, in the order of the file."""
         found = [child for child in self.children if child.tag in tags]
         for child in found:
-            child.visit()
+            child.visited = True
         return found
 
     def maybe(self, *tags: str) -> "Element | None":
@@ -113,28 +119,22 @@ class Element:
             raise self.error(f"found {there}, allowed is {' or '.join(tags)}")
         return found
 
-    # -- what was read
-
-    def visit(self) -> None:
-        """Mark the element as read, but not its attributes and children."""
-        self._visited = True
-
-    def visited(self) -> bool:
-        return self._visited
-
-    def ignore(self, reason: str) -> None:
-        """Record why this element, with all below it, cannot change the drive."""
-        self.ignored = reason
-
-    def unread_attributes(self) -> list[str]:
-        """The attributes that were not read, without those of XML itself (namespaces)."""
-        return [name for name in self.attributes if name not in self._read and not _of_xml(name)]
-
     def walk(self) -> Iterator["Element"]:
         """This element and all below it, in the order of the file."""
         yield self
         for child in self.children:
             yield from child.walk()
+
+    def unread_attributes(self) -> list[str]:
+        """The attributes that were not read and may have an effect."""
+        return [
+            name
+            for name in self.attributes
+            if name not in self._read
+            and name not in LABELS
+            and name != "xmlns"
+            and not name.startswith(("xmlns:", "xsi:", "xml:"))
+        ]
 
 
 def finite(text: str) -> float | None:
@@ -146,19 +146,21 @@ def finite(text: str) -> float | None:
     return number if math.isfinite(number) else None
 
 
-def read_tree(path: Path, name: str | None = None) -> Element:
-    """The root of the XML file `path`. Errors call the file `name`."""
-    name = name or str(path)
+# -- parsing
+
+
+def read_tree(path: Path) -> Element:
+    """The root of the XML file `path`."""
     try:
         with path.open("rb") as file:
             data = file.read(FILE_BYTES_MAX + 1)
     except OSError as error:
-        raise ConfigError(f"{name}: cannot be read: {error.strerror}") from error
-    return parse_tree(data, name)
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
+    return parse_tree(data, str(path))
 
 
 def parse_tree(data: bytes, name: str) -> Element:
-    """The root of the XML document `data`. Raises ConfigError."""
+    """The root of the XML document `data`. Raises ConfigError, which calls it `name`."""
     if len(data) > FILE_BYTES_MAX:
         raise ConfigError(f"{name}: more than the {FILE_BYTES_MAX} bytes that are allowed")
     builder = _Builder(name)
@@ -180,7 +182,7 @@ class _Builder:
         self.parser = expat.ParserCreate()
         self.parser.buffer_text = True
         self.parser.StartElementHandler = self._start
-        self.parser.EndElementHandler = self._end
+        self.parser.EndElementHandler = lambda _tag: self._open.pop()
         self.parser.CharacterDataHandler = self._data
         self.parser.StartDoctypeDeclHandler = self._doctype
         self._name = name
@@ -201,9 +203,6 @@ class _Builder:
             self.root = element
         self._open.append(element)
 
-    def _end(self, _tag: str) -> None:
-        self._open.pop()
-
     def _data(self, data: str) -> None:
         self._open[-1].text = (self._open[-1].text + data).strip()[: SHOWN_CHARACTERS_MAX + 1]
 
@@ -212,101 +211,61 @@ class _Builder:
         raise ConfigError(f"{self._name}: line {line}: DOCTYPE: not allowed, it may define entities")
 
 
-def _of_xml(name: str) -> bool:
-    return name == "xmlns" or name.startswith(("xmlns:", "xsi:", "xml:"))
-
-
-def _shown(found: str | None) -> str:
-    if found is None:
-        return "nothing"
-    cut = found[:SHOWN_CHARACTERS_MAX]
-    return repr(cut) + ("..." if cut != found else "")
-
-
 # -- the account of unused elements
 
 
 REFUSED_SHOWN_MAX: Final = 20
-
-_LATERAL: Final = "lateral motion; the cars keep to one lane of a straight road"
-_ROUTES: Final = "routes, trajectories and places off the straight road"
-_OTHERS: Final = "one car ahead is all there is: no other road users or objects"
-_SIGNALS: Final = "traffic signals"
-_CONTROLLER: Final = "controllers: the storyboard moves the car ahead, and the function brakes the ego"
-_SPEED: Final = "the speed of the car ahead changes by a SpeedAction to 0 only"
-_RUN_TIME: Final = "values that change while the scenario runs"
 TRIGGER_UNKNOWN: Final = "a trigger whose moment does not follow from the start"
 
-REFUSED: Final[Mapping[str, str]] = {
-    "LateralAction": _LATERAL,
-    "RoutingAction": _ROUTES,
-    "GeoPosition": _ROUTES,
-    "RoutePosition": _ROUTES,
-    "TrajectoryPosition": _ROUTES,
-    "Pedestrian": _OTHERS,
-    "MiscObject": _OTHERS,
-    "ExternalObjectReference": _OTHERS,
-    "EntitySelection": _OTHERS,
-    "Trailer": _OTHERS,
-    "TrailerAction": _OTHERS,
-    "EntityAction": _OTHERS,
-    "TrafficAction": _OTHERS,
-    "TrafficSignalController": _SIGNALS,
-    "InfrastructureAction": _SIGNALS,
-    "TrafficSignalCondition": _SIGNALS,
-    "TrafficSignalControllerCondition": _SIGNALS,
-    "ObjectController": _CONTROLLER,
-    "ControllerAction": _CONTROLLER,
-    "ActivateControllerAction": _CONTROLLER,
-    "LongitudinalDistanceAction": _SPEED,
-    "SpeedProfileAction": _SPEED,
-    "SynchronizeAction": _SPEED,
-    "VisibilityAction": "a car that sensors do not see",
-    "UserDefinedAction": "commands that only one simulator knows",
-    "ParameterAction": _RUN_TIME,
-    "VariableAction": _RUN_TIME,
-    "ParameterCondition": TRIGGER_UNKNOWN,
-    "VariableCondition": TRIGGER_UNKNOWN,
-    "UserDefinedValueCondition": TRIGGER_UNKNOWN,
-    "TimeOfDayCondition": TRIGGER_UNKNOWN,
-    "AccelerationCondition": TRIGGER_UNKNOWN,
-    "AngleCondition": TRIGGER_UNKNOWN,
-    "RelativeAngleCondition": TRIGGER_UNKNOWN,
-    "DistanceCondition": TRIGGER_UNKNOWN,
-    "EndOfRoadCondition": TRIGGER_UNKNOWN,
-    "OffroadCondition": TRIGGER_UNKNOWN,
-    "ReachPositionCondition": TRIGGER_UNKNOWN,
-    "RelativeClearanceCondition": TRIGGER_UNKNOWN,
-    "RelativeSpeedCondition": TRIGGER_UNKNOWN,
-    "SpeedCondition": TRIGGER_UNKNOWN,
-}
 
-_TOOLS: Final = "for people and tools"
-_DRAWN: Final = "for pictures"
-_OWN_CAR: Final = "aftbed has its own model of the car and its brakes"
-_AIR: Final = "the radar sees through any weather, and the air stands still"
+def _by_tag(tags_by_reason: Mapping[str, str]) -> dict[str, str]:
+    return {tag: reason for reason, tags in tags_by_reason.items() for tag in tags.split()}
 
-IGNORED: Final[Mapping[str, str]] = {
-    "License": _TOOLS,
-    "Properties": _TOOLS,
-    "CatalogLocations": "read where an entry is needed",
-    "SceneGraphFile": _DRAWN,
-    "UsedArea": _DRAWN,
-    "AppearanceAction": _DRAWN,
-    "Performance": _OWN_CAR,
-    "Axles": _OWN_CAR,
-    "TrailerHitch": _OWN_CAR,
-    "TrailerCoupler": _OWN_CAR,
-    "TimeOfDay": _AIR,
-    "Weather": _AIR,
-    "VariableDeclarations": "nothing here depends on a variable",
-    "MonitorDeclarations": "nothing here depends on a monitor",
-    "SetMonitorAction": "nothing here depends on a monitor",
-}
+
+REFUSED: Final[Mapping[str, str]] = _by_tag(
+    {
+        "lateral motion; the cars keep to one lane of a straight road": "LateralAction",
+        "routes, trajectories and places off the straight road": (
+            "RoutingAction GeoPosition RoutePosition TrajectoryPosition"
+        ),
+        "one car ahead is all there is: no other road users or objects": (
+            "Pedestrian MiscObject ExternalObjectReference EntitySelection Trailer TrailerAction "
+            "EntityAction TrafficAction"
+        ),
+        "traffic signals": (
+            "TrafficSignalController InfrastructureAction TrafficSignalCondition "
+            "TrafficSignalControllerCondition"
+        ),
+        "controllers: the storyboard moves the car ahead, and the function brakes the ego": (
+            "ObjectController ControllerAction ActivateControllerAction"
+        ),
+        "the speed of the car ahead changes by a SpeedAction to 0 only": (
+            "LongitudinalDistanceAction SpeedProfileAction SynchronizeAction"
+        ),
+        "a car that sensors do not see": "VisibilityAction",
+        "commands that only one simulator knows": "UserDefinedAction",
+        "values that change while the scenario runs": "ParameterAction VariableAction",
+        TRIGGER_UNKNOWN: (
+            "ParameterCondition VariableCondition UserDefinedValueCondition TimeOfDayCondition "
+            "AccelerationCondition AngleCondition RelativeAngleCondition DistanceCondition SpeedCondition "
+            "EndOfRoadCondition OffroadCondition ReachPositionCondition RelativeClearanceCondition "
+            "RelativeSpeedCondition"
+        ),
+    }
+)
+IGNORED: Final[Mapping[str, str]] = _by_tag(
+    {
+        "for people and tools": "License Properties",
+        "read where an entry is needed": "CatalogLocations",
+        "for pictures": "SceneGraphFile UsedArea AppearanceAction",
+        "aftbed has its own model of the car and its brakes": "Performance Axles TrailerHitch TrailerCoupler",
+        "the radar sees through any weather, and the air stands still": "TimeOfDay Weather",
+        "nothing here depends on a variable": "VariableDeclarations",
+        "nothing here depends on a monitor": "MonitorDeclarations SetMonitorAction",
+    }
+)
 CONTROLLERS: Final = ("ObjectController", "ControllerAction", "ActivateControllerAction")
-LABELS: Final = frozenset(
-    ("name", "description", "author", "date", "model3d")
-)  # attributes without any effect
+LABELS: Final = frozenset(("name", "description", "author", "date", "model3d"))  # without any effect
 
 
 class IgnoredElement(msgspec.Struct, frozen=True):
@@ -320,36 +279,38 @@ class IgnoredElement(msgspec.Struct, frozen=True):
 
 def refuse(root: Element) -> None:
     """Raise ConfigError with every element of the tree whose tag is in `REFUSED`."""
-    _raise(root, _refused(root))
+    _raise(root, list(_refused(root)))
 
 
 def account(root: Element) -> list[IgnoredElement]:
     """The ignored elements. Raises ConfigError with all that is unread and may have an effect."""
     ignored: list[IgnoredElement] = []
     refused: list[tuple[Element, str]] = []
-    root.visit()
+    root.visited = True
     _account(root, ignored, refused)
     _raise(root, refused)
     return ignored
 
 
-def _refused(element: Element) -> list[tuple[Element, str]]:
+def _refused(element: Element) -> Iterator[tuple[Element, str]]:
     if element.ignored is not None or element.tag in IGNORED:
-        return []
+        return
     if element.tag in REFUSED:
-        return [(element, REFUSED[element.tag])]
-    return [one for child in element.children for one in _refused(child)]
+        yield element, REFUSED[element.tag]
+        return
+    for child in element.children:
+        yield from _refused(child)
 
 
 def _account(element: Element, ignored: list[IgnoredElement], refused: list[tuple[Element, str]]) -> None:
-    reason = element.ignored if element.visited() else element.ignored or IGNORED.get(element.tag)
+    reason = element.ignored if element.visited else element.ignored or IGNORED.get(element.tag)
     if reason is not None:
         ignored.append(IgnoredElement(element.path, element.line, element.tag, reason))
         return
-    if not element.visited():
+    if not element.visited:
         refused.append((element, REFUSED.get(element.tag, "not expected here")))
         return
-    strange = [name for name in element.unread_attributes() if name not in LABELS]
+    strange = element.unread_attributes()
     refused += [(element, f"attribute {name!r} is not expected here") for name in strange]
     if element.text:
         refused.append((element, "text is not expected here"))

@@ -50,7 +50,7 @@ _STEP_EPSILON: Final = 1e-9  # steps: an upper limit that is a multiple of the s
 _NUMBER: Final = r"(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?(?![A-Za-z0-9_.])"
 _NAME: Final = r"\$?[A-Za-z_][A-Za-z0-9_]*(?![A-Za-z0-9_])"
 _TOKENS: Final = re.compile(rf"(?: *(?:{_NUMBER}|{_NAME}|[-+*/%(),]))* *")
-_PLACEHOLDER: Final = "é"  # stands for a parameter while Python parses; `_TOKENS` keeps it out of the input
+_PLACEHOLDER: Final = "é"  # before a parameter while Python parses; `_TOKENS` keeps it out of the input
 _DECLARED_NAME: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _PARAMETER: Final = re.compile(rf"\$({_DECLARED_NAME.pattern})")
 _EXPRESSION: Final = re.compile(r"\$\{(.*)\}", re.DOTALL)
@@ -58,29 +58,33 @@ _NOT_IN_FILE_NAMES: Final = re.compile(r"[^A-Za-z0-9.+-]+")
 
 Values = Mapping[str, str]
 
-_INTEGERS: Final = ("integer", "int", "unsignedInt", "unsignedShort")
-_TYPES: Final = ("double", *_INTEGERS, "boolean", "string", "dateTime")
-_RULES: Final[Mapping[str, Callable[[float, float], bool]]] = {
-    "equalTo": operator.eq,
-    "greaterThan": operator.gt,
-    "lessThan": operator.lt,
-    "greaterOrEqual": operator.ge,
-    "lessOrEqual": operator.le,
-    "notEqualTo": operator.ne,
-}
+
+# -- expressions
 
 
-def _round(value: float) -> float:
-    """Rounds halves away from zero; Python's `round` rounds them to even."""
-    return math.copysign(math.floor(abs(value) + 0.5), value)
+def _modulo(left: float, right: float) -> float:
+    if right == 0.0:
+        raise ZeroDivisionError
+    return math.fmod(left, right)
 
 
 def _sign(value: float) -> float:
     return 0.0 if value == 0.0 else math.copysign(1.0, value)
 
 
+_SIGNS: Final[Mapping[type[ast.unaryop], Callable[[float], float]]] = {
+    ast.USub: operator.neg,
+    ast.UAdd: operator.pos,
+}
+_OPERATORS: Final[Mapping[type[ast.operator], Callable[[float, float], float]]] = {
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.Div: operator.truediv,
+    ast.Mod: _modulo,
+}
 _UNARY: Final[Mapping[str, Callable[[float], float]]] = {
-    "round": _round,
+    "round": lambda value: math.copysign(math.floor(abs(value) + 0.5), value),  # halves away from zero
     "floor": lambda value: float(math.floor(value)),
     "ceil": lambda value: float(math.ceil(value)),
     "sqrt": math.sqrt,
@@ -97,90 +101,46 @@ _BINARY: Final[Mapping[str, Callable[[float, float], float]]] = {"max": max, "mi
 FUNCTIONS: Final = (*_UNARY, *_BINARY)
 
 
-# -- expressions
-
-
-def evaluate(text: str, values: Mapping[str, str]) -> float:
+def evaluate(text: str, values: Values) -> float:
     """The value of the text between `${` and `}`. Raises ConfigError with the reason, but without a place."""
     if len(text) > EXPRESSION_CHARACTERS_MAX:
         raise ConfigError(f"{len(text)} characters, allowed are {EXPRESSION_CHARACTERS_MAX}")
     if not _TOKENS.fullmatch(text):
         raise ConfigError("allowed are numbers, $parameters, + - * / % ( ) and functions")
-    names: list[str] = []
-
-    def placeholder(found: re.Match[str]) -> str:
-        names.append(found[1])
-        return f" {_PLACEHOLDER}{len(names) - 1} "
-
     try:
-        tree = ast.parse(_PARAMETER.sub(placeholder, text).strip(), mode="eval")
-        found = _value(
-            tree.body, {f"{_PLACEHOLDER}{i}": _number(name, values) for i, name in enumerate(names)}
-        )
-    except (SyntaxError, ValueError, OverflowError, ZeroDivisionError, RecursionError, MemoryError) as error:
-        raise ConfigError(_reason(error)) from error
+        tree = ast.parse(_PARAMETER.sub(rf" {_PLACEHOLDER}\1 ", text).strip(), mode="eval")
+        found = _value(tree.body, values)
+    except ZeroDivisionError as error:
+        raise ConfigError("division by zero") from error
+    except OverflowError as error:
+        raise ConfigError("the result is too large") from error
+    except ValueError as error:
+        raise ConfigError("outside of the function's domain") from error
+    except (SyntaxError, RecursionError, MemoryError) as error:
+        raise ConfigError("not understood as arithmetic") from error
     if not math.isfinite(found):
         raise ConfigError("the result is not a finite number")
     return found
 
 
-def _reason(error: Exception) -> str:
-    match error:
-        case ZeroDivisionError():
-            return "division by zero"
-        case OverflowError():
-            return "the result is too large"
-        case ValueError():
-            return "outside of the function's domain"
-        case _:
-            return "not understood as arithmetic"
-
-
-def _number(name: str, values: Mapping[str, str]) -> float:
-    if name not in values:
-        raise unknown("parameter", name, values)
-    found = finite(values[name])
-    if found is None:
-        raise ConfigError(f"${name} is {values[name]!r}, allowed is a number")
-    return found
-
-
-def _value(node: ast.expr, places: Mapping[str, float]) -> float:
+def _value(node: ast.expr, values: Values) -> float:
     match node:
         case ast.Constant(value=int() | float() as value) if not isinstance(value, bool):
             return float(value)
-        case ast.Name(id=name) if name in places:
-            return places[name]
+        case ast.Name(id=name) if name.startswith(_PLACEHOLDER):
+            return _number(name.removeprefix(_PLACEHOLDER), values)
         case ast.Name(id=name):
             raise ConfigError(f"the name {name!r}: a parameter is written ${name}")
-        case ast.UnaryOp(op=ast.USub(), operand=operand):
-            return -_value(operand, places)
-        case ast.UnaryOp(op=ast.UAdd(), operand=operand):
-            return _value(operand, places)
-        case ast.BinOp(left=left, op=operator, right=right):
-            return _binary(operator, _value(left, places), _value(right, places))
+        case ast.UnaryOp(op=sign, operand=operand) if type(sign) in _SIGNS:
+            return _SIGNS[type(sign)](_value(operand, values))
+        case ast.BinOp(left=left, op=operation, right=right):
+            if type(operation) not in _OPERATORS:
+                raise ConfigError(f"the operator {type(operation).__name__} is none of + - * / %")
+            return _OPERATORS[type(operation)](_value(left, values), _value(right, values))
         case ast.Call(func=ast.Name(id=name), args=arguments, keywords=[]):
-            return _call(name, [_value(argument, places) for argument in arguments])
+            return _call(name, [_value(argument, values) for argument in arguments])
         case _:
             raise ConfigError(f"{type(node).__name__} is no arithmetic")
-
-
-def _binary(operator: ast.operator, left: float, right: float) -> float:
-    match operator:
-        case ast.Add():
-            return left + right
-        case ast.Sub():
-            return left - right
-        case ast.Mult():
-            return left * right
-        case ast.Div():
-            return left / right
-        case ast.Mod():
-            if right == 0.0:
-                raise ZeroDivisionError
-            return math.fmod(left, right)
-        case _:
-            raise ConfigError(f"the operator {type(operator).__name__} is none of + - * / %")
 
 
 def _call(name: str, arguments: list[float]) -> float:
@@ -194,13 +154,33 @@ def _call(name: str, arguments: list[float]) -> float:
     raise ConfigError(f"{name} takes {1 if name in _UNARY else 2} arguments, found {len(arguments)}")
 
 
+def _number(name: str, values: Values) -> float:
+    if name not in values:
+        raise unknown("parameter", name, values)
+    found = finite(values[name])
+    if found is None:
+        raise ConfigError(f"${name} is {values[name]!r}, allowed is a number")
+    return found
+
+
 # -- parameters
+
+_INTEGERS: Final = ("integer", "int", "unsignedInt", "unsignedShort")
+_TYPES: Final = ("double", *_INTEGERS, "boolean", "string", "dateTime")
+_RULES: Final[Mapping[str, Callable[[float, float], bool]]] = {
+    "equalTo": operator.eq,
+    "greaterThan": operator.gt,
+    "lessThan": operator.lt,
+    "greaterOrEqual": operator.ge,
+    "lessOrEqual": operator.le,
+    "notEqualTo": operator.ne,
+}
 
 
 def declared(root: Element) -> list[str]:
     """The names of the parameters declared at the root of the file. A variation may set these."""
-    found = [group for group in root.children if group.tag == "ParameterDeclarations"]
-    return [_name(one) for group in found for one in group.children if one.has("name")]
+    groups = [group for group in root.children if group.tag == "ParameterDeclarations"]
+    return [_name(one) for group in groups for one in group.children if one.has("name")]
 
 
 def substituted(element: Element, variation: Values, outer: Values | None = None) -> Element:
@@ -235,11 +215,9 @@ def _declared_values(group: Element, outer: Values, variation: Values) -> Values
     for one in group.children:
         if one.tag != "ParameterDeclaration":
             raise one.error("allowed is ParameterDeclaration")
-        one.visit()
-        name = _name(one)
-        values[name] = variation.get(name, _replaced(one, "value", values) if one.has("value") else "")
-        if not one.has("value"):
-            raise one.error("attribute 'value' is missing")
+        one.visited = True
+        name, default = _name(one), _replaced(one, "value", values)
+        values[name] = variation.get(name, default)
         _check(one, name, values[name], values)
     return values
 
@@ -262,9 +240,9 @@ def _check(one: Element, name: str, value: str, values: Values) -> None:
         raise one.error(f"{shown}, allowed is a whole number")
     if kind.startswith("unsigned") and number is not None and number < 0:
         raise one.error(f"{shown}, allowed is 0 or more")
-    for other in one.children:
-        if other.tag != "ConstraintGroup":
-            raise other.error("allowed is ConstraintGroup")
+    for group in one.children:
+        if group.tag != "ConstraintGroup":
+            raise group.error("allowed is ConstraintGroup")
     if one.children and not any(_holds(group, value, values) for group in one.children):
         raise one.error(f"{shown} keeps to no ConstraintGroup")
 
@@ -297,8 +275,7 @@ def _replaced(element: Element, name: str, values: Values) -> str:
         try:
             return repr(evaluate(expression[1], values))
         except ConfigError as error:
-            shown = text[:SHOWN_CHARACTERS_MAX]
-            raise element.error(f"{name}: {shown!r}: {error}") from error
+            raise element.error(f"{name}: {text[:SHOWN_CHARACTERS_MAX]!r}: {error}") from error
     return text
 
 
@@ -323,14 +300,9 @@ def variation_name(stem: str, values: Values) -> str:
     """The name of a scenario with these values: `brake-EgoSpeed-50-Gap-12`."""
     full = "-".join([stem, *(f"{name}-{value.removesuffix('.0')}" for name, value in values.items())])
     name = _NOT_IN_FILE_NAMES.sub("_", full)
-    if len(name) > NAME_CHARACTERS_MAX or name != full:
-        name = (
-            f"{name[: NAME_CHARACTERS_MAX - 9]}-{hashlib.blake2b(full.encode(), digest_size=4).hexdigest()}"
-        )
-    return name
-
-
-# -- deterministic
+    if len(name) <= NAME_CHARACTERS_MAX and name == full:
+        return name
+    return f"{name[: NAME_CHARACTERS_MAX - 9]}-{hashlib.blake2b(full.encode(), digest_size=4).hexdigest()}"
 
 
 def _deterministic(kind: Element) -> list[Values]:
@@ -339,7 +311,7 @@ def _deterministic(kind: Element) -> list[Values]:
         "DeterministicSingleParameterDistribution", "DeterministicMultiParameterDistribution"
     ):
         if one.tag == "DeterministicSingleParameterDistribution":
-            name = one.word("parameterName").removeprefix("$")
+            name = _parameter(one, "parameterName")
             axes.append([{name: value} for value in _values(one)])
         else:
             sets = one.one("ValueSetDistribution").every("ParameterValueSet")
@@ -349,9 +321,9 @@ def _deterministic(kind: Element) -> list[Values]:
     count = math.prod(len(axis) for axis in axes)
     if count > VARIATIONS_MAX:
         raise kind.error(f"{count} variations, allowed are {VARIATIONS_MAX}")
-    names = [sorted({name for values in axis for name in values}) for axis in axes]
+    names = [{name for values in axis for name in values} for axis in axes]
     for first, second in itertools.combinations(names, 2):
-        if twice := sorted(set(first) & set(second)):
+        if twice := sorted(first & second):
             raise kind.error(f"parameter {twice[0]!r} stands in two distributions")
     return [
         {name: value for values in choice for name, value in values.items()}
@@ -380,10 +352,14 @@ def _limits(limits: Element) -> tuple[float, float]:
     return lower, upper
 
 
+def _parameter(one: Element, attribute: str) -> str:
+    return one.word(attribute).removeprefix("$")
+
+
 def _assigned(group: Element) -> dict[str, str]:
     assigned: dict[str, str] = {}
     for one in group.every("ParameterAssignment"):
-        name = one.word("parameterRef").removeprefix("$")
+        name = _parameter(one, "parameterRef")
         if name in assigned:
             raise one.error(f"parameter {name!r} stands twice")
         assigned[name] = one.word("value")
@@ -396,9 +372,6 @@ def _decimal(value: float) -> str:
     return str(int(rounded)) if rounded == int(rounded) else repr(rounded)
 
 
-# -- stochastic
-
-
 def _stochastic(kind: Element, seed: int) -> list[Values]:
     runs = kind.number("numberOfTestRuns")
     if not 1 <= runs <= VARIATIONS_MAX or runs != int(runs):
@@ -407,7 +380,7 @@ def _stochastic(kind: Element, seed: int) -> list[Values]:
     distributions = kind.every("StochasticDistribution")
     if not distributions:
         raise kind.error("no StochasticDistribution")
-    names = [one.word("parameterName").removeprefix("$") for one in distributions]
+    names = [_parameter(one, "parameterName") for one in distributions]
     if len(set(names)) < len(names):
         raise kind.error("a parameter stands in two distributions")
     return [

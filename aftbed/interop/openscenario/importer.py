@@ -17,7 +17,6 @@ against hostile XML would amount to refusing a DOCTYPE, which expat can do.
 """
 
 import json
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
@@ -104,9 +103,11 @@ def import_scenario(path: Path, distribution: Path | None, options: ImportOption
         name = variation_name(path.stem, values)
         try:
             drive, ignored, description = _read(substituted(root, values), options)
-            found[name] = _variation(name, values, drive, description, options)
+            text = _scenario_file(name, drive, description, options.expect)
         except ConfigError as error:
-            raise _of_variation(error, values) from error
+            shown = ", ".join(f"{name} = {value}" for name, value in values.items())
+            raise (ConfigError(f"{error}\n  with {shown}") if values else error) from error
+        found[name] = ScenarioVariation(name, values, drive, text)
         accounts.append((drive.taken, ignored))
     return ImportedFile(str(path), version, description, len(sets), tuple(found.values()), *accounts[0])
 
@@ -126,12 +127,16 @@ def write(imported: ImportedFile, folder: Path, *, force: bool) -> list[Path]:
     return paths
 
 
+def _read_version(header: Element) -> str:
+    return f"{header.word('revMajor')}.{header.word('revMinor')}"
+
+
 def _check_root(root: Element) -> str:
     """Check root and header; the version of OpenSCENARIO."""
     if root.tag not in _ROOTS:
         raise root.error(f"allowed is {_ROOTS[0]}")
     header = root.one("FileHeader")
-    version = f"{header.word('revMajor')}.{header.word('revMinor')}"
+    version = _read_version(header)
     if version not in VERSIONS:
         raise header.error(f"OpenSCENARIO {version[:20]}, allowed are {', '.join(VERSIONS)}")
     for child in root.children:
@@ -148,9 +153,7 @@ def _read_distribution(path: Path, scenario: Path, parameters: list[str], seed: 
     root = read_tree(path)
     if not any(child.tag == "ParameterValueDistribution" for child in root.children):
         raise ConfigError(f"{root.path}: no ParameterValueDistribution in it")
-    header = root.one("FileHeader")
-    for label in ("revMajor", "revMinor"):
-        header.word(label)
+    _read_version(root.one("FileHeader"))
     found = variations_of(root, scenario.name, parameters, seed)
     account(root)
     return found
@@ -158,8 +161,7 @@ def _read_distribution(path: Path, scenario: Path, parameters: list[str], seed: 
 
 def _read(root: Element, options: ImportOptions) -> tuple[ImportedDrive, tuple[IgnoredElement, ...], str]:
     header = root.one("FileHeader")
-    for label in ("revMajor", "revMinor"):
-        header.word(label)
+    _read_version(header)
     description = header.word("description", "") or root.path
     ego = _find_ego(root, options.ego)
     _set_aside(root, ego, options)
@@ -193,35 +195,25 @@ def _set_aside(root: Element, ego: str, options: ImportOptions) -> None:
         if options.replace_controller and of_ego and element.tag in ("Private", "ScenarioObject"):
             for inner in element.walk():
                 if inner.tag in CONTROLLERS:
-                    inner.ignore("replaced by aftbed's function, as asked for")
+                    inner.ignored = "replaced by aftbed's function, as asked for"
         if options.duration_s is not None and element.tag == "Storyboard":
             for child in element.children:
                 if child.tag == "StopTrigger":
-                    child.ignore("the length of the drive was asked for")
+                    child.ignored = "the length of the drive was asked for"
 
 
-def _variation(
-    name: str, values: Values, drive: ImportedDrive, description: str, options: ImportOptions
-) -> ScenarioVariation:
-    keys = _keys(drive, description, options.expect)
-    try:
-        scenario_of(name, name, msgspec.convert(keys, ScenarioKeys))
-    except msgspec.ValidationError as error:
-        raise ConfigError(f"the scenario would be out of range: {error}") from error
-    return ScenarioVariation(name, values, drive, _yaml(keys))
-
-
-def _keys(drive: ImportedDrive, description: str, expect: str) -> dict[str, object]:
-    """The keys of the scenario file, in the order in which docs/scenarios.md describes them."""
+def _scenario_file(name: str, drive: ImportedDrive, description: str, expect: str) -> str:
+    """The text of the scenario file. Its keys are in the order in which docs/scenarios.md describes them."""
     printable = "".join(one if one.isprintable() else " " for one in description)
-    shown = " ".join(printable.split())[:DESCRIPTION_CHARACTERS_MAX]
-    keys: dict[str, object] = {"description": shown, "duration_s": _round(drive.duration_s)}
-    keys["ego"] = {"speed_kmh": _round(drive.speed_ms * KMH_PER_MS)}
+    keys: dict[str, object] = {
+        "description": " ".join(printable.split())[:DESCRIPTION_CHARACTERS_MAX],
+        "duration_s": _round(drive.duration_s),
+        "ego": {"speed_kmh": _round(drive.speed_ms * KMH_PER_MS)},
+    }
     if drive.lead is not None:
         lead: dict[str, object] = {"gap_m": _round(drive.lead.gap_m)}
         lead["speed_kmh"] = _round(drive.lead.speed_ms * KMH_PER_MS)
-        if drive.lead.braking is not None:
-            braking = drive.lead.braking
+        if (braking := drive.lead.braking) is not None:
             lead["braking"] = {
                 "after_s": _round(braking.after_s),
                 "deceleration_ms2": _round(braking.deceleration_ms2),
@@ -230,7 +222,11 @@ def _keys(drive: ImportedDrive, description: str, expect: str) -> dict[str, obje
         keys["lead"] = lead
     keys["road"] = {"friction": drive.friction}
     keys["expect"] = {"outcome": expect}
-    return keys
+    try:
+        scenario_of(name, name, msgspec.convert(keys, ScenarioKeys))
+    except msgspec.ValidationError as error:
+        raise ConfigError(f"the scenario would be out of range: {error}") from error
+    return "".join(f"{key}: {_yaml(value)}\n" for key, value in keys.items())
 
 
 def _round(value: float) -> float:
@@ -238,23 +234,12 @@ def _round(value: float) -> float:
     return round(value, 6) + 0.0
 
 
-def _yaml(keys: Mapping[str, object]) -> str:
-    """One key a line. A text or number in JSON notation is valid YAML."""
-    return "".join(f"{key}: {_flow(value)}\n" for key, value in keys.items())
-
-
-def _flow(value: object) -> str:
+def _yaml(value: object) -> str:
+    """In one line. A text or number in JSON notation is valid YAML."""
     match value:
         case dict():
-            return "{" + ", ".join(f"{key}: {_flow(inner)}" for key, inner in value.items()) + "}"
+            return "{" + ", ".join(f"{key}: {_yaml(inner)}" for key, inner in value.items()) + "}"
         case float():
             return f"{value:.6f}".rstrip("0").rstrip(".")
         case _:
             return json.dumps(value, ensure_ascii=False)
-
-
-def _of_variation(error: ConfigError, values: Values) -> ConfigError:
-    if not values:
-        return error
-    shown = ", ".join(f"{name} = {value}" for name, value in values.items())
-    return ConfigError(f"{error}\n  with {shown}")

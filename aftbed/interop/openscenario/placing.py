@@ -29,18 +29,9 @@ from aftbed.interop.openscenario.expression import replaced_below
 VEHICLES: Final = ("car", "van", "truck", "bus", "motorbike")
 BESIDE_M_MAX: Final = 0.01  # tolerance for rounded positions
 TURNED_RAD_MAX: Final = 0.001
-_SLOPES: Final = ("b", "c", "d")  # of height = a + b s + c s^2 + d s^3
 LENGTH_M_MAX: Final = 100.0
 CATALOG_FILES_MAX: Final = 100
-
 _WORLD: Final = "the world"
-_POSITIONS: Final = (
-    "WorldPosition",
-    "LanePosition",
-    "RoadPosition",
-    "RelativeLanePosition",
-    "RelativeRoadPosition",
-) + ("RelativeObjectPosition", "RelativeWorldPosition")
 
 
 class CarShape(msgspec.Struct, frozen=True):
@@ -107,8 +98,7 @@ def _entry(root: Element, reference: Element) -> Element:
     }
     entries: list[str] = []
     for path in _catalog_files(root, reference):
-        file = read_tree(path)
-        for group in file.every("Catalog"):
+        for group in read_tree(path).every("Catalog"):
             for vehicle in group.every("Vehicle") if group.word("name") == catalog else []:
                 entries.append(vehicle.word("name"))
                 if entries[-1] == name:
@@ -165,23 +155,29 @@ def distance_m(ego: CarShape, lead: CarShape, positions: Mapping[str, Element]) 
 
 def _place(name: str, positions: Mapping[str, Element], asking: tuple[str, ...]) -> RoadPlace:
     """The place of the car `name`; `asking` are the cars whose places depend on it."""
-    position = positions[name].one(*_POSITIONS)
-    _check_orientation(position)
+    position = positions[name].one(
+        "WorldPosition", "LanePosition", "RoadPosition", "RelativeLanePosition", "RelativeRoadPosition",
+        "RelativeObjectPosition", "RelativeWorldPosition",
+    )  # fmt: skip
+    if (turned := position.maybe("Orientation")) is not None:
+        turned.choice("type", ("relative", "absolute"), "absolute")
+        for angle in ("h", "p", "r"):
+            if turned.number(angle, 0.0) != 0.0:
+                raise turned.wrong(angle, "0, along the lane")
+    number = position.number
     match position.tag:
         case "WorldPosition":
             for turn in ("p", "r"):
-                if position.number(turn, 0.0) != 0.0:
+                if number(turn, 0.0) != 0.0:
                     raise position.wrong(turn, "0, the road is level")
-            number = position.number
             return RoadPlace(_WORLD, number("x"), number("y"), number("z", 0.0), number("h", 0.0))
         case "LanePosition":
             road, lane = position.word("roadId"), position.word("laneId")
             if not lane.startswith("-") or not lane[1:].isdecimal():
                 raise position.wrong("laneId", "a lane that runs with its road, -1 or less")
-            frame = f"lane {lane} of road {road}"
-            return RoadPlace(frame, position.number("s"), position.number("offset", 0.0))
+            return RoadPlace(f"lane {lane} of road {road}", number("s"), number("offset", 0.0))
         case "RoadPosition":
-            return RoadPlace(f"road {position.word('roadId')}", position.number("s"), position.number("t"))
+            return RoadPlace(f"road {position.word('roadId')}", number("s"), number("t"))
         case _:
             other = position.word("entityRef")
             if other not in positions or other == name:
@@ -193,43 +189,33 @@ def _place(name: str, positions: Mapping[str, Element], asking: tuple[str, ...])
 
 def _beside(position: Element, other: RoadPlace) -> RoadPlace:
     """The place that `position` gives relative to `other`."""
+    number, above_m, heading_rad = position.number, 0.0, other.heading_rad
     match position.tag:
         case "RelativeLanePosition":
-            if position.number("dLane") != 0.0:
+            if number("dLane") != 0.0:
                 raise position.wrong("dLane", "0, the lane of the other car")
-            along_m = position.number("dsLane" if position.has("dsLane") else "ds")
-            offset_m = position.number("offset", 0.0)
-            across_m = offset_m - other.across_m if other.frame.startswith("lane ") else offset_m
+            along_m = number("dsLane" if position.has("dsLane") else "ds")
+            across_m = number("offset", 0.0)
+            if other.frame.startswith("lane "):
+                across_m -= other.across_m
         case "RelativeRoadPosition":
-            along_m, across_m = position.number("ds"), position.number("dt")
+            along_m, across_m = number("ds"), number("dt")
         case "RelativeObjectPosition":
-            along_m, across_m = position.number("dx"), position.number("dy")
+            along_m, across_m, above_m = number("dx"), number("dy"), number("dz", 0.0)
         case _:
             assert position.tag == "RelativeWorldPosition", position.tag
             if other.frame != _WORLD:
                 raise position.error(f"the other car is in {other.frame}, allowed is a WorldPosition")
-            moved_m = (other.along_m + position.number("dx"), other.across_m + position.number("dy"))
-            above_m = other.above_m + position.number("dz", 0.0)
-            return RoadPlace(other.frame, *moved_m, above_m, other.heading_rad)
-    above_m = position.number("dz", 0.0) if position.tag == "RelativeObjectPosition" else 0.0
-    cos, sin = math.cos(other.heading_rad), math.sin(other.heading_rad)
+            along_m, across_m, above_m = number("dx"), number("dy"), number("dz", 0.0) + other.above_m
+            heading_rad = 0.0  # of the frame in which the distances are given
+    cos, sin = math.cos(heading_rad), math.sin(heading_rad)
     return RoadPlace(
         other.frame,
         other.along_m + along_m * cos - across_m * sin,
         other.across_m + along_m * sin + across_m * cos,
-        other.above_m + above_m,
+        above_m,
         other.heading_rad,
     )
-
-
-def _check_orientation(position: Element) -> None:
-    turned = position.maybe("Orientation")
-    if turned is None:
-        return
-    turned.choice("type", ("relative", "absolute"), "absolute")
-    for angle in ("h", "p", "r"):
-        if turned.number(angle, 0.0) != 0.0:
-            raise turned.wrong(angle, "0, along the lane")
 
 
 # -- the road
@@ -242,26 +228,23 @@ def check_road(root: Element) -> None:
         return
     signals = network.maybe("TrafficSignals")
     if signals is not None and not signals.children:
-        signals.ignore("there are none")
+        signals.ignored = "there are none"
     logic = network.maybe("LogicFile")
     if logic is None:
         return
     path = Path(root.path).parent / logic.word("filepath")
-    roads = {one.attributes["roadId"] for one in root.walk() if one.visited() and one.has("roadId")}
-    if not roads or not _at_hand(path):
-        logic.ignore("not read: the road is taken to be straight and level")
+    roads = {one.attributes["roadId"] for one in root.walk() if one.visited and one.has("roadId")}
+    try:
+        is_readable = path.is_file() and path.stat().st_size <= FILE_BYTES_MAX
+    except (OSError, ValueError):
+        is_readable = False
+    if not roads or not is_readable:
+        logic.ignored = "not read: the road is taken to be straight and level"
         return
     for road in read_tree(path).children:
         if road.tag == "road" and road.attributes.get("id") in roads:
             _check(road)
-    logic.ignore("nothing but its being straight and level was looked at")
-
-
-def _at_hand(path: Path) -> bool:
-    try:
-        return path.is_file() and path.stat().st_size <= FILE_BYTES_MAX
-    except (OSError, ValueError):
-        return False
+    logic.ignored = "nothing but its being straight and level was looked at"
 
 
 def _check(road: Element) -> None:
@@ -274,6 +257,6 @@ def _check(road: Element) -> None:
         if abs(headings[-1] - headings[0]) > TURNED_RAD_MAX:
             raise geometry.error("another direction; the road has to be straight")
     for elevation in (one for one in road.walk() if one.tag == "elevation"):
-        for slope in _SLOPES:
+        for slope in ("b", "c", "d"):  # of height = a + b s + c s^2 + d s^3
             if elevation.number(slope, 0.0) != 0.0:
                 raise elevation.wrong(slope, "0; the road has to be level")

@@ -38,20 +38,16 @@ FRICTION_NOMINAL: Final = 0.9
 DURATION_S_DEFAULT: Final = 30.0
 _SHAPES: Final = ("linear", "step", "cubic", "sinusoidal")
 _DIMENSIONS: Final = ("rate", "time", "distance")
-_PRIORITIES: Final = ("parallel", "override", "overwrite", "skip")
-_OVERRIDING: Final = ("override", "overwrite")
-_OWN_END: Final = "the drive ends by itself then, at a standstill or on contact"
 _EDGES: Final = ("rising", "none")
 _UPWARD: Final = ("greaterThan", "greaterOrEqual")
 _DOWNWARD: Final = ("lessThan", "lessOrEqual")
-_ALONG: Final = ("longitudinal", "euclidianDistance", "cartesianDistance")
-_FRAMES: Final = ("entity", "lane", "road", "world")
-_CONDITIONS: Final = ("RelativeDistanceCondition", "TimeHeadwayCondition", "TimeToCollisionCondition") + (
+_CONDITIONS: Final = (
+    "RelativeDistanceCondition", "TimeHeadwayCondition", "TimeToCollisionCondition",
     "TraveledDistanceCondition",
-)
+)  # fmt: skip
 
-_BY_VALUE: Final = ("SimulationTimeCondition",)
-_BY_ENTITY: Final = ("TriggeringEntities", "EntityCondition")
+
+# -- triggers
 
 
 class Motion(msgspec.Struct, frozen=True):
@@ -63,10 +59,6 @@ class Motion(msgspec.Struct, frozen=True):
     lead_ms: float
     gap_m: float
     distance_m: float
-
-    @property
-    def closing_ms(self) -> float:
-        return self.ego_ms - self.lead_ms
 
 
 class TriggerTime(msgspec.Struct, frozen=True):
@@ -82,7 +74,6 @@ class _Linear(msgspec.Struct, frozen=True):
 
     start: float
     slope: float
-    assumes_speeds: bool = True
 
 
 def trigger_time(trigger: Element | None, begin_s: float, motion: Motion) -> TriggerTime:
@@ -95,16 +86,15 @@ def trigger_time(trigger: Element | None, begin_s: float, motion: Motion) -> Tri
     if delay_s < 0.0:
         raise condition.wrong("delay", "0 or more")
     by, line = _quantity(condition, motion)
-    allowed = (*_UPWARD, *_DOWNWARD)
     travelled = by.tag == "TraveledDistanceCondition"
-    rule = "greaterOrEqual" if travelled else by.choice("rule", allowed)
-    at_s = _crossing_s(by, line, rule, by.number("value"), begin_s)
+    rule = "greaterOrEqual" if travelled else by.choice("rule", (*_UPWARD, *_DOWNWARD))
+    at_s = _crossing_s(line, rule, by.number("value"), begin_s)
     if at_s is None:
         raise by.error("never met while both cars keep their speed")
     if at_s < begin_s and edge == "rising":
         late = f"met before it is looked at, at {begin_s:g} s"
         raise by.error(f"{late}: with conditionEdge 'rising' it never triggers")
-    return TriggerTime(max(at_s, begin_s) + delay_s, by, line.assumes_speeds)
+    return TriggerTime(max(at_s, begin_s) + delay_s, by, by.tag != "SimulationTimeCondition")
 
 
 def only_condition(trigger: Element | None) -> Element | None:
@@ -131,49 +121,51 @@ def _quantity(condition: Element, motion: Motion) -> tuple[Element, _Linear]:
     """The element of the condition, and the quantity that it compares with its limit."""
     kind = condition.one("ByValueCondition", "ByEntityCondition")
     for child in kind.children:
-        if child.tag not in _BY_VALUE and child.tag not in _BY_ENTITY:
+        if child.tag not in ("SimulationTimeCondition", "TriggeringEntities", "EntityCondition"):
             raise child.error(TRIGGER_UNKNOWN)
     if kind.tag == "ByValueCondition":
-        return kind.one("SimulationTimeCondition"), _Linear(0.0, 1.0, assumes_speeds=False)
+        return kind.one("SimulationTimeCondition"), _Linear(0.0, 1.0)
     entities = kind.one("TriggeringEntities")
     entities.choice("triggeringEntitiesRule", ("any", "all"))
     name = entities.one("EntityRef").choice("entityRef", (motion.ego, motion.lead))
-    (by,) = kind.one("EntityCondition").children[:1] or [kind]
-    if by.tag not in _CONDITIONS:
-        raise by.error(TRIGGER_UNKNOWN)
-    by = kind.one("EntityCondition").one(*_CONDITIONS)
+    holder = kind.one("EntityCondition")
+    first = holder.children[0] if holder.children else kind
+    if first.tag not in _CONDITIONS:
+        raise first.error(TRIGGER_UNKNOWN)
+    by = holder.one(*_CONDITIONS)
     if by.tag == "TraveledDistanceCondition":
         return by, _Linear(0.0, motion.ego_ms if name == motion.ego else motion.lead_ms)
-    _check_other(by, name, motion)
-    distance_m = motion.gap_m if by.flag("freespace") else motion.distance_m
+    distance, closing_ms = _distance_m(by, name, motion), motion.ego_ms - motion.lead_ms
     match by.tag:
         case "RelativeDistanceCondition":
-            return by, _Linear(distance_m, -motion.closing_ms)
+            return by, _Linear(distance, -closing_ms)
         case "TimeHeadwayCondition":
             if name != motion.ego or motion.ego_ms == 0.0:
                 raise by.error(f"allowed is the headway of {motion.ego!r}, which moves, to the car ahead")
-            return by, _Linear(distance_m / motion.ego_ms, -motion.closing_ms / motion.ego_ms)
+            return by, _Linear(distance / motion.ego_ms, -closing_ms / motion.ego_ms)
         case _:
             assert by.tag == "TimeToCollisionCondition", by.tag
-            if motion.closing_ms <= 0.0:
+            if closing_ms <= 0.0:
                 raise by.error("never met: the gap does not close while both cars keep their speed")
-            return by, _Linear(distance_m / motion.closing_ms, -1.0)
+            return by, _Linear(distance / closing_ms, -1.0)
 
 
-def _check_other(by: Element, name: str, motion: Motion) -> None:
-    """Check that the condition looks at the distance between the two cars, along the lane."""
+def _distance_m(by: Element, name: str, motion: Motion) -> float:
+    """The distance that the condition looks at, at the start: that between the two cars, along the lane."""
     holder = by
     if by.tag == "TimeToCollisionCondition":
         holder = by.one("TimeToCollisionConditionTarget").one("EntityRef")
     holder.choice("entityRef", (motion.lead if name == motion.ego else motion.ego,))
-    by.choice("relativeDistanceType", _ALONG, "longitudinal")
-    by.choice("coordinateSystem", _FRAMES, "entity")  # on a straight road they are all one
+    along = ("longitudinal", "euclidianDistance", "cartesianDistance")
+    by.choice("relativeDistanceType", along, "longitudinal")
+    by.choice("coordinateSystem", ("entity", "lane", "road", "world"), "entity")  # all one on a straight road
     by.word("routingAlgorithm", "")
     if by.has("alongRoute"):
         by.flag("alongRoute")
+    return motion.gap_m if by.flag("freespace") else motion.distance_m
 
 
-def _crossing_s(by: Element, line: _Linear, rule: str, limit: float, begin_s: float) -> float | None:
+def _crossing_s(line: _Linear, rule: str, limit: float, begin_s: float) -> float | None:
     """The first time at which the rule holds (before `begin_s` if it holds then already); None: never."""
     sign = 1.0 if rule in _UPWARD else -1.0
     missing = sign * (limit - line.start)
@@ -255,11 +247,14 @@ class StoryboardReader:
             if name not in self._speeds:
                 self._take(init, f"{name} stands: no SpeedAction")
         speed_ms = self._speed_ms(self._ego.name, ())
-        if self._lead is None:
-            self._refuse_changes(storyboard)
+        lead = None
+        if self._lead is not None:
+            lead = self._read_lead(storyboard, self._lead, speed_ms)
+        else:
+            for change in _moving_actions(storyboard):
+                raise change.event.error("there is no car ahead that it could move")
             for place in self._places.values():
-                place.ignore("the road is empty: one place is like another")
-        lead = self._read_lead(storyboard, speed_ms) if self._lead else None
+                place.ignored = "the road is empty: one place is like another"
         duration_s = self._read_stop(storyboard)
         if lead and lead.braking and lead.braking.after_s >= duration_s:
             begin = f"braking begins at {lead.braking.after_s:g} s"
@@ -280,17 +275,16 @@ class StoryboardReader:
             if name not in self._cars:
                 raise private.error(f"entityRef: {unknown('car', name, self._cars)}")
             for action in private.every("PrivateAction"):
-                if not idle(action):
-                    self._read_begin(name, action.one("TeleportAction", "LongitudinalAction"))
-
-    def _read_begin(self, name: str, action: Element) -> None:
-        if action.tag == "TeleportAction":
-            begin, found = self._places, action.one("Position")
-        else:
-            begin, found = self._speeds, action.one("SpeedAction")
-        if name in begin:
-            raise found.error(f"the second one of {name!r}")
-        begin[name] = found
+                if idle(action):
+                    continue
+                kind = action.one("TeleportAction", "LongitudinalAction")
+                if kind.tag == "TeleportAction":
+                    begin, found = self._places, kind.one("Position")
+                else:
+                    begin, found = self._speeds, kind.one("SpeedAction")
+                if name in begin:
+                    raise found.error(f"the second one of {name!r}")
+                begin[name] = found
 
     def _read_environment(self, environment: Element) -> None:
         road = environment.maybe("RoadCondition")
@@ -319,55 +313,39 @@ class StoryboardReader:
         target = action.one("SpeedActionTarget").one("AbsoluteTargetSpeed", "RelativeTargetSpeed")
         speed_ms = target.number("value")
         if target.tag == "RelativeTargetSpeed":
-            speed_ms = self._relative_ms(name, target, asking)
+            others = set(self._cars) - {name, *asking}
+            other = target.word("entityRef")
+            if other not in others:
+                raise target.error(f"entityRef: {unknown('car', other, others)}")
+            if target.flag("continuous"):
+                raise target.wrong("continuous", "false")
+            other_ms = self._speed_ms(other, (*asking, name))
+            delta = target.choice("speedTargetValueType", ("delta", "factor")) == "delta"
+            speed_ms = other_ms + speed_ms if delta else other_ms * speed_ms
         if speed_ms < 0.0:
             raise target.error(f"{speed_ms:g} m/s, allowed is 0 or more")
         if not asking:
             self._take(target, f"{name} drives at {speed_ms * KMH_PER_MS:g} km/h")
         return speed_ms
 
-    def _relative_ms(self, name: str, target: Element, asking: tuple[str, ...]) -> float:
-        other = target.word("entityRef")
-        if other not in self._cars or other in (*asking, name):
-            raise target.error(f"entityRef: {unknown('car', other, set(self._cars) - {name, *asking})}")
-        if target.flag("continuous"):
-            raise target.wrong("continuous", "false")
-        other_ms = self._speed_ms(other, (*asking, name))
-        kind = target.choice("speedTargetValueType", ("delta", "factor"))
-        value = target.number("value")
-        return other_ms + value if kind == "delta" else other_ms * value
-
     # -- Story
 
-    def _read_lead(self, storyboard: Element, ego_ms: float) -> LeadDrive:
-        assert self._lead is not None
+    def _read_lead(self, storyboard: Element, lead: CarShape, ego_ms: float) -> LeadDrive:
         for name in self._cars:
             if name not in self._places:
                 raise storyboard.error(f"Init places {name!r} nowhere: TeleportAction is missing")
-        gap = gap_m(self._ego, self._lead, self._places)
-        where = self._places[self._lead.name]
+        gap = gap_m(self._ego, lead, self._places)
+        where = self._places[lead.name]
         if gap <= 0.0:
-            raise where.error(f"{self._lead.name!r} is {gap:g} m ahead of the ego, bumper to bumper")
-        self._take(where, f"{self._lead.name} is {gap:g} m ahead, bumper to bumper")
-        lead_ms = self._speed_ms(self._lead.name, ())
-        away_m = distance_m(self._ego, self._lead, self._places)
-        motion = Motion(self._ego.name, self._lead.name, ego_ms, lead_ms, gap, away_m)
-        braking = self._read_braking(storyboard, motion)
-        return LeadDrive(self._lead.name, gap, lead_ms, braking)
-
-    def _refuse_changes(self, storyboard: Element) -> None:
-        for change in self._changes(storyboard):
-            raise change.event.error("there is no car ahead that it could move")
-
-    def _changes(self, storyboard: Element) -> list[MovingAction]:
-        found = []
-        for story in storyboard.every("Story"):
-            for act in story.every("Act"):
-                found += _changes(act)
-        return found
+            raise where.error(f"{lead.name!r} is {gap:g} m ahead of the ego, bumper to bumper")
+        self._take(where, f"{lead.name} is {gap:g} m ahead, bumper to bumper")
+        lead_ms = self._speed_ms(lead.name, ())
+        away_m = distance_m(self._ego, lead, self._places)
+        motion = Motion(self._ego.name, lead.name, ego_ms, lead_ms, gap, away_m)
+        return LeadDrive(lead.name, gap, lead_ms, self._read_braking(storyboard, motion))
 
     def _read_braking(self, storyboard: Element, motion: Motion) -> Braking | None:
-        changes = self._changes(storyboard)
+        changes = _moving_actions(storyboard)
         if not changes:
             return None
         if len(changes) > 1:
@@ -375,78 +353,29 @@ class StoryboardReader:
         act, group, event, change = changes[0]
         if change.tag == "GlobalAction":
             raise change.error("changes the world while the cars drive; only Init may")
-        self._check_actors(group)
+        _check_actors(group, motion.lead)
         for element in (group, event):
             if element.word("maximumExecutionCount", "1") != "1":
                 raise element.wrong("maximumExecutionCount", "1")
         action = change.one("LongitudinalAction").one("SpeedAction")
         if event.word("priority", "") == "skip":
             raise event.wrong("priority", "another one: it may not begin while another event runs")
-        begin = self._begin(act, 0.0, motion)
-        start = self._begin(event, begin, motion)
-        deceleration_ms2 = self._deceleration_ms2(action, motion.lead_ms)
-        end_s = start + motion.lead_ms / deceleration_ms2
-        self._check_act_stop(act, end_s)
-        self._take(action, f"{motion.lead} brakes at {deceleration_ms2:g} m/s2 from {start:g} s on")
-        return Braking(start, deceleration_ms2)
+        begin_s = self._begin_s(event, self._begin_s(act, 0.0, motion), motion)
+        deceleration_ms2 = _deceleration_ms2(action, motion.lead_ms)
+        _check_act_stop(act, begin_s + motion.lead_ms / deceleration_ms2)
+        self._take(action, f"{motion.lead} brakes at {deceleration_ms2:g} m/s2 from {begin_s:g} s on")
+        return Braking(begin_s, deceleration_ms2)
 
-    def _begin(self, element: Element, begin_s: float, motion: Motion) -> float:
-        """When an act or event begins whose trigger is evaluated from `begin_s` on."""
+    def _begin_s(self, element: Element, from_s: float, motion: Motion) -> float:
+        """When an act or event begins whose trigger is evaluated from `from_s` on."""
         trigger = element.maybe("StartTrigger")
-        found = trigger_time(trigger, begin_s, motion)
+        found = trigger_time(trigger, from_s, motion)
         if found.condition is not None:
             kept = ", if no car has braked by then" if found.assumes_speeds else ""
             self._take(found.condition, f"met at {found.at_s:g} s{kept}")
         elif trigger is not None:
             self._take(trigger, f"has no condition: met at {found.at_s:g} s")
         return found.at_s
-
-    def _check_actors(self, group: Element) -> None:
-        actors = group.one("Actors")
-        if actors.flag("selectTriggeringEntities", False):
-            raise actors.wrong("selectTriggeringEntities", "false")
-        actor = actors.one("EntityRef")
-        assert self._lead is not None
-        if actor.word("entityRef") != self._lead.name:
-            moved = f"only the car ahead, {self._lead.name!r}, is moved by the storyboard"
-            raise actor.error(f"found {actor.word('entityRef')!r}; {moved}")
-
-    def _deceleration_ms2(self, action: Element, speed_ms: float) -> float:
-        dynamics = action.one("SpeedActionDynamics")
-        if dynamics.choice("dynamicsShape", _SHAPES) != "linear":
-            raise dynamics.wrong("dynamicsShape", "linear")
-        dynamics.choice("followingMode", ("position",), "position")
-        target = action.one("SpeedActionTarget").one("AbsoluteTargetSpeed")
-        if target.number("value") != 0.0:
-            raise target.wrong("value", "0: the car ahead brakes to a standstill")
-        if speed_ms == 0.0:
-            raise action.error("the car ahead stands already")
-        value = abs(dynamics.number("value"))  # some files write a rate as -6
-        dimension = dynamics.choice("dynamicsDimension", _DIMENSIONS)
-        if value == 0.0:
-            raise dynamics.wrong("value", "more than 0")
-        match dimension:
-            case "rate":
-                found = value
-            case "time":
-                found = speed_ms / value
-            case _:
-                found = speed_ms * speed_ms / (2.0 * value)
-        if not 0.01 <= found <= 12.0:
-            raise dynamics.error(f"a deceleration of {found:g} m/s2, allowed is 0.01 to 12")
-        return found
-
-    def _check_act_stop(self, act: Element, end_s: float) -> None:
-        """Check that nothing stops the act while the car ahead brakes."""
-        stop = act.maybe("StopTrigger")
-        condition = only_condition(stop)
-        if stop is None or condition is None:
-            return
-        at_s = time_limit_s(condition)
-        if at_s is None and _has_ended(condition):
-            stop.ignore("what it waits for has ended by then")
-        elif at_s is None or at_s < end_s:
-            raise stop.error(f"may stop the act before the car ahead stands, at {end_s:g} s")
 
     # -- Stop
 
@@ -458,11 +387,12 @@ class StoryboardReader:
         for group in stop.every("ConditionGroup") if stop else []:
             for condition in group.every("Condition"):
                 at_s = time_limit_s(condition)
+                tags = {element.tag for element in condition.walk()}
                 if at_s is not None and len(group.children) == 1:
                     found_s.append(at_s)
                     self._take(condition, f"the drive ends at {at_s:g} s")
-                elif _ends_by_itself(condition) and len(group.children) == 1:
-                    condition.ignore(_OWN_END)
+                elif tags & {"StandStillCondition", "CollisionCondition"} and len(group.children) == 1:
+                    condition.ignored = "the drive ends by itself then, at a standstill or on contact"
                 else:
                     raise condition.error("ends the drive at a moment that is not known; --duration says it")
         if not found_s:
@@ -477,21 +407,24 @@ def idle(holder: Element) -> bool:
     )
 
 
-def _changes(act: Element) -> list[MovingAction]:
-    """The moving actions of an act. Triggers and actors of events without any are marked as ignored."""
+def _moving_actions(storyboard: Element) -> list[MovingAction]:
+    """The moving actions of all acts. Triggers and actors of elements without any are marked as ignored."""
     found = []
-    for group in act.every("ManeuverGroup"):
-        group.word("maximumExecutionCount", "")
-        for reference in group.every("CatalogReference"):
-            raise reference.error("maneuvers of catalogs are not read; put it into the file")
-        changes = [
-            change for maneuver in group.every("Maneuver") for change in _in_maneuver(act, group, maneuver)
-        ]
-        if not changes:
-            _ignore_below(group, "Actors")
-        found += changes
-    if not found:
-        _ignore_below(act, "StartTrigger", "StopTrigger")
+    for act in (act for story in storyboard.every("Story") for act in story.every("Act")):
+        in_act = []
+        for group in act.every("ManeuverGroup"):
+            group.word("maximumExecutionCount", "")
+            for reference in group.every("CatalogReference"):
+                raise reference.error("maneuvers of catalogs are not read; put it into the file")
+            in_group = [
+                one for maneuver in group.every("Maneuver") for one in _in_maneuver(act, group, maneuver)
+            ]
+            if not in_group:
+                _ignore_below(group, "Actors")
+            in_act += in_group
+        if not in_act:
+            _ignore_below(act, "StartTrigger", "StopTrigger")
+        found += in_act
     return found
 
 
@@ -499,31 +432,73 @@ def _in_maneuver(act: Element, group: Element, maneuver: Element) -> list[Moving
     found, quiet = [], []
     for event in maneuver.every("Event"):
         event.word("maximumExecutionCount", "")
-        event.choice("priority", _PRIORITIES, "parallel")
-        inner = [
-            kind for action in event.every("Action") for kind in action.every("PrivateAction", "GlobalAction")
+        event.choice("priority", ("parallel", "override", "overwrite", "skip"), "parallel")
+        moving = [
+            MovingAction(act, group, event, kind)
+            for action in event.every("Action")
+            for kind in action.every("PrivateAction", "GlobalAction")
+            if not idle(kind)
         ]
-        moving = [kind for kind in inner if not idle(kind)]
-        found += [MovingAction(act, group, event, kind) for kind in moving]
+        found += moving
         if not moving:
             quiet.append(event)
             _ignore_below(event, "StartTrigger")
     for event in quiet:
-        if found and event.attributes.get("priority") in _OVERRIDING:
+        if found and event.attributes.get("priority") in ("override", "overwrite"):
             raise event.wrong("priority", "parallel: it may stop the event that moves the car")
     return found
 
 
 def _ignore_below(element: Element, *tags: str) -> None:
     for child in element.every(*tags):
-        child.ignore(f"nothing in the {element.tag} moves a car")
+        child.ignored = f"nothing in the {element.tag} moves a car"
 
 
-def _ends_by_itself(condition: Element) -> bool:
-    tags = {element.tag for element in condition.walk()}
-    return bool(tags & {"StandStillCondition", "CollisionCondition"})
+def _check_actors(group: Element, lead: str) -> None:
+    actors = group.one("Actors")
+    if actors.flag("selectTriggeringEntities", False):
+        raise actors.wrong("selectTriggeringEntities", "false")
+    actor = actors.one("EntityRef")
+    if (name := actor.word("entityRef")) != lead:
+        raise actor.error(f"found {name!r}; only the car ahead, {lead!r}, is moved by the storyboard")
 
 
-def _has_ended(condition: Element) -> bool:
+def _deceleration_ms2(action: Element, speed_ms: float) -> float:
+    dynamics = action.one("SpeedActionDynamics")
+    if dynamics.choice("dynamicsShape", _SHAPES) != "linear":
+        raise dynamics.wrong("dynamicsShape", "linear")
+    dynamics.choice("followingMode", ("position",), "position")
+    target = action.one("SpeedActionTarget").one("AbsoluteTargetSpeed")
+    if target.number("value") != 0.0:
+        raise target.wrong("value", "0: the car ahead brakes to a standstill")
+    if speed_ms == 0.0:
+        raise action.error("the car ahead stands already")
+    value = abs(dynamics.number("value"))  # some files write a rate as -6
+    dimension = dynamics.choice("dynamicsDimension", _DIMENSIONS)
+    if value == 0.0:
+        raise dynamics.wrong("value", "more than 0")
+    match dimension:
+        case "rate":
+            found = value
+        case "time":
+            found = speed_ms / value
+        case _:
+            found = speed_ms * speed_ms / (2.0 * value)
+    if not 0.01 <= found <= 12.0:
+        raise dynamics.error(f"a deceleration of {found:g} m/s2, allowed is 0.01 to 12")
+    return found
+
+
+def _check_act_stop(act: Element, end_s: float) -> None:
+    """Check that nothing stops the act while the car ahead brakes, until `end_s`."""
+    stop = act.maybe("StopTrigger")
+    condition = only_condition(stop)
+    if stop is None or condition is None:
+        return
+    at_s = time_limit_s(condition)
     states = [one for one in condition.walk() if one.tag == "StoryboardElementStateCondition"]
-    return len(states) == 1 and states[0].attributes.get("state") in ("completeState", "endTransition")
+    ended = len(states) == 1 and states[0].attributes.get("state") in ("completeState", "endTransition")
+    if at_s is None and ended:
+        stop.ignored = "what it waits for has ended by then"
+    elif at_s is None or at_s < end_s:
+        raise stop.error(f"may stop the act before the car ahead stands, at {end_s:g} s")
