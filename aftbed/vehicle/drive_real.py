@@ -95,45 +95,55 @@ def drive(
 
     `report` is called each 50 ms of bus time and at the end. Raises HarnessError when the bus fails.
     """
-    return _Car(scenario, codec, buses, options).run(report, stop)
+    return _Drive(scenario, codec, buses, options, stop).run(report)
 
 
-class _Car:
-    def __init__(self, scenario: Scenario, codec: Codec, buses: CarBuses, options: DriveOptions) -> None:
+class _Drive:
+    def __init__(
+        self,
+        scenario: Scenario,
+        codec: Codec,
+        buses: CarBuses,
+        options: DriveOptions,
+        stop: Callable[[], bool],
+    ) -> None:
         assert options.pace is not None or buses.line is not None, "lockstep without a hub"
-        self._options = options
         self._buses = buses
         self._body = CarBody(scenario, codec, options.brake_policy, options.seed)
+        self._schedule = None if options.pace is None else Schedule(options.pace)
+        self._stop = stop
         self._track_id = codec.can_id("RADAR_TRACK")
         self._tracks = 0
-        self._lag_ms_max = 0.0
         self._sent = {RADAR: 0, BRAKE: 0}
         line = buses.line if options.pace is None else None
         answer_id = codec.can_id("AEB_REQ")
         self._watch = AnswerWatch(buses.brake, answer_id, self._body.receive, self._track_id, line)
 
-    def run(self, report: Callable[[Telemetry], None], stop: Callable[[], bool]) -> DriveReport:
-        schedule = None if self._options.pace is None else Schedule(self._options.pace)
-        while (end := self._ended(stop)) is None:
+    def run(self, report: Callable[[Telemetry], None]) -> DriveReport:
+        body, schedule = self._body, self._schedule
+        while (end := body.ended() or ("stopped" if self._stop() else None)) is None:
             if schedule is None:
-                self._exchange_in_lockstep(stop)
+                assert self._buses.line is not None
+                self._exchange_in_lockstep(self._buses.line)
             else:
-                schedule.wait_until(self._body.t_us, stop)
-                self._lag_ms_max = schedule.lag_ms_max
+                schedule.wait_until(body.plant.t_us, self._stop)
                 self._exchange()
-            self._body.step(report)
-            for can_id, word in self._body.noticed():
+            body.step(report)
+            for can_id, word in body.noticed():
                 self._buses.brake.notice(can_id, word)
-        report(self._body.telemetry())
-        return self._report(end)
-
-    def _ended(self, stop: Callable[[], bool]) -> End | None:
-        return self._body.ended() or ("stopped" if stop() else None)
-
-    # -- frames
+        report(body.telemetry())
+        return DriveReport(
+            result=body.result(),
+            end=end,
+            t_us=body.plant.t_us,
+            tracks=self._tracks,
+            answers=self._watch.answered,
+            missing_answers=self._watch.missing,
+            lag_ms_max=0.0 if schedule is None else schedule.lag_ms_max,
+        )
 
     def _exchange(self) -> None:
-        """Paced: take what has come, send what is due."""
+        """Paced: take the frames that have come, send those that are due."""
         if self._buses.line is not None:
             self._buses.line.changes()  # not used: time does not wait
             self._report_conditions(self._buses.line)
@@ -148,16 +158,16 @@ class _Car:
 
     def _report_conditions(self, line: HubLine) -> None:
         """Report to the hub which conditions hold now."""
+        t_us = self._body.plant.t_us
         for number, condition in list(line.conditions.items()):
             if self._body.holds(condition):
-                if self._options.pace is None:
-                    line.set_time(self._body.t_us)
-                line.met(number, self._body.t_us)
+                if self._schedule is None:
+                    line.set_time(t_us)
+                line.met(number, t_us)
 
-    def _exchange_in_lockstep(self, stop: Callable[[], bool]) -> None:
-        """Send what is due in an order that the hub cannot change, and wait for the answer."""
-        line, t_us = self._buses.line, self._body.t_us
-        assert line is not None
+    def _exchange_in_lockstep(self, line: HubLine) -> None:
+        """Send the frames that are due in an order that the hub cannot change, and wait for the answer."""
+        t_us = self._body.plant.t_us
         if line.conditions:
             self._report_conditions(line)
         brake_frames, radar_frames = self._body.brake_frames(), self._body.radar_frames()
@@ -166,17 +176,16 @@ class _Car:
             return
         line.set_time(t_us)
         if due:
-            self._watch.wait(stop)  # for what is answered of what the hub had held back
+            self._watch.wait(self._stop)  # for the answers to frames that the hub had held back
         self._send(BRAKE, self._buses.brake, brake_frames, line)
         asks = any(frame.can_id == self._track_id for frame in radar_frames)
         if asks:
             self._watch.asked()
         self._send(RADAR, self._buses.radar, radar_frames, line)
         self._buses.radar.drain()
-        if asks:
-            self._tracks += 1
+        self._tracks += asks
         if asks or line.disturbed:
-            self._watch.wait(stop)
+            self._watch.wait(self._stop)
 
     def _send(self, node: str, bus: Bus, frames: Sequence[Frame], line: HubLine) -> None:
         """Return when all `frames` have been over the wire."""
@@ -185,14 +194,3 @@ class _Car:
         if frames:
             self._sent[node] += len(frames)
             line.carried(node, self._sent[node])
-
-    def _report(self, end: End) -> DriveReport:
-        return DriveReport(
-            result=self._body.result(),
-            end=end,
-            t_us=self._body.t_us,
-            tracks=self._tracks,
-            answers=self._watch.answered,
-            missing_answers=self._watch.missing,
-            lag_ms_max=self._lag_ms_max,
-        )

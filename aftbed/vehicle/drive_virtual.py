@@ -1,4 +1,4 @@
-"""The car in virtual time, inside one process: no socket, no clock, no thread. The bus is a call.
+"""The car in virtual time, inside one process: no socket, no clock, no thread. The bus is a function call.
 
 The body, the frames with their E2E and the gateway are those of a real run, and so are the rules of the bus
 (`can.bus_model`). What differs: a frame reaches all nodes in the instant in which it is sent, and time is
@@ -112,7 +112,7 @@ class VirtualCar:
     @property
     def t_us(self) -> int:
         """How far the drive has come, in microseconds of bus time."""
-        return self._body.t_us
+        return self._body.plant.t_us
 
     @property
     def counts(self) -> GatewayCounts:
@@ -120,7 +120,7 @@ class VirtualCar:
         return self._bus.gateway.counts
 
     def result(self) -> VehicleResult:
-        """What the drive came to, so far."""
+        """The drive so far."""
         return self._body.result()
 
     def due_ns(self) -> int | None:
@@ -129,7 +129,7 @@ class VirtualCar:
             return None
         if self._bus.requests:
             return self._now_ns
-        due_us = min(self._body.track_due_us(self._step_us), self._body.duration_us)
+        due_us = min(self._body.radar.track.next_us(self._step_us), self._body.duration_us)
         released_us = self._bus.disturber.due_us() if self._bus.disturber is not None else None
         if released_us is not None:  # it comes with a step that has not begun
             due_us = min(due_us, max(self._step_us, -(-released_us // STEP_US) * STEP_US))
@@ -175,7 +175,7 @@ class VirtualCar:
         self._bus.watch(number, condition)
 
     def go_on(self, now_ns: int) -> None:
-        """One of the conditions has been dealt with: the step goes on when all have."""
+        """All actions at one of the conditions are done: the step goes on when this is true of all."""
         self._holds -= 1
         self.pass_time(now_ns)
 
@@ -190,13 +190,6 @@ class VirtualCar:
         self._bus.gateway.noticed()  # what it has noticed before, no fault has caused
         self._bus.disturb(disturber)
 
-    def _meet_conditions(self) -> None:
-        t_us = self._body.t_us
-        for number, condition in self._bus.conditions():
-            if self._body.holds(condition) and self._bus.met(number, t_us):
-                self._holds += 1
-                self._on_met.pop(number)(t_us)
-
     # -- steps ----------------------------------------------------------------------------------
 
     def _set_now(self, now_ns: int) -> None:
@@ -205,24 +198,27 @@ class VirtualCar:
 
     def _drive(self, until_ns: int) -> None:
         """Take the steps up to and including that time."""
-        body = self._body
+        plant = self._body.plant
         while self._end is None and not self._holds and self._step_us * 1000 <= until_ns:
-            if self._step_us > body.t_us:
+            if self._step_us > plant.t_us:
                 self._finish_step()
             else:
-                self._begin_step()
+                self._begin_step(plant.t_us)
 
-    def _begin_step(self) -> None:
-        """The ECUs send what is due, unless a condition has to be dealt with before."""
+    def _begin_step(self, t_us: int) -> None:
+        """The ECUs send the frames that are due, unless a condition holds whose actions come first."""
         bus, body = self._bus, self._body
-        bus.receive_until(body.t_us - 1)
+        bus.receive_until(t_us - 1)
         if bus.disturbed or bus.watched:
-            self._meet_conditions()
+            for number, condition in bus.conditions():
+                if body.holds(condition) and bus.met(number, t_us):
+                    self._holds += 1
+                    self._on_met.pop(number)(t_us)
             if self._holds:
                 return
-        self._step_us = body.t_us + STEP_US
+        self._step_us = t_us + STEP_US
         if bus.disturbed:
-            bus.release(body.t_us)
+            bus.release(t_us)
         for frame in body.brake_frames():
             bus.transmit(bus.brake_node, frame)
         for frame in body.radar_frames():
@@ -230,7 +226,7 @@ class VirtualCar:
 
     def _finish_step(self) -> None:
         """The brake ECU receives what has come in this instant, and the plant moves."""
-        self._bus.receive_until(self._body.t_us)
+        self._bus.receive_until(self._body.plant.t_us)
         self._body.step()
         if self._bus.disturber is not None:
             for can_id, word in self._body.noticed():

@@ -6,8 +6,8 @@ believed is bridged with the last one for `HOLD_US`, after that a policy decides
 
     hold     keep the last request for as long as none comes
     release  no braking without a request
-    latch    (default) if full braking was being asked for above standstill, brake to standstill, whatever
-             comes in the meantime except a full request; else release
+    latch    (default) if the last request above standstill was for full braking, brake to standstill,
+             whatever comes in the meantime except a full request; else release
 
 Latch, because a car in emergency braking has, by its last knowledge, an obstacle ahead: the death of the
 function that saw it does not remove it. A weaker request does not end a latch, since a function that has
@@ -20,9 +20,9 @@ order, and RADAR_STATUS is kept 5 ms off the grid of the others: so RADAR_TRACK 
 `CarBody` is the plant with both ECUs. `drive_real` and `drive_virtual` carry its frames: the one over a real
 bus, paced or in lockstep, the other inside one process. A step is, in both:
 
-    frames   what the ECUs have to send now, brake ECU first
-    receive  what has arrived for the brake ECU
-    step     the brakes follow what was received, and the plant moves by 1 ms
+    brake_frames, radar_frames   what the ECUs have to send now, in this order
+    receive                      what has arrived for the brake ECU
+    step                         the brakes follow what was received, and the plant moves by 1 ms
 
 A frame arrives, for an ECU, in the step that finds it. The drive ends one second after the car has come to
 stand and stayed there, on contact, or at the end of the scenario.
@@ -36,13 +36,13 @@ from typing import Final, Literal
 
 import msgspec
 
-from aftbed.vehicle.aeb.messages import STAGE_WARN
+from aftbed.vehicle.aeb.messages import STAGE_FULL, STAGE_WARN
 from aftbed.vehicle.can.bus_model import FALLBACK
 from aftbed.vehicle.can.dbc_file import Codec
 from aftbed.vehicle.can.e2e import P11, ChannelState, FrameStatus, Receiver, Supervision
 from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.condition import Condition
-from aftbed.vehicle.plant import STEP_US, Driver, Plant, Telemetry, VehicleResult
+from aftbed.vehicle.plant import STEP_US, Plant, Telemetry, VehicleResult
 from aftbed.vehicle.scenarios.scenario import Scenario
 
 BrakePolicy = Literal["hold", "release", "latch"]
@@ -58,7 +58,6 @@ TRACK_ID: Final = 0
 HOLD_US: Final = 60_000
 LATE_US: Final = 30_000  # one cycle and a half: from here on a request is missing
 AEB_REQ_TIMEOUT_US: Final = 100_000
-STAGE_FULL: Final = 3
 NOTICED_MAX: Final = 64
 
 
@@ -103,52 +102,44 @@ class RadarEcu:
     """RADAR_TRACK at 0, 20, 40 ms and so on; RADAR_STATUS at 5, 105, 205 ms and so on."""
 
     def __init__(self, codec: Codec, seed: int) -> None:
-        self._random = Random(seed)
-        self._track = Sender(codec, "RADAR_TRACK")
+        self.track = Sender(codec, "RADAR_TRACK")
         self._status = Sender(codec, "RADAR_STATUS", RADAR_STATUS_OFFSET_US)
+        self._random = Random(seed)
         self._seen = False
         self._cycle = 0
 
-    def track_due_us(self, from_us: int) -> int:
-        """The bus time of the first RADAR_TRACK at or after `from_us`."""
-        return self._track.next_us(from_us)
-
     def frames(self, plant: Plant) -> list[Frame]:
         """The frames due at `plant.t_us`. To be called once for each plant step."""
-        if self._track.due(plant.t_us):
+        if self.track.due(plant.t_us):
             self._cycle += 1
-            return [self._track.frame(plant.t_us, self._measure(plant))]
+            return [self.track.frame(plant.t_us, self._measure(plant))]
         if self._status.due(plant.t_us):
             status = {"STATE": 1, "TRACKS": int(self._seen), "CYCLE": self._cycle % 0x10000}
             return [self._status.frame(plant.t_us, status)]
         return []
 
     def _measure(self, plant: Plant) -> dict[str, float]:
-        noise = (self._noise(RANGE_NOISE_M), self._noise(SPEED_NOISE_MS), self._noise(LATERAL_NOISE_M))
+        """The signals of RADAR_TRACK; all 0 if there is no target."""
+        noise = [self._noise(width) for width in (RANGE_NOISE_M, SPEED_NOISE_MS, LATERAL_NOISE_M)]
         seen = plant.gap_m is not None and plant.gap_m <= RANGE_MAX_M
         new, self._seen = seen and not self._seen, seen
-        if plant.gap_m is None or not seen:
-            return _track_signals(False, False, 0.0, 0.0, 0.0)
-        relative_ms = plant.lead_speed_ms - plant.speed_ms
-        range_m, lateral_m = max(0.0, plant.gap_m + noise[0]), plant.lateral_m + noise[2]
-        return _track_signals(True, new, range_m, relative_ms + noise[1], lateral_m)
+        range_m = relative_ms = lateral_m = 0.0
+        if plant.gap_m is not None and seen:
+            range_m = max(0.0, plant.gap_m + noise[0])
+            relative_ms = plant.lead_speed_ms - plant.speed_ms + noise[1]
+            lateral_m = plant.lateral_m + noise[2]
+        return {
+            "VALID": int(seen),
+            "NEW_TRACK": int(new),
+            "TRACK_ID": TRACK_ID,
+            "RANGE": range_m,
+            "RELATIVE_SPEED": max(-100.0, min(100.0, relative_ms)),
+            "LATERAL_OFFSET": max(-10.0, min(10.0, lateral_m)),
+        }
 
     def _noise(self, half_width: float) -> float:
         """Bell-shaped and bounded: four uniforms, and none of a platform's own log or cos."""
         return half_width * (sum(self._random.random() for _ in range(4)) - 2.0) / 2.0
-
-
-def _track_signals(
-    valid: bool, new: bool, range_m: float, relative_ms: float, lateral_m: float
-) -> dict[str, float]:
-    return {
-        "VALID": int(valid),
-        "NEW_TRACK": int(new),
-        "TRACK_ID": TRACK_ID,
-        "RANGE": range_m,
-        "RELATIVE_SPEED": max(-100.0, min(100.0, relative_ms)),
-        "LATERAL_OFFSET": max(-10.0, min(10.0, lateral_m)),
-    }
 
 
 class BrakeEcu:
@@ -160,7 +151,7 @@ class BrakeEcu:
         self.fallback = Fallback.NONE
         self.accepted = 0
         self.refused = 0
-        self.noticed: deque[tuple[int, str]] = deque(maxlen=NOTICED_MAX)  # of which frames, what is wrong
+        self.noticed: deque[tuple[int, str]] = deque(maxlen=NOTICED_MAX)  # identifier of a frame, its defect
         self._codec = codec
         self._policy = policy
         self._aeb_req_id = codec.can_id("AEB_REQ")
@@ -203,10 +194,22 @@ class BrakeEcu:
 
     def frames(self, plant: Plant) -> list[Frame]:
         """The frames due at `plant.t_us`, in arbitration order. Call once for each plant step."""
-        if not self._status.due(plant.t_us):
-            return []
         t_us = plant.t_us
-        return [self._status.frame(t_us, self._status_signals(plant)), self._ego.frame(t_us, _motion(plant))]
+        if not self._status.due(t_us):
+            return []
+        status = {
+            "STAGE_APPLIED": self.stage,
+            "FALLBACK": int(self.fallback),
+            "DECELERATION_ACTUAL": max(0.0, min(20.0, -plant.acceleration_ms2)),
+            "DECELERATION_DEMANDED": self._demand_ms2,
+            "SEQUENCE_FOLLOWED": self._request["SEQUENCE"] if self._request else 0,
+        }
+        ego = {
+            "SPEED_VALID": 1,
+            "SPEED": min(65.535, plant.speed_ms),
+            "ACCELERATION": max(-20.0, min(20.0, plant.acceleration_ms2)),
+        }
+        return [self._status.frame(t_us, status), self._ego.frame(t_us, ego)]
 
     def _choose(self, plant: Plant, request: dict[str, float]) -> Fallback:
         """Fresh request, bridge, or policy."""
@@ -222,23 +225,6 @@ class BrakeEcu:
             return Fallback.LATCH
         return Fallback.RELEASE
 
-    def _status_signals(self, plant: Plant) -> dict[str, float]:
-        return {
-            "STAGE_APPLIED": self.stage,
-            "FALLBACK": int(self.fallback),
-            "DECELERATION_ACTUAL": max(0.0, min(20.0, -plant.acceleration_ms2)),
-            "DECELERATION_DEMANDED": self._demand_ms2,
-            "SEQUENCE_FOLLOWED": self._request["SEQUENCE"] if self._request else 0,
-        }
-
-
-def _motion(plant: Plant) -> dict[str, float]:
-    return {
-        "SPEED_VALID": 1,
-        "SPEED": min(65.535, plant.speed_ms),
-        "ACCELERATION": max(-20.0, min(20.0, plant.acceleration_ms2)),
-    }
-
 
 STANDSTILL_US: Final = 1_000_000  # the brakes' dead time and lag are ten times shorter
 TELEMETRY_US: Final = 50_000
@@ -251,67 +237,63 @@ class CarBody:
 
     def __init__(self, scenario: Scenario, codec: Codec, policy: BrakePolicy, seed: int) -> None:
         self.duration_us = scenario.duration_ms * 1000
-        self._plant = Plant(scenario.plant)
+        self.plant = Plant(scenario.plant)
+        self.radar = RadarEcu(codec, seed)
         self._brake = BrakeEcu(codec, policy)
-        self._radar = RadarEcu(codec, seed)
         self._still_us = 0
         self._demand_max_ms2 = 0.0
         self._warned_us: int | None = None
         self._braked_us: int | None = None  # by the function
 
-    @property
-    def t_us(self) -> int:
-        """Microseconds of bus time since the start, a multiple of 1 ms."""
-        return self._plant.t_us
-
     def ended(self) -> End | None:
         """Why the drive is over, None while it is not; "stopped" is left to `drive_real`."""
-        if self._plant.collided:
+        if self.plant.collided:
             return "collision"
         if self._still_us >= STANDSTILL_US:
             return "standstill"
-        return "duration" if self._plant.t_us >= self.duration_us else None
-
-    def track_due_us(self, from_us: int) -> int:
-        """The bus time of the first RADAR_TRACK at or after `from_us`."""
-        return self._radar.track_due_us(from_us)
+        return "duration" if self.plant.t_us >= self.duration_us else None
 
     def brake_frames(self) -> list[Frame]:
-        """What the brake ECU has to send. Call once for each step."""
-        return self._brake.frames(self._plant)
+        """Call once for each step, before `radar_frames`."""
+        return self._brake.frames(self.plant)
 
     def radar_frames(self) -> list[Frame]:
-        """What the radar ECU has to send, after the brake ECU. Call once for each step."""
-        return self._radar.frames(self._plant)
+        return self.radar.frames(self.plant)
 
     def receive(self, frame: Frame) -> None:
         """A frame has come to the brake ECU, which takes it as of this step."""
-        self._brake.on_frame(Frame(self._plant.t_us, frame.can_id, frame.data))
+        self._brake.on_frame(Frame(self.plant.t_us, frame.can_id, frame.data))
 
     def noticed(self) -> list[tuple[int, str]]:
-        """What the brake ECU has found wrong since it was last asked: of which frames, and what."""
+        """The defects that the brake ECU has found since the last call: identifier of the frame, and what."""
         found = list(self._brake.noticed)
         self._brake.noticed.clear()
         return found
 
     def holds(self, condition: Condition) -> bool:
-        """Whether `condition` holds in this instant."""
-        return condition.holds(self._plant.ttc_s(), self._plant.gap_m, self._plant.speed_ms)
+        return condition.holds(self.plant.ttc_s(), self.plant.gap_m, self.plant.speed_ms)
 
     def step(self, report: Callable[[Telemetry], None] | None = None) -> None:
-        """Go on by 1 ms. `report` is called each 50 ms, with what the brakes have decided here."""
-        demand_ms2 = self._brake.demand_ms2(self._plant)
-        if report is not None and self._plant.t_us % TELEMETRY_US == 0:
+        """Advance by 1 ms. `report` is called each 50 ms, after the brake ECU has decided."""
+        plant, brake = self.plant, self._brake
+        demand_ms2 = brake.demand_ms2(plant)
+        if report is not None and plant.t_us % TELEMETRY_US == 0:
             report(self.telemetry())
-        if demand_ms2 > self._demand_max_ms2 or self._warned_us is None:
-            self._heed(demand_ms2)
-        driver = self._plant.setup.driver
-        self._plant.step(demand_ms2 if driver is None else max(demand_ms2, self._pedal_ms2(driver)))
-        self._still_us = self._still_us + STEP_US if self._plant.stopped() else 0
+        if self._warned_us is None and brake.stage >= STAGE_WARN:
+            self._warned_us = plant.t_us
+        if demand_ms2 > self._demand_max_ms2:
+            self._demand_max_ms2 = demand_ms2
+            if self._braked_us is None:
+                self._braked_us = plant.t_us
+        driver, warned_us = plant.setup.driver, self._warned_us
+        if driver and warned_us is not None and plant.t_us - warned_us >= driver.reaction_ms * 1000:
+            demand_ms2 = max(demand_ms2, driver.deceleration_ms2)
+        plant.step(demand_ms2)
+        self._still_us = self._still_us + STEP_US if plant.stopped() else 0
 
     def telemetry(self) -> Telemetry:
         """The car at this instant."""
-        plant, brake = self._plant, self._brake
+        plant, brake = self.plant, self._brake
         return Telemetry(
             t_ms=plant.t_us // 1000,
             speed_ms=plant.speed_ms,
@@ -325,26 +307,10 @@ class CarBody:
         )
 
     def result(self) -> VehicleResult:
-        """What the drive came to, so far."""
+        """The drive so far."""
         warning_s = None
         if self._braked_us is not None and self._warned_us is not None:
             warning_s = (self._braked_us - self._warned_us) / 1e6
         return msgspec.structs.replace(
-            self._plant.result(),
-            warning_s=warning_s,
-            demand_max_ms2=self._demand_max_ms2,
+            self.plant.result(), warning_s=warning_s, demand_max_ms2=self._demand_max_ms2
         )
-
-    def _heed(self, demand_ms2: float) -> None:
-        """Note what is asked of the brakes now, where it is the first or the most of its kind."""
-        if self._warned_us is None and self._brake.stage >= STAGE_WARN:
-            self._warned_us = self._plant.t_us
-        if self._braked_us is None and demand_ms2 > 0.0:
-            self._braked_us = self._plant.t_us
-        self._demand_max_ms2 = max(self._demand_max_ms2, demand_ms2)
-
-    def _pedal_ms2(self, driver: Driver) -> float:
-        """What the driver asks of the brakes, which is nothing before the warning."""
-        if self._warned_us is None or self._plant.t_us - self._warned_us < driver.reaction_ms * 1000:
-            return 0.0
-        return driver.deceleration_ms2

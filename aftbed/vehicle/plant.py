@@ -1,8 +1,8 @@
-"""The car and the car ahead: longitudinal truth, in fixed steps of 1 ms.
+"""The longitudinal motion of the ego car and the car ahead, in fixed steps of 1 ms.
 
 The ego's brakes do nothing for a dead time, then approach the demand as a first-order lag. They give no
 more than their own limit, and no tyre gives more than friction times gravity. The driver holds the speed
-until braking is asked for, then takes the foot off for good: drag and rolling resistance act from there
+until the first demand, then releases the accelerator for good: drag and rolling resistance act from there
 on. The car ahead stands, drives at constant speed, or brakes with a linear ramp. It is in our lane, or
 beside it, or comes into it from the side.
 
@@ -27,10 +27,10 @@ import msgspec
 class VehicleResult(msgspec.Struct, frozen=True):
     """A whole drive. `min_gap_m` and `stop_gap_m` are None without a target or without a stop.
 
-    `warning_s` is the time from the first warning to the first braking that the function asks for, however
-    little: UN R152 calls every such demand emergency braking. 0.0 if the two came together, None without
-    braking. `demand_max_ms2` is the greatest deceleration that it asks for. `braked` is true also when the
-    driver has braked after the warning.
+    `warning_s` is the time from the first warning to the function's first demand for braking, however small:
+    UN R152 calls every such demand emergency braking. 0.0 if the two came together, None without braking.
+    `demand_max_ms2` is the greatest demand. `braked` is true also when the driver has braked after the
+    warning.
     """
 
     collision: bool
@@ -149,7 +149,7 @@ class Plant:
         self._max_deceleration_ms2 = 0.0
 
     def step(self, demand_ms2: float) -> None:
-        """Advance by one step with `demand_ms2` asked of the brakes: m/s2, 0 or more."""
+        """Advance by one step with `demand_ms2` demanded of the brakes: m/s2, 0 or more."""
         assert demand_ms2 >= 0.0
         self.t_us += self._step_us
         if self.collided:
@@ -169,12 +169,10 @@ class Plant:
     def ttc_s(self) -> float | None:
         """Seconds to contact at the present speeds; None if the gap is not closing."""
         closing_ms = self.speed_ms - self.lead_speed_ms
-        if self.gap_m is None or closing_ms <= 0.0:
-            return None
-        return self.gap_m / closing_ms
+        return None if self.gap_m is None or closing_ms <= 0.0 else self.gap_m / closing_ms
 
     def result(self) -> VehicleResult:
-        """What this drive came to, so far."""
+        """The drive so far."""
         impact_ms = self._impact_speed_ms
         return VehicleResult(
             collision=self.collided,
@@ -189,55 +187,39 @@ class Plant:
         return -IN_THE_WAY_M < self.lateral_m < IN_THE_WAY_M
 
     def _move_ego(self, demand_ms2: float) -> float:
-        """Metres that the ego moves in this step."""
-        self._move_brake(demand_ms2)
-        resistance_ms2 = ROLLING_MS2 + DRAG_PER_M * self.speed_ms * self.speed_ms if self._braked else 0.0
-        deceleration_ms2 = self._brake_ms2 + resistance_ms2
-        before_ms = self.speed_ms
-        self.speed_ms = max(0.0, before_ms - deceleration_ms2 * self._step_s)
-        self.acceleration_ms2 = (self.speed_ms - before_ms) / self._step_s
-        self._max_deceleration_ms2 = max(self._max_deceleration_ms2, -self.acceleration_ms2)
-        return (before_ms + self.speed_ms) / 2.0 * self._step_s
-
-    def _move_brake(self, demand_ms2: float) -> None:
-        """Dead time, lag, jerk limit, and what brakes and tyres can give."""
+        """Metres that the ego moves in this step: dead time, lag, jerk limit, tyres; then resistance."""
         self._pipe.append(demand_ms2)  # the oldest one leaves by itself
-        asked_ms2 = min(self._pipe[0], self._brake_most_ms2)
-        change_ms2 = (asked_ms2 - self._brake_ms2) * self._gain
+        change_ms2 = (min(self._pipe[0], self._brake_most_ms2) - self._brake_ms2) * self._gain
         jerk_max_ms3 = self.setup.brakes.jerk_max_ms3
         if jerk_max_ms3 is not None:
             limit_ms2 = jerk_max_ms3 * self._step_s
             change_ms2 = max(-limit_ms2, min(limit_ms2, change_ms2))
         self._brake_ms2 += change_ms2
+        before_ms = self.speed_ms
+        resistance_ms2 = ROLLING_MS2 + DRAG_PER_M * before_ms * before_ms if self._braked else 0.0
+        self.speed_ms = max(0.0, before_ms - (self._brake_ms2 + resistance_ms2) * self._step_s)
+        self.acceleration_ms2 = (self.speed_ms - before_ms) / self._step_s
+        self._max_deceleration_ms2 = max(self._max_deceleration_ms2, -self.acceleration_ms2)
+        return (before_ms + self.speed_ms) / 2.0 * self._step_s
 
     def _move_lead(self) -> float:
-        """Metres that the car ahead moves in this step."""
-        lead = self.setup.lead
+        """Metres that the car ahead moves in this step, along the lane. A cut-in is even."""
+        lead, t_ms = self.setup.lead, self.t_us / 1000
         assert lead is not None
         if lead.cut_in is not None:
-            self._move_sideways(lead.lateral_m, lead.cut_in)
+            left_ms = lead.cut_in.after_ms + lead.cut_in.over_ms - t_ms
+            if left_ms <= 0.0:
+                self.lateral_m = 0.0
+            elif left_ms < lead.cut_in.over_ms:
+                self.lateral_m = lead.lateral_m * (left_ms / lead.cut_in.over_ms)
+        deceleration_ms2 = 0.0
+        if lead.braking is not None and (since_ms := t_ms - lead.braking.after_ms) > 0.0:
+            deceleration_ms2 = lead.braking.deceleration_ms2
+            if since_ms < lead.braking.ramp_ms:
+                deceleration_ms2 = deceleration_ms2 * since_ms / lead.braking.ramp_ms
         before_ms = self.lead_speed_ms
-        self.lead_speed_ms = max(0.0, before_ms - self._lead_deceleration_ms2() * self._step_s)
+        self.lead_speed_ms = max(0.0, before_ms - deceleration_ms2 * self._step_s)
         return (before_ms + self.lead_speed_ms) / 2.0 * self._step_s
-
-    def _move_sideways(self, from_m: float, cut_in: CutIn) -> None:
-        """Evenly, since what is judged is where the car ahead is, not how it feels in there."""
-        left_ms = cut_in.after_ms + cut_in.over_ms - self.t_us / 1000
-        if left_ms <= 0.0:
-            self.lateral_m = 0.0
-        elif left_ms < cut_in.over_ms:
-            self.lateral_m = from_m * (left_ms / cut_in.over_ms)
-
-    def _lead_deceleration_ms2(self) -> float:
-        braking = self.setup.lead.braking if self.setup.lead else None
-        if braking is None:
-            return 0.0
-        since_ms = self.t_us / 1000 - braking.after_ms
-        if since_ms <= 0.0:
-            return 0.0
-        if since_ms >= braking.ramp_ms:
-            return braking.deceleration_ms2
-        return braking.deceleration_ms2 * since_ms / braking.ramp_ms
 
     def _move_gap(self, before_m: float, change_m: float, closing_before_ms: float) -> None:
         """Change the gap; find contact inside the step."""

@@ -11,17 +11,15 @@ until the AEB_REQ that answers it.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Final
 
 import msgspec
 
 from aftbed.core.errors import PeerError
+from aftbed.vehicle.aeb.messages import STAGE_PARTIAL
 from aftbed.vehicle.can.bus import AnswerWatch, Bus, Schedule
 from aftbed.vehicle.can.candump import LogFrame
 from aftbed.vehicle.can.dbc_file import Codec
 from aftbed.vehicle.can.frame import Frame
-
-STAGE_PARTIAL: Final = 2
 
 
 class PlayReport(msgspec.Struct):
@@ -62,65 +60,59 @@ def play(
     `ends_cycle` is asked once for each frame, in order, with the bus time in the frame. Raises
     HarnessError when the bus fails.
     """
-    return _Player(codec, bus, pace).run(log, ends_cycle, stop)
+    return _Player(codec, bus, pace, stop).run(log, ends_cycle)
 
 
 class _Player:
-    def __init__(self, codec: Codec, bus: Bus, pace: float | None) -> None:
+    def __init__(self, codec: Codec, bus: Bus, pace: float | None, stop: Callable[[], bool]) -> None:
         self._report = PlayReport()
         self._codec = codec
         self._bus = bus
+        self._stop = stop
         self._schedule = None if pace is None else Schedule(pace)
-        self._t_us = -1
         self._answer_id = codec.can_id("AEB_REQ")
-        self._watch = AnswerWatch(bus, self._answer_id, self._hear)
+        self._watch = AnswerWatch(bus, self._answer_id, self._receive)
 
-    def run(
-        self, log: Sequence[LogFrame], ends_cycle: Callable[[Frame], bool], stop: Callable[[], bool]
-    ) -> PlayReport:
-        start_us = log[0].frame.t_us if log else 0
+    def run(self, log: Sequence[LogFrame], ends_cycle: Callable[[Frame], bool]) -> PlayReport:
+        report, schedule = self._report, self._schedule
+        report.complete = self._play(log, ends_cycle)
+        if report.complete and schedule is not None:
+            self._watch.wait(self._stop)
+        report.refused = self._bus.errors
+        report.answers, report.missing_answers = self._watch.answered, self._watch.missing
+        report.lag_ms_max = 0.0 if schedule is None else schedule.lag_ms_max
+        return report
+
+    def _play(self, log: Sequence[LogFrame], ends_cycle: Callable[[Frame], bool]) -> bool:
+        """True if the whole log was sent."""
+        start_us, last_us = log[0].frame.t_us if log else 0, -1
         for entry in log:
             frame = Frame(entry.frame.t_us - start_us, entry.frame.can_id, entry.frame.data)
-            self._pass_time(frame.t_us, stop)
-            if stop():
-                return self._finished(complete=False)
-            self._send(frame, ends_cycle(frame), stop)
-        if self._schedule is not None:
-            self._watch.wait(stop)
-        return self._finished(complete=True)
+            if self._schedule is not None:
+                self._schedule.wait_until(frame.t_us, self._stop)
+            elif frame.t_us != last_us:
+                self._bus.set_time(frame.t_us)
+            last_us = frame.t_us
+            if self._stop():
+                return False
+            asks = ends_cycle(frame)
+            if asks:
+                self._report.cycles += 1
+                self._watch.asked()
+            self._bus.send(frame)
+            self._report.sent += 1
+            if asks and self._schedule is None:
+                self._watch.wait(self._stop)
+        return True
 
-    def _pass_time(self, t_us: int, stop: Callable[[], bool]) -> None:
-        if self._schedule is not None:
-            self._schedule.wait_until(t_us, stop)
-        elif t_us != self._t_us:
-            self._bus.set_time(t_us)
-        self._t_us = t_us
-
-    def _send(self, frame: Frame, asks: bool, stop: Callable[[], bool]) -> None:
-        if asks:
-            self._report.cycles += 1
-            self._watch.asked()
-        self._bus.send(frame)
-        self._report.sent += 1
-        if asks and self._schedule is None:
-            self._watch.wait(stop)
-
-    def _hear(self, frame: Frame) -> None:
+    def _receive(self, frame: Frame) -> None:
         if frame.can_id != self._answer_id:
             return
+        report = self._report
         try:
             answer = self._codec.decode("AEB_REQ", frame.data)
         except PeerError:
-            self._report.malformed_answers += 1
+            report.malformed_answers += 1
             return
-        self._report.stage_max = max(self._report.stage_max, int(answer["STAGE"]))
-        deceleration_ms2 = max(self._report.deceleration_ms2_max, answer["DECELERATION"])
-        self._report.deceleration_ms2_max = deceleration_ms2
-
-    def _finished(self, *, complete: bool) -> PlayReport:
-        report = self._report
-        report.complete = complete
-        report.refused = self._bus.errors
-        report.answers, report.missing_answers = self._watch.answered, self._watch.missing
-        report.lag_ms_max = 0.0 if self._schedule is None else self._schedule.lag_ms_max
-        return report
+        report.stage_max = max(report.stage_max, int(answer["STAGE"]))
+        report.deceleration_ms2_max = max(report.deceleration_ms2_max, answer["DECELERATION"])
