@@ -41,7 +41,7 @@ from aftbed.judge.timeline import (
 )
 from aftbed.runtime.unix.options import CarRun, ReplayRun
 from aftbed.vehicle.aeb.messages import AebInput
-from aftbed.vehicle.can.candump import LogCounts, LogFrame, parse_lines
+from aftbed.vehicle.can.candump import LogCounts, parse_lines
 from aftbed.vehicle.can.dbc_file import Codec, load_dbc
 from aftbed.vehicle.can.e2e import intact
 
@@ -245,29 +245,21 @@ def messages_of(run: RunRecord) -> Iterator[TimedMessage]:
 
 
 def _bus(path: Path, codec: Codec, *, own: bool) -> Iterator[TimedMessage]:
-    """The frames. On a bus of other ECUs only the frames of the gateway are decoded."""
-    readable = set(codec.names()) if own else set(codec.sent_by("gateway"))
-    names = {codec.can_id(name): name for name in codec.names() if name in readable}
+    """The frames in complete lines of the log. On a bus of other ECUs only the gateway's are decoded."""
+    readable = codec.names() if own else codec.sent_by("gateway")
+    names = {codec.can_id(name): name for name in readable}
     data_ids = {name: _data_id(codec, name) for name in readable}
     ego_ms: float | None = None
-    for frame in _logged(path):
-        t_ns, can_id, data = frame.frame.t_us * 1000, frame.frame.can_id, frame.frame.data
+    content = path.read_bytes() if path.exists() else b""  # a run that ended early has no log
+    for logged in parse_lines(io.BytesIO(content), LogCounts()):
+        t_ns, can_id, data = logged.frame.t_us * 1000, logged.frame.can_id, logged.frame.data
         name = names.get(can_id)
         data_id = data_ids[name] if name is not None else None
-        whole = None if data_id is None else intact(data, data_id)
-        yield TimedMessage(
-            t_ns,
-            "/can",
-            CanFrame(
-                can_id,
-                frame.interface,
-                len(data),
-                data.hex().upper(),
-                UNSET if name is None else name,
-                UNSET if whole is None else whole,
-            ),
-        )
-        if name is None or not whole:
+        whole = UNSET if data_id is None else intact(data, data_id)
+        shown = UNSET if name is None else name
+        frame = CanFrame(can_id, logged.interface, len(data), data.hex().upper(), shown, whole)
+        yield TimedMessage(t_ns, "/can", frame)
+        if name is None or whole is not True:
             continue
         try:
             signals = codec.decode(name, data)
@@ -276,12 +268,6 @@ def _bus(path: Path, codec: Codec, *, own: bool) -> Iterator[TimedMessage]:
         if name == "EGO_STATE":
             ego_ms = signals["SPEED"] if signals["SPEED_VALID"] else None
         yield from _decoded(t_ns, name, signals, ego_ms)
-
-
-def _logged(path: Path) -> Iterator[LogFrame]:
-    """The complete lines of the bus log. A run that ended early has no log."""
-    content = path.read_bytes() if path.exists() else b""
-    return parse_lines(io.BytesIO(content), LogCounts())
 
 
 def _data_id(codec: Codec, name: str) -> int | None:
@@ -296,64 +282,47 @@ def _decoded(t_ns: int, name: str, signals: dict[str, float], ego_ms: float | No
         case "EGO_STATE":
             yield TimedMessage(t_ns, "/ego", _ego(ego_ms, signals["ACCELERATION"]))
         case "RADAR_TRACK":
+            lead = LeadTarget(False)
             if signals["VALID"]:
                 lead = _lead(signals["RANGE"], signals["RELATIVE_SPEED"], ego_ms, signals["LATERAL_OFFSET"])
-            else:
-                lead = LeadTarget(False)
             yield TimedMessage(t_ns, "/lead", lead)
         case "AEB_REQ":
-            yield TimedMessage(t_ns, "/function", _function(signals))
+            stage, threat = int(signals["STAGE"]), bool(signals["TTC_VALID"])
+            demand = BrakeDemand(
+                stage,
+                STAGES[stage],
+                signals["DECELERATION"],
+                int(signals["SEQUENCE"]),
+                signals["TTC"] if threat else UNSET,
+                int(signals["TARGET"]) if threat else UNSET,
+            )
+            yield TimedMessage(t_ns, "/function", demand)
         case "BRAKE_STATUS":
-            yield TimedMessage(t_ns, "/brake", _brake(signals))
+            stage, fallback = int(signals["STAGE_APPLIED"]), int(signals["FALLBACK"])
+            actual_ms2, demanded_ms2 = signals["DECELERATION_ACTUAL"], signals["DECELERATION_DEMANDED"]
+            names = STAGES[stage], FALLBACKS[fallback]
+            brake = BrakeState(stage, names[0], fallback, names[1], actual_ms2, demanded_ms2)
+            yield TimedMessage(t_ns, "/brake", brake)
         case _:
             return
 
 
-def _rounded(value: float) -> float:
-    return round(value, 6)
-
-
-def _ego(speed_ms: float | None, acceleration_ms2: float | None = None) -> EgoMotion:
-    acceleration = UNSET if acceleration_ms2 is None else acceleration_ms2
+def _ego(speed_ms: float | None, acceleration_ms2: float | UnsetType = UNSET) -> EgoMotion:
     if speed_ms is None:
-        return EgoMotion(acceleration_ms2=acceleration)
-    return EgoMotion(_rounded(speed_ms), _rounded(speed_ms * 3.6), acceleration)
+        return EgoMotion(acceleration_ms2=acceleration_ms2)
+    return EgoMotion(round(speed_ms, 6), round(speed_ms * 3.6, 6), acceleration_ms2)
 
 
 def _lead(
-    gap_m: float, relative_ms: float, ego_ms: float | None, lateral_m: float | None = None
+    gap_m: float, relative_ms: float, ego_ms: float | None, lateral_m: float | UnsetType = UNSET
 ) -> LeadTarget:
     return LeadTarget(
         in_sight=True,
         gap_m=gap_m,
         relative_speed_ms=relative_ms,
-        speed_ms=UNSET if ego_ms is None else _rounded(ego_ms + relative_ms),
-        lateral_offset_m=UNSET if lateral_m is None else lateral_m,
-        ttc_s=_rounded(-gap_m / relative_ms) if relative_ms < 0 else UNSET,
-    )
-
-
-def _function(signals: dict[str, float]) -> BrakeDemand:
-    stage, threat = int(signals["STAGE"]), bool(signals["TTC_VALID"])
-    return BrakeDemand(
-        stage,
-        STAGES[stage],
-        signals["DECELERATION"],
-        int(signals["SEQUENCE"]),
-        signals["TTC"] if threat else UNSET,
-        int(signals["TARGET"]) if threat else UNSET,
-    )
-
-
-def _brake(signals: dict[str, float]) -> BrakeState:
-    stage, fallback = int(signals["STAGE_APPLIED"]), int(signals["FALLBACK"])
-    return BrakeState(
-        stage,
-        STAGES[stage],
-        fallback,
-        FALLBACKS[fallback],
-        signals["DECELERATION_ACTUAL"],
-        signals["DECELERATION_DEMANDED"],
+        speed_ms=UNSET if ego_ms is None else round(ego_ms + relative_ms, 6),
+        lateral_offset_m=lateral_m,
+        ttc_s=round(-gap_m / relative_ms, 6) if relative_ms < 0 else UNSET,
     )
 
 

@@ -11,7 +11,7 @@ lockstep that is the time of the processes, not of the car.
 """
 
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
@@ -20,7 +20,6 @@ from aftbed.core.journal import EntryKind
 from aftbed.judge.record import RunRecord
 from aftbed.judge.timeline import (
     Category,
-    NodeStep,
     between_processes,
     category_of,
     describe,
@@ -124,13 +123,8 @@ def _steps(run: RunRecord, tracks: _Tracks) -> Iterator[TraceEvent]:
         }
     for number, arrow in enumerate(between_processes(steps, links), 1):
         about: TraceEvent = {"cat": "message", "name": arrow.channel, "id": number}
-        cause, effect = steps[arrow.cause], steps[arrow.effect]
-        yield {"ph": "s", **about, **_at(cause, run, tracks)}
-        yield {"ph": "f", "bp": "e", **about, **_at(effect, run, tracks)}
-
-
-def _at(step: NodeStep, run: RunRecord, tracks: _Tracks) -> TraceEvent:
-    return {"ts": _ts(step.t_ns, run), **tracks.of(step.node, step.incarnation)}
+        for ends, step in (({"ph": "s"}, steps[arrow.cause]), ({"ph": "f", "bp": "e"}, steps[arrow.effect])):
+            yield {**ends, **about, "ts": _ts(step.t_ns, run), **tracks.of(step.node, step.incarnation)}
 
 
 def _instants(run: RunRecord, tracks: _Tracks) -> Iterator[TraceEvent]:
@@ -157,33 +151,23 @@ def _requests(run: RunRecord, tracks: _Tracks) -> Iterator[TraceEvent]:
         if entry.kind is EntryKind.SENT:
             sent.setdefault(entry.request_id, entry.t_ns)
         elif (t_ns := sent.pop(entry.request_id, None)) is not None:
-            about: Iterable[tuple[str, int]] = (("b", t_ns), ("e", entry.t_ns))
-            yield from _asynchronous(
-                "request", f"request {entry.request_id}", entry.request_id, about, run, tracks.of("client")
-            )
+            yield from _slice("request", entry.request_id, t_ns, entry.t_ns, run, tracks.of("client"))
 
 
 def _adaptations(run: RunRecord, tracks: _Tracks) -> Iterator[TraceEvent]:
     """From `adapt.plan` to `adapt.commit` or `adapt.rollback`."""
     begun: dict[int, int] = {}
-    found = run.history.events(Event.ADAPT_PLAN, Event.ADAPT_COMMIT, Event.ADAPT_ROLLBACK)
-    for one in found:
+    for one in run.history.events(Event.ADAPT_PLAN, Event.ADAPT_COMMIT, Event.ADAPT_ROLLBACK):
         if one.event is Event.ADAPT_PLAN:
             begun.setdefault(one.detail, one.t_ns)
         elif (t_ns := begun.pop(one.detail, None)) is not None:
-            ends: Iterable[tuple[str, int]] = (("b", t_ns), ("e", one.t_ns))
-            yield from _asynchronous(
-                "adaptation", f"adaptation {one.detail}", one.detail, ends, run, tracks.of("engine")
-            )
+            yield from _slice("adaptation", one.detail, t_ns, one.t_ns, run, tracks.of("engine"))
 
 
-def _asynchronous(
-    category: str,
-    name: str,
-    number: int,
-    ends: Iterable[tuple[str, int]],
-    run: RunRecord,
-    track: TraceEvent,
+def _slice(
+    kind: str, number: int, begin_ns: int, end_ns: int, run: RunRecord, track: TraceEvent
 ) -> Iterator[TraceEvent]:
-    for phase, t_ns in ends:
-        yield {"ph": phase, "cat": category, "name": name, "id": number, "ts": _ts(t_ns, run), **track}
+    """An asynchronous slice."""
+    for phase, t_ns in (("b", begin_ns), ("e", end_ns)):
+        about: TraceEvent = {"cat": kind, "name": f"{kind} {number}", "id": number}
+        yield {"ph": phase, **about, "ts": _ts(t_ns, run), **track}

@@ -19,7 +19,6 @@ class Condition(msgspec.Struct, frozen=True):
     value: float
 
     def holds(self, ttc_s: float | None, gap_m: float | None, speed_ms: float) -> bool:
-        """Whether it holds in a car with these."""
         found = {"ttc": ttc_s, "gap": gap_m, "speed": speed_ms}[self.quantity]
         if found is None:
             return False

@@ -1,13 +1,13 @@
 """The gateway: frames in, requests out; replies in, frames out. The paper's Client, without its sockets.
 
-Nothing in a frame is believed before its E2E protection is checked. Each RADAR_TRACK makes one
+No content of a frame is used before its E2E protection is checked. Each RADAR_TRACK makes one
 request, and the reply to it becomes one AEB_REQ: the radar is the clock of the function.
 
-A RADAR_TRACK that is refused is counted, and nothing in it is used. It still makes a request,
-with `radar_valid` False; not one with no targets, because "unknown" must never look like "the road is empty",
-which would end a braking. Such a request is made only where the radar's cycle has a
-place for it: a repeated frame, or a flood of bad ones, does not drive the function faster. An EGO_STATE that
-is missing or refused makes the ego speed of the next request unknown.
+A RADAR_TRACK that is refused is counted, and not used. It still makes a request, with `radar_valid` False;
+not one with no targets: "unknown" must never look like "the road is empty", which would end a braking.
+Such a request is made only where the radar's cycle has a place for it: a repeated frame, or a flood of bad
+ones, does not drive the function faster. An EGO_STATE that is missing or refused makes the ego speed of the
+next request unknown.
 
 The first frame of a run, or after a silence, only starts the E2E sequence, and is refused too.
 
@@ -50,7 +50,6 @@ class GatewayCounts(msgspec.Struct):
     refused: dict[str, int] = msgspec.field(default_factory=dict)
 
     def refuse(self, reason: str) -> None:
-        """Count one refused frame."""
         self.refused[reason] = self.refused.get(reason, 0) + 1
 
 
@@ -81,15 +80,15 @@ class BusGateway(ABC):
 
     @abstractmethod
     def _request_of(self, frame: Frame) -> bytes | None:
-        """Judge a frame off the bus. A request payload if it ends a radar cycle, else None."""
+        """As `on_frame`."""
 
     def on_frame(self, frame: Frame) -> bytes | None:
-        """Judge a frame off the bus. A request payload if it ends a radar cycle, else None."""
+        """Judge a frame off the bus: the payload of a request if it ends a radar cycle, else None."""
         self._bus_us = max(self._bus_us, frame.t_us)
         return self._request_of(frame)
 
     def noticed(self) -> list[tuple[int, str]]:
-        """The identifiers of frames with something wrong since the last call, and what was wrong."""
+        """The defects of frames since the last call: their identifier, and what was wrong."""
         if not self._noticed:
             return []
         found = list(self._noticed)
@@ -162,27 +161,28 @@ class Gateway(BusGateway):
         if frame.t_us < self._t_us:
             self.counts.refuse("time")
             return None
-        if frame.can_id == self._ego_id:
-            self._on_ego(frame)
-            return None
-        return self._on_track(frame)
-
-    def _on_ego(self, frame: Frame) -> None:
+        if frame.can_id == self.request_id:
+            return self._on_track(frame)
         if self._believed(self._ego, frame):
             self.counts.accepted += 1
             signals = self._codec.decode("EGO_STATE", frame.data)
             self._ego_speed_ms = signals["SPEED"] if signals["SPEED_VALID"] else None
             self._ego_us = frame.t_us
+        return None
 
     def _on_track(self, frame: Frame) -> bytes | None:
-        targets = self._targets(frame)
-        early = self._request_us is not None and frame.t_us - self._request_us < self._blind_after_us
+        """The request that a RADAR_TRACK makes."""
+        t_us, targets = frame.t_us, self._targets(frame)
+        early = self._request_us is not None and t_us - self._request_us < self._blind_after_us
         if targets is None and early:
             return None
-        self._request_us = frame.t_us
-        speed_ms, known = self._ego_speed(frame.t_us)
+        self._request_us = t_us
+        speed_ms = self._ego_speed_ms
+        if speed_ms is None or t_us - self._ego_us > self._ego.supervision.timeout_us:
+            self._noticed.append((self._ego_id, "timeout"))
+            speed_ms = None
         return encode_request(
-            AebInput(frame.t_us // 1000, speed_ms, known, targets is not None, targets or ())
+            AebInput(t_us // 1000, speed_ms or 0.0, speed_ms is not None, targets is not None, targets or ())
         )
 
     def _targets(self, frame: Frame) -> tuple[AebTarget, ...] | None:
@@ -199,14 +199,6 @@ class Gateway(BusGateway):
         self.counts.accepted += 1
         in_path = signals["VALID"] and abs(signals["LATERAL_OFFSET"]) <= LANE_HALF_M
         return (target,) if target is not None and in_path else ()
-
-    def _ego_speed(self, t_us: int) -> tuple[float, bool]:
-        """The ego speed, and whether it is to be believed now."""
-        timeout_us = self._ego.supervision.timeout_us
-        if self._ego_speed_ms is None or t_us - self._ego_us > timeout_us:
-            self._noticed.append((self._ego_id, "timeout"))
-            return 0.0, False
-        return self._ego_speed_ms, True
 
     def _believed(self, receiver: Receiver, frame: Frame) -> bool:
         """Let E2E judge the frame; count it if it is refused."""

@@ -37,31 +37,28 @@ class WithoutStateAccess:
         self._function: Application = default_application()
 
     def execute(self, request: bytes) -> bytes:
-        """As the function does."""
         return self._function.execute(request)
 
     def capture(self) -> bytes:
-        """Nothing: the state is not to be had."""
         return b""
 
     def restore(self, state: bytes) -> None:
-        """Take the nothing that `capture` gives, and stay as it is. Raises PeerError on anything else."""
+        """Accepts only the empty state that `capture` gives, and changes nothing. Raises PeerError."""
         if state:
             raise PeerError(f"state of {len(state)} bytes, expected none: there is no access to it")
 
     def migrate(self, old_state: bytes) -> None:
-        """Begin where the open version ended; from here on the state is not to be had. Raises PeerError."""
+        """Begin where the open version ended. Raises PeerError."""
         self._function.restore(old_state)
 
     def acceptable(self, request: bytes, reply: bytes) -> bool:
-        """As the function does."""
         return self._function.acceptable(request, reply)
 
 
 class NonDeterministic:
-    """The function with a time to collision that is a matter of chance, by one part in a hundred.
+    """The function with a random error of up to one part in a hundred in its time to collision.
 
-    Any one such reply is acceptable, and hardly two are equal, as of a function that reads its own clock.
+    Each reply is acceptable, and hardly two are equal, as of a function that reads its own clock.
     """
 
     characteristics = Characteristics(deterministic=False, state_access=True)
@@ -72,7 +69,6 @@ class NonDeterministic:
         self._random = SystemRandom()  # another one would be the same in every fork of a zygote
 
     def execute(self, request: bytes) -> bytes:
-        """As the function does, but for the time to collision, where there is one."""
         reply = self._function.execute(request)
         output = decode_reply(reply)
         if output.ttc_s is None:
@@ -82,23 +78,19 @@ class NonDeterministic:
         return other if self._function.acceptable(request, other) else reply
 
     def capture(self) -> bytes:
-        """As the function does: chance is in the reply, not in the state."""
         return self._function.capture()
 
     def restore(self, state: bytes) -> None:
-        """As the function does."""
         self._function.restore(state)
 
     def acceptable(self, request: bytes, reply: bytes) -> bool:
-        """As the function does."""
         return self._function.acceptable(request, reply)
 
 
 class Cautious:
     """Version 2: warns from `EARLY_TTC_S` on, and brakes as version 1 does.
 
-    Its state is version 1's behind two bytes, so that neither can be taken for the other; `migrate` makes
-    the one of the other.
+    Its state is version 1's behind two bytes, so that neither is valid for the other; `migrate` converts it.
     """
 
     characteristics = Characteristics(deterministic=True, state_access=True)
@@ -112,7 +104,7 @@ class Cautious:
         self._warns = False
 
     def execute(self, request: bytes) -> bytes:
-        """As version 1 does; a warning where that has none yet. Raises PeerError, with nothing changed."""
+        """Raises PeerError, with nothing changed."""
         reply = self._function.execute(request)
         output = decode_reply(reply)
         limit_s = CALM_TTC_S if self._warns else EARLY_TTC_S
@@ -122,11 +114,10 @@ class Cautious:
         return encode_reply(msgspec.structs.replace(output, stage=STAGE_WARN))
 
     def capture(self) -> bytes:
-        """The whole state."""
         return bytes((CAUTIOUS_VERSION, self._warns)) + self._function.capture()
 
     def restore(self, state: bytes) -> None:
-        """Become what `capture` saw. Raises PeerError, with nothing changed, if `state` is not one."""
+        """Raises PeerError, with nothing changed, if `state` is not one."""
         if len(state) != CAUTIOUS_BYTES:
             raise PeerError(f"state of {len(state)} bytes, expected {CAUTIOUS_BYTES}")
         version, warns, function = state[0], state[1], state[2:]
@@ -138,10 +129,9 @@ class Cautious:
         self._warns = bool(warns)
 
     def migrate(self, old_state: bytes) -> None:
-        """Take over where version 1 stopped. Raises PeerError, with nothing changed, on another state."""
+        """Begin where version 1 ended. Raises PeerError, with nothing changed, on another state."""
         self._function.restore(old_state)
         self._warns = False
 
     def acceptable(self, request: bytes, reply: bytes) -> bool:
-        """As version 1 does: whatever warns may also be warned of earlier."""
         return self._function.acceptable(request, reply)

@@ -30,7 +30,7 @@ from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.condition import Condition
 
 NODES: Final = ("radar", "brake", "gateway")  # of a car's bus
-FALLBACK: Final = "fallback"  # the word with which the brake ECU reports that it misses its requests
+FALLBACK: Final = "fallback"  # reported by the brake ECU when its requests are missing
 
 
 class CarriedFrame(msgspec.Struct, frozen=True):
@@ -69,7 +69,7 @@ class BusDisturber(Protocol):
         ...
 
     def conditions(self) -> Sequence[tuple[int, Condition]]:
-        """The conditions that faults still wait for, by the number of the fault."""
+        """Those that faults still wait for, by the number of the fault."""
         ...
 
     def met(self, number: int, now_us: int) -> None:
@@ -135,7 +135,7 @@ class BusModel(ABC, Generic[Node]):
         """That many more or fewer nodes are about to receive a frame that they use, because of a fault."""
 
     def condition_added(self, number: int, condition: Condition) -> None:
-        """From now on the car has to look for this condition."""
+        """From now on the car has to check this condition."""
 
     def faults_acted(self) -> None:
         """What became of the faults may have changed."""
@@ -180,9 +180,9 @@ class BusModel(ABC, Generic[Node]):
 
     def _timed(self, frame: Frame) -> Frame:
         """`frame` with the time at which its transmission ends, beginning when the wire is free."""
-        bits = frame_bits(len(frame.data))
-        wire_us = 0 if self._bitrate_bps is None else -(-bits * 1_000_000 // self._bitrate_bps)
-        self._wire_free_us = max(self._wire_free_us, frame.t_us) + wire_us
+        self._wire_free_us = max(self._wire_free_us, frame.t_us)
+        if self._bitrate_bps is not None:
+            self._wire_free_us += -(-frame_bits(len(frame.data)) * 1_000_000 // self._bitrate_bps)
         if self._wire_free_us == frame.t_us:
             return frame
         return Frame(self._wire_free_us, frame.can_id, frame.data)
@@ -211,6 +211,7 @@ class BusModel(ABC, Generic[Node]):
     def _deliver_all(
         self, disturber: BusDisturber, carried: Sequence[CarriedFrame], changes: dict[int, int]
     ) -> None:
+        """Deliver these frames. `changes`: by how many the receipts of an identifier have changed so far."""
         deliveries = []
         for one in carried:
             frame, sender = one.frame, one.sender
@@ -229,12 +230,12 @@ class BusModel(ABC, Generic[Node]):
                 self.receipts_changed(can_id, change)
         for delivery in deliveries:
             self.deliver(*delivery)
-        self._look_after_faults(disturber)
+        self._update_faults(disturber)
 
     # -- faults and conditions ------------------------------------------------------------------
 
     def disturb(self, disturber: BusDisturber) -> None:
-        """A fault was armed or ended in `disturber`, which is the same one for the whole run."""
+        """A fault was armed or ended in `disturber`, which is the same for the whole run."""
         self.disturber, self.disturbed = disturber, True
         for number, condition in disturber.conditions():
             if number not in self._announced:
@@ -245,19 +246,19 @@ class BusModel(ABC, Generic[Node]):
         """`node` reports what is wrong with the frames of `can_id`."""
         if self.disturber is not None:
             self.disturber.noticed(node, can_id, word)
-            self._look_after_faults(self.disturber)
+            self._update_faults(self.disturber)
 
-    def _look_after_faults(self, disturber: BusDisturber) -> None:
+    def _update_faults(self, disturber: BusDisturber) -> None:
         self.faults_acted()
         self.disturbed = not disturber.idle
 
     def watch(self, number: int, condition: Condition) -> None:
-        """Have the car look for the condition of a fault that is none of the bus."""
+        """Have the car check the condition of a fault that is not of the bus."""
         self.watched[number] = condition
         self.condition_added(number, condition)
 
     def conditions(self) -> list[tuple[int, Condition]]:
-        """All conditions that the car has to look for, by the number of the fault."""
+        """All conditions that the car has to check, by the number of the fault."""
         own = self.disturber.conditions() if self.disturbed and self.disturber is not None else ()
         return [*own, *self.watched.items()]
 

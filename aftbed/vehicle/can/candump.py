@@ -2,10 +2,10 @@
 
     (0000000012.345678) can0 130#0102030405060708
 
-It is what `candump -l` of can-utils writes and what the hub records. A log is evidence, so nothing
-in it is guessed: a line that is not exactly this is refused and counted by its reason, with the
-number of the first line that had it, and changes nothing. A last line without its newline counts
-as torn even where it would parse: `130#01020304` may be all that was written of eight bytes.
+It is what `candump -l` of can-utils writes and what the hub records. A log is evidence: a line that is not
+exactly this is refused and counted by its reason, with the number of the first line that had it. A last line
+without its newline counts as torn even where it would parse: `130#01020304` may be all that was written of
+eight bytes.
 
 Read but not written: the direction (` R` or ` T`) that python-can's logger appends. Refused, being
 no classic CAN data frame with an 11-bit identifier: extended, remote, error and FD frames.
@@ -36,8 +36,6 @@ _DATA: Final = re.compile(rb"(?:[0-9A-Fa-f]{2})*")
 
 
 class Refusal(StrEnum):
-    """Why a line was not believed."""
-
     TORN = "torn last line"
     SYNTAX = "not a candump line"
     IDENTIFIER = "not an 11-bit data frame"
@@ -53,7 +51,7 @@ class LogFrame(msgspec.Struct, frozen=True):
 
 
 class LogCounts(msgspec.Struct):
-    """What became of the lines of a log; `first_line` counts from 1, by reason."""
+    """Lines of a log by what became of them; `first_line` counts from 1, by reason."""
 
     lines: int = 0
     frames: int = 0
@@ -61,13 +59,12 @@ class LogCounts(msgspec.Struct):
     first_line: dict[Refusal, int] = {}
 
     def refuse(self, reason: Refusal, line_number: int) -> None:
-        """Count one refused line."""
         self.refused[reason] = self.refused.get(reason, 0) + 1
         self.first_line.setdefault(reason, line_number)
 
 
 def log_line(frame: Frame, interface: str) -> str:
-    """`frame` as one line, newline included."""
+    """With its newline."""
     seconds, micros = divmod(frame.t_us, 1_000_000)
     return f"({seconds:010d}.{micros:06d}) {interface} {frame.can_id:03X}#{frame.data.hex().upper()}\n"
 
@@ -120,13 +117,9 @@ def read_log(path: Path) -> tuple[list[LogFrame], LogCounts]:
     counts = LogCounts()
     frames = list(parse_lines(io.BytesIO(content), counts))  # splits at newlines, nowhere else
     if not frames:
-        raise ConfigError(f"{path}: no line is a CAN frame; {_shown(content)}, expected {EXPECTED}")
+        shown = "the file is empty"
+        if content:
+            line = content.splitlines()[0].decode("ascii", "replace")
+            shown = f"line 1 is {line[:LINE_SHOWN_CHARACTERS_MAX]!r}"
+        raise ConfigError(f"{path}: no line is a CAN frame; {shown}, expected {EXPECTED}")
     return frames, counts
-
-
-def _shown(content: bytes) -> str:
-    """The first line of a file, fit for a message."""
-    if not content:
-        return "the file is empty"
-    line = content.splitlines()[0].decode("ascii", "replace")
-    return f"line 1 is {line[:LINE_SHOWN_CHARACTERS_MAX]!r}"

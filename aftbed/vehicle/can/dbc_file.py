@@ -41,7 +41,6 @@ class Codec:
     """One DBC, loaded: encodes and decodes by message name, in the physical units of the file."""
 
     def __init__(self, database: Database, path: Path, misfits: Mapping[str, frozenset[str]]) -> None:
-        """`misfits`: of each message that contradicts itself, the signals that lie outside of it."""
         self.path = path
         self._messages: dict[str, Message] = {message.name: message for message in database.messages}
         self._misfits = misfits
@@ -52,23 +51,19 @@ class Codec:
         }
 
     def names(self) -> list[str]:
-        """All messages of the file."""
         return sorted(self._messages)
 
     def signal_names(self, name: str) -> list[str]:
-        """All signals of message `name`."""
         return [signal.name for signal in self._message(name).signals]
 
     def misfits(self, name: str) -> frozenset[str]:
-        """The signals of message `name` that do not lie in it: in a DBC that was not read strictly."""
+        """The signals of message `name` that lie outside of it; none in a DBC that was read strictly."""
         return self._misfits.get(name, frozenset())
 
     def can_id(self, name: str) -> int:
-        """The 11-bit identifier of message `name`."""
         return self._message(name).frame_id
 
     def length(self, name: str) -> int:
-        """The number of data bytes of message `name`."""
         return self._message(name).length
 
     def cycle_us(self, name: str) -> int:
@@ -86,18 +81,17 @@ class Codec:
         return int(attributes["E2EDataID"].value)
 
     def senders(self) -> list[str]:
-        """The nodes that send something, in small letters."""
+        """In small letters."""
         return sorted({node.lower() for message in self._messages.values() for node in message.senders})
 
     def sent_by(self, node: str) -> list[str]:
-        """The messages that `node` sends."""
         messages = self._messages.values()
         return [m.name for m in messages if node in (sender.lower() for sender in m.senders)]
 
     def patch(self, name: str, signal: str, value: float) -> tuple[bytes, bytes]:
-        """Where the bits of a signal are in its message, as a mask, and what they are for `value`.
+        """The bits of a signal in its message as a mask, and those of `value`.
 
-        Any value that has bits will do, also one outside the range that the file gives. ConfigError else.
+        A value outside the range that the file gives is allowed. ConfigError if the bits cannot hold it.
         """
         found, message = self._signal(name, signal), self._message(name)
         if message.is_multiplexed():
@@ -126,11 +120,11 @@ class Codec:
         return not found.is_float and found.scale == 1 and found.offset == 0
 
     def multiplexed(self, name: str) -> bool:
-        """True if what the message holds depends on a signal in it."""
+        """True if the signals of the message depend on the value of one of them."""
         return self._message(name).is_multiplexed()
 
     def encode(self, name: str, signals: Mapping[str, float]) -> bytes:
-        """The data bytes of message `name`. What does not fit the file's ranges is our own mistake."""
+        """The data bytes of message `name`. Values outside the file's ranges are our own mistake."""
         return self._message(name).encode(dict(signals))
 
     def decode(self, name: str, data: bytes) -> dict[str, float]:

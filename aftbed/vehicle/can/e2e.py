@@ -132,7 +132,6 @@ class _ProfileWithId(Profile, frozen=True):
     offset: int = 0
 
     def __post_init__(self) -> None:
-        """All of these are ours, or were checked."""
         assert 0 <= self.data_id <= (NIBBLE_ID_MAX if self.mode == "nibble" else DATA_ID_MAX)
         assert self.offset >= 0
 
@@ -248,7 +247,6 @@ class Supervision(msgspec.Struct, frozen=True):
     errors_max: int = 2
 
     def __post_init__(self) -> None:
-        """All of these are ours, never a peer's."""
         count = self.profile.counter_count
         assert self.length >= self.profile.bytes_min
         assert 1 <= self.delta_max < count

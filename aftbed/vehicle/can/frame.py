@@ -1,8 +1,6 @@
-"""One classic CAN frame on the bus, with the bus time at which it was seen.
+"""One classic CAN frame on the bus, with its bus time, whatever clock the run is paced by.
 
-Bus time is microseconds since the start of the run, whatever clock the run is paced by: the pure
-code never asks a clock. Only 11-bit identifiers and at most 8 data bytes exist here (no CAN FD, no
-extended or remote frames); whatever comes from outside is checked when the frame is made.
+No CAN FD, no extended or remote frames.
 """
 
 from typing import Final
@@ -16,14 +14,13 @@ DATA_LENGTH_MAX: Final = 8
 
 
 class Frame(msgspec.Struct, frozen=True):
-    """A frame: bus time in microseconds since the start of the run, 11-bit id, 0 to 8 bytes."""
+    """Bus time in microseconds since the start of the run, 11-bit id, 0 to 8 bytes. PeerError otherwise."""
 
     t_us: int
     can_id: int
     data: bytes
 
     def __post_init__(self) -> None:
-        """Refuse, with a PeerError, what cannot stand on a classic CAN bus."""
         if not 0 <= self.can_id <= CAN_ID_MAX:
             raise PeerError(f"CAN id {self.can_id:#x}, allowed is 0 to {CAN_ID_MAX:#x}")
         if len(self.data) > DATA_LENGTH_MAX:

@@ -1,7 +1,6 @@
-"""What a scenario file may hold, key by key, and the `Scenario` that is made of it.
+"""The keys of a scenario file, with units in their names and ranges in their types, and the `Scenario`.
 
-The same keys describe a user's file, a shipped scenario, and the rows of a published table (`tables`). Units
-are in the keys, ranges in the types; an error names the file, the key, what was found and what is allowed.
+The same keys describe a user's file, a shipped scenario, and the rows of a published table (`tables`).
 """
 
 from typing import Annotated, Literal
@@ -51,13 +50,11 @@ class Scenario(msgspec.Struct, frozen=True):
 
 
 class EgoKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """`ego:`"""
-
     speed_kmh: Speed
 
 
 class BrakingKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """`lead.braking:`. Euro NCAP gives the car ahead one second to reach its deceleration."""
+    """Euro NCAP gives the car ahead one second to reach its deceleration."""
 
     after_s: Duration
     deceleration_ms2: Deceleration
@@ -65,14 +62,12 @@ class BrakingKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class CutInKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """`lead.cut_in:`"""
-
     after_s: Duration
     over_s: Annotated[float, Meta(gt=0, le=60)]
 
 
 class LeadKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """`lead:`. Either `gap_m`, or the time in which the ego would close it: `ttc_s`."""
+    """Either `gap_m`, or the time in which the ego would close it: `ttc_s`."""
 
     speed_kmh: Speed
     gap_m: Distance | None = None
@@ -83,14 +78,10 @@ class LeadKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class RoadKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """`road:`"""
-
     friction: Annotated[float, Meta(gt=0, le=1.2)] = 0.9
 
 
 class BrakesKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """`brakes:`"""
-
     dead_time_s: Lag = DEAD_TIME_MS / 1000
     lag_s: Lag = LAG_MS / 1000
     jerk_max_ms3: Annotated[float, Meta(gt=0, le=1000)] | None = None
@@ -98,15 +89,11 @@ class BrakesKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class DriverKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """`driver:`, who brakes when warned."""
-
     reaction_s: Annotated[float, Meta(ge=0, le=10)]
     deceleration_ms2: Deceleration
 
 
 class ScenarioKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A scenario file."""
-
     description: str
     duration_s: Annotated[float, Meta(gt=0, le=3600)]
     ego: EgoKeys
@@ -119,12 +106,15 @@ class ScenarioKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 def scenario_of(name: str, where: str, keys: ScenarioKeys) -> Scenario:
     """The scenario that `keys` describe. Raises ConfigError, which begins with `where`."""
+    brakes, driver = keys.brakes, keys.driver
     setup = PlantSetup(
         speed_ms=keys.ego.speed_kmh / KMH_PER_MS,
         lead=_lead(where, keys.lead, keys.ego.speed_kmh) if keys.lead else None,
         friction=keys.road.friction,
-        brakes=_brakes(keys.brakes),
-        driver=Driver(_ms(keys.driver.reaction_s), keys.driver.deceleration_ms2) if keys.driver else None,
+        brakes=Brakes(
+            _ms(brakes.dead_time_s), _ms(brakes.lag_s), brakes.jerk_max_ms3, brakes.deceleration_max_ms2
+        ),
+        driver=Driver(_ms(driver.reaction_s), driver.deceleration_ms2) if driver else None,
     )
     return Scenario(name, keys.description, _ms(keys.duration_s), setup, keys.expect)
 
@@ -133,45 +123,33 @@ def _ms(duration_s: float) -> int:
     return round(duration_s * 1000)
 
 
-def _brakes(keys: BrakesKeys) -> Brakes:
-    return Brakes(_ms(keys.dead_time_s), _ms(keys.lag_s), keys.jerk_max_ms3, keys.deceleration_max_ms2)
-
-
 def _lead(where: str, keys: LeadKeys, ego_kmh: float) -> LeadCar:
-    return LeadCar(
-        gap_m=_gap_m(where, keys, ego_kmh),
-        speed_ms=keys.speed_kmh / KMH_PER_MS,
-        braking=_braking(keys.braking) if keys.braking else None,
-        lateral_m=keys.lateral_m,
-        cut_in=_cut_in(where, keys.cut_in, keys.lateral_m) if keys.cut_in else None,
-    )
-
-
-def _braking(keys: BrakingKeys) -> LeadBraking:
-    return LeadBraking(_ms(keys.after_s), keys.deceleration_ms2, _ms(keys.ramp_s))
-
-
-def _cut_in(where: str, keys: CutInKeys, lateral_m: float) -> CutIn:
-    if lateral_m == 0.0:
-        raise ConfigError(f"{where}: lead.cut_in: found without lateral_m, allowed is a car beside our lane")
-    return CutIn(_ms(keys.after_s), max(1, _ms(keys.over_s)))
-
-
-def _gap_m(where: str, lead: LeadKeys, ego_kmh: float) -> float:
-    """The gap as given, or as it follows from `ttc_s`. Zero would be a collision before the start."""
-    if (lead.gap_m is None) == (lead.ttc_s is None):
-        given = "none of them" if lead.gap_m is None else "both"
+    if (keys.gap_m is None) == (keys.ttc_s is None):
+        given = "none of them" if keys.gap_m is None else "both"
         raise ConfigError(f"{where}: lead: found {given}, allowed is one of gap_m, ttc_s")
-    if lead.ttc_s is not None:
-        closing_kmh = ego_kmh - lead.speed_kmh
+    if keys.ttc_s is not None:
+        closing_kmh = ego_kmh - keys.speed_kmh
         if closing_kmh <= 0.0:
-            reason = f"found {lead.ttc_s}, allowed is gap_m, because the gap does not close"
+            reason = f"found {keys.ttc_s}, allowed is gap_m, because the gap does not close"
             raise ConfigError(f"{where}: lead.ttc_s: {reason}")
-        return lead.ttc_s * closing_kmh / KMH_PER_MS
-    assert lead.gap_m is not None
-    if lead.gap_m == 0.0:
-        raise ConfigError(f"{where}: lead.gap_m: found 0, allowed is more than 0")
-    return lead.gap_m
+        gap_m = keys.ttc_s * closing_kmh / KMH_PER_MS
+    else:
+        assert keys.gap_m is not None
+        gap_m = keys.gap_m
+        if gap_m == 0.0:  # a collision before the start
+            raise ConfigError(f"{where}: lead.gap_m: found 0, allowed is more than 0")
+    braking, cut_in = keys.braking, keys.cut_in
+    if cut_in and keys.lateral_m == 0.0:
+        raise ConfigError(f"{where}: lead.cut_in: found without lateral_m, allowed is a car beside our lane")
+    return LeadCar(
+        gap_m=gap_m,
+        speed_ms=keys.speed_kmh / KMH_PER_MS,
+        braking=LeadBraking(_ms(braking.after_s), braking.deceleration_ms2, _ms(braking.ramp_s))
+        if braking
+        else None,
+        lateral_m=keys.lateral_m,
+        cut_in=CutIn(_ms(cut_in.after_s), max(1, _ms(cut_in.over_s))) if cut_in else None,
+    )
 
 
 def broken_expectations(scenario: Scenario, result: VehicleResult) -> list[str]:

@@ -79,14 +79,11 @@ class _Group(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class _Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A file of cases."""
-
     title: str
     groups: dict[str, _Group]
 
 
 def table_names() -> list[str]:
-    """The tables that there are."""
     return sorted(path.stem for path in _FOLDER.glob("*.yaml"))
 
 
@@ -106,7 +103,17 @@ def cases(table: str, group: str | None = None) -> tuple[Case, ...]:
     if group is not None and group not in groups:
         raise unknown(f"group of table {table}", group, groups)
     return tuple(
-        _case(table, name, held, speed_kmh, limit_kmh)
+        Case(
+            name=f"{table}{SEPARATOR}{name}-{speed_kmh:g}",
+            table=table,
+            group=name,
+            speed_kmh=speed_kmh,
+            limit_kmh=limit_kmh,
+            warning_s_min=held.warning_s_min,
+            demand_ms2_min=held.demand_ms2_min,
+            source=held.source,
+            demand_ms2_max=held.demand_ms2_max,
+        )
         for name, held in groups.items()
         if group in (None, name)
         for speed_kmh, limit_kmh in held.rows
@@ -156,38 +163,22 @@ def _table(name: str) -> _Table:
     return read_yaml(_FOLDER / f"{name}.yaml", _Table)
 
 
-def _case(table: str, name: str, group: _Group, speed_kmh: float, limit_kmh: float) -> Case:
-    return Case(
-        name=f"{table}{SEPARATOR}{name}-{speed_kmh:g}",
-        table=table,
-        group=name,
-        speed_kmh=speed_kmh,
-        limit_kmh=limit_kmh,
-        warning_s_min=group.warning_s_min,
-        demand_ms2_min=group.demand_ms2_min,
-        source=group.source,
-        demand_ms2_max=group.demand_ms2_max,
-    )
-
-
 def _scenario(case: Case, group: _Group) -> Scenario:
     lead_kmh = group.lead.speed_kmh if group.lead is not None else 0.0
+    if case.demand_ms2_max == 0.0:
+        expect = Expectation("no_braking")
+    elif case.limit_kmh == 0.0:
+        expect = Expectation("no_collision")
+    else:
+        expect = Expectation("impact", impact_speed_kmh_max=case.limit_kmh)
     keys = ScenarioKeys(
         description=f"{group.description}, {case.speed_kmh:g} km/h",
         duration_s=group.duration_s,
         ego=EgoKeys(case.speed_kmh + (lead_kmh if group.speed == "relative" else 0.0)),
-        expect=_expectation(case),
+        expect=expect,
         lead=group.lead,
         road=group.road,
         brakes=group.brakes,
         driver=group.driver,
     )
     return scenario_of(case.name, f"{_FOLDER / case.table}.yaml: {case.group}", keys)
-
-
-def _expectation(case: Case) -> Expectation:
-    if case.demand_ms2_max == 0.0:
-        return Expectation("no_braking")
-    if case.limit_kmh == 0.0:
-        return Expectation("no_collision")
-    return Expectation("impact", impact_speed_kmh_max=case.limit_kmh)
