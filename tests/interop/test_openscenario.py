@@ -158,6 +158,7 @@ def test_each_way_to_say_a_speed(target: str, speed_kmh: float, tmp_path: Path) 
         (EGO_PLACE, '<RelativeLanePosition entityRef="Ego" dLane="0" dsLane="30" offset="0"/>'),
         (EGO_PLACE, '<RelativeRoadPosition entityRef="Ego" ds="30" dt="0"/>'),
         (EGO_PLACE, '<RelativeObjectPosition entityRef="Ego" dx="30" dy="0"/>'),
+        ('<WorldPosition x="1" y="2" z="5"/>', '<RelativeObjectPosition entityRef="Ego" dx="30" dy="0"/>'),
         ('<RoadPosition roadId="7" s="3" t="-1.75"/>', '<RoadPosition roadId="7" s="33" t="-1.75"/>'),
         (
             '<WorldPosition x="1" y="2" h="3.141592653589793"/>',

@@ -189,7 +189,7 @@ def _place(name: str, positions: Mapping[str, Element], asking: tuple[str, ...])
 
 def _beside(position: Element, other: RoadPlace) -> RoadPlace:
     """The place that `position` gives relative to `other`."""
-    number, above_m, heading_rad = position.number, 0.0, other.heading_rad
+    number, above_m, heading_rad = position.number, other.above_m, other.heading_rad
     match position.tag:
         case "RelativeLanePosition":
             if number("dLane") != 0.0:
@@ -201,12 +201,14 @@ def _beside(position: Element, other: RoadPlace) -> RoadPlace:
         case "RelativeRoadPosition":
             along_m, across_m = number("ds"), number("dt")
         case "RelativeObjectPosition":
-            along_m, across_m, above_m = number("dx"), number("dy"), number("dz", 0.0)
+            along_m, across_m = number("dx"), number("dy")
+            above_m += number("dz", 0.0)
         case _:
             assert position.tag == "RelativeWorldPosition", position.tag
             if other.frame != _WORLD:
                 raise position.error(f"the other car is in {other.frame}, allowed is a WorldPosition")
-            along_m, across_m, above_m = number("dx"), number("dy"), number("dz", 0.0) + other.above_m
+            along_m, across_m = number("dx"), number("dy")
+            above_m += number("dz", 0.0)
             heading_rad = 0.0  # of the frame in which the distances are given
     cos, sin = math.cos(heading_rad), math.sin(heading_rad)
     return RoadPlace(

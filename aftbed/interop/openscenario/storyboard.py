@@ -151,7 +151,7 @@ def _quantity(condition: Element, motion: Motion) -> tuple[Element, _Linear]:
 
 
 def _distance_m(by: Element, name: str, motion: Motion) -> float:
-    """The distance that the condition looks at, at the start: that between the two cars, along the lane."""
+    """The distance of the condition at the start: that between the two cars, along the lane."""
     holder = by
     if by.tag == "TimeToCollisionCondition":
         holder = by.one("TimeToCollisionConditionTarget").one("EntityRef")
@@ -207,7 +207,7 @@ class LeadDrive(msgspec.Struct, frozen=True):
 
 
 class ImportedDrive(msgspec.Struct, frozen=True):
-    """What a scenario file of aftbed says about a drive, without the expected outcome."""
+    """The content of a scenario file of aftbed, without the expected outcome."""
 
     ego: str
     speed_ms: float
