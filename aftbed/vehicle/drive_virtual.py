@@ -1,8 +1,8 @@
 """The car in virtual time, inside one process: no socket, no clock, no thread. The bus is a function call.
 
 The body, the frames with their E2E and the gateway are those of a real run, and so are the rules of the bus
-(`can.bus_model`). What differs: a frame reaches all nodes in the instant in which it is sent, and time is
-what the caller says.
+(`can.bus_model`). What differs: a frame reaches all nodes in the instant in which it is sent, and the caller
+sets the time.
 
     car.advance(now_ns)          the requests that the gateway hands to the client, up to now
     car.deliver(reply, now_ns)   a reply that the client has received: it leaves as AEB_REQ
@@ -39,7 +39,7 @@ RADAR, BRAKE, GATEWAY = NODES
 
 
 class VirtualBus(BusModel[BusNode]):
-    """The car's bus: the two ECUs and the gateway. `witness` sees every frame, in the order of the bus."""
+    """The car's bus: the two ECUs and the gateway."""
 
     def __init__(self, codec: Codec, body: CarBody, witness: Callable[[Frame], None] | None) -> None:
         super().__init__()
@@ -93,7 +93,7 @@ class VirtualCar:
     ) -> None:
         """`codec` is aftbed's own DBC, loaded where none is given: that takes 3 ms.
 
-        `witness` sees every frame of the bus, in the order of the bus, as a log does.
+        `witness` is called with every frame, in the order of the bus.
         """
         codec = codec or load_dbc()
         self._body = CarBody(scenario, codec, brake_policy, seed)
@@ -116,7 +116,7 @@ class VirtualCar:
 
     @property
     def counts(self) -> GatewayCounts:
-        """The frames that the gateway has believed and refused."""
+        """The frames that the gateway has accepted and refused."""
         return self._bus.gateway.counts
 
     def result(self) -> VehicleResult:

@@ -1,21 +1,21 @@
 """The radar ECU, the brake ECU, and the car that they are in, without a bus: frames in, frames out.
 
-Time comes from the plant. The radar sees the plant's truth through seeded noise and quantisation, as one
-track. The brake ECU obeys AEB_REQ only where E2E lets it be believed; a request that is late or not to be
-believed is bridged with the last one for `HOLD_US`, after that a policy decides:
+Time comes from the plant. The radar measures the plant's state with seeded noise and quantisation, as one
+track. The brake ECU follows an AEB_REQ only if E2E accepts it; a request that is late or refused is bridged
+with the last one for `HOLD_US`, after that a policy decides:
 
-    hold     keep the last request for as long as none comes
+    hold     keep the last request until the next
     release  no braking without a request
     latch    (default) if the last request above standstill was for full braking, brake to standstill,
              whatever comes in the meantime except a full request; else release
 
-Latch, because a car in emergency braking has, by its last knowledge, an obstacle ahead: the death of the
-function that saw it does not remove it. A weaker request does not end a latch, since a function that has
-lost its state is back before it has seen the obstacle again.
+Latch, because a car in emergency braking has, as far as is known, an obstacle ahead: a crash of the function
+does not remove it. A weaker request does not end a latch, because a function that has lost its state answers
+before it has measured the obstacle again.
 
 Both ECUs are stepped once per millisecond of the plant. Frames due at the same instant come in arbitration
 order, and RADAR_STATUS is kept 5 ms off the grid of the others: so RADAR_TRACK is the last frame of its
-10 ms batch, and the request it makes sees the EGO_STATE of the same instant.
+10 ms batch, and the request it makes has the EGO_STATE of the same instant.
 
 `CarBody` is the plant with both ECUs. `drive_real` and `drive_virtual` carry its frames: the one over a real
 bus, paced or in lockstep, the other inside one process. A step is, in both:
@@ -160,7 +160,7 @@ class BrakeEcu:
         )
         self._status = Sender(codec, "BRAKE_STATUS")
         self._ego = Sender(codec, "EGO_STATE")
-        self._request: dict[str, float] | None = None  # the last one believed
+        self._request: dict[str, float] | None = None  # the last one accepted
         self._request_us = 0
         self._demand_ms2 = 0.0
 

@@ -43,7 +43,7 @@ BLIND_PART: Final = 0.75  # of a radar cycle must have passed since the last req
 
 
 class GatewayCounts(msgspec.Struct):
-    """Frames so far: believed, not for us, and refused, by reason."""
+    """Frames so far: accepted, not for us, and refused, by reason."""
 
     accepted: int = 0
     ignored: int = 0
@@ -150,7 +150,7 @@ class Gateway(BusGateway):
         self.uses = (self._ego_id, self.request_id)
         self._t_us = 0
         self._ego_us = 0
-        self._ego_speed_ms: float | None = None  # the last one believed
+        self._ego_speed_ms: float | None = None  # the last one accepted
         self._request_us: int | None = None  # when the last request was made
         self._blind_after_us = round(BLIND_PART * codec.cycle_us("RADAR_TRACK"))
 
@@ -163,7 +163,7 @@ class Gateway(BusGateway):
             return None
         if frame.can_id == self.request_id:
             return self._on_track(frame)
-        if self._believed(self._ego, frame):
+        if self._accepts(self._ego, frame):
             self.counts.accepted += 1
             signals = self._codec.decode("EGO_STATE", frame.data)
             self._ego_speed_ms = signals["SPEED"] if signals["SPEED_VALID"] else None
@@ -186,8 +186,8 @@ class Gateway(BusGateway):
         )
 
     def _targets(self, frame: Frame) -> tuple[AebTarget, ...] | None:
-        """The targets in our path; None, and counted, if the frame is not to be believed."""
-        if not self._believed(self._track, frame):
+        """The targets in our path; None, and counted, if the frame is refused."""
+        if not self._accepts(self._track, frame):
             return None
         signals = self._codec.decode("RADAR_TRACK", frame.data)
         slot, new = int(signals["TRACK_ID"]), bool(signals["NEW_TRACK"])
@@ -200,8 +200,8 @@ class Gateway(BusGateway):
         in_path = signals["VALID"] and abs(signals["LATERAL_OFFSET"]) <= LANE_HALF_M
         return (target,) if target is not None and in_path else ()
 
-    def _believed(self, receiver: Receiver, frame: Frame) -> bool:
-        """Let E2E judge the frame; count it if it is refused."""
+    def _accepts(self, receiver: Receiver, frame: Frame) -> bool:
+        """Whether the frame passes E2E; count it if it does not."""
         self._t_us = frame.t_us
         first = receiver.state is ChannelState.NODATA
         status = receiver.check(frame.data, frame.t_us)

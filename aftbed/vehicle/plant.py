@@ -12,8 +12,8 @@ from there on the road is empty. Gaps count only while the car ahead is in our w
 doubles: the same drive on every machine, bit for bit.
 
 The plant is the only source of `VehicleResult` and `Telemetry`: nothing in them comes off the bus, so a
-frame fault cannot make a collision look like a stop. Warning and demand in them are what the brake ECU
-made of the frames that it believed.
+frame fault cannot make a collision look like a stop. Warning and demand in them are those of the
+brake ECU, from the frames that it accepted.
 
 Limits: the ego keeps its lane; one target, no road gradient, no load transfer, no ABS dynamics.
 """

@@ -422,7 +422,7 @@ def _later(timer_ms: int, elapsed_ms: int) -> int:
 
 
 def _plausible(cycle: AebInput, output: AebOutput) -> bool:
-    """Whether some track can have led to `output`: one that `cycle` has seen, or one that is coasting."""
+    """Whether some track can have led to `output`: one that `cycle` measures, or one that is coasting."""
     if output.slot is None:
         return output.ttc_s is None
     if not (cycle.ego_valid and cycle.radar_valid):

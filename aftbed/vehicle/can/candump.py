@@ -44,7 +44,7 @@ class Refusal(StrEnum):
 
 
 class LogFrame(msgspec.Struct, frozen=True):
-    """A frame of a log, its time in microseconds by the log's own clock, and where it was seen."""
+    """A frame of a log, its time in microseconds by the log's own clock, and its interface."""
 
     interface: str
     frame: Frame

@@ -1,6 +1,6 @@
 """AUTOSAR E2E protection: profiles 1, 2, 5 and 11, and the supervision of a message by its counter.
 
-No signal of a safety frame is believed unless `Receiver.usable` holds. After the E2E Protocol Specification
+No signal of a safety frame is used unless `Receiver.usable` holds. After the E2E Protocol Specification
 (AUTOSAR PRS); the CRCs are those of the `autosar-e2e` library. A profile protects one message by a CRC, a
 counter, and a data id that is part of the CRC and, except for a nibble, not in the frame: so an intact
 frame of another message has a wrong CRC.
@@ -23,7 +23,7 @@ The supervision is the same for all profiles, with the states of the PRS:
                 OK_SOMELOST    CRC right, counter 2 to `delta_max` further: usable, some are missing
                 REPEATED       CRC right, counter as before: the same frame again
                 WRONGSEQUENCE  CRC right, counter too far ahead, or there is no last one to compare with
-                ERROR          wrong length, CRC or counter value: nothing in it can be believed
+                ERROR          wrong length, CRC or counter value: its content is unknown
     per poll    NONEWDATA      a whole cycle has passed without a frame
 
 and per message a window of the last statuses, from which the state of the channel follows:
@@ -293,11 +293,11 @@ class Receiver:
         return FrameStatus.NONEWDATA
 
     def usable(self, status: FrameStatus) -> bool:
-        """True if the frame that was just judged `status` may be believed."""
+        """True if the frame that was just judged `status` may be used."""
         return status in GOOD and self.state is ChannelState.VALID
 
     def refusal(self, data: bytes, status: FrameStatus) -> str | None:
-        """Why the frame that was just judged `status` may not be believed, in a word; None if it may."""
+        """Why the frame that was just judged `status` may not be used, in a word; None if it may."""
         if self.usable(status):
             return None
         match status:

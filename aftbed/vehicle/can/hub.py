@@ -18,7 +18,7 @@ ends the connection. Frames follow the rules of `bus_model`.
 virtual time that one client, the first that asks for it, sets by `aftbed time`; it never runs backwards.
 
 *Beside the bus* aftbed's nodes send elements of their own. A client that gives its name can be cut off by
-a fault, and its reports are believed; one that does not is a tool: it receives all frames, and all receive
+a fault, and its reports count; one that does not is a tool: it receives all frames, and all receive
 its frames.
 
     < < aftbed node radar 100 >        the client's name, and the identifiers that it uses

@@ -2,7 +2,7 @@
 
 The shipped ones follow Euro NCAP's car-to-car rear tests (CCR: s the car ahead stands, m it moves, b it
 brakes). Each row of a published table (`tables`) is a scenario too, by the name of its case:
-`r152:m1-60`. `expect` says what an undisturbed run must come to; the verdict of a run checks it.
+`r152:m1-60`. `expect` is the outcome that an undisturbed run must have; the verdict of a run checks it.
 
     stop          the ego brakes to standstill, without contact
     no_collision  no contact; the ego need not stop
