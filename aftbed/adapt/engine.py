@@ -83,7 +83,7 @@ class AdaptationEngine(Machine):
     AT_REST = (_S.IDLE,)
 
     def __init__(self) -> None:
-        super().__init__(_S.IDLE)
+        super().__init__()
         self.number = 0
         self.script: Script | None = None
         self.reason = ""  # of what is being undone

@@ -92,13 +92,17 @@ def target(graph: Graph, expression: str) -> Graph:
         raise ConfigError(f"{expression} is what runs already")
     application = next(b.application for b in graph.bricks if b.part == "server")
     new = build(expression, graph.placement, leader_of(graph))
-    updates = {(b.name, b.kind): b.source for b in graph.bricks if b.source}
-    kept = [b for b in new.bricks if (b.name, b.kind) in updates]
-    new = _with(new, {b.name: msgspec.structs.replace(b, source=updates[b.name, b.kind]) for b in kept})
-    if not application:
-        return new
-    concerned = [b for b in new.bricks if b.part == "server" or b.kind in REPLY_CHECKERS]  # call it, judge it
-    return _with(new, {b.name: msgspec.structs.replace(b, application=application) for b in concerned})
+    sources = {(b.name, b.kind): b.source for b in graph.bricks}
+
+    def carried_over(spec: BrickSpec) -> BrickSpec:
+        concerned = application and (spec.part == "server" or spec.kind in REPLY_CHECKERS)
+        return msgspec.structs.replace(
+            spec,
+            source=sources.get((spec.name, spec.kind), ""),
+            application=application if concerned else "",
+        )
+
+    return msgspec.structs.replace(new, bricks=tuple(map(carried_over, new.bricks)))
 
 
 def updated(graph: Graph, part: str, source: str) -> Graph:
@@ -106,23 +110,18 @@ def updated(graph: Graph, part: str, source: str) -> Graph:
 
     Raises ConfigError, naming what there is, if no replica has such a part.
     """
-    if part == APPLICATION:
-        return _with(graph, {b.name: msgspec.structs.replace(b, application=source) for b in _servers(graph)})
-    parts = sorted({b.part for b in graph.bricks if b.replica and b.kind != "watchdog"})
-    if part not in parts:
-        raise unknown("brick", part, (APPLICATION, *parts))
-    return _with(
-        graph,
-        {b.name: msgspec.structs.replace(b, source=source) for b in graph.bricks if b.part == part},
+    wanted, change = (
+        ("server", {"application": source}) if part == APPLICATION else (part, {"source": source})
     )
+    parts = sorted({b.part for b in graph.bricks if b.replica and b.kind != "watchdog"})
+    if wanted not in parts:
+        raise unknown("brick", part, (APPLICATION, *parts))
+    bricks = (msgspec.structs.replace(b, **change) if b.part == wanted else b for b in graph.bricks)
+    return msgspec.structs.replace(graph, bricks=tuple(bricks))
 
 
 def _servers(graph: Graph) -> list[BrickSpec]:
     return [b for b in graph.bricks if b.part == "server"]
-
-
-def _with(graph: Graph, bricks: dict[str, BrickSpec]) -> Graph:
-    return msgspec.structs.replace(graph, bricks=tuple(bricks.get(b.name, b) for b in graph.bricks))
 
 
 def plan(old: Graph, new: Graph, recipe: str = RECIPES[0]) -> Plan:

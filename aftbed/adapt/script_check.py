@@ -268,7 +268,7 @@ def _loops(graph: Graph) -> list[str]:
 
 
 def _masters(old: Graph, new: Graph) -> list[str]:
-    """Who leads, and how the leader speaks to its backup."""
+    """A change of the leader, and ports by which no leader sends to its backup."""
     leader = leader_of(old)
     led = {k.sink for k in new.links if k.source == "proxy" and k.source_port == "pxy2pro" and not k.standby}
     found = [

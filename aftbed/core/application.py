@@ -71,7 +71,7 @@ class Application(Protocol):
 
 
 def fields_of(application: Application | type[Application]) -> tuple[Field, ...]:
-    """The variables that the state consists of, where the function says so; else none."""
+    """The variables that the state consists of, where the function declares them; else none."""
     fields: tuple[Field, ...] = getattr(application, "fields", ())
     return fields
 

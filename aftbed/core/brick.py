@@ -4,7 +4,7 @@ A brick reads no clock, no socket and no random number. Time comes in as `now_ns
 and what the brick wants done goes out as effects. The host performs the effects in list order, none before
 `step` returns. The order is part of a mechanism's meaning (checkpoint before reply).
 
-A brick also says which of its ports are open in its present state. A host reads from open ports only.
+A brick declares which of its ports are open in its present state. A host reads from open ports only.
 Messages for the other ports wait in their channel, which outlives this node. So "one request at a time" is a
 closed port, not a queue in a brick.
 
@@ -29,7 +29,7 @@ from aftbed.core.events import Event
 from aftbed.core.messages import AnyMessage, Message, Rebound
 from aftbed.core.script import Phase, Script
 
-CONTROL: Final = "control"  # the port on which the runtime speaks to a brick
+CONTROL: Final = "control"  # the port on which the runtime sends to a brick
 NO_REQUEST: Final = 0
 
 
@@ -243,8 +243,9 @@ class Machine(Brick):
         """The tables as they are written, by name."""
         return {"": cls.MOVES, **cls.FURTHER_MOVES}
 
-    def __init__(self, state: BrickState) -> None:
-        self.state = state
+    def __init__(self, state: BrickState | None = None) -> None:
+        """Begins in `state`, or in the first of `AT_REST`."""
+        self.state = self.AT_REST[0] if state is None else state
         self.go_by("")
 
     def go_by(self, table: str) -> None:

@@ -11,7 +11,7 @@ from aftbed.core.errors import unknown
 
 
 class Weight(Enum):
-    """What an event says of a run, to a reader."""
+    """How much an event matters to a reader of a run."""
 
     ROUTINE = "routine"  # a request leaves it where nothing goes wrong
     NOTABLE = "notable"

@@ -99,7 +99,7 @@ class Graph(msgspec.Struct, frozen=True):
         raise KeyError(brick)
 
     def led_by(self, leader: str) -> "Graph":
-        """The same with `leader` leading: whom the Proxy is bound to, and which way replication goes."""
+        """The same with `leader` leading: where the Proxy is bound to, and which way replication goes."""
         specs = {b.name: b for b in self.bricks}
 
         def turned(link: Link) -> Link:

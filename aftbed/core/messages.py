@@ -33,7 +33,7 @@ class Message(msgspec.Struct, frozen=True, array_like=True, gc=False):
     TRAFFIC: ClassVar[Traffic] = Traffic.CONTROL
 
 
-class Request(Message, frozen=True, array_like=True, gc=False, tag=1):
+class Request(Message, frozen=True, tag=1):
     """`payload` for the protected function. Ids start at 1 and grow by 1."""
 
     TRAFFIC = Traffic.REQUEST
@@ -42,7 +42,7 @@ class Request(Message, frozen=True, array_like=True, gc=False, tag=1):
     payload: bytes
 
 
-class Reply(Message, frozen=True, array_like=True, gc=False, tag=2):
+class Reply(Message, frozen=True, tag=2):
     """The answer to request `request_id`, given by replica number `replica` (1 or 2)."""
 
     TRAFFIC = Traffic.REPLY
@@ -52,7 +52,7 @@ class Reply(Message, frozen=True, array_like=True, gc=False, tag=2):
     payload: bytes
 
 
-class CaptureState(Message, frozen=True, array_like=True, gc=False, tag=3):
+class CaptureState(Message, frozen=True, tag=3):
     """Asks the Server for its state: after exactly request `request_id`, or before it."""
 
     TRAFFIC = Traffic.STATE
@@ -60,7 +60,7 @@ class CaptureState(Message, frozen=True, array_like=True, gc=False, tag=3):
     request_id: int
 
 
-class StateCaptured(Message, frozen=True, array_like=True, gc=False, tag=4):
+class StateCaptured(Message, frozen=True, tag=4):
     """The Server's answer to CaptureState."""
 
     TRAFFIC = Traffic.STATE
@@ -69,7 +69,7 @@ class StateCaptured(Message, frozen=True, array_like=True, gc=False, tag=4):
     state: bytes
 
 
-class Checkpoint(Message, frozen=True, array_like=True, gc=False, tag=5):
+class Checkpoint(Message, frozen=True, tag=5):
     """Primary to backup: the state after `request_id`, and the reply that the client will get."""
 
     TRAFFIC = Traffic.STATE
@@ -79,7 +79,7 @@ class Checkpoint(Message, frozen=True, array_like=True, gc=False, tag=5):
     state: bytes
 
 
-class RestoreState(Message, frozen=True, array_like=True, gc=False, tag=6):
+class RestoreState(Message, frozen=True, tag=6):
     """After of the backup to its Server: the state of a checkpoint."""
 
     TRAFFIC = Traffic.STATE
@@ -88,7 +88,7 @@ class RestoreState(Message, frozen=True, array_like=True, gc=False, tag=6):
     state: bytes
 
 
-class StateRestored(Message, frozen=True, array_like=True, gc=False, tag=7):
+class StateRestored(Message, frozen=True, tag=7):
     """The Server's answer to RestoreState."""
 
     TRAFFIC = Traffic.STATE
@@ -96,7 +96,7 @@ class StateRestored(Message, frozen=True, array_like=True, gc=False, tag=7):
     request_id: int
 
 
-class StoreReply(Message, frozen=True, array_like=True, gc=False, tag=8):
+class StoreReply(Message, frozen=True, tag=8):
     """After of a backup to its Protocol: a reply to keep."""
 
     TRAFFIC = Traffic.REPLY
@@ -105,7 +105,7 @@ class StoreReply(Message, frozen=True, array_like=True, gc=False, tag=8):
     payload: bytes
 
 
-class TakeOver(Message, frozen=True, array_like=True, gc=False, tag=9):
+class TakeOver(Message, frozen=True, tag=9):
     """All that came before in this channel is applied: lead, under this epoch.
 
     It goes the way of a request, from the brick that was promoted on. Each brick hands it on.
@@ -114,7 +114,7 @@ class TakeOver(Message, frozen=True, array_like=True, gc=False, tag=9):
     epoch: int
 
 
-class Suspect(Message, frozen=True, array_like=True, gc=False, tag=10):
+class Suspect(Message, frozen=True, tag=10):
     """A Watchdog to Recovery: `node` of this generation of `replica` is dead or hangs."""
 
     replica: str
@@ -124,7 +124,7 @@ class Suspect(Message, frozen=True, array_like=True, gc=False, tag=10):
     at_ns: int
 
 
-class Notification(Message, frozen=True, array_like=True, gc=False, tag=11):
+class Notification(Message, frozen=True, tag=11):
     """LFR, leader to follower: the client gets the reply to `request_id`, which has this digest."""
 
     TRAFFIC = Traffic.REPLY
@@ -133,7 +133,7 @@ class Notification(Message, frozen=True, array_like=True, gc=False, tag=11):
     digest: bytes
 
 
-class Trial(Message, frozen=True, array_like=True, gc=False, tag=12):
+class Trial(Message, frozen=True, tag=12):
     """TR: one execution of `payload`. A `rerun` starts from `state`, from which the first run started."""
 
     TRAFFIC = Traffic.REQUEST
@@ -144,7 +144,7 @@ class Trial(Message, frozen=True, array_like=True, gc=False, tag=12):
     rerun: bool
 
 
-class Tried(Message, frozen=True, array_like=True, gc=False, tag=13):
+class Tried(Message, frozen=True, tag=13):
     """The result of one Trial: the reply, and the state after it."""
 
     TRAFFIC = Traffic.REPLY
@@ -155,7 +155,7 @@ class Tried(Message, frozen=True, array_like=True, gc=False, tag=13):
     state: bytes
 
 
-class Trials(Message, frozen=True, array_like=True, gc=False, tag=14):
+class Trials(Message, frozen=True, tag=14):
     """TR, Proceed to After: two results to compare, or the third one."""
 
     TRAFFIC = Traffic.REPLY
@@ -164,7 +164,7 @@ class Trials(Message, frozen=True, array_like=True, gc=False, tag=14):
     tried: tuple[Tried, ...]
 
 
-class Again(Message, frozen=True, array_like=True, gc=False, tag=15):
+class Again(Message, frozen=True, tag=15):
     """TR, After to Proceed: two trials differ, run a third."""
 
     TRAFFIC = Traffic.REQUEST
@@ -172,19 +172,19 @@ class Again(Message, frozen=True, array_like=True, gc=False, tag=15):
     request_id: int
 
 
-class Promotion(Message, frozen=True, array_like=True, gc=False, tag=20):
+class Promotion(Message, frozen=True, tag=20):
     """Runtime to the brick of a backup that receives from its leader: drain to the end, then take over."""
 
     epoch: int
 
 
-class Promoted(Message, frozen=True, array_like=True, gc=False, tag=21):
+class Promoted(Message, frozen=True, tag=21):
     """The backup's Protocol to the runtime: this replica leads now."""
 
     epoch: int
 
 
-class Rebound(Message, frozen=True, array_like=True, gc=False, tag=22):
+class Rebound(Message, frozen=True, tag=22):
     """Runtime to a brick: output `port` is bound to another channel, or to none; the epoch from here on."""
 
     port: str
@@ -192,17 +192,17 @@ class Rebound(Message, frozen=True, array_like=True, gc=False, tag=22):
     epoch: int
 
 
-class ChannelEnded(Message, frozen=True, array_like=True, gc=False, tag=23):
+class ChannelEnded(Message, frozen=True, tag=23):
     """Host to a brick: the port's channel is drained to its end."""
 
 
-class Submit(Message, frozen=True, array_like=True, gc=False, tag=24):
+class Submit(Message, frozen=True, tag=24):
     """The source of requests to the Client."""
 
     payload: bytes
 
 
-class Watch(Message, frozen=True, array_like=True, gc=False, tag=25):
+class Watch(Message, frozen=True, tag=25):
     """Runtime to a Watchdog: the nodes of this generation of the replica."""
 
     replica: str
@@ -210,19 +210,19 @@ class Watch(Message, frozen=True, array_like=True, gc=False, tag=25):
     nodes: tuple[str, ...]
 
 
-class NodeDied(Message, frozen=True, array_like=True, gc=False, tag=26):
+class NodeDied(Message, frozen=True, tag=26):
     """Host to a Watchdog: the pidfd of a watched node became readable."""
 
     node: str
 
 
-class Pulses(Message, frozen=True, array_like=True, gc=False, tag=27):
+class Pulses(Message, frozen=True, tag=27):
     """Host to a Watchdog: when each watched node was last seen running (monotonic ns)."""
 
     seen_ns: dict[str, int]
 
 
-class Situation(Message, frozen=True, array_like=True, gc=False, tag=28):
+class Situation(Message, frozen=True, tag=28):
     """Runtime to Recovery: which replica leads, which backs up (`""`: none), which slots are empty.
 
     Sent at the start and after each script, done or `failed`; so a new Recovery needs no memory of the old
@@ -264,14 +264,14 @@ class Scheduled(msgspec.Struct, frozen=True):
     after_ms: float = 0.0
 
 
-class Adapt(Message, frozen=True, array_like=True, gc=False, tag=40):
+class Adapt(Message, frozen=True, tag=40):
     """Runtime to the Engine: adaptation `number`, as it was planned."""
 
     number: int
     script: Script
 
 
-class Progress(Message, frozen=True, array_like=True, gc=False, tag=41):
+class Progress(Message, frozen=True, tag=41):
     """Runtime to the Engine: a phase that it ordered has ended. `failure`: `""` or the reason."""
 
     number: int
@@ -279,7 +279,7 @@ class Progress(Message, frozen=True, array_like=True, gc=False, tag=41):
     failure: str
 
 
-class TakeUp(Message, frozen=True, array_like=True, gc=False, tag=42):
+class TakeUp(Message, frozen=True, tag=42):
     """Runtime to a new Engine: what the dead one had ordered last, and how that ended, if it has."""
 
     number: int
@@ -289,7 +289,7 @@ class TakeUp(Message, frozen=True, array_like=True, gc=False, tag=42):
     failure: str
 
 
-class Adapted(Message, frozen=True, array_like=True, gc=False, tag=43):
+class Adapted(Message, frozen=True, tag=43):
     """The Engine to the runtime: how adaptation `number` ended: done, refused, rolled back."""
 
     number: int
@@ -297,19 +297,19 @@ class Adapted(Message, frozen=True, array_like=True, gc=False, tag=43):
     reason: str
 
 
-class HoldAt(Message, frozen=True, array_like=True, gc=False, tag=44):
+class HoldAt(Message, frozen=True, tag=44):
     """Runtime to the Client: report these requests, and send each of them only when it is released."""
 
     requests: tuple[int, ...]
 
 
-class RequestHeld(Message, frozen=True, array_like=True, gc=False, tag=45):
+class RequestHeld(Message, frozen=True, tag=45):
     """The Client to the runtime: it has come to `request_id`, and waits for its Release."""
 
     request_id: int
 
 
-class Release(Message, frozen=True, array_like=True, gc=False, tag=46):
+class Release(Message, frozen=True, tag=46):
     """Runtime to the Client: send `request_id`, if it is held."""
 
     request_id: int

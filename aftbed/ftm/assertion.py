@@ -29,9 +29,6 @@ class AssertBefore(Machine):
 
     AT_REST = (PassState.READY,)
 
-    def __init__(self) -> None:
-        super().__init__(PassState.READY)
-
     def pass_on_twice(self, msg: Request) -> list[Effect]:
         """After has the request before there can be a reply."""
         return [Send("bfr2aft", msg), Note(_EXIT, msg.request_id), Send("bfr2prd", msg)]
@@ -56,7 +53,7 @@ class AssertAfter(Machine):
     AT_REST = (_S.IDLE,)
 
     def __init__(self, acceptable: Acceptable) -> None:
-        super().__init__(_S.IDLE)
+        super().__init__()
         self._acceptable = acceptable
         self._held: Reply | None = None
 

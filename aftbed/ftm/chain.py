@@ -165,9 +165,6 @@ class PassBefore(Machine):
 
     AT_REST = (PassState.READY,)
 
-    def __init__(self) -> None:
-        super().__init__(PassState.READY)
-
     def pass_on(self, msg: Request) -> list[Effect]:
         return [Note(_BEFORE_EXIT, msg.request_id), Send("bfr2prd", msg)]
 
@@ -186,9 +183,6 @@ class Compute(Machine):
     """Proceed that has the Server compute once, and hands the result to After (paper, III-A)."""
 
     AT_REST = (ComputeState.IDLE,)
-
-    def __init__(self) -> None:
-        super().__init__(ComputeState.IDLE)
 
     def compute(self, msg: Request) -> list[Effect]:
         return [Note(_PROCEED_ENTER, msg.request_id), Send("prd2srv", msg)]
@@ -223,7 +217,7 @@ class InnerProtocol(Machine):
     AT_REST = (InnerState.IDLE,)
 
     def __init__(self) -> None:
-        super().__init__(InnerState.IDLE)
+        super().__init__()
         self.busy_id, self.epoch = NO_REQUEST, 0
 
     def admit(self, msg: Request) -> list[Effect]:
@@ -255,7 +249,7 @@ class InnerProtocol(Machine):
     }
 
 
-# -- handlers of the bricks through which a leader speaks to its backup ---------------------------
+# -- handlers of the bricks through which a leader sends to its backup ----------------------------
 #
 # Such a brick has an `epoch`, knows whether it is `duplex` (there is a backup), and, once promoted, the
 # `promote_epoch` to lead under. A promoted backup leads when the channel from its leader is drained.

@@ -68,7 +68,7 @@ class Client(Machine):
     AT_REST = (_C.READY,)
 
     def __init__(self) -> None:
-        super().__init__(_C.READY)
+        super().__init__()
         self.next_id = 1
         self.unanswered: dict[int, Request] = {}
         self._hold_at: frozenset[int] = frozenset()
@@ -222,7 +222,7 @@ class Proxy(Machine):
     AT_REST = (_S.UNBOUND, _S.IDLE)
 
     def __init__(self) -> None:
-        super().__init__(_S.UNBOUND)
+        super().__init__()
         self.epoch = 0
         self.waiting: Request | None = None
 

@@ -97,7 +97,7 @@ def tolerates(expression: str, fault: FaultClass) -> bool:
 
 
 def replication_of(expression: str) -> tuple[tuple[str, str], ...]:
-    """The parts and ports by which a leader speaks to its backup; () with one replica."""
+    """The parts and ports by which a leader sends to its backup; () with one replica."""
     names = parse(expression)
     return MECHANISMS[names[0]].replication if names else ()
 

@@ -10,8 +10,8 @@ of a failover is replaced by one that knows as much.
 | any       | suspected         | drop backup: the leader alone   |
 | sound     | none, slot vacant | new backup, by state transfer   |
 
-By which ports a leader speaks to its backup, and whose state a new backup needs, depends on the mechanism:
-the situation says it. Without such a port there is one replica, and nothing to be done about its death.
+By which ports a leader sends to its backup, and whose state a new backup needs, depends on the mechanism:
+the situation has both. Without such a port there is one replica, and nothing to be done about its death.
 """
 
 from typing import Final

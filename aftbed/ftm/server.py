@@ -93,7 +93,7 @@ class Server(Machine):
     AT_REST = (_S.STANDBY, _S.READY)
 
     def __init__(self, application: Application, replica: int) -> None:
-        super().__init__(_S.STANDBY)
+        super().__init__()
         self.application, self.replica = application, replica
         self._state_after = self._state_before = False  # whether the outputs for it are bound
 

@@ -77,7 +77,7 @@ class TrBefore(Machine):
     AT_REST = (_B.IDLE,)
 
     def __init__(self) -> None:
-        super().__init__(_B.IDLE)
+        super().__init__()
         self._request: Request | None = None
 
     def ask_for_state(self, msg: Request) -> list[Effect]:
@@ -123,7 +123,7 @@ class TrProceed(Machine):
     AT_REST = (_P.IDLE,)
 
     def __init__(self) -> None:
-        super().__init__(_P.IDLE)
+        super().__init__()
         self._trial: Trial | None = None
         self._first: Tried | None = None
 
@@ -203,7 +203,7 @@ class TrAfter(Machine):
     AT_REST = (_A.IDLE,)
 
     def __init__(self) -> None:
-        super().__init__(_A.IDLE)
+        super().__init__()
         self._held: tuple[Tried, ...] = ()
 
     def vote(self, msg: Trials) -> Vote:

@@ -22,7 +22,7 @@ not exist is the user's error and costs the run nothing. What a fault does to th
 import re
 from collections import deque
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, ClassVar, Final
+from typing import TYPE_CHECKING, Final
 
 import msgspec
 
@@ -60,7 +60,7 @@ _NODE: Final = re.compile(r"[a-z_][a-z0-9_]{0,31}")
 class BusEffect(msgspec.Struct, frozen=True, tag=True):
     """Base of what a fault does to frames or nodes. As text: the words behind the frames."""
 
-    VERB: ClassVar = ""
+    VERB = ""
 
     def __str__(self) -> str:
         return ""
@@ -245,9 +245,9 @@ class BusFault(FaultKind, frozen=True, tag="bus"):
     persistence: BusPersistence = ONCE
     targets: tuple[TargetFrame, ...] | None = None
 
-    NAMES: ClassVar = (*ON_FRAMES, *ON_NODES)
+    NAMES = (*ON_FRAMES, *ON_NODES)
 
-    needs_bus: ClassVar = True
+    needs_bus = True
 
     def __post_init__(self) -> None:
         """Refuse, with a ValueError, what means nothing."""

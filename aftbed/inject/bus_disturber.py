@@ -88,7 +88,7 @@ class _ArmedBusFault:
         return not self.over and self.opens_us is not None and self.opens_us <= now_us
 
     def ends_us(self) -> int | None:
-        """When it ends by time; None while that cannot be said."""
+        """When it ends by time; None before it has begun, or without such an end."""
         persistence, since_us = self.fault.persistence, self.since_us
         if self.over or since_us is None or not isinstance(persistence, Lasting):
             return None

@@ -13,7 +13,7 @@ is kept except where it is the fault to break it, and nothing is held back for e
 from collections import deque
 from collections.abc import Callable
 from enum import Enum
-from typing import ClassVar, Final, NamedTuple, Self, assert_never
+from typing import Final, NamedTuple, Self, assert_never
 
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.graph import Graph
@@ -49,12 +49,12 @@ class ChannelFault(FaultKind, frozen=True, tag="disturb"):
     channel: str
     by_ms: float = HOLD_MS
 
-    NAMES: ClassVar = tuple(how.value for how in Disturbance)
-    KEYS: ClassVar = ("by", "in", "nth", "after", "when", *REPEAT_KEYS)
+    NAMES = tuple(how.value for how in Disturbance)
+    KEYS = ("by", "in", "nth", "after", "when", *REPEAT_KEYS)
 
-    repeats: ClassVar = True
-    counts_messages: ClassVar = True
-    acts_in_node: ClassVar = True
+    repeats = True
+    counts_messages = True
+    acts_in_node = True
 
     @classmethod
     def from_words(cls, words: FaultWords) -> Self:

@@ -4,7 +4,7 @@ A node that emits the event and belongs to the target kills itself, so the point
 waits until the supervisor has seen the target dead.
 """
 
-from typing import ClassVar, Self
+from typing import Self
 
 from aftbed.core.errors import ConfigError
 from aftbed.core.graph import Graph
@@ -17,12 +17,12 @@ from aftbed.inject.receipts import Receipt, ReceiptState
 class Crash(FaultKind, frozen=True, tag="crash"):
     """SIGKILL."""
 
-    NAMES: ClassVar = ("crash",)
-    KEYS: ClassVar = ("for", *WHEN_KEYS)
+    NAMES = ("crash",)
+    KEYS = ("for", *WHEN_KEYS)
 
-    stops_process: ClassVar = True
-    has_worst_instant: ClassVar = True
-    emitter_may_act: ClassVar = True
+    stops_process = True
+    has_worst_instant = True
+    emitter_may_act = True
 
     @classmethod
     def from_words(cls, words: FaultWords) -> Self:

@@ -23,7 +23,7 @@ _WHOLE: Final = re.compile(r"[0-9]{1,12}")
 
 
 class FaultWords:
-    """The words of one fault, told apart.
+    """The words of one fault: name, subject, keys with their values.
 
     Raises ConfigError where a key is unknown, double or without value.
     """

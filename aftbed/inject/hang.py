@@ -5,7 +5,7 @@ Without `for` the target stays stopped. The end of a stop is recorded in the run
 so the cleanup process thaws the target even if the supervisor has died (`runtime.unix.cleanup`).
 """
 
-from typing import ClassVar, Final, Self
+from typing import Final, Self
 
 from msgspec import structs
 
@@ -25,12 +25,12 @@ class Hang(FaultKind, frozen=True, tag="hang"):
 
     for_ms: int = FOREVER_MS
 
-    NAMES: ClassVar = ("hang",)
-    KEYS: ClassVar = ("for", *WHEN_KEYS)
+    NAMES = ("hang",)
+    KEYS = ("for", *WHEN_KEYS)
 
-    stops_process: ClassVar = True
-    takes_real_time: ClassVar = True
-    has_worst_instant: ClassVar = True
+    stops_process = True
+    takes_real_time = True
+    has_worst_instant = True
 
     @classmethod
     def from_words(cls, words: FaultWords) -> Self:

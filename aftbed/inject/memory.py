@@ -10,7 +10,7 @@ is lost with the process. How the memory of another process is reached is in `ru
 
 import re
 from collections.abc import Sequence
-from typing import ClassVar, Final, Self
+from typing import Final, Self
 
 from aftbed.core.errors import ConfigError, StepFailed
 from aftbed.core.graph import Graph
@@ -30,13 +30,13 @@ class MemoryFlip(FaultKind, frozen=True, tag="memory"):
     bit: int | None = None
     address: int | None = None
 
-    NAMES: ClassVar = (BITFLIP,)
-    KEYS: ClassVar = BITFLIP_KEYS
+    NAMES = (BITFLIP,)
+    KEYS = BITFLIP_KEYS
 
-    alters_value: ClassVar = True
-    strikes_stored_state: ClassVar = True
-    unsafe: ClassVar = True
-    simulated: ClassVar = False
+    alters_value = True
+    strikes_stored_state = True
+    unsafe = True
+    simulated = False
 
     @classmethod
     def claims(cls, words: Sequence[str]) -> bool:

@@ -94,7 +94,7 @@ def parse(text: str) -> Fault:
 
 
 def read(words: Sequence[str]) -> Fault:
-    """The same of words that were told apart already: one of them may have spaces."""
+    """The same of words that are separate already: one of them may have spaces."""
     for kind in KINDS:
         if kind.claims(words):
             found = kind.read(words)

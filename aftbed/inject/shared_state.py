@@ -12,7 +12,7 @@ one shares nothing, or fresh memory: the memory does not outlive its process.
 
 Limits: a state that is replaced, by a checkpoint or before a further trial, covers what was flipped, as in
 any memory. The supervisor may flip while the function works: then its bit may be overwritten, or it may
-write a byte back as it was a microsecond ago. The records say which bits the node really found.
+write a byte back as it was a microsecond ago. The records show which bits the node really found.
 """
 
 from collections.abc import Callable, Iterable

@@ -7,7 +7,7 @@ a CPU. The agent in the node delays the steps; the node's pulse goes on, because
 
 import contextlib
 import re
-from typing import ClassVar, Final, Self
+from typing import Final, Self
 
 from msgspec import structs
 
@@ -33,11 +33,11 @@ class Slow(FaultKind, frozen=True, tag="slow"):
     for_ms: int = 0
     share: float | None = None
 
-    NAMES: ClassVar = ("slow",)
-    KEYS: ClassVar = ("by", "share", "for", *WHEN_KEYS)
+    NAMES = ("slow",)
+    KEYS = ("by", "share", "for", *WHEN_KEYS)
 
-    takes_real_time: ClassVar = True
-    has_worst_instant: ClassVar = True
+    takes_real_time = True
+    has_worst_instant = True
 
     @classmethod
     def from_words(cls, words: FaultWords) -> Self:

@@ -9,7 +9,7 @@ once.
 
 import re
 from collections.abc import Sequence
-from typing import ClassVar, Final, Self
+from typing import Final, Self
 
 from aftbed.core.application import fields_of
 from aftbed.core.errors import ConfigError, StepFailed, unknown
@@ -35,12 +35,12 @@ class StateFlip(FaultKind, frozen=True, tag="state"):
     field: str
     pattern: BitPattern = Bit()
 
-    NAMES: ClassVar = (BITFLIP,)
-    KEYS: ClassVar = BITFLIP_KEYS
+    NAMES = (BITFLIP,)
+    KEYS = BITFLIP_KEYS
 
-    alters_value: ClassVar = True
-    strikes_stored_state: ClassVar = True
-    shares_state: ClassVar = True
+    alters_value = True
+    strikes_stored_state = True
+    shares_state = True
 
     @classmethod
     def claims(cls, words: Sequence[str]) -> bool:

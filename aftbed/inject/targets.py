@@ -126,7 +126,7 @@ def _nodes(event: str, graph: Graph) -> tuple[str, ...]:
     return (*nodes, *(f"{node}{STAGED}" for node in nodes))
 
 
-# -- who emits an event, who sends on a channel ---------------------------------------------------
+# -- which brick emits an event, or sends on a channel --------------------------------------------
 
 
 def emitting_node(roles: Roles, event: str) -> str | None:

@@ -13,7 +13,7 @@ place is sound.
 
 from collections.abc import Sequence
 from enum import Enum
-from typing import ClassVar, Final, Self
+from typing import Final, Self
 
 import msgspec
 from msgspec import structs
@@ -76,12 +76,12 @@ class ValueFlip(FaultKind, frozen=True, tag=BITFLIP):
     place: ValuePlace
     pattern: BitPattern = Bit()
 
-    NAMES: ClassVar = (BITFLIP,)
-    KEYS: ClassVar = BITFLIP_KEYS
+    NAMES = (BITFLIP,)
+    KEYS = BITFLIP_KEYS
 
-    alters_value: ClassVar = True
-    repeats: ClassVar = True
-    acts_in_node: ClassVar = True
+    alters_value = True
+    repeats = True
+    acts_in_node = True
 
     @classmethod
     def from_words(cls, words: FaultWords) -> Self:
