@@ -9,7 +9,7 @@ without a fault.
 
 from typing import Final
 
-from aftbed.adapt.observer import VOTE_MASKED
+from aftbed.adapt.policy import VOTE_MASKED
 from aftbed.core.events import Event
 from aftbed.core.journal import EntryKind
 from aftbed.ftm.compose import replication_of

@@ -9,8 +9,24 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from policies import ACTIONS, COMPOSE, DECOMPOSE, TO_LFR, S, beyond_oracle, beyonds, levels
 
-from aftbed.adapt.observer import Declined, Measured, Observation, Observer, Proposal, Running, Seen
-from aftbed.adapt.policy import ADAPTABLE, Action, Beyond, Burst, Condition, Policy, Quiet, Rule, conflict
+from aftbed.adapt.policy import (
+    ADAPTABLE,
+    Action,
+    Beyond,
+    Burst,
+    Condition,
+    Declined,
+    Measured,
+    Observation,
+    Observer,
+    Policy,
+    Proposal,
+    Quiet,
+    Rule,
+    Running,
+    Seen,
+    conflict,
+)
 
 # -- by hand
 

@@ -9,7 +9,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from policies import ACTIONS, COMPOSE, DECOMPOSE, TO_LFR, TO_PBR, S, read
 
-from aftbed.adapt.observer import symptoms
 from aftbed.adapt.policy import (
     Action,
     Beyond,
@@ -22,6 +21,7 @@ from aftbed.adapt.policy import (
     action,
     conflict,
     policy_from,
+    symptoms,
 )
 from aftbed.core.errors import ConfigError
 from aftbed.core.events import Event

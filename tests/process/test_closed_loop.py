@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from liveruns import WAIT_SECONDS_MAX, Done, Home, aftbed
 
-from aftbed.adapt.observer import Seen
+from aftbed.adapt.policy import Seen
 from aftbed.core import journal
 from aftbed.core.errors import PeerError
 from aftbed.core.events import Event

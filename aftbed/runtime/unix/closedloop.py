@@ -1,8 +1,8 @@
 """The closed loop: the command of a run observes it, and has it adapted as a policy says (paper, II).
 
-`adapt.observer` decides and is pure; here is all I/O around it. The loop lives in the command, not in the
-supervisor: what it reads are files, what it wants it asks for like any second terminal, so a run is the same
-with it and without it until the first adaptation.
+The `Observer` of `adapt.policy` decides and is pure; here is all I/O around it. The loop lives in the
+command, not in the supervisor: it reads files and requests adaptations as any second terminal does, so a run
+is the same with it and without it until the first adaptation.
 
     journals, events, resources, history --> Observer --> Proposal --> (a person) --> Adapt --> outcome
 
@@ -34,9 +34,21 @@ from typing import Final, Literal
 
 import msgspec
 
-from aftbed.adapt import observer
-from aftbed.adapt.observer import Declined, Measured, Observation, Observer, Proposal, Running, Seen
-from aftbed.adapt.policy import Beyond, Policy, PolicyFile, policy_from
+from aftbed import adapt
+from aftbed.adapt.policy import (
+    Beyond,
+    Declined,
+    Measured,
+    Observation,
+    Observer,
+    Policy,
+    PolicyFile,
+    Proposal,
+    Running,
+    Seen,
+    policy_from,
+    symptoms,
+)
 from aftbed.adapt.suitability import unsuitable
 from aftbed.core.application import Characteristics
 from aftbed.core.errors import AftbedError, ConfigError, PeerError, unknown
@@ -51,7 +63,7 @@ from aftbed.runtime.unix.support import HISTORY_NAME
 PERIOD_SECONDS: Final = 0.1
 PROPOSALS_NAME: Final = "proposals.jsonl"
 APPROVALS: Final = ("auto", "ask")
-_FOLDER: Final = Path(observer.__file__).resolve().parent / "policies"
+_FOLDER: Final = Path(adapt.__file__).resolve().parent / "policies"
 
 Tell = Callable[[dict[str, object]], None]
 
@@ -219,7 +231,7 @@ class ClosedLoop:
                 self._end(self._open, "superseded", f"{outcome.ftm} runs now")
             self._step(Running(outcome.ftm), now_ns)
         for record in self._records():
-            for symptom in observer.symptoms(record.event, record.detail):
+            for symptom in symptoms(record.event, record.detail):
                 self._step(Seen(symptom), record.t_ns)
         self._step(Measured(self._meter.values()), now_ns)
 

@@ -11,8 +11,7 @@ from typing import Final
 
 import msgspec
 
-from aftbed.adapt.observer import Seen
-from aftbed.adapt.policy import Beyond, Policy, Resource
+from aftbed.adapt.policy import Beyond, Policy, Resource, Seen
 from aftbed.core import journal
 from aftbed.core.journal import Record
 from aftbed.runtime.adaptations import Outcome
