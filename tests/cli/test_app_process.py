@@ -5,7 +5,8 @@ import socket
 from pathlib import Path
 
 import pytest
-from liveruns import Done, Home, aftbed
+from liveruns import Done, Home
+from liveruns import command as aftbed
 from test_bad_input import DBC, MAP
 
 from aftbed.campaign.plan import code_version
@@ -25,10 +26,7 @@ def assert_refused(done: Done, home: Home) -> None:
 @pytest.mark.parametrize(
     "arguments",
     [
-        ("run", "--scenario", "ccrs50"),
-        ("run", "--ftm", "pbrr"),
         ("run", "--inject", "crash primary at checkpoint.send"),
-        ("run", "--pace", "fast"),
         ("run", "--replay", "absent.log", "--dbc", "absent.dbc", "--map", "toyota"),
         ("status",),
         ("inject", "crash", "primary"),
@@ -52,9 +50,9 @@ def test_a_refused_run_leaves_no_record(home: Home, tmp_path: Path) -> None:
     assert not record.exists()
 
 
-@pytest.mark.parametrize("command", [("--help",), ("run", "--load", "10"), ("status",)])
-def test_an_interpreter_without_asserts_is_refused(home: Home, command: tuple[str, ...]) -> None:
-    done = aftbed(*command, flags=("-O",))
+@pytest.mark.parametrize("arguments", [("--help",), ("run", "--load", "10"), ("status",)])
+def test_an_interpreter_without_asserts_is_refused(home: Home, arguments: tuple[str, ...]) -> None:
+    done = aftbed(*arguments, flags=("-O",))
     assert done.code != 0
     assert "refusing to run under python -O" in done.err
     assert home.left() == []
@@ -65,7 +63,7 @@ def test_the_version_is_the_one_of_the_records() -> None:
     assert (done.code, done.out, done.err) == (0, f"aftbed {code_version()}\n", "")
 
 
-@pytest.mark.parametrize("option", [("--bus-port", "x"), ("--seed", "x"), ("--unknown",)])
+@pytest.mark.parametrize("option", [("--seed", "x"), ("--unknown",)])
 def test_usage_is_exit_code_2(home: Home, option: tuple[str, ...]) -> None:
     done = aftbed("run", *option)
     assert done.code == 2

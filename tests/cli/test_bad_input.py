@@ -115,6 +115,10 @@ def test_options_of_run(refused: Output, arguments: tuple[str, ...], words: tupl
         ("hang primary for -5ms", ("duration '-5ms'",)),
         ("crash primary at reply.sent after 5ms", ("one of them is allowed",)),
         ("crash primary after 5ms after 6ms", ("'after' twice",)),
+        ("bitflip memory", ("say --unsafe-memory if that is wanted",)),
+        ("omission bus RADAR_TRAC", ("unknown message 'RADAR_TRAC'", "did you mean 'RADAR_TRACK'?")),
+        ("bus-off wheel", ("unknown node of the bus 'wheel'",)),
+        ("delay bus AEB_REQ", ("'by' is missing",)),
     ],
 )
 def test_faults(refused: Output, fault: str, words: tuple[str, ...]) -> None:

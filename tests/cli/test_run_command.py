@@ -91,3 +91,46 @@ def test_the_adaptations_of_a_run_are_among_its_options(home: Home, monkeypatch:
     with pytest.raises(StartedError):
         main()
     assert started[0].adaptations == (Scheduled(Goal(expression="lfr", recipe="paper"), after_ms=1000.0),)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("dwell_s: 5\nrules: []\n", "rules: found 0"),
+        ("dwell_s: 5\n", "key 'rules' is missing"),
+        (
+            "dwell_s: 5\nrules:\n"
+            "  - {when: {resource: cpu_load, above: 0.8}, then: switch pbr}\n"
+            "  - {when: {resource: cpu_load, below: 0.9}, then: switch lfr}\n",
+            "both can hold at once",
+        ),
+        (
+            "dwell_s: 5\nrules:\n  - {when: {resource: traffic_kbit_s, above: 600}, then: switch lfr}\n",
+            "found traffic_kbit_s, which no run measures; measured are: cpus, cpu_load",
+        ),
+    ],
+)
+def test_a_bad_policy_starts_nothing(refused: Output, tmp_path: Path, text: str, words: str) -> None:
+    path, record = tmp_path / "policy.yaml", tmp_path / "record"
+    path.write_text(text)
+    error = refused("run", "--load", "10", "--record", record, "--policy", path)
+    assert error.startswith(f"aftbed: error: {path}: ") and words in error
+    assert not record.exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--policy", "value-fault"), "did you mean 'value-faults'"),
+        (("--policy", "absent.yaml"), "absent.yaml: cannot be read"),
+        (("--policy", "value-faults", "--approve", "auto-matic"), "unknown approval"),
+        (("--policy", "value-faults", "--approve", "ask"), "standard input is no terminal"),
+        (("--policy", "value-faults", "--approve", "ask", "--json"), "--json prints no question"),
+        (("--policy", "value-faults", "--ftm", "none"), "none has no Engine"),
+        (("--approve", "ask"), "give --policy too"),
+    ],
+)
+def test_options_of_a_policy_that_do_not_go_together(
+    refused: Output, arguments: tuple[str, ...], words: str
+) -> None:
+    assert words in refused("run", "--load", "10", *arguments)

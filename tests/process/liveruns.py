@@ -6,6 +6,8 @@ own. Both belong to a `Home` (`homes`).
 Nothing here sleeps to wait: a wait is a poll of a descriptor or of a condition, with a deadline.
 """
 
+import contextlib
+import io
 import json
 import os
 import select
@@ -29,6 +31,7 @@ from homes import (
     until,
 )
 
+from aftbed.cli import main
 from aftbed.core.errors import ConfigError
 from aftbed.core.journal import EntryKind, entries
 from aftbed.inject.model import Fault
@@ -40,6 +43,7 @@ from aftbed.runtime.unix.options import LoadRun, Work
 from aftbed.runtime.unix.resources import ProcessRow
 
 RUN_SECONDS_MAX: Final = 60.0
+CLIENTS: Final = ("adapt", "check", "graph", "inject", "ps", "status", "stop")
 
 __all__ = [  # what others import from here
     "GONE_SECONDS_MAX",
@@ -52,6 +56,7 @@ __all__ = [  # what others import from here
     "Outcome",
     "Started",
     "aftbed",
+    "command",
     "ended",
     "home",
     "readable",
@@ -262,8 +267,29 @@ class Done(msgspec.Struct, frozen=True):
         return msgspec.json.decode(self.out, type=Verdict)
 
 
-def aftbed(*arguments: str | Path, flags: tuple[str, ...] = ()) -> Done:
-    """Run a command to its end; `flags` are the interpreter's."""
+def aftbed(*arguments: str | Path) -> Done:
+    """Run a command to its end: in this process if it starts none, that is about a run that is there."""
+    return called(*arguments) if arguments[0] in CLIENTS else command(*arguments)
+
+
+def called(*arguments: str | Path) -> Done:
+    """Run a command in this process."""
+    out, err = (io.TextIOWrapper(io.BytesIO(), write_through=True) for _ in range(2))
+    argv, sys.argv = sys.argv, ["aftbed", *map(str, arguments)]
+    try:
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+            main()
+        code: object = 0
+    except SystemExit as ended:
+        code = ended.code or 0
+    finally:
+        sys.argv = argv
+    assert isinstance(code, int), code
+    return Done(code, *(text.buffer.getvalue().decode() for text in (out, err)))
+
+
+def command(*arguments: str | Path, flags: tuple[str, ...] = ()) -> Done:
+    """Run a command in an interpreter of its own; `flags` are the interpreter's."""
     done = subprocess.run(
         [sys.executable, *flags, "-m", "aftbed", *map(str, arguments)],
         capture_output=True,
@@ -279,10 +305,10 @@ class Command:
     """An `aftbed run` of its own, in the background. A context manager that kills it."""
 
     def __init__(self, *arguments: str | Path) -> None:
-        command = [sys.executable, "-m", "aftbed", "run", *map(str, arguments)]
+        words = [sys.executable, "-m", "aftbed", "run", *map(str, arguments)]
         self._errors = tempfile.TemporaryFile("w+")  # noqa: SIM115 - for as long as the command
         self.popen = subprocess.Popen(
-            command,
+            words,
             stdout=subprocess.PIPE,
             stderr=self._errors,
             stdin=subprocess.DEVNULL,
@@ -302,14 +328,14 @@ class Command:
         self.popen.stdout.close()
         self._errors.close()
 
-    def wait_for_line(self, words: str) -> str:
-        """The first line of its output that has `words`."""
+    def wait_for_line(self, words: str, nth: int = 1) -> str:
+        """The `nth` line of its output that has `words`."""
         limit = time.monotonic() + WAIT_SECONDS_MAX
         while True:
             lines = self._text.decode(errors="replace").splitlines(keepends=True)
-            for line in lines:
-                if words in line and line.endswith("\n"):
-                    return line.rstrip()
+            found = [line for line in lines if words in line and line.endswith("\n")]
+            if len(found) >= nth:
+                return found[nth - 1].rstrip()
             if not readable(self._out, limit - time.monotonic()):
                 pytest.fail(f"no line with {words!r} in {self._text[-500:]!r}")
             got = os.read(self._out, 65536)

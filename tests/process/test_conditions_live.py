@@ -177,24 +177,6 @@ def test_a_process_of_another_run_is_not_struck(home: Home) -> None:
         run.finish()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        (("run", "--load", "10", "--inject", "bitflip memory"), "say --unsafe-memory if that is wanted"),
-        (("inject", "bitflip", "a/server", "--level", "memory"), "say --unsafe-memory if that is wanted"),
-        (("inject", "bitflip", "result", "--level", "memry"), "unknown level of a bitflip 'memry'"),
-        (
-            ("inject", "bitflip", "a/server", "--level", "memory", "--unsafe-memory", "--replica", "a"),
-            "--replica a: with --level memory the target is 'a/server' already",
-        ),
-        (("sim", "--faults", "bitflip memory"), "simulated processes have no memory of their own"),
-    ],
-)
-def test_nobody_strikes_memory_by_chance(arguments: tuple[str, ...], says: str) -> None:
-    done = aftbed(*arguments)
-    assert done.code == 2 and says in done.err, done.err
-
-
 def test_memory_is_struck_from_a_second_command(home: Home) -> None:
     with under_load(home, 4000, 200.0) as run:
         done = aftbed("inject", "bitflip", "backup", "--level", "memory", "--unsafe-memory", "--bit", "0")
