@@ -231,7 +231,7 @@ def messages_of(run: RunRecord) -> Iterator[TimedMessage]:
             category = category_of(one)
             topic = "/ftm/requests" if category is Category.REQUEST else "/ftm"
             run_ms = (one.t_ns - run.started_ns) / 1e6
-            text = describe(one, run)
+            text = describe(one, run.faults)
             event = FtmEvent(category.value, node, str(one.event), text, one.request_id, one.detail, run_ms)
             yield TimedMessage(axis.at(one.t_ns), topic, event)
     for logged in logged_events(run):

@@ -133,7 +133,7 @@ def _instants(run: RunRecord, tracks: _Tracks) -> Iterator[TraceEvent]:
             category = category_of(one)
             if category is not Category.REQUEST:
                 track = tracks.of(node, incarnation)
-                yield _instant(category.value, describe(one, run), _ts(one.t_ns, run), track)
+                yield _instant(category.value, describe(one, run.faults), _ts(one.t_ns, run), track)
     for logged in logged_events(run):
         yield _instant(
             EVENT_LOG, f"{logged.event}: {logged.text}", _ts(logged.t_ns, run), tracks.of(EVENT_LOG)

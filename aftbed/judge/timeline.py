@@ -27,13 +27,14 @@ import itertools
 import json
 from bisect import bisect_right
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from enum import Enum
 from typing import Final, NamedTuple
 
 from aftbed.core.errors import PeerError
 from aftbed.core.events import FIRST_FAULT, REQUEST_EVENTS, STEP_EVENTS, Event
 from aftbed.core.journal import EntryKind, Record
+from aftbed.inject.model import FaultReport
 from aftbed.inject.receipts import fault_and_bits
 from aftbed.judge.record import RunRecord
 from aftbed.runtime.unix.options import LoadRun
@@ -91,11 +92,11 @@ def category_of(one: Record) -> Category:
     return Category.ADAPTATION if str(one.event).startswith("adapt") else Category.RECOVERY
 
 
-def describe(one: Record, run: RunRecord) -> str:
+def describe(one: Record, faults: Sequence[FaultReport]) -> str:
     """A record in words: an applied fault in those of its user; others by event, request and step."""
     if one.event is Event.FAULT_APPLIED:
         at = fault_and_bits(one.detail)[0] - FIRST_FAULT
-        return run.faults[at].fault if 0 <= at < len(run.faults) else "a fault"
+        return faults[at].fault if 0 <= at < len(faults) else "a fault"
     if one.event is Event.NODE_DIED:
         return f"{one.event}: process {one.detail}"
     words = [str(one.event), *([f"#{one.request_id}"] if one.request_id else [])]

@@ -1,7 +1,8 @@
 """What happened in a simulated run: as a listing, as a Mermaid diagram, and as a space-time diagram.
 
-All three are made from one trace (`runtime.sim.trace`). The records that every request leaves are the usual
-case; a *turning point* is a fault, an alarm, a step of a failover, the start or the end of an adaptation.
+All three are made from one trace (`runtime.sim.trace`), in the words of `judge.timeline`. The records that
+every request leaves are the usual case; a *turning point* is a fault, an alarm, a step of a failover, the
+start or the end of an adaptation.
 
 - `listing` and `mermaid` show the last `LAST` entries before a promise was broken. A breach has no time of
   its own, because the checks read a whole history. If its reason names a request, the entries end with the
@@ -24,11 +25,10 @@ from typing import Final, NamedTuple, assert_never
 
 import msgspec
 
-from aftbed.core.events import FIRST_FAULT, REQUEST_EVENTS, STEP_EVENTS, Event
+from aftbed.core.events import REQUEST_EVENTS, STEP_EVENTS, TURNING_POINTS, Event
 from aftbed.core.journal import Entry, Record
 from aftbed.ftm.compose import build
-from aftbed.inject.model import Fault
-from aftbed.inject.receipts import fault_and_bits
+from aftbed.judge.timeline import describe
 from aftbed.judge.verdict import Breach
 from aftbed.runtime.sim.trace import STRUCK, Happening, Sent, Told, Trace, brief, digest, milliseconds
 
@@ -37,12 +37,8 @@ LAST: Final = 40  # lines of a listing; arrows and notes of a Mermaid diagram
 BEFORE, AFTER = 14, 30  # entries around a turning point in a space-time diagram
 KEPT_MAX: Final = 330  # entries of a space-time diagram
 
-TURNS: Final = frozenset(
-    (Event.FAULT_APPLIED, Event.WATCHDOG_SUSPECT, Event.RECOVERY_ENTER, Event.REPLICA_PROMOTED)
-    + (Event.RECOVERY_EXIT, Event.DETECTED_STOP, Event.FOLLOWER_DIVERGED, Event.BACKUP_READY)
-    + (Event.ADAPT_PLAN, Event.ADAPT_COMMIT, Event.ADAPT_ROLLBACK)
-)
 _LABELLED: Final = ("roles", "adapted", "script.done")  # lines of the executive with a label in the diagram
+_FAULTS: Final = (Event.FAULT_APPLIED, Event.DETECTED_STOP, Event.FOLLOWER_DIVERGED)  # drawn as faults
 _REQUEST: Final = re.compile(r"\brequest (\d+)")
 _ESCAPED: Final = re.compile(r"[^A-Za-z0-9 _.,:'/()=+*-]|\b[Ee](?=[Nn][Dd]\b)")  # `end` would end a block
 
@@ -50,63 +46,91 @@ _ESCAPED: Final = re.compile(r"[^A-Za-z0-9 _.,:'/()=+*-]|\b[Ee](?=[Nn][Dd]\b)") 
 # -- entries of a trace ---------------------------------------------------------------------------
 
 
-def hosts_of(trace: Trace) -> dict[str, str]:
-    """The node of each brick, over all mechanisms that the run had."""
-    setup = trace.run.setup
-    later = [adaptation.ftm for adaptation in trace.run.adaptations]
-    graphs = [trace.run.rest.graph, *(build(ftm, setup.placement) for ftm in (*later, setup.ftm))]
-    return {brick: node for graph in graphs for node, bricks in graph.nodes.items() for brick in bricks}
+class _View(NamedTuple):
+    """How an entry is shown. `nodes`: sender and receiver of a message, the one node of any other entry.
+
+    `columns`: place, kind and content in a listing. `note`: in Mermaid, "" if it is left out there. `shape`:
+    the list of `SpaceTime` that it belongs to, "" if it is not drawn; `text` is its label and tooltip.
+    """
+
+    nodes: tuple[str, ...]
+    columns: tuple[str, str, str]
+    note: str = ""
+    shape: str = ""
+    css: str = ""
+    text: str = ""
+    labelled: bool = False
+    room_px: float = 0.0
 
 
-def nodes_of(one: Happening, hosts: dict[str, str]) -> list[str]:
-    """The nodes that take part: sender and receiver of a message, the one node of any other entry."""
-    match one:
-        case Sent():
-            return [hosts.get(one.source, one.source), hosts.get(one.sink, one.sink)]
-        case Record():
-            return [one.node]
-        case Told(event=event, text=text):
-            return [text if event == STRUCK else EXECUTIVE]
-        case _:
-            return []
+class _Views:
+    """The entries of one trace, as they are shown."""
+
+    def __init__(self, trace: Trace) -> None:
+        setup = trace.run.setup
+        later = [adaptation.ftm for adaptation in trace.run.adaptations]
+        graphs = [trace.run.rest.graph, *(build(ftm, setup.placement) for ftm in (*later, setup.ftm))]
+        self._hosts = {b: node for graph in graphs for node, bricks in graph.nodes.items() for b in bricks}
+        self._faults = trace.run.faults
+
+    def nodes(self, one: Happening) -> tuple[str, ...]:
+        match one:
+            case Sent():
+                return self._hosts.get(one.source, one.source), self._hosts.get(one.sink, one.sink)
+            case Record():
+                return (one.node,)
+            case Told(event=event, text=text):
+                return (text if event == STRUCK else EXECUTIVE,)
+            case _:
+                return ()
+
+    def __call__(self, one: Happening) -> _View:
+        nodes = self.nodes(one)
+        match one:
+            case Sent():
+                message = brief(one.message)
+                columns = one.source, f"{one.port} -> {one.sink}", message
+                text = f"{nodes[0]} to {nodes[1]}: {one.port} {message}"
+                css = one.message.TRAFFIC.value
+                return _View(nodes, columns, f"{one.port} {message}", "arrows", css, text, room_px=16)
+            case Record(event=event):
+                return self._of_record(one, event)
+            case Told(event=event, text=text):
+                struck = event == STRUCK
+                words = f"{text} was hit" if struck else f"{event}: {text}"
+                css = "fault" if struck else "adapt" if event.startswith("adapt") else "step"
+                note, shape = (STRUCK, "crosses") if struck else (words, "diamonds")
+                labelled = event in _LABELLED
+                return _View(nodes, (EXECUTIVE, event, text), note, shape, css, words, labelled, 9)
+            case Entry():
+                content = f"#{one.request_id} {digest(one.payload)}"
+                return _View(nodes, ("client", one.kind.name.lower(), content))
+            case _:
+                assert_never(one)
+
+    def _of_record(self, one: Record, event: Event) -> _View:
+        text = describe(one, self._faults)
+        full = f"{event}: {text}" if event is Event.FAULT_APPLIED else text
+        if one.detail and event not in (*STEP_EVENTS, Event.FAULT_APPLIED, Event.NODE_DIED):
+            full = f"{text} {one.detail}"
+        columns = one.node, "*", full
+        if event in REQUEST_EVENTS:
+            return _View((one.node,), columns, shape="dots", css="step", text=text, room_px=3)
+        css = "fault" if event in _FAULTS else "adapt" if str(event).startswith("adapt") else "step"
+        shape = "crosses" if css == "fault" else "diamonds"
+        return _View((one.node,), columns, full, shape, css, text, event in TURNING_POINTS, 9)
 
 
 def is_turn(one: Happening) -> bool:
-    match one:
-        case Told(event=event):
-            return event == STRUCK
-        case Record(event=event):
-            return event in TURNS
-        case _:
-            return False
+    return one.event in TURNING_POINTS if isinstance(one, Record) else _is_strike(one)
 
 
-def _is_labelled(one: Record | Told) -> bool:
-    return one.event in _LABELLED if isinstance(one, Told) else is_turn(one)
+def _is_strike(one: Happening) -> bool:
+    return isinstance(one, Told) and one.event == STRUCK
 
 
-def _fault_of(record: Record, faults: Sequence[Fault]) -> Fault | None:
-    """The fault that a `fault.applied` record is about."""
-    at = fault_and_bits(record.detail)[0] - FIRST_FAULT
-    return faults[at] if record.event is Event.FAULT_APPLIED and 0 <= at < len(faults) else None
-
-
-def _record_words(record: Record, faults: Sequence[Fault]) -> str:
-    """With all its details, for a listing."""
-    if fault := _fault_of(record, faults):
-        return f"{record.event}: {fault}"
-    words = [str(record.event), *([f"#{record.request_id}"] if record.request_id else [])]
-    return " ".join([*words, *([str(record.detail)] if record.detail else [])])
-
-
-def _mark_words(one: Record | Told, faults: Sequence[Fault]) -> str:
-    """What a mark of the space-time diagram is called; a fault by its own words."""
-    if isinstance(one, Told):
-        return f"{one.text} was hit" if one.event == STRUCK else f"{one.event}: {one.text}"
-    if one.event is Event.FAULT_APPLIED:
-        return str(_fault_of(one, faults) or one.event)
-    words = [str(one.event), *([f"#{one.request_id}"] if one.request_id else [])]
-    return " ".join([*words, *([str(one.detail)] if one.detail and one.event in STEP_EVENTS else [])])
+def _ms(t_ns: int) -> str:
+    return f"{milliseconds(t_ns):.3f}"
 
 
 # -- the end of a run: listing and Mermaid --------------------------------------------------------
@@ -114,11 +138,11 @@ def _mark_words(one: Record | Told, faults: Sequence[Fault]) -> str:
 
 def listing(trace: Trace, broken: Sequence[Breach] = (), last: int = LAST) -> str:
     """The last lines before the first of `broken` (without one: of the run), with virtual time in ms."""
-    return _lines(trace, _until(trace.happened, broken)[-last:], broken)
+    return _lines(_Views(trace), _until(trace.happened, broken)[-last:], broken)
 
 
-def _lines(trace: Trace, shown: Iterable[Happening], broken: Sequence[Breach] = ()) -> str:
-    rows = [_columns(one, trace.run.setup.faults) for one in shown]
+def _lines(views: _Views, shown: Iterable[Happening], broken: Sequence[Breach] = ()) -> str:
+    rows = [(_ms(one.t_ns), *views(one).columns) for one in shown]
     widths = [max((len(row[at]) for row in rows), default=0) for at in range(3)]
     found = [
         f"{time:>{widths[0]}} ms  {where:<{widths[1]}}  {how:<{widths[2]}}  {what}".rstrip()
@@ -132,53 +156,25 @@ def _until(happened: Sequence[Happening], broken: Sequence[Breach]) -> Sequence[
     named = _REQUEST.search(broken[0].reason) if broken else None
     if named is None:
         return happened
-    last = max((at for at, one in enumerate(happened) if _request_of(one) == int(named[1])), default=None)
-    return happened if last is None else happened[: last + 1]
-
-
-def _request_of(one: Happening) -> int:
-    """0 for none."""
-    found = getattr(one.message if isinstance(one, Sent) else one, "request_id", 0)
-    assert isinstance(found, int)
-    return found
-
-
-def _columns(one: Happening, faults: Sequence[Fault]) -> tuple[str, str, str, str]:
-    """Time, place, kind, content."""
-    time = f"{milliseconds(one.t_ns):.3f}"
-    match one:
-        case Sent():
-            return time, one.source, f"{one.port} -> {one.sink}", brief(one.message)
-        case Record():
-            return time, one.node, "*", _record_words(one, faults)
-        case Entry():
-            return time, "client", one.kind.name.lower(), f"#{one.request_id} {digest(one.payload)}"
-        case Told():
-            return time, EXECUTIVE, one.event, one.text
-        case _:
-            assert_never(one)
-
-
-class _Step(NamedTuple):
-    """An arrow from `node` to `sink`, or a note over `node`; a note over "" spans all participants."""
-
-    t_ns: int
-    node: str
-    sink: str
-    words: str
+    for at in range(len(happened) - 1, -1, -1):
+        one = happened[at]
+        if getattr(one.message if isinstance(one, Sent) else one, "request_id", 0) == int(named[1]):
+            return happened[: at + 1]
+    return happened
 
 
 def mermaid(trace: Trace, broken: Sequence[Breach] = (), last: int = LAST) -> str:
     """The same in Mermaid: nodes are participants, faults and lines of the executive are notes."""
-    hosts, faults = hosts_of(trace), trace.run.setup.faults
-    steps = [step for one in _until(trace.happened, broken) for step in _steps(one, hosts, faults)][-last:]
-    names = dict.fromkeys(name for step in steps for name in (step.node, step.sink) if name)
+    views = _Views(trace)
+    shown = [(one.t_ns, view) for one in _until(trace.happened, broken) if (view := views(one)).note][-last:]
+    names = dict.fromkeys(name for _, view in shown for name in view.nodes if name != EXECUTIVE)
     aliases = {name: f"p{number}" for number, name in enumerate(names or (EXECUTIVE,))}
     everybody = ",".join(dict.fromkeys((next(iter(aliases.values())), list(aliases.values())[-1])))
     found = [f"participant {alias} as {escaped(name)}" for name, alias in aliases.items()]
-    for t_ns, node, sink, words in steps:
-        where = f"{aliases[node]}->>{aliases[sink]}" if sink else f"Note over {aliases.get(node, everybody)}"
-        found.append(f"{where}: {escaped(f'{milliseconds(t_ns):.3f} ms: {words}')}")
+    for t_ns, view in shown:
+        where = "->>".join(aliases.get(name, everybody) for name in view.nodes)
+        where = where if view.shape == "arrows" else f"Note over {where}"
+        found.append(f"{where}: {escaped(f'{_ms(t_ns)} ms: {view.note}')}")
     found += [f"Note over {everybody}: {escaped(f'broken: {breach}')}" for breach in broken]
     return "".join(f"{line}\n" for line in ("sequenceDiagram", *(f"    {line}" for line in found)))
 
@@ -186,24 +182,6 @@ def mermaid(trace: Trace, broken: Sequence[Breach] = (), last: int = LAST) -> st
 def escaped(words: str) -> str:
     """`words` with every character that could mean something to Mermaid replaced by its code."""
     return _ESCAPED.sub(lambda found: f"#{ord(found[0])};", words)
-
-
-def _steps(one: Happening, hosts: dict[str, str], faults: Sequence[Fault]) -> list[_Step]:
-    """An arrow, a note, or nothing."""
-    match one:
-        case Sent():
-            source, sink = nodes_of(one, hosts)
-            return [_Step(one.t_ns, source, sink, f"{one.port} {brief(one.message)}")]
-        case Record() if one.event not in REQUEST_EVENTS:
-            return [
-                _Step(one.t_ns, "" if one.node == EXECUTIVE else one.node, "", _record_words(one, faults))
-            ]
-        case Told(event=event) if event == STRUCK:
-            return [_Step(one.t_ns, one.text, "", STRUCK)]
-        case Told():
-            return [_Step(one.t_ns, "", "", f"{one.event}: {one.text}")]
-        case _:
-            return []
 
 
 # -- the turning points of a run: layout of a space-time diagram -----------------------------------
@@ -238,7 +216,7 @@ class Shape(NamedTuple):
 
 
 class SpaceTime(msgspec.Struct, frozen=True):
-    """The layout. `text` says the same in lines. The template draws the lists in their order."""
+    """The layout. `text` has the same in lines. The template draws the lists in their order."""
 
     width: float
     height: float
@@ -262,181 +240,127 @@ class _Place(NamedTuple):
 
     x: float
     one: Happening
+    view: _View
     skipped: int
     skipped_ns: int
 
 
 def space_time(trace: Trace) -> SpaceTime:
     """Lay out the turning points of a run, and the entries around them."""
-    kept = _kept(trace.happened)
-    places = list(_places(trace.happened, kept))
-    return _Layout(trace, places).drawn(_lines(trace, [trace.happened[at] for at in kept]))
-
-
-def _kept(happened: Sequence[Happening]) -> list[int]:
-    """The indices of the entries to draw, in order."""
-    turns = [at for at, one in enumerate(happened) if is_turn(one)] or [len(happened) - 1]
-    found: set[int] = set()
-    for turn in turns:
+    happened, views = trace.happened, _Views(trace)
+    kept: set[int] = set()
+    for turn in [at for at, one in enumerate(happened) if is_turn(one)] or [len(happened) - 1]:
         around = range(max(0, turn - BEFORE), min(len(happened), turn + AFTER + 1))
-        if len(found | set(around)) > KEPT_MAX:
+        if len(kept.union(around)) > KEPT_MAX:
             break
-        found |= set(around)
-    return sorted(found)
-
-
-def _places(happened: Sequence[Happening], kept: Sequence[int]) -> Iterator[_Place]:
-    x, before = LEFT_PX, kept[0] - 1 if kept else -1
-    for at in kept:
-        one = happened[at]
-        skipped, waited_ns = at - before - 1, one.t_ns - happened[max(before, 0)].t_ns
-        stretch = WAIT_PX * math.log10(waited_ns / WAIT_NS) if waited_ns > WAIT_NS else 0.0
-        x += GAP_PX if skipped else stretch
-        yield _Place(x, one, skipped, waited_ns)
-        x += _room(one)
+        kept.update(around)
+    places, x, before = list[_Place](), LEFT_PX, min(kept, default=0) - 1
+    for at in sorted(kept):
+        one, skipped = happened[at], at - before - 1
+        waited_ns, view = one.t_ns - happened[max(before, 0)].t_ns, views(one)
+        x += GAP_PX if skipped else WAIT_PX * math.log10(max(1.0, waited_ns / WAIT_NS))
+        places.append(_Place(x, one, view, skipped, waited_ns))
+        x += view.room_px
         before = at
+    parts = (node.rpartition("/")[2] for one in happened for node in views.nodes(one))
+    text = _lines(views, [place.one for place in places])
+    return _layout(places, {part: at for at, part in enumerate(dict.fromkeys(parts))}, text)
 
 
-def _room(one: Happening) -> float:
-    match one:
-        case Sent():
-            return 16.0
-        case Record(event=event):
-            return 3.0 if event in REQUEST_EVENTS else 9.0
-        case Told():
-            return 9.0
-        case _:
-            return 0.0
+def _layout(places: list[_Place], parts: dict[str, int], text: str) -> SpaceTime:
+    """`parts`: the last words of the names of nodes, in the order of a request."""
 
-
-def _style(one: Record | Told) -> str:
-    """The class of a mark and of its label: `fault`, `adapt` or `step`."""
-    if isinstance(one, Told):
-        return "fault" if one.event == STRUCK else "adapt" if one.event.startswith("adapt") else "step"
-    if one.event in (Event.FAULT_APPLIED, Event.DETECTED_STOP, Event.FOLLOWER_DIVERGED):
-        return "fault"
-    return "adapt" if str(one.event).startswith("adapt") else "step"
-
-
-def _width_of(words: str) -> float:
-    return CHARACTER_PX * len(words)
-
-
-class _Layout:
-    def __init__(self, trace: Trace, places: list[_Place]) -> None:
-        self._trace, self._places, self._hosts = trace, places, hosts_of(trace)
-        self._order = self._rows()
-        self._lanes = list(self._in_lanes())  # (place, lane, words)
-        ends = [place.x + _width_of(words) + 8 for place, _, words in self._lanes]
-        self._width = max([places[-1].x + RIGHT_PX if places else RIGHT_PX, *ends])
-        self._top = LANE_PX * (1 + max((lane for _, lane, _ in self._lanes), default=-1)) + 12
-        self._axis_y = self._top + ROW_PX * len(self._order) + 6
-
-    def drawn(self, text: str) -> SpaceTime:
-        found: dict[str, list[Shape]] = {"arrows": [], "dots": [], "crosses": [], "diamonds": []}
-        for place in self._places:
-            if not isinstance(place.one, Entry):
-                kind, shape = self._mark(place.one, place.x)
-                found[kind].append(shape)
-        return SpaceTime(
-            width=self._width,
-            height=self._axis_y + 24,
-            top=self._top,
-            axis_y=self._axis_y,
-            bands=list(self._bands()),
-            rows=[Shape(0, self._y(node), text=node) for node in self._order],
-            lives=[life for node in self._order for life in self._lives(node)],
-            gaps=[self._gap(place) for place in self._places if place.skipped],
-            ticks=list(self._ticks()),
-            labels=[self._label(*lane) for lane in self._lanes],
-            text=text,
-            **found,
-        )
-
-    def _nodes(self, one: Happening) -> list[str]:
-        return nodes_of(one, self._hosts)
-
-    def _y(self, node: str) -> float:
-        return self._top + ROW_PX * (self._order.index(node) + 0.5)
-
-    def _rows(self) -> list[str]:
+    def order(name: str) -> tuple[int, str, int]:
         """The client's side, the replicas with their bricks in the order of a request, the executive."""
-        parts = [n.rpartition("/")[2] for one in self._trace.happened for n in self._nodes(one)]
-        order = {part: place for place, part in enumerate(dict.fromkeys(parts))}
+        replica, slash, part = name.rpartition("/")
+        if name in ("client", "proxy"):
+            return 0, "", ("client", "proxy").index(name)
+        if slash or name in ("a", "b"):
+            return 1, replica or name, parts.get(part.rstrip("'"), len(parts))
+        return 2, "", 1 if name == EXECUTIVE else 0
 
-        def key(name: str) -> tuple[int, str, int]:
-            replica, slash, part = name.rpartition("/")
-            if name in ("client", "proxy"):
-                return 0, "", ("client", "proxy").index(name)
-            if slash or name in ("a", "b"):
-                return 1, replica or name, order.get(part.rstrip("'"), len(order))
-            return 2, "", 1 if name == EXECUTIVE else 0
+    names = sorted(dict.fromkeys(name for place in places for name in place.view.nodes), key=order)
+    labels = list(_labels(places))
+    ends = [place.x + CHARACTER_PX * len(place.view.text) + 8 for place, _ in labels]
+    width = max([places[-1].x + RIGHT_PX if places else RIGHT_PX, *ends])
+    top = LANE_PX * (1 + max((lane for _, lane in labels), default=-1)) + 12
+    ys = {name: top + ROW_PX * (at + 0.5) for at, name in enumerate(names)}
+    axis_y = top + ROW_PX * len(names) + 6
+    marks: dict[str, list[Shape]] = {"arrows": [], "dots": [], "crosses": [], "diamonds": []}
+    for place in places:
+        if place.view.shape:
+            marks[place.view.shape].append(_mark(place, ys))
+    bands = []
+    for replica in ("a", "b"):
+        of_replica = [y for name, y in ys.items() if name.split("/")[0] == replica]
+        if of_replica:
+            edges = min(of_replica) - ROW_PX / 2, max(of_replica) + ROW_PX / 2
+            bands.append(Shape(0, edges[0], width, edges[1], replica))
+    gaps = []
+    for place in places:
+        if place.skipped:
+            x, words = place.x - GAP_PX + 18, f"{place.skipped} more\n{place.skipped_ns / 1e6:.3g} ms"
+            gaps.append(Shape(x, top, x + GAP_BOX_PX, axis_y, text=words))
+    return SpaceTime(
+        width=width,
+        height=axis_y + 24,
+        top=top,
+        axis_y=axis_y,
+        bands=bands,
+        rows=[Shape(0, y, text=name) for name, y in ys.items()],
+        lives=[life for name, y in ys.items() for life in _lives(name, y, places, width)],
+        gaps=gaps,
+        ticks=list(_ticks(places, axis_y)),
+        labels=[
+            Shape(p.x, top - 10 - LANE_PX * lane, p.x, ys[p.view.nodes[0]], p.view.css, p.view.text)
+            for p, lane in labels
+        ],
+        text=text,
+        **marks,
+    )
 
-        return sorted(dict.fromkeys(n for p in self._places for n in self._nodes(p.one)), key=key)
 
-    def _in_lanes(self) -> Iterator[tuple[_Place, int, str]]:
-        """Each label that has room, with its lane above the rows; lane 0 is the lowest."""
-        ends = [-math.inf] * LANES_MAX
-        for place in self._places:
-            one = place.one
-            if isinstance(one, Record | Told) and _is_labelled(one):
-                words = _mark_words(one, self._trace.run.setup.faults)
-                lane = next((n for n, end in enumerate(ends) if end + 10 < place.x), None)
-                if lane is not None:
-                    ends[lane] = place.x + _width_of(words)
-                    yield place, lane, words
+def _labels(places: Iterable[_Place]) -> Iterator[tuple[_Place, int]]:
+    """Each label that has room, with its lane above the rows; lane 0 is the lowest."""
+    ends = [-math.inf] * LANES_MAX
+    for place in places:
+        if place.view.labelled:
+            lane = next((n for n, end in enumerate(ends) if end + 10 < place.x), None)
+            if lane is not None:
+                ends[lane] = place.x + CHARACTER_PX * len(place.view.text)
+                yield place, lane
 
-    def _label(self, place: _Place, lane: int, words: str) -> Shape:
-        assert isinstance(place.one, Record | Told)
-        y, row_y = self._top - 10 - LANE_PX * lane, self._y(self._nodes(place.one)[0])
-        return Shape(place.x, y, place.x, row_y, _style(place.one), words)
 
-    def _bands(self) -> Iterator[Shape]:
-        for replica in ("a", "b"):
-            ys = [self._y(name) for name in self._order if name.split("/")[0] == replica]
-            if ys:
-                yield Shape(0, min(ys) - ROW_PX / 2, self._width, max(ys) + ROW_PX / 2, replica)
+def _lives(name: str, y: float, places: Iterable[_Place], width: float) -> Iterator[Shape]:
+    hit, since = False, 0.0
+    for place in places:
+        strike = _is_strike(place.one)
+        if place.view.nodes[:1] == (name,) and strike is not hit:  # it is hit, or acts again
+            yield Shape(since, y, place.x, y, "hit" if hit else "")
+            hit, since = not hit, place.x
+    yield Shape(since, y, width, y, "hit" if hit else "")
 
-    def _lives(self, node: str) -> Iterator[Shape]:
-        hit, since, y = False, 0.0, self._y(node)
-        for place in self._places:
-            one = place.one
-            victim = one.text if isinstance(one, Told) and one.event == STRUCK else ""
-            acts = not victim and self._nodes(one)[:1] == [node]
-            if acts if hit else victim == node:
-                yield Shape(since, y, place.x, y, "hit" if hit else "")
-                hit, since = not hit, place.x
-        yield Shape(since, y, self._width, y, "hit" if hit else "")
 
-    def _ticks(self) -> Iterator[Shape]:
-        last = -math.inf
-        for place in self._places:
-            last = max(last, place.x - GAP_PX / 2) if place.skipped else last
-            if place.x - last >= TICK_PX:
-                first = place.x < TICK_PX / 2  # its time stands beside it, not below
-                last = place.x + (TICK_PX / 2 if first else 0)
-                time = f"{milliseconds(place.one.t_ns):.3f} ms"
-                yield Shape(place.x, self._axis_y, css="start" if first else "middle", text=time)
+def _ticks(places: Iterable[_Place], axis_y: float) -> Iterator[Shape]:
+    last = -math.inf
+    for place in places:
+        last = max(last, place.x - GAP_PX / 2) if place.skipped else last
+        if place.x - last >= TICK_PX:
+            first = place.x < TICK_PX / 2  # its time stands beside it, not below
+            last = place.x + (TICK_PX / 2 if first else 0)
+            yield Shape(place.x, axis_y, css="start" if first else "middle", text=f"{_ms(place.one.t_ns)} ms")
 
-    def _gap(self, place: _Place) -> Shape:
-        x = place.x - GAP_PX + 18
-        words = f"{place.skipped} more\n{place.skipped_ns / 1e6:.3g} ms"
-        return Shape(x, self._top, x + GAP_BOX_PX, self._axis_y, text=words)
 
-    def _mark(self, one: Sent | Record | Told, x: float) -> tuple[str, Shape]:
-        """Which list it belongs to, and its shape; `text` is its tooltip."""
-        time = f"{milliseconds(one.t_ns):.3f} ms  "
-        if isinstance(one, Sent):
-            source, sink = self._nodes(one)
-            words = f"{time}{source} to {sink}: {one.port} {brief(one.message)}"
-            css = one.message.TRAFFIC.value
-            return "arrows", Shape(x, self._y(source), x + ARROW_PX, self._y(sink), css, words)
-        where = f"{one.node}: " if isinstance(one, Record) else ""
-        css, words = _style(one), f"{time}{where}{_mark_words(one, self._trace.run.setup.faults)}"
-        y = self._y(self._nodes(one)[0])
-        if isinstance(one, Record) and one.event in REQUEST_EVENTS:
-            return "dots", Shape(x, y, text=words)
-        if css == "fault":
-            return "crosses", Shape(x, y, css=css, text=words)
-        small = isinstance(one, Record) and one.event in STEP_EVENTS
-        return "diamonds", Shape(x, y, css=f"{css} small" if small else css, text=words)
+def _mark(place: _Place, ys: dict[str, float]) -> Shape:
+    """`text` is its tooltip."""
+    one, view = place.one, place.view
+    node = f"{one.node}: " if isinstance(one, Record) else ""
+    text, y = f"{_ms(one.t_ns)} ms  {node}{view.text}", ys[view.nodes[0]]
+    match view.shape:
+        case "arrows":
+            return Shape(place.x, y, place.x + ARROW_PX, ys[view.nodes[1]], view.css, text)
+        case "dots":
+            return Shape(place.x, y, text=text)
+        case _:
+            small = isinstance(one, Record) and one.event in STEP_EVENTS
+            return Shape(place.x, y, css=f"{view.css} small" if small else view.css, text=text)

@@ -121,12 +121,12 @@ def test_a_step_with_a_late_effect_is_drawn_short(tmp_path: Path) -> None:
 def test_a_fault_is_described_in_the_words_of_its_user(tmp_path: Path) -> None:
     record = finished(run_of(tmp_path))
     applied = Record(0, Event.FAULT_APPLIED, 0, FIRST_FAULT, "a/after")
-    assert describe(applied, record) == str(CRASH)
+    assert describe(applied, record.faults) == str(CRASH)
     injected_later = msgspec.structs.replace(applied, detail=FIRST_FAULT + 1)
-    assert describe(injected_later, record) == "a fault"
+    assert describe(injected_later, record.faults) == "a fault"
     hang = msgspec.structs.replace(record.faults[0], fault="hang backup")
     record = msgspec.structs.replace(record, faults=(*record.faults, hang))
-    assert describe(injected_later, record) == "hang backup"
+    assert describe(injected_later, record.faults) == "hang backup"
 
 
 # -- the axis of time -----------------------------------------------------------------------------
