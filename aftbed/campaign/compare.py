@@ -21,24 +21,21 @@ little, and costs nothing. Each of many comparisons is wrong with 1 - confidence
 divides it among them.
 """
 
+import math
 from collections.abc import Sequence
 from random import Random
 from typing import Final
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 from scipy import special
 
 from aftbed.campaign.experiment import Result, failed
 from aftbed.campaign.ledger import Ledger
 from aftbed.campaign.statistics import (
     CONFIDENCE,
-    RESAMPLES,
     Interval,
-    check_resamples,
     look_confidence,
-    place,
     quantile,
     quantile_needs,
     tail,
@@ -47,6 +44,8 @@ from aftbed.core.errors import ConfigError
 
 BITS: Final = 32  # of chance for each draw; with at most PAIRS_MAX pairs no pair is favoured by over 0.1 %
 PAIRS_MAX: Final = 1 << 22
+RESAMPLES: Final = 2000
+BEYOND_MIN: Final = 5  # resamples beyond each bound of an interval; fewer say nothing
 
 
 def mcnemar(only_base: int, only_new: int) -> float:
@@ -70,31 +69,26 @@ def paired_quantile_shift(
     """
     assert len(base) == len(new) <= PAIRS_MAX, f"{len(base)} and {len(new)} are no pairs"
     beyond, pairs = tail(confidence), len(base)
-    check_resamples(resamples, confidence)
+    least = math.ceil(BEYOND_MIN / beyond - 1e-6)  # 100 at 0.9, whose tail is 0.0499...
+    if resamples < least:
+        raise ConfigError(f"resamples {resamples}: at least {least} are allowed at confidence {confidence:g}")
     if pairs < quantile_needs(q, confidence):
         return None
     before, after = np.asarray(base, dtype=np.float64), np.asarray(new, dtype=np.float64)
     assert not (np.isnan(before).any() or np.isnan(after).any()), "a time that is no number"
-    at, shifts = place(pairs, q), list[float]()
-    for _ in range(resamples):
-        drawn = _draw(pairs, chance)
+    at, shifts = quantile(range(pairs), q), list[float]()
+    for _ in range(resamples):  # all chance is that of the seed: numpy's own is not used
+        words = np.frombuffer(chance.randbytes(pairs * BITS // 8), dtype="<u4").astype(np.uint64)
+        drawn = words * np.uint64(pairs) >> np.uint64(BITS)
         shifts.append(float(np.partition(after[drawn], at)[at] - np.partition(before[drawn], at)[at]))
     return Interval(quantile(shifts, beyond), quantile(shifts, 1 - beyond))
 
 
-def _draw(pairs: int, chance: Random) -> npt.NDArray[np.uint64]:
-    """As many indices of pairs as there are pairs. All chance is the seed's: numpy's own is not used."""
-    words = np.frombuffer(chance.randbytes(pairs * BITS // 8), dtype="<u4").astype(np.uint64)
-    return words * np.uint64(pairs) >> np.uint64(BITS)
-
-
-# -- Two campaigns of one plan, experiment by experiment: what a change of the code has made better or
-# worse.
+# -- Two campaigns of one plan, experiment by experiment --------------------------------------------
 #
-# Paired by what was to be run (stratum, number, seed, faults), whatever the code was. See `comparison` for
-# the
-# two tests and their limits. A stratum is *worse* if significantly more of its pairs fail only in the new
-# campaign, or if the interval of the shift of its p99 recovery lies above 0, and above `SHIFT_MS_MIN`.
+# They are paired by what was to be run (stratum, number, seed, faults), whatever the code was. A stratum is
+# *worse* if significantly more of its pairs fail only in the new campaign, or if the interval of the shift
+# of its p99 recovery lies above 0, and above `SHIFT_MS_MIN`.
 
 
 SHIFT_MS_MIN: Final = 0.1  # less is of no consequence, however certain
