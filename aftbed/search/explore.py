@@ -42,7 +42,7 @@ ADAPTABLE: Final = tuple(
     ftm for ftm in DUPLEX_EXPRESSIONS if all(MECHANISMS[name].adaptations_explored for name in parse(ftm))
 )
 PLACEMENTS: Final = ("process", "replica")
-WHEN: Final = (Event.ADAPT_STEP_ENTER, Event.ADAPT_STEP_ACT, Event.ADAPT_STEP_EXIT)
+STEPS: Final = (Event.ADAPT_STEP_ENTER, Event.ADAPT_STEP_ACT, Event.ADAPT_STEP_EXIT)
 ELSEWHERE: Final = ("client", "a/watchdog", "b/watchdog")  # take no part in an adaptation
 ADAPT_REQUESTS: Final = 40
 ADAPT_RATE_HZ: Final = 400.0
@@ -67,11 +67,11 @@ def strikes(old: str, new: str, placement: str) -> Iterator[Strike]:
     script = plan(start, target(start, new)).script
     staged = [v.node for v in flat(script.prepare) if isinstance(v, Stage)]
     steps = range(1, len(staged) + len(script.commit) + 1)
-    for node, when, step in itertools.product(start.nodes, WHEN, steps):
+    for node, when, step in itertools.product(start.nodes, STEPS, steps):
         if node not in ELSEWHERE:
             yield Strike(old, new, node, when, step)
-    for node, when, step in itertools.product(staged, WHEN, steps):
-        if when is Event.ADAPT_STEP_EXIT or (step, WHEN.index(when)) > (len(staged), 0):  # all are staged
+    for node, when, step in itertools.product(staged, STEPS, steps):
+        if when is Event.ADAPT_STEP_EXIT or (step, STEPS.index(when)) > (len(staged), 0):  # all are staged
             yield Strike(old, new, f"{node}{STAGED}", when, step)
 
 

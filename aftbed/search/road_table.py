@@ -1,12 +1,12 @@
 """A published table of the road, driven on the simulator: without a fault, or with one at its worst instant.
 
 A table is driven once for each `Line`: a mechanism with or without a fault, or an *outage*. In an outage
-the function does not answer for so long and nobody notices. It is stopped under `none`, as the paper's
-adaptation stops the Protocol (SIGSTOP, then SIGCONT): what is asked meanwhile waits, and is answered then.
+the function does not answer for so long, unnoticed. It is stopped under `none`, as the paper's
+adaptation stops the Protocol (SIGSTOP, then SIGCONT): a request meanwhile waits, and is answered then.
 The paper's 1 to 2 ms of recovery and 300 ms of adaptation are such outages, to be seen beside ours.
 
 A row fails if the car breaks what the table asks for, or if the run breaks a promise. A row whose
-fault never struck proves nothing (G8): it is no pass, and is told apart.
+fault never struck proves nothing (G8): it is no pass, and is shown apart.
 
 Rows that begin alike are driven once: the tables ask for different things of the same drive.
 """
@@ -23,7 +23,7 @@ from aftbed.inject.model import Fault
 from aftbed.inject.timing import Trigger
 from aftbed.runtime.sim.world import Setup
 from aftbed.runtime.unix.worker_pool import each
-from aftbed.search.worst_instant import Course, StruckDrive, course_of, strike, worst_instant
+from aftbed.search.worst_instant import Course, StruckDrive, course_of, impact_kmh, strike, worst_instant
 from aftbed.vehicle.plant import KMH_PER_MS, VehicleResult
 from aftbed.vehicle.scenarios.library import load_scenario
 from aftbed.vehicle.scenarios.scenario import Scenario
@@ -82,7 +82,7 @@ class DrivenRow(msgspec.Struct, frozen=True):
 
 
 def outage(length_ms: int) -> RoadLine:
-    """The function is stopped for so long, and nothing stands in for it."""
+    """The function is stopped for so long, and nothing takes its place."""
     fault = Fault(Hang(length_ms), PRIMARY, Trigger())
     return RoadLine(f"outage {length_ms}ms", NONE, fault, searched=True, outage_ms=length_ms)
 
@@ -108,10 +108,13 @@ def drive(todo: RoadDrive) -> tuple[DrivenRow, ...]:
     course = course_of(Setup(line.ftm, seed=todo.seed, scenario=todo.cases[0].name))
     if line.fault is None:
         return tuple(_row(case, line, course) for case in todo.cases)
+    struck, instants = None, None
     if not line.searched:
-        return tuple(_with_fault(case, line, course, strike(course, line.fault), None) for case in todo.cases)
-    worst = worst_instant(course, line.fault.action, line.fault.target)
-    struck, instants = (None, 0) if worst is None else (worst.struck, worst.instants)
+        struck = strike(course, line.fault)
+    elif worst := worst_instant(course, line.fault.action, line.fault.target):
+        struck, instants = worst.struck, worst.instants
+    else:
+        instants = 0
     return tuple(_with_fault(case, line, course, struck, instants) for case in todo.cases)
 
 
@@ -146,34 +149,24 @@ def _with_fault(
         words = str(line.fault)
         row = replace(_row(case, line, course), fault=words, instants=instants)
         return replace(row, passed=False, struck=False, because=(f"never struck: {words}",), repeat=())
+    free_m, struck_m = course.result.min_gap_m, struck.result.min_gap_m
     row = replace(
         _row(case, line, struck),
         fault=str(struck.fault),
         at_s=None if struck.t_ms is None else round(struck.t_ms / 1000, 6),
         instants=instants,
-        loss_m=_lost_m(course.result, struck.result),
+        loss_m=None if free_m is None or struck_m is None else round(free_m - struck_m, 4),
         loss_kmh=round(impact_kmh(struck.result) - impact_kmh(course.result), 3),
     )
-    return row if line.outage_ms is None else _of_outage(case, row, course.result, line.outage_ms)
-
-
-def _of_outage(case: Case, row: DrivenRow, free: VehicleResult, outage_ms: int) -> DrivenRow:
-    """What it can take at most, and whether it has to fail."""
     closing_ms = closing_speed_ms(load_scenario(case.name))
-    if closing_ms is None:
+    if line.outage_ms is None or closing_ms is None:
         return row
-    most_kmh = round(residual_kmh(free, closing_ms, outage_ms), 3)
+    most_kmh = round(residual_kmh(course.result, closing_ms, line.outage_ms), 3)
     must = ""
     if not row.passed and most_kmh > case.limit_kmh:
-        taken_m = closing_ms * outage_ms / 1000
-        must = f"{outage_ms} ms take {taken_m:.2f} m of the braking distance; {left_m(free):.2f} m were left"
+        taken_m, left = closing_ms * line.outage_ms / 1000, left_m(course.result)
+        must = f"{line.outage_ms} ms take {taken_m:.2f} m of the braking distance; {left:.2f} m were left"
     return replace(row, closed_form_kmh=most_kmh, must_fail=must)
-
-
-def _lost_m(free: VehicleResult, struck: VehicleResult) -> float | None:
-    if free.min_gap_m is None or struck.min_gap_m is None:
-        return None
-    return round(free.min_gap_m - struck.min_gap_m, 4)
 
 
 def repeat(setup: Setup) -> tuple[str, ...]:
@@ -193,37 +186,29 @@ def repeat(setup: Setup) -> tuple[str, ...]:
     return simulated, f'aftbed run {asked} --pace {pace} --inject "{fault}"'
 
 
-# -- What an outage can cost at most, in closed form: the speed at which the car still hits what is ahead.
+# -- what an outage can cost at most --------------------------------------------------------------
 #
-# The paper (Section IV) tells an outage of t in metres: v0 t at the speed v0. An outage that delays the
-# whole
-# of a braking by t brings the car to every place with the speed that it would have had v0 t metres before.
-# Where the braking left a gap of d0, and ends with a constant deceleration a, that is an impact at
+# In closed form: the speed at which the car still hits what is ahead. The paper (Section IV) gives an outage
+# of t in metres: v0 t at the speed v0. An outage that delays the whole of a braking by t brings the car to
+# every place with the speed that it would have had v0 t metres before. Where the braking left a gap of d0,
+# and ends with a constant deceleration a, that is an impact at
 #
 #     v = sqrt(2 a (v0 t - d0))     none where v0 t <= d0, and never more than v0
 #
 # and, from a drive that ends in an impact at u anyway, v = sqrt(u u + 2 a v0 t). With d0 = 0, the car that
-# would have just stopped, it is sqrt(2 a v0 t). Here v0 is the speed at which the gap closes before anybody
+# would have just stopped, it is sqrt(2 a v0 t). Here v0 is the speed at which the gap closes before the car
 # brakes, and a the greatest deceleration of the drive without the outage.
 #
 # Where the function goes from nothing to full braking at once, that is what happens. Where it asks for a
 # part of it before, an outage delays less than the whole, and what is lost is made up for in part: the form
 # is a bound then. Beside it an outage costs up to `SLACK_MS` more: a reply counts from the next step of the
-# brakes on.
-#
-# Limits: a car ahead that brakes has no such v0.
-
+# brakes on. Limits: a car ahead that brakes has no such v0.
 
 SLACK_MS: Final = 2.0
 
 
-def impact_kmh(result: VehicleResult) -> float:
-    """The relative speed at contact; 0 without one."""
-    return (result.impact_speed_kmh or 0.0) if result.collision else 0.0
-
-
 def closing_speed_ms(scenario: Scenario) -> float | None:
-    """How fast the gap closes before anybody brakes; None where it does not, or the car ahead brakes."""
+    """How fast the gap closes before the car brakes; None where it does not, or the car ahead brakes."""
     lead = scenario.plant.lead
     if lead is None or lead.braking is not None:
         return None

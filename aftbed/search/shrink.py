@@ -21,7 +21,7 @@ found. A fault keeps its target.
 
 import itertools
 from collections.abc import Callable, Iterator
-from typing import Final, TypeVar
+from typing import Final, assert_never
 
 from msgspec import json
 from msgspec.structs import replace
@@ -32,33 +32,32 @@ from aftbed.ftm.compose import DUPLEX, build, parse, replication_of
 from aftbed.inject.model import Fault
 from aftbed.judge.verdict import Breach
 from aftbed.runtime.sim.world import Doom, Setup, check
+from aftbed.search.swarm import LAUNCH_MS, REQUEST_MS_MIN
 
 TRIES_MAX: Final = 400
 CAR_COUNT: Final = 100  # requests in the place of a car
-MS_MIN: Final = 0.6  # no fault is planned earlier: a launch must succeed
-REQUEST_MS_MIN: Final = 0.02  # what a request takes at least
 
 Broken = Callable[[Setup], tuple[Breach, ...]]
-Item = TypeVar("Item")
 
 
 def shrink(setup: Setup, broken: Broken, tries_max: int = TRIES_MAX) -> Setup:
-    """The simplest that breaks what `setup` breaks first; `broken` is asked `tries_max` times at most.
+    """The simplest that breaks what `setup` breaks first; `broken` is called `tries_max` times at most.
 
-    The same for the same arguments, and never one that `broken` has not said to break it.
+    The same for the same arguments, and always one for which `broken` has returned that.
     """
     first = broken(setup)
     assert first, f"nothing is broken by {setup}"
-    check, tried = first[0].check, {_key(setup)}
+    check, tried = first[0].check, {json.encode(setup)}
     tries = 1
     while tries < tries_max:
         for simpler in _simpler(setup):
-            if _key(simpler) in tried:
+            key = json.encode(simpler)
+            if key in tried:
                 continue
             if tries == tries_max:
                 break
             tries += 1
-            tried.add(_key(simpler))
+            tried.add(key)
             found = broken(simpler)
             if found and found[0].check == check:
                 setup = simpler
@@ -68,13 +67,9 @@ def shrink(setup: Setup, broken: Broken, tries_max: int = TRIES_MAX) -> Setup:
     return setup
 
 
-def _key(setup: Setup) -> bytes:
-    return json.encode(setup)
-
-
 def _simpler(setup: Setup) -> Iterator[Setup]:
     """All that are simpler in one respect, and still make sense."""
-    ways = (_fewer, _smaller_loads, _smaller_graphs, _earlier, *_ONE_BY_ONE)
+    ways = (_fewer, _smaller_loads, _smaller_graphs, _earlier, _one_earlier)
     return filter(_makes_sense, map(_in_time, itertools.chain.from_iterable(way(setup) for way in ways)))
 
 
@@ -93,7 +88,7 @@ def _in_time(setup: Setup) -> Setup:
     """Nothing is planned for behind the last request."""
     if setup.scenario:
         return setup
-    load_ms = max(MS_MIN, (setup.count - 1) * (1e3 / setup.rate_hz if setup.rate_hz else REQUEST_MS_MIN))
+    load_ms = max(LAUNCH_MS, (setup.count - 1) * (1e3 / setup.rate_hz if setup.rate_hz else REQUEST_MS_MIN))
 
     def timely(fault: Fault) -> Fault:
         trigger = fault.trigger
@@ -110,14 +105,14 @@ def _in_time(setup: Setup) -> Setup:
 
 # -- ways ------------------------------------------------------------------------------------------
 
+LISTS: Final = ("faults", "adaptations", "dooms")
+
 
 def _fewer(setup: Setup) -> Iterator[Setup]:
-    for at in range(len(setup.faults)):
-        yield replace(setup, faults=_without(setup.faults, at))
-    for at in range(len(setup.adaptations)):
-        yield replace(setup, adaptations=_without(setup.adaptations, at))
-    for at in range(len(setup.dooms)):
-        yield replace(setup, dooms=_without(setup.dooms, at))
+    for name in LISTS:
+        items = getattr(setup, name)
+        for at in range(len(items)):
+            yield replace(setup, **{name: items[:at] + items[at + 1 :]})
 
 
 def _smaller_loads(setup: Setup) -> Iterator[Setup]:
@@ -163,44 +158,34 @@ def _by(setup: Setup, gone: int) -> Setup:
     return replace(setup, count=setup.count - gone, faults=faults, adaptations=tuple(adaptations))
 
 
-def _earlier_faults(setup: Setup) -> Iterator[Setup]:
-    for at, fault in enumerate(setup.faults):
-        for other in _earlier_fault(fault):
-            yield replace(setup, faults=_with(setup.faults, at, other))
+def _one_earlier(setup: Setup) -> Iterator[Setup]:
+    """One fault, adaptation or doom earlier, or shorter."""
+    for name in LISTS:
+        items = getattr(setup, name)
+        for at, item in enumerate(items):
+            for other in _earlier_item(item):
+                yield replace(setup, **{name: (*items[:at], other, *items[at + 1 :])})
 
 
-def _earlier_fault(fault: Fault) -> Iterator[Fault]:
-    trigger = fault.trigger
-    for nth in _smaller(trigger.nth):
-        yield replace(fault, trigger=replace(trigger, nth=nth))
-    for after_ms in _sooner(trigger.after_ms):
-        yield replace(fault, trigger=replace(trigger, after_ms=after_ms))
-    for lasts_ms in _smaller(fault.action.lasts_ms):
-        yield replace(fault, action=fault.action.lasting(lasts_ms))
-
-
-def _earlier_adaptations(setup: Setup) -> Iterator[Setup]:
-    for at, scheduled in enumerate(setup.adaptations):
-        for other in _earlier_adaptation(scheduled):
-            yield replace(setup, adaptations=_with(setup.adaptations, at, other))
-
-
-def _earlier_adaptation(scheduled: Scheduled) -> Iterator[Scheduled]:
-    for at_request in _smaller(scheduled.at_request):
-        yield replace(scheduled, at_request=at_request)
-    for after_ms in _sooner(scheduled.after_ms):
-        yield replace(scheduled, after_ms=after_ms)
-
-
-def _earlier_dooms(setup: Setup) -> Iterator[Setup]:
-    for at, doom in enumerate(setup.dooms):
-        for effect in _smaller(doom.effect, least=0):
-            yield replace(setup, dooms=_with(setup.dooms, at, Doom(doom.brick, effect)))
-
-
-_ONE_BY_ONE: Final = (_earlier_faults, _earlier_adaptations, _earlier_dooms)
-
-# -- numbers and tuples ----------------------------------------------------------------------------
+def _earlier_item(item: Fault | Scheduled | Doom) -> Iterator[Fault | Scheduled | Doom]:
+    match item:
+        case Fault(trigger=trigger, action=action):
+            for nth in _smaller(trigger.nth):
+                yield replace(item, trigger=replace(trigger, nth=nth))
+            for after_ms in _sooner(trigger.after_ms):
+                yield replace(item, trigger=replace(trigger, after_ms=after_ms))
+            for lasts_ms in _smaller(action.lasts_ms):
+                yield replace(item, action=action.lasting(lasts_ms))
+        case Scheduled():
+            for at_request in _smaller(item.at_request):
+                yield replace(item, at_request=at_request)
+            for after_ms in _sooner(item.after_ms):
+                yield replace(item, after_ms=after_ms)
+        case Doom(brick=brick, effect=effect):
+            for less in _smaller(effect, least=0):
+                yield Doom(brick, less)
+        case _:
+            assert_never(item)
 
 
 def _smaller(number: int, least: int = 1) -> Iterator[int]:
@@ -212,13 +197,5 @@ def _smaller(number: int, least: int = 1) -> Iterator[int]:
 def _sooner(ms: float) -> Iterator[float]:
     """Half of it, or without what is behind the point; 0 means something else."""
     for found in (round(ms / 2, 3), float(int(ms))):
-        if MS_MIN <= found < ms:
+        if LAUNCH_MS <= found < ms:
             yield found
-
-
-def _without(items: tuple[Item, ...], at: int) -> tuple[Item, ...]:
-    return items[:at] + items[at + 1 :]
-
-
-def _with(items: tuple[Item, ...], at: int, item: Item) -> tuple[Item, ...]:
-    return items[:at] + (item,) + items[at + 1 :]

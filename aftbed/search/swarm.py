@@ -28,8 +28,8 @@ from random import Random
 from typing import Final
 
 from aftbed.core.errors import ConfigError
-from aftbed.core.events import REQUEST_PATH, Event
-from aftbed.core.graph import PLACEMENTS, STAGED
+from aftbed.core.events import REQUEST_EVENTS, Event
+from aftbed.core.graph import PLACEMENTS, STAGED, Graph
 from aftbed.core.messages import Goal, Scheduled
 from aftbed.ftm.compose import EXPRESSIONS, NONE, build, replication_of, tolerates
 from aftbed.ftm.registry import EMITTERS, MECHANISMS, server_emits
@@ -44,6 +44,7 @@ from aftbed.inject.timing import Trigger
 from aftbed.inject.value import EXECUTED, ValueFlip
 from aftbed.runtime.deployment import replica_of
 from aftbed.runtime.sim.world import Setup
+from aftbed.search.explore import STEPS
 from aftbed.vehicle.scenarios.library import scenario_names
 
 DUPLEX: Final = tuple(e for e in EXPRESSIONS if replication_of(e))
@@ -64,7 +65,6 @@ ADAPTATIONS_MAX: Final = 2
 HANG_MS_MAX: Final = 400
 LATE_PART: Final = 0.2  # of the faults: a channel or a node that is late
 LATE_MS_MAX: Final = 10
-CHECKPOINTS: Final = "aft2aft"
 SLOW_FOR_MS_MAX: Final = 100
 NTH_PART: Final = 0.75  # of the requests: an event is counted so far at most
 RARE_NTH_MAX: Final = 2  # of events that not every request brings
@@ -77,12 +77,6 @@ REQUEST_MS_MIN: Final = 0.02  # what a request takes at least
 LAUNCH_MS: Final = 0.6  # from the arming of a fault to the first request, at most: a launch must succeed
 FLIPS_APART: Final = 50  # executions, so that no request sees two
 BIT_DRAWN_MAX: Final = 4096
-
-_OFTEN: Final = frozenset(  # with every request, where they are emitted at all
-    (*REQUEST_PATH, Event.REPLY_ACCEPTED, Event.CHECKPOINT_APPLIED, Event.STATE_RESTORED)
-    + (Event.FOLLOWER_FORWARDED, Event.FOLLOWER_NOTIFIED, Event.VOTE_COMPARED)
-)
-_STEPS: Final = (Event.ADAPT_STEP_ENTER, Event.ADAPT_STEP_ACT, Event.ADAPT_STEP_EXIT)
 
 
 def drawn(seed: int) -> Setup:
@@ -99,32 +93,31 @@ def experiments(seeds: Iterable[int]) -> Iterator[Setup]:
 def _events(ftm: str, placement: str) -> tuple[Event, ...]:
     """What a fault can wait for where `ftm` runs."""
     graph = build(ftm, placement)
-    found = []
-    for event in EMITTERS:
-        try:
-            Fault(Crash(), targets.PRIMARY, Trigger(event.label)).check(graph)
-        except ConfigError:
-            continue
-        found.append(event)
-    return tuple(found)
+    return tuple(e for e in EMITTERS if _possible(Fault(Crash(), targets.PRIMARY, Trigger(e.label)), graph))
 
 
 @lru_cache(maxsize=128)
 def _channels(ftm: str, placement: str) -> tuple[str, ...]:
-    """Those on which somebody sends for the replica that leads, but that of the checkpoints.
+    """Those on which the replica that leads sends, but that from After to the backup.
 
-    A checkpoint that is held back dies with who holds it, when the reply has gone: two faults, and two
-    replicas that differ.
+    What is held back there dies with its sender, when the reply has gone: two faults, and two replicas
+    that differ.
     """
     graph = build(ftm, placement)
-    found = []
-    for channel in sorted({link.name for link in graph.links} - {CHECKPOINTS}):
-        try:
-            Fault(ChannelFault(Disturbance.DELAY, channel), targets.PRIMARY, Trigger()).check(graph)
-        except ConfigError:
-            continue
-        found.append(channel)
-    return tuple(found)
+    to_backup = {port for part, port in replication_of(ftm) if part == "after"}
+    names = sorted({link.name for link in graph.links} - to_backup)
+    faults = {
+        name: Fault(ChannelFault(Disturbance.DELAY, name), targets.PRIMARY, Trigger()) for name in names
+    }
+    return tuple(name for name, fault in faults.items() if _possible(fault, graph))
+
+
+def _possible(fault: Fault, graph: Graph) -> bool:
+    try:
+        fault.check(graph)
+    except ConfigError:
+        return False
+    return True
 
 
 class _Draw:
@@ -219,7 +212,7 @@ class _Draw:
         if chance.random() < LATE_PART:
             return self._draw_late()
         trigger = self._draw_trigger(adapted)
-        steps = trigger.event in {event.label for event in _STEPS}
+        steps = trigger.event in {event.label for event in STEPS}
         target = self._draw_target(staged=steps)
         if chance.random() < 0.6 or target.endswith(STAGED):
             return Fault(Crash(), target, trigger)
@@ -254,11 +247,13 @@ class _Draw:
     def _draw_trigger(self, adapted: bool) -> Trigger:
         chance = self._chance
         if adapted and chance.random() < 0.5:
-            return Trigger(chance.choice(_STEPS).label, chance.randint(1, STEPS_MAX))
+            return Trigger(chance.choice(STEPS).label, chance.randint(1, STEPS_MAX))
         if chance.random() < 0.3:
             return Trigger(after_ms=round(LAUNCH_MS + self._load_ms() * chance.random(), 3))
         often = chance.random() >= RARE_PART
-        event = chance.choice([e for e in _events(self._ftm, self._placement) if (e in _OFTEN) is often])
+        event = chance.choice(
+            [e for e in _events(self._ftm, self._placement) if (e in REQUEST_EVENTS) is often]
+        )
         return Trigger(event.label, chance.randint(1, self._nth_max() if often else RARE_NTH_MAX))
 
     def _nth_max(self) -> int:

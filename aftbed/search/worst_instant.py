@@ -1,10 +1,27 @@
-"""A drive on the simulator, and the same drive with a fault in it: what a table of the road is made of.
+"""When a fault harms the car most: a drive on the simulator, again with a fault at each of many instants.
 
-A `Course` is the drive without the fault. It knows where an instant of the drive is, in all the ways in which
-a fault can be aimed: by the radar cycle, by the how manieth event of its kind, by the time since the arming.
-A `Struck` is what became of the drive when the fault struck, and when that was.
+The paper (Section IV) gives an outage in metres at 50 km/h. What those metres cost depends on when they are
+lost: before anything was in sight, nothing; at the cycle that would have begun the braking, all of them. So
+the fault is tried at many instants, and the worst is reported with the words that repeat it:
 
-All times are milliseconds of bus time, which begins with the drive.
+    coarse  each cycle whose reply asks for another stage, and each `STEP_CYCLES`th from the first with a
+            target to standstill, or to the end of the last braking; without either, of the whole drive
+    fine    around the worst so far, at ever smaller distances, down to the next cycle
+    inside  of that cycle: each event on the request's way; and the time before it, down to 1 ms
+
+Harm is, in this order: a broken promise, a faster impact, a smaller gap, more braking. Of two instants that
+harm alike the one that was tried first is reported, so those at an event: they mean the same in a real run.
+
+They are tried in copies of one drive: the process that simulates is forked shortly before the fault is to
+strike. The copy strikes, drives on until it is decided, and reports what came of it; the original drives on
+to the next instant. So no copy repeats what lies before its fault, and none drives on when all is over. In a
+copy the fault is armed when the drive has begun, so chance (the delays of hops, microseconds each) is drawn
+in another order than in a run with the same fault from its start; the two can differ by a step of the brakes.
+So each of the `CONFIRMED` worst is then run whole, by its words, and the worst of these is reported.
+
+All times are milliseconds of bus time, which begins with the drive. Limits: it is a search and no proof:
+between two coarse instants harm is taken to have one peak, and one that is narrower than `STEP_CYCLES` and at
+no change of stage is not found.
 """
 
 import gc
@@ -15,14 +32,14 @@ import sys
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import pairwise
-from typing import Final, NamedTuple
+from typing import Final
 
 import msgspec
 from msgspec.structs import replace
 
 from aftbed.core.errors import HarnessError
 from aftbed.core.events import Event
-from aftbed.core.journal import Entry, EntryKind
+from aftbed.core.journal import EntryKind
 from aftbed.ftm.compose import build
 from aftbed.ftm.registry import EMITTERS
 from aftbed.inject.crash import Crash
@@ -39,6 +56,10 @@ from aftbed.vehicle.plant import VehicleResult
 LEADER, BACKUP = "a", "b"  # as every run begins
 LATER: Final = Fault(Crash(), "primary", Trigger(after_ms=3_600_000.0))
 ARMED: Final = "armed"
+ANCHOR: Final = Event.SERVER_ENTER.label  # under every mechanism: the function is about to be called
+
+
+# -- a drive, and the same drive with a fault -----------------------------------------------------
 
 
 class DriveCycle(msgspec.Struct, frozen=True):
@@ -54,7 +75,9 @@ class DriveCycle(msgspec.Struct, frozen=True):
 class Course(msgspec.Struct, frozen=True):
     """A drive without a fault. `broken` are promises.
 
-    `nths` tells, by event and request, the how manieth of its kind the first one of that request was.
+    It has the place of an instant in all the ways in which a fault can be aimed: by the radar cycle; by the
+    time since the arming; and `nths`, by event and request: the number, among the events of its kind, of the
+    first one of that request.
     """
 
     setup: Setup
@@ -67,7 +90,7 @@ class Course(msgspec.Struct, frozen=True):
 
 
 class StruckDrive(msgspec.Struct, frozen=True):
-    """A drive with a fault. `t_ms` is when it struck, if a record says so."""
+    """A drive with a fault. `t_ms` is when it struck, if a record has it."""
 
     setup: Setup
     result: VehicleResult
@@ -77,104 +100,73 @@ class StruckDrive(msgspec.Struct, frozen=True):
 
     @property
     def fault(self) -> Fault:
-        """The one there is."""
         return self.setup.faults[0]
 
 
 def course_of(setup: Setup) -> Course:
     """Drive `setup.scenario` without a fault. Raises HarnessError if the simulator breaks down."""
     assert not setup.faults
-    run = _run(setup)
-    asked = {e.request_id: decode_request(e.payload) for e in _entries(run, EntryKind.SENT)}
-    stages = {e.request_id: decode_reply(e.payload).stage for e in _entries(run, EntryKind.ANSWERED)}
-    began_ns = min(e.t_ns - asked[e.request_id].t_ms * 1_000_000 for e in _entries(run, EntryKind.SENT))
+    run, result, broken = _driven(setup)
+    dialogue = run.history.dialogue
+    sent = {e.request_id: e.t_ns for e in dialogue if e.kind is EntryKind.SENT}
+    asked = {e.request_id: decode_request(e.payload) for e in dialogue if e.kind is EntryKind.SENT}
+    answers = (e for e in dialogue if e.kind is EntryKind.ANSWERED)
+    stages = {e.request_id: decode_reply(e.payload).stage for e in answers}
+    began_ns = min(t_ns - asked[request_id].t_ms * 1_000_000 for request_id, t_ns in sent.items())
+    world = World(replace(setup, faults=(LATER,)))  # faults are armed before the first request is made
+    world.start()
+    armed_ns = next(t_ns for t_ns, event, _ in world.told if event == ARMED)
     return Course(
         setup=setup,
-        result=_result(run),
-        broken=_promises(run),
+        result=result,
+        broken=broken,
         cycles=tuple(
             DriveCycle(name, of.t_ms, stages.get(name, STAGE_NONE), bool(of.targets), of.ego_speed_ms > 0.0)
             for name, of in sorted(asked.items())
         ),
-        nths={event: dict(_counted(run, event)) for event in _events(setup)},
+        nths=_nths(run, setup),
         began_ns=began_ns,
-        armed_ms=(_armed_ns(setup) - began_ns) / 1e6,
+        armed_ms=(armed_ns - began_ns) / 1e6,
     )
 
 
 def strike(course: Course, fault: Fault) -> StruckDrive:
     """The drive of `course` with `fault`. Raises HarnessError if the simulator breaks down."""
     setup = replace(course.setup, faults=(fault,))
-    run = _run(setup)
+    run, result, broken = _driven(setup)
     fired = all(found.fired for found in run.faults)
-    records = (record for journal in run.history.journals.values() for record in journal)
-    struck_ns = min((r.t_ns for r in records if r.event is Event.FAULT_APPLIED), default=None)
-    t_ms = (struck_ns - course.began_ns) / 1e6 if fired and struck_ns is not None else None
-    return StruckDrive(setup, _result(run), _promises(run), fired, t_ms)
+    struck = run.history.events(Event.FAULT_APPLIED)
+    t_ms = (struck[0].t_ns - course.began_ns) / 1e6 if fired and struck else None
+    return StruckDrive(setup, result, broken, fired, t_ms)
 
 
-def _run(setup: Setup) -> Run:
+def _driven(setup: Setup) -> tuple[Run, VehicleResult, tuple[str, ...]]:
+    """The run, the car's result, and what breaks beside what the scenario expects of the car."""
     try:
-        return simulate(setup)
+        run = simulate(setup)
     except AssertionError as error:
         raise HarnessError(
             f"{setup.scenario} under {setup.ftm}: the simulator broke down: {error}"
         ) from error
-
-
-def _result(run: Run) -> VehicleResult:
     assert run.vehicle is not None, "a course has a car"
-    return run.vehicle
+    return run, run.vehicle, tuple(str(breach) for breach in breaches(run) if breach.check != VEHICLE)
 
 
-def _promises(run: Run) -> tuple[str, ...]:
-    """What the run breaks beside what its scenario expects of the car."""
-    return tuple(str(breach) for breach in breaches(run) if breach.check != VEHICLE)
-
-
-def _entries(run: Run, kind: EntryKind) -> list[Entry]:
-    return [entry for entry in run.history.dialogue if entry.kind is kind]
-
-
-def _events(setup: Setup) -> Iterator[str]:
-    """What is emitted on the leader's side under this mechanism."""
-    graph = build(setup.ftm, setup.placement)
+def _nths(run: Run, setup: Setup) -> dict[str, dict[int, int]]:
+    """By event that the leader's side emits under this mechanism: see `Course`."""
+    found: dict[str, dict[int, int]] = {}
+    begun = Roles(build(setup.ftm, setup.placement), LEADER, BACKUP)
+    ended = Roles(run.rest.graph, LEADER, BACKUP)
     for event, (_, of_backup) in EMITTERS.items():
-        if not of_backup and emitting_node(Roles(graph, LEADER, BACKUP), event.label) is not None:
-            yield event.label
+        if not of_backup and emitting_node(begun, event.label) is not None:
+            node = emitting_node(ended, event.label)
+            nths = found[event.label] = {}
+            for nth, record in enumerate((r for r in run.history.events(event) if r.node == node), 1):
+                nths.setdefault(record.request_id, nth)
+    return found
 
 
-def _counted(run: Run, event: str) -> Iterator[tuple[int, int]]:
-    """Each request with the how manieth of these events its first one is."""
-    node = emitting_node(Roles(run.rest.graph, LEADER, BACKUP), event)
-    records = (record for journal in run.history.journals.values() for record in journal)
-    found = sorted((r for r in records if r.node == node and r.event.label == event), key=lambda r: r.t_ns)
-    seen: set[int] = set()
-    for nth, record in enumerate(found, 1):
-        if record.request_id not in seen:
-            seen.add(record.request_id)
-            yield record.request_id, nth
-
-
-def _armed_ns(setup: Setup) -> int:
-    """Faults are armed before the first request is made, when the clock of the car goes already."""
-    world = World(replace(setup, faults=(LATER,)))
-    world.start()
-    return next(t_ns for t_ns, event, _ in world.told if event == ARMED)
-
-
-# -- One drive, copied at many instants: what a fault would do at each of them, for less than a run each.
-#
-# The process that simulates is copied (`fork`) shortly before the fault is to strike. The copy strikes,
-# drives on until it is decided, and says what came of it; the original drives on to the next instant. So no
-# copy repeats what lies before its fault, and none drives on when all is over: half of the time for a table
-# whose cars ahead stand or move, more where they move.
-#
-# In a copy the fault is armed when the drive has begun, so chance (the delays of hops, microseconds each)
-# is
-# drawn in another order than in a run with the same fault from its start. The two can differ by a step of
-# the brakes: whoever tells a result takes it from a whole run.
-
+# -- one drive, copied at many instants -----------------------------------------------------------
 
 LOOK_NS: Final = 100_000_000  # of virtual time, between two looks at whether it is decided
 DECIDED_SECONDS_MAX: Final = 60.0  # a drive takes a tenth of a second
@@ -226,14 +218,14 @@ def _branch(world: World, fault: Fault, last_ns: int) -> BranchOutcome:
     poll.register(reader, select.POLLIN)
     late = not poll.poll(DECIDED_SECONDS_MAX * 1e3)
     if late:
-        os.kill(pid, signal.SIGKILL)  # ours, and not reaped yet: so this pid is nobody else's
+        os.kill(pid, signal.SIGKILL)  # ours, and not reaped yet, so no other process has this pid
     with open(reader, "rb") as file:
-        said = file.read()
+        answer = file.read()
     os.waitpid(pid, 0)
-    if not said:
+    if not answer:
         what = f"is not decided after {DECIDED_SECONDS_MAX:g} s" if late else "died"
         raise HarnessError(f"{fault}: the copy of the simulator {what}, {world.setup.scenario}")
-    return msgspec.msgpack.decode(said, type=BranchOutcome)
+    return msgspec.msgpack.decode(answer, type=BranchOutcome)
 
 
 def _decided(world: World, fault: Fault, last_ns: int) -> BranchOutcome:
@@ -247,33 +239,10 @@ def _decided(world: World, fault: Fault, last_ns: int) -> BranchOutcome:
         result = found.vehicle
         assert result is not None, "a course has a car"
         if result.collision or result.stop_gap_m is not None or until_ns > last_ns:
-            return BranchOutcome(result, all(told.fired for told in found.faults))
+            return BranchOutcome(result, all(fault.fired for fault in found.faults))
 
 
-# -- The worst instant: when a fault harms the car most, searched on the simulator.
-#
-# The paper (Section IV) tells an outage in metres at 50 km/h. What those metres cost depends on when they
-# are lost: before anything was in sight, nothing; at the cycle that would have begun the braking, all of
-# them. So the fault is tried at many instants, and the one that harms most is told, with the words that
-# repeat it.
-#
-#     coarse  each cycle whose reply asks for another stage, and each `STEP_CYCLES`th from the first with a
-#             target to standstill, or to the end of the last braking; without either, of the whole drive
-#     fine    around the worst so far, at ever smaller distances, down to the next cycle
-#     inside  of that cycle: each event on the request's way; and the time before it, down to 1 ms
-#
-# They are tried in copies of one drive (`branching`). Of the `CONFIRMED` worst each is then run whole, by
-# its
-# words, and the worst of these is told: so what is told is what the words repeat.
-#
-# Harm is, in this order: a broken promise, a faster impact, a smaller gap, more braking. Of two instants
-# that
-# harm alike the one that was tried first is told, so those at an event: they mean the same in a real run.
-#
-# Limits. It is a search and no proof: between two coarse instants harm is taken to have one peak. One that
-# is
-# narrower than `STEP_CYCLES` and at no change of stage is not found. `instants` is how many were tried.
-
+# -- the search -----------------------------------------------------------------------------------
 
 STEP_CYCLES: Final = 20  # 0.4 s
 FINER_CYCLES: Final = (10, 5, 2, 1)
@@ -282,7 +251,6 @@ FINER_MS: Final = (2, 1)
 ARM_MS: Final = 1.0  # so long before its cycle a fault is armed: an order takes some 50 us
 AFTER_MS: Final = 3000.0  # so long after the last instant and the end of a fault a copy drives on at most
 CONFIRMED: Final = 3
-ANCHOR: Final = Event.SERVER_ENTER.label  # under every mechanism: the function is about to be called
 
 Harm = tuple[bool, float, float, float]
 
@@ -306,112 +274,94 @@ class Instant(msgspec.Struct, frozen=True):
     place: int
 
 
+Make = Callable[[Iterable[int]], Iterator[Instant]]
+
+
 def worst_instant(course: Course, action: FaultAction, target: str) -> Worst | None:
     """Search; None if the fault struck at none of the instants. Raises HarnessError."""
-    return _Search(course, action, target).run()
+    search, cycles = _Search(course, action, target), course.cycles
+    first, last = span(course)
+
+    def anchored(places: Iterable[int]) -> Iterator[Instant]:
+        return (instant for at in places for instant in _events(course, at, (ANCHOR,)))
+
+    def moments(times_ms: Iterable[int]) -> Iterator[Instant]:
+        """These times, from the arming on."""
+        for t_ms in times_ms:
+            after_ms = round(t_ms - course.armed_ms, 6)
+            if after_ms > 0.0:
+                yield Instant(Trigger(after_ms=after_ms), float(t_ms), Trigger(), t_ms)
+
+    begin = list(anchored(coarse(course, first, last)))
+    at = search.narrow(begin, anchored, FINER_CYCLES, range(first, last + 1))
+    search.attempt(list(_events(course, at, course.nths)))
+    t_ms = cycles[at].t_ms
+    before_ms = cycles[at - 1].t_ms if at else t_ms
+    begin = list(moments(range(t_ms - 1, before_ms, -STEP_MS)))
+    search.narrow(begin, moments, FINER_MS, range(before_ms + 1, t_ms))
+    struck = sorted(
+        ((found, words) for words, found in search.found.items() if found is not None), key=lambda one: one[0]
+    )
+    whole = [strike(course, Fault(action, target, words)) for _, words in reversed(struck[-CONFIRMED:])]
+    whole = [one for one in whole if one.fired]
+    if not whole:
+        return None
+    return Worst(max(whole, key=lambda one: harm(one.result, one.broken)), len(struck))
+
+
+def _events(course: Course, index: int, events: Iterable[str]) -> Iterator[Instant]:
+    """These events of that cycle, as far as it has them."""
+    cycle = course.cycles[index]
+    for event in events:
+        nth = course.nths[event].get(cycle.request_id)
+        if nth is not None:
+            yield Instant(Trigger(event, nth), cycle.t_ms - ARM_MS, Trigger(event), index)
+
+
+def impact_kmh(result: VehicleResult) -> float:
+    """The relative speed at contact; 0 without one."""
+    return (result.impact_speed_kmh or 0.0) if result.collision else 0.0
 
 
 def harm(result: VehicleResult, broken: tuple[str, ...] = ()) -> Harm:
     """The greater, the worse. Rounded, since what is finer than that is noise of the last digits."""
-    impact_kmh = (result.impact_speed_kmh or 0.0) if result.collision else 0.0
     gap_m = result.min_gap_m if result.min_gap_m is not None else float("inf")
-    return bool(broken), round(impact_kmh, 4), -round(gap_m, 4), result.demand_max_ms2
-
-
-class _Tried(NamedTuple):
-    harm: Harm
-    earlier: int  # the greater, the earlier it was tried
+    return bool(broken), round(impact_kmh(result), 4), -round(gap_m, 4), result.demand_max_ms2
 
 
 class _Search:
+    """`found`: harm of each instant, and a number, greater the earlier it was tried; None: no strike."""
+
     def __init__(self, course: Course, action: FaultAction, target: str) -> None:
         self._course, self._action, self._target = course, action, target
-        self._over_ms = _over_ms(course, action)
-        self._tried: dict[Trigger, _Tried | None] = {}  # None where the fault did not strike
+        # All is over when the fault has ended after the last instant, and what it led to.
+        self._over_ms = course.cycles[span(course)[1]].t_ms + action.lasts_ms + AFTER_MS
+        self.found: dict[Trigger, tuple[Harm, int] | None] = {}
 
-    def run(self) -> Worst | None:
-        """From coarse to fine."""
-        first, last = span(self._course)
-        begin = list(self._cycles(coarse(self._course, first, last)))
-        at = self._narrow(begin, self._cycles, FINER_CYCLES, range(first, last + 1))
-        self._try(list(self._events(at, self._course.nths)))
-        t_ms = self._course.cycles[at].t_ms
-        before_ms = self._course.cycles[at - 1].t_ms if at else t_ms
-        begin = list(self._moments(range(t_ms - 1, before_ms, -STEP_MS)))
-        self._narrow(begin, self._moments, FINER_MS, range(before_ms + 1, t_ms))
-        return self._confirmed()
-
-    # -- instants -----------------------------------------------------------------------------
-
-    def _cycles(self, indices: Iterable[int]) -> Iterator[Instant]:
-        """The beginning of each of these cycles, as the function sees it."""
-        for index in indices:
-            yield from self._events(index, (ANCHOR,))
-
-    def _events(self, index: int, events: Iterable[str]) -> Iterator[Instant]:
-        """These events of that cycle, as far as it has them."""
-        cycle = self._course.cycles[index]
-        for event in events:
-            nth = self._course.nths[event].get(cycle.request_id)
-            if nth is not None:
-                yield Instant(Trigger(event, nth), cycle.t_ms - ARM_MS, Trigger(event), index)
-
-    def _moments(self, times_ms: Iterable[int]) -> Iterator[Instant]:
-        """These times, from the arming on."""
-        for t_ms in times_ms:
-            after_ms = round(t_ms - self._course.armed_ms, 6)
-            if after_ms > 0.0:
-                yield Instant(Trigger(after_ms=after_ms), float(t_ms), Trigger(), t_ms)
-
-    # -- trying -------------------------------------------------------------------------------
-
-    def _narrow(
-        self,
-        found: list[Instant],
-        make: Callable[[Iterable[int]], Iterator[Instant]],
-        steps: Sequence[int],
-        places: range,
-    ) -> int:
-        """Try `found`, then ever nearer to the worst of them. The place of the worst of all."""
-        self._try(found)
-        at = self._worst_place(found, places.start)
+    def narrow(self, instants: list[Instant], make: Make, steps: Sequence[int], places: range) -> int:
+        """Try `instants`, then ever nearer to the worst of them. The place of the worst of all."""
+        self.attempt(instants)
+        at = self._worst_place(instants, places.start)
         for step in steps:
             more = list(make(near for near in (at - step, at + step) if near in places))
-            self._try(more)
-            found += more
-            at = self._worst_place(found, at)
+            self.attempt(more)
+            instants += more
+            at = self._worst_place(instants, at)
         return at
 
-    def _try(self, instants: Sequence[Instant]) -> None:
-        """Those that are new, in the order of time; who is proposed first counts as tried first."""
-        fresh = {instant.words: instant for instant in instants if instant.words not in self._tried}
-        order = {words: -len(self._tried) - at for at, words in enumerate(fresh)}
+    def attempt(self, instants: Sequence[Instant]) -> None:
+        """Those that are new, in the order of time; the one that is proposed first counts as tried first."""
+        fresh = {instant.words: instant for instant in instants if instant.words not in self.found}
+        order = {words: -len(self.found) - at for at, words in enumerate(fresh)}
         todo = sorted(fresh.values(), key=lambda instant: instant.branch_ms)
-        faults = (Fault(self._action, self._target, instant.branch) for instant in todo)
-        branches = (Branch(i.branch_ms, fault) for i, fault in zip(todo, faults, strict=True))
+        branches = (Branch(i.branch_ms, Fault(self._action, self._target, i.branch)) for i in todo)
         for instant, outcome in zip(todo, branched(self._course, branches, self._over_ms), strict=True):
-            found = _Tried(harm(outcome.result), order[instant.words]) if outcome.fired else None
-            self._tried[instant.words] = found
+            found = (harm(outcome.result), order[instant.words]) if outcome.fired else None
+            self.found[instant.words] = found
 
     def _worst_place(self, instants: Iterable[Instant], otherwise: int) -> int:
-        found = [(tried, i.place) for i in instants if (tried := self._tried[i.words]) is not None]
+        found = [(tried, i.place) for i in instants if (tried := self.found[i.words]) is not None]
         return max(found)[1] if found else otherwise
-
-    def _confirmed(self) -> Worst | None:
-        """The worst of the worst, run whole."""
-        struck = sorted(((t, words) for words, t in self._tried.items() if t is not None), key=_by_harm)
-        whole = [self._strike(words) for _, words in struck[-CONFIRMED:]]
-        whole = [one for one in reversed(whole) if one.fired]
-        if not whole:
-            return None
-        return Worst(max(whole, key=lambda one: harm(one.result, one.broken)), len(struck))
-
-    def _strike(self, words: Trigger) -> StruckDrive:
-        return strike(self._course, Fault(self._action, self._target, words))
-
-
-def _by_harm(one: tuple[_Tried, Trigger]) -> _Tried:
-    return one[0]
 
 
 def span(course: Course) -> tuple[int, int]:
@@ -431,9 +381,3 @@ def coarse(course: Course, first: int, last: int) -> list[int]:
 def _changes(course: Course) -> list[int]:
     """The cycles that ask for another stage than those before them."""
     return [at for at, (a, b) in enumerate(pairwise(course.cycles), 1) if a.stage != b.stage]
-
-
-def _over_ms(course: Course, action: FaultAction) -> float:
-    """When all is over: after the last instant of the search the fault ends, and what it led to."""
-    length_ms = action.lasts_ms
-    return course.cycles[span(course)[1]].t_ms + length_ms + AFTER_MS

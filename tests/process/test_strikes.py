@@ -34,7 +34,7 @@ from aftbed.inject.crash import Crash
 from aftbed.inject.model import Fault
 from aftbed.inject.timing import Trigger
 from aftbed.runtime.unix import control_client
-from aftbed.search.explore import WHEN, Strike, strikes
+from aftbed.search.explore import STEPS, Strike, strikes
 
 pytestmark = pytest.mark.process
 
@@ -111,7 +111,7 @@ def test_a_death_at_a_step_leaves_one_graph_whole(home: Home, placement: str) ->
 
 
 @pytest.mark.parametrize("node", ["a", "b", "b'"])
-@pytest.mark.parametrize("when", WHEN, ids=str)
+@pytest.mark.parametrize("when", STEPS, ids=str)
 def test_a_death_while_requests_are_let_on(home: Home, node: str, when: Event) -> None:
     last = max(s.step for s in strikes("pbr", "lfr", "replica"))
     assert walk(home, "replica", [Strike("pbr", "lfr", node, when, last)]) == 1

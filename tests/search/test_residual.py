@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from roads import sudden_course
 
 from aftbed.inject.hang import Hang
-from aftbed.search.road_table import closing_speed_ms, impact_kmh, residual_kmh
-from aftbed.search.worst_instant import worst_instant
+from aftbed.search.road_table import closing_speed_ms, residual_kmh
+from aftbed.search.worst_instant import impact_kmh, worst_instant
 from aftbed.vehicle.plant import KMH_PER_MS, LeadCar, Plant, PlantSetup, VehicleResult
 from aftbed.vehicle.scenarios.library import load_scenario
 
