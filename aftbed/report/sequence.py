@@ -25,7 +25,7 @@ from typing import Final, NamedTuple, assert_never
 
 import msgspec
 
-from aftbed.core.events import REQUEST_EVENTS, STEP_EVENTS, TURNING_POINTS, Event
+from aftbed.core.events import REQUEST_EVENTS, STEP_EVENTS, Event, Weight
 from aftbed.core.journal import Entry, Record
 from aftbed.ftm.compose import build
 from aftbed.judge.timeline import describe
@@ -118,11 +118,12 @@ class _Views:
             return _View((one.node,), columns, shape="dots", css="step", text=text, room_px=3)
         css = "fault" if event in _FAULTS else "adapt" if str(event).startswith("adapt") else "step"
         shape = "crosses" if css == "fault" else "diamonds"
-        return _View((one.node,), columns, full, shape, css, text, event in TURNING_POINTS, 9)
+        return _View((one.node,), columns, full, shape, css, text, is_turn(one), 9)
 
 
 def is_turn(one: Happening) -> bool:
-    return one.event in TURNING_POINTS if isinstance(one, Record) else _is_strike(one)
+    turns = isinstance(one, Record) and one.event.weight is Weight.TURNING_POINT
+    return turns or _is_strike(one)
 
 
 def _is_strike(one: Happening) -> bool:
