@@ -44,9 +44,9 @@ from aftbed.core.errors import HarnessError
 from aftbed.core.journal import EntryKind
 from aftbed.judge.record import read_record
 from aftbed.runtime.unix import control_client
+from aftbed.runtime.unix.control_client import ProcessRow, measured
 from aftbed.runtime.unix.launch import launch, options_for
 from aftbed.runtime.unix.options import CarRun
-from aftbed.runtime.unix.resources import ProcessRow, measured
 
 RADAR_HZ: Final = 50.0
 IDLE_HZ: Final = 1.0

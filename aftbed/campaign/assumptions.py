@@ -25,7 +25,7 @@ from aftbed.core.application import Application, Characteristics
 from aftbed.inject.model import parse
 from aftbed.inject.timing import Permanent
 from aftbed.judge.outcome import FAILED, UNKNOWN
-from aftbed.runtime.unix.part import load_module
+from aftbed.runtime.unix.options import load_module
 from aftbed.vehicle.aeb.function import default_application
 
 BROKEN: Final = (*FAILED, "latent", "detected_stop")

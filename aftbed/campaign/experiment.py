@@ -31,10 +31,9 @@ from aftbed.runtime.interface import BUS, LIGHT
 from aftbed.runtime.sim.world import Setup, simulate
 from aftbed.runtime.unix import launch as unix_launch
 from aftbed.runtime.unix import linux
-from aftbed.runtime.unix.bus_fault_names import with_names_resolved
 from aftbed.runtime.unix.launch import launch, options_for
-from aftbed.runtime.unix.options import CarRun, LoadRun, Work
-from aftbed.runtime.unix.prefault import Area
+from aftbed.runtime.unix.linux import Area
+from aftbed.runtime.unix.options import CarRun, LoadRun, Work, with_names_resolved
 from aftbed.search.shrink import shrink
 from aftbed.vehicle.aeb.function import default_application
 from aftbed.vehicle.plant import VehicleResult

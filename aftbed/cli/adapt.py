@@ -30,7 +30,7 @@ from aftbed.core.script import Script, Stage, Step, Together
 from aftbed.core.yaml_file import read_yaml
 from aftbed.ftm.compose import build
 from aftbed.runtime.unix import control_client, run_directory
-from aftbed.runtime.unix.part import load_module
+from aftbed.runtime.unix.options import load_module
 from aftbed.vehicle.aeb.function import default_application
 
 EXIT_CODES: Final = {"done": 0, "rolled back": 1, "refused": 2}

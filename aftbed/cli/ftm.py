@@ -31,7 +31,7 @@ from aftbed.core.errors import ConfigError
 from aftbed.core.graph import Graph
 from aftbed.core.yaml_file import read_yaml
 from aftbed.ftm.compose import EXPRESSIONS, build
-from aftbed.runtime.unix.part import load_module
+from aftbed.runtime.unix.options import load_module
 from aftbed.vehicle.aeb.function import default_application
 
 ftm = typer.Typer()

@@ -17,8 +17,7 @@ from aftbed.inject.memory import refuse_unsafe
 from aftbed.inject.model import Fault, on_bus, read
 from aftbed.inject.value import MEMORY
 from aftbed.runtime.unix import control_client, run_directory
-from aftbed.runtime.unix.bus_fault_names import with_names_resolved
-from aftbed.runtime.unix.options import Work
+from aftbed.runtime.unix.options import Work, with_names_resolved
 
 inject = typer.Typer()
 

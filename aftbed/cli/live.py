@@ -10,7 +10,7 @@ from aftbed.core.errors import unknown
 from aftbed.core.graph import Graph
 from aftbed.ftm.compose import build
 from aftbed.runtime.unix import control_client, run_directory
-from aftbed.runtime.unix.resources import measured
+from aftbed.runtime.unix.control_client import measured
 
 
 def status(run: Run = None, json: Json = False) -> None:

@@ -31,7 +31,7 @@ from aftbed.runtime.unix.launch import Launched, launch, options_for
 from aftbed.runtime.unix.options import CarRun, LoadRun, ReplayRun, Work
 
 if TYPE_CHECKING:
-    from aftbed.runtime.unix.closedloop import ClosedLoop
+    from aftbed.runtime.unix.closed_loop import ClosedLoop
 
 POLICIES: Final = ("hold", "release", "latch")
 PACE_MIN, PACE_MAX = 0.01, 100.0
@@ -158,7 +158,7 @@ def _closed_loop(given: RunArguments) -> "Callable[[Launched], ClosedLoop] | Non
     """What makes the closed loop of a launched run; None without `--policy`."""
     if given.policy is None and given.approve == "auto":
         return None
-    from aftbed.runtime.unix.closedloop import ClosedLoop, asked_for  # noqa: PLC0415 - only with --policy
+    from aftbed.runtime.unix.closed_loop import ClosedLoop, asked_for  # noqa: PLC0415 - only with --policy
 
     policy = asked_for(given.policy, given.approve, given.ftm, as_json=given.json)
     if policy is None:
@@ -250,7 +250,7 @@ def _follow(launched: Launched, view: AbstractContextManager[RunView], closed: "
     try:
         with view as shown:
             if closed is not None:
-                closed.show(shown.event)
+                closed.show = shown.event
             for report in _reports(launched, closed):
                 match report.kind:
                     case "telemetry":
@@ -261,7 +261,7 @@ def _follow(launched: Launched, view: AbstractContextManager[RunView], closed: "
                         event = json.loads(report.data)
                         shown.event(event)
                         if closed is not None:
-                            closed.told(event)
+                            closed.on_event(event)
             if closed is not None:
                 closed.close()
     finally:

@@ -149,7 +149,7 @@ def show_verdict(verdict: "Verdict", *, as_json: bool) -> None:
             f" blackout {_ms(f.blackout_ms)}"
         )
     if verdict.proposals:
-        from aftbed.runtime.unix.closedloop import proposed_line  # noqa: PLC0415 - only with a policy
+        from aftbed.runtime.unix.closed_loop import proposed_line  # noqa: PLC0415 - only with a policy
 
         for proposal in verdict.proposals:
             print(f"  proposal   {proposed_line(proposal)}")

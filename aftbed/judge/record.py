@@ -15,7 +15,7 @@ from aftbed.inject.receipts import ReceiptState
 from aftbed.runtime.deployment import Hosted
 from aftbed.runtime.unix.journal_files import contents
 from aftbed.runtime.unix.options import CarRun, RunOptions
-from aftbed.runtime.unix.support import HISTORY_NAME
+from aftbed.runtime.unix.run_directory import HISTORY_NAME
 from aftbed.vehicle.plant import VehicleResult
 
 

@@ -22,7 +22,7 @@ from aftbed.core.events import Event
 from aftbed.core.journal import EntryKind, History
 from aftbed.judge.record import RunRecord
 from aftbed.runtime.deployment import digest, replica_of
-from aftbed.runtime.unix.part import load_module
+from aftbed.runtime.unix.options import load_module
 from aftbed.vehicle.aeb.function import default_application
 
 Make = Callable[[], Application]

@@ -14,7 +14,7 @@ from aftbed.judge import checks
 from aftbed.judge.checks import Check, Checker, Evidence, Failover, Requests
 from aftbed.judge.record import RunRecord
 from aftbed.judge.reference import reference_of
-from aftbed.runtime.unix.closedloop import Proposed, read_proposals
+from aftbed.runtime.unix.closed_loop import Proposed, read_proposals
 from aftbed.runtime.unix.options import CarRun, ReplayRun
 from aftbed.vehicle.plant import VehicleResult
 

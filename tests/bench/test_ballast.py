@@ -8,7 +8,7 @@ from aftbed.adapt.plugins import load_application
 from aftbed.bench import ballast
 from aftbed.core.application import Application
 from aftbed.core.errors import ConfigError, PeerError
-from aftbed.runtime.unix.part import load_module
+from aftbed.runtime.unix.options import load_module
 
 
 def made(size_bytes: int, version: int = 1) -> Application:

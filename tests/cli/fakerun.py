@@ -50,7 +50,7 @@ class FakeRun:
         self.record = Path("/nowhere/record")
 
     def ask(
-        self, private: Path, question: control_client.Question, seconds: float = 0.0
+        self, private: Path, question: control_client.ControlRequest, seconds: float = 0.0
     ) -> dict[str, object]:
         """Replaces `ask.ask`."""
         assert private.name == "abc123"

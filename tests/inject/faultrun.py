@@ -5,7 +5,7 @@ The fixture `run` is imported by the tests that use it.
 
 from collections.abc import Callable, Generator, Iterable
 from pathlib import Path
-from typing import Final
+from typing import Final, cast
 
 import pytest
 
@@ -20,7 +20,10 @@ from aftbed.runtime.interface import ProcessKind
 from aftbed.runtime.tasks import Wait
 from aftbed.runtime.unix.event_loop import EventLoop
 from aftbed.runtime.unix.journal_files import JournalFile
-from aftbed.runtime.unix.support import UnixRuntime
+from aftbed.runtime.unix.options import LoadRun, RunOptions
+from aftbed.runtime.unix.process_pool import UnixProcessPool
+from aftbed.runtime.unix.supervisor import UnixRuntime
+from aftbed.runtime.unix.workload import Workload
 
 FIRST: Final = 1_000_001  # the number of a run's first fault
 
@@ -118,15 +121,14 @@ class Run:
         self.deployment = FakeDeployment(folder, ftm, placement)
         self.said: list[str] = []
         (folder / "journal").mkdir()
-        runtime = UnixRuntime(
-            folder,
-            EventLoop(),
-            self.deployment,  # type: ignore[arg-type]
-            lambda kind, incarnation: ("", b""),
-            lambda event, text: self.said.append(f"{event}: {text}"),
-            seed,
-        )
-        self.deployment.runtime = runtime
+        options = RunOptions("", "", str(folder), ftm, placement, seed, LoadRun(1, 0.0))
+        loop, pool = EventLoop(), cast("UnixProcessPool", self.deployment)
+
+        def log(event: str, text: str) -> None:
+            self.said.append(f"{event}: {text}")
+
+        work = Workload(options, pool, loop, log, lambda reason: None, lambda kind, data: None)
+        self.deployment.runtime = UnixRuntime(options, loop, pool, work, log)
         self.faults = FaultController(self.deployment)  # type: ignore[arg-type]
 
     def do(self, steps: Generator[Wait, object, None]) -> list[Wait]:

@@ -14,7 +14,7 @@ from aftbed.inject.receipts import ReceiptState
 from aftbed.judge.record import read_record
 from aftbed.judge.verdict import EXIT_CODES
 from aftbed.runtime.unix.options import COMMAND_GONE
-from aftbed.runtime.unix.support import HISTORY_NAME
+from aftbed.runtime.unix.run_directory import HISTORY_NAME
 
 
 def test_a_run_without_trouble_passes(path: Path) -> None:

@@ -38,9 +38,9 @@ from aftbed.inject.model import Fault
 from aftbed.judge.record import RunRecord, read_record
 from aftbed.judge.verdict import Verdict, judge
 from aftbed.runtime.unix import control_client, run_directory
+from aftbed.runtime.unix.control_client import ProcessRow
 from aftbed.runtime.unix.launch import launch, options_for
 from aftbed.runtime.unix.options import LoadRun, Work
-from aftbed.runtime.unix.resources import ProcessRow
 
 RUN_SECONDS_MAX: Final = 60.0
 CLIENTS: Final = ("adapt", "check", "graph", "inject", "ps", "status", "stop")
@@ -116,7 +116,7 @@ class Started:
             ftm=ftm, placement=placement, work=work, seed=seed, faults=faults, record=kept
         )
         self.launched = launch(options, listener)
-        home.forks += [self.launched.supervisor, self.launched._warden]
+        home.forks += [self.launched.supervisor, self.launched.warden]
         self.private = self.launched.private
         self.events: list[dict[str, object]] = []
         self._ended = self._closed = False

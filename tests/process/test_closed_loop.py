@@ -11,8 +11,7 @@ from typing import Final
 import pytest
 from liveruns import WAIT_SECONDS_MAX, Done, Home, aftbed
 
-from aftbed.runtime.unix.closedloop import Proposed, read_proposals
-from aftbed.runtime.unix.observation import Lines
+from aftbed.runtime.unix.closed_loop import AdaptationHistory, Proposed, read_proposals
 
 pytestmark = pytest.mark.process
 
@@ -64,7 +63,7 @@ def test_two_divergences_compose_tr_once(home: Home, tmp_path: Path, placement: 
     assert (one.reason, one.outcome, one.why) == ("2 divergence within 10 s", "done", "")
     assert one.consistent_after_ms is not None and 100 < one.consistent_after_ms < 2500
     assert read_proposals(tmp_path / "record") == [one]
-    history = Lines(tmp_path / "record" / "adaptations.jsonl").new()
+    history = AdaptationHistory(tmp_path / "record" / "adaptations.jsonl").new()
     assert [(o.purpose, o.outcome, o.ftm) for o in history] == [("lfr to lfr+tr", "done", "lfr+tr")]
 
 

@@ -13,11 +13,13 @@ from typing import Final
 import msgspec
 import pytest
 from liveruns import Command, Home, Started, aftbed, ended, only_run, state_of, under_load, until
+from rundirs import new_run
 
 from aftbed.cli.doctor import Diagnosis
 from aftbed.runtime.unix import cleanup, control_client, run_directory
-from aftbed.runtime.unix.cleanup import LeftDirectory, LeftProcess
+from aftbed.runtime.unix.cleanup import LeftDirectory
 from aftbed.runtime.unix.options import LoadRun
+from aftbed.runtime.unix.run_directory import Member
 
 pytestmark = pytest.mark.process
 
@@ -32,7 +34,7 @@ def doctor(*arguments: str) -> tuple[int, Diagnosis]:
     return done.code, msgspec.json.decode(done.out, type=Diagnosis)
 
 
-def of_run(run: Path) -> list[run_directory.Member]:
+def of_run(run: Path) -> list[Member]:
     """All of its processes but the command."""
     return [m for m in run_directory.members() if m.run == str(run)]
 
@@ -51,7 +53,7 @@ def stopped(pid: int) -> None:
 
 def test_every_process_of_a_run_is_told_by_its_mark(home: Home) -> None:
     with under_load(home, 200) as run:
-        known = {row.pid for row in run.rows()} | {run.launched._warden}
+        known = {row.pid for row in run.rows()} | {run.launched.warden}
         marked = {m.pid for m in of_run(run.private)}
         assert known <= marked
         assert os.getpid() not in marked, "the command is not to be ended"
@@ -108,7 +110,7 @@ def test_the_processes_of_a_dead_run_are_named_and_removed_and_a_live_run_goes_o
         code, found = doctor()
         assert code == 1
         assert {left.run for left in found.left} == {str(run)}
-        processes = {left.pid: left for left in found.left if isinstance(left, LeftProcess)}
+        processes = {left.pid: left for left in found.left if isinstance(left, Member)}
         assert set(processes) == there
         assert (processes[engine].name, processes[engine].state) == ("engine", "T")
         shown = aftbed("doctor")
@@ -117,7 +119,7 @@ def test_the_processes_of_a_dead_run_are_named_and_removed_and_a_live_run_goes_o
 
         code, cleaned = doctor("--clean")
         assert code == 0
-        assert {left.pid for left in cleaned.removed if isinstance(left, LeftProcess)} == there
+        assert {left.pid for left in cleaned.removed if isinstance(left, Member)} == there
         assert {left.run for left in cleaned.removed} == {str(run)}
         assert not any(state_of(pid) not in ("", "Z") for pid in there)
         assert home.runs() == [alive.private]
@@ -131,7 +133,7 @@ def test_the_processes_of_a_dead_run_are_named_and_removed_and_a_live_run_goes_o
 
 def test_a_run_is_alive_from_its_first_moment_to_the_last(home: Home) -> None:
     """Its directory is there before a process is, and after the last one."""
-    private = run_directory.create()
+    private = new_run()
     try:
         assert doctor("--clean")[1].removed == []
         assert private.exists()

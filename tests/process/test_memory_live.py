@@ -11,7 +11,7 @@ from aftbed.core.events import Event
 from aftbed.inject.model import parse
 from aftbed.runtime.unix import control_client
 from aftbed.runtime.unix.options import LoadRun
-from aftbed.runtime.unix.shared_memory import NAME
+from aftbed.runtime.unix.transport import MEMORY_NAME
 
 pytestmark = pytest.mark.process
 
@@ -21,7 +21,7 @@ HIT: Final = 32  # the counter is odd then, and not its last
 FLIP: Final = "bitflip state.counter bit 0"
 REFUSED: Final = "bitflip state.counter bit 7"  # no state has such a counter
 NEVER: Final = "nth 1000000"
-_CELL: Final = re.compile(rf" (\d+) +/memfd:{NAME}")
+_CELL: Final = re.compile(rf" (\d+) +/memfd:{MEMORY_NAME}")
 
 
 def ran(home: Home, ftm: str, *texts: str, placement: str = "process") -> Outcome:

@@ -52,7 +52,7 @@ def test_the_runs_of_a_killed_command_do_not_wait_for_each_other(home: Home) -> 
 def test_a_stopped_warden_does_not_hold_up_its_command(home: Home) -> None:
     with Started(home, LoadRun(50, 500.0)) as run:
         until(lambda: ended(run.launched.supervisor), "the end of the supervisor")
-        os.kill(run.launched._warden, signal.SIGSTOP)
+        os.kill(run.launched.warden, signal.SIGSTOP)
         assert run.finish().verdict.verdict == "pass"
 
 

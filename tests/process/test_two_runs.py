@@ -4,6 +4,7 @@ import signal
 
 import pytest
 from liveruns import Command, Home, aftbed, under_load, until
+from rundirs import new_run
 
 from aftbed.runtime.unix import control_client, run_directory
 
@@ -62,7 +63,7 @@ def test_with_two_runs_alive_a_command_must_name_one(home: Home) -> None:
 
 def test_the_directory_of_a_dead_run_is_no_run(home: Home) -> None:
     """What a crash of the machine may leave: a directory, and a socket that nobody serves."""
-    private = run_directory.create()
+    private = new_run()
     with pytest.raises(OSError, match=r"No such file|refused"):
         run_directory.connect(private)
     assert run_directory.live() == []

@@ -11,7 +11,7 @@ from liveruns import GONE_SECONDS_MAX, Home, Started, state_of, under_load, unti
 from aftbed.inject.hang import Hang
 from aftbed.inject.model import Fault
 from aftbed.inject.timing import Trigger
-from aftbed.runtime.unix import cleanup, control_client, run_directory
+from aftbed.runtime.unix import cleanup, control_client, linux
 from aftbed.runtime.unix.options import LoadRun
 
 pytestmark = pytest.mark.process
@@ -27,7 +27,7 @@ def hang(target: str, for_ms: int = 0) -> control_client.InjectCommand:
 def entries(run: Started) -> list[cleanup.Entry]:
     """The ledger of the run, line by line."""
     lines = (run.private / cleanup.LEDGER_NAME).read_bytes().splitlines()
-    return [cleanup._decode(line) for line in lines]
+    return [cleanup.decode_entry(line) for line in lines]
 
 
 def test_a_stop_is_written_before_it_is_done_and_its_undo_behind_it(home: Home) -> None:
@@ -41,7 +41,7 @@ def test_a_stop_is_written_before_it_is_done_and_its_undo_behind_it(home: Home) 
         assert (stopped[0].name, stopped[0].pid, stopped[0].start) == (
             "engine",
             pid,
-            run_directory.started(pid),
+            linux.started(pid),
         )
         assert began_ns + 60e6 <= stopped[0].due_ns <= time.monotonic_ns() + 60e6
         until(lambda: len(entries(run)) == 2, "the undo")
@@ -62,7 +62,7 @@ def test_what_a_stopped_supervisor_stopped_is_thawed_by_the_warden_in_time(home:
         assert FOR_MS / 1e3 <= seconds < FOR_MS / 1e3 + cleanup.LATE_NS_MAX / 1e9 + BUSY_SECONDS
         assert state_of(run.launched.supervisor) == "T"
         until(lambda: len(entries(run)) == 2, "the word of it")
-        assert entries(run)[1] == cleanup.Undone(pid, run_directory.started(pid), "warden")
+        assert entries(run)[1] == cleanup.Undone(pid, linux.started(pid), "warden")
         run.strike("supervisor", signal.SIGCONT)
         assert run.pid("engine") == pid
         told = (run.launched.record / "events.jsonl").read_text()

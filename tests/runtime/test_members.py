@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from aftbed.runtime.unix import run_directory
+from aftbed.runtime.unix import linux, run_directory
 
 pytestmark = pytest.mark.process
 
@@ -54,7 +54,7 @@ def test_a_mark_is_known_by_its_directory(forked: Forked, tmp_path: Path) -> Non
     child = forked(lambda: run_directory.mark(run))
     assert run_directory.run_of(child) == run
     found = {m.pid: m for m in run_directory.members()}[child]
-    assert (found.run, found.start) == (str(run), run_directory.started(child))
+    assert (found.run, found.start) == (str(run), linux.started(child))
 
 
 def test_a_mark_stays_where_all_descriptors_are_closed(forked: Forked, tmp_path: Path) -> None:
@@ -88,8 +88,8 @@ def test_what_is_executed_is_marked_by_its_environment(tmp_path: Path) -> None:
 def test_a_process_is_ended_only_if_it_still_is_that_one(forked: Forked, tmp_path: Path) -> None:
     child = forked(lambda: run_directory.mark(tmp_path))
     found = {m.pid: m for m in run_directory.members()}[child]
-    other = run_directory.Member(child, found.start + 1, found.run, found.name, found.state)
+    other = run_directory.Member(found.run, child, found.start + 1, found.name, found.state)
     assert other.end(1.0), "that one is gone"
-    assert run_directory.state_of(child) == "S"
+    assert linux.state_of(child) == "S"
     assert found.end(1.0)
-    assert run_directory.state_of(child) == "Z"
+    assert linux.state_of(child) == "Z"

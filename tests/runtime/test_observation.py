@@ -15,8 +15,16 @@ from aftbed.core.errors import PeerError
 from aftbed.core.events import Event
 from aftbed.core.journal import RECORD, Record
 from aftbed.runtime.adaptations import Outcome
-from aftbed.runtime.unix.closedloop import load_policy, policy_names
-from aftbed.runtime.unix.observation import CHUNK_BYTES, Journals, Lines, Meter, Tail, lost
+from aftbed.runtime.unix.closed_loop import (
+    CHUNK_BYTES,
+    AdaptationHistory,
+    Journals,
+    Meter,
+    Tail,
+    load_policy,
+    loss_in,
+    policy_names,
+)
 
 EVENTS: Final = (Event.SERVER_EXIT, Event.FOLLOWER_DIVERGED, Event.VOTE_COMPARED)
 WRITTEN: Final = [Record(10 + n, EVENTS[n % 3], n, n, "a/after", n % 2) for n in range(6)]
@@ -74,7 +82,7 @@ def test_only_journals_that_can_hold_a_symptom_are_read(tmp_path: Path) -> None:
 
 def test_half_a_line_of_the_history_waits_for_its_end(tmp_path: Path) -> None:
     path = tmp_path / "adaptations.jsonl"
-    lines = Lines(path)
+    lines = AdaptationHistory(path)
     assert lines.new() == []
     data = b"".join(msgspec.json.encode(Outcome(n, "x", "drained", "lfr")) + b"\n" for n in (1, 2))
     numbers = []
@@ -85,9 +93,9 @@ def test_half_a_line_of_the_history_waits_for_its_end(tmp_path: Path) -> None:
 
 
 def test_crash_or_hang() -> None:
-    assert lost("alarm", "a: crash") == Seen("crash")
-    assert lost("alarm", "b: hang") == Seen("hang")
-    assert lost("died", "a/server (pid 7)") is None
+    assert loss_in("alarm", "a: crash") == Seen("crash")
+    assert loss_in("alarm", "b: hang") == Seen("hang")
+    assert loss_in("died", "a/server (pid 7)") is None
 
 
 def test_only_what_a_rule_names_is_measured(tmp_path: Path) -> None:

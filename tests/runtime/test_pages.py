@@ -6,7 +6,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from aftbed.runtime.unix.prefault import PAGE, Area, own, written_by
+from aftbed.runtime.unix.linux import Area, populate
+from aftbed.runtime.unix.prefault import PAGE, written_by
 
 PAGES = 16
 
@@ -42,14 +43,14 @@ def test_a_child_that_owns_them_has_its_own_copies_with_what_was_there(memory: m
     start = ctypes.addressof(ctypes.c_char.from_buffer(memory))
 
     def work() -> None:
-        own(((start + 3 * PAGE, PAGE), (start + 8 * PAGE, 3 * PAGE)))
+        populate(((start + 3 * PAGE, PAGE), (start + 8 * PAGE, 3 * PAGE)))
         assert all(memory[page * PAGE] == 1 for page in range(PAGES))
 
     assert within(memory, written_by(work)) == [(3, 1), (8, 3)]
 
 
 def test_memory_that_is_not_there_is_passed_over(memory: mmap.mmap) -> None:
-    own(((1 << 46, PAGE),))
+    populate(((1 << 46, PAGE),))
     assert memory[0] == 1
 
 

@@ -9,17 +9,17 @@ from aftbed.runtime.unix.prefault import PAGE, written_by
 
 SCRIPT = """
 import resource
-from aftbed.runtime.unix import prefault, rehearsal
+from aftbed.runtime.unix import linux, prefault
 
-areas = rehearsal.warm_up()
+areas = prefault.warm_up()
 
 def faults():
     return resource.getrusage(resource.RUSAGE_SELF).ru_minflt
 
 def prepared():
-    prefault.own(areas)
+    linux.populate(areas)
     before = faults()
-    rehearsal.rehearse_host()
+    prefault.rehearse_host()
     print(sum(size for _, size in areas) // prefault.PAGE, faults() - before, flush=True)
 
 prefault.written_by(prepared)

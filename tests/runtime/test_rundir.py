@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from rundirs import new_run
 
 from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.runtime.unix import run_directory
@@ -31,7 +32,7 @@ def listeners() -> Iterator[list[socket.socket]]:
 
 def alive(listeners: list[socket.socket]) -> Path:
     """A run whose supervisor listens."""
-    private = run_directory.create()
+    private = new_run()
     sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     sock.bind(str(private / run_directory.SOCKET_NAME))
     sock.listen()
@@ -44,13 +45,13 @@ def mode(path: Path) -> int:
 
 
 def test_a_runs_directory_is_private(runtime: Path) -> None:
-    private = run_directory.create()
+    private = new_run()
     assert private.parent == runtime == run_directory.root()
     assert mode(private) == mode(runtime) == 0o700
 
 
 def test_each_run_has_its_own(runtime: Path) -> None:
-    assert len({run_directory.create() for _ in range(20)}) == 20
+    assert len({new_run() for _ in range(20)}) == 20
 
 
 def test_a_run_that_has_just_taken_the_place_is_left_alone(runtime: Path) -> None:
@@ -83,7 +84,7 @@ def test_a_directory_that_others_can_enter_is_refused(runtime: Path, wide: int) 
     with pytest.raises(
         HarnessError, match=re.escape(f"{runtime}: must be a directory of this user alone (mode 0700)")
     ):
-        run_directory.create()
+        new_run()
 
 
 def test_a_directory_of_another_user_is_refused(runtime: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -110,7 +111,7 @@ def test_a_link_to_a_directory_is_refused(runtime: Path, tmp_path: Path) -> None
 
 
 def test_without_a_wish_the_record_goes_with_the_run(runtime: Path) -> None:
-    private = run_directory.create()
+    private = new_run()
     record = run_directory.record_directory(private / "record")
     assert record == private / "record" and (record / "journal").is_dir()
     run_directory.remove(private)
@@ -118,7 +119,7 @@ def test_without_a_wish_the_record_goes_with_the_run(runtime: Path) -> None:
 
 
 def test_a_wished_record_stays(runtime: Path, tmp_path: Path) -> None:
-    private = run_directory.create()
+    private = new_run()
     record = run_directory.record_directory(tmp_path / "new" / "record")
     assert record == tmp_path / "new" / "record" and (record / "journal").is_dir()
     run_directory.remove(private)
@@ -147,7 +148,7 @@ def test_a_record_directory_that_cannot_be_made_is_refused(runtime: Path, tmp_pa
 
 def test_the_only_run_is_found_by_itself(runtime: Path, listeners: list[socket.socket]) -> None:
     private = alive(listeners)
-    run_directory.create()  # a run whose supervisor is gone: nobody listens
+    new_run()  # a run whose supervisor is gone: nobody listens
     assert run_directory.live() == [private.name]
     assert run_directory.find(None) == run_directory.find(private.name) == private
 
@@ -181,7 +182,7 @@ def test_a_dead_run_is_no_run(runtime: Path, listeners: list[socket.socket]) -> 
 
 
 def test_a_run_has_an_owner_until_it_is_removed(runtime: Path) -> None:
-    private = run_directory.create()
+    private = new_run()
     assert run_directory.owned(private)
     run_directory.remove(private)
     assert not run_directory.owned(private)
@@ -189,7 +190,7 @@ def test_a_run_has_an_owner_until_it_is_removed(runtime: Path) -> None:
 
 def test_a_child_of_its_owner_does_not_own_it(runtime: Path) -> None:
     """Else a run would seem alive as long as any other run of the same command."""
-    private = run_directory.create()
+    private = new_run()
     end, life = os.pipe()
     told, telling = os.pipe()
     child = os.fork()

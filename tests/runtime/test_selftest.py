@@ -130,7 +130,7 @@ def test_a_source_that_names_no_class(source: str, words: str) -> None:
 
 
 def test_a_brick_is_no_function() -> None:
-    from aftbed.runtime.unix.part import load_module  # noqa: PLC0415
+    from aftbed.runtime.unix.options import load_module  # noqa: PLC0415
 
     with pytest.raises(ConfigError, match="is no protected function: it lacks execute"):
         load_application("aftbed.ftm.chain:Compute", load_module)

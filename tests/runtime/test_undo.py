@@ -14,14 +14,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from aftbed.core.errors import StepFailed
-from aftbed.runtime.unix import cleanup, run_directory
-from aftbed.runtime.unix.cleanup import LATE_NS_MAX, Book, Ending, StoppedProcess, UndoLedger, Undone
+from aftbed.runtime.unix import cleanup, linux, run_directory
+from aftbed.runtime.unix.cleanup import (
+    LATE_NS_MAX,
+    LedgerReader,
+    StoppedProcess,
+    ThawOutcome,
+    UndoLedger,
+    Undone,
+)
 
 MS = 1_000_000
 
 
-def book_of(*entries: cleanup.Entry) -> Book:
-    book = Book(Path("nowhere"))
+def book_of(*entries: cleanup.Entry) -> LedgerReader:
+    book = LedgerReader(Path("nowhere"))
     for entry in entries:
         book.take(msgspec.json.encode(entry))
     return book
@@ -42,10 +49,10 @@ def waker() -> Iterator[int]:
 
 
 def test_what_was_undone_is_not_due(tmp_path: Path, waker: int) -> None:
-    ledger, book = UndoLedger(tmp_path, waker), Book(tmp_path)
+    ledger, book = UndoLedger(tmp_path, waker), LedgerReader(tmp_path)
     book.read()
     assert book.open == {}, "nothing has been written yet"
-    me, start = os.getpid(), run_directory.started(os.getpid())
+    me, start = os.getpid(), linux.started(os.getpid())
     before_ns = time.monotonic_ns()
     ledger.ahead("a/server", me, 50)
     assert os.eventfd_read(waker) == 1, "the warden is woken"
@@ -88,7 +95,7 @@ def test_what_lasts_as_long_as_the_run_wakes_nobody() -> None:
 
 def test_a_torn_line_is_read_when_it_is_whole(tmp_path: Path) -> None:
     line = msgspec.json.encode(stopped(100)) + b"\n"
-    book = Book(tmp_path)
+    book = LedgerReader(tmp_path)
     with open(tmp_path / cleanup.LEDGER_NAME, "ab", buffering=0) as file:
         file.write(line[:20])
         book.read()
@@ -142,7 +149,7 @@ def victim() -> Iterator[Victim]:
         assert process.stdout is not None and process.stdout.readline() == b"\n"
         os.kill(process.pid, signal.SIGSTOP)
         os.waitid(os.P_PID, process.pid, os.WSTOPPED)
-        return StoppedProcess("a/server", process.pid, run_directory.started(process.pid), 1)
+        return StoppedProcess("a/server", process.pid, linux.started(process.pid), 1)
 
     yield start
     for process in started:
@@ -153,26 +160,26 @@ def victim() -> Iterator[Victim]:
 @pytest.mark.process
 def test_a_stopped_process_of_the_run_goes_on(tmp_path: Path, victim: Victim) -> None:
     found = victim(tmp_path)
-    assert cleanup.thaw(found, tmp_path) is Ending.THAWED
-    assert run_directory.state_of(found.pid) != "T"
-    assert cleanup.thaw(found, tmp_path) is Ending.RAN
+    assert cleanup.thaw(found, tmp_path) is ThawOutcome.THAWED
+    assert linux.state_of(found.pid) != "T"
+    assert cleanup.thaw(found, tmp_path) is ThawOutcome.RAN
 
 
 @pytest.mark.process
 def test_a_process_of_another_run_or_of_none_is_not_touched(tmp_path: Path, victim: Victim) -> None:
     for found in (victim(tmp_path / "another"), victim(None)):
-        assert cleanup.thaw(found, tmp_path) is Ending.GONE
+        assert cleanup.thaw(found, tmp_path) is ThawOutcome.GONE
         cleanup.kill_open(book_of(found), tmp_path)
-        assert run_directory.state_of(found.pid) == "T"
+        assert linux.state_of(found.pid) == "T"
 
 
 @pytest.mark.process
 def test_a_process_that_got_the_pid_later_is_not_touched(tmp_path: Path, victim: Victim) -> None:
     found = victim(tmp_path)
     earlier = msgspec.structs.replace(found, start=found.start - 1)
-    assert cleanup.thaw(earlier, tmp_path) is Ending.GONE
+    assert cleanup.thaw(earlier, tmp_path) is ThawOutcome.GONE
     cleanup.kill_open(book_of(earlier), tmp_path)
-    assert run_directory.state_of(found.pid) == "T"
+    assert linux.state_of(found.pid) == "T"
 
 
 @pytest.mark.process
@@ -184,7 +191,7 @@ def test_what_is_overdue_is_undone_once_and_told(tmp_path: Path, victim: Victim,
     assert told[0].endswith(" ms over its time: thawed")
     assert book.open == {}
     line = (tmp_path / cleanup.LEDGER_NAME).read_bytes()
-    assert cleanup._decode(line) == Undone(found.pid, found.start, "warden")
+    assert cleanup.decode_entry(line) == Undone(found.pid, found.start, "warden")
 
 
 @pytest.mark.process

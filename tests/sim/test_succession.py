@@ -15,7 +15,7 @@ from aftbed.judge.checks import wrong_replies
 from aftbed.judge.reference import reference_run, succession
 from aftbed.judge.simulated import breaches
 from aftbed.runtime.sim.world import Doom, Run, Setup, World
-from aftbed.runtime.unix.part import load_module
+from aftbed.runtime.unix.options import load_module
 from aftbed.vehicle.aeb.function import default_application
 
 VERSIONS: Final = str(Path(versions.__file__).resolve())

@@ -278,7 +278,7 @@ class TestGateway:
 
 
 class FunctionGateway:
-    """The client process, as `runtime.unix.gateway` is: the gateway, with the bare function as its server.
+    """The client process, as `runtime.unix.devices` is: the gateway, with the bare function as its server.
 
     `named`: it gives the bus its name, what it uses, and what it notices; else it is an unnamed client.
     """

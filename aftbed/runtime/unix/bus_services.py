@@ -1,7 +1,9 @@
-"""The processes beside the graph: the hub, the car, the player of logs. Each ends with its control line."""
+"""The processes beside the graph: the hub, the vehicle, the player of logs. Each ends with its control
+line."""
 
 import os
 import select
+import socket
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,7 +13,7 @@ import msgspec
 from aftbed.core.errors import HarnessError
 from aftbed.inject.receipts import BusReport, ReceiptState
 from aftbed.runtime import control
-from aftbed.runtime.unix.options import PlayerOptions, VehicleOptions
+from aftbed.runtime.unix.options import PLAYER, CarRun, ReplayRun, SourceOptions
 from aftbed.runtime.unix.transport import Line
 from aftbed.vehicle.can.hub import Hub, HubOptions
 from aftbed.vehicle.can.hub import serve as serve_hub
@@ -21,14 +23,23 @@ if TYPE_CHECKING:
 
 
 def serve(line: Line[control.ToNode], order: control.Serve, fds: list[int]) -> None:
-    """Run the service that `order` names, until it is done or its line ends."""
-    if order.service == "hub":
-        _hub(line, order, fds)
-    elif order.service == "vehicle":
-        _vehicle(line, msgspec.msgpack.decode(order.options, type=VehicleOptions))
-    else:
-        assert order.service == "player", order.service
-        _player(line, msgspec.msgpack.decode(order.options, type=PlayerOptions))
+    """Run the service that `order` names, until it has finished or its line ends."""
+    if order.service == control.HUB:
+        _serve_hub(line, order, fds)
+        return
+    source = msgspec.msgpack.decode(order.options, type=SourceOptions)
+    run = _play if order.service == PLAYER else _drive
+    try:
+        run(line, source)
+    except HarnessError as error:
+        _report(line, "trouble", str(error).encode())
+
+
+def _report(line: Line[control.ToNode], kind: str, data: bytes = b"") -> None:
+    line.send(control.Report(kind, data))
+
+
+# -- the hub --------------------------------------------------------------------------------------
 
 
 class _Desk:
@@ -42,66 +53,66 @@ class _Desk:
     def attend(self, hub: Hub) -> bool:
         """Carry out the next order; False when the line has ended."""
         got = self._line.recv()
-        if got is None:
-            return False
-        order = got[0]
-        if isinstance(order, control.DisturbBus):
-            self._disturb(hub, order)
-            self._line.send(control.Report(control.BUS_FAULT_ARMED, str(order.token).encode()))
-        elif isinstance(order, control.WatchCar):
-            hub.watch(order.token, order.condition)
-            self._line.send(control.Report(control.CONDITION_WATCHED, str(order.token).encode()))
-        elif isinstance(order, control.Ack):
-            hub.go_on(order.token)
-        elif isinstance(order, control.Stats):
-            self._line.send(control.Report(control.BUS_FAULTS_ASKED, msgspec.msgpack.encode(self._reports())))
+        match got[0] if got is not None else None:
+            case None:
+                return False
+            case control.DisturbBus(number, fault, draw):
+                from aftbed.inject.bus_disturber import Disturber  # noqa: PLC0415 - few runs need it
+
+                self._faults = self._faults or Disturber()
+                self._faults.arm(number, fault, draw, hub.now_us())
+                hub.disturb(self._faults)
+                _report(self._line, control.BUS_FAULT_ARMED, str(number).encode())
+            case control.WatchCar(number, condition):
+                hub.watch(number, condition)
+                _report(self._line, control.CONDITION_WATCHED, str(number).encode())
+            case control.Ack(number):
+                hub.go_on(number)
+            case control.Stats():
+                _report(self._line, control.BUS_FAULTS_ASKED, msgspec.msgpack.encode(self._receipts()))
         return True
 
     def faults_acted(self) -> None:
-        """Report the faults whose receipt is another one than before."""
-        armed = ReceiptState.ARMED
-        found = self._reports()
-        news = [one for one in found if self._reported.get(one.number, armed) is not one.receipt.state]
+        """Report the faults whose receipt has another state than before."""
+        news = [
+            one
+            for one in self._receipts()
+            if self._reported.get(one.number, ReceiptState.ARMED) is not one.receipt.state
+        ]
         if news:
             self._reported |= {one.number: one.receipt.state for one in news}
-            self._line.send(control.Report(control.BUS_FAULTS_CHANGED, msgspec.msgpack.encode(news)))
+            _report(self._line, control.BUS_FAULTS_CHANGED, msgspec.msgpack.encode(news))
 
     def met(self, fault_number: int, t_us: int, since_ns: int) -> None:
-        """To the supervisor."""
-        self._line.send(
-            control.Report(control.CONDITION_MET, msgspec.msgpack.encode((fault_number, t_us, since_ns)))
-        )
+        """Report that the condition of a fault holds."""
+        data = msgspec.msgpack.encode((fault_number, t_us, since_ns))
+        _report(self._line, control.CONDITION_MET, data)
 
-    def _disturb(self, hub: Hub, order: control.DisturbBus) -> None:
-        from aftbed.inject.bus_disturber import Disturber  # noqa: PLC0415 - it needs the CRC, and few runs it
-
-        if self._faults is None:
-            self._faults = Disturber()
-        self._faults.arm(order.token, order.fault, order.draw, hub.now_us())
-        hub.disturb(self._faults)
-
-    def _reports(self) -> list[BusReport]:
+    def _receipts(self) -> list[BusReport]:
         return [] if self._faults is None else self._faults.reports()
 
 
-def _hub(line: Line[control.ToNode], order: control.Serve, fds: list[int]) -> None:
-    import socket  # noqa: PLC0415 - imported by all others already
-
+def _serve_hub(line: Line[control.ToNode], order: control.Serve, fds: list[int]) -> None:
     listener, log = fds
-    line.send(control.Report("ready", b""))
-    counts = serve_hub(
-        socket.socket(fileno=listener),
-        log,
-        msgspec.msgpack.decode(order.options, type=HubOptions),
-        line.fileno(),
-        _Desk(line),
-    )
+    _report(line, "ready")
+    options = msgspec.msgpack.decode(order.options, type=HubOptions)
+    counts = serve_hub(socket.socket(fileno=listener), log, options, line.fileno(), _Desk(line))
     os.close(log)
-    line.send(control.Report("result", msgspec.json.encode(counts)))
+    _report(line, "result", msgspec.json.encode(counts))
+
+
+# -- the vehicle and the player -------------------------------------------------------------------
+
+
+def _wait_for_go(line: Line[control.ToNode]) -> bool:
+    """Attached: wait for Resume; False if it is a Stop, or the end."""
+    _report(line, "ready")
+    got = line.recv()
+    return got is not None and isinstance(got[0], control.Resume)
 
 
 def _stopper(line: Line[control.ToNode]) -> Callable[[], bool]:
-    """Becomes true when the supervisor says Stop, or is gone."""
+    """A function that is true once the supervisor has sent Stop, or is gone."""
     poll = select.poll()
     poll.register(line.fileno(), select.POLLIN)
     stopped = False
@@ -114,45 +125,32 @@ def _stopper(line: Line[control.ToNode]) -> Callable[[], bool]:
     return stop
 
 
-def _wait_for_go(line: Line[control.ToNode]) -> bool:
-    """Attached: wait for Resume; False if it is a Stop, or the end."""
-    line.send(control.Report("ready", b""))
-    got = line.recv()
-    return got is not None and isinstance(got[0], control.Resume)
-
-
-def _vehicle(line: Line[control.ToNode], options: VehicleOptions) -> None:
+def _drive(line: Line[control.ToNode], source: SourceOptions) -> None:
     from aftbed.vehicle.can.bus import BusOptions  # noqa: PLC0415
     from aftbed.vehicle.can.dbc_file import load_dbc  # noqa: PLC0415
     from aftbed.vehicle.drive_real import CarBuses, DriveOptions, drive  # noqa: PLC0415
     from aftbed.vehicle.scenarios.library import load_scenario  # noqa: PLC0415
 
-    scenario, codec = load_scenario(options.scenario), load_dbc()
+    work = source.work
+    assert isinstance(work, CarRun), work
+    scenario, codec = load_scenario(work.scenario), load_dbc()
+    given = {"pace": work.pace, "brake_policy": work.brake_policy, "seed": source.seed}
+    options = msgspec.convert(given, DriveOptions)
     follows = (codec.can_id("AEB_REQ"),)
-    buses = CarBuses(BusOptions(port=options.port), lockstep=options.pace is None, follows=follows)
-    if not _wait_for_go(line):
-        return
-    try:
+    buses = CarBuses(BusOptions(port=source.port), lockstep=work.pace is None, follows=follows)
+    if _wait_for_go(line):
         result = drive(
             scenario,
             codec,
             buses,
-            msgspec.convert(
-                {"pace": options.pace, "brake_policy": options.brake_policy, "seed": options.seed},
-                DriveOptions,
-            ),
-            report=lambda telemetry: line.send(
-                control.Report("telemetry", msgspec.msgpack.encode(telemetry))
-            ),
+            options,
+            report=lambda telemetry: _report(line, "telemetry", msgspec.msgpack.encode(telemetry)),
             stop=_stopper(line),
         )
-    except HarnessError as error:
-        line.send(control.Report("trouble", str(error).encode()))
-        return
-    line.send(control.Report("result", msgspec.json.encode(result)))
+        _report(line, "result", msgspec.json.encode(result))
 
 
-def _player(line: Line[control.ToNode], options: PlayerOptions) -> None:
+def _play(line: Line[control.ToNode], source: SourceOptions) -> None:
     from aftbed.vehicle.can.bus import BusOptions, open_bus  # noqa: PLC0415
     from aftbed.vehicle.can.candump import read_log  # noqa: PLC0415
     from aftbed.vehicle.can.dbc_file import load_dbc  # noqa: PLC0415
@@ -160,26 +158,19 @@ def _player(line: Line[control.ToNode], options: PlayerOptions) -> None:
     from aftbed.vehicle.replay.mapped_gateway import MappedGateway  # noqa: PLC0415
     from aftbed.vehicle.replay.player import play  # noqa: PLC0415
 
-    gateway = MappedGateway(load_dbc(), Path(options.dbc), find_map(options.map))
-    frames, counts = read_log(Path(options.log))
-    attached = open_bus(BusOptions(port=options.port, node="player"))
-    if not _wait_for_go(line):
-        return
-    try:
+    work = source.work
+    assert isinstance(work, ReplayRun), work
+    gateway = MappedGateway(load_dbc(), Path(work.dbc), find_map(work.map))
+    frames, counts = read_log(Path(work.log))
+    bus = open_bus(BusOptions(port=source.port, node=PLAYER))
+    if _wait_for_go(line):
         result = play(
             frames,
             load_dbc(),
-            attached,
-            options.pace,
+            bus,
+            work.pace,
             ends_cycle=lambda frame: gateway.on_frame(frame) is not None,
             stop=_stopper(line),
         )
-    except HarnessError as error:
-        line.send(control.Report("trouble", str(error).encode()))
-        return
-    line.send(
-        control.Report(
-            "result",
-            msgspec.json.encode({"played": result, "log": counts, "gateway": gateway.counts}),
-        )
-    )
+        report = {"played": result, "log": counts, "gateway": gateway.counts}
+        _report(line, "result", msgspec.json.encode(report))

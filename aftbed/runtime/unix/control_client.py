@@ -1,8 +1,12 @@
-"""What another command asks of a live run, and the answer. One packet each way per question."""
+"""The control protocol of a live run, and its client: one packet each way per request.
+
+A *query* reads, a *command* changes something. `control_server` answers them.
+"""
 
 import json
 import socket
 import struct
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Final
@@ -14,23 +18,33 @@ from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.core.messages import Goal
 from aftbed.inject.model import Fault
 from aftbed.runtime.unix import run_directory
-from aftbed.runtime.unix.resources import ProcessRow
 from aftbed.runtime.unix.transport import Line
 
 ANSWER_SECONDS_MAX: Final = 2.0
 ADAPT_SECONDS_MAX: Final = 15.0  # to prepare, commit, observe and finish, on a busy machine
+CPU_SAMPLE_SECONDS: Final = 0.2
 
 
 class StatusQuery(msgspec.Struct, frozen=True, tag=True):
-    """How the run is."""
+    """The state of the run."""
 
 
 class ProcessesQuery(msgspec.Struct, frozen=True, tag=True):
-    """Names, roles and pids."""
+    """All processes, as `ProcessRow`."""
 
 
 class GraphQuery(msgspec.Struct, frozen=True, tag=True):
-    """The graph, as JSON."""
+    """The graph that runs."""
+
+
+class AdaptationsQuery(msgspec.Struct, frozen=True, tag=True):
+    """The adaptations that have ended."""
+
+
+class PlanQuery(msgspec.Struct, frozen=True, tag=True):
+    """The plan of an adaptation to `goal`, and that of the way back, as `PlanAnswer`."""
+
+    goal: Goal
 
 
 class InjectCommand(msgspec.Struct, frozen=True, tag=True):
@@ -40,30 +54,20 @@ class InjectCommand(msgspec.Struct, frozen=True, tag=True):
 
 
 class AdaptCommand(msgspec.Struct, frozen=True, tag=True):
-    """Adapt; answered when it has ended."""
+    """Adapt; answered when the adaptation has ended."""
 
     goal: Goal
-
-
-class PlanQuery(msgspec.Struct, frozen=True, tag=True):
-    """The plan of an adaptation to `goal`, and that of the way back; nothing is changed. See `Planned`."""
-
-    goal: Goal
-
-
-class PlanAnswer(msgspec.Struct, frozen=True):
-    """The answer to PlanFor."""
-
-    there: Plan
-    back: Plan
-
-
-class AdaptationsQuery(msgspec.Struct, frozen=True, tag=True):
-    """Those that have ended."""
 
 
 class StopCommand(msgspec.Struct, frozen=True, tag=True):
     """End the run."""
+
+
+class PlanAnswer(msgspec.Struct, frozen=True):
+    """Of a PlanQuery."""
+
+    there: Plan
+    back: Plan
 
 
 class Answer(msgspec.Struct, frozen=True, tag=True):
@@ -73,18 +77,30 @@ class Answer(msgspec.Struct, frozen=True, tag=True):
     error: str = ""
 
 
-Question = (
+ControlRequest = (
     StatusQuery
     | ProcessesQuery
     | GraphQuery
+    | AdaptationsQuery
+    | PlanQuery
     | InjectCommand
     | AdaptCommand
-    | PlanQuery
-    | AdaptationsQuery
     | StopCommand
 )
-decode_question: Callable[[bytes], Question] = msgspec.msgpack.Decoder(Question).decode
+decode_request: Callable[[bytes], ControlRequest] = msgspec.msgpack.Decoder(ControlRequest).decode
 decode_answer: Callable[[bytes], Answer] = msgspec.msgpack.Decoder(Answer).decode
+
+
+class ProcessRow(msgspec.Struct, frozen=True):
+    """A process of a run; `node`: one of the graph, or the supervisor."""
+
+    name: str
+    role: str
+    pid: int
+    node: bool
+    cpu_percent: float = 0.0
+    pss_mb: float = 0.0
+    rss_mb: float = 0.0
 
 
 def same_user(sock: socket.socket, uid: int) -> bool:
@@ -93,34 +109,29 @@ def same_user(sock: socket.socket, uid: int) -> bool:
     return bool(struct.unpack("3i", raw)[1] == uid)
 
 
-def processes(private: Path) -> list[ProcessRow]:
-    """The processes of the run in `private`."""
-    return msgspec.convert(ask(private, ProcessesQuery())["processes"], list[ProcessRow])
+def ask(private: Path, request: ControlRequest, seconds: float = ANSWER_SECONDS_MAX) -> dict[str, object]:
+    """The answer of the run in `private`.
+
+    Raises ConfigError with its refusal, HarnessError without an answer.
+    """
+    return receive(send(private, request), seconds)
 
 
-Waiting = Line[Answer]
-
-
-def ask(private: Path, question: Question, seconds: float = ANSWER_SECONDS_MAX) -> dict[str, object]:
-    """Ask the run in `private`. Raises ConfigError with its refusal, HarnessError without an answer."""
-    return receive(send(private, question), seconds)
-
-
-def send(private: Path, question: Question) -> Waiting:
-    """Ask; the answer is for `receive`. Raises ConfigError where nobody listens."""
+def send(private: Path, request: ControlRequest) -> Line[Answer]:
+    """Send a request, whose answer `receive` takes. Raises ConfigError if no supervisor listens."""
     try:
         line = Line(run_directory.connect(private), decode_answer)
     except OSError as error:
         raise ConfigError(f"run {private.name} does not answer: {error.strerror}") from None
     try:
-        line.send(question)
+        line.send(request)
     except OSError as error:
         line.close()
         raise HarnessError(f"run {private.name} does not hear: {error.strerror}") from None
     return line
 
 
-def receive(line: Waiting, seconds: float = ANSWER_SECONDS_MAX) -> dict[str, object]:
+def receive(line: Line[Answer], seconds: float = ANSWER_SECONDS_MAX) -> dict[str, object]:
     """The answer. Raises ConfigError with a refusal, HarnessError without an answer."""
     try:
         line.sock.settimeout(seconds)
@@ -136,4 +147,32 @@ def receive(line: Waiting, seconds: float = ANSWER_SECONDS_MAX) -> dict[str, obj
         raise ConfigError(answer.error)
     found = json.loads(answer.data)
     assert isinstance(found, dict)
+    return found
+
+
+def processes(private: Path) -> list[ProcessRow]:
+    """The processes of the run in `private`."""
+    return msgspec.convert(ask(private, ProcessesQuery())["processes"], list[ProcessRow])
+
+
+def measured(rows: list[ProcessRow]) -> list[ProcessRow]:
+    """`rows` with CPU over `CPU_SAMPLE_SECONDS`, PSS and RSS; without processes that have ended meanwhile."""
+    import psutil  # noqa: PLC0415 - it costs 15 ms
+
+    alive, found = [], []
+    for row in rows:
+        try:
+            process = psutil.Process(row.pid)
+            process.cpu_percent()
+            alive.append((row, process))
+        except psutil.Error:
+            continue
+    time.sleep(CPU_SAMPLE_SECONDS)  # what is sampled, not what is waited for
+    for row, process in alive:
+        try:
+            memory, cpu = process.memory_full_info(), process.cpu_percent()
+        except psutil.Error:
+            continue
+        pss_mb, rss_mb = round(memory.pss / 1e6, 2), round(memory.rss / 1e6, 2)
+        found.append(msgspec.structs.replace(row, cpu_percent=cpu, pss_mb=pss_mb, rss_mb=rss_mb))
     return found

@@ -1,4 +1,4 @@
-"""What other commands ask of a live run, answered by the supervisor between other things.
+"""The control socket of a live run: the supervisor answers other commands between other things.
 
 Only a process of the same user gets a connection (SO_PEERCRED); what it sends is decoded whole or not
 at all, and a bad packet ends its connection and nothing else.
@@ -9,63 +9,59 @@ import os
 import socket
 import time
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Final, assert_never
 
 import msgspec
 
 from aftbed.adapt.planner import plan
 from aftbed.core.errors import AftbedError, ConfigError
-from aftbed.runtime.adaptations import Adaptations, Outcome
-from aftbed.runtime.deployment import Deployment
-from aftbed.runtime.fault_controller import FaultController
+from aftbed.runtime.adaptations import Outcome
 from aftbed.runtime.interface import ProcessKind
+from aftbed.runtime.run_controller import RunController
 from aftbed.runtime.unix import control_client, run_directory
+from aftbed.runtime.unix.control_client import Answer, ControlRequest, ProcessRow
 from aftbed.runtime.unix.event_loop import EventLoop
 from aftbed.runtime.unix.options import RunOptions
-from aftbed.runtime.unix.resources import ProcessRow
 from aftbed.runtime.unix.transport import Line
-from aftbed.runtime.unix.workload import Work
+from aftbed.runtime.unix.workload import Workload
 
-BESIDE: Final = (ProcessKind.ZYGOTE, ProcessKind.SPARE, ProcessKind.SERVICE, ProcessKind.STAGED)
-QUESTIONS_MAX: Final = 16  # connections at once, and questions that wait for the launch
+NOT_IN_GRAPH: Final = (ProcessKind.ZYGOTE, ProcessKind.SPARE, ProcessKind.SERVICE, ProcessKind.STAGED)
+REQUESTS_MAX: Final = 16  # connections at once, and requests that wait for the launch
 
 
 class ControlServer:
-    """The control socket of the run."""
+    """Of one run. `finish` ends it."""
 
     def __init__(
         self,
         options: RunOptions,
         loop: EventLoop,
-        deployment: Deployment,
-        faults: FaultController,
-        adaptations: Adaptations,
-        work: Work,
+        controller: RunController,
+        work: Workload,
         finish: Callable[[str], None],
     ) -> None:
-        self._options, self._loop, self._deployment = options, loop, deployment
-        self._faults, self._work, self._finish = faults, work, finish
-        self._adaptations = adaptations
+        self._options, self._loop, self._work, self._finish = options, loop, work, finish
+        self._deployment = controller.deployment
+        self._faults, self._adaptations = controller.faults, controller.adaptations
         self._started_ns = time.monotonic_ns()
-        self._lines: dict[int, Line[control_client.Question]] = {}
-        # Requests that came before the graph stood; None since then.
-        self._early: list[tuple[Line[control_client.Question], control_client.Question]] | None = []
-
-    def launched(self) -> None:
-        """The graph is whole, and the function works: from here on it can be disturbed and changed."""
-        early, self._early = self._early, None
-        for line, question in early or ():
-            if self._lines.get(line.fileno()) is line:  # who waits no longer was told that it failed
-                self._reply(line, question)
+        self._lines: dict[int, Line[ControlRequest]] = {}
+        # Requests that came before the graph was complete; None since then.
+        self._early: list[tuple[Line[ControlRequest], ControlRequest]] | None = []
 
     def listen(self) -> None:
-        """Open the socket; from here on the run is found by other commands."""
+        """Open the socket; from here on other commands find the run."""
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
         self._listener.bind(str(Path(self._options.private) / run_directory.SOCKET_NAME))
-        self._listener.listen(QUESTIONS_MAX)
+        self._listener.listen(REQUESTS_MAX)
         self._loop.read(self._listener.fileno(), self._accept)
+
+    def launched(self) -> None:
+        """The graph is complete, and the function works: from here on it can be disturbed and changed."""
+        early, self._early = self._early, None
+        for line, request in early or ():
+            if self._lines.get(line.fileno()) is line:  # else the command has given up
+                self._answer(line, request)
 
     def _accept(self) -> None:
         try:
@@ -73,75 +69,83 @@ class ControlServer:
         except OSError:
             return
         sock.setblocking(False)
-        if not control_client.same_user(sock, os.getuid()) or len(self._lines) >= QUESTIONS_MAX:
+        if not control_client.same_user(sock, os.getuid()) or len(self._lines) >= REQUESTS_MAX:
             sock.close()
             return
-        line = self._lines[sock.fileno()] = Line(sock, control_client.decode_question)
-        self._loop.read(sock.fileno(), lambda: self._answer(line))
+        line = self._lines[sock.fileno()] = Line(sock, control_client.decode_request)
+        self._loop.read(sock.fileno(), lambda: self._read(line))
 
-    def _answer(self, line: Line[control_client.Question]) -> None:
+    def _read(self, line: Line[ControlRequest]) -> None:
         try:
             got = line.recv()
         except BlockingIOError:
             return
         except (OSError, AftbedError):
             got = None
-        if got is not None:
-            for fd in got[1]:  # nobody asked for descriptors
-                os.close(fd)
-            self._reply(line, got[0])
+        if got is None:
+            self._loop.forget(line.fileno())
+            self._lines.pop(line.fileno(), None)
+            line.close()
             return
-        self._loop.forget(line.fileno())
-        self._lines.pop(line.fileno(), None)
-        line.close()
+        request, fds = got
+        for fd in fds:  # no request has any
+            os.close(fd)
+        self._answer(line, request)
 
-    def _send_answer(self, line: Line[control_client.Question], answer: control_client.Answer) -> None:
-        try:
-            line.send(answer)
-        except OSError:
-            return
+    def _answer(self, line: Line[ControlRequest], request: ControlRequest) -> None:
+        def answer(data: bytes, error: str = "") -> None:
+            try:
+                line.send(Answer(data, error))
+            except OSError:
+                return
 
-    def _reply(self, line: Line[control_client.Question], question: control_client.Question) -> None:
-        answer = partial(self._send_answer, line)
         try:
-            match question:
-                case control_client.InjectCommand() | control_client.AdaptCommand() if (
-                    self._early is not None
-                ):
-                    if len(self._early) >= QUESTIONS_MAX:
-                        raise ConfigError("the run has not started yet: ask again when it has")
-                    self._early.append((line, question))
-                case control_client.StatusQuery():
-                    answer(control_client.Answer(json.dumps(self.status()).encode()))
-                case control_client.ProcessesQuery():
-                    answer(control_client.Answer(msgspec.json.encode({"processes": self.processes()})))
-                case control_client.GraphQuery():
-                    answer(control_client.Answer(msgspec.json.encode(self._deployment.graph)))
-                case control_client.InjectCommand(fault):
-                    fault.check(self._deployment.graph)
-                    self._loop.tasks.start(
-                        "inject",
-                        self._faults.arm(fault),
-                        lambda failure: answer(
-                            control_client.Answer(json.dumps({"armed": str(fault)}).encode(), error=failure)
-                        ),
-                    )
-                case control_client.AdaptCommand(goal):
-                    self._adaptations.ask(goal, lambda outcome: answer(_told(outcome)))
-                case control_client.PlanQuery(goal):
-                    there = self._adaptations.plan(goal)
-                    back = plan(there.new, there.old, goal.recipe)
-                    answer(control_client.Answer(msgspec.json.encode(control_client.PlanAnswer(there, back))))
-                case control_client.AdaptationsQuery():
-                    answer(control_client.Answer(self._adaptations.to_json()))
-                case control_client.StopCommand():
-                    self._finish("stopped")
-                    answer(control_client.Answer(b'{"stopping": true}'))
+            self._carry_out(line, request, answer)
         except ConfigError as error:
-            answer(control_client.Answer(error=str(error)))
+            answer(b"{}", str(error))
 
-    def status(self) -> dict[str, object]:
-        """How the run is, for `aftbed status`."""
+    def _carry_out(
+        self, line: Line[ControlRequest], request: ControlRequest, answer: Callable[..., None]
+    ) -> None:
+        """Carry out one request; `answer` may be called later. Raises ConfigError."""
+        match request:
+            case control_client.StatusQuery():
+                answer(json.dumps(self._status()).encode())
+            case control_client.ProcessesQuery():
+                answer(msgspec.json.encode({"processes": self._processes()}))
+            case control_client.GraphQuery():
+                answer(msgspec.json.encode(self._deployment.graph))
+            case control_client.AdaptationsQuery():
+                answer(self._adaptations.to_json())
+            case control_client.PlanQuery(goal):
+                there = self._adaptations.plan(goal)
+                back = plan(there.new, there.old, goal.recipe)
+                answer(msgspec.json.encode(control_client.PlanAnswer(there, back)))
+            case control_client.StopCommand():
+                self._finish("stopped")
+                answer(b'{"stopping": true}')
+            case _ if self._early is not None:
+                if len(self._early) >= REQUESTS_MAX:
+                    raise ConfigError("the run has not started yet: ask again when it has")
+                self._early.append((line, request))
+            case control_client.InjectCommand(fault):
+                fault.check(self._deployment.graph)
+                armed = json.dumps({"armed": str(fault)}).encode()
+                self._loop.tasks.start(
+                    "inject", self._faults.arm(fault), lambda failure: answer(armed, failure)
+                )
+            case control_client.AdaptCommand(goal):
+
+                def adapted(outcome: Outcome) -> None:
+                    refused = outcome.outcome == "refused"  # any other outcome is an answer
+                    answer(msgspec.json.encode(outcome), outcome.reason if refused else "")
+
+                self._adaptations.ask(goal, adapted)
+            case _:
+                assert_never(request)
+
+    def _status(self) -> dict[str, object]:
+        """For `aftbed status`."""
         deployment = self._deployment
         return {
             "run": self._options.run,
@@ -159,7 +163,7 @@ class ControlServer:
             "vehicle": self._work.telemetry,
         }
 
-    def processes(self) -> list[ProcessRow]:
+    def _processes(self) -> list[ProcessRow]:
         """Every process of the run; the nodes and the supervisor are the paper's count."""
         deployment = self._deployment
         rows = [ProcessRow("supervisor", "master", os.getpid(), True)]
@@ -167,11 +171,5 @@ class ControlServer:
             process = deployment.nodes.get(node)
             if process is not None and process.alive:
                 rows.append(ProcessRow(node, deployment.role_of(node), process.pid, True))
-        others = [p for p in deployment.pool.processes if p.kind in BESIDE and p.pid]
+        others = [p for p in deployment.pool.processes if p.kind in NOT_IN_GRAPH and p.pid]
         return rows + [ProcessRow(p.name, p.kind.value, p.pid, False) for p in others]
-
-
-def _told(outcome: Outcome) -> control_client.Answer:
-    """What the one who asked for an adaptation hears: only what was refused is an error."""
-    refused = outcome.outcome == "refused"
-    return control_client.Answer(msgspec.json.encode(outcome), error=outcome.reason if refused else "")

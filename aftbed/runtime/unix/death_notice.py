@@ -1,13 +1,13 @@
-"""The lifeline: word of a death half a millisecond before the pidfd has it.
+"""The lifeline: notice of a death half a millisecond before the pidfd has it.
 
-A process that is killed first gives back its memory, page by page, and only then becomes a zombie that
-a pidfd reports. But before the memory goes, the kernel walks the list of robust futexes that the dead
-thread held (set_robust_list(2)), marks each with `FUTEX_OWNER_DIED` and wakes who waits for it. So each
-node holds one, a word in the header of its journal, and each Watchdog's host has a thread that waits
-for the words of its replica, all in one call (futex_waitv(2), Linux 5.16).
+A process that is killed first returns its memory, page by page, and only then becomes a zombie that a pidfd
+reports. But before that, the kernel walks the list of robust futexes that the dead thread held
+(set_robust_list(2)), marks each with `FUTEX_OWNER_DIED` and wakes its waiters. So each node holds one, a
+word in the header of its journal, and the host of each Watchdog has a thread that waits for the words of its
+replica, all in one call (futex_waitv(2), Linux 5.16).
 
-No instruction of the dead process runs after that point, so a word is as good as a pidfd; where a kernel
-has no futex_waitv, the pidfds, which are watched all the same, tell it later.
+No instruction of the dead process runs after that point, so a word is as good as a pidfd. The pidfds are
+watched, too: they report the death later where the kernel has no futex_waitv.
 
 The thread is one of `_thread`: the mere import of `threading` has each child of a fork do work and write to
 pages, 0.3 ms of CPU in each node and each spare (measured).
@@ -32,7 +32,7 @@ FUTEX_WAITERS: Final = 0x8000_0000
 FUTEX_OWNER_DIED: Final = 0x4000_0000
 FUTEX2_SIZE_U32: Final = 2  # and not private: the word is shared between processes
 CLOCK_MONOTONIC: Final = 1
-WAIT_SECONDS: Final = 0.25  # then the thread looks whether it is still wanted
+WAIT_SECONDS: Final = 0.25  # then the thread checks whether it is still wanted
 
 _libc: Final = ctypes.CDLL(None, use_errno=True)
 
@@ -62,7 +62,7 @@ class _Timespec(ctypes.Structure):
     _fields_ = (("seconds", ctypes.c_long), ("nanoseconds", ctypes.c_long))
 
 
-class Word:
+class _Word:
     """The futex in the header of the journal at `path`, mapped by itself: a journal's mapping may move."""
 
     def __init__(self, path: Path) -> None:
@@ -84,11 +84,11 @@ class Word:
         self._word.value = value
 
 
-class Held:
-    """This thread's word. Keep it: the kernel reads its memory when this thread dies."""
+class Lifeline:
+    """This thread's lifeline. Keep it: the kernel reads its memory when this thread dies."""
 
     def __init__(self, path: Path) -> None:
-        self._word = Word(path)
+        self._word = _Word(path)
         self._entry, self._head = _RobustList(), _RobustListHead()
         self._entry.next = ctypes.addressof(self._head)
         self._head.next = ctypes.addressof(self._entry)
@@ -100,16 +100,16 @@ class Held:
             self._word.value = _thread.get_native_id() | FUTEX_WAITERS
 
 
-class Watcher:
+class LifelineWatcher:
     """Writes the indices of the first holders that die into a pipe, one byte each; `fd` is its reading end.
 
-    The first death ends it: the replica is given up then, and who dies next would only take the CPU
-    from the one that takes over (0.3 ms of a failover, measured).
+    The first death ends it: the replica is lost then, and to handle further deaths would only take the CPU
+    from the replica that takes over (0.3 ms of a failover, measured).
     """
 
     def __init__(self, paths: tuple[str, ...]) -> None:
         self.fd, self._pipe = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
-        self._words = [Word(Path(path)) for path in paths]
+        self._words = [_Word(Path(path)) for path in paths]
         self._wanted = _thread.allocate_lock()  # held until it is closed
         self._wanted.acquire()
         _thread.start_new_thread(self._watch, ())
@@ -146,7 +146,7 @@ class Watcher:
             os.close(self._pipe)
 
     @staticmethod
-    def _wait(words: list[Word]) -> bool:
+    def _wait(words: list[_Word]) -> bool:
         """Until one of `words` changes, or a while has passed; False where the kernel cannot do it."""
         waiters = (_Waiter * len(words))()
         for waiter, word in zip(waiters, words, strict=True):

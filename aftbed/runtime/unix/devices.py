@@ -1,40 +1,47 @@
-"""What the devices of a node that is a process work with: pidfds, lifelines and pulses; a load's options."""
+"""The devices of nodes that are processes: what a Watchdog senses with, and where the Client's requests come
+from.
+"""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
-import msgspec
-
-from aftbed.core.journal import Entry, entries
+from aftbed.core.journal import entries
+from aftbed.core.messages import Reply
 from aftbed.ftm.client import Client
 from aftbed.runtime import control
-from aftbed.runtime.devices import Load, resume_client
+from aftbed.runtime.devices import CarDevice, Device, Load, resume_client
 from aftbed.runtime.unix import linux
-from aftbed.runtime.unix.death_notice import Watcher
+from aftbed.runtime.unix.death_notice import LifelineWatcher
 from aftbed.runtime.unix.journal_files import DialogueFile, Header
+from aftbed.runtime.unix.options import GATEWAY, LoadRun, ReplayRun, SourceOptions
+from aftbed.vehicle.aeb.function import sample_requests
 
-STALE_NS: Final = 35_000_000  # a pulse older than this is looked into; it comes every 20 ms
+if TYPE_CHECKING:
+    from aftbed.vehicle.gateway import BusGateway
+
+STALE_NS: Final = 35_000_000  # a pulse that is older is looked into; it comes every 20 ms
+LOAD_REQUESTS: Final = 512
 
 
 class ProcessSenses:
     """The `Senses` of a Watchdog: lifelines and pidfds for deaths, journals for pulses."""
 
     def __init__(self) -> None:
+        self._nodes: tuple[str, ...] = ()
         self._pidfds: dict[int, str] = {}
         self._headers: dict[str, Header] = {}
-        self._nodes: tuple[str, ...] = ()
-        self._lifelines: Watcher | None = None
         self._starvation: dict[str, linux.Starvation] = {}
+        self._lifelines: LifelineWatcher | None = None
 
     def watch(self, order: control.WatchNodes, fds: list[int], died: Callable[[str], None]) -> None:
         """Watch these nodes and no others; `fds` are their pidfds. Deaths are read from `fds()`."""
-        nodes = order.nodes
+        self._nodes = nodes = order.nodes
         self._pidfds = dict(zip(fds, nodes, strict=True))
         self._headers = {n: Header(Path(j)) for n, j in zip(nodes, order.journals, strict=True)}
-        self._nodes, self._lifelines = nodes, Watcher(order.journals)
         self._starvation = {n: linux.Starvation(pid) for n, pid in zip(nodes, order.pids, strict=True)}
+        self._lifelines = LifelineWatcher(order.journals)
 
     def forget(self) -> None:
         """Watch no node."""
@@ -67,23 +74,70 @@ class ProcessSenses:
         return pulse_ns
 
 
-def entries_of(dialogues: tuple[str, ...]) -> list[Entry]:
-    """The entries of the dialogues of earlier Clients, in order."""
-    return [entry for path in dialogues for entry in entries(Path(path).read_bytes())]
+class BusLink:
+    """The `CarLink` over a bus: frames in, requests to the Client, replies out as AEB_REQ."""
+
+    def __init__(self, gateway: "BusGateway", port: int) -> None:
+        from aftbed.vehicle.can.bus import BusOptions, open_bus  # noqa: PLC0415 - see make_source
+
+        self._gateway = gateway
+        self._bus = open_bus(BusOptions(port=port, node=GATEWAY, uses=gateway.uses))
+
+    def fds(self) -> tuple[int, ...]:
+        """The bus."""
+        return (self._bus.fileno(),)
+
+    def read(self) -> Iterator[bytes]:
+        """The requests that all frames that are there make."""
+        for frame in self._bus.drain():
+            payload = self._gateway.on_frame(frame)
+            if payload is not None:
+                yield payload
+            elif frame.can_id == self._gateway.request_id:
+                self._bus.unasked(frame.can_id)
+        for can_id, word in self._gateway.noticed():
+            self._bus.notice(can_id, word)
+
+    def advance(self, now_ns: int) -> tuple[bytes, ...]:
+        """None: frames come by themselves."""
+        return ()
+
+    def deliver(self, reply: Reply, now_ns: int) -> None:
+        """Send the reply as frames."""
+        for frame in self._gateway.on_reply(reply.payload, reply.replica, reply.epoch):
+            self._bus.send(frame)
+
+    def deadline_ns(self) -> int | None:
+        """None: frames come by themselves."""
+        return None
+
+    def counts(self) -> dict[str, object]:
+        """The frames that the gateway accepted and refused."""
+        counts = self._gateway.counts
+        return {
+            "replies_refused": self._gateway.replies_refused,
+            "accepted": counts.accepted,
+            "ignored": counts.ignored,
+            "refused": counts.refused,
+        }
 
 
-class LoadOptions(msgspec.Struct, frozen=True):
-    """`rate_hz` 0 is a closed loop: the next request follows the reply. Stops after `count`."""
+def make_source(client: Client, options: SourceOptions) -> Device:
+    """Where the requests of a Client come from; the Client takes over from its predecessors."""
+    resume_client(client, [entry for path in options.earlier for entry in entries(Path(path).read_bytes())])
+    dialogue, work = DialogueFile(Path(options.dialogue), "client"), options.work
+    if isinstance(work, LoadRun):
+        requests = sample_requests(options.seed, LOAD_REQUESTS)
+        return Load(client, dialogue, requests, work.count, work.rate_hz)
+    # Imported here: the bus costs 150 ms to import, and only the zygote of the bus has it.
+    from aftbed.vehicle.can.dbc_file import load_dbc  # noqa: PLC0415
+    from aftbed.vehicle.gateway import Gateway  # noqa: PLC0415
+    from aftbed.vehicle.replay.map_file import find_map  # noqa: PLC0415
+    from aftbed.vehicle.replay.mapped_gateway import MappedGateway  # noqa: PLC0415
 
-    seed: int
-    count: int
-    rate_hz: float
-    dialogue: str
-    earlier: tuple[str, ...] = ()
-
-
-def make_load(client: Client, options: LoadOptions, requests: list[bytes]) -> Load:
-    """A load for a Client that may have had predecessors."""
-    resume_client(client, entries_of(options.earlier))
-    dialogue = DialogueFile(Path(options.dialogue), "client")
-    return Load(client, dialogue, requests, options.count, options.rate_hz)
+    gateway: BusGateway = (
+        MappedGateway(load_dbc(), Path(work.dbc), find_map(work.map))
+        if isinstance(work, ReplayRun)
+        else Gateway(load_dbc())
+    )
+    return CarDevice(client, dialogue, BusLink(gateway, options.port))

@@ -1,7 +1,7 @@
-"""What of this machine is missing, or in the way: each check says what it is for and what to do.
+"""What this machine lacks for a run: each check says what it is for and what to do.
 
 `missing` is what a run cannot do without; `warning` is what makes it slower, what makes its figures
-worse, or what only some commands need. A check tries the thing itself where that does no harm, and reads
+worse, or what only some commands need. A check tries the thing itself if that does no harm, and reads
 no version numbers: a kernel has many calls that its sandbox refuses.
 """
 
@@ -17,7 +17,7 @@ import shutil
 import signal
 import socket
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final, Literal
 
@@ -36,8 +36,10 @@ FREE_BYTES_MIN, FREE_BYTES_GOOD = 50_000_000, 500_000_000  # a run of some minut
 SOCKET_PATH_MAX: Final = 107  # unix(7), without the NUL
 STEAL_SECONDS: Final = 0.2
 STEAL_MAX: Final = 0.01
+STEAL: Final = 7  # the field of the line `cpu` in /proc/stat
 PR_GET_PDEATHSIG: Final = 2
-OPTIONAL: Final = {  # what some commands use where it is there
+SANDBOX: Final = "Linux 5.4 or later, and a sandbox (container, seccomp) that allows it"
+OPTIONAL: Final = {  # what some commands use if it is installed
     "scipy": "exact intervals of a campaign's statistics",
     "jinja2": "the HTML report of a campaign",
     "pyarrow": "export of a campaign's records as Parquet",
@@ -49,7 +51,7 @@ _libc: Final = ctypes.CDLL(None, use_errno=True)
 
 
 class HostCheck(msgspec.Struct, frozen=True):
-    """One thing looked at: what was found, what it is for, and what to do unless it is `ok`."""
+    """What was found, what it is for, and what to do unless it is `ok`."""
 
     name: str
     status: Status
@@ -60,14 +62,38 @@ class HostCheck(msgspec.Struct, frozen=True):
 
 def inspect() -> list[HostCheck]:
     """Every check, in the order in which a run needs them."""
-    return [*kernel(), *limits(), *place(), *python(), *extras(), foreign_memory(), *measuring()]
+    return [*_kernel(), *_limits(), *_place(), *_python(), *_extras(), _foreign_memory(), *_measuring()]
 
 
 def _check(name: str, status: Status, found: str, serves: str, remedy: str) -> HostCheck:
     return HostCheck(name, status, found, serves, "" if status == "ok" else remedy)
 
 
+def _graded(value: float, minimum: float, good: float) -> Status:
+    return "missing" if value < minimum else "warning" if value < good else "ok"
+
+
 # -- the kernel -----------------------------------------------------------------------------------
+
+
+def _kernel() -> Iterator[HostCheck]:
+    """System calls without which there is no run, and those without which it is slower."""
+    yield _tried("pidfd", "deaths are seen; a signal reaches the process that was meant", SANDBOX, _pidfd)
+    yield _tried("memfd", "states above a packet travel; the mark of a run", SANDBOX, _memfd)
+    yield _tried("parent death signal", "no process outlives its run (G7)", SANDBOX, _parent_death_signal)
+    yield _tried("packet sockets", "the channels between bricks", SANDBOX, _packets)
+    yield _tried("loopback", "the CAN bus between processes", "bring the interface lo up", _loopback)
+    yield _tried("/proc", "hangs, stops and leftovers are seen", "mount proc(5) at /proc", _process_files)
+    ctypes.set_errno(0)
+    _libc.syscall(SYS_FUTEX_WAITV, None, 0, 0, None, 0)  # nothing to wait for: EINVAL where it exists
+    there = ctypes.get_errno() != errno.ENOSYS
+    yield _check(
+        "futex_waitv",
+        "ok" if there else "warning",
+        "works" if there else "the kernel has none",
+        "a death is seen half a millisecond earlier",
+        "Linux 5.16 or later",
+    )
 
 
 def _tried(name: str, serves: str, remedy: str, call: Callable[[], object]) -> HostCheck:
@@ -119,138 +145,85 @@ def _process_files() -> None:
     os.listdir("/proc/self/fd")  # noqa: PTH208 - its names are all that is wanted
 
 
-def kernel() -> list[HostCheck]:
-    """System calls without which there is no run, and those without which it is slower."""
-    sandbox = "Linux 5.4 or later, and a sandbox (container, seccomp) that allows it"
-    return [
-        _tried("pidfd", "deaths are seen; a signal reaches the process that was meant", sandbox, _pidfd),
-        _tried("memfd", "states above a packet travel; the mark of a run", sandbox, _memfd),
-        _tried("parent death signal", "no process outlives its run (G7)", sandbox, _parent_death_signal),
-        _tried("packet sockets", "the channels between bricks", sandbox, _packets),
-        _tried("loopback", "the CAN bus between processes", "bring the interface lo up", _loopback),
-        _tried("/proc", "hangs, stops and leftovers are seen", "mount proc(5) at /proc", _process_files),
-        _futexes(),
-    ]
-
-
-def _futexes() -> HostCheck:
-    ctypes.set_errno(0)
-    _libc.syscall(SYS_FUTEX_WAITV, None, 0, 0, None, 0)  # nothing to wait for: EINVAL where it exists
-    there = ctypes.get_errno() != errno.ENOSYS
-    serves = "a death is seen half a millisecond earlier"
-    found = "works" if there else "the kernel has none"
-    return _check("futex_waitv", "ok" if there else "warning", found, serves, "Linux 5.16 or later")
-
-
 # -- limits ---------------------------------------------------------------------------------------
 
 
-def limits() -> list[HostCheck]:
+def _limits() -> Iterator[HostCheck]:
     """CPUs, descriptors, processes."""
-    return [_cpus(), _pinning(), _files(), _processes()]
-
-
-def _cpus() -> HostCheck:
     count = len(os.sched_getaffinity(0))
     remedy = "give it two: on one, the replicas wait for each other, and figures mean little"
     found = f"{count} usable of {os.cpu_count()}"
-    return _check("CPUs", "ok" if count > 1 else "warning", found, "a core for each replica", remedy)
+    yield _check("CPUs", "ok" if count > 1 else "warning", found, "a core for each replica", remedy)
 
-
-def _pinning() -> HostCheck:
     serves = "a replica's chain stays on its core"
     try:
         os.sched_setaffinity(0, os.sched_getaffinity(0))
     except OSError as error:
-        return HostCheck("pinning", "missing", str(error), serves, "allow sched_setaffinity(2)")
-    return HostCheck("pinning", "ok", "allowed", serves)
+        yield HostCheck("pinning", "missing", str(error), serves, "allow sched_setaffinity(2)")
+    else:
+        yield HostCheck("pinning", "ok", "allowed", serves)
 
-
-def _limit(number: int) -> str:
-    return "unlimited" if number == resource.RLIM_INFINITY else str(number)
-
-
-def _files() -> HostCheck:
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    room = float("inf") if soft == resource.RLIM_INFINITY else soft
-    status: Status = "missing" if room < FILES_MIN else "warning" if room < FILES_GOOD else "ok"
-    found = f"{_limit(soft)} of at most {_limit(hard)}"
-    serves = "the supervisor holds all channels"
-    return _check("open files", status, found, serves, f"ulimit -n {FILES_GOOD}")
+    status = "ok" if soft == resource.RLIM_INFINITY else _graded(soft, FILES_MIN, FILES_GOOD)
+    words = ["unlimited" if number == resource.RLIM_INFINITY else str(number) for number in (soft, hard)]
+    serves, remedy = "the supervisor holds all channels", f"ulimit -n {FILES_GOOD}"
+    yield _check("open files", status, " of at most ".join(words), serves, remedy)
 
-
-def _processes() -> HostCheck:
     soft, _ = resource.getrlimit(resource.RLIMIT_NPROC)
     serves = "a run has up to 40"
     if soft == resource.RLIM_INFINITY or os.getuid() == 0:
-        return HostCheck("processes", "ok", "unlimited", serves)
-    mine = sum(p.name.isdigit() and p.stat().st_uid == os.getuid() for p in _there(Path("/proc")))
-    status: Status = "ok" if soft - mine >= PROCESSES_MIN else "missing"
-    found = f"{max(0, soft - mine)} more allowed"
-    return _check("processes", status, found, serves, f"ulimit -u {mine + PROCESSES_MIN}, or more")
+        yield HostCheck("processes", "ok", "unlimited", serves)
+        return
+    mine = sum(1 for _ in run_directory.pids())
+    remedy = f"ulimit -u {mine + PROCESSES_MIN}, or more"
+    status = _graded(soft - mine, PROCESSES_MIN, PROCESSES_MIN)
+    yield _check("processes", status, f"{max(0, soft - mine)} more allowed", serves, remedy)
 
 
-def _there(folder: Path) -> list[os.DirEntry[str]]:
-    """What still is there when it is looked at."""
-    found = []
-    for entry in os.scandir(folder):
-        try:
-            entry.stat()
-        except OSError:
-            continue
-        found.append(entry)
-    return found
+# -- the directory of all runs --------------------------------------------------------------------
 
 
-# -- where runs live ------------------------------------------------------------------------------
-
-
-def place() -> list[HostCheck]:
-    """The directory of all runs."""
-    serves = "control sockets and records of runs, closed to others"
+def _place() -> Iterator[HostCheck]:
+    name, serves = "run directory", "control sockets and records of runs, closed to others"
     try:
         root = run_directory.root()
     except (HarnessError, OSError) as error:
         remedy = "remove it, or set XDG_RUNTIME_DIR or TMPDIR to a directory of yours"
-        return [HostCheck("run directory", "missing", str(error), serves, remedy)]
+        yield HostCheck(name, "missing", str(error), serves, remedy)
+        return
     longest = len(os.fsencode(root / ("0" * 2 * run_directory.ID_BYTES) / run_directory.SOCKET_NAME))
     if longest > SOCKET_PATH_MAX:
         found = f"{root}: {longest - SOCKET_PATH_MAX} bytes too long for a socket's path"
-        remedy = "set XDG_RUNTIME_DIR or TMPDIR to a shorter path"
-        return [HostCheck("run directory", "missing", found, serves, remedy)]
-    return [HostCheck("run directory", "ok", f"{root}, mode 0700", serves), _space(root)]
-
-
-def _space(root: Path) -> HostCheck:
+        yield HostCheck(name, "missing", found, serves, "set XDG_RUNTIME_DIR or TMPDIR to a shorter path")
+        return
+    yield HostCheck(name, "ok", f"{root}, mode 0700", serves)
     free = shutil.disk_usage(root).free
-    status: Status = "missing" if free < FREE_BYTES_MIN else "warning" if free < FREE_BYTES_GOOD else "ok"
+    status = _graded(free, FREE_BYTES_MIN, FREE_BYTES_GOOD)
     remedy = "make room, or keep records elsewhere: aftbed run --record"
-    return _check("space", status, f"{free / 1e6:.0f} MB free in {root}", "journals and bus logs", remedy)
+    yield _check("space", status, f"{free / 1e6:.0f} MB free in {root}", "journals and bus logs", remedy)
 
 
 # -- Python ---------------------------------------------------------------------------------------
 
 
-def python() -> list[HostCheck]:
+def _python() -> Iterator[HostCheck]:
     """The interpreter, and the packages that aftbed cannot do without."""
+    yield HostCheck("Python", "ok", platform.python_version(), "the interpreter of all nodes")
     serves = "a failed assert ends a node: fail-silence"
     status: Status = "ok" if __debug__ else "missing"
-    asserts = _check("asserts", status, "on" if __debug__ else "off", serves, "no -O, no PYTHONOPTIMIZE")
-    version = HostCheck("Python", "ok", platform.python_version(), "the interpreter of all nodes")
-    return [version, asserts, _packages()]
+    yield _check("asserts", status, "on" if __debug__ else "off", serves, "no -O, no PYTHONOPTIMIZE")
 
-
-def _packages() -> HostCheck:
     serves = "the bus, the wire format, the command line"
     try:
         wanted = [r for r in importlib.metadata.requires("aftbed") or [] if "extra ==" not in r]
     except importlib.metadata.PackageNotFoundError:
-        return HostCheck("packages", "warning", "aftbed is not installed", serves, "pip install .")
+        yield HostCheck("packages", "warning", "aftbed is not installed", serves, "pip install .")
+        return
     names = [match[0] for match in (re.match(r"[\w.-]+", r) for r in wanted) if match]
     lacking = [name for name in names if not _version(name)]
     found = f"without {', '.join(lacking)}" if lacking else f"all {len(names)}"
-    remedy = f"pip install {' '.join(lacking)}"
-    return _check("packages", "missing" if lacking else "ok", found, serves, remedy)
+    status = "missing" if lacking else "ok"
+    yield _check("packages", status, found, serves, f"pip install {' '.join(lacking)}")
 
 
 def _version(package: str) -> str:
@@ -260,21 +233,19 @@ def _version(package: str) -> str:
         return ""
 
 
-def extras() -> list[HostCheck]:
+def _extras() -> Iterator[HostCheck]:
     """What single commands need."""
-    found = []
     for package, serves in OPTIONAL.items():
         version = _version(package)
         status: Status = "ok" if version else "warning"
-        found.append(_check(package, status, version or "not installed", serves, f"pip install {package}"))
+        yield _check(package, status, version or "not installed", serves, f"pip install {package}")
     browser = next((where for name in BROWSERS if (where := shutil.which(name))), "")
     status = "ok" if browser else "warning"
     serves = "tests of the HTML report, and nothing else"
-    found.append(_check("Chromium", status, browser or "not found", serves, "install chromium"))
-    return found
+    yield _check("Chromium", status, browser or "not found", serves, "install chromium")
 
 
-def foreign_memory() -> HostCheck:
+def _foreign_memory() -> HostCheck:
     """Whether the memory of a child can be written, by trying it."""
     serves = "aftbed inject bitflip --level memory"
     try:
@@ -289,40 +260,31 @@ def foreign_memory() -> HostCheck:
     return HostCheck("memory of nodes", "ok", f"can be written (Yama scope: {scope})", serves)
 
 
-# -- what spoils figures --------------------------------------------------------------------------
+# -- measuring ------------------------------------------------------------------------------------
 
 
-def measuring() -> list[HostCheck]:
+def _measuring() -> Iterator[HostCheck]:
     """What makes times larger, or scatter; verdicts do not depend on it."""
-    return [_governor(), _steal(), _load()]
-
-
-def _governor() -> HostCheck:
-    serves = "benches: a clock that stays as it is"
-    files = sorted(Path("/sys/devices/system/cpu").glob("cpu[0-9]*/cpufreq/scaling_governor"))
+    files = Path("/sys/devices/system/cpu").glob("cpu[0-9]*/cpufreq/scaling_governor")
     kinds = {file.read_text().strip() for file in files}
     found = ", ".join(sorted(kinds)) or "not to be seen from here"
     status: Status = "ok" if kinds <= {"performance"} else "warning"
-    return _check("CPU governor", status, found, serves, "cpupower frequency-set -g performance")
+    serves = "benches: a clock that stays as it is"
+    yield _check("CPU governor", status, found, serves, "cpupower frequency-set -g performance")
+
+    before = _jiffies()
+    time.sleep(STEAL_SECONDS)  # what is sampled, not what is waited for
+    passed = [b - a for a, b in zip(before, _jiffies(), strict=True)]
+    share = passed[STEAL] / max(1, sum(passed))
+    status = "ok" if share <= STEAL_MAX else "warning"
+    remedy = "other guests of this machine take its CPUs: measure elsewhere, or later"
+    yield _check("CPU steal", status, f"{share:.1%}", "benches: a core that is ours", remedy)
+
+    load, count = os.getloadavg()[0], os.cpu_count() or 1
+    status = "ok" if load < count else "warning"
+    found, serves = f"{load:.1f} on {count} CPUs", "benches: nothing else runs"
+    yield _check("load", status, found, serves, "measure when nothing else runs")
 
 
 def _jiffies() -> list[int]:
     return [int(word) for word in Path("/proc/stat").read_text().splitlines()[0].split()[1:9]]
-
-
-def _steal() -> HostCheck:
-    before = _jiffies()
-    time.sleep(STEAL_SECONDS)  # what is sampled, not what is waited for
-    passed = [b - a for a, b in zip(before, _jiffies(), strict=True)]
-    share = passed[7] / max(1, sum(passed))
-    status: Status = "ok" if share <= STEAL_MAX else "warning"
-    serves = "benches: a core that is ours"
-    remedy = "other guests of this machine take its CPUs: measure elsewhere, or later"
-    return _check("CPU steal", status, f"{share:.1%}", serves, remedy)
-
-
-def _load() -> HostCheck:
-    load, count = os.getloadavg()[0], os.cpu_count() or 1
-    status: Status = "ok" if load < count else "warning"
-    serves = "benches: nothing else runs"
-    return _check("load", status, f"{load:.1f} on {count} CPUs", serves, "measure when nothing else runs")

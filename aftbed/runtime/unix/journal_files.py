@@ -18,14 +18,14 @@ from aftbed.runtime.unix import linux
 
 CHUNK_BYTES: Final = 1 << 20
 FILE_BYTES_MAX: Final = 1 << 30
-READY_BYTES: Final = 1 << 16  # there from the start: a backup's first record is written when time counts
+READY_BYTES: Final = 1 << 16  # in memory from the start: a backup writes its first record in a failover
 RECORDED_MAX: Final = 16
 RECORDED_BYTES_MAX: Final = 1 << 16
 STEP_BYTES_MAX: Final = 8 * layout.RECORD.size  # what the notes of one step take at most
 
 
 def contents(path: Path) -> layout.Data:
-    """What is in the file, read where it is looked at: of a chunk, most is empty. Raises OSError."""
+    """The file, mapped: most of a chunk is empty, and is not read from disk. Raises OSError."""
     with path.open("rb") as file:
         if not os.fstat(file.fileno()).st_size:
             return b""
@@ -64,7 +64,7 @@ class JournalFile:
     """
 
     def __init__(self, path: Path | None, node: str) -> None:
-        """Without a path, one that nobody will read."""
+        """Without a path, one in memory that is not read."""
         self.mapping = mmap.mmap(-1, CHUNK_BYTES) if path is None else _mapped(path, node)
         self.at, self.end = layout.HEADER_BYTES, CHUNK_BYTES - STEP_BYTES_MAX
         self._pack = layout.RECORD.pack_into

@@ -1,13 +1,15 @@
-"""Starting a run from a command, and being told how it goes.
+"""Starts a run from a command, and passes on the reports of its supervisor.
 
 The command forks the supervisor and the warden before it does anything else that takes memory, and before
-there is anything to remove: only then it makes the private directory, and says *go*. So whenever the command
-is killed, there is a warden, or nothing is left. The supervisor has a session of its own, so a terminal's
-Ctrl-C reaches the command alone. By the ends of
-what a `Launched` holds its run knows that the command is gone. So no child of the command keeps them, of
-this run or of a later one: else one run would end behind the other, each a little later.
+there is anything to remove: only then does it make the private directory, and send *go*. So whenever the
+command is killed, there is a warden, or nothing is left. The supervisor has a session of its own, so a
+terminal's Ctrl-C reaches the command alone.
+
+When the descriptors of a `Launched` are closed, its run knows that the command is gone. So no child of the
+command keeps them, of this run or of a later one: else one run would end only after the other.
 """
 
+import contextlib
 import importlib
 import os
 import select
@@ -28,11 +30,10 @@ from aftbed.inject.model import Fault
 from aftbed.runtime import control
 from aftbed.runtime.interface import BUS, LIGHT
 from aftbed.runtime.unix import linux, run_directory
-from aftbed.runtime.unix.bus_fault_names import with_names_resolved
-from aftbed.runtime.unix.cleanup import UndoLedger, Watched, watch
-from aftbed.runtime.unix.options import LoadRun, RunOptions, Work
-from aftbed.runtime.unix.prefault import Area
-from aftbed.runtime.unix.spawn import CONTROL_FD, PRELOADS, Started, start_zygote
+from aftbed.runtime.unix.cleanup import UndoLedger, watch
+from aftbed.runtime.unix.linux import Area
+from aftbed.runtime.unix.options import LoadRun, RunOptions, Work, with_names_resolved
+from aftbed.runtime.unix.process_pool import PRELOADS, Started, start_zygote
 from aftbed.runtime.unix.transport import Line, decode_report
 
 END_SECONDS_MAX: Final = 8.0
@@ -56,19 +57,19 @@ def bind_hub(port: int) -> socket.socket:
 
 
 def warm_up(name: str) -> tuple[Area, ...]:
-    """Import and rehearse what `fork_zygote` hands on: once, in a process that starts many runs.
+    """Import and rehearse what `_fork_zygote` hands on: once, in a process that starts many runs.
 
     Returns where a node will write to.
     """
-    from aftbed.runtime.unix import rehearsal, supervisor, zygote  # noqa: PLC0415 - for processes that start many runs
+    from aftbed.runtime.unix import prefault, supervisor, zygote  # noqa: PLC0415 - for many runs
 
     assert supervisor and zygote
     for module in PRELOADS[name]:
         importlib.import_module(module)
-    return rehearsal.warm_up()
+    return prefault.warm_up()
 
 
-def fork_zygote(cpus: list[int], areas: tuple[Area, ...]) -> Started:
+def _fork_zygote(cpus: list[int], areas: tuple[Area, ...]) -> Started:
     """A zygote that is a fork of this process, which `warm_up` has prepared: it saves 0.2 s of imports."""
     from aftbed.runtime.unix import zygote  # noqa: PLC0415 - imported by `warm_up`
 
@@ -77,8 +78,8 @@ def fork_zygote(cpus: list[int], areas: tuple[Area, ...]) -> Started:
     pid = os.fork()
     if pid == 0:
         try:
-            os.dup2(theirs.fileno(), CONTROL_FD)
-            os.closerange(CONTROL_FD + 1, 1 << 16)
+            os.dup2(theirs.fileno(), linux.INHERITED_FD)
+            os.closerange(linux.INHERITED_FD + 1, 1 << 16)
             zygote.run(supervisor, cpus, (), areas)
         finally:
             os._exit(1)
@@ -87,83 +88,49 @@ def fork_zygote(cpus: list[int], areas: tuple[Area, ...]) -> Started:
 
 
 class Launched:
-    """A run in progress, seen from its command."""
+    """A run in progress, seen from its command. `end` is set when it has ended in order.
+
+    `warm` is what `warm_up` returned in this process, if it was called: then the zygotes are forks of it.
+    """
 
     def __init__(
-        self, options: RunOptions, listener: socket.socket | None, warm: tuple[Area, ...] | None
+        self, options: RunOptions, listener: socket.socket | None, warm: tuple[Area, ...] | None = None
     ) -> None:
         self.options, self._warm = options, warm
-        self.private = Path(options.private)
-        self.record = Path(options.record)
+        self.private, self.record = Path(options.private), Path(options.record)
         self.started_ns = time.monotonic_ns()
-        self._life: list[int] = []
-        self._start(listener)
-        self._go()
-        self._reports = iter(self._listen())
         self.end: dict[str, object] | None = None
+        self._fork(listener)
+        self._make_directories()
+        self.line.sock.send(GO)
 
-    def _start(self, listener: socket.socket | None) -> None:
+    # -- start --------------------------------------------------------------------------------
+
+    def _fork(self, listener: socket.socket | None) -> None:
+        """Fork the supervisor and the warden, each with its ends of a line and of two pipes."""
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         command_end, command_life = os.pipe()
         supervisor_end, supervisor_life = os.pipe()
         waker = os.eventfd(0)
-        self._supervisor = os.fork()
-        if self._supervisor == 0:
+        self.supervisor = os.fork()
+        if self.supervisor == 0:
             os.setsid()
             for fd in (command_end, command_life, supervisor_end):
                 os.close(fd)
             ours.close()
             self._be_supervisor(theirs, waker)
-        self._pidfd = os.pidfd_open(self._supervisor)
+        self._pidfd = os.pidfd_open(self.supervisor)
         theirs.close()
         os.close(supervisor_life)
-        self._warden = os.fork()
-        if self._warden == 0:
-            os.setsid()
-            os.close(command_life)
-            ours.close()
-            if listener is not None:
-                listener.close()
-            self._be_warden(command_end, supervisor_end, waker)
-        self._warden_pidfd = os.pidfd_open(self._warden)
-        for fd in (command_end, supervisor_end, waker):
-            os.close(fd)
-        self._life = [command_life]
-        self.line = Line(ours, decode_report)
-        _HELD.add(self)
-
-    def _go(self) -> None:
-        """Make the directories. `run.json` is written first: a record says what it is a record of."""
-        about = {"version": __version__, "started_ns": self.started_ns, **msgspec.to_builtins(self.options)}
-        for key in ("listener", "private"):
-            about.pop(key)
-        about["load"] = isinstance(self.options.work, LoadRun)
-        try:
-            run_directory.make(self.private)
-            if self.record.parent == self.private:
-                run_directory.record_directory(self.record)
-            (self.record / "run.json").write_bytes(msgspec.json.format(msgspec.json.encode(about)))
-        except BaseException:
-            if not run_directory.owned_here(
-                self.private
-            ):  # it is another run's: nothing of it is ours to remove
-                linux.kill(self._warden_pidfd, signal.SIGKILL)
-            self.line.close()
-            os.waitpid(self._supervisor, 0)
-            self.remove()
-            raise
-        self.line.sock.send(GO)
-
-    def let_go(self) -> None:
-        """In a child of the command: this run is not its own."""
-        self.line.close()
-        for fd in (*self._life, self._pidfd, self._warden_pidfd):
-            os.close(fd)
-
-    def _be_warden(self, command_end: int, supervisor_end: int, waker: int) -> NoReturn:
-        try:
-            watch(
-                Watched(
+        self.warden = os.fork()
+        if self.warden == 0:
+            try:
+                os.setsid()
+                os.close(command_life)
+                ours.close()
+                if listener is not None:
+                    listener.close()
+                watch(
                     private=self.private,
                     record=self.record,
                     started_ns=self.started_ns,
@@ -172,15 +139,20 @@ class Launched:
                     supervisor_pidfd=self._pidfd,
                     waker=waker,
                 )
-            )
-        finally:
-            os._exit(1)  # never into what the command goes on to do
+            finally:
+                os._exit(1)  # never into what the command does next
+        self._warden_pidfd = os.pidfd_open(self.warden)
+        for fd in (command_end, supervisor_end, waker):
+            os.close(fd)
+        self._life: list[int] = [command_life]
+        self.line = Line(ours, decode_report)
+        _LAUNCHED.add(self)
 
     def _be_supervisor(self, owner: socket.socket, waker: int) -> NoReturn:
         code = 1
-        if owner.recv(len(GO)) != GO:
-            os._exit(code)
         try:
+            if owner.recv(len(GO)) != GO:
+                os._exit(code)
             signal.signal(signal.SIGINT, signal.SIG_IGN)
             run_directory.mark(self.private)
             os.environ[run_directory.VARIABLE] = str(self.private)  # of all that is executed from here on
@@ -192,51 +164,62 @@ class Launched:
             load = isinstance(self.options.work, LoadRun)
             if self._warm is not None:
                 names = (LIGHT,) if load else (LIGHT, BUS)
-                zygotes = {name: fork_zygote(cpus, self._warm) for name in names}
+                zygotes = {name: _fork_zygote(cpus, self._warm) for name in names}
             else:
-                name = LIGHT if load else BUS  # it imports while we do; it has the most to import
+                name = LIGHT if load else BUS  # it imports while this process does; it has the most to import
                 zygotes = {name: start_zygote(name, cpus)}
-            from aftbed.runtime.unix.supervisor import supervise  # noqa: PLC0415
+            from aftbed.runtime.unix.supervisor import supervise  # noqa: PLC0415 - behind the first zygote
 
             supervise(self.options, owner, zygotes, UndoLedger(self.private, waker))
             code = 0
         except BaseException:  # noqa: BLE001 - the last frame of this process
-            import traceback  # noqa: PLC0415
+            import traceback  # noqa: PLC0415 - rarely needed
 
             traceback.print_exc()
         finally:
             os._exit(code)
 
-    @property
-    def supervisor(self) -> int:
-        """Its pid."""
-        return self._supervisor
+    def _make_directories(self) -> None:
+        """The private one, and the record, in which `run.json` is written first."""
+        about = {"version": __version__, "started_ns": self.started_ns, **msgspec.to_builtins(self.options)}
+        for key in ("listener", "private"):
+            about.pop(key)
+        about["load"] = isinstance(self.options.work, LoadRun)
+        try:
+            run_directory.make(self.private)
+            if self.record.parent == self.private:
+                run_directory.record_directory(self.record)
+            (self.record / "run.json").write_bytes(msgspec.json.format(msgspec.json.encode(about)))
+        except BaseException:
+            if not run_directory.owned_here(self.private):  # another run has made it: its warden keeps it
+                linux.kill(self._warden_pidfd, signal.SIGKILL)
+            self.line.close()
+            os.waitpid(self.supervisor, 0)
+            self.remove()
+            raise
 
-    def _listen(self) -> Iterator[control.Report]:
-        while True:
+    # -- while it runs, and its end -----------------------------------------------------------
+
+    def reports(self) -> Iterator[control.Report]:
+        """The reports of the supervisor, until the run has ended."""
+        while self.end is None:
             try:
                 got = self.line.recv()
             except OSError:
                 return
             if got is None:
                 return
-            if isinstance(got[0], control.Report):
-                yield got[0]
-
-    def reports(self) -> Iterator[control.Report]:
-        """What the supervisor says, until the run has ended; `end` is set if it ended in order."""
-        for report in self._reports:
-            if report.kind == "finished":
-                self.end = msgspec.json.decode(report.data)
-                return
-            yield report
+            report, _ = got
+            if isinstance(report, control.Report):
+                if report.kind == "finished":
+                    self.end = msgspec.json.decode(report.data)
+                else:
+                    yield report
 
     def stop(self) -> None:
         """Ask for the end; reports go on until it is there."""
-        try:
-            self.line.send(control.Stop(0))
-        except OSError:
-            return
+        with contextlib.suppress(OSError):
+            self.line.send(control.Stop(control.UNANSWERED))
 
     def wait(self) -> None:
         """Wait for the supervisor's end; kill it if that does not come. The record is still there."""
@@ -244,33 +227,39 @@ class Launched:
         if not _ends(self._pidfd, END_SECONDS_MAX):
             linux.kill(self._pidfd, signal.SIGKILL)
             _ends(self._pidfd, KILL_SECONDS_MAX)
-        os.waitpid(self._supervisor, 0)
+        os.waitpid(self.supervisor, 0)
 
     def remove(self) -> None:
-        """The record has been read: let everything go."""
+        """The record has been read: remove the private directory, and let the warden end."""
         if run_directory.owned_here(self.private):
             run_directory.remove(self.private)
         life, self._life = self._life, []
         for fd in life:
             os.close(fd)
         if not _ends(self._warden_pidfd, KILL_SECONDS_MAX):
-            linux.kill(self._warden_pidfd, signal.SIGKILL)  # stopped, it would be waited for for ever
-        os.waitpid(self._warden, 0)
-        _HELD.discard(self)
+            linux.kill(self._warden_pidfd, signal.SIGKILL)  # a stopped warden would never end
+        os.waitpid(self.warden, 0)
+        _LAUNCHED.discard(self)
         os.close(self._pidfd)
         os.close(self._warden_pidfd)
 
-
-_HELD: Final[weakref.WeakSet[Launched]] = weakref.WeakSet()
-
-
-def _let_go() -> None:
-    for launched in list(_HELD):
-        launched.let_go()
-    _HELD.clear()  # a child of this child has other descriptors by the same numbers
+    def disown(self) -> None:
+        """In a child of the command: this run is not its own."""
+        self.line.close()
+        for fd in (*self._life, self._pidfd, self._warden_pidfd):
+            os.close(fd)
 
 
-os.register_at_fork(after_in_child=_let_go)
+_LAUNCHED: Final[weakref.WeakSet[Launched]] = weakref.WeakSet()
+
+
+def _disown_all() -> None:
+    for launched in list(_LAUNCHED):
+        launched.disown()
+    _LAUNCHED.clear()  # a child of this child has other descriptors by the same numbers
+
+
+os.register_at_fork(after_in_child=_disown_all)
 
 
 def _ends(pidfd: int, seconds: float) -> bool:
@@ -282,7 +271,7 @@ def _ends(pidfd: int, seconds: float) -> bool:
 def launch(
     options: RunOptions, listener: socket.socket | None, warm: tuple[Area, ...] | None = None
 ) -> Launched:
-    """Start a run. `warm`: what `warm_up` said in this process; its zygotes are forks of it."""
+    """Start a run; see `Launched`."""
     launched = Launched(options, listener, warm)
     if listener is not None:
         listener.close()

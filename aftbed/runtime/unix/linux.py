@@ -1,4 +1,4 @@
-"""The few Linux calls that Python has no word for, and their errors.
+"""Linux calls that Python does not have, what proc(5) shows of a process, and fresh interpreters.
 
 `PR_SET_PDEATHSIG` (prctl(2)) ties a process to its parent's life; `PR_SET_CHILD_SUBREAPER` makes the
 supervisor the parent of whatever its descendants leave behind.
@@ -9,8 +9,10 @@ import ctypes
 import os
 import resource
 import signal
+import site
 import socket
 import struct
+import sys
 import time
 from collections.abc import Sequence
 from itertools import chain
@@ -23,11 +25,15 @@ PR_SET_PDEATHSIG: Final = 1
 PR_SET_NAME: Final = 15
 PR_SET_CHILD_SUBREAPER: Final = 36
 MADV_POPULATE_WRITE: Final = 23
-SYS_PROCESS_MADVISE: Final = 440  # on every architecture but alpha; the C library may have no word for it
+SYS_PROCESS_MADVISE: Final = 440  # on every architecture but alpha; the C library may not have it
 IOV_MAX: Final = 1024  # areas in one call
 ADOPTION_SECONDS_MAX: Final = 5.0
 EXCUSED_NS_MAX: Final = 2_000_000_000  # as long as any step of the runtime may take
+_START: Final = 19  # the field `starttime` of /proc/PID/stat, the state being 0
 SLICE_NS: Final = 500_000  # shorter than the default of some ms, long enough for all that a failover orders
+INHERITED_FD: Final = 3  # of an interpreter that `start_interpreter` started
+
+Area = tuple[int, int]  # of memory: address and bytes
 
 _libc: Final = ctypes.CDLL(None, use_errno=True)
 _libc.madvise.argtypes = (ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int)
@@ -42,12 +48,12 @@ def _prctl(option: int, argument: int) -> None:
 def die_with(parent: int) -> None:
     """Have the kernel kill this process when `parent` dies. Ends it now if that happened already.
 
-    Waits to be adopted by `parent` first: the signal is bound to the parent of this moment. A dead one
-    adopts nobody, and may have died before its child came here.
+    The signal is bound to the parent of this moment, so this waits until `parent` has adopted the process. A
+    dead one never does, and may have died before its child came here.
     """
     limit = time.monotonic() + ADOPTION_SECONDS_MAX
     while os.getppid() != parent:
-        if _dead(parent) or time.monotonic() > limit:
+        if dead(parent) or time.monotonic() > limit:
             os._exit(1)
         os.sched_yield()
     _prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
@@ -55,11 +61,28 @@ def die_with(parent: int) -> None:
         os._exit(1)
 
 
-def _dead(pid: int) -> bool:
+def _stat(pid: int) -> list[str]:
+    """The fields behind the name in `/proc/PID/stat` (proc(5)); none of a process that is gone."""
     try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] in "ZX"
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     except OSError:
-        return True
+        return []
+
+
+def started(pid: int) -> int:
+    """When the process began, in ticks since the boot; -1 if there is none. Unique together with its pid."""
+    fields = _stat(pid)
+    return int(fields[_START]) if fields else -1
+
+
+def state_of(pid: int) -> str:
+    """The state letter of proc(5): `T` is stopped by a signal; `""` of a process that is gone."""
+    return "".join(_stat(pid)[:1])
+
+
+def dead(pid: int) -> bool:
+    """Whether the process is a zombie, or gone."""
+    return state_of(pid) in ("", "X", "Z")
 
 
 class _SchedAttr(ctypes.Structure):
@@ -76,7 +99,7 @@ class _SchedAttr(ctypes.Structure):
 
 
 def answer_soon() -> None:
-    """Ask for short time slices for this thread: woken, it runs before whoever has long ones.
+    """Ask for short time slices for this thread: woken, it runs before threads with long ones.
 
     sched_setattr(2), `sched_runtime` of SCHED_OTHER (Linux 6.12); no privilege, no larger share of the
     CPU, only sooner. Without it a watcher can wait 3 ms behind a backup that is catching up. A kernel
@@ -90,12 +113,29 @@ def answer_soon() -> None:
 
 
 def hand_over() -> None:
-    """Do not break in on whoever wakes this process: it blocks in a moment, and then it is our turn.
+    """Do not preempt the process that wakes this one: it blocks in a moment, and then this one runs.
 
     SCHED_BATCH (sched(7)): the nodes of a chain share a core and wake each other in turn; without it
     some hops take two switches instead of one.
     """
     os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+
+
+def start_interpreter(module: str, descriptor: int, *arguments: str) -> int:
+    """Start `python -m module arguments`, which gets `descriptor` as `INHERITED_FD`; its pid.
+
+    The module is that of this very package: the working directory is not searched (`-P`).
+    """
+    home, environment = str(Path(__file__).resolve().parents[3]), dict(os.environ)
+    if home not in site.getsitepackages():
+        path = os.environ.get("PYTHONPATH")
+        environment["PYTHONPATH"] = home if path is None else os.pathsep.join((home, path))
+    return os.posix_spawn(
+        sys.executable,
+        [sys.executable, "-P", "-m", module, *arguments],
+        environment,
+        file_actions=[(os.POSIX_SPAWN_DUP2, descriptor, INHERITED_FD)],
+    )
 
 
 def become_subreaper() -> None:
@@ -124,15 +164,15 @@ def kill(pidfd: int, sig: signal.Signals) -> bool:
 
 
 def trim() -> None:
-    """Give memory that is allocated but free back to the kernel: less to copy at a fork, and to unmap."""
+    """Return memory that is allocated but free to the kernel: a fork copies less, a death unmaps less."""
     _libc.malloc_trim(0)
 
 
-def populate(areas: Sequence[tuple[int, int]]) -> None:
-    """Have the kernel copy these pages now (address, bytes), as if this process had written to them; or not.
+def populate(areas: Sequence[Area]) -> None:
+    """Have the kernel copy these pages now, as if this process had written to them (Linux 5.14).
 
-    All in one call (process_madvise(2)) where the kernel takes any advice of a process for itself; older ones
-    take this one area by area only.
+    One call (process_madvise(2)) where the kernel takes this advice there, else one call for each area. Where
+    it takes none, nothing happens.
     """
     myself = os.pidfd_open(os.getpid())
     for first in range(0, len(areas), IOV_MAX):
@@ -147,7 +187,7 @@ def populate(areas: Sequence[tuple[int, int]]) -> None:
 
 
 class Starvation:
-    """Tells a process that hangs from one that the machine does not let run (proc(5)).
+    """Distinguishes a process that hangs from one that the machine does not let run (proc(5)).
 
     | state                  | its CPU time since it was asked for first | verdict                   |
     |------------------------|-------------------------------------------|---------------------------|
@@ -168,13 +208,13 @@ class Starvation:
         self._since_ns, self._cpu_ns, self._waited_ns = 0, 0, 0
 
     def forget(self) -> None:
-        """It has shown that it runs."""
+        """The process has shown that it runs."""
         self._since_ns = 0
 
     def starves(self, now_ns: int) -> bool:
-        """Asked while it shows nothing; see the table."""
+        """To be called while the process shows no pulse; see the table."""
+        state = state_of(self._pid)
         try:
-            stat = Path(f"/proc/{self._pid}/stat").read_text()
             cpu_ns, waited_ns = map(int, Path(f"/proc/{self._pid}/schedstat").read_text().split()[:2])
         except (OSError, ValueError, IndexError):
             return False
@@ -183,7 +223,7 @@ class Starvation:
         ran_ns, passed_ns = cpu_ns - self._cpu_ns, now_ns - self._since_ns
         if passed_ns > EXCUSED_NS_MAX:
             return False
-        match stat.rpartition(")")[2].split()[0]:
+        match state:
             case "R" | "D":
                 return 2 * ran_ns <= passed_ns
             case "S":
@@ -193,7 +233,7 @@ class Starvation:
 
 
 def waited_ns(pid: int) -> int:
-    """How long `pid` has been runnable and not run so far (schedstats); 0 where that cannot be told."""
+    """How long `pid` has been runnable and did not run so far (schedstats); 0 where that is not known."""
     try:
         return int(Path(f"/proc/{pid}/schedstat").read_text().split()[1])
     except (OSError, ValueError, IndexError):

@@ -3,8 +3,8 @@
 Blocking, never spinning. A node whose bricks have one open port, which is the rule on the request path,
 blocks in a plain read of that port: a poll before each read costs 1.4 us a hop (measured, 20 % of a hop). So
 the control socket is not polled there; the supervisor raises a flag in the header of the node's journal and
-puts a *nudge*, a packet of one byte, into the node's inputs. A node looks at the flag after each wake-up,
-before it looks at the mail: control is served before data. It is also served where the node cannot go on:
+puts a *nudge*, a packet of one byte, into the node's inputs. A node checks the flag after each wake-up,
+before it handles the mail: control is served before data. It is also served while the node cannot continue:
 while it is suspended, while a channel has no room, while a fault is being applied.
 
 Two loops. `Node.turn` is the general one. `serve_fast` is the same for a node that hosts one brick without
@@ -46,8 +46,8 @@ from aftbed.inject.slow import SLOW_MS_MAX
 from aftbed.runtime import control
 from aftbed.runtime import node as node_module
 from aftbed.runtime.node import HostedBrick, Node, NodeIO, Recorder
-from aftbed.runtime.unix import shared_memory, transport
-from aftbed.runtime.unix.death_notice import Held
+from aftbed.runtime.unix import transport
+from aftbed.runtime.unix.death_notice import Lifeline
 from aftbed.runtime.unix.journal_files import JournalFile
 from aftbed.runtime.unix.transport import NUDGE, PULSE_SECONDS, READ_BYTES_MAX, WRITE_SECONDS_MAX, Line
 
@@ -104,7 +104,7 @@ class UnixIO(NodeIO[Inlet, int]):
 
     def __init__(self, line: Line[control.ToNode], journal: JournalFile) -> None:
         self.line, self.journal = line, journal
-        self.lifeline: Held | None = None  # kept, not used: the kernel reads it when this process dies
+        self.lifeline: Lifeline | None = None  # kept, not used: the kernel reads it when this process dies
         self._pulse_at = 0  # where the journal was at the last pulse
         self._announced: Inlet | None = None  # the next packet there is a large one
         self._used_ns = self._owed_ns = 0  # CPU time at the last throttle; what is left to wait
@@ -133,7 +133,7 @@ class UnixIO(NodeIO[Inlet, int]):
 
     def memory(self, number: int) -> memoryview:
         """The memory behind that descriptor, which is closed."""
-        return shared_memory.mapped(number)
+        return transport.map_memory(number)
 
     # -- the pulse ----------------------------------------------------------------------------
 
@@ -389,7 +389,7 @@ class UnixIO(NodeIO[Inlet, int]):
     def _write_hard(self, hosted: UnixBrick, port: str, end: int, data: bytes) -> None:
         """The channel is full or shut: serve orders meanwhile, since one may be about this channel.
 
-        Where the port is bound elsewhere meanwhile the data is not sent: the brick was told, and has asked
+        If the port is bound elsewhere meanwhile, the data is not sent: the brick was notified, and has asked
         again for what it wants. A fault that is armed at the channel meanwhile strikes what is sent later.
         Raises BrokenPipeError where this node is fenced, or nothing reads the channel for
         `WRITE_SECONDS_MAX`.

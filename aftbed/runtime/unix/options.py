@@ -1,13 +1,22 @@
 """What a run is made of, checked by the command before a process is started."""
 
+import importlib
+import importlib.util
+from pathlib import Path
+from types import ModuleType
 from typing import Final
 
 import msgspec
 
+from aftbed.core.errors import ConfigError
 from aftbed.core.messages import Scheduled
+from aftbed.inject.bus import BusFault
 from aftbed.inject.model import Fault
+from aftbed.vehicle.can.bus_model import NODES
 
 COMMAND_GONE: Final = "the command is gone"  # a reason to end at once, whatever waits for an answer
+PLAYER: Final = "player"
+*_, GATEWAY = NODES
 
 
 class LoadRun(msgspec.Struct, frozen=True, tag=True):
@@ -54,31 +63,51 @@ class RunOptions(msgspec.Struct, frozen=True):
     port: int = 0
 
 
-class VehicleOptions(msgspec.Struct, frozen=True):
-    """A drive."""
+class SourceOptions(msgspec.Struct, frozen=True):
+    """For the process that makes the requests: the host of the Client, the vehicle or the player.
 
-    port: int
-    scenario: str
-    pace: float | None
-    brake_policy: str
+    `port` is the hub's. `dialogue` is the file of this Client, `earlier` are those of its predecessors.
+    """
+
+    work: Work
     seed: int
-
-
-class PlayerOptions(msgspec.Struct, frozen=True):
-    """A replay."""
-
     port: int
-    log: str
-    dbc: str
-    map: str
-    pace: float | None
-
-
-class GatewayOptions(msgspec.Struct, frozen=True):
-    """`dbc` and `map` are empty on aftbed's own bus."""
-
-    port: int
-    dialogue: str
+    dialogue: str = ""
     earlier: tuple[str, ...] = ()
-    dbc: str = ""
-    map: str = ""
+
+
+def load_module(place: str) -> ModuleType:
+    """The module called `place`, or in that file if it ends in `.py`. Raises ConfigError without the file."""
+    if not place.endswith(".py"):
+        return importlib.import_module(place)
+    spec = importlib.util.spec_from_file_location(Path(place).stem, place)
+    if spec is None or spec.loader is None or not Path(place).is_file():
+        raise ConfigError(f"{place}: no such file")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def with_names_resolved(fault: Fault, work: Work) -> Fault:
+    """`fault`, with its names resolved if it is a fault of the bus.
+
+    Raises ConfigError, also where there is no bus, or no car for its condition.
+    """
+    if fault.trigger.when is not None and not isinstance(work, CarRun):
+        source = "--load" if isinstance(work, LoadRun) else "--replay"
+        raise ConfigError(f"{fault}: 'when' looks at the car, and a run of {source} has none")
+    action = fault.action
+    if not isinstance(action, BusFault):
+        return fault
+    if isinstance(work, LoadRun):
+        raise ConfigError(f"{fault}: a run of --load has no bus")
+    # Imported here, by the command: the supervisor must not read a DBC, since a failover would wait for it.
+    from aftbed.vehicle.can.dbc_file import load_dbc  # noqa: PLC0415
+    from aftbed.vehicle.replay.map_file import find_map, load_mapped  # noqa: PLC0415
+
+    if isinstance(work, ReplayRun):
+        mapped = load_mapped(find_map(work.map), Path(work.dbc))
+        action = action.resolved([mapped, load_dbc()], (PLAYER, GATEWAY), car=False)
+    else:
+        action = action.resolved([load_dbc()])
+    return msgspec.structs.replace(fault, action=action)

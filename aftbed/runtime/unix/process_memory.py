@@ -6,7 +6,7 @@ read back. The process is not stopped for that: it may write the byte in the sam
 read back is what the process wrote.
 
 The consequence can be anything: a crash, a wrong value, a reference count that matters in an hour, or
-nothing. There is no undo, and none is needed: the bit goes with the process.
+nothing. There is no undo, and none is needed: the bit is lost with the process.
 
 *The process* is verified as in `runtime.unix.cleanup`: while a pidfd is open on it, its mark shows that it
 belongs to this run; so the pid cannot mean another process.
@@ -16,6 +16,7 @@ asks for the rights of ptrace(2) (PTRACE_MODE_ATTACH): under Yama's `ptrace_scop
 them over its nodes; under 2 only with CAP_SYS_PTRACE; under 3 no process has.
 """
 
+import array
 import ctypes
 import errno
 import mmap
@@ -34,7 +35,7 @@ REMEDY: Final = f"see {YAMA} and `aftbed doctor`; it takes scope 0 or 1, or CAP_
 _MAPPED: Final = re.compile(
     r"^([0-9a-f]+)-([0-9a-f]+) (....) [0-9a-f]+ [0-9a-f]+:[0-9a-f]+ (\d+) *(.*)$", re.MULTILINE
 )
-_PRESENT: Final = 63  # of the bits of an entry in pagemap
+_PRESENT: Final = 1 << 63  # of an entry in pagemap
 _ENTRY_BYTES: Final = 8
 
 _libc: Final = ctypes.CDLL(None, use_errno=True)
@@ -46,6 +47,9 @@ class Owner(NamedTuple):
     name: str
     pid: int
     run: Path
+
+    def __str__(self) -> str:
+        return f"{self.name} (pid {self.pid})"
 
 
 class Mapping(NamedTuple):
@@ -67,10 +71,10 @@ def flip(owner: Owner, bit: int | None, address: int | None, draw: int) -> str:
     try:
         pidfd = os.pidfd_open(owner.pid)
     except OSError:
-        raise StepFailed(f"{owner.name} (pid {owner.pid}) is gone") from None
+        raise StepFailed(f"{owner} is gone") from None
     try:
         if run_directory.run_of(owner.pid) != owner.run:
-            raise StepFailed(f"{owner.name} (pid {owner.pid}) is no process of this run")
+            raise StepFailed(f"{owner} is no process of this run")
         return _flip(owner, bit, address, draw)
     finally:
         os.close(pidfd)
@@ -82,7 +86,7 @@ def _flip(owner: Owner, bit: int | None, address: int | None, draw: int) -> str:
     mapping = next((one for one in found if one.start <= address < one.end), None)
     if mapping is None:
         raise StepFailed(
-            f"address {address:#x}: in no private memory that {owner.name} (pid {owner.pid}) can write:"
+            f"address {address:#x}: in no private memory that {owner} can write:"
             f" the heap, or anonymous, as /proc/{owner.pid}/maps shows it"
         )
     bit = drawn(draw, 1) % BYTE_BITS if bit is None else bit
@@ -91,7 +95,7 @@ def _flip(owner: Owner, bit: int | None, address: int | None, draw: int) -> str:
     there = peek(owner, address)
     where = f"byte {address:#x} of {mapping.name} {mapping.start:x}-{mapping.end:x}"
     seen = "read back" if there == after else f"overwritten with {there:#04x} meanwhile"
-    return f"bit {bit} of {where} in {owner.name} (pid {owner.pid}): {before:#04x} to {after:#04x}, {seen}"
+    return f"bit {bit} of {where} in {owner}: {before:#04x} to {after:#04x}, {seen}"
 
 
 def mappings(pid: int) -> list[Mapping]:
@@ -108,28 +112,23 @@ def mappings(pid: int) -> list[Mapping]:
 
 
 def _draw(owner: Owner, found: list[Mapping], draw: int) -> int:
-    """Any byte of the pages that are there, each with the same chance."""
-    pages = [page for one in found for page in _present(owner, one)]
-    if not pages:
-        raise StepFailed(f"{owner.name} (pid {owner.pid}) has no memory of its own that is there")
-    at = drawn(draw, 0) % (len(pages) * mmap.PAGESIZE)
-    return pages[at // mmap.PAGESIZE] + at % mmap.PAGESIZE
-
-
-def _present(owner: Owner, mapping: Mapping) -> list[int]:
-    """The addresses of its pages that are in memory."""
-    count = (mapping.end - mapping.start) // mmap.PAGESIZE
+    """Any byte of the pages that are present, each with the same chance."""
+    pages: list[int] = []
     try:
         with open(f"/proc/{owner.pid}/pagemap", "rb", buffering=0) as file:
-            file.seek(mapping.start // mmap.PAGESIZE * _ENTRY_BYTES)
-            entries = file.read(count * _ENTRY_BYTES)
+            for one in found:
+                file.seek(one.start // mmap.PAGESIZE * _ENTRY_BYTES)
+                data = file.read((one.end - one.start) // mmap.PAGESIZE * _ENTRY_BYTES)
+                entries = array.array("Q", data[: len(data) // _ENTRY_BYTES * _ENTRY_BYTES])
+                pages += [
+                    one.start + at * mmap.PAGESIZE for at, entry in enumerate(entries) if entry & _PRESENT
+                ]
     except OSError as error:
         raise StepFailed(f"/proc/{owner.pid}/pagemap: {error.strerror}; {REMEDY}") from None
-    return [
-        mapping.start + at * mmap.PAGESIZE
-        for at in range(len(entries) // _ENTRY_BYTES)
-        if int.from_bytes(entries[at * _ENTRY_BYTES : (at + 1) * _ENTRY_BYTES], "little") >> _PRESENT & 1
-    ]
+    if not pages:
+        raise StepFailed(f"{owner} has no memory of its own that is there")
+    at = drawn(draw, 0) % (len(pages) * mmap.PAGESIZE)
+    return pages[at // mmap.PAGESIZE] + at % mmap.PAGESIZE
 
 
 def peek(owner: Owner, address: int) -> int:
@@ -146,21 +145,13 @@ def poke(owner: Owner, address: int, byte: int) -> None:
 
 def _transfer(call: str, owner: Owner, address: int, buffer: "ctypes.Array[ctypes.c_char]") -> None:
     ours, theirs = _Span(ctypes.addressof(buffer), 1), _Span(address, 1)
+    one, flags = ctypes.c_ulong(1), ctypes.c_ulong(0)
     function = getattr(_libc, call)
     function.restype = ctypes.c_ssize_t
-    done = function(
-        ctypes.c_int(owner.pid),
-        ctypes.byref(ours),
-        ctypes.c_ulong(1),
-        ctypes.byref(theirs),
-        ctypes.c_ulong(1),
-        ctypes.c_ulong(0),
-    )
-    if done != 1:
+    if function(ctypes.c_int(owner.pid), ctypes.byref(ours), one, ctypes.byref(theirs), one, flags) != 1:
         number = ctypes.get_errno()
         remedy = f"; {REMEDY}" if number in (errno.EPERM, errno.ENOSYS) else ""
-        who = f"{owner.name} (pid {owner.pid})"
-        raise StepFailed(f"{call} at {address:#x} of {who}: {os.strerror(number)}{remedy}")
+        raise StepFailed(f"{call} at {address:#x} of {owner}: {os.strerror(number)}{remedy}")
 
 
 def try_on_a_child() -> None:
@@ -170,7 +161,7 @@ def try_on_a_child() -> None:
     pid = os.fork()
     if pid == 0:
         os.close(life)
-        os.read(end, 1)  # until the parent is done, or gone
+        os.read(end, 1)  # until the parent has finished, or is gone
         os._exit(0)
     os.close(end)
     child, address = Owner("a child", pid, Path()), ctypes.addressof(byte)

@@ -1,6 +1,6 @@
-"""The supervisor's processes: zygotes, the spares that they parked, and what spares became.
+"""The pool of processes: zygotes, the spares that they fork, and what the spares became.
 
-Everything is found by its own pidfd and its own control line; nothing is ever killed by name.
+Each is identified by its own pidfd and its own control line; no process is ever killed by name.
 """
 
 import contextlib
@@ -16,24 +16,47 @@ import msgspec
 
 from aftbed.core.errors import StepFailed
 from aftbed.runtime import control, interface
-from aftbed.runtime.interface import ProcessKind
+from aftbed.runtime.interface import BUS, LIGHT, ProcessKind
 from aftbed.runtime.tasks import Key, Wait
-from aftbed.runtime.unix import linux, run_directory
+from aftbed.runtime.unix import linux
 from aftbed.runtime.unix.cleanup import UndoLedger
 from aftbed.runtime.unix.event_loop import EventLoop
 from aftbed.runtime.unix.journal_files import Header
-from aftbed.runtime.unix.spawn import Started, start_zygote
 from aftbed.runtime.unix.transport import Line, decode_report
 
-REAP_SECONDS: Final = 0.01
+REAP_SECONDS: Final = 0.01  # a failover does not wait for the reaping of a dead process
 SPARE_SECONDS_MAX: Final = 5.0  # a zygote imports first
-DEMAND: Final = 3  # spares that are forked where one is waited for: whoever takes one takes more
+DEMAND: Final = 3  # spares that are forked where one is waited for: the next ones are wanted soon
 PARK_BATCH: Final = 8  # spares per order: the first of them start while the next are forked
 WATCHING_KINDS: Final = ("watchdog", "recovery")
 
+PRELOADS: Final[dict[str, tuple[str, ...]]] = {
+    LIGHT: (),
+    BUS: (
+        "aftbed.vehicle.drive_real",
+        "aftbed.vehicle.replay.mapped_gateway",
+        "aftbed.vehicle.replay.player",
+        "cantools",
+    ),
+}
+
+Started = tuple[int, socket.socket]  # a zygote's pid, and our end of its control line
+
+
+def start_zygote(name: str, cpus: list[int]) -> Started:
+    """Start the zygote called `name` as a child of this process.
+
+    In a fresh interpreter, because whatever its parent has imported would weigh on every fork and every
+    death.
+    """
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with theirs:
+        arguments = (str(os.getpid()), ",".join(map(str, cpus)), *PRELOADS[name])
+        return linux.start_interpreter("aftbed.runtime.unix.zygote", theirs.fileno(), *arguments), ours
+
 
 class UnixProcess:
-    """A child of the supervisor."""
+    """A child of the supervisor: see `runtime.interface.Process`."""
 
     def __init__(
         self, name: str, kind: ProcessKind, line: Line[control.FromNode], ledger: UndoLedger
@@ -45,22 +68,12 @@ class UnixProcess:
         self.alive = True
         self.incarnation = 0
         self.bricks: tuple[tuple[str, str], ...] = ()
-        self.starvation: linux.Starvation | None = None
+        self._starvation: linux.Starvation | None = None
 
     def born(self, pid: int) -> None:
-        """The process exists; it cannot be reaped by another, so the pid is its own."""
+        """The process exists; only this one can reap it, so the pid cannot have been given away."""
         self.pid, self.pidfd = pid, os.pidfd_open(pid)
-        self.starvation = linux.Starvation(pid)
-
-    def hangs(self, now_ns: int, deadline_ns: int) -> bool:
-        """Whether its pulse is older than `deadline_ns`, though the machine lets it run."""
-        if self.header is None or self.starvation is None:
-            return False
-        pulse_ns = self.header.pulse_ns()
-        if pulse_ns == 0 or now_ns - pulse_ns < deadline_ns // 2:
-            self.starvation.forget()
-            return False
-        return not self.starvation.starves(now_ns) and now_ns - pulse_ns > deadline_ns
+        self._starvation = linux.Starvation(pid)
 
     def kill(self) -> bool:
         """SIGKILL; False if it is gone."""
@@ -77,36 +90,38 @@ class UnixProcess:
         return self._signal(signal.SIGSTOP)
 
     def thaw(self) -> bool:
-        """SIGCONT; False if it is gone. One that is not seen to go on is left to the warden."""
+        """SIGCONT; False if it is gone. If it is not seen to run again, the warden retries."""
         sent = self._signal(signal.SIGCONT)
-        if sent and run_directory.state_of(self.pid) != "T":
+        if sent and linux.state_of(self.pid) != "T":
             self._ledger.undone(self.pid)
         return sent
 
     def _signal(self, sig: signal.Signals) -> bool:
         return self.pidfd >= 0 and linux.kill(self.pidfd, sig)
 
+    def stopped(self) -> bool:
+        """Whether the kernel has it in state `T` (proc(5)), or as a dead one."""
+        return linux.state_of(self.pid) in ("T", "X", "Z", "")
+
     def silent(self, now_ns: int, deadline_ns: int) -> bool:
         """Whether it lives, as far as is known, and its pulse is older than `deadline_ns`."""
         pulse_ns = self.header.pulse_ns() if self.alive and self.header is not None else 0
         return 0 < pulse_ns < now_ns - deadline_ns
 
-    def stopped(self) -> bool:
-        """Whether the kernel has it in state `T` (proc(5)), or as a dead one."""
-        try:
-            stat = Path(f"/proc/{self.pid}/stat").read_text()
-        except OSError:
-            return True
-        return stat.rpartition(")")[2].split()[0] in "TZX"
+    def hangs(self, now_ns: int, deadline_ns: int) -> bool:
+        """Whether its pulse is older than `deadline_ns`, though the machine lets it run."""
+        if self.header is None or self._starvation is None:
+            return False
+        pulse_ns = self.header.pulse_ns()
+        if pulse_ns == 0 or now_ns - pulse_ns < deadline_ns // 2:
+            self._starvation.forget()
+            return False
+        return not self._starvation.starves(now_ns) and now_ns - pulse_ns > deadline_ns
 
     def assigned(self) -> None:
-        """The Ack of an Assign is here: its journal exists."""
+        """It has acknowledged an Assign, so its journal exists."""
         if self.header is None and self.journal and Path(self.journal).exists():
             self.header = Header(Path(self.journal))
-
-    def watches(self) -> bool:
-        """Whether it would act on the death of another."""
-        return any(kind in WATCHING_KINDS for _, kind in self.bricks)
 
     def announce(self) -> None:
         """Raise the flag: an order waits."""
@@ -117,8 +132,12 @@ class UnixProcess:
         """Whether it has yet to see the flag."""
         return self.header is not None and self.header.announced()
 
+    def watches(self) -> bool:
+        """Whether it would act on the death of another process."""
+        return any(kind in WATCHING_KINDS for _, kind in self.bricks)
+
     def close(self) -> None:
-        """Let go of all descriptors."""
+        """Close all descriptors."""
         self.alive = False
         self.line.close()
         if self.pidfd >= 0:
@@ -130,7 +149,7 @@ class UnixProcess:
 
 
 class UnixProcessPool:
-    """Two zygotes, and what they park. `on_report` and `on_death` are the supervisor's."""
+    """See `runtime.interface.ProcessPool`. `on_report` and `on_death` are the supervisor's."""
 
     def __init__(
         self,
@@ -144,91 +163,99 @@ class UnixProcessPool:
         self._on_report, self._on_death = on_report, on_death
         self.processes: list[UnixProcess] = []
         self.zygotes: dict[str, UnixProcess] = {}
-        self.parked: dict[str, deque[UnixProcess]] = {}
-        self._unborn: dict[str, list[UnixProcess]] = {}
-        self._levels: dict[str, int] = {}
-
-    # -- zygotes ------------------------------------------------------------------------------
+        self._parked: dict[str, deque[UnixProcess]] = {}  # by zygote
+        self._unborn: dict[str, list[UnixProcess]] = {}  # ordered from their zygote, not seen yet
+        self._levels: dict[str, int] = {}  # to which spares are refilled
 
     def start_zygote(self, name: str, started: Started | None = None) -> None:
-        """Take over a zygote that has been started, or start one."""
-        self.parked.setdefault(name, deque())
+        """Take over a zygote that was started already, or start one."""
+        self._parked.setdefault(name, deque())
         self._unborn[name] = []
         pid, ours = started or start_zygote(name, self._cpus)
-        process = self._adopt(name, ProcessKind.ZYGOTE, ours)
-        process.born(pid)
-        self.zygotes[name] = process
-        self._watch(process)
+        self.zygotes[name] = self._add(name, ProcessKind.ZYGOTE, ours)
+        self._born(self.zygotes[name], pid)
 
     def restart_zygote(self, name: str) -> None:
-        """After its death: a new one, and the spares that the old one did not get to fork."""
-        wanted = len(self._unborn[name])
-        for process in self._unborn[name]:
+        """Replace a dead zygote, and order the spares from it that the old one did not fork any more."""
+        unborn = list(self._unborn[name])
+        for process in unborn:
             self._forget(process)
         self.start_zygote(name)
-        self.park(name, wanted)
+        self.park(name, len(unborn))
 
     # -- spares -------------------------------------------------------------------------------
 
     def park(self, zygote: str, count: int) -> None:
         """Have `count` more spares forked."""
-        while count > 0:
-            batch = min(count, PARK_BATCH)
-            pairs = [socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET) for _ in range(batch)]
-            for ours, _ in pairs:
-                self._unborn[zygote].append(self._adopt("spare", ProcessKind.SPARE, ours))
-            with contextlib.suppress(OSError):  # a dead zygote: its restart asks again
-                fds = tuple(end.fileno() for _, end in pairs)
-                self.zygotes[zygote].line.send(control.Park(0), fds)
+        for first in range(0, count, PARK_BATCH):
+            pairs = [
+                socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+                for _ in range(min(PARK_BATCH, count - first))
+            ]
+            self._unborn[zygote] += [self._add("spare", ProcessKind.SPARE, ours) for ours, _ in pairs]
+            with contextlib.suppress(OSError):  # a dead zygote: its restart orders them again
+                self.zygotes[zygote].line.send(control.Park(0), tuple(end.fileno() for _, end in pairs))
             for _, theirs in pairs:
                 theirs.close()
-            count -= batch
 
     def spare(self, zygote: str) -> Generator[Wait, dict[Key, bytes], UnixProcess]:
         """A parked spare; waits for one to be forked if there is none."""
         while True:
-            while not self.parked[zygote]:
+            while not self._parked[zygote]:
                 if not self._unborn[zygote]:
                     self.park(zygote, DEMAND)
-                yield Wait(frozenset({("spare", zygote, 0)}), seconds=SPARE_SECONDS_MAX)
-            process = self.parked[zygote].popleft()
+                yield _next_spare(zygote)
+            process = self._parked[zygote].popleft()
             if process.alive:
                 return process
 
     def parked_at_least(self, zygote: str, count: int) -> Generator[Wait, dict[Key, bytes], None]:
         """Wait until `count` spares are parked."""
-        while len(self.parked[zygote]) < count:
-            yield Wait(frozenset({("spare", zygote, 0)}), seconds=SPARE_SECONDS_MAX)
+        while len(self._parked[zygote]) < count:
+            yield _next_spare(zygote)
 
     def wait_for_forks(self, zygote: str) -> Generator[Wait, dict[Key, bytes], None]:
-        """Wait until no spare is being forked: what comes next shall have the CPUs."""
+        """Wait until no spare is being forked, so that the next thing to do has the CPUs."""
         while self._unborn[zygote]:
-            yield Wait(frozenset({("spare", zygote, 0)}), seconds=SPARE_SECONDS_MAX)
+            yield _next_spare(zygote)
 
     def refill(self, zygote: str, count: int) -> None:
-        """Have `count` spares parked, in the end: one after the other, since others need the CPUs, too."""
-        self._levels[zygote] = count
-        self._fill(zygote)
+        """Have `count` spares parked in the end, forked one after the other: others need the CPUs, too.
 
-    def _fill(self, zygote: str) -> None:
-        """Fork the next one to the level asked for. Once that is reached, what is taken is not replaced."""
-        if len(self.parked[zygote]) >= self._levels.get(zygote, 0):
+        When the level is reached, spares that are taken are not replaced any more.
+        """
+        self._levels[zygote] = count
+        self._refill_next(zygote)
+
+    def _refill_next(self, zygote: str) -> None:
+        if len(self._parked[zygote]) >= self._levels.get(zygote, 0):
             self._levels.pop(zygote, None)
         elif not self._unborn[zygote]:
             self.park(zygote, 1)
 
-    def _adopt(self, name: str, kind: ProcessKind, sock: socket.socket) -> UnixProcess:
+    # -- control lines ------------------------------------------------------------------------
+
+    def order(self, process: interface.Process, order: control.ToNode, fds: tuple[int, ...] = ()) -> None:
+        """Send `order`. Raises StepFailed if the process is gone or does not read its line."""
+        assert isinstance(process, UnixProcess)
+        try:
+            process.line.send(order, fds)
+        except OSError as error:
+            raise StepFailed(f"{process.name} cannot be reached: {error.strerror}") from None
+
+    def _add(self, name: str, kind: ProcessKind, sock: socket.socket) -> UnixProcess:
         sock.setblocking(False)
         process = UnixProcess(name, kind, Line(sock, decode_report), self._ledger)
         self.processes.append(process)
-        self._loop.read(sock.fileno(), lambda: self._heard(process))
+        self._loop.read(sock.fileno(), lambda: self._read_line(process))
         return process
 
-    def _watch(self, process: UnixProcess) -> None:
+    def _born(self, process: UnixProcess, pid: int) -> None:
+        process.born(pid)
         self._loop.read(process.pidfd, lambda: self._died(process), patient=True)
 
-    def _heard(self, process: UnixProcess) -> None:
-        """Read what the process says; its death is the pidfd's business, not the line's."""
+    def _read_line(self, process: UnixProcess) -> None:
+        """Handle all messages that are there. The end of a line is no death: the pidfd shows that."""
         while process.alive:
             try:
                 got = process.line.recv()
@@ -241,26 +268,20 @@ class UnixProcessPool:
                 return
             message, fds = got
             assert not fds, f"{process.name} sent descriptors"
-            if isinstance(message, control.Hello) and process.kind is ProcessKind.SPARE and not process.pid:
-                self._hello(process, message.pid)
-            elif not isinstance(message, control.Hello):
+            if not isinstance(message, control.Hello):
                 self._on_report(process, message)
-
-    def _hello(self, process: UnixProcess, pid: int) -> None:
-        process.born(pid)
-        self._watch(process)
-        for name, unborn in self._unborn.items():
-            if process in unborn:
-                unborn.remove(process)
-                self.parked[name].append(process)
-                self._fill(name)
-                self._loop.tasks.settle(("spare", name, 0))
+            elif process.kind is ProcessKind.SPARE and not process.pid:
+                self._born(process, message.pid)
+                zygote = next(name for name, unborn in self._unborn.items() if process in unborn)
+                self._unborn[zygote].remove(process)
+                self._parked[zygote].append(process)
+                self._refill_next(zygote)
+                self._loop.tasks.settle(("spare", zygote, 0))
 
     # -- death --------------------------------------------------------------------------------
 
     def _died(self, process: UnixProcess) -> None:
-        """It can be reaped at leisure: others wait for a failover just now."""
-        self._heard(process)  # its last words are still in the line
+        self._read_line(process)  # its last messages are still in the line
         self._loop.forget(process.pidfd)
         process.alive = False
         self._on_death(process)
@@ -277,14 +298,11 @@ class UnixProcessPool:
         self._loop.forget(process.line.fileno())
         process.close()
         self.processes.remove(process)
-        for pool in (*self.parked.values(), *self._unborn.values()):
-            if process in pool:
-                pool.remove(process)
+        for spares in (*self._parked.values(), *self._unborn.values()):
+            if process in spares:
+                spares.remove(process)
 
-    def order(self, process: interface.Process, order: control.ToNode, fds: tuple[int, ...] = ()) -> None:
-        """Send `order`. Raises StepFailed if the process is gone or does not read its line."""
-        assert isinstance(process, UnixProcess)
-        try:
-            process.line.send(order, fds)
-        except OSError as error:
-            raise StepFailed(f"{process.name} cannot be reached: {error.strerror}") from None
+
+def _next_spare(zygote: str) -> Wait:
+    """Until `zygote` has forked one more spare."""
+    return Wait(frozenset({("spare", zygote, 0)}), seconds=SPARE_SECONDS_MAX)

@@ -1,91 +1,155 @@
-"""The supervisor: starts the graph, carries out what Recovery orders, replaces what dies, ends it all.
+"""The supervisor: starts the graph, executes what Recovery orders, replaces what dies, and ends the run.
 
-It has the place of the ROS master in the paper's count of processes, and it is trusted as that one is.
-It is not on the request path: while it sleeps, requests flow. It outlives nobody: its death kills its
-children (`PR_SET_PDEATHSIG`), and the end of its owner's line ends the run.
+It corresponds to the ROS master in the paper's count of processes, and is trusted as that one is. It is not
+on the request path: while it sleeps, requests flow. Nothing outlives it: its death kills its children
+(`PR_SET_PDEATHSIG`), and the end of the control line to its command ends the run.
 """
 
 import json
 import os
 import socket
 import time
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from random import Random
 from typing import Final
 
 import msgspec
 
 from aftbed.core.errors import AftbedError
+from aftbed.core.graph import Link
+from aftbed.core.journal import Record, records
 from aftbed.ftm.compose import build
+from aftbed.inject.kind import FaultKind
+from aftbed.inject.receipts import BusReport
 from aftbed.runtime import control
 from aftbed.runtime.deployment import HANG_NS, Keys
-from aftbed.runtime.interface import BUS, LIGHT, ProcessKind
+from aftbed.runtime.interface import BUS, DRAW_BITS, LIGHT, Met, Process, ProcessKind
 from aftbed.runtime.run_controller import RunController
 from aftbed.runtime.tasks import STATS_TASK
-from aftbed.runtime.unix import linux
+from aftbed.runtime.unix import linux, process_memory
 from aftbed.runtime.unix.cleanup import UndoLedger
 from aftbed.runtime.unix.control_server import ControlServer
 from aftbed.runtime.unix.event_loop import EventLoop
+from aftbed.runtime.unix.journal_files import JournalFile, contents, recorded_requests
 from aftbed.runtime.unix.options import COMMAND_GONE, LoadRun, RunOptions
-from aftbed.runtime.unix.process_pool import UnixProcess, UnixProcessPool
-from aftbed.runtime.unix.spawn import Started
-from aftbed.runtime.unix.support import UnixRuntime
-from aftbed.runtime.unix.transport import Line, decode_order
-from aftbed.runtime.unix.workload import Work
+from aftbed.runtime.unix.process_pool import Started, UnixProcess, UnixProcessPool
+from aftbed.runtime.unix.run_directory import HISTORY_NAME
+from aftbed.runtime.unix.transport import Line, MemfdMemory, UnixChannel, decode_order
+from aftbed.runtime.unix.workload import Workload
+from aftbed.vehicle.condition import Condition
 
 TICK_SECONDS: Final = 0.02
-TELL_SECONDS: Final = 0.005
-LATE_NS_MAX: Final = 40_000_000
+LOG_SECONDS: Final = 0.005  # until a line is written: a failover does not wait for that
+LATE_NS_MAX: Final = 40_000_000  # of a tick: beyond it the machine was too busy to judge pulses
 DRAIN_SECONDS_MAX: Final = 2.0
-DRAIN_SECONDS: Final = 0.005  # between two looks at what is still under way
+DRAIN_SECONDS: Final = 0.005  # between two checks of what is still under way
 LOOKS_MAX: Final = 80  # at states that differ: time for a follower on a busy machine
 STOP_SECONDS_MAX: Final = 1.0
 
 
+class UnixRuntime:
+    """The Unix runtime as the executive sees it: see `runtime.interface.Runtime`."""
+
+    def __init__(
+        self,
+        options: RunOptions,
+        loop: EventLoop,
+        pool: UnixProcessPool,
+        work: Workload,
+        log: Callable[[str, str], None],
+    ) -> None:
+        self._options, self._record, self._bus = options, Path(options.record), work.bus
+        self.loop, self.pool, self.device, self.log = loop, pool, work.device_of, log
+        self.journal = JournalFile(self._record / "journal" / "supervisor.1.journal", "supervisor")
+
+    def channel(self, link: Link) -> UnixChannel:
+        """A fresh pair of sockets."""
+        return UnixChannel(link)
+
+    def shared_memory(self) -> MemfdMemory:
+        """A fresh memfd."""
+        return MemfdMemory()
+
+    def journal_of(self, node: str, incarnation: int) -> str:
+        """A file for each incarnation of a node."""
+        return str(self._record / "journal" / f"{node.replace('/', '.')}.{incarnation}.journal")
+
+    def records(self, journal: str) -> Iterable[Record]:
+        """What is committed in the file; nothing if its node died before it made one."""
+        try:
+            return records(contents(Path(journal)))
+        except FileNotFoundError:
+            return ()
+
+    def recorded_requests(self) -> tuple[bytes, ...]:
+        """From the dialogue of the first Client."""
+        return recorded_requests(self._record)
+
+    def draw(self, number: int) -> int:
+        """From the seed of the run."""
+        return Random(f"{self._options.seed}/{number}").getrandbits(DRAW_BITS)
+
+    def disturb(self, number: int, fault: FaultKind, draw: int) -> Keys:
+        """By the hub."""
+        return self._bus.disturb(number, fault, draw)
+
+    def watch(self, number: int, condition: Condition, met: Callable[[Met], None]) -> Keys:
+        """By the car, through the hub."""
+        return self._bus.watch(number, condition, met)
+
+    def bus_fault(self, number: int) -> BusReport | None:
+        """The hub's latest report."""
+        return self._bus.report(number)
+
+    def flip_memory(self, process: Process, bit: int | None, address: int | None, draw: int) -> str:
+        """By process_vm_writev(2)."""
+        owner = process_memory.Owner(process.name, process.pid, Path(self._options.private))
+        return process_memory.flip(owner, bit, address, draw)
+
+    def pin(self, pid: int, cpu: int) -> None:
+        """By sched_setaffinity(2)."""
+        os.sched_setaffinity(pid, {cpu})
+
+    def record_adaptation(self, adaptation: bytes) -> None:
+        """One line in the record."""
+        with open(self._record / HISTORY_NAME, "ab") as file:
+            file.write(adaptation + b"\n")
+
+
 class Supervisor:
-    """One run. `owner` is the line to the command; its end is the command's."""
+    """One run. `owner` is the control line to the command; its end is the command's."""
 
     def __init__(
         self, options: RunOptions, owner: socket.socket, zygotes: dict[str, Started], ledger: UndoLedger
     ) -> None:
-        self.options, self._zygotes = options, zygotes
-        self.record = Path(options.record)
-        self.started_ns = time.monotonic_ns()
-        self.owner = Line(owner, decode_order)
-        self.owner.sock.setblocking(False)
-        self.loop = EventLoop()
-        self.pool = UnixProcessPool(self.loop, self._on_report, self._on_death, ledger)
-        self._events = open(self.record / "events.jsonl", "ab", buffering=0)  # noqa: SIM115 - for the whole run
-        self._ending = ""
-        self._told: list[bytes] = []
-        self._finish_reason = ""
-        self._grace_until_ns = 0
-        self.graph_ms = 0.0
-        self._incomplete: list[str] = []
-        self._lost, self._looks_left = False, LOOKS_MAX
-        self._waited_ns: dict[int, int] = {}
-        self._states: dict[str, str] = {}  # digests, by replica, at the end
-        self._last_tick_ns = 0
-        self._situation_wanted = False
-        graph = build(options.ftm, options.placement)
+        self._options, self._zygotes, self._record = options, zygotes, Path(options.record)
+        self._started_ns = time.monotonic_ns()
+        self._owner = Line(owner, decode_order)
+        self._owner.sock.setblocking(False)
+        self._events = open(self._record / "events.jsonl", "ab", buffering=0)  # noqa: SIM115
+        self._unwritten: list[bytes] = []  # lines of the log
+        self._graph_ms = 0.0
+        self._waited_ns: dict[int, int] = {}  # for a CPU until the graph was complete, by pid
+        self._last_tick_ns = self._grace_until_ns = 0
+        self._lost = False
+        # Of the end: `_reason` is None before it, "" for the good one.
+        self._reason: str | None = None
+        self._unfinished: list[str] = []
+        self._looks_left = LOOKS_MAX
+        self._states: dict[str, str] = {}  # digests, by replica
+
+        self._loop = EventLoop()
+        self.pool = UnixProcessPool(self._loop, self._on_report, self._on_death, ledger)
+        self._work = Workload(options, self.pool, self._loop, self._log, self._finish, self._report_owner)
+        runtime = UnixRuntime(options, self._loop, self.pool, self._work, self._log)
         cpus = sorted(os.sched_getaffinity(0))
         pinned = cpus if options.pin and len(cpus) > 1 else None
-        self.work = Work(options, self.pool, self.loop, self.log, self._finish, self._report_owner)
-        runtime = UnixRuntime(
-            self.record,
-            self.loop,
-            self.pool,
-            self.work.device_of,
-            self.log,
-            options.seed,
-            self.work.bus,
-            Path(options.private),
+        self._controller = RunController(
+            build(options.ftm, options.placement), runtime, pinned, self._on_loss
         )
-        self.controller = RunController(graph, runtime, pinned, self._on_loss)
-        self.deployment, self.faults = self.controller.deployment, self.controller.faults
-        self.adaptations = self.controller.adaptations
-        self.questions = ControlServer(
-            options, self.loop, self.deployment, self.faults, self.adaptations, self.work, self._finish
-        )
+        self._deployment = self._work.deployment = self._controller.deployment
+        self._server = ControlServer(options, self._loop, self._controller, self._work, self._finish)
 
     # -- life ---------------------------------------------------------------------------------
 
@@ -94,154 +158,188 @@ class Supervisor:
         linux.become_subreaper()
         linux.no_core()
         linux.answer_soon()
-        wants_bus = BUS in self._zygotes
-        for name in (BUS, LIGHT) if wants_bus else (LIGHT,):
+        has_bus = BUS in self._zygotes
+        for name in (BUS, LIGHT) if has_bus else (LIGHT,):
             self.pool.start_zygote(name, self._zygotes.get(name))
-        self.pool.park(LIGHT, len(self.deployment.graph.nodes) + self.controller.spares() + wants_bus)
-        if wants_bus:
+        self.pool.park(LIGHT, len(self._deployment.graph.nodes) + self._controller.spares() + has_bus)
+        if has_bus:
             self.pool.park(BUS, 2)
-        self.questions.listen()
-        self.loop.read(self.owner.fileno(), self._on_owner)
-        self.loop.tasks.start("launch", self._launch(), self._launched)
+        self._server.listen()
+        self._loop.read(self._owner.fileno(), self._on_owner)
+        self._loop.tasks.start("launch", self._launch(), self._launched)
         self._tick()
-        self.loop.run()
-        self._teardown()
+        self._loop.run()
+        self._tear_down()
 
     def _launch(self) -> Keys:
-        yield from self.work.before(self.deployment)
-        for zygote, count in self.work.spares_for(self.deployment).items():
+        yield from self._work.start_bus()
+        for zygote, count in self._work.spares().items():
             yield from self.pool.parked_at_least(zygote, count)
         began_ns = time.monotonic_ns()
-        yield from self.deployment.launch(held=self.work.held)
-        self.graph_ms = (time.monotonic_ns() - began_ns) / 1e6
-        for fault in self.options.faults:
-            yield from self.faults.arm(fault)
-        yield from self.adaptations.schedule(self.options.adaptations)
-        yield from self.work.start(self.deployment)
+        yield from self._deployment.launch(held=self._work.held)
+        self._graph_ms = (time.monotonic_ns() - began_ns) / 1e6
+        for fault in self._options.faults:
+            yield from self._controller.faults.arm(fault)
+        yield from self._controller.adaptations.schedule(self._options.adaptations)
+        yield from self._work.start()
 
     def _launched(self, failure: str) -> None:
         if failure:
-            self.log("launch.failed", failure)
+            self._log("launch.failed", failure)
             self._finish(f"launch failed: {failure}")
             return
-        self._waited_ns = {p.pid: linux.waited_ns(p.pid) for p in self.deployment.nodes.values()}
-        self.log("started", f"{len(self.deployment.nodes)} nodes in {self.graph_ms:.1f} ms")
-        self.controller.inform_recovery(failed=False)
-        self.questions.launched()
+        nodes = self._deployment.nodes.values()
+        self._waited_ns = {process.pid: linux.waited_ns(process.pid) for process in nodes}
+        self._log("started", f"{len(nodes)} nodes in {self._graph_ms:.1f} ms")
+        self._controller.inform_recovery(failed=False)
+        self._server.launched()
+
+    def _tick(self) -> None:
+        """Check the pulses of nodes that no Watchdog watches: one that hangs is killed, and replaced."""
+        now_ns = time.monotonic_ns()
+        if now_ns - self._last_tick_ns > TICK_SECONDS * 1e9 + LATE_NS_MAX:
+            self._grace_until_ns = now_ns + HANG_NS
+        self._last_tick_ns = now_ns
+        self._deployment.nudge_late()
+        if self._graph_ms and now_ns > self._grace_until_ns:  # births have a limit of their own
+            self._controller.look_for_hangs()
+        self._loop.after(TICK_SECONDS, self._tick)
+
+    # -- processes ----------------------------------------------------------------------------
+
+    def _on_report(self, process: UnixProcess, report: msgspec.Struct) -> None:
+        if isinstance(report, control.Report):
+            self._work.on_report(process, report.kind, report.data)
+        else:
+            self._controller.on_report(process, report)
+
+    def _on_death(self, process: UnixProcess) -> None:
+        self._controller.on_death(process)
+        if process.kind is ProcessKind.KILLED or self._reason is not None:
+            return
+        if process.kind is ProcessKind.ZYGOTE:
+            self.pool.restart_zygote(process.name)
+        elif process.kind is ProcessKind.SERVICE:
+            self._finish(f"{process.name} died")
+
+    def _on_loss(self) -> None:
+        """A load would wait for ever; a car drives on."""
+        self._lost = True
+        if isinstance(self._options.work, LoadRun):
+            self._finish("")
+
+    # -- the command --------------------------------------------------------------------------
 
     def _on_owner(self) -> None:
         try:
-            got = self.owner.recv()
+            got = self._owner.recv()
         except BlockingIOError:
             return
         except (OSError, AftbedError):
             got = None
         for fd in got[1] if got is not None else ():
             os.close(fd)
-        if got is None or isinstance(got[0], control.Stop):
-            self._finish(COMMAND_GONE if got is None else "interrupted")
-            if got is None:
-                self.loop.forget(self.owner.fileno())
+        if got is None:
+            self._loop.forget(self._owner.fileno())
+            self._finish(COMMAND_GONE)
+        elif isinstance(got[0], control.Stop):
+            self._finish("interrupted")
 
     def _report_owner(self, kind: str, data: bytes) -> None:
-        """For the command; dropped where it does not read, since a view must not stop a run."""
+        """To the command; dropped if it does not read, since a view must not stop a run."""
         try:
-            self.owner.send(control.Report(kind, data))
+            self._owner.send(control.Report(kind, data))
         except OSError:
             return
 
-    def log(self, event: str, text: str) -> None:
-        """A line for people: to the record, and to the command. Soon, since a failover does not wait."""
-        t_ms = round((time.monotonic_ns() - self.started_ns) / 1e6, 3)
-        self._told.append(json.dumps({"t_ms": t_ms, "event": event, "text": text}).encode())
-        if len(self._told) == 1:
-            self.loop.after(TELL_SECONDS, self._tell_all)
+    def _log(self, event: str, text: str) -> None:
+        """A line for people, to the record and to the command."""
+        line = {"t_ms": self._ms_since_start(), "event": event, "text": text}
+        self._unwritten.append(json.dumps(line).encode())
+        if len(self._unwritten) == 1:
+            self._loop.after(LOG_SECONDS, self._write_log)
 
-    def _tell_all(self) -> None:
-        told, self._told = self._told, []
-        self._events.write(b"".join(line + b"\n" for line in told))
-        for line in told:
+    def _ms_since_start(self) -> float:
+        return round((time.monotonic_ns() - self._started_ns) / 1e6, 3)
+
+    def _write_log(self) -> None:
+        lines, self._unwritten = self._unwritten, []
+        self._events.write(b"".join(line + b"\n" for line in lines))
+        for line in lines:
             self._report_owner("event", line)
 
     # -- the end ------------------------------------------------------------------------------
 
     def _finish(self, reason: str) -> None:
         """End the run: let what is unanswered be answered, then stop. `""` is the good end."""
-        if self._ending:
+        if self._reason is not None:
             return
-        self._ending = reason or "done"
-        self._finish_reason = reason
-        limit_ns = time.monotonic_ns() + round(DRAIN_SECONDS_MAX * 1e9)
-        self.loop.tasks.start("stop", self.work.stop_source(self.deployment), lambda _: None)
-        self._drain(limit_ns)
+        self._reason = reason
+        self._loop.tasks.start("stop", self._work.stop_source(), lambda _: None)
+        self._drain(time.monotonic_ns() + round(DRAIN_SECONDS_MAX * 1e9))
 
     def _drain(self, limit_ns: int) -> None:
         """Wait until all is answered, and what fails or changes has come to its end; or to the limit."""
-        settled = self.work.settled and (self._lost or not self.controller.unrest())
+        settled = self._work.settled and (self._lost or not self._controller.unrest())
+        command_gone = self._reason == COMMAND_GONE  # no process waits for a verdict
         if settled and self._looks_left:
-            ask = self.deployment.ask_states(self._states)
-            self.loop.tasks.start("states", ask, lambda _: self._looked(limit_ns))
+            ask = self._deployment.ask_states(self._states)
+            self._loop.tasks.start("states", ask, lambda _: self._looked(limit_ns))
             return
-        if self.owner_gone() or settled or time.monotonic_ns() > limit_ns:
-            if not settled and not self.owner_gone():
-                self._incomplete = self.loop.tasks.names()
-            self.controller.ending = True
-            self.loop.end()
+        if command_gone or settled or time.monotonic_ns() > limit_ns:
+            if not settled and not command_gone:
+                self._unfinished = self._loop.tasks.names()
+            self._controller.ending = True
+            self._loop.end()
             return
-        if not len(self.loop.tasks):
-            self.loop.tasks.start(STATS_TASK, self.work.wind_up(self.deployment), lambda _: None)
-        self.loop.after(DRAIN_SECONDS, lambda: self._drain(limit_ns))
+        if not len(self._loop.tasks):
+            self._loop.tasks.start(STATS_TASK, self._work.wind_up(), lambda _: None)
+        self._loop.after(DRAIN_SECONDS, lambda: self._drain(limit_ns))
 
     def _looked(self, limit_ns: int) -> None:
         """A replica may have yet to apply what was sent to it: look again, for a time."""
-        self._looks_left -= 1
-        if len(set(self._states.values())) <= 1:
-            self._looks_left = 0
+        self._looks_left = self._looks_left - 1 if len(set(self._states.values())) > 1 else 0
         pause_s = DRAIN_SECONDS if self._looks_left else 0.0
-        self.loop.after(pause_s, lambda: self._drain(limit_ns))
+        self._loop.after(pause_s, lambda: self._drain(limit_ns))
 
-    def owner_gone(self) -> bool:
-        """Nobody waits for a verdict."""
-        return self._finish_reason == COMMAND_GONE
-
-    def _teardown(self) -> None:
-        """Kill what is left, reap it, say how it ended, and leave."""
-        self._tell_all()
-        living = self.deployment.hosted()
+    def _tear_down(self) -> None:
+        """Kill and reap all processes, and report how the run ended."""
+        self._write_log()
+        living = self._deployment.hosted()
         waits = [linux.waited_ns(pid) - before for pid, before in self._waited_ns.items()]
-        left = self._bury()
+        left = self._kill_all()
         end = {
-            "reason": self._finish_reason,
+            "reason": self._reason,
             "ended_ns": time.monotonic_ns(),
-            "seconds": round((time.monotonic_ns() - self.started_ns) / 1e9, 3),
-            "graph_ms": round(self.graph_ms, 3),
+            "seconds": round(self._ms_since_start() / 1e3, 3),
+            "graph_ms": round(self._graph_ms, 3),
             "left": left,
-            "unfinished": self._incomplete,
+            "unfinished": self._unfinished,
             "lost": self._lost,
-            "leader": self.deployment.leader,
-            "backup": self.deployment.backup,
+            "leader": self._deployment.leader,
+            "backup": self._deployment.backup,
             "hosted": msgspec.to_builtins(living),
             "states": self._states,
             "starved_ms": round(max(waits, default=0) / 1e6, 3),  # of the node that waited longest for a CPU
-            "epoch": self.deployment.epoch,
-            "faults": msgspec.to_builtins(self.faults.reports()),
-            **self.work.end(),
+            "epoch": self._deployment.epoch,
+            "faults": msgspec.to_builtins(self._controller.faults.reports()),
+            **self._work.end(),
         }
-        unfinished = self.record / "end.json.new"
-        unfinished.write_text(json.dumps(end))
-        unfinished.rename(self.record / "end.json")  # whole, or not there
+        new = self._record / "end.json.new"
+        new.write_text(json.dumps(end))
+        new.rename(self._record / "end.json")  # complete, or not there
         self._report_owner("finished", json.dumps(end).encode())
 
-    def _bury(self) -> list[str]:
-        """Kill all, and reap what dies; what is left after a second. The dying need a CPU, too.
+    def _kill_all(self) -> list[str]:
+        """Kill all processes and reap them; what is left after a second in which they had a CPU to die on.
 
-        Whoever watches is killed first: the end of the run is nothing to recover from.
+        Watchdogs and Recovery are killed first, so that the shutdown does not trigger a failover.
         """
         dying = self.pool.processes
         starvation = {p.pid: linux.Starvation(p.pid) for p in dying if p.pid}
         began_ns = time.monotonic_ns()
-        for watch in starvation.values():
-            watch.starves(began_ns)  # counts from here
+        for one in starvation.values():
+            one.starves(began_ns)  # counts from here
         for process in sorted(dying, key=UnixProcess.watches, reverse=True):
             process.kill()
         while dying:
@@ -256,43 +354,6 @@ class Supervisor:
                 break  # while some die, the rest may become ours to reap: a zygote's children
             time.sleep(0.001)  # no event to wait for: a killed process is a matter of a millisecond
         return [f"{p.name} ({p.pid})" for p in dying]
-
-    # -- what processes say -------------------------------------------------------------------
-
-    def _on_report(self, process: UnixProcess, report: msgspec.Struct) -> None:
-        if isinstance(report, control.Report):
-            self.work.on_report(process, report.kind, report.data)
-        else:
-            self.controller.on_report(process, report)
-
-    # -- deaths and hangs ---------------------------------------------------------------------
-
-    def _on_death(self, process: UnixProcess) -> None:
-        self.controller.on_death(process)
-        if process.kind is ProcessKind.KILLED or self._ending:
-            return
-        if process.kind is ProcessKind.ZYGOTE:
-            self.pool.restart_zygote(process.name)
-        elif process.kind is ProcessKind.SERVICE:
-            self._finish(f"{process.name} died")
-
-    def _on_loss(self) -> None:
-        """A load would wait for ever; a car drives on."""
-        self._lost = True
-        if isinstance(self.options.work, LoadRun):
-            self._finish("")
-
-    def _tick(self) -> None:
-        """Look after the pulses of what no Watchdog watches: a node that hangs is killed, and replaced."""
-        now_ns = time.monotonic_ns()
-        late = now_ns - self._last_tick_ns > TICK_SECONDS * 1e9 + LATE_NS_MAX
-        if late:
-            self._grace_until_ns = now_ns + HANG_NS
-        self._last_tick_ns = now_ns
-        self.deployment.nudge_late()
-        if self.graph_ms and now_ns > self._grace_until_ns:  # births have a limit
-            self.controller.look_for_hangs()
-        self.loop.after(TICK_SECONDS, self._tick)
 
 
 def supervise(

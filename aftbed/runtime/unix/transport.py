@@ -14,10 +14,11 @@ is faster than its reader.
 
 import array
 import contextlib
+import mmap
 import os
 import socket
 import stat
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Final, Generic, TypeVar
 
 import msgspec
@@ -25,6 +26,7 @@ import msgspec
 from aftbed.core.errors import PeerError
 from aftbed.core.graph import Link
 from aftbed.core.messages import PACKET_BYTES_MAX, UNREADABLE
+from aftbed.inject.shared_state import SHARED_BYTES
 from aftbed.runtime.control import FromNode, ToNode
 from aftbed.runtime.unix.linux import set_timeouts
 
@@ -45,13 +47,13 @@ def put(descriptor: int, data: bytes) -> None:
         return
     os.write(descriptor, ANNOUNCED)
     with _borrowed(descriptor) as sock:
-        send_in_file(sock.socket, data, _WEIGHT)
+        send_in_file(sock, data, _WEIGHT)
 
 
 def take(descriptor: int) -> bytes:
     """The next packet, behind an announcement; one without a memfd is given as it is. Raises PeerError."""
     with _borrowed(descriptor) as sock:
-        data, ancillary, _, _ = sock.socket.recvmsg(READ_BYTES_MAX, _RIGHTS_BYTES, socket.MSG_CMSG_CLOEXEC)
+        data, ancillary, _, _ = sock.recvmsg(READ_BYTES_MAX, _RIGHTS_BYTES, socket.MSG_CMSG_CLOEXEC)
     fds = descriptors_in(ancillary)
     return read_file(fds[0]) if fds else data
 
@@ -88,23 +90,17 @@ def descriptors_in(ancillary: list[tuple[int, int, bytes]]) -> list[int]:
     return list(fds)
 
 
-class _borrowed:  # noqa: N801 - a context
-    """A socket out of a descriptor, which is not closed with it."""
-
-    __slots__ = ("socket",)
-
-    def __init__(self, descriptor: int) -> None:
-        self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET, 0, fileno=descriptor)
-
-    def __enter__(self) -> "_borrowed":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.socket.detach()
+@contextlib.contextmanager
+def _borrowed(descriptor: int) -> Iterator[socket.socket]:
+    """A socket out of a descriptor, which stays open."""
+    sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET, 0, fileno=descriptor)
+    try:
+        yield sock
+    finally:
+        sock.detach()
 
 
-# -- Control lines: one pair between the supervisor and each process; `runtime.control` has the messages.
-
+# -- control lines: one pair between the supervisor and each process; the messages are `runtime.control`'s.
 
 FDS_MAX: Final = 64
 _LINE_RIGHTS_BYTES: Final = socket.CMSG_SPACE(FDS_MAX * 4)
@@ -133,11 +129,8 @@ class Line(Generic[Incoming]):
             assert not fds, f"{len(data)} bytes, and descriptors"
             send_in_file(self.sock, data)
         else:
-            self._sendmsg(data, fds)
-
-    def _sendmsg(self, data: bytes, fds: tuple[int, ...]) -> None:
-        rights = [(socket.SOL_SOCKET, socket.SCM_RIGHTS, array.array("i", fds))] if fds else []
-        self.sock.sendmsg([data], rights)
+            rights = [(socket.SOL_SOCKET, socket.SCM_RIGHTS, array.array("i", fds))] if fds else []
+            self.sock.sendmsg([data], rights)
 
     def recv(self) -> tuple[Incoming, list[int]] | None:
         """The next message with its descriptors; None at the end.
@@ -170,11 +163,11 @@ class Line(Generic[Incoming]):
             self.sock.close()
 
 
-# -- Channels outlive nodes: the supervisor owns both ends of each, and hands them out.
+# -- channels -------------------------------------------------------------------------------------
 #
-# `fence` shuts the writing end behind all of its descriptors: what was sent stays readable, then the
-# channel ends; a later write gets EPIPE.
-
+# They outlive nodes: the supervisor owns both ends of each, and hands them out. `fence` shuts the writing
+# end behind all of its descriptors: what was sent stays readable, then the channel ends; a later write gets
+# EPIPE.
 
 WRITE_PATIENCE_SECONDS: Final = PULSE_SECONDS
 assert WRITE_PATIENCE_SECONDS < WRITE_SECONDS_MAX
@@ -195,16 +188,61 @@ class UnixChannel:
             self.write.shutdown(socket.SHUT_WR)
 
     def refuse(self) -> None:
-        """Nobody will read: a writer that waits for room gets EPIPE."""
+        """Close the reading side: a writer that waits for room gets EPIPE."""
         with contextlib.suppress(OSError):
             self.read.shutdown(socket.SHUT_RD)
 
     def nudge(self) -> None:
-        """Wake the reader, so that it looks for control mail. A full queue wakes it just as well."""
+        """Wake the reader, so that it looks for orders. A full queue wakes it just as well."""
         with contextlib.suppress(OSError):
             self.write.send(NUDGE, socket.MSG_DONTWAIT)
 
     def close(self) -> None:
-        """Let go of both ends; nodes keep theirs."""
+        """Close both ends here; nodes keep theirs."""
         self.write.close()
         self.read.close()
+
+
+# -- shared memory --------------------------------------------------------------------------------
+
+MEMORY_NAME: Final = "aftbed-cell"  # as /proc/PID/maps shows it
+
+
+def map_memory(descriptor: int) -> memoryview:
+    """The memory behind `descriptor`, which is closed.
+
+    A process that is forked from here does not inherit it.
+    """
+    try:
+        memory = mmap.mmap(descriptor, SHARED_BYTES)
+    finally:
+        os.close(descriptor)
+    memory.madvise(mmap.MADV_DONTFORK)
+    return memoryview(memory)
+
+
+class MemfdMemory:
+    """The supervisor's end of memory that it shares with a node: see `runtime.interface.SharedMemory`.
+
+    A memfd has no name in any directory, and goes with its processes.
+    """
+
+    def __init__(self) -> None:
+        self._descriptor = os.memfd_create(MEMORY_NAME)
+        os.ftruncate(self._descriptor, SHARED_BYTES)
+        self.memory = map_memory(os.dup(self._descriptor))
+
+    def fileno(self) -> int:
+        """The descriptor that is passed to the node."""
+        return self._descriptor
+
+    def seal(self) -> None:
+        """Close the descriptor: from here on only the two mappings are left."""
+        if self._descriptor >= 0:
+            os.close(self._descriptor)
+            self._descriptor = -1
+
+    def close(self) -> None:
+        """Unmap it as well."""
+        self.seal()
+        self.memory.release()

@@ -1,41 +1,108 @@
-"""What makes the requests of a run: a load inside the client, or the car, or a replayed log, on the bus."""
+"""Where the requests of a run come from, as the supervisor has it: a load inside the Client; or a car, or a
+replayed log, on the bus, which is a process, too (the hub).
 
+The hub also carries out the faults of the bus, and passes on the conditions of the car at which other faults
+begin: the car is connected to it.
+"""
+
+import contextlib
 import json
 import os
 import socket
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
 import msgspec
 
+from aftbed.core.errors import StepFailed
+from aftbed.inject.bus import BusFault
+from aftbed.inject.kind import FaultKind
+from aftbed.inject.receipts import BusReport, ReceiptState
 from aftbed.runtime import control
 from aftbed.runtime.deployment import Deployment, Keys
-from aftbed.runtime.interface import BUS, LIGHT, ProcessKind
+from aftbed.runtime.interface import BUS, LIGHT, Met, ProcessKind
 from aftbed.runtime.tasks import STATS_TASK, Key, Wait
-from aftbed.runtime.unix.bus_faults import BusFaults
-from aftbed.runtime.unix.devices import LoadOptions
 from aftbed.runtime.unix.event_loop import EventLoop
-from aftbed.runtime.unix.options import (
-    CarRun,
-    GatewayOptions,
-    LoadRun,
-    PlayerOptions,
-    ReplayRun,
-    RunOptions,
-    VehicleOptions,
-)
+from aftbed.runtime.unix.options import PLAYER, CarRun, LoadRun, RunOptions, SourceOptions
 from aftbed.runtime.unix.process_pool import UnixProcess, UnixProcessPool
+from aftbed.vehicle.condition import Condition
 
 ATTACH_SECONDS_MAX: Final = 10.0
 LOAD_POLL_SECONDS: Final = 0.02
 STALL_SECONDS_MAX: Final = 3.0  # a recovery takes milliseconds, a loss is seen after half a second
-CYCLE_EVERY: Final = 10  # telemetries: so often the cycle time is shown
+CYCLE_EVERY: Final = 10  # telemetry reports, after which the cycle time is shown
+VEHICLE: Final = "vehicle"
 
 
-class Work:
-    """`settled` turns true when the source is at its end and all is answered."""
+class BusFaults:
+    """Faults of the bus and conditions of the car. `settle` ends the wait of tasks for the hub."""
+
+    def __init__(
+        self, pool: UnixProcessPool, settle: Callable[[Key], None], log: Callable[[str, str], None]
+    ) -> None:
+        self._pool, self._settle, self._log = pool, settle, log
+        self.hub: UnixProcess | None = None
+        self._faults: dict[int, BusFault] = {}
+        self._reports: dict[int, BusReport] = {}
+        self._on_met: dict[int, Callable[[Met], None]] = {}
+
+    def disturb(self, number: int, fault: FaultKind, draw: int) -> Keys:
+        """Return when the hub has armed the fault. Raises StepFailed."""
+        assert isinstance(fault, BusFault), fault
+        if self.hub is None or not self.hub.alive:
+            raise StepFailed(f"{fault}: this run has no bus")
+        if fault.targets is None:
+            raise StepFailed(f"{fault}: its names were not resolved")
+        self._faults[number] = fault
+        self._pool.order(self.hub, control.DisturbBus(number, fault, draw))
+        yield Wait(frozenset({(control.BUS_FAULT_ARMED, control.HUB, number)}), frozenset({control.HUB}))
+
+    def watch(self, number: int, condition: Condition, met: Callable[[Met], None]) -> Keys:
+        """Return when the car checks the condition. Raises StepFailed."""
+        if self.hub is None or not self.hub.alive:
+            raise StepFailed(f"when {condition}: this run has no car")
+        self._on_met[number] = met
+        self._pool.order(self.hub, control.WatchCar(number, condition))
+        yield Wait(frozenset({(control.CONDITION_WATCHED, control.HUB, number)}), frozenset({control.HUB}))
+
+    def ask(self) -> Keys:
+        """Have the hub report on all faults once more."""
+        if self._faults and self.hub is not None and self.hub.alive:
+            with contextlib.suppress(StepFailed):  # then its earlier reports have to do
+                self._pool.order(self.hub, control.Stats(control.UNANSWERED))
+                yield Wait(frozenset({(control.BUS_FAULTS_ASKED, control.HUB, 0)}), frozenset({control.HUB}))
+
+    def on_report(self, kind: str, data: bytes) -> None:
+        """A report of the hub."""
+        if kind in (control.BUS_FAULT_ARMED, control.CONDITION_WATCHED):
+            self._settle((kind, control.HUB, int(data)))
+            return
+        if kind == control.CONDITION_MET:
+            number, t_us, since_ns = msgspec.msgpack.decode(data, type=tuple[int, int, int])
+            hub, on_met = self.hub, self._on_met.pop(number, None)
+            if on_met is not None and hub is not None:
+                on_met(Met(t_us, since_ns, lambda: self._pool.order(hub, control.Ack(number))))
+            return
+        for report in msgspec.msgpack.decode(data, type=list[BusReport]):
+            number, found = report.number, report.receipt
+            before = self._reports[number].receipt.state if number in self._reports else ReceiptState.ARMED
+            self._reports[number] = report
+            if found.state is not before:
+                self._log("fault", f"{self._faults[number]}: {found.state.value}, {found.detail}")
+        if kind == control.BUS_FAULTS_ASKED:
+            self._settle((control.BUS_FAULTS_ASKED, control.HUB, 0))
+
+    def report(self, number: int) -> BusReport | None:
+        """The latest report on a fault."""
+        return self._reports.get(number)
+
+
+class Workload:
+    """`settled` becomes true when the source has ended and all its requests are answered."""
+
+    deployment: Deployment  # set by the supervisor before anything is started
 
     def __init__(
         self,
@@ -48,6 +115,7 @@ class Work:
     ) -> None:
         self._options, self._pool, self._loop = options, pool, loop
         self._log, self._finish, self._report_owner = log, finish, report_owner
+        self._is_load = isinstance(options.work, LoadRun)
         self._services: dict[str, UnixProcess] = {}
         self.bus = BusFaults(pool, loop.tasks.settle, log)
         self._result: object = None
@@ -58,86 +126,73 @@ class Work:
         self._progress: tuple[object, object] = (None, None)
         self._moved_ns = time.monotonic_ns()
 
+    # -- launch -------------------------------------------------------------------------------
+
     def device_of(self, kind: str, incarnation: int) -> tuple[str, bytes]:
         """The device of a brick of `kind`, and its options."""
         if kind == "watchdog":
             return "sensor", b""
         if kind != "client":
             return "", b""
-        journal = Path(self._options.record) / "journal"
-        dialogue = str(journal / f"client.{incarnation}.dialogue")
-        earlier = tuple(str(journal / f"client.{i}.dialogue") for i in range(1, incarnation))
-        earlier = tuple(path for path in earlier if Path(path).exists())
-        work = self._options.work
-        if isinstance(work, LoadRun):
-            load = LoadOptions(self._options.seed, work.count, work.rate_hz, dialogue, earlier)
-            return "load", msgspec.msgpack.encode(load)
-        dbc, mapped = (work.dbc, work.map) if isinstance(work, ReplayRun) else ("", "")
-        gateway = GatewayOptions(self._options.port, dialogue, earlier, dbc, mapped)
-        return "gateway", msgspec.msgpack.encode(gateway)
+        options, journal = self._options, Path(self._options.record) / "journal"
+        dialogues = [journal / f"client.{number}.dialogue" for number in range(1, incarnation + 1)]
+        source = SourceOptions(
+            options.work,
+            options.seed,
+            options.port,
+            str(dialogues[-1]),
+            tuple(str(path) for path in dialogues[:-1] if path.exists()),
+        )
+        return "load" if self._is_load else "gateway", msgspec.msgpack.encode(source)
 
-    def spares_for(self, deployment: Deployment) -> dict[str, int]:
+    def spares(self) -> dict[str, int]:
         """How many spares of each zygote the graph takes."""
-        nodes = len(deployment.graph.nodes)
-        return {LIGHT: nodes} if isinstance(self._options.work, LoadRun) else {LIGHT: nodes - 1, BUS: 1}
+        nodes = len(self.deployment.graph.nodes)
+        return {LIGHT: nodes} if self._is_load else {LIGHT: nodes - 1, BUS: 1}
 
     @property
     def held(self) -> tuple[str, ...]:
-        """Who must not begin before faults and adaptations are armed: a load is inside the Client."""
-        return ("client",) if isinstance(self._options.work, LoadRun) else ()
+        """Nodes that must not begin before faults and adaptations are armed: a load is inside the Client."""
+        return ("client",) if self._is_load else ()
 
-    def before(self, deployment: Deployment) -> Keys:
-        """What must stand before the graph does: the hub."""
-        self._deployment = deployment
-        work = self._options.work
+    def start_bus(self) -> Keys:
+        """Start the hub, which the graph needs."""
+        options, work = self._options, self._options.work
         if isinstance(work, LoadRun):
             return
         flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC
-        log = os.open(Path(self._options.record) / "bus.log", flags, 0o600)
-        options = {"lockstep": work.pace is None, "pace": work.pace or 1.0, "origin_ns": time.monotonic_ns()}
-        yield from self._serve(LIGHT, "hub", msgspec.msgpack.encode(options), (self._options.listener, log))
-        self.bus.serve(self._services["hub"])
+        log = os.open(Path(options.record) / "bus.log", flags, 0o600)
+        hub = {"lockstep": work.pace is None, "pace": work.pace or 1.0, "origin_ns": time.monotonic_ns()}
+        yield from self._serve(LIGHT, control.HUB, msgspec.msgpack.encode(hub), (options.listener, log))
+        self.bus.hub = self._services[control.HUB]
         os.close(log)
-        socket.socket(fileno=self._options.listener).close()  # the hub's alone from here on
+        socket.socket(fileno=options.listener).close()  # only the hub has it from here on
 
-    def start(self, deployment: Deployment) -> Keys:
-        """The graph stands: let requests come."""
-        work = self._options.work
-        if isinstance(work, LoadRun):
-            yield from deployment.ask("client", control.Resume)
-            self._loop.after(LOAD_POLL_SECONDS, lambda: self._watch_load(deployment))
+    def start(self) -> Keys:
+        """The graph is complete: let requests come."""
+        options = self._options
+        if self._is_load:
+            yield from self.deployment.ask("client", control.Resume)
+            self._loop.after(LOAD_POLL_SECONDS, self._watch_load)
             return
-        if isinstance(work, CarRun):
-            name, options = (
-                "vehicle",
-                msgspec.msgpack.encode(
-                    VehicleOptions(
-                        self._options.port, work.scenario, work.pace, work.brake_policy, self._options.seed
-                    )
-                ),
-            )
-        else:
-            name, options = (
-                "player",
-                msgspec.msgpack.encode(
-                    PlayerOptions(self._options.port, work.log, work.dbc, work.map, work.pace)
-                ),
-            )
-        yield from self._serve(BUS, name, options, ())
-        self._pool.order(self._services[name], control.Resume(0))
+        name = VEHICLE if isinstance(options.work, CarRun) else PLAYER
+        source = SourceOptions(options.work, options.seed, options.port)
+        yield from self._serve(BUS, name, msgspec.msgpack.encode(source), ())
+        self._pool.order(self._services[name], control.Resume(control.UNANSWERED))
         self._pool.refill(BUS, 1)
 
-    def _serve(
-        self, zygote: str, name: str, options: bytes, fds: tuple[int, ...]
-    ) -> Generator[Wait, dict[Key, bytes], None]:
+    def _serve(self, zygote: str, name: str, options: bytes, fds: tuple[int, ...]) -> Keys:
+        """Make a spare the service `name`, and wait until it is ready."""
         process = yield from self._pool.spare(zygote)
         process.name, process.kind = name, ProcessKind.SERVICE
         self._services[name] = process
-        self._pool.order(process, control.Serve(0, name, options), fds)
+        self._pool.order(process, control.Serve(control.UNANSWERED, name, options), fds)
         yield Wait(frozenset({("ready", name, 0)}), frozenset({name}), ATTACH_SECONDS_MAX)
 
+    # -- while it runs ------------------------------------------------------------------------
+
     def on_report(self, process: UnixProcess, kind: str, data: bytes) -> None:
-        """What a service says."""
+        """A report of a service."""
         if kind == "ready":
             self._loop.tasks.settle(("ready", process.name, 0))
         elif kind in control.BUS_REPORTS:
@@ -147,37 +202,21 @@ class Work:
             self._report_owner("telemetry", data)
             self._telemetries += 1
             if self._telemetries % CYCLE_EVERY == 0:
-                self._loop.tasks.start(STATS_TASK, self.ask_stats(self._deployment), self._report_cycle)
+                self._loop.tasks.start(STATS_TASK, self._ask_stats(), self._report_cycle)
         elif kind == "trouble":
             self._log("trouble", f"{process.name}: {data.decode()}")
             self._finish(f"{process.name}: {data.decode()}")
-        elif kind == "result" and process.name in ("vehicle", "player"):
+        elif kind == "result" and process.name in (VEHICLE, PLAYER):
             self._result = json.loads(data)
-            process.kind = ProcessKind.KILLED  # it is done: its death is no event
+            process.kind = ProcessKind.KILLED  # it has finished: its death is expected
             self._finish("")
 
     def _report_cycle(self, failure: str) -> None:
         if not failure:
             self._report_owner("cycle", json.dumps(self._stats.get("cycle_us")).encode())
 
-    def stop_source(self, deployment: Deployment) -> Keys:
-        """No more requests; the car or the player ends with the result so far."""
-        for name in ("vehicle", "player"):
-            process = self._services.get(name)
-            if process is not None and process.alive and process.kind is ProcessKind.SERVICE:
-                self._pool.order(process, control.Stop(0))
-        yield from self.bus.ask()
-        yield from self.wind_up(deployment)
-
-    def wind_up(self, deployment: Deployment) -> Keys:
-        """Have nothing more sent, then see what is unanswered: a count from before may be out of date."""
-        yield from deployment.ask("client", control.Quiet)
-        yield from self.ask_stats(deployment)
-        source_is_done = self._result is not None or isinstance(self._options.work, LoadRun)
-        self.settled = source_is_done and not self._stats.get("unanswered", 1)
-
-    def _watch_load(self, deployment: Deployment) -> None:
-        """Until all is answered, or nothing moves any more: a reply that got lost is waited for in vain."""
+    def _watch_load(self) -> None:
+        """Finish when all is answered, or when nothing moves any more: a lost reply would never come."""
 
         def asked(failure: str) -> None:
             progress, now_ns = (self._stats.get("sent"), self._stats.get("unanswered")), time.monotonic_ns()
@@ -189,14 +228,30 @@ class Work:
                 self._log("stalled", f"no request was sent or answered for {STALL_SECONDS_MAX:g} s")
                 self._finish("")
             else:
-                self._loop.after(LOAD_POLL_SECONDS, lambda: self._watch_load(deployment))
+                self._loop.after(LOAD_POLL_SECONDS, self._watch_load)
 
-        self._loop.tasks.start(STATS_TASK, self.ask_stats(deployment), asked)
+        self._loop.tasks.start(STATS_TASK, self._ask_stats(), asked)
 
-    def ask_stats(self, deployment: Deployment) -> Keys:
-        """Ask the client how far it is."""
-        data = yield from deployment.ask("client", control.Stats)
+    def _ask_stats(self) -> Keys:
+        data = yield from self.deployment.ask("client", control.Stats)
         self._stats = msgspec.msgpack.decode(data)
+
+    # -- the end ------------------------------------------------------------------------------
+
+    def stop_source(self) -> Keys:
+        """No more requests; the vehicle or the player ends with its result so far."""
+        for name in (VEHICLE, PLAYER):
+            process = self._services.get(name)
+            if process is not None and process.alive and process.kind is ProcessKind.SERVICE:
+                self._pool.order(process, control.Stop(control.UNANSWERED))
+        yield from self.bus.ask()
+        yield from self.wind_up()
+
+    def wind_up(self) -> Keys:
+        """Have no more requests sent; then count the unanswered ones: an earlier count may be out of date."""
+        yield from self.deployment.ask("client", control.Quiet)
+        yield from self._ask_stats()
+        self.settled = (self._result is not None or self._is_load) and not self._stats.get("unanswered", 1)
 
     def end(self) -> dict[str, object]:
         """For the record."""

@@ -1,10 +1,12 @@
 """The zygote: imports everything once, then forks processes in about a millisecond.
 
-It forks *spares*: processes that are parked at their control line until they are told what to be. A
-spare is forked twice removed, so that the supervisor, a subreaper, adopts it: a zygote's death then
-kills nobody (`PR_SET_PDEATHSIG` follows the parent), and the supervisor reaps what it started.
-There are two: one for the mechanism, light, since the fork and the death of a process take time in
-proportion to its memory; one for what needs the bus (`preload`).
+It forks *spares*, which wait at their control line for what they are to be: a node of the graph (`Assign`)
+or a service beside it (`Serve`: the hub, the vehicle, the player). A spare is forked by an intermediate
+process that ends at once, so that the supervisor, a subreaper, adopts it: the death of a zygote then kills
+no spare (`PR_SET_PDEATHSIG` follows the parent), and the supervisor reaps what it started.
+
+There are two zygotes, because the fork and the death of a process take time in proportion to its memory: a
+light one for the mechanism, and one that has imported what needs the bus (`preload`).
 """
 
 import gc
@@ -12,77 +14,132 @@ import importlib
 import os
 import socket
 import sys
+from pathlib import Path
 from typing import NoReturn
 
+import msgspec
+
+from aftbed.core.errors import ConfigError
+from aftbed.ftm.client import Client
 from aftbed.runtime import control
-from aftbed.runtime.unix import linux, prefault, rehearsal
-from aftbed.runtime.unix.part import become
-from aftbed.runtime.unix.prefault import Area
-from aftbed.runtime.unix.spawn import CONTROL_FD
-from aftbed.runtime.unix.transport import Line, decode_order
+from aftbed.runtime.assembly import Assembler
+from aftbed.runtime.devices import Device, Sensor
+from aftbed.runtime.node import Node
+from aftbed.runtime.unix import linux, prefault
+from aftbed.runtime.unix.death_notice import Lifeline
+from aftbed.runtime.unix.devices import ProcessSenses, make_source
+from aftbed.runtime.unix.journal_files import JournalFile
+from aftbed.runtime.unix.linux import INHERITED_FD, Area
+from aftbed.runtime.unix.node_io import EXIT_ASSERT, UnixIO, UnixNode
+from aftbed.runtime.unix.options import SourceOptions, load_module
+from aftbed.runtime.unix.transport import PULSE_SECONDS, Line, decode_order
+from aftbed.vehicle.aeb.function import default_application
 
 
 def run(
     supervisor: int, cpus: list[int], preload: tuple[str, ...], areas: tuple[Area, ...] | None = None
 ) -> NoReturn:
-    """Be a zygote, serving `CONTROL_FD`, until it ends.
+    """Serve the control line at `INHERITED_FD` until it ends.
 
-    `areas`: where a node writes to, if the parent of this process has found it out (`launch.warm_up`).
+    `areas`: where a node writes to, if the parent of this process has found that out (`launch.warm_up`).
     """
-    os.set_inheritable(CONTROL_FD, False)
+    os.set_inheritable(INHERITED_FD, False)
     os.sched_setaffinity(0, cpus)
     linux.die_with(supervisor)
     linux.set_name("aftbed-zygote")
     for module in preload:
         importlib.import_module(module)
     if areas is None:
-        areas = rehearsal.warm_up()
+        areas = prefault.warm_up()
     gc.freeze()
-    gc.disable()  # structs on the path are untracked; what is left dies by reference count
-    line = Line(socket.socket(fileno=CONTROL_FD), decode_order)
+    gc.disable()  # structs on the path are untracked; the rest is freed by its reference count
+    line = Line(socket.socket(fileno=INHERITED_FD), decode_order)
     line.send(control.Hello(os.getpid()))
-    while True:
-        got = line.recv()
-        if got is None:
-            os._exit(0)
+    while (got := line.recv()) is not None:
         order, fds = got
         assert isinstance(order, control.Park), order
-        _park(fds, supervisor, areas)
+        _fork_spares(fds, supervisor, areas)
+    os._exit(0)
 
 
-def _park(fds: list[int], supervisor: int, areas: tuple[Area, ...]) -> None:
-    """Fork one spare per descriptor, through an intermediate that leaves them to the supervisor."""
+def _fork_spares(fds: list[int], supervisor: int, areas: tuple[Area, ...]) -> None:
+    """Fork one spare per descriptor, through an intermediate process that leaves them to the supervisor."""
     alive, life = os.pipe()
     intermediate = os.fork()
     if intermediate == 0:
-        os.close(CONTROL_FD)
+        os.close(INHERITED_FD)
         for descriptor in fds:
             if os.fork() == 0:
                 os.close(life)
                 os.read(alive, 1)  # ends when the intermediate does, so that no spare spins meanwhile
-                os.dup2(descriptor, CONTROL_FD, inheritable=False)
-                os.closerange(CONTROL_FD + 1, 1 << 16)
-                _wait_for_a_part(supervisor, areas)
+                os.dup2(descriptor, INHERITED_FD, inheritable=False)
+                os.closerange(INHERITED_FD + 1, 1 << 16)
+                _be_spare(supervisor, areas)
         os._exit(0)
     os.waitpid(intermediate, 0)
     for descriptor in (*fds, alive, life):
         os.close(descriptor)
 
 
-def _wait_for_a_part(supervisor: int, areas: tuple[Area, ...]) -> NoReturn:
-    """A spare: adopted, parked, then what it is told to be."""
+def _be_spare(supervisor: int, areas: tuple[Area, ...]) -> NoReturn:
+    """Wait for an order; then be the node or the service that it describes."""
     linux.die_with(supervisor)
     linux.set_name("aftbed-spare")
-    prefault.own(areas)
-    line = Line(socket.socket(fileno=CONTROL_FD), decode_order)
+    linux.populate(areas)
+    line = Line(socket.socket(fileno=INHERITED_FD), decode_order)
     line.send(control.Hello(os.getpid()))
     got = line.recv()
     if got is None:
         os._exit(0)
     order, fds = got
-    if isinstance(order, control.Assign | control.Serve):
-        become(line, order, fds)
-    os._exit(0)
+    assert isinstance(order, control.Assign | control.Serve), order
+    try:
+        if isinstance(order, control.Serve):
+            from aftbed.runtime.unix.bus_services import serve  # noqa: PLC0415 - costs 150 ms
+
+            linux.set_name(f"aftbed-{order.service}")
+            serve(line, order, fds)
+            os._exit(0)
+        io = _make_node(line, order, fds)
+    except BaseException as error:  # noqa: BLE001 - the last frame of this process
+        known = isinstance(error, ConfigError)
+        reason = str(error) if known else f"{type(error).__name__}: {error}"
+        line.send(control.Ack(order.token, error=reason))
+        if known:
+            os._exit(0)
+        sys.excepthook(type(error), error, error.__traceback__)
+        os._exit(EXIT_ASSERT)
+    io.serve()
+
+
+def _make_node(line: Line[control.ToNode], order: control.Assign, fds: list[int]) -> UnixIO:
+    linux.set_name(order.node)
+    kind = order.bricks[0].kind
+    if order.staged and order.aside is not None:
+        os.sched_setaffinity(0, {order.aside})  # requests are served on the other one
+    if order.cpu is not None:
+        os.sched_setaffinity(0, {order.cpu})
+    if kind in ("watchdog", "recovery"):
+        linux.answer_soon()
+    else:
+        linux.hand_over()
+    linux.set_timeouts(line.sock, PULSE_SECONDS, 2.0)
+    io = UnixIO(line, JournalFile(Path(order.journal), order.node))
+    node = Node(order.node, io)
+    io.start_pulse()
+    io.lifeline = Lifeline(Path(order.journal))
+    if kind == "engine":
+        gc.enable()  # a plan leaves cycles behind, and the Engine is not on the request path
+    Assembler(default_application, load_module).build(node, order, fds, lambda: _make_device(order, node))
+    return io
+
+
+def _make_device(order: control.Assign, node: UnixNode) -> Device:
+    if order.device == "sensor":
+        return Sensor(ProcessSenses())
+    client = node.brick(order.bricks[0].name)
+    assert isinstance(client, Client)
+    return make_source(client, msgspec.msgpack.decode(order.options, type=SourceOptions))
 
 
 if __name__ == "__main__":

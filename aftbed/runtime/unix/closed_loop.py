@@ -8,26 +8,27 @@ is the same with it and without it until the first adaptation.
 
 | symptom                                | is read from                                                     |
 |----------------------------------------|------------------------------------------------------------------|
-| divergence, value_fault, detected_stop | the journals of what hosts an After; a `Tail` each               |
-| crash, hang                            | the `alarm` that the supervisor tells when a replica is lost     |
+| divergence, value_fault, detected_stop | the journals of nodes that host an After                         |
+| crash, hang                            | the `alarm` that the supervisor logs when a replica is lost      |
 
-**Time.** A look every `PERIOD_SECONDS`. A symptom counts from when it was journalled, and
+**Time.** The loop observes every `PERIOD_SECONDS`. A symptom counts from when it was journalled, and
 `consistent_after_ms` runs from there: from the first event (or sample) of what triggered it until the run
-says that it is adapted.
+reports that it is adapted.
 
 **One at a time.** While a proposal waits for its answer, another one is dropped: what still holds is proposed
-again after the dwell time. While a person is asked, a different proposal takes the place of the open one.
+again after the dwell time. While a person is asked, a different proposal replaces the open one.
 
 Limits. A detected stop of a duplex is seen twice, as such and as a crash, because it ends in a failover. A
-node that no Watchdog watches (Proxy, Recovery, Engine) is replaced and is no symptom. What replicas send each
-other is not measured: on one host nothing limits it, and no journal tells its size. Of each node the newest
-`observation.INCARNATIONS` journals are read.
+node that no Watchdog watches (Proxy, Recovery, Engine) is replaced and is no symptom. What replicas send
+each other is not measured: on one host nothing limits it, and no journal contains its size. Of each node
+the newest `INCARNATIONS` journals are read.
 """
 
 import os
 import select
 import sys
 import time
+from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 from typing import Final, Literal
@@ -35,6 +36,7 @@ from typing import Final, Literal
 import msgspec
 
 from aftbed import adapt
+from aftbed.adapt.plugins import load_application
 from aftbed.adapt.policy import (
     Beyond,
     Declined,
@@ -44,12 +46,14 @@ from aftbed.adapt.policy import (
     Policy,
     PolicyFile,
     Proposal,
+    Resource,
     Running,
     Seen,
     policy_from,
     symptoms,
 )
 from aftbed.adapt.suitability import unsuitable
+from aftbed.core import journal
 from aftbed.core.application import Characteristics
 from aftbed.core.errors import AftbedError, ConfigError, PeerError, unknown
 from aftbed.core.journal import Record
@@ -57,15 +61,29 @@ from aftbed.core.messages import Goal
 from aftbed.ftm.compose import NONE
 from aftbed.runtime.adaptations import Outcome
 from aftbed.runtime.unix import control_client
-from aftbed.runtime.unix.observation import MEASURED, Journals, Lines, Meter, lost
-from aftbed.runtime.unix.support import HISTORY_NAME
+from aftbed.runtime.unix.control_client import Answer
+from aftbed.runtime.unix.options import load_module
+from aftbed.runtime.unix.run_directory import HISTORY_NAME
+from aftbed.runtime.unix.transport import Line
+from aftbed.vehicle.aeb.function import default_application
 
 PERIOD_SECONDS: Final = 0.1
 PROPOSALS_NAME: Final = "proposals.jsonl"
 APPROVALS: Final = ("auto", "ask")
+MEASURED: Final[tuple[Resource, ...]] = ("cpus", "cpu_load")
+LOAD_SAMPLES: Final = 10  # CPU load is that of the last second
+
+FIRST_BYTES: Final = journal.HEADER_BYTES + journal.RECORD.size
+CODE_BYTES: Final = 4  # at the end of a record
+CHUNK_BYTES: Final = 2048 * journal.RECORD.size
+HISTORY_BYTES_MAX: Final = 1 << 20  # that are read at once
+INCARNATIONS: Final = 2
+REPLICA_NODES: Final = ("a", "b", "single")
+
 _FOLDER: Final = Path(adapt.__file__).resolve().parent / "policies"
 
-Tell = Callable[[dict[str, object]], None]
+Show = Callable[[dict[str, object]], None]
+State = Literal["free", "asking", "adapting"]
 
 
 class Proposed(msgspec.Struct, frozen=True):
@@ -131,103 +149,190 @@ def asked_for(policy: str | None, approve: str, ftm: str, *, as_json: bool) -> P
     return load_policy(policy)
 
 
-def _unsuitable(expression: str, application: str) -> str:
-    """Why `expression` does not suit the function that is protected now; "" if it does."""
-    from aftbed.adapt.plugins import load_application  # noqa: PLC0415 - at the first proposal
-    from aftbed.runtime.unix.part import load_module  # noqa: PLC0415
-    from aftbed.vehicle.aeb.function import default_application  # noqa: PLC0415
+# -- what is observed -----------------------------------------------------------------------------
 
-    function = load_application(application, load_module) if application else default_application()
-    declared: object = getattr(function, "characteristics", None)
-    if not isinstance(declared, Characteristics):
-        return f"{application}: characteristics: found {declared!r}, allowed is Characteristics(...)"
-    return unsuitable(expression, declared)
+
+class Tail:
+    """Reads what was committed to a journal since the last call: each record once, and complete.
+
+    Journals grow while they are read. A record is committed by its event code, which is written last, so
+    whatever stands before the first record without one is complete.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._at, self._header = path, journal.HEADER_BYTES, b""
+
+    def new(self) -> list[Record]:
+        """The new records. Raises PeerError on what is no journal."""
+        found: list[Record] = []
+        with open(self._path, "rb") as file:
+            if not self._header:
+                first = file.read(FIRST_BYTES)
+                if len(first) < FIRST_BYTES or not any(first[-CODE_BYTES:]):
+                    return found  # before its first record, a node may still write the header
+                self._header = first[: journal.HEADER_BYTES]
+            file.seek(self._at)
+            full = True
+            while full:
+                some = list(journal.records(self._header + file.read(CHUNK_BYTES)))
+                found += some
+                self._at += len(some) * journal.RECORD.size
+                full = len(some) * journal.RECORD.size == CHUNK_BYTES
+        return found
+
+
+class Journals:
+    """The tails of all journals that can contain a symptom."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._tails: dict[Path, Tail] = {}
+
+    def new(self) -> list[Record]:
+        """What is new in the newest journals of each node that hosts an After, by time. Raises PeerError."""
+        nodes: dict[str, list[tuple[int, Path]]] = {}
+        for path in self._folder.glob("*.journal"):
+            node, _, incarnation = path.name.removesuffix(".journal").rpartition(".")
+            if node in REPLICA_NODES or node.endswith("after"):
+                nodes.setdefault(node, []).append((int(incarnation), path))
+        wanted = [path for found in nodes.values() for _, path in sorted(found)[-INCARNATIONS:]]
+        self._tails = {path: self._tails.get(path) or Tail(path) for path in wanted}
+        records = [record for tail in self._tails.values() for record in tail.new()]
+        return sorted(records, key=lambda record: record.t_ns)
+
+
+class AdaptationHistory:
+    """Reads the adaptations that ended since the last call."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._at = path, 0
+
+    def new(self) -> list[Outcome]:
+        """The lines that are complete."""
+        if not self._path.exists():
+            return []
+        with open(self._path, "rb") as file:
+            file.seek(self._at)
+            whole, end, _ = file.read(HISTORY_BYTES_MAX).rpartition(b"\n")
+        self._at += len(whole) + len(end)
+        return [msgspec.json.decode(line, type=Outcome) for line in whole.splitlines()]
+
+
+def loss_in(event: str, text: str) -> Seen | None:
+    """A replica's loss, by its cause, if that is what the supervisor logs: `alarm`, `a: crash`."""
+    if event != "alarm":
+        return None
+    return Seen("crash") if text.endswith(": crash") else Seen("hang")
+
+
+class Meter:
+    """Measures the resources that a policy names, and no others."""
+
+    def __init__(self, policy: Policy) -> None:
+        self._wanted = {rule.when.resource for rule in policy.rules if isinstance(rule.when, Beyond)}
+        self._samples: deque[tuple[float, float]] = deque(maxlen=LOAD_SAMPLES + 1)  # busy, all; seconds
+
+    def values(self) -> dict[Resource, float]:
+        """As they are now; CPU load is not known at the first call."""
+        found: dict[Resource, float] = {}
+        if "cpus" in self._wanted:
+            found["cpus"] = float(len(os.sched_getaffinity(0)))
+        if "cpu_load" in self._wanted:
+            self._samples.append(_cpu_seconds())
+            (busy_s, all_s), (busy_now_s, now_s) = self._samples[0], self._samples[-1]
+            if now_s > all_s:
+                found["cpu_load"] = (busy_now_s - busy_s) / (now_s - all_s)
+        return found
+
+
+def _cpu_seconds() -> tuple[float, float]:
+    """Busy and all, of all CPUs, since the boot. Guests are in `user` already."""
+    import psutil  # noqa: PLC0415 - 15 ms, if a policy asks for it
+
+    t = psutil.cpu_times()
+    busy = t.user + t.nice + t.system + t.irq + t.softirq + t.steal
+    return busy, busy + t.idle + t.iowait
 
 
 # -- the loop -------------------------------------------------------------------------------------
 
-State = Literal["free", "asking", "adapting"]
-
 
 class ClosedLoop:
-    """One run under a policy. `tell` shows a line, like the events of the run."""
+    """One run under a policy. Assign `show` to have its lines shown like the events of the run."""
 
     def __init__(self, policy: Policy, ftm: str, private: Path, record: Path, approve: str) -> None:
         self._private, self._approve = private, approve
         self._started_ns = time.monotonic_ns()
         self._observer = Observer(policy, ftm, self._started_ns)
         self._journals, self._meter = Journals(record / "journal"), Meter(policy)
-        self._history = Lines(record / HISTORY_NAME)
+        self._history = AdaptationHistory(record / HISTORY_NAME)
         self._path = record / PROPOSALS_NAME
         self._path.touch()  # there is a policy, even if it proposes nothing
-        self._tell: Tell = lambda _: None
+        self.show: Show = lambda _: None
         self._application = ""
-        self._blind = self._deaf = self._timed = False
+        self._clock_known = False  # an event has shown when the run's clock began
+        self._journals_failed = self._input_ended = False
         self._open: Proposal | None = None  # waits for a person, or for the run
-        self._waiting: control_client.Waiting | None = None
+        self._line: Line[Answer] | None = None  # by which the run will answer
         self._due_ns = self._asked_ns = self._started_ns
-
-    def show(self, tell: Tell) -> None:
-        """Where lines go from here on."""
-        self._tell = tell
 
     @property
     def state(self) -> State:
         """What it waits for."""
         if self._open is None:
             return "free"
-        return "asking" if self._waiting is None else "adapting"
+        return "asking" if self._line is None else "adapting"
 
     def wait(self, descriptor: int) -> None:
-        """Go on observing until `descriptor` is readable."""
+        """Observe until `descriptor` is readable."""
         while True:
             now_ns = time.monotonic_ns()
             if now_ns >= self._due_ns:
                 self._due_ns = now_ns + round(PERIOD_SECONDS * 1e9)
-                self._look(now_ns)
+                self._observe(now_ns)
             ready = self._ready(descriptor, max(0, self._due_ns - time.monotonic_ns()))
-            if self._waiting is not None and self._waiting.fileno() in ready:
-                self._answered()
+            if self._line is not None and self._line.fileno() in ready:
+                self._take_answer(self._line)
             if self.state == "asking" and sys.stdin.fileno() in ready:
-                self._decided()
+                self._take_decision()
             if descriptor in ready:
                 return
 
     def _ready(self, descriptor: int, wait_ns: int) -> set[int]:
-        """The descriptors that can be read, after a while at the latest."""
+        """Wait until some descriptors can be read, at most that long."""
         poll = select.poll()
         poll.register(descriptor, select.POLLIN)
-        if self._waiting is not None:
-            poll.register(self._waiting.fileno(), select.POLLIN)
+        if self._line is not None:
+            poll.register(self._line.fileno(), select.POLLIN)
         elif self.state == "asking":
             poll.register(sys.stdin.fileno(), select.POLLIN)
         return {fd for fd, _ in poll.poll(wait_ns / 1e6)}
 
-    def told(self, event: dict[str, object]) -> None:
-        """An event of the run, as the view is told it; its time tells when the run's clock began."""
+    def on_event(self, event: dict[str, object]) -> None:
+        """An event of the run; its time shows when the run's clock began."""
         now_ns = time.monotonic_ns()
         zero_ns = now_ns - round(float(str(event["t_ms"])) * 1e6)
-        self._started_ns = min(zero_ns, self._started_ns) if self._timed else zero_ns
-        self._timed = True
-        if seen := lost(str(event["event"]), str(event["text"])):
+        self._started_ns = min(zero_ns, self._started_ns) if self._clock_known else zero_ns
+        self._clock_known = True
+        if seen := loss_in(str(event["event"]), str(event["text"])):
             self._step(seen, now_ns)
 
     def close(self) -> None:
         """The run has ended."""
-        if self._waiting is not None and self._waiting.fileno() in self._ready(self._waiting.fileno(), 0):
-            self._answered()
+        if self._line is not None and self._line.fileno() in self._ready(self._line.fileno(), 0):
+            self._take_answer(self._line)
         if self._open is not None:
             self._end(self._open, "cut off", "the run ended before")
 
     # -- observing ----------------------------------------------------------------------------
 
-    def _look(self, now_ns: int) -> None:
-        """Tell the Observer what is new. The history first: it says what runs."""
-        if self.state == "adapting" and now_ns - self._asked_ns > control_client.ADAPT_SECONDS_MAX * 1e9:
-            self._answered()
+    def _observe(self, now_ns: int) -> None:
+        """Step the Observer with what is new; the history first, because it shows which FTM runs."""
+        if self._line is not None and now_ns - self._asked_ns > control_client.ADAPT_SECONDS_MAX * 1e9:
+            self._take_answer(self._line)
         for outcome in self._history.new():
             self._application = outcome.application
-            if outcome.ftm != self._observer.running and self._open is not None and self._waiting is None:
+            if outcome.ftm != self._observer.running and self._open is not None and self._line is None:
                 self._end(self._open, "superseded", f"{outcome.ftm} runs now")
             self._step(Running(outcome.ftm), now_ns)
         for record in self._records():
@@ -236,14 +341,14 @@ class ClosedLoop:
         self._step(Measured(self._meter.values()), now_ns)
 
     def _records(self) -> list[Record]:
-        """What is new in the journals; none any more once one of them cannot be read."""
-        if self._blind:
+        """What is new in the journals; nothing any more once one of them could not be read."""
+        if self._journals_failed:
             return []
         try:
             return self._journals.new()
         except (PeerError, OSError, ValueError) as error:
-            self._blind = True
-            self._say("trouble", f"the policy sees no value faults any more: {error}")
+            self._journals_failed = True
+            self._log("trouble", f"the policy sees no value faults any more: {error}")
             return []
 
     def _step(self, observation: Observation, now_ns: int) -> None:
@@ -262,47 +367,46 @@ class ClosedLoop:
             self._end(old, "superseded", f"{proposal.target} is proposed instead")
         self._open = proposal
         change = f"{proposal.running} to {proposal.target}"
-        self._say("proposed", f"{proposal.action}: {change} ({proposal.reason})")
+        self._log("proposed", f"{proposal.action}: {change} ({proposal.reason})")
         if self._approve == "auto":
             self._carry_out(proposal)
-        elif self._deaf:
+        elif self._input_ended:
             self._decline(proposal)
         else:
-            self._say("question", f"{proposal.action}? y or n")
+            self._log("question", f"{proposal.action}? y or n")
 
-    def _decided(self) -> None:
+    def _take_decision(self) -> None:
         """A line was typed."""
         assert self._open is not None
         typed = os.read(sys.stdin.fileno(), 4096)
-        self._deaf = not typed
+        self._input_ended = not typed
         word = typed.decode(errors="replace").strip().lower()
         if word in ("y", "yes"):
             self._carry_out(self._open)
-        elif self._deaf or word in ("n", "no"):
+        elif self._input_ended or word in ("n", "no"):
             self._decline(self._open)
         else:
-            self._say("question", f"{self._open.action}? y or n; found {word[:20]!r}")
+            self._log("question", f"{self._open.action}? y or n; found {word[:20]!r}")
 
     def _decline(self, proposal: Proposal) -> None:
         self._end(proposal, "declined")
         self._step(Declined(), time.monotonic_ns())
 
     def _carry_out(self, proposal: Proposal) -> None:
-        """Ask the run for it; the answer comes later."""
+        """Request it from the run, which answers later."""
         try:
             if reason := _unsuitable(proposal.target, self._application):
                 raise ConfigError(reason)
-            self._waiting = control_client.send(
-                self._private, control_client.AdaptCommand(Goal(expression=proposal.target))
-            )
+            command = control_client.AdaptCommand(Goal(expression=proposal.target))
+            self._line = control_client.send(self._private, command)
             self._asked_ns = time.monotonic_ns()
         except AftbedError as error:
             self._end(proposal, "refused", str(error))
 
-    def _answered(self) -> None:
-        """The run has answered, or has gone, or keeps silent for too long."""
-        proposal, line, self._waiting = self._open, self._waiting, None
-        assert proposal is not None and line is not None
+    def _take_answer(self, line: Line[Answer]) -> None:
+        """The run has answered, or has ended, or did not answer in time."""
+        proposal, self._line = self._open, None
+        assert proposal is not None
         try:
             outcome = msgspec.convert(control_client.receive(line, PERIOD_SECONDS), Outcome)
         except ConfigError as error:
@@ -313,12 +417,10 @@ class ClosedLoop:
             self._end(proposal, outcome.outcome, outcome.reason)
 
     def _end(self, proposal: Proposal, outcome: str, why: str = "") -> None:
-        """Tell it and write it down. What runs then is told by the history."""
+        """Record and show it. Which FTM runs then is read from the history."""
         self._open = None
-        after_ms = self._ms_since(proposal.since_ns) if outcome == "done" else None
-        t_ms = round((proposal.now_ns - self._started_ns) / 1e6, 3)
         ended = Proposed(
-            t_ms,
+            round((proposal.now_ns - self._started_ns) / 1e6, 3),
             proposal.rule,
             proposal.reason,
             proposal.action,
@@ -326,17 +428,27 @@ class ClosedLoop:
             proposal.target,
             outcome,
             why,
-            after_ms,
+            _ms_since(proposal.since_ns) if outcome == "done" else None,
         )
         with open(self._path, "ab") as file:
             file.write(msgspec.json.encode(ended) + b"\n")
-        self._say("proposal", proposed_line(ended))
+        self._log("proposal", proposed_line(ended))
 
-    def _ms_since(self, t_ns: int) -> float:
-        return round((time.monotonic_ns() - t_ns) / 1e6, 3)
+    def _log(self, event: str, text: str) -> None:
+        self.show({"t_ms": _ms_since(self._started_ns), "event": event, "text": text})
 
-    def _say(self, event: str, text: str) -> None:
-        self._tell({"t_ms": self._ms_since(self._started_ns), "event": event, "text": text})
+
+def _ms_since(t_ns: int) -> float:
+    return round((time.monotonic_ns() - t_ns) / 1e6, 3)
+
+
+def _unsuitable(expression: str, application: str) -> str:
+    """Why `expression` does not suit the function that is protected now; "" if it does."""
+    function = load_application(application, load_module) if application else default_application()
+    declared: object = getattr(function, "characteristics", None)
+    if not isinstance(declared, Characteristics):
+        return f"{application}: characteristics: found {declared!r}, allowed is Characteristics(...)"
+    return unsuitable(expression, declared)
 
 
 def proposed_line(ended: Proposed) -> str:
