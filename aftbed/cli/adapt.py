@@ -64,8 +64,7 @@ def _change_command(verb: str, about: str) -> None:
     @adapt.command(verb, help=about)
     @takes(ChangeArguments)
     def change(given: ChangeArguments) -> int:
-        wish = Wish(verb, given.expr)
-        return _change(wish, given.run, given.recipe, force=given.force, as_json=given.json)
+        return _change(Wish(verb, given.expr), given)
 
 
 EXIT_HELP: Final = "Exit code of all that adapts: 0 done, 1 rolled back, 2 refused."
@@ -77,7 +76,7 @@ _change_command("compose", "Keep the outer mechanism, and add mechanisms inside 
 @adapt.command()
 def decompose(recipe: Recipe = "drained", run: Run = None, json: Json = False) -> None:
     """Keep the outer mechanism, and remove those inside it."""
-    raise typer.Exit(_change(Wish("decompose"), run, recipe, force=False, as_json=json))
+    raise typer.Exit(_change(Wish("decompose"), ChangeArguments(expr="", recipe=recipe, run=run, json=json)))
 
 
 @adapt.command()
@@ -90,7 +89,8 @@ def update(
     json: Json = False,
 ) -> None:
     """Replace the class of one brick on every replica; the class may be newer than the run."""
-    raise typer.Exit(_change(Wish("update", brick, source), run, recipe, force=force, as_json=json))
+    given = ChangeArguments(expr="", recipe=recipe, force=force, run=run, json=json)
+    raise typer.Exit(_change(Wish("update", brick, source), given))
 
 
 @adapt.command()
@@ -106,13 +106,13 @@ def script(
     raise typer.Exit(_ask(run_directory.find(run), goal, as_json=json))
 
 
-def _change(wish: Wish, run: str | None, recipe: str, *, force: bool, as_json: bool) -> int:
-    private = run_directory.find(run)
+def _change(wish: Wish, given: ChangeArguments) -> int:
+    private = run_directory.find(given.run)
     graph = msgspec.convert(control_client.ask(private, control_client.GraphQuery()), Graph)
-    goal = goal_of(wish, graph, recipe, _source)
+    goal = goal_of(wish, graph, given.recipe, _source)
     application = goal.source if goal.part == APPLICATION else _function_of(graph)
-    _refuse_unsuitable(goal.expression or graph.ftm, application, wish, force=force)
-    return _ask(private, goal, as_json=as_json)
+    _refuse_unsuitable(goal.expression or graph.ftm, application, wish, force=given.force)
+    return _ask(private, goal, as_json=given.json)
 
 
 def _ask(private: Path, goal: Goal, *, as_json: bool) -> int:
