@@ -1,6 +1,5 @@
 """`aftbed explore`: simulate every experiment of one kind, and count them exactly."""
 
-import sys
 import time
 from contextlib import closing
 from typing import Annotated, Final
@@ -127,7 +126,7 @@ def _explore(explorer: str, given: NumberedArguments, requests: int = 0) -> int:
         if len(broken) > LISTED_MAX:
             print(f"and {spaced(len(broken) - LISTED_MAX)} more; --json lists them all")
         if runs < len(setups):
-            print(f"interrupted: {spaced(runs)} of {spaced(len(setups))} were run")
+            print(_interrupted(runs, len(setups)))
         print(_count(result))
     return EXIT_INTERRUPTED if interrupted else EXIT_CODES["fail" if broken else "pass"]
 
@@ -173,6 +172,10 @@ def _count(result: Explored) -> str:
     )
 
 
+def _interrupted(runs: int, of: int) -> str:
+    return f"interrupted: {spaced(runs)} of {spaced(of)} were run"
+
+
 def _since(began_s: float) -> float:
     return round(time.monotonic() - began_s, 3)
 
@@ -190,16 +193,16 @@ def order(given: ExploreOrderArguments) -> int:
     # The same mechanisms as those of `crash`.
     chosen = selected("crash", separated(given.ftm), separated(given.placement), given.requests)
     setups = list(experiments(chosen.ftms, chosen.placements, given.requests))
-    with progress_bar("explore order", len(setups), quiet=given.json) as show:
-        for one in explore_orders(setups, given.bound, jobs):
-            found.append(one)
-            show(len(found), len(found), sum(bool(o.broken) for o in found))
-            if not given.json:
-                whole = "all" if one.complete else "at least"
-                print(f"{whole} {spaced(one.orders)} orders ({spaced(one.cut)} cut): {described(one.setup)}")
-                for reason in one.breaches:
-                    print(f"  broken in {spaced(one.broken)}: {reason}")
-                sys.stdout.flush()
+    interrupted = False
+    try:
+        with progress_bar("explore order", len(setups), quiet=given.json) as show:
+            for one in explore_orders(setups, given.bound, jobs):
+                found.append(one)
+                show(len(found), len(found), sum(bool(o.broken) for o in found))
+                if not given.json:
+                    print(_order_text(one), flush=True)
+    except KeyboardInterrupt:
+        interrupted = True
     orders, broken = sum(o.orders for o in found), sum(o.broken for o in found)
     complete, seconds = sum(o.complete for o in found), _since(began_s)
     if given.json:
@@ -218,8 +221,16 @@ def order(given: ExploreOrderArguments) -> int:
         }
         print_json(document)
     else:
+        if interrupted:
+            print(_interrupted(len(found), len(setups)))
         print(
             f"{spaced(orders - broken)} of {spaced(orders)} orders survived; all orders of {complete} of"
             f" {len(found)} experiments, the others up to {spaced(given.bound)} runs each; {seconds:.1f} s"
         )
-    return EXIT_CODES["fail" if broken else "pass"]
+    return EXIT_INTERRUPTED if interrupted else EXIT_CODES["fail" if broken else "pass"]
+
+
+def _order_text(one: OrderedRuns) -> str:
+    whole = "all" if one.complete else "at least"
+    head = f"{whole} {spaced(one.orders)} orders ({spaced(one.cut)} cut): {described(one.setup)}"
+    return "\n".join([head, *(f"  broken in {spaced(one.broken)}: {reason}" for reason in one.breaches)])

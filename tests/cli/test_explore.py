@@ -160,3 +160,23 @@ def test_options_that_are_refused(
 ) -> None:
     error = refused("explore", *arguments)
     assert all(word in error for word in words), error
+
+
+class Interrupted:
+    """An exploration at whose first result Ctrl-C is pressed."""
+
+    def __iter__(self) -> "Interrupted":
+        return self
+
+    def __next__(self) -> None:
+        raise KeyboardInterrupt
+
+    def close(self) -> None:
+        """As a generator has it."""
+
+
+def test_ctrl_c_ends_every_explorer_with_130(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, command in (("explore_all", "crash"), ("explore_orders", "order")):
+        monkeypatch.setattr(f"aftbed.cli.explore.{name}", lambda *_: Interrupted())
+        code, out, _ = call("explore", command, "--ftm", "pbr", "--placement", "process", "--requests", "1")
+        assert code == 130 and "interrupted: 0 of " in out
