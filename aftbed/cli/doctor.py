@@ -29,19 +29,7 @@ def doctor(
 
     Exit code: 0 nothing is missing and nothing left, 1 something is.
     """
-    diagnosis = _diagnose(clean=clean)
-    if json:
-        print_json(diagnosis)
-    else:
-        _show(diagnosis, clean=clean)
-    raise typer.Exit(0 if diagnosis.ok else 1)
-
-
-def _diagnose(*, clean: bool) -> Diagnosis:
-    """Inspect the machine, and remove what dead runs left if `clean`."""
-    checks = inspect()
-    removed: list[Left] = []
-    left: list[Left] = []
+    checks, removed, left = inspect(), list[Left](), list[Left]()
     try:
         left = cleanup.find()
         if clean:
@@ -49,7 +37,12 @@ def _diagnose(*, clean: bool) -> Diagnosis:
     except HarnessError:  # runs have no directory here: one of the checks reports it
         assert any(c.status == "missing" for c in checks)
     ok = not left and all(c.status != "missing" for c in checks)
-    return Diagnosis(checks, left, removed, ok)
+    diagnosis = Diagnosis(checks, left, removed, ok)
+    if json:
+        print_json(diagnosis)
+    else:
+        _show(diagnosis, clean=clean)
+    raise typer.Exit(0 if ok else 1)
 
 
 def _show(diagnosis: Diagnosis, *, clean: bool) -> None:

@@ -26,7 +26,6 @@ from aftbed.adapt.suitability import (
     table_from,
 )
 from aftbed.cli.options import Json, check_range, print_json
-from aftbed.core.application import Characteristics
 from aftbed.core.errors import ConfigError
 from aftbed.core.graph import Graph
 from aftbed.core.yaml_file import read_yaml
@@ -77,15 +76,16 @@ def show(
         channels = [{"name": k.name, "source": k.source, "sink": k.sink} for k in graph.links]
         print_json({**_summary(wanted, graph), "bricks": bricks, "channels": channels})
         return
-    _print_block("tolerates", [", ".join(wanted.tolerates) or "nothing"])
-    if set(wanted.detects) - set(wanted.tolerates):
-        _print_block("detects", [", ".join(wanted.detects)])
-    _print_block("needs", [*wanted.deterministic, *wanted.state_access] or ["nothing of the function"])
     bandwidth = "no" if wanted.bandwidth == "none" else wanted.bandwidth
-    _print_block("takes", [f"{_cpus(wanted.cpus)}, {wanted.cpu_load} CPU load, {bandwidth} bandwidth"])
-    _print_block("processes", [f"{_processes(graph)}, one per brick and the supervisor"])
-    _print_block("bricks", _bricks(graph))
-    _print_block("channels", _channels(graph))
+    _print_blocks(
+        tolerates=[", ".join(wanted.tolerates) or "nothing"],
+        detects=[", ".join(wanted.detects)] if set(wanted.detects) - set(wanted.tolerates) else [],
+        needs=[*wanted.deterministic, *wanted.state_access] or ["nothing of the function"],
+        takes=[f"{_cpus(wanted.cpus)}, {wanted.cpu_load} CPU load, {bandwidth} bandwidth"],
+        processes=[f"{_processes(graph)}, one per brick and the supervisor"],
+        bricks=_bricks(graph),
+        channels=_channels(graph),
+    )
 
 
 @ftm.command()
@@ -124,30 +124,28 @@ def check(
         given = {"faults": model.asked(), "app": app, "characteristics": declared, "resources": resources}
         print_json({"ftm": expression, "consistent": suits, **judged, **given})
     else:
-        _print_block("faults", [", ".join(model.asked()) or "none"])
-        _print_block("function", [_function(declared, app)])
-        _print_block("resources", [_machine(resources)])
-        _print_verdict(expression, found, notes, others)
+        determinism = "deterministic" if declared.deterministic else "not deterministic"
+        access = "state access" if declared.state_access else "no state access"
+        kbit_s = resources.bandwidth_kbit_s
+        limit = "bandwidth not limited" if kbit_s is None else f"{kbit_s:g} kbit/s"
+        _print_blocks(
+            faults=[", ".join(model.asked()) or "none"],
+            function=[f"{determinism}, {access} ({app or 'the brake function'})"],
+            resources=[f"{_cpus(resources.cpus)}, load {resources.cpu_load:.0%}, {limit}"],
+            because=found,
+            remark=notes,
+        )
+        would_do = f"consistent: {', '.join(others)}" if others else NO_FTM
+        if expression is None:
+            print(would_do)
+        else:
+            print(f"{expression} is not consistent; {would_do}" if found else f"{expression} is consistent")
     if not suits:
         raise typer.Exit(EXIT_INCONSISTENT)
 
 
-def _print_verdict(expression: str | None, found: list[str], notes: list[str], others: list[str]) -> None:
-    """The reasons; the last line is the answer."""
-    _print_block("because", found)
-    _print_block("remark", notes)
-    would_do = f"consistent: {', '.join(others)}" if others else NO_FTM
-    if expression is None:
-        print(would_do)
-    else:
-        print(f"{expression} is not consistent; {would_do}" if found else f"{expression} is consistent")
-
-
 def _table(path: str | None) -> SuitabilityTable:
-    if path is None:
-        return TABLE
-
-    return table_from(read_yaml(Path(path), TableFile), path)
+    return TABLE if path is None else table_from(read_yaml(Path(path), TableFile), path)
 
 
 def _resources(cpus: int | None, cpu_load: float | None, bandwidth: float | None) -> Resources:
@@ -204,22 +202,12 @@ def _channels(graph: Graph) -> list[str]:
     ]
 
 
-def _function(declared: Characteristics, app: str | None) -> str:
-    determinism = "deterministic" if declared.deterministic else "not deterministic"
-    access = "state access" if declared.state_access else "no state access"
-    return f"{determinism}, {access} ({app or 'the brake function'})"
-
-
-def _machine(resources: Resources) -> str:
-    bandwidth = resources.bandwidth_kbit_s
-    limit = "bandwidth not limited" if bandwidth is None else f"{bandwidth:g} kbit/s"
-    return f"{_cpus(resources.cpus)}, load {resources.cpu_load:.0%}, {limit}"
-
-
 def _cpus(count: int) -> str:
     return "1 CPU" if count == 1 else f"{count} CPUs"
 
 
-def _print_block(head: str, lines: list[str]) -> None:
-    for index, line in enumerate(lines):
-        print(f"{'' if index else head:<10} {line}")
+def _print_blocks(**blocks: list[str]) -> None:
+    """Each block's lines, its name before the first."""
+    for name, lines in blocks.items():
+        for index, line in enumerate(lines):
+            print(f"{'' if index else name:<10} {line}")
