@@ -119,40 +119,29 @@ class Graph(msgspec.Struct, frozen=True):
         found += [f"{b.name}: no such kind of brick: {b.kind}" for b in self.bricks if b.kind not in kinds]
         if found:
             return found
-        ports = {b.name: kinds[b.kind] for b in self.bricks}
-        return self._link_problems(ports) + self._binding_problems(ports) + self._node_problems()
-
-    def _link_problems(self, ports: dict[str, Kind]) -> list[str]:
-        found = []
+        sides = {b.name: {"out": kinds[b.kind].outputs, "in": kinds[b.kind].inputs} for b in self.bricks}
         for link in self.links:
-            for brick, port, side in (
-                (link.source, link.source_port, "outputs"),
-                (link.sink, link.sink_port, "inputs"),
-            ):
-                if brick not in ports:
+            for brick, port, side in link.ends:
+                if brick not in sides:
                     found.append(f"{link.name}: no brick is called {brick}")
-                elif port not in (ports[brick].outputs if side == "outputs" else ports[brick].inputs):
-                    found.append(f"{link.name}: {brick} has no {side[:-1]} port {port}")
-        return found
+                elif port not in sides[brick][side]:
+                    found.append(f"{link.name}: {brick} has no {side}put port {port}")
 
-    def _binding_problems(self, ports: dict[str, Kind]) -> list[str]:
         bound = Counter(end for k in self.links if not k.standby for end in k.ends)
         standby = {end for k in self.links if k.standby for end in k.ends}
-        found = [f"{b}:{p} is bound {n} times" for (b, p, _), n in bound.items() if n > 1]
-        for name, kind in ports.items():
-            wanted = [(name, port, "out") for port in kind.outputs]
-            wanted += [(name, port, "in") for port in kind.inputs]
-            found += [
-                f"{name}:{port} is not bound"
-                for _, port, side in wanted
-                if port not in kind.optional
-                and not bound[name, port, side]
-                and (name, port, side) not in standby
-            ]
-        return found
+        found += [f"{b}:{p} is bound {n} times" for (b, p, _), n in bound.items() if n > 1]
+        found += [
+            f"{b.name}:{port} is not bound"
+            for b in self.bricks
+            for side, ports in sides[b.name].items()
+            for port in ports
+            if port not in kinds[b.kind].optional
+            and not bound[b.name, port, side]
+            and (b.name, port, side) not in standby
+        ]
 
-    def _node_problems(self) -> list[str]:
         hosted = Counter(brick for bricks in self.nodes.values() for brick in bricks)
-        names = {b.name for b in self.bricks}
-        found = [f"{name} is hosted by {hosted[name]} nodes" for name in sorted(names) if hosted[name] != 1]
-        return found + [f"a node hosts {name}, which is not a brick" for name in sorted(set(hosted) - names)]
+        found += [f"{name} is hosted by {hosted[name]} nodes" for name in sorted(sides) if hosted[name] != 1]
+        return found + [
+            f"a node hosts {name}, which is not a brick" for name in sorted(hosted.keys() - sides)
+        ]

@@ -9,6 +9,7 @@ paper's 17 processes of a duplex (23 when composed) are the nodes made here and 
 the place of the ROS master.
 """
 
+import contextlib
 from typing import Final
 
 from aftbed.core.errors import ConfigError, unknown
@@ -49,10 +50,14 @@ def parse(expression: str) -> tuple[str, ...]:
     return names
 
 
-def expressions() -> tuple[str, ...]:
+def _expressions() -> tuple[str, ...]:
     """Every expression of one or two mechanisms that makes sense, `none` first."""
-    pairs = (f"{outer}+{inner}" for outer in MECHANISMS for inner in SIMPLEX if outer != inner)
-    return (NONE, *DUPLEX, *SIMPLEX, *(e for e in pairs if _makes_sense(e)))
+    found = [NONE, *DUPLEX, *SIMPLEX]
+    for pair in (f"{outer}+{inner}" for outer in MECHANISMS for inner in SIMPLEX):
+        with contextlib.suppress(ConfigError):
+            parse(pair)
+            found.append(pair)
+    return tuple(found)
 
 
 def chain(graph: Graph, replica: str) -> tuple[str, ...]:
@@ -77,15 +82,7 @@ def chain(graph: Graph, replica: str) -> tuple[str, ...]:
     return (*found, *sorted(ahead), *(bricks & {server}))
 
 
-def _makes_sense(expression: str) -> bool:
-    try:
-        parse(expression)
-    except ConfigError:
-        return False
-    return True
-
-
-EXPRESSIONS: Final = expressions()
+EXPRESSIONS: Final = _expressions()
 DUPLEX_EXPRESSIONS: Final = tuple(  # each mechanism that replicates, alone and around each other one
     "+".join((outer, *inner)) for inner in ((), *((name,) for name in SIMPLEX)) for outer in DUPLEX
 )
@@ -144,7 +141,8 @@ def _protected(names: tuple[str, ...], placement: str, leader: str) -> Graph:
     ]
     hosted: dict[str, tuple[str, ...]] = {}
     for replica in replicas:
-        chain, inside = replica_of(names, replica)
+        chain, inside = _stage(names, "", replica)
+        chain.append(BrickSpec(f"{replica}/server", "server"))
         bricks += chain
         links += inside
         standby = replica != leader
@@ -162,25 +160,22 @@ def _protected(names: tuple[str, ...], placement: str, leader: str) -> Graph:
 ALARMS: Final = {"a": "wdg2rec", "b": "wdg2rec.b"}  # Recovery's port for each replica's Watchdog
 
 
-def replica_of(names: tuple[str, ...], replica: str) -> tuple[list[BrickSpec], list[Link]]:
-    """The chain of one replica: its bricks, in the order of a request, and the links among them."""
-    bricks, links = _stage(names, f"{replica}/", "", replica)
-    return [*bricks, BrickSpec(f"{replica}/server", "server")], links
+def _stage(names: tuple[str, ...], prefix: str, replica: str) -> tuple[list[BrickSpec], list[Link]]:
+    """Protocol, Before, Proceed and After of `names[0]`, with the rest of `names` as its Proceed.
 
-
-def _stage(names: tuple[str, ...], at: str, prefix: str, replica: str) -> tuple[list[BrickSpec], list[Link]]:
-    """Protocol, Before, Proceed and After of `names[0]`, with the rest of `names` as its Proceed."""
+    The bricks are in the order of a request; the links are those among them and with the Server.
+    """
     row, rest = MECHANISMS[names[0]], names[1:]
     server = f"{replica}/server"
 
     def brick(part: str) -> str:
-        return server if part == "server" else f"{at}{prefix}{part}"
+        return server if part == "server" else f"{replica}/{prefix}{part}"
 
     protocol = BrickSpec(brick("protocol"), "inner.protocol" if prefix else "protocol")
     before, after = BrickSpec(brick("before"), row.before.name), BrickSpec(brick("after"), row.after.name)
     links = [Link(protocol.name, "pro2bfr", before.name, "pro2bfr")]
     if rest:
-        inner, inner_links = _stage(rest, at, f"{rest[0]}.", replica)
+        inner, inner_links = _stage(rest, f"{rest[0]}.", replica)
         links += [
             Link(before.name, "bfr2prd", inner[0].name, "pxy2pro"),
             *inner_links,
