@@ -22,7 +22,7 @@ not exist is the user's error and costs the run nothing. What a fault does to th
 import re
 from collections import deque
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, get_args
 
 import msgspec
 
@@ -137,28 +137,27 @@ class StuckCounter(BusEffect, frozen=True):
     VERB = "stuck-counter"
 
 
-class Babble(BusEffect, frozen=True):
+class NodeEffect(BusEffect, frozen=True):
+    """Base of what is done to one node."""
+
+    node: str
+
+    def __str__(self) -> str:
+        return self.node
+
+
+class Babble(NodeEffect, frozen=True):
     """The node sends the highest priority without a pause: no other frame gets through, none of its own
     either.
     """
 
-    node: str
-
     VERB = "babbling"
 
-    def __str__(self) -> str:
-        return self.node
 
-
-class BusOff(BusEffect, frozen=True):
+class BusOff(NodeEffect, frozen=True):
     """Nothing of the node reaches the bus, and nothing of the bus the node."""
 
-    node: str
-
     VERB = "bus-off"
-
-    def __str__(self) -> str:
-        return self.node
 
 
 class Partition(BusEffect, frozen=True):
@@ -182,9 +181,9 @@ BusPersistence = Transient | Lasting | Chance | Every | Permanent
 _WITHOUT_WORDS: Final[dict[str, BusAct]] = {
     act.VERB: act for act in (Omission(), Duplicate(), Reorder(), StuckCounter())
 }
-ON_FRAMES: Final = ("omission", "delay", "duplicate", "reorder", "corrupt", "masquerade", "stuck-counter")
+ON_FRAMES: Final = tuple(dict.fromkeys(act.VERB for act in get_args(FrameAct)))
 ON_NODES: Final = tuple(act.VERB for act in NODE_ACTS)
-ONLY_ON_BUS: Final = (*ON_NODES, "corrupt", "masquerade", "stuck-counter")  # no channel has these
+ONLY_ON_BUS: Final = (*ON_NODES, FlipBit.VERB, Masquerade.VERB, StuckCounter.VERB)  # no channel has these
 
 
 # -- to which frames, from when -------------------------------------------------------------------
@@ -300,7 +299,7 @@ class BusFault(FaultKind, frozen=True, tag="bus"):
         if self.opening.when is not None and not car:
             raise ConfigError(f"{self}: 'when' looks at the car, and a replay has none")
         match self.effect:
-            case Babble(node) | BusOff(node):
+            case NodeEffect(node):
                 named: tuple[str, ...] = (node,)
             case Partition(side, other):
                 named = (*side, *other)

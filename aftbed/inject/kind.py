@@ -3,12 +3,12 @@
 A kind is one file and one line in `model.FaultAction`. The file has the rule of its words, what it may
 target, where it waits, what it does, what its receipt shows, and how it is undone:
 
-    words            from_words `run --inject "..."`, `aftbed inject`, campaigns
-    fault            check      before a run starts, and in it
-    armed            waits_in   the brick that comes to its point; none: it strikes at once
-    at its point     act        what the supervisor does, as a task of the runtime
-    after `lasts_ms` undo
-    at any time      receipt    what has become of it, by journals and by what is seen
+    words             from_words  `run --inject "..."`, `aftbed inject`, campaigns
+    fault             check       before a run starts, and in it
+    armed             waits_in    the brick that comes to its point; none: it strikes at once
+    at its point      act         what the supervisor does, as a task of the runtime
+    after `lasts_ms`  undo
+    at any time       receipt     what has become of it, by journals and by what is seen
 
 What is the same for all kinds belongs to the controller (`runtime.fault_controller`): conditions of the
 car, moves after a failover, counting, reports. It hands itself to a kind as `RunControl`.
@@ -37,8 +37,9 @@ Steps = Generator[Any, Any, T]  # a task of the runtime: what it yields is the r
 
 
 class AnyFault(msgspec.Struct, frozen=True):
-    """A fault of any kind: what is done, to what, when, and how often again. `model.Fault` travels.
+    """A fault of any kind: what is done, to what, when, and how often again.
 
+    `model.Fault` is the same for the registered kinds, which can be encoded and decoded.
     `target` is a role, a replica, a node, or another process, as the kind allows.
     Raises ValueError on a combination that means nothing.
     """
