@@ -87,7 +87,7 @@ REQUEST_PATH: Final = (  # one request under PBR
 )
 REQUEST_EVENTS: Final = frozenset(event for event in Event if event.weight is Weight.ROUTINE)
 STEP_EVENTS: Final = frozenset((Event.ADAPT_STEP_ENTER, Event.ADAPT_STEP_ACT, Event.ADAPT_STEP_EXIT))
-FIRST_FAULT: Final = 1_000_001  # number of the first fault of a run, in the detail of `fault.applied`
+FIRST_FAULT: Final = 1_000_001  # number of the first fault of a run; those of orders are smaller
 
 
 def event_named(label: str) -> Event:

@@ -258,13 +258,13 @@ class Layout(msgspec.Struct, frozen=True):
 
 def after(graph: Graph, script: Script, kinds: dict[str, Kind]) -> Graph:
     """The graph that `script` leads to. What it stages counts as in place, exchanged or not."""
-    fold = _Fold(Layout(graph), kinds)
-    fold.apply(script.prepare, committing=False)
-    fold.apply((*script.commit, *script.finish), committing=True)
-    for node in list(fold.staged):
-        fold.exchange(node)
-    waiting = [k for key, k in fold.prepared.items() if key not in fold.links]
-    found = fold.layout().graph
+    reached = _MutableLayout(Layout(graph), kinds)
+    reached.apply(script.prepare, committing=False)
+    reached.apply((*script.commit, *script.finish), committing=True)
+    for node in list(reached.staged):
+        reached.exchange(node)
+    waiting = [k for key, k in reached.prepared.items() if key not in reached.links]
+    found = reached.layout().graph
     return msgspec.structs.replace(found, ftm=script.ftm or graph.ftm, links=(*found.links, *waiting))
 
 
@@ -272,12 +272,12 @@ def applied(
     layout: Layout, steps: Iterable[Step], kinds: dict[str, Kind], *, committing: bool = True
 ) -> Layout:
     """What `steps` make of `layout`. While not `committing`, bricks that serve keep their links."""
-    fold = _Fold(layout, kinds)
-    fold.apply(steps, committing=committing)
-    return fold.layout()
+    reached = _MutableLayout(layout, kinds)
+    reached.apply(steps, committing=committing)
+    return reached.layout()
 
 
-class _Fold:
+class _MutableLayout:
     """A Layout that steps are applied to."""
 
     def __init__(self, layout: Layout, kinds: dict[str, Kind]) -> None:

@@ -15,12 +15,12 @@ not move to the process that takes its place.
 import contextlib
 import itertools
 from collections.abc import Callable, Iterable, Sequence
-from typing import Final, cast
+from typing import cast
 
 import msgspec
 
 from aftbed.core.errors import ConfigError, StepFailed
-from aftbed.core.events import Event, event_named
+from aftbed.core.events import FIRST_FAULT, Event, event_named
 from aftbed.core.journal import Record
 from aftbed.inject import targets
 from aftbed.inject.kind import Injection, Steps
@@ -32,8 +32,6 @@ from aftbed.runtime import control
 from aftbed.runtime.deployment import Deployment, Keys
 from aftbed.runtime.interface import Met, Process, SharedMemory
 from aftbed.runtime.tasks import Key, Wait
-
-FIRST_FAULT: Final = 1_000_001  # numbers of faults are apart from the tokens of orders
 
 
 class NoHost(StepFailed):
