@@ -63,7 +63,7 @@ IMPURE_CALLS: Final = frozenset({"open", "input", "print", "exec", "eval", "__im
 PENDING_ROWS: Final[frozenset[str]] = frozenset()
 PENDING_IMPORTS: Final[frozenset[str]] = frozenset()
 PENDING_CYCLES: Final = 0
-PENDING_DOUBLE_NAMES: Final = 5
+PENDING_DOUBLE_NAMES: Final = 0
 
 
 class Import(NamedTuple):

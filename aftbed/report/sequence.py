@@ -30,7 +30,7 @@ from aftbed.core.journal import Entry, Record
 from aftbed.ftm.compose import build
 from aftbed.judge.timeline import describe
 from aftbed.judge.verdict import Breach
-from aftbed.runtime.sim.trace import STRUCK, Happening, Sent, Told, Trace, brief, digest, milliseconds
+from aftbed.runtime.sim.trace import STRUCK, Happening, LoggedLine, Sent, Trace, brief, digest, milliseconds
 
 EXECUTIVE: Final = "supervisor"
 LAST: Final = 40  # lines of a listing; arrows and notes of a Mermaid diagram
@@ -79,7 +79,7 @@ class _Views:
                 return self._hosts.get(one.source, one.source), self._hosts.get(one.sink, one.sink)
             case Record():
                 return (one.node,)
-            case Told(event=event, text=text):
+            case LoggedLine(event=event, text=text):
                 return (text if event == STRUCK else EXECUTIVE,)
             case _:
                 return ()
@@ -95,7 +95,7 @@ class _Views:
                 return _View(nodes, columns, f"{one.port} {message}", "arrows", css, text, room_px=16)
             case Record(event=event):
                 return self._of_record(one, event)
-            case Told(event=event, text=text):
+            case LoggedLine(event=event, text=text):
                 struck = event == STRUCK
                 words = f"{text} was hit" if struck else f"{event}: {text}"
                 css = "fault" if struck else "adapt" if event.startswith("adapt") else "step"
@@ -127,7 +127,7 @@ def is_turn(one: Happening) -> bool:
 
 
 def _is_strike(one: Happening) -> bool:
-    return isinstance(one, Told) and one.event == STRUCK
+    return isinstance(one, LoggedLine) and one.event == STRUCK
 
 
 def _ms(t_ns: int) -> str:

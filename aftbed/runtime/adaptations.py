@@ -1,7 +1,7 @@
 """Adaptations of a run: requests for them, their plans, the orders of the Engine, how they ended.
 
 An adaptation is planned and checked once, when it begins. The Engine decides, phase by phase; its orders are
-executed here, and what it must not forget is kept: a new Engine is told what the dead one had ordered last.
+executed here, and what it must not forget is kept: a new Engine gets what the dead one had ordered last.
 While a phase acts on what serves, Recovery waits; a replica that is lost before the end of the observation
 undoes the adaptation, then it fails over.
 """
@@ -37,7 +37,7 @@ Answer = Callable[["Outcome"], None]
 
 
 class Outcome(msgspec.Struct):
-    """One adaptation, as it is told and written down; times in milliseconds."""
+    """One adaptation, as it is shown and recorded; times in milliseconds."""
 
     number: int
     purpose: str
@@ -71,7 +71,7 @@ def function_of(graph: Graph) -> str:
     return next(b.application for b in graph.bricks if b.part == "server")
 
 
-def _nobody(outcome: Outcome) -> None:
+def _unanswered(outcome: Outcome) -> None:
     """Asked for with the run: it is in the history."""
 
 
@@ -164,7 +164,7 @@ class Adaptations:
             raise PlanError(str(error)) from error
         outcome = self._asked(goal)
         self._current = _Current(outcome, answer, self._loop.now_ns(), deployment.epoch, plan)
-        self._say(messages.Adapt(outcome.number, plan.script))
+        self._send(messages.Adapt(outcome.number, plan.script))
 
     def plan(self, goal: messages.Goal) -> Plan:
         """What would be done, from the graph that runs now. Raises ConfigError."""
@@ -181,30 +181,30 @@ class Adaptations:
             if later.at_request:
                 self._scheduled.append(later)
             else:
-                begin = functools.partial(self._ask_again, later.goal, _nobody, RETRIES_MAX)
+                begin = functools.partial(self._ask_again, later.goal, _unanswered, RETRIES_MAX)
                 self._loop.after(later.after_ms / 1e3, begin)
         yield from self._hold_requests()
 
     def client_is_new(self) -> Keys:
         """Have the new Client, which takes no mail yet, hold the requests that adaptations wait for."""
         yield from self._hold_requests()
-        yield from self._deployment.ask(CLIENT, control.Resume)
+        yield from self._deployment.ask(CLIENT, control.ResumeNode)
 
     def _hold_requests(self) -> Keys:
         requests = tuple(sorted({later.at_request for later in self._scheduled}))
         if requests:
             hold = messages.HoldAt(requests)
-            yield from self._deployment.ask(CLIENT, lambda token: control.Tell(token, CLIENT, hold))
+            yield from self._deployment.ask(CLIENT, lambda token: control.Deliver(token, CLIENT, hold))
 
     def request_held(self, request_id: int) -> None:
         """The Client has come to `request_id`: begin what waits for it, then have the request sent."""
         due = [later for later in self._scheduled if later.at_request == request_id]
         self._scheduled = [later for later in self._scheduled if later.at_request != request_id]
         for later in due:
-            self._ask_again(later.goal, _nobody, RETRIES_MAX)
+            self._ask_again(later.goal, _unanswered, RETRIES_MAX)
         release = messages.Release(request_id)
         with contextlib.suppress(StepFailed):  # the Client is dead; its successor sends the request again
-            self._deployment.order(CLIENT, lambda token: control.Tell(token, CLIENT, release))
+            self._deployment.order(CLIENT, lambda token: control.Deliver(token, CLIENT, release))
 
     def _ask_again(self, goal: messages.Goal, answer: Answer, retries: int) -> None:
         try:
@@ -219,27 +219,27 @@ class Adaptations:
             self._log("adapted", f"{_named(goal)}: refused: {error}")
             answer(Outcome(0, _named(goal), goal.recipe, ftm, REFUSED, str(error)))
 
-    def _say(self, told: messages.Adapt | messages.Progress | messages.TakeUp) -> None:
+    def _send(self, message: messages.Adapt | messages.Progress | messages.TakeUp) -> None:
         try:
-            self._deployment.order(ENGINE, lambda token: control.Tell(token, ENGINE, told))
+            self._deployment.order(ENGINE, lambda token: control.Deliver(token, ENGINE, message))
         except StepFailed:
-            return  # it is dead: its successor is told by `engine_is_new`
+            return  # it is dead: `engine_is_new` informs its successor
 
     # -- what the Engine orders ---------------------------------------------------------------
 
     def ordered(self, todo: Script, phase: Phase, number: int) -> None:
-        """Carry out a phase, and tell the Engine how it went."""
+        """Carry out a phase, and report its result to the Engine."""
         now = self._current
         if now is None or now.outcome.number != number:
             return
         if phase is Phase.FINISH and now.lost:
-            return  # it was said before the Engine heard of the loss
+            return  # ordered before the Engine knew of the loss
         if now.execution is None and (now.epoch != self._deployment.epoch or self._executor.busy):
             now.spoiled = now.spoiled or "the leader has changed since it was planned"
         if now.execution is None and now.spoiled:
             now.phase, now.ended = phase, True
             now.failure = "" if phase is Phase.UNDO else now.spoiled
-            self._say(messages.Progress(number, phase, now.failure))
+            self._send(messages.Progress(number, phase, now.failure))
             return
         if now.execution is None:
             now.execution = Execution(self._deployment, todo, now.plan.new, self._step)
@@ -277,12 +277,12 @@ class Adaptations:
             now.outcome.blackout_ms = round(closed / 1e6, 3)
         if not (now.phase is Phase.COMMIT and failure):
             self._executor.held = False
-        self._say(messages.Progress(now.outcome.number, now.phase, failure))
+        self._send(messages.Progress(now.outcome.number, now.phase, failure))
         if now.phase in (Phase.COMMIT, Phase.UNDO) and not self._executor.busy:
             self._inform_recovery()
 
-    def adapted(self, told: messages.Adapted) -> None:
-        """The Engine says how it ended."""
+    def adapted(self, ended: messages.Adapted) -> None:
+        """The Engine has ended the adaptation under way."""
         now, self._current = self._current, None
         if now is None:
             return
@@ -290,7 +290,7 @@ class Adaptations:
             self._executor.held = False
             self._inform_recovery()
         outcome = now.outcome
-        outcome.outcome, outcome.reason = told.outcome, told.reason
+        outcome.outcome, outcome.reason = ended.outcome, ended.reason
         outcome.total_ms = round((self._loop.now_ns() - now.began_ns) / 1e6, 3)
         outcome.ftm = self._deployment.graph.ftm
         outcome.application = function_of(self._deployment.graph)
@@ -310,18 +310,18 @@ class Adaptations:
     # -- what happens meanwhile ---------------------------------------------------------------
 
     def engine_is_new(self) -> None:
-        """Tell it what its predecessor had ordered last, if anything."""
+        """Send it what its predecessor had ordered last, if anything."""
         now = self._current
         if now is None:
             return
         number, script = now.outcome.number, now.plan.script
         if now.execution is None and not now.ended:  # it had ordered nothing
-            self._say(messages.Adapt(number, script))
+            self._send(messages.Adapt(number, script))
             return
-        self._say(messages.TakeUp(number, script, now.phase, now.ended, now.failure))
+        self._send(messages.TakeUp(number, script, now.phase, now.ended, now.failure))
 
     def interrupted(self, replica: str) -> bool:
-        """Recovery wants to act on `replica`. True if it must wait, and will be told when it may."""
+        """Recovery wants to act on `replica`. True if it must wait: `inform_recovery` follows."""
         now = self._current
         if now is None or now.execution is None:
             return False
@@ -332,7 +332,7 @@ class Adaptations:
             self._executor.held = True
             now.lost = replica
             now.failure = f"replica {replica} was lost within the observation window"
-            self._say(messages.Progress(now.outcome.number, Phase.COMMIT, now.failure))
+            self._send(messages.Progress(now.outcome.number, Phase.COMMIT, now.failure))
             return True
         return False
 

@@ -72,7 +72,7 @@ class Assembler:
         epoch = TEST_EPOCH if leader else order.epoch
         return Setting(number, epoch, spec.replica == (leader or order.leader), named)
 
-    def _try_out(self, order: control.Assign, trial: control.Trial) -> None:
+    def _try_out(self, order: control.Assign, trial: control.SelfTest) -> None:
         """The self-test of bricks that are not built in."""
         replica = next(s.replica for s in order.bricks if s.replica)
         server = next(b for b in trial.graph.bricks if b.part == "server")

@@ -1,4 +1,4 @@
-"""What the executive and the nodes say to each other.
+"""The messages between the executive and the nodes.
 
 Each order carries a token; its answer is `Ack` with the same token, so an order without an answer is
 noticed by its deadline. How it travels, and ends of channels with it, is the runtime's affair.
@@ -31,8 +31,8 @@ from aftbed.vehicle.condition import Condition
 WHOLE: Final = 1.0  # of a CPU
 UNANSWERED: Final = 0  # the token of an order that gets no Ack
 
-Told = Promotion | Rebound | Watch | Situation | Adapt | Progress | TakeUp | HoldAt | Release
-Spoken = Promoted | Adapted | RequestHeld  # what bricks say to the runtime
+ToBrick = Promotion | Rebound | Watch | Situation | Adapt | Progress | TakeUp | HoldAt | Release
+FromBrick = Promoted | Adapted | RequestHeld  # from a brick to the executive
 NOWHERE: Final = -1  # the index of a port that is to lead nowhere
 
 
@@ -53,24 +53,24 @@ class Local(msgspec.Struct, frozen=True):
     sink_port: str
 
 
-class Order(msgspec.Struct, frozen=True, tag=True):
-    """Base of what the supervisor says; `token` comes back in the Ack, if it is not UNANSWERED."""
+class ControlOrder(msgspec.Struct, frozen=True, tag=True):
+    """Base of what the executive sends; `token` comes back in the Ack, if it is not UNANSWERED."""
 
     token: int
 
 
-class Park(Order, frozen=True):
+class Park(ControlOrder, frozen=True):
     """To a zygote: fork one spare for each descriptor that came along."""
 
 
-class Trial(msgspec.Struct, frozen=True):
+class SelfTest(msgspec.Struct, frozen=True):
     """A self-test: the graph to be, and requests that were recorded in this run."""
 
     graph: Graph
     requests: tuple[bytes, ...]
 
 
-class Assign(Order, frozen=True):
+class Assign(ControlOrder, frozen=True):
     """To a spare: be this node."""
 
     node: str
@@ -83,28 +83,28 @@ class Assign(Order, frozen=True):
     locals: tuple[Local, ...]
     cpu: int | None
     held: bool = False  # take no mail before a Resume
-    staged: bool = False  # nobody waits for it yet, and everybody will later: rehearse first,
-    aside: int | None = None  # on this core
-    trial: Trial | None = None  # what is written off line must stand before it is wired
+    staged: bool = False  # it serves later: run the warm-up before
+    aside: int | None = None  # core of the warm-up
+    trial: SelfTest | None = None  # what is written off line must stand before it is wired
     device: str = ""  # see `devices`
     options: bytes = b""
 
 
-class Serve(Order, frozen=True):
+class Serve(ControlOrder, frozen=True):
     """To a spare: run the service called `service` (the hub, the vehicle) with these options."""
 
     service: str
     options: bytes
 
 
-class BindInput(Order, frozen=True):
+class BindInput(ControlOrder, frozen=True):
     """Read `port` from the descriptor that came along, or from nowhere."""
 
     brick: str
     port: str
 
 
-class BindOutput(Order, frozen=True):
+class BindOutput(ControlOrder, frozen=True):
     """Write `port` to the descriptor that came along, or to nowhere; `epoch` is in force from here."""
 
     brick: str
@@ -112,7 +112,7 @@ class BindOutput(Order, frozen=True):
     epoch: int
 
 
-class Follow(Order, frozen=True):
+class Follow(ControlOrder, frozen=True):
     """To the Proxy: follow a new leader; `input` is the first descriptor, `output` the second."""
 
     brick: str
@@ -121,7 +121,7 @@ class Follow(Order, frozen=True):
     epoch: int
 
 
-class Rewire(Order, frozen=True):
+class Rewire(ControlOrder, frozen=True):
     """All that changes at this node's ports in one adaptation; then, if `suspend`, Suspend."""
 
     inputs: tuple[Port, ...]
@@ -130,24 +130,24 @@ class Rewire(Order, frozen=True):
     suspend: bool
 
 
-class Suspend(Order, frozen=True):
+class SuspendNode(ControlOrder, frozen=True):
     """Finish what is inside (`drain`: and all that waits at the open ports), take no more, then answer."""
 
     drain: bool = False
 
 
-class Resume(Order, frozen=True):
+class ResumeNode(ControlOrder, frozen=True):
     """Undo Suspend."""
 
 
-class Capture(Order, frozen=True):
+class Capture(ControlOrder, frozen=True):
     """Answer with the state of `brick`."""
 
     brick: str
     look: bool = False  # at what is there; it is not going to be used
 
 
-class Restore(Order, frozen=True):
+class Restore(ControlOrder, frozen=True):
     """Take over `state`; `migrate`: of a brick of another class, or with another function, perhaps."""
 
     brick: str
@@ -155,14 +155,14 @@ class Restore(Order, frozen=True):
     migrate: bool = False
 
 
-class Tell(Order, frozen=True):
+class Deliver(ControlOrder, frozen=True):
     """Have `brick` step with `message` on its control port."""
 
     brick: str
-    message: Told
+    message: ToBrick
 
 
-class WatchNodes(Order, frozen=True):
+class WatchNodes(ControlOrder, frozen=True):
     """To the host of a Watchdog: watch the pidfds that came along, and the pulses in these journals."""
 
     replica: str
@@ -172,20 +172,17 @@ class WatchNodes(Order, frozen=True):
     pids: tuple[int, ...]
 
 
-class Arm(Order, frozen=True):
-    """These wait for `event` here, counted from now, beside those that do already; `nth` 0: no longer."""
+class Arm(ControlOrder, frozen=True):
+    """These wait for `event` here, counted from now, beside those that do already; `nth` 0: no longer.
+
+    Without an event: each disturbs what its brick sends on its channel, from the `nth` message on.
+    """
 
     event: str
     faults: tuple[ArmedFault, ...]
 
 
-class ArmOnChannel(Order, frozen=True):
-    """Disturb what `fault.brick` sends on the channel, from the `nth` message on; `nth` 0: no longer."""
-
-    fault: ArmedFault
-
-
-class SlowDown(Order, frozen=True):
+class SlowDown(ControlOrder, frozen=True):
     """Because of `fault`, each step takes `by_ns` longer, and as much longer as with that share of a CPU.
 
     0 ns and the whole CPU: no longer.
@@ -196,7 +193,7 @@ class SlowDown(Order, frozen=True):
     share: float = WHOLE
 
 
-class ShareState(Order, frozen=True):
+class ShareState(ControlOrder, frozen=True):
     """Keep the state of a Server's function in the memory that came along; the answer is its StateLayout.
 
     `number` is in the records of what is found changed there.
@@ -206,28 +203,28 @@ class ShareState(Order, frozen=True):
     number: int
 
 
-class DisturbBus(Order, frozen=True):
+class DisturbBus(ControlOrder, frozen=True):
     """To the hub: arm this fault of the bus; `token` is its number, `draw` seeds its chance."""
 
     fault: BusFault
     draw: int
 
 
-class WatchCar(Order, frozen=True):
-    """To the hub: say when the car is so; `token` is the number of the fault. An Ack has to follow."""
+class WatchCar(ControlOrder, frozen=True):
+    """To the hub: report when `condition` holds; `token` is the number of the fault. An Ack has to follow."""
 
     condition: Condition
 
 
-class Stop(Order, frozen=True):
+class Stop(ControlOrder, frozen=True):
     """To a service, or from the command: come to an end, with what there is so far."""
 
 
-class Quiet(Order, frozen=True):
+class StopRequests(ControlOrder, frozen=True):
     """To the client's host: hand in no more requests."""
 
 
-class Stats(Order, frozen=True):
+class Stats(ControlOrder, frozen=True):
     """Answer with counts, as MessagePack."""
 
 
@@ -245,11 +242,11 @@ class Ack(msgspec.Struct, frozen=True, tag=True):
     error: str = ""
 
 
-class Said(msgspec.Struct, frozen=True, tag=True):
-    """A brick to the runtime."""
+class BrickReport(msgspec.Struct, frozen=True, tag=True):
+    """A message of a brick to the executive."""
 
     brick: str
-    message: Spoken
+    message: FromBrick
 
 
 class Ordered(msgspec.Struct, frozen=True, tag=True):
@@ -278,15 +275,15 @@ BUS_REPORTS: Final = (BUS_FAULT_ARMED, BUS_FAULTS_CHANGED, BUS_FAULTS_ASKED, CON
 
 
 class Report(msgspec.Struct, frozen=True, tag=True):
-    """A service to the runtime: `kind` says what `data` is."""
+    """A service to the executive; `data` depends on `kind`."""
 
     kind: str
     data: bytes
 
 
 ToNode = (
-    Park | Assign | Serve | BindInput | BindOutput | Follow | Rewire | Suspend | Resume | Capture | Restore
-    | Tell | WatchNodes | Arm | ArmOnChannel | SlowDown | ShareState | DisturbBus | WatchCar | Stop | Quiet
-    | Stats | Ack
+    Park | Assign | Serve | BindInput | BindOutput | Follow | Rewire | SuspendNode | ResumeNode | Capture
+    | Restore | Deliver | WatchNodes | Arm | SlowDown | ShareState | DisturbBus | WatchCar | Stop
+    | StopRequests | Stats | Ack
 )  # fmt: skip
-FromNode = Hello | Ack | Said | Ordered | Fired | Report
+FromNode = Hello | Ack | BrickReport | Ordered | Fired | Report

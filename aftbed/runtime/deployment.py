@@ -275,7 +275,7 @@ class Deployment:
     # -- processes ----------------------------------------------------------------------------
 
     def launch(self, held: Container[str] = ()) -> Keys:
-        """The whole graph, from spares; the first replica leads. Who is `held` waits for a Resume."""
+        """The whole graph, from spares; the first replica leads. A node that is `held` waits for a Resume."""
         for link in self.graph.links:
             self.channels.renew(link)
         sent = []
@@ -319,18 +319,18 @@ class Deployment:
             elif sink in slot.bricks and "/" in source and source not in slot.bricks:
                 channel.refuse()
 
-    def watch(self, slot: Slot, *, nobody: bool = False) -> Keys:
-        """Have the Watchdog of `slot` watch its present nodes, or nobody. Without a Watchdog: nothing.
+    def watch(self, slot: Slot, *, none: bool = False) -> Keys:
+        """Have the Watchdog of `slot` watch its present nodes, or none. Without a Watchdog: nothing.
 
-        If one of them is dead already, the replica is `lost`: Recovery hears of it with the next situation.
+        If one of them is dead already, the replica is `lost`: the next situation informs Recovery.
         """
         watchdog = f"{slot.name}/watchdog"
         process = self.nodes.get(watchdog)
         if process is None or not process.alive or not slot.nodes:
-            return  # a Watchdog that is being replaced is told when it is there
-        nodes = () if nobody else tuple(slot.nodes)
+            return  # a Watchdog that is being replaced gets it later
+        nodes = () if none else tuple(slot.nodes)
         if not all(self.lives(n) for n in nodes):
-            self.lost.add(slot.name)  # its Watchdog has died before it could say so
+            self.lost.add(slot.name)  # its Watchdog died before it could report that
             return
         hosts = [self.nodes[n] for n in nodes]
         yield from self.ask(
@@ -347,7 +347,7 @@ class Deployment:
         )
 
     def respawn(self, node: str, *, held: bool = False) -> Keys:
-        """Replace a dead node of no replica: fresh channels, and its neighbours are told."""
+        """Replace a dead node of no replica: fresh channels, and new ends for its neighbours."""
         (brick,) = self.graph.nodes[node]
         for channel in self.channels.touching(frozenset({brick})):
             if not self._held(channel):
@@ -391,7 +391,7 @@ class Deployment:
         process.bricks = tuple((spec.name, spec.kind) for spec in specs)
         trial = None
         if staged and any(spec.source or spec.application for spec in specs):
-            trial = control.Trial(graph, self.runtime.recorded_requests())
+            trial = control.SelfTest(graph, self.runtime.recorded_requests())
         sent = self.order(
             process,
             lambda token: control.Assign(
@@ -433,7 +433,7 @@ class Deployment:
                 self.runtime.pin(process.pid, cpu)
 
     def pin_watchers(self) -> None:
-        """Move who watches, recovers or forks, this process included, to the core that does not lead."""
+        """Move Watchdogs, Recovery, zygotes and this process to the core that does not lead."""
         cpu = self.cpu_of("recovery")
         if cpu is not None:
             for pid in (0, *(zygote.pid for zygote in self.pool.zygotes.values() if zygote.alive)):
@@ -507,7 +507,7 @@ class Deployment:
     def cause_of_loss(self, replica: str) -> str:
         """What the Watchdog of `replica` saw: a node that is silent, or one that died.
 
-        A lifeline tells of a death before the pidfd does, so to ask whether all are alive would not do.
+        A lifeline shows a death before the pidfd does, so to check whether all are alive is not enough.
         """
         now_ns = self.runtime.loop.now_ns()
         nodes = [self.nodes[node] for node in self.slots[replica].nodes if node in self.nodes]

@@ -25,18 +25,20 @@ CATCH_UP: Final = 10  # periods: a load that was held up makes good for no more
 
 
 class Device(Protocol):
-    """What a node needs of its device. `port` is the brick's port that it feeds."""
+    """What a node needs of its device. A class that names it as its base gets the defaults of a device
+    without descriptors. `port` is the brick's port that it feeds.
+    """
 
     port: str
-    polled: bool  # it has descriptors to poll, or deadlines
+    polled: bool = True  # it has descriptors to poll, or deadlines
 
     def fds(self) -> tuple[int, ...]:
         """Descriptors that make `ready` worth calling when they are readable."""
-        ...
+        return ()
 
     def ready(self, fd: int, now_ns: int) -> None:
         """`fd` is readable."""
-        ...
+        raise AssertionError(f"no descriptor {fd}")
 
     def take(self, now_ns: int) -> Submit | NodeDied | Pulses | None:
         """The next message for the brick, or None."""
@@ -44,11 +46,11 @@ class Device(Protocol):
 
     def wait(self, now_ns: int) -> None:
         """The brick's port is closed, and time goes on."""
-        ...
+        return
 
     def accept(self, reply: Reply, now_ns: int) -> None:
         """What the brick sent to `deliver`."""
-        ...
+        raise AssertionError(f"{type(self).__name__} takes no replies")
 
     def quiet(self) -> None:
         """Hand in nothing more."""
@@ -56,11 +58,11 @@ class Device(Protocol):
 
     def deadline_ns(self) -> int | None:
         """When `take` is worth calling again at the latest."""
-        ...
+        return None
 
     def stats(self) -> bytes:
         """Counts, as MessagePack."""
-        ...
+        return msgspec.msgpack.encode({})
 
 
 class Dialogue(Protocol):
@@ -72,7 +74,7 @@ class Dialogue(Protocol):
 
 
 def resume_client(client: Client, history: Iterable[Entry]) -> None:
-    """Give a new Client the state that its predecessors' dialogues tell."""
+    """Give a new Client the state that follows from its predecessors' dialogues."""
     waiting: dict[int, Request] = {}
     answered = set()
     next_id = 1
@@ -86,7 +88,7 @@ def resume_client(client: Client, history: Iterable[Entry]) -> None:
     client.restore(msgspec.msgpack.encode((next_id, left)))
 
 
-class Load:
+class Load(Device):
     """Requests out of a list. `rate_hz` 0 is a closed loop: the next request follows the reply. Stops after
     `count`.
     """
@@ -101,14 +103,6 @@ class Load:
         self._next_ns = 0
         self.polled = self._period_ns > 0
 
-    def fds(self) -> tuple[int, ...]:
-        """None: the load comes from within."""
-        return ()
-
-    def ready(self, fd: int, now_ns: int) -> None:
-        """Never called."""
-        raise AssertionError(f"no descriptor {fd}")
-
     def take(self, now_ns: int) -> Submit | None:
         """The next request, if it is due. Written ahead: a successor knows it even if this node dies now."""
         request_id = self._client.next_id
@@ -122,9 +116,6 @@ class Load:
             self._next_ns = max(self._next_ns or now_ns, earliest_ns) + self._period_ns
         self._dialogue.write(now_ns, request_id, 0, _SENT, payload)
         return Submit(payload)
-
-    def wait(self, now_ns: int) -> None:
-        """A load that is held up makes good for it later, as far as it does."""
 
     def accept(self, reply: Reply, now_ns: int) -> None:
         """Keep the reply in the dialogue."""
@@ -154,15 +145,15 @@ class Load:
 
 
 class CarLink(Protocol):
-    """How a runtime reaches a car: by frames on a bus, or by calls in virtual time."""
+    """How a runtime reaches a car: by frames on a bus, or, as in the defaults, by calls in virtual time."""
 
     def fds(self) -> tuple[int, ...]:
         """Descriptors that are readable when `read` is worth calling."""
-        ...
+        return ()
 
     def read(self) -> Iterable[bytes]:
         """The requests that have come."""
-        ...
+        raise AssertionError("no descriptor")
 
     def advance(self, now_ns: int) -> Iterable[bytes]:
         """The requests that are made as time goes on to `now_ns`."""
@@ -178,16 +169,15 @@ class CarLink(Protocol):
 
     def counts(self) -> dict[str, object]:
         """What it counts."""
-        ...
+        return {}
 
 
-class CarDevice:
+class CarDevice(Device):
     """The device of a Client between a car's radar and its brakes. Of `BACKLOG_MAX` waiting requests the
-    oldest, whose track is worth least, gives way.
+    oldest, which has the oldest track, is dropped.
     """
 
     port = "submit"
-    polled = True
 
     def __init__(self, client: Client, dialogue: Dialogue, link: CarLink) -> None:
         self._client, self._dialogue, self.link = client, dialogue, link
@@ -269,26 +259,25 @@ class Senses(Protocol):
         ...
 
     def fds(self) -> tuple[int, ...]:
-        """Descriptors that are readable when a node has died."""
-        ...
+        """Descriptors that are readable when a node has died; none where `died` of `watch` is called."""
+        return ()
 
     def died(self, fd: int) -> list[str]:
         """`fd` is readable: the nodes that have died."""
-        ...
+        raise AssertionError(f"no descriptor {fd}")
 
     def pulse_ns(self, node: str, now_ns: int) -> int:
         """When `node` was last seen running. A node that the machine does not let run counts as seen now."""
         ...
 
 
-class Sensor:
+class Sensor(Device):
     """The device of a Watchdog: deaths and pulses of the nodes of its replica.
 
-    A replica whose first node has died is lost: the deaths that follow are not looked at.
+    A replica whose first node has died is lost: the deaths that follow are ignored.
     """
 
     port = "sense"
-    polled = True
 
     def __init__(self, senses: Senses) -> None:
         self._senses = senses
@@ -313,7 +302,7 @@ class Sensor:
         return () if self._alarmed else self._senses.fds()
 
     def ready(self, fd: int, now_ns: int) -> None:
-        """`fd` is readable: somebody has died."""
+        """`fd` is readable: a node has died."""
         self._died += self._senses.died(fd)
         self._alarmed = bool(self._died)
 
@@ -326,13 +315,6 @@ class Sensor:
         self._next_ns = now_ns + PERIOD_NS
         return Pulses({node: self._senses.pulse_ns(node, now_ns) for node in self._nodes})
 
-    def wait(self, now_ns: int) -> None:
-        """Deaths are kept until they are taken."""
-
-    def accept(self, reply: Reply, now_ns: int) -> None:
-        """Nothing is delivered to a sensor."""
-        raise AssertionError("a reply delivered to a Watchdog's sensor")
-
     def quiet(self) -> None:
         """Watch no node any more."""
         self._senses.forget()
@@ -342,7 +324,3 @@ class Sensor:
     def deadline_ns(self) -> int | None:
         """The next look at the pulses."""
         return self._next_ns if self._nodes and not self._alarmed else None
-
-    def stats(self) -> bytes:
-        """Nothing is counted."""
-        return msgspec.msgpack.encode({})

@@ -71,15 +71,13 @@ class RunInjection(Injection):
             self.left = max(1, self.left - happened // self._emitters)
         self.host = self.process = None
 
-    def order(self, token: int, nth: int) -> control.Arm | control.ArmOnChannel:
-        """What the host is told; `nth` 0: to wait no longer."""
+    def order(self, token: int, nth: int) -> control.Arm:
+        """To the host; `nth` 0: wait no longer."""
         fault = self.fault
         armed = ArmedFault(
             self.number, self.brick, nth, fault.action, self.by_itself, self.draw, fault.persistence
         )
-        if fault.action.counts_messages:
-            return control.ArmOnChannel(token, armed)
-        return control.Arm(token, fault.event, (armed,))
+        return control.Arm(token, "" if fault.action.counts_messages else fault.event, (armed,))
 
     def begun(self, now_ns: int) -> None:
         """What followed its condition is done: the car goes on, if it waited."""
@@ -285,8 +283,8 @@ class FaultController:
 
     def log(self, injection: Injection) -> None:
         """A line for people."""
-        said = ", ".join(filter(None, (injection.receipt.state.value, injection.receipt.detail)))
-        self._log("fault", f"{injection.fault}: {said}")
+        line = ", ".join(filter(None, (injection.receipt.state.value, injection.receipt.detail)))
+        self._log("fault", f"{injection.fault}: {line}")
 
     def record_strike(self, injection: Injection) -> None:
         """In the supervisor's journal."""

@@ -49,11 +49,11 @@ class Channel(Protocol):
         ...
 
     def fence(self) -> None:
-        """No more mail: what was sent stays readable and then ends; who writes later dies."""
+        """No more mail: what was sent stays readable and then ends; a node that writes later dies."""
         ...
 
     def refuse(self) -> None:
-        """Nobody will read: who waits for room dies."""
+        """No node will read: one that waits for room dies."""
         ...
 
     def nudge(self) -> None:
@@ -75,7 +75,7 @@ class SharedMemory(Protocol):
         ...
 
     def seal(self) -> None:
-        """Nobody else is to have it."""
+        """No other process can get it from now on."""
         ...
 
     def close(self) -> None:
@@ -103,7 +103,7 @@ class Process(Protocol):
     pidfd: int
     journal: str  # where it writes its records, `""` for nowhere
     incarnation: int
-    bricks: tuple[tuple[str, str], ...]  # that it was told to host, with the kind of each
+    bricks: tuple[tuple[str, str], ...]  # that it was ordered to host, with the kind of each
     alive: bool
 
     def kill(self) -> bool:
@@ -113,7 +113,7 @@ class Process(Protocol):
     def freeze(self, for_ms: int = 0) -> bool:
         """Stop it wherever it is, at most that long, 0 for good; False if it is gone.
 
-        Who stops it lets it go on; the time is what holds if that one dies first.
+        The process that stops it lets it go on; the time counts if that one dies first.
         """
         ...
 
@@ -134,11 +134,11 @@ class Process(Protocol):
         ...
 
     def assigned(self) -> None:
-        """It has become what it was told to be."""
+        """It has become what it was assigned to be."""
         ...
 
     def announce(self) -> None:
-        """Tell it that an order waits."""
+        """Signal that an order waits."""
         ...
 
     def announced(self) -> bool:

@@ -161,11 +161,11 @@ class NodeIO(Protocol[In, Out]):
     # -- faults
 
     def kill(self) -> None:
-        """Die, here and now."""
+        """Die at once."""
         raise AssertionError("no fault waits here")
 
     def stop_detected(self, brick: str, reason: str) -> NoReturn:
-        """A detected stop: end here and now."""
+        """A detected stop: end at once."""
         ...
 
     def wait_until_applied(self, fault: int) -> None:
@@ -222,11 +222,11 @@ class Node(Generic[In, Out]):
         return hosted
 
     def _report_message(self, brick: str, message: Message) -> None:
-        assert isinstance(message, control.Spoken)
-        self.io.report(control.Said(brick, message))
+        assert isinstance(message, control.FromBrick)
+        self.io.report(control.BrickReport(brick, message))
 
     def link_inside(self, local: control.Local, epoch: int) -> None:
-        """A channel between two bricks of this node; the source is told of it, as of any other."""
+        """A channel between two bricks of this node; the source gets a Rebound, as for any other."""
         source, sink = self.bricks[local.brick], self.bricks[local.sink]
         source.outputs[local.port] = lambda message: self._mail.append((sink, local.sink_port, message))
         self.step(source, CONTROL, Rebound(local.port, True, epoch))
@@ -256,7 +256,7 @@ class Node(Generic[In, Out]):
         self.io.rewired()
 
     def bind_output(self, brick: str, port: str, number: int | None, epoch: int) -> None:
-        """Write `port` to the channel with that end from now on, or to nowhere, and tell the brick.
+        """Write `port` to the channel with that end from now on, or to nowhere, and inform the brick.
 
         What a fault of the old channel holds back goes there first; the fault then lies on the new one.
         """
@@ -472,7 +472,7 @@ class Node(Generic[In, Out]):
         out = hosted.outputs[port]
         for message in messages:
             if hosted.outputs[port] != out:
-                return  # bound elsewhere meanwhile: the brick was told, and has asked again for what it wants
+                return  # bound elsewhere meanwhile: the brick got a Rebound, and has asked again
             if isinstance(out, self._output):
                 self.io.write_in_turn(hosted, port, out, message)
             else:
@@ -497,7 +497,7 @@ class Node(Generic[In, Out]):
         self._record(self._now_ns(), event, request_id, detail)
 
     def report_fired(self, fault: int) -> None:
-        """Tell the executive that `fault` is due, or has struck."""
+        """Report that `fault` is due, or has struck."""
         self.io.report(control.Fired(fault))
 
     def wait_until_applied(self, fault: int) -> None:
@@ -505,11 +505,11 @@ class Node(Generic[In, Out]):
         self.io.wait_until_applied(fault)
 
     def kill(self) -> None:
-        """End this node, here and now."""
+        """End this node at once."""
         self.io.kill()
 
     def stop_detected(self, brick: str, reason: str) -> None:
-        """A detected stop: end this node here and now."""
+        """A detected stop: end this node at once."""
         self.io.stop_detected(brick, reason)
 
     # -- orders of the executive --------------------------------------------------------------
@@ -529,7 +529,9 @@ class Node(Generic[In, Out]):
         if token != control.UNANSWERED:
             self.io.report(control.Ack(token, data, error))
 
-    def carry_out(self, order: control.ToNode, fds: list[int]) -> bytes | None:
+    def carry_out(  # noqa: PLR0912 - a case for each order
+        self, order: control.ToNode, fds: list[int]
+    ) -> bytes | None:
         """Do what `order` says; the data of its Ack, or None where the Ack comes later.
 
         `fds` are the numbers of the ends that came with it. Raises PeerError where a brick refuses, or where
@@ -544,12 +546,19 @@ class Node(Generic[In, Out]):
                 read, write = fds
                 self.bind_input(brick, port, read)
                 self.bind_output(brick, output, write, epoch)
-            case control.Rewire():
-                return self._rewire(order, fds)
-            case control.Suspend(token, drain):
+            case control.Rewire(token, inputs, outputs, epoch, suspend):
+                numbers = dict(enumerate(fds))
+                for end in inputs:
+                    self.bind_input(end.brick, end.port, numbers.get(end.index))  # NOWHERE is none of them
+                for end in outputs:
+                    self.bind_output(end.brick, end.port, numbers.get(end.index), epoch)
+                if suspend:
+                    self.suspend_token, self._draining = token, False
+                    return None  # answered when quiescent
+            case control.SuspendNode(token, drain):
                 self.suspend_token, self._draining = token, drain
                 return None  # answered when quiescent
-            case control.Resume():
+            case control.ResumeNode():
                 self.suspended, self.suspend_token = False, 0
             case control.Capture(_, brick, looks):
                 found = self.bricks[brick].brick
@@ -558,15 +567,28 @@ class Node(Generic[In, Out]):
                 taker = self.bricks[brick].brick
                 take = getattr(taker, "migrate", taker.restore) if migrate else taker.restore
                 take(state)
-            case control.Tell(_, brick, message):
+            case control.Deliver(_, brick, message):
                 self.step(self.bricks[brick], CONTROL, message)
-            case control.WatchNodes():
-                self._watch(order, fds)
-            case control.Arm() | control.ArmOnChannel() | control.SlowDown() | control.ShareState():
-                return self._take_fault(order, fds)
+            case control.WatchNodes(_, replica, generation, nodes):
+                assert isinstance(self.device, Sensor)
+                self.device.watch(order, fds)
+                self.io.rewired()
+                watchdog = self.bricks[WATCHDOG.format(replica)]
+                self.step(watchdog, CONTROL, Watch(replica, generation, nodes))
+            case control.Arm(_, event, faults) if event:
+                self.agent.arm(event, faults)
+            case control.Arm(_, _, faults):
+                for fault in faults:
+                    self.agent.disturb(fault)
+            case control.SlowDown(_, number, by_ns, share):
+                if not self.agent.slowed:
+                    self.io.begin_throttle()
+                self.agent.slow_down(number, by_ns, share)
+            case control.ShareState(_, brick, number):
+                return self.agent.share_state(brick, number, self.io.memory(fds.pop()))
             case control.Stats():
                 return self.device.stats() if self.device is not None else b""
-            case control.Quiet():
+            case control.StopRequests():
                 assert self.device is not None
                 self.device.quiet()
             case (
@@ -579,47 +601,6 @@ class Node(Generic[In, Out]):
                 | control.Ack()
             ):
                 raise PeerError(f"{type(order).__name__} to a node")
-            case _:
-                assert_never(order)
-        return b""
-
-    def _rewire(self, order: control.Rewire, fds: list[int]) -> bytes | None:
-        for port in order.inputs:
-            self.bind_input(port.brick, port.port, None if port.index == control.NOWHERE else fds[port.index])
-        for port in order.outputs:
-            number = None if port.index == control.NOWHERE else fds[port.index]
-            self.bind_output(port.brick, port.port, number, order.epoch)
-        if not order.suspend:
-            return b""
-        self.suspend_token, self._draining = order.token, False
-        return None  # answered when quiescent
-
-    def _watch(self, order: control.WatchNodes, fds: list[int]) -> None:
-        """Have the Watchdog watch these nodes and no others."""
-        assert isinstance(self.device, Sensor)
-        self.device.watch(order, fds)
-        self.io.rewired()
-        watchdog = self.bricks[WATCHDOG.format(order.replica)]
-        self.step(watchdog, CONTROL, Watch(order.replica, order.generation, order.nodes))
-
-    def _take_fault(
-        self,
-        order: control.Arm | control.ArmOnChannel | control.SlowDown | control.ShareState,
-        fds: list[int],
-    ) -> bytes:
-        """Hand an order about a fault to the fault agent."""
-        agent = self.agent
-        match order:
-            case control.Arm(_, event, faults):
-                agent.arm(event, faults)
-            case control.ArmOnChannel(_, armed):
-                agent.disturb(armed)
-            case control.SlowDown(_, fault, by_ns, share):
-                if not agent.slowed:
-                    self.io.begin_throttle()
-                agent.slow_down(fault, by_ns, share)
-            case control.ShareState(_, brick, number):
-                return agent.share_state(brick, number, self.io.memory(fds.pop()))
             case _:
                 assert_never(order)
         return b""

@@ -1,7 +1,7 @@
 """Rebinding: which processes must be given which ends of channels on the way from one graph to another.
 
 A channel that both graphs have is kept, with the mail that is in it; a brick that comes to it gets a
-descriptor of the same socket. Each process is told of all its changes in one order (`control.Rewire`). The
+descriptor of the same socket. Each process gets all its changes in one order (`control.Rewire`). The
 orders of a commit are worked out before the client waits for them (`Rebinding.prepare`), and are used if no
 process and no channel has been replaced meanwhile.
 """

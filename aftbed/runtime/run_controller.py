@@ -1,8 +1,8 @@
 """The controller of a run: handles orders of bricks, reports of processes, and their deaths.
 
 Recovery orders scripts, the Engine phases of adaptations. They are executed one at a time, and the brick is
-told how each ended. A node of no replica (Client, Proxy, Watchdog, Recovery, Engine) is replaced when it
-dies. The controller is not on the request path: while it sleeps, requests flow.
+informed of how each ended. A node of no replica (Client, Proxy, Watchdog, Recovery, Engine) is replaced when
+it dies. The controller is not on the request path: while it sleeps, requests flow.
 """
 
 from collections.abc import Callable
@@ -73,10 +73,10 @@ class RunController:
         chain = max(sum(set(bricks) <= slot.bricks for bricks in nodes) for slot in slots)
         return chain + 1 if len(slots) > 1 else 1
 
-    # -- what processes say -------------------------------------------------------------------
+    # -- reports of processes -----------------------------------------------------------------
 
     def on_report(self, process: Process, report: msgspec.Struct) -> None:
-        """A node has said something."""
+        """`report` has come from `process`."""
         tasks = self._loop.tasks
         match report:
             case control.Ack(token, data, error):
@@ -87,12 +87,12 @@ class RunController:
                     tasks.fail(key, f"{process.name}: {error}")
                 else:
                     tasks.settle(key, data)
-            case control.Said(brick, messages.Promoted(epoch)):
+            case control.BrickReport(brick, messages.Promoted(epoch)):
                 tasks.settle(("promoted", brick, epoch))
-            case control.Said(_, messages.RequestHeld(request_id)):
+            case control.BrickReport(_, messages.RequestHeld(request_id)):
                 self.adaptations.request_held(request_id)
-            case control.Said(_, messages.Adapted() as told):
-                self.adaptations.adapted(told)
+            case control.BrickReport(_, messages.Adapted() as ended):
+                self.adaptations.adapted(ended)
                 self._loop.after(SETTLE_SECONDS, self._rearm)
                 self._loop.after(SETTLE_SECONDS, self._restock)  # the next one waits until that is done
             case control.Ordered(_, ordered, Phase.WHOLE):
@@ -106,7 +106,7 @@ class RunController:
 
     def _on_script(self, ordered: script.Script) -> None:
         if self.executor.busy or self.ending or self.executor.stale(ordered):
-            return  # another script is under way, or has been; Recovery hears how it ended
+            return  # another script is under way, or has been; Recovery is informed of its end
         if ordered.kind in LOSSES and self.adaptations.interrupted(ordered.replica):
             return  # the way back first
         run = ScriptRun(ordered.kind, ordered.replica, self._loop.now_ns())
@@ -138,7 +138,7 @@ class RunController:
             self._loop.tasks.start("rearm", self.faults.rearm(), lambda _: None)
 
     def _restock_after(self, scripts: int) -> None:
-        """Unless something is under way again: who takes part in that needs the CPUs."""
+        """Unless something is under way again, which needs the CPUs."""
         if scripts == len(self.scripts) and not self.adaptations.busy:
             self._restock()
 
@@ -147,7 +147,7 @@ class RunController:
             self._runtime.pool.refill(LIGHT, self.spares())
 
     def inform_recovery(self, *, failed: bool) -> None:
-        """Tell it how things are; it may act again."""
+        """Send it the situation; it may act again."""
         deployment = self.deployment
         leads = f"{deployment.leader} leads" if deployment.leader else "no leader"
         backs_up = f"{deployment.backup} backs up" if deployment.backup else "no backup"
@@ -156,14 +156,14 @@ class RunController:
             return
         situation = self.executor.situation(failed=failed)
         try:
-            deployment.order("recovery", lambda token: control.Tell(token, "recovery", situation))
+            deployment.order("recovery", lambda token: control.Deliver(token, "recovery", situation))
         except StepFailed as error:
             self._runtime.log("refused", str(error))
 
     # -- deaths and hangs -------------------------------------------------------------------------------
 
     def on_death(self, process: Process) -> None:
-        """A process is dead, and nobody meant it to be unless its kind is `killed`."""
+        """A process is dead; that was intended only if its kind is `killed`."""
         self._runtime.journal.write(self._loop.now_ns(), Event.NODE_DIED, 0, process.pid)
         self._loop.tasks.settle(("died", process.name, process.pid))
         if process.kind is ProcessKind.KILLED or self.ending:
@@ -216,7 +216,7 @@ class RunController:
             self._runtime.log("replaced", f"{node}: {failure or f'{ms:.2f} ms'}")
             half = self.deployment.nodes.get(node)
             if failure and not self.ending and half is not None and half.alive:
-                half.kill()  # half bound: its death is heard, and replaced in turn
+                half.kill()  # half bound: its death is noticed, and it is replaced in turn
             elif failure and not self.ending:
                 self._loop.after(AGAIN_SECONDS, lambda: self._replace(node))
             if node == "recovery" or self.deployment.lost:

@@ -96,7 +96,7 @@ class ScriptExecutor:
             self._running = False
 
     def stale(self, script: Script) -> bool:
-        """Whether `script` was ordered before Recovery heard of what has changed since.
+        """Whether `script` was ordered before Recovery knew of what has changed since.
 
         The situation that is on its way to it will make it decide anew.
         """
@@ -192,7 +192,7 @@ class Execution:
         deployment = self._deployment
         if self.script.recipe != RECIPES[0]:
             for slot in deployment.slots.values():  # it kills what they watch
-                yield from deployment.watch(slot, nobody=True)
+                yield from deployment.watch(slot, none=True)
         self.closed_ns = self._runtime.loop.now_ns()
         try:
             for step in self.script.commit:
@@ -285,7 +285,7 @@ class Execution:
     def _watch(self) -> Keys:
         for slot in self._deployment.slots.values():
             if slot.name not in self.lost:
-                with suppress(StepFailed):  # a Watchdog that is dead is replaced, and told then
+                with suppress(StepFailed):  # a Watchdog that is dead is replaced, and gets it then
                     yield from self._deployment.watch(slot)
 
     def _probe_way_back(self) -> Keys:
@@ -372,14 +372,14 @@ class Execution:
         return sent
 
     def _suspend(self, brick: str, *, drain: bool) -> Keys:
-        order = functools.partial(control.Suspend, drain=drain)
+        order = functools.partial(control.SuspendNode, drain=drain)
         yield from self._deployment.ask(self._rebinding.host(brick), order, seconds=SUSPEND_SECONDS_MAX)
 
     def _resume(self, steps: Iterable[Resume]) -> Keys:
         sent = []
         for step in steps:
             before_ns = self._runtime.loop.now_ns()
-            sent.append(self._deployment.order(self._rebinding.host(step.brick), control.Resume))
+            sent.append(self._deployment.order(self._rebinding.host(step.brick), control.ResumeNode))
             self.done.append(step)
             if step.brick == f"{self._deployment.leader}/protocol":
                 self.turned_ns = before_ns
@@ -466,10 +466,10 @@ class Execution:
         """Send it, and go on: until it leads, its Protocol takes no request. Attach waits for it."""
         deployment = self._deployment
         slot = deployment.slots[replica]
-        part, _ = replication_of(deployment.graph.ftm)[0]  # the first to hear of the leader
+        part, _ = replication_of(deployment.graph.ftm)[0]  # the first that receives from the leader
         brick = f"{replica}/{part}"
         # The end of the channel from the leader, which the fence made, wakes it.
-        promote = control.Tell(control.UNANSWERED, brick, messages.Promotion(epoch))
+        promote = control.Deliver(control.UNANSWERED, brick, messages.Promotion(epoch))
         deployment.leave(deployment.graph.node_of(brick), promote)
         promoted = ("promoted", f"{replica}/protocol", epoch)
         self._promoting = Wait(frozenset({promoted}), frozenset(slot.nodes), PROMOTE_SECONDS_MAX)
@@ -505,7 +505,7 @@ class Execution:
     # -- channels and places ------------------------------------------------------------------
 
     def _rebind(self, steps: tuple[Step, ...]) -> Keys:
-        """Each process is told of all that concerns it at once; then what is staged takes its place."""
+        """Each process gets all its changes at once; then the staged one takes its place."""
         if self.script.kind is not ScriptKind.ADAPTATION:
             self._note_backup(steps)
         yield from self._rebinding.send(self._rebinding.changes(steps, committing=True), STEP_SECONDS_MAX)
@@ -646,7 +646,7 @@ class Execution:
         for brick in bricks:
             if replica_of(brick) not in self.lost:
                 with suppress(StepFailed):
-                    self._deployment.order(self._rebinding.host(brick), control.Resume)
+                    self._deployment.order(self._rebinding.host(brick), control.ResumeNode)
 
 
 def end(process: Process) -> None:

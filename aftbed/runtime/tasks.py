@@ -56,8 +56,8 @@ class Tasks:
     def __init__(self, now_ns: Callable[[], int]) -> None:
         self._now_ns = now_ns
         self._tasks: list[_TaskRun] = []
-        self._early: dict[Key, bytes] = {}  # settled before anybody waited for it
-        self._refused: dict[Key, str] = {}  # failed before anybody waited for it
+        self._early: dict[Key, bytes] = {}  # settled before a task waited for it
+        self._refused: dict[Key, str] = {}  # failed before a task waited for it
 
     def __len__(self) -> int:
         return len(self._tasks)

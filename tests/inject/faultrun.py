@@ -67,7 +67,7 @@ class FakeDeployment:
         self.graph, self.folder = build(ftm, placement), folder
         self.leader, self.backup = "a", "b"
         self.nodes: dict[str, FakeProcess] = {}
-        self.told: list[tuple[str, control.Arm | control.ArmOnChannel | control.SlowDown]] = []
+        self.told: list[tuple[str, control.Arm | control.SlowDown]] = []
         self.refuses = False
         self.pool = self
         self.made = 0
@@ -86,9 +86,7 @@ class FakeDeployment:
     def lives(self, node: str) -> bool:
         return node in self.nodes and self.nodes[node].alive
 
-    def ask(
-        self, node: str, make: Callable[[int], control.Arm | control.ArmOnChannel]
-    ) -> Generator[Wait, object, bytes]:
+    def ask(self, node: str, make: Callable[[int], control.Arm]) -> Generator[Wait, object, bytes]:
         self.told.append((node, make(1)))
         yield Wait(frozenset())
         if self.refuses:
@@ -154,7 +152,7 @@ class Run:
         """The node and the fault of the last order."""
         node, order = self.deployment.told[-1]
         assert not isinstance(order, control.SlowDown)
-        (armed,) = order.faults if isinstance(order, control.Arm) else (order.fault,)
+        (armed,) = order.faults
         return node, armed
 
     def happened(self, node: str, event: Event, times: int, detail: int = 0, t_ns: int = 2**62) -> None:

@@ -99,13 +99,13 @@ class Host:
         """Once the node looks at its orders, there is room."""
         self.order(control.Capture(control.UNANSWERED, BRICK))
 
-    def disturb(self, how: Disturbance, nth: int = 1, *, permanent: bool = False) -> control.ArmOnChannel:
+    def disturb(self, how: Disturbance, nth: int = 1, *, permanent: bool = False) -> control.Arm:
         blow = model.ArmedFault(FAULT, BRICK, nth, ChannelFault(how, PORT), False)
         if permanent:
             blow = model.ArmedFault(
                 FAULT, BRICK, nth, ChannelFault(how, PORT), False, persistence=Permanent()
             )
-        return control.ArmOnChannel(control.UNANSWERED, blow)
+        return control.Arm(control.UNANSWERED, "", (blow,))
 
     def send(self, request_id: int) -> None:
         self.node.step(self.node.bricks[BRICK], "in", Request(1, request_id, b""))

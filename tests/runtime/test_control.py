@@ -147,7 +147,7 @@ def test_every_report_arrives(kind: type[msgspec.Struct], data: st.DataObject) -
 
 def test_messages_keep_their_order(pair: Pair) -> None:
     for token in range(20):
-        pair.ours.send(control.Suspend(token))
+        pair.ours.send(control.SuspendNode(token))
     assert [got[0].token for _ in range(20) if (got := pair.theirs.recv())] == list(range(20))
 
 
@@ -157,16 +157,16 @@ def test_where_there_is_none_it_says_so(pair: Pair) -> None:
 
 
 def test_the_end_is_none(pair: Pair) -> None:
-    pair.ours.send(control.Suspend(1))
+    pair.ours.send(control.SuspendNode(1))
     pair.ours.close()
-    assert pair.theirs.recv() == (control.Suspend(1), []), "what was sent stays readable"
+    assert pair.theirs.recv() == (control.SuspendNode(1), []), "what was sent stays readable"
     assert pair.theirs.recv() is None
 
 
 def test_who_sends_to_a_closed_line_is_told(pair: Pair) -> None:
     pair.theirs.close()
     with pytest.raises(BrokenPipeError):
-        pair.ours.send(control.Suspend(1))
+        pair.ours.send(control.SuspendNode(1))
 
 
 # -- descriptors
@@ -260,7 +260,7 @@ SUSPEND_AND_MORE: Final = b"\x83\xa4type\xa7Suspend\xa5token\x01\xa1x"
         msgspec.msgpack.encode({"type": "Suspend"}),
         msgspec.msgpack.encode({"type": "Suspend", "token": "one"}),
         msgspec.msgpack.encode(control.Hello(1)),  # a report is no order
-        msgspec.msgpack.encode(control.Suspend(1)) + b"\x00",
+        msgspec.msgpack.encode(control.SuspendNode(1)) + b"\x00",
         msgspec.msgpack.encode(
             {"type": "Arm", "token": 1, "fault": 1, "event": "", "nth": 1, "act": "x", "itself": True}
         ),
@@ -275,8 +275,8 @@ def test_what_is_no_order_is_refused_and_its_descriptors_are_closed(
     socket.send_fds(pair.ours.sock, [packet], [0] * fds)
     with pytest.raises(PeerError, match="not a control message"):
         pair.theirs.recv()
-    pair.ours.send(control.Suspend(1))
-    assert pair.theirs.recv() == (control.Suspend(1), []), "the line goes on"
+    pair.ours.send(control.SuspendNode(1))
+    assert pair.theirs.recv() == (control.SuspendNode(1), []), "the line goes on"
 
 
 def test_a_file_with_garbage_is_refused(pair: Pair) -> None:

@@ -41,9 +41,9 @@ OMISSION: Final = model.ArmedFault(8, "brick", 1, ChannelFault(Disturbance.OMISS
 KINDS: Final = ("answer", "pass on", "note", "order", "refuse", "nothing")
 ORDERS: Final[dict[str, tuple[control.ToNode, ...]]] = {
     "capture": (control.Capture(1, "brick"),),
-    "suspend": (control.Suspend(2), control.Resume(3)),
+    "suspend": (control.SuspendNode(2), control.ResumeNode(3)),
     "flip": (control.Arm(4, Event.SERVER_EXIT.label, (FLIP,)),),
-    "omit": (control.ArmOnChannel(5, OMISSION),),
+    "omit": (control.Arm(5, "", (OMISSION,)),),
 }
 LAST: Final = messages.encode(Request(1, 0, b"last"))
 

@@ -17,7 +17,7 @@ from aftbed.runtime.tasks import Tasks
 # machine of two cores under CPython 3.11, 2026-11-21. Other work ran on that machine meanwhile; of 83 runs
 # this is the one with the lowest median.
 #
-# Limits: the last value is the longest delay of all, and tells more of the machine's other work than of a
+# Limits: the last value is the longest delay of all, and is due to the machine's other work more than to a
 # hop. It stands for one sample of 30 000, not for one of 128: to draw evenly between the last two values
 # makes the mean 17 us, where it is less than 10 us.
 # fmt: off
@@ -58,8 +58,8 @@ class Carrier(Protocol):
         """It is known by this."""
         ...
 
-    def heard_by(self) -> frozenset[str] | None:
-        """The nodes at its end; None for the executive, which may touch anybody."""
+    def reader_names(self) -> frozenset[str] | None:
+        """The nodes at its end; None for the executive, which may act on any node."""
         ...
 
 
@@ -102,7 +102,7 @@ class Clock:
         self.at(self.ns + round(seconds * 1e9), guarded)
 
     def rest(self, seconds: float) -> None:
-        """Nobody is in the way of anybody here."""
+        """Virtual CPUs are not shared."""
 
     def hop_ns(self) -> int:
         """How long a message takes, the step of its reader included: as measured."""

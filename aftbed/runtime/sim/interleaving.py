@@ -3,7 +3,7 @@
 In other runs, time decides what arrives next. Here a choice does: of all lines that carry something
 (channels, orders, answers, the news of a death) any one may deliver its oldest message. Two deliveries to
 different nodes commute, so of the orders that differ in nothing else only one is run: sleep sets (Godefroid,
-*Partial-Order Methods for the Verification of Concurrent Systems*, 1996, ch. 5). What the executive hears
+*Partial-Order Methods for the Verification of Concurrent Systems*, 1996, ch. 5). What the executive receives
 commutes with nothing.
 
 A run is repeated from its start for each order, choice by choice. Deadlines and births come when nothing else
@@ -23,8 +23,8 @@ from aftbed.runtime.sim.node_io import SimChannel
 STEP_NS: Final = 1_000  # of virtual time, per delivery
 ON_ITS_WAY: Final = 1 << 62
 
-Heard = frozenset[str] | None
-Sleep = dict[int, Heard]  # lines whose delivery would make no difference now, with who hears them
+Readers = frozenset[str] | None
+Sleep = dict[int, Readers]  # lines whose delivery would make no difference now, with their readers
 
 
 class HeldChannel(SimChannel):
@@ -57,16 +57,16 @@ class HeldChannel(SimChannel):
 class ChoicePoint:
     """A moment with a choice: what could arrive, and what need not be tried."""
 
-    def __init__(self, enabled: dict[int, Heard], sleep: Sleep, chosen: int) -> None:
+    def __init__(self, enabled: dict[int, Readers], sleep: Sleep, chosen: int) -> None:
         self.enabled, self.sleep, self.chosen = enabled, sleep, chosen
 
     def next_sleep(self) -> Sleep:
         """What still makes no difference behind the choice."""
-        heard = self.enabled[self.chosen]
-        return {line: other for line, other in self.sleep.items() if _commute(heard, other)}
+        readers = self.enabled[self.chosen]
+        return {line: other for line, other in self.sleep.items() if _commute(readers, other)}
 
 
-def _commute(one: Heard, other: Heard) -> bool:
+def _commute(one: Readers, other: Readers) -> bool:
     return one is not None and other is not None and not one & other
 
 
@@ -103,7 +103,7 @@ class Chooser(Clock):
         """What is due at this very moment, else a delivery, else the next deadline."""
         if not self.chooses or (self.heap and self.heap[0][0] <= self.ns):
             return super().step()
-        enabled = {number: line.heard_by() for number, (line, calls) in self._lines.items() if calls}
+        enabled = {number: line.reader_names() for number, (line, calls) in self._lines.items() if calls}
         if not enabled:
             return super().step()
         if self._at == len(self.points):

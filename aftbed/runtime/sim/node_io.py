@@ -94,8 +94,8 @@ class SimChannel:
         """Of its writing end."""
         return self.write.number
 
-    def heard_by(self) -> frozenset[str]:
-        """Who reads it."""
+    def reader_names(self) -> frozenset[str]:
+        """The nodes that read it."""
         return frozenset([node.name for node in self.readers])
 
     def has_room(self) -> bool:
@@ -136,7 +136,7 @@ class SimChannel:
         return self.mail.popleft()[1]
 
     def fence(self) -> None:
-        """No more mail. The reader hears of the end behind what was sent."""
+        """No more mail. The reader comes to the end behind what was sent."""
         if self.ended:
             return
         self.ended = True
@@ -154,7 +154,7 @@ class SimChannel:
         return self.ended and not self.mail and self._clock.ns >= self._last_ns
 
     def refuse(self) -> None:
-        """Who waits for room dies."""
+        """A writer that waits for room dies."""
         self.refused = True
         for node in list(self.writers):
             self._clock.at(self._clock.ns, node.run)
@@ -526,8 +526,8 @@ class SimIO(NodeIO[SimChannel, SimChannel]):
         return True
 
     def _write_held(self, held: _Held, end: SimChannel) -> bool:
-        """Send what waited for room. What is bound elsewhere is not sent: the brick was told, and has asked
-        again.
+        """Send what waited for room. What is bound elsewhere is not sent: the brick got a Rebound, and has
+        asked again.
         """
         effect = held.effects[held.at]
         assert isinstance(effect, Send)
@@ -540,11 +540,11 @@ class SimIO(NodeIO[SimChannel, SimChannel]):
     # -- faults and ends ----------------------------------------------------------------------
 
     def kill(self) -> None:
-        """Die, here and now."""
+        """Die, at once."""
         raise Died
 
     def stop_detected(self, brick: str, reason: str) -> NoReturn:
-        """Die, here and now, with a reason."""
+        """Die, at once, with a reason."""
         raise Died(f"{brick}: detected stop: {reason}")
 
     def wait_until_applied(self, fault: int) -> None:

@@ -1,6 +1,6 @@
-"""Processes in virtual time: what is told to them and what they say takes a while, and so does their death.
+"""Processes in virtual time: orders, reports and deaths take a while to arrive.
 
-A signal is not instant: for some microseconds its target goes on. A death is seen first by who holds the
+A signal is not instant: for some microseconds its target goes on. A death is seen first by the holder of the
 lifeline (the Watchdog), later by the executive, as on Linux: 0.1 to 0.3 ms, and 0.5 to 0.8 ms (see
 `runtime.unix.death_notice`).
 """
@@ -14,7 +14,7 @@ from aftbed.core.errors import ConfigError, StepFailed
 from aftbed.core.journal import Record
 from aftbed.runtime import control, interface
 from aftbed.runtime.assembly import Assembler
-from aftbed.runtime.devices import Device
+from aftbed.runtime.devices import Device, Senses
 from aftbed.runtime.interface import ProcessKind
 from aftbed.runtime.node import Node
 from aftbed.runtime.sim.clock import Clock
@@ -39,7 +39,7 @@ class Wire:
     def __init__(self, number: int, process: "SimProcess | None") -> None:
         self.number, self._process = -number, process
 
-    def heard_by(self) -> frozenset[str] | None:
+    def reader_names(self) -> frozenset[str] | None:
         """The process, where one was named; else the executive."""
         if self._process is None or self._process.io is None:
             return None
@@ -57,7 +57,7 @@ class SimProcess:
         self.bricks: tuple[tuple[str, str], ...] = ()
         self.dead = self._still = False
         self._pool, self._clock = pool, pool.clock
-        self._order_ns = self._say_ns = 0  # of the last one that is under way
+        self._order_ns = self._report_ns = 0  # of the last one that is under way
         self._orders: deque[tuple[control.ToNode, tuple[int, ...]]] = deque()
         self._known: set[type[control.ToNode]] = set()  # kinds of orders that it has had
         self._reports: deque[control.FromNode] = deque()
@@ -110,7 +110,7 @@ class SimProcess:
         return self.alive and self.pulse_ns(now_ns) < now_ns - deadline_ns
 
     def hangs(self, now_ns: int, deadline_ns: int) -> bool:
-        """The same: here nobody is starved."""
+        """The same: no virtual process is starved."""
         return self.silent(now_ns, deadline_ns)
 
     def pulse_ns(self, now_ns: int) -> int:
@@ -120,21 +120,21 @@ class SimProcess:
     # -- death --------------------------------------------------------------------------------
 
     def die(self) -> None:
-        """Dead here and now."""
+        """Dead at once."""
         if self.io is not None:
             self.io.die()
         else:
             self.ended("")
 
     def ended(self, reason: str) -> None:
-        """Those who look will see it."""
+        """It is dead: watchers notice it later."""
         if self.dead:
             return
         self.dead = True
         self._pool.on_end(self, reason)
         for call in self._noticed:
             self._clock.message(self._clock.ns + self._clock.between_ns(*LIFELINE_NS), self._news, call)
-        seen_ns = max(self._say_ns, self._clock.ns + self._clock.between_ns(*PIDFD_NS))
+        seen_ns = max(self._report_ns, self._clock.ns + self._clock.between_ns(*PIDFD_NS))
         self._clock.message(seen_ns, self._to_us, self._seen)
 
     def notice(self, call: Callable[[], None]) -> None:
@@ -181,20 +181,20 @@ class SimProcess:
         try:
             self.io = self._pool.build(self, order, fds)
         except ConfigError as error:
-            self.say(control.Ack(order.token, error=str(error)))
+            self.report(control.Ack(order.token, error=str(error)))
             self.die()
         else:
             if self._still:
                 self.io.freeze()
 
-    def say(self, report: control.FromNode) -> None:
-        """The executive will hear this."""
+    def report(self, report: control.FromNode) -> None:
+        """Send to the executive."""
         delay_ns = self._clock.between_ns(*LINE_NS) + self._pool.rouse_ns()
-        self._say_ns = max(self._say_ns + 1, self._clock.ns + delay_ns)
+        self._report_ns = max(self._report_ns + 1, self._clock.ns + delay_ns)
         self._reports.append(report)
-        self._clock.message(self._say_ns, self._to_us, self.heard)
+        self._clock.message(self._report_ns, self._to_us, self.on_line)
 
-    def heard(self) -> None:
+    def on_line(self) -> None:
         """The oldest report is at the executive."""
         self._pool.on_report(self, self._reports.popleft())
 
@@ -209,7 +209,7 @@ class SimProcess:
         return False
 
 
-class SimSenses:
+class SimSenses(Senses):
     """The `Senses` of a Watchdog, which is woken by `wake`. `find`: a process by the number in an order."""
 
     def __init__(self, find: Callable[[int], SimProcess], wake: Callable[[], None]) -> None:
@@ -231,14 +231,6 @@ class SimSenses:
     def forget(self) -> None:
         """Watch no node."""
         self._nodes = {}
-
-    def fds(self) -> tuple[int, ...]:
-        """None: deaths are noticed."""
-        return ()
-
-    def died(self, fd: int) -> list[str]:
-        """Never called."""
-        raise AssertionError(f"no descriptor {fd}")
 
     def pulse_ns(self, node: str, now_ns: int) -> int:
         """When `node` was last seen running."""
@@ -262,16 +254,16 @@ class SimProcessPool:
         self.by_number: dict[int, SimProcess] = {}
         self.zygotes: dict[str, SimProcess] = {}
         self.cells: list[SimulatedMemory] = []
-        self._heard_ns = 0
+        self._reported_ns = 0
         self.on_report: Callable[[SimProcess, control.FromNode], None] = lambda process, report: None
         self.on_death: Callable[[SimProcess], None] = lambda process: None
         self.on_end: Callable[[SimProcess, str], None] = lambda process, reason: None
         self.on_freeze: Callable[[SimProcess], None] = lambda process: None
 
     def rouse_ns(self) -> int:
-        """How much longer the executive takes to hear what is said to it now."""
-        asleep = self.clock.ns - self._heard_ns > SLEEPS_AFTER_NS
-        self._heard_ns = self.clock.ns
+        """How much longer a report takes now: the executive may sleep."""
+        asleep = self.clock.ns - self._reported_ns > SLEEPS_AFTER_NS
+        self._reported_ns = self.clock.ns
         return self.clock.between_ns(*ROUSED_NS) if asleep else 0
 
     def spare(self, zygote: str) -> Generator[Wait, dict[Key, bytes], SimProcess]:
@@ -297,7 +289,7 @@ class SimProcessPool:
     def build(self, process: SimProcess, order: control.Assign, fds: tuple[int, ...]) -> SimIO:
         """The node that `order` describes. Raises ConfigError where a class is no good."""
         records = self._records(order.journal)
-        io = SimIO(order.node, self.clock, records, self._end, process.say, process.ended, self.cells)
+        io = SimIO(order.node, self.clock, records, self._end, process.report, process.ended, self.cells)
         self._assembler.build(Node(order.node, io), order, list(fds), lambda: self._make_device(order, io))
         self.clock.at(self.clock.ns, io.run)
         return io

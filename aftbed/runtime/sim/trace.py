@@ -1,11 +1,11 @@
 """A traced run: beside what every run leaves behind, all that happened in it, in the order in which it did.
 
-Only a traced world keeps each message that is put into a channel, and what was noted, told and answered
+Only a traced world keeps each message that is put into a channel, and what was noted, logged and answered
 between two of them; any other pays nothing. What is kept is a function of the run, and a run is a function of
 its setup: two traces of one setup are equal byte for byte, on any machine.
 
 Limits: bricks that share a node speak to each other without a channel, so in the placements `replica` and
-`single` what happens inside is told by the records alone. The executive's own records have their place by
+`single` only the records show what happens inside. The executive's own records have their place by
 their time, behind what else happened in that instant.
 """
 
@@ -25,7 +25,7 @@ from aftbed.runtime.sim.node_io import SimChannel
 from aftbed.runtime.sim.world import Run, Setup, World
 
 EXECUTIVE: Final = "supervisor.1"  # its journal
-STRUCK: Final = "struck"  # what is told of a node that died of a fault, or was stopped by one
+STRUCK: Final = "struck"  # the event of a node that died of a fault, or was stopped by one
 _SHOWN: Final = ("replica", "generation", "node", "cause", "rerun")  # fields that are shown as they are
 
 
@@ -39,7 +39,7 @@ class Sent(msgspec.Struct, frozen=True):
     message: Message
 
 
-class Told(msgspec.Struct, frozen=True):
+class LoggedLine(msgspec.Struct, frozen=True):
     """A line of the executive, for people; or, as `STRUCK`, the name of a node."""
 
     t_ns: int
@@ -47,7 +47,7 @@ class Told(msgspec.Struct, frozen=True):
     text: str
 
 
-Happening = Sent | Record | Entry | Told
+Happening = Sent | Record | Entry | LoggedLine
 
 
 class Trace(msgspec.Struct, frozen=True):
@@ -61,7 +61,7 @@ def traced(setup: Setup, make: MakeSetting | None = None) -> Trace:
     """Run `setup` and keep all that happens; `make` makes other bricks than the catalog's."""
     world = _Traced(setup, make)
     run = world.run()
-    struck = [Told(t_ns, STRUCK, node) for t_ns, node in run.struck]
+    struck = [LoggedLine(t_ns, STRUCK, node) for t_ns, node in run.struck]
     sources: tuple[list[Happening], ...] = (world.happened, [*run.history.journals[EXECUTIVE]], [*struck])
     return Trace(run, tuple(merge(*sources, key=lambda one: one.t_ns)))
 
@@ -92,7 +92,7 @@ class _Traced(World):
     def log(self, event: str, text: str) -> None:
         """For the outcome, and in its place."""
         super().log(event, text)
-        self.happened.append(Told(self.loop.ns, event, text))
+        self.happened.append(LoggedLine(self.loop.ns, event, text))
 
     def write(self, now_ns: int, request_id: int, epoch: int, kind: EntryKind, payload: bytes) -> None:
         """An entry of the dialogue, and in its place."""
@@ -123,7 +123,7 @@ def _recording(happened: list[Happening]) -> type[SimChannel]:
 
 
 def lines(trace: Trace) -> Iterator[str]:
-    """The whole of it, a line each, with the virtual time in ms; the last one says how it ended."""
+    """The whole of it, a line each, with the virtual time in ms; the last one is the end."""
     for one in trace.happened:
         yield f"{milliseconds(one.t_ns):.6f} {_line(one)}"
     rest = trace.run.rest
@@ -168,7 +168,7 @@ def _line(one: Happening) -> str:
             return f"note {where} {one.event} #{one.request_id} {one.detail}"
         case Entry():
             return f"{one.kind.name.lower()} #{one.request_id} e{one.epoch} {digest(one.payload)}"
-        case Told():
+        case LoggedLine():
             return f"told {one.event} {one.text}"
         case _:
             assert_never(one)

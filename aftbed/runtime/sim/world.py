@@ -32,7 +32,7 @@ from aftbed.runtime import control
 from aftbed.runtime.adaptations import Outcome
 from aftbed.runtime.assembly import Assembler, MakeSetting
 from aftbed.runtime.deployment import Hosted, Keys, digest
-from aftbed.runtime.devices import CarDevice, Device, Load, Sensor, resume_client
+from aftbed.runtime.devices import CarDevice, CarLink, Device, Load, Sensor, resume_client
 from aftbed.runtime.interface import DRAW_BITS, Met, ProcessKind
 from aftbed.runtime.run_controller import RunController, ScriptRun
 from aftbed.runtime.sim.clock import START_NS, Clock
@@ -50,7 +50,7 @@ REQUESTS: Final = 512  # of a load; then they repeat
 STEP_NS: Final = STEP_US * 1000  # of a car
 STOPPED: Final = "detected stop"  # in the reason of a death
 REST_NS_MAX: Final = 3_000_000_000  # from the last fault to the rest, in virtual time
-TICK_SECONDS: Final = 0.02  # as the supervisor looks after what no Watchdog watches
+TICK_SECONDS: Final = 0.02  # between two looks for hangs, as in the supervisor
 STRAY_NS: Final = 5_000_000  # so long after the rest, what comes too late would still be seen
 LOOK_EVERY: Final = 32  # events between two looks at whether all is done
 EVENTS_MAX: Final = 20_000_000
@@ -154,7 +154,7 @@ class ExecutiveJournal:
         self._records.append(Record(now_ns, event, request_id, detail, "supervisor", brick))
 
 
-class Drive:
+class Drive(CarLink):
     """The car of a simulated run, and the `CarLink` of its client. It begins with the first client.
 
     The car (`vehicle.drive_virtual`) is advanced on demand, which is once in a cycle of its radar. While a
@@ -177,14 +177,6 @@ class Drive:
 
     # -- for the client: see `runtime.devices.CarLink` --------------------------------------------
 
-    def fds(self) -> tuple[int, ...]:
-        """None."""
-        return ()
-
-    def read(self) -> Iterable[bytes]:
-        """Never called."""
-        raise AssertionError("no descriptor")
-
     def advance(self, now_ns: int) -> Iterable[bytes]:
         """Drive up to `now_ns`: the requests that are made on the way."""
         return self._car.advance(now_ns - self._began_ns)
@@ -197,10 +189,6 @@ class Drive:
         """The next frame of the radar."""
         due = self._car.due_ns()
         return None if due is None else due + self._began_ns
-
-    def counts(self) -> dict[str, object]:
-        """None."""
-        return {}
 
     # -- for the run ------------------------------------------------------------------------------
 
@@ -430,7 +418,7 @@ class World:
         self.controller.inform_recovery(failed=False)
         self.loop.after(TICK_SECONDS, self._tick)
         self.loop.begin()
-        self.controller.deployment.leave("client", control.Resume(control.UNANSWERED))
+        self.controller.deployment.leave("client", control.ResumeNode(control.UNANSWERED))
 
     def _tick(self) -> None:
         self.controller.look_for_hangs()

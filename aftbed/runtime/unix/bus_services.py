@@ -108,7 +108,7 @@ def _wait_for_go(line: Line[control.ToNode]) -> bool:
     """Attached: wait for Resume; False if it is a Stop, or the end."""
     _report(line, "ready")
     got = line.recv()
-    return got is not None and isinstance(got[0], control.Resume)
+    return got is not None and isinstance(got[0], control.ResumeNode)
 
 
 def _stopper(line: Line[control.ToNode]) -> Callable[[], bool]:

@@ -266,7 +266,7 @@ def _rehearse_mail() -> None:
         for _ in range(MAIL_BATCH):
             request_id += 1
             scratch.send("pro2bfr", Request(1, request_id, b""))
-        scratch.order(control.Resume(request_id))
+        scratch.order(control.ResumeNode(request_id))
         scratch.io.turn()  # the order, then the first request
         scratch.io.serve_fast(scratch.node.bricks["brick"])  # until it meets the nudge
         assert scratch.io.journal.at == HEADER_BYTES + request_id * RECORD.size, "a rehearsal went wrong"
@@ -276,7 +276,7 @@ def _rehearse_mail() -> None:
 
 def _rehearse_promotion() -> None:
     scratch = _Scratch(PbrAfter(1, leads=False), ("aft2aft", "srv2aft"), ("aft2srv", "aft2pro", "aft2aft"))
-    scratch.order(control.Tell(control.UNANSWERED, "brick", Promotion(2)))
+    scratch.order(control.Deliver(control.UNANSWERED, "brick", Promotion(2)))
     scratch.into["aft2aft"].shutdown(socket.SHUT_WR)
     scratch.io.turn()  # the nudge and the order with it
     scratch.io.turn()  # the end of the channel

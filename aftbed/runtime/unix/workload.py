@@ -172,13 +172,13 @@ class Workload:
         """The graph is complete: let requests come."""
         options = self._options
         if self._is_load:
-            yield from self.deployment.ask("client", control.Resume)
+            yield from self.deployment.ask("client", control.ResumeNode)
             self._loop.after(LOAD_POLL_SECONDS, self._watch_load)
             return
         name = VEHICLE if isinstance(options.work, CarRun) else PLAYER
         source = SourceOptions(options.work, options.seed, options.port)
         yield from self._serve(BUS, name, msgspec.msgpack.encode(source), ())
-        self._pool.order(self._services[name], control.Resume(control.UNANSWERED))
+        self._pool.order(self._services[name], control.ResumeNode(control.UNANSWERED))
         self._pool.refill(BUS, 1)
 
     def _serve(self, zygote: str, name: str, options: bytes, fds: tuple[int, ...]) -> Keys:
@@ -249,7 +249,7 @@ class Workload:
 
     def wind_up(self) -> Keys:
         """Have no more requests sent; then count the unanswered ones: an earlier count may be out of date."""
-        yield from self.deployment.ask("client", control.Quiet)
+        yield from self.deployment.ask("client", control.StopRequests)
         yield from self._ask_stats()
         self.settled = (self._result is not None or self._is_load) and not self._stats.get("unanswered", 1)
 
