@@ -2,10 +2,13 @@
 
 import json
 import re
+import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from fakerun import Call, Output
+from liveruns import called
 
 SPEC = """
 campaign: try
@@ -30,6 +33,31 @@ def spec(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     path = tmp_path / "try.yaml"
     path.write_text(SPEC)
     return path
+
+
+Ran = Callable[[str], dict[str, object]]
+
+
+@pytest.fixture(scope="module")
+def records(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What SPEC comes to, run once."""
+    folder = tmp_path_factory.mktemp("campaign")
+    (folder / "try.yaml").write_text(SPEC)
+    done = called("campaign", "run", folder / "try.yaml", "--out", folder / "out", "--jobs", "1", "--json")
+    assert done.code == 0, done.err
+    return folder / "out"
+
+
+@pytest.fixture
+def ran(spec: Path, records: Path) -> Ran:
+    """Put these records into a folder beside `spec`: its summary."""
+
+    def to(name: str) -> dict[str, object]:
+        shutil.copytree(records, spec.parent / name)
+        summary: dict[str, object] = json.loads((records / "summary.json").read_text())
+        return summary
+
+    return to
 
 
 def test_from_a_file_to_a_gate(spec: Path, call: Call) -> None:
@@ -66,16 +94,16 @@ def test_a_campaign_whose_faults_cannot_fire_fails(spec: Path, call: Call) -> No
     assert failed["not_activated"] == "none of 12 faults struck: this stratum could not have failed"
 
 
-def test_a_report_from_records_equals_the_first(spec: Path, output: Output) -> None:
-    first = json.loads(output("campaign", "run", spec, "--out", "out", "--json"))
+def test_a_report_from_records_equals_the_first(ran: Ran, output: Output) -> None:
+    first = ran("out")
     again = json.loads(output("campaign", "report", "out", "--json"))
     assert first | {"seconds": 0} == again | {"seconds": 0}
 
 
-def test_shards_are_merged(spec: Path, output: Output, call: Call) -> None:
-    whole = json.loads(output("campaign", "run", spec, "--out", "whole", "--json"))
+def test_shards_are_merged(spec: Path, ran: Ran, output: Output, call: Call) -> None:
+    whole = ran("whole")
     for shard in (1, 2):
-        call("campaign", "run", spec, "--shard", f"{shard}/2", "--out", f"part{shard}")
+        call("campaign", "run", spec, "--shard", f"{shard}/2", "--out", f"part{shard}", "--jobs", "1")
     merged = json.loads(output("campaign", "merge", "part1", "part2", "--out", "merged", "--json"))
     assert merged["strata"] == whole["strata"] and merged["gates"] == whole["gates"]
 
@@ -87,23 +115,23 @@ def test_a_plan_runs_nothing(spec: Path, output: Output) -> None:
     assert not (spec.parent / "campaign-try").exists()
 
 
-def test_an_experiment_is_replayed(spec: Path, output: Output) -> None:
-    output("campaign", "run", spec, "--out", "out", "--json")
+def test_an_experiment_is_replayed(ran: Ran, output: Output) -> None:
+    ran("out")
     found = json.loads(output("campaign", "replay", "out", "1", "--json"))
     assert found["before"]["outcome"] == found["after"]["outcome"] == "unavailable"
     shown = output("campaign", "replay", "out", "1")
     assert "aftbed sim --ftm none --placement process --seed" in shown
 
 
-def test_an_experiment_is_shrunk(spec: Path, output: Output) -> None:
-    output("campaign", "run", spec, "--out", "out", "--json")
+def test_an_experiment_is_shrunk(ran: Ran, output: Output) -> None:
+    ran("out")
     found = json.loads(output("campaign", "shrink", "out", "1", "--json"))
     assert found["ftm"] == "none" and found["requests"] == 1
     assert found["faults"] == ["crash primary at server.exit nth 1"]
 
 
-def test_two_campaigns_are_compared(spec: Path, output: Output, call: Call) -> None:
-    output("campaign", "run", spec, "--out", "base", "--json")
+def test_two_campaigns_are_compared(spec: Path, ran: Ran, output: Output, call: Call) -> None:
+    ran("base")
     same = json.loads(output("campaign", "compare", "base", "base", "--json"))
     assert not same["worse"] and [c["pairs"] for c in same["changes"]] == [12, 12]
     records = spec.parent / "base" / "records.jsonl"
@@ -116,8 +144,8 @@ def test_two_campaigns_are_compared(spec: Path, output: Output, call: Call) -> N
 
 
 @pytest.mark.parametrize("name", ["out.csv", "out.parquet"])
-def test_results_are_exported(spec: Path, output: Output, name: str) -> None:
-    output("campaign", "run", spec, "--out", "out", "--json")
+def test_results_are_exported(spec: Path, ran: Ran, output: Output, name: str) -> None:
+    ran("out")
     output("campaign", "export", "out", "--out", name)
     assert (spec.parent / name).stat().st_size > 1000
 

@@ -13,7 +13,7 @@ from typing import Final
 
 import pytest
 from liveruns import Done, Home, Started, aftbed, state_of, under_load, until
-from sampling import sampled
+from sampling import every, sampled
 
 from aftbed.core.events import Event
 from aftbed.core.graph import PLACEMENTS
@@ -166,7 +166,7 @@ def test_a_follower_that_was_hit_has_diverged_and_the_client_has_its_reply(tmp_p
     assert [(r.node, r.request_id) for r in ran.events(Event.FOLLOWER_DIVERGED)] == [("b/after", HIT)]
 
 
-@pytest.mark.parametrize("ftm", [e for e in WITH_TR if replication_of(e)])
+@pytest.mark.parametrize("ftm", every(2, [e for e in WITH_TR if replication_of(e)]))
 def test_a_bit_of_the_backup_is_no_concern_of_the_client(tmp_path: Path, ftm: str) -> None:
     executes = ftm.startswith("lfr")
     fault = "result in backup nth" if executes else f"state bit {COUNTER} in b at state.restored nth"

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from liveruns import GONE_SECONDS_MAX, WAIT_SECONDS_MAX, Home, until
+from sampling import every
 
 from aftbed.campaign import ledger
 from aftbed.judge.verdict import EXIT_INTERRUPTED
@@ -80,7 +81,7 @@ MOMENTS: dict[str, Callable[[Interrupted], bool]] = {
 }
 
 
-@pytest.mark.parametrize("moment", MOMENTS)
+@pytest.mark.parametrize("moment", every(3, tuple(MOMENTS)))
 def test_it_ends_and_nothing_is_left(campaign: Interrupted, moment: str) -> None:
     until(lambda: MOMENTS[moment](campaign), moment)
     campaign.interrupt()

@@ -243,7 +243,7 @@ def test_python_cans_logger_logs_the_running_bus_in_formats_that_we_read(
     try:
         for logger in loggers:
             logger.wait_for(b"Connected to")
-        wait_for_traffic(port, 500)
+        wait_for_traffic(port, 200)
     finally:
         for logger in loggers:
             logger.end()

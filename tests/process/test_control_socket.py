@@ -23,7 +23,7 @@ from aftbed.runtime.unix import control_client, run_directory
 
 pytestmark = pytest.mark.process
 
-EXAMPLES: Final = 300
+EXAMPLES: Final = 6 * settings.default.max_examples
 WORDS: Final = st.text(max_size=20)
 GRAPH: Final = build("pbr", "process")
 WHOM: Final = {*targets.ROLES, *GRAPH.nodes, *targets.OTHERS}

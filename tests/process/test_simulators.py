@@ -6,13 +6,14 @@ import sys
 
 import pytest
 from liveruns import GONE_SECONDS_MAX, PATIENCE_SECONDS, Home, until
+from sampling import every
 
 pytestmark = pytest.mark.process
 
 JOBS = 2
 
 
-@pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("end", every(2, (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)))
 def test_no_simulator_outlives_its_command(home: Home, end: signal.Signals) -> None:
     command = [sys.executable, "-m", "aftbed", "explore", "pairs", "--jobs", str(JOBS), "--json"]
     explored = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)

@@ -71,8 +71,8 @@ def fail_over(run: Started, count: int) -> None:
 @pytest.mark.parametrize(
     ("placement", "count"),
     [
-        ("process", 20),
-        ("replica", 20),
+        ("process", 10),
+        ("replica", 10),
         pytest.param("process", 1000, marks=[pytest.mark.deep, pytest.mark.timeout(1200)]),
         pytest.param("replica", 1000, marks=[pytest.mark.deep, pytest.mark.timeout(1200)]),
     ],

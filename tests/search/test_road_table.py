@@ -62,7 +62,7 @@ def test_every_row_of_m1_passes_under_a_crash_at_the_worst_instant(ftm: str) -> 
 
 
 def test_a_row_passes_under_a_crash_at_the_worst_instant_as_without_it() -> None:
-    case = R152["r152:m1-20"]
+    case = R152["r152:m1-10"]
     found, free = row(case, crash("pbr")), row(case, RoadLine("pbr", "pbr"))
     assert found.passed and free.passed
     assert found.loss_m is not None and 0.0 <= found.loss_m <= LOST_M_MAX
@@ -72,7 +72,7 @@ def test_a_row_passes_under_a_crash_at_the_worst_instant_as_without_it() -> None
     assert found.fault is not None and found.fault.startswith("crash primary at ")
     assert (
         found.repeat[1]
-        == f'aftbed run --scenario r152:m1-20 --ftm pbr --seed 0 --pace max --inject "{found.fault}"'
+        == f'aftbed run --scenario r152:m1-10 --ftm pbr --seed 0 --pace max --inject "{found.fault}"'
     )
 
 

@@ -19,6 +19,7 @@ import msgspec
 import pytest
 from busharness import FunctionGateway, running_hub
 from puredrive import CODEC
+from sampling import every, sampled
 
 from aftbed.vehicle.aeb.function import default_application
 from aftbed.vehicle.can.candump import log_line
@@ -132,7 +133,7 @@ def test_with_replies_at_once_it_is_the_lockstep_drive_frame_by_frame(
 
 
 @pytest.mark.process
-@pytest.mark.parametrize("scenario", scenario_names())
+@pytest.mark.parametrize("scenario", every(3, scenario_names()))
 def test_with_replies_at_once_it_is_a_real_run(scenario: str, tmp_path: Path) -> None:
     command = ["run", "--ftm", "none", "--scenario", scenario, "--pace", "max", "--seed", "5", "--json"]
     with tempfile.TemporaryDirectory(prefix="aft-", dir="/tmp") as home:  # a socket's path may be 108 bytes
@@ -179,8 +180,10 @@ def seldom_advanced(delay_ns: int) -> Drive:
     return drive("ccrs-20", after(delay_ns))
 
 
-@pytest.mark.parametrize("delay_ns", [0, 5 * MS, 13 * MS + 400_000, 20 * MS, 33 * MS + 1])
-@pytest.mark.parametrize("tick_ns", [MS, 7 * MS, 370_001])
+@pytest.mark.parametrize(
+    ("delay_ns", "tick_ns"),
+    sampled((0, 5 * MS, 13 * MS + 400_000, 20 * MS, 33 * MS + 1), (MS, 7 * MS, 370_001)),
+)
 def test_how_often_it_is_advanced_makes_no_difference(delay_ns: int, tick_ns: int) -> None:
     lazy, busy = seldom_advanced(delay_ns), drive("ccrs-20", after(delay_ns), tick_ns=tick_ns)
     assert busy.frames == lazy.frames

@@ -200,8 +200,8 @@ def test_the_bare_function_passes_r152_in_running_order(case: Case) -> None:
     check_bare(case, seed=1)
 
 
-@pytest.mark.parametrize("case", FASTEST, ids=lambda case: case.name)
-def test_the_bare_function_passes_the_fastest_row_of_every_group(case: Case) -> None:
+@pytest.mark.parametrize("case", FASTEST[::2], ids=lambda case: case.name)  # deep: every row
+def test_the_bare_function_passes_the_fastest_row_of_a_group(case: Case) -> None:
     check_bare(case, seed=2)
 
 
