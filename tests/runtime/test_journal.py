@@ -20,7 +20,7 @@ from aftbed.core.journal import (
     records,
 )
 from aftbed.runtime.unix import journal_files as mapped
-from aftbed.runtime.unix.journal_files import CHUNK_BYTES, DialogueFile, Header, JournalFile
+from aftbed.runtime.unix.journal_files import CHUNK_BYTES, DialogueFile, JournalFile, JournalHeader
 
 PER_CHUNK: Final = (CHUNK_BYTES - HEADER_BYTES) // RECORD.size
 
@@ -106,7 +106,7 @@ def test_what_was_written_outlives_a_kill(tmp_path: Path) -> None:
 
 def test_the_header_carries_a_pulse_and_a_flag_between_processes(tmp_path: Path) -> None:
     path = tmp_path / "a.journal"
-    journal, header = JournalFile(path, "a"), Header(path)
+    journal, header = JournalFile(path, "a"), JournalHeader(path)
     assert header.pulse_ns() == 0
     journal.mapping[PULSE_OFFSET : PULSE_OFFSET + 8] = (2**63 + 5).to_bytes(8, "little")
     assert header.pulse_ns() == 2**63 + 5
@@ -120,7 +120,7 @@ def test_the_header_carries_a_pulse_and_a_flag_between_processes(tmp_path: Path)
 
 def test_the_header_is_still_seen_after_the_journal_has_grown(tmp_path: Path) -> None:
     path = tmp_path / "a.journal"
-    journal, header = JournalFile(path, "a"), Header(path)
+    journal, header = JournalFile(path, "a"), JournalHeader(path)
     for number in range(PER_CHUNK + 1):
         journal.write(number, Event.SERVER_EXIT, number, 0)
     journal.mapping[PULSE_OFFSET] = 7

@@ -13,7 +13,7 @@ import pytest
 from aftbed.core.brick import Brick, Effect
 from aftbed.core.messages import AnyMessage
 from aftbed.runtime.node import Node
-from aftbed.runtime.unix.journal_files import Header, JournalFile
+from aftbed.runtime.unix.journal_files import JournalFile, JournalHeader
 from aftbed.runtime.unix.linux import set_timeouts
 from aftbed.runtime.unix.node_io import UnixIO
 from aftbed.runtime.unix.transport import Line, decode_order
@@ -66,11 +66,11 @@ def test_a_node_that_waits_shows_that_it_lives(tmp_path: Path, suspended: bool) 
     journal, seen = tmp_path / "idle.journal", set[int]()
     with waiting(journal, suspended=suspended):
         limit = time.monotonic() + SECONDS_MAX
-        header: Header | None = None
+        header: JournalHeader | None = None
         while len(seen) < BEATS:
             assert time.monotonic() < limit, f"{len(seen)} beats"
             if header is None and journal.exists() and journal.stat().st_size:
-                header = Header(journal)
+                header = JournalHeader(journal)
             seen |= {header.pulse_ns()} - {0} if header is not None else set()
             os.sched_yield()
         assert header is not None

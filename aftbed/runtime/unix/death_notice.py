@@ -129,7 +129,7 @@ class LifelineWatcher:
 
     def _watch(self) -> None:
         signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())  # they are the main thread's
-        linux.answer_soon()
+        linux.use_short_slices()
         alive = [i for i, word in enumerate(self._words) if word.value]
         try:
             while alive and self._wanted.locked():

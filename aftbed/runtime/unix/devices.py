@@ -14,7 +14,7 @@ from aftbed.runtime import control
 from aftbed.runtime.devices import CarDevice, Device, Load, resume_client
 from aftbed.runtime.unix import linux
 from aftbed.runtime.unix.death_notice import LifelineWatcher
-from aftbed.runtime.unix.journal_files import DialogueFile, Header
+from aftbed.runtime.unix.journal_files import DialogueFile, JournalHeader
 from aftbed.runtime.unix.options import GATEWAY, LoadRun, ReplayRun, SourceOptions
 from aftbed.vehicle.aeb.function import sample_requests
 
@@ -31,7 +31,7 @@ class ProcessSenses:
     def __init__(self) -> None:
         self._nodes: tuple[str, ...] = ()
         self._pidfds: dict[int, str] = {}
-        self._headers: dict[str, Header] = {}
+        self._headers: dict[str, JournalHeader] = {}
         self._starvation: dict[str, linux.Starvation] = {}
         self._lifelines: LifelineWatcher | None = None
 
@@ -39,7 +39,7 @@ class ProcessSenses:
         """Watch these nodes and no others; `fds` are their pidfds. Deaths are read from `fds()`."""
         self._nodes = nodes = order.nodes
         self._pidfds = dict(zip(fds, nodes, strict=True))
-        self._headers = {n: Header(Path(j)) for n, j in zip(nodes, order.journals, strict=True)}
+        self._headers = {n: JournalHeader(Path(j)) for n, j in zip(nodes, order.journals, strict=True)}
         self._starvation = {n: linux.Starvation(pid) for n, pid in zip(nodes, order.pids, strict=True)}
         self._lifelines = LifelineWatcher(order.journals)
 

@@ -98,7 +98,7 @@ class DialogueFile:
         self._at = end
 
 
-class Header:
+class JournalHeader:
     """The header page of another node's journal: its pulse, and the flag that announces control mail."""
 
     def __init__(self, path: Path) -> None:

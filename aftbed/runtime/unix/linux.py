@@ -98,7 +98,7 @@ class _SchedAttr(ctypes.Structure):
     )
 
 
-def answer_soon() -> None:
+def use_short_slices() -> None:
     """Ask for short time slices for this thread: woken, it runs before threads with long ones.
 
     sched_setattr(2), `sched_runtime` of SCHED_OTHER (Linux 6.12); no privilege, no larger share of the
@@ -112,7 +112,7 @@ def answer_soon() -> None:
         _libc.syscall(number, 0, ctypes.byref(attributes), 0)
 
 
-def hand_over() -> None:
+def use_batch_scheduling() -> None:
     """Do not preempt the process that wakes this one: it blocks in a moment, and then this one runs.
 
     SCHED_BATCH (sched(7)): the nodes of a chain share a core and wake each other in turn; without it

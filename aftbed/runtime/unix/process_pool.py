@@ -21,7 +21,7 @@ from aftbed.runtime.tasks import Key, Wait
 from aftbed.runtime.unix import linux
 from aftbed.runtime.unix.cleanup import UndoLedger
 from aftbed.runtime.unix.event_loop import EventLoop
-from aftbed.runtime.unix.journal_files import Header
+from aftbed.runtime.unix.journal_files import JournalHeader
 from aftbed.runtime.unix.transport import Line, decode_report
 
 REAP_SECONDS: Final = 0.01  # a failover does not wait for the reaping of a dead process
@@ -64,7 +64,7 @@ class UnixProcess:
         self.name, self.kind, self.line, self._ledger = name, kind, line, ledger
         self.pid, self.pidfd = 0, -1
         self.journal = ""
-        self.header: Header | None = None
+        self.header: JournalHeader | None = None
         self.alive = True
         self.incarnation = 0
         self.bricks: tuple[tuple[str, str], ...] = ()
@@ -121,7 +121,7 @@ class UnixProcess:
     def assigned(self) -> None:
         """It has acknowledged an Assign, so its journal exists."""
         if self.header is None and self.journal and Path(self.journal).exists():
-            self.header = Header(Path(self.journal))
+            self.header = JournalHeader(Path(self.journal))
 
     def announce(self) -> None:
         """Raise the flag: an order waits."""

@@ -157,7 +157,7 @@ class Supervisor:
         """From the first fork to the last reaped process."""
         linux.become_subreaper()
         linux.no_core()
-        linux.answer_soon()
+        linux.use_short_slices()
         has_bus = BUS in self._zygotes
         for name in (BUS, LIGHT) if has_bus else (LIGHT,):
             self.pool.start_zygote(name, self._zygotes.get(name))

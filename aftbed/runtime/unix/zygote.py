@@ -120,9 +120,9 @@ def _make_node(line: Line[control.ToNode], order: control.Assign, fds: list[int]
     if order.cpu is not None:
         os.sched_setaffinity(0, {order.cpu})
     if kind in ("watchdog", "recovery"):
-        linux.answer_soon()
+        linux.use_short_slices()
     else:
-        linux.hand_over()
+        linux.use_batch_scheduling()
     linux.set_timeouts(line.sock, PULSE_SECONDS, 2.0)
     io = UnixIO(line, JournalFile(Path(order.journal), order.node))
     node = Node(order.node, io)

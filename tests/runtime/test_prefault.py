@@ -1,7 +1,9 @@
-"""The pages that some work writes to are found, and had in advance."""
+"""The pages that some work writes to are found and copied in advance; the rehearsal finds those of a node."""
 
 import ctypes
 import mmap
+import subprocess
+import sys
 from collections.abc import Iterator
 
 import pytest
@@ -59,3 +61,34 @@ def test_where_the_work_fails_nothing_is_known() -> None:
         raise RuntimeError
 
     assert written_by(fails) == ()
+
+
+# -- the rehearsal
+
+
+SCRIPT = """
+import resource
+from aftbed.runtime.unix import linux, prefault
+
+areas = prefault.warm_up()
+
+def faults():
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+
+def prepared():
+    linux.populate(areas)
+    before = faults()
+    prefault.rehearse_host()
+    print(sum(size for _, size in areas) // prefault.PAGE, faults() - before, flush=True)
+
+prefault.written_by(prepared)
+"""
+
+
+@pytest.mark.skipif(not written_by(lambda: None), reason="this kernel does not tell which pages are whose")
+def test_a_child_that_owns_the_pages_of_the_rehearsal_takes_hardly_a_fault_in_it() -> None:
+    """In an interpreter of its own, as in a zygote: the rehearsal freezes the garbage collector."""
+    told = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=True).stdout
+    owned, faults = map(int, told.split())
+    assert owned > 100
+    assert faults < owned / 5, f"{faults} page faults, {owned} pages of {PAGE} bytes were owned before"
