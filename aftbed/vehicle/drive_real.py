@@ -65,21 +65,18 @@ class DriveReport(msgspec.Struct, frozen=True):
 class CarBuses:
     """The car's attachments to the bus, complete: the drive may begin."""
 
-    def __init__(self, options: BusOptions, *, lockstep: bool, follows: tuple[int, ...] = ()) -> None:
+    def __init__(self, options: BusOptions, follows: tuple[int, ...] = ()) -> None:
         """`follows` are the identifiers of the frames that the brake ECU follows."""
-        on_hub = lockstep or options.interface == "socketcand"
-        self.line = HubLine(options) if on_hub else None
+        self.line = HubLine(options)
         self.brake = open_bus(msgspec.structs.replace(options, node=BRAKE, uses=follows))
         self.radar = open_bus(msgspec.structs.replace(options, node=RADAR))
-        if self.line is not None:
-            self.line.drives_the_car()
+        self.line.drives_the_car()
 
     def close(self) -> None:
         """Leave the bus."""
         self.brake.close()
         self.radar.close()
-        if self.line is not None:
-            self.line.close()
+        self.line.close()
 
 
 def drive(
@@ -107,7 +104,6 @@ class _Drive:
         options: DriveOptions,
         stop: Callable[[], bool],
     ) -> None:
-        assert options.pace is not None or buses.line is not None, "lockstep without a hub"
         self._buses = buses
         self._body = CarBody(scenario, codec, options.brake_policy, options.seed)
         self._schedule = None if options.pace is None else Schedule(options.pace)
@@ -123,8 +119,7 @@ class _Drive:
         body, schedule = self._body, self._schedule
         while (end := body.ended() or ("stopped" if self._stop() else None)) is None:
             if schedule is None:
-                assert self._buses.line is not None
-                self._exchange_in_lockstep(self._buses.line)
+                self._exchange_in_lockstep()
             else:
                 schedule.wait_until(body.plant.t_us, self._stop)
                 self._exchange()
@@ -144,9 +139,8 @@ class _Drive:
 
     def _exchange(self) -> None:
         """Paced: take the frames that have come, send those that are due."""
-        if self._buses.line is not None:
-            self._buses.line.changes()  # not used: time does not wait
-            self._report_conditions(self._buses.line)
+        self._buses.line.changes()  # not used: time does not wait
+        self._report_conditions()
         for frame in self._buses.brake.drain():
             self._watch.take(frame)
         for frame in self._body.brake_frames():
@@ -156,20 +150,20 @@ class _Drive:
             self._buses.radar.send(frame)
             self._tracks += frame.can_id == self._track_id
 
-    def _report_conditions(self, line: HubLine) -> None:
+    def _report_conditions(self) -> None:
         """Report to the hub which conditions hold now."""
-        t_us = self._body.plant.t_us
+        line, t_us = self._buses.line, self._body.plant.t_us
         for number, condition in list(line.conditions.items()):
             if self._body.holds(condition):
                 if self._schedule is None:
                     line.set_time(t_us)
                 line.met(number, t_us)
 
-    def _exchange_in_lockstep(self, line: HubLine) -> None:
+    def _exchange_in_lockstep(self) -> None:
         """Send the frames that are due in an order that the hub cannot change, and wait for the answer."""
-        t_us = self._body.plant.t_us
+        line, t_us = self._buses.line, self._body.plant.t_us
         if line.conditions:
-            self._report_conditions(line)
+            self._report_conditions()
         brake_frames, radar_frames = self._body.brake_frames(), self._body.radar_frames()
         due = line.due_us is not None and line.due_us <= t_us
         if not (brake_frames or radar_frames or due):
@@ -177,20 +171,20 @@ class _Drive:
         line.set_time(t_us)
         if due:
             self._watch.wait(self._stop)  # for the answers to frames that the hub had held back
-        self._send(BRAKE, self._buses.brake, brake_frames, line)
+        self._send(BRAKE, self._buses.brake, brake_frames)
         asks = any(frame.can_id == self._track_id for frame in radar_frames)
         if asks:
             self._watch.asked()
-        self._send(RADAR, self._buses.radar, radar_frames, line)
+        self._send(RADAR, self._buses.radar, radar_frames)
         self._buses.radar.drain()
         self._tracks += asks
         if asks or line.disturbed:
             self._watch.wait(self._stop)
 
-    def _send(self, node: str, bus: Bus, frames: Sequence[Frame], line: HubLine) -> None:
+    def _send(self, node: str, bus: Bus, frames: Sequence[Frame]) -> None:
         """Return when all `frames` have been over the wire."""
         for frame in frames:
             bus.send(frame)
         if frames:
             self._sent[node] += len(frames)
-            line.carried(node, self._sent[node])
+            self._buses.line.carried(node, self._sent[node])

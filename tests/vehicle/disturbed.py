@@ -60,7 +60,7 @@ def real(
     with (
         running_hub(log, HubOptions(lockstep=lockstep, pace=pace or 1.0)) as hub,
         FunctionGateway(hub.options, CODEC, named=True) as gateway,
-        closing(CarBuses(hub.options, lockstep=lockstep, follows=(CODEC.can_id("AEB_REQ"),))) as buses,
+        closing(CarBuses(hub.options, (CODEC.can_id("AEB_REQ"),))) as buses,
     ):
         arm(hub, faults)
         report = drive(

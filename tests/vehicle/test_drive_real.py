@@ -12,7 +12,6 @@ from busharness import TestGateway, brake_late, running_hub
 
 from aftbed.core.errors import HarnessError
 from aftbed.vehicle.can import bus as bus_module
-from aftbed.vehicle.can.bus import BusOptions
 from aftbed.vehicle.can.candump import read_log
 from aftbed.vehicle.can.dbc_file import Codec, load_dbc
 from aftbed.vehicle.can.hub import HubOptions
@@ -51,7 +50,7 @@ def run(
     with (
         running_hub(log, HubOptions(lockstep=lockstep, pace=options.pace or 1.0)) as hub,
         TestGateway(hub.options, codec, decide),
-        closing(CarBuses(hub.options, lockstep=lockstep)) as buses,
+        closing(CarBuses(hub.options)) as buses,
     ):
         return drive(scenario, codec, buses, options, report=report, stop=stop)
 
@@ -178,7 +177,7 @@ def test_a_lost_hub_ends_the_drive(pace: float | None, tmp_path: Path, codec: Co
     with (
         running_hub(tmp_path / "bus.log", HubOptions(lockstep=pace is None)) as hub,
         TestGateway(hub.options, codec, brake_late),
-        closing(CarBuses(hub.options, lockstep=pace is None)) as buses,
+        closing(CarBuses(hub.options)) as buses,
     ):
 
         def at_100_ms(telemetry: Telemetry) -> None:
@@ -187,12 +186,3 @@ def test_a_lost_hub_ends_the_drive(pace: float | None, tmp_path: Path, codec: Co
 
         with pytest.raises(HarnessError):
             drive(ccrs, codec, buses, DriveOptions(pace=pace), report=at_100_ms, stop=never)
-
-
-def test_a_paced_drive_on_the_virtual_bus(codec: Codec, ccrs: Scenario) -> None:
-    options = BusOptions(interface="virtual", channel="test_car")
-    with TestGateway(options, codec, brake_late), closing(CarBuses(options, lockstep=False)) as buses:
-        short = msgspec.structs.replace(ccrs, duration_ms=300)
-        report = drive(short, codec, buses, DriveOptions(), report=lambda _: None, stop=never)
-    assert report.end == "duration"
-    assert report.answers > 0

@@ -109,7 +109,7 @@ def real_drive(log: Path, scenario: str, policy: BrakePolicy, seed: int) -> Driv
     with (
         running_hub(log, HubOptions(lockstep=True)) as hub,
         FunctionGateway(hub.options, CODEC),
-        closing(CarBuses(hub.options, lockstep=True)) as buses,
+        closing(CarBuses(hub.options)) as buses,
     ):
         options = DriveOptions(pace=None, brake_policy=policy, seed=seed)
         return drive_on_hub(

@@ -137,7 +137,7 @@ def _drive(line: Line[control.ToNode], source: SourceOptions) -> None:
     given = {"pace": work.pace, "brake_policy": work.brake_policy, "seed": source.seed}
     options = msgspec.convert(given, DriveOptions)
     follows = (codec.can_id("AEB_REQ"),)
-    buses = CarBuses(BusOptions(port=source.port), lockstep=work.pace is None, follows=follows)
+    buses = CarBuses(BusOptions(port=source.port), follows)
     if _wait_for_go(line):
         result = drive(
             scenario,

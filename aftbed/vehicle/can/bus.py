@@ -1,8 +1,6 @@
 """How a process of aftbed attaches to the CAN bus: `Bus` for frames, `HubLine` for what goes beside them.
 
-`Bus` is python-can with types, and with its quirks handled. `socketcand` is the hub between processes,
-`virtual` is python-can's bus inside one process, `socketcan` is the kernel's (vcan, hardware). Quirks of the
-socketcand client of python-can 4.6:
+`Bus` is python-can's socketcand client with types, and with its quirks (of python-can 4.6) handled:
 
 1. One read of its socket may yield several frames; it keeps the rest in a buffer of its own. Waiting on
    the descriptor alone misses them. `drain` empties that buffer, so the rule for a node is: drain first,
@@ -31,7 +29,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Final, Literal, cast
+from typing import Final, cast
 
 import msgspec
 
@@ -54,17 +52,12 @@ _OK: Final = re.compile(r"< ok (?:(-|[0-9]+) )?>")
 _WATCH: Final = re.compile(r"< watch ([0-9]+) (ttc|gap|speed) (below|above) (-?[0-9.]+) >")
 _CHANGE: Final = re.compile(r"< change ([0-9A-F]{3}) ([+-][0-9]+) >")
 
-Interface = Literal["socketcand", "virtual", "socketcan"]
-
 
 class BusOptions(msgspec.Struct, frozen=True):
-    """Which bus to attach to. `port` is the hub's, for `socketcand` only.
-
-    `node` is the name by which a fault can cut this node off, and `uses` are the identifiers of the frames
-    that it evaluates; both are sent to the hub.
+    """The hub to attach to. `node` is the name by which a fault can cut this node off, and `uses` are the
+    identifiers of the frames that it evaluates; both are sent to the hub.
     """
 
-    interface: Interface = "socketcand"
     channel: str = "can0"
     port: int = 0
     node: str = ""
@@ -74,22 +67,18 @@ class BusOptions(msgspec.Struct, frozen=True):
 class Bus:
     """One attachment. Not for use from two threads."""
 
-    def __init__(self, bus: can.BusABC, sock: socket.socket | None, fd: int | None) -> None:
+    def __init__(self, bus: can.BusABC, sock: socket.socket) -> None:
         self.refused = 0  # frames that cannot be ours: extended, remote, FD
         self.errors = 0  # error frames: the hub refused what we sent
         self._bus = bus
         self._socket = sock
-        self._fd = fd
         self._ready: deque[Frame] = deque()
         self._poll = select.poll()
-        if fd is not None:
-            self._poll.register(fd, select.POLLIN)
+        self._poll.register(sock, select.POLLIN)
 
     def fileno(self) -> int:
-        """What to wait on, once `drain` has been called. HarnessError where there is none."""
-        if self._fd is None:
-            raise HarnessError("the virtual bus has no descriptor to wait on")
-        return self._fd
+        """What to wait on, once `drain` has been called."""
+        return self._socket.fileno()
 
     def send(self, frame: Frame) -> None:
         """Hand `frame` to the bus; its `t_us` stays here, the bus stamps it."""
@@ -104,9 +93,7 @@ class Bus:
         end_s = time.monotonic() + timeout_s
         while not self._ready:
             rest_s = end_s - time.monotonic()
-            if self._fd is None:
-                self._take_next(max(0.0, rest_s))
-            elif self._poll.poll(max(0.0, rest_s) * 1000):
+            if self._poll.poll(max(0.0, rest_s) * 1000):
                 self._fill()
             if rest_s <= 0:
                 break
@@ -114,7 +101,7 @@ class Bus:
 
     def drain(self) -> list[Frame]:
         """All frames that have arrived; none is left in python-can's buffer."""
-        if self._fd is None or self._poll.poll(0):
+        if self._poll.poll(0):
             self._fill()
         frames = list(self._ready)
         self._ready.clear()
@@ -122,12 +109,10 @@ class Bus:
 
     def set_time(self, t_us: int) -> None:
         """Set the virtual time of the hub, for the frames that this node sends from here on."""
-        if self._socket is None:
-            raise HarnessError("only the hub keeps virtual time")
         self._socket.sendall(f"< aftbed time {t_us} >".encode("ascii"))
 
     def notice(self, can_id: int, word: str) -> None:
-        """Report beside the bus what is wrong with these frames; only the hub takes such reports."""
+        """Report beside the bus what is wrong with these frames."""
         self._send_beside(f"noticed {can_id:03X} {word}")
 
     def unasked(self, can_id: int) -> None:
@@ -135,8 +120,6 @@ class Bus:
         self._send_beside(f"unasked {can_id:03X}")
 
     def _send_beside(self, words: str) -> None:
-        if self._socket is None:
-            return
         try:
             self._socket.sendall(f"< aftbed {words} >".encode("ascii"))
         except OSError as error:
@@ -148,21 +131,20 @@ class Bus:
         To close on unread data is a reset, which discards what the hub has not read yet: so our direction
         ends first, and the other is read to its end.
         """
-        if self._socket is not None:
-            end_s = time.monotonic() + GOODBYE_S_MAX
-            with suppress(OSError):  # gone already, or too slow
-                self._socket.shutdown(socket.SHUT_WR)
-                self._socket.settimeout(GOODBYE_S_MAX)
-                while time.monotonic() < end_s and self._socket.recv(65536):
-                    pass
+        end_s = time.monotonic() + GOODBYE_S_MAX
+        with suppress(OSError):  # gone already, or too slow
+            self._socket.shutdown(socket.SHUT_WR)
+            self._socket.settimeout(GOODBYE_S_MAX)
+            while time.monotonic() < end_s and self._socket.recv(65536):
+                pass
         self._bus.shutdown()
 
     def _fill(self) -> None:
         """Move what python-can has or can read at once to `_ready`."""
         found = False
-        while self._take_next(0.0):
+        while self._take_next():
             found = True
-        if found or self._socket is None:
+        if found:
             return
         try:
             ended = not self._socket.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT)
@@ -173,10 +155,10 @@ class Bus:
         if ended:
             raise HarnessError("the CAN bus hung up: the hub is gone, or found this node too slow")
 
-    def _take_next(self, timeout_s: float) -> bool:
+    def _take_next(self) -> bool:
         """Take one message from python-can; False if there was none."""
         try:
-            message = self._bus.recv(timeout_s)
+            message = self._bus.recv(0.0)
         except can.CanError as error:
             raise HarnessError(f"the CAN bus gave no frame: {error}") from error
         if message is None:
@@ -193,18 +175,6 @@ class Bus:
 
 def open_bus(options: BusOptions) -> Bus:
     """Attach. When this returns, every frame that the bus carries from here on arrives."""
-    if options.interface == "socketcand":
-        return _open_hub(options)
-    if options.interface == "virtual":
-        return Bus(can.Bus(interface="virtual", channel=options.channel), None, None)
-    try:
-        bus = can.Bus(interface="socketcan", channel=options.channel)
-    except (OSError, can.CanError) as error:
-        raise ConfigError(f"CAN interface {options.channel!r}: {error}") from error
-    return Bus(bus, None, bus.fileno())
-
-
-def _open_hub(options: BusOptions) -> Bus:
     _connect(options, ATTACH_S_MAX).close()  # python-can would retry for ten seconds, without a pause
     # What it logs is either harmless (a frame cut by the end of a read) or raised as well.
     logging.getLogger("can.interfaces.socketcand.socketcand").setLevel(logging.CRITICAL)
@@ -225,7 +195,7 @@ def _open_hub(options: BusOptions) -> Bus:
     if options.node:
         uses = "".join(f" {can_id:03X}" for can_id in options.uses)
         sock.sendall(f"< aftbed node {options.node}{uses} >".encode("ascii"))
-    return Bus(bus, sock, sock.fileno())
+    return Bus(bus, sock)
 
 
 def _connect(options: BusOptions, seconds_max: float) -> socket.socket:
@@ -247,8 +217,6 @@ class HubLine:
     """
 
     def __init__(self, options: BusOptions) -> None:
-        if options.interface != "socketcand":
-            raise ConfigError(f"lockstep needs the hub, interface socketcand, not {options.interface}")
         self.conditions: dict[int, Condition] = {}  # still to be met, by the number of their faults
         self.disturbed = False  # by the latest from the hub
         self.due_us: int | None = None  # when something comes of a fault by itself

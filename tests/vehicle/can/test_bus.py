@@ -101,32 +101,6 @@ def test_a_channel_that_is_not_there(hub: RunningHub) -> None:
         HubLine(BusOptions(port=hub.port, channel="can7"))
 
 
-def test_the_virtual_bus_has_the_same_face() -> None:
-    options = BusOptions(interface="virtual", channel="test_bus")
-    a, b = open_bus(options), open_bus(options)
-    try:
-        a.send(Frame(0, 0x123, b"\x01"))
-        a.send(Frame(0, 0x124, b""))
-        one = b.recv(DEADLINE_S)
-        assert one is not None
-        assert [(frame.can_id, frame.data) for frame in (one, *b.drain())] == [(0x123, b"\x01"), (0x124, b"")]
-        assert a.drain() == []
-        with pytest.raises(HarnessError, match="no descriptor"):
-            a.fileno()
-        with pytest.raises(HarnessError, match="virtual time"):
-            a.set_time(1)
-        with pytest.raises(ConfigError, match="lockstep needs the hub"):
-            HubLine(options)
-    finally:
-        a.close()
-        b.close()
-
-
-def test_a_kernel_interface_that_is_not_there() -> None:
-    with pytest.raises(ConfigError, match="CAN interface 'vcan77'"):
-        open_bus(BusOptions(interface="socketcan", channel="vcan77"))
-
-
 def test_the_hub_clock_sets_time_for_all(hub: RunningHub, pair: tuple[Bus, Bus]) -> None:
     a, b = pair
     clock = HubLine(hub.options)
