@@ -3,10 +3,10 @@
 The hub between processes and the bus of the car in virtual time both let a frame pass through a `Disturber`
 at the moment at which it wins the bus (`vehicle`'s protocol for it has the calls that a bus makes):
 
-    carry(frame, sender)     what comes onto the bus in its place, now: the frame, another one, two, or none
-    release(now_us)          what comes now without being sent now: held back before, or a babbling idiot's
-    due_us()                 when to call `release` next
-    deaf(sender, node, ...)  whether the node receives nothing of that sender now: bus-off, partition
+    carry(frame, sender)       what comes onto the bus in its place, now: the frame, another one, two, or none
+    release(now_us)            what comes now without being sent now: held back before, or a babbling idiot's
+    due_us()                   when to call `release` next
+    cut_off(sender, node, ...) whether the node receives nothing of that sender now: bus-off, partition
 
 Several faults are armed at once: what one lets through, the next one gets, in the order of arming. What is
 released is not struck again.
@@ -228,7 +228,7 @@ class Disturber:
                     due.append(armed.flood_us)
         return min(due, default=None)
 
-    def deaf(self, sender: str, node: str, now_us: int) -> bool:
+    def cut_off(self, sender: str, node: str, now_us: int) -> bool:
         """Whether `node` receives nothing of `sender` now."""
         for armed in self._armed.values():
             if not armed.on_nodes or not armed.holds(now_us):

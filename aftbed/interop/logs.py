@@ -331,30 +331,28 @@ TRC_LACKS: Final = (FrameKind.REMOTE, FrameKind.ERROR)
 
 
 def read_asc(path: Path) -> CanLog:
-    lines = _lines(path)
     try:
-        return _read_asc(path, lines, dated=True)
+        return _read_asc(path, dated=True)
     except ConfigError as error:
         if "Incompatible datetime string" not in str(error):  # python-can's text
             raise
-    lines.seek(0)
-    lines.number = 0
-    return _read_asc(path, lines, dated=False)
+    return _read_asc(path, dated=False)
 
 
-def _read_asc(path: Path, lines: _Lines, *, dated: bool) -> CanLog:
-    return _log_of(path, _asc_messages(path, can.ASCReader(lines, relative_timestamp=not dated)), lines.where)
+def _read_asc(path: Path, *, dated: bool) -> CanLog:
+    lines = _lines(path)
+    reader = can.ASCReader(lines, relative_timestamp=not dated)
 
+    def messages() -> Iterator[can.Message]:
+        for message in reader:
+            if reader.timestamps_format == "relative":
+                reason = "its times count from frame to frame; `timestamps absolute` is allowed"
+                raise ConfigError(f"{path}: {reason}")
+            if reader.start_time < DATED_US_MIN / 1e6:
+                message.timestamp -= reader.start_time
+            yield message
 
-def _asc_messages(path: Path, reader: can.ASCReader) -> Iterator[can.Message]:
-    for message in reader:
-        if reader.timestamps_format == "relative":
-            raise ConfigError(
-                f"{path}: its times count from frame to frame; `timestamps absolute` is allowed"
-            )
-        if reader.start_time < DATED_US_MIN / 1e6:
-            message.timestamp -= reader.start_time
-        yield message
+    return _log_of(path, messages(), lines.where)
 
 
 def write_asc(log: CanLog, path: Path) -> None:

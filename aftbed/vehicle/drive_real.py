@@ -70,10 +70,9 @@ class CarBuses:
         self.line = HubLine(options)
         self.brake = open_bus(msgspec.structs.replace(options, node=BRAKE, uses=follows))
         self.radar = open_bus(msgspec.structs.replace(options, node=RADAR))
-        self.line.drives_the_car()
+        self.line.request_conditions()
 
     def close(self) -> None:
-        """Leave the bus."""
         self.brake.close()
         self.radar.close()
         self.line.close()

@@ -41,12 +41,12 @@ RADAR, BRAKE, GATEWAY = NODES
 class VirtualBus(BusModel[BusNode]):
     """The car's bus: the two ECUs and the gateway."""
 
-    def __init__(self, codec: Codec, body: CarBody, witness: Callable[[Frame], None] | None) -> None:
+    def __init__(self, codec: Codec, body: CarBody, on_frame: Callable[[Frame], None] | None) -> None:
         super().__init__()
         self.gateway = Gateway(codec)
         self.requests: list[bytes] = []  # that the gateway has made, and that were not fetched yet
         self._body = body
-        self._witness = witness
+        self._on_frame = on_frame
         self._arriving: deque[tuple[Frame, bool]] = deque()  # at the brake ECU, and whether it receives them
         self.radar_node = BusNode(RADAR)
         self.brake_node = BusNode(BRAKE, frozenset({codec.can_id("AEB_REQ")}))
@@ -59,8 +59,8 @@ class VirtualBus(BusModel[BusNode]):
         if sender == GATEWAY:
             self._arriving.append((frame, self.brake_node in receivers))
             return
-        if self._witness is not None:
-            self._witness(frame)
+        if self._on_frame is not None:
+            self._on_frame(frame)
         if self.gateway_node in receivers:
             payload = self.gateway.on_frame(frame)
             if payload is not None:
@@ -73,8 +73,8 @@ class VirtualBus(BusModel[BusNode]):
         """The brake ECU takes what has arrived at `t_us` or before."""
         while self._arriving and self._arriving[0][0].t_us <= t_us:
             frame, receives = self._arriving.popleft()
-            if self._witness is not None:
-                self._witness(frame)
+            if self._on_frame is not None:
+                self._on_frame(frame)
             if receives:
                 self._body.receive(frame)
 
@@ -89,15 +89,15 @@ class VirtualCar:
         brake_policy: BrakePolicy = "latch",
         seed: int = 0,
         codec: Codec | None = None,
-        witness: Callable[[Frame], None] | None = None,
+        on_frame: Callable[[Frame], None] | None = None,
     ) -> None:
         """`codec` is aftbed's own DBC, loaded where none is given: that takes 3 ms.
 
-        `witness` is called with every frame, in the order of the bus.
+        `on_frame` is called with every frame, in the order of the bus.
         """
         codec = codec or load_dbc()
         self._body = CarBody(scenario, codec, brake_policy, seed)
-        self._bus = VirtualBus(codec, self._body, witness)
+        self._bus = VirtualBus(codec, self._body, on_frame)
         self._end = self._body.ended()
         self._step_us = 0  # the step whose frames are to be sent next
         self._now_ns = 0
@@ -106,7 +106,6 @@ class VirtualCar:
 
     @property
     def end(self) -> End | None:
-        """Why the drive is over; None while it is not."""
         return self._end
 
     @property
@@ -120,7 +119,6 @@ class VirtualCar:
         return self._bus.gateway.counts
 
     def result(self) -> VehicleResult:
-        """The drive so far."""
         return self._body.result()
 
     def due_ns(self) -> int | None:

@@ -292,7 +292,6 @@ class CarBody:
         self._still_us = self._still_us + STEP_US if plant.stopped() else 0
 
     def telemetry(self) -> Telemetry:
-        """The car at this instant."""
         plant, brake = self.plant, self._brake
         return Telemetry(
             t_ms=plant.t_us // 1000,
@@ -307,7 +306,6 @@ class CarBody:
         )
 
     def result(self) -> VehicleResult:
-        """The drive so far."""
         warning_s = None
         if self._braked_us is not None and self._warned_us is not None:
             warning_s = (self._braked_us - self._warned_us) / 1e6

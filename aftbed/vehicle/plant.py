@@ -172,7 +172,6 @@ class Plant:
         return None if self.gap_m is None or closing_ms <= 0.0 else self.gap_m / closing_ms
 
     def result(self) -> VehicleResult:
-        """The drive so far."""
         impact_ms = self._impact_speed_ms
         return VehicleResult(
             collision=self.collided,

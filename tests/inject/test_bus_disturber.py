@@ -206,17 +206,17 @@ def test_a_bus_off_node_is_neither_heard_nor_hears_until_it_is_back() -> None:
     disturber = armed("bus-off radar after 30ms for 40ms")
     assert lengths(disturber, 6) == [1, 1, 0, 0, 1, 1]
     disturber = armed("bus-off radar for 40ms")
-    assert disturber.deaf("brake", "radar", 0) and not disturber.deaf("radar", "brake", 0)
-    assert not disturber.deaf("brake", "radar", 40_000) and disturber.idle
+    assert disturber.cut_off("brake", "radar", 0) and not disturber.cut_off("radar", "brake", 0)
+    assert not disturber.cut_off("brake", "radar", 40_000) and disturber.idle
 
 
 def test_a_partition_cuts_both_ways_and_only_between_its_sides() -> None:
     disturber = armed("partition radar|gateway for 40ms")
     nodes = ("radar", "gateway", "brake", "client 9")
-    deaf = {(s, n) for s in nodes for n in nodes if disturber.deaf(s, n, 0)}
+    deaf = {(s, n) for s in nodes for n in nodes if disturber.cut_off(s, n, 0)}
     assert deaf == {("radar", "gateway"), ("gateway", "radar")}
     assert lengths(disturber, 1) == [1], "it is on the bus, and in the log"
-    assert not any(disturber.deaf(s, n, 40_000) for s in nodes for n in nodes)
+    assert not any(disturber.cut_off(s, n, 40_000) for s in nodes for n in nodes)
 
 
 def test_what_is_forgotten_gives_back_what_it_holds() -> None:

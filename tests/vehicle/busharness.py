@@ -27,7 +27,7 @@ from aftbed.vehicle.gateway import Gateway
 DEADLINE_S = 5.0
 
 
-class TestDesk:
+class TestSupervisorLink:
     """The supervisor of a hub in a thread: a byte on its life descriptor is an order in the queue."""
 
     __test__ = False
@@ -67,13 +67,13 @@ class RunningHub:
         self._log_fd = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
         self._life_read, self._life_write = os.pipe()
         self._error: BaseException | None = None
-        self.desk = TestDesk(self._life_read)
+        self.link = TestSupervisorLink(self._life_read)
         self._thread = threading.Thread(target=self._run, args=(options,), daemon=True)
         self._thread.start()
 
     def _run(self, options: HubOptions) -> None:
         try:
-            self.counts = serve(self._listener, self._log_fd, options, self._life_read, self.desk)
+            self.counts = serve(self._listener, self._log_fd, options, self._life_read, self.link)
         except BaseException as error:  # noqa: BLE001 - raised again in the test's thread
             self._error = error
 
@@ -85,23 +85,23 @@ class RunningHub:
             what(hub)
             done.set()
 
-        self.desk.orders.put(carry_out)
+        self.link.orders.put(carry_out)
         os.write(self._life_write, b".")
         assert done.wait(DEADLINE_S), "the hub does not take orders"
 
     def arm(self, number: int, fault: BusFault, draw: int = 0) -> None:
         def carry_out(hub: Hub) -> None:
-            self.desk.faults.arm(number, fault, draw, hub.now_us())
-            hub.disturb(self.desk.faults)
+            self.link.faults.arm(number, fault, draw, hub.now_us())
+            hub.disturb(self.link.faults)
 
         self.order(carry_out)
 
     def forget(self, number: int) -> None:
-        self.order(lambda hub: self.desk.faults.forget(number, hub.now_us()))
+        self.order(lambda hub: self.link.faults.forget(number, hub.now_us()))
 
     def struck(self) -> list[BusReport]:
         found: list[BusReport] = []
-        self.order(lambda _: found.extend(self.desk.faults.reports()))
+        self.order(lambda _: found.extend(self.link.faults.reports()))
         return found
 
     def stop(self) -> HubCounts:

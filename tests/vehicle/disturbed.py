@@ -81,7 +81,7 @@ def real(
 def virtual(*faults: str, late_ns: int = 0, tick_ns: int | None = None) -> Disturbed:
     """In virtual time; each reply comes that late. `tick_ns` advances the car that often as well."""
     frames: list[Frame] = []
-    car = VirtualCar(load_scenario("ccrs-50"), seed=SEED, codec=CODEC, witness=frames.append)
+    car = VirtualCar(load_scenario("ccrs-50"), seed=SEED, codec=CODEC, on_frame=frames.append)
     disturber = Disturber()
     for number, words in enumerate(faults, FIRST_NUMBER):
         disturber.arm(number, fault(words), SEED, car.before(0))

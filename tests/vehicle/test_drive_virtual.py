@@ -80,7 +80,7 @@ def drive(
     """Drive before the bare function. `tick_ns` advances the car that often as well."""
     frames: list[Frame] = []
     car = VirtualCar(
-        load_scenario(scenario), brake_policy=policy, seed=seed, codec=CODEC, witness=frames.append
+        load_scenario(scenario), brake_policy=policy, seed=seed, codec=CODEC, on_frame=frames.append
     )
     done = Drive(car, frames)
     function = default_application()
@@ -281,7 +281,7 @@ def test_a_reply_after_the_end_changes_nothing() -> None:
 
 def test_what_is_no_reply_to_the_brakes_sends_nothing() -> None:
     frames: list[Frame] = []
-    car = VirtualCar(load_scenario("ccrs-20"), codec=CODEC, witness=frames.append)
+    car = VirtualCar(load_scenario("ccrs-20"), codec=CODEC, on_frame=frames.append)
     assert len(car.advance(0)) == 1
     car.deliver(b"\xff", 0)
     car.advance(15 * MS)
@@ -290,7 +290,7 @@ def test_what_is_no_reply_to_the_brakes_sends_nothing() -> None:
 
 def test_a_heartbeat_has_the_replica_and_the_epoch_of_the_reply() -> None:
     frames: list[Frame] = []
-    car = VirtualCar(load_scenario("ccrs-20"), codec=CODEC, witness=frames.append)
+    car = VirtualCar(load_scenario("ccrs-20"), codec=CODEC, on_frame=frames.append)
     function = default_application()
     for payload in car.advance(0):
         car.deliver(function.execute(payload), 0, replica=2, epoch=9)

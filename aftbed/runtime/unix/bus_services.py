@@ -42,8 +42,8 @@ def _report(line: Line[control.ToNode], kind: str, data: bytes = b"") -> None:
 # -- the hub --------------------------------------------------------------------------------------
 
 
-class _Desk:
-    """The hub's link to the supervisor, and the faults of its bus (see `vehicle.can.hub.Desk`)."""
+class _SupervisorLink:
+    """The hub's link to the supervisor, and the faults of its bus (see `vehicle.can.hub.SupervisorLink`)."""
 
     def __init__(self, line: Line[control.ToNode]) -> None:
         self._line = line
@@ -96,7 +96,7 @@ def _serve_hub(line: Line[control.ToNode], order: control.Serve, fds: list[int])
     listener, log = fds
     _report(line, "ready")
     options = msgspec.msgpack.decode(order.options, type=HubOptions)
-    counts = serve_hub(socket.socket(fileno=listener), log, options, line.fileno(), _Desk(line))
+    counts = serve_hub(socket.socket(fileno=listener), log, options, line.fileno(), _SupervisorLink(line))
     os.close(log)
     _report(line, "result", msgspec.json.encode(counts))
 

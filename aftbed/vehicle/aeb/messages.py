@@ -65,12 +65,10 @@ _decode_reply = msgspec.msgpack.Decoder(AebOutput).decode
 
 
 def encode_request(cycle: AebInput) -> bytes:
-    """The payload of one request."""
     return _encode(cycle)
 
 
 def encode_reply(output: AebOutput) -> bytes:
-    """The payload of one reply."""
     return _encode(output)
 
 

@@ -235,10 +235,9 @@ class HubLine:
             raise
 
     def fileno(self) -> int:
-        """What to wait on for changes."""
         return self._socket.fileno()
 
-    def drives_the_car(self) -> None:
+    def request_conditions(self) -> None:
         """Ask the hub for conditions to look for."""
         self._ask("< aftbed plant >")
 

@@ -56,7 +56,7 @@ class BusDisturber(Protocol):
         """When to call `release` next."""
         ...
 
-    def deaf(self, sender: str, node: str, now_us: int) -> bool:
+    def cut_off(self, sender: str, node: str, now_us: int) -> bool:
         """Whether `node` receives nothing from `sender` now."""
         ...
 
@@ -218,7 +218,7 @@ class BusModel(ABC, Generic[Node]):
             receivers = [
                 node
                 for node in self._receivers
-                if node.name != sender and not disturber.deaf(sender, node.name, frame.t_us)
+                if node.name != sender and not disturber.cut_off(sender, node.name, frame.t_us)
             ]
             users = [node for node in receivers if frame.can_id in node.uses]
             for user in users:

@@ -103,7 +103,6 @@ class Profile(msgspec.Struct, frozen=True):
 
     @property
     def bytes_min(self) -> int:
-        """The least number of data bytes that have room for the header."""
         return self.counter_place + 1
 
     def counter_of(self, data: bytes) -> int:
@@ -212,8 +211,6 @@ def intact(data: bytes, data_id: int) -> bool:
 
 
 class FrameStatus(Enum):
-    """The judgement of one frame, or of its absence."""
-
     OK = auto()
     OK_SOMELOST = auto()
     REPEATED = auto()
@@ -226,8 +223,6 @@ GOOD: Final = frozenset({FrameStatus.OK, FrameStatus.OK_SOMELOST})
 
 
 class ChannelState(Enum):
-    """The judgement of one message's channel as a whole."""
-
     NODATA = auto()
     INIT = auto()
     VALID = auto()

@@ -38,9 +38,8 @@ receivers that use it differs from the number without faults:
     > < change 130 -1 >        lost, or no request was made of it
     > < change 100 +1 >        one more: held back before, or a second time
 
-Faults that are none of the bus can wait for a condition of the car, too (`Desk`). In lockstep the car gets
-its `< ok >` only when what was to be done at the condition has been done, so it does not take its next step
-before.
+Other faults can wait for a condition of the car, too (`SupervisorLink`). In lockstep it gets its `< ok >`
+only after all actions at the condition are done, so it does not take its next step before.
 
 *Order of work.* One thread that blocks only to wait for events: relay first, because latency is what
 the bus is measured by, then one `write` to the log before the next frame is taken. So a `kill -9` costs the
@@ -107,7 +106,6 @@ class HubOptions(msgspec.Struct, frozen=True):
     origin_ns: int | None = None  # None: when `serve` is called
 
     def __post_init__(self) -> None:
-        """Refuse a bus on which no time would pass."""
         if not self.pace > 0:
             raise ConfigError(f"bus pace {self.pace}, allowed is more than 0")
         if self.bitrate_bps is not None and not 1_000 <= self.bitrate_bps <= 1_000_000:
@@ -124,7 +122,7 @@ class HubCounts(msgspec.Struct):
     turned_away: int = 0
 
 
-class Desk(Protocol):
+class SupervisorLink(Protocol):
     """The hub's link to the supervisor; it reads the hub's life descriptor."""
 
     def attend(self, hub: "Hub") -> bool:
@@ -162,7 +160,12 @@ class Hub(BusModel[HubConnection]):
     """The bus. `serve` makes one and runs it; it owns the connections, not the descriptors given."""
 
     def __init__(
-        self, listener: socket.socket, log_fd: int, options: HubOptions, life_fd: int, desk: Desk | None
+        self,
+        listener: socket.socket,
+        log_fd: int,
+        options: HubOptions,
+        life_fd: int,
+        link: SupervisorLink | None,
     ) -> None:
         super().__init__(options.bitrate_bps)
         self.counts = HubCounts()
@@ -171,7 +174,7 @@ class Hub(BusModel[HubConnection]):
         self._log_fd = log_fd
         self._log_bytes = 0
         self._life_fd = life_fd
-        self._desk = desk
+        self._link = link
         self._origin_ns = time.monotonic_ns() if options.origin_ns is None else options.origin_ns
         self._virtual_us = 0
         self._time_master: HubConnection | None = None
@@ -203,7 +206,6 @@ class Hub(BusModel[HubConnection]):
         return self.counts
 
     def close(self) -> None:
-        """Disconnect all clients."""
         for client in list(self._clients.values()):
             self._drop(client)
         self._epoll.close()
@@ -217,7 +219,6 @@ class Hub(BusModel[HubConnection]):
     # -- time and waiting -----------------------------------------------------------------------
 
     def now_us(self) -> int:
-        """The bus time."""
         if self._options.lockstep:
             return self._virtual_us
         elapsed_us = (time.monotonic_ns() - self._origin_ns) // 1000
@@ -247,7 +248,7 @@ class Hub(BusModel[HubConnection]):
                 if mask & _READABLE:
                     self._receive(client)
             elif fd == self._life_fd:
-                alive = bool(read(fd, READ_BYTES_MAX)) if self._desk is None else self._desk.attend(self)
+                alive = bool(read(fd, READ_BYTES_MAX)) if self._link is None else self._link.attend(self)
             elif fd == self._listener.fileno():
                 self._accept()
         return alive
@@ -282,8 +283,8 @@ class Hub(BusModel[HubConnection]):
             self._send(self._plant, _watch_element(number, condition))
 
     def faults_acted(self) -> None:
-        if self._desk is not None:
-            self._desk.faults_acted()
+        if self._link is not None:
+            self._link.faults_acted()
 
     # -- elements -------------------------------------------------------------------------------
 
@@ -338,13 +339,13 @@ class Hub(BusModel[HubConnection]):
 
     def _condition_met(self, car: HubConnection, fault_number: int, t_us: int, since_ns: int) -> None:
         met = self.met(fault_number, self.now_us())
-        if met and self._desk is not None and self._options.lockstep:
+        if met and self._link is not None and self._options.lockstep:
             self._held[fault_number] = car
-            self._desk.met(fault_number, t_us, 0)
+            self._link.met(fault_number, t_us, 0)
             return
         self._send(car, self._ok())
-        if met and self._desk is not None:
-            self._desk.met(fault_number, t_us, since_ns)
+        if met and self._link is not None:
+            self._link.met(fault_number, t_us, since_ns)
 
     def _ok(self) -> bytes:
         """To the time master: once there have been faults, when something is due next."""
@@ -477,15 +478,19 @@ def _watch_element(fault_number: int, condition: Condition) -> bytes:
 
 
 def serve(
-    listener: socket.socket, log_fd: int, options: HubOptions, life_fd: int, desk: Desk | None = None
+    listener: socket.socket,
+    log_fd: int,
+    options: HubOptions,
+    life_fd: int,
+    link: SupervisorLink | None = None,
 ) -> HubCounts:
     """Run a bus on `listener`, bound and listening, until `life_fd` reads its end; record on `log_fd`.
 
-    A `desk` reads `life_fd` itself.
+    A `link` reads `life_fd` itself.
 
     Raises HarnessError, or OSError, when a frame cannot be recorded.
     """
-    hub = Hub(listener, log_fd, options, life_fd, desk)
+    hub = Hub(listener, log_fd, options, life_fd, link)
     try:
         return hub.run()
     finally:

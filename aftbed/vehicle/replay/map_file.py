@@ -157,7 +157,6 @@ class Messages(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     last: Annotated[int, Meta(ge=0, le=255)] = 0
 
     def names(self) -> list[str]:
-        """All of them, in order."""
         return [
             _NUMBER.sub(lambda found, number=number: f"{number:0{found[1] or 0}}", self.name)  # type: ignore[misc]
             for number in range(self.first, self.last + 1)
@@ -217,8 +216,6 @@ class OtherMap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class MapFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A map, key by key."""
-
     description: str
     cycle_ms: Annotated[int, Meta(ge=1, le=1000)]
     ego: EgoMap

@@ -192,7 +192,6 @@ class MappedGateway(BusGateway):
 
 
 def _is_set(flag: str | Flag, signals: dict[str, float]) -> bool:
-    """Whether a flag of the map is set."""
     if isinstance(flag, Flag):
         return int(signals[flag.signal]) in flag.values
     return bool(signals[flag])

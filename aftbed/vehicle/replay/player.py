@@ -42,7 +42,6 @@ class PlayReport(msgspec.Struct):
 
     @property
     def braked(self) -> bool:
-        """True if any answer asked the brakes for anything."""
         return self.stage_max >= STAGE_PARTIAL or self.deceleration_ms2_max > 0.0
 
 

@@ -320,7 +320,7 @@ def test_the_hub_reports_what_becomes_of_a_fault(hub: RunningHub) -> None:
         gateway.write("< aftbed noticed 130 lost >")
         gateway.fence()
     hub.stop()
-    assert hub.desk.receipts == ["armed", "applied", "activated"]
+    assert hub.link.receipts == ["armed", "applied", "activated"]
 
 
 def test_the_latest_client_with_a_name_has_it(hub: RunningHub) -> None:
@@ -335,7 +335,7 @@ def test_the_car_gets_the_conditions_whenever_it_comes(tmp_path: Path) -> None:
     with running_hub(tmp_path / "bus.log", HubOptions(lockstep=True)) as hub:
         arm(hub, "omission bus RADAR_TRACK when ttc < 1.2")
         line = HubLine(hub.options)
-        line.drives_the_car()
+        line.request_conditions()
         arm(hub, "omission bus AEB_REQ when gap > 30.5", 8)
         line.set_time(0)
         assert {n: str(c.quantity) for n, c in line.conditions.items()} == {FIRST_NUMBER: "ttc", 8: "gap"}

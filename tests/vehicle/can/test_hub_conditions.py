@@ -44,7 +44,7 @@ def test_in_lockstep_the_car_is_answered_when_it_is_done(lockstep: RunningHub) -
         lockstep.order(lambda hub: hub.go_on(7))
         assert plant.read() == "< ok >"
         assert plant.ask("< echo >") == "< echo >", "it is answered once"
-    assert lockstep.desk.conditions_met == [(7, 2_000, 0)]
+    assert lockstep.link.conditions_met == [(7, 2_000, 0)]
 
 
 def test_in_real_time_it_is_answered_at_once_and_reported_with_its_time(hub: RunningHub) -> None:
@@ -54,7 +54,7 @@ def test_in_real_time_it_is_answered_at_once_and_reported_with_its_time(hub: Run
         assert plant.ask("< aftbed met 7 2000 123 >") == "< ok >"
         hub.order(lambda it: it.go_on(7))
         assert plant.ask("< echo >") == "< echo >"
-    assert hub.desk.conditions_met == [(7, 2_000, 123)]
+    assert hub.link.conditions_met == [(7, 2_000, 123)]
 
 
 def test_a_condition_is_met_once_and_only_if_it_is_watched(paced: tuple[RunningHub, bool]) -> None:
@@ -71,7 +71,7 @@ def test_a_condition_is_met_once_and_only_if_it_is_watched(paced: tuple[RunningH
         else:
             assert plant.read() == "< ok >"
         assert plant.read() == "< ok >"
-    assert [number for number, _, _ in hub.desk.conditions_met] == [7]
+    assert [number for number, _, _ in hub.link.conditions_met] == [7]
     with RawClient(hub.port, raw=False) as later:
         assert later.ask("< open can0 >") == "< ok >"
         assert later.ask("< aftbed plant >") == "< ok >"
