@@ -2,13 +2,13 @@
 
 The classes are those of the design (section 2), the worst one wins. A run that breaks nothing is `masked`
 if the fault had no visible effect, `tolerated` if the mechanism had to act in sight: a failover, a third
-execution, a refused adaptation. `inconclusive` and `harness_error` say nothing of the mechanism, and are
-never a pass (G8).
+execution, a refused adaptation. `inconclusive` and `harness_error` are not about the mechanism, and never
+a pass (G8).
 """
 
 import shlex
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from functools import lru_cache
 from typing import Final
@@ -60,20 +60,16 @@ class Experiment(msgspec.Struct, frozen=True):
     budget_ms: float | None = None  # for a recovery
 
     def command(self) -> str:
-        """What repeats it by hand, and shows it in full."""
-        words = ["aftbed", "sim" if self.runtime == "sim" else "run", "--ftm", self.ftm]
+        """The command that repeats it by hand, and shows it in full."""
+        simulated, rate = self.runtime == "sim", f"{self.rate_hz:g}" if self.rate_hz else ""
+        words = ["aftbed", "sim" if simulated else "run", "--ftm", self.ftm]
         words += ["--placement", self.placement, "--seed", str(self.seed)]
-        simulated = self.runtime == "sim"
         if self.scenario:
             words += ["--scenario", self.scenario, *([] if simulated else ["--pace", "max"])]
         elif simulated:
-            words += [
-                "--count",
-                str(self.requests),
-                *(["--rate", f"{self.rate_hz:g}"] if self.rate_hz else []),
-            ]
+            words += ["--count", str(self.requests), *(["--rate", rate] if rate else [])]
         else:
-            words += ["--load", f"{self.requests}" + (f"@{self.rate_hz:g}" if self.rate_hz else "")]
+            words += ["--load", f"{self.requests}@{rate}" if rate else str(self.requests)]
         for text in self.faults:
             words += ["--faults" if simulated else "--inject", shlex.quote(text)]
         for text in self.adaptations:
@@ -115,18 +111,13 @@ def failed(result: Result) -> bool:
     return result.outcome in FAILED
 
 
-# -- Whether the machine lets times mean anything: a probe beside each real experiment.
+# -- whether times mean anything ------------------------------------------------------------------
 #
-# Experiments side by side, or the neighbours of a virtual machine, can take the CPU away for longer than
-# any
+# Experiments side by side, or the neighbours of a virtual machine, can take the CPU away for longer than any
 # mechanism needs to recover. So each worker measures, before and after each experiment, how late it wakes
-# from
-# sleeps of a millisecond, as a node does that waits for mail, and the supervisor of the run says how long
-# its
-# most unlucky node was ready to run and had no CPU. If either is far off, the experiment is marked as
-# noisy:
-# what depends on time in it is inconclusive, what does not (a wrong reply, a lost one) stands.
-
+# from sleeps of a millisecond, as a node does that waits for mail, and the supervisor of the run reports how
+# long its unluckiest node was ready to run and had no CPU. If either is far off, the experiment is marked as
+# noisy: what depends on time in it is inconclusive, what does not (a wrong reply, a lost one) stands.
 
 SLEEP_SECONDS: Final = 0.001
 SLEEPS: Final = 5
@@ -153,7 +144,7 @@ class Probe:
         self.quiet_ms = lateness_ms()
 
     def noisy(self) -> bool:
-        """Whether it is now."""
+        """Whether the machine is too busy now."""
         return lateness_ms() > max(LATE_MS_MIN, FACTOR * self.quiet_ms)
 
 
@@ -162,12 +153,11 @@ def starved(starved_ms: float, seconds: float) -> bool:
     return starved_ms > max(STARVED_MS_MIN, STARVED_PART * seconds * 1e3)
 
 
-# -- One experiment carried out, on real processes or in the simulator, and its result.
+# -- one experiment -------------------------------------------------------------------------------
 #
 # Trouble of the harness (a run that does not start, a supervisor that dies) is `harness_error`, a history
-# that is not whole is `inconclusive`: neither says anything of the mechanism. The result of a real run is
-# handed over *before* its record is torn down, so that a death in between costs a directory and no verdict.
-
+# that is not whole is `inconclusive`: neither is about the mechanism. The result of a real run is kept
+# *before* its record is torn down, so that a death in between costs a directory and no verdict.
 
 REASONS_MAX: Final = 3
 REASON_MAX: Final = 300  # characters
@@ -187,7 +177,7 @@ def carry_out(experiment: Experiment, keep: Keep) -> Result:
     began_s = time.monotonic()
     with ExitStack() as standing:
         try:
-            result = (_simulated if experiment.runtime == "sim" else _quietly)(experiment, standing)
+            result = _simulated(experiment) if experiment.runtime == "sim" else _real(experiment, standing)
         except Exception as error:  # noqa: BLE001 - one experiment must not end a campaign
             reason = f"{type(error).__name__}: {error}"[:REASON_MAX]
             result = Result(experiment, "harness_error", activated=False, reasons=(reason,))
@@ -196,11 +186,82 @@ def carry_out(experiment: Experiment, keep: Keep) -> Result:
     return result
 
 
-def _quietly(experiment: Experiment, standing: ExitStack) -> Result:
-    """On real processes; without its times, where the machine was too busy for them."""
+def faults_of(experiment: Experiment, graph: Graph) -> tuple[Fault, ...]:
+    """As values, checked. Raises ConfigError."""
+    work: Work = CarRun(experiment.scenario, None, "") if experiment.scenario else LoadRun(1, 0.0)
+    found = tuple(parse(text) for text in experiment.faults)
+    for fault in found:
+        fault.check(graph)
+        with_names_resolved(fault, work)
+    return found
+
+
+def setup_of(experiment: Experiment) -> Setup:
+    """The experiment for the simulator. Raises ConfigError."""
+    faults, changes = _asked(experiment)
+    return Setup(
+        experiment.ftm,
+        experiment.placement,
+        experiment.seed,
+        experiment.requests,
+        experiment.rate_hz,
+        faults,
+        changes,
+        scenario=experiment.scenario,
+    )
+
+
+def _asked(experiment: Experiment) -> tuple[tuple[Fault, ...], tuple[Scheduled, ...]]:
+    graph = build(experiment.ftm, experiment.placement)
+    recipe = experiment.recipe or RECIPES[0]
+    return faults_of(experiment, graph), scheduled(experiment.adaptations, graph, recipe)
+
+
+def _simulated(experiment: Experiment) -> Result:
+    evidence = evidence_of(record_of(simulate(setup_of(experiment))), default_application)
+    outcome, reasons = outcome_of(evidence)
+    reasons += tuple(f"an assertion failed: {failure}" for failure in evidence.record.failures)
+    return _result(experiment, evidence, judge(evidence.record, evidence), outcome, reasons)
+
+
+def _real(experiment: Experiment, standing: ExitStack) -> Result:
+    """On real processes, whose record is there until `standing` ends."""
     noisy = _probe().noisy()
-    result = _real(experiment, standing)
-    return without_times(result) if noisy or result.noisy or _probe().noisy() else result
+    evidence = evidence_of(_recorded(experiment, standing))
+    verdict, (outcome, reasons) = judge(evidence.record, evidence), outcome_of(evidence)
+    # G8: what the harness does not know is worse than any outcome that it believes to have seen.
+    unknown = {name for name, word in verdict.checks.items() if word == "unknown"} - {"faults_applied"}
+    if "clean_exit" in unknown:
+        outcome, reasons = "harness_error", tuple(verdict.reasons)
+    elif unknown and outcome != "sdc":
+        outcome, reasons = "inconclusive", tuple(verdict.reasons)
+    result = _result(experiment, evidence, verdict, outcome, reasons)
+    end = evidence.record.end or RunEnd()
+    noisy = noisy or starved(end.starved_ms, end.seconds or 0.0) or _probe().noisy()
+    return without_times(result) if noisy else result
+
+
+def _recorded(experiment: Experiment, standing: ExitStack) -> RunRecord:
+    faults, changes = _asked(experiment)
+    work: Work = LoadRun(experiment.requests, experiment.rate_hz)
+    if experiment.scenario:
+        work = CarRun(experiment.scenario, None, "latch")
+    options, listener = options_for(
+        ftm=experiment.ftm,
+        placement=experiment.placement,
+        work=work,
+        seed=experiment.seed,
+        faults=faults,
+        adaptations=changes,
+    )
+    launched = launch(options, listener, _warm_up(BUS if experiment.scenario else LIGHT))
+    standing.callback(launched.remove)
+    silence_s = RUN_SECONDS_MAX + experiment.requests * (1 / (experiment.rate_hz or REQUESTS_PER_SECOND_MIN))
+    linux.set_timeouts(launched.line.sock, silence_s, silence_s)  # a load reports nothing before its end
+    for _ in launched.reports():
+        pass
+    launched.wait()
+    return read_record(launched.record)
 
 
 @lru_cache(maxsize=1)
@@ -216,7 +277,7 @@ def _warm_up(name: str) -> tuple[Area, ...]:
 
 
 def without_times(result: Result) -> Result:
-    """What can be said of a run on a machine that was too busy."""
+    """What is known of a run on a machine that was too busy."""
     reasons = ("the machine was too busy for times to mean anything", *result.reasons)
     false_alarm = result.outcome == "tolerated" and result.unexpected
     outcome = "inconclusive" if result.outcome in TIMED or false_alarm else result.outcome
@@ -233,101 +294,13 @@ def without_times(result: Result) -> Result:
     )
 
 
-def faults_of(experiment: Experiment, graph: Graph) -> tuple[Fault, ...]:
-    """As values, checked. Raises ConfigError."""
-    work: Work = CarRun(experiment.scenario, None, "") if experiment.scenario else LoadRun(1, 0.0)
-    found = tuple(parse(text) for text in experiment.faults)
-    for fault in found:
-        fault.check(graph)
-        with_names_resolved(fault, work)
-    return found
-
-
-# -- the simulator --------------------------------------------------------------------------------
-
-
-def setup_of(experiment: Experiment) -> Setup:
-    """What the simulator makes of it. Raises ConfigError."""
-    faults, changes = _asked(experiment)
-    return Setup(
-        experiment.ftm,
-        experiment.placement,
-        experiment.seed,
-        experiment.requests,
-        experiment.rate_hz,
-        faults,
-        changes,
-        scenario=experiment.scenario,
-    )
-
-
-def _simulated(experiment: Experiment, standing: ExitStack) -> Result:
-    evidence = evidence_of(record_of(simulate(setup_of(experiment))), default_application)
-    outcome, reasons = outcome_of(evidence)
-    reasons += tuple(f"an assertion failed: {failure}" for failure in evidence.record.failures)
-    return _result(experiment, evidence, (outcome, reasons))
-
-
-# -- real processes -------------------------------------------------------------------------------
-
-
-def _real(experiment: Experiment, standing: ExitStack) -> Result:
-    faults, changes = _asked(experiment)
-    work: Work = LoadRun(experiment.requests, experiment.rate_hz)
-    if experiment.scenario:
-        work = CarRun(experiment.scenario, None, "latch")
-    options, listener = options_for(
-        ftm=experiment.ftm,
-        placement=experiment.placement,
-        work=work,
-        seed=experiment.seed,
-        faults=faults,
-        adaptations=changes,
-    )
-    launched = launch(options, listener, _warm_up(BUS if experiment.scenario else LIGHT))
-    standing.callback(launched.remove)
-    silence_s = RUN_SECONDS_MAX + experiment.requests * (1 / (experiment.rate_hz or REQUESTS_PER_SECOND_MIN))
-    linux.set_timeouts(launched.line.sock, silence_s, silence_s)  # of a load, nothing is heard to its end
-    for _ in launched.reports():
-        pass
-    launched.wait()
-    return _judged(experiment, read_record(launched.record))
-
-
-def _judged(experiment: Experiment, record: RunRecord) -> Result:
-    evidence = evidence_of(record)
-    result = _result(experiment, evidence, outcome_of(evidence))
-    end = record.end or RunEnd()
-    return msgspec.structs.replace(result, noisy=starved(end.starved_ms, end.seconds or 0.0))
-
-
-def _honest(found: tuple[str, tuple[str, ...]], verdict: Verdict) -> tuple[str, tuple[str, ...]]:
-    """G8: what the harness does not know is worse than any outcome that it believes to have seen."""
-    unknown = {name for name, word in verdict.checks.items() if word == "unknown"} - {"faults_applied"}
-    if "clean_exit" in unknown:
-        return "harness_error", tuple(verdict.reasons)
-    if unknown and found[0] != "sdc":
-        return "inconclusive", tuple(verdict.reasons)
-    return found
-
-
-# -- both -----------------------------------------------------------------------------------------
-
-
-def _asked(experiment: Experiment) -> tuple[tuple[Fault, ...], tuple[Scheduled, ...]]:
-    graph = build(experiment.ftm, experiment.placement)
-    recipe = experiment.recipe or RECIPES[0]
-    return faults_of(experiment, graph), scheduled(experiment.adaptations, graph, recipe)
-
-
-def _result(experiment: Experiment, evidence: Evidence, found: tuple[str, tuple[str, ...]]) -> Result:
-    record, verdict = evidence.record, judge(evidence.record, evidence)
-    outcome, reasons = found if record.simulated else _honest(found, verdict)
-    broken = tuple(reason for reason in verdict.reasons if reason.partition(":")[0] in UNEXCUSED)
-    adapted = tuple(str(a["outcome"]) for a in record.adaptations)
-    blackouts = [float(str(a["blackout_ms"])) for a in record.adaptations]
+def _result(
+    experiment: Experiment, evidence: Evidence, verdict: Verdict, outcome: str, reasons: tuple[str, ...]
+) -> Result:
+    record = evidence.record
     faults, vehicle, failovers = record.faults, record.vehicle, verdict.failovers
-    recovery_ms = _longest([f.recovered_ms for f in failovers])
+    adapted = tuple(str(a["outcome"]) for a in record.adaptations)
+    recovery_ms = _longest(f.recovered_ms for f in failovers)
     if recovery_ms is not None and recovery_ms > (experiment.budget_ms or recovery_ms):
         outcome = worst([outcome, "degraded"])
         reasons = (f"recovery took {recovery_ms:g} ms, {experiment.budget_ms:g} are allowed", *reasons)
@@ -335,8 +308,8 @@ def _result(experiment: Experiment, evidence: Evidence, found: tuple[str, tuple[
     if vehicle is not None and golden is not None and vehicle.collision and not golden.collision:
         outcome = worst([outcome, "unavailable"])
         reasons = (f"the car hit something at {vehicle.impact_speed_kmh} km/h", *reasons)
-    applied = all(f.fired for f in faults)
-    activated = applied and len(adapted) == len(experiment.adaptations)
+    activated = all(f.fired for f in faults) and len(adapted) == len(experiment.adaptations)
+    broken = [reason for reason in verdict.reasons if reason.partition(":")[0] in UNEXCUSED]
     return Result(
         experiment,
         outcome,
@@ -347,11 +320,11 @@ def _result(experiment: Experiment, evidence: Evidence, found: tuple[str, tuple[
         faults=faults,
         requests=verdict.requests,
         failovers=len(failovers),
-        detected_ms=_longest([f.detected_ms for f in failovers]),
+        detected_ms=_longest(f.detected_ms for f in failovers),
         recovery_ms=recovery_ms,
-        blackout_ms=_longest([f.blackout_ms for f in failovers]),
+        blackout_ms=_longest(f.blackout_ms for f in failovers),
         adapted=adapted,
-        adapt_blackout_ms=max(blackouts, default=None),
+        adapt_blackout_ms=_longest(float(str(a["blackout_ms"])) for a in record.adaptations),
         collision=vehicle.collision if vehicle is not None else None,
         impact_kmh=vehicle.impact_speed_kmh if vehicle is not None else None,
         gap_m=vehicle.stop_gap_m if vehicle is not None else None,
@@ -361,15 +334,15 @@ def _result(experiment: Experiment, evidence: Evidence, found: tuple[str, tuple[
 
 @lru_cache(maxsize=256)
 def golden_drive(scenario: str, seed: int) -> VehicleResult | None:
-    """What the car does with the bare server, and no fault."""
+    """The drive of the car with the bare server, and no fault."""
     return simulate(Setup("none", seed=seed, scenario=scenario)).vehicle
 
 
-def _longest(times: list[float | None]) -> float | None:
+def _longest(times: Iterable[float | None]) -> float | None:
     return max((t for t in times if t is not None), default=None)
 
 
-# -- The smallest experiment with the same outcome: `shrink`, told that an outcome is what is broken.
+# -- the smallest experiment with the same outcome ------------------------------------------------
 
 
 def smallest(result: Result) -> Experiment:
@@ -390,7 +363,7 @@ def smallest(result: Result) -> Experiment:
 
 
 def _as(first: Experiment, setup: Setup) -> Experiment:
-    """The words of `setup`."""
+    """`first` with what `setup` has."""
     return msgspec.structs.replace(
         first,
         ftm=setup.ftm,

@@ -3,32 +3,35 @@
 The first line says what it is the ledger of. Each further line is one result, written in one `write` to a
 file opened for appending, by the process that has just judged the run: so a `kill -9` of the campaign
 loses at most what is in flight, and workers need no lock. A last line without its end can only be what a
-full disk or a dead machine left; `resume` cuts it off, everybody else refuses it.
+full disk or a dead machine left; `resume` cuts it off, all other readers refuse it.
 """
 
 import os
 import platform
 import shlex
 import sys
+from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Final, TypeVar
 
 import msgspec
 
-from aftbed.campaign.experiment import Experiment, Result
+from aftbed.campaign.experiment import Result
 from aftbed.campaign.plan import CampaignPlan
 from aftbed.campaign.spec import Spec
 from aftbed.core.errors import ConfigError, HarnessError
 
-# -- On what a campaign was run: what a reader asks when the numbers of two of them differ.
-
-
 CPUINFO = Path("/proc/cpuinfo")
+NAME: Final = "records.jsonl"
+LINE_BYTES_MAX: Final = 1_000_000
+OWN: Final = {"digest": "spec", "code": "version of the code", "shard": "shard", "shards": "number of shards"}
+
+T = TypeVar("T")
 
 
 class Environment(msgspec.Struct, frozen=True):
-    """Of this process: versions, machine, and the command that it was started with."""
+    """On what a campaign was run: versions, machine, and the command that it was started with."""
 
     python: str
     kernel: str
@@ -39,28 +42,17 @@ class Environment(msgspec.Struct, frozen=True):
 def here() -> Environment:
     """That of this process."""
     usable = len(os.sched_getaffinity(0))
-    return Environment(
-        f"{platform.python_implementation()} {platform.python_version()}",
-        f"{platform.system()} {platform.release()}",
-        f"{usable} of {os.cpu_count()}, {_cpu_model()}",
-        shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
-    )
-
-
-def _cpu_model() -> str:
     try:
         lines = CPUINFO.read_text().splitlines()
     except OSError:
         lines = []
-    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return models[0] if models else platform.machine()
-
-
-NAME: Final = "records.jsonl"
-LINE_BYTES_MAX: Final = 1_000_000
-OWN: Final = {"digest": "spec", "code": "version of the code", "shard": "shard", "shards": "number of shards"}
-
-T = TypeVar("T")
+    models = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    return Environment(
+        f"{platform.python_implementation()} {platform.python_version()}",
+        f"{platform.system()} {platform.release()}",
+        f"{usable} of {os.cpu_count()}, {next(models, platform.machine())}",
+        shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+    )
 
 
 class Head(msgspec.Struct, frozen=True):
@@ -100,7 +92,7 @@ def begin(path: Path, head: Head) -> None:
 
 
 def resume(path: Path, head: Head) -> None:
-    """Make it ready to go on with: a torn last line is cut off. Raises ConfigError on another's."""
+    """Cut off a torn last line, to go on after it. Raises ConfigError on the ledger of another campaign."""
     data = _bytes(path)
     whole = data.rfind(b"\n") + 1
     found = read(path, data[:whole])
@@ -160,7 +152,16 @@ def merged(ledgers: Iterable[Ledger]) -> Ledger:
                 f"{other.path}: shard {other.head.shard} of {other.head.shards}; {first.path} is one of "
                 f"{first.head.shards}: shards of one run belong together"
             )
-    _refuse_gaps(found)
+    # Each shard once, and all of them: a sum that lacks one looks like a whole campaign.
+    shards = first.head.shards
+    seen = set[int]()
+    for ledger in found:
+        if ledger.head.shard in seen:
+            raise ConfigError(f"{ledger.path}: shard {ledger.head.shard} of {shards} stands twice")
+        seen.add(ledger.head.shard)
+    missing = [str(shard) for shard in range(1, shards + 1) if shard not in seen]
+    if missing:
+        raise ConfigError(f"shard {', '.join(missing)} of {shards} is missing: name the records of all")
     results = [result for ledger in found for result in ledger.results]
     _refuse_doubles(first.path, results)
     head = msgspec.structs.replace(first.head, shard=1, shards=1)
@@ -176,25 +177,10 @@ def find(ledger: Ledger, name: str) -> Result:
     return exact[0]
 
 
-def _refuse_gaps(ledgers: list[Ledger]) -> None:
-    """Each shard once, and all of them: a sum that lacks one looks like a whole campaign."""
-    shards = ledgers[0].head.shards
-    stands: dict[int, Path] = {}
-    for ledger in ledgers:
-        if ledger.head.shard in stands:
-            raise ConfigError(f"{ledger.path}: shard {ledger.head.shard} of {shards} stands twice")
-        stands[ledger.head.shard] = ledger.path
-    missing = [str(shard) for shard in range(1, shards + 1) if shard not in stands]
-    if missing:
-        raise ConfigError(f"shard {', '.join(missing)} of {shards} is missing: name the records of all")
-
-
 def _refuse_doubles(path: Path, results: list[Result]) -> None:
-    seen: dict[str, Experiment] = {}
-    for result in results:
-        if result.experiment.id in seen:
-            raise ConfigError(f"{path}: experiment {result.experiment.id} stands twice")
-        seen[result.experiment.id] = result.experiment
+    for name, count in Counter(result.experiment.id for result in results).items():
+        if count > 1:
+            raise ConfigError(f"{path}: experiment {name} stands twice")
 
 
 def _path_of(descriptor: int) -> str:

@@ -8,6 +8,7 @@ which they end has a part in what is run.
 
 import hashlib
 import itertools
+import math
 from collections.abc import Iterator
 from fnmatch import fnmatchcase
 from functools import lru_cache
@@ -20,11 +21,10 @@ import msgspec
 import aftbed
 from aftbed.adapt.commands import scheduled
 from aftbed.campaign.experiment import Experiment, faults_of
-from aftbed.campaign.spec import ANY, AdaptationEntry, FaultEntry, Spec, System, Value
+from aftbed.campaign.spec import ANY, AdaptationEntry, FaultEntry, Spec, Value
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.ftm.compose import build
 from aftbed.inject.memory import refuse_unsafe
-from aftbed.inject.model import Fault
 
 ID_DIGITS: Final = 16
 SEED_BITS: Final = 31
@@ -94,15 +94,11 @@ def plan(spec: Spec) -> CampaignPlan:
     strata = tuple(strata_of(spec))
     if not strata:
         raise ConfigError("mechanisms: no entry of faults and adaptations is left for any of them")
-    made = CampaignPlan(spec, digest_of(spec), code_version(), strata)
+    digest = hashlib.sha256(msgspec.json.encode(spec, order="deterministic")).hexdigest()[:ID_DIGITS]
+    made = CampaignPlan(spec, digest, code_version(), strata)
     for stratum in strata:
         _check(made, stratum)
     return made
-
-
-def digest_of(spec: Spec) -> str:
-    """Equal specs have the same."""
-    return hashlib.sha256(msgspec.json.encode(spec, order="deterministic")).hexdigest()[:ID_DIGITS]
 
 
 @lru_cache(maxsize=1)
@@ -154,36 +150,28 @@ def _filled(entry: FaultEntry, number: int, chance: Random) -> tuple[str, ...]:
 
 def points(entry: FaultEntry) -> int:
     """How many points its matrix has."""
-    found = 1
-    for values in entry.matrix.values():
-        found *= len(values)
-    return found
+    return math.prod(map(len, entry.matrix.values()))
 
 
 def population(entry: FaultEntry) -> int:
     """How many faults the entry can mean: the size of its part of the fault space."""
-    found = points(entry)
-    for low, high in entry.draw.values():
-        found *= high - low + 1
-    return found
-
-
-def _check_memory(faults: tuple[Fault, ...], system: System) -> None:
-    """Raise ConfigError where a fault strikes memory that does not exist, or that was not opened to it."""
-    for fault in faults:
-        if fault.action.unsafe:
-            if system.runtime == "sim":
-                raise ConfigError(f"{fault}: under system.runtime sim processes have no memory of their own")
-            refuse_unsafe(str(fault), agreed=system.unsafe_memory, option="system.unsafe_memory: true")
+    return points(entry) * math.prod(high - low + 1 for low, high in entry.draw.values())
 
 
 def _check(made: CampaignPlan, stratum: Stratum) -> None:
     """Every point of the matrix, before anything runs."""
     where = f"faults: {stratum.fault.name!r} under {stratum.ftm}"
-    graph = build(stratum.ftm, stratum.placement)
+    graph, system = build(stratum.ftm, stratum.placement), made.spec.system
     try:
         for number in range(points(stratum.fault)):
-            _check_memory(faults_of(made.experiment(0, number, stratum), graph), made.spec.system)
+            for fault in faults_of(made.experiment(0, number, stratum), graph):
+                if not fault.action.unsafe:
+                    continue
+                if system.runtime == "sim":
+                    raise ConfigError(
+                        f"{fault}: under system.runtime sim processes have no memory of their own"
+                    )
+                refuse_unsafe(str(fault), agreed=system.unsafe_memory, option="system.unsafe_memory: true")
     except ConfigError as error:
         raise ConfigError(f"{where}: {error}") from error
     try:

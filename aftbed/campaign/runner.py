@@ -64,7 +64,9 @@ def _results(plan: CampaignPlan, asked: CampaignRunOptions, path: Path) -> Gener
     stop = plan.spec.stop
     limit_s = time.monotonic() + stop.minutes * 60 if stop.minutes is not None else None
     state = _Progress(plan, path)
-    for first, last in _looks(plan):
+    looks = min(stop.looks, stop.experiments) if stop.half_width is not None else 1
+    edges = [round(stop.experiments * look / looks) for look in range(looks + 1)]
+    for first, last in itertools.pairwise(edges):  # parts of the numbers of each stratum, a look after each
         todo = (e for e in state.open(first, last) if asked.has(e.index, len(plan.strata)))
         for result in performed(todo, path, asked, plan):
             state.add(result)
@@ -74,20 +76,17 @@ def _results(plan: CampaignPlan, asked: CampaignRunOptions, path: Path) -> Gener
                 return
 
 
-def _seconds_max(plan: CampaignPlan) -> float:
-    """An experiment that takes more hangs; real ones have deadlines of their own, and end before."""
-    system = plan.spec.system
-    return SECONDS_MAX + 2 * system.requests / (system.rate_hz or REQUESTS_PER_SECOND_MIN)
-
-
 def performed(
     todo: Iterator[Experiment], path: Path, asked: CampaignRunOptions, plan: CampaignPlan
 ) -> Iterator[Result]:
     """Each result, which is in the ledger by then."""
     if not asked.scheduler:
         perform = partial(_perform, os.fspath(path))
-        fresh = plan.spec.system.runtime == "unix"
-        for _, _, result in each(perform, todo, asked.jobs, seconds_max=_seconds_max(plan), fresh=fresh):
+        system = plan.spec.system
+        # An experiment that takes more hangs; real ones have deadlines of their own, and end before.
+        seconds_max = SECONDS_MAX + 2 * system.requests / (system.rate_hz or REQUESTS_PER_SECOND_MIN)
+        fresh = system.runtime == "unix"
+        for _, _, result in each(perform, todo, asked.jobs, seconds_max=seconds_max, fresh=fresh):
             yield result
         return
     from aftbed.campaign import dask  # noqa: PLC0415 - an extra
@@ -109,14 +108,6 @@ def _perform(path: str, experiment: Experiment) -> Result:
         return carry_out(experiment, partial(ledger.append, descriptor))
     finally:
         os.close(descriptor)
-
-
-def _looks(plan: CampaignPlan) -> Iterator[tuple[int, int]]:
-    """The parts of the numbers of each stratum, with a look at the results after each."""
-    stop = plan.spec.stop
-    looks = min(stop.looks, stop.experiments) if stop.half_width is not None else 1
-    edges = [round(stop.experiments * look / looks) for look in range(looks + 1)]
-    yield from itertools.pairwise(edges)
 
 
 class _Progress:

@@ -13,14 +13,15 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
-from aftbed.campaign.experiment import Result
+from msgspec.structs import asdict
+
 from aftbed.campaign.ledger import Ledger
 from aftbed.core.errors import ConfigError
 
 Value = str | int | float | bool | None
 SEPARATOR: Final = "; "
 
-COLUMNS: Final = {  # name: type
+COLUMNS: Final = {  # name: type; most are fields of the experiment, its result and its requests
     "experiment": str,
     "index": int,
     "stratum": str,
@@ -65,7 +66,16 @@ COLUMNS: Final = {  # name: type
 def rows(ledger: Ledger) -> Iterator[dict[str, Value]]:
     """For each result, a value for each of `COLUMNS`."""
     for result in ledger.results:
-        yield _asked(result) | _found(result)
+        experiment = result.experiment
+        found = asdict(result) | (asdict(result.requests) if result.requests else {}) | asdict(experiment)
+        found |= {
+            "experiment": experiment.id,
+            "receipts": tuple(fault.receipt.value for fault in result.faults),
+            "duration_s": result.seconds,
+            "command": experiment.command(),
+        }
+        cells = {name: found.get(name) for name in COLUMNS}
+        yield {n: SEPARATOR.join(cell) if isinstance(cell, tuple) else cell for n, cell in cells.items()}
 
 
 def write_csv(ledger: Ledger, path: Path) -> None:
@@ -100,53 +110,3 @@ def write_parquet(ledger: Ledger, path: Path) -> None:
 
 def _unwritable(path: Path, error: OSError) -> ConfigError:
     return ConfigError(f"{path}: cannot be written: {error.strerror or error}")
-
-
-def _asked(result: Result) -> dict[str, Value]:
-    experiment = result.experiment
-    return {
-        "experiment": experiment.id,
-        "index": experiment.index,
-        "stratum": experiment.stratum,
-        "number": experiment.number,
-        "seed": experiment.seed,
-        "ftm": experiment.ftm,
-        "placement": experiment.placement,
-        "runtime": experiment.runtime,
-        "scenario": experiment.scenario,
-        "requests": experiment.requests,
-        "rate_hz": experiment.rate_hz,
-        "faults": SEPARATOR.join(experiment.faults),
-        "adaptations": SEPARATOR.join(experiment.adaptations),
-        "recipe": experiment.recipe,
-        "expected": SEPARATOR.join(experiment.expected),
-        "command": experiment.command(),
-    }
-
-
-def _found(result: Result) -> dict[str, Value]:
-    counts = result.requests
-    return {
-        "outcome": result.outcome,
-        "unexpected": result.unexpected,
-        "activated": result.activated,
-        "receipts": SEPARATOR.join(fault.receipt.value for fault in result.faults),
-        "reasons": SEPARATOR.join(result.reasons),
-        "sent": counts.sent if counts else None,
-        "answered": counts.answered if counts else None,
-        "lost": counts.lost if counts else None,
-        "duplicated": counts.duplicated if counts else None,
-        "late": counts.late if counts else None,
-        "wrong": counts.wrong if counts else None,
-        "failovers": result.failovers,
-        "adapted": SEPARATOR.join(result.adapted),
-        "collision": result.collision,
-        "noisy": result.noisy,
-        "detected_ms": result.detected_ms,
-        "recovery_ms": result.recovery_ms,
-        "blackout_ms": result.blackout_ms,
-        "adapt_blackout_ms": result.adapt_blackout_ms,
-        "impact_kmh": result.impact_kmh,
-        "gap_m": result.gap_m,
-        "duration_s": result.seconds,
-    }
