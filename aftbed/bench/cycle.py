@@ -296,7 +296,7 @@ def _visits(graph: Graph) -> list[NotePlace | None]:
     asker = ""
     for brick in path(graph):
         kind = graph.brick(brick).kind
-        if kind.endswith("server"):  # what it notes depends on what it is asked for
+        if kind.endswith("server"):  # what it notes depends on the message that it got
             asks_state = asker.endswith(("before", "after"))
             event: Event | None = Event.STATE_CAPTURED if asks_state else Event.SERVER_ENTER
         else:

@@ -196,7 +196,7 @@ def _cpu_ns(rows: list[ProcessRow]) -> dict[int, int]:
         except (FileNotFoundError, ProcessLookupError):
             continue
     if rows and not found:
-        raise HarnessError("no /proc/PID/schedstat: this kernel does not tell CPU times (CONFIG_SCHED_INFO)")
+        raise HarnessError("no /proc/PID/schedstat: this kernel reports no CPU times (CONFIG_SCHED_INFO)")
     return found
 
 

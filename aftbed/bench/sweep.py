@@ -5,8 +5,8 @@ replace each other. This moves the whole state on both replicas while the client
 blackout. The cycle is measured in a closed loop after the last update. Under `pbr` the state goes into each
 checkpoint; under `lfr` it never leaves its replica, except for an update.
 
-If a mechanism does not carry a size, that is a result and no failure of the bench: the row says why, and
-larger sizes are not tried under that mechanism. (A message over PACKET_BYTES_MAX travels as a memfd; in a
+If a mechanism does not carry a size, that is a result and no failure of the bench: the row has the reason,
+and larger sizes are not tried under that mechanism. (A message over PACKET_BYTES_MAX travels as a memfd; in a
 closed loop a backup may be so many of them behind that it cannot be brought to rest in time.)
 """
 
@@ -38,7 +38,7 @@ _AROUND_BYTES: Final = 1024  # of a message, beside the state in it
 
 
 class StateResult(msgspec.Struct, frozen=True):
-    """One size of the state under one mechanism; `refused` says why where it is not carried."""
+    """One size of the state under one mechanism; `refused`: the reason where it is not carried."""
 
     ftm: str
     state_bytes: int

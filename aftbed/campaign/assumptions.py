@@ -1,8 +1,8 @@
 """The FT/A/R table, measured: what each mechanism assumes, and what comes of it where that does not hold.
 
-The paper's Fig. 1 says which mechanism suits which faults (FT) and which function (A). `adapt.suitability`
+The paper's Fig. 1 has which mechanism suits which faults (FT) and which function (A). `adapt.suitability`
 has that as a table; here is what was measured. For each stratum of a campaign over mechanisms, variants of
-the function and faults: what the table says of it, and the share of experiments in which the client got wrong
+the function and faults: the verdict of the table, and the share of experiments in which the client got wrong
 replies or none, or the replicas came apart, with its interval. Where the table is right, it says "holds" if
 nothing broke, and names the assumption if something did. It can be wrong in both ways: a cell where it says
 "holds" and something broke, and one where it names an assumption and nothing did.
@@ -34,7 +34,7 @@ REFUSED: Final = "refused by the self-test"
 
 
 class AssumptionCell(msgspec.Struct, frozen=True):
-    """`assumption`: what the table says is broken there, `""` where it says that the mechanism holds."""
+    """`assumption`: the one that is broken there by the table, `""` where the mechanism holds by it."""
 
     stratum: str
     assumption: str
@@ -75,7 +75,7 @@ def _came_to(result: Result) -> str:
 
 
 def assumed_wrongly(result: Result) -> str:
-    """What the table says against this mechanism, for these faults and this function; "" for nothing."""
+    """Why the table has this mechanism fail under these faults and with this function; "" if it holds."""
     experiment = result.experiment
     faults = [parse(text) for text in experiment.faults]
     flips = [fault for fault in faults if fault.action.alters_value]

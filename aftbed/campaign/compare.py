@@ -4,7 +4,7 @@ Experiment i of both campaigns had the same seed, so the same fault at the same 
 What the fault and the drive do to the outcome is in both of a pair and cancels out; compared as two
 independent samples, it would hide the difference.
 
-- Shares (failed or not): only the pairs that differ tell something. If nothing has changed, each of them is
+- Shares (failed or not): only the pairs that differ count. If nothing has changed, each of them is
   as likely to have failed only before as to fail only now: a fair coin. `mcnemar` is the exact test of that
   (McNemar, Psychometrika 12, 1947; exact: Liddell, Journal of Epidemiology and Community Health 37, 1983).
   It is conservative (Fagerland, Lydersen and Laake, BMC Medical Research Methodology 13:91, 2013): a change
@@ -45,7 +45,7 @@ from aftbed.core.errors import ConfigError
 BITS: Final = 32  # of chance for each draw; with at most PAIRS_MAX pairs no pair is favoured by over 0.1 %
 PAIRS_MAX: Final = 1 << 22
 RESAMPLES: Final = 2000
-BEYOND_MIN: Final = 5  # resamples beyond each bound of an interval; fewer say nothing
+BEYOND_MIN: Final = 5  # resamples beyond each bound of an interval; fewer mean nothing
 
 
 def mcnemar(only_base: int, only_new: int) -> float:

@@ -4,7 +4,7 @@ The scheduler hands each experiment to a worker that is free, and to another one
 of it; only this process writes the ledger, and it takes each experiment once, so a worker's death loses
 nothing and counts nothing twice. A real run is started in an interpreter of its own on the worker, since a
 Dask worker has threads and a run is begun by a fork. Every machine needs the same version of aftbed: the
-answer says by which code it was made, and another's is refused.
+answer names the code that made it, and that of another version is refused.
 """
 
 import os

@@ -1,6 +1,6 @@
 """The records of a campaign: a text file, one JSON document per line, appended as the results come.
 
-The first line says what it is the ledger of. Each further line is one result, written in one `write` to a
+The first line names the campaign. Each further line is one result, written in one `write` to a
 file opened for appending, by the process that has just judged the run: so a `kill -9` of the campaign
 loses at most what is in flight, and workers need no lock. A last line without its end can only be what a
 full disk or a dead machine left; `resume` cuts it off, all other readers refuse it.

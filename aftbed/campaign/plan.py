@@ -32,7 +32,7 @@ JOINED: Final = " · "
 
 
 class Stratum(msgspec.Struct, frozen=True):
-    """`expected`: outcomes, none where nothing is asked."""
+    """`expected`: outcomes, none where all are accepted."""
 
     name: str
     ftm: str

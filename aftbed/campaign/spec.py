@@ -18,7 +18,7 @@
 A *stratum* is one mechanism, one placement, one adaptation and one entry of `faults`. The experiments of a
 stratum go through its matrix in turn; what is drawn depends on the seed, the stratum and the number of the
 experiment, and on nothing else. Words that a mechanism does not know (an event that it never emits) are
-refused before anything runs: such an entry says `mechanisms: [...]` for itself.
+refused before anything runs: such an entry has `mechanisms: [...]` of its own.
 
 *Expected* is the class of the outcome (`experiment.OUTCOMES`), per mechanism; `"*"` is any other. An outcome
 that is better than the expected ones counts as unexpected too: an oracle that never sees anything is no
@@ -171,7 +171,7 @@ def shipped() -> list[str]:
 
 
 def check(spec: Spec) -> None:
-    """What the types do not say. Raises ConfigError naming the key."""
+    """Check what the types do not express. Raises ConfigError naming the key."""
     _each_known("mechanisms", spec.mechanisms, EXPRESSIONS)
     _each_known("system.placements", spec.system.placements, PLACEMENTS)
     if not spec.system.placements:

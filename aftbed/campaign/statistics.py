@@ -1,4 +1,4 @@
-"""What a sample of experiments says about all of them: intervals of shares, of counts and of quantiles.
+"""What follows from a sample of experiments for all of them: intervals of shares, of counts and of quantiles.
 
 A campaign tries some faults out of very many, so its numbers are estimates, and a gate judges the bound
 of an interval and never the estimate. What is estimated is mostly close to 0 or to 1 (a mechanism that

@@ -113,9 +113,8 @@ def summarise(ledger: Ledger, planned: int, seconds: float) -> Summary:
     for result in results:
         groups.setdefault(result.experiment.stratum, []).append(result)
     confidence = confidence_of(spec)
-    gates = tuple(judged(gate, groups, confidence) for gate in (*spec.gates, *_always(spec)))
-    gates += (_unexcused(results),)
-    gates += tuple(_vacuous(name, group) for name, group in groups.items() if _never_struck(group))
+    asked = tuple(judged(gate, groups, confidence) for gate in (*spec.gates, *_always(spec)))
+    gates = (*asked, _unexcused(results), *_vacuous(groups))
     sizes = {stratum.name: population(stratum.fault) for stratum in strata_of(spec)}
     broken = not results or any(g.word == "fail" for g in gates)
     return Summary(
@@ -185,38 +184,27 @@ def judged(gate: Gate, groups: dict[str, list[Result]], confidence: float) -> Ga
     group = [r for name, results in groups.items() if fnmatch.fnmatch(name, gate.strata) for r in results]
     limit = f"at most {gate.max:g}" if gate.max is not None else f"at least {gate.min:g}"
     if not group:
-        return _failed(gate, limit, f"no stratum is called {gate.strata!r}")
+        reason = f"no stratum is called {gate.strata!r}"
+        return GateResult(gate.metric, gate.strata, limit, None, None, "fail", reason)
+    interval: Interval | None
     if gate.metric in SHARES:
-        share = SHARES[gate.metric]
         of = OF.get(gate.metric)
         group = list(filter(of, group)) if of is not None else group
-        count = sum(share(r) for r in group)
-        interval = proportion(count, len(group), confidence)
-        return _by_interval(gate, limit, count / max(1, len(group)), interval)
-    return _of_times(gate, limit, group, confidence)
-
-
-def _of_times(gate: Gate, limit: str, group: list[Result], confidence: float) -> GateResult:
-    name, _, which = gate.metric.rpartition("_")
-    values, q = [v for r in group if (v := getattr(r, name)) is not None], QUANTILES[which]
-    interval = quantile_interval(values, q, confidence) if values else None
-    if interval is None:
-        needed = quantile_needs(q, confidence)
-        return _failed(
-            gate, limit, f"{len(values)} values; {needed} are needed to bound it at {confidence:.1%}"
-        )
-    return _by_interval(gate, limit, quantile(values, q), interval)
-
-
-def _by_interval(gate: Gate, limit: str, value: float, interval: Interval) -> GateResult:
+        count = sum(map(SHARES[gate.metric], group))
+        value, interval = count / max(1, len(group)), proportion(count, len(group), confidence)
+    else:
+        name, _, which = gate.metric.rpartition("_")
+        times, q = [v for r in group if (v := getattr(r, name)) is not None], QUANTILES[which]
+        interval = quantile_interval(times, q, confidence)
+        if interval is None:
+            needed = quantile_needs(q, confidence)
+            reason = f"{len(times)} values; {needed} are needed to bound it at {confidence:.1%}"
+            return GateResult(gate.metric, gate.strata, limit, None, None, "fail", reason)
+        value = quantile(times, q)
     bound = interval.high if gate.max is not None else interval.low
     kept = bound <= gate.max if gate.max is not None else bound >= (gate.min or 0.0)
     reason = "" if kept else f"{value:.4g} was measured, and it may be {bound:.4g}"
     return GateResult(gate.metric, gate.strata, limit, value, bound, "pass" if kept else "fail", reason)
-
-
-def _failed(gate: Gate, limit: str, reason: str) -> GateResult:
-    return GateResult(gate.metric, gate.strata, limit, None, None, "fail", reason)
 
 
 def _always(spec: Spec) -> Iterator[Gate]:
@@ -234,10 +222,9 @@ def _unexcused(results: Iterable[Result]) -> GateResult:
     return GateResult(BROKEN, ANY, "none", float(len(found)), None, word, reason)
 
 
-def _never_struck(group: list[Result]) -> bool:
-    return bool(group[0].experiment.faults) and not any(r.activated for r in group)
-
-
-def _vacuous(name: str, group: list[Result]) -> GateResult:
-    reason = f"none of {len(group)} faults struck: this stratum could not have failed"
-    return GateResult(NOT_ACTIVATED, name, "not all", 1.0, None, "fail", reason)
+def _vacuous(groups: dict[str, list[Result]]) -> Iterator[GateResult]:
+    """Strata that could not have failed."""
+    for name, group in groups.items():
+        if group[0].experiment.faults and not any(r.activated for r in group):
+            reason = f"none of {len(group)} faults struck: this stratum could not have failed"
+            yield GateResult(NOT_ACTIVATED, name, "not all", 1.0, None, "fail", reason)

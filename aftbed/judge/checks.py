@@ -236,7 +236,7 @@ def corruptions(history: History, reference: ReferenceRun) -> list[str]:
 
 
 def _difference(wrong: bytes, right: bytes) -> str:
-    """What the brake ECU is asked for, and what it should have been asked for."""
+    """The demand on the brakes, and what it should have been."""
     found, expected = _decoded(wrong), _decoded(right)
     if isinstance(found, str) or isinstance(expected, str):
         texts = [one if isinstance(one, str) else _demand(one) for one in (found, expected)]
@@ -277,7 +277,7 @@ def half_a_graph(hosted: Hosted, expected: str) -> list[str]:
 
 
 class Evidence(msgspec.Struct, frozen=True):
-    """What a check looks at: the record of a run, and what the bare server made of the same requests."""
+    """The input of a check: the record of a run, and what the bare server made of the same requests."""
 
     record: RunRecord
     reference: ReferenceRun
@@ -340,7 +340,7 @@ def check_whole_graph(evidence: Evidence) -> Check:
     """G5: at the end lives a whole graph, the one to which the adaptations came, unless none is left."""
     record = evidence.record
     if record.end is None or record.end.hosted is None:
-        return Check("unknown", ("the supervisor did not live to say what lived",))
+        return Check("unknown", ("the supervisor did not live to report the graph",))
     if record.lost or evidence.excuses.service_lost:
         return Check("pass")  # no service is left: the other checks judge that
     if record.end.unfinished and not record.simulated:

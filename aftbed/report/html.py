@@ -229,7 +229,7 @@ def _allowed(gate: Gate) -> str:
 
 
 class WorstRun(msgspec.Struct, frozen=True):
-    """A run to look at; `note` says of the first few what is drawn, or why nothing is."""
+    """A run to look at; `note`: of the first few, what is drawn, or why nothing is."""
 
     result: Result
     slowness_ms: float

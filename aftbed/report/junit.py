@@ -1,6 +1,6 @@
 """JUnit XML: what a CI shows of a campaign without knowing what a campaign is.
 
-A test suite is the campaign; a test case is a stratum, or a gate. The text of a failure says why, and ends
+A test suite is the campaign; a test case is a stratum, or a gate. A failure has its reason as text, and ends
 with the command that repeats the worst experiment, so that it stands in the log of a build.
 
 A stratum fails if

@@ -321,7 +321,7 @@ def _scale(
 
 @contextmanager
 def _drawing(title: str, width: float, height: float) -> "Iterator[_Drawing]":
-    """A drawing in our style, whatever the user's matplotlibrc says."""
+    """A drawing in our style, whatever the user's matplotlibrc has."""
     import matplotlib.style  # noqa: PLC0415 - takes a second
 
     logging.getLogger("matplotlib").setLevel(logging.ERROR)  # it reports the building of its font cache

@@ -170,13 +170,13 @@ def mermaid(trace: Trace, broken: Sequence[Breach] = (), last: int = LAST) -> st
     shown = [(one.t_ns, view) for one in _until(trace.happened, broken) if (view := views(one)).note][-last:]
     names = dict.fromkeys(name for _, view in shown for name in view.nodes if name != EXECUTIVE)
     aliases = {name: f"p{number}" for number, name in enumerate(names or (EXECUTIVE,))}
-    everybody = ",".join(dict.fromkeys((next(iter(aliases.values())), list(aliases.values())[-1])))
+    all_nodes = ",".join(dict.fromkeys((next(iter(aliases.values())), list(aliases.values())[-1])))
     found = [f"participant {alias} as {escaped(name)}" for name, alias in aliases.items()]
     for t_ns, view in shown:
-        where = "->>".join(aliases.get(name, everybody) for name in view.nodes)
+        where = "->>".join(aliases.get(name, all_nodes) for name in view.nodes)
         where = where if view.shape == "arrows" else f"Note over {where}"
         found.append(f"{where}: {escaped(f'{_ms(t_ns)} ms: {view.note}')}")
-    found += [f"Note over {everybody}: {escaped(f'broken: {breach}')}" for breach in broken]
+    found += [f"Note over {all_nodes}: {escaped(f'broken: {breach}')}" for breach in broken]
     return "".join(f"{line}\n" for line in ("sequenceDiagram", *(f"    {line}" for line in found)))
 
 

@@ -5,7 +5,7 @@ then the slowest. One run of a stratum represents it: forty runs that fail in th
 
 A ledger keeps no messages, so a run is simulated to draw it: with the same bricks, scripts, faults and
 seed. A run of real processes need not have the same outcome there (the times differ, so a fault may strike
-another request); then the report says so, and the drawing shows what the simulator did.
+another request); then the report notes it, and the drawing shows what the simulator did.
 """
 
 from collections.abc import Iterable

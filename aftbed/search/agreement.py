@@ -1,10 +1,10 @@
-"""Does the simulator say what real runs say? The same experiments on both, put side by side.
+"""Does the simulator agree with real runs? The same experiments on both, put side by side.
 
 Real records are grouped by what was done in them (mechanism, placement, source, faults, adaptations). For
 each group the same is simulated under as many seeds as are asked for. Two things are compared: the classes of
 what the faults did, and the times of recovery. They agree if no real run has a class that no seed has, and if
 the real median lies between the shortest and the longest simulated time, or the simulated median between the
-real ones. Where they do not, the report says so; what is left out here is in `docs/simulation.md`.
+real ones. Where they do not, the report has the reason; what is left out here is in `docs/simulation.md`.
 """
 
 from collections import Counter
@@ -15,9 +15,9 @@ from typing import Final
 import msgspec
 
 from aftbed.core.errors import ConfigError
-from aftbed.core.journal import History
 from aftbed.core.messages import Scheduled
 from aftbed.judge import checks
+from aftbed.judge.checks import Evidence
 from aftbed.judge.outcome import outcome_of
 from aftbed.judge.record import RunRecord, read_record
 from aftbed.judge.simulated import record_of
@@ -75,16 +75,9 @@ def setup_of(record: RunRecord) -> Setup:
 
 
 def _compare(setup: Setup, records: list[RunRecord], seeds: int) -> Agreement:
-    real_classes, real_ms = Counter[str](), list[float]()
-    for record in records:
-        real_classes[outcome_of(evidence_of(record))[0]] += 1
-        real_ms += _recoveries(record.history)
-    sim_classes, sim_ms = Counter[str](), list[float]()
-    for seed in range(seeds):
-        run = simulate(msgspec.structs.replace(setup, seed=seed))
-        sim_classes[outcome_of(evidence_of(record_of(run), default_application))[0]] += 1
-        sim_ms += _recoveries(run.history)
-    real_times, sim_times = _times(real_ms), _times(sim_ms)
+    runs = (simulate(msgspec.structs.replace(setup, seed=seed)) for seed in range(seeds))
+    real_classes, real_times = _summed(evidence_of(record) for record in records)
+    sim_classes, sim_times = _summed(evidence_of(record_of(run), default_application) for run in runs)
     found = [
         f"no seed ends {word}, as {n} real runs do"
         for word, n in real_classes.items()
@@ -100,15 +93,18 @@ def _compare(setup: Setup, records: list[RunRecord], seeds: int) -> Agreement:
     )
 
 
-def _recoveries(history: History) -> list[float]:
-    return [f.recovered_ms for f in checks.failovers(history) if f.recovered_ms is not None]
-
-
-def _times(found: list[float]) -> RecoveryRange | None:
-    if not found:
-        return None
-    ordered = sorted(found)
-    return RecoveryRange(len(ordered), ordered[0], ordered[len(ordered) // 2], ordered[-1])
+def _summed(runs: Iterable[Evidence]) -> tuple[Counter[str], RecoveryRange | None]:
+    """The classes of outcomes, and the times of recovery."""
+    classes, times_ms = Counter[str](), list[float]()
+    for run in runs:
+        classes[outcome_of(run)[0]] += 1
+        failovers = checks.failovers(run.record.history)
+        times_ms += [f.recovered_ms for f in failovers if f.recovered_ms is not None]
+    if not times_ms:
+        return classes, None
+    times_ms.sort()
+    median_ms = times_ms[len(times_ms) // 2]
+    return classes, RecoveryRange(len(times_ms), times_ms[0], median_ms, times_ms[-1])
 
 
 def apart(real: RecoveryRange | None, simulated: RecoveryRange | None) -> list[str]:

@@ -111,6 +111,8 @@ FIRST_EVENTS: Final = (  # where the first fault of a pair strikes the leader's 
 )
 DELAYS_MS: Final = (0.05, 0.15, 0.25, 0.35, 0.5, 0.8, 1.2, 2.0, 3.0, 4.0, 6.0, 9.0)  # to the second
 PAIR_REQUESTS: Final = 40
+PAIR_RATE_HZ: Final = 2000.0
+FIRST_MS: Final = 1.0  # from the start of the load to the first fault, about
 
 
 def pairs(ftms: Iterable[str], placements: Iterable[str]) -> Iterator[Setup]:
@@ -122,24 +124,19 @@ def pairs(ftms: Iterable[str], placements: Iterable[str]) -> Iterator[Setup]:
             Fault(act, "primary", Trigger(event.label, 3))
             for act, event in itertools.product(STRIKES, FIRST_EVENTS)
         ]
+        flips: list[tuple[ValuePlace, str, Event]] = []
         if tolerates(ftm, "value"):
-            places = itertools.product(EXECUTED, (0, 100))
-            firsts += [
-                Fault(ValueFlip(place, Bit(bit)), "primary", Trigger(Event.SERVER_EXIT.label, 3))
-                for place, bit in places
-            ]
+            flips += [(place, "primary", Event.SERVER_EXIT) for place in EXECUTED]
         if server_emits(graph, Event.STATE_RESTORED, backs_up=True):  # in the backup's checkpoint
-            firsts += [
-                Fault(ValueFlip(ValuePlace.STATE, Bit(bit)), "backup", Trigger(Event.STATE_RESTORED.label, 3))
-                for bit in (0, 100)
-            ]
+            flips += [(ValuePlace.STATE, "backup", Event.STATE_RESTORED)]
+        firsts += [
+            Fault(ValueFlip(place, Bit(bit)), role, Trigger(event.label, 3))
+            for place, role, event in flips
+            for bit in (0, 100)
+        ]
         for first, node, delay_ms in itertools.product(firsts, nodes, DELAYS_MS):
             second = Fault(Crash(), node, Trigger(after_ms=FIRST_MS + delay_ms))
             yield Setup(ftm, placement, count=PAIR_REQUESTS, rate_hz=PAIR_RATE_HZ, faults=(first, second))
-
-
-PAIR_RATE_HZ: Final = 2000.0
-FIRST_MS: Final = 1.0  # from the start of the load to the first fault, about
 
 
 # -- a choice of them -----------------------------------------------------------------------------
@@ -243,8 +240,7 @@ def tried(setup: Setup) -> Found:
 def missed(run: Run) -> tuple[str, ...]:
     """G8: what was to happen in `run` and did not, so that it proves nothing about it."""
     found = [f"never fired: {f.fault}" for f in run.faults if not f.fired]
-    begun = len(run.adaptations)
-    late = run.setup.adaptations[begun:]
+    late = run.setup.adaptations[len(run.adaptations) :]
     return (*found, *(f"never began: the adaptation to {s.goal.expression or s.goal.part}" for s in late))
 
 
@@ -262,13 +258,11 @@ def explore(
         yield number, setup, lost, broken
 
 
-# -- `explore order`: every order in which messages can arrive, for a few requests, with and without a
-# crash.
+# -- `explore order`: every order in which messages can arrive ------------------------------------
 #
-# What is run, and which orders are left out since they equal another: `runtime.sim.interleaving`. An
-# experiment ends when all its orders have been run, or at a bound on the runs, which is part of the result:
-# "complete" is said only of those that came to their end.
-
+# For a few requests, with and without a crash. What is run, and which orders are left out since they equal
+# another: `runtime.sim.interleaving`. An experiment ends when all its orders have been run, or at a bound on
+# the runs, which is part of the result: only those that came to their end are `complete`.
 
 RUN_SECONDS_MAX: Final = 1.0  # on a busy machine
 RUNS_MAX: Final = 2_000  # per experiment, unless another bound is given

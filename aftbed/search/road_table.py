@@ -35,7 +35,7 @@ PRIMARY: Final = "primary"
 
 
 class RoadLine(msgspec.Struct, frozen=True):
-    """How a table is driven. `searched`: at the worst instant, whatever the trigger of the fault says."""
+    """How a table is driven. `searched`: at the worst instant, whatever the trigger of the fault is."""
 
     name: str
     ftm: str

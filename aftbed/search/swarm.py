@@ -221,7 +221,7 @@ class _Draw:
         return Fault(Hang(hang_ms), target, trigger)
 
     def _draw_late(self) -> Fault:
-        """Something that takes its time; it may be taken for dead, and must not be heard then."""
+        """A slow node or channel. It may be taken for dead; then its messages must not be accepted."""
         chance, graph = self._chance, build(self._ftm, self._placement)
         by_ms = chance.randint(1, LATE_MS_MAX)
         if chance.random() < 0.5:

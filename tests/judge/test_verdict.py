@@ -156,7 +156,7 @@ def test_a_run_without_an_end_is_inconclusive(path: Path) -> None:
     verdict = record.verdict()
     assert (verdict.verdict, verdict.checks["clean_exit"]) == ("inconclusive", "unknown")
     assert verdict.reasons == [
-        "whole_graph: the supervisor did not live to say what lived",
+        "whole_graph: the supervisor did not live to report the graph",
         "clean_exit: the supervisor did not live to end the run",
     ]
     assert verdict.seconds is None
