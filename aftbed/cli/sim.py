@@ -16,8 +16,6 @@ from typing import Annotated, Final, NamedTuple
 import msgspec
 import typer
 from msgspec.structs import asdict, replace
-from rich.console import Console
-from rich.table import Table
 
 from aftbed.adapt import commands
 from aftbed.cli.adapt import scheduled
@@ -560,6 +558,9 @@ def _compare(given: SimArguments) -> int:
     if given.json:
         print_json({"agree": not disagreeing, "experiments": found})
         return EXIT_CODES["fail" if disagreeing else "pass"]
+    from rich.console import Console  # noqa: PLC0415 - only for this table
+    from rich.table import Table  # noqa: PLC0415 - the same
+
     table = Table("", "classes", "recovery: low, median, high (ms)", box=None, pad_edge=False)
     for one in found:
         table.add_row(one.experiment, "", "")
