@@ -224,7 +224,7 @@ def plan(
     if as_yaml and json:
         raise ConfigError("--yaml and --json: one of them is allowed")
     if start is None and placement is not None:
-        raise ConfigError("--placement says where --from stands: give --from EXPR too")
+        raise ConfigError("--placement belongs to --from: give --from EXPR too")
     if start is None:
         goal = control_client.PlanQuery(Goal(expression=expr, recipe=recipe))
         planned = msgspec.convert(

@@ -15,7 +15,7 @@ from aftbed.bench.adaptation import bench_adapt
 from aftbed.bench.cycle import bench_cycle, bench_hops
 from aftbed.bench.recovery import bench_recovery
 from aftbed.bench.resources import bench_launch, bench_memory
-from aftbed.cli.options import Recipe, print_json
+from aftbed.cli.options import Ftm, Recipe, print_json
 from aftbed.core.errors import ConfigError
 from aftbed.ftm.compose import DUPLEX, replication_of
 
@@ -24,7 +24,6 @@ REQUESTS_MIN: Final = 5000
 KILLS_MIN: Final = 1
 PROGRESS: Final = "  measuring: "
 
-Ftm = Annotated[str, typer.Option(help="none, pbr, lfr, tr, pbr+tr, ...: aftbed ftm list.")]
 Placement = Annotated[str, typer.Option(help="process, replica or single.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document.")]
 Pin = Annotated[bool, typer.Option(help="Keep each replica's chain on one core.")]

@@ -191,6 +191,10 @@ def _run_options(found: CampaignPlan, given: CampaignRunArguments) -> runner.Cam
     )
 
 
+def _ledger(folder: Path) -> ledger.Ledger:
+    return ledger.read(folder / ledger.NAME)
+
+
 def _judge(folder: Path, size: int, seconds: float, *, as_json: bool) -> int:
     """Summarise the ledger, of a campaign of `size` experiments, and write the reports; the exit code."""
     from aftbed.campaign.summary import summarise  # noqa: PLC0415
@@ -198,7 +202,7 @@ def _judge(folder: Path, size: int, seconds: float, *, as_json: bool) -> int:
     from aftbed.report.junit import junit_xml  # noqa: PLC0415
     from aftbed.report.terminal import summary_lines  # noqa: PLC0415
 
-    records = ledger.read(folder / ledger.NAME)
+    records = _ledger(folder)
     summary = summarise(records, size, seconds)
     document = msgspec.json.encode(summary)
     (folder / SUMMARY).write_bytes(msgspec.json.format(document))
@@ -222,7 +226,7 @@ def report(folder: Folder, json: Json = False) -> None:
 
 
 def _report(folder: Path, *, as_json: bool) -> int:
-    records = ledger.read(folder / ledger.NAME)
+    records = _ledger(folder)
     size = len(plan_of(records.head.spec).strata) * records.head.spec.stop.experiments
     seconds = sum(result.seconds for result in records.results)
     return _judge(folder, size, seconds, as_json=as_json)
@@ -237,7 +241,7 @@ def export(
     writers = {".csv": write_csv, ".parquet": write_parquet}
     if out.suffix not in writers:
         raise unknown("kind of file", out.suffix, writers)
-    writers[out.suffix](ledger.read(folder / ledger.NAME), out)
+    writers[out.suffix](_ledger(folder), out)
 
 
 @campaign.command()
@@ -247,7 +251,7 @@ def merge(
     json: Json = False,
 ) -> None:
     """Merge the shards of a campaign, and report on the whole."""
-    merged = ledger.merged([ledger.read(folder / ledger.NAME) for folder in folders])
+    merged = ledger.merged([_ledger(folder) for folder in folders])
     out.mkdir(parents=True, exist_ok=True)
     path = out / ledger.NAME
     ledger.begin(path, merged.head)
@@ -273,7 +277,7 @@ def compare(base: Folder, new: Folder, json: Json = False) -> None:
         word = "worse" if change.worse else "same or better"
         return f"  {change.stratum:<{width}}  {change.pairs:>5} pairs: {differ}; {shift}: {word}"
 
-    found = compared(ledger.read(base / ledger.NAME), ledger.read(new / ledger.NAME))
+    found = compared(_ledger(base), _ledger(new))
     if json:
         print_json(found)
     else:
@@ -288,7 +292,7 @@ def assumptions(folder: Folder) -> None:
     """What each mechanism assumes, and the outcomes where that does not hold, as Markdown."""
     from aftbed.campaign.assumptions import markdown  # noqa: PLC0415 - scipy
 
-    print(markdown(ledger.read(folder / ledger.NAME)), end="")
+    print(markdown(_ledger(folder)), end="")
 
 
 # -- one experiment -------------------------------------------------------------------------------
@@ -300,7 +304,7 @@ def replay(folder: Folder, experiment: ExperimentName, json: Json = False) -> No
 
     Exit code: 0 the outcome is the same, 1 it is not, 2 usage.
     """
-    before = ledger.find(ledger.read(folder / ledger.NAME), experiment)
+    before = ledger.find(_ledger(folder), experiment)
     after = carry_out(before.experiment, lambda result: None)
     if json:
         print_json({"before": before, "after": after})
@@ -316,7 +320,7 @@ def shrink(folder: Folder, experiment: ExperimentName, json: Json = False) -> No
 
     A real experiment is shrunk in the simulator, too: there a run is repeated to the last event.
     """
-    before = ledger.find(ledger.read(folder / ledger.NAME), experiment)
+    before = ledger.find(_ledger(folder), experiment)
     found = smallest(before)
     if json:
         print_json(found)

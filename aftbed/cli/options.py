@@ -18,6 +18,7 @@ JOBS_MAX: Final = 256
 
 Run = Annotated[str | None, typer.Option("--run", help="Id of the run; needed if several are alive.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else.")]
+Ftm = Annotated[str, typer.Option(help="none, pbr, lfr, tr, pbr+tr, ...: aftbed ftm list.")]
 Seed = Annotated[int, typer.Option(help="Seed of all random numbers.")]
 Recipe = Annotated[str, typer.Option(help="drained, or paper: SIGSTOP, kill, launch, link, SIGCONT.")]
 

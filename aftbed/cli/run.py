@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import msgspec
 import typer
 
-from aftbed.cli.options import RATE_HZ_MAX, Json, check_range, check_seed, takes
+from aftbed.cli.options import RATE_HZ_MAX, Ftm, Json, check_range, check_seed, takes
 from aftbed.cli.views import RunView, open_view
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.graph import Graph
@@ -39,13 +39,17 @@ LOAD_MAX: Final = 10_000_000
 PROCESSES_LOG_SHOWN: Final = 4000  # characters
 
 
+Placement = Annotated[str, typer.Option(help="process (one per brick) or replica.")]
+Pace = Annotated[str, typer.Option(help="real, a factor (4), or max (lockstep).")]
+
+
 class RunArguments(msgspec.Struct, frozen=True):
     """The options of `aftbed run`."""
 
-    ftm: Annotated[str, typer.Option(help="none, pbr, lfr, tr, pbr+tr, ...: aftbed ftm list.")] = "pbr"
+    ftm: Ftm = "pbr"
     scenario: Annotated[str, typer.Option(help="Name of a scenario, or a YAML file.")] = "ccrs-50"
-    placement: Annotated[str, typer.Option(help="process (one per brick) or replica.")] = "process"
-    pace: Annotated[str, typer.Option(help="real, a factor (4), or max (lockstep).")] = "real"
+    placement: Placement = "process"
+    pace: Pace = "real"
     seed: Annotated[int, typer.Option(help="Seed of all random numbers of the run.")] = 0
     faults: Annotated[
         tuple[str, ...], typer.Option("--inject", help='E.g. "crash primary at checkpoint.sent nth 100".')

@@ -8,8 +8,8 @@ from typing import Annotated, Final
 import typer
 
 from aftbed.cli.lazy import CommandTable, group_of
-from aftbed.cli.options import Json, Seed, print_json
-from aftbed.cli.run import RunArguments, execute
+from aftbed.cli.options import Ftm, Json, Seed, print_json
+from aftbed.cli.run import Pace, Placement, RunArguments, execute
 from aftbed.vehicle.plant import KMH_PER_MS, LeadCar
 from aftbed.vehicle.scenarios import tables
 from aftbed.vehicle.scenarios.library import load_scenario, scenario_names
@@ -127,9 +127,9 @@ def _demands(case: tables.Case) -> str:
 @scenario.command()
 def run(
     name: Name,
-    ftm: Annotated[str, typer.Option(help="none, pbr, lfr, tr, pbr+tr, ...: aftbed ftm list.")] = "pbr",
-    placement: Annotated[str, typer.Option(help="process (one per brick) or replica.")] = "process",
-    pace: Annotated[str, typer.Option(help="real, a factor (4), or max (lockstep).")] = "real",
+    ftm: Ftm = "pbr",
+    placement: Placement = "process",
+    pace: Pace = "real",
     seed: Seed = 0,
     faults: Annotated[
         list[str] | None, typer.Option("--inject", help='E.g. "crash primary at server.enter nth 100".')

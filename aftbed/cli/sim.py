@@ -59,7 +59,7 @@ MINUTES_MAX: Final = 100_000.0
 SHRUNK_MAX: Final = 3  # broken runs: shrinking one takes up to 400 runs
 MISSED_MAX: Final = 3  # reasons shown
 LISTED_MAX: Final = 20  # broken runs, while the others go on
-NO_COMMAND: Final = "(no command line says it: repeat the original)"
+NO_COMMAND: Final = "(no command expresses it: repeat the original)"
 DEFAULT: Final = Setup()
 _RANGE: Final = re.compile(r"([0-9]{1,19})\.\.([0-9]{1,19})")
 
