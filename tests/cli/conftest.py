@@ -5,13 +5,10 @@ from pathlib import Path
 
 import pytest
 from fakerun import Call, FakeRun, Output
+from liveruns import Home, home
 
 from aftbed.cli import main
 from aftbed.runtime.unix import control_client, run_directory
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "process"))
-
-from liveruns import Home, home
 
 __all__ = ["home"]
 

@@ -43,7 +43,8 @@ from aftbed.runtime.unix.launch import launch, options_for
 from aftbed.runtime.unix.options import LoadRun, Work
 
 RUN_SECONDS_MAX: Final = 60.0
-CLIENTS: Final = ("adapt", "check", "graph", "inject", "ps", "status", "stop")
+# commands that start no process
+PLAIN: Final = ("adapt", "check", "ftm", "graph", "inject", "log", "ps", "sim", "status", "stop")
 
 __all__ = [  # what others import from here
     "GONE_SECONDS_MAX",
@@ -268,8 +269,8 @@ class Done(msgspec.Struct, frozen=True):
 
 
 def aftbed(*arguments: str | Path) -> Done:
-    """Run a command to its end: in this process if it starts none, that is about a run that is there."""
-    return called(*arguments) if arguments[0] in CLIENTS else command(*arguments)
+    """Run a command to its end: in this process if it starts none."""
+    return called(*arguments) if arguments[0] in PLAIN else command(*arguments)
 
 
 def called(*arguments: str | Path) -> Done:

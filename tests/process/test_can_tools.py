@@ -3,6 +3,7 @@
 Each is the real tool. Where it is not installed, or the kernel has no CAN, the test is skipped and says so.
 """
 
+import json
 import os
 import pty
 import re
@@ -19,12 +20,12 @@ from typing import Final
 
 import msgspec
 import pytest
-from liveruns import Home, home
+from liveruns import Home
+from mcap.reader import make_reader
+from tracechecks import problems
 
 from aftbed.interop.logs import READERS, CanLog, LoggedFrame, convert, read_candump, write_candump
 from aftbed.vehicle.can.bus import BusOptions, open_bus
-
-__all__ = ["home"]
 
 pytestmark = pytest.mark.process
 
@@ -119,12 +120,6 @@ def test_canplayer_plays_what_the_hub_logged(record: Path, home: Home) -> None:
 
 def test_a_run_leaves_the_files_that_it_was_asked_for(record: Path, home: Home) -> None:
     """tests/interop/test_exported_runs.py checks the contents; here a real run has them."""
-    import json  # noqa: PLC0415
-
-    from mcap.reader import make_reader  # noqa: PLC0415
-
-    sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "interop"))
-    from tracechecks import problems  # noqa: PLC0415
 
     events = json.loads((record / "run.json").read_text())["traceEvents"]
     assert problems(events) == []

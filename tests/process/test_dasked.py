@@ -9,14 +9,11 @@ from pathlib import Path
 
 import psutil
 import pytest
+from campaigns import CRASHES, planned, ran
 from liveruns import GONE_SECONDS_MAX, Home, ended, until
 
 from aftbed.campaign import ledger, runner
 from aftbed.core.errors import ConfigError
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "campaign"))
-
-from campaigns import CRASHES, planned, ran
 
 pytestmark = [
     pytest.mark.process,

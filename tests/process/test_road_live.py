@@ -1,19 +1,15 @@
 """Rows of the tables, and the painted drive, on real processes: what the simulator says of them is so."""
 
-import sys
 from pathlib import Path
 
 import pytest
 from liveruns import Done, aftbed
+from paintedlog import WHY_NOT, painted, real_drive
+from puredrive import TOYOTA_DBC, TOYOTA_LOG
 
 from aftbed.runtime.sim.world import Setup, simulate
 from aftbed.vehicle.can.candump import log_line
 from aftbed.vehicle.scenarios.tables import Case, broken, cases
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "vehicle"))
-
-from paintedlog import WHY_NOT, painted, real_drive
-from puredrive import TOYOTA_DBC, TOYOTA_LOG
 
 pytestmark = pytest.mark.process
 

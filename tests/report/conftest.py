@@ -1,12 +1,6 @@
 """What the tests of reports share: a small campaign with many outcomes, simulated once."""
 
-import sys
-from pathlib import Path
-
 import pytest
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "campaign"))  # `campaigns`
-
 from reported import mixed
 
 from aftbed.campaign.ledger import Ledger
