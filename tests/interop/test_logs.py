@@ -94,8 +94,7 @@ def set_zone(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str], None]]
     time.tzset()
 
 
-@pytest.mark.parametrize(("zone", "t_us"), sampled(ZONES, DATES_US))
-@pytest.mark.parametrize("name", FORMATS)
+@pytest.mark.parametrize(("name", "zone", "t_us"), sampled(FORMATS, ZONES, DATES_US))
 def test_a_log_of_any_zone_comes_back(
     name: str, t_us: int, zone: str, tmp_path: Path, set_zone: Callable[[str], None]
 ) -> None:

@@ -44,7 +44,7 @@ BITS: Final = {
     ValuePlace.RESULT: (0, 16),
     ValuePlace.STATE: (8, 15),
 }  # of the first digits; of the number of requests
-FEW: Final = settings.default.max_examples // 4
+FEW: Final = settings.default.max_examples // 6
 
 seeds = st.integers(0, 2**32)
 pytestmark = pytest.mark.timeout(900)  # in profile `deep`; seconds in the others

@@ -182,7 +182,7 @@ def test_a_longer_silence_of_the_function_never_lowers_the_impact_speed(name: st
     assert impacts_kmh == sorted(impacts_kmh)
 
 
-@settings(max_examples=settings.default.max_examples // 3)
+@settings(max_examples=settings.default.max_examples // 5)
 @given(st.floats(10.0, 60.0), st.floats(0.55, 0.9), st.floats(0.0, 0.3), st.integers(0, 1000))
 def test_more_friction_never_raises_the_impact_speed_of_the_function(
     speed_kmh: float, friction: float, more: float, seed: int

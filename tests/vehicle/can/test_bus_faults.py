@@ -60,7 +60,7 @@ ALIKE = [
 ]
 
 
-@pytest.mark.parametrize("words", every(3, ALIKE))
+@pytest.mark.parametrize("words", every(4, ALIKE))
 def test_a_hub_in_lockstep_and_a_bus_in_virtual_time_are_alike(words: str, tmp_path: Path) -> None:
     """Each frame to the last bit, by identifier and time, the car, what was noticed; without a wait."""
     over_hub, in_virtual_time = real(tmp_path / "bus.log", words), virtual(words)
