@@ -453,7 +453,7 @@ def _simulate_one(given: SimArguments, setup: Setup) -> int:
 
 def event_lines(run: Run) -> Iterator[str]:
     """The events of the executive, in virtual time, as `aftbed run` shows them."""
-    for t_ns, event, text in run.told:
+    for t_ns, event, text in run.logged:
         yield f"[{(t_ns - START_NS) / 1e6:>10.3f} ms] {event}: {text}"
 
 

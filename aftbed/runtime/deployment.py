@@ -13,7 +13,7 @@ import contextlib
 import functools
 import hashlib
 import itertools
-from collections.abc import Callable, Container, Generator, Iterable
+from collections.abc import Callable, Container, Generator, Iterable, Iterator
 from typing import Final
 
 import msgspec
@@ -83,9 +83,8 @@ class Channels:
         """The channel from `port` of `source` to `sink`."""
         return self._all.get((source, port, sink))
 
-    def items(self) -> list[tuple[ChannelKey, Channel]]:
-        """All of them, each with its source, port and sink."""
-        return list(self._all.items())
+    def __iter__(self) -> Iterator[Channel]:
+        return iter(self._all.values())
 
     def drop(self, channel: Channel) -> None:
         """Let go of `channel`."""

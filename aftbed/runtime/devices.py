@@ -145,7 +145,7 @@ class Load(Device):
 
 
 class CarLink(Protocol):
-    """How a runtime reaches a car: by frames on a bus, or, as in the defaults, by calls in virtual time."""
+    """How a runtime reaches a car: by frames on a bus, or by calls in virtual time. Its defaults: nothing."""
 
     def fds(self) -> tuple[int, ...]:
         """Descriptors that are readable when `read` is worth calling."""
@@ -157,7 +157,7 @@ class CarLink(Protocol):
 
     def advance(self, now_ns: int) -> Iterable[bytes]:
         """The requests that are made as time goes on to `now_ns`."""
-        ...
+        return ()
 
     def deliver(self, reply: Reply, now_ns: int) -> None:
         """To the brakes."""
@@ -165,7 +165,7 @@ class CarLink(Protocol):
 
     def deadline_ns(self) -> int | None:
         """When `advance` is worth calling again at the latest."""
-        ...
+        return None
 
     def counts(self) -> dict[str, object]:
         """What it counts."""

@@ -124,7 +124,8 @@ class FaultController:
             yield from self._runtime.watch(number, fault.trigger.when, lambda met: self._met(injection, met))
             return
         if fault.trigger.after_ms and not fault.trigger.event:
-            self._loop.after(fault.trigger.after_ms / 1e3, lambda: self._start(injection))
+            after_s = fault.trigger.after_ms / 1e3
+            self._loop.after(after_s, lambda: self._run(injection, self._begin(injection)))
             return
         try:
             yield from self._begin(injection)
@@ -133,10 +134,9 @@ class FaultController:
             self._log("refused", str(refusal))
             raise
 
-    def _start(self, injection: RunInjection) -> None:
-        self._run(injection, self._begin(injection), lambda failure: None)
-
-    def _run(self, injection: RunInjection, steps: Keys, on_end: Callable[[str], None]) -> None:
+    def _run(
+        self, injection: RunInjection, steps: Keys, on_end: Callable[[str], None] = lambda failure: None
+    ) -> None:
         self._loop.tasks.start(f"fault {injection.fault}", steps, on_end)
 
     def _met(self, injection: RunInjection, met: Met) -> None:

@@ -133,8 +133,7 @@ class Rebinding:
     def _present(self) -> Present:
         """All that an order names; processes and channels are compared by identity."""
         deployment = self._deployment
-        channels = [channel for _, channel in deployment.channels.items()]
-        return [*deployment.nodes.values(), *self._beside.values()], channels
+        return [*deployment.nodes.values(), *self._beside.values()], list(deployment.channels)
 
     def _bind(self, changes: Changes, link: Link, *, committing: bool) -> None:
         target = self._target

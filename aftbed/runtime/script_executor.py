@@ -51,7 +51,7 @@ from aftbed.core.script import (
 from aftbed.ftm.compose import REPLICAS, STATEFUL, replication_of
 from aftbed.ftm.registry import KINDS
 from aftbed.runtime import control
-from aftbed.runtime.deployment import BESIDE_LEADER, HANG_NS, Deployment, Keys, Slot, replica_of
+from aftbed.runtime.deployment import BESIDE_LEADER, HANG_NS, Deployment, Keys, replica_of
 from aftbed.runtime.interface import LIGHT, Channel, Process, ProcessKind
 from aftbed.runtime.rebinding import Rebinding
 from aftbed.runtime.tasks import Key, Wait, run_after_first_yield
@@ -202,7 +202,8 @@ class Execution:
                 yield from self._note(Event.ADAPT_STEP_EXIT, self._number)
             self._assert_whole()
         except StepFailed:
-            if self._opened():  # requests may have passed: the state that counts is in what is new
+            if Resume(f"{deployment.leader}/protocol") in self.done:
+                # Requests may have passed: the state that counts is in the new processes.
                 self._adopt(self.new)
                 yield from self._probe_way_back()
             if not self._one_way:
@@ -214,10 +215,10 @@ class Execution:
         if not self._one_way:
             yield from self._probe_way_back()
         for slot in deployment.slots.values():
-            if self._one_way:
-                self._leave_if_dead(slot)
-            else:
+            if not self._one_way:
                 deployment.assert_whole(slot)
+            elif not all(map(deployment.lives, deployment.nodes_of(slot))):
+                deployment.lost.add(slot.name)  # without a way back it is Recovery's, as at any other time
 
     def finish(self) -> Keys:
         """End what does not serve any more."""
@@ -242,7 +243,8 @@ class Execution:
         if self.committed:  # else the Watchdogs have seen it
             deployment.lost |= self.lost
             yield from self._shut_lost()
-        self._rebinding = Rebinding(deployment, self.new, self.old, self._exchanged(), self.lost)
+        exchanged = {node: process for node, process in self._replaced.items() if node in self.new.nodes}
+        self._rebinding = Rebinding(deployment, self.new, self.old, exchanged, self.lost)
         for step in inverse(self.old, self.done, KINDS, drains(self.new, self.old)):
             yield from self._do_back(step)
         yield from self._end_staged(list(self._staged))
@@ -255,9 +257,6 @@ class Execution:
         replaced = self._replaced.items()
         return not self._one_way and all(p.alive for n, p in replaced if replica_of(n) != without)
 
-    def _exchanged(self) -> dict[str, Process]:
-        return {node: process for node, process in self._replaced.items() if node in self.new.nodes}
-
     def _enter(self) -> Keys:
         self._number += 1
         yield from self._note(Event.ADAPT_STEP_ENTER, self._number)
@@ -265,15 +264,6 @@ class Execution:
     def _note(self, event: Event, number: int) -> Keys:
         assert self._observe is not None
         return self._observe(event, number)
-
-    def _opened(self) -> bool:
-        """Whether the leader's Protocol has been let on."""
-        return Resume(f"{self._deployment.leader}/protocol") in self.done
-
-    def _leave_if_dead(self, slot: Slot) -> None:
-        """There is no way back, so it is Recovery's, as at any other time."""
-        if not all(map(self._deployment.lives, self._deployment.nodes_of(slot))):
-            self._deployment.lost.add(slot.name)
 
     def _assert_whole(self) -> None:
         """Raise StepFailed if a node of a replica is dead: not every step asks every node."""
@@ -289,29 +279,22 @@ class Execution:
                     yield from self._deployment.watch(slot)
 
     def _probe_way_back(self) -> Keys:
-        """Find out whether a class of before takes the state of the one that has its place: it need not.
+        """Find out whether a class that was replaced takes the state of its successor: it need not.
 
         Done when requests have been let on, so that the client does not wait for it.
         """
-        deployment = self._deployment
-        for node, brick in self._another_class():
-            giver, taker = deployment.process(node), self._replaced[node]
+        migrated = [step.node for step in flat(self.done) if isinstance(step, Migrate)]
+        for node, brick in [(n, b) for n in migrated for b in self.old.nodes[n] if b in self.new.nodes[n]]:
+            before, after = self.old.brick(brick), self.new.brick(brick)
+            if (before.source, before.application) == (after.source, after.application):
+                continue
+            giver, taker = self._deployment.process(node), self._replaced[node]
             try:
                 state = yield from self._capture(giver, brick)
                 if state:
                     yield from self._restore(taker, brick, state, migrate=True)
             except StepFailed:
                 self._one_way = self._one_way or (giver.alive and taker.alive)  # else it was a death
-
-    def _another_class(self) -> list[tuple[str, str]]:
-        """Where state was handed to a brick of another class, or with another function: nodes and bricks."""
-
-        def written(graph: Graph, brick: str) -> tuple[str, str]:
-            return graph.brick(brick).source, graph.brick(brick).application
-
-        migrated = [step.node for step in flat(self.done) if isinstance(step, Migrate)]
-        moved = [(n, b) for n in migrated for b in self.old.nodes[n] if b in self.new.nodes[n]]
-        return [(n, b) for n, b in moved if written(self.old, b) != written(self.new, b)]
 
     # -- steps --------------------------------------------------------------------------------
 

@@ -70,7 +70,7 @@ class Tasks:
         """Run `steps`; `on_end` gets the reason of its failure, or `""`."""
         run = _TaskRun(name, steps, on_end)
         self._tasks.append(run)
-        self._advance(run, lambda: next(steps))
+        self._advance(run, None)
 
     def settle(self, key: Key, value: bytes = b"") -> None:
         """`key` has happened. An answer may come before its task waits for it: it is kept."""
@@ -80,8 +80,7 @@ class Tasks:
                 waited_for = True
                 run.got[key] = value
                 if len(run.got) == len(run.wait.keys):
-                    got = run.got
-                    self._advance(run, lambda j=run, g=got: j.steps.send(g))  # type: ignore[misc]
+                    self._advance(run, run.got)
         if not waited_for and key[0] == "ack":
             self._early[key] = value
             if len(self._early) > EARLY_MAX:
@@ -118,19 +117,23 @@ class Tasks:
     def _throw(self, tasks: list[_TaskRun], reason: str) -> None:
         for run in tasks:
             if run in self._tasks:
-                self._advance(run, lambda j=run: j.steps.throw(StepFailed(reason)))  # type: ignore[misc]
+                self._advance(run, StepFailed(reason))
 
-    def _advance(self, run: _TaskRun, resume: Callable[[], Wait]) -> None:
+    def _advance(self, run: _TaskRun, result: dict[Key, bytes] | StepFailed | None) -> None:
+        """Resume with the result of the wait; None begins."""
         try:
             while True:
-                run.wait = resume()
+                if isinstance(result, StepFailed):
+                    run.wait = run.steps.throw(result)
+                else:
+                    run.wait = run.steps.send(result)  # type: ignore[arg-type]  # None begins a generator
                 run.got = {key: self._early.pop(key) for key in run.wait.keys & self._early.keys()}
                 run.deadline_ns = self._now_ns() + round(run.wait.seconds * 1e9)
                 refused = [self._refused.pop(key) for key in run.wait.keys & self._refused.keys()]
                 if refused:
-                    resume = lambda why=refused[0]: run.steps.throw(StepFailed(why))  # type: ignore[misc]  # noqa: E731
+                    result = StepFailed(refused[0])
                 elif len(run.got) == len(run.wait.keys):
-                    resume = lambda got=run.got: run.steps.send(got)  # type: ignore[misc]  # noqa: E731
+                    result = run.got
                 else:
                     return
         except StopIteration:

@@ -115,7 +115,7 @@ def course_of(setup: Setup) -> Course:
     began_ns = min(t_ns - asked[request_id].t_ms * 1_000_000 for request_id, t_ns in sent.items())
     world = World(replace(setup, faults=(LATER,)))  # faults are armed before the first request is made
     world.start()
-    armed_ns = next(t_ns for t_ns, event, _ in world.told if event == ARMED)
+    armed_ns = next(t_ns for t_ns, event, _ in world.logged if event == ARMED)
     return Course(
         setup=setup,
         result=result,

@@ -128,7 +128,7 @@ def test_without_a_mechanism_a_crash_in_sight_of_the_car_ahead_is_a_collision(tm
 def test_under_none_nothing_notices_an_outage(tmp_path: Path) -> None:
     course = sudden_course(tmp_path, "none", 50, 15.5)
     run = simulate(replace(course.setup, faults=(parse("hang primary for 300ms at server.enter nth 4"),)))
-    told = {event for _, event, _ in run.told}
+    told = {event for _, event, _ in run.logged}
     assert told == {"armed", "roles"}
     found = strike(course, Fault(Hang(300), "primary", Trigger(ANCHOR, 4)))
     assert found.fired and found.broken == ()

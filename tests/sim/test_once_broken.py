@@ -176,4 +176,4 @@ def test_a_script_that_was_ordered_before_the_last_one_was_done_is_not_carried_o
     world.end()
     run = world.outcome()
     assert breaches(run) == () and run.rest.leader == "b"
-    assert [text for _, event, text in run.told if event == "script"] == ["failover (a)", "new backup (a)"]
+    assert [text for _, event, text in run.logged if event == "script"] == ["failover (a)", "new backup (a)"]

@@ -71,7 +71,7 @@ def test_to_trace_a_run_changes_nothing(seed: int) -> None:
     with_trace, without = traced(drawn(seed)).run, simulate(drawn(seed))
     assert with_trace.history.journals == without.history.journals
     assert with_trace.history.dialogue == without.history.dialogue
-    assert (with_trace.rest, with_trace.told) == (without.rest, without.told)
+    assert (with_trace.rest, with_trace.logged) == (without.rest, without.logged)
 
 
 def test_a_trace_has_all_that_happened_by_time() -> None:
@@ -79,7 +79,7 @@ def test_a_trace_has_all_that_happened_by_time() -> None:
     run, found = trace.run, trace_of(FAILOVER)
     records = sum(map(len, run.history.journals.values()))
     messages = sum(isinstance(one, Sent) for one in trace.happened)
-    others = len(run.history.dialogue) + len(run.told) + len(run.struck)
+    others = len(run.history.dialogue) + len(run.logged) + len(run.struck)
     assert len(trace.happened) == records + messages + others == len(found) - 1
     times = [float(line.split()[0]) for line in found]
     assert times == sorted(times) and times[-1] == pytest.approx(milliseconds(run.rest.ended_ns), abs=1e-6)

@@ -98,7 +98,7 @@ class Run(msgspec.Struct, frozen=True):
     setup: Setup
     history: History
     rest: Rest
-    told: tuple[tuple[int, str, str], ...]  # time, event, text
+    logged: tuple[tuple[int, str, str], ...]  # time, event, text
     scripts: tuple[ScriptRun, ...]  # of Recovery
     adaptations: tuple[Outcome, ...]
     faults: tuple[FaultReport, ...]
@@ -273,7 +273,7 @@ class World:
             check(fault, self.setup.scenario)
         self.journals: dict[str, list[Record]] = {}
         self.dialogue: list[Entry] = []
-        self.told: list[tuple[int, str, str]] = []
+        self.logged: list[tuple[int, str, str]] = []
         self._ends: dict[int, SimChannel] = {}
         self.failures: list[str] = []
         self.struck: list[tuple[int, str]] = []  # nodes that died, or were stopped, of a fault, and when
@@ -355,7 +355,7 @@ class World:
 
     def log(self, event: str, text: str) -> None:
         """For the outcome."""
-        self.told.append((self.loop.ns, event, text))
+        self.logged.append((self.loop.ns, event, text))
 
     # -- parts --------------------------------------------------------------------------------
 
@@ -544,7 +544,7 @@ class World:
             self.setup,
             History(self.journals, self.dialogue),
             rest,
-            tuple(self.told),
+            tuple(self.logged),
             tuple(self.controller.scripts),
             tuple(self.controller.adaptations.history),
             tuple(self.controller.faults.reports()),

@@ -11,7 +11,7 @@ from aftbed.core.journal import entries
 from aftbed.core.messages import Reply
 from aftbed.ftm.client import Client
 from aftbed.runtime import control
-from aftbed.runtime.devices import CarDevice, Device, Load, resume_client
+from aftbed.runtime.devices import CarDevice, CarLink, Device, Load, Senses, resume_client
 from aftbed.runtime.unix import linux
 from aftbed.runtime.unix.death_notice import LifelineWatcher
 from aftbed.runtime.unix.journal_files import DialogueFile, JournalHeader
@@ -25,7 +25,7 @@ STALE_NS: Final = 35_000_000  # a pulse that is older is looked into; it comes e
 LOAD_REQUESTS: Final = 512
 
 
-class ProcessSenses:
+class ProcessSenses(Senses):
     """The `Senses` of a Watchdog: lifelines and pidfds for deaths, journals for pulses."""
 
     def __init__(self) -> None:
@@ -74,7 +74,7 @@ class ProcessSenses:
         return pulse_ns
 
 
-class BusLink:
+class BusLink(CarLink):
     """The `CarLink` over a bus: frames in, requests to the Client, replies out as AEB_REQ."""
 
     def __init__(self, gateway: "BusGateway", port: int) -> None:
@@ -98,18 +98,10 @@ class BusLink:
         for can_id, word in self._gateway.noticed():
             self._bus.notice(can_id, word)
 
-    def advance(self, now_ns: int) -> tuple[bytes, ...]:
-        """None: frames come by themselves."""
-        return ()
-
     def deliver(self, reply: Reply, now_ns: int) -> None:
         """Send the reply as frames."""
         for frame in self._gateway.on_reply(reply.payload, reply.replica, reply.epoch):
             self._bus.send(frame)
-
-    def deadline_ns(self) -> int | None:
-        """None: frames come by themselves."""
-        return None
 
     def counts(self) -> dict[str, object]:
         """The frames that the gateway accepted and refused."""
