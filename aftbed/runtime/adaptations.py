@@ -37,7 +37,7 @@ Answer = Callable[["Outcome"], None]
 
 
 class Outcome(msgspec.Struct):
-    """One adaptation, as it is shown and recorded; times in milliseconds."""
+    """An adaptation as it is shown and recorded; times in ms."""
 
     number: int
     purpose: str
@@ -72,7 +72,7 @@ def function_of(graph: Graph) -> str:
 
 
 def _unanswered(outcome: Outcome) -> None:
-    """Asked for with the run: it is in the history."""
+    """The answer of an adaptation that was scheduled with the run: the history has it."""
 
 
 def _spoiled(reason: str) -> Keys:
@@ -81,7 +81,7 @@ def _spoiled(reason: str) -> Keys:
 
 
 class _Current:
-    """The one under way."""
+    """The adaptation under way."""
 
     def __init__(self, outcome: Outcome, answer: Answer, began_ns: int, epoch: int, plan: Plan) -> None:
         self.outcome, self.answer, self.began_ns, self.epoch = outcome, answer, began_ns, epoch
@@ -115,22 +115,22 @@ class Adaptations:
 
     @property
     def busy(self) -> bool:
-        """One is under way."""
+        """Whether an adaptation is under way."""
         return self._current is not None
 
     @property
     def to_come(self) -> bool:
-        """One that was asked for with the run waits for its request."""
+        """Whether a scheduled adaptation waits for its request."""
         return bool(self._scheduled)
 
     @property
     def acting(self) -> bool:
-        """A phase that acts on what serves is under way."""
+        """Whether a phase that acts on serving nodes is under way."""
         now = self._current
         return now is not None and now.phase in (Phase.COMMIT, Phase.UNDO) and not now.ended
 
     def give_up_preparing(self, reason: str) -> None:
-        """What is staged has ends of channels that are being renewed."""
+        """Abandon the preparation: the staged nodes have ends of channels that are being renewed."""
         now = self._current
         if now is not None and now.phase is Phase.PREPARE:
             now.spoiled = reason
@@ -140,7 +140,7 @@ class Adaptations:
     # -- asked for ----------------------------------------------------------------------------
 
     def ask(self, goal: messages.Goal, answer: Answer, retries: int = RETRIES_MAX) -> None:
-        """Begin. Raises ConfigError where that cannot be now; waits a moment for redundancy to be back."""
+        """Begin an adaptation, after a short wait for redundancy. Raises ConfigError where it is refused."""
         deployment = self._deployment
         if self._current is not None:
             raise ConfigError(
@@ -167,7 +167,7 @@ class Adaptations:
         self._send(messages.Adapt(outcome.number, plan.script))
 
     def plan(self, goal: messages.Goal) -> Plan:
-        """What would be done, from the graph that runs now. Raises ConfigError."""
+        """Plan an adaptation of the graph that runs now. Raises ConfigError."""
         return plan_goal(self._deployment.graph, goal)
 
     def _asked(self, goal: messages.Goal) -> Outcome:
@@ -176,7 +176,7 @@ class Adaptations:
         return outcome
 
     def schedule(self, scheduled: tuple[messages.Scheduled, ...]) -> Keys:
-        """Those that were asked for with the run. The Client sends their requests when they have begun."""
+        """Begin the adaptations requested with the run, each when the Client reaches its request."""
         for later in scheduled:
             if later.at_request:
                 self._scheduled.append(later)
@@ -197,7 +197,9 @@ class Adaptations:
             yield from self._deployment.ask(CLIENT, lambda token: control.Deliver(token, CLIENT, hold))
 
     def request_held(self, request_id: int) -> None:
-        """The Client has come to `request_id`: begin what waits for it, then have the request sent."""
+        """The Client has reached `request_id`: begin the adaptations that wait for it, then release the
+        request.
+        """
         due = [later for later in self._scheduled if later.at_request == request_id]
         self._scheduled = [later for later in self._scheduled if later.at_request != request_id]
         for later in due:
@@ -261,7 +263,7 @@ class Adaptations:
         )
 
     def _step(self, event: Event, number: int) -> Keys:
-        """Journal a step before it acts; whatever fault waits for it strikes first."""
+        """Record a step before it acts; a fault that waits for it strikes first."""
         self._runtime.journal.write(self._loop.now_ns(), event, 0, number)
         yield from self._faults.at(event)
 
@@ -310,7 +312,7 @@ class Adaptations:
     # -- what happens meanwhile ---------------------------------------------------------------
 
     def engine_is_new(self) -> None:
-        """Send it what its predecessor had ordered last, if anything."""
+        """Send the new Engine the last order of its predecessor, if there was one."""
         now = self._current
         if now is None:
             return
@@ -337,5 +339,4 @@ class Adaptations:
         return False
 
     def to_json(self) -> bytes:
-        """The history, for `aftbed adapt history`."""
         return msgspec.json.encode({"adaptations": self.history})

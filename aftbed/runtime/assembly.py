@@ -120,21 +120,18 @@ def _suspects(graph: Graph) -> str:
 
 
 class _Checked(Brick):
-    """A brick whose steps must not raise."""
+    """A brick whose exceptions are ConfigErrors."""
 
     def __init__(self, name: str, brick: Brick) -> None:
         self._name, self._brick = name, brick
 
     def open_ports(self) -> tuple[str, ...]:
-        """Those of the brick."""
         return self._brick.open_ports()
 
     def quiescent(self) -> bool:
-        """As the brick is."""
         return self._brick.quiescent()
 
     def step(self, port: str, msg: AnyMessage, now_ns: int) -> list[Effect]:
-        """As the brick does. Raises ConfigError."""
         try:
             return self._brick.step(port, msg, now_ns)
         except Exception as error:

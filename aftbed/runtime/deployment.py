@@ -30,7 +30,7 @@ ChannelKey = tuple[str, str, str]  # source, its port, sink
 
 
 def key_of(link: Link) -> ChannelKey:
-    """By which a channel is found."""
+    """The key of its channel."""
     return link.source, link.source_port, link.sink
 
 
@@ -43,7 +43,7 @@ class Channels:
         self._all: dict[ChannelKey, Channel] = {}
 
     def renew(self, link: Link) -> Channel:
-        """A fresh channel for `link`; the old one is let go."""
+        """Make a new channel for `link`; the old one is closed."""
         key = key_of(link)
         old = self._all.pop(key, None)
         if old is not None:
@@ -59,14 +59,14 @@ class Channels:
         return self.beside[key]
 
     def adopt(self, links: Iterable[Link]) -> None:
-        """From now on the graph that runs has these links; what it does not have stays beside, open."""
+        """Make `links` those of the graph that runs; the other channels stay open beside it."""
         kept = set(map(key_of, links))
         known = self._all | self.beside
         self._all = {key: channel for key, channel in known.items() if key in kept}
         self.beside = {key: channel for key, channel in known.items() if key not in kept}
 
     def close_beside(self) -> None:
-        """Let go of all that the graph that runs does not have."""
+        """Close all channels beside the graph that runs."""
         for channel in self.beside.values():
             channel.close()
         self.beside = {}
@@ -87,7 +87,7 @@ class Channels:
         return iter(self._all.values())
 
     def drop(self, channel: Channel) -> None:
-        """Let go of `channel`."""
+        """Close and remove `channel`."""
         self._all.pop(key_of(channel.link), None)
         channel.close()
 
@@ -105,7 +105,7 @@ class Cores:
         self._of_replica = dict(zip(REPLICAS, itertools.cycle(cpus), strict=False)) if cpus else {}
 
     def of(self, node: str, hosted: tuple[str, ...], leader: str) -> int | None:
-        """The core of `node`, which hosts these bricks, while `leader` leads."""
+        """The core of `node`, which hosts `hosted`, while `leader` leads."""
         if not self._of_replica:
             return None
         if node.endswith("/watchdog"):
@@ -159,7 +159,7 @@ class Hosted(msgspec.Struct, frozen=True):
 
 
 def digest(state: bytes) -> str:
-    """Short, for a record; equal states have the same."""
+    """The first digits of the SHA-256 of `state`."""
     return hashlib.sha256(state).hexdigest()[:DIGEST_DIGITS]
 
 
@@ -226,7 +226,7 @@ class Deployment:
         return ("ack", process.name, self._tokens), process.name
 
     def leave(self, node: str, order: control.ToNode, fds: tuple[int, ...] = ()) -> None:
-        """Leave an order, unanswered, for when `node` wakes up next. Raises StepFailed if it is gone."""
+        """Send an order without an answer, read at the next wake-up. Raises StepFailed if it is gone."""
         assert order.token == control.UNANSWERED
         self._send(self.process(node), order, fds)
 
@@ -420,12 +420,12 @@ class Deployment:
         return process, sent
 
     def cpu_of(self, node: str, graph: Graph | None = None) -> int | None:
-        """Where `node` belongs."""
+        """The core of `node`."""
         hosted = (graph or self.graph).nodes.get(node, ())
         return self._cores.of(node, hosted, self.leader or self.backup)
 
     def pin(self, nodes: Iterable[str]) -> None:
-        """Move `nodes` to where they belong now that another replica leads."""
+        """Move `nodes` to their cores after another replica has become leader."""
         for node in nodes:
             cpu, process = self.cpu_of(node), self.nodes.get(node)
             if cpu is not None and process is not None and process.alive:
@@ -442,7 +442,9 @@ class Deployment:
     # -- channels -----------------------------------------------------------------------------
 
     def _held(self, channel: Channel) -> bool:
-        """Whether the Proxy's end of `channel` is kept here: it leads to a replica that does not lead."""
+        """Whether the executive keeps the Proxy's end of `channel`: it leads to a replica that does not
+        lead.
+        """
         link = channel.link
         if "proxy" not in (link.source, link.sink):
             return False
@@ -483,7 +485,7 @@ class Deployment:
     # -- what there is ------------------------------------------------------------------------
 
     def hosted(self) -> Hosted:
-        """What lives now, as far as is known: a node that is dead, and not yet seen dead, lives."""
+        """What lives now, as far as is known: a death that is not yet noticed does not count."""
         living = [p for p in self.pool.processes if p.alive and p.kind is not ProcessKind.KILLED]
         bricks = tuple(sorted(brick for process in living for brick in process.bricks))
         return Hosted(self.graph.ftm, self.graph.placement, self.leader, self.backup, bricks)
@@ -515,7 +517,7 @@ class Deployment:
         return "hang" if silent and not dead else "crash"
 
     def role_of(self, node: str) -> str:
-        """What `aftbed ps` shows."""
+        """The role that `aftbed ps` shows."""
         for slot in self.slots.values():
             if set(self.graph.nodes[node]) <= slot.bricks:
                 if slot.name == self.leader:

@@ -37,7 +37,7 @@ class Device(Protocol):
         return ()
 
     def ready(self, fd: int, now_ns: int) -> None:
-        """`fd` is readable."""
+        """Handle `fd`, which is readable."""
         raise AssertionError(f"no descriptor {fd}")
 
     def take(self, now_ns: int) -> Submit | NodeDied | Pulses | None:
@@ -45,15 +45,15 @@ class Device(Protocol):
         ...
 
     def wait(self, now_ns: int) -> None:
-        """The brick's port is closed, and time goes on."""
+        """Let time pass while the brick's port is closed."""
         return
 
     def accept(self, reply: Reply, now_ns: int) -> None:
-        """What the brick sent to `deliver`."""
+        """Take the reply that the brick sent to `deliver`."""
         raise AssertionError(f"{type(self).__name__} takes no replies")
 
     def quiet(self) -> None:
-        """Hand in nothing more."""
+        """Send no more requests."""
         ...
 
     def deadline_ns(self) -> int | None:
@@ -118,15 +118,12 @@ class Load(Device):
         return Submit(payload)
 
     def accept(self, reply: Reply, now_ns: int) -> None:
-        """Keep the reply in the dialogue."""
         self._dialogue.write(now_ns, reply.request_id, reply.epoch, _ANSWERED, reply.payload)
 
     def quiet(self) -> None:
-        """The load is at its end now."""
         self._count = self._client.next_id - 1
 
     def deadline_ns(self) -> int | None:
-        """When the next request is due."""
         if not self._period_ns or self._client.next_id > self._count:
             return None
         return self._next_ns
@@ -137,7 +134,6 @@ class Load(Device):
         return self._client.next_id > self._count and not self._client.unanswered
 
     def stats(self) -> bytes:
-        """How far the load is."""
         waiting = len(self._client.unanswered)
         return msgspec.msgpack.encode(
             {"sent": self._client.next_id - 1, "unanswered": waiting, "done": self.done}
@@ -160,7 +156,7 @@ class CarLink(Protocol):
         return ()
 
     def deliver(self, reply: Reply, now_ns: int) -> None:
-        """To the brakes."""
+        """Send `reply` to the brakes."""
         ...
 
     def deadline_ns(self) -> int | None:
@@ -168,7 +164,7 @@ class CarLink(Protocol):
         return None
 
     def counts(self) -> dict[str, object]:
-        """What it counts."""
+        """The counters of the link."""
         return {}
 
 
@@ -188,11 +184,9 @@ class CarDevice(Device):
         self._cycle_us = 0.0  # of the last request
 
     def fds(self) -> tuple[int, ...]:
-        """Those of the bus."""
         return self.link.fds()
 
     def ready(self, fd: int, now_ns: int) -> None:
-        """Keep the requests that have come."""
         self._keep(self.link.read())
 
     def _keep(self, payloads: Iterable[bytes]) -> None:
@@ -213,22 +207,19 @@ class CarDevice(Device):
         return Submit(payload)
 
     def wait(self, now_ns: int) -> None:
-        """Let the car drive on."""
         self._keep(self.link.advance(now_ns))
 
     def accept(self, reply: Reply, now_ns: int) -> None:
-        """To the brakes; then written, so that a reply that did not get there is asked for again."""
+        """Send the reply to the brakes, then write it: a reply lost in between is requested again."""
         self._cycle_us = round((now_ns - self._sent_ns) / 1e3, 1)
         self.link.deliver(reply, now_ns)
         self._dialogue.write(now_ns, reply.request_id, reply.epoch, _ANSWERED, reply.payload)
 
     def quiet(self) -> None:
-        """No more requests."""
         self._quiet = True
         self._payloads.clear()
 
     def deadline_ns(self) -> int | None:
-        """When the link has to look again."""
         return self.link.deadline_ns()
 
     @property
@@ -237,7 +228,6 @@ class CarDevice(Device):
         return not self._payloads and not self._client.unanswered
 
     def stats(self) -> bytes:
-        """How far the requests are, and what the link counts."""
         counts: dict[str, object] = {
             "sent": self._client.next_id - 1,
             "unanswered": len(self._client.unanswered) + len(self._payloads),
@@ -254,16 +244,14 @@ class Senses(Protocol):
         """Watch these nodes and no others; `died` may be called for each."""
         ...
 
-    def forget(self) -> None:
-        """Watch no node."""
-        ...
+    def forget(self) -> None: ...
 
     def fds(self) -> tuple[int, ...]:
         """Descriptors that are readable when a node has died; none where `died` of `watch` is called."""
         return ()
 
     def died(self, fd: int) -> list[str]:
-        """`fd` is readable: the nodes that have died."""
+        """The nodes behind `fd`, which is readable, that have died."""
         raise AssertionError(f"no descriptor {fd}")
 
     def pulse_ns(self, node: str, now_ns: int) -> int:

@@ -54,9 +54,7 @@ class Carrier(Protocol):
     """Something on which messages travel, in order."""
 
     @property
-    def number(self) -> int:
-        """It is known by this."""
-        ...
+    def number(self) -> int: ...
 
     def reader_names(self) -> frozenset[str] | None:
         """The nodes at its end; None for the executive, which may act on any node."""
@@ -75,23 +73,22 @@ class Clock:
         self._expiry_ns: int | None = None
 
     def now_ns(self) -> int:
-        """Virtual."""
         return self.ns
 
     def at(self, t_ns: int, call: Call) -> None:
-        """Plan `call`."""
+        """Call `call` at `t_ns`."""
         self.count += 1
         heapq.heappush(self.heap, (t_ns, self.count, call))
 
     def message(self, t_ns: int, line: "Carrier", call: Call) -> None:
-        """The same, for what travels on a line: never before what was put on it earlier."""
+        """Call `call` at `t_ns`, or later: the messages of a line keep their order."""
         self.at(t_ns, call)
 
     def begin(self) -> None:
-        """The launch is over: requests may come."""
+        """The launch is over: the source may send requests."""
 
     def after(self, seconds: float, call: Call) -> None:
-        """Plan `call` for `seconds` from now. An order to the dead ends it quietly, as everywhere."""
+        """Call `call` in `seconds`. An order to a dead process is dropped, as in the event loop."""
 
         def guarded() -> None:
             try:
@@ -102,18 +99,18 @@ class Clock:
         self.at(self.ns + round(seconds * 1e9), guarded)
 
     def rest(self, seconds: float) -> None:
-        """Virtual CPUs are not shared."""
+        """Return at once: virtual CPUs are not shared."""
 
     def hop_ns(self) -> int:
-        """How long a message takes, the step of its reader included: as measured."""
+        """A measured delay of one message, the step of its reader included."""
         return HOP_QUANTILES_NS[self._bits(HOP_BITS)]
 
     def between_ns(self, low_ns: int, high_ns: int) -> int:
-        """A delay, each as likely as the other."""
+        """A delay between both, uniformly distributed."""
         return low_ns + self._bits(30) * (high_ns - low_ns) // (1 << 30)
 
     def step(self) -> bool:
-        """The next event; False if there is none."""
+        """Handle the next event; False if there is none."""
         if not self.heap:
             return False
         self.ns, _, call = heapq.heappop(self.heap)
@@ -121,7 +118,7 @@ class Clock:
         return True
 
     def steps(self, count: int) -> bool:
-        """The next `count` events; False if there are not as many."""
+        """Handle the next `count` events; False if there are fewer."""
         heap, pop = self.heap, heapq.heappop
         for _ in range(count):
             if not heap:
@@ -131,7 +128,7 @@ class Clock:
         return True
 
     def watch_jobs(self) -> None:
-        """Have what is past its deadline fail: planned anew whenever a job has begun to wait."""
+        """Plan the deadlines of tasks: anew whenever a task has begun to wait."""
         due = self.tasks.deadline_ns()
         if due is None or (self._expiry_ns is not None and self._expiry_ns <= due):
             return

@@ -28,7 +28,7 @@ Sleep = dict[int, Readers]  # lines whose delivery would make no difference now,
 
 
 class HeldChannel(SimChannel):
-    """A channel whose messages arrive when they are chosen to."""
+    """A channel whose messages arrive when the Chooser delivers them."""
 
     def __init__(self, link: Link, clock: Clock, first_number: int) -> None:
         super().__init__(link, clock, first_number)
@@ -36,7 +36,6 @@ class HeldChannel(SimChannel):
         self._chooser = clock
 
     def put(self, message: Message) -> bool:
-        """Send."""
         if not self._chooser.chooses:
             return super().put(message)
         if not self.has_room():
@@ -46,7 +45,7 @@ class HeldChannel(SimChannel):
         return True
 
     def _come(self) -> None:
-        """The oldest one that is on its way has arrived."""
+        """Deliver the oldest message under way."""
         for index, (t_ns, message) in enumerate(self.mail):
             if t_ns == ON_ITS_WAY:
                 self.mail[index] = (self._chooser.ns, message)
@@ -55,13 +54,13 @@ class HeldChannel(SimChannel):
 
 
 class ChoicePoint:
-    """A moment with a choice: what could arrive, and what need not be tried."""
+    """A moment with several possible deliveries, and those of them that need not be tried."""
 
     def __init__(self, enabled: dict[int, Readers], sleep: Sleep, chosen: int) -> None:
         self.enabled, self.sleep, self.chosen = enabled, sleep, chosen
 
     def next_sleep(self) -> Sleep:
-        """What still makes no difference behind the choice."""
+        """The deliveries that stay irrelevant behind the choice."""
         readers = self.enabled[self.chosen]
         return {line: other for line, other in self.sleep.items() if _commute(readers, other)}
 
@@ -71,11 +70,11 @@ def _commute(one: Readers, other: Readers) -> bool:
 
 
 class Pruned(Exception):  # noqa: N818 - not an error: an order that is another one's equal
-    """Whatever could arrive now makes no difference to orders that were run already."""
+    """Every delivery that is possible now leads to an order that was run already."""
 
 
 class Chooser(Clock):
-    """`points`: the choices of a run so far; the first ones are given, then comes the first that may be."""
+    """A clock that replays the choices in `points`, then takes the first possible one each time."""
 
     def __init__(self, chance: Random, given: list[ChoicePoint]) -> None:
         super().__init__(chance)
@@ -85,22 +84,20 @@ class Chooser(Clock):
         self._lines: dict[int, tuple[Carrier, deque[Call]]] = {}
 
     def begin(self) -> None:
-        """From now on."""
         self.chooses = True
 
     def message(self, t_ns: int, line: Carrier, call: Call) -> None:
-        """It waits to be chosen."""
+        """Queue the message for a choice."""
         if not self.chooses:
             super().message(t_ns, line, call)
             return
         self._lines.setdefault(line.number, (line, deque()))[1].append(call)
 
     def steps(self, count: int) -> bool:
-        """The next `count` events, each one chosen."""
         return all(self.step() for _ in range(count))
 
     def step(self) -> bool:
-        """What is due at this very moment, else a delivery, else the next deadline."""
+        """Handle what is due at this moment, else deliver a message, else advance to the next deadline."""
         if not self.chooses or (self.heap and self.heap[0][0] <= self.ns):
             return super().step()
         enabled = {number: line.reader_names() for number, (line, calls) in self._lines.items() if calls}

@@ -37,9 +37,8 @@ FULL_NS: Final = 100_000  # between two looks whether a full channel has room
 
 
 class SimulatedMemory:
-    """Some bytes that the executive and a node both have (see `runtime.interface.SharedMemory`).
-
-    An order to the node carries its number.
+    """Memory shared by the executive and a node (see `runtime.interface.SharedMemory`); orders carry its
+    number.
     """
 
     def __init__(self, number: int) -> None:
@@ -47,26 +46,20 @@ class SimulatedMemory:
         self.memory = memoryview(bytearray(SHARED_BYTES))
 
     def fileno(self) -> int:
-        """The number."""
         return self._number
 
-    def seal(self) -> None:
-        """Nothing is open."""
+    def seal(self) -> None: ...
 
-    def close(self) -> None:
-        """The node keeps its view."""
+    def close(self) -> None: ...
 
 
 class SimEnd:
-    """One end, by its number."""
-
     __slots__ = ("channel", "number")
 
     def __init__(self, channel: "SimChannel", number: int) -> None:
         self.channel, self.number = channel, number
 
     def fileno(self) -> int:
-        """The number."""
         return self.number
 
 
@@ -91,7 +84,6 @@ class SimChannel:
 
     @property
     def number(self) -> int:
-        """Of its writing end."""
         return self.write.number
 
     def reader_names(self) -> frozenset[str]:
@@ -120,7 +112,7 @@ class SimChannel:
         return True
 
     def arrive(self) -> None:
-        """Something has come, or may be read now."""
+        """Wake the readers: a message has arrived, or may be read now."""
         readers = self.readers
         if len(readers) == 1:
             readers[0].run()
@@ -129,14 +121,14 @@ class SimChannel:
             node.run()
 
     def take(self) -> Message:
-        """The oldest message, which has arrived."""
+        """Remove and return the oldest message that has arrived."""
         if len(self.mail) == QUEUE_MAX:
             for node in list(self.writers):
                 self._clock.at(self._clock.ns, node.run)  # there is room again
         return self.mail.popleft()[1]
 
     def fence(self) -> None:
-        """No more mail. The reader comes to the end behind what was sent."""
+        """Refuse further mail. The reader reaches the end behind what was sent."""
         if self.ended:
             return
         self.ended = True
@@ -150,25 +142,25 @@ class SimChannel:
         self.arrive()
 
     def over(self) -> bool:
-        """Whether the reader has come to the end."""
+        """Whether the reader has reached the end."""
         return self.ended and not self.mail and self._clock.ns >= self._last_ns
 
     def refuse(self) -> None:
-        """A writer that waits for room dies."""
+        """End a writer that waits for room."""
         self.refused = True
         for node in list(self.writers):
             self._clock.at(self._clock.ns, node.run)
 
     def nudge(self) -> None:
-        """Orders arrive by themselves here."""
+        """Do nothing: orders arrive without it."""
 
     def close(self) -> None:
-        """The executive's hold on both ends."""
+        """Close the executive's hold on both ends."""
         self.closed = True
         self._look()
 
     def leave(self, node: "SimIO") -> None:
-        """`node` has no end of it any more."""
+        """Remove `node` from the readers and writers."""
         if node in self.readers:
             self.readers.remove(node)
         if node in self.writers:
@@ -244,17 +236,14 @@ class SimIO(NodeIO[SimChannel, SimChannel]):
         self._running = False
 
     def join(self, node: SimNode) -> None:
-        """Work for `node`."""
         self.node = node
 
     @property
     def now_ns(self) -> Callable[[], int]:
-        """Virtual time."""
         return partial(attrgetter("ns"), self._clock)
 
     @property
     def record(self) -> Recorder:
-        """Appends to the list that is the journal."""
         append, name = self._records.append, self.name
 
         def record(now_ns: int, event: Event, request_id: int, detail: int, brick: int = 0, /) -> None:
@@ -263,28 +252,24 @@ class SimIO(NodeIO[SimChannel, SimChannel]):
         return record
 
     def report(self, report: control.FromNode) -> None:
-        """Send to the executive."""
         self._report(report)
 
     def memory(self, number: int) -> memoryview:
-        """That of the cell with that number."""
         return self._cells[number].memory
 
     # -- its life -----------------------------------------------------------------------------
 
     def freeze(self) -> None:
-        """Stop it wherever it is; its last pulse was some time before."""
+        """Stop the node wherever it is; its last pulse was some time before."""
         if not self.frozen_ns:
             self.frozen_ns = self._clock.ns
             self._pulse_ns = self._clock.ns - self._clock.between_ns(0, PULSE_NS)
 
     def thaw(self) -> None:
-        """Let it go on from there."""
         self.frozen_ns = 0
         self.run()
 
     def pulse_ns(self, now_ns: int) -> int:
-        """When it was last seen running."""
         return self._pulse_ns if self.frozen_ns else now_ns
 
     def die_before(self, brick: str, effect: int) -> None:
@@ -303,12 +288,10 @@ class SimIO(NodeIO[SimChannel, SimChannel]):
         self._on_end(reason)
 
     def order(self, order: control.ToNode, fds: tuple[int, ...]) -> None:
-        """An order has arrived."""
         self._orders.append((order, fds))
         self.run()
 
     def run(self) -> None:
-        """Handle all that can be handled now."""
         if self._running or not self.alive or self.frozen_ns:
             return
         self._running = True
@@ -338,7 +321,7 @@ class SimIO(NodeIO[SimChannel, SimChannel]):
             self._awaited = 0
 
     def _set_timer(self) -> None:
-        """Be woken when something is due."""
+        """Have `run` called when something is due."""
         due = self.node.deadline_ns()
         if due is not None and due < self._timer_ns and due > self._clock.ns:
             self._timer_ns = due
@@ -351,13 +334,11 @@ class SimIO(NodeIO[SimChannel, SimChannel]):
     # -- reading ------------------------------------------------------------------------------
 
     def open_input(self, hosted: SimBrick, port: str, number: int) -> SimChannel:
-        """The channel with that end, which has one reader more."""
         channel = self._ends(number)
         channel.readers.append(self)
         return channel
 
     def close_input(self, end: SimChannel) -> None:
-        """Read it no more."""
         end.leave(self)
 
     def rewired(self) -> None:
@@ -412,12 +393,11 @@ class SimIO(NodeIO[SimChannel, SimChannel]):
         return first is not None or ended is not None
 
     def _handle_end(self, hosted: SimBrick, port: str) -> None:
-        """The channel is drained to its end."""
+        """Close the input: the channel is drained to its end."""
         self.node.bind_input(hosted.name, port, None)
         self.node.step(hosted, port, ChannelEnded())
 
     def mail_waits(self) -> bool:
-        """Whether there is mail at an open port."""
         return any(
             channel.mail and channel.mail[0][0] <= self._clock.ns
             for hosted in self._fronts
@@ -426,34 +406,28 @@ class SimIO(NodeIO[SimChannel, SimChannel]):
         )
 
     def wait_for_order(self) -> bool:
-        """An order makes the node run again."""
         return False
 
     # -- writing ------------------------------------------------------------------------------
 
     def open_output(self, number: int) -> SimChannel:
-        """The channel with that end, which has one writer more."""
         channel = self._ends(number)
         channel.writers.append(self)
         return channel
 
     def close_output(self, end: SimChannel) -> None:
-        """Write to it no more."""
         self._backlog.pop(end, None)
         end.leave(self)
 
     def has_room(self, end: SimChannel) -> bool:
-        """Whether a write can succeed now."""
         return end not in self._backlog and end.has_room()
 
     def write(
         self, hosted: SimBrick, port: str, end: SimChannel, message: Message, raw: bytes | None
     ) -> bool:
-        """Send. False if there is no room now."""
         return not (self._backlog and end in self._backlog) and end.put(message)
 
     def write_in_turn(self, hosted: SimBrick, port: str, end: SimChannel, message: Message) -> None:
-        """Send, behind what waits for room."""
         if not self.write(hosted, port, end, message, None):
             if end not in self._backlog:
                 self._backlog[end] = deque()
@@ -461,7 +435,7 @@ class SimIO(NodeIO[SimChannel, SimChannel]):
             self._backlog[end].append(message)
 
     def _write_backlog(self, end: SimChannel) -> None:
-        """Send what waits, as far as there is room, and look again for the rest."""
+        """Write the backlog as far as there is room; try again later with the rest."""
         backlog = self._backlog.get(end)
         if backlog is None or not self.alive:
             return
@@ -474,28 +448,27 @@ class SimIO(NodeIO[SimChannel, SimChannel]):
             self.run()
 
     def write_or_drop(self, end: SimChannel, message: Message) -> None:
-        """Send if there is room."""
         if self.has_room(end):
             end.put(message)
 
     # -- stopping between two effects ---------------------------------------------------------
 
     def stops(self, hosted: SimBrick) -> bool:
-        """Whether the next effect has to wait; or the node dies here."""
+        """Whether the next effect has to wait. Raises Died where the node was to die before it."""
         if self._awaited or self.frozen_ns or self._slow_until_ns > self._clock.ns:
             return True
         self.step_done(hosted)
         return False
 
     def step_done(self, hosted: SimBrick) -> None:
-        """Die, if the node was to die here."""
+        """Die if the node was to die after its last effect."""
         if self._doom == (hosted.name, hosted.performed):
             raise Died
 
     def hold(
         self, hosted: SimBrick, effects: list[Effect], at: int, end: SimChannel | None, *, filtered: bool
     ) -> None:
-        """Go on from there later. A write that is held up too long ends the node."""
+        """Continue with the effects from `at` later. A write that is held up too long ends the node."""
         limit_ns = self._clock.ns + WRITE_NS_MAX if end is not None else NEVER
         self._held.append(_Held(hosted, effects, at, end, filtered, limit_ns))
         self._held_up = True
@@ -503,7 +476,7 @@ class SimIO(NodeIO[SimChannel, SimChannel]):
             self._clock.at(limit_ns, self.run)
 
     def _go_on(self) -> bool:
-        """Perform what was held, unless something holds the node up still. True if all is done."""
+        """Perform the held effects, unless the node is still held. True if none is left."""
         if self._awaited or self._slow_until_ns > self._clock.ns:
             return False
         self._held_up = False
@@ -540,11 +513,9 @@ class SimIO(NodeIO[SimChannel, SimChannel]):
     # -- faults and ends ----------------------------------------------------------------------
 
     def kill(self) -> None:
-        """Die, at once."""
         raise Died
 
     def stop_detected(self, brick: str, reason: str) -> NoReturn:
-        """Die, at once, with a reason."""
         raise Died(f"{brick}: detected stop: {reason}")
 
     def wait_until_applied(self, fault: int) -> None:
@@ -557,8 +528,7 @@ class SimIO(NodeIO[SimChannel, SimChannel]):
             self._slow_until_ns, self._held_up = max(self._slow_until_ns, self._clock.ns) + by_ns, True
             self._clock.at(self._slow_until_ns, self.run)
 
-    def begin_throttle(self) -> None:
-        """Every step takes the same of a CPU."""
+    def begin_throttle(self) -> None: ...
 
     def throttle(self, stretch_ns: Callable[[int], int]) -> None:
         """Hold the effects of this step for as long as its share of a CPU makes it longer."""

@@ -70,20 +70,19 @@ class SimProcess:
 
     @property
     def node(self) -> SimNode | None:
-        """The node that it has become."""
         return self.io.node if self.io is not None else None
 
     # -- signals ------------------------------------------------------------------------------
 
     def kill(self) -> bool:
-        """It dies soon."""
+        """Send SIGKILL, which takes effect some microseconds later."""
         if self.dead:
             return False
         self._clock.message(self._clock.ns + self._clock.between_ns(*SIGNAL_NS), self._to_it, self.die)
         return True
 
     def freeze(self, for_ms: int = 0) -> bool:
-        """It stops at once. Here the executive does not die before it lets it go on."""
+        """Stop it at once. `for_ms` is not used: the simulated executive does not die."""
         if self.dead:
             return False
         self._still = True
@@ -93,7 +92,6 @@ class SimProcess:
         return True
 
     def thaw(self) -> bool:
-        """It goes on."""
         if self.dead:
             return False
         self._still = False
@@ -102,32 +100,27 @@ class SimProcess:
         return True
 
     def stopped(self) -> bool:
-        """Whether it runs no more."""
         return self.dead or self._still or (self.io is not None and bool(self.io.frozen_ns))
 
     def silent(self, now_ns: int, deadline_ns: int) -> bool:
-        """Whether it lives, as far as is known, and its pulse is older than `deadline_ns`."""
         return self.alive and self.pulse_ns(now_ns) < now_ns - deadline_ns
 
     def hangs(self, now_ns: int, deadline_ns: int) -> bool:
-        """The same: no virtual process is starved."""
         return self.silent(now_ns, deadline_ns)
 
     def pulse_ns(self, now_ns: int) -> int:
-        """When it was last seen running."""
         return now_ns if self.io is None else self.io.pulse_ns(now_ns)
 
     # -- death --------------------------------------------------------------------------------
 
     def die(self) -> None:
-        """Dead at once."""
         if self.io is not None:
             self.io.die()
         else:
             self.ended("")
 
     def ended(self, reason: str) -> None:
-        """It is dead: watchers notice it later."""
+        """Mark it dead; watchers notice it later."""
         if self.dead:
             return
         self.dead = True
@@ -152,7 +145,6 @@ class SimProcess:
     # -- the line -----------------------------------------------------------------------------
 
     def order(self, order: control.ToNode, fds: tuple[int, ...]) -> None:
-        """It will read this. Raises StepFailed if it is gone."""
         if self.dead:
             raise StepFailed(f"{self.name} cannot be reached")
         delay_ns = self._clock.between_ns(*LINE_NS)
@@ -164,7 +156,7 @@ class SimProcess:
         self._clock.message(self._order_ns, self._to_it, self.read)
 
     def read(self) -> None:
-        """The oldest order is here."""
+        """Handle the oldest order."""
         order, fds = self._orders.popleft()
         if self.dead:
             return
@@ -188,24 +180,20 @@ class SimProcess:
                 self.io.freeze()
 
     def report(self, report: control.FromNode) -> None:
-        """Send to the executive."""
         delay_ns = self._clock.between_ns(*LINE_NS) + self._pool.rouse_ns()
         self._report_ns = max(self._report_ns + 1, self._clock.ns + delay_ns)
         self._reports.append(report)
         self._clock.message(self._report_ns, self._to_us, self.on_line)
 
     def on_line(self) -> None:
-        """The oldest report is at the executive."""
+        """Hand the oldest report to the executive."""
         self._pool.on_report(self, self._reports.popleft())
 
-    def assigned(self) -> None:
-        """Nothing to open."""
+    def assigned(self) -> None: ...
 
-    def announce(self) -> None:
-        """Orders arrive by themselves."""
+    def announce(self) -> None: ...
 
     def announced(self) -> bool:
-        """Whether an order is under way."""
         return False
 
 
@@ -229,11 +217,9 @@ class SimSenses(Senses):
             process.notice(functools.partial(noticed, node))
 
     def forget(self) -> None:
-        """Watch no node."""
         self._nodes = {}
 
     def pulse_ns(self, node: str, now_ns: int) -> int:
-        """When `node` was last seen running."""
         return self._nodes[node].pulse_ns(now_ns)
 
 
@@ -261,13 +247,12 @@ class SimProcessPool:
         self.on_freeze: Callable[[SimProcess], None] = lambda process: None
 
     def rouse_ns(self) -> int:
-        """How much longer a report takes now: the executive may sleep."""
+        """Extra delay of a report, in ns, because the executive may sleep."""
         asleep = self.clock.ns - self._reported_ns > SLEEPS_AFTER_NS
         self._reported_ns = self.clock.ns
         return self.clock.between_ns(*ROUSED_NS) if asleep else 0
 
     def spare(self, zygote: str) -> Generator[Wait, dict[Key, bytes], SimProcess]:
-        """A fresh one."""
         process = SimProcess(len(self.by_number) + 1, self)
         self.by_number[process.pid] = process
         self.processes.append(process)
@@ -275,11 +260,11 @@ class SimProcessPool:
         return process
 
     def wait_for_forks(self, zygote: str) -> Generator[Wait, dict[Key, bytes], None]:
-        """It always is."""
+        """Return at once: a virtual fork takes no time."""
         yield Wait(frozenset())
 
     def refill(self, zygote: str, count: int) -> None:
-        """There are always enough."""
+        """Do nothing: the supply of spares is unlimited."""
 
     def order(self, process: interface.Process, order: control.ToNode, fds: tuple[int, ...] = ()) -> None:
         """Send an order. Raises StepFailed if the process is gone."""

@@ -67,14 +67,13 @@ def traced(setup: Setup, make: MakeSetting | None = None) -> Trace:
 
 
 class _Records(list[Record]):
-    """A journal whose records go to `happened` too."""
+    """A journal that also appends its records to `happened`."""
 
     def __init__(self, happened: list[Happening]) -> None:
         super().__init__()
         self._happened = happened
 
     def append(self, record: Record) -> None:
-        """Here and there."""
         super().append(record)
         self._happened.append(record)
 
@@ -90,18 +89,16 @@ class _Traced(World):
         return self.journals.setdefault(name, _Records(self.happened))
 
     def log(self, event: str, text: str) -> None:
-        """For the outcome, and in its place."""
         super().log(event, text)
         self.happened.append(LoggedLine(self.loop.ns, event, text))
 
     def write(self, now_ns: int, request_id: int, epoch: int, kind: EntryKind, payload: bytes) -> None:
-        """An entry of the dialogue, and in its place."""
         super().write(now_ns, request_id, epoch, kind, payload)
         self.happened.append(self.dialogue[-1])
 
 
 def _recording(happened: list[Happening]) -> type[SimChannel]:
-    """A kind of channel that appends to `happened` whatever is put into it."""
+    """A class of channels that append what is sent to `happened`."""
 
     class Recorded(SimChannel):
         def __init__(self, link: Link, clock: Clock, first_number: int) -> None:
@@ -109,7 +106,6 @@ def _recording(happened: list[Happening]) -> type[SimChannel]:
             self._now = clock
 
         def put(self, message: Message) -> bool:
-            """Send; what there was no room for was not sent."""
             if not super().put(message):
                 return False
             link = self.link
@@ -123,7 +119,7 @@ def _recording(happened: list[Happening]) -> type[SimChannel]:
 
 
 def lines(trace: Trace) -> Iterator[str]:
-    """The whole of it, a line each, with the virtual time in ms; the last one is the end."""
+    """A line per entry, with the virtual time in ms; the last one is the end."""
     for one in trace.happened:
         yield f"{milliseconds(one.t_ns):.6f} {_line(one)}"
     rest = trace.run.rest
@@ -155,7 +151,7 @@ def brief(message: Message) -> str:
 
 
 def digest(data: bytes) -> str:
-    """How much it is, and whether it is the same."""
+    """Length and hash of `data`."""
     return f"{len(data)}B/{zlib.crc32(data):08x}"
 
 

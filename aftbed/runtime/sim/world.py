@@ -110,7 +110,7 @@ class Run(msgspec.Struct, frozen=True):
 
 @lru_cache(maxsize=8)
 def requests_of(seed: int) -> list[bytes]:
-    """The load of a seed."""
+    """The payloads of a seed's load."""
     return sample_requests(seed, REQUESTS)
 
 
@@ -122,7 +122,6 @@ def graph_of(ftm: str, placement: str) -> Graph:
 
 @lru_cache(maxsize=1)
 def own_codec() -> Codec:
-    """aftbed's own DBC."""
     return load_dbc()
 
 
@@ -144,13 +143,10 @@ def nothing_off_line(place: str) -> NoReturn:
 
 
 class ExecutiveJournal:
-    """The executive's records."""
-
     def __init__(self, records: list[Record]) -> None:
         self._records = records
 
     def write(self, now_ns: int, event: Event, request_id: int, detail: int, brick: int = 0) -> None:
-        """Append one."""
         self._records.append(Record(now_ns, event, request_id, detail, "supervisor", brick))
 
 
@@ -171,7 +167,7 @@ class Drive(CarLink):
         self._under_way = self._stepping = False
 
     def join(self, wake: Callable[[], None]) -> "Drive":
-        """Serve a client, which is woken where there may be requests."""
+        """Serve a client; `wake` is called where there may be requests."""
         self._wake, self._began_ns = wake, self._began_ns or self._clock.ns
         return self
 
@@ -182,7 +178,6 @@ class Drive(CarLink):
         return self._car.advance(now_ns - self._began_ns)
 
     def deliver(self, reply: Reply, now_ns: int) -> None:
-        """To the brakes."""
         self._car.deliver(reply.payload, now_ns - self._began_ns, replica=reply.replica, epoch=reply.epoch)
 
     def deadline_ns(self) -> int | None:
@@ -194,16 +189,15 @@ class Drive(CarLink):
 
     @property
     def over(self) -> bool:
-        """The car makes no more requests."""
+        """Whether the car makes no more requests."""
         return self._car.due_ns() is None
 
     def go(self) -> None:
-        """The run is launched."""
         self._under_way = True
         self._step_by_step()
 
     def result(self) -> VehicleResult:
-        """So far."""
+        """The result so far."""
         return self._car.result()
 
     def disturb(self, number: int, fault: FaultKind, draw: int) -> None:
@@ -295,46 +289,37 @@ class World:
     # -- the runtime, as the executive sees it: see `runtime.interface.Runtime` ------------------
 
     def channel(self, link: Link) -> SimChannel:
-        """A fresh one."""
         channel = self._channel(link, self.loop, len(self._ends) + 1)
         for end in (channel.write, channel.read):
             self._ends[end.number] = channel
         return channel
 
     def shared_memory(self) -> SimulatedMemory:
-        """A fresh one."""
         cell = SimulatedMemory(len(self.pool.cells))
         self.pool.cells.append(cell)
         return cell
 
     def device(self, kind: str, incarnation: int) -> tuple[str, bytes]:
-        """By the kind of its brick."""
         return {"watchdog": "sensor", "client": "source"}.get(kind, ""), b""
 
     def journal_of(self, node: str, incarnation: int) -> str:
-        """A name."""
         return f"{node.replace('/', '.')}.{incarnation}"
 
     def records(self, journal: str) -> Iterable[Record]:
-        """What has been written."""
         return self.journals.get(journal, ())
 
     def recorded_requests(self) -> tuple[bytes, ...]:
-        """The first few of the dialogue."""
         return tuple(e.payload for e in self.dialogue if e.kind is EntryKind.SENT)[:16]
 
     def draw(self, number: int) -> int:
-        """Of the run's seed."""
         return Random(f"{self.setup.seed}/{number}").getrandbits(DRAW_BITS)
 
     def disturb(self, number: int, fault: FaultKind, draw: int) -> Keys:
-        """In the car's own bus."""
         assert self._drive is not None, fault
         self._drive.disturb(number, fault, draw)
         yield Wait(frozenset())
 
     def watch(self, number: int, condition: Condition, met: Callable[[Met], None]) -> Keys:
-        """By the car itself."""
         assert self._drive is not None, condition
         self._drive.watch(number, condition, met)
         yield Wait(frozenset())
@@ -344,17 +329,15 @@ class World:
         raise AssertionError(f"{process} has no memory")
 
     def bus_fault(self, number: int) -> BusReport | None:
-        """By the car's bus."""
         return self._drive.report(number) if self._drive is not None else None
 
     def pin(self, pid: int, cpu: int) -> None:
-        """There are no cores here."""
+        """Do nothing: virtual nodes have no cores."""
 
     def record_adaptation(self, adaptation: bytes) -> None:
-        """The outcome has them all."""
+        """Do nothing: `outcome` has all adaptations."""
 
     def log(self, event: str, text: str) -> None:
-        """For the outcome."""
         self.logged.append((self.loop.ns, event, text))
 
     # -- parts --------------------------------------------------------------------------------
@@ -373,7 +356,6 @@ class World:
         return Load(client, self, self._requests, self.setup.count, self.setup.rate_hz)
 
     def write(self, now_ns: int, request_id: int, epoch: int, kind: EntryKind, payload: bytes) -> None:
-        """An entry of the dialogue."""
         self.dialogue.append(Entry(now_ns, request_id, epoch, kind, payload))
 
     def _on_report(self, process: SimProcess, report: control.FromNode) -> None:
@@ -425,13 +407,13 @@ class World:
         self.loop.after(TICK_SECONDS, self._tick)
 
     def run(self) -> Run:
-        """From the launch to the rest."""
+        """Run from the launch to the state of rest."""
         self.start()
         self.end()
         return self.outcome()
 
     def start(self) -> None:
-        """Launch; requests come from here on."""
+        """Launch; requests are sent from here on."""
         self.loop.tasks.start("launch", self._launch(), self._on_launched)
         self.loop.watch_jobs()
         while not self._launched:
@@ -439,26 +421,26 @@ class World:
             self.loop.watch_jobs()
 
     def advance(self, until_ns: int) -> None:
-        """Let happen what happens up to that time."""
+        """Handle all events up to `until_ns`."""
         while self.loop.heap and self.loop.heap[0][0] <= until_ns:
             self.loop.step()
             self.loop.watch_jobs()
         self.loop.ns = max(self.loop.ns, until_ns)
 
     def inject(self, fault: Fault) -> None:
-        """Arm one more, now. Raises ConfigError where there is no such fault."""
+        """Arm another fault now. Raises ConfigError where there is no such fault."""
         check(fault, self.setup.scenario)
         fault.check(self.controller.deployment.graph)
         self.loop.tasks.start("inject", self.controller.faults.arm(fault), lambda failure: None)
         self.loop.watch_jobs()
 
     def adapt(self, goal: Goal) -> None:
-        """Ask for an adaptation, now. Raises ConfigError where it is refused at once."""
+        """Request an adaptation now. Raises ConfigError where it is refused at once."""
         self.controller.adaptations.ask(goal, lambda outcome: None)
         self.loop.watch_jobs()
 
     def end(self) -> None:
-        """Come to rest: all requests made, all faults over, everything answered; or to the bound."""
+        """Wait until all requests are sent and answered and all faults are over, or for the bound."""
         loop = self.loop
         rested_ns = done_ns = 0
         for _ in range(EVENTS_MAX // LOOK_EVERY):
@@ -475,13 +457,13 @@ class World:
         raise AssertionError(f"no end in sight: {self.setup}")
 
     def _io_of(self, brick: str) -> SimIO | None:
-        """That of the node that hosts `brick`, if it is not dead."""
+        """The node that hosts `brick`, unless it is dead."""
         deployment = self.controller.deployment
         process = deployment.nodes.get(deployment.graph.node_of(brick))
         return process.io if isinstance(process, SimProcess) and not process.dead else None
 
     def _source_ended(self) -> bool:
-        """Whether all requests have been made, be they answered or not."""
+        """Whether all requests have been sent, answered or not."""
         io = self._io_of("client")
         if io is None or io.node.device is None:
             return False
@@ -509,7 +491,7 @@ class World:
         return found + [f"{p.name} is dead or stopped" for p in processes if p.stopped()][:1]
 
     def _states(self) -> dict[str, str]:
-        """Digests by replica; none of one that is stopped, or whose function hands out no state."""
+        """Digests of states by replica, without replicas that are stopped or whose function has no state."""
         deployment, found = self.controller.deployment, dict[str, str]()
         for replica in filter(None, (deployment.leader, deployment.backup)):
             io = self._io_of(f"{replica}/server")
@@ -520,13 +502,13 @@ class World:
         return found
 
     def _limit_ns(self) -> int:
-        """A source that is held up for ever must not hold up the simulator."""
+        """The end of a run whose source is held up."""
         period = 1 / self.setup.rate_hz if self.setup.rate_hz else 0.001
         seconds = 60.0 if self._drive is not None else self.setup.count * period
         return START_NS + round(seconds * 1e9) + 2 * REST_NS_MAX
 
     def outcome(self) -> Run:
-        """What there is to judge."""
+        """The record of the run, to be judged."""
         deployment = self.controller.deployment
         for process in deployment.nodes.values():
             if isinstance(process, SimProcess) and process.node is not None and process.incarnation == 1:
@@ -556,5 +538,4 @@ class World:
 
 
 def simulate(setup: Setup) -> Run:
-    """One run."""
     return World(setup).run()

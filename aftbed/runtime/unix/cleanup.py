@@ -85,7 +85,9 @@ class UndoLedger:
         self._path, self._waker, self._by = private / LEDGER_NAME, waker, by
 
     def ahead(self, name: str, pid: int, for_ms: int) -> None:
-        """Before SIGSTOP of `pid`, a child of this process. Raises StepFailed if it cannot be written."""
+        """Record that `pid`, a child of this process, is about to get SIGSTOP. Raises StepFailed if it
+        cannot be written.
+        """
         due_ns = time.monotonic_ns() + for_ms * 1_000_000 if for_ms else 0
         try:
             self._write(StoppedProcess(name, pid, linux.started(pid), due_ns))
@@ -94,7 +96,7 @@ class UndoLedger:
             raise StepFailed(f"{name} is not stopped: its undo cannot be written: {error.strerror}") from None
 
     def undone(self, pid: int, start: int | None = None) -> None:
-        """`pid` has been seen running, or gone. Without this line the warden acts."""
+        """Record that `pid` was seen running, or gone. Without this line the warden acts."""
         with contextlib.suppress(OSError):
             self._write(Undone(pid, linux.started(pid) if start is None else start, self._by))
 
@@ -104,7 +106,7 @@ class UndoLedger:
 
 
 class LedgerReader:
-    """What is still to be undone, by process."""
+    """The entries that are still to be undone, by process."""
 
     def __init__(self, private: Path) -> None:
         self._path, self._at = private / LEDGER_NAME, 0
@@ -124,7 +126,7 @@ class LedgerReader:
             self.take(line)
 
     def take(self, line: bytes) -> None:
-        """One line; one that is no entry is skipped."""
+        """Read one line; a line that is no entry is skipped."""
         try:
             entry = decode_entry(line)
         except msgspec.MsgspecError:
@@ -138,17 +140,17 @@ class LedgerReader:
             self.open[key] = entry  # stopped twice: the longer one counts
 
     def overdue(self, now_ns: int) -> list[StoppedProcess]:
-        """What the supervisor should have undone by now."""
+        """The entries that the supervisor should have undone by `now_ns`."""
         return [s for s in self.open.values() if s.due_ns and s.due_ns + LATE_NS_MAX <= now_ns]
 
     def patience_ms(self, now_ns: int) -> float | None:
-        """How long until something is overdue; None if nothing will be."""
+        """Time until an entry is overdue, in ms; None if there is none."""
         dues = [s.due_ns + LATE_NS_MAX - now_ns for s in self.open.values() if s.due_ns]
         return max(0.0, min(dues) / 1e6) if dues else None
 
 
 class ThawOutcome(Enum):
-    """What became of a process that was to be thawed."""
+    """What became of a process that was to be continued."""
 
     GONE = "was gone"
     RAN = "ran already"
@@ -157,7 +159,7 @@ class ThawOutcome(Enum):
 
 
 def thaw(stopped: StoppedProcess, private: Path) -> ThawOutcome:
-    """Let the very process that was stopped go on, if it is of the run in `private`, and see it run."""
+    """Continue the stopped process, if it belongs to the run in `private`, and check that it runs."""
     if linux.started(stopped.pid) != stopped.start:
         return ThawOutcome.GONE
     if linux.state_of(stopped.pid) != "T":
@@ -173,7 +175,7 @@ def thaw(stopped: StoppedProcess, private: Path) -> ThawOutcome:
 
 
 def undo_overdue(reader: LedgerReader, ledger: UndoLedger, private: Path) -> Iterator[str]:
-    """Undo what the supervisor did not; what was done, for people."""
+    """Undo what the supervisor did not undo; yields what was done, for people."""
     now_ns = time.monotonic_ns()
     for stopped in reader.overdue(now_ns):
         outcome = thaw(stopped, private)
@@ -186,7 +188,7 @@ def undo_overdue(reader: LedgerReader, ledger: UndoLedger, private: Path) -> Ite
 
 
 def kill_open(reader: LedgerReader, private: Path) -> None:
-    """The run has ended: kill what is still stopped."""
+    """Kill what is still stopped after the run has ended."""
     for stopped in reader.open.values():
         run_directory.signalled(stopped.pid, stopped.start, private, signal.SIGKILL)
 
@@ -272,7 +274,7 @@ Left = Member | LeftDirectory
 
 
 def find() -> list[Left]:
-    """What dead runs have left, processes first; a run that ends meanwhile is given its second."""
+    """What dead runs have left, processes first; a run that is just ending gets one second."""
     limit = time.monotonic() + GONE_SECONDS_MAX
     found = _leftovers()
     while found and time.monotonic() < limit:
@@ -311,7 +313,7 @@ def _leftovers() -> list[Left]:
 
 
 def _is_run(path: Path) -> bool:
-    """Whether it can be a run's directory: other things that lie there are not ours."""
+    """Whether `path` can be the directory of a run: the folder may hold other things."""
     try:
         state = path.lstat()
     except OSError:
@@ -321,7 +323,7 @@ def _is_run(path: Path) -> bool:
 
 
 def _alive(run: Path) -> bool:
-    """Whether its command lives, even if the directory of the run was removed meanwhile."""
+    """Whether the run's command lives, even if the directory of the run was removed."""
     return run_directory.owned(run) if run.exists() else run_directory.held(run)
 
 

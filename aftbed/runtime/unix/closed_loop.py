@@ -233,7 +233,7 @@ class Meter:
         self._samples: deque[tuple[float, float]] = deque(maxlen=LOAD_SAMPLES + 1)  # busy, all; seconds
 
     def values(self) -> dict[Resource, float]:
-        """As they are now; CPU load is not known at the first call."""
+        """The present values; the CPU load is unknown at the first call."""
         found: dict[Resource, float] = {}
         if "cpus" in self._wanted:
             found["cpus"] = float(len(os.sched_getaffinity(0)))
@@ -246,7 +246,7 @@ class Meter:
 
 
 def _cpu_seconds() -> tuple[float, float]:
-    """Busy and all, of all CPUs, since the boot. Guests are in `user` already."""
+    """CPU seconds, busy and total, of all CPUs since the boot. Guests are in `user` already."""
     import psutil  # noqa: PLC0415 - 15 ms, if a policy asks for it
 
     t = psutil.cpu_times()
@@ -278,7 +278,6 @@ class ClosedLoop:
 
     @property
     def state(self) -> State:
-        """What it waits for."""
         if self._open is None:
             return "free"
         return "asking" if self._line is None else "adapting"
@@ -309,7 +308,7 @@ class ClosedLoop:
         return {fd for fd, _ in poll.poll(wait_ns / 1e6)}
 
     def on_event(self, event: dict[str, object]) -> None:
-        """An event of the run; its time shows when the run's clock began."""
+        """Show an event of the run; its time gives the start of the run's clock."""
         now_ns = time.monotonic_ns()
         zero_ns = now_ns - round(float(str(event["t_ms"])) * 1e6)
         self._started_ns = min(zero_ns, self._started_ns) if self._clock_known else zero_ns
@@ -318,7 +317,6 @@ class ClosedLoop:
             self._step(seen, now_ns)
 
     def close(self) -> None:
-        """The run has ended."""
         if self._line is not None and self._line.fileno() in self._ready(self._line.fileno(), 0):
             self._take_answer(self._line)
         if self._open is not None:
@@ -376,7 +374,6 @@ class ClosedLoop:
             self._log("question", f"{proposal.action}? y or n")
 
     def _take_decision(self) -> None:
-        """A line was typed."""
         assert self._open is not None
         typed = os.read(sys.stdin.fileno(), 4096)
         self._input_ended = not typed
@@ -393,7 +390,7 @@ class ClosedLoop:
         self._step(Declined(), time.monotonic_ns())
 
     def _carry_out(self, proposal: Proposal) -> None:
-        """Request it from the run, which answers later."""
+        """Send it to the run, which answers later."""
         try:
             if reason := _unsuitable(proposal.target, self._application):
                 raise ConfigError(reason)
@@ -404,7 +401,7 @@ class ClosedLoop:
             self._end(proposal, "refused", str(error))
 
     def _take_answer(self, line: Line[Answer]) -> None:
-        """The run has answered, or has ended, or did not answer in time."""
+        """Handle the run's answer, its end, or the missed deadline of an answer."""
         proposal, self._line = self._open, None
         assert proposal is not None
         try:
@@ -417,7 +414,7 @@ class ClosedLoop:
             self._end(proposal, outcome.outcome, outcome.reason)
 
     def _end(self, proposal: Proposal, outcome: str, why: str = "") -> None:
-        """Record and show it. Which FTM runs then is read from the history."""
+        """Record and show the end of a proposal. Which FTM runs then is read from the history."""
         self._open = None
         ended = Proposed(
             round((proposal.now_ns - self._started_ns) / 1e6, 3),

@@ -26,19 +26,19 @@ CPU_SAMPLE_SECONDS: Final = 0.2
 
 
 class StatusQuery(msgspec.Struct, frozen=True, tag=True):
-    """The state of the run."""
+    """Ask for the state of the run."""
 
 
 class ProcessesQuery(msgspec.Struct, frozen=True, tag=True):
-    """All processes, as `ProcessRow`."""
+    """Ask for all processes, as `ProcessRow`."""
 
 
 class GraphQuery(msgspec.Struct, frozen=True, tag=True):
-    """The graph that runs."""
+    """Ask for the graph that runs."""
 
 
 class AdaptationsQuery(msgspec.Struct, frozen=True, tag=True):
-    """The adaptations that have ended."""
+    """Ask for the adaptations that have ended."""
 
 
 class PlanQuery(msgspec.Struct, frozen=True, tag=True):
@@ -60,11 +60,11 @@ class AdaptCommand(msgspec.Struct, frozen=True, tag=True):
 
 
 class StopCommand(msgspec.Struct, frozen=True, tag=True):
-    """End the run."""
+    pass
 
 
 class PlanAnswer(msgspec.Struct, frozen=True):
-    """Of a PlanQuery."""
+    """The answer to a PlanQuery."""
 
     there: Plan
     back: Plan

@@ -31,7 +31,7 @@ REQUESTS_MAX: Final = 16  # connections at once, and requests that wait for the 
 
 
 class ControlServer:
-    """Of one run. `finish` ends it."""
+    """Answers the requests that other commands send to one run; `finish` ends the run."""
 
     def __init__(
         self,
@@ -57,7 +57,7 @@ class ControlServer:
         self._loop.read(self._listener.fileno(), self._accept)
 
     def launched(self) -> None:
-        """The graph is complete, and the function works: from here on it can be disturbed and changed."""
+        """The graph is complete and the function works: faults and adaptations are accepted from here on."""
         early, self._early = self._early, None
         for line, request in early or ():
             if self._lines.get(line.fileno()) is line:  # else the command has given up
@@ -145,7 +145,6 @@ class ControlServer:
                 assert_never(request)
 
     def _status(self) -> dict[str, object]:
-        """For `aftbed status`."""
         deployment = self._deployment
         return {
             "run": self._options.run,

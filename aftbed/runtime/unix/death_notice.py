@@ -63,7 +63,9 @@ class _Timespec(ctypes.Structure):
 
 
 class _Word:
-    """The futex in the header of the journal at `path`, mapped by itself: a journal's mapping may move."""
+    """The futex in the header of the journal at `path`, in a mapping of its own, because a journal's mapping
+    may move.
+    """
 
     def __init__(self, path: Path) -> None:
         descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC)
@@ -76,7 +78,6 @@ class _Word:
 
     @property
     def value(self) -> int:
-        """The word as it is now."""
         return self._word.value
 
     @value.setter
@@ -85,7 +86,7 @@ class _Word:
 
 
 class Lifeline:
-    """This thread's lifeline. Keep it: the kernel reads its memory when this thread dies."""
+    """This thread's lifeline. It must stay referenced: the kernel reads its memory when the thread dies."""
 
     def __init__(self, path: Path) -> None:
         self._word = _Word(path)
@@ -115,14 +116,13 @@ class LifelineWatcher:
         _thread.start_new_thread(self._watch, ())
 
     def died(self) -> bytes:
-        """The indices of those that have died since the last call."""
+        """The indices of those that died since the last call."""
         try:
             return os.read(self.fd, 64)
         except BlockingIOError:
             return b""
 
     def close(self) -> None:
-        """Watch no more; the thread ends within `WAIT_SECONDS`."""
         if self._wanted.locked():
             self._wanted.release()
         os.close(self.fd)

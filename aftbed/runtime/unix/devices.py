@@ -44,7 +44,6 @@ class ProcessSenses(Senses):
         self._lifelines = LifelineWatcher(order.journals)
 
     def forget(self) -> None:
-        """Watch no node."""
         for fd in self._pidfds:
             os.close(fd)
         for header in self._headers.values():
@@ -59,7 +58,7 @@ class ProcessSenses(Senses):
         return (*lifelines, *self._pidfds)
 
     def died(self, fd: int) -> list[str]:
-        """`fd` is readable: the nodes that have died."""
+        """The nodes behind `fd`, which is readable, that have died."""
         if self._lifelines is not None and fd == self._lifelines.fd:
             return [self._nodes[index] for index in self._lifelines.died()]
         return [self._pidfds[fd]]
@@ -84,7 +83,6 @@ class BusLink(CarLink):
         self._bus = open_bus(BusOptions(port=port, node=GATEWAY, uses=gateway.uses))
 
     def fds(self) -> tuple[int, ...]:
-        """The bus."""
         return (self._bus.fileno(),)
 
     def read(self) -> Iterator[bytes]:
@@ -99,7 +97,6 @@ class BusLink(CarLink):
             self._bus.notice(can_id, word)
 
     def deliver(self, reply: Reply, now_ns: int) -> None:
-        """Send the reply as frames."""
         for frame in self._gateway.on_reply(reply.payload, reply.replica, reply.epoch):
             self._bus.send(frame)
 

@@ -12,7 +12,7 @@ from aftbed.runtime.tasks import Tasks
 
 
 def _call(call: Callable[[], None]) -> None:
-    """An order to a process that is gone must not end the run: its death is seen anyway."""
+    """Call `call`. An order to a process that is gone must not end the run: its death is noticed anyway."""
     with contextlib.suppress(StepFailed):
         call()
 
@@ -34,29 +34,25 @@ class EventLoop:
         self._epoll.register(fd, select.EPOLLIN)
 
     def forget(self, fd: int) -> None:
-        """Undo `read`; before the descriptor is closed."""
+        """Undo `read`; call it before the descriptor is closed."""
         if self._readers.pop(fd, None) is not None:
             self._epoll.unregister(fd)
 
     def after(self, seconds: float, call: Callable[[], None]) -> None:
-        """Call `call` once, `seconds` from now."""
         due = time.monotonic_ns() + round(seconds * 1e9)
         heapq.heappush(self._timers, (due, next(self._order), call))
 
     def now_ns(self) -> int:
-        """Monotonic."""
         return time.monotonic_ns()
 
     def rest(self, seconds: float) -> None:
-        """Leave the CPU to others for a moment."""
+        """Yield the CPU for `seconds`."""
         time.sleep(seconds)
 
     def end(self) -> None:
-        """Let `run` return."""
         self._ended = True
 
     def run(self) -> None:
-        """Serve until `end`."""
         while not self._ended:
             polled = self._epoll.poll(self._patience_seconds())
             now_ns = time.monotonic_ns()  # before the calls: what arrives while they run is not late yet

@@ -47,7 +47,7 @@ def _mapped(path: Path, name: str) -> mmap.mmap:
 
 
 def _grow(mapping: mmap.mmap) -> bool:
-    """One chunk more; False, and the loss is counted, at the limit."""
+    """Add a chunk; False, with the loss counted, at the limit."""
     if len(mapping) >= FILE_BYTES_MAX:
         at = layout.DROPPED_OFFSET
         lost = int.from_bytes(mapping[at : at + 4], "little") + 1
@@ -70,7 +70,6 @@ class JournalFile:
         self._pack = layout.RECORD.pack_into
 
     def write(self, now_ns: int, event: Event, request_id: int, detail: int, brick: int = 0) -> None:
-        """Append a record."""
         at = self.at
         if at > self.end:
             if not _grow(self.mapping):
@@ -114,20 +113,18 @@ class JournalHeader:
         return int.from_bytes(self._mapping[at : at + 8], "little")
 
     def announced(self) -> bool:
-        """Whether the node has yet to see the flag."""
+        """Whether the node has not yet seen the flag."""
         return self._mapping[layout.FLAG_OFFSET] != 0
 
     def announce(self) -> None:
-        """Raise the flag."""
         self._mapping[layout.FLAG_OFFSET] = 1
 
     def close(self) -> None:
-        """Unmap."""
         self._mapping.close()
 
 
 def recorded_requests(record: Path) -> tuple[bytes, ...]:
-    """The first few requests of a run, with which what is new is tested."""
+    """The first few requests of a run: the self-test of new bricks replays them."""
     found: list[bytes] = []
     path = record / "journal" / "client.1.dialogue"
     with open(path, "rb") as file, contextlib.suppress(PeerError):  # the last entry is cut off

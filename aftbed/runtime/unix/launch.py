@@ -180,7 +180,7 @@ class Launched:
             os._exit(code)
 
     def _make_directories(self) -> None:
-        """The private one, and the record, in which `run.json` is written first."""
+        """Make the private directory and the record, with `run.json` in it."""
         about = {"version": __version__, "started_ns": self.started_ns, **msgspec.to_builtins(self.options)}
         for key in ("listener", "private"):
             about.pop(key)
@@ -217,12 +217,12 @@ class Launched:
                     yield report
 
     def stop(self) -> None:
-        """Ask for the end; reports go on until it is there."""
+        """Request the end of the run; reports continue until then."""
         with contextlib.suppress(OSError):
             self.line.send(control.Stop(control.UNANSWERED))
 
     def wait(self) -> None:
-        """Wait for the supervisor's end; kill it if that does not come. The record is still there."""
+        """Wait for the supervisor's end; kill it at the deadline. The record stays."""
         self.line.close()
         if not _ends(self._pidfd, END_SECONDS_MAX):
             linux.kill(self._pidfd, signal.SIGKILL)
@@ -230,7 +230,7 @@ class Launched:
         os.waitpid(self.supervisor, 0)
 
     def remove(self) -> None:
-        """The record has been read: remove the private directory, and let the warden end."""
+        """Remove the private directory, after the record was read, and let the warden end."""
         if run_directory.owned_here(self.private):
             run_directory.remove(self.private)
         life, self._life = self._life, []
@@ -244,7 +244,7 @@ class Launched:
         os.close(self._warden_pidfd)
 
     def disown(self) -> None:
-        """In a child of the command: this run is not its own."""
+        """Forget the run in a child of the command, which must not end it."""
         self.line.close()
         for fd in (*self._life, self._pidfd, self._warden_pidfd):
             os.close(fd)

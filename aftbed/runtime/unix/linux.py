@@ -139,7 +139,6 @@ def start_interpreter(module: str, descriptor: int, *arguments: str) -> int:
 
 
 def become_subreaper() -> None:
-    """Adopt the orphans among this process's descendants."""
     _prctl(PR_SET_CHILD_SUBREAPER, 1)
 
 
@@ -150,7 +149,7 @@ def set_name(name: str) -> None:
 
 
 def no_core() -> None:
-    """A killed node leaves no core file."""
+    """Disable core files for this process."""
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 
@@ -208,11 +207,13 @@ class Starvation:
         self._since_ns, self._cpu_ns, self._waited_ns = 0, 0, 0
 
     def forget(self) -> None:
-        """The process has shown that it runs."""
+        """Reset: the process has shown a pulse."""
         self._since_ns = 0
 
     def starves(self, now_ns: int) -> bool:
-        """To be called while the process shows no pulse; see the table."""
+        """Whether the process, which shows no pulse, is one that the machine does not let run; see the
+        table.
+        """
         state = state_of(self._pid)
         try:
             cpu_ns, waited_ns = map(int, Path(f"/proc/{self._pid}/schedstat").read_text().split()[:2])

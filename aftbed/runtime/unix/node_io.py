@@ -114,21 +114,17 @@ class UnixIO(NodeIO[Inlet, int]):
         self._inlets: dict[tuple[str, ...], Inlet] = {}  # of a node with one brick, by its open ports
 
     def join(self, node: UnixNode) -> None:
-        """Work for `node`."""
         self._node = node
 
     @property
     def now_ns(self) -> Callable[[], int]:
-        """The kernel's."""
         return time.monotonic_ns
 
     @property
     def record(self) -> Recorder:
-        """The journal's own."""
         return self.journal.write
 
     def report(self, report: control.FromNode) -> None:
-        """Send to the supervisor."""
         self.line.send(report)
 
     def memory(self, number: int) -> memoryview:
@@ -138,7 +134,9 @@ class UnixIO(NodeIO[Inlet, int]):
     # -- the pulse ----------------------------------------------------------------------------
 
     def start_pulse(self) -> None:
-        """From now on, show that the host runs. A blocked read goes on after the signal (PEP 475)."""
+        """Start the timer whose signal writes the pulse. A blocked read is resumed after the signal (PEP
+        475).
+        """
         signal.signal(signal.SIGALRM, self._on_timer)
         signal.setitimer(signal.ITIMER_REAL, PULSE_SECONDS, PULSE_SECONDS)
         self._pulse(_now())
@@ -167,7 +165,7 @@ class UnixIO(NodeIO[Inlet, int]):
             os._exit(EXIT_ASSERT)
 
     def loop(self) -> NoReturn:
-        """Handle one thing after the other, mail on the fast loop where that may serve this node."""
+        """Handle events one by one, and mail on the fast loop where it can serve this node."""
         turn = self._node.turn
         while True:
             if self._announced is not None:
@@ -178,7 +176,7 @@ class UnixIO(NodeIO[Inlet, int]):
                 self.serve_fast(self._fast)
 
     def turn(self) -> None:
-        """Handle one thing, or wait for one, on the general path."""
+        """Handle one event, or wait for one, on the general path."""
         if self._announced is not None:
             self._take_announced(self._announced)
         else:
@@ -241,11 +239,9 @@ class UnixIO(NodeIO[Inlet, int]):
     # -- reading ------------------------------------------------------------------------------
 
     def open_input(self, hosted: UnixBrick, port: str, number: int) -> Inlet:
-        """The reading end."""
         return Inlet(hosted, port, number)
 
     def close_input(self, end: Inlet) -> None:
-        """Close it."""
         os.close(end.fd)
 
     def rewired(self) -> None:
@@ -298,7 +294,7 @@ class UnixIO(NodeIO[Inlet, int]):
         return True
 
     def _poll(self, found: PollSet) -> None:
-        """Wait for several things; orders go first."""
+        """Wait for several descriptors; orders go first."""
         node = self._node
         ready = found.poll.poll(self._patience_ms())
         now_ns = _now()
@@ -318,12 +314,12 @@ class UnixIO(NodeIO[Inlet, int]):
         node.wake_due(now_ns)
 
     def _patience_ms(self) -> float:
-        """How long to wait at most."""
+        """The longest wait, in ms."""
         due, limit = self._node.deadline_ns(), PULSE_SECONDS * 1e3
         return limit if due is None else min(limit, max(0.0, (due - _now()) / 1e6 + 0.999))
 
     def _handle_packet(self, inlet: Inlet, raw: bytes) -> None:
-        """Orders first."""
+        """Handle one packet, after the orders that wait."""
         if self.journal.mapping[FLAG_OFFSET]:
             self.serve_orders()
         if raw == b"":
@@ -353,23 +349,21 @@ class UnixIO(NodeIO[Inlet, int]):
             self._announced = None  # the order that has just been served has taken the channel away
 
     def _handle_end(self, inlet: Inlet) -> None:
-        """The channel is drained to its end: nothing more will come from it."""
+        """Close the input: the channel is drained to its end."""
         if inlet.hosted.inputs.get(inlet.port) is inlet:
             self._node.bind_input(inlet.hosted.name, inlet.port, None)
             self._node.step(inlet.hosted, inlet.port, ChannelEnded())
 
     def _refuse(self, request_id: int = 0) -> None:
-        """A message that the brick does not take, or a packet that is no message."""
+        """Record a message that the brick does not take, or a packet that is no message."""
         self.record(_now(), Event.PEER_REFUSED, request_id, 0)
 
     # -- writing ------------------------------------------------------------------------------
 
     def open_output(self, number: int) -> int:
-        """The descriptor itself."""
         return number
 
     def close_output(self, end: int) -> None:
-        """Close it."""
         os.close(end)
 
     def write(self, hosted: UnixBrick, port: str, end: int, message: Message, raw: bytes | None) -> bool:
