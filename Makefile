@@ -29,7 +29,7 @@ help:
 	@echo "make lint     ruff check, ruff format --check, mypy"
 	@echo "make fast     the tests without real runs"
 	@echo "make process  the tests that start real runs: a sample of their combinations"
-	@echo "make deep     the exhaustive tests, one after the other: hours"
+	@echo "make deep     the exhaustive tests, and thousands of examples of every property: hours"
 	@echo "make bench    every figure of docs/numbers.md, written into its table: ten minutes"
 
 # Where the tests are installed, the package is too: then the demo needs nothing more.

@@ -127,9 +127,9 @@ def test_too_few_pairs_bound_no_tail() -> None:
 
 def test_ten_thousand_pairs_take_seconds() -> None:
     base = drives(Random(SEED), 10_000)
-    start_s = time.perf_counter()
+    start_s = time.process_time()
     assert paired_quantile_shift(base, base[::-1], 0.99, Random(SEED))
-    assert time.perf_counter() - start_s < 5  # 0.3 to 0.6 s on an idle core
+    assert time.process_time() - start_s < 5  # 0.3 to 0.6 s on an idle core
 
 
 def test_what_is_asked_for_wrongly_is_named() -> None:

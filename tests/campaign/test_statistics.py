@@ -235,9 +235,9 @@ def test_simulated_times_of_two_modes_and_a_long_tail_are_held(q: float, size: i
 
 def test_ten_thousand_times_take_less_than_a_second() -> None:
     values = [Random(SEED).random() for _ in range(10_000)]
-    start_s = time.perf_counter()
+    start_s = time.process_time()
     assert quantile_interval(values, 0.99)
-    assert time.perf_counter() - start_s < 1
+    assert time.process_time() - start_s < 1
 
 
 # --- what the user may not ask for --------------------------------------------------------------------------

@@ -52,6 +52,7 @@ def test_rows_that_begin_alike_are_driven_once_and_judged_each_by_its_own() -> N
 
 
 @pytest.mark.deep
+@pytest.mark.timeout(3600)
 @pytest.mark.parametrize("ftm", ["pbr", "lfr", "pbr+tr", "lfr+tr"])
 def test_every_row_of_m1_passes_under_a_crash_at_the_worst_instant(ftm: str) -> None:
     for rows in driven(drives(cases("r152", "m1"), (crash(ftm),), 0), 2):
