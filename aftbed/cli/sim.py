@@ -438,16 +438,14 @@ def _simulate_one(given: SimArguments, setup: Setup) -> int:
     drawing = picture(setup, broken) if broken or given.diagram is not None else Picture([], "")
     if given.diagram is not None:
         Path(given.diagram).write_text(drawing.mermaid)
-    if not given.json:
-        print(
-            "\n".join(
-                (*(drawing.lines if found else ()), *(found.lines() if found else ()), f"seed {setup.seed}")
-            )
-        )
-        return EXIT_CODES[word]
-    about = {"seed": setup.seed, "verdict": word, "setup": described(setup), "missed": lacking}
-    breach = found.document() if found is not None else {"breaches": [], "command": None, "shrunk": None}
-    print_json({**about, **breach, **(done.document() if done is not None else {}), "wall_ms": wall_ms})
+    if given.json:
+        about = {"seed": setup.seed, "verdict": word, "setup": described(setup), "missed": lacking}
+        breach = found.document() if found is not None else {"breaches": [], "command": None, "shrunk": None}
+        print_json({**about, **breach, **(done.document() if done is not None else {}), "wall_ms": wall_ms})
+    else:
+        for line in (*drawing.lines, *found.lines()) if found is not None else ():
+            print(line)
+        print(f"seed {setup.seed}")
     return EXIT_CODES[word]
 
 
