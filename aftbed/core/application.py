@@ -24,7 +24,6 @@ class Field(msgspec.Struct, frozen=True):
 
     @property
     def size_bits(self) -> int:
-        """How wide it is."""
         return BITS[self.kind]
 
 

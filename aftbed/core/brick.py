@@ -272,9 +272,7 @@ class Machine(Brick):
         return PeerError(f"{type(msg).__name__} on {port} while {self.state.name}")
 
     def open_ports(self) -> tuple[str, ...]:
-        """The ports that have a row in this state."""
         return self._open[self.state]
 
     def quiescent(self) -> bool:
-        """In a state of `AT_REST`."""
         return self.state in self.AT_REST

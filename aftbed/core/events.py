@@ -72,19 +72,6 @@ BY_LABEL: Final = {event.label: event for event in Event}
 
 RERUN: Final = 1  # detail of `server.enter` and `server.exit`: the request ran again, from the same state
 
-REQUEST_PATH: Final = (  # one request under PBR
-    Event.REQUEST_SENT,
-    Event.REQUEST_RECEIVED,
-    Event.BEFORE_EXIT,
-    Event.PROCEED_ENTER,
-    Event.SERVER_ENTER,
-    Event.SERVER_EXIT,
-    Event.STATE_CAPTURED,
-    Event.CHECKPOINT_SENT,
-    Event.REPLY_STORED,
-    Event.REPLY_SENT,
-    Event.REPLY_DELIVERED,
-)
 REQUEST_EVENTS: Final = frozenset(event for event in Event if event.weight is Weight.ROUTINE)
 STEP_EVENTS: Final = frozenset((Event.ADAPT_STEP_ENTER, Event.ADAPT_STEP_ACT, Event.ADAPT_STEP_EXIT))
 FIRST_FAULT: Final = 1_000_001  # number of the first fault of a run; those of orders are smaller

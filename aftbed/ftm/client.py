@@ -85,7 +85,6 @@ class Client(Machine):
         return NextRequest.FILLS_BACKLOG if len(self.unanswered) + 1 >= BACKLOG_MAX else _GOES
 
     def send(self, msg: Submit) -> list[Effect]:
-        """Give it its number."""
         request = self._numbered(msg)
         return [Note(_SENT, request.request_id), Send("clt2pxy", request)]
 
@@ -109,7 +108,6 @@ class Client(Machine):
         raise PeerError(f"reply to request {msg.request_id}, which is not unanswered")
 
     def deliver(self, msg: Reply) -> list[Effect]:
-        """The source has its answer."""
         del self.unanswered[msg.request_id]
         return [Note(_DELIVERED, msg.request_id, msg.replica), Send("deliver", msg)]
 
@@ -264,7 +262,6 @@ class Proxy(Machine):
         return LeaderIs.BOUND
 
     def bind(self, msg: Rebound) -> list[Effect]:
-        """Requests go to this leader."""
         self.epoch = msg.epoch
         return []
 

@@ -32,7 +32,6 @@ KINDS: Final[dict[str, Kind]] = {**BRICKS, ENGINE.name: ENGINE}
 
 
 def make(kind: str, setting: Setting) -> Brick:
-    """A new brick of `kind`."""
     return BRICKS[kind].make(setting)
 
 

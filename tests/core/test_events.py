@@ -1,9 +1,10 @@
 """Events: one closed enumeration, found by code in a journal and by name in the words of a user."""
 
 import pytest
+from requestpath import REQUEST_PATH
 
 from aftbed.core.errors import ConfigError, unknown
-from aftbed.core.events import BY_CODE, BY_LABEL, REQUEST_PATH, Event, event_named
+from aftbed.core.events import BY_CODE, BY_LABEL, Event, event_named
 
 
 def test_a_code_fits_into_a_record_and_is_not_that_of_no_record() -> None:

@@ -9,10 +9,11 @@ from typing import Final
 import pytest
 import typer
 from pages import PAGES, ROOT, anchors, blocks, links, names, prose, sections, table
+from requestpath import REQUEST_PATH
 
 from aftbed.cli.app import app
 from aftbed.cli.lazy import LazyCommand
-from aftbed.core.events import BY_LABEL, REQUEST_PATH
+from aftbed.core.events import BY_LABEL
 from aftbed.core.graph import PLACEMENTS
 from aftbed.ftm.compose import EXPRESSIONS, build
 from aftbed.ftm.registry import EMITTERS

@@ -8,10 +8,10 @@ from typing import Final
 import msgspec
 import pytest
 from counting import Counting
+from requestpath import REQUEST_PATH
 
 from aftbed.core.brick import Brick
 from aftbed.core.errors import ConfigError
-from aftbed.core.events import REQUEST_PATH
 from aftbed.core.graph import PLACEMENTS, BrickSpec, Graph, Kind, Link
 from aftbed.ftm.compose import EXPRESSIONS, build, chain, parse, replication_of
 from aftbed.ftm.registry import EMITTERS, KINDS, MECHANISMS, Setting, make

@@ -1,4 +1,4 @@
-"""The faults of a run whose processes are names with a journal: what a node would do is told to them.
+"""The faults of a run whose processes are names with a journal: the test does what a node would do.
 
 The fixture `run` is imported by the tests that use it.
 """

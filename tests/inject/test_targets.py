@@ -3,9 +3,10 @@
 import re
 
 import pytest
+from requestpath import REQUEST_PATH
 
 from aftbed.core.errors import ConfigError
-from aftbed.core.events import REQUEST_PATH, Event
+from aftbed.core.events import Event
 from aftbed.core.graph import PLACEMENTS, Graph
 from aftbed.ftm.compose import DUPLEX, EXPRESSIONS, build
 from aftbed.inject.bit_patterns import BIT_MAX, Bit, BitBurst, Bits, Byte, StuckBit

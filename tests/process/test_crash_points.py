@@ -8,9 +8,9 @@ from typing import Final
 
 import pytest
 from liveruns import aftbed
+from requestpath import REQUEST_PATH
 from sampling import every
 
-from aftbed.core.events import REQUEST_PATH
 from aftbed.judge.verdict import Verdict
 
 pytestmark = pytest.mark.process

@@ -1,8 +1,7 @@
-"""What hinders a real node: a channel that is full when a fault comes or goes; a share of a CPU.
+"""Faults in a real node: of a channel that is full when the fault comes or goes; of a share of a CPU.
 
-Orders lie in the control line before the node looks at it. One of them has the brick hand out its state, and
-what the brick does then is to read its channel empty: so what happens while there is no room happens in an
-order that is known.
+Orders lie in the control line before the node reads it. One of them has the brick hand out its state, and the
+brick of the test then empties its channel: so what happens while there is no room happens in a known order.
 """
 
 import os
