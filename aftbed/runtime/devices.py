@@ -275,7 +275,6 @@ class Sensor(Device):
         self._next_ns = 0
 
     def watch(self, order: control.WatchNodes, fds: list[int]) -> None:
-        """Watch these nodes and no others."""
         self.quiet()
         self._nodes = order.nodes
         self._senses.watch(order, fds, self._see_death)
@@ -290,7 +289,6 @@ class Sensor(Device):
         return () if self._alarmed else self._senses.fds()
 
     def ready(self, fd: int, now_ns: int) -> None:
-        """`fd` is readable: a node has died."""
         self._died += self._senses.died(fd)
         self._alarmed = bool(self._died)
 
@@ -304,11 +302,9 @@ class Sensor(Device):
         return Pulses({node: self._senses.pulse_ns(node, now_ns) for node in self._nodes})
 
     def quiet(self) -> None:
-        """Watch no node any more."""
         self._senses.forget()
         self._nodes, self._alarmed = (), False
         self._died.clear()
 
     def deadline_ns(self) -> int | None:
-        """The next look at the pulses."""
         return self._next_ns if self._nodes and not self._alarmed else None

@@ -274,47 +274,37 @@ class FaultController:
         return found or [p for p in deployment.pool.processes if p.name == target and p.pid]
 
     def now_ns(self) -> int:
-        """Monotonic."""
         return self._loop.now_ns()
 
     def pause(self) -> None:
-        """Let others run."""
         self._loop.rest(0)
 
     def log(self, injection: Injection) -> None:
-        """A line for people."""
         line = ", ".join(filter(None, (injection.receipt.state.value, injection.receipt.detail)))
         self._log("fault", f"{injection.fault}: {line}")
 
     def record_strike(self, injection: Injection) -> None:
-        """In the supervisor's journal."""
         self._runtime.journal.write(self._loop.now_ns(), Event.FAULT_APPLIED, 0, injection.number)
 
     def until_dead(self, processes: Iterable[TargetProcess]) -> Steps[None]:
-        """Wait for their deaths."""
         dead: set[Key] = {("died", p.name, p.pid) for p in processes}
         yield Wait(frozenset(dead))
 
     def slow_down(self, process: TargetProcess, number: int, by_ns: int, share: float) -> tuple[Key, str]:
-        """Order it."""
         return self._deployment.order(
             cast("Process", process), lambda token: control.SlowDown(token, number, by_ns, share)
         )
 
     def until_answered(self, orders: Iterable[tuple[Key, str]]) -> Steps[None]:
-        """Wait for the answers."""
         yield from self._deployment.answers(orders)
 
     def flip_memory(self, process: TargetProcess, bit: int | None, address: int | None, draw: int) -> str:
-        """By the runtime."""
         return self._runtime.flip_memory(cast("Process", process), bit, address, draw)
 
     def disturb_bus(self, injection: Injection) -> Steps[None]:
-        """By the runtime."""
         yield from self._runtime.disturb(injection.number, injection.fault.action, injection.draw)
 
     def bus_report(self, injection: Injection) -> BusReport | None:
-        """By the runtime."""
         return self._runtime.bus_fault(injection.number)
 
     def records_about(self, injection: Injection) -> list[Record]:
@@ -330,7 +320,6 @@ class FaultController:
         return [record for path in paths for record in self._runtime.records(path)]
 
     def journal(self, path: str) -> Iterable[Record]:
-        """The records there."""
         return self._runtime.records(path)
 
     def _process_of(self, brick: str) -> Process | None:

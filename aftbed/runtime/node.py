@@ -493,7 +493,6 @@ class Node(Generic[In, Out]):
         return self.bricks[name].brick
 
     def record(self, event: Event, request_id: int, detail: int) -> None:
-        """Write a record, now."""
         self._record(self._now_ns(), event, request_id, detail)
 
     def report_fired(self, fault: int) -> None:
@@ -505,7 +504,6 @@ class Node(Generic[In, Out]):
         self.io.wait_until_applied(fault)
 
     def kill(self) -> None:
-        """End this node at once."""
         self.io.kill()
 
     def stop_detected(self, brick: str, reason: str) -> None:
@@ -618,7 +616,6 @@ class MemoryIO(NodeIO[int, int]):
 
     @property
     def now_ns(self) -> Callable[[], int]:
-        """Always the same."""
         return lambda: 0
 
     @property

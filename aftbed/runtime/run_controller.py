@@ -113,12 +113,17 @@ class RunController:
         self.scripts.append(run)
         log = self._runtime.log
 
+        def settle() -> None:  # spares, and faults that are still to come
+            if ordered.kind is ScriptKind.NEW_BACKUP:
+                self._loop.after(RESTOCK_SECONDS, partial(self._restock_after, len(self.scripts)))
+            self._rearm()
+
         def ended(failure: str) -> None:
             run.ended_ns, run.failure = self._loop.now_ns(), failure
             ms = f"{(run.ended_ns - run.began_ns) / 1e6:.2f} ms"
             log("script.failed" if failure else "script.done", f"{ordered.purpose}: {failure or ms}")
             self.inform_recovery(failed=bool(failure))
-            self._loop.after(SETTLE_SECONDS, lambda: self._settle_after(ordered))
+            self._loop.after(SETTLE_SECONDS, settle)
             if failure:
                 self._loop.after(LOSS_SECONDS, self._look_for_loss)
 
@@ -126,12 +131,6 @@ class RunController:
         if ordered.kind in LOSSES:  # its nodes are killed only when the new leader serves
             log("alarm", f"{ordered.replica}: {self.deployment.cause_of_loss(ordered.replica)}")
         log("script", f"{ordered.purpose} ({ordered.replica})")
-
-    def _settle_after(self, ordered: script.Script) -> None:
-        """What can wait until after a script: spares, and faults that are still to come."""
-        if ordered.kind is ScriptKind.NEW_BACKUP:
-            self._loop.after(RESTOCK_SECONDS, partial(self._restock_after, len(self.scripts)))
-        self._rearm()
 
     def _rearm(self) -> None:
         if not self.ending:

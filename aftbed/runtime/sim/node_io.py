@@ -87,11 +87,9 @@ class SimChannel:
         return self.write.number
 
     def reader_names(self) -> frozenset[str]:
-        """The nodes that read it."""
         return frozenset([node.name for node in self.readers])
 
     def has_room(self) -> bool:
-        """Whether `put` would succeed now."""
         return not (self.ended or self.refused or len(self.mail) >= QUEUE_MAX)
 
     def put(self, message: Message) -> bool:
@@ -155,7 +153,6 @@ class SimChannel:
         """Do nothing: orders arrive without it."""
 
     def close(self) -> None:
-        """Close the executive's hold on both ends."""
         self.closed = True
         self._look()
 

@@ -47,7 +47,7 @@ class Wire:
 
 
 class SimProcess:
-    """A child of the executive, which becomes one node."""
+    """A child of the executive, which becomes one node (see `runtime.interface.Process`)."""
 
     def __init__(self, number: int, pool: "SimProcessPool") -> None:
         self.name, self.kind, self.journal, self.incarnation = "spare", ProcessKind.SPARE, "", 0
@@ -156,7 +156,6 @@ class SimProcess:
         self._clock.message(self._order_ns, self._to_it, self.read)
 
     def read(self) -> None:
-        """Handle the oldest order."""
         order, fds = self._orders.popleft()
         if self.dead:
             return
@@ -224,7 +223,7 @@ class SimSenses(Senses):
 
 
 class SimProcessPool:
-    """Spares without end, at once: what a birth costs is in `BIRTH_NS`."""
+    """Spares without end, at once: what a birth costs is in `BIRTH_NS` (see `runtime.interface`)."""
 
     def __init__(
         self,

@@ -181,7 +181,6 @@ class Drive(CarLink):
         self._car.deliver(reply.payload, now_ns - self._began_ns, replica=reply.replica, epoch=reply.epoch)
 
     def deadline_ns(self) -> int | None:
-        """The next frame of the radar."""
         due = self._car.due_ns()
         return None if due is None else due + self._began_ns
 
@@ -213,7 +212,6 @@ class Drive(CarLink):
         return next((one for one in self._faults.reports() if one.number == number), None)
 
     def watch(self, number: int, condition: Condition, met: Callable[[Met], None]) -> None:
-        """See `runtime.interface.Runtime`."""
 
         def held(t_us: int) -> None:  # in the middle of a step, perhaps of the fault's target
             self._clock.at(self._clock.ns, lambda: self._met(met, t_us))
