@@ -44,9 +44,12 @@ def private(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     assert left == [], "a run was left behind"
 
 
-def aftbed(words: list[str], folder: Path) -> subprocess.CompletedProcess[str]:
-    """Run one command of a page to its end, in this process if it starts none."""
-    if words[0] in PLAIN:
+def aftbed(words: list[str], folder: Path, *, live: bool = False) -> subprocess.CompletedProcess[str]:
+    """Run one command of a page to its end, in this process if it starts none.
+
+    One about a `live` run is started as a person does: the next comes when the run has dealt with it.
+    """
+    if words[0] in PLAIN and not live:
         with contextlib.chdir(folder):
             done = called(*words)
         return subprocess.CompletedProcess(words, done.code, done.out, done.err)
@@ -109,6 +112,8 @@ class LiveRun:
         """Whatever happened."""
         self._process.kill()
         self._process.wait()
+        assert self._process.stdout is not None
+        self._process.stdout.close()
 
 
 def matches(shown: str, output: str) -> bool:
@@ -140,7 +145,7 @@ def run_page(page: Path, folder: Path, lives: list[LiveRun]) -> int:
                 continue
             if "live" in block.words and not (lives and lives[-1].alive):
                 lives.append(LiveRun(folder))
-            check(block, command, aftbed(words[1:], folder))
+            check(block, command, aftbed(words[1:], folder, live="live" in block.words))
             count += 1
             if words[1] == "stop":
                 lives.pop().end()
