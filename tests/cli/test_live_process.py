@@ -22,7 +22,7 @@ def drive(home: Home) -> Iterator[Command]:
     """A car on a free road, in real time."""
     with Command("--scenario", "free-drive", "--pace", "real", "--ftm", "pbr") as command:
         command.started()
-        command.wait_for_line("km/h")
+        command.wait_until_it_drives()
         yield command
 
 
@@ -163,7 +163,7 @@ def test_a_wrong_fault_is_refused_and_the_run_goes_on(drive: Command) -> None:
 def test_an_interrupt_ends_the_run_with_its_verdict(home: Home, sig: signal.Signals) -> None:
     with Command("--scenario", "free-drive") as command:
         command.started()
-        command.wait_for_line("km/h")
+        command.wait_until_it_drives()
         command.popen.send_signal(sig)
         done = command.done()
         assert done.code == 130, done.out + done.err

@@ -329,6 +329,10 @@ class Command:
         self.popen.stdout.close()
         self._errors.close()
 
+    def wait_until_it_drives(self) -> None:
+        """Requests are answered by then; the first line of the car is of 0.00 s, before any request."""
+        self.wait_for_line("km/h", nth=4)
+
     def wait_for_line(self, words: str, nth: int = 1) -> str:
         """The `nth` line of its output that has `words`."""
         limit = time.monotonic() + WAIT_SECONDS_MAX
