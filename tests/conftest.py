@@ -6,6 +6,7 @@ A failing example prints the line that repeats it.
 """
 
 import os
+import signal
 from typing import Final
 
 import pytest
@@ -20,6 +21,10 @@ settings.register_profile(
 settings.register_profile("ci", settings.get_profile("dev"), derandomize=True)
 settings.register_profile("deep", settings.get_profile("dev"), max_examples=5_000)
 settings.load_profile("ci" if os.environ.get("CI") else "dev")
+
+# A shell without job control starts what is behind `&` with SIGINT ignored, and commands under test would
+# inherit that: an interrupt would do nothing.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
