@@ -11,6 +11,7 @@ import os
 import select
 import signal
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
@@ -26,6 +27,7 @@ from aftbed.runtime.unix import control_client, linux
 
 REDUNDANCY_SECONDS_MAX: Final = 5.0
 PAUSE_SECONDS: Final = 0.02  # of undisturbed service between two kills
+DEATH_SECONDS_MAX: Final = 5.0
 DEATHS: Final = 25  # before the kills, and as many after them
 
 
@@ -90,38 +92,49 @@ def _redundant_epoch(private: Path, after: int) -> int:
 
 
 def death_ms() -> float:
-    """From SIGKILL of a process to the death that another process reads from its pidfd."""
+    """From SIGKILL of a process to its pidfd being readable in another process. Raises HarnessError."""
     parent = os.getpid()
-    victim = os.fork()
-    if victim == 0:
-        try:
-            linux.die_with(parent)
-            signal.pause()
-        finally:
-            os._exit(0)
     reader, writer = os.pipe()
-    watcher = os.fork()
-    if watcher == 0:
-        try:
-            linux.die_with(parent)
-            poll = select.poll()
-            poll.register(os.pidfd_open(victim), select.POLLIN)
-            os.write(writer, bytes(8))  # it is ready
-            poll.poll()
-            os.write(writer, time.monotonic_ns().to_bytes(8, "little"))
-        finally:
-            os._exit(0)
-    os.close(writer)
+    children = []
     try:
-        ready = os.read(reader, 8)
-        time.sleep(POLL_SECONDS)  # until it polls
+        victim = _child(parent, signal.pause)
+        children.append(victim)
+        children.append(_child(parent, lambda: _watch_death(victim, writer)))
+        _read_time(reader)  # it is about to poll
+        time.sleep(POLL_SECONDS)
         killed_ns = time.monotonic_ns()
         os.kill(victim, signal.SIGKILL)
-        seen = os.read(reader, 8) if ready else b""
+        return (_read_time(reader) - killed_ns) / 1e6
     finally:
         os.close(reader)
-        os.waitpid(watcher, 0)
-        os.waitpid(victim, 0)
-    if not seen:
-        raise HarnessError("the process that waited for the death of another died")
-    return (int.from_bytes(seen, "little") - killed_ns) / 1e6
+        os.close(writer)
+        for child in children:  # not reaped yet, so the pid is still its own
+            os.kill(child, signal.SIGKILL)
+            os.waitpid(child, 0)
+
+
+def _child(parent: int, work: Callable[[], None]) -> int:
+    """Fork a process that does `work` and exits; it dies with `parent`."""
+    pid = os.fork()
+    if pid == 0:
+        try:
+            linux.die_with(parent)
+            work()
+        finally:
+            os._exit(0)
+    return pid
+
+
+def _watch_death(victim: int, writer: int) -> None:
+    """Write the time when the watch begins, and the time of the death (monotonic ns, 8 bytes each)."""
+    poll = select.poll()
+    poll.register(os.pidfd_open(victim), select.POLLIN)
+    os.write(writer, time.monotonic_ns().to_bytes(8, "little"))
+    if poll.poll(DEATH_SECONDS_MAX * 1e3):
+        os.write(writer, time.monotonic_ns().to_bytes(8, "little"))
+
+
+def _read_time(reader: int) -> int:
+    if not select.select([reader], [], [], DEATH_SECONDS_MAX)[0]:
+        raise HarnessError(f"no process reported a death within {DEATH_SECONDS_MAX:g} s")
+    return int.from_bytes(os.read(reader, 8), "little")
