@@ -54,7 +54,7 @@ def test_results_come_in_order(jobs: int) -> None:
     assert list(each(doubled, range(50), jobs)) == [(n, n, 2 * n) for n in range(50)]
 
 
-def test_one_that_hangs_is_named_with_its_command_and_nobody_is_left() -> None:
+def test_one_that_hangs_is_named_with_its_command_and_no_process_is_left() -> None:
     before, began_s = workers(), time.monotonic()
     found = each(hangs_at_five, range(9), 2, alone=lambda number, _: f"run {number}", seconds_max=1.0)
     with pytest.raises(HarnessError) as raised:
@@ -64,7 +64,7 @@ def test_one_that_hangs_is_named_with_its_command_and_nobody_is_left() -> None:
     assert workers() <= before
 
 
-def test_one_whose_process_dies_is_named_and_nobody_is_left() -> None:
+def test_one_whose_process_dies_is_named_and_no_process_is_left() -> None:
     before = workers()
     with pytest.raises(HarnessError) as raised:
         list(each(dies_at_five, range(9), 2, alone=lambda number, _: f"run {number}"))
@@ -74,7 +74,7 @@ def test_one_whose_process_dies_is_named_and_nobody_is_left() -> None:
 
 
 @pytest.mark.parametrize("fresh", [False, True])
-def test_what_is_larger_than_a_pipe_comes_through_and_nobody_is_left(fresh: bool) -> None:
+def test_what_is_larger_than_a_pipe_comes_through_and_no_process_is_left(fresh: bool) -> None:
     before = workers()
     setups = [bytes([number]) * 3_000_000 + b"end" for number in range(6)]
     assert [found for _, _, found in each(heavy, setups, 2, fresh=fresh)] == [s[::-1] for s in setups]

@@ -26,7 +26,7 @@ def test_a_node_that_waits_long_for_a_cpu_makes_a_run_noisy(
     [
         ("degraded", False, "inconclusive"),  # late
         ("hang", True, "inconclusive"),
-        ("tolerated", True, "inconclusive"),  # a failover that nobody expected: a false alarm
+        ("tolerated", True, "inconclusive"),  # a failover that was not expected: a false alarm
         ("tolerated", False, "tolerated"),
         ("masked", False, "masked"),
         ("sdc", True, "sdc"),  # no machine is so busy that it makes up a wrong value

@@ -138,7 +138,7 @@ DEEP: Final = (*EXPRESSIONS, "pbr+assert+tr", "lfr+assert+tr")
 @pytest.mark.parametrize("leader", ["a", "b"])
 @pytest.mark.parametrize("expression", DEEP)
 def test_a_graph_uses_every_port_of_its_bricks_that_its_mechanism_has(expression: str, leader: str) -> None:
-    """Unbound are only ports of a Server that nobody captures, and of an alarm that nobody gives."""
+    """Unbound are only ports of a Server that no brick captures, and of an alarm that no brick raises."""
     graph = build(expression, "process", leader)
     assert graph.problems(KINDS) == []
     bound = {end for link in graph.links for end in link.ends}

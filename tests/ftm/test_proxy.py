@@ -38,7 +38,7 @@ def test_one_request_is_under_way_the_others_wait_in_their_channel() -> None:
     assert "clt2pxy" in brick.open_ports() and brick.quiescent()
 
 
-def test_a_reply_is_accepted_and_says_of_whom_it_is() -> None:
+def test_a_reply_is_accepted_and_names_its_replica() -> None:
     effects = waiting(epoch=3).step("pro2pxy", Reply(3, 1, 2, b"that"), 0)
     assert sends(effects) == [("pxy2clt", Reply(3, 1, 2, b"that"))]
     assert notes(effects) == [Event.REPLY_ACCEPTED]

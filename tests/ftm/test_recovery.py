@@ -62,7 +62,7 @@ def alarm(replica: str, generation: int = 1) -> Suspect:
         (WHOLE, {("a", 1), ("b", 1)}, dropped()),
         (WHOLE, {("a", 2)}, None),  # another generation's
         (ALONE, set(), renewed("a", "b")),
-        (ALONE, {("a", 1)}, None),  # nobody is left to take over
+        (ALONE, {("a", 1)}, None),  # no replica is left to take over
         (Situation("a", 1, "", 0, 1, (), False), set(), None),  # the slot is not free yet
         (Situation("b", 3, "a", 2, 5, (), False), {("b", 3)}, failover("b", "a", 6)),
         (NOBODY, set(), None),

@@ -98,7 +98,7 @@ def test_the_state_is_captured_after_exactly_the_request() -> None:
     assert brick.open_ports() == ("prd2srv",) and brick.quiescent()
 
 
-def test_a_server_whose_state_nobody_captures_is_open_for_requests() -> None:
+def test_a_server_whose_state_no_brick_captures_is_open_for_requests() -> None:
     brick = bound()
     for count in (1, 2):
         assert brick.open_ports() == ("prd2srv",) and brick.quiescent()

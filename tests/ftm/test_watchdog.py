@@ -45,7 +45,7 @@ def test_a_death_is_told_at_once() -> None:
     assert notes(effects) == [Event.WATCHDOG_SUSPECT]
 
 
-def test_the_death_of_what_is_not_watched_is_nobodys_business() -> None:
+def test_the_death_of_what_is_not_watched_is_ignored() -> None:
     assert Watched().brick.step("sense", NodeDied("b/server"), START_NS) == []
     assert Watchdog().step("sense", NodeDied("a/server"), START_NS) == []
 

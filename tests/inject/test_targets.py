@@ -76,7 +76,7 @@ def test_every_event_of_the_request_path_can_trigger(placement: str, event: Even
         (
             "none",
             "process",
-            crash("primary", Trigger("state.captured")),  # there is a Server, but nobody asks for its state
+            crash("primary", Trigger("state.captured")),  # there is a Server, but no brick asks for its state
             "event 'state.captured' cannot trigger a fault under --ftm none (one of: ",
         ),
     ],

@@ -102,7 +102,7 @@ def test_a_request_that_came_later_did_not_wait_for_the_failover() -> None:
     tale.served(2, epoch=2, replica=2)
     (found,) = checks.failovers(tale.history())
     assert found.recovered_ms == 107.0, "the fault was that long ago"
-    assert found.blackout_ms == 3.0, "but nobody waited"
+    assert found.blackout_ms == 3.0, "but no request waited"
 
 
 def test_a_failover_that_nobody_lived_to_use() -> None:

@@ -195,7 +195,7 @@ def test_a_state_that_the_function_refuses_was_not_flipped(tmp_path: Path) -> No
     assert_served(ran)
 
 
-def test_the_bit_that_nobody_names_is_drawn_by_the_seed_and_said(tmp_path: Path) -> None:
+def test_a_bit_that_is_not_named_is_drawn_by_the_seed_and_reported(tmp_path: Path) -> None:
     one, again, other = (drive(tmp_path, "pbr", f"bitflip result nth {HIT}", seed=seed) for seed in (1, 1, 2))
     assert one.details == again.details and one.details != other.details
     for ran in (one, other):

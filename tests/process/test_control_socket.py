@@ -157,7 +157,7 @@ def _answers(run: Started) -> bool:
     return True
 
 
-def test_a_closed_end_before_the_answer_is_nobodys_trouble(run: Started) -> None:
+def test_a_closed_end_before_the_answer_is_no_trouble(run: Started) -> None:
     for question in (
         control_client.StatusQuery(),
         control_client.ProcessesQuery(),

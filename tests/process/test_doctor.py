@@ -1,4 +1,4 @@
-"""`aftbed doctor`: what a dead run left is named and removed; what is a live one's, or nobody's, is not."""
+"""`aftbed doctor`: what a dead run left is named and removed; what is a live one's, or of no run, is not."""
 
 import json
 import os
@@ -69,7 +69,7 @@ def test_nothing_is_left_where_all_is_well(home: Home) -> None:
 
 
 def test_a_run_killed_with_all_its_keepers_leaves_its_directory(home: Home) -> None:
-    """Supervisor, warden and command at once: the kernel ends the nodes, nobody removes the directory."""
+    """Supervisor, warden and command at once: the kernel ends the nodes, the directory is not removed."""
     with Command(*ENDLESS) as command:
         command.started()
         run = only_run()
@@ -91,7 +91,7 @@ def test_a_run_killed_with_all_its_keepers_leaves_its_directory(home: Home) -> N
 
 
 def test_the_processes_of_a_dead_run_are_named_and_removed_and_a_live_run_goes_on(home: Home) -> None:
-    """The worst: the supervisor is stopped, so with nobody left its nodes, one of them stopped, live on."""
+    """The worst: the supervisor is stopped, so its nodes, one of them stopped, live on."""
     with under_load(home, 100_000) as alive, Command(*ENDLESS) as command:
         until(lambda: len(run_directory.live()) == 2, "two runs")
         command.started()
@@ -99,7 +99,7 @@ def test_the_processes_of_a_dead_run_are_named_and_removed_and_a_live_run_goes_o
         engine = next(row.pid for row in control_client.processes(run) if row.name == "engine")
         supervisor, warden = parts(run)
         stopped(supervisor)
-        stopped(engine)  # nobody is there to replace it
+        stopped(engine)  # no process is there to replace it
         os.kill(warden, signal.SIGKILL)
         command.popen.kill()
         command.popen.wait()

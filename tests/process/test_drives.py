@@ -98,7 +98,7 @@ def test_a_crash_changes_nothing_on_the_bus() -> None:
 
 
 @pytest.mark.parametrize("policy", ["hold", "release", "latch"])
-def test_a_brake_policy_matters_to_nobody_while_requests_come(policy: str) -> None:
+def test_a_brake_policy_does_not_matter_while_requests_come(policy: str) -> None:
     verdict = passed("--scenario", "ccrs-20", "--pace", "max", "--brake-policy", policy).verdict()
     assert verdict.vehicle is not None
     assert not verdict.vehicle.collision

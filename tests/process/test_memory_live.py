@@ -71,7 +71,7 @@ def test_a_state_that_is_refused_ends_its_node_and_the_backup_takes_over(home: H
     assert len(outcome.record.history.events(Event.DETECTED_STOP)) == 1
 
 
-def test_what_nobody_reads_any_more_is_latent(home: Home) -> None:
+def test_what_is_not_read_any_more_is_latent(home: Home) -> None:
     outcome = ran(home, "pbr", f"{FLIP} at reply.delivered nth {COUNT}")
     assert receipts(outcome) == ["applied"] and outcome.verdict.verdict == "pass"
     assert outcome.record.end is not None
@@ -92,7 +92,7 @@ def test_it_is_memory_of_that_process_and_of_no_other(home: Home) -> None:
 
         control_client.ask(run.private, control_client.InjectCommand(parse("crash a/server")))
         until(lambda: run.status()["leader"] == "b" and run.redundant(), "a new backup")
-        assert not held(run) and not cells(run.launched.supervisor), "nobody has the dead one's"
+        assert not held(run) and not cells(run.launched.supervisor), "no process has the dead one's"
         control_client.ask(
             run.private, control_client.InjectCommand(parse(f"{FLIP} in a at request.received {NEVER}"))
         )

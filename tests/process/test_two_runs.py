@@ -62,7 +62,7 @@ def test_with_two_runs_alive_a_command_must_name_one(home: Home) -> None:
 
 
 def test_the_directory_of_a_dead_run_is_no_run(home: Home) -> None:
-    """What a crash of the machine may leave: a directory, and a socket that nobody serves."""
+    """What a crash of the machine may leave: a directory, and a socket without a server."""
     private = new_run()
     with pytest.raises(OSError, match=r"No such file|refused"):
         run_directory.connect(private)

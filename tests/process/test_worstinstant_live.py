@@ -38,7 +38,7 @@ def test_a_crash_at_the_worst_instant_passes_on_processes_too(ftm: str) -> None:
     done = aftbed(*words, "--json")
     verdict = done.verdict()
     assert (done.code, verdict.verdict) == (0, "pass"), done.out + done.err
-    assert verdict.failovers, "nobody was struck"
+    assert verdict.failovers, "no process was struck"
     assert verdict.vehicle is not None and not verdict.vehicle.collision
     assert verdict.vehicle.min_gap_m == pytest.approx(free.min_gap_m, abs=LOST_M_MAX)
 

@@ -1,4 +1,4 @@
-"""The terminal: lines at the end, a picture while it runs; plain lines where nobody looks."""
+"""The terminal: lines at the end, a picture while it runs; plain lines where it is no terminal."""
 
 import io
 import os

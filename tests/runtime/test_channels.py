@@ -101,7 +101,7 @@ def test_mail_outlives_its_writer_and_its_reader(channel: UnixChannel) -> None:
     assert channel.read.recv(100) == b"mail"
 
 
-def test_a_writer_that_nobody_will_read_gets_epipe(channel: UnixChannel) -> None:
+def test_a_writer_that_no_process_will_read_gets_epipe(channel: UnixChannel) -> None:
     at_once(channel)
     assert filled(channel) > 0
     channel.refuse()

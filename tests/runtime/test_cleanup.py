@@ -1,4 +1,4 @@
-"""The ledger of what is to be undone: what is read in it, when it is due, and whom it is done to."""
+"""The ledger of what is to be undone: what is read in it, when it is due, and on which processes it acts."""
 
 import os
 import signal
@@ -87,7 +87,7 @@ def test_it_is_overdue_when_the_supervisor_had_its_time() -> None:
     assert book.patience_ms(edge_ns + 5) == 0.0
 
 
-def test_what_lasts_as_long_as_the_run_wakes_nobody() -> None:
+def test_what_lasts_as_long_as_the_run_wakes_no_process() -> None:
     assert book_of().patience_ms(0) is None
     assert book_of(stopped(0)).patience_ms(10**18) is None
     assert book_of(stopped(0)).overdue(10**18) == []
@@ -130,7 +130,7 @@ def test_what_cannot_be_written_is_not_done(tmp_path: Path, waker: int) -> None:
         ledger.ahead("a/server", os.getpid(), 50)
 
 
-# -- whom it is done to
+# -- on which processes it acts
 
 
 Victim = Callable[[Path | None], StoppedProcess]

@@ -8,7 +8,7 @@ from aftbed.core.errors import ConfigError
 from aftbed.runtime.unix.launch import bind_hub
 from aftbed.vehicle.can.bus import HOST
 
-TEST_NET: str = "192.0.2.1"  # RFC 5737: nobody has it; nothing is sent there
+TEST_NET: str = "192.0.2.1"  # RFC 5737: it is not assigned; nothing is sent there
 
 
 def own_addresses() -> list[str]:
@@ -23,7 +23,7 @@ def own_addresses() -> list[str]:
 
 
 @pytest.mark.parametrize("address", own_addresses())
-def test_nobody_gets_to_the_bus_by_another_address(address: str) -> None:
+def test_the_bus_is_not_reached_by_another_address(address: str) -> None:
     with bind_hub(0) as listener:
         host, port = listener.getsockname()
         assert host == HOST == "127.0.0.1"

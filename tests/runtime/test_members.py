@@ -1,4 +1,4 @@
-"""Whose a process is: told by its mark, which outlives descriptors, and goes to nobody by accident."""
+"""To which run a process belongs: its mark outlives descriptors, and no other process gets it by accident."""
 
 import os
 import signal

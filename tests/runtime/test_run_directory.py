@@ -148,7 +148,7 @@ def test_a_record_directory_that_cannot_be_made_is_refused(runtime: Path, tmp_pa
 
 def test_the_only_run_is_found_by_itself(runtime: Path, listeners: list[socket.socket]) -> None:
     private = alive(listeners)
-    new_run()  # a run whose supervisor is gone: nobody listens
+    new_run()  # a run whose supervisor is gone: nothing listens
     assert run_directory.live() == [private.name]
     assert run_directory.find(None) == run_directory.find(private.name) == private
 

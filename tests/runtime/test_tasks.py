@@ -183,7 +183,7 @@ def test_a_task_that_makes_up_for_a_failure_has_succeeded(tasks: Tasks) -> None:
 
     ends: list[str] = []
     tasks.start("script", steps(), ends.append)
-    tasks.died("nobody")
+    tasks.died("unknown")
     tasks.fail(ONE, "refused")
     assert ends == [""]
 

@@ -66,7 +66,7 @@ def test_what_is_aimed_at_is_there() -> None:
             fault.check(build(setup.ftm, setup.placement))
 
 
-def test_nobody_is_asked_for_what_he_does_not_promise() -> None:
+def test_no_mechanism_is_asked_for_what_it_does_not_promise() -> None:
     for setup in many():
         duplex = bool(replication_of(setup.ftm))
         assert duplex or not setup.scenario

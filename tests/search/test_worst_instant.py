@@ -104,7 +104,7 @@ def check_worst_crash(course: Course) -> None:
     assert worst.struck.broken == ()
     again = simulate(replace(course.setup, faults=(parse(str(worst.struck.fault)),)))
     assert again.vehicle == worst.struck.result
-    assert [name for _, name in again.struck], "nobody was struck"
+    assert [name for _, name in again.struck], "no process was struck"
 
 
 def test_a_crash_at_the_worst_instant_takes_next_to_nothing_under_a_mechanism(pbr: Course) -> None:

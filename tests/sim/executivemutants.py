@@ -265,7 +265,7 @@ EXECUTIVE: Final = (
     ),
     Mutant(
         "switch never resumed",
-        "ScriptExecutor forgets to resume whom it suspended",
+        "ScriptExecutor does not resume a node that it suspended",
         instead(Execution, "_resume", lambda self, steps: nothing()),
         CLEAN,
         clean(adapted("pbr", "lfr"), adapted("pbr", "pbr+tr")),
@@ -273,7 +273,7 @@ EXECUTIVE: Final = (
     ),
     Mutant(
         "undone and not resumed",
-        "ScriptExecutor forgets to resume whom it suspended, on the way back",
+        "ScriptExecutor does not resume a node that it suspended, on the way back",
         instead(Execution, "_resume_living", lambda self, bricks: None),
         ADAPT,
         adapts("pbr", "lfr", "b/after"),

@@ -346,7 +346,7 @@ MECHANISMS: Final = (
     ),
     Mutant(
         "deaths not told",
-        "Watchdog suspects nobody, whoever dies",
+        "Watchdog suspects no node, whichever dies",
         instead(Watchdog, "_suspect", lambda self, node, cause, now_ns: []),
         CRASH,
         crashes("pbr", "a/proceed"),

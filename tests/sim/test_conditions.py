@@ -43,7 +43,7 @@ def test_a_crash_strikes_at_the_step_of_its_condition(ftm: str, placement: str) 
 
 
 def test_a_step_between_two_cycles_of_the_radar_is_met_as_well() -> None:
-    """Frames come each 20 ms, and nobody else would look at the car meanwhile."""
+    """Frames come each 20 ms, and no other event advances the car meanwhile."""
     (fault,) = drive("crash primary when ttc < 1.995").faults
     assert fault.detail == "ttc < 1.995 at 2.005000 s"
 

@@ -189,7 +189,7 @@ def transient(ftm: str, role: str, count: int, random: Random) -> tuple[Fault, .
 @settings(max_examples=FEW)
 @given(seed=seeds, count=st.integers(1, 8))
 def test_one_value_fault_per_request_never_reaches_the_client(ftm: str, seed: int, count: int) -> None:
-    """G4, and it is corrected: nobody stops, and only a request with a fault costs a third trial."""
+    """G4, and it is corrected: no replica stops, and only a request with a fault costs a third trial."""
     random = Random(seed)
     roles = ("primary", "backup") if ftm.startswith("lfr") else ("primary",)
     faults = tuple(f for role in roles for f in transient(ftm, role, count, random))

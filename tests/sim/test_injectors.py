@@ -283,7 +283,7 @@ def test_a_kept_reply_that_was_hit_is_what_is_answered_once_more() -> None:
     run = played("pbr", flip, "crash primary at checkpoint.sent nth 5")
     assert wrong(run) == [5] and receipts(run) == ["activated", "activated"]
     unasked = played("pbr", flip)
-    assert wrong(unasked) == [] and receipts(unasked) == ["applied"], "nobody asked again"
+    assert wrong(unasked) == [] and receipts(unasked) == ["applied"], "no request was repeated"
     assert_healed(unasked)
 
 

@@ -26,7 +26,7 @@ from aftbed.search.explore import all_orders, experiments
         ("lfr", "replica", 3, 20),
         ("pbr", "process", 2, 2),
         ("lfr", "process", 2, 12),
-        ("pbr+tr", "process", 1, 1),  # a chain, and a backup for which nobody waits
+        ("pbr+tr", "process", 1, 1),  # a chain, and a backup that is not waited for
     ],
 )
 def test_how_many_orders_there_are(ftm: str, placement: str, count: int, expected: int) -> None:

@@ -44,7 +44,7 @@ DUPLEX: Final = tuple(e for e in EXPRESSIONS if replication_of(e))
 SOUND: Final = tuple(e for e in EXPRESSIONS if e != NONE)
 PAYLOADS: Final = [b"d=%d" % number for number in range(1, REQUESTS + 1)]
 
-whom = st.integers(0, 99)
+any_node = st.integers(0, 99)
 
 
 class Interference(RuleBasedStateMachine):
@@ -81,11 +81,11 @@ class Interference(RuleBasedStateMachine):
     def time_passes(self, ms: float) -> None:
         self.world.advance(self.world.loop.ns + round(ms * 1e6))
 
-    @rule(node=whom)
+    @rule(node=any_node)
     def a_node_dies(self, node: int) -> None:
         self.world.inject(Fault(Crash(), self._node(node), Trigger()))
 
-    @rule(first=whom, second=whom)
+    @rule(first=any_node, second=any_node)
     def two_nodes_die(self, first: int, second: int) -> None:
         self.a_node_dies(first)
         self.a_node_dies(second)
@@ -94,10 +94,10 @@ class Interference(RuleBasedStateMachine):
     def the_primary_will_die(self, event: Event) -> None:
         try:
             self.world.inject(Fault(Crash(), "primary", Trigger(event.label)))
-        except ConfigError:  # nobody emits it under this mechanism
+        except ConfigError:  # no brick emits it under this mechanism
             return
 
-    @rule(node=whom, ms=st.integers(1, HANG_MS_MAX))
+    @rule(node=any_node, ms=st.integers(1, HANG_MS_MAX))
     def a_node_hangs(self, node: int, ms: int) -> None:
         self.world.inject(Fault(Hang(ms), self._node(node), Trigger()))
 
@@ -106,7 +106,7 @@ class Interference(RuleBasedStateMachine):
         if role in roles_in(self.world.controller.deployment.graph):
             self.world.inject(Fault(Hang(), role, Trigger()))
 
-    @rule(node=whom)
+    @rule(node=any_node)
     def a_watchdog_is_mistaken(self, node: int) -> None:
         """It takes a node of its replica for dead, which lives, and will be fenced."""
         name = self._node(node)
@@ -130,7 +130,7 @@ class Interference(RuleBasedStateMachine):
             return
         try:
             self.world.adapt(Goal(expression=expression))
-        except ConfigError:  # another one is under way, or nobody is left to adapt
+        except ConfigError:  # another one is under way, or no replica is left to adapt
             return
 
     # -- what must hold all the time -----------------------------------------------------------

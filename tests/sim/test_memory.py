@@ -78,7 +78,7 @@ def test_a_state_that_the_function_refuses_ends_its_node_and_no_more(ftm: str) -
     assert len(set(run.rest.states.values())) == 1, "the new backup has not read the cell of the dead one"
 
 
-def test_what_nobody_reads_any_more_is_latent() -> None:
+def test_what_is_not_read_any_more_is_latent() -> None:
     run = played("pbr", f"{FLIP} at reply.delivered nth {COUNT}")
     assert wrong(run) == []
     said = "bit 0 of state.counter in a/server, not used so far, or covered up before"
@@ -99,7 +99,7 @@ def test_a_follower_goes_on_with_it() -> None:
     assert len(set(run.rest.states.values())) == 2
 
 
-def test_the_cell_of_a_dead_replica_is_read_by_nobody() -> None:
+def test_the_cell_of_a_dead_replica_is_not_read() -> None:
     """What is flipped in the old cell dies with it; who takes its place is hit in a cell of its own."""
     old = f"{FLIP} in a at before.exit nth 10"
     crash = "crash a/server at proceed.enter nth 10"

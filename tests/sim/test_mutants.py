@@ -70,7 +70,7 @@ def test_a_planted_bug_is_taken_out_again() -> None:
 
 
 def test_digests_that_are_not_compared_break_no_promise_but_leave_no_word() -> None:
-    """A divergence is only reported (nobody can tell who is right): the bug shows in the journal alone."""
+    """A divergence is only reported (which replica is right is unknown): the journal alone shows the bug."""
     setup = Setup("lfr", count=6, faults=(flip(ValuePlace.RESULT, 0, "server.exit", 3, "backup"),))
     with instead(lfr, "digest", lambda payload: b"")():
         wrong = simulate(setup)

@@ -216,7 +216,7 @@ def test_every_promise_of_a_run_is_told() -> None:
 
 
 def test_a_service_is_not_lost_in_vain() -> None:
-    """Where faults struck each replica, nobody promised more: but for at most once, and right replies."""
+    """Where faults struck each replica, no more is promised than at most once, and right replies."""
     gone = all_of(LOST, struck("a/server", "b/after"), rested(why_not=("requests wait",)))
     unanswered = all_of(gone, retold(lambda e: []))(UNBROKEN)
     assert breaches(unanswered) == ()
