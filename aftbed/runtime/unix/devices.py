@@ -121,12 +121,13 @@ def make_source(client: Client, options: SourceOptions) -> Device:
     # Imported here: the bus costs 150 ms to import, and only the zygote of the bus has it.
     from aftbed.vehicle.can.dbc_file import load_dbc  # noqa: PLC0415
     from aftbed.vehicle.gateway import Gateway  # noqa: PLC0415
-    from aftbed.vehicle.replay.map_file import find_map  # noqa: PLC0415
-    from aftbed.vehicle.replay.mapped_gateway import MappedGateway  # noqa: PLC0415
 
-    gateway: BusGateway = (
-        MappedGateway(load_dbc(), Path(work.dbc), find_map(work.map))
-        if isinstance(work, ReplayRun)
-        else Gateway(load_dbc())
-    )
+    gateway: BusGateway
+    if isinstance(work, ReplayRun):
+        from aftbed.vehicle.replay.map_file import find_map  # noqa: PLC0415
+        from aftbed.vehicle.replay.mapped_gateway import MappedGateway  # noqa: PLC0415
+
+        gateway = MappedGateway(load_dbc(), Path(work.dbc), find_map(work.map))
+    else:
+        gateway = Gateway(load_dbc())
     return CarDevice(client, dialogue, BusLink(gateway, options.port))

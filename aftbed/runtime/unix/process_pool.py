@@ -32,10 +32,10 @@ WATCHING_KINDS: Final = ("watchdog", "recovery")
 
 PRELOADS: Final[dict[str, tuple[str, ...]]] = {
     LIGHT: (),
-    BUS: (
+    BUS: (  # what a drive needs; the processes of a replay import the rest themselves
         "aftbed.vehicle.drive_real",
-        "aftbed.vehicle.replay.mapped_gateway",
-        "aftbed.vehicle.replay.player",
+        "aftbed.vehicle.gateway",
+        "aftbed.vehicle.scenarios.library",
         "cantools",
     ),
 }
