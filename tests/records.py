@@ -9,10 +9,9 @@ import msgspec
 from aftbed.core.events import Event
 from aftbed.core.journal import DROPPED_OFFSET, EntryKind
 from aftbed.ftm.compose import build
-from aftbed.inject.bit_patterns import Bit, with_flipped
 from aftbed.inject.crash import Crash
+from aftbed.inject.grammar import Bit, Trigger, with_flipped
 from aftbed.inject.model import Fault
-from aftbed.inject.timing import Trigger
 from aftbed.inject.value import ValueFlip, ValuePlace
 from aftbed.judge.record import read_record
 from aftbed.judge.verdict import Verdict, judge

@@ -20,8 +20,8 @@ import msgspec
 from aftbed.bench.runs import POLL_SECONDS, Percentiles, endless_run, percentiles, wait_for
 from aftbed.core.errors import HarnessError
 from aftbed.inject.crash import Crash
+from aftbed.inject.grammar import Trigger
 from aftbed.inject.model import Fault
-from aftbed.inject.timing import Trigger
 from aftbed.judge.checks import failovers
 from aftbed.runtime.unix import control_client, linux
 

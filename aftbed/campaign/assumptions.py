@@ -22,8 +22,8 @@ from aftbed.campaign.experiment import Result
 from aftbed.campaign.ledger import Ledger
 from aftbed.campaign.statistics import Interval, proportion
 from aftbed.core.application import Application, Characteristics
+from aftbed.inject.grammar import Permanent
 from aftbed.inject.model import parse
-from aftbed.inject.timing import Permanent
 from aftbed.judge.outcome import FAILED, UNKNOWN
 from aftbed.runtime.unix.options import load_module
 from aftbed.vehicle.aeb.function import default_application

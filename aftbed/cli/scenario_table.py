@@ -29,8 +29,8 @@ from aftbed.core.errors import ConfigError
 from aftbed.core.units import milliseconds, whole_milliseconds
 from aftbed.ftm.compose import build
 from aftbed.inject.crash import Crash
+from aftbed.inject.grammar import Trigger
 from aftbed.inject.model import Fault, parse
-from aftbed.inject.timing import Trigger
 from aftbed.judge.verdict import EXIT_CODES, EXIT_INTERRUPTED
 from aftbed.report.plots import RoadCurve, RoadPoint, road_plot
 from aftbed.search.road_table import NONE, PRIMARY, DrivenRow, RoadLine, driven, drives, outage

@@ -23,12 +23,12 @@ from aftbed.core.events import Event, event_named
 from aftbed.core.messages import AnyMessage, Message
 from aftbed.ftm.server import Server
 from aftbed.inject.channel import ALTERED, ChannelFault, ChannelFilter, FilterStage, RecordStrike
+from aftbed.inject.grammar import gap
 from aftbed.inject.kind import Alteration
 from aftbed.inject.model import ArmedFault
 from aftbed.inject.receipts import record_detail
 from aftbed.inject.shared_state import SHARED_BYTES, SharedFunction, StateLayout
 from aftbed.inject.slow import WHOLE_CPU
-from aftbed.inject.timing import gap
 
 Sender = tuple[str, str]  # a brick and its port
 

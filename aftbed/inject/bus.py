@@ -29,11 +29,10 @@ import msgspec
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.graph import Graph
 from aftbed.core.units import duration, milliseconds, number
-from aftbed.inject import timing
-from aftbed.inject.grammar import NUMBER, whole
+from aftbed.inject import grammar
+from aftbed.inject.grammar import NUMBER, ONCE, Chance, Every, Lasting, Permanent, Transient, Trigger, whole
 from aftbed.inject.kind import AnyFault, FaultKind, Injection, RunControl, Steps
 from aftbed.inject.receipts import Receipt
-from aftbed.inject.timing import ONCE, Chance, Every, Lasting, Permanent, Transient, Trigger
 from aftbed.vehicle.can.bus_model import NODES
 from aftbed.vehicle.condition import Condition
 
@@ -504,7 +503,7 @@ def _opening_and_persistence(words: _WordReader, *, on_nodes: bool) -> tuple[Ope
             case "after":
                 after_us = words.duration_us()
             case "when":
-                when = timing.condition(
+                when = grammar.condition(
                     *(words.next(what) for what in ("ttc, gap or speed", "'<' or '>'", "a value"))
                 )
             case "nth" if not on_nodes:
@@ -512,7 +511,7 @@ def _opening_and_persistence(words: _WordReader, *, on_nodes: bool) -> tuple[Ope
             case "for":
                 persistence = Lasting(words.duration_us())
             case "intermittent" if not on_nodes:
-                persistence = timing.intermittent(words.next("'every' or 'p'"), words.next("a number"))
+                persistence = grammar.intermittent(words.next("'every' or 'p'"), words.next("a number"))
             case "permanent":
                 persistence = Permanent()
             case "nth" | "intermittent":

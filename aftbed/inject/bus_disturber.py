@@ -30,7 +30,6 @@ from typing import Final
 
 from e2e.p11 import e2e_p11_protect
 
-from aftbed.inject.bit_patterns import with_flipped
 from aftbed.inject.bus import (
     NODE_ACTS,
     Babble,
@@ -46,8 +45,8 @@ from aftbed.inject.bus import (
     SetSignal,
     StuckCounter,
 )
+from aftbed.inject.grammar import Chance, Every, Lasting, Permanent, Transient, with_flipped
 from aftbed.inject.receipts import BusReport
-from aftbed.inject.timing import Chance, Every, Lasting, Permanent, Transient
 from aftbed.vehicle.can.bus_model import FALLBACK, CarriedFrame
 from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.condition import Condition

@@ -20,10 +20,9 @@ from aftbed.core.graph import Graph
 from aftbed.core.messages import Message
 from aftbed.core.units import DURATION_MS_MAX, duration, milliseconds
 from aftbed.inject import targets
-from aftbed.inject.grammar import REPEAT_KEYS, FaultWords
+from aftbed.inject.grammar import REPEAT_KEYS, FaultWords, Persistence, gap
 from aftbed.inject.kind import AnyFault, FaultKind, Injection, RunControl
 from aftbed.inject.receipts import Receipt, ReceiptState, fault_and_bits, more_times
-from aftbed.inject.timing import Persistence, gap
 
 HOLD_MS: Final = 20.0
 HELD: Final = 0  # the detail of a record: a message was held back

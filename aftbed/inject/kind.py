@@ -25,11 +25,10 @@ from aftbed.core.graph import Graph
 from aftbed.core.journal import Record
 from aftbed.core.messages import Message
 from aftbed.inject import targets
-from aftbed.inject.grammar import FaultWords
+from aftbed.inject.grammar import ONCE, FaultWords, Persistence, Trigger, read_persistence, read_trigger
 from aftbed.inject.receipts import BusReport, Receipt, ReceiptState
 from aftbed.inject.shared_state import SharedState, StateHit
 from aftbed.inject.targets import TargetProcess
-from aftbed.inject.timing import ONCE, Persistence, Trigger, read_persistence, read_trigger
 from aftbed.vehicle.condition import Condition
 
 T = TypeVar("T")

@@ -15,8 +15,7 @@ from typing import Final, Self
 from aftbed.core.errors import ConfigError, StepFailed
 from aftbed.core.graph import Graph
 from aftbed.inject import targets
-from aftbed.inject.bit_patterns import BYTE_BITS, PATTERN_KEYS
-from aftbed.inject.grammar import REPEAT_KEYS, FaultWords, whole
+from aftbed.inject.grammar import BYTE_BITS, PATTERN_KEYS, REPEAT_KEYS, FaultWords, whole
 from aftbed.inject.kind import AnyFault, FaultKind, Injection, RunControl, Steps, strike
 from aftbed.inject.receipts import Receipt, ReceiptState
 from aftbed.inject.value import BITFLIP, BITFLIP_KEYS, MEMORY

@@ -16,13 +16,13 @@ from aftbed.core.errors import ConfigError, unknown
 from aftbed.inject.bus import BUS, BusFault
 from aftbed.inject.channel import ChannelFault
 from aftbed.inject.crash import Crash
+from aftbed.inject.grammar import ONCE, Persistence, Trigger
 from aftbed.inject.hang import Hang
 from aftbed.inject.kind import AnyFault, FaultKind
 from aftbed.inject.memory import MemoryFlip
 from aftbed.inject.receipts import ReceiptState
 from aftbed.inject.slow import Slow
 from aftbed.inject.state import StateFlip
-from aftbed.inject.timing import ONCE, Persistence, Trigger
 from aftbed.inject.value import ValueFlip
 
 FaultAction = (  # the registry: the first kind that claims the words of a fault reads them

@@ -26,7 +26,7 @@ from aftbed.core.errors import ConfigError, PeerError
 from aftbed.core.events import Event
 from aftbed.core.journal import Record
 from aftbed.ftm.server import Server
-from aftbed.inject.bit_patterns import BitPattern, Byte, StuckBit, bit_names, bits_to_flip
+from aftbed.inject.grammar import BitPattern, Byte, StuckBit, bit_names, bits_to_flip
 from aftbed.inject.receipts import Receipt, ReceiptState, fault_and_bits
 
 SHARED_BYTES: Final = 1 << 16  # memory that is never touched costs nothing

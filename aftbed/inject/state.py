@@ -16,8 +16,7 @@ from aftbed.core.errors import ConfigError, StepFailed, unknown
 from aftbed.core.events import Event
 from aftbed.core.graph import Graph
 from aftbed.inject import targets
-from aftbed.inject.bit_patterns import Bit, BitPattern, check_pattern, read_pattern
-from aftbed.inject.grammar import REPEAT_KEYS, FaultWords
+from aftbed.inject.grammar import REPEAT_KEYS, Bit, BitPattern, FaultWords, check_pattern, read_pattern
 from aftbed.inject.kind import AnyFault, FaultKind, Injection, RunControl, Steps
 from aftbed.inject.receipts import Receipt, ReceiptState
 from aftbed.inject.shared_state import SharedState, field_with_bits

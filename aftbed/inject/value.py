@@ -25,22 +25,24 @@ from aftbed.core.graph import Graph
 from aftbed.core.journal import Record
 from aftbed.core.messages import Checkpoint, Message, Reply, Request, StateCaptured, StoreReply, Trial, Tried
 from aftbed.inject import targets
-from aftbed.inject.bit_patterns import (
+from aftbed.inject.grammar import (
     PATTERN_KEYS,
+    REPEAT_KEYS,
+    WHEN_KEYS,
     Bit,
     BitPattern,
     Byte,
+    FaultWords,
     StuckBit,
+    Trigger,
     bit_names,
     bits_to_flip,
     check_pattern,
     read_pattern,
     with_flipped,
 )
-from aftbed.inject.grammar import REPEAT_KEYS, WHEN_KEYS, FaultWords
 from aftbed.inject.kind import Alteration, AnyFault, FaultKind, Injection, RunControl
 from aftbed.inject.receipts import Receipt, ReceiptState, fault_and_bits, more_times
-from aftbed.inject.timing import Trigger
 
 BITFLIP: Final = "bitflip"
 MEMORY: Final = "memory"  # the place of a bit flip outside of all values: see `memory`

@@ -25,11 +25,10 @@ from aftbed.core.messages import Goal, Scheduled
 from aftbed.core.script import Stage, flat
 from aftbed.ftm.compose import DUPLEX_EXPRESSIONS, build, parse, tolerates
 from aftbed.ftm.registry import MECHANISMS, server_emits
-from aftbed.inject.bit_patterns import Bit
 from aftbed.inject.crash import Crash
+from aftbed.inject.grammar import Bit, Trigger
 from aftbed.inject.hang import Hang
 from aftbed.inject.model import Fault, FaultAction
-from aftbed.inject.timing import Trigger
 from aftbed.inject.value import EXECUTED, ValueFlip, ValuePlace
 from aftbed.judge.simulated import breaches
 from aftbed.judge.verdict import Breach

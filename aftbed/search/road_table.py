@@ -18,9 +18,9 @@ from typing import Final
 import msgspec
 from msgspec.structs import replace
 
+from aftbed.inject.grammar import Trigger
 from aftbed.inject.hang import Hang
 from aftbed.inject.model import Fault
-from aftbed.inject.timing import Trigger
 from aftbed.runtime.sim.world import Setup
 from aftbed.runtime.unix.worker_pool import each
 from aftbed.search.worst_instant import Course, StruckDrive, course_of, impact_kmh, strike, worst_instant

@@ -34,13 +34,12 @@ from aftbed.core.messages import Goal, Scheduled
 from aftbed.ftm.compose import EXPRESSIONS, NONE, build, replication_of, tolerates
 from aftbed.ftm.registry import EMITTERS, MECHANISMS, server_emits
 from aftbed.inject import targets
-from aftbed.inject.bit_patterns import Bit
 from aftbed.inject.channel import ChannelFault, Disturbance
 from aftbed.inject.crash import Crash
+from aftbed.inject.grammar import Bit, Trigger
 from aftbed.inject.hang import Hang
 from aftbed.inject.model import Fault
 from aftbed.inject.slow import Slow
-from aftbed.inject.timing import Trigger
 from aftbed.inject.value import EXECUTED, ValueFlip
 from aftbed.runtime.deployment import replica_of
 from aftbed.runtime.sim.world import Setup

@@ -43,9 +43,9 @@ from aftbed.core.journal import EntryKind
 from aftbed.ftm.compose import build
 from aftbed.ftm.registry import EMITTERS
 from aftbed.inject.crash import Crash
+from aftbed.inject.grammar import Trigger
 from aftbed.inject.model import Fault, FaultAction
 from aftbed.inject.targets import Roles, emitting_node
-from aftbed.inject.timing import Trigger
 from aftbed.judge.checks import VEHICLE
 from aftbed.judge.simulated import breaches
 from aftbed.runtime.sim.world import Run, Setup, World, simulate

@@ -16,8 +16,8 @@ from msgspec.structs import replace
 from aftbed.cli.sim import SHRUNK_MAX, repeating
 from aftbed.core.messages import Goal, Scheduled
 from aftbed.inject.crash import Crash
+from aftbed.inject.grammar import Trigger
 from aftbed.inject.model import Fault
-from aftbed.inject.timing import Trigger
 from aftbed.runtime.sim.world import Doom, Setup
 from aftbed.runtime.unix.worker_pool import each
 from aftbed.search.agreement import Agreement, RecoveryRange, apart

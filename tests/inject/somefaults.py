@@ -4,15 +4,27 @@ from hypothesis import strategies as st
 
 from aftbed.core.events import Event
 from aftbed.core.units import DURATION_MS_MAX
-from aftbed.inject.bit_patterns import BIT_MAX, BITS_MAX, Bit, BitBurst, Bits, Byte, StuckBit
 from aftbed.inject.channel import HOLDING, ChannelFault, Disturbance
 from aftbed.inject.crash import Crash
+from aftbed.inject.grammar import (
+    BIT_MAX,
+    BITS_MAX,
+    ONCE,
+    Bit,
+    BitBurst,
+    Bits,
+    Byte,
+    Chance,
+    Every,
+    Permanent,
+    StuckBit,
+    Trigger,
+)
 from aftbed.inject.hang import FOREVER_MS, Hang
 from aftbed.inject.memory import MemoryFlip
 from aftbed.inject.model import Fault
 from aftbed.inject.slow import SHARE_MAX, SHARE_MIN, SLOW_MS_MAX, Slow
 from aftbed.inject.state import StateFlip
-from aftbed.inject.timing import ONCE, Chance, Every, Permanent, Trigger
 from aftbed.inject.value import ValueFlip, ValuePlace
 from aftbed.vehicle.condition import QUANTITIES, Condition
 

@@ -19,8 +19,8 @@ from aftbed.core.events import Event
 from aftbed.core.journal import Record, records
 from aftbed.core.messages import AnyMessage, CaptureState, Message, Reply, Request, StateCaptured, Tried
 from aftbed.inject import model
-from aftbed.inject.bit_patterns import Bit, with_flipped
 from aftbed.inject.crash import Crash
+from aftbed.inject.grammar import Bit, with_flipped
 from aftbed.inject.hang import Hang
 from aftbed.inject.receipts import fault_and_bits, record_detail
 from aftbed.inject.value import EXECUTED, ValueFlip, ValuePlace

@@ -6,23 +6,30 @@ from hypothesis import given
 from hypothesis import strategies as st
 from somefaults import faults, patterns
 
-from aftbed.inject.bit_patterns import (
+from aftbed.inject.channel import ChannelFault, Disturbance
+from aftbed.inject.crash import Crash
+from aftbed.inject.grammar import (
     BIT_MAX,
+    ONCE,
     Bit,
     BitBurst,
     BitPattern,
     Bits,
     Byte,
+    Chance,
+    Every,
+    Permanent,
+    Persistence,
     StuckBit,
+    Transient,
+    Trigger,
     bits_to_flip,
+    gap,
     with_flipped,
 )
-from aftbed.inject.channel import ChannelFault, Disturbance
-from aftbed.inject.crash import Crash
 from aftbed.inject.model import Fault
 from aftbed.inject.receipts import fault_and_bits, record_detail
 from aftbed.inject.slow import Slow
-from aftbed.inject.timing import ONCE, Chance, Every, Permanent, Persistence, Transient, Trigger, gap
 from aftbed.inject.value import ValueFlip, ValuePlace
 
 

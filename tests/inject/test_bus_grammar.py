@@ -22,8 +22,8 @@ from aftbed.inject.bus import (
     StuckCounter,
     read_bus_fault,
 )
+from aftbed.inject.grammar import Chance, Every, Lasting, Permanent, Transient
 from aftbed.inject.model import Fault, on_bus, parse
-from aftbed.inject.timing import Chance, Every, Lasting, Permanent, Transient
 from aftbed.vehicle.condition import Condition
 
 NAMES = st.from_regex(r"[A-Za-z_][A-Za-z0-9_]{0,20}", fullmatch=True).filter(lambda name: name != "from")

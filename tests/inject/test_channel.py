@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from aftbed.core.messages import CaptureState, Message
 from aftbed.inject.channel import ALTERED, HELD, ChannelFault, ChannelFilter, Disturbance, FilterStage
-from aftbed.inject.timing import ONCE, Every, Permanent, Persistence
+from aftbed.inject.grammar import ONCE, Every, Permanent, Persistence
 
 BY_NS = 10
 

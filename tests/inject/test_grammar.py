@@ -9,15 +9,14 @@ from hypothesis import strategies as st
 from somefaults import faults
 
 from aftbed.core.errors import ConfigError
-from aftbed.inject.bit_patterns import Bit, BitBurst, Bits, Byte, StuckBit
 from aftbed.inject.channel import ChannelFault, Disturbance
 from aftbed.inject.crash import Crash
+from aftbed.inject.grammar import Bit, BitBurst, Bits, Byte, Chance, Every, Permanent, StuckBit, Trigger
 from aftbed.inject.hang import Hang
 from aftbed.inject.memory import MemoryFlip
 from aftbed.inject.model import NAMES, Fault, parse, read
 from aftbed.inject.slow import Slow
 from aftbed.inject.state import StateFlip
-from aftbed.inject.timing import Chance, Every, Permanent, Trigger
 from aftbed.inject.value import ValueFlip, ValuePlace
 from aftbed.vehicle.condition import Condition
 

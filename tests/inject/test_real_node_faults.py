@@ -20,8 +20,8 @@ from aftbed.core.journal import FLAG_OFFSET, records
 from aftbed.core.messages import AnyMessage, Request
 from aftbed.inject import model
 from aftbed.inject.channel import ChannelFault, Disturbance
+from aftbed.inject.grammar import Permanent
 from aftbed.inject.receipts import fault_and_bits
-from aftbed.inject.timing import Permanent
 from aftbed.runtime import control
 from aftbed.runtime.node import Node
 from aftbed.runtime.unix.journal_files import JournalFile

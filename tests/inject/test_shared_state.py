@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from aftbed.core.application import Application, Characteristics, Field, Width, field_named, fields_of
 from aftbed.core.errors import ConfigError, PeerError
 from aftbed.ftm.compose import build
-from aftbed.inject.bit_patterns import Bit, BitBurst, BitPattern, Bits, Byte, StuckBit, with_flipped
+from aftbed.inject.grammar import Bit, BitBurst, BitPattern, Bits, Byte, StuckBit, with_flipped
 from aftbed.inject.model import parse
 from aftbed.inject.shared_state import SHARED_BYTES, SharedFunction, differing_bits, field_with_bits
 from aftbed.inject.targets import Roles

@@ -9,13 +9,12 @@ from aftbed.core.errors import ConfigError
 from aftbed.core.events import Event
 from aftbed.core.graph import PLACEMENTS, Graph
 from aftbed.ftm.compose import DUPLEX, EXPRESSIONS, build
-from aftbed.inject.bit_patterns import BIT_MAX, Bit, BitBurst, Bits, Byte, StuckBit
 from aftbed.inject.channel import ChannelFault, Disturbance
 from aftbed.inject.crash import Crash
+from aftbed.inject.grammar import BIT_MAX, Bit, BitBurst, Bits, Byte, StuckBit, Trigger
 from aftbed.inject.model import Fault, parse
 from aftbed.inject.slow import Slow
 from aftbed.inject.targets import OTHERS, SUPERVISOR, Roles, emitters_in, emitting_node
-from aftbed.inject.timing import Trigger
 from aftbed.inject.value import EXECUTED, ValueFlip, ValuePlace
 
 

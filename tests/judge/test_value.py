@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from aftbed.core.journal import Entry, EntryKind, History
-from aftbed.inject.bit_patterns import with_flipped
+from aftbed.inject.grammar import with_flipped
 from aftbed.inject.model import FaultReport
 from aftbed.inject.receipts import ReceiptState
 from aftbed.judge.checks import (

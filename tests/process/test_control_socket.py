@@ -16,9 +16,9 @@ from aftbed.core.messages import PACKET_BYTES_MAX
 from aftbed.ftm.compose import build
 from aftbed.inject import targets
 from aftbed.inject.crash import Crash
+from aftbed.inject.grammar import Trigger
 from aftbed.inject.hang import Hang
 from aftbed.inject.model import Fault
-from aftbed.inject.timing import Trigger
 from aftbed.runtime.unix import control_client, run_directory
 
 pytestmark = pytest.mark.process

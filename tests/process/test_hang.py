@@ -14,9 +14,9 @@ from sampling import every
 
 from aftbed.core.events import Event
 from aftbed.ftm.compose import build
+from aftbed.inject.grammar import Trigger
 from aftbed.inject.hang import Hang
 from aftbed.inject.model import Fault
-from aftbed.inject.timing import Trigger
 from aftbed.runtime.unix import control_client
 from aftbed.runtime.unix.options import LoadRun
 

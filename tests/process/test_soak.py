@@ -15,8 +15,8 @@ from liveruns import LOOK_SECONDS, Home, Started, until
 
 from aftbed.core.messages import Goal
 from aftbed.inject.crash import Crash
+from aftbed.inject.grammar import Trigger
 from aftbed.inject.model import Fault
-from aftbed.inject.timing import Trigger
 from aftbed.runtime.unix import control_client
 from aftbed.runtime.unix.options import LoadRun
 

@@ -32,8 +32,8 @@ from aftbed.core.events import Event
 from aftbed.core.graph import STAGED
 from aftbed.core.messages import Goal
 from aftbed.inject.crash import Crash
+from aftbed.inject.grammar import Trigger
 from aftbed.inject.model import Fault
-from aftbed.inject.timing import Trigger
 from aftbed.runtime.unix import control_client
 from aftbed.search.explore import STEPS, Strike, strikes
 

@@ -8,9 +8,9 @@ from typing import Final
 import pytest
 from liveruns import GONE_SECONDS_MAX, Home, Started, state_of, under_load, until
 
+from aftbed.inject.grammar import Trigger
 from aftbed.inject.hang import Hang
 from aftbed.inject.model import Fault
-from aftbed.inject.timing import Trigger
 from aftbed.runtime.unix import cleanup, control_client, linux
 from aftbed.runtime.unix.options import LoadRun
 

@@ -9,8 +9,8 @@ from aftbed.adapt.commands import scheduled
 from aftbed.core.script import RECIPES
 from aftbed.ftm.compose import build
 from aftbed.inject.crash import Crash
+from aftbed.inject.grammar import Trigger
 from aftbed.inject.model import Fault, parse
-from aftbed.inject.timing import Trigger
 from aftbed.judge.verdict import Breach
 from aftbed.report.html import TEMPLATES, engine
 from aftbed.report.sequence import KEPT_MAX, Shape, SpaceTime, escaped, listing, mermaid, space_time

@@ -19,9 +19,9 @@ from aftbed.core.errors import PeerError
 from aftbed.core.messages import PACKET_BYTES_MAX
 from aftbed.inject.bus import BusFault, read_bus_fault
 from aftbed.inject.crash import Crash
+from aftbed.inject.grammar import Trigger
 from aftbed.inject.hang import Hang
 from aftbed.inject.model import Fault
-from aftbed.inject.timing import Trigger
 from aftbed.runtime import control
 from aftbed.runtime.unix.transport import FDS_MAX, STATE_BYTES_MAX, Line, decode_order, decode_report
 from aftbed.vehicle.condition import Condition

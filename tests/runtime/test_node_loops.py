@@ -26,8 +26,8 @@ from aftbed.core.journal import FLAG_OFFSET, records
 from aftbed.core.messages import AnyMessage, Rebound, Reply, Request
 from aftbed.core.script import Script
 from aftbed.inject import model
-from aftbed.inject.bit_patterns import Bit
 from aftbed.inject.channel import ChannelFault, Disturbance
+from aftbed.inject.grammar import Bit
 from aftbed.inject.value import ValueFlip, ValuePlace
 from aftbed.runtime import control
 from aftbed.runtime.node import Node

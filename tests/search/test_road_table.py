@@ -6,8 +6,8 @@ import pytest
 from msgspec.structs import replace
 
 from aftbed.inject.crash import Crash
+from aftbed.inject.grammar import Trigger
 from aftbed.inject.model import Fault, parse
-from aftbed.inject.timing import Trigger
 from aftbed.search.road_table import PRIMARY, DrivenRow, RoadDrive, RoadLine, drive, driven, drives, outage
 from aftbed.vehicle.scenarios.tables import Case, cases
 

@@ -14,9 +14,9 @@ from aftbed.core.messages import Goal, Scheduled, StateCaptured
 from aftbed.ftm.pbr import PbrAfter
 from aftbed.ftm.registry import Setting, make
 from aftbed.inject.crash import Crash
+from aftbed.inject.grammar import Trigger
 from aftbed.inject.hang import Hang
 from aftbed.inject.model import Fault
-from aftbed.inject.timing import Trigger
 from aftbed.inject.value import ValueFlip, ValuePlace
 from aftbed.judge.simulated import breaches
 from aftbed.judge.verdict import Breach

@@ -13,9 +13,9 @@ from roads import near_course, sudden_course
 
 from aftbed.core.errors import HarnessError
 from aftbed.inject.crash import Crash
+from aftbed.inject.grammar import Trigger
 from aftbed.inject.hang import Hang
 from aftbed.inject.model import Fault, FaultAction, parse
-from aftbed.inject.timing import Trigger
 from aftbed.runtime.sim.world import Setup, simulate
 from aftbed.search import worst_instant as search_worst_instant
 from aftbed.search.worst_instant import (

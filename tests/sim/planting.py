@@ -12,11 +12,10 @@ import msgspec
 
 from aftbed.core.brick import Brick, Effect, Machine, Moves
 from aftbed.core.messages import Goal, Scheduled
-from aftbed.inject.bit_patterns import Bit
 from aftbed.inject.crash import Crash
+from aftbed.inject.grammar import Bit, Trigger
 from aftbed.inject.hang import Hang
 from aftbed.inject.model import Fault
-from aftbed.inject.timing import Trigger
 from aftbed.inject.value import ValueFlip, ValuePlace
 from aftbed.runtime.sim.world import Setup
 from aftbed.search import explore

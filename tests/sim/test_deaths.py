@@ -20,10 +20,9 @@ from msgspec.structs import replace
 from aftbed.core.events import Event
 from aftbed.core.journal import EntryKind
 from aftbed.ftm.compose import EXPRESSIONS, build, chain, parse, replication_of
-from aftbed.inject.bit_patterns import Bit
 from aftbed.inject.crash import Crash
+from aftbed.inject.grammar import Bit, Trigger
 from aftbed.inject.model import Fault
-from aftbed.inject.timing import Trigger
 from aftbed.inject.value import EXECUTED, ValueFlip, ValuePlace
 from aftbed.judge import checks
 from aftbed.judge.reference import reference_run

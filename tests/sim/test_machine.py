@@ -21,12 +21,11 @@ from aftbed.core.events import Event
 from aftbed.core.journal import EntryKind
 from aftbed.core.messages import Goal, NodeDied
 from aftbed.ftm.compose import EXPRESSIONS, NONE, parse, replication_of
-from aftbed.inject.bit_patterns import Bit
 from aftbed.inject.crash import Crash
+from aftbed.inject.grammar import Bit, Trigger
 from aftbed.inject.hang import Hang
 from aftbed.inject.model import Fault
 from aftbed.inject.targets import roles_in
-from aftbed.inject.timing import Trigger
 from aftbed.inject.value import EXECUTED, ValueFlip, ValuePlace
 from aftbed.judge.simulated import breaches
 from aftbed.runtime.deployment import replica_of

@@ -9,8 +9,8 @@ from sampling import sampled
 
 from aftbed.core.messages import Goal, Scheduled
 from aftbed.inject.crash import Crash
+from aftbed.inject.grammar import Trigger
 from aftbed.inject.model import Fault
-from aftbed.inject.timing import Trigger
 from aftbed.judge.checks import wrong_replies
 from aftbed.judge.reference import reference_run, succession
 from aftbed.judge.simulated import breaches

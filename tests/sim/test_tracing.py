@@ -9,8 +9,8 @@ import pytest
 
 from aftbed.core.messages import Checkpoint, Goal, Scheduled, Trials, Tried
 from aftbed.inject.crash import Crash
+from aftbed.inject.grammar import Trigger
 from aftbed.inject.model import Fault
-from aftbed.inject.timing import Trigger
 from aftbed.runtime.sim.trace import Sent, brief, lines, milliseconds, traced
 from aftbed.runtime.sim.world import Setup, simulate
 from aftbed.search.swarm import drawn

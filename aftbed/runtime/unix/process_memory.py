@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from aftbed.core.errors import HarnessError, StepFailed
-from aftbed.inject.bit_patterns import BYTE_BITS, drawn
+from aftbed.inject.grammar import BYTE_BITS, drawn
 from aftbed.runtime.unix import run_directory
 
 YAMA: Final = Path("/proc/sys/kernel/yama/ptrace_scope")

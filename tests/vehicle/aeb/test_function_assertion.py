@@ -10,7 +10,7 @@ from aebcycles import EGO_MS, braking, cycles
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aftbed.inject.bit_patterns import with_flipped
+from aftbed.inject.grammar import with_flipped
 from aftbed.vehicle.aeb.function import DEMAND_MS2, AebFunction, sample_requests
 from aftbed.vehicle.aeb.messages import (
     STAGE_FULL,
