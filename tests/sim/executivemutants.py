@@ -42,8 +42,7 @@ from aftbed.runtime.adaptations import Adaptations
 from aftbed.runtime.control import NOWHERE
 from aftbed.runtime.deployment import Deployment, Keys
 from aftbed.runtime.interface import Process
-from aftbed.runtime.rebinding import Changes, Rebinding
-from aftbed.runtime.script_executor import Execution
+from aftbed.runtime.script_executor import Changes, Execution, Rebinding
 from aftbed.runtime.sim import world
 from aftbed.runtime.sim.world import Setup
 

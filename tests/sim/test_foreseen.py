@@ -9,7 +9,7 @@ from planting import adapted, crash_after
 from aftbed.core.messages import Goal, Scheduled
 from aftbed.core.script import Step
 from aftbed.judge.simulated import breaches
-from aftbed.runtime.rebinding import Changes, Rebinding
+from aftbed.runtime.script_executor import Changes, Rebinding
 from aftbed.runtime.sim.world import Setup, simulate
 
 WAYS: Final = [
