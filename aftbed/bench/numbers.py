@@ -7,8 +7,6 @@ compared is the ratio of the two.
 """
 
 import datetime
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -17,10 +15,10 @@ from typing import Final
 
 import msgspec
 
-from aftbed.bench.runs import Log, tried
+from aftbed.bench.runs import Log, run_python, tried
 from aftbed.campaign.ledger import Environment, here
 from aftbed.campaign.plan import code_version
-from aftbed.core.errors import ConfigError, HarnessError
+from aftbed.core.errors import ConfigError
 
 COMMAND_SECONDS_MAX: Final = 1200.0
 BEGIN, END = "<!-- numbers: begin -->", "<!-- numbers: end -->"  # of the table in a page
@@ -167,14 +165,8 @@ def bench_all(log: Log, *, quick: bool = False, measure: Callable[[str], Documen
 
 def _measured(command: str) -> Document:
     """What `aftbed bench COMMAND --json` prints."""
-    arguments = [sys.executable, "-m", "aftbed", "bench", *command.split(), "--json"]
-    try:
-        done = subprocess.run(arguments, capture_output=True, timeout=COMMAND_SECONDS_MAX, check=False)
-    except subprocess.TimeoutExpired:
-        raise HarnessError(f"no result after {COMMAND_SECONDS_MAX:g} s") from None
-    if done.returncode != 0:
-        raise HarnessError(f"exit code {done.returncode}: {done.stderr.decode()[-500:].strip()}")
-    return msgspec.json.decode(done.stdout, type=Document)
+    arguments = ["-m", "aftbed", "bench", *command.split(), "--json"]
+    return msgspec.json.decode(run_python(arguments, COMMAND_SECONDS_MAX), type=Document)
 
 
 def _number(line: TableLine, found: dict[str, Document]) -> Number:

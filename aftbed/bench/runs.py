@@ -1,6 +1,8 @@
 """Runs under a synthetic load, without a car, and the times in their records: what the benches share."""
 
 import contextlib
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -51,6 +53,20 @@ def tried(what: str, measure: Callable[[], Found], log: Log) -> Found:
         except (HarnessError, ConfigError) as error:  # a run that died refuses like one that never was
             reason = str(error)
     raise HarnessError(f"{what}: failed {TRIES} times, the last time: {reason}")
+
+
+def run_python(arguments: list[str], seconds_max: float) -> bytes:
+    """The output of an interpreter with `arguments`. Raises HarnessError on a failure or a timeout."""
+    command = " ".join(["python", *arguments])
+    try:
+        done = subprocess.run(
+            [sys.executable, *arguments], capture_output=True, timeout=seconds_max, check=False
+        )
+    except subprocess.TimeoutExpired:
+        raise HarnessError(f"{command}: not ended after {seconds_max:g} s") from None
+    if done.returncode != 0:
+        raise HarnessError(f"{command}: exit code {done.returncode}: {done.stderr.decode()[-500:].strip()}")
+    return done.stdout
 
 
 # -- runs -----------------------------------------------------------------------------------------
