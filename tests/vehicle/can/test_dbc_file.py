@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from cantools.database import EncodeError
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -59,6 +60,19 @@ def test_a_signal_comes_back_within_half_a_step(signal: str, value: float, step:
     assert CODEC.decode("RADAR_TRACK", CODEC.encode("RADAR_TRACK", signals))[signal] == pytest.approx(
         value, abs=step / 2
     )
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"RANGE": 400.0}, {"RELATIVE_SPEED": -1000.0}, {"TRACK_ID": 16}, {"RANG": 1.0}], ids=str
+)
+def test_what_the_file_does_not_allow_is_not_encoded(wrong: dict[str, float]) -> None:
+    signals = dict.fromkeys(CODEC.signal_names("RADAR_TRACK"), 0.0)
+    for _ in range(2):  # a message that was encoded before is checked as the first one
+        with pytest.raises(EncodeError):
+            CODEC.encode("RADAR_TRACK", signals | wrong)
+        CODEC.encode("RADAR_TRACK", signals)
+    with pytest.raises((EncodeError, KeyError)):
+        CODEC.encode("RADAR_TRACK", {name: 0.0 for name in signals if name != "RANGE"})
 
 
 @pytest.mark.parametrize("length", [0, 7])
