@@ -8,6 +8,8 @@ from msgspec.structs import replace
 from aftbed.inject.crash import Crash
 from aftbed.inject.grammar import Trigger
 from aftbed.inject.model import Fault, parse
+from aftbed.judge.simulated import breaches
+from aftbed.runtime.sim.world import Setup, simulate
 from aftbed.search.road_table import PRIMARY, DrivenRow, RoadDrive, RoadLine, drive, driven, drives, outage
 from aftbed.vehicle.scenarios.tables import Case, cases
 
@@ -71,6 +73,10 @@ def test_a_row_passes_under_a_crash_at_the_worst_instant_as_without_it() -> None
     assert found.min_gap_m == pytest.approx(free.min_gap_m - found.loss_m, abs=2e-4)
     assert found.at_s is not None and found.instants is not None and found.instants > 20
     assert found.fault is not None and found.fault.startswith("crash primary at ")
+    again = simulate(Setup("pbr", scenario=case.name, faults=(parse(found.fault),)))
+    assert again.vehicle is not None and again.vehicle.min_gap_m is not None
+    assert round(again.vehicle.min_gap_m, 4) == found.min_gap_m
+    assert breaches(again) == () and [name for _, name in again.struck], "its words repeat it"
     assert (
         found.repeat[1]
         == f'aftbed run --scenario r152:m1-10 --ftm pbr --seed 0 --pace max --inject "{found.fault}"'

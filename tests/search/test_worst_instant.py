@@ -89,14 +89,24 @@ def test_nothing_worse_is_found_by_trying_every_cycle(near: Course, outage_ms: i
     assert_none_is_worse(near, worst, outage_ms, step=1)
 
 
+def test_the_words_of_the_worst_repeat_it_from_the_beginning(near: Course, hung: Worst) -> None:
+    again = simulate(replace(near.setup, faults=(parse(str(hung.struck.fault)),)))
+    assert again.vehicle == hung.struck.result != near.result
+
+
 def test_a_longer_outage_never_harms_less(near: Course, hung: Worst) -> None:
     shorter = worst_instant(near, Hang(20), "primary")
     assert shorter is not None
     assert harm(shorter.struck.result) <= harm(hung.struck.result)
 
 
-def check_worst_crash(course: Course) -> None:
-    """It costs next to nothing; and its words, simulated from the beginning, repeat it."""
+@pytest.mark.deep
+@pytest.mark.parametrize("ftm", ["pbr", "lfr", "pbr+tr", "lfr+tr"])
+def test_a_crash_at_the_worst_instant_takes_next_to_nothing_under_any_mechanism(
+    tmp_path: Path, ftm: str
+) -> None:
+    """And its words, simulated from the beginning, repeat it. One is in the tests of the tables each time."""
+    course = near_course(tmp_path, ftm)
     worst = worst_instant(course, Crash(), "primary")
     assert worst is not None and worst.instants > 20
     lost_m = (course.result.min_gap_m or 0.0) - (worst.struck.result.min_gap_m or 0.0)
@@ -105,18 +115,6 @@ def check_worst_crash(course: Course) -> None:
     again = simulate(replace(course.setup, faults=(parse(str(worst.struck.fault)),)))
     assert again.vehicle == worst.struck.result
     assert [name for _, name in again.struck], "no process was struck"
-
-
-def test_a_crash_at_the_worst_instant_takes_next_to_nothing_under_a_mechanism(pbr: Course) -> None:
-    check_worst_crash(pbr)
-
-
-@pytest.mark.deep
-@pytest.mark.parametrize("ftm", ["lfr", "pbr+tr", "lfr+tr"])
-def test_a_crash_at_the_worst_instant_takes_next_to_nothing_under_any_mechanism(
-    tmp_path: Path, ftm: str
-) -> None:
-    check_worst_crash(near_course(tmp_path, ftm))
 
 
 def test_without_a_mechanism_a_crash_in_sight_of_the_car_ahead_is_a_collision(tmp_path: Path) -> None:
