@@ -33,6 +33,7 @@ from aftbed.runtime.sim.world import Doom, Run, Setup, World
 
 NESTED: Final = ("pbr+assert+tr", "lfr+assert+tr")
 DUPLEX: Final = (*(e for e in EXPRESSIONS if replication_of(e)), *NESTED)
+SAMPLE: Final = ("pbr", "lfr", "pbr+tr", "lfr+assert+tr")  # in which each mechanism occurs
 SIMPLEX: Final = tuple(e for e in EXPRESSIONS if e != "none" and not replication_of(e))
 VOTING: Final = (*(e for e in EXPRESSIONS if "tr" in parse(e)), *NESTED)
 DETECTING: Final = tuple(e for e in DUPLEX if "assert" in parse(e) and "tr" not in parse(e))
@@ -105,7 +106,9 @@ def doomed(setup: Setup, brick: str, at: int) -> Doom:
     return Doom(brick, at % (effects(setup.ftm, setup.placement, setup.count)[brick] + 1))
 
 
-@pytest.mark.parametrize("ftm", DUPLEX)
+@pytest.mark.parametrize(
+    "ftm", [pytest.param(e, marks=[] if e in SAMPLE else [pytest.mark.deep]) for e in DUPLEX]
+)
 def test_who_speaks_to_the_other_replica_or_the_proxy_may_die_at_each_effect(ftm: str) -> None:
     """All there are over two requests: here the order of a mechanism's effects is what it promises."""
     setup = Setup(ftm, "process", 0, 2)

@@ -8,6 +8,7 @@ import puredrive
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from sampling import sampled
 
 from aftbed.core.application import Application, Characteristics
 from aftbed.core.errors import PeerError
@@ -273,8 +274,9 @@ def driven_by_the_function(name: str) -> puredrive.Drive:
     return puredrive.drive(scenario.plant, scenario.duration_ms)
 
 
-@every_variant
-@pytest.mark.parametrize("name", ["ccrs-50", "ccrm-50", "ccrb-50-12m", "free-drive"])
+@pytest.mark.parametrize(
+    ("make", "name"), sampled(VARIANTS, ("ccrs-50", "ccrm-50", "ccrb-50-12m", "free-drive"))
+)
 def test_the_car_drives_as_the_scenario_expects(
     make: Make, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

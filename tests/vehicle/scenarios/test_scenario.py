@@ -6,6 +6,7 @@ from random import Random
 
 import pytest
 from puredrive import as_it_is, drive
+from sampling import sampled
 
 from aftbed.core.errors import ConfigError
 from aftbed.vehicle.aeb.messages import STAGE_FULL, STAGE_NONE, STAGE_WARN
@@ -29,8 +30,7 @@ def test_these_are_shipped() -> None:
     assert scenario_names() == NAMES
 
 
-@pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize(("name", "seed"), sampled(NAMES, (1, 2)))
 def test_an_undisturbed_drive_comes_to_what_is_expected(name: str, seed: int) -> None:
     scenario = load_scenario(name)
     driven = drive(scenario.plant, scenario.duration_ms, seed=seed)
