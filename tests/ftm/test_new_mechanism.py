@@ -34,7 +34,7 @@ REGISTRATION: Final = (
 def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A copy of the package with one mechanism more."""
     root = tmp_path_factory.mktemp("project")
-    shutil.copytree(PACKAGE, root / "aftbed", ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(PACKAGE, root / "aftbed")  # with its bytecode
     if (PACKAGE.parent / "dbc").is_dir():
         shutil.copytree(PACKAGE.parent / "dbc", root / "dbc")
     (example,) = EXAMPLE.findall(PAGE.read_text())

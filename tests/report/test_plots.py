@@ -124,13 +124,14 @@ def test_lines_differ_by_their_dashes_too() -> None:
 
 
 def test_equal_data_give_equal_bytes_in_any_process() -> None:
+    here = ecdf("x", {"a": [1.0, 2.0, 90.0], "b": [3.0]}, {"a": 0, "b": 1}, [Limit("l", 5.0)])
     code = """
 from aftbed.report.plots import Limit, ecdf
 print(ecdf("x", {"a": [1.0, 2.0, 90.0], "b": [3.0]}, {"a": 0, "b": 1}, [Limit("l", 5.0)]))
 """
     command = [sys.executable, "-c", code]
-    first, second = (subprocess.run(command, capture_output=True, check=True, timeout=60) for _ in range(2))
-    assert first.stdout == second.stdout != b""
+    there = subprocess.run(command, capture_output=True, check=True, text=True, timeout=60).stdout
+    assert there == f"{here}\n" != "\n"
 
 
 def test_ids_of_two_drawings_differ() -> None:
