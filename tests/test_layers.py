@@ -7,6 +7,7 @@ allowed, and a class name is defined once in the package.
 import ast
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
+from functools import cache
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -71,9 +72,15 @@ class Import(NamedTuple):
         return f"{self.module}:{self.line} imports {self.target}"
 
 
+@cache
+def tree(source: str) -> ast.Module:
+    """Parsed once for all tests."""
+    return ast.parse(source)
+
+
 def imports(module: str, source: str) -> Iterator[Import]:
     """Every import in `source`, wherever it stands."""
-    for node in ast.walk(ast.parse(source)):
+    for node in ast.walk(tree(source)):
         if isinstance(node, ast.Import):
             for alias in node.names:
                 yield Import(module, alias.name, node.lineno)
@@ -132,7 +139,7 @@ def _row_problems(one: Import) -> list[str]:
 
 def impure_calls(source: str) -> Iterator[tuple[str, int]]:
     """Calls of builtins that do I/O."""
-    for node in ast.walk(ast.parse(source)):
+    for node in ast.walk(tree(source)):
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in IMPURE_CALLS:
             yield node.func.id, node.lineno
 
@@ -153,7 +160,7 @@ def sources() -> dict[str, str]:
 def imported_modules(module: str, source: str, known: Iterable[str]) -> set[str]:
     """The modules of ours that `module` imports; `from package import module` names the module."""
     known, found = set(known), set()
-    for node in ast.walk(ast.parse(source)):
+    for node in ast.walk(tree(source)):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names if alias.name in known}
         elif isinstance(node, ast.ImportFrom) and node.module:
@@ -200,7 +207,7 @@ def double_names(sources: Mapping[str, str]) -> list[str]:
     """Class names, not private ones, that more than one module defines at its top level."""
     homes = defaultdict(list)
     for name, source in sources.items():
-        for node in ast.parse(source).body:
+        for node in tree(source).body:
             if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
                 homes[node.name].append(name)
     return [f"{name}: {', '.join(where)}" for name, where in sorted(homes.items()) if len(where) > 1]
