@@ -44,8 +44,8 @@ def test_a_stop_is_written_before_it_is_done_and_its_undo_behind_it(home: Home) 
             linux.started(pid),
         )
         assert began_ns + 60e6 <= stopped[0].due_ns <= time.monotonic_ns() + 60e6
-        until(lambda: len(entries(run)) == 2, "the undo")
-        assert entries(run)[1] == cleanup.Undone(pid, stopped[0].start, "supervisor")
+        # Where a busy machine makes the supervisor late, the warden has undone it before.
+        until(lambda: cleanup.Undone(pid, stopped[0].start, "supervisor") in entries(run)[1:], "the undo")
         assert state_of(pid) not in ("T", "")
         assert run.finish().verdict.verdict == "pass"
 
