@@ -35,6 +35,14 @@ def pytest_make_parametrize_id(val: object) -> str | None:
     return f"{val[:ID_MAX]!r}..." if isinstance(val, str | bytes) and len(val) > ID_MAX else None
 
 
+@pytest.hookimpl(tryfirst=True)  # pytest-xdist reads the marks in the same hook
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """A file stays in one worker under `--dist loadgroup`, unless its tests name groups of their own."""
+    for item in items:
+        if item.get_closest_marker("xdist_group") is None:
+            item.add_marker(pytest.mark.xdist_group(item.path.relative_to(item.config.rootpath).as_posix()))
+
+
 @pytest.fixture
 def rewrite(request: pytest.FixtureRequest) -> bool:
     """Whether golden files are to be written instead of compared."""

@@ -154,7 +154,12 @@ def run_page(page: Path, folder: Path, lives: list[LiveRun]) -> int:
 
 @pytest.mark.timeout(PAGE_SECONDS_MAX)
 @pytest.mark.parametrize(
-    "page", [p for p in PAGES if p.name != "contributing.md"], ids=lambda page: page.name
+    "page",
+    [
+        pytest.param(page, id=page.name, marks=pytest.mark.xdist_group(page.name))
+        for page in PAGES
+        if page.name != "contributing.md"
+    ],
 )
 def test_the_commands_of_a_page_end_as_it_says(page: Path, tmp_path: Path, private: Path) -> None:
     shutil.copy(ROOT / "dbc" / "aftbed.dbc", tmp_path)
