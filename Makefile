@@ -10,8 +10,8 @@ EDITABLE := $(VENV)/.installed-editable
 SOURCES  := pyproject.toml README.md $(shell find aftbed dbc -type f -not -name '*.pyc')
 
 # The tests without real runs take every core. Of real runs, each has a core for either replica: two at a time
-# are as many as two cores bear without false alarms. A file stays together, for the runs that its tests share; a page
-# of docs/ is a unit of its own. In the order of collection: the small files of tests/runtime and tests/vehicle are last.
+# are as many as two cores bear without false alarms. A file stays together, for the runs that its tests share;
+# each page of the docs is a unit of its own. They are taken in the order of collection, the small files last.
 FAST := -n auto --dist worksteal -m "not process and not deep"
 REAL := -n 2 --dist loadgroup --no-loadscope-reorder -m "process and not deep"
 
