@@ -33,8 +33,8 @@ stop: {experiments: 6}
 unknown_max: 1.0
 not_activated_max: 1.0
 """
-MOMENTS = 10
 EXPERIMENTS = 24
+SMOKE_SECONDS_MAX = 600.0  # of all its experiments; one of each stratum takes a few seconds
 
 
 @pytest.fixture
@@ -57,11 +57,12 @@ def reached(out: Path, mark: int, running: subprocess.Popen[bytes]) -> bool:
     return done(out) > mark or running.poll() is not None
 
 
+@pytest.mark.parametrize("moments", [4, pytest.param(10, marks=pytest.mark.deep)])
 def test_a_campaign_that_is_killed_again_and_again_comes_to_its_end(
-    home: Home, spec: Path, tmp_path: Path
+    moments: int, home: Home, spec: Path, tmp_path: Path
 ) -> None:
     out, chance = tmp_path / "out", Random(7)
-    marks = sorted(chance.sample(range(EXPERIMENTS), MOMENTS))
+    marks = sorted(chance.sample(range(EXPERIMENTS), moments))
     command = [sys.executable, "-m", "aftbed", "campaign", "run", str(spec), "--out", str(out), "--jobs", "2"]
     for number, mark in enumerate(marks):
         resumed = ["--resume"] if number else []
@@ -95,3 +96,34 @@ def test_the_records_are_complete_before_a_run_is_taken_down(home: Home, spec: P
         lines = (out / ledger.NAME).read_bytes().splitlines(keepends=True)
         (out / ledger.NAME).write_bytes(b"".join((*lines, lines[-1])))
         ledger.read(out / ledger.NAME)
+
+
+@pytest.mark.timeout(SMOKE_SECONDS_MAX + 60)
+@pytest.mark.parametrize("experiments", [1, pytest.param(12, marks=pytest.mark.deep)])
+def test_the_smoke_campaign_has_nothing_unexpected(experiments: int, home: Home, tmp_path: Path) -> None:
+    """The README runs it in the simulator; here one real run of each stratum, in the deep tier all."""
+    out = tmp_path / "out"
+    command = [
+        sys.executable,
+        "-m",
+        "aftbed",
+        "campaign",
+        "run",
+        "ci-smoke",
+        "--out",
+        str(out),
+        "--jobs",
+        "1",
+    ]
+    ended = subprocess.run(
+        [*command, "--experiments", str(experiments)],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=SMOKE_SECONDS_MAX,
+    )
+    assert ended.returncode == 0 or experiments < 12, ended.stdout  # so few do not pass its gates
+    found = ledger.read(out / ledger.NAME).results
+    assert len(found) == 12 * experiments
+    assert not any(r.unexpected for r in found), [r for r in found if r.unexpected]
+    assert all(r.activated for r in found), [r for r in found if not r.activated]
