@@ -134,6 +134,9 @@ def run_below(worker: int) -> list[int]:
 
 LOCAL = """
 import sys
+
+from distributed import LocalCluster
+
 if __name__ == "__main__":
     with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as local:
         print(local.scheduler_address, flush=True)
@@ -152,7 +155,9 @@ def test_a_local_cluster_comes_to_the_same_results(tmp_path: Path) -> None:
     ) as local:
         try:
             assert local.stdout is not None
-            there = ran(found, tmp_path / "there", scheduler=local.stdout.readline().decode().strip())
+            address = local.stdout.readline().decode().strip()
+            assert address.startswith("tcp://127.0.0.1:"), "no cluster has started"
+            there = ran(found, tmp_path / "there", scheduler=address)
         finally:
             local.communicate(timeout=60)
     assert [(r.experiment, r.outcome) for r in there.results] == [

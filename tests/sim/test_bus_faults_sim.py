@@ -3,6 +3,7 @@
 from typing import Final
 
 import pytest
+from sampling import sampled
 
 from aftbed.inject.model import FaultReport, parse
 from aftbed.inject.receipts import ReceiptState
@@ -15,25 +16,25 @@ def drive(*faults: str, ftm: str = "pbr", seed: int = 1) -> Run:
     return simulate(Setup(ftm=ftm, seed=seed, scenario=DRIVE, faults=tuple(map(parse, faults))))
 
 
-@pytest.mark.parametrize("ftm", ["none", "pbr", "lfr+tr"])
-@pytest.mark.parametrize(
-    ("words", "noticed"),
-    [
-        (
-            "corrupt bus RADAR_TRACK bit 21 nth 50",
-            "1 frame, at 0.980000 s, id 130; noticed by gateway (checksum)",
-        ),
-        (
-            "stuck-counter bus RADAR_TRACK nth 50",
-            "1 frame, at 0.980000 s, id 130; noticed by gateway (repeated)",
-        ),
-        (
-            "corrupt bus RADAR_TRACK signal LATERAL_OFFSET=9 crc good nth 50",
-            "1 frame, at 0.980000 s, id 130; believed by gateway",
-        ),
-    ],
+STRUCK: Final = (  # a fault, and its receipt
+    (
+        "corrupt bus RADAR_TRACK bit 21 nth 50",
+        "1 frame, at 0.980000 s, id 130; noticed by gateway (checksum)",
+    ),
+    (
+        "stuck-counter bus RADAR_TRACK nth 50",
+        "1 frame, at 0.980000 s, id 130; noticed by gateway (repeated)",
+    ),
+    (
+        "corrupt bus RADAR_TRACK signal LATERAL_OFFSET=9 crc good nth 50",
+        "1 frame, at 0.980000 s, id 130; believed by gateway",
+    ),
 )
-def test_a_frame_is_struck_and_who_noticed_is_said(words: str, noticed: str, ftm: str) -> None:
+
+
+@pytest.mark.parametrize(("struck", "ftm"), sampled(STRUCK, ("none", "pbr", "lfr+tr")))
+def test_a_frame_is_struck_and_who_noticed_is_said(struck: tuple[str, str], ftm: str) -> None:
+    words, noticed = struck
     run = drive(words, ftm=ftm)
     assert run.faults == (FaultReport(words, ReceiptState.ACTIVATED, noticed),)
     assert run.rest.why_not == ()

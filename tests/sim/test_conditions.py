@@ -3,6 +3,7 @@
 from typing import Final
 
 import pytest
+from sampling import sampled
 
 from aftbed.core.errors import ConfigError
 from aftbed.core.events import Event
@@ -29,8 +30,7 @@ def began_ns(run: Run) -> int:
     return sent[50].t_ns - 50 * CYCLE_NS
 
 
-@pytest.mark.parametrize("placement", ["process", "replica"])
-@pytest.mark.parametrize("ftm", ["pbr", "lfr", "pbr+tr"])
+@pytest.mark.parametrize(("ftm", "placement"), sampled(("pbr", "lfr", "pbr+tr"), ("process", "replica")))
 def test_a_crash_strikes_at_the_step_of_its_condition(ftm: str, placement: str) -> None:
     run = drive("crash primary when ttc < 2", ftm=ftm, placement=placement)
     words = FaultReport("crash primary when ttc < 2", ReceiptState.ACTIVATED, "ttc < 2 at 2.000000 s")

@@ -156,7 +156,7 @@ def test_with_replies_at_once_it_is_a_real_run(scenario: str, tmp_path: Path) ->
 # -- every drive ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("scenario", scenario_names())
+@pytest.mark.parametrize("scenario", every(2, scenario_names()))
 def test_every_scenario_comes_to_its_end_and_to_what_it_expects(scenario: str) -> None:
     done = drive(scenario)
     assert done.car.end in ("standstill", "duration")
