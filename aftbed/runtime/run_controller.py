@@ -213,16 +213,17 @@ class RunController:
         def ended(failure: str) -> None:
             ms = (self._loop.now_ns() - began_ns) / 1e6
             self._runtime.log("replaced", f"{node}: {failure or f'{ms:.2f} ms'}")
-            half = self.deployment.nodes.get(node)
-            if failure and not self.ending and half is not None and half.alive:
-                half.kill()  # half bound: its death is noticed, and it is replaced in turn
-            elif failure and not self.ending:
+            replacement = self.deployment.nodes.get(node)
+            serves = not failure and self.deployment.lives(node)
+            if failure and not self.ending and replacement is not None and replacement.alive:
+                replacement.kill()  # half bound: its death is noticed, and it is replaced in turn
+            elif not serves and not self.ending:  # it may have died while others were bound to it
                 self._loop.after(AGAIN_SECONDS, lambda: self._replace(node))
             if node == "recovery" or self.deployment.lost:
                 self.inform_recovery(failed=False)
-            if node == ENGINE and not failure:
+            if node == ENGINE and serves:
                 self.adaptations.engine_is_new()
-            if node == CLIENT and not failure:
+            if node == CLIENT and serves:
                 self._loop.tasks.start("rearm", self.adaptations.client_is_new(), lambda _: None)
             self._runtime.pool.refill(LIGHT, self.spares())
 
