@@ -31,6 +31,7 @@ class CampaignResult(msgspec.Struct, frozen=True):
     cpus: int
     experiments: int
     outcomes: dict[str, int]
+    noisy: int  # experiments during which the machine was too busy for times to mean anything
     seconds: float
     per_minute: int
     cpu_ms: float
@@ -47,7 +48,7 @@ def bench_campaign(
     with tempfile.TemporaryDirectory(prefix="aftbed-bench-") as folder:
         began_s, began_cpu_s = time.monotonic(), _cpu_s()
         asked = runner.CampaignRunOptions(Path(folder) / "campaign", jobs)
-        outcomes = Counter(result.outcome for result in runner.run(planned, asked))
+        results = list(runner.run(planned, asked))
         seconds, cpu_s = time.monotonic() - began_s, _cpu_s() - began_cpu_s
     return CampaignResult(
         ftm,
@@ -56,7 +57,8 @@ def bench_campaign(
         jobs,
         cpus=len(os.sched_getaffinity(0)),
         experiments=experiments,
-        outcomes=dict(outcomes),
+        outcomes=dict(Counter(result.outcome for result in results)),
+        noisy=sum(result.noisy for result in results),
         seconds=round(seconds, 1),
         per_minute=round(60 * experiments / seconds),
         cpu_ms=round(cpu_s / experiments * 1e3, 1),
