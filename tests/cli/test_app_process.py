@@ -2,11 +2,13 @@
 
 import json
 import socket
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 from liveruns import Done, Home
-from liveruns import command as aftbed
+from liveruns import forked as aftbed
 from test_bad_input import DBC, MAP
 
 from aftbed.campaign.plan import code_version
@@ -52,9 +54,10 @@ def test_a_refused_run_leaves_no_record(home: Home, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("arguments", [("--help",), ("run", "--load", "10"), ("status",)])
 def test_an_interpreter_without_asserts_is_refused(home: Home, arguments: tuple[str, ...]) -> None:
-    done = aftbed(*arguments, flags=("-O",))
-    assert done.code != 0
-    assert "refusing to run under python -O" in done.err
+    words = [sys.executable, "-O", "-m", "aftbed", *arguments]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode != 0
+    assert "refusing to run under python -O" in done.stderr
     assert home.left() == []
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Final
 
 import pytest
-from liveruns import PLAIN, called
+from liveruns import PLAIN, called, forked
 from pages import PAGES, ROOT, Block, Command, blocks, names, table
 
 SECONDS_MAX: Final = 180.0  # of one command, on a machine under load
@@ -45,13 +45,13 @@ def private(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 def aftbed(words: list[str], folder: Path, *, live: bool = False) -> subprocess.CompletedProcess[str]:
-    """Run one command of a page to its end, in this process if it starts none.
+    """Run one command of a page to its end, in an interpreter of its own if it is about a `live` run.
 
-    One about a `live` run is started as a person does: the next comes when the run has dealt with it.
+    Then it takes as long as a person's: the next comes when the run has dealt with it.
     """
-    if words[0] in PLAIN and not live:
+    if not live:
         with contextlib.chdir(folder):
-            done = called(*words)
+            done = called(*words) if words[0] in PLAIN else forked(*words, seconds=SECONDS_MAX)
         return subprocess.CompletedProcess(words, done.code, done.out, done.err)
     return subprocess.run(
         [sys.executable, "-m", "aftbed", *words],

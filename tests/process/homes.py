@@ -1,11 +1,12 @@
 """The home of a test: the XDG_RUNTIME_DIR of its runs, and what is left in it when they are over.
 
-Whatever descends from a test carries the name of its home in its environment (`/proc/PID/environ`), or is a
-fork of this process whose pid is known; so after a test it can be told, without a name to guess, whether
-anything of it is left. Other tests, and other people's processes, may run beside it.
+Whatever descends from a test carries the name of its home in its environment (`/proc/PID/environ`), or in a
+mapping (`mark`), or is a fork of this process whose pid is known. So after a test it is certain whether any
+of its processes is left. Other tests, and other people's processes, may run beside it.
 """
 
 import contextlib
+import mmap
 import os
 import shutil
 import signal
@@ -24,6 +25,15 @@ PATIENCE_SECONDS: Final = 5.0  # how long a test waits for what G7 allows a seco
 SHARED_MEMORY: Final = Path("/dev/shm")
 
 Found = TypeVar("Found")
+_MARKS: Final[list[mmap.mmap]] = []
+
+
+def mark() -> None:
+    """Mark this process, a fork of a test's, and what it will fork as belonging to the test's home."""
+    descriptor = os.memfd_create(os.environ["XDG_RUNTIME_DIR"])
+    os.ftruncate(descriptor, mmap.PAGESIZE)
+    _MARKS.append(mmap.mmap(descriptor, mmap.PAGESIZE))
+    os.close(descriptor)
 
 
 def until(look: Callable[[], Found], what: str, seconds: float = WAIT_SECONDS_MAX) -> Found:
@@ -54,7 +64,9 @@ class Home:
         try:
             if int(process.name) in self.forks:
                 return (process / "stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
-            return self._mark in (process / "environ").read_bytes().split(b"\0")
+            if self._mark in (process / "environ").read_bytes().split(b"\0"):
+                return True
+            return f"/memfd:{self.path} " in (process / "maps").read_text()
         except OSError:
             return False
 

@@ -7,17 +7,20 @@ Nothing here sleeps to wait: a wait is a poll of a descriptor or of a condition,
 """
 
 import contextlib
+import gc
 import io
 import json
 import os
+import resource
 import select
 import signal
 import subprocess
 import sys
 import tempfile
 import time
+import traceback
 from pathlib import Path
-from typing import Final
+from typing import Final, NoReturn
 
 import msgspec
 import pytest
@@ -28,6 +31,7 @@ from homes import (
     WAIT_SECONDS_MAX,
     Home,
     home,
+    mark,
     until,
 )
 
@@ -57,8 +61,8 @@ __all__ = [  # what others import from here
     "Outcome",
     "Started",
     "aftbed",
-    "command",
     "ended",
+    "forked",
     "home",
     "readable",
     "state_of",
@@ -270,36 +274,71 @@ class Done(msgspec.Struct, frozen=True):
 
 def aftbed(*arguments: str | Path) -> Done:
     """Run a command to its end: in this process if it starts none."""
-    return called(*arguments) if arguments[0] in PLAIN else command(*arguments)
+    return called(*arguments) if arguments[0] in PLAIN else forked(*arguments)
 
 
 def called(*arguments: str | Path) -> Done:
     """Run a command in this process."""
     out, err = (io.TextIOWrapper(io.BytesIO(), write_through=True) for _ in range(2))
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        code = _main(arguments)
+    return Done(code, *(text.buffer.getvalue().decode() for text in (out, err)))
+
+
+def _main(arguments: tuple[str | Path, ...]) -> int:
     argv, sys.argv = sys.argv, ["aftbed", *map(str, arguments)]
     try:
-        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-            main()
+        main()
         code: object = 0
     except SystemExit as ended:
         code = ended.code or 0
     finally:
         sys.argv = argv
     assert isinstance(code, int), code
-    return Done(code, *(text.buffer.getvalue().decode() for text in (out, err)))
+    return code
 
 
-def command(*arguments: str | Path, flags: tuple[str, ...] = ()) -> Done:
-    """Run a command in an interpreter of its own; `flags` are the interpreter's."""
-    done = subprocess.run(
-        [sys.executable, *flags, "-m", "aftbed", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        timeout=RUN_SECONDS_MAX,
-        check=False,
-        stdin=subprocess.DEVNULL,
-    )
-    return Done(done.returncode, done.stdout, done.stderr)
+def forked(*arguments: str | Path, folder: Path | None = None, seconds: float = RUN_SECONDS_MAX) -> Done:
+    """Run a command in a process of its own: a fork of this one, which has imported most of what it needs.
+
+    The start of an interpreter and its imports would take longer than most commands.
+    """
+    with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
+        pid = os.fork()
+        if pid == 0:
+            _be_command(arguments, folder or Path(), out.fileno(), err.fileno())
+        pidfd = os.pidfd_open(pid)
+        try:
+            in_time = readable(pidfd, seconds)
+            if not in_time:
+                os.kill(pid, signal.SIGKILL)
+            _, status = os.waitpid(pid, 0)
+        finally:
+            os.close(pidfd)
+        for file in (out, err):
+            file.seek(0)
+        done = Done(os.waitstatus_to_exitcode(status), out.read().decode(), err.read().decode())
+    assert in_time, f"{arguments} took more than {seconds} s:\n{done.out}{done.err}"
+    return done
+
+
+def _be_command(arguments: tuple[str | Path, ...], folder: Path, out: int, err: int) -> NoReturn:
+    code = 1
+    try:
+        gc.freeze()  # no object of the tests is finalized here: its descriptor may be another's by then
+        mark()
+        for descriptor, place in ((os.open(os.devnull, os.O_RDONLY), 0), (out, 1), (err, 2)):
+            os.dup2(descriptor, place)
+        os.closerange(3, resource.getrlimit(resource.RLIMIT_NOFILE)[0])
+        sys.stdin, sys.stdout, sys.stderr = os.fdopen(0), os.fdopen(1, "w"), os.fdopen(2, "w")
+        os.chdir(folder)
+        code = _main(arguments)
+    except BaseException:  # noqa: BLE001 - the last frame of this process
+        traceback.print_exc()
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
 
 
 class Command:

@@ -17,7 +17,7 @@ and `aftbed --help` must not wait for it.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from importlib import import_module
 from math import inf
 from pathlib import Path
@@ -31,6 +31,13 @@ if TYPE_CHECKING:
     from cantools.database.can.signal import Signal
 
 DBC_BYTES_MAX: Final = 16_000_000  # the largest real ones known to us have two; a log given by mistake more
+SIZE_MAX: Final = 0xFFFF  # of a message's bytes, a signal's bits and place, a range of multiplexer values
+DIGITS_MAX: Final = 18
+_SIZES: Final = re.compile(
+    r"\bBO_\s+\d+\s+\w+\s*:\s*(\d+)|\bSG_\s+\w+(?:\s+\w+)?\s*:\s*(-?\d+)\s*\|\s*(\d+)", re.ASCII
+)
+_MULTIPLEXED: Final = re.compile(r"\bSG_MUL_VAL_\s[^;]*")
+_RANGE: Final = re.compile(r"(\d+)\s*-\s*(\d+)", re.ASCII)
 _PACKAGE: Final = Path(__file__).resolve().parents[2]
 _CANDIDATES: Final = (
     _PACKAGE / "dbc" / "aftbed.dbc",  # in a wheel
@@ -198,6 +205,7 @@ def load_dbc(path: Path | None = None, *, strict: bool = True) -> Codec:
         raise ConfigError(f"{chosen}: cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:
         raise ConfigError(f"{chosen}: not text, at byte {error.start}") from error
+    _check_sizes(text, chosen)
     database, failure = _parse(text, strict=strict)
     if database is None:
         assert failure is not None
@@ -206,6 +214,25 @@ def load_dbc(path: Path | None = None, *, strict: bool = True) -> Codec:
         raise ConfigError(f"{chosen}: {_explain(failure, text)}{offer}") from failure
     _check_messages(database, chosen, text)
     return Codec(database, chosen, {} if strict else _contradictions(database))
+
+
+def _check_sizes(text: str, path: Path) -> None:
+    """Refuse what cantools allocates by before it compares it with the frame, or counts from the end."""
+    for at, size in _sizes(text):
+        if not 0 <= size <= SIZE_MAX:
+            line = text.count("\n", 0, at) + 1
+            what = "a length, a start bit or a range of multiplexer values"
+            raise ConfigError(f"{path}: line {line}: {what} is {size}, allowed is 0 to {SIZE_MAX}")
+
+
+def _sizes(text: str) -> Iterator[tuple[int, int]]:
+    """Where a size stands in a DBC, and the size; of a range of multiplexer values, how many they are."""
+    for found in _SIZES.finditer(text):
+        for number in filter(None, found.groups()):
+            yield found.start(), int(number[:DIGITS_MAX])
+    for found in _MULTIPLEXED.finditer(text):
+        for low, high in _RANGE.findall(found[0]):
+            yield found.start(), int(high[:DIGITS_MAX]) - int(low[:DIGITS_MAX])
 
 
 def _parse(text: str, *, strict: bool) -> tuple[Database | None, Exception | None]:

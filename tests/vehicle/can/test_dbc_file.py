@@ -1,5 +1,6 @@
 """The DBC says what the design says, and a bad one is refused with its file, reason and line."""
 
+import re
 import subprocess
 import sys
 import tempfile
@@ -97,6 +98,14 @@ OVERLAP = (
     'BU_: X\nBO_ 1 X: 2 V\n SG_ A : 0|8@1+ (1,0) [0|1] "m" V\n SG_ B : 4|8@1- (0.5,1) [0|1] "" V\n'
     'BO_ 2 Y: 1 V\n SG_ B : 0|8@1+ (1,0) [0|1] "" V\n'
 )
+SIZE = "a length, a start bit or a range of multiplexer values is"
+MULTIPLEXED = """\
+BU_: X
+BO_ 1 X: 8 V
+ SG_ A m0 : 0|8@1+ (1,0) [0|1] "" V
+ SG_ B M : 8|8@1+ (1,0) [0|1] "" V
+SG_MUL_VAL_ 1 A B 0-3, 5 - 99999999999;
+"""
 WAY_OUT = " (a map with `strict: false` takes it as it is)"
 
 
@@ -130,6 +139,10 @@ WAY_OUT = " (a map with `strict: false` takes it as it is)"
         ('BU_: X\nBA_DEF_ BO_ "Cycle" INT 0 ;\nBO_ 1 X: 8 V\n', "cantools gives up: list index out of range"),
         ("BU_: X\nBO_ 1 X: 64 V\n", "line 2: message X has 64 bytes, allowed is 0 to 8"),
         ("BU_: X\nBO_ 1 X: -8 V\n", "line 2: message X has -8 bytes, allowed is 0 to 8"),
+        ("BU_: X\nBO_ 1 X: 99999999999999 V\n", f"line 2: {SIZE} 99999999999999, allowed"),
+        ('BU_: X\nBO_ 1 X: 8 V\n SG_ A : 0|99999999999@1+ (1,0) [0|1] "" V\n', f"line 3: {SIZE} 99999999999"),
+        ('BU_: X\nBO_ 1 X: 8 V\n SG_ A m0 : -1|8@0+ (1,0) [0|1] "" V\n', f"line 3: {SIZE} -1"),
+        (MULTIPLEXED, f"line 5: {SIZE} 99999999994"),
         ("BU_: X\nBO_ 1 X: 8 V\nBO_ 2 X: 8 V\n", "line 2: message X stands twice, allowed is once"),
         ("BU_: X\n", "holds no message"),
     ],
@@ -205,7 +218,7 @@ PIECES = (
     '"',
     ";",
 )
-WORDS = Path(CODEC.path).read_text().split(" ")
+WORDS = re.findall(r"\w+|\W", Path(CODEC.path).read_text())
 
 
 @given(
@@ -217,7 +230,7 @@ def test_a_damaged_dbc_is_loaded_or_refused(changes: list[tuple[int, str]], stri
     for place, word in changes:
         words[place] = word
     with tempfile.NamedTemporaryFile("w", suffix=".dbc") as file:
-        file.write(" ".join(words))
+        file.write("".join(words))
         file.flush()
         try:
             codec = load_dbc(Path(file.name), strict=strict)
