@@ -45,23 +45,16 @@ def private(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 def aftbed(words: list[str], folder: Path, *, live: bool = False) -> subprocess.CompletedProcess[str]:
-    """Run one command of a page to its end, in an interpreter of its own if it is about a `live` run.
+    """Run one command of a page to its end, in this process if it starts none.
 
-    Then it takes as long as a person's: the next comes when the run has dealt with it.
+    One about a `live` run has a process of its own, as a person's: the run deals with it meanwhile.
     """
-    if not live:
+    if words[0] in PLAIN and not live:
         with contextlib.chdir(folder):
-            done = called(*words) if words[0] in PLAIN else forked(*words, seconds=SECONDS_MAX)
-        return subprocess.CompletedProcess(words, done.code, done.out, done.err)
-    return subprocess.run(
-        [sys.executable, "-m", "aftbed", *words],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        timeout=SECONDS_MAX,
-        check=False,
-        stdin=subprocess.DEVNULL,
-    )
+            done = called(*words)
+    else:
+        done = forked(*words, folder=folder, seconds=SECONDS_MAX)
+    return subprocess.CompletedProcess(words, done.code, done.out, done.err)
 
 
 class LiveRun:

@@ -1,12 +1,11 @@
 """The home of a test: the XDG_RUNTIME_DIR of its runs, and what is left in it when they are over.
 
 Whatever descends from a test carries the name of its home in its environment (`/proc/PID/environ`), or in a
-mapping (`mark`), or is a fork of this process whose pid is known. So after a test it is certain whether any
-of its processes is left. Other tests, and other people's processes, may run beside it.
+mapping (`command_process.mark`), or is a fork of this process whose pid is known. So after a test it is
+certain whether any of its processes is left. Other tests, and other people's processes, may run beside it.
 """
 
 import contextlib
-import mmap
 import os
 import shutil
 import signal
@@ -22,18 +21,10 @@ WAIT_SECONDS_MAX: Final = 60.0  # a wait ends with its event: this is for machin
 LOOK_SECONDS: Final = 0.005  # between two looks at what no descriptor tells
 GONE_SECONDS_MAX: Final = 1.0  # G7
 PATIENCE_SECONDS: Final = 5.0  # how long a test waits for what G7 allows a second
+FORKED: Final = "/of/the/test"  # the home in the environment of a forked command, which its mapping names
 SHARED_MEMORY: Final = Path("/dev/shm")
 
 Found = TypeVar("Found")
-_MARKS: Final[list[mmap.mmap]] = []
-
-
-def mark() -> None:
-    """Mark this process, a fork of a test's, and what it will fork as belonging to the test's home."""
-    descriptor = os.memfd_create(os.environ["XDG_RUNTIME_DIR"])
-    os.ftruncate(descriptor, mmap.PAGESIZE)
-    _MARKS.append(mmap.mmap(descriptor, mmap.PAGESIZE))
-    os.close(descriptor)
 
 
 def until(look: Callable[[], Found], what: str, seconds: float = WAIT_SECONDS_MAX) -> Found:
@@ -64,9 +55,10 @@ class Home:
         try:
             if int(process.name) in self.forks:
                 return (process / "stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
-            if self._mark in (process / "environ").read_bytes().split(b"\0"):
-                return True
-            return f"/memfd:{self.path} " in (process / "maps").read_text()
+            environment = (process / "environ").read_bytes().split(b"\0")
+            if f"XDG_RUNTIME_DIR={FORKED}".encode() in environment:
+                return f"/memfd:{self.path} " in (process / "maps").read_text()
+            return self._mark in environment
         except OSError:
             return False
 

@@ -7,31 +7,33 @@ Nothing here sleeps to wait: a wait is a poll of a descriptor or of a condition,
 """
 
 import contextlib
-import gc
+import functools
 import io
 import json
+import multiprocessing
 import os
-import resource
 import select
 import signal
 import subprocess
 import sys
 import tempfile
 import time
-import traceback
+from multiprocessing.context import ForkServerContext
+from multiprocessing.forkserver import ensure_running
 from pathlib import Path
-from typing import Final, NoReturn
+from typing import Final
 
+import command_process
 import msgspec
 import pytest
 from homes import (
+    FORKED,
     GONE_SECONDS_MAX,
     LOOK_SECONDS,
     PATIENCE_SECONDS,
     WAIT_SECONDS_MAX,
     Home,
     home,
-    mark,
     until,
 )
 
@@ -298,47 +300,38 @@ def _main(arguments: tuple[str | Path, ...]) -> int:
     return code
 
 
+@functools.cache
+def _forks() -> ForkServerContext:
+    """From where commands are forked, for as long as the tests run."""
+    context = multiprocessing.get_context("forkserver")
+    names = ("run", "campaign", "scenario_table")
+    context.set_forkserver_preload([*(f"aftbed.cli.{name}" for name in names), "aftbed.runtime.unix.launch"])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_RUNTIME_DIR", FORKED)
+        ensure_running()
+    return context
+
+
 def forked(*arguments: str | Path, folder: Path | None = None, seconds: float = RUN_SECONDS_MAX) -> Done:
-    """Run a command in a process of its own: a fork of this one, which has imported most of what it needs.
+    """Run a command in a process of its own, a fork of one that has imported what a command needs.
 
-    The start of an interpreter and its imports would take longer than most commands.
+    An interpreter's start and its imports would take longer than most commands.
     """
-    with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
-        pid = os.fork()
-        if pid == 0:
-            _be_command(arguments, folder or Path(), out.fileno(), err.fileno())
-        pidfd = os.pidfd_open(pid)
+    with tempfile.TemporaryDirectory() as place:
+        out, err = Path(place, "out"), Path(place, "err")
+        words = ["aftbed", *map(str, arguments)]
+        process = _forks().Process(
+            target=command_process.run, args=(words, dict(os.environ), folder or Path.cwd(), out, err)
+        )
+        process.start()
         try:
-            in_time = readable(pidfd, seconds)
-            if not in_time:
-                os.kill(pid, signal.SIGKILL)
-            _, status = os.waitpid(pid, 0)
+            process.join(seconds)
+            assert process.exitcode is not None, f"{words} took more than {seconds} s"
+            return Done(process.exitcode, out.read_text(), err.read_text())
         finally:
-            os.close(pidfd)
-        for file in (out, err):
-            file.seek(0)
-        done = Done(os.waitstatus_to_exitcode(status), out.read().decode(), err.read().decode())
-    assert in_time, f"{arguments} took more than {seconds} s:\n{done.out}{done.err}"
-    return done
-
-
-def _be_command(arguments: tuple[str | Path, ...], folder: Path, out: int, err: int) -> NoReturn:
-    code = 1
-    try:
-        gc.freeze()  # no object of the tests is finalized here: its descriptor may be another's by then
-        mark()
-        for descriptor, place in ((os.open(os.devnull, os.O_RDONLY), 0), (out, 1), (err, 2)):
-            os.dup2(descriptor, place)
-        os.closerange(3, resource.getrlimit(resource.RLIMIT_NOFILE)[0])
-        sys.stdin, sys.stdout, sys.stderr = os.fdopen(0), os.fdopen(1, "w"), os.fdopen(2, "w")
-        os.chdir(folder)
-        code = _main(arguments)
-    except BaseException:  # noqa: BLE001 - the last frame of this process
-        traceback.print_exc()
-    finally:
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(code)
+            process.kill()
+            process.join()
+            process.close()
 
 
 class Command:

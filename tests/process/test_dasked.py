@@ -12,7 +12,7 @@ import pytest
 from campaigns import CRASHES, planned, ran
 from liveruns import GONE_SECONDS_MAX, Home, ended, until
 
-from aftbed.campaign import ledger, runner
+from aftbed.campaign import dask, ledger, runner
 from aftbed.core.errors import ConfigError
 
 pytestmark = [
@@ -101,7 +101,7 @@ def test_real_processes_on_a_cluster(tmp_path: Path) -> None:
 
 def test_a_worker_that_dies_in_the_midst_of_a_real_run_leaves_nothing(tmp_path: Path, home: Home) -> None:
     """Its interpreter, its run and all processes of that die with it, and another worker does the work."""
-    text = CRASHES.replace("requests: 30, runtime: sim", "requests: 400, rate_hz: 200, runtime: unix")
+    text = CRASHES.replace("requests: 30, runtime: sim", "requests: 200, rate_hz: 200, runtime: unix")
     found = planned(tmp_path, text.replace("experiments: 4", "experiments: 1"))
     with cluster(tmp_path, 2) as (address, workers):
         told = []
@@ -165,7 +165,10 @@ def test_a_local_cluster_comes_to_the_same_results(tmp_path: Path) -> None:
     ]
 
 
-def test_a_scheduler_that_is_not_there_is_refused_before_anything_is_written(tmp_path: Path) -> None:
+def test_a_scheduler_that_is_not_there_is_refused_before_anything_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(dask, "CONNECT_SECONDS_MAX", 1)
     with pytest.raises(ConfigError, match=r"--scheduler tcp://127.0.0.1:9: cannot be reached"):
         runner.run(
             planned(tmp_path), runner.CampaignRunOptions(tmp_path / "out", scheduler="tcp://127.0.0.1:9")
