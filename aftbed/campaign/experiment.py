@@ -29,10 +29,8 @@ from aftbed.judge.simulated import record_of
 from aftbed.judge.verdict import Breach, Verdict, evidence_of, judge
 from aftbed.runtime.interface import BUS, LIGHT
 from aftbed.runtime.sim.world import Setup, simulate
-from aftbed.runtime.unix import launch as unix_launch
 from aftbed.runtime.unix import linux
-from aftbed.runtime.unix.launch import launch, options_for
-from aftbed.runtime.unix.linux import Area
+from aftbed.runtime.unix.launch import launch, options_for, warm_up
 from aftbed.runtime.unix.options import CarRun, LoadRun, Work, with_names_resolved
 from aftbed.search.shrink import shrink
 from aftbed.vehicle.aeb.function import default_application
@@ -254,7 +252,8 @@ def _recorded(experiment: Experiment, standing: ExitStack) -> RunRecord:
         faults=faults,
         adaptations=changes,
     )
-    launched = launch(options, listener, _warm_up(BUS if experiment.scenario else LIGHT))
+    warm_up(BUS if experiment.scenario else LIGHT)
+    launched = launch(options, listener)
     standing.callback(launched.remove)
     silence_s = RUN_SECONDS_MAX + experiment.requests * (1 / (experiment.rate_hz or REQUESTS_PER_SECOND_MIN))
     linux.set_timeouts(launched.line.sock, silence_s, silence_s)  # a load reports nothing before its end
@@ -268,12 +267,6 @@ def _recorded(experiment: Experiment, standing: ExitStack) -> RunRecord:
 def _probe() -> Probe:
     """Of this process."""
     return Probe()
-
-
-@lru_cache(maxsize=2)
-def _warm_up(name: str) -> tuple[Area, ...]:
-    """Once in this process: its zygotes are forks of it."""
-    return unix_launch.warm_up(name)
 
 
 def without_times(result: Result) -> Result:

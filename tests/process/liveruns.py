@@ -304,10 +304,10 @@ def _main(arguments: tuple[str | Path, ...]) -> int:
 def _forks() -> ForkServerContext:
     """From where commands are forked, for as long as the tests run."""
     context = multiprocessing.get_context("forkserver")
-    names = ("run", "campaign", "scenario_table")
-    context.set_forkserver_preload([*(f"aftbed.cli.{name}" for name in names), "aftbed.runtime.unix.launch"])
+    context.set_forkserver_preload(["warm_commands"])
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_RUNTIME_DIR", FORKED)
+        patch.setenv("PYTHONPATH", str(Path(__file__).parent))
         ensure_running()
     return context
 

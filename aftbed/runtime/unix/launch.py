@@ -56,21 +56,25 @@ def bind_hub(port: int) -> socket.socket:
     return sock
 
 
-def warm_up(name: str) -> tuple[Area, ...]:
-    """Import and rehearse what `_fork_zygote` hands on: once, in a process that starts many runs.
+_WARM: Final[dict[str, tuple[Area, ...]]] = {}  # by zygote: where its nodes will write to
 
-    Returns where a node will write to.
+
+def warm_up(name: str) -> None:
+    """Import and rehearse what the zygote `name` hands on, for all runs of this process and of its forks.
+
+    Their zygotes are forks from then on. That is for a process that starts many runs.
     """
     from aftbed.runtime.unix import prefault, supervisor, zygote  # noqa: PLC0415 - for many runs
 
     assert supervisor and zygote
-    for module in PRELOADS[name]:
-        importlib.import_module(module)
-    return prefault.warm_up()
+    if name not in _WARM:
+        for module in PRELOADS[name]:
+            importlib.import_module(module)
+        _WARM[name] = prefault.warm_up()
 
 
 def _fork_zygote(cpus: list[int], areas: tuple[Area, ...]) -> Started:
-    """A zygote that is a fork of this process, which `warm_up` has prepared: it saves 0.2 s of imports."""
+    """A zygote that is a fork of this process, which is warm: it saves 0.2 s of imports."""
     from aftbed.runtime.unix import zygote  # noqa: PLC0415 - imported by `warm_up`
 
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -88,15 +92,10 @@ def _fork_zygote(cpus: list[int], areas: tuple[Area, ...]) -> Started:
 
 
 class Launched:
-    """A run in progress, seen from its command. `end` is set when it has ended in order.
+    """A run in progress, seen from its command. `end` is set when it has ended in order."""
 
-    `warm` is what `warm_up` returned in this process, if it was called: then the zygotes are forks of it.
-    """
-
-    def __init__(
-        self, options: RunOptions, listener: socket.socket | None, warm: tuple[Area, ...] | None = None
-    ) -> None:
-        self.options, self._warm = options, warm
+    def __init__(self, options: RunOptions, listener: socket.socket | None) -> None:
+        self.options = options
         self.private, self.record = Path(options.private), Path(options.record)
         self.started_ns = time.monotonic_ns()
         self.end: dict[str, object] | None = None
@@ -162,12 +161,12 @@ class Launched:
             linux.set_name("aftbed-supervis")
             cpus = sorted(os.sched_getaffinity(0))
             load = isinstance(self.options.work, LoadRun)
-            if self._warm is not None:
+            largest = LIGHT if load else BUS
+            if (areas := _WARM.get(largest)) is not None:
                 names = (LIGHT,) if load else (LIGHT, BUS)
-                zygotes = {name: _fork_zygote(cpus, self._warm) for name in names}
-            else:
-                name = LIGHT if load else BUS  # it imports while this process does; it has the most to import
-                zygotes = {name: start_zygote(name, cpus)}
+                zygotes = {name: _fork_zygote(cpus, areas) for name in names}
+            else:  # it imports while this process does; the smaller one is started by the supervisor
+                zygotes = {largest: start_zygote(largest, cpus)}
             from aftbed.runtime.unix.supervisor import supervise  # noqa: PLC0415 - behind the first zygote
 
             supervise(self.options, owner, zygotes, UndoLedger(self.private, waker))
@@ -268,11 +267,9 @@ def _ends(pidfd: int, seconds: float) -> bool:
     return bool(poll.poll(seconds * 1e3))
 
 
-def launch(
-    options: RunOptions, listener: socket.socket | None, warm: tuple[Area, ...] | None = None
-) -> Launched:
+def launch(options: RunOptions, listener: socket.socket | None) -> Launched:
     """Start a run; see `Launched`."""
-    launched = Launched(options, listener, warm)
+    launched = Launched(options, listener)
     if listener is not None:
         listener.close()
     return launched
