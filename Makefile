@@ -13,7 +13,7 @@ SOURCES  := pyproject.toml README.md $(shell find aftbed dbc -type f -not -name 
 # are as many as two cores bear without false alarms. A file stays together, for the runs that its tests share;
 # each page of the docs is a unit of its own. They are taken in the order of collection, the small files last.
 FAST := -n auto --dist worksteal -m "not process and not deep"
-REAL := -n 2 --dist loadgroup --no-loadscope-reorder -m "process and not deep"
+REAL := -n 3 --dist loadgroup --no-loadscope-reorder -m "process and not deep"
 
 FAULT := crash primary at checkpoint.sent nth 100
 
