@@ -3,14 +3,12 @@
 No test depends on speed: it must hold on a busy machine.
 """
 
-import subprocess
-import sys
 from pathlib import Path
 from typing import Final
 
 import msgspec
 import pytest
-from liveruns import Home
+from liveruns import Home, forked
 
 from aftbed.bench import resources, sweep
 from aftbed.bench.paper import CYCLES, QUICK, Paper, tables
@@ -55,17 +53,9 @@ def check(paper: Paper) -> None:
 @pytest.mark.timeout(2 * QUICK_SECONDS_MAX)
 def test_it_measures_every_figure_and_writes_the_page(home: Home, tmp_path: Path) -> None:
     page = tmp_path / "page.html"
-    words = ["bench", "paper", "--quick", "--json", "--html", str(page)]
-    done = subprocess.run(
-        [sys.executable, "-m", "aftbed", *words],
-        capture_output=True,
-        text=True,
-        timeout=QUICK_SECONDS_MAX,
-        check=False,
-        stdin=subprocess.DEVNULL,
-    )
-    assert done.returncode == 0, done.stderr
-    paper = msgspec.json.decode(done.stdout, type=Paper)
+    done = forked("bench", "paper", "--quick", "--json", "--html", page, seconds=QUICK_SECONDS_MAX)
+    assert done.code == 0, done.err
+    paper = msgspec.json.decode(done.out, type=Paper)
     assert paper.quick
     check(paper)
     assert page.read_text().count("<table>") == len(tables(paper))
