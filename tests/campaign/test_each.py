@@ -11,6 +11,8 @@ import pytest
 from aftbed.core.errors import HarnessError
 from aftbed.runtime.unix.worker_pool import each
 
+pytestmark = pytest.mark.process
+
 LIMIT_S = 20.0  # what a machine under load may take for a failure that is due after one second
 
 

@@ -17,6 +17,8 @@ import pytest
 from pages import ROOT, Block, Command, blocks
 from test_commands import check
 
+pytestmark = pytest.mark.process
+
 PAGE: Final = ROOT / "docs" / "contributing.md"
 SECONDS_MAX: Final = 180
 

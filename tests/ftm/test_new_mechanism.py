@@ -17,6 +17,8 @@ import pytest
 
 import aftbed
 
+pytestmark = pytest.mark.process
+
 PACKAGE: Final = Path(aftbed.__file__).parent
 SECONDS_MAX: Final = 100
 PAGE: Final = PACKAGE.parent / "docs" / "contributing.md"

@@ -20,6 +20,8 @@ from aftbed.vehicle.plant import Telemetry
 from aftbed.vehicle.scenarios.library import load_scenario
 from aftbed.vehicle.scenarios.scenario import Scenario
 
+pytestmark = pytest.mark.process
+
 Decide = Callable[[dict[str, float]], tuple[int, float] | None]
 
 
@@ -128,7 +130,6 @@ def test_a_short_scenario_ends_in_time(tmp_path: Path, codec: Codec, ccrs: Scena
     assert seen[-1].frames_accepted > 0
 
 
-@pytest.mark.process
 def test_pace_4_is_faster_than_pace_1_and_drives_the_same_road(
     tmp_path: Path, codec: Codec, ccrs: Scenario
 ) -> None:

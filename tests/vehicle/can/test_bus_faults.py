@@ -17,6 +17,8 @@ from aftbed.vehicle.can.bus import BusOptions, HubLine, open_bus
 from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.can.hub import HubOptions
 
+pytestmark = pytest.mark.process
+
 TRACK, AEB_REQ, EGO, STATUS = (
     CODEC.can_id(name) for name in ("RADAR_TRACK", "AEB_REQ", "EGO_STATE", "BRAKE_STATUS")
 )
