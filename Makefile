@@ -9,11 +9,12 @@ PLAIN    := $(VENV)/.installed-plain
 EDITABLE := $(VENV)/.installed-editable
 SOURCES  := pyproject.toml README.md $(shell find aftbed dbc -type f -not -name '*.pyc')
 
-# The tests without real runs take every core. Of real runs there are three at a time on two cores, since some of
-# each is waiting. A file stays together, for the runs that its tests share; each page of the docs is a unit of
-# its own. They are taken in the order of collection, the small files last. Only files with real runs are read.
+# The tests without real runs take every core. Of real runs, each has a core for either replica: two at a time
+# are as many as two cores bear without false alarms. A file stays together, for the runs that its tests share;
+# each page of the docs is a unit of its own. They are taken in the order of collection, the small files last.
+# Only files with real runs are read.
 FAST := -n auto --dist worksteal -m "not process and not deep"
-REAL := -n 3 --dist loadgroup --no-loadscope-reorder -m "process and not deep" \
+REAL := -n 2 --dist loadgroup --no-loadscope-reorder -m "process and not deep" \
   $(sort $(shell grep -rl --include='test_*.py' mark.process tests))
 
 FAULT := crash primary at checkpoint.sent nth 100

@@ -37,13 +37,18 @@ def until(look: Callable[[], Found], what: str, seconds: float = WAIT_SECONDS_MA
     return found
 
 
+def _shared_memory() -> set[Path]:
+    """What there is but semaphores: a run has none, and no mapping says whose one is (glibc renames it)."""
+    return {path for path in SHARED_MEMORY.iterdir() if not path.name.startswith("sem.")}
+
+
 class Home:
     """The XDG_RUNTIME_DIR of one test. Its path is short: a socket's may have 108 bytes."""
 
     def __init__(self) -> None:
         self.path = Path(tempfile.mkdtemp(prefix="aft-", dir="/tmp"))
         self._mark = f"XDG_RUNTIME_DIR={self.path}".encode()
-        self._shared = set(SHARED_MEMORY.iterdir())
+        self._shared = _shared_memory()
         self.forks: list[int] = []
 
     def processes(self) -> list[int]:
@@ -71,7 +76,7 @@ class Home:
         """Everything that a run would have left behind (G7)."""
         found = [f"process {pid}" for pid in self.processes()]
         found += [f"directory {path}" for path in self.runs()]
-        new = set(SHARED_MEMORY.iterdir()) - self._shared
+        new = _shared_memory() - self._shared
         return found + [f"shared memory {p}" for p in new if not self._is_mapped_elsewhere(p)]
 
     def _is_mapped_elsewhere(self, path: Path) -> bool:
