@@ -62,13 +62,19 @@ class RecordInTheMaking:
         self._journals[journal].write(self.t_ns, event, request_id, detail)
 
     def request(
-        self, epoch: int = 1, replica: int = 1, answers: int = 1, flipped_bit: int | None = None
+        self,
+        epoch: int = 1,
+        replica: int = 1,
+        answers: int = 1,
+        flipped_bit: int | None = None,
+        late_ms: int = 0,
     ) -> None:
         """One request, served as it should be, but for `flipped_bit`; answered `answers` times."""
         self.sent += 1
         payload = sample_requests(7, self.sent)[-1]
         self.t_ns += MS
         self._dialogue.write(self.t_ns, self.sent, 0, EntryKind.SENT, payload)
+        self.t_ns += late_ms * MS
         self.note(f"{'ab'[replica - 1]}-server.1", Event.SERVER_EXIT, self.sent)
         self.note("proxy.1", Event.REPLY_ACCEPTED, self.sent, epoch << 8 | replica)
         reply = self._bare.execute(payload)

@@ -19,7 +19,7 @@ from aftbed.ftm.compose import build, replication_of
 from aftbed.judge.record import Excuses, RunRecord
 from aftbed.judge.reference import ReferenceRun
 from aftbed.runtime.deployment import Hosted
-from aftbed.runtime.unix.options import COMMAND_GONE, CarRun
+from aftbed.runtime.unix.options import COMMAND_GONE, CarRun, ReplayRun, Work
 from aftbed.vehicle.aeb.messages import AebOutput, decode_reply
 from aftbed.vehicle.scenarios.library import load_scenario
 from aftbed.vehicle.scenarios.scenario import broken_expectations
@@ -28,7 +28,7 @@ REASONS_MAX: Final = 5
 REQUESTED_ENDS: Final = ("", "interrupted", "stopped")  # ends of a run that its user asked for
 VEHICLE: Final = "vehicle"  # the name of the check of what a scenario expects of the car
 NOTHING_EXCUSED: Final = Excuses()
-LATE_NS: Final = 60_000_000  # as long as the brake ECU holds the last request
+LATE_NS: Final = 60_000_000  # of bus time: as long as the brake ECU holds the last request
 CAUSE_NS_MAX: Final = 1_000_000_000  # an older fault is not the cause of an alarm
 
 Finding = Literal["pass", "fail", "unknown"]
@@ -42,7 +42,7 @@ class Check(msgspec.Struct, frozen=True):
 
 
 class Requests(msgspec.Struct, frozen=True):
-    """The client's account. `late`: answered after `LATE_NS`; `wrong`: not the bare server's."""
+    """The client's account. `late`: answered after `late_after_ns`; `wrong`: not the bare server's."""
 
     sent: int
     answered: int
@@ -154,18 +154,31 @@ def wrong_replies(history: History, reference: ReferenceRun) -> dict[int, bytes]
     }
 
 
-def requests(history: History, reference: ReferenceRun) -> Requests:
+def late_after_ns(work: Work) -> int:
+    """After how long a reply is late, by the clock: `LATE_NS` at the pace of the run, if it has one."""
+    pace = work.pace if isinstance(work, CarRun | ReplayRun) else None
+    return LATE_NS if pace is None else round(LATE_NS / pace)
+
+
+def answered_after_ns(history: History) -> list[int]:
+    """How long each request that was answered waited for its first reply."""
+    sent_ns = {e.request_id: e.t_ns for e in _sent(history)}
+    firsts = {i: min(a.t_ns for a in found) for i, found in _answers(history).items() if found}
+    return [t_ns - sent_ns[i] for i, t_ns in firsts.items() if i in sent_ns]
+
+
+def requests(history: History, reference: ReferenceRun, late_ns: int = LATE_NS) -> Requests:
     """The client's account of its requests."""
     answers = _answers(history)
     sent_ns = {e.request_id: e.t_ns for e in _sent(history)}
-    firsts = {i: min(a.t_ns for a in found) for i, found in answers.items() if found}
+    firsts = {i for i, found in answers.items() if found}
     refused = sum(bool(r.request_id) for r in _client_refusals(history))
     return Requests(
         sent=len(sent_ns),
         answered=len(firsts),
         lost=sum(i not in firsts for i in sent_ns),
         duplicated=sum(len(a) > 1 for a in answers.values()) + refused,
-        late=sum(t_ns - sent_ns[i] > LATE_NS for i, t_ns in firsts.items() if i in sent_ns),
+        late=sum(waited_ns > late_ns for waited_ns in answered_after_ns(history)),
         wrong=len(wrong_replies(history, reference)),
     )
 
@@ -406,4 +419,18 @@ def check_vehicle(evidence: Evidence) -> Check | None:
     if result is not None and result.get("end") == "stopped" and not record.vehicle.collision:
         return Check("pass")
     broken = broken_expectations(load_scenario(work.scenario), record.vehicle)
+    if broken and work.pace is not None:
+        broken = [*broken, *_lateness(record.history, work.pace, late_after_ns(work))]
     return Check("fail" if broken else "pass", tuple(broken))
+
+
+def _lateness(history: History, pace: float, late_ns: int) -> list[str]:
+    """What a car in real time may have missed: the replies that came late, by bus time."""
+    late = sorted(waited_ns for waited_ns in answered_after_ns(history) if waited_ns > late_ns)
+    if not late:
+        return []
+    latest_s, limit_ms = late[-1] * pace / 1e9, LATE_NS // 1_000_000
+    return [
+        f"{len(late)} replies came more than {limit_ms} ms of bus time after their requests, the latest"
+        f" after {latest_s:.2f} s: is this machine too slow or too busy for this pace?"
+    ]

@@ -49,7 +49,7 @@ def outcome_of(evidence: Evidence) -> tuple[str, tuple[str, ...]]:
     """
     record, reference = evidence.record, evidence.reference
     history, living = record.history, record.end.hosted if record.end is not None else None
-    counts = checks.requests(history, reference)
+    counts = checks.requests(history, reference, checks.late_after_ns(record.options.work))
     found: dict[str, str] = {}
     wrong = corruptions(history, reference) if reference.deterministic else []
     if wrong:

@@ -1,12 +1,13 @@
 """The verdict over a drive: whether the car did what its scenario expects."""
 
 from pathlib import Path
+from typing import Final
 
 import msgspec
 import pytest
 from records import CAR, STOPPED, RecordInTheMaking, whole
 
-from aftbed.runtime.unix.options import ReplayRun
+from aftbed.runtime.unix.options import CarRun, ReplayRun
 from aftbed.vehicle.plant import VehicleResult
 
 
@@ -40,6 +41,27 @@ def test_a_car_that_does_not_fails(path: Path, result: VehicleResult, reason: st
     assert verdict.verdict == "fail" and verdict.reasons == [reason]
 
 
+HIT: Final = VehicleResult(True, 31.0, 0.0, None, 9.0, True)
+
+
+@pytest.mark.parametrize(("pace", "told"), [(None, False), (1.0, False), (4.0, True)])
+def test_replies_that_came_late_for_the_pace_are_told_and_excuse_nothing(
+    path: Path, pace: float | None, told: bool
+) -> None:
+    """40 ms by the clock are 160 ms on the road at pace 4; the brake ECU holds a request for 60 ms."""
+    record = whole(path, CarRun("ccrs-50", pace, "latch"))
+    record.request(late_ms=40)
+    assert record.end is not None
+    record.end["result"] = {"end": "collision", "result": msgspec.to_builtins(HIT)}
+    verdict = record.verdict()
+    assert (verdict.verdict, verdict.requests.late) == ("fail", int(told))
+    assert verdict.reasons[0] == "vehicle: collision at 31.0 km/h, expected stop"
+    assert verdict.reasons[1:] == told * [
+        "vehicle: 1 replies came more than 60 ms of bus time after their requests, the latest after 0.17 s:"
+        " is this machine too slow or too busy for this pace?"
+    ]
+
+
 def test_a_car_that_did_not_report_is_inconclusive(path: Path) -> None:
     verdict = drive(path, None).verdict()
     assert verdict.verdict == "inconclusive" and verdict.vehicle is None
@@ -49,8 +71,7 @@ def test_a_car_that_did_not_report_is_inconclusive(path: Path) -> None:
 def test_a_drive_that_was_broken_off_is_judged_by_what_it_did(path: Path) -> None:
     under_way = VehicleResult(False, None, 20.0, None, 0.0, False)
     assert drive(path / "1", under_way, end="stopped").verdict().verdict == "pass"
-    hit = VehicleResult(True, 31.0, 0.0, None, 9.0, True)
-    assert drive(path / "2", hit, end="stopped").verdict().verdict == "fail"
+    assert drive(path / "2", HIT, end="stopped").verdict().verdict == "fail"
 
 
 def test_a_replay_gives_its_figures_and_needs_no_car(path: Path) -> None:

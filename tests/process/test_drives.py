@@ -21,6 +21,7 @@ _SHARED: Final = os.environ.get("AFTBED_SHARED")
 DATA: Final = (Path(_SHARED) if _SHARED else Path(__file__).resolve().parents[2].parent / "shared") / "data"
 TOYOTA_LOG, TOYOTA_DBC = DATA / "rav4_following_50kmh.log", DATA / "toyota_adas.dbc"
 MECHANISMS: Final = ("none process", "pbr process", "pbr replica")  # with their placement
+IN_TIME_TRIES: Final = 5
 HEARTBEATS: Final = tuple(f" {number:03X}#" for number in range(0x700, 0x710))
 
 
@@ -57,9 +58,17 @@ def test_every_scenario_comes_to_what_it_expects(scenario: str, mechanism: str) 
 
 
 def test_a_drive_in_real_time_passes() -> None:
-    verdict = passed("--scenario", "ccrs-20", "--pace", "4").verdict()
-    assert verdict.vehicle is not None
-    assert verdict.vehicle.stop_gap_m is not None
+    """A machine may be too busy for the pace: then the verdict says so, and the car drives again."""
+    for _ in range(IN_TIME_TRIES):
+        verdict = aftbed("run", "--json", "--scenario", "ccrs-20", "--pace", "4").verdict()
+        assert verdict.requests.answered == verdict.requests.sent > 0
+        assert verdict.vehicle is not None
+        if verdict.verdict == "pass":
+            assert verdict.vehicle.stop_gap_m is not None
+            return
+        assert verdict.requests.late > 0, verdict
+        assert "is this machine too slow or too busy for this pace?" in verdict.reasons[-1]
+    pytest.fail(f"{IN_TIME_TRIES} drives, and in none the replies came in time: {verdict}")
 
 
 @pytest.mark.deep
