@@ -50,6 +50,7 @@ def check(paper: Paper) -> None:
     assert len(paper.load) == 2 * len(QUICK.rates_hz)
 
 
+@pytest.mark.deep  # each of its parts is measured below, and its page made of figures in `test_paper_page`
 @pytest.mark.timeout(2 * QUICK_SECONDS_MAX)
 def test_it_measures_every_figure_and_writes_the_page(home: Home, tmp_path: Path) -> None:
     page = tmp_path / "page.html"

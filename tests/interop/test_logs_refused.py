@@ -219,7 +219,7 @@ def test_any_bytes_give_frames_or_one_error(name: str, data: st.DataObject, tmp_
 
 
 @pytest.mark.process  # each MF4 is read by a process of its own
-@settings(max_examples=settings.default.max_examples // 3, suppress_health_check=WITH_FILES, deadline=None)
+@settings(max_examples=settings.default.max_examples // 8, suppress_health_check=WITH_FILES, deadline=None)
 @given(data=st.data())
 def test_any_bytes_of_an_mf4_give_frames_or_one_error(data: st.DataObject, tmp_path: Path) -> None:
     answers_any_bytes("mf4", data, tmp_path)

@@ -77,7 +77,7 @@ def assert_served(ran: Ran) -> None:
 # -- where nothing compares
 
 
-@pytest.mark.parametrize("ftm", WITHOUT)
+@pytest.mark.parametrize("ftm", every(2, WITHOUT))
 def test_a_flipped_result_reaches_the_client_and_fails(tmp_path: Path, ftm: str) -> None:
     ran = drive(tmp_path, ftm, f"bitflip result bit {STAGE} at server.exit nth {HIT}")
     assert ran.code == 1 and ran.verdict.verdict == "fail"
@@ -166,7 +166,7 @@ def test_a_follower_that_was_hit_has_diverged_and_the_client_has_its_reply(tmp_p
     assert [(r.node, r.request_id) for r in ran.events(Event.FOLLOWER_DIVERGED)] == [("b/after", HIT)]
 
 
-@pytest.mark.parametrize("ftm", every(2, [e for e in WITH_TR if replication_of(e)]))
+@pytest.mark.parametrize("ftm", every(3, [e for e in WITH_TR if replication_of(e)]))
 def test_a_bit_of_the_backup_is_no_concern_of_the_client(tmp_path: Path, ftm: str) -> None:
     executes = ftm.startswith("lfr")
     fault = "result in backup nth" if executes else f"state bit {COUNTER} in b at state.restored nth"

@@ -47,7 +47,7 @@ def assert_masked(verdict: Verdict, failovers: int, faults: int = 1) -> None:
     assert [fault.receipt.value for fault in verdict.faults] == ["activated"] * faults
 
 
-@pytest.mark.parametrize("event", every(2, POINTS))
+@pytest.mark.parametrize("event", every(3, POINTS))
 def test_a_crash_of_the_primary_at_any_point_is_masked(event: str) -> None:
     assert_masked(drive(f"crash primary at {event} nth 100"), failovers=1)
 

@@ -99,6 +99,7 @@ def test_real_processes_on_a_cluster(tmp_path: Path) -> None:
         assert result.outcome in allowed and result.activated and not result.broken, result.reasons
 
 
+@pytest.mark.deep  # the rest of a killed run is looked for in `test_kill` too
 def test_a_worker_that_dies_in_the_midst_of_a_real_run_leaves_nothing(tmp_path: Path, home: Home) -> None:
     """Its interpreter, its run and all processes of that die with it, and another worker does the work."""
     text = CRASHES.replace("requests: 30, runtime: sim", "requests: 200, rate_hz: 200, runtime: unix")
