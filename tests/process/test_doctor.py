@@ -1,5 +1,6 @@
 """`aftbed doctor`: what a dead run left is named and removed; what is a live one's, or of no run, is not."""
 
+import contextlib
 import json
 import os
 import shutil
@@ -23,6 +24,15 @@ from aftbed.runtime.unix.run_directory import Member
 
 pytestmark = pytest.mark.process
 
+STRAY: Final = """
+import signal, sys
+from pathlib import Path
+from aftbed.runtime.unix import linux, run_directory
+linux.set_name(sys.argv[2])
+run_directory.mark(Path(sys.argv[1]))
+print("marked", flush=True)
+signal.pause()
+"""
 ENDLESS: Final = ("--load", "100000@200")
 OF_THE_MOMENT: Final = ("CPU steal", "load")  # measured anew by each command
 
@@ -43,6 +53,20 @@ def parts(run: Path) -> tuple[int, int]:
     """The pids of its supervisor and its warden."""
     names = {m.name: m.pid for m in of_run(run)}
     return names["aftbed-supervis"], names["aftbed-warden"]
+
+
+@contextlib.contextmanager
+def stray(run: Path, name: str) -> Iterator[int]:
+    """The pid of a process with the mark of `run` that no process of it knows of."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", STRAY, run, name], stdout=subprocess.PIPE, stdin=subprocess.DEVNULL
+    )
+    try:
+        assert process.stdout is not None and process.stdout.readline() == b"marked\n"
+        yield process.pid
+    finally:
+        process.kill()
+        process.communicate()
 
 
 def stopped(pid: int) -> None:
@@ -91,21 +115,21 @@ def test_a_run_killed_with_all_its_keepers_leaves_its_directory(home: Home) -> N
 
 
 def test_the_processes_of_a_dead_run_are_named_and_removed_and_a_live_run_goes_on(home: Home) -> None:
-    """The worst: the supervisor is stopped, so its nodes, one of them stopped, live on."""
-    with under_load(home, 100_000) as alive, Command(*ENDLESS) as command:
+    """All keepers were killed, and two processes that they did not know of live on, one of them stopped."""
+    with under_load(home, 100_000) as alive, Command(*ENDLESS) as command, contextlib.ExitStack() as strays:
         until(lambda: len(run_directory.live()) == 2, "two runs")
         command.started()
         run = next(path for path in home.runs() if path != alive.private)
-        engine = next(row.pid for row in control_client.processes(run) if row.name == "engine")
         supervisor, warden = parts(run)
-        stopped(supervisor)
-        stopped(engine)  # no process is there to replace it
-        os.kill(warden, signal.SIGKILL)
-        command.popen.kill()
+        idle, engine = (strays.enter_context(stray(run, name)) for name in ("stray", "engine"))
+        stopped(engine)
+        for pid in (warden, command.popen.pid, supervisor):  # each cleans up after those behind it
+            os.kill(pid, signal.SIGKILL)
         command.popen.wait()
-        assert ended(warden)
-        there = {m.pid for m in of_run(run)}
-        assert len(there) > 16 and supervisor in there and state_of(engine) == "T"
+        assert ended(supervisor) and ended(warden)
+        until(lambda: len(of_run(run)) == 2, "the end of all that the run knew of")
+        there = {idle, engine}
+        assert {m.pid for m in of_run(run)} == there and state_of(engine) == "T"
 
         code, found = doctor()
         assert code == 1

@@ -1,8 +1,10 @@
 """SIGKILL of every process of a run, under load: the service goes on, and nothing is left (G1 to G7)."""
 
 import io
+import itertools
 import os
 import signal
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -24,7 +26,10 @@ from sampling import every
 
 from aftbed.core.journal import EntryKind
 from aftbed.ftm.compose import build
-from aftbed.runtime.unix import control_client
+from aftbed.inject.grammar import Trigger
+from aftbed.inject.hang import Hang
+from aftbed.inject.model import Fault
+from aftbed.runtime.unix import control_client, run_directory
 from aftbed.runtime.unix.options import LoadRun
 from aftbed.vehicle.can.candump import LogCounts, Refusal, parse_lines
 
@@ -35,6 +40,7 @@ CHAIN: Final = ("protocol", "before", "proceed", "after", "server")
 OUTSIDE: Final = tuple(n for n in NODES if n.rpartition("/")[2] not in CHAIN)
 REQUESTS: Final = 150
 RATE_HZ: Final = 200.0
+STOPPED_MS: Final = 110  # longer than a replacement takes
 
 
 def assert_served(outcome: Outcome, failovers: int) -> None:
@@ -46,6 +52,15 @@ def assert_served(outcome: Outcome, failovers: int) -> None:
     assert len(outcome.verdict.failovers) == failovers, outcome.events
     assert outcome.record.end is not None
     assert outcome.record.end.epoch == 1 + failovers
+
+
+def in_state(pid: int, state: str) -> bool:
+    return state_of(pid) == state
+
+
+def pids_of(run: Started, name: str) -> set[int]:
+    """The process called `name`, if there is one."""
+    return {row.pid for row in run.rows() if row.name == name}
 
 
 def load_over_a_kill(home: Home, name: str, placement: str = "process") -> Outcome:
@@ -126,6 +141,22 @@ def test_a_node_beside_the_replicas_may_die_again_and_again(home: Home, name: st
         assert_served(run.finish(), failovers=0)
 
 
+@pytest.mark.parametrize("pair", every(7, list(itertools.permutations(OUTSIDE, 2))), ids="-".join)
+def test_a_replacement_that_dies_beside_a_stopped_neighbour_is_replaced(
+    home: Home, pair: tuple[str, str]
+) -> None:
+    """While others are bound to the new process, one of them does not answer; then the new one dies too."""
+    node, neighbour = pair
+    with under_load(home, REQUESTS, RATE_HZ) as run:
+        hang = Fault(Hang(STOPPED_MS), neighbour, Trigger())
+        control_client.ask(run.private, control_client.InjectCommand(hang))
+        first = run.strike(node, signal.SIGKILL)
+        second = until(lambda: next(iter(pids_of(run, node) - {first}), 0), f"a new {node}")
+        os.kill(second, signal.SIGKILL)
+        until(lambda: pids_of(run, node) - {first, second}, f"another new {node}")
+        assert_served(run.finish(), failovers=0)
+
+
 def test_the_death_of_the_supervisor_ends_everything_and_is_inconclusive(home: Home) -> None:
     with Command("--load", "100000@200") as command:
         command.started()
@@ -170,15 +201,26 @@ def test_command_and_supervisor_killed_at_once_leave_nothing_but_the_record(
     assert aftbed("check", record).code == 3
 
 
-def test_a_killed_command_takes_a_stopped_supervisor_with_it(home: Home) -> None:
-    """Nobody else could tell it: it does not read."""
+@pytest.mark.parametrize("warden", ["lives", "stopped", "killed"])
+@pytest.mark.parametrize("supervisor", ["lives", "stopped", "killed"])
+def test_a_killed_command_leaves_nothing_whatever_its_keepers_suffer(
+    home: Home, supervisor: str, warden: str
+) -> None:
+    """One of the two is enough, and goes on if it was stopped. Without both only the directory stays."""
     with Command("--load", "100000@200") as command:
         command.started()
-        supervisor = next(row.pid for row in control_client.processes(only_run()) if row.name == "supervisor")
-        os.kill(supervisor, signal.SIGSTOP)
-        until(lambda: state_of(supervisor) == "T", "the supervisor to stop")
+        pids = {m.name: m.pid for m in run_directory.members() if m.run == str(only_run())}
+        keepers = {pids["aftbed-warden"]: warden, pids["aftbed-supervis"]: supervisor}
+        for pid in (pid for pid, fate in keepers.items() if fate == "stopped"):
+            os.kill(pid, signal.SIGSTOP)
+            until(partial(in_state, pid, "T"), "the process to stop")
+        for pid in (pid for pid, fate in keepers.items() if fate == "killed"):
+            os.kill(pid, signal.SIGKILL)
         command.popen.kill()
         command.popen.wait()
+        if supervisor == warden == "killed":
+            until(lambda: not home.processes(), "the end of all processes", GONE_SECONDS_MAX)
+            assert aftbed("doctor", "--clean").code == 0
         assert home.seconds_to_clean() < GONE_SECONDS_MAX
 
 

@@ -16,7 +16,8 @@ it is the last one, torn, and is not read.
 
 *The warden* is a small process that is forked before anything of the run exists. The supervisor cleans up
 after the command, and the command after the supervisor. If both die, or if one dies while the other is
-stopped, the warden does it.
+stopped, the warden does it. A supervisor or warden that is stopped when the command dies is continued by the
+kernel (`PR_SET_PDEATHSIG`), and does its part.
 
 *Leftovers* of dead runs are what `aftbed doctor` finds.
 """

@@ -113,6 +113,7 @@ class Launched:
         waker = os.eventfd(0)
         self.supervisor = os.fork()
         if self.supervisor == 0:
+            linux.continue_at_parents_death()
             os.setsid()
             for fd in (command_end, command_life, supervisor_end):
                 os.close(fd)
@@ -124,6 +125,7 @@ class Launched:
         self.warden = os.fork()
         if self.warden == 0:
             try:
+                linux.continue_at_parents_death()
                 os.setsid()
                 os.close(command_life)
                 ours.close()

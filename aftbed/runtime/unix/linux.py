@@ -61,6 +61,11 @@ def die_with(parent: int) -> None:
         os._exit(1)
 
 
+def continue_at_parents_death() -> None:
+    """Have the kernel send SIGCONT to this process when its parent dies: if it was stopped, it goes on."""
+    _prctl(PR_SET_PDEATHSIG, signal.SIGCONT)
+
+
 def _stat(pid: int) -> list[str]:
     """The fields behind the name in `/proc/PID/stat` (proc(5)); none of a process that is gone."""
     try:

@@ -27,7 +27,7 @@ from aftbed.runtime.deployment import HANG_NS, Keys
 from aftbed.runtime.interface import BUS, DRAW_BITS, LIGHT, Met, Process, ProcessKind
 from aftbed.runtime.run_controller import RunController
 from aftbed.runtime.tasks import STATS_TASK
-from aftbed.runtime.unix import linux, process_memory
+from aftbed.runtime.unix import linux, process_memory, run_directory
 from aftbed.runtime.unix.cleanup import UndoLedger
 from aftbed.runtime.unix.control_server import ControlServer
 from aftbed.runtime.unix.event_loop import EventLoop
@@ -302,6 +302,11 @@ class Supervisor:
         pause_s = DRAIN_SECONDS if self._looks_left else 0.0
         self._loop.after(pause_s, lambda: self._drain(limit_ns))
 
+    @property
+    def reason(self) -> str | None:
+        """Why the run ends; None before it does, `""` for the good end."""
+        return self._reason
+
     def _tear_down(self) -> None:
         """Kill and reap all processes, and report how the run ended."""
         self._write_log()
@@ -366,3 +371,5 @@ def supervise(
     finally:
         for process in supervisor.pool.processes:
             process.kill()
+    if supervisor.reason == COMMAND_GONE:
+        run_directory.remove(Path(options.private))  # the warden does the same, if it lives
