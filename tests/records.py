@@ -6,7 +6,7 @@ from typing import Final
 
 import msgspec
 
-from aftbed.core.events import Event
+from aftbed.core.events import FIRST_FAULT, Event
 from aftbed.core.journal import DROPPED_OFFSET, EntryKind
 from aftbed.ftm.compose import build
 from aftbed.inject.crash import Crash
@@ -53,6 +53,7 @@ class RecordInTheMaking:
         self._dialogue = DialogueFile(path / "journal" / "client.1.dialogue", "client")
         self._bare = default_application()
         self.sent = 0
+        self.asked = 0  # requests; 0: as many as were sent
 
     def note(self, journal: str, event: Event, request_id: int = 0, detail: int = 0) -> None:
         if journal not in self._journals:
@@ -95,14 +96,17 @@ class RecordInTheMaking:
             file.write(count.to_bytes(4, "little"))
 
     def failover(self) -> None:
-        self.note("a-after.1", Event.FAULT_APPLIED, detail=1)
+        self.note("a-after.1", Event.FAULT_APPLIED, detail=FIRST_FAULT)
         self.note("a-watchdog.1", Event.WATCHDOG_SUSPECT, detail=1)
         self.note("supervisor", Event.REPLICA_FENCED, detail=FIRST_GENERATION | 1)
         self.note("b-protocol.1", Event.REPLICA_PROMOTED, detail=2)
 
     def verdict(self) -> Verdict:
         """Write what is left to write, then read it all back and judge."""
-        about = msgspec.to_builtins(self.options) | {"started_ns": START_NS - 250 * MS}
+        options = self.options
+        if isinstance(self.work, LoadRun):
+            options = msgspec.structs.replace(options, work=LoadRun(self.asked or self.sent, 0.0))
+        about = msgspec.to_builtins(options) | {"started_ns": START_NS - 250 * MS}
         del about["private"], about["listener"]  # of a live run only
         (self.path / "run.json").write_text(json.dumps(about))
         if self.end is not None:

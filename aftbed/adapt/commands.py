@@ -155,6 +155,7 @@ def scheduled(
     *,
     resolve: Resolve = as_written,
     judge: Judge = whatever_suits,
+    may_fail: bool = False,
 ) -> tuple[Scheduled, ...]:
     """The adaptations of a run that begins with `start`, one after the other, as they were given.
 
@@ -171,6 +172,7 @@ def scheduled(
             judge(graph, timed.wish)
         except ConfigError as error:
             raise ConfigError(f"{text!r}: {error}") from error
+        goal = msgspec.structs.replace(goal, may_fail=may_fail)
         found.append(Scheduled(goal, timed.at_request, timed.after_ms))
         if len(found) > 1 and before(found[-1], found[-2]):
             raise ConfigError(f"{text!r}: it begins before the one that stands before it")

@@ -58,7 +58,7 @@ def bench_recovery(ftm: str, placement: str, kills: int, *, pin: bool = True) ->
     deaths += [death_ms() for _ in range(DEATHS)]
     parts: dict[str, list[float]] = {"detection": [], "fencing": [], "promotion": [], "first_reply": []}
     recovered = []
-    for f in failovers(run.record.history):
+    for f in failovers(run.record.history, run.record.faults):
         if f.detected_ms is None or f.fenced_ms is None or f.promoted_ms is None or f.recovered_ms is None:
             continue
         recovered.append(f.recovered_ms)

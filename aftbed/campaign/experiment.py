@@ -22,7 +22,7 @@ from aftbed.core.messages import Scheduled
 from aftbed.core.script import RECIPES
 from aftbed.ftm.compose import build
 from aftbed.inject.model import Fault, FaultReport, parse
-from aftbed.judge.checks import Evidence, Requests
+from aftbed.judge.checks import WITHOUT_END, Evidence, Requests
 from aftbed.judge.outcome import FAILED, OUTCOMES, UNKNOWN, outcome_of, worst
 from aftbed.judge.record import RunEnd, RunRecord, read_record
 from aftbed.judge.simulated import record_of
@@ -160,6 +160,7 @@ def starved(starved_ms: float, seconds: float) -> bool:
 REASONS_MAX: Final = 3
 REASON_MAX: Final = 300  # characters
 TIMED: Final = ("degraded", "hang")  # classes that a slow machine alone can bring about
+ON_ACTIVATION: Final = {"faults_applied", "adaptations_done"}  # an experiment says that by `activated`
 UNEXCUSED: Final = ("one_master", "whole_graph", "clean_exit")  # checks that hold whatever the faults are
 RUN_SECONDS_MAX: Final = 60.0
 REQUESTS_PER_SECOND_MIN: Final = 100.0  # of a closed loop on a busy machine
@@ -228,7 +229,7 @@ def _real(experiment: Experiment, standing: ExitStack) -> Result:
     evidence = evidence_of(_recorded(experiment, standing))
     verdict, (outcome, reasons) = judge(evidence.record, evidence), outcome_of(evidence)
     # G8: what the harness does not know is worse than any outcome that it believes to have seen.
-    unknown = {name for name, word in verdict.checks.items() if word == "unknown"} - {"faults_applied"}
+    unknown = {name for name, word in verdict.checks.items() if word == "unknown"} - ON_ACTIVATION
     if "clean_exit" in unknown:
         outcome, reasons = "harness_error", tuple(verdict.reasons)
     elif unknown and outcome != "sdc":
@@ -301,8 +302,10 @@ def _result(
     if vehicle is not None and golden is not None and vehicle.collision and not golden.collision:
         outcome = worst([outcome, "unavailable"])
         reasons = (f"the car hit something at {vehicle.impact_speed_kmh} km/h", *reasons)
-    activated = all(f.fired for f in faults) and len(adapted) == len(experiment.adaptations)
-    broken = [reason for reason in verdict.reasons if reason.partition(":")[0] in UNEXCUSED]
+    ended = all(one.outcome not in WITHOUT_END for one in verdict.adaptations)
+    activated = all(f.fired for f in faults) and ended
+    failed = {name for name, word in verdict.checks.items() if word == "fail" and name in UNEXCUSED}
+    broken = [reason for reason in verdict.reasons if reason.partition(":")[0] in failed]
     return Result(
         experiment,
         outcome,

@@ -44,6 +44,9 @@ WHEN: Final = {
 adapt = typer.Typer()
 
 Expr = Annotated[str, typer.Argument(help="The whole new expression, the outer mechanism first: lfr+tr.")]
+MayFail = Annotated[
+    bool, typer.Option("--may-fail", help="The run may pass even if this is rolled back or refused.")
+]
 Force = Annotated[bool, typer.Option("--force", help="Even where it does not suit the function.")]
 
 
@@ -56,6 +59,7 @@ class ChangeArguments(msgspec.Struct, frozen=True, kw_only=True):
     expr: Expr
     recipe: Recipe = "drained"
     force: Force = False
+    may_fail: MayFail = False
     run: Run = None
     json: Json = False
 
@@ -74,9 +78,12 @@ _change_command("compose", "Keep the outer mechanism, and add mechanisms inside 
 
 
 @adapt.command()
-def decompose(recipe: Recipe = "drained", run: Run = None, json: Json = False) -> None:
+def decompose(
+    recipe: Recipe = "drained", may_fail: MayFail = False, run: Run = None, json: Json = False
+) -> None:
     """Keep the outer mechanism, and remove those inside it."""
-    raise typer.Exit(_change(Wish("decompose"), ChangeArguments(expr="", recipe=recipe, run=run, json=json)))
+    given = ChangeArguments(expr="", recipe=recipe, may_fail=may_fail, run=run, json=json)
+    raise typer.Exit(_change(Wish("decompose"), given))
 
 
 @adapt.command()
@@ -85,31 +92,33 @@ def update(
     source: Annotated[str, typer.Option("--to", help="MODULE:CLASS or FILE.py:CLASS.")],
     recipe: Recipe = "drained",
     force: Force = False,
+    may_fail: MayFail = False,
     run: Run = None,
     json: Json = False,
 ) -> None:
     """Replace the class of one brick on every replica; the class may be newer than the run."""
-    given = ChangeArguments(expr="", recipe=recipe, force=force, run=run, json=json)
+    given = ChangeArguments(expr="", recipe=recipe, force=force, may_fail=may_fail, run=run, json=json)
     raise typer.Exit(_change(Wish("update", brick, source), given))
 
 
 @adapt.command()
 def script(
     file: Annotated[str, typer.Argument(help="A YAML file, as `adapt plan --yaml` prints it.")],
+    may_fail: MayFail = False,
     run: Run = None,
     json: Json = False,
 ) -> None:
     """Carry out a script from a file; all of it is checked before its first step."""
     path = Path(file)
     wanted = _absolute(script_from(read_yaml(path, ScriptFile), file), path.parent)
-    goal = Goal(script=wanted, recipe=wanted.recipe, file=file)
+    goal = Goal(script=wanted, recipe=wanted.recipe, file=file, may_fail=may_fail)
     raise typer.Exit(_ask(run_directory.find(run), goal, as_json=json))
 
 
 def _change(wish: Wish, given: ChangeArguments) -> int:
     private = run_directory.find(given.run)
     graph = msgspec.convert(control_client.ask(private, control_client.GraphQuery()), Graph)
-    goal = goal_of(wish, graph, given.recipe, _source)
+    goal = msgspec.structs.replace(goal_of(wish, graph, given.recipe, _source), may_fail=given.may_fail)
     application = goal.source if goal.part == APPLICATION else _function_of(graph)
     _refuse_unsuitable(goal.expression or graph.ftm, application, wish, force=given.force)
     return _ask(private, goal, as_json=given.json)
@@ -133,14 +142,16 @@ def _ask(private: Path, goal: Goal, *, as_json: bool) -> int:
 # -- what is refused before the run is asked ------------------------------------------------------
 
 
-def scheduled(texts: tuple[str, ...], start: Graph, recipe: str, *, force: bool) -> tuple[Scheduled, ...]:
+def scheduled(
+    texts: tuple[str, ...], start: Graph, recipe: str, *, force: bool, may_fail: bool = False
+) -> tuple[Scheduled, ...]:
     """The adaptations of `--adapt`, each checked on the graph that it will find. Raises ConfigError."""
 
     def judge(new: Graph, wish: Wish) -> None:
         _refuse_unsuitable(new.ftm, _function_of(new), wish, force=force)
 
     try:
-        return commands.scheduled(texts, start, recipe, resolve=_source, judge=judge)
+        return commands.scheduled(texts, start, recipe, resolve=_source, judge=judge, may_fail=may_fail)
     except ConfigError as error:
         raise ConfigError(f"--adapt {error}") from error
 

@@ -63,6 +63,9 @@ class RunArguments(msgspec.Struct, frozen=True):
     force: Annotated[
         bool, typer.Option("--force", help="Carry out --adapt even where it does not suit the function.")
     ] = False
+    may_fail: Annotated[
+        bool, typer.Option("--may-fail", help="The run may pass even if an --adapt was not done.")
+    ] = False
     policy: Annotated[
         str | None, typer.Option(help="When the run adapts by itself: name of a policy, or a YAML file.")
     ] = None
@@ -150,12 +153,12 @@ def _fault(text: str, graph: Graph, *, unsafe: bool) -> Fault:
 
 def _adaptations(given: RunArguments, graph: Graph) -> tuple[Scheduled, ...]:
     if not given.adaptations:
-        if given.recipe != RECIPES[0] or given.force:
-            raise ConfigError("--recipe and --force say how --adapt is carried out: give --adapt too")
+        if given.recipe != RECIPES[0] or given.force or given.may_fail:
+            raise ConfigError("--recipe, --force and --may-fail are about --adapt: give --adapt too")
         return ()
     from aftbed.cli.adapt import scheduled  # noqa: PLC0415 - only with --adapt
 
-    return scheduled(given.adaptations, graph, given.recipe, force=given.force)
+    return scheduled(given.adaptations, graph, given.recipe, force=given.force, may_fail=given.may_fail)
 
 
 def _closed_loop(given: RunArguments) -> "Callable[[Launched], ClosedLoop] | None":

@@ -148,6 +148,11 @@ def show_verdict(verdict: "Verdict", *, as_json: bool) -> None:
             f" promoted {_ms(f.promoted_ms)}, next good reply {_ms(f.recovered_ms)},"
             f" blackout {_ms(f.blackout_ms)}"
         )
+    for one in verdict.adaptations:
+        took = f", blackout {_ms(one.blackout_ms)}, total {_ms(one.total_ms)}" if one.total_ms else ""
+        print(f"  adaptation {one}{took}")
+    if verdict.adaptations:
+        print(f"  at the end {verdict.ftm_at_end or 'unknown'}")
     if verdict.proposals:
         from aftbed.runtime.unix.closed_loop import proposed_line  # noqa: PLC0415 - only with a policy
 

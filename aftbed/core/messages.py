@@ -16,6 +16,7 @@ import msgspec
 
 from aftbed.core.errors import PeerError
 from aftbed.core.script import Phase, Script
+from aftbed.core.units import duration
 
 
 class Traffic(Enum):
@@ -245,7 +246,8 @@ class Situation(Message, frozen=True, tag=28):
 class Goal(msgspec.Struct, frozen=True):
     """The goal of an adaptation: one of `expression`, `part` with `source`, or `script`.
 
-    `file`: where the script was read, for messages to the user.
+    `file`: where the script was read, for messages to the user. If it `may_fail`, the verdict does not demand
+    that it is done.
     """
 
     expression: str = ""
@@ -254,6 +256,12 @@ class Goal(msgspec.Struct, frozen=True):
     script: Script | None = None
     recipe: str = "drained"
     file: str = ""
+    may_fail: bool = False
+
+    def __str__(self) -> str:
+        if self.script is not None:
+            return f"script {self.file or self.script.purpose}"
+        return f"update {self.part} to {self.source}" if self.part else f"to {self.expression}"
 
 
 class Scheduled(msgspec.Struct, frozen=True):
@@ -262,6 +270,11 @@ class Scheduled(msgspec.Struct, frozen=True):
     goal: Goal
     at_request: int = 0
     after_ms: float = 0.0
+
+    def __str__(self) -> str:
+        if self.at_request:
+            return f"{self.goal} at request {self.at_request}"
+        return f"{self.goal} after {duration(self.after_ms)}" if self.after_ms else str(self.goal)
 
 
 class Adapt(Message, frozen=True, tag=40):

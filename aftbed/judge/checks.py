@@ -6,20 +6,25 @@ has a broken history in the tests that it must refuse.
 """
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Final, Literal, NamedTuple
 
 import msgspec
 
+from aftbed.adapt.engine import DONE
 from aftbed.core.errors import PeerError
-from aftbed.core.events import RERUN, Event
+from aftbed.core.events import FIRST_FAULT, RERUN, Event
 from aftbed.core.graph import Graph
 from aftbed.core.journal import Entry, EntryKind, History, Record
-from aftbed.ftm.compose import build, replication_of
+from aftbed.core.messages import Scheduled
+from aftbed.ftm.compose import REPLICAS, build, replication_of
+from aftbed.inject.model import Fault, FaultReport, parse
+from aftbed.inject.receipts import fault_and_bits
+from aftbed.inject.targets import PRIMARY
 from aftbed.judge.record import Excuses, RunRecord
 from aftbed.judge.reference import ReferenceRun
-from aftbed.runtime.deployment import Hosted
-from aftbed.runtime.unix.options import COMMAND_GONE, CarRun, ReplayRun, Work
+from aftbed.runtime.deployment import Hosted, replica_of
+from aftbed.runtime.unix.options import COMMAND_GONE, CarRun, LoadRun, ReplayRun, Work
 from aftbed.vehicle.aeb.messages import AebOutput, decode_reply
 from aftbed.vehicle.scenarios.library import load_scenario
 from aftbed.vehicle.scenarios.scenario import broken_expectations
@@ -29,7 +34,10 @@ REQUESTED_ENDS: Final = ("", "interrupted", "stopped")  # ends of a run that its
 VEHICLE: Final = "vehicle"  # the name of the check of what a scenario expects of the car
 NOTHING_EXCUSED: Final = Excuses()
 LATE_NS: Final = 60_000_000  # of bus time: as long as the brake ECU holds the last request
-CAUSE_NS_MAX: Final = 1_000_000_000  # an older fault is not the cause of an alarm
+HANG_NOTICED_NS: Final = 50_000_000  # after the end of a hang an alarm may still be about it
+NOT_BEGUN: Final = "not begun"
+NOT_ENDED: Final = "not ended"
+WITHOUT_END: Final = (NOT_BEGUN, NOT_ENDED)
 
 Finding = Literal["pass", "fail", "unknown"]
 
@@ -53,10 +61,11 @@ class Requests(msgspec.Struct, frozen=True):
 
 
 class Failover(msgspec.Struct, frozen=True):
-    """One change of master. Times count from the fault if that is in the history, else from the alarm.
+    """One change of master. Times count from the fault that ended the last one, else from the alarm.
 
-    `blackout_ms` is the time without service: from when a request waited and no replica could answer it,
-    to the first reply of the new master.
+    `fault` is that crash or hang, in its words, "" where the record names none. `blackout_ms` is the time
+    without service: from when a request waited and no replica could answer it, to the first reply of the new
+    master.
     """
 
     epoch: int
@@ -66,6 +75,43 @@ class Failover(msgspec.Struct, frozen=True):
     promoted_ms: float | None
     recovered_ms: float | None
     blackout_ms: float | None
+    fault: str = ""
+
+
+class AskedAdaptation(msgspec.Struct, frozen=True):
+    """An adaptation that was asked for, and how it ended; times in milliseconds.
+
+    `outcome`: `done`, `rolled back`, `refused`, `not begun`, or `not ended`, with the reason.
+    """
+
+    asked: str
+    outcome: str
+    reason: str = ""
+    prepare_ms: float = 0.0
+    blackout_ms: float = 0.0
+    total_ms: float = 0.0
+    may_fail: bool = False
+
+    def __str__(self) -> str:
+        why = f": {self.reason}" if self.reason else ""
+        return f"{self.asked}: {self.outcome}{why}"
+
+
+class _Ended(msgspec.Struct, frozen=True):
+    """The part of `runtime.adaptations.Outcome` that a verdict shows."""
+
+    outcome: str
+    reason: str = ""
+    prepare_ms: float = 0.0
+    blackout_ms: float = 0.0
+    total_ms: float = 0.0
+    may_fail: bool = False
+    asked: str = ""
+    scheduled: int = 0
+
+    def told(self, asked: str) -> AskedAdaptation:
+        times_ms = (self.prepare_ms, self.blackout_ms, self.total_ms)
+        return AskedAdaptation(asked, self.outcome, self.reason, *times_ms, may_fail=self.may_fail)
 
 
 def _check(reasons: list[str]) -> Check:
@@ -183,19 +229,19 @@ def requests(history: History, reference: ReferenceRun, late_ns: int = LATE_NS) 
     )
 
 
-def failovers(history: History) -> list[Failover]:
-    """Each change of master, in order."""
+def failovers(history: History, faults: Sequence[FaultReport] = ()) -> list[Failover]:
+    """Each change of master, in order. `faults` are those of the run, in the order of their numbers."""
     accepted = history.events(Event.REPLY_ACCEPTED)
     sent_ns = {e.request_id: e.t_ns for e in _sent(history)}
-    found = []
+    actions = [parse(report.fault) for report in faults]
+    found, since_ns = [], 0
     for promoted in history.events(Event.REPLICA_PROMOTED):
         epoch = promoted.detail
         fence = _last_before(history.events(Event.REPLICA_FENCED), promoted.t_ns)
         alarm = _last_before(history.events(Event.WATCHDOG_SUSPECT), (fence or promoted).t_ns)
         first = alarm or fence or promoted
-        fault = _last_before(history.events(Event.FAULT_APPLIED), first.t_ns)
-        if fault is not None and first.t_ns - fault.t_ns >= CAUSE_NS_MAX:
-            fault = None
+        fault = _cause(history, actions, since_ns, first, fence)
+        since_ns = promoted.t_ns
         start_ns = (fault or first).t_ns
         reply = next((r for r in accepted if r.detail >> 8 == epoch), None)
         blackout_ms = None
@@ -208,8 +254,62 @@ def failovers(history: History) -> list[Failover]:
             for one in (alarm if fault else None, fence, promoted, reply)
         )
         cause = "fault" if fault else "alarm" if alarm else "unknown"
-        found.append(Failover(epoch, cause, detected_ms, fenced_ms, promoted_ms, recovered_ms, blackout_ms))
+        times_ms = (detected_ms, fenced_ms, promoted_ms, recovered_ms, blackout_ms)
+        words = "" if fault is None else faults[_number_of(fault)].fault
+        found.append(Failover(epoch, cause, *times_ms, fault=words))
     return found
+
+
+def _cause(
+    history: History, faults: Sequence[Fault], since_ns: int, alarm: Record, fence: Record | None
+) -> Record | None:
+    """The strike that ended the fenced leader: of a crash, or of a hang that was not over before the alarm.
+
+    Only a fault aimed at that replica while it led, from `since_ns` on, is one. What else ends a replica (a
+    signal from outside, a value fault that a self-test finds) is not named by a strike.
+    """
+
+    def ended_it(strike: Record) -> bool:
+        number = _number_of(strike)
+        if fence is None or not (0 <= number < len(faults) and since_ns <= strike.t_ns <= alarm.t_ns):
+            return False
+        fault, fenced = faults[number], REPLICAS[(fence.detail & 0xFF) - 1]
+        if not fault.action.stops_process or (fault.target != PRIMARY and replica_of(fault.target) != fenced):
+            return False
+        lasts_ns = fault.action.lasts_ms * 1_000_000
+        return not lasts_ns or alarm.t_ns <= strike.t_ns + lasts_ns + HANG_NOTICED_NS
+
+    return _last_before(filter(ended_it, history.events(Event.FAULT_APPLIED)), alarm.t_ns)
+
+
+def _number_of(strike: Record) -> int:
+    """Which of the run's faults has struck, from 0 on."""
+    return fault_and_bits(strike.detail)[0] - FIRST_FAULT
+
+
+def adaptations(record: RunRecord) -> list[AskedAdaptation]:
+    """Those asked for with the run, in their order, then those asked for while it ran."""
+    ended = [msgspec.convert(outcome, _Ended) for outcome in record.adaptations]
+    by_place = {one.scheduled: one for one in ended}
+    with_run = [
+        by_place[place].told(str(one)) if place in by_place else _without_end(record, one)
+        for place, one in enumerate(record.options.adaptations, 1)
+    ]
+    return with_run + [one.told(one.asked) for one in ended if not one.scheduled]
+
+
+def _without_end(record: RunRecord, scheduled: Scheduled) -> AskedAdaptation:
+    """What is known of one that has left no outcome."""
+    seconds = record.end.seconds if record.end is not None else None
+    sent = max((entry.request_id for entry in _sent(record.history)), default=0)
+    outcome = NOT_BEGUN
+    if sent < scheduled.at_request:
+        reason = f"request {scheduled.at_request} was never sent, {sent} was the last"
+    elif seconds is not None and seconds * 1e3 < scheduled.after_ms:
+        reason = f"the run ended after {seconds:g} s"
+    else:
+        outcome, reason = NOT_ENDED, "the run ended before it"
+    return AskedAdaptation(str(scheduled), outcome, reason, may_fail=scheduled.goal.may_fail)
 
 
 def _last_before(records: Iterable[Record], t_ns: int) -> Record | None:
@@ -399,6 +499,33 @@ def check_faults_applied(evidence: Evidence) -> Check:
         if not f.fired
     )
     return Check("unknown" if reasons else "pass", reasons)
+
+
+def check_adaptations(evidence: Evidence) -> Check | None:
+    """G8: an adaptation that was asked for and not done proves nothing, unless it may fail."""
+    asked = adaptations(evidence.record)
+    failed = tuple(str(one) for one in asked if one.outcome != DONE and not one.may_fail)
+    return Check("unknown" if failed else "pass", failed[:REASONS_MAX]) if asked else None
+
+
+def check_complete(evidence: Evidence) -> Check | None:
+    """G8: as many requests as asked for, the log to its end, unless the user ended the run before.
+
+    A drive is judged by what its scenario expects (`check_vehicle`).
+    """
+    record, reasons = evidence.record, []
+    if isinstance(record.options.work, CarRun) or record.end is None or record.lost or record.end.reason:
+        return None
+    match record.options.work:
+        case LoadRun(count):
+            sent = len({entry.request_id for entry in _sent(record.history)})
+            if sent != count:
+                reasons = [f"{sent} requests were sent, {count} were asked for"]
+        case ReplayRun():
+            played = (record.end.result or {}).get("played")
+            if not isinstance(played, dict) or not played.get("complete"):
+                reasons = ["the log was not replayed to its end"]
+    return Check("unknown" if reasons else "pass", tuple(reasons))
 
 
 def check_whole_history(evidence: Evidence) -> Check:

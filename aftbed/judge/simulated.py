@@ -30,7 +30,8 @@ def record_of(run: Run) -> RunRecord:
     """The record of a simulated run."""
     setup, rest = run.setup, run.rest
     work: Work = CarRun(setup.scenario, None, "") if setup.scenario else LoadRun(setup.count, setup.rate_hz)
-    options = RunOptions("", "", "", setup.ftm, setup.placement, setup.seed, work, setup.faults)
+    asked = (setup.faults, setup.adaptations)
+    options = RunOptions("", "", "", setup.ftm, setup.placement, setup.seed, work, *asked)
     end = RunEnd(
         unfinished=rest.why_not,
         lost=rest.lost,

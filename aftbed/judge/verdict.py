@@ -11,7 +11,7 @@ import msgspec
 from aftbed.core.application import Application
 from aftbed.inject.model import FaultReport
 from aftbed.judge import checks
-from aftbed.judge.checks import Check, Checker, Evidence, Failover, Requests
+from aftbed.judge.checks import AskedAdaptation, Check, Checker, Evidence, Failover, Requests
 from aftbed.judge.record import RunRecord
 from aftbed.judge.reference import reference_of
 from aftbed.runtime.unix.closed_loop import Proposed, read_proposals
@@ -31,6 +31,8 @@ CHECKERS: Final = (  # a new check is one line here; its name is its key in ever
     Checker("whole_graph", "G5", checks.check_whole_graph),
     Checker("clean_exit", "G7", checks.check_clean_exit),
     Checker("faults_applied", "G8", checks.check_faults_applied),
+    Checker("adaptations_done", "G8", checks.check_adaptations),
+    Checker("complete", "G8", checks.check_complete),
     Checker("whole_history", "G8", checks.check_whole_history),
     Checker("value", "G4", checks.check_value),
     Checker("at_rest", "", checks.check_at_rest),
@@ -57,6 +59,8 @@ class Verdict(msgspec.Struct, frozen=True):
     requests: Requests
     vehicle: VehicleResult | None
     failovers: list[Failover]
+    adaptations: list[AskedAdaptation]
+    ftm_at_end: str  # "" where the supervisor did not live to report it
     checks: dict[str, str]
     reasons: list[str]
     faults: list[FaultReport]
@@ -108,7 +112,9 @@ def judge(record: RunRecord, evidence: Evidence | None = None) -> Verdict:
         verdict="fail" if "fail" in words else "inconclusive" if "unknown" in words else "pass",
         requests=checks.requests(history, evidence.reference, checks.late_after_ns(options.work)),
         vehicle=record.vehicle,
-        failovers=checks.failovers(history),
+        failovers=checks.failovers(history, record.faults),
+        adaptations=checks.adaptations(record),
+        ftm_at_end=record.end.hosted.ftm if record.end is not None and record.end.hosted is not None else "",
         checks={name: check.finding for name, check in found.items()},
         reasons=[f"{name}: {reason}" for name, check in found.items() for reason in check.reasons],
         faults=list(record.faults),

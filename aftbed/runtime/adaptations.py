@@ -56,10 +56,9 @@ class Outcome(msgspec.Struct):
     opened_ns: int = 0  # from when on the new graph served (monotonic), 0 if it never did
     undone_ns: int = 0  # from when on the old one served again
     lost: str = ""  # the replicas that did not serve again, and were left to Recovery, as "a" or "a b"
-
-
-class PlanError(ConfigError):
-    """Nothing leads from the graph that runs to the goal, or its script is refused."""
+    asked: str = ""  # the words of the request
+    scheduled: int = 0  # its place among those of the run's options, from 1 on; 0: asked for while it ran
+    may_fail: bool = False  # see `core.messages.Goal`
 
 
 def _named(goal: messages.Goal) -> str:
@@ -110,8 +109,11 @@ class Adaptations:
         self._inform_recovery = inform_recovery
         self._started_ns = self._loop.now_ns()
         self._current: _Current | None = None
+        self._count = 0
         self.history: list[Outcome] = []
-        self._scheduled: list[messages.Scheduled] = []  # those that wait for their request
+        self._scheduled: list[
+            tuple[int, messages.Scheduled]
+        ] = []  # with their places: they wait for a request
 
     @property
     def busy(self) -> bool:
@@ -139,8 +141,13 @@ class Adaptations:
 
     # -- asked for ----------------------------------------------------------------------------
 
-    def ask(self, goal: messages.Goal, answer: Answer, retries: int = RETRIES_MAX) -> None:
-        """Begin an adaptation, after a short wait for redundancy. Raises ConfigError where it is refused."""
+    def ask(
+        self, goal: messages.Goal, answer: Answer, retries: int = RETRIES_MAX, scheduled: int = 0
+    ) -> None:
+        """Begin an adaptation, after a short wait for redundancy. Raises ConfigError where it is refused.
+
+        `scheduled` is its place among those of the run's options, from 1 on.
+        """
         deployment = self._deployment
         if self._current is not None:
             raise ConfigError(
@@ -156,13 +163,10 @@ class Adaptations:
                     f" backup {deployment.backup or 'none'}, engine"
                     f" {'there' if deployment.lives(ENGINE) else 'not there'}"
                 )
-            self._loop.after(RETRY_SECONDS, lambda: self._ask_again(goal, answer, retries - 1))
+            self._loop.after(RETRY_SECONDS, lambda: self._ask_again(goal, answer, retries - 1, scheduled))
             return
-        try:
-            plan = plan_goal(deployment.graph, goal)
-        except ConfigError as error:
-            raise PlanError(str(error)) from error
-        outcome = self._asked(goal)
+        plan = plan_goal(deployment.graph, goal)
+        outcome = self._asked(goal, scheduled)
         self._current = _Current(outcome, answer, self._loop.now_ns(), deployment.epoch, plan)
         self._send(messages.Adapt(outcome.number, plan.script))
 
@@ -170,18 +174,20 @@ class Adaptations:
         """Plan an adaptation of the graph that runs now. Raises ConfigError."""
         return plan_goal(self._deployment.graph, goal)
 
-    def _asked(self, goal: messages.Goal) -> Outcome:
-        outcome = Outcome(len(self.history) + 1, _named(goal), goal.recipe, self._deployment.graph.ftm)
+    def _asked(self, goal: messages.Goal, scheduled: int) -> Outcome:
+        self._count += 1
+        outcome = Outcome(self._count, _named(goal), goal.recipe, self._deployment.graph.ftm)
+        outcome.asked, outcome.scheduled, outcome.may_fail = str(goal), scheduled, goal.may_fail
         outcome.asked_ms = round((self._loop.now_ns() - self._started_ns) / 1e6, 3)
         return outcome
 
     def schedule(self, scheduled: tuple[messages.Scheduled, ...]) -> Keys:
         """Begin the adaptations requested with the run, each when the Client reaches its request."""
-        for later in scheduled:
+        for place, later in enumerate(scheduled, 1):
             if later.at_request:
-                self._scheduled.append(later)
+                self._scheduled.append((place, later))
             else:
-                begin = functools.partial(self._ask_again, later.goal, _unanswered, RETRIES_MAX)
+                begin = functools.partial(self._ask_again, later.goal, _unanswered, RETRIES_MAX, place)
                 self._loop.after(later.after_ms / 1e3, begin)
         yield from self._hold_requests()
 
@@ -191,7 +197,7 @@ class Adaptations:
         yield from self._deployment.ask(CLIENT, control.ResumeNode)
 
     def _hold_requests(self) -> Keys:
-        requests = tuple(sorted({later.at_request for later in self._scheduled}))
+        requests = tuple(sorted({later.at_request for _, later in self._scheduled}))
         if requests:
             hold = messages.HoldAt(requests)
             yield from self._deployment.ask(CLIENT, lambda token: control.Deliver(token, CLIENT, hold))
@@ -200,26 +206,22 @@ class Adaptations:
         """The Client has reached `request_id`: begin the adaptations that wait for it, then release the
         request.
         """
-        due = [later for later in self._scheduled if later.at_request == request_id]
-        self._scheduled = [later for later in self._scheduled if later.at_request != request_id]
-        for later in due:
-            self._ask_again(later.goal, _unanswered, RETRIES_MAX)
+        due = [one for one in self._scheduled if one[1].at_request == request_id]
+        self._scheduled = [one for one in self._scheduled if one not in due]
+        for place, later in due:
+            self._ask_again(later.goal, _unanswered, RETRIES_MAX, place)
         release = messages.Release(request_id)
         with contextlib.suppress(StepFailed):  # the Client is dead; its successor sends the request again
             self._deployment.order(CLIENT, lambda token: control.Deliver(token, CLIENT, release))
 
-    def _ask_again(self, goal: messages.Goal, answer: Answer, retries: int) -> None:
+    def _ask_again(self, goal: messages.Goal, answer: Answer, retries: int, scheduled: int) -> None:
         try:
-            self.ask(goal, answer, retries)
-        except PlanError as error:
-            outcome = self._asked(goal)
+            self.ask(goal, answer, retries, scheduled)
+        except ConfigError as error:
+            outcome = self._asked(goal, scheduled)
             outcome.outcome, outcome.reason = REFUSED, str(error)
             self._keep(outcome)
             answer(outcome)
-        except ConfigError as error:
-            ftm = self._deployment.graph.ftm
-            self._log("adapted", f"{_named(goal)}: refused: {error}")
-            answer(Outcome(0, _named(goal), goal.recipe, ftm, REFUSED, str(error)))
 
     def _send(self, message: messages.Adapt | messages.Progress | messages.TakeUp) -> None:
         try:

@@ -98,7 +98,7 @@ def _summed(runs: Iterable[Evidence]) -> tuple[Counter[str], RecoveryRange | Non
     classes, times_ms = Counter[str](), list[float]()
     for run in runs:
         classes[outcome_of(run)[0]] += 1
-        failovers = checks.failovers(run.record.history)
+        failovers = checks.failovers(run.record.history, run.record.faults)
         times_ms += [f.recovered_ms for f in failovers if f.recovered_ms is not None]
     if not times_ms:
         return classes, None

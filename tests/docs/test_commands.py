@@ -19,9 +19,12 @@ import pytest
 from liveruns import PLAIN, called, forked
 from pages import PAGES, ROOT, Block, Command, blocks, names, table
 
+from aftbed.judge.verdict import CHECKERS
+
 SECONDS_MAX: Final = 180.0  # of one command, on a machine under load
 PAGE_SECONDS_MAX: Final = 900
 DOCS: Final = ROOT / "docs"
+BELOW_THE_TABLE: Final = ("value", "at_rest", "assertions")  # with a bitflip; of simulated runs
 LONG_DRIVE: Final = """\
 description: an empty road, for as long as the page's commands take
 duration_s: 600
@@ -171,7 +174,9 @@ def test_the_document_of_a_run_is_described_key_by_key(tmp_path: Path, private: 
     found = json.loads(done.stdout)
     keys = [name for row in table(DOCS / "commands.md", "key") for name in names(row[0])]
     assert set(keys) == set(found)
-    assert [names(row[0])[0] for row in table(DOCS / "record.md", "check")] == list(found["checks"])
+    described = [names(row[0])[0] for row in table(DOCS / "record.md", "check")]
+    assert [name for name in described if name in found["checks"]] == list(found["checks"])
+    assert {*described, *BELOW_THE_TABLE} == {checker.name for checker in CHECKERS}
 
 
 @pytest.mark.parametrize(

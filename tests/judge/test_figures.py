@@ -1,13 +1,19 @@
 """The figures of a history: the client's account, and how long each failover took."""
 
+from typing import Final
+
 import pytest
 from tales import MS, Sums, Tale, good
 
-from aftbed.core.events import Event
+from aftbed.core.events import FIRST_FAULT, Event
 from aftbed.core.journal import Entry, EntryKind, History, Record
+from aftbed.inject.model import FaultReport
+from aftbed.inject.receipts import ReceiptState
 from aftbed.judge import checks
 from aftbed.judge.checks import LATE_NS, Failover, Requests
 from aftbed.judge.reference import reference_run
+
+CRASH: Final = FaultReport("crash primary", ReceiptState.ACTIVATED)
 
 
 def account_of(history: History) -> Requests:
@@ -46,7 +52,7 @@ def a_failover(*, fault: bool, alarm: bool = True) -> Tale:
     """Sent at +0, fault at +1 ms, alarm at +2, fence at +3, promotion at +4, accepted at +5."""
     tale = Tale().served(1).sent(2)
     if fault:
-        tale.note("a/server.1", Event.FAULT_APPLIED)
+        tale.note("a/server.1", Event.FAULT_APPLIED, detail=FIRST_FAULT)
     else:
         tale.wait(1)
     if alarm:
@@ -57,7 +63,7 @@ def a_failover(*, fault: bool, alarm: bool = True) -> Tale:
 
 
 def test_the_times_of_a_failover_count_from_the_fault() -> None:
-    assert checks.failovers(a_failover(fault=True).history()) == [
+    assert checks.failovers(a_failover(fault=True).history(), [CRASH]) == [
         Failover(
             epoch=2,
             cause="fault",
@@ -66,6 +72,7 @@ def test_the_times_of_a_failover_count_from_the_fault() -> None:
             promoted_ms=3.0,
             recovered_ms=4.0,
             blackout_ms=4.0,
+            fault="crash primary",
         )
     ]
 
@@ -97,10 +104,10 @@ def test_a_promotion_without_any_of_them_has_no_time_of_its_fence() -> None:
 
 
 def test_a_request_that_came_later_did_not_wait_for_the_failover() -> None:
-    tale = Tale().served(1).note("a/server.1", Event.FAULT_APPLIED)
+    tale = Tale().served(1).note("a/server.1", Event.FAULT_APPLIED, detail=FIRST_FAULT)
     tale.note("a/watchdog.1", Event.WATCHDOG_SUSPECT).fenced(1).promoted(2).wait(100)
     tale.served(2, epoch=2, replica=2)
-    (found,) = checks.failovers(tale.history())
+    (found,) = checks.failovers(tale.history(), [CRASH])
     assert found.recovered_ms == 107.0, "the fault was that long ago"
     assert found.blackout_ms == 3.0, "but no request waited"
 
@@ -111,11 +118,36 @@ def test_a_failover_that_nobody_lived_to_use() -> None:
     assert (found.promoted_ms, found.recovered_ms, found.blackout_ms) == (2.0, None, None)
 
 
-def test_an_old_fault_is_not_the_cause() -> None:
-    tale = Tale().served(1).note("hub.1", Event.FAULT_APPLIED).wait(1001)
+@pytest.mark.parametrize(
+    ("words", "wait_ms", "cause"),
+    [
+        ("crash primary at server.exit nth 2", 3000, "fault"),  # on a busy machine
+        ("crash a/after", 1, "fault"),
+        ("crash a", 1, "fault"),
+        ("hang primary", 500, "fault"),
+        ("hang primary for 100ms", 60, "fault"),
+        ("hang primary for 100ms", 400, "alarm"),  # it was over by then
+        ("crash b/after", 1, "alarm"),  # of the other replica
+        ("crash backup", 1, "alarm"),
+        ("crash a/watchdog", 1, "alarm"),
+        ("crash proxy", 1, "alarm"),
+        ("bitflip result bit 3 nth 2", 1, "alarm"),  # ends no process
+        ("slow primary by 2ms", 1, "alarm"),
+    ],
+)
+def test_the_cause_is_what_ended_the_leader_and_nothing_beside_it(
+    words: str, wait_ms: float, cause: str
+) -> None:
+    tale = Tale().served(1).note("supervisor.1", Event.FAULT_APPLIED, detail=FIRST_FAULT).wait(wait_ms)
     tale.note("a/watchdog.1", Event.WATCHDOG_SUSPECT).fenced(1).promoted(2)
-    (found,) = checks.failovers(tale.history())
-    assert found.cause == "alarm"
+    (found,) = checks.failovers(tale.history(), [FaultReport(words, ReceiptState.ACTIVATED)])
+    assert (found.cause, found.fault) == (cause, words if cause == "fault" else "")
+    assert (found.detected_ms is None) is (cause != "fault")
+
+
+def test_a_fault_of_an_earlier_mastership_is_not_the_cause() -> None:
+    tale = a_failover(fault=True).note("b/watchdog.1", Event.WATCHDOG_SUSPECT).fenced(2).promoted(3)
+    assert [f.cause for f in checks.failovers(tale.history(), [CRASH])] == ["fault", "alarm"]
 
 
 def test_each_failover_is_told_in_order() -> None:

@@ -77,7 +77,9 @@ def test_a_drive_that_was_broken_off_is_judged_by_what_it_did(path: Path) -> Non
 def test_a_replay_gives_its_figures_and_needs_no_car(path: Path) -> None:
     record = whole(path, ReplayRun("drive.log", "radar.dbc", "toyota", None))
     assert record.end is not None
-    record.end["result"] = {"played": 5}
+    record.end["result"] = whole_log = {"played": {"complete": True}}
     verdict = record.verdict()
-    assert (verdict.scenario, verdict.replay, verdict.vehicle) == ("replay drive.log", {"played": 5}, None)
+    assert (verdict.scenario, verdict.replay, verdict.vehicle) == ("replay drive.log", whole_log, None)
+    record.end["result"] = {"played": {"complete": False}}
+    assert record.verdict().reasons == ["complete: the log was not replayed to its end"]
     assert verdict.verdict == "pass" and "vehicle" not in verdict.checks

@@ -166,7 +166,7 @@ def test_a_faulty_brick_is_refused_and_the_service_never_notices(
 ) -> None:
     with serving(home, "pbr", "process") as run:
         with pytest.raises(ConfigError, match=words):
-            adapt(run, Goal(part="proceed", source=written(tmp_path, kind, steps, text)))
+            adapt(run, Goal(part="proceed", source=written(tmp_path, kind, steps, text), may_fail=True))
         assert graph_of(run) == whole("pbr", "process")
         outcome = ended(run)
     assert_nothing_happened_to_requests(outcome)
@@ -178,7 +178,8 @@ def test_a_brick_that_crashes_while_it_is_observed_is_rolled_back(
     home: Home, tmp_path: Path, placement: str
 ) -> None:
     with serving(home, "pbr", placement) as run:
-        found = adapt(run, Goal(part="proceed", source=written(tmp_path, steps=SELF_TEST_STEPS)))
+        source = written(tmp_path, steps=SELF_TEST_STEPS)
+        found = adapt(run, Goal(part="proceed", source=source, may_fail=True))
         assert found["outcome"] == "rolled back"
         until(run.redundant, "redundancy")
         outcome = ended(run)

@@ -60,7 +60,9 @@ def strike(run: Started, struck: Strike, placement: str) -> str:
     leader = str(run.status()["leader"])
     fault = Fault(Crash(), mirrored(struck.node, leader), Trigger(struck.when.label, struck.step))
     control_client.ask(run.private, control_client.InjectCommand(fault))
-    came_to = struck.new if how_it_ended(run, Goal(expression=struck.new)) == "done" else struck.old
+    came_to = (
+        struck.new if how_it_ended(run, Goal(expression=struck.new, may_fail=True)) == "done" else struck.old
+    )
     until(run.redundant, f"redundancy after {struck}")
     assert graph_of(run) == whole(came_to, placement, str(run.status()["leader"])), struck
     run.wait_for_answers(run.answered() + 1)

@@ -394,7 +394,8 @@ class ClosedLoop:
         try:
             if reason := _unsuitable(proposal.target, self._application):
                 raise ConfigError(reason)
-            command = control_client.AdaptCommand(Goal(expression=proposal.target))
+            goal = Goal(expression=proposal.target, may_fail=True)
+            command = control_client.AdaptCommand(goal)
             self._line = control_client.send(self._private, command)
             self._asked_ns = time.monotonic_ns()
         except AftbedError as error:
