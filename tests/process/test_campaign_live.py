@@ -33,6 +33,17 @@ stop: {experiments: 6}
 unknown_max: 1.0
 not_activated_max: 1.0
 """
+HANG = """\
+campaign: hang
+seed: 1
+system: {requests: 50, rate_hz: 400}
+mechanisms: [pbr]
+faults:
+- {name: lost, fault: omission pxy2pro nth 1, expect: {"*": [hang]}}
+stop: {experiments: 1}
+not_activated_max: 1.0
+unknown_max: 1.0
+"""
 EXPERIMENTS = 24
 SMOKE_SECONDS_MAX = 600.0  # of all its experiments
 
@@ -96,6 +107,15 @@ def test_the_records_are_complete_before_a_run_is_taken_down(home: Home, spec: P
         lines = (out / ledger.NAME).read_bytes().splitlines(keepends=True)
         (out / ledger.NAME).write_bytes(b"".join((*lines, lines[-1])))
         ledger.read(out / ledger.NAME)
+
+
+def test_a_run_that_hangs_as_expected_breaks_nothing(home: Home, tmp_path: Path) -> None:
+    """What its history cannot show is unknown, which is no broken promise."""
+    (tmp_path / "hang.yaml").write_text(HANG)
+    done = aftbed("campaign", "run", tmp_path / "hang.yaml", "--out", tmp_path / "out", "--json")
+    assert done.code == 0, done.out + done.err
+    (result,) = ledger.read(tmp_path / "out" / ledger.NAME).results
+    assert (result.outcome, result.broken, result.unexpected) == ("hang", (), False)
 
 
 @pytest.mark.timeout(SMOKE_SECONDS_MAX + 60)
