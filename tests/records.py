@@ -15,6 +15,7 @@ from aftbed.inject.model import Fault
 from aftbed.inject.value import ValueFlip, ValuePlace
 from aftbed.judge.record import read_record
 from aftbed.judge.verdict import Verdict, judge
+from aftbed.runtime.deployment import digest
 from aftbed.runtime.unix.journal_files import DialogueFile, JournalFile
 from aftbed.runtime.unix.options import CarRun, LoadRun, RunOptions, Work
 from aftbed.vehicle.aeb.function import default_application, sample_requests
@@ -43,6 +44,10 @@ class RecordInTheMaking:
             "reason": "",
             "left": [],
             "unfinished": [],
+            "lost": False,
+            "leader": "a",
+            "backup": "b",
+            "epoch": 1,
             "seconds": 1.5,
             "faults": receipts,
             "hosted": hosted,
@@ -50,6 +55,9 @@ class RecordInTheMaking:
         self.t_ns = START_NS
         (path / "journal").mkdir(parents=True)
         self._journals: dict[str, JournalFile] = {}
+        for node in ("supervisor", *build("pbr", "process").nodes):
+            name = f"{node.replace('/', '.')}.1"
+            self._journals[name] = JournalFile(path / "journal" / f"{name}.journal", node)
         self._dialogue = DialogueFile(path / "journal" / "client.1.dialogue", "client")
         self._bare = default_application()
         self.sent = 0
@@ -57,7 +65,7 @@ class RecordInTheMaking:
 
     def note(self, journal: str, event: Event, request_id: int = 0, detail: int = 0) -> None:
         if journal not in self._journals:
-            node = journal.rpartition(".")[0].replace("-", "/")
+            node = journal.rpartition(".")[0].replace(".", "/")
             self._journals[journal] = JournalFile(self.path / "journal" / f"{journal}.journal", node)
         self.t_ns += MS
         self._journals[journal].write(self.t_ns, event, request_id, detail)
@@ -76,7 +84,7 @@ class RecordInTheMaking:
         self.t_ns += MS
         self._dialogue.write(self.t_ns, self.sent, 0, EntryKind.SENT, payload)
         self.t_ns += late_ms * MS
-        self.note(f"{'ab'[replica - 1]}-server.1", Event.SERVER_EXIT, self.sent)
+        self.note(f"{'ab'[replica - 1]}.server.1", Event.SERVER_EXIT, self.sent)
         self.note("proxy.1", Event.REPLY_ACCEPTED, self.sent, epoch << 8 | replica)
         reply = self._bare.execute(payload)
         if flipped_bit is not None:
@@ -96,10 +104,10 @@ class RecordInTheMaking:
             file.write(count.to_bytes(4, "little"))
 
     def failover(self) -> None:
-        self.note("a-after.1", Event.FAULT_APPLIED, detail=FIRST_FAULT)
-        self.note("a-watchdog.1", Event.WATCHDOG_SUSPECT, detail=1)
-        self.note("supervisor", Event.REPLICA_FENCED, detail=FIRST_GENERATION | 1)
-        self.note("b-protocol.1", Event.REPLICA_PROMOTED, detail=2)
+        self.note("a.after.1", Event.FAULT_APPLIED, detail=FIRST_FAULT)
+        self.note("a.watchdog.1", Event.WATCHDOG_SUSPECT, detail=1)
+        self.note("supervisor.1", Event.REPLICA_FENCED, detail=FIRST_GENERATION | 1)
+        self.note("b.protocol.1", Event.REPLICA_PROMOTED, detail=2)
 
     def verdict(self) -> Verdict:
         """Write what is left to write, then read it all back and judge."""
@@ -110,6 +118,8 @@ class RecordInTheMaking:
         del about["private"], about["listener"]  # of a live run only
         (self.path / "run.json").write_text(json.dumps(about))
         if self.end is not None:
+            states = dict.fromkeys("ab", digest(self._bare.capture()))
+            self.end = {"ended_ns": self.t_ns + MS, "states": states} | self.end
             (self.path / "end.json").write_text(json.dumps(self.end))
         return judge(read_record(self.path))
 

@@ -74,6 +74,7 @@ class FaultReport(msgspec.Struct, frozen=True, omit_defaults=True):
     fault: str
     receipt: ReceiptState
     detail: str = ""
+    live: bool = False  # it was asked for while the run ran
 
     @property
     def fired(self) -> bool:

@@ -21,6 +21,7 @@ from aftbed.ftm.compose import REPLICAS, build, replication_of
 from aftbed.inject.model import Fault, FaultReport, parse
 from aftbed.inject.receipts import fault_and_bits
 from aftbed.inject.targets import PRIMARY
+from aftbed.judge import sources
 from aftbed.judge.record import Excuses, RunRecord
 from aftbed.judge.reference import ReferenceRun
 from aftbed.runtime.deployment import Hosted, replica_of
@@ -529,6 +530,16 @@ def check_complete(evidence: Evidence) -> Check | None:
             if not isinstance(played, dict) or not played.get("complete"):
                 reasons = ["the log was not replayed to its end"]
     return Check("unknown" if reasons else "pass", tuple(reasons))
+
+
+def check_sources(evidence: Evidence) -> Check | None:
+    """G8: what the sources of a record tell fits together, and none is missing."""
+    if evidence.record.simulated:
+        return None
+    wrong = tuple(sources.contradictions(evidence.record, evidence.reference))
+    missing = tuple(sources.gaps(evidence.record, evidence.reference))
+    finding: Finding = "fail" if wrong else "unknown" if missing else "pass"
+    return Check(finding, (*wrong, *missing)[:REASONS_MAX])
 
 
 def check_whole_history(evidence: Evidence) -> Check:

@@ -5,6 +5,7 @@ The directory of a real run can be read after a `kill -9`, too.
 
 import json
 from pathlib import Path
+from typing import Final
 
 import msgspec
 
@@ -17,6 +18,17 @@ from aftbed.runtime.unix.journal_files import contents
 from aftbed.runtime.unix.options import CarRun, RunOptions
 from aftbed.runtime.unix.run_directory import HISTORY_NAME
 from aftbed.vehicle.plant import VehicleResult
+
+END_KEYS: Final = (
+    *("reason", "ended_ns", "seconds", "left", "unfinished", "lost", "leader", "backup", "hosted", "states"),
+    *("epoch", "faults"),
+)
+
+
+class ClientEnd(msgspec.Struct, frozen=True):
+    """What the last client of a load said of itself."""
+
+    sent: int | None = None
 
 
 class RunEnd(msgspec.Struct, frozen=True):
@@ -39,6 +51,9 @@ class RunEnd(msgspec.Struct, frozen=True):
     result: dict[str, object] | None = None
     seconds: float | None = None
     starved_ms: float = 0.0
+    ended_ns: int = 0  # monotonic
+    client: ClientEnd | None = None
+    absent: tuple[str, ...] = ()  # keys that every end has, and this one does not
 
 
 class Excuses(msgspec.Struct, frozen=True):
@@ -70,6 +85,7 @@ class RunRecord(msgspec.Struct, frozen=True):
     started_ns: int = 0
     failures: tuple[str, ...] = ()
     excuses: Excuses | None = None
+    kept: bool = False  # after the run, so it was sealed at its end
 
     @property
     def simulated(self) -> bool:
@@ -115,12 +131,15 @@ def read_record(path: Path) -> RunRecord:
         else tuple(FaultReport(str(fault), ReceiptState.UNKNOWN) for fault in options.faults)
     )
     vehicle = _vehicle(options, end)
-    return RunRecord(options, history, end, faults, _adaptations(path), vehicle, path, started)
+    kept = about.get("kept") is True
+    return RunRecord(options, history, end, faults, _adaptations(path), vehicle, path, started, kept=kept)
 
 
 def _end(path: Path) -> RunEnd:
+    found = _json(path)
+    absent = tuple(key for key in END_KEYS if key not in found)
     try:
-        return msgspec.convert(_json(path), RunEnd)
+        return msgspec.convert(found | {"absent": absent}, RunEnd)
     except msgspec.ValidationError as error:
         raise ConfigError(f"{path}: not the end of a run: {error}") from None
 

@@ -33,6 +33,7 @@ CHECKERS: Final = (  # a new check is one line here; its name is its key in ever
     Checker("faults_applied", "G8", checks.check_faults_applied),
     Checker("adaptations_done", "G8", checks.check_adaptations),
     Checker("complete", "G8", checks.check_complete),
+    Checker("sources_agree", "G8", checks.check_sources),
     Checker("whole_history", "G8", checks.check_whole_history),
     Checker("value", "G4", checks.check_value),
     Checker("at_rest", "", checks.check_at_rest),

@@ -41,9 +41,10 @@ class NoHost(StepFailed):
 class RunInjection(Injection):
     """One fault of a run, with what the controller keeps of it."""
 
-    def __init__(self, number: int, fault: Fault, draw: int) -> None:
+    def __init__(self, number: int, fault: Fault, draw: int, *, live: bool) -> None:
         super().__init__(number, fault, draw)
         self.fault: Fault = fault
+        self.live = live
         self.left = fault.trigger.nth  # occurrences of its event until it strikes, since it came to its host
         self.waits = False  # for its event: in its host, or, while no node emits it, in none
         self.process: Process | None = None  # the host
@@ -94,7 +95,7 @@ class RunInjection(Injection):
             held = f"{self.fault.trigger.when} at {self.met.t_us / 1e6:.6f} s"
             held += f", {self._lag_ns / 1e6:.2f} ms before" if self._lag_ns else ""
             found = Receipt(found.state, "; ".join(filter(None, (found.detail, held))))
-        return FaultReport(str(self.fault), found.state, found.detail)
+        return FaultReport(str(self.fault), found.state, found.detail, self.live)
 
 
 class FaultController:
@@ -109,13 +110,13 @@ class FaultController:
 
     # -- arming -----------------------------------------------------------------------------------
 
-    def arm(self, fault: Fault) -> Keys:
-        """Apply `fault` now, later, or have it wait for its event.
+    def arm(self, fault: Fault, *, live: bool = False) -> Keys:
+        """Apply `fault` now, later, or have it wait for its event. If `live`, it came while the run ran.
 
         Raises StepFailed; NoHost is a refusal: nothing has been armed, and the run is not judged by it.
         """
         number = next(self._numbers)
-        injection = RunInjection(number, fault, self._runtime.draw(number))
+        injection = RunInjection(number, fault, self._runtime.draw(number), live=live)
         self._injections.append(injection)
         self._log("armed", str(fault))
         if fault.action.shares_state:

@@ -34,13 +34,13 @@ def eventful(tmp_path: Path) -> RunRecord:
     """A crash, a failover, an adaptation, requests, and printed lines."""
     run = run_of(tmp_path)
     run.request()
-    run.note("a-after.1", Event.FAULT_APPLIED, detail=FIRST_FAULT)
-    run.note("a-watchdog.1", Event.WATCHDOG_SUSPECT, detail=1)
+    run.note("a.after.1", Event.FAULT_APPLIED, detail=FIRST_FAULT)
+    run.note("a.watchdog.1", Event.WATCHDOG_SUSPECT, detail=1)
     run.note("supervisor.1", Event.NODE_DIED, detail=4711)
     run.note("engine.1", Event.ADAPT_PLAN, detail=1)
     run.note("supervisor.1", Event.ADAPT_STEP_ENTER, detail=3)
     run.note("engine.1", Event.ADAPT_COMMIT, detail=1)
-    run.note("a-after.2", Event.CHECKPOINT_APPLIED, 2)
+    run.note("a.after.2", Event.CHECKPOINT_APPLIED, 2)
     told = [{"t_ms": 1.5, "event": "alarm", "text": "a: crash"}, {"t_ms": 2.5, "event": "roles", "text": "b"}]
     lines = "".join(json.dumps(line) + "\n" for line in told) + '{"t_ms": 3'
     (tmp_path / "events.jsonl").write_text(lines)

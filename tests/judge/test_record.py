@@ -44,7 +44,7 @@ def test_a_run_json_that_is_none(path: Path, text: str, message: str) -> None:
         read_record(path)
 
 
-@pytest.mark.parametrize("name", ["a-server.1.journal", "client.1.dialogue"])
+@pytest.mark.parametrize("name", ["a.server.1.journal", "client.1.dialogue"])
 def test_a_journal_that_is_none(path: Path, name: str) -> None:
     whole(path).verdict()
     (path / "journal" / name).write_bytes(b"garbage")

@@ -46,7 +46,7 @@ def test_a_repeated_request_is_answered_by_the_new_leader(tmp_path: Path) -> Non
     run = RecordInTheMaking(tmp_path)
     for journal, event in PBR_PATH[:8]:
         run.note(journal, event, 1)
-    run.note("b-protocol.1", Event.DEDUPE_HIT, 1)
+    run.note("b.protocol.1", Event.DEDUPE_HIT, 1)
     run.note("proxy.1", Event.REPLY_ACCEPTED, 1)
     assert arrows(finished(run))[-2:] == [
         ("client", "pxy2pro", "b/protocol"),
@@ -56,16 +56,16 @@ def test_a_repeated_request_is_answered_by_the_new_leader(tmp_path: Path) -> Non
 
 LFR_PATH: Final = (
     *PBR_PATH[:2],
-    ("a-before.1", Event.FOLLOWER_FORWARDED),
-    ("a-proceed.1", Event.PROCEED_ENTER),
-    ("b-before.1", Event.BEFORE_EXIT),
-    ("b-proceed.1", Event.PROCEED_ENTER),
-    ("a-server.1", Event.SERVER_ENTER),
-    ("b-server.1", Event.SERVER_ENTER),
-    ("a-server.1", Event.SERVER_EXIT),
-    ("b-server.1", Event.SERVER_EXIT),
-    ("a-after.1", Event.FOLLOWER_NOTIFIED),
-    ("a-protocol.1", Event.REPLY_STORED),
+    ("a.before.1", Event.FOLLOWER_FORWARDED),
+    ("a.proceed.1", Event.PROCEED_ENTER),
+    ("b.before.1", Event.BEFORE_EXIT),
+    ("b.proceed.1", Event.PROCEED_ENTER),
+    ("a.server.1", Event.SERVER_ENTER),
+    ("b.server.1", Event.SERVER_ENTER),
+    ("a.server.1", Event.SERVER_EXIT),
+    ("b.server.1", Event.SERVER_EXIT),
+    ("a.after.1", Event.FOLLOWER_NOTIFIED),
+    ("a.protocol.1", Event.REPLY_STORED),
 )
 
 
@@ -89,7 +89,7 @@ def test_arrows_belong_to_one_request(tmp_path: Path) -> None:
     run = RecordInTheMaking(tmp_path)
     run.note("client.1", Event.REQUEST_SENT, 1)
     run.note("client.1", Event.REQUEST_SENT, 2)
-    run.note("a-protocol.1", Event.REQUEST_RECEIVED, 1)
+    run.note("a.protocol.1", Event.REQUEST_RECEIVED, 1)
     steps = steps_of(finished(run))
     assert [(steps[f.cause].request_id, steps[f.effect].request_id) for f in links_of(steps)] == [(1, 1)]
 
@@ -99,9 +99,9 @@ def test_a_step_ends_when_its_effect_begins_and_before_the_next_step_of_its_proc
     run.t_ns -= MS  # each note is a ms behind the one before
     run.note("client.1", Event.REQUEST_SENT, 1)
     run.t_ns -= MS - 50_000
-    run.note("a-protocol.1", Event.REQUEST_RECEIVED, 1)
+    run.note("a.protocol.1", Event.REQUEST_RECEIVED, 1)
     run.t_ns -= MS - 500
-    run.note("a-protocol.1", Event.DEDUPE_HIT, 2)
+    run.note("a.protocol.1", Event.DEDUPE_HIT, 2)
     steps = steps_of(finished(run))
     lengths = [end - step.t_ns for step, end in zip(steps, ends_ns(steps, links_of(steps)), strict=True)]
     assert lengths == [50_000, 500, 1_000]
@@ -110,7 +110,7 @@ def test_a_step_ends_when_its_effect_begins_and_before_the_next_step_of_its_proc
 def test_a_step_with_a_late_effect_is_drawn_short(tmp_path: Path) -> None:
     run = RecordInTheMaking(tmp_path)
     run.note("client.1", Event.REQUEST_SENT, 1)
-    run.note("a-protocol.1", Event.REQUEST_RECEIVED, 1)  # a ms later: the first was hung
+    run.note("a.protocol.1", Event.REQUEST_RECEIVED, 1)  # a ms later: the first was hung
     steps = steps_of(finished(run))
     assert ends_ns(steps, links_of(steps))[0] - steps[0].t_ns == 200_000
 

@@ -33,6 +33,7 @@ def test_a_run_without_trouble_passes(path: Path) -> None:
         "clean_exit",
         "faults_applied",
         "complete",
+        "sources_agree",
         "whole_history",
     }
     assert set(verdict.checks.values()) == {"pass"}
@@ -156,7 +157,7 @@ def test_a_doubled_reply_fails(path: Path) -> None:
 
 def test_a_doubled_execution_fails(path: Path) -> None:
     record = whole(path)
-    record.note("a-server.1", Event.SERVER_EXIT, 3)
+    record.note("a.server.1", Event.SERVER_EXIT, 3)
     verdict = record.verdict()
     assert (verdict.verdict, verdict.checks["at_most_once"]) == ("fail", "fail")
 
@@ -282,7 +283,7 @@ def test_without_an_end_the_receipts_of_faults_are_not_known(path: Path) -> None
     assert verdict.checks["faults_applied"] == "unknown"
 
 
-@pytest.mark.parametrize("name", ["a-server.1.journal", "client.1.dialogue"])
+@pytest.mark.parametrize("name", ["a.server.1.journal", "client.1.dialogue"])
 def test_a_history_that_is_not_whole_is_inconclusive(path: Path, name: str) -> None:
     record = whole(path)
     record.lose(name, 3)
@@ -293,7 +294,7 @@ def test_a_history_that_is_not_whole_is_inconclusive(path: Path, name: str) -> N
 
 def test_what_all_journals_have_dropped_is_added_up(path: Path) -> None:
     record = whole(path)
-    for name in ("a-server.1.journal", "proxy.1.journal", "client.1.dialogue"):
+    for name in ("a.server.1.journal", "proxy.1.journal", "client.1.dialogue"):
         record.lose(name, 2)
     record.verdict()
     assert read_record(path).history.dropped == 6

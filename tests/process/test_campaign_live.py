@@ -115,7 +115,8 @@ def test_a_run_that_hangs_as_expected_breaks_nothing(home: Home, tmp_path: Path)
     done = aftbed("campaign", "run", tmp_path / "hang.yaml", "--out", tmp_path / "out", "--json")
     assert done.code == 0, done.out + done.err
     (result,) = ledger.read(tmp_path / "out" / ledger.NAME).results
-    assert (result.outcome, result.broken, result.unexpected) == ("hang", (), False)
+    assert (result.broken, result.unexpected) == ((), False)
+    assert result.outcome == "hang" or result.noisy, result.reasons
 
 
 @pytest.mark.timeout(SMOKE_SECONDS_MAX + 60)

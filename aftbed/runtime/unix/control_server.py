@@ -132,7 +132,7 @@ class ControlServer:
                 fault.check(self._deployment.graph)
                 armed = json.dumps({"armed": str(fault)}).encode()
                 self._loop.tasks.start(
-                    "inject", self._faults.arm(fault), lambda failure: answer(armed, failure)
+                    "inject", self._faults.arm(fault, live=True), lambda failure: answer(armed, failure)
                 )
             case control_client.AdaptCommand(goal):
 

@@ -29,7 +29,7 @@ from aftbed.core.messages import Scheduled
 from aftbed.inject.model import Fault
 from aftbed.runtime import control
 from aftbed.runtime.interface import BUS, LIGHT
-from aftbed.runtime.unix import linux, run_directory
+from aftbed.runtime.unix import linux, run_directory, seal
 from aftbed.runtime.unix.cleanup import UndoLedger, watch
 from aftbed.runtime.unix.linux import Area
 from aftbed.runtime.unix.options import LoadRun, RunOptions, Work, with_names_resolved
@@ -97,6 +97,7 @@ class Launched:
     def __init__(self, options: RunOptions, listener: socket.socket | None) -> None:
         self.options = options
         self.private, self.record = Path(options.private), Path(options.record)
+        self._kept = self.record.parent != self.private  # after the run
         self.started_ns = time.monotonic_ns()
         self.end: dict[str, object] | None = None
         self._fork(listener)
@@ -186,6 +187,7 @@ class Launched:
         for key in ("listener", "private"):
             about.pop(key)
         about["load"] = isinstance(self.options.work, LoadRun)
+        about["kept"] = self._kept
         try:
             run_directory.make(self.private)
             if self.record.parent == self.private:
@@ -223,12 +225,15 @@ class Launched:
             self.line.send(control.Stop(control.UNANSWERED))
 
     def wait(self) -> None:
-        """Wait for the supervisor's end; kill it at the deadline. The record stays."""
+        """Wait for the supervisor's end; kill it at the deadline. The record stays; a kept one is sealed."""
         self.line.close()
         if not _ends(self._pidfd, END_SECONDS_MAX):
             linux.kill(self._pidfd, signal.SIGKILL)
             _ends(self._pidfd, KILL_SECONDS_MAX)
         os.waitpid(self.supervisor, 0)
+        if self._kept and self.end is not None:
+            with contextlib.suppress(OSError):  # then it has none, which the judge tells
+                seal.write(self.record)
 
     def remove(self) -> None:
         """Remove the private directory, after the record was read, and let the warden end."""
