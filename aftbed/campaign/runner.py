@@ -55,7 +55,10 @@ def run(plan: CampaignPlan, asked: CampaignRunOptions) -> Generator[Result, None
     if asked.resume:
         ledger.resume(path, head)
     else:
-        asked.out.mkdir(parents=True, exist_ok=True)
+        try:
+            asked.out.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ConfigError(f"--out {asked.out}: cannot be made: {error.strerror}") from None
         ledger.begin(path, head)
     return _results(plan, asked, path)
 

@@ -1,18 +1,115 @@
-"""The command line: parses, prints, and maps a verdict to an exit code."""
+"""The command line: parses, prints, and maps a verdict to an exit code.
 
+What surrounds a command is dealt with here, once for all commands: standard streams that are closed, that
+take no more, or whose encoding lacks some characters; and what the system refused that no command foresees.
+"""
+
+import contextlib
+import errno
+import io
+import os
+import select
+import signal
 import sys
+from typing import Final, TextIO
 
 from aftbed.cli.app import app
 from aftbed.core.errors import ConfigError, HarnessError, PeerError
 
+EXIT_USAGE: Final = 2
+EXIT_TROUBLE: Final = 3
+EXIT_READER_GONE: Final = 128 + signal.SIGPIPE
+NO_ROOM: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+STREAMS: Final = (("stdin", "r"), ("stdout", "w"), ("stderr", "w"))  # by descriptor
+
 
 def main() -> None:
     """The console script `aftbed`."""
+    _prepare()
+    try:
+        code = _call()
+    except ConfigError as error:
+        code = _explain(EXIT_USAGE, f"error: {error}")
+    except (HarnessError, PeerError) as error:
+        code = _explain(EXIT_TROUBLE, f"trouble: {error}")
+    except OSError as error:
+        code = _failed(error)
+    for stream in (sys.stdout, sys.stderr):
+        if not _taken(stream):  # the interpreter would try again at its end, and complain
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+    sys.exit(code)
+
+
+def _prepare() -> None:
+    """Make the process what a command relies on, whatever it was started with.
+
+    A standard descriptor that is closed becomes the null device: otherwise a socket of the run would get its
+    number, and what is printed would go there. Children are waited for, so SIGCHLD may not be ignored.
+    """
+    for number, (name, mode) in enumerate(STREAMS):
+        try:
+            os.fstat(number)
+        except OSError:
+            opened = os.open(os.devnull, os.O_RDWR)
+            if opened == number:
+                os.set_inheritable(number, True)
+            else:
+                os.dup2(opened, number)
+                os.close(opened)
+            setattr(sys, name, open(number, mode, closefd=False))  # noqa: SIM115 - for as long as the process
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+
+
+def _call() -> int:
+    """Call the command; its exit code. What it printed has been written."""
+    for word in sys.argv[1:]:
+        try:
+            word.encode()
+        except UnicodeEncodeError:  # neither messages nor JSON could carry it
+            raise ConfigError(f"{word!a}: not UTF-8; choose another name, or set LANG=C.UTF-8") from None
+    code: object = 0
+    streams = sys.stdout, sys.stderr
     try:
         app()
-    except ConfigError as error:
-        print(f"aftbed: error: {error}", file=sys.stderr)
-        sys.exit(2)
-    except (HarnessError, PeerError) as error:
-        print(f"aftbed: trouble: {error}", file=sys.stderr)
-        sys.exit(3)
+    except SystemExit as ended:
+        if isinstance(
+            ended.__context__, BrokenPipeError
+        ):  # typer makes exit code 1 of it, and replaces streams
+            sys.stdout, sys.stderr = streams
+            raise ended.__context__ from None
+        code = ended.code
+    sys.stdout.flush()
+    return code if isinstance(code, int) else 0
+
+
+def _explain(code: int, text: str) -> int:
+    """Print one line for the user; `code`."""
+    with contextlib.suppress(OSError):
+        print(f"aftbed: {text}", file=sys.stderr)
+    return code
+
+
+def _failed(error: OSError) -> int:
+    """The exit code of a command that the system refused something. A reader that is gone needs no words."""
+    if isinstance(error, BrokenPipeError) and (_reader_gone(sys.stdout) or _reader_gone(sys.stderr)):
+        return EXIT_READER_GONE
+    what = error.filename or ("the output" if error.errno in NO_ROOM else "")
+    return _explain(EXIT_TROUBLE, f"trouble: {f'{what}: ' if what else ''}{error.strerror or error}")
+
+
+def _reader_gone(stream: TextIO) -> bool:
+    """Whether the stream is a pipe or a socket from which nobody reads any more."""
+    poll = select.poll()
+    poll.register(stream.fileno(), 0)
+    return any(events & select.POLLERR for _, events in poll.poll(0))
+
+
+def _taken(stream: TextIO) -> bool:
+    """Whether the stream takes what is still to be written."""
+    try:
+        stream.flush()
+    except OSError:
+        return False
+    return True

@@ -252,7 +252,10 @@ def merge(
 ) -> None:
     """Merge the shards of a campaign, and report on the whole."""
     merged = ledger.merged([_ledger(folder) for folder in folders])
-    out.mkdir(parents=True, exist_ok=True)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"--out {out}: cannot be made: {error.strerror}") from None
     path = out / ledger.NAME
     ledger.begin(path, merged.head)
     with open(ledger.opened(path), "wb") as file:

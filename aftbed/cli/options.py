@@ -2,7 +2,9 @@
 
 import functools
 import inspect
+import json
 import os
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Final, Generic, TypeVar, get_args, get_origin
@@ -94,11 +96,20 @@ def check_file(option: str, path: Path | None, suffix: str = "") -> None:
     """Raise ConfigError if `path` cannot be written, before the work whose result goes there."""
     if path is None:
         return
-    if path.suffix != (suffix or path.suffix) or path.is_dir() or not path.absolute().parent.is_dir():
+    try:
+        has_place = path.absolute().parent.is_dir()
+    except FileNotFoundError:  # the working directory was removed
+        has_place = False
+    if path.suffix != (suffix or path.suffix) or path.is_dir() or not has_place:
         kind = f"file {suffix}" if suffix else "file"
         raise ConfigError(f"{option} {path}: a {kind} in a directory that exists is allowed")
 
 
 def print_json(document: object) -> None:
-    """Print one JSON document, in one line."""
-    print(msgspec.json.encode(document).decode())
+    """Print one JSON document, in one line; in ASCII where the output takes no other characters."""
+    text = msgspec.json.encode(document).decode()
+    try:
+        text.encode(sys.stdout.encoding)
+    except UnicodeEncodeError:
+        text = json.dumps(json.loads(text))
+    print(text)

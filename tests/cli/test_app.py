@@ -64,14 +64,21 @@ def test_help_of_a_command_and_of_a_subcommand(call: Call) -> None:
     assert code == 0 and " campaign run [OPTIONS]" in out and "--shard" in out
 
 
-def test_trouble_is_exit_code_3(home: Home, call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_surroundings_in_which_no_run_can_be_are_exit_code_2(home: Home, call: Call) -> None:
     """The example is a directory of runs that other users could read."""
     root = run_directory.root()
     root.chmod(0o755)
     code, _, err = call("status")
     root.chmod(0o700)
-    assert code == 3
-    assert err.startswith("aftbed: trouble: ") and "must be a directory of this user alone" in err
+    assert code == 2
+    assert err == f"aftbed: error: {root}: must be a directory of this user alone (mode 0700); remove it\n"
+
+
+def test_trouble_is_exit_code_3(call: Call) -> None:
+    """The example is a file that the system refuses when the work is done."""
+    code, out, err = call("sim", "--diagram", "/proc/picture")
+    assert code == 3 and "verdict: pass" in out
+    assert err == "aftbed: trouble: /proc/picture: No such file or directory\n"
 
 
 # -- commands whose options are a struct
