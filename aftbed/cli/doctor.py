@@ -6,7 +6,7 @@ import msgspec
 import typer
 
 from aftbed.cli.options import Json, print_json
-from aftbed.core.errors import HarnessError
+from aftbed.core.errors import ConfigError
 from aftbed.runtime.unix import cleanup
 from aftbed.runtime.unix.cleanup import Left
 from aftbed.runtime.unix.doctor import HostCheck, inspect
@@ -34,7 +34,7 @@ def doctor(
         left = cleanup.find()
         if clean:
             removed, left = cleanup.clean(left)
-    except HarnessError:  # runs have no directory here: one of the checks reports it
+    except ConfigError:  # runs have no directory here: one of the checks reports it
         assert any(c.status == "missing" for c in checks)
     ok = not left and all(c.status != "missing" for c in checks)
     diagnosis = Diagnosis(checks, left, removed, ok)

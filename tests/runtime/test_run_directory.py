@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from rundirs import new_run
 
-from aftbed.core.errors import ConfigError, HarnessError
+from aftbed.core.errors import ConfigError
 from aftbed.runtime.unix import run_directory
 from aftbed.runtime.unix.launch import launch, options_for
 from aftbed.runtime.unix.options import LoadRun
@@ -60,7 +60,7 @@ def test_a_run_that_has_just_taken_the_place_is_left_alone(runtime: Path) -> Non
     taken = Path(options.private)
     run_directory.make(taken)
     run_directory._owned.pop(taken)  # as if by another process
-    with pytest.raises(HarnessError, match=f"{taken}: cannot be made: File exists; start the run again"):
+    with pytest.raises(ConfigError, match=f"{taken}: cannot be made: File exists; start the run again"):
         launch(options, None)
     assert taken.is_dir()
 
@@ -82,7 +82,7 @@ def test_a_directory_that_others_can_enter_is_refused(runtime: Path, wide: int) 
     runtime.mkdir()
     runtime.chmod(wide)
     with pytest.raises(
-        HarnessError, match=re.escape(f"{runtime}: must be a directory of this user alone (mode 0700)")
+        ConfigError, match=re.escape(f"{runtime}: must be a directory of this user alone (mode 0700)")
     ):
         new_run()
 
@@ -90,20 +90,20 @@ def test_a_directory_that_others_can_enter_is_refused(runtime: Path, wide: int) 
 def test_a_directory_of_another_user_is_refused(runtime: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     another = run_directory.root().stat().st_uid + 1
     monkeypatch.setattr("os.getuid", lambda: another)
-    with pytest.raises(HarnessError, match="must be a directory of this user alone"):
+    with pytest.raises(ConfigError, match="must be a directory of this user alone"):
         run_directory.root()
 
 
 def test_a_file_in_its_place_is_refused(runtime: Path) -> None:
     runtime.write_text("")
-    with pytest.raises(HarnessError, match="must be a directory of this user alone"):
+    with pytest.raises(ConfigError, match="must be a directory of this user alone"):
         run_directory.root()
 
 
 def test_a_link_to_a_directory_is_refused(runtime: Path, tmp_path: Path) -> None:
     (tmp_path / "elsewhere").mkdir(mode=0o700)
     runtime.symlink_to(tmp_path / "elsewhere")
-    with pytest.raises(HarnessError, match="must be a directory of this user alone"):
+    with pytest.raises(ConfigError, match="must be a directory of this user alone"):
         run_directory.root()
 
 

@@ -52,7 +52,11 @@ class ControlServer:
     def listen(self) -> None:
         """Open the socket; from here on other commands find the run."""
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
-        self._listener.bind(str(Path(self._options.private) / run_directory.SOCKET_NAME))
+        before = os.umask(0o177)
+        try:
+            self._listener.bind(str(Path(self._options.private) / run_directory.SOCKET_NAME))
+        finally:
+            os.umask(before)
         self._listener.listen(REQUESTS_MAX)
         self._loop.read(self._listener.fileno(), self._accept)
 

@@ -23,17 +23,16 @@ from typing import Final, Literal
 
 import msgspec
 
-from aftbed.core.errors import HarnessError
+from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.runtime.unix import run_directory
 from aftbed.runtime.unix.death_notice import SYS_FUTEX_WAITV
+from aftbed.runtime.unix.launch import FILES_GOOD, FILES_MIN
 from aftbed.runtime.unix.process_memory import YAMA, try_on_a_child
 
 Status = Literal["ok", "warning", "missing"]
 
-FILES_MIN, FILES_GOOD = 256, 1024  # a supervisor of 37 processes holds 180, more while it adapts
 PROCESSES_MIN: Final = 64
 FREE_BYTES_MIN, FREE_BYTES_GOOD = 50_000_000, 500_000_000  # a run of some minutes takes some MB
-SOCKET_PATH_MAX: Final = 107  # unix(7), without the NUL
 STEAL_SECONDS: Final = 0.2
 STEAL_MAX: Final = 0.01
 STEAL: Final = 7  # the field of the line `cpu` in /proc/stat
@@ -163,11 +162,11 @@ def _limits() -> Iterator[HostCheck]:
     else:
         yield HostCheck("pinning", "ok", "allowed", serves)
 
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    status = "ok" if soft == resource.RLIM_INFINITY else _graded(soft, FILES_MIN, FILES_GOOD)
-    words = ["unlimited" if number == resource.RLIM_INFINITY else str(number) for number in (soft, hard)]
+    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)  # a run raises its soft limit
+    status = "ok" if hard == resource.RLIM_INFINITY else _graded(hard, FILES_MIN, FILES_GOOD)
+    found = "unlimited" if hard == resource.RLIM_INFINITY else f"{hard} allowed"
     serves, remedy = "the supervisor holds all channels", f"ulimit -n {FILES_GOOD}"
-    yield _check("open files", status, " of at most ".join(words), serves, remedy)
+    yield _check("open files", status, found, serves, remedy)
 
     soft, _ = resource.getrlimit(resource.RLIMIT_NPROC)
     serves = "a run has up to 40"
@@ -187,13 +186,13 @@ def _place() -> Iterator[HostCheck]:
     name, serves = "run directory", "control sockets and records of runs, closed to others"
     try:
         root = run_directory.root()
-    except (HarnessError, OSError) as error:
+    except ConfigError as error:
         remedy = "remove it, or set XDG_RUNTIME_DIR or TMPDIR to a directory of yours"
         yield HostCheck(name, "missing", str(error), serves, remedy)
         return
-    longest = len(os.fsencode(root / ("0" * 2 * run_directory.ID_BYTES) / run_directory.SOCKET_NAME))
-    if longest > SOCKET_PATH_MAX:
-        found = f"{root}: {longest - SOCKET_PATH_MAX} bytes too long for a socket's path"
+    over = run_directory.socket_bytes(root) - run_directory.SOCKET_PATH_MAX
+    if over > 0:
+        found = f"{root}: {over} bytes too long for a socket's path"
         yield HostCheck(name, "missing", found, serves, "set XDG_RUNTIME_DIR or TMPDIR to a shorter path")
         return
     yield HostCheck(name, "ok", f"{root}, mode 0700", serves)

@@ -36,15 +36,17 @@ from typing import Final
 
 import msgspec
 
-from aftbed.core.errors import ConfigError, HarnessError
+from aftbed.core.errors import ConfigError
 from aftbed.runtime.unix import linux
 
 SOCKET_NAME: Final = "control"
+SOCKET_PATH_MAX: Final = 107  # bytes, unix(7), without the NUL
 HISTORY_NAME: Final = "adaptations.jsonl"  # in the record: a line for each adaptation that has ended
 ID_BYTES: Final = 3
 ANSWER_SECONDS_MAX: Final = 2.0
 CONNECT_PAUSE_SECONDS: Final = 0.005
 VARIABLE: Final = "AFTBED_RUN"
+ELSEWHERE: Final = "set XDG_RUNTIME_DIR or TMPDIR to a directory that this user can write to"
 
 _MARK: Final = "aftbed-run:"
 _MAPPED: Final = re.compile(rf" /memfd:{_MARK}(.+?)(?: \(deleted\))?$", re.MULTILINE)
@@ -56,43 +58,66 @@ _owned: Final[dict[Path, int]] = {}  # by private directory, the descriptor that
 
 
 def root() -> Path:
-    """The directory of all runs of this user; made if absent. Raises HarnessError if it is not ours."""
+    """The directory of all runs of this user; made if absent. Raises ConfigError if that cannot be, or if it
+    is not ours.
+    """
     runtime = os.environ.get("XDG_RUNTIME_DIR")
-    if runtime and Path(runtime).is_dir():
+    if runtime and os.path.isdir(runtime):  # noqa: PTH112 - False too where this user may not look
         path = Path(runtime) / "aftbed"
     else:
         path = Path(os.environ.get("TMPDIR") or "/tmp") / f"aftbed-{os.getuid()}"
-    with contextlib.suppress(FileExistsError):
-        path.mkdir(mode=0o700)
-    state = path.lstat()
+    try:
+        with contextlib.suppress(FileExistsError):
+            path.mkdir(mode=0o700)
+        state = path.lstat()
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be made: {error.strerror}; {ELSEWHERE}") from None
     if not stat.S_ISDIR(state.st_mode) or state.st_uid != os.getuid() or state.st_mode & 0o077:
-        raise HarnessError(f"{path}: must be a directory of this user alone (mode 0700); remove it")
+        raise ConfigError(f"{path}: must be a directory of this user alone (mode 0700); remove it")
     return path
 
 
 def free() -> Path:
-    """Where a private directory can be made; its name is the id of the run."""
-    while (path := root() / secrets.token_hex(ID_BYTES)).exists():
+    """Where a private directory can be made; its name is the id of the run. Raises ConfigError."""
+    above = root()
+    try:
+        str(above).encode()
+    except UnicodeEncodeError:  # messages could not carry it
+        raise ConfigError(f"{above}: not UTF-8; set XDG_RUNTIME_DIR or TMPDIR to another path") from None
+    while (path := above / secrets.token_hex(ID_BYTES)).exists():
         pass
+    over = socket_bytes(above) - SOCKET_PATH_MAX
+    if over > 0:
+        raise ConfigError(
+            f"{path / SOCKET_NAME}: {over} bytes too long for the path of a socket;"
+            " set XDG_RUNTIME_DIR or TMPDIR to a shorter path"
+        )
     return path
+
+
+def socket_bytes(above: Path) -> int:
+    """How long the path of a control socket is, of a run below `above`."""
+    return len(os.fsencode(above / ("0" * 2 * ID_BYTES) / SOCKET_NAME))
 
 
 def make(path: Path) -> None:
     """Make a private directory, and own it.
 
-    Raises HarnessError if another run has just made it, or it cannot be made or locked.
+    Raises ConfigError if another run has just made it, or it cannot be made or locked.
     """
     try:
         path.mkdir(mode=0o700)
+    except FileExistsError as error:
+        raise ConfigError(f"{path}: cannot be made: {error.strerror}; start the run again") from None
     except OSError as error:
-        raise HarnessError(f"{path}: cannot be made: {error.strerror}; start the run again") from None
+        raise ConfigError(f"{path}: cannot be made: {error.strerror}; {ELSEWHERE}") from None
     descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX)
     except OSError as error:
         os.close(descriptor)
         path.rmdir()
-        raise HarnessError(
+        raise ConfigError(
             f"{path}: cannot be locked: {error.strerror}; set XDG_RUNTIME_DIR or TMPDIR to a local disk"
         ) from None
     _owned[path] = descriptor
