@@ -123,15 +123,17 @@ def execute(given: RunArguments) -> int:
         bus_port=given.bus_port,
     )
     launched = launch(options, listener)
-    closed = make_loop(launched) if make_loop is not None else None
-    interrupted = _follow(launched, open_view(options, quiet=given.json), closed)
-    launched.wait()
-    from aftbed.cli.check import judge_and_show  # noqa: PLC0415 - after the launch
-    from aftbed.judge.verdict import EXIT_CODES, EXIT_INTERRUPTED  # noqa: PLC0415 - after the launch
-
     try:
+        closed = make_loop(launched) if make_loop is not None else None
+        interrupted = _follow(launched, open_view(options, quiet=given.json), closed)
+        launched.wait()
+        from aftbed.cli.check import judge_and_show  # noqa: PLC0415 - after the launch
+        from aftbed.judge.verdict import EXIT_CODES, EXIT_INTERRUPTED  # noqa: PLC0415 - after the launch
+
         verdict = judge_and_show(launched.record, as_json=given.json)
-        if verdict.verdict == "inconclusive" and not given.json:
+        if launched.trouble:
+            print(f"aftbed: trouble: {launched.trouble}", file=sys.stderr)
+        elif verdict.verdict == "inconclusive" and not given.json:
             _show_log(launched.record / "processes.log")
         written = write_files is None or _write(write_files, launched.record, as_json=given.json)
     finally:

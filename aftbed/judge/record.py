@@ -10,7 +10,7 @@ from typing import Final
 import msgspec
 
 from aftbed.core.errors import ConfigError, PeerError
-from aftbed.core.journal import History, dropped, entries, records
+from aftbed.core.journal import EntryKind, History, dropped, entries, records
 from aftbed.inject.model import FaultReport
 from aftbed.inject.receipts import ReceiptState
 from aftbed.runtime.deployment import Hosted
@@ -118,9 +118,13 @@ def read_record(path: Path) -> RunRecord:
     files = sorted(folder.glob("*.journal"))
     dialogues = sorted(folder.glob("client.*.dialogue"), key=lambda p: int(p.name.split(".")[1]))
     try:
-        journals = {p.name.removesuffix(".journal"): list(records(contents(p))) for p in files}
-        dialogue = [e for p in dialogues for e in entries(contents(p))]
-        lost = sum(dropped(contents(p)) for p in (*files, *dialogues))
+        read = {p: contents(p) for p in (*files, *dialogues)}
+        journals = {p.name.removesuffix(".journal"): list(records(read[p])) for p in files}
+        dialogue = [e for p in dialogues for e in entries(read[p])]
+        if any(dropped(read[p]) for p in dialogues):  # what was answered behind its end is not known
+            answered = {e.request_id for e in dialogue if e.kind is EntryKind.ANSWERED}
+            dialogue = [e for e in dialogue if e.request_id in answered]
+        lost = sum(map(dropped, read.values()))
     except PeerError as error:
         raise ConfigError(f"{folder}: {error}") from None
     history = History(journals, dialogue, lost)

@@ -24,14 +24,14 @@ if TYPE_CHECKING:
 
 def serve(line: Line[control.ToNode], order: control.Serve, fds: list[int]) -> None:
     """Run the service that `order` names, until it has finished or its line ends."""
-    if order.service == control.HUB:
-        _serve_hub(line, order, fds)
-        return
-    source = msgspec.msgpack.decode(order.options, type=SourceOptions)
-    run = _play if order.service == PLAYER else _drive
     try:
+        if order.service == control.HUB:
+            _serve_hub(line, order, fds)
+            return
+        source = msgspec.msgpack.decode(order.options, type=SourceOptions)
+        run = _play if order.service == PLAYER else _drive
         run(line, source)
-    except HarnessError as error:
+    except (HarnessError, OSError) as error:
         _report(line, "trouble", str(error).encode())
 
 

@@ -25,11 +25,12 @@ STEP_BYTES_MAX: Final = 8 * layout.RECORD.size  # what the notes of one step tak
 
 
 def contents(path: Path) -> layout.Data:
-    """The file, mapped: most of a chunk is empty, and is not read from disk. Raises OSError."""
-    with path.open("rb") as file:
-        if not os.fstat(file.fileno()).st_size:
-            return b""
-        return memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
+    """The file, read. Raises OSError.
+
+    It is not mapped: where a tmpfs is full, the kernel sends SIGBUS even to a process that reads the empty
+    part of a chunk.
+    """
+    return path.read_bytes()
 
 
 def _mapped(path: Path, name: str) -> mmap.mmap:
@@ -47,14 +48,20 @@ def _mapped(path: Path, name: str) -> mmap.mmap:
 
 
 def _grow(mapping: mmap.mmap) -> bool:
-    """Add a chunk; False, with the loss counted, at the limit."""
-    if len(mapping) >= FILE_BYTES_MAX:
-        at = layout.DROPPED_OFFSET
-        lost = int.from_bytes(mapping[at : at + 4], "little") + 1
-        mapping[at : at + 4] = min(lost, 0xFFFF_FFFF).to_bytes(4, "little")
-        return False
-    mapping.resize(len(mapping) + CHUNK_BYTES)
-    return True
+    """Add a chunk; False, with the loss counted, at the limit or where the file cannot grow."""
+    if len(mapping) < FILE_BYTES_MAX:
+        with contextlib.suppress(OSError):  # a limit of the user (RLIMIT_FSIZE), or of the disk
+            mapping.resize(len(mapping) + CHUNK_BYTES)
+            return True
+    _count_loss(mapping)
+    return False
+
+
+def _count_loss(mapping: mmap.mmap) -> None:
+    """Count one record or entry that found no room."""
+    at = layout.DROPPED_OFFSET
+    lost = int.from_bytes(mapping[at : at + 4], "little") + 1
+    mapping[at : at + 4] = min(lost, 0xFFFF_FFFF).to_bytes(4, "little")
 
 
 class JournalFile:
@@ -80,17 +87,24 @@ class JournalFile:
 
 
 class DialogueFile:
-    """Requests and replies with their bytes, as the client saw them."""
+    """Requests and replies with their bytes, as the client saw them.
+
+    After the first entry that found no room no other is written: what is there has no gap.
+    """
 
     def __init__(self, path: Path, node: str) -> None:
         self.mapping = _mapped(path, node)
-        self._at = layout.HEADER_BYTES
+        self._at, self._full = layout.HEADER_BYTES, False
 
     def write(self, now_ns: int, request_id: int, epoch: int, kind: layout.EntryKind, payload: bytes) -> None:
         """Append an entry; its kind is written last and commits it."""
+        if self._full:
+            _count_loss(self.mapping)
+            return
         end = self._at + layout.ENTRY.size + len(payload)
         while end > len(self.mapping):
             if not _grow(self.mapping):
+                self._full = True
                 return
         self.mapping[self._at + layout.ENTRY.size : end] = payload
         layout.ENTRY.pack_into(self.mapping, self._at, now_ns, request_id, len(payload), epoch, kind)

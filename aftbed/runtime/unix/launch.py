@@ -10,9 +10,12 @@ command keeps them, of this run or of a later one: else one run would end only a
 """
 
 import contextlib
+import errno
 import importlib
 import os
+import resource
 import select
+import shutil
 import signal
 import socket
 import time
@@ -24,21 +27,47 @@ from typing import Final, NoReturn
 import msgspec
 
 from aftbed import __version__
-from aftbed.core.errors import ConfigError
+from aftbed.core.errors import AftbedError, ConfigError, HarnessError
 from aftbed.core.messages import Scheduled
 from aftbed.inject.model import Fault
 from aftbed.runtime import control
 from aftbed.runtime.interface import BUS, LIGHT
 from aftbed.runtime.unix import linux, run_directory, seal
 from aftbed.runtime.unix.cleanup import UndoLedger, watch
+from aftbed.runtime.unix.journal_files import CHUNK_BYTES
 from aftbed.runtime.unix.linux import Area
 from aftbed.runtime.unix.options import LoadRun, RunOptions, Work, with_names_resolved
-from aftbed.runtime.unix.process_pool import PRELOADS, Started, start_zygote
-from aftbed.runtime.unix.transport import Line, decode_report
+from aftbed.runtime.unix.process_pool import PRELOADS, Started, killed_by, start_zygote
+from aftbed.runtime.unix.transport import Line, decode_order, decode_report
 
 END_SECONDS_MAX: Final = 8.0
 KILL_SECONDS_MAX: Final = 1.0
+FILES_MIN, FILES_GOOD = 256, 1024  # a supervisor of 37 processes holds 180, more while it adapts
 GO: Final = b"go"
+
+
+def ensure_limits() -> None:
+    """Raise the soft limit on open files if a run could need more.
+
+    Raises ConfigError where a limit, or the umask, does not allow a run.
+    """
+    files, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if files != resource.RLIM_INFINITY and files < FILES_GOOD:
+        files = FILES_GOOD if most == resource.RLIM_INFINITY else min(most, FILES_GOOD)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (files, most))
+        if files < FILES_MIN:
+            raise ConfigError(
+                f"{files} open files are allowed, and a run needs {FILES_MIN}: ulimit -n {FILES_GOOD}"
+            )
+    mask = os.umask(0o077)
+    os.umask(mask)
+    if mask & 0o700:
+        raise ConfigError(f"umask {mask:04o}: a run could not use its own files: umask 0022")
+    size, _ = resource.getrlimit(resource.RLIMIT_FSIZE)
+    if size != resource.RLIM_INFINITY and size < CHUNK_BYTES:
+        raise ConfigError(
+            f"a file may have {size} bytes, and a journal takes at least {CHUNK_BYTES}: ulimit -f unlimited"
+        )
 
 
 def bind_hub(port: int) -> socket.socket:
@@ -92,7 +121,10 @@ def _fork_zygote(cpus: list[int], areas: tuple[Area, ...]) -> Started:
 
 
 class Launched:
-    """A run in progress, seen from its command. `end` is set when it has ended in order."""
+    """A run in progress, seen from its command. `end` is set when it has ended in order.
+
+    `trouble`: why its supervisor could not go on, "" if it could.
+    """
 
     def __init__(self, options: RunOptions, listener: socket.socket | None) -> None:
         self.options = options
@@ -100,15 +132,24 @@ class Launched:
         self._kept = self.record.parent != self.private  # after the run
         self.started_ns = time.monotonic_ns()
         self.end: dict[str, object] | None = None
-        self._fork(listener)
+        self.trouble = ""
+        self._waited = False
+        self.supervisor = 0
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self.line = Line(ours, decode_report)
+        try:
+            self._fork(listener, theirs)
+        except OSError:
+            self.line.close()  # what was forked ends without a *go*
+            if self.supervisor:
+                os.waitpid(self.supervisor, 0)
+            raise
         self._make_directories()
-        self.line.sock.send(GO)
 
     # -- start --------------------------------------------------------------------------------
 
-    def _fork(self, listener: socket.socket | None) -> None:
+    def _fork(self, listener: socket.socket | None, theirs: socket.socket) -> None:
         """Fork the supervisor and the warden, each with its ends of a line and of two pipes."""
-        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         command_end, command_life = os.pipe()
         supervisor_end, supervisor_life = os.pipe()
         waker = os.eventfd(0)
@@ -118,7 +159,7 @@ class Launched:
             os.setsid()
             for fd in (command_end, command_life, supervisor_end):
                 os.close(fd)
-            ours.close()
+            self.line.close()
             self._be_supervisor(theirs, waker)
         self._pidfd = os.pidfd_open(self.supervisor)
         theirs.close()
@@ -129,7 +170,7 @@ class Launched:
                 linux.continue_at_parents_death()
                 os.setsid()
                 os.close(command_life)
-                ours.close()
+                self.line.close()
                 if listener is not None:
                     listener.close()
                 watch(
@@ -147,7 +188,6 @@ class Launched:
         for fd in (command_end, supervisor_end, waker):
             os.close(fd)
         self._life: list[int] = [command_life]
-        self.line = Line(ours, decode_report)
         _LAUNCHED.add(self)
 
     def _be_supervisor(self, owner: socket.socket, waker: int) -> NoReturn:
@@ -174,6 +214,13 @@ class Launched:
 
             supervise(self.options, owner, zygotes, UndoLedger(self.private, waker))
             code = 0
+        except (AftbedError, OSError) as error:  # of the machine: a full disk, a limit
+            if isinstance(error, OSError):
+                error = HarnessError(
+                    f"the supervisor cannot go on: {error.strerror}{_hint(error, self.record)}"
+                )
+            with contextlib.suppress(OSError):
+                Line(owner, decode_order).send(control.Report("trouble", str(error).encode()))
         except BaseException:  # noqa: BLE001 - the last frame of this process
             import traceback  # noqa: PLC0415 - rarely needed
 
@@ -182,7 +229,7 @@ class Launched:
             os._exit(code)
 
     def _make_directories(self) -> None:
-        """Make the private directory and the record, with `run.json` in it."""
+        """Make the private directory and the record, with `run.json` in it, and send *go*."""
         about = {"version": __version__, "started_ns": self.started_ns, **msgspec.to_builtins(self.options)}
         for key in ("listener", "private"):
             about.pop(key)
@@ -193,12 +240,14 @@ class Launched:
             if self.record.parent == self.private:
                 run_directory.record_directory(self.record)
             (self.record / "run.json").write_bytes(msgspec.json.format(msgspec.json.encode(about)))
-        except BaseException:
+            self.line.sock.send(GO)
+        except BaseException as error:
             if not run_directory.owned_here(self.private):  # another run has made it: its warden keeps it
                 linux.kill(self._warden_pidfd, signal.SIGKILL)
-            self.line.close()
-            os.waitpid(self.supervisor, 0)
+            self.wait()
             self.remove()
+            if isinstance(error, OSError):
+                raise ConfigError(f"{self.record}: cannot be written: {error.strerror}") from None
             raise
 
     # -- while it runs, and its end -----------------------------------------------------------
@@ -214,10 +263,13 @@ class Launched:
                 return
             report, _ = got
             if isinstance(report, control.Report):
-                if report.kind == "finished":
-                    self.end = msgspec.json.decode(report.data)
-                else:
-                    yield report
+                match report.kind:
+                    case "finished":
+                        self.end = msgspec.json.decode(report.data)
+                    case "trouble":
+                        self.trouble = report.data.decode()
+                    case _:
+                        yield report
 
     def stop(self) -> None:
         """Request the end of the run; reports continue until then."""
@@ -226,17 +278,26 @@ class Launched:
 
     def wait(self) -> None:
         """Wait for the supervisor's end; kill it at the deadline. The record stays; a kept one is sealed."""
+        if self._waited:
+            return
+        self._waited = True
         self.line.close()
         if not _ends(self._pidfd, END_SECONDS_MAX):
             linux.kill(self._pidfd, signal.SIGKILL)
             _ends(self._pidfd, KILL_SECONDS_MAX)
-        os.waitpid(self.supervisor, 0)
+        code = os.waitstatus_to_exitcode(os.waitpid(self.supervisor, 0)[1])
+        if code < 0 and not self.trouble:
+            self.trouble = f"the supervisor {killed_by(-code, self.record)}"
         if self._kept and self.end is not None:
             with contextlib.suppress(OSError):  # then it has none, which the judge tells
                 seal.write(self.record)
 
     def remove(self) -> None:
-        """Remove the private directory, after the record was read, and let the warden end."""
+        """Remove the private directory, after the record was read, and let the warden end.
+
+        A supervisor that was not waited for is ended first.
+        """
+        self.wait()
         if run_directory.owned_here(self.private):
             run_directory.remove(self.private)
         life, self._life = self._life, []
@@ -254,6 +315,13 @@ class Launched:
         self.line.close()
         for fd in (*self._life, self._pidfd, self._warden_pidfd):
             os.close(fd)
+
+
+def _hint(error: OSError, record: Path) -> str:
+    """What to look at, where that can be told from the error."""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return f": is the disk of {record} full?"
+    return f": {error.filename}" if error.filename else ""
 
 
 _LAUNCHED: Final[weakref.WeakSet[Launched]] = weakref.WeakSet()
@@ -275,11 +343,19 @@ def _ends(pidfd: int, seconds: float) -> bool:
 
 
 def launch(options: RunOptions, listener: socket.socket | None) -> Launched:
-    """Start a run; see `Launched`."""
-    launched = Launched(options, listener)
-    if listener is not None:
-        listener.close()
-    return launched
+    """Start a run; see `Launched`. Raises ConfigError, leaving nothing, where it cannot be started."""
+    try:
+        return Launched(options, listener)
+    except BaseException as error:
+        record = Path(options.record)
+        if record.parent != Path(options.private):
+            shutil.rmtree(record, ignore_errors=True)
+        if isinstance(error, OSError):
+            raise ConfigError(f"a run cannot be started: {error.strerror}") from None
+        raise
+    finally:
+        if listener is not None:
+            listener.close()
 
 
 def options_for(
@@ -296,10 +372,11 @@ def options_for(
 ) -> tuple[RunOptions, socket.socket | None]:
     """What a run needs; where there is a bus, its socket too. Raises ConfigError, leaving nothing."""
     faults = tuple(with_names_resolved(fault, work) for fault in faults)
+    ensure_limits()
     listener = None if isinstance(work, LoadRun) else bind_hub(bus_port)
-    private = run_directory.free()
     try:
-        directory = run_directory.record_directory(Path(record)) if record else private / "record"
+        private = run_directory.free()
+        directory = private / "record" if record is None else run_directory.record_directory(Path(record))
     except ConfigError:
         if listener is not None:
             listener.close()

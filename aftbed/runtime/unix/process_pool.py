@@ -14,7 +14,7 @@ from typing import Final
 
 import msgspec
 
-from aftbed.core.errors import StepFailed
+from aftbed.core.errors import HarnessError, StepFailed
 from aftbed.runtime import control, interface
 from aftbed.runtime.interface import BUS, LIGHT, ProcessKind
 from aftbed.runtime.tasks import Key, Wait
@@ -53,6 +53,13 @@ def start_zygote(name: str, cpus: list[int]) -> Started:
     with theirs:
         arguments = (str(os.getpid()), ",".join(map(str, cpus)), *PRELOADS[name])
         return linux.start_interpreter("aftbed.runtime.unix.zygote", theirs.fileno(), *arguments), ours
+
+
+def killed_by(sig: int, record: Path) -> str:
+    """What ended a process with a journal in `record`."""
+    if sig == signal.SIGBUS:
+        return f"was killed by SIGBUS, as where a journal finds no room: is the disk of {record} full?"
+    return f"was killed by {signal.Signals(sig).name}"
 
 
 class UnixProcess:
@@ -289,7 +296,7 @@ class UnixProcessPool:
 
     def _reap(self, process: UnixProcess) -> None:
         if process in self.processes:
-            linux.reap(process.pid)
+            reap(process)
             self._forget(process)
 
     def _forget(self, process: UnixProcess) -> None:
@@ -301,6 +308,18 @@ class UnixProcessPool:
         for spares in (*self._parked.values(), *self._unborn.values()):
             if process in spares:
                 spares.remove(process)
+
+
+def reap(process: UnixProcess) -> bool:
+    """Reap a child if it is dead; False if it is not, or not ours.
+
+    Raises HarnessError if its journal found no room: that is a file mapped into memory, so the kernel sends
+    SIGBUS.
+    """
+    code = linux.reap(process.pid)
+    if code == -signal.SIGBUS and process.journal:
+        raise HarnessError(f"{process.name} {killed_by(-code, Path(process.journal).parent)}")
+    return code is not None
 
 
 def _next_spare(zygote: str) -> Wait:

@@ -33,7 +33,7 @@ from aftbed.runtime.unix.control_server import ControlServer
 from aftbed.runtime.unix.event_loop import EventLoop
 from aftbed.runtime.unix.journal_files import JournalFile, contents, recorded_requests
 from aftbed.runtime.unix.options import COMMAND_GONE, LoadRun, RunOptions
-from aftbed.runtime.unix.process_pool import Started, UnixProcess, UnixProcessPool
+from aftbed.runtime.unix.process_pool import Started, UnixProcess, UnixProcessPool, reap
 from aftbed.runtime.unix.run_directory import HISTORY_NAME
 from aftbed.runtime.unix.transport import Line, MemfdMemory, UnixChannel, decode_order
 from aftbed.runtime.unix.workload import Workload
@@ -323,7 +323,7 @@ class Supervisor:
             "lost": self._lost,
             "leader": self._deployment.leader,
             "backup": self._deployment.backup,
-            "hosted": msgspec.to_builtins(living),
+            "hosted": msgspec.to_builtins(living) if self._graph_ms else None,  # the graph was never complete
             "states": self._states,
             "starved_ms": round(max(waits, default=0) / 1e6, 3),  # of the node that waited longest for a CPU
             "epoch": self._deployment.epoch,
@@ -350,7 +350,7 @@ class Supervisor:
         while dying:
             before = len(dying)
             for process in list(dying):
-                if not process.pid or linux.reap(process.pid) is not None:
+                if not process.pid or reap(process):
                     process.close()
                     dying.remove(process)
             now_ns = time.monotonic_ns()
@@ -364,7 +364,11 @@ class Supervisor:
 def supervise(
     options: RunOptions, owner: socket.socket, zygotes: dict[str, Started], ledger: UndoLedger
 ) -> None:
-    """Be the supervisor of a run, in a process of its own; the first zygote has been started."""
+    """Be the supervisor of a run, in a process of its own; the first zygote has been started.
+
+    Raises OSError or HarnessError if the machine does not let the run go on or be recorded. Such a run has no
+    `end.json`: how it would have ended is not known.
+    """
     supervisor = Supervisor(options, owner, zygotes, ledger)
     try:
         supervisor.run()

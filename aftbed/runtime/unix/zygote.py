@@ -58,27 +58,40 @@ def run(
     while (got := line.recv()) is not None:
         order, fds = got
         assert isinstance(order, control.Park), order
-        _fork_spares(fds, supervisor, areas)
+        try:
+            _fork_spares(fds, supervisor, areas)
+        except OSError as error:
+            line.send(control.Report("trouble", f"no process can be forked: {error.strerror}".encode()))
+            break
     os._exit(0)
 
 
 def _fork_spares(fds: list[int], supervisor: int, areas: tuple[Area, ...]) -> None:
-    """Fork one spare per descriptor, through an intermediate process that leaves them to the supervisor."""
+    """Fork one spare per descriptor, through an intermediate process that leaves them to the supervisor.
+
+    Raises OSError if one cannot be forked.
+    """
     alive, life = os.pipe()
     intermediate = os.fork()
     if intermediate == 0:
         os.close(INHERITED_FD)
         for descriptor in fds:
-            if os.fork() == 0:
+            try:
+                spare = os.fork()
+            except OSError as error:
+                os._exit(error.errno or 1)
+            if spare == 0:
                 os.close(life)
                 os.read(alive, 1)  # ends when the intermediate does, so that no spare spins meanwhile
                 os.dup2(descriptor, INHERITED_FD, inheritable=False)
                 os.closerange(INHERITED_FD + 1, 1 << 16)
                 _be_spare(supervisor, areas)
         os._exit(0)
-    os.waitpid(intermediate, 0)
+    refused = os.waitstatus_to_exitcode(os.waitpid(intermediate, 0)[1])
     for descriptor in (*fds, alive, life):
         os.close(descriptor)
+    if refused > 0:  # negative: it was killed
+        raise OSError(refused, os.strerror(refused))
 
 
 def _be_spare(supervisor: int, areas: tuple[Area, ...]) -> NoReturn:
@@ -102,7 +115,7 @@ def _be_spare(supervisor: int, areas: tuple[Area, ...]) -> NoReturn:
             os._exit(0)
         io = _make_node(line, order, fds)
     except BaseException as error:  # noqa: BLE001 - the last frame of this process
-        known = isinstance(error, ConfigError)
+        known = isinstance(error, ConfigError | OSError)
         reason = str(error) if known else f"{type(error).__name__}: {error}"
         line.send(control.Ack(order.token, error=reason))
         if known:
