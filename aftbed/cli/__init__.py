@@ -95,6 +95,8 @@ def _failed(error: OSError) -> int:
     """The exit code of a command that the system refused something. A reader that is gone needs no words."""
     if isinstance(error, BrokenPipeError) and (_reader_gone(sys.stdout) or _reader_gone(sys.stderr)):
         return EXIT_READER_GONE
+    if isinstance(error, FileNotFoundError) and not error.filename:  # of getcwd(2)
+        return _explain(EXIT_USAGE, "error: the working directory was removed; change to another one")
     what = error.filename or ("the output" if error.errno in NO_ROOM else "")
     return _explain(EXIT_TROUBLE, f"trouble: {f'{what}: ' if what else ''}{error.strerror or error}")
 

@@ -96,11 +96,7 @@ def check_file(option: str, path: Path | None, suffix: str = "") -> None:
     """Raise ConfigError if `path` cannot be written, before the work whose result goes there."""
     if path is None:
         return
-    try:
-        has_place = path.absolute().parent.is_dir()
-    except FileNotFoundError:  # the working directory was removed
-        has_place = False
-    if path.suffix != (suffix or path.suffix) or path.is_dir() or not has_place:
+    if path.suffix != (suffix or path.suffix) or path.is_dir() or not path.absolute().parent.is_dir():
         kind = f"file {suffix}" if suffix else "file"
         raise ConfigError(f"{option} {path}: a {kind} in a directory that exists is allowed")
 
