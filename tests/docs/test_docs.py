@@ -11,6 +11,7 @@ import typer
 from pages import PAGES, ROOT, anchors, blocks, links, names, prose, sections, table
 from requestpath import REQUEST_PATH
 
+from aftbed.cli import EXIT_READER_GONE, EXIT_USAGE
 from aftbed.cli.app import app
 from aftbed.cli.lazy import LazyCommand
 from aftbed.core.events import BY_LABEL
@@ -172,7 +173,7 @@ def test_the_reasons_to_refuse_a_line_are_all_there_are() -> None:
 
 
 def test_the_exit_codes_are_those_of_the_command_line() -> None:
-    wanted = {str(code) for code in (*EXIT_CODES.values(), 2, EXIT_INTERRUPTED)}
+    wanted = {str(code) for code in (*EXIT_CODES.values(), EXIT_USAGE, EXIT_INTERRUPTED, EXIT_READER_GONE)}
     for page in (README, DOCS / "commands.md"):
         assert {row[0] for row in table(page, "code")} == wanted, page.name
 

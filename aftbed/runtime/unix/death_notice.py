@@ -113,7 +113,10 @@ class LifelineWatcher:
         self._words = [_Word(Path(path)) for path in paths]
         self._wanted = _thread.allocate_lock()  # held until it is closed
         self._wanted.acquire()
-        _thread.start_new_thread(self._watch, ())
+        try:
+            _thread.start_new_thread(self._watch, ())
+        except RuntimeError as error:  # a thread counts as a process
+            raise OSError(errno.EAGAIN, str(error)) from None
 
     def died(self) -> bytes:
         """The indices of those that died since the last call."""
