@@ -211,6 +211,7 @@ ROWS: Final = (
         LOAD,
         0,
         PASS,
+        deep=True,
     ),
     Row(
         "path_too_long",
@@ -292,9 +293,9 @@ ROWS: Final = (
     # standard streams
     Row("no_stdin", '"$@" <&-', LOAD, 0, PASS, deep=True),
     Row("no_stdout", '"$@" >&-', LOAD, 0, deep=True),
-    Row("no_stderr", '"$@" 2>&-', DRIVE, 0, PASS),
-    Row("no_stream", '"$@" <&- >&- 2>&-', LOAD, 0),
-    Row("no_stream_and_a_drive", '"$@" <&- >&- 2>&-', DRIVE, 0, deep=True),
+    Row("no_stderr", '"$@" 2>&-', DRIVE, 0, PASS, deep=True),
+    Row("no_stream", '"$@" <&- >&- 2>&-', LOAD, 0, deep=True),
+    Row("no_stream_and_a_drive", '"$@" <&- >&- 2>&-', DRIVE, 0),
     Row("no_stream_to_simulate", '"$@" <&- >&- 2>&-', "sim", 0, deep=True),
     Row("no_stream_to_list", '"$@" <&- >&- 2>&-', "ftm list", 0, deep=True),
     Row("reader_goes", '"$@" | head -1; exit ${PIPESTATUS[0]}', "run --load 2000@500", 141, "^run "),
