@@ -305,6 +305,14 @@ ROWS: Final = (
     # the interpreter and its environment
     Row("output_in_ascii", 'export PYTHONIOENCODING=ascii; "$@" --record $HERE/é', LOAD, 0, PASS, deep=True),
     Row(
+        "json_in_ascii",
+        "cp $REPOSITORY/aftbed/vehicle/scenarios/ccrs-20.yaml $HERE/é.yaml; export PYTHONIOENCODING=ascii;"
+        ' "$@" --scenario $HERE/é.yaml --json',
+        "sim",
+        0,
+        r"/\\u00e9\.yaml",
+    ),
+    Row(
         "error_in_ascii",
         'export PYTHONIOENCODING=ascii; "$@" $HERE/é',
         "check",
