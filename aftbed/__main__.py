@@ -1,5 +1,11 @@
 """`python -m aftbed`."""
 
-from aftbed.cli import main
+import sys
+from pathlib import Path
 
-main()
+if __name__ == "__main__":
+    if not sys.flags.safe_path and sys.path[:1] == [str(Path.cwd())]:
+        del sys.path[0]  # `-m` puts the working directory there: nothing is imported from it
+    from aftbed.cli import main
+
+    main()

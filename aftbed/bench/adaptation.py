@@ -29,8 +29,8 @@ from aftbed.core.journal import EntryKind
 from aftbed.core.messages import Goal
 from aftbed.core.script import RECIPES
 from aftbed.judge import checks
+from aftbed.judge.isolated import reference_of
 from aftbed.judge.record import RunRecord
-from aftbed.judge.reference import reference_of
 from aftbed.runtime.unix import control_client
 from aftbed.vehicle.aeb.function import default_application
 

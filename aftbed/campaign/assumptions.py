@@ -10,22 +10,23 @@ nothing broke, and names the assumption if something did. It can be wrong in bot
 
 from collections import Counter
 from collections.abc import Callable, Iterator
+from functools import cache, partial
 from typing import Final
 
 import msgspec
 
 from aftbed.adapt.commands import read
 from aftbed.adapt.planner import APPLICATION
-from aftbed.adapt.plugins import load_application
 from aftbed.adapt.suitability import AMPLE, FaultModel, problems
 from aftbed.campaign.experiment import Result
 from aftbed.campaign.ledger import Ledger
 from aftbed.campaign.statistics import Interval, proportion
-from aftbed.core.application import Application, Characteristics
+from aftbed.core.application import Characteristics
 from aftbed.inject.grammar import Permanent
 from aftbed.inject.model import parse
+from aftbed.judge.isolated import declared_by
 from aftbed.judge.outcome import FAILED, UNKNOWN
-from aftbed.runtime.unix.options import load_module
+from aftbed.runtime.unix.trust import NOBODY, Trust
 from aftbed.vehicle.aeb.function import default_application
 
 BROKEN: Final = (*FAILED, "latent", "detected_stop")
@@ -45,11 +46,13 @@ class AssumptionCell(msgspec.Struct, frozen=True):
     agrees: bool
 
 
-def cells(ledger: Ledger) -> Iterator[AssumptionCell]:
+def cells(ledger: Ledger, trust: Trust = NOBODY) -> Iterator[AssumptionCell]:
     """One for each stratum, of the experiments whose faults happened and of which something is known.
 
     Where an update was rolled back, some requests were served by one version and some by the other: left out.
+    Raises ConfigError where a function is not trusted: what it declares is not known then.
     """
+    declared = cache(partial(declared_by, trust=trust))
     groups: dict[str, list[Result]] = {}
     for result in ledger.results:
         known = result.activated and result.outcome not in UNKNOWN
@@ -58,7 +61,7 @@ def cells(ledger: Ledger) -> Iterator[AssumptionCell]:
     for name, group in groups.items():
         outcomes = Counter(_came_to(result) for result in group)
         broken = sum(count for outcome, count in outcomes.items() if outcome in BROKEN)
-        assumption = assumed_wrongly(group[0])
+        assumption = assumed_wrongly(group[0], declared)
         yield AssumptionCell(
             name,
             assumption,
@@ -74,8 +77,11 @@ def _came_to(result: Result) -> str:
     return REFUSED if "refused" in result.adapted else result.outcome
 
 
-def assumed_wrongly(result: Result) -> str:
-    """Why the table has this mechanism fail under these faults and with this function; "" if it holds."""
+def assumed_wrongly(result: Result, declared: Callable[[str], Characteristics]) -> str:
+    """Why the table has this mechanism fail under these faults and with this function; "" if it holds.
+
+    `declared`: what a function declares, by its source.
+    """
     experiment = result.experiment
     faults = [parse(text) for text in experiment.faults]
     flips = [fault for fault in faults if fault.action.alters_value]
@@ -83,7 +89,7 @@ def assumed_wrongly(result: Result) -> str:
         crash=any(fault.action.stops_process for fault in faults),
         value=bool(flips),
     )
-    found = problems(experiment.ftm, asked, _characteristics(experiment.adaptations), AMPLE)
+    found = problems(experiment.ftm, asked, _characteristics(experiment.adaptations, declared), AMPLE)
     if not found and any(isinstance(fault.persistence, Permanent) for fault in flips):
         found = [f"{experiment.ftm} takes a value fault for transient: this one is in every execution"]
     if not found and any(fault.action.strikes_stored_state for fault in flips):
@@ -91,20 +97,19 @@ def assumed_wrongly(result: Result) -> str:
     return "; ".join(found)
 
 
-def _characteristics(adaptations: tuple[str, ...]) -> Characteristics:
+def _characteristics(
+    adaptations: tuple[str, ...], declared: Callable[[str], Characteristics]
+) -> Characteristics:
     """Of the last version of the function."""
-    make: Callable[[], Application] = default_application
-    for text in adaptations:
-        wish = read(text).wish
-        if wish.verb == "update" and wish.name == APPLICATION:
-            make = load_application(wish.source, load_module)
-    return make().characteristics
+    wishes = [read(text).wish for text in adaptations]
+    sources = [wish.source for wish in wishes if wish.verb == "update" and wish.name == APPLICATION]
+    return declared(sources[-1]) if sources else default_application().characteristics
 
 
-def markdown(ledger: Ledger) -> str:
+def markdown(ledger: Ledger, trust: Trust = NOBODY) -> str:
     """The table for people."""
     head = ledger.head
-    found = list(cells(ledger))
+    found = list(cells(ledger, trust))
     lines = [
         "| stratum | what the table says | broke | outcomes | |",
         "|---|---|---|---|---|",

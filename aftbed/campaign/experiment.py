@@ -15,7 +15,7 @@ from typing import Final
 
 import msgspec
 
-from aftbed.adapt.commands import scheduled
+from aftbed.adapt.commands import read, scheduled
 from aftbed.core.errors import ConfigError
 from aftbed.core.graph import Graph
 from aftbed.core.messages import Scheduled
@@ -32,6 +32,7 @@ from aftbed.runtime.sim.world import Setup, simulate
 from aftbed.runtime.unix import linux
 from aftbed.runtime.unix.launch import launch, options_for, warm_up
 from aftbed.runtime.unix.options import CarRun, LoadRun, Work, with_names_resolved
+from aftbed.runtime.unix.trust import OWN_RUN, Trust, remember, vetted
 from aftbed.search.shrink import shrink
 from aftbed.vehicle.aeb.function import default_application
 from aftbed.vehicle.plant import VehicleResult
@@ -195,6 +196,14 @@ def faults_of(experiment: Experiment, graph: Graph) -> tuple[Fault, ...]:
     return found
 
 
+def refuse_untrusted(experiment: Experiment, trust: Trust) -> None:
+    """Raise ConfigError if the experiment, of a ledger, would execute code that is not trusted."""
+    for text in experiment.adaptations:
+        wish = read(text).wish
+        if wish.source:
+            vetted(wish.source, trust)
+
+
 def setup_of(experiment: Experiment) -> Setup:
     """The experiment for the simulator. Raises ConfigError."""
     faults, changes = _asked(experiment)
@@ -226,7 +235,7 @@ def _simulated(experiment: Experiment) -> Result:
 def _real(experiment: Experiment, standing: ExitStack) -> Result:
     """On real processes, whose record is there until `standing` ends."""
     noisy = _probe().noisy()
-    evidence = evidence_of(_recorded(experiment, standing))
+    evidence = evidence_of(_recorded(experiment, standing), trust=OWN_RUN)
     verdict, (outcome, reasons) = judge(evidence.record, evidence), outcome_of(evidence)
     # G8: what the harness does not know is worse than any outcome that it believes to have seen.
     unknown = {name for name, word in verdict.checks.items() if word == "unknown"} - ON_ACTIVATION
@@ -261,6 +270,7 @@ def _recorded(experiment: Experiment, standing: ExitStack) -> RunRecord:
     for _ in launched.reports():
         pass
     launched.wait()
+    remember(launched.record)
     return read_record(launched.record)
 
 

@@ -16,14 +16,15 @@ import typer
 from msgspec.structs import replace
 
 from aftbed.campaign import ledger, runner
-from aftbed.campaign.experiment import Result, carry_out, smallest
+from aftbed.campaign.experiment import Result, carry_out, refuse_untrusted, smallest
 from aftbed.campaign.plan import CampaignPlan
 from aftbed.campaign.plan import plan as plan_of
 from aftbed.campaign.spec import EXPERIMENTS_MAX, Spec, check, read_spec, shipped
-from aftbed.cli.options import Json, check_range, jobs_of, print_json, takes
+from aftbed.cli.options import Json, TrustedFolders, check_range, jobs_of, print_json, takes
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.judge.verdict import EXIT_INTERRUPTED
 from aftbed.report.export import write_csv, write_parquet
+from aftbed.runtime.unix.trust import trusting
 
 RUNTIMES: Final = ("unix", "sim")
 EXECUTORS: Final = ("local", "dask")
@@ -291,23 +292,26 @@ def compare(base: Folder, new: Folder, json: Json = False) -> None:
 
 
 @campaign.command()
-def assumptions(folder: Folder) -> None:
+def assumptions(folder: Folder, trust: TrustedFolders = None) -> None:
     """What each mechanism assumes, and the outcomes where that does not hold, as Markdown."""
     from aftbed.campaign.assumptions import markdown  # noqa: PLC0415 - scipy
 
-    print(markdown(_ledger(folder)), end="")
+    print(markdown(_ledger(folder), trusting(tuple(trust or ()))), end="")
 
 
 # -- one experiment -------------------------------------------------------------------------------
 
 
 @campaign.command()
-def replay(folder: Folder, experiment: ExperimentName, json: Json = False) -> None:
+def replay(
+    folder: Folder, experiment: ExperimentName, trust: TrustedFolders = None, json: Json = False
+) -> None:
     """Run one experiment of a campaign again.
 
     Exit code: 0 the outcome is the same, 1 it is not, 2 usage.
     """
     before = ledger.find(_ledger(folder), experiment)
+    refuse_untrusted(before.experiment, trusting(tuple(trust or ())))
     after = carry_out(before.experiment, lambda result: None)
     if json:
         print_json({"before": before, "after": after})

@@ -5,22 +5,26 @@ from typing import Annotated
 
 import typer
 
-from aftbed.cli.options import Json
+from aftbed.cli.options import Json, TrustedFolders
 from aftbed.cli.views import show_verdict
 from aftbed.judge.record import read_record
-from aftbed.judge.verdict import EXIT_CODES, Verdict, judge
+from aftbed.judge.verdict import EXIT_CODES, Verdict, evidence_of, judge
+from aftbed.runtime.unix.trust import Trust, trusting
 
 
 def check(
     record: Annotated[Path, typer.Argument(help="The directory of --record.")],
+    trust: TrustedFolders = None,
     json: Json = False,
 ) -> None:
     """Judge a recorded run again."""
-    raise typer.Exit(EXIT_CODES[judge_and_show(record, as_json=json).verdict])
+    verdict = judge_and_show(record, trusting(tuple(trust or ())), as_json=json)
+    raise typer.Exit(EXIT_CODES[verdict.verdict])
 
 
-def judge_and_show(record: Path, *, as_json: bool) -> Verdict:
+def judge_and_show(record: Path, trust: Trust, *, as_json: bool) -> Verdict:
     """Judge the record in this directory, and print the verdict."""
-    verdict = judge(read_record(record))
+    found = read_record(record)
+    verdict = judge(found, evidence_of(found, trust=trust))
     show_verdict(verdict, as_json=as_json)
     return verdict

@@ -22,6 +22,10 @@ Run = Annotated[str | None, typer.Option("--run", help="Id of the run; needed if
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else.")]
 Ftm = Annotated[str, typer.Option(help="none, pbr, lfr, tr, pbr+tr, ...: aftbed ftm list.")]
 Seed = Annotated[int, typer.Option(help="Seed of all random numbers.")]
+TrustedFolders = Annotated[
+    list[Path] | None,
+    typer.Option("--trust", help="Directory whose functions may be executed; may be given several times."),
+]
 Recipe = Annotated[str, typer.Option(help="drained, or paper: SIGSTOP, kill, launch, link, SIGCONT.")]
 
 Arguments = TypeVar("Arguments", bound=msgspec.Struct)

@@ -129,8 +129,12 @@ def execute(given: RunArguments) -> int:
         launched.wait()
         from aftbed.cli.check import judge_and_show  # noqa: PLC0415 - after the launch
         from aftbed.judge.verdict import EXIT_CODES, EXIT_INTERRUPTED  # noqa: PLC0415 - after the launch
+        from aftbed.runtime.unix.trust import OWN_RUN, remember  # noqa: PLC0415 - after the launch
 
-        verdict = judge_and_show(launched.record, as_json=given.json)
+        if why_not := remember(launched.record):
+            text = f"aftbed check will ask for --trust: what was run cannot be remembered: {why_not}"
+            print(f"aftbed: note: {text}", file=sys.stderr)
+        verdict = judge_and_show(launched.record, OWN_RUN, as_json=given.json)
         if launched.trouble:
             print(f"aftbed: trouble: {launched.trouble}", file=sys.stderr)
         elif verdict.verdict == "inconclusive" and not given.json:

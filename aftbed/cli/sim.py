@@ -45,6 +45,7 @@ from aftbed.runtime.sim.clock import START_NS
 from aftbed.runtime.sim.trace import traced
 from aftbed.runtime.sim.world import Run, Setup
 from aftbed.runtime.sim.world import check as check_fault
+from aftbed.runtime.unix.trust import trusting
 from aftbed.runtime.unix.worker_pool import each
 from aftbed.search.agreement import SEEDS, RecoveryRange, against
 from aftbed.search.explore import Found, attempt, missed, tried
@@ -109,6 +110,9 @@ class SimArguments(msgspec.Struct, frozen=True):
         tuple[Path, ...],
         typer.Option(help="The record of a real run: simulate the same, under --seeds, and compare."),
     ] = ()
+    trust: Annotated[
+        tuple[Path, ...], typer.Option(help="With --against: directory whose functions may be executed.")
+    ] = ()
     json: Json = False
 
 
@@ -122,6 +126,8 @@ def sim(given: SimArguments) -> int:
     """
     if given.against:
         return _compare(given)
+    if given.trust:
+        raise ConfigError("--trust says which functions of records are executed: give --against RECORD too")
     first, last = _seeds(given)
     jobs, make = jobs_of(given.jobs), _setup_maker(given)
     check_file("--diagram", None if given.diagram is None else Path(given.diagram))
@@ -548,10 +554,12 @@ class _ManyRuns:
 
 def _compare(given: SimArguments) -> int:
     """Compare each record with its simulations; the exit code is 1 if one does not agree."""
-    if _used(given, "seeds", "against", "json"):
-        raise ConfigError("--against: the experiments are the records'; only --seeds and --json go with it")
+    if _used(given, "seeds", "against", "trust", "json"):
+        raise ConfigError(
+            "--against: the experiments are the records'; only --seeds, --trust and --json go with it"
+        )
     first, last = _seeds(given) if given.seeds is not None else (0, SEEDS - 1)
-    found = against(given.against, last - first + 1)
+    found = against(given.against, last - first + 1, trusting(given.trust))
     disagreeing = sum(bool(one.why_not) for one in found)
     if given.json:
         print_json({"agree": not disagreeing, "experiments": found})

@@ -160,6 +160,8 @@ def exactly_one_answer(history: History, *, cut_off: bool = False) -> Check:
 
 def one_history(history: History, reference: ReferenceRun) -> Check:
     """G3: the replies are those of the bare server over the same requests in the order of ids."""
+    if reference.unknown:
+        return Check("unknown", (reference.unknown,))
     wrong = wrong_replies(history, reference)
     reasons = [f"request {i}: the reply is not the bare server's" for i in wrong]
     sent = [e.request_id for e in _sent(history)]
@@ -445,6 +447,8 @@ def check_value(evidence: Evidence) -> Check | None:
     flips = [f for f in record.faults if f.action.alters_value]
     if not flips or evidence.excuses.values:
         return None
+    if evidence.reference.unknown:
+        return Check("unknown", (evidence.reference.unknown,))
     wrong = corruptions(record.history, evidence.reference)
     if wrong:
         return Check("fail", tuple(wrong[:REASONS_MAX]))

@@ -51,6 +51,8 @@ def outcome_of(evidence: Evidence) -> tuple[str, tuple[str, ...]]:
     history, living = record.history, record.end.hosted if record.end is not None else None
     counts = checks.requests(history, reference, checks.late_after_ns(record.options.work))
     found: dict[str, str] = {}
+    if reference.unknown:
+        found["inconclusive"] = reference.unknown
     wrong = corruptions(history, reference) if reference.deterministic else []
     if wrong:
         found["sdc"] = wrong[0]
@@ -77,7 +79,12 @@ def outcome_of(evidence: Evidence) -> tuple[str, tuple[str, ...]]:
     states = set(record.end.states.values()) if record.end is not None else set()
     if history.events(Event.FOLLOWER_DIVERGED) or len(states) > 1:
         found["latent"] = "the replicas differ"
-    elif states and reference.deterministic and not wrong and states != {reference.digest}:
+    elif (
+        states
+        and reference.deterministic
+        and not (wrong or reference.unknown)
+        and states != {reference.digest}
+    ):
         found["latent"] = "the state of the replicas is not the bare server's"
     word = worst(list(found))
     return word, tuple(found[name] for name in sorted(found, key=OUTCOMES.index, reverse=True))

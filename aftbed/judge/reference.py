@@ -15,18 +15,18 @@ from typing import Final
 
 import msgspec
 
-from aftbed.adapt.plugins import load_application
+from aftbed.adapt.plugins import LoadModule, load_application
 from aftbed.core.application import Application
 from aftbed.core.errors import PeerError
 from aftbed.core.events import Event
 from aftbed.core.journal import EntryKind, History
-from aftbed.judge.record import RunRecord
 from aftbed.runtime.deployment import digest, replica_of
 from aftbed.runtime.unix.options import load_module
 from aftbed.vehicle.aeb.function import default_application
 
 Make = Callable[[], Application]
 Change = tuple[int, Make | None]  # from which request on, counted from 1; None: the version of before
+NamedChange = tuple[int, str | None]  # the same, by `MODULE:CLASS` or `FILE.py:CLASS`; "": the built-in one
 BUILT_IN: Final = ""
 DONE: Final = "done"
 
@@ -92,12 +92,9 @@ class Succession:
         return self._function.acceptable(request, reply)
 
 
-def succession(history: History, adaptations: Iterable[object]) -> Callable[[], Succession]:
-    """Makes the bare server of a run, from the outcomes of its adaptations, or from what was written of them.
-
-    Raises ConfigError where a version of the function is gone.
-    """
-    changes: list[Change] = []
+def changes_of(history: History, adaptations: Iterable[object]) -> list[NamedChange]:
+    """When another version began to serve, from the outcomes of adaptations, or what was written of them."""
+    changes: list[NamedChange] = []
     running = BUILT_IN
     for outcome in adaptations:
         update = msgspec.convert(outcome, AppliedUpdate, from_attributes=True)
@@ -106,8 +103,7 @@ def succession(history: History, adaptations: Iterable[object]) -> Callable[[], 
             continue
         stored = (r.request_id for r in history.events(Event.REPLY_STORED) if r.t_ns < update.opened_ns)
         first = 1 + max(stored, default=0)
-        make = load_application(function, load_module) if function else default_application
-        changes.append((first, make))
+        changes.append((first, function))
         if update.undone_ns:
             lost = update.lost.split()
             known = (
@@ -118,6 +114,26 @@ def succession(history: History, adaptations: Iterable[object]) -> Callable[[], 
             changes.append((max(first, 1 + max(known, default=0)), None))
         else:
             running = function
+    return changes
+
+
+def loaded(changes: Iterable[NamedChange], load_module: LoadModule) -> list[Change]:
+    """The same with the versions, which are executed for that. Raises ConfigError where one is no good."""
+
+    def make(function: str) -> Make:
+        return load_application(function, load_module) if function else default_application
+
+    return [(first, None if function is None else make(function)) for first, function in changes]
+
+
+def succession(
+    history: History, adaptations: Iterable[object], load_module: LoadModule = load_module
+) -> Callable[[], Succession]:
+    """Makes the bare server of a run, in this process: of a run whose functions are trusted.
+
+    Raises ConfigError where a version of the function is gone.
+    """
+    changes = loaded(changes_of(history, adaptations), load_module)
     return lambda: Succession(changes)
 
 
@@ -125,12 +141,13 @@ class ReferenceRun(msgspec.Struct, frozen=True):
     """What the bare server makes of the requests of a run: its replies, by id, and its state behind them.
 
     A request that it refuses has an empty reply. Where the function is not `deterministic`, its replies
-    need not be those of a run.
+    need not be those of a run. `unknown`: why nothing is known of them, "" where they are.
     """
 
     replies: tuple[tuple[int, bytes], ...]
     state: bytes
     deterministic: bool = True
+    unknown: str = ""
 
     @property
     def digest(self) -> str:
@@ -138,22 +155,22 @@ class ReferenceRun(msgspec.Struct, frozen=True):
         return digest(self.state)
 
 
-def reference_run(history: History, bare: Application) -> ReferenceRun:
-    """`bare` is a fresh one: it executes each request that was sent, in their order."""
+def requests_of(history: History) -> list[tuple[int, bytes]]:
+    """Id and payload of each request that was sent, in their order."""
+    return [(e.request_id, e.payload) for e in history.dialogue if e.kind is EntryKind.SENT]
+
+
+def executed(requests: Iterable[tuple[int, bytes]], bare: Application) -> ReferenceRun:
+    """`bare` is a fresh one: it executes each request, in their order."""
     replies = []
-    for entry in history.dialogue:
-        if entry.kind is EntryKind.SENT:
-            try:
-                replies.append((entry.request_id, bare.execute(entry.payload)))
-            except PeerError:
-                replies.append((entry.request_id, b""))
+    for number, payload in requests:
+        try:
+            replies.append((number, bare.execute(payload)))
+        except PeerError:
+            replies.append((number, b""))
     return ReferenceRun(tuple(replies), bare.capture(), getattr(bare, "deterministic", True))
 
 
-def reference_of(record: RunRecord, function: Callable[[], Application] | None = None) -> ReferenceRun:
-    """Of the versions of the function that served the run; of `function`, where one is given.
-
-    Raises ConfigError where a version of the function is gone.
-    """
-    make = function or succession(record.history, record.adaptations)
-    return reference_run(record.history, make())
+def reference_run(history: History, bare: Application) -> ReferenceRun:
+    """`bare` is a fresh one: it executes each request that was sent, in their order."""
+    return executed(requests_of(history), bare)

@@ -12,10 +12,11 @@ from aftbed.core.application import Application
 from aftbed.inject.model import FaultReport
 from aftbed.judge import checks
 from aftbed.judge.checks import AskedAdaptation, Check, Checker, Evidence, Failover, Requests
+from aftbed.judge.isolated import reference_of
 from aftbed.judge.record import RunRecord
-from aftbed.judge.reference import reference_of
 from aftbed.runtime.unix.closed_loop import Proposed, read_proposals
 from aftbed.runtime.unix.options import CarRun, ReplayRun
+from aftbed.runtime.unix.trust import NOBODY, Trust
 from aftbed.vehicle.plant import VehicleResult
 
 Word = Literal["pass", "fail", "inconclusive"]
@@ -83,9 +84,14 @@ class Breach(msgspec.Struct, frozen=True):
         return f"{self.check}{promise}: {self.reason}"
 
 
-def evidence_of(record: RunRecord, function: Callable[[], Application] | None = None) -> Evidence:
-    """With the bare server's run over the same requests; of `function`, where the record does not name it."""
-    return Evidence(record, reference_of(record, function))
+def evidence_of(
+    record: RunRecord, function: Callable[[], Application] | None = None, trust: Trust = NOBODY
+) -> Evidence:
+    """With the bare server's run over the same requests; of `function`, where the record does not name it.
+
+    A function that the record names is executed only if `trust` allows it; else its replies are unknown.
+    """
+    return Evidence(record, reference_of(record, function, trust))
 
 
 def judge(record: RunRecord, evidence: Evidence | None = None) -> Verdict:

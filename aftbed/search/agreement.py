@@ -24,6 +24,7 @@ from aftbed.judge.simulated import record_of
 from aftbed.judge.verdict import evidence_of
 from aftbed.runtime.sim.world import Setup, simulate
 from aftbed.runtime.unix.options import CarRun, LoadRun
+from aftbed.runtime.unix.trust import NOBODY, Trust
 from aftbed.vehicle.aeb.function import default_application
 
 SEEDS: Final = 20
@@ -49,13 +50,13 @@ class Agreement(msgspec.Struct, frozen=True):
     why_not: tuple[str, ...]
 
 
-def against(paths: Iterable[Path], seeds: int = SEEDS) -> list[Agreement]:
+def against(paths: Iterable[Path], seeds: int = SEEDS, trust: Trust = NOBODY) -> list[Agreement]:
     """Compare the records in `paths`. Raises ConfigError where one is none, or cannot be simulated."""
     groups: dict[Setup, list[RunRecord]] = {}
     for path in paths:
         record = read_record(path)
         groups.setdefault(setup_of(record), []).append(record)
-    return [_compare(setup, records, seeds) for setup, records in groups.items()]
+    return [_compare(setup, records, seeds, trust) for setup, records in groups.items()]
 
 
 def setup_of(record: RunRecord) -> Setup:
@@ -74,9 +75,9 @@ def setup_of(record: RunRecord) -> Setup:
             raise ConfigError(f"{record.path}: a replay is not simulated")
 
 
-def _compare(setup: Setup, records: list[RunRecord], seeds: int) -> Agreement:
+def _compare(setup: Setup, records: list[RunRecord], seeds: int, trust: Trust) -> Agreement:
     runs = (simulate(msgspec.structs.replace(setup, seed=seed)) for seed in range(seeds))
-    real_classes, real_times = _summed(evidence_of(record) for record in records)
+    real_classes, real_times = _summed(evidence_of(record, trust=trust) for record in records)
     sim_classes, sim_times = _summed(evidence_of(record_of(run), default_application) for run in runs)
     found = [
         f"no seed ends {word}, as {n} real runs do"

@@ -15,6 +15,11 @@ def test_a_record_without_a_good_head(refused: Output, tmp_path: Path, content: 
     assert "run.json" in error and word in error
 
 
+def test_a_trusted_directory_that_is_none(refused: Output, tmp_path: Path) -> None:
+    error = refused("check", tmp_path, "--trust", tmp_path / "absent")
+    assert f"--trust {tmp_path / 'absent'}: no such directory" in error
+
+
 def test_a_directory_that_is_no_record(refused: Output, tmp_path: Path) -> None:
     error = refused("check", tmp_path)
     assert "run.json" in error and "is this the record of a run?" in error

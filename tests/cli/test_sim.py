@@ -255,7 +255,7 @@ def test_a_disagreement_is_exit_code_1(
     sim: Call, monkeypatch: pytest.MonkeyPatch, why_not: tuple[str, ...], code: int
 ) -> None:
     one = Agreement("pbr process", {"masked": 1}, {"masked": 20}, FAST, None, why_not)
-    monkeypatch.setattr("aftbed.cli.sim.against", lambda records, seeds: [one] if seeds == 3 else [])
+    monkeypatch.setattr("aftbed.cli.sim.against", lambda records, seeds, trust: [one] if seeds == 3 else [])
     found, out, _ = sim("--against", str(Path("there")), "--seeds", "0..2", "--json")
     assert (found, json.loads(out)["agree"]) == (code, not why_not)
 
@@ -269,6 +269,8 @@ def test_a_disagreement_is_exit_code_1(
         (("--against", "/nowhere"), ("/nowhere/run.json: No such file or directory",)),
         (("--against", "/nowhere", "--ftm", "lfr"), ("--against: the experiments are the records'",)),
         (("--against", "/nowhere", "--seeds", "5..4"), ("5..4",)),
+        (("--against", "/nowhere", "--trust", "/nowhere"), ("--trust /nowhere: no such directory",)),
+        (("--trust", "/tmp"), ("--trust", "give --against RECORD too")),
         (("--seeds", "5..4"), ("--seeds 5..4", "no seed is in it", "as 4..5")),
         (("--seeds", "5"), ("--seeds '5'", "A..B")),
         (("--seeds", "a..b"), ("A..B", "0..99")),

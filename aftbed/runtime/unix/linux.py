@@ -25,6 +25,8 @@ PR_SET_PDEATHSIG: Final = 1
 PR_SET_NAME: Final = 15
 PR_SET_CHILD_SUBREAPER: Final = 36
 MADV_POPULATE_WRITE: Final = 23
+CLONE_NEWUSER: Final = 0x10000000
+CLONE_NEWNET: Final = 0x40000000
 SYS_PROCESS_MADVISE: Final = 440  # on every architecture but alpha; the C library may not have it
 IOV_MAX: Final = 1024  # areas in one call
 ADOPTION_SECONDS_MAX: Final = 5.0
@@ -156,6 +158,14 @@ def set_name(name: str) -> None:
 def no_core() -> None:
     """Disable core files for this process."""
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+
+
+def leave_network() -> bool:
+    """Give this process, which has one thread, a network without any device (unshare(2)); False if refused.
+
+    Without privileges that takes a user namespace, which some containers and distributions do not allow.
+    """
+    return any(_libc.unshare(flags) == 0 for flags in (CLONE_NEWNET, CLONE_NEWUSER | CLONE_NEWNET))
 
 
 def kill(pidfd: int, sig: signal.Signals) -> bool:

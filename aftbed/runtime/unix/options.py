@@ -2,8 +2,9 @@
 
 import importlib
 import importlib.util
+from importlib.machinery import SourceFileLoader
 from pathlib import Path
-from types import ModuleType
+from types import CodeType, ModuleType
 from typing import Final
 
 import msgspec
@@ -76,11 +77,22 @@ class SourceOptions(msgspec.Struct, frozen=True):
     earlier: tuple[str, ...] = ()
 
 
+class SourceLoader(SourceFileLoader):
+    """Compiles the file that is there: a compiled one beside it is not read, and none is written."""
+
+    def get_code(self, fullname: str) -> CodeType:
+        return compile(self.source(), self.path, "exec", dont_inherit=True)
+
+    def source(self) -> bytes:
+        return self.get_data(self.path)
+
+
 def load_module(place: str) -> ModuleType:
     """The module called `place`, or in that file if it ends in `.py`. Raises ConfigError without the file."""
     if not place.endswith(".py"):
         return importlib.import_module(place)
-    spec = importlib.util.spec_from_file_location(Path(place).stem, place)
+    name = Path(place).stem
+    spec = importlib.util.spec_from_file_location(name, place, loader=SourceLoader(name, place))
     if spec is None or spec.loader is None or not Path(place).is_file():
         raise ConfigError(f"{place}: no such file")
     module = importlib.util.module_from_spec(spec)

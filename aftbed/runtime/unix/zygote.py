@@ -14,7 +14,9 @@ import importlib
 import os
 import socket
 import sys
+from functools import partial
 from pathlib import Path
+from types import ModuleType
 from typing import NoReturn
 
 import msgspec
@@ -143,8 +145,19 @@ def _make_node(line: Line[control.ToNode], order: control.Assign, fds: list[int]
     io.lifeline = Lifeline(Path(order.journal))
     if kind == "engine":
         gc.enable()  # a plan leaves cycles behind, and the Engine is not on the request path
-    Assembler(default_application, load_module).build(node, order, fds, lambda: _make_device(order, node))
+    load = partial(_load_and_note, Path(order.journal).parent.parent)
+    Assembler(default_application, load).build(node, order, fds, lambda: _make_device(order, node))
     return io
+
+
+def _load_and_note(record: Path, place: str) -> ModuleType:
+    """`load_module`; what is not of this package is noted in the record of the run."""
+    module = load_module(place)
+    if place.endswith(".py") or place.partition(".")[0] != "aftbed":
+        from aftbed.runtime.unix import trust  # noqa: PLC0415 - hashlib, in nodes with such code only
+
+        trust.note(record, place, module)
+    return module
 
 
 def _make_device(order: control.Assign, node: UnixNode) -> Device:

@@ -1,0 +1,324 @@
+"""Which code outside of the package a judge may execute, and how it is loaded.
+
+A record names the function that served a run. Whoever made the record chose that name, so a judge executes
+the code behind it only if the user has agreed: its files lie under a directory of `--trust`, or each of them
+has the SHA-256 of a file that this user has run. A run notes what it loads in its record (`note`), and its
+command keeps the hashes in a ledger of this user (`remember`).
+
+Code is found without executing any of it: the import system would execute the packages on the way to a
+module. It is executed from the very bytes that were hashed: neither a file that was exchanged meanwhile nor a
+compiled one beside it is. The working directory is not searched.
+"""
+
+import contextlib
+import fcntl
+import importlib
+import json
+import os
+import stat
+import sys
+import tempfile
+from collections.abc import Iterator
+from hashlib import sha256
+from importlib.machinery import ModuleSpec, PathFinder
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+from types import ModuleType
+from typing import Final
+
+import msgspec
+
+import aftbed
+from aftbed.core.errors import ConfigError
+from aftbed.runtime.unix.options import SourceLoader
+
+PACKAGE: Final = Path(aftbed.__file__).resolve().parent
+FILE_BYTES_MAX: Final = 10_000_000
+NOTES_NAME: Final = "functions.jsonl"  # in the record: a line for each file of code that was loaded
+NOTES_BYTES_MAX: Final = 10_000_000
+LEDGER_NAME: Final = "functions"  # in the state directory: a hash per line, the latest last
+HASHES_MAX: Final = 1000
+HASH_DIGITS: Final = 64
+LEDGER_BYTES_MAX: Final = HASHES_MAX * (HASH_DIGITS + 1)
+
+
+class Trust(msgspec.Struct, frozen=True):
+    """`folders`: of `--trust`. `own_run`: this very command made the record, and named its functions."""
+
+    folders: tuple[Path, ...] = ()
+    own_run: bool = False
+
+
+NOBODY: Final = Trust()  # nobody's code but what this user has run
+OWN_RUN: Final = Trust(own_run=True)
+
+
+def trusting(folders: tuple[Path, ...]) -> Trust:
+    """For `--trust`. Raises ConfigError where one is no directory."""
+    for folder in folders:
+        if not folder.is_dir():
+            raise ConfigError(f"--trust {folder}: no such directory")
+    return Trust(tuple(folder.resolve() for folder in folders))
+
+
+# -- what a source executes -----------------------------------------------------------------------
+
+
+class CodeFile(msgspec.Struct, frozen=True):
+    """A file that is executed as `module`; `folders` are those of a package, none of another module."""
+
+    module: str
+    path: str
+    sha256: str
+    folders: tuple[str, ...] = ()
+
+
+class Code(msgspec.Struct, frozen=True):
+    """All that loading `MODULE` or `FILE.py` executes, in order; no file of a module of this package."""
+
+    place: str
+    files: tuple[CodeFile, ...]
+
+
+def vetted(source: str, trust: Trust) -> Code:
+    """The code of `MODULE:CLASS` or `FILE.py:CLASS`; nothing of it is executed.
+
+    Raises ConfigError, which names the source, where it is not trusted, or is not there.
+    """
+    place = source.rpartition(":")[0]
+    if place.partition(".")[0] == PACKAGE.name and not place.endswith(".py"):
+        return Code(place, ())
+    try:
+        files = tuple(_files_of(place))
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        raise ConfigError(f"{source} cannot be read: {reason}") from None
+    outside = [one for one in files if not any(Path(one.path).is_relative_to(f) for f in trust.folders)]
+    if outside:
+        known, why_not = known_hashes()
+        strangers = [one for one in outside if one.sha256 not in known]
+        if strangers:
+            folder = Path(strangers[0].path).parent
+            unknown = f" (what you ran before is not known: {why_not})" if why_not else ""
+            raise ConfigError(
+                f"{source} is not trusted, so it was not executed: you have not run it before{unknown};"
+                f" --trust {folder} executes it"
+            )
+    return Code(place, files)
+
+
+def _files_of(place: str) -> Iterator[CodeFile]:
+    """Raises OSError, ValueError."""
+    if place.endswith(".py"):
+        path = Path(place).resolve()
+        yield CodeFile(path.stem, str(path), _hash(path))
+        return
+    parts = place.split(".")
+    folders: list[str] | None = search_path()
+    for number in range(1, len(parts) + 1):
+        name = ".".join(parts[:number])
+        spec = PathFinder.find_spec(name, folders)
+        if spec is None or not all(parts):
+            raise ValueError(f"no module {name}")
+        folders = _folders_of(spec)
+        if spec.origin is not None:
+            path = Path(spec.origin).resolve()
+            if path.suffix != ".py":
+                raise ValueError(f"{path} is no Python file")
+            yield CodeFile(name, str(path), _hash(path), tuple(folders))
+
+
+def _folders_of(spec: ModuleSpec) -> list[str]:
+    return [str(Path(folder).resolve()) for folder in spec.submodule_search_locations or ()]
+
+
+def search_path() -> list[str]:
+    """Where modules are looked for: `sys.path`, without the working directory unless PYTHONPATH names it."""
+    here = str(Path.cwd())
+    asked = os.environ.get("PYTHONPATH", "").split(os.pathsep)
+    return [p for p in sys.path if Path(p).is_absolute() and (p != here or p in asked)]
+
+
+def _hash(path: Path) -> str:
+    return sha256(_read(path)).hexdigest()
+
+
+def _read(path: Path) -> bytes:
+    """Raises OSError; ValueError if it is no file, or too large."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+    with open(descriptor, "rb") as file:
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            raise ValueError(f"{path} is no file")
+        data = file.read(FILE_BYTES_MAX + 1)
+    if len(data) > FILE_BYTES_MAX:
+        raise ValueError(f"{path} has more than {FILE_BYTES_MAX} bytes")
+    return data
+
+
+# -- loading it, in the process that executes it --------------------------------------------------
+
+
+class _HashedLoader(SourceLoader):
+    """Loads the file if it has the hash."""
+
+    def __init__(self, file: CodeFile) -> None:
+        super().__init__(file.module, file.path)
+        self._file = file
+
+    def source(self) -> bytes:
+        data = _read(Path(self._file.path))
+        if sha256(data).hexdigest() != self._file.sha256:
+            raise ConfigError(f"{self._file.path}: was changed meanwhile")
+        return data
+
+
+def load(code: Code) -> ModuleType:
+    """Execute it. Raises whatever that raises."""
+    if not code.files:
+        return importlib.import_module(code.place)
+    module = None
+    for file in code.files:
+        module = sys.modules.get(file.module) if not code.place.endswith(".py") else None
+        if module is not None:
+            continue
+        folders = list(file.folders) or None
+        spec = spec_from_file_location(
+            file.module, file.path, loader=_HashedLoader(file), submodule_search_locations=folders
+        )
+        assert spec is not None and spec.loader is not None
+        module = module_from_spec(spec)
+        if not code.place.endswith(".py"):
+            sys.modules[file.module] = module
+        spec.loader.exec_module(module)
+    assert module is not None
+    return module
+
+
+# -- what runs have loaded ------------------------------------------------------------------------
+
+
+def note(record: Path, place: str, module: ModuleType) -> None:
+    """Add the files of `module`, which a node has loaded as `place`, to the notes in the record of its run.
+
+    A note that cannot be written is left out: the record can then only be judged with `--trust`.
+    """
+    parts = place.split(".")
+    loaded = [module]
+    if not place.endswith(".py"):
+        names = [".".join(parts[:number]) for number in range(1, len(parts))]
+        loaded = [*(sys.modules[name] for name in names if name in sys.modules), module]
+    with contextlib.suppress(OSError, ValueError):
+        paths = [Path(file).resolve() for one in loaded if (file := getattr(one, "__file__", None))]
+        notes = [{"place": place, "file": str(path), "sha256": _hash(path)} for path in paths]
+        with open(record / NOTES_NAME, "ab", buffering=0) as file:
+            file.write("".join(json.dumps(one) + "\n" for one in notes).encode())
+
+
+def noted(record: Path) -> list[str]:
+    """The hashes in the notes of a run, each once."""
+    try:
+        with open(record / NOTES_NAME, "rb") as file:
+            lines = file.read(NOTES_BYTES_MAX).splitlines()
+    except OSError:
+        return []
+    found = []
+    for line in lines:
+        with contextlib.suppress(ValueError, LookupError, TypeError):
+            found.append(str(json.loads(line)["sha256"]))
+    return list(dict.fromkeys(one for one in found if len(one) == HASH_DIGITS))
+
+
+# -- the ledger of this user ----------------------------------------------------------------------
+
+
+def state_directory() -> Path:
+    """Of this user: `$XDG_STATE_HOME/aftbed`, or `~/.local/state/aftbed`."""
+    given = Path(os.environ.get("XDG_STATE_HOME") or "")
+    return (given if given.is_absolute() else Path.home() / ".local" / "state") / "aftbed"
+
+
+def known_hashes() -> tuple[frozenset[str], str]:
+    """The hashes of what this user has run; and why they are not known, or "".
+
+    A ledger that others could have written is not read.
+    """
+    try:
+        with _state(make=False) as folder:
+            return frozenset(_ledger(folder)), ""
+    except FileNotFoundError:
+        return frozenset(), ""  # nothing was run
+    except (OSError, ValueError, RuntimeError) as error:
+        return frozenset(), _words(error)
+
+
+def remember(record: Path) -> str:
+    """Add what the run of `record`, which this command made, has loaded. "" if that is done, or why not."""
+    new = noted(record)
+    if not new:
+        return ""
+    try:
+        with _state(make=True) as folder:
+            fcntl.flock(folder, fcntl.LOCK_EX)
+            found = _ledger(folder)
+            lines = [*(one for one in found if one not in new), *new][-HASHES_MAX:]
+            _write_ledger("".join(f"{line}\n" for line in lines).encode())
+    except (OSError, ValueError, RuntimeError) as error:
+        return _words(error)
+    return ""
+
+
+def _words(error: Exception) -> str:
+    """RuntimeError is that of a user without a home."""
+    return f"{error.filename}: {error.strerror}" if isinstance(error, OSError) else str(error)
+
+
+@contextlib.contextmanager
+def _state(*, make: bool) -> Iterator[int]:
+    """A descriptor of the state directory. Raises OSError; ValueError if it is not of this user alone."""
+    path = state_directory()
+    if make:
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        with contextlib.suppress(FileExistsError):
+            path.mkdir(mode=0o700)
+    descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+    try:
+        _check_ours(descriptor, path)
+        yield descriptor
+    finally:
+        os.close(descriptor)
+
+
+def _check_ours(descriptor: int, path: Path) -> None:
+    state = os.fstat(descriptor)
+    if state.st_uid != os.getuid() or state.st_mode & 0o077:
+        raise ValueError(f"{path} must belong to this user alone: no rights for group or others")
+
+
+def _ledger(folder: int) -> list[str]:
+    """The hashes, the latest last."""
+    path = state_directory() / LEDGER_NAME
+    try:
+        descriptor = os.open(
+            LEDGER_NAME, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, dir_fd=folder
+        )
+    except FileNotFoundError:
+        return []
+    with open(descriptor, "rb") as file:
+        _check_ours(descriptor, path)
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            raise ValueError(f"{path} is no file")
+        lines = file.read(LEDGER_BYTES_MAX).decode("ascii", "replace").split()
+    return [line for line in lines if len(line) == HASH_DIGITS]
+
+
+def _write_ledger(data: bytes) -> None:
+    """Whole or not at all."""
+    folder = state_directory()
+    descriptor, name = tempfile.mkstemp(prefix=f".{LEDGER_NAME}.", dir=folder)  # mode 0600
+    beside = Path(name)
+    try:
+        with open(descriptor, "wb") as file:
+            file.write(data)
+        beside.replace(folder / LEDGER_NAME)
+    finally:
+        beside.unlink(missing_ok=True)

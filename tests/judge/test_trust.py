@@ -1,0 +1,385 @@
+"""Functions that a record names: executed only if they are trusted, and then in a process of their own.
+
+Each function leaves a sentinel file when it is imported. Records are made by hand, as a stranger could do it.
+"""
+
+import json
+import os
+import py_compile
+import socket
+import sys
+from hashlib import sha256
+from pathlib import Path
+from typing import Final
+
+import pytest
+from records import whole
+
+from aftbed.core.events import Event
+from aftbed.judge import isolated
+from aftbed.judge.checks import Evidence
+from aftbed.judge.isolated import ProcessLimits, declared_by, reference_of
+from aftbed.judge.outcome import outcome_of
+from aftbed.judge.record import RunRecord, read_record
+from aftbed.judge.verdict import Verdict, evidence_of, judge
+from aftbed.runtime.unix import trust
+from aftbed.runtime.unix.options import load_module
+from aftbed.runtime.unix.trust import NOBODY, OWN_RUN, Trust, known_hashes, note, remember, trusting, vetted
+
+FUNCTION: Final = """\
+from pathlib import Path
+from aftbed.vehicle.aeb.function import AebFunction
+
+Path({sentinel!r}).touch()
+
+
+class Mine(AebFunction):
+    {body}
+"""
+NEEDS_FUNCTION: Final = "one_history"
+starts_process = pytest.mark.process
+
+
+class Planted:
+    """A directory with a function `mine.py`, and the file that appears when it is executed."""
+
+    def __init__(self, folder: Path, body: str = "pass", name: str = "mine.py") -> None:
+        self.folder, self.file, self.sentinel = folder, folder / name, folder / f"{name}-was-executed"
+        self.file.parent.mkdir(parents=True, exist_ok=True)
+        self.file.write_text(FUNCTION.format(sentinel=str(self.sentinel), body=body))
+        self.source = f"{self.file}:Mine"
+
+    @property
+    def executed(self) -> bool:
+        return self.sentinel.exists()
+
+
+def record_naming(path: Path, *sources: str) -> RunRecord:
+    """A run in which nothing is wrong, updated to each of these functions from its first request on."""
+    run = whole(path)
+    run.note("a-protocol.1", Event.REPLY_STORED, 0)
+    run.verdict()
+    lines = [{"ftm": "pbr", "outcome": "done", "application": s, "opened_ns": 1} for s in sources]
+    (path / "adaptations.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    return read_record(path)
+
+
+def verdict_of(record: RunRecord, allowed: Trust = NOBODY) -> Verdict:
+    return judge(record, evidence_of(record, trust=allowed))
+
+
+def remembered(folder: Path, planted: Planted) -> None:
+    """A run of this user has executed it."""
+    folder.mkdir()
+    note(folder, str(planted.file), load_module(str(planted.file)))
+    assert remember(folder) == ""
+    planted.sentinel.unlink()
+
+
+@pytest.fixture(autouse=True)
+def state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The state directory of the user, where nothing was run yet."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    return tmp_path / "state" / "aftbed"
+
+
+@pytest.fixture
+def planted(tmp_path: Path) -> Planted:
+    return Planted(tmp_path / "code")
+
+
+# -- what is not trusted --------------------------------------------------------------------------
+
+
+def test_a_function_that_is_not_trusted_is_unknown_and_not_executed(tmp_path: Path, planted: Planted) -> None:
+    record = record_naming(tmp_path / "record", planted.source)
+    verdict = verdict_of(record)
+    assert (verdict.verdict, verdict.checks[NEEDS_FUNCTION]) == ("inconclusive", "unknown")
+    (reason,) = verdict.reasons
+    assert planted.source in reason and f"--trust {planted.folder}" in reason
+    assert [name for name, word in verdict.checks.items() if word != "pass"] == [NEEDS_FUNCTION]
+    assert outcome_of(evidence_of(record))[0] == "inconclusive"
+    assert not planted.executed
+
+
+def test_neither_the_record_nor_the_working_directory_is_searched(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for place in ("record", "here"):
+        in_package = Planted(tmp_path / place, name="evil/__init__.py")
+        as_module = Planted(tmp_path / place, name="evil_module.py")
+        monkeypatch.chdir(tmp_path / place)
+        monkeypatch.syspath_prepend(str(tmp_path / place))  # as of `python -m`
+        for number, source in enumerate(
+            ("evil:Mine", "evil.inner:Mine", "evil_module:Mine", "evil_module.py:Mine")
+        ):
+            record = record_naming(tmp_path / f"{place}{number}", source)
+            verdict = verdict_of(record)
+            assert verdict.checks[NEEDS_FUNCTION] == "unknown" and source in verdict.reasons[0]
+        assert not in_package.executed and not as_module.executed
+
+
+@starts_process
+def test_a_package_is_found_without_executing_it(
+    tmp_path: Path, planted: Planted, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    outer = Planted(tmp_path / "libraries", name="outer/__init__.py")
+    inner = Planted(tmp_path / "libraries", name="outer/inner.py")
+    monkeypatch.syspath_prepend(str(tmp_path / "libraries"))
+    record = record_naming(tmp_path / "record", "outer.inner:Mine")
+    assert "outer.inner:Mine is not trusted" in verdict_of(record).reasons[0]
+    assert not outer.executed and not inner.executed and "outer" not in sys.modules
+    assert verdict_of(record, Trust((outer.file,))).verdict == "inconclusive", "each file on the way counts"
+    assert verdict_of(record, trusting((tmp_path / "libraries",))).verdict == "pass"
+    assert outer.executed and inner.executed and "outer" not in sys.modules, "in another process"
+
+
+@pytest.mark.parametrize(
+    "source", ["pathlib:Path", "builtins:object", "..:Mine", "a..b:Mine", ":", "/:Mine", "\0.py:M"]
+)
+def test_other_code_of_this_machine_is_no_function_to_execute(tmp_path: Path, source: str) -> None:
+    assert verdict_of(record_naming(tmp_path / "record", source)).checks[NEEDS_FUNCTION] == "unknown"
+
+
+def test_a_link_out_of_a_trusted_directory_is_not_trusted(tmp_path: Path, planted: Planted) -> None:
+    trusted = tmp_path / "trusted"
+    trusted.mkdir()
+    (trusted / "link.py").symlink_to(planted.file)
+    for source in (f"{trusted}/link.py:Mine", f"{trusted}/../code/mine.py:Mine"):
+        with pytest.raises(trust.ConfigError, match="is not trusted"):
+            vetted(source, trusting((trusted,)))
+    assert not planted.executed
+
+
+# -- what is trusted ------------------------------------------------------------------------------
+
+
+@starts_process
+def test_what_lies_in_a_trusted_directory_is_executed_in_another_process(
+    tmp_path: Path, planted: Planted
+) -> None:
+    record = record_naming(tmp_path / "record", planted.source)
+    verdict = verdict_of(record, trusting((planted.folder,)))
+    assert (verdict.verdict, verdict.reasons) == ("pass", []) and planted.executed
+    assert "mine" not in sys.modules
+
+
+@starts_process
+def test_what_this_user_has_run_is_executed_wherever_it_lies(
+    tmp_path: Path, planted: Planted, state: Path
+) -> None:
+    remembered(tmp_path / "run", planted)
+    assert (state.stat().st_mode & 0o777, (state / "functions").stat().st_mode & 0o777) == (0o700, 0o600)
+    elsewhere = tmp_path / "elsewhere.py"
+    elsewhere.write_bytes(planted.file.read_bytes())
+    assert verdict_of(record_naming(tmp_path / "record", f"{elsewhere}:Mine")).verdict == "pass"
+    assert planted.executed
+    elsewhere.write_text(planted.file.read_text() + "\n")
+    assert verdict_of(record_naming(tmp_path / "other", f"{elsewhere}:Mine")).verdict == "inconclusive"
+
+
+@starts_process
+def test_a_compiled_file_beside_a_known_one_is_not_executed(tmp_path: Path, planted: Planted) -> None:
+    remembered(tmp_path / "run", planted)
+    evil = Planted(tmp_path / "evil")
+    compiled = py_compile.compile(
+        str(evil.file), invalidation_mode=py_compile.PycInvalidationMode.UNCHECKED_HASH
+    )
+    assert compiled is not None
+    evil.file.write_bytes(planted.file.read_bytes())
+    assert verdict_of(record_naming(tmp_path / "record", evil.source)).verdict == "pass"
+    assert planted.executed and not evil.executed
+
+
+def test_a_file_that_is_exchanged_after_it_was_looked_at_is_not_executed(
+    tmp_path: Path, planted: Planted
+) -> None:
+    code = vetted(planted.source, trusting((planted.folder,)))
+    planted.file.write_text(planted.file.read_text() + "\n")
+    with pytest.raises(trust.ConfigError, match=r"mine\.py: was changed meanwhile"):
+        trust.load(code)
+    assert not planted.executed
+
+
+def test_the_run_of_this_command_executes_its_own_function_here(tmp_path: Path, planted: Planted) -> None:
+    assert verdict_of(record_naming(tmp_path / "record", planted.source), OWN_RUN).verdict == "pass"
+    assert planted.executed
+
+
+@starts_process
+def test_what_a_function_declares_is_asked_in_another_process(tmp_path: Path) -> None:
+    mine = Planted(
+        tmp_path, "from aftbed.core.application import Characteristics as C; characteristics = C(False, True)"
+    )
+    with pytest.raises(trust.ConfigError, match="--trust"):
+        declared_by(mine.source, NOBODY)
+    assert not mine.executed
+    assert not declared_by(mine.source, trusting((tmp_path,))).deterministic
+
+
+# -- trusted functions that go wrong --------------------------------------------------------------
+
+
+@starts_process
+@pytest.mark.parametrize(
+    ("body", "word"),
+    [
+        ("execute = lambda self, request: 1 / 0", "ZeroDivisionError"),
+        ("execute = lambda self, request: __import__('os')._exit(7)", "ended with code 7"),
+        ("execute = lambda self, request: __import__('os').kill(__import__('os').getpid(), 11)", "signal 11"),
+        ("execute = lambda self, request: bytes(1 << 40)", "MemoryError"),
+        ("execute = lambda self, request: 'no bytes'", "no answer"),
+        ("execute = lambda self, request: exit('bye')", "SystemExit: bye"),
+        ("execute = lambda self, request: print('noise') or b''", ""),
+        ("execute = lambda self, request: input()", "EOFError"),
+        ("def __init__(self, more): pass", "TypeError"),
+        ("execute = capture = None", "TypeError"),
+        ("pass\n\ndel Mine", "no class Mine"),
+        ("pass\n\nraise SystemExit", "SystemExit"),
+        ("this is no Python", "SyntaxError"),
+    ],
+)
+def test_a_function_that_goes_wrong_is_a_reason(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], body: str, word: str
+) -> None:
+    mine = Planted(tmp_path / "code", body)
+    found = reference_of(record_naming(tmp_path / "record", mine.source), None, trusting((mine.folder,)))
+    assert word in found.unknown and bool(found.unknown) == bool(word), found.unknown
+    assert capfd.readouterr() == ("", ""), "it prints nothing into the verdict"
+
+
+@starts_process
+def test_a_function_that_hangs_is_ended(tmp_path: Path) -> None:
+    mine = Planted(
+        tmp_path / "code",
+        f"""def execute(self, request):
+        import os
+        Path({str(tmp_path / "pid")!r}).symlink_to(str(os.getpid()))
+        while True: pass
+    """,
+    )
+    record = record_naming(tmp_path / "record", mine.source)
+    limits = ProcessLimits(seconds=4.0)
+    found = reference_of(record, None, trusting((mine.folder,)), limits)
+    assert "it takes more than 4 s" in found.unknown
+    pid = (
+        (tmp_path / "pid").readlink() if (tmp_path / "pid").is_symlink() else None
+    )  # a slow machine: not yet
+    assert pid is None or not (Path("/proc") / pid).exists()
+
+
+@starts_process
+def test_a_function_writes_nothing_and_reaches_no_network(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        mine = Planted(
+            tmp_path / "code",
+            f"""def execute(self, request):
+        import os, socket
+        try:
+            Path({str(tmp_path / "written")!r}).write_text("more than nothing")
+        except OSError:
+            pass
+        try:
+            socket.create_connection(("127.0.0.1", {port}), 1).close()
+            return b"reached"
+        except OSError:
+            return b"cut off:" + os.getcwd().encode()
+    """,
+        )
+        found = reference_of(record_naming(tmp_path / "record", mine.source), None, trusting((mine.folder,)))
+    assert not found.unknown
+    assert not (tmp_path / "written").exists() or (tmp_path / "written").stat().st_size == 0
+    if network_can_be_left():
+        assert {reply for _, reply in found.replies} == {b"cut off:/"}
+
+
+def network_can_be_left() -> bool:
+    """Whether this machine lets a process have a network of its own."""
+    pid = os.fork()
+    if pid == 0:
+        os._exit(0 if isolated.linux.leave_network() else 1)
+    return os.waitpid(pid, 0)[1] == 0
+
+
+@starts_process
+def test_versions_of_the_package_are_executed_too(tmp_path: Path) -> None:
+    """Those of the package need no trust. A name in it that is no function is a reason, not a traceback."""
+    record = record_naming(tmp_path / "record", "aftbed.vehicle.aeb.variants:WithoutStateAccess")
+    assert reference_of(record).unknown == ""
+    for source in ("aftbed.judge.reference:Succession", "aftbed.__main__:main", "aftbed.nothing:Mine"):
+        found = reference_of(record_naming(tmp_path / source, source))
+        assert source in found.unknown and "cannot be executed again" in found.unknown
+
+
+def test_without_replies_nothing_is_called_wrong(tmp_path: Path, planted: Planted) -> None:
+    record = record_naming(tmp_path / "record", planted.source)
+    evidence: Evidence = evidence_of(record)
+    assert evidence.reference.replies == () and judge(record, evidence).requests.wrong == 0
+
+
+# -- the ledger of the user -----------------------------------------------------------------------
+
+
+def noted_run(path: Path, *hashes: str) -> Path:
+    path.mkdir(parents=True)
+    (path / "functions.jsonl").write_text("".join(json.dumps({"sha256": one}) + "\n" for one in hashes))
+    return path
+
+
+def digest(number: int) -> str:
+    return sha256(str(number).encode()).hexdigest()
+
+
+def test_the_ledger_is_bounded_and_keeps_the_latest(tmp_path: Path, state: Path) -> None:
+    for part in range(3):
+        run = noted_run(tmp_path / str(part), *(digest(part * 500 + n) for n in range(500)))
+        assert remember(run) == ""
+    known, why_not = known_hashes()
+    assert why_not == "" and known == {digest(n) for n in range(500, 1500)}
+    assert (state / "functions").stat().st_size == 65_000
+    assert [path.name for path in state.iterdir()] == ["functions"]
+
+
+def test_notes_that_are_none_are_left_out(tmp_path: Path) -> None:
+    run = noted_run(tmp_path / "run", digest(1), "short")
+    with (run / "functions.jsonl").open("a") as file:
+        file.write("[]\n{}\nnot JSON\n\n" + json.dumps({"sha256": digest(2)}))
+    assert remember(run) == "" and known_hashes()[0] == {digest(1), digest(2)}
+
+
+@starts_process
+def test_a_ledger_that_others_can_write_is_not_believed(
+    tmp_path: Path, state: Path, planted: Planted
+) -> None:
+    remembered(tmp_path / "run", planted)
+    record = record_naming(tmp_path / "record", planted.source)
+    (state / "functions").chmod(0o620)
+    (reason,) = verdict_of(record).reasons
+    assert "functions must belong to this user alone" in reason and "--trust" in reason
+    assert "must belong to this user alone" in remember(noted_run(tmp_path / "more", digest(1)))
+    (state / "functions").chmod(0o600)
+    state.chmod(0o755)
+    assert "must belong to this user alone" in verdict_of(record).reasons[0]
+    state.chmod(0o700)
+    assert verdict_of(record).verdict == "pass"
+
+
+def test_a_ledger_that_is_a_link_is_not_followed(tmp_path: Path, state: Path, planted: Planted) -> None:
+    state.mkdir(mode=0o700, parents=True)
+    other = tmp_path / "other"
+    other.write_text("untouched")
+    (state / "functions").symlink_to(other)
+    assert known_hashes()[1] != "" and remember(noted_run(tmp_path / "run", digest(1))) != ""
+    assert other.read_text() == "untouched"
+
+
+def test_a_state_directory_that_cannot_be_made_is_no_error(
+    tmp_path: Path, planted: Planted, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "file"))
+    assert "File exists" in remember(noted_run(tmp_path / "run", digest(1)))
+    assert "--trust" in verdict_of(record_naming(tmp_path / "record", planted.source)).reasons[0]
+    monkeypatch.setenv("XDG_STATE_HOME", "relative")
+    assert trust.state_directory().is_absolute()
