@@ -34,10 +34,8 @@ other, and a name whose number is taken, gets the lowest free one. Number n beco
 import csv
 import io
 import logging
-import os
 import re
 import struct
-import sys
 import zlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
@@ -45,8 +43,6 @@ from contextlib import contextmanager
 from datetime import UTC, datetime
 from enum import Enum
 from importlib.util import find_spec
-from multiprocessing import get_context
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Final
 
@@ -54,7 +50,7 @@ import msgspec
 
 from aftbed.core.errors import ConfigError, PeerError, unknown
 from aftbed.interop.files import write_whole
-from aftbed.runtime.unix import linux
+from aftbed.runtime.unix.confined import JobFailedError, ProcessLimits, ask, serve
 from aftbed.vehicle.can.candump import LINE_SHOWN_CHARACTERS_MAX, LOG_BYTES_MAX, Refusal
 from aftbed.vehicle.can.dbc_file import Codec, load_dbc
 from aftbed.vehicle.can.frame import CAN_ID_MAX, DATA_LENGTH_MAX
@@ -149,7 +145,8 @@ def content(path: Path) -> bytes:
         size_bytes = path.stat().st_size
         if size_bytes > LOG_BYTES_MAX:
             raise ConfigError(f"{path}: {size_bytes} bytes, a log may have {LOG_BYTES_MAX}")
-        found = path.read_bytes()
+        with path.open("rb") as file:
+            found = file.read(LOG_BYTES_MAX)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
     if not found:
@@ -478,8 +475,11 @@ MF4_TABLES: Final = {
     FrameKind.REMOTE: "CAN_RemoteFrame",
 }
 MF4_SIGNATURES: Final = (b"MDF     ", b"UnFinMF ")
-MF4_READ_SECONDS_MAX: Final = 600.0  # 300 000 frames take 6 s
-MF4_UNREADABLE: Final = "{path}: not an MF4 that can be read: torn or malformed: {why}"
+MF4_LIMITS: Final = ProcessLimits(  # 300 000 frames take 6 s; asammdf may write temporary files
+    seconds=600.0, memory_bytes=16 << 30
+)
+MF4_TORN: Final = "not an MF4 that can be read: torn or malformed: "
+MF4_UNREADABLE: Final = f"{{path}}: {MF4_TORN}{{why}}"
 
 
 def read_mf4(path: Path) -> CanLog:
@@ -487,42 +487,31 @@ def read_mf4(path: Path) -> CanLog:
     if not content(path).startswith(MF4_SIGNATURES):
         raise ConfigError(f"{path}: not an MF4: it does not begin with MDF")
     _require_asammdf()
-    context = get_context("spawn")
-    receiver, sender = context.Pipe(duplex=False)
-    reader = context.Process(target=_read_mf4_and_send, args=(os.getpid(), path, sender))
-    reader.start()
-    sender.close()
     try:
-        found: CanLog | str = MF4_UNREADABLE.format(
-            path=path, why=f"it takes more than {MF4_READ_SECONDS_MAX:g} s"
-        )
-        if receiver.poll(MF4_READ_SECONDS_MAX):
-            found = receiver.recv()
-    except EOFError:
-        reader.join()
-        found = MF4_UNREADABLE.format(path=path, why=f"its reader ended with {reader.exitcode}")
-    finally:
-        reader.kill()
-        reader.join()
-        receiver.close()
+        answer = ask(__name__, str(path.absolute()).encode(), MF4_LIMITS)
+        found = msgspec.msgpack.decode(answer, type=CanLog | str)
+    except JobFailedError as error:
+        raise ConfigError(MF4_UNREADABLE.format(path=path, why=f"its reader {error}")) from None
+    except msgspec.DecodeError as error:
+        raise ConfigError(MF4_UNREADABLE.format(path=path, why=f"its reader answered {error}")) from None
     if isinstance(found, str):
-        raise ConfigError(found)
+        raise ConfigError(f"{path}: {found}")
     return found
 
 
-def _read_mf4_and_send(parent: int, path: Path, sender: Connection) -> None:
-    """The reader process: sends the log or an error text. Its standard error would be asammdf's."""
-    linux.die_with(parent)
-    with Path(os.devnull).open("w") as nowhere:
-        os.dup2(nowhere.fileno(), sys.stderr.fileno())
+def _read_mf4_here(job: bytes) -> bytes:
+    """In the process of the reader: the log of a path, or what is wrong with it."""
+    path = Path(job.decode())
+    answer: CanLog | str
     try:
         reader = with_asammdf().MF4Reader(io.BytesIO(content(path)))
-        sender.send(_log_of(path, reader, lambda: "in its tables of frames"))
+        answer = _log_of(path, reader, lambda: "in its tables of frames")
     except ConfigError as error:
-        sender.send(str(error))
+        answer = str(error).removeprefix(f"{path}: ")
     except Exception as error:  # noqa: BLE001 - of asammdf, python-can, and four decompressors
         why = str(error) if str(error) and "BytesIO" not in str(error) else type(error).__name__
-        sender.send(MF4_UNREADABLE.format(path=path, why=why))
+        answer = f"{MF4_TORN}{why}"
+    return msgspec.msgpack.encode(answer)
 
 
 def write_mf4(log: CanLog, path: Path) -> None:
@@ -697,3 +686,7 @@ def convert(
         kept = without(log, *TRC_LACKS) if write_as == "trc" else log
         write_whole(sink, lambda path: WRITERS[write_as](kept, path))
     return Conversion(read_as, write_as, len(kept.frames), kept.left_out)
+
+
+if __name__ == "__main__":
+    serve(_read_mf4_here)

@@ -10,11 +10,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
+import msgspec
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from aftbed.core.errors import ConfigError
+from aftbed.interop import logs
 from aftbed.interop.logs import READERS, WRITERS, CanLog, LoggedFrame, convert
 
 FRAMES: Final = tuple(LoggedFrame(1000 * n, "can0", 0x100 + n % 64, bytes(8)) for n in range(200))
@@ -205,9 +207,10 @@ def test_an_mf4_reader_that_exceeds_its_deadline_is_killed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """asammdf may follow a wild pointer in a malformed file; here the deadline is 1 ms."""
-    monkeypatch.setattr("aftbed.interop.logs.MF4_READ_SECONDS_MAX", 0.001)
+    limits = msgspec.structs.replace(logs.MF4_LIMITS, seconds=0.001)
+    monkeypatch.setattr(logs, "MF4_LIMITS", limits)
     WRITERS["mf4"](MF4, tmp_path / "a.mf4")
-    with pytest.raises(ConfigError, match=r"malformed: it takes more than 0\.001 s"):
+    with pytest.raises(ConfigError, match=r"malformed: its reader takes more than 0\.001 s"):
         READERS["mf4"](tmp_path / "a.mf4")
 
 

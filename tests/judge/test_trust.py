@@ -16,13 +16,13 @@ import pytest
 from records import whole
 
 from aftbed.core.events import Event
-from aftbed.judge import isolated
 from aftbed.judge.checks import Evidence
-from aftbed.judge.isolated import ProcessLimits, declared_by, reference_of
+from aftbed.judge.isolated import declared_by, reference_of
 from aftbed.judge.outcome import outcome_of
 from aftbed.judge.record import RunRecord, read_record
 from aftbed.judge.verdict import Verdict, evidence_of, judge
-from aftbed.runtime.unix import trust
+from aftbed.runtime.unix import linux, trust
+from aftbed.runtime.unix.confined import ProcessLimits
 from aftbed.runtime.unix.options import load_module
 from aftbed.runtime.unix.trust import NOBODY, OWN_RUN, Trust, known_hashes, note, remember, trusting, vetted
 
@@ -259,9 +259,9 @@ def test_a_function_that_hangs_is_ended(tmp_path: Path) -> None:
     """,
     )
     record = record_naming(tmp_path / "record", mine.source)
-    limits = ProcessLimits(seconds=4.0)
+    limits = ProcessLimits(seconds=4.0, memory_bytes=4 << 30)
     found = reference_of(record, None, trusting((mine.folder,)), limits)
-    assert "it takes more than 4 s" in found.unknown
+    assert "takes more than 4 s" in found.unknown
     pid = (
         (tmp_path / "pid").readlink() if (tmp_path / "pid").is_symlink() else None
     )  # a slow machine: not yet
@@ -298,7 +298,7 @@ def network_can_be_left() -> bool:
     """Whether this machine lets a process have a network of its own."""
     pid = os.fork()
     if pid == 0:
-        os._exit(0 if isolated.linux.leave_network() else 1)
+        os._exit(0 if linux.leave_network() else 1)
     return os.waitpid(pid, 0)[1] == 0
 
 
