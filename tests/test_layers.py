@@ -49,7 +49,8 @@ IMPURE_PLACES: Final = (  # where clock, socket, process, file and chance may li
     "aftbed.interop",
     "aftbed.bench",
     "aftbed.cli",
-    "aftbed.core.yaml_file",  # the one reader of files in core: all upper rows read YAML by it
+    "aftbed.core.input_file",  # the readers of files in core: all upper rows read by them
+    "aftbed.core.yaml_file",
 )
 SEEDED_PLACES: Final = ("aftbed.runtime.sim",)  # chance, but from a seed: nothing of `random` but its class
 SEEDED: Final = "from random import Random"

@@ -21,10 +21,12 @@ from aftbed.campaign.experiment import Result
 from aftbed.campaign.plan import CampaignPlan
 from aftbed.campaign.spec import Spec
 from aftbed.core.errors import ConfigError, HarnessError
+from aftbed.core.input_file import read_input
 
 CPUINFO = Path("/proc/cpuinfo")
 NAME: Final = "records.jsonl"
 LINE_BYTES_MAX: Final = 1_000_000
+LEDGER_BYTES_MAX: Final = 4 << 30
 OWN: Final = {"digest": "spec", "code": "version of the code", "shard": "shard", "shards": "number of shards"}
 
 T = TypeVar("T")
@@ -189,7 +191,7 @@ def _path_of(descriptor: int) -> str:
 
 def _bytes(path: Path) -> bytes:
     try:
-        return path.read_bytes()
+        return read_input(path, LEDGER_BYTES_MAX)
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}; is this the directory of a campaign?") from None
 

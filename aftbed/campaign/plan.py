@@ -9,6 +9,7 @@ which they end has a part in what is run.
 import hashlib
 import itertools
 import math
+import re
 from collections.abc import Iterator
 from fnmatch import fnmatchcase
 from functools import lru_cache
@@ -29,6 +30,9 @@ from aftbed.inject.memory import refuse_unsafe
 ID_DIGITS: Final = 16
 SEED_BITS: Final = 31
 JOINED: Final = " · "
+STRATA_MAX: Final = 10_000  # with those that are left out
+POINTS_MAX: Final = 100_000  # of one matrix: each of them is checked before anything runs
+_PLACE: Final = re.compile(r"\{([^{}]*)\}")
 
 
 class Stratum(msgspec.Struct, frozen=True):
@@ -90,6 +94,7 @@ class CampaignPlan(msgspec.Struct, frozen=True):
 
 def plan(spec: Spec) -> CampaignPlan:
     """The plan of `spec`, every experiment of it checked. Raises ConfigError naming the key."""
+    _check_sizes(spec)
     _check_left_out(spec)
     strata = tuple(strata_of(spec))
     if not strata:
@@ -126,6 +131,16 @@ def strata_of(spec: Spec) -> Iterator[Stratum]:
             yield Stratum(name, ftm, placement, fault, adaptation, expected)
 
 
+def _check_sizes(spec: Spec) -> None:
+    """A small file can ask for more than any machine has."""
+    parts = (spec.mechanisms, spec.system.placements, spec.adaptations, spec.faults)
+    if (strata := math.prod(map(len, parts))) > STRATA_MAX:
+        raise ConfigError(f"{strata} strata, allowed are {STRATA_MAX}")
+    for entry in spec.faults:
+        if (many := points(entry)) > POINTS_MAX:
+            raise ConfigError(f"faults: {entry.name!r}: a matrix of {many} points, allowed are {POINTS_MAX}")
+
+
 def _check_left_out(spec: Spec) -> None:
     """What is left out would be there."""
     every = [stratum.name for stratum in strata_of(msgspec.structs.replace(spec, leave_out=()))]
@@ -138,14 +153,18 @@ def _check_left_out(spec: Spec) -> None:
 
 def _filled(entry: FaultEntry, number: int, chance: Random) -> tuple[str, ...]:
     """The faults of experiment `number`: its point of the matrix, and what is drawn."""
-    names = list(entry.matrix)
-    points = list(itertools.product(*entry.matrix.values()))
-    values: dict[str, Value] = dict(zip(names, points[number % len(points)], strict=True))
+    values: dict[str, Value] = {}
+    for name, allowed in reversed(entry.matrix.items()):  # the last one changes first
+        number, at = divmod(number, len(allowed))
+        values[name] = allowed[at]
     values |= {name: chance.randint(*limits) for name, limits in entry.draw.items()}
-    try:
-        return tuple(text.format(**values) for text in entry.texts)
-    except (KeyError, IndexError, ValueError) as error:
-        raise ConfigError(f"fault {entry.texts}: {{{error}}} stands neither in matrix nor in draw") from None
+
+    def value(place: re.Match[str]) -> str:
+        if place[1] not in values:
+            raise ConfigError(f"fault {entry.texts}: {{{place[1]!r}}} stands neither in matrix nor in draw")
+        return str(values[place[1]])
+
+    return tuple(_PLACE.sub(value, text) for text in entry.texts)
 
 
 def points(entry: FaultEntry) -> int:

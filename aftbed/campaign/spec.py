@@ -31,6 +31,7 @@ from typing import Annotated, Final, Literal
 import msgspec
 from msgspec import Meta
 
+from aftbed.campaign.experiment import RATE_HZ_MAX, REQUESTS_MAX
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.graph import PLACEMENTS
 from aftbed.core.script import RECIPES
@@ -66,8 +67,8 @@ Share = Annotated[float, Meta(gt=0, lt=1)]
 class System(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What the mechanisms protect: `requests` of a load, or those of a car in `scenario`."""
 
-    requests: Annotated[int, Meta(ge=1, le=1_000_000)] = 100
-    rate_hz: Annotated[float, Meta(ge=0, le=100_000)] = 0.0  # 0: the next follows the reply
+    requests: Annotated[int, Meta(ge=1, le=REQUESTS_MAX)] = 100
+    rate_hz: Annotated[float, Meta(ge=0, le=RATE_HZ_MAX)] = 0.0  # 0: the next follows the reply
     scenario: str = ""
     placements: tuple[str, ...] = ("process",)
     runtime: Literal["unix", "sim"] = "unix"

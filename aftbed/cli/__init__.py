@@ -14,7 +14,7 @@ import sys
 from typing import Final, TextIO
 
 from aftbed.cli.app import app
-from aftbed.core.errors import ConfigError, HarnessError, PeerError
+from aftbed.core.errors import ConfigError, HarnessError, PeerError, shown
 
 EXIT_USAGE: Final = 2
 EXIT_TROUBLE: Final = 3
@@ -87,7 +87,7 @@ def _call() -> int:
 def _explain(code: int, text: str) -> int:
     """Print one line for the user; `code`."""
     with contextlib.suppress(OSError):
-        print(f"aftbed: {text}", file=sys.stderr)
+        print(shown(f"aftbed: {text}"), file=sys.stderr)
     return code
 
 

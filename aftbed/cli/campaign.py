@@ -7,6 +7,7 @@ import re
 import sys
 import time
 from contextlib import closing
+from functools import partial
 from json import dumps
 from pathlib import Path
 from typing import Annotated, Final
@@ -21,7 +22,8 @@ from aftbed.campaign.plan import CampaignPlan
 from aftbed.campaign.plan import plan as plan_of
 from aftbed.campaign.spec import EXPERIMENTS_MAX, Spec, check, read_spec, shipped
 from aftbed.cli.options import Json, TrustedFolders, check_range, jobs_of, print_json, takes
-from aftbed.core.errors import ConfigError, unknown
+from aftbed.core.errors import ConfigError, shown, unknown
+from aftbed.interop.files import write_text_whole, write_whole
 from aftbed.judge.verdict import EXIT_INTERRUPTED
 from aftbed.report.export import write_csv, write_parquet
 from aftbed.runtime.unix.trust import trusting
@@ -206,9 +208,13 @@ def _judge(folder: Path, size: int, seconds: float, *, as_json: bool) -> int:
     records = _ledger(folder)
     summary = summarise(records, size, seconds)
     document = msgspec.json.encode(summary)
-    (folder / SUMMARY).write_bytes(msgspec.json.format(document))
-    (folder / JUNIT).write_text(junit_xml(summary, records), encoding="utf-8")
-    (folder / HTML).write_text(html_report(summary, records), encoding="utf-8")
+    reports = {
+        SUMMARY: msgspec.json.format(document).decode(),
+        JUNIT: junit_xml(summary, records),
+        HTML: html_report(summary, records),
+    }
+    for name, text in reports.items():
+        write_text_whole(folder / name, text)
     if as_json:
         print(document.decode())
     else:
@@ -242,7 +248,7 @@ def export(
     writers = {".csv": write_csv, ".parquet": write_parquet}
     if out.suffix not in writers:
         raise unknown("kind of file", out.suffix, writers)
-    writers[out.suffix](_ledger(folder), out)
+    write_whole(out, partial(writers[out.suffix], _ledger(folder)))
 
 
 @campaign.command()
@@ -285,9 +291,9 @@ def compare(base: Folder, new: Folder, json: Json = False) -> None:
     if json:
         print_json(found)
     else:
-        print(f"base {found.base}, new {found.new}; {found.unpaired} experiments without their pair")
-        width = max(len(change.stratum) for change in found.changes)
-        print("\n".join(map(line, found.changes)))
+        head = f"base {found.base}, new {found.new}; {found.unpaired} experiments without their pair"
+        width = max((len(change.stratum) for change in found.changes), default=0)
+        print(shown("\n".join((head, *map(line, found.changes)))))
     raise typer.Exit(1 if found.worse else 0)
 
 
@@ -296,7 +302,7 @@ def assumptions(folder: Folder, trust: TrustedFolders = None) -> None:
     """What each mechanism assumes, and the outcomes where that does not hold, as Markdown."""
     from aftbed.campaign.assumptions import markdown  # noqa: PLC0415 - scipy
 
-    print(markdown(_ledger(folder), trusting(tuple(trust or ()))), end="")
+    print(shown(markdown(_ledger(folder), trusting(tuple(trust or ())))), end="")
 
 
 # -- one experiment -------------------------------------------------------------------------------
@@ -316,8 +322,8 @@ def replay(
     if json:
         print_json({"before": before, "after": after})
     else:
-        print(f"{_title(before)}\n  then  {_outcome(before)}\n  now   {_outcome(after)}")
-        print(before.experiment.command())
+        print(shown(f"{_title(before)}\n  then  {_outcome(before)}\n  now   {_outcome(after)}"))
+        print(shown(before.experiment.command()))
     raise typer.Exit(0 if after.outcome == before.outcome else 1)
 
 
@@ -332,7 +338,7 @@ def shrink(folder: Folder, experiment: ExperimentName, json: Json = False) -> No
     if json:
         print_json(found)
     else:
-        print(f"{_title(before)}\n  outcome  {_outcome(before)}\n  smallest  {found.command()}")
+        print(shown(f"{_title(before)}\n  outcome  {_outcome(before)}\n  smallest  {found.command()}"))
 
 
 def _title(result: Result) -> str:

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from aftbed.cli.options import Json, print_json
+from aftbed.core.errors import shown
 from aftbed.interop.openscenario.importer import ImportOptions, import_scenario, write
 
 
@@ -54,14 +55,15 @@ def import_(
         }
         print_json(document)
         return
-    print(f"{imported.path}: OpenSCENARIO {imported.version}: {' '.join(imported.description.split())}")
+    description = " ".join(imported.description.split())
+    print(shown(f"{imported.path}: OpenSCENARIO {imported.version}: {description}"))
     print("taken")
     for taken in imported.taken:
-        print(f"  line {taken.line:<5} {taken.element:26} {taken.meaning}")
+        print(shown(f"  line {taken.line:<5} {taken.element:26} {taken.meaning}"))
     print("ignored")
     for ignored in imported.ignored:
         elsewhere = f" ({ignored.path})" if ignored.path != imported.path else ""
-        print(f"  line {ignored.line:<5} {ignored.element:26} {ignored.reason}{elsewhere}")
+        print(shown(f"  line {ignored.line:<5} {ignored.element:26} {ignored.reason}{elsewhere}"))
     if imported.sets > len(paths):
         print(f"{imported.sets} sets of values, {len(paths)} of them different")
     print("\n  ".join(("written", *map(str, paths))))

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from aftbed.cli.options import print_json
+from aftbed.core.errors import shown
 from aftbed.runtime.unix.options import RunOptions
 from aftbed.vehicle.plant import Telemetry
 
@@ -136,7 +137,7 @@ def show_verdict(verdict: "Verdict", *, as_json: bool) -> None:
         print_json(verdict)
         return
     requests = verdict.requests
-    print(f"{verdict.scenario} under {verdict.ftm} ({verdict.placement}), seed {verdict.seed}")
+    print(shown(f"{verdict.scenario} under {verdict.ftm} ({verdict.placement}), seed {verdict.seed}"))
     print(
         f"  requests   {requests.sent} sent, {requests.answered} answered, {requests.lost} lost,"
         f" {requests.duplicated} duplicated, {requests.late} late, {requests.wrong} wrong"
@@ -157,12 +158,12 @@ def show_verdict(verdict: "Verdict", *, as_json: bool) -> None:
         from aftbed.runtime.unix.closed_loop import proposed_line  # noqa: PLC0415 - only with a policy
 
         for proposal in verdict.proposals:
-            print(f"  proposal   {proposed_line(proposal)}")
+            print(shown(f"  proposal   {proposed_line(proposal)}"))
     for fault in verdict.faults:
-        print(f"  fault      {fault.fault}: {fault.receipt.value}")
+        print(shown(f"  fault      {fault.fault}: {fault.receipt.value}"))
     print("  checks     " + ", ".join(f"{name} {found}" for name, found in verdict.checks.items()))
     for reason in verdict.reasons:
-        print(f"  because    {reason}")
+        print(shown(f"  because    {reason}"))
     print(f"verdict: {verdict.verdict}")
 
 

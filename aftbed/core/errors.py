@@ -33,6 +33,14 @@ class HarnessError(AftbedError):
     """The testbed itself is in trouble: the verdict is inconclusive, exit code 3."""
 
 
+def shown(text: str) -> str:
+    """A text that others may have written, fit for a terminal: it cannot move the cursor or ask for anything.
+
+    Control characters but newlines become U+FFFD, as does what changes the direction of writing.
+    """
+    return "".join(one if one.isprintable() or one == "\n" else "\ufffd" for one in text)
+
+
 def unknown(what: str, found: str, allowed: Iterable[str]) -> ConfigError:
     """A `ConfigError` that names what was found, the nearest name that exists, and all allowed."""
     names = sorted(allowed)

@@ -17,8 +17,10 @@ import yaml
 from msgspec import inspect
 
 from aftbed.core.errors import ConfigError, unknown
+from aftbed.core.input_file import read_input
 
 YAML_BYTES_MAX: Final = 100_000
+VALUES_MAX: Final = 100_000  # with what aliases repeat: each may stand for all that is before it
 _WHERE: Final = re.compile(r" - at `\$(?P<path>.*)`$")
 _UNKNOWN: Final = re.compile(r"unknown field `(?P<key>.*)`")
 _MISSING: Final = re.compile(r"missing required field `(?P<key>.*)`")
@@ -54,12 +56,11 @@ def read_yaml(path: Path, shape: type[S]) -> S:
 
 def _read(path: Path) -> bytes:
     try:
-        data = path.read_bytes()
+        return read_input(path, YAML_BYTES_MAX)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
-    if len(data) > YAML_BYTES_MAX:
-        raise ConfigError(f"{path}: {len(data)} bytes, allowed are {YAML_BYTES_MAX}")
-    return data
+    except ValueError as error:  # a name with a NUL
+        raise ConfigError(f"{path}: cannot be read: {error}") from error
 
 
 def _parse(path: Path, data: bytes) -> tuple[yaml.Node | None, object]:
@@ -67,6 +68,8 @@ def _parse(path: Path, data: bytes) -> tuple[yaml.Node | None, object]:
     try:
         loader = _Loader(data)
         root = loader.get_single_node()
+        if root is not None and _size(root, {}) > VALUES_MAX:
+            raise yaml.YAMLError(f"more than {VALUES_MAX} values, by its aliases")
         found: object = None if root is None else loader.construct_document(root)
     except yaml.MarkedYAMLError as error:
         line = f"line {error.problem_mark.line + 1}: " if error.problem_mark else ""
@@ -74,6 +77,22 @@ def _parse(path: Path, data: bytes) -> tuple[yaml.Node | None, object]:
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise ConfigError(f"{path}: not YAML: {error}") from error
     return root, found
+
+
+def _size(node: yaml.Node, known: dict[int, int]) -> int:
+    """How many values the node comes to with each alias written out. Raises YAMLError on one in itself."""
+    found = known.get(id(node))
+    if found is None:
+        known[id(node)] = -1  # under way
+        inner: list[yaml.Node] = []
+        if isinstance(node, yaml.SequenceNode):
+            inner = node.value
+        elif isinstance(node, yaml.MappingNode):
+            inner = [part for pair in node.value for part in pair]
+        found = known[id(node)] = 1 + sum(_size(one, known) for one in inner)
+    if found < 0:
+        raise yaml.YAMLError("an alias stands in what it names")
+    return found
 
 
 def _explain(error: str, root: yaml.Node | None, found: object, shape: type[msgspec.Struct]) -> str:

@@ -29,6 +29,7 @@ import msgspec
 from msgspec import UNSET, Meta, UnsetType
 
 from aftbed.core.errors import ConfigError, PeerError
+from aftbed.core.input_file import read_input
 from aftbed.judge.record import RunRecord
 from aftbed.judge.timeline import (
     Category,
@@ -46,6 +47,7 @@ from aftbed.vehicle.can.dbc_file import Codec, load_dbc
 from aftbed.vehicle.can.e2e import intact
 
 BUS_NAME: Final = "bus.log"
+BUS_LOG_BYTES_MAX: Final = 2 << 30
 STAGES: Final = ("NONE", "WARN", "PARTIAL", "FULL")
 FALLBACKS: Final = ("NONE", "HOLD", "RELEASE", "LATCH")
 INFORMATION, WARNING = 2, 3  # levels of `/log`
@@ -250,7 +252,12 @@ def _bus(path: Path, codec: Codec, *, own: bool) -> Iterator[TimedMessage]:
     names = {codec.can_id(name): name for name in readable}
     data_ids = {name: _data_id(codec, name) for name in readable}
     ego_ms: float | None = None
-    content = path.read_bytes() if path.exists() else b""  # a run that ended early has no log
+    try:
+        content = read_input(path, BUS_LOG_BYTES_MAX)
+    except FileNotFoundError:  # a run that ended early has no log
+        content = b""
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}") from None
     for logged in parse_lines(io.BytesIO(content), LogCounts()):
         t_ns, can_id, data = logged.frame.t_us * 1000, logged.frame.can_id, logged.frame.data
         name = names.get(can_id)

@@ -10,6 +10,7 @@ from typing import Final
 import msgspec
 
 from aftbed.core.errors import ConfigError, PeerError
+from aftbed.core.input_file import read_input
 from aftbed.core.journal import EntryKind, History, dropped, entries, records
 from aftbed.inject.model import FaultReport
 from aftbed.inject.receipts import ReceiptState
@@ -19,6 +20,7 @@ from aftbed.runtime.unix.options import CarRun, RunOptions
 from aftbed.runtime.unix.run_directory import HISTORY_NAME
 from aftbed.vehicle.plant import VehicleResult
 
+DOCUMENT_BYTES_MAX: Final = 64_000_000  # of a file that is no journal
 END_KEYS: Final = (
     *("reason", "ended_ns", "seconds", "left", "unfinished", "lost", "leader", "backup", "hosted", "states"),
     *("epoch", "faults"),
@@ -127,6 +129,8 @@ def read_record(path: Path) -> RunRecord:
         lost = sum(map(dropped, read.values()))
     except PeerError as error:
         raise ConfigError(f"{folder}: {error}") from None
+    except OSError as error:
+        raise ConfigError(f"{error.filename}: {error.strerror}") from None
     history = History(journals, dialogue, lost)
     end = _end(path / "end.json") if (path / "end.json").exists() else None
     faults = (
@@ -156,24 +160,26 @@ def _vehicle(options: RunOptions, end: RunEnd | None) -> VehicleResult | None:
 
 def _adaptations(path: Path) -> tuple[dict[str, object], ...]:
     try:
-        lines = (path / HISTORY_NAME).read_bytes().splitlines()
+        lines = read_input(path / HISTORY_NAME, DOCUMENT_BYTES_MAX).splitlines()
     except FileNotFoundError:
         return ()
+    except OSError as error:
+        raise ConfigError(f"{path / HISTORY_NAME}: {error.strerror}") from None
     found = []
     for line in lines:
         try:
             found.append(json.loads(line))
-        except ValueError:  # the last line, cut off with the run
+        except (ValueError, RecursionError):  # the last line, cut off with the run
             break
     return tuple(found)
 
 
 def _json(path: Path) -> dict[str, object]:
     try:
-        found = json.loads(path.read_bytes())
+        found = json.loads(read_input(path, DOCUMENT_BYTES_MAX))
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}; is this the record of a run?") from None
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ConfigError(f"{path}: not JSON: {error}") from None
     if not isinstance(found, dict):
         raise ConfigError(f"{path}: not a JSON object")

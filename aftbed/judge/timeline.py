@@ -31,8 +31,9 @@ from collections.abc import Iterator, Sequence
 from enum import Enum
 from typing import Final, NamedTuple
 
-from aftbed.core.errors import PeerError
+from aftbed.core.errors import ConfigError, PeerError
 from aftbed.core.events import FIRST_FAULT, REQUEST_EVENTS, STEP_EVENTS, Event
+from aftbed.core.input_file import read_input
 from aftbed.core.journal import EntryKind, Record
 from aftbed.inject.model import FaultReport
 from aftbed.inject.receipts import fault_and_bits
@@ -41,6 +42,7 @@ from aftbed.runtime.unix.options import LoadRun
 from aftbed.vehicle.aeb.messages import AebInput, decode_request
 
 EVENT_LOG_NAME: Final = "events.jsonl"
+EVENT_LOG_BYTES_MAX: Final = 1 << 30
 FAILURES: Final = frozenset(
     (Event.DETECTED_STOP, Event.FOLLOWER_DIVERGED, Event.NODE_DIED, Event.WATCHDOG_SUSPECT)
 )
@@ -106,12 +108,18 @@ def describe(one: Record, faults: Sequence[FaultReport]) -> str:
 def logged_events(run: RunRecord) -> Iterator[LoggedEvent]:
     """The lines of the event log, up to the first torn one."""
     path = run.path / EVENT_LOG_NAME
-    for line in path.read_bytes().splitlines() if path.exists() else ():
+    try:
+        lines = read_input(path, EVENT_LOG_BYTES_MAX).splitlines()
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}") from None
+    for line in lines:
         try:
             found = json.loads(line)
             t_ns = run.started_ns + int(found["t_ms"] * 1e6)
             yield LoggedEvent(t_ns, str(found["event"]), str(found["text"]))
-        except (ValueError, KeyError, TypeError):
+        except (ValueError, KeyError, TypeError, RecursionError):
             return
 
 

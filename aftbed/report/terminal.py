@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Final, Self
 from aftbed.campaign.experiment import Result
 from aftbed.campaign.statistics import Interval
 from aftbed.campaign.summary import GateResult, StratumSummary, Summary, TimeSummary
+from aftbed.core.errors import shown
 from aftbed.judge.outcome import OUTCOMES
 
 if TYPE_CHECKING:
@@ -43,7 +44,7 @@ def summary_lines(summary: Summary) -> list[str]:
     lines = [_head(summary)]
     lines += ["", *_aligned([_STRATUM, *map(_stratum, summary.strata)])] if summary.strata else []
     lines += ["", *_aligned([_GATE, *map(_gate, summary.gates)])] if summary.gates else []
-    return [*lines, f"gate: {summary.gate}"]
+    return [shown(line) for line in (*lines, f"gate: {summary.gate}")]
 
 
 _STRATUM: Final = ("stratum", "runs", "outcomes", "unexpected", "recovery p50, p99")

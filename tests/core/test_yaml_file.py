@@ -1,5 +1,6 @@
 """A YAML file that is refused: the error names file, line and key."""
 
+import os
 from pathlib import Path
 from typing import Annotated
 
@@ -7,7 +8,7 @@ import msgspec
 import pytest
 
 from aftbed.core.errors import ConfigError
-from aftbed.core.yaml_file import YAML_BYTES_MAX, read_yaml
+from aftbed.core.yaml_file import VALUES_MAX, YAML_BYTES_MAX, read_yaml
 
 
 class Wheel(msgspec.Struct, forbid_unknown_fields=True):
@@ -21,6 +22,11 @@ class Cart(msgspec.Struct, forbid_unknown_fields=True):
 
 
 GOOD = "name: x\nwheels:\n  - size_mm: 200\n    tyre: winter\n"
+
+# 10^9 values in 400 bytes: each list names the one before it ten times.
+LAUGHS = "wheels:\n- &l0 [ha]\n" + "".join(
+    f"- &l{n} [{', '.join([f'*l{n - 1}'] * 10)}]\n" for n in range(1, 10)
+)
 
 
 def refusal(path: Path, text: str | bytes) -> str:
@@ -63,7 +69,10 @@ def test_a_file_is_read_as_the_struct_that_declares_it(tmp_path: Path) -> None:
         (b"\xff\xfe\x00\xd8", "not YAML: "),
         ("[" * 5000, "not YAML: "),
         ("name: !!python/object:os.system {}\n", "line 1: could not determine a constructor for the tag"),
-        ("x" * (YAML_BYTES_MAX + 1), f"{YAML_BYTES_MAX + 1} bytes, allowed are {YAML_BYTES_MAX}"),
+        (b"x" * (YAML_BYTES_MAX + 1), f"cannot be read: {YAML_BYTES_MAX + 1} bytes, allowed are "),
+        (LAUGHS, f"not YAML: more than {VALUES_MAX} values, by its aliases"),
+        (LAUGHS.replace("- ", "- <<: ").replace("[ha]", "{k: ha}"), "not YAML: "),
+        ("name: &a [*a]\n", "not YAML: an alias stands in what it names"),
     ],
 )
 def test_a_bad_file_is_refused_with_the_line_of_the_error(
@@ -75,3 +84,17 @@ def test_a_bad_file_is_refused_with_the_line_of_the_error(
 def test_a_file_that_cannot_be_read_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"none\.yaml: cannot be read: No such file"):
         read_yaml(tmp_path / "none.yaml", Cart)
+
+
+def test_aliases_are_allowed(tmp_path: Path) -> None:
+    path = tmp_path / "a.yaml"
+    path.write_text("name: x\nwheels:\n- &w {size_mm: 200}\n- *w\n")
+    assert read_yaml(path, Cart).wheels == [Wheel(200), Wheel(200)]
+
+
+def test_what_is_no_regular_file_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "fifo.yaml")
+    (tmp_path / "zero.yaml").symlink_to("/dev/zero")
+    for name in ("fifo.yaml", "zero.yaml"):
+        with pytest.raises(ConfigError, match=f"{name}: cannot be read: not a regular file"):
+            read_yaml(tmp_path / name, Cart)

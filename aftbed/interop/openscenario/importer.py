@@ -23,6 +23,7 @@ from typing import Final
 import msgspec
 
 from aftbed.core.errors import ConfigError, unknown
+from aftbed.interop.files import write_text_whole
 from aftbed.interop.openscenario.document import (
     CONTROLLERS,
     Element,
@@ -121,7 +122,7 @@ def write(imported: ImportedFile, folder: Path, *, force: bool) -> list[Path]:
                 raise ConfigError(f"{path}: exists, and says something else; --force writes over it")
         folder.mkdir(parents=True, exist_ok=True)
         for path, variation in zip(paths, imported.variations, strict=True):
-            path.write_text(variation.text, encoding="utf-8")
+            write_text_whole(path, variation.text)
     except OSError as error:
         raise ConfigError(f"{error.filename or folder}: cannot be written: {error.strerror}") from error
     return paths

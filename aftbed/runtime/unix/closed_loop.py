@@ -56,6 +56,7 @@ from aftbed.adapt.suitability import unsuitable
 from aftbed.core import journal
 from aftbed.core.application import Characteristics
 from aftbed.core.errors import AftbedError, ConfigError, PeerError, unknown
+from aftbed.core.input_file import read_input
 from aftbed.core.journal import Record
 from aftbed.core.messages import Goal
 from aftbed.ftm.compose import NONE
@@ -69,6 +70,7 @@ from aftbed.vehicle.aeb.function import default_application
 
 PERIOD_SECONDS: Final = 0.1
 PROPOSALS_NAME: Final = "proposals.jsonl"
+PROPOSALS_BYTES_MAX: Final = 64_000_000
 APPROVALS: Final = ("auto", "ask")
 MEASURED: Final[tuple[Resource, ...]] = ("cpus", "cpu_load")
 LOAD_SAMPLES: Final = 10  # CPU load is that of the last second
@@ -463,6 +465,9 @@ def read_proposals(record: Path) -> list[Proposed] | None:
     if not path.exists():
         return None
     try:
-        return [msgspec.json.decode(line, type=Proposed) for line in path.read_bytes().splitlines()]
+        lines = read_input(path, PROPOSALS_BYTES_MAX).splitlines()
+        return [msgspec.json.decode(line, type=Proposed) for line in lines]
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}") from None
     except msgspec.DecodeError as error:
         raise ConfigError(f"{path}: not the proposals of a run: {error}") from None

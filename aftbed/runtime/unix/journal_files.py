@@ -14,6 +14,7 @@ from typing import Final
 from aftbed.core import journal as layout
 from aftbed.core.errors import PeerError
 from aftbed.core.events import Event
+from aftbed.core.input_file import open_input
 from aftbed.runtime.unix import linux
 
 CHUNK_BYTES: Final = 1 << 20
@@ -25,12 +26,13 @@ STEP_BYTES_MAX: Final = 8 * layout.RECORD.size  # what the notes of one step tak
 
 
 def contents(path: Path) -> layout.Data:
-    """The file, read. Raises OSError.
+    """The file, read. Raises OSError, also where it is no regular file.
 
     It is not mapped: where a tmpfs is full, the kernel sends SIGBUS even to a process that reads the empty
     part of a chunk.
     """
-    return path.read_bytes()
+    with open_input(path) as file:
+        return file.read()
 
 
 def _mapped(path: Path, name: str) -> mmap.mmap:

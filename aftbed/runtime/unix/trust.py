@@ -30,6 +30,7 @@ import msgspec
 
 import aftbed
 from aftbed.core.errors import ConfigError
+from aftbed.core.input_file import read_input
 from aftbed.runtime.unix.options import SourceLoader
 
 PACKAGE: Final = Path(aftbed.__file__).resolve().parent
@@ -140,19 +141,8 @@ def search_path() -> list[str]:
 
 
 def _hash(path: Path) -> str:
-    return sha256(_read(path)).hexdigest()
-
-
-def _read(path: Path) -> bytes:
-    """Raises OSError; ValueError if it is no file, or too large."""
-    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
-    with open(descriptor, "rb") as file:
-        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-            raise ValueError(f"{path} is no file")
-        data = file.read(FILE_BYTES_MAX + 1)
-    if len(data) > FILE_BYTES_MAX:
-        raise ValueError(f"{path} has more than {FILE_BYTES_MAX} bytes")
-    return data
+    """Raises OSError, ValueError."""
+    return sha256(read_input(path, FILE_BYTES_MAX)).hexdigest()
 
 
 # -- loading it, in the process that executes it --------------------------------------------------
@@ -166,7 +156,7 @@ class _HashedLoader(SourceLoader):
         self._file = file
 
     def source(self) -> bytes:
-        data = _read(Path(self._file.path))
+        data = read_input(Path(self._file.path), FILE_BYTES_MAX)
         if sha256(data).hexdigest() != self._file.sha256:
             raise ConfigError(f"{self._file.path}: was changed meanwhile")
         return data

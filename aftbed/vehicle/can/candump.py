@@ -111,7 +111,8 @@ def read_log(path: Path) -> tuple[list[LogFrame], LogCounts]:
         size_bytes = path.stat().st_size
         if size_bytes > LOG_BYTES_MAX:
             raise ConfigError(f"{path}: {size_bytes} bytes, a log may have {LOG_BYTES_MAX}")
-        content = path.read_bytes()
+        with path.open("rb") as file:
+            content = file.read(LOG_BYTES_MAX)
     except OSError as error:
         raise ConfigError(f"{path}: cannot read the log: {error.strerror}") from error
     counts = LogCounts()

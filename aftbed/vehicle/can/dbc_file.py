@@ -200,7 +200,8 @@ def load_dbc(path: Path | None = None, *, strict: bool = True) -> Codec:
     try:
         if chosen.stat().st_size > DBC_BYTES_MAX:
             raise ConfigError(f"{chosen}: more than {DBC_BYTES_MAX} bytes, not a DBC")
-        text = chosen.read_text(encoding="cp1252")  # what DBC files are written in
+        with chosen.open("rb") as file:
+            text = file.read(DBC_BYTES_MAX).decode("cp1252")  # what DBC files are written in
     except OSError as error:
         raise ConfigError(f"{chosen}: cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:
