@@ -136,7 +136,7 @@ def start_interpreter(module: str, descriptor: int, *arguments: str) -> int:
     home, environment = str(Path(__file__).resolve().parents[3]), dict(os.environ)
     if home not in site.getsitepackages():
         path = os.environ.get("PYTHONPATH")
-        environment["PYTHONPATH"] = home if path is None else os.pathsep.join((home, path))
+        environment["PYTHONPATH"] = os.pathsep.join((home, path)) if path else home
     return os.posix_spawn(
         sys.executable,
         [sys.executable, "-P", "-m", module, *arguments],

@@ -164,8 +164,8 @@ def remove(private: Path) -> None:
 def record_directory(path: Path) -> Path:
     """Make the directory of a record; raises ConfigError if `path` exists or cannot be made."""
     try:
-        path.mkdir(mode=0o755, parents=True)  # whatever the umask: its own command trusts what is in it
-        (path / "journal").mkdir(mode=0o755)
+        path.mkdir(mode=0o700, parents=True)  # whatever the umask: its own command trusts what is in it
+        (path / "journal").mkdir(mode=0o700)
     except FileExistsError:
         raise ConfigError(f"--record {path}: exists already; name a directory that does not") from None
     except OSError as error:
