@@ -79,3 +79,13 @@ def test_a_ledger_that_cannot_be_kept_is_a_note(tmp_path: Path, ledger: Path) ->
     done = aftbed(*LOAD, "--adapt", f"update app to {mine}:Mine at request 9")
     assert done.code == 0
     assert "aftbed: note: aftbed check will ask for --trust" in done.err and "File exists" in done.err
+
+
+def test_no_module_is_imported_from_the_working_directory(tmp_path: Path) -> None:
+    """`python -m` puts it in the first place of the path."""
+    for name in ("msgspec", "typer", "yaml", "can", "json", "multiprocessing"):
+        (tmp_path / f"{name}.py").write_text(f"open({str(tmp_path / 'EXECUTED')!r}, 'a').write({name!r})\n")
+    line = [sys.executable, "-m", "aftbed", "log", "convert", "none.asc", "none.log"]
+    done = subprocess.run(line, capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert done.returncode == 2 and "none.asc: cannot be read" in done.stderr
+    assert not (tmp_path / "EXECUTED").exists()
