@@ -15,7 +15,11 @@ from typing import Final
 
 import msgspec
 
+from aftbed.core.input_file import open_input, read_input
+
 NAME: Final = "seal.json"
+SEAL_BYTES_MAX: Final = 4_000_000
+PART_BYTES: Final = 1 << 20
 
 
 class Seal(msgspec.Struct, frozen=True):
@@ -52,7 +56,7 @@ def changes(record: Path) -> Iterator[str]:
     if not sealed(record):
         return
     try:
-        seal = msgspec.json.decode((record / NAME).read_bytes(), type=Seal)
+        seal = msgspec.json.decode(read_input(record / NAME, SEAL_BYTES_MAX), type=Seal)
     except (OSError, msgspec.MsgspecError):
         yield f"{NAME} is not a seal"
         return
@@ -67,5 +71,8 @@ def changes(record: Path) -> Iterator[str]:
 
 
 def _hash(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    digest = hashlib.sha256()
+    with open_input(path) as file:
+        while part := file.read(PART_BYTES):
+            digest.update(part)
+    return digest.hexdigest()
