@@ -282,6 +282,8 @@ class Adaptations:
         if not (now.phase is Phase.COMMIT and failure):
             self._executor.held = False
         self._send(messages.Progress(now.outcome.number, now.phase, failure))
+        if now.phase is Phase.COMMIT and not failure:  # faults that waited in what was exchanged
+            self._loop.tasks.start("rearm", self._faults.rearm(), lambda _: None)
         if now.phase in (Phase.COMMIT, Phase.UNDO) and not self._executor.busy:
             self._inform_recovery()
 

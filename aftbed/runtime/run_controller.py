@@ -224,7 +224,9 @@ class RunController:
             if node == ENGINE and serves:
                 self.adaptations.engine_is_new()
             if node == CLIENT and serves:
-                self._loop.tasks.start("rearm", self.adaptations.client_is_new(), lambda _: None)
+                self._loop.tasks.start("resume client", self.adaptations.client_is_new(), lambda _: None)
+            if serves:  # faults that waited in the dead one
+                self._loop.after(SETTLE_SECONDS, self._rearm)
             self._runtime.pool.refill(LIGHT, self.spares())
 
         held = node == CLIENT and self.adaptations.to_come  # until it knows what waits for its requests

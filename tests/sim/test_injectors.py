@@ -372,3 +372,31 @@ def test_a_state_that_is_hit_in_a_backup_and_overwritten_was_never_used() -> Non
 )
 def test_each_fault_ends_with_a_receipt(text: str, receipt: str) -> None:
     assert receipts(played("pbr", text.replace("1h", "3600s"))) == [receipt]
+
+
+# -- where the host of a fault is replaced while the fault waits
+
+
+@pytest.mark.parametrize(
+    "fault", ["crash proxy at request.sent nth 30", "crash proxy at reply.delivered nth 30"]
+)
+def test_a_fault_that_waits_in_a_client_waits_on_in_the_next_one(fault: str) -> None:
+    run = played("pbr", "crash client at request.sent nth 10", fault)
+    assert receipts(run) == ["activated", "activated"]
+
+
+def test_a_fault_strikes_while_an_adaptation_is_observed() -> None:
+    """The brick that emits its event was exchanged just before: the occurrences on both sides count.
+
+    One may be missed, that of the request which the new brick answers before the fault has moved there.
+    """
+    text, nth = "crash primary at server.exit nth {}", 14
+    adaptation = (Scheduled(Goal(expression="lfr"), 4),)
+    run = World(Setup("pbr", "replica", 1, COUNT, RATE_HZ, (parse(text.format(nth)),), adaptation)).run()
+    assert receipts(run) == ["activated"]
+    (struck,) = run.history.events(Event.FAULT_APPLIED)
+    first = [r for r in run.history.journals["a.1"] if r.event is Event.SERVER_EXIT]
+    second = [r for r in run.history.journals["a.2"] if r.event is Event.SERVER_EXIT]
+    assert first and struck.t_ns == second[-1].t_ns
+    assert 0 <= len(first) + len(second) - nth <= 1
+    assert [o.outcome for o in run.adaptations] == ["rolled back"]
