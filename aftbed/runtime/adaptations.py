@@ -111,9 +111,8 @@ class Adaptations:
         self._current: _Current | None = None
         self._count = 0
         self.history: list[Outcome] = []
-        self._scheduled: list[
-            tuple[int, messages.Scheduled]
-        ] = []  # with their places: they wait for a request
+        self._scheduled: list[tuple[int, messages.Scheduled]] = []  # with their places, until their request
+        self._asked_with_run = 0
 
     @property
     def busy(self) -> bool:
@@ -124,6 +123,17 @@ class Adaptations:
     def to_come(self) -> bool:
         """Whether a scheduled adaptation waits for its request."""
         return bool(self._scheduled)
+
+    @property
+    def scheduled(self) -> tuple[Outcome | None, ...]:
+        """What became of each adaptation that was asked for with the run, in the order asked.
+
+        None: it has not begun. An empty `outcome`: it is under way.
+        """
+        ended = {one.scheduled: one for one in self.history}
+        if self._current is not None:
+            ended[self._current.outcome.scheduled] = self._current.outcome
+        return tuple(ended.get(place) for place in range(1, self._asked_with_run + 1))
 
     @property
     def acting(self) -> bool:
@@ -183,6 +193,7 @@ class Adaptations:
 
     def schedule(self, scheduled: tuple[messages.Scheduled, ...]) -> Keys:
         """Begin the adaptations requested with the run, each when the Client reaches its request."""
+        self._asked_with_run = len(scheduled)
         for place, later in enumerate(scheduled, 1):
             if later.at_request:
                 self._scheduled.append((place, later))

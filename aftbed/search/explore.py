@@ -10,12 +10,13 @@ that a broken one is repeated by its number in the same `Selection`.
 
 import itertools
 from collections.abc import Callable, Generator, Iterable, Iterator
-from functools import partial
+from functools import lru_cache, partial
 from random import Random
 from typing import Final, NamedTuple
 
 import msgspec
 
+from aftbed.adapt.engine import REFUSED
 from aftbed.adapt.planner import plan, target
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.events import Event
@@ -36,6 +37,7 @@ from aftbed.runtime.sim.clock import Clock
 from aftbed.runtime.sim.interleaving import HeldChannel, orders
 from aftbed.runtime.sim.world import Doom, Run, Setup, World, simulate
 from aftbed.runtime.unix.worker_pool import SECONDS_MAX, Alone, each
+from aftbed.search.tally import Happened, happened_in
 
 ADAPTABLE: Final = tuple(
     ftm for ftm in DUPLEX_EXPRESSIONS if all(MECHANISMS[name].adaptations_explored for name in parse(ftm))
@@ -50,6 +52,22 @@ EXECUTIVE: Final = "executive"  # beside the checks: it broke down
 REASON_MAX: Final = 300  # characters of an error of our own
 
 
+class ScriptSteps(NamedTuple):
+    """The steps of an adaptation at which a fault can strike, and the nodes that the first of them stage."""
+
+    staged: tuple[str, ...]
+    total: int
+
+
+@lru_cache(maxsize=512)
+def steps_of(old: str, new: str, placement: str) -> ScriptSteps:
+    """Those of the adaptation from `old` to `new`. Raises ConfigError where nothing leads there."""
+    start = build(old, placement)
+    script = plan(start, target(start, new)).script
+    staged = tuple(v.node for v in flat(script.prepare) if isinstance(v, Stage))
+    return ScriptSteps(staged, len(staged) + len(script.commit))
+
+
 class Strike(NamedTuple):
     """A node that dies at a step of an adaptation, before or behind it."""
 
@@ -62,11 +80,9 @@ class Strike(NamedTuple):
 
 def strikes(old: str, new: str, placement: str) -> Iterator[Strike]:
     """All of one way: each node that takes part, and each process that is staged, as soon as it is."""
-    start = build(old, placement)
-    script = plan(start, target(start, new)).script
-    staged = [v.node for v in flat(script.prepare) if isinstance(v, Stage)]
-    steps = range(1, len(staged) + len(script.commit) + 1)
-    for node, when, step in itertools.product(start.nodes, STEPS, steps):
+    staged, count = steps_of(old, new, placement)
+    steps = range(1, count + 1)
+    for node, when, step in itertools.product(build(old, placement).nodes, STEPS, steps):
         if node not in ELSEWHERE:
             yield Strike(old, new, node, when, step)
     for node, when, step in itertools.product(staged, STEPS, steps):
@@ -209,12 +225,19 @@ class Explored(msgspec.Struct, frozen=True):
 
 
 class Found(NamedTuple):
-    """What came of an experiment; `missed` are the faults and adaptations that never came about."""
+    """What came of an experiment; `missed` are the faults and adaptations that never came about.
+
+    `happened` is None where the executive itself broke down.
+    """
 
     lost: bool
     breaches: tuple[Breach, ...]
     requests: int = 0
     missed: tuple[str, ...] = ()
+    happened: Happened | None = None
+
+
+Attempt = Callable[[Setup], tuple[Run | None, tuple[Breach, ...]]]
 
 
 def attempt(setup: Setup) -> tuple[Run | None, tuple[Breach, ...]]:
@@ -227,20 +250,23 @@ def attempt(setup: Setup) -> tuple[Run | None, tuple[Breach, ...]]:
     return run, breaches(run)
 
 
-def tried(setup: Setup) -> Found:
-    """One experiment, in numbers."""
+def tried(setup: Setup, attempt: Attempt = attempt) -> Found:
+    """One experiment, in numbers, as `attempt` makes and judges it."""
     run, broken = attempt(setup)
     if run is None:
         return Found(False, broken)
     sent = sum(e.kind is EntryKind.SENT for e in run.history.dialogue)
-    return Found(run.rest.lost, broken, sent, missed(run))
+    return Found(run.rest.lost, broken, sent, missed(run), happened_in(run))
 
 
 def missed(run: Run) -> tuple[str, ...]:
     """G8: what was to happen in `run` and did not, so that it proves nothing about it."""
     found = [f"never fired: {f.fault}" for f in run.faults if not f.fired]
-    late = run.setup.adaptations[len(run.adaptations) :]
-    return (*found, *(f"never began: the adaptation to {s.goal.expression or s.goal.part}" for s in late))
+    for asked, outcome in zip(run.setup.adaptations, run.scheduled, strict=True):
+        if outcome is None or (outcome.outcome == REFUSED and not outcome.total_ms):
+            why = f": {outcome.reason}" if outcome is not None else ""
+            found.append(f"never began: the adaptation to {asked.goal.expression or asked.goal.part}{why}")
+    return tuple(found)
 
 
 def judged(setup: Setup) -> tuple[bool, tuple[Breach, ...]]:

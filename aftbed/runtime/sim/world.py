@@ -101,6 +101,7 @@ class Run(msgspec.Struct, frozen=True):
     logged: tuple[tuple[int, str, str], ...]  # time, event, text
     scripts: tuple[ScriptRun, ...]  # of Recovery
     adaptations: tuple[Outcome, ...]
+    scheduled: tuple[Outcome | None, ...]  # those of the setup, as `Adaptations.scheduled`
     faults: tuple[FaultReport, ...]
     failures: tuple[str, ...]  # of asserts, in nodes
     vehicle: VehicleResult | None
@@ -527,6 +528,7 @@ class World:
             tuple(self.logged),
             tuple(self.controller.scripts),
             tuple(self.controller.adaptations.history),
+            self.controller.adaptations.scheduled,
             tuple(self.controller.faults.reports()),
             tuple(self.failures),
             self._drive.result() if self._drive is not None else None,
