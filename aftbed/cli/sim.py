@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Final, NamedTuple
 
@@ -48,9 +49,10 @@ from aftbed.runtime.sim.world import check as check_fault
 from aftbed.runtime.unix.trust import trusting
 from aftbed.runtime.unix.worker_pool import each
 from aftbed.search.agreement import SEEDS, RecoveryRange, against
-from aftbed.search.explore import Found, attempt, missed, tried
+from aftbed.search.explore import Attempt, Found, attempt, missed, tried
 from aftbed.search.shrink import shrink
-from aftbed.search.swarm import drawn
+from aftbed.search.swarm import attempt_drawn, drawn, intended
+from aftbed.search.tally import Tally, happened_in
 from aftbed.vehicle.aeb.function import default_application
 from aftbed.vehicle.scenarios.library import load_scenario
 
@@ -122,7 +124,8 @@ def sim(given: SimArguments) -> int:
 
     The bricks, scripts and faults are those of real runs.
 
-    Exit code: 0 pass, 1 a promise was broken, 2 usage, 3 a fault did not fire, 130 interrupted.
+    Exit code: 0 pass, 1 a promise was broken, 2 usage, 3 a fault did not fire or a swarm proves too little,
+    130 interrupted.
     """
     if given.against:
         return _compare(given)
@@ -339,6 +342,11 @@ class Picture(NamedTuple):
     mermaid: str
 
 
+def _attempt(*, swarm: bool) -> Attempt:
+    """How a run is made and judged: what a swarm drew not to happen must not have happened."""
+    return attempt_drawn if swarm else attempt
+
+
 def picture(setup: Setup, broken: tuple[Breach, ...]) -> Picture:
     """Simulates `setup` again, traced. Empty if the executive itself failed."""
     if attempt(setup)[0] is None:
@@ -383,7 +391,7 @@ def broken_run(setup: Setup, broken: tuple[Breach, ...], *, swarm: bool, shrinks
     original = repeating(setup, swarm=swarm)
     if not shrinks:
         return BrokenRun(setup, broken, original, None, "")
-    smaller = shrink(setup, lambda simpler: attempt(simpler)[1])
+    smaller = shrink(setup, lambda simpler: _attempt(swarm=swarm)(simpler)[1])
     return BrokenRun(setup, broken, original, smaller, repeating(smaller))
 
 
@@ -398,11 +406,12 @@ class _DoneRun(NamedTuple):
     outcome: str
     virtual_ms: float
 
-    def lines(self, wall_ms: float) -> Iterator[str]:
-        """The events, the adaptations and the outcome of its faults."""
+    def lines(self, wall_ms: float, tally: Tally) -> Iterator[str]:
+        """The events, the adaptations, what became of what was asked for, and the outcome of the faults."""
         yield from event_lines(self.run)
         ended = msgspec.convert(msgspec.to_builtins(self.run.adaptations), list[EndedAdaptation])
         yield from history_lines(ended) if ended else ()
+        yield from tally.lines()
         outcome = f"; outcome: {self.outcome}" if self.run.setup.faults else ""
         yield f"{self.virtual_ms:.1f} ms of virtual time in {wall_ms:.1f} ms{outcome}"
 
@@ -427,18 +436,21 @@ def _judged(run: Run, word: Word, reasons: list[str]) -> _DoneRun:
 
 def _simulate_one(given: SimArguments, setup: Setup) -> int:
     began_s = time.perf_counter()
-    run, broken = attempt(setup)
+    run, broken = _attempt(swarm=given.swarm)(setup)
     wall_ms = round((time.perf_counter() - began_s) * 1e3, 3)
     lacking = missed(run) if run is not None and not given.swarm else ()
     word: Word = "fail" if broken else "inconclusive" if lacking else "pass"
     reasons = [*map(str, broken), *lacking]
     done = _judged(run, word, reasons) if run is not None else None
+    tally = Tally()
+    if run is not None:
+        tally.add(happened_in(run), intended(setup) if given.swarm else None)
     if not given.json:
         print(f"seed {setup.seed}\n{described(setup)}")
         if done is None:
             print("\n".join((*(f"  because    {reason}" for reason in reasons), f"verdict: {word}")))
         else:
-            print("\n".join(done.lines(wall_ms)))
+            print("\n".join(done.lines(wall_ms, tally)))
             show_verdict(done.verdict, as_json=False)
     found = broken_run(setup, broken, swarm=given.swarm) if broken else None
     drawing = picture(setup, broken) if broken or given.diagram is not None else Picture([], "")
@@ -447,7 +459,8 @@ def _simulate_one(given: SimArguments, setup: Setup) -> int:
     if given.json:
         about = {"seed": setup.seed, "verdict": word, "setup": described(setup), "missed": lacking}
         breach = found.document() if found is not None else {"breaches": [], "command": None, "shrunk": None}
-        print_json({**about, **breach, **(done.document() if done is not None else {}), "wall_ms": wall_ms})
+        happened = {**done.document(), "happened": tally.document()} if done is not None else {}
+        print_json({**about, **breach, **happened, "wall_ms": wall_ms})
     else:
         for line in (*drawing.lines, *found.lines()) if found is not None else ():
             print(line)
@@ -472,6 +485,7 @@ class _ManyRuns:
         self._runs = self._unavailable = self._requests = self._inconclusive = 0
         self._broken: list[tuple[Setup, tuple[Breach, ...]]] = []
         self._missed: list[str] = []
+        self._tally = Tally()
 
     def simulate(self, make: MakeSetup, first: int, last: int, jobs: int) -> int:
         """Simulate the seeds from `first` to `last` in `jobs` processes, show the result; the exit code."""
@@ -480,7 +494,8 @@ class _ManyRuns:
         if not given.json:
             print(f"seeds {first}..{'' if seconds else last}", flush=True)
         setups = map(make, range(first, last + 1))
-        results = each(tried, setups, jobs, alone=lambda _, setup: repeating(setup, swarm=given.swarm))
+        try_ = partial(tried, attempt=_attempt(swarm=given.swarm))
+        results = each(try_, setups, jobs, alone=lambda _, setup: repeating(setup, swarm=given.swarm))
         interrupted = False
         try:
             with progress_bar("sim", seconds or last - first + 1, quiet=given.json) as show, closing(results):
@@ -501,13 +516,16 @@ class _ManyRuns:
         elif given.diagram is not None:
             print(f"aftbed: note: nothing broke: {given.diagram} is not written", file=sys.stderr)
         self._show(broken, (first, first + self._runs - 1), max(took_s, 1e-9))
-        word: Word = "fail" if self._broken else "inconclusive" if self._inconclusive else "pass"
+        proves_little = bool(self._inconclusive or self._vacuous())
+        word: Word = "fail" if self._broken else "inconclusive" if proves_little else "pass"
         return EXIT_INTERRUPTED if interrupted else EXIT_CODES[word]
 
     def _count(self, setup: Setup, found: Found) -> None:
         self._runs += 1
         self._requests += found.requests
         self._unavailable += found.lost and not found.breaches
+        if found.happened is not None:
+            self._tally.add(found.happened, intended(setup) if self._given.swarm else None)
         if found.missed and not self._given.swarm:
             self._inconclusive += 1
             self._missed.append(f"seed {setup.seed}: {found.missed[0]}")
@@ -515,6 +533,10 @@ class _ManyRuns:
             self._broken.append((setup, found.breaches))
             if not self._given.json and len(self._broken) <= LISTED_MAX:
                 print(f"seed {setup.seed}: {found.breaches[0]}", flush=True)
+
+    def _vacuous(self) -> list[str]:
+        """Why a swarm proves too little; other runs were asked for one by one, see `missed`."""
+        return self._tally.vacuous() if self._given.swarm else []
 
     def _show(self, broken: list[BrokenRun], seeds: tuple[int, int], took_s: float) -> None:
         survived = self._runs - len(broken)
@@ -525,6 +547,8 @@ class _ManyRuns:
                 "survived": survived,
                 "unavailable": self._unavailable,
                 "inconclusive": self._inconclusive,
+                **self._tally.document(),
+                "vacuous": self._vacuous(),
                 "broken": [found.document() for found in broken],
                 "runs_per_second": round(self._runs / took_s, 1),
                 "requests_per_second": round(self._requests / took_s, 1),
@@ -541,6 +565,8 @@ class _ManyRuns:
             print(reason)
         if self._inconclusive:
             print(f"inconclusive: in {spaced(self._inconclusive)} runs, what was asked for never came about")
+        for line in (*self._tally.lines(), *self._vacuous()):
+            print(line)
         print(
             f"{spaced(survived)} of {spaced(self._runs)} survived ({spaced(self._unavailable)} unavailable)"
             f" in {took_s:.1f} s: {spaced(self._runs / took_s)} runs/s,"

@@ -232,6 +232,57 @@ def test_a_swarm_is_drawn_from_the_seed(sim: Call) -> None:
     assert json.loads(out)["setup"].startswith(f"{drawn(3).ftm} ({drawn(3).placement}), seed 3, ")
 
 
+def test_a_swarm_counts_what_it_drew_beside_what_happened(sim: Call) -> None:
+    code, out, _ = sim("--swarm", "--seeds", "0..29")
+    assert code == 0
+    assert re.search(r"^faults: [0-9]+ drawn to happen: [0-9]+ activated", out, re.MULTILINE)
+    assert re.search(r"^adaptations: [0-9]+ drawn to happen: [0-9]+ done", out, re.MULTILINE)
+    found = json.loads(sim("--swarm", "--seeds", "0..29", "--json")[1])
+    setups = [drawn(seed) for seed in range(30)]
+    assert sum(group["total"] for group in found["faults"].values()) == sum(len(s.faults) for s in setups)
+    adaptations = sum(group["total"] for group in found["adaptations"].values())
+    assert adaptations == sum(len(s.adaptations) for s in setups)
+    assert found["vacuous"] == []
+
+
+def test_one_run_tells_what_became_of_what_it_drew(sim: Call) -> None:
+    seed = next(s for s in range(100) if len(drawn(s).faults) == 2 and len(drawn(s).adaptations) == 1)
+    _, out, _ = sim("--swarm", "--seed", str(seed))
+    assert re.search(r"^faults: [12] drawn ", out, re.MULTILINE)
+    assert re.search(r"^adaptations: 1 drawn ", out, re.MULTILINE)
+    _, out, _ = sim("--count", "10", "--faults", "crash primary at server.exit nth 3")
+    assert "faults: 1 asked for: 1 activated" in out.splitlines()
+    _, out, _ = sim("--count", "10", "--adapt", "to lfr at request 3", "--json")
+    assert json.loads(out)["happened"]["adaptations"] == {"asked": {"total": 1, "done": 1}}
+
+
+def test_a_swarm_that_proves_too_little_is_inconclusive(sim: Call, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("aftbed.search.tally.ENOUGH_RUNS", 5)
+    monkeypatch.setattr("aftbed.search.tally.ACTIVATED_MIN", 1.1)
+    code, out, _ = sim("--swarm", "--seeds", "0..3")
+    assert code == 0 and "vacuous" not in out
+    code, out, _ = sim("--swarm", "--seeds", "0..4")
+    assert code == 3
+    assert re.search(r"^vacuous: [0-9]+ of [0-9]+ faults were activated; these runs prove", out, re.MULTILINE)
+    code, out, _ = sim("--swarm", "--seeds", "0..4", "--json")
+    assert code == 3 and len(json.loads(out)["vacuous"]) == 1
+    code, _, _ = sim("--seeds", "0..4", "--count", "5")
+    assert code == 0
+
+
+def test_a_broken_promise_counts_more_than_a_swarm_that_proves_too_little(
+    sim: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def breaks_down(setup: Setup) -> None:
+        raise KeyError("a/server")
+
+    monkeypatch.setattr("aftbed.search.tally.ENOUGH_RUNS", 1)
+    monkeypatch.setattr("aftbed.search.explore.simulate", breaks_down)
+    monkeypatch.setattr("aftbed.cli.sim.SHRUNK_MAX", 0)
+    code, out, _ = sim("--swarm", "--seeds", "0..1")
+    assert code == 1 and "the executive broke down: KeyError" in out
+
+
 # -- real records beside their simulation
 
 FAST: Final = RecoveryRange(20, 0.2, 0.4, 0.6)
