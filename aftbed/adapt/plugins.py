@@ -10,7 +10,7 @@ from types import ModuleType
 from typing import Final
 
 from aftbed.adapt.engine import AdaptationEngine
-from aftbed.core.application import Application, Characteristics
+from aftbed.core.application import REPLY_BYTES_MAX, STATE_BYTES_MAX, Application, Characteristics
 from aftbed.core.brick import Brick
 from aftbed.core.errors import ConfigError
 from aftbed.core.graph import BrickSpec, Kind
@@ -49,7 +49,32 @@ def load_application(source: str, load_module: LoadModule) -> Callable[[], Appli
     missing = [n for n in APPLICATION_NAMES if not hasattr(found, n)]
     if missing:
         raise ConfigError(f"{source} is no protected function: it lacks {', '.join(missing)}")
-    return found
+    return _checked(found)
+
+
+def _checked(found: type) -> Callable[[], Application]:
+    """The class, with its results checked: what is no bytes, or too long, ends the node (fail-silence).
+
+    Otherwise nothing that it sends could be read, and the service would stand still.
+    """
+
+    class Checked(found):  # type: ignore[misc]
+        def execute(self, request: bytes) -> bytes:
+            return _bytes("execute", super().execute(request), REPLY_BYTES_MAX)
+
+        def capture(self) -> bytes:
+            return _bytes("capture", super().capture(), STATE_BYTES_MAX)
+
+    Checked.__name__, Checked.__qualname__ = found.__name__, found.__qualname__
+    return Checked
+
+
+def _bytes(what: str, result: object, bytes_max: int) -> bytes:
+    if not isinstance(result, bytes):
+        raise TypeError(f"{what} returned {type(result).__name__}, bytes are required")
+    if len(result) > bytes_max:
+        raise ValueError(f"{what} returned {len(result)} bytes, at most {bytes_max} are allowed")
+    return result
 
 
 def characteristics_of(source: str, load_module: LoadModule) -> Characteristics:

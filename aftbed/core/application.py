@@ -13,6 +13,8 @@ from aftbed.core.errors import ConfigError, unknown
 
 Width = Literal["u8", "u32", "i64", "u64", "f64"]
 BITS: Final[dict[Width, int]] = {"u8": 8, "u32": 32, "i64": 64, "u64": 64, "f64": 64}
+REPLY_BYTES_MAX: Final = 60 * 1024  # a reply has to fit into a packet
+STATE_BYTES_MAX: Final = 64 << 20
 
 
 class Field(msgspec.Struct, frozen=True):
@@ -50,11 +52,14 @@ class Application(Protocol):
     characteristics: Characteristics
 
     def execute(self, request: bytes) -> bytes:
-        """Return the reply to `request`, updating the state. Raises PeerError, state unchanged."""
+        """Return the reply to `request`, at most `REPLY_BYTES_MAX` long, updating the state.
+
+        Raises PeerError, state unchanged.
+        """
         ...
 
     def capture(self) -> bytes:
-        """Return the whole state; equal states give equal bytes."""
+        """Return the whole state, at most `STATE_BYTES_MAX` long; equal states give equal bytes."""
         ...
 
     def restore(self, state: bytes) -> None:

@@ -25,7 +25,6 @@ from aftbed.judge.reference import (
     loaded,
     reference_run,
     requests_of,
-    succession,
 )
 from aftbed.runtime.unix.confined import JobFailedError, ProcessLimits, ask, serve
 from aftbed.runtime.unix.options import load_module
@@ -82,13 +81,10 @@ def reference_of(
 ) -> ReferenceRun:
     """Of `function` if it is given, else of the versions of the function that served the run.
 
-    Those that the record names are executed in a process of their own, or in this one if it is its own run.
-    Raises ConfigError where a version of an own run is gone.
+    Those that the record names are executed in a process of their own: whatever they do ends that.
     """
     if function is not None:
         return reference_run(record.history, function())
-    if trust.own_run:
-        return reference_run(record.history, succession(record.history, record.adaptations)())
     changes = changes_of(record.history, record.adaptations)
     sources = tuple(dict.fromkeys(source for _, source in changes if source))
     if not sources:

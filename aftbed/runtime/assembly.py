@@ -29,6 +29,7 @@ from aftbed.runtime.node import MemoryIO, Node, Stopped, nowhere
 STEPS_MAX: Final = 500  # of a self-test, for one request; the longest mechanism takes 40
 TEST_EPOCH: Final = 1
 
+Result = TypeVar("Result")
 MakeSetting = Callable[[BrickSpec, Setting], Brick]
 MakeBrick = Callable[[BrickSpec], Brick]
 In = TypeVar("In")
@@ -179,8 +180,16 @@ class _TestedChain:
                 raise ConfigError(
                     f"self-test: {_suspects(self._graph)}: recorded request {number} is never answered"
                 )
-        state = self._server.capture()
-        self._server.restore(state)
-        if self._server.capture() != state:
+        state = self._tried(self._server.capture, "capture")
+        self._tried(lambda: self._server.restore(state), "restore")
+        if self._tried(self._server.capture, "capture") != state:
             raise ConfigError(f"self-test: {_suspects(self._graph)}: it does not restore what it captures")
         return self._replies
+
+    def _tried(self, call: Callable[[], Result], what: str) -> Result:
+        """What the call returns. Raises ConfigError for any exception of it."""
+        try:
+            return call()
+        except Exception as error:
+            text = f"{what}: {type(error).__name__}: {error}"
+            raise ConfigError(f"self-test: {_suspects(self._graph)}: {text}") from error

@@ -229,7 +229,7 @@ def test_what_a_function_declares_is_asked_in_another_process(tmp_path: Path) ->
         ("execute = lambda self, request: __import__('os')._exit(7)", "ended with code 7"),
         ("execute = lambda self, request: __import__('os').kill(__import__('os').getpid(), 11)", "signal 11"),
         ("execute = lambda self, request: bytes(1 << 40)", "MemoryError"),
-        ("execute = lambda self, request: 'no bytes'", "no answer"),
+        ("execute = lambda self, request: 'no bytes'", "execute returned str, bytes are required"),
         ("execute = lambda self, request: exit('bye')", "SystemExit: bye"),
         ("execute = lambda self, request: print('noise') or b''", ""),
         ("execute = lambda self, request: input()", "EOFError"),

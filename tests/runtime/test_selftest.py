@@ -1,5 +1,8 @@
 """The self-test of what is written off line: whatever it does wrong is found before it gets a channel."""
 
+from pathlib import Path
+from typing import Final
+
 import msgspec
 import pytest
 
@@ -12,6 +15,7 @@ from aftbed.ftm.chain import Compute
 from aftbed.ftm.compose import EXPRESSIONS, NONE, build
 from aftbed.ftm.registry import KINDS, Setting
 from aftbed.runtime.assembly import TEST_EPOCH, MakeBrick, self_test
+from aftbed.runtime.unix.options import load_module
 from aftbed.vehicle.aeb.function import default_application, sample_requests
 
 REQUESTS = tuple(sample_requests(0, 8))
@@ -113,6 +117,80 @@ def test_what_is_wrong_is_named(kind: type, words: str) -> None:
     assert words in str(refusal.value)
 
 
+# -- functions
+
+
+FUNCTIONS: Final = """
+from aftbed.vehicle.aeb.function import AebFunction
+
+class Text(AebFunction):
+    def execute(self, request): return "brake"
+
+class Nothing(AebFunction):
+    def execute(self, request): return None
+
+class Endless(AebFunction):
+    def execute(self, request): return bytes(100_000_000)
+
+class Breaking(AebFunction):
+    def execute(self, request): raise KeyError("speed")
+
+class StateText(AebFunction):
+    def capture(self): return "state"
+
+class StateEndless(AebFunction):
+    def capture(self): return bytes(100_000_000)
+
+class Forgetful(AebFunction):
+    def restore(self, state): raise IndexError("out of range")
+
+class Sound(AebFunction):
+    pass
+"""
+
+
+def try_out(tmp_path: Path, name: str, ftm: str = "pbr") -> None:
+    """The self-test of the function of that name."""
+    path = tmp_path / "functions.py"
+    path.write_text(FUNCTIONS)
+    source = f"{path}:{name}"
+    function, graph = load_application(source, load_module), build(ftm, "process")
+    bricks = tuple(
+        msgspec.structs.replace(b, application=source) if b.part == "server" else b for b in graph.bricks
+    )
+    setting = Setting(1, TEST_EPOCH, True, function)
+    graph = msgspec.structs.replace(graph, bricks=bricks)
+    self_test(graph, "a", lambda spec: make_brick(spec, setting, _nothing), REQUESTS)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("Text", "a/server: Request on prd2srv: TypeError: execute returned str, bytes are required"),
+        ("Nothing", "TypeError: execute returned NoneType, bytes are required"),
+        ("Endless", "ValueError: execute returned 100000000 bytes, at most 61440 are allowed"),
+        ("Breaking", "KeyError: 'speed'"),
+        ("StateText", "TypeError: capture returned str, bytes are required"),
+        ("StateEndless", "ValueError: capture returned 100000000 bytes, at most 67108864 are allowed"),
+    ],
+)
+def test_a_function_that_answers_nonsense_is_refused_with_the_reason(
+    tmp_path: Path, name: str, words: str
+) -> None:
+    with pytest.raises(ConfigError, match="self-test: ") as refusal:
+        try_out(tmp_path, name)
+    assert words in str(refusal.value)
+
+
+def test_a_function_that_does_not_restore_is_refused_with_the_reason(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"self-test: .*: restore: IndexError: out of range"):
+        try_out(tmp_path, "Forgetful")
+
+
+def test_a_sound_function_passes(tmp_path: Path) -> None:
+    try_out(tmp_path, "Sound", "lfr+tr")
+
+
 # -- loading
 
 
@@ -130,8 +208,6 @@ def test_a_source_that_names_no_class(source: str, words: str) -> None:
 
 
 def test_a_brick_is_no_function() -> None:
-    from aftbed.runtime.unix.options import load_module  # noqa: PLC0415
-
     with pytest.raises(ConfigError, match="is no protected function: it lacks execute"):
         load_application("aftbed.ftm.chain:Compute", load_module)
     with pytest.raises(ConfigError, match=r"has no class Comput \(it has: .*Compute"):

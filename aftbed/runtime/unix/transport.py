@@ -23,6 +23,7 @@ from typing import Final, Generic, TypeVar
 
 import msgspec
 
+from aftbed.core.application import STATE_BYTES_MAX
 from aftbed.core.errors import PeerError
 from aftbed.core.graph import Link
 from aftbed.core.messages import PACKET_BYTES_MAX, UNREADABLE
@@ -30,7 +31,6 @@ from aftbed.inject.shared_state import SHARED_BYTES
 from aftbed.runtime.control import FromNode, ToNode
 from aftbed.runtime.unix.linux import set_timeouts
 
-STATE_BYTES_MAX: Final = 64 << 20
 ANNOUNCED: Final = b"\xc1"  # a byte that MessagePack never uses
 READ_BYTES_MAX: Final = PACKET_BYTES_MAX + 1  # one byte more than is allowed, so that it is noticed
 _WEIGHT: Final = ANNOUNCED * PACKET_BYTES_MAX

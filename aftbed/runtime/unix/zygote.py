@@ -103,7 +103,10 @@ def _be_spare(supervisor: int, areas: tuple[Area, ...]) -> NoReturn:
     linux.populate(areas)
     line = Line(socket.socket(fileno=INHERITED_FD), decode_order)
     line.send(control.Hello(os.getpid()))
-    got = line.recv()
+    try:
+        got = line.recv()
+    except ConnectionResetError:  # the run has ended
+        os._exit(0)
     if got is None:
         os._exit(0)
     order, fds = got
