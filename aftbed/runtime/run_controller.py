@@ -93,6 +93,7 @@ class RunController:
                 self.adaptations.request_held(request_id)
             case control.BrickReport(_, messages.Adapted() as ended):
                 self.adaptations.adapted(ended)
+                self._loop.after(SETTLE_SECONDS, self._replace_missing)
                 self._loop.after(SETTLE_SECONDS, self._rearm)
                 self._loop.after(SETTLE_SECONDS, self._restock)  # the next one waits until that is done
             case control.Ordered(_, ordered, Phase.WHOLE):
@@ -200,6 +201,12 @@ class RunController:
             return
         self._runtime.log("lost", "no replica is left: the service is gone")
         self._on_loss()
+
+    def _replace_missing(self) -> None:
+        """Replace what was staged, died, and became a part of the graph all the same."""
+        for node in self.deployment.singles:
+            if not self.ending:
+                self._replace(node)
 
     def _replace(self, node: str) -> None:
         under_way = f"{REPLACE}{node}" in self._loop.tasks.names()

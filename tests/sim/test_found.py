@@ -1,4 +1,4 @@
-"""Experiments that broke a promise once, found by `test_machine` and shrunk; each stays, to stay mended."""
+"""Experiments that broke a promise once, found by `test_machine` or a swarm and shrunk; each stays mended."""
 
 from typing import Final
 
@@ -70,6 +70,14 @@ FOUND: Final = {
         rate_hz=2000.0,
         faults=(dies("a/server", AT_MS - 0.3),),
         adaptations=wanted("tr"),
+    ),
+    # A Watchdog dies between the step that exchanges it and the end of the commit.
+    "a staged node of no replica": Setup(
+        "tr",
+        "replica",
+        count=1,
+        faults=(Fault(Crash(), "b/watchdog'", Trigger("adapt.step.exit", 4)),),
+        adaptations=(Scheduled(Goal(expression="lfr+tr"), 1),),
     ),
     # The fault moves to the new leader, whose channel to a backup leads nowhere yet.
     "a channel that is not bound yet": Setup(
