@@ -15,6 +15,7 @@ from aftbed.inject.model import Fault
 from aftbed.inject.value import ValueFlip, ValuePlace
 from aftbed.judge.record import read_record
 from aftbed.judge.verdict import Verdict, judge
+from aftbed.runtime.adaptations import Outcome
 from aftbed.runtime.deployment import digest
 from aftbed.runtime.unix.journal_files import DialogueFile, JournalFile
 from aftbed.runtime.unix.options import CarRun, LoadRun, RunOptions, Work
@@ -28,6 +29,12 @@ STOPPED: Final = VehicleResult(False, None, 2.5, 2.5, 9.0, True)
 CRASH: Final = Fault(Crash(), "primary", Trigger("checkpoint.sent", 2))
 FLIP: Final = Fault(ValueFlip(ValuePlace.RESULT, Bit(8)), "primary", Trigger("server.exit", 2))
 FIRST_GENERATION: Final = 1 << 8
+
+
+def outcomes(*changes: dict[str, object]) -> str:
+    """Lines of `adaptations.jsonl`: adaptations that were done, with these changes."""
+    done = Outcome(1, "to lfr", "drained", "pbr", "done", asked="to lfr")
+    return "".join(json.dumps(msgspec.to_builtins(done) | one) + "\n" for one in changes)
 
 
 class RecordInTheMaking:

@@ -310,7 +310,7 @@ def _result(
 ) -> Result:
     record = evidence.record
     faults, vehicle, failovers = record.faults, record.vehicle, verdict.failovers
-    adapted = tuple(str(a["outcome"]) for a in record.adaptations)
+    adapted = tuple(one.outcome for one in record.adaptations)
     recovery_ms = _longest(f.recovered_ms for f in failovers)
     if recovery_ms is not None and recovery_ms > (experiment.budget_ms or recovery_ms):
         outcome = worst([outcome, "degraded"])
@@ -337,7 +337,7 @@ def _result(
         recovery_ms=recovery_ms,
         blackout_ms=_longest(f.blackout_ms for f in failovers),
         adapted=adapted,
-        adapt_blackout_ms=_longest(float(str(a["blackout_ms"])) for a in record.adaptations),
+        adapt_blackout_ms=_longest(one.blackout_ms for one in record.adaptations),
         collision=vehicle.collision if vehicle is not None else None,
         impact_kmh=vehicle.impact_speed_kmh if vehicle is not None else None,
         gap_m=vehicle.stop_gap_m if vehicle is not None else None,

@@ -74,9 +74,7 @@ def _call() -> int:
     try:
         app()
     except SystemExit as ended:
-        if isinstance(
-            ended.__context__, BrokenPipeError
-        ):  # typer makes exit code 1 of it, and replaces streams
+        if isinstance(ended.__context__, BrokenPipeError):  # typer makes code 1 of it, and replaces streams
             sys.stdout, sys.stderr = streams
             raise ended.__context__ from None
         code = ended.code

@@ -151,9 +151,9 @@ def show_verdict(verdict: "Verdict", *, as_json: bool) -> None:
         )
     for one in verdict.adaptations:
         took = f", blackout {_ms(one.blackout_ms)}, total {_ms(one.total_ms)}" if one.total_ms else ""
-        print(f"  adaptation {one}{took}")
+        print(shown(f"  adaptation {one}{took}"))
     if verdict.adaptations:
-        print(f"  at the end {verdict.ftm_at_end or 'unknown'}")
+        print(shown(f"  at the end {verdict.ftm_at_end or 'unknown'}"))
     if verdict.proposals:
         from aftbed.runtime.unix.closed_loop import proposed_line  # noqa: PLC0415 - only with a policy
 

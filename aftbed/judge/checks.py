@@ -24,6 +24,7 @@ from aftbed.inject.targets import PRIMARY
 from aftbed.judge import sources
 from aftbed.judge.record import Excuses, RunRecord
 from aftbed.judge.reference import ReferenceRun
+from aftbed.runtime.adaptations import Outcome
 from aftbed.runtime.deployment import Hosted, replica_of
 from aftbed.runtime.unix.options import COMMAND_GONE, CarRun, LoadRun, ReplayRun, Work
 from aftbed.vehicle.aeb.messages import AebOutput, decode_reply
@@ -96,23 +97,6 @@ class AskedAdaptation(msgspec.Struct, frozen=True):
     def __str__(self) -> str:
         why = f": {self.reason}" if self.reason else ""
         return f"{self.asked}: {self.outcome}{why}"
-
-
-class _Ended(msgspec.Struct, frozen=True):
-    """The part of `runtime.adaptations.Outcome` that a verdict shows."""
-
-    outcome: str
-    reason: str = ""
-    prepare_ms: float = 0.0
-    blackout_ms: float = 0.0
-    total_ms: float = 0.0
-    may_fail: bool = False
-    asked: str = ""
-    scheduled: int = 0
-
-    def told(self, asked: str) -> AskedAdaptation:
-        times_ms = (self.prepare_ms, self.blackout_ms, self.total_ms)
-        return AskedAdaptation(asked, self.outcome, self.reason, *times_ms, may_fail=self.may_fail)
 
 
 def _check(reasons: list[str]) -> Check:
@@ -295,13 +279,17 @@ def _number_of(strike: Record) -> int:
 
 def adaptations(record: RunRecord) -> list[AskedAdaptation]:
     """Those asked for with the run, in their order, then those asked for while it ran."""
-    ended = [msgspec.convert(outcome, _Ended) for outcome in record.adaptations]
-    by_place = {one.scheduled: one for one in ended}
+    by_place = {one.scheduled: one for one in record.adaptations}
     with_run = [
-        by_place[place].told(str(one)) if place in by_place else _without_end(record, one)
+        _told(by_place[place], str(one)) if place in by_place else _without_end(record, one)
         for place, one in enumerate(record.options.adaptations, 1)
     ]
-    return with_run + [one.told(one.asked) for one in ended if not one.scheduled]
+    return with_run + [_told(one, one.asked) for one in record.adaptations if not one.scheduled]
+
+
+def _told(one: Outcome, asked: str) -> AskedAdaptation:
+    times_ms = (one.prepare_ms, one.blackout_ms, one.total_ms)
+    return AskedAdaptation(asked, one.outcome, one.reason, *times_ms, may_fail=one.may_fail)
 
 
 def _without_end(record: RunRecord, scheduled: Scheduled) -> AskedAdaptation:

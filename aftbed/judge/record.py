@@ -9,11 +9,13 @@ from typing import Final
 
 import msgspec
 
+from aftbed.adapt.engine import DONE
 from aftbed.core.errors import ConfigError, PeerError
 from aftbed.core.input_file import read_input
 from aftbed.core.journal import EntryKind, History, dropped, entries, records
 from aftbed.inject.model import FaultReport
 from aftbed.inject.receipts import ReceiptState
+from aftbed.runtime.adaptations import Outcome
 from aftbed.runtime.deployment import Hosted
 from aftbed.runtime.unix.journal_files import contents
 from aftbed.runtime.unix.options import CarRun, RunOptions
@@ -81,7 +83,7 @@ class RunRecord(msgspec.Struct, frozen=True):
     history: History
     end: RunEnd | None
     faults: tuple[FaultReport, ...] = ()  # each with its receipt
-    adaptations: tuple[dict[str, object], ...] = ()  # how each one ended, in order
+    adaptations: tuple[Outcome, ...] = ()  # how each one ended, in order
     vehicle: VehicleResult | None = None
     path: Path = Path()
     started_ns: int = 0
@@ -97,7 +99,7 @@ class RunRecord(msgspec.Struct, frozen=True):
     @property
     def ftm(self) -> str:
         """The FTM that the adaptations, as they ended, have come to."""
-        done = [str(a["ftm"]) for a in self.adaptations if a["outcome"] == "done"]
+        done = [one.ftm for one in self.adaptations if one.outcome == DONE]
         return done[-1] if done else self.options.ftm
 
     @property
@@ -155,10 +157,13 @@ def _end(path: Path) -> RunEnd:
 def _vehicle(options: RunOptions, end: RunEnd | None) -> VehicleResult | None:
     if end is None or end.result is None or not isinstance(options.work, CarRun):
         return None
-    return msgspec.convert(end.result["result"], VehicleResult)
+    try:
+        return msgspec.convert(end.result.get("result"), VehicleResult)
+    except msgspec.ValidationError as error:
+        raise ConfigError(f"end.json: not the result of a drive: {error}") from None
 
 
-def _adaptations(path: Path) -> tuple[dict[str, object], ...]:
+def _adaptations(path: Path) -> tuple[Outcome, ...]:
     try:
         lines = read_input(path / HISTORY_NAME, DOCUMENT_BYTES_MAX).splitlines()
     except FileNotFoundError:
@@ -166,10 +171,12 @@ def _adaptations(path: Path) -> tuple[dict[str, object], ...]:
     except OSError as error:
         raise ConfigError(f"{path / HISTORY_NAME}: {error.strerror}") from None
     found = []
-    for line in lines:
+    for number, line in enumerate(lines, 1):
         try:
-            found.append(json.loads(line))
-        except (ValueError, RecursionError):  # the last line, cut off with the run
+            found.append(msgspec.json.decode(line, type=Outcome))
+        except msgspec.ValidationError as error:
+            raise ConfigError(f"{path / HISTORY_NAME}: line {number}: {error}") from None
+        except (msgspec.DecodeError, RecursionError):  # the last line, cut off with the run
             break
     return tuple(found)
 

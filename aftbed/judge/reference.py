@@ -15,31 +15,20 @@ from typing import Final
 
 import msgspec
 
+from aftbed.adapt.engine import DONE
 from aftbed.adapt.plugins import LoadModule, load_application
 from aftbed.core.application import Application
 from aftbed.core.errors import PeerError
 from aftbed.core.events import Event
 from aftbed.core.journal import EntryKind, History
+from aftbed.runtime.adaptations import Outcome
 from aftbed.runtime.deployment import digest, replica_of
-from aftbed.runtime.unix.options import load_module
 from aftbed.vehicle.aeb.function import default_application
 
 Make = Callable[[], Application]
 Change = tuple[int, Make | None]  # from which request on, counted from 1; None: the version of before
 NamedChange = tuple[int, str | None]  # the same, by `MODULE:CLASS` or `FILE.py:CLASS`; "": the built-in one
 BUILT_IN: Final = ""
-DONE: Final = "done"
-
-
-class AppliedUpdate(msgspec.Struct, frozen=True):
-    """The part of `runtime.adaptations.Outcome` that is about the version that served."""
-
-    outcome: str
-    application: str = BUILT_IN
-    tried: str = BUILT_IN
-    opened_ns: int = 0
-    undone_ns: int = 0
-    lost: str = ""
 
 
 class Succession:
@@ -92,12 +81,11 @@ class Succession:
         return self._function.acceptable(request, reply)
 
 
-def changes_of(history: History, adaptations: Iterable[object]) -> list[NamedChange]:
-    """When another version began to serve, from the outcomes of adaptations, or what was written of them."""
+def changes_of(history: History, adaptations: Iterable[Outcome]) -> list[NamedChange]:
+    """When another version began to serve, from the outcomes of the adaptations."""
     changes: list[NamedChange] = []
     running = BUILT_IN
-    for outcome in adaptations:
-        update = msgspec.convert(outcome, AppliedUpdate, from_attributes=True)
+    for update in adaptations:
         function = update.application if update.outcome == DONE else update.tried
         if not update.opened_ns or function == running:
             continue
@@ -124,17 +112,6 @@ def loaded(changes: Iterable[NamedChange], load_module: LoadModule) -> list[Chan
         return load_application(function, load_module) if function else default_application
 
     return [(first, None if function is None else make(function)) for first, function in changes]
-
-
-def succession(
-    history: History, adaptations: Iterable[object], load_module: LoadModule = load_module
-) -> Callable[[], Succession]:
-    """Makes the bare server of a run, in this process: of a run whose functions are trusted.
-
-    Raises ConfigError where a version of the function is gone.
-    """
-    changes = loaded(changes_of(history, adaptations), load_module)
-    return lambda: Succession(changes)
 
 
 class ReferenceRun(msgspec.Struct, frozen=True):

@@ -4,8 +4,6 @@ import itertools
 from collections.abc import Callable
 from typing import Final
 
-import msgspec
-
 from aftbed.core.application import Application
 from aftbed.core.events import Event
 from aftbed.core.script import ScriptKind
@@ -48,7 +46,7 @@ def record_of(run: Run) -> RunRecord:
         run.history,
         end,
         run.faults,
-        tuple(msgspec.to_builtins(outcome) for outcome in run.adaptations),
+        run.adaptations,
         run.vehicle,
         failures=run.failures,
         excuses=Excuses(service_struck_down(run), values, tuple(name for _, name in run.struck)),

@@ -14,7 +14,7 @@ from typing import Final
 import pytest
 from fakerun import Call
 from liveruns import called
-from records import whole
+from records import outcomes, whole
 
 from aftbed.campaign.ledger import NAME
 from aftbed.cli.campaign import HTML, JUNIT, SUMMARY
@@ -249,12 +249,12 @@ def record(stranger: Stranger, source: str, **about: object) -> Path:
     path = stranger.folder / "record"
     shutil.rmtree(path)
     run = whole(path)
-    run.note("a-protocol.1", Event.REPLY_STORED, 0)
+    run.note("a.protocol.1", Event.REPLY_STORED, 0)
     run.end = {"reason": ESCAPE, **(run.end or {})} | {"reason": ESCAPE}
     run.verdict()
     stranger.file("record/evil.py", EVIL.format(sentinel=str(stranger.sentinel)))
-    adapted = {"ftm": "pbr", "outcome": "done", "application": source, "opened_ns": 1}
-    stranger.file("record/adaptations.jsonl", json.dumps(adapted) + "\n")
+    adapted = {"application": source, "opened_ns": 1, "asked": ESCAPE, "reason": ESCAPE}
+    stranger.file("record/adaptations.jsonl", outcomes(adapted))
     stranger.file("record/events.jsonl", json.dumps({"t_ms": 1, "event": ESCAPE, "text": SCRIPT}) + "\n")
     known = json.loads((path / "run.json").read_text())
     stranger.file("record/run.json", json.dumps(known | about))

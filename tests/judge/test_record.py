@@ -1,9 +1,10 @@
 """Records: what is read as one, and what is none."""
 
+import re
 from pathlib import Path
 
 import pytest
-from records import whole
+from records import CAR, whole
 
 from aftbed.core.errors import ConfigError
 from aftbed.judge.record import read_record
@@ -49,4 +50,20 @@ def test_a_journal_that_is_none(path: Path, name: str) -> None:
     whole(path).verdict()
     (path / "journal" / name).write_bytes(b"garbage")
     with pytest.raises(ConfigError, match=r"journal: not a journal \(7 bytes\)"):
+        read_record(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("adaptations.jsonl", '{"outcome": 5}\n', "adaptations.jsonl: line 1: "),
+        ("adaptations.jsonl", "[]\n", "adaptations.jsonl: line 1: "),
+        ("end.json", '{"result": {"result": 5}}', "end.json: not the result of a drive: "),
+        ("end.json", '{"result": {}}', "end.json: not the result of a drive: "),
+    ],
+)
+def test_what_is_json_and_not_of_a_run_is_refused(path: Path, name: str, text: str, words: str) -> None:
+    whole(path, CAR).verdict()
+    (path / name).write_text(text)
+    with pytest.raises(ConfigError, match=re.escape(words)):
         read_record(path)

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Final
 
 import pytest
-from records import whole
+from records import outcomes, whole
 
 from aftbed.core.events import Event
 from aftbed.judge.checks import Evidence
@@ -57,10 +57,10 @@ class Planted:
 def record_naming(path: Path, *sources: str) -> RunRecord:
     """A run in which nothing is wrong, updated to each of these functions from its first request on."""
     run = whole(path)
-    run.note("a-protocol.1", Event.REPLY_STORED, 0)
+    run.note("a.protocol.1", Event.REPLY_STORED, 0)
     run.verdict()
-    lines = [{"ftm": "pbr", "outcome": "done", "application": s, "opened_ns": 1} for s in sources]
-    (path / "adaptations.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    updates = outcomes(*({"application": source, "opened_ns": 1} for source in sources))
+    (path / "adaptations.jsonl").write_text(updates)
     return read_record(path)
 
 

@@ -7,7 +7,7 @@ from typing import Final
 import msgspec
 import pytest
 from msgspec.structs import replace
-from records import CRASH, FLIP, RecordInTheMaking, whole
+from records import CRASH, FLIP, RecordInTheMaking, outcomes, whole
 
 from aftbed.core.events import Event
 from aftbed.core.messages import Goal, Scheduled
@@ -72,14 +72,14 @@ def test_a_load_that_its_user_stopped_is_judged_by_what_it_did(path: Path) -> No
 # -- adaptations that were asked for
 
 
-DONE: Final = {"outcome": "done", "blackout_ms": 1.5, "total_ms": 120.0, "scheduled": 1, "ftm": "lfr"}
+DONE: Final = {"blackout_ms": 1.5, "total_ms": 120.0, "scheduled": 1, "ftm": "lfr"}
 AT_2: Final = Scheduled(Goal(expression="lfr"), at_request=2)
 
 
-def adapted(path: Path, asked: tuple[Scheduled, ...], *outcomes: dict[str, object]) -> RecordInTheMaking:
+def adapted(path: Path, asked: tuple[Scheduled, ...], *changes: dict[str, object]) -> RecordInTheMaking:
     record = whole(path)
     record.options = msgspec.structs.replace(record.options, adaptations=asked)
-    (path / HISTORY_NAME).write_text("".join(json.dumps(one) + "\n" for one in outcomes))
+    (path / HISTORY_NAME).write_text(outcomes(*changes))
     return record
 
 
@@ -95,7 +95,7 @@ def test_an_adaptation_that_was_done_is_told(path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("asked", "outcomes", "reason"),
+    ("asked", "changes", "reason"),
     [
         ((AT_2,), [DONE | {"outcome": "rolled back", "reason": "b died"}], "rolled back: b died"),
         ((AT_2,), [DONE | {"outcome": "refused", "reason": "no backup"}], "refused: no backup"),
@@ -103,14 +103,14 @@ def test_an_adaptation_that_was_done_is_told(path: Path) -> None:
     ],
 )
 def test_one_that_was_not_done_proves_nothing(
-    path: Path, asked: tuple[Scheduled, ...], outcomes: list[dict[str, object]], reason: str
+    path: Path, asked: tuple[Scheduled, ...], changes: list[dict[str, object]], reason: str
 ) -> None:
-    verdict = adapted(path / "1", asked, *outcomes).verdict()
+    verdict = adapted(path / "1", asked, *changes).verdict()
     assert (verdict.verdict, verdict.checks["adaptations_done"]) == ("inconclusive", "unknown")
     assert verdict.reasons == [f"adaptations_done: to lfr at request 2: {reason}"]
     may_fail = tuple(replace(one, goal=replace(one.goal, may_fail=True)) for one in asked)
-    outcomes = [one | {"may_fail": True} for one in outcomes]
-    assert adapted(path / "2", may_fail, *outcomes).verdict().verdict == "pass"
+    changes = [one | {"may_fail": True} for one in changes]
+    assert adapted(path / "2", may_fail, *changes).verdict().verdict == "pass"
 
 
 @pytest.mark.parametrize(
@@ -190,8 +190,7 @@ def test_a_graph_to_which_no_adaptation_led_fails(path: Path) -> None:
     record = whole(path)
     record.host(ftm="lfr", bricks=[[b.name, b.kind] for b in build("lfr", "process").bricks])
     assert record.verdict().reasons == ["whole_graph: lfr runs, though the adaptations came to pbr"]
-    told = {"number": 1, "outcome": "done", "ftm": "lfr", "application": ""}
-    (path / HISTORY_NAME).write_text(json.dumps(told) + "\n")
+    (path / HISTORY_NAME).write_text(outcomes({"ftm": "lfr"}))
     assert record.verdict().verdict == "pass"
 
 
