@@ -113,7 +113,7 @@ def held(of: int, share: float) -> float:
     return math.fsum(m for m, i in zip(masses, intervals, strict=True) if i.low <= share <= i.high)
 
 
-@pytest.mark.parametrize("of", [5, 30, 200])
+@pytest.mark.parametrize("of", [5, 30, pytest.param(200, marks=pytest.mark.deep)])
 def test_clopper_pearson_holds_its_confidence_for_every_share(of: int) -> None:
     assert min(held(of, step / 500) for step in range(1, 500)) >= 0.95
 

@@ -15,6 +15,7 @@ import pytest
 from fakerun import Call
 from liveruns import called
 from records import outcomes, whole
+from sampling import sampled
 
 from aftbed.campaign.ledger import NAME
 from aftbed.cli.campaign import HTML, JUNIT, SUMMARY
@@ -263,8 +264,14 @@ def record(stranger: Stranger, source: str, **about: object) -> Path:
 
 @pytest.mark.parametrize(
     "source",
-    ["evil:Evil", "evil_package:Evil", "evil_package.inner:Evil", "evil.py:Evil", "record/evil.py:Evil"]
-    + ["{folder}/record/evil.py:Evil", "yaml:Evil", f"{ESCAPE}:Evil", "os:system", "../evil.py:Evil"],
+    ["evil_package.inner:Evil", "{folder}/record/evil.py:Evil", f"{ESCAPE}:Evil"]
+    + [
+        pytest.param(source, marks=pytest.mark.deep)
+        for source in (
+            *("evil:Evil", "evil_package:Evil", "evil.py:Evil", "record/evil.py:Evil"),
+            *("yaml:Evil", "os:system", "../evil.py:Evil"),
+        )
+    ],
 )
 def test_a_record_is_judged_without_its_code(stranger: Stranger, source: str) -> None:
     source = source.format(folder=stranger.folder)
@@ -321,8 +328,7 @@ UPDATES: Final = [
 ]
 
 
-@pytest.mark.parametrize("update", UPDATES)
-@pytest.mark.parametrize("runtime", ["sim", "unix"])
+@pytest.mark.parametrize(("runtime", "update"), sampled(("sim", "unix"), UPDATES))
 def test_a_campaign_is_read_without_its_code(
     stranger: Stranger, ran: Path, update: str, runtime: str
 ) -> None:

@@ -233,12 +233,12 @@ def test_a_swarm_is_drawn_from_the_seed(sim: Call) -> None:
 
 
 def test_a_swarm_counts_what_it_drew_beside_what_happened(sim: Call) -> None:
-    code, out, _ = sim("--swarm", "--seeds", "0..29")
+    code, out, _ = sim("--swarm", "--seeds", "0..9")
     assert code == 0
     assert re.search(r"^faults: [0-9]+ drawn to happen: [0-9]+ activated", out, re.MULTILINE)
     assert re.search(r"^adaptations: [0-9]+ drawn to happen: [0-9]+ done", out, re.MULTILINE)
-    found = json.loads(sim("--swarm", "--seeds", "0..29", "--json")[1])
-    setups = [drawn(seed) for seed in range(30)]
+    found = json.loads(sim("--swarm", "--seeds", "0..9", "--json")[1])
+    setups = [drawn(seed) for seed in range(10)]
     assert sum(group["total"] for group in found["faults"].values()) == sum(len(s.faults) for s in setups)
     adaptations = sum(group["total"] for group in found["adaptations"].values())
     assert adaptations == sum(len(s.adaptations) for s in setups)

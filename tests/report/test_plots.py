@@ -28,7 +28,7 @@ from aftbed.report.plots import (
 
 SVG: Final = "{http://www.w3.org/2000/svg}"
 TIMES = st.lists(st.floats(0, 1e6), min_size=1, max_size=60)
-few_examples = settings(max_examples=settings.default.max_examples // 2)  # a drawing takes 20 ms
+few_examples = settings(max_examples=settings.default.max_examples // 4)  # a drawing takes 20 ms
 
 
 def elements(drawing: str, tag: str) -> list[ElementTree.Element]:

@@ -64,6 +64,7 @@ def test_every_row_of_m1_passes_under_a_crash_at_the_worst_instant(ftm: str) -> 
             assert found.loss_kmh == 0.0
 
 
+@pytest.mark.deep
 def test_a_row_passes_under_a_crash_at_the_worst_instant_as_without_it() -> None:
     case = R152["r152:m1-10"]
     found, free = row(case, crash("pbr")), row(case, RoadLine("pbr", "pbr"))
