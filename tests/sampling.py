@@ -22,8 +22,11 @@ def sampled(*axes: Sequence[object]) -> list[ParameterSet]:
 
 
 def every(step: int, values: Sequence[object]) -> list[ParameterSet]:
-    """All values, deep but for each `step`-th."""
+    """All values, deep but for each `step`-th. A tuple has one for each name."""
     return [
-        pytest.param(value, marks=[pytest.mark.deep] if number % step else [])
+        pytest.param(
+            *(value if isinstance(value, tuple) else (value,)),
+            marks=[pytest.mark.deep] if number % step else [],
+        )
         for number, value in enumerate(values)
     ]

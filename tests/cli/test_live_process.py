@@ -120,23 +120,20 @@ def test_inject_crash_of_others(drive: Command) -> None:
     ended_well(drive, *(f"crash {target}: activated" for target in (*beside, *of_replicas)))
 
 
-def test_inject_crash_at_the_nth_event(drive: Command) -> None:
+def test_inject_at_an_event_for_a_time_and_after_a_delay(drive: Command) -> None:
+    output("inject", "hang", "engine", "--for", "50ms")
+    assert json.loads(output("status", "--json"))["epoch"] == 1
     output("inject", "crash", "a/server", "--at", "checkpoint.sent", "--nth", "5")
     drive.wait_for_line("armed: crash a/server at checkpoint.sent nth 5")
     drive.wait_for_line("script.done: new backup")
-    ended_well(drive, "crash a/server at checkpoint.sent nth 5: activated")
-
-
-def test_inject_a_short_hang(drive: Command) -> None:
-    output("inject", "hang", "engine", "--for", "50ms")
-    assert json.loads(output("status", "--json"))["epoch"] == 1
-    ended_well(drive, "hang engine for 50ms: activated")
-
-
-def test_inject_after_a_delay(drive: Command) -> None:
     output("inject", "crash", "primary", "--after", "200ms")
-    drive.wait_for_line("script.done: failover")
-    ended_well(drive, "crash primary after 200ms: activated")
+    drive.wait_for_line("script.done: failover", nth=2)
+    ended_well(
+        drive,
+        "hang engine for 50ms: activated",
+        "crash a/server at checkpoint.sent nth 5: activated",
+        "crash primary after 200ms: activated",
+    )
 
 
 def test_a_wrong_fault_is_refused_and_the_run_goes_on(drive: Command) -> None:
@@ -159,7 +156,7 @@ def test_a_wrong_fault_is_refused_and_the_run_goes_on(drive: Command) -> None:
 # -- how a run ends ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("sig", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("sig", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.deep)])
 def test_an_interrupt_ends_the_run_with_its_verdict(home: Home, sig: signal.Signals) -> None:
     with Command("--scenario", "free-drive") as command:
         command.started()

@@ -363,7 +363,7 @@ class Command:
 
     def wait_until_it_drives(self) -> None:
         """Requests are answered by then; the first line of the car is of 0.00 s, before any request."""
-        self.wait_for_line("km/h", nth=4)
+        self.wait_for_line("km/h", nth=2)
 
     def wait_for_line(self, words: str, nth: int = 1) -> str:
         """The `nth` line of its output that has `words`."""

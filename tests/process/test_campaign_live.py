@@ -68,7 +68,7 @@ def reached(out: Path, mark: int, running: subprocess.Popen[bytes]) -> bool:
     return done(out) > mark or running.poll() is not None
 
 
-@pytest.mark.parametrize("moments", [4, pytest.param(10, marks=pytest.mark.deep)])
+@pytest.mark.parametrize("moments", [2, pytest.param(10, marks=pytest.mark.deep)])
 def test_a_campaign_that_is_killed_again_and_again_comes_to_its_end(
     moments: int, home: Home, spec: Path, tmp_path: Path
 ) -> None:

@@ -109,7 +109,7 @@ def test_a_replica_that_hangs_is_replaced() -> None:
 
 
 def test_without_a_mechanism_a_crash_is_not_masked() -> None:
-    done = aftbed(*DRIVE, "--ftm", "none", "--inject", "crash primary at server.enter nth 100")
+    done = aftbed(*DRIVE, "--ftm", "none", "--inject", "crash primary at server.enter nth 268")
     verdict = done.verdict()
     assert done.code == 1, done.out
     assert verdict.verdict == "fail"

@@ -53,7 +53,7 @@ def wait_until_replaced(run: Started, name: str, seen: int) -> None:
 
 @pytest.mark.parametrize(
     "name",
-    every(2, ["a/server", "a/protocol", "b/after", "b/server", "proxy", "client", "recovery", "a/watchdog"]),
+    every(3, ["a/server", "a/protocol", "b/after", "b/server", "client", "recovery", "proxy", "a/watchdog"]),
 )
 def test_a_stopped_node_is_replaced_and_does_not_come_back(home: Home, name: str) -> None:
     with under_load(home, 300, RATE_HZ) as run:

@@ -108,7 +108,7 @@ def sampled(placement: str, count: int) -> list[Strike]:
     return random.Random(SEED).sample([s for pair in PAIRS for s in strikes(*pair, placement)], count)
 
 
-@pytest.mark.parametrize("placement", ["process", "replica"])
+@pytest.mark.parametrize("placement", ["process", pytest.param("replica", marks=pytest.mark.deep)])
 def test_a_death_at_a_step_leaves_one_graph_whole(home: Home, placement: str) -> None:
     assert walk(home, placement, sampled(placement, SAMPLED)) == SAMPLED
 

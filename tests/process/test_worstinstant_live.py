@@ -43,6 +43,7 @@ def test_a_crash_at_the_worst_instant_passes_on_processes_too(ftm: str) -> None:
     assert verdict.vehicle.min_gap_m == pytest.approx(free.min_gap_m, abs=LOST_M_MAX)
 
 
+@pytest.mark.deep
 def test_an_outage_at_the_worst_instant_takes_its_metres_on_processes_too() -> None:
     words, free, struck = searched("none", Hang(300))
     done = aftbed(*words, "--json")

@@ -15,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from puredrive import CODEC
 from radarlogs import EGO_MS, FAR, RADARS, STANDING, Car, ars408, codec, drive, write
+from sampling import sampled
 
 from aftbed.vehicle.aeb.function import AebFunction
 from aftbed.vehicle.aeb.messages import (
@@ -250,8 +251,7 @@ def test_damaged_drives_are_counted_frame_by_frame(radar: str) -> None:
 
 
 @pytest.mark.process
-@pytest.mark.parametrize("radar", RADARS)
-@pytest.mark.parametrize("braked", [True, False])
+@pytest.mark.parametrize(("radar", "braked"), sampled(tuple(RADARS), (True, False)))
 def test_a_replay_by_the_mechanism_brakes_or_does_not(radar: str, braked: bool, tmp_path: Path) -> None:
     log = write(tmp_path / "drive.log", drive(radar, APPROACH if braked else FAR, 3.2))
     command = ["run", "--replay", str(log), "--dbc", radar, "--map", radar, "--pace", "max", "--json"]
