@@ -260,9 +260,9 @@ def test_a_function_that_hangs_is_ended(tmp_path: Path) -> None:
     """,
     )
     record = record_naming(tmp_path / "record", mine.source)
-    limits = ProcessLimits(seconds=4.0, memory_bytes=4 << 30)
+    limits = ProcessLimits(seconds=2.0, memory_bytes=4 << 30)
     found = reference_of(record, None, trusting((mine.folder,)), limits)
-    assert "takes more than 4 s" in found.unknown
+    assert "takes more than 2 s" in found.unknown
     pid = (
         (tmp_path / "pid").readlink() if (tmp_path / "pid").is_symlink() else None
     )  # a slow machine: not yet
