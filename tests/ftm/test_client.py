@@ -108,4 +108,6 @@ def test_a_held_request_is_not_sent_to_a_new_proxy() -> None:
 
 def test_requests_that_a_predecessor_has_come_to_are_reported_at_once() -> None:
     brick = client(3)
-    assert sends(brick.step(CONTROL, HoldAt((2, 9)), 0)) == [(CONTROL, RequestHeld(2))]
+    effects = brick.step(CONTROL, HoldAt((2, 4, 9)), 0)
+    assert sends(effects) == [(CONTROL, RequestHeld(2))]
+    assert sends(brick.step("submit", Submit(b"4"), 0)) == [(CONTROL, RequestHeld(4))], "the next one is held"

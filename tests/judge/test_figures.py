@@ -12,6 +12,7 @@ from aftbed.inject.receipts import ReceiptState
 from aftbed.judge import checks
 from aftbed.judge.checks import LATE_NS, Failover, Requests
 from aftbed.judge.reference import reference_run
+from aftbed.vehicle.ecus import HOLD_US
 
 CRASH: Final = FaultReport("crash primary", ReceiptState.ACTIVATED)
 
@@ -46,6 +47,10 @@ def test_how_late_is_late(more_ns: int, late: int) -> None:
         Entry(5 + LATE_NS + more_ns, 1, 1, EntryKind.ANSWERED, Sums().execute(b"request 1")),
     ]
     assert account_of(History({}, entries)).late == late
+
+
+def test_a_reply_is_late_when_the_brakes_no_longer_hold_the_request_before_it() -> None:
+    assert LATE_NS == HOLD_US * 1000
 
 
 def a_failover(*, fault: bool, alarm: bool = True) -> Tale:

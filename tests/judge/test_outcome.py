@@ -9,7 +9,7 @@ import pytest
 from aftbed.campaign.experiment import Experiment, carry_out
 from aftbed.core.events import Event
 from aftbed.core.journal import Entry, EntryKind, History, Record
-from aftbed.judge.checks import LATE_NS
+from aftbed.judge.checks import LATE_NS, Evidence
 from aftbed.judge.outcome import OUTCOMES, outcome_of, worst
 from aftbed.judge.reference import reference_run
 from aftbed.judge.simulated import record_of
@@ -86,6 +86,15 @@ def answered(change: Callable[[Entry], list[Entry]]) -> History:
 )
 def test_each_class_has_its_history(found: Changed, word: str) -> None:
     assert found.word() == word
+
+
+def test_replicas_that_differ_are_told_of_a_function_that_has_no_right_state_too() -> None:
+    record, reference = record_of(CLEAN), reference_run(CLEAN.history, default_application())
+    assert record.end is not None
+    end = msgspec.structs.replace(record.end, states={"a": "1", "b": "2"})
+    record = msgspec.structs.replace(record, end=end)
+    reference = msgspec.structs.replace(reference, deterministic=False)
+    assert outcome_of(Evidence(record, reference)) == ("latent", ("the replicas differ",))
 
 
 def test_the_worst_wins() -> None:

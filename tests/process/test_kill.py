@@ -1,9 +1,13 @@
 """SIGKILL of every process of a run, under load: the service goes on, and nothing is left (G1 to G7)."""
 
+import contextlib
+import ctypes
 import io
 import itertools
 import os
 import signal
+import struct
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -24,7 +28,7 @@ from liveruns import (
 )
 from sampling import every
 
-from aftbed.core.journal import EntryKind
+from aftbed.core.journal import LIFELINE_OFFSET, EntryKind
 from aftbed.ftm.compose import build
 from aftbed.inject.grammar import Trigger
 from aftbed.inject.hang import Hang
@@ -40,6 +44,10 @@ CHAIN: Final = ("protocol", "before", "proceed", "after", "server")
 OUTSIDE: Final = tuple(n for n in NODES if n.rpartition("/")[2] not in CHAIN)
 REQUESTS: Final = 150
 RATE_HZ: Final = 200.0
+FUTEX_TID_MASK: Final = 0x3FFF_FFFF
+PR_SET_CHILD_SUBREAPER: Final = 36
+PTRACE_SEIZE: Final = 0x4206
+WAIT_ALL: Final = 0x4000_0000  # __WALL: also for what is no child
 STOPPED_MS: Final = 110  # longer than a replacement takes
 
 
@@ -63,6 +71,30 @@ def pids_of(run: Started, name: str) -> set[int]:
     return {row.pid for row in run.rows() if row.name == name}
 
 
+def holder_of_lifeline(run: Started, node: str) -> int:
+    """The process whose death the kernel will mark in the journal of the first `node`, for its Watchdog."""
+    journal = run.launched.record / "journal" / f"{node.replace('/', '.')}.1.journal"
+    (word,) = struct.unpack_from("I", journal.read_bytes(), LIFELINE_OFFSET)
+    return word & FUTEX_TID_MASK
+
+
+@contextlib.contextmanager
+def traced(pid: int) -> Iterator[None]:
+    """Killed, `pid` stays until its tracer has waited for it (ptrace(2)): here, until the end.
+
+    Meanwhile this process adopts orphans, so that nobody else has to reap it.
+    """
+    libc = ctypes.CDLL(None, use_errno=True)
+    libc.ptrace.argtypes = (ctypes.c_long, ctypes.c_long, ctypes.c_void_p, ctypes.c_void_p)
+    libc.prctl(PR_SET_CHILD_SUBREAPER, 1)
+    try:
+        assert libc.ptrace(PTRACE_SEIZE, pid, None, None) == 0, os.strerror(ctypes.get_errno())
+        yield
+        os.waitpid(pid, WAIT_ALL)
+    finally:
+        libc.prctl(PR_SET_CHILD_SUBREAPER, 0)
+
+
 def load_over_a_kill(home: Home, name: str, placement: str = "process") -> Outcome:
     """A run under load in which the process called `name` is killed."""
     with under_load(home, REQUESTS, RATE_HZ, placement=placement) as run:
@@ -77,6 +109,8 @@ def test_there_are_the_seventeen_processes_of_the_paper(home: Home) -> None:
         assert [row.name for row in rows if row.node] == ["supervisor", *NODES]
         assert len({row.pid for row in rows}) == len(rows)
         assert len([row for row in rows if row.node]) == 17
+        nodes = {row.name: row.pid for row in rows if row.name in NODES}
+        assert {name: holder_of_lifeline(run, name) for name in nodes} == nodes
         assert_served(run.finish(), failovers=0)
 
 
@@ -222,6 +256,15 @@ def test_a_killed_command_leaves_nothing_whatever_its_keepers_suffer(
             until(lambda: not home.processes(), "the end of all processes", GONE_SECONDS_MAX)
             assert aftbed("doctor", "--clean").code == 0
         assert home.seconds_to_clean() < GONE_SECONDS_MAX
+
+
+def test_what_does_not_end_in_time_is_named(home: Home) -> None:
+    with under_load(home, 50) as run:
+        pid = run.pid("zygote")
+        with traced(pid):
+            outcome = run.finish()
+    assert outcome.verdict.verdict == "fail"
+    assert outcome.verdict.reasons == [f"clean_exit: left behind: ['zygote ({pid})']"]
 
 
 def test_the_record_of_a_killed_run_holds_every_reply_that_was_given(home: Home) -> None:

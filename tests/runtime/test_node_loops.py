@@ -6,6 +6,7 @@ nudges, large packets and orders come in between. An order is laid into the cont
 it, so that it comes at the same place in both.
 """
 
+import contextlib
 import os
 import socket
 from collections.abc import Callable
@@ -22,6 +23,7 @@ from aftbed.core import messages
 from aftbed.core.brick import Brick, Effect, Note, Order, Send
 from aftbed.core.errors import PeerError
 from aftbed.core.events import Event
+from aftbed.core.graph import Link
 from aftbed.core.journal import FLAG_OFFSET, records
 from aftbed.core.messages import AnyMessage, Rebound, Reply, Request
 from aftbed.core.script import Script
@@ -31,10 +33,10 @@ from aftbed.inject.grammar import Bit
 from aftbed.inject.value import ValueFlip, ValuePlace
 from aftbed.runtime import control
 from aftbed.runtime.node import Node
-from aftbed.runtime.unix import transport
+from aftbed.runtime.unix import node_io, transport
 from aftbed.runtime.unix.journal_files import JournalFile
 from aftbed.runtime.unix.node_io import UnixIO, UnixNode
-from aftbed.runtime.unix.transport import NUDGE, Line, decode_order, decode_report
+from aftbed.runtime.unix.transport import NUDGE, Line, UnixChannel, decode_order, decode_report
 
 FLIP: Final = model.ArmedFault(7, "brick", 1, ValueFlip(ValuePlace.RESULT, Bit(0)), False)
 OMISSION: Final = model.ArmedFault(8, "brick", 1, ChannelFault(Disturbance.OMISSION, "out"), False)
@@ -213,3 +215,22 @@ def test_a_fault_that_is_armed_leaves_the_fast_loop_until_it_has_struck() -> Non
     replies = [messages.decode(packet) for packet in sent]
     assert [r.payload for r in replies if isinstance(r, Reply)][:2] == [b"`b", b"ab"]
     assert [event for event, *_ in noted].count(Event.FAULT_APPLIED) == 1, "given twice, it began anew"
+
+
+def test_a_node_whose_mail_nobody_reads_takes_itself_for_fenced(tmp_path: Path) -> None:
+    """It ends, by an error that `serve` takes for a fence: what it wants to say must not be lost silently."""
+    harness, channel = Harness(tmp_path / "journal"), UnixChannel(Link("node", "out", "other", "in"))
+    harness.node.bind_output("brick", "out", os.dup(channel.write.fileno()), 1)
+    hosted = harness.node.bricks["brick"]
+    end = hosted.outputs["out"]
+    assert isinstance(end, int)
+    with contextlib.suppress(BlockingIOError):
+        while True:
+            channel.write.send(b"mail", socket.MSG_DONTWAIT)
+    with (
+        mock.patch.object(node_io, "WRITE_SECONDS_MAX", 2 * transport.WRITE_PATIENCE_SECONDS),
+        pytest.raises(BrokenPipeError, match="brick: out is shut or has no reader"),
+    ):
+        harness.io.write(hosted, "out", end, Reply(1, 1, 1, b""), None)
+    harness.close()
+    channel.close()
