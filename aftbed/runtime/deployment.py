@@ -310,13 +310,11 @@ class Deployment:
             raise StepFailed(f"{dead[0]} died")
 
     def shut_replication(self, slot: Slot) -> None:
-        """What `slot` sends to the other replica ends after what was sent; what is sent to it, is refused."""
+        """What `slot` sends to the other replica ends after what was sent."""
         for channel in self.channels.touching(slot.bricks):
             source, sink = channel.link.source, channel.link.sink
             if source in slot.bricks and "/" in sink and sink not in slot.bricks:
                 channel.fence()
-            elif sink in slot.bricks and "/" in source and source not in slot.bricks:
-                channel.refuse()
 
     def watch(self, slot: Slot, *, none: bool = False) -> Keys:
         """Have the Watchdog of `slot` watch its present nodes, or none. Without a Watchdog: nothing.
