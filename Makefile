@@ -22,7 +22,7 @@ FAULT := crash primary at checkpoint.sent nth 100
 # Hundreds of interpreters start in the tests; without bytecode each would compile all that it imports.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help demo test lint fast process deep bench
+.PHONY: help demo test lint fast process deep mutants bench
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
 
@@ -33,6 +33,7 @@ help:
 	@echo "make fast     the tests without real runs"
 	@echo "make process  the tests that start real runs: a sample of their combinations"
 	@echo "make deep     the exhaustive tests, and thousands of examples of every property: hours"
+	@echo "make mutants  plant bugs one by one, see what notices them, write docs/assumptions.md (ONLY=words: some, print)"
 	@echo "make bench    every figure of docs/numbers.md, written into its table: ten minutes"
 
 # Where the tests are installed, the package is too: then the demo needs nothing more.
@@ -55,6 +56,9 @@ process: $(EDITABLE)
 deep: $(EDITABLE)
 	$(BIN)/python -m pytest -m deep
 	$(BIN)/python -m pytest -n auto --hypothesis-profile deep --timeout 0 -m "hypothesis and not process and not deep"
+
+mutants: $(EDITABLE)
+	$(BIN)/python tests/mutation/run_mutants.py --into docs/assumptions.md $(if $(ONLY),--only "$(ONLY)")
 
 bench: $(EDITABLE)
 	$(BIN)/aftbed bench all --into docs/numbers.md

@@ -1,0 +1,312 @@
+"""Bugs to plant in the source: right code with one thing wrong in it. `make mutants` sees what notices them.
+
+A bug that was mended becomes one of them: what the code was before, in the place of what it is. `before`
+occurs once in its file; a test of every commit sees to that, so that the list cannot rot.
+
+Bugs that are planted in memory, and found by the explorers' own experiments, are in tests/sim.
+"""
+
+from enum import Enum
+from typing import Final, NamedTuple
+
+
+class Finder(Enum):
+    """What looks for bugs, the cheapest first."""
+
+    UNIT_TESTS = "unit tests"
+    EXPLORERS = "explorers"
+    SWARM = "swarm"
+    CAMPAIGN = "real campaign"
+    PROCESS_TESTS = "tests of real runs"
+
+
+class SourceMutant(NamedTuple):
+    """`found_by`: the cheapest finder that has to notice it; `tests`: those about it, for pytest."""
+
+    name: str
+    promise: str
+    path: str
+    before: str
+    after: str
+    found_by: Finder
+    tests: tuple[str, ...]
+
+
+UNIT, EXPLORERS, SWARM, CAMPAIGN, PROCESS = Finder
+FTM: Final = "aftbed/ftm"
+RUNTIME: Final = "aftbed/runtime"
+UNIX: Final = "aftbed/runtime/unix"
+JUDGE: Final = "aftbed/judge"
+SCRIPTS: Final = ("tests/sim/test_failing_scripts.py",)
+KILLS: Final = "tests/process/test_kill.py::"
+
+MUTANTS: Final = (
+    SourceMutant(
+        "After takes over while a checkpoint is half applied",
+        "G1",
+        f"{FTM}/pbr.py",
+        "(_S.APPLYING, CONTROL, Promotion): (promote, _S.PROMOTED_APPLYING)",
+        "(_S.APPLYING, CONTROL, Promotion): (promote_at_once('aft2pro'), _S.IDLE)",
+        UNIT,
+        ("tests/ftm/test_pbr.py",),
+    ),
+    SourceMutant(
+        "a new Client takes the next request for one that was sent",
+        "G5",
+        f"{FTM}/client.py",
+        "if number < self.next_id]",
+        "if number <= self.next_id]",
+        UNIT,
+        ("tests/ftm/test_client.py",),
+    ),
+    SourceMutant(
+        "the last words of a fenced leader are not fenced",
+        "G6",
+        f"{RUNTIME}/script_executor.py",
+        "            self._last_replies.fence()  #",
+        "            pass  #",
+        UNIT,
+        SCRIPTS,
+    ),
+    SourceMutant(
+        "the leader stays suspended when a new backup fails",
+        "G2",
+        f"{RUNTIME}/script_executor.py",
+        "done = [step for step in done if isinstance(step, Suspend)]",
+        "done = []",
+        UNIT,
+        SCRIPTS,
+    ),
+    SourceMutant(
+        "a dead replica is waited for as the next leader",
+        "G2",
+        f"{RUNTIME}/script_executor.py",
+        "            deployment.assert_whole(deployment.slots[replica])\n            yield promoting\n",
+        "            yield promoting\n",
+        UNIT,
+        SCRIPTS,
+    ),
+    SourceMutant(
+        "a failover to a backup that is gone is not refused",
+        "G2",
+        f"{RUNTIME}/script_executor.py",
+        "return script.replica != deployment.leader or not deployment.backup",
+        "return script.replica != deployment.leader",
+        UNIT,
+        SCRIPTS,
+    ),
+    SourceMutant(
+        "a new backup is of the generation of the dead one",
+        "G5",
+        f"{RUNTIME}/deployment.py",
+        "        slot.generation += 1\n",
+        "",
+        UNIT,
+        SCRIPTS,
+    ),
+    SourceMutant(
+        "Recovery acts before the way back of an adaptation",
+        "G5",
+        f"{RUNTIME}/adaptations.py",
+        "            self._executor.held = True\n            now.lost = replica\n",
+        "            now.lost = replica\n",
+        UNIT,
+        SCRIPTS,
+    ),
+    SourceMutant(
+        "a Watchdog that dies while it is put in place stays away",
+        "G5",
+        f"{RUNTIME}/run_controller.py",
+        "                self._loop.after(SETTLE_SECONDS, self._replace_missing)\n",
+        "",
+        UNIT,
+        ("tests/sim/test_found.py",),
+    ),
+    SourceMutant(
+        "a replacement that dies is taken as told",
+        "G5",
+        f"{RUNTIME}/run_controller.py",
+        "elif not serves and not self.ending:",
+        "elif failure and not self.ending:",
+        UNIT,
+        ("tests/sim/test_replacements.py",),
+    ),
+    SourceMutant(
+        "a fault that waits in a replaced node is lost",
+        "G8",
+        f"{RUNTIME}/run_controller.py",
+        "            if serves:  # faults that waited",
+        "            if False:  # faults that waited",
+        UNIT,
+        ("tests/sim/test_injectors.py",),
+    ),
+    SourceMutant(
+        "a fault that waits in an exchanged brick comes late",
+        "G8",
+        f"{RUNTIME}/adaptations.py",
+        "if now.phase is Phase.COMMIT and not failure:  # faults that waited",
+        "if False:  # faults that waited",
+        UNIT,
+        ("tests/sim/test_injectors.py",),
+    ),
+    SourceMutant(
+        "the pulse goes on although a brick loops",
+        "G2",
+        f"{UNIX}/node_io.py",
+        "if at != self._pulse_at or (frame is not None and",
+        "if at != self._pulse_at or (frame is not None or",
+        UNIT,
+        ("tests/runtime/test_pulse.py",),
+    ),
+    SourceMutant(
+        "a write without a reader is given up silently",
+        "G3",
+        f"{UNIX}/node_io.py",
+        '        raise BrokenPipeError(f"{hosted.name}',
+        '        assert (f"{hosted.name}',
+        UNIT,
+        ("tests/runtime/test_node_loops.py",),
+    ),
+    SourceMutant(
+        "anybody may ask the control socket",
+        "G8",
+        f"{UNIX}/control_client.py",
+        '    return bool(struct.unpack("3i", raw)[1] == uid)\n',
+        '    return bool(struct.unpack("3i", raw))\n',
+        UNIT,
+        ("tests/runtime/test_control_server.py",),
+    ),
+    SourceMutant(
+        "a full disk looks like a crash of a node",
+        "G8",
+        f"{UNIX}/process_pool.py",
+        "    if code == -signal.SIGBUS and process.journal:",
+        "    if code == -signal.SIGBUS and not process.journal:",
+        UNIT,
+        ("tests/runtime/test_reap.py",),
+    ),
+    SourceMutant(
+        "a function that returns no bytes passes the self-test",
+        "G8",
+        "aftbed/adapt/plugins.py",
+        "    return _checked(found)\n",
+        "    return found\n",
+        UNIT,
+        ("tests/runtime/test_selftest.py",),
+    ),
+    SourceMutant(
+        "the lifeline is never held",
+        "G2",
+        f"{UNIX}/zygote.py",
+        "    io.lifeline = Lifeline(Path(order.journal))\n",
+        "",
+        PROCESS,
+        (KILLS + "test_there_are_the_seventeen_processes_of_the_paper",),
+    ),
+    SourceMutant(
+        "the warden leaves the run's directory",
+        "G7",
+        f"{UNIX}/cleanup.py",
+        "    kill_open(reader, private)\n    run_directory.remove(private)\n",
+        "    kill_open(reader, private)\n",
+        PROCESS,
+        (KILLS + "test_a_killed_command_leaves_nothing_whatever_its_keepers_suffer",),
+    ),
+    SourceMutant(
+        "a stopped supervisor is not continued when its command dies",
+        "G7",
+        f"{UNIX}/launch.py",
+        "        if self.supervisor == 0:\n            linux.continue_at_parents_death()\n",
+        "        if self.supervisor == 0:\n",
+        PROCESS,
+        (KILLS + "test_a_killed_command_leaves_nothing_whatever_its_keepers_suffer",),
+    ),
+    SourceMutant(
+        "a stopped warden is not continued when its command dies",
+        "G7",
+        f"{UNIX}/launch.py",
+        "            try:\n                linux.continue_at_parents_death()\n",
+        "            try:\n",
+        PROCESS,
+        (KILLS + "test_a_killed_command_leaves_nothing_whatever_its_keepers_suffer",),
+    ),
+    SourceMutant(
+        "what is left at the end is not told",
+        "G7",
+        f"{UNIX}/supervisor.py",
+        "for p in dying]\n",
+        "for p in []]\n",
+        PROCESS,
+        (KILLS + "test_what_does_not_end_in_time_is_named",),
+    ),
+    SourceMutant(
+        "a reply is late after ten times as long",
+        "G8",
+        f"{JUDGE}/checks.py",
+        "LATE_NS: Final = 60_000_000",
+        "LATE_NS: Final = 600_000_000",
+        UNIT,
+        ("tests/judge/test_figures.py",),
+    ),
+    SourceMutant(
+        "states are not compared in the classification",
+        "G8",
+        f"{JUDGE}/outcome.py",
+        "or len(states) > 1:",
+        "or not isinstance(states, set):",
+        UNIT,
+        ("tests/judge/test_outcome.py",),
+    ),
+    SourceMutant(
+        "a failover is counted from any fault before it",
+        "G8",
+        f"{JUDGE}/checks.py",
+        "        if not fault.action.stops_process or (",
+        "        if False and (",
+        UNIT,
+        ("tests/judge/test_figures.py",),
+    ),
+    SourceMutant(
+        "a fault of an earlier leader is the cause of a failover",
+        "G8",
+        f"{JUDGE}/checks.py",
+        "and since_ns <= strike.t_ns <= alarm.t_ns",
+        "and strike.t_ns <= alarm.t_ns",
+        UNIT,
+        ("tests/judge/test_figures.py",),
+    ),
+    SourceMutant(
+        "an adaptation that was not done passes",
+        "G8",
+        f"{JUDGE}/checks.py",
+        'Check("unknown" if failed else "pass", failed[:REASONS_MAX])',
+        'Check("pass", failed[:REASONS_MAX])',
+        UNIT,
+        ("tests/judge/test_verdict.py",),
+    ),
+    SourceMutant(
+        "sources that contradict each other pass",
+        "G8",
+        f"{JUDGE}/checks.py",
+        'Finding = "fail" if wrong else "unknown"',
+        'Finding = "unknown"',
+        PROCESS,
+        ("tests/process/test_tampered.py",),
+    ),
+    SourceMutant(
+        "a record's function is executed without trust",
+        "G8",
+        f"{UNIX}/trust.py",
+        "        if strangers:\n",
+        "        if strangers and not files:\n",
+        UNIT,
+        ("tests/judge/test_trust.py",),
+    ),
+)
+
+
+def planted(mutant: SourceMutant, text: str) -> str:
+    """`text`, with the bug in it."""
+    count = text.count(mutant.before)
+    assert count == 1, f"{mutant.name}: its text is {count} times in {mutant.path}"
+    return text.replace(mutant.before, mutant.after)
