@@ -87,6 +87,7 @@ class Tree:
         (packages / "tree.pth").write_text(f"{self._root}\n{ours}\n")  # .pth files of `ours` are not read
         self._python = place / "venv" / "bin" / "python"
         self._process: subprocess.Popen[str] | None = None
+        self._closed = False
 
     def examine(self, mutant: SourceMutant) -> Row:
         """Plant the bug, have it looked for, take it out again."""
@@ -139,16 +140,22 @@ class Tree:
             )
             code: int | None = None
             try:
+                if self._closed:
+                    raise KeyboardInterrupt
                 code = self._process.wait(seconds_max)
             except subprocess.TimeoutExpired:
                 pass
             finally:
-                self.stop()
+                self._stop()
             out.seek(0)
             return code, time.monotonic() - began_s, out.read().splitlines()
 
-    def stop(self) -> None:
-        """End what is under way, with all that belongs to it."""
+    def close(self) -> None:
+        """End what is under way. No other look begins."""
+        self._closed = True
+        self._stop()
+
+    def _stop(self) -> None:
         process = self._process
         if process is not None and process.poll() is None:
             os.killpg(process.pid, signal.SIGKILL)
@@ -160,10 +167,10 @@ class Tree:
             old.unlink()  # it may be of the same second and size
 
 
-def control(tree: Tree) -> Iterator[str]:
-    """What the finders find in the code as it is."""
-    tests = sorted({test for mutant in MUTANTS for test in mutant.tests})
-    for finder in Finder:
+def control(tree: Tree, names: Sequence[str]) -> Iterator[str]:
+    """What the finders of these bugs find in the code as it is."""
+    tests = sorted({test for mutant in MUTANTS if mutant.name in names for test in mutant.tests})
+    for finder in Finder if tests else SIMULATED:
         look = tree.look(finder, tests)
         print(f"without a bug: {finder.value}: {look.seconds if look else 0:.1f} s", flush=True)
         if look is not None and look.found:
@@ -192,7 +199,7 @@ def examined(names: Sequence[str], trees: Sequence[Tree]) -> Iterator[Row]:
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
             for tree in trees:
-                tree.stop()
+                tree.close()
 
 
 def markdown(rows: Sequence[Row], seconds: float) -> Iterator[str]:
@@ -241,10 +248,11 @@ def main() -> int:
     names = [name for name in order if given.only is None or given.only in name]
     if not names:
         parser.error(f"--only {given.only}: no bug has that in its name")
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as an interrupt: nothing is left
     began_s = time.monotonic()
     with tempfile.TemporaryDirectory(prefix="mutants-") as place:
         trees = [Tree(Path(place, str(number))) for number in range(min(given.jobs, len(names)))]
-        found = list(control(trees[0]))
+        found = list(control(trees[0], names))
         if found:
             print("\n".join(("there is a bug already:", *found)))
             return 1
@@ -262,4 +270,7 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    try:
+        sys.exit(main())
+    except KeyboardInterrupt:
+        sys.exit(130)

@@ -32,6 +32,7 @@ from planting import (
 
 from aftbed.adapt.engine import AdaptationEngine
 from aftbed.core import script
+from aftbed.core.events import Event
 from aftbed.core.graph import Graph
 from aftbed.core.messages import Rebound, TakeUp
 from aftbed.ftm import failover
@@ -45,6 +46,8 @@ from aftbed.runtime.interface import Process
 from aftbed.runtime.script_executor import Changes, Execution, Rebinding
 from aftbed.runtime.sim import world
 from aftbed.runtime.sim.world import Setup
+
+BEHIND: Final = (Event.ADAPT_STEP_EXIT,)  # a step: what takes part dies when it is done
 
 
 def _unfenced(self: Execution, replica: str) -> None:
@@ -291,7 +294,7 @@ EXECUTIVE: Final = (
         "ScriptExecutor goes back to the bricks of before, and leaves them the state of before",
         wrapped(script_executor, "inverse", _without(script.Migrate)),
         ADAPT,
-        adapts("pbr", "pbr+tr", "a", placement="replica"),
+        adapts("pbr", "pbr+tr", "a", placement="replica", when=BEHIND),
         "G3",
     ),
     Mutant(
@@ -299,7 +302,7 @@ EXECUTIVE: Final = (
         "ScriptExecutor goes back as if no request had passed, where a commit fails after it let them on",
         wrapped(Execution, "_resume", _unnoticed),
         ADAPT,
-        adapts("pbr", "pbr+tr", "a", placement="replica"),
+        adapts("pbr", "pbr+tr", "a", placement="replica", when=BEHIND),
         "G3",
     ),
     Mutant(
@@ -307,7 +310,7 @@ EXECUTIVE: Final = (
         "ScriptExecutor does not look whether all that is to serve is alive",
         instead(Execution, "_assert_whole", lambda self: None),
         ADAPT,
-        adapts("pbr", "lfr", "a/before"),
+        adapts("pbr", "lfr", "a/before", when=BEHIND),
         "G5",
     ),
     Mutant(

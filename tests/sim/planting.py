@@ -11,6 +11,7 @@ from typing import Final, NamedTuple
 import msgspec
 
 from aftbed.core.brick import Brick, Effect, Machine, Moves
+from aftbed.core.events import Event
 from aftbed.core.messages import Goal, Scheduled
 from aftbed.inject.crash import Crash
 from aftbed.inject.grammar import Bit, Trigger
@@ -165,12 +166,14 @@ def adapts(
     placement: str = "process",
     load: tuple[int, float] = LOAD,
     seeds: int = 1,
+    when: Iterable[Event] = explore.STEPS,
 ) -> Setups:
     """Of `explore adapt`: the deaths of these nodes, under another load perhaps (requests, and how fast)."""
+    events = {event.label for event in when}
     return lambda: (
         msgspec.structs.replace(s, count=load[0], rate_hz=load[1], seed=seed)
         for s in explore.adaptations([(old, new)], [placement])
-        if s.faults[0].target in nodes
+        if s.faults[0].target in nodes and s.faults[0].trigger.event in events
         for seed in range(seeds)
     )
 
