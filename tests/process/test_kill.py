@@ -175,12 +175,11 @@ def test_a_node_beside_the_replicas_may_die_again_and_again(home: Home, name: st
         assert_served(run.finish(), failovers=0)
 
 
-@pytest.mark.parametrize("pair", every(7, list(itertools.permutations(OUTSIDE, 2))), ids="-".join)
+@pytest.mark.parametrize(("node", "neighbour"), every(7, list(itertools.permutations(OUTSIDE, 2))))
 def test_a_replacement_that_dies_beside_a_stopped_neighbour_is_replaced(
-    home: Home, pair: tuple[str, str]
+    home: Home, node: str, neighbour: str
 ) -> None:
     """While others are bound to the new process, one of them does not answer; then the new one dies too."""
-    node, neighbour = pair
     with under_load(home, REQUESTS, RATE_HZ) as run:
         hang = Fault(Hang(STOPPED_MS), neighbour, Trigger())
         control_client.ask(run.private, control_client.InjectCommand(hang))
