@@ -66,7 +66,7 @@ class NodeJournal(NamedTuple):
 
     node: str
     incarnation: int
-    records: list[Record]
+    records: Sequence[Record]
 
 
 class LoggedEvent(NamedTuple):

@@ -72,12 +72,16 @@ class Dialogue(Protocol):
         """Append an entry."""
         ...
 
+    def keep(self, now_ns: int, capture: Callable[[], bytes]) -> None:
+        """Keep the state of the Client now and then, where a successor would have too much to read."""
+        return
 
-def resume_client(client: Client, history: Iterable[Entry]) -> None:
-    """Give a new Client the state that follows from its predecessors' dialogues."""
-    waiting: dict[int, Request] = {}
-    answered = set()
-    next_id = 1
+
+def resume_client(client: Client, history: Iterable[Entry], state: bytes = b"") -> None:
+    """Give a new Client the state that follows from its predecessors' dialogues: since `state`, if given."""
+    if state:
+        client.restore(state)
+    waiting, next_id, answered = dict(client.unanswered), client.next_id, set()
     for entry in history:
         if entry.kind is _SENT:
             waiting[entry.request_id] = Request(0, entry.request_id, entry.payload)
@@ -114,6 +118,7 @@ class Load(Device):
         if self._period_ns:
             earliest_ns = now_ns - CATCH_UP * self._period_ns
             self._next_ns = max(self._next_ns or now_ns, earliest_ns) + self._period_ns
+        self._dialogue.keep(now_ns, self._client.capture)
         self._dialogue.write(now_ns, request_id, 0, _SENT, payload)
         return Submit(payload)
 
@@ -202,6 +207,7 @@ class CarDevice(Device):
         if not self._payloads or self._quiet:
             return None
         payload = self._payloads.popleft()
+        self._dialogue.keep(now_ns, self._client.capture)
         self._dialogue.write(now_ns, self._client.next_id, 0, _SENT, payload)
         self._sent_ns = now_ns
         return Submit(payload)

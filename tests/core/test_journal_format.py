@@ -16,9 +16,13 @@ from aftbed.core.journal import (
     RECORD,
     Entry,
     EntryKind,
+    History,
     Record,
+    StoredRecords,
+    committed,
     dropped,
     entries,
+    entries_in,
     header,
     node_name,
     records,
@@ -48,7 +52,40 @@ def test_records_are_read_as_written_and_end_where_none_is_committed(found: list
 
 @given(some_entries, st.integers(0, 100))
 def test_entries_are_read_as_written_and_end_where_none_is_committed(found: list[Entry], room: int) -> None:
-    assert list(entries(dialogue(found) + bytes(room))) == found
+    told = [entry for entry in found if entry.kind is not EntryKind.STATE]
+    assert list(entries(dialogue(found) + bytes(room))) == told, "states of the Client are no history"
+
+
+@given(some_entries, st.integers(1, 80))
+def test_entries_are_the_same_however_the_file_is_cut_into_parts(found: list[Entry], size: int) -> None:
+    data = dialogue(found)[HEADER_BYTES:] + bytes(ENTRY.size)
+    parts = [data[at : at + size] for at in range(0, len(data), size)]
+    assert list(entries_in(parts)) == found
+
+
+@given(some_records, st.sets(st.sampled_from(Event)), st.integers(1, 5))
+def test_stored_records_are_the_same_as_those_in_memory(
+    found: list[Record], wanted: set[Event], size: int
+) -> None:
+    data = journal(found)[HEADER_BYTES:]
+    parts = [data[at : at + size * RECORD.size] for at in range(0, len(data), size * RECORD.size)]
+    stored, kept = StoredRecords("a/after", lambda: parts), found
+    assert (len(stored), list(stored), stored[1:]) == (len(found), found, found[1:])
+    assert not found or (stored[0], stored[-1]) == (found[0], found[-1])
+    one, other = History({"a.after.1": stored}, []), History({"a.after.1": kept}, [])
+    assert one.events(*wanted) == other.events(*wanted)
+    assert list(one.times()) == list(other.times())
+    assert one.in_memory() == other
+
+
+@given(some_records, st.integers(0, 100), st.sampled_from([36, 256, 1 << 16, 1 << 24, 2**32 - 1]))
+def test_committed_ends_where_the_records_do_and_refuses_an_unknown_code(
+    found: list[Record], room: int, code: int
+) -> None:
+    data = journal(found)[HEADER_BYTES:]
+    assert committed(data + bytes(room), "a", 0) == len(data)
+    with pytest.raises(PeerError, match=f"record at byte {7 + len(data)} has the unknown event code {code}"):
+        committed(data + RECORD.pack(1, 2, 3, 0, code), "a", 7)
 
 
 RECORDS: Final = [Record(7, Event.SERVER_EXIT, 1, 2, "a/after"), Record(8, Event.NODE_DIED, 0, 9, "a/after")]

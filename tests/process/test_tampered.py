@@ -15,7 +15,7 @@ from liveruns import aftbed
 
 from aftbed.core.errors import ConfigError
 from aftbed.core.events import Event
-from aftbed.core.journal import DROPPED_OFFSET, ENTRY, HEADER_BYTES, RECORD, EntryKind, entries, records
+from aftbed.core.journal import DROPPED_OFFSET, ENTRY, HEADER_BYTES, RECORD, EntryKind, entries_in, records
 from aftbed.judge.record import read_record
 from aftbed.judge.verdict import judge
 from aftbed.runtime.unix import seal
@@ -117,7 +117,7 @@ def packed(path: Path) -> list[bytes]:
         count = len(list(records(data)))
         return [data[at : at + RECORD.size] for at in _steps(count, RECORD.size)]
     found, at = [], HEADER_BYTES
-    for entry in entries(data):
+    for entry in entries_in((data[HEADER_BYTES:],)):
         size = ENTRY.size + len(entry.payload)
         found.append(data[at : at + size])
         at += size
@@ -176,7 +176,9 @@ def stale_epoch(parts: list[bytes]) -> list[bytes]:
 
 
 def payload_flipped(parts: list[bytes]) -> list[bytes]:
-    return [parts[0][:-1] + bytes([parts[0][-1] ^ 1]), *parts[1:]]
+    """Of the first request."""
+    at = next(n for n, part in enumerate(parts) if ENTRY.unpack_from(part)[4] == EntryKind.SENT)
+    return [*parts[:at], parts[at][:-1] + bytes([parts[at][-1] ^ 1]), *parts[at + 1 :]]
 
 
 def times_shuffled(parts: list[bytes]) -> list[bytes]:

@@ -1,6 +1,7 @@
 """Journals in mapped files: they grow by chunks, outlive their node, and are read while they are written."""
 
 import os
+import re
 import signal
 from pathlib import Path
 from typing import Final
@@ -9,6 +10,7 @@ import pytest
 
 from aftbed.core.events import Event
 from aftbed.core.journal import (
+    ENTRY,
     FLAG_OFFSET,
     HEADER_BYTES,
     PULSE_OFFSET,
@@ -19,8 +21,19 @@ from aftbed.core.journal import (
     node_name,
     records,
 )
+from aftbed.core.messages import Request
+from aftbed.ftm.client import Client
+from aftbed.runtime.devices import resume_client
 from aftbed.runtime.unix import journal_files as mapped
-from aftbed.runtime.unix.journal_files import CHUNK_BYTES, DialogueFile, JournalFile, JournalHeader
+from aftbed.runtime.unix.journal_files import (
+    CHUNK_BYTES,
+    STATE_EVERY_BYTES,
+    DialogueFile,
+    JournalFile,
+    JournalHeader,
+    dialogue_path,
+    last_words,
+)
 
 PER_CHUNK: Final = (CHUNK_BYTES - HEADER_BYTES) // RECORD.size
 
@@ -49,6 +62,88 @@ def test_a_journal_grows_past_a_chunk(tmp_path: Path, count: int) -> None:
     for number in range(count):
         journal.write(number, Event.SERVER_EXIT, number, 0)
     assert [r.request_id for r in records(path.read_bytes())] == list(range(count))
+
+
+def resident(path: Path) -> int:
+    """How many bytes of the file this process has in its memory."""
+    text = Path("/proc/self/smaps").read_text()
+    sizes = re.findall(rf"{re.escape(str(path))}\n.*?^Rss: +(\d+) kB", text, re.DOTALL | re.MULTILINE)
+    assert sizes
+    return 1024 * sum(map(int, sizes))
+
+
+def test_memory_does_not_grow_with_the_journal(tmp_path: Path) -> None:
+    path, other = tmp_path / "a.journal", tmp_path / "client.1.dialogue"
+    journal, dialogue = JournalFile(path, "a"), DialogueFile(other, "client")
+    for number in range(4 * PER_CHUNK):
+        journal.write(number, Event.SERVER_EXIT, number, 0)
+    for number in range(400):
+        dialogue.write(number, number, 1, EntryKind.SENT, bytes(CHUNK_BYTES // 100))
+    assert path.stat().st_size >= 4 * CHUNK_BYTES <= other.stat().st_size
+    assert resident(path) <= CHUNK_BYTES + HEADER_BYTES >= resident(other)
+    assert len(list(records(path.read_bytes()))) == 4 * PER_CHUNK
+    assert len(list(entries(other.read_bytes()))) == 400
+
+
+def client_of(next_id: int, *waiting: int) -> bytes:
+    client = Client()
+    client.next_id, client.unanswered = next_id, {n: Request(0, n, b"%d" % n) for n in waiting}
+    return client.capture()
+
+
+def serve(dialogue: DialogueFile, first: int, last: int) -> None:
+    """Requests that are answered, as a device writes them."""
+    for number in range(first, last + 1):
+        dialogue.keep(number, lambda n=number: client_of(n))
+        dialogue.write(number, number, 0, EntryKind.SENT, b"request")
+        dialogue.write(number, number, 1, EntryKind.ANSWERED, b"reply")
+
+
+def resumed(folder: Path, incarnation: int) -> tuple[int, list[int]]:
+    """From which request on a Client goes on, and which it asks for again."""
+    client, (state, since) = Client(), last_words(folder, incarnation)
+    resume_client(client, since, state)
+    return client.next_id, list(client.unanswered)
+
+
+def test_a_successor_reads_as_little_after_many_requests_as_after_few(tmp_path: Path) -> None:
+    dialogue = DialogueFile(dialogue_path(tmp_path, 1), "client")
+    serve(dialogue, 1, 20_000)
+    dialogue.write(20_001, 20_001, 0, EntryKind.SENT, b"unanswered")
+    assert resumed(tmp_path, 2) == (20_002, [20_001])
+    most = STATE_EVERY_BYTES // ENTRY.size
+    assert len(last_words(tmp_path, 2)[1]) <= most < 20_000
+    assert len(list(entries(dialogue_path(tmp_path, 1).read_bytes()))) == 40_001, "the judge has them all"
+
+
+def test_a_successor_goes_on_from_predecessors_that_have_kept_no_state(tmp_path: Path) -> None:
+    """The third takes a reply for the first and sends nothing; the second and the fourth leave nothing."""
+    first, third = (DialogueFile(dialogue_path(tmp_path, n), "client") for n in (1, 3))
+    dialogue_path(tmp_path, 4).write_bytes(b"")  # it died while it made it
+    serve(first, 1, 5)
+    for number in (6, 7):
+        first.write(number, number, 0, EntryKind.SENT, b"request")
+    third.write(8, 6, 1, EntryKind.ANSWERED, b"reply")
+    assert resumed(tmp_path, 5) == (8, [7])
+    assert resumed(tmp_path, 1) == (1, [])
+
+
+def test_a_state_has_what_waited(tmp_path: Path) -> None:
+    first, second = (DialogueFile(dialogue_path(tmp_path, n), "client") for n in (1, 2))
+    serve(first, 1, 5)
+    second.keep(9, lambda: client_of(9, 7, 8))
+    second.write(9, 9, 0, EntryKind.SENT, b"request")
+    second.write(10, 7, 1, EntryKind.ANSWERED, b"reply")
+    assert resumed(tmp_path, 3) == (10, [8, 9])
+
+
+def test_a_state_that_finds_no_room_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mapped, "FILE_BYTES_MAX", CHUNK_BYTES)
+    dialogue = DialogueFile(dialogue_path(tmp_path, 1), "client")
+    serve(dialogue, 1, 3)
+    dialogue.write(4, 4, 0, EntryKind.SENT, bytes(CHUNK_BYTES - STATE_EVERY_BYTES // 2))
+    dialogue.keep(5, lambda: bytes(STATE_EVERY_BYTES))
+    assert resumed(tmp_path, 2) == (5, [4])
 
 
 def test_a_dialogue_grows_past_a_chunk_and_takes_an_entry_larger_than_one(tmp_path: Path) -> None:

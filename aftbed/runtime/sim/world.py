@@ -357,6 +357,9 @@ class World:
     def write(self, now_ns: int, request_id: int, epoch: int, kind: EntryKind, payload: bytes) -> None:
         self.dialogue.append(Entry(now_ns, request_id, epoch, kind, payload))
 
+    def keep(self, now_ns: int, capture: Callable[[], bytes]) -> None:
+        """Do nothing: a new Client has the whole dialogue."""
+
     def _on_report(self, process: SimProcess, report: control.FromNode) -> None:
         self.controller.on_report(process, report)
         self.loop.watch_jobs()

@@ -7,14 +7,13 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from aftbed.core.journal import entries
 from aftbed.core.messages import Reply
 from aftbed.ftm.client import Client
 from aftbed.runtime import control
 from aftbed.runtime.devices import CarDevice, CarLink, Device, Load, Senses, resume_client
 from aftbed.runtime.unix import linux
 from aftbed.runtime.unix.death_notice import LifelineWatcher
-from aftbed.runtime.unix.journal_files import DialogueFile, JournalHeader
+from aftbed.runtime.unix.journal_files import DialogueFile, JournalHeader, dialogue_path, last_words
 from aftbed.runtime.unix.options import GATEWAY, LoadRun, ReplayRun, SourceOptions
 from aftbed.vehicle.aeb.function import sample_requests
 
@@ -113,8 +112,10 @@ class BusLink(CarLink):
 
 def make_source(client: Client, options: SourceOptions) -> Device:
     """Where the requests of a Client come from; the Client takes over from its predecessors."""
-    resume_client(client, [entry for path in options.earlier for entry in entries(Path(path).read_bytes())])
-    dialogue, work = DialogueFile(Path(options.dialogue), "client"), options.work
+    journals, work = Path(options.journals), options.work
+    state, since = last_words(journals, options.incarnation)
+    resume_client(client, since, state)
+    dialogue = DialogueFile(dialogue_path(journals, options.incarnation), "client")
     if isinstance(work, LoadRun):
         requests = sample_requests(options.seed, LOAD_REQUESTS)
         return Load(client, dialogue, requests, work.count, work.rate_hz)

@@ -2,12 +2,15 @@
 
 The format is `core.journal`'s. A file grows by a chunk when it is full; up to a limit, beyond which
 a record is dropped and the drop is counted in the header, so that a checker says `unknown` and not
-`pass`.
+`pass`. The chunk before is given back then (its pages stay the kernel's), so a node takes as much memory for
+its journal after a day as after a second.
 """
 
 import contextlib
+import functools
 import mmap
 import os
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final
 
@@ -18,10 +21,12 @@ from aftbed.core.input_file import open_input
 from aftbed.runtime.unix import linux
 
 CHUNK_BYTES: Final = 1 << 20
-FILE_BYTES_MAX: Final = 1 << 30
+FILE_BYTES_MAX: Final = 8 << 30  # a day at 1000 requests a second, where one node hosts a whole replica
 READY_BYTES: Final = 1 << 16  # in memory from the start: a backup writes its first record in a failover
+STATE_EVERY_BYTES: Final = 1 << 18  # of a dialogue: what a new Client reads of it at most, in a millisecond
 RECORDED_MAX: Final = 16
 RECORDED_BYTES_MAX: Final = 1 << 16
+PART_BYTES: Final = 1 << 16  # read at once: most journals are shorter
 STEP_BYTES_MAX: Final = 8 * layout.RECORD.size  # what the notes of one step take at most
 
 
@@ -33,6 +38,47 @@ def contents(path: Path) -> layout.Data:
     """
     with open_input(path) as file:
         return file.read()
+
+
+def stored_records(path: Path) -> tuple[layout.StoredRecords, int]:
+    """The records of a journal of any length, and how many found no room.
+
+    Raises OSError, and PeerError if it is no journal. It has been read once then.
+    """
+    with open_input(path) as file:
+        head = file.read(layout.HEADER_BYTES)
+    if layout.unfinished(head):
+        return layout.StoredRecords("", tuple), 0
+    node = layout.node_name(head)
+
+    def parts() -> Iterator[bytes]:
+        with open_input(path) as file:
+            file.seek(at := layout.HEADER_BYTES)
+            while part := file.read(PART_BYTES):
+                end = layout.committed(part, node, at)
+                yield part[:end]
+                if end < len(part):
+                    return
+                at += end
+
+    return layout.StoredRecords(node, parts), layout.dropped(head)
+
+
+def stored_entries(path: Path) -> Iterator[layout.Entry]:
+    """The requests and replies in a dialogue of any length. Raises OSError, and PeerError as it goes on."""
+    with open_input(path) as file:
+        head = file.read(layout.HEADER_BYTES)
+        if not layout.unfinished(head):
+            layout.node_name(head)
+            yield from layout.requests_and_replies(
+                layout.entries_in(iter(functools.partial(file.read, PART_BYTES), b""))
+            )
+
+
+def entries_dropped(path: Path) -> int:
+    """How many entries of a dialogue found no room. Raises OSError and PeerError."""
+    with open_input(path) as file:
+        return layout.dropped(file.read(layout.HEADER_BYTES))
 
 
 def _mapped(path: Path, name: str) -> mmap.mmap:
@@ -51,9 +97,14 @@ def _mapped(path: Path, name: str) -> mmap.mmap:
 
 def _grow(mapping: mmap.mmap) -> bool:
     """Add a chunk; False, with the loss counted, at the limit or where the file cannot grow."""
-    if len(mapping) < FILE_BYTES_MAX:
+    full = len(mapping)
+    if full < FILE_BYTES_MAX:
         with contextlib.suppress(OSError):  # a limit of the user (RLIMIT_FSIZE), or of the disk
-            mapping.resize(len(mapping) + CHUNK_BYTES)
+            mapping.resize(full + CHUNK_BYTES)
+            first = max(layout.HEADER_BYTES, full - CHUNK_BYTES)
+            mapping.madvise(
+                mmap.MADV_DONTNEED, first, full - first
+            )  # of a file: what was written stays in it
             return True
     _count_loss(mapping)
     return False
@@ -97,6 +148,17 @@ class DialogueFile:
     def __init__(self, path: Path, node: str) -> None:
         self.mapping = _mapped(path, node)
         self._at, self._full = layout.HEADER_BYTES, False
+        self._state_due = layout.HEADER_BYTES
+
+    def keep(self, now_ns: int, capture: Callable[[], bytes]) -> None:
+        """Write the state of the Client, if the last one is far behind: a successor reads from there on."""
+        at = self._at
+        if at < self._state_due or self._full:
+            return
+        self.write(now_ns, 0, 0, layout.EntryKind.STATE, capture())
+        if not self._full:  # it is complete
+            self.mapping[layout.STATE_OFFSET : layout.STATE_OFFSET + 8] = at.to_bytes(8, "little")
+            self._state_due = at + STATE_EVERY_BYTES
 
     def write(self, now_ns: int, request_id: int, epoch: int, kind: layout.EntryKind, payload: bytes) -> None:
         """Append an entry; its kind is written last and commits it."""
@@ -139,10 +201,35 @@ class JournalHeader:
         self._mapping.close()
 
 
+def dialogue_path(journals: Path, incarnation: int) -> Path:
+    """Of the Client that was made as the `incarnation`th."""
+    return journals / f"client.{incarnation}.dialogue"
+
+
+def last_words(journals: Path, incarnation: int) -> tuple[bytes, list[layout.Entry]]:
+    """The last state that the predecessors of that Client have written, and what happened since.
+
+    Without a state (none of them came to its first request) it is empty. Raises PeerError.
+    """
+    since: list[layout.Entry] = []
+    for before in range(incarnation - 1, 0, -1):
+        try:
+            with open(dialogue_path(journals, before), "rb") as file:
+                at = layout.state_at(file.read(layout.HEADER_BYTES))
+                file.seek(at or layout.HEADER_BYTES)
+                found = list(layout.entries_in((file.read(),), at or layout.HEADER_BYTES))
+        except FileNotFoundError:  # it died before
+            continue
+        if at:
+            return found[0].payload, found[1:] + since
+        since = found + since
+    return b"", since
+
+
 def recorded_requests(record: Path) -> tuple[bytes, ...]:
     """The first few requests of a run: the self-test of new bricks replays them."""
     found: list[bytes] = []
-    path = record / "journal" / "client.1.dialogue"
+    path = dialogue_path(record / "journal", 1)
     with open(path, "rb") as file, contextlib.suppress(PeerError):  # the last entry is cut off
         for entry in layout.entries(file.read(RECORDED_BYTES_MAX)):
             found += [entry.payload] if entry.kind is layout.EntryKind.SENT else []

@@ -67,14 +67,15 @@ class RunOptions(msgspec.Struct, frozen=True):
 class SourceOptions(msgspec.Struct, frozen=True):
     """For the process that makes the requests: the host of the Client, the vehicle or the player.
 
-    `port` is the hub's. `dialogue` is the file of this Client, `earlier` are those of its predecessors.
+    `port` is the hub's. `journals` is the directory of the dialogues of this Client, which was made as the
+    `incarnation`th, and of its predecessors.
     """
 
     work: Work
     seed: int
     port: int
-    dialogue: str = ""
-    earlier: tuple[str, ...] = ()
+    journals: str = ""
+    incarnation: int = 1
 
 
 class SourceLoader(SourceFileLoader):

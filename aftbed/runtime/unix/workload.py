@@ -134,15 +134,8 @@ class Workload:
             return "sensor", b""
         if kind != "client":
             return "", b""
-        options, journal = self._options, Path(self._options.record) / "journal"
-        dialogues = [journal / f"client.{number}.dialogue" for number in range(1, incarnation + 1)]
-        source = SourceOptions(
-            options.work,
-            options.seed,
-            options.port,
-            str(dialogues[-1]),
-            tuple(str(path) for path in dialogues[:-1] if path.exists()),
-        )
+        options, journals = self._options, Path(self._options.record) / "journal"
+        source = SourceOptions(options.work, options.seed, options.port, str(journals), incarnation)
         return "load" if self._is_load else "gateway", msgspec.msgpack.encode(source)
 
     def spares(self) -> dict[str, int]:
