@@ -109,7 +109,7 @@ def finished(launched: Launched, ends: tuple[str, ...]) -> RunRecord:
         for _ in launched.reports():
             pass
         launched.wait()
-        record = read_record(launched.record)
+        record = read_record(launched.record, in_memory=True)
         if record.end is None or record.end.reason not in ends:
             reason = "the supervisor died" if record.end is None else record.end.reason
             raise HarnessError(f"a run of the bench ended early: {reason}")

@@ -6,7 +6,7 @@ has a broken history in the tests that it must refuse.
 """
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Final, Literal, NamedTuple
 
 import msgspec
@@ -110,11 +110,9 @@ def at_most_once(history: History) -> Check:
     before, so what it did stands in the place of what the run before it did.
     """
     reasons = []
-    for name, records in history.journals.items():
+    for name in history.journals:
         lasts: dict[int, tuple[int, bool]] = {}  # by the Server: a node may host two
-        for record in records:
-            if record.event not in (Event.SERVER_EXIT, Event.STATE_RESTORED):
-                continue
+        for record in history.events_of(name, Event.SERVER_EXIT, Event.STATE_RESTORED):
             last, executed = lasts.get(record.brick, (0, False))
             exits = record.event is Event.SERVER_EXIT
             again = exits and executed and record.detail == RERUN and record.request_id == last
@@ -127,18 +125,17 @@ def at_most_once(history: History) -> Check:
 def exactly_one_answer(history: History, *, cut_off: bool = False) -> Check:
     """G2: each request sent has one reply. Of a history that was `cut_off`, what waited is not known."""
     answers = _answers(history)
-    waiting = [i for i, found in sorted(answers.items()) if not found] if cut_off else []
-    reasons = [
-        f"request {i}: {len(found)} replies"
-        for i, found in sorted(answers.items())
-        if len(found) != 1 and i not in waiting
-    ]
+    odd = sorted(i for i, count in answers.items() if count != 1)
+    waiting = {i for i in odd if not answers[i]} if cut_off else set()
+    reasons = [f"request {i}: {answers[i]} replies" for i in odd if i not in waiting]
     asked = {e.request_id for e in _sent(history)}
     reasons += [f"request {i}: answered, but never sent" for i in sorted(answers.keys() - asked)]
     strays = [r.request_id for r in _client_refusals(history) if r.request_id]
     reasons += [f"request {i}: one reply too many reached the client" for i in strays]
     if waiting and not reasons:
-        return Check("unknown", (f"requests {waiting[:REASONS_MAX]} waited when the run was cut off",))
+        return Check(
+            "unknown", (f"requests {sorted(waiting)[:REASONS_MAX]} waited when the run was cut off",)
+        )
     return _check(reasons) if answers else Check("unknown", ("no request was sent",))
 
 
@@ -148,9 +145,11 @@ def one_history(history: History, reference: ReferenceRun) -> Check:
         return Check("unknown", (reference.unknown,))
     wrong = wrong_replies(history, reference)
     reasons = [f"request {i}: the reply is not the bare server's" for i in wrong]
-    sent = [e.request_id for e in _sent(history)]
-    if sent != list(range(1, len(sent) + 1)):
-        reasons.append("the ids of the requests are not 1, 2, 3, ...")
+    sent = 0
+    for sent, entry in enumerate(_sent(history), 1):
+        if entry.request_id != sent:
+            reasons.append("the ids of the requests are not 1, 2, 3, ...")
+            break
     return _check(reasons) if sent else Check("unknown", ("no request was sent",))
 
 
@@ -177,17 +176,18 @@ def one_master(history: History) -> Check:
             if not any(f.detail & 0xFF == old and began_ns <= f.t_ns <= ended_ns for f in fences):
                 reasons.append(f"replica {old} was not fenced between epochs {epoch} and {found}")
         epoch = max(epoch, found)
-    return _check(reasons) if _sent(history) else Check("unknown", ("no request was sent",))
+    sent = any(True for _ in _sent(history))
+    return _check(reasons) if sent else Check("unknown", ("no request was sent",))
 
 
 def wrong_replies(history: History, reference: ReferenceRun) -> dict[int, bytes]:
     """The replies that differ from the bare server's, by request."""
-    answers = _answers(history)
-    return {
-        i: wrong[0]
-        for i, expected in reference.replies
-        if (wrong := [a.payload for a in answers[i] if a.payload != expected])
-    }
+    expected, wrong = dict(reference.replies), dict[int, bytes]()
+    for entry in history.dialogue:
+        number = entry.request_id
+        if entry.kind is EntryKind.ANSWERED and entry.payload != expected.get(number, entry.payload):
+            wrong.setdefault(number, entry.payload)
+    return dict(sorted(wrong.items()))
 
 
 def late_after_ns(work: Work) -> int:
@@ -199,21 +199,23 @@ def late_after_ns(work: Work) -> int:
 def answered_after_ns(history: History) -> list[int]:
     """How long each request that was answered waited for its first reply."""
     sent_ns = {e.request_id: e.t_ns for e in _sent(history)}
-    firsts = {i: min(a.t_ns for a in found) for i, found in _answers(history).items() if found}
+    firsts: dict[int, int] = {}
+    for entry in history.dialogue:
+        if entry.kind is EntryKind.ANSWERED:
+            firsts[entry.request_id] = min(entry.t_ns, firsts.get(entry.request_id, entry.t_ns))
     return [t_ns - sent_ns[i] for i, t_ns in firsts.items() if i in sent_ns]
 
 
 def requests(history: History, reference: ReferenceRun, late_ns: int = LATE_NS) -> Requests:
     """The client's account of its requests."""
     answers = _answers(history)
-    sent_ns = {e.request_id: e.t_ns for e in _sent(history)}
-    firsts = {i for i, found in answers.items() if found}
+    sent = {e.request_id for e in _sent(history)}
     refused = sum(bool(r.request_id) for r in _client_refusals(history))
     return Requests(
-        sent=len(sent_ns),
-        answered=len(firsts),
-        lost=sum(i not in firsts for i in sent_ns),
-        duplicated=sum(len(a) > 1 for a in answers.values()) + refused,
+        sent=len(sent),
+        answered=sum(count > 0 for count in answers.values()),
+        lost=sum(not answers[i] for i in sent),
+        duplicated=sum(count > 1 for count in answers.values()) + refused,
         late=sum(waited_ns > late_ns for waited_ns in answered_after_ns(history)),
         wrong=len(wrong_replies(history, reference)),
     )
@@ -221,24 +223,26 @@ def requests(history: History, reference: ReferenceRun, late_ns: int = LATE_NS) 
 
 def failovers(history: History, faults: Sequence[FaultReport] = ()) -> list[Failover]:
     """Each change of master, in order. `faults` are those of the run, in the order of their numbers."""
-    accepted = history.events(Event.REPLY_ACCEPTED)
-    sent_ns = {e.request_id: e.t_ns for e in _sent(history)}
+    epochs = _epochs(history)
+    fences, alarms = history.events(Event.REPLICA_FENCED), history.events(Event.WATCHDOG_SUSPECT)
+    strikes = history.events(Event.FAULT_APPLIED)
     actions = [parse(report.fault) for report in faults]
     found, since_ns = [], 0
     for promoted in history.events(Event.REPLICA_PROMOTED):
         epoch = promoted.detail
-        fence = _last_before(history.events(Event.REPLICA_FENCED), promoted.t_ns)
-        alarm = _last_before(history.events(Event.WATCHDOG_SUSPECT), (fence or promoted).t_ns)
+        fence = _last_before(fences, promoted.t_ns)
+        alarm = _last_before(alarms, (fence or promoted).t_ns)
         first = alarm or fence or promoted
-        fault = _cause(history, actions, since_ns, first, fence)
+        fault = _cause(strikes, actions, since_ns, first, fence)
         since_ns = promoted.t_ns
         start_ns = (fault or first).t_ns
-        reply = next((r for r in accepted if r.detail >> 8 == epoch), None)
+        service = epochs.get(epoch)
+        reply = service.first if service is not None else None
         blackout_ms = None
-        if reply is not None:  # no service from when a request waited, and the last master replied no more
-            waiting_ns = max(start_ns, sent_ns.get(reply.request_id, start_ns))
-            before_ns = max((r.t_ns for r in accepted if r.detail >> 8 < epoch), default=0)
-            blackout_ms = round((reply.t_ns - max(waiting_ns, before_ns)) / 1e6, 3)
+        if service is not None:  # no service from when a request waited, and the last master replied no more
+            waiting_ns = max(start_ns, service.sent_ns or start_ns)
+            before_ns = max((one.last_ns for e, one in epochs.items() if e < epoch), default=0)
+            blackout_ms = round((service.first.t_ns - max(waiting_ns, before_ns)) / 1e6, 3)
         detected_ms, fenced_ms, promoted_ms, recovered_ms = (
             None if one is None else round((one.t_ns - start_ns) / 1e6, 3)
             for one in (alarm if fault else None, fence, promoted, reply)
@@ -250,8 +254,39 @@ def failovers(history: History, faults: Sequence[FaultReport] = ()) -> list[Fail
     return found
 
 
+class _Service(NamedTuple):
+    """Of one master: its first accepted reply, when that request was sent (0: unknown), and its last one."""
+
+    first: Record
+    sent_ns: int
+    last_ns: int
+
+
+def _epochs(history: History) -> dict[int, _Service]:
+    """The service of each master, by epoch."""
+    firsts: dict[int, Record] = {}
+    lasts_ns: dict[int, int] = {}
+    for name in history.journals:
+        for record in history.events_of(name, Event.REPLY_ACCEPTED):
+            epoch = record.detail >> 8
+            first = firsts.setdefault(epoch, record)
+            if record.t_ns < first.t_ns:
+                firsts[epoch] = record
+            lasts_ns[epoch] = max(record.t_ns, lasts_ns.get(epoch, 0))
+    numbers = {record.request_id for record in firsts.values()}
+    sent_ns = {e.request_id: e.t_ns for e in _sent(history) if e.request_id in numbers}
+    return {
+        epoch: _Service(first, sent_ns.get(first.request_id, 0), lasts_ns[epoch])
+        for epoch, first in firsts.items()
+    }
+
+
 def _cause(
-    history: History, faults: Sequence[Fault], since_ns: int, alarm: Record, fence: Record | None
+    strikes: Sequence[Record],
+    faults: Sequence[Fault],
+    since_ns: int,
+    alarm: Record,
+    fence: Record | None,
 ) -> Record | None:
     """The strike that ended the fenced leader: of a crash, or of a hang that was not over before the alarm.
 
@@ -269,7 +304,7 @@ def _cause(
         lasts_ns = fault.action.lasts_ms * 1_000_000
         return not lasts_ns or alarm.t_ns <= strike.t_ns + lasts_ns + HANG_NOTICED_NS
 
-    return _last_before(filter(ended_it, history.events(Event.FAULT_APPLIED)), alarm.t_ns)
+    return _last_before(filter(ended_it, strikes), alarm.t_ns)
 
 
 def _number_of(strike: Record) -> int:
@@ -310,17 +345,15 @@ def _last_before(records: Iterable[Record], t_ns: int) -> Record | None:
     return max((r for r in records if r.t_ns <= t_ns), key=lambda r: r.t_ns, default=None)
 
 
-def _sent(history: History) -> list[Entry]:
-    return [e for e in history.dialogue if e.kind is EntryKind.SENT]
+def _sent(history: History) -> Iterator[Entry]:
+    return (e for e in history.dialogue if e.kind is EntryKind.SENT)
 
 
-def _answers(history: History) -> dict[int, list[Entry]]:
-    found: dict[int, list[Entry]] = defaultdict(list)
+def _answers(history: History) -> dict[int, int]:
+    """How many replies each request has that was sent or answered."""
+    found: dict[int, int] = defaultdict(int)
     for entry in history.dialogue:
-        if entry.kind is EntryKind.SENT:
-            found[entry.request_id] = found[entry.request_id]
-        elif entry.kind is EntryKind.ANSWERED:
-            found[entry.request_id].append(entry)
+        found[entry.request_id] += entry.kind is EntryKind.ANSWERED
     return found
 
 

@@ -3,7 +3,9 @@
 The directory of a real run can be read after a `kill -9`, too.
 """
 
+import itertools
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
@@ -12,17 +14,18 @@ import msgspec
 from aftbed.adapt.engine import DONE
 from aftbed.core.errors import ConfigError, PeerError
 from aftbed.core.input_file import read_input
-from aftbed.core.journal import EntryKind, History, dropped, entries, records
+from aftbed.core.journal import Entry, EntryKind, History, Stored
 from aftbed.inject.model import FaultReport
 from aftbed.inject.receipts import ReceiptState
 from aftbed.runtime.adaptations import Outcome
 from aftbed.runtime.deployment import Hosted
-from aftbed.runtime.unix.journal_files import contents
+from aftbed.runtime.unix.journal_files import entries_dropped, stored_entries, stored_records
 from aftbed.runtime.unix.options import CarRun, RunOptions
 from aftbed.runtime.unix.run_directory import HISTORY_NAME
 from aftbed.vehicle.plant import VehicleResult
 
 DOCUMENT_BYTES_MAX: Final = 64_000_000  # of a file that is no journal
+IN_MEMORY_MAX: Final = 200_000  # records and entries that are kept, at some 200 bytes each
 END_KEYS: Final = (
     *("reason", "ended_ns", "seconds", "left", "unfinished", "lost", "leader", "backup", "hosted", "states"),
     *("epoch", "faults"),
@@ -110,30 +113,19 @@ class RunRecord(msgspec.Struct, frozen=True):
         return not (self.end.hosted.leader if self.end.hosted is not None else self.end.leader)
 
 
-def read_record(path: Path) -> RunRecord:
-    """The record in `path`. Raises ConfigError naming the file that is missing or malformed."""
+def read_record(path: Path, *, in_memory: bool = False) -> RunRecord:
+    """The record in `path`. Raises ConfigError naming the file that is missing or malformed.
+
+    What is long stays in its files, and each check reads it again. With `in_memory` it is kept all the same,
+    so that the directory may be removed.
+    """
     about = _json(path / "run.json")
     try:
         options = msgspec.convert(about | {"private": "", "listener": -1}, RunOptions)
         started = msgspec.convert(about.get("started_ns"), int)
     except msgspec.ValidationError as error:
         raise ConfigError(f"{path / 'run.json'}: not the options of a run: {error}") from None
-    folder = path / "journal"
-    files = sorted(folder.glob("*.journal"))
-    dialogues = sorted(folder.glob("client.*.dialogue"), key=lambda p: int(p.name.split(".")[1]))
-    try:
-        read = {p: contents(p) for p in (*files, *dialogues)}
-        journals = {p.name.removesuffix(".journal"): list(records(read[p])) for p in files}
-        dialogue = [e for p in dialogues for e in entries(read[p])]
-        if any(dropped(read[p]) for p in dialogues):  # what was answered behind its end is not known
-            answered = {e.request_id for e in dialogue if e.kind is EntryKind.ANSWERED}
-            dialogue = [e for e in dialogue if e.request_id in answered]
-        lost = sum(map(dropped, read.values()))
-    except PeerError as error:
-        raise ConfigError(f"{folder}: {error}") from None
-    except OSError as error:
-        raise ConfigError(f"{error.filename}: {error.strerror}") from None
-    history = History(journals, dialogue, lost)
+    history = _history(path / "journal", in_memory=in_memory)
     end = _end(path / "end.json") if (path / "end.json").exists() else None
     faults = (
         end.faults
@@ -143,6 +135,33 @@ def read_record(path: Path) -> RunRecord:
     vehicle = _vehicle(options, end)
     kept = about.get("kept") is True
     return RunRecord(options, history, end, faults, _adaptations(path), vehicle, path, started, kept=kept)
+
+
+def _history(folder: Path, *, in_memory: bool) -> History:
+    dialogues = sorted(folder.glob("client.*.dialogue"), key=lambda p: int(p.name.split(".")[1]))
+    try:
+        found = {p.name.removesuffix(".journal"): stored_records(p) for p in sorted(folder.glob("*.journal"))}
+        lost = [entries_dropped(p) for p in dialogues]
+
+        def read() -> Iterator[Entry]:
+            return itertools.chain.from_iterable(map(stored_entries, dialogues))
+
+        if any(lost):  # what was answered behind the end of a dialogue is not known
+            answered = {e.request_id for e in read() if e.kind is EntryKind.ANSWERED}
+            entries = Stored(lambda: (e for e in read() if e.request_id in answered))
+        else:
+            entries = Stored(read)
+        history = History(
+            {name: records for name, (records, _) in found.items()},
+            entries,
+            sum(dropped for _, dropped in found.values()) + sum(lost),
+        )
+        size = len(entries) + sum(map(len, history.journals.values()))
+        return history.in_memory() if in_memory or size <= IN_MEMORY_MAX else history
+    except PeerError as error:
+        raise ConfigError(f"{folder}: {error}") from None
+    except OSError as error:
+        raise ConfigError(f"{error.filename}: {error.strerror}") from None
 
 
 def _end(path: Path) -> RunEnd:

@@ -10,7 +10,7 @@ again. What only a lost replica had executed was executed once more, by the vers
 """
 
 import contextlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from typing import Final
 
 import msgspec
@@ -132,9 +132,9 @@ class ReferenceRun(msgspec.Struct, frozen=True):
         return digest(self.state)
 
 
-def requests_of(history: History) -> list[tuple[int, bytes]]:
+def requests_of(history: History) -> Iterator[tuple[int, bytes]]:
     """Id and payload of each request that was sent, in their order."""
-    return [(e.request_id, e.payload) for e in history.dialogue if e.kind is EntryKind.SENT]
+    return ((e.request_id, e.payload) for e in history.dialogue if e.kind is EntryKind.SENT)
 
 
 def executed(requests: Iterable[tuple[int, bytes]], bare: Application) -> ReferenceRun:

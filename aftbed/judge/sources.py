@@ -12,13 +12,12 @@ What a request must have left, if it was answered:
     dialogue     the bytes that the seed draws, of a load
 """
 
-from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterator
 from functools import lru_cache
-from itertools import pairwise
+from typing import NamedTuple
 
 from aftbed.core.events import FIRST_FAULT, Event
-from aftbed.core.journal import Entry, EntryKind, Record
+from aftbed.core.journal import EntryKind, History, Record
 from aftbed.ftm.compose import build
 from aftbed.inject.receipts import fault_and_bits
 from aftbed.judge.record import RunEnd, RunRecord
@@ -89,33 +88,56 @@ def gaps(record: RunRecord, reference: ReferenceRun) -> Iterator[str]:
 
 def _of_requests(record: RunRecord) -> Iterator[str]:
     """The dialogue against itself, the proxy, the servers and the seed."""
-    accepted = _by_request(record.history.events(Event.REPLY_ACCEPTED))
-    executed = _by_request(record.history.events(Event.SERVER_EXIT))
-    sent: dict[int, Entry] = {}
-    backwards = sum(after.t_ns < before.t_ns for before, after in pairwise(record.history.dialogue))
-    if backwards:
-        yield f"{backwards} entries of the dialogue are earlier than the ones before them"
+    work, seed = record.options.work, record.options.seed
+    drawn = _drawn(seed) if isinstance(work, LoadRun) and not _flipped(record) else None
+    sent_ns: dict[int, int] = {}
+    spans: dict[int, _Span] = {}  # of the first answer: a second one breaks G2
+    backwards, last_ns, not_drawn = 0, 0, []
     for entry in record.history.dialogue:
         number = entry.request_id
-        if entry.kind is EntryKind.SENT:
-            sent.setdefault(number, entry)
-            continue
-        before = sent.get(number)
-        if before is None or entry.t_ns < before.t_ns:
-            yield f"request {number}: answered before it was sent"
-            continue
-        between = (before.t_ns, entry.t_ns)
-        if not any(r.detail >> 8 == entry.epoch for r in _within(accepted[number], *between)):
-            yield f"request {number}: answered under epoch {entry.epoch}, which the proxy did not accept"
-        if not any(True for _ in _within(executed[number], *between)):
-            yield f"request {number}: answered, and no server executed it meanwhile"
-    if isinstance(record.options.work, LoadRun) and not _flipped(record):
-        drawn = _drawn(record.options.seed)
-        yield from (
-            f"request {number}: not what seed {record.options.seed} draws"
-            for number, entry in sent.items()
-            if entry.payload != drawn[(number - 1) % LOAD_REQUESTS]
-        )
+        backwards += entry.t_ns < last_ns
+        last_ns = entry.t_ns
+        if entry.kind is EntryKind.ANSWERED:
+            before_ns = sent_ns.get(number)
+            if before_ns is None or entry.t_ns < before_ns:
+                yield f"request {number}: answered before it was sent"
+            elif number not in spans:
+                spans[number] = _Span(before_ns, entry.t_ns, entry.epoch)
+        elif number not in sent_ns:
+            sent_ns[number] = entry.t_ns
+            if drawn is not None and entry.payload != drawn[(number - 1) % LOAD_REQUESTS]:
+                not_drawn.append(number)
+    if backwards:
+        yield f"{backwards} entries of the dialogue are earlier than the ones before them"
+    del sent_ns
+    for number in _without(
+        Event.REPLY_ACCEPTED, spans, record.history, lambda r, s: r.detail >> 8 == s.epoch
+    ):
+        yield f"request {number}: answered under epoch {spans[number].epoch}, which the proxy did not accept"
+    for number in _without(Event.SERVER_EXIT, spans, record.history, lambda r, s: True):
+        yield f"request {number}: answered, and no server executed it meanwhile"
+    yield from (f"request {number}: not what seed {seed} draws" for number in not_drawn)
+
+
+class _Span(NamedTuple):
+    """Of a request: when it was sent and answered, and under which epoch."""
+
+    sent_ns: int
+    answered_ns: int
+    epoch: int
+
+
+def _without(
+    event: Event, spans: dict[int, _Span], history: History, fits: Callable[[Record, _Span], bool]
+) -> list[int]:
+    """The requests that have no such record within their spans."""
+    left = set(spans)
+    for journal in history.journals:
+        for record in history.events_of(journal, event):
+            span = spans.get(record.request_id)
+            if span is not None and span.sent_ns <= record.t_ns <= span.answered_ns and fits(record, span):
+                left.discard(record.request_id)
+    return sorted(left)
 
 
 def _of_faults(record: RunRecord) -> Iterator[str]:
@@ -137,22 +159,10 @@ def _of_end(record: RunRecord, end: RunEnd) -> Iterator[str]:
     if _at_rest(end) and end.client is not None and end.client.sent not in (None, len(ids)):
         yield f"the client sent {end.client.sent} requests, and its dialogue has {len(ids)}"
     if end.ended_ns:
-        times = [entry.t_ns for entry in record.history.dialogue]
-        times += [one.t_ns for records in record.history.journals.values() for one in records]
-        outside = sum(not record.started_ns <= t_ns <= end.ended_ns for t_ns in times)
+        first_ns, last_ns = record.started_ns, end.ended_ns
+        outside = sum(not first_ns <= t_ns <= last_ns for t_ns in record.history.times())
         if outside:
             yield f"{outside} records are of a time at which the run was not"
-
-
-def _by_request(records: Iterable[Record]) -> dict[int, list[Record]]:
-    found: dict[int, list[Record]] = defaultdict(list)
-    for record in records:
-        found[record.request_id].append(record)
-    return found
-
-
-def _within(records: Iterable[Record], first_ns: int, last_ns: int) -> Iterator[Record]:
-    return (record for record in records if first_ns <= record.t_ns <= last_ns)
 
 
 @lru_cache(maxsize=4)

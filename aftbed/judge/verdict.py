@@ -109,7 +109,7 @@ def judge(record: RunRecord, evidence: Evidence | None = None) -> Verdict:
         case _:
             scenario = "load"
     proposals = None if record.simulated else read_proposals(record.path)
-    sent = [e.t_ns for e in history.dialogue]
+    began_ns = min((e.t_ns for e in history.dialogue), default=None)
     return Verdict(
         run=options.run,
         seed=options.seed,
@@ -127,7 +127,9 @@ def judge(record: RunRecord, evidence: Evidence | None = None) -> Verdict:
         faults=list(record.faults),
         replay=replay,
         seconds=record.end.seconds if record.end is not None else None,
-        launch_ms=None if record.simulated or not sent else round((min(sent) - record.started_ns) / 1e6, 3),
+        launch_ms=(
+            None if record.simulated or began_ns is None else round((began_ns - record.started_ns) / 1e6, 3)
+        ),
         proposals=msgspec.UNSET if proposals is None else proposals,
     )
 

@@ -7,7 +7,10 @@ import pytest
 from records import CAR, whole
 
 from aftbed.core.errors import ConfigError
+from aftbed.core.journal import Stored
+from aftbed.judge import record as judged
 from aftbed.judge.record import read_record
+from aftbed.judge.verdict import judge
 from aftbed.runtime.unix.journal_files import DialogueFile
 
 
@@ -19,6 +22,39 @@ def test_several_incarnations_of_the_client_are_one_dialogue(path: Path) -> None
         record.request()
     verdict = record.verdict()
     assert verdict.verdict == "pass" and verdict.requests.sent == 12
+
+
+def test_a_record_that_is_too_long_for_memory_is_judged_like_a_short_one(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With a failover, a reply that is wrong, one that is doubled, and one that is lost."""
+    record = whole(path)
+    record.failover()
+    record.request(epoch=2, replica=2, flipped_bit=8)
+    record.request(epoch=2, replica=2, answers=2)
+    record.request(epoch=2, replica=2, answers=0)
+    short = record.verdict()
+    assert (short.requests.lost, short.requests.duplicated, short.requests.wrong) == (1, 1, 1)
+    assert len(short.failovers) == 1 and short.verdict == "fail"
+    monkeypatch.setattr(judged, "IN_MEMORY_MAX", 0)
+    long = read_record(path)
+    assert isinstance(long.history.dialogue, Stored)
+    assert judge(long) == short
+    assert read_record(path, in_memory=True).history == long.history.in_memory()
+
+
+def test_what_a_full_dialogue_has_not_seen_is_not_asked_of_a_long_record(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    record = whole(path)
+    record.request(answers=0)
+    record.lose("client.1.dialogue", 1)
+    short = record.verdict()
+    assert (
+        short.requests.lost == 0 and "whole_history: 1 records found no room in the journals" in short.reasons
+    )
+    monkeypatch.setattr(judged, "IN_MEMORY_MAX", 0)
+    assert judge(read_record(path)) == short
 
 
 def test_a_directory_that_is_no_record(tmp_path: Path) -> None:
