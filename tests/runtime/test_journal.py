@@ -33,6 +33,7 @@ from aftbed.runtime.unix.journal_files import (
     JournalHeader,
     dialogue_path,
     last_words,
+    trim,
 )
 
 PER_CHUNK: Final = (CHUNK_BYTES - HEADER_BYTES) // RECORD.size
@@ -83,6 +84,22 @@ def test_memory_does_not_grow_with_the_journal(tmp_path: Path) -> None:
     assert resident(path) <= CHUNK_BYTES + HEADER_BYTES >= resident(other)
     assert len(list(records(path.read_bytes()))) == 4 * PER_CHUNK
     assert len(list(entries(other.read_bytes()))) == 400
+
+
+def test_the_journals_of_a_run_that_has_ended_are_cut_to_what_is_in_them(tmp_path: Path) -> None:
+    counts = {"a.1": 5, "b.1": PER_CHUNK + 1, "c.1": 0}
+    for name, count in counts.items():
+        journal = JournalFile(tmp_path / f"{name}.journal", name)
+        for number in range(count):
+            journal.write(number, Event.SERVER_EXIT, number, 0)
+    (tmp_path / "died.1.journal").write_bytes(b"")
+    (tmp_path / "strange.1.journal").write_bytes(b"no journal")
+    trim(tmp_path)
+    for name, count in counts.items():
+        data = (tmp_path / f"{name}.journal").read_bytes()
+        assert len(data) == HEADER_BYTES + count * RECORD.size
+        assert [r.request_id for r in records(data)] == list(range(count))
+    assert (tmp_path / "strange.1.journal").read_bytes() == b"no journal"
 
 
 def client_of(next_id: int, *waiting: int) -> bytes:

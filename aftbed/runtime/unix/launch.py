@@ -34,7 +34,7 @@ from aftbed.runtime import control
 from aftbed.runtime.interface import BUS, LIGHT
 from aftbed.runtime.unix import linux, run_directory, seal
 from aftbed.runtime.unix.cleanup import UndoLedger, watch
-from aftbed.runtime.unix.journal_files import CHUNK_BYTES
+from aftbed.runtime.unix.journal_files import CHUNK_BYTES, trim
 from aftbed.runtime.unix.linux import Area
 from aftbed.runtime.unix.options import LoadRun, RunOptions, Work, with_names_resolved
 from aftbed.runtime.unix.process_pool import PRELOADS, Started, killed_by, start_zygote
@@ -290,6 +290,7 @@ class Launched:
             self.trouble = f"the supervisor {killed_by(-code, self.record)}"
         if self._kept and self.end is not None:
             with contextlib.suppress(OSError):  # then it has none, which the judge tells
+                trim(self.record / "journal")
                 seal.write(self.record)
 
     def remove(self) -> None:
