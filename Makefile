@@ -22,7 +22,7 @@ FAULT := crash primary at checkpoint.sent nth 100
 # Hundreds of interpreters start in the tests; without bytecode each would compile all that it imports.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help demo test lint fast process deep mutants bench
+.PHONY: help demo test lint fast process deep mutants bench soak
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
 
@@ -34,6 +34,7 @@ help:
 	@echo "make process  the tests that start real runs: a sample of their combinations"
 	@echo "make deep     the exhaustive tests, and thousands of examples of every property: hours"
 	@echo "make mutants  plant bugs one by one, see what notices them, write docs/assumptions.md (ONLY=words: some, print)"
+	@echo "make soak     one run of 30 minutes with a crash every 2 s, an adaptation every 5 s: does anything grow?"
 	@echo "make bench    every figure of docs/numbers.md, written into its table: ten minutes"
 
 # Where the tests are installed, the package is too: then the demo needs nothing more.
@@ -62,6 +63,9 @@ mutants: $(EDITABLE)
 
 bench: $(EDITABLE)
 	$(BIN)/aftbed bench all --into docs/numbers.md
+
+soak: $(EDITABLE)
+	$(BIN)/aftbed bench soak --minutes 30 --rate 500 --crash-every 2 --adapt-every 5
 
 # -- installation: a stamp each, so that a second `make` installs only what has changed ------------
 

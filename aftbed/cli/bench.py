@@ -127,6 +127,35 @@ def hops(
         print(f"p50 {pair.p50_ns / 1e3:9.2f} us  {pair.source} -> {pair.sink}{apart}")
 
 
+@bench.command()
+def soak(
+    minutes: Annotated[float, typer.Option(help="How long the load lasts.")] = 30.0,
+    rate: Annotated[float, typer.Option(help="Requests a second.")] = 500.0,
+    crash_every: Annotated[float, typer.Option(help="Seconds between two crashes; 0: none.")] = 2.0,
+    adapt_every: Annotated[float, typer.Option(help="Seconds between two adaptations; 0: none.")] = 5.0,
+    placement: Placement = "process",
+    record: Annotated[
+        str | None, typer.Option(help="Keep the record of the run in this new directory.")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """One long run with crashes and adaptations in turn: is all served right, and does anything grow?
+
+    Exit code: 0 all was served right and each figure is flat, 1 not so, 3 the run was too short to tell.
+    """
+    from aftbed.bench import soak as endurance  # noqa: PLC0415 - the judge, see above
+    from aftbed.judge.verdict import EXIT_CODES  # noqa: PLC0415 - the same
+
+    plan = endurance.SoakPlan(minutes, rate, crash_every, adapt_every, placement, record)
+    endurance.check(plan)
+    found = endurance.bench_soak(plan, _show_progress)
+    if json:
+        print_json(found)
+    else:
+        print("\n".join(endurance.text(found)))
+    raise typer.Exit(EXIT_CODES[found.verdict])
+
+
 @bench.command(name="all")
 def every(
     quick: Annotated[bool, typer.Option("--quick", help="Two minutes: too few samples to quote.")] = False,
