@@ -44,10 +44,8 @@ class Crash(FaultKind, frozen=True, tag="crash"):
         if processes:
             injection.receipt = Receipt(ReceiptState.APPLIED)
             yield from run.until_dead(processes)
-            injection.receipt, injection.struck = (
-                Receipt(ReceiptState.ACTIVATED),
-                (),
-            )  # a long run forgets them
+            injection.receipt = Receipt(ReceiptState.ACTIVATED)
+            injection.struck = ()  # dead: a run of many crashes would keep them all
 
     def receipt(self, injection: Injection, run: RunControl) -> Receipt:
         """Activated when the target is dead."""

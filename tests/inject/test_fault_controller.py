@@ -1,5 +1,7 @@
 """Where faults wait, and how they move when the roles or the graph change."""
 
+import gc
+import weakref
 from pathlib import Path
 
 import pytest
@@ -150,3 +152,14 @@ def test_an_adaptation_that_never_comes_activates_nothing(run: Run) -> None:
     fault = run.arm("crash engine at adapt.commit")
     run.do(run.faults.rearm())
     assert run.reports() == [(str(fault), "armed", "")]
+
+
+def test_a_crash_keeps_no_process_that_is_dead(run: Run) -> None:
+    """A long run has thousands."""
+    fault = run.arm("crash proxy at adapt.commit")
+    dead = weakref.ref(run.deployment.nodes["proxy"])
+    run.do(run.faults.at(Event.ADAPT_COMMIT))
+    run.deployment.renew("proxy")
+    gc.collect()
+    assert dead() is None
+    assert run.reports() == [(str(fault), "activated", "")]

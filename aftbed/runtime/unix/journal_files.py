@@ -21,7 +21,7 @@ from aftbed.core.input_file import open_input
 from aftbed.runtime.unix import linux
 
 CHUNK_BYTES: Final = 1 << 20
-FILE_BYTES_MAX: Final = 8 << 30  # a day at 1000 requests a second, where one node hosts a whole replica
+FILE_BYTES_MAX: Final = 16 << 30  # a day at 500 requests a second, where one node hosts a whole replica
 READY_BYTES: Final = 1 << 16  # in memory from the start: a backup writes its first record in a failover
 STATE_EVERY_BYTES: Final = 1 << 18  # of a dialogue: what a new Client reads of it at most, in a millisecond
 RECORDED_MAX: Final = 16
@@ -30,20 +30,12 @@ PART_BYTES: Final = 1 << 16  # read at once: most journals are shorter
 STEP_BYTES_MAX: Final = 8 * layout.RECORD.size  # what the notes of one step take at most
 
 
-def contents(path: Path) -> layout.Data:
-    """The file, read. Raises OSError, also where it is no regular file.
-
-    It is not mapped: where a tmpfs is full, the kernel sends SIGBUS even to a process that reads the empty
-    part of a chunk.
-    """
-    with open_input(path) as file:
-        return file.read()
-
-
 def stored_records(path: Path) -> tuple[layout.StoredRecords, int]:
-    """The records of a journal of any length, and how many found no room.
+    """The records of a journal of any length, and how many found no room. Its parts have been read once then.
 
-    Raises OSError, and PeerError if it is no journal. It has been read once then.
+    Raises OSError, also where it is no regular file, and PeerError if it is no journal. The file is not
+    mapped: where a tmpfs is full, the kernel sends SIGBUS even to a process that reads the empty part of a
+    chunk.
     """
     with open_input(path) as file:
         head = file.read(layout.HEADER_BYTES)
@@ -114,9 +106,7 @@ def _grow(mapping: mmap.mmap) -> bool:
         with contextlib.suppress(OSError):  # a limit of the user (RLIMIT_FSIZE), or of the disk
             mapping.resize(full + CHUNK_BYTES)
             first = max(layout.HEADER_BYTES, full - CHUNK_BYTES)
-            mapping.madvise(
-                mmap.MADV_DONTNEED, first, full - first
-            )  # of a file: what was written stays in it
+            mapping.madvise(mmap.MADV_DONTNEED, first, full - first)  # what was written stays in the file
             return True
     _count_loss(mapping)
     return False

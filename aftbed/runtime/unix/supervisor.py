@@ -18,7 +18,7 @@ import msgspec
 
 from aftbed.core.errors import AftbedError
 from aftbed.core.graph import Link
-from aftbed.core.journal import Record, records
+from aftbed.core.journal import Record
 from aftbed.ftm.compose import build
 from aftbed.inject.kind import FaultKind
 from aftbed.inject.receipts import BusReport
@@ -31,7 +31,7 @@ from aftbed.runtime.unix import linux, process_memory, run_directory
 from aftbed.runtime.unix.cleanup import UndoLedger
 from aftbed.runtime.unix.control_server import ControlServer
 from aftbed.runtime.unix.event_loop import EventLoop
-from aftbed.runtime.unix.journal_files import JournalFile, contents, recorded_requests
+from aftbed.runtime.unix.journal_files import JournalFile, recorded_requests, stored_records
 from aftbed.runtime.unix.options import COMMAND_GONE, LoadRun, RunOptions
 from aftbed.runtime.unix.process_pool import Started, UnixProcess, UnixProcessPool, reap
 from aftbed.runtime.unix.run_directory import HISTORY_NAME
@@ -78,7 +78,7 @@ class UnixRuntime:
     def records(self, journal: str) -> Iterable[Record]:
         """What is committed in the file; nothing if its node died before it made one."""
         try:
-            return records(contents(Path(journal)))
+            return stored_records(Path(journal))[0]
         except FileNotFoundError:
             return ()
 
