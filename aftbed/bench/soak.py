@@ -32,7 +32,7 @@ from typing import Final, Literal, NamedTuple
 
 import msgspec
 
-from aftbed.bench.adaptation import adapted
+from aftbed.adapt.engine import DONE
 from aftbed.bench.runs import POLL_SECONDS, Log, Percentiles, percentiles
 from aftbed.campaign.statistics import CONFIDENCE, quantile
 from aftbed.core.errors import ConfigError, HarnessError, unknown
@@ -54,6 +54,7 @@ from aftbed.runtime.unix.launch import launch, options_for
 from aftbed.runtime.unix.options import LoadRun
 
 SETTLE_SECONDS_MAX: Final = 10.0  # until both replicas stand again
+ANSWER_SECONDS_MAX: Final = 2.0  # until a run that has ended is seen to have
 LAST_SECONDS: Final = 1.0  # of the run, in which nothing begins
 END_SECONDS_MAX: Final = 60.0  # beyond its time: a load is held up, and makes good for little of it
 REQUESTS_MAX: Final = 100_000_000
@@ -223,6 +224,7 @@ class Soak:
         self.samples: list[Sample] = []
         self.crashes: Counter[str] = Counter()
         self.adaptations: Counter[str] = Counter()
+        self._asked = 0  # adaptations
         self._reports = self.launched.reports()
         self._ended = False
 
@@ -237,18 +239,18 @@ class Soak:
         self._settle()
         began_s = time.monotonic()
         end_s = began_s + plan.minutes * 60 - LAST_SECONDS
-        for due_s, what in _agenda(plan, began_s):
-            if due_s > end_s or self._ended:
-                break
-            self._wait(due_s - time.monotonic())
-            self._settle()
-            match what:
-                case "crash":
-                    self._crash()
-                case "adapt":
-                    self._adapt()
-                case "sample":
-                    self._sample()
+        begin = {"crash": self._crash, "adapt": self._adapt, "sample": self._sample}
+        try:
+            for due_s, what in _agenda(plan, began_s):
+                self._wait(min(due_s, end_s) - time.monotonic())
+                self._settle()
+                if self._ended or time.monotonic() >= end_s:
+                    break
+                begin[what]()
+        except (ConfigError, HarnessError):  # it does not answer
+            self._wait(ANSWER_SECONDS_MAX)
+            if not self._ended:  # else the judge says how
+                raise
         self._wait(end_s + LAST_SECONDS + END_SECONDS_MAX - time.monotonic())
         if not self._ended:
             raise HarnessError(f"the run had not ended {END_SECONDS_MAX:g} s after its time")
@@ -302,13 +304,15 @@ class Soak:
         self.crashes[target] += 1
 
     def _adapt(self) -> None:
-        """To the next mechanism."""
-        done = self.adaptations.total()
-        goal = DUPLEX_EXPRESSIONS[(done + 1) % len(DUPLEX_EXPRESSIONS)]
-        adapted(self.launched.private, Goal(expression=goal))
-        self.adaptations[goal] += 1
-        if (done + 1) % len(DUPLEX_EXPRESSIONS) == 0:
-            tours, crashes = (done + 1) // len(DUPLEX_EXPRESSIONS), self.crashes.total()
+        """To the next mechanism. One that is refused or rolled back is the judge's affair."""
+        self._asked += 1
+        goal = DUPLEX_EXPRESSIONS[self._asked % len(DUPLEX_EXPRESSIONS)]
+        command = control_client.AdaptCommand(Goal(expression=goal))
+        with contextlib.suppress(ConfigError):  # refused
+            outcome = control_client.ask(self.launched.private, command, control_client.ADAPT_SECONDS_MAX)
+            self.adaptations[goal] += outcome["outcome"] == DONE
+        if self._asked % len(DUPLEX_EXPRESSIONS) == 0:
+            tours, crashes = self._asked // len(DUPLEX_EXPRESSIONS), self.crashes.total()
             self._log(f"{tours} tours of {len(DUPLEX_EXPRESSIONS)} mechanisms, {crashes} crashes")
         self._settle()
         self._sample()
