@@ -27,7 +27,7 @@ def measured(slope: float, count: int, noise: float = 0.5) -> Trend:
 
 @pytest.mark.parametrize(
     ("slope", "count", "finding"),
-    [(0.0, 60, "flat"), (-9.0, 60, "flat"), (3.0, 60, "grows"), (0.0, 6, "unknown")],
+    [(0.0, 60, "flat"), (-9.0, 60, "flat"), (3.0, 60, "grows"), (0.0, 10, "unknown")],
 )
 def test_a_figure_is_flat_or_grows_with_confidence_or_it_is_not_known(
     slope: float, count: int, finding: str
@@ -43,7 +43,7 @@ def test_too_few_values_have_no_slope() -> None:
 
 
 def test_a_figure_that_grows_fails_a_run_that_was_served_right() -> None:
-    flat, grows, unknown = (measured(*one) for one in ((0.0, 60), (3.0, 60), (0.0, 6)))
+    flat, grows, unknown = (measured(*one) for one in ((0.0, 60), (3.0, 60), (0.0, 10)))
     assert with_trends("pass", [flat]) == ("pass", [])
     assert with_trends("pass", [flat, unknown])[0] == "inconclusive"
     assert with_trends("pass", [unknown, grows])[0] == "fail"
