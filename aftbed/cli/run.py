@@ -83,6 +83,12 @@ class RunArguments(msgspec.Struct, frozen=True):
         str | None, typer.Option(help="COUNT[@RATE]: synthetic requests (per second) instead of a drive.")
     ] = None
     bus_port: Annotated[int, typer.Option(help="TCP port of the bus on 127.0.0.1; 0 is any free one.")] = 0
+    bus_open: Annotated[
+        bool,
+        typer.Option(
+            "--bus-open", help="Let other users onto the bus; what strangers send is part of the run."
+        ),
+    ] = False
     pin: Annotated[bool, typer.Option(help="Keep each replica's chain on one core.")] = True
     unsafe_memory: Annotated[
         bool, typer.Option("--unsafe-memory", help='Allow --inject "bitflip memory ...".')
@@ -121,6 +127,7 @@ def execute(given: RunArguments) -> int:
         adaptations=adaptations,
         pin=given.pin,
         bus_port=given.bus_port,
+        bus_open=given.bus_open,
     )
     launched = launch(options, listener)
     try:
@@ -183,6 +190,8 @@ def _work(given: RunArguments) -> Work:
     if given.replay is not None and given.load is not None:
         raise ConfigError("--replay and --load: one of them is allowed")
     if given.load is not None:
+        if given.bus_open:
+            raise ConfigError("--bus-open: a run of --load has no bus")
         return _load(given.load)
     pace = _pace(given.pace)
     if given.replay is not None:

@@ -41,12 +41,12 @@ from aftbed.judge.timeline import (
     sent_requests,
 )
 from aftbed.runtime.unix.options import CarRun, ReplayRun
+from aftbed.runtime.unix.run_directory import BUS_NAME
 from aftbed.vehicle.aeb.messages import AebInput
 from aftbed.vehicle.can.candump import LogCounts, parse_lines
 from aftbed.vehicle.can.dbc_file import Codec, load_dbc
 from aftbed.vehicle.can.e2e import intact
 
-BUS_NAME: Final = "bus.log"
 BUS_LOG_BYTES_MAX: Final = 2 << 30
 STAGES: Final = ("NONE", "WARN", "PARTIAL", "FULL")
 FALLBACKS: Final = ("NONE", "HOLD", "RELEASE", "LATCH")

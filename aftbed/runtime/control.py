@@ -271,7 +271,12 @@ BUS_FAULTS_CHANGED: Final = "struck"  # the receipts that are new
 BUS_FAULTS_ASKED: Final = "struck.all"  # the receipts of all, as asked
 CONDITION_WATCHED: Final = "watched"
 CONDITION_MET: Final = "met"
-BUS_REPORTS: Final = (BUS_FAULT_ARMED, BUS_FAULTS_CHANGED, BUS_FAULTS_ASKED, CONDITION_WATCHED, CONDITION_MET)
+BUS_COUNTS: Final = "counts"
+BUS_STRANGER: Final = "stranger"
+BUS_REPORTS: Final = (
+    *(BUS_FAULT_ARMED, BUS_FAULTS_CHANGED, BUS_FAULTS_ASKED, CONDITION_WATCHED, CONDITION_MET),
+    *(BUS_COUNTS, BUS_STRANGER),
+)
 
 
 class Report(msgspec.Struct, frozen=True, tag=True):

@@ -79,6 +79,7 @@ def all_words(error: str, *words: str) -> bool:
         (("--load", "10", "--replay", "x.log"), ("--replay and --load", "one of them")),
         (("--bus-port", "65536"), ("--bus-port 65536", "0 to 65535")),
         (("--bus-port", "-1"), ("--bus-port -1", "0 to 65535")),
+        (("--bus-open", "--load", "10"), ("--bus-open: a run of --load has no bus",)),
         (("--dbc", "x.dbc"), ("--dbc and --map", "--replay")),
         (("--replay", "x.log"), ("--replay LOG needs --dbc FILE and --map FILE",)),
         (("--replay", "x.log", "--dbc", "x.dbc"), ("needs --dbc FILE and --map FILE",)),

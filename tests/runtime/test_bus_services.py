@@ -16,7 +16,7 @@ def test_a_vehicle_that_does_not_reach_the_bus_reports_why() -> None:
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     with ours, theirs, socket.socket() as bound:
         bound.bind(("127.0.0.1", 0))  # and does not listen
-        options = SourceOptions(CarRun("ccrs-50", 1.0, "latch"), 0, bound.getsockname()[1])
+        options = SourceOptions(CarRun("ccrs-50", 1.0, "latch"), 0, bound.getsockname()[1], "")
         order = control.Serve(control.UNANSWERED, VEHICLE, msgspec.msgpack.encode(options))
         serve(Line(theirs, decode_order), order, [])
         ours.settimeout(5.0)

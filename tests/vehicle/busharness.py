@@ -25,6 +25,7 @@ from aftbed.vehicle.ecus import Sender
 from aftbed.vehicle.gateway import Gateway
 
 DEADLINE_S = 5.0
+SECRET = "0123456789abcdef" * 2
 
 
 class TestSupervisorLink:
@@ -38,6 +39,7 @@ class TestSupervisorLink:
         self.faults = Disturber()
         self.receipts: list[str] = []  # of the first fault, each time that it changed
         self.conditions_met: list[tuple[int, int, int]] = []
+        self.strangers: list[str] = []
 
     def attend(self, hub: Hub) -> bool:
         for _ in (got := os.read(self._life, 4096)):
@@ -52,22 +54,28 @@ class TestSupervisorLink:
     def met(self, fault_number: int, t_us: int, since_ns: int) -> None:
         self.conditions_met.append((fault_number, t_us, since_ns))
 
+    def stranger(self, text: str) -> None:
+        self.strangers.append(text)
+
 
 class RunningHub:
     """A hub in a thread of the test; `stop` ends it and gives its counts."""
 
-    def __init__(self, log: Path, options: HubOptions, send_buffer_bytes: int = 0) -> None:
+    def __init__(
+        self, log: Path, options: HubOptions, send_buffer_bytes: int = 0, secret: str = SECRET
+    ) -> None:
         self.log = log
         self.counts = HubCounts()
         self._listener = socket.create_server(("127.0.0.1", 0), backlog=128)
         if send_buffer_bytes:  # inherited by the connections
             self._listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, send_buffer_bytes)
         self.port = self._listener.getsockname()[1]
-        self.options = BusOptions(port=self.port)
+        self.options = BusOptions(port=self.port, secret=secret)
         self._log_fd = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
         self._life_read, self._life_write = os.pipe()
         self._error: BaseException | None = None
         self.link = TestSupervisorLink(self._life_read)
+        options = msgspec.structs.replace(options, secret=secret)
         self._thread = threading.Thread(target=self._run, args=(options,), daemon=True)
         self._thread.start()
 
@@ -120,9 +128,9 @@ class RunningHub:
 
 @contextmanager
 def running_hub(
-    log: Path, options: HubOptions | None = None, send_buffer_bytes: int = 0
+    log: Path, options: HubOptions | None = None, send_buffer_bytes: int = 0, secret: str = SECRET
 ) -> Iterator[RunningHub]:
-    hub = RunningHub(log, options or HubOptions(), send_buffer_bytes)
+    hub = RunningHub(log, options or HubOptions(), send_buffer_bytes, secret)
     try:
         yield hub
     finally:
@@ -135,7 +143,7 @@ from aftbed.vehicle.can.hub import serve
 from aftbed.vehicle.can.hub import HubOptions
 listener = socket.socket(fileno=int(sys.argv[1]))
 log = os.open(sys.argv[2], os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
-serve(listener, log, HubOptions(), 0)
+serve(listener, log, HubOptions(secret=sys.argv[3]), 0)
 """
 
 
@@ -143,7 +151,7 @@ serve(listener, log, HubOptions(), 0)
 def hub_process(log: Path) -> Iterator[tuple["subprocess.Popen[bytes]", int]]:
     """A hub that can be killed, and its port."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
-        command = [sys.executable, "-c", _HUB_PROCESS, str(listener.fileno()), str(log)]
+        command = [sys.executable, "-c", _HUB_PROCESS, str(listener.fileno()), str(log), SECRET]
         with subprocess.Popen(command, stdin=subprocess.PIPE, pass_fds=[listener.fileno()]) as process:
             try:
                 yield process, listener.getsockname()[1]
@@ -152,9 +160,14 @@ def hub_process(log: Path) -> Iterator[tuple["subprocess.Popen[bytes]", int]]:
 
 
 class RawClient:
-    """A client that says what the test says, byte for byte; every read has a deadline."""
+    """A client that says what the test says, byte for byte; every read has a deadline.
 
-    def __init__(self, port: int, *, raw: bool = True, receive_buffer_bytes: int = 0) -> None:
+    `ours`: a node of the run, which has the secret; else it is a stranger.
+    """
+
+    def __init__(
+        self, port: int, *, raw: bool = True, ours: bool = False, receive_buffer_bytes: int = 0
+    ) -> None:
         self.sock = socket.socket()
         if receive_buffer_bytes:
             self.sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, receive_buffer_bytes)
@@ -163,8 +176,9 @@ class RawClient:
         self.sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._buffer = b""
         assert self.read() == "< hi >"
+        if raw or ours:
+            assert self.ask(f"< open can0 {SECRET} >" if ours else "< open can0 >") == "< ok >"
         if raw:
-            assert self.ask("< open can0 >") == "< ok >"
             assert self.ask("< rawmode >") == "< ok >"
 
     def __enter__(self) -> "RawClient":

@@ -69,6 +69,7 @@ class _SupervisorLink:
             case control.Ack(number):
                 hub.go_on(number)
             case control.Stats():
+                _report(self._line, control.BUS_COUNTS, msgspec.msgpack.encode(hub.counts()))
                 _report(self._line, control.BUS_FAULTS_ASKED, msgspec.msgpack.encode(self._receipts()))
         return True
 
@@ -88,6 +89,10 @@ class _SupervisorLink:
         data = msgspec.msgpack.encode((fault_number, t_us, since_ns))
         _report(self._line, control.CONDITION_MET, data)
 
+    def stranger(self, text: str) -> None:
+        """Report what a stranger does."""
+        _report(self._line, control.BUS_STRANGER, text.encode())
+
     def _receipts(self) -> list[BusReport]:
         return [] if self._faults is None else self._faults.reports()
 
@@ -96,9 +101,8 @@ def _serve_hub(line: Line[control.ToNode], order: control.Serve, fds: list[int])
     listener, log = fds
     _report(line, "ready")
     options = msgspec.msgpack.decode(order.options, type=HubOptions)
-    counts = serve_hub(socket.socket(fileno=listener), log, options, line.fileno(), _SupervisorLink(line))
+    serve_hub(socket.socket(fileno=listener), log, options, line.fileno(), _SupervisorLink(line))
     os.close(log)
-    _report(line, "result", msgspec.json.encode(counts))
 
 
 # -- the vehicle and the player -------------------------------------------------------------------
@@ -137,7 +141,7 @@ def _drive(line: Line[control.ToNode], source: SourceOptions) -> None:
     given = {"pace": work.pace, "brake_policy": work.brake_policy, "seed": source.seed}
     options = msgspec.convert(given, DriveOptions)
     follows = (codec.can_id("AEB_REQ"),)
-    buses = CarBuses(BusOptions(port=source.port), follows)
+    buses = CarBuses(BusOptions(port=source.port, secret=source.secret), follows)
     if _wait_for_go(line):
         result = drive(
             scenario,
@@ -162,7 +166,7 @@ def _play(line: Line[control.ToNode], source: SourceOptions) -> None:
     assert isinstance(work, ReplayRun), work
     gateway = MappedGateway(load_dbc(), Path(work.dbc), find_map(work.map))
     frames, counts = read_log(Path(work.log))
-    bus = open_bus(BusOptions(port=source.port, node=PLAYER))
+    bus = open_bus(BusOptions(port=source.port, secret=source.secret, node=PLAYER))
     if _wait_for_go(line):
         result = play(
             frames,

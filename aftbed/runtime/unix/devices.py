@@ -75,11 +75,11 @@ class ProcessSenses(Senses):
 class BusLink(CarLink):
     """The `CarLink` over a bus: frames in, requests to the Client, replies out as AEB_REQ."""
 
-    def __init__(self, gateway: "BusGateway", port: int) -> None:
+    def __init__(self, gateway: "BusGateway", port: int, secret: str) -> None:
         from aftbed.vehicle.can.bus import BusOptions, open_bus  # noqa: PLC0415 - see make_source
 
         self._gateway = gateway
-        self._bus = open_bus(BusOptions(port=port, node=GATEWAY, uses=gateway.uses))
+        self._bus = open_bus(BusOptions(port=port, secret=secret, node=GATEWAY, uses=gateway.uses))
 
     def fds(self) -> tuple[int, ...]:
         return (self._bus.fileno(),)
@@ -131,4 +131,4 @@ def make_source(client: Client, options: SourceOptions) -> Device:
         gateway = MappedGateway(load_dbc(), Path(work.dbc), find_map(work.map))
     else:
         gateway = Gateway(load_dbc())
-    return CarDevice(client, dialogue, BusLink(gateway, options.port))
+    return CarDevice(client, dialogue, BusLink(gateway, options.port, options.secret))

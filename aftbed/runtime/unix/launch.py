@@ -43,6 +43,7 @@ from aftbed.runtime.unix.transport import Line, decode_order, decode_report
 END_SECONDS_MAX: Final = 8.0
 KILL_SECONDS_MAX: Final = 1.0
 FILES_MIN, FILES_GOOD = 256, 1024  # a supervisor of 37 processes holds 180, more while it adapts
+BACKLOG: Final = 128  # connections that wait for the hub
 GO: Final = b"go"
 
 
@@ -76,7 +77,7 @@ def bind_hub(port: int) -> socket.socket:
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         sock.bind(("127.0.0.1", port))
-        sock.listen(32)
+        sock.listen(BACKLOG)
     except OSError as error:
         sock.close()
         raise ConfigError(
@@ -370,6 +371,7 @@ def options_for(
     adaptations: tuple[Scheduled, ...] = (),
     pin: bool = True,
     bus_port: int = 0,
+    bus_open: bool = False,
 ) -> tuple[RunOptions, socket.socket | None]:
     """What a run needs; where there is a bus, its socket too. Raises ConfigError, leaving nothing."""
     faults = tuple(with_names_resolved(fault, work) for fault in faults)
@@ -395,5 +397,6 @@ def options_for(
         pin=pin,
         listener=listener.fileno() if listener is not None else -1,
         port=listener.getsockname()[1] if listener is not None else 0,
+        bus_open=bus_open,
     )
     return options, listener

@@ -48,7 +48,10 @@ Work = LoadRun | CarRun | ReplayRun
 
 
 class RunOptions(msgspec.Struct, frozen=True):
-    """`private` and `record` are directories, made by the launch; `listener` is the hub's bound socket."""
+    """`private` and `record` are directories, made by the launch; `listener` is the hub's bound socket.
+
+    `bus_open`: other users may attach to the bus, and the verdict stands whatever strangers send.
+    """
 
     run: str
     private: str
@@ -62,18 +65,20 @@ class RunOptions(msgspec.Struct, frozen=True):
     pin: bool = True
     listener: int = -1
     port: int = 0
+    bus_open: bool = False
 
 
 class SourceOptions(msgspec.Struct, frozen=True):
     """For the process that makes the requests: the host of the Client, the vehicle or the player.
 
-    `port` is the hub's. `journals` is the directory of the dialogues of this Client, which was made as the
-    `incarnation`th, and of its predecessors.
+    `port` is the hub's, `secret` its bus's. `journals` is the directory of the dialogues of this Client,
+    which was made as the `incarnation`th, and of its predecessors.
     """
 
     work: Work
     seed: int
     port: int
+    secret: str
     journals: str = ""
     incarnation: int = 1
 

@@ -8,6 +8,7 @@ begin: the car is connected to it.
 import contextlib
 import json
 import os
+import secrets
 import socket
 import time
 from collections.abc import Callable
@@ -27,6 +28,7 @@ from aftbed.runtime.tasks import STATS_TASK, Key, Wait
 from aftbed.runtime.unix.event_loop import EventLoop
 from aftbed.runtime.unix.options import PLAYER, CarRun, LoadRun, RunOptions, SourceOptions
 from aftbed.runtime.unix.process_pool import UnixProcess, UnixProcessPool
+from aftbed.runtime.unix.run_directory import BUS_NAME
 from aftbed.vehicle.condition import Condition
 
 ATTACH_SECONDS_MAX: Final = 10.0
@@ -34,6 +36,7 @@ LOAD_POLL_SECONDS: Final = 0.02
 STALL_SECONDS_MAX: Final = 3.0  # a recovery takes milliseconds, a loss is seen after half a second
 CYCLE_EVERY: Final = 10  # telemetry reports, after which the cycle time is shown
 VEHICLE: Final = "vehicle"
+SECRET_BYTES: Final = 16
 
 
 class BusFaults:
@@ -47,6 +50,7 @@ class BusFaults:
         self._faults: dict[int, BusFault] = {}
         self._reports: dict[int, BusReport] = {}
         self._on_met: dict[int, Callable[[Met], None]] = {}
+        self.counts: object = None  # what happened on the bus, as last asked for
 
     def disturb(self, number: int, fault: FaultKind, draw: int) -> Keys:
         """Return when the hub has armed the fault. Raises StepFailed."""
@@ -68,8 +72,8 @@ class BusFaults:
         yield Wait(frozenset({(control.CONDITION_WATCHED, control.HUB, number)}), frozenset({control.HUB}))
 
     def ask(self) -> Keys:
-        """Have the hub report on all faults once more."""
-        if self._faults and self.hub is not None and self.hub.alive:
+        """Have the hub report on all faults, and on strangers, once more."""
+        if self.hub is not None and self.hub.alive:
             with contextlib.suppress(StepFailed):  # then its earlier reports have to do
                 self._pool.order(self.hub, control.Stats(control.UNANSWERED))
                 yield Wait(frozenset({(control.BUS_FAULTS_ASKED, control.HUB, 0)}), frozenset({control.HUB}))
@@ -78,6 +82,12 @@ class BusFaults:
         """A report of the hub."""
         if kind in (control.BUS_FAULT_ARMED, control.CONDITION_WATCHED):
             self._settle((kind, control.HUB, int(data)))
+            return
+        if kind == control.BUS_COUNTS:
+            self.counts = msgspec.msgpack.decode(data)
+            return
+        if kind == control.BUS_STRANGER:
+            self._log("bus", data.decode())
             return
         if kind == control.CONDITION_MET:
             number, t_us, since_ns = msgspec.msgpack.decode(data, type=tuple[int, int, int])
@@ -116,6 +126,7 @@ class Workload:
         self._options, self._pool, self._loop = options, pool, loop
         self._log, self._finish, self._report_owner = log, finish, report_owner
         self._is_load = isinstance(options.work, LoadRun)
+        self._secret = secrets.token_hex(SECRET_BYTES)  # of the bus: for the processes of this run alone
         self._services: dict[str, UnixProcess] = {}
         self.bus = BusFaults(pool, loop.tasks.settle, log)
         self._result: object = None
@@ -135,7 +146,9 @@ class Workload:
         if kind != "client":
             return "", b""
         options, journals = self._options, Path(self._options.record) / "journal"
-        source = SourceOptions(options.work, options.seed, options.port, str(journals), incarnation)
+        source = SourceOptions(
+            options.work, options.seed, options.port, self._secret, str(journals), incarnation
+        )
         return "load" if self._is_load else "gateway", msgspec.msgpack.encode(source)
 
     def spares(self) -> dict[str, int]:
@@ -154,8 +167,14 @@ class Workload:
         if isinstance(work, LoadRun):
             return
         flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC
-        log = os.open(Path(options.record) / "bus.log", flags, 0o600)
-        hub = {"lockstep": work.pace is None, "pace": work.pace or 1.0, "origin_ns": time.monotonic_ns()}
+        log = os.open(Path(options.record) / BUS_NAME, flags, 0o600)
+        hub = {
+            "secret": self._secret,
+            "open_to_all": options.bus_open,
+            "lockstep": work.pace is None,
+            "pace": work.pace or 1.0,
+            "origin_ns": time.monotonic_ns(),
+        }
         yield from self._serve(LIGHT, control.HUB, msgspec.msgpack.encode(hub), (options.listener, log))
         self.bus.hub = self._services[control.HUB]
         os.close(log)
@@ -169,7 +188,7 @@ class Workload:
             self._loop.after(LOAD_POLL_SECONDS, self._watch_load)
             return
         name = VEHICLE if isinstance(options.work, CarRun) else PLAYER
-        source = SourceOptions(options.work, options.seed, options.port)
+        source = SourceOptions(options.work, options.seed, options.port, self._secret)
         yield from self._serve(BUS, name, msgspec.msgpack.encode(source), ())
         self._pool.order(self._services[name], control.ResumeNode(control.UNANSWERED))
         self._pool.refill(BUS, 1)
@@ -243,9 +262,10 @@ class Workload:
     def wind_up(self) -> Keys:
         """Have no more requests sent; then count the unanswered ones: an earlier count may be out of date."""
         yield from self.deployment.ask("client", control.StopRequests)
+        yield from self.bus.ask()
         yield from self._ask_stats()
         self.settled = (self._result is not None or self._is_load) and not self._stats.get("unanswered", 1)
 
     def end(self) -> dict[str, object]:
         """For the record."""
-        return {"result": self._result, "client": self._stats}
+        return {"result": self._result, "client": self._stats, "bus": self.bus.counts}

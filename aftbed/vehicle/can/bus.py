@@ -55,13 +55,20 @@ _CHANGE: Final = re.compile(r"< change ([0-9A-F]{3}) ([+-][0-9]+) >")
 
 class BusOptions(msgspec.Struct, frozen=True):
     """The hub to attach to. `node` is the name by which a fault can cut this node off, and `uses` are the
-    identifiers of the frames that it evaluates; both are sent to the hub.
+    identifiers of the frames that it evaluates; both are sent to the hub. `secret` is that of the run;
+    without it this is a stranger, and has no name.
     """
 
     channel: str = "can0"
     port: int = 0
+    secret: str = ""
     node: str = ""
     uses: tuple[int, ...] = ()
+
+    @property
+    def opens(self) -> str:
+        """What follows `open`."""
+        return f"{self.channel} {self.secret}" if self.secret else self.channel
 
 
 class Bus:
@@ -182,7 +189,7 @@ def open_bus(options: BusOptions) -> Bus:
     socket.setdefaulttimeout(ATTACH_S_MAX)  # its handshake has no other deadline
     try:
         bus = can.Bus(
-            interface="socketcand", host=HOST, port=options.port, channel=options.channel, tcp_tune=True
+            interface="socketcand", host=HOST, port=options.port, channel=options.opens, tcp_tune=True
         )
     except (OSError, can.CanError) as error:
         raise HarnessError(f"cannot attach to the CAN hub at {HOST}:{options.port}: {error}") from error
@@ -229,7 +236,7 @@ class HubLine:
         self._poll.register(self._socket, select.POLLIN)
         try:
             self._expect("< hi >")
-            self._ask(f"< open {options.channel} >")
+            self._ask(f"< open {options.opens} >")
         except HarnessError:
             self.close()
             raise
@@ -286,7 +293,7 @@ class HubLine:
         try:
             self._socket.sendall(line.encode("ascii"))
         except OSError as error:
-            raise HarnessError(f"the CAN hub did not take {line}: {error}") from error
+            raise HarnessError(f"the CAN hub took no word: {error}") from error
 
     def _expect(self, line: str) -> None:
         while True:

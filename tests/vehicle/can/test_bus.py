@@ -4,6 +4,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import msgspec
 import pytest
 from busharness import DEADLINE_S, RawClient, RunningHub, running_hub
 
@@ -103,7 +104,7 @@ def test_no_hub_is_said_at_once() -> None:
 
 def test_a_channel_that_is_not_there(hub: RunningHub) -> None:
     with pytest.raises(HarnessError, match="only can0 is here"):
-        HubLine(BusOptions(port=hub.port, channel="can7"))
+        HubLine(msgspec.structs.replace(hub.options, channel="can7"))
 
 
 def test_the_hub_clock_sets_time_for_all(hub: RunningHub, pair: tuple[Bus, Bus]) -> None:

@@ -7,13 +7,14 @@ import threading
 import time
 from pathlib import Path
 
+import msgspec
 import pytest
 from busharness import DEADLINE_S, RawClient, RunningHub, running_hub
 from disturbed import FIRST_NUMBER, Disturbed, fault, real, virtual
 from puredrive import CODEC
 from sampling import every
 
-from aftbed.vehicle.can.bus import BusOptions, HubLine, open_bus
+from aftbed.vehicle.can.bus import HubLine, open_bus
 from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.can.hub import HubOptions
 
@@ -240,7 +241,7 @@ class Node(RawClient):
     _kept: list[int]
 
     def __init__(self, port: int, name: str, *uses: int) -> None:
-        super().__init__(port)
+        super().__init__(port, ours=True)
         self._kept = []
         self.write(f"< aftbed node {name}{''.join(f' {i:03X}' for i in uses)} >")
         self.fence()
@@ -348,7 +349,7 @@ def test_the_car_gets_the_conditions_whenever_it_comes(tmp_path: Path) -> None:
 
 def test_await_is_answered_when_the_frames_have_been_carried(tmp_path: Path) -> None:
     with running_hub(tmp_path / "bus.log", HubOptions(lockstep=True)) as hub:
-        line, bus = HubLine(hub.options), open_bus(BusOptions(port=hub.port, node="radar"))
+        line, bus = HubLine(hub.options), open_bus(msgspec.structs.replace(hub.options, node="radar"))
         done = threading.Event()
 
         def wait() -> None:
@@ -375,12 +376,13 @@ def test_await_is_answered_when_the_frames_have_been_carried(tmp_path: Path) -> 
         "< aftbed node two words >",
         "< aftbed await radar >",
         "< aftbed met x >",
+        "< aftbed met 7 2000 123 >",
         "< aftbed noticed 130 >",
         "< aftbed unasked 1 >",
         "< aftbed sing >",
     ],
 )
 def test_a_malformed_word_beside_the_bus_is_refused(hub: RunningHub, element: str) -> None:
-    with RawClient(hub.port) as client:
+    with RawClient(hub.port, ours=True) as client:
         assert client.ask(element).startswith("< error 20000000 ")
     assert hub.stop().refused == 1

@@ -26,8 +26,7 @@ def lockstep(tmp_path: Path) -> Iterator[RunningHub]:
 
 
 def car(hub: RunningHub) -> RawClient:
-    client = RawClient(hub.port, raw=False)
-    assert client.ask("< open can0 >") == "< ok >"
+    client = RawClient(hub.port, raw=False, ours=True)
     assert client.ask("< aftbed plant >") == "< ok >"
     return client
 
@@ -59,6 +58,7 @@ def test_in_real_time_it_is_answered_at_once_and_reported_with_its_time(hub: Run
 
 def test_a_condition_is_met_once_and_only_if_it_is_watched(paced: tuple[RunningHub, bool]) -> None:
     hub, lockstep = paced
+    left: list[tuple[int, Condition]] = []
     with car(hub) as plant:
         hub.order(lambda it: it.watch(7, TTC))
         assert plant.read() == WATCH_7
@@ -72,10 +72,21 @@ def test_a_condition_is_met_once_and_only_if_it_is_watched(paced: tuple[RunningH
             assert plant.read() == "< ok >"
         assert plant.read() == "< ok >"
     assert [number for number, _, _ in hub.link.conditions_met] == [7]
-    with RawClient(hub.port, raw=False) as later:
-        assert later.ask("< open can0 >") == "< ok >"
-        assert later.ask("< aftbed plant >") == "< ok >"
-        assert later.ask("< echo >") == "< echo >", "there is nothing left to watch"
+    hub.order(lambda it: left.extend(it.conditions()))
+    assert left == []
+
+
+def test_there_is_one_car(hub: RunningHub) -> None:
+    """Nobody else says that a condition holds, and nobody takes its place when it is gone."""
+    hub.order(lambda it: it.watch(7, TTC))
+    with car(hub) as plant, RawClient(hub.port, raw=False, ours=True) as other:
+        assert plant.read() == WATCH_7
+        assert "another client is the car" in other.ask("< aftbed plant >")
+        assert "only the car knows" in other.ask("< aftbed met 7 2000 123 >")
+        assert plant.ask("< aftbed plant >") == "< ok >"
+        plant.sock.close()
+        assert "another client is the car" in other.ask("< aftbed plant >")
+    assert hub.link.conditions_met == []
 
 
 def test_a_car_that_comes_later_is_sent_all_conditions(lockstep: RunningHub) -> None:
