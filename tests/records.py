@@ -20,6 +20,7 @@ from aftbed.runtime.deployment import digest
 from aftbed.runtime.unix.journal_files import DialogueFile, JournalFile
 from aftbed.runtime.unix.options import CarRun, LoadRun, RunOptions, Work
 from aftbed.vehicle.aeb.function import default_application, sample_requests
+from aftbed.vehicle.can.hub import HubCounts
 from aftbed.vehicle.plant import VehicleResult
 
 MS: Final = 1_000_000
@@ -58,6 +59,7 @@ class RecordInTheMaking:
             "seconds": 1.5,
             "faults": receipts,
             "hosted": hosted,
+            "bus": None if isinstance(self.work, LoadRun) else msgspec.to_builtins(HubCounts()),
         }
         self.t_ns = START_NS
         (path / "journal").mkdir(parents=True)

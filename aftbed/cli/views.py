@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
     from aftbed.judge.verdict import Verdict
+    from aftbed.vehicle.can.hub import Stranger
 
 EVENTS_SHOWN: Final = 10
 STAGES: Final = ("-", "WARN", "PARTIAL", "FULL")
@@ -159,12 +160,31 @@ def show_verdict(verdict: "Verdict", *, as_json: bool) -> None:
 
         for proposal in verdict.proposals:
             print(shown(f"  proposal   {proposed_line(proposal)}"))
+    for stranger in verdict.strangers:
+        print(f"  bus        {_stranger_line(stranger)}")
     for fault in verdict.faults:
         print(shown(f"  fault      {fault.fault}: {fault.receipt.value}"))
     print("  checks     " + ", ".join(f"{name} {found}" for name, found in verdict.checks.items()))
     for reason in verdict.reasons:
         print(shown(f"  because    {reason}"))
     print(f"verdict: {verdict.verdict}")
+
+
+def _stranger_line(one: "Stranger") -> str:
+    from aftbed.judge.checks import counted  # noqa: PLC0415 - after the run
+
+    forged = f" (forged: {counted(one.forged)})" if one.forged else ""
+    figures = (
+        (one.connections, "on the bus"),
+        (one.turned_away, "turned away"),
+        (one.frames, f"frames{forged}"),
+        (one.refused, "elements refused"),
+        (one.commands_refused, "of them commands"),
+        (one.put_out_fast, "put out as too fast"),
+        (one.put_out_slow, "put out as too slow"),
+        (one.put_out_oversized, "put out for an element over the limit"),
+    )
+    return f"{one}: " + ", ".join(f"{count} {what}" for count, what in figures if count)
 
 
 def _show_vehicle(verdict: "Verdict") -> None:

@@ -6,7 +6,7 @@ has a broken history in the tests that it must refuse.
 """
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Final, Literal, NamedTuple
 
 import msgspec
@@ -28,6 +28,8 @@ from aftbed.runtime.adaptations import Outcome
 from aftbed.runtime.deployment import Hosted, replica_of
 from aftbed.runtime.unix.options import COMMAND_GONE, CarRun, LoadRun, ReplayRun, Work
 from aftbed.vehicle.aeb.messages import AebOutput, decode_reply
+from aftbed.vehicle.can.dbc_file import load_dbc
+from aftbed.vehicle.can.hub import Stranger
 from aftbed.vehicle.scenarios.library import load_scenario
 from aftbed.vehicle.scenarios.scenario import broken_expectations
 
@@ -555,6 +557,39 @@ def check_complete(evidence: Evidence) -> Check | None:
             if not isinstance(played, dict) or not played.get("complete"):
                 reasons = ["the log was not replayed to its end"]
     return Check("unknown" if reasons else "pass", tuple(reasons))
+
+
+def strangers(record: RunRecord) -> list[Stranger]:
+    """What strangers did on the bus, by user; messages of the car are called by their names."""
+    found = record.end.bus.strangers if record.end is not None and record.end.bus is not None else []
+    if not any(one.forged for one in found):
+        return found
+    codec = load_dbc()
+    names = {f"{codec.can_id(name):03X}": name for name in codec.names()}
+    return [
+        msgspec.structs.replace(one, forged={names.get(i, f"0x{i}"): n for i, n in one.forged.items()})
+        for one in found
+    ]
+
+
+def check_no_forged_frames(evidence: Evidence) -> Check | None:
+    """G8: what a stranger sent in the name of a node of the run is a fault that nobody asked for.
+
+    What the function then did proves nothing about what was asked for, unless the bus was open to all: then
+    strangers are a part of it.
+    """
+    record = evidence.record
+    if record.simulated or record.end is None or record.end.bus is None:
+        return None
+    forged = [f"{one} sent {counted(one.forged)}" for one in strangers(record) if one.forged]
+    if not forged or record.options.bus_open:
+        return Check("pass")
+    return Check("unknown", tuple(f"{one}, which nobody asked for" for one in forged[:REASONS_MAX]))
+
+
+def counted(frames: Mapping[str, int]) -> str:
+    """`3 AEB_REQ, 1 RADAR_TRACK`."""
+    return ", ".join(f"{count} {name}" for name, count in frames.items())
 
 
 def check_sources(evidence: Evidence) -> Check | None:

@@ -5,7 +5,9 @@ The directory of a real run can be read after a `kill -9`, too.
 
 import itertools
 import json
+import os
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -13,7 +15,7 @@ import msgspec
 
 from aftbed.adapt.engine import DONE
 from aftbed.core.errors import ConfigError, PeerError
-from aftbed.core.input_file import read_input
+from aftbed.core.input_file import open_input, read_input
 from aftbed.core.journal import Entry, EntryKind, History, Stored
 from aftbed.inject.model import FaultReport
 from aftbed.inject.receipts import ReceiptState
@@ -21,14 +23,16 @@ from aftbed.runtime.adaptations import Outcome
 from aftbed.runtime.deployment import Hosted
 from aftbed.runtime.unix.journal_files import entries_dropped, stored_entries, stored_records
 from aftbed.runtime.unix.options import CarRun, RunOptions
-from aftbed.runtime.unix.run_directory import HISTORY_NAME
+from aftbed.runtime.unix.run_directory import BUS_NAME, HISTORY_NAME
+from aftbed.vehicle.can.hub import LOG_BYTES_MAX, HubCounts
 from aftbed.vehicle.plant import VehicleResult
 
 DOCUMENT_BYTES_MAX: Final = 64_000_000  # of a file that is no journal
 IN_MEMORY_MAX: Final = 200_000  # records and entries that are kept, at some 200 bytes each
+PART_BYTES: Final = 1 << 20
 END_KEYS: Final = (
     *("reason", "ended_ns", "seconds", "left", "unfinished", "lost", "leader", "backup", "hosted", "states"),
-    *("epoch", "faults"),
+    *("epoch", "faults", "bus"),
 )
 
 
@@ -60,6 +64,7 @@ class RunEnd(msgspec.Struct, frozen=True):
     starved_ms: float = 0.0
     ended_ns: int = 0  # monotonic
     client: ClientEnd | None = None
+    bus: HubCounts | None = None  # of a load, or where the hub did not live to report
     absent: tuple[str, ...] = ()  # keys that every end has, and this one does not
 
 
@@ -93,6 +98,7 @@ class RunRecord(msgspec.Struct, frozen=True):
     failures: tuple[str, ...] = ()
     excuses: Excuses | None = None
     kept: bool = False  # after the run, so it was sealed at its end
+    frames: int = 0  # in the log of the bus
 
     @property
     def simulated(self) -> bool:
@@ -134,7 +140,31 @@ def read_record(path: Path, *, in_memory: bool = False) -> RunRecord:
     )
     vehicle = _vehicle(options, end)
     kept = about.get("kept") is True
-    return RunRecord(options, history, end, faults, _adaptations(path), vehicle, path, started, kept=kept)
+    return RunRecord(
+        options,
+        history,
+        end,
+        faults,
+        _adaptations(path),
+        vehicle,
+        path,
+        started,
+        kept=kept,
+        frames=_frames(path / BUS_NAME),
+    )
+
+
+def _frames(log: Path) -> int:
+    """How many lines it has; 0 where there is none."""
+    try:
+        with open_input(log) as file:
+            if (size := os.fstat(file.fileno()).st_size) > LOG_BYTES_MAX:
+                raise ConfigError(f"{log}: {size} bytes, allowed are {LOG_BYTES_MAX}")
+            return sum(part.count(b"\n") for part in iter(partial(file.read, PART_BYTES), b""))
+    except FileNotFoundError:
+        return 0
+    except OSError as error:
+        raise ConfigError(f"{log}: {error.strerror}") from None
 
 
 def _history(folder: Path, *, in_memory: bool) -> History:

@@ -25,6 +25,7 @@ from aftbed.judge.reference import ReferenceRun
 from aftbed.runtime.unix import seal
 from aftbed.runtime.unix.devices import LOAD_REQUESTS
 from aftbed.runtime.unix.options import LoadRun
+from aftbed.runtime.unix.run_directory import BUS_NAME
 from aftbed.vehicle.aeb.function import sample_requests
 
 
@@ -36,6 +37,7 @@ def contradictions(record: RunRecord, reference: ReferenceRun) -> Iterator[str]:
     yield from _of_faults(record)
     if end is not None:
         yield from _of_end(record, end)
+        yield from _of_bus(record, end)
         if _at_rest(end) and _comparable(record, reference):
             yield from (
                 f"the state of {replica} at the end is not the bare server's"
@@ -77,6 +79,8 @@ def gaps(record: RunRecord, reference: ReferenceRun) -> Iterator[str]:
         if name not in record.history.journals:
             yield f"the journal {name} is missing"
     if _at_rest(record.end):
+        if not isinstance(record.options.work, LoadRun) and record.end.bus is None:
+            yield "the hub did not report what happened on the bus"
         hosted = record.end.hosted
         if not record.end.leader or (hosted is not None and not hosted.leader):
             yield "no replica leads at the end, and no loss was reported"
@@ -163,6 +167,16 @@ def _of_end(record: RunRecord, end: RunEnd) -> Iterator[str]:
         outside = sum(not first_ns <= t_ns <= last_ns for t_ns in record.history.times())
         if outside:
             yield f"{outside} records are of a time at which the run was not"
+
+
+def _of_bus(record: RunRecord, end: RunEnd) -> Iterator[str]:
+    """What the hub says of the bus against its log, and against what was asked for."""
+    if end.bus is None:
+        return
+    if end.bus.open_to_all != record.options.bus_open:
+        yield "run.json and end.json do not agree whether the bus was open to all"
+    if record.frames < end.bus.frames:  # it may have carried more since it reported
+        yield f"the hub carried {end.bus.frames} frames, and {BUS_NAME} has {record.frames}"
 
 
 @lru_cache(maxsize=4)

@@ -17,6 +17,7 @@ from aftbed.judge.record import RunRecord
 from aftbed.runtime.unix.closed_loop import Proposed, read_proposals
 from aftbed.runtime.unix.options import CarRun, ReplayRun
 from aftbed.runtime.unix.trust import NOBODY, Trust
+from aftbed.vehicle.can.hub import Stranger
 from aftbed.vehicle.plant import VehicleResult
 
 Word = Literal["pass", "fail", "inconclusive"]
@@ -34,6 +35,7 @@ CHECKERS: Final = (  # a new check is one line here; its name is its key in ever
     Checker("faults_applied", "G8", checks.check_faults_applied),
     Checker("adaptations_done", "G8", checks.check_adaptations),
     Checker("complete", "G8", checks.check_complete),
+    Checker("no_forged_frames", "G8", checks.check_no_forged_frames),
     Checker("sources_agree", "G8", checks.check_sources),
     Checker("whole_history", "G8", checks.check_whole_history),
     Checker("value", "G4", checks.check_value),
@@ -65,6 +67,7 @@ class Verdict(msgspec.Struct, frozen=True):
     ftm_at_end: str  # "" where the supervisor did not live to report it
     checks: dict[str, str]
     reasons: list[str]
+    strangers: list[Stranger]
     faults: list[FaultReport]
     replay: dict[str, object] | None
     seconds: float | None
@@ -124,6 +127,7 @@ def judge(record: RunRecord, evidence: Evidence | None = None) -> Verdict:
         ftm_at_end=record.end.hosted.ftm if record.end is not None and record.end.hosted is not None else "",
         checks={name: check.finding for name, check in found.items()},
         reasons=[f"{name}: {reason}" for name, check in found.items() for reason in check.reasons],
+        strangers=checks.strangers(record),
         faults=list(record.faults),
         replay=replay,
         seconds=record.end.seconds if record.end is not None else None,

@@ -117,10 +117,16 @@ class Started:
         faults: tuple[Fault, ...] = (),
         seed: int = 0,
         record: Path | None = None,
+        bus_open: bool = False,
     ) -> None:
-        kept = str(record) if record else None
         options, listener = options_for(
-            ftm=ftm, placement=placement, work=work, seed=seed, faults=faults, record=kept
+            ftm=ftm,
+            placement=placement,
+            work=work,
+            seed=seed,
+            faults=faults,
+            record=str(record) if record else None,
+            bus_open=bus_open,
         )
         self.launched = launch(options, listener)
         home.forks += [self.launched.supervisor, self.launched.warden]

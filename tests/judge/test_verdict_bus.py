@@ -1,0 +1,84 @@
+"""The verdict over what strangers did on the bus."""
+
+from pathlib import Path
+from typing import Final
+
+import msgspec
+import pytest
+from records import CAR, STOPPED, RecordInTheMaking, whole
+
+from aftbed.cli.views import show_verdict
+from aftbed.vehicle.can.hub import HubCounts, Stranger
+
+LISTENER: Final = Stranger(1000, connections=2)
+FORGER: Final = Stranger(1000, connections=1, frames=9, forged={"100": 5, "130": 1, "7FF": 2})
+
+
+def drive(path: Path, *strangers: Stranger, is_open: bool = False, frames: int = 0) -> RecordInTheMaking:
+    """A drive that went well, on whose bus these strangers were."""
+    record = whole(path, CAR)
+    record.options = msgspec.structs.replace(record.options, bus_open=is_open)
+    assert record.end is not None
+    record.end["result"] = {"end": "stopped itself", "result": msgspec.to_builtins(STOPPED)}
+    record.end["bus"] = msgspec.to_builtins(HubCounts(is_open, frames, strangers=list(strangers)))
+    return record
+
+
+@pytest.mark.parametrize("stranger", [LISTENER, Stranger(1000, connections=1, frames=9, put_out_fast=1)])
+def test_strangers_in_nobodys_name_are_told_and_change_nothing(path: Path, stranger: Stranger) -> None:
+    verdict = drive(path, stranger).verdict()
+    assert (verdict.verdict, verdict.checks["no_forged_frames"]) == ("pass", "pass")
+    assert verdict.strangers == [stranger]
+
+
+def test_with_forged_frames_a_run_proves_nothing(path: Path) -> None:
+    verdict = drive(path, LISTENER, FORGER).verdict()
+    assert (verdict.verdict, verdict.checks["no_forged_frames"]) == ("inconclusive", "unknown")
+    forged = "a stranger of user 1000 sent 5 AEB_REQ, 1 RADAR_TRACK, 2 0x7FF, which nobody asked for"
+    assert verdict.reasons == [f"no_forged_frames: {forged}"]
+    assert verdict.strangers[1].forged == {"AEB_REQ": 5, "RADAR_TRACK": 1, "0x7FF": 2}
+
+
+def test_on_an_open_bus_forged_frames_are_a_part_of_the_run(path: Path) -> None:
+    verdict = drive(path, FORGER, is_open=True).verdict()
+    assert (verdict.verdict, verdict.checks["no_forged_frames"]) == ("pass", "pass")
+    assert verdict.strangers[0].forged["AEB_REQ"] == 5
+
+
+def test_what_strangers_did_is_shown(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    unknown = Stranger(None, turned_away=3, refused=4, commands_refused=2, put_out_slow=1)
+    show_verdict(drive(path, FORGER, unknown).verdict(), as_json=False)
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("  bus ")]
+    assert lines == [
+        "  bus        a stranger of user 1000: 1 on the bus,"
+        " 9 frames (forged: 5 AEB_REQ, 1 RADAR_TRACK, 2 0x7FF)",
+        "  bus        a stranger of an unknown user: 3 turned away, 4 elements refused, 2 of them commands,"
+        " 1 put out as too slow",
+    ]
+
+
+def test_a_hub_that_did_not_report_leaves_it_unknown(path: Path) -> None:
+    record = drive(path)
+    assert record.end is not None
+    record.end["bus"] = None
+    verdict = record.verdict()
+    assert verdict.verdict == "inconclusive"
+    assert verdict.reasons == ["sources_agree: the hub did not report what happened on the bus"]
+    del record.end["bus"]
+    assert "sources_agree: end.json has no 'bus'" in record.verdict().reasons
+
+
+def test_the_log_of_the_bus_has_what_the_hub_says_that_it_carried(path: Path) -> None:
+    for frames, word in ((2, "pass"), (3, "pass"), (4, "fail")):
+        record = drive(path / str(frames), frames=frames)
+        (record.path / "bus.log").write_text("(0000000000.000000) can0 130#\n" * 3)
+        assert record.verdict().verdict == word, frames
+    assert record.verdict().reasons == ["sources_agree: the hub carried 4 frames, and bus.log has 3"]
+
+
+def test_a_bus_that_was_opened_later_on_paper_is_a_contradiction(path: Path) -> None:
+    record = drive(path, FORGER)
+    record.options = msgspec.structs.replace(record.options, bus_open=True)
+    told = "run.json and end.json do not agree whether the bus was open to all"
+    assert record.verdict().reasons == [f"sources_agree: {told}"]
+    assert record.verdict().verdict == "fail"

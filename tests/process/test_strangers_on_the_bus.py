@@ -1,0 +1,86 @@
+"""Real runs whose bus strangers flood and forge frames on, from before the first node of the run is on it."""
+
+import os
+import re
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Final
+
+import pytest
+from busharness import DEADLINE_S, RawClient
+from liveruns import Home, Started
+
+from aftbed.runtime.unix.options import CarRun
+from aftbed.runtime.unix.run_directory import members
+
+pytestmark = pytest.mark.process
+
+DRIVE: Final = CarRun("ccrs-20", None, "latch")
+REQUESTS: Final = 244  # of this drive
+FORGED: Final = b"< send 130 8 0 1 2 3 4 5 6 7 >"  # RADAR_TRACK
+FLOODS: Final = 2
+SECRET: Final = re.compile(rb"(?<![0-9a-f])[0-9a-f]{32}(?![0-9a-f])")
+
+
+@contextmanager
+def flooded(port: int) -> Iterator[None]:
+    """As much as the hub takes, and again whenever it puts the stranger out."""
+    over = threading.Event()
+
+    def flood() -> None:
+        while not over.is_set():
+            with suppress(OSError), socket.create_connection(("127.0.0.1", port), DEADLINE_S) as stranger:
+                stranger.sendall(b"< open can0 >< rawmode >")
+                while not over.is_set():
+                    stranger.sendall(FORGED * 100)
+
+    floods = [threading.Thread(target=flood) for _ in range(FLOODS)]
+    for one in floods:
+        one.start()
+    try:
+        yield
+    finally:
+        over.set()
+        for one in floods:
+            one.join()
+
+
+def readable_of(pid: int) -> bytes:
+    """The command line and the environment of a process; nothing of one that has ended."""
+    about = Path(f"/proc/{pid}")
+    with suppress(FileNotFoundError, ProcessLookupError):
+        return (about / "cmdline").read_bytes() + (about / "environ").read_bytes()
+    return b""
+
+
+def test_a_flood_of_forged_frames_does_not_starve_a_run_and_is_told(home: Home, tmp_path: Path) -> None:
+    """And the secret of the bus is in no file of the record, on no command line, in no environment."""
+    with Started(home, DRIVE, record=tmp_path / "record") as run, flooded(run.launched.options.port):
+        run.wait_for("started")
+        own = [one for one in members() if one.run == str(run.private)]
+        seen = b"".join(readable_of(one.pid) for one in own)
+        outcome = run.finish()
+    verdict = outcome.verdict
+    assert (verdict.requests.sent, verdict.requests.answered) == (REQUESTS, REQUESTS)
+    assert verdict.checks["no_forged_frames"] == "unknown" and verdict.verdict != "pass"
+    assert {name for name, word in verdict.checks.items() if word == "fail"} <= {"vehicle"}
+    (stranger,) = verdict.strangers
+    assert stranger.forged == {"RADAR_TRACK": stranger.frames} and stranger.put_out_fast
+    assert any(text.endswith("is on the bus") for text in outcome.told("bus"))
+    files = [path for path in (tmp_path / "record").rglob("*") if path.is_file()]
+    of_the_test = "\0".join(os.environ.values()).encode()
+    assert seen and set(SECRET.findall(seen)) <= set(SECRET.findall(of_the_test))
+    assert [path.name for path in files if SECRET.search(path.read_bytes())] == []
+
+
+def test_on_a_bus_that_was_opened_a_listener_and_a_sender_change_no_verdict(home: Home) -> None:
+    with Started(home, DRIVE, bus_open=True) as run, RawClient(run.launched.options.port) as stranger:
+        stranger.write("< send 701 1 1 >")
+        stranger.fence()
+        outcome = run.finish()
+    assert outcome.verdict.verdict == "pass", outcome.verdict.reasons
+    (found,) = outcome.verdict.strangers
+    assert (found.connections, found.frames) == (1, 1)
