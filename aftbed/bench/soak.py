@@ -63,7 +63,7 @@ MINUTES_MIN: Final = 0.05
 EVERY_SECONDS_MIN: Final = 0.1
 SAMPLE_SECONDS: Final = 5.0  # between samples, where there are no adaptations
 DESCRIPTORS_OF_SPARE: Final = 2  # in the supervisor: its control line and its pidfd
-VALUES_MIN: Final = 4  # of which a slope has an interval
+VALUES_MIN: Final = 8  # for the interval: of fewer, Kendall's tau is not normally distributed
 
 
 Finding = Literal["flat", "grows", "unknown"]
@@ -160,7 +160,7 @@ SIZES: Final = (
     ),
     *(Quantity(f"RSS of {one}", "MB", RSS_BOUND_MB) for one in ("watchdogs", REPLICAS)),
     Quantity("RSS of a spare", "MB", RSS_BOUND_MB),
-    Quantity("PSS of all", "MB", KEPT_BOUND_MB + RSS_BOUND_MB),
+    Quantity("RSS of all", "MB", KEPT_BOUND_MB + RSS_BOUND_MB),
     Quantity("descriptors of supervisor", "", COUNT_BOUND),
     Quantity("descriptors of all", "", COUNT_BOUND),
     Quantity("threads of all", "", COUNT_BOUND),
@@ -341,8 +341,9 @@ def _agenda(plan: SoakPlan, began_s: float) -> Iterator[tuple[float, str]]:
 def _sizes(rows: list[ProcessRow], record: Path) -> dict[str, float]:
     """Of processes that are there; one that has ended meanwhile counts for nothing.
 
-    There are more spares or fewer from moment to moment, as is intended: "all" is without them, and the
-    supervisor's descriptors are without the two for each of them.
+    RSS and not PSS: the supervisor is a fork of this process, and PSS rises, up to RSS, as one of the two
+    writes to pages that both have. There are more spares or fewer from moment to moment, as is intended, so
+    "all" is without them, and the supervisor's descriptors are without the two for each of them.
     """
     import psutil  # noqa: PLC0415 - it costs 15 ms, and the supervisor is a fork of this process
 
@@ -352,20 +353,16 @@ def _sizes(rows: list[ProcessRow], record: Path) -> dict[str, float]:
         group = REPLICAS if row.node and row.name not in GROUPS else GROUPS.get(row.name, row.name)
         with contextlib.suppress(psutil.Error):
             process = psutil.Process(row.pid)
-            memory, descriptors, threads = (
-                process.memory_full_info(),
-                process.num_fds(),
-                process.num_threads(),
-            )
-            found[f"RSS of {group}"] += memory.rss / 1e6
+            rss_mb, descriptors = process.memory_info().rss / 1e6, process.num_fds()
+            found[f"RSS of {group}"] += rss_mb
             found[f"descriptors of {group}"] += descriptors
             if group == SPARES:
                 spares += 1
                 continue
             found["processes"] += 1
-            found["PSS of all"] += memory.pss / 1e6
+            found["RSS of all"] += rss_mb
             found["descriptors of all"] += descriptors
-            found["threads of all"] += threads
+            found["threads of all"] += process.num_threads()
     for name in ("descriptors of supervisor", "descriptors of all"):
         found[name] -= DESCRIPTORS_OF_SPARE * spares
     if spares:

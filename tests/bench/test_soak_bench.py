@@ -38,7 +38,7 @@ def test_a_figure_is_flat_or_grows_with_confidence_or_it_is_not_known(
 
 
 def test_too_few_values_have_no_slope() -> None:
-    found = trend(FIGURE, [(0.0, 1.0), (1e9, 1.0), (2e9, 1.0)])
+    found = trend(FIGURE, [(number * 1e9, float(number)) for number in range(7)])
     assert (found.slope, found.finding) == (None, "unknown")
 
 
