@@ -22,7 +22,7 @@ from aftbed.runtime.unix import seal
 
 pytestmark = pytest.mark.process
 
-REQUESTS: Final = 60
+REQUESTS: Final = 120  # enough for the adaptation to end on a busy machine
 CRASH: Final = "crash primary at server.exit nth 20"
 NS_PER_S: Final = 10**9
 DIALOGUE: Final = "client.1.dialogue"
