@@ -390,6 +390,7 @@ class Observer:
 
     def __init__(self, policy: Policy, running: str, now_ns: int) -> None:
         self.running = running
+        self.held: set[str] = set()  # the rules whose conditions have held so far
         self._policy = policy
         self._watches = tuple(_watch(rule.when, now_ns) for rule in policy.rules)
         self._rest_until_ns = now_ns
@@ -416,6 +417,8 @@ class Observer:
     def wake(self, now_ns: int) -> Proposal | None:
         now_ns = max(now_ns, self._now_ns)
         self._now_ns = now_ns
+        pairs = zip(self._policy.rules, self._watches, strict=True)
+        self.held.update(rule.key for rule, watch in pairs if watch.holds(now_ns))
         if now_ns < self._rest_until_ns:
             return None
         for rule, since_ns in self._deciding(now_ns):

@@ -23,7 +23,8 @@ from aftbed.core.messages import Scheduled
 from aftbed.core.script import RECIPES
 from aftbed.ftm.compose import build
 from aftbed.inject.model import Fault, FaultReport, parse
-from aftbed.judge.checks import WITHOUT_END, Evidence, Requests
+from aftbed.judge.asked import WITHOUT_END
+from aftbed.judge.checks import Evidence, Requests
 from aftbed.judge.outcome import FAILED, OUTCOMES, UNKNOWN, outcome_of, worst
 from aftbed.judge.record import RunEnd, RunRecord, read_record
 from aftbed.judge.simulated import record_of
@@ -246,6 +247,8 @@ def _real(experiment: Experiment, standing: ExitStack) -> Result:
     verdict, (outcome, reasons) = judge(evidence.record, evidence), outcome_of(evidence)
     # G8: what the harness does not know is worse than any outcome that it believes to have seen.
     unknown = {name for name, word in verdict.checks.items() if word == "unknown"} - ON_ACTIVATION
+    if outcome in ("unavailable", "hang"):
+        unknown -= {"complete"}  # which is why not all of the load was sent
     if "clean_exit" in unknown:
         outcome, reasons = "harness_error", tuple(verdict.reasons)
     elif unknown and outcome != "sdc":

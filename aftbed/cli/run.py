@@ -28,7 +28,7 @@ from aftbed.inject.memory import refuse_unsafe
 from aftbed.inject.model import Fault, parse
 from aftbed.runtime.control import Report
 from aftbed.runtime.unix.launch import Launched, launch, options_for
-from aftbed.runtime.unix.options import CarRun, LoadRun, ReplayRun, Work
+from aftbed.runtime.unix.options import CarRun, LoadRun, PolicyOptions, ReplayRun, Work
 
 if TYPE_CHECKING:
     from aftbed.runtime.unix.closed_loop import ClosedLoop
@@ -64,7 +64,7 @@ class RunArguments(msgspec.Struct, frozen=True):
         bool, typer.Option("--force", help="Carry out --adapt even where it does not suit the function.")
     ] = False
     may_fail: Annotated[
-        bool, typer.Option("--may-fail", help="The run may pass even if an --adapt was not done.")
+        bool, typer.Option("--may-fail", help="The run may pass even if an adaptation was not done.")
     ] = False
     policy: Annotated[
         str | None, typer.Option(help="When the run adapts by itself: name of a policy, or a YAML file.")
@@ -112,6 +112,9 @@ def execute(given: RunArguments) -> int:
     graph = build(given.ftm, given.placement)
     faults = tuple(_fault(text, graph, unsafe=given.unsafe_memory) for text in given.faults)
     adaptations = _adaptations(given, graph)
+    policy = None
+    if given.policy is not None:
+        policy = PolicyOptions(given.policy, given.approve, given.may_fail)
     make_loop = _closed_loop(given)
     work = _work(given)
     check_seed(given.seed)
@@ -125,6 +128,7 @@ def execute(given: RunArguments) -> int:
         record=given.record,
         faults=faults,
         adaptations=adaptations,
+        policy=policy,
         pin=given.pin,
         bus_port=given.bus_port,
         bus_open=given.bus_open,
@@ -166,8 +170,10 @@ def _fault(text: str, graph: Graph, *, unsafe: bool) -> Fault:
 
 def _adaptations(given: RunArguments, graph: Graph) -> tuple[Scheduled, ...]:
     if not given.adaptations:
-        if given.recipe != RECIPES[0] or given.force or given.may_fail:
-            raise ConfigError("--recipe, --force and --may-fail are about --adapt: give --adapt too")
+        if given.recipe != RECIPES[0] or given.force:
+            raise ConfigError("--recipe and --force say how --adapt is carried out: give --adapt too")
+        if given.may_fail and given.policy is None:
+            raise ConfigError("--may-fail is about --adapt and --policy: give one of them too")
         return ()
     from aftbed.cli.adapt import scheduled  # noqa: PLC0415 - only with --adapt
 

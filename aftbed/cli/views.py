@@ -155,11 +155,8 @@ def show_verdict(verdict: "Verdict", *, as_json: bool) -> None:
         print(shown(f"  adaptation {one}{took}"))
     if verdict.adaptations:
         print(shown(f"  at the end {verdict.ftm_at_end or 'unknown'}"))
-    if verdict.proposals:
-        from aftbed.runtime.unix.closed_loop import proposed_line  # noqa: PLC0415 - only with a policy
-
-        for proposal in verdict.proposals:
-            print(shown(f"  proposal   {proposed_line(proposal)}"))
+    if verdict.policy is not msgspec.UNSET:
+        _show_policy(verdict)
     for stranger in verdict.strangers:
         print(f"  bus        {_stranger_line(stranger)}")
     for fault in verdict.faults:
@@ -168,6 +165,15 @@ def show_verdict(verdict: "Verdict", *, as_json: bool) -> None:
     for reason in verdict.reasons:
         print(shown(f"  because    {reason}"))
     print(f"verdict: {verdict.verdict}")
+
+
+def _show_policy(verdict: "Verdict") -> None:
+    from aftbed.runtime.unix.closed_loop import proposed_line, rule_line  # noqa: PLC0415 - only with a policy
+
+    for rule in verdict.policy.rules if verdict.policy else ():
+        print(shown(f"  policy     {rule_line(rule)}"))
+    for proposal in verdict.proposals or ():
+        print(shown(f"  proposal   {proposed_line(proposal)}"))
 
 
 def _stranger_line(one: "Stranger") -> str:

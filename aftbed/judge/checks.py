@@ -11,12 +11,10 @@ from typing import Final, Literal, NamedTuple
 
 import msgspec
 
-from aftbed.adapt.engine import DONE
 from aftbed.core.errors import PeerError
 from aftbed.core.events import FIRST_FAULT, RERUN, Event
 from aftbed.core.graph import Graph
 from aftbed.core.journal import Entry, EntryKind, History, Record
-from aftbed.core.messages import Scheduled
 from aftbed.ftm.compose import REPLICAS, build, replication_of
 from aftbed.inject.model import Fault, FaultReport, parse
 from aftbed.inject.receipts import fault_and_bits
@@ -24,9 +22,8 @@ from aftbed.inject.targets import PRIMARY
 from aftbed.judge import sources
 from aftbed.judge.record import Excuses, RunRecord
 from aftbed.judge.reference import ReferenceRun
-from aftbed.runtime.adaptations import Outcome
 from aftbed.runtime.deployment import Hosted, replica_of
-from aftbed.runtime.unix.options import COMMAND_GONE, CarRun, LoadRun, ReplayRun, Work
+from aftbed.runtime.unix.options import COMMAND_GONE, CarRun, ReplayRun, Work
 from aftbed.vehicle.aeb.messages import AebOutput, decode_reply
 from aftbed.vehicle.can.dbc_file import load_dbc
 from aftbed.vehicle.can.hub import Stranger
@@ -39,9 +36,6 @@ VEHICLE: Final = "vehicle"  # the name of the check of what a scenario expects o
 NOTHING_EXCUSED: Final = Excuses()
 LATE_NS: Final = 60_000_000  # of bus time: as long as the brake ECU holds the last request
 HANG_NOTICED_NS: Final = 50_000_000  # after the end of a hang an alarm may still be about it
-NOT_BEGUN: Final = "not begun"
-NOT_ENDED: Final = "not ended"
-WITHOUT_END: Final = (NOT_BEGUN, NOT_ENDED)
 
 Finding = Literal["pass", "fail", "unknown"]
 
@@ -80,25 +74,6 @@ class Failover(msgspec.Struct, frozen=True):
     recovered_ms: float | None
     blackout_ms: float | None
     fault: str = ""
-
-
-class AskedAdaptation(msgspec.Struct, frozen=True):
-    """An adaptation that was asked for, and how it ended; times in milliseconds.
-
-    `outcome`: `done`, `rolled back`, `refused`, `not begun`, or `not ended`, with the reason.
-    """
-
-    asked: str
-    outcome: str
-    reason: str = ""
-    prepare_ms: float = 0.0
-    blackout_ms: float = 0.0
-    total_ms: float = 0.0
-    may_fail: bool = False
-
-    def __str__(self) -> str:
-        why = f": {self.reason}" if self.reason else ""
-        return f"{self.asked}: {self.outcome}{why}"
 
 
 def _check(reasons: list[str]) -> Check:
@@ -314,35 +289,6 @@ def _number_of(strike: Record) -> int:
     return fault_and_bits(strike.detail)[0] - FIRST_FAULT
 
 
-def adaptations(record: RunRecord) -> list[AskedAdaptation]:
-    """Those asked for with the run, in their order, then those asked for while it ran."""
-    by_place = {one.scheduled: one for one in record.adaptations}
-    with_run = [
-        _told(by_place[place], str(one)) if place in by_place else _without_end(record, one)
-        for place, one in enumerate(record.options.adaptations, 1)
-    ]
-    return with_run + [_told(one, one.asked) for one in record.adaptations if not one.scheduled]
-
-
-def _told(one: Outcome, asked: str) -> AskedAdaptation:
-    times_ms = (one.prepare_ms, one.blackout_ms, one.total_ms)
-    return AskedAdaptation(asked, one.outcome, one.reason, *times_ms, may_fail=one.may_fail)
-
-
-def _without_end(record: RunRecord, scheduled: Scheduled) -> AskedAdaptation:
-    """What is known of one that has left no outcome."""
-    seconds = record.end.seconds if record.end is not None else None
-    sent = max((entry.request_id for entry in _sent(record.history)), default=0)
-    outcome = NOT_BEGUN
-    if sent < scheduled.at_request:
-        reason = f"request {scheduled.at_request} was never sent, {sent} was the last"
-    elif seconds is not None and seconds * 1e3 < scheduled.after_ms:
-        reason = f"the run ended after {seconds:g} s"
-    else:
-        outcome, reason = NOT_ENDED, "the run ended before it"
-    return AskedAdaptation(str(scheduled), outcome, reason, may_fail=scheduled.goal.may_fail)
-
-
 def _last_before(records: Iterable[Record], t_ns: int) -> Record | None:
     return max((r for r in records if r.t_ns <= t_ns), key=lambda r: r.t_ns, default=None)
 
@@ -522,43 +468,6 @@ def check_clean_exit(evidence: Evidence) -> Check | None:
     return Check("pass")
 
 
-def check_faults_applied(evidence: Evidence) -> Check:
-    """G8: a fault that did not fire proves nothing."""
-    reasons = tuple(
-        f"{f.receipt.value}: {f.fault}: {f.detail}" if f.detail else f"never fired: {f.fault}"
-        for f in evidence.record.faults
-        if not f.fired
-    )
-    return Check("unknown" if reasons else "pass", reasons)
-
-
-def check_adaptations(evidence: Evidence) -> Check | None:
-    """G8: an adaptation that was asked for and not done proves nothing, unless it may fail."""
-    asked = adaptations(evidence.record)
-    failed = tuple(str(one) for one in asked if one.outcome != DONE and not one.may_fail)
-    return Check("unknown" if failed else "pass", failed[:REASONS_MAX]) if asked else None
-
-
-def check_complete(evidence: Evidence) -> Check | None:
-    """G8: as many requests as asked for, the log to its end, unless the user ended the run before.
-
-    A drive is judged by what its scenario expects (`check_vehicle`).
-    """
-    record, reasons = evidence.record, []
-    if isinstance(record.options.work, CarRun) or record.end is None or record.lost or record.end.reason:
-        return None
-    match record.options.work:
-        case LoadRun(count):
-            sent = len({entry.request_id for entry in _sent(record.history)})
-            if sent != count:
-                reasons = [f"{sent} requests were sent, {count} were asked for"]
-        case ReplayRun():
-            played = (record.end.result or {}).get("played")
-            if not isinstance(played, dict) or not played.get("complete"):
-                reasons = ["the log was not replayed to its end"]
-    return Check("unknown" if reasons else "pass", tuple(reasons))
-
-
 def strangers(record: RunRecord) -> list[Stranger]:
     """What strangers did on the bus, by user; messages of the car are called by their names."""
     found = record.end.bus.strangers if record.end is not None and record.end.bus is not None else []
@@ -616,8 +525,7 @@ def check_vehicle(evidence: Evidence) -> Check | None:
         return None  # without a service no drive is promised to end well
     if record.vehicle is None:
         return Check("unknown", ("the car did not report",))
-    result = record.end.result if record.end is not None else None
-    if result is not None and result.get("end") == "stopped" and not record.vehicle.collision:
+    if record.drive is not None and record.drive.end == "stopped" and not record.vehicle.collision:
         return Check("pass")
     broken = broken_expectations(load_scenario(work.scenario), record.vehicle)
     if broken and work.pace is not None:

@@ -21,10 +21,12 @@ from aftbed.inject.model import FaultReport
 from aftbed.inject.receipts import ReceiptState
 from aftbed.runtime.adaptations import Outcome
 from aftbed.runtime.deployment import Hosted
+from aftbed.runtime.unix.closed_loop import PolicyReport, Proposed, read_policy_report, read_proposals
 from aftbed.runtime.unix.journal_files import entries_dropped, stored_entries, stored_records
 from aftbed.runtime.unix.options import CarRun, RunOptions
 from aftbed.runtime.unix.run_directory import BUS_NAME, HISTORY_NAME
 from aftbed.vehicle.can.hub import LOG_BYTES_MAX, HubCounts
+from aftbed.vehicle.ecus import End
 from aftbed.vehicle.plant import VehicleResult
 
 DOCUMENT_BYTES_MAX: Final = 64_000_000  # of a file that is no journal
@@ -68,6 +70,14 @@ class RunEnd(msgspec.Struct, frozen=True):
     absent: tuple[str, ...] = ()  # keys that every end has, and this one does not
 
 
+class DriveEnd(msgspec.Struct, frozen=True):
+    """How a drive ended, after so many microseconds of bus time. `end` is None where it did not."""
+
+    end: End | None
+    t_us: int
+    result: VehicleResult
+
+
 class Excuses(msgspec.Struct, frozen=True):
     """What the faults of a run allow, although a promise is broken by it; only the simulator knows this.
 
@@ -92,7 +102,9 @@ class RunRecord(msgspec.Struct, frozen=True):
     end: RunEnd | None
     faults: tuple[FaultReport, ...] = ()  # each with its receipt
     adaptations: tuple[Outcome, ...] = ()  # how each one ended, in order
-    vehicle: VehicleResult | None = None
+    drive: DriveEnd | None = None
+    policy: PolicyReport | None = None
+    proposals: tuple[Proposed, ...] = ()  # of the policy
     path: Path = Path()
     started_ns: int = 0
     failures: tuple[str, ...] = ()
@@ -104,6 +116,11 @@ class RunRecord(msgspec.Struct, frozen=True):
     def simulated(self) -> bool:
         """Whether the simulator made it."""
         return self.excuses is not None
+
+    @property
+    def vehicle(self) -> VehicleResult | None:
+        """What the car did, if there was one and it reported."""
+        return self.drive.result if self.drive is not None else None
 
     @property
     def ftm(self) -> str:
@@ -138,18 +155,18 @@ def read_record(path: Path, *, in_memory: bool = False) -> RunRecord:
         if end is not None
         else tuple(FaultReport(str(fault), ReceiptState.UNKNOWN) for fault in options.faults)
     )
-    vehicle = _vehicle(options, end)
-    kept = about.get("kept") is True
     return RunRecord(
         options,
         history,
         end,
         faults,
         _adaptations(path),
-        vehicle,
+        _drive(options, end),
+        read_policy_report(path),
+        tuple(read_proposals(path)),
         path,
         started,
-        kept=kept,
+        kept=about.get("kept") is True,
         frames=_frames(path / BUS_NAME),
     )
 
@@ -203,11 +220,11 @@ def _end(path: Path) -> RunEnd:
         raise ConfigError(f"{path}: not the end of a run: {error}") from None
 
 
-def _vehicle(options: RunOptions, end: RunEnd | None) -> VehicleResult | None:
+def _drive(options: RunOptions, end: RunEnd | None) -> DriveEnd | None:
     if end is None or end.result is None or not isinstance(options.work, CarRun):
         return None
     try:
-        return msgspec.convert(end.result.get("result"), VehicleResult)
+        return msgspec.convert(end.result, DriveEnd)
     except msgspec.ValidationError as error:
         raise ConfigError(f"end.json: not the result of a drive: {error}") from None
 

@@ -8,7 +8,7 @@ from aftbed.core.application import Application
 from aftbed.core.events import Event
 from aftbed.core.script import ScriptKind
 from aftbed.ftm.compose import replication_of
-from aftbed.judge.record import Excuses, RunEnd, RunRecord
+from aftbed.judge.record import DriveEnd, Excuses, RunEnd, RunRecord
 from aftbed.judge.verdict import Breach, broken, evidence_of
 from aftbed.runtime.deployment import replica_of
 from aftbed.runtime.sim.world import Run
@@ -47,7 +47,7 @@ def record_of(run: Run) -> RunRecord:
         end,
         run.faults,
         run.adaptations,
-        run.vehicle,
+        DriveEnd(run.drive_end, run.drive_us, run.vehicle) if run.vehicle is not None else None,
         failures=run.failures,
         excuses=Excuses(service_struck_down(run), values, tuple(name for _, name in run.struck)),
     )

@@ -12,10 +12,12 @@ What a request must have left, if it was answered:
     dialogue     the bytes that the seed draws, of a load
 """
 
+from collections import Counter
 from collections.abc import Callable, Iterator
 from functools import lru_cache
 from typing import NamedTuple
 
+from aftbed.adapt.engine import DONE
 from aftbed.core.events import FIRST_FAULT, Event
 from aftbed.core.journal import EntryKind, History, Record
 from aftbed.ftm.compose import build
@@ -35,6 +37,7 @@ def contradictions(record: RunRecord, reference: ReferenceRun) -> Iterator[str]:
     yield from seal.changes(record.path)
     yield from _of_requests(record)
     yield from _of_faults(record)
+    yield from _of_policy(record)
     if end is not None:
         yield from _of_end(record, end)
         yield from _of_bus(record, end)
@@ -153,6 +156,25 @@ def _of_faults(record: RunRecord) -> Iterator[str]:
     struck = [number for number in numbers if number >= len(record.faults)]
     if struck:
         yield f"a fault has struck, and there is no receipt: number {min(struck) + 1}"
+
+
+def _of_policy(record: RunRecord) -> Iterator[str]:
+    """What the closed loop reports, what it proposed, and what came of it."""
+    if record.options.policy is None:
+        if record.policy is not None or record.proposals:
+            yield "a policy was followed, and none was asked for"
+        return
+    if record.policy is None:
+        return  # the closed loop did not live to report
+    proposed = Counter(one.rule for one in record.proposals)
+    yield from (
+        f"{rule.rule} proposed {rule.proposed} times, and there are {proposed[rule.rule]} proposals of it"
+        for rule in record.policy.rules
+        if proposed[rule.rule] != rule.proposed
+    )
+    done = Counter(one.ftm for one in record.adaptations if one.outcome == DONE and not one.scheduled)
+    missing = Counter(one.target for one in record.proposals if one.outcome == DONE) - done
+    yield from (f"the proposal of {target} was done, and no adaptation led there" for target in missing)
 
 
 def _of_end(record: RunRecord, end: RunEnd) -> Iterator[str]:

@@ -11,10 +11,12 @@ import msgspec
 from aftbed.core.application import Application
 from aftbed.inject.model import FaultReport
 from aftbed.judge import checks
-from aftbed.judge.checks import AskedAdaptation, Check, Checker, Evidence, Failover, Requests
+from aftbed.judge.asked import CHECKS as ASKED_CHECKS
+from aftbed.judge.asked import AskedAdaptation, adaptations, check_asked
+from aftbed.judge.checks import Check, Checker, Evidence, Failover, Requests
 from aftbed.judge.isolated import reference_of
 from aftbed.judge.record import RunRecord
-from aftbed.runtime.unix.closed_loop import Proposed, read_proposals
+from aftbed.runtime.unix.closed_loop import PolicyReport, Proposed
 from aftbed.runtime.unix.options import CarRun, ReplayRun
 from aftbed.runtime.unix.trust import NOBODY, Trust
 from aftbed.vehicle.can.hub import Stranger
@@ -32,9 +34,7 @@ CHECKERS: Final = (  # a new check is one line here; its name is its key in ever
     Checker("one_master", "G6", lambda e: checks.one_master(e.record.history)),
     Checker("whole_graph", "G5", checks.check_whole_graph),
     Checker("clean_exit", "G7", checks.check_clean_exit),
-    Checker("faults_applied", "G8", checks.check_faults_applied),
-    Checker("adaptations_done", "G8", checks.check_adaptations),
-    Checker("complete", "G8", checks.check_complete),
+    *(Checker(name, "G8", check_asked(name)) for name in ASKED_CHECKS),
     Checker("no_forged_frames", "G8", checks.check_no_forged_frames),
     Checker("sources_agree", "G8", checks.check_sources),
     Checker("whole_history", "G8", checks.check_whole_history),
@@ -72,7 +72,8 @@ class Verdict(msgspec.Struct, frozen=True):
     replay: dict[str, object] | None
     seconds: float | None
     launch_ms: float | None
-    proposals: list[Proposed] | msgspec.UnsetType = msgspec.UNSET  # where there is a policy
+    policy: PolicyReport | msgspec.UnsetType | None = msgspec.UNSET  # only under a policy, as `proposals`
+    proposals: list[Proposed] | msgspec.UnsetType = msgspec.UNSET
 
 
 class Breach(msgspec.Struct, frozen=True):
@@ -111,7 +112,7 @@ def judge(record: RunRecord, evidence: Evidence | None = None) -> Verdict:
             scenario, replay = f"replay {log.log}", record.end.result if record.end is not None else None
         case _:
             scenario = "load"
-    proposals = None if record.simulated else read_proposals(record.path)
+    followed = options.policy is not None
     began_ns = min((e.t_ns for e in history.dialogue), default=None)
     return Verdict(
         run=options.run,
@@ -123,7 +124,7 @@ def judge(record: RunRecord, evidence: Evidence | None = None) -> Verdict:
         requests=checks.requests(history, evidence.reference, checks.late_after_ns(options.work)),
         vehicle=record.vehicle,
         failovers=checks.failovers(history, record.faults),
-        adaptations=checks.adaptations(record),
+        adaptations=adaptations(record),
         ftm_at_end=record.end.hosted.ftm if record.end is not None and record.end.hosted is not None else "",
         checks={name: check.finding for name, check in found.items()},
         reasons=[f"{name}: {reason}" for name, check in found.items() for reason in check.reasons],
@@ -134,7 +135,8 @@ def judge(record: RunRecord, evidence: Evidence | None = None) -> Verdict:
         launch_ms=(
             None if record.simulated or began_ns is None else round((began_ns - record.started_ns) / 1e6, 3)
         ),
-        proposals=msgspec.UNSET if proposals is None else proposals,
+        policy=record.policy if followed else msgspec.UNSET,
+        proposals=list(record.proposals) if followed else msgspec.UNSET,
     )
 
 

@@ -120,9 +120,9 @@ class Adaptations:
         return self._current is not None
 
     @property
-    def to_come(self) -> bool:
-        """Whether a scheduled adaptation waits for its request."""
-        return bool(self._scheduled)
+    def awaited(self) -> tuple[int, ...]:
+        """The requests that scheduled adaptations wait for."""
+        return tuple(sorted({later.at_request for _, later in self._scheduled}))
 
     @property
     def scheduled(self) -> tuple[Outcome | None, ...]:
@@ -208,9 +208,8 @@ class Adaptations:
         yield from self._deployment.ask(CLIENT, control.ResumeNode)
 
     def _hold_requests(self) -> Keys:
-        requests = tuple(sorted({later.at_request for _, later in self._scheduled}))
-        if requests:
-            hold = messages.HoldAt(requests)
+        if self.awaited:
+            hold = messages.HoldAt(self.awaited)
             yield from self._deployment.ask(CLIENT, lambda token: control.Deliver(token, CLIENT, hold))
 
     def request_held(self, request_id: int) -> None:

@@ -236,5 +236,5 @@ class RunController:
                 self._loop.after(SETTLE_SECONDS, self._rearm)
             self._runtime.pool.refill(LIGHT, self.spares())
 
-        held = node == CLIENT and self.adaptations.to_come  # until it knows what waits for its requests
+        held = node == CLIENT and bool(self.adaptations.awaited)  # until it knows what waits for its requests
         self._loop.tasks.start(f"{REPLACE}{node}", self.deployment.respawn(node, held=held), ended)

@@ -32,9 +32,9 @@ from aftbed.runtime.unix.options import RunOptions
         (("--adapt", f"update app to {CLOSED}"), ("pbr needs state access", "--force")),
         (("--adapt", "to lfr", "--recipe", "papr"), ("did you mean 'paper'",)),
         (("--adapt", "to lfr", "--recipe", "paper", "--placement", "replica"), ("not replica",)),
-        (("--recipe", "paper"), ("--recipe, --force and --may-fail", "give --adapt too")),
-        (("--force",), ("--recipe, --force and --may-fail", "give --adapt too")),
-        (("--may-fail",), ("--recipe, --force and --may-fail", "give --adapt too")),
+        (("--recipe", "paper"), ("--recipe and --force", "give --adapt too")),
+        (("--force",), ("--recipe and --force", "give --adapt too")),
+        (("--may-fail",), ("--adapt and --policy", "give one of them too")),
         (
             ("--adapt", "switch lfr", "--adapt", "switch lfr"),
             ("--adapt 'switch lfr'", "is what runs already"),

@@ -2,19 +2,15 @@
 
 import json
 from pathlib import Path
-from typing import Final
 
 import msgspec
 import pytest
-from msgspec.structs import replace
 from records import CRASH, FLIP, RecordInTheMaking, outcomes, whole
 
 from aftbed.core.events import Event
-from aftbed.core.messages import Goal, Scheduled
 from aftbed.ftm.compose import build
 from aftbed.inject.model import FaultReport
 from aftbed.inject.receipts import ReceiptState
-from aftbed.judge.checks import AskedAdaptation
 from aftbed.judge.record import read_record
 from aftbed.judge.verdict import EXIT_CODES
 from aftbed.runtime.unix.options import COMMAND_GONE
@@ -51,86 +47,6 @@ def test_a_fault_that_was_survived_passes_and_is_told(path: Path) -> None:
     assert (verdict.verdict, verdict.reasons) == ("pass", [])
     assert verdict.faults == [FaultReport(str(CRASH), ReceiptState.APPLIED)]
     assert [(f.epoch, f.cause, f.detected_ms) for f in verdict.failovers] == [(2, "fault", 1.0)]
-
-
-def test_a_load_that_ended_early_proves_nothing(path: Path) -> None:
-    record = whole(path)
-    record.asked = 5
-    verdict = record.verdict()
-    assert (verdict.verdict, verdict.checks["complete"]) == ("inconclusive", "unknown")
-    assert verdict.reasons == ["complete: 3 requests were sent, 5 were asked for"]
-
-
-def test_a_load_that_its_user_stopped_is_judged_by_what_it_did(path: Path) -> None:
-    record = whole(path)
-    record.asked = 5
-    assert record.end is not None
-    record.end["reason"] = "stopped"
-    assert record.verdict().verdict == "pass"
-
-
-# -- adaptations that were asked for
-
-
-DONE: Final = {"blackout_ms": 1.5, "total_ms": 120.0, "scheduled": 1, "ftm": "lfr"}
-AT_2: Final = Scheduled(Goal(expression="lfr"), at_request=2)
-
-
-def adapted(path: Path, asked: tuple[Scheduled, ...], *changes: dict[str, object]) -> RecordInTheMaking:
-    record = whole(path)
-    record.options = msgspec.structs.replace(record.options, adaptations=asked)
-    (path / HISTORY_NAME).write_text(outcomes(*changes))
-    return record
-
-
-def test_an_adaptation_that_was_done_is_told(path: Path) -> None:
-    record = adapted(path, (AT_2,), DONE)
-    record.host(ftm="lfr", bricks=[[b.name, b.kind] for b in build("lfr", "process").bricks])
-    verdict = record.verdict()
-    assert (verdict.verdict, verdict.checks["adaptations_done"]) == ("pass", "pass")
-    assert verdict.adaptations == [
-        AskedAdaptation("to lfr at request 2", "done", blackout_ms=1.5, total_ms=120.0)
-    ]
-    assert (verdict.ftm, verdict.ftm_at_end) == ("pbr", "lfr")
-
-
-@pytest.mark.parametrize(
-    ("asked", "changes", "reason"),
-    [
-        ((AT_2,), [DONE | {"outcome": "rolled back", "reason": "b died"}], "rolled back: b died"),
-        ((AT_2,), [DONE | {"outcome": "refused", "reason": "no backup"}], "refused: no backup"),
-        ((AT_2,), [], "not ended: the run ended before it"),
-    ],
-)
-def test_one_that_was_not_done_proves_nothing(
-    path: Path, asked: tuple[Scheduled, ...], changes: list[dict[str, object]], reason: str
-) -> None:
-    verdict = adapted(path / "1", asked, *changes).verdict()
-    assert (verdict.verdict, verdict.checks["adaptations_done"]) == ("inconclusive", "unknown")
-    assert verdict.reasons == [f"adaptations_done: to lfr at request 2: {reason}"]
-    may_fail = tuple(replace(one, goal=replace(one.goal, may_fail=True)) for one in asked)
-    changes = [one | {"may_fail": True} for one in changes]
-    assert adapted(path / "2", may_fail, *changes).verdict().verdict == "pass"
-
-
-@pytest.mark.parametrize(
-    ("asked", "reason"),
-    [
-        (Scheduled(Goal(expression="lfr"), at_request=5000), "request 5000 was never sent, 3 was the last"),
-        (Scheduled(Goal(expression="lfr"), after_ms=20_000), "the run ended after 1.5 s"),
-    ],
-)
-def test_one_whose_time_never_came_proves_nothing(path: Path, asked: Scheduled, reason: str) -> None:
-    verdict = adapted(path, (asked,)).verdict()
-    assert verdict.verdict == "inconclusive"
-    assert verdict.reasons == [f"adaptations_done: {asked}: not begun: {reason}"]
-
-
-def test_one_that_was_asked_for_while_it_ran_is_told_behind_them(path: Path) -> None:
-    live = {"outcome": "rolled back", "reason": "b died", "asked": "to lfr+tr"}
-    verdict = adapted(path, (AT_2,), live, DONE | {"ftm": "pbr"}).verdict()
-    assert [one.asked for one in verdict.adaptations] == ["to lfr at request 2", "to lfr+tr"]
-    assert verdict.reasons == ["adaptations_done: to lfr+tr: rolled back: b died"]
 
 
 def test_exit_codes() -> None:

@@ -11,11 +11,11 @@ from aftbed.runtime.unix.options import CarRun, ReplayRun
 from aftbed.vehicle.plant import VehicleResult
 
 
-def drive(path: Path, result: VehicleResult | None, end: str = "stopped itself") -> RecordInTheMaking:
+def drive(path: Path, result: VehicleResult | None, end: str = "standstill") -> RecordInTheMaking:
     record = whole(path, CAR)
     assert record.end is not None
     if result is not None:
-        record.end["result"] = {"end": end, "result": msgspec.to_builtins(result)}
+        record.end["result"] = {"end": end, "t_us": 4_000_000, "result": msgspec.to_builtins(result)}
     return record
 
 
@@ -52,7 +52,7 @@ def test_replies_that_came_late_for_the_pace_are_told_and_excuse_nothing(
     record = whole(path, CarRun("ccrs-50", pace, "latch"))
     record.request(late_ms=40)
     assert record.end is not None
-    record.end["result"] = {"end": "collision", "result": msgspec.to_builtins(HIT)}
+    record.end["result"] = {"end": "collision", "t_us": 4_000_000, "result": msgspec.to_builtins(HIT)}
     verdict = record.verdict()
     assert (verdict.verdict, verdict.requests.late) == ("fail", int(told))
     assert verdict.reasons[0] == "vehicle: collision at 31.0 km/h, expected stop"
@@ -70,8 +70,11 @@ def test_a_car_that_did_not_report_is_inconclusive(path: Path) -> None:
 
 def test_a_drive_that_was_broken_off_is_judged_by_what_it_did(path: Path) -> None:
     under_way = VehicleResult(False, None, 20.0, None, 0.0, False)
-    assert drive(path / "1", under_way, end="stopped").verdict().verdict == "pass"
-    assert drive(path / "2", HIT, end="stopped").verdict().verdict == "fail"
+    for number, (result, word) in enumerate(((under_way, "pass"), (HIT, "fail"))):
+        record = drive(path / str(number), result, end="stopped")
+        assert record.end is not None
+        record.end["reason"] = "interrupted"
+        assert record.verdict().verdict == word
 
 
 def test_a_replay_gives_its_figures_and_needs_no_car(path: Path) -> None:

@@ -3,6 +3,7 @@
 import json
 import os
 import pty
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -69,7 +70,12 @@ def test_two_divergences_compose_tr_once(home: Home, tmp_path: Path, placement: 
 
 
 def test_a_policy_that_has_nothing_to_say(home: Home) -> None:
-    assert proposals(aftbed("run", "--load", "200@400", "--policy", "value-faults", "--json")) == []
+    """It passes, and its verdict says that no condition held."""
+    done = aftbed("run", "--load", "200@400", "--policy", "value-faults")
+    assert done.code == 0 and "policy_followed pass" in done.out, done.out + done.err
+    never = r"^  policy     2 value_fault within 10 s, .*: never held in [1-9]"
+    assert re.search(never, done.out, re.MULTILINE)
+    assert "  proposal " not in done.out
 
 
 def test_without_a_policy_the_document_has_no_proposals(home: Home) -> None:
@@ -89,7 +95,13 @@ def test_what_the_run_refuses_is_an_outcome(home: Home, tmp_path: Path) -> None:
     """The function has lost its state access meanwhile, and TR needs it."""
     closed = "update app to aftbed.vehicle.aeb.variants:WithoutStateAccess at request 20"
     options = ("--ftm", "lfr", *LOAD, *DIVERGE, "--adapt", closed, "--json")
-    (one,) = proposals(aftbed("run", *options, "--policy", policy(tmp_path, TWO_DIVERGENCES)))[:1]
+    path = policy(tmp_path, TWO_DIVERGENCES)
+    done = aftbed("run", *options, "--policy", path)
+    verdict = done.verdict()
+    refused = "policy_followed: lfr to lfr+tr (2 divergence within 10 s): refused: "
+    assert done.code == 3 and verdict.reasons[0].startswith(refused)
+    assert isinstance(verdict.proposals, list)
+    one = verdict.proposals[0]
     assert one.outcome == "refused" and "tr needs state access" in one.why
     assert one.consistent_after_ms is None
 

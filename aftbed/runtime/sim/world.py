@@ -43,6 +43,7 @@ from aftbed.vehicle.aeb.function import default_application, sample_requests
 from aftbed.vehicle.can.dbc_file import Codec, load_dbc
 from aftbed.vehicle.condition import Condition
 from aftbed.vehicle.drive_virtual import VirtualCar
+from aftbed.vehicle.ecus import End
 from aftbed.vehicle.plant import STEP_US, VehicleResult
 from aftbed.vehicle.scenarios.library import load_scenario
 
@@ -105,6 +106,8 @@ class Run(msgspec.Struct, frozen=True):
     faults: tuple[FaultReport, ...]
     failures: tuple[str, ...]  # of asserts, in nodes
     vehicle: VehicleResult | None
+    drive_end: End | None  # None: the car was still under way, or there was none
+    drive_us: int  # of bus time
     effects: dict[str, int]  # by brick: how many it has performed in its first life
     struck: tuple[tuple[int, str], ...]  # nodes that died, or were stopped, of a fault, and when
 
@@ -199,6 +202,15 @@ class Drive(CarLink):
     def result(self) -> VehicleResult:
         """The result so far."""
         return self._car.result()
+
+    @property
+    def end(self) -> End | None:
+        return self._car.end
+
+    @property
+    def t_us(self) -> int:
+        """How far the car has come."""
+        return self._car.t_us
 
     def disturb(self, number: int, fault: FaultKind, draw: int) -> None:
         """Arm `fault` in the car's bus. Raises ConfigError where it names what does not exist."""
@@ -469,10 +481,13 @@ class World:
         io = self._io_of("client")
         if io is None or io.node.device is None:
             return False
-        if self._drive is not None:
-            return self._drive.over
-        client = io.node.brick("client")
-        return isinstance(client, Client) and client.next_id > self.setup.count
+        return self._drive.over if self._drive is not None else self._next_request() > self.setup.count
+
+    def _next_request(self) -> int:
+        """The id of the request that the Client sends next; 0 if it is dead."""
+        io = self._io_of("client")
+        client = io.node.brick("client") if io is not None else None
+        return client.next_id if isinstance(client, Client) else 0
 
     def _unrest(self) -> list[str]:
         """Why the run has not come to rest."""
@@ -485,8 +500,8 @@ class World:
         elif not device.done or not self._source_ended():
             found.append("requests wait")
         found += controller.unrest()
-        if controller.adaptations.to_come:
-            found.append("an adaptation is to come")
+        if any(request < self._next_request() for request in controller.adaptations.awaited):
+            found.append("an adaptation waits for a request that was sent")
         if replication_of(deployment.graph.ftm) and not deployment.backup:
             found.append("no redundancy")
         processes = [p for p in deployment.nodes.values() if isinstance(p, SimProcess)]
@@ -535,6 +550,8 @@ class World:
             tuple(self.controller.faults.reports()),
             tuple(self.failures),
             self._drive.result() if self._drive is not None else None,
+            self._drive.end if self._drive is not None else None,
+            self._drive.t_us if self._drive is not None else 0,
             self.effects,
             tuple(self.struck),
         )

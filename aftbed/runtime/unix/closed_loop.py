@@ -24,11 +24,12 @@ each other is not measured: on one host nothing limits it, and no journal contai
 the newest `INCARNATIONS` journals are read.
 """
 
+import contextlib
 import os
 import select
 import sys
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
 from pathlib import Path
 from typing import Final, Literal
@@ -70,8 +71,10 @@ from aftbed.vehicle.aeb.function import default_application
 
 PERIOD_SECONDS: Final = 0.1
 PROPOSALS_NAME: Final = "proposals.jsonl"
+REPORT_NAME: Final = "policy.json"
 PROPOSALS_BYTES_MAX: Final = 64_000_000
 APPROVALS: Final = ("auto", "ask")
+SETTLED: Final = ("done", "declined", "superseded")  # outcomes of proposals after which nothing is left to do
 MEASURED: Final[tuple[Resource, ...]] = ("cpus", "cpu_load")
 LOAD_SAMPLES: Final = 10  # CPU load is that of the last second
 
@@ -104,6 +107,24 @@ class Proposed(msgspec.Struct, frozen=True):
     outcome: str
     why: str = ""
     consistent_after_ms: float | None = None
+
+
+class RuleReport(msgspec.Struct, frozen=True):
+    """What became of a rule: how often it was evaluated, whether its condition held, what it proposed."""
+
+    rule: str
+    when: str
+    then: str
+    observations: int
+    held: bool
+    proposed: int
+
+
+class PolicyReport(msgspec.Struct, frozen=True):
+    """How a policy was followed, written when the run has ended. `trouble`: why not to its end."""
+
+    rules: tuple[RuleReport, ...]
+    trouble: str = ""
 
 
 # -- before the run -------------------------------------------------------------------------------
@@ -265,15 +286,17 @@ class ClosedLoop:
     def __init__(self, policy: Policy, ftm: str, private: Path, record: Path, approve: str) -> None:
         self._private, self._approve = private, approve
         self._started_ns = time.monotonic_ns()
-        self._observer = Observer(policy, ftm, self._started_ns)
+        self._policy, self._observer = policy, Observer(policy, ftm, self._started_ns)
         self._journals, self._meter = Journals(record / "journal"), Meter(policy)
         self._history = AdaptationHistory(record / HISTORY_NAME)
-        self._path = record / PROPOSALS_NAME
-        self._path.touch()  # there is a policy, even if it proposes nothing
+        self._record = record
+        self._observations: Counter[str] = Counter()  # by rule
+        self._proposed: Counter[str] = Counter()  # by rule
+        self._trouble = ""
         self.show: Show = lambda _: None
         self._application = ""
         self._clock_known = False  # an event has shown when the run's clock began
-        self._journals_failed = self._input_ended = False
+        self._input_ended = False
         self._open: Proposal | None = None  # waits for a person, or for the run
         self._line: Line[Answer] | None = None  # by which the run will answer
         self._due_ns = self._asked_ns = self._started_ns
@@ -319,10 +342,25 @@ class ClosedLoop:
             self._step(seen, now_ns)
 
     def close(self) -> None:
+        """End what is open, and report how the policy was followed."""
         if self._line is not None and self._line.fileno() in self._ready(self._line.fileno(), 0):
             self._take_answer(self._line)
         if self._open is not None:
             self._end(self._open, "cut off", "the run ended before")
+        rules = [
+            RuleReport(
+                rule.key,
+                str(rule.when),
+                str(rule.then),
+                self._observations[rule.key],
+                rule.key in self._observer.held,
+                self._proposed[rule.key],
+            )
+            for rule in self._policy.rules
+        ]
+        report = PolicyReport(tuple(rules), self._trouble)
+        with contextlib.suppress(OSError):  # then there is no report, which the judge tells
+            (self._record / REPORT_NAME).write_bytes(msgspec.json.format(msgspec.json.encode(report)))
 
     # -- observing ----------------------------------------------------------------------------
 
@@ -338,17 +376,21 @@ class ClosedLoop:
         for record in self._records():
             for symptom in symptoms(record.event, record.detail):
                 self._step(Seen(symptom), record.t_ns)
-        self._step(Measured(self._meter.values()), now_ns)
+        values = self._meter.values()
+        self._step(Measured(values), now_ns)
+        for rule in self._policy.rules:
+            seen = rule.when.resource in values if isinstance(rule.when, Beyond) else not self._trouble
+            self._observations[rule.key] += seen
 
     def _records(self) -> list[Record]:
         """What is new in the journals; nothing any more once one of them could not be read."""
-        if self._journals_failed:
+        if self._trouble:
             return []
         try:
             return self._journals.new()
         except (PeerError, OSError, ValueError) as error:
-            self._journals_failed = True
-            self._log("trouble", f"the policy sees no value faults any more: {error}")
+            self._trouble = f"the policy sees no value faults any more: {error}"
+            self._log("trouble", self._trouble)
             return []
 
     def _step(self, observation: Observation, now_ns: int) -> None:
@@ -419,6 +461,7 @@ class ClosedLoop:
     def _end(self, proposal: Proposal, outcome: str, why: str = "") -> None:
         """Record and show the end of a proposal. Which FTM runs then is read from the history."""
         self._open = None
+        self._proposed[proposal.rule] += 1
         ended = Proposed(
             round((proposal.now_ns - self._started_ns) / 1e6, 3),
             proposal.rule,
@@ -430,7 +473,7 @@ class ClosedLoop:
             why,
             _ms_since(proposal.since_ns) if outcome == "done" else None,
         )
-        with open(self._path, "ab") as file:
+        with open(self._record / PROPOSALS_NAME, "ab") as file:
             file.write(msgspec.json.encode(ended) + b"\n")
         self._log("proposal", proposed_line(ended))
 
@@ -459,15 +502,38 @@ def proposed_line(ended: Proposed) -> str:
     return f"{ended.running} to {ended.target} ({ended.reason}): {ended.outcome}{why}{tail}"
 
 
-def read_proposals(record: Path) -> list[Proposed] | None:
-    """The proposals of a recorded run; None if it had no policy. Raises ConfigError naming the file."""
+def rule_line(one: RuleReport) -> str:
+    """What became of a rule, for people."""
+    held = _counted(one.proposed, "proposal") if one.proposed else "held" if one.held else "never held"
+    return f"{one.when}, then {one.then}: {held} in {_counted(one.observations, 'observation')}"
+
+
+def _counted(number: int, what: str) -> str:
+    return f"{number} {what}{'s' if number != 1 else ''}"
+
+
+def read_proposals(record: Path) -> list[Proposed]:
+    """The proposals of a recorded run. Raises ConfigError naming the file."""
     path = record / PROPOSALS_NAME
-    if not path.exists():
-        return None
     try:
         lines = read_input(path, PROPOSALS_BYTES_MAX).splitlines()
         return [msgspec.json.decode(line, type=Proposed) for line in lines]
+    except FileNotFoundError:
+        return []
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}") from None
-    except msgspec.DecodeError as error:
+    except (msgspec.DecodeError, RecursionError) as error:
         raise ConfigError(f"{path}: not the proposals of a run: {error}") from None
+
+
+def read_policy_report(record: Path) -> PolicyReport | None:
+    """How the policy of a recorded run was followed, if it had one. Raises ConfigError naming the file."""
+    path = record / REPORT_NAME
+    try:
+        return msgspec.json.decode(read_input(path, PROPOSALS_BYTES_MAX), type=PolicyReport)
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}") from None
+    except (msgspec.DecodeError, RecursionError) as error:
+        raise ConfigError(f"{path}: not the report of a policy: {error}") from None

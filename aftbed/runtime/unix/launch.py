@@ -36,7 +36,7 @@ from aftbed.runtime.unix import linux, run_directory, seal
 from aftbed.runtime.unix.cleanup import UndoLedger, watch
 from aftbed.runtime.unix.journal_files import CHUNK_BYTES, trim
 from aftbed.runtime.unix.linux import Area
-from aftbed.runtime.unix.options import LoadRun, RunOptions, Work, with_names_resolved
+from aftbed.runtime.unix.options import LoadRun, PolicyOptions, RunOptions, Work, with_names_resolved
 from aftbed.runtime.unix.process_pool import PRELOADS, Started, killed_by, start_zygote
 from aftbed.runtime.unix.transport import Line, decode_order, decode_report
 
@@ -369,6 +369,7 @@ def options_for(
     record: str | None = None,
     faults: tuple[Fault, ...] = (),
     adaptations: tuple[Scheduled, ...] = (),
+    policy: PolicyOptions | None = None,
     pin: bool = True,
     bus_port: int = 0,
     bus_open: bool = False,
@@ -394,6 +395,7 @@ def options_for(
         work=work,
         faults=faults,
         adaptations=adaptations,
+        policy=policy,
         pin=pin,
         listener=listener.fileno() if listener is not None else -1,
         port=listener.getsockname()[1] if listener is not None else 0,

@@ -47,6 +47,14 @@ class ReplayRun(msgspec.Struct, frozen=True, tag=True):
 Work = LoadRun | CarRun | ReplayRun
 
 
+class PolicyOptions(msgspec.Struct, frozen=True):
+    """The policy that a run follows, by its name or path. `may_fail`: what it proposes may fail."""
+
+    name: str
+    approve: str
+    may_fail: bool = False
+
+
 class RunOptions(msgspec.Struct, frozen=True):
     """`private` and `record` are directories, made by the launch; `listener` is the hub's bound socket.
 
@@ -62,6 +70,7 @@ class RunOptions(msgspec.Struct, frozen=True):
     work: Work
     faults: tuple[Fault, ...] = ()
     adaptations: tuple[Scheduled, ...] = ()
+    policy: PolicyOptions | None = None
     pin: bool = True
     listener: int = -1
     port: int = 0
