@@ -30,7 +30,7 @@ from aftbed.cli.options import (
     print_json,
     takes,
 )
-from aftbed.cli.views import EndedAdaptation, history_lines, progress_bar, show_verdict, spaced
+from aftbed.cli.views import progress_bar, show_verdict, spaced
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.graph import Graph
 from aftbed.core.messages import Goal, Scheduled
@@ -38,6 +38,7 @@ from aftbed.core.script import RECIPES
 from aftbed.ftm.compose import build
 from aftbed.inject.model import Fault, parse
 from aftbed.inject.targets import OTHERS
+from aftbed.judge.asked import not_happened
 from aftbed.judge.outcome import outcome_of
 from aftbed.judge.simulated import record_of
 from aftbed.judge.verdict import EXIT_CODES, EXIT_INTERRUPTED, Breach, Verdict, Word, evidence_of, judge
@@ -49,7 +50,7 @@ from aftbed.runtime.sim.world import check as check_fault
 from aftbed.runtime.unix.trust import trusting
 from aftbed.runtime.unix.worker_pool import each
 from aftbed.search.agreement import SEEDS, RecoveryRange, against
-from aftbed.search.explore import Attempt, Found, attempt, missed, tried
+from aftbed.search.explore import Attempt, Found, attempt, tried
 from aftbed.search.shrink import shrink
 from aftbed.search.swarm import attempt_drawn, drawn, intended
 from aftbed.search.tally import Tally, happened_in
@@ -98,6 +99,9 @@ class SimArguments(msgspec.Struct, frozen=True):
     force: Annotated[
         bool, typer.Option("--force", help="Begin each --adapt even if it would be refused.")
     ] = False
+    may_fail: Annotated[
+        bool, typer.Option("--may-fail", help="A run may pass even if an --adapt was not done.")
+    ] = False
     swarm: Annotated[bool, typer.Option("--swarm", help="Draw everything from the seed.")] = False
     minutes: Annotated[float | None, typer.Option(help="Simulate the seeds from --seed on, for so long.")] = (
         None
@@ -124,8 +128,8 @@ def sim(given: SimArguments) -> int:
 
     The bricks, scripts and faults are those of real runs.
 
-    Exit code: 0 pass, 1 a promise was broken, 2 usage, 3 a fault did not fire or a swarm proves too little,
-    130 interrupted.
+    Exit code: 0 pass, 1 a promise was broken, 2 usage, 3 what was asked for did not happen or a swarm proves
+    too little, 130 interrupted.
     """
     if given.against:
         return _compare(given)
@@ -144,7 +148,7 @@ def sim(given: SimArguments) -> int:
 
 def _used(given: SimArguments, *but: str) -> list[str]:
     """The options that were given, except those of the fields `but`."""
-    names = {"adaptations": "adapt"}
+    names = {"adaptations": "adapt", "may_fail": "may-fail"}
     values = asdict(given).items()
     used = [name for name, value in values if value is not None and value is not False and value != ()]
     return [f"--{names.get(name, name)}" for name in used if name not in but]
@@ -232,25 +236,26 @@ def _adaptations(given: SimArguments, graph: Graph) -> tuple[Scheduled, ...]:
     recipe = given.recipe or RECIPES[0]
     if recipe not in RECIPES:
         raise unknown("recipe", recipe, RECIPES)
-    if not given.adaptations and (given.recipe is not None or given.force):
-        raise ConfigError("--recipe and --force say how --adapt is carried out: give --adapt too")
+    if not given.adaptations and (given.recipe is not None or given.force or given.may_fail):
+        raise ConfigError("--recipe, --force and --may-fail are about --adapt: give --adapt too")
     if given.force:
-        found = tuple(_forced(text, recipe) for text in given.adaptations)
+        found = tuple(_forced(text, recipe, may_fail=given.may_fail) for text in given.adaptations)
     else:
-        found = scheduled(given.adaptations, graph, recipe, force=False)
+        found = scheduled(given.adaptations, graph, recipe, force=False, may_fail=given.may_fail)
     for text, adaptation in zip(given.adaptations, found, strict=True):
         if adaptation.goal.source:
             raise ConfigError(f"--adapt {text!r}: the simulator loads no brick that was written off line")
     return found
 
 
-def _forced(text: str, recipe: str) -> Scheduled:
+def _forced(text: str, recipe: str, *, may_fail: bool) -> Scheduled:
     """An adaptation that is not checked here: the Engine may refuse it when it begins."""
     timed = commands.read(text)
     if timed.wish.verb == "decompose":
         raise ConfigError(f"--adapt {text!r}: with --force, the whole of what will run is named: to EXPR")
     build(timed.wish.name, DEFAULT.placement)
-    return Scheduled(Goal(expression=timed.wish.name, recipe=recipe), timed.at_request, timed.after_ms)
+    goal = Goal(expression=timed.wish.name, recipe=recipe, may_fail=may_fail)
+    return Scheduled(goal, timed.at_request, timed.after_ms)
 
 
 # -- a setup in words, and as a command -----------------------------------------------------------
@@ -297,6 +302,7 @@ def repeating(setup: Setup, *, swarm: bool = False) -> str:
         faults=tuple(map(str, setup.faults)),
         adaptations=tuple(map(_adaptation_words, setup.adaptations)),
         recipe=next((a.goal.recipe for a in setup.adaptations if a.goal.recipe != RECIPES[0]), None),
+        may_fail=any(a.goal.may_fail for a in setup.adaptations),
     )
     for force in (False, True)[: 1 + bool(setup.adaptations)]:
         given = replace(given, force=force)
@@ -321,7 +327,8 @@ def _command(given: SimArguments) -> str:
         ("--recipe", given.recipe),
     ]
     words = [f"{name} {_quoted(value)}" for name, value in options if value is not None]
-    return " ".join([f"aftbed sim --seed {given.seed}", *words, *(["--force"] if given.force else [])])
+    flags = [flag for flag, on in (("--force", given.force), ("--may-fail", given.may_fail)) if on]
+    return " ".join([f"aftbed sim --seed {given.seed}", *words, *flags])
 
 
 def _number(value: float) -> str:
@@ -406,12 +413,10 @@ class _DoneRun(NamedTuple):
     outcome: str
     virtual_ms: float
 
-    def lines(self, wall_ms: float, tally: Tally) -> Iterator[str]:
-        """The events, the adaptations, what became of what was asked for, and the outcome of the faults."""
+    def lines(self, wall_ms: float, tally: Tally | None) -> Iterator[str]:
+        """The events, what became of what a swarm drew, and the outcome of the faults."""
         yield from event_lines(self.run)
-        ended = msgspec.convert(msgspec.to_builtins(self.run.adaptations), list[EndedAdaptation])
-        yield from history_lines(ended) if ended else ()
-        yield from tally.lines()
+        yield from tally.lines() if tally is not None else ()
         outcome = f"; outcome: {self.outcome}" if self.run.setup.faults else ""
         yield f"{self.virtual_ms:.1f} ms of virtual time in {wall_ms:.1f} ms{outcome}"
 
@@ -421,30 +426,32 @@ class _DoneRun(NamedTuple):
             "outcome": self.outcome,
             "requests": self.verdict.requests,
             "failovers": self.verdict.failovers,
-            "adaptations": self.run.adaptations,
+            "adaptations": self.verdict.adaptations,
+            "ftm_at_end": self.verdict.ftm_at_end,
             "faults": self.run.faults,
             "vehicle": self.run.vehicle,
             "virtual_ms": round(self.virtual_ms, 3),
         }
 
 
-def _judged(run: Run, word: Word, reasons: list[str]) -> _DoneRun:
-    evidence = evidence_of(record_of(run), default_application)
-    verdict = replace(judge(evidence.record, evidence), verdict=word, reasons=reasons)
-    return _DoneRun(run, verdict, outcome_of(evidence)[0], (run.rest.ended_ns - START_NS) / 1e6)
-
-
 def _simulate_one(given: SimArguments, setup: Setup) -> int:
     began_s = time.perf_counter()
     run, broken = _attempt(swarm=given.swarm)(setup)
     wall_ms = round((time.perf_counter() - began_s) * 1e3, 3)
-    lacking = missed(run) if run is not None and not given.swarm else ()
-    word: Word = "fail" if broken else "inconclusive" if lacking else "pass"
-    reasons = [*map(str, broken), *lacking]
-    done = _judged(run, word, reasons) if run is not None else None
-    tally = Tally()
+    done, tally, lacking = None, None, tuple[str, ...]()
+    word: Word = "fail" if broken else "pass"
+    reasons = list(map(str, broken))
     if run is not None:
-        tally.add(happened_in(run), intended(setup) if given.swarm else None)
+        evidence = evidence_of(record_of(run), default_application)
+        if given.swarm:  # what a swarm draws may well not happen: `attempt_drawn` has judged that
+            tally = Tally()
+            tally.add(happened_in(run), intended(setup))
+        else:
+            lacking = tuple(not_happened(evidence.record))
+            word = "inconclusive" if lacking and not broken else word
+            reasons += lacking
+        verdict = replace(judge(evidence.record, evidence), verdict=word, reasons=reasons)
+        done = _DoneRun(run, verdict, outcome_of(evidence)[0], (run.rest.ended_ns - START_NS) / 1e6)
     if not given.json:
         print(f"seed {setup.seed}\n{described(setup)}")
         if done is None:
@@ -459,8 +466,9 @@ def _simulate_one(given: SimArguments, setup: Setup) -> int:
     if given.json:
         about = {"seed": setup.seed, "verdict": word, "setup": described(setup), "missed": lacking}
         breach = found.document() if found is not None else {"breaches": [], "command": None, "shrunk": None}
-        happened = {**done.document(), "happened": tally.document()} if done is not None else {}
-        print_json({**about, **breach, **happened, "wall_ms": wall_ms})
+        happened = done.document() if done is not None else {}
+        by_intent = {"happened": tally.document()} if tally is not None else {}
+        print_json({**about, **breach, **happened, **by_intent, "wall_ms": wall_ms})
     else:
         for line in (*drawing.lines, *found.lines()) if found is not None else ():
             print(line)

@@ -182,6 +182,11 @@ ASKED_FOR: Final = (
 CHECKS: Final = tuple(dict.fromkeys(row.check for row in ASKED_FOR))
 
 
+def not_happened(record: RunRecord) -> list[str]:
+    """All that was asked for and did not happen, in the words of a verdict."""
+    return [f"{row.check}: {reason}" for row in ASKED_FOR for reason in row.missing(record) or ()]
+
+
 def check_asked(name: str) -> Callable[[Evidence], Check | None]:
     """The check that is called `name`: unknown, with the reasons, if something asked for did not happen."""
     rows = [row for row in ASKED_FOR if row.check == name]

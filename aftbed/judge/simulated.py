@@ -11,6 +11,7 @@ from aftbed.ftm.compose import replication_of
 from aftbed.judge.record import DriveEnd, Excuses, RunEnd, RunRecord
 from aftbed.judge.verdict import Breach, broken, evidence_of
 from aftbed.runtime.deployment import replica_of
+from aftbed.runtime.sim.clock import START_NS
 from aftbed.runtime.sim.world import Run
 from aftbed.runtime.unix.options import CarRun, LoadRun, RunOptions, Work
 from aftbed.vehicle.aeb.function import default_application
@@ -37,6 +38,7 @@ def record_of(run: Run) -> RunRecord:
         hosted=rest.hosted,
         states=rest.states,
         faults=run.faults,
+        seconds=round((rest.ended_ns - START_NS) / 1e9, 3),
     )
     flips = [f for f in setup.faults if f.action.alters_value]
     # A switch of the mechanism brings the Servers in line, so with adaptations the values are promised again.

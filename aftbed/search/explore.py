@@ -16,7 +16,6 @@ from typing import Final, NamedTuple
 
 import msgspec
 
-from aftbed.adapt.engine import REFUSED
 from aftbed.adapt.planner import plan, target
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.events import Event
@@ -31,7 +30,8 @@ from aftbed.inject.grammar import Bit, Trigger
 from aftbed.inject.hang import Hang
 from aftbed.inject.model import Fault, FaultAction
 from aftbed.inject.value import EXECUTED, ValueFlip, ValuePlace
-from aftbed.judge.simulated import breaches
+from aftbed.judge.asked import not_happened
+from aftbed.judge.simulated import breaches, record_of
 from aftbed.judge.verdict import Breach
 from aftbed.runtime.sim.clock import Clock
 from aftbed.runtime.sim.interleaving import HeldChannel, orders
@@ -225,7 +225,7 @@ class Explored(msgspec.Struct, frozen=True):
 
 
 class Found(NamedTuple):
-    """What came of an experiment; `missed` are the faults and adaptations that never came about.
+    """What came of an experiment; `missed` is what was asked for and did not happen (G8).
 
     `happened` is None where the executive itself broke down.
     """
@@ -256,17 +256,8 @@ def tried(setup: Setup, attempt: Attempt = attempt) -> Found:
     if run is None:
         return Found(False, broken)
     sent = sum(e.kind is EntryKind.SENT for e in run.history.dialogue)
-    return Found(run.rest.lost, broken, sent, missed(run), happened_in(run))
-
-
-def missed(run: Run) -> tuple[str, ...]:
-    """G8: what was to happen in `run` and did not, so that it proves nothing about it."""
-    found = [f"never fired: {f.fault}" for f in run.faults if not f.fired]
-    for asked, outcome in zip(run.setup.adaptations, run.scheduled, strict=True):
-        if outcome is None or (outcome.outcome == REFUSED and not outcome.total_ms):
-            why = f": {outcome.reason}" if outcome is not None else ""
-            found.append(f"never began: the adaptation to {asked.goal.expression or asked.goal.part}{why}")
-    return tuple(found)
+    missed = tuple(not_happened(record_of(run)))
+    return Found(run.rest.lost, broken, sent, missed, happened_in(run))
 
 
 def judged(setup: Setup) -> tuple[bool, tuple[Breach, ...]]:

@@ -18,6 +18,7 @@ from aftbed.core.messages import Goal, Scheduled
 from aftbed.inject.crash import Crash
 from aftbed.inject.grammar import Trigger
 from aftbed.inject.model import Fault
+from aftbed.judge.asked import AskedAdaptation
 from aftbed.runtime.sim.world import Doom, Setup
 from aftbed.runtime.unix.worker_pool import each
 from aftbed.search.agreement import Agreement, RecoveryRange, apart
@@ -67,15 +68,42 @@ def test_the_same_seed_prints_the_same(sim: Call) -> None:
     assert first == second
 
 
-def test_an_adaptation_is_printed_with_its_blackout(sim: Call) -> None:
+def test_an_adaptation_is_told_once_as_in_a_real_run(sim: Call) -> None:
     words = ("--ftm", "lfr", "--count", "30", "--rate", "500", "--adapt", "compose lfr+tr at request 5")
     code, out, _ = sim(*words)
     assert code == 0
-    assert re.search(r"1 +0\.01 s .* 10/22 drained lfr to lfr\+tr: done", out)
+    told = [line for line in out.splitlines() if ": done" in line and not line.startswith("[")]
+    assert len(told) == 1, told
+    assert re.match(r"  adaptation to lfr\+tr at request 5: done, blackout [0-2]\.\d\d ms, total ", told[0])
+    assert "  at the end lfr+tr" in out.splitlines()
     document = json.loads(sim(*words, "--json")[1])
     (adaptation,) = document["adaptations"]
-    assert adaptation["outcome"] == "done" and 0 < adaptation["blackout_ms"] < 3
+    assert set(adaptation) == set(AskedAdaptation.__struct_fields__)
+    assert (adaptation["asked"], adaptation["outcome"]) == ("to lfr+tr at request 5", "done")
+    assert 0 < adaptation["blackout_ms"] < 3 and document["ftm_at_end"] == "lfr+tr"
     assert document["verdict"] == "pass" and document["requests"]["answered"] == 30
+
+
+ROLLED_BACK: Final = ("--adapt", "to lfr at request 5", "--faults", "crash b/after at adapt.step.enter nth 7")
+REFUSED: Final = ("--adapt", "to pbr at request 5", "--force")
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (ROLLED_BACK, "to lfr at request 5: rolled back: "),
+        (REFUSED, "to pbr at request 5: refused: "),
+    ],
+)
+def test_an_adaptation_that_was_not_done_is_inconclusive_unless_it_may_fail(
+    sim: Call, words: tuple[str, ...], reason: str
+) -> None:
+    code, out, _ = sim("--count", "30", "--rate", "500", *words)
+    assert code == 3 and f"  because    adaptations_done: {reason}" in out, out
+    assert sim("--count", "30", "--rate", "500", *words, "--seeds", "0..1")[0] == 3
+    code, out, _ = sim("--count", "30", "--rate", "500", *words, "--may-fail")
+    assert code == 0 and f"  adaptation {reason}" in out, out
+    assert sim("--count", "30", "--rate", "500", *words, "--may-fail", "--seeds", "0..1")[0] == 0
 
 
 def test_a_car_stops_short(sim: Call) -> None:
@@ -92,10 +120,12 @@ def test_a_fault_or_adaptation_that_never_happened_is_inconclusive(sim: Call) ->
     assert "never fired: crash primary at server.exit nth 11" in out and "verdict: inconclusive" in out
     code, out, _ = sim("--count", "10", "--adapt", "to lfr after 60s", "--json")
     assert code == 3
-    assert json.loads(out)["missed"] == ["never began: the adaptation to lfr"]
+    assert json.loads(out)["missed"] == [
+        "adaptations_done: to lfr after 60000ms: not begun: the run ended after 0.253 s"
+    ]
     code, out, _ = sim(*fault, "--seeds", "0..2")
     assert code == 3
-    assert "inconclusive: in 3 runs" in out and "seed 0: never fired" in out
+    assert "inconclusive: in 3 runs" in out and "seed 0: faults_applied: never fired" in out
 
 
 def test_a_service_is_unavailable_if_every_replica_was_struck(sim: Call) -> None:
@@ -168,6 +198,8 @@ def test_what_an_engine_would_refuse_needs_force() -> None:
     assert repeating(same).endswith('--adapt "to pbr at request 5" --force')
     other = Setup(adaptations=(Scheduled(Goal(expression="lfr"), 0, 2.5),))
     assert repeating(other).endswith('--adapt "to lfr after 2.5ms"')
+    may_fail = Setup(adaptations=(Scheduled(Goal(expression="lfr", may_fail=True), 5),))
+    assert repeating(may_fail).endswith('--adapt "to lfr at request 5" --may-fail')
 
 
 def test_times_in_a_command_are_exact_and_some_setups_have_no_command() -> None:
@@ -250,10 +282,6 @@ def test_one_run_tells_what_became_of_what_it_drew(sim: Call) -> None:
     _, out, _ = sim("--swarm", "--seed", str(seed))
     assert re.search(r"^faults: [12] drawn ", out, re.MULTILINE)
     assert re.search(r"^adaptations: 1 drawn ", out, re.MULTILINE)
-    _, out, _ = sim("--count", "10", "--faults", "crash primary at server.exit nth 3")
-    assert "faults: 1 asked for: 1 activated" in out.splitlines()
-    _, out, _ = sim("--count", "10", "--adapt", "to lfr at request 3", "--json")
-    assert json.loads(out)["happened"]["adaptations"] == {"asked": {"total": 1, "done": 1}}
 
 
 def test_a_swarm_that_proves_too_little_is_inconclusive(sim: Call, monkeypatch: pytest.MonkeyPatch) -> None:
