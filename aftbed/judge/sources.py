@@ -15,10 +15,12 @@ What a request must have left, if it was answered:
 from collections import Counter
 from collections.abc import Callable, Iterator
 from functools import lru_cache
-from typing import NamedTuple
+from pathlib import Path
+from typing import Final, NamedTuple
 
 from aftbed.adapt.engine import DONE
 from aftbed.core.events import FIRST_FAULT, Event
+from aftbed.core.input_file import open_input
 from aftbed.core.journal import EntryKind, History, Record
 from aftbed.ftm.compose import build
 from aftbed.inject.receipts import fault_and_bits
@@ -29,6 +31,10 @@ from aftbed.runtime.unix.devices import LOAD_REQUESTS
 from aftbed.runtime.unix.options import LoadRun
 from aftbed.runtime.unix.run_directory import BUS_NAME
 from aftbed.vehicle.aeb.function import sample_requests
+
+PROCESSES_LOG: Final = "processes.log"
+PRINTED_BYTES_MAX: Final = 1_000_000  # that are searched: the first error counts
+TRACEBACK: Final = "Traceback (most recent call last):"
 
 
 def contradictions(record: RunRecord, reference: ReferenceRun) -> Iterator[str]:
@@ -77,6 +83,8 @@ def gaps(record: RunRecord, reference: ReferenceRun) -> Iterator[str]:
     if record.kept and not seal.sealed(record.path):
         yield f"the record has no {seal.NAME}: its command did not live to seal it, or it was removed"
     yield from (f"end.json has no {key!r}" for key in record.end.absent)
+    if not _flipped(record):  # a flipped bit may well fail an assertion
+        yield from _tracebacks(record.path / PROCESSES_LOG)
     for node in ("supervisor", *build(record.options.ftm, record.options.placement).nodes):
         name = f"{node.replace('/', '.')}.1"
         if name not in record.history.journals:
@@ -91,6 +99,23 @@ def gaps(record: RunRecord, reference: ReferenceRun) -> Iterator[str]:
         if reference.state and _all_answered(record, reference):  # a function may hand out none
             missing = [replica for replica in replicas if replica not in record.end.states]
             yield from (f"the state of {replica} at the end is missing" for replica in missing)
+
+
+def _tracebacks(path: Path) -> Iterator[str]:
+    """The errors that ended processes, which no fault of a run without flipped bits explains."""
+    try:
+        with open_input(path) as file:
+            lines = file.read(PRINTED_BYTES_MAX).decode(errors="replace").splitlines()
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        yield f"{path.name}: {error.strerror}"
+        return
+    for at, line in enumerate(lines):
+        if line == TRACEBACK:
+            error_line = next((one for one in lines[at + 1 :] if not one.startswith(" ")), "cut off")
+            who = lines[at - 1] if at and lines[at - 1].endswith(":") else "a process:"
+            yield f"{path.name} has a traceback of {who} {error_line}"
 
 
 def _of_requests(record: RunRecord) -> Iterator[str]:

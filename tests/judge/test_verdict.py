@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Final
 
 import msgspec
 import pytest
@@ -235,6 +236,39 @@ def test_a_run_without_a_request_is_inconclusive(path: Path) -> None:
     verdict = RecordInTheMaking(path).verdict()
     assert verdict.verdict == "inconclusive" and verdict.launch_ms is None
     assert verdict.checks["one_history"] == verdict.checks["exactly_one_answer"] == "unknown"
+
+
+NODE_FAILED: Final = """\
+a/proceed (pid 4711):
+Traceback (most recent call last):
+  File "node.py", line 7, in turn
+    assert port in self.open_ports
+           ^^^^^^^^^^^^^^^^^^^^^^^
+AssertionError: pro2bfr
+of request 3
+"""
+
+
+def test_a_process_that_ended_in_an_error_is_no_pass(path: Path) -> None:
+    record = whole(path)
+    (path / "processes.log").write_text(f"b/after (pid 12): detected stop: no majority\n{NODE_FAILED}")
+    verdict = record.verdict()
+    assert (verdict.verdict, verdict.checks["sources_agree"]) == ("inconclusive", "unknown")
+    assert verdict.reasons == [
+        "sources_agree: processes.log has a traceback of a/proceed (pid 4711): AssertionError: pro2bfr"
+    ]
+
+
+def test_what_processes_print_beside_is_no_trouble(path: Path) -> None:
+    record = whole(path)
+    (path / "processes.log").write_text("b/after (pid 12): detected stop: no majority\n  a warning\n")
+    assert record.verdict().verdict == "pass"
+
+
+def test_an_error_that_a_flipped_bit_explains_is_no_trouble(path: Path) -> None:
+    record = hit(path)
+    (path / "processes.log").write_text(NODE_FAILED)
+    assert record.verdict().verdict == "pass"
 
 
 # -- value faults
