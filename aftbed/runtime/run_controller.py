@@ -82,11 +82,10 @@ class RunController:
             case control.Ack(token, data, error):
                 process.assigned()
                 key = ("ack", process.name, token)
-                if error:
-                    self._runtime.log("refused", f"{process.name}: {error}")
-                    tasks.fail(key, f"{process.name}: {error}")
-                else:
+                if not error:
                     tasks.settle(key, data)
+                elif not tasks.fail(key, f"{process.name}: {error}"):  # else its task tells, if it matters
+                    self._runtime.log("refused", f"{process.name}: {error}")
             case control.BrickReport(brick, messages.Promoted(epoch)):
                 tasks.settle(("promoted", brick, epoch))
             case control.BrickReport(_, messages.RequestHeld(request_id)):

@@ -476,7 +476,10 @@ class Execution:
                 if state:
                     yield from self._restore(taker, brick, state, migrate=True)
             except StepFailed:
-                self._one_way = self._one_way or (giver.alive and taker.alive)  # else it was a death
+                if giver.alive and taker.alive and not self._one_way:  # else it was a death
+                    self._one_way = True
+                    why = f"the version of {brick} before does not take the state of this one"
+                    self._runtime.log("adapt", f"it cannot be undone any more: {why}")
 
     # -- steps --------------------------------------------------------------------------------
 

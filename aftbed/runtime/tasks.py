@@ -86,14 +86,15 @@ class Tasks:
             if len(self._early) > EARLY_MAX:
                 del self._early[next(iter(self._early))]
 
-    def fail(self, key: Key, reason: str) -> None:
-        """`key` will not happen."""
+    def fail(self, key: Key, reason: str) -> bool:
+        """`key` will not happen. False if no task waits for it now."""
         waiting = [run for run in self._tasks if key in run.wait.keys]
         if not waiting and key[0] == "ack":
             self._refused[key] = reason
             if len(self._refused) > EARLY_MAX:
                 del self._refused[next(iter(self._refused))]
         self._throw(waiting, reason)
+        return bool(waiting)
 
     def died(self, process: str) -> None:
         """The process called `process` is dead."""
@@ -107,8 +108,9 @@ class Tasks:
         """Fail what is past its deadline."""
         late = [run for run in self._tasks if now_ns >= run.deadline_ns]
         for run in late:
-            missing = ", ".join(f"{a} {b}" for a, b, _ in run.wait.keys - run.got.keys())
-            self._throw([run], f"no answer within {run.wait.seconds} s: {missing}")
+            keys = sorted(run.wait.keys - run.got.keys())
+            missing = ", ".join(who if what == "ack" else f"{who} ({what})" for what, who, _ in keys)
+            self._throw([run], f"no answer within {run.wait.seconds:g} s from {missing}")
 
     def deadline_ns(self) -> int | None:
         """The earliest deadline."""

@@ -88,6 +88,12 @@ ROLLED_BACK: Final = ("--adapt", "to lfr at request 5", "--faults", "crash b/aft
 REFUSED: Final = ("--adapt", "to pbr at request 5", "--force")
 
 
+def test_a_node_that_is_never_prepared_is_told_with_the_deadline(sim: Call) -> None:
+    fault = ("--faults", "hang a/after' at adapt.step.exit nth 1")
+    code, out, _ = sim("--count", "40", "--rate", "50", "--adapt", "to lfr at request 5", *fault)
+    assert code == 3 and "prepare: no answer within 0.5 s from a/after'\n" in out, out
+
+
 @pytest.mark.parametrize(
     ("words", "reason"),
     [

@@ -138,7 +138,7 @@ def test_what_is_past_its_deadline_fails_and_says_what_is_missing(tasks: Tasks) 
     tasks.expire(due_ns - 1)
     assert run.ends == []
     tasks.expire(due_ns)
-    assert run.undone == ["no answer within 0.25 s: ack b/after"] and other.ends == []
+    assert run.undone == ["no answer within 0.25 s from b/after"] and other.ends == []
 
 
 def test_each_step_has_its_own_deadline(tasks: Tasks) -> None:

@@ -106,6 +106,16 @@ def test_where_the_first_version_takes_no_state_back_the_second_goes_on(
     assert outcomes[-4:] == ["done"] * 4 and set(outcomes) >= {"done", "rolled back"}
 
 
+def test_an_update_without_a_way_back_says_so_and_looks_like_no_failure() -> None:
+    update = Scheduled(Goal(part="app", source=ONE_WAY), FIRST)
+    run = World(Setup(count=60, rate_hz=400, adaptations=(update,)), load=load_module).run()
+    assert [a.outcome for a in run.adaptations] == ["done"]
+    told = [(event, text) for _, event, text in run.logged]
+    assert "refused" not in dict(told)
+    why = "the version of a/server before does not take the state of this one"
+    assert told.count(("adapt", f"it cannot be undone any more: {why}")) == 1
+
+
 def test_what_never_served_is_no_version() -> None:
     """It died before requests were let on again."""
     run = updated("pbr", "process", "Firm", Fault(Crash(), "a/protocol", Trigger("adapt.step.enter", 4)))
