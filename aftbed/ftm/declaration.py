@@ -83,7 +83,7 @@ class Mechanism(msgspec.Struct, frozen=True, kw_only=True):
     `links`: those of this mechanism only, from part to part through a port that both ends call the same.
     `replication`: parts and ports by which a leader sends to its backup; none: one replica.
     `innermost`: its Proceed is part of what it does, so no other mechanism can take that place.
-    `adaptations_explored`: `explore adapt` makes all adaptations from and to it.
+    `adaptations_explored`: `explore adapt` makes all adaptations from and to it, without being told to.
     """
 
     name: str

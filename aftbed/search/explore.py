@@ -17,6 +17,7 @@ from typing import Final, NamedTuple
 import msgspec
 
 from aftbed.adapt.planner import plan, target
+from aftbed.adapt.policy import ADAPTABLE
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.events import Event
 from aftbed.core.graph import STAGED
@@ -39,8 +40,8 @@ from aftbed.runtime.sim.world import Doom, Run, Setup, World, simulate
 from aftbed.runtime.unix.worker_pool import SECONDS_MAX, Alone, each
 from aftbed.search.tally import Happened, happened_in
 
-ADAPTABLE: Final = tuple(
-    ftm for ftm in DUPLEX_EXPRESSIONS if all(MECHANISMS[name].adaptations_explored for name in parse(ftm))
+ADAPTED: Final = tuple(  # unless others are named
+    ftm for ftm in ADAPTABLE if all(MECHANISMS[name].adaptations_explored for name in parse(ftm))
 )
 PLACEMENTS: Final = ("process", "replica")
 STEPS: Final = (Event.ADAPT_STEP_ENTER, Event.ADAPT_STEP_ACT, Event.ADAPT_STEP_EXIT)
@@ -158,8 +159,11 @@ def pairs(ftms: Iterable[str], placements: Iterable[str]) -> Iterator[Setup]:
 
 
 class Explorer(NamedTuple):
-    """`ftms`: all that it knows; `every`: its experiments over some of them, always in the same order."""
+    """`known`: the mechanisms that can be named; `ftms`: those of a selection that names none; `every`: the
+    experiments of a selection, always in the same order.
+    """
 
+    known: tuple[str, ...]
     ftms: tuple[str, ...]
     every: Callable[["Selection"], Iterator[Setup]]
 
@@ -178,28 +182,33 @@ class Selection(msgspec.Struct, frozen=True):
 
 
 EXPLORERS: Final = {
-    "crash": Explorer(DUPLEX_EXPRESSIONS, lambda s: crashes(s.ftms, s.placements, s.requests)),
-    "adapt": Explorer(ADAPTABLE, lambda s: adaptations(itertools.permutations(s.ftms, 2), s.placements)),
-    "pairs": Explorer(DUPLEX_EXPRESSIONS, lambda s: pairs(s.ftms, s.placements)),
+    "crash": Explorer(
+        DUPLEX_EXPRESSIONS, DUPLEX_EXPRESSIONS, lambda s: crashes(s.ftms, s.placements, s.requests)
+    ),
+    "adapt": Explorer(
+        ADAPTABLE, ADAPTED, lambda s: adaptations(itertools.permutations(s.ftms, 2), s.placements)
+    ),
+    "pairs": Explorer(DUPLEX_EXPRESSIONS, DUPLEX_EXPRESSIONS, lambda s: pairs(s.ftms, s.placements)),
 }
 
 
 def selected(explorer: str, ftms: Iterable[str], placements: Iterable[str], requests: int = 0) -> Selection:
-    """The choice; nothing named is all there is. Raises ConfigError naming what cannot be explored."""
-    known = EXPLORERS[explorer].ftms
-    chosen = Selection(explorer, _chosen("FTM", ftms, known), _chosen("placement", placements, PLACEMENTS))
+    """What is named; where nothing is, all that is explored. Raises ConfigError naming what cannot be."""
+    found = EXPLORERS[explorer]
+    ftms = _chosen("FTM", ftms, found.known) or found.ftms
+    chosen = Selection(explorer, ftms, _chosen("placement", placements, PLACEMENTS) or PLACEMENTS)
     if explorer == "adapt" and len(chosen.ftms) < 2:
         raise ConfigError(f"--ftm {chosen.ftms[0]}: an adaptation leads to another one: name two")
     return msgspec.structs.replace(chosen, requests=requests)
 
 
 def _chosen(what: str, names: Iterable[str], known: tuple[str, ...]) -> tuple[str, ...]:
-    """Those of `known` that are named, each once, as they were named; all of them if none is."""
+    """Those of `known` that are named, each once, as they were named."""
     named = tuple(dict.fromkeys(names))
     for name in named:
         if name not in known:
             raise unknown(what, name, known)
-    return named or known
+    return named
 
 
 # -- exploring ------------------------------------------------------------------------------------

@@ -113,6 +113,19 @@ def test_a_selection_without_names_has_all_mechanisms_and_placements(explorer: s
     assert whole.placements == PLACEMENTS and whole.ftms == EXPLORERS[explorer].ftms
 
 
+def test_adaptations_from_and_to_a_mechanism_of_one_replica(explore: Call) -> None:
+    """Also those that stage what watches a backup, which is explored without being named."""
+    assert selected("adapt", (), ()).ftms == ("pbr", "lfr", "tr", "pbr+tr", "lfr+tr")
+    numbered = list(selected("adapt", ("tr", "pbr"), ("process",)).setups())
+    watched = next(n for n, one in enumerate(numbered) if str(one.faults[0]).startswith("crash b/watchdog'"))
+    code, out, _ = explore("adapt", "--ftm", "tr,pbr", "--placement", "process", "--only", str(watched))
+    assert code == 0 and "1 of 1 survived" in out
+    code, out, _ = explore("adapt", "--ftm", "assert,pbr", "--placement", "replica", "--only", "3")
+    assert code == 0 and "assert (replica)" in out
+    code, _, err = explore("adapt", "--ftm", "none,pbr")
+    assert code == 2 and "unknown FTM 'none'" in err
+
+
 # -- order
 
 
