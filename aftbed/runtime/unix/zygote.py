@@ -9,6 +9,7 @@ There are two zygotes, because the fork and the death of a process take time in 
 light one for the mechanism, and one that has imported what needs the bus (`preload`).
 """
 
+import contextlib
 import gc
 import importlib
 import os
@@ -63,7 +64,8 @@ def run(
         try:
             _fork_spares(fds, supervisor, areas)
         except OSError as error:
-            line.send(control.Report("trouble", f"no process can be forked: {error.strerror}".encode()))
+            with contextlib.suppress(BrokenPipeError):  # the run has ended
+                line.send(control.Report("trouble", f"no process can be forked: {error.strerror}".encode()))
             break
     os._exit(0)
 
@@ -87,7 +89,10 @@ def _fork_spares(fds: list[int], supervisor: int, areas: tuple[Area, ...]) -> No
                 os.read(alive, 1)  # ends when the intermediate does, so that no spare spins meanwhile
                 os.dup2(descriptor, INHERITED_FD, inheritable=False)
                 os.closerange(INHERITED_FD + 1, 1 << 16)
-                _be_spare(supervisor, areas)
+                try:
+                    _be_spare(supervisor, areas)
+                except (BrokenPipeError, ConnectionResetError):  # the run has ended
+                    os._exit(0)
         os._exit(0)
     refused = os.waitstatus_to_exitcode(os.waitpid(intermediate, 0)[1])
     for descriptor in (*fds, alive, life):
@@ -103,10 +108,7 @@ def _be_spare(supervisor: int, areas: tuple[Area, ...]) -> NoReturn:
     linux.populate(areas)
     line = Line(socket.socket(fileno=INHERITED_FD), decode_order)
     line.send(control.Hello(os.getpid()))
-    try:
-        got = line.recv()
-    except ConnectionResetError:  # the run has ended
-        os._exit(0)
+    got = line.recv()
     if got is None:
         os._exit(0)
     order, fds = got
