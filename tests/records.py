@@ -117,6 +117,9 @@ class RecordInTheMaking:
         self.note("a.watchdog.1", Event.WATCHDOG_SUSPECT, detail=1)
         self.note("supervisor.1", Event.REPLICA_FENCED, detail=FIRST_GENERATION | 1)
         self.note("b.protocol.1", Event.REPLICA_PROMOTED, detail=2)
+        assert self.end is not None
+        self.end |= {"leader": "b", "backup": "", "epoch": 2}
+        self.host(leader="b", backup="")
 
     def verdict(self) -> Verdict:
         """Write what is left to write, then read it all back and judge."""

@@ -48,15 +48,15 @@ def adaptations(record: RunRecord) -> list[AskedAdaptation]:
     """Those asked for with the run, in their order, then those asked for while it ran."""
     by_place = {one.scheduled: one for one in record.adaptations}
     with_run = [
-        _told(by_place[place], str(one)) if place in by_place else _without_end(record, one)
+        _told(by_place[place]) if place in by_place else _without_end(record, one)
         for place, one in enumerate(record.options.adaptations, 1)
     ]
-    return with_run + [_told(one, one.asked) for one in record.adaptations if not one.scheduled]
+    return with_run + [_told(one) for one in record.adaptations if not one.scheduled]
 
 
-def _told(one: Outcome, asked: str) -> AskedAdaptation:
+def _told(one: Outcome) -> AskedAdaptation:
     times_ms = (one.prepare_ms, one.blackout_ms, one.total_ms)
-    return AskedAdaptation(asked, one.outcome, one.reason, *times_ms, may_fail=one.may_fail)
+    return AskedAdaptation(one.asked, one.outcome, one.reason, *times_ms, may_fail=one.may_fail)
 
 
 def _without_end(record: RunRecord, scheduled: Scheduled) -> AskedAdaptation:

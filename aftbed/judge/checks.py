@@ -353,6 +353,8 @@ def half_a_graph(hosted: Hosted, expected: str) -> list[str]:
     """
     if not hosted.leader:
         return ["no replica leads"]
+    if hosted.leader not in REPLICAS:
+        return [f"{hosted.leader!r} leads, which is no replica"]
     if hosted.ftm != expected:
         return [f"{hosted.ftm} runs, though the adaptations came to {expected}"]
     duplex = bool(replication_of(expected))

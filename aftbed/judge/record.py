@@ -3,13 +3,14 @@
 The directory of a real run can be read after a `kill -9`, too.
 """
 
+import contextlib
 import itertools
 import json
 import os
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeVar
 
 import msgspec
 
@@ -36,6 +37,11 @@ END_KEYS: Final = (
     *("reason", "ended_ns", "seconds", "left", "unfinished", "lost", "leader", "backup", "hosted", "states"),
     *("epoch", "faults", "bus"),
 )
+
+
+BESIDE_OPTIONS: Final = ("version", "started_ns", "load", "kept")  # keys of `run.json`
+
+T = TypeVar("T")
 
 
 class ClientEnd(msgspec.Struct, frozen=True):
@@ -68,6 +74,13 @@ class RunEnd(msgspec.Struct, frozen=True):
     client: ClientEnd | None = None
     bus: HubCounts | None = None  # of a load, or where the hub did not live to report
     absent: tuple[str, ...] = ()  # keys that every end has, and this one does not
+
+
+class _OfSource(msgspec.Struct, frozen=True):
+    """What the source of the requests has left in `end.json`."""
+
+    result: dict[str, object] | None
+    client: ClientEnd | None
 
 
 class DriveEnd(msgspec.Struct, frozen=True):
@@ -143,11 +156,13 @@ def read_record(path: Path, *, in_memory: bool = False) -> RunRecord:
     so that the directory may be removed.
     """
     about = _json(path / "run.json")
+    given = {key: value for key, value in about.items() if key not in BESIDE_OPTIONS}
+    what = f"{path / 'run.json'}: not the options of a run"
+    options = _exactly(given | {"private": "", "listener": -1}, RunOptions, what)
     try:
-        options = msgspec.convert(about | {"private": "", "listener": -1}, RunOptions)
         started = msgspec.convert(about.get("started_ns"), int)
     except msgspec.ValidationError as error:
-        raise ConfigError(f"{path / 'run.json'}: not the options of a run: {error}") from None
+        raise ConfigError(f"{what}: started_ns: {error}") from None
     history = _history(path / "journal", in_memory=in_memory)
     end = _end(path / "end.json") if (path / "end.json").exists() else None
     faults = (
@@ -212,48 +227,80 @@ def _history(folder: Path, *, in_memory: bool) -> History:
 
 
 def _end(path: Path) -> RunEnd:
-    found = _json(path)
+    found, what = _json(path), f"{path}: not the end of a run"
     absent = tuple(key for key in END_KEYS if key not in found)
+    of_source = {key: found.pop(key, None) for key in ("result", "client")}  # the judge reads parts of these
+    found.pop("graph_ms", None)
+    end = _exactly(found | {"absent": absent}, RunEnd, what)
     try:
-        return msgspec.convert(found | {"absent": absent}, RunEnd)
+        rest = msgspec.convert(of_source, _OfSource)
     except msgspec.ValidationError as error:
-        raise ConfigError(f"{path}: not the end of a run: {error}") from None
+        raise ConfigError(f"{what}: {error}") from None
+    return msgspec.structs.replace(end, result=rest.result, client=rest.client)
 
 
 def _drive(options: RunOptions, end: RunEnd | None) -> DriveEnd | None:
     if end is None or end.result is None or not isinstance(options.work, CarRun):
         return None
+    what = "end.json: not the result of a drive"
     try:
-        return msgspec.convert(end.result, DriveEnd)
+        drive = msgspec.convert(end.result, DriveEnd)
     except msgspec.ValidationError as error:
-        raise ConfigError(f"end.json: not the result of a drive: {error}") from None
+        raise ConfigError(f"{what}: {error}") from None
+    _exactly(end.result["result"], VehicleResult, what)
+    return drive
 
 
 def _adaptations(path: Path) -> tuple[Outcome, ...]:
     try:
-        lines = read_input(path / HISTORY_NAME, DOCUMENT_BYTES_MAX).splitlines()
+        lines = read_input(path / HISTORY_NAME, DOCUMENT_BYTES_MAX).split(b"\n")
     except FileNotFoundError:
         return ()
     except OSError as error:
         raise ConfigError(f"{path / HISTORY_NAME}: {error.strerror}") from None
-    found = []
-    for number, line in enumerate(lines, 1):
-        try:
-            found.append(msgspec.json.decode(line, type=Outcome))
-        except msgspec.ValidationError as error:
-            raise ConfigError(f"{path / HISTORY_NAME}: line {number}: {error}") from None
-        except (msgspec.DecodeError, RecursionError):  # the last line, cut off with the run
-            break
-    return tuple(found)
+    *whole, cut = lines
+    with contextlib.suppress(ConfigError):  # cut off with the run, if there is something
+        whole += [cut] if _parsed(cut, "") else []
+    what = f"{path / HISTORY_NAME}: line"
+    return tuple(
+        _exactly(_parsed(line, f"{what} {number}"), Outcome, f"{what} {number}")
+        for number, line in enumerate(whole, 1)
+    )
 
 
 def _json(path: Path) -> dict[str, object]:
     try:
-        found = json.loads(read_input(path, DOCUMENT_BYTES_MAX))
+        return _parsed(read_input(path, DOCUMENT_BYTES_MAX), str(path))
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}; is this the record of a run?") from None
+
+
+def _parsed(data: bytes, where: str) -> dict[str, object]:
+    try:
+        found = json.loads(data)
     except (ValueError, RecursionError) as error:
-        raise ConfigError(f"{path}: not JSON: {error}") from None
+        raise ConfigError(f"{where}: not JSON: {error}") from None
     if not isinstance(found, dict):
-        raise ConfigError(f"{path}: not a JSON object")
+        raise ConfigError(f"{where}: not a JSON object")
     return found
+
+
+def _exactly(found: object, kind: type[T], what: str) -> T:
+    """`found` as a `kind`. Raises ConfigError, also for a key that it does not have: it was misspelt."""
+    try:
+        converted = msgspec.convert(found, kind)
+    except msgspec.ValidationError as error:
+        raise ConfigError(f"{what}: {error}") from None
+    if key := _unknown_key(found, msgspec.to_builtins(converted)):
+        raise ConfigError(f"{what}: unknown key {key!r}")
+    return converted
+
+
+def _unknown_key(found: object, known: object) -> str:
+    """The first key of `found`, at any depth, that `known` does not have; "" if there is none."""
+    if isinstance(found, dict) and isinstance(known, dict):
+        keys = (key if key not in known else _unknown_key(value, known[key]) for key, value in found.items())
+        return next(filter(None, keys), "")
+    if isinstance(found, list) and isinstance(known, list | tuple):
+        return next(filter(None, map(_unknown_key, found, known)), "")
+    return ""

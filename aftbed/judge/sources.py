@@ -14,11 +14,13 @@ What a request must have left, if it was answered:
 
 from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import Final, NamedTuple
 
 from aftbed.adapt.engine import DONE
+from aftbed.core.errors import ConfigError
 from aftbed.core.events import FIRST_FAULT, Event
 from aftbed.core.input_file import open_input
 from aftbed.core.journal import EntryKind, History, Record
@@ -26,6 +28,7 @@ from aftbed.ftm.compose import build
 from aftbed.inject.receipts import fault_and_bits
 from aftbed.judge.record import RunEnd, RunRecord
 from aftbed.judge.reference import ReferenceRun
+from aftbed.runtime.deployment import replica_of
 from aftbed.runtime.unix import seal
 from aftbed.runtime.unix.devices import LOAD_REQUESTS
 from aftbed.runtime.unix.options import LoadRun
@@ -34,6 +37,9 @@ from aftbed.vehicle.aeb.function import sample_requests
 
 PROCESSES_LOG: Final = "processes.log"
 PRINTED_BYTES_MAX: Final = 1_000_000  # that are searched: the first error counts
+SINGLE: Final = "single"  # the placement whose only node hosts two Servers
+SERVER: Final = "/server"  # ends the name of its brick
+EFFECTS: Final = (Event.SERVER_EXIT, Event.STATE_RESTORED)
 TRACEBACK: Final = "Traceback (most recent call last):"
 
 
@@ -41,7 +47,9 @@ def contradictions(record: RunRecord, reference: ReferenceRun) -> Iterator[str]:
     """What cannot be true together."""
     end = record.end
     yield from seal.changes(record.path)
+    yield from _of_journals(record)
     yield from _of_requests(record)
+    yield from _of_adaptations(record)
     yield from _of_faults(record)
     yield from _of_policy(record)
     if end is not None:
@@ -89,6 +97,7 @@ def gaps(record: RunRecord, reference: ReferenceRun) -> Iterator[str]:
         name = f"{node.replace('/', '.')}.1"
         if name not in record.history.journals:
             yield f"the journal {name} is missing"
+    yield from effects_missing(record, record.end)
     if _at_rest(record.end):
         if not isinstance(record.options.work, LoadRun) and record.end.bus is None:
             yield "the hub did not report what happened on the bus"
@@ -99,6 +108,39 @@ def gaps(record: RunRecord, reference: ReferenceRun) -> Iterator[str]:
         if reference.state and _all_answered(record, reference):  # a function may hand out none
             missing = [replica for replica in replicas if replica not in record.end.states]
             yield from (f"the state of {replica} at the end is missing" for replica in missing)
+
+
+def effects_missing(record: RunRecord, end: RunEnd) -> Iterator[str]:
+    """A Server's effects follow request on request; those of a replica at the end go up to the last request.
+
+    This is so where faults only end or stop processes, and each node hosts one Server. A Server that was put
+    aside by an adaptation which was undone has not seen what happened meanwhile.
+    """
+    undone = any(one.outcome != DONE for one in record.adaptations)
+    stopped = all(report.action.stops_process for report in record.faults)
+    if undone or not stopped or record.options.placement == SINGLE:
+        return
+    last_sent = max((e.request_id for e in record.history.dialogue if e.kind is EntryKind.SENT), default=0)
+    newest: dict[str, tuple[str, int]] = {}  # by node: the journal, the last effect
+    for name in sorted(record.history.journals, key=_incarnation):
+        last = 0
+        for one in record.history.events_of(name, *EFFECTS):
+            if last and one.request_id > last + 1:
+                yield f"the journal {name} lacks what was between requests {last} and {one.request_id}"
+            last = one.request_id
+            newest[one.node] = name, last
+    if _at_rest(end) and end.states:
+        serving = {replica for replica in (end.leader, end.backup) if replica}
+        yield from (
+            f"the journal {name} ends with request {last}, and {last_sent} was the last one"
+            for node, (name, last) in newest.items()
+            if last != last_sent and replica_of(node) in serving
+        )
+
+
+def _incarnation(journal: str) -> int:
+    number = journal.rpartition(".")[2]
+    return int(number) if number.isdigit() else 0
 
 
 def _tracebacks(path: Path) -> Iterator[str]:
@@ -141,6 +183,9 @@ def _of_requests(record: RunRecord) -> Iterator[str]:
                 not_drawn.append(number)
     if backwards:
         yield f"{backwards} entries of the dialogue are earlier than the ones before them"
+    effects = (one for name in record.history.journals for one in record.history.events_of(name, *EFFECTS))
+    never = {one.request_id for one in effects} - sent_ns.keys() - {0}
+    yield from (f"request {number}: executed, but never sent" for number in sorted(never))
     del sent_ns
     for number in _without(
         Event.REPLY_ACCEPTED, spans, record.history, lambda r, s: r.detail >> 8 == s.epoch
@@ -170,6 +215,48 @@ def _without(
             if span is not None and span.sent_ns <= record.t_ns <= span.answered_ns and fits(record, span):
                 left.discard(record.request_id)
     return sorted(left)
+
+
+def _of_journals(record: RunRecord) -> Iterator[str]:
+    """Each is that of its node, and has records of the bricks that the node has hosted."""
+    graphs = [build(ftm, record.options.placement) for ftm in {record.options.ftm, *_adapted_to(record)}]
+    for name, records in record.history.journals.items():
+        if not records:
+            continue
+        node = records[0].node
+        bricks = [graph.nodes.get(node, ()) for graph in graphs]
+        if node.replace("/", ".") != name.rpartition(".")[0]:
+            yield f"the journal {name} is that of {node}"
+        servers = {
+            number for hosted in bricks for number, brick in enumerate(hosted) if brick.endswith(SERVER)
+        }
+        if any(one.brick not in servers for one in record.history.events_of(name, *EFFECTS)):
+            yield f"the journal {name} has effects of what is no server of {node}"
+
+
+def _adapted_to(record: RunRecord) -> Iterator[str]:
+    """The mechanisms to which adaptations led, or would have led."""
+    for one in record.adaptations:
+        with suppress(ConfigError):
+            build(one.ftm, record.options.placement)
+            yield one.ftm
+    for asked in record.options.adaptations:
+        if asked.goal.expression:
+            yield asked.goal.expression
+
+
+def _of_adaptations(record: RunRecord) -> Iterator[str]:
+    """What was asked for with the run, and what has an outcome."""
+    asked = dict(enumerate(record.options.adaptations, 1))
+    for one in record.adaptations:
+        option = asked.get(one.scheduled)
+        same = option is not None and (str(option), option.goal.recipe, option.goal.may_fail) == (
+            one.asked,
+            one.recipe,
+            one.may_fail,
+        )
+        if one.scheduled and not same:
+            yield f"adaptation {one.number}, {one.asked!r}, is not the one that was asked for with the run"
 
 
 def _of_faults(record: RunRecord) -> Iterator[str]:
@@ -205,6 +292,8 @@ def _of_policy(record: RunRecord) -> Iterator[str]:
 def _of_end(record: RunRecord, end: RunEnd) -> Iterator[str]:
     """The supervisor's last words against the rest."""
     ids = {entry.request_id for entry in record.history.dialogue if entry.kind is EntryKind.SENT}
+    if end.hosted is not None and (end.leader, end.backup) != (end.hosted.leader, end.hosted.backup):
+        yield f"{end.leader or 'none'} led at the end, and {end.hosted.leader or 'none'} led the graph"
     if end.lost and end.states:
         yield f"no replica was left, and {' and '.join(end.states)} had a state"
     if _at_rest(end) and end.client is not None and end.client.sent not in (None, len(ids)):

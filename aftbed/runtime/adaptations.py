@@ -9,7 +9,7 @@ undoes the adaptation, then it fails over.
 import contextlib
 import functools
 from collections.abc import Callable
-from typing import Final
+from typing import Final, NamedTuple
 
 import msgspec
 
@@ -56,7 +56,7 @@ class Outcome(msgspec.Struct):
     opened_ns: int = 0  # from when on the new graph served (monotonic), 0 if it never did
     undone_ns: int = 0  # from when on the old one served again
     lost: str = ""  # the replicas that did not serve again, and were left to Recovery, as "a" or "a b"
-    asked: str = ""  # the words of the request
+    asked: str = ""  # the words of the request, with the time for which it was scheduled
     scheduled: int = 0  # its place among those of the run's options, from 1 on; 0: asked for while it ran
     may_fail: bool = False  # see `core.messages.Goal`
 
@@ -72,6 +72,15 @@ def function_of(graph: Graph) -> str:
 
 def _unanswered(outcome: Outcome) -> None:
     """The answer of an adaptation that was scheduled with the run: the history has it."""
+
+
+class _Request(NamedTuple):
+    """`asked`: its words. `scheduled`: as in `Outcome`."""
+
+    goal: messages.Goal
+    answer: Answer
+    asked: str
+    scheduled: int = 0
 
 
 def _spoiled(reason: str) -> Keys:
@@ -111,8 +120,8 @@ class Adaptations:
         self._current: _Current | None = None
         self._count = 0
         self.history: list[Outcome] = []
-        self._scheduled: list[tuple[int, messages.Scheduled]] = []  # with their places, until their request
-        self._asked_with_run = 0
+        self._scheduled = 0  # how many
+        self._waiting: list[tuple[int, _Request]] = []  # of those, with the requests that they wait for
 
     @property
     def busy(self) -> bool:
@@ -122,18 +131,18 @@ class Adaptations:
     @property
     def awaited(self) -> tuple[int, ...]:
         """The requests that scheduled adaptations wait for."""
-        return tuple(sorted({later.at_request for _, later in self._scheduled}))
+        return tuple(sorted({at_request for at_request, _ in self._waiting}))
 
     @property
     def scheduled(self) -> tuple[Outcome | None, ...]:
-        """What became of each adaptation that was asked for with the run, in the order asked.
+        """What became of each scheduled adaptation, in the order of the run's options.
 
         None: it has not begun. An empty `outcome`: it is under way.
         """
         ended = {one.scheduled: one for one in self.history}
         if self._current is not None:
             ended[self._current.outcome.scheduled] = self._current.outcome
-        return tuple(ended.get(place) for place in range(1, self._asked_with_run + 1))
+        return tuple(ended.get(place) for place in range(1, self._scheduled + 1))
 
     @property
     def acting(self) -> bool:
@@ -151,13 +160,11 @@ class Adaptations:
 
     # -- asked for ----------------------------------------------------------------------------
 
-    def ask(
-        self, goal: messages.Goal, answer: Answer, retries: int = RETRIES_MAX, scheduled: int = 0
-    ) -> None:
-        """Begin an adaptation, after a short wait for redundancy. Raises ConfigError where it is refused.
+    def ask(self, goal: messages.Goal, answer: Answer) -> None:
+        """Begin an adaptation, after a short wait for redundancy. Raises ConfigError where it is refused."""
+        self._ask(_Request(goal, answer, str(goal)), RETRIES_MAX)
 
-        `scheduled` is its place among those of the run's options, from 1 on.
-        """
+    def _ask(self, request: _Request, retries: int) -> None:
         deployment = self._deployment
         if self._current is not None:
             raise ConfigError(
@@ -173,32 +180,34 @@ class Adaptations:
                     f" backup {deployment.backup or 'none'}, engine"
                     f" {'there' if deployment.lives(ENGINE) else 'not there'}"
                 )
-            self._loop.after(RETRY_SECONDS, lambda: self._ask_again(goal, answer, retries - 1, scheduled))
+            self._loop.after(RETRY_SECONDS, lambda: self._ask_again(request, retries - 1))
             return
-        plan = plan_goal(deployment.graph, goal)
-        outcome = self._asked(goal, scheduled)
-        self._current = _Current(outcome, answer, self._loop.now_ns(), deployment.epoch, plan)
+        plan = plan_goal(deployment.graph, request.goal)
+        outcome = self._asked(request)
+        self._current = _Current(outcome, request.answer, self._loop.now_ns(), deployment.epoch, plan)
         self._send(messages.Adapt(outcome.number, plan.script))
 
     def plan(self, goal: messages.Goal) -> Plan:
         """Plan an adaptation of the graph that runs now. Raises ConfigError."""
         return plan_goal(self._deployment.graph, goal)
 
-    def _asked(self, goal: messages.Goal, scheduled: int) -> Outcome:
+    def _asked(self, request: _Request) -> Outcome:
         self._count += 1
+        goal = request.goal
         outcome = Outcome(self._count, _named(goal), goal.recipe, self._deployment.graph.ftm)
-        outcome.asked, outcome.scheduled, outcome.may_fail = str(goal), scheduled, goal.may_fail
+        outcome.asked, outcome.scheduled, outcome.may_fail = request.asked, request.scheduled, goal.may_fail
         outcome.asked_ms = round((self._loop.now_ns() - self._started_ns) / 1e6, 3)
         return outcome
 
     def schedule(self, scheduled: tuple[messages.Scheduled, ...]) -> Keys:
         """Begin the adaptations requested with the run, each when the Client reaches its request."""
-        self._asked_with_run = len(scheduled)
+        self._scheduled = len(scheduled)
         for place, later in enumerate(scheduled, 1):
+            request = _Request(later.goal, _unanswered, str(later), place)
             if later.at_request:
-                self._scheduled.append((place, later))
+                self._waiting.append((later.at_request, request))
             else:
-                begin = functools.partial(self._ask_again, later.goal, _unanswered, RETRIES_MAX, place)
+                begin = functools.partial(self._ask_again, request, RETRIES_MAX)
                 self._loop.after(later.after_ms / 1e3, begin)
         yield from self._hold_requests()
 
@@ -216,22 +225,22 @@ class Adaptations:
         """The Client has reached `request_id`: begin the adaptations that wait for it, then release the
         request.
         """
-        due = [one for one in self._scheduled if one[1].at_request == request_id]
-        self._scheduled = [one for one in self._scheduled if one not in due]
-        for place, later in due:
-            self._ask_again(later.goal, _unanswered, RETRIES_MAX, place)
+        due = [request for at_request, request in self._waiting if at_request == request_id]
+        self._waiting = [one for one in self._waiting if one[0] != request_id]
+        for request in due:
+            self._ask_again(request, RETRIES_MAX)
         release = messages.Release(request_id)
         with contextlib.suppress(StepFailed):  # the Client is dead; its successor sends the request again
             self._deployment.order(CLIENT, lambda token: control.Deliver(token, CLIENT, release))
 
-    def _ask_again(self, goal: messages.Goal, answer: Answer, retries: int, scheduled: int) -> None:
+    def _ask_again(self, request: _Request, retries: int) -> None:
         try:
-            self.ask(goal, answer, retries, scheduled)
+            self._ask(request, retries)
         except ConfigError as error:
-            outcome = self._asked(goal, scheduled)
+            outcome = self._asked(request)
             outcome.outcome, outcome.reason = REFUSED, str(error)
             self._keep(outcome)
-            answer(outcome)
+            request.answer(outcome)
 
     def _send(self, message: messages.Adapt | messages.Progress | messages.TakeUp) -> None:
         try:

@@ -23,7 +23,7 @@ DONE_MIN: Final = 0.8  # of the adaptations drawn to happen
 
 
 class AdaptationEnd(Enum):
-    """What became of an adaptation that was asked for with the run."""
+    """What became of a scheduled adaptation."""
 
     DONE = DONE
     ROLLED_BACK = ROLLED_BACK

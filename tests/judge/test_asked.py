@@ -29,7 +29,10 @@ from aftbed.runtime.unix.closed_loop import (
 from aftbed.runtime.unix.options import LoadRun, PolicyOptions, ReplayRun
 from aftbed.runtime.unix.run_directory import HISTORY_NAME
 
-DONE: Final = {"blackout_ms": 1.5, "total_ms": 120.0, "scheduled": 1, "ftm": "lfr"}
+DONE: Final = {
+    **{"blackout_ms": 1.5, "total_ms": 120.0, "scheduled": 1, "ftm": "lfr"},
+    "asked": "to lfr at request 2",
+}
 AT_2: Final = Scheduled(Goal(expression="lfr"), at_request=2)
 RULE: Final = RuleReport("rules[0]", "2 crash within 10 s", "switch lfr", 12, True, 1)
 PROPOSED: Final = Proposed(300.0, "rules[0]", "2 crash within 10 s", "switch lfr", "pbr", "lfr", "done")

@@ -103,6 +103,12 @@ def test_half_a_graph_fails(path: Path) -> None:
     assert verdict.reasons == ["whole_graph: b/after (pbr.after) is missing"]
 
 
+def test_a_leader_that_is_no_replica_fails(path: Path) -> None:
+    record = whole(path)
+    record.host(leader="c")
+    assert "whole_graph: 'c' leads, which is no replica" in record.verdict().reasons
+
+
 def test_a_graph_to_which_no_adaptation_led_fails(path: Path) -> None:
     record = whole(path)
     record.host(ftm="lfr", bricks=[[b.name, b.kind] for b in build("lfr", "process").bricks])

@@ -522,7 +522,7 @@ def read_proposals(record: Path) -> list[Proposed]:
         return []
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}") from None
-    except (msgspec.DecodeError, RecursionError) as error:
+    except (msgspec.DecodeError, ValueError, RecursionError) as error:
         raise ConfigError(f"{path}: not the proposals of a run: {error}") from None
 
 
@@ -535,5 +535,5 @@ def read_policy_report(record: Path) -> PolicyReport | None:
         return None
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}") from None
-    except (msgspec.DecodeError, RecursionError) as error:
+    except (msgspec.DecodeError, ValueError, RecursionError) as error:
         raise ConfigError(f"{path}: not the report of a policy: {error}") from None

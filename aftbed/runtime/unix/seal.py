@@ -57,7 +57,7 @@ def changes(record: Path) -> Iterator[str]:
         return
     try:
         seal = msgspec.json.decode(read_input(record / NAME, SEAL_BYTES_MAX), type=Seal)
-    except (OSError, msgspec.MsgspecError):
+    except (OSError, ValueError, msgspec.MsgspecError, RecursionError):
         yield f"{NAME} is not a seal"
         return
     if seal.chain != chain(seal.files):

@@ -1,0 +1,109 @@
+"""A record with a flipped bit, or with a file missing, cut or exchanged, passes with no other meaning.
+
+With its old seal every change is told. With a new one, the sources have to contradict each other, or the
+record means the same: see `meaning`.
+"""
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from writtenruns import SEED, meaning, setup, write_run
+
+from aftbed.core.errors import ConfigError
+from aftbed.core.journal import HEADER_BYTES
+from aftbed.judge.record import read_record
+from aftbed.judge.verdict import judge
+from aftbed.runtime.unix import seal
+
+HEADER_USED: Final = 200  # of a journal's first page, what it has room for is empty
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_run(tmp_path_factory.mktemp("records") / "whole", setup())
+
+
+@pytest.fixture(scope="module")
+def copy(whole: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Changed and mended again by each test."""
+    return Path(shutil.copytree(whole, tmp_path_factory.mktemp("copies") / "copy"))
+
+
+def files(record: Path) -> list[Path]:
+    return sorted(path for path in record.rglob("*") if path.is_file() and path.name != seal.NAME)
+
+
+def places(record: Path) -> Iterator[tuple[Path, int]]:
+    """Each byte that means something."""
+    for path in files(record):
+        for at in range(path.stat().st_size):
+            if path.parent.name != "journal" or not HEADER_USED <= at < HEADER_BYTES:
+                yield path, at
+
+
+def passes_with_another_meaning(record: Path, original: Path) -> bool:
+    try:
+        found = read_record(record)
+        if judge(found).verdict != "pass":
+            return False
+    except ConfigError:
+        return False
+    return meaning(found) != meaning(read_record(original))
+
+
+def flipped(data: bytes, at: int, bit: int) -> bytes:
+    return data[:at] + bytes([data[at] ^ 1 << bit]) + data[at + 1 :]
+
+
+def test_as_it_is_it_passes(whole: Path) -> None:
+    verdict = judge(read_record(whole))
+    assert (verdict.verdict, verdict.reasons) == ("pass", [])
+    assert len(verdict.faults) == len(verdict.adaptations) == len(verdict.failovers) == 1
+
+
+@given(data=st.data())
+def test_a_flipped_bit_is_told_by_the_seal(copy: Path, data: st.DataObject) -> None:
+    path = data.draw(st.sampled_from([one for one in files(copy) if one.stat().st_size]))
+    before = path.read_bytes()
+    at, bit = data.draw(st.integers(0, len(before) - 1)), data.draw(st.integers(0, 7))
+    path.write_bytes(flipped(before, at, bit))
+    try:
+        changed = f"{path.relative_to(copy)} was changed since the record was sealed"
+        assert changed in list(seal.changes(copy))
+    finally:
+        path.write_bytes(before)
+
+
+@given(data=st.data())
+def test_a_flipped_bit_under_a_new_seal_changes_no_meaning(
+    copy: Path, whole: Path, data: st.DataObject
+) -> None:
+    path, at = data.draw(st.sampled_from(list(places(copy))))
+    before = path.read_bytes()
+    path.write_bytes(flipped(before, at, data.draw(st.integers(0, 7))))
+    seal.write(copy)
+    try:
+        assert not passes_with_another_meaning(copy, whole), (path.name, at)
+    finally:
+        path.write_bytes(before)
+
+
+def test_no_file_is_missing_cut_or_exchanged_without_a_word(copy: Path, whole: Path, tmp_path: Path) -> None:
+    other = write_run(tmp_path / "other", setup(SEED + 1))
+    for path in files(copy):
+        before, exchanged = path.read_bytes(), other / path.relative_to(copy)
+        changes = [None, before[: len(before) // 2], before[:HEADER_BYTES]]
+        changes += [exchanged.read_bytes()] if exchanged.exists() else []
+        for change in changes:
+            if change is None:
+                path.unlink()
+            else:
+                path.write_bytes(change)
+            seal.write(copy)
+            assert not passes_with_another_meaning(copy, whole), path.name
+        path.write_bytes(before)
