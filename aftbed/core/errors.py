@@ -41,6 +41,11 @@ def shown(text: str) -> str:
     return "".join(one if one.isprintable() or one == "\n" else "\ufffd" for one in text)
 
 
+def spreadsheet_text(text: str) -> str:
+    """A text that others may have written, fit for a CSV: a spreadsheet takes it for no formula."""
+    return f"'{text}" if text.startswith(("=", "+", "-", "@", "\t", "\r")) else text
+
+
 def unknown(what: str, found: str, allowed: Iterable[str]) -> ConfigError:
     """A `ConfigError` that names what was found, the nearest name that exists, and all allowed."""
     names = sorted(allowed)

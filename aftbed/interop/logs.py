@@ -48,7 +48,7 @@ from typing import Final
 
 import msgspec
 
-from aftbed.core.errors import ConfigError, PeerError, unknown
+from aftbed.core.errors import ConfigError, PeerError, spreadsheet_text, unknown
 from aftbed.interop.files import write_whole
 from aftbed.runtime.unix.confined import JobFailedError, ProcessLimits, ask, serve
 from aftbed.vehicle.can.candump import LINE_SHOWN_CHARACTERS_MAX, LOG_BYTES_MAX, Refusal
@@ -575,7 +575,9 @@ def write_csv(log: CanLog, codec: Codec, path: Path) -> CanLog:
             interfaces[name].append(frame.interface)
 
     def column(interface: str, name: str, signal: str) -> str:
-        return f"{name}.{signal}" if len(interfaces[name]) == 1 else f"{interface}.{name}.{signal}"
+        if len(interfaces[name]) == 1:
+            return f"{name}.{signal}"
+        return spreadsheet_text(f"{interface}.{name}.{signal}")
 
     columns = [
         column(interface, name, signal)

@@ -4,8 +4,8 @@ The columns are the same in both, and so are their types where a format has type
 a name. An unknown value (no failover, no car) is an empty field in CSV and a null in Parquet. Several
 values, such as faults and reasons, are one text, separated by `; `.
 
-Limits: CSV has no types, so a reader guesses them. A text that a spreadsheet would take for a formula is
-exported unchanged: the records are the user's own.
+Limits: CSV has no types, so a reader guesses them. In CSV, a text that a spreadsheet would take for a formula
+(it begins with =, +, -, @, a tab or a carriage return) has an apostrophe before it.
 """
 
 import csv
@@ -16,7 +16,7 @@ from typing import Final
 from msgspec.structs import asdict
 
 from aftbed.campaign.ledger import Ledger
-from aftbed.core.errors import ConfigError
+from aftbed.core.errors import ConfigError, spreadsheet_text
 
 Value = str | int | float | bool | None
 SEPARATOR: Final = "; "
@@ -84,7 +84,9 @@ def write_csv(ledger: Ledger, path: Path) -> None:
         with path.open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, list(COLUMNS), lineterminator="\n")
             writer.writeheader()
-            writer.writerows(rows(ledger))
+            for row in rows(ledger):
+                texts = {n: spreadsheet_text(cell) for n, cell in row.items() if isinstance(cell, str)}
+                writer.writerow(row | texts)
     except OSError as error:
         raise _unwritable(path, error) from None
 

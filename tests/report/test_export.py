@@ -64,6 +64,15 @@ def test_any_text_comes_back(ledger: Ledger, tmp_path: Path) -> None:
     assert first["stratum"] == HOSTILE and second["reasons"] == nasty
 
 
+@pytest.mark.parametrize("start", ["=", "+", "-", "@", "\t", "\r"])
+def test_no_text_is_a_formula(ledger: Ledger, tmp_path: Path, start: str) -> None:
+    told = with_results(ledger, result(reasons=(f"{start}cmd|' /C calc'!A0",), gap_m=-0.5))
+    write_csv(told, tmp_path / "r.csv")
+    (row,) = read_csv(tmp_path / "r.csv")
+    assert row["reasons"] == f"'{start}cmd|' /C calc'!A0"
+    assert row["gap_m"] == "-0.5", "a number is none"
+
+
 @pytest.mark.parametrize("write", [write_csv, write_parquet])
 def test_a_place_that_cannot_be_written_is_named(ledger: Ledger, tmp_path: Path, write: object) -> None:
     path = tmp_path / "no" / "r"
