@@ -17,7 +17,7 @@ import msgspec
 from msgspec import Meta
 
 from aftbed.adapt.commands import read, scheduled
-from aftbed.core.errors import ConfigError
+from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.core.graph import Graph
 from aftbed.core.messages import Scheduled
 from aftbed.core.script import RECIPES
@@ -280,6 +280,8 @@ def _recorded(experiment: Experiment, standing: ExitStack) -> RunRecord:
     for _ in launched.reports():
         pass
     launched.wait()
+    if launched.trouble:
+        raise HarnessError(launched.trouble)
     remember(launched.record)
     return read_record(launched.record)
 

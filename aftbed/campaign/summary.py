@@ -204,7 +204,14 @@ def judged(gate: Gate, groups: dict[str, list[Result]], confidence: float) -> Ga
     bound = interval.high if gate.max is not None else interval.low
     kept = bound <= gate.max if gate.max is not None else bound >= (gate.min or 0.0)
     reason = "" if kept else f"{value:.4g} was measured, and it may be {bound:.4g}"
+    if not kept and gate.metric == "unknown":
+        reason += next((f"; experiment {r.experiment.id}: {r.reasons[0]}" for r in group if _untold(r)), "")
     return GateResult(gate.metric, gate.strata, limit, value, bound, "pass" if kept else "fail", reason)
+
+
+def _untold(result: Result) -> bool:
+    """Whether nothing is known of the mechanism, and why."""
+    return result.outcome in UNKNOWN and bool(result.reasons)
 
 
 def _always(spec: Spec) -> Iterator[Gate]:

@@ -85,6 +85,14 @@ def test_one_experiment_that_broke_what_no_fault_excuses_fails_the_campaign(tmp_
     assert found.gates[-1].reason == f"experiment {masters.experiment.id}: one_master: two at 3 ms"
 
 
+def test_trouble_of_the_harness_is_told_with_the_gate(tmp_path: Path) -> None:
+    full = "HarnessError: the supervisor cannot go on: No space left on device"
+    trouble = msgspec.structs.replace(result("harness_error", index=3), reasons=(full,))
+    found = judged(tmp_path, [*many(3), trouble])
+    (gate,) = (one for one in found.gates if one.metric == "unknown")
+    assert gate.word == "fail" and gate.reason.endswith(f"; experiment {trouble.experiment.id}: {full}")
+
+
 def test_a_stratum_in_which_nothing_struck_fails_by_itself(tmp_path: Path) -> None:
     lone = result(stratum="lfr · crash", index=990).experiment
     results = [*many(400), msgspec.structs.replace(result(index=990, activated=False), experiment=lone)]
