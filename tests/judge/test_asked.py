@@ -30,7 +30,10 @@ from aftbed.runtime.unix.options import LoadRun, PolicyOptions, ReplayRun
 from aftbed.runtime.unix.run_directory import HISTORY_NAME
 
 DONE: Final = {
-    **{"blackout_ms": 1.5, "total_ms": 120.0, "scheduled": 1, "ftm": "lfr"},
+    "blackout_ms": 1.5,
+    "total_ms": 120.0,
+    "scheduled": 1,
+    "ftm": "lfr",
     "asked": "to lfr at request 2",
 }
 AT_2: Final = Scheduled(Goal(expression="lfr"), at_request=2)
