@@ -19,7 +19,8 @@ def drive(path: Path, *strangers: Stranger, is_open: bool = False, frames: int =
     record = whole(path, CAR)
     record.options = msgspec.structs.replace(record.options, bus_open=is_open)
     assert record.end is not None
-    record.end["result"] = {"end": "stopped itself", "result": msgspec.to_builtins(STOPPED)}
+    stopped = {"end": "standstill", "t_us": 4_000_000, "result": msgspec.to_builtins(STOPPED)}
+    record.end["result"] = stopped
     record.end["bus"] = msgspec.to_builtins(HubCounts(is_open, frames, strangers=list(strangers)))
     return record
 
