@@ -42,8 +42,12 @@ def shown(text: str) -> str:
 
 
 def spreadsheet_text(text: str) -> str:
-    """A text that others may have written, fit for a CSV: a spreadsheet takes it for no formula."""
-    return f"'{text}" if text.startswith(("=", "+", "-", "@", "\t", "\r")) else text
+    """A text that others may have written, fit for a CSV: a spreadsheet takes it for no formula.
+
+    A carriage return becomes a newline: `csv` does not quote it, and a reader would end the row there.
+    """
+    text = text.replace("\r\n", "\n").replace("\r", "\n")
+    return f"'{text}" if text.startswith(("=", "+", "-", "@", "\t")) else text
 
 
 def unknown(what: str, found: str, allowed: Iterable[str]) -> ConfigError:

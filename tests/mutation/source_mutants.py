@@ -278,11 +278,11 @@ MUTANTS: Final = (
     SourceMutant(
         "an adaptation that was not done passes",
         "G8",
-        f"{JUDGE}/checks.py",
-        'Check("unknown" if failed else "pass", failed[:REASONS_MAX])',
-        'Check("pass", failed[:REASONS_MAX])',
+        f"{JUDGE}/asked.py",
+        "if one.outcome != DONE and not one.may_fail]",
+        "if False]",
         UNIT,
-        ("tests/judge/test_verdict.py",),
+        ("tests/judge/test_asked.py",),
     ),
     SourceMutant(
         "sources that contradict each other pass",
