@@ -139,13 +139,17 @@ def replica_of(name: str) -> str:
 
 
 class Slot:
-    """One place for a replica; `generation` counts the replicas that were in it."""
+    """One place for a replica; `generation` counts the replicas that were in it.
+
+    `complete`: all nodes of the present one have become what they are, so it can be watched.
+    """
 
     def __init__(self, name: str, bricks: frozenset[str]) -> None:
         self.name, self.bricks = name, bricks
         self.number = REPLICAS.index(name) + 1
         self.generation = 0
         self.nodes: list[str] = []
+        self.complete = False
 
 
 class Hosted(msgspec.Struct, frozen=True):
@@ -196,7 +200,7 @@ class Deployment:
                 bricks = frozenset(brick for brick, replica in of_replicas.items() if replica == name)
             if bricks:
                 slot = self.slots[name] = Slot(name, bricks)
-                slot.nodes = [n for n in self.nodes_of(slot) if self.lives(n)]
+                slot.nodes, slot.complete = [n for n in self.nodes_of(slot) if self.lives(n)], True
                 slot.generation = self._generations.get(name, 0) + (name not in lost)
 
     def nodes_of(self, slot: Slot) -> list[str]:
@@ -285,13 +289,13 @@ class Deployment:
             self.backup = REPLICAS[1]
         self.pin_watchers()
         for slot in self.slots.values():
-            slot.nodes = self.nodes_of(slot)
+            slot.nodes, slot.complete = self.nodes_of(slot), True
             yield from self.watch(slot)
 
     def spawn(self, slot: Slot) -> Keys:
         """A new generation of nodes in `slot`, its channels fresh, not leading."""
         slot.generation += 1
-        slot.nodes = self.nodes_of(slot)
+        slot.nodes, slot.complete = self.nodes_of(slot), False
         for link in self.graph.links:
             inside = link.source in slot.bricks and link.sink in slot.bricks
             if inside or ("proxy" in (link.source, link.sink) and {link.source, link.sink} & slot.bricks):
@@ -301,6 +305,7 @@ class Deployment:
             sent.append((yield from self._assign(node)))
         yield from self.answers(sent, BIRTH_SECONDS_MAX)
         self.assert_whole(slot)
+        slot.complete = True
         yield from self.watch(slot)
 
     def assert_whole(self, slot: Slot) -> None:
@@ -323,8 +328,8 @@ class Deployment:
         """
         watchdog = f"{slot.name}/watchdog"
         process = self.nodes.get(watchdog)
-        if process is None or not process.alive or not slot.nodes:
-            return  # a Watchdog that is being replaced gets it later
+        if process is None or not process.alive or not slot.nodes or not slot.complete:
+            return  # a Watchdog that is being replaced gets it later, as does that of a replica being made
         nodes = () if none else tuple(slot.nodes)
         if not all(self.lives(n) for n in nodes):
             self.lost.add(slot.name)  # its Watchdog died before it could report that

@@ -276,6 +276,15 @@ MUTANTS: Final = (
         ("tests/judge/test_figures.py",),
     ),
     SourceMutant(
+        "a new Watchdog watches a replica that is being made",
+        "G2",
+        "aftbed/runtime/deployment.py",
+        "or not slot.nodes or not slot.complete:",
+        "or not slot.nodes:",
+        UNIT,
+        ("tests/sim/test_failing_scripts.py",),
+    ),
+    SourceMutant(
         "an adaptation that was not done passes",
         "G8",
         f"{JUDGE}/asked.py",

@@ -56,6 +56,16 @@ def until(world: World, event: str, text: str) -> int:
         world.loop.watch_jobs()
 
 
+def test_a_replica_that_is_being_made_is_not_watched_yet() -> None:
+    """Its nodes have no journals before they have become what they are; a new Watchdog ended in an error."""
+    world = begun(0)
+    deployment = world.controller.deployment
+    slot = deployment.slots["b"]
+    assert next(deployment.watch(slot), None) is not None
+    next(deployment.spawn(slot))
+    assert list(deployment.watch(slot)) == []
+
+
 def pauses_ms(world: World) -> Iterator[float]:
     """The times between one answer and the next."""
     answers = [entry.t_ns for entry in world.dialogue if entry.kind is EntryKind.ANSWERED]
