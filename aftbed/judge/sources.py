@@ -28,7 +28,6 @@ from aftbed.ftm.compose import build
 from aftbed.inject.receipts import fault_and_bits
 from aftbed.judge.record import RunEnd, RunRecord
 from aftbed.judge.reference import ReferenceRun
-from aftbed.runtime.deployment import replica_of
 from aftbed.runtime.unix import seal
 from aftbed.runtime.unix.devices import LOAD_REQUESTS
 from aftbed.runtime.unix.options import LoadRun
@@ -91,7 +90,7 @@ def gaps(record: RunRecord, reference: ReferenceRun) -> Iterator[str]:
     if record.kept and not seal.sealed(record.path):
         yield f"the record has no {seal.NAME}: its command did not live to seal it, or it was removed"
     yield from (f"end.json has no {key!r}" for key in record.end.absent)
-    if not _flipped(record):  # a flipped bit may well fail an assertion
+    if not _flipped(record) and not _undone(record):  # either may well fail an assertion
         yield from _tracebacks(record.path / PROCESSES_LOG)
     for node in ("supervisor", *build(record.options.ftm, record.options.placement).nodes):
         name = f"{node.replace('/', '.')}.1"
@@ -114,28 +113,38 @@ def effects_missing(record: RunRecord, end: RunEnd) -> Iterator[str]:
     """A Server's effects follow request on request; those of a replica at the end go up to the last request.
 
     This is so where faults only end or stop processes, and each node hosts one Server. A Server that was put
-    aside by an adaptation which was undone has not seen what happened meanwhile.
+    aside by an adaptation which was undone has not seen what happened meanwhile. The Server of a backup that
+    was ready after the last request has no effects.
     """
-    undone = any(one.outcome != DONE for one in record.adaptations)
+    undone = _undone(record)
     stopped = all(report.action.stops_process for report in record.faults)
     if undone or not stopped or record.options.placement == SINGLE:
         return
     last_sent = max((e.request_id for e in record.history.dialogue if e.kind is EntryKind.SENT), default=0)
-    newest: dict[str, tuple[str, int]] = {}  # by node: the journal, the last effect
+    sent_ns = max((e.t_ns for e in record.history.dialogue if e.kind is EntryKind.SENT), default=0)
+    late = any(one.t_ns > sent_ns for one in record.history.events(Event.BACKUP_READY))
+    newest: dict[str, tuple[str, int]] = {}  # by node: the journal, the last effect (0: none)
     for name in sorted(record.history.journals, key=_incarnation):
         last = 0
         for one in record.history.events_of(name, *EFFECTS):
             if last and one.request_id > last + 1:
                 yield f"the journal {name} lacks what was between requests {last} and {one.request_id}"
             last = one.request_id
-            newest[one.node] = name, last
+        node = name.rpartition(".")[0]
+        if last or node in newest:
+            newest[node] = name, last
     if _at_rest(end) and end.states:
-        serving = {replica for replica in (end.leader, end.backup) if replica}
+        serving = [replica for replica in (end.leader, end.backup) if replica]
         yield from (
             f"the journal {name} ends with request {last}, and {last_sent} was the last one"
             for node, (name, last) in newest.items()
-            if last != last_sent and replica_of(node) in serving
+            if last != last_sent and not (late and not last) and node.partition(".")[0] in serving
         )
+
+
+def _undone(record: RunRecord) -> bool:
+    """Whether an adaptation was rolled back or refused: its verdict is `adaptations_done`."""
+    return any(one.outcome != DONE for one in record.adaptations)
 
 
 def _incarnation(journal: str) -> int:
@@ -144,7 +153,7 @@ def _incarnation(journal: str) -> int:
 
 
 def _tracebacks(path: Path) -> Iterator[str]:
-    """The errors that ended processes, which no fault of a run without flipped bits explains."""
+    """The errors that ended processes, but for those that a flipped bit or an undone adaptation explains."""
     try:
         with open_input(path) as file:
             lines = file.read(PRINTED_BYTES_MAX).decode(errors="replace").splitlines()
