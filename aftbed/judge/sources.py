@@ -113,8 +113,8 @@ def effects_missing(record: RunRecord, end: RunEnd) -> Iterator[str]:
     """A Server's effects follow request on request; those of a replica at the end go up to the last request.
 
     This is so where faults only end or stop processes, and each node hosts one Server. A Server that was put
-    aside by an adaptation which was undone has not seen what happened meanwhile. The Server of a backup that
-    was ready after the last request has no effects.
+    aside by an adaptation which was undone has not seen what happened meanwhile. A Server has none if it
+    came after the last request, as a new backup or by an adaptation, or never came to be.
     """
     undone = _undone(record)
     stopped = all(report.action.stops_process for report in record.faults)
@@ -122,7 +122,8 @@ def effects_missing(record: RunRecord, end: RunEnd) -> Iterator[str]:
         return
     last_sent = max((e.request_id for e in record.history.dialogue if e.kind is EntryKind.SENT), default=0)
     sent_ns = max((e.t_ns for e in record.history.dialogue if e.kind is EntryKind.SENT), default=0)
-    late = any(one.t_ns > sent_ns for one in record.history.events(Event.BACKUP_READY))
+    ready_ns = [one.t_ns for one in record.history.events(Event.BACKUP_READY)]
+    came = bool(ready_ns) and max(*ready_ns, *(one.opened_ns for one in record.adaptations), 0) <= sent_ns
     newest: dict[str, tuple[str, int]] = {}  # by node: the journal, the last effect (0: none)
     for name in sorted(record.history.journals, key=_incarnation):
         last = 0
@@ -138,7 +139,7 @@ def effects_missing(record: RunRecord, end: RunEnd) -> Iterator[str]:
         yield from (
             f"the journal {name} ends with request {last}, and {last_sent} was the last one"
             for node, (name, last) in newest.items()
-            if last != last_sent and not (late and not last) and node.partition(".")[0] in serving
+            if last != last_sent and (last or came) and node.partition(".")[0] in serving
         )
 
 
