@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from aftbed.adapt.engine import DONE
-from aftbed.core.errors import ConfigError
+from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.core.events import FIRST_FAULT, Event
 from aftbed.core.input_file import open_input
 from aftbed.core.journal import EntryKind, History, Record
@@ -36,6 +36,7 @@ from aftbed.vehicle.aeb.function import sample_requests
 
 PROCESSES_LOG: Final = "processes.log"
 PRINTED_BYTES_MAX: Final = 1_000_000  # that are searched: the first error counts
+OF_HARNESS: Final = f"{HarnessError.__module__}.{HarnessError.__name__}"
 SINGLE: Final = "single"  # the placement whose only node hosts two Servers
 SERVER: Final = "/server"  # ends the name of its brick
 EFFECTS: Final = (Event.SERVER_EXIT, Event.STATE_RESTORED)
@@ -166,6 +167,8 @@ def _tracebacks(path: Path) -> Iterator[str]:
     for at, line in enumerate(lines):
         if line == TRACEBACK:
             error_line = next((one for one in lines[at + 1 :] if not one.startswith(" ")), "cut off")
+            if error_line.startswith(OF_HARNESS):
+                continue  # the run tells it as the reason of its end; at the end the hub goes before its clients
             who = lines[at - 1] if at and lines[at - 1].endswith(":") else "a process:"
             yield f"{path.name} has a traceback of {who} {error_line}"
 
