@@ -168,7 +168,7 @@ def _tracebacks(path: Path) -> Iterator[str]:
         if line == TRACEBACK:
             error_line = next((one for one in lines[at + 1 :] if not one.startswith(" ")), "cut off")
             if error_line.startswith(OF_HARNESS):
-                continue  # the run tells it as the reason of its end; at the end the hub goes before its clients
+                continue  # the run reports it itself; and at the end, the hub goes before its clients
             who = lines[at - 1] if at and lines[at - 1].endswith(":") else "a process:"
             yield f"{path.name} has a traceback of {who} {error_line}"
 
