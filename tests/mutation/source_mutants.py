@@ -311,6 +311,24 @@ MUTANTS: Final = (
         UNIT,
         ("tests/judge/test_trust.py",),
     ),
+    SourceMutant(
+        "the hub is killed before its clients at the end of a run",
+        "G7",
+        f"{UNIX}/process_pool.py",
+        "return 2 if self.name == control.HUB else 1",
+        "return 1",
+        UNIT,
+        ("tests/runtime/test_reap.py",),
+    ),
+    SourceMutant(
+        "a server that came after the last request is missed",
+        "G8",
+        f"{JUDGE}/sources.py",
+        "max(came_ns) <= sent_ns",
+        "max(came_ns) > 0",
+        UNIT,
+        ("tests/judge/test_damaged.py",),
+    ),
 )
 
 

@@ -14,13 +14,17 @@ from aftbed.runtime.unix.process_pool import UnixProcess, reap
 from aftbed.runtime.unix.transport import Line, decode_report
 
 
-def dead(journal: str, sig: signal.Signals) -> UnixProcess:
-    """A node with that journal, killed by `sig` and not reaped yet."""
+def process_of(name: str, kind: ProcessKind, *bricks: tuple[str, str]) -> UnixProcess:
     ours, theirs = socket.socketpair()
     theirs.close()
-    process = UnixProcess(
-        "client", ProcessKind.NODE, Line(ours, decode_report), UndoLedger(Path("/nonexistent"), -1)
-    )
+    process = UnixProcess(name, kind, Line(ours, decode_report), UndoLedger(Path("/nonexistent"), -1))
+    process.bricks = bricks
+    return process
+
+
+def dead(journal: str, sig: signal.Signals) -> UnixProcess:
+    """A node with that journal, killed by `sig` and not reaped yet."""
+    process = process_of("client", ProcessKind.NODE)
     process.pid, process.journal = os.posix_spawn("/bin/sleep", ["sleep", "60"], {}), journal
     os.kill(process.pid, sig)
     os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
@@ -42,3 +46,18 @@ def test_a_journal_without_room_is_named() -> None:
 def test_other_deaths_are_no_trouble(journal: str, sig: signal.Signals) -> None:
     process = dead(journal, sig)
     assert reap(process) and not reap(process)
+
+
+def test_at_the_end_watchdogs_are_killed_first_and_the_hub_after_its_clients() -> None:
+    everything = [
+        process_of("hub", ProcessKind.SERVICE),
+        process_of("vehicle", ProcessKind.SERVICE),
+        process_of("client", ProcessKind.NODE, ("client", "client")),
+        process_of("a/watchdog", ProcessKind.NODE, ("a/watchdog", "watchdog")),
+    ]
+    try:
+        in_turn = sorted(everything, key=UnixProcess.killed_in_turn)
+        assert [one.name for one in in_turn] == ["a/watchdog", "vehicle", "client", "hub"]
+    finally:
+        for one in everything:
+            one.close()

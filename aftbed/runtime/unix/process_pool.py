@@ -139,9 +139,14 @@ class UnixProcess:
         """Whether it has yet to see the flag."""
         return self.header is not None and self.header.announced()
 
-    def watches(self) -> bool:
-        """Whether it would act on the death of another process."""
-        return any(kind in WATCHING_KINDS for _, kind in self.bricks)
+    def killed_in_turn(self) -> int:
+        """Its place when all are killed: those that act on the death of others first, and the hub last.
+
+        A client of the hub that outlives it ends in an error, and reports that.
+        """
+        if any(kind in WATCHING_KINDS for _, kind in self.bricks):
+            return 0
+        return 2 if self.name == control.HUB else 1
 
     def close(self) -> None:
         """Close all descriptors."""

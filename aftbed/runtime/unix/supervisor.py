@@ -338,14 +338,14 @@ class Supervisor:
     def _kill_all(self) -> list[str]:
         """Kill all processes and reap them; what is left after a second in which they had a CPU to die on.
 
-        Watchdogs and Recovery are killed first, so that the shutdown does not trigger a failover.
+        Watchdogs and Recovery come first, so that the shutdown triggers no failover; see `killed_in_turn`.
         """
         dying = self.pool.processes
         starvation = {p.pid: linux.Starvation(p.pid) for p in dying if p.pid}
         began_ns = time.monotonic_ns()
         for one in starvation.values():
             one.starves(began_ns)  # counts from here
-        for process in sorted(dying, key=UnixProcess.watches, reverse=True):
+        for process in sorted(dying, key=UnixProcess.killed_in_turn):
             process.kill()
         while dying:
             before = len(dying)
