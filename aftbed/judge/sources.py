@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from aftbed.adapt.engine import DONE
-from aftbed.core.errors import ConfigError, HarnessError
+from aftbed.core.errors import ConfigError
 from aftbed.core.events import FIRST_FAULT, Event
 from aftbed.core.input_file import open_input
 from aftbed.core.journal import EntryKind, History, Record
@@ -36,7 +36,6 @@ from aftbed.vehicle.aeb.function import sample_requests
 
 PROCESSES_LOG: Final = "processes.log"
 PRINTED_BYTES_MAX: Final = 1_000_000  # that are searched: the first error counts
-OF_HARNESS: Final = f"{HarnessError.__module__}.{HarnessError.__name__}"
 SINGLE: Final = "single"  # the placement whose only node hosts two Servers
 SERVER: Final = "/server"  # ends the name of its brick
 EFFECTS: Final = (Event.SERVER_EXIT, Event.STATE_RESTORED)
@@ -121,10 +120,11 @@ def effects_missing(record: RunRecord, end: RunEnd) -> Iterator[str]:
     stopped = all(report.action.stops_process for report in record.faults)
     if undone or not stopped or record.options.placement == SINGLE:
         return
-    last_sent = max((e.request_id for e in record.history.dialogue if e.kind is EntryKind.SENT), default=0)
-    sent_ns = max((e.t_ns for e in record.history.dialogue if e.kind is EntryKind.SENT), default=0)
+    sent = ((e.request_id, e.t_ns) for e in record.history.dialogue if e.kind is EntryKind.SENT)
+    last_sent, sent_ns = max(sent, default=(0, 0))
     ready_ns = [one.t_ns for one in record.history.events(Event.BACKUP_READY)]
-    came = bool(ready_ns) and max(*ready_ns, *(one.opened_ns for one in record.adaptations), 0) <= sent_ns
+    came_ns = [*ready_ns, *(one.opened_ns for one in record.adaptations)]
+    came = bool(ready_ns) and max(came_ns) <= sent_ns
     newest: dict[str, tuple[str, int]] = {}  # by node: the journal, the last effect (0: none)
     for name in sorted(record.history.journals, key=_incarnation):
         last = 0
@@ -167,8 +167,6 @@ def _tracebacks(path: Path) -> Iterator[str]:
     for at, line in enumerate(lines):
         if line == TRACEBACK:
             error_line = next((one for one in lines[at + 1 :] if not one.startswith(" ")), "cut off")
-            if error_line.startswith(OF_HARNESS):
-                continue  # the run reports it itself; and at the end, the hub goes before its clients
             who = lines[at - 1] if at and lines[at - 1].endswith(":") else "a process:"
             yield f"{path.name} has a traceback of {who} {error_line}"
 

@@ -66,6 +66,22 @@ def test_as_it_is_it_passes(whole: Path) -> None:
     assert len(verdict.faults) == len(verdict.adaptations) == len(verdict.failovers) == 1
 
 
+@pytest.mark.parametrize(("crash_at", "adapt_at"), [(12, 0), (11, 0), (0, 12), (4, 12)])
+def test_a_server_that_came_after_the_last_request_has_no_effects(
+    tmp_path: Path, crash_at: int, adapt_at: int
+) -> None:
+    """As a new backup or by an adaptation, and there is nothing wrong with that."""
+    verdict = judge(read_record(write_run(tmp_path / "run", setup(crash_at=crash_at, adapt_at=adapt_at))))
+    assert (verdict.verdict, verdict.reasons) == ("pass", [])
+
+
+def test_a_journal_that_was_just_being_made_is_no_gap(tmp_path: Path) -> None:
+    path = write_run(tmp_path / "run", setup(crash_at=0))
+    (path / "journal" / "b.server.2.journal").touch()
+    seal.write(path)
+    assert judge(read_record(path)).reasons == []
+
+
 @given(data=st.data())
 def test_a_flipped_bit_is_told_by_the_seal(copy: Path, data: st.DataObject) -> None:
     path = data.draw(st.sampled_from([one for one in files(copy) if one.stat().st_size]))

@@ -22,11 +22,11 @@ from aftbed.vehicle.aeb.function import sample_requests
 SEED: Final = 3
 
 
-def setup(seed: int = SEED) -> Setup:
-    """Twelve requests, a crash and an adaptation, so that nothing in the record is empty."""
-    crash = parse("crash primary at server.exit nth 4")
-    to_lfr = Scheduled(Goal(expression="lfr"), at_request=8)
-    return Setup(seed=seed, count=12, rate_hz=400.0, faults=(crash,), adaptations=(to_lfr,))
+def setup(seed: int = SEED, crash_at: int = 4, adapt_at: int = 8) -> Setup:
+    """Twelve requests, a crash and an adaptation (0: none), so that nothing in the record is empty."""
+    faults = (parse(f"crash primary at server.exit nth {crash_at}"),) if crash_at else ()
+    adaptations = (Scheduled(Goal(expression="lfr"), at_request=adapt_at),) if adapt_at else ()
+    return Setup(seed=seed, count=12, rate_hz=400.0, faults=faults, adaptations=adaptations)
 
 
 def write_run(path: Path, given: Setup) -> Path:
