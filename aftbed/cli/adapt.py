@@ -18,11 +18,11 @@ from aftbed.adapt import commands
 from aftbed.adapt.commands import Wish, goal_of
 from aftbed.adapt.planner import APPLICATION, Plan, target
 from aftbed.adapt.planner import plan as plan_between
-from aftbed.adapt.plugins import characteristics_of
 from aftbed.adapt.script_file import ScriptFile, entry, mapping, phases, script_from
 from aftbed.adapt.suitability import remarks, unsuitable
-from aftbed.cli.options import Json, Recipe, Run, print_json, takes
+from aftbed.cli.options import Json, Recipe, Run, class_source, print_json, takes
 from aftbed.cli.views import EndedAdaptation, history_lines
+from aftbed.core.application import Characteristics
 from aftbed.core.errors import ConfigError
 from aftbed.core.graph import PLACEMENTS, BrickSpec, Graph
 from aftbed.core.messages import Goal, Scheduled
@@ -30,7 +30,6 @@ from aftbed.core.script import Script, Stage, Step, Together
 from aftbed.core.yaml_file import read_yaml
 from aftbed.ftm.compose import build
 from aftbed.runtime.unix import control_client, run_directory
-from aftbed.runtime.unix.options import load_module
 from aftbed.vehicle.aeb.function import default_application
 
 EXIT_CODES: Final = {"done": 0, "rolled back": 1, "refused": 2}
@@ -96,7 +95,10 @@ def update(
     run: Run = None,
     json: Json = False,
 ) -> None:
-    """Replace the class of one brick on every replica; the class may be newer than the run."""
+    """Replace the class of one brick on every replica; the class may be newer than the run.
+
+    To load it and to test it with recorded requests may take 5 s; then the adaptation is refused.
+    """
     given = ChangeArguments(expr="", recipe=recipe, force=force, may_fail=may_fail, run=run, json=json)
     raise typer.Exit(_change(Wish("update", brick, source), given))
 
@@ -118,7 +120,7 @@ def script(
 def _change(wish: Wish, given: ChangeArguments) -> int:
     private = run_directory.find(given.run)
     graph = msgspec.convert(control_client.ask(private, control_client.GraphQuery()), Graph)
-    goal = msgspec.structs.replace(goal_of(wish, graph, given.recipe, _source), may_fail=given.may_fail)
+    goal = msgspec.structs.replace(goal_of(wish, graph, given.recipe, class_source), may_fail=given.may_fail)
     application = goal.source if goal.part == APPLICATION else _function_of(graph)
     _refuse_unsuitable(goal.expression or graph.ftm, application, wish, force=given.force)
     return _ask(private, goal, as_json=given.json)
@@ -151,7 +153,7 @@ def scheduled(
         _refuse_unsuitable(new.ftm, _function_of(new), wish, force=force)
 
     try:
-        return commands.scheduled(texts, start, recipe, resolve=_source, judge=judge, may_fail=may_fail)
+        return commands.scheduled(texts, start, recipe, resolve=class_source, judge=judge, may_fail=may_fail)
     except ConfigError as error:
         raise ConfigError(f"--adapt {error}") from error
 
@@ -163,12 +165,11 @@ def _function_of(graph: Graph) -> str:
 def _refuse_unsuitable(ftm: str, application: str, wish: Wish, *, force: bool) -> None:
     """Raise ConfigError if `ftm` does not suit the function, unless `force`.
 
-    This is judged in the command: a class of the user is never loaded in the supervisor.
+    A class of the user is loaded neither here nor in the supervisor.
     """
     if wish.verb == "decompose" or (wish.verb == "update" and wish.name != APPLICATION):
         return  # the new graph needs no more of the function than the old one
-    built_in = default_application().characteristics
-    declared = characteristics_of(application, load_module) if application else built_in
+    declared = _declared_by(application) if application else default_application().characteristics
     if reason := unsuitable(ftm, declared):
         if not force:
             raise ConfigError(f"{reason}; --force does it all the same")
@@ -177,28 +178,22 @@ def _refuse_unsuitable(ftm: str, application: str, wish: Wish, *, force: bool) -
         print(f"aftbed: note: {remark}", file=sys.stderr)
 
 
-def _source(text: str, folder: Path | None = None) -> str:
-    """`FILE.py:CLASS` with the absolute path of the file, which is looked up in `folder`, here if left out.
+def _declared_by(application: str) -> Characteristics:
+    """Its process has as long as the run's processes will have. Raises ConfigError."""
+    # Imported here: no run waits for a judge at its start.
+    from aftbed.judge.isolated import LIMITS, declared_by  # noqa: PLC0415
+    from aftbed.runtime.script_executor import STAGE_SECONDS_MAX  # noqa: PLC0415
+    from aftbed.runtime.unix.trust import OWN_RUN  # noqa: PLC0415
 
-    Raises ConfigError if there is no such file.
-    """
-    place, colon, name = text.rpartition(":")
-    if not (colon and place and name.isidentifier()):
-        raise ConfigError(f"{text!r} names no class; MODULE:CLASS or FILE.py:CLASS is allowed")
-    if not place.endswith(".py"):
-        return text
-    path = ((folder or Path.cwd()) / place).resolve()
-    if not path.is_file():
-        raise ConfigError(f"{text}: {path}: no such file")
-    return f"{path}:{name}"
+    return declared_by(application, OWN_RUN, msgspec.structs.replace(LIMITS, seconds=STAGE_SECONDS_MAX))
 
 
 def _absolute(script: Script, folder: Path) -> Script:
     """`script`, with the classes that it names resolved against `folder`."""
 
     def brick(spec: BrickSpec) -> BrickSpec:
-        source = _source(spec.source, folder) if spec.source else ""
-        application = _source(spec.application, folder) if spec.application else ""
+        source = class_source(spec.source, folder) if spec.source else ""
+        application = class_source(spec.application, folder) if spec.application else ""
         return msgspec.structs.replace(spec, source=source, application=application)
 
     def resolved(verb: Step) -> Step:

@@ -302,7 +302,7 @@ def assumptions(folder: Folder, trust: TrustedFolders = None) -> None:
     """What each mechanism assumes, and the outcomes where that does not hold, as Markdown."""
     from aftbed.campaign.assumptions import markdown  # noqa: PLC0415 - scipy
 
-    print(shown(markdown(_ledger(folder), trusting(tuple(trust or ())))), end="")
+    print(shown(markdown(_ledger(folder), trusting(trust))), end="")
 
 
 # -- one experiment -------------------------------------------------------------------------------
@@ -317,7 +317,7 @@ def replay(
     Exit code: 0 the outcome is the same, 1 it is not, 2 usage.
     """
     before = ledger.find(_ledger(folder), experiment)
-    refuse_untrusted(before.experiment, trusting(tuple(trust or ())))
+    refuse_untrusted(before.experiment, trusting(trust))
     after = carry_out(before.experiment, lambda result: None)
     if json:
         print_json({"before": before, "after": after})

@@ -18,7 +18,7 @@ def check(
     json: Json = False,
 ) -> None:
     """Judge a recorded run again."""
-    verdict = judge_and_show(record, trusting(tuple(trust or ())), as_json=json)
+    verdict = judge_and_show(record, trusting(trust), as_json=json)
     raise typer.Exit(EXIT_CODES[verdict.verdict])
 
 

@@ -11,7 +11,6 @@ from typing import Annotated, Final
 import psutil
 import typer
 
-from aftbed.adapt.plugins import characteristics_of
 from aftbed.adapt.suitability import (
     TABLE,
     Demand,
@@ -25,12 +24,13 @@ from aftbed.adapt.suitability import (
     remarks,
     table_from,
 )
-from aftbed.cli.options import Json, check_range, print_json
+from aftbed.cli.options import Json, check_range, class_source, print_json
 from aftbed.core.errors import ConfigError
 from aftbed.core.graph import Graph
 from aftbed.core.yaml_file import read_yaml
 from aftbed.ftm.compose import EXPRESSIONS, build
-from aftbed.runtime.unix.options import load_module
+from aftbed.judge.isolated import declared_by
+from aftbed.runtime.unix.trust import OWN_RUN
 from aftbed.vehicle.aeb.function import default_application
 
 ftm = typer.Typer()
@@ -113,7 +113,7 @@ def check(
     """
     model, rules = fault_model(faults), _table(table)
     built_in = default_application().characteristics
-    declared = built_in if app is None else characteristics_of(app, load_module)
+    declared = built_in if app is None else declared_by(class_source(app), OWN_RUN)
     resources = _resources(cpus, cpu_load, bandwidth)
     others = consistent(model, declared, resources, rules)
     found = [] if expression is None else problems(expression, model, declared, resources, rules)

@@ -113,3 +113,19 @@ def print_json(document: object) -> None:
     except UnicodeEncodeError:
         text = json.dumps(json.loads(text))
     print(text)
+
+
+def class_source(text: str, folder: Path | None = None) -> str:
+    """`FILE.py:CLASS` with the absolute path of the file, which is looked up in `folder`, here if left out.
+
+    Raises ConfigError if there is no such file.
+    """
+    place, colon, name = text.rpartition(":")
+    if not (colon and place and name.isidentifier()):
+        raise ConfigError(f"{text!r} names no class; MODULE:CLASS or FILE.py:CLASS is allowed")
+    if not place.endswith(".py"):
+        return text
+    path = ((folder or Path.cwd()) / place).resolve()
+    if not path.is_file():
+        raise ConfigError(f"{text}: {path}: no such file")
+    return f"{path}:{name}"

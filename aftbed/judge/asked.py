@@ -127,7 +127,7 @@ def _drive(record: RunRecord) -> list[str] | None:
     lasted_s = drive.t_us / 1e6
     match drive.end:
         case "stopped" | None:
-            return [f"the drive was stopped after {lasted_s:g} s, and nobody had asked for it"]
+            return [f"the drive was stopped after {lasted_s:g} s, which was not asked for"]
         case "duration" if lasted_s < (lasts_s := load_scenario(work.scenario).duration_ms / 1e3):
             return [f"the drive ended after {lasted_s:g} of {lasts_s:g} s"]
     return []

@@ -484,7 +484,7 @@ def strangers(record: RunRecord) -> list[Stranger]:
 
 
 def check_no_forged_frames(evidence: Evidence) -> Check | None:
-    """G8: what a stranger sent in the name of a node of the run is a fault that nobody asked for.
+    """G8: what a stranger sent in the name of a node of the run is a fault that was not asked for.
 
     What the function then did proves nothing about what was asked for, unless the bus was open to all: then
     strangers are a part of it.
@@ -495,7 +495,7 @@ def check_no_forged_frames(evidence: Evidence) -> Check | None:
     forged = [f"{one} sent {counted(one.forged)}" for one in strangers(record) if one.forged]
     if not forged or record.options.bus_open:
         return Check("pass")
-    return Check("unknown", tuple(f"{one}, which nobody asked for" for one in forged[:REASONS_MAX]))
+    return Check("unknown", tuple(f"{one}, which was not asked for" for one in forged[:REASONS_MAX]))
 
 
 def counted(frames: Mapping[str, int]) -> str:

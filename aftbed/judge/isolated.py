@@ -89,44 +89,51 @@ def reference_of(
     sources = tuple(dict.fromkeys(source for _, source in changes if source))
     if not sources:
         return reference_run(record.history, Succession(loaded(changes, load_module)))
-    task = Execute(tuple(changes), tuple(requests_of(record.history)))
-    match _answer(task, sources, trust, limits):
-        case Replies(run):
-            return run
-        case Failed(reason):
-            return ReferenceRun((), b"", unknown=reason)
-        case Declared():
-            return ReferenceRun((), b"", unknown=_failed(sources, "it answered something else").reason)
-
-
-def declared_by(source: str, trust: Trust, limits: ProcessLimits = LIMITS) -> Characteristics:
-    """What the function `source` declares. Raises ConfigError if that is unknown."""
-    found = _answer(Describe(source), (source,), trust, limits)
-    if isinstance(found, Declared):
-        return found.characteristics
-    raise ConfigError(found.reason if isinstance(found, Failed) else f"{source}: it answered something else")
-
-
-def _answer(
-    task: Execute | Describe, sources: tuple[str, ...], trust: Trust, limits: ProcessLimits
-) -> Answer:
-    """Of a new process, which has ended then."""
     try:
         codes = tuple(vetted(source, trust) for source in sources)
     except ConfigError as error:
-        return Failed(str(error))
+        return ReferenceRun((), b"", unknown=str(error))
+    match _answer(Execute(tuple(changes), tuple(requests_of(record.history))), codes, limits):
+        case Replies(run):
+            return run
+        case Failed(reason):
+            return _unknown(sources, reason)
+        case Declared():
+            return _unknown(sources, "it answered something else")
+
+
+def _unknown(sources: tuple[str, ...], why: str) -> ReferenceRun:
+    reason = f"{', '.join(sources)} cannot be executed again: {why}"
+    return ReferenceRun((), b"", unknown=reason[: 2 * WORDS_MAX])
+
+
+def declared_by(source: str, trust: Trust, limits: ProcessLimits = LIMITS) -> Characteristics:
+    """What the function `source` declares. Raises ConfigError if that is unknown.
+
+    One outside of this package is asked in a process of its own, too.
+    """
+    code = vetted(source, trust)
+    if not code.files:
+        return characteristics_of(source, load_module)
+    match _answer(Describe(source), (code,), limits):
+        case Declared(characteristics):
+            return characteristics
+        case Failed(reason):
+            raise ConfigError(reason if source in reason else f"{source}: {reason}")
+        case Replies():
+            raise ConfigError(f"{source}: it answered something else")
+
+
+def _answer(task: Execute | Describe, codes: tuple[Code, ...], limits: ProcessLimits) -> Answer:
+    """Of a new process, which has ended then."""
     job = msgspec.msgpack.encode(Job(task, codes, tuple(search_path())))
     try:
         found: Answer = msgspec.msgpack.decode(ask(__name__, job, limits), type=Answer)
     except JobFailedError as error:
-        return _failed(sources, f"its process {error}")
+        return Failed(f"its process {error}")
     except (msgspec.DecodeError, RecursionError) as error:
-        return _failed(sources, f"its process answered what is no answer: {error}")
-    return _failed(sources, found.reason) if isinstance(found, Failed) else found
-
-
-def _failed(sources: tuple[str, ...], why: str) -> Failed:
-    return Failed(f"{', '.join(sources)} cannot be executed again: {why}"[: 2 * WORDS_MAX])
+        return Failed(f"its process answered what is no answer: {error}")
+    return found
 
 
 # -- in the process -------------------------------------------------------------------------------

@@ -133,7 +133,7 @@ def test_the_history_has_a_line_for_each_adaptation(fake: FakeRun, output: Outpu
         ("pbr", ("update", "after", "--to", ":C"), ("':C' names no class",)),
         ("pbr", ("update", "after", "--to", "m:C d"), ("'m:C d' names no class",)),
         ("pbr", ("update", "after", "--to", "gone.py:C"), ("gone.py:C", "no such file")),
-        ("pbr", ("update", "app", "--to", "no.such.module:C"), ("no.such.module:C: cannot be imported",)),
+        ("pbr", ("update", "app", "--to", "no.such.module:C"), ("C cannot be read: no module no",)),
         ("pbr", ("update", "app", "--to", f"{VARIANTS}:Calm"), ("has no class Calm", "Cautious")),
         (
             "pbr",

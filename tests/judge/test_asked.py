@@ -138,12 +138,12 @@ NOT_HAPPENED: Final[
     "drive to its end": [
         (
             lambda path: driven(path, "stopped", 1_500_000),
-            "the drive was stopped after 1.5 s, and nobody had asked for it",
+            "the drive was stopped after 1.5 s, which was not asked for",
         ),
         (lambda path: driven(path, "duration", 1_500_000), "the drive ended after 1.5 of 9 s"),
         (
             lambda _: judge(unfinished()),
-            "the drive was stopped after 2 s, and nobody had asked for it",
+            "the drive was stopped after 2 s, which was not asked for",
         ),
     ],
     "replay to its end": [

@@ -218,6 +218,15 @@ def test_what_a_function_declares_is_asked_in_another_process(tmp_path: Path) ->
     assert not declared_by(mine.source, trusting((tmp_path,))).deterministic
 
 
+@starts_process
+def test_a_function_that_is_never_loaded_declares_nothing(tmp_path: Path) -> None:
+    """Its module loops. The command that asks is told, and goes on."""
+    (tmp_path / "looping.py").write_text("while True: pass\nclass Mine: ...\n")
+    source = f"{tmp_path}/looping.py:Mine"
+    with pytest.raises(trust.ConfigError, match=f"{source}: its process takes more than 0.5 s"):
+        declared_by(source, OWN_RUN, ProcessLimits(seconds=0.5, memory_bytes=1 << 30))
+
+
 # -- trusted functions that go wrong --------------------------------------------------------------
 
 

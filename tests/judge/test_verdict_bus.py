@@ -35,7 +35,7 @@ def test_strangers_in_nobodys_name_are_told_and_change_nothing(path: Path, stran
 def test_with_forged_frames_a_run_proves_nothing(path: Path) -> None:
     verdict = drive(path, LISTENER, FORGER).verdict()
     assert (verdict.verdict, verdict.checks["no_forged_frames"]) == ("inconclusive", "unknown")
-    forged = "a stranger of user 1000 sent 5 AEB_REQ, 1 RADAR_TRACK, 2 0x7FF, which nobody asked for"
+    forged = "a stranger of user 1000 sent 5 AEB_REQ, 1 RADAR_TRACK, 2 0x7FF, which was not asked for"
     assert verdict.reasons == [f"no_forged_frames: {forged}"]
     assert verdict.strangers[1].forged == {"AEB_REQ": 5, "RADAR_TRACK": 1, "0x7FF": 2}
 

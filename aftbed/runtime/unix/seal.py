@@ -1,9 +1,9 @@
 """The seal of a record that is kept: the SHA-256 of each of its files, written when the run has ended.
 
-It shows that a file was changed, cut or removed since, by accident or by hand. It is no signature: whoever
-can write the record can write another seal, so the judge compares the sources with each other, too. `chain`
-is one value for the whole record, to be noted elsewhere: the hash of the names and hashes of the files, in
-order.
+It shows that a file was changed, cut or removed since, by accident or by hand. It is no signature: a user
+that can write the record can write another seal, so the judge compares the sources with each other, too.
+`chain` is one value for the whole record, to be noted elsewhere: the hash of the names and hashes of the
+files, in order.
 
 A record without a seal is that of a run whose command did not live to write it.
 """

@@ -1,9 +1,9 @@
 """Which code outside of the package a judge may execute, and how it is loaded.
 
-A record names the function that served a run. Whoever made the record chose that name, so a judge executes
-the code behind it only if the user has agreed: its files lie under a directory of `--trust`, or each of them
-has the SHA-256 of a file that this user has run. A run notes what it loads in its record (`note`), and its
-command keeps the hashes in a ledger of this user (`remember`).
+A record names the function that served a run. Its author chose that name, so a judge executes the code
+behind it only if the user has agreed: its files lie under a directory of `--trust`, or each of them has the
+SHA-256 of a file that this user has run. A run notes what it loads in its record (`note`), and its command
+keeps the hashes in a ledger of this user (`remember`).
 
 Code is found without executing any of it: the import system would execute the packages on the way to a
 module. It is executed from the very bytes that were hashed: neither a file that was exchanged meanwhile nor a
@@ -18,7 +18,7 @@ import os
 import stat
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from hashlib import sha256
 from importlib.machinery import ModuleSpec, PathFinder
 from importlib.util import module_from_spec, spec_from_file_location
@@ -54,12 +54,13 @@ NOBODY: Final = Trust()  # nobody's code but what this user has run
 OWN_RUN: Final = Trust(own_run=True)
 
 
-def trusting(folders: tuple[Path, ...]) -> Trust:
+def trusting(folders: Iterable[Path] | None) -> Trust:
     """For `--trust`. Raises ConfigError where one is no directory."""
-    for folder in folders:
+    given = tuple(folders or ())
+    for folder in given:
         if not folder.is_dir():
             raise ConfigError(f"--trust {folder}: no such directory")
-    return Trust(tuple(folder.resolve() for folder in folders))
+    return Trust(tuple(folder.resolve() for folder in given))
 
 
 # -- what a source executes -----------------------------------------------------------------------

@@ -29,6 +29,7 @@ from aftbed.vehicle.can.hub import (
     HubCounts,
     HubOptions,
     Stranger,
+    uid_by_sock_diag,
     user_behind,
 )
 
@@ -212,8 +213,18 @@ def test_a_kernel_that_does_not_say_gives_no_user(
 ) -> None:
     monkeypatch.setattr(hub_module, "_SOCK_DIAG_BY_FAMILY", 99)
     assert user_behind(pair[0]) is None
+
+
+def test_without_sock_diag_the_table_of_connections_is_read(
+    pair: tuple[socket.socket, socket.socket], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(hub_module, "_SOCK_DIAG", 31)
-    assert user_behind(pair[0]) is None
+    accepted, end = pair
+    with pytest.raises(OSError):
+        uid_by_sock_diag(end.getsockname(), accepted.getsockname())
+    assert user_behind(accepted) == user_behind(end) == ME
+    end.close()
+    assert user_behind(accepted) is None
 
 
 # -- limits
