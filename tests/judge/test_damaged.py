@@ -5,7 +5,6 @@ record means the same: see `meaning`.
 """
 
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
@@ -38,12 +37,15 @@ def files(record: Path) -> list[Path]:
     return sorted(path for path in record.rglob("*") if path.is_file() and path.name != seal.NAME)
 
 
-def places(record: Path) -> Iterator[tuple[Path, int]]:
+@pytest.fixture(scope="module")
+def places(copy: Path) -> list[tuple[Path, int]]:
     """Each byte that means something."""
-    for path in files(record):
-        for at in range(path.stat().st_size):
-            if path.parent.name != "journal" or not HEADER_USED <= at < HEADER_BYTES:
-                yield path, at
+    return [
+        (path, at)
+        for path in files(copy)
+        for at in range(path.stat().st_size)
+        if path.parent.name != "journal" or not HEADER_USED <= at < HEADER_BYTES
+    ]
 
 
 def passes_with_another_meaning(record: Path, original: Path) -> bool:
@@ -97,9 +99,9 @@ def test_a_flipped_bit_is_told_by_the_seal(copy: Path, data: st.DataObject) -> N
 
 @given(data=st.data())
 def test_a_flipped_bit_under_a_new_seal_changes_no_meaning(
-    copy: Path, whole: Path, data: st.DataObject
+    copy: Path, places: list[tuple[Path, int]], whole: Path, data: st.DataObject
 ) -> None:
-    path, at = data.draw(st.sampled_from(list(places(copy))))
+    path, at = data.draw(st.sampled_from(places))
     before = path.read_bytes()
     path.write_bytes(flipped(before, at, data.draw(st.integers(0, 7))))
     seal.write(copy)

@@ -279,8 +279,12 @@ class Supervisor:
         self._drain(time.monotonic_ns() + round(DRAIN_SECONDS_MAX * 1e9))
 
     def _drain(self, limit_ns: int) -> None:
-        """Wait until all is answered, and what fails or changes has come to its end; or to the limit."""
-        settled = self._work.settled and (self._lost or not self._controller.unrest())
+        """Wait until all is answered, and what fails or changes has come to its end; or to the limit.
+
+        Of a service that is lost, neither is waited for.
+        """
+        unrest = self._work.awaits_replies or bool(self._controller.unrest())
+        settled = self._work.ended and (self._lost or not unrest)
         command_gone = self._reason == COMMAND_GONE  # no process waits for a verdict
         if settled and self._looks_left:
             ask = self._deployment.ask_states(self._states)

@@ -110,7 +110,7 @@ class BusFaults:
 
 
 class Workload:
-    """`settled` becomes true when the source has ended and all its requests are answered."""
+    """`ended`: the source has. `awaits_replies`: some of its requests may still be answered."""
 
     deployment: Deployment  # set by the supervisor before anything is started
 
@@ -132,7 +132,8 @@ class Workload:
         self._result: object = None
         self._stats: dict[str, object] = {}
         self.telemetry: dict[str, object] | None = None
-        self.settled = False
+        self.ended, self.awaits_replies = False, True
+        self._stalled = False
         self._telemetries = 0
         self._progress: tuple[object, object] = (None, None)
         self._moved_ns = time.monotonic_ns()
@@ -237,6 +238,7 @@ class Workload:
             if self._stats.get("done"):
                 self._finish("")
             elif now_ns - self._moved_ns > STALL_SECONDS_MAX * 1e9:
+                self._stalled = True
                 self._log("stalled", f"no request was sent or answered for {STALL_SECONDS_MAX:g} s")
                 self._finish("")
             else:
@@ -264,7 +266,8 @@ class Workload:
         yield from self.deployment.ask("client", control.StopRequests)
         yield from self.bus.ask()
         yield from self._ask_stats()
-        self.settled = (self._result is not None or self._is_load) and not self._stats.get("unanswered", 1)
+        self.ended = self._result is not None or self._is_load
+        self.awaits_replies = not self._stalled and bool(self._stats.get("unanswered", 1))
 
     def end(self) -> dict[str, object]:
         """For the record."""
