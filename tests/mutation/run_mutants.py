@@ -13,6 +13,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import textwrap
 import time
 import venv
 from collections.abc import Iterable, Iterator, Sequence
@@ -40,6 +41,7 @@ SECONDS_MAX: Final = {
     Finder.PROCESS_TESTS: 300.0,
 }
 NO_TESTS: Final = 5  # exit code of pytest
+WIDTH: Final = 120  # of a line of a page
 BEGIN: Final = "<!-- mutants: written by make mutants -->"
 END: Final = "<!-- end of mutants -->"
 
@@ -205,16 +207,17 @@ def examined(names: Sequence[str], trees: Sequence[Tree]) -> Iterator[Row]:
 def markdown(rows: Sequence[Row], seconds: float) -> Iterator[str]:
     """The table, and above it the day, the machine, and who found how many."""
     about, today = here(), datetime.datetime.now(datetime.UTC).date()
-    yield (
+    text = (
         f"Measured on {today} by `make mutants` in {seconds / 60:.0f} minutes:"
-        f" {about.cpus}; {about.kernel.partition('-')[0]}; {about.python}; aftbed {code_version()}."
+        f" CPUs {about.cpus}; {about.kernel.partition('-')[0]}; {about.python}; aftbed {code_version()}. "
     )
     counts = (
         f"{finder.value} {sum(row.looks[finder].found for row in rows if finder in row.looks)} of"
         f" {sum(finder in row.looks for row in rows)}"
         for finder in Finder
     )
-    yield f"{len(rows)} bugs, {sum(row.survived for row in rows)} survived. Found by {', '.join(counts)}."
+    text += f"{len(rows)} bugs, {sum(row.survived for row in rows)} survived. Found by {', '.join(counts)}."
+    yield from textwrap.wrap(text, WIDTH)
     yield ""
     yield f"| bug | promise | {' | '.join(finder.value for finder in Finder)} |"
     yield f"|---|---|{'---|' * len(Finder)}"
