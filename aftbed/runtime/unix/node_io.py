@@ -31,7 +31,6 @@ import select
 import signal
 import sys
 import time
-import traceback
 from collections.abc import Callable
 from types import FrameType
 from typing import Final, NoReturn
@@ -158,9 +157,9 @@ class UnixIO(NodeIO[Inlet, int]):
             self.loop()
         except BrokenPipeError:
             os._exit(EXIT_FENCED)
-        except BaseException:  # noqa: BLE001 - the last frame of this process: nothing may leak out of it
+        except BaseException as error:  # noqa: BLE001 - the last frame of this process: nothing may leak out
             print(f"{self._node.name} (pid {os.getpid()}):", file=sys.stderr)
-            traceback.print_exc()
+            sys.excepthook(type(error), error, error.__traceback__)
             sys.stderr.flush()
             os._exit(EXIT_ASSERT)
 

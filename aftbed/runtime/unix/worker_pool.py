@@ -302,6 +302,7 @@ def _read(pipe: socket.socket, size: int) -> bytearray:
     return data
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Of an interpreter that `_Pool` has started."""
     os.set_inheritable(linux.INHERITED_FD, False)
     _work(int(sys.argv[1]), socket.socket(fileno=linux.INHERITED_FD))

@@ -24,7 +24,6 @@ functions touched. So only slots with a target have a track, limits are comparis
 """
 
 from collections.abc import Mapping, Set
-from dataclasses import dataclass
 from random import Random
 from struct import Struct
 from typing import Final
@@ -69,8 +68,7 @@ GROUND_SPEED_MAX_MS: Final = 2 * SPEED_MAX_MS
 ACCELERATION_MAX_MS2: Final = 50.0
 
 
-@dataclass(slots=True)
-class Track:
+class Track(msgspec.Struct, gc=False):
     """The target in one slot: an alpha-beta filter on its range and on its speed over ground.
 
     Over ground, because a standing car then stays a standing car while the ego brakes towards it. The
