@@ -68,8 +68,9 @@ def _at_rest(end: RunEnd) -> bool:
 
 
 def _comparable(record: RunRecord, reference: ReferenceRun) -> bool:
-    """Whether the states have to be the bare server's: each request was answered, and no bit was flipped."""
-    return reference.deterministic and not _flipped(record) and _all_answered(record, reference)
+    """Whether the states have to be the bare server's: each request is known and answered, no bit flipped."""
+    known = not record.history.dropped and not _flipped(record)
+    return known and reference.deterministic and _all_answered(record, reference)
 
 
 def _all_answered(record: RunRecord, reference: ReferenceRun) -> bool:
@@ -112,13 +113,13 @@ def gaps(record: RunRecord, reference: ReferenceRun) -> Iterator[str]:
 def effects_missing(record: RunRecord, end: RunEnd) -> Iterator[str]:
     """A Server's effects follow request on request; those of a replica at the end go up to the last request.
 
-    This is so where faults only end or stop processes, and each node hosts one Server. A Server that was put
-    aside by an adaptation which was undone has not seen what happened meanwhile. A Server has none if it
-    came after the last request, as a new backup or by an adaptation, or never came to be.
+    This is so where faults only end or stop processes, each node hosts one Server, and records found room. A
+    Server that was put aside by an adaptation which was undone has not seen what happened meanwhile. A Server
+    has none if it came after the last request, as a new backup or by an adaptation, or never came to be.
     """
     undone = _undone(record)
     stopped = all(report.action.stops_process for report in record.faults)
-    if undone or not stopped or record.options.placement == SINGLE:
+    if undone or not stopped or record.options.placement == SINGLE or record.history.dropped:
         return
     sent = ((e.request_id, e.t_ns) for e in record.history.dialogue if e.kind is EntryKind.SENT)
     last_sent, sent_ns = max(sent, default=(0, 0))
@@ -172,7 +173,10 @@ def _tracebacks(path: Path) -> Iterator[str]:
 
 
 def _of_requests(record: RunRecord) -> Iterator[str]:
-    """The dialogue against itself, the proxy, the servers and the seed."""
+    """The dialogue against itself, the proxy, the servers and the seed.
+
+    What one source has and another lacks proves nothing where records found no room: `whole_history` says so.
+    """
     work, seed = record.options.work, record.options.seed
     drawn = _drawn(seed) if isinstance(work, LoadRun) and not _flipped(record) else None
     sent_ns: dict[int, int] = {}
@@ -194,6 +198,9 @@ def _of_requests(record: RunRecord) -> Iterator[str]:
                 not_drawn.append(number)
     if backwards:
         yield f"{backwards} entries of the dialogue are earlier than the ones before them"
+    yield from (f"request {number}: not what seed {seed} draws" for number in not_drawn)
+    if record.history.dropped:
+        return
     effects = (one for name in record.history.journals for one in record.history.events_of(name, *EFFECTS))
     never = {one.request_id for one in effects} - sent_ns.keys() - {0}
     yield from (f"request {number}: executed, but never sent" for number in sorted(never))
@@ -204,7 +211,6 @@ def _of_requests(record: RunRecord) -> Iterator[str]:
         yield f"request {number}: answered under epoch {spans[number].epoch}, which the proxy did not accept"
     for number in _without(Event.SERVER_EXIT, spans, record.history, lambda r, s: True):
         yield f"request {number}: answered, and no server executed it meanwhile"
-    yield from (f"request {number}: not what seed {seed} draws" for number in not_drawn)
 
 
 class _Span(NamedTuple):
@@ -307,7 +313,8 @@ def _of_end(record: RunRecord, end: RunEnd) -> Iterator[str]:
         yield f"{end.leader or 'none'} led at the end, and {end.hosted.leader or 'none'} led the graph"
     if end.lost and end.states:
         yield f"no replica was left, and {' and '.join(end.states)} had a state"
-    if _at_rest(end) and end.client is not None and end.client.sent not in (None, len(ids)):
+    whole = not record.history.dropped
+    if whole and _at_rest(end) and end.client is not None and end.client.sent not in (None, len(ids)):
         yield f"the client sent {end.client.sent} requests, and its dialogue has {len(ids)}"
     if end.ended_ns:
         first_ns, last_ns = record.started_ns, end.ended_ns

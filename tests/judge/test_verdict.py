@@ -214,6 +214,19 @@ def test_a_history_that_is_not_whole_is_inconclusive(path: Path, name: str) -> N
     assert verdict.reasons == ["whole_history: 3 records found no room in the journals"]
 
 
+@pytest.mark.parametrize(("dropped", "expected"), [(0, "fail"), (2, "inconclusive")])
+def test_what_found_no_room_is_no_contradiction(path: Path, dropped: int, expected: str) -> None:
+    """The dialogue was full before the fourth request; without a word about that, the record is wrong."""
+    record = whole(path)
+    record.note("a.server.1", Event.SERVER_EXIT, 4)
+    record.note("proxy.1", Event.REPLY_ACCEPTED, 4, 1 << 8 | 1)
+    record.lose("client.1.dialogue", dropped)
+    verdict = record.verdict()
+    assert verdict.verdict == expected
+    told = any("request 4: executed, but never sent" in reason for reason in verdict.reasons)
+    assert told is (expected == "fail")
+
+
 def test_what_all_journals_have_dropped_is_added_up(path: Path) -> None:
     record = whole(path)
     for name in ("a.server.1.journal", "proxy.1.journal", "client.1.dialogue"):

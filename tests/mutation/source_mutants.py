@@ -303,6 +303,15 @@ MUTANTS: Final = (
         ("tests/process/test_tampered.py",),
     ),
     SourceMutant(
+        "what found no room in a journal is a contradiction",
+        "G8",
+        f"{JUDGE}/sources.py",
+        "    if record.history.dropped:\n        return\n",
+        "",
+        UNIT,
+        ("tests/judge/test_verdict.py",),
+    ),
+    SourceMutant(
         "a record's function is executed without trust",
         "G8",
         f"{UNIX}/trust.py",

@@ -464,7 +464,7 @@ def test_a_umask_opens_nothing_and_an_ignored_sigint_still_ends_a_run(home: Home
             control = until(lambda: [*home.path.glob("aftbed/*/control")], "the control socket")[0]
             assert [path.stat().st_mode & 0o777 for path in (control, control.parent)] == [0o600, 0o700]
             assert running.stdout is not None
-            while "started: " not in running.stdout.readline():
+            while " 0.50 s " not in running.stdout.readline():  # requests were sent by then
                 assert running.poll() is None
             running.send_signal(signal.SIGINT)
             out, _ = running.communicate(timeout=WAIT_SECONDS_MAX)
