@@ -28,7 +28,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 help:
 	@echo "make demo     install into $(VENV), drive a car whose server's primary is killed on the way"
-	@echo "make test     install with the tools of the tests, then lint, then process with fast beside it"
+	@echo "make test     install with the tools of the tests, then lint, fast and process"
 	@echo "make lint     ruff check, ruff format --check, mypy"
 	@echo "make fast     the tests without real runs"
 	@echo "make process  the tests that start real runs: a sample of their combinations"
@@ -41,11 +41,7 @@ help:
 demo: $(if $(wildcard $(EDITABLE)),$(EDITABLE),$(PLAIN))
 	$(BIN)/aftbed run --ftm pbr --scenario ccrs-50 --pace real --inject "$(FAULT)"
 
-# Real runs wait for much, and leave the cores half of the time: the others take that, and nothing more.
-test: lint
-	@log=$$(mktemp); nice -n 19 $(MAKE) --no-print-directory fast >$$log 2>&1 & \
-	$(MAKE) --no-print-directory process; code=$$?; \
-	wait $$! || code=$$?; cat $$log; rm -f $$log; exit $$code
+test: lint fast process
 
 lint: $(EDITABLE)
 	$(BIN)/ruff check .

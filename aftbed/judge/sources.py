@@ -24,6 +24,7 @@ from aftbed.core.errors import ConfigError
 from aftbed.core.events import FIRST_FAULT, Event
 from aftbed.core.input_file import open_input
 from aftbed.core.journal import EntryKind, History, Record
+from aftbed.core.script import RECIPES
 from aftbed.ftm.compose import build
 from aftbed.inject.receipts import fault_and_bits
 from aftbed.judge.record import RunEnd, RunRecord
@@ -36,6 +37,7 @@ from aftbed.vehicle.aeb.function import sample_requests
 
 PROCESSES_LOG: Final = "processes.log"
 PRINTED_BYTES_MAX: Final = 1_000_000  # that are searched: the first error counts
+DRAINED: Final = RECIPES[0]
 SINGLE: Final = "single"  # the placement whose only node hosts two Servers
 SERVER: Final = "/server"  # ends the name of its brick
 EFFECTS: Final = (Event.SERVER_EXIT, Event.STATE_RESTORED)
@@ -115,11 +117,12 @@ def effects_missing(record: RunRecord, end: RunEnd) -> Iterator[str]:
 
     This is so where faults only end or stop processes, each node hosts one Server, and records found room. A
     Server that was put aside by an adaptation which was undone has not seen what happened meanwhile. A Server
-    has none if it came after the last request, as a new backup or by an adaptation, or never came to be.
+    has none if it came after the last request, as a new backup or by an adaptation, or never came to be. The
+    recipe of the paper kills bricks with checkpoints inside.
     """
-    undone = _undone(record)
+    cut_short = _undone(record) or any(one.recipe != DRAINED for one in record.adaptations)
     stopped = all(report.action.stops_process for report in record.faults)
-    if undone or not stopped or record.options.placement == SINGLE or record.history.dropped:
+    if cut_short or not stopped or record.options.placement == SINGLE or record.history.dropped:
         return
     sent = ((e.request_id, e.t_ns) for e in record.history.dialogue if e.kind is EntryKind.SENT)
     last_sent, sent_ns = max(sent, default=(0, 0))
