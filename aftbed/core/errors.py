@@ -5,6 +5,7 @@ must not be believed, `HarnessError` for trouble of the testbed itself (exit cod
 failed `assert` is a bug of ours: it ends the node, because fail-silence is the fault model.
 """
 
+import difflib
 from collections.abc import Iterable
 
 
@@ -51,8 +52,6 @@ def spreadsheet_text(text: str) -> str:
 
 def unknown(what: str, found: str, allowed: Iterable[str]) -> ConfigError:
     """A `ConfigError` that names what was found, the nearest name that exists, and all allowed."""
-    import difflib  # noqa: PLC0415 - no node suggests a name
-
     names = sorted(allowed)
     near = difflib.get_close_matches(found, names, n=1, cutoff=0.5)
     hint = f"; did you mean {near[0]!r}?" if near else ""

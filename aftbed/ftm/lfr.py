@@ -19,6 +19,7 @@ Limit: while a follower is being replaced (by state transfer), the leader serves
 """
 
 from enum import auto
+from hashlib import blake2b
 from typing import ClassVar, Final
 
 from aftbed.core.brick import (
@@ -47,11 +48,6 @@ from aftbed.core.messages import (
 )
 from aftbed.ftm.chain import COMPUTE, lead, learn_duplex, promote, promote_at_once
 from aftbed.ftm.declaration import BrickKind, Emits, Mechanism, Suitability
-
-try:
-    from _blake2 import blake2b  # hashlib's: with it comes OpenSSL, for 4 ms in each start of a run
-except ImportError:
-    from hashlib import blake2b
 
 DIGEST_BYTES: Final = 16
 

@@ -44,7 +44,7 @@ from datetime import UTC, datetime
 from enum import Enum
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Final, NoReturn
+from typing import Final
 
 import msgspec
 
@@ -690,6 +690,5 @@ def convert(
     return Conversion(read_as, write_as, len(kept.frames), kept.left_out)
 
 
-def main() -> NoReturn:
-    """Of the process that `ask` has started."""
+if __name__ == "__main__":
     serve(_read_mf4_here)

@@ -8,7 +8,7 @@ anything but MessagePack of the declared type, the replies of the function are u
 import sys
 from collections.abc import Callable
 from types import ModuleType
-from typing import Final, NoReturn
+from typing import Final
 
 import msgspec
 
@@ -164,6 +164,5 @@ def _done(job: Job) -> Answer:
             return Declared(characteristics_of(source, load_code))
 
 
-def main() -> NoReturn:
-    """Of the process that `ask` has started."""
+if __name__ == "__main__":
     serve(work)

@@ -118,33 +118,35 @@ def effects_missing(record: RunRecord, end: RunEnd) -> Iterator[str]:
     This is so where faults only end or stop processes, each node hosts one Server, and records found room. A
     Server that was put aside by an adaptation which was undone has not seen what happened meanwhile. A Server
     has none if it came after the last request, as a new backup or by an adaptation, or never came to be. The
-    recipe of the paper kills bricks with checkpoints inside.
+    recipe of the paper destroys bricks with what is inside them.
     """
-    cut_short = _undone(record) or any(one.recipe != DRAINED for one in record.adaptations)
     stopped = all(report.action.stops_process for report in record.faults)
-    if cut_short or not stopped or record.options.placement == SINGLE or record.history.dropped:
+    if _undone(record) or not stopped or record.options.placement == SINGLE or record.history.dropped:
         return
+    destroyed_ns = [one.opened_ns for one in record.adaptations if one.recipe != DRAINED]
     sent = ((e.request_id, e.t_ns) for e in record.history.dialogue if e.kind is EntryKind.SENT)
     last_sent, sent_ns = max(sent, default=(0, 0))
     ready_ns = [one.t_ns for one in record.history.events(Event.BACKUP_READY)]
     came_ns = [*ready_ns, *(one.opened_ns for one in record.adaptations)]
     came = bool(ready_ns) and max(came_ns) <= sent_ns
-    newest: dict[str, tuple[str, int]] = {}  # by node: the journal, the last effect (0: none)
+    newest: dict[str, tuple[str, int, int]] = {}  # by node: the journal, the last effect (0: none), its time
     for name in sorted(record.history.journals, key=_incarnation):
-        last = 0
+        last, last_ns = 0, 0
         for one in record.history.events_of(name, *EFFECTS):
-            if last and one.request_id > last + 1:
+            lost = any(last_ns < t_ns < one.t_ns for t_ns in destroyed_ns)
+            if last and one.request_id > last + 1 and not lost:
                 yield f"the journal {name} lacks what was between requests {last} and {one.request_id}"
-            last = one.request_id
+            last, last_ns = one.request_id, one.t_ns
         node = name.rpartition(".")[0]
         if last or node in newest:
-            newest[node] = name, last
+            newest[node] = name, last, last_ns
     if _at_rest(end) and end.states:
         serving = [replica for replica in (end.leader, end.backup) if replica]
         yield from (
             f"the journal {name} ends with request {last}, and {last_sent} was the last one"
-            for node, (name, last) in newest.items()
+            for node, (name, last, last_ns) in newest.items()
             if last != last_sent and (last or came) and node.partition(".")[0] in serving
+            if last_ns >= max(destroyed_ns, default=0)
         )
 
 

@@ -14,10 +14,11 @@ from hypothesis import strategies as st
 from writtenruns import SEED, meaning, setup, write_run
 
 from aftbed.core.errors import ConfigError
-from aftbed.core.journal import HEADER_BYTES
+from aftbed.core.journal import HEADER_BYTES, RECORD
 from aftbed.judge.record import read_record
 from aftbed.judge.verdict import judge
 from aftbed.runtime.unix import seal
+from aftbed.runtime.unix.run_directory import HISTORY_NAME
 
 HEADER_USED: Final = 200  # of a journal's first page, what it has room for is empty
 
@@ -82,6 +83,31 @@ def test_a_journal_that_was_just_being_made_is_no_gap(tmp_path: Path) -> None:
     (path / "journal" / "b.server.2.journal").touch()
     seal.write(path)
     assert judge(read_record(path)).reasons == []
+
+
+@pytest.mark.parametrize(
+    ("recipe", "lost", "reasons"),
+    [
+        ("drained", 9, ["the journal b.server.1 lacks what was between requests 8 and 10"]),
+        ("paper", 9, []),
+        ("paper", 4, ["the journal b.server.1 lacks what was between requests 3 and 5"]),
+    ],
+)
+def test_only_the_recipe_of_the_paper_may_lose_a_checkpoint(
+    tmp_path: Path, recipe: str, lost: int, reasons: list[str]
+) -> None:
+    """At its turn: it destroys bricks with what is inside them."""
+    path = write_run(tmp_path / "run", setup(crash_at=0))
+    journal = path / "journal" / "b.server.1.journal"
+    whole = journal.read_bytes()
+    records = [whole[at : at + RECORD.size] for at in range(HEADER_BYTES, len(whole), RECORD.size)]
+    kept = [one for one in records if RECORD.unpack(one)[1] != lost]
+    journal.write_bytes(whole[:HEADER_BYTES] + b"".join(kept))
+    for name in ("run.json", HISTORY_NAME):
+        told = path / name
+        told.write_text(told.read_text().replace("drained", recipe))
+    seal.write(path)
+    assert judge(read_record(path)).reasons == [f"sources_agree: {one}" for one in reasons]
 
 
 @given(data=st.data())

@@ -193,7 +193,7 @@ def test_adaptations_that_were_asked_for_beforehand(home: Home) -> None:
 
 
 def test_a_second_adaptation_is_refused_while_one_is_under_way(run: Command, tmp_path: Path) -> None:
-    (tmp_path / "slow.py").write_text("import time\ntime.sleep(0.7)\n" + BRICK.format(limit=10**9))
+    (tmp_path / "slow.py").write_text("import time\ntime.sleep(1.5)\n" + BRICK.format(limit=10**9))
     update = ("adapt", "update", "proceed", "--to", f"{tmp_path}/slow.py:Counting")
     with subprocess.Popen([sys.executable, "-m", "aftbed", *update], stdout=subprocess.DEVNULL) as first:
         run.wait_for_line("adapt: 1: update proceed")

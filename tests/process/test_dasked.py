@@ -65,7 +65,6 @@ def cluster(folder: Path, workers: int) -> Iterator[tuple[str, list[subprocess.P
             process.communicate()
 
 
-@pytest.mark.deep  # the next two run a cluster each time
 def test_a_cluster_comes_to_the_same_results(tmp_path: Path) -> None:
     found = planned(tmp_path)
     here = ran(found, tmp_path / "here")
@@ -146,7 +145,6 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.deep
 def test_a_local_cluster_comes_to_the_same_results(tmp_path: Path) -> None:
     """Dask's own way to have a few workers, what a user tries first: here in a process of its own."""
     found = planned(tmp_path)

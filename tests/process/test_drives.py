@@ -8,7 +8,7 @@ from typing import Final
 
 import pytest
 from liveruns import Done, aftbed
-from sampling import every, sampled
+from sampling import sampled
 
 from aftbed.core.journal import EntryKind
 from aftbed.judge.record import read_record
@@ -106,7 +106,7 @@ def test_a_crash_changes_nothing_on_the_bus() -> None:
     assert without_heartbeats(crashed) == bus_log_under("pbr process")
 
 
-@pytest.mark.parametrize("policy", every(3, ["hold", "release", "latch"]))
+@pytest.mark.parametrize("policy", ["hold", "release", "latch"])
 def test_a_brake_policy_does_not_matter_while_requests_come(policy: str) -> None:
     verdict = passed("--scenario", "ccrs-20", "--pace", "max", "--brake-policy", policy).verdict()
     assert verdict.vehicle is not None

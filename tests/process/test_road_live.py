@@ -6,7 +6,6 @@ import pytest
 from liveruns import Done, aftbed
 from paintedlog import WHY_NOT, painted, real_drive
 from puredrive import TOYOTA_DBC, TOYOTA_LOG
-from sampling import every
 
 from aftbed.runtime.sim.world import Setup, simulate
 from aftbed.vehicle.can.candump import log_line
@@ -25,7 +24,7 @@ def passed(*arguments: str | Path) -> Done:
     return done
 
 
-@pytest.mark.parametrize("case", every(2, CASES), ids=lambda case: case.name)
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 def test_a_row_comes_to_the_same_on_real_processes_and_in_the_simulator(case: Case) -> None:
     """But for the millisecond that a reply takes in the simulator, at the speed at which the gap closes."""
     vehicle = passed("--scenario", case.name, "--ftm", "none", "--seed", "5").verdict().vehicle

@@ -45,7 +45,7 @@ class JobFailedError(Exception):
 
 
 def ask(module: str, job: bytes, limits: ProcessLimits) -> bytes:
-    """The answer of `module`, whose `main` calls `serve`. Raises JobFailedError."""
+    """The answer of `module`, which is executed and calls `serve`. Raises JobFailedError."""
     ours, theirs = socket.socketpair()
     with ours:
         with theirs:

@@ -128,22 +128,10 @@ def use_batch_scheduling() -> None:
     os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
 
 
-# msgspec imports typing_extensions if it is there, and with it inspect and ast: 8 of the 105 ms that the
-# imports of a run take. It needs neither. What is imported later finds typing_extensions as ever.
-_BEGIN: Final = """\
-import sys
-sys.modules["typing_extensions"] = None
-import msgspec
-del sys.modules["typing_extensions"]
-__import__(sys.argv.pop(1), fromlist=["main"]).main()
-"""
-
-
 def start_interpreter(module: str, descriptor: int, *arguments: str) -> int:
-    """Start an interpreter that calls `main()` of `module`; its pid.
+    """Start `python -m module arguments`, which gets `descriptor` as `INHERITED_FD`; its pid.
 
-    It gets `descriptor` as `INHERITED_FD`, and the arguments in `sys.argv`. The module is that of this very
-    package: the working directory is not searched (`-P`).
+    The module is that of this very package: the working directory is not searched (`-P`).
     """
     home, environment = str(Path(__file__).resolve().parents[3]), dict(os.environ)
     if home not in site.getsitepackages():
@@ -151,7 +139,7 @@ def start_interpreter(module: str, descriptor: int, *arguments: str) -> int:
         environment["PYTHONPATH"] = os.pathsep.join((home, path)) if path else home
     return os.posix_spawn(
         sys.executable,
-        [sys.executable, "-P", "-c", _BEGIN, module, *arguments],
+        [sys.executable, "-P", "-m", module, *arguments],
         environment,
         file_actions=[(os.POSIX_SPAWN_DUP2, descriptor, INHERITED_FD)],
     )

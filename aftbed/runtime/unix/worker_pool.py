@@ -302,7 +302,6 @@ def _read(pipe: socket.socket, size: int) -> bytearray:
     return data
 
 
-def main() -> None:
-    """Of an interpreter that `_Pool` has started."""
+if __name__ == "__main__":
     os.set_inheritable(linux.INHERITED_FD, False)
     _work(int(sys.argv[1]), socket.socket(fileno=linux.INHERITED_FD))

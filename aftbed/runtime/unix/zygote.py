@@ -173,6 +173,5 @@ def _make_device(order: control.Assign, node: UnixNode) -> Device:
     return make_source(client, msgspec.msgpack.decode(order.options, type=SourceOptions))
 
 
-def main() -> NoReturn:
-    """Of an interpreter that the supervisor has started."""
+if __name__ == "__main__":
     run(int(sys.argv[1]), [int(cpu) for cpu in sys.argv[2].split(",")], tuple(sys.argv[3:]))
