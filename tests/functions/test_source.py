@@ -32,7 +32,7 @@ def test_each_form(text: str, kind: FunctionKind, place: str, part: str) -> None
 
 @pytest.mark.parametrize("text", ["", "  ", "mine", ":Class", "module:", "module:no-name", "no/such/file"])
 def test_what_names_no_function(text: str) -> None:
-    with pytest.raises(ConfigError, match="names no function; MODULE:CLASS, FILE.py:CLASS, FILE.so, "):
+    with pytest.raises(ConfigError, match=r"names no function; MODULE:CLASS, FILE\.py:CLASS, FILE\.so, "):
         parse_source(text)
 
 
