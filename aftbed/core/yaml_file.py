@@ -175,6 +175,8 @@ def _describe(allowed: inspect.Type) -> str:
             return "a whole number" + _limits(allowed)
         case inspect.StructType():
             return "keys and values: " + ", ".join(_keys(allowed))
+        case inspect.DictType():
+            return "keys and values"
         case inspect.ListType() | inspect.VarTupleType():
             return "a list"
         case inspect.StrType():

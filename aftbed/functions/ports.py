@@ -110,7 +110,7 @@ class PortsFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     reply: tuple[ReplyField, ...]
     request: tuple[RequestField, ...] = ()
     step_s: StepSeconds | None = None
-    start: dict[str, object] = {}
+    start: dict[object, object] = {}  # a name may look like a number
     characteristics: DeclaredCharacteristics = DeclaredCharacteristics()
 
 
@@ -281,7 +281,7 @@ class _Binding:
             names = [one.name for one in found]
             if double := next((name for name in names if names.count(name) > 1), None):
                 raise self._error(key, f"{double!r} more than once", "a variable once")
-        start = [self._started(name, value) for name, value in self._file.start.items()]
+        start = [self._started(str(name), value) for name, value in self._file.start.items()]
         return Ports(self._file, inputs, outputs, start, self._characteristics(has_state))
 
     def _check_lengths(self) -> None:

@@ -342,6 +342,24 @@ def test_a_state_that_the_library_does_not_give_is_found_at_the_start(make: Make
     assert "its state cannot be captured: fmi2GetFMUstate failed with status 3" in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("mark", "time_s", "before"),
+    [
+        (b"FMU0", 1.0, b""),
+        (b"FMU1", float("nan"), b""),
+        (b"FMU1", float("inf"), b""),
+        (b"FMU1", -1.0, b""),
+        (b"FMU1", 1.0, b"1234"),  # there is no field with a time
+    ],
+)
+def test_a_state_has_a_sound_header(make: Make, mark: bytes, time_s: float, before: bytes) -> None:
+    model = make()()
+    state = model.capture()
+    with pytest.raises(PeerError, match="not a state of this model"):
+        model.restore(struct.pack("<4sdB8s", mark, time_s, len(before), before) + state[21:])
+    assert model.capture() == state
+
+
 @pytest.fixture
 def model(make: Make) -> Application:
     return make()()
@@ -617,6 +635,7 @@ def run_python(code: str, *arguments: object) -> str:
     words = [sys.executable, "-c", textwrap.dedent(code), *map(str, arguments)]
     path = str(Path(aftbed.__file__).parents[1])
     environment = {**os.environ, "PYTHONPATH": path}
+    environment.pop("OPENBLAS_NUM_THREADS", None)
     return subprocess.run(
         words, env=environment, check=True, timeout=60, stdout=subprocess.PIPE, text=True
     ).stdout

@@ -1,5 +1,6 @@
 """The map of a model's ports: what it refuses, and the bytes that it reads and writes."""
 
+import re
 import struct
 from pathlib import Path
 from typing import Final
@@ -8,7 +9,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from aftbed.core.application import Field
+from aftbed.core.application import Characteristics, Field, approximate
 from aftbed.core.errors import ConfigError, PeerError
 from aftbed.core.yaml_file import read_yaml
 from aftbed.functions.ports import FIELDS_MAX, Kind, Ports, PortsFile, Variable, bind
@@ -170,6 +171,8 @@ def bound(path: Path, text: str, has_state: bool = True) -> Ports:
         ),
         # the values at the start
         (GOOD + "start: {mas: 1}\n", f"start: found 'mas', allowed is {STARTS}; did you mean 'mass'?"),
+        (GOOD + "start: {1: 2}\n", f"start: found '1', allowed is {STARTS}"),
+        (GOOD + "start: [1]\n", "line 7: start: found [1], allowed is keys and values"),
         (GOOD + "start: {mass: heavy}\n", "start.mass: found 'heavy', allowed is a finite number, for Real"),
         (GOOD + "start: {mass: true}\n", "start.mass: found True, allowed is a finite number, for Real"),
         (GOOD + "start: {mass: .nan}\n", "start.mass: found nan, allowed is a finite number, for Real"),
@@ -207,6 +210,19 @@ def test_a_model_with_many_ports_is_not_listed_as_a_whole(tmp_path: Path) -> Non
     path.write_text(GOOD)
     with pytest.raises(ConfigError, match=r"\(u00, u01, .*, u19, and 30 more\)$"):
         bind(path, read_yaml(path, PortsFile), MODEL, many, True)
+
+
+def test_the_example_of_the_page_is_a_map(tmp_path: Path) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "functions.md").read_text()
+    (example,) = re.findall(r"```yaml\n(request:.*?)```", page, re.DOTALL)
+    path = tmp_path / "ports.yaml"
+    path.write_text(example)
+    mode = variable("mode", "Integer", "integer", "discrete output")
+    ports = bind(path, read_yaml(path, PortsFile), MODEL, [*VARIABLES, mode], True)
+    assert ports.read_request(struct.pack("<IdBH", 7, 25.0, 1, 0), b"").values == [25.0, True]
+    assert ports.characteristics == Characteristics(state_access=approximate(1e-9))
+    reply = ports.write_reply([1.5, 2])
+    assert reply == struct.pack("<fB", 1.5, 2) and not ports.acceptable(reply)
 
 
 VALUES: Final = {
