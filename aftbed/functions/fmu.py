@@ -36,7 +36,7 @@ from xml.etree import ElementTree
 
 import msgspec
 
-from aftbed.core.application import AccessKind, Application, Characteristics, Field
+from aftbed.core.application import STATE_BYTES_MAX, AccessKind, Application, Characteristics, Field
 from aftbed.core.errors import ConfigError, PeerError, shown
 from aftbed.core.input_file import open_input
 from aftbed.core.yaml_file import read_yaml
@@ -67,7 +67,7 @@ _WHOLE: Final[Mapping[str, tuple[float, float]]] = {
 _FLOAT32_MAX: Final = 3.4028234663852886e38
 
 
-class FmuError(Exception):
+class FmuFailedError(Exception):
     """The model failed: a fault of the replica that hosts it. The text says what happened, with its log."""
 
 
@@ -99,12 +99,12 @@ class FmuFunction:
             files = self._shared = _Unpacked(self._model, self._description)
         try:
             application = FmuApplication(self._model, self._description, self._ports, files)
-        except FmuError as error:
+        except FmuFailedError as error:
             raise ConfigError(str(error)) from error
         if self.characteristics.state_access.kind is not AccessKind.NONE:
             try:
                 application.capture()
-            except FmuError as error:
+            except FmuFailedError as error:
                 found = self.characteristics.state_access.kind.value
                 key = f"{self._ports_path}: characteristics.state_access"
                 raise ConfigError(f"{key}: found {found}, allowed is none: {error}") from error
@@ -156,6 +156,8 @@ class FmuApplication:
         _LOG.clear()
         with self._failing("its state cannot be captured"):
             state = self._model.save()
+            if len(state) > STATE_BYTES_MAX - _STATE.size:
+                raise ValueError(f"{len(state)} bytes, allowed are {STATE_BYTES_MAX - _STATE.size}")
         before = self._time_before
         return _STATE.pack(_MARK, self._time_s, len(before), before) + state
 
@@ -189,7 +191,7 @@ class FmuApplication:
 
     @contextlib.contextmanager
     def _failing(self, when: str) -> Iterator[None]:
-        """What goes wrong in the model becomes an FmuError; its instance is not used any more, nor freed."""
+        """What goes wrong in the model ends its use, as FmuFailedError. The instance is not freed then."""
         try:
             yield
         except PeerError:
@@ -197,7 +199,7 @@ class FmuApplication:
         except Exception as error:
             if self._free is not None:
                 self._free.detach()
-            raise FmuError(f"{self._name}: {when}: {str(error).rstrip('.')}{_LOG.text()}") from error
+            raise FmuFailedError(f"{self._name}: {when}: {str(error).rstrip('.')}{_LOG.text()}") from error
 
 
 def _by_type(variables: Sequence[Variable]) -> list[tuple[str, list[int], list[int]]]:

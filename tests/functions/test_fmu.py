@@ -22,7 +22,7 @@ import aftbed
 from aftbed.core.application import EXACT, NONE, Application, Field, approximate, reply_fields_of
 from aftbed.core.errors import ConfigError, PeerError
 from aftbed.functions import fmu
-from aftbed.functions.fmu import FmuError, fmu_function
+from aftbed.functions.fmu import FmuFailedError, fmu_function
 
 SOURCES: Final = Path(__file__).parent / "fmus"
 STATE: Final = {
@@ -239,7 +239,7 @@ def test_a_request_is_refused_whose_number_the_variable_cannot_hold(make: Make) 
 def test_a_failure_of_the_model_is_no_refusal(make: Make, version: int, fault: str, what: str) -> None:
     model = make(version)()
     model.execute(request())
-    with pytest.raises(FmuError, match=what.format(version=version)) as caught:
+    with pytest.raises(FmuFailedError, match=what.format(version=version)) as caught:
         model.execute(request(fault=1 + FAULTS.index(fault)))
     assert not isinstance(caught.value, PeerError)
     assert "integral.fmu: at 0.5 s, in a step of 0.5 s: " in str(caught.value)
@@ -250,7 +250,7 @@ def test_a_failure_comes_with_the_log_of_the_model(make: Make) -> None:
     models = [make(2)(), make(3)()]
     logs = ["fault 1 at 0 s, expected 0.5 s", "it does not go on"]
     for model, log in zip(models, logs, strict=True):
-        with pytest.raises(FmuError) as caught:
+        with pytest.raises(FmuFailedError) as caught:
             model.execute(request(fault=1))
         assert str(caught.value).endswith(f"; its log: {log}")
 
@@ -261,13 +261,13 @@ def test_a_failure_comes_with_the_log_of_the_model(make: Make) -> None:
 )
 def test_a_model_of_fmi_3_may_stop_without_an_error(make: Make, fault: str, what: str) -> None:
     model = make(3)()
-    with pytest.raises(FmuError, match=f"{what} at 0.5 s"):
+    with pytest.raises(FmuFailedError, match=f"{what} at 0.5 s"):
         model.execute(request(fault=1 + FAULTS.index(fault)))
 
 
 def test_an_output_that_does_not_fit_is_a_failure(make: Make) -> None:
     ports = "step_s: 1\nrequest: [{type: f64, variable: u}]\nreply: [{type: f32, variable: total}]\n"
-    with pytest.raises(FmuError, match=r"output total: 1e\+300 does not fit into f32"):
+    with pytest.raises(FmuFailedError, match=r"output total: 1e\+300 does not fit into f32"):
         make(ports=ports)().execute(struct.pack("<d", 1e300))
 
 
@@ -340,6 +340,12 @@ def test_a_state_that_the_library_does_not_give_is_found_at_the_start(make: Make
         function()
     assert "ports.yaml: characteristics.state_access: found exact, allowed is none: " in str(caught.value)
     assert "its state cannot be captured: fmi2GetFMUstate failed with status 3" in str(caught.value)
+
+
+def test_a_state_has_a_limit(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fmu, "STATE_BYTES_MAX", 60)
+    with pytest.raises(ConfigError, match="its state cannot be captured: 56 bytes, allowed are 39"):
+        make()()
 
 
 @pytest.mark.parametrize(
@@ -695,7 +701,7 @@ def test_an_fmu_of_pythonfmu(tmp_path: Path) -> None:
         import sys
         from pathlib import Path
         from struct import pack, unpack
-        from aftbed.functions.fmu import FmuError, fmu_function
+        from aftbed.functions.fmu import FmuFailedError, fmu_function
         function = fmu_function(Path(sys.argv[1]), Path(sys.argv[2]))
         first, second = function(), function()
         print(first.characteristics.state_access)
@@ -705,7 +711,7 @@ def test_an_fmu_of_pythonfmu(tmp_path: Path) -> None:
         print(*unpack("<2d", second.execute(pack("<d", 1.0))))
         try:
             first.execute(pack("<d", 101.0))
-        except FmuError as error:
+        except FmuFailedError as error:
             print("too much" in str(error), "fmi2DoStep failed" in str(error))
         """
     found = run_python(code, tmp_path / "Adder.fmu", tmp_path / "ports.yaml").split("\n")
