@@ -37,7 +37,7 @@ from xml.etree import ElementTree
 import msgspec
 
 from aftbed.core.application import STATE_BYTES_MAX, AccessKind, Application, Characteristics, Field
-from aftbed.core.errors import ConfigError, PeerError, shown
+from aftbed.core.errors import ConfigError, FunctionFailedError, PeerError, shown
 from aftbed.core.input_file import open_input
 from aftbed.core.yaml_file import read_yaml
 from aftbed.functions.ports import Kind, Ports, PortsFile, Value, Variable, bind
@@ -67,7 +67,7 @@ _WHOLE: Final[Mapping[str, tuple[float, float]]] = {
 _FLOAT32_MAX: Final = 3.4028234663852886e38
 
 
-class FmuFailedError(Exception):
+class FmuFailedError(FunctionFailedError):
     """The model failed: a fault of the replica that hosts it. The text says what happened, with its log."""
 
 

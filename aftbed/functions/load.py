@@ -6,7 +6,7 @@ from collections.abc import Callable
 from importlib.machinery import SourceFileLoader
 from pathlib import Path
 from types import CodeType, ModuleType
-from typing import Final
+from typing import Final, assert_never
 
 from aftbed.core.application import REPLY_BYTES_MAX, STATE_BYTES_MAX, Application, Characteristics
 from aftbed.core.errors import ConfigError
@@ -101,14 +101,19 @@ def load_application(source: str, code: Code) -> Callable[[], Application]:
             from aftbed.functions.program import program_function  # noqa: PLC0415
 
             return program_function(named.place)
+        case FunctionKind.MODEL:
+            from aftbed.functions.fmu import fmu_function  # noqa: PLC0415
+
+            return fmu_function(Path(named.place), Path(named.part))
         case _:
-            raise ConfigError(f"{source} names no class (MODULE:CLASS or FILE.py:CLASS)")
+            assert_never(named.kind)
 
 
 def characteristics_of(source: str, code: Code) -> Characteristics:
     """What the protected function of `source` declares. Raises ConfigError if it declares nothing."""
     make = load_application(source, code)
-    declared: object = getattr(make if isinstance(make, type) else make(), "characteristics", None)
+    told = make if hasattr(make, "characteristics") else make()
+    declared: object = getattr(told, "characteristics", None)
     if not isinstance(declared, Characteristics):
         raise ConfigError(f"{source}: characteristics: found {declared!r}, allowed is Characteristics(...)")
     return declared

@@ -1,7 +1,7 @@
 """Executes a function that a record names: only if it is trusted, and in a process of its own.
 
 Code that is not trusted is not executed at all (`runtime.unix.trust`). The process of code that is trusted
-has limits (`runtime.unix.confined`), and writes no byte into a file. When it crashes, hangs or answers
+has limits (`runtime.unix.confined`); a class writes no byte into a file. When it crashes, hangs or answers
 anything but MessagePack of the declared type, the replies of the function are unknown, with the reason.
 """
 
@@ -41,6 +41,7 @@ from aftbed.runtime.unix.trust import (
 )
 
 WORDS_MAX: Final = 300  # characters of what went wrong
+OPAQUE_FILE_BYTES: Final = 1 << 30  # a model is unpacked; a program may keep a log
 LIMITS: Final = ProcessLimits(seconds=120.0, memory_bytes=4 << 30, file_bytes=0)
 
 
@@ -139,6 +140,8 @@ def declared_by(source: str, trust: Trust, limits: ProcessLimits = LIMITS) -> Ch
 def _answer(task: Execute | Describe, codes: tuple[VettedFiles, ...], limits: ProcessLimits) -> Answer:
     """Of a new process, which has ended then."""
     job = msgspec.msgpack.encode(Job(task, codes, tuple(search_path())))
+    if any(not file.module for code in codes for file in code.files):
+        limits = msgspec.structs.replace(limits, file_bytes=OPAQUE_FILE_BYTES)
     try:
         found: Answer = msgspec.msgpack.decode(ask(__name__, job, limits), type=Answer)
     except JobFailedError as error:
