@@ -35,8 +35,8 @@ ROWS: Final = {  # package: row, the lowest first
 }
 STRANGERS: Final = (  # neither imports the other
     frozenset({"ftm", "vehicle"}),
-    frozenset({"ftm", "functions"}),
-    frozenset({"vehicle", "functions"}),
+    frozenset({"functions", "ftm"}),
+    frozenset({"functions", "vehicle"}),
     frozenset({"report", "interop"}),
 )
 NO_ROW: Final = {"aftbed": (), "aftbed.__main__": ("aftbed.cli",)}  # all that they may import

@@ -1,1 +1,2 @@
-"""Protected functions of users: where they come from, how they are loaded, and what they are asked."""
+"""Protected functions of users: how a text names one, how it is loaded (`load.load_application`), and the
+requests that it is sent (`request_file`)."""

@@ -20,7 +20,6 @@ import re
 import struct
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from types import ModuleType
 from typing import Final, NamedTuple, Self
 
 import msgspec
@@ -28,6 +27,7 @@ import msgspec
 from aftbed.core.application import REPLY_BYTES_MAX
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.input_file import read_input
+from aftbed.functions.load import LoadModule
 
 REQUEST_BYTES_MAX: Final = REPLY_BYTES_MAX  # a request has to fit into a packet, as a reply has
 REQUESTS_MAX: Final = 100_000
@@ -460,7 +460,7 @@ def names_function(source: str) -> bool:
     return bool(colon and place) and name.isidentifier() and not Path(source).exists()
 
 
-def generated(source: str, count: int, seed: int, load_module: Callable[[str], ModuleType]) -> list[bytes]:
+def generated(source: str, count: int, seed: int, load_module: LoadModule) -> list[bytes]:
     """The first `count` requests of `function(seed)`, where `source` is `MODULE:FUNCTION` or
     `FILE.py:FUNCTION`.
 

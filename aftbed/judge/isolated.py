@@ -6,15 +6,15 @@ anything but MessagePack of the declared type, the replies of the function are u
 """
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from types import ModuleType
 from typing import Final
 
 import msgspec
 
-from aftbed.adapt.plugins import characteristics_of
 from aftbed.core.application import Application, Characteristics
 from aftbed.core.errors import ConfigError
+from aftbed.functions.load import LoadModule, characteristics_of
 from aftbed.judge.record import RunRecord
 from aftbed.judge.reference import (
     NamedChange,
@@ -23,20 +23,22 @@ from aftbed.judge.reference import (
     changes_of,
     executed,
     loaded,
+    maker,
     reference_run,
     requests_of,
 )
 from aftbed.runtime.unix.confined import JobFailedError, ProcessLimits, ask, serve
 from aftbed.runtime.unix.options import load_module
-from aftbed.runtime.unix.trust import NOBODY, Code, Trust, load, search_path, vetted
+from aftbed.runtime.unix.trust import NOBODY, Code, Trust, check_unchanged, load, search_path, vetted
 
 WORDS_MAX: Final = 300  # characters of what went wrong
 LIMITS: Final = ProcessLimits(seconds=120.0, memory_bytes=4 << 30, file_bytes=0)
 
 
 class Execute(msgspec.Struct, frozen=True, tag=True):
-    """Execute `requests` by the versions in `changes`."""
+    """Execute `requests` by the function `first`, and then by the versions in `changes`."""
 
+    first: str
     changes: tuple[NamedChange, ...]
     requests: tuple[tuple[int, bytes], ...]
 
@@ -85,21 +87,26 @@ def reference_of(
     """
     if function is not None:
         return reference_run(record.history, function())
-    changes = changes_of(record.history, record.adaptations)
-    sources = tuple(dict.fromkeys(source for _, source in changes if source))
+    first = record.options.application
+    changes = changes_of(record.history, record.adaptations, first)
+    sources = tuple(dict.fromkeys(source for source in (first, *(one for _, one in changes)) if source))
     if not sources:
-        return reference_run(record.history, Succession(loaded(changes, load_module)))
+        return reference_run(record.history, _succession(first, changes, load_module))
     try:
         codes = tuple(vetted(source, trust) for source in sources)
     except ConfigError as error:
         return ReferenceRun((), b"", unknown=str(error))
-    match _answer(Execute(tuple(changes), tuple(requests_of(record.history))), codes, limits):
+    match _answer(Execute(first, tuple(changes), tuple(requests_of(record.history))), codes, limits):
         case Replies(run):
             return run
         case Failed(reason):
             return _unknown(sources, reason)
         case Declared():
             return _unknown(sources, "it answered something else")
+
+
+def _succession(first: str, changes: Iterable[NamedChange], load_module: LoadModule) -> Succession:
+    return Succession(maker(first, load_module), loaded(changes, load_module))
 
 
 def _unknown(sources: tuple[str, ...], why: str) -> ReferenceRun:
@@ -153,13 +160,15 @@ def work(data: bytes) -> bytes:
 
 def _done(job: Job) -> Answer:
     codes = {code.place: code for code in job.codes}
+    for code in job.codes:
+        check_unchanged(code)
 
     def load_code(place: str) -> ModuleType:
         return load(codes[place])
 
     match job.task:
-        case Execute(changes, requests):
-            return Replies(executed(requests, Succession(loaded(changes, load_code))))
+        case Execute(first, changes, requests):
+            return Replies(executed(requests, _succession(first, changes, load_code)))
         case Describe(source):
             return Declared(characteristics_of(source, load_code))
 

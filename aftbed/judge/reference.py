@@ -16,11 +16,11 @@ from typing import Final
 import msgspec
 
 from aftbed.adapt.engine import DONE
-from aftbed.adapt.plugins import LoadModule, load_application
 from aftbed.core.application import Application
 from aftbed.core.errors import PeerError
 from aftbed.core.events import Event
 from aftbed.core.journal import EntryKind, History
+from aftbed.functions.load import LoadModule, load_application
 from aftbed.runtime.adaptations import Outcome
 from aftbed.runtime.deployment import digest, replica_of
 from aftbed.vehicle.aeb.function import default_application
@@ -34,8 +34,8 @@ BUILT_IN: Final = ""
 class Succession:
     """An application whose requests are executed by several versions in turn, as `changes` have it."""
 
-    def __init__(self, changes: list[Change]) -> None:
-        self._serve(default_application())
+    def __init__(self, first: Make, changes: list[Change]) -> None:
+        self._serve(first())
         self._before: list[Application] = []
         self._changes = list(changes)
         self._count = 0
@@ -81,10 +81,10 @@ class Succession:
         return self._function.acceptable(request, reply)
 
 
-def changes_of(history: History, adaptations: Iterable[Outcome]) -> list[NamedChange]:
-    """When another version began to serve, from the outcomes of the adaptations."""
+def changes_of(history: History, adaptations: Iterable[Outcome], begun: str = BUILT_IN) -> list[NamedChange]:
+    """When another version than `begun` began to serve, from the outcomes of the adaptations."""
     changes: list[NamedChange] = []
-    running = BUILT_IN
+    running = begun
     for update in adaptations:
         function = update.application if update.outcome == DONE else update.tried
         if not update.opened_ns or function == running:
@@ -108,10 +108,12 @@ def changes_of(history: History, adaptations: Iterable[Outcome]) -> list[NamedCh
 def loaded(changes: Iterable[NamedChange], load_module: LoadModule) -> list[Change]:
     """The same with the versions, which are executed for that. Raises ConfigError where one is no good."""
 
-    def make(function: str) -> Make:
-        return load_application(function, load_module) if function else default_application
+    return [(n, None if function is None else maker(function, load_module)) for n, function in changes]
 
-    return [(first, None if function is None else make(function)) for first, function in changes]
+
+def maker(function: str, load_module: LoadModule) -> Make:
+    """Of the function that a record names. Raises ConfigError."""
+    return load_application(function, load_module) if function else default_application
 
 
 class ReferenceRun(msgspec.Struct, frozen=True):

@@ -14,7 +14,7 @@ from typing import Final, TypeVar
 
 import msgspec
 
-from aftbed.adapt.plugins import LoadModule, load_application, make_brick
+from aftbed.adapt.plugins import make_brick
 from aftbed.core.application import Application
 from aftbed.core.brick import Brick, Effect
 from aftbed.core.errors import ConfigError
@@ -22,6 +22,7 @@ from aftbed.core.graph import BrickSpec, Graph
 from aftbed.core.messages import AnyMessage, Message, Reply, Request
 from aftbed.ftm.compose import REPLICAS, chain
 from aftbed.ftm.registry import Setting
+from aftbed.functions.load import LoadModule, load_application
 from aftbed.runtime import control
 from aftbed.runtime.devices import Device
 from aftbed.runtime.node import MemoryIO, Node, Stopped, nowhere

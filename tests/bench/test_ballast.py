@@ -4,10 +4,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aftbed.adapt.plugins import load_application
 from aftbed.bench import ballast
 from aftbed.core.application import Application
 from aftbed.core.errors import ConfigError, PeerError
+from aftbed.functions.load import load_application
 from aftbed.runtime.unix.options import load_module
 
 

@@ -188,9 +188,9 @@ MUTANTS: Final = (
     SourceMutant(
         "a function that returns no bytes passes the self-test",
         "G8",
-        "aftbed/adapt/plugins.py",
-        "    return _checked(found)\n",
-        "    return found\n",
+        "aftbed/functions/load.py",
+        "            return _checked(_application_class(source, load_module))\n",
+        "            return _application_class(source, load_module)\n",
         UNIT,
         ("tests/runtime/test_selftest.py",),
     ),

@@ -6,7 +6,7 @@ from typing import Final
 import msgspec
 import pytest
 
-from aftbed.adapt.plugins import load, load_application, make_brick
+from aftbed.adapt.plugins import make_brick
 from aftbed.core.brick import Brick, Effect, Send
 from aftbed.core.errors import ConfigError
 from aftbed.core.graph import BrickSpec, Graph, Kind
@@ -14,6 +14,7 @@ from aftbed.core.messages import AnyMessage, Reply
 from aftbed.ftm.chain import Compute
 from aftbed.ftm.compose import EXPRESSIONS, NONE, build
 from aftbed.ftm.registry import KINDS, Setting
+from aftbed.functions.load import load_application, load_class
 from aftbed.runtime.assembly import TEST_EPOCH, MakeBrick, self_test
 from aftbed.runtime.unix.options import load_module
 from aftbed.vehicle.aeb.function import default_application, sample_requests
@@ -204,7 +205,7 @@ def test_a_sound_function_passes(tmp_path: Path) -> None:
 )
 def test_a_source_that_names_no_class(source: str, words: str) -> None:
     with pytest.raises(ConfigError, match=words):
-        load(source, _nothing)
+        load_class(source, _nothing)
 
 
 def test_a_brick_is_no_function() -> None:

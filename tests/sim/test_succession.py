@@ -28,7 +28,7 @@ EFFECTS: Final = 16  # of a brick: several requests
 def succession(run: Run) -> Callable[[], Succession]:
     """Makes the bare server of the run."""
     changes = loaded(changes_of(run.history, run.adaptations), load_module)
-    return lambda: Succession(changes)
+    return lambda: Succession(default_application, changes)
 
 
 def setup(

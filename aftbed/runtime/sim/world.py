@@ -13,7 +13,6 @@ from typing import Final, NoReturn
 
 import msgspec
 
-from aftbed.adapt.plugins import LoadModule
 from aftbed.core.application import Application
 from aftbed.core.errors import ConfigError, PeerError
 from aftbed.core.events import Event
@@ -22,6 +21,7 @@ from aftbed.core.journal import Entry, EntryKind, History, Record
 from aftbed.core.messages import Goal, Reply, Scheduled
 from aftbed.ftm.client import Client
 from aftbed.ftm.compose import build, replication_of
+from aftbed.functions.load import LoadModule
 from aftbed.inject.bus import BusFault
 from aftbed.inject.bus_disturber import Disturber
 from aftbed.inject.kind import FaultKind

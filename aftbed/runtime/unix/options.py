@@ -59,6 +59,7 @@ class RunOptions(msgspec.Struct, frozen=True):
     """`private` and `record` are directories, made by the launch; `listener` is the hub's bound socket.
 
     `bus_open`: other users may attach to the bus, and the verdict stands whatever strangers send.
+    `application`: the protected function that the run begins with, "" for the built-in one.
     """
 
     run: str
@@ -75,6 +76,7 @@ class RunOptions(msgspec.Struct, frozen=True):
     listener: int = -1
     port: int = 0
     bus_open: bool = False
+    application: str = ""
 
 
 class SourceOptions(msgspec.Struct, frozen=True):
