@@ -214,7 +214,9 @@ class ExpectedReplies(msgspec.Struct, frozen=True):
 
 
 def _length(reply: bytes) -> str:
-    return f"{len(reply)} bytes" if reply else "an empty reply (the request was refused)"
+    if not reply:
+        return "an empty reply (the request was refused)"
+    return f"{len(reply)} byte{'s' if len(reply) > 1 else ''}"
 
 
 def _alike(one: Value, other: Value, tolerance: float) -> bool:
@@ -224,12 +226,13 @@ def _alike(one: Value, other: Value, tolerance: float) -> bool:
 
 
 class GivenRequests(msgspec.Struct, frozen=True):
-    """What `--requests` and `--expect` have given a run; both as the user named them."""
+    """What `--requests`, `--expect` and `--tolerance` give a run: what was named, and what is in it."""
 
     source: str
     requests: tuple[bytes, ...]
     expect: str = ""
     expected: ExpectedReplies | None = None
+    tolerance: float | None = None
 
 
 # -- reading --------------------------------------------------------------------------------------
