@@ -140,3 +140,12 @@ def test_a_function_makes_the_requests_of_each_seed(folder: Path, call: Call) ->
     code, out, _ = call(*words, "--seeds", "7..9", "--jobs", "1")
     assert code == 0 and "3 of 3 survived" in out
     assert (folder / "calls").read_text() == "7 8 9 "
+
+
+def test_a_failure_with_the_requests_of_a_function_is_shrunk_and_repeated(folder: Path, call: Call) -> None:
+    words = ("--requests", "mine.py:make", "--seed", "3", "--expect", "wrong.jsonl")
+    code, out, _ = call("sim", *words, "--count", str(COUNT), "--json")
+    document = json.loads(out)
+    assert code == 1 and " --count 4 " in document["shrunk"], document
+    code, out, _ = call(*shlex.split(document["shrunk"])[1:])
+    assert code == 1 and "expected_replies (G8): request 4: " in out
