@@ -5,6 +5,7 @@ from pathlib import Path
 
 from aftbed.cli.options import check_range
 from aftbed.core.errors import ConfigError
+from aftbed.functions.load import OWN_CODE
 from aftbed.functions.request_file import (
     REQUESTS_MAX,
     ExpectedReplies,
@@ -14,7 +15,6 @@ from aftbed.functions.request_file import (
     read_replies,
     read_requests,
 )
-from aftbed.runtime.unix.options import load_module
 
 
 class RequestSource:
@@ -44,7 +44,7 @@ class RequestSource:
         self._expected = self._read_expected(asked=count is not None)
 
     def _generated(self, seed: int) -> tuple[bytes, ...]:
-        return tuple(generated(self.name, self.count, seed, load_module))
+        return tuple(generated(self.name, self.count, seed, OWN_CODE))
 
     def _read_expected(self, *, asked: bool) -> ExpectedReplies | None:
         """Replies of requests that are not sent are left over only where `--count` asks for fewer."""

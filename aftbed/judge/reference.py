@@ -20,7 +20,8 @@ from aftbed.core.application import Application
 from aftbed.core.errors import PeerError
 from aftbed.core.events import Event
 from aftbed.core.journal import EntryKind, History
-from aftbed.functions.load import LoadModule, load_application
+from aftbed.functions.load import Code, load_application
+from aftbed.judge.record import RunRecord
 from aftbed.runtime.adaptations import Outcome
 from aftbed.runtime.deployment import digest, replica_of
 from aftbed.vehicle.aeb.function import default_application
@@ -105,15 +106,23 @@ def changes_of(history: History, adaptations: Iterable[Outcome], begun: str = BU
     return changes
 
 
-def loaded(changes: Iterable[NamedChange], load_module: LoadModule) -> list[Change]:
+def loaded(changes: Iterable[NamedChange], code: Code) -> list[Change]:
     """The same with the versions, which are executed for that. Raises ConfigError where one is no good."""
 
-    return [(n, None if function is None else maker(function, load_module)) for n, function in changes]
+    return [(n, None if function is None else maker(function, code)) for n, function in changes]
 
 
-def maker(function: str, load_module: LoadModule) -> Make:
+def maker(function: str, code: Code) -> Make:
     """Of the function that a record names. Raises ConfigError."""
-    return load_application(function, load_module) if function else default_application
+    return load_application(function, code) if function else default_application
+
+
+def succession(record: RunRecord, code: Code) -> Application:
+    """The bare server of a run, which this process loads. Raises ConfigError."""
+    begun = record.options.application
+    changes = changes_of(record.history, record.adaptations, begun)
+    first = maker(begun, code)
+    return Succession(first, loaded(changes, code)) if changes else first()
 
 
 class ReferenceRun(msgspec.Struct, frozen=True):

@@ -21,7 +21,7 @@ from aftbed.core.journal import Entry, EntryKind, History, Record
 from aftbed.core.messages import Goal, Reply, Scheduled
 from aftbed.ftm.client import Client
 from aftbed.ftm.compose import build, replication_of
-from aftbed.functions.load import LoadModule
+from aftbed.functions.load import NO_CODE, Code
 from aftbed.functions.request_file import GivenRequests
 from aftbed.inject.bus import BusFault
 from aftbed.inject.bus_disturber import Disturber
@@ -69,7 +69,7 @@ class Setup(msgspec.Struct, frozen=True):
     """What a run is made of, so that it can be repeated: nothing else has a part in it.
 
     `count` requests at `rate_hz` (0: the next follows the reply), which are `given` or drawn from a seed; or
-    those of a car in `scenario`.
+    those of a car in `scenario`. `application`: the protected function, "" for the built-in one.
     """
 
     ftm: str = "pbr"
@@ -81,6 +81,7 @@ class Setup(msgspec.Struct, frozen=True):
     adaptations: tuple[Scheduled, ...] = ()
     dooms: tuple[Doom, ...] = ()
     scenario: str = ""
+    application: str = ""
     given: GivenRequests | None = None
 
 
@@ -122,9 +123,9 @@ def requests_of(seed: int) -> list[bytes]:
 
 
 @lru_cache(maxsize=64)
-def graph_of(ftm: str, placement: str) -> Graph:
+def graph_of(ftm: str, placement: str, application: str = "") -> Graph:
     """The graph that a run begins with."""
-    return build(ftm, placement)
+    return build(ftm, placement, application=application)
 
 
 @lru_cache(maxsize=1)
@@ -142,11 +143,6 @@ def check(fault: Fault, scenario: str) -> None:
         raise ConfigError(f"{fault}: without a scenario there is no bus")
     if fault.trigger.when is not None:
         raise ConfigError(f"{fault}: 'when' looks at the car, and without a scenario there is none")
-
-
-def nothing_off_line(place: str) -> NoReturn:
-    """No module is found. Raises ConfigError."""
-    raise ConfigError(f"{place}: the simulator loads nothing that was written off line")
 
 
 class ExecutiveJournal:
@@ -260,7 +256,7 @@ class Drive(CarLink):
 
 
 class World:
-    """The `Runtime` of a simulated run, and the run itself."""
+    """The `Runtime` of a simulated run, and the run itself. `code`: how that of the user is found."""
 
     def __init__(
         self,
@@ -269,7 +265,7 @@ class World:
         function: Callable[[], Application] = default_application,
         requests: list[bytes] | None = None,
         make: MakeSetting | None = None,
-        load: LoadModule = nothing_off_line,
+        code: Code = NO_CODE,
         channel: type[SimChannel] = SimChannel,
         clock: Callable[[Random], Clock] = Clock,
     ) -> None:
@@ -289,11 +285,11 @@ class World:
         self.effects: dict[str, int] = {}
         self.lost = False
         self.journal = ExecutiveJournal(self.journals.setdefault("supervisor.1", []))
-        assembler = Assembler(function, load, make)
+        assembler = Assembler(function, code, make)
         self.pool = SimProcessPool(
             self.loop, assembler, self._make_device, self._ends.__getitem__, self._journal_for
         )
-        graph = graph_of(setup.ftm, setup.placement)
+        graph = graph_of(setup.ftm, setup.placement, setup.application)
         self.controller = RunController(graph, self, None, lambda: setattr(self, "lost", True))
         self.pool.on_report = self._on_report
         self.pool.on_death = self._on_death
@@ -561,5 +557,5 @@ class World:
         )
 
 
-def simulate(setup: Setup) -> Run:
-    return World(setup).run()
+def simulate(setup: Setup, code: Code = NO_CODE) -> Run:
+    return World(setup, code=code).run()
