@@ -8,11 +8,22 @@ from typing import Final
 
 import pytest
 from fakerun import Call, Output
+from msgspec.structs import replace
 
+from aftbed.core.errors import ConfigError
+from aftbed.functions.request_file import GivenRequests
+from aftbed.judge.simulated import record_of
+from aftbed.runtime.sim.world import Setup, simulate
+from aftbed.search.agreement import setup_of
 from aftbed.vehicle.aeb.function import default_application, sample_requests
 
 COUNT: Final = 6
 MAKE: Final = """
+from aftbed.core.errors import ConfigError
+from aftbed.functions.request_file import GivenRequests
+from aftbed.judge.simulated import record_of
+from aftbed.runtime.sim.world import Setup, simulate
+from aftbed.search.agreement import setup_of
 from aftbed.vehicle.aeb.function import sample_requests
 
 def make(seed):
@@ -149,3 +160,11 @@ def test_a_failure_with_the_requests_of_a_function_is_shrunk_and_repeated(folder
     assert code == 1 and " --count 4 " in document["shrunk"], document
     code, out, _ = call(*shlex.split(document["shrunk"])[1:])
     assert code == 1 and "expected_replies (G8): request 4: " in out
+
+
+def test_a_record_is_compared_with_simulations_of_its_own_requests() -> None:
+    given = GivenRequests("mine.csv", tuple(sample_requests(3, 2)))
+    record = record_of(simulate(Setup(count=3, given=given)))
+    assert setup_of(record) == Setup(count=3, given=given)
+    with pytest.raises(ConfigError, match="its requests are missing, so it is not simulated"):
+        setup_of(replace(record, given=None))
