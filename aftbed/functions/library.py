@@ -22,7 +22,7 @@ from aftbed.core.application import (
     Characteristics,
     approximate,
 )
-from aftbed.core.errors import ConfigError, PeerError
+from aftbed.core.errors import ConfigError, FunctionFailedError, PeerError
 from aftbed.core.input_file import open_input
 
 HEADER: Final = Path(__file__).with_name("aft.h")
@@ -63,7 +63,7 @@ _MAY_REFUSE: Final = ("aft_execute", "aft_restore")
 _LIVE: Final[dict[int, set[int]]] = {}  # the instances of each library that this process has loaded
 
 
-class LibraryFailedError(Exception):
+class LibraryFailedError(FunctionFailedError):
     """The library broke the contract of `aft.h`: a fault of the replica that hosts it."""
 
 

@@ -88,9 +88,19 @@ def load_class(source: str, code: Code) -> type:
 def load_application(source: str, code: Code) -> Callable[[], Application]:
     """The maker of a protected function. Raises ConfigError if it is none; so may the maker."""
     named = parse_source(source)
-    match named.kind:
+    if named.kind is not FunctionKind.CLASS:
+        code.permit(named)
+    match named.kind:  # what a run does not use costs it no import
         case FunctionKind.CLASS:
             return _checked(_application_class(source, code))
+        case FunctionKind.LIBRARY:
+            from aftbed.functions.library import library_function  # noqa: PLC0415
+
+            return library_function(Path(named.place))
+        case FunctionKind.PROGRAM:
+            from aftbed.functions.program import program_function  # noqa: PLC0415
+
+            return program_function(named.place)
         case _:
             raise ConfigError(f"{source} names no class (MODULE:CLASS or FILE.py:CLASS)")
 

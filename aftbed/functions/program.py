@@ -49,7 +49,7 @@ from aftbed.core.application import (
     Characteristics,
     approximate,
 )
-from aftbed.core.errors import ConfigError, PeerError, shown
+from aftbed.core.errors import ConfigError, FunctionFailedError, PeerError, shown
 
 DESCRIBE_SECONDS_MAX: Final = (
     5.0  # an interpreter or a virtual machine starts first, on a machine that is busy
@@ -70,7 +70,7 @@ _libc: Final = ctypes.CDLL(None)
 _libc.prctl.argtypes = (ctypes.c_int, *(ctypes.c_ulong,) * 4)
 
 
-class ProgramFailedError(Exception):
+class ProgramFailedError(FunctionFailedError):
     """The program broke the protocol, or ended: a fault of the replica that hosts it."""
 
 

@@ -16,7 +16,7 @@ from typing import Final
 import msgspec
 
 from aftbed.adapt.engine import DONE
-from aftbed.core.application import Application
+from aftbed.core.application import Application, Characteristics, Field, reply_fields_of
 from aftbed.core.errors import PeerError
 from aftbed.core.events import Event
 from aftbed.core.journal import EntryKind, History
@@ -46,6 +46,7 @@ class Succession:
     def _serve(self, function: Application) -> None:
         self._function = function
         self.characteristics = function.characteristics
+        self.reply_fields = reply_fields_of(function)
 
     def execute(self, request: bytes) -> bytes:
         self._count += 1
@@ -130,12 +131,16 @@ class ReferenceRun(msgspec.Struct, frozen=True):
 
     A request that it refuses has an empty reply. Where the function is not `deterministic`, its replies
     need not be those of a run. `unknown`: why nothing is known of them, "" where they are.
+
+    `tolerance`: by so much the numbers in `reply_fields` may differ, as the function declares.
     """
 
     replies: tuple[tuple[int, bytes], ...]
     state: bytes
     deterministic: bool = True
     unknown: str = ""
+    tolerance: float = 0.0
+    reply_fields: tuple[Field, ...] = ()
 
     @property
     def digest(self) -> str:
@@ -156,7 +161,14 @@ def executed(requests: Iterable[tuple[int, bytes]], bare: Application) -> Refere
             replies.append((number, bare.execute(payload)))
         except PeerError:
             replies.append((number, b""))
-    return ReferenceRun(tuple(replies), bare.capture(), getattr(bare, "deterministic", True))
+    declared = getattr(bare, "characteristics", Characteristics())
+    return ReferenceRun(
+        tuple(replies),
+        bare.capture(),
+        getattr(bare, "deterministic", declared.deterministic),
+        tolerance=declared.state_access.tolerance,
+        reply_fields=reply_fields_of(bare),
+    )
 
 
 def reference_run(history: History, bare: Application) -> ReferenceRun:

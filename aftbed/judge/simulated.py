@@ -12,8 +12,9 @@ from aftbed.judge.record import DriveEnd, Excuses, RunEnd, RunRecord
 from aftbed.judge.reference import reference_run, succession
 from aftbed.judge.verdict import Breach, broken
 from aftbed.runtime.deployment import replica_of
+from aftbed.runtime.node import FUNCTION_FAILED
 from aftbed.runtime.sim.clock import START_NS
-from aftbed.runtime.sim.world import Run
+from aftbed.runtime.sim.world import FUNCTION, Run
 from aftbed.runtime.unix.options import CarRun, LoadRun, RunOptions, Work
 
 # Events of faults that no mechanism outvotes: bits of a checkpoint, or of a reply that is kept.
@@ -56,6 +57,11 @@ def record_of(run: Run) -> RunRecord:
         run.adaptations,
         DriveEnd(run.drive_end, run.drive_us, run.vehicle) if run.vehicle is not None else None,
         failures=run.failures,
+        function_failures=tuple(
+            text.replace(f"detected stop: {FUNCTION_FAILED}", "")
+            for _, event, text in run.logged
+            if event == FUNCTION
+        ),
         excuses=Excuses(service_struck_down(run), values, tuple(name for _, name in run.struck)),
         given=given.requests if given is not None else None,
         expected=given.expected if given is not None else None,

@@ -35,6 +35,7 @@ from aftbed.runtime.assembly import Assembler, MakeSetting
 from aftbed.runtime.deployment import Hosted, Keys, digest
 from aftbed.runtime.devices import CarDevice, CarLink, Device, Load, Sensor, resume_client
 from aftbed.runtime.interface import DRAW_BITS, Met, ProcessKind
+from aftbed.runtime.node import FUNCTION_FAILED
 from aftbed.runtime.run_controller import RunController, ScriptRun
 from aftbed.runtime.sim.clock import START_NS, Clock
 from aftbed.runtime.sim.node_io import SimChannel, SimIO, SimNode, SimulatedMemory
@@ -50,6 +51,7 @@ from aftbed.vehicle.scenarios.library import load_scenario
 
 REQUESTS: Final = 512  # of a load; then they repeat
 STEP_NS: Final = STEP_US * 1000  # of a car
+FUNCTION: Final = "function"  # the event of one that failed
 STOPPED: Final = "detected stop"  # in the reason of a death
 REST_NS_MAX: Final = 3_000_000_000  # from the last fault to the rest, in virtual time
 TICK_SECONDS: Final = 0.02  # between two looks for hangs, as in the supervisor
@@ -386,6 +388,8 @@ class World:
         flipped = STOPPED in reason and any(fault.action.alters_value for fault in self.setup.faults)
         if (not reason or flipped) and process.kind is not ProcessKind.KILLED:
             self.struck.append((self.loop.ns, process.name))
+        if FUNCTION_FAILED in reason:
+            self.log(FUNCTION, reason)
         if reason.startswith("assertion"):
             self.failures.append(f"{process.name}: {reason}")
             self.log("assert", f"{process.name}: {reason}")

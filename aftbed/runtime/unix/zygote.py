@@ -21,7 +21,7 @@ from typing import NoReturn
 
 import msgspec
 
-from aftbed.core.errors import ConfigError
+from aftbed.core.errors import ConfigError, FunctionFailedError
 from aftbed.ftm.client import Client
 from aftbed.functions.load import Code, load_module
 from aftbed.functions.source import FunctionSource
@@ -123,7 +123,7 @@ def _be_spare(supervisor: int, areas: tuple[Area, ...]) -> NoReturn:
             os._exit(0)
         io = _make_node(line, order, fds)
     except BaseException as error:  # noqa: BLE001 - the last frame of this process
-        known = isinstance(error, ConfigError | OSError)
+        known = isinstance(error, ConfigError | FunctionFailedError | OSError)
         reason = str(error) if known else f"{type(error).__name__}: {error}"
         line.send(control.Ack(order.token, error=reason))
         if known:
