@@ -16,6 +16,7 @@ import msgspec
 
 from aftbed.core.errors import ConfigError
 from aftbed.core.messages import Scheduled
+from aftbed.functions.request_file import GivenRequests
 from aftbed.judge import checks
 from aftbed.judge.checks import Evidence
 from aftbed.judge.outcome import outcome_of
@@ -66,12 +67,19 @@ def setup_of(record: RunRecord) -> Setup:
         raise ConfigError(f"{record.path}: an update or a hand-written script is not simulated")
     same = Setup(options.ftm, options.placement, faults=options.faults, adaptations=adaptations)
     match options.work:
-        case LoadRun(count, rate_hz):
-            return msgspec.structs.replace(same, count=count, rate_hz=rate_hz)
+        case LoadRun(count, rate_hz) as load:
+            given = _given(record, load.requests) if load.requests else None
+            return msgspec.structs.replace(same, count=count, rate_hz=rate_hz, given=given)
         case CarRun() as car:
             return msgspec.structs.replace(same, scenario=car.scenario)
         case _:
             raise ConfigError(f"{record.path}: a replay is not simulated")
+
+
+def _given(record: RunRecord, source: str) -> GivenRequests:
+    if record.given is None:
+        raise ConfigError(f"{record.path}: its requests are missing, so it is not simulated")
+    return GivenRequests(source, record.given)
 
 
 def _compare(setup: Setup, records: list[RunRecord], seeds: int, trust: Trust) -> Agreement:
