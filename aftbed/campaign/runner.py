@@ -19,7 +19,7 @@ from aftbed.campaign import ledger
 from aftbed.campaign.experiment import REQUESTS_PER_SECOND_MIN, Experiment, Result, carry_out
 from aftbed.campaign.plan import CampaignPlan
 from aftbed.core.errors import ConfigError
-from aftbed.runtime.unix.worker_pool import SECONDS_MAX, each
+from aftbed.runtime.unix.worker_pool import SECONDS_MAX, each, own_seconds_max
 
 
 class CampaignRunOptions(msgspec.Struct, frozen=True):
@@ -89,7 +89,11 @@ def performed(
         # An experiment that takes more hangs; real ones have deadlines of their own, and end before.
         seconds_max = SECONDS_MAX + 2 * system.requests / (system.rate_hz or REQUESTS_PER_SECOND_MIN)
         fresh = system.runtime == "unix"
-        for _, _, result in each(perform, todo, asked.jobs, seconds_max=seconds_max, fresh=fresh):
+        apart = bool(system.app)
+        if apart and not fresh:
+            seconds_max = own_seconds_max(system.requests)
+        results = each(perform, todo, asked.jobs, seconds_max=seconds_max, fresh=fresh, apart=apart)
+        for _, _, result in results:
             yield result
         return
     from aftbed.campaign import dask  # noqa: PLC0415 - an extra

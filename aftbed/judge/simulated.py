@@ -3,6 +3,7 @@
 import itertools
 from typing import Final
 
+from aftbed.core.errors import FunctionFailedError, HarnessError
 from aftbed.core.events import Event
 from aftbed.core.script import ScriptKind
 from aftbed.ftm.compose import replication_of
@@ -89,10 +90,22 @@ def service_struck_down(run: Run) -> bool:
 
 
 def evidence_of_run(run: Run, code: Code = NO_CODE) -> Evidence:
-    """With the bare server's run, which is executed here: this process has simulated the function, too."""
+    """With the bare server's run, which is executed here: this process has simulated the function, too.
+
+    Raises HarnessError where the function of a user fails in it: nothing is known of its replies then.
+    """
     record = record_of(run)
     bare = succession(record, code)
-    return Evidence(record, reference_run(record.history, bare))
+    try:
+        return Evidence(record, reference_run(record.history, bare))
+    except Exception as error:
+        if not (source := record.options.application):
+            raise
+        name = "" if isinstance(error, FunctionFailedError) else f"{type(error).__name__}: "
+        reason = f"{name}{error}".removeprefix(f"{source}: ")
+        raise HarnessError(
+            f"{source}: it fails without a fault, so there is nothing to compare with: {reason}"
+        ) from error
 
 
 def breaches(run: Run, code: Code = NO_CODE) -> tuple[Breach, ...]:
