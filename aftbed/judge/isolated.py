@@ -235,11 +235,13 @@ def _tried(function: Application, requests: Sequence[bytes]) -> str:
     Raises FunctionFailedError.
     """
     declared = function.characteristics
-    if declared.state_access.kind is AccessKind.NONE:
-        _replies(function, requests)
-        return ""
     begun = _did("capture", function.capture)
     replies = _replies(function, requests)
+    for number, (request, reply) in enumerate(zip(requests, replies, strict=True), 1):
+        if not _did(f"request {number}: acceptable", partial(function.acceptable, request, reply)):
+            return f"its assertion does not accept its own reply to request {number}"
+    if declared.state_access.kind is AccessKind.NONE:
+        return ""
     ended = _did("capture", function.capture)
     _did("restore of what capture gave", lambda: function.restore(begun))
     restored = _did("capture", function.capture)
