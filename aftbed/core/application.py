@@ -5,7 +5,8 @@ know in common. Requests, replies and states are opaque bytes to the mechanism.
 """
 
 import re
-from typing import Final, Literal, Protocol
+from collections.abc import Mapping
+from typing import Final, Literal, Protocol, TypeGuard
 
 import msgspec
 
@@ -43,7 +44,8 @@ class Characteristics(msgspec.Struct, frozen=True):
 class Application(Protocol):
     """A protected function. What it declares is believed, and measured by campaigns.
 
-    One whose state has a fixed layout may declare it, as `fields: tuple[Field, ...]`: see `fields_of`.
+    One whose state has a fixed layout may declare it, as `fields: tuple[Field, ...]`: see `fields_of`. One
+    with a large state may know its changes: see `KnowsChanges`.
 
     `execute` is the only thing that changes the state. No clock, no chance, no I/O: time comes
     in with the request.
@@ -72,6 +74,30 @@ class Application(Protocol):
         Looks at nothing but these two, and changes nothing.
         """
         ...
+
+
+class KnowsChanges(Application, Protocol):
+    """What a function with a large state may have besides, both or neither.
+
+    Its checkpoints then cost as much as what changed, and not as much as the state. The length of the state
+    never changes. Page N of it begins at byte N * `page_bytes`, and is as long, unless the state ends in it.
+    """
+
+    def changes(self, page_bytes: int) -> Mapping[int, bytes]:
+        """Return the pages that `capture` would show changed since the last call of `changes`, by number.
+
+        Whatever changed them: `execute`, `restore`, `patch`. A page too many does no harm, one too few does.
+        """
+        ...
+
+    def patch(self, page_bytes: int, pages: Mapping[int, bytes]) -> None:
+        """Replace these pages of the state. Raises PeerError, state unchanged, if the result is no state."""
+        ...
+
+
+def knows_changes(application: Application) -> TypeGuard[KnowsChanges]:
+    """Whether it has both methods."""
+    return hasattr(application, "changes") and hasattr(application, "patch")
 
 
 def fields_of(application: Application | type[Application]) -> tuple[Field, ...]:
