@@ -5,23 +5,26 @@ The self-test sends recorded requests through a whole replica in memory. It runs
 the new brick, before that gets any channel: so whatever the brick does there harms nothing, and a brick that
 never ends is killed by the deadline of its preparation. Every request must be answered. Where the function is
 the one that runs, the replies must be those of the built-in bricks, byte for byte; a new function must give
-its own state back (`restore(capture())`).
+its own state back (`restore(capture())`), and know all its changes if it knows any.
 """
 
 from collections import defaultdict
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Final, TypeVar
 
 import msgspec
 
 from aftbed.adapt.plugins import LoadModule, load_application, make_brick
-from aftbed.core.application import Application
+from aftbed.core.application import Application, KnowsChanges, knows_changes
 from aftbed.core.brick import Brick, Effect
-from aftbed.core.errors import ConfigError
+from aftbed.core.errors import ConfigError, PeerError
 from aftbed.core.graph import BrickSpec, Graph
 from aftbed.core.messages import AnyMessage, Message, Reply, Request
 from aftbed.ftm.compose import REPLICAS, chain
+from aftbed.ftm.pages import PAGE_BYTES
 from aftbed.ftm.registry import Setting
+from aftbed.ftm.server import Server
 from aftbed.runtime import control
 from aftbed.runtime.devices import Device
 from aftbed.runtime.node import MemoryIO, Node, Stopped, nowhere
@@ -37,12 +40,18 @@ Out = TypeVar("Out")
 
 
 class Assembler:
-    """`function`: what is protected if the graph names nothing else; `load`: how a class is found."""
+    """`function`: what is protected if the graph names nothing else; `load`: how a class is found;
+    `page_bytes`: of a page of a checkpoint.
+    """
 
     def __init__(
-        self, function: Callable[[], Application], load: LoadModule, make: MakeSetting | None = None
+        self,
+        function: Callable[[], Application],
+        load: LoadModule,
+        make: MakeSetting | None = None,
+        page_bytes: int = PAGE_BYTES,
     ) -> None:
-        self._function, self._load = function, load
+        self._function, self._load, self._page_bytes = function, load, page_bytes
         self._make: MakeSetting = make or (lambda spec, setting: make_brick(spec, setting, load))
 
     def build(
@@ -71,7 +80,8 @@ class Assembler:
         number = REPLICAS.index(spec.replica) + 1 if spec.replica else 0
         named = load_application(spec.application, self._load) if spec.application else self._function
         epoch = TEST_EPOCH if leader else order.epoch
-        return Setting(number, epoch, spec.replica == (leader or order.leader), named)
+        leads = spec.replica == (leader or order.leader)
+        return Setting(number, epoch, leads, named, self._page_bytes)
 
     def _try_out(self, order: control.Assign, trial: control.SelfTest) -> None:
         """The self-test of bricks that are not built in."""
@@ -118,6 +128,18 @@ def self_test(
 def _suspects(graph: Graph) -> str:
     """What is not built in."""
     return ", ".join(sorted({b.source or b.application for b in graph.bricks if b.source or b.application}))
+
+
+def _all_known(function: KnowsChanges, requests: tuple[bytes, ...]) -> bool:
+    before = function.capture()
+    function.changes(PAGE_BYTES)
+    for request in requests:
+        with suppress(PeerError):
+            function.execute(request)
+    after, pages = function.capture(), function.changes(PAGE_BYTES)
+    function.restore(before)
+    function.patch(PAGE_BYTES, pages)
+    return function.capture() == after and len(before) == len(after)
 
 
 class _Checked(Brick):
@@ -184,7 +206,19 @@ class _TestedChain:
         self._tried(lambda: self._server.restore(state), "restore")
         if self._tried(self._server.capture, "capture") != state:
             raise ConfigError(f"self-test: {_suspects(self._graph)}: it does not restore what it captures")
+        if isinstance(self._server, Server):
+            self._try_changes(self._server.application, requests)
         return self._replies
+
+    def _try_changes(self, function: Application, requests: tuple[bytes, ...]) -> None:
+        """Its changes, put on the state of before, are its state. Raises ConfigError."""
+        has = [name for name in ("changes", "patch") if hasattr(function, name)]
+        if len(has) == 1:
+            raise ConfigError(f"self-test: {_suspects(self._graph)}: it has {has[0]}, and not the other one")
+        if knows_changes(function) and not self._tried(lambda: _all_known(function, requests), "changes"):
+            raise ConfigError(
+                f"self-test: {_suspects(self._graph)}: changes and patch do not give the state of capture"
+            )
 
     def _tried(self, call: Callable[[], Result], what: str) -> Result:
         """What the call returns. Raises ConfigError for any exception of it."""
