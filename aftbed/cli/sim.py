@@ -58,6 +58,7 @@ from aftbed.vehicle.aeb.function import default_application
 from aftbed.vehicle.scenarios.library import load_scenario
 
 COUNT_MAX: Final = 100_000
+PAGE_BYTES: Final = (16, 65536)
 LOAD_S_MAX: Final = 3600.0  # of virtual time
 MINUTES_MAX: Final = 100_000.0
 SHRUNK_MAX: Final = 3  # broken runs: shrinking one takes up to 400 runs
@@ -102,6 +103,12 @@ class SimArguments(msgspec.Struct, frozen=True):
     may_fail: Annotated[
         bool, typer.Option("--may-fail", help="A run may pass even if an --adapt was not done.")
     ] = False
+    page_bytes: Annotated[
+        int | None,
+        typer.Option(
+            help="Of a page of a checkpoint; 4096 if left out. Of 4 pages or more only changes travel."
+        ),
+    ] = None
     swarm: Annotated[bool, typer.Option("--swarm", help="Draw everything from the seed.")] = False
     minutes: Annotated[float | None, typer.Option(help="Simulate the seeds from --seed on, for so long.")] = (
         None
@@ -148,7 +155,7 @@ def sim(given: SimArguments) -> int:
 
 def _used(given: SimArguments, *but: str) -> list[str]:
     """The options that were given, except those of the fields `but`."""
-    names = {"adaptations": "adapt", "may_fail": "may-fail"}
+    names = {"adaptations": "adapt", "may_fail": "may-fail", "page_bytes": "page-bytes"}
     values = asdict(given).items()
     used = [name for name, value in values if value is not None and value is not False and value != ()]
     return [f"--{names.get(name, name)}" for name in used if name not in but]
@@ -190,7 +197,12 @@ def _setup_maker(given: SimArguments) -> MakeSetup:
     faults = tuple(read_fault(text, graph) for text in given.faults)
     adaptations = _adaptations(given, graph)
     setup = replace(
-        _load(given), ftm=graph.ftm, placement=graph.placement, faults=faults, adaptations=adaptations
+        _load(given),
+        ftm=graph.ftm,
+        placement=graph.placement,
+        faults=faults,
+        adaptations=adaptations,
+        page_bytes=_page_bytes(given),
     )
     for fault in faults:
         check_fault(fault, setup.scenario)
@@ -221,6 +233,13 @@ def _load(given: SimArguments) -> Setup:
     if rate_hz and count / rate_hz > LOAD_S_MAX:
         raise ConfigError(f"--count {count} --rate {rate_hz}: {LOAD_S_MAX:.0f} s of virtual time are allowed")
     return Setup(count=count, rate_hz=rate_hz)
+
+
+def _page_bytes(given: SimArguments) -> int:
+    least, most = PAGE_BYTES
+    if given.page_bytes is not None and not least <= given.page_bytes <= most:
+        raise ConfigError(f"--page-bytes {given.page_bytes}: {least} to {most} are allowed")
+    return given.page_bytes or DEFAULT.page_bytes
 
 
 def read_fault(text: str, graph: Graph) -> Fault:
@@ -270,7 +289,9 @@ def described(setup: Setup) -> str:
         load += f" at {_number(setup.rate_hz)}/s" if setup.rate_hz else ""
     parts = [f"{setup.ftm} ({setup.placement}), seed {setup.seed}, {load}"]
     parts += [f"{doom.brick} dies before its effect {doom.effect}" for doom in setup.dooms]
-    return "; ".join([*parts, *map(str, setup.faults), *map(_adaptation_words, setup.adaptations)])
+    parts += [*map(str, setup.faults), *map(_adaptation_words, setup.adaptations)]
+    parts += [f"pages of {setup.page_bytes} bytes"] if setup.page_bytes != DEFAULT.page_bytes else []
+    return "; ".join(parts)
 
 
 def _adaptation_words(adaptation: Scheduled) -> str:
@@ -299,6 +320,7 @@ def repeating(setup: Setup, *, swarm: bool = False) -> str:
         count=None if setup.scenario else setup.count,
         rate=None if setup.scenario else setup.rate_hz or None,
         scenario=setup.scenario or None,
+        page_bytes=setup.page_bytes if setup.page_bytes != DEFAULT.page_bytes else None,
         faults=tuple(map(str, setup.faults)),
         adaptations=tuple(map(_adaptation_words, setup.adaptations)),
         recipe=next((a.goal.recipe for a in setup.adaptations if a.goal.recipe != RECIPES[0]), None),
@@ -322,6 +344,7 @@ def _command(given: SimArguments) -> str:
         ("--scenario", given.scenario),
         ("--count", None if given.count is None else str(given.count)),
         ("--rate", None if given.rate is None else _number(given.rate)),
+        ("--page-bytes", None if given.page_bytes is None else str(given.page_bytes)),
         *(("--faults", text) for text in given.faults),
         *(("--adapt", text) for text in given.adaptations),
         ("--recipe", given.recipe),

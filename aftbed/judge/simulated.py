@@ -8,6 +8,9 @@ from aftbed.core.application import Application
 from aftbed.core.events import Event
 from aftbed.core.script import ScriptKind
 from aftbed.ftm.compose import replication_of
+from aftbed.inject.crash import Crash
+from aftbed.inject.hang import Hang
+from aftbed.inject.slow import Slow
 from aftbed.judge.record import DriveEnd, Excuses, RunEnd, RunRecord
 from aftbed.judge.verdict import Breach, broken, evidence_of
 from aftbed.runtime.deployment import replica_of
@@ -22,6 +25,7 @@ UNPROMISED_VALUES: Final = frozenset(
     for event in (Event.STATE_CAPTURED, Event.STATE_RESTORED, Event.CHECKPOINT_SENT)
     + (Event.CHECKPOINT_APPLIED, Event.REPLY_STORED, Event.DEDUPE_HIT)
 )
+HARMLESS: Final = (Crash, Hang, Slow)  # kinds of faults that alter no message and no state
 SINGLE: Final = "single"  # the node of that placement hosts both replicas
 
 
@@ -77,4 +81,12 @@ def service_struck_down(run: Run) -> bool:
 
 def breaches(run: Run, function: Callable[[], Application] = default_application) -> tuple[Breach, ...]:
     """All that a simulated run breaks; `function` makes the bare server."""
-    return broken(evidence_of(record_of(run), function))
+    return (*broken(evidence_of(record_of(run), function)), *needless_stops(run))
+
+
+def needless_stops(run: Run) -> tuple[Breach, ...]:
+    """A brick that stopped itself, though nothing that it was given can have been altered."""
+    if not all(isinstance(fault.action, HARMLESS) for fault in run.setup.faults):
+        return ()
+    stops = run.history.events(Event.DETECTED_STOP)
+    return tuple(Breach("needless_stop", f"{r.node} stopped at request {r.request_id}") for r in stops)

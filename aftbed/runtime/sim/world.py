@@ -22,6 +22,7 @@ from aftbed.core.journal import Entry, EntryKind, History, Record
 from aftbed.core.messages import Goal, Reply, Scheduled
 from aftbed.ftm.client import Client
 from aftbed.ftm.compose import build, replication_of
+from aftbed.ftm.pages import PAGE_BYTES
 from aftbed.inject.bus import BusFault
 from aftbed.inject.bus_disturber import Disturber
 from aftbed.inject.kind import FaultKind
@@ -67,7 +68,8 @@ class Doom(msgspec.Struct, frozen=True):
 class Setup(msgspec.Struct, frozen=True):
     """What a run is made of, so that it can be repeated: nothing else has a part in it.
 
-    `count` requests at `rate_hz` (0: the next follows the reply); or those of a car in `scenario`.
+    `count` requests at `rate_hz` (0: the next follows the reply); or those of a car in `scenario`. With small
+    pages (`page_bytes`) checkpoints of the built-in function travel as those of a large state do.
     """
 
     ftm: str = "pbr"
@@ -79,6 +81,7 @@ class Setup(msgspec.Struct, frozen=True):
     adaptations: tuple[Scheduled, ...] = ()
     dooms: tuple[Doom, ...] = ()
     scenario: str = ""
+    page_bytes: int = PAGE_BYTES
 
 
 class Rest(msgspec.Struct, frozen=True):
@@ -285,7 +288,7 @@ class World:
         self.effects: dict[str, int] = {}
         self.lost = False
         self.journal = ExecutiveJournal(self.journals.setdefault("supervisor.1", []))
-        assembler = Assembler(function, load, make)
+        assembler = Assembler(function, load, make, setup.page_bytes)
         self.pool = SimProcessPool(
             self.loop, assembler, self._make_device, self._ends.__getitem__, self._journal_for
         )
