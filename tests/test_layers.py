@@ -19,6 +19,7 @@ PACKAGE: Final = Path(aftbed.__file__).parent
 
 ROWS: Final = {  # package: row, the lowest first
     "core": 0,
+    "functions": 1,
     "ftm": 1,
     "vehicle": 1,
     "inject": 2,
@@ -34,12 +35,15 @@ ROWS: Final = {  # package: row, the lowest first
 }
 STRANGERS: Final = (  # neither imports the other
     frozenset({"ftm", "vehicle"}),
+    frozenset({"functions", "ftm"}),
+    frozenset({"functions", "vehicle"}),
     frozenset({"report", "interop"}),
 )
 NO_ROW: Final = {"aftbed": (), "aftbed.__main__": ("aftbed.cli",)}  # all that they may import
 
 IMPURE_PLACES: Final = (  # where clock, socket, process, file and chance may live
     "aftbed.runtime.unix",
+    "aftbed.functions",
     "aftbed.vehicle",
     "aftbed.inject",
     "aftbed.judge",

@@ -21,7 +21,7 @@ from typing import Final
 
 import msgspec
 
-from aftbed.adapt.planner import Plan, plan, plan_of, target, updated
+from aftbed.adapt.planner import APPLICATION, Plan, plan, plan_of, target, updated
 from aftbed.adapt.script_check import refusals
 from aftbed.adapt.script_file import refuse
 from aftbed.core.errors import ConfigError, ScriptError, unknown
@@ -36,6 +36,7 @@ VERBS: Final = ("to", "switch", "compose", "decompose", "update")
 GRAMMAR: Final = (
     "to|switch|compose EXPR, decompose, or update BRICK to SOURCE, then [at request N | after 500ms]"
 )
+TIMES: Final = ("at", "after")  # begin the words about when
 _WHOLE: Final = re.compile(r"[0-9]{1,12}")
 
 
@@ -70,8 +71,10 @@ def read(text: str) -> Timed:
     length = {"decompose": 0, "update": 3}.get(verb, 1)
     if len(rest) < length or (verb == "update" and rest[1] != "to"):
         raise ConfigError(f"adaptation {text!r}: expected {GRAMMAR}")
+    if verb == "update" and rest[0] == APPLICATION:  # a command line has several words
+        length = next((at for at in range(3, len(rest)) if rest[at] in TIMES), len(rest))
     name = rest[0] if length else ""
-    source = rest[2] if verb == "update" else ""
+    source = " ".join(rest[2:length]) if verb == "update" else ""
     wish = Wish(verb, name, source)
     match rest[length:]:
         case []:
@@ -136,12 +139,12 @@ def verb_for(old: tuple[str, ...], new: tuple[str, ...]) -> str:
 
 # -- what commands come to ------------------------------------------------------------------------
 
-Resolve = Callable[[str], str]  # the text of a brick's source -> where it is found
+Resolve = Callable[[Wish], str]  # of an update: where the brick's class, or the function, is found
 Judge = Callable[[Graph, Wish], None]
 
 
-def as_written(source: str) -> str:
-    return source
+def as_written(wish: Wish) -> str:
+    return wish.source
 
 
 def whatever_suits(graph: Graph, wish: Wish) -> None:
@@ -182,7 +185,7 @@ def scheduled(
 def goal_of(wish: Wish, graph: Graph, recipe: str, resolve: Resolve) -> Goal:
     """What `wish` comes to where `graph` runs. Raises ConfigError."""
     if wish.verb == "update":
-        wish = msgspec.structs.replace(wish, source=resolve(wish.source))
+        wish = msgspec.structs.replace(wish, source=resolve(wish))
     return goal(wish, graph.ftm, recipe)
 
 

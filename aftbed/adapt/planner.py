@@ -46,8 +46,16 @@ from aftbed.core.script import (
     Transfer,
     Unbind,
 )
-from aftbed.ftm.compose import NONE, STATEFUL, build, chain, parse, replication_of
-from aftbed.ftm.registry import REPLY_CHECKERS
+from aftbed.ftm.compose import (
+    NONE,
+    STATEFUL,
+    build,
+    chain,
+    parse,
+    protected_by,
+    protecting,
+    replication_of,
+)
 
 APPLICATION: Final = "app"  # what `adapt update` calls the protected function
 
@@ -90,17 +98,11 @@ def target(graph: Graph, expression: str) -> Graph:
         raise ConfigError("none has no engine and no Protocol: an adaptation neither starts nor ends there")
     if expression == graph.ftm:
         raise ConfigError(f"{expression} is what runs already")
-    application = next(b.application for b in graph.bricks if b.part == "server")
-    new = build(expression, graph.placement, leader_of(graph))
+    new = build(expression, graph.placement, leader_of(graph), protected_by(graph))
     sources = {(b.name, b.kind): b.source for b in graph.bricks}
 
     def carried_over(spec: BrickSpec) -> BrickSpec:
-        concerned = application and (spec.part == "server" or spec.kind in REPLY_CHECKERS)
-        return msgspec.structs.replace(
-            spec,
-            source=sources.get((spec.name, spec.kind), ""),
-            application=application if concerned else "",
-        )
+        return msgspec.structs.replace(spec, source=sources.get((spec.name, spec.kind), ""))
 
     return msgspec.structs.replace(new, bricks=tuple(map(carried_over, new.bricks)))
 
@@ -110,13 +112,12 @@ def updated(graph: Graph, part: str, source: str) -> Graph:
 
     Raises ConfigError, naming what there is, if no replica has such a part.
     """
-    wanted, change = (
-        ("server", {"application": source}) if part == APPLICATION else (part, {"source": source})
-    )
+    if part == APPLICATION:
+        return protecting(graph, source)
     parts = sorted({b.part for b in graph.bricks if b.replica and b.kind != "watchdog"})
-    if wanted not in parts:
+    if part not in parts:
         raise unknown("brick", part, (APPLICATION, *parts))
-    bricks = (msgspec.structs.replace(b, **change) if b.part == wanted else b for b in graph.bricks)
+    bricks = (msgspec.structs.replace(b, source=source) if b.part == part else b for b in graph.bricks)
     return msgspec.structs.replace(graph, bricks=tuple(bricks))
 
 

@@ -29,7 +29,7 @@ from typing import Annotated, Final
 import msgspec
 from msgspec import Meta
 
-from aftbed.core.application import Characteristics
+from aftbed.core.application import NONE, AccessKind, Characteristics
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.ftm.compose import DUPLEX, EXPRESSIONS, parse
 from aftbed.ftm.declaration import FaultClass, Level, Suitability
@@ -108,7 +108,7 @@ class TableFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Demand(msgspec.Struct, frozen=True):
     """What an expression tolerates and needs.
 
-    `deterministic`, `state_access`: a sentence for each part that needs it.
+    `deterministic`, `state_access`, `exact_state`: a sentence for each part that needs it.
     """
 
     ftm: str
@@ -116,6 +116,7 @@ class Demand(msgspec.Struct, frozen=True):
     detects: tuple[FaultClass, ...]
     deterministic: tuple[str, ...]
     state_access: tuple[str, ...]
+    exact_state: tuple[str, ...]
     cpus: int
     cpu_load: Level
     bandwidth: Level
@@ -166,6 +167,9 @@ def demand(expression: str, table: SuitabilityTable = TABLE) -> Demand:
         state_access=tuple(
             f"{row.mechanism} needs state access: {row.state_access}" for row in rows if row.state_access
         ),
+        exact_state=tuple(
+            f"{row.mechanism} needs exact state access: {row.exact_state}" for row in rows if row.exact_state
+        ),
         cpus=max([row.cpus for row in rows], default=1),
         cpu_load=max([row.cpu_load for row in rows], default="low", key=LEVELS.index),
         bandwidth=max([row.bandwidth for row in rows], default="none", key=LEVELS.index),
@@ -195,8 +199,10 @@ def problems(
     ]
     if not characteristics.deterministic:
         found += wanted.deterministic
-    if not characteristics.state_access:
+    if characteristics.state_access == NONE:
         found += wanted.state_access
+    if characteristics.state_access.kind is AccessKind.APPROXIMATE:
+        found += wanted.exact_state
     return found + _short_of(wanted, resources, table.limits)
 
 
@@ -222,7 +228,7 @@ def consistent(
 
 def remarks(expression: str, characteristics: Characteristics) -> list[str]:
     """Limits of an expression that is consistent."""
-    if _replicates(parse(expression)) and not characteristics.state_access:
+    if _replicates(parse(expression)) and characteristics.state_access == NONE:
         return [f"{expression} without state access: after a failover the survivor stays alone"]
     return []
 

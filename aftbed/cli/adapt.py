@@ -28,7 +28,8 @@ from aftbed.core.graph import PLACEMENTS, BrickSpec, Graph
 from aftbed.core.messages import Goal, Scheduled
 from aftbed.core.script import Script, Stage, Step, Together
 from aftbed.core.yaml_file import read_yaml
-from aftbed.ftm.compose import build
+from aftbed.ftm.compose import build, protected_by
+from aftbed.functions.source import located
 from aftbed.runtime.unix import control_client, run_directory
 from aftbed.vehicle.aeb.function import default_application
 
@@ -120,9 +121,8 @@ def script(
 def _change(wish: Wish, given: ChangeArguments) -> int:
     private = run_directory.find(given.run)
     graph = msgspec.convert(control_client.ask(private, control_client.GraphQuery()), Graph)
-    goal = msgspec.structs.replace(goal_of(wish, graph, given.recipe, class_source), may_fail=given.may_fail)
-    application = goal.source if goal.part == APPLICATION else _function_of(graph)
-    _refuse_unsuitable(goal.expression or graph.ftm, application, wish, force=given.force)
+    goal = msgspec.structs.replace(goal_of(wish, graph, given.recipe, found_source), may_fail=given.may_fail)
+    _refuse_unsuitable(commands.plan_goal(graph, goal).new, wish, force=given.force)
     return _ask(private, goal, as_json=given.json)
 
 
@@ -150,35 +150,42 @@ def scheduled(
     """The adaptations of `--adapt`, each checked on the graph that it will find. Raises ConfigError."""
 
     def judge(new: Graph, wish: Wish) -> None:
-        _refuse_unsuitable(new.ftm, _function_of(new), wish, force=force)
+        _refuse_unsuitable(new, wish, force=force)
 
     try:
-        return commands.scheduled(texts, start, recipe, resolve=class_source, judge=judge, may_fail=may_fail)
+        return commands.scheduled(texts, start, recipe, resolve=found_source, judge=judge, may_fail=may_fail)
     except ConfigError as error:
         raise ConfigError(f"--adapt {error}") from error
 
 
-def _function_of(graph: Graph) -> str:
-    return next(b.application for b in graph.bricks if b.part == "server")
+def found_source(wish: Wish) -> str:
+    """Where the class, or the function, of an update is found. Raises ConfigError."""
+    return located(wish.source) if wish.name == APPLICATION else class_source(wish.source)
 
 
-def _refuse_unsuitable(ftm: str, application: str, wish: Wish, *, force: bool) -> None:
-    """Raise ConfigError if `ftm` does not suit the function, unless `force`.
+def _refuse_unsuitable(new: Graph, wish: Wish, *, force: bool) -> None:
+    """The same of `new`, to which `wish` leads."""
+    if wish.verb == "decompose" or (wish.verb == "update" and wish.name != APPLICATION):
+        return  # the new graph needs no more of the function than the old one
+    refuse_unsuitable(new, force=force)
+
+
+def refuse_unsuitable(graph: Graph, *, force: bool) -> None:
+    """Raise ConfigError if the mechanism of `graph` does not suit its function, unless `force`.
 
     A class of the user is loaded neither here nor in the supervisor.
     """
-    if wish.verb == "decompose" or (wish.verb == "update" and wish.name != APPLICATION):
-        return  # the new graph needs no more of the function than the old one
-    declared = _declared_by(application) if application else default_application().characteristics
-    if reason := unsuitable(ftm, declared):
+    application = protected_by(graph)
+    declared = declared_in_time(application) if application else default_application().characteristics
+    if reason := unsuitable(graph.ftm, declared):
         if not force:
             raise ConfigError(f"{reason}; --force does it all the same")
         print(f"aftbed: forced: {reason}", file=sys.stderr)
-    for remark in remarks(ftm, declared):
+    for remark in remarks(graph.ftm, declared):
         print(f"aftbed: note: {remark}", file=sys.stderr)
 
 
-def _declared_by(application: str) -> Characteristics:
+def declared_in_time(application: str) -> Characteristics:
     """Its process has as long as the run's processes will have. Raises ConfigError."""
     # Imported here: no run waits for a judge at its start.
     from aftbed.judge.isolated import LIMITS, declared_by  # noqa: PLC0415
@@ -193,7 +200,7 @@ def _absolute(script: Script, folder: Path) -> Script:
 
     def brick(spec: BrickSpec) -> BrickSpec:
         source = class_source(spec.source, folder) if spec.source else ""
-        application = class_source(spec.application, folder) if spec.application else ""
+        application = located(spec.application, folder) if spec.application else ""
         return msgspec.structs.replace(spec, source=source, application=application)
 
     def resolved(verb: Step) -> Step:

@@ -24,11 +24,13 @@ from aftbed.adapt.suitability import (
     remarks,
     table_from,
 )
-from aftbed.cli.options import Json, check_range, class_source, print_json
+from aftbed.cli.options import Json, check_range, print_json
+from aftbed.core.application import NONE
 from aftbed.core.errors import ConfigError
 from aftbed.core.graph import Graph
 from aftbed.core.yaml_file import read_yaml
 from aftbed.ftm.compose import EXPRESSIONS, build
+from aftbed.functions.source import located
 from aftbed.judge.isolated import declared_by
 from aftbed.runtime.unix.trust import OWN_RUN
 from aftbed.vehicle.aeb.function import default_application
@@ -80,7 +82,8 @@ def show(
     _print_blocks(
         tolerates=[", ".join(wanted.tolerates) or "nothing"],
         detects=[", ".join(wanted.detects)] if set(wanted.detects) - set(wanted.tolerates) else [],
-        needs=[*wanted.deterministic, *wanted.state_access] or ["nothing of the function"],
+        needs=[*wanted.deterministic, *wanted.state_access, *wanted.exact_state]
+        or ["nothing of the function"],
         takes=[f"{_cpus(wanted.cpus)}, {wanted.cpu_load} CPU load, {bandwidth} bandwidth"],
         processes=[f"{_processes(graph)}, one per brick and the supervisor"],
         bricks=_bricks(graph),
@@ -113,7 +116,7 @@ def check(
     """
     model, rules = fault_model(faults), _table(table)
     built_in = default_application().characteristics
-    declared = built_in if app is None else declared_by(class_source(app), OWN_RUN)
+    declared = built_in if app is None else declared_by(located(app), OWN_RUN)
     resources = _resources(cpus, cpu_load, bandwidth)
     others = consistent(model, declared, resources, rules)
     found = [] if expression is None else problems(expression, model, declared, resources, rules)
@@ -121,11 +124,12 @@ def check(
     suits = bool(others) if expression is None else not found
     if json:
         judged = {"problems": found, "remarks": notes, "consistent_ftms": others}
-        given = {"faults": model.asked(), "app": app, "characteristics": declared, "resources": resources}
-        print_json({"ftm": expression, "consistent": suits, **judged, **given})
+        given = {"faults": model.asked(), "app": app, "characteristics": declared.told()}
+        print_json({"ftm": expression, "consistent": suits, **judged, **given, "resources": resources})
     else:
         determinism = "deterministic" if declared.deterministic else "not deterministic"
-        access = "state access" if declared.state_access else "no state access"
+        state_access = declared.state_access
+        access = "no state access" if state_access == NONE else f"{state_access} state access"
         kbit_s = resources.bandwidth_kbit_s
         limit = "bandwidth not limited" if kbit_s is None else f"{kbit_s:g} kbit/s"
         _print_blocks(
@@ -169,7 +173,11 @@ def _summary(wanted: Demand, graph: Graph) -> dict[str, object]:
         "ftm": wanted.ftm,
         "tolerates": wanted.tolerates,
         "detects": wanted.detects,
-        "needs": {"deterministic": wanted.deterministic, "state_access": wanted.state_access},
+        "needs": {
+            "deterministic": wanted.deterministic,
+            "state_access": wanted.state_access,
+            "exact_state": wanted.exact_state,
+        },
         "cpus": wanted.cpus,
         "cpu_load": wanted.cpu_load,
         "bandwidth": wanted.bandwidth,

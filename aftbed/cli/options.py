@@ -19,6 +19,10 @@ RATE_HZ_MAX: Final = 100_000.0
 JOBS_MAX: Final = 256
 
 Run = Annotated[str | None, typer.Option("--run", help="Id of the run; needed if several are alive.")]
+App = Annotated[
+    str | None,
+    typer.Option(help="The protected function: a class, .so, .fmu, or a program; the brake if left out."),
+]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else.")]
 Ftm = Annotated[str, typer.Option(help="none, pbr, lfr, tr, pbr+tr, ...: aftbed ftm list.")]
 Seed = Annotated[int, typer.Option(help="Seed of all random numbers.")]

@@ -17,13 +17,14 @@ from typing import TYPE_CHECKING, Annotated, Final
 import msgspec
 import typer
 
-from aftbed.cli.options import RATE_HZ_MAX, Ftm, Json, check_range, check_seed, takes
+from aftbed.cli.options import RATE_HZ_MAX, App, Ftm, Json, check_range, check_seed, takes
 from aftbed.cli.views import RunView, open_view
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.graph import Graph
 from aftbed.core.messages import Scheduled
 from aftbed.core.script import RECIPES
 from aftbed.ftm.compose import build
+from aftbed.functions.source import located
 from aftbed.inject.memory import refuse_unsafe
 from aftbed.inject.model import Fault, parse
 from aftbed.runtime.control import Report
@@ -48,6 +49,7 @@ class RunArguments(msgspec.Struct, frozen=True):
 
     ftm: Ftm = "pbr"
     scenario: Annotated[str, typer.Option(help="Name of a scenario, or a YAML file.")] = "ccrs-50"
+    app: App = None
     placement: Placement = "process"
     pace: Pace = "real"
     seed: Annotated[int, typer.Option(help="Seed of all random numbers of the run.")] = 0
@@ -61,7 +63,7 @@ class RunArguments(msgspec.Struct, frozen=True):
         "drained"
     )
     force: Annotated[
-        bool, typer.Option("--force", help="Carry out --adapt even where it does not suit the function.")
+        bool, typer.Option("--force", help="Run, and --adapt, even where it does not suit the function.")
     ] = False
     may_fail: Annotated[
         bool, typer.Option("--may-fail", help="The run may pass even if an adaptation was not done.")
@@ -109,7 +111,10 @@ def run(given: RunArguments) -> int:
 
 def execute(given: RunArguments) -> int:
     """Run, show, judge; the exit code. Raises ConfigError before anything is started."""
-    graph = build(given.ftm, given.placement)
+    application = located(given.app) if given.app is not None else ""
+    graph = build(given.ftm, given.placement, application=application)
+    if application:
+        _refuse_unsuitable(graph, force=given.force)
     faults = tuple(_fault(text, graph, unsafe=given.unsafe_memory) for text in given.faults)
     adaptations = _adaptations(given, graph)
     policy = None
@@ -132,6 +137,7 @@ def execute(given: RunArguments) -> int:
         pin=given.pin,
         bus_port=given.bus_port,
         bus_open=given.bus_open,
+        application=application,
     )
     launched = launch(options, listener)
     try:
@@ -168,10 +174,18 @@ def _fault(text: str, graph: Graph, *, unsafe: bool) -> Fault:
     return fault
 
 
+def _refuse_unsuitable(graph: Graph, *, force: bool) -> None:
+    from aftbed.cli.adapt import refuse_unsuitable  # noqa: PLC0415 - only with --app
+
+    refuse_unsuitable(graph, force=force)
+
+
 def _adaptations(given: RunArguments, graph: Graph) -> tuple[Scheduled, ...]:
     if not given.adaptations:
-        if given.recipe != RECIPES[0] or given.force:
-            raise ConfigError("--recipe and --force say how --adapt is carried out: give --adapt too")
+        if given.recipe != RECIPES[0]:
+            raise ConfigError("--recipe says how --adapt is carried out: give --adapt too")
+        if given.force and given.app is None:
+            raise ConfigError("--force is about --adapt and --app: give one of them too")
         if given.may_fail and given.policy is None:
             raise ConfigError("--may-fail is about --adapt and --policy: give one of them too")
         return ()
@@ -189,7 +203,9 @@ def _closed_loop(given: RunArguments) -> "Callable[[Launched], ClosedLoop] | Non
     policy = asked_for(given.policy, given.approve, given.ftm, as_json=given.json)
     if policy is None:
         return None
-    return lambda run: ClosedLoop(policy, given.ftm, run.private, run.record, given.approve)
+    from aftbed.cli.adapt import declared_in_time  # noqa: PLC0415 - the same
+
+    return lambda run: ClosedLoop(policy, run.options, given.approve, declared_in_time)
 
 
 def _work(given: RunArguments) -> Work:

@@ -140,4 +140,10 @@ def run(
 
     Exit code: 0 pass, 1 a promise was broken, 2 usage, 3 inconclusive, 130 interrupted and cleaned.
     """
-    raise typer.Exit(execute(RunArguments(ftm, name, placement, pace, seed, tuple(faults or ()), json=json)))
+    raise typer.Exit(
+        execute(
+            RunArguments(
+                ftm, name, placement=placement, pace=pace, seed=seed, faults=tuple(faults or ()), json=json
+            )
+        )
+    )

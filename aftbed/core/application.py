@@ -4,16 +4,31 @@ The mechanisms (`ftm`) and the car (`vehicle`) are strangers to each other; this
 know in common. Requests, replies and states are opaque bytes to the mechanism.
 """
 
+import math
 import re
+import struct
 from collections.abc import Mapping
+from enum import Enum
 from typing import Final, Literal, Protocol, TypeGuard
 
 import msgspec
 
 from aftbed.core.errors import ConfigError, unknown
 
-Width = Literal["u8", "u32", "i64", "u64", "f64"]
-BITS: Final[dict[Width, int]] = {"u8": 8, "u32": 32, "i64": 64, "u64": 64, "f64": 64}
+Width = Literal["bool", "u8", "u16", "u32", "u64", "i8", "i16", "i32", "i64", "f32", "f64"]
+BITS: Final[dict[Width, int]] = {
+    "bool": 8,
+    "u8": 8,
+    "u16": 16,
+    "u32": 32,
+    "u64": 64,
+    "i8": 8,
+    "i16": 16,
+    "i32": 32,
+    "i64": 64,
+    "f32": 32,
+    "f64": 64,
+}
 REPLY_BYTES_MAX: Final = 60 * 1024  # a reply has to fit into a packet
 STATE_BYTES_MAX: Final = 64 << 20
 
@@ -30,22 +45,60 @@ class Field(msgspec.Struct, frozen=True):
         return BITS[self.kind]
 
 
+class AccessKind(Enum):
+    EXACT = "exact"
+    APPROXIMATE = "approximate"
+    NONE = "none"
+
+
+class StateAccess(msgspec.Struct, frozen=True):
+    """What `capture` and `restore` mean: `EXACT`, `NONE`, or `approximate(tolerance)`.
+
+    Behind a restored state, each number in a reply differs by at most `tolerance` from the one without.
+    """
+
+    kind: AccessKind = AccessKind.EXACT
+    tolerance: float = 0.0
+
+    def __str__(self) -> str:
+        return f"approximate({self.tolerance:g})" if self.tolerance else self.kind.value
+
+
+EXACT: Final = StateAccess()
+NONE: Final = StateAccess(AccessKind.NONE)  # `capture` returns no byte
+
+
+def approximate(tolerance: float) -> StateAccess:
+    """Of a function that does not restore all digits. Raises ConfigError."""
+    if not (math.isfinite(tolerance) and tolerance > 0):
+        raise ConfigError(f"approximate({tolerance:g}): a tolerance is more than 0 and finite")
+    return StateAccess(AccessKind.APPROXIMATE, tolerance)
+
+
 class Characteristics(msgspec.Struct, frozen=True):
     """The A of FT/A/R: what a function declares of itself, and what the choice of a mechanism rests on.
 
-    `deterministic`: equal states and requests give equal replies and states. `state_access`: `capture`
-    and `restore` mean the whole state.
+    `deterministic`: equal states and requests give equal replies and states.
     """
 
     deterministic: bool = True
-    state_access: bool = True
+    state_access: StateAccess = EXACT
+
+    def told(self) -> dict[str, object]:
+        """For documents of `--json`."""
+        access = self.state_access
+        return {
+            "deterministic": self.deterministic,
+            "state_access": access.kind.value,
+            "tolerance": access.tolerance,
+        }
 
 
 class Application(Protocol):
     """A protected function. What it declares is believed, and measured by campaigns.
 
-    One whose state has a fixed layout may declare it, as `fields: tuple[Field, ...]`: see `fields_of`. One
-    with a large state may know its changes: see `KnowsChanges`.
+    One whose state has a fixed layout may declare it, as `fields: tuple[Field, ...]`: see `fields_of`; one
+    whose replies have, as `reply_fields`. One with a large state may know its changes: see `KnowsChanges`.
 
     `execute` is the only thing that changes the state. No clock, no chance, no I/O: time comes
     in with the request.
@@ -104,6 +157,56 @@ def fields_of(application: Application | type[Application]) -> tuple[Field, ...]
     """The variables that the state consists of, where the function declares them; else none."""
     fields: tuple[Field, ...] = getattr(application, "fields", ())
     return fields
+
+
+def reply_fields_of(application: Application | type[Application]) -> tuple[Field, ...]:
+    """The variables that a reply consists of, where the function declares them; else none."""
+    fields: tuple[Field, ...] = getattr(application, "reply_fields", ())
+    return fields
+
+
+_CODES: Final[dict[Width, str]] = {
+    "bool": "?",
+    "u8": "B",
+    "u16": "H",
+    "u32": "I",
+    "u64": "Q",
+    "i8": "b",
+    "i16": "h",
+    "i32": "i",
+    "i64": "q",
+    "f32": "f",
+    "f64": "d",
+}
+
+
+def value_of(field: Field, data: bytes) -> float:
+    """The number in `data`, which is long enough."""
+    found: float = struct.unpack_from(f"<{_CODES[field.kind]}", data, field.offset_bytes)[0]
+    return found
+
+
+def difference(fields: tuple[Field, ...], one: bytes, other: bytes) -> float:
+    """The largest difference between the numbers of two replies, or states.
+
+    Infinite where anything else differs, or a number is not finite in one of them.
+    """
+    if one == other:
+        return 0.0
+    if not fields or len(one) != len(other):
+        return math.inf
+    rest, largest = [bytearray(one), bytearray(other)], 0.0
+    for field in fields:
+        end = field.offset_bytes + field.size_bits // 8
+        if end > len(one):
+            return math.inf
+        first, second = value_of(field, one), value_of(field, other)
+        if one[field.offset_bytes : end] != other[field.offset_bytes : end] and first != second:
+            apart = abs(first - second)
+            largest = max(largest, apart if math.isfinite(apart) else math.inf)
+        for data in rest:
+            data[field.offset_bytes : end] = bytes(end - field.offset_bytes)
+    return largest if rest[0] == rest[1] else math.inf
 
 
 def field_named(name: str, fields: tuple[Field, ...]) -> Field:

@@ -12,10 +12,12 @@ the place of the ROS master.
 import contextlib
 from typing import Final
 
+import msgspec
+
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.graph import PLACEMENTS, BrickSpec, Graph, Link
 from aftbed.ftm.declaration import FaultClass
-from aftbed.ftm.registry import KINDS, MECHANISMS
+from aftbed.ftm.registry import KINDS, MECHANISMS, REPLY_CHECKERS
 
 REPLICAS: Final = ("a", "b")
 NONE: Final = "none"
@@ -99,15 +101,33 @@ def replication_of(expression: str) -> tuple[tuple[str, str], ...]:
     return MECHANISMS[names[0]].replication if names else ()
 
 
-def build(expression: str, placement: str, leader: str = REPLICAS[0]) -> Graph:
-    """The graph of `expression`; `leader` leads. Raises ConfigError on an unknown name."""
+def build(expression: str, placement: str, leader: str = REPLICAS[0], application: str = "") -> Graph:
+    """The graph of `expression`; `leader` leads, and `application` is protected ("": the built-in function).
+
+    Raises ConfigError on an unknown name.
+    """
     if placement not in PLACEMENTS:
         raise unknown("placement", placement, PLACEMENTS)
     names = parse(expression)
     graph = _protected(names, placement, leader) if names else _bare(placement)
     problems = graph.problems(KINDS)
     assert not problems, problems
-    return graph
+    return protecting(graph, application) if application else graph
+
+
+def protecting(graph: Graph, application: str) -> Graph:
+    """`graph` with another function in its Servers, and in the bricks that check replies by its assertion."""
+
+    def brick(spec: BrickSpec) -> BrickSpec:
+        concerned = spec.part == "server" or spec.kind in REPLY_CHECKERS
+        return msgspec.structs.replace(spec, application=application) if concerned else spec
+
+    return msgspec.structs.replace(graph, bricks=tuple(map(brick, graph.bricks)))
+
+
+def protected_by(graph: Graph) -> str:
+    """The function that the Servers of `graph` protect, "" for the built-in one."""
+    return next(b.application for b in graph.bricks if b.part == "server")
 
 
 def _bare(placement: str) -> Graph:

@@ -70,13 +70,14 @@ class BrickKind(Kind, frozen=True, kw_only=True):
 class Suitability(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """What a mechanism tolerates, and what it needs: FT, A and R.
 
-    `deterministic`, `state_access`: why the function must have it; empty: it need not.
+    `deterministic`, `state_access`, `exact_state`: why the function must have it; empty: it need not.
     """
 
     tolerates: tuple[FaultClass, ...] = ()
     detects: tuple[FaultClass, ...] = ()
     deterministic: str = ""
     state_access: str = ""
+    exact_state: str = ""
     cpus: Annotated[int, Meta(ge=1, le=1024)] = 1
     cpu_load: Level = "low"
     bandwidth: Level = "none"

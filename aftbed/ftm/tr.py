@@ -301,6 +301,7 @@ TR: Final = Mechanism(
         tolerates=("value", "implausible"),
         deterministic="executions of one request are compared",
         state_access="every execution starts from the same state",
+        exact_state="executions from one state are compared bit by bit",
         cpus=1,
         cpu_load="high",
         bandwidth="none",

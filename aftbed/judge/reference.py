@@ -16,11 +16,12 @@ from typing import Final
 import msgspec
 
 from aftbed.adapt.engine import DONE
-from aftbed.adapt.plugins import LoadModule, load_application
-from aftbed.core.application import Application
+from aftbed.core.application import Application, Characteristics, Field, reply_fields_of
 from aftbed.core.errors import PeerError
 from aftbed.core.events import Event
 from aftbed.core.journal import EntryKind, History
+from aftbed.functions.load import Code, load_application
+from aftbed.judge.record import RunRecord
 from aftbed.runtime.adaptations import Outcome
 from aftbed.runtime.deployment import digest, replica_of
 from aftbed.vehicle.aeb.function import default_application
@@ -34,8 +35,8 @@ BUILT_IN: Final = ""
 class Succession:
     """An application whose requests are executed by several versions in turn, as `changes` have it."""
 
-    def __init__(self, changes: list[Change]) -> None:
-        self._serve(default_application())
+    def __init__(self, first: Make, changes: list[Change]) -> None:
+        self._serve(first())
         self._before: list[Application] = []
         self._changes = list(changes)
         self._count = 0
@@ -45,6 +46,7 @@ class Succession:
     def _serve(self, function: Application) -> None:
         self._function = function
         self.characteristics = function.characteristics
+        self.reply_fields = reply_fields_of(function)
 
     def execute(self, request: bytes) -> bytes:
         self._count += 1
@@ -81,10 +83,10 @@ class Succession:
         return self._function.acceptable(request, reply)
 
 
-def changes_of(history: History, adaptations: Iterable[Outcome]) -> list[NamedChange]:
-    """When another version began to serve, from the outcomes of the adaptations."""
+def changes_of(history: History, adaptations: Iterable[Outcome], begun: str = BUILT_IN) -> list[NamedChange]:
+    """When another version than `begun` began to serve, from the outcomes of the adaptations."""
     changes: list[NamedChange] = []
-    running = BUILT_IN
+    running = begun
     for update in adaptations:
         function = update.application if update.outcome == DONE else update.tried
         if not update.opened_ns or function == running:
@@ -105,13 +107,23 @@ def changes_of(history: History, adaptations: Iterable[Outcome]) -> list[NamedCh
     return changes
 
 
-def loaded(changes: Iterable[NamedChange], load_module: LoadModule) -> list[Change]:
+def loaded(changes: Iterable[NamedChange], code: Code) -> list[Change]:
     """The same with the versions, which are executed for that. Raises ConfigError where one is no good."""
 
-    def make(function: str) -> Make:
-        return load_application(function, load_module) if function else default_application
+    return [(n, None if function is None else maker(function, code)) for n, function in changes]
 
-    return [(first, None if function is None else make(function)) for first, function in changes]
+
+def maker(function: str, code: Code) -> Make:
+    """Of the function that a record names. Raises ConfigError."""
+    return load_application(function, code) if function else default_application
+
+
+def succession(record: RunRecord, code: Code) -> Application:
+    """The bare server of a run, which this process loads. Raises ConfigError."""
+    begun = record.options.application
+    changes = changes_of(record.history, record.adaptations, begun)
+    first = maker(begun, code)
+    return Succession(first, loaded(changes, code)) if changes else first()
 
 
 class ReferenceRun(msgspec.Struct, frozen=True):
@@ -119,12 +131,16 @@ class ReferenceRun(msgspec.Struct, frozen=True):
 
     A request that it refuses has an empty reply. Where the function is not `deterministic`, its replies
     need not be those of a run. `unknown`: why nothing is known of them, "" where they are.
+
+    `tolerance`: by so much the numbers in `reply_fields` may differ, as the function declares.
     """
 
     replies: tuple[tuple[int, bytes], ...]
     state: bytes
     deterministic: bool = True
     unknown: str = ""
+    tolerance: float = 0.0
+    reply_fields: tuple[Field, ...] = ()
 
     @property
     def digest(self) -> str:
@@ -145,7 +161,14 @@ def executed(requests: Iterable[tuple[int, bytes]], bare: Application) -> Refere
             replies.append((number, bare.execute(payload)))
         except PeerError:
             replies.append((number, b""))
-    return ReferenceRun(tuple(replies), bare.capture(), getattr(bare, "deterministic", True))
+    declared = getattr(bare, "characteristics", Characteristics())
+    return ReferenceRun(
+        tuple(replies),
+        bare.capture(),
+        getattr(bare, "deterministic", declared.deterministic),
+        tolerance=declared.state_access.tolerance,
+        reply_fields=reply_fields_of(bare),
+    )
 
 
 def reference_run(history: History, bare: Application) -> ReferenceRun:

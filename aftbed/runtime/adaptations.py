@@ -19,8 +19,8 @@ from aftbed.adapt.planner import Plan
 from aftbed.core import messages
 from aftbed.core.errors import ConfigError, StepFailed
 from aftbed.core.events import Event
-from aftbed.core.graph import Graph
 from aftbed.core.script import Phase, Script, bricks_changed
+from aftbed.ftm.compose import protected_by
 from aftbed.runtime import control
 from aftbed.runtime.deployment import Deployment, Keys
 from aftbed.runtime.fault_controller import FaultController
@@ -63,11 +63,6 @@ class Outcome(msgspec.Struct):
 
 def _named(goal: messages.Goal) -> str:
     return goal.expression or goal.part or "script"
-
-
-def function_of(graph: Graph) -> str:
-    """The protected function of `graph`, "" for the built-in one."""
-    return next(b.application for b in graph.bricks if b.part == "server")
 
 
 def _unanswered(outcome: Outcome) -> None:
@@ -318,10 +313,10 @@ class Adaptations:
         outcome.outcome, outcome.reason = ended.outcome, ended.reason
         outcome.total_ms = round((self._loop.now_ns() - now.began_ns) / 1e6, 3)
         outcome.ftm = self._deployment.graph.ftm
-        outcome.application = function_of(self._deployment.graph)
+        outcome.application = protected_by(self._deployment.graph)
         if now.execution is not None:
             outcome.bricks_changed = bricks_changed(now.execution.old, now.execution.new, now.plan.script)
-            outcome.tried, outcome.opened_ns = function_of(now.execution.new), now.execution.turned_ns
+            outcome.tried, outcome.opened_ns = protected_by(now.execution.new), now.execution.turned_ns
             outcome.undone_ns, outcome.lost = now.execution.undone_ns, " ".join(sorted(now.execution.lost))
         self._keep(outcome)
         now.answer(outcome)

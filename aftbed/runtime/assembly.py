@@ -15,7 +15,7 @@ from typing import Final, TypeVar
 
 import msgspec
 
-from aftbed.adapt.plugins import LoadModule, load_application, make_brick
+from aftbed.adapt.plugins import make_brick
 from aftbed.core.application import Application, KnowsChanges, knows_changes
 from aftbed.core.brick import Brick, Effect
 from aftbed.core.errors import ConfigError, PeerError
@@ -25,6 +25,7 @@ from aftbed.ftm.compose import REPLICAS, chain
 from aftbed.ftm.pages import PAGE_BYTES
 from aftbed.ftm.registry import Setting
 from aftbed.ftm.server import Server
+from aftbed.functions.load import Code, load_application
 from aftbed.runtime import control
 from aftbed.runtime.devices import Device
 from aftbed.runtime.node import MemoryIO, Node, Stopped, nowhere
@@ -40,19 +41,17 @@ Out = TypeVar("Out")
 
 
 class Assembler:
-    """`function`: what is protected if the graph names nothing else; `load`: how a class is found;
-    `page_bytes`: of a page of a checkpoint.
-    """
+    """`function`: what is protected if the graph names nothing else; `page_bytes`: see `Setting`."""
 
     def __init__(
         self,
         function: Callable[[], Application],
-        load: LoadModule,
+        code: Code,
         make: MakeSetting | None = None,
         page_bytes: int = PAGE_BYTES,
     ) -> None:
-        self._function, self._load, self._page_bytes = function, load, page_bytes
-        self._make: MakeSetting = make or (lambda spec, setting: make_brick(spec, setting, load))
+        self._function, self._code, self._page_bytes = function, code, page_bytes
+        self._make: MakeSetting = make or (lambda spec, setting: make_brick(spec, setting, code))
 
     def build(
         self, node: Node[In, Out], order: control.Assign, fds: list[int], make_device: Callable[[], Device]
@@ -78,7 +77,7 @@ class Assembler:
         default.
         """
         number = REPLICAS.index(spec.replica) + 1 if spec.replica else 0
-        named = load_application(spec.application, self._load) if spec.application else self._function
+        named = load_application(spec.application, self._code) if spec.application else self._function
         epoch = TEST_EPOCH if leader else order.epoch
         leads = spec.replica == (leader or order.leader)
         return Setting(number, epoch, leads, named, self._page_bytes)

@@ -27,7 +27,7 @@ from aftbed.adapt.suitability import (
     table_from,
 )
 from aftbed.core import messages
-from aftbed.core.application import Characteristics
+from aftbed.core.application import EXACT, NONE, Characteristics, approximate
 from aftbed.core.errors import ConfigError
 from aftbed.core.messages import Checkpoint, Notification, Request
 from aftbed.core.yaml_file import read_yaml
@@ -35,10 +35,11 @@ from aftbed.ftm.compose import DUPLEX, EXPRESSIONS, parse
 from aftbed.ftm.registry import MECHANISMS
 from aftbed.vehicle.aeb.function import default_application, sample_requests
 
-OPEN: Final = Characteristics(deterministic=True, state_access=True)
-CLOSED: Final = Characteristics(deterministic=True, state_access=False)
-RANDOM: Final = Characteristics(deterministic=False, state_access=True)
-NEITHER: Final = Characteristics(deterministic=False, state_access=False)
+OPEN: Final = Characteristics()
+CLOSED: Final = Characteristics(state_access=NONE)
+ROUGH: Final = Characteristics(state_access=approximate(1e-3))
+RANDOM: Final = Characteristics(deterministic=False)
+NEITHER: Final = Characteristics(deterministic=False, state_access=NONE)
 AMPLE: Final = Resources(cpus=2, cpu_load=0.0)
 CRASH: Final = FaultModel(crash=True)
 VALUE: Final = FaultModel(crash=False, value=True)
@@ -47,7 +48,7 @@ NOTHING: Final = FaultModel(crash=False)
 
 expressions = st.sampled_from(EXPRESSIONS)
 models = st.builds(FaultModel, st.booleans(), st.booleans(), st.booleans())
-functions = st.builds(Characteristics, st.booleans(), st.booleans())
+functions = st.builds(Characteristics, st.booleans(), st.sampled_from([EXACT, NONE, approximate(1e-3)]))
 machines = st.builds(
     Resources,
     st.integers(1, 4),
@@ -137,6 +138,9 @@ def test_the_limits_of_bandwidth_carry_the_function_at_50_requests_a_second() ->
         ("pbr+assert", RANDOM, []),
         ("lfr+assert", CLOSED, []),
         ("lfr+assert", NEITHER, ["lfr needs a deterministic function: "]),
+        ("pbr", ROUGH, []),
+        ("lfr", ROUGH, []),
+        ("pbr+tr", ROUGH, ["tr needs exact state access: executions from one state are compared bit by bit"]),
     ],
 )
 def test_an_assumption_on_the_function_is_named(
@@ -270,7 +274,7 @@ def test_a_refusal_names_every_problem_and_what_would_do(
 
 @given(expressions, functions)
 def test_a_follower_that_cannot_be_renewed_is_remarked(expression: str, function: Characteristics) -> None:
-    alone = parse(expression)[:1] in [(name,) for name in DUPLEX] and not function.state_access
+    alone = parse(expression)[:1] in [(name,) for name in DUPLEX] and function.state_access == NONE
     assert [("survivor" in remark) for remark in remarks(expression, function)] == ([True] if alone else [])
 
 

@@ -203,10 +203,10 @@ def test_removing_mechanisms_is_not_refused(fake: FakeRun, call: Call) -> None:
 def test_a_function_that_no_mechanism_suits(fake: FakeRun, refused: Output, tmp_path: Path) -> None:
     """It is not deterministic and has no state access."""
     (tmp_path / "neither.py").write_text(
-        "from aftbed.core.application import Characteristics\n"
+        "from aftbed.core.application import NONE, Characteristics\n"
         f"from {VARIANTS} import WithoutStateAccess\n"
         "class Neither(WithoutStateAccess):\n"
-        "    characteristics = Characteristics(deterministic=False, state_access=False)\n"
+        "    characteristics = Characteristics(deterministic=False, state_access=NONE)\n"
     )
     assert "(no consistent FTM)" in refused("adapt", "update", "app", "--to", tmp_path / "neither.py:Neither")
 

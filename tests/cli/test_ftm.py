@@ -17,9 +17,9 @@ from aftbed.ftm.compose import EXPRESSIONS, build
 VARIANTS: Final = "aftbed.vehicle.aeb.variants"
 AMPLE: Final = ("--cpus", "2", "--cpu-load", "0.1")
 MINE: Final = """
-from aftbed.core.application import Characteristics
+from aftbed.core.application import NONE, Characteristics
 class Mine:
-    characteristics = Characteristics(deterministic=False, state_access=False)
+    characteristics = Characteristics(deterministic=False, state_access=NONE)
     def execute(self, request): return b""
     def capture(self): return b""
     def restore(self, state): pass
@@ -62,6 +62,7 @@ def test_the_list_as_a_document(call: Call) -> None:
                 "lfr needs a deterministic function: two replicas execute every request",
             ],
             "state_access": [],
+            "exact_state": [],
         },
         "cpus": 2,
         "cpu_load": "high",
@@ -190,7 +191,7 @@ def test_the_answer_as_a_document(call: Call) -> None:
         "consistent_ftms": ["pbr", "pbr+assert"],
         "faults": ["crash"],
         "app": f"{VARIANTS}:NonDeterministic",
-        "characteristics": {"deterministic": False, "state_access": True},
+        "characteristics": {"deterministic": False, "state_access": "exact", "tolerance": 0.0},
         "resources": {"cpus": 2, "cpu_load": 0.1, "bandwidth_kbit_s": None},
     }
 
@@ -240,7 +241,7 @@ def test_a_table_of_the_user_replaces_rows(call: Call, tmp_path: Path) -> None:
         (("check", "--faults", "crsh"), ("unknown fault 'crsh'", "did you mean 'crash'", "implausible")),
         (("check", "--app", f"{VARIANTS}:Cautios"), (f"{VARIANTS}:Cautios", "Cautious")),
         (("check", "--app", "aftbed.gone:Mine"), ("aftbed.gone:Mine", "cannot be imported")),
-        (("check", "--app", "mine"), ("'mine' names no class", "MODULE:CLASS or FILE.py:CLASS")),
+        (("check", "--app", "mine"), ("'mine' names no function", "MODULE:CLASS, FILE.py:CLASS")),
         (("check", "--app", "gone.py:Mine"), ("gone.py", "no such file")),
         (("check", "--cpus", "0"), ("--cpus 0", "1 to 1024")),
         (("check", "--cpu-load", "1.5"), ("--cpu-load 1.5", "0 to 1")),
@@ -262,7 +263,7 @@ def test_bad_input_is_exit_code_2(call: Call, arguments: tuple[str, ...], words:
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("Half", ("no protected function", "capture, restore, acceptable, characteristics")),
+        ("Half", ("no protected function", "capture, restore, characteristics")),
         ("Odd", ("Odd: characteristics: found {", "allowed is Characteristics(...)")),
         ("Mien", ("no class Mien", "Half, Mine, Odd")),
     ],

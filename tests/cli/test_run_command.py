@@ -32,8 +32,8 @@ from aftbed.runtime.unix.options import RunOptions
         (("--adapt", f"update app to {CLOSED}"), ("pbr needs state access", "--force")),
         (("--adapt", "to lfr", "--recipe", "papr"), ("did you mean 'paper'",)),
         (("--adapt", "to lfr", "--recipe", "paper", "--placement", "replica"), ("not replica",)),
-        (("--recipe", "paper"), ("--recipe and --force", "give --adapt too")),
-        (("--force",), ("--recipe and --force", "give --adapt too")),
+        (("--recipe", "paper"), ("--recipe says how", "give --adapt too")),
+        (("--force",), ("--force is about --adapt and --app",)),
         (("--may-fail",), ("--adapt and --policy", "give one of them too")),
         (
             ("--adapt", "switch lfr", "--adapt", "switch lfr"),

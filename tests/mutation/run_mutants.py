@@ -30,7 +30,7 @@ from aftbed.campaign.plan import code_version
 
 ROOT: Final = Path(__file__).parents[2]
 COPIED: Final = ("aftbed", "dbc", "docs", "tests", "pyproject.toml", "README.md", "CHANGELOG.md", "Makefile")
-ONLY_REAL: Final = ("aftbed/runtime/unix/", "aftbed/adapt/plugins.py")  # the simulator does not execute them
+ONLY_REAL: Final = ("aftbed/runtime/unix/", "aftbed/functions/")  # the simulator does not execute them
 SIMULATED: Final = (Finder.EXPLORERS, Finder.SWARM)
 SCRIPTS: Final = {Finder.EXPLORERS: "explorers", Finder.SWARM: "swarm", Finder.CAMPAIGN: "campaign"}
 SECONDS_MAX: Final = {

@@ -270,9 +270,9 @@ MUTANTS: Final = (
     SourceMutant(
         "a function that returns no bytes passes the self-test",
         "G8",
-        "aftbed/adapt/plugins.py",
-        "    return _checked(found)\n",
-        "    return found\n",
+        "aftbed/functions/load.py",
+        "            return _checked(_application_class(source, code))\n",
+        "            return _application_class(source, code)\n",
         UNIT,
         ("tests/runtime/test_selftest.py",),
     ),

@@ -5,7 +5,7 @@ Their state has the first version's form, so that either takes it from the other
 
 import msgspec
 
-from aftbed.core.application import Application, Characteristics
+from aftbed.core.application import NONE, Application, Characteristics
 from aftbed.vehicle.aeb.function import default_application
 from aftbed.vehicle.aeb.messages import decode_reply, encode_reply
 
@@ -41,7 +41,7 @@ class Firm:
 class Closed(Firm):
     """The same, with its state locked in."""
 
-    characteristics = Characteristics(state_access=False)
+    characteristics = Characteristics(state_access=NONE)
 
     def capture(self) -> bytes:
         return b""

@@ -37,7 +37,6 @@ from typing import Final, Literal
 import msgspec
 
 from aftbed import adapt
-from aftbed.adapt.plugins import load_application
 from aftbed.adapt.policy import (
     Beyond,
     Declined,
@@ -64,7 +63,7 @@ from aftbed.ftm.compose import NONE
 from aftbed.runtime.adaptations import Outcome
 from aftbed.runtime.unix import control_client
 from aftbed.runtime.unix.control_client import Answer
-from aftbed.runtime.unix.options import load_module
+from aftbed.runtime.unix.options import RunOptions
 from aftbed.runtime.unix.run_directory import HISTORY_NAME
 from aftbed.runtime.unix.transport import Line
 from aftbed.vehicle.aeb.function import default_application
@@ -283,8 +282,12 @@ def _cpu_seconds() -> tuple[float, float]:
 class ClosedLoop:
     """One run under a policy. Assign `show` to have its lines shown like the events of the run."""
 
-    def __init__(self, policy: Policy, ftm: str, private: Path, record: Path, approve: str) -> None:
-        self._private, self._approve = private, approve
+    def __init__(
+        self, policy: Policy, options: RunOptions, approve: str, declared_by: Callable[[str], Characteristics]
+    ) -> None:
+        """`declared_by` is asked for the characteristics of a function outside of the package."""
+        private, record, ftm = Path(options.private), Path(options.record), options.ftm
+        self._private, self._approve, self._declared_by = private, approve, declared_by
         self._started_ns = time.monotonic_ns()
         self._policy, self._observer = policy, Observer(policy, ftm, self._started_ns)
         self._journals, self._meter = Journals(record / "journal"), Meter(policy)
@@ -294,7 +297,7 @@ class ClosedLoop:
         self._proposed: Counter[str] = Counter()  # by rule
         self._trouble = ""
         self.show: Show = lambda _: None
-        self._application = ""
+        self._application = options.application
         self._clock_known = False  # an event has shown when the run's clock began
         self._input_ended = False
         self._open: Proposal | None = None  # waits for a person, or for the run
@@ -436,7 +439,7 @@ class ClosedLoop:
     def _carry_out(self, proposal: Proposal) -> None:
         """Send it to the run, which answers later."""
         try:
-            if reason := _unsuitable(proposal.target, self._application):
+            if reason := self._unsuitable(proposal.target):
                 raise ConfigError(reason)
             goal = Goal(expression=proposal.target, may_fail=True)
             command = control_client.AdaptCommand(goal)
@@ -477,21 +480,23 @@ class ClosedLoop:
             file.write(msgspec.json.encode(ended) + b"\n")
         self._log("proposal", proposed_line(ended))
 
+    def _unsuitable(self, expression: str) -> str:
+        """Why `expression` does not suit the function that is protected now; "" if it does."""
+        application = self._application
+        try:
+            declared = (
+                self._declared_by(application) if application else default_application().characteristics
+            )
+        except ConfigError as error:
+            return str(error)
+        return unsuitable(expression, declared)
+
     def _log(self, event: str, text: str) -> None:
         self.show({"t_ms": _ms_since(self._started_ns), "event": event, "text": text})
 
 
 def _ms_since(t_ns: int) -> float:
     return round((time.monotonic_ns() - t_ns) / 1e6, 3)
-
-
-def _unsuitable(expression: str, application: str) -> str:
-    """Why `expression` does not suit the function that is protected now; "" if it does."""
-    function = load_application(application, load_module) if application else default_application()
-    declared: object = getattr(function, "characteristics", None)
-    if not isinstance(declared, Characteristics):
-        return f"{application}: characteristics: found {declared!r}, allowed is Characteristics(...)"
-    return unsuitable(expression, declared)
 
 
 def proposed_line(ended: Proposed) -> str:

@@ -373,6 +373,7 @@ def options_for(
     pin: bool = True,
     bus_port: int = 0,
     bus_open: bool = False,
+    application: str = "",
 ) -> tuple[RunOptions, socket.socket | None]:
     """What a run needs; where there is a bus, its socket too. Raises ConfigError, leaving nothing."""
     faults = tuple(with_names_resolved(fault, work) for fault in faults)
@@ -400,5 +401,6 @@ def options_for(
         listener=listener.fileno() if listener is not None else -1,
         port=listener.getsockname()[1] if listener is not None else 0,
         bus_open=bus_open,
+        application=application,
     )
     return options, listener

@@ -146,7 +146,10 @@ class Supervisor:
         cpus = sorted(os.sched_getaffinity(0))
         pinned = cpus if options.pin and len(cpus) > 1 else None
         self._controller = RunController(
-            build(options.ftm, options.placement), runtime, pinned, self._on_loss
+            build(options.ftm, options.placement, application=options.application),
+            runtime,
+            pinned,
+            self._on_loss,
         )
         self._deployment = self._work.deployment = self._controller.deployment
         self._server = ControlServer(options, self._loop, self._controller, self._work, self._finish)

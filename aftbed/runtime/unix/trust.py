@@ -31,10 +31,11 @@ import msgspec
 import aftbed
 from aftbed.core.errors import ConfigError
 from aftbed.core.input_file import read_input
-from aftbed.runtime.unix.options import SourceLoader
+from aftbed.functions.load import SourceLoader
+from aftbed.functions.source import FunctionKind, FunctionSource, parse_source
 
 PACKAGE: Final = Path(aftbed.__file__).resolve().parent
-FILE_BYTES_MAX: Final = 10_000_000
+FILE_BYTES_MAX: Final = 1 << 28  # a program may be as long as an interpreter
 NOTES_NAME: Final = "functions.jsonl"  # in the record: a line for each file of code that was loaded
 NOTES_BYTES_MAX: Final = 10_000_000
 LEDGER_NAME: Final = "functions"  # in the state directory: a hash per line, the latest last
@@ -67,7 +68,10 @@ def trusting(folders: Iterable[Path] | None) -> Trust:
 
 
 class CodeFile(msgspec.Struct, frozen=True):
-    """A file that is executed as `module`; `folders` are those of a package, none of another module."""
+    """A file that is executed as `module`; `folders` are those of a package, none of another module.
+
+    Without a `module`: one that is no Python, and is executed as it is.
+    """
 
     module: str
     path: str
@@ -75,23 +79,28 @@ class CodeFile(msgspec.Struct, frozen=True):
     folders: tuple[str, ...] = ()
 
 
-class Code(msgspec.Struct, frozen=True):
-    """All that loading `MODULE` or `FILE.py` executes, in order; no file of a module of this package."""
+class VettedFiles(msgspec.Struct, frozen=True):
+    """All that loading a function executes, in order; no file of a module of this package.
+
+    `place`: `MODULE`, `FILE.py`, or all of the text that names a function of another kind.
+    """
 
     place: str
     files: tuple[CodeFile, ...]
 
 
-def vetted(source: str, trust: Trust) -> Code:
-    """The code of `MODULE:CLASS` or `FILE.py:CLASS`; nothing of it is executed.
+def vetted(source: str, trust: Trust) -> VettedFiles:
+    """The code of a function, or of a brick's class; nothing of it is executed.
 
     Raises ConfigError, which names the source, where it is not trusted, or is not there.
     """
-    place = source.rpartition(":")[0]
-    if place.partition(".")[0] == PACKAGE.name and not place.endswith(".py"):
-        return Code(place, ())
+    named = parse_source(source)
+    is_class = named.kind is FunctionKind.CLASS
+    place = named.place if is_class else source
+    if is_class and place.partition(".")[0] == PACKAGE.name and not place.endswith(".py"):
+        return VettedFiles(place, ())
     try:
-        files = tuple(_files_of(place))
+        files = tuple(_files_of(place) if is_class else _opaque_files(named))
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
         raise ConfigError(f"{source} cannot be read: {reason}") from None
@@ -106,7 +115,7 @@ def vetted(source: str, trust: Trust) -> Code:
                 f"{source} is not trusted, so it was not executed: you have not run it before{unknown};"
                 f" --trust {folder} executes it"
             )
-    return Code(place, files)
+    return VettedFiles(place, files)
 
 
 def _files_of(place: str) -> Iterator[CodeFile]:
@@ -128,6 +137,12 @@ def _files_of(place: str) -> Iterator[CodeFile]:
             if path.suffix != ".py":
                 raise ValueError(f"{path} is no Python file")
             yield CodeFile(name, str(path), _hash(path), tuple(folders))
+
+
+def _opaque_files(source: FunctionSource) -> Iterator[CodeFile]:
+    """Raises OSError, ValueError."""
+    for path in source.files():
+        yield CodeFile("", str(path), _hash(path))
 
 
 def _folders_of(spec: ModuleSpec) -> list[str]:
@@ -163,8 +178,8 @@ class _HashedLoader(SourceLoader):
         return data
 
 
-def load(code: Code) -> ModuleType:
-    """Execute it. Raises whatever that raises."""
+def load(code: VettedFiles) -> ModuleType:
+    """Execute it, which is Python. Raises whatever that raises."""
     if not code.files:
         return importlib.import_module(code.place)
     module = None
@@ -185,6 +200,13 @@ def load(code: Code) -> ModuleType:
     return module
 
 
+def check_unchanged(code: VettedFiles) -> None:
+    """That the files which are no Python have their hashes still. Raises ConfigError."""
+    for file in code.files:
+        if not file.module and _hash(Path(file.path)) != file.sha256:
+            raise ConfigError(f"{file.path}: was changed meanwhile")
+
+
 # -- what runs have loaded ------------------------------------------------------------------------
 
 
@@ -198,9 +220,18 @@ def note(record: Path, place: str, module: ModuleType) -> None:
     if not place.endswith(".py"):
         names = [".".join(parts[:number]) for number in range(1, len(parts))]
         loaded = [*(sys.modules[name] for name in names if name in sys.modules), module]
+    _note(record, place, [Path(file) for one in loaded if (file := getattr(one, "__file__", None))])
+
+
+def note_files(record: Path, source: FunctionSource) -> None:
+    """The same of a function that is no class, which a node is about to execute."""
+    with contextlib.suppress(ConfigError):
+        _note(record, str(source), source.files())
+
+
+def _note(record: Path, place: str, paths: list[Path]) -> None:
     with contextlib.suppress(OSError, ValueError):
-        paths = [Path(file).resolve() for one in loaded if (file := getattr(one, "__file__", None))]
-        notes = [{"place": place, "file": str(path), "sha256": _hash(path)} for path in paths]
+        notes = [{"place": place, "file": str(path), "sha256": _hash(path.resolve())} for path in paths]
         with open(record / NOTES_NAME, "ab", buffering=0) as file:
             file.write("".join(json.dumps(one) + "\n" for one in notes).encode())
 

@@ -16,7 +16,7 @@ from typing import Final
 
 import msgspec
 
-from aftbed.core.application import Application, Characteristics, Field
+from aftbed.core.application import NONE, Application, Characteristics, Field
 from aftbed.core.errors import PeerError
 from aftbed.vehicle.aeb.function import STATE_BYTES, AebFunction, default_application
 from aftbed.vehicle.aeb.messages import STAGE_NONE, STAGE_WARN, decode_reply, encode_reply
@@ -31,7 +31,7 @@ CAUTIOUS_BYTES: Final = 2 + STATE_BYTES  # version, whether it warns early, vers
 class WithoutStateAccess:
     """The function with its state locked in, like that of a supplier that gives no access."""
 
-    characteristics = Characteristics(deterministic=True, state_access=False)
+    characteristics = Characteristics(state_access=NONE)
 
     def __init__(self) -> None:
         self._function: Application = default_application()
@@ -61,7 +61,7 @@ class NonDeterministic:
     Each reply is acceptable, and hardly two are equal, as of a function that reads its own clock.
     """
 
-    characteristics = Characteristics(deterministic=False, state_access=True)
+    characteristics = Characteristics(deterministic=False)
     fields = AebFunction.fields
 
     def __init__(self) -> None:
@@ -93,7 +93,7 @@ class Cautious:
     Its state is version 1's behind two bytes, so that neither is valid for the other; `migrate` converts it.
     """
 
-    characteristics = Characteristics(deterministic=True, state_access=True)
+    characteristics = Characteristics()
     fields: tuple[Field, ...] = (
         Field("warns", "u8", 1),
         *(Field(field.name, field.kind, 2 + field.offset_bytes) for field in AebFunction.fields),

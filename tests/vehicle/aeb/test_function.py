@@ -244,7 +244,7 @@ def test_a_jump_in_time_starts_all_tracks_anew(jump_ms: int, kept: bool) -> None
 
 
 def test_the_function_is_deterministic_and_opens_its_state() -> None:
-    assert AebFunction.characteristics == Characteristics(deterministic=True, state_access=True)
+    assert AebFunction.characteristics == Characteristics()
 
 
 # -- samples

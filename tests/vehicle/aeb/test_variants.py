@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sampling import sampled
 
-from aftbed.core.application import Application, Characteristics
+from aftbed.core.application import EXACT, NONE, Application, Characteristics, StateAccess
 from aftbed.core.errors import PeerError
 from aftbed.vehicle.aeb import variants
 from aftbed.vehicle.aeb.function import STATE_BYTES, default_application, sample_requests
@@ -43,9 +43,11 @@ def after(make: Make, count: int) -> Application:
 
 @pytest.mark.parametrize(
     ("make", "deterministic", "state_access"),
-    [(WithoutStateAccess, True, False), (NonDeterministic, False, True), (Cautious, True, True)],
+    [(WithoutStateAccess, True, NONE), (NonDeterministic, False, EXACT), (Cautious, True, EXACT)],
 )
-def test_each_declares_one_difference_at_most(make: Make, deterministic: bool, state_access: bool) -> None:
+def test_each_declares_one_difference_at_most(
+    make: Make, deterministic: bool, state_access: StateAccess
+) -> None:
     assert make().characteristics == Characteristics(deterministic, state_access)
 
 
@@ -76,7 +78,7 @@ def goes_on(make: Make) -> bool:
 
 @every_variant
 def test_what_it_declares_of_state_access_is_so(make: Make) -> None:
-    assert goes_on(make) == make().characteristics.state_access
+    assert goes_on(make) == (make().characteristics.state_access == EXACT)
 
 
 def test_the_state_of_the_one_without_access_is_nothing_and_only_that_is_taken() -> None:

@@ -1,0 +1,1 @@
+"""Protected functions of users: how a text names one, and how it is loaded (`load.load_application`)."""

@@ -1,0 +1,89 @@
+"""What a text names, and where that is found."""
+
+import sys
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from aftbed.core.errors import ConfigError
+from aftbed.functions.source import FunctionKind, located, parse_source
+
+
+@pytest.mark.parametrize(
+    ("text", "kind", "place", "part"),
+    [
+        ("package.module:Class", FunctionKind.CLASS, "package.module", "Class"),
+        ("path/file.py:Class", FunctionKind.CLASS, "path/file.py", "Class"),
+        ("a b/file.py:Class", FunctionKind.CLASS, "a b/file.py", "Class"),
+        ("path/lib.so", FunctionKind.LIBRARY, "path/lib.so", ""),
+        ("lib.so.1.2", FunctionKind.LIBRARY, "lib.so.1.2", ""),
+        ("path/model.fmu", FunctionKind.MODEL, "path/model.fmu", "path/ports.yaml"),
+        ("model.fmu:other.yaml", FunctionKind.MODEL, "model.fmu", "other.yaml"),
+        ("awk -f brake.awk", FunctionKind.PROGRAM, "awk -f brake.awk", ""),
+        ("sh", FunctionKind.PROGRAM, "sh", ""),
+    ],
+)
+def test_each_form(text: str, kind: FunctionKind, place: str, part: str) -> None:
+    found = parse_source(text)
+    assert (found.kind, found.place, found.part) == (kind, place, part)
+
+
+@pytest.mark.parametrize("text", ["", "  ", "mine", ":Class", "module:", "module:no-name", "no/such/file"])
+def test_what_names_no_function(text: str) -> None:
+    with pytest.raises(ConfigError, match=r"names no function; MODULE:CLASS, FILE\.py:CLASS, FILE\.so, "):
+        parse_source(text)
+
+
+def test_paths_are_made_absolute(tmp_path: Path) -> None:
+    for name in ("brake.py", "brake.so", "brake.fmu", "ports.yaml", "my data.txt"):
+        (tmp_path / name).touch()
+    (tmp_path / "program").write_text("#!/bin/sh\n")
+    (tmp_path / "program").chmod(0o755)
+    assert located("brake.py:Brake", tmp_path) == f"{tmp_path}/brake.py:Brake"
+    assert located("package.module:Brake", tmp_path) == "package.module:Brake"
+    assert located("brake.so", tmp_path) == f"{tmp_path}/brake.so"
+    assert located("brake.fmu", tmp_path) == f"{tmp_path}/brake.fmu:{tmp_path}/ports.yaml"
+    assert located("./program 'my data.txt' --fast", tmp_path) == (
+        f"{tmp_path}/program '{tmp_path}/my data.txt' --fast"
+    )
+    assert located("sh -c true", tmp_path) == "sh -c true"
+
+
+@pytest.mark.parametrize(
+    ("text", "missing"),
+    [
+        ("none.py:Brake", "none.py: no such file"),
+        ("none.so", "none.so: no such file"),
+        ("none.fmu", "none.fmu: no such file"),
+        ("brake.fmu", "ports.yaml: no such file"),
+        ("./none --fast", "no program "),
+        ("no-such-program --fast", "no program no-such-program"),
+        ("sh 'open", "no closing quotation"),
+    ],
+)
+def test_what_is_missing_is_named(tmp_path: Path, text: str, missing: str) -> None:
+    (tmp_path / "brake.fmu").touch()
+    with pytest.raises(ConfigError, match=missing):
+        located(text, tmp_path)
+
+
+def test_the_files_that_a_judge_has_to_trust(tmp_path: Path) -> None:
+    """A program's interpreter and its script; not the words that are no files."""
+    script = tmp_path / "brake.py"
+    script.touch()
+    files = parse_source(located(f"{sys.executable} brake.py --fast", tmp_path)).files()
+    assert files == [Path(sys.executable).resolve(), script]
+    model = parse_source("/m/brake.fmu")
+    assert model.files() == [Path("/m/brake.fmu"), Path("/m/ports.yaml")]
+    assert parse_source("module:Class").files() == []
+
+
+@given(st.text(max_size=40))
+def test_whatever_is_typed_is_read_or_refused(text: str) -> None:
+    try:
+        found = parse_source(text)
+    except ConfigError:
+        return
+    assert found.place and str(found)
