@@ -23,6 +23,7 @@ from aftbed.ftm.client import Client
 from aftbed.ftm.compose import build, replication_of
 from aftbed.ftm.pages import PAGE_BYTES
 from aftbed.functions.load import NO_CODE, Code
+from aftbed.functions.request_file import GivenRequests
 from aftbed.inject.bus import BusFault
 from aftbed.inject.bus_disturber import Disturber
 from aftbed.inject.kind import FaultKind
@@ -70,9 +71,9 @@ class Doom(msgspec.Struct, frozen=True):
 class Setup(msgspec.Struct, frozen=True):
     """What a run is made of, so that it can be repeated: nothing else has a part in it.
 
-    `count` requests at `rate_hz` (0: the next follows the reply); or those of a car in `scenario`.
-    `application`: the protected function, "" for the built-in one. With small pages (`page_bytes`) its
-    checkpoints travel as those of a large state do.
+    `count` requests at `rate_hz` (0: the next follows the reply), which are `given` or drawn from a seed; or
+    those of a car in `scenario`. `application`: the protected function, "" for the built-in one. With small
+    pages (`page_bytes`) its checkpoints travel as those of a large state do.
     """
 
     ftm: str = "pbr"
@@ -85,6 +86,7 @@ class Setup(msgspec.Struct, frozen=True):
     dooms: tuple[Doom, ...] = ()
     scenario: str = ""
     application: str = ""
+    given: GivenRequests | None = None
     page_bytes: int = PAGE_BYTES
 
 
@@ -273,7 +275,8 @@ class World:
         clock: Callable[[Random], Clock] = Clock,
     ) -> None:
         self.setup, self._channel = setup, channel
-        self._requests = requests if requests is not None else requests_of(0)
+        drawn = list(setup.given.requests) if setup.given is not None else requests_of(0)
+        self._requests = requests if requests is not None else drawn
         self.loop = clock(Random(setup.seed))
         self._drive = Drive(setup.scenario, setup.seed, self.loop) if setup.scenario else None
         for fault in setup.faults:
