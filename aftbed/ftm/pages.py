@@ -56,7 +56,7 @@ class CheckpointBase:
 
     def forget(self) -> None:
         """The next checkpoint is whole."""
-        self._number, self._state = NONE, None
+        self._number, self._state, self._left = NONE, None, 0
 
     def replaced(self) -> None:
         """The function's state is another one, which came in no checkpoint.
@@ -71,12 +71,15 @@ class CheckpointBase:
 
     def capture(self, application: Application, number: int, base: int) -> State:
         """The state of `application` as checkpoint `number`, for a backup that has checkpoint `base`."""
-        if base and base == self._number and self._left:
+        if self._left and base and base == self._number:
             if self._state is not None:
                 return self._compared(application.capture(), self._state, application, number)
             if knows_changes(application):
                 return self._told(application, number)
-        return self._whole(application, number, application.capture())
+        state = application.capture()
+        if self._left or len(state) >= self._bytes_min:
+            return self._whole(application, number, state)
+        return state  # the rule on the hot path
 
     def _compared(self, new: bytes, old: bytes, application: Application, number: int) -> State:
         page_bytes = self._page_bytes
@@ -106,7 +109,7 @@ class CheckpointBase:
 
     def _whole(self, application: Application, number: int, state: bytes) -> State:
         if len(state) < self._bytes_min:
-            self._number, self._state = NONE, None
+            self.forget()
             return state
         self._keep(application, number, state)
         self._left = self._whole_every - 1
@@ -118,7 +121,8 @@ class CheckpointBase:
         """Have `application` take the state of checkpoint `number`. Raises PeerError, nothing changed."""
         if isinstance(state, bytes):
             application.restore(state)
-            self._number, self._state = NONE, None
+            if self._number:
+                self.forget()
             return
         if state.check != _check(state):
             raise PeerError(f"{len(state.data)} bytes of it do not have their checksum")
