@@ -12,22 +12,22 @@ from aftbed.core.brick import Brick
 from aftbed.core.errors import ConfigError
 from aftbed.core.graph import BrickSpec, Kind
 from aftbed.ftm.registry import KINDS, Setting, make
-from aftbed.functions.load import LoadModule, load_class
+from aftbed.functions.load import Code, load_class
 
 BRICK_NAMES: Final = ("step", "open_ports", "quiescent")
 
 
-def make_brick(spec: BrickSpec, setting: Setting, load_module: LoadModule) -> Brick:
+def make_brick(spec: BrickSpec, setting: Setting, code: Code) -> Brick:
     """A new brick for `spec`. Raises ConfigError where a class written off line does not fit."""
     if spec.source:
-        return _off_line(spec, setting, load_module)
+        return _off_line(spec, setting, code)
     if spec.kind == "engine":
         return AdaptationEngine()
     return make(spec.kind, setting)
 
 
-def _off_line(spec: BrickSpec, setting: Setting, load_module: LoadModule) -> Brick:
-    found = load_class(spec.source, load_module)
+def _off_line(spec: BrickSpec, setting: Setting, code: Code) -> Brick:
+    found = load_class(spec.source, code)
     missing = [n for n in BRICK_NAMES if not callable(getattr(found, n, None))]
     if missing:
         raise ConfigError(f"{spec.source} is no brick: it lacks {', '.join(missing)}")

@@ -22,12 +22,13 @@ from aftbed.core.graph import Graph
 from aftbed.core.messages import Scheduled
 from aftbed.core.script import RECIPES
 from aftbed.ftm.compose import build
+from aftbed.functions.load import NO_CODE, OWN_CODE, Code
 from aftbed.inject.model import Fault, FaultReport, parse
 from aftbed.judge.asked import WITHOUT_END
 from aftbed.judge.checks import Evidence, Requests
 from aftbed.judge.outcome import FAILED, OUTCOMES, UNKNOWN, outcome_of, worst
 from aftbed.judge.record import RunEnd, RunRecord, read_record
-from aftbed.judge.simulated import record_of
+from aftbed.judge.simulated import evidence_of_run
 from aftbed.judge.verdict import Breach, Verdict, evidence_of, judge
 from aftbed.runtime.interface import BUS, LIGHT
 from aftbed.runtime.sim.world import Setup, simulate
@@ -36,7 +37,6 @@ from aftbed.runtime.unix.launch import launch, options_for, warm_up
 from aftbed.runtime.unix.options import CarRun, LoadRun, Work, with_names_resolved
 from aftbed.runtime.unix.trust import OWN_RUN, Trust, remember, vetted
 from aftbed.search.shrink import shrink
-from aftbed.vehicle.aeb.function import default_application
 from aftbed.vehicle.plant import VehicleResult
 
 REQUESTS_MAX: Final = 1_000_000  # of one experiment
@@ -174,15 +174,18 @@ REQUESTS_PER_SECOND_MIN: Final = 100.0  # of a closed loop on a busy machine
 Keep = Callable[[Result], None]
 
 
-def carry_out(experiment: Experiment, keep: Keep) -> Result:
+def carry_out(experiment: Experiment, keep: Keep, code: Code = OWN_CODE) -> Result:
     """Run it, and `keep` the result before anything of the run is taken down.
 
+    `code`: how that of the user is found in a simulated run; for a stranger's, see `refuse_untrusted`.
     Whatever goes wrong in the run is an outcome, `harness_error`. What goes wrong in `keep` is raised.
     """
     began_s = time.monotonic()
     with ExitStack() as standing:
         try:
-            result = _simulated(experiment) if experiment.runtime == "sim" else _real(experiment, standing)
+            result = (
+                _simulated(experiment, code) if experiment.runtime == "sim" else _real(experiment, standing)
+            )
         except Exception as error:  # noqa: BLE001 - one experiment must not end a campaign
             reason = f"{type(error).__name__}: {error}"[:REASON_MAX]
             result = Result(experiment, "harness_error", activated=False, reasons=(reason,))
@@ -202,11 +205,8 @@ def faults_of(experiment: Experiment, graph: Graph) -> tuple[Fault, ...]:
 
 
 def refuse_untrusted(experiment: Experiment, trust: Trust) -> None:
-    """Raise ConfigError if the experiment, of a ledger, would execute code that is not trusted.
-
-    The simulator executes no code from outside of the package.
-    """
-    for text in experiment.adaptations if experiment.runtime != "sim" else ():
+    """Raise ConfigError if the experiment, of a ledger, would execute code that is not trusted."""
+    for text in experiment.adaptations:
         wish = read(text).wish
         if wish.source:
             vetted(wish.source, trust)
@@ -233,8 +233,8 @@ def _asked(experiment: Experiment) -> tuple[tuple[Fault, ...], tuple[Scheduled, 
     return faults_of(experiment, graph), scheduled(experiment.adaptations, graph, recipe)
 
 
-def _simulated(experiment: Experiment) -> Result:
-    evidence = evidence_of(record_of(simulate(setup_of(experiment))), default_application)
+def _simulated(experiment: Experiment, code: Code) -> Result:
+    evidence = evidence_of_run(simulate(setup_of(experiment), code), code)
     outcome, reasons = outcome_of(evidence)
     reasons += tuple(f"an assertion failed: {failure}" for failure in evidence.record.failures)
     return _result(experiment, evidence, judge(evidence.record, evidence), outcome, reasons)
@@ -369,7 +369,7 @@ def smallest(result: Result) -> Experiment:
     setup = setup_of(first)
 
     def same(simpler: Setup) -> tuple[Breach, ...]:
-        found = carry_out(_as(first, simpler), lambda _: None)
+        found = carry_out(_as(first, simpler), lambda _: None, NO_CODE)
         return (Breach(found.outcome, "; ".join(found.reasons)),) if found.outcome == result.outcome else ()
 
     if not same(setup):

@@ -19,10 +19,11 @@ import typer
 from msgspec.structs import asdict, replace
 
 from aftbed.adapt import commands
-from aftbed.cli.adapt import scheduled
+from aftbed.cli.adapt import refuse_unsuitable, scheduled
 from aftbed.cli.options import (
     RATE_HZ_MAX,
     SEED_MAX,
+    App,
     Json,
     check_file,
     check_seed,
@@ -36,12 +37,14 @@ from aftbed.core.graph import Graph
 from aftbed.core.messages import Goal, Scheduled
 from aftbed.core.script import RECIPES
 from aftbed.ftm.compose import build
+from aftbed.functions.load import OWN_CODE
+from aftbed.functions.source import located
 from aftbed.inject.model import Fault, parse
 from aftbed.inject.targets import OTHERS
 from aftbed.judge.asked import not_happened
 from aftbed.judge.outcome import outcome_of
-from aftbed.judge.simulated import record_of
-from aftbed.judge.verdict import EXIT_CODES, EXIT_INTERRUPTED, Breach, Verdict, Word, evidence_of, judge
+from aftbed.judge.simulated import evidence_of_run
+from aftbed.judge.verdict import EXIT_CODES, EXIT_INTERRUPTED, Breach, Verdict, Word, judge
 from aftbed.report import sequence
 from aftbed.runtime.sim.clock import START_NS
 from aftbed.runtime.sim.trace import traced
@@ -50,11 +53,10 @@ from aftbed.runtime.sim.world import check as check_fault
 from aftbed.runtime.unix.trust import trusting
 from aftbed.runtime.unix.worker_pool import each
 from aftbed.search.agreement import SEEDS, RecoveryRange, against
-from aftbed.search.explore import Attempt, Found, attempt, tried
+from aftbed.search.explore import Attempt, Found, attempt_own, tried
 from aftbed.search.shrink import shrink
 from aftbed.search.swarm import attempt_drawn, drawn, intended
 from aftbed.search.tally import Tally, happened_in
-from aftbed.vehicle.aeb.function import default_application
 from aftbed.vehicle.scenarios.library import load_scenario
 
 COUNT_MAX: Final = 100_000
@@ -78,6 +80,7 @@ class SimArguments(msgspec.Struct, frozen=True):
     ] = None
     seeds: Annotated[str | None, typer.Option(help="A..B: a run for each, both ends included.")] = None
     ftm: Annotated[str | None, typer.Option(help="none, pbr, lfr, tr, pbr+tr, ...; pbr if left out.")] = None
+    app: App = None
     placement: Annotated[str | None, typer.Option(help="process (default), replica or single.")] = None
     count: Annotated[int | None, typer.Option(help="Requests of a run; 100 if left out.")] = None
     rate: Annotated[
@@ -137,6 +140,10 @@ def sim(given: SimArguments) -> int:
         raise ConfigError("--trust says which functions of records are executed: give --against RECORD too")
     first, last = _seeds(given)
     jobs, make = jobs_of(given.jobs), _setup_maker(given)
+    if given.app is not None:
+        setup = make(first)
+        graph = build(setup.ftm, setup.placement, application=setup.application)
+        refuse_unsuitable(graph, force=given.force)
     check_file("--diagram", None if given.diagram is None else Path(given.diagram))
     if given.seeds is None and given.minutes is None:
         return _simulate_one(given, make(first))
@@ -186,11 +193,17 @@ def _setup_maker(given: SimArguments) -> MakeSetup:
         if used := _used(given, *kept):
             raise ConfigError(f"--swarm draws everything from the seed: leave out {', '.join(used)}")
         return drawn
-    graph = build(given.ftm or DEFAULT.ftm, given.placement or DEFAULT.placement)
+    application = located(given.app) if given.app is not None else ""
+    graph = build(given.ftm or DEFAULT.ftm, given.placement or DEFAULT.placement, application=application)
     faults = tuple(read_fault(text, graph) for text in given.faults)
     adaptations = _adaptations(given, graph)
     setup = replace(
-        _load(given), ftm=graph.ftm, placement=graph.placement, faults=faults, adaptations=adaptations
+        _load(given),
+        ftm=graph.ftm,
+        placement=graph.placement,
+        faults=faults,
+        adaptations=adaptations,
+        application=application,
     )
     for fault in faults:
         check_fault(fault, setup.scenario)
@@ -236,15 +249,14 @@ def _adaptations(given: SimArguments, graph: Graph) -> tuple[Scheduled, ...]:
     recipe = given.recipe or RECIPES[0]
     if recipe not in RECIPES:
         raise unknown("recipe", recipe, RECIPES)
-    if not given.adaptations and (given.recipe is not None or given.force or given.may_fail):
-        raise ConfigError("--recipe, --force and --may-fail are about --adapt: give --adapt too")
-    if given.force:
+    if not given.adaptations and (given.recipe is not None or given.may_fail):
+        raise ConfigError("--recipe and --may-fail are about --adapt: give --adapt too")
+    if given.force and not given.adaptations and given.app is None:
+        raise ConfigError("--force is about --adapt and --app: give one of them too")
+    if given.force and given.app is None:
         found = tuple(_forced(text, recipe, may_fail=given.may_fail) for text in given.adaptations)
     else:
-        found = scheduled(given.adaptations, graph, recipe, force=False, may_fail=given.may_fail)
-    for text, adaptation in zip(given.adaptations, found, strict=True):
-        if adaptation.goal.source:
-            raise ConfigError(f"--adapt {text!r}: the simulator loads no brick that was written off line")
+        found = scheduled(given.adaptations, graph, recipe, force=given.force, may_fail=given.may_fail)
     return found
 
 
@@ -269,6 +281,7 @@ def described(setup: Setup) -> str:
         load = f"{setup.count} request{'s' if setup.count > 1 else ''}"
         load += f" at {_number(setup.rate_hz)}/s" if setup.rate_hz else ""
     parts = [f"{setup.ftm} ({setup.placement}), seed {setup.seed}, {load}"]
+    parts += [setup.application] if setup.application else []
     parts += [f"{doom.brick} dies before its effect {doom.effect}" for doom in setup.dooms]
     return "; ".join([*parts, *map(str, setup.faults), *map(_adaptation_words, setup.adaptations)])
 
@@ -295,6 +308,7 @@ def repeating(setup: Setup, *, swarm: bool = False) -> str:
     given = SimArguments(
         seed=setup.seed,
         ftm=setup.ftm,
+        app=setup.application or None,
         placement=setup.placement if setup.placement != DEFAULT.placement else None,
         count=None if setup.scenario else setup.count,
         rate=None if setup.scenario else setup.rate_hz or None,
@@ -318,6 +332,7 @@ def _command(given: SimArguments) -> str:
     """The command whose options are `given`."""
     options: list[tuple[str, str | None]] = [
         ("--ftm", given.ftm),
+        ("--app", given.app),
         ("--placement", given.placement),
         ("--scenario", given.scenario),
         ("--count", None if given.count is None else str(given.count)),
@@ -351,14 +366,14 @@ class Picture(NamedTuple):
 
 def _attempt(*, swarm: bool) -> Attempt:
     """How a run is made and judged: what a swarm drew not to happen must not have happened."""
-    return attempt_drawn if swarm else attempt
+    return attempt_drawn if swarm else attempt_own
 
 
 def picture(setup: Setup, broken: tuple[Breach, ...]) -> Picture:
     """Simulates `setup` again, traced. Empty if the executive itself failed."""
-    if attempt(setup)[0] is None:
+    if attempt_own(setup)[0] is None:
         return Picture([], "")
-    trace = traced(setup)
+    trace = traced(setup, code=OWN_CODE)
     return Picture(
         sequence.listing(trace, broken).rstrip().splitlines(),
         sequence.mermaid(trace, broken),
@@ -442,7 +457,7 @@ def _simulate_one(given: SimArguments, setup: Setup) -> int:
     word: Word = "fail" if broken else "pass"
     reasons = list(map(str, broken))
     if run is not None:
-        evidence = evidence_of(record_of(run), default_application)
+        evidence = evidence_of_run(run, OWN_CODE)
         if given.swarm:  # what a swarm draws may well not happen: `attempt_drawn` has judged that
             tally = Tally()
             tally.add(happened_in(run), intended(setup))

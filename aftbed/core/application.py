@@ -6,6 +6,7 @@ know in common. Requests, replies and states are opaque bytes to the mechanism.
 
 import math
 import re
+import struct
 from enum import Enum
 from typing import Final, Literal, Protocol
 
@@ -137,6 +138,50 @@ def reply_fields_of(application: Application | type[Application]) -> tuple[Field
     """The variables that a reply consists of, where the function declares them; else none."""
     fields: tuple[Field, ...] = getattr(application, "reply_fields", ())
     return fields
+
+
+_CODES: Final[dict[Width, str]] = {
+    "bool": "?",
+    "u8": "B",
+    "u16": "H",
+    "u32": "I",
+    "u64": "Q",
+    "i8": "b",
+    "i16": "h",
+    "i32": "i",
+    "i64": "q",
+    "f32": "f",
+    "f64": "d",
+}
+
+
+def value_of(field: Field, data: bytes) -> float:
+    """The number in `data`, which is long enough."""
+    found: float = struct.unpack_from(f"<{_CODES[field.kind]}", data, field.offset_bytes)[0]
+    return found
+
+
+def difference(fields: tuple[Field, ...], one: bytes, other: bytes) -> float:
+    """The largest difference between the numbers of two replies, or states.
+
+    Infinite where anything else differs, or a number is not finite in one of them.
+    """
+    if one == other:
+        return 0.0
+    if not fields or len(one) != len(other):
+        return math.inf
+    rest, largest = [bytearray(one), bytearray(other)], 0.0
+    for field in fields:
+        end = field.offset_bytes + field.size_bits // 8
+        if end > len(one):
+            return math.inf
+        first, second = value_of(field, one), value_of(field, other)
+        if one[field.offset_bytes : end] != other[field.offset_bytes : end] and first != second:
+            apart = abs(first - second)
+            largest = max(largest, apart if math.isfinite(apart) else math.inf)
+        for data in rest:
+            data[field.offset_bytes : end] = bytes(end - field.offset_bytes)
+    return largest if rest[0] == rest[1] else math.inf
 
 
 def field_named(name: str, fields: tuple[Field, ...]) -> Field:

@@ -29,6 +29,10 @@ class StepFailed(Exception):  # noqa: N818 - a situation within a task, never sh
     """Within a task of the runtime: a step was refused, its process died, or its deadline passed."""
 
 
+class FunctionFailedError(AftbedError):
+    """The protected function broke its contract, or ended: its replica stops. The text is fit to be shown."""
+
+
 class HarnessError(AftbedError):
     """The testbed itself is in trouble: the verdict is inconclusive, exit code 3."""
 

@@ -29,7 +29,9 @@ S = TypeVar("S", bound=msgspec.Struct)
 
 
 class _Loader(yaml.SafeLoader):
-    """Refuses a key that stands twice in a mapping; PyYAML would take the last one."""
+    """Refuses a key that stands twice in a mapping; PyYAML would take the last one. 1e-9 is a number, not a
+    text as in YAML 1.1, which wants a point in it.
+    """
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, object]:
         seen: set[Hashable] = set()
@@ -41,6 +43,11 @@ class _Loader(yaml.SafeLoader):
                     raise yaml.MarkedYAMLError(problem=f"key {key!r} stands twice", problem_mark=mark)
                 seen.add(key)
         return super().construct_mapping(node, deep)
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"[-+]?[0-9]+[eE][-+]?[0-9]+$"), list("-+0123456789")
+)
 
 
 def read_yaml(path: Path, shape: type[S]) -> S:
@@ -168,6 +175,8 @@ def _describe(allowed: inspect.Type) -> str:
             return "a whole number" + _limits(allowed)
         case inspect.StructType():
             return "keys and values: " + ", ".join(_keys(allowed))
+        case inspect.DictType():
+            return "keys and values"
         case inspect.ListType() | inspect.VarTupleType():
             return "a list"
         case inspect.StrType():

@@ -1,24 +1,75 @@
 """Loads a protected function, in the process that will host it, never in one that serves."""
 
+import importlib
+import importlib.util
 from collections.abc import Callable
-from types import ModuleType
-from typing import Final
+from importlib.machinery import SourceFileLoader
+from pathlib import Path
+from types import CodeType, ModuleType
+from typing import Final, assert_never
 
 from aftbed.core.application import REPLY_BYTES_MAX, STATE_BYTES_MAX, Application, Characteristics
 from aftbed.core.errors import ConfigError
-from aftbed.functions.source import FunctionKind, parse_source
+from aftbed.functions.source import FunctionKind, FunctionSource, parse_source
 
 APPLICATION_NAMES: Final = ("execute", "capture", "restore", "characteristics")
-LoadModule = Callable[[str], ModuleType]  # a module, or a file that ends in `.py`
 
 
-def load_class(source: str, load_module: LoadModule) -> type:
+class SourceLoader(SourceFileLoader):
+    """Compiles the file that is there: a compiled one beside it is not read, and none is written."""
+
+    def get_code(self, fullname: str) -> CodeType:
+        return compile(self.source(), self.path, "exec", dont_inherit=True)
+
+    def source(self) -> bytes:
+        return self.get_data(self.path)
+
+
+def load_module(place: str) -> ModuleType:
+    """The module called `place`, or in that file if it ends in `.py`. Raises ConfigError without the file."""
+    if not place.endswith(".py"):
+        return importlib.import_module(place)
+    name = Path(place).stem
+    spec = importlib.util.spec_from_file_location(name, place, loader=SourceLoader(name, place))
+    if spec is None or spec.loader is None or not Path(place).is_file():
+        raise ConfigError(f"{place}: no such file")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+class Code:
+    """How code from outside of the package gets into this process: here, whatever the user has named."""
+
+    def module(self, place: str) -> ModuleType:
+        """A module, or a file that ends in `.py`, for bricks and functions. Raises ConfigError."""
+        return load_module(place)
+
+    def permit(self, source: FunctionSource) -> None:
+        """Called before a function that is no class is loaded. Raises ConfigError."""
+
+
+class NoCode(Code):
+    """For what was read from others."""
+
+    def module(self, place: str) -> ModuleType:
+        raise ConfigError(f"{place}: no code from outside of the package is executed here")
+
+    def permit(self, source: FunctionSource) -> None:
+        self.module(str(source))
+
+
+OWN_CODE: Final = Code()
+NO_CODE: Final = NoCode()
+
+
+def load_class(source: str, code: Code) -> type:
     """The class that `MODULE:CLASS` or `FILE.py:CLASS` names. Raises ConfigError."""
     place, colon, name = source.rpartition(":")
     if not colon or not place or not name:
         raise ConfigError(f"{source!r} names no class (MODULE:CLASS or FILE.py:CLASS)")
     try:
-        module = load_module(place)
+        module = code.module(place)
     except ConfigError:
         raise
     except Exception as error:  # whatever a stranger's module does
@@ -34,27 +85,42 @@ def load_class(source: str, load_module: LoadModule) -> type:
     return found
 
 
-def load_application(source: str, load_module: LoadModule) -> Callable[[], Application]:
+def load_application(source: str, code: Code) -> Callable[[], Application]:
     """The maker of a protected function. Raises ConfigError if it is none; so may the maker."""
     named = parse_source(source)
-    match named.kind:
+    if named.kind is not FunctionKind.CLASS:
+        code.permit(named)
+    match named.kind:  # what a run does not use costs it no import
         case FunctionKind.CLASS:
-            return _checked(_application_class(source, load_module))
+            return _checked(_application_class(source, code))
+        case FunctionKind.LIBRARY:
+            from aftbed.functions.library import library_function  # noqa: PLC0415
+
+            return library_function(Path(named.place))
+        case FunctionKind.PROGRAM:
+            from aftbed.functions.program import program_function  # noqa: PLC0415
+
+            return program_function(named.place)
+        case FunctionKind.MODEL:
+            from aftbed.functions.fmu import fmu_function  # noqa: PLC0415
+
+            return fmu_function(Path(named.place), Path(named.part))
         case _:
-            raise ConfigError(f"{source} names no class (MODULE:CLASS or FILE.py:CLASS)")
+            assert_never(named.kind)
 
 
-def characteristics_of(source: str, load_module: LoadModule) -> Characteristics:
+def characteristics_of(source: str, code: Code) -> Characteristics:
     """What the protected function of `source` declares. Raises ConfigError if it declares nothing."""
-    make = load_application(source, load_module)
-    declared: object = getattr(make if isinstance(make, type) else make(), "characteristics", None)
+    make = load_application(source, code)
+    told = make if hasattr(make, "characteristics") else make()
+    declared: object = getattr(told, "characteristics", None)
     if not isinstance(declared, Characteristics):
         raise ConfigError(f"{source}: characteristics: found {declared!r}, allowed is Characteristics(...)")
     return declared
 
 
-def _application_class(source: str, load_module: LoadModule) -> type:
-    found = load_class(source, load_module)
+def _application_class(source: str, code: Code) -> type:
+    found = load_class(source, code)
     missing = [n for n in APPLICATION_NAMES if not hasattr(found, n)]
     if missing:
         raise ConfigError(f"{source} is no protected function: it lacks {', '.join(missing)}")

@@ -1,12 +1,12 @@
 """Executes a function that a record names: only if it is trusted, and in a process of its own.
 
 Code that is not trusted is not executed at all (`runtime.unix.trust`). The process of code that is trusted
-has limits (`runtime.unix.confined`), and writes no byte into a file. When it crashes, hangs or answers
+has limits (`runtime.unix.confined`); a class writes no byte into a file. When it crashes, hangs or answers
 anything but MessagePack of the declared type, the replies of the function are unknown, with the reason.
 """
 
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from types import ModuleType
 from typing import Final
 
@@ -14,7 +14,8 @@ import msgspec
 
 from aftbed.core.application import Application, Characteristics
 from aftbed.core.errors import ConfigError
-from aftbed.functions.load import LoadModule, characteristics_of
+from aftbed.functions.load import OWN_CODE, Code, characteristics_of
+from aftbed.functions.source import FunctionSource
 from aftbed.judge.record import RunRecord
 from aftbed.judge.reference import (
     NamedChange,
@@ -26,12 +27,21 @@ from aftbed.judge.reference import (
     maker,
     reference_run,
     requests_of,
+    succession,
 )
 from aftbed.runtime.unix.confined import JobFailedError, ProcessLimits, ask, serve
-from aftbed.runtime.unix.options import load_module
-from aftbed.runtime.unix.trust import NOBODY, Code, Trust, check_unchanged, load, search_path, vetted
+from aftbed.runtime.unix.trust import (
+    NOBODY,
+    Trust,
+    VettedFiles,
+    check_unchanged,
+    load,
+    search_path,
+    vetted,
+)
 
 WORDS_MAX: Final = 300  # characters of what went wrong
+OPAQUE_FILE_BYTES: Final = 1 << 30  # a model is unpacked; a program may keep a log
 LIMITS: Final = ProcessLimits(seconds=120.0, memory_bytes=4 << 30, file_bytes=0)
 
 
@@ -53,7 +63,7 @@ class Job(msgspec.Struct, frozen=True):
     """`path`: where the code looks for modules that it imports."""
 
     task: Execute | Describe
-    codes: tuple[Code, ...]
+    codes: tuple[VettedFiles, ...]
     path: tuple[str, ...]
 
 
@@ -91,7 +101,7 @@ def reference_of(
     changes = changes_of(record.history, record.adaptations, first)
     sources = tuple(dict.fromkeys(source for source in (first, *(one for _, one in changes)) if source))
     if not sources:
-        return reference_run(record.history, _succession(first, changes, load_module))
+        return reference_run(record.history, succession(record, OWN_CODE))
     try:
         codes = tuple(vetted(source, trust) for source in sources)
     except ConfigError as error:
@@ -103,10 +113,6 @@ def reference_of(
             return _unknown(sources, reason)
         case Declared():
             return _unknown(sources, "it answered something else")
-
-
-def _succession(first: str, changes: Iterable[NamedChange], load_module: LoadModule) -> Succession:
-    return Succession(maker(first, load_module), loaded(changes, load_module))
 
 
 def _unknown(sources: tuple[str, ...], why: str) -> ReferenceRun:
@@ -121,7 +127,7 @@ def declared_by(source: str, trust: Trust, limits: ProcessLimits = LIMITS) -> Ch
     """
     code = vetted(source, trust)
     if not code.files:
-        return characteristics_of(source, load_module)
+        return characteristics_of(source, OWN_CODE)
     match _answer(Describe(source), (code,), limits):
         case Declared(characteristics):
             return characteristics
@@ -131,9 +137,11 @@ def declared_by(source: str, trust: Trust, limits: ProcessLimits = LIMITS) -> Ch
             raise ConfigError(f"{source}: it answered something else")
 
 
-def _answer(task: Execute | Describe, codes: tuple[Code, ...], limits: ProcessLimits) -> Answer:
+def _answer(task: Execute | Describe, codes: tuple[VettedFiles, ...], limits: ProcessLimits) -> Answer:
     """Of a new process, which has ended then."""
     job = msgspec.msgpack.encode(Job(task, codes, tuple(search_path())))
+    if any(not file.module for code in codes for file in code.files):
+        limits = msgspec.structs.replace(limits, file_bytes=OPAQUE_FILE_BYTES)
     try:
         found: Answer = msgspec.msgpack.decode(ask(__name__, job, limits), type=Answer)
     except JobFailedError as error:
@@ -158,19 +166,26 @@ def work(data: bytes) -> bytes:
         return msgspec.msgpack.encode(Failed(reason[:WORDS_MAX]))
 
 
+class _VettedCode(Code):
+    """From the bytes that were hashed; without any file of this package."""
+
+    def __init__(self, codes: tuple[VettedFiles, ...]) -> None:
+        self._codes = {code.place: code for code in codes}
+
+    def module(self, place: str) -> ModuleType:
+        return load(self._codes[place])
+
+    def permit(self, source: FunctionSource) -> None:
+        check_unchanged(self._codes[str(source)])
+
+
 def _done(job: Job) -> Answer:
-    codes = {code.place: code for code in job.codes}
-    for code in job.codes:
-        check_unchanged(code)
-
-    def load_code(place: str) -> ModuleType:
-        return load(codes[place])
-
+    code = _VettedCode(job.codes)
     match job.task:
         case Execute(first, changes, requests):
-            return Replies(executed(requests, _succession(first, changes, load_code)))
+            return Replies(executed(requests, Succession(maker(first, code), loaded(changes, code))))
         case Describe(source):
-            return Declared(characteristics_of(source, load_code))
+            return Declared(characteristics_of(source, code))
 
 
 if __name__ == "__main__":

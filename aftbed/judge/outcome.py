@@ -53,7 +53,7 @@ def outcome_of(evidence: Evidence) -> tuple[str, tuple[str, ...]]:
     found: dict[str, str] = {}
     if reference.unknown:
         found["inconclusive"] = reference.unknown
-    wrong = corruptions(history, reference) if reference.deterministic else []
+    wrong = corruptions(history, reference)
     if wrong:
         found["sdc"] = wrong[0]
     if record.lost:
@@ -76,7 +76,7 @@ def outcome_of(evidence: Evidence) -> tuple[str, tuple[str, ...]]:
         acted.append("a third execution")
     if acted:
         found["tolerated"] = f"the mechanism acted: {', '.join(acted)}"
-    states = set(record.end.states.values()) if record.end is not None else set()
+    states = set(record.end.states.values()) if record.end is not None and not reference.tolerance else set()
     if history.events(Event.FOLLOWER_DIVERGED) or len(states) > 1:
         found["latent"] = "the replicas differ"
     elif (

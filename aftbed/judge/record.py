@@ -124,6 +124,7 @@ class RunRecord(msgspec.Struct, frozen=True):
     excuses: Excuses | None = None
     kept: bool = False  # after the run, so it was sealed at its end
     frames: int = 0  # in the log of the bus
+    function_failures: tuple[str, ...] = ()  # of a simulated run: nodes that stopped for their function
 
     @property
     def simulated(self) -> bool:

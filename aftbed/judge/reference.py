@@ -16,11 +16,12 @@ from typing import Final
 import msgspec
 
 from aftbed.adapt.engine import DONE
-from aftbed.core.application import Application
+from aftbed.core.application import Application, Characteristics, Field, reply_fields_of
 from aftbed.core.errors import PeerError
 from aftbed.core.events import Event
 from aftbed.core.journal import EntryKind, History
-from aftbed.functions.load import LoadModule, load_application
+from aftbed.functions.load import Code, load_application
+from aftbed.judge.record import RunRecord
 from aftbed.runtime.adaptations import Outcome
 from aftbed.runtime.deployment import digest, replica_of
 from aftbed.vehicle.aeb.function import default_application
@@ -45,6 +46,7 @@ class Succession:
     def _serve(self, function: Application) -> None:
         self._function = function
         self.characteristics = function.characteristics
+        self.reply_fields = reply_fields_of(function)
 
     def execute(self, request: bytes) -> bytes:
         self._count += 1
@@ -105,15 +107,23 @@ def changes_of(history: History, adaptations: Iterable[Outcome], begun: str = BU
     return changes
 
 
-def loaded(changes: Iterable[NamedChange], load_module: LoadModule) -> list[Change]:
+def loaded(changes: Iterable[NamedChange], code: Code) -> list[Change]:
     """The same with the versions, which are executed for that. Raises ConfigError where one is no good."""
 
-    return [(n, None if function is None else maker(function, load_module)) for n, function in changes]
+    return [(n, None if function is None else maker(function, code)) for n, function in changes]
 
 
-def maker(function: str, load_module: LoadModule) -> Make:
+def maker(function: str, code: Code) -> Make:
     """Of the function that a record names. Raises ConfigError."""
-    return load_application(function, load_module) if function else default_application
+    return load_application(function, code) if function else default_application
+
+
+def succession(record: RunRecord, code: Code) -> Application:
+    """The bare server of a run, which this process loads. Raises ConfigError."""
+    begun = record.options.application
+    changes = changes_of(record.history, record.adaptations, begun)
+    first = maker(begun, code)
+    return Succession(first, loaded(changes, code)) if changes else first()
 
 
 class ReferenceRun(msgspec.Struct, frozen=True):
@@ -121,12 +131,16 @@ class ReferenceRun(msgspec.Struct, frozen=True):
 
     A request that it refuses has an empty reply. Where the function is not `deterministic`, its replies
     need not be those of a run. `unknown`: why nothing is known of them, "" where they are.
+
+    `tolerance`: by so much the numbers in `reply_fields` may differ, as the function declares.
     """
 
     replies: tuple[tuple[int, bytes], ...]
     state: bytes
     deterministic: bool = True
     unknown: str = ""
+    tolerance: float = 0.0
+    reply_fields: tuple[Field, ...] = ()
 
     @property
     def digest(self) -> str:
@@ -147,7 +161,14 @@ def executed(requests: Iterable[tuple[int, bytes]], bare: Application) -> Refere
             replies.append((number, bare.execute(payload)))
         except PeerError:
             replies.append((number, b""))
-    return ReferenceRun(tuple(replies), bare.capture(), getattr(bare, "deterministic", True))
+    declared = getattr(bare, "characteristics", Characteristics())
+    return ReferenceRun(
+        tuple(replies),
+        bare.capture(),
+        getattr(bare, "deterministic", declared.deterministic),
+        tolerance=declared.state_access.tolerance,
+        reply_fields=reply_fields_of(bare),
+    )
 
 
 def reference_run(history: History, bare: Application) -> ReferenceRun:

@@ -1,20 +1,21 @@
 """The record of a simulated run, and what it breaks. Only this module of the judge imports the simulator."""
 
 import itertools
-from collections.abc import Callable
 from typing import Final
 
-from aftbed.core.application import Application
 from aftbed.core.events import Event
 from aftbed.core.script import ScriptKind
 from aftbed.ftm.compose import replication_of
+from aftbed.functions.load import NO_CODE, Code
+from aftbed.judge.checks import Evidence
 from aftbed.judge.record import DriveEnd, Excuses, RunEnd, RunRecord
-from aftbed.judge.verdict import Breach, broken, evidence_of
+from aftbed.judge.reference import reference_run, succession
+from aftbed.judge.verdict import Breach, broken
 from aftbed.runtime.deployment import replica_of
+from aftbed.runtime.node import FUNCTION_FAILED
 from aftbed.runtime.sim.clock import START_NS
-from aftbed.runtime.sim.world import Run
+from aftbed.runtime.sim.world import FUNCTION, Run
 from aftbed.runtime.unix.options import CarRun, LoadRun, RunOptions, Work
-from aftbed.vehicle.aeb.function import default_application
 
 # Events of faults that no mechanism outvotes: bits of a checkpoint, or of a reply that is kept.
 UNPROMISED_VALUES: Final = frozenset(
@@ -30,7 +31,9 @@ def record_of(run: Run) -> RunRecord:
     setup, rest = run.setup, run.rest
     work: Work = CarRun(setup.scenario, None, "") if setup.scenario else LoadRun(setup.count, setup.rate_hz)
     asked = (setup.faults, setup.adaptations)
-    options = RunOptions("", "", "", setup.ftm, setup.placement, setup.seed, work, *asked)
+    options = RunOptions(
+        "", "", "", setup.ftm, setup.placement, setup.seed, work, *asked, application=setup.application
+    )
     end = RunEnd(
         unfinished=rest.why_not,
         lost=rest.lost,
@@ -51,6 +54,11 @@ def record_of(run: Run) -> RunRecord:
         run.adaptations,
         DriveEnd(run.drive_end, run.drive_us, run.vehicle) if run.vehicle is not None else None,
         failures=run.failures,
+        function_failures=tuple(
+            text.replace(f"detected stop: {FUNCTION_FAILED}", "")
+            for _, event, text in run.logged
+            if event == FUNCTION
+        ),
         excuses=Excuses(service_struck_down(run), values, tuple(name for _, name in run.struck)),
     )
 
@@ -75,6 +83,13 @@ def service_struck_down(run: Run) -> bool:
     )
 
 
-def breaches(run: Run, function: Callable[[], Application] = default_application) -> tuple[Breach, ...]:
-    """All that a simulated run breaks; `function` makes the bare server."""
-    return broken(evidence_of(record_of(run), function))
+def evidence_of_run(run: Run, code: Code = NO_CODE) -> Evidence:
+    """With the bare server's run, which is executed here: this process has simulated the function, too."""
+    record = record_of(run)
+    bare = succession(record, code)
+    return Evidence(record, reference_run(record.history, bare))
+
+
+def breaches(run: Run, code: Code = NO_CODE) -> tuple[Breach, ...]:
+    """All that a simulated run breaks."""
+    return broken(evidence_of_run(run, code))

@@ -12,6 +12,7 @@ What a request must have left, if it was answered:
     dialogue     the bytes that the seed draws, of a load
 """
 
+import re
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -29,6 +30,7 @@ from aftbed.ftm.compose import build
 from aftbed.inject.receipts import fault_and_bits
 from aftbed.judge.record import RunEnd, RunRecord
 from aftbed.judge.reference import ReferenceRun
+from aftbed.runtime.node import FUNCTION_FAILED
 from aftbed.runtime.unix import seal
 from aftbed.runtime.unix.devices import LOAD_REQUESTS
 from aftbed.runtime.unix.options import LoadRun
@@ -41,6 +43,7 @@ DRAINED: Final = RECIPES[0]
 SINGLE: Final = "single"  # the placement whose only node hosts two Servers
 SERVER: Final = "/server"  # ends the name of its brick
 EFFECTS: Final = (Event.SERVER_EXIT, Event.STATE_RESTORED)
+FAILED: Final = re.compile(rf"^(?P<node>\S+) \(pid \d+\): detected stop: {FUNCTION_FAILED}(?P<why>.*)$")
 TRACEBACK: Final = "Traceback (most recent call last):"
 
 
@@ -72,7 +75,8 @@ def _at_rest(end: RunEnd) -> bool:
 def _comparable(record: RunRecord, reference: ReferenceRun) -> bool:
     """Whether the states have to be the bare server's: each request is known and answered, no bit flipped."""
     known = not record.history.dropped and not _flipped(record)
-    return known and reference.deterministic and _all_answered(record, reference)
+    exact = reference.deterministic and not reference.tolerance
+    return known and exact and _all_answered(record, reference)
 
 
 def _all_answered(record: RunRecord, reference: ReferenceRun) -> bool:
@@ -175,6 +179,19 @@ def _tracebacks(path: Path) -> Iterator[str]:
             error_line = next((one for one in lines[at + 1 :] if not one.startswith(" ")), "cut off")
             who = lines[at - 1] if at and lines[at - 1].endswith(":") else "a process:"
             yield f"{path.name} has a traceback of {who} {error_line}"
+
+
+def function_failures(record: RunRecord) -> list[str]:
+    """Of each node that stopped because its function ended or broke its contract, which one and why."""
+    if record.simulated:
+        return list(record.function_failures)
+    try:
+        with open_input(record.path / PROCESSES_LOG) as file:
+            lines = file.read(PRINTED_BYTES_MAX).decode(errors="replace").splitlines()
+    except OSError:
+        return []
+    found = (re.search(FAILED, line) for line in lines)
+    return [f"{one['node']}: {one['why']}" for one in found if one]
 
 
 def _of_requests(record: RunRecord) -> Iterator[str]:

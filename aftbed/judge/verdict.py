@@ -16,6 +16,7 @@ from aftbed.judge.asked import AskedAdaptation, adaptations, check_asked
 from aftbed.judge.checks import Check, Checker, Evidence, Failover, Requests
 from aftbed.judge.isolated import reference_of
 from aftbed.judge.record import RunRecord
+from aftbed.judge.sources import function_failures
 from aftbed.runtime.unix.closed_loop import PolicyReport, Proposed
 from aftbed.runtime.unix.options import CarRun, ReplayRun
 from aftbed.runtime.unix.trust import NOBODY, Trust
@@ -68,6 +69,9 @@ class Verdict(msgspec.Struct, frozen=True):
     checks: dict[str, str]
     reasons: list[str]
     strangers: list[Stranger]
+    app: str  # the function that the run began with, "" for the built-in one
+    tolerance: float  # by which its replies may differ from those of the bare server
+    function_failures: list[str]  # why nodes stopped whose function ended, or broke its contract
     faults: list[FaultReport]
     replay: dict[str, object] | None
     seconds: float | None
@@ -129,6 +133,9 @@ def judge(record: RunRecord, evidence: Evidence | None = None) -> Verdict:
         checks={name: check.finding for name, check in found.items()},
         reasons=[f"{name}: {reason}" for name, check in found.items() for reason in check.reasons],
         strangers=checks.strangers(record),
+        app=options.application,
+        tolerance=evidence.reference.tolerance,
+        function_failures=function_failures(record),
         faults=list(record.faults),
         replay=replay,
         seconds=record.end.seconds if record.end is not None else None,

@@ -15,6 +15,7 @@ import msgspec
 
 from aftbed.campaign.experiment import Experiment, Result, carry_out, setup_of
 from aftbed.core.errors import AftbedError
+from aftbed.functions.load import NO_CODE
 from aftbed.judge.outcome import OUTCOMES
 from aftbed.runtime.sim.trace import Trace, traced
 
@@ -52,7 +53,7 @@ def worst_of(results: Iterable[Result]) -> Result:
 def rerun(experiment: Experiment) -> Rerun:
     """Simulate it, whatever runtime it had."""
     simulated = msgspec.structs.replace(experiment, runtime="sim")
-    again = carry_out(simulated, lambda _: None)
+    again = carry_out(simulated, lambda _: None, NO_CODE)
     try:
         return Rerun(again.outcome, traced(setup_of(simulated)))
     except (AftbedError, AssertionError, LookupError, ValueError) as error:

@@ -22,7 +22,7 @@ from aftbed.core.graph import BrickSpec, Graph
 from aftbed.core.messages import AnyMessage, Message, Reply, Request
 from aftbed.ftm.compose import REPLICAS, chain
 from aftbed.ftm.registry import Setting
-from aftbed.functions.load import LoadModule, load_application
+from aftbed.functions.load import Code, load_application
 from aftbed.runtime import control
 from aftbed.runtime.devices import Device
 from aftbed.runtime.node import MemoryIO, Node, Stopped, nowhere
@@ -38,13 +38,13 @@ Out = TypeVar("Out")
 
 
 class Assembler:
-    """`function`: what is protected if the graph names nothing else; `load`: how a class is found."""
+    """`function`: what is protected if the graph names nothing else."""
 
     def __init__(
-        self, function: Callable[[], Application], load: LoadModule, make: MakeSetting | None = None
+        self, function: Callable[[], Application], code: Code, make: MakeSetting | None = None
     ) -> None:
-        self._function, self._load = function, load
-        self._make: MakeSetting = make or (lambda spec, setting: make_brick(spec, setting, load))
+        self._function, self._code = function, code
+        self._make: MakeSetting = make or (lambda spec, setting: make_brick(spec, setting, code))
 
     def build(
         self, node: Node[In, Out], order: control.Assign, fds: list[int], make_device: Callable[[], Device]
@@ -70,7 +70,7 @@ class Assembler:
         default.
         """
         number = REPLICAS.index(spec.replica) + 1 if spec.replica else 0
-        named = load_application(spec.application, self._load) if spec.application else self._function
+        named = load_application(spec.application, self._code) if spec.application else self._function
         epoch = TEST_EPOCH if leader else order.epoch
         return Setting(number, epoch, spec.replica == (leader or order.leader), named)
 

@@ -20,12 +20,11 @@ from aftbed.judge import checks
 from aftbed.judge.checks import Evidence
 from aftbed.judge.outcome import outcome_of
 from aftbed.judge.record import RunRecord, read_record
-from aftbed.judge.simulated import record_of
+from aftbed.judge.simulated import evidence_of_run
 from aftbed.judge.verdict import evidence_of
 from aftbed.runtime.sim.world import Setup, simulate
 from aftbed.runtime.unix.options import CarRun, LoadRun
 from aftbed.runtime.unix.trust import NOBODY, Trust
-from aftbed.vehicle.aeb.function import default_application
 
 SEEDS: Final = 20
 
@@ -78,7 +77,7 @@ def setup_of(record: RunRecord) -> Setup:
 def _compare(setup: Setup, records: list[RunRecord], seeds: int, trust: Trust) -> Agreement:
     runs = (simulate(msgspec.structs.replace(setup, seed=seed)) for seed in range(seeds))
     real_classes, real_times = _summed(evidence_of(record, trust=trust) for record in records)
-    sim_classes, sim_times = _summed(evidence_of(record_of(run), default_application) for run in runs)
+    sim_classes, sim_times = _summed(evidence_of_run(run) for run in runs)
     found = [
         f"no seed ends {word}, as {n} real runs do"
         for word, n in real_classes.items()

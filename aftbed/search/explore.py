@@ -26,6 +26,7 @@ from aftbed.core.messages import Goal, Scheduled
 from aftbed.core.script import Stage, flat
 from aftbed.ftm.compose import DUPLEX_EXPRESSIONS, build, parse, tolerates
 from aftbed.ftm.registry import MECHANISMS, server_emits
+from aftbed.functions.load import NO_CODE, OWN_CODE, Code
 from aftbed.inject.crash import Crash
 from aftbed.inject.grammar import Bit, Trigger
 from aftbed.inject.hang import Hang
@@ -249,14 +250,19 @@ class Found(NamedTuple):
 Attempt = Callable[[Setup], tuple[Run | None, tuple[Breach, ...]]]
 
 
-def attempt(setup: Setup) -> tuple[Run | None, tuple[Breach, ...]]:
+def attempt(setup: Setup, code: Code = NO_CODE) -> tuple[Run | None, tuple[Breach, ...]]:
     """The run and what it breaks; None where the executive itself broke down: that is a fault of ours."""
     try:
-        run = simulate(setup)
+        run = simulate(setup, code)
     except Exception as error:  # noqa: BLE001 - whatever it is, this experiment has found it
         reason = f"the executive broke down: {type(error).__name__}: {error}"
         return None, (Breach(EXECUTIVE, reason[:REASON_MAX]),)
-    return run, breaches(run)
+    return run, breaches(run, code)
+
+
+def attempt_own(setup: Setup) -> tuple[Run | None, tuple[Breach, ...]]:
+    """`attempt` of a setup whose function, and bricks, the user has named himself."""
+    return attempt(setup, OWN_CODE)
 
 
 def tried(setup: Setup, attempt: Attempt = attempt) -> Found:

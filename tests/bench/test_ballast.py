@@ -7,13 +7,12 @@ from hypothesis import strategies as st
 from aftbed.bench import ballast
 from aftbed.core.application import Application
 from aftbed.core.errors import ConfigError, PeerError
-from aftbed.functions.load import load_application
-from aftbed.runtime.unix.options import load_module
+from aftbed.functions.load import OWN_CODE, load_application
 
 
 def made(size_bytes: int, version: int = 1) -> Application:
     """As an update loads it."""
-    return load_application(ballast.source_of(size_bytes, version), load_module)()
+    return load_application(ballast.source_of(size_bytes, version), OWN_CODE)()
 
 
 @pytest.mark.parametrize("size_bytes", [ballast.SIZE_BYTES_MIN, 100, 60_000, 10_000_000])
@@ -63,4 +62,4 @@ def test_the_next_version_takes_the_state_over_and_another_size_begins_anew() ->
 @pytest.mark.parametrize("name", ["Ballast7v1", "Ballast100", "Ballast100v3", "Ballast99999999v1", "Stone"])
 def test_what_is_no_size_is_no_class(name: str) -> None:
     with pytest.raises(ConfigError, match=f"has no class {name}"):
-        load_application(f"aftbed.bench.ballast:{name}", load_module)
+        load_application(f"aftbed.bench.ballast:{name}", OWN_CODE)

@@ -15,6 +15,7 @@ from msgspec.structs import replace
 
 from aftbed.cli.sim import SHRUNK_MAX, repeating
 from aftbed.core.messages import Goal, Scheduled
+from aftbed.functions.load import NO_CODE, Code
 from aftbed.inject.crash import Crash
 from aftbed.inject.grammar import Trigger
 from aftbed.inject.model import Fault
@@ -25,6 +26,7 @@ from aftbed.search.agreement import Agreement, RecoveryRange, apart
 from aftbed.search.explore import tried
 from aftbed.search.swarm import drawn
 
+UNREPEATABLE: Final = "aftbed.vehicle.aeb.variants:NonDeterministic"
 FLIP: Final = ("--ftm", "pbr", "--count", "10", "--faults", "bitflip result bit 60 nth 3")  # no TR: sdc
 
 
@@ -82,6 +84,41 @@ def test_an_adaptation_is_told_once_as_in_a_real_run(sim: Call) -> None:
     assert (adaptation["asked"], adaptation["outcome"]) == ("to lfr+tr at request 5", "done")
     assert 0 < adaptation["blackout_ms"] < 3 and document["ftm_at_end"] == "lfr+tr"
     assert document["verdict"] == "pass" and document["requests"]["answered"] == 30
+
+
+OTHER_FUNCTION: Final = """
+from aftbed.core.application import Characteristics
+class Adder:
+    characteristics = Characteristics()
+    def __init__(self): self.sum = 0
+    def execute(self, request):
+        self.sum += len(request) * STEP
+        return b"%d" % self.sum
+    def capture(self): return b"%d" % self.sum
+    def restore(self, state): self.sum = int(state)
+"""
+
+
+def test_a_function_of_the_user_is_simulated_updated_and_judged(sim: Call, tmp_path: Path) -> None:
+    for step in (1, 2):
+        (tmp_path / f"adder{step}.py").write_text(OTHER_FUNCTION.replace("STEP", str(step)))
+    update = ("--adapt", f"update app to {tmp_path}/adder2.py:Adder at request 20")
+    crash = ("--faults", "crash primary at server.exit nth 9")
+    code, out, _ = sim("--app", tmp_path / "adder1.py:Adder", "--count", "40", *update, *crash)
+    assert code == 0, out
+    assert f"seed 0, 40 requests; {tmp_path}/adder1.py:Adder; crash primary" in out
+    assert "  requests   40 sent, 40 answered, 0 lost, 0 duplicated, 0 late, 0 wrong" in out
+    assert f"  adaptation update app to {tmp_path}/adder2.py:Adder at request 20: done" in out
+
+
+def test_what_a_function_says_wrong_after_a_failover_is_found(sim: Call, tmp_path: Path) -> None:
+    forgetful = OTHER_FUNCTION.replace("STEP", "1").replace("self.sum = int(state)", "pass")
+    (tmp_path / "adder.py").write_text(forgetful)
+    app = ("--app", tmp_path / "adder.py:Adder")
+    code, out, _ = sim(*app, "--count", "40", "--faults", "crash primary at server.exit nth 9")
+    assert code == 1 and "one_history fail" in out
+    again = next(line for line in out.splitlines() if line.startswith("  repeat "))
+    assert f"--app {tmp_path}/adder.py:Adder" in again
 
 
 ROLLED_BACK: Final = ("--adapt", "to lfr at request 5", "--faults", "crash b/after at adapt.step.enter nth 7")
@@ -185,7 +222,7 @@ def test_a_diagram_of_many_is_of_the_first_that_broke(sim: Call, tmp_path: Path)
 
 
 def test_an_exception_in_the_executive_is_a_failure(sim: Call, monkeypatch: pytest.MonkeyPatch) -> None:
-    def breaks_down(setup: Setup) -> None:
+    def breaks_down(setup: Setup, code: Code = NO_CODE) -> None:
         raise KeyError("a/server")
 
     monkeypatch.setattr("aftbed.search.explore.simulate", breaks_down)
@@ -307,7 +344,7 @@ def test_a_swarm_that_proves_too_little_is_inconclusive(sim: Call, monkeypatch: 
 def test_a_broken_promise_counts_more_than_a_swarm_that_proves_too_little(
     sim: Call, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def breaks_down(setup: Setup) -> None:
+    def breaks_down(setup: Setup, code: Code = NO_CODE) -> None:
         raise KeyError("a/server")
 
     monkeypatch.setattr("aftbed.search.tally.ENOUGH_RUNS", 1)
@@ -389,10 +426,13 @@ def test_a_disagreement_is_exit_code_1(
         ),
         (("--adapt", "to lfrr"), ("--adapt 'to lfrr'", "did you mean 'lfr'")),
         (("--adapt", "to lfr at request 101"), ("there are 100 requests",)),
-        (("--adapt", "update before to aftbed.ftm.chain:PbrBefore"), ("loads no brick",)),
+        (("--adapt", "update before to none.py:Mine"), ("none.py: no such file",)),
+        (("--app", "none.py:Mine"), ("none.py: no such file",)),
+        (("--app", UNREPEATABLE, "--ftm", "lfr"), ("lfr needs a deterministic function", "--force does it")),
+        (("--swarm", "--app", UNREPEATABLE), ("leave out --app",)),
         (("--adapt", "decompose", "--force"), ("to EXPR",)),
         (("--adapt", "to lfr", "--recipe", "papr"), ("unknown recipe 'papr'",)),
-        (("--force",), ("give --adapt too",)),
+        (("--force",), ("--force is about --adapt and --app",)),
         (("--diagram", "/nowhere/at/all.md"), ("--diagram /nowhere/at/all.md", "a directory that exists")),
     ],
 )

@@ -21,6 +21,10 @@ class Cart(msgspec.Struct, forbid_unknown_fields=True):
     wheels: list[Wheel] = []
 
 
+class Limits(msgspec.Struct):
+    tolerance: float
+
+
 GOOD = "name: x\nwheels:\n  - size_mm: 200\n    tyre: winter\n"
 
 # 10^9 values in 400 bytes: each list names the one before it ten times.
@@ -41,6 +45,13 @@ def test_a_file_is_read_as_the_struct_that_declares_it(tmp_path: Path) -> None:
     path = tmp_path / "a.yaml"
     path.write_text(GOOD)
     assert read_yaml(path, Cart) == Cart("x", [Wheel(200, "winter")])
+
+
+@pytest.mark.parametrize("text", ["1e-9", "1E-9", "+1e-09", "1.0e-9", "0.000000001"])
+def test_a_number_needs_no_point_before_its_exponent(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "a.yaml"
+    path.write_text(f"tolerance: {text}\n")
+    assert read_yaml(path, Limits) == Limits(1e-9)
 
 
 @pytest.mark.parametrize(

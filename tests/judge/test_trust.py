@@ -16,6 +16,7 @@ import pytest
 from records import outcomes, whole
 
 from aftbed.core.events import Event
+from aftbed.functions.load import load_module
 from aftbed.judge.checks import Evidence
 from aftbed.judge.isolated import declared_by, reference_of
 from aftbed.judge.outcome import outcome_of
@@ -23,7 +24,6 @@ from aftbed.judge.record import RunRecord, read_record
 from aftbed.judge.verdict import Verdict, evidence_of, judge
 from aftbed.runtime.unix import linux, trust
 from aftbed.runtime.unix.confined import ProcessLimits
-from aftbed.runtime.unix.options import load_module
 from aftbed.runtime.unix.trust import NOBODY, OWN_RUN, Trust, known_hashes, note, remember, trusting, vetted
 
 FUNCTION: Final = """\

@@ -14,9 +14,8 @@ from aftbed.core.messages import AnyMessage, Reply
 from aftbed.ftm.chain import Compute
 from aftbed.ftm.compose import EXPRESSIONS, NONE, build
 from aftbed.ftm.registry import KINDS, Setting
-from aftbed.functions.load import load_application, load_class
+from aftbed.functions.load import NO_CODE, OWN_CODE, load_application, load_class
 from aftbed.runtime.assembly import TEST_EPOCH, MakeBrick, self_test
-from aftbed.runtime.unix.options import load_module
 from aftbed.vehicle.aeb.function import default_application, sample_requests
 
 REQUESTS = tuple(sample_requests(0, 8))
@@ -80,13 +79,9 @@ def _with(graph: Graph, kind: type) -> tuple[Graph, MakeBrick]:
         if spec.source:
             found: Brick = kind(setting)
             return found
-        return make_brick(spec, setting, _nothing)
+        return make_brick(spec, setting, NO_CODE)
 
     return msgspec.structs.replace(graph, bricks=bricks), make
-
-
-def _nothing(place: str) -> type:
-    raise AssertionError(f"nothing is to be loaded, and {place} was")
 
 
 @pytest.mark.parametrize("expression", [e for e in EXPRESSIONS if e != NONE])
@@ -155,13 +150,13 @@ def try_out(tmp_path: Path, name: str, ftm: str = "pbr") -> None:
     path = tmp_path / "functions.py"
     path.write_text(FUNCTIONS)
     source = f"{path}:{name}"
-    function, graph = load_application(source, load_module), build(ftm, "process")
+    function, graph = load_application(source, OWN_CODE), build(ftm, "process")
     bricks = tuple(
         msgspec.structs.replace(b, application=source) if b.part == "server" else b for b in graph.bricks
     )
     setting = Setting(1, TEST_EPOCH, True, function)
     graph = msgspec.structs.replace(graph, bricks=bricks)
-    self_test(graph, "a", lambda spec: make_brick(spec, setting, _nothing), REQUESTS)
+    self_test(graph, "a", lambda spec: make_brick(spec, setting, NO_CODE), REQUESTS)
 
 
 @pytest.mark.parametrize(
@@ -205,13 +200,13 @@ def test_a_sound_function_passes(tmp_path: Path) -> None:
 )
 def test_a_source_that_names_no_class(source: str, words: str) -> None:
     with pytest.raises(ConfigError, match=words):
-        load_class(source, _nothing)
+        load_class(source, NO_CODE)
 
 
 def test_a_brick_is_no_function() -> None:
     with pytest.raises(ConfigError, match="is no protected function: it lacks execute"):
-        load_application("aftbed.ftm.chain:Compute", load_module)
+        load_application("aftbed.ftm.chain:Compute", OWN_CODE)
     with pytest.raises(ConfigError, match=r"has no class Comput \(it has: .*Compute"):
-        load_application("aftbed.ftm.chain:Comput", load_module)
+        load_application("aftbed.ftm.chain:Comput", OWN_CODE)
     with pytest.raises(ConfigError, match="cannot be imported: ModuleNotFoundError"):
-        load_application("aftbed.ftm.nothing:Compute", load_module)
+        load_application("aftbed.ftm.nothing:Compute", OWN_CODE)

@@ -10,6 +10,7 @@ from aftbed.core.brick import Brick, Effect, Note
 from aftbed.core.graph import BrickSpec
 from aftbed.core.messages import AnyMessage
 from aftbed.ftm.registry import Setting
+from aftbed.functions.load import NO_CODE
 from aftbed.judge.simulated import breaches
 from aftbed.runtime.sim.clock import Clock
 from aftbed.runtime.sim.interleaving import Chooser, HeldChannel, orders
@@ -87,7 +88,7 @@ class Hasty(Brick):
 
 def test_a_mistake_is_found_in_some_order() -> None:
     def made(spec: BrickSpec, setting: Setting) -> Brick:
-        brick = make_brick(spec, setting, pytest.fail)
+        brick = make_brick(spec, setting, NO_CODE)
         return Hasty(brick) if spec.name == "b/after" else brick
 
     broken = 0

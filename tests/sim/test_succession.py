@@ -1,6 +1,5 @@
 """Updates of the function in simulated runs: which version served which request, though one was undone."""
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
@@ -9,26 +8,20 @@ import versions
 from sampling import sampled
 
 from aftbed.core.messages import Goal, Scheduled
+from aftbed.functions.load import OWN_CODE
 from aftbed.inject.crash import Crash
 from aftbed.inject.grammar import Trigger
 from aftbed.inject.model import Fault
 from aftbed.judge.checks import wrong_replies
-from aftbed.judge.reference import Succession, changes_of, loaded, reference_run
+from aftbed.judge.reference import reference_run
 from aftbed.judge.simulated import breaches
 from aftbed.runtime.sim.world import Doom, Run, Setup, World
-from aftbed.runtime.unix.options import load_module
 from aftbed.vehicle.aeb.function import default_application
 
 VERSIONS: Final = str(Path(versions.__file__).resolve())
 ONE_WAY: Final = "aftbed.vehicle.aeb.variants:Cautious"  # the first version refuses its state
 FIRST: Final = 4  # the request at which the update begins
 EFFECTS: Final = 16  # of a brick: several requests
-
-
-def succession(run: Run) -> Callable[[], Succession]:
-    """Makes the bare server of the run."""
-    changes = loaded(changes_of(run.history, run.adaptations), load_module)
-    return lambda: Succession(default_application, changes)
 
 
 def setup(
@@ -44,14 +37,14 @@ def setup(
 
 
 def updated(ftm: str, placement: str, source: str, *faults: Fault) -> Run:
-    return World(setup(ftm, placement, source, faults), load=load_module).run()
+    return World(setup(ftm, placement, source, faults), code=OWN_CODE).run()
 
 
 @pytest.mark.parametrize("ftm", ["pbr", "lfr", "pbr+tr", "tr"])
 def test_an_update_is_compared_with_the_version_that_served(ftm: str) -> None:
     run = updated(ftm, "process", "Firm")
     assert [a.outcome for a in run.adaptations] == ["done"]
-    assert breaches(run, succession(run)) == ()
+    assert breaches(run, OWN_CODE) == ()
     wrong = list(wrong_replies(run.history, reference_run(run.history, default_application())))
     assert wrong == list(range(wrong[0], 61)) and FIRST <= wrong[0] < FIRST + 8, "from the update to the end"
 
@@ -67,7 +60,7 @@ def test_an_update_that_is_undone_served_only_meanwhile(
         target = target.partition("/")[0]
     run = updated(ftm, placement, source, Fault(Crash(), target, Trigger(after_ms=60)))
     assert [a.outcome for a in run.adaptations] == ["rolled back"]
-    assert breaches(run, succession(run)) == ()
+    assert breaches(run, OWN_CODE) == ()
     wrong = list(wrong_replies(run.history, reference_run(run.history, default_application())))
     assert wrong, "the second version served"
     if source == "Firm":  # else the first one goes on with the state that it had left
@@ -81,9 +74,9 @@ def test_wherever_in_a_request_the_leader_dies(ftm: str, brick: str) -> None:
     """What only the dead one had executed is done again by the first version; what the other knew is not."""
     undone = 0
     for effect in range(40, 40 + EFFECTS):
-        run = World(setup(ftm, "process", "Firm", dooms=(Doom(brick, effect),)), load=load_module).run()
+        run = World(setup(ftm, "process", "Firm", dooms=(Doom(brick, effect),)), code=OWN_CODE).run()
         undone += [a.outcome for a in run.adaptations] == ["rolled back"]
-        assert breaches(run, succession(run)) == (), effect
+        assert breaches(run, OWN_CODE) == (), effect
     assert undone == EFFECTS
 
 
@@ -99,16 +92,16 @@ def test_where_the_first_version_takes_no_state_back_the_second_goes_on(
         fault = Fault(Crash(), target, Trigger(after_ms=after_ms))
         update = Scheduled(Goal(part="app", source=ONE_WAY), FIRST)
         given = Setup(ftm, placement, count=60, rate_hz=400, faults=(fault,), adaptations=(update,))
-        run = World(given, load=load_module).run()
+        run = World(given, code=OWN_CODE).run()
         assert not run.rest.lost, after_ms
-        assert breaches(run, succession(run)) == (), after_ms
+        assert breaches(run, OWN_CODE) == (), after_ms
         outcomes.append(run.adaptations[0].outcome)
     assert outcomes[-4:] == ["done"] * 4 and set(outcomes) >= {"done", "rolled back"}
 
 
 def test_an_update_without_a_way_back_says_so_and_looks_like_no_failure() -> None:
     update = Scheduled(Goal(part="app", source=ONE_WAY), FIRST)
-    run = World(Setup(count=60, rate_hz=400, adaptations=(update,)), load=load_module).run()
+    run = World(Setup(count=60, rate_hz=400, adaptations=(update,)), code=OWN_CODE).run()
     assert [a.outcome for a in run.adaptations] == ["done"]
     told = [(event, text) for _, event, text in run.logged]
     assert "refused" not in dict(told)
@@ -120,5 +113,5 @@ def test_what_never_served_is_no_version() -> None:
     """It died before requests were let on again."""
     run = updated("pbr", "process", "Firm", Fault(Crash(), "a/protocol", Trigger("adapt.step.enter", 4)))
     assert [(a.outcome, a.opened_ns) for a in run.adaptations] == [("rolled back", 0)]
-    assert breaches(run, succession(run)) == ()
+    assert breaches(run, OWN_CODE) == ()
     assert wrong_replies(run.history, reference_run(run.history, default_application())) == {}

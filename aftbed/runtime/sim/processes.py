@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Callable, Generator
 from typing import Final
 
-from aftbed.core.errors import ConfigError, StepFailed
+from aftbed.core.errors import ConfigError, FunctionFailedError, StepFailed
 from aftbed.core.journal import Record
 from aftbed.runtime import control, interface
 from aftbed.runtime.assembly import Assembler
@@ -171,7 +171,7 @@ class SimProcess:
             return
         try:
             self.io = self._pool.build(self, order, fds)
-        except ConfigError as error:
+        except (ConfigError, FunctionFailedError) as error:
             self.report(control.Ack(order.token, error=str(error)))
             self.die()
         else:

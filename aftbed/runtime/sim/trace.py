@@ -19,6 +19,7 @@ import msgspec
 from aftbed.core.graph import Link
 from aftbed.core.journal import Entry, EntryKind, Record
 from aftbed.core.messages import Message
+from aftbed.functions.load import NO_CODE, Code
 from aftbed.runtime.assembly import MakeSetting
 from aftbed.runtime.sim.clock import START_NS, Clock
 from aftbed.runtime.sim.node_io import SimChannel
@@ -57,9 +58,9 @@ class Trace(msgspec.Struct, frozen=True):
     happened: tuple[Happening, ...]
 
 
-def traced(setup: Setup, make: MakeSetting | None = None) -> Trace:
+def traced(setup: Setup, make: MakeSetting | None = None, code: Code = NO_CODE) -> Trace:
     """Run `setup` and keep all that happens; `make` makes other bricks than the catalog's."""
-    world = _Traced(setup, make)
+    world = _Traced(setup, make, code)
     run = world.run()
     struck = [LoggedLine(t_ns, STRUCK, node) for t_ns, node in run.struck]
     sources: tuple[list[Happening], ...] = (world.happened, [*run.history.journals[EXECUTIVE]], [*struck])
@@ -81,9 +82,9 @@ class _Records(list[Record]):
 class _Traced(World):
     """A world that keeps what happens."""
 
-    def __init__(self, setup: Setup, make: MakeSetting | None) -> None:
+    def __init__(self, setup: Setup, make: MakeSetting | None, code: Code) -> None:
         self.happened: list[Happening] = []
-        super().__init__(setup, make=make, channel=_recording(self.happened))
+        super().__init__(setup, make=make, code=code, channel=_recording(self.happened))
 
     def _journal_for(self, name: str) -> list[Record]:
         return self.journals.setdefault(name, _Records(self.happened))

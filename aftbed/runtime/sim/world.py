@@ -21,7 +21,7 @@ from aftbed.core.journal import Entry, EntryKind, History, Record
 from aftbed.core.messages import Goal, Reply, Scheduled
 from aftbed.ftm.client import Client
 from aftbed.ftm.compose import build, replication_of
-from aftbed.functions.load import LoadModule
+from aftbed.functions.load import NO_CODE, Code
 from aftbed.inject.bus import BusFault
 from aftbed.inject.bus_disturber import Disturber
 from aftbed.inject.kind import FaultKind
@@ -34,6 +34,7 @@ from aftbed.runtime.assembly import Assembler, MakeSetting
 from aftbed.runtime.deployment import Hosted, Keys, digest
 from aftbed.runtime.devices import CarDevice, CarLink, Device, Load, Sensor, resume_client
 from aftbed.runtime.interface import DRAW_BITS, Met, ProcessKind
+from aftbed.runtime.node import FUNCTION_FAILED
 from aftbed.runtime.run_controller import RunController, ScriptRun
 from aftbed.runtime.sim.clock import START_NS, Clock
 from aftbed.runtime.sim.node_io import SimChannel, SimIO, SimNode, SimulatedMemory
@@ -49,6 +50,7 @@ from aftbed.vehicle.scenarios.library import load_scenario
 
 REQUESTS: Final = 512  # of a load; then they repeat
 STEP_NS: Final = STEP_US * 1000  # of a car
+FUNCTION: Final = "function"  # the event of one that failed
 STOPPED: Final = "detected stop"  # in the reason of a death
 REST_NS_MAX: Final = 3_000_000_000  # from the last fault to the rest, in virtual time
 TICK_SECONDS: Final = 0.02  # between two looks for hangs, as in the supervisor
@@ -68,6 +70,7 @@ class Setup(msgspec.Struct, frozen=True):
     """What a run is made of, so that it can be repeated: nothing else has a part in it.
 
     `count` requests at `rate_hz` (0: the next follows the reply); or those of a car in `scenario`.
+    `application`: the protected function, "" for the built-in one.
     """
 
     ftm: str = "pbr"
@@ -79,6 +82,7 @@ class Setup(msgspec.Struct, frozen=True):
     adaptations: tuple[Scheduled, ...] = ()
     dooms: tuple[Doom, ...] = ()
     scenario: str = ""
+    application: str = ""
 
 
 class Rest(msgspec.Struct, frozen=True):
@@ -119,9 +123,9 @@ def requests_of(seed: int) -> list[bytes]:
 
 
 @lru_cache(maxsize=64)
-def graph_of(ftm: str, placement: str) -> Graph:
+def graph_of(ftm: str, placement: str, application: str = "") -> Graph:
     """The graph that a run begins with."""
-    return build(ftm, placement)
+    return build(ftm, placement, application=application)
 
 
 @lru_cache(maxsize=1)
@@ -139,11 +143,6 @@ def check(fault: Fault, scenario: str) -> None:
         raise ConfigError(f"{fault}: without a scenario there is no bus")
     if fault.trigger.when is not None:
         raise ConfigError(f"{fault}: 'when' looks at the car, and without a scenario there is none")
-
-
-def nothing_off_line(place: str) -> NoReturn:
-    """No module is found. Raises ConfigError."""
-    raise ConfigError(f"{place}: the simulator loads nothing that was written off line")
 
 
 class ExecutiveJournal:
@@ -257,7 +256,7 @@ class Drive(CarLink):
 
 
 class World:
-    """The `Runtime` of a simulated run, and the run itself."""
+    """The `Runtime` of a simulated run, and the run itself. `code`: how that of the user is found."""
 
     def __init__(
         self,
@@ -266,7 +265,7 @@ class World:
         function: Callable[[], Application] = default_application,
         requests: list[bytes] | None = None,
         make: MakeSetting | None = None,
-        load: LoadModule = nothing_off_line,
+        code: Code = NO_CODE,
         channel: type[SimChannel] = SimChannel,
         clock: Callable[[Random], Clock] = Clock,
     ) -> None:
@@ -285,11 +284,11 @@ class World:
         self.effects: dict[str, int] = {}
         self.lost = False
         self.journal = ExecutiveJournal(self.journals.setdefault("supervisor.1", []))
-        assembler = Assembler(function, load, make)
+        assembler = Assembler(function, code, make)
         self.pool = SimProcessPool(
             self.loop, assembler, self._make_device, self._ends.__getitem__, self._journal_for
         )
-        graph = graph_of(setup.ftm, setup.placement)
+        graph = graph_of(setup.ftm, setup.placement, setup.application)
         self.controller = RunController(graph, self, None, lambda: setattr(self, "lost", True))
         self.pool.on_report = self._on_report
         self.pool.on_death = self._on_death
@@ -386,6 +385,8 @@ class World:
         flipped = STOPPED in reason and any(fault.action.alters_value for fault in self.setup.faults)
         if (not reason or flipped) and process.kind is not ProcessKind.KILLED:
             self.struck.append((self.loop.ns, process.name))
+        if FUNCTION_FAILED in reason:
+            self.log(FUNCTION, reason)
         if reason.startswith("assertion"):
             self.failures.append(f"{process.name}: {reason}")
             self.log("assert", f"{process.name}: {reason}")
@@ -557,5 +558,5 @@ class World:
         )
 
 
-def simulate(setup: Setup) -> Run:
-    return World(setup).run()
+def simulate(setup: Setup, code: Code = NO_CODE) -> Run:
+    return World(setup, code=code).run()

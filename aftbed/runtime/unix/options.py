@@ -1,10 +1,6 @@
 """What a run is made of, checked by the command before a process is started."""
 
-import importlib
-import importlib.util
-from importlib.machinery import SourceFileLoader
 from pathlib import Path
-from types import CodeType, ModuleType
 from typing import Final
 
 import msgspec
@@ -92,29 +88,6 @@ class SourceOptions(msgspec.Struct, frozen=True):
     secret: str
     journals: str = ""
     incarnation: int = 1
-
-
-class SourceLoader(SourceFileLoader):
-    """Compiles the file that is there: a compiled one beside it is not read, and none is written."""
-
-    def get_code(self, fullname: str) -> CodeType:
-        return compile(self.source(), self.path, "exec", dont_inherit=True)
-
-    def source(self) -> bytes:
-        return self.get_data(self.path)
-
-
-def load_module(place: str) -> ModuleType:
-    """The module called `place`, or in that file if it ends in `.py`. Raises ConfigError without the file."""
-    if not place.endswith(".py"):
-        return importlib.import_module(place)
-    name = Path(place).stem
-    spec = importlib.util.spec_from_file_location(name, place, loader=SourceLoader(name, place))
-    if spec is None or spec.loader is None or not Path(place).is_file():
-        raise ConfigError(f"{place}: no such file")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def with_names_resolved(fault: Fault, work: Work) -> Fault:

@@ -31,8 +31,8 @@ import msgspec
 import aftbed
 from aftbed.core.errors import ConfigError
 from aftbed.core.input_file import read_input
+from aftbed.functions.load import SourceLoader
 from aftbed.functions.source import FunctionKind, FunctionSource, parse_source
-from aftbed.runtime.unix.options import SourceLoader
 
 PACKAGE: Final = Path(aftbed.__file__).resolve().parent
 FILE_BYTES_MAX: Final = 1 << 28  # a program may be as long as an interpreter
@@ -79,7 +79,7 @@ class CodeFile(msgspec.Struct, frozen=True):
     folders: tuple[str, ...] = ()
 
 
-class Code(msgspec.Struct, frozen=True):
+class VettedFiles(msgspec.Struct, frozen=True):
     """All that loading a function executes, in order; no file of a module of this package.
 
     `place`: `MODULE`, `FILE.py`, or all of the text that names a function of another kind.
@@ -89,7 +89,7 @@ class Code(msgspec.Struct, frozen=True):
     files: tuple[CodeFile, ...]
 
 
-def vetted(source: str, trust: Trust) -> Code:
+def vetted(source: str, trust: Trust) -> VettedFiles:
     """The code of a function, or of a brick's class; nothing of it is executed.
 
     Raises ConfigError, which names the source, where it is not trusted, or is not there.
@@ -98,7 +98,7 @@ def vetted(source: str, trust: Trust) -> Code:
     is_class = named.kind is FunctionKind.CLASS
     place = named.place if is_class else source
     if is_class and place.partition(".")[0] == PACKAGE.name and not place.endswith(".py"):
-        return Code(place, ())
+        return VettedFiles(place, ())
     try:
         files = tuple(_files_of(place) if is_class else _opaque_files(named))
     except (OSError, ValueError) as error:
@@ -115,7 +115,7 @@ def vetted(source: str, trust: Trust) -> Code:
                 f"{source} is not trusted, so it was not executed: you have not run it before{unknown};"
                 f" --trust {folder} executes it"
             )
-    return Code(place, files)
+    return VettedFiles(place, files)
 
 
 def _files_of(place: str) -> Iterator[CodeFile]:
@@ -178,7 +178,7 @@ class _HashedLoader(SourceLoader):
         return data
 
 
-def load(code: Code) -> ModuleType:
+def load(code: VettedFiles) -> ModuleType:
     """Execute it, which is Python. Raises whatever that raises."""
     if not code.files:
         return importlib.import_module(code.place)
@@ -200,7 +200,7 @@ def load(code: Code) -> ModuleType:
     return module
 
 
-def check_unchanged(code: Code) -> None:
+def check_unchanged(code: VettedFiles) -> None:
     """That the files which are no Python have their hashes still. Raises ConfigError."""
     for file in code.files:
         if not file.module and _hash(Path(file.path)) != file.sha256:
@@ -223,10 +223,10 @@ def note(record: Path, place: str, module: ModuleType) -> None:
     _note(record, place, [Path(file) for one in loaded if (file := getattr(one, "__file__", None))])
 
 
-def note_files(record: Path, source: str) -> None:
+def note_files(record: Path, source: FunctionSource) -> None:
     """The same of a function that is no class, which a node is about to execute."""
     with contextlib.suppress(ConfigError):
-        _note(record, source, parse_source(source).files())
+        _note(record, str(source), source.files())
 
 
 def _note(record: Path, place: str, paths: list[Path]) -> None:

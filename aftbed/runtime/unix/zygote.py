@@ -15,15 +15,16 @@ import importlib
 import os
 import socket
 import sys
-from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import NoReturn
 
 import msgspec
 
-from aftbed.core.errors import ConfigError
+from aftbed.core.errors import ConfigError, FunctionFailedError
 from aftbed.ftm.client import Client
+from aftbed.functions.load import Code, load_module
+from aftbed.functions.source import FunctionSource
 from aftbed.runtime import control
 from aftbed.runtime.assembly import Assembler
 from aftbed.runtime.devices import Device, Sensor
@@ -34,7 +35,7 @@ from aftbed.runtime.unix.devices import ProcessSenses, make_source
 from aftbed.runtime.unix.journal_files import JournalFile
 from aftbed.runtime.unix.linux import INHERITED_FD, Area
 from aftbed.runtime.unix.node_io import EXIT_ASSERT, UnixIO, UnixNode
-from aftbed.runtime.unix.options import SourceOptions, load_module
+from aftbed.runtime.unix.options import SourceOptions
 from aftbed.runtime.unix.transport import PULSE_SECONDS, Line, decode_order
 from aftbed.vehicle.aeb.function import default_application
 
@@ -122,7 +123,7 @@ def _be_spare(supervisor: int, areas: tuple[Area, ...]) -> NoReturn:
             os._exit(0)
         io = _make_node(line, order, fds)
     except BaseException as error:  # noqa: BLE001 - the last frame of this process
-        known = isinstance(error, ConfigError | OSError)
+        known = isinstance(error, ConfigError | FunctionFailedError | OSError)
         reason = str(error) if known else f"{type(error).__name__}: {error}"
         line.send(control.Ack(order.token, error=reason))
         if known:
@@ -150,29 +151,29 @@ def _make_node(line: Line[control.ToNode], order: control.Assign, fds: list[int]
     io.lifeline = Lifeline(Path(order.journal))
     if kind == "engine":
         gc.enable()  # a plan leaves cycles behind, and the Engine is not on the request path
-    record = Path(order.journal).parent.parent
-    load = partial(_load_and_note, record)
-    for application in {spec.application for spec in order.bricks if spec.application}:
-        _note_files(record, application)
-    Assembler(default_application, load).build(node, order, fds, lambda: _make_device(order, node))
+    code = _NotedCode(Path(order.journal).parent.parent)
+    Assembler(default_application, code).build(node, order, fds, lambda: _make_device(order, node))
     return io
 
 
-def _note_files(record: Path, application: str) -> None:
-    """For the judge: a function that is no class has no module, which is noted when it is loaded."""
-    from aftbed.runtime.unix import trust  # noqa: PLC0415 - hashlib, in nodes with such code only
+class _NotedCode(Code):
+    """Notes in the record of the run what is not of this package."""
 
-    trust.note_files(record, application)
+    def __init__(self, record: Path) -> None:
+        self._record = record
 
+    def module(self, place: str) -> ModuleType:
+        module = load_module(place)
+        if place.endswith(".py") or place.partition(".")[0] != "aftbed":
+            from aftbed.runtime.unix import trust  # noqa: PLC0415 - hashlib, in nodes with such code only
 
-def _load_and_note(record: Path, place: str) -> ModuleType:
-    """`load_module`; what is not of this package is noted in the record of the run."""
-    module = load_module(place)
-    if place.endswith(".py") or place.partition(".")[0] != "aftbed":
-        from aftbed.runtime.unix import trust  # noqa: PLC0415 - hashlib, in nodes with such code only
+            trust.note(self._record, place, module)
+        return module
 
-        trust.note(record, place, module)
-    return module
+    def permit(self, source: FunctionSource) -> None:
+        from aftbed.runtime.unix import trust  # noqa: PLC0415 - the same
+
+        trust.note_files(self._record, source)
 
 
 def _make_device(order: control.Assign, node: UnixNode) -> Device:
