@@ -27,7 +27,7 @@ import msgspec
 from aftbed.core.application import REPLY_BYTES_MAX
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.input_file import read_input
-from aftbed.functions.load import LoadModule
+from aftbed.functions.load import Code
 
 REQUEST_BYTES_MAX: Final = REPLY_BYTES_MAX  # a request has to fit into a packet, as a reply has
 REQUESTS_MAX: Final = 100_000
@@ -214,7 +214,9 @@ class ExpectedReplies(msgspec.Struct, frozen=True):
 
 
 def _length(reply: bytes) -> str:
-    return f"{len(reply)} bytes" if reply else "an empty reply (the request was refused)"
+    if not reply:
+        return "an empty reply (the request was refused)"
+    return f"{len(reply)} byte{'s' if len(reply) > 1 else ''}"
 
 
 def _alike(one: Value, other: Value, tolerance: float) -> bool:
@@ -224,12 +226,13 @@ def _alike(one: Value, other: Value, tolerance: float) -> bool:
 
 
 class GivenRequests(msgspec.Struct, frozen=True):
-    """What `--requests` and `--expect` have given a run; both as the user named them."""
+    """What `--requests`, `--expect` and `--tolerance` give a run: what was named, and what is in it."""
 
     source: str
     requests: tuple[bytes, ...]
     expect: str = ""
     expected: ExpectedReplies | None = None
+    tolerance: float | None = None
 
 
 # -- reading --------------------------------------------------------------------------------------
@@ -460,7 +463,7 @@ def names_function(source: str) -> bool:
     return bool(colon and place) and name.isidentifier() and not Path(source).exists()
 
 
-def generated(source: str, count: int, seed: int, load_module: LoadModule) -> list[bytes]:
+def generated(source: str, count: int, seed: int, code: Code) -> list[bytes]:
     """The first `count` requests of `function(seed)`, where `source` is `MODULE:FUNCTION` or
     `FILE.py:FUNCTION`.
 
@@ -468,7 +471,7 @@ def generated(source: str, count: int, seed: int, load_module: LoadModule) -> li
     """
     place, _, name = source.rpartition(":")
     try:
-        module = load_module(place)
+        module = code.module(place)
     except ConfigError:
         raise
     except (Exception, SystemExit) as error:

@@ -5,9 +5,7 @@ time, as some libraries can have no more. The process notes each call before it 
 does not return has a name.
 """
 
-import math
 import os
-import struct
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -17,26 +15,24 @@ from typing import Final
 import msgspec
 
 from aftbed.core.application import (
+    BITS,
     Application,
     Characteristics,
     Field,
-    Width,
+    difference,
     fields_of,
     reply_fields_of,
+    value_of,
 )
 from aftbed.core.errors import ConfigError, PeerError
-from aftbed.functions.load import LoadModule, load_application
+from aftbed.functions.load import Code, load_application
 from aftbed.runtime.unix.confined import note, serve
-from aftbed.runtime.unix.trust import Code, check_unchanged, load
+from aftbed.runtime.unix.trust import VettedCode, VettedFiles
 
 PAGE_BYTES: Final = 4096
 WHOLE_STATES_BYTES_MAX: Final = 64 << 20  # of states that are handed over; of any further ones, digests
 DIGEST_BYTES: Final = 16
 WORDS_MAX: Final = 300  # characters of what went wrong
-_FORMATS: Final[dict[Width, str]] = {
-    "bool": "?", "u8": "B", "u16": "H", "u32": "I", "u64": "Q",
-    "i8": "b", "i16": "h", "i32": "i", "i64": "q", "f32": "f", "f64": "d",
-}  # fmt: skip
 
 Note = Callable[[str], None]
 Make = Callable[[], Application]
@@ -81,7 +77,7 @@ class ResumeStates(msgspec.Struct, frozen=True, tag=True):
 Task = ExecuteAll | WatchStates | ResumeStates
 
 
-class Description(msgspec.Struct, frozen=True):
+class FunctionDescription(msgspec.Struct, frozen=True):
     """What a function declares."""
 
     characteristics: Characteristics
@@ -92,7 +88,7 @@ class Description(msgspec.Struct, frozen=True):
 class Executed(msgspec.Struct, frozen=True, tag=True):
     """`state`: the last one; `execute_ns`: the time of each request."""
 
-    described: Description
+    described: FunctionDescription
     replies: tuple[bytes, ...]
     refused: int
     state: bytes
@@ -159,38 +155,19 @@ Answer = Executed | Watched | ResumedElsewhere | NoFunction | Unanswered
 # -- differences ----------------------------------------------------------------------------------
 
 
-def difference(found: bytes, expected: bytes, fields: Sequence[Field]) -> str:
+def differs(found: bytes, expected: bytes, fields: Sequence[Field]) -> str:
     """The first one, as `ttc_s is 2.5 instead of 2.6`; "" if there is none."""
     if found == expected:
         return ""
     if len(found) != len(expected):
         return f"{_size(found)} instead of {_size(expected)}"
     for field in fields:
-        one, other = _value(field, found), _value(field, expected)
-        if one != other and not (one != one and other != other):  # noqa: PLR0124 - NaN
-            return f"{field.name} is {one} instead of {other}"
+        if field.offset_bytes + field.size_bits // 8 <= len(found):
+            one, other = value_of(field, found), value_of(field, expected)
+            if one != other and not (one != one and other != other):  # noqa: PLR0124 - NaN
+                return f"{field.name} is {one} instead of {other}"
     at = next(at for at, (one, other) in enumerate(zip(found, expected, strict=True)) if one != other)
     return f"byte {at} is 0x{found[at]:02x} instead of 0x{expected[at]:02x}"
-
-
-def distance(found: bytes, expected: bytes, fields: Sequence[Field]) -> float:
-    """The greatest difference of a number of type f32 or f64; infinite if anything else differs."""
-    if found == expected:
-        return 0.0
-    if len(found) != len(expected):
-        return math.inf
-    one, other = bytearray(found), bytearray(expected)
-    greatest = 0.0
-    for field in fields:
-        number, wanted = _value(field, found), _value(field, expected)
-        if not (isinstance(number, float) and isinstance(wanted, float)):
-            continue
-        place = slice(field.offset_bytes, field.offset_bytes + field.size_bits // 8)
-        one[place] = other[place] = bytes(field.size_bits // 8)
-        if number != wanted and not (math.isnan(number) and math.isnan(wanted)):
-            apart = abs(number - wanted)
-            greatest = max(greatest, math.inf if math.isnan(apart) else apart)
-    return greatest if one == other else math.inf
 
 
 def changes(before: bytes, after: bytes) -> tuple[int, int]:
@@ -206,8 +183,8 @@ def changes(before: bytes, after: bytes) -> tuple[int, int]:
     return count, pages
 
 
-def of_reply(number: int, differs: str) -> str:
-    return f"the reply to request {number}: {differs}"
+def of_reply(number: int, text: str) -> str:
+    return f"the reply to request {number}: {text}"
 
 
 def behind(number: int) -> str:
@@ -218,19 +195,10 @@ def _size(data: bytes) -> str:
     return "no byte" if not data else f"{len(data)} byte{'s' if len(data) > 1 else ''}"
 
 
-def _value(field: Field, data: bytes) -> float | bool | None:
-    """None where the data is too short for it."""
-    try:
-        found: float | bool = struct.unpack_from("<" + _FORMATS[field.kind], data, field.offset_bytes)[0]
-    except struct.error:
-        return None
-    return found
-
-
 # -- the tasks ------------------------------------------------------------------------------------
 
 
-def perform(task: Task, source: str, load_module: LoadModule, tell: Note) -> Answer:
+def perform(task: Task, source: str, code: Code, tell: Note) -> Answer:
     """The answer of the function `source`; whatever it does by exceptions is an answer too."""
     last = ""
 
@@ -242,7 +210,7 @@ def perform(task: Task, source: str, load_module: LoadModule, tell: Note) -> Ans
     try:
         call("loading")
         try:
-            make = load_application(source, load_module)
+            make = load_application(source, code)
             first = make()
             described = _described(source, first)
         except ConfigError as error:
@@ -264,7 +232,7 @@ def perform(task: Task, source: str, load_module: LoadModule, tell: Note) -> Ans
         return Unanswered(_words(error), last)
 
 
-def _described(source: str, function: Application) -> Description:
+def _described(source: str, function: Application) -> FunctionDescription:
     """Raises ConfigError."""
     declared: object = function.characteristics
     if not isinstance(declared, Characteristics):
@@ -272,16 +240,16 @@ def _described(source: str, function: Application) -> Description:
     for name in ("fields", "reply_fields"):
         found: object = getattr(function, name, ())
         if not isinstance(found, tuple) or not all(
-            isinstance(one, Field) and one.kind in _FORMATS for one in found
+            isinstance(one, Field) and one.kind in BITS for one in found
         ):
             raise ConfigError(f"{source}: {name}: found {found!r}, allowed is a tuple of Field(...)")
-    return Description(declared, fields_of(function), reply_fields_of(function))
+    return FunctionDescription(declared, fields_of(function), reply_fields_of(function))
 
 
 def _execute(
     function: Application,
     requests: tuple[bytes, ...],
-    described: Description,
+    described: FunctionDescription,
     call: Note,
 ) -> Executed:
     replies, took_ns, refused = [], [], 0
@@ -304,7 +272,7 @@ def _watch(
     function: Application,
     requests: tuple[bytes, ...],
     points: tuple[int, ...],
-    described: Description,
+    described: FunctionDescription,
     call: Note,
 ) -> Watched:
     replies: list[bytes] = []
@@ -319,8 +287,8 @@ def _watch(
             replies.append(_reply(function, requests[number - 1]))
         call(f"capture of {behind(number)}")
         state = function.capture()
-        differs = difference(function.capture(), state, described.fields)
-        unstable = unstable or (differs and f"{behind(number)}: {differs}")
+        text = differs(function.capture(), state, described.fields)
+        unstable = unstable or (text and f"{behind(number)}: {text}")
         whole_bytes += len(state)
         most_bytes = max(most_bytes, len(state))
         if whole_bytes <= WHOLE_STATES_BYTES_MAX:
@@ -357,10 +325,8 @@ def _compared(
     begun_anew = ""
     for number, request in enumerate(requests, 1):
         call(f"execute of request {number} in a second instance")
-        differs = difference(
-            _reply(used, request), expected.replies[number - 1], expected.described.reply_fields
-        )
-        begun_anew = begun_anew or (differs and of_reply(number, differs))
+        text = differs(_reply(used, request), expected.replies[number - 1], expected.described.reply_fields)
+        begun_anew = begun_anew or (text and of_reply(number, text))
     resumed = []
     if found.state_bytes:
         for at, state in found.points:
@@ -391,21 +357,21 @@ def _resume(
         call(f"restore of {behind(at)}")
         function.restore(state)
         call(f"capture {where}")
-        same = difference(function.capture(), state, fields)
+        same = differs(function.capture(), state, fields)
         found = msgspec.structs.replace(found, restored_state=same)
         for number, request in enumerate(requests[at:], at + 1):
             call(f"execute of request {number} {where}")
             reply, wanted = _reply(function, request), expected.replies[number - 1]
             if reply == wanted:
                 continue
-            differs = difference(reply, wanted, reply_fields)
+            text = differs(reply, wanted, reply_fields)
             found = msgspec.structs.replace(
                 found,
-                reply=found.reply or of_reply(number, differs),
-                size=max(found.size, distance(reply, wanted, reply_fields)),
+                reply=found.reply or of_reply(number, text),
+                size=max(found.size, difference(reply_fields, reply, wanted)),
             )
         call(f"capture {where} and of all further requests")
-        last = difference(function.capture(), expected.state, fields)
+        last = differs(function.capture(), expected.state, fields)
         return msgspec.structs.replace(found, last_state=last)
     except PeerError as error:
         return msgspec.structs.replace(found, failed=f"refused: {error}"[:WORDS_MAX])
@@ -432,7 +398,7 @@ class ExerciseJob(msgspec.Struct, frozen=True):
 
     task: Task
     source: str
-    code: Code
+    files: VettedFiles
     path: tuple[str, ...]
     surroundings: Surroundings
 
@@ -443,11 +409,7 @@ def work(data: bytes) -> bytes:
     sys.dont_write_bytecode = True
     os.chdir(job.surroundings.folder)
     ballast = [object() for _ in range(job.surroundings.ballast)]
-    try:
-        check_unchanged(job.code)
-    except ConfigError as error:
-        return msgspec.msgpack.encode(NoFunction(str(error)))
-    answer = perform(job.task, job.source, lambda place: load(job.code), note)
+    answer = perform(job.task, job.source, VettedCode((job.files,)), note)
     del ballast
     return msgspec.msgpack.encode(answer)
 

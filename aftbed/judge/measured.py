@@ -41,7 +41,7 @@ from aftbed.judge.exercise import (
     Watched,
     WatchStates,
     behind,
-    difference,
+    differs,
     of_reply,
 )
 from aftbed.runtime.unix.confined import JobFailedError, ProcessLimits, ask
@@ -166,11 +166,11 @@ class ProcessHost:
     """Has each task done by a process of its own. Raises ConfigError where the source cannot be read."""
 
     def __init__(self, source: str, seconds_max: float = math.inf) -> None:
-        self._source, self._code, self._seconds_max = source, vetted(source, OWN_RUN), seconds_max
+        self._source, self._files, self._seconds_max = source, vetted(source, OWN_RUN), seconds_max
 
     def __call__(self, task: Task, surroundings: Surroundings, seconds: float) -> Answer:
         job = msgspec.msgpack.encode(
-            ExerciseJob(task, self._source, self._code, tuple(search_path()), surroundings)
+            ExerciseJob(task, self._source, self._files, tuple(search_path()), surroundings)
         )
         limits = ProcessLimits(min(seconds, self._seconds_max), MEMORY_BYTES, FILE_BYTES)
         try:
@@ -368,14 +368,14 @@ def _first_difference(found: Watched, expected: Watched, first: Executed) -> str
     """Of two that watched: where the first reply or state differs; "" if none does."""
     for number, (state, wanted) in enumerate(zip(found.states, expected.states, strict=True)):
         if number and (
-            differs := difference(
+            text := differs(
                 found.replies[number - 1], expected.replies[number - 1], first.described.reply_fields
             )
         ):
-            return of_reply(number, differs)
+            return of_reply(number, text)
         whole = number < min(found.whole, expected.whole)
-        if whole and (differs := difference(state, wanted, first.described.fields)):
-            return f"{behind(number)}: {differs}"
+        if whole and (text := differs(state, wanted, first.described.fields)):
+            return f"{behind(number)}: {text}"
         if state != wanted:
             return f"{behind(number)} differs"
     return ""
@@ -384,8 +384,8 @@ def _first_difference(found: Watched, expected: Watched, first: Executed) -> str
 def _first_reply(replies: tuple[bytes, ...], first: Executed) -> str:
     """Where `replies` differ from those of the first process."""
     for number, (reply, wanted) in enumerate(zip(replies, first.replies, strict=True), 1):
-        if differs := difference(reply, wanted, first.described.reply_fields):
-            return of_reply(number, differs)
+        if text := differs(reply, wanted, first.described.reply_fields):
+            return of_reply(number, text)
     return ""
 
 

@@ -32,7 +32,6 @@ def requests(seed: int) -> Iterator[bytes]:
 class Sum:
     characteristics = Characteristics()
     fields: ClassVar[tuple[Field, ...]] = SUM_FIELDS
-    reply_fields: ClassVar[tuple[Field, ...]] = SUM_FIELDS
 
     def __init__(self) -> None:
         self.sum = self.count = 0
@@ -119,6 +118,12 @@ class ForgetsField(Sum):
 
     def capture(self) -> bytes:
         return LAYOUT.pack(self.sum, 0)
+
+
+class ForgetsNumber(ForgetsField):
+    """Its replies have fields."""
+
+    reply_fields: ClassVar[tuple[Field, ...]] = SUM_FIELDS
 
 
 class RestoresLess(Sum):
@@ -259,7 +264,7 @@ class MeanWithoutFields(Mean):
 
 
 class MeanOfOtherCount(Mean):
-    """What is no number of type f64 may not differ."""
+    """A count is a number, too."""
 
     def restore(self, state: bytes) -> None:
         super().restore(state)

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from aftbed.core.errors import ConfigError
 from aftbed.functions import request_file
+from aftbed.functions.load import NO_CODE, OWN_CODE, Code
 from aftbed.functions.request_file import (
     REQUEST_BYTES_MAX,
     ExpectedReplies,
@@ -24,7 +25,6 @@ from aftbed.functions.request_file import (
     read_replies,
     read_requests,
 )
-from aftbed.runtime.unix.options import load_module
 
 RADAR: Final = "t_us:u64,distance:f64,flag:u8"
 CODEC: Final = FieldCodec.parse(RADAR)
@@ -362,8 +362,8 @@ number = 7
 def test_a_function_makes_as_many_requests_as_are_asked_for(tmp_path: Path) -> None:
     path = tmp_path / "mine.py"
     path.write_text(GENERATORS)
-    assert generated(f"{path}:count", 3, 41, load_module) == [b"41", b"42", b"43"]
-    assert generated(f"{path}:few", 2, 0, load_module) == [b"a", b"b"]
+    assert generated(f"{path}:count", 3, 41, OWN_CODE) == [b"41", b"42", b"43"]
+    assert generated(f"{path}:few", 2, 0, OWN_CODE) == [b"a", b"b"]
 
 
 @pytest.mark.parametrize(
@@ -383,18 +383,21 @@ def test_what_a_function_does_wrong_is_told(tmp_path: Path, name: str, words: st
     path = tmp_path / "mine.py"
     path.write_text(GENERATORS)
     with pytest.raises(ConfigError) as found:
-        generated(f"{path}:{name}", 3, 0, load_module)
+        generated(f"{path}:{name}", 3, 0, OWN_CODE)
     assert str(found.value).startswith(f"{path}:{name}: ") and str(found.value).endswith(words)
 
 
 def test_a_module_that_cannot_be_imported_is_told(tmp_path: Path) -> None:
-    def broken(place: str) -> ModuleType:
-        raise SystemExit(f"{place} ends it")
+    class Broken(Code):
+        def module(self, place: str) -> ModuleType:
+            raise SystemExit(f"{place} ends it")
 
     with pytest.raises(ConfigError, match="m:f: cannot be imported: SystemExit: m ends it"):
-        generated("m:f", 1, 0, broken)
+        generated("m:f", 1, 0, Broken())
+    with pytest.raises(ConfigError, match="m: no code from outside of the package is executed here"):
+        generated("m:f", 1, 0, NO_CODE)
     with pytest.raises(ConfigError, match=r"gone\.py: no such file"):
-        generated(f"{tmp_path}/gone.py:f", 1, 0, load_module)
+        generated(f"{tmp_path}/gone.py:f", 1, 0, OWN_CODE)
 
 
 def test_a_source_is_a_function_if_it_reads_like_one_and_is_no_file(tmp_path: Path) -> None:
