@@ -128,7 +128,8 @@ class RecordInTheMaking:
         """Write what is left to write, then read it all back and judge."""
         options = self.options
         if isinstance(self.work, LoadRun):
-            options = msgspec.structs.replace(options, work=LoadRun(self.asked or self.sent, 0.0))
+            work = msgspec.structs.replace(self.work, count=self.asked or self.sent)
+            options = msgspec.structs.replace(options, work=work)
         about = msgspec.to_builtins(options) | {"started_ns": START_NS - 250 * MS}
         del about["private"], about["listener"]  # of a live run only
         (self.path / "run.json").write_text(json.dumps(about))

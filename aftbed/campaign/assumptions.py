@@ -18,7 +18,7 @@ import msgspec
 from aftbed.adapt.commands import read
 from aftbed.adapt.planner import APPLICATION
 from aftbed.adapt.suitability import AMPLE, FaultModel, problems
-from aftbed.campaign.experiment import Result
+from aftbed.campaign.experiment import Experiment, Result
 from aftbed.campaign.ledger import Ledger
 from aftbed.campaign.statistics import Interval, proportion
 from aftbed.core.application import Characteristics
@@ -89,7 +89,7 @@ def assumed_wrongly(result: Result, declared: Callable[[str], Characteristics]) 
         crash=any(fault.action.stops_process for fault in faults),
         value=bool(flips),
     )
-    found = problems(experiment.ftm, asked, _characteristics(experiment.adaptations, declared), AMPLE)
+    found = problems(experiment.ftm, asked, _characteristics(experiment, declared), AMPLE)
     if not found and any(isinstance(fault.persistence, Permanent) for fault in flips):
         found = [f"{experiment.ftm} takes a value fault for transient: this one is in every execution"]
     if not found and any(fault.action.strikes_stored_state for fault in flips):
@@ -97,13 +97,12 @@ def assumed_wrongly(result: Result, declared: Callable[[str], Characteristics]) 
     return "; ".join(found)
 
 
-def _characteristics(
-    adaptations: tuple[str, ...], declared: Callable[[str], Characteristics]
-) -> Characteristics:
+def _characteristics(experiment: Experiment, declared: Callable[[str], Characteristics]) -> Characteristics:
     """Of the last version of the function."""
-    wishes = [read(text).wish for text in adaptations]
-    sources = [wish.source for wish in wishes if wish.verb == "update" and wish.name == APPLICATION]
-    return declared(sources[-1]) if sources else default_application().characteristics
+    wishes = [read(text).wish for text in experiment.adaptations]
+    updates = [wish.source for wish in wishes if wish.verb == "update" and wish.name == APPLICATION]
+    source = updates[-1] if updates else experiment.app
+    return declared(source) if source else default_application().characteristics
 
 
 def markdown(ledger: Ledger, trust: Trust = NOBODY) -> str:

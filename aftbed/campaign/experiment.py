@@ -62,12 +62,14 @@ class Experiment(msgspec.Struct, frozen=True):
     recipe: str = ""
     expected: tuple[str, ...] = ()
     budget_ms: float | None = None  # for a recovery
+    app: str = ""  # the protected function, the built-in one if left out
 
     def command(self) -> str:
         """The command that repeats it by hand, and shows it in full."""
         simulated, rate = self.runtime == "sim", f"{self.rate_hz:g}" if self.rate_hz else ""
         words = ["aftbed", "sim" if simulated else "run", "--ftm", self.ftm]
         words += ["--placement", self.placement, "--seed", str(self.seed)]
+        words += ["--app", shlex.quote(self.app)] if self.app else []
         if self.scenario:
             words += ["--scenario", self.scenario, *([] if simulated else ["--pace", "max"])]
         elif simulated:
@@ -206,10 +208,9 @@ def faults_of(experiment: Experiment, graph: Graph) -> tuple[Fault, ...]:
 
 def refuse_untrusted(experiment: Experiment, trust: Trust) -> None:
     """Raise ConfigError if the experiment, of a ledger, would execute code that is not trusted."""
-    for text in experiment.adaptations:
-        wish = read(text).wish
-        if wish.source:
-            vetted(wish.source, trust)
+    wishes = (read(text).wish for text in experiment.adaptations)
+    for source in filter(None, (experiment.app, *(wish.source for wish in wishes))):
+        vetted(source, trust)
 
 
 def setup_of(experiment: Experiment) -> Setup:
@@ -224,11 +225,12 @@ def setup_of(experiment: Experiment) -> Setup:
         faults,
         changes,
         scenario=experiment.scenario,
+        application=experiment.app,
     )
 
 
 def _asked(experiment: Experiment) -> tuple[tuple[Fault, ...], tuple[Scheduled, ...]]:
-    graph = build(experiment.ftm, experiment.placement)
+    graph = build(experiment.ftm, experiment.placement, application=experiment.app)
     recipe = experiment.recipe or RECIPES[0]
     return faults_of(experiment, graph), scheduled(experiment.adaptations, graph, recipe)
 
@@ -271,6 +273,7 @@ def _recorded(experiment: Experiment, standing: ExitStack) -> RunRecord:
         seed=experiment.seed,
         faults=faults,
         adaptations=changes,
+        application=experiment.app,
     )
     warm_up(BUS if experiment.scenario else LIGHT)
     launched = launch(options, listener)

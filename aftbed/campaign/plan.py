@@ -89,6 +89,7 @@ class CampaignPlan(msgspec.Struct, frozen=True):
             stratum.adaptation.recipe if stratum.adaptation.texts else "",
             stratum.expected,
             spec.recovery_budget_ms,
+            spec.system.app,
         )
 
 
@@ -180,7 +181,8 @@ def population(entry: FaultEntry) -> int:
 def _check(made: CampaignPlan, stratum: Stratum) -> None:
     """Every point of the matrix, before anything runs."""
     where = f"faults: {stratum.fault.name!r} under {stratum.ftm}"
-    graph, system = build(stratum.ftm, stratum.placement), made.spec.system
+    system = made.spec.system
+    graph = build(stratum.ftm, stratum.placement, application=system.app)
     try:
         for number in range(points(stratum.fault)):
             for fault in faults_of(made.experiment(0, number, stratum), graph):

@@ -37,6 +37,7 @@ from aftbed.core.graph import PLACEMENTS
 from aftbed.core.script import RECIPES
 from aftbed.core.yaml_file import read_yaml
 from aftbed.ftm.compose import EXPRESSIONS
+from aftbed.functions.source import located
 from aftbed.judge.outcome import OUTCOMES
 from aftbed.vehicle.scenarios.library import load_scenario
 
@@ -65,8 +66,12 @@ Share = Annotated[float, Meta(gt=0, lt=1)]
 
 
 class System(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What the mechanisms protect: `requests` of a load, or those of a car in `scenario`."""
+    """What the mechanisms protect: `app` ("": the brake), asked for `requests` of a load, or by a car.
 
+    `app` is looked up beside the campaign file.
+    """
+
+    app: str = ""
     requests: Annotated[int, Meta(ge=1, le=REQUESTS_MAX)] = 100
     rate_hz: Annotated[float, Meta(ge=0, le=RATE_HZ_MAX)] = 0.0  # 0: the next follows the reply
     scenario: str = ""
@@ -160,6 +165,9 @@ def read_spec(name: str) -> Spec:
             raise unknown("campaign", name, shipped())
     spec = read_yaml(path, Spec)
     try:
+        if spec.system.app:
+            system = msgspec.structs.replace(spec.system, app=located(spec.system.app, path.parent))
+            spec = msgspec.structs.replace(spec, system=system)
         check(spec)
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error

@@ -21,8 +21,9 @@ from aftbed.campaign.experiment import Result, carry_out, refuse_untrusted, smal
 from aftbed.campaign.plan import CampaignPlan
 from aftbed.campaign.plan import plan as plan_of
 from aftbed.campaign.spec import EXPERIMENTS_MAX, Spec, check, read_spec, shipped
-from aftbed.cli.options import Json, TrustedFolders, check_range, jobs_of, print_json, takes
+from aftbed.cli.options import App, Json, TrustedFolders, check_range, jobs_of, print_json, takes
 from aftbed.core.errors import ConfigError, shown, unknown
+from aftbed.functions.source import located
 from aftbed.interop.files import write_text_whole, write_whole
 from aftbed.judge.verdict import EXIT_INTERRUPTED
 from aftbed.report.export import write_csv, write_parquet
@@ -70,6 +71,7 @@ class CampaignArguments(msgspec.Struct, frozen=True, kw_only=True):
         int | None, typer.Option("--experiments", help="In each stratum; overrides that of the file.")
     ] = None
     runtime: Annotated[str | None, typer.Option(help="unix or sim; overrides that of the file.")] = None
+    app: App = None
     json: Json = False
 
 
@@ -87,6 +89,8 @@ def planned(given: CampaignArguments) -> CampaignPlan:
         if given.runtime not in RUNTIMES:
             raise unknown("runtime", given.runtime, RUNTIMES)
         spec = replace(spec, system=replace(spec.system, runtime=given.runtime))
+    if given.app is not None:
+        spec = replace(spec, system=replace(spec.system, app=located(given.app)))
     try:
         check(spec)
         return plan_of(spec)

@@ -1,16 +1,23 @@
 """`aftbed explore`: simulate every experiment of one kind, and count them exactly."""
 
+import shlex
 import time
 from contextlib import closing
 from typing import Annotated, Final
 
 import msgspec
 import typer
+from msgspec.structs import replace
 
-from aftbed.cli.options import Json, check_range, jobs_of, print_json, separated, takes
+from aftbed.cli.adapt import refuse_unsuitable
+from aftbed.cli.options import App, Json, check_range, jobs_of, print_json, separated, takes
+from aftbed.cli.request_options import RequestSource
 from aftbed.cli.sim import described, event_lines, picture
 from aftbed.cli.views import progress_bar, spaced
 from aftbed.core.errors import ConfigError
+from aftbed.ftm.compose import build
+from aftbed.functions.request_file import names_function
+from aftbed.functions.source import located
 from aftbed.judge.verdict import EXIT_CODES, EXIT_INTERRUPTED, Breach
 from aftbed.runtime.sim.world import Setup
 from aftbed.search.explore import (
@@ -19,7 +26,7 @@ from aftbed.search.explore import (
     Explored,
     OrderedRuns,
     Selection,
-    attempt,
+    attempt_own,
     experiments,
     explore_orders,
     selected,
@@ -29,6 +36,7 @@ from aftbed.search.explore import explore as explore_all
 REQUESTS: Final = 3
 ORDER_REQUESTS: Final = 2
 REQUESTS_MAX: Final = 1000
+FUNCTION_REQUESTS: Final = 40  # of MODULE:FUNCTION
 BOUND: Final = 2_000
 BOUND_MAX: Final = 10_000_000
 LISTED_MAX: Final = 20  # broken experiments that are printed; --json has all of them
@@ -54,12 +62,14 @@ class NumberedArguments(ExploreArguments, frozen=True, kw_only=True):
     """The options of `aftbed explore adapt` and `pairs`."""
 
     only: Annotated[int | None, typer.Option(help="One experiment of this selection, by its number.")] = None
-
-
-class ExploreCrashArguments(NumberedArguments, frozen=True, kw_only=True):
-    """The options of `aftbed explore crash`."""
-
-    requests: Annotated[int, typer.Option(help="Requests of each run.")] = REQUESTS
+    app: App = None
+    requests: Annotated[
+        str | None,
+        typer.Option(help="crash: how many a run has (3). Or what is sent: FILE, or MODULE:FUNCTION."),
+    ] = None
+    force: Annotated[
+        bool, typer.Option("--force", help="Explore --app even where a mechanism does not suit it.")
+    ] = False
 
 
 class ExploreOrderArguments(ExploreArguments, frozen=True, kw_only=True):
@@ -75,14 +85,13 @@ class ExploreOrderArguments(ExploreArguments, frozen=True, kw_only=True):
 
 
 @explore.command()
-@takes(ExploreCrashArguments)
-def crash(given: ExploreCrashArguments) -> int:
+@takes(NumberedArguments)
+def crash(given: NumberedArguments) -> int:
     """A crash before each effect of each brick, and after its last.
 
     Exit code of all explorers: 0 all survived, 1 a promise was broken, 2 usage, 130 interrupted.
     """
-    check_range("--requests", given.requests, 1, REQUESTS_MAX)
-    return _explore("crash", given, given.requests)
+    return _explore("crash", given)
 
 
 @explore.command()
@@ -99,9 +108,30 @@ def pairs(given: NumberedArguments) -> int:
     return _explore("pairs", given)
 
 
-def _explore(explorer: str, given: NumberedArguments, requests: int = 0) -> int:
+def _selection(explorer: str, given: NumberedArguments) -> Selection:
+    """What of all there is was asked for. Raises ConfigError."""
+    text, sent, counted = given.requests, None, explorer == "crash"
+    count = REQUESTS if counted else 0
+    if text is not None and text.removeprefix("-").isdecimal():
+        if not counted:
+            raise ConfigError(f"--requests {text}: how many a run has is the explorer's; FILE is allowed")
+        count = int(text)
+    elif text is not None:
+        whole = None if not names_function(text) else max(count, FUNCTION_REQUESTS)
+        source = RequestSource(text, count=whole, count_max=REQUESTS_MAX, expect=None, tolerance=None)
+        sent, count = source.of(0), source.count if counted else 0
+    if counted:
+        check_range("--requests", count, 1, REQUESTS_MAX)
+    chosen = selected(explorer, separated(given.ftm), separated(given.placement), count)
+    application = located(given.app) if given.app is not None else ""
+    for ftm in chosen.ftms if application else ():
+        refuse_unsuitable(build(ftm, PLACEMENTS[0], application=application), force=given.force)
+    return replace(chosen, application=application, given=sent)
+
+
+def _explore(explorer: str, given: NumberedArguments) -> int:
     jobs, began_s = jobs_of(given.jobs), time.monotonic()
-    selection = selected(explorer, separated(given.ftm), separated(given.placement), requests)
+    selection = _selection(explorer, given)
     setups = list(selection.setups())
     if given.only is not None:
         return _explore_one(selection, setups, given.only, as_json=given.json)
@@ -135,7 +165,7 @@ def _explore_one(selection: Selection, setups: list[Setup], number: int, *, as_j
     if not 0 <= number < len(setups):
         raise ConfigError(f"--only {number}: this selection has the experiments 0 to {len(setups) - 1}")
     setup, began_s = setups[number], time.monotonic()
-    run, breaches = attempt(setup)
+    run, breaches = attempt_own(setup)
     lost = run is not None and run.rest.lost
     found = tuple(_broken(selection, number, setup, breaches) for _ in breaches[:1])
     result = Explored(1, 1 - len(found), int(lost and not found), _since(began_s), found)
@@ -150,7 +180,11 @@ def _explore_one(selection: Selection, setups: list[Setup], number: int, *, as_j
 
 def _command(selection: Selection, only: int) -> str:
     """The command that runs one experiment of `selection` again."""
-    requests = f" --requests {selection.requests}" if selection.requests else ""
+    if selection.given is not None:
+        requests = f" --requests {shlex.quote(selection.given.source)}"
+    else:
+        requests = f" --requests {selection.requests}" if selection.requests else ""
+    requests += f" --app {shlex.quote(selection.application)}" if selection.application else ""
     ftms, placements = ",".join(selection.ftms), ",".join(selection.placements)
     where = "" if selection.placements == PLACEMENTS else f" --placement {placements}"
     return f"aftbed explore {selection.explorer} --ftm {ftms}{where}{requests} --only {only}"

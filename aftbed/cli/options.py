@@ -23,6 +23,18 @@ App = Annotated[
     str | None,
     typer.Option(help="The protected function: a class, .so, .fmu, or a program; the brake if left out."),
 ]
+Requests = Annotated[
+    str | None,
+    typer.Option(
+        help="Requests instead of a car: FILE (CSV, JSON lines) or MODULE:FUNCTION, FILE.py:FUNCTION."
+    ),
+]
+Expect = Annotated[
+    str | None, typer.Option(help="With --requests: a file of the reply that each of them must get.")
+]
+Tolerance = Annotated[
+    float | None, typer.Option(help="With --expect FILE.csv: by how much numbers of f32 and f64 may differ.")
+]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else.")]
 Ftm = Annotated[str, typer.Option(help="none, pbr, lfr, tr, pbr+tr, ...: aftbed ftm list.")]
 Seed = Annotated[int, typer.Option(help="Seed of all random numbers.")]

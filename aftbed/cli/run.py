@@ -17,7 +17,18 @@ from typing import TYPE_CHECKING, Annotated, Final
 import msgspec
 import typer
 
-from aftbed.cli.options import RATE_HZ_MAX, App, Ftm, Json, check_range, check_seed, takes
+from aftbed.cli.options import (
+    RATE_HZ_MAX,
+    App,
+    Expect,
+    Ftm,
+    Json,
+    Requests,
+    Tolerance,
+    check_range,
+    check_seed,
+    takes,
+)
 from aftbed.cli.views import RunView, open_view
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.graph import Graph
@@ -32,6 +43,7 @@ from aftbed.runtime.unix.launch import Launched, launch, options_for
 from aftbed.runtime.unix.options import CarRun, LoadRun, PolicyOptions, ReplayRun, Work
 
 if TYPE_CHECKING:
+    from aftbed.cli.request_options import RequestSource
     from aftbed.runtime.unix.closed_loop import ClosedLoop
 
 POLICIES: Final = ("hold", "release", "latch")
@@ -84,6 +96,17 @@ class RunArguments(msgspec.Struct, frozen=True):
     load: Annotated[
         str | None, typer.Option(help="COUNT[@RATE]: synthetic requests (per second) instead of a drive.")
     ] = None
+    requests: Requests = None
+    count: Annotated[
+        int | None,
+        typer.Option(help="With --requests: how many are sent; behind the last of a file, the first again."),
+    ] = None
+    rate: Annotated[
+        float | None,
+        typer.Option(help="With --requests: per second; 0 or left out, each follows the reply before it."),
+    ] = None
+    expect: Expect = None
+    tolerance: Tolerance = None
     bus_port: Annotated[int, typer.Option(help="TCP port of the bus on 127.0.0.1; 0 is any free one.")] = 0
     bus_open: Annotated[
         bool,
@@ -98,6 +121,11 @@ class RunArguments(msgspec.Struct, frozen=True):
     mcap: Annotated[Path | None, typer.Option(help="Write the run to this file, for Foxglove.")] = None
     trace: Annotated[Path | None, typer.Option(help="Write its nodes to this file, for Perfetto.")] = None
     json: Json = False
+
+
+DEFAULTS: Final = RunArguments()
+OTHER_SOURCES: Final = ("load", "replay", "dbc", "map_file", "scenario", "pace", "brake_policy")
+OF_THE_BUS: Final = ("bus_port", "bus_open")
 
 
 @takes(RunArguments)
@@ -121,8 +149,10 @@ def execute(given: RunArguments) -> int:
     if given.policy is not None:
         policy = PolicyOptions(given.policy, given.approve, given.may_fail)
     make_loop = _closed_loop(given)
-    work = _work(given)
     check_seed(given.seed)
+    source = _requests(given)
+    work = _work(given) if source is None else _sent(source, given)
+    requests = source.of(given.seed) if source is not None else None
     check_range("--bus-port", given.bus_port, 0, 65535)
     write_files = _files(given)
     options, listener = options_for(
@@ -139,7 +169,7 @@ def execute(given: RunArguments) -> int:
         bus_open=given.bus_open,
         application=application,
     )
-    launched = launch(options, listener)
+    launched = launch(options, listener, requests)
     try:
         closed = make_loop(launched) if make_loop is not None else None
         interrupted = _follow(launched, open_view(options, quiet=given.json), closed)
@@ -274,6 +304,41 @@ def _load(text: str) -> LoadRun:
             f" up to {RATE_HZ_MAX:.0f} a second (without a rate: each follows the reply before)"
         )
     return load
+
+
+def _requests(given: RunArguments) -> "RequestSource | None":
+    """Of `--requests`, or None without it."""
+    if given.requests is None:
+        _refuse(given, ("count", "rate", "expect", "tolerance"), "only with --requests: leave out")
+        return None
+    _refuse(
+        given, OTHER_SOURCES + OF_THE_BUS, "--requests: there is no car, no bus and no other load: leave out"
+    )
+    from aftbed.cli.request_options import RequestSource  # noqa: PLC0415 - only with --requests
+
+    return RequestSource(
+        given.requests,
+        count=given.count,
+        count_max=LOAD_MAX,
+        expect=given.expect,
+        tolerance=given.tolerance,
+    )
+
+
+def _refuse(given: RunArguments, names: tuple[str, ...], why: str) -> None:
+    """Raise ConfigError if one of these options has another value than by default."""
+    used = [name for name in names if getattr(given, name) != getattr(DEFAULTS, name)]
+    if used:
+        options = (f"--{name.removesuffix('_file').replace('_', '-')}" for name in used)
+        raise ConfigError(f"{why} {', '.join(options)}")
+
+
+def _sent(source: "RequestSource", given: RunArguments) -> LoadRun:
+    rate_hz = given.rate or 0.0
+    if not 0 <= rate_hz <= RATE_HZ_MAX:
+        raise ConfigError(f"--rate {rate_hz}: 0 to {RATE_HZ_MAX:.0f} a second are allowed")
+    expect = str(Path(given.expect).resolve()) if given.expect is not None else ""
+    return LoadRun(source.count, rate_hz, source.name, expect)
 
 
 # -- while it runs --------------------------------------------------------------------------------

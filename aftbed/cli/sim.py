@@ -24,13 +24,17 @@ from aftbed.cli.options import (
     RATE_HZ_MAX,
     SEED_MAX,
     App,
+    Expect,
     Json,
+    Requests,
+    Tolerance,
     check_file,
     check_seed,
     jobs_of,
     print_json,
     takes,
 )
+from aftbed.cli.request_options import RequestSource
 from aftbed.cli.views import progress_bar, show_verdict, spaced
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.graph import Graph
@@ -82,11 +86,16 @@ class SimArguments(msgspec.Struct, frozen=True):
     ftm: Annotated[str | None, typer.Option(help="none, pbr, lfr, tr, pbr+tr, ...; pbr if left out.")] = None
     app: App = None
     placement: Annotated[str | None, typer.Option(help="process (default), replica or single.")] = None
-    count: Annotated[int | None, typer.Option(help="Requests of a run; 100 if left out.")] = None
+    count: Annotated[
+        int | None, typer.Option(help="Requests of a run; if left out 100, or all of a file.")
+    ] = None
     rate: Annotated[
         float | None,
         typer.Option(help="Requests per second; if left out, each follows the reply before it."),
     ] = None
+    requests: Requests = None
+    expect: Expect = None
+    tolerance: Tolerance = None
     scenario: Annotated[
         str | None, typer.Option(help="A car makes the requests: a scenario, or a YAML file.")
     ] = None
@@ -197,8 +206,9 @@ def _setup_maker(given: SimArguments) -> MakeSetup:
     graph = build(given.ftm or DEFAULT.ftm, given.placement or DEFAULT.placement, application=application)
     faults = tuple(read_fault(text, graph) for text in given.faults)
     adaptations = _adaptations(given, graph)
+    source = _source(given)
     setup = replace(
-        _load(given),
+        _load(given if source is None else replace(given, count=source.count)),
         ftm=graph.ftm,
         placement=graph.placement,
         faults=faults,
@@ -212,7 +222,24 @@ def _setup_maker(given: SimArguments) -> MakeSetup:
             raise ConfigError(
                 f"--adapt: at request {adaptation.at_request}: there are {setup.count} requests (--count)"
             )
-    return lambda seed: replace(setup, seed=seed)
+    return lambda seed: replace(setup, seed=seed, given=source.of(seed) if source is not None else None)
+
+
+def _source(given: SimArguments) -> RequestSource | None:
+    """Of `--requests`, or None without it."""
+    if given.requests is None:
+        if given.expect is not None or given.tolerance is not None:
+            raise ConfigError("--expect and --tolerance are about --requests: give it too")
+        return None
+    if given.scenario is not None:
+        raise ConfigError("--scenario: the car makes the requests; leave out --requests")
+    return RequestSource(
+        given.requests,
+        count=given.count,
+        count_max=COUNT_MAX,
+        expect=given.expect,
+        tolerance=given.tolerance,
+    )
 
 
 def _load(given: SimArguments) -> Setup:
@@ -279,6 +306,7 @@ def described(setup: Setup) -> str:
         load = f"a car in {setup.scenario}"
     else:
         load = f"{setup.count} request{'s' if setup.count > 1 else ''}"
+        load += f" of {setup.given.source}" if setup.given is not None else ""
         load += f" at {_number(setup.rate_hz)}/s" if setup.rate_hz else ""
     parts = [f"{setup.ftm} ({setup.placement}), seed {setup.seed}, {load}"]
     parts += [setup.application] if setup.application else []
@@ -305,6 +333,7 @@ def repeating(setup: Setup, *, swarm: bool = False) -> str:
     if setup.dooms:
         return ""
     exact = replace(setup, count=DEFAULT.count, rate_hz=DEFAULT.rate_hz) if setup.scenario else setup
+    requests = setup.given
     given = SimArguments(
         seed=setup.seed,
         ftm=setup.ftm,
@@ -312,6 +341,9 @@ def repeating(setup: Setup, *, swarm: bool = False) -> str:
         placement=setup.placement if setup.placement != DEFAULT.placement else None,
         count=None if setup.scenario else setup.count,
         rate=None if setup.scenario else setup.rate_hz or None,
+        requests=requests.source if requests is not None else None,
+        expect=requests.expect or None if requests is not None else None,
+        tolerance=requests.tolerance if requests is not None else None,
         scenario=setup.scenario or None,
         faults=tuple(map(str, setup.faults)),
         adaptations=tuple(map(_adaptation_words, setup.adaptations)),
@@ -321,11 +353,19 @@ def repeating(setup: Setup, *, swarm: bool = False) -> str:
     for force in (False, True)[: 1 + bool(setup.adaptations)]:
         given = replace(given, force=force)
         try:
-            if _setup_maker(given)(setup.seed) == exact:
+            if _as_sent(_setup_maker(given)(setup.seed)) == _as_sent(exact):
                 return _command(given)
         except ConfigError:
             continue
     return ""
+
+
+def _as_sent(setup: Setup) -> Setup:
+    """Without the given requests that are never sent: a function is asked for no more."""
+    given = setup.given
+    if given is None:
+        return setup
+    return replace(setup, given=replace(given, requests=given.requests[: setup.count]))
 
 
 def _command(given: SimArguments) -> str:
@@ -337,6 +377,9 @@ def _command(given: SimArguments) -> str:
         ("--scenario", given.scenario),
         ("--count", None if given.count is None else str(given.count)),
         ("--rate", None if given.rate is None else _number(given.rate)),
+        ("--requests", given.requests),
+        ("--expect", given.expect),
+        ("--tolerance", None if given.tolerance is None else repr(given.tolerance)),
         *(("--faults", text) for text in given.faults),
         *(("--adapt", text) for text in given.adaptations),
         ("--recipe", given.recipe),

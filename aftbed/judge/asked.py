@@ -5,15 +5,16 @@ A run in which something that was asked for did not happen proves nothing about 
 the record that it did not happen. A new option that asks for something is a row of it.
 """
 
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Iterator
 from typing import Final, NamedTuple
 
 import msgspec
 
 from aftbed.adapt.engine import DONE
-from aftbed.core.journal import EntryKind
+from aftbed.core.journal import Entry, EntryKind
 from aftbed.core.messages import Scheduled
-from aftbed.judge.checks import REASONS_MAX, Check, Evidence
+from aftbed.judge.checks import REASONS_MAX, Check, Evidence, Finding
 from aftbed.judge.record import RunRecord
 from aftbed.runtime.adaptations import Outcome
 from aftbed.runtime.unix.closed_loop import SETTLED
@@ -110,6 +111,36 @@ def _requests(record: RunRecord) -> list[str] | None:
     return [f"{sent} requests were sent, {work.count} were asked for"] if sent != work.count else []
 
 
+def _no_reply(record: RunRecord) -> list[str] | None:
+    """The expected replies that never came."""
+    work = record.options.work
+    if not isinstance(work, LoadRun) or not work.expect:
+        return None
+    if record.expected is None:
+        return ["the expected replies are not in the record"]
+    expected = min(len(record.expected.replies), work.count)
+    answered = {entry.request_id for entry in _answers(record)}
+    left = [number for number in range(1, expected + 1) if number not in answered]
+    return [f"no reply to {len(left)} of {expected} requests, the first is request {left[0]}"] if left else []
+
+
+def _other_reply(record: RunRecord) -> list[str]:
+    """The first reply that is not the expected one."""
+    expected = record.expected
+    if expected is None:
+        return []
+    replies: dict[int, bytes] = {}
+    for entry in _answers(record):
+        replies.setdefault(entry.request_id, entry.payload)
+    numbers = sorted(number for number in replies if 1 <= number <= len(expected.replies))
+    found = (expected.difference(number, replies[number]) for number in numbers)
+    return list(itertools.islice(filter(None, found), 1))
+
+
+def _answers(record: RunRecord) -> Iterator[Entry]:
+    return (entry for entry in record.history.dialogue if entry.kind is EntryKind.ANSWERED)
+
+
 def _replay(record: RunRecord) -> list[str] | None:
     if not isinstance(record.options.work, ReplayRun) or not _ended_by_itself(record):
         return None
@@ -163,12 +194,14 @@ class Asked(NamedTuple):
     """Something that options ask for, and the check in whose name it is reported.
 
     `missing` finds in a record what of it did not happen: nothing if all of it did. None where nothing of the
-    kind was asked for, or where the run did not come to its end by itself.
+    kind was asked for, or where the run did not come to its end by itself. `wrong` finds what came about, and
+    not as it was asked for.
     """
 
     what: str
     check: str
     missing: Callable[[RunRecord], list[str] | None]
+    wrong: Callable[[RunRecord], list[str]] = lambda record: []
 
 
 ASKED_FOR: Final = (
@@ -178,6 +211,7 @@ ASKED_FOR: Final = (
     Asked("drive to its end", "complete", _drive),
     Asked("replay to its end", "complete", _replay),
     Asked("policy", "policy_followed", _policy),
+    Asked("expected replies", "expected_replies", _no_reply, _other_reply),
 )
 CHECKS: Final = tuple(dict.fromkeys(row.check for row in ASKED_FOR))
 
@@ -188,12 +222,18 @@ def not_happened(record: RunRecord) -> list[str]:
 
 
 def check_asked(name: str) -> Callable[[Evidence], Check | None]:
-    """The check that is called `name`: unknown, with the reasons, if something asked for did not happen."""
+    """The check that is called `name`: unknown, with the reasons, if something asked for did not happen; fail
+    if it happened otherwise.
+    """
     rows = [row for row in ASKED_FOR if row.check == name]
 
     def check(evidence: Evidence) -> Check | None:
         found = [missing for row in rows if (missing := row.missing(evidence.record)) is not None]
-        reasons = tuple(reason for missing in found for reason in missing)[:REASONS_MAX]
-        return Check("unknown" if reasons else "pass", reasons) if found else None
+        if not found:
+            return None
+        wrong = [reason for row in rows for reason in row.wrong(evidence.record)]
+        missing = [reason for missing in found for reason in missing]
+        finding: Finding = "fail" if wrong else "unknown" if missing else "pass"
+        return Check(finding, (*wrong, *missing)[:REASONS_MAX])
 
     return check

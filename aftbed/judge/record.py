@@ -18,13 +18,15 @@ from aftbed.adapt.engine import DONE
 from aftbed.core.errors import ConfigError, PeerError
 from aftbed.core.input_file import open_input, read_input
 from aftbed.core.journal import Entry, EntryKind, History, Stored
+from aftbed.functions.request_file import ExpectedReplies
 from aftbed.inject.model import FaultReport
 from aftbed.inject.receipts import ReceiptState
 from aftbed.runtime.adaptations import Outcome
 from aftbed.runtime.deployment import Hosted
 from aftbed.runtime.unix.closed_loop import PolicyReport, Proposed, read_policy_report, read_proposals
 from aftbed.runtime.unix.journal_files import entries_dropped, stored_entries, stored_records
-from aftbed.runtime.unix.options import CarRun, RunOptions
+from aftbed.runtime.unix.options import CarRun, LoadRun, RunOptions
+from aftbed.runtime.unix.request_store import stored_replies, stored_requests
 from aftbed.runtime.unix.run_directory import BUS_NAME, HISTORY_NAME
 from aftbed.vehicle.can.hub import LOG_BYTES_MAX, HubCounts
 from aftbed.vehicle.ecus import End
@@ -107,7 +109,8 @@ class RunRecord(msgspec.Struct, frozen=True):
     """What a run left behind: of real processes, read from its directory, or of the simulator.
 
     `end` is None where the supervisor did not live to write it. `failures`: asserts that failed in nodes, as
-    far as they are known. `excuses` is None of a real run, of which nothing is excused.
+    far as they are known. `excuses` is None of a real run, of which nothing is excused. `given`, `expected`:
+    the requests and the replies that the user gave, None if there are none, or they are missing.
     """
 
     options: RunOptions
@@ -125,6 +128,8 @@ class RunRecord(msgspec.Struct, frozen=True):
     kept: bool = False  # after the run, so it was sealed at its end
     frames: int = 0  # in the log of the bus
     function_failures: tuple[str, ...] = ()  # of a simulated run: nodes that stopped for their function
+    given: tuple[bytes, ...] | None = None
+    expected: ExpectedReplies | None = None
 
     @property
     def simulated(self) -> bool:
@@ -171,6 +176,7 @@ def read_record(path: Path, *, in_memory: bool = False) -> RunRecord:
         if end is not None
         else tuple(FaultReport(str(fault), ReceiptState.UNKNOWN) for fault in options.faults)
     )
+    work = options.work
     return RunRecord(
         options,
         history,
@@ -184,6 +190,8 @@ def read_record(path: Path, *, in_memory: bool = False) -> RunRecord:
         started,
         kept=about.get("kept") is True,
         frames=_frames(path / BUS_NAME),
+        given=stored_requests(path) if isinstance(work, LoadRun) and work.requests else None,
+        expected=stored_replies(path) if isinstance(work, LoadRun) and work.expect else None,
     )
 
 

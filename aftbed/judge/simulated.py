@@ -29,7 +29,10 @@ SINGLE: Final = "single"  # the node of that placement hosts both replicas
 def record_of(run: Run) -> RunRecord:
     """The record of a simulated run."""
     setup, rest = run.setup, run.rest
-    work: Work = CarRun(setup.scenario, None, "") if setup.scenario else LoadRun(setup.count, setup.rate_hz)
+    given = setup.given
+    named = (given.source, given.expect) if given is not None else ()
+    load = LoadRun(setup.count, setup.rate_hz, *named)
+    work: Work = CarRun(setup.scenario, None, "") if setup.scenario else load
     asked = (setup.faults, setup.adaptations)
     options = RunOptions(
         "", "", "", setup.ftm, setup.placement, setup.seed, work, *asked, application=setup.application
@@ -60,6 +63,8 @@ def record_of(run: Run) -> RunRecord:
             if event == FUNCTION
         ),
         excuses=Excuses(service_struck_down(run), values, tuple(name for _, name in run.struck)),
+        given=given.requests if given is not None else None,
+        expected=given.expected if given is not None else None,
     )
 
 

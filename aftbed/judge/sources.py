@@ -9,12 +9,12 @@ What a request must have left, if it was answered:
     dialogue     sent, then answered, in the order of time, under the epoch of the reply that was accepted
     proxy        the reply accepted under that epoch, in between
     a server     executed, in between
-    dialogue     the bytes that the seed draws, of a load
+    dialogue     of a load, the bytes that the seed draws, or those that the user gave (`requests.msgpack`)
 """
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
@@ -34,6 +34,7 @@ from aftbed.runtime.node import FUNCTION_FAILED
 from aftbed.runtime.unix import seal
 from aftbed.runtime.unix.devices import LOAD_REQUESTS
 from aftbed.runtime.unix.options import LoadRun
+from aftbed.runtime.unix.request_store import EXPECTED_NAME, REQUESTS_NAME
 from aftbed.runtime.unix.run_directory import BUS_NAME
 from aftbed.vehicle.aeb.function import sample_requests
 
@@ -99,6 +100,7 @@ def gaps(record: RunRecord, reference: ReferenceRun) -> Iterator[str]:
     yield from (f"end.json has no {key!r}" for key in record.end.absent)
     if not _flipped(record) and not _undone(record):  # either may well fail an assertion
         yield from _tracebacks(record.path / PROCESSES_LOG)
+    yield from _given_missing(record)
     for node in ("supervisor", *build(record.options.ftm, record.options.placement).nodes):
         name = f"{node.replace('/', '.')}.1"
         if name not in record.history.journals:
@@ -114,6 +116,16 @@ def gaps(record: RunRecord, reference: ReferenceRun) -> Iterator[str]:
         if reference.state and _all_answered(record, reference):  # a function may hand out none
             missing = [replica for replica in replicas if replica not in record.end.states]
             yield from (f"the state of {replica} at the end is missing" for replica in missing)
+
+
+def _given_missing(record: RunRecord) -> Iterator[str]:
+    """What the user gave the run, and its record has no longer."""
+    work = record.options.work
+    if isinstance(work, LoadRun):
+        if work.requests and record.given is None:
+            yield f"{REQUESTS_NAME} is missing"
+        if work.expect and record.expected is None:
+            yield f"{EXPECTED_NAME} is missing"
 
 
 def effects_missing(record: RunRecord, end: RunEnd) -> Iterator[str]:
@@ -199,11 +211,10 @@ def _of_requests(record: RunRecord) -> Iterator[str]:
 
     What one source has and another lacks proves nothing where records found no room: `whole_history` says so.
     """
-    work, seed = record.options.work, record.options.seed
-    drawn = _drawn(seed) if isinstance(work, LoadRun) and not _flipped(record) else None
+    listed = _listed_requests(record)
     sent_ns: dict[int, int] = {}
     spans: dict[int, _Span] = {}  # of the first answer: a second one breaks G2
-    backwards, last_ns, not_drawn = 0, 0, []
+    backwards, last_ns, not_listed = 0, 0, []
     for entry in record.history.dialogue:
         number = entry.request_id
         backwards += entry.t_ns < last_ns
@@ -216,11 +227,12 @@ def _of_requests(record: RunRecord) -> Iterator[str]:
                 spans[number] = _Span(before_ns, entry.t_ns, entry.epoch)
         elif number not in sent_ns:
             sent_ns[number] = entry.t_ns
-            if drawn is not None and entry.payload != drawn[(number - 1) % LOAD_REQUESTS]:
-                not_drawn.append(number)
+            if listed and entry.payload != listed[(number - 1) % len(listed)]:
+                not_listed.append(number)
     if backwards:
         yield f"{backwards} entries of the dialogue are earlier than the ones before them"
-    yield from (f"request {number}: not what seed {seed} draws" for number in not_drawn)
+    origin = f"what seed {record.options.seed} draws" if record.given is None else f"that of {REQUESTS_NAME}"
+    yield from (f"request {number}: not {origin}" for number in not_listed)
     if record.history.dropped:
         return
     effects = (one for name in record.history.journals for one in record.history.events_of(name, *EFFECTS))
@@ -233,6 +245,14 @@ def _of_requests(record: RunRecord) -> Iterator[str]:
         yield f"request {number}: answered under epoch {spans[number].epoch}, which the proxy did not accept"
     for number in _without(Event.SERVER_EXIT, spans, record.history, lambda r, s: True):
         yield f"request {number}: answered, and no server executed it meanwhile"
+
+
+def _listed_requests(record: RunRecord) -> Sequence[bytes]:
+    """Those that a load sends again and again; none where they are not known, or a fault altered them."""
+    work = record.options.work
+    if not isinstance(work, LoadRun) or _flipped(record):
+        return ()
+    return record.given or () if work.requests else _drawn(record.options.seed)
 
 
 class _Span(NamedTuple):

@@ -18,7 +18,7 @@ from aftbed.judge.isolated import reference_of
 from aftbed.judge.record import RunRecord
 from aftbed.judge.sources import function_failures
 from aftbed.runtime.unix.closed_loop import PolicyReport, Proposed
-from aftbed.runtime.unix.options import CarRun, ReplayRun
+from aftbed.runtime.unix.options import CarRun, LoadRun, ReplayRun
 from aftbed.runtime.unix.trust import NOBODY, Trust
 from aftbed.vehicle.can.hub import Stranger
 from aftbed.vehicle.plant import VehicleResult
@@ -114,8 +114,8 @@ def judge(record: RunRecord, evidence: Evidence | None = None) -> Verdict:
             scenario = car.scenario
         case ReplayRun() as log:
             scenario, replay = f"replay {log.log}", record.end.result if record.end is not None else None
-        case _:
-            scenario = "load"
+        case LoadRun() as load:
+            scenario = f"requests {load.requests}" if load.requests else "load"
     followed = options.policy is not None
     began_ns = min((e.t_ns for e in history.dialogue), default=None)
     return Verdict(

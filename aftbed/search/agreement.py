@@ -16,6 +16,8 @@ import msgspec
 
 from aftbed.core.errors import ConfigError
 from aftbed.core.messages import Scheduled
+from aftbed.functions.load import OWN_CODE
+from aftbed.functions.request_file import GivenRequests
 from aftbed.judge import checks
 from aftbed.judge.checks import Evidence
 from aftbed.judge.outcome import outcome_of
@@ -24,7 +26,7 @@ from aftbed.judge.simulated import evidence_of_run
 from aftbed.judge.verdict import evidence_of
 from aftbed.runtime.sim.world import Setup, simulate
 from aftbed.runtime.unix.options import CarRun, LoadRun
-from aftbed.runtime.unix.trust import NOBODY, Trust
+from aftbed.runtime.unix.trust import NOBODY, Trust, vetted
 
 SEEDS: Final = 20
 
@@ -50,10 +52,15 @@ class Agreement(msgspec.Struct, frozen=True):
 
 
 def against(paths: Iterable[Path], seeds: int = SEEDS, trust: Trust = NOBODY) -> list[Agreement]:
-    """Compare the records in `paths`. Raises ConfigError where one is none, or cannot be simulated."""
+    """Compare the records in `paths`.
+
+    Raises ConfigError where one is none, cannot be simulated, or names a function that is not trusted.
+    """
     groups: dict[Setup, list[RunRecord]] = {}
     for path in paths:
         record = read_record(path)
+        if record.options.application:
+            vetted(record.options.application, trust)
         groups.setdefault(setup_of(record), []).append(record)
     return [_compare(setup, records, seeds, trust) for setup, records in groups.items()]
 
@@ -64,20 +71,33 @@ def setup_of(record: RunRecord) -> Setup:
     adaptations = tuple(Scheduled(a.goal, a.at_request, a.after_ms) for a in options.adaptations)
     if any(a.goal.part or a.goal.script for a in adaptations):
         raise ConfigError(f"{record.path}: an update or a hand-written script is not simulated")
-    same = Setup(options.ftm, options.placement, faults=options.faults, adaptations=adaptations)
+    same = Setup(
+        options.ftm,
+        options.placement,
+        faults=options.faults,
+        adaptations=adaptations,
+        application=options.application,
+    )
     match options.work:
-        case LoadRun(count, rate_hz):
-            return msgspec.structs.replace(same, count=count, rate_hz=rate_hz)
+        case LoadRun(count, rate_hz) as load:
+            given = _given(record, load.requests) if load.requests else None
+            return msgspec.structs.replace(same, count=count, rate_hz=rate_hz, given=given)
         case CarRun() as car:
             return msgspec.structs.replace(same, scenario=car.scenario)
         case _:
             raise ConfigError(f"{record.path}: a replay is not simulated")
 
 
+def _given(record: RunRecord, source: str) -> GivenRequests:
+    if record.given is None:
+        raise ConfigError(f"{record.path}: its requests are missing, so it is not simulated")
+    return GivenRequests(source, record.given)
+
+
 def _compare(setup: Setup, records: list[RunRecord], seeds: int, trust: Trust) -> Agreement:
-    runs = (simulate(msgspec.structs.replace(setup, seed=seed)) for seed in range(seeds))
+    runs = (simulate(msgspec.structs.replace(setup, seed=seed), OWN_CODE) for seed in range(seeds))
     real_classes, real_times = _summed(evidence_of(record, trust=trust) for record in records)
-    sim_classes, sim_times = _summed(evidence_of_run(run) for run in runs)
+    sim_classes, sim_times = _summed(evidence_of_run(run, OWN_CODE) for run in runs)
     found = [
         f"no seed ends {word}, as {n} real runs do"
         for word, n in real_classes.items()

@@ -27,6 +27,7 @@ from aftbed.core.script import Stage, flat
 from aftbed.ftm.compose import DUPLEX_EXPRESSIONS, build, parse, tolerates
 from aftbed.ftm.registry import MECHANISMS, server_emits
 from aftbed.functions.load import NO_CODE, OWN_CODE, Code
+from aftbed.functions.request_file import GivenRequests
 from aftbed.inject.crash import Crash
 from aftbed.inject.grammar import Bit, Trigger
 from aftbed.inject.hang import Hang
@@ -95,11 +96,11 @@ def strikes(old: str, new: str, placement: str) -> Iterator[Strike]:
 # -- what there is to explore ---------------------------------------------------------------------
 
 
-def crashes(ftms: Iterable[str], placements: Iterable[str], requests: int) -> Iterator[Setup]:
-    """A death at each effect of each brick."""
+def crashes(base: Setup, ftms: Iterable[str], placements: Iterable[str]) -> Iterator[Setup]:
+    """A death at each effect of each brick; `base` has the function and its requests."""
     for ftm, placement in itertools.product(ftms, placements):
-        clean = Setup(ftm, placement, count=requests)
-        for brick, count in sorted(simulate(clean).effects.items()):
+        clean = msgspec.structs.replace(base, ftm=ftm, placement=placement)
+        for brick, count in sorted(simulate(clean, OWN_CODE).effects.items()):
             for effect in range(count + 1):
                 yield msgspec.structs.replace(clean, dooms=(Doom(brick, effect),))
 
@@ -170,21 +171,32 @@ class Explorer(NamedTuple):
 
 
 class Selection(msgspec.Struct, frozen=True):
-    """What of all there is is explored; `requests` for `crash` only. An experiment has its number in it."""
+    """What of all there is is explored; `requests` for `crash` only. An experiment has its number in it.
+
+    `application`, `given`: a function of the user, and the requests that it is sent.
+    """
 
     explorer: str
     ftms: tuple[str, ...]
     placements: tuple[str, ...] = PLACEMENTS
     requests: int = 0
+    application: str = ""
+    given: GivenRequests | None = None
 
     def setups(self) -> Iterator[Setup]:
         """Every experiment."""
-        return EXPLORERS[self.explorer].every(self)
+        for setup in EXPLORERS[self.explorer].every(self):
+            yield msgspec.structs.replace(setup, application=self.application, given=self.given)
+
+    @property
+    def base(self) -> Setup:
+        """What all experiments have in common."""
+        return Setup(count=self.requests, application=self.application, given=self.given)
 
 
 EXPLORERS: Final = {
     "crash": Explorer(
-        DUPLEX_EXPRESSIONS, DUPLEX_EXPRESSIONS, lambda s: crashes(s.ftms, s.placements, s.requests)
+        DUPLEX_EXPRESSIONS, DUPLEX_EXPRESSIONS, lambda s: crashes(s.base, s.ftms, s.placements)
     ),
     "adapt": Explorer(
         ADAPTABLE, ADAPTED, lambda s: adaptations(itertools.permutations(s.ftms, 2), s.placements)
@@ -277,7 +289,7 @@ def tried(setup: Setup, attempt: Attempt = attempt) -> Found:
 
 def judged(setup: Setup) -> tuple[bool, tuple[Breach, ...]]:
     """Whether the service was lost, and what was broken."""
-    run, broken = attempt(setup)
+    run, broken = attempt_own(setup)
     return run is not None and run.rest.lost, broken
 
 

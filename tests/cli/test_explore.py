@@ -5,6 +5,7 @@ import re
 import shlex
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Final
 
 import pytest
@@ -42,6 +43,34 @@ def test_the_count_is_exact(explore: Call) -> None:
     number = len(list(selected("crash", ["lfr"], ["replica"], 1).setups()))
     assert (code, err) == (0, "")
     assert re.fullmatch(rf"{number} of {number} survived \(0 unavailable\) in [0-9.]+ s\n", out)
+
+
+FUNCTION: Final = """
+from aftbed.core.application import Characteristics
+class Adder:
+    characteristics = Characteristics()
+    def __init__(self): self.sum = 0
+    def execute(self, request):
+        self.sum += request[0]
+        return b"%d" % self.sum
+    def capture(self): return b"%d" % self.sum
+    def restore(self, state): RESTORED
+"""
+
+
+def test_a_function_of_the_user_with_its_requests(explore: Call, tmp_path: Path) -> None:
+    (tmp_path / "requests.csv").write_text("step:u8\n3\n4\n")
+    (tmp_path / "good.py").write_text(FUNCTION.replace("RESTORED", "self.sum = int(state)"))
+    (tmp_path / "bad.py").write_text(FUNCTION.replace("RESTORED", "pass"))
+    words = ("crash", "--ftm", "pbr", "--placement", "replica", "--requests", tmp_path / "requests.csv")
+    code, out, _ = explore(*words, "--app", tmp_path / "good.py:Adder")
+    assert code == 0 and re.match(r"\d\d of \d\d survived", out)
+    code, out, _ = explore(*words, "--app", tmp_path / "bad.py:Adder", "--jobs", "1")
+    assert code == 1 and "one_history (G3): request 2: the reply is not the bare server's" in out
+    again = re.search(r"repeat +aftbed explore (.*)", out)
+    assert again is not None and f"--app {tmp_path}/bad.py:Adder" in again[1]
+    code, repeated, _ = explore(*shlex.split(again[1]))
+    assert code == 1 and "request 2: the reply is not the bare server's" in repeated
 
 
 def test_one_process_and_two_count_the_same(explore: Call) -> None:

@@ -342,6 +342,19 @@ def test_a_campaign_is_read_without_its_code(
     stranger.read_by("campaign", "assumptions", folder, code=2 if " app " in update else 0)
 
 
+@pytest.mark.parametrize("runtime", ["sim", "unix"])
+@pytest.mark.parametrize("app", ["evil:Evil", "evil.py:Evil", "sh evil.sh", "evil.so"])
+def test_a_campaign_whose_function_is_a_strangers_is_read_without_it(
+    stranger: Stranger, ran: Path, app: str, runtime: str
+) -> None:
+    folder = ledger(stranger, ran, app=app, runtime=runtime)
+    shown = stranger.read_by("campaign", "replay", folder, "0", code=2)
+    assert "is not trusted" in shown or "cannot be read: " in shown, shown
+    stranger.read_by("campaign", "shrink", folder, "0", code=2)
+    shutil.move(folder, stranger.out / "campaign")
+    stranger.read_by("campaign", "report", stranger.out / "campaign", code=1)
+
+
 def test_the_reports_of_a_campaign_replace_links(stranger: Stranger, ran: Path) -> None:
     folder = ledger(stranger, ran, adaptations=[UPDATES[0]], stratum=f"{SCRIPT}{ESCAPE}../../mine")
     shutil.move(folder, stranger.out / "campaign")

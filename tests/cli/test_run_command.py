@@ -80,7 +80,7 @@ def test_the_adaptations_of_a_run_are_among_its_options(home: Home, monkeypatch:
     class StartedError(Exception):
         pass
 
-    def launch(options: RunOptions, listener: object) -> None:
+    def launch(options: RunOptions, listener: object, requests: object) -> None:
         started.append(options)
         run_directory.remove(Path(options.private))
         raise StartedError

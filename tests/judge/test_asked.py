@@ -1,6 +1,6 @@
 """What was asked for and did not happen is never a pass: each row of the judge's table, and what it tells."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Final
@@ -10,12 +10,14 @@ import pytest
 from msgspec.structs import replace
 from records import CAR, CRASH, STOPPED, RecordInTheMaking, outcomes, whole
 
+from aftbed.core.errors import ConfigError
 from aftbed.core.messages import Goal, Scheduled
 from aftbed.ftm.compose import build
+from aftbed.functions.request_file import ExpectedReplies
 from aftbed.inject.grammar import Trigger
 from aftbed.inject.model import Fault
 from aftbed.judge.asked import ASKED_FOR, Asked, AskedAdaptation
-from aftbed.judge.record import RunRecord
+from aftbed.judge.record import RunRecord, read_record
 from aftbed.judge.simulated import record_of
 from aftbed.judge.verdict import Verdict, judge
 from aftbed.runtime.sim.world import Setup, simulate
@@ -27,7 +29,9 @@ from aftbed.runtime.unix.closed_loop import (
     RuleReport,
 )
 from aftbed.runtime.unix.options import LoadRun, PolicyOptions, ReplayRun
+from aftbed.runtime.unix.request_store import EXPECTED_NAME, REQUESTS_NAME
 from aftbed.runtime.unix.run_directory import HISTORY_NAME
+from aftbed.vehicle.aeb.function import default_application, sample_requests
 
 DONE: Final = {
     "blackout_ms": 1.5,
@@ -76,6 +80,29 @@ def replayed(path: Path, **played: object) -> Verdict:
     assert record.end is not None
     record.end["result"] = {"played": played}
     return record.verdict()
+
+
+def expecting(path: Path, replies: Sequence[bytes], answers: int = 1, count: int = 0) -> Verdict:
+    """A run of three requests whose user expected `replies`; `answers` to the last."""
+    record = RecordInTheMaking(path, LoadRun(3, 0.0, "mine.csv", "expected.csv"))
+    for given in (1, 1, answers):
+        record.request(answers=given)
+    record.asked = count
+    (path / REQUESTS_NAME).write_bytes(msgspec.msgpack.encode(sample_requests(7, 3)))
+    (path / EXPECTED_NAME).write_bytes(msgspec.msgpack.encode(ExpectedReplies(tuple(replies))))
+    return record.verdict()
+
+
+def replies(count: int = 3) -> list[bytes]:
+    """The right ones."""
+    bare = default_application()
+    return [bare.execute(request) for request in sample_requests(7, count)]
+
+
+def not_in_the_record(path: Path) -> Verdict:
+    expecting(path, replies())
+    (path / EXPECTED_NAME).unlink()
+    return judge(read_record(path))
 
 
 def followed(
@@ -150,6 +177,17 @@ NOT_HAPPENED: Final[
         (lambda path: replayed(path, complete=False), "the log was not replayed to its end"),
         (replayed, "the log was not replayed to its end"),
     ],
+    "expected replies": [
+        (
+            lambda path: expecting(path, replies(), answers=0),
+            "no reply to 1 of 3 requests, the first is request 3",
+        ),
+        (
+            lambda path: expecting(path, replies(5), count=5),
+            "no reply to 2 of 5 requests, the first is request 4",
+        ),
+        (not_in_the_record, "the expected replies are not in the record"),
+    ],
     "policy": [
         (lambda path: followed(path, None).verdict(), "the closed loop did not live to report"),
         (
@@ -178,7 +216,8 @@ def test_what_did_not_happen_is_no_pass(path: Path, row: Asked) -> None:
     """Each row has its cases above: a new one without them fails."""
     for number, (run, reason) in enumerate(NOT_HAPPENED[row.what]):
         verdict = run(path / str(number))
-        assert (verdict.verdict, verdict.checks[row.check]) == ("inconclusive", "unknown")
+        lost = ("fail",) if verdict.requests.lost else ()  # a promise is broken, too
+        assert verdict.verdict in ("inconclusive", *lost) and verdict.checks[row.check] == "unknown"
         assert f"{row.check}: {reason}" in verdict.reasons
 
 
@@ -259,6 +298,86 @@ def test_a_policy_that_nobody_asked_for_fails(path: Path) -> None:
     record = followed(path, PolicyReport((replace(RULE, proposed=0),)))
     record.options = replace(record.options, policy=None)
     assert record.verdict().reasons == ["sources_agree: a policy was followed, and none was asked for"]
+
+
+# -- requests and replies that the user gave
+
+
+def test_replies_that_are_as_expected_pass(path: Path) -> None:
+    verdict = expecting(path, replies())
+    assert (verdict.verdict, verdict.checks["expected_replies"]) == ("pass", "pass")
+    assert verdict.scenario == "requests mine.csv"
+
+
+def test_the_first_reply_that_is_not_as_expected_fails(path: Path) -> None:
+    one, two, three = replies()
+    verdict = expecting(path, [one, b"", three + b"x"])
+    assert (verdict.verdict, verdict.checks["expected_replies"]) == ("fail", "fail")
+    length = f"{len(two)} bytes"
+    assert verdict.reasons == [
+        f"expected_replies: request 2: found {length}, expected an empty reply (the request was refused)"
+    ]
+
+
+def test_a_wrong_reply_fails_even_where_another_is_missing(path: Path) -> None:
+    one, two, three = replies()
+    verdict = expecting(path, [one + b"x", two, three], answers=0)
+    assert verdict.checks["expected_replies"] == "fail"
+    assert [one for one in verdict.reasons if one.startswith("expected_replies")] == [
+        f"expected_replies: request 1: found {len(one)} bytes, expected {len(one) + 1} bytes",
+        "expected_replies: no reply to 1 of 3 requests, the first is request 3",
+    ]
+
+
+def test_without_expected_replies_there_is_no_such_check(path: Path) -> None:
+    assert "expected_replies" not in whole(path).verdict().checks
+
+
+@pytest.mark.parametrize(
+    ("stored", "finding", "reason"),
+    [
+        (sample_requests(7, 2), "fail", "request 3: not that of requests.msgpack"),
+        (sample_requests(8, 3), "fail", "request 1: not that of requests.msgpack"),
+        (None, "unknown", "requests.msgpack is missing"),
+    ],
+    ids=["fewer", "others", "none"],
+)
+def test_requests_that_are_not_those_given_do_not_pass(
+    path: Path, stored: list[bytes] | None, finding: str, reason: str
+) -> None:
+    expecting(path, replies())
+    (path / REQUESTS_NAME).unlink()
+    if stored is not None:
+        (path / REQUESTS_NAME).write_bytes(msgspec.msgpack.encode(stored))
+    verdict = judge(read_record(path))
+    assert verdict.checks["sources_agree"] == finding
+    assert f"sources_agree: {reason}" in verdict.reasons
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        (REQUESTS_NAME, b"\xc1", "requests.msgpack: "),
+        (REQUESTS_NAME, msgspec.msgpack.encode([1]), "requests.msgpack: Expected `bytes`"),
+        (REQUESTS_NAME, msgspec.msgpack.encode([]), "requests.msgpack: no request in it"),
+        (
+            EXPECTED_NAME,
+            msgspec.msgpack.encode(ExpectedReplies((), "x:u9")),
+            "expected.msgpack: column 1, x: unknown type 'u9'",
+        ),
+        (
+            EXPECTED_NAME,
+            msgspec.msgpack.encode(ExpectedReplies((), "x:u8", -1.0)),
+            "expected.msgpack: tolerance: found -1.0",
+        ),
+    ],
+)
+def test_files_of_requests_that_are_none_are_told(path: Path, name: str, content: bytes, words: str) -> None:
+    expecting(path, replies())
+    (path / name).write_bytes(content)
+    with pytest.raises(ConfigError) as found:
+        read_record(path)
+    assert words in str(found.value)
 
 
 # -- loads and adaptations

@@ -209,8 +209,9 @@ def test_the_run_of_this_command_executes_its_own_function_here(tmp_path: Path, 
 
 @starts_process
 def test_what_a_function_declares_is_asked_in_another_process(tmp_path: Path) -> None:
+    declared = "Characteristics(deterministic=False)"
     mine = Planted(
-        tmp_path, "from aftbed.core.application import Characteristics as C; characteristics = C(False, True)"
+        tmp_path, f"from aftbed.core.application import Characteristics; characteristics = {declared}"
     )
     with pytest.raises(trust.ConfigError, match="--trust"):
         declared_by(mine.source, NOBODY)

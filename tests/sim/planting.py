@@ -156,7 +156,8 @@ def both(*plants: Plant) -> Plant:
 
 def crashes(ftm: str, *bricks: str, placement: str = "process", requests: int = REQUESTS) -> Setups:
     """Of `explore crash`: the deaths in these bricks."""
-    return lambda: (s for s in explore.crashes([ftm], [placement], requests) if s.dooms[0].brick in bricks)
+    base = Setup(count=requests)
+    return lambda: (s for s in explore.crashes(base, [ftm], [placement]) if s.dooms[0].brick in bricks)
 
 
 def adapts(

@@ -22,6 +22,7 @@ from aftbed.core.messages import Goal, Reply, Scheduled
 from aftbed.ftm.client import Client
 from aftbed.ftm.compose import build, replication_of
 from aftbed.functions.load import NO_CODE, Code
+from aftbed.functions.request_file import GivenRequests
 from aftbed.inject.bus import BusFault
 from aftbed.inject.bus_disturber import Disturber
 from aftbed.inject.kind import FaultKind
@@ -69,8 +70,8 @@ class Doom(msgspec.Struct, frozen=True):
 class Setup(msgspec.Struct, frozen=True):
     """What a run is made of, so that it can be repeated: nothing else has a part in it.
 
-    `count` requests at `rate_hz` (0: the next follows the reply); or those of a car in `scenario`.
-    `application`: the protected function, "" for the built-in one.
+    `count` requests at `rate_hz` (0: the next follows the reply), which are `given` or drawn from a seed; or
+    those of a car in `scenario`. `application`: the protected function, "" for the built-in one.
     """
 
     ftm: str = "pbr"
@@ -83,6 +84,7 @@ class Setup(msgspec.Struct, frozen=True):
     dooms: tuple[Doom, ...] = ()
     scenario: str = ""
     application: str = ""
+    given: GivenRequests | None = None
 
 
 class Rest(msgspec.Struct, frozen=True):
@@ -270,7 +272,8 @@ class World:
         clock: Callable[[Random], Clock] = Clock,
     ) -> None:
         self.setup, self._channel = setup, channel
-        self._requests = requests if requests is not None else requests_of(0)
+        drawn = list(setup.given.requests) if setup.given is not None else requests_of(0)
+        self._requests = requests if requests is not None else drawn
         self.loop = clock(Random(setup.seed))
         self._drive = Drive(setup.scenario, setup.seed, self.loop) if setup.scenario else None
         for fault in setup.faults:

@@ -15,6 +15,7 @@ from aftbed.runtime.unix import linux
 from aftbed.runtime.unix.death_notice import LifelineWatcher
 from aftbed.runtime.unix.journal_files import DialogueFile, JournalHeader, dialogue_path, last_words
 from aftbed.runtime.unix.options import GATEWAY, LoadRun, ReplayRun, SourceOptions
+from aftbed.runtime.unix.request_store import stored_requests
 from aftbed.vehicle.aeb.function import sample_requests
 
 if TYPE_CHECKING:
@@ -118,6 +119,10 @@ def make_source(client: Client, options: SourceOptions) -> Device:
     dialogue = DialogueFile(dialogue_path(journals, options.incarnation), "client")
     if isinstance(work, LoadRun):
         requests = sample_requests(options.seed, LOAD_REQUESTS)
+        if work.requests:
+            given = stored_requests(journals.parent)
+            assert given, f"the requests are no longer in {journals.parent}"
+            requests = list(given)
         return Load(client, dialogue, requests, work.count, work.rate_hz)
     # Imported here: the bus costs 150 ms to import, and only the zygote of the bus has it.
     from aftbed.vehicle.can.dbc_file import load_dbc  # noqa: PLC0415

@@ -22,7 +22,7 @@ import time
 import weakref
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Final, NoReturn
+from typing import TYPE_CHECKING, Final, NoReturn
 
 import msgspec
 
@@ -38,7 +38,11 @@ from aftbed.runtime.unix.journal_files import CHUNK_BYTES, trim
 from aftbed.runtime.unix.linux import Area
 from aftbed.runtime.unix.options import LoadRun, PolicyOptions, RunOptions, Work, with_names_resolved
 from aftbed.runtime.unix.process_pool import PRELOADS, Started, killed_by, start_zygote
+from aftbed.runtime.unix.request_store import write_given
 from aftbed.runtime.unix.transport import Line, decode_order, decode_report
+
+if TYPE_CHECKING:
+    from aftbed.functions.request_file import GivenRequests
 
 END_SECONDS_MAX: Final = 8.0
 KILL_SECONDS_MAX: Final = 1.0
@@ -127,7 +131,9 @@ class Launched:
     `trouble`: why its supervisor could not go on, "" if it could.
     """
 
-    def __init__(self, options: RunOptions, listener: socket.socket | None) -> None:
+    def __init__(
+        self, options: RunOptions, listener: socket.socket | None, given: "GivenRequests | None" = None
+    ) -> None:
         self.options = options
         self.private, self.record = Path(options.private), Path(options.record)
         self._kept = self.record.parent != self.private  # after the run
@@ -145,7 +151,7 @@ class Launched:
             if self.supervisor:
                 os.waitpid(self.supervisor, 0)
             raise
-        self._make_directories()
+        self._make_directories(given)
 
     # -- start --------------------------------------------------------------------------------
 
@@ -229,8 +235,8 @@ class Launched:
         finally:
             os._exit(code)
 
-    def _make_directories(self) -> None:
-        """Make the private directory and the record, with `run.json` in it, and send *go*."""
+    def _make_directories(self, given: "GivenRequests | None") -> None:
+        """Make the private directory and the record, with what was asked for in it, and send *go*."""
         about = {"version": __version__, "started_ns": self.started_ns, **msgspec.to_builtins(self.options)}
         for key in ("listener", "private"):
             about.pop(key)
@@ -240,6 +246,8 @@ class Launched:
             run_directory.make(self.private)
             if self.record.parent == self.private:
                 run_directory.record_directory(self.record)
+            if given is not None:
+                write_given(self.record, given)
             (self.record / "run.json").write_bytes(msgspec.json.format(msgspec.json.encode(about)))
             self.line.sock.send(GO)
         except BaseException as error:
@@ -344,10 +352,15 @@ def _ends(pidfd: int, seconds: float) -> bool:
     return bool(poll.poll(seconds * 1e3))
 
 
-def launch(options: RunOptions, listener: socket.socket | None) -> Launched:
-    """Start a run; see `Launched`. Raises ConfigError, leaving nothing, where it cannot be started."""
+def launch(
+    options: RunOptions, listener: socket.socket | None, given: "GivenRequests | None" = None
+) -> Launched:
+    """Start a run, of the requests `given` where its work names some; see `Launched`.
+
+    Raises ConfigError, leaving nothing, where it cannot be started.
+    """
     try:
-        return Launched(options, listener)
+        return Launched(options, listener, given)
     except BaseException as error:
         record = Path(options.record)
         if record.parent != Path(options.private):

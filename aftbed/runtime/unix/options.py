@@ -17,10 +17,20 @@ PLAYER: Final = "player"
 
 
 class LoadRun(msgspec.Struct, frozen=True, tag=True):
-    """Requests without a car: for benches and for tests of the mechanism alone."""
+    """Requests without a car: drawn from the seed, for benches and tests, or given by the user.
+
+    `requests`, `expect`: what the user named, "" if nothing; the record has what was in them.
+    """
 
     count: int
     rate_hz: float  # 0: closed loop
+    requests: str = ""
+    expect: str = ""
+
+    @property
+    def option(self) -> str:
+        """By which it was asked for."""
+        return "--requests" if self.requests else "--load"
 
 
 class CarRun(msgspec.Struct, frozen=True, tag=True):
@@ -96,13 +106,13 @@ def with_names_resolved(fault: Fault, work: Work) -> Fault:
     Raises ConfigError, also where there is no bus, or no car for its condition.
     """
     if fault.trigger.when is not None and not isinstance(work, CarRun):
-        source = "--load" if isinstance(work, LoadRun) else "--replay"
+        source = work.option if isinstance(work, LoadRun) else "--replay"
         raise ConfigError(f"{fault}: 'when' looks at the car, and a run of {source} has none")
     action = fault.action
     if not isinstance(action, BusFault):
         return fault
     if isinstance(work, LoadRun):
-        raise ConfigError(f"{fault}: a run of --load has no bus")
+        raise ConfigError(f"{fault}: a run of {work.option} has no bus")
     # Imported here, by the command: the supervisor must not read a DBC, since a failover would wait for it.
     from aftbed.vehicle.can.dbc_file import load_dbc  # noqa: PLC0415
     from aftbed.vehicle.replay.map_file import find_map, load_mapped  # noqa: PLC0415

@@ -1,0 +1,153 @@
+"""Functions that are no Python, protected in real runs: they survive crashes, and their failures are told."""
+
+import os
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Final
+
+import psutil
+import pytest
+from liveruns import Command, aftbed, home, until
+from sampling import every
+
+from aftbed.functions.library import HEADER
+
+pytestmark = pytest.mark.process
+
+__all__ = ["home"]
+
+LIBRARY: Final = """
+#include <fcntl.h>
+#include <signal.h>
+#include <stdlib.h>
+#include <string.h>
+#include "aft.h"
+
+struct state { uint64_t sum, count; };
+
+int aft_init(void **instance) { *instance = calloc(1, sizeof(struct state)); return AFT_OK; }
+
+int aft_execute(void *instance, const uint8_t *request, size_t request_size, uint8_t *reply, size_t reply_max,
+                size_t *reply_size) {
+    struct state *state = instance;
+    const char *once = getenv("CRASH_ONCE");
+    for (size_t i = 0; i < request_size; i++) state->sum = state->sum * 31 + request[i];
+    if (++state->count == 40 && once && open(once, O_CREAT | O_EXCL, 0600) >= 0) raise(SIGSEGV);
+    memcpy(reply, &state->sum, *reply_size = sizeof state->sum);
+    return AFT_OK;
+}
+
+int64_t aft_state_size(void *instance) { return sizeof(struct state); }
+
+int aft_capture(void *instance, uint8_t *state, size_t size) { memcpy(state, instance, size); return AFT_OK; }
+
+int aft_restore(void *instance, const uint8_t *state, size_t size) {
+    if (size != sizeof(struct state)) return AFT_REFUSED;
+    memcpy(instance, state, size);
+    return AFT_OK;
+}
+"""
+PROGRAM: Final = """
+import json, sys, zlib
+value = 0
+for line in sys.stdin:
+    asked = json.loads(line)
+    answer = {"id": asked["id"]}
+    if "describe" in asked:
+        answer["describe"] = {"deterministic": True, "state_access": "exact"}
+    elif "execute" in asked:
+        value = zlib.crc32(bytes.fromhex(asked["execute"]), value)
+        answer["execute"] = (b"%08x" % value).hex()
+    elif "capture" in asked:
+        answer["capture"] = (b"%d" % value).hex()
+    else:
+        value, answer["restore"] = int(bytes.fromhex(asked["restore"])), None
+    print(json.dumps(answer), flush=True)
+"""
+FTMS: Final = ("pbr", "lfr", "pbr+tr")
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory: pytest.TempPathFactory) -> str:
+    compiler = next((one for one in ("cc", "gcc", "clang") if shutil.which(one)), None)
+    if compiler is None:
+        pytest.skip("there is no C compiler")
+    source = tmp_path_factory.mktemp("library") / "sum.c"
+    source.write_text(LIBRARY)
+    built = source.with_suffix(".so")
+    line = [compiler, "-shared", "-fPIC", "-I", HEADER.parent, "-o", built, source]
+    subprocess.run(line, check=True, timeout=60)
+    return str(built)
+
+
+@pytest.fixture(scope="module")
+def program(tmp_path_factory: pytest.TempPathFactory) -> str:
+    path = tmp_path_factory.mktemp("program") / "sum.py"
+    path.write_text(PROGRAM)
+    return shlex.join([sys.executable, "-I", "-S", str(path)])
+
+
+def programs(command: str) -> list[int]:
+    """The pids of those that run."""
+    words = shlex.split(command)
+    return [
+        one.pid
+        for one in psutil.process_iter(["cmdline"])
+        if one.info["cmdline"] == words and one.status() != psutil.STATUS_ZOMBIE
+    ]
+
+
+@pytest.mark.parametrize(
+    ("kind", "ftm", "event"),
+    every(
+        5,
+        [
+            (kind, ftm, event)
+            for kind in ("library", "program")
+            for ftm in FTMS
+            for event in ("server.enter", "server.exit", "reply.sent")
+        ],
+    ),
+)
+def test_a_crash_loses_nothing(kind: str, ftm: str, event: str, request: pytest.FixtureRequest) -> None:
+    app = request.getfixturevalue(kind)
+    done = aftbed(
+        "run", "--app", app, "--ftm", ftm, "--load", "120@400", "--inject", f"crash primary at {event} nth 50"
+    )
+    assert done.code == 0, done.out + done.err
+    assert "120 sent, 120 answered, 0 lost" in done.out and f"  function   {app}" in done.out
+    assert "failover   to epoch 2" in done.out and "  failed  " not in done.out
+
+
+def test_a_library_that_crashes_its_process_is_failed_over(
+    library: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CRASH_ONCE", str(tmp_path / "crashed"))
+    done = aftbed("run", "--app", library, "--load", "120@400")
+    assert done.code == 0, done.out + done.err
+    assert (tmp_path / "crashed").exists()
+    assert "120 sent, 120 answered, 0 lost" in done.out and "failover   to epoch 2" in done.out
+
+
+def test_a_program_that_is_killed_is_failed_over_and_told(program: str) -> None:
+    with Command("--app", program, "--load", "1200@400") as run:
+        run.wait_for_line("roles: a leads, b backs up")
+        until(lambda: len(programs(program)) == 2, "both replicas run their program")
+        os.kill(programs(program)[0], signal.SIGKILL)
+        done = run.done()
+    assert done.code == 0, done.out + done.err
+    assert "1200 sent, 1200 answered, 0 lost" in done.out
+    (failure,) = (line for line in done.out.splitlines() if line.startswith("  failed     "))
+    assert failure.endswith("sum.py: was killed by SIGKILL; nothing is on its stderr")
+    assert failure.split()[1] in ("a/server:", "b/server:")
+    assert programs(program) == []
+
+
+def test_a_function_that_cannot_begin_is_refused_before_the_start(tmp_path: Path) -> None:
+    (tmp_path / "silent.py").write_text("import sys\nsys.exit('not today')\n")
+    done = aftbed("run", "--app", f"{sys.executable} {tmp_path}/silent.py", "--load", "10")
+    assert done.code == 2 and "not today" in done.err and "exit code 1" in done.err, done.err
