@@ -24,7 +24,7 @@ from aftbed.core.application import (
     reply_fields_of,
     value_of,
 )
-from aftbed.core.errors import ConfigError, PeerError
+from aftbed.core.errors import ConfigError, FunctionFailedError, PeerError
 from aftbed.functions.load import Code, load_application
 from aftbed.runtime.unix.confined import note, serve
 from aftbed.runtime.unix.trust import VettedCode, VettedFiles
@@ -33,6 +33,7 @@ PAGE_BYTES: Final = 4096
 WHOLE_STATES_BYTES_MAX: Final = 64 << 20  # of states that are handed over; of any further ones, digests
 DIGEST_BYTES: Final = 16
 WORDS_MAX: Final = 300  # characters of what went wrong
+LINES_MAX: Final = 8000  # the same, with what a program wrote on stderr
 
 Note = Callable[[str], None]
 Make = Callable[[], Application]
@@ -376,7 +377,8 @@ def _resume(
     except PeerError as error:
         return msgspec.structs.replace(found, failed=f"refused: {error}"[:WORDS_MAX])
     except Exception as error:  # noqa: BLE001 - of a function of the user
-        return msgspec.structs.replace(found, failed=f"failed: {_words(error)}")
+        line, *_ = _words(error).split("\n")
+        return msgspec.structs.replace(found, failed=f"failed: {line}")
 
 
 def _reply(function: Application, request: bytes) -> bytes:
@@ -387,6 +389,8 @@ def _reply(function: Application, request: bytes) -> bytes:
 
 
 def _words(error: BaseException) -> str:
+    if isinstance(error, FunctionFailedError):
+        return str(error)[:LINES_MAX]
     return f"{type(error).__name__}: {error}"[:WORDS_MAX]
 
 
