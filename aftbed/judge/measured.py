@@ -218,8 +218,7 @@ def measure(
         raise _unmeasured(source, watched)
     elsewhere: Answer = ResumedElsewhere(())
     if watched.state_bytes:
-        expected = msgspec.structs.replace(first, state=watched.last_state)
-        elsewhere = done(ResumeStates(payloads, watched.points, expected), other)
+        elsewhere = done(ResumeStates(payloads, watched.points, first), other)
     if not isinstance(elsewhere, ResumedElsewhere | Unanswered):
         raise _unmeasured(source, elsewhere)
     time.sleep(max(0.0, apart_seconds - (time.monotonic() - begun_s)))

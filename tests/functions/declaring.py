@@ -152,6 +152,24 @@ class CaptureCounts(Sum):
         return super().capture()
 
 
+class CaptureNumbers(Sum):
+    """Numbers its captures; no reply shows it."""
+
+    fields: ClassVar[tuple[Field, ...]] = ()
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.captured = 0
+
+    def capture(self) -> bytes:
+        self.captured += 1
+        return super().capture() + bytes((self.captured % 256,))
+
+    def restore(self, state: bytes) -> None:
+        super().restore(state[: LAYOUT.size])
+        self.captured = state[LAYOUT.size] - 1
+
+
 class CaptureSpoils(Sum):
     """A capture changes what the next request finds, but not what the next capture does."""
 

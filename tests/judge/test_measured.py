@@ -6,6 +6,7 @@ one of its own: a file is loaded anew for each task, so its globals are those of
 
 import math
 import os
+import time
 from itertools import islice
 from pathlib import Path
 from typing import Final
@@ -22,6 +23,7 @@ from aftbed.judge.exercise import (
     Answer,
     Surroundings,
     Task,
+    WatchStates,
     changes,
     differs,
     perform,
@@ -86,6 +88,11 @@ def test_a_function_that_is_what_it_declares() -> None:
             "CaptureCounts",
             True,
             "of two in a row, the second one of the initial state: count is 2 instead of",
+        ),
+        (
+            "CaptureNumbers",
+            True,
+            "two in a row, the second one of the initial state: byte 16 is 0x02 instead",
         ),
         ("CaptureSpoils", True, "capture changes the state: with captures after each request, the reply to"),
         (
@@ -237,6 +244,19 @@ def test_what_depends_on_its_surroundings_is_not_deterministic(name: str, told: 
     found = elsewhere(name)
     assert found.wrong == ("it declares to be deterministic, and is not",), found
     assert found.differences[0].startswith(f"in another process, {told}"), found.differences
+
+
+def test_the_two_that_watch_begin_apart() -> None:
+    """Or a clock of seconds would be the same for both."""
+    source, begun_s = f"{DECLARING}:Sum", []
+
+    def host(task: Task, surroundings: Surroundings, seconds: float) -> Answer:
+        if isinstance(task, WatchStates):
+            begun_s.append(time.monotonic())
+        return perform(task, source, OWN_CODE, lambda call: None)
+
+    measure(source, requests(), host=host, apart_seconds=0.2)
+    assert begun_s[1] - begun_s[0] >= 0.2
 
 
 @starts_process
