@@ -30,7 +30,7 @@ from aftbed.runtime.unix.confined import note, serve
 from aftbed.runtime.unix.trust import VettedCode, VettedFiles
 
 PAGE_BYTES: Final = 4096
-WHOLE_STATES_BYTES_MAX: Final = 64 << 20  # of states that are handed over; of any further ones, digests
+WHOLE_STATES_BYTES_MAX: Final = 8 << 20  # of states that are handed over; of any further ones, digests
 DIGEST_BYTES: Final = 16
 WORDS_MAX: Final = 300  # characters of what went wrong
 LINES_MAX: Final = 8000  # the same, with what a program wrote on stderr
@@ -87,13 +87,14 @@ class FunctionDescription(msgspec.Struct, frozen=True):
 
 
 class Executed(msgspec.Struct, frozen=True, tag=True):
-    """`state`: the last one; `execute_ns`: the time of each request."""
+    """`state`: the last one; `execute_ns`: the time of each request; `capture_ns`: of that state."""
 
     described: FunctionDescription
     replies: tuple[bytes, ...]
     refused: int
     state: bytes
     execute_ns: tuple[int, ...]
+    capture_ns: int
 
 
 class Resumed(msgspec.Struct, frozen=True):
@@ -266,7 +267,9 @@ def _execute(
         took_ns.append(clock() - begin_ns)
         replies.append(reply)
     call("capture of the last state")
-    return Executed(described, tuple(replies), refused, function.capture(), tuple(took_ns))
+    begin_ns = clock()
+    state = function.capture()
+    return Executed(described, tuple(replies), refused, state, tuple(took_ns), clock() - begin_ns)
 
 
 def _watch(

@@ -50,8 +50,9 @@ from aftbed.runtime.unix.trust import OWN_RUN, search_path, vetted
 MODULE: Final = "aftbed.judge.exercise"
 START_SECONDS_MAX: Final = 20.0  # of a process and of what it loads
 CALL_SECONDS_MAX: Final = 0.06  # a replica that answers later is taken for one that hangs
-CALLS_MAX: Final = 20  # of each request, in the process with the most
+CALLS_MAX: Final = 20  # of each request, and of each state, in the process with the most
 SLOWER_MAX: Final = 3.0  # another process than the first one
+STATE_NS_PER_BYTE: Final = 1.0  # to copy it once, or to compare it
 MEMORY_BYTES: Final = 4 << 30
 FILE_BYTES: Final = 1 << 30
 APART_SECONDS: Final = 1.1  # between the first request of the two that watch: not within the same second
@@ -211,7 +212,7 @@ def measure(
         raise _unmeasured(source, first)
     if first.refused == len(payloads):
         raise UnmeasuredError(f"{source} cannot be measured: it refused each of {first.refused} requests")
-    seconds = START_SECONDS_MAX + SLOWER_MAX * CALLS_MAX * sum(first.execute_ns) / 1e9
+    seconds = _seconds_max(first)
     begun_s = time.monotonic()
     watched = done(WatchStates(payloads, _points(random, len(payloads), len(first.state)), first), usual)
     if not isinstance(watched, Watched):
@@ -226,6 +227,13 @@ def measure(
     if not isinstance(again, Watched):
         raise _unmeasured(source, again)
     return conclude(first, watched, elsewhere, again)
+
+
+def _seconds_max(first: Executed) -> float:
+    """Of any other process: `first` is what the first one did."""
+    of_states_ns = first.capture_ns + STATE_NS_PER_BYTE * len(first.state)
+    all_ns = sum(first.execute_ns) + len(first.replies) * of_states_ns
+    return START_SECONDS_MAX + SLOWER_MAX * CALLS_MAX * all_ns / 1e9
 
 
 def _unmeasured(source: str, found: Answer) -> UnmeasuredError:
