@@ -97,7 +97,7 @@ class Application(Protocol):
     """A protected function. What it declares is believed, and measured by campaigns.
 
     One whose state has a fixed layout may declare it, as `fields: tuple[Field, ...]`: see `fields_of`; one
-    whose replies have, as `reply_fields`.
+    whose replies have, as `reply_fields`. One that holds more than memory may have `close()`.
 
     `execute` is the only thing that changes the state. No clock, no chance, no I/O: time comes
     in with the request.
@@ -126,6 +126,13 @@ class Application(Protocol):
         Looks at nothing but these two, and changes nothing.
         """
         ...
+
+
+def close(application: Application) -> None:
+    """Free what a function holds beside its memory, as a process; it is not used from then on."""
+    closing = getattr(application, "close", None)
+    if closing is not None:
+        closing()
 
 
 def fields_of(application: Application | type[Application]) -> tuple[Field, ...]:

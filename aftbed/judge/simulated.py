@@ -3,6 +3,7 @@
 import itertools
 from typing import Final
 
+from aftbed.core.application import close
 from aftbed.core.events import Event
 from aftbed.core.script import ScriptKind
 from aftbed.ftm.compose import replication_of
@@ -92,7 +93,10 @@ def evidence_of_run(run: Run, code: Code = NO_CODE) -> Evidence:
     """With the bare server's run, which is executed here: this process has simulated the function, too."""
     record = record_of(run)
     bare = succession(record, code)
-    return Evidence(record, reference_run(record.history, bare))
+    try:
+        return Evidence(record, reference_run(record.history, bare))
+    finally:
+        close(bare)
 
 
 def breaches(run: Run, code: Code = NO_CODE) -> tuple[Breach, ...]:

@@ -15,14 +15,15 @@ from typing import Final, TypeVar
 import msgspec
 
 from aftbed.adapt.plugins import make_brick
-from aftbed.core.application import Application
+from aftbed.core.application import Application, close
 from aftbed.core.brick import Brick, Effect
-from aftbed.core.errors import ConfigError
+from aftbed.core.errors import ConfigError, FunctionFailedError
 from aftbed.core.graph import BrickSpec, Graph
 from aftbed.core.messages import AnyMessage, Message, Reply, Request
 from aftbed.ftm.compose import REPLICAS, chain
 from aftbed.ftm.registry import Setting
 from aftbed.functions.load import Code, load_application
+from aftbed.functions.source import is_foreign
 from aftbed.runtime import control
 from aftbed.runtime.devices import Device
 from aftbed.runtime.node import MemoryIO, Node, Stopped, nowhere
@@ -44,6 +45,8 @@ class Assembler:
         self, function: Callable[[], Application], code: Code, make: MakeSetting | None = None
     ) -> None:
         self._function, self._code = function, code
+        self._opaque: dict[str, Callable[[], Application]] = {}  # makers of functions that are no classes
+        self._made: list[Application] = []
         self._make: MakeSetting = make or (lambda spec, setting: make_brick(spec, setting, code))
 
     def build(
@@ -70,9 +73,28 @@ class Assembler:
         default.
         """
         number = REPLICAS.index(spec.replica) + 1 if spec.replica else 0
-        named = load_application(spec.application, self._code) if spec.application else self._function
+        named = self._maker(spec.application) if spec.application else self._function
         epoch = TEST_EPOCH if leader else order.epoch
         return Setting(number, epoch, spec.replica == (leader or order.leader), named)
+
+    def _maker(self, application: str) -> Callable[[], Application]:
+        """Each class is loaded anew: replicas share no variable of a module, even in one process."""
+        make = self._opaque.get(application) or load_application(application, self._code)
+        if is_foreign(application):
+            self._opaque[application] = make
+
+        def made() -> Application:
+            function = make()
+            self._made.append(function)
+            return function
+
+        return made
+
+    def close(self) -> None:
+        """Close all functions that were made: programs end, models are removed."""
+        for function in self._made:
+            close(function)
+        self._made.clear()
 
     def _try_out(self, order: control.Assign, trial: control.SelfTest) -> None:
         """The self-test of bricks that are not built in."""
@@ -121,6 +143,11 @@ def _suspects(graph: Graph) -> str:
     return ", ".join(sorted({b.source or b.application for b in graph.bricks if b.source or b.application}))
 
 
+def _told(error: Exception) -> str:
+    known = isinstance(error, FunctionFailedError)
+    return str(error) if known else f"{type(error).__name__}: {error}"
+
+
 class _Checked(Brick):
     """A brick whose exceptions are ConfigErrors."""
 
@@ -138,7 +165,7 @@ class _Checked(Brick):
             return self._brick.step(port, msg, now_ns)
         except Exception as error:
             raise ConfigError(
-                f"self-test: {self._name}: {type(msg).__name__} on {port}: {type(error).__name__}: {error}"
+                f"self-test: {self._name}: {type(msg).__name__} on {port}: {_told(error)}"
             ) from error
 
 
@@ -192,5 +219,5 @@ class _TestedChain:
         try:
             return call()
         except Exception as error:
-            text = f"{what}: {type(error).__name__}: {error}"
+            text = f"{what}: {_told(error)}"
             raise ConfigError(f"self-test: {_suspects(self._graph)}: {text}") from error
