@@ -16,9 +16,10 @@ from aftbed.core.errors import shown
 from aftbed.ftm.compose import EXPRESSIONS
 from aftbed.functions.load import OWN_CODE
 from aftbed.functions.request_file import generated, names_function, read_requests
-from aftbed.functions.source import located, parse_source
+from aftbed.functions.source import is_foreign, located, parse_source
 from aftbed.judge.measured import MeasuredFunction, StateChange, UnmeasuredError, measure
 from aftbed.vehicle.aeb.function import sample_requests
+from aftbed.vehicle.aeb.messages import decode_request, encode_fixed
 
 function = typer.Typer()
 EXIT_OVERSTATED: Final = 1
@@ -45,7 +46,7 @@ def check(
     """
     check_seed(seed)
     place = located(source)
-    payloads = _requests(requests, count, seed)
+    payloads = _requests(place, requests, count, seed)
     try:
         found = measure(place, payloads, seed)
     except UnmeasuredError as error:
@@ -65,12 +66,13 @@ def header() -> None:
     print(HEADER)
 
 
-def _requests(source: str | None, count: int | None, seed: int) -> list[bytes]:
-    """Raises ConfigError."""
+def _requests(app: str, source: str | None, count: int | None, seed: int) -> list[bytes]:
+    """Those of the brake are in the layout in which a car asks the function `app`. Raises ConfigError."""
     if count is not None:
         check_range("--count", count, 1, COUNT_MAX)
     if source is None:
-        return sample_requests(seed, count or COUNT)
+        sample = sample_requests(seed, count or COUNT)
+        return [encode_fixed(decode_request(one)) for one in sample] if is_foreign(app) else sample
     if names_function(source):
         return generated(source, count or COUNT, seed, OWN_CODE)
     found = read_requests(Path(source)).requests

@@ -19,6 +19,7 @@ from aftbed.core.application import (
     Application,
     Characteristics,
     Field,
+    close,
     difference,
     fields_of,
     reply_fields_of,
@@ -222,9 +223,11 @@ def perform(task: Task, source: str, code: Code, tell: Note) -> Answer:
                 return _execute(first, requests, described, call)
             case WatchStates(requests, points, expected):
                 found = _watch(first, requests, points, described, call)
+                close(first)
                 del first
                 return found if expected is None else _compared(found, make, requests, expected, call)
             case ResumeStates(requests, states, expected):
+                close(first)
                 del first
                 call("initialisation")
                 return ResumedElsewhere(
@@ -335,7 +338,9 @@ def _compared(
     if found.state_bytes:
         for at, state in found.points:
             resumed.append(_resume(used, at, state, requests, expected, call, used=True))
-        del used
+    close(used)
+    del used
+    if found.state_bytes:
         for at, state in found.points:
             call("initialisation of another instance")
             resumed.append(_resume(make(), at, state, requests, expected, call))
@@ -376,6 +381,8 @@ def _resume(
             )
         call(f"capture {where} and of all further requests")
         last = differs(function.capture(), expected.state, fields)
+        if not used:
+            close(function)
         return msgspec.structs.replace(found, last_state=last)
     except PeerError as error:
         return msgspec.structs.replace(found, failed=f"refused: {error}"[:WORDS_MAX])

@@ -1,6 +1,7 @@
 """`aftbed app`: what is printed, the exit codes, and the messages about wrong words."""
 
 import json
+import sys
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -108,6 +109,27 @@ def test_requests_of_a_file_are_executed(call: Call, tmp_path: Path) -> None:
     assert code == 0, "to be more than declared is no danger"
     assert "2 requests" in out.splitlines()[0]
     assert "remark     it does not declare to be deterministic, and no difference was found" in out
+
+
+FIXED: Final = """
+import json, sys
+for line in sys.stdin:
+    asked = json.loads(line)
+    number, given = asked["id"], asked.get("execute")
+    answer = {"describe": {"state_access": "none"}}
+    if given is not None:
+        fixed = len(given) == 72 and given.startswith("01")
+        answer = {"execute": "00"} if fixed else {"error": "no request of a car in the fixed layout"}
+    print(json.dumps({"id": number, **answer}), flush=True)
+"""
+
+
+@starts_process
+def test_a_program_is_asked_for_the_brake_in_the_fixed_layout(call: Call, tmp_path: Path) -> None:
+    (tmp_path / "fixed.py").write_text(FIXED)
+    code, out, err = call("check", f"{sys.executable} -I -S {tmp_path}/fixed.py", "--count", "20")
+    assert (code, err) == (0, "")
+    assert "measured   deterministic, no state access" in out and "refused" not in out
 
 
 # -- bad input

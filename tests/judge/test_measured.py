@@ -101,7 +101,11 @@ def test_a_function_that_is_what_it_declares() -> None:
             "the state is that of its process: in another one, restored from the initial",
         ),
         ("RefusesOwnState", False, "restored from the initial state: refused: never again"),
-        ("RaisesInRestore", False, "restored from the initial state: failed: KeyError: 'sum'"),
+        (
+            "RaisesInRestore",
+            False,
+            "the initial state: failed: RaisesInRestore: KeyError: 'sum' (",
+        ),
     ],
 )
 def test_a_state_that_is_false(name: str, serialisable: bool, told: str) -> None:
@@ -183,16 +187,16 @@ def test_without_determinism_a_state_is_judged_by_its_bytes_only() -> None:
 @pytest.mark.parametrize(
     ("name", "told"),
     [
-        ("RaisesInExecute", "execute of request 7: ZeroDivisionError: no more"),
-        ("RaisesInCapture", "capture of the last state: ValueError: nothing to see"),
-        ("NoBytes", "execute of request 1: TypeError: execute returned str, bytes are required"),
+        ("RaisesInExecute", "execute of request 7: RaisesInExecute: ZeroDivisionError: no more ("),
+        ("RaisesInCapture", "capture of the last state: RaisesInCapture: ValueError: nothing to see ("),
+        ("NoBytes", "execute of request 1: NoBytes: execute returned str, bytes are required"),
         ("Refuses", "it refused each of 40 requests"),
     ],
 )
 def test_what_cannot_be_measured(name: str, told: str) -> None:
     with pytest.raises(UnmeasuredError) as raised:
         here(name)
-    assert str(raised.value) == f"{DECLARING}:{name} cannot be measured: {told}"
+    assert str(raised.value).startswith(f"{DECLARING}:{name} cannot be measured: {told}")
 
 
 def test_requests_that_are_refused_are_counted() -> None:
@@ -291,13 +295,13 @@ def test_the_function_of_the_brake_and_its_variants(
     [
         ("Crashes", "execute of request 7: its process ended with signal 11 (Segmentation fault)"),
         ("Leaves", "execute of request 1: its process ended with code 7"),
-        ("RaisesInExecute", "execute of request 7: ZeroDivisionError: no more"),
+        ("RaisesInExecute", "execute of request 7: RaisesInExecute: ZeroDivisionError: no more ("),
     ],
 )
 def test_a_crash_is_told_with_its_call(name: str, told: str) -> None:
     with pytest.raises(UnmeasuredError) as raised:
         elsewhere(name)
-    assert str(raised.value) == f"{DECLARING}:{name} cannot be measured: {told}"
+    assert str(raised.value).startswith(f"{DECLARING}:{name} cannot be measured: {told}")
 
 
 @starts_process
