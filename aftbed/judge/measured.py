@@ -190,7 +190,7 @@ def measure(
     requests: Sequence[bytes],
     seed: int = 0,
     host: Host | None = None,
-    apart_seconds: float = APART_SECONDS,
+    apart_seconds: float | None = None,
 ) -> MeasuredFunction:
     """Execute `requests`, at least one, by the function `source`. `seed` draws where states are restored.
 
@@ -222,7 +222,8 @@ def measure(
         elsewhere = done(ResumeStates(payloads, watched.points, first), other)
     if not isinstance(elsewhere, ResumedElsewhere | Unanswered):
         raise _unmeasured(source, elsewhere)
-    time.sleep(max(0.0, apart_seconds - (time.monotonic() - begun_s)))
+    apart_s = APART_SECONDS if apart_seconds is None else apart_seconds
+    time.sleep(max(0.0, apart_s - (time.monotonic() - begun_s)))
     again = done(WatchStates(payloads), other)
     if not isinstance(again, Watched):
         raise _unmeasured(source, again)

@@ -10,6 +10,7 @@ import pytest
 from fakerun import Call, Output
 
 from aftbed.ftm.compose import EXPRESSIONS
+from aftbed.judge import measured
 
 DECLARING: Final = Path(__file__).parents[1] / "functions" / "declaring.py"
 REQUESTS: Final = ("--requests", f"{DECLARING}:requests", "--count", "40")
@@ -18,8 +19,9 @@ starts_process = pytest.mark.process
 
 
 @pytest.fixture
-def call(call: Call) -> Call:
-    """Call `aftbed app` with these arguments: exit code, output, errors."""
+def call(call: Call, monkeypatch: pytest.MonkeyPatch) -> Call:
+    """Call `aftbed app` with these arguments: exit code, output, errors. No function here reads a clock."""
+    monkeypatch.setattr(measured, "APART_SECONDS", 0.0)
     return partial(call, "app")
 
 
