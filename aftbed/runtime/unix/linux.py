@@ -14,7 +14,7 @@ import socket
 import struct
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Final
@@ -130,12 +130,15 @@ def use_batch_scheduling() -> None:
     os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
 
 
-def start_interpreter(module: str, descriptor: int, *arguments: str) -> int:
+def start_interpreter(
+    module: str, descriptor: int, *arguments: str, variables: Mapping[str, str] | None = None
+) -> int:
     """Start `python -m module arguments`, which gets `descriptor` as `INHERITED_FD`; its pid.
 
-    The module is that of this very package: the working directory is not searched (`-P`).
+    `variables` are added to the environment. The module is that of this very package: the working directory
+    is not searched (`-P`).
     """
-    home, environment = str(Path(__file__).resolve().parents[3]), dict(os.environ)
+    home, environment = str(Path(__file__).resolve().parents[3]), {**os.environ, **(variables or {})}
     if home not in site.getsitepackages():
         path = os.environ.get("PYTHONPATH")
         environment["PYTHONPATH"] = os.pathsep.join((home, path)) if path else home
