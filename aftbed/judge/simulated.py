@@ -3,15 +3,18 @@
 import itertools
 from typing import Final
 
+import msgspec
+
 from aftbed.core.application import close
 from aftbed.core.events import Event
 from aftbed.core.script import ScriptKind
 from aftbed.ftm.compose import replication_of
 from aftbed.functions.load import NO_CODE, Code
+from aftbed.judge.asked import not_happened
 from aftbed.judge.checks import Evidence
 from aftbed.judge.record import DriveEnd, Excuses, RunEnd, RunRecord
 from aftbed.judge.reference import reference_run, succession
-from aftbed.judge.verdict import Breach, broken
+from aftbed.judge.verdict import Breach, Verdict, Word, broken, judge
 from aftbed.runtime.deployment import replica_of
 from aftbed.runtime.node import FUNCTION_FAILED
 from aftbed.runtime.sim.clock import START_NS
@@ -102,3 +105,12 @@ def evidence_of_run(run: Run, code: Code = NO_CODE) -> Evidence:
 def breaches(run: Run, code: Code = NO_CODE) -> tuple[Breach, ...]:
     """All that a simulated run breaks."""
     return broken(evidence_of_run(run, code))
+
+
+def verdict_of(evidence: Evidence) -> Verdict:
+    """Of a simulated run: what it breaks, else what did not happen, or is not known (G8)."""
+    found, missed = broken(evidence), not_happened(evidence.record)
+    missed += [evidence.reference.unknown] if evidence.reference.unknown else []
+    word: Word = "fail" if found else "inconclusive" if missed else "pass"
+    reasons = [*map(str, found), *missed]
+    return msgspec.structs.replace(judge(evidence.record, evidence), verdict=word, reasons=reasons)
