@@ -33,6 +33,7 @@ ROWS: Final = {  # package: row, the lowest first
     "bench": 9,
     "cli": 10,
     "api": 11,  # a module of the package itself: it carries out what the commands do
+    "pytest_plugin": 12,
 }
 STRANGERS: Final = (  # neither imports the other
     frozenset({"ftm", "vehicle"}),
@@ -59,6 +60,7 @@ IMPURE_PLACES: Final = (  # where clock, socket, process, file and chance may li
     "aftbed.bench",
     "aftbed.cli",
     "aftbed.api",
+    "aftbed.pytest_plugin",
     "aftbed.core.input_file",  # the readers of files in core: all upper rows read by them
     "aftbed.core.yaml_file",
 )
@@ -312,6 +314,7 @@ def test_every_row_that_exists_is_looked_at() -> None:
         ("aftbed.attic.old", "import aftbed.core.wire", "attic is no row"),
         ("aftbed", "from aftbed.core import wire", "it may not"),
         ("aftbed.cli.run", "from aftbed.api import run", "a lower row imports an upper one"),
+        ("aftbed.api", "import aftbed.pytest_plugin", "a lower row imports an upper one"),
         ("aftbed.__main__", "from aftbed.core import wire", "it may not"),
     ],
 )
