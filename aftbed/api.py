@@ -447,7 +447,8 @@ def _source_of(wish: Wish, folder: Path | None = None) -> str:
 
 def _simulated(wanted: _Wanted) -> RunReport:
     code = wanted.app.code
-    return _reported(verdict_of(evidence_of_run(simulate(_setup(wanted), code), code)), wanted, "sim")
+    simulated = simulate(_setup(wanted), code)
+    return _reported(verdict_of(simulated, evidence_of_run(simulated, code)), wanted, "sim")
 
 
 def _setup(wanted: _Wanted) -> Setup:

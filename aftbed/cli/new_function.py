@@ -54,15 +54,7 @@ KINDS: Final = {
     "stdio": ProjectKind("python3 function.py", "function.py", {"function.py": "stdio/function.py.tmpl"}),
 }
 
-app = typer.Typer()
 
-
-@app.callback()
-def function() -> None:
-    """A group, also with one command."""
-
-
-@app.command()
 def new(
     name: Annotated[str, typer.Argument(help="Of the project, and of its new directory.")],
     kind: Annotated[str, typer.Option(help=f"What the function is: {', '.join(KINDS)}.")] = "class",

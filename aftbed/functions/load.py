@@ -137,7 +137,7 @@ def _checked(found: type) -> Callable[[], Application]:
 
     name = found.__qualname__
 
-    def tried(call: Callable[..., object], *given: bytes) -> object:
+    def tried(call: Callable[..., object], *given: object) -> object:
         try:
             return call(*given)
         except PeerError:
@@ -171,5 +171,13 @@ def _checked(found: type) -> Callable[[], Application]:
             own = getattr(super(), "acceptable", None)
             return own is None or bool(tried(own, request, reply))
 
-    Checked.__name__, Checked.__qualname__ = found.__name__, found.__qualname__
-    return Checked
+    class Tracked(Checked):
+        def changes(self, page_bytes: int) -> object:
+            return tried(super().changes, page_bytes)
+
+        def patch(self, page_bytes: int, pages: object) -> None:
+            tried(super().patch, page_bytes, pages)
+
+    made = Tracked if hasattr(found, "changes") and hasattr(found, "patch") else Checked
+    made.__name__, made.__qualname__ = found.__name__, found.__qualname__
+    return made

@@ -1,15 +1,19 @@
 """The record of a simulated run, and what it breaks. Only this module of the judge imports the simulator."""
 
 import itertools
+from collections.abc import Callable
 from typing import Final
 
 import msgspec
 
-from aftbed.core.application import close
+from aftbed.core.application import Application, close
 from aftbed.core.events import Event
 from aftbed.core.script import ScriptKind
 from aftbed.ftm.compose import replication_of
 from aftbed.functions.load import NO_CODE, Code
+from aftbed.inject.crash import Crash
+from aftbed.inject.hang import Hang
+from aftbed.inject.slow import Slow
 from aftbed.judge.asked import not_happened
 from aftbed.judge.checks import Evidence
 from aftbed.judge.record import DriveEnd, Excuses, RunEnd, RunRecord
@@ -27,6 +31,7 @@ UNPROMISED_VALUES: Final = frozenset(
     for event in (Event.STATE_CAPTURED, Event.STATE_RESTORED, Event.CHECKPOINT_SENT)
     + (Event.CHECKPOINT_APPLIED, Event.REPLY_STORED, Event.DEDUPE_HIT)
 )
+HARMLESS: Final = (Crash, Hang, Slow)  # kinds of faults that alter no message and no state
 SINGLE: Final = "single"  # the node of that placement hosts both replicas
 
 
@@ -92,24 +97,40 @@ def service_struck_down(run: Run) -> bool:
     )
 
 
-def evidence_of_run(run: Run, code: Code = NO_CODE) -> Evidence:
-    """With the bare server's run, which is executed here: this process has simulated the function, too."""
+def evidence_of_run(
+    run: Run, code: Code = NO_CODE, function: Callable[[], Application] | None = None
+) -> Evidence:
+    """With the bare server's run, which is executed here: this process has simulated the function, too.
+
+    `function` makes the bare server of a run whose setup does not name it.
+    """
     record = record_of(run)
-    bare = succession(record, code)
+    bare = succession(record, code) if function is None else function()
     try:
         return Evidence(record, reference_run(record.history, bare))
     finally:
         close(bare)
 
 
-def breaches(run: Run, code: Code = NO_CODE) -> tuple[Breach, ...]:
+def breaches(
+    run: Run, code: Code = NO_CODE, function: Callable[[], Application] | None = None
+) -> tuple[Breach, ...]:
     """All that a simulated run breaks."""
-    return broken(evidence_of_run(run, code))
+    return (*broken(evidence_of_run(run, code, function)), *needless_stops(run))
 
 
-def verdict_of(evidence: Evidence) -> Verdict:
-    """Of a simulated run: what it breaks, else what did not happen, or is not known (G8)."""
-    found, missed = broken(evidence), not_happened(evidence.record)
+def needless_stops(run: Run) -> tuple[Breach, ...]:
+    """A brick that stopped itself, though nothing that it was given can have been altered."""
+    if not all(isinstance(fault.action, HARMLESS) for fault in run.setup.faults):
+        return ()
+    stops = run.history.events(Event.DETECTED_STOP)
+    return tuple(Breach("needless_stop", f"{r.node} stopped at request {r.request_id}") for r in stops)
+
+
+def verdict_of(run: Run, evidence: Evidence) -> Verdict:
+    """What the run breaks, else what did not happen, or is not known (G8)."""
+    found = (*broken(evidence), *needless_stops(run))
+    missed = not_happened(evidence.record)
     missed += [evidence.reference.unknown] if evidence.reference.unknown else []
     word: Word = "fail" if found else "inconclusive" if missed else "pass"
     reasons = [*map(str, found), *missed]

@@ -21,6 +21,7 @@ from aftbed.core.journal import Entry, EntryKind, History, Record
 from aftbed.core.messages import Goal, Reply, Scheduled
 from aftbed.ftm.client import Client
 from aftbed.ftm.compose import build, replication_of
+from aftbed.ftm.pages import PAGE_BYTES
 from aftbed.functions.load import NO_CODE, Code
 from aftbed.functions.request_file import GivenRequests
 from aftbed.functions.source import is_foreign
@@ -73,7 +74,8 @@ class Setup(msgspec.Struct, frozen=True):
     """What a run is made of, so that it can be repeated: nothing else has a part in it.
 
     `count` requests at `rate_hz` (0: the next follows the reply), which are `given` or drawn from a seed; or
-    those of a car in `scenario`. `application`: the protected function, "" for the built-in one.
+    those of a car in `scenario`. `application`: the protected function, "" for the built-in one. With small
+    pages (`page_bytes`) its checkpoints travel as those of a large state do.
     """
 
     ftm: str = "pbr"
@@ -87,6 +89,7 @@ class Setup(msgspec.Struct, frozen=True):
     scenario: str = ""
     application: str = ""
     given: GivenRequests | None = None
+    page_bytes: int = PAGE_BYTES
 
 
 class Rest(msgspec.Struct, frozen=True):
@@ -291,7 +294,7 @@ class World:
         self.effects: dict[str, int] = {}
         self.lost = False
         self.journal = ExecutiveJournal(self.journals.setdefault("supervisor.1", []))
-        self._assembler = assembler = Assembler(function, code, make)
+        self._assembler = assembler = Assembler(function, code, make, setup.page_bytes)
         self.pool = SimProcessPool(
             self.loop, assembler, self._make_device, self._ends.__getitem__, self._journal_for
         )
