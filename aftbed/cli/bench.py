@@ -15,12 +15,16 @@ from aftbed.bench.adaptation import bench_adapt
 from aftbed.bench.cycle import bench_cycle, bench_hops
 from aftbed.bench.recovery import bench_recovery
 from aftbed.bench.resources import bench_launch, bench_memory
-from aftbed.cli.options import Ftm, Recipe, print_json
+from aftbed.cli.options import App, Ftm, Recipe, check_range, print_json
+from aftbed.cli.request_options import RequestSource
 from aftbed.core.errors import ConfigError
 from aftbed.ftm.compose import DUPLEX, replication_of
+from aftbed.functions.request_file import REQUESTS_MAX, names_function
+from aftbed.functions.source import located
 
 bench = typer.Typer()
 REQUESTS_MIN: Final = 5000
+SENT_FUNCTION: Final = 512  # requests of MODULE:FUNCTION, sent in turn
 KILLS_MIN: Final = 1
 PROGRESS: Final = "  measuring: "
 
@@ -34,11 +38,21 @@ def cycle(
     ftm: Ftm = "pbr",
     placement: Placement = "process",
     requests: Annotated[int, typer.Option(min=100, help="After the warm-up.")] = REQUESTS_MIN,
+    app: App = None,
+    sent: Annotated[
+        str | None, typer.Option(help="What --app is sent: FILE (CSV, JSON lines) or MODULE:FUNCTION.")
+    ] = None,
     pin: Pin = True,
     json: Json = False,
 ) -> None:
     """Cycle time at the client, alternating with a bare ring of the same number of hops."""
-    _print(bench_cycle(ftm, placement, requests, pin=pin), as_json=json)
+    application, given = located(app) if app is not None else "", None
+    if sent is not None:
+        count = SENT_FUNCTION if names_function(sent) else None
+        source = RequestSource(sent, count=count, count_max=REQUESTS_MAX, expect=None, tolerance=None)
+        given = source.of(0)
+    result = bench_cycle(ftm, placement, requests, pin=pin, application=application, given=given)
+    _print(result, as_json=json)
 
 
 @bench.command()
@@ -105,6 +119,26 @@ def campaign(
     from aftbed.bench.campaign import bench_campaign  # noqa: PLC0415 - see above
 
     _print(bench_campaign(ftm, placement, "sim" if sim else "unix", experiments, jobs), as_json=json)
+
+
+@bench.command()
+def state(
+    ftm: Ftm = "pbr",
+    size: Annotated[int, typer.Option("--bytes", help="Of the state.")] = 1_000_000,
+    beside: Annotated[int, typer.Option(help="Of the state that it is compared with.")] = 10_000,
+    tells_changes: Annotated[
+        bool, typer.Option("--tells-changes", help="The function knows what it has changed.")
+    ] = False,
+    rounds: Annotated[int, typer.Option(min=1, help="Of both sizes in turn.")] = 11,
+    json: Json = False,
+) -> None:
+    """The cycle under a large state beside a small one, a page of it changed; the blackout of an update."""
+    from aftbed.bench.ballast import SIZE_BYTES_MAX, SIZE_BYTES_MIN  # noqa: PLC0415 - see above
+    from aftbed.bench.sweep import bench_state  # noqa: PLC0415 - see above
+
+    check_range("--bytes", size, SIZE_BYTES_MIN, SIZE_BYTES_MAX)
+    check_range("--beside", beside, SIZE_BYTES_MIN, SIZE_BYTES_MAX)
+    _print(bench_state(ftm, size, beside, tracked=tells_changes, rounds=rounds), as_json=json)
 
 
 @bench.command()

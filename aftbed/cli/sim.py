@@ -48,8 +48,8 @@ from aftbed.inject.model import Fault, parse
 from aftbed.inject.targets import OTHERS
 from aftbed.judge.asked import not_happened
 from aftbed.judge.outcome import outcome_of
-from aftbed.judge.simulated import evidence_of_run
-from aftbed.judge.verdict import EXIT_CODES, EXIT_INTERRUPTED, Breach, Verdict, Word, judge
+from aftbed.judge.simulated import evidence_of_run, verdict_of
+from aftbed.judge.verdict import EXIT_CODES, EXIT_INTERRUPTED, Breach, Verdict, Word
 from aftbed.report import sequence
 from aftbed.runtime.sim.clock import START_NS
 from aftbed.runtime.sim.trace import traced
@@ -67,6 +67,7 @@ from aftbed.vehicle.scenarios.library import load_scenario
 S = TypeVar("S")
 T = TypeVar("T")
 COUNT_MAX: Final = 100_000
+PAGE_BYTES: Final = (16, 65536)
 LOAD_S_MAX: Final = 3600.0  # of virtual time
 MINUTES_MAX: Final = 100_000.0
 SHRUNK_MAX: Final = 3  # broken runs: shrinking one takes up to 400 runs
@@ -117,6 +118,12 @@ class SimArguments(msgspec.Struct, frozen=True):
     may_fail: Annotated[
         bool, typer.Option("--may-fail", help="A run may pass even if an --adapt was not done.")
     ] = False
+    page_bytes: Annotated[
+        int | None,
+        typer.Option(
+            help="Of a page of a checkpoint; 4096 if left out. Of 4 pages or more only changes travel."
+        ),
+    ] = None
     swarm: Annotated[bool, typer.Option("--swarm", help="Draw everything from the seed.")] = False
     minutes: Annotated[float | None, typer.Option(help="Simulate the seeds from --seed on, for so long.")] = (
         None
@@ -169,7 +176,7 @@ def sim(given: SimArguments) -> int:
 
 def _used(given: SimArguments, *but: str) -> list[str]:
     """The options that were given, except those of the fields `but`."""
-    names = {"adaptations": "adapt", "may_fail": "may-fail"}
+    names = {"adaptations": "adapt", "may_fail": "may-fail", "page_bytes": "page-bytes"}
     values = asdict(given).items()
     used = [name for name, value in values if value is not None and value is not False and value != ()]
     return [f"--{names.get(name, name)}" for name in used if name not in but]
@@ -218,16 +225,22 @@ def _setup_maker(given: SimArguments) -> MakeSetup:
         placement=graph.placement,
         faults=faults,
         adaptations=adaptations,
+        page_bytes=_page_bytes(given),
         application=application,
     )
-    for fault in faults:
+    check_setup(setup)
+    return lambda seed: replace(setup, seed=seed, given=source.of(seed) if source is not None else None)
+
+
+def check_setup(setup: Setup) -> None:
+    """Raise ConfigError if its faults have nothing to strike, or an adaptation would not begin."""
+    for fault in setup.faults:
         check_fault(fault, setup.scenario)
-    for adaptation in adaptations:
+    for adaptation in setup.adaptations:
         if not setup.scenario and adaptation.at_request > setup.count:
             raise ConfigError(
                 f"--adapt: at request {adaptation.at_request}: there are {setup.count} requests (--count)"
             )
-    return lambda seed: replace(setup, seed=seed, given=source.of(seed) if source is not None else None)
 
 
 def _source(given: SimArguments) -> RequestSource | None:
@@ -254,18 +267,30 @@ def _load(given: SimArguments) -> Setup:
             raise ConfigError("--scenario: the car makes the requests; leave out --count and --rate")
         load_scenario(given.scenario)
         return Setup(scenario=given.scenario)
-    count = DEFAULT.count if given.count is None else given.count
-    rate_hz = DEFAULT.rate_hz if given.rate is None else given.rate
+    return load_of(DEFAULT.count if given.count is None else given.count, given.rate)
+
+
+def load_of(count: int, rate_hz: float | None) -> Setup:
+    """`count` requests; without a rate, each follows the reply before it. Raises ConfigError."""
     if not 1 <= count <= COUNT_MAX:
         raise ConfigError(f"--count {count}: 1 to {COUNT_MAX} requests are allowed")
-    if given.rate is not None and not 0 < rate_hz <= RATE_HZ_MAX:
+    if rate_hz is None:
+        return Setup(count=count)
+    if not 0 < rate_hz <= RATE_HZ_MAX:
         raise ConfigError(
             f"--rate {rate_hz}: more than 0, up to {RATE_HZ_MAX:.0f} a second are allowed"
             " (without it, each follows the reply before)"
         )
-    if rate_hz and count / rate_hz > LOAD_S_MAX:
+    if count / rate_hz > LOAD_S_MAX:
         raise ConfigError(f"--count {count} --rate {rate_hz}: {LOAD_S_MAX:.0f} s of virtual time are allowed")
     return Setup(count=count, rate_hz=rate_hz)
+
+
+def _page_bytes(given: SimArguments) -> int:
+    least, most = PAGE_BYTES
+    if given.page_bytes is not None and not least <= given.page_bytes <= most:
+        raise ConfigError(f"--page-bytes {given.page_bytes}: {least} to {most} are allowed")
+    return given.page_bytes or DEFAULT.page_bytes
 
 
 def read_fault(text: str, graph: Graph) -> Fault:
@@ -316,7 +341,9 @@ def described(setup: Setup) -> str:
     parts = [f"{setup.ftm} ({setup.placement}), seed {setup.seed}, {load}"]
     parts += [setup.application] if setup.application else []
     parts += [f"{doom.brick} dies before its effect {doom.effect}" for doom in setup.dooms]
-    return "; ".join([*parts, *map(str, setup.faults), *map(_adaptation_words, setup.adaptations)])
+    parts += [*map(str, setup.faults), *map(_adaptation_words, setup.adaptations)]
+    parts += [f"pages of {setup.page_bytes} bytes"] if setup.page_bytes != DEFAULT.page_bytes else []
+    return "; ".join(parts)
 
 
 def _adaptation_words(adaptation: Scheduled) -> str:
@@ -350,6 +377,7 @@ def repeating(setup: Setup, *, swarm: bool = False) -> str:
         expect=requests.expect or None if requests is not None else None,
         tolerance=requests.tolerance if requests is not None else None,
         scenario=setup.scenario or None,
+        page_bytes=setup.page_bytes if setup.page_bytes != DEFAULT.page_bytes else None,
         faults=tuple(map(str, setup.faults)),
         adaptations=tuple(map(_adaptation_words, setup.adaptations)),
         recipe=next((a.goal.recipe for a in setup.adaptations if a.goal.recipe != RECIPES[0]), None),
@@ -382,6 +410,7 @@ def _command(given: SimArguments) -> str:
         ("--scenario", given.scenario),
         ("--count", None if given.count is None else str(given.count)),
         ("--rate", None if given.rate is None else _number(given.rate)),
+        ("--page-bytes", None if given.page_bytes is None else str(given.page_bytes)),
         ("--requests", given.requests),
         ("--expect", given.expect),
         ("--tolerance", None if given.tolerance is None else repr(given.tolerance)),
@@ -520,14 +549,14 @@ def _simulate_one(given: SimArguments, setup: Setup) -> int:
     reasons = list(map(str, broken))
     if run is not None:
         evidence = evidence_of_run(run, OWN_CODE)
+        verdict = verdict_of(run, evidence)
         if given.swarm:  # what a swarm draws may well not happen: `attempt_drawn` has judged that
             tally = Tally()
             tally.add(happened_in(run), intended(setup))
+            verdict = replace(verdict, verdict=word, reasons=reasons)
         else:
             lacking = tuple(not_happened(evidence.record))
-            word = "inconclusive" if lacking and not broken else word
-            reasons += lacking
-        verdict = replace(judge(evidence.record, evidence), verdict=word, reasons=reasons)
+            word, reasons = verdict.verdict, verdict.reasons
         done = _DoneRun(run, verdict, outcome_of(evidence)[0], (run.rest.ended_ns - START_NS) / 1e6)
     if not given.json:
         print(f"seed {setup.seed}\n{described(setup)}")

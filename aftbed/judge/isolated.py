@@ -8,15 +8,20 @@ anything but MessagePack of the declared type, the replies of the function are u
 import sys
 from collections.abc import Callable, Sequence
 from functools import partial
-from types import ModuleType
 from typing import Final, TypeVar
 
 import msgspec
 
-from aftbed.core.application import AccessKind, Application, Characteristics, difference, reply_fields_of
+from aftbed.core.application import (
+    AccessKind,
+    Application,
+    Characteristics,
+    close,
+    difference,
+    reply_fields_of,
+)
 from aftbed.core.errors import ConfigError, FunctionFailedError, PeerError
-from aftbed.functions.load import OWN_CODE, Code, characteristics_of, declared_in, load_application
-from aftbed.functions.source import FunctionSource
+from aftbed.functions.load import OWN_CODE, characteristics_of, declared_in, load_application
 from aftbed.judge.record import RunRecord
 from aftbed.judge.reference import (
     NamedChange,
@@ -30,19 +35,17 @@ from aftbed.judge.reference import (
     requests_of,
     succession,
 )
-from aftbed.runtime.unix.confined import JobFailedError, ProcessLimits, ask, serve
+from aftbed.runtime.unix.confined import JobFailedError, ProcessLimits, ask, note, serve
 from aftbed.runtime.unix.trust import (
     NOBODY,
     Trust,
+    VettedCode,
     VettedFiles,
-    check_unchanged,
-    load,
     search_path,
     vetted,
 )
 
 WORDS_MAX: Final = 300  # characters of what went wrong
-ITS_PROCESS: Final = "its process"
 OPAQUE_FILE_BYTES: Final = 1 << 30  # a model is unpacked; a program may keep a log
 LIMITS: Final = ProcessLimits(seconds=120.0, memory_bytes=4 << 30, file_bytes=0)
 TRIAL_LIMITS: Final = ProcessLimits(seconds=10.0, memory_bytes=4 << 30, file_bytes=0)
@@ -165,8 +168,6 @@ def _declared(source: str, task: Describe | TryOut, trust: Trust, limits: Proces
         case Declared() as found:
             return found
         case Failed(reason):
-            tried = f" (its first {len(task.requests)} requests)" if isinstance(task, TryOut) else ""
-            reason = reason if not reason.startswith(ITS_PROCESS) else reason + tried
             raise ConfigError(reason if source in reason else f"{source}: {reason}")
         case Replies():
             raise ConfigError(f"{source}: it answered something else")
@@ -180,9 +181,9 @@ def _answer(task: Task, codes: tuple[VettedFiles, ...], limits: ProcessLimits) -
     try:
         found: Answer = msgspec.msgpack.decode(ask(__name__, job, limits), type=Answer)
     except JobFailedError as error:
-        return Failed(f"{ITS_PROCESS} {error}")
+        return Failed(f"its process {error}{f': {error.noted}' if error.noted else ''}")
     except (msgspec.DecodeError, RecursionError) as error:
-        return Failed(f"{ITS_PROCESS} answered what is no answer: {error}")
+        return Failed(f"its process answered what is no answer: {error}")
     return found
 
 
@@ -201,21 +202,8 @@ def work(data: bytes) -> bytes:
         return msgspec.msgpack.encode(Failed(reason[:WORDS_MAX]))
 
 
-class _VettedCode(Code):
-    """From the bytes that were hashed; without any file of this package."""
-
-    def __init__(self, codes: tuple[VettedFiles, ...]) -> None:
-        self._codes = {code.place: code for code in codes}
-
-    def module(self, place: str) -> ModuleType:
-        return load(self._codes[place])
-
-    def permit(self, source: FunctionSource) -> None:
-        check_unchanged(self._codes[str(source)])
-
-
 def _done(job: Job) -> Answer:
-    code = _VettedCode(job.codes)
+    code = VettedCode(job.codes)
     match job.task:
         case Execute(first, changes, requests):
             return Replies(executed(requests, Succession(maker(first, code), loaded(changes, code))))
@@ -227,6 +215,8 @@ def _done(job: Job) -> Answer:
                 return Declared(declared_in(source, function), _tried(function, requests))
             except FunctionFailedError as error:
                 raise ConfigError(f"{source}: {str(error).replace(f'{source}: ', '')}") from error
+            finally:
+                close(function)
 
 
 def _tried(function: Application, requests: Sequence[bytes]) -> str:
@@ -273,6 +263,7 @@ def _replies(function: Application, requests: Sequence[bytes]) -> list[bytes]:
 
 def _did(what: str, act: Callable[[], T]) -> T:
     """Raises FunctionFailedError where `act` raises whatever it does."""
+    note(what)
     try:
         return act()
     except FunctionFailedError as error:

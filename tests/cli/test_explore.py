@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
+import psutil
 import pytest
 from fakerun import Call, Output
 
@@ -71,6 +72,31 @@ def test_a_function_of_the_user_with_its_requests(explore: Call, tmp_path: Path)
     assert again is not None and f"--app {tmp_path}/bad.py:Adder" in again[1]
     code, repeated, _ = explore(*shlex.split(again[1]))
     assert code == 1 and "request 2: the reply is not the bare server's" in repeated
+
+
+@pytest.mark.parametrize(
+    ("body", "told"),
+    [
+        ("os.kill(os.getpid(), 9)", "has no result, its process has been killed by signal 9"),
+        ("exec('while True: pass')", "hangs, after 1 s there is no result"),
+    ],
+)
+def test_a_function_that_fails_later_is_told_and_ends_no_command(
+    body: str, told: str, call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Later than the requests with which it is tried out."""
+    for module in ("cli.sim", "cli.explore", "search.explore"):
+        monkeypatch.setattr(f"aftbed.{module}.own_seconds_max", lambda _requests: 1.0)
+    (tmp_path / "requests.csv").write_text("step:u8\n" + "3\n" * 20)
+    fails = f"if self.sum >= 57: {body}\n        return b"
+    text = FUNCTION.replace("RESTORED", "self.sum = int(state)").replace("return b", fails, 1)
+    (tmp_path / "mine.py").write_text(f"import os\n{text}")
+    app = ("--app", tmp_path / "mine.py:Adder", "--requests", tmp_path / "requests.csv", "--ftm", "pbr")
+    before = psutil.Process().children()
+    for command in (("sim",), ("explore", "crash", "--placement", "replica", "--jobs", "1")):
+        code, out, err = call(*command, *app)
+        assert code == 3 and told in err and err.count("\n") == 1, (code, out, err)
+        assert psutil.Process().children() == before
 
 
 def test_one_process_and_two_count_the_same(explore: Call) -> None:
@@ -162,8 +188,8 @@ def test_every_order_is_counted_up_to_the_bound(explore: Call) -> None:
     code, out, _ = explore(*ORDER, "--requests", "2", "--bound", "20")
     lines = out.splitlines()
     assert code == 0
-    assert lines[0] == "all 2 orders (3 cut): lfr (replica), seed 0, 1 request"
-    assert lines[1] == "all 6 orders (13 cut): lfr (replica), seed 0, 2 requests"
+    assert lines[0] == "all 2 orders (3 cut): lfr (replica), seed 0, 1 request; pages of 16 bytes"
+    assert lines[1] == "all 6 orders (13 cut): lfr (replica), seed 0, 2 requests; pages of 16 bytes"
     assert all(line.startswith("at least ") for line in lines[2:-1]), "20 runs are not enough with a crash"
     assert "all orders of 2 of " in lines[-1] and "the others up to 20 runs each" in lines[-1]
 
