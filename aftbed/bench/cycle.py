@@ -52,6 +52,7 @@ from aftbed.core.messages import PACKET_BYTES_MAX
 from aftbed.ftm.compose import NONE, build, chain
 from aftbed.ftm.registry import BRICKS
 from aftbed.functions.request_file import GivenRequests
+from aftbed.functions.source import is_foreign
 from aftbed.judge.record import RunRecord
 from aftbed.runtime.unix import linux
 from aftbed.vehicle.aeb.function import sample_requests
@@ -108,7 +109,7 @@ def bench_cycle(
     """Cycle and ring in turn, `rounds` times; of a function of the user, and what it is sent, if given."""
     wanted = hops(build(ftm, placement))
     cpu = _pinned_cpu() if pin else None
-    sent = given.requests if given is not None else sample_requests(0, 64)
+    sent = given.requests if given is not None else sample_requests(0, 64, fixed=is_foreign(application))
     size = sum(map(len, sent)) // len(sent)
     cycles: list[float] = []
     ring: list[float] = []

@@ -169,7 +169,7 @@ def run(given: CampaignRunArguments) -> int:
         from aftbed.cli.adapt import tried_out  # noqa: PLC0415 - only with a function of the user
         from aftbed.cli.request_options import first_requests  # noqa: PLC0415 - the same
 
-        tried_out(found.spec.system.app, first_requests(None), force=False)
+        tried_out(found.spec.system.app, first_requests(found.spec.system.app, None), force=False)
     from aftbed.report.terminal import CampaignProgress  # noqa: PLC0415 - scipy, after the options
 
     began_s, interrupted = time.monotonic(), False

@@ -126,7 +126,9 @@ def _selection(explorer: str, given: NumberedArguments) -> Selection:
     chosen = selected(explorer, separated(given.ftm), separated(given.placement), count)
     application = located(given.app) if given.app is not None else ""
     if application:
-        refuse_unsuitable(application, *chosen.ftms, force=given.force, requests=first_requests(sent))
+        refuse_unsuitable(
+            application, *chosen.ftms, force=given.force, requests=first_requests(application, sent)
+        )
     return replace(chosen, application=application, given=sent)
 
 

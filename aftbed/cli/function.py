@@ -20,7 +20,6 @@ from aftbed.functions.request_file import generated, names_function, read_reques
 from aftbed.functions.source import is_foreign, located, parse_source
 from aftbed.judge.measured import MeasuredFunction, StateChange, UnmeasuredError, measure
 from aftbed.vehicle.aeb.function import sample_requests
-from aftbed.vehicle.aeb.messages import decode_request, encode_fixed
 
 function = typer.Typer()
 function.command()(new)
@@ -73,8 +72,7 @@ def _requests(app: str, source: str | None, count: int | None, seed: int) -> lis
     if count is not None:
         check_range("--count", count, 1, COUNT_MAX)
     if source is None:
-        sample = sample_requests(seed, count or COUNT)
-        return [encode_fixed(decode_request(one)) for one in sample] if is_foreign(app) else sample
+        return sample_requests(seed, count or COUNT, fixed=is_foreign(app))
     if names_function(source):
         return generated(source, count or COUNT, seed, OWN_CODE)
     found = read_requests(Path(source)).requests

@@ -16,14 +16,17 @@ from aftbed.functions.request_file import (
     read_replies,
     read_requests,
 )
+from aftbed.functions.source import is_foreign
 from aftbed.vehicle.aeb.function import sample_requests
 
 TRIED_OUT_MAX: Final = 16
 
 
-def first_requests(given: GivenRequests | None) -> tuple[bytes, ...]:
+def first_requests(application: str, given: GivenRequests | None) -> tuple[bytes, ...]:
     """A few of a run, with which a function is tried out; `given` is None where they are those of a car."""
-    return given.requests[:TRIED_OUT_MAX] if given is not None else tuple(sample_requests(0, TRIED_OUT_MAX))
+    if given is not None:
+        return given.requests[:TRIED_OUT_MAX]
+    return tuple(sample_requests(0, TRIED_OUT_MAX, fixed=is_foreign(application)))
 
 
 class RequestSource:

@@ -209,7 +209,7 @@ def _refuse_unsuitable(application: str, ftm: str, requests: "GivenRequests | No
     from aftbed.cli.adapt import refuse_unsuitable  # noqa: PLC0415 - only with --app
     from aftbed.cli.request_options import first_requests  # noqa: PLC0415 - the same
 
-    refuse_unsuitable(application, ftm, force=force, requests=first_requests(requests))
+    refuse_unsuitable(application, ftm, force=force, requests=first_requests(application, requests))
 
 
 def _adaptations(given: RunArguments, graph: Graph) -> tuple[Scheduled, ...]:

@@ -161,7 +161,7 @@ def sim(given: SimArguments) -> int:
     jobs, make = jobs_of(given.jobs), _setup_maker(given)
     if given.app is not None:
         setup = make(first)
-        requests = first_requests(setup.given)
+        requests = first_requests(setup.application, setup.given)
         refuse_unsuitable(setup.application, setup.ftm, force=given.force, requests=requests)
     check_file("--diagram", None if given.diagram is None else Path(given.diagram))
     if given.seeds is None and given.minutes is None:

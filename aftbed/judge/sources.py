@@ -27,6 +27,7 @@ from aftbed.core.input_file import open_input
 from aftbed.core.journal import EntryKind, History, Record
 from aftbed.core.script import RECIPES
 from aftbed.ftm.compose import build
+from aftbed.functions.source import is_foreign
 from aftbed.inject.receipts import fault_and_bits
 from aftbed.judge.record import RunEnd, RunRecord
 from aftbed.judge.reference import ReferenceRun
@@ -252,7 +253,11 @@ def _listed_requests(record: RunRecord) -> Sequence[bytes]:
     work = record.options.work
     if not isinstance(work, LoadRun) or _flipped(record):
         return ()
-    return record.given or () if work.requests else _drawn(record.options.seed)
+    return (
+        record.given or ()
+        if work.requests
+        else _drawn(record.options.seed, fixed=is_foreign(record.options.application))
+    )
 
 
 class _Span(NamedTuple):
@@ -376,6 +381,6 @@ def _of_bus(record: RunRecord, end: RunEnd) -> Iterator[str]:
 
 
 @lru_cache(maxsize=4)
-def _drawn(seed: int) -> list[bytes]:
+def _drawn(seed: int, *, fixed: bool) -> list[bytes]:
     """The requests of a load, which come again and again."""
-    return sample_requests(seed, LOAD_REQUESTS)
+    return sample_requests(seed, LOAD_REQUESTS, fixed=fixed)

@@ -26,7 +26,7 @@ SUITED = ("pbr", "lfr", "pbr+tr", "lfr+tr")
 
 @pytest.fixture(scope="module")
 def aeb(request: pytest.FixtureRequest) -> ModuleType:
-    pytest.importorskip("aeb", reason="mono-aeb is not installed")
+    pytest.importorskip("aeb.config", reason="mono-aeb is not installed")
     return load_module(str(AEB))
 
 

@@ -124,9 +124,9 @@ class Run(msgspec.Struct, frozen=True):
 
 
 @lru_cache(maxsize=8)
-def requests_of(seed: int) -> list[bytes]:
+def requests_of(seed: int, *, fixed: bool = False) -> list[bytes]:
     """The payloads of a seed's load."""
-    return sample_requests(seed, REQUESTS)
+    return sample_requests(seed, REQUESTS, fixed=fixed)
 
 
 @lru_cache(maxsize=64)
@@ -279,7 +279,10 @@ class World:
         clock: Callable[[Random], Clock] = Clock,
     ) -> None:
         self.setup, self._channel = setup, channel
-        drawn = list(setup.given.requests) if setup.given is not None else requests_of(0)
+        if setup.given is not None:
+            drawn = list(setup.given.requests)
+        else:
+            drawn = requests_of(0, fixed=is_foreign(setup.application))
         self._requests = requests if requests is not None else drawn
         self.loop = clock(Random(setup.seed))
         self._drive = Drive(setup, self.loop) if setup.scenario else None

@@ -120,7 +120,8 @@ def make_source(client: Client, options: SourceOptions) -> Device:
     resume_client(client, since, state)
     dialogue = DialogueFile(dialogue_path(journals, options.incarnation), "client")
     if isinstance(work, LoadRun):
-        requests = sample_requests(options.seed, LOAD_REQUESTS)
+        fixed = is_foreign(options.application)
+        requests = sample_requests(options.seed, LOAD_REQUESTS, fixed=fixed)
         if work.requests:
             given = stored_requests(journals.parent)
             assert given, f"the requests are no longer in {journals.parent}"

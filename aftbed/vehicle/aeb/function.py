@@ -47,6 +47,7 @@ from aftbed.vehicle.aeb.messages import (
     AebTarget,
     decode_reply,
     decode_request,
+    encode_fixed,
     encode_reply,
     encode_request,
 )
@@ -453,17 +454,20 @@ SAMPLE_CYCLE_MS: Final = 20
 SAMPLE_LIMIT_MS2: Final = 6.0
 
 
-def sample_requests(seed: int, count: int) -> list[bytes]:
+def sample_requests(seed: int, count: int, *, fixed: bool = False) -> list[bytes]:
     """`count` radar cycles of 20 ms for load and benches: approaches to a car ahead, one after the other.
 
     In each, the ego closes in on a slower or standing car, brakes late and steadily down to its speed,
     follows for a second, and meets the next one. No feedback: the same seed gives the same bytes.
+
+    `fixed`: in the fixed layout, in which a car asks a function that is no class.
     """
     random = Random(seed)
     requests: list[bytes] = []
     while len(requests) < count:
         requests += _sample_approach(random, len(requests) * SAMPLE_CYCLE_MS)
-    return requests[:count]
+    found = requests[:count]
+    return [encode_fixed(decode_request(request)) for request in found] if fixed else found
 
 
 def _sample_approach(random: Random, start_ms: int) -> list[bytes]:
