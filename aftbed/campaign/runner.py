@@ -88,8 +88,12 @@ def performed(
         system = plan.spec.system
         # An experiment that takes more hangs; real ones have deadlines of their own, and end before.
         seconds_max = SECONDS_MAX + 2 * system.requests / (system.rate_hz or REQUESTS_PER_SECOND_MIN)
-        fresh = system.runtime == "unix"
-        for _, _, result in each(perform, todo, asked.jobs, seconds_max=seconds_max, fresh=fresh):
+        # A function of the user may end, or hang, the process that simulates it: that is never the command.
+        fresh = system.runtime == "unix" or bool(system.app)
+        alone = _alone if system.runtime == "sim" else None
+        for _, _, result in each(
+            perform, todo, asked.jobs, alone=alone, seconds_max=seconds_max, fresh=fresh
+        ):
             yield result
         return
     from aftbed.campaign import dask  # noqa: PLC0415 - an extra
@@ -102,6 +106,10 @@ def performed(
                 yield result
     finally:
         os.close(descriptor)
+
+
+def _alone(number: int, experiment: Experiment) -> str:
+    return experiment.command()
 
 
 def _perform(path: str, experiment: Experiment) -> Result:

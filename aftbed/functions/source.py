@@ -114,3 +114,18 @@ def located(text: str, folder: Path | None = None) -> str:
             return str(
                 FunctionSource(source.kind, file(source.place), file(source.part) if source.part else "")
             )
+
+
+def renamed(text: str) -> str:
+    """Another text that names the same function, whose paths are absolute, so that an update to it does
+    something; "" where there is none, as of a class in a module.
+    """
+    source = parse_source(text)
+    path = Path(source.place)
+    if source.kind is FunctionKind.PROGRAM:
+        first, *rest = source.words
+        quoted = shlex.quote(first)
+        return " ".join([f"'{first}'" if quoted == first else f"{quoted}''", *map(shlex.quote, rest)])
+    if not path.is_absolute():
+        return ""
+    return str(msgspec.structs.replace(source, place=f"{path.parent}/./{path.name}"))

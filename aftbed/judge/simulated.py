@@ -9,7 +9,7 @@ from aftbed.ftm.compose import replication_of
 from aftbed.functions.load import NO_CODE, Code
 from aftbed.judge.checks import Evidence
 from aftbed.judge.record import DriveEnd, Excuses, RunEnd, RunRecord
-from aftbed.judge.reference import reference_run, succession
+from aftbed.judge.reference import ReferenceRun, reference_run, succession
 from aftbed.judge.verdict import Breach, broken
 from aftbed.runtime.deployment import replica_of
 from aftbed.runtime.node import FUNCTION_FAILED
@@ -23,6 +23,7 @@ UNPROMISED_VALUES: Final = frozenset(
     for event in (Event.STATE_CAPTURED, Event.STATE_RESTORED, Event.CHECKPOINT_SENT)
     + (Event.CHECKPOINT_APPLIED, Event.REPLY_STORED, Event.DEDUPE_HIT)
 )
+WORDS_MAX: Final = 600  # of why the replies of a function are unknown
 SINGLE: Final = "single"  # the node of that placement hosts both replicas
 
 
@@ -89,10 +90,19 @@ def service_struck_down(run: Run) -> bool:
 
 
 def evidence_of_run(run: Run, code: Code = NO_CODE) -> Evidence:
-    """With the bare server's run, which is executed here: this process has simulated the function, too."""
-    record = record_of(run)
+    """With the bare server's run, which is executed here: this process has simulated the function, too.
+
+    Where a function of the user fails in it, its replies are unknown.
+    """
+    record, source = record_of(run), run.setup.application
     bare = succession(record, code)
-    return Evidence(record, reference_run(record.history, bare))
+    try:
+        return Evidence(record, reference_run(record.history, bare))
+    except Exception as error:  # whatever it does
+        if not source:
+            raise
+        why = f"{source} cannot be executed again: {type(error).__name__}: {error}"
+        return Evidence(record, ReferenceRun((), b"", unknown=why[:WORDS_MAX]))
 
 
 def breaches(run: Run, code: Code = NO_CODE) -> tuple[Breach, ...]:
