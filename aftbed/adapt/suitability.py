@@ -255,7 +255,16 @@ def unsuitable(expression: str, characteristics: Characteristics) -> str:
     The faults asked for are those that the mechanism is chosen for: crashes, where it replicates. Resources
     are not judged.
     """
-    return refusal(expression, FaultModel(crash=_replicates(parse(expression))), characteristics, AMPLE)
+    return refusal(expression, _chosen_for(expression), characteristics, AMPLE)
+
+
+def mismatches(expression: str, characteristics: Characteristics) -> list[str]:
+    """The same as sentences, without the expressions that would suit; [] if it does."""
+    return problems(expression, _chosen_for(expression), characteristics, AMPLE)
+
+
+def _chosen_for(expression: str) -> FaultModel:
+    return FaultModel(crash=_replicates(parse(expression)))
 
 
 def _united(faults: Iterable[tuple[FaultClass, ...]]) -> tuple[FaultClass, ...]:

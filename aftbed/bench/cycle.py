@@ -51,6 +51,7 @@ from aftbed.core.graph import Graph
 from aftbed.core.messages import PACKET_BYTES_MAX
 from aftbed.ftm.compose import NONE, build, chain
 from aftbed.ftm.registry import BRICKS
+from aftbed.functions.request_file import GivenRequests
 from aftbed.judge.record import RunRecord
 from aftbed.runtime.unix import linux
 from aftbed.vehicle.aeb.function import sample_requests
@@ -95,19 +96,28 @@ class CycleResult(msgspec.Struct, frozen=True):
 
 
 def bench_cycle(
-    ftm: str, placement: str, count: int, *, pin: bool = True, rounds: int = ROUNDS
+    ftm: str,
+    placement: str,
+    count: int,
+    *,
+    pin: bool = True,
+    rounds: int = ROUNDS,
+    application: str = "",
+    given: GivenRequests | None = None,
 ) -> CycleResult:
-    """Cycle and ring in turn, `rounds` times."""
+    """Cycle and ring in turn, `rounds` times; of a function of the user, and what it is sent, if given."""
     wanted = hops(build(ftm, placement))
     cpu = _pinned_cpu() if pin else None
-    size = sum(map(len, sample_requests(0, 64))) // 64
+    sent = given.requests if given is not None else sample_requests(0, 64)
+    size = sum(map(len, sent)) // len(sent)
     cycles: list[float] = []
     ring: list[float] = []
     ratios: list[float] = []
     for _ in range(rounds):
         share = -(-count // rounds)
         bare = ring_us(wanted, size, share, cpu)
-        ours = latencies_us(limited_run(ftm, placement, share + WARM_UP, pin=pin), skip=WARM_UP)
+        run = limited_run(ftm, placement, share + WARM_UP, pin=pin, application=application, given=given)
+        ours = latencies_us(run, skip=WARM_UP)
         ratios.append(quantile(ours, 0.5) / quantile(bare, 0.5))
         cycles += ours
         ring += bare

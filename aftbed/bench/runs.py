@@ -13,6 +13,7 @@ import msgspec
 from aftbed.campaign.statistics import quantile
 from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.core.events import Event
+from aftbed.functions.request_file import GivenRequests
 from aftbed.judge.record import RunRecord, read_record
 from aftbed.runtime.unix import control_client
 from aftbed.runtime.unix.launch import Launched, launch, options_for
@@ -72,9 +73,18 @@ def run_python(arguments: list[str], seconds_max: float) -> bytes:
 # -- runs -----------------------------------------------------------------------------------------
 
 
-def limited_run(ftm: str, placement: str, count: int, *, pin: bool) -> RunRecord:
-    """The record of a run of `count` requests in a closed loop."""
-    return finished(_start(ftm, placement, LoadRun(count, 0.0), pin), ends=("",))
+def limited_run(
+    ftm: str,
+    placement: str,
+    count: int,
+    *,
+    pin: bool,
+    application: str = "",
+    given: GivenRequests | None = None,
+) -> RunRecord:
+    """The record of a run of `count` requests in a closed loop; see `RunOptions` and `LoadRun`."""
+    load = LoadRun(count, 0.0, given.source if given is not None else "")
+    return finished(_start(ftm, placement, load, pin, application, given), ends=("",))
 
 
 class EndlessRun:
@@ -98,9 +108,18 @@ def endless_run(ftm: str, placement: str, rate_hz: float = 0.0, *, pin: bool = T
         run.record = finished(launched, STOPPED)
 
 
-def _start(ftm: str, placement: str, load: LoadRun, pin: bool) -> Launched:
-    options, listener = options_for(ftm=ftm, placement=placement, work=load, faults=(), pin=pin)
-    return launch(options, listener)
+def _start(
+    ftm: str,
+    placement: str,
+    load: LoadRun,
+    pin: bool,
+    application: str = "",
+    given: GivenRequests | None = None,
+) -> Launched:
+    options, listener = options_for(
+        ftm=ftm, placement=placement, work=load, faults=(), pin=pin, application=application
+    )
+    return launch(options, listener, given)
 
 
 def finished(launched: Launched, ends: tuple[str, ...]) -> RunRecord:

@@ -263,19 +263,21 @@ def resolved(spec: Spec, trust: Trust) -> Spec:
 
     The same for what is resolved already. Raises ConfigError, also where the function is not trusted.
     """
-    if spec.mechanisms == (SUITABLE,):
-        app = spec.system.app
-        declared = declared_by(app, trust) if app else default_application().characteristics
-        suit = tuple(ftm for ftm in EXPRESSIONS if not unsuitable(ftm, declared))
-        faults = tuple(_for_known(spec, entry, suit, declared) for entry in spec.faults)
-        spec = msgspec.structs.replace(
-            spec, mechanisms=suit, faults=tuple(entry for entry in faults if entry is not None)
-        )
-        spec = _with_each_adaptation(spec, declared)
-        names = [stratum.name for stratum in strata_of(msgspec.structs.replace(spec, leave_out=()))]
-        there = (pattern for pattern in spec.leave_out if any(fnmatchcase(name, pattern) for name in names))
-        return msgspec.structs.replace(spec, leave_out=tuple(there))
-    return _with_each_adaptation(spec)
+    if spec.mechanisms != (SUITABLE,):
+        return _with_each_adaptation(spec)
+    app = spec.system.app
+    return suited(spec, declared_by(app, trust) if app else default_application().characteristics)
+
+
+def suited(spec: Spec, declared: Characteristics) -> Spec:
+    """`spec`, whose mechanisms are `suitable`, for a function that declares this. Raises ConfigError."""
+    suit = tuple(ftm for ftm in EXPRESSIONS if not unsuitable(ftm, declared))
+    faults = tuple(_for_known(spec, entry, suit, declared) for entry in spec.faults)
+    left = tuple(entry for entry in faults if entry is not None)
+    spec = _with_each_adaptation(msgspec.structs.replace(spec, mechanisms=suit, faults=left), declared)
+    names = [stratum.name for stratum in strata_of(msgspec.structs.replace(spec, leave_out=()))]
+    there = (pattern for pattern in spec.leave_out if any(fnmatchcase(name, pattern) for name in names))
+    return msgspec.structs.replace(spec, leave_out=tuple(there))
 
 
 def _for_known(

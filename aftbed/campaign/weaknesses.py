@@ -1,10 +1,10 @@
 """What a campaign has found against a function and its mechanisms, and what would have held.
 
 A *weakness* is a kind of fault (or none at all) with experiments that ended neither `masked` nor `tolerated`,
-and the strata where. Some are limits of a mechanism: it does not promise to hold such a fault, so the outcome
-was expected; the mechanisms under which all experiments with the same fault ended well are named, if there are
-enough of them to rule out chance. Others are not expected: then the function does not do what it declares, and
-what it has to change follows from where it shows:
+and the strata where. Some are limits of a mechanism, which does not promise to hold such a fault, so that the
+outcome was expected; the mechanisms under which all experiments with the same fault ended well are named, if
+there are enough of them to rule out chance. Others are not expected: then the function does not do what it
+declares, and what it has to change follows from where it shows:
 
 | bad without a fault              | the function                                                     |
 |----------------------------------|------------------------------------------------------------------|
@@ -52,7 +52,7 @@ EFFECTS: Final = {
 }
 
 
-class Seen(msgspec.Struct, frozen=True):
+class SeenPlace(msgspec.Struct, frozen=True):
     """`count` of `experiments` under a mechanism; `place` has the adaptation, too."""
 
     place: str
@@ -70,8 +70,8 @@ class Weakness(msgspec.Struct, frozen=True):
     fault: str
     effect: str
     expected: bool
-    seen: tuple[Seen, ...]
-    held: tuple[Seen, ...]
+    seen: tuple[SeenPlace, ...]
+    held: tuple[SeenPlace, ...]
     advice: str
 
 
@@ -101,15 +101,16 @@ class _Group(msgspec.Struct, frozen=True):
         more = f" {self.stratum.adaptation.name}" if self.stratum.adaptation.texts else ""
         return self.stratum.ftm + more
 
-    def seen(self, confidence: float) -> Seen:
+    def seen(self, confidence: float) -> SeenPlace:
         count, of = len(self.bad), len(self.results)
-        return Seen(self.place, count, of, proportion(count, of, confidence))
+        return SeenPlace(self.place, count, of, proportion(count, of, confidence))
 
 
 def weaknesses(spec: Spec, groups: dict[str, list[Result]], confidence: float) -> tuple[Weakness, ...]:
     """Those of a campaign, the unexpected ones first. `groups`: its results by stratum."""
     known = {stratum.name: stratum for stratum in strata_of(spec)}
-    found = [_Group(known[name], tuple(group)) for name, group in groups.items() if name in known]
+    told_of = {name: tuple(filter(_tells, group)) for name, group in groups.items() if name in known}
+    found = [_Group(known[name], group) for name, group in told_of.items() if group]
     calm_bad = {g.stratum.ftm: g for g in found if g.calm and g.unexpected}
     told = list(_calm(found, calm_bad, confidence))
     sound = [group for group in found if group.stratum.ftm not in calm_bad]
@@ -127,21 +128,26 @@ def weaknesses(spec: Spec, groups: dict[str, list[Result]], confidence: float) -
     return tuple(sorted(told, key=lambda weakness: weakness.expected))
 
 
+def _tells(result: Result) -> bool:
+    """Not of a run on a machine that was too busy."""
+    return not (result.noisy and result.outcome in UNKNOWN)
+
+
 def _weakness(
-    groups: list[_Group], held: Iterable[Seen], advice: str, confidence: float, *, expected: bool
+    groups: list[_Group], held: Iterable[SeenPlace], advice: str, confidence: float, *, expected: bool
 ) -> Weakness:
     seen = tuple(group.seen(confidence) for group in groups)
     return Weakness(groups[0].stratum.fault.name, _effect(groups), expected, seen, tuple(held), advice)
 
 
-def _held(able: Iterable[_Group], bad: list[_Group], confidence: float) -> Iterator[Seen]:
+def _held(able: Iterable[_Group], bad: list[_Group], confidence: float) -> Iterator[SeenPlace]:
     """Where all that struck ended well, and surely more often than in `bad`."""
     count, of = sum(len(group.bad) for group in bad), sum(len(group.results) for group in bad)
     for group in able:
         struck = sum(r.activated for r in group.results)
         share = proportion(struck, struck, confidence)
         if not group.bad and 1 - share.low < proportion(count, of, confidence).low:
-            yield Seen(group.place, struck, struck, share)
+            yield SeenPlace(group.place, struck, struck, share)
 
 
 def _effect(groups: Iterable[_Group]) -> str:

@@ -19,6 +19,7 @@ COMMANDS: Final[CommandTable] = {
     "adapt": ("adapt:adapt", "Change the mechanism of a live run: update, switch, compose."),
     "bench": ("bench:bench", "Measure, with the bare limit measured beside each figure."),
     "ftm": ("ftm:ftm", "What each mechanism tolerates and needs, and which one suits."),
+    "app": ("function:function", "The protected function of a user: what it declares, measured."),
     "explore": ("explore:explore", "Simulate every experiment of one kind, with an exact count."),
     "campaign": (
         "campaign:campaign",

@@ -15,12 +15,16 @@ from aftbed.bench.adaptation import bench_adapt
 from aftbed.bench.cycle import bench_cycle, bench_hops
 from aftbed.bench.recovery import bench_recovery
 from aftbed.bench.resources import bench_launch, bench_memory
-from aftbed.cli.options import Ftm, Recipe, print_json
+from aftbed.cli.options import App, Ftm, Recipe, print_json
+from aftbed.cli.request_options import RequestSource
 from aftbed.core.errors import ConfigError
 from aftbed.ftm.compose import DUPLEX, replication_of
+from aftbed.functions.request_file import REQUESTS_MAX, names_function
+from aftbed.functions.source import located
 
 bench = typer.Typer()
 REQUESTS_MIN: Final = 5000
+SENT_FUNCTION: Final = 512  # requests of MODULE:FUNCTION, sent in turn
 KILLS_MIN: Final = 1
 PROGRESS: Final = "  measuring: "
 
@@ -34,11 +38,21 @@ def cycle(
     ftm: Ftm = "pbr",
     placement: Placement = "process",
     requests: Annotated[int, typer.Option(min=100, help="After the warm-up.")] = REQUESTS_MIN,
+    app: App = None,
+    sent: Annotated[
+        str | None, typer.Option(help="What --app is sent: FILE (CSV, JSON lines) or MODULE:FUNCTION.")
+    ] = None,
     pin: Pin = True,
     json: Json = False,
 ) -> None:
     """Cycle time at the client, alternating with a bare ring of the same number of hops."""
-    _print(bench_cycle(ftm, placement, requests, pin=pin), as_json=json)
+    application, given = located(app) if app is not None else "", None
+    if sent is not None:
+        count = SENT_FUNCTION if names_function(sent) else None
+        source = RequestSource(sent, count=count, count_max=REQUESTS_MAX, expect=None, tolerance=None)
+        given = source.of(0)
+    result = bench_cycle(ftm, placement, requests, pin=pin, application=application, given=given)
+    _print(result, as_json=json)
 
 
 @bench.command()

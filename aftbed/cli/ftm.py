@@ -24,7 +24,7 @@ from aftbed.adapt.suitability import (
     remarks,
     table_from,
 )
-from aftbed.cli.options import Json, check_range, print_json
+from aftbed.cli.options import Json, check_range, print_blocks, print_json
 from aftbed.core.application import NONE
 from aftbed.core.errors import ConfigError
 from aftbed.core.graph import Graph
@@ -79,7 +79,7 @@ def show(
         print_json({**_summary(wanted, graph), "bricks": bricks, "channels": channels})
         return
     bandwidth = "no" if wanted.bandwidth == "none" else wanted.bandwidth
-    _print_blocks(
+    print_blocks(
         tolerates=[", ".join(wanted.tolerates) or "nothing"],
         detects=[", ".join(wanted.detects)] if set(wanted.detects) - set(wanted.tolerates) else [],
         needs=[*wanted.deterministic, *wanted.state_access, *wanted.exact_state]
@@ -132,7 +132,7 @@ def check(
         access = "no state access" if state_access == NONE else f"{state_access} state access"
         kbit_s = resources.bandwidth_kbit_s
         limit = "bandwidth not limited" if kbit_s is None else f"{kbit_s:g} kbit/s"
-        _print_blocks(
+        print_blocks(
             faults=[", ".join(model.asked()) or "none"],
             function=[f"{determinism}, {access} ({app or 'the brake function'})"],
             resources=[f"{_cpus(resources.cpus)}, load {resources.cpu_load:.0%}, {limit}"],
@@ -212,10 +212,3 @@ def _channels(graph: Graph) -> list[str]:
 
 def _cpus(count: int) -> str:
     return "1 CPU" if count == 1 else f"{count} CPUs"
-
-
-def _print_blocks(**blocks: list[str]) -> None:
-    """Each block's lines, its name before the first."""
-    for name, lines in blocks.items():
-        for index, line in enumerate(lines):
-            print(f"{'' if index else name:<10} {line}")

@@ -131,6 +131,13 @@ def print_json(document: object) -> None:
     print(text)
 
 
+def print_blocks(**blocks: list[str]) -> None:
+    """Print each block's lines, its name before the first."""
+    for name, lines in blocks.items():
+        for index, line in enumerate(lines):
+            print(f"{'' if index else name:<10} {line}")
+
+
 def class_source(text: str, folder: Path | None = None) -> str:
     """`FILE.py:CLASS` with the absolute path of the file, which is looked up in `folder`, here if left out.
 

@@ -64,6 +64,7 @@ from aftbed.search.tally import Tally, happened_in
 from aftbed.vehicle.scenarios.library import load_scenario
 
 COUNT_MAX: Final = 100_000
+PAGE_BYTES: Final = (16, 65536)
 LOAD_S_MAX: Final = 3600.0  # of virtual time
 MINUTES_MAX: Final = 100_000.0
 SHRUNK_MAX: Final = 3  # broken runs: shrinking one takes up to 400 runs
@@ -114,6 +115,12 @@ class SimArguments(msgspec.Struct, frozen=True):
     may_fail: Annotated[
         bool, typer.Option("--may-fail", help="A run may pass even if an --adapt was not done.")
     ] = False
+    page_bytes: Annotated[
+        int | None,
+        typer.Option(
+            help="Of a page of a checkpoint; 4096 if left out. Of 4 pages or more only changes travel."
+        ),
+    ] = None
     swarm: Annotated[bool, typer.Option("--swarm", help="Draw everything from the seed.")] = False
     minutes: Annotated[float | None, typer.Option(help="Simulate the seeds from --seed on, for so long.")] = (
         None
@@ -164,7 +171,7 @@ def sim(given: SimArguments) -> int:
 
 def _used(given: SimArguments, *but: str) -> list[str]:
     """The options that were given, except those of the fields `but`."""
-    names = {"adaptations": "adapt", "may_fail": "may-fail"}
+    names = {"adaptations": "adapt", "may_fail": "may-fail", "page_bytes": "page-bytes"}
     values = asdict(given).items()
     used = [name for name, value in values if value is not None and value is not False and value != ()]
     return [f"--{names.get(name, name)}" for name in used if name not in but]
@@ -213,6 +220,7 @@ def _setup_maker(given: SimArguments) -> MakeSetup:
         placement=graph.placement,
         faults=faults,
         adaptations=adaptations,
+        page_bytes=_page_bytes(given),
         application=application,
     )
     for fault in faults:
@@ -263,6 +271,13 @@ def _load(given: SimArguments) -> Setup:
     return Setup(count=count, rate_hz=rate_hz)
 
 
+def _page_bytes(given: SimArguments) -> int:
+    least, most = PAGE_BYTES
+    if given.page_bytes is not None and not least <= given.page_bytes <= most:
+        raise ConfigError(f"--page-bytes {given.page_bytes}: {least} to {most} are allowed")
+    return given.page_bytes or DEFAULT.page_bytes
+
+
 def read_fault(text: str, graph: Graph) -> Fault:
     """A fault in the words of `aftbed run --inject`. Raises ConfigError."""
     fault = parse(text)
@@ -311,7 +326,9 @@ def described(setup: Setup) -> str:
     parts = [f"{setup.ftm} ({setup.placement}), seed {setup.seed}, {load}"]
     parts += [setup.application] if setup.application else []
     parts += [f"{doom.brick} dies before its effect {doom.effect}" for doom in setup.dooms]
-    return "; ".join([*parts, *map(str, setup.faults), *map(_adaptation_words, setup.adaptations)])
+    parts += [*map(str, setup.faults), *map(_adaptation_words, setup.adaptations)]
+    parts += [f"pages of {setup.page_bytes} bytes"] if setup.page_bytes != DEFAULT.page_bytes else []
+    return "; ".join(parts)
 
 
 def _adaptation_words(adaptation: Scheduled) -> str:
@@ -345,6 +362,7 @@ def repeating(setup: Setup, *, swarm: bool = False) -> str:
         expect=requests.expect or None if requests is not None else None,
         tolerance=requests.tolerance if requests is not None else None,
         scenario=setup.scenario or None,
+        page_bytes=setup.page_bytes if setup.page_bytes != DEFAULT.page_bytes else None,
         faults=tuple(map(str, setup.faults)),
         adaptations=tuple(map(_adaptation_words, setup.adaptations)),
         recipe=next((a.goal.recipe for a in setup.adaptations if a.goal.recipe != RECIPES[0]), None),
@@ -377,6 +395,7 @@ def _command(given: SimArguments) -> str:
         ("--scenario", given.scenario),
         ("--count", None if given.count is None else str(given.count)),
         ("--rate", None if given.rate is None else _number(given.rate)),
+        ("--page-bytes", None if given.page_bytes is None else str(given.page_bytes)),
         ("--requests", given.requests),
         ("--expect", given.expect),
         ("--tolerance", None if given.tolerance is None else repr(given.tolerance)),

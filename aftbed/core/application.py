@@ -7,8 +7,9 @@ know in common. Requests, replies and states are opaque bytes to the mechanism.
 import math
 import re
 import struct
+from collections.abc import Mapping
 from enum import Enum
-from typing import Final, Literal, Protocol
+from typing import Final, Literal, Protocol, TypeGuard
 
 import msgspec
 
@@ -97,7 +98,8 @@ class Application(Protocol):
     """A protected function. What it declares is believed, and measured by campaigns.
 
     One whose state has a fixed layout may declare it, as `fields: tuple[Field, ...]`: see `fields_of`; one
-    whose replies have, as `reply_fields`.
+    whose replies have, as `reply_fields`. One with a large state may know its changes (`KnowsChanges`); one
+    that holds more than memory may have `close()`.
 
     `execute` is the only thing that changes the state. No clock, no chance, no I/O: time comes
     in with the request.
@@ -126,6 +128,37 @@ class Application(Protocol):
         Looks at nothing but these two, and changes nothing.
         """
         ...
+
+
+def close(application: Application) -> None:
+    """Free what a function holds beside its memory, as a process; it is not used from then on."""
+    closing = getattr(application, "close", None)
+    if closing is not None:
+        closing()
+
+
+class KnowsChanges(Application, Protocol):
+    """What a function with a large state may have besides, both or neither.
+
+    Its checkpoints then cost as much as what changed, and not as much as the state. The length of the state
+    never changes. Page N of it begins at byte N * `page_bytes`, and is as long, unless the state ends in it.
+    """
+
+    def changes(self, page_bytes: int) -> Mapping[int, bytes]:
+        """Return the pages that `capture` would show changed since the last call of `changes`, by number.
+
+        Whatever changed them: `execute`, `restore`, `patch`. A page too many does no harm, one too few does.
+        """
+        ...
+
+    def patch(self, page_bytes: int, pages: Mapping[int, bytes]) -> None:
+        """Replace these pages of the state. Raises PeerError, state unchanged, if the result is no state."""
+        ...
+
+
+def knows_changes(application: Application) -> TypeGuard[KnowsChanges]:
+    """Whether it has both methods."""
+    return hasattr(application, "changes") and hasattr(application, "patch")
 
 
 def fields_of(application: Application | type[Application]) -> tuple[Field, ...]:

@@ -53,12 +53,34 @@ class Reply(Message, frozen=True, tag=2):
     payload: bytes
 
 
+class Pages(msgspec.Struct, frozen=True, array_like=True, gc=False):
+    """The state of a checkpoint, `state_bytes` long: what of it differs from that of checkpoint `base`.
+
+    A page is `page_bytes` long, but for the last. `numbers`: those in `data`, in ascending order. With `base`
+    0 `data` is the whole state. `check`: a CRC-32 of all of this (`ftm.pages`).
+    """
+
+    state_bytes: int
+    base: int
+    page_bytes: int
+    numbers: tuple[int, ...]
+    data: bytes
+    check: int
+
+
+State = bytes | Pages  # of a checkpoint; a small one always travels as bytes
+
+
 class CaptureState(Message, frozen=True, tag=3):
-    """Asks the Server for its state: after exactly request `request_id`, or before it."""
+    """Asks the Server for its state: after exactly request `request_id`, or before it.
+
+    `base`: a checkpoint, by its request; what has changed since is enough. 0: the whole state is wanted.
+    """
 
     TRAFFIC = Traffic.STATE
     epoch: int
     request_id: int
+    base: int = 0
 
 
 class StateCaptured(Message, frozen=True, tag=4):
@@ -67,7 +89,7 @@ class StateCaptured(Message, frozen=True, tag=4):
     TRAFFIC = Traffic.STATE
     epoch: int
     request_id: int
-    state: bytes
+    state: State
 
 
 class Checkpoint(Message, frozen=True, tag=5):
@@ -77,7 +99,7 @@ class Checkpoint(Message, frozen=True, tag=5):
     epoch: int
     request_id: int
     reply: bytes
-    state: bytes
+    state: State
 
 
 class RestoreState(Message, frozen=True, tag=6):
@@ -86,7 +108,7 @@ class RestoreState(Message, frozen=True, tag=6):
     TRAFFIC = Traffic.STATE
     epoch: int
     request_id: int
-    state: bytes
+    state: State
 
 
 class StateRestored(Message, frozen=True, tag=7):

@@ -15,18 +15,23 @@ from aftbed.core.application import Application
 from aftbed.core.brick import Brick
 from aftbed.core.events import Event
 from aftbed.core.graph import Kind
+from aftbed.ftm.pages import PAGE_BYTES
 
 FaultClass = Literal["crash", "value", "implausible"]
 Level = Literal["none", "low", "high"]
 
 
 class Setting(msgspec.Struct, frozen=True):
-    """What a brick is made for: which replica (1, 2; 0 for none), which epoch, leading or not."""
+    """What a brick is made for: which replica (1, 2; 0 for none), which epoch, leading or not.
+
+    `page_bytes`: of a page of a checkpoint, which a test may make small.
+    """
 
     replica: int
     epoch: int
     leads: bool
     application: Callable[[], Application]
+    page_bytes: int = PAGE_BYTES
 
 
 class Emits(msgspec.Struct, frozen=True):

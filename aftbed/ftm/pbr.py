@@ -1,7 +1,8 @@
 """PBR, primary-backup replication: the backup owns the reply before the client does.
 
 Paper, III-A: After takes the result from Proceed, captures the Server's state, and sends a checkpoint to the
-After of the backup replica, which applies it. Without a backup (it died, the new one is not ready) the
+After of the backup replica, which applies it. Of a large state, what changed since the checkpoint before is
+captured and sent (`pages`). Without a backup (it died, the new one is not ready) the
 primary serves alone, and the state that it captures goes nowhere.
 
 A backup applies one checkpoint at a time: the next one waits in the channel, which outlives the primary. When
@@ -14,6 +15,7 @@ from typing import ClassVar, Final
 from aftbed.core.brick import (
     ANY_STATE,
     CONTROL,
+    NO_REQUEST,
     SAME_STATE,
     BrickState,
     Effect,
@@ -37,7 +39,7 @@ from aftbed.core.messages import (
     StateRestored,
     StoreReply,
 )
-from aftbed.ftm.chain import COMPUTE, PASS_BEFORE, lead, learn_duplex, promote, promote_at_once
+from aftbed.ftm.chain import COMPUTE, PASS_BEFORE, lead, promote, promote_at_once
 from aftbed.ftm.declaration import BrickKind, Emits, Mechanism, Suitability
 
 
@@ -58,13 +60,13 @@ _APPLIED: Final = Event.CHECKPOINT_APPLIED
 
 
 class PbrAfter(Machine):
-    """`duplex`: there is a backup to send checkpoints to."""
+    """`duplex`: there is a backup to send checkpoints to; `base`: the last one that was sent to it, or 0."""
 
     AT_REST = (_S.IDLE, _S.STANDBY, _S.ENDED, _S.PROMOTED)
 
     def __init__(self, epoch: int, leads: bool) -> None:
         super().__init__(_S.IDLE if leads else _S.STANDBY)
-        self.epoch, self.duplex = epoch, False
+        self.epoch, self.duplex, self.base = epoch, False, NO_REQUEST
         self.promote_epoch = 0  # the epoch to lead under, once promoted
         self._reply: Reply | None = None
         self._checkpoint: Checkpoint | None = None
@@ -74,7 +76,7 @@ class PbrAfter(Machine):
     def hold_reply(self, msg: Reply) -> list[Effect]:
         """Ask the Server for the state that goes with the reply."""
         self._reply = msg
-        return [Send("aft2srv", CaptureState(msg.epoch, msg.request_id))]
+        return [Send("aft2srv", CaptureState(msg.epoch, msg.request_id, self.base))]
 
     def checkpoint_then_reply(self, msg: StateCaptured) -> list[Effect]:
         """The backup's copy first, then the client's."""
@@ -85,6 +87,7 @@ class PbrAfter(Machine):
         self._reply = None
         if not self.duplex:
             return [Send("aft2pro", reply)]
+        self.base = reply.request_id
         # A crash between the two sends leaves a backup that can repeat the reply. Swapped, the client could
         # hold a reply that the backup never knew.
         return [
@@ -92,6 +95,12 @@ class PbrAfter(Machine):
             Note(_SENT, reply.request_id),
             Send("aft2pro", reply),
         ]
+
+    def learn_backup(self, msg: Rebound) -> list[Effect]:
+        """There is a backup while `aft2aft` is bound. One that has just been bound has no checkpoint."""
+        if msg.port == "aft2aft":
+            self.duplex, self.base = msg.bound, NO_REQUEST
+        return []
 
     # -- the backup ---------------------------------------------------------------------------
 
@@ -130,7 +139,7 @@ class PbrAfter(Machine):
         (_S.ENDED, CONTROL, Promotion): (promote_at_once("aft2pro"), _S.IDLE),
         (_S.ENDED, "aft2aft", Checkpoint): (apply, _S.APPLYING),  # another channel was bound since
         (_S.ENDED, "aft2aft", ChannelEnded): (ignore, SAME_STATE),
-        (ANY_STATE, CONTROL, Rebound): (learn_duplex("aft2aft"), SAME_STATE),
+        (ANY_STATE, CONTROL, Rebound): (learn_backup, SAME_STATE),
     }
 
 

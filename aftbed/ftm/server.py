@@ -2,7 +2,7 @@
 
 State access is the A of FT/A/R that some mechanisms need. The Server knows neither the function (bytes in,
 bytes out) nor the mechanism: it learns what will be asked of it from which of its outputs are bound. So a
-switch to another mechanism never exchanges it.
+switch to another mechanism never exchanges it. Of a large state only what changed goes to an After (`pages`).
 
 | `srv2aft` bound | `srv2bfr` bound | what is asked of it                                        |
 |-----------------|-----------------|------------------------------------------------------------|
@@ -48,6 +48,7 @@ from aftbed.core.messages import (
     Tried,
 )
 from aftbed.ftm.declaration import BrickKind, Emits
+from aftbed.ftm.pages import PAGE_BYTES, CheckpointBase
 
 
 class ServerState(BrickState):
@@ -88,13 +89,14 @@ _RESTORED: Final = Event.STATE_RESTORED
 
 
 class Server(Machine):
-    """`replica` (1 or 2) marks the replies as its own."""
+    """`replica` (1 or 2) marks the replies as its own; `page_bytes`: of a page of a checkpoint."""
 
     AT_REST = (_S.STANDBY, _S.READY)
 
-    def __init__(self, application: Application, replica: int) -> None:
+    def __init__(self, application: Application, replica: int, page_bytes: int = PAGE_BYTES) -> None:
         super().__init__()
         self.application, self.replica = application, replica
+        self._base = CheckpointBase(page_bytes)
         self._state_after = self._state_before = False  # whether the outputs for it are bound
 
     def execute(self, msg: Request) -> list[Effect]:
@@ -118,17 +120,20 @@ class Server(Machine):
         return self._try(msg, RERUN)
 
     def capture_after(self, msg: CaptureState) -> list[Effect]:
-        """After asks for the state after exactly this request."""
-        return self._capture(msg, "srv2aft")
+        """After asks for the state after exactly this request: a checkpoint."""
+        state = self._base.capture(self.application, msg.request_id, msg.base)
+        captured = StateCaptured(msg.epoch, msg.request_id, state)
+        return [Note(_CAPTURED, msg.request_id), Send("srv2aft", captured)]
 
     def capture_before(self, msg: CaptureState) -> list[Effect]:
-        """Before asks for the state before this request."""
-        return self._capture(msg, "srv2bfr")
+        """Before asks for the state before this request: the trials start from it."""
+        captured = StateCaptured(msg.epoch, msg.request_id, self.application.capture())
+        return [Note(_CAPTURED, msg.request_id), Send("srv2bfr", captured)]
 
     def restore_state(self, msg: RestoreState) -> list[Effect]:
         """Take over the state of a checkpoint. A backup that cannot is dropped, and a new one is made."""
         try:
-            self.application.restore(msg.state)
+            self._base.restore(self.application, msg.request_id, msg.state)
         except PeerError as error:
             reason = f"the state after request {msg.request_id} is refused: {error}"
             return [Note(Event.DETECTED_STOP, msg.request_id), Halt(reason)]
@@ -142,7 +147,8 @@ class Server(Machine):
         return _OUTPUTS.get(msg.port, BoundOutput.OTHER)
 
     def rebind_after(self, msg: Rebound) -> list[Effect]:
-        """With another After this replica may back up from now on, or lead."""
+        """With another After this replica may back up from now on, or lead: the next checkpoint is whole."""
+        self._base.forget()
         self._state_after = msg.bound
         return self._go_by_bindings()
 
@@ -171,20 +177,18 @@ class Server(Machine):
             Send("srv2prd", tried),
         ]
 
-    def _capture(self, msg: CaptureState, port: str) -> list[Effect]:
-        captured = StateCaptured(msg.epoch, msg.request_id, self.application.capture())
-        return [Note(_CAPTURED, msg.request_id), Send(port, captured)]
-
     def capture(self) -> bytes:
         return self.application.capture()
 
     def restore(self, state: bytes) -> None:
         self.application.restore(state)
+        self._base.replaced()
 
     def migrate(self, state: bytes) -> None:
         """Take over the state of another function, which has been this one's until now."""
         migrate = getattr(self.application, "migrate", self.application.restore)
         migrate(state)
+        self._base.replaced()
 
     # -- the tables ---------------------------------------------------------------------------
 
@@ -257,13 +261,13 @@ SERVER: Final = BrickKind(
     ("prd2srv", "aft2srv", "bfr2srv"),
     ("srv2prd", "srv2aft", "srv2bfr"),
     ("aft2srv", "bfr2srv", "srv2aft", "srv2bfr"),
-    make=lambda setting: Server(setting.application(), setting.replica),
+    make=lambda setting: Server(setting.application(), setting.replica, setting.page_bytes),
     events=(Emits(Event.SERVER_ENTER), Emits(Event.SERVER_EXIT)),
 )
 BARE_SERVER: Final = BrickKind(  # without a mechanism
     "bare.server",
     ("prd2srv",),
     ("srv2prd",),
-    make=lambda setting: Server(setting.application(), setting.replica),
+    make=lambda setting: Server(setting.application(), setting.replica, setting.page_bytes),
     events=(Emits(Event.SERVER_ENTER), Emits(Event.SERVER_EXIT)),
 )

@@ -90,6 +90,8 @@ class TrBefore(Machine):
         assert request is not None
         if msg.request_id != request.request_id:
             raise PeerError(f"state for request {msg.request_id}, expected {request.request_id}")
+        if not isinstance(msg.state, bytes):
+            raise PeerError(f"state for request {msg.request_id} in pages, expected whole")
         self._request = None
         trial = Trial(request.epoch, request.request_id, request.payload, msg.state, rerun=False)
         return [Note(_BEFORE_EXIT, request.request_id), Send("bfr2prd", trial)]

@@ -2,6 +2,7 @@
 
 import importlib
 import importlib.util
+import traceback
 from collections.abc import Callable
 from importlib.machinery import SourceFileLoader
 from pathlib import Path
@@ -9,7 +10,7 @@ from types import CodeType, ModuleType
 from typing import Final, assert_never
 
 from aftbed.core.application import REPLY_BYTES_MAX, STATE_BYTES_MAX, Application, Characteristics
-from aftbed.core.errors import ConfigError
+from aftbed.core.errors import ConfigError, FunctionFailedError, PeerError
 from aftbed.functions.source import FunctionKind, FunctionSource, parse_source
 
 APPLICATION_NAMES: Final = ("execute", "capture", "restore", "characteristics")
@@ -128,30 +129,55 @@ def _application_class(source: str, code: Code) -> type:
 
 
 def _checked(found: type) -> Callable[[], Application]:
-    """The class, with its results checked: what is no bytes, or too long, ends the node (fail-silence).
+    """The class, with what it does checked: no bytes, too many, or any error but PeerError ends the node.
 
     Otherwise nothing that it sends could be read, and the service would stand still. Without an assertion
     of its own, every reply is acceptable.
     """
 
+    name = found.__qualname__
+
+    def tried(call: Callable[..., object], *given: object) -> object:
+        try:
+            return call(*given)
+        except PeerError:
+            raise
+        except Exception as error:
+            *_, last = traceback.extract_tb(error.__traceback__)
+            where = f"{last.filename}:{last.lineno}, in {last.name}"
+            raise FunctionFailedError(f"{name}: {type(error).__name__}: {error} ({where})") from error
+
+    def checked(what: str, result: object, bytes_max: int) -> bytes:
+        if not isinstance(result, bytes):
+            kind = type(result).__name__
+            raise FunctionFailedError(f"{name}: {what} returned {kind}, bytes are required")
+        if len(result) > bytes_max:
+            raise FunctionFailedError(
+                f"{name}: {what} returned {len(result)} bytes, at most {bytes_max} are allowed"
+            )
+        return result
+
     class Checked(found):  # type: ignore[misc]
         def execute(self, request: bytes) -> bytes:
-            return _bytes("execute", super().execute(request), REPLY_BYTES_MAX)
+            return checked("execute", tried(super().execute, request), REPLY_BYTES_MAX)
 
         def capture(self) -> bytes:
-            return _bytes("capture", super().capture(), STATE_BYTES_MAX)
+            return checked("capture", tried(super().capture), STATE_BYTES_MAX)
+
+        def restore(self, state: bytes) -> None:
+            tried(super().restore, state)
 
         def acceptable(self, request: bytes, reply: bytes) -> bool:
             own = getattr(super(), "acceptable", None)
-            return own is None or own(request, reply)
+            return own is None or bool(tried(own, request, reply))
 
-    Checked.__name__, Checked.__qualname__ = found.__name__, found.__qualname__
-    return Checked
+    class Tracked(Checked):
+        def changes(self, page_bytes: int) -> object:
+            return tried(super().changes, page_bytes)
 
+        def patch(self, page_bytes: int, pages: object) -> None:
+            tried(super().patch, page_bytes, pages)
 
-def _bytes(what: str, result: object, bytes_max: int) -> bytes:
-    if not isinstance(result, bytes):
-        raise TypeError(f"{what} returned {type(result).__name__}, bytes are required")
-    if len(result) > bytes_max:
-        raise ValueError(f"{what} returned {len(result)} bytes, at most {bytes_max} are allowed")
-    return result
+    made = Tracked if hasattr(found, "changes") and hasattr(found, "patch") else Checked
+    made.__name__, made.__qualname__ = found.__name__, found.__qualname__
+    return made

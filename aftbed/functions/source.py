@@ -84,6 +84,11 @@ def parse_source(text: str) -> FunctionSource:
     raise ConfigError(f"{text!r} names no function; {FORMS}")
 
 
+def is_foreign(text: str) -> bool:
+    """Whether it names a function that is no Python class; "" is the built-in one."""
+    return bool(text) and parse_source(text).kind is not FunctionKind.CLASS
+
+
 def located(text: str, folder: Path | None = None) -> str:
     """`text` with absolute paths; relative ones are looked up in `folder`, here if left out.
 

@@ -23,7 +23,18 @@ from aftbed.core.errors import ConfigError, PeerError, unknown
 from aftbed.core.events import Event, event_named
 from aftbed.core.graph import Graph
 from aftbed.core.journal import Record
-from aftbed.core.messages import Checkpoint, Message, Reply, Request, StateCaptured, StoreReply, Trial, Tried
+from aftbed.core.messages import (
+    Checkpoint,
+    Message,
+    Pages,
+    Reply,
+    Request,
+    StateCaptured,
+    StoreReply,
+    Trial,
+    Tried,
+)
+from aftbed.ftm.pages import Spans, spans
 from aftbed.inject import targets
 from aftbed.inject.grammar import (
     PATTERN_KEYS,
@@ -31,6 +42,7 @@ from aftbed.inject.grammar import (
     WHEN_KEYS,
     Bit,
     BitPattern,
+    Bits,
     Byte,
     FaultWords,
     StuckBit,
@@ -142,13 +154,29 @@ class ValueFlip(FaultKind, frozen=True, tag=BITFLIP):
             return effects, None
         for at, effect in enumerate(effects):
             if isinstance(effect, Send) and isinstance(effect.message, Checkpoint):
-                sent = effect.message
-                data, bits = self._flip(sent.state + sent.reply, draw)
-                length = len(sent.state)
-                other = structs.replace(sent, state=data[:length], reply=data[length:])
-                effects = [*effects[:at], Send(effect.port, other), *effects[at + 1 :]]
-                return effects, Alteration(sent.request_id, bits, 8 * len(data))
+                altered, hit = self._alter_checkpoint(effect.message, draw)
+                return [*effects[:at], Send(effect.port, altered), *effects[at + 1 :]], hit
         return effects, None
+
+    def _alter_checkpoint(self, sent: Checkpoint, draw: int) -> tuple[Checkpoint, Alteration]:
+        """Bits count in the whole state and the reply behind it, though only pages of it may travel.
+
+        Their checksum stays as it is: it was made before.
+        """
+        state, reply = sent.state, sent.reply
+        if isinstance(state, Pages):
+            travels, parts, state_bytes = state.data, spans(state), state.state_bytes
+        else:
+            travels, parts, state_bytes = state, [(0, len(state))], len(state)
+        parts = [*parts, (state_bytes, state_bytes + len(reply))]
+        pattern = _in_parts(self.pattern, parts)
+        bits = () if pattern is None else bits_to_flip(pattern, travels + reply, draw) or ()
+        data = with_flipped(travels + reply, bits)
+        travels, reply = data[: len(travels)], data[len(travels) :]
+        altered = structs.replace(state, data=travels) if isinstance(state, Pages) else travels
+        in_whole = tuple(_in_whole(bit, parts) for bit in bits)
+        hit = Alteration(sent.request_id, in_whole, 8 * (state_bytes + len(reply)))
+        return structs.replace(sent, state=altered, reply=reply), hit
 
     def alter_at(self, brick: Brick, effects: list[Effect], at: int, draw: int) -> Alteration:
         """What the brick has in hand, and the message behind the Note that carries it away."""
@@ -242,10 +270,35 @@ class ValueFlip(FaultKind, frozen=True, tag=BITFLIP):
         if bits is None:
             unit, count = ("bytes", size // 8) if isinstance(self.pattern, Byte) else ("bits", size)
             return Receipt(ReceiptState.NOT_ACTIVATED, f"there are {count} {unit} {where}")
+        if self.place is ValuePlace.CHECKPOINT:
+            detail = f"{bit_names(bits)} {where} did not travel: nothing has changed there"
+            return Receipt(ReceiptState.NOT_ACTIVATED, detail)
         return Receipt(ReceiptState.NOT_ACTIVATED, f"the function refused {bit_names(bits)} {where}")
 
     def _where(self, injection: Injection, request_id: int) -> str:
         return f"of the {self.place.value} of request {request_id} in {injection.brick}"
+
+
+def _in_parts(pattern: BitPattern, parts: Spans) -> BitPattern | None:
+    """The pattern in what travels, laid end to end; None where its place does not travel."""
+    if isinstance(pattern, Bits) or pattern.at is None:
+        return pattern
+    unit, begins = 1 if isinstance(pattern, Byte) else 8, 0
+    for begin, end in parts:
+        if unit * begin <= pattern.at < unit * end:
+            return structs.replace(pattern, at=unit * (begins - begin) + pattern.at)
+        begins += end - begin
+    return None
+
+
+def _in_whole(bit: int, parts: Spans) -> int:
+    """The bit of the whole that is bit `bit` of what travels."""
+    left = bit
+    for begin, end in parts:
+        if left < 8 * (end - begin):
+            return 8 * begin + left
+        left -= 8 * (end - begin)
+    raise AssertionError(f"bit {bit} of {parts}")
 
 
 def _logged(brick: Brick) -> LoggedReplies | None:

@@ -7,15 +7,13 @@ anything but MessagePack of the declared type, the replies of the function are u
 
 import sys
 from collections.abc import Callable
-from types import ModuleType
 from typing import Final
 
 import msgspec
 
 from aftbed.core.application import Application, Characteristics
 from aftbed.core.errors import ConfigError
-from aftbed.functions.load import OWN_CODE, Code, characteristics_of
-from aftbed.functions.source import FunctionSource
+from aftbed.functions.load import OWN_CODE, characteristics_of
 from aftbed.judge.record import RunRecord
 from aftbed.judge.reference import (
     NamedChange,
@@ -33,9 +31,8 @@ from aftbed.runtime.unix.confined import JobFailedError, ProcessLimits, ask, ser
 from aftbed.runtime.unix.trust import (
     NOBODY,
     Trust,
+    VettedCode,
     VettedFiles,
-    check_unchanged,
-    load,
     search_path,
     vetted,
 )
@@ -166,21 +163,8 @@ def work(data: bytes) -> bytes:
         return msgspec.msgpack.encode(Failed(reason[:WORDS_MAX]))
 
 
-class _VettedCode(Code):
-    """From the bytes that were hashed; without any file of this package."""
-
-    def __init__(self, codes: tuple[VettedFiles, ...]) -> None:
-        self._codes = {code.place: code for code in codes}
-
-    def module(self, place: str) -> ModuleType:
-        return load(self._codes[place])
-
-    def permit(self, source: FunctionSource) -> None:
-        check_unchanged(self._codes[str(source)])
-
-
 def _done(job: Job) -> Answer:
-    code = _VettedCode(job.codes)
+    code = VettedCode(job.codes)
     match job.task:
         case Execute(first, changes, requests):
             return Replies(executed(requests, Succession(maker(first, code), loaded(changes, code))))

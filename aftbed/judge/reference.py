@@ -16,8 +16,8 @@ from typing import Final
 import msgspec
 
 from aftbed.adapt.engine import DONE
-from aftbed.core.application import Application, Characteristics, Field, reply_fields_of
-from aftbed.core.errors import PeerError
+from aftbed.core.application import Application, Characteristics, Field, close, reply_fields_of
+from aftbed.core.errors import FunctionFailedError, PeerError
 from aftbed.core.events import Event
 from aftbed.core.journal import EntryKind, History
 from aftbed.functions.load import Code, load_application
@@ -72,6 +72,10 @@ class Succession:
             if state:
                 getattr(old, "migrate", old.restore)(state)
         self._serve(old)
+
+    def close(self) -> None:
+        for version in (*self._before, self._function):
+            close(version)
 
     def capture(self) -> bytes:
         return self._function.capture()
@@ -155,16 +159,20 @@ def requests_of(history: History) -> Iterator[tuple[int, bytes]]:
 
 def executed(requests: Iterable[tuple[int, bytes]], bare: Application) -> ReferenceRun:
     """`bare` is a fresh one: it executes each request, in their order."""
-    replies = []
-    for number, payload in requests:
-        try:
-            replies.append((number, bare.execute(payload)))
-        except PeerError:
-            replies.append((number, b""))
+    replies, number = list[tuple[int, bytes]](), 0
+    try:
+        for number, payload in requests:
+            try:
+                replies.append((number, bare.execute(payload)))
+            except PeerError:
+                replies.append((number, b""))
+        state = bare.capture()
+    except FunctionFailedError as error:
+        return ReferenceRun((), b"", unknown=f"the bare function fails at request {number}: {error}")
     declared = getattr(bare, "characteristics", Characteristics())
     return ReferenceRun(
         tuple(replies),
-        bare.capture(),
+        state,
         getattr(bare, "deterministic", declared.deterministic),
         tolerance=declared.state_access.tolerance,
         reply_fields=reply_fields_of(bare),

@@ -1,15 +1,20 @@
 """The record of a simulated run, and what it breaks. Only this module of the judge imports the simulator."""
 
 import itertools
+from collections.abc import Callable
 from typing import Final
 
+from aftbed.core.application import Application, close
 from aftbed.core.events import Event
 from aftbed.core.script import ScriptKind
 from aftbed.ftm.compose import replication_of
 from aftbed.functions.load import NO_CODE, Code
+from aftbed.inject.crash import Crash
+from aftbed.inject.hang import Hang
+from aftbed.inject.slow import Slow
 from aftbed.judge.checks import Evidence
 from aftbed.judge.record import DriveEnd, Excuses, RunEnd, RunRecord
-from aftbed.judge.reference import ReferenceRun, reference_run, succession
+from aftbed.judge.reference import reference_run, succession
 from aftbed.judge.verdict import Breach, broken
 from aftbed.runtime.deployment import replica_of
 from aftbed.runtime.node import FUNCTION_FAILED
@@ -23,7 +28,7 @@ UNPROMISED_VALUES: Final = frozenset(
     for event in (Event.STATE_CAPTURED, Event.STATE_RESTORED, Event.CHECKPOINT_SENT)
     + (Event.CHECKPOINT_APPLIED, Event.REPLY_STORED, Event.DEDUPE_HIT)
 )
-WORDS_MAX: Final = 600  # of why the replies of a function are unknown
+HARMLESS: Final = (Crash, Hang, Slow)  # kinds of faults that alter no message and no state
 SINGLE: Final = "single"  # the node of that placement hosts both replicas
 
 
@@ -89,22 +94,31 @@ def service_struck_down(run: Run) -> bool:
     )
 
 
-def evidence_of_run(run: Run, code: Code = NO_CODE) -> Evidence:
+def evidence_of_run(
+    run: Run, code: Code = NO_CODE, function: Callable[[], Application] | None = None
+) -> Evidence:
     """With the bare server's run, which is executed here: this process has simulated the function, too.
 
-    Where a function of the user fails in it, its replies are unknown.
+    `function` makes the bare server of a run whose setup does not name it.
     """
-    record, source = record_of(run), run.setup.application
-    bare = succession(record, code)
+    record = record_of(run)
+    bare = succession(record, code) if function is None else function()
     try:
         return Evidence(record, reference_run(record.history, bare))
-    except Exception as error:  # whatever it does
-        if not source:
-            raise
-        why = f"{source} cannot be executed again: {type(error).__name__}: {error}"
-        return Evidence(record, ReferenceRun((), b"", unknown=why[:WORDS_MAX]))
+    finally:
+        close(bare)
 
 
-def breaches(run: Run, code: Code = NO_CODE) -> tuple[Breach, ...]:
+def breaches(
+    run: Run, code: Code = NO_CODE, function: Callable[[], Application] | None = None
+) -> tuple[Breach, ...]:
     """All that a simulated run breaks."""
-    return broken(evidence_of_run(run, code))
+    return (*broken(evidence_of_run(run, code, function)), *needless_stops(run))
+
+
+def needless_stops(run: Run) -> tuple[Breach, ...]:
+    """A brick that stopped itself, though nothing that it was given can have been altered."""
+    if not all(isinstance(fault.action, HARMLESS) for fault in run.setup.faults):
+        return ()
+    stops = run.history.events(Event.DETECTED_STOP)
+    return tuple(Breach("needless_stop", f"{r.node} stopped at request {r.request_id}") for r in stops)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final, Self
 from aftbed.campaign.experiment import Result
 from aftbed.campaign.statistics import Interval
 from aftbed.campaign.summary import NOT_ALL, GateResult, StratumSummary, Summary, TimeSummary
-from aftbed.campaign.weaknesses import Seen, Weakness
+from aftbed.campaign.weaknesses import SeenPlace, Weakness
 from aftbed.core.errors import shown
 from aftbed.judge.outcome import OUTCOMES
 
@@ -121,7 +121,7 @@ def remedy(found: Weakness) -> str:
     return "; ".join(filter(None, (found.advice, held))) or "nothing that was tried held it"
 
 
-def places(seen: Sequence[Seen]) -> str:
+def places(seen: Sequence[SeenPlace]) -> str:
     """`pbr 12 of 12 (73.5 to 100.0 %), ...`."""
     words = [f"{one.place} {one.count} of {one.experiments} ({_share(one.interval)})" for one in seen]
     more = len(words) - PLACES_MAX

@@ -5,24 +5,28 @@ The self-test sends recorded requests through a whole replica in memory. It runs
 the new brick, before that gets any channel: so whatever the brick does there harms nothing, and a brick that
 never ends is killed by the deadline of its preparation. Every request must be answered. Where the function is
 the one that runs, the replies must be those of the built-in bricks, byte for byte; a new function must give
-its own state back (`restore(capture())`).
+its own state back (`restore(capture())`), and know all its changes if it knows any.
 """
 
 from collections import defaultdict
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Final, TypeVar
 
 import msgspec
 
 from aftbed.adapt.plugins import make_brick
-from aftbed.core.application import Application
+from aftbed.core.application import Application, KnowsChanges, close, knows_changes
 from aftbed.core.brick import Brick, Effect
-from aftbed.core.errors import ConfigError
+from aftbed.core.errors import ConfigError, FunctionFailedError, PeerError
 from aftbed.core.graph import BrickSpec, Graph
 from aftbed.core.messages import AnyMessage, Message, Reply, Request
 from aftbed.ftm.compose import REPLICAS, chain
+from aftbed.ftm.pages import PAGE_BYTES
 from aftbed.ftm.registry import Setting
+from aftbed.ftm.server import Server
 from aftbed.functions.load import Code, load_application
+from aftbed.functions.source import is_foreign
 from aftbed.runtime import control
 from aftbed.runtime.devices import Device
 from aftbed.runtime.node import MemoryIO, Node, Stopped, nowhere
@@ -38,12 +42,18 @@ Out = TypeVar("Out")
 
 
 class Assembler:
-    """`function`: what is protected if the graph names nothing else."""
+    """`function`: what is protected if the graph names nothing else; `page_bytes`: see `Setting`."""
 
     def __init__(
-        self, function: Callable[[], Application], code: Code, make: MakeSetting | None = None
+        self,
+        function: Callable[[], Application],
+        code: Code,
+        make: MakeSetting | None = None,
+        page_bytes: int = PAGE_BYTES,
     ) -> None:
-        self._function, self._code = function, code
+        self._function, self._code, self._page_bytes = function, code, page_bytes
+        self._opaque: dict[str, Callable[[], Application]] = {}  # makers of functions that are no classes
+        self._made: list[Application] = []
         self._make: MakeSetting = make or (lambda spec, setting: make_brick(spec, setting, code))
 
     def build(
@@ -70,9 +80,29 @@ class Assembler:
         default.
         """
         number = REPLICAS.index(spec.replica) + 1 if spec.replica else 0
-        named = load_application(spec.application, self._code) if spec.application else self._function
+        named = self._maker(spec.application) if spec.application else self._function
         epoch = TEST_EPOCH if leader else order.epoch
-        return Setting(number, epoch, spec.replica == (leader or order.leader), named)
+        leads = spec.replica == (leader or order.leader)
+        return Setting(number, epoch, leads, named, self._page_bytes)
+
+    def _maker(self, application: str) -> Callable[[], Application]:
+        """Each class is loaded anew: replicas share no variable of a module, even in one process."""
+        make = self._opaque.get(application) or load_application(application, self._code)
+        if is_foreign(application):
+            self._opaque[application] = make
+
+        def made() -> Application:
+            function = make()
+            self._made.append(function)
+            return function
+
+        return made
+
+    def close(self) -> None:
+        """Close all functions that were made: programs end, models are removed."""
+        for function in self._made:
+            close(function)
+        self._made.clear()
 
     def _try_out(self, order: control.Assign, trial: control.SelfTest) -> None:
         """The self-test of bricks that are not built in."""
@@ -121,6 +151,23 @@ def _suspects(graph: Graph) -> str:
     return ", ".join(sorted({b.source or b.application for b in graph.bricks if b.source or b.application}))
 
 
+def _told(error: Exception) -> str:
+    known = isinstance(error, FunctionFailedError)
+    return str(error) if known else f"{type(error).__name__}: {error}"
+
+
+def _all_known(function: KnowsChanges, requests: tuple[bytes, ...]) -> bool:
+    before = function.capture()
+    function.changes(PAGE_BYTES)
+    for request in requests:
+        with suppress(PeerError):
+            function.execute(request)
+    after, pages = function.capture(), function.changes(PAGE_BYTES)
+    function.restore(before)
+    function.patch(PAGE_BYTES, pages)
+    return function.capture() == after and len(before) == len(after)
+
+
 class _Checked(Brick):
     """A brick whose exceptions are ConfigErrors."""
 
@@ -138,7 +185,7 @@ class _Checked(Brick):
             return self._brick.step(port, msg, now_ns)
         except Exception as error:
             raise ConfigError(
-                f"self-test: {self._name}: {type(msg).__name__} on {port}: {type(error).__name__}: {error}"
+                f"self-test: {self._name}: {type(msg).__name__} on {port}: {_told(error)}"
             ) from error
 
 
@@ -185,12 +232,24 @@ class _TestedChain:
         self._tried(lambda: self._server.restore(state), "restore")
         if self._tried(self._server.capture, "capture") != state:
             raise ConfigError(f"self-test: {_suspects(self._graph)}: it does not restore what it captures")
+        if isinstance(self._server, Server):
+            self._try_changes(self._server.application, requests)
         return self._replies
+
+    def _try_changes(self, function: Application, requests: tuple[bytes, ...]) -> None:
+        """Its changes, put on the state of before, are its state. Raises ConfigError."""
+        has = [name for name in ("changes", "patch") if hasattr(function, name)]
+        if len(has) == 1:
+            raise ConfigError(f"self-test: {_suspects(self._graph)}: it has {has[0]}, and not the other one")
+        if knows_changes(function) and not self._tried(lambda: _all_known(function, requests), "changes"):
+            raise ConfigError(
+                f"self-test: {_suspects(self._graph)}: changes and patch do not give the state of capture"
+            )
 
     def _tried(self, call: Callable[[], Result], what: str) -> Result:
         """What the call returns. Raises ConfigError for any exception of it."""
         try:
             return call()
         except Exception as error:
-            text = f"{what}: {type(error).__name__}: {error}"
+            text = f"{what}: {_told(error)}"
             raise ConfigError(f"self-test: {_suspects(self._graph)}: {text}") from error

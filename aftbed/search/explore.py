@@ -4,6 +4,8 @@
     adapt    a death before, during and after each step of each adaptation, of each node that takes part
     pairs    each first fault of a few, followed by each second one, after each delay of a grid
 
+In all of them pages are small (`PAGE_BYTES`), so that checkpoints travel as those of a large state do.
+
 Every case is one simulated run of its own, judged by all checkers. An experiment is a value (`Setup`), so
 that a broken one is repeated by its number in the same `Selection`.
 """
@@ -52,6 +54,7 @@ ADAPT_REQUESTS: Final = 40
 ADAPT_RATE_HZ: Final = 400.0
 ADAPT_AT: Final = 4  # the request at which the adaptation begins
 EXECUTIVE: Final = "executive"  # beside the checks: it broke down
+PAGE_BYTES: Final = 16  # the built-in function's state is that of a large one then: only its changes travel
 REASON_MAX: Final = 300  # characters of an error of our own
 
 
@@ -99,7 +102,7 @@ def strikes(old: str, new: str, placement: str) -> Iterator[Strike]:
 def crashes(base: Setup, ftms: Iterable[str], placements: Iterable[str]) -> Iterator[Setup]:
     """A death at each effect of each brick; `base` has the function and its requests."""
     for ftm, placement in itertools.product(ftms, placements):
-        clean = msgspec.structs.replace(base, ftm=ftm, placement=placement)
+        clean = msgspec.structs.replace(base, ftm=ftm, placement=placement, page_bytes=PAGE_BYTES)
         for brick, count in sorted(simulate(clean, OWN_CODE).effects.items()):
             for effect in range(count + 1):
                 yield msgspec.structs.replace(clean, dooms=(Doom(brick, effect),))
@@ -116,6 +119,7 @@ def adaptations(pairs: Iterable[tuple[str, str]], placements: Iterable[str]) -> 
                 rate_hz=ADAPT_RATE_HZ,
                 faults=(Fault(Crash(), struck.node, Trigger(struck.when.label, struck.step)),),
                 adaptations=(Scheduled(Goal(expression=new), ADAPT_AT),),
+                page_bytes=PAGE_BYTES,
             )
 
 
@@ -154,7 +158,14 @@ def pairs(ftms: Iterable[str], placements: Iterable[str]) -> Iterator[Setup]:
         ]
         for first, node, delay_ms in itertools.product(firsts, nodes, DELAYS_MS):
             second = Fault(Crash(), node, Trigger(after_ms=FIRST_MS + delay_ms))
-            yield Setup(ftm, placement, count=PAIR_REQUESTS, rate_hz=PAIR_RATE_HZ, faults=(first, second))
+            yield Setup(
+                ftm,
+                placement,
+                count=PAIR_REQUESTS,
+                rate_hz=PAIR_RATE_HZ,
+                faults=(first, second),
+                page_bytes=PAGE_BYTES,
+            )
 
 
 # -- a choice of them -----------------------------------------------------------------------------
@@ -327,8 +338,8 @@ def experiments(ftms: Iterable[str], placements: Iterable[str], requests: int) -
     """Up to `requests` requests undisturbed; and one, with a death in the midst of each part of a replica."""
     for ftm, placement in itertools.product(ftms, placements):
         for count in range(1, requests + 1):
-            yield Setup(ftm, placement, count=count)
-        one = Setup(ftm, placement, count=1)
+            yield Setup(ftm, placement, count=count, page_bytes=PAGE_BYTES)
+        one = Setup(ftm, placement, count=1, page_bytes=PAGE_BYTES)
         for brick, effects in sorted(simulate(one).effects.items()):
             if brick.rpartition("/")[2] in CRASHED and effects > 1:
                 yield msgspec.structs.replace(one, dooms=(Doom(brick, effects // 2),))

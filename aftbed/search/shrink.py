@@ -11,6 +11,7 @@ is simpler, the most telling first:
 | adaptations            | one less; earlier                                                   |
 | all that is counted    | requests, `nth` and the request of an adaptation, by as much each   |
 | mechanism, placement   | nothing inside, if no bit is flipped; `pbr`; one brick a node       |
+| pages                  | of the common size                                                  |
 
 An experiment stays one that something is promised of (see `swarm`): with fewer requests nothing is planned
 behind the last of them, and what is aimed at a thing that the simpler graph does not have is not tried.
@@ -29,6 +30,7 @@ from msgspec.structs import replace
 from aftbed.core.errors import ConfigError
 from aftbed.core.messages import Scheduled
 from aftbed.ftm.compose import DUPLEX, build, parse, replication_of
+from aftbed.ftm.pages import PAGE_BYTES
 from aftbed.inject.model import Fault
 from aftbed.judge.verdict import Breach
 from aftbed.runtime.sim.world import Doom, Setup, check
@@ -135,6 +137,8 @@ def _smaller_graphs(setup: Setup) -> Iterator[Setup]:
         yield replace(setup, ftm="+".join((DUPLEX[0], *names[1:])))
     if setup.placement != "process":
         yield replace(setup, placement="process")
+    if setup.page_bytes != PAGE_BYTES:
+        yield replace(setup, page_bytes=PAGE_BYTES)
 
 
 def _earlier(setup: Setup) -> Iterator[Setup]:

@@ -29,6 +29,8 @@ What is drawn can also happen, so that **a run proves something about it**:
 | a bit                    | those that the function does not refuse                                         |
 | an adaptation            | ways from what then runs; the one before it has time to end                     |
 
+In half of the runs pages are small: checkpoints travel as those of a large state do.
+
 The rest is drawn on purpose (NEVER_PART): a trigger beyond the run, an event that nothing causes, an
 adaptation to what runs, or while another is under way. `intended` says which these are, by the setup alone,
 and `contradictions` finds what happened in spite of it. What was drawn to happen may still be prevented, by
@@ -46,6 +48,7 @@ from aftbed.core.errors import ConfigError, PeerError
 from aftbed.core.events import REQUEST_EVENTS, Event
 from aftbed.core.graph import PLACEMENTS, STAGED, Graph
 from aftbed.core.messages import Goal, Scheduled
+from aftbed.ftm import pages
 from aftbed.ftm.compose import EXPRESSIONS, NONE, replication_of, tolerates
 from aftbed.ftm.registry import EMITTERS, MECHANISMS, server_emits
 from aftbed.inject import targets
@@ -60,6 +63,7 @@ from aftbed.inject.value import EXECUTED, ValueFlip, ValuePlace
 from aftbed.judge.verdict import Breach
 from aftbed.runtime.deployment import replica_of
 from aftbed.runtime.sim.world import Run, Setup, graph_of, requests_of
+from aftbed.search import explore
 from aftbed.search.explore import STEPS, ScriptSteps, attempt, steps_of
 from aftbed.search.tally import AdaptationEnd, Intended, Intent, happened_in
 from aftbed.vehicle.aeb.function import default_application
@@ -302,6 +306,7 @@ class _Draw:
             faults,
             adaptations,
             scenario=self._scenario,
+            page_bytes=self._chance.choice((explore.PAGE_BYTES, pages.PAGE_BYTES)),
         )
 
     # -- what runs ----------------------------------------------------------------------------

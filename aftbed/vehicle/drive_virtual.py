@@ -26,6 +26,7 @@ Limits: except for its faults the bus is ideal. It takes no time, loses nothing,
 from collections import deque
 from collections.abc import Callable, Sequence
 
+from aftbed.vehicle.aeb.messages import EncodeRequest, encode_request
 from aftbed.vehicle.can.bus_model import NODES, BusDisturber, BusModel, BusNode
 from aftbed.vehicle.can.dbc_file import Codec, load_dbc
 from aftbed.vehicle.can.frame import Frame
@@ -41,9 +42,11 @@ RADAR, BRAKE, GATEWAY = NODES
 class VirtualBus(BusModel[BusNode]):
     """The car's bus: the two ECUs and the gateway."""
 
-    def __init__(self, codec: Codec, body: CarBody, on_frame: Callable[[Frame], None] | None) -> None:
+    def __init__(
+        self, codec: Codec, body: CarBody, on_frame: Callable[[Frame], None] | None, encode: EncodeRequest
+    ) -> None:
         super().__init__()
-        self.gateway = Gateway(codec)
+        self.gateway = Gateway(codec, encode)
         self.requests: list[bytes] = []  # that the gateway has made, and that were not fetched yet
         self._body = body
         self._on_frame = on_frame
@@ -90,14 +93,15 @@ class VirtualCar:
         seed: int = 0,
         codec: Codec | None = None,
         on_frame: Callable[[Frame], None] | None = None,
+        encode: EncodeRequest = encode_request,
     ) -> None:
         """`codec` is aftbed's own DBC, loaded where none is given: that takes 3 ms.
 
-        `on_frame` is called with every frame, in the order of the bus.
+        `on_frame` is called with every frame, in the order of the bus; `encode` writes the requests.
         """
         codec = codec or load_dbc()
         self._body = CarBody(scenario, codec, brake_policy, seed)
-        self._bus = VirtualBus(codec, self._body, on_frame)
+        self._bus = VirtualBus(codec, self._body, on_frame, encode)
         self._end = self._body.ended()
         self._step_us = 0  # the step whose frames are to be sent next
         self._now_ns = 0

@@ -23,10 +23,12 @@ import msgspec
 
 from aftbed.core.errors import PeerError
 from aftbed.vehicle.aeb.messages import (
+    COUNTER_COUNT,
     RANGE_MAX_M,
     SPEED_MAX_MS,
     AebInput,
     AebTarget,
+    EncodeRequest,
     decode_reply,
     encode_request,
 )
@@ -64,8 +66,9 @@ class BusGateway(ABC):
     uses: tuple[int, ...] = ()  # identifiers of the frames that it evaluates, for the faults of the bus
     request_id: int | None = None  # of the frame that makes a request each time, where there is one
 
-    def __init__(self, codec: Codec) -> None:
-        """`codec` is aftbed's own DBC."""
+    def __init__(self, codec: Codec, encode: EncodeRequest = encode_request) -> None:
+        """`codec` is aftbed's own DBC; `encode` writes the requests."""
+        self.encode = encode
         self.counts = GatewayCounts()
         self.answered = 0
         self.replies_refused = 0
@@ -107,7 +110,7 @@ class BusGateway(ABC):
     def reply_frames(self, reply: bytes, t_us: int, replica: int, epoch: int, answered: int) -> list[Frame]:
         """The frames that the reply becomes, sent at `t_us`. Raises PeerError if it is not a reply.
 
-        The E2E counter is the reply's own, so a failover leaves no gap.
+        The E2E counter is the reply's own, so a failover leaves no gap; the gateway counts where it has none.
         """
         assert replica in REPLICAS
         output = decode_reply(reply)
@@ -121,7 +124,8 @@ class BusGateway(ABC):
             "TTC": min(output.ttc_s or 0.0, TTC_MAX_S),
             "SEQUENCE": answered & 0xFFFF,
         }
-        data = self._protection.protect(self._codec.encode("AEB_REQ", signals), output.counter)
+        counter = answered % COUNTER_COUNT if output.counter is None else output.counter
+        data = self._protection.protect(self._codec.encode("AEB_REQ", signals), counter)
         return [*self._heartbeat(t_us, replica, epoch, answered), Frame(t_us, self._aeb_req_id, data)]
 
     def _heartbeat(self, t_us: int, replica: int, epoch: int, answered: int) -> list[Frame]:
@@ -143,8 +147,8 @@ def target_of(slot: int, range_m: float, rel_speed_ms: float, new: bool) -> AebT
 class Gateway(BusGateway):
     """The gateway on aftbed's own bus: RADAR_TRACK, which makes the requests, and EGO_STATE in."""
 
-    def __init__(self, codec: Codec) -> None:
-        super().__init__(codec)
+    def __init__(self, codec: Codec, encode: EncodeRequest = encode_request) -> None:
+        super().__init__(codec, encode)
         self._ego_id, self._ego = codec.can_id("EGO_STATE"), _receiver(codec, "EGO_STATE")
         self.request_id, self._track = codec.can_id("RADAR_TRACK"), _receiver(codec, "RADAR_TRACK")
         self.uses = (self._ego_id, self.request_id)
@@ -181,7 +185,7 @@ class Gateway(BusGateway):
         if speed_ms is None or t_us - self._ego_us > self._ego.supervision.timeout_us:
             self._noticed.append((self._ego_id, "timeout"))
             speed_ms = None
-        return encode_request(
+        return self.encode(
             AebInput(t_us // 1000, speed_ms or 0.0, speed_ms is not None, targets is not None, targets or ())
         )
 

@@ -162,8 +162,8 @@ def test_every_order_is_counted_up_to_the_bound(explore: Call) -> None:
     code, out, _ = explore(*ORDER, "--requests", "2", "--bound", "20")
     lines = out.splitlines()
     assert code == 0
-    assert lines[0] == "all 2 orders (3 cut): lfr (replica), seed 0, 1 request"
-    assert lines[1] == "all 6 orders (13 cut): lfr (replica), seed 0, 2 requests"
+    assert lines[0] == "all 2 orders (3 cut): lfr (replica), seed 0, 1 request; pages of 16 bytes"
+    assert lines[1] == "all 6 orders (13 cut): lfr (replica), seed 0, 2 requests; pages of 16 bytes"
     assert all(line.startswith("at least ") for line in lines[2:-1]), "20 runs are not enough with a crash"
     assert "all orders of 2 of " in lines[-1] and "the others up to 20 runs each" in lines[-1]
 

@@ -4,6 +4,7 @@ import itertools
 import json
 import re
 import shlex
+import sys
 from contextlib import closing
 from functools import partial
 from pathlib import Path
@@ -109,6 +110,37 @@ def test_a_function_of_the_user_is_simulated_updated_and_judged(sim: Call, tmp_p
     assert f"seed 0, 40 requests; {tmp_path}/adder1.py:Adder; crash primary" in out
     assert "  requests   40 sent, 40 answered, 0 lost, 0 duplicated, 0 late, 0 wrong" in out
     assert f"  adaptation update app to {tmp_path}/adder2.py:Adder at request 20: done" in out
+
+
+BRAKE: Final = """
+import json, struct, sys
+latched = False
+for line in sys.stdin:
+    asked = json.loads(line)
+    answer = {"id": asked["id"]}
+    if "describe" in asked:
+        answer["describe"] = {"deterministic": True, "state_access": "exact"}
+    elif "execute" in asked:
+        _, t_ms, speed, known, radar, target, gap, closing = struct.unpack(
+            "<BQdBBBdd", bytes.fromhex(asked["execute"])
+        )
+        latched |= bool(target and closing < 0 and gap < 1.6 * -closing)
+        answer["execute"] = struct.pack("<d", 9.0 if latched else 0.0).hex()
+    elif "capture" in asked:
+        answer["capture"] = bytes([latched]).hex()
+    else:
+        latched, answer["restore"] = bool(bytes.fromhex(asked["restore"])[0]), None
+    print(json.dumps(answer), flush=True)
+"""
+
+
+def test_a_program_brakes_a_car(sim: Call, tmp_path: Path) -> None:
+    (tmp_path / "brake.py").write_text(BRAKE)
+    app = f"{sys.executable} -I -S {tmp_path}/brake.py"
+    crash = ("--faults", "crash primary when ttc < 1.5")
+    code, out, _ = sim("--app", app, "--ftm", "pbr", "--scenario", "ccrs-50", *crash)
+    assert code == 0 and re.search(r"^  car +stopped", out, re.MULTILINE), out
+    assert "  failover   to epoch 2" in out
 
 
 def test_what_a_function_says_wrong_after_a_failover_is_found(sim: Call, tmp_path: Path) -> None:

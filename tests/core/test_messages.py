@@ -9,14 +9,35 @@ from hypothesis import strategies as st
 
 from aftbed.core import messages
 from aftbed.core.errors import PeerError
-from aftbed.core.messages import AnyMessage, Checkpoint, Message, Reply, Request, Suspect, Tried, WireMessage
+from aftbed.core.messages import (
+    AnyMessage,
+    Checkpoint,
+    Message,
+    Pages,
+    Reply,
+    Request,
+    State,
+    Suspect,
+    Tried,
+    WireMessage,
+)
 
 KINDS: Final[tuple[type[Message], ...]] = get_args(WireMessage)
 
 numbers = st.integers(0, 2**64 - 1)
+some_pages = st.builds(
+    Pages,
+    numbers,
+    numbers,
+    numbers,
+    st.lists(numbers, max_size=4).map(tuple),
+    st.binary(max_size=99),
+    numbers,
+)
 BY_TYPE: Final = {
     int: numbers,
     bytes: st.binary(max_size=300),
+    State: st.one_of(st.binary(max_size=300), some_pages),
     str: st.text(max_size=40),
     bool: st.booleans(),
     tuple[Tried, ...]: st.lists(

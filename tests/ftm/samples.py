@@ -40,6 +40,7 @@ from aftbed.core.messages import (
 )
 from aftbed.core.script import Phase, Script
 from aftbed.ftm.lfr import digest
+from aftbed.ftm.pages import CheckpointBase
 
 STATE: Final = b"\x92\x01\x02"  # of `Counting`: one request, checksum 2
 
@@ -85,7 +86,8 @@ assert set(SAMPLES) == set(get_args(AnyMessage)), "one sample of each type"
 def inspected(brick: Brick) -> dict[str, object]:
     """All that a brick is, inside and outside, as a value."""
     strangers = ("application", "_acceptable")
-    inside = {k: copy.deepcopy(v) for k, v in vars(brick).items() if k not in strangers}
+    parts = {k: vars(v) if isinstance(v, CheckpointBase) else v for k, v in vars(brick).items()}
+    inside = {k: copy.deepcopy(v) for k, v in parts.items() if k not in strangers}
     outside = (brick.open_ports(), brick.quiescent(), brick.deadline_ns(), brick.capture())
     return inside | {"outside": outside}
 

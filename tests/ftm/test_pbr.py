@@ -10,6 +10,7 @@ from aftbed.core.messages import (
     CaptureState,
     ChannelEnded,
     Checkpoint,
+    Pages,
     Promotion,
     Rebound,
     Reply,
@@ -19,6 +20,7 @@ from aftbed.core.messages import (
     StoreReply,
     TakeOver,
 )
+from aftbed.ftm.pages import sealed
 from aftbed.ftm.pbr import PbrAfter, PbrAfterState
 
 REPLY = Reply(1, 7, 1, b"that")
@@ -101,6 +103,44 @@ def test_who_leads_is_not_promoted(capturing: bool) -> None:
     with pytest.raises(PeerError, match="Promotion on control while"):
         brick.step(CONTROL, Promotion(2), 0)
     assert inspected(brick) == before
+
+
+def asked(brick: PbrAfter, number: int) -> int:
+    """The base on which it asks the Server for the state after that request, which it then sends."""
+    ((_, ask),) = sends(brick.step("prd2aft", Reply(brick.epoch, number, 1, b"that"), 0))
+    assert isinstance(ask, CaptureState)
+    brick.step("srv2aft", StateCaptured(brick.epoch, number, STATE), 0)
+    return ask.base
+
+
+def test_what_has_changed_since_the_last_checkpoint_that_was_sent_is_enough() -> None:
+    brick = primary()
+    assert [asked(brick, number) for number in (7, 8, 12)] == [0, 7, 8]
+
+
+def test_a_new_backup_needs_the_whole_state() -> None:
+    brick = primary()
+    asked(brick, 7)
+    brick.step(CONTROL, Rebound("aft2aft", True, 1), 0)
+    assert [asked(brick, number) for number in (8, 9)] == [0, 8]
+
+
+def test_what_was_captured_without_a_backup_is_no_base() -> None:
+    brick = primary()
+    asked(brick, 7)
+    brick.step(CONTROL, Rebound("aft2aft", False, 1), 0)
+    assert [asked(brick, number) for number in (8, 9)] == [0, 0]
+    brick.step(CONTROL, Rebound("aft2aft", True, 1), 0)
+    assert [asked(brick, number) for number in (10, 11)] == [0, 10]
+
+
+def test_pages_of_a_state_go_to_the_backup_and_its_server_as_they_are() -> None:
+    pages = sealed(Pages(100, 6, 16, (1,), bytes(16), 0))
+    brick = primary()
+    brick.step("prd2aft", REPLY, 0)
+    sent = sends(brick.step("srv2aft", StateCaptured(1, 7, pages), 0))[0][1]
+    assert sent == Checkpoint(1, 7, b"that", pages)
+    assert sends(backup().step("aft2aft", sent, 0)) == [("aft2srv", RestoreState(1, 7, pages))]
 
 
 # -- the backup

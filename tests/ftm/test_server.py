@@ -9,6 +9,7 @@ from aftbed.core.errors import PeerError
 from aftbed.core.events import RERUN, Event
 from aftbed.core.messages import (
     CaptureState,
+    Pages,
     Rebound,
     Reply,
     Request,
@@ -130,6 +131,81 @@ def test_a_state_that_is_none_is_refused() -> None:
         with pytest.raises(PeerError, match="not a state"):
             brick.restore(data)
         assert inspected(brick) == before
+
+
+# -- a large state
+
+
+class Large(Counting):
+    """Its state is four pages of 16 bytes; the count is in the first of them."""
+
+    def capture(self) -> bytes:
+        state = super().capture()
+        return bytes([len(state), *state]).ljust(64, b"\0")
+
+    def restore(self, state: bytes) -> None:
+        super().restore(state[1 : 1 + state[0]])
+
+
+def large(replica: int) -> Server:
+    brick = Server(Large(), replica, page_bytes=16)
+    brick.step(CONTROL, Rebound("srv2aft", True, 2), 0)
+    return brick
+
+
+def checkpoint(brick: Server, number: int, base: int) -> Pages:
+    brick.step("prd2srv", Request(2, number, b"what"), 0)
+    ((_, captured),) = sends(brick.step("aft2srv", CaptureState(2, number, base), 0))
+    assert isinstance(captured, StateCaptured) and isinstance(captured.state, Pages)
+    return captured.state
+
+
+def test_of_a_large_state_the_changed_pages_go_to_the_backup() -> None:
+    leads, follows = large(1), large(2)
+    for number, numbers in ((7, ()), (8, (0,)), (9, (0,))):
+        state = checkpoint(leads, number, number - 1)
+        assert (state.base, state.numbers) == ((number - 1) * bool(numbers), numbers)
+        effects = follows.step("aft2srv", RestoreState(2, number, state), 0)
+        assert sends(effects) == [("srv2aft", StateRestored(2, number))]
+        assert follows.capture() == leads.capture()
+
+
+def test_pages_on_a_base_that_it_does_not_have_end_the_backup() -> None:
+    leads, follows = large(1), large(2)
+    checkpoint(leads, 7, 6)
+    effects = follows.step("aft2srv", RestoreState(2, 8, checkpoint(leads, 8, 7)), 0)
+    assert notes(effects) == [Event.DETECTED_STOP] and sends(effects) == []
+    assert effects[-1] == Halt(
+        "the state after request 8 is refused: it is based on checkpoint 7, found is none"
+    )
+
+
+@pytest.mark.parametrize("what", ["rebound", "restored", "migrated", "another base", "no base"])
+def test_after_any_doubt_the_state_is_whole(what: str) -> None:
+    brick = large(1)
+    checkpoint(brick, 7, 6)
+    if what == "rebound":
+        brick.step(CONTROL, Rebound("srv2aft", True, 2), 0)
+    elif what == "restored":
+        brick.restore(brick.capture())
+    elif what == "migrated":
+        brick.migrate(brick.capture())
+    state = checkpoint(brick, 8, {"another base": 6, "no base": 0}.get(what, 7))
+    assert (state.base, state.data) == (0, brick.capture())
+
+
+def test_the_state_before_a_request_is_whole_and_no_base() -> None:
+    brick = large(1)
+    brick.step(CONTROL, Rebound("srv2bfr", True, 2), 0)
+    for number in (7, 8):
+        effects = brick.step("bfr2srv", CaptureState(2, number), 0)
+        state = brick.capture()
+        assert sends(effects) == [("srv2bfr", StateCaptured(2, number, state))]
+        for rerun in (False, True):
+            brick.step("prd2srv", trial(state, rerun=rerun, number=number), 0)
+        ((_, captured),) = sends(brick.step("aft2srv", CaptureState(2, number, number - 1), 0))
+        assert isinstance(captured, StateCaptured) and isinstance(captured.state, Pages)
+        assert captured.state.numbers == (() if number == 7 else (0,))
 
 
 def test_state_goes_over_to_a_new_backup() -> None:

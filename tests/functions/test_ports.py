@@ -214,8 +214,11 @@ def test_a_model_with_many_ports_is_not_listed_as_a_whole(tmp_path: Path) -> Non
 
 def test_the_example_of_the_page_is_a_map(tmp_path: Path) -> None:
     page = (Path(__file__).parents[2] / "docs" / "functions.md").read_text()
-    (example,) = re.findall(r"```yaml\n(request:.*?)```", page, re.DOTALL)
+    of_a_car, example = re.findall(r"```yaml\n(request:.*?)```", page, re.DOTALL)
     path = tmp_path / "ports.yaml"
+    path.write_text(of_a_car)
+    fields = [port.type for port in read_yaml(path, PortsFile).request]
+    assert fields == ["u8", "u64", "f64", "u8", "u8", "u8", "f64", "f64"], "the fixed layout of a radar cycle"
     path.write_text(example)
     mode = variable("mode", "Integer", "integer", "discrete output")
     ports = bind(path, read_yaml(path, PortsFile), MODEL, [*VARIABLES, mode], True)

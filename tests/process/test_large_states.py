@@ -1,7 +1,7 @@
 """A state that is larger than a packet goes the way of all states: through channels, failover, adaptation."""
 
 import pytest
-from liveruns import aftbed
+from liveruns import Command, Home, aftbed
 from sampling import every
 
 pytestmark = pytest.mark.process
@@ -22,3 +22,27 @@ def test_a_large_state_is_carried(ftm: str, size: int) -> None:
     assert found.verdict == "pass", found.reasons
     assert found.requests.answered == 200 and found.requests.wrong == 0
     assert len(found.failovers) == 1
+
+
+def test_ten_megabytes_are_updated_switched_and_taken_over(home: Home) -> None:
+    """Compared by the Server, then told by a function that knows its changes."""
+    with Command("--load", "100000@50") as run:
+        run.started()
+        for epoch, function in ((2, "Ballast10000000v1"), (3, "TrackedBallast10000000v2")):
+            adapt("update", "app", "--to", f"aftbed.bench.ballast:{function}")
+            adapt("switch", "lfr")
+            adapt("switch", "pbr")
+            crash = aftbed("inject", "crash", "primary", "--at", "checkpoint.sent", "--nth", "5")
+            assert crash.code == 0, crash.err
+            run.wait_for_line(f"backs up, epoch {epoch}")
+        assert aftbed("stop").code == 0
+        ended = run.done()
+    assert ended.code == 0, ended.out + ended.err
+    assert "0 lost, 0 duplicated" in ended.out and "0 wrong" in ended.out
+    assert ended.out.count("failover   to epoch") == 2 and "verdict: pass" in ended.out
+
+
+def adapt(*words: str) -> None:
+    """It must be done."""
+    found = aftbed("adapt", *words, "--json")
+    assert found.code == 0, found.out + found.err

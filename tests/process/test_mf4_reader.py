@@ -42,7 +42,7 @@ def test_the_death_of_the_reader_is_an_error(tmp_path: Path) -> None:
         os.kill(reader, signal.SIGKILL)
         _, errors = command.communicate(timeout=WAIT_SECONDS_MAX)
     assert command.returncode == 2 and not (tmp_path / "a.log").exists()
-    words = b"a.mf4: not an MF4 that can be read: torn or malformed: its reader ended with signal 9\n"
+    words = b"a.mf4: not an MF4 that can be read: torn or malformed: its reader ended with signal 9 (Killed)"
     assert words in errors
 
 

@@ -1,5 +1,6 @@
 """Functions that are no Python, protected in real runs: they survive crashes, and their failures are told."""
 
+import json
 import os
 import shlex
 import shutil
@@ -151,3 +152,22 @@ def test_a_function_that_cannot_begin_is_refused_before_the_start(tmp_path: Path
     (tmp_path / "silent.py").write_text("import sys\nsys.exit('not today')\n")
     done = aftbed("run", "--app", f"{sys.executable} {tmp_path}/silent.py", "--load", "10")
     assert done.code == 2 and "not today" in done.err and "exit code 1" in done.err, done.err
+
+
+@pytest.mark.deep
+def test_the_cycle_of_a_function_is_measured_with_its_requests(library: str, tmp_path: Path) -> None:
+    (tmp_path / "sent.csv").write_text("a:u8,b:u64\n1,2\n3,4\n")
+    words = (
+        "bench",
+        "cycle",
+        "--requests",
+        "100",
+        "--app",
+        library,
+        "--sent",
+        tmp_path / "sent.csv",
+        "--json",
+    )
+    done = aftbed(*words)
+    assert done.code == 0, done.err
+    assert json.loads(done.out)["requests"] >= 100 and json.loads(done.out)["ratio_p50"] > 1

@@ -92,3 +92,28 @@ def test_a_child_that_owns_the_pages_of_the_rehearsal_takes_hardly_a_fault_in_it
     owned, faults = map(int, told.split())
     assert owned > 100
     assert faults < owned / 5, f"{faults} page faults, {owned} pages of {PAGE} bytes were owned before"
+
+
+REUSES = """
+import resource
+from aftbed.runtime.unix import linux
+
+linux.reuse_blocks()
+def faults():
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+def copies(count):
+    before, kept = faults(), b""
+    for number in range(count):
+        kept = bytes({size})  # beside the one before
+        kept.count(1)
+    return faults() - before
+copies(10)
+print(copies(50))
+"""
+
+
+@pytest.mark.parametrize("size", [1_000_000, 10_000_000])
+def test_the_memory_of_a_large_block_is_used_again(size: int) -> None:
+    """Given back, each block would cost a fault for each of its pages."""
+    done = subprocess.run([sys.executable, "-c", REUSES.format(size=size)], capture_output=True, check=True)
+    assert int(done.stdout) < 50

@@ -117,6 +117,7 @@ def test_what_is_wrong_is_named(kind: type, words: str) -> None:
 
 
 FUNCTIONS: Final = """
+from aftbed.bench.ballast import TrackedBallast
 from aftbed.vehicle.aeb.function import AebFunction
 
 class Text(AebFunction):
@@ -142,6 +143,27 @@ class Forgetful(AebFunction):
 
 class Sound(AebFunction):
     pass
+
+class Tracked(TrackedBallast):
+    size_bytes = 20_000
+
+class Unaware(Tracked):
+    def changes(self, page_bytes): return {}
+
+class Careless(Tracked):
+    def patch(self, page_bytes, pages): pass
+
+class Growing(Tracked):
+    def execute(self, request):
+        self._state.append(1)
+        return super().execute(request)
+    def restore(self, state): self._state[:] = state
+
+class Rude(Tracked):
+    def changes(self, page_bytes): raise KeyError("no page")
+
+class Half(AebFunction):
+    def changes(self, page_bytes): return {}
 """
 
 
@@ -162,12 +184,17 @@ def try_out(tmp_path: Path, name: str, ftm: str = "pbr") -> None:
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("Text", "a/server: Request on prd2srv: TypeError: execute returned str, bytes are required"),
-        ("Nothing", "TypeError: execute returned NoneType, bytes are required"),
-        ("Endless", "ValueError: execute returned 100000000 bytes, at most 61440 are allowed"),
+        ("Text", "a/server: Request on prd2srv: Text: execute returned str, bytes are required"),
+        ("Nothing", "execute returned NoneType, bytes are required"),
+        ("Endless", "execute returned 100000000 bytes, at most 61440 are allowed"),
         ("Breaking", "KeyError: 'speed'"),
-        ("StateText", "TypeError: capture returned str, bytes are required"),
-        ("StateEndless", "ValueError: capture returned 100000000 bytes, at most 67108864 are allowed"),
+        ("StateText", "capture returned str, bytes are required"),
+        ("Unaware", "changes and patch do not give the state of capture"),
+        ("Careless", "changes and patch do not give the state of capture"),
+        ("Growing", "changes and patch do not give the state of capture"),
+        ("Rude", "KeyError: 'no page'"),
+        ("Half", "it has changes, and not the other one"),
+        ("StateEndless", "capture returned 100000000 bytes, at most 67108864 are allowed"),
     ],
 )
 def test_a_function_that_answers_nonsense_is_refused_with_the_reason(
@@ -179,12 +206,17 @@ def test_a_function_that_answers_nonsense_is_refused_with_the_reason(
 
 
 def test_a_function_that_does_not_restore_is_refused_with_the_reason(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"self-test: .*: restore: IndexError: out of range"):
+    with pytest.raises(ConfigError, match=r"self-test: .*: restore: Forgetful: IndexError: out of range"):
         try_out(tmp_path, "Forgetful")
 
 
 def test_a_sound_function_passes(tmp_path: Path) -> None:
     try_out(tmp_path, "Sound", "lfr+tr")
+
+
+@pytest.mark.parametrize("ftm", ["pbr", "pbr+tr", "lfr"])
+def test_a_function_that_knows_its_changes_passes(tmp_path: Path, ftm: str) -> None:
+    try_out(tmp_path, "Tracked", ftm)
 
 
 # -- loading

@@ -31,34 +31,42 @@ from planting import (
     heard,
     instead,
     outcome,
+    skipped,
     wrapped,
 )
 
+from aftbed.core.application import Application
 from aftbed.core.brick import CONTROL, Choice, Effect, Send
 from aftbed.core.messages import (
     ChannelEnded,
     Checkpoint,
+    Goal,
     Promotion,
     Rebound,
     Reply,
     Request,
     RestoreState,
+    Scheduled,
+    State,
     Trial,
     Trials,
     Watch,
 )
-from aftbed.ftm import tr
+from aftbed.ftm import pages, tr
 from aftbed.ftm.assertion import Acceptable, AssertAfter
-from aftbed.ftm.chain import Protocol, ProtocolState, RequestAge, promote_at_once
+from aftbed.ftm.chain import Protocol, ProtocolState, RequestAge, learn_duplex, promote_at_once
 from aftbed.ftm.client import Client, Proxy, ReplyIs
 from aftbed.ftm.failover import Watchdog
 from aftbed.ftm.lfr import LfrAfter, LfrBefore, LfrBeforeState
+from aftbed.ftm.pages import CheckpointBase
 from aftbed.ftm.pbr import PbrAfter, PbrAfterState
 from aftbed.ftm.server import Server
 from aftbed.ftm.tr import TrAfter, Vote
 from aftbed.inject.value import ValuePlace
 from aftbed.runtime.sim.world import Setup
+from aftbed.search.explore import ADAPT_RATE_HZ, PAGE_BYTES
 
+RARE_HZ: Final = 100.0  # a new backup is there before the next request
 _IDLE, _BUSY = ProtocolState.IDLE, ProtocolState.BUSY
 _LOG_IGNORED: Final = {
     (_IDLE, "pxy2pro", Request): Choice(Protocol.age, dict.fromkeys(RequestAge, (Protocol.admit, _BUSY)))
@@ -109,6 +117,28 @@ def _never_promoted(right: Callable[..., list[Effect]]) -> object:
         return effects
 
     return step
+
+
+def _base_not_kept(right: Callable[..., None]) -> object:
+    def restore(self: CheckpointBase, application: Application, number: int, state: State) -> None:
+        before = self._number
+        right(self, application, number, state)
+        self._number = before or number
+
+    return restore
+
+
+def _own_base(right: Callable[..., State]) -> object:
+    def capture(self: CheckpointBase, application: Application, number: int, base: int) -> State:
+        return right(self, application, number, self._number)
+
+    return capture
+
+
+def _there_and_back() -> list[Setup]:
+    """The backup goes with the first adaptation, and another one comes with the second."""
+    ways = (Scheduled(Goal(expression="tr"), 20), Scheduled(Goal(expression="pbr"), 90))
+    return [Setup("pbr", count=200, rate_hz=ADAPT_RATE_HZ, adaptations=ways, page_bytes=PAGE_BYTES)]
 
 
 def _gullible(right: Callable[..., None]) -> object:
@@ -211,6 +241,41 @@ MECHANISMS: Final = (
         CRASH,
         crashes("pbr", "a/proceed"),
         "G3",
+    ),
+    Mutant(
+        "page lost",
+        "of the pages that have changed, the first one never travels",
+        outcome(pages, "changed_pages", lambda found: found[1:]),
+        CRASH,
+        crashes("pbr", "a/proceed"),
+        "G3",
+    ),
+    Mutant(
+        "stale base",
+        "Server of the backup goes by the first checkpoint that it had, whatever has come since",
+        wrapped(CheckpointBase, "restore", _base_not_kept),
+        CLEAN,
+        clean(Setup("pbr", count=6, page_bytes=PAGE_BYTES)),
+        "needless_stop",
+    ),
+    Mutant(
+        "base of before an adaptation",
+        "Server sends what has changed since a checkpoint of before its After was replaced",
+        both(
+            skipped(CheckpointBase, "forget"),
+            wrapped(CheckpointBase, "capture", _own_base),
+        ),
+        OWN,
+        _there_and_back,
+        "needless_stop",
+    ),
+    Mutant(
+        "no whole checkpoint to a new backup",
+        "PbrAfter takes a new backup for one that has what was sent to the old one",
+        instead(PbrAfter, "learn_backup", learn_duplex("aft2aft")),
+        CRASH,
+        lambda: (replace(s, rate_hz=RARE_HZ) for s in crashes("pbr", "b/after")()),
+        "needless_stop",
     ),
     Mutant(
         "promoted before its channel is drained",

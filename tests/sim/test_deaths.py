@@ -73,7 +73,7 @@ def played(setup: Setup, payloads: Sequence[bytes] = ()) -> tuple[World, Run]:
 
 def assert_promises(world: World, run: Run) -> None:
     """G1 to G6 and the rest; nothing is left inside, and all replicas are in the state of a bare server."""
-    assert breaches(run, Counting) == ()
+    assert breaches(run, function=Counting) == ()
     bare = Counting()
     for entry in run.history.dialogue:
         if entry.kind is EntryKind.SENT:
@@ -232,7 +232,7 @@ def test_a_request_that_the_function_refuses_does_not_stand_in_the_way_of_the_ne
     _, run = played(Setup(ftm, count=3), [b"before", b"", b"after"])
     answers = [e for e in run.history.dialogue if e.kind is EntryKind.ANSWERED]
     assert [(e.request_id, bool(e.payload)) for e in answers] == [(1, True), (2, False), (3, True)]
-    assert breaches(run, Counting) == ()
+    assert breaches(run, function=Counting) == ()
 
 
 @pytest.mark.parametrize("ftm", SIMPLEX)

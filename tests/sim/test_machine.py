@@ -154,7 +154,7 @@ class Interference(RuleBasedStateMachine):
         """The acts are over: it must come to rest."""
         self.world.end()
         self.no_reply_is_wrong_doubled_or_of_an_old_master()
-        broken = breaches(self.world.outcome(), Counting)
+        broken = breaches(self.world.outcome(), function=Counting)
         assert not broken, "; ".join(map(str, broken))
 
 

@@ -6,7 +6,19 @@ from hypothesis import strategies as st
 from puredrive import CODEC
 
 from aftbed.core.errors import PeerError
-from aftbed.vehicle.aeb.messages import AebInput, AebOutput, AebTarget, decode_request, encode_reply
+from aftbed.vehicle.aeb.messages import (
+    FIXED_REPLY,
+    FIXED_REQUEST,
+    RANGE_MAX_M,
+    SPEED_MAX_MS,
+    T_MS_MAX,
+    AebInput,
+    AebOutput,
+    AebTarget,
+    decode_request,
+    encode_fixed,
+    encode_reply,
+)
 from aftbed.vehicle.can.e2e import intact, protect
 from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.gateway import LANE_HALF_M, Gateway
@@ -189,6 +201,47 @@ def test_a_reply_becomes_a_protected_request_to_the_brakes() -> None:
     assert (told["TARGET"], told["COUNTER"], told["SEQUENCE"]) == (5, 7, 4)
 
 
+@pytest.mark.parametrize(
+    ("demand_ms2", "stage"), [(0.0, 0), (0.1, 2), (5.9, 2), (6.0, 3), (12.0, 3)], ids=str
+)
+def test_a_reply_may_be_a_deceleration_alone(demand_ms2: float, stage: int) -> None:
+    gateway = Gateway(CODEC)
+    told = [
+        CODEC.decode("AEB_REQ", gateway.reply_frames(FIXED_REPLY.pack(demand_ms2), 0, 1, 1, n)[-1].data)
+        for n in (14, 15, 16)
+    ]
+    assert [one["COUNTER"] for one in told] == [14, 0, 1], "the gateway counts, the brake misses none"
+    assert {(one["STAGE"], one["TTC_VALID"]) for one in told} == {(stage, 0)}
+    assert told[0]["DECELERATION"] == pytest.approx(demand_ms2, abs=0.05)
+
+
+@given(
+    st.integers(0, T_MS_MAX),
+    st.floats(0, SPEED_MAX_MS),
+    st.booleans(),
+    st.booleans(),
+    st.lists(st.tuples(st.floats(0, RANGE_MAX_M), st.floats(-SPEED_MAX_MS, SPEED_MAX_MS)), max_size=3),
+)
+def test_the_fixed_layout_has_the_nearest_target(
+    t_ms: int, speed_ms: float, ego: bool, radar: bool, seen: list[tuple[float, float]]
+) -> None:
+    targets = tuple(AebTarget(slot, *one) for slot, one in enumerate(seen))
+    request = encode_fixed(AebInput(t_ms, speed_ms, ego, radar, targets))
+    nearest = min(seen, key=lambda one: one[0], default=None)
+    assert len(request) == 36 and request[0] == 1
+    expected = () if nearest is None else (AebTarget(0, *nearest),)
+    assert decode_request(request) == AebInput(t_ms, speed_ms, ego, radar, expected)
+
+
+def test_a_function_that_is_no_class_is_asked_in_the_fixed_layout() -> None:
+    gateway = Gateway(CODEC, encode_fixed)
+    gateway.on_frame(frame("EGO_STATE", 40, 0, EGO))
+    gateway.on_frame(frame("EGO_STATE", 50, 1, EGO))
+    gateway.on_frame(frame("RADAR_TRACK", 60, 0, TRACK))
+    made = gateway.on_frame(frame("RADAR_TRACK", 80, 1, TRACK))
+    assert made is not None and FIXED_REQUEST.unpack(made) == (1, 80, 14.0, 1, 1, 1, 40.0, -3.0)
+
+
 def test_without_a_threat_there_is_no_time_to_collision() -> None:
     reply = encode_reply(AebOutput(0, 0.0, None, None, 0))
     told = CODEC.decode("AEB_REQ", Gateway(CODEC).reply_frames(reply, 0, 1, 1, 1)[-1].data)
@@ -219,6 +272,10 @@ def test_heartbeats_come_50_ms_apart_and_before_the_request() -> None:
         (encode_reply(AebOutput(3, 12.1, None, None, 0)), "with 12.1 m/s2"),
         (encode_reply(AebOutput(3, float("nan"), None, None, 0)), "with nan m/s2"),
         (encode_reply(AebOutput(3, 9.0, None, None, 15)), "counter 15, allowed is 0 to 14"),
+        (encode_reply(AebOutput(3, 9.0, None, None, None)), "counter None, allowed is 0 to 14"),
+        (FIXED_REPLY.pack(-0.1), r"-0\.1 m/s2, allowed is 0 to 12"),
+        (FIXED_REPLY.pack(12.1), r"12\.1 m/s2, allowed is 0 to 12"),
+        (FIXED_REPLY.pack(float("nan")), "nan m/s2, allowed is 0 to 12"),
         (encode_reply(AebOutput(3, 9.0, None, 16, 0)), "slot 16"),
         (encode_reply(AebOutput(3, 9.0, -1.0, 1, 0)), "ttc_s -1.0"),
     ],

@@ -21,8 +21,10 @@ from aftbed.core.journal import Entry, EntryKind, History, Record
 from aftbed.core.messages import Goal, Reply, Scheduled
 from aftbed.ftm.client import Client
 from aftbed.ftm.compose import build, replication_of
+from aftbed.ftm.pages import PAGE_BYTES
 from aftbed.functions.load import NO_CODE, Code
 from aftbed.functions.request_file import GivenRequests
+from aftbed.functions.source import is_foreign
 from aftbed.inject.bus import BusFault
 from aftbed.inject.bus_disturber import Disturber
 from aftbed.inject.kind import FaultKind
@@ -42,6 +44,7 @@ from aftbed.runtime.sim.node_io import SimChannel, SimIO, SimNode, SimulatedMemo
 from aftbed.runtime.sim.processes import SimProcess, SimProcessPool, SimSenses
 from aftbed.runtime.tasks import Wait
 from aftbed.vehicle.aeb.function import default_application, sample_requests
+from aftbed.vehicle.aeb.messages import encode_fixed, encode_request
 from aftbed.vehicle.can.dbc_file import Codec, load_dbc
 from aftbed.vehicle.condition import Condition
 from aftbed.vehicle.drive_virtual import VirtualCar
@@ -71,7 +74,8 @@ class Setup(msgspec.Struct, frozen=True):
     """What a run is made of, so that it can be repeated: nothing else has a part in it.
 
     `count` requests at `rate_hz` (0: the next follows the reply), which are `given` or drawn from a seed; or
-    those of a car in `scenario`. `application`: the protected function, "" for the built-in one.
+    those of a car in `scenario`. `application`: the protected function, "" for the built-in one. With small
+    pages (`page_bytes`) its checkpoints travel as those of a large state do.
     """
 
     ftm: str = "pbr"
@@ -85,6 +89,7 @@ class Setup(msgspec.Struct, frozen=True):
     scenario: str = ""
     application: str = ""
     given: GivenRequests | None = None
+    page_bytes: int = PAGE_BYTES
 
 
 class Rest(msgspec.Struct, frozen=True):
@@ -163,9 +168,11 @@ class Drive(CarLink):
     virtual time of that step and, as in lockstep, before anything else that belongs to the step.
     """
 
-    def __init__(self, scenario: str, seed: int, clock: Clock) -> None:
+    def __init__(self, setup: Setup, clock: Clock) -> None:
         self._clock = clock
-        self._car = VirtualCar(load_scenario(scenario), seed=seed, codec=own_codec())
+        encode = encode_fixed if is_foreign(setup.application) else encode_request
+        scenario = load_scenario(setup.scenario)
+        self._car = VirtualCar(scenario, seed=setup.seed, codec=own_codec(), encode=encode)
         self._faults = Disturber()  # of its bus
         self._began_ns = 0
         self._wake: Callable[[], None] = lambda: None
@@ -275,7 +282,7 @@ class World:
         drawn = list(setup.given.requests) if setup.given is not None else requests_of(0)
         self._requests = requests if requests is not None else drawn
         self.loop = clock(Random(setup.seed))
-        self._drive = Drive(setup.scenario, setup.seed, self.loop) if setup.scenario else None
+        self._drive = Drive(setup, self.loop) if setup.scenario else None
         for fault in setup.faults:
             check(fault, self.setup.scenario)
         self.journals: dict[str, list[Record]] = {}
@@ -287,7 +294,7 @@ class World:
         self.effects: dict[str, int] = {}
         self.lost = False
         self.journal = ExecutiveJournal(self.journals.setdefault("supervisor.1", []))
-        assembler = Assembler(function, code, make)
+        self._assembler = assembler = Assembler(function, code, make, setup.page_bytes)
         self.pool = SimProcessPool(
             self.loop, assembler, self._make_device, self._ends.__getitem__, self._journal_for
         )
@@ -426,9 +433,12 @@ class World:
 
     def run(self) -> Run:
         """Run from the launch to the state of rest."""
-        self.start()
-        self.end()
-        return self.outcome()
+        try:
+            self.start()
+            self.end()
+            return self.outcome()
+        finally:
+            self._assembler.close()
 
     def start(self) -> None:
         """Launch; requests are sent from here on."""

@@ -6,8 +6,11 @@ where the kernel gives it a network namespace of its own (unshare(2); some conta
 rights of the user: the limits are there for mistakes, not against code that is not trusted.
 
 Job and answer are bytes, with their length before them, over one socket; the caller decodes what it gets.
+What the process is about to do it may write into memory that the command shares (`note`): when it crashes or
+hangs, the message says where.
 """
 
+import mmap
 import os
 import resource
 import select
@@ -15,17 +18,20 @@ import signal
 import socket
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
+from io import FileIO
 from typing import Final, NoReturn
 
 import msgspec
 
+from aftbed.core.errors import shown
 from aftbed.runtime.unix import linux
 
 ANSWER_BYTES_MAX: Final = 4 << 30
 SIZE_BYTES: Final = 8
 CHUNK_BYTES: Final = 1 << 20
+NOTE_BYTES: Final = 256
 END_SECONDS_MAX: Final = 5.0  # of a process whose socket has ended
 
 
@@ -38,27 +44,37 @@ class ProcessLimits(msgspec.Struct, frozen=True):
 
 
 class JobFailedError(Exception):
-    """No answer came; the text says why, as the end of a sentence about the process."""
+    """No answer came; the text says why, as the end of a sentence about the process.
+
+    `noted`: the last `note` of the process, "" without one.
+    """
+
+    noted: str = ""
 
 
 # -- in the command -------------------------------------------------------------------------------
 
 
-def ask(module: str, job: bytes, limits: ProcessLimits) -> bytes:
-    """The answer of `module`, which is executed and calls `serve`. Raises JobFailedError."""
+def ask(module: str, job: bytes, limits: ProcessLimits, variables: Mapping[str, str] | None = None) -> bytes:
+    """The answer of `module`, which is executed and calls `serve`. Raises JobFailedError.
+
+    `variables` are added to its environment.
+    """
     ours, theirs = socket.socketpair()
-    with ours:
+    noted = os.memfd_create("aftbed-note")
+    os.truncate(noted, NOTE_BYTES)
+    with ours, open(noted, "rb", buffering=0) as notes:
         with theirs:
             files = -1 if limits.file_bytes is None else limits.file_bytes
             words = (str(os.getpid()), str(limits.memory_bytes), str(files))
-            pid = linux.start_interpreter(module, theirs.fileno(), *words)
+            pid = linux.start_interpreter(module, theirs.fileno(), *words, variables=variables)
         pidfd = os.pidfd_open(pid)
         try:
-            return _exchange(ours, job, time.monotonic() + limits.seconds)
+            return _exchange(ours, noted, job, time.monotonic() + limits.seconds)
         except TimeoutError:
-            raise JobFailedError(f"takes more than {limits.seconds:g} s") from None
+            raise _failed(f"takes more than {limits.seconds:g} s", notes) from None
         except (EOFError, OSError):
-            raise JobFailedError(_end_of(pidfd)) from None
+            raise _failed(_end_of(pidfd), notes) from None
         finally:
             with suppress(ProcessLookupError):
                 os.killpg(pid, signal.SIGKILL)  # with what it may have started
@@ -67,10 +83,17 @@ def ask(module: str, job: bytes, limits: ProcessLimits) -> bytes:
             os.close(pidfd)
 
 
-def _exchange(sock: socket.socket, job: bytes, limit_s: float) -> bytes:
+def _failed(why: str, notes: FileIO) -> JobFailedError:
+    error = JobFailedError(why)
+    error.noted = shown(notes.read(NOTE_BYTES).rstrip(b"\0").decode(errors="replace"))
+    return error
+
+
+def _exchange(sock: socket.socket, notes: int, job: bytes, limit_s: float) -> bytes:
     """Send the job and receive the answer. Raises TimeoutError, EOFError, OSError."""
     sock.setblocking(False)
-    left = memoryview(len(job).to_bytes(SIZE_BYTES, "little") + job)
+    socket.send_fds(sock, [len(job).to_bytes(SIZE_BYTES, "little")], [notes])
+    left = memoryview(job)
     while left:
         _wait(sock, select.POLLOUT, limit_s)
         left = left[sock.send(left) :]
@@ -105,14 +128,26 @@ def _end_of(pidfd: int) -> str:
     ended = os.waitid(os.P_PIDFD, pidfd, os.WEXITED | os.WNOHANG | os.WNOWAIT)
     if ended is None:
         return "closed its connection"
-    return f"ended with {'code' if ended.si_code == os.CLD_EXITED else 'signal'} {ended.si_status}"
+    if ended.si_code == os.CLD_EXITED:
+        return f"ended with code {ended.si_status}"
+    return f"ended with signal {ended.si_status} ({signal.strsignal(ended.si_status)})"
 
 
 # -- in the process -------------------------------------------------------------------------------
 
 
+_notes: mmap.mmap | None = None  # shared with the command
+
+
+def note(what: str) -> None:
+    """Tell what this process is about to do, should it not return from it. Takes less than 1 us."""
+    if _notes is not None:
+        _notes[:] = what.encode()[:NOTE_BYTES].ljust(NOTE_BYTES, b"\0")
+
+
 def serve(work: Callable[[bytes], bytes]) -> NoReturn:
     """Do the one job of this process by `work`, which raises nothing, and end."""
+    global _notes  # noqa: PLW0603 - one of each process
     command, memory_bytes, file_bytes = map(int, sys.argv[1:])
     os.set_inheritable(linux.INHERITED_FD, False)
     os.setsid()
@@ -125,7 +160,10 @@ def serve(work: Callable[[bytes], bytes]) -> NoReturn:
     os.chdir("/")
     with socket.socket(fileno=linux.INHERITED_FD) as sock:
         sock.setblocking(True)
-        job = _whole(sock, int.from_bytes(_whole(sock, SIZE_BYTES), "little"))
+        size, (descriptor,), *_ = socket.recv_fds(sock, SIZE_BYTES, 1)  # in one piece: it was sent as one
+        _notes = mmap.mmap(descriptor, NOTE_BYTES)
+        os.close(descriptor)
+        job = _whole(sock, int.from_bytes(size, "little"))
         resource.setrlimit(resource.RLIMIT_AS, (memory_bytes, memory_bytes))
         if file_bytes >= 0:
             resource.setrlimit(resource.RLIMIT_FSIZE, (file_bytes, file_bytes))

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 from aftbed.core.messages import Reply
 from aftbed.ftm.client import Client
+from aftbed.functions.source import is_foreign
 from aftbed.runtime import control
 from aftbed.runtime.devices import CarDevice, CarLink, Device, Load, Senses, resume_client
 from aftbed.runtime.unix import linux
@@ -17,6 +18,7 @@ from aftbed.runtime.unix.journal_files import DialogueFile, JournalHeader, dialo
 from aftbed.runtime.unix.options import GATEWAY, LoadRun, ReplayRun, SourceOptions
 from aftbed.runtime.unix.request_store import stored_requests
 from aftbed.vehicle.aeb.function import sample_requests
+from aftbed.vehicle.aeb.messages import encode_fixed, encode_request
 
 if TYPE_CHECKING:
     from aftbed.vehicle.gateway import BusGateway
@@ -129,11 +131,12 @@ def make_source(client: Client, options: SourceOptions) -> Device:
     from aftbed.vehicle.gateway import Gateway  # noqa: PLC0415
 
     gateway: BusGateway
+    encode = encode_fixed if is_foreign(options.application) else encode_request
     if isinstance(work, ReplayRun):
         from aftbed.vehicle.replay.map_file import find_map  # noqa: PLC0415
         from aftbed.vehicle.replay.mapped_gateway import MappedGateway  # noqa: PLC0415
 
-        gateway = MappedGateway(load_dbc(), Path(work.dbc), find_map(work.map))
+        gateway = MappedGateway(load_dbc(), Path(work.dbc), find_map(work.map), encode)
     else:
-        gateway = Gateway(load_dbc())
+        gateway = Gateway(load_dbc(), encode)
     return CarDevice(client, dialogue, BusLink(gateway, options.port, options.secret))

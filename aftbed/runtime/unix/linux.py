@@ -14,7 +14,7 @@ import socket
 import struct
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Final
@@ -33,6 +33,8 @@ ADOPTION_SECONDS_MAX: Final = 5.0
 EXCUSED_NS_MAX: Final = 2_000_000_000  # as long as any step of the runtime may take
 _START: Final = 19  # the field `starttime` of /proc/PID/stat, the state being 0
 SLICE_NS: Final = 500_000  # shorter than the default of some ms, long enough for all that a failover orders
+REUSED_BYTES_MAX: Final = 16 << 20
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # malloc.h
 INHERITED_FD: Final = 3  # of an interpreter that `start_interpreter` started
 
 Area = tuple[int, int]  # of memory: address and bytes
@@ -128,12 +130,15 @@ def use_batch_scheduling() -> None:
     os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
 
 
-def start_interpreter(module: str, descriptor: int, *arguments: str) -> int:
+def start_interpreter(
+    module: str, descriptor: int, *arguments: str, variables: Mapping[str, str] | None = None
+) -> int:
     """Start `python -m module arguments`, which gets `descriptor` as `INHERITED_FD`; its pid.
 
-    The module is that of this very package: the working directory is not searched (`-P`).
+    `variables` are added to the environment. The module is that of this very package: the working directory
+    is not searched (`-P`).
     """
-    home, environment = str(Path(__file__).resolve().parents[3]), dict(os.environ)
+    home, environment = str(Path(__file__).resolve().parents[3]), {**os.environ, **(variables or {})}
     if home not in site.getsitepackages():
         path = os.environ.get("PYTHONPATH")
         environment["PYTHONPATH"] = os.pathsep.join((home, path)) if path else home
@@ -180,6 +185,16 @@ def kill(pidfd: int, sig: signal.Signals) -> bool:
 def trim() -> None:
     """Return memory that is allocated but free to the kernel: a fork copies less, a death unmaps less."""
     _libc.malloc_trim(0)
+
+
+def reuse_blocks() -> None:
+    """Have the memory of blocks up to `REUSED_BYTES_MAX` used again, here and in all forks from here on.
+
+    By default the C library gives it back at once, and each page of the next block is a fault and is cleared:
+    for a state of 1 MB that takes longer than to copy and to compare it. Larger blocks go back.
+    """
+    _libc.mallopt(M_MMAP_THRESHOLD, REUSED_BYTES_MAX)
+    _libc.mallopt(M_TRIM_THRESHOLD, 2 * REUSED_BYTES_MAX)
 
 
 def populate(areas: Sequence[Area]) -> None:

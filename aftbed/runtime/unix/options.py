@@ -89,7 +89,7 @@ class SourceOptions(msgspec.Struct, frozen=True):
     """For the process that makes the requests: the host of the Client, the vehicle or the player.
 
     `port` is the hub's, `secret` its bus's. `journals` is the directory of the dialogues of this Client,
-    which was made as the `incarnation`th, and of its predecessors.
+    which was made as the `incarnation`th, and of its predecessors. `application`: see `RunOptions`.
     """
 
     work: Work
@@ -98,6 +98,7 @@ class SourceOptions(msgspec.Struct, frozen=True):
     secret: str
     journals: str = ""
     incarnation: int = 1
+    application: str = ""
 
 
 def with_names_resolved(fault: Fault, work: Work) -> Fault:

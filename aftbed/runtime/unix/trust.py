@@ -31,7 +31,7 @@ import msgspec
 import aftbed
 from aftbed.core.errors import ConfigError
 from aftbed.core.input_file import read_input
-from aftbed.functions.load import SourceLoader
+from aftbed.functions.load import Code, SourceLoader
 from aftbed.functions.source import FunctionKind, FunctionSource, parse_source
 
 PACKAGE: Final = Path(aftbed.__file__).resolve().parent
@@ -205,6 +205,19 @@ def check_unchanged(code: VettedFiles) -> None:
     for file in code.files:
         if not file.module and _hash(Path(file.path)) != file.sha256:
             raise ConfigError(f"{file.path}: was changed meanwhile")
+
+
+class VettedCode(Code):
+    """From the bytes that were hashed; without any file of this package."""
+
+    def __init__(self, codes: Iterable[VettedFiles]) -> None:
+        self._codes = {code.place: code for code in codes}
+
+    def module(self, place: str) -> ModuleType:
+        return load(self._codes[place])
+
+    def permit(self, source: FunctionSource) -> None:
+        check_unchanged(self._codes[str(source)])
 
 
 # -- what runs have loaded ------------------------------------------------------------------------

@@ -148,7 +148,13 @@ class Workload:
             return "", b""
         options, journals = self._options, Path(self._options.record) / "journal"
         source = SourceOptions(
-            options.work, options.seed, options.port, self._secret, str(journals), incarnation
+            options.work,
+            options.seed,
+            options.port,
+            self._secret,
+            str(journals),
+            incarnation,
+            options.application,
         )
         return "load" if self._is_load else "gateway", msgspec.msgpack.encode(source)
 

@@ -51,6 +51,7 @@ def run(
     os.sched_setaffinity(0, cpus)
     linux.die_with(supervisor)
     linux.set_name("aftbed-zygote")
+    linux.reuse_blocks()
     for module in preload:
         importlib.import_module(module)
     if areas is None:

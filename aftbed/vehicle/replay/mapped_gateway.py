@@ -19,7 +19,14 @@ from typing import Final
 
 import msgspec
 
-from aftbed.vehicle.aeb.messages import SLOTS, SPEED_MAX_MS, AebInput, AebTarget, encode_request
+from aftbed.vehicle.aeb.messages import (
+    SLOTS,
+    SPEED_MAX_MS,
+    AebInput,
+    AebTarget,
+    EncodeRequest,
+    encode_request,
+)
 from aftbed.vehicle.can.dbc_file import Codec
 from aftbed.vehicle.can.e2e import Receiver
 from aftbed.vehicle.can.frame import Frame
@@ -74,9 +81,11 @@ class SeenTrack(msgspec.Struct, frozen=True):
 class MappedGateway(BusGateway):
     """Reads frames by a user's DBC and map; `codec` is aftbed's own, for what it sends."""
 
-    def __init__(self, codec: Codec, dbc: Path, map_file: Path) -> None:
+    def __init__(
+        self, codec: Codec, dbc: Path, map_file: Path, encode: EncodeRequest = encode_request
+    ) -> None:
         """Raises ConfigError if the DBC does not parse, or the map does not fit it."""
-        super().__init__(codec)
+        super().__init__(codec, encode)
         self._bound = bind(map_file, dbc)
         self._receivers = {
             rule.can_id: Receiver(rule.watch) for rule in self._bound.rules.values() if rule.watch is not None
@@ -188,7 +197,7 @@ class MappedGateway(BusGateway):
         self._tracks.clear()
         known = self._ego is not None and t_us - self._ego[0] <= self._bound.map.ego.timeout_ms * 1000
         speed_ms = self._ego[1] if self._ego is not None and known else 0.0
-        return encode_request(AebInput(t_us // 1000, speed_ms, known, bool(fresh) or empty, targets))
+        return self.encode(AebInput(t_us // 1000, speed_ms, known, bool(fresh) or empty, targets))
 
 
 def _is_set(flag: str | Flag, signals: dict[str, float]) -> bool:
