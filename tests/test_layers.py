@@ -32,6 +32,8 @@ ROWS: Final = {  # package: row, the lowest first
     "interop": 8,
     "bench": 9,
     "cli": 10,
+    "api": 11,  # a module of the package itself: it carries out what the commands do
+    "pytest_plugin": 12,
 }
 STRANGERS: Final = (  # neither imports the other
     frozenset({"ftm", "vehicle"}),
@@ -39,7 +41,11 @@ STRANGERS: Final = (  # neither imports the other
     frozenset({"functions", "vehicle"}),
     frozenset({"report", "interop"}),
 )
-NO_ROW: Final = {"aftbed": (), "aftbed.__main__": ("aftbed.cli",)}  # all that they may import
+NO_ROW: Final = {  # all that they may import
+    "aftbed": ("aftbed.api", "aftbed.core.application", "aftbed.core.errors", "aftbed.search.explore"),
+    "aftbed.__main__": ("aftbed.cli",),
+}
+OF_THE_PACKAGE: Final = frozenset({"__version__", "__file__"})  # all that modules take of `aftbed` itself
 
 IMPURE_PLACES: Final = (  # where clock, socket, process, file and chance may live
     "aftbed.runtime.unix",
@@ -53,6 +59,8 @@ IMPURE_PLACES: Final = (  # where clock, socket, process, file and chance may li
     "aftbed.interop",
     "aftbed.bench",
     "aftbed.cli",
+    "aftbed.api",
+    "aftbed.pytest_plugin",
     "aftbed.core.input_file",  # the readers of files in core: all upper rows read by them
     "aftbed.core.yaml_file",
 )
@@ -205,7 +213,21 @@ def cycles(graph: Mapping[str, set[str]]) -> list[list[str]]:
 
 
 def import_graph(sources: Mapping[str, str]) -> dict[str, set[str]]:
-    return {name: imported_modules(name, source, sources) for name, source in sources.items()}
+    """Without `aftbed` itself, which names for others what it offers: see `taken_of_the_package`."""
+    return {name: imported_modules(name, source, sources) - {"aftbed"} for name, source in sources.items()}
+
+
+def taken_of_the_package(source: str, known: Iterable[str]) -> set[str]:
+    """The names that `source` takes of `aftbed`, but for the modules in it."""
+    found, known = set[str](), set(known)
+    for node in ast.walk(tree(source)):
+        if isinstance(node, ast.ImportFrom) and node.module == "aftbed":
+            found |= {alias.name for alias in node.names if f"aftbed.{alias.name}" not in known}
+        elif (
+            isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "aftbed"
+        ):
+            found |= {node.attr} if f"aftbed.{node.attr}" not in known else set()
+    return found
 
 
 def double_names(sources: Mapping[str, str]) -> list[str]:
@@ -225,6 +247,32 @@ def test_no_module_breaches_the_architecture() -> None:
 
 def test_no_modules_import_one_another() -> None:
     assert not cycles(import_graph(sources()))
+
+
+def test_modules_take_nothing_of_the_package_itself_but_its_version_and_place() -> None:
+    """What it offers to other programs lies above them."""
+    known = modules()
+    taken = {name: taken_of_the_package(source, known) - OF_THE_PACKAGE for name, source in sources().items()}
+    assert {name: names for name, names in taken.items() if names} == {}
+
+
+def test_a_name_that_is_taken_of_the_package_is_found() -> None:
+    known = ("aftbed", "aftbed.cli")
+    assert taken_of_the_package("from aftbed import cli, run", known) == {"run"}
+    assert taken_of_the_package("import aftbed\naftbed.run()\naftbed.cli.main()", known) == {"run"}
+
+
+def test_what_the_package_offers_is_where_a_type_checker_is_told() -> None:
+    assert set(aftbed._HOMES) == set(NO_ROW["aftbed"])
+    offered = {name for names in aftbed._HOMES.values() for name in names}
+    assert offered == set(aftbed.__all__)
+    told = {
+        alias.name
+        for node in ast.walk(tree(Path(aftbed.__file__).read_text()))
+        if isinstance(node, ast.ImportFrom) and node.module in NO_ROW["aftbed"]
+        for alias in node.names
+    }
+    assert told == offered
 
 
 def test_a_class_name_is_defined_once() -> None:
@@ -265,6 +313,8 @@ def test_every_row_that_exists_is_looked_at() -> None:
         ("aftbed.ftm.proxy", "def f():\n    open('x')", "calls open"),
         ("aftbed.attic.old", "import aftbed.core.wire", "attic is no row"),
         ("aftbed", "from aftbed.core import wire", "it may not"),
+        ("aftbed.cli.run", "from aftbed.api import run", "a lower row imports an upper one"),
+        ("aftbed.api", "import aftbed.pytest_plugin", "a lower row imports an upper one"),
         ("aftbed.__main__", "from aftbed.core import wire", "it may not"),
     ],
 )
@@ -282,6 +332,8 @@ def test_a_planted_breach_is_found(module: str, source: str, reason: str) -> Non
         ("aftbed.runtime.sim.world", "from random import Random"),
         ("aftbed.ftm.proxy", "import msgspec\nfrom collections.abc import Callable"),
         ("aftbed.__main__", "from aftbed.cli import main"),
+        ("aftbed", "def f():\n    from aftbed.api import run"),
+        ("aftbed.api", "import subprocess\nfrom aftbed.cli import sim"),
         ("aftbed.runtime.unix.launch", "from aftbed import __version__"),
     ],
 )

@@ -29,6 +29,7 @@ QUICK: Final = {  # what makes a command short; too few samples to quote
     "adapt": "--adaptations 2",
     "launch": "--runs 1",
     "campaign": "--experiments 4",
+    "state": "--rounds 1",
 }
 
 Document = dict[str, object]
@@ -86,6 +87,11 @@ def _rate(what: str, command: str, least: float) -> TableLine:
     return TableLine(what, command, "per_minute", goal={"": least}, more_is_better=True)
 
 
+def _state(what: str, options: str, **goal: float) -> TableLine:
+    return TableLine(what, f"state {options}", "cycle_us", "us", SMALL_STATE, "ratio_p50", goal)
+
+
+SMALL_STATE: Final = FigureLimit("the same with 10 kB", "beside_cycle_us")
 RING: Final = FigureLimit("bare ring of as many hops", "ring_us")
 DEATH: Final = FigureLimit("SIGKILL to a pidfd readable elsewhere", "death_ms", "recovery --ftm pbr")
 IMPORTS: Final = FigureLimit("import of its libraries", "imports_ms")
@@ -107,6 +113,18 @@ LINES: Final = (
     *_adaptation("switch `pbr` to `lfr`", "--from pbr --to lfr", p50=1.5, p99=4.0),
     TableLine("the same by the paper's recipe (the paper: 300 ms)", RECIPE, "blackout_ms", "ms", DEATH),
     TableLine("of these, never served again", RECIPE, "stuck"),
+    _state("cycle under `pbr`, 1 MB of state, a page changed", "--bytes 1000000", p50=2.0),
+    TableLine(
+        "update of a function with 1 MB of state: no request is served for",
+        "state --bytes 1000000 --beside 1000",
+        "blackout_ms",
+        "ms",
+        FigureLimit("the same with 1 kB", "beside_blackout_ms"),
+        "blackout_ratio_p50",
+        {"p50": 3.0},
+    ),
+    _state("cycle under `pbr`, 10 MB of state, a page changed", "--bytes 10000000", p50=4.0),
+    _state("the same, of a function that tells its changes", "--bytes 10000000 --tells-changes", p50=4.0),
     TableLine("start of a run to a reply", "launch --ftm pbr", "launch_ms", "ms", IMPORTS, goal={"p50": 2}),
     TableLine("the graph from a warm zygote", "launch --ftm pbr", "graph_ms", "ms", goal={"p50": 40}),
     TableLine("memory of the 17 processes (PSS)", "memory --ftm pbr", "pss_mb", "MB", goal={"": 70}),

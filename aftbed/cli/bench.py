@@ -15,7 +15,7 @@ from aftbed.bench.adaptation import bench_adapt
 from aftbed.bench.cycle import bench_cycle, bench_hops
 from aftbed.bench.recovery import bench_recovery
 from aftbed.bench.resources import bench_launch, bench_memory
-from aftbed.cli.options import App, Ftm, Recipe, print_json
+from aftbed.cli.options import App, Ftm, Recipe, check_range, print_json
 from aftbed.cli.request_options import RequestSource
 from aftbed.core.errors import ConfigError
 from aftbed.ftm.compose import DUPLEX, replication_of
@@ -119,6 +119,26 @@ def campaign(
     from aftbed.bench.campaign import bench_campaign  # noqa: PLC0415 - see above
 
     _print(bench_campaign(ftm, placement, "sim" if sim else "unix", experiments, jobs), as_json=json)
+
+
+@bench.command()
+def state(
+    ftm: Ftm = "pbr",
+    size: Annotated[int, typer.Option("--bytes", help="Of the state.")] = 1_000_000,
+    beside: Annotated[int, typer.Option(help="Of the state that it is compared with.")] = 10_000,
+    tells_changes: Annotated[
+        bool, typer.Option("--tells-changes", help="The function knows what it has changed.")
+    ] = False,
+    rounds: Annotated[int, typer.Option(min=1, help="Of both sizes in turn.")] = 11,
+    json: Json = False,
+) -> None:
+    """The cycle under a large state beside a small one, a page of it changed; the blackout of an update."""
+    from aftbed.bench.ballast import SIZE_BYTES_MAX, SIZE_BYTES_MIN  # noqa: PLC0415 - see above
+    from aftbed.bench.sweep import bench_state  # noqa: PLC0415 - see above
+
+    check_range("--bytes", size, SIZE_BYTES_MIN, SIZE_BYTES_MAX)
+    check_range("--beside", beside, SIZE_BYTES_MIN, SIZE_BYTES_MAX)
+    _print(bench_state(ftm, size, beside, tracked=tells_changes, rounds=rounds), as_json=json)
 
 
 @bench.command()

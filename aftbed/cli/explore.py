@@ -143,7 +143,7 @@ def _explore(explorer: str, given: NumberedArguments) -> int:
                 runs += 1
                 unavailable += lost and not breaches
                 if breaches:
-                    broken.append(_broken(selection, number, setup, breaches))
+                    broken.append(broken_one(selection, number, setup, breaches))
                     if not given.json and len(broken) <= LISTED_MAX:
                         print(_breach_text(broken[-1]), flush=True)
                 show(runs, runs, len(broken))
@@ -167,7 +167,7 @@ def _explore_one(selection: Selection, setups: list[Setup], number: int, *, as_j
     setup, began_s = setups[number], time.monotonic()
     run, breaches = attempt_own(setup)
     lost = run is not None and run.rest.lost
-    found = tuple(_broken(selection, number, setup, breaches) for _ in breaches[:1])
+    found = tuple(broken_one(selection, number, setup, breaches) for _ in breaches[:1])
     result = Explored(1, 1 - len(found), int(lost and not found), _since(began_s), found)
     if as_json:
         print_json(result)
@@ -190,7 +190,8 @@ def _command(selection: Selection, only: int) -> str:
     return f"aftbed explore {selection.explorer} --ftm {ftms}{where}{requests} --only {only}"
 
 
-def _broken(selection: Selection, number: int, setup: Setup, breaches: tuple[Breach, ...]) -> Broken:
+def broken_one(selection: Selection, number: int, setup: Setup, breaches: tuple[Breach, ...]) -> Broken:
+    """With the command that repeats it."""
     return Broken(number, described(setup), tuple(map(str, breaches)), _command(selection, number))
 
 

@@ -10,6 +10,7 @@ import typer
 
 from aftbed import functions
 from aftbed.adapt.suitability import mismatches
+from aftbed.cli.new_function import new
 from aftbed.cli.options import Json, Seed, check_range, check_seed, print_blocks, print_json
 from aftbed.core.application import NONE, Characteristics
 from aftbed.core.errors import shown
@@ -22,6 +23,7 @@ from aftbed.vehicle.aeb.function import sample_requests
 from aftbed.vehicle.aeb.messages import decode_request, encode_fixed
 
 function = typer.Typer()
+function.command()(new)
 EXIT_OVERSTATED: Final = 1
 COUNT: Final = 200
 COUNT_MAX: Final = 100_000

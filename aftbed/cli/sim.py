@@ -47,8 +47,8 @@ from aftbed.inject.model import Fault, parse
 from aftbed.inject.targets import OTHERS
 from aftbed.judge.asked import not_happened
 from aftbed.judge.outcome import outcome_of
-from aftbed.judge.simulated import evidence_of_run
-from aftbed.judge.verdict import EXIT_CODES, EXIT_INTERRUPTED, Breach, Verdict, Word, judge
+from aftbed.judge.simulated import evidence_of_run, verdict_of
+from aftbed.judge.verdict import EXIT_CODES, EXIT_INTERRUPTED, Breach, Verdict, Word
 from aftbed.report import sequence
 from aftbed.runtime.sim.clock import START_NS
 from aftbed.runtime.sim.trace import traced
@@ -223,14 +223,19 @@ def _setup_maker(given: SimArguments) -> MakeSetup:
         page_bytes=_page_bytes(given),
         application=application,
     )
-    for fault in faults:
+    check_setup(setup)
+    return lambda seed: replace(setup, seed=seed, given=source.of(seed) if source is not None else None)
+
+
+def check_setup(setup: Setup) -> None:
+    """Raise ConfigError if its faults have nothing to strike, or an adaptation would not begin."""
+    for fault in setup.faults:
         check_fault(fault, setup.scenario)
-    for adaptation in adaptations:
+    for adaptation in setup.adaptations:
         if not setup.scenario and adaptation.at_request > setup.count:
             raise ConfigError(
                 f"--adapt: at request {adaptation.at_request}: there are {setup.count} requests (--count)"
             )
-    return lambda seed: replace(setup, seed=seed, given=source.of(seed) if source is not None else None)
 
 
 def _source(given: SimArguments) -> RequestSource | None:
@@ -257,16 +262,21 @@ def _load(given: SimArguments) -> Setup:
             raise ConfigError("--scenario: the car makes the requests; leave out --count and --rate")
         load_scenario(given.scenario)
         return Setup(scenario=given.scenario)
-    count = DEFAULT.count if given.count is None else given.count
-    rate_hz = DEFAULT.rate_hz if given.rate is None else given.rate
+    return load_of(DEFAULT.count if given.count is None else given.count, given.rate)
+
+
+def load_of(count: int, rate_hz: float | None) -> Setup:
+    """`count` requests; without a rate, each follows the reply before it. Raises ConfigError."""
     if not 1 <= count <= COUNT_MAX:
         raise ConfigError(f"--count {count}: 1 to {COUNT_MAX} requests are allowed")
-    if given.rate is not None and not 0 < rate_hz <= RATE_HZ_MAX:
+    if rate_hz is None:
+        return Setup(count=count)
+    if not 0 < rate_hz <= RATE_HZ_MAX:
         raise ConfigError(
             f"--rate {rate_hz}: more than 0, up to {RATE_HZ_MAX:.0f} a second are allowed"
             " (without it, each follows the reply before)"
         )
-    if rate_hz and count / rate_hz > LOAD_S_MAX:
+    if count / rate_hz > LOAD_S_MAX:
         raise ConfigError(f"--count {count} --rate {rate_hz}: {LOAD_S_MAX:.0f} s of virtual time are allowed")
     return Setup(count=count, rate_hz=rate_hz)
 
@@ -520,14 +530,14 @@ def _simulate_one(given: SimArguments, setup: Setup) -> int:
     reasons = list(map(str, broken))
     if run is not None:
         evidence = evidence_of_run(run, OWN_CODE)
+        verdict = verdict_of(run, evidence)
         if given.swarm:  # what a swarm draws may well not happen: `attempt_drawn` has judged that
             tally = Tally()
             tally.add(happened_in(run), intended(setup))
+            verdict = replace(verdict, verdict=word, reasons=reasons)
         else:
             lacking = tuple(not_happened(evidence.record))
-            word = "inconclusive" if lacking and not broken else word
-            reasons += lacking
-        verdict = replace(judge(evidence.record, evidence), verdict=word, reasons=reasons)
+            word, reasons = verdict.verdict, verdict.reasons
         done = _DoneRun(run, verdict, outcome_of(evidence)[0], (run.rest.ended_ns - START_NS) / 1e6)
     if not given.json:
         print(f"seed {setup.seed}\n{described(setup)}")

@@ -4,6 +4,8 @@ import itertools
 from collections.abc import Callable
 from typing import Final
 
+import msgspec
+
 from aftbed.core.application import Application, close
 from aftbed.core.events import Event
 from aftbed.core.script import ScriptKind
@@ -12,10 +14,11 @@ from aftbed.functions.load import NO_CODE, Code
 from aftbed.inject.crash import Crash
 from aftbed.inject.hang import Hang
 from aftbed.inject.slow import Slow
+from aftbed.judge.asked import not_happened
 from aftbed.judge.checks import Evidence
 from aftbed.judge.record import DriveEnd, Excuses, RunEnd, RunRecord
 from aftbed.judge.reference import reference_run, succession
-from aftbed.judge.verdict import Breach, broken
+from aftbed.judge.verdict import Breach, Verdict, Word, broken, judge
 from aftbed.runtime.deployment import replica_of
 from aftbed.runtime.node import FUNCTION_FAILED
 from aftbed.runtime.sim.clock import START_NS
@@ -122,3 +125,13 @@ def needless_stops(run: Run) -> tuple[Breach, ...]:
         return ()
     stops = run.history.events(Event.DETECTED_STOP)
     return tuple(Breach("needless_stop", f"{r.node} stopped at request {r.request_id}") for r in stops)
+
+
+def verdict_of(run: Run, evidence: Evidence) -> Verdict:
+    """What the run breaks, else what did not happen, or is not known (G8)."""
+    found = (*broken(evidence), *needless_stops(run))
+    missed = not_happened(evidence.record)
+    missed += [evidence.reference.unknown] if evidence.reference.unknown else []
+    word: Word = "fail" if found else "inconclusive" if missed else "pass"
+    reasons = [*map(str, found), *missed]
+    return msgspec.structs.replace(judge(evidence.record, evidence), verdict=word, reasons=reasons)

@@ -99,11 +99,13 @@ def strikes(old: str, new: str, placement: str) -> Iterator[Strike]:
 # -- what there is to explore ---------------------------------------------------------------------
 
 
-def crashes(base: Setup, ftms: Iterable[str], placements: Iterable[str]) -> Iterator[Setup]:
+def crashes(
+    base: Setup, ftms: Iterable[str], placements: Iterable[str], code: Code = OWN_CODE
+) -> Iterator[Setup]:
     """A death at each effect of each brick; `base` has the function and its requests."""
     for ftm, placement in itertools.product(ftms, placements):
         clean = msgspec.structs.replace(base, ftm=ftm, placement=placement, page_bytes=PAGE_BYTES)
-        for brick, count in sorted(simulate(clean, OWN_CODE).effects.items()):
+        for brick, count in sorted(simulate(clean, code).effects.items()):
             for effect in range(count + 1):
                 yield msgspec.structs.replace(clean, dooms=(Doom(brick, effect),))
 

@@ -47,6 +47,14 @@ DOCUMENTS: Final[dict[str, Document]] = {  # by the first word of a command
     },
     "memory": {"pss_mb": 80.0, "others": {"zygote": {"processes": 2, "pss_mb": 20.0}}},
     "campaign": {"per_minute": 700, "cpu_ms": 230},
+    "state": {
+        "cycle_us": TIMES,
+        "beside_cycle_us": {"p50": 1.5},
+        "ratio_p50": 1.3,
+        "blackout_ms": TIMES,
+        "beside_blackout_ms": {"p50": 0.5},
+        "blackout_ratio_p50": 4.0,
+    },
 }
 
 

@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
+import command_line
 import pytest
 from liveruns import PLAIN, called, forked
 from pages import PAGES, ROOT, Block, Command, blocks, names, table
@@ -31,6 +32,10 @@ duration_s: 600
 ego: {speed_kmh: 80}
 expect: {outcome: no_braking}
 """
+PYTHON: Final[dict[str, tuple[str, ...]]] = {
+    "python": (),
+    "pytest": ("-m", "pytest", "-q", "-p", "no:cacheprovider", *command_line.PLUGIN),
+}
 _PLACEHOLDER: Final = re.compile(r"\.\.\.|\b[0-9a-f]{6}\b|\b\d+(?= late)")  # left out, ids, real time
 
 pytestmark = pytest.mark.process
@@ -58,6 +63,11 @@ def aftbed(words: list[str], folder: Path, *, live: bool = False) -> subprocess.
     else:
         done = forked(*words, folder=folder, seconds=SECONDS_MAX)
     return subprocess.CompletedProcess(words, done.code, done.out, done.err)
+
+
+def python(words: list[str], folder: Path) -> subprocess.CompletedProcess[str]:
+    """Run `python FILE` or `pytest ...` of a page with this interpreter."""
+    return command_line.called(sys.executable, *PYTHON[words[0]], *words[1:], folder=folder)
 
 
 class LiveRun:
@@ -137,6 +147,9 @@ def run_page(page: Path, folder: Path, lives: list[LiveRun]) -> int:
             continue
         for command in block.commands():
             words = shlex.split(command.line)
+            if words[0] in PYTHON:
+                check(block, command, python(words, folder))
+                count += 1
             if words[0] != "aftbed":
                 continue
             if "live" in block.words and not (lives and lives[-1].alive):

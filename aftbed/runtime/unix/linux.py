@@ -130,6 +130,15 @@ def use_batch_scheduling() -> None:
     os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
 
 
+def package_environment() -> dict[str, str]:
+    """An environment in which an interpreter finds this very package."""
+    home, environment = str(Path(__file__).resolve().parents[3]), dict(os.environ)
+    if home not in site.getsitepackages():
+        path = os.environ.get("PYTHONPATH")
+        environment["PYTHONPATH"] = os.pathsep.join((home, path)) if path else home
+    return environment
+
+
 def start_interpreter(
     module: str, descriptor: int, *arguments: str, variables: Mapping[str, str] | None = None
 ) -> int:
@@ -138,14 +147,10 @@ def start_interpreter(
     `variables` are added to the environment. The module is that of this very package: the working directory
     is not searched (`-P`).
     """
-    home, environment = str(Path(__file__).resolve().parents[3]), {**os.environ, **(variables or {})}
-    if home not in site.getsitepackages():
-        path = os.environ.get("PYTHONPATH")
-        environment["PYTHONPATH"] = os.pathsep.join((home, path)) if path else home
     return os.posix_spawn(
         sys.executable,
         [sys.executable, "-P", "-m", module, *arguments],
-        environment,
+        package_environment() | dict(variables or {}),
         file_actions=[(os.POSIX_SPAWN_DUP2, descriptor, INHERITED_FD)],
     )
 
