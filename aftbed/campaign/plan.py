@@ -38,7 +38,7 @@ from aftbed.campaign.spec import (
 )
 from aftbed.core.application import Characteristics
 from aftbed.core.errors import ConfigError, unknown
-from aftbed.ftm.compose import EXPRESSIONS, build
+from aftbed.ftm.compose import EXPRESSIONS, build, replication_of
 from aftbed.functions.request_file import names_function, read_requests
 from aftbed.functions.source import renamed
 from aftbed.inject.memory import refuse_unsafe
@@ -255,7 +255,6 @@ def _check_adaptations(made: CampaignPlan, stratum: Stratum) -> None:
 # Its plan, and so its ledger, names each mechanism, and each adaptation: whoever reads a ledger asks nobody.
 
 NO_ADAPTATION: Final = AdaptationEntry("none")
-ANYTHING: Final = Characteristics()
 
 
 def resolved(spec: Spec, trust: Trust) -> Spec:
@@ -313,40 +312,46 @@ def unknown_words(spec: Spec, entry: FaultEntry, ftm: str) -> ConfigError | None
     return None
 
 
-def _with_each_adaptation(spec: Spec, declared: Characteristics = ANYTHING) -> Spec:
-    """One entry for each mechanism that `{mechanism}` means, if another one can become it.
+def _with_each_adaptation(spec: Spec, declared: Characteristics | None = None) -> Spec:
+    """An entry for each mechanism that `{mechanism}` means, begun by those that can be adapted so.
 
-    Without state access nothing becomes one that has to start a backup.
+    `declared`: by the function, where the mechanisms are those that suit it. Without state access nothing
+    becomes one that has to start a backup.
     """
     found: list[AdaptationEntry] = []
     for entry in spec.adaptations:
-        places = " ".join(entry.texts)
-        if APP_PLACE in places:
-            app = renamed(spec.system.app) if spec.system.app else ""
-            if not app:
-                continue
-            texts = tuple(text.replace(APP_PLACE, app) for text in entry.texts)
-            entry = msgspec.structs.replace(entry, adapt=texts)  # noqa: PLW2901
-        others = spec.mechanisms if MECHANISM_PLACE in places else ()
-        found += [] if others else [entry]
-        for other in others:
-            texts = tuple(text.replace(MECHANISM_PLACE, other) for text in entry.texts)
+        words = " ".join(entry.texts)
+        places = [place for place in (MECHANISM_PLACE, APP_PLACE) if place in words]
+        if not places and (declared is None or not entry.texts):
+            found.append(entry)
+            continue
+        app = renamed(spec.system.app) if spec.system.app else ""
+        if APP_PLACE in places and not app:
+            continue
+        for other in spec.mechanisms if MECHANISM_PLACE in places else ("",):
+            texts = (text.replace(MECHANISM_PLACE, other).replace(APP_PLACE, app) for text in entry.texts)
             name = entry.name.replace(MECHANISM_PLACE, other)
-            begun = tuple(ftm for ftm in spec.mechanisms if ftm != other and means(entry.mechanisms, ftm))
-            begun = tuple(ftm for ftm in begun if _can_be(spec, texts, ftm, entry.recipe))
-            begun = tuple(ftm for ftm in begun if remarks(ftm, declared) or not remarks(other, declared))
-            if begun:
-                found.append(msgspec.structs.replace(entry, name=name, adapt=texts, mechanisms=begun))
+            made = msgspec.structs.replace(entry, name=name, adapt=tuple(texts))
+            lacks_state = declared is not None and bool(other) and bool(remarks(other, declared))
+            begun = tuple(
+                ftm
+                for ftm in spec.mechanisms
+                if ftm != other
+                and means(entry.mechanisms, ftm)
+                and _can_be(spec, made, ftm)
+                and not (lacks_state and not replication_of(ftm))
+            )
+            found += [msgspec.structs.replace(made, mechanisms=begun)] if begun else []
     return msgspec.structs.replace(spec, adaptations=tuple(found) or (NO_ADAPTATION,))
 
 
-def _can_be(spec: Spec, texts: tuple[str, ...], ftm: str, recipe: str) -> bool:
+def _can_be(spec: Spec, entry: AdaptationEntry, ftm: str) -> bool:
     """Whether a run that begins with `ftm` can be adapted so. Raises ConfigError where words are wrong."""
-    for text in texts:
+    for text in entry.texts:
         read(text)
     try:
         for placement in spec.system.placements:
-            scheduled(texts, build(ftm, placement, application=spec.system.app), recipe)
+            scheduled(entry.texts, build(ftm, placement, application=spec.system.app), entry.recipe)
     except ConfigError:
         return False
     return True

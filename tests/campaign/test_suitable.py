@@ -175,7 +175,7 @@ def test_an_experiment_sends_the_requests_of_a_file_and_begins_anew_behind_the_l
     assert given is not None and len(given.requests) == REQUESTS.count("\n") - 1 == 40
     result = carry_out(experiment, lambda _: None)
     assert result.outcome == "tolerated", result.reasons
-    assert result.requests is not None and (result.requests.sent, result.requests.refused) == (50, 0)
+    assert result.requests is not None and (result.requests.sent, result.requests.wrong) == (50, 0)
     assert f"--requests {folder}/requests.csv --count 50" in experiment.command()
     real = replace(experiment, runtime="unix").command()
     assert f"--requests {folder}/requests.csv --count 50" in real and "--load" not in real
