@@ -26,7 +26,7 @@ adaptations:
 - name: "to {mechanism}"
   adapt: to {mechanism} at request 9
   faults: [adapting]
-  mechanisms: ["pbr*", lfr, tr]
+  mechanisms: ["pbr*", lfr, tr, assert]
 - {name: to itself, adapt: "update app to {app} at request 9", faults: [adapting]}
 faults:
 - name: crash
@@ -103,7 +103,7 @@ def test_words_that_no_mechanism_knows_are_refused(folder: Path) -> None:
 def test_a_mechanism_stands_for_each_other_one_that_can_be_reached(folder: Path) -> None:
     names = strata(suited(read(folder), Characteristics()))
     pairs = {(name.split()[0], name.split(" · ")[1].split()[1]) for name in names if " · to " in name}
-    begun = {"pbr", "lfr", "tr", "pbr+tr", "pbr+assert"}
+    begun = {"pbr", "lfr", "tr", "assert", "pbr+tr", "pbr+assert"}
     ends = {"pbr", "lfr", "tr", "assert", "pbr+tr", "pbr+assert", "lfr+tr", "lfr+assert", "assert+tr"}
     assert {pair for pair in pairs if pair[1] != "itself"} == {
         (one, other) for one in begun for other in ends if one != other
