@@ -126,11 +126,10 @@ def renamed(text: str) -> str:
     something; "" where there is none, as of a class in a module.
     """
     source = parse_source(text)
+    if source.kind is FunctionKind.PROGRAM and len(source.words) > 1:
+        first, *rest = map(shlex.quote, source.words)
+        return " ".join([f"{first}''" if first.startswith("'") else f"'{first}'", *rest])
     path = Path(source.place)
-    if source.kind is FunctionKind.PROGRAM:
-        first, *rest = source.words
-        quoted = shlex.quote(first)
-        return " ".join([f"'{first}'" if quoted == first else f"{quoted}''", *map(shlex.quote, rest)])
     if not path.is_absolute():
         return ""
     return str(msgspec.structs.replace(source, place=f"{path.parent}/./{path.name}"))
