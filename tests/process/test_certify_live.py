@@ -56,11 +56,12 @@ def test_app_check_finds_hidden_state_on_real_processes(tmp_path: Path, function
 
 
 @pytest.mark.deep
+@pytest.mark.timeout(900)
 @pytest.mark.parametrize(
     ("function", "code"), [("Counter", 0), ("Forgetful", 1), ("Hidden", 1), ("Chance", 1)]
 )
 def test_app_check_tells_false_declarations(tmp_path: Path, function: str, code: int) -> None:
-    words = ("--app", f"{STRANGERS}:{function}", "--requests", requests_in(tmp_path))
+    words = ("--app", f"{STRANGERS}:{function}", "--requests", requests_in(tmp_path), "--experiments", "2")
     done = called("campaign", "run", "app-check", *words, "--out", tmp_path / "out", "--json")
     assert done.code == code, (done.err, json.loads(done.out)["gates"])
     weak = [one for one in json.loads(done.out)["weaknesses"] if not one["expected"]]
