@@ -19,7 +19,7 @@ from aftbed.campaign import ledger
 from aftbed.campaign.experiment import REQUESTS_PER_SECOND_MIN, Experiment, Result, carry_out
 from aftbed.campaign.plan import CampaignPlan
 from aftbed.core.errors import ConfigError
-from aftbed.runtime.unix.worker_pool import SECONDS_MAX, each
+from aftbed.runtime.unix.worker_pool import SECONDS_MAX, each, own_seconds_max
 
 
 class CampaignRunOptions(msgspec.Struct, frozen=True):
@@ -88,12 +88,14 @@ def performed(
         system = plan.spec.system
         # An experiment that takes more hangs; real ones have deadlines of their own, and end before.
         seconds_max = SECONDS_MAX + 2 * system.requests / (system.rate_hz or REQUESTS_PER_SECOND_MIN)
-        # A function of the user may end, or hang, the process that simulates it: that is never the command.
-        fresh = system.runtime == "unix" or bool(system.app)
-        alone = _alone if system.runtime == "sim" else None
-        for _, _, result in each(
-            perform, todo, asked.jobs, alone=alone, seconds_max=seconds_max, fresh=fresh
-        ):
+        fresh = system.runtime == "unix"
+        apart = bool(system.app)
+        if apart and not fresh:
+            seconds_max = own_seconds_max(system.requests)
+        results = each(
+            perform, todo, asked.jobs, alone=_alone, seconds_max=seconds_max, fresh=fresh, apart=apart
+        )
+        for _, _, result in results:
             yield result
         return
     from aftbed.campaign import dask  # noqa: PLC0415 - an extra

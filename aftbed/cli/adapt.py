@@ -6,7 +6,7 @@ plans the change on the graph that runs when it begins, checks it, and carries i
 
 import sys
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -167,22 +167,51 @@ def _refuse_unsuitable(new: Graph, wish: Wish, *, force: bool) -> None:
     """The same of `new`, to which `wish` leads."""
     if wish.verb == "decompose" or (wish.verb == "update" and wish.name != APPLICATION):
         return  # the new graph needs no more of the function than the old one
-    refuse_unsuitable(new, force=force)
+    refuse_unsuitable(protected_by(new), new.ftm, force=force)
 
 
-def refuse_unsuitable(graph: Graph, *, force: bool) -> None:
-    """Raise ConfigError if the mechanism of `graph` does not suit its function, unless `force`.
+def refuse_unsuitable(
+    application: str, *ftms: str, force: bool, requests: Sequence[bytes] | None = None
+) -> None:
+    """Raise ConfigError if one of `ftms` does not suit the function, unless `force`.
 
-    A class of the user is loaded neither here nor in the supervisor.
+    With `requests`, the function of a user is tried out with them, and refused likewise if it fails. It is
+    loaded neither here nor in the supervisor.
     """
-    application = protected_by(graph)
-    declared = declared_in_time(application) if application else default_application().characteristics
-    if reason := unsuitable(graph.ftm, declared):
+    if not application:
+        declared = default_application().characteristics
+    elif requests is None:
+        declared = declared_in_time(application)
+    else:
+        declared = tried_out(application, requests, force=force)
+    for ftm in ftms:
+        if reason := unsuitable(ftm, declared):
+            if not force:
+                raise ConfigError(f"{reason}; --force does it all the same")
+            print(f"aftbed: forced: {reason}", file=sys.stderr)
+        for remark in remarks(ftm, declared):
+            print(f"aftbed: note: {remark}", file=sys.stderr)
+
+
+def tried_out(application: str, requests: Sequence[bytes], *, force: bool) -> Characteristics:
+    """What the function of a user declares, which is tried out with `requests`.
+
+    Raises ConfigError if it fails; with `force`, only where what it declares is not known.
+    """
+    from aftbed.judge import isolated  # noqa: PLC0415 - as below
+    from aftbed.runtime.unix.trust import OWN_RUN  # noqa: PLC0415
+
+    try:
+        found = isolated.tried_out(application, requests, OWN_RUN)
+    except ConfigError as error:
         if not force:
-            raise ConfigError(f"{reason}; --force does it all the same")
-        print(f"aftbed: forced: {reason}", file=sys.stderr)
-    for remark in remarks(graph.ftm, declared):
-        print(f"aftbed: note: {remark}", file=sys.stderr)
+            raise
+        declared = declared_in_time(application)
+        print(f"aftbed: forced: {error}", file=sys.stderr)
+        return declared
+    if found.otherwise:
+        print(f"aftbed: note: {application}: {found.otherwise}", file=sys.stderr)
+    return found.characteristics
 
 
 def declared_in_time(application: str) -> Characteristics:

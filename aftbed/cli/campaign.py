@@ -33,7 +33,7 @@ from aftbed.cli.options import (
 )
 from aftbed.core.errors import ConfigError, shown, unknown
 from aftbed.functions.load import OWN_CODE
-from aftbed.functions.request_file import located_requests, names_function, requests_from
+from aftbed.functions.request_file import located_requests, requests_from
 from aftbed.functions.source import located
 from aftbed.interop.files import write_text_whole, write_whole
 from aftbed.judge.verdict import EXIT_INTERRUPTED
@@ -197,8 +197,14 @@ def run(given: CampaignRunArguments) -> int:
     found = planned(given, OWN_RUN)  # what the file names is executed anyway
     options = _run_options(found, given)
     system = found.spec.system
-    if names_function(system.request_file):  # what is wrong with it is said once, not by each experiment
-        requests_from(system.request_file, system.requests, found.spec.seed, OWN_CODE)
+    given_requests = None
+    if system.request_file:  # what is wrong with it is said once, not by each experiment
+        given_requests = requests_from(system.request_file, system.requests, found.spec.seed, OWN_CODE)
+    if system.app:
+        from aftbed.cli.adapt import tried_out  # noqa: PLC0415 - only with a function of the user
+        from aftbed.cli.request_options import first_requests  # noqa: PLC0415 - the same
+
+        tried_out(system.app, first_requests(given_requests), force=False)
     from aftbed.report.terminal import CampaignProgress  # noqa: PLC0415 - scipy, after the options
 
     began_s, interrupted = time.monotonic(), False

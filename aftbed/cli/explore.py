@@ -3,6 +3,7 @@
 import shlex
 import time
 from contextlib import closing
+from functools import partial
 from typing import Annotated, Final
 
 import msgspec
@@ -11,15 +12,15 @@ from msgspec.structs import replace
 
 from aftbed.cli.adapt import refuse_unsuitable
 from aftbed.cli.options import App, Json, check_range, jobs_of, print_json, separated, takes
-from aftbed.cli.request_options import RequestSource
-from aftbed.cli.sim import described, event_lines, picture
+from aftbed.cli.request_options import RequestSource, first_requests
+from aftbed.cli.sim import described, event_lines, picture, shown_apart
 from aftbed.cli.views import progress_bar, spaced
 from aftbed.core.errors import ConfigError
-from aftbed.ftm.compose import build
 from aftbed.functions.request_file import names_function
 from aftbed.functions.source import located
 from aftbed.judge.verdict import EXIT_CODES, EXIT_INTERRUPTED, Breach
 from aftbed.runtime.sim.world import Setup
+from aftbed.runtime.unix.worker_pool import once, own_seconds_max
 from aftbed.search.explore import (
     PLACEMENTS,
     Broken,
@@ -124,19 +125,28 @@ def _selection(explorer: str, given: NumberedArguments) -> Selection:
         check_range("--requests", count, 1, REQUESTS_MAX)
     chosen = selected(explorer, separated(given.ftm), separated(given.placement), count)
     application = located(given.app) if given.app is not None else ""
-    for ftm in chosen.ftms if application else ():
-        refuse_unsuitable(build(ftm, PLACEMENTS[0], application=application), force=given.force)
+    if application:
+        refuse_unsuitable(application, *chosen.ftms, force=given.force, requests=first_requests(sent))
     return replace(chosen, application=application, given=sent)
 
 
 def _explore(explorer: str, given: NumberedArguments) -> int:
     jobs, began_s = jobs_of(given.jobs), time.monotonic()
     selection = _selection(explorer, given)
-    setups = list(selection.setups())
+    apart = bool(selection.application)
+    # How many points a run has is found by simulating it.
+    setups = once(_setups, selection, own_seconds_max(REQUESTS_MAX), apart=apart)
     if given.only is not None:
-        return _explore_one(selection, setups, given.only, as_json=given.json)
+        if not 0 <= given.only < len(setups):
+            raise ConfigError(
+                f"--only {given.only}: this selection has the experiments 0 to {len(setups) - 1}"
+            )
+        one = partial(_explore_one, selection, setups, as_json=given.json)
+        if not apart:
+            return one(given.only)
+        return shown_apart(one, given.only, REQUESTS_MAX, lambda number, _: _command(selection, number))
     runs, unavailable, broken, interrupted = 0, 0, list[Broken](), False
-    results = explore_all(setups, jobs, lambda number, _: _command(selection, number))
+    results = explore_all(setups, jobs, lambda number, _: _command(selection, number), apart=apart)
     try:
         with progress_bar(f"explore {explorer}", len(setups), quiet=given.json) as show, closing(results):
             for number, setup, lost, breaches in results:
@@ -161,9 +171,11 @@ def _explore(explorer: str, given: NumberedArguments) -> int:
     return EXIT_INTERRUPTED if interrupted else EXIT_CODES["fail" if broken else "pass"]
 
 
+def _setups(selection: Selection) -> list[Setup]:
+    return list(selection.setups())
+
+
 def _explore_one(selection: Selection, setups: list[Setup], number: int, *, as_json: bool) -> int:
-    if not 0 <= number < len(setups):
-        raise ConfigError(f"--only {number}: this selection has the experiments 0 to {len(setups) - 1}")
     setup, began_s = setups[number], time.monotonic()
     run, breaches = attempt_own(setup)
     lost = run is not None and run.rest.lost

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Final
 
 from aftbed.cli.options import check_range
 from aftbed.core.errors import ConfigError
@@ -15,6 +16,14 @@ from aftbed.functions.request_file import (
     read_replies,
     read_requests,
 )
+from aftbed.vehicle.aeb.function import sample_requests
+
+TRIED_OUT_MAX: Final = 16
+
+
+def first_requests(given: GivenRequests | None) -> tuple[bytes, ...]:
+    """A few of a run, with which a function is tried out; `given` is None where they are those of a car."""
+    return given.requests[:TRIED_OUT_MAX] if given is not None else tuple(sample_requests(0, TRIED_OUT_MAX))
 
 
 class RequestSource:

@@ -44,6 +44,7 @@ from aftbed.runtime.unix.options import CarRun, LoadRun, PolicyOptions, ReplayRu
 
 if TYPE_CHECKING:
     from aftbed.cli.request_options import RequestSource
+    from aftbed.functions.request_file import GivenRequests
     from aftbed.runtime.unix.closed_loop import ClosedLoop
 
 POLICIES: Final = ("hold", "release", "latch")
@@ -141,8 +142,6 @@ def execute(given: RunArguments) -> int:
     """Run, show, judge; the exit code. Raises ConfigError before anything is started."""
     application = located(given.app) if given.app is not None else ""
     graph = build(given.ftm, given.placement, application=application)
-    if application:
-        _refuse_unsuitable(graph, force=given.force)
     faults = tuple(_fault(text, graph, unsafe=given.unsafe_memory) for text in given.faults)
     adaptations = _adaptations(given, graph)
     policy = None
@@ -153,6 +152,8 @@ def execute(given: RunArguments) -> int:
     source = _requests(given)
     work = _work(given) if source is None else _sent(source, given)
     requests = source.of(given.seed) if source is not None else None
+    if application:
+        _refuse_unsuitable(application, graph.ftm, requests, force=given.force)
     check_range("--bus-port", given.bus_port, 0, 65535)
     write_files = _files(given)
     options, listener = options_for(
@@ -204,10 +205,11 @@ def _fault(text: str, graph: Graph, *, unsafe: bool) -> Fault:
     return fault
 
 
-def _refuse_unsuitable(graph: Graph, *, force: bool) -> None:
+def _refuse_unsuitable(application: str, ftm: str, requests: "GivenRequests | None", *, force: bool) -> None:
     from aftbed.cli.adapt import refuse_unsuitable  # noqa: PLC0415 - only with --app
+    from aftbed.cli.request_options import first_requests  # noqa: PLC0415 - the same
 
-    refuse_unsuitable(graph, force=force)
+    refuse_unsuitable(application, ftm, force=force, requests=first_requests(requests))
 
 
 def _adaptations(given: RunArguments, graph: Graph) -> tuple[Scheduled, ...]:

@@ -5,14 +5,15 @@ replica is no failure here (`unavailable`), since a swarm draws such faults too 
 fault or an adaptation that was asked for and never happened makes the verdict inconclusive (G8).
 """
 
+import io
 import re
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing
+from contextlib import closing, redirect_stdout
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Final, NamedTuple
+from typing import Annotated, Final, NamedTuple, TypeVar
 
 import msgspec
 import typer
@@ -34,7 +35,7 @@ from aftbed.cli.options import (
     print_json,
     takes,
 )
-from aftbed.cli.request_options import RequestSource
+from aftbed.cli.request_options import RequestSource, first_requests
 from aftbed.cli.views import progress_bar, show_verdict, spaced
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.graph import Graph
@@ -55,7 +56,7 @@ from aftbed.runtime.sim.trace import traced
 from aftbed.runtime.sim.world import Run, Setup
 from aftbed.runtime.sim.world import check as check_fault
 from aftbed.runtime.unix.trust import trusting
-from aftbed.runtime.unix.worker_pool import each
+from aftbed.runtime.unix.worker_pool import SECONDS_MAX, Alone, each, once, own_seconds_max
 from aftbed.search.agreement import SEEDS, RecoveryRange, against
 from aftbed.search.explore import Attempt, Found, attempt_own, tried
 from aftbed.search.shrink import shrink
@@ -63,6 +64,8 @@ from aftbed.search.swarm import attempt_drawn, drawn, intended
 from aftbed.search.tally import Tally, happened_in
 from aftbed.vehicle.scenarios.library import load_scenario
 
+S = TypeVar("S")
+T = TypeVar("T")
 COUNT_MAX: Final = 100_000
 PAGE_BYTES: Final = (16, 65536)
 LOAD_S_MAX: Final = 3600.0  # of virtual time
@@ -158,11 +161,13 @@ def sim(given: SimArguments) -> int:
     jobs, make = jobs_of(given.jobs), _setup_maker(given)
     if given.app is not None:
         setup = make(first)
-        graph = build(setup.ftm, setup.placement, application=setup.application)
-        refuse_unsuitable(graph, force=given.force)
+        requests = first_requests(setup.given)
+        refuse_unsuitable(setup.application, setup.ftm, force=given.force, requests=requests)
     check_file("--diagram", None if given.diagram is None else Path(given.diagram))
     if given.seeds is None and given.minutes is None:
-        return _simulate_one(given, make(first))
+        show, apart = partial(_simulate_one, given), given.app is not None
+        setup = make(first)
+        return shown_apart(show, setup, setup.count, lambda _, s: repeating(s)) if apart else show(setup)
     return _ManyRuns(given).simulate(make, first, last, jobs)
 
 
@@ -521,6 +526,20 @@ class _DoneRun(NamedTuple):
         }
 
 
+def shown_apart(show: Callable[[S], int], setup: S, requests: int, alone: Alone[S]) -> int:
+    """`show`, which executes a function of the user, in a process of its own. Raises HarnessError."""
+    code, text = once(partial(_printed, show), setup, own_seconds_max(requests), apart=True, alone=alone)
+    print(text, end="")
+    return code
+
+
+def _printed(show: Callable[[S], int], setup: S) -> tuple[int, str]:
+    """The exit code, and what it prints."""
+    with redirect_stdout(io.StringIO()) as text:
+        code = show(setup)
+    return code, text.getvalue()
+
+
 def _simulate_one(given: SimArguments, setup: Setup) -> int:
     began_s = time.perf_counter()
     run, broken = _attempt(swarm=given.swarm)(setup)
@@ -576,7 +595,7 @@ class _ManyRuns:
     """The runs of a range of seeds; with --minutes, as many as there is time for."""
 
     def __init__(self, given: SimArguments) -> None:
-        self._given = given
+        self._given, self._apart = given, given.app is not None
         self._runs = self._unavailable = self._requests = self._inconclusive = 0
         self._broken: list[tuple[Setup, tuple[Breach, ...]]] = []
         self._missed: list[str] = []
@@ -590,7 +609,16 @@ class _ManyRuns:
             print(f"seeds {first}..{'' if seconds else last}", flush=True)
         setups = map(make, range(first, last + 1))
         try_ = partial(tried, attempt=_attempt(swarm=given.swarm))
-        results = each(try_, setups, jobs, alone=lambda _, setup: repeating(setup, swarm=given.swarm))
+        count = make(first).count if self._apart else 0
+        seconds_max = own_seconds_max(count) if self._apart else SECONDS_MAX
+        results = each(
+            try_,
+            setups,
+            jobs,
+            alone=lambda _, setup: repeating(setup, swarm=given.swarm),
+            seconds_max=seconds_max,
+            apart=self._apart,
+        )
         interrupted = False
         try:
             with progress_bar("sim", seconds or last - first + 1, quiet=given.json) as show, closing(results):
@@ -603,17 +631,30 @@ class _ManyRuns:
         except KeyboardInterrupt:
             interrupted = True
         broken = [
-            broken_run(setup, found, swarm=given.swarm, shrinks=number < SHRUNK_MAX and not interrupted)
+            self._simulated_again(
+                partial(
+                    broken_run,
+                    broken=found,
+                    swarm=given.swarm,
+                    shrinks=number < SHRUNK_MAX and not interrupted,
+                ),
+                setup,
+            )
             for number, (setup, found) in enumerate(self._broken)
         ]
         if given.diagram is not None and self._broken:
-            Path(given.diagram).write_text(picture(*self._broken[0]).mermaid)
+            broken_setup, breaches = self._broken[0]
+            drawing = self._simulated_again(partial(picture, broken=breaches), broken_setup)
+            Path(given.diagram).write_text(drawing.mermaid)
         elif given.diagram is not None:
             print(f"aftbed: note: nothing broke: {given.diagram} is not written", file=sys.stderr)
         self._show(broken, (first, first + self._runs - 1), max(took_s, 1e-9))
         proves_little = bool(self._inconclusive or self._vacuous())
         word: Word = "fail" if self._broken else "inconclusive" if proves_little else "pass"
         return EXIT_INTERRUPTED if interrupted else EXIT_CODES[word]
+
+    def _simulated_again(self, look: Callable[[Setup], T], setup: Setup) -> T:
+        return once(look, setup, SECONDS_MAX, apart=self._apart)
 
     def _count(self, setup: Setup, found: Found) -> None:
         self._runs += 1
@@ -652,7 +693,8 @@ class _ManyRuns:
             print_json(document)
             return
         for found in broken[:SHRUNK_MAX]:
-            messages = picture(found.setup, found.breaches).lines if found.shrunk is not None else []
+            show = partial(picture, broken=found.breaches)
+            messages = self._simulated_again(show, found.setup).lines if found.shrunk is not None else []
             print("\n".join((*messages, *found.lines())))
         if len(broken) > SHRUNK_MAX:
             print(f"{spaced(len(broken))} broke in all; --json lists them, each with its command")

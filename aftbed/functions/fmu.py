@@ -553,10 +553,30 @@ class _Unpacked:
             raise
 
 
+def outside_of_runs() -> Path:
+    """The directory above those of FMUs that no run has unpacked: a judge, a simulation, a test."""
+    return Path(os.environ.get("TMPDIR") or "/tmp") / f"aftbed-fmu-{os.getuid()}"
+
+
+def left_behind() -> list[Path]:
+    """What killed processes have left there."""
+    above = outside_of_runs()
+    with contextlib.suppress(OSError):
+        if above.lstat().st_uid == os.getuid() and not above.is_symlink():
+            return sorted(path for path in above.glob(f"{SWEPT}*") if _is_dead(path, lambda: None))
+    return []
+
+
+def remove_dead(path: Path) -> bool:
+    """Remove one of these, unless a process uses it. Whether it is gone."""
+    _is_dead(path, lambda: shutil.rmtree(path, ignore_errors=True))
+    return not path.exists()
+
+
 def _above() -> Path:
     """The directory above those of FMUs, of this user alone. Raises ConfigError."""
     run = Path(os.environ.get(RUN_VARIABLE) or "")
-    path = Path(os.environ.get("TMPDIR") or "/tmp") / f"aftbed-fmu-{os.getuid()}"
+    path = outside_of_runs()
     if run.is_absolute() and run.is_dir():
         path = run / "fmu"
     try:
@@ -588,13 +608,20 @@ def _locked_directory(above: Path) -> tuple[Path, int]:
 def _sweep(above: Path) -> None:
     """Remove what processes have left that were killed. Raises OSError."""
     for path in above.glob(f"{SWEPT}*"):
-        with contextlib.suppress(OSError):  # its process lives, or another one removes it
-            descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC | os.O_NOFOLLOW)
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                shutil.rmtree(path, ignore_errors=True)
-            finally:
-                os.close(descriptor)
+        remove_dead(path)
+
+
+def _is_dead(path: Path, act: Callable[[], None]) -> bool:
+    """Whether no process uses it; then `act`, while none can."""
+    with contextlib.suppress(OSError):  # its process lives, or another one removes it
+        descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC | os.O_NOFOLLOW)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            act()
+        finally:
+            os.close(descriptor)
+        return True
+    return False
 
 
 def _remove(path: Path, descriptor: int, pid: int) -> None:

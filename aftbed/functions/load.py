@@ -113,8 +113,12 @@ def load_application(source: str, code: Code) -> Callable[[], Application]:
 def characteristics_of(source: str, code: Code) -> Characteristics:
     """What the protected function of `source` declares. Raises ConfigError if it declares nothing."""
     make = load_application(source, code)
-    told = make if hasattr(make, "characteristics") else make()
-    declared: object = getattr(told, "characteristics", None)
+    return declared_in(source, make if hasattr(make, "characteristics") else make())
+
+
+def declared_in(source: str, function: object) -> Characteristics:
+    """The same of `function`, which was made of `source`. Raises ConfigError."""
+    declared: object = getattr(function, "characteristics", None)
     if not isinstance(declared, Characteristics):
         raise ConfigError(f"{source}: characteristics: found {declared!r}, allowed is Characteristics(...)")
     return declared

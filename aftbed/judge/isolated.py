@@ -1,4 +1,4 @@
-"""Executes a function that a record names: only if it is trusted, and in a process of its own.
+"""Executes a function that a user or a record names: only if it is trusted, and in a process of its own.
 
 Code that is not trusted is not executed at all (`runtime.unix.trust`). The process of code that is trusted
 has limits (`runtime.unix.confined`); a class writes no byte into a file. When it crashes, hangs or answers
@@ -6,14 +6,22 @@ anything but MessagePack of the declared type, the replies of the function are u
 """
 
 import sys
-from collections.abc import Callable
-from typing import Final
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Final, TypeVar
 
 import msgspec
 
-from aftbed.core.application import Application, Characteristics
-from aftbed.core.errors import ConfigError
-from aftbed.functions.load import OWN_CODE, characteristics_of
+from aftbed.core.application import (
+    AccessKind,
+    Application,
+    Characteristics,
+    close,
+    difference,
+    reply_fields_of,
+)
+from aftbed.core.errors import ConfigError, FunctionFailedError, PeerError
+from aftbed.functions.load import OWN_CODE, characteristics_of, declared_in, load_application
 from aftbed.judge.record import RunRecord
 from aftbed.judge.reference import (
     NamedChange,
@@ -27,7 +35,7 @@ from aftbed.judge.reference import (
     requests_of,
     succession,
 )
-from aftbed.runtime.unix.confined import JobFailedError, ProcessLimits, ask, serve
+from aftbed.runtime.unix.confined import JobFailedError, ProcessLimits, ask, note, serve
 from aftbed.runtime.unix.trust import (
     NOBODY,
     Trust,
@@ -40,6 +48,9 @@ from aftbed.runtime.unix.trust import (
 WORDS_MAX: Final = 300  # characters of what went wrong
 OPAQUE_FILE_BYTES: Final = 1 << 30  # a model is unpacked; a program may keep a log
 LIMITS: Final = ProcessLimits(seconds=120.0, memory_bytes=4 << 30, file_bytes=0)
+TRIAL_LIMITS: Final = ProcessLimits(seconds=10.0, memory_bytes=4 << 30, file_bytes=0)
+
+T = TypeVar("T")
 
 
 class Execute(msgspec.Struct, frozen=True, tag=True):
@@ -56,10 +67,20 @@ class Describe(msgspec.Struct, frozen=True, tag=True):
     source: str
 
 
+class TryOut(msgspec.Struct, frozen=True, tag=True):
+    """The same, and have it execute `requests` twice, from one state."""
+
+    source: str
+    requests: tuple[bytes, ...]
+
+
+Task = Execute | Describe | TryOut
+
+
 class Job(msgspec.Struct, frozen=True):
     """`path`: where the code looks for modules that it imports."""
 
-    task: Execute | Describe
+    task: Task
     codes: tuple[VettedFiles, ...]
     path: tuple[str, ...]
 
@@ -69,7 +90,10 @@ class Replies(msgspec.Struct, frozen=True, tag=True):
 
 
 class Declared(msgspec.Struct, frozen=True, tag=True):
+    """`otherwise`: what it did that differs from this when it was tried out, "" for nothing."""
+
     characteristics: Characteristics
+    otherwise: str = ""
 
 
 class Failed(msgspec.Struct, frozen=True, tag=True):
@@ -122,19 +146,34 @@ def declared_by(source: str, trust: Trust, limits: ProcessLimits = LIMITS) -> Ch
 
     One outside of this package is asked in a process of its own, too.
     """
+    return _declared(source, Describe(source), trust, limits).characteristics
+
+
+def tried_out(
+    source: str, requests: Sequence[bytes], trust: Trust, limits: ProcessLimits = TRIAL_LIMITS
+) -> Declared:
+    """What the function `source` declares, and whether it is so for `requests`.
+
+    Raises ConfigError where it is not known, or the function fails to execute them, to capture its state or
+    to restore it; one that it refuses is none it fails to execute. One of this package is not tried out.
+    """
+    return _declared(source, TryOut(source, tuple(requests)), trust, limits)
+
+
+def _declared(source: str, task: Describe | TryOut, trust: Trust, limits: ProcessLimits) -> Declared:
     code = vetted(source, trust)
     if not code.files:
-        return characteristics_of(source, OWN_CODE)
-    match _answer(Describe(source), (code,), limits):
-        case Declared(characteristics):
-            return characteristics
+        return Declared(characteristics_of(source, OWN_CODE))
+    match _answer(task, (code,), limits):
+        case Declared() as found:
+            return found
         case Failed(reason):
             raise ConfigError(reason if source in reason else f"{source}: {reason}")
         case Replies():
             raise ConfigError(f"{source}: it answered something else")
 
 
-def _answer(task: Execute | Describe, codes: tuple[VettedFiles, ...], limits: ProcessLimits) -> Answer:
+def _answer(task: Task, codes: tuple[VettedFiles, ...], limits: ProcessLimits) -> Answer:
     """Of a new process, which has ended then."""
     job = msgspec.msgpack.encode(Job(task, codes, tuple(search_path())))
     if any(not file.module for code in codes for file in code.files):
@@ -142,7 +181,7 @@ def _answer(task: Execute | Describe, codes: tuple[VettedFiles, ...], limits: Pr
     try:
         found: Answer = msgspec.msgpack.decode(ask(__name__, job, limits), type=Answer)
     except JobFailedError as error:
-        return Failed(f"its process {error}")
+        return Failed(f"its process {error}{f': {error.noted}' if error.noted else ''}")
     except (msgspec.DecodeError, RecursionError) as error:
         return Failed(f"its process answered what is no answer: {error}")
     return found
@@ -170,6 +209,67 @@ def _done(job: Job) -> Answer:
             return Replies(executed(requests, Succession(maker(first, code), loaded(changes, code))))
         case Describe(source):
             return Declared(characteristics_of(source, code))
+        case TryOut(source, requests):
+            function = load_application(source, code)()
+            try:
+                return Declared(declared_in(source, function), _tried(function, requests))
+            except FunctionFailedError as error:
+                raise ConfigError(f"{source}: {str(error).replace(f'{source}: ', '')}") from error
+            finally:
+                close(function)
+
+
+def _tried(function: Application, requests: Sequence[bytes]) -> str:
+    """Have it execute `requests` twice, from one state; how that differs from what it declares, or "".
+
+    Raises FunctionFailedError.
+    """
+    declared = function.characteristics
+    begun = _did("capture", function.capture)
+    replies = _replies(function, requests)
+    for number, (request, reply) in enumerate(zip(requests, replies, strict=True), 1):
+        if not _did(f"request {number}: acceptable", partial(function.acceptable, request, reply)):
+            return f"its assertion does not accept its own reply to request {number}"
+    if declared.state_access.kind is AccessKind.NONE:
+        return ""
+    ended = _did("capture", function.capture)
+    _did("restore of what capture gave", lambda: function.restore(begun))
+    restored = _did("capture", function.capture)
+    replies_again = _replies(function, requests)
+    ended_again = _did("capture", function.capture)
+    exact = declared.state_access.kind is AccessKind.EXACT
+    if exact and restored != begun:
+        return "restore does not give the state back that capture gave"
+    if not declared.deterministic:
+        return ""
+    fields, tolerance = reply_fields_of(function), declared.state_access.tolerance
+    for number, (one, other) in enumerate(zip(replies, replies_again, strict=True), 1):
+        if difference(fields, one, other) > tolerance:
+            return f"behind a restored state, the reply to request {number} is another"
+    if exact and ended != ended_again:
+        return f"behind a restored state, {len(requests)} requests lead to another state"
+    return ""
+
+
+def _replies(function: Application, requests: Sequence[bytes]) -> list[bytes]:
+    def reply(request: bytes) -> bytes:
+        try:
+            return function.execute(request)
+        except PeerError:
+            return b""
+
+    return [_did(f"request {n}: execute", partial(reply, one)) for n, one in enumerate(requests, 1)]
+
+
+def _did(what: str, act: Callable[[], T]) -> T:
+    """Raises FunctionFailedError where `act` raises whatever it does."""
+    note(what)
+    try:
+        return act()
+    except FunctionFailedError as error:
+        raise FunctionFailedError(f"{what}: {error}") from error
+    except Exception as error:
+        raise FunctionFailedError(f"{what}: {type(error).__name__}: {error}") from error
 
 
 if __name__ == "__main__":

@@ -41,7 +41,7 @@ from aftbed.judge.verdict import Breach
 from aftbed.runtime.sim.clock import Clock
 from aftbed.runtime.sim.interleaving import HeldChannel, orders
 from aftbed.runtime.sim.world import Doom, Run, Setup, World, simulate
-from aftbed.runtime.unix.worker_pool import SECONDS_MAX, Alone, each
+from aftbed.runtime.unix.worker_pool import SECONDS_MAX, Alone, each, own_seconds_max
 from aftbed.search.tally import Happened, happened_in
 
 ADAPTED: Final = tuple(  # unless others are named
@@ -307,10 +307,18 @@ def judged(setup: Setup) -> tuple[bool, tuple[Breach, ...]]:
 
 
 def explore(
-    setups: Iterable[Setup], jobs: int = 1, alone: Alone[Setup] | None = None
+    setups: Iterable[Setup], jobs: int = 1, alone: Alone[Setup] | None = None, *, apart: bool = False
 ) -> Generator[tuple[int, Setup, bool, tuple[Breach, ...]], None, None]:
-    """Every experiment with its number and what came of it, in order. See `each`."""
-    for number, setup, (lost, broken) in each(judged, setups, jobs, alone=alone):
+    """Every experiment with its number and what came of it, in order. See `each`.
+
+    `apart`: each executes a function of the user, so it may crash, or hang.
+    """
+    seconds_max = SECONDS_MAX
+    if apart:
+        setups = list(setups)
+        seconds_max = own_seconds_max(max((setup.count for setup in setups), default=0))
+    found = each(judged, setups, jobs, alone=alone, seconds_max=seconds_max, apart=apart)
+    for number, setup, (lost, broken) in found:
         yield number, setup, lost, broken
 
 

@@ -61,7 +61,7 @@ def test_one_that_hangs_is_named_with_its_command_and_no_process_is_left() -> No
     found = each(hangs_at_five, range(9), 2, alone=lambda number, _: f"run {number}", seconds_max=1.0)
     with pytest.raises(HarnessError) as raised:
         list(found)
-    assert str(raised.value) == "experiment 5 hangs, after 1 s there is no result: 5; alone: run 5"
+    assert str(raised.value) == "experiment 5 hangs, after 1 s there is no result; alone: run 5"
     assert time.monotonic() - began_s < LIMIT_S
     assert workers() <= before
 
@@ -70,7 +70,7 @@ def test_one_whose_process_dies_is_named_and_no_process_is_left() -> None:
     before = workers()
     with pytest.raises(HarnessError) as raised:
         list(each(dies_at_five, range(9), 2, alone=lambda number, _: f"run {number}"))
-    said = "experiment 5 has no result, its process has been killed by signal 9: 5; alone: run 5"
+    said = "experiment 5 has no result, its process has been killed by signal 9; alone: run 5"
     assert str(raised.value) == said
     assert workers() <= before
 

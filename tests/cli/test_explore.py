@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
+import psutil
 import pytest
 from fakerun import Call, Output
 
@@ -71,6 +72,31 @@ def test_a_function_of_the_user_with_its_requests(explore: Call, tmp_path: Path)
     assert again is not None and f"--app {tmp_path}/bad.py:Adder" in again[1]
     code, repeated, _ = explore(*shlex.split(again[1]))
     assert code == 1 and "request 2: the reply is not the bare server's" in repeated
+
+
+@pytest.mark.parametrize(
+    ("body", "told"),
+    [
+        ("os.kill(os.getpid(), 9)", "has no result, its process has been killed by signal 9"),
+        ("exec('while True: pass')", "hangs, after 1 s there is no result"),
+    ],
+)
+def test_a_function_that_fails_later_is_told_and_ends_no_command(
+    body: str, told: str, call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Later than the requests with which it is tried out."""
+    for module in ("cli.sim", "cli.explore", "search.explore"):
+        monkeypatch.setattr(f"aftbed.{module}.own_seconds_max", lambda _requests: 1.0)
+    (tmp_path / "requests.csv").write_text("step:u8\n" + "3\n" * 20)
+    fails = f"if self.sum >= 57: {body}\n        return b"
+    text = FUNCTION.replace("RESTORED", "self.sum = int(state)").replace("return b", fails, 1)
+    (tmp_path / "mine.py").write_text(f"import os\n{text}")
+    app = ("--app", tmp_path / "mine.py:Adder", "--requests", tmp_path / "requests.csv", "--ftm", "pbr")
+    before = psutil.Process().children()
+    for command in (("sim",), ("explore", "crash", "--placement", "replica", "--jobs", "1")):
+        code, out, err = call(*command, *app)
+        assert code == 3 and told in err and err.count("\n") == 1, (code, out, err)
+        assert psutil.Process().children() == before
 
 
 def test_one_process_and_two_count_the_same(explore: Call) -> None:
@@ -219,6 +245,6 @@ class Interrupted:
 
 def test_ctrl_c_ends_every_explorer_with_130(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
     for name, command in (("explore_all", "crash"), ("explore_orders", "order")):
-        monkeypatch.setattr(f"aftbed.cli.explore.{name}", lambda *_: Interrupted())
+        monkeypatch.setattr(f"aftbed.cli.explore.{name}", lambda *_, **__: Interrupted())
         code, out, _ = call("explore", command, "--ftm", "pbr", "--placement", "process", "--requests", "1")
         assert code == 130 and "interrupted: 0 of " in out

@@ -6,6 +6,7 @@ Each function leaves a sentinel file when it is imported. Records are made by ha
 import json
 import os
 import py_compile
+import re
 import socket
 import sys
 from hashlib import sha256
@@ -18,7 +19,7 @@ from records import outcomes, whole
 from aftbed.core.events import Event
 from aftbed.functions.load import load_module
 from aftbed.judge.checks import Evidence
-from aftbed.judge.isolated import declared_by, reference_of
+from aftbed.judge.isolated import declared_by, reference_of, tried_out
 from aftbed.judge.outcome import outcome_of
 from aftbed.judge.record import RunRecord, read_record
 from aftbed.judge.verdict import Verdict, evidence_of, judge
@@ -394,3 +395,88 @@ def test_a_state_directory_that_cannot_be_made_is_no_error(
     assert "--trust" in verdict_of(record_naming(tmp_path / "record", planted.source)).reasons[0]
     monkeypatch.setenv("XDG_STATE_HOME", "relative")
     assert trust.state_directory().is_absolute()
+
+
+# -- a function that is tried out before a run ----------------------------------------------------
+
+COUNTS: Final = """\
+import os, signal
+from aftbed.core.application import Characteristics
+from aftbed.core.errors import PeerError
+
+class Mine:
+    characteristics = Characteristics()
+    def __init__(self):
+        self.count = self.calls = 0
+    def execute(self, request):
+        self.calls += 1
+        {body}
+        self.count += len(request)
+        return b"%d" % self.count
+    def capture(self):
+        return b"%d" % self.count
+    def restore(self, state):
+        self.count = int(state)
+"""
+
+
+def trial(tmp_path: Path, body: str = "pass", *changes: tuple[str, str]) -> str:
+    """What it does otherwise, when it is tried out with four requests."""
+    text = COUNTS.replace("{body}", body)
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    (tmp_path / "mine.py").write_text(text)
+    limits = ProcessLimits(seconds=2.0, memory_bytes=1 << 30, file_bytes=0)
+    return tried_out(f"{tmp_path}/mine.py:Mine", [b"a", b"", b"bc", b"d"], OWN_RUN, limits).otherwise
+
+
+@starts_process
+@pytest.mark.parametrize(
+    ("body", "told"),
+    [
+        ("if request == b'bc': 1 / 0", "mine.py:Mine: request 3: execute: "),
+        (
+            "if not request: os.kill(os.getpid(), 11)",
+            "its process ended with signal 11 (Segmentation fault): request 2: execute",
+        ),
+        ("while request == b'd': pass", "its process takes more than 2 s: request 4: execute"),
+        ("if request == b'd': return 7", "execute returned int, bytes are required"),
+    ],
+)
+def test_a_function_that_fails_its_first_requests_is_told(tmp_path: Path, body: str, told: str) -> None:
+    with pytest.raises(trust.ConfigError, match=re.escape(told)):
+        trial(tmp_path, body)
+
+
+@starts_process
+@pytest.mark.parametrize(
+    ("body", "change", "told"),
+    [
+        ("pass", ("", ""), ""),
+        ("if request == b'd': raise PeerError('no')", ("", ""), ""),
+        ("pass", ("int(state)", "int(state) + 1"), "restore does not give the state back that capture gave"),
+        (
+            "self.count += self.calls == 7",
+            ("", ""),
+            "behind a restored state, the reply to request 3 is anoth",
+        ),
+        ("self.count += self.calls == 7", ("Characteristics()", "Characteristics(deterministic=False)"), ""),
+        (
+            "pass",
+            ("    def capture", "    acceptable = lambda *_: False\n    def capture"),
+            "reply to request 1",
+        ),
+    ],
+)
+def test_a_function_that_is_not_as_it_declares_is_told(
+    tmp_path: Path, body: str, change: tuple[str, str], told: str
+) -> None:
+    found = trial(tmp_path, body, change)
+    assert told in found and bool(told) == bool(found), found
+
+
+@starts_process
+def test_a_function_that_cannot_restore_is_told(tmp_path: Path) -> None:
+    with pytest.raises(trust.ConfigError, match="restore of what capture gave: PeerError: not mine"):
+        trial(tmp_path, "pass", ("self.count = int(state)", "raise PeerError('not mine')"))

@@ -1,6 +1,7 @@
 """`aftbed doctor`: what a dead run left is named and removed; what is a live one's, or of no run, is not."""
 
 import contextlib
+import fcntl
 import json
 import os
 import shutil
@@ -18,7 +19,7 @@ from rundirs import new_run
 
 from aftbed.cli.doctor import Diagnosis
 from aftbed.runtime.unix import cleanup, control_client, run_directory
-from aftbed.runtime.unix.cleanup import LeftDirectory
+from aftbed.runtime.unix.cleanup import LeftDirectory, LeftModel
 from aftbed.runtime.unix.options import LoadRun
 from aftbed.runtime.unix.run_directory import Member
 
@@ -90,6 +91,30 @@ def test_nothing_is_left_where_all_is_well(home: Home) -> None:
         assert (code, found.left, found.removed, found.ok) == (0, [], [], True)
         assert doctor("--clean")[1].removed == []
         assert run.status()["leader"] == "a"
+
+
+def test_an_fmu_that_a_dead_process_had_unpacked_is_named_and_removed(
+    home: Home, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One that is in use has a lock, and stays."""
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    above = tmp_path / f"aftbed-fmu-{os.getuid()}"
+    dead, used = above / "unpacked-dead", above / "unpacked-used"
+    for folder in (dead, used):
+        (folder / "binaries").mkdir(parents=True)
+        (folder / "binaries" / "model.so").write_bytes(bytes(100_000))
+    lock = os.open(used, os.O_RDONLY)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        code, found = doctor()
+        assert code == 1 and [(type(left), left.run) for left in found.left] == [(LeftModel, str(dead))]
+        assert found.left[0].bytes_used >= 100_000 and str(dead) in str(found.left[0])
+        code, found = doctor("--clean")
+        assert (code, len(found.removed), found.left) == (0, 1, [])
+        assert used.exists() and not dead.exists()
+    finally:
+        os.close(lock)
+    assert [left.run for left in doctor("--clean")[1].removed] == [str(used)]
 
 
 def test_a_run_killed_with_all_its_keepers_leaves_its_directory(home: Home) -> None:

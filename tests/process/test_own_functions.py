@@ -35,9 +35,14 @@ int aft_init(void **instance) { *instance = calloc(1, sizeof(struct state)); ret
 int aft_execute(void *instance, const uint8_t *request, size_t request_size, uint8_t *reply, size_t reply_max,
                 size_t *reply_size) {
     struct state *state = instance;
-    const char *once = getenv("CRASH_ONCE");
+    const char *once = getenv("FAIL_ONCE"), *how = getenv("FAIL");
     for (size_t i = 0; i < request_size; i++) state->sum = state->sum * 31 + request[i];
-    if (++state->count == 40 && once && open(once, O_CREAT | O_EXCL, 0600) >= 0) raise(SIGSEGV);
+    if (++state->count == 40 && once && open(once, O_CREAT | O_EXCL, 0600) >= 0) {
+        if (*how == 'c') raise(SIGSEGV);
+        while (*how == 'h') ;
+        *reply_size = 1 << 20;
+        return AFT_OK;
+    }
     memcpy(reply, &state->sum, *reply_size = sizeof state->sum);
     return AFT_OK;
 }
@@ -53,15 +58,31 @@ int aft_restore(void *instance, const uint8_t *state, size_t size) {
 }
 """
 PROGRAM: Final = """
-import json, sys, zlib
-value = 0
+import json, os, sys, time, zlib
+value = count = 0
+how, once = os.environ.get("FAIL"), os.environ.get("FAIL_ONCE")
+
+def fails():
+    try:
+        os.close(os.open(once, os.O_CREAT | os.O_EXCL))
+    except OSError:
+        return False
+    return True
+
 for line in sys.stdin:
     asked = json.loads(line)
     answer = {"id": asked["id"]}
     if "describe" in asked:
         answer["describe"] = {"deterministic": True, "state_access": "exact"}
     elif "execute" in asked:
+        count += 1
         value = zlib.crc32(bytes.fromhex(asked["execute"]), value)
+        if count == 40 and once and fails():
+            while how == "hang":
+                time.sleep(9)
+            much = json.dumps(answer | {"execute": "00" * 70000})
+            print("\x1b[2Jnot today" if how == "garbage" else much, flush=True)
+            continue
         answer["execute"] = (b"%08x" % value).hex()
     elif "capture" in asked:
         answer["capture"] = (b"%d" % value).hex()
@@ -124,14 +145,41 @@ def test_a_crash_loses_nothing(kind: str, ftm: str, event: str, request: pytest.
     assert "failover   to epoch 2" in done.out and "  failed  " not in done.out
 
 
-def test_a_library_that_crashes_its_process_is_failed_over(
-    library: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("kind", "how", "told"),
+    every(
+        2,
+        [
+            ("library", "crash", "] alarm: a: crash"),
+            ("library", "too much", ": aft_execute: *reply_size is 1048576, at most 61440 is allowed"),
+            ("library", "hang", "] alarm: a: hang"),
+            ("program", "too much", ": answered to execute: more than 126976 bytes in a line"),
+            ("program", "hang", "] alarm: a: hang"),
+            ("program", "garbage", r": answered to execute: b'\x1b[2Jnot today': JSON is malformed"),
+        ],
+    ),
+)
+def test_a_function_that_fails_by_itself_is_failed_over_and_told(
+    kind: str,
+    how: str,
+    told: str,
+    request: pytest.FixtureRequest,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setenv("CRASH_ONCE", str(tmp_path / "crashed"))
-    done = aftbed("run", "--app", library, "--load", "120@400")
+    """In one replica only, at its 40th request. A hang is the Watchdog's to see, within 60 ms."""
+    app = request.getfixturevalue(kind)
+    monkeypatch.setenv("FAIL_ONCE", str(tmp_path / "failed"))
+    monkeypatch.setenv("FAIL", how)
+    done = aftbed("run", "--app", app, "--load", "120@400")
     assert done.code == 0, done.out + done.err
-    assert (tmp_path / "crashed").exists()
-    assert "120 sent, 120 answered, 0 lost" in done.out and "failover   to epoch 2" in done.out
+    assert (tmp_path / "failed").exists()
+    assert "120 sent, 120 answered, 0 lost, 0 duplicated" in done.out and "0 wrong" in done.out
+    assert "failover   to epoch 2" in done.out and told in done.out
+    if told.startswith(":"):
+        (failure,) = (line for line in done.out.splitlines() if line.startswith("  failed     "))
+        assert told in failure and failure.split()[1] == "a/server:"
+    assert programs(app) == []
 
 
 def test_a_program_that_is_killed_is_failed_over_and_told(program: str) -> None:

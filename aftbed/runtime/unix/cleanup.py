@@ -255,7 +255,8 @@ def _record_undo(record: Path, started_ns: int, text: str) -> None:
 # second has passed, and only what stays is reported: no run that is just beginning or ending.
 #
 # A run has no other files than those in its directory, and its record. What it shares in memory are memfds,
-# which the kernel removes with the last process that has them.
+# which the kernel removes with the last process that has them. A judge, or a simulation, unpacks an FMU
+# elsewhere (`functions.fmu`): the lock of that directory says whether its process lives.
 
 
 class LeftDirectory(msgspec.Struct, frozen=True, tag="directory", tag_field="kind"):
@@ -271,7 +272,17 @@ class LeftDirectory(msgspec.Struct, frozen=True, tag="directory", tag_field="kin
         return f"directory {self.run} ({sockets}, {self.files} files, {self.bytes_used / 1e6:.1f} MB)"
 
 
-Left = Member | LeftDirectory
+class LeftModel(msgspec.Struct, frozen=True, tag="model", tag_field="kind"):
+    """An FMU that a dead process had unpacked."""
+
+    run: str
+    bytes_used: int
+
+    def __str__(self) -> str:
+        return f"model {self.run} ({self.bytes_used / 1e6:.1f} MB)"
+
+
+Left = Member | LeftDirectory | LeftModel
 
 
 def find() -> list[Left]:
@@ -299,6 +310,10 @@ def _remove(left: Left) -> bool:
     match left:
         case Member():
             return left.end(END_SECONDS_MAX)
+        case LeftModel(run):
+            from aftbed.functions.fmu import remove_dead  # noqa: PLC0415 - no run needs it
+
+            return remove_dead(Path(run))
         case LeftDirectory(run):
             shutil.rmtree(run, ignore_errors=True)
             return not Path(run).exists()
@@ -310,7 +325,17 @@ def _leftovers() -> list[Left]:
     directories = {path for path in root.iterdir() if _is_run(path)}
     dead = {run for run in directories | {Path(m.run) for m in members} if not _alive(run)}
     processes = [m for m in members if Path(m.run) in dead]
-    return [*sorted(processes, key=lambda p: (p.run, p.pid)), *map(_directory, sorted(directories & dead))]
+    return [
+        *sorted(processes, key=lambda p: (p.run, p.pid)),
+        *map(_directory, sorted(directories & dead)),
+        *_models(),
+    ]
+
+
+def _models() -> list[LeftModel]:
+    from aftbed.functions.fmu import left_behind  # noqa: PLC0415 - no run needs it
+
+    return [LeftModel(str(path), _directory(path).bytes_used) for path in left_behind()]
 
 
 def _is_run(path: Path) -> bool:

@@ -30,6 +30,8 @@ from aftbed.runtime.unix import linux
 
 AHEAD: Final = 32  # experiments for each worker that may be done before the oldest is
 SECONDS_MAX: Final = 900.0  # of one: it takes seconds, on a busy machine a minute
+OWN_SECONDS_MAX: Final = 60.0  # of a simulated one that executes a function of the user, and for each request
+OWN_REQUEST_SECONDS_MAX: Final = 0.01
 RUN_END_SECONDS_MAX: Final = 30.0  # when the command ends: a real run is taken down in order
 END_SECONDS_MAX: Final = 1.0  # of a worker without real runs, whatever ends it
 TALK_SECONDS_MAX: Final = 60.0  # for a message to be sent or received once it has begun
@@ -51,15 +53,17 @@ def each(
     alone: Alone[S] | None = None,
     seconds_max: float = SECONDS_MAX,
     fresh: bool = False,
+    apart: bool = False,
 ) -> Generator[tuple[int, S, T], None, None]:
     """Number, experiment and what `judge` found, in order, over `jobs` processes.
 
     `fresh`: in new interpreters that import what `judge` takes, and have nothing of the command's: the
-    processes of a real run are forks of them, and all that is in them would be copied with each. What
-    `judge` raises is raised here. Raises HarnessError if a worker dies, or takes more than `seconds_max`
+    processes of a real run are forks of them, and all that is in them would be copied with each. `apart`:
+    not in this process, even if `jobs` is 1, since code of the user may crash it, or hang. What `judge`
+    raises is raised here. Raises HarnessError if a worker dies, or takes more than `seconds_max`
     for one experiment; `alone` is the command that runs it by itself.
     """
-    if jobs == 1 and not fresh:
+    if jobs == 1 and not (fresh or apart):
         for number, setup in enumerate(setups):
             yield number, setup, judge(setup)
         return
@@ -83,10 +87,24 @@ def each(
                 yield oldest, given.pop(oldest), cast("T", result)
     except _LostError as lost:
         setup = given[lost.number]
-        command = f"; alone: {alone(lost.number, setup)}" if alone is not None else ""
-        raise HarnessError(f"{lost}: {f'{setup}'[:SETUP_MAX]}{command}") from None
+        command = alone(lost.number, setup) if alone is not None else ""
+        which = f"; alone: {command}" if command else f": {setup}"[:SETUP_MAX]
+        raise HarnessError(f"{lost}{which}") from None
     finally:
         pool.end()
+
+
+def own_seconds_max(requests: int) -> float:
+    """Of a simulated experiment that executes a function of the user."""
+    return OWN_SECONDS_MAX + OWN_REQUEST_SECONDS_MAX * requests
+
+
+def once(
+    judge: Callable[[S], T], setup: S, seconds_max: float, *, apart: bool, alone: Alone[S] | None = None
+) -> T:
+    """What `judge` finds in one experiment. As `each`."""
+    ((_, _, found),) = each(judge, [setup], alone=alone, seconds_max=seconds_max, apart=apart)
+    return found
 
 
 # -- in the command -------------------------------------------------------------------------------
