@@ -110,8 +110,10 @@ def target(graph: Graph, expression: str) -> Graph:
 def updated(graph: Graph, part: str, source: str) -> Graph:
     """`graph` with `source` in the place of `part`'s class on every replica; `app` is the function.
 
-    Raises ConfigError, naming what there is, if no replica has such a part.
+    Raises ConfigError, naming what there is, if no replica has such a part, and under `none`.
     """
+    if graph.ftm == NONE:
+        raise ConfigError(f"{NONE} has no engine, so nothing can be updated; any other mechanism has one")
     if part == APPLICATION:
         return protecting(graph, source)
     parts = sorted({b.part for b in graph.bricks if b.replica and b.kind != "watchdog"})

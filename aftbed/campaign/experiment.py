@@ -23,6 +23,7 @@ from aftbed.core.messages import Scheduled
 from aftbed.core.script import RECIPES
 from aftbed.ftm.compose import build
 from aftbed.functions.load import NO_CODE, OWN_CODE, Code
+from aftbed.functions.request_file import GivenRequests, names_function, requests_from
 from aftbed.inject.model import Fault, FaultReport, parse
 from aftbed.judge.asked import WITHOUT_END
 from aftbed.judge.checks import Evidence, Requests
@@ -63,6 +64,7 @@ class Experiment(msgspec.Struct, frozen=True):
     expected: tuple[str, ...] = ()
     budget_ms: float | None = None  # for a recovery
     app: str = ""  # the protected function, the built-in one if left out
+    request_file: str = ""  # where the requests come from: see `spec.System`
 
     def command(self) -> str:
         """The command that repeats it by hand, and shows it in full."""
@@ -72,7 +74,8 @@ class Experiment(msgspec.Struct, frozen=True):
         words += ["--app", shlex.quote(self.app)] if self.app else []
         if self.scenario:
             words += ["--scenario", self.scenario, *([] if simulated else ["--pace", "max"])]
-        elif simulated:
+        elif simulated or self.request_file:
+            words += ["--requests", shlex.quote(self.request_file)] if self.request_file else []
             words += ["--count", str(self.requests), *(["--rate", rate] if rate else [])]
         else:
             words += ["--load", f"{self.requests}@{rate}" if rate else str(self.requests)]
@@ -209,12 +212,13 @@ def faults_of(experiment: Experiment, graph: Graph) -> tuple[Fault, ...]:
 def refuse_untrusted(experiment: Experiment, trust: Trust) -> None:
     """Raise ConfigError if the experiment, of a ledger, would execute code that is not trusted."""
     wishes = (read(text).wish for text in experiment.adaptations)
-    for source in filter(None, (experiment.app, *(wish.source for wish in wishes))):
+    function = experiment.request_file if names_function(experiment.request_file) else ""
+    for source in filter(None, (experiment.app, function, *(wish.source for wish in wishes))):
         vetted(source, trust)
 
 
-def setup_of(experiment: Experiment) -> Setup:
-    """The experiment for the simulator. Raises ConfigError."""
+def setup_of(experiment: Experiment, code: Code = NO_CODE) -> Setup:
+    """The experiment for the simulator. `code`: of a function that makes its requests. Raises ConfigError."""
     faults, changes = _asked(experiment)
     return Setup(
         experiment.ftm,
@@ -226,7 +230,15 @@ def setup_of(experiment: Experiment) -> Setup:
         changes,
         scenario=experiment.scenario,
         application=experiment.app,
+        given=_given(experiment, code),
     )
+
+
+def _given(experiment: Experiment, code: Code) -> GivenRequests | None:
+    """None where the requests are drawn, or a car's. Raises ConfigError."""
+    if not experiment.request_file:
+        return None
+    return requests_from(experiment.request_file, experiment.requests, experiment.seed, code)
 
 
 def _asked(experiment: Experiment) -> tuple[tuple[Fault, ...], tuple[Scheduled, ...]]:
@@ -236,7 +248,7 @@ def _asked(experiment: Experiment) -> tuple[tuple[Fault, ...], tuple[Scheduled, 
 
 
 def _simulated(experiment: Experiment, code: Code) -> Result:
-    evidence = evidence_of_run(simulate(setup_of(experiment), code), code)
+    evidence = evidence_of_run(simulate(setup_of(experiment, code), code), code)
     outcome, reasons = outcome_of(evidence)
     reasons += tuple(f"an assertion failed: {failure}" for failure in evidence.record.failures)
     return _result(experiment, evidence, judge(evidence.record, evidence), outcome, reasons)
@@ -263,7 +275,8 @@ def _real(experiment: Experiment, standing: ExitStack) -> Result:
 
 def _recorded(experiment: Experiment, standing: ExitStack) -> RunRecord:
     faults, changes = _asked(experiment)
-    work: Work = LoadRun(experiment.requests, experiment.rate_hz)
+    given = _given(experiment, OWN_CODE)
+    work: Work = LoadRun(experiment.requests, experiment.rate_hz, experiment.request_file)
     if experiment.scenario:
         work = CarRun(experiment.scenario, None, "latch")
     options, listener = options_for(
@@ -276,7 +289,7 @@ def _recorded(experiment: Experiment, standing: ExitStack) -> RunRecord:
         application=experiment.app,
     )
     warm_up(BUS if experiment.scenario else LIGHT)
-    launched = launch(options, listener)
+    launched = launch(options, listener, given)
     standing.callback(launched.remove)
     silence_s = RUN_SECONDS_MAX + experiment.requests * (1 / (experiment.rate_hz or REQUESTS_PER_SECOND_MIN))
     linux.set_timeouts(launched.line.sock, silence_s, silence_s)  # a load reports nothing before its end

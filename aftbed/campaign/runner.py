@@ -92,7 +92,9 @@ def performed(
         apart = bool(system.app)
         if apart and not fresh:
             seconds_max = own_seconds_max(system.requests)
-        results = each(perform, todo, asked.jobs, seconds_max=seconds_max, fresh=fresh, apart=apart)
+        results = each(
+            perform, todo, asked.jobs, alone=_alone, seconds_max=seconds_max, fresh=fresh, apart=apart
+        )
         for _, _, result in results:
             yield result
         return
@@ -106,6 +108,10 @@ def performed(
                 yield result
     finally:
         os.close(descriptor)
+
+
+def _alone(number: int, experiment: Experiment) -> str:
+    return experiment.command()
 
 
 def _perform(path: str, experiment: Experiment) -> Result:

@@ -20,11 +20,17 @@ stratum go through its matrix in turn; what is drawn depends on the seed, the st
 experiment, and on nothing else. Words that a mechanism does not know (an event that it never emits) are
 refused before anything runs: such an entry has `mechanisms: [...]` of its own.
 
-*Expected* is the class of the outcome (`experiment.OUTCOMES`), per mechanism; `"*"` is any other. An outcome
-that is better than the expected ones counts as unexpected too: an oracle that never sees anything is no
-oracle.
+`mechanisms: [suitable]` are those that suit what the function declares; an entry of `faults` is then left out
+where a mechanism does not know its words. `{mechanism}` in an entry of `adaptations` is each other mechanism,
+`{app}` the function. What that comes to is in the plan, and in the ledger: see `plan.resolved`.
+
+*Expected* is the class of the outcome (`experiment.OUTCOMES`), per mechanism, or per pattern of them; `"*"`
+is any other. An outcome that is better than the expected ones counts as unexpected too: an oracle that never
+sees anything is no oracle.
 """
 
+from collections.abc import Iterable
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated, Final, Literal
 
@@ -37,12 +43,16 @@ from aftbed.core.graph import PLACEMENTS
 from aftbed.core.script import RECIPES
 from aftbed.core.yaml_file import read_yaml
 from aftbed.ftm.compose import EXPRESSIONS
+from aftbed.functions.request_file import located_requests
 from aftbed.functions.source import located
 from aftbed.judge.outcome import OUTCOMES
 from aftbed.vehicle.scenarios.library import load_scenario
 
 SHIPPED: Final = Path(__file__).resolve().parent.parent / "campaigns"
 ANY: Final = "*"
+SUITABLE: Final = "suitable"
+MECHANISM_PLACE: Final = "{mechanism}"  # in an adaptation: each other one
+APP_PLACE: Final = "{app}"
 EXPERIMENTS_MAX: Final = 1_000_000
 METRICS: Final = (
     *OUTCOMES,
@@ -68,10 +78,12 @@ Share = Annotated[float, Meta(gt=0, lt=1)]
 class System(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What the mechanisms protect: `app` ("": the brake), asked for `requests` of a load, or by a car.
 
-    `app` is looked up beside the campaign file.
+    `request_file`: what is sent, as `--requests` has it; behind the last of a file comes the first. It and
+    `app` are looked up beside the campaign file.
     """
 
     app: str = ""
+    request_file: str = ""
     requests: Annotated[int, Meta(ge=1, le=REQUESTS_MAX)] = 100
     rate_hz: Annotated[float, Meta(ge=0, le=RATE_HZ_MAX)] = 0.0  # 0: the next follows the reply
     scenario: str = ""
@@ -87,13 +99,20 @@ class FaultEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     fault: str | tuple[str, ...] = ()
     matrix: dict[str, tuple[Value, ...]] = {}
     draw: dict[str, tuple[int, int]] = {}
-    mechanisms: tuple[str, ...] = ()  # where not all
+    mechanisms: tuple[str, ...] = ()  # where not all; patterns as of file names
     expect: dict[str, tuple[str, ...]] = {}
+    may_miss: bool = False  # there may be nothing to strike: a stratum where nothing struck is no failure
 
     @property
     def texts(self) -> tuple[str, ...]:
         """As they stand in the file."""
         return (self.fault,) if isinstance(self.fault, str) else self.fault
+
+    def expected(self, mechanism: str) -> tuple[str, ...]:
+        """By its name, else by the first pattern that means it, `"*"` last."""
+        patterns = (mechanism, *(name for name in self.expect if name != ANY), ANY)
+        found = (name for name in patterns if name in self.expect and fnmatchcase(mechanism, name))
+        return self.expect.get(next(found, ""), ())
 
 
 class AdaptationEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -103,6 +122,7 @@ class AdaptationEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     adapt: str | tuple[str, ...] = ()
     recipe: str = RECIPES[0]
     mechanisms: tuple[str, ...] = ()
+    faults: tuple[str, ...] = ()  # entries of `faults`, where not all; patterns, too
 
     @property
     def texts(self) -> tuple[str, ...]:
@@ -128,7 +148,8 @@ class Gate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """`metric` of the strata whose name matches `strata`, taken together, is at most `max`, or at least
     `min`.
 
-    A share is judged by the bound of its interval, so few experiments prove little.
+    A share is judged by the bound of its interval, so few experiments prove little. But `max: 0` is judged
+    by what was measured: not one may be seen.
     """
 
     metric: str
@@ -168,6 +189,10 @@ def read_spec(name: str) -> Spec:
         if spec.system.app:
             system = msgspec.structs.replace(spec.system, app=located(spec.system.app, path.parent))
             spec = msgspec.structs.replace(spec, system=system)
+        if spec.system.request_file:
+            source = located_requests(spec.system.request_file, path.parent)
+            system = msgspec.structs.replace(spec.system, request_file=source)
+            spec = msgspec.structs.replace(spec, system=system)
         check(spec)
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error
@@ -181,12 +206,17 @@ def shipped() -> list[str]:
 
 def check(spec: Spec) -> None:
     """Check what the types do not express. Raises ConfigError naming the key."""
-    _each_known("mechanisms", spec.mechanisms, EXPRESSIONS)
+    if spec.mechanisms != (SUITABLE,):
+        _each_known("mechanisms", spec.mechanisms, (*EXPRESSIONS, SUITABLE))
+        if SUITABLE in spec.mechanisms:
+            raise ConfigError(f"mechanisms: {SUITABLE!r} stands alone: they are all that suit the function")
     _each_known("system.placements", spec.system.placements, PLACEMENTS)
     if not spec.system.placements:
         raise ConfigError("system.placements: found none, allowed is at least one of them")
     if spec.system.scenario:
         load_scenario(spec.system.scenario)
+        if spec.system.request_file:
+            raise ConfigError("system.request_file: the car of system.scenario makes the requests")
     _all_different("faults", [entry.name for entry in spec.faults])
     _all_different("adaptations", [entry.name for entry in spec.adaptations])
     if not spec.adaptations:
@@ -195,14 +225,30 @@ def check(spec: Spec) -> None:
         _check_fault(f"faults[{number}]", entry, spec)
     for number, adaptation in enumerate(spec.adaptations):
         where = f"adaptations[{number}]"
-        _each_known(f"{where}.mechanisms", adaptation.mechanisms, spec.mechanisms)
+        _each_means(f"{where}.mechanisms", adaptation.mechanisms, mechanisms_of(spec))
+        _each_means(f"{where}.faults", adaptation.faults, [entry.name for entry in spec.faults])
+        if (
+            any(MECHANISM_PLACE in text for text in adaptation.texts)
+            and MECHANISM_PLACE not in adaptation.name
+        ):
+            raise ConfigError(f"{where}.name: {MECHANISM_PLACE} stands in adapt, so it has to in the name")
         _each_known(f"{where}.recipe", (adaptation.recipe,), RECIPES)
     for number, gate in enumerate(spec.gates):
         _check_gate(f"gates[{number}]", gate)
 
 
+def mechanisms_of(spec: Spec) -> tuple[str, ...]:
+    """Those that may be named in entries."""
+    return EXPRESSIONS if spec.mechanisms == (SUITABLE,) else spec.mechanisms
+
+
+def means(patterns: tuple[str, ...], name: str) -> bool:
+    """Whether one of them means `name`; none of them mean all."""
+    return not patterns or name in patterns or any(fnmatchcase(name, pattern) for pattern in patterns)
+
+
 def _check_fault(where: str, entry: FaultEntry, spec: Spec) -> None:
-    _each_known(f"{where}.mechanisms", entry.mechanisms, spec.mechanisms)
+    _each_means(f"{where}.mechanisms", entry.mechanisms, mechanisms_of(spec))
     for key, values in entry.matrix.items():
         if not values:
             raise ConfigError(f"{where}.matrix.{key}: it is empty: name at least one value")
@@ -214,7 +260,7 @@ def _check_fault(where: str, entry: FaultEntry, spec: Spec) -> None:
         raise ConfigError(f"{where}: {min(twice)!r} stands in matrix and in draw")
     for mechanism, outcomes in entry.expect.items():
         if mechanism != ANY:
-            _each_known(f"{where}.expect", (mechanism,), spec.mechanisms)
+            _each_means(f"{where}.expect", (mechanism,), mechanisms_of(spec))
         _each_known(f"{where}.expect.{mechanism}", outcomes, OUTCOMES)
 
 
@@ -229,6 +275,12 @@ def _each_known(where: str, names: tuple[str, ...], allowed: tuple[str, ...]) ->
     for name in names:
         if name not in allowed:
             raise ConfigError(f"{where}: {unknown('name', name, allowed)}")
+
+
+def _each_means(where: str, patterns: tuple[str, ...], allowed: Iterable[str]) -> None:
+    for pattern in patterns:
+        if not any(means((pattern,), name) for name in allowed):
+            raise ConfigError(f"{where}: {unknown('name', pattern, allowed)}")
 
 
 def _all_different(where: str, names: list[str]) -> None:

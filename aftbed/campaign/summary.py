@@ -28,10 +28,12 @@ from aftbed.campaign.statistics import (
     quantile_interval,
     quantile_needs,
 )
+from aftbed.campaign.weaknesses import Weakness, weaknesses
 from aftbed.judge.outcome import OUTCOMES, UNKNOWN
 
 Word = Literal["pass", "fail"]
 NOT_ACTIVATED: Final = "not_activated"
+NOT_ALL: Final = "not all"  # of the faults of a stratum may miss
 BROKEN: Final = "broken"
 QUANTILES: Final = {"p50": 0.5, "p99": 0.99}
 SHARES: Final[dict[str, Callable[[Result], bool]]] = {
@@ -104,6 +106,7 @@ class Summary(msgspec.Struct, frozen=True):
     gates: tuple[GateResult, ...]
     gate: Word
     seconds: float
+    weaknesses: tuple[Weakness, ...] = ()  # of a function of the user (`system.app`), and of its mechanisms
 
 
 def summarise(ledger: Ledger, planned: int, seconds: float) -> Summary:
@@ -113,8 +116,15 @@ def summarise(ledger: Ledger, planned: int, seconds: float) -> Summary:
     for result in results:
         groups.setdefault(result.experiment.stratum, []).append(result)
     confidence = confidence_of(spec)
-    asked = tuple(judged(gate, groups, confidence) for gate in (*spec.gates, *_always(spec)))
-    gates = (*asked, _unexcused(results), *_vacuous(groups))
+    asked = tuple(judged(gate, groups, confidence) for gate in spec.gates)
+    missable = {stratum.name for stratum in strata_of(spec) if stratum.fault.may_miss}
+    struck = {
+        name: group
+        for name, group in groups.items()
+        if name not in missable or any(result.activated for result in group)
+    }
+    always = tuple(judged(gate, struck, confidence) for gate in _always(spec))
+    gates = (*asked, *always, _unexcused(results), *_vacuous(struck))
     sizes = {stratum.name: population(stratum.fault) for stratum in strata_of(spec)}
     broken = not results or any(g.word == "fail" for g in gates)
     return Summary(
@@ -128,6 +138,7 @@ def summarise(ledger: Ledger, planned: int, seconds: float) -> Summary:
         gates,
         "fail" if broken else "pass",
         round(seconds, 3),
+        weaknesses(spec, groups, confidence) if spec.system.app else (),
     )
 
 
@@ -202,6 +213,8 @@ def judged(gate: Gate, groups: dict[str, list[Result]], confidence: float) -> Ga
             return GateResult(gate.metric, gate.strata, limit, None, None, "fail", reason)
         value = quantile(times, q)
     bound = interval.high if gate.max is not None else interval.low
+    if gate.max == 0 and gate.metric in SHARES:
+        bound = value  # no number of experiments bounds a share by 0
     kept = bound <= gate.max if gate.max is not None else bound >= (gate.min or 0.0)
     reason = "" if kept else f"{value:.4g} was measured, and it may be {bound:.4g}"
     if not kept and gate.metric == "unknown":
@@ -234,4 +247,4 @@ def _vacuous(groups: dict[str, list[Result]]) -> Iterator[GateResult]:
     for name, group in groups.items():
         if group[0].experiment.faults and not any(r.activated for r in group):
             reason = f"none of {len(group)} faults struck: this stratum could not have failed"
-            yield GateResult(NOT_ACTIVATED, name, "not all", 1.0, None, "fail", reason)
+            yield GateResult(NOT_ACTIVATED, name, NOT_ALL, 1.0, None, "fail", reason)

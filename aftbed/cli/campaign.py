@@ -17,17 +17,28 @@ import typer
 from msgspec.structs import replace
 
 from aftbed.campaign import ledger, runner
-from aftbed.campaign.experiment import Result, carry_out, refuse_untrusted, smallest
-from aftbed.campaign.plan import CampaignPlan
+from aftbed.campaign.experiment import REQUESTS_MAX, Result, carry_out, refuse_untrusted, smallest
+from aftbed.campaign.plan import CampaignPlan, size_of
 from aftbed.campaign.plan import plan as plan_of
 from aftbed.campaign.spec import EXPERIMENTS_MAX, Spec, check, read_spec, shipped
-from aftbed.cli.options import App, Json, TrustedFolders, check_range, jobs_of, print_json, takes
+from aftbed.cli.options import (
+    App,
+    Json,
+    Requests,
+    TrustedFolders,
+    check_range,
+    jobs_of,
+    print_json,
+    takes,
+)
 from aftbed.core.errors import ConfigError, shown, unknown
+from aftbed.functions.load import OWN_CODE
+from aftbed.functions.request_file import located_requests, requests_from
 from aftbed.functions.source import located
 from aftbed.interop.files import write_text_whole, write_whole
 from aftbed.judge.verdict import EXIT_INTERRUPTED
 from aftbed.report.export import write_csv, write_parquet
-from aftbed.runtime.unix.trust import trusting
+from aftbed.runtime.unix.trust import NOBODY, OWN_RUN, Trust, trusting
 
 RUNTIMES: Final = ("unix", "sim")
 EXECUTORS: Final = ("local", "dask")
@@ -36,6 +47,7 @@ EXIT_CODES: Final = {"pass": 0, "fail": 1}
 SUMMARY: Final = "summary.json"
 JUNIT: Final = "junit.xml"
 HTML: Final = "report.html"
+MARKDOWN: Final = "summary.md"  # of a campaign with a function of the user
 _SHARD: Final = re.compile(r"([0-9]{1,6})/([0-9]{1,6})")
 
 campaign = typer.Typer()
@@ -72,11 +84,18 @@ class CampaignArguments(msgspec.Struct, frozen=True, kw_only=True):
     ] = None
     runtime: Annotated[str | None, typer.Option(help="unix or sim; overrides that of the file.")] = None
     app: App = None
+    requests: Requests = None
+    count: Annotated[
+        int | None, typer.Option(help="Requests of an experiment; overrides that of the file.")
+    ] = None
     json: Json = False
 
 
-def planned(given: CampaignArguments) -> CampaignPlan:
-    """The plan. Raises ConfigError before anything runs."""
+def planned(given: CampaignArguments, trust: Trust = NOBODY) -> CampaignPlan:
+    """The plan. Raises ConfigError before anything runs.
+
+    `trust`: of a function that the campaign's file names, where it is asked what it declares.
+    """
     spec = read_spec(given.name)
     if given.seed is not None:
         if given.seed < 0:
@@ -91,9 +110,15 @@ def planned(given: CampaignArguments) -> CampaignPlan:
         spec = replace(spec, system=replace(spec.system, runtime=given.runtime))
     if given.app is not None:
         spec = replace(spec, system=replace(spec.system, app=located(given.app)))
+        trust = OWN_RUN
+    if given.requests is not None:
+        spec = replace(spec, system=replace(spec.system, request_file=located_requests(given.requests)))
+    if given.count is not None:
+        check_range("--count", given.count, 1, REQUESTS_MAX)
+        spec = replace(spec, system=replace(spec.system, requests=given.count))
     try:
         check(spec)
-        return plan_of(spec)
+        return plan_of(spec, trust)
     except ConfigError as error:
         raise ConfigError(f"{given.name}: {error}") from error
 
@@ -102,13 +127,19 @@ class PlanArguments(CampaignArguments, frozen=True, kw_only=True):
     """The options of `aftbed campaign plan`."""
 
     out: Annotated[Path | None, typer.Option(help="Write every experiment to this file, a line each.")] = None
+    trust: Annotated[
+        tuple[Path, ...],
+        typer.Option(
+            "--trust", help="Directory whose functions may be executed; may be given several times."
+        ),
+    ] = ()
 
 
 @campaign.command()
 @takes(PlanArguments)
 def plan(given: PlanArguments) -> None:
     """What would be run: the strata, the number of experiments, about how long. Nothing is run."""
-    found = planned(given)
+    found = planned(given, trusting(given.trust))
     spec = found.spec
     if given.out is not None:
         lines = (msgspec.json.encode(e) + b"\n" for e in found.experiments())
@@ -163,13 +194,17 @@ def run(given: CampaignRunArguments) -> int:
 
     Exit code: 0 all gates pass, 1 one does not, 2 usage, 3 trouble of the harness, 130 interrupted.
     """
-    found = planned(given)
+    found = planned(given, OWN_RUN)  # what the file names is executed anyway
     options = _run_options(found, given)
-    if found.spec.system.app:
+    system = found.spec.system
+    given_requests = None
+    if system.request_file:  # what is wrong with it is said once, not by each experiment
+        given_requests = requests_from(system.request_file, system.requests, found.spec.seed, OWN_CODE)
+    if system.app:
         from aftbed.cli.adapt import tried_out  # noqa: PLC0415 - only with a function of the user
         from aftbed.cli.request_options import first_requests  # noqa: PLC0415 - the same
 
-        tried_out(found.spec.system.app, first_requests(found.spec.system.app, None), force=False)
+        tried_out(system.app, first_requests(system.app, given_requests), force=False)
     from aftbed.report.terminal import CampaignProgress  # noqa: PLC0415 - scipy, after the options
 
     began_s, interrupted = time.monotonic(), False
@@ -212,6 +247,7 @@ def _judge(folder: Path, size: int, seconds: float, *, as_json: bool) -> int:
     from aftbed.campaign.summary import summarise  # noqa: PLC0415
     from aftbed.report.html import html_report  # noqa: PLC0415 - scipy
     from aftbed.report.junit import junit_xml  # noqa: PLC0415
+    from aftbed.report.markdown import markdown_summary  # noqa: PLC0415
     from aftbed.report.terminal import summary_lines  # noqa: PLC0415
 
     records = _ledger(folder)
@@ -222,6 +258,8 @@ def _judge(folder: Path, size: int, seconds: float, *, as_json: bool) -> int:
         JUNIT: junit_xml(summary, records),
         HTML: html_report(summary, records),
     }
+    if records.head.spec.system.app:
+        reports[MARKDOWN] = markdown_summary(summary, records.head.spec.system.app)
     for name, text in reports.items():
         write_text_whole(folder / name, text)
     if as_json:
@@ -243,9 +281,8 @@ def report(folder: Folder, json: Json = False) -> None:
 
 def _report(folder: Path, *, as_json: bool) -> int:
     records = _ledger(folder)
-    size = len(plan_of(records.head.spec).strata) * records.head.spec.stop.experiments
     seconds = sum(result.seconds for result in records.results)
-    return _judge(folder, size, seconds, as_json=as_json)
+    return _judge(folder, size_of(records.head.spec), seconds, as_json=as_json)
 
 
 @campaign.command()

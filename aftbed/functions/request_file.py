@@ -463,6 +463,40 @@ def names_function(source: str) -> bool:
     return bool(colon and place) and name.isidentifier() and not Path(source).exists()
 
 
+def located_requests(source: str, folder: Path | None = None) -> str:
+    """`source` with an absolute path, which is looked up in `folder`, here if left out.
+
+    Nothing is executed. Raises ConfigError where a file is missing.
+    """
+    here = (folder or Path.cwd()).resolve()
+    place, name = source, ""
+    if not (here / source).exists() and names_function(source):
+        place, _, name = source.rpartition(":")
+        if not place.endswith(".py"):
+            return source
+    path = (here / place).resolve()
+    if not path.is_file():
+        raise ConfigError(f"{source}: {path}: no such file")
+    return f"{path}:{name}" if name else str(path)
+
+
+def requests_from(source: str, count: int, seed: int, code: Code) -> GivenRequests:
+    """All requests of a file, or `count` of a function, which is executed. Raises ConfigError."""
+    if names_function(source):
+        return GivenRequests(source, tuple(generated(source, count, seed, code)))
+    try:
+        written_ns = Path(source).stat().st_mtime_ns
+    except OSError:
+        written_ns = 0  # reading it says why
+    return GivenRequests(source, _read_once(source, written_ns).requests)
+
+
+@functools.lru_cache(maxsize=1)
+def _read_once(source: str, written_ns: int) -> RequestList:
+    """Not anew for each experiment of a campaign."""
+    return read_requests(Path(source))
+
+
 def generated(source: str, count: int, seed: int, code: Code) -> list[bytes]:
     """The first `count` requests of `function(seed)`, where `source` is `MODULE:FUNCTION` or
     `FILE.py:FUNCTION`.

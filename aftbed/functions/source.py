@@ -119,3 +119,17 @@ def located(text: str, folder: Path | None = None) -> str:
             return str(
                 FunctionSource(source.kind, file(source.place), file(source.part) if source.part else "")
             )
+
+
+def renamed(text: str) -> str:
+    """Another text that names the same function, whose paths are absolute, so that an update to it does
+    something; "" where there is none, as of a class in a module.
+    """
+    source = parse_source(text)
+    if source.kind is FunctionKind.PROGRAM and len(source.words) > 1:
+        first, *rest = map(shlex.quote, source.words)
+        return " ".join([f"{first}''" if first.startswith("'") else f"'{first}'", *rest])
+    path = Path(source.place)
+    if not path.is_absolute():
+        return ""
+    return str(msgspec.structs.replace(source, place=f"{path.parent}/./{path.name}"))

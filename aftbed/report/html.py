@@ -26,6 +26,8 @@ from aftbed.judge.outcome import OUTCOMES
 from aftbed.report import plots
 from aftbed.report.plots import Limit, milliseconds
 from aftbed.report.sequence import SpaceTime, space_time
+from aftbed.report.terminal import places as places_text
+from aftbed.report.terminal import remedy
 from aftbed.report.worst import by_badness, rerun, slowness_ms
 
 TEMPLATES: Final = Path(__file__).resolve().parent / "templates"
@@ -58,7 +60,8 @@ _UNREADABLE: Final = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")
 def html_report(summary: Summary, ledger: Ledger, *, drawn: int = DRAWN_MAX) -> str:
     """The whole page; `drawn` of the worst runs are simulated once more, to draw them."""
     spec = ledger.head.spec
-    places = {stratum.name: place_of(stratum.name, spec) for stratum in summary.strata}
+    known = Places(spec)
+    places = {stratum.name: known.of(stratum.name) for stratum in summary.strata}
     styles = {row: number for number, row in enumerate(dict.fromkeys(row for row, _ in places.values()))}
     anchors = {stratum.name: f"stratum-{number}" for number, stratum in enumerate(summary.strata)}
     worst = by_badness(ledger.results)
@@ -68,6 +71,7 @@ def html_report(summary: Summary, ledger: Ledger, *, drawn: int = DRAWN_MAX) -> 
     return page_text(
         page,
         summary=summary,
+        weaknesses=[(found, places_text(found.seen), remedy(found)) for found in summary.weaknesses],
         spec=spec,
         head=ledger.head,
         faults=list(dict.fromkeys(fault for _, fault in places.values())),
@@ -143,11 +147,15 @@ class OutcomeShare(msgspec.Struct, frozen=True):
     percent: float
 
 
-def place_of(stratum: str, spec: Spec) -> tuple[str, str]:
+class Places:
     """Row (mechanism, placement and adaptation) and column (fault) of a stratum, by its name."""
-    faults = {found.name: found.fault.name for found in strata_of(spec)}
-    fault = faults.get(stratum, stratum.rpartition(JOINED)[2])
-    return stratum.removesuffix(f"{JOINED}{fault}"), fault
+
+    def __init__(self, spec: Spec) -> None:
+        self._faults = {found.name: found.fault.name for found in strata_of(spec)}
+
+    def of(self, stratum: str) -> tuple[str, str]:
+        fault = self._faults.get(stratum, stratum.rpartition(JOINED)[2])
+        return stratum.removesuffix(f"{JOINED}{fault}"), fault
 
 
 def shares(stratum: StratumSummary) -> list[OutcomeShare]:
@@ -192,12 +200,12 @@ class TimePlots(msgspec.Struct, frozen=True):
 def _time_plots(metric: str, results: Iterable[Result], spec: Spec, styles: dict[str, int]) -> TimePlots:
     found: dict[str, dict[str, list[float]]] = {}
     strata: dict[str, dict[str, None]] = {}
-    places: dict[str, tuple[str, str]] = {}
+    places = Places(spec)
     for result in results:
         value: float | None = getattr(result, metric)
         name = result.experiment.stratum
         if value is not None:
-            row, fault = places.setdefault(name, place_of(name, spec))
+            row, fault = places.of(name)
             found.setdefault(fault, {}).setdefault(row, []).append(value)
             strata.setdefault(fault, {})[name] = None
     title, meaning = METRICS[metric]

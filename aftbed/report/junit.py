@@ -96,7 +96,7 @@ def _why(
         came = ", ".join(f"{name} {count}" for name, count in stratum.outcomes.items())
         text = f"{stratum.unexpected} of {stratum.experiments} unexpected: {came};"
         return UNEXPECTED, f"{text} expected: {', '.join(stratum.expected)}\n{_worst_text(results)}"
-    if results[0].experiment.faults and not stratum.activated:
+    if any(gate.metric == NOT_ACTIVATED and gate.strata == stratum.name for gate in gates):
         text = f"none of {stratum.experiments} faults struck: this stratum could not have failed"
         return NOT_ACTIVATED, f"{text}\n{_worst_text(results)}"
     return None

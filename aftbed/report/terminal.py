@@ -8,12 +8,15 @@ picture, not a thread: a thread would be forked with the processes that do the e
 import sys
 import time
 from collections import Counter
+from collections.abc import Sequence
+from itertools import chain
 from types import TracebackType
 from typing import TYPE_CHECKING, Final, Self
 
 from aftbed.campaign.experiment import Result
 from aftbed.campaign.statistics import Interval
-from aftbed.campaign.summary import GateResult, StratumSummary, Summary, TimeSummary
+from aftbed.campaign.summary import NOT_ALL, GateResult, StratumSummary, Summary, TimeSummary
+from aftbed.campaign.weaknesses import SeenPlace, Weakness
 from aftbed.core.errors import shown
 from aftbed.judge.outcome import OUTCOMES
 
@@ -23,6 +26,7 @@ if TYPE_CHECKING:
 
 REDRAW_S: Final = 0.1
 LINE_S: Final = 10.0  # between two plain lines
+PLACES_MAX: Final = 6  # of a weakness, listed
 ROWS_MAX: Final = 30  # strata in the picture
 BAR: Final = 30  # characters
 STYLES: Final = {  # of outcomes; all others are red
@@ -43,7 +47,12 @@ def summary_lines(summary: Summary) -> list[str]:
     """Strata and gates as tables, the verdict last."""
     lines = [_head(summary)]
     lines += ["", *_aligned([_STRATUM, *map(_stratum, summary.strata)])] if summary.strata else []
-    lines += ["", *_aligned([_GATE, *map(_gate, summary.gates)])] if summary.gates else []
+    vacuous = [gate for gate in summary.gates if gate.value == 1.0 and gate.limit == NOT_ALL]
+    left_out = vacuous[PLACES_MAX:]
+    gates = [gate for gate in summary.gates if gate not in left_out]
+    lines += ["", *_aligned([_GATE, *map(_gate, gates)])] if gates else []
+    lines += [f"fail  none of the faults struck in {len(left_out)} more strata"] if left_out else []
+    lines += ["", *chain.from_iterable(map(_weakness, summary.weaknesses))] if summary.weaknesses else []
     return [shown(line) for line in (*lines, f"gate: {summary.gate}")]
 
 
@@ -96,6 +105,27 @@ def _gate(gate: GateResult) -> tuple[str, ...]:
 
 def _figure(value: float | None) -> str:
     return "-" if value is None else f"{value:.4g}"
+
+
+def _weakness(found: Weakness) -> list[str]:
+    return [
+        f"{'limit' if found.expected else 'weakness'}: {found.fault}: {found.effect}",
+        f"  seen under {places(found.seen)}",
+        f"  {remedy(found)}",
+    ]
+
+
+def remedy(found: Weakness) -> str:
+    """What would have held, in words."""
+    held = f"held under {places(found.held)}" if found.held else ""
+    return "; ".join(filter(None, (found.advice, held))) or "nothing that was tried held it"
+
+
+def places(seen: Sequence[SeenPlace]) -> str:
+    """`pbr 12 of 12 (73.5 to 100.0 %), ...`."""
+    words = [f"{one.place} {one.count} of {one.experiments} ({_share(one.interval)})" for one in seen]
+    more = len(words) - PLACES_MAX
+    return ", ".join(words[:PLACES_MAX]) + (f", and {more} more" if more > 0 else "")
 
 
 def _aligned(rows: list[tuple[str, ...]]) -> list[str]:

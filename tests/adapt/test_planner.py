@@ -319,6 +319,12 @@ def test_where_there_is_no_way(old: str, new: str, words: str) -> None:
     assert words in str(error.value)
 
 
+@pytest.mark.parametrize("part", ["app", "after"])
+def test_nothing_is_updated_without_a_mechanism(part: str) -> None:
+    with pytest.raises(ConfigError, match="none has no engine, so nothing can be updated"):
+        updated(build(NONE, "process"), part, "x.py:X")
+
+
 def test_a_recipe_that_does_not_exist_or_does_not_fit() -> None:
     old, new = build("pbr", "process"), build("lfr", "process")
     with pytest.raises(ConfigError, match=r"unknown recipe 'papr'; did you mean 'paper'\?"):

@@ -158,6 +158,7 @@ def test_plain(aftbed):
 
 
 @pytest.mark.process
+@pytest.mark.deep
 def test_two_workers_share_the_tests(project: Pytester, monkeypatch: pytest.MonkeyPatch) -> None:
     project.makepyfile(
         test_it=f"""

@@ -27,7 +27,7 @@ def test_what_goes_wrong_in_keeping_is_raised() -> None:
 
 def test_an_error_of_any_kind_is_an_outcome(monkeypatch: pytest.MonkeyPatch) -> None:
     """A bug of ours in one experiment of ten thousand ends neither the campaign nor as a pass."""
-    monkeypatch.setattr(experiment, "setup_of", lambda _: 1 // 0)
+    monkeypatch.setattr(experiment, "setup_of", lambda *_: 1 // 0)
     kept: list[Result] = []
     result = carry_out(CALM, kept.append)
     assert (result.outcome, result.activated) == ("harness_error", False)

@@ -55,6 +55,24 @@ def test_a_gate_on_a_time_needs_enough_values(tmp_path: Path) -> None:
     assert (enough.gates[0].word, enough.gates[0].value) == ("pass", 1.0)
 
 
+@pytest.mark.parametrize(("bad", "word"), [(0, "pass"), (1, "fail")])
+def test_a_gate_of_none_is_judged_by_what_was_seen(tmp_path: Path, bad: int, word: str) -> None:
+    """No number of experiments bounds a share by 0."""
+    results = many(40 - bad) + many(bad, "sdc", 40, unexpected=True)
+    found = judged(tmp_path, results, Gate("unexpected", max=0))
+    assert (found.gates[0].word, found.gates[0].bound) == (word, bad / 40)
+
+
+def test_a_stratum_that_may_miss_fails_nothing_unless_it_strikes_in_part(tmp_path: Path) -> None:
+    text = CRASHES.replace("- name: nothing", "  may_miss: true\n- name: nothing")
+    steady = many(40, stratum="pbr · nothing")
+    missed = many(40, first=40, activated=False)
+    assert judged(tmp_path, steady + missed).gate == "fail"
+    assert judged(tmp_path, steady + missed, text=text).gate == "pass"
+    partly = [*missed, *many(1, first=90)]
+    assert judged(tmp_path, steady + partly, text=text).gate == "fail"
+
+
 def test_a_gate_on_strata_that_do_not_exist_fails(tmp_path: Path) -> None:
     found = judged(tmp_path, many(100), Gate("sdc", max=0.5, strata="lfr*"))
     assert (found.gates[0].word, found.gates[0].reason) == ("fail", "no stratum is called 'lfr*'")

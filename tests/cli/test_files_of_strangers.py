@@ -18,7 +18,7 @@ from records import outcomes, whole
 from sampling import sampled
 
 from aftbed.campaign.ledger import NAME
-from aftbed.cli.campaign import HTML, JUNIT, SUMMARY
+from aftbed.cli.campaign import HTML, JUNIT, MARKDOWN, SUMMARY
 from aftbed.core.events import Event
 from aftbed.interop.openscenario import importer
 
@@ -353,6 +353,47 @@ def test_a_campaign_whose_function_is_a_strangers_is_read_without_it(
     stranger.read_by("campaign", "shrink", folder, "0", code=2)
     shutil.move(folder, stranger.out / "campaign")
     stranger.read_by("campaign", "report", stranger.out / "campaign", code=1)
+
+
+@pytest.mark.parametrize("runtime", ["sim", "unix"])
+@pytest.mark.parametrize(
+    "source", ["evil:Evil", "evil.py:Evil", "evil_package.inner:Evil", "{folder}/evil.py:Evil"]
+)
+def test_a_campaign_whose_requests_a_strangers_function_makes_is_read_without_it(
+    stranger: Stranger, ran: Path, source: str, runtime: str
+) -> None:
+    source = source.format(folder=stranger.folder)
+    folder = ledger(stranger, ran, request_file=source, runtime=runtime)
+    shown = stranger.read_by("campaign", "replay", folder, "0", code=2)
+    assert "is not trusted" in shown or "cannot be read: " in shown, shown
+    assert "no code from outside" in stranger.read_by("campaign", "shrink", folder, "0", code=2)
+    shutil.move(folder, stranger.out / "campaign")
+    stranger.read_by("campaign", "report", stranger.out / "campaign", code=1)
+
+
+def test_a_ledger_whose_spec_names_code_is_reported_without_it(stranger: Stranger, ran: Path) -> None:
+    """Nobody is asked what it declares, and nothing of it has to be there."""
+    folder = ledger(stranger, ran, app="evil.py:Evil", request_file="evil.py:Evil")
+    head, result = (folder / NAME).read_text().splitlines()
+    named = json.loads(head)
+    named["spec"]["system"] |= {"app": "evil.py:Evil", "request_file": "evil.py:Evil"}
+    for mechanisms in (["pbr"], ["suitable"]):
+        named["spec"]["mechanisms"] = mechanisms
+        named["spec"]["campaign"] = "evil"
+        stranger.file(f"campaign/{NAME}", f"{json.dumps(named)}\n{result}\n")
+        shutil.copytree(folder, stranger.out / mechanisms[0])
+        stranger.read_by("campaign", "report", stranger.out / mechanisms[0], code=1)
+        assert (stranger.out / mechanisms[0] / MARKDOWN).exists()
+
+
+@pytest.mark.parametrize("key", ["app", "request_file"])
+def test_a_campaign_file_that_names_functions_is_planned_without_them(stranger: Stranger, key: str) -> None:
+    """What suits it would be asked of the function: not of one that nobody has named on the command line."""
+    named = CAMPAIGN.replace("runtime: sim", f'runtime: sim, {key}: "evil.py:Evil"')
+    stranger.read_by("campaign", "plan", stranger.file("c.yaml", named), code=0)
+    file = stranger.file("c.yaml", named.replace("[pbr]", "[suitable]"))
+    shown = stranger.read_by("campaign", "plan", file, code=2 if key == "app" else 0)
+    assert ("is not trusted, so it was not executed" in shown) == (key == "app")
 
 
 def test_the_reports_of_a_campaign_replace_links(stranger: Stranger, ran: Path) -> None:

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from aftbed.core.errors import ConfigError
-from aftbed.functions.source import FunctionKind, located, parse_source
+from aftbed.functions.source import FunctionKind, located, parse_source, renamed
 
 
 @pytest.mark.parametrize(
@@ -67,6 +67,30 @@ def test_what_is_missing_is_named(tmp_path: Path, text: str, missing: str) -> No
     (tmp_path / "brake.fmu").touch()
     with pytest.raises(ConfigError, match=missing):
         located(text, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "other"),
+    [
+        ("/a/brake.py:Brake", "/a/./brake.py:Brake"),
+        ("/a/brake.so", "/a/./brake.so"),
+        ("/a/brake.fmu:/b/ports.yaml", "/a/./brake.fmu:/b/ports.yaml"),
+        ("sh /a/brake.sh 'my data'", "'sh' /a/brake.sh 'my data'"),
+        ("'/my a/brake' fast", "'/my a/brake''' fast"),
+        ("/bin/true", "/bin/./true"),
+        ("true", ""),
+        ("package.module:Brake", ""),
+    ],
+)
+def test_another_name_is_of_the_same_function(text: str, other: str) -> None:
+    assert renamed(text) == other
+    if other:
+        one, same = parse_source(text), parse_source(renamed(text))
+        assert (one.kind, one.part) == (same.kind, same.part) and renamed(text) != text
+        if one.kind is FunctionKind.PROGRAM and len(one.words) > 1:
+            assert one.words == same.words
+        else:
+            assert Path(one.place) == Path(same.place)
 
 
 def test_the_files_that_a_judge_has_to_trust(tmp_path: Path) -> None:

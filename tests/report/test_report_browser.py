@@ -5,6 +5,7 @@ from typing import Final
 
 import pytest
 from browser import in_browser, measured, needs_browser
+from certified import certified, suite
 from reported import hostile, summary_of, with_results
 
 from aftbed.campaign.ledger import Ledger
@@ -41,3 +42,11 @@ def test_it_can_be_drawn(ledger: Ledger, tmp_path: Path, scheme: str) -> None:
     page = html_report(summary_of(ledger), ledger)
     in_browser(tmp_path, page, f"--screenshot={picture}", f"--blink-settings=preferredColorScheme={scheme}")
     assert picture.read_bytes().startswith(PNG)
+
+
+def test_a_table_of_weaknesses_is_in_its_place(tmp_path: Path) -> None:
+    spec = suite(tmp_path, "Forgetful", ("none", "pbr"), "crash primary", "wrong reply")
+    ledger, summary = certified(spec, 2)
+    dom, console = in_browser(tmp_path, measured(html_report(summary, ledger, drawn=0)), width=500)
+    assert console == [] and "<title>measured 0 0 0 1 0</title>" in dom
+    assert dom.count("<b>limit</b>") == dom.count("<b>✗ weakness</b>") == 1
