@@ -18,6 +18,7 @@ EVERY_KIND: Final = {  # file of a project: its template
     "README.md": "all/README.md.tmpl",
     "requests.csv": "all/requests.csv.tmpl",
     "test_function.py": "all/test_function.py.tmpl",
+    "campaign.yaml": "all/campaign.yaml.tmpl",
     ".github/workflows/test.yml": "all/workflow.yml.tmpl",
 }
 
@@ -59,7 +60,7 @@ def new(
     name: Annotated[str, typer.Argument(help="Of the project, and of its new directory.")],
     kind: Annotated[str, typer.Option(help=f"What the function is: {', '.join(KINDS)}.")] = "class",
 ) -> None:
-    """Write a project with a function, its requests, its tests and a CI workflow."""
+    """Write a project with a function, its requests, tests, a campaign and a CI workflow."""
     folder = create(name, kind)
     first = f"{KINDS[kind].first} && " if KINDS[kind].first else ""
     typer.echo(f"{folder}/: {', '.join(sorted(_files(kind)))}")

@@ -24,7 +24,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_a_new_project_is_listed_with_the_next_command(refused: Callable[..., str], here: Path) -> None:
     folder = create("heater", "so")
     files = {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
-    common = {"README.md", "requests.csv", "test_function.py", ".github/workflows/test.yml"}
+    common = {"README.md", "requests.csv", "test_function.py", "campaign.yaml", ".github/workflows/test.yml"}
     assert files == common | {"function.c", "aft.h", "Makefile"}
     text = "".join(path.read_text() for path in folder.rglob("*") if path.is_file() and path.suffix != ".h")
     assert "heater" in text and "@APP@" not in text and "@NAME@" not in text
@@ -73,6 +73,10 @@ def test_a_new_project_passes_its_own_tests(kind: str, here: Path) -> None:
     done = called(sys.executable, "-m", "pytest", "-q", *PLUGIN, "-W", "error", folder=folder)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "8 passed" in done.stdout
+    words = ("-m", "aftbed", "campaign", "run", "campaign.yaml", "--out", "out")
+    done = called(sys.executable, *words, folder=folder)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "gate: pass" in done.stdout
 
 
 @pytest.mark.deep
