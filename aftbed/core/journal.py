@@ -176,7 +176,7 @@ def header(node: str) -> bytes:
 def node_name(data: Data) -> str:
     """Whose journal this is. Raises PeerError if it is none."""
     if len(data) < HEADER_BYTES or data[: len(MAGIC)] != MAGIC:
-        raise PeerError(f"not a journal ({len(data)} bytes)")
+        raise PeerError(f"not a journal ({len(data)} bytes, begins with {bytes(data[: len(MAGIC)]).hex()})")
     length = data[NAME_OFFSET]
     return bytes(data[NAME_OFFSET + 1 : NAME_OFFSET + 1 + length]).decode(errors="replace")
 

@@ -7,7 +7,7 @@ import contextlib
 import itertools
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Final, TypeVar
@@ -211,8 +211,9 @@ def _frames(log: Path) -> int:
 def _history(folder: Path, *, in_memory: bool) -> History:
     dialogues = sorted(folder.glob("client.*.dialogue"), key=lambda p: int(p.name.split(".")[1]))
     try:
-        found = {p.name.removesuffix(".journal"): stored_records(p) for p in sorted(folder.glob("*.journal"))}
-        lost = [entries_dropped(p) for p in dialogues]
+        journals = sorted(folder.glob("*.journal"))
+        found = {p.name.removesuffix(".journal"): _head_of(p, stored_records) for p in journals}
+        lost = [_head_of(p, entries_dropped) for p in dialogues]
 
         def read() -> Iterator[Entry]:
             return itertools.chain.from_iterable(map(stored_entries, dialogues))
@@ -233,6 +234,14 @@ def _history(folder: Path, *, in_memory: bool) -> History:
         raise ConfigError(f"{folder}: {error}") from None
     except OSError as error:
         raise ConfigError(f"{error.filename}: {error.strerror}") from None
+
+
+def _head_of(path: Path, read: Callable[[Path], T]) -> T:
+    """What `read` finds. Raises ConfigError, which names the file, if it is no journal."""
+    try:
+        return read(path)
+    except PeerError as error:
+        raise ConfigError(f"{path}: {error}") from None
 
 
 def _end(path: Path) -> RunEnd:
