@@ -47,23 +47,6 @@ def test_a_new_journal_is_empty_private_and_has_a_name(tmp_path: Path) -> None:
     assert path.stat().st_mode & 0o777 == 0o600
 
 
-def test_a_node_that_dies_while_its_journal_gets_its_pages_leaves_an_empty_journal(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    truncate = os.ftruncate
-
-    def dies(descriptor: int, size: int) -> None:
-        truncate(descriptor, size)
-        raise InterruptedError
-
-    path = tmp_path / "a.journal"
-    monkeypatch.setattr(os, "ftruncate", dies)
-    with pytest.raises(InterruptedError):
-        JournalFile(path, "a/after")
-    found, lost = mapped.stored_records(path)
-    assert (list(found), lost) == ([], 0)
-
-
 def test_a_record_is_in_the_file_as_soon_as_it_is_written(tmp_path: Path) -> None:
     path = tmp_path / "a.journal"
     journal = JournalFile(path, "a/after")

@@ -86,19 +86,16 @@ def entries_dropped(path: Path) -> int:
 
 
 def _mapped(path: Path, name: str) -> mmap.mmap:
-    """A new file of one chunk with the header of `name`, mapped.
-
-    The header is written first: to find pages takes time on a busy disk, and a run may end meanwhile.
-    """
+    """A new file of one chunk with the header of `name`, mapped."""
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
     try:
-        os.write(descriptor, layout.header(name))  # one page
         os.ftruncate(descriptor, CHUNK_BYTES)
         mapping = mmap.mmap(descriptor, CHUNK_BYTES)
     finally:
         os.close(descriptor)
     with contextlib.suppress(OSError, ValueError):  # Linux before 5.14: the pages come one by one
         mapping.madvise(linux.MADV_POPULATE_WRITE, 0, READY_BYTES)
+    mapping[: layout.HEADER_BYTES] = layout.header(name)
     return mapping
 
 
