@@ -18,6 +18,7 @@ import select
 import shutil
 import signal
 import socket
+import sys
 import time
 import weakref
 from collections.abc import Iterator
@@ -118,6 +119,8 @@ def _fork_zygote(cpus: list[int], areas: tuple[Area, ...]) -> Started:
         try:
             os.dup2(theirs.fileno(), linux.INHERITED_FD)
             os.closerange(linux.INHERITED_FD + 1, 1 << 16)
+            # The parent's may write to descriptors that are closed now, and will be those of journals.
+            sys.stdout, sys.stderr = (open(fd, "w", buffering=1, closefd=False) for fd in (1, 2))  # noqa: SIM115
             zygote.run(supervisor, cpus, (), areas)
         finally:
             os._exit(1)
