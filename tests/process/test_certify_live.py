@@ -1,22 +1,30 @@
 """The suites for a function of the user, from the command line: simulated, and on real processes."""
 
 import json
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
+import subprocess
+import sys
 from pathlib import Path
 
+import msgspec
 import pytest
 from certified import STRANGERS, requests_in
 from liveruns import called
 from msgspec.structs import replace
 
-from aftbed.campaign.experiment import Experiment, Result, carry_out
+from aftbed.campaign.experiment import Experiment, Result
 from aftbed.campaign.plan import plan
 from aftbed.campaign.spec import read_spec
 from aftbed.runtime.unix.trust import OWN_RUN
 
 pytestmark = pytest.mark.process
 
+CARRY_OUT = """
+import sys
+import msgspec
+from aftbed.campaign.experiment import Experiment, carry_out
+experiment = msgspec.json.decode(sys.stdin.buffer.read(), type=Experiment)
+sys.stdout.buffer.write(msgspec.json.encode(carry_out(experiment, lambda _: None)))
+"""
 MAKER = """
 from random import Random
 
@@ -43,7 +51,11 @@ def test_certify_passes_a_good_function(tmp_path: Path) -> None:
 
 
 def carried_out(experiment: Experiment) -> Result:
-    return carry_out(experiment, lambda _: None)
+    """In a process of its own: it warms up for many runs."""
+    line, data = [sys.executable, "-c", CARRY_OUT], msgspec.json.encode(experiment)
+    done = subprocess.run(line, input=data, capture_output=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr.decode()
+    return msgspec.json.decode(done.stdout, type=Result)
 
 
 @pytest.mark.parametrize(("function", "outcome"), [("Counter", "tolerated"), ("Hidden", "sdc")])
@@ -56,8 +68,7 @@ def test_app_check_finds_hidden_state_on_real_processes(tmp_path: Path, function
     found = plan(replace(spec, system=system), OWN_RUN)
     experiment = next(e for e in found.experiments() if e.stratum == "pbr · steady · crash primary")
     assert experiment.runtime == "unix"
-    with ProcessPoolExecutor(1, get_context("spawn")) as pool:  # it warms up for many runs
-        result = pool.submit(carried_out, experiment).result()
+    result = carried_out(experiment)
     assert (result.outcome, result.unexpected) == (outcome, outcome == "sdc"), result.reasons
     assert result.requests is not None and result.requests.sent == experiment.requests
 
