@@ -252,7 +252,7 @@ def _check_adaptations(made: CampaignPlan, stratum: Stratum) -> None:
 
 # -- what a spec leaves to the function -----------------------------------------------------------
 #
-# Its plan, and so its ledger, names each mechanism, and each adaptation: whoever reads a ledger asks nobody.
+# Its plan, and so its ledger, names each mechanism, and each adaptation: reading a ledger asks no function.
 
 NO_ADAPTATION: Final = AdaptationEntry("none")
 

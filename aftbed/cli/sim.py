@@ -534,10 +534,12 @@ def shown_apart(show: Callable[[S], int], setup: S, requests: int, alone: Alone[
 
 
 def _printed(show: Callable[[S], int], setup: S) -> tuple[int, str]:
-    """The exit code, and what it prints."""
-    with redirect_stdout(io.StringIO()) as text:
+    """The exit code, and what it prints, in the encoding of the output."""
+    data, encoding = io.BytesIO(), sys.stdout.encoding or "utf-8"
+    out = io.TextIOWrapper(data, encoding, sys.stdout.errors, write_through=True)
+    with redirect_stdout(out):
         code = show(setup)
-    return code, text.getvalue()
+        return code, data.getvalue().decode(encoding)
 
 
 def _simulate_one(given: SimArguments, setup: Setup) -> int:

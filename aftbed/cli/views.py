@@ -143,9 +143,11 @@ def show_verdict(verdict: "Verdict", *, as_json: bool) -> None:
         f"  requests   {requests.sent} sent, {requests.answered} answered, {requests.lost} lost,"
         f" {requests.duplicated} duplicated, {requests.late} late, {requests.wrong} wrong"
     )
-    if verdict.app:
+    compared = "one_history" in verdict.checks
+    if verdict.app or not compared:
         within = f", replies within {verdict.tolerance:g}" if verdict.tolerance else ""
-        print(shown(f"  function   {verdict.app}{within}"))
+        how = within if compared else ", its replies are not compared"
+        print(shown(f"  function   {verdict.app or 'the built-in one'}{how}"))
     for failure in verdict.function_failures:
         print(shown(f"  failed     {failure}"))
     _show_vehicle(verdict)

@@ -16,19 +16,20 @@ import msgspec
 from aftbed.core.errors import ConfigError, unknown
 
 Width = Literal["bool", "u8", "u16", "u32", "u64", "i8", "i16", "i32", "i64", "f32", "f64"]
-BITS: Final[dict[Width, int]] = {
-    "bool": 8,
-    "u8": 8,
-    "u16": 16,
-    "u32": 32,
-    "u64": 64,
-    "i8": 8,
-    "i16": 16,
-    "i32": 32,
-    "i64": 64,
-    "f32": 32,
-    "f64": 64,
+CODES: Final[Mapping[str, str]] = {  # of `struct`; a byte that is neither 0 nor 1 is no bool, and is seen
+    "bool": "B",
+    "u8": "B",
+    "u16": "H",
+    "u32": "I",
+    "u64": "Q",
+    "i8": "b",
+    "i16": "h",
+    "i32": "i",
+    "i64": "q",
+    "f32": "f",
+    "f64": "d",
 }
+BITS: Final[Mapping[str, int]] = {width: 8 * struct.calcsize(f"<{code}") for width, code in CODES.items()}
 REPLY_BYTES_MAX: Final = 60 * 1024  # a reply has to fit into a packet
 STATE_BYTES_MAX: Final = 64 << 20
 
@@ -173,24 +174,9 @@ def reply_fields_of(application: Application | type[Application]) -> tuple[Field
     return fields
 
 
-_CODES: Final[dict[Width, str]] = {
-    "bool": "?",
-    "u8": "B",
-    "u16": "H",
-    "u32": "I",
-    "u64": "Q",
-    "i8": "b",
-    "i16": "h",
-    "i32": "i",
-    "i64": "q",
-    "f32": "f",
-    "f64": "d",
-}
-
-
 def value_of(field: Field, data: bytes) -> float:
     """The number in `data`, which is long enough."""
-    found: float = struct.unpack_from(f"<{_CODES[field.kind]}", data, field.offset_bytes)[0]
+    found: float = struct.unpack_from(f"<{CODES[field.kind]}", data, field.offset_bytes)[0]
     return found
 
 

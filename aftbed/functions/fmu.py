@@ -120,7 +120,7 @@ class FmuApplication:
         self._has_state = ports.characteristics.state_access.kind is not AccessKind.NONE
         self._name, self._ports = str(model), ports
         self._time_s, self._time_before = 0.0, b""
-        self._files = files  # removed when nobody uses them
+        self._files = files  # removed with the last function that uses them
         self._inputs = _by_type(ports.inputs)
         self._outputs = _by_type(ports.outputs)
         _LOG.clear()

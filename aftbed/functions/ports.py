@@ -26,7 +26,16 @@ from typing import Annotated, Final, Literal
 import msgspec
 from msgspec import Meta
 
-from aftbed.core.application import EXACT, NONE, Characteristics, Field, StateAccess, Width, approximate
+from aftbed.core.application import (
+    CODES,
+    EXACT,
+    NONE,
+    Characteristics,
+    Field,
+    StateAccess,
+    Width,
+    approximate,
+)
 from aftbed.core.errors import ConfigError, PeerError
 
 Unit = Literal["s", "ms", "us", "ns"]
@@ -37,19 +46,6 @@ FIELDS_MAX: Final = 1000  # so that a reply of them fits into a packet
 STEP_S_MAX: Final = 3600.0  # a request that asks for more is refused: the replica would hang
 NAMES_SHOWN_MAX: Final = 20
 
-_CODES: Final[Mapping[Width, str]] = {
-    "bool": "B",
-    "u8": "B",
-    "u16": "H",
-    "u32": "I",
-    "u64": "Q",
-    "i8": "b",
-    "i16": "h",
-    "i32": "i",
-    "i64": "q",
-    "f32": "f",
-    "f64": "d",
-}
 _FLOATS: Final = ("f32", "f64")
 _INTEGERS: Final = ("u8", "u16", "u32", "u64", "i8", "i16", "i32", "i64")
 _TO_MODEL: Final[
@@ -161,7 +157,7 @@ class Ports:
         self.inputs, self.outputs = tuple(inputs), tuple(outputs)
         self.start, self.characteristics = tuple(start), characteristics
         self._request = struct.Struct("<" + "".join(map(_code, file.request)))
-        self._reply = struct.Struct("<" + "".join(_CODES[one.type] for one in file.reply))
+        self._reply = struct.Struct("<" + "".join(CODES[one.type] for one in file.reply))
         self._fields = tuple(one for one in file.request if not one.skip)
         self._reply_types = tuple(one.type for one in file.reply)
         self._ranges = tuple(
@@ -170,9 +166,9 @@ class Ports:
         self._judges = any(f.min is not None or f.max is not None for f in file.reply)
         self._step_s = file.step_s
         clock = next((one for one in file.request if one.time), None)
-        self._clock = None if clock is None else struct.Struct("<" + _CODES[clock.type])
+        self._clock = None if clock is None else struct.Struct("<" + CODES[clock.type])
         offsets = [
-            struct.calcsize("<" + "".join(_CODES[t] for t in self._reply_types[:n]))
+            struct.calcsize("<" + "".join(CODES[t] for t in self._reply_types[:n]))
             for n in range(len(outputs))
         ]
         self.reply_fields = tuple(
@@ -221,7 +217,7 @@ class Ports:
             if not isfinite(value):
                 raise ValueError(f"output {variable.name}: found {value}, a finite number is required")
             try:
-                struct.pack("<" + _CODES[kind], value)
+                struct.pack("<" + CODES[kind], value)
             except (struct.error, OverflowError):
                 raise ValueError(f"output {variable.name}: {value} does not fit into {kind}") from None
         return self._reply.pack(*values)
@@ -237,7 +233,7 @@ class Ports:
 
 
 def _code(field: RequestField) -> str:
-    code = _CODES[field.type]
+    code = CODES[field.type]
     return f"{struct.calcsize('<' + code)}x" if field.skip else code
 
 

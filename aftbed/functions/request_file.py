@@ -24,7 +24,7 @@ from typing import Final, NamedTuple, Self
 
 import msgspec
 
-from aftbed.core.application import REPLY_BYTES_MAX
+from aftbed.core.application import CODES, REPLY_BYTES_MAX
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.input_file import read_input
 from aftbed.functions.load import Code
@@ -37,15 +37,11 @@ NAMES_SHOWN_MAX: Final = 12
 
 Value = int | float | bool
 
-_CODES: Final = {
-    "u8": "B", "u16": "H", "u32": "I", "u64": "Q", "i8": "b", "i16": "h", "i32": "i", "i64": "q",
-    "f32": "f", "f64": "d", "bool": "B",
-}  # fmt: skip
 _RANGES: Final = {
     kind: (0, 2 ** int(kind[1:]) - 1)
     if kind[0] == "u"
     else (-(2 ** (int(kind[1:]) - 1)), 2 ** (int(kind[1:]) - 1) - 1)
-    for kind in _CODES
+    for kind in CODES
     if kind[0] in "ui"
 }
 _NAME: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_.\[\]]{0,63}")
@@ -76,8 +72,8 @@ class FieldCodec(msgspec.Struct, frozen=True):
             name, colon, kind = (part.strip() for part in cell.partition(":"))
             if not colon or not _NAME.fullmatch(name):
                 raise ConfigError(f"column {number}: found {_words(cell)}, NAME:TYPE is allowed, as t_us:u64")
-            if kind not in _CODES:
-                raise ConfigError(f"column {number}, {name}: {unknown('type', kind[:SHOWN_MAX], _CODES)}")
+            if kind not in CODES:
+                raise ConfigError(f"column {number}, {name}: {unknown('type', kind[:SHOWN_MAX], CODES)}")
             if name in fields:
                 raise ConfigError(f"column {number}: {name} is there already; each name is allowed once")
             fields[name] = kind
@@ -117,7 +113,7 @@ class FieldCodec(msgspec.Struct, frozen=True):
 
 @functools.lru_cache(maxsize=8)
 def _layout(fields: tuple[tuple[str, str], ...]) -> struct.Struct:
-    return struct.Struct("<" + "".join(_CODES[kind] for _, kind in fields))
+    return struct.Struct("<" + "".join(CODES[kind] for _, kind in fields))
 
 
 @functools.lru_cache(maxsize=8)
@@ -140,7 +136,7 @@ def _checked(name: str, kind: str, value: object) -> Value:
         return value
     try:
         number = float(value)
-        struct.pack("<" + _CODES[kind], number)
+        struct.pack("<" + CODES[kind], number)
     except OverflowError:
         raise _not_allowed(name, value, _allowed(kind)) from None
     if not math.isfinite(number):

@@ -11,7 +11,6 @@ from typing import Final, Literal, NamedTuple
 
 import msgspec
 
-from aftbed.core.application import difference
 from aftbed.core.errors import PeerError
 from aftbed.core.events import FIRST_FAULT, RERUN, Event
 from aftbed.core.graph import Graph
@@ -159,16 +158,12 @@ def one_master(history: History) -> Check:
 
 
 def wrong_replies(history: History, reference: ReferenceRun) -> dict[int, bytes]:
-    """The replies that differ from the bare server's, by more than its function tolerates, by request.
-
-    Of a function that is not deterministic nothing is known.
-    """
+    """The replies that differ from the bare server's by more than its function tolerates, by request."""
     expected, wrong = dict(reference.replies), dict[int, bytes]()
-    for entry in history.dialogue if reference.deterministic else ():
+    for entry in history.dialogue:
         number = entry.request_id
-        if entry.kind is not EntryKind.ANSWERED or entry.payload == expected.get(number, entry.payload):
-            continue
-        if difference(reference.reply_fields, entry.payload, expected[number]) > reference.tolerance:
+        known = entry.kind is EntryKind.ANSWERED and number in expected
+        if known and reference.is_wrong(number, entry.payload, expected[number]):
             wrong.setdefault(number, entry.payload)
     return dict(sorted(wrong.items()))
 
@@ -409,7 +404,7 @@ def check_exactly_one_answer(evidence: Evidence) -> Check:
 
 
 def check_one_history(evidence: Evidence) -> Check | None:
-    if evidence.excuses.values or not evidence.reference.deterministic:
+    if evidence.excuses.values or not evidence.reference.rules[0].deterministic:
         return None
     return one_history(evidence.record.history, evidence.reference)
 

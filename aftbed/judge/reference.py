@@ -16,7 +16,7 @@ from typing import Final
 import msgspec
 
 from aftbed.adapt.engine import DONE
-from aftbed.core.application import Application, Characteristics, Field, close, reply_fields_of
+from aftbed.core.application import Application, Characteristics, Field, close, difference, reply_fields_of
 from aftbed.core.errors import FunctionFailedError, PeerError
 from aftbed.core.events import Event
 from aftbed.core.journal import EntryKind, History
@@ -36,17 +36,17 @@ class Succession:
     """An application whose requests are executed by several versions in turn, as `changes` have it."""
 
     def __init__(self, first: Make, changes: list[Change]) -> None:
-        self._serve(first())
+        self._function = first()
         self._before: list[Application] = []
         self._changes = list(changes)
         self._count = 0
-        versions = (self._function, *(make() for _, make in changes if make is not None))
-        self.deterministic = all(version.characteristics.deterministic for version in versions)
+        self.characteristics = self._function.characteristics
+        self.rules = [rule_of(self._function)]
 
     def _serve(self, function: Application) -> None:
         self._function = function
         self.characteristics = function.characteristics
-        self.reply_fields = reply_fields_of(function)
+        self.rules.append(rule_of(function, self._count, self.rules[-1]))
 
     def execute(self, request: bytes) -> bytes:
         self._count += 1
@@ -130,21 +130,60 @@ def succession(record: RunRecord, code: Code) -> Application:
     return Succession(first, loaded(changes, code)) if changes else first()
 
 
+class ReplyRule(msgspec.Struct, frozen=True):
+    """How replies are compared, from request `first` on: by so much their numbers may differ.
+
+    Where the function is not `deterministic`, they are not compared.
+    """
+
+    first: int = 1
+    deterministic: bool = True
+    tolerance: float = 0.0
+    fields: tuple[Field, ...] = ()
+
+
+EXACT_REPLIES: Final = ReplyRule()
+
+
+def rule_of(function: Application, first: int = 1, before: ReplyRule = EXACT_REPLIES) -> ReplyRule:
+    """From request `first` on, with which `function` begins to serve, with the state of the one before."""
+    declared = getattr(function, "characteristics", Characteristics())
+    return ReplyRule(
+        first,
+        before.deterministic and declared.deterministic,
+        max(before.tolerance, declared.state_access.tolerance),
+        reply_fields_of(function),
+    )
+
+
 class ReferenceRun(msgspec.Struct, frozen=True):
     """What the bare server makes of the requests of a run: its replies, by id, and its state behind them.
 
-    A request that it refuses has an empty reply. Where the function is not `deterministic`, its replies
-    need not be those of a run. `unknown`: why nothing is known of them, "" where they are.
-
-    `tolerance`: by so much the numbers in `reply_fields` may differ, as the function declares.
+    A request that it refuses has an empty reply. `unknown`: why nothing is known of them, "" where they are.
+    `rules`: how they are compared with those of the run; one for each version of the function that served.
     """
 
     replies: tuple[tuple[int, bytes], ...]
     state: bytes
-    deterministic: bool = True
     unknown: str = ""
-    tolerance: float = 0.0
-    reply_fields: tuple[Field, ...] = ()
+    rules: tuple[ReplyRule, ...] = (EXACT_REPLIES,)
+
+    @property
+    def deterministic(self) -> bool:
+        """To the end: each rule has what those before have."""
+        return self.rules[-1].deterministic
+
+    @property
+    def tolerance(self) -> float:
+        """The greatest one."""
+        return self.rules[-1].tolerance
+
+    def is_wrong(self, number: int, reply: bytes, expected: bytes) -> bool:
+        """Whether `reply` cannot be taken for the one that is expected to request `number`."""
+        if reply == expected:
+            return False
+        rule = next(rule for rule in reversed(self.rules) if rule.first <= number)
+        return rule.deterministic and difference(rule.fields, reply, expected) > rule.tolerance
 
     @property
     def digest(self) -> str:
@@ -169,14 +208,8 @@ def executed(requests: Iterable[tuple[int, bytes]], bare: Application) -> Refere
         state = bare.capture()
     except FunctionFailedError as error:
         return ReferenceRun((), b"", unknown=f"the bare function fails at request {number}: {error}")
-    declared = getattr(bare, "characteristics", Characteristics())
-    return ReferenceRun(
-        tuple(replies),
-        state,
-        getattr(bare, "deterministic", declared.deterministic),
-        tolerance=declared.state_access.tolerance,
-        reply_fields=reply_fields_of(bare),
-    )
+    rules = bare.rules if isinstance(bare, Succession) else (rule_of(bare),)
+    return ReferenceRun(tuple(replies), state, rules=tuple(rules))
 
 
 def reference_run(history: History, bare: Application) -> ReferenceRun:

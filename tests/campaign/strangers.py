@@ -86,7 +86,7 @@ class Fatal(Counter):
 
 
 class Closed(Counter):
-    """Lets nobody have its state."""
+    """Gives no state."""
 
     characteristics = Characteristics(state_access=NONE)
 

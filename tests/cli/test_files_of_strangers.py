@@ -388,7 +388,7 @@ def test_a_ledger_whose_spec_names_code_is_reported_without_it(stranger: Strange
 
 @pytest.mark.parametrize("key", ["app", "request_file"])
 def test_a_campaign_file_that_names_functions_is_planned_without_them(stranger: Stranger, key: str) -> None:
-    """What suits it would be asked of the function: not of one that nobody has named on the command line."""
+    """The function would be asked what suits it, and the command line does not name it."""
     named = CAMPAIGN.replace("runtime: sim", f'runtime: sim, {key}: "evil.py:Evil"')
     stranger.read_by("campaign", "plan", stranger.file("c.yaml", named), code=0)
     file = stranger.file("c.yaml", named.replace("[pbr]", "[suitable]"))

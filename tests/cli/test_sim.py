@@ -112,6 +112,88 @@ def test_a_function_of_the_user_is_simulated_updated_and_judged(sim: Call, tmp_p
     assert f"  adaptation update app to {tmp_path}/adder2.py:Adder at request 20: done" in out
 
 
+ROUGH: Final = """
+import struct
+from aftbed.core.application import *
+class Mean:
+    characteristics = Characteristics(state_access=ACCESS)
+    reply_fields = (Field("mean", "f64", 0),)
+    mean = 0.0
+    def execute(self, request):
+        self.mean += (request[-1] / 7 - self.mean) / 10
+        return struct.pack("<d", self.mean)
+    def capture(self): return struct.pack("<f", self.mean)
+    def restore(self, state): (self.mean,) = struct.unpack("<f", state)
+"""
+
+
+@pytest.mark.parametrize(
+    ("access", "found"),
+    [("approximate(1e-3)", "pass"), ("approximate(1e-12)", "fail"), ("EXACT", "fail")],
+)
+def test_replies_are_compared_within_what_the_function_declares(
+    sim: Call, tmp_path: Path, access: str, found: str
+) -> None:
+    """Its state keeps seven digits."""
+    (tmp_path / "rough.py").write_text(ROUGH.replace("ACCESS", access))
+    app, crash = f"{tmp_path}/rough.py:Mean", ("--faults", "crash primary at server.exit nth 9")
+    document = json.loads(sim("--app", app, "--ftm", "pbr", "--count", "40", *crash, "--json")[1])
+    assert document["verdict"] == found, document["breaches"]
+    assert all(one.startswith("one_history (G3): request ") for one in document["breaches"])
+
+
+def test_it_is_told_that_replies_were_not_compared(sim: Call) -> None:
+    code, out, _ = sim("--app", UNREPEATABLE, "--ftm", "pbr", "--count", "9")
+    assert code == 0 and f"  function   {UNREPEATABLE}, its replies are not compared" in out
+
+
+FAILING: Final = """
+from aftbed.core.application import Characteristics
+class Failing:
+    characteristics = Characteristics()
+    captured = 0
+    def execute(self, request): return b"done"
+    def capture(self):
+        self.captured += 1
+        if self.captured > 20: raise MemoryError("no more")
+        return b"state"
+    def restore(self, state): pass
+"""
+
+
+def test_a_function_that_fails_is_told_and_nothing_breaks_down(sim: Call, tmp_path: Path) -> None:
+    """In both replicas, and when its state is asked for at the end."""
+    (tmp_path / "failing.py").write_text(FAILING)
+    code, out, err = sim("--app", f"{tmp_path}/failing.py:Failing", "--count", "40")
+    assert code == 1 and "Traceback" not in err, err
+    assert re.search(
+        r"^  failed     a/server: Failing: MemoryError: no more \(.*failing.py:9, in", out, re.M
+    ), out
+
+
+SILENT_AT_THE_END: Final = """
+from aftbed.core.application import Characteristics
+class Silent:
+    characteristics = Characteristics()
+    executed = 0
+    def execute(self, request):
+        self.executed += 1
+        return b"done"
+    def capture(self):
+        if self.executed > 35: raise MemoryError("no more")
+        return b"state"
+    def restore(self, state): pass
+"""
+
+
+def test_a_state_that_cannot_be_had_at_the_end_is_no_pass(sim: Call, tmp_path: Path) -> None:
+    """Under LFR it is asked for only then."""
+    (tmp_path / "silent.py").write_text(SILENT_AT_THE_END)
+    code, out, err = sim("--app", f"{tmp_path}/silent.py:Silent", "--ftm", "lfr", "--count", "40")
+    assert code == 3 and "Traceback" not in err, out + err
+    assert "the bare function fails at request 40: Silent: MemoryError: no more" in out
+
+
 BRAKE: Final = """
 import json, struct, sys
 latched = False

@@ -11,7 +11,7 @@ from aftbed.core.events import Event
 from aftbed.core.journal import Entry, EntryKind, History, Record
 from aftbed.judge.checks import LATE_NS, Evidence
 from aftbed.judge.outcome import OUTCOMES, outcome_of, worst
-from aftbed.judge.reference import reference_run
+from aftbed.judge.reference import ReplyRule, reference_run
 from aftbed.judge.simulated import record_of
 from aftbed.judge.verdict import evidence_of
 from aftbed.runtime.deployment import Hosted
@@ -93,7 +93,7 @@ def test_replicas_that_differ_are_told_of_a_function_that_has_no_right_state_too
     assert record.end is not None
     end = msgspec.structs.replace(record.end, states={"a": "1", "b": "2"})
     record = msgspec.structs.replace(record, end=end)
-    reference = msgspec.structs.replace(reference, deterministic=False)
+    reference = msgspec.structs.replace(reference, rules=(ReplyRule(deterministic=False),))
     assert outcome_of(Evidence(record, reference)) == ("latent", ("the replicas differ",))
 
 

@@ -1,6 +1,8 @@
 """A field of the state, flipped in shared memory of real processes. The matrix is simulated."""
 
 import re
+import subprocess
+import sys
 from pathlib import Path
 from typing import Final
 
@@ -117,3 +119,34 @@ def test_a_bit_is_flipped_from_outside(home: Home) -> None:
     assert receipts(outcome) == ["activated"]
     assert outcome.verdict.verdict == "pass", outcome.verdict.reasons
     assert len(outcome.verdict.failovers) == 1
+
+
+WARM: Final = """
+import sys
+stderr = open(sys.argv[1], "w+")  # as a test runner has it: no descriptor 2
+sys.stderr = stderr
+from aftbed.inject.model import parse
+from aftbed.judge.record import read_record
+from aftbed.judge.verdict import judge
+from aftbed.runtime.interface import LIGHT
+from aftbed.runtime.unix.launch import launch, options_for, warm_up
+from aftbed.runtime.unix.options import LoadRun
+warm_up(LIGHT)
+fault = parse(sys.argv[2])
+launched = launch(*options_for(ftm="pbr", placement="process", work=LoadRun(80, 200.0), faults=(fault,)))
+for _ in launched.reports():
+    pass
+launched.wait()
+verdict = judge(read_record(launched.record))
+print(verdict.verdict, len(verdict.failovers), (launched.record / "processes.log").read_text())
+launched.remove()
+"""
+
+
+def test_what_nodes_of_a_warm_run_print_gets_into_no_journal(home: Home, tmp_path: Path) -> None:
+    """Their process is a fork of one whose `sys.stderr` has a descriptor that is closed in the fork."""
+    words = [sys.executable, "-c", WARM, str(tmp_path / "stderr"), f"{REFUSED} at reply.sent nth {HIT}"]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr + (tmp_path / "stderr").read_text()
+    assert done.stdout.startswith("pass 1 ") and ": detected stop: " in done.stdout, done.stdout
+    assert (tmp_path / "stderr").read_text() == ""

@@ -14,7 +14,7 @@ from typing import Final, NoReturn
 import msgspec
 
 from aftbed.core.application import Application
-from aftbed.core.errors import ConfigError, PeerError
+from aftbed.core.errors import ConfigError, FunctionFailedError, PeerError
 from aftbed.core.events import Event
 from aftbed.core.graph import Graph, Link
 from aftbed.core.journal import Entry, EntryKind, History, Record
@@ -530,7 +530,7 @@ class World:
         for replica in filter(None, (deployment.leader, deployment.backup)):
             io = self._io_of(f"{replica}/server")
             if io is not None and not io.frozen_ns:
-                with contextlib.suppress(PeerError):
+                with contextlib.suppress(PeerError, FunctionFailedError):
                     state = look(io.node.brick(f"{replica}/server"))
                     found |= {replica: digest(state)} if state else {}
         return found

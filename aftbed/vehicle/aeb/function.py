@@ -30,7 +30,7 @@ from typing import Final
 
 import msgspec
 
-from aftbed.core.application import BITS, Application, Characteristics, Field, Width
+from aftbed.core.application import BITS, CODES, Application, Characteristics, Field, Width
 from aftbed.core.errors import PeerError
 from aftbed.vehicle.aeb.messages import (
     COUNTER_COUNT,
@@ -252,9 +252,8 @@ _HEADER_LAYOUT: Final[Mapping[str, Width]] = {
 _TRACK_LAYOUT: Final[Mapping[str, Width]] = {
     "hits": "u8", "misses": "u8", "range_m": "f64", "speed_ms": "f64", "acceleration_ms2": "f64",
 }  # fmt: skip
-_CODES: Final[Mapping[Width, str]] = {"u8": "B", "u32": "I", "i64": "q", "f64": "d"}
-_HEADER: Final = Struct("<" + "".join(map(_CODES.__getitem__, _HEADER_LAYOUT.values())))
-_TRACK: Final = Struct("<" + "".join(map(_CODES.__getitem__, _TRACK_LAYOUT.values())))
+_HEADER: Final = Struct("<" + "".join(map(CODES.__getitem__, _HEADER_LAYOUT.values())))
+_TRACK: Final = Struct("<" + "".join(map(CODES.__getitem__, _TRACK_LAYOUT.values())))
 STATE_BYTES: Final = _HEADER.size + _TRACK.size * SLOTS
 _OFFSETS: Final = tuple(range(_HEADER.size, STATE_BYTES, _TRACK.size))  # by slot
 _EMPTY: Final = bytes(STATE_BYTES)
