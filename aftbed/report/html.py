@@ -6,6 +6,7 @@ mail, and on paper. Its size depends on the number of strata and not on that of 
 runs the worst are listed and the others are counted.
 """
 
+import functools
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from fnmatch import fnmatch
@@ -91,6 +92,7 @@ def html_report(summary: Summary, ledger: Ledger, *, drawn: int = DRAWN_MAX) -> 
     )
 
 
+@functools.cache  # it keeps the templates that it has compiled
 def engine(*folders: Path) -> jinja2.Environment:
     """For pages whose templates are in `folders`: it escapes all values, and refuses unknown names."""
     found = jinja2.Environment(

@@ -71,7 +71,7 @@ def test_a_fault_that_never_strikes_proves_nothing() -> None:
 
 
 def test_a_live_run_is_disturbed_from_a_second_command(home: Home) -> None:
-    """The car slows down only by its brake: then the brake has taken in requests, and misses the next ones."""
+    """The car slows down only by its brake: that has taken in requests then, and misses the next ones."""
     words = "omission bus AEB_REQ when speed < 13 for 100ms"
     with Started(home, CarRun("ccrs-50", 1.0, "latch")) as started:
         started.wait_for("started")
