@@ -7,6 +7,8 @@ from typing import Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
+from aftbed.cli.parsing import PlainCommand, PlainGroup
+
 CommandTable = Mapping[
     str, tuple[str, str]
 ]  # name of a command: MODULE:ATTRIBUTE below aftbed.cli, help in one line
@@ -29,9 +31,11 @@ class LazyCommand(TyperCommand):
         found = getattr(importlib.import_module(f"aftbed.cli.{module}"), attribute)
         parent = typer.Typer(rich_markup_mode=None)
         if isinstance(found, typer.Typer):
+            for command in found.registered_commands:
+                command.cls = PlainCommand
             parent.add_typer(found, name=self.name, help=self.help, no_args_is_help=True)
         else:
-            parent.command(self.name)(found)
+            parent.command(self.name, cls=PlainCommand)(found)
         assert self.name is not None
         loaded = typer.main.get_group(parent).commands[self.name]
         assert isinstance(loaded, TyperCommand | TyperGroup)
@@ -41,7 +45,7 @@ class LazyCommand(TyperCommand):
 def group_of(table: CommandTable) -> type[TyperGroup]:
     """A group that has, after the commands that it defines, those of `table`."""
 
-    class LazyGroup(TyperGroup):
+    class LazyGroup(PlainGroup):
         def __init__(self, **settings: Any) -> None:
             super().__init__(**settings)
             for name, (place, about) in table.items():
