@@ -11,9 +11,9 @@ import os
 import select
 import signal
 import sys
+from collections.abc import Iterator
 from typing import Final, TextIO
 
-from aftbed.cli.app import app
 from aftbed.core.errors import ConfigError, HarnessError, PeerError, shown
 
 EXIT_USAGE: Final = 2
@@ -27,7 +27,8 @@ def main() -> None:
     """The console script `aftbed`."""
     _prepare()
     try:
-        code = _call()
+        with _head_start(sys.argv[1:]):
+            code = _call()
     except ConfigError as error:
         code = _explain(EXIT_USAGE, f"error: {error}")
     except (HarnessError, PeerError) as error:
@@ -62,6 +63,24 @@ def _prepare() -> None:
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
 
 
+@contextlib.contextmanager
+def _head_start(words: list[str]) -> Iterator[None]:
+    """Let the supervisor of a run begin before the command is imported.
+
+    In a fresh interpreter only: what is in this process is copied with each process of the run.
+    """
+    if words[:1] != ["run"] or "typer" in sys.modules:
+        yield
+        return
+    from aftbed.runtime.unix import head_start  # noqa: PLC0415 - of runs only
+
+    head_start.begin(words[1:])
+    try:
+        yield
+    finally:
+        head_start.end()
+
+
 def _call() -> int:
     """Call the command; its exit code. What it printed has been written."""
     for word in sys.argv[1:]:
@@ -69,6 +88,8 @@ def _call() -> int:
             word.encode()
         except UnicodeEncodeError:  # neither messages nor JSON could carry it
             raise ConfigError(f"{word!a}: not UTF-8; choose another name, or set LANG=C.UTF-8") from None
+    from aftbed.cli.app import app  # noqa: PLC0415 - typer, behind the head start of a run
+
     code: object = 0
     streams = sys.stdout, sys.stderr
     try:

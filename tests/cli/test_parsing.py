@@ -71,6 +71,13 @@ WORDS = st.one_of(
 @example([])
 @example(["here", "--nth", "3", "--nth", "4", "--trust", "x", "--no-pin", "--real", "2.5"])
 @example(["--whole", "5", "here", "there"])
+@example(["here", "--whole", "a"])
+@example(["here", "--whole", "1_0"])
+@example(["here", "--nth", "5a"])
+@example(["here", "--least", "9"])
+@example(["here", "--real", "1e999"])
+@example(["here", "--real", "e5"])
+@example(["here", "--known", "/nowhere"])
 def test_values_and_messages_are_those_of_typer(words: list[str]) -> None:
     assert outcome(PlainCommand, words) == outcome(TyperCommand, words)
 

@@ -128,7 +128,7 @@ def make_source(client: Client, options: SourceOptions) -> Device:
             requests = list(given)
         return Load(client, dialogue, requests, work.count, work.rate_hz)
     # Imported here: the bus costs 150 ms to import, and only the zygote of the bus has it.
-    from aftbed.vehicle.can.dbc_file import load_dbc  # noqa: PLC0415
+    from aftbed.vehicle.can.dbc_file import own_dbc  # noqa: PLC0415
     from aftbed.vehicle.gateway import Gateway  # noqa: PLC0415
 
     gateway: BusGateway
@@ -137,7 +137,7 @@ def make_source(client: Client, options: SourceOptions) -> Device:
         from aftbed.vehicle.replay.map_file import find_map  # noqa: PLC0415
         from aftbed.vehicle.replay.mapped_gateway import MappedGateway  # noqa: PLC0415
 
-        gateway = MappedGateway(load_dbc(), Path(work.dbc), find_map(work.map), encode)
+        gateway = MappedGateway(own_dbc(), Path(work.dbc), find_map(work.map), encode)
     else:
-        gateway = Gateway(load_dbc(), encode)
+        gateway = Gateway(own_dbc(), encode)
     return CarDevice(client, dialogue, BusLink(gateway, options.port, options.secret))

@@ -115,12 +115,12 @@ def with_names_resolved(fault: Fault, work: Work) -> Fault:
     if isinstance(work, LoadRun):
         raise ConfigError(f"{fault}: a run of {work.option} has no bus")
     # Imported here, by the command: the supervisor must not read a DBC, since a failover would wait for it.
-    from aftbed.vehicle.can.dbc_file import load_dbc  # noqa: PLC0415
+    from aftbed.vehicle.can.dbc_file import own_dbc  # noqa: PLC0415
     from aftbed.vehicle.replay.map_file import find_map, load_mapped  # noqa: PLC0415
 
     if isinstance(work, ReplayRun):
         mapped = load_mapped(find_map(work.map), Path(work.dbc))
-        action = action.resolved([mapped, load_dbc()], (PLAYER, GATEWAY), car=False)
+        action = action.resolved([mapped, own_dbc()], (PLAYER, GATEWAY), car=False)
     else:
-        action = action.resolved([load_dbc()])
+        action = action.resolved([own_dbc()])
     return msgspec.structs.replace(fault, action=action)
