@@ -6,6 +6,7 @@ take no more, or whose encoding lacks some characters; and what the system refus
 
 import contextlib
 import errno
+import gc
 import io
 import os
 import select
@@ -26,8 +27,11 @@ STREAMS: Final = (("stdin", "r"), ("stdout", "w"), ("stderr", "w"))  # by descri
 def main() -> None:
     """The console script `aftbed`."""
     _prepare()
+    fresh = "typer" not in sys.modules  # this interpreter has been started for this command
+    if fresh:  # what is imported stays; to look for garbage in it takes a tenth of the time
+        gc.disable()  # until the command has been imported: see `lazy`
     try:
-        with _head_start(sys.argv[1:]):
+        with _head_start(sys.argv[1:]) if fresh else contextlib.nullcontext():
             code = _call()
     except ConfigError as error:
         code = _explain(EXIT_USAGE, f"error: {error}")
@@ -69,7 +73,7 @@ def _head_start(words: list[str]) -> Iterator[None]:
 
     In a fresh interpreter only: what is in this process is copied with each process of the run.
     """
-    if words[:1] != ["run"] or "typer" in sys.modules:
+    if words[:1] != ["run"]:
         yield
         return
     from aftbed.runtime.unix import head_start  # noqa: PLC0415 - of runs only

@@ -1,5 +1,6 @@
 """Commands whose module is imported when they are called: the help of a group imports none of them."""
 
+import gc
 import importlib
 from collections.abc import Mapping
 from typing import Any
@@ -29,6 +30,9 @@ class LazyCommand(TyperCommand):
         """The command, with its options or its subcommands."""
         module, _, attribute = self._place.partition(":")
         found = getattr(importlib.import_module(f"aftbed.cli.{module}"), attribute)
+        if not gc.isenabled():  # see `main`
+            gc.freeze()
+            gc.enable()
         parent = typer.Typer(rich_markup_mode=None)
         if isinstance(found, typer.Typer):
             for command in found.registered_commands:

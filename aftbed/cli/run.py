@@ -252,9 +252,6 @@ def _work(given: RunArguments) -> Work:
         return _replay(given.replay, given.dbc, given.map_file, pace)
     if given.dbc is not None or given.map_file is not None:
         raise ConfigError("--dbc and --map say what a replayed log means: give --replay LOG too")
-    from aftbed.vehicle.scenarios.library import load_scenario  # noqa: PLC0415 - only for a drive: PyYAML
-
-    load_scenario(given.scenario)
     if given.brake_policy not in POLICIES:
         raise unknown("brake policy", given.brake_policy, POLICIES)
     scenario = given.scenario

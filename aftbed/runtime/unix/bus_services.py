@@ -28,8 +28,7 @@ def preload() -> None:
     The processes of a replay import the rest themselves.
     """
     import aftbed.vehicle.drive_real  # noqa: PLC0415
-    import aftbed.vehicle.gateway  # noqa: PLC0415
-    import aftbed.vehicle.scenarios.library  # noqa: PLC0415, F401
+    import aftbed.vehicle.gateway  # noqa: PLC0415, F401
     from aftbed.vehicle.can.dbc_file import own_dbc  # noqa: PLC0415
 
     own_dbc()
@@ -147,11 +146,11 @@ def _drive(line: Line[control.ToNode], source: SourceOptions) -> None:
     from aftbed.vehicle.can.bus import BusOptions  # noqa: PLC0415
     from aftbed.vehicle.can.dbc_file import own_dbc  # noqa: PLC0415
     from aftbed.vehicle.drive_real import CarBuses, DriveOptions, drive  # noqa: PLC0415
-    from aftbed.vehicle.scenarios.library import load_scenario  # noqa: PLC0415
+    from aftbed.vehicle.scenarios.scenario import Scenario  # noqa: PLC0415
 
     work = source.work
     assert isinstance(work, CarRun), work
-    scenario, codec = load_scenario(work.scenario), own_dbc()
+    scenario, codec = msgspec.msgpack.decode(source.drive, type=Scenario), own_dbc()
     given = {"pace": work.pace, "brake_policy": work.brake_policy, "seed": source.seed}
     options = msgspec.convert(given, DriveOptions)
     follows = (codec.can_id("AEB_REQ"),)

@@ -113,6 +113,11 @@ class BusLink(CarLink):
         }
 
 
+def load_requests(seed: int, count: int, *, fixed: bool) -> list[bytes]:
+    """What a load of `count` requests is drawn from, again and again; `fixed` as in `sample_requests`."""
+    return sample_requests(seed, min(count, LOAD_REQUESTS), fixed=fixed)
+
+
 def make_source(client: Client, options: SourceOptions) -> Device:
     """Where the requests of a Client come from; the Client takes over from its predecessors."""
     journals, work = Path(options.journals), options.work
@@ -121,7 +126,7 @@ def make_source(client: Client, options: SourceOptions) -> Device:
     dialogue = DialogueFile(dialogue_path(journals, options.incarnation), "client")
     if isinstance(work, LoadRun):
         fixed = is_foreign(options.application)
-        requests = sample_requests(options.seed, LOAD_REQUESTS, fixed=fixed)
+        requests = load_requests(options.seed, work.count, fixed=fixed)
         if work.requests:
             given = stored_requests(journals.parent)
             assert given, f"the requests are no longer in {journals.parent}"

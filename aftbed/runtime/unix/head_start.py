@@ -62,7 +62,7 @@ def begin(words: Sequence[str]) -> None:
     """Fork the supervisor of the run that the options `words` describe."""
     if "--help" in words:
         return
-    has_bus = not any(word.startswith(WORDS_WITHOUT_BUS) for word in words)  # a guess, it costs time if wrong
+    has_bus = not any(word.startswith(WORDS_WITHOUT_BUS) for word in words)
     with suppress(OSError):  # then the launch says so
         _begun.append(fork(lambda line: _supervise(line, has_bus)))
 

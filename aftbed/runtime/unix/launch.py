@@ -32,7 +32,7 @@ from aftbed.runtime import control
 from aftbed.runtime.unix import head_start, linux, run_directory, seal
 from aftbed.runtime.unix.cleanup import watch
 from aftbed.runtime.unix.journal_files import CHUNK_BYTES, trim
-from aftbed.runtime.unix.options import LoadRun, PolicyOptions, RunOptions, Work, with_names_resolved
+from aftbed.runtime.unix.options import CarRun, LoadRun, PolicyOptions, RunOptions, Work, with_names_resolved
 from aftbed.runtime.unix.process_pool import killed_by
 from aftbed.runtime.unix.request_store import write_given
 from aftbed.runtime.unix.supervisor_process import GO, RUN, be_supervisor
@@ -170,7 +170,7 @@ class Launched:
     def _make_directories(self, given: "GivenRequests | None") -> None:
         """Make the private directory and the record, with what was asked for in it, and send *go*."""
         about = {"version": __version__, "started_ns": self.started_ns, **msgspec.to_builtins(self.options)}
-        for key in ("listener", "private"):
+        for key in ("listener", "private", "drive"):
             about.pop(key)
         about["load"] = isinstance(self.options.work, LoadRun)
         about["kept"] = self._kept
@@ -315,6 +315,7 @@ def options_for(
 ) -> tuple[RunOptions, socket.socket | None]:
     """What a run needs; where there is a bus, its socket too. Raises ConfigError, leaving nothing."""
     faults = tuple(with_names_resolved(fault, work) for fault in faults)
+    drive = _drive(work.scenario) if isinstance(work, CarRun) else b""
     ensure_limits()
     listener = None if isinstance(work, LoadRun) else bind_hub(bus_port)
     try:
@@ -340,5 +341,13 @@ def options_for(
         port=listener.getsockname()[1] if listener is not None else 0,
         bus_open=bus_open,
         application=application,
+        drive=drive,
     )
     return options, listener
+
+
+def _drive(scenario: str) -> bytes:
+    """The scenario as MessagePack. Raises ConfigError."""
+    from aftbed.vehicle.scenarios.library import load_scenario  # noqa: PLC0415 - only for a drive: PyYAML
+
+    return _encode(load_scenario(scenario))

@@ -65,7 +65,8 @@ class RunOptions(msgspec.Struct, frozen=True):
     """`private` and `record` are directories, made by the launch; `listener` is the hub's bound socket.
 
     `bus_open`: other users may attach to the bus, and the verdict stands whatever strangers send.
-    `application`: the protected function that the run begins with, "" for the built-in one.
+    `application`: the protected function that the run begins with, "" for the built-in one. `drive`: the
+    scenario of a CarRun as MessagePack, read once for all processes.
     """
 
     run: str
@@ -83,13 +84,14 @@ class RunOptions(msgspec.Struct, frozen=True):
     port: int = 0
     bus_open: bool = False
     application: str = ""
+    drive: bytes = b""
 
 
 class SourceOptions(msgspec.Struct, frozen=True):
     """For the process that makes the requests: the host of the Client, the vehicle or the player.
 
     `port` is the hub's, `secret` its bus's. `journals` is the directory of the dialogues of this Client,
-    which was made as the `incarnation`th, and of its predecessors. `application`: see `RunOptions`.
+    which was made as the `incarnation`th, and of its predecessors. `application`, `drive`: see `RunOptions`.
     """
 
     work: Work
@@ -99,6 +101,7 @@ class SourceOptions(msgspec.Struct, frozen=True):
     journals: str = ""
     incarnation: int = 1
     application: str = ""
+    drive: bytes = b""
 
 
 def with_names_resolved(fault: Fault, work: Work) -> Fault:

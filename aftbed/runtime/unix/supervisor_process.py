@@ -14,6 +14,7 @@ the run have been made.
 
 import contextlib
 import errno
+import gc
 import os
 import signal
 import socket
@@ -59,19 +60,21 @@ def warm_up(name: str) -> None:
 def begin_early(owner: socket.socket, *, has_bus: bool) -> NoReturn:
     """Fork zygotes, then be the supervisor. Called in a process that has imported next to nothing.
 
-    `has_bus` is a guess: a zygote that is missing is started later, one that is not needed is ended.
+    `has_bus`: whether the run has one, as far as can be told; if it has one all the same, that costs time.
     """
+    gc.disable()  # what is imported stays
     linux.continue_at_parents_death()
     linux.set_name("aftbed-supervis")
     linux.allow_files()
     from aftbed.runtime.unix import prefault, zygote  # noqa: PLC0415 - a launch does not need them
 
-    prefault.rehearse()
     cpus = sorted(os.sched_getaffinity(0))
     zygotes: dict[str, Started] = {}
     with contextlib.suppress(OSError):  # no process can be forked: the launch will say so
-        for name in (BUS, LIGHT) if has_bus else (LIGHT,):  # the one that imports more is the first
-            zygotes[name] = zygote.fork(name, cpus)
+        if has_bus:  # it has more to import
+            zygotes[BUS] = zygote.fork(BUS, cpus)
+        prefault.rehearse()
+        zygotes[LIGHT] = zygote.fork(LIGHT, cpus)
     from aftbed.runtime.unix import supervisor  # noqa: PLC0415 - the zygotes have less to copy without it
 
     assert supervisor
@@ -84,6 +87,8 @@ def be_supervisor(owner: socket.socket, zygotes: dict[str, Started]) -> NoReturn
     `zygotes` have been forked by this process before it knew of the run.
     """
     code, record = 1, Path()
+    gc.freeze()  # to visit what this process shares with others would be to copy it
+    gc.enable()
     try:
         handed_over, fds, _, _ = socket.recv_fds(owner, len(RUN), RUN_FDS_MAX, socket.MSG_CMSG_CLOEXEC)
         if handed_over != RUN:
@@ -124,8 +129,7 @@ def _joined(zygotes: dict[str, Started], options: RunOptions, log: int) -> dict[
     """The zygotes of the run, as far as they have been started; one that it does not need is ended."""
     load = isinstance(options.work, LoadRun)
     names = (LIGHT,) if load else (LIGHT, BUS)
-    _end({name: started for name, started in zygotes.items() if name not in names})
-    zygotes = {name: started for name, started in zygotes.items() if name in names}
+    assert set(zygotes) <= set(names), "a zygote without a use"
     for _, sock in zygotes.values():
         with contextlib.suppress(BrokenPipeError):  # it is dead, which the supervisor will see
             Line(sock, decode_report).send(control.JoinRun(control.UNANSWERED, options.private), (log,))

@@ -196,7 +196,9 @@ class Workload:
         """Have the vehicle or the player attach to the bus, while the graph is made."""
         options = self._options
         if not self._is_load:
-            source = SourceOptions(options.work, options.seed, options.port, self._secret)
+            source = SourceOptions(
+                options.work, options.seed, options.port, self._secret, drive=options.drive
+            )
             yield from self._assign(BUS, self._source, msgspec.msgpack.encode(source), ())
 
     def start(self) -> Keys:

@@ -30,7 +30,7 @@ from aftbed.functions.source import FunctionSource
 from aftbed.runtime import control
 from aftbed.runtime.assembly import Assembler
 from aftbed.runtime.devices import Device, Sensor
-from aftbed.runtime.interface import BUS
+from aftbed.runtime.interface import BUS, LIGHT
 from aftbed.runtime.node import Node
 from aftbed.runtime.unix import linux, prefault, run_directory
 from aftbed.runtime.unix.death_notice import Lifeline
@@ -44,9 +44,10 @@ from aftbed.vehicle.aeb.function import default_application
 
 
 def fork(name: str, cpus: list[int], areas: tuple[Area, ...] | None = None) -> tuple[int, socket.socket]:
-    """Fork the zygote `name` from this process, which has rehearsed: its pid, our end of its control line.
+    """Fork the zygote `name` from this process: its pid, and our end of its control line.
 
-    `areas`: where a node will write to, if this process has found that out. Raises OSError.
+    That of the mechanism is forked from a process that has rehearsed. `areas`: where a node will write to, if
+    this process has found that out. Raises OSError.
     """
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     supervisor = os.getpid()
@@ -61,7 +62,7 @@ def fork(name: str, cpus: list[int], areas: tuple[Area, ...] | None = None) -> t
                 _begin(supervisor, cpus)
                 if areas is None:
                     preload(name)
-                    areas = prefault.areas_of_a_child()
+                    areas = prefault.areas_of_a_child() if name == LIGHT else None
                 _serve(supervisor, areas)
             except (BrokenPipeError, ConnectionResetError):  # there is no run
                 os._exit(0)
@@ -88,8 +89,13 @@ def _begin(supervisor: int, cpus: list[int]) -> None:
     linux.reuse_blocks()
 
 
-def _serve(supervisor: int, areas: tuple[Area, ...]) -> NoReturn:
-    """Carry out what comes on the control line at `INHERITED_FD`, until it ends."""
+def _serve(supervisor: int, areas: tuple[Area, ...] | None) -> NoReturn:
+    """Carry out what comes on the control line at `INHERITED_FD`, until it ends.
+
+    `areas` is None in a zygote that has not rehearsed: a drive waits for its first spares, so it rehearses
+    when they are forked.
+    """
+    first = True
     gc.freeze()
     gc.disable()  # structs on the path are untracked; the rest is freed by its reference count
     line = Line(socket.socket(fileno=INHERITED_FD), decode_order)
@@ -100,8 +106,11 @@ def _serve(supervisor: int, areas: tuple[Area, ...]) -> NoReturn:
             _join(Path(order.private), fds)
             continue
         assert isinstance(order, control.Park), order
+        if areas is None and not first:
+            areas = prefault.warm_up()
+        first = False
         try:
-            _fork_spares(fds, supervisor, areas)
+            _fork_spares(fds, supervisor, areas or ())
         except OSError as error:
             with contextlib.suppress(BrokenPipeError):  # the run has ended
                 line.send(control.Report("trouble", f"no process can be forked: {error.strerror}".encode()))
@@ -235,4 +244,4 @@ def _make_device(order: control.Assign, node: UnixNode) -> Device:
 if __name__ == "__main__":
     _begin(int(sys.argv[1]), [int(cpu) for cpu in sys.argv[2].split(",")])
     preload(sys.argv[3])
-    _serve(int(sys.argv[1]), prefault.warm_up())
+    _serve(int(sys.argv[1]), prefault.warm_up() if sys.argv[3] == LIGHT else None)
