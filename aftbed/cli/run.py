@@ -1,8 +1,8 @@
 """`aftbed run`: check all options, start the run, show it, judge it.
 
-The command forks the supervisor, so a module that is imported before the launch costs memory in every
-process of the run and delays its first reply. What only some runs need is imported where it is used, and
-what judges is imported after the run.
+The supervisor has begun before this module is imported (`runtime.unix.head_start`), and waits for the
+options: a module that is imported before the launch delays the first reply. What only some runs need is
+imported where it is used, and what judges is imported after the run.
 """
 
 import json
