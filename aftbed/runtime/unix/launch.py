@@ -157,7 +157,8 @@ class Launched:
         for fd in (command_end, supervisor_end, waker):
             os.close(fd)
         self._life: list[int] = [command_life]
-        _LAUNCHED.add(self)
+        self._reference = weakref.ref(self, _LAUNCHED.discard)
+        _LAUNCHED.add(self._reference)
 
     def _hand_over(self, *fds: int) -> None:
         """Send the options to the supervisor, as a file, and descriptors. Raises OSError."""
@@ -248,7 +249,7 @@ class Launched:
         if not _ends(self._warden_pidfd, KILL_SECONDS_MAX):
             linux.kill(self._warden_pidfd, signal.SIGKILL)  # a stopped warden would never end
         os.waitpid(self.warden, 0)
-        _LAUNCHED.discard(self)
+        _LAUNCHED.discard(self._reference)
         os.close(self._pidfd)
         os.close(self._warden_pidfd)
 
@@ -259,12 +260,15 @@ class Launched:
             os.close(fd)
 
 
-_LAUNCHED: Final[weakref.WeakSet[Launched]] = weakref.WeakSet()
+_LAUNCHED: Final[set[weakref.ref[Launched]]] = set()
 
 
 def _disown_all() -> None:
-    for launched in list(_LAUNCHED):
-        launched.disown()
+    if not _LAUNCHED:  # as in each process that a zygote forks: what is not executed there is not copied
+        return
+    for reference in list(_LAUNCHED):
+        if (launched := reference()) is not None:
+            launched.disown()
     _LAUNCHED.clear()  # a child of this child has other descriptors by the same numbers
 
 
