@@ -34,8 +34,9 @@ from aftbed.judge.verdict import Breach, Verdict, evidence_of, judge
 from aftbed.runtime.interface import BUS, LIGHT
 from aftbed.runtime.sim.world import Setup, simulate
 from aftbed.runtime.unix import linux
-from aftbed.runtime.unix.launch import launch, options_for, warm_up
+from aftbed.runtime.unix.launch import launch, options_for
 from aftbed.runtime.unix.options import CarRun, LoadRun, Work, with_names_resolved
+from aftbed.runtime.unix.supervisor_process import warm_up
 from aftbed.runtime.unix.trust import OWN_RUN, Trust, remember, vetted
 from aftbed.search.shrink import shrink
 from aftbed.vehicle.plant import VehicleResult

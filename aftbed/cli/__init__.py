@@ -6,14 +6,15 @@ take no more, or whose encoding lacks some characters; and what the system refus
 
 import contextlib
 import errno
+import gc
 import io
 import os
 import select
 import signal
 import sys
+from collections.abc import Iterator
 from typing import Final, TextIO
 
-from aftbed.cli.app import app
 from aftbed.core.errors import ConfigError, HarnessError, PeerError, shown
 
 EXIT_USAGE: Final = 2
@@ -26,8 +27,12 @@ STREAMS: Final = (("stdin", "r"), ("stdout", "w"), ("stderr", "w"))  # by descri
 def main() -> None:
     """The console script `aftbed`."""
     _prepare()
+    fresh = "typer" not in sys.modules  # this interpreter has been started for this command
+    if fresh:  # what is imported stays; to look for garbage in it takes a tenth of the time
+        gc.disable()  # until the command has been imported: see `lazy`
     try:
-        code = _call()
+        with _head_start(sys.argv[1:]) if fresh else contextlib.nullcontext():
+            code = _call()
     except ConfigError as error:
         code = _explain(EXIT_USAGE, f"error: {error}")
     except (HarnessError, PeerError) as error:
@@ -62,6 +67,24 @@ def _prepare() -> None:
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
 
 
+@contextlib.contextmanager
+def _head_start(words: list[str]) -> Iterator[None]:
+    """Let the supervisor of a run begin before the command is imported.
+
+    In a fresh interpreter only: what is in this process is copied with each process of the run.
+    """
+    if words[:1] != ["run"]:
+        yield
+        return
+    from aftbed.runtime.unix import head_start  # noqa: PLC0415 - of runs only
+
+    head_start.begin(words[1:])
+    try:
+        yield
+    finally:
+        head_start.end()
+
+
 def _call() -> int:
     """Call the command; its exit code. What it printed has been written."""
     for word in sys.argv[1:]:
@@ -69,6 +92,8 @@ def _call() -> int:
             word.encode()
         except UnicodeEncodeError:  # neither messages nor JSON could carry it
             raise ConfigError(f"{word!a}: not UTF-8; choose another name, or set LANG=C.UTF-8") from None
+    from aftbed.cli.app import app  # noqa: PLC0415 - typer, behind the head start of a run
+
     code: object = 0
     streams = sys.stdout, sys.stderr
     try:

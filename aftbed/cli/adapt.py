@@ -21,6 +21,7 @@ from aftbed.adapt.planner import plan as plan_between
 from aftbed.adapt.script_file import ScriptFile, entry, mapping, phases, script_from
 from aftbed.adapt.suitability import remarks, unsuitable
 from aftbed.cli.options import Json, Recipe, Run, class_source, print_json, takes
+from aftbed.cli.parsing import PlainGroup
 from aftbed.cli.views import EndedAdaptation, history_lines
 from aftbed.core.application import Characteristics
 from aftbed.core.errors import ConfigError
@@ -41,7 +42,7 @@ WHEN: Final = {
     "finish": "when nothing has broken",
 }
 
-adapt = typer.Typer()
+adapt = typer.Typer(cls=PlainGroup)
 
 Expr = Annotated[str, typer.Argument(help="The whole new expression, the outer mechanism first: lfr+tr.")]
 MayFail = Annotated[

@@ -16,13 +16,14 @@ from aftbed.bench.cycle import bench_cycle, bench_hops
 from aftbed.bench.recovery import bench_recovery
 from aftbed.bench.resources import bench_launch, bench_memory
 from aftbed.cli.options import App, Ftm, Recipe, check_range, print_json
+from aftbed.cli.parsing import PlainGroup
 from aftbed.cli.request_options import RequestSource
 from aftbed.core.errors import ConfigError
 from aftbed.ftm.compose import DUPLEX, replication_of
 from aftbed.functions.request_file import REQUESTS_MAX, names_function
 from aftbed.functions.source import located
 
-bench = typer.Typer()
+bench = typer.Typer(cls=PlainGroup)
 REQUESTS_MIN: Final = 5000
 SENT_FUNCTION: Final = 512  # requests of MODULE:FUNCTION, sent in turn
 KILLS_MIN: Final = 1

@@ -31,6 +31,7 @@ from aftbed.cli.options import (
     print_json,
     takes,
 )
+from aftbed.cli.parsing import PlainGroup
 from aftbed.core.errors import ConfigError, shown, unknown
 from aftbed.functions.load import OWN_CODE
 from aftbed.functions.request_file import located_requests, requests_from
@@ -50,7 +51,7 @@ HTML: Final = "report.html"
 MARKDOWN: Final = "summary.md"  # of a campaign with a function of the user
 _SHARD: Final = re.compile(r"([0-9]{1,6})/([0-9]{1,6})")
 
-campaign = typer.Typer()
+campaign = typer.Typer(cls=PlainGroup)
 
 Folder = Annotated[Path, typer.Argument(help="The directory of a campaign (its --out).")]
 ExperimentName = Annotated[str, typer.Argument(help="Id of the experiment, its beginning, or its number.")]

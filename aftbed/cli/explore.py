@@ -12,6 +12,7 @@ from msgspec.structs import replace
 
 from aftbed.cli.adapt import refuse_unsuitable
 from aftbed.cli.options import App, Json, check_range, jobs_of, print_json, separated, takes
+from aftbed.cli.parsing import PlainGroup
 from aftbed.cli.request_options import RequestSource, first_requests
 from aftbed.cli.sim import described, event_lines, picture, shown_apart
 from aftbed.cli.views import progress_bar, spaced
@@ -42,7 +43,7 @@ BOUND: Final = 2_000
 BOUND_MAX: Final = 10_000_000
 LISTED_MAX: Final = 20  # broken experiments that are printed; --json has all of them
 
-explore = typer.Typer()
+explore = typer.Typer(cls=PlainGroup)
 
 
 class ExploreArguments(msgspec.Struct, frozen=True, kw_only=True):

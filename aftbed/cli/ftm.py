@@ -25,6 +25,7 @@ from aftbed.adapt.suitability import (
     table_from,
 )
 from aftbed.cli.options import Json, check_range, print_blocks, print_json
+from aftbed.cli.parsing import PlainGroup
 from aftbed.core.application import NONE
 from aftbed.core.errors import ConfigError
 from aftbed.core.graph import Graph
@@ -35,7 +36,7 @@ from aftbed.judge.isolated import declared_by
 from aftbed.runtime.unix.trust import OWN_RUN
 from aftbed.vehicle.aeb.function import default_application
 
-ftm = typer.Typer()
+ftm = typer.Typer(cls=PlainGroup)
 EXIT_INCONSISTENT: Final = 1
 CPUS_MAX: Final = 1024
 BANDWIDTH_KBIT_S_MAX: Final = 1e9

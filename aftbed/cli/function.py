@@ -12,6 +12,7 @@ from aftbed import functions
 from aftbed.adapt.suitability import mismatches
 from aftbed.cli.new_function import new
 from aftbed.cli.options import Json, Seed, check_range, check_seed, print_blocks, print_json
+from aftbed.cli.parsing import PlainGroup
 from aftbed.core.application import NONE, Characteristics
 from aftbed.core.errors import shown
 from aftbed.ftm.compose import EXPRESSIONS
@@ -21,7 +22,7 @@ from aftbed.functions.source import is_foreign, located, parse_source
 from aftbed.judge.measured import MeasuredFunction, StateChange, UnmeasuredError, measure
 from aftbed.vehicle.aeb.function import sample_requests
 
-function = typer.Typer()
+function = typer.Typer(cls=PlainGroup)
 function.command()(new)
 EXIT_OVERSTATED: Final = 1
 COUNT: Final = 200

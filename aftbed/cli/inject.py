@@ -11,6 +11,7 @@ import typer
 from msgspec.structs import asdict, replace
 
 from aftbed.cli.options import Run, takes
+from aftbed.cli.parsing import PlainGroup
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.inject.bus import read_bus_fault
 from aftbed.inject.memory import refuse_unsafe
@@ -19,7 +20,7 @@ from aftbed.inject.value import MEMORY
 from aftbed.runtime.unix import control_client, run_directory
 from aftbed.runtime.unix.options import Work, with_names_resolved
 
-inject = typer.Typer()
+inject = typer.Typer(cls=PlainGroup)
 
 LEVELS: Final = ("value", MEMORY)
 DRAWN: Final = "drawn"  # in the place of a byte's number: the seed chooses the byte

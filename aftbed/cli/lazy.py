@@ -1,11 +1,14 @@
 """Commands whose module is imported when they are called: the help of a group imports none of them."""
 
+import gc
 import importlib
 from collections.abc import Mapping
 from typing import Any
 
 import typer
 from typer.core import TyperCommand, TyperGroup
+
+from aftbed.cli.parsing import PlainCommand, PlainGroup
 
 CommandTable = Mapping[
     str, tuple[str, str]
@@ -27,11 +30,16 @@ class LazyCommand(TyperCommand):
         """The command, with its options or its subcommands."""
         module, _, attribute = self._place.partition(":")
         found = getattr(importlib.import_module(f"aftbed.cli.{module}"), attribute)
+        if not gc.isenabled():  # see `main`
+            gc.freeze()
+            gc.enable()
         parent = typer.Typer(rich_markup_mode=None)
         if isinstance(found, typer.Typer):
+            for command in found.registered_commands:
+                command.cls = PlainCommand
             parent.add_typer(found, name=self.name, help=self.help, no_args_is_help=True)
         else:
-            parent.command(self.name)(found)
+            parent.command(self.name, cls=PlainCommand)(found)
         assert self.name is not None
         loaded = typer.main.get_group(parent).commands[self.name]
         assert isinstance(loaded, TyperCommand | TyperGroup)
@@ -41,7 +49,7 @@ class LazyCommand(TyperCommand):
 def group_of(table: CommandTable) -> type[TyperGroup]:
     """A group that has, after the commands that it defines, those of `table`."""
 
-    class LazyGroup(TyperGroup):
+    class LazyGroup(PlainGroup):
         def __init__(self, **settings: Any) -> None:
             super().__init__(**settings)
             for name, (place, about) in table.items():

@@ -5,9 +5,10 @@ from typing import Annotated
 
 import typer
 
+from aftbed.cli.parsing import PlainGroup
 from aftbed.core.errors import ConfigError
 
-log = typer.Typer()
+log = typer.Typer(cls=PlainGroup)
 
 
 @log.command()

@@ -1,8 +1,8 @@
 """`aftbed run`: check all options, start the run, show it, judge it.
 
-The command forks the supervisor, so a module that is imported before the launch costs memory in every
-process of the run and delays its first reply. What only some runs need is imported where it is used, and
-what judges is imported after the run.
+The supervisor has begun before this module is imported (`runtime.unix.head_start`), and waits for the
+options: a module that is imported before the launch delays the first reply. What only some runs need is
+imported where it is used, and what judges is imported after the run.
 """
 
 import json
@@ -252,9 +252,6 @@ def _work(given: RunArguments) -> Work:
         return _replay(given.replay, given.dbc, given.map_file, pace)
     if given.dbc is not None or given.map_file is not None:
         raise ConfigError("--dbc and --map say what a replayed log means: give --replay LOG too")
-    from aftbed.vehicle.scenarios.library import load_scenario  # noqa: PLC0415 - only for a drive: PyYAML
-
-    load_scenario(given.scenario)
     if given.brake_policy not in POLICIES:
         raise unknown("brake policy", given.brake_policy, POLICIES)
     scenario = given.scenario

@@ -25,7 +25,7 @@ from aftbed.judge.reference import ReferenceRun
 from aftbed.runtime.deployment import Hosted, replica_of
 from aftbed.runtime.unix.options import COMMAND_GONE, CarRun, ReplayRun, Work
 from aftbed.vehicle.aeb.messages import AebOutput, decode_reply
-from aftbed.vehicle.can.dbc_file import load_dbc
+from aftbed.vehicle.can.dbc_file import own_dbc
 from aftbed.vehicle.can.hub import Stranger
 from aftbed.vehicle.scenarios.library import load_scenario
 from aftbed.vehicle.scenarios.scenario import broken_expectations
@@ -476,7 +476,7 @@ def strangers(record: RunRecord) -> list[Stranger]:
     found = record.end.bus.strangers if record.end is not None and record.end.bus is not None else []
     if not any(one.forged for one in found):
         return found
-    codec = load_dbc()
+    codec = own_dbc()
     names = {f"{codec.can_id(name):03X}": name for name in codec.names()}
     return [
         msgspec.structs.replace(one, forged={names.get(i, f"0x{i}"): n for i, n in one.forged.items()})

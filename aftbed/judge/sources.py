@@ -33,11 +33,10 @@ from aftbed.judge.record import RunEnd, RunRecord
 from aftbed.judge.reference import ReferenceRun
 from aftbed.runtime.node import FUNCTION_FAILED
 from aftbed.runtime.unix import seal
-from aftbed.runtime.unix.devices import LOAD_REQUESTS
+from aftbed.runtime.unix.devices import load_requests
 from aftbed.runtime.unix.options import LoadRun
 from aftbed.runtime.unix.request_store import EXPECTED_NAME, REQUESTS_NAME
 from aftbed.runtime.unix.run_directory import BUS_NAME
-from aftbed.vehicle.aeb.function import sample_requests
 
 PROCESSES_LOG: Final = "processes.log"
 PRINTED_BYTES_MAX: Final = 1_000_000  # that are searched: the first error counts
@@ -256,7 +255,7 @@ def _listed_requests(record: RunRecord) -> Sequence[bytes]:
     return (
         record.given or ()
         if work.requests
-        else _drawn(record.options.seed, fixed=is_foreign(record.options.application))
+        else _drawn(record.options.seed, work.count, fixed=is_foreign(record.options.application))
     )
 
 
@@ -381,6 +380,6 @@ def _of_bus(record: RunRecord, end: RunEnd) -> Iterator[str]:
 
 
 @lru_cache(maxsize=4)
-def _drawn(seed: int, *, fixed: bool) -> list[bytes]:
+def _drawn(seed: int, count: int, *, fixed: bool) -> list[bytes]:
     """The requests of a load, which come again and again."""
-    return sample_requests(seed, LOAD_REQUESTS, fixed=fixed)
+    return load_requests(seed, count, fixed=fixed)

@@ -63,6 +63,14 @@ class Park(ControlOrder, frozen=True):
     """To a zygote: fork one spare for each descriptor that came along."""
 
 
+class JoinRun(ControlOrder, frozen=True):
+    """To a zygote that was forked before there was a run: belong to the one in `private`, and print to the
+    file that came along.
+    """
+
+    private: str
+
+
 class SelfTest(msgspec.Struct, frozen=True):
     """A self-test: the graph to be, and requests that were recorded in this run."""
 
@@ -287,8 +295,8 @@ class Report(msgspec.Struct, frozen=True, tag=True):
 
 
 ToNode = (
-    Park | Assign | Serve | BindInput | BindOutput | Follow | Rewire | SuspendNode | ResumeNode | Capture
-    | Restore | Deliver | WatchNodes | Arm | SlowDown | ShareState | DisturbBus | WatchCar | Stop
+    Park | JoinRun | Assign | Serve | BindInput | BindOutput | Follow | Rewire | SuspendNode | ResumeNode
+    | Capture | Restore | Deliver | WatchNodes | Arm | SlowDown | ShareState | DisturbBus | WatchCar | Stop
     | StopRequests | Stats | Ack
 )  # fmt: skip
 FromNode = Hello | Ack | BrickReport | Ordered | Fired | Report

@@ -591,6 +591,7 @@ class Node(Generic[In, Out]):
                 self.device.quiet()
             case (
                 control.Park()
+                | control.JoinRun()
                 | control.Assign()
                 | control.Serve()
                 | control.DisturbBus()

@@ -63,14 +63,13 @@ class DriveReport(msgspec.Struct, frozen=True):
 
 
 class CarBuses:
-    """The car's attachments to the bus, complete: the drive may begin."""
+    """The car's attachments to the bus, complete."""
 
     def __init__(self, options: BusOptions, follows: tuple[int, ...] = ()) -> None:
         """`follows` are the identifiers of the frames that the brake ECU follows."""
         self.line = HubLine(options)
         self.brake = open_bus(msgspec.structs.replace(options, node=BRAKE, uses=follows))
         self.radar = open_bus(msgspec.structs.replace(options, node=RADAR))
-        self.line.request_conditions()
 
     def close(self) -> None:
         self.brake.close()
@@ -91,6 +90,7 @@ def drive(
 
     `report` is called each 50 ms of bus time and at the end. Raises HarnessError when the bus fails.
     """
+    buses.line.request_conditions()  # those of faults that were armed since the car has attached, too
     return _Drive(scenario, codec, buses, options, stop).run(report)
 
 

@@ -28,7 +28,7 @@ from collections.abc import Callable, Sequence
 
 from aftbed.vehicle.aeb.messages import EncodeRequest, encode_request
 from aftbed.vehicle.can.bus_model import NODES, BusDisturber, BusModel, BusNode
-from aftbed.vehicle.can.dbc_file import Codec, load_dbc
+from aftbed.vehicle.can.dbc_file import Codec, own_dbc
 from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.condition import Condition
 from aftbed.vehicle.ecus import BrakePolicy, CarBody, End
@@ -95,11 +95,11 @@ class VirtualCar:
         on_frame: Callable[[Frame], None] | None = None,
         encode: EncodeRequest = encode_request,
     ) -> None:
-        """`codec` is aftbed's own DBC, loaded where none is given: that takes 3 ms.
+        """`codec` is aftbed's own DBC where none is given.
 
         `on_frame` is called with every frame, in the order of the bus; `encode` writes the requests.
         """
-        codec = codec or load_dbc()
+        codec = codec or own_dbc()
         self._body = CarBody(scenario, codec, brake_policy, seed)
         self._bus = VirtualBus(codec, self._body, on_frame, encode)
         self._end = self._body.ended()

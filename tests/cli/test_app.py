@@ -44,11 +44,34 @@ def test_the_help_of_all_commands_imports_no_command() -> None:
         "aftbed.cli",
         "aftbed.cli.app",
         "aftbed.cli.lazy",
+        "aftbed.cli.parsing",
         "aftbed.core",
         "aftbed.core.errors",
     }
-    assert not modules & {"msgspec", "rich", "yaml", "can", "cantools", "psutil", "scipy", "numpy", "jinja2"}
+    assert not modules & {
+        "pydantic",
+        "msgspec",
+        "rich",
+        "yaml",
+        "can",
+        "cantools",
+        "psutil",
+        "scipy",
+        "numpy",
+        "jinja2",
+    }
     assert all(f"  {name} " in done.stdout for name in COMMANDS)
+
+
+def test_a_command_with_plain_options_does_not_import_pydantic(home: Home) -> None:
+    code = (
+        "import sys; from aftbed.cli import main; sys.argv = ['aftbed', 'status', '--run', 'abc', '--json']\n"
+        "try: main()\n"
+        "finally: print(*sorted(name for name in sys.modules), file=sys.stderr)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 2 and "no such run is alive" in done.stderr
+    assert not {"pydantic", "email", "rich", "yaml", "can", "numpy"} & set(done.stderr.split())
 
 
 def test_a_mistyped_command_is_refused_with_a_suggestion(call: Call) -> None:

@@ -129,7 +129,8 @@ from aftbed.inject.model import parse
 from aftbed.judge.record import read_record
 from aftbed.judge.verdict import judge
 from aftbed.runtime.interface import LIGHT
-from aftbed.runtime.unix.launch import launch, options_for, warm_up
+from aftbed.runtime.unix.launch import launch, options_for
+from aftbed.runtime.unix.supervisor_process import warm_up
 from aftbed.runtime.unix.options import LoadRun
 warm_up(LIGHT)
 fault = parse(sys.argv[2])

@@ -2,7 +2,7 @@
 
 from aftbed.cli import campaign, run, scenario_table
 from aftbed.runtime.interface import BUS, LIGHT
-from aftbed.runtime.unix.launch import warm_up
+from aftbed.runtime.unix.supervisor_process import warm_up
 
 assert campaign and run and scenario_table
 warm_up(LIGHT)

@@ -45,7 +45,7 @@ from aftbed.runtime.sim.processes import SimProcess, SimProcessPool, SimSenses
 from aftbed.runtime.tasks import Wait
 from aftbed.vehicle.aeb.function import default_application, sample_requests
 from aftbed.vehicle.aeb.messages import encode_fixed, encode_request
-from aftbed.vehicle.can.dbc_file import Codec, load_dbc
+from aftbed.vehicle.can.dbc_file import own_dbc
 from aftbed.vehicle.condition import Condition
 from aftbed.vehicle.drive_virtual import VirtualCar
 from aftbed.vehicle.ecus import End
@@ -135,11 +135,6 @@ def graph_of(ftm: str, placement: str, application: str = "") -> Graph:
     return build(ftm, placement, application=application)
 
 
-@lru_cache(maxsize=1)
-def own_codec() -> Codec:
-    return load_dbc()
-
-
 def check(fault: Fault, scenario: str) -> None:
     """Raise ConfigError if a simulated run has nothing that `fault` could strike, or wait for."""
     if not fault.action.simulated:
@@ -172,7 +167,7 @@ class Drive(CarLink):
         self._clock = clock
         encode = encode_fixed if is_foreign(setup.application) else encode_request
         scenario = load_scenario(setup.scenario)
-        self._car = VirtualCar(scenario, seed=setup.seed, codec=own_codec(), encode=encode)
+        self._car = VirtualCar(scenario, seed=setup.seed, codec=own_dbc(), encode=encode)
         self._faults = Disturber()  # of its bus
         self._began_ns = 0
         self._wake: Callable[[], None] = lambda: None
@@ -223,7 +218,7 @@ class Drive(CarLink):
     def disturb(self, number: int, fault: FaultKind, draw: int) -> None:
         """Arm `fault` in the car's bus. Raises ConfigError where it names what does not exist."""
         assert isinstance(fault, BusFault), fault
-        fault = fault if fault.targets is not None else fault.resolved([own_codec()])
+        fault = fault if fault.targets is not None else fault.resolved([own_dbc()])
         now_us = self._car.before(self._t_ns() if self._under_way else 0)
         self._faults.arm(number, fault, draw, now_us)
         self._car.disturb(self._faults)

@@ -22,6 +22,19 @@ if TYPE_CHECKING:
     from aftbed.inject.bus_disturber import Disturber
 
 
+def preload() -> None:
+    """Import what a drive needs, and read its DBC, for all forks of this process.
+
+    The processes of a replay import the rest themselves.
+    """
+    import aftbed.vehicle.drive_real  # noqa: PLC0415
+    import aftbed.vehicle.gateway  # noqa: PLC0415, F401
+    from aftbed.vehicle.can.dbc_file import own_dbc  # noqa: PLC0415
+
+    own_dbc()
+    "localhost".encode("idna")  # a table that python-can's connection would load in each process
+
+
 def serve(line: Line[control.ToNode], order: control.Serve, fds: list[int]) -> None:
     """Run the service that `order` names, until it has finished or its line ends."""
     try:
@@ -131,13 +144,13 @@ def _stopper(line: Line[control.ToNode]) -> Callable[[], bool]:
 
 def _drive(line: Line[control.ToNode], source: SourceOptions) -> None:
     from aftbed.vehicle.can.bus import BusOptions  # noqa: PLC0415
-    from aftbed.vehicle.can.dbc_file import load_dbc  # noqa: PLC0415
+    from aftbed.vehicle.can.dbc_file import own_dbc  # noqa: PLC0415
     from aftbed.vehicle.drive_real import CarBuses, DriveOptions, drive  # noqa: PLC0415
-    from aftbed.vehicle.scenarios.library import load_scenario  # noqa: PLC0415
+    from aftbed.vehicle.scenarios.scenario import Scenario  # noqa: PLC0415
 
     work = source.work
     assert isinstance(work, CarRun), work
-    scenario, codec = load_scenario(work.scenario), load_dbc()
+    scenario, codec = msgspec.msgpack.decode(source.drive, type=Scenario), own_dbc()
     given = {"pace": work.pace, "brake_policy": work.brake_policy, "seed": source.seed}
     options = msgspec.convert(given, DriveOptions)
     follows = (codec.can_id("AEB_REQ"),)
@@ -157,20 +170,20 @@ def _drive(line: Line[control.ToNode], source: SourceOptions) -> None:
 def _play(line: Line[control.ToNode], source: SourceOptions) -> None:
     from aftbed.vehicle.can.bus import BusOptions, open_bus  # noqa: PLC0415
     from aftbed.vehicle.can.candump import read_log  # noqa: PLC0415
-    from aftbed.vehicle.can.dbc_file import load_dbc  # noqa: PLC0415
+    from aftbed.vehicle.can.dbc_file import own_dbc  # noqa: PLC0415
     from aftbed.vehicle.replay.map_file import find_map  # noqa: PLC0415
     from aftbed.vehicle.replay.mapped_gateway import MappedGateway  # noqa: PLC0415
     from aftbed.vehicle.replay.player import play  # noqa: PLC0415
 
     work = source.work
     assert isinstance(work, ReplayRun), work
-    gateway = MappedGateway(load_dbc(), Path(work.dbc), find_map(work.map))
+    gateway = MappedGateway(own_dbc(), Path(work.dbc), find_map(work.map))
     frames, counts = read_log(Path(work.log))
     bus = open_bus(BusOptions(port=source.port, secret=source.secret, node=PLAYER))
     if _wait_for_go(line):
         result = play(
             frames,
-            load_dbc(),
+            own_dbc(),
             bus,
             work.pace,
             ends_cycle=lambda frame: gateway.on_frame(frame) is not None,

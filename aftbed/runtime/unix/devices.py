@@ -113,6 +113,11 @@ class BusLink(CarLink):
         }
 
 
+def load_requests(seed: int, count: int, *, fixed: bool) -> list[bytes]:
+    """What a load of `count` requests is drawn from, again and again; `fixed` as in `sample_requests`."""
+    return sample_requests(seed, min(count, LOAD_REQUESTS), fixed=fixed)
+
+
 def make_source(client: Client, options: SourceOptions) -> Device:
     """Where the requests of a Client come from; the Client takes over from its predecessors."""
     journals, work = Path(options.journals), options.work
@@ -121,14 +126,14 @@ def make_source(client: Client, options: SourceOptions) -> Device:
     dialogue = DialogueFile(dialogue_path(journals, options.incarnation), "client")
     if isinstance(work, LoadRun):
         fixed = is_foreign(options.application)
-        requests = sample_requests(options.seed, LOAD_REQUESTS, fixed=fixed)
+        requests = load_requests(options.seed, work.count, fixed=fixed)
         if work.requests:
             given = stored_requests(journals.parent)
             assert given, f"the requests are no longer in {journals.parent}"
             requests = list(given)
         return Load(client, dialogue, requests, work.count, work.rate_hz)
     # Imported here: the bus costs 150 ms to import, and only the zygote of the bus has it.
-    from aftbed.vehicle.can.dbc_file import load_dbc  # noqa: PLC0415
+    from aftbed.vehicle.can.dbc_file import own_dbc  # noqa: PLC0415
     from aftbed.vehicle.gateway import Gateway  # noqa: PLC0415
 
     gateway: BusGateway
@@ -137,7 +142,7 @@ def make_source(client: Client, options: SourceOptions) -> Device:
         from aftbed.vehicle.replay.map_file import find_map  # noqa: PLC0415
         from aftbed.vehicle.replay.mapped_gateway import MappedGateway  # noqa: PLC0415
 
-        gateway = MappedGateway(load_dbc(), Path(work.dbc), find_map(work.map), encode)
+        gateway = MappedGateway(own_dbc(), Path(work.dbc), find_map(work.map), encode)
     else:
-        gateway = Gateway(load_dbc(), encode)
+        gateway = Gateway(own_dbc(), encode)
     return CarDevice(client, dialogue, BusLink(gateway, options.port, options.secret))

@@ -26,7 +26,8 @@ import msgspec
 from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.runtime.unix import run_directory
 from aftbed.runtime.unix.death_notice import SYS_FUTEX_WAITV
-from aftbed.runtime.unix.launch import FILES_GOOD, FILES_MIN
+from aftbed.runtime.unix.launch import FILES_MIN
+from aftbed.runtime.unix.linux import FILES_GOOD
 from aftbed.runtime.unix.process_memory import YAMA, try_on_a_child
 
 Status = Literal["ok", "warning", "missing"]

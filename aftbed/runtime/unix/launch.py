@@ -1,24 +1,21 @@
 """Starts a run from a command, and passes on the reports of its supervisor.
 
-The command forks the supervisor and the warden before it does anything else that takes memory, and before
-there is anything to remove: only then does it make the private directory, and send *go*. So whenever the
-command is killed, there is a warden, or nothing is left. The supervisor has a session of its own, so a
-terminal's Ctrl-C reaches the command alone.
+The command forks the supervisor, if that has not begun before (`head_start`), tells it what to run, and
+forks the warden, before there is anything to remove: only then does it make the private directory, and send
+*go*. So whenever the command is killed, there is a warden, or nothing is left. The supervisor has a session
+of its own, so a terminal's Ctrl-C reaches the command alone.
 
 When the descriptors of a `Launched` are closed, its run knows that the command is gone. So no child of the
 command keeps them, of this run or of a later one: else one run would end only after the other.
 """
 
 import contextlib
-import errno
-import importlib
 import os
 import resource
 import select
 import shutil
 import signal
 import socket
-import sys
 import time
 import weakref
 from collections.abc import Iterator
@@ -28,28 +25,27 @@ from typing import TYPE_CHECKING, Final, NoReturn
 import msgspec
 
 from aftbed import __version__
-from aftbed.core.errors import AftbedError, ConfigError, HarnessError
+from aftbed.core.errors import ConfigError
 from aftbed.core.messages import Scheduled
 from aftbed.inject.model import Fault
 from aftbed.runtime import control
-from aftbed.runtime.interface import BUS, LIGHT
-from aftbed.runtime.unix import linux, run_directory, seal
-from aftbed.runtime.unix.cleanup import UndoLedger, watch
+from aftbed.runtime.unix import head_start, linux, run_directory, seal
+from aftbed.runtime.unix.cleanup import watch
 from aftbed.runtime.unix.journal_files import CHUNK_BYTES, trim
-from aftbed.runtime.unix.linux import Area
-from aftbed.runtime.unix.options import LoadRun, PolicyOptions, RunOptions, Work, with_names_resolved
-from aftbed.runtime.unix.process_pool import PRELOADS, Started, killed_by, start_zygote
+from aftbed.runtime.unix.options import CarRun, LoadRun, PolicyOptions, RunOptions, Work, with_names_resolved
+from aftbed.runtime.unix.process_pool import killed_by
 from aftbed.runtime.unix.request_store import write_given
-from aftbed.runtime.unix.transport import Line, decode_order, decode_report
+from aftbed.runtime.unix.supervisor_process import GO, RUN, be_supervisor
+from aftbed.runtime.unix.transport import Line, decode_report
 
 if TYPE_CHECKING:
     from aftbed.functions.request_file import GivenRequests
 
 END_SECONDS_MAX: Final = 8.0
 KILL_SECONDS_MAX: Final = 1.0
-FILES_MIN, FILES_GOOD = 256, 1024  # a supervisor of 37 processes holds 180, more while it adapts
+FILES_MIN: Final = 256
 BACKLOG: Final = 128  # connections that wait for the hub
-GO: Final = b"go"
+_encode: Final = msgspec.msgpack.Encoder().encode
 
 
 def ensure_limits() -> None:
@@ -57,14 +53,11 @@ def ensure_limits() -> None:
 
     Raises ConfigError where a limit, or the umask, does not allow a run.
     """
-    files, most = resource.getrlimit(resource.RLIMIT_NOFILE)
-    if files != resource.RLIM_INFINITY and files < FILES_GOOD:
-        files = FILES_GOOD if most == resource.RLIM_INFINITY else min(most, FILES_GOOD)
-        resource.setrlimit(resource.RLIMIT_NOFILE, (files, most))
-        if files < FILES_MIN:
-            raise ConfigError(
-                f"{files} open files are allowed, and a run needs {FILES_MIN}: ulimit -n {FILES_GOOD}"
-            )
+    files = linux.allow_files()
+    if files < FILES_MIN:
+        raise ConfigError(
+            f"{files} open files are allowed, and a run needs {FILES_MIN}: ulimit -n {linux.FILES_GOOD}"
+        )
     mask = os.umask(0o077)
     os.umask(mask)
     if mask & 0o700:
@@ -91,41 +84,17 @@ def bind_hub(port: int) -> socket.socket:
     return sock
 
 
-_WARM: Final[dict[str, tuple[Area, ...]]] = {}  # by zygote: where its nodes will write to
+def _fork_supervisor(listener: socket.socket | None) -> head_start.Start:
+    """A supervisor that begins now. Raises OSError."""
 
+    def supervise(line: socket.socket) -> NoReturn:
+        linux.continue_at_parents_death()
+        os.setsid()
+        if listener is not None:
+            listener.close()  # it comes with the options
+        be_supervisor(line, {})
 
-def warm_up(name: str) -> None:
-    """Import and rehearse what the zygote `name` hands on, for all runs of this process and of its forks.
-
-    Their zygotes are forks from then on. That is for a process that starts many runs.
-    """
-    from aftbed.runtime.unix import prefault, supervisor, zygote  # noqa: PLC0415 - for many runs
-
-    assert supervisor and zygote
-    if name not in _WARM:
-        for module in PRELOADS[name]:
-            importlib.import_module(module)
-        _WARM[name] = prefault.warm_up()
-
-
-def _fork_zygote(cpus: list[int], areas: tuple[Area, ...]) -> Started:
-    """A zygote that is a fork of this process, which is warm: it saves 0.2 s of imports."""
-    from aftbed.runtime.unix import zygote  # noqa: PLC0415 - imported by `warm_up`
-
-    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    supervisor = os.getpid()
-    pid = os.fork()
-    if pid == 0:
-        try:
-            os.dup2(theirs.fileno(), linux.INHERITED_FD)
-            os.closerange(linux.INHERITED_FD + 1, 1 << 16)
-            # The parent's may write to descriptors that are closed now, and will be those of journals.
-            sys.stdout, sys.stderr = (open(fd, "w", buffering=1, closefd=False) for fd in (1, 2))  # noqa: SIM115
-            zygote.run(supervisor, cpus, (), areas)
-        finally:
-            os._exit(1)
-    theirs.close()
-    return pid, ours
+    return head_start.fork(supervise)
 
 
 class Launched:
@@ -145,34 +114,24 @@ class Launched:
         self.trouble = ""
         self._waited = False
         self.supervisor = 0
-        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        self.line = Line(ours, decode_report)
+        start = head_start.taken() or _fork_supervisor(listener)
+        self.supervisor, self.line = start.pid, Line(start.line, decode_report)
         try:
-            self._fork(listener, theirs)
+            self._fork_warden(listener)
         except OSError:
-            self.line.close()  # what was forked ends without a *go*
-            if self.supervisor:
-                os.waitpid(self.supervisor, 0)
+            start.end()
             raise
         self._make_directories(given)
 
     # -- start --------------------------------------------------------------------------------
 
-    def _fork(self, listener: socket.socket | None, theirs: socket.socket) -> None:
-        """Fork the supervisor and the warden, each with its ends of a line and of two pipes."""
+    def _fork_warden(self, listener: socket.socket | None) -> None:
+        """Tell the supervisor what to run, and fork the warden. Each has its ends of two pipes."""
         command_end, command_life = os.pipe()
         supervisor_end, supervisor_life = os.pipe()
         waker = os.eventfd(0)
-        self.supervisor = os.fork()
-        if self.supervisor == 0:
-            linux.continue_at_parents_death()
-            os.setsid()
-            for fd in (command_end, command_life, supervisor_end):
-                os.close(fd)
-            self.line.close()
-            self._be_supervisor(theirs, waker)
         self._pidfd = os.pidfd_open(self.supervisor)
-        theirs.close()
+        self._hand_over(supervisor_life, waker, *([listener.fileno()] if listener is not None else []))
         os.close(supervisor_life)
         self.warden = os.fork()
         if self.warden == 0:
@@ -198,50 +157,21 @@ class Launched:
         for fd in (command_end, supervisor_end, waker):
             os.close(fd)
         self._life: list[int] = [command_life]
-        _LAUNCHED.add(self)
+        self._reference = weakref.ref(self, _LAUNCHED.discard)
+        _LAUNCHED.add(self._reference)
 
-    def _be_supervisor(self, owner: socket.socket, waker: int) -> NoReturn:
-        code = 1
-        try:
-            if owner.recv(len(GO)) != GO:
-                os._exit(code)
-            signal.signal(signal.SIGINT, signal.SIG_IGN)
-            run_directory.mark(self.private)
-            os.environ[run_directory.VARIABLE] = str(self.private)  # of all that is executed from here on
-            log = os.open(self.record / "processes.log", os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
-            os.dup2(log, 1)
-            os.dup2(log, 2)
-            linux.set_name("aftbed-supervis")
-            cpus = sorted(os.sched_getaffinity(0))
-            load = isinstance(self.options.work, LoadRun)
-            largest = LIGHT if load else BUS
-            if (areas := _WARM.get(largest)) is not None:
-                names = (LIGHT,) if load else (LIGHT, BUS)
-                zygotes = {name: _fork_zygote(cpus, areas) for name in names}
-            else:  # it imports while this process does; the smaller one is started by the supervisor
-                zygotes = {largest: start_zygote(largest, cpus)}
-            from aftbed.runtime.unix.supervisor import supervise  # noqa: PLC0415 - behind the first zygote
-
-            supervise(self.options, owner, zygotes, UndoLedger(self.private, waker))
-            code = 0
-        except (AftbedError, OSError) as error:  # of the machine: a full disk, a limit
-            if isinstance(error, OSError):
-                error = HarnessError(
-                    f"the supervisor cannot go on: {error.strerror}{_hint(error, self.record)}"
-                )
-            with contextlib.suppress(OSError):
-                Line(owner, decode_order).send(control.Report("trouble", str(error).encode()))
-        except BaseException:  # noqa: BLE001 - the last frame of this process
-            import traceback  # noqa: PLC0415 - rarely needed
-
-            traceback.print_exc()
-        finally:
-            os._exit(code)
+    def _hand_over(self, *fds: int) -> None:
+        """Send the options to the supervisor, as a file, and descriptors. Raises OSError."""
+        with open(os.memfd_create("aftbed-options"), "wb", buffering=0) as file:
+            left = memoryview(_encode(self.options))
+            while left:
+                left = left[file.write(left) :]
+            socket.send_fds(self.line.sock, [RUN], [file.fileno(), *fds])
 
     def _make_directories(self, given: "GivenRequests | None") -> None:
         """Make the private directory and the record, with what was asked for in it, and send *go*."""
         about = {"version": __version__, "started_ns": self.started_ns, **msgspec.to_builtins(self.options)}
-        for key in ("listener", "private"):
+        for key in ("listener", "private", "drive"):
             about.pop(key)
         about["load"] = isinstance(self.options.work, LoadRun)
         about["kept"] = self._kept
@@ -319,7 +249,7 @@ class Launched:
         if not _ends(self._warden_pidfd, KILL_SECONDS_MAX):
             linux.kill(self._warden_pidfd, signal.SIGKILL)  # a stopped warden would never end
         os.waitpid(self.warden, 0)
-        _LAUNCHED.discard(self)
+        _LAUNCHED.discard(self._reference)
         os.close(self._pidfd)
         os.close(self._warden_pidfd)
 
@@ -330,19 +260,15 @@ class Launched:
             os.close(fd)
 
 
-def _hint(error: OSError, record: Path) -> str:
-    """What to look at, where that can be told from the error."""
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return f": is the disk of {record} full?"
-    return f": {error.filename}" if error.filename else ""
-
-
-_LAUNCHED: Final[weakref.WeakSet[Launched]] = weakref.WeakSet()
+_LAUNCHED: Final[set[weakref.ref[Launched]]] = set()
 
 
 def _disown_all() -> None:
-    for launched in list(_LAUNCHED):
-        launched.disown()
+    if not _LAUNCHED:  # as in each process that a zygote forks: what is not executed there is not copied
+        return
+    for reference in list(_LAUNCHED):
+        if (launched := reference()) is not None:
+            launched.disown()
     _LAUNCHED.clear()  # a child of this child has other descriptors by the same numbers
 
 
@@ -393,6 +319,7 @@ def options_for(
 ) -> tuple[RunOptions, socket.socket | None]:
     """What a run needs; where there is a bus, its socket too. Raises ConfigError, leaving nothing."""
     faults = tuple(with_names_resolved(fault, work) for fault in faults)
+    drive = _drive(work.scenario) if isinstance(work, CarRun) else b""
     ensure_limits()
     listener = None if isinstance(work, LoadRun) else bind_hub(bus_port)
     try:
@@ -418,5 +345,13 @@ def options_for(
         port=listener.getsockname()[1] if listener is not None else 0,
         bus_open=bus_open,
         application=application,
+        drive=drive,
     )
     return options, listener
+
+
+def _drive(scenario: str) -> bytes:
+    """The scenario as MessagePack. Raises ConfigError."""
+    from aftbed.vehicle.scenarios.library import load_scenario  # noqa: PLC0415 - only for a drive: PyYAML
+
+    return _encode(load_scenario(scenario))

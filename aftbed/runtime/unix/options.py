@@ -65,7 +65,8 @@ class RunOptions(msgspec.Struct, frozen=True):
     """`private` and `record` are directories, made by the launch; `listener` is the hub's bound socket.
 
     `bus_open`: other users may attach to the bus, and the verdict stands whatever strangers send.
-    `application`: the protected function that the run begins with, "" for the built-in one.
+    `application`: the protected function that the run begins with, "" for the built-in one. `drive`: the
+    scenario of a CarRun as MessagePack, read once for all processes.
     """
 
     run: str
@@ -83,13 +84,14 @@ class RunOptions(msgspec.Struct, frozen=True):
     port: int = 0
     bus_open: bool = False
     application: str = ""
+    drive: bytes = b""
 
 
 class SourceOptions(msgspec.Struct, frozen=True):
     """For the process that makes the requests: the host of the Client, the vehicle or the player.
 
     `port` is the hub's, `secret` its bus's. `journals` is the directory of the dialogues of this Client,
-    which was made as the `incarnation`th, and of its predecessors. `application`: see `RunOptions`.
+    which was made as the `incarnation`th, and of its predecessors. `application`, `drive`: see `RunOptions`.
     """
 
     work: Work
@@ -99,6 +101,7 @@ class SourceOptions(msgspec.Struct, frozen=True):
     journals: str = ""
     incarnation: int = 1
     application: str = ""
+    drive: bytes = b""
 
 
 def with_names_resolved(fault: Fault, work: Work) -> Fault:
@@ -115,12 +118,12 @@ def with_names_resolved(fault: Fault, work: Work) -> Fault:
     if isinstance(work, LoadRun):
         raise ConfigError(f"{fault}: a run of {work.option} has no bus")
     # Imported here, by the command: the supervisor must not read a DBC, since a failover would wait for it.
-    from aftbed.vehicle.can.dbc_file import load_dbc  # noqa: PLC0415
+    from aftbed.vehicle.can.dbc_file import own_dbc  # noqa: PLC0415
     from aftbed.vehicle.replay.map_file import find_map, load_mapped  # noqa: PLC0415
 
     if isinstance(work, ReplayRun):
         mapped = load_mapped(find_map(work.map), Path(work.dbc))
-        action = action.resolved([mapped, load_dbc()], (PLAYER, GATEWAY), car=False)
+        action = action.resolved([mapped, own_dbc()], (PLAYER, GATEWAY), car=False)
     else:
-        action = action.resolved([load_dbc()])
+        action = action.resolved([own_dbc()])
     return msgspec.structs.replace(fault, action=action)

@@ -67,13 +67,23 @@ Ends = dict[tuple[str, str], tuple[str, str]]  # brick and port that send -> bri
 
 
 def warm_up() -> tuple[Area, ...]:
-    """Rehearse; then find out where a child will write to.
+    """Rehearse; then see `areas_of_a_child`."""
+    rehearse()
+    return areas_of_a_child()
 
-    What is in memory by then stays there, and no garbage collection visits it: that would write to it.
-    """
+
+def rehearse() -> None:
+    """Until the interpreter has specialised the code on the path, here and for all forks."""
     rehearse_chain(ROUNDS_WARM)
     for _ in range(ROUNDS_WARM):
         rehearse_host()
+
+
+def areas_of_a_child() -> tuple[Area, ...]:
+    """Where a child of this process, which has rehearsed, will write to.
+
+    What is in memory by then stays there, and no garbage collection visits it: that would write to it.
+    """
     gc.collect()
     linux.trim()
     gc.freeze()

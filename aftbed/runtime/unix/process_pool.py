@@ -16,7 +16,7 @@ import msgspec
 
 from aftbed.core.errors import HarnessError, StepFailed
 from aftbed.runtime import control, interface
-from aftbed.runtime.interface import BUS, LIGHT, ProcessKind
+from aftbed.runtime.interface import ProcessKind
 from aftbed.runtime.tasks import Key, Wait
 from aftbed.runtime.unix import linux
 from aftbed.runtime.unix.cleanup import UndoLedger
@@ -30,16 +30,6 @@ DEMAND: Final = 3  # spares that are forked where one is waited for: the next on
 PARK_BATCH: Final = 8  # spares per order: the first of them start while the next are forked
 WATCHING_KINDS: Final = ("watchdog", "recovery")
 
-PRELOADS: Final[dict[str, tuple[str, ...]]] = {
-    LIGHT: (),
-    BUS: (  # what a drive needs; the processes of a replay import the rest themselves
-        "aftbed.vehicle.drive_real",
-        "aftbed.vehicle.gateway",
-        "aftbed.vehicle.scenarios.library",
-        "cantools",
-    ),
-}
-
 Started = tuple[int, socket.socket]  # a zygote's pid, and our end of its control line
 
 
@@ -51,7 +41,7 @@ def start_zygote(name: str, cpus: list[int]) -> Started:
     """
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     with theirs:
-        arguments = (str(os.getpid()), ",".join(map(str, cpus)), *PRELOADS[name])
+        arguments = (str(os.getpid()), ",".join(map(str, cpus)), name)
         return linux.start_interpreter("aftbed.runtime.unix.zygote", theirs.fileno(), *arguments), ours
 
 

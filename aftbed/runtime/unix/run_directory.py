@@ -126,6 +126,8 @@ def make(path: Path) -> None:
 
 def _disown() -> None:
     """In a child: it owns none of the runs of its parent."""
+    if not _owned:
+        return
     for descriptor in _owned.values():
         os.close(descriptor)
     _owned.clear()

@@ -161,7 +161,7 @@ class Supervisor:
         linux.become_subreaper()
         linux.no_core()
         linux.use_short_slices()
-        has_bus = BUS in self._zygotes
+        has_bus = not isinstance(self._options.work, LoadRun)
         for name in (BUS, LIGHT) if has_bus else (LIGHT,):
             self.pool.start_zygote(name, self._zygotes.get(name))
         self.pool.park(LIGHT, len(self._deployment.graph.nodes) + self._controller.spares() + has_bus)
@@ -178,6 +178,7 @@ class Supervisor:
         yield from self._work.start_bus()
         for zygote, count in self._work.spares().items():
             yield from self.pool.parked_at_least(zygote, count)
+        yield from self._work.prepare()
         began_ns = time.monotonic_ns()
         yield from self._deployment.launch(held=self._work.held)
         self._graph_ms = (time.monotonic_ns() - began_ns) / 1e6

@@ -127,7 +127,9 @@ class Workload:
         self._log, self._finish, self._report_owner = log, finish, report_owner
         self._is_load = isinstance(options.work, LoadRun)
         self._secret = secrets.token_hex(SECRET_BYTES)  # of the bus: for the processes of this run alone
+        self._source = VEHICLE if isinstance(options.work, CarRun) else PLAYER  # of a run with a bus
         self._services: dict[str, UnixProcess] = {}
+        self._ready: set[str] = set()  # names of services
         self.bus = BusFaults(pool, loop.tasks.settle, log)
         self._result: object = None
         self._stats: dict[str, object] = {}
@@ -159,9 +161,11 @@ class Workload:
         return "load" if self._is_load else "gateway", msgspec.msgpack.encode(source)
 
     def spares(self) -> dict[str, int]:
-        """How many spares of each zygote the graph takes."""
+        """How many spares of each zygote the graph and its source take."""
         nodes = len(self.deployment.graph.nodes)
-        return {LIGHT: nodes} if self._is_load else {LIGHT: nodes - 1, BUS: 1}
+        return (
+            {LIGHT: nodes} if self._is_load else {LIGHT: nodes - 1, BUS: 2}
+        )  # its source, beside the client
 
     @property
     def held(self) -> tuple[str, ...]:
@@ -182,37 +186,48 @@ class Workload:
             "pace": work.pace or 1.0,
             "origin_ns": time.monotonic_ns(),
         }
-        yield from self._serve(LIGHT, control.HUB, msgspec.msgpack.encode(hub), (options.listener, log))
+        yield from self._assign(LIGHT, control.HUB, msgspec.msgpack.encode(hub), (options.listener, log))
+        yield from self._until_ready(control.HUB)
         self.bus.hub = self._services[control.HUB]
         os.close(log)
         socket.socket(fileno=options.listener).close()  # only the hub has it from here on
 
+    def prepare(self) -> Keys:
+        """Have the vehicle or the player attach to the bus, while the graph is made."""
+        options = self._options
+        if not self._is_load:
+            source = SourceOptions(
+                options.work, options.seed, options.port, self._secret, drive=options.drive
+            )
+            yield from self._assign(BUS, self._source, msgspec.msgpack.encode(source), ())
+
     def start(self) -> Keys:
         """The graph is complete: let requests come."""
-        options = self._options
         if self._is_load:
             yield from self.deployment.ask("client", control.ResumeNode)
             self._loop.after(LOAD_POLL_SECONDS, self._watch_load)
             return
-        name = VEHICLE if isinstance(options.work, CarRun) else PLAYER
-        source = SourceOptions(options.work, options.seed, options.port, self._secret)
-        yield from self._serve(BUS, name, msgspec.msgpack.encode(source), ())
-        self._pool.order(self._services[name], control.ResumeNode(control.UNANSWERED))
+        yield from self._until_ready(self._source)
+        self._pool.order(self._services[self._source], control.ResumeNode(control.UNANSWERED))
         self._pool.refill(BUS, 1)
 
-    def _serve(self, zygote: str, name: str, options: bytes, fds: tuple[int, ...]) -> Keys:
-        """Make a spare the service `name`, and wait until it is ready."""
+    def _assign(self, zygote: str, name: str, options: bytes, fds: tuple[int, ...]) -> Keys:
+        """Make a spare the service `name`."""
         process = yield from self._pool.spare(zygote)
         process.name, process.kind = name, ProcessKind.SERVICE
         self._services[name] = process
         self._pool.order(process, control.Serve(control.UNANSWERED, name, options), fds)
-        yield Wait(frozenset({("ready", name, 0)}), frozenset({name}), ATTACH_SECONDS_MAX)
+
+    def _until_ready(self, name: str) -> Keys:
+        if name not in self._ready:
+            yield Wait(frozenset({("ready", name, 0)}), frozenset({name}), ATTACH_SECONDS_MAX)
 
     # -- while it runs ------------------------------------------------------------------------
 
     def on_report(self, process: UnixProcess, kind: str, data: bytes) -> None:
         """A report of a service."""
         if kind == "ready":
+            self._ready.add(process.name)
             self._loop.tasks.settle(("ready", process.name, 0))
         elif kind in control.BUS_REPORTS:
             self.bus.on_report(kind, data)

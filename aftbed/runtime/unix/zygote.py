@@ -7,11 +7,13 @@ no spare (`PR_SET_PDEATHSIG` follows the parent), and the supervisor reaps what 
 
 There are two zygotes, because the fork and the death of a process take time in proportion to its memory: a
 light one for the mechanism, and one that has imported what needs the bus (`preload`).
+
+A zygote is a fork of the supervisor where that has imported the same and little else; otherwise it is an
+interpreter of its own.
 """
 
 import contextlib
 import gc
-import importlib
 import os
 import socket
 import sys
@@ -28,8 +30,9 @@ from aftbed.functions.source import FunctionSource
 from aftbed.runtime import control
 from aftbed.runtime.assembly import Assembler
 from aftbed.runtime.devices import Device, Sensor
+from aftbed.runtime.interface import BUS, LIGHT
 from aftbed.runtime.node import Node
-from aftbed.runtime.unix import linux, prefault
+from aftbed.runtime.unix import linux, prefault, run_directory
 from aftbed.runtime.unix.death_notice import Lifeline
 from aftbed.runtime.unix.devices import ProcessSenses, make_source
 from aftbed.runtime.unix.journal_files import JournalFile
@@ -40,36 +43,89 @@ from aftbed.runtime.unix.transport import PULSE_SECONDS, Line, decode_order
 from aftbed.vehicle.aeb.function import default_application
 
 
-def run(
-    supervisor: int, cpus: list[int], preload: tuple[str, ...], areas: tuple[Area, ...] | None = None
-) -> NoReturn:
-    """Serve the control line at `INHERITED_FD` until it ends.
+def fork(name: str, cpus: list[int], areas: tuple[Area, ...] | None = None) -> tuple[int, socket.socket]:
+    """Fork the zygote `name` from this process: its pid, and our end of its control line.
 
-    `areas`: where a node writes to, if the parent of this process has found that out (`launch.warm_up`).
+    That of the mechanism is forked from a process that has rehearsed. `areas`: where a node will write to, if
+    this process has found that out. Raises OSError.
     """
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    supervisor = os.getpid()
+    with theirs:
+        pid = os.fork()
+        if pid == 0:
+            try:
+                os.dup2(theirs.fileno(), INHERITED_FD)
+                os.closerange(INHERITED_FD + 1, 1 << 16)
+                # The parent's may write to descriptors that are closed now, and will be those of journals.
+                sys.stdout, sys.stderr = (open(fd, "w", buffering=1, closefd=False) for fd in (1, 2))  # noqa: SIM115
+                _begin(supervisor, cpus)
+                if areas is None:
+                    preload(name)
+                    areas = prefault.areas_of_a_child() if name == LIGHT else None
+                _serve(supervisor, areas)
+            except (BrokenPipeError, ConnectionResetError):  # there is no run
+                os._exit(0)
+            except BaseException:  # noqa: BLE001 - the last frame of this process
+                sys.excepthook(*sys.exc_info())
+            finally:
+                os._exit(1)
+    return pid, ours
+
+
+def preload(name: str) -> None:
+    """Import what the processes of the zygote `name` need beside this module."""
+    if name == BUS:
+        from aftbed.runtime.unix import bus_services  # noqa: PLC0415 - costs 150 ms
+
+        bus_services.preload()
+
+
+def _begin(supervisor: int, cpus: list[int]) -> None:
     os.set_inheritable(INHERITED_FD, False)
     os.sched_setaffinity(0, cpus)
     linux.die_with(supervisor)
     linux.set_name("aftbed-zygote")
     linux.reuse_blocks()
-    for module in preload:
-        importlib.import_module(module)
-    if areas is None:
-        areas = prefault.warm_up()
+
+
+def _serve(supervisor: int, areas: tuple[Area, ...] | None) -> NoReturn:
+    """Carry out what comes on the control line at `INHERITED_FD`, until it ends.
+
+    `areas` is None in a zygote that has not rehearsed: a drive waits for its first spares, so it rehearses
+    when they are forked.
+    """
+    first = True
     gc.freeze()
     gc.disable()  # structs on the path are untracked; the rest is freed by its reference count
     line = Line(socket.socket(fileno=INHERITED_FD), decode_order)
     line.send(control.Hello(os.getpid()))
     while (got := line.recv()) is not None:
         order, fds = got
+        if isinstance(order, control.JoinRun):
+            _join(Path(order.private), fds)
+            continue
         assert isinstance(order, control.Park), order
+        if areas is None and not first:
+            areas = prefault.warm_up()
+        first = False
         try:
-            _fork_spares(fds, supervisor, areas)
+            _fork_spares(fds, supervisor, areas or ())
         except OSError as error:
             with contextlib.suppress(BrokenPipeError):  # the run has ended
                 line.send(control.Report("trouble", f"no process can be forked: {error.strerror}".encode()))
             break
     os._exit(0)
+
+
+def _join(private: Path, fds: list[int]) -> None:
+    """Belong to the run, with all that is forked or executed from here on, and print to its file."""
+    run_directory.mark(private)
+    os.environ[run_directory.VARIABLE] = str(private)
+    (log,) = fds
+    os.dup2(log, 1)
+    os.dup2(log, 2)
+    os.close(log)
 
 
 def _fork_spares(fds: list[int], supervisor: int, areas: tuple[Area, ...]) -> None:
@@ -186,4 +242,6 @@ def _make_device(order: control.Assign, node: UnixNode) -> Device:
 
 
 if __name__ == "__main__":
-    run(int(sys.argv[1]), [int(cpu) for cpu in sys.argv[2].split(",")], tuple(sys.argv[3:]))
+    _begin(int(sys.argv[1]), [int(cpu) for cpu in sys.argv[2].split(",")])
+    preload(sys.argv[3])
+    _serve(int(sys.argv[1]), prefault.warm_up() if sys.argv[3] == LIGHT else None)
