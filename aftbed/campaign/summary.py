@@ -107,6 +107,7 @@ class Summary(msgspec.Struct, frozen=True):
     gate: Word
     seconds: float
     weaknesses: tuple[Weakness, ...] = ()  # of a function of the user (`system.app`), and of its mechanisms
+    really: tuple[str, ...] = ()  # the stratum of each experiment that ended its simulator, so ran for real
 
 
 def summarise(ledger: Ledger, planned: int, seconds: float) -> Summary:
@@ -139,6 +140,7 @@ def summarise(ledger: Ledger, planned: int, seconds: float) -> Summary:
         "fail" if broken else "pass",
         round(seconds, 3),
         weaknesses(spec, groups, confidence) if spec.system.app else (),
+        tuple(r.experiment.stratum for r in results if r.experiment.runtime != spec.system.runtime),
     )
 
 

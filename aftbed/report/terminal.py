@@ -45,7 +45,7 @@ STYLES: Final = {  # of outcomes; all others are red
 
 def summary_lines(summary: Summary) -> list[str]:
     """Strata and gates as tables, the verdict last."""
-    lines = [_head(summary)]
+    lines = [_head(summary), *_really(summary)]
     lines += ["", *_aligned([_STRATUM, *map(_stratum, summary.strata)])] if summary.strata else []
     vacuous = [gate for gate in summary.gates if gate.value == 1.0 and gate.limit == NOT_ALL]
     left_out = vacuous[PLACES_MAX:]
@@ -64,6 +64,16 @@ def _head(summary: Summary) -> str:
     of = f" of {summary.planned}" if summary.planned != summary.experiments else ""
     counts = f"{summary.experiments}{of} experiments"
     return f"campaign {summary.campaign}, seed {summary.seed}: {counts} in {summary.seconds:.1f} s"
+
+
+def _really(summary: Summary) -> list[str]:
+    """Which experiments of a simulated campaign ran on real processes."""
+    if not summary.really:
+        return []
+    named = list(dict.fromkeys(summary.really))
+    more = f", and {len(named) - PLACES_MAX} more strata" if len(named) > PLACES_MAX else ""
+    why = "since the function ends or blocks the simulator"
+    return [f"{len(summary.really)} of them on real processes, {why}: {', '.join(named[:PLACES_MAX])}{more}"]
 
 
 def _stratum(stratum: StratumSummary) -> tuple[str, ...]:
