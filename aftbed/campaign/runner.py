@@ -154,8 +154,8 @@ class _Really:
             return result
         if not self._left:
             raise HarnessError(
-                f"{self._plan.spec.system.app}: more than {REALLY_MAX} simulations were ended, or blocked, by it:"
-                f" the process of `{experiment.command()}` {how}: `--runtime unix` runs all on real processes"
+                f"{self._plan.spec.system.app}: it has ended, or blocked, more than {REALLY_MAX} simulations;"
+                f" that of `{experiment.command()}` {how}: `--runtime unix` runs all on real processes"
             )
         self._left -= 1
         real = msgspec.structs.replace(experiment, runtime="unix")

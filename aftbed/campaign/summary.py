@@ -218,7 +218,8 @@ def judged(gate: Gate, groups: dict[str, list[Result]], confidence: float) -> Ga
     if gate.max == 0 and gate.metric in SHARES:
         bound = value  # no number of experiments bounds a share by 0
     kept = bound <= gate.max if gate.max is not None else bound >= (gate.min or 0.0)
-    reason = "" if kept else f"{value:.4g} was measured, and it may be {bound:.4g}"
+    range_ = f", and it may be {bound:.4g}" if bound != value else ""
+    reason = "" if kept else f"{value:.4g} was measured{range_}"
     if not kept and gate.metric == "unknown":
         reason += next((f"; experiment {r.experiment.id}: {r.reasons[0]}" for r in group if _untold(r)), "")
     return GateResult(gate.metric, gate.strata, limit, value, bound, "pass" if kept else "fail", reason)
