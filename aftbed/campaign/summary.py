@@ -47,7 +47,7 @@ SHARES: Final[dict[str, Callable[[Result], bool]]] = {
 }
 
 OF: Final[dict[str, Callable[[Result], bool]]] = {  # which experiments a share is a share of, where not all
-    "unexpected": lambda r: r.activated,
+    "unexpected": lambda r: r.activated and r.outcome not in UNKNOWN,
     NOT_ACTIVATED: lambda r: bool(r.experiment.faults),
 }
 
@@ -151,7 +151,8 @@ def confidence_of(spec: Spec) -> float:
 
 
 def _stratum(name: str, group: list[Result], size: int, confidence: float) -> StratumSummary:
-    unexpected, harm = sum(r.unexpected for r in group), sum(map(failed, group))
+    told = list(filter(OF["unexpected"], group))
+    unexpected, harm = sum(r.unexpected for r in told), sum(map(failed, group))
     return StratumSummary(
         name,
         len(group),
@@ -162,7 +163,7 @@ def _stratum(name: str, group: list[Result], size: int, confidence: float) -> St
         size,
         extrapolated(harm, len(group), size, confidence),
         unexpected,
-        proportion(unexpected, sum(r.activated for r in group), confidence),
+        proportion(unexpected, len(told), confidence),
         times([r.recovery_ms for r in group], confidence),
         times([r.blackout_ms for r in group], confidence),
         times([r.adapt_blackout_ms for r in group], confidence),
@@ -248,6 +249,11 @@ def _unexcused(results: Iterable[Result]) -> GateResult:
 def _vacuous(groups: dict[str, list[Result]]) -> Iterator[GateResult]:
     """Strata that could not have failed."""
     for name, group in groups.items():
+        reason = ""
         if group[0].experiment.faults and not any(r.activated for r in group):
-            reason = f"none of {len(group)} faults struck: this stratum could not have failed"
-            yield GateResult(NOT_ACTIVATED, name, NOT_ALL, 1.0, None, "fail", reason)
+            metric, reason = NOT_ACTIVATED, f"none of {len(group)} faults struck"
+        elif all(r.outcome in UNKNOWN for r in group):
+            metric, reason = "unknown", f"of none of {len(group)} experiments anything is known"
+        if reason:
+            reason += ": this stratum could not have failed"
+            yield GateResult(metric, name, NOT_ALL, 1.0, None, "fail", reason)

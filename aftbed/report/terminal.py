@@ -51,7 +51,7 @@ def summary_lines(summary: Summary) -> list[str]:
     left_out = vacuous[PLACES_MAX:]
     gates = [gate for gate in summary.gates if gate not in left_out]
     lines += ["", *_aligned([_GATE, *map(_gate, gates)])] if gates else []
-    lines += [f"fail  none of the faults struck in {len(left_out)} more strata"] if left_out else []
+    lines += [f"fail  {len(left_out)} more strata could not have failed"] if left_out else []
     lines += ["", *chain.from_iterable(map(_weakness, summary.weaknesses))] if summary.weaknesses else []
     return [shown(line) for line in (*lines, f"gate: {summary.gate}")]
 
