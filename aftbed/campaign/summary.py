@@ -125,7 +125,7 @@ def summarise(ledger: Ledger, planned: int, seconds: float) -> Summary:
         if name not in missable or any(result.activated for result in group)
     }
     always = tuple(judged(gate, struck, confidence) for gate in _always(spec))
-    gates = (*asked, *always, _unexcused(results), *_vacuous(struck))
+    gates = (*asked, *always, _unexcused(results), *_vacuous(spec, struck))
     sizes = {stratum.name: population(stratum.fault) for stratum in strata_of(spec)}
     broken = not results or any(g.word == "fail" for g in gates)
     return Summary(
@@ -246,13 +246,13 @@ def _unexcused(results: Iterable[Result]) -> GateResult:
     return GateResult(BROKEN, ANY, "none", float(len(found)), None, word, reason)
 
 
-def _vacuous(groups: dict[str, list[Result]]) -> Iterator[GateResult]:
-    """Strata that could not have failed."""
+def _vacuous(spec: Spec, groups: dict[str, list[Result]]) -> Iterator[GateResult]:
+    """Strata that could not have failed. With an `unknown_max` of 1, nothing needs to be known."""
     for name, group in groups.items():
         reason = ""
         if group[0].experiment.faults and not any(r.activated for r in group):
             metric, reason = NOT_ACTIVATED, f"none of {len(group)} faults struck"
-        elif all(r.outcome in UNKNOWN for r in group):
+        elif spec.unknown_max < 1 and all(r.outcome in UNKNOWN for r in group):
             metric, reason = "unknown", f"of none of {len(group)} experiments anything is known"
         if reason:
             reason += ": this stratum could not have failed"

@@ -132,6 +132,8 @@ def test_a_stratum_of_which_nothing_is_known_fails_by_itself(tmp_path: Path) -> 
         "of none of 2 experiments anything is known: this stratum could not have failed"
     )
     assert (found.gate, found.gates[-1].strata) == ("fail", "lfr · crash")
+    allowed = CRASHES.replace("not_activated_max: 0.5", "not_activated_max: 0.5\nunknown_max: 1")
+    assert judged(tmp_path, [*many(400), *lone], text=allowed).gate == "pass"
 
 
 def test_what_is_not_known_is_not_counted_as_expected(tmp_path: Path) -> None:
