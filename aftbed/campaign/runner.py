@@ -3,6 +3,10 @@
 A worker is a process that performs one experiment after the other and appends each result to the ledger
 itself. What ends a campaign early (its own stop rule, an interrupt, a `kill -9`) leaves a ledger that can be
 gone on with.
+
+A simulated experiment has all replicas and the judge in its worker. A function of the user that crashes in
+native code, or hangs, ends or blocks all of them; so its experiment is performed on real processes instead,
+where only a replica fails, and the mechanism has to act.
 """
 
 import itertools
@@ -10,16 +14,21 @@ import os
 import time
 from collections import Counter
 from collections.abc import Generator, Iterator
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
+from typing import Final
 
 import msgspec
 
 from aftbed.campaign import ledger
 from aftbed.campaign.experiment import REQUESTS_PER_SECOND_MIN, Experiment, Result, carry_out
 from aftbed.campaign.plan import CampaignPlan
-from aftbed.core.errors import ConfigError
-from aftbed.runtime.unix.worker_pool import SECONDS_MAX, each, own_seconds_max
+from aftbed.core.errors import ConfigError, HarnessError
+from aftbed.runtime.unix.worker_pool import SECONDS_MAX, each, once, own_seconds_max
+
+REALLY_MAX: Final = 200  # experiments of a simulated campaign; each takes a second
+SIMULATOR_ENDED: Final = "the function ends or blocks the simulator"
 
 
 class CampaignRunOptions(msgspec.Struct, frozen=True):
@@ -92,8 +101,16 @@ def performed(
         apart = bool(system.app)
         if apart and not fresh:
             seconds_max = own_seconds_max(system.requests)
+        really = _Really(path, plan, seconds_max) if apart and not fresh else None
         results = each(
-            perform, todo, asked.jobs, alone=_alone, seconds_max=seconds_max, fresh=fresh, apart=apart
+            perform,
+            todo,
+            asked.jobs,
+            alone=_alone,
+            seconds_max=seconds_max,
+            fresh=fresh,
+            apart=apart,
+            instead=really,
         )
         for _, _, result in results:
             yield result
@@ -121,6 +138,45 @@ def _perform(path: str, experiment: Experiment) -> Result:
         return carry_out(experiment, partial(ledger.append, descriptor))
     finally:
         os.close(descriptor)
+
+
+class _Really:
+    """Performs on real processes what has ended, or blocked, its simulator."""
+
+    def __init__(self, path: Path, plan: CampaignPlan, seconds_max: float) -> None:
+        self._path, self._plan, self._seconds_max = path, plan, seconds_max
+        self._left = REALLY_MAX
+
+    def __call__(self, experiment: Experiment, how: str) -> Result:
+        """Raises HarnessError."""
+        kept = (r for r in ledger.read(self._path).results if r.experiment.id == experiment.id)
+        if (result := next(kept, None)) is not None:  # it ended behind its experiment
+            return result
+        if not self._left:
+            raise HarnessError(
+                f"{self._plan.spec.system.app}: it has ended, or blocked, more than {REALLY_MAX} simulations;"
+                f" that of `{experiment.command()}` {how}: `--runtime unix` runs all on real processes"
+            )
+        self._left -= 1
+        real = msgspec.structs.replace(experiment, runtime="unix")
+        perform = partial(_perform_really, os.fspath(self._path), how)
+        return once(perform, real, self._seconds_max, fresh=True, alone=_alone)
+
+
+def _perform_really(path: str, how: str, experiment: Experiment) -> Result:
+    """In a worker."""
+    reason = f"{SIMULATOR_ENDED}: its process {how}; this is of a run of real processes"
+    with ExitStack() as standing:
+        descriptor = ledger.opened(Path(path))
+        standing.callback(os.close, descriptor)
+        kept: list[Result] = []
+
+        def keep(result: Result) -> None:
+            kept.append(msgspec.structs.replace(result, reasons=(reason, *result.reasons)))
+            ledger.append(descriptor, kept[0])
+
+        carry_out(experiment, keep)
+        return kept[0]
 
 
 class _Progress:

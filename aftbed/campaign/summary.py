@@ -47,7 +47,7 @@ SHARES: Final[dict[str, Callable[[Result], bool]]] = {
 }
 
 OF: Final[dict[str, Callable[[Result], bool]]] = {  # which experiments a share is a share of, where not all
-    "unexpected": lambda r: r.activated,
+    "unexpected": lambda r: r.activated and r.outcome not in UNKNOWN,
     NOT_ACTIVATED: lambda r: bool(r.experiment.faults),
 }
 
@@ -107,6 +107,7 @@ class Summary(msgspec.Struct, frozen=True):
     gate: Word
     seconds: float
     weaknesses: tuple[Weakness, ...] = ()  # of a function of the user (`system.app`), and of its mechanisms
+    really: tuple[str, ...] = ()  # the stratum of each experiment that ended its simulator, so ran for real
 
 
 def summarise(ledger: Ledger, planned: int, seconds: float) -> Summary:
@@ -124,7 +125,7 @@ def summarise(ledger: Ledger, planned: int, seconds: float) -> Summary:
         if name not in missable or any(result.activated for result in group)
     }
     always = tuple(judged(gate, struck, confidence) for gate in _always(spec))
-    gates = (*asked, *always, _unexcused(results), *_vacuous(struck))
+    gates = (*asked, *always, _unexcused(results), *_vacuous(spec, struck))
     sizes = {stratum.name: population(stratum.fault) for stratum in strata_of(spec)}
     broken = not results or any(g.word == "fail" for g in gates)
     return Summary(
@@ -139,6 +140,7 @@ def summarise(ledger: Ledger, planned: int, seconds: float) -> Summary:
         "fail" if broken else "pass",
         round(seconds, 3),
         weaknesses(spec, groups, confidence) if spec.system.app else (),
+        tuple(r.experiment.stratum for r in results if r.experiment.runtime != spec.system.runtime),
     )
 
 
@@ -149,7 +151,8 @@ def confidence_of(spec: Spec) -> float:
 
 
 def _stratum(name: str, group: list[Result], size: int, confidence: float) -> StratumSummary:
-    unexpected, harm = sum(r.unexpected for r in group), sum(map(failed, group))
+    told = list(filter(OF["unexpected"], group))
+    unexpected, harm = sum(r.unexpected for r in told), sum(map(failed, group))
     return StratumSummary(
         name,
         len(group),
@@ -160,7 +163,7 @@ def _stratum(name: str, group: list[Result], size: int, confidence: float) -> St
         size,
         extrapolated(harm, len(group), size, confidence),
         unexpected,
-        proportion(unexpected, sum(r.activated for r in group), confidence),
+        proportion(unexpected, len(told), confidence),
         times([r.recovery_ms for r in group], confidence),
         times([r.blackout_ms for r in group], confidence),
         times([r.adapt_blackout_ms for r in group], confidence),
@@ -216,7 +219,8 @@ def judged(gate: Gate, groups: dict[str, list[Result]], confidence: float) -> Ga
     if gate.max == 0 and gate.metric in SHARES:
         bound = value  # no number of experiments bounds a share by 0
     kept = bound <= gate.max if gate.max is not None else bound >= (gate.min or 0.0)
-    reason = "" if kept else f"{value:.4g} was measured, and it may be {bound:.4g}"
+    range_ = f", and it may be {bound:.4g}" if bound != value else ""
+    reason = "" if kept else f"{value:.4g} was measured{range_}"
     if not kept and gate.metric == "unknown":
         reason += next((f"; experiment {r.experiment.id}: {r.reasons[0]}" for r in group if _untold(r)), "")
     return GateResult(gate.metric, gate.strata, limit, value, bound, "pass" if kept else "fail", reason)
@@ -242,9 +246,14 @@ def _unexcused(results: Iterable[Result]) -> GateResult:
     return GateResult(BROKEN, ANY, "none", float(len(found)), None, word, reason)
 
 
-def _vacuous(groups: dict[str, list[Result]]) -> Iterator[GateResult]:
-    """Strata that could not have failed."""
+def _vacuous(spec: Spec, groups: dict[str, list[Result]]) -> Iterator[GateResult]:
+    """Strata that could not have failed. With an `unknown_max` of 1, nothing needs to be known."""
     for name, group in groups.items():
+        reason = ""
         if group[0].experiment.faults and not any(r.activated for r in group):
-            reason = f"none of {len(group)} faults struck: this stratum could not have failed"
-            yield GateResult(NOT_ACTIVATED, name, NOT_ALL, 1.0, None, "fail", reason)
+            metric, reason = NOT_ACTIVATED, f"none of {len(group)} faults struck"
+        elif spec.unknown_max < 1 and all(r.outcome in UNKNOWN for r in group):
+            metric, reason = "unknown", f"of none of {len(group)} experiments anything is known"
+        if reason:
+            reason += ": this stratum could not have failed"
+            yield GateResult(metric, name, NOT_ALL, 1.0, None, "fail", reason)

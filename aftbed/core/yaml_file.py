@@ -179,8 +179,8 @@ def _describe(allowed: inspect.Type) -> str:
             return "keys and values"
         case inspect.ListType() | inspect.VarTupleType():
             return "a list"
-        case inspect.StrType():
-            return "a text"
+        case inspect.StrType(pattern=pattern):
+            return f"a text that matches {pattern}" if pattern else "a text"
         case inspect.BoolType():
             return "true or false"
         case inspect.NoneType():

@@ -11,6 +11,7 @@ from typing import Final, Literal, NamedTuple
 
 import msgspec
 
+from aftbed.core.application import Field
 from aftbed.core.errors import PeerError
 from aftbed.core.events import FIRST_FAULT, RERUN, Event
 from aftbed.core.graph import Graph
@@ -20,6 +21,7 @@ from aftbed.inject.model import Fault, FaultReport, parse
 from aftbed.inject.receipts import fault_and_bits
 from aftbed.inject.targets import PRIMARY
 from aftbed.judge import sources
+from aftbed.judge.exercise import differs
 from aftbed.judge.record import Excuses, RunRecord
 from aftbed.judge.reference import ReferenceRun
 from aftbed.runtime.deployment import Hosted, replica_of
@@ -321,17 +323,20 @@ def corruptions(history: History, reference: ReferenceRun) -> list[str]:
     """Each reply that is not the bare server's, and what it asks for instead, by request."""
     right = dict(reference.replies)
     wrong = wrong_replies(history, reference).items()
-    return [f"request {i}: sdc: {_difference(reply, right[i])}" for i, reply in wrong]
+    return [
+        f"request {i}: sdc: {_difference(reply, right[i], reference.rule(i).fields)}" for i, reply in wrong
+    ]
 
 
-def _difference(wrong: bytes, right: bytes) -> str:
-    """The demand on the brakes, and what it should have been."""
+def _difference(wrong: bytes, right: bytes, fields: Sequence[Field]) -> str:
+    """The demand on the brakes, or the first of the function's `fields` that differs; and what is right."""
     found, expected = _decoded(wrong), _decoded(right)
-    if isinstance(found, str) or isinstance(expected, str):
-        texts = [one if isinstance(one, str) else _demand(one) for one in (found, expected)]
-        return " instead of ".join(texts)
-    fields = [(f, getattr(found, f), getattr(expected, f)) for f in AebOutput.__struct_fields__]
-    differing = [f"{name} {a} instead of {b}" for name, a, b in fields if a != b]
+    if isinstance(expected, str):  # of a function of the user
+        return f"the reply is wrong: {differs(wrong, right, fields)} ({wrong.hex()} instead of {right.hex()})"
+    if isinstance(found, str):
+        return f"{found} instead of {_demand(expected)}"
+    values = [(f, getattr(found, f), getattr(expected, f)) for f in AebOutput.__struct_fields__]
+    differing = [f"{name} {a} instead of {b}" for name, a, b in values if a != b]
     return ", ".join(differing) or f"the same demand in other bytes ({wrong.hex()})"
 
 

@@ -178,11 +178,15 @@ class ReferenceRun(msgspec.Struct, frozen=True):
         """The greatest one."""
         return self.rules[-1].tolerance
 
+    def rule(self, number: int) -> ReplyRule:
+        """By which the reply to request `number` is compared."""
+        return next(rule for rule in reversed(self.rules) if rule.first <= number)
+
     def is_wrong(self, number: int, reply: bytes, expected: bytes) -> bool:
         """Whether `reply` cannot be taken for the one that is expected to request `number`."""
         if reply == expected:
             return False
-        rule = next(rule for rule in reversed(self.rules) if rule.first <= number)
+        rule = self.rule(number)
         return rule.deterministic and difference(rule.fields, reply, expected) > rule.tolerance
 
     @property

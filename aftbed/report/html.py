@@ -8,14 +8,14 @@ runs the worst are listed and the others are counted.
 
 import functools
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Final
 
 import jinja2
 import msgspec
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from aftbed.campaign.experiment import Result
 from aftbed.campaign.ledger import Ledger
@@ -23,7 +23,7 @@ from aftbed.campaign.plan import JOINED, strata_of
 from aftbed.campaign.spec import Gate, Spec
 from aftbed.campaign.statistics import Interval
 from aftbed.campaign.summary import StratumSummary, Summary, confidence_of
-from aftbed.judge.outcome import OUTCOMES
+from aftbed.judge.outcome import OUTCOMES, UNKNOWN
 from aftbed.report import plots
 from aftbed.report.plots import Limit, milliseconds
 from aftbed.report.sequence import SpaceTime, space_time
@@ -55,6 +55,7 @@ MEANINGS: Final = {
     "harness_error": "trouble of the testbed: nothing is known of the mechanism",
 }
 assert tuple(MEANINGS) == OUTCOMES
+_CODE: Final = re.compile("`([^`]+)`")
 _UNREADABLE: Final = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")
 
 
@@ -63,26 +64,30 @@ def html_report(summary: Summary, ledger: Ledger, *, drawn: int = DRAWN_MAX) -> 
     spec = ledger.head.spec
     known = Places(spec)
     places = {stratum.name: known.of(stratum.name) for stratum in summary.strata}
-    styles = {row: number for number, row in enumerate(dict.fromkeys(row for row, _ in places.values()))}
     anchors = {stratum.name: f"stratum-{number}" for number, stratum in enumerate(summary.strata)}
     worst = by_badness(ledger.results)
-    times = [_time_plots(metric, ledger.results, spec, styles) for metric in METRICS]
-    timed = {name for kind in times for panel in kind.panels for name in panel.lines}
+    timed = [result for result in ledger.results if _is_timed(result)]
+    rows = dict.fromkeys(known.of(result.experiment.stratum)[0] for result in timed)
+    pooled = len(rows) > len(plots.LINES)
+    named = _by_mechanism if pooled else known.row_of
+    styles = {name: number for number, name in enumerate(dict.fromkeys(map(named, timed)))}
+    times = [_time_plots(metric, timed, spec, named, styles) for metric in METRICS]
     page = engine(TEMPLATES).get_template("report.html.j2")
     return page_text(
         page,
         summary=summary,
-        weaknesses=[(found, places_text(found.seen), remedy(found)) for found in summary.weaknesses],
+        weaknesses=[(one, places_text(one.seen), with_code(remedy(one))) for one in summary.weaknesses],
         spec=spec,
         head=ledger.head,
-        faults=list(dict.fromkeys(fault for _, fault in places.values())),
-        matrix=_matrix(summary.strata, places),
+        matrices=_matrices(summary.strata, places),
         shares={stratum.name: shares(stratum) for stratum in summary.strata},
         anchors=anchors,
         outcomes=[name for name in OUTCOMES if name in summary.outcomes],
         meanings=MEANINGS,
+        unknown=UNKNOWN,
         times=times,
-        lines=[(name, style) for name, style in styles.items() if name in timed],
+        lines=list(styles.items()),
+        pooled=pooled,
         worst=list(_worst_runs(worst[:LISTED_MAX], drawn)),
         worst_count=len(worst),
         failed_gates=sum(gate.word == "fail" for gate in summary.gates),
@@ -129,6 +134,11 @@ def interval(found: Interval) -> str:
     return f"{percent(found.low)} to {percent(found.high)}"
 
 
+def with_code(text: str) -> Markup:
+    """What stands between backquotes is code."""
+    return Markup(_CODE.sub(r"<code>\1</code>", str(escape(text))))
+
+
 def _count(value: float) -> str:
     """`12 800`."""
     return f"{value:,.0f}".replace(",", " ")
@@ -159,6 +169,9 @@ class Places:
         fault = self._faults.get(stratum, stratum.rpartition(JOINED)[2])
         return stratum.removesuffix(f"{JOINED}{fault}"), fault
 
+    def row_of(self, result: Result) -> str:
+        return self.of(result.experiment.stratum)[0]
+
 
 def shares(stratum: StratumSummary) -> list[OutcomeShare]:
     """Its outcomes, the best first."""
@@ -166,14 +179,29 @@ def shares(stratum: StratumSummary) -> list[OutcomeShare]:
     return [OutcomeShare(name, count, 100 * count / stratum.experiments) for name, count in counts]
 
 
-def _matrix(
-    strata: Iterable[StratumSummary], places: dict[str, tuple[str, str]]
-) -> dict[str, dict[str, StratumSummary]]:
-    """The strata by row and column."""
-    found: dict[str, dict[str, StratumSummary]] = {}
+class Matrix(msgspec.Struct, frozen=True):
+    """Strata by row and column."""
+
+    faults: list[str]
+    rows: dict[str, dict[str, StratumSummary]]
+
+
+def _matrices(strata: Iterable[StratumSummary], places: dict[str, tuple[str, str]]) -> list[Matrix]:
+    """One for all rows that share columns: rows with other faults are another table, not empty cells."""
+    rows: dict[str, dict[str, StratumSummary]] = {}
     for stratum in strata:
         row, fault = places[stratum.name]
-        found.setdefault(row, {})[fault] = stratum
+        rows.setdefault(row, {})[fault] = stratum
+    found: list[Matrix] = []
+    for name, cells in rows.items():
+        shared = [matrix for matrix in found if cells.keys() & set(matrix.faults)]
+        joined = Matrix([], {})
+        for matrix in (*shared, Matrix(list(cells), {name: cells})):
+            joined.faults.extend(fault for fault in matrix.faults if fault not in joined.faults)
+            joined.rows.update(matrix.rows)
+        at = found.index(shared[0]) if shared else len(found)
+        found = [matrix for matrix in found if matrix not in shared]
+        found.insert(at, joined)
     return found
 
 
@@ -181,10 +209,9 @@ def _matrix(
 
 
 class TimePanel(msgspec.Struct, frozen=True):
-    """A plot of the runs with one kind of fault; `lines` are named by the rows of the matrix."""
+    """A plot of the runs with one kind of fault; without one where all took no time."""
 
     fault: str
-    lines: tuple[str, ...]
     count: int
     drawing: Markup
 
@@ -199,7 +226,22 @@ class TimePlots(msgspec.Struct, frozen=True):
     left_out: int  # kinds of fault
 
 
-def _time_plots(metric: str, results: Iterable[Result], spec: Spec, styles: dict[str, int]) -> TimePlots:
+def _is_timed(result: Result) -> bool:
+    return any(getattr(result, metric) is not None for metric in METRICS)
+
+
+def _by_mechanism(result: Result) -> str:
+    """The name of its line, where there are too many rows for a line each."""
+    return result.experiment.ftm
+
+
+def _time_plots(
+    metric: str,
+    results: Iterable[Result],
+    spec: Spec,
+    named: Callable[[Result], str],
+    styles: dict[str, int],
+) -> TimePlots:
     found: dict[str, dict[str, list[float]]] = {}
     strata: dict[str, dict[str, None]] = {}
     places = Places(spec)
@@ -207,15 +249,16 @@ def _time_plots(metric: str, results: Iterable[Result], spec: Spec, styles: dict
         value: float | None = getattr(result, metric)
         name = result.experiment.stratum
         if value is not None:
-            row, fault = places.of(name)
-            found.setdefault(fault, {}).setdefault(row, []).append(value)
+            _, fault = places.of(name)
+            found.setdefault(fault, {}).setdefault(named(result), []).append(value)
             strata.setdefault(fault, {})[name] = None
     title, meaning = METRICS[metric]
     panels = []
     for fault, lines in list(found.items())[:PANELS_MAX]:
         limits = list(_limits(metric, spec, strata[fault]))
-        drawing = plots.ecdf(f"{title}, {fault}", lines, styles, limits)
-        panels.append(TimePanel(fault, tuple(lines), sum(map(len, lines.values())), Markup(drawing)))
+        none = not any(map(any, lines.values()))
+        drawing = "" if none else plots.ecdf(f"{title}, {fault}", lines, styles, limits)
+        panels.append(TimePanel(fault, sum(map(len, lines.values())), Markup(drawing)))
     return TimePlots(f"times-{metric}", title, meaning, tuple(panels), max(0, len(found) - PANELS_MAX))
 
 
@@ -255,6 +298,8 @@ def _worst_runs(worst: Sequence[Result], drawn: int) -> Iterator[WorstRun]:
         again = rerun(result.experiment)
         if again.trace is None:
             note = f"Not drawn: it cannot be simulated: {again.why_not}"
+            if result.experiment.app:
+                note = "Not drawn: a report executes no function of a user. The command above shows the run."
             yield WorstRun(result, slowness_ms(result), note=note)
             continue
         same = again.outcome == result.outcome

@@ -25,11 +25,10 @@ from junitparser import Failure, JUnitXml, TestCase, TestSuite
 
 from aftbed.campaign.experiment import Result
 from aftbed.campaign.ledger import Ledger
-from aftbed.campaign.summary import GateResult, StratumSummary, Summary
+from aftbed.campaign.summary import NOT_ALL, GateResult, StratumSummary, Summary
 from aftbed.report.worst import worst_of
 
 UNEXPECTED: Final = "unexpected"
-NOT_ACTIVATED: Final = "not_activated"
 GATE: Final = "gate"
 _NO_XML: Final = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
@@ -96,10 +95,8 @@ def _why(
         came = ", ".join(f"{name} {count}" for name, count in stratum.outcomes.items())
         text = f"{stratum.unexpected} of {stratum.experiments} unexpected: {came};"
         return UNEXPECTED, f"{text} expected: {', '.join(stratum.expected)}\n{_worst_text(results)}"
-    if any(gate.metric == NOT_ACTIVATED and gate.strata == stratum.name for gate in gates):
-        text = f"none of {stratum.experiments} faults struck: this stratum could not have failed"
-        return NOT_ACTIVATED, f"{text}\n{_worst_text(results)}"
-    return None
+    vacuous = (gate for gate in gates if gate.limit == NOT_ALL and gate.strata == stratum.name)
+    return next(((gate.metric, f"{gate.reason}\n{_worst_text(results)}") for gate in vacuous), None)
 
 
 def _allowed(name: str, gates: Iterable[GateResult]) -> bool:

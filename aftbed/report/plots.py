@@ -134,8 +134,12 @@ def milliseconds(value: float) -> str:
 
 def line_style(number: int) -> str:
     """Colour and dashes of a page's line with that number, as CSS: for its legend."""
-    place = number % len(LINES)
-    return f"stroke: var(--l{place}); stroke-dasharray: {LINES[place][1] or 'none'}"
+    return f"stroke: var(--l{number % len(LINES)}); stroke-dasharray: {_dashes(number) or 'none'}"
+
+
+def _dashes(number: int) -> str:
+    """Of the line with that number: behind the last colour, the first one comes with other dashes."""
+    return LINES[(number + number // len(LINES)) % len(LINES)][1]
 
 
 # -- plots of a page --------------------------------------------------------------------------------
@@ -346,7 +350,7 @@ class _Drawing:
 
     def line(self, axes: "Axes", points: Points, number: int) -> "Line2D":
         """In the style with that number."""
-        colour, dashes = LINES[number % len(LINES)]
+        colour, dashes = LINES[number % len(LINES)][0], _dashes(number)
         (line,) = axes.plot(*zip(*points, strict=True), color=colour)
         if dashes:
             line.set_linestyle((0, tuple(map(float, dashes.split()))))

@@ -1,5 +1,6 @@
 """Functions of users: a good one, and others with one planted weakness each."""
 
+import os
 import random
 from struct import pack, unpack
 from typing import Final
@@ -83,6 +84,26 @@ class Fatal(Counter):
         if self.count == FATAL:
             raise ZeroDivisionError("the distance is 0")
         return reply
+
+
+class Fragile(Counter):
+    """Its process ends, as one of native code may, behind a wrong bit in its state."""
+
+    check = 0
+
+    def execute(self, request: bytes) -> bytes:
+        if self.check != self.sum ^ self.count:
+            os._exit(9)
+        reply = super().execute(request)
+        self.check = self.sum ^ self.count
+        return reply
+
+    def capture(self) -> bytes:
+        return super().capture() + pack("<I", self.check)
+
+    def restore(self, state: bytes) -> None:
+        super().restore(state[:8])
+        (self.check,) = unpack("<I", state[8:])
 
 
 class Closed(Counter):

@@ -44,7 +44,15 @@ def test_a_forgotten_field_is_found_behind_a_failover_and_by_a_second_execution(
     )
     assert [one.place for one in calm.seen] == ["pbr+tr"]
     assert "executed again from a captured state, it answers otherwise" in calm.advice
-    assert "`aftbed app check`" in calm.advice
+    assert calm.advice.endswith("requests.csv` tells what") and "`aftbed app check /" in calm.advice
+
+
+def test_kinds_of_fault_that_show_one_cause_are_one_weakness(tmp_path: Path) -> None:
+    faults = ("crash primary", "hang primary", "crash backup")
+    _, summary = certified(suite(tmp_path, "Forgetful", ("pbr",), *faults), 2)
+    (weak,) = unexpected(summary)
+    assert weak.fault == "crash primary; hang primary"
+    assert [(one.place, one.experiments) for one in weak.seen] == [("pbr", 4)]
 
 
 def test_a_forgotten_field_is_found_in_the_second_failover_of_lfr(tmp_path: Path) -> None:
@@ -90,10 +98,15 @@ def test_what_a_mechanism_does_not_promise_is_a_limit_and_those_that_held_it_are
     assert 0.5 < limit.held[0].interval.low < 0.6 and limit.held[0].interval.high == 1.0
 
 
-def test_few_experiments_recommend_nothing(tmp_path: Path) -> None:
-    """One that ended well proves nothing."""
-    _, summary = certified(suite(tmp_path, "Counter", ("pbr", "pbr+tr"), "wrong reply"), 1)
-    assert of(summary, "wrong reply").held == ()
+def test_few_experiments_recommend_nothing_and_it_is_told_how_many_would(tmp_path: Path) -> None:
+    """Three that ended well may be chance."""
+    spec = suite(tmp_path, "Counter", ("pbr", "pbr+tr"), "wrong reply")
+    limit = of(certified(spec, 3)[1], "wrong reply")
+    assert limit.held == ()
+    named, _, number = limit.advice.partition("`--experiments ")
+    assert named == "pbr+tr held it, which may be chance: "
+    enough = of(certified(spec, int(number.removesuffix("` or more tell")))[1], "wrong reply")
+    assert [one.place for one in enough.held] == ["pbr+tr"]
 
 
 def test_what_cannot_occur_elsewhere_is_named(tmp_path: Path) -> None:

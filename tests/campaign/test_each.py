@@ -4,6 +4,7 @@ import itertools
 import os
 import signal
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -72,6 +73,23 @@ def test_one_whose_process_dies_is_named_and_no_process_is_left() -> None:
         list(each(dies_at_five, range(9), 2, alone=lambda number, _: f"run {number}"))
     said = "experiment 5 has no result, its process has been killed by signal 9; alone: run 5"
     assert str(raised.value) == said
+    assert workers() <= before
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+@pytest.mark.parametrize(
+    ("judge", "told"),
+    [
+        (dies_at_five, "5 has been killed by signal 9"),
+        (hangs_at_five, "5 was hanging, and was killed after 1 s"),
+    ],
+)
+def test_another_result_takes_the_place_of_one_that_is_lost_and_the_rest_follows(
+    judge: Callable[[int], int | str], told: str, jobs: int
+) -> None:
+    before = workers()
+    found = each(judge, range(9), jobs, seconds_max=1.0, apart=True, instead=lambda n, how: f"{n} {how}")
+    assert [one for _, _, one in found] == [0, 1, 2, 3, 4, told, 6, 7, 8]
     assert workers() <= before
 
 

@@ -119,6 +119,29 @@ def test_a_stratum_in_which_nothing_struck_fails_by_itself(tmp_path: Path) -> No
     assert found.gate == "fail"
 
 
+def test_a_stratum_of_which_nothing_is_known_fails_by_itself(tmp_path: Path) -> None:
+    """Not one of which a part is known."""
+    busy = [msgspec.structs.replace(r, outcome="inconclusive") for r in many(2, first=900)]
+    lone = [
+        msgspec.structs.replace(r, experiment=msgspec.structs.replace(r.experiment, stratum="lfr · crash"))
+        for r in busy
+    ]
+    assert judged(tmp_path, [*many(400), *busy]).gate == "pass"
+    found = judged(tmp_path, [*many(400), *lone])
+    assert found.gates[-1].reason == (
+        "of none of 2 experiments anything is known: this stratum could not have failed"
+    )
+    assert (found.gate, found.gates[-1].strata) == ("fail", "lfr · crash")
+    allowed = CRASHES.replace("not_activated_max: 0.5", "not_activated_max: 0.5\nunknown_max: 1")
+    assert judged(tmp_path, [*many(400), *lone], text=allowed).gate == "pass"
+
+
+def test_what_is_not_known_is_not_counted_as_expected(tmp_path: Path) -> None:
+    busy = [msgspec.structs.replace(r, outcome="inconclusive") for r in many(6, first=900)]
+    (stratum,) = judged(tmp_path, [*many(6), *busy]).strata
+    assert stratum.unexpected_interval == proportion(0, 6)
+
+
 def test_a_campaign_without_results_is_no_pass(tmp_path: Path) -> None:
     assert judged(tmp_path, []).gate == "fail"
 

@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from aftbed.core.application import Field
 from aftbed.core.journal import Entry, EntryKind, History
 from aftbed.inject.grammar import with_flipped
 from aftbed.inject.model import FaultReport
@@ -19,7 +20,7 @@ from aftbed.judge.checks import (
     wrong_replies,
 )
 from aftbed.judge.record import RunRecord
-from aftbed.judge.reference import ReferenceRun, reference_run
+from aftbed.judge.reference import ReferenceRun, ReplyRule, reference_run
 from aftbed.runtime.unix.options import LoadRun, RunOptions
 from aftbed.vehicle.aeb.function import default_application, sample_requests
 from aftbed.vehicle.aeb.messages import AebOutput, encode_reply
@@ -82,6 +83,15 @@ def test_what_differs_is_named() -> None:
 )
 def test_what_is_no_demand_is_named(reply: bytes, words: str) -> None:
     assert corruptions_of(history({3: reply})) == [f"request 3: sdc: {words}"]
+
+
+def test_a_reply_of_a_function_of_the_user_is_told_in_its_own_fields() -> None:
+    asked = [Entry(1, 1, 0, EntryKind.SENT, b""), Entry(1, 1, 1, EntryKind.ANSWERED, b"\x01\x05")]
+    for fields, words in [((Field("level", "u8", 1),), "level is 5 instead of 3"), ((), "byte 1 is 0x05")]:
+        bare = ReferenceRun(((1, b"\x01\x03"),), b"", rules=(ReplyRule(fields=fields),))
+        (found,) = corruptions(History({}, asked), bare)
+        assert found.startswith(f"request 1: sdc: the reply is wrong: {words}")
+        assert found.endswith("(0105 instead of 0103)")
 
 
 def test_the_same_demand_in_other_bytes_is_wrong_too() -> None:

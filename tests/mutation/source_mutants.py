@@ -420,6 +420,24 @@ MUTANTS: Final = (
         UNIT,
         ("tests/judge/test_damaged.py",),
     ),
+    SourceMutant(
+        "an experiment of which nothing is known counts as expected",
+        "G8",
+        "aftbed/campaign/summary.py",
+        "r.activated and r.outcome not in UNKNOWN",
+        "r.activated",
+        UNIT,
+        ("tests/campaign/test_summary.py",),
+    ),
+    SourceMutant(
+        "a stratum of which nothing is known passes",
+        "G8",
+        "aftbed/campaign/summary.py",
+        "elif spec.unknown_max < 1 and all(r.outcome in UNKNOWN for r in group):",
+        "elif not group:",
+        UNIT,
+        ("tests/campaign/test_summary.py",),
+    ),
 )
 
 

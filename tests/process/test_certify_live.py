@@ -7,13 +7,19 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from certified import STRANGERS, requests_in
+from campaigns import ran
+from certified import STRANGERS, requests_in, suite
 from liveruns import called
 from msgspec.structs import replace
 
 from aftbed.campaign.experiment import Experiment, Result
-from aftbed.campaign.plan import plan
+from aftbed.campaign.plan import CampaignPlan, plan
+from aftbed.campaign.runner import _Really
 from aftbed.campaign.spec import read_spec
+from aftbed.campaign.summary import summarise
+from aftbed.core.errors import HarnessError
+from aftbed.report.html import html_report
+from aftbed.report.terminal import summary_lines
 from aftbed.runtime.unix.trust import OWN_RUN
 
 pytestmark = pytest.mark.process
@@ -48,6 +54,52 @@ def test_certify_passes_a_good_function(tmp_path: Path) -> None:
     assert (out / "summary.md").read_text().startswith("# certify: pass\n")
     again = called("campaign", "report", out, "--json")
     assert json.loads(again.out) | {"seconds": 0} == summary | {"seconds": 0}
+
+
+@pytest.fixture
+def fragile(tmp_path: Path) -> CampaignPlan:
+    """A wrong bit in the state ends the process in which the function is."""
+    spec = suite(tmp_path, "Fragile", ("none", "lfr"), "nothing", "wrong state")
+    return plan(replace(spec, stop=replace(spec.stop, experiments=1)), OWN_RUN)
+
+
+def test_what_ends_the_simulator_is_carried_out_on_real_processes(
+    tmp_path: Path, fragile: CampaignPlan
+) -> None:
+    """There the replica fails alone: the follower of `lfr` has executed the requests itself."""
+    found = ran(fragile, tmp_path / "out")
+    told = {r.experiment.stratum: (r.experiment.runtime, r.outcome) for r in found.results}
+    assert told == {
+        "none · nothing": ("sim", "masked"),
+        "none · wrong state": ("unix", "unavailable"),
+        "lfr · nothing": ("sim", "masked"),
+        "lfr · wrong state": ("unix", "tolerated"),
+    }
+    summary = summarise(found, fragile.size, 1.0)
+    (limit,) = summary.weaknesses
+    assert limit.expected and [one.place for one in limit.seen] == ["none"]
+    assert summary.really == ("none · wrong state", "lfr · wrong state")
+    why = "since the function ends or blocks the simulator: none · wrong state, lfr · wrong state"
+    assert f"2 of them on real processes, {why}" in "\n".join(summary_lines(summary))
+    assert f"2 experiments, {why}" in html_report(summary, found, drawn=0)
+    assert len(ran(fragile, tmp_path / "out", resume=True).results) == fragile.size
+
+
+def test_a_function_that_always_ends_the_simulator_is_not_tried_for_ever(
+    tmp_path: Path, fragile: CampaignPlan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("aftbed.campaign.runner.REALLY_MAX", 0)
+    with pytest.raises(HarnessError, match=r"Fragile: .* has ended with code 9: `--runtime unix` runs all"):
+        ran(fragile, tmp_path / "out")
+
+
+def test_a_worker_that_ends_behind_its_experiment_leaves_its_result(
+    tmp_path: Path, fragile: CampaignPlan
+) -> None:
+    """It was in the records, so it is not carried out again."""
+    found = ran(fragile, tmp_path / "out")
+    known = _Really(found.path, fragile, 1.0)
+    assert known(found.results[0].experiment, "has ended") == found.results[0]
 
 
 def carried_out(experiment: Experiment) -> Result:

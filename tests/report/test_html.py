@@ -9,12 +9,14 @@ from typing import Final
 import msgspec
 import pytest
 from campaigns import result
-from reported import HOSTILE, MACHINE, hostile, summary_of, with_results
+from certified import certified, suite
+from reported import HOSTILE, MACHINE, hostile, named, summary_of, with_results
 
 from aftbed.campaign.ledger import Ledger
 from aftbed.campaign.spec import Gate
 from aftbed.judge.outcome import OUTCOMES
 from aftbed.report.html import DRAWN_MAX, html_report, percent
+from aftbed.report.plots import LINES
 from aftbed.report.worst import by_badness
 
 VOID: Final = frozenset(("meta", "link", "br"))
@@ -126,6 +128,46 @@ def test_gates_and_environment(page: Page, ledger: Ledger) -> None:
     for fact in (MACHINE.python, MACHINE.kernel, MACHINE.cpus, MACHINE.command, ledger.head.code):
         assert fact in said
     assert re.search(r"Seed\s*7", said)
+
+
+def test_rows_with_other_faults_are_another_table(text: str, ledger: Ledger, tmp_path: Path) -> None:
+    assert Page(text).classes["matrix"] == 1, "of these, each has a fault in common with another"
+    spec = suite(tmp_path, "Counter", ("pbr", "lfr"), "nothing", "crash primary", "adapting")
+    found, summary = certified(spec)
+    page = Page(html_report(summary, found, drawn=0))
+    assert (page.classes["matrix"], page.classes["empty"]) == (2, 0)
+    assert page.classes["counts"] == len(summary.strata) == 6
+
+
+def test_more_rows_than_styles_are_one_line_for_each_mechanism(ledger: Ledger) -> None:
+    """Two lines of one style could not be told apart."""
+    names = [f"pbr · to {number} · crash primary" for number in range(len(LINES) + 1)]
+    many = [
+        named(result("tolerated", index=number, recovery_ms=1.0 + number), name)
+        for number, name in enumerate(names)
+    ]
+    for count, lines, told in [(len(LINES), len(LINES), 0), (len(LINES) + 1, 1, 1)]:
+        few = with_results(ledger, *many[:count])
+        page = Page(html_report(summary_of(few), few, drawn=0))
+        assert page.classes["swatch"] == page.classes["line"] == lines
+        assert "".join(page.text).count("A line is a mechanism") == told
+
+
+def test_times_of_which_all_are_zero_are_told_and_not_drawn(ledger: Ledger) -> None:
+    none = with_results(ledger, *(result("tolerated", index=n, adapt_blackout_ms=0.0) for n in range(3)))
+    page = Page(html_report(summary_of(none), none, drawn=0))
+    assert "(3 runs)\n0 ms in all of them." in "".join(page.text) and page.classes["plot"] == 0
+
+
+def test_a_cell_of_which_nothing_is_known_does_not_say_as_expected(ledger: Ledger) -> None:
+    first = result("tolerated", index=1)
+    first = msgspec.structs.replace(
+        first, experiment=msgspec.structs.replace(first.experiment, expected=("tolerated",))
+    )
+    busy = msgspec.structs.replace(first, outcome="inconclusive")
+    for results, said in [((first,), "✓ as expected"), ((first, busy), "nothing is known of 1; the others")]:
+        few = with_results(ledger, *results)
+        assert said in "".join(Page(html_report(summary_of(few), few, drawn=0)).text)
 
 
 def test_hostile_names_are_text(ledger: Ledger) -> None:

@@ -118,9 +118,10 @@ def test_ten_thousand_values_are_thinned_to_their_ends() -> None:
 
 
 def test_lines_differ_by_their_dashes_too() -> None:
-    styles = [line_style(number) for number in range(len(LINES))]
-    assert len({style.partition("; ")[2] for style in styles}) == len(LINES)
-    assert line_style(len(LINES)) == styles[0]
+    """Seven of them by colour and by dashes, more by both together."""
+    styles = [line_style(number) for number in range(len(LINES) ** 2)]
+    assert len({style.partition("; ")[2] for style in styles[: len(LINES)]}) == len(LINES)
+    assert len(set(styles)) == len(styles)
 
 
 def test_equal_data_give_equal_bytes_in_any_process() -> None:

@@ -41,6 +41,7 @@ def test_a_page_and_a_markdown_have_the_same_table(weak: tuple[Ledger, Summary])
         "pbr 2 of 2 (15.8 to 100.0 %)",
     ):
         assert words in page and words in text
+    assert "<code>aftbed app check " in page and "`aftbed app check " in text
     assert 'href="#weaknesses"' in page and page.count("<b>limit</b>") == 1
     assert text.startswith("# certify: fail\n") and "| **weakness** | crash primary | " in text
 

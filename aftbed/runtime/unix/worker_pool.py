@@ -43,6 +43,7 @@ Result = tuple[Any, Exception | None]  # what was found, or what was raised
 S = TypeVar("S")
 T = TypeVar("T")
 Alone = Callable[[int, S], str]  # number and experiment -> a command
+Instead = Callable[[S, str], T]  # experiment, and what became of its worker -> a result
 
 
 def each(
@@ -54,6 +55,7 @@ def each(
     seconds_max: float = SECONDS_MAX,
     fresh: bool = False,
     apart: bool = False,
+    instead: Instead[S, T] | None = None,
 ) -> Generator[tuple[int, S, T], None, None]:
     """Number, experiment and what `judge` found, in order, over `jobs` processes.
 
@@ -61,7 +63,8 @@ def each(
     processes of a real run are forks of them, and all that is in them would be copied with each. `apart`:
     not in this process, even if `jobs` is 1, since code of the user may crash it, or hang. What `judge`
     raises is raised here. Raises HarnessError if a worker dies, or takes more than `seconds_max`
-    for one experiment; `alone` is the command that runs it by itself.
+    for one experiment; `alone` is the command that runs it by itself. With `instead`, what that returns in
+    this process is the result of such an experiment.
     """
     if jobs == 1 and not (fresh or apart):
         for number, setup in enumerate(setups):
@@ -73,23 +76,29 @@ def each(
     pool = _Pool(judge, jobs, seconds_max, fresh)
     try:
         while True:
-            while len(given) < AHEAD * jobs and pool.has_room() and (following := next(numbered, None)):
-                number, given[number] = following
-                pool.give(*following)
-            if not given:
-                return
+            try:
+                while len(given) < AHEAD * jobs and pool.has_room() and (following := next(numbered, None)):
+                    number, given[number] = following
+                    pool.give(*following)
+                if not given:
+                    return
+                oldest = next(iter(given))
+                for number, result in pool.results(waits=oldest not in found):
+                    found[number] = result
+            except _LostError as lost:
+                setup = given[lost.number]
+                if instead is None:
+                    command = alone(lost.number, setup) if alone is not None else ""
+                    which = f"; alone: {command}" if command else f": {setup}"[:SETUP_MAX]
+                    raise HarnessError(f"{lost}{which}") from None
+                pool.leave(lost.number)
+                found[lost.number] = instead(setup, lost.how), None
             oldest = next(iter(given))
-            found.update(pool.results(waits=oldest not in found))
             if oldest in found:
                 result, error = found.pop(oldest)
                 if error is not None:
                     raise error
                 yield oldest, given.pop(oldest), cast("T", result)
-    except _LostError as lost:
-        setup = given[lost.number]
-        command = alone(lost.number, setup) if alone is not None else ""
-        which = f"; alone: {command}" if command else f": {setup}"[:SETUP_MAX]
-        raise HarnessError(f"{lost}{which}") from None
     finally:
         pool.end()
 
@@ -100,10 +109,16 @@ def own_seconds_max(requests: int) -> float:
 
 
 def once(
-    judge: Callable[[S], T], setup: S, seconds_max: float, *, apart: bool, alone: Alone[S] | None = None
+    judge: Callable[[S], T],
+    setup: S,
+    seconds_max: float,
+    *,
+    fresh: bool = False,
+    apart: bool = False,
+    alone: Alone[S] | None = None,
 ) -> T:
     """What `judge` finds in one experiment. As `each`."""
-    ((_, _, found),) = each(judge, [setup], alone=alone, seconds_max=seconds_max, apart=apart)
+    ((_, _, found),) = each(judge, [setup], alone=alone, seconds_max=seconds_max, fresh=fresh, apart=apart)
     return found
 
 
@@ -113,9 +128,9 @@ def once(
 class _LostError(Exception):
     """No result will come for experiment `number`."""
 
-    def __init__(self, number: int, why: str) -> None:
+    def __init__(self, number: int, why: str, how: str) -> None:
         super().__init__(f"experiment {number} {why}")
-        self.number = number
+        self.number, self.how = number, how
 
 
 class _Worker:
@@ -155,12 +170,13 @@ class _Worker:
         if ended is not None:
             exited = ended.si_code == os.CLD_EXITED
             how = f"has {'ended with code' if exited else 'been killed by signal'} {ended.si_status}"
-        return _LostError(self.number, f"has no result, its process {how}")
+        return _LostError(self.number, f"has no result, its process {how}", how)
 
     def hangs(self, seconds_max: float) -> _LostError:
         """Kill it."""
         linux.kill(self.pidfd, signal.SIGKILL)
-        return _LostError(self.number, f"hangs, after {seconds_max:g} s there is no result")
+        why = f"hangs, after {seconds_max:g} s there is no result"
+        return _LostError(self.number, why, f"was hanging, and was killed after {seconds_max:g} s")
 
     def end(self) -> None:
         """Kill it if it lives, and reap it."""
@@ -203,6 +219,14 @@ class _Pool:
                 yield worker.result()
             elif worker.pidfd in ready:  # a process that it started may still have its end of the pipe
                 raise worker.died()
+
+    def leave(self, number: int) -> None:
+        """End the worker that has experiment `number`."""
+        with _uninterrupted():
+            for worker in [worker for worker in self._workers if worker.number == number]:
+                self._workers.remove(worker)
+                worker.pipe.close()
+                worker.end()
 
     def end(self) -> None:
         """Let each finish its experiment. One that takes too long is killed, all are at another interrupt."""
