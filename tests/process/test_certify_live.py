@@ -41,6 +41,7 @@ def requests(seed):
 """
 
 
+@pytest.mark.deep  # a page of the docs runs one that passes
 def test_certify_passes_a_good_function(tmp_path: Path) -> None:
     """All of it, once in each stratum: every mechanism suits, and each becomes each other one."""
     words = ("--app", f"{STRANGERS}:Counter", "--requests", requests_in(tmp_path), "--experiments", "1")

@@ -32,7 +32,8 @@ def searched(ftm: str, action: FaultAction) -> tuple[list[str], VehicleResult, V
     return words[1:], course.result, worst.struck.result
 
 
-@pytest.mark.parametrize("ftm", ["pbr", pytest.param("lfr+tr", marks=pytest.mark.deep)])
+@pytest.mark.deep
+@pytest.mark.parametrize("ftm", ["pbr", "lfr+tr"])
 def test_a_crash_at_the_worst_instant_passes_on_processes_too(ftm: str) -> None:
     words, free, _ = searched(ftm, Crash())
     done = aftbed(*words, "--json")
