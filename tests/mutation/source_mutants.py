@@ -297,9 +297,9 @@ MUTANTS: Final = (
     SourceMutant(
         "a stopped supervisor is not continued when its command dies",
         "G7",
-        f"{UNIX}/launch.py",
-        "        if self.supervisor == 0:\n            linux.continue_at_parents_death()\n",
-        "        if self.supervisor == 0:\n",
+        f"{UNIX}/supervisor_process.py",
+        "    linux.continue_at_parents_death()\n",
+        "",
         PROCESS,
         (KILLS + "test_a_killed_command_leaves_nothing_whatever_its_keepers_suffer",),
     ),
