@@ -35,7 +35,7 @@ help:
 	@echo "make deep     the exhaustive tests, and thousands of examples of every property: hours"
 	@echo "make mutants  plant bugs one by one, see what notices them, write docs/assumptions.md (ONLY=words: some, print)"
 	@echo "make soak     one run of 30 minutes with a crash every 2 s, an adaptation every 5 s: does anything grow?"
-	@echo "make bench    every figure of docs/numbers.md, written into its table: ten minutes"
+	@echo "make bench    every figure of docs/numbers.md, written into its table: ten minutes (OLD=VENV: then compare with it)"
 
 # Where the tests are installed, the package is too: then the demo needs nothing more.
 demo: $(if $(wildcard $(EDITABLE)),$(EDITABLE),$(PLAIN))
@@ -63,6 +63,7 @@ mutants: $(EDITABLE)
 
 bench: $(EDITABLE)
 	$(BIN)/aftbed bench all --into docs/numbers.md
+	$(if $(OLD),$(BIN)/aftbed bench compare "$(OLD)" $(VENV))
 
 soak: $(EDITABLE)
 	$(BIN)/aftbed bench soak --minutes 30 --rate 500 --crash-every 2 --adapt-every 5

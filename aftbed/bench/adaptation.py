@@ -4,6 +4,10 @@ The load has a fixed rate, because a closed loop would hide requests that wait. 
 from the order to stop taking requests to the last acknowledgement that they are taken again: what a request
 meets that arrives at the worst moment. `worst_request_ms` is what the client saw, from the journals.
 
+The limit is that of a failover, SIGKILL to a pidfd readable elsewhere (`recovery`): no brick can be replaced
+by another process sooner than the kernel takes to tell of the end of one. The two alternate; each round has a
+run of its own.
+
 The paper's recipe may leave a request in a brick that is killed, and then nothing is served any more. So
 each of its adaptations has a run of its own; those that never answer again are counted as `stuck`.
 """
@@ -11,11 +15,13 @@ each of its adaptations has a run of its own; those that never answer again are 
 import itertools
 import time
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import msgspec
 
-from aftbed.bench.cycle import ring_us
+from aftbed.bench.cycle import RING_BYTES, ring_of, ring_us
+from aftbed.bench.recovery import DEATH, deaths_ms
+from aftbed.bench.rounds import ROUNDS, BesideLimit, Meanwhile, beside_limit, in_turn, shares
 from aftbed.bench.runs import (
     PAUSE_SECONDS,
     Percentiles,
@@ -28,6 +34,7 @@ from aftbed.core.errors import HarnessError
 from aftbed.core.journal import EntryKind
 from aftbed.core.messages import Goal
 from aftbed.core.script import RECIPES
+from aftbed.ftm.compose import build
 from aftbed.judge import checks
 from aftbed.judge.isolated import reference_of
 from aftbed.judge.record import RunRecord
@@ -40,8 +47,8 @@ RING_COUNT: Final = 500
 Outcomes = list[dict[str, object]]
 
 
-class AdaptationTimes(msgspec.Struct, frozen=True):
-    """Of the adaptations in one direction."""
+class AdaptationTimes(BesideLimit, frozen=True):
+    """Of the adaptations in one direction; `ratio` is that of `blackout_ms`."""
 
     prepare_ms: Percentiles
     blackout_ms: Percentiles
@@ -64,38 +71,50 @@ class AdaptationResult(AdaptationTimes, frozen=True, kw_only=True):
     stuck: int
     worst_request_ms: float
     ring_us: Percentiles
+    machine: Meanwhile
+
+
+class _Round(NamedTuple):
+    """What the runs of a round gave."""
+
+    there: Outcomes
+    back: Outcomes
+    records: list[RunRecord]
 
 
 def bench_adapt(
-    old: str, new: str, placement: str, recipe: str, count: int, *, pin: bool = True
+    old: str,
+    new: str,
+    placement: str,
+    recipe: str,
+    count: int,
+    *,
+    pin: bool = True,
+    rounds: int = ROUNDS,
 ) -> AdaptationResult:
     """Adapt `count` times, and back as often. Raises HarnessError."""
-    ring = ring_us(12, 64, RING_COUNT, None)
-    there: Outcomes = []
-    back: Outcomes = []
-    records: list[RunRecord] = []
-    drained = recipe == RECIPES[0]
-    for _ in range(1 if drained else count):
-        with endless_run(old, placement, RATE_HZ, pin=pin) as run:
-            wait_until_ready(run.private)
-            for _ in range(count if drained else 1):
-                there.append(adapted(run.private, Goal(expression=new, recipe=recipe)))
-                time.sleep(PAUSE_SECONDS)
-                if drained:
-                    back.append(adapted(run.private, Goal(expression=old)))
-                    time.sleep(PAUSE_SECONDS)
-        records.append(run.record)
-    ring += ring_us(12, 64, RING_COUNT, None)
+    ring = ring_us(ring_of(build(old, placement)), RING_BYTES, RING_COUNT, pin=pin)
+    share = shares(count, rounds)
+
+    def adaptations(number: int) -> _Round:
+        if recipe == RECIPES[0]:
+            return _there_and_back(old, new, placement, share[number], pin=pin)
+        return _each_in_a_run(old, new, placement, recipe, share[number], pin=pin)
+
+    found = in_turn(len(share), adaptations, lambda number: deaths_ms(share[number], pin=pin))
+    there, back = ([one.there for one in found.figures], [one.back for one in found.figures])
+    records = [record for one in found.figures for record in one.records]
     counts = [_requests(record) for record in records]
     return AdaptationResult(
-        **msgspec.structs.asdict(_times(there)),
+        **msgspec.structs.asdict(_times(there, found.limits)),
+        machine=found.machine,
         old=old,
         new=new,
         placement=placement,
         recipe=recipe,
-        adaptations=len(there) + len(back),
+        adaptations=sum(map(len, there)) + sum(map(len, back)),
         rate_hz=RATE_HZ,
-        back=_times(back) if back else msgspec.UNSET,
+        back=_times(back, found.limits) if all(back) else msgspec.UNSET,
         requests={name: sum(count[name] for count in counts) for name in counts[0]},
         stuck=sum(count["lost"] > 0 for count in counts),
         worst_request_ms=round(max(max(latencies_us(r), default=0.0) for r in records) / 1e3, 3),
@@ -103,12 +122,50 @@ def bench_adapt(
     )
 
 
-def _times(outcomes: Outcomes) -> AdaptationTimes:
+def _there_and_back(old: str, new: str, placement: str, count: int, *, pin: bool) -> _Round:
+    """In one run."""
+    there: Outcomes = []
+    back: Outcomes = []
+    with endless_run(old, placement, RATE_HZ, pin=pin) as run:
+        wait_until_ready(run.private)
+        for _ in range(count):
+            there.append(adapted(run.private, Goal(expression=new, recipe=RECIPES[0])))
+            time.sleep(PAUSE_SECONDS)
+            back.append(adapted(run.private, Goal(expression=old)))
+            time.sleep(PAUSE_SECONDS)
+    return _Round(there, back, [run.record])
+
+
+def _each_in_a_run(old: str, new: str, placement: str, recipe: str, count: int, *, pin: bool) -> _Round:
+    """There only, since it may be the last thing that the run does."""
+    found = _Round([], [], [])
+    for _ in range(count):
+        with endless_run(old, placement, RATE_HZ, pin=pin) as run:
+            wait_until_ready(run.private)
+            found.there.append(adapted(run.private, Goal(expression=new, recipe=recipe)))
+            time.sleep(PAUSE_SECONDS)
+        found.records.append(run.record)
+    return found
+
+
+def _times(rounds: list[Outcomes], deaths: list[list[float]]) -> AdaptationTimes:
+    outcomes = [outcome for one in rounds for outcome in one]
+
     def part(name: str) -> Percentiles:
         return percentiles([float(str(outcome[name])) for outcome in outcomes])
 
     changed, total = (int(str(outcomes[0][name])) for name in ("bricks_changed", "bricks_total"))
-    return AdaptationTimes(part("prepare_ms"), part("blackout_ms"), part("total_ms"), changed, total)
+    blackouts = [[float(str(outcome["blackout_ms"])) for outcome in one] for one in rounds]
+    beside = beside_limit(DEATH, blackouts, deaths)
+    return AdaptationTimes(
+        part("prepare_ms"),
+        part("blackout_ms"),
+        part("total_ms"),
+        changed,
+        total,
+        limit=beside.limit,
+        ratio=beside.ratio,
+    )
 
 
 def _requests(record: RunRecord) -> dict[str, int]:

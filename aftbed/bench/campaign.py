@@ -2,27 +2,43 @@
 
 Everything counts, from the start of the workers to the last line in the ledger. `cpu_ms` is the CPU time of
 all processes of an experiment: it distinguishes a slow machine from one that has other work, too.
+
+Each round is a campaign of its own, with its own seed. The limit is what an experiment cannot do without:
+
+- on real processes, to fork as many processes as the graph has nodes, and the supervisor, and to wait for
+  their end, in as many processes side by side as the campaign has jobs;
+- in the simulator, to have the bare function answer as many requests as an experiment has, in one process.
+
+Both are in ms for each experiment, as `experiment_ms` is: with two jobs on two cores, it is half of what one
+experiment takes.
 """
 
 import os
 import resource
+import signal
 import tempfile
 import time
 from collections import Counter
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final, Literal, NamedTuple
 
-import msgspec
-
+from aftbed.bench.rounds import ROUNDS, InRounds, beside_limit, in_turn, shares
 from aftbed.campaign import runner
+from aftbed.campaign.experiment import Result
 from aftbed.campaign.plan import plan
 from aftbed.campaign.spec import FaultEntry, Spec, StopRule, System, check
+from aftbed.campaign.statistics import quantile
+from aftbed.core.errors import HarnessError
+from aftbed.ftm.compose import build
+from aftbed.runtime.unix import linux
+from aftbed.vehicle.aeb.function import default_application, sample_requests
 
+FORK_SECONDS_MAX: Final = 60.0
 CRASH: Final = FaultEntry("crash primary", "crash primary at server.exit nth {nth}", draw={"nth": (1, 90)})
 
 
-class CampaignResult(msgspec.Struct, frozen=True):
-    """The document of `aftbed bench campaign`; `cpu_ms` per experiment."""
+class CampaignResult(InRounds, frozen=True):
+    """The document of `aftbed bench campaign`; `cpu_ms` per experiment, `experiment_ms` the median round."""
 
     ftm: str
     placement: str
@@ -35,21 +51,47 @@ class CampaignResult(msgspec.Struct, frozen=True):
     seconds: float
     per_minute: int
     cpu_ms: float
+    experiment_ms: float
+
+
+class _Part(NamedTuple):
+    """A round: a campaign of some experiments."""
+
+    results: list[Result]
+    seconds: float
+    cpu_s: float
 
 
 def bench_campaign(
-    ftm: str, placement: str, runtime: Literal["unix", "sim"], experiments: int, jobs: int
+    ftm: str,
+    placement: str,
+    runtime: Literal["unix", "sim"],
+    experiments: int,
+    jobs: int,
+    *,
+    rounds: int = ROUNDS,
 ) -> CampaignResult:
-    """Carry out a campaign of one stratum. Raises ConfigError."""
+    """Carry out campaigns of one stratum, a round each. Raises ConfigError."""
+    share = shares(experiments, rounds)
     system = System(placements=(placement,), runtime=runtime)
-    spec = Spec("bench", (ftm,), (CRASH,), system=system, stop=StopRule(experiments))
-    check(spec)
-    planned = plan(spec)
-    with tempfile.TemporaryDirectory(prefix="aftbed-bench-") as folder:
-        began_s, began_cpu_s = time.monotonic(), _cpu_s()
-        asked = runner.CampaignRunOptions(Path(folder) / "campaign", jobs)
-        results = list(runner.run(planned, asked))
-        seconds, cpu_s = time.monotonic() - began_s, _cpu_s() - began_cpu_s
+    specs = [
+        Spec("bench", (ftm,), (CRASH,), system=system, stop=StopRule(count), seed=seed)
+        for seed, count in enumerate(share, 1)
+    ]
+    check(specs[0])
+    processes = len(build(ftm, placement).nodes) + 1
+
+    def limit(number: int) -> float:
+        if runtime == "unix":
+            return forks_ms(processes, share[number], jobs)
+        return requests_ms(system.requests, share[number])
+
+    found = in_turn(len(share), lambda number: _carried_out(specs[number], jobs), limit)
+    times = [1e3 * one.seconds / len(one.results) for one in found.figures]
+    name = f"fork and wait of {processes} processes" if runtime == "unix" else "its requests, bare"
+    beside = beside_limit(name, [[ms] for ms in times], [[ms] for ms in found.limits])
+    results = [result for one in found.figures for result in one.results]
+    seconds, cpu_s = sum(one.seconds for one in found.figures), sum(one.cpu_s for one in found.figures)
     return CampaignResult(
         ftm,
         placement,
@@ -62,7 +104,72 @@ def bench_campaign(
         seconds=round(seconds, 1),
         per_minute=round(60 * experiments / seconds),
         cpu_ms=round(cpu_s / experiments * 1e3, 1),
+        experiment_ms=round(quantile(times, 0.5), 2),
+        limit=beside.limit,
+        ratio=beside.ratio,
+        machine=found.machine,
     )
+
+
+def _carried_out(spec: Spec, jobs: int) -> _Part:
+    planned = plan(spec)
+    with tempfile.TemporaryDirectory(prefix="aftbed-bench-") as folder:
+        began_s, began_cpu_s = time.monotonic(), _cpu_s()
+        asked = runner.CampaignRunOptions(Path(folder) / "campaign", jobs)
+        results = list(runner.run(planned, asked))
+        seconds, cpu_s = time.monotonic() - began_s, _cpu_s() - began_cpu_s
+    if len(results) != spec.stop.experiments:
+        raise HarnessError(f"{len(results)} of {spec.stop.experiments} experiments have a result")
+    return _Part(results, seconds, cpu_s)
+
+
+def forks_ms(processes: int, times: int, jobs: int) -> float:
+    """Fork so many processes and wait for them, `times` times, by `jobs` processes: ms for each time.
+
+    Raises HarnessError if one of the jobs fails.
+    """
+    parent = os.getpid()
+    share = shares(times, jobs)
+    began_s = time.monotonic()
+    workers = [_fork_worker(parent, processes, count) for count in share]
+    statuses = [os.waitpid(worker, 0)[1] for worker in workers]
+    seconds = time.monotonic() - began_s
+    if any(statuses):
+        raise HarnessError(f"fork and wait: not done within {FORK_SECONDS_MAX:g} s, or no process was left")
+    return 1e3 * seconds / times
+
+
+def _fork_worker(parent: int, processes: int, times: int) -> int:
+    pid = os.fork()
+    if pid:
+        return pid
+    code = 1
+    try:
+        linux.die_with(parent)
+        signal.setitimer(signal.ITIMER_REAL, FORK_SECONDS_MAX)  # ends the process: the signal has no handler
+        for _ in range(times):
+            children = []
+            for _ in range(processes):
+                child = os.fork()
+                if child == 0:
+                    os._exit(0)
+                children.append(child)
+            for child in children:
+                os.waitpid(child, 0)
+        code = 0
+    finally:
+        os._exit(code)
+
+
+def requests_ms(requests: int, times: int) -> float:
+    """The bare built-in function answers so many requests, `times` times anew: ms for each time."""
+    sent = sample_requests(0, requests)
+    began_s = time.perf_counter()
+    for _ in range(times):
+        function = default_application()
+        for request in sent:
+            function.execute(request)
+    return 1e3 * (time.perf_counter() - began_s) / times
 
 
 def _cpu_s() -> float:

@@ -1,9 +1,10 @@
 """Cycle time at the client beside its limit, the bare ring; and the delay of one hop.
 
 **Ring.** No mechanism over processes and sockets can be faster: as many hops as a request takes through the
-mechanism, over the same kind of sockets, pinned alike, in the same language, but with a plain read and a
-plain write per hop, without bricks, decoding or journal. Cycle and ring are measured in turn in the same
-run.
+mechanism, over the same kind of sockets, under the same scheduling policy and pinned alike, in the same
+language, but with a plain read and a plain write per hop, without bricks, decoding or journal. Where the
+leader sends to its backup (a checkpoint under `pbr`), the ring's process in its place first writes a packet
+to a process on the backup's core, which reads and drops it. Cycle and ring are measured in turn (`rounds`).
 
 **Hop.** `bench_hops` reads the delay of one hop, as a distribution, from the journals of a run. All notes
 of a step carry the time at which the step began, on a clock common to all nodes. So the time between the
@@ -39,10 +40,24 @@ import os
 import socket
 import time
 from collections import Counter
-from typing import Final
+from collections.abc import Callable
+from functools import partial
+from typing import Final, NamedTuple
 
 import msgspec
 
+from aftbed.bench.rounds import (
+    ROUNDS,
+    InRounds,
+    MachineWatch,
+    Meanwhile,
+    as_node,
+    become_node,
+    beside_limit,
+    cores,
+    in_turn,
+    shares,
+)
 from aftbed.bench.runs import Percentiles, latencies_us, limited_run, percentiles
 from aftbed.campaign.statistics import quantile
 from aftbed.core.errors import HarnessError
@@ -57,10 +72,10 @@ from aftbed.judge.record import RunRecord
 from aftbed.runtime.unix import linux
 from aftbed.vehicle.aeb.function import sample_requests
 
-WARM_UP: Final = 200  # requests, and rounds of the ring
-ROUNDS: Final = 5
-RING_BYTES, RING_COUNT = 64, 300  # a packet and the rounds of `ring_p50_us`
+WARM_UP: Final = 200  # requests, and turns of the ring
+RING_BYTES, RING_COUNT = 64, 300  # a packet and the turns of `ring_p50_us`
 READ_BYTES_MAX: Final = 4096
+TURN_SECONDS_MAX: Final = 10.0  # of the ring
 assert READ_BYTES_MAX <= PACKET_BYTES_MAX
 
 # -- cycle ------------------------------------------------------------------------------------------
@@ -83,7 +98,7 @@ def hops(graph: Graph) -> int:
     return sum(a != b for a, b in itertools.pairwise(graph.node_of(name) for name in path(graph)))
 
 
-class CycleResult(msgspec.Struct, frozen=True):
+class CycleResult(InRounds, frozen=True):
     """The document of `aftbed bench cycle`; `ratio_p50` is the median of `ratio_rounds`."""
 
     ftm: str
@@ -106,94 +121,199 @@ def bench_cycle(
     application: str = "",
     given: GivenRequests | None = None,
 ) -> CycleResult:
-    """Cycle and ring in turn, `rounds` times; of a function of the user, and what it is sent, if given."""
-    wanted = hops(build(ftm, placement))
-    cpu = _pinned_cpu() if pin else None
+    """`count` requests in rounds with the ring; of a function of the user, and what it is sent, if given."""
+    shape = ring_of(build(ftm, placement))
     sent = given.requests if given is not None else sample_requests(0, 64, fixed=is_foreign(application))
     size = sum(map(len, sent)) // len(sent)
-    cycles: list[float] = []
-    ring: list[float] = []
-    ratios: list[float] = []
-    for _ in range(rounds):
-        share = -(-count // rounds)
-        bare = ring_us(wanted, size, share, cpu)
-        run = limited_run(ftm, placement, share + WARM_UP, pin=pin, application=application, given=given)
-        ours = latencies_us(run, skip=WARM_UP)
-        ratios.append(quantile(ours, 0.5) / quantile(bare, 0.5))
-        cycles += ours
-        ring += bare
+    share = shares(count, rounds)
+
+    def cycle(number: int) -> list[float]:
+        run = limited_run(
+            ftm, placement, share[number] + WARM_UP, pin=pin, application=application, given=given
+        )
+        return latencies_us(run, skip=WARM_UP)
+
+    found = in_turn(len(share), cycle, lambda number: ring_us(shape, size, share[number], pin=pin))
+    cycles, ring = ([us for one in values for us in one] for values in (found.figures, found.limits))
+    beside = beside_limit(shape.name, found.figures, found.limits, 1)
+    medians = [
+        quantile(ours, 0.5) / quantile(bare, 0.5)
+        for ours, bare in zip(found.figures, found.limits, strict=True)
+    ]
     return CycleResult(
         ftm,
         placement,
         len(cycles),
         percentiles(cycles, 1),
         percentiles(ring, 1),
-        wanted,
-        round(quantile(ratios, 0.5), 3),
-        tuple(round(ratio, 3) for ratio in ratios),
+        shape.hops,
+        beside.ratio.p50.median,
+        tuple(round(ratio, 3) for ratio in medians),
+        limit=beside.limit,
+        ratio=beside.ratio,
+        machine=found.machine,
     )
 
 
 # -- ring -------------------------------------------------------------------------------------------
 
 
+class RingShape(NamedTuple):
+    """`hops` channels in a ring, and the processes on it that send to the backup as well.
+
+    The process that starts the packet is number 0, the reader of the first channel number 1, and so on.
+    `beside`: the number of such a process, and the name of the backup's node that it sends to.
+    """
+
+    hops: int
+    beside: tuple[tuple[int, str], ...] = ()
+
+    @property
+    def name(self) -> str:
+        """`bare ring of 12 hops and 1 to the backup`."""
+        return f"bare ring of {self.hops} hops" + f" and {len(self.beside)} to the backup" * bool(self.beside)
+
+
+def ring_of(graph: Graph) -> RingShape:
+    """The ring of as many hops as a request takes through `graph`, its way to the backup included."""
+    visits: list[str] = []  # of nodes
+    last: dict[str, int] = {}  # visit of a brick: it sends to the backup in that one
+    for brick in path(graph):
+        node = graph.node_of(brick)
+        if not visits or visits[-1] != node:
+            visits.append(node)
+        last[brick] = len(visits) - 1
+    beside = []
+    for link in graph.links:
+        source, sink = graph.brick(link.source), graph.brick(link.sink)
+        crosses = source.replica and sink.replica and source.replica != sink.replica and not link.standby
+        if crosses and link.source in last and graph.node_of(link.source) != graph.node_of(link.sink):
+            beside.append((last[link.source], graph.node_of(link.sink)))
+    return RingShape(len(visits) - 1, tuple(sorted(beside)))
+
+
 def ring_p50_us(ftm: str, placement: str) -> float:
-    """The median round of a ring with as many hops as a request takes."""
-    hop_count = hops(build(ftm, placement))
-    return round(quantile(ring_us(hop_count, RING_BYTES, RING_COUNT, _pinned_cpu()), 0.5), 1)
+    """The median turn of a ring with as many hops as a request takes."""
+    return round(quantile(ring_us(ring_of(build(ftm, placement)), RING_BYTES, RING_COUNT), 0.5), 1)
 
 
-def _pinned_cpu() -> int | None:
-    """The core on which runs pin their chain: the first, if there are several."""
-    cpus = sorted(os.sched_getaffinity(0))
-    return cpus[0] if len(cpus) > 1 else None
+class RingWork(NamedTuple):
+    """What the ring does for a state with each packet to the backup.
+
+    Both are called once, in the processes that do the work. They return what is done each time: the leader's
+    makes the packet, the backup's takes it.
+    """
+
+    of_leader: Callable[[], Callable[[], bytes | memoryview]]
+    of_backup: Callable[[], Callable[[bytes], None]]
 
 
-def ring_us(hops: int, packet_bytes: int, count: int, cpu: int | None) -> list[float]:
-    """The times of `count` rounds (us) of a packet through `hops` channels, after a warm-up."""
-    before = os.sched_getaffinity(0)
-    if cpu is not None:
-        os.sched_setaffinity(0, {cpu})
-    pairs = [socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET) for _ in range(hops)]
+def ring_us(
+    shape: RingShape,
+    packet_bytes: int,
+    count: int,
+    *,
+    pin: bool = True,
+    warm_up: int = WARM_UP,
+    work: RingWork | None = None,
+) -> list[float]:
+    """The times of `count` turns (us) of a packet through the ring, after a warm-up; run as the nodes are.
+
+    Raises HarnessError if a packet does not come back.
+    """
+    here, there = cores(pin=pin)
+    packet = bytes(packet_bytes)
+    pairs = [_channel() for _ in range(shape.hops)]
+    backups = {node: _channel() for node in dict.fromkeys(node for _, node in shape.beside)}
+    ends = [end for pair in (*pairs, *backups.values()) for end in pair]
     parent = os.getpid()
-    children = [_node(parent, pairs, i) for i in range(hops - 1)]
+    children: list[int] = []
     try:
-        write_fd, read_fd = pairs[0][0].fileno(), pairs[-1][1].fileno()
-        packet, times = bytes(packet_bytes), []
-        for _ in range(WARM_UP + count):
-            began_ns = time.perf_counter_ns()
-            os.write(write_fd, packet)
-            os.read(read_fd, READ_BYTES_MAX)
-            times.append((time.perf_counter_ns() - began_ns) / 1e3)
-        return times[WARM_UP:]
+        for _, source in backups.values():
+            serve = partial(_take, source, work)
+            children.append(_forked(parent, there, ends, [source], serve))
+        for number in range(1, shape.hops):
+            source, sink = pairs[number - 1][1], pairs[number][0]
+            beside = [backups[node][0] for at, node in shape.beside if at == number]
+            serve = partial(_pass_on, source, sink, beside, packet, work)
+            children.append(_forked(parent, here, ends, [source, sink, *beside], serve))
+        ours = pairs[0][0], pairs[-1][1]
+        for end in set(ends) - set(ours):  # so the death of any of them ends the ring
+            end.close()
+        with as_node(here):
+            times = [_turn_us(*ours, packet) for _ in range(warm_up + count)]
+        return times[warm_up:]
     finally:
-        for write, read in pairs:
-            write.close()
-            read.close()
+        for end in ends:
+            end.close()
         for child in children:
             os.waitpid(child, 0)
-        os.sched_setaffinity(0, before)
 
 
-def _node(parent: int, pairs: list[tuple[socket.socket, socket.socket]], index: int) -> int:
-    """A process that passes on what it reads, until its channel is closed."""
+def _channel() -> tuple[socket.socket, socket.socket]:
+    pair = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    for end in pair:
+        linux.set_timeouts(end, TURN_SECONDS_MAX, TURN_SECONDS_MAX)
+    return pair
+
+
+def _turn_us(sink: socket.socket, source: socket.socket, packet: bytes) -> float:
+    write_fd, read_fd = sink.fileno(), source.fileno()
+    try:
+        began_ns = time.perf_counter_ns()
+        os.write(write_fd, packet)
+        back = os.read(read_fd, READ_BYTES_MAX)
+        ended_ns = time.perf_counter_ns()
+    except OSError as error:  # a timeout, too
+        raise HarnessError(f"the bare ring: {error.strerror}") from None
+    if not back and packet:
+        raise HarnessError("the bare ring: one of its processes died")
+    return (ended_ns - began_ns) / 1e3
+
+
+def _forked(
+    parent: int,
+    cpu: int | None,
+    ends: list[socket.socket],
+    keep: list[socket.socket],
+    serve: Callable[[], None],
+) -> int:
+    """Fork a process of the ring, which keeps only its own ends and dies with `parent`."""
     child = os.fork()
     if child:
         return child
     try:
         linux.die_with(parent)
-        source, sink = pairs[index][1].fileno(), pairs[index + 1][0].fileno()
-        for write, read in pairs:
-            for end in (write, read):
-                if end.fileno() not in (source, sink):
-                    end.close()
-        while True:
-            packet = os.read(source, READ_BYTES_MAX)
-            if not packet:
-                break
-            os.write(sink, packet)
+        become_node(cpu)
+        for end in set(ends) - set(keep):
+            end.close()
+        serve()
     finally:
         os._exit(0)
+
+
+def _pass_on(
+    source: socket.socket,
+    sink: socket.socket,
+    beside: list[socket.socket],
+    message: bytes,
+    work: RingWork | None,
+) -> None:
+    """Pass on what is read, until the channel is closed; before it, send to the backup."""
+    read_fd, write_fd, others = source.fileno(), sink.fileno(), [end.fileno() for end in beside]
+    make = work.of_leader() if work is not None and others else lambda: message
+    while packet := os.read(read_fd, READ_BYTES_MAX):
+        for other in others:
+            os.write(other, make())
+        os.write(write_fd, packet)
+
+
+def _take(source: socket.socket, work: RingWork | None) -> None:
+    """What the backup does with what is sent to it, until the channel is closed."""
+    read_fd = source.fileno()
+    take = work.of_backup() if work is not None else lambda packet: None
+    while packet := os.read(read_fd, PACKET_BYTES_MAX):
+        take(packet)
 
 
 # -- hops -------------------------------------------------------------------------------------------
@@ -241,6 +361,7 @@ class HopDelays(msgspec.Struct, frozen=True):
     quantiles_ns: tuple[int, ...]
     pairs: tuple[PairDelay, ...]
     beside: tuple[PairDelay, ...]
+    machine: Meanwhile
 
 
 def bench_hops(ftm: str, count: int, *, pin: bool = True) -> HopDelays:
@@ -249,7 +370,9 @@ def bench_hops(ftm: str, count: int, *, pin: bool = True) -> HopDelays:
     Raises HarnessError where the run ended early, or no run of RUNS_MAX went without an alarm.
     """
     pairs, beside = single_hops(build(ftm, PLACEMENT))
+    watch = MachineWatch()
     record = undisturbed(ftm, count + WARM_UP, pin=pin)
+    machine = watch.found()
     delays = {pair: delays_ns(record, pair, WARM_UP) for pair in (*pairs, *beside)}
     for (source, sink), found in delays.items():
         if len(found) != count:
@@ -268,6 +391,7 @@ def bench_hops(ftm: str, count: int, *, pin: bool = True) -> HopDelays:
         quantiles_ns=tuple(quantile(ordered, step / STEPS) for step in range(STEPS + 1)),
         pairs=tuple(map(delay, pairs)),
         beside=tuple(map(delay, beside)),
+        machine=machine,
     )
 
 

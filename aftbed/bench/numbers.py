@@ -1,9 +1,13 @@
 """`aftbed bench all`: every figure of docs/numbers.md in one table, by one command on one day.
 
 A line names the command that measures it. Each command is run once, in an interpreter of its own, as a user
-would start it; several lines may read its document. A figure stands beside its limit, which was measured by
-the same command or by that of another line. The speed of a machine changes from day to day, so what can be
-compared is the ratio of the two.
+would start it; several lines may read its document. A figure stands beside its limit. The speed of a machine
+changes from minute to minute, so what can be compared is the ratio of the two, and nearly every document has
+it: both were measured in turn (`rounds`). A figure that is compared with that of another line (`lfr` with
+`pbr`) was measured minutes apart from it.
+
+Of a ratio that a document has, the table shows as the p50 the median of the rounds with its quartiles, and
+the p99 over all rounds (`rounds.QuantileRatio`).
 """
 
 import datetime
@@ -15,6 +19,7 @@ from typing import Final
 
 import msgspec
 
+from aftbed.bench.rounds import Ratio
 from aftbed.bench.runs import Log, run_python, tried
 from aftbed.campaign.ledger import Environment, here
 from aftbed.campaign.plan import code_version
@@ -23,12 +28,12 @@ from aftbed.core.errors import ConfigError
 COMMAND_SECONDS_MAX: Final = 1200.0
 BEGIN, END = "<!-- numbers: begin -->", "<!-- numbers: end -->"  # of the table in a page
 QUICK: Final = {  # what makes a command short; too few samples to quote
-    "cycle": "--requests 200",
+    "cycle": "--requests 200 --rounds 2",
     "hops": "--requests 200",
     "recovery": "--kills 2",
     "adapt": "--adaptations 2",
     "launch": "--runs 1",
-    "campaign": "--experiments 4",
+    "campaign": "--experiments 4 --rounds 1",
     "state": "--rounds 1",
 }
 
@@ -36,7 +41,10 @@ Document = dict[str, object]
 
 
 class FigureLimit(msgspec.Struct, frozen=True):
-    """What a figure is compared with: the path in a document, of the same command if none is given."""
+    """What a figure is compared with: the path in a document, of the same command if none is given.
+
+    Without a name, it is the one that the document gives.
+    """
 
     name: str
     path: str
@@ -47,7 +55,8 @@ class TableLine(msgspec.Struct, frozen=True):
     """A line of the table. `figure` is a path in the document of `aftbed bench COMMAND`.
 
     `goal`: the greatest value of each quantile's ratio to the limit; without a limit, of the figure itself;
-    the least one where `more_is_better`. `ratio`: path of a ratio that the document has already.
+    the least one where `more_is_better`. `ratio`: path of a ratio that the document has, a `Ratio` or the
+    number of the p50; "": the quotient is made here, of what was measured minutes apart.
     """
 
     what: str
@@ -61,7 +70,7 @@ class TableLine(msgspec.Struct, frozen=True):
 
 
 def _cycle(what: str, options: str, limit: FigureLimit, **goal: float) -> TableLine:
-    ratio = "ratio_p50" if limit is RING else ""
+    ratio = OWN_RATIO if limit is OWN else ""
     return TableLine(what, f"cycle --ftm {options}", "cycle_us", "us", limit, ratio, goal)
 
 
@@ -70,15 +79,16 @@ def _cycle_of(ftm: str) -> FigureLimit:
 
 
 def _recovery(what: str, options: str) -> TableLine:
-    return TableLine(what, f"recovery {options}", "recovery_ms", "ms", DEATH, goal={"p50": 1.5, "p99": 3.0})
+    goal = {"p50": 1.5, "p99": 3.0}
+    return TableLine(what, f"recovery {options}", "recovery_ms", "ms", OWN, OWN_RATIO, goal)
 
 
 def _adaptation(what: str, options: str, **goal: float) -> tuple[TableLine, ...]:
     command = f"adapt {options}"
     kept = dict.fromkeys(("lost", "duplicated", "reordered", "wrong"), 0.0)
     return (
-        TableLine(f"{what}: no request is served for", command, "blackout_ms", "ms", DEATH, goal=goal),
-        TableLine("and back", command, "back.blackout_ms", "ms", DEATH, goal=goal),
+        TableLine(f"{what}: no request is served for", command, "blackout_ms", "ms", OWN, OWN_RATIO, goal),
+        TableLine("and back", command, "back.blackout_ms", "ms", OWN, f"back.{OWN_RATIO}", goal),
         TableLine("the requests meanwhile", command, "requests", goal=kept),
     )
 
@@ -92,15 +102,16 @@ def _state(what: str, options: str, **goal: float) -> TableLine:
 
 
 SMALL_STATE: Final = FigureLimit("the same with 10 kB", "beside_cycle_us")
-RING: Final = FigureLimit("bare ring of as many hops", "ring_us")
-DEATH: Final = FigureLimit("SIGKILL to a pidfd readable elsewhere", "death_ms", "recovery --ftm pbr")
-IMPORTS: Final = FigureLimit("import of its libraries", "imports_ms")
+OWN: Final = FigureLimit("", "limit")
+OWN_RATIO: Final = "ratio"
+LAUNCH: Final = "launch --ftm pbr"
 RECIPE: Final = "adapt --from pbr --to pbr+tr --recipe paper"
+SIM_CAMPAIGN: Final = "campaign --sim --experiments 4000"
 LINES: Final = (
-    _cycle("cycle under `pbr`, a process per brick", "pbr", RING, p50=1.35),
-    _cycle("cycle under `pbr`, a process per replica", "pbr --placement replica", RING, p50=2.0),
+    _cycle("cycle under `pbr`, a process per brick", "pbr", OWN, p50=1.35),
+    _cycle("cycle under `pbr`, a process per replica", "pbr --placement replica", OWN, p50=2.0),
     _cycle("the same beside a process per brick", "pbr --placement replica", _cycle_of("pbr"), p50=0.5),
-    _cycle("cycle of the bare server", "none", RING),
+    _cycle("cycle of the bare server", "none", OWN),
     _cycle("cycle under `lfr`", "lfr", _cycle_of("pbr"), p50=0.9),
     _cycle("cycle under `pbr+tr`", "pbr+tr", _cycle_of("pbr"), p50=1.8),
     _cycle("cycle under `lfr+tr`", "lfr+tr", _cycle_of("lfr"), p50=1.8),
@@ -111,9 +122,14 @@ LINES: Final = (
     _recovery("the same under `lfr`", "--ftm lfr"),
     *_adaptation("composition `pbr` to `pbr+tr`", "--from pbr --to pbr+tr", p50=1.2, p99=3.0),
     *_adaptation("switch `pbr` to `lfr`", "--from pbr --to lfr", p50=1.5, p99=4.0),
-    TableLine("the same by the paper's recipe (the paper: 300 ms)", RECIPE, "blackout_ms", "ms", DEATH),
+    TableLine(
+        "the same by the paper's recipe (the paper: 300 ms)", RECIPE, "blackout_ms", "ms", OWN, OWN_RATIO
+    ),
     TableLine("of these, never served again", RECIPE, "stuck"),
     _state("cycle under `pbr`, 1 MB of state, a page changed", "--bytes 1000000", p50=2.0),
+    TableLine(
+        "the same beside what the machine allows", "state --bytes 1000000", "cycle_us", "us", OWN, OWN_RATIO
+    ),
     TableLine(
         "update of a function with 1 MB of state: no request is served for",
         "state --bytes 1000000 --beside 1000",
@@ -125,13 +141,23 @@ LINES: Final = (
     ),
     _state("cycle under `pbr`, 10 MB of state, a page changed", "--bytes 10000000", p50=4.0),
     _state("the same, of a function that tells its changes", "--bytes 10000000 --tells-changes", p50=4.0),
-    TableLine("start of a run to a reply", "launch --ftm pbr", "launch_ms", "ms", IMPORTS, goal={"p50": 2}),
-    TableLine("the graph from a warm zygote", "launch --ftm pbr", "graph_ms", "ms", goal={"p50": 40}),
+    TableLine("start of a run to a reply", LAUNCH, "launch_ms", "ms", OWN, OWN_RATIO, {"p50": 2}),
+    TableLine(
+        "the page of `aftbed --help`",
+        LAUNCH,
+        "help.help_ms",
+        "ms",
+        FigureLimit("", "help.limit"),
+        "help.ratio",
+    ),
+    TableLine("the graph from a warm zygote", LAUNCH, "graph_ms", "ms", goal={"p50": 40}),
     TableLine("memory of the 17 processes (PSS)", "memory --ftm pbr", "pss_mb", "MB", goal={"": 70}),
     TableLine("beside them (PSS)", "memory --ftm pbr", "others.*.pss_mb", "MB"),
     _rate("experiments a minute on real processes, each a crash in 100 requests", "campaign", 600),
+    TableLine("time of one of them, two at a time", "campaign", "experiment_ms", "ms", OWN, OWN_RATIO),
     TableLine("CPU time of one of them", "campaign", "cpu_ms", "ms"),
-    _rate("experiments a minute in the simulator", "campaign --sim --experiments 4000", 3000),
+    _rate("experiments a minute in the simulator", SIM_CAMPAIGN, 3000),
+    TableLine("time of one of them, two at a time", SIM_CAMPAIGN, "experiment_ms", "ms", OWN, OWN_RATIO),
 )
 
 
@@ -139,7 +165,10 @@ LINES: Final = (
 
 
 class Number(msgspec.Struct, frozen=True):
-    """A line, measured. A figure without quantiles has the name "". `met`: None where there is no goal."""
+    """A line, measured. A figure without quantiles has the name "". `met`: None where there is no goal.
+
+    `quartiles` of the p50 of a ratio, and of how many rounds; none where the ratio is not one of rounds.
+    """
 
     what: str
     command: str
@@ -151,6 +180,8 @@ class Number(msgspec.Struct, frozen=True):
     goal: dict[str, float]
     more_is_better: bool
     met: bool | None
+    quartiles: tuple[float, float] | None = None
+    rounds: int | None = None
 
 
 class Numbers(msgspec.Struct, frozen=True):
@@ -189,13 +220,14 @@ def _measured(command: str) -> Document:
 
 def _number(line: TableLine, found: dict[str, Document]) -> Number:
     document, measured = found[line.command], figure_at(found[line.command], line.figure)
-    ratios, limit_p50 = {}, None
+    ratios: dict[str, float] = {}
+    limit_p50, limit_name, rounds = None, "", None
     if line.limit is not None:
-        limit_p50 = figure_at(found[line.limit.command or line.command], line.limit.path)["p50"]
-        names = dict.fromkeys(("p50", *line.goal))
-        ratios = {name: round(measured[name] / limit_p50, 2) for name in names}
-        if line.ratio:
-            ratios["p50"] = round(figure_at(document, line.ratio)[""], 2)
+        if list(measured) == [""]:
+            measured = {"p50": measured[""]}  # one value for each round: this is their median
+        limit = _at(found[line.limit.command or line.command], line.limit.path)
+        limit_p50, limit_name = figure_at(limit, "p50")[""], line.limit.name or str(_at(limit, "name"))
+        ratios, rounds = _ratios(line, document, measured, limit_p50)
     judged = ratios or measured
     kept = [judged[name] >= g if line.more_is_better else judged[name] <= g for name, g in line.goal.items()]
     return Number(
@@ -203,13 +235,38 @@ def _number(line: TableLine, found: dict[str, Document]) -> Number:
         f"aftbed bench {line.command}",
         line.unit,
         measured,
-        line.limit.name if line.limit is not None else "",
+        limit_name,
         limit_p50,
         ratios,
         line.goal,
         line.more_is_better,
         all(kept) if kept else None,
+        (round(rounds.p50.q1, 2), round(rounds.p50.q3, 2)) if rounds is not None else None,
+        rounds.rounds if rounds is not None else None,
     )
+
+
+def _ratios(
+    line: TableLine, document: Document, measured: dict[str, float], limit_p50: float
+) -> tuple[dict[str, float], Ratio | None]:
+    """Of the p50 and of what the goal names; and the ratio of rounds, if the document has one."""
+    names = dict.fromkeys(("p50", *line.goal))
+    quotients = {name: round(measured[name] / limit_p50, 2) for name in names}
+    if not line.ratio:
+        return quotients, None
+    own = _at(document, line.ratio)
+    if not isinstance(own, dict):
+        return quotients | {"p50": round(msgspec.convert(own, float), 2)}, None
+    rounds = msgspec.convert(own, Ratio)
+    in_rounds = {"p50": rounds.p50.median, "p99": rounds.p99.all}
+    return {name: round(in_rounds[name], 2) for name in names}, rounds
+
+
+def _at(document: object, path: str) -> object:
+    for key in path.split("."):
+        assert isinstance(document, dict), path
+        document = document[key]
+    return document
 
 
 def figure_at(document: object, path: str) -> dict[str, float]:
@@ -248,11 +305,19 @@ def markdown(found: Numbers) -> Iterator[str]:
             one.what,
             _words(one.measured, one.unit),
             limit,
-            _words(one.ratios),
+            _ratio_words(one),
             goal,
             f"`{one.command}`",
         )
         yield f"| {' | '.join(cells)} |"
+
+
+def _ratio_words(one: Number) -> str:
+    """`p50 1.5 (1.4 to 1.7), p99 3.1`."""
+    words = [f"{name} {value:g}" for name, value in one.ratios.items()]
+    if one.quartiles is not None:
+        words[0] += " ({:g} to {:g})".format(*one.quartiles)
+    return ", ".join(words)
 
 
 def _words(values: dict[str, float], unit: str = "") -> str:

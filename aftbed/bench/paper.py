@@ -41,6 +41,7 @@ from aftbed.bench.resources import (
     process_count,
     under_load,
 )
+from aftbed.bench.rounds import ROUNDS
 from aftbed.bench.runs import Found, Log, Percentiles, percentiles, tried
 from aftbed.bench.sweep import PLACEMENT, StateResult, sized, sweep_sizes
 from aftbed.campaign.ledger import Environment, here
@@ -226,7 +227,7 @@ class Effort(msgspec.Struct, frozen=True):
 FULL: Final = Effort(
     launches=10,
     requests=5000,
-    rounds=5,
+    rounds=ROUNDS,
     kills=30,
     adaptations=25,
     recipe_runs=5,

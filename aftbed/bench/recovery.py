@@ -4,7 +4,9 @@ Each kill takes the whole replica (all nodes of its chain), as the crash of an E
 waits until redundancy is back. Times are from the journals, whose clock is common to all processes.
 
 `death_ms` is the limit of any detection: from SIGKILL of a process to the moment at which another one that
-polls its pidfd sees that it is dead. It is measured in the same command, before and after the kills.
+polls its pidfd sees that it is dead. The victim runs as a node of the leader's chain does, the other one as
+a Watchdog does. Kills and deaths alternate: each round has a run of its own, and as many deaths as kills, but
+at least DEATHS_MIN.
 """
 
 import os
@@ -12,11 +14,12 @@ import select
 import signal
 import time
 from collections.abc import Callable
+from functools import partial
+from itertools import pairwise
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
-import msgspec
-
+from aftbed.bench.rounds import ROUNDS, InRounds, become_node, beside_limit, cores, in_turn, shares
 from aftbed.bench.runs import POLL_SECONDS, Percentiles, endless_run, percentiles, wait_for
 from aftbed.core.errors import HarnessError
 from aftbed.inject.crash import Crash
@@ -28,10 +31,12 @@ from aftbed.runtime.unix import control_client, linux
 REDUNDANCY_SECONDS_MAX: Final = 5.0
 PAUSE_SECONDS: Final = 0.02  # of undisturbed service between two kills
 DEATH_SECONDS_MAX: Final = 5.0
-DEATHS: Final = 25  # before the kills, and as many after them
+DEATHS_MIN: Final = 5  # in a round
+DEATH: Final = "SIGKILL to a pidfd readable elsewhere"
+PARTS: Final = ("detection", "fencing", "promotion", "first_reply")
 
 
-class RecoveryResult(msgspec.Struct, frozen=True):
+class RecoveryResult(InRounds, frozen=True):
     """The document of `aftbed bench recovery`; `after_detection_ms`: from the alarm on."""
 
     ftm: str
@@ -43,9 +48,42 @@ class RecoveryResult(msgspec.Struct, frozen=True):
     death_ms: Percentiles
 
 
-def bench_recovery(ftm: str, placement: str, kills: int, *, pin: bool = True) -> RecoveryResult:
+class _Recovery(NamedTuple):
+    """One of them (ms): the whole, and its parts in the order of PARTS."""
+
+    whole_ms: float
+    parts_ms: tuple[float, float, float, float]
+
+
+def bench_recovery(
+    ftm: str, placement: str, kills: int, *, pin: bool = True, rounds: int = ROUNDS
+) -> RecoveryResult:
     """Kill the primary `kills` times. Raises HarnessError."""
-    deaths = [death_ms() for _ in range(DEATHS)]
+    share = shares(kills, rounds)
+    found = in_turn(
+        len(share),
+        lambda number: _recoveries(ftm, placement, share[number], pin=pin),
+        lambda number: deaths_ms(share[number], pin=pin),
+    )
+    recoveries = [one for values in found.figures for one in values]
+    parts = {name: [one.parts_ms[n] for one in recoveries] for n, name in enumerate(PARTS)}
+    beside = beside_limit(DEATH, [[one.whole_ms for one in values] for values in found.figures], found.limits)
+    return RecoveryResult(
+        ftm,
+        placement,
+        kills,
+        percentiles([one.whole_ms for one in recoveries]),
+        percentiles([one.whole_ms - one.parts_ms[0] for one in recoveries]),
+        {name: percentiles(values) for name, values in parts.items()},
+        percentiles([ms for values in found.limits for ms in values]),
+        limit=beside.limit,
+        ratio=beside.ratio,
+        machine=found.machine,
+    )
+
+
+def _recoveries(ftm: str, placement: str, kills: int, *, pin: bool) -> list[_Recovery]:
+    """Of a run whose primary is killed so often."""
     with endless_run(ftm, placement, pin=pin) as run:
         epoch = 0
         for number in range(kills + 1):
@@ -55,28 +93,16 @@ def bench_recovery(ftm: str, placement: str, kills: int, *, pin: bool = True) ->
                 control_client.ask(
                     run.private, control_client.InjectCommand(Fault(Crash(), "primary", Trigger()))
                 )
-    deaths += [death_ms() for _ in range(DEATHS)]
-    parts: dict[str, list[float]] = {"detection": [], "fencing": [], "promotion": [], "first_reply": []}
-    recovered = []
+    found = []
     for f in failovers(run.record.history, run.record.faults):
         if f.detected_ms is None or f.fenced_ms is None or f.promoted_ms is None or f.recovered_ms is None:
             continue
-        recovered.append(f.recovered_ms)
-        parts["detection"].append(f.detected_ms)
-        parts["fencing"].append(f.fenced_ms - f.detected_ms)
-        parts["promotion"].append(f.promoted_ms - f.fenced_ms)
-        parts["first_reply"].append(f.recovered_ms - f.promoted_ms)
-    if len(recovered) < kills:
-        raise HarnessError(f"{kills} kills, but only {len(recovered)} recoveries in the journals")
-    return RecoveryResult(
-        ftm,
-        placement,
-        kills,
-        percentiles(recovered),
-        percentiles([r - d for r, d in zip(recovered, parts["detection"], strict=True)]),
-        {name: percentiles(values) for name, values in parts.items()},
-        percentiles(deaths),
-    )
+        times = (0.0, f.detected_ms, f.fenced_ms, f.promoted_ms, f.recovered_ms)
+        detection, fencing, promotion, first_reply = (after - before for before, after in pairwise(times))
+        found.append(_Recovery(f.recovered_ms, (detection, fencing, promotion, first_reply)))
+    if len(found) < kills:
+        raise HarnessError(f"{kills} kills, but only {len(found)} recoveries in the journals")
+    return found
 
 
 def _redundant_epoch(private: Path, after: int) -> int:
@@ -91,15 +117,21 @@ def _redundant_epoch(private: Path, after: int) -> int:
     return int(str(wait_for(private, reached, REDUNDANCY_SECONDS_MAX, "redundancy")["epoch"]))
 
 
-def death_ms() -> float:
+def deaths_ms(count: int, *, pin: bool) -> list[float]:
+    """Of so many processes, and at least of DEATHS_MIN. Raises HarnessError."""
+    return [death_ms(pin=pin) for _ in range(max(count, DEATHS_MIN))]
+
+
+def death_ms(*, pin: bool = True) -> float:
     """From SIGKILL of a process to its pidfd being readable in another process. Raises HarnessError."""
+    here, there = cores(pin=pin)
     parent = os.getpid()
     reader, writer = os.pipe()
     children = []
     try:
-        victim = _child(parent, signal.pause)
+        victim = _child(parent, partial(_be_victim, here))
         children.append(victim)
-        children.append(_child(parent, lambda: _watch_death(victim, writer)))
+        children.append(_child(parent, partial(_watch_death, victim, writer, there)))
         _read_time(reader)  # it is about to poll
         time.sleep(POLL_SECONDS)
         killed_ns = time.monotonic_ns()
@@ -125,8 +157,20 @@ def _child(parent: int, work: Callable[[], None]) -> int:
     return pid
 
 
-def _watch_death(victim: int, writer: int) -> None:
-    """Write the time when the watch begins, and the time of the death (monotonic ns, 8 bytes each)."""
+def _be_victim(cpu: int | None) -> None:
+    """As a node of the leader's chain that waits for a message."""
+    become_node(cpu)
+    signal.pause()
+
+
+def _watch_death(victim: int, writer: int, cpu: int | None) -> None:
+    """Write the time when the watch begins, and the time of the death (monotonic ns, 8 bytes each).
+
+    It runs as a Watchdog does: on another core than the victim, with short slices.
+    """
+    if cpu is not None:
+        os.sched_setaffinity(0, {cpu})
+    linux.use_short_slices()
     poll = select.poll()
     poll.register(os.pidfd_open(victim), select.POLLIN)
     os.write(writer, time.monotonic_ns().to_bytes(8, "little"))

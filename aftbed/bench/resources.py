@@ -14,7 +14,8 @@ sum over processes is honest.
 
 A start is measured as a user would make it, in an interpreter of its own: `launch_ms` to the first reply, and
 `graph_ms` of it from a warm zygote with parked spares to the answer of the last node. `imports_ms` is the
-limit: an interpreter that only imports the libraries that a run needs, started in turn with the command.
+limit: an interpreter that only imports the libraries that a run needs. The help page is measured with it,
+beside an interpreter that only imports typer. Each round starts all four once.
 """
 
 import json
@@ -22,11 +23,12 @@ import os
 import tempfile
 import time
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import msgspec
 
 from aftbed.bench.cycle import ring_p50_us
+from aftbed.bench.rounds import BesideLimit, InRounds, MachineWatch, Meanwhile, beside_limit, in_turn
 from aftbed.bench.runs import (
     STOPPED,
     Percentiles,
@@ -57,6 +59,7 @@ NO_CRASH: Final = "single"  # the placement in which both replicas die at once
 RUN_SECONDS_MAX: Final = 30.0
 # Without asammdf, which a run does not import either, wherever it is installed.
 IMPORTS: Final = "from aftbed.vehicle.can import python_can; import cantools, msgspec, typer"
+HELP_IMPORTS: Final = "import typer"
 
 
 class Usage(msgspec.Struct, frozen=True):
@@ -105,10 +108,12 @@ class MemoryResult(msgspec.Struct, frozen=True):
     pss_mb: float
     rss_mb: float
     others: dict[str, MemoryOfOthers]
+    machine: Meanwhile
 
 
 def bench_memory(ftm: str, placement: str) -> MemoryResult:
     """Of a car's drive, when it has settled. Raises HarnessError."""
+    watch = MachineWatch()
     options, listener = options_for(ftm=ftm, placement=placement, work=CarRun("free-drive", 1.0, "latch"))
     launched = launch(options, listener)
     try:
@@ -127,7 +132,8 @@ def bench_memory(ftm: str, placement: str) -> MemoryResult:
             found.processes += 1
             found.pss_mb = round(found.pss_mb + row.pss_mb, 1)
     pss_mb, rss_mb = sum(row.pss_mb for row in nodes), sum(row.rss_mb for row in nodes)
-    return MemoryResult(ftm, placement, len(nodes), round(pss_mb, 1), round(rss_mb, 1), others)
+    sizes = round(pss_mb, 1), round(rss_mb, 1)
+    return MemoryResult(ftm, placement, len(nodes), *sizes, others, watch.found())
 
 
 def process_count(ftm: str, placement: str) -> int:
@@ -210,8 +216,14 @@ class StartTime(msgspec.Struct, frozen=True):
     max: float
 
 
-class LaunchResult(msgspec.Struct, frozen=True):
-    """The document of `aftbed bench launch`."""
+class HelpResult(BesideLimit, frozen=True):
+    """Of `aftbed --help`; the limit is `python -c "import typer"`."""
+
+    help_ms: StartTime
+
+
+class LaunchResult(InRounds, frozen=True):
+    """The document of `aftbed bench launch`; `ratio` is that of `launch_ms`."""
 
     ftm: str
     placement: str
@@ -219,13 +231,52 @@ class LaunchResult(msgspec.Struct, frozen=True):
     launch_ms: StartTime
     graph_ms: StartTime
     imports_ms: StartTime
+    help: HelpResult
+
+
+class _Start(NamedTuple):
+    """Of the command up to the first reply, of its graph alone, and of the help page (ms)."""
+
+    launch_ms: float
+    graph_ms: float
+    help_ms: float
 
 
 def bench_launch(ftm: str, placement: str, runs: int) -> LaunchResult:
-    """Start `aftbed run` so many times. Raises HarnessError."""
-    starts = [(*_launched_ms(ftm, placement), _imported_ms()) for _ in range(runs)]
-    times = [StartTime(round(quantile(ms, 0.5), 1), round(max(ms), 1)) for ms in zip(*starts, strict=True)]
-    return LaunchResult(ftm, placement, runs, *times)
+    """Start `aftbed run` and its help page so many times, a round each. Raises HarnessError."""
+
+    def start(number: int) -> _Start:
+        return _Start(*_launched_ms(ftm, placement), _python_ms("-m", "aftbed", "--help"))
+
+    def limits(number: int) -> tuple[float, float]:
+        return _python_ms("-c", IMPORTS), _python_ms("-c", HELP_IMPORTS)
+
+    found = in_turn(runs, start, limits)
+    launches, graphs, helps = ([one[n] for one in found.figures] for n in range(3))
+    imports, typers = ([one[n] for one in found.limits] for n in range(2))
+    beside = beside_limit("import of its libraries", _alone(launches), _alone(imports))
+    beside_help = beside_limit("import of typer", _alone(helps), _alone(typers))
+    return LaunchResult(
+        ftm,
+        placement,
+        runs,
+        _start_time(launches),
+        _start_time(graphs),
+        _start_time(imports),
+        HelpResult(_start_time(helps), limit=beside_help.limit, ratio=beside_help.ratio),
+        limit=beside.limit,
+        ratio=beside.ratio,
+        machine=found.machine,
+    )
+
+
+def _alone(values: list[float]) -> list[list[float]]:
+    """Rounds of one value each."""
+    return [[value] for value in values]
+
+
+def _start_time(values: list[float]) -> StartTime:
+    return StartTime(round(quantile(values, 0.5), 1), round(max(values), 1))
 
 
 def _launched_ms(ftm: str, placement: str) -> tuple[float, float]:
@@ -245,7 +296,8 @@ def _launched_ms(ftm: str, placement: str) -> tuple[float, float]:
     return (first_ns - began_ns) / 1e6, float(graph_ms)
 
 
-def _imported_ms() -> float:
+def _python_ms(*arguments: str) -> float:
+    """How long an interpreter with these arguments takes."""
     began_ns = time.monotonic_ns()
-    run_python(["-c", IMPORTS], RUN_SECONDS_MAX)
+    run_python(list(arguments), RUN_SECONDS_MAX)
     return (time.monotonic_ns() - began_ns) / 1e6

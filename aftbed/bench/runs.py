@@ -1,10 +1,12 @@
 """Runs under a synthetic load, without a car, and the times in their records: what the benches share."""
 
 import contextlib
+import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Final, TypeVar
 
@@ -15,7 +17,7 @@ from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.core.events import Event
 from aftbed.functions.request_file import GivenRequests
 from aftbed.judge.record import RunRecord, read_record
-from aftbed.runtime.unix import control_client
+from aftbed.runtime.unix import control_client, linux
 from aftbed.runtime.unix.launch import Launched, launch, options_for
 from aftbed.runtime.unix.options import LoadRun
 
@@ -56,17 +58,43 @@ def tried(what: str, measure: Callable[[], Found], log: Log) -> Found:
     raise HarnessError(f"{what}: failed {TRIES} times, the last time: {reason}")
 
 
-def run_python(arguments: list[str], seconds_max: float) -> bytes:
-    """The output of an interpreter with `arguments`. Raises HarnessError on a failure or a timeout."""
+class CommandFailedError(HarnessError):
+    """An interpreter that ended with another exit code than 0."""
+
+    def __init__(self, command: str, code: int, last_words: str) -> None:
+        super().__init__(f"{command}: exit code {code}: {last_words}")
+        self.code, self.last_words = code, last_words
+
+
+def run_python(
+    arguments: list[str],
+    seconds_max: float,
+    *,
+    python: str = sys.executable,
+    folder: str | None = None,
+    environment: Mapping[str, str] | None = None,
+) -> bytes:
+    """The output of an interpreter with `arguments`, which dies with this process.
+
+    Raises CommandFailedError on a failure, HarnessError on a timeout.
+    """
     command = " ".join(["python", *arguments])
     try:
         done = subprocess.run(
-            [sys.executable, *arguments], capture_output=True, timeout=seconds_max, check=False
+            [python, *arguments],
+            capture_output=True,
+            timeout=seconds_max,
+            check=False,
+            cwd=folder,
+            env=environment,
+            preexec_fn=partial(linux.die_with, os.getpid()),
         )
     except subprocess.TimeoutExpired:
         raise HarnessError(f"{command}: not ended after {seconds_max:g} s") from None
     if done.returncode != 0:
-        raise HarnessError(f"{command}: exit code {done.returncode}: {done.stderr.decode()[-500:].strip()}")
+        raise CommandFailedError(
+            command, done.returncode, done.stderr.decode(errors="replace")[-500:].strip()
+        )
     return done.stdout
 
 

@@ -5,11 +5,19 @@ replace each other. This moves the whole state on both replicas while the client
 blackout. The cycle is measured in a closed loop after the last update. Under `pbr` the state goes into each
 checkpoint; under `lfr` it never leaves its replica, except for an update.
 
+The limit of a cycle under a state is the bare ring (`cycle`), with what the machine allows for the state.
+Its process in the leader's place copies as many bytes into a memfd as are captured for a checkpoint, compares
+them with the last ones, and sends what changed, a page. The process in the backup's place copies the state
+with this page into a memfd, and back out of it. A function that tells its changes is not captured: a page is
+all that is copied then. Under `lfr` no checkpoint is made, so its limit is the ring alone.
+
 If a mechanism does not carry a size, that is a result and no failure of the bench: the row has the reason,
 and larger sizes are not tried under that mechanism. (A message over PACKET_BYTES_MAX travels as a memfd; in a
 closed loop a backup may be so many of them behind that it cannot be brought to rest in time.)
 """
 
+import mmap
+import os
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -20,7 +28,8 @@ import msgspec
 from aftbed.adapt.planner import APPLICATION
 from aftbed.bench import ballast
 from aftbed.bench.adaptation import adapted
-from aftbed.bench.cycle import ring_p50_us
+from aftbed.bench.cycle import RING_BYTES, RingWork, path, ring_of, ring_p50_us, ring_us
+from aftbed.bench.rounds import ROUNDS, InRounds, beside_limit, in_turn
 from aftbed.bench.runs import (
     PAUSE_SECONDS,
     Percentiles,
@@ -31,13 +40,17 @@ from aftbed.bench.runs import (
 )
 from aftbed.campaign.statistics import quantile
 from aftbed.core.errors import ConfigError, HarnessError
+from aftbed.core.events import Event
 from aftbed.core.messages import PACKET_BYTES_MAX, Goal
+from aftbed.ftm.compose import build
+from aftbed.ftm.pages import PAGE_BYTES
+from aftbed.ftm.registry import BRICKS
 
 PLACEMENT: Final = "process"
 REPLIES_MIN: Final = 5
-ROUNDS: Final = 11  # of two sizes in turn
 UPDATES: Final = 2  # in a round
 WINDOW_SECONDS: Final = 0.5  # of a closed loop in a round
+RING_COUNT, RING_WARM_UP = 100, 20  # turns in a round
 _AROUND_BYTES: Final = 1024  # of a message, beside the state in it
 
 
@@ -69,8 +82,11 @@ def sweep_sizes(
     return found
 
 
-class StateRatio(msgspec.Struct, frozen=True):
-    """The document of `aftbed bench state`: one size beside another, in turn; ratios of the medians."""
+class StateRatio(InRounds, frozen=True):
+    """The document of `aftbed bench state`: one size beside another, in turn; ratios of the medians.
+
+    `limit` and `ratio` are those of `cycle_us`.
+    """
 
     ftm: str
     state_bytes: int
@@ -92,31 +108,98 @@ def bench_state(
 
     One page changes with each request. `tracked`: the function tells its changes. Raises HarnessError.
     """
-    cycles: dict[int, list[float]] = {size_bytes: [], beside_bytes: []}
-    blackouts: dict[int, list[float]] = {size_bytes: [], beside_bytes: []}
-    ratios = []
-    for _ in range(rounds):
-        medians = []
-        for size in (beside_bytes, size_bytes):
-            measured = _window(ftm, size, UPDATES, WINDOW_SECONDS, tracked=tracked)
-            cycles[size] += measured.cycles_us
-            blackouts[size] += measured.blackouts_ms
-            medians.append(quantile(measured.cycles_us, 0.5))
-        ratios.append(medians[1] / medians[0])
-    blackout, beside = percentiles(blackouts[size_bytes]), percentiles(blackouts[beside_bytes])
+    shape = ring_of(build(ftm, PLACEMENT))
+    moved_bytes = captured_bytes(ftm, size_bytes, tracked=tracked)
+    work = state_work(moved_bytes) if moved_bytes else None
+
+    def both(number: int) -> tuple[_Window, _Window]:
+        sizes = (beside_bytes, size_bytes)
+        first, second = (
+            _window(ftm, size, UPDATES, WINDOW_SECONDS, tracked=tracked)
+            for size in (sizes if number % 2 == 0 else reversed(sizes))
+        )
+        return (first, second) if number % 2 == 0 else (second, first)
+
+    def limit(number: int) -> list[float]:
+        return ring_us(shape, RING_BYTES, RING_COUNT, warm_up=RING_WARM_UP, work=work)
+
+    found = in_turn(rounds, both, limit)
+    small, large = ([one[n] for one in found.figures] for n in range(2))
+    beside_cycles, cycles = ([us for one in windows for us in one.cycles_us] for windows in (small, large))
+    beside_blackout, blackout = (
+        percentiles([ms for one in windows for ms in one.blackouts_ms]) for windows in (small, large)
+    )
+    ratios = [
+        quantile(one.cycles_us, 0.5) / quantile(other.cycles_us, 0.5)
+        for one, other in zip(large, small, strict=True)
+    ]
+    name = shape.name + f", memcpy of {moved_bytes} bytes through memfds" * bool(moved_bytes)
+    beside = beside_limit(name, [one.cycles_us for one in large], found.limits, 1)
     return StateRatio(
         ftm,
         size_bytes,
         beside_bytes,
         tracked,
-        percentiles(cycles[size_bytes], 1),
-        percentiles(cycles[beside_bytes], 1),
+        percentiles(cycles, 1),
+        percentiles(beside_cycles, 1),
         round(quantile(ratios, 0.5), 3),
         tuple(round(ratio, 3) for ratio in ratios),
         blackout,
-        beside,
-        round(blackout.p50 / beside.p50, 3),
+        beside_blackout,
+        round(blackout.p50 / beside_blackout.p50, 3),
+        limit=beside.limit,
+        ratio=beside.ratio,
+        machine=found.machine,
     )
+
+
+def captured_bytes(ftm: str, size_bytes: int, *, tracked: bool) -> int:
+    """How many bytes of a state are copied for a checkpoint of one changed page; 0: none is made."""
+    graph = build(ftm, PLACEMENT)
+    if not any(Event.CHECKPOINT_SENT in BRICKS[graph.brick(name).kind].visits for name in path(graph)):
+        return 0
+    return min(size_bytes, PAGE_BYTES) if tracked else size_bytes
+
+
+def state_work(moved_bytes: int) -> RingWork:
+    """What the ring does for a checkpoint of a state of which so many bytes are captured."""
+    page_bytes = min(moved_bytes, PAGE_BYTES)
+
+    def of_leader() -> Callable[[], memoryview]:
+        state, last, copy = bytearray(moved_bytes), bytearray(moved_bytes), _memfd(moved_bytes)
+        view, page, last_page = memoryview(state), copy[-page_bytes:], memoryview(last)[-page_bytes:]
+
+        def checkpoint() -> memoryview:
+            state[-1] = (state[-1] + 1) % 256  # in the last page, so that all bytes are compared
+            copy[:] = view
+            assert last != copy
+            last_page[:] = page
+            return page
+
+        return checkpoint
+
+    def of_backup() -> Callable[[bytes], None]:
+        state, copy = memoryview(bytearray(moved_bytes)), _memfd(moved_bytes)
+        page = copy[-page_bytes:]
+
+        def restore(packet: bytes) -> None:
+            copy[:] = state
+            page[:] = packet
+            state[:] = copy
+
+        return restore
+
+    return RingWork(of_leader, of_backup)
+
+
+def _memfd(size_bytes: int) -> memoryview:
+    """Of shared memory without a name, mapped."""
+    descriptor = os.memfd_create("aftbed-bench")
+    try:
+        os.ftruncate(descriptor, size_bytes)
+        return memoryview(mmap.mmap(descriptor, size_bytes))
+    finally:
+        os.close(descriptor)
 
 
 def sized(ftm: str, size_bytes: int, updates: int, seconds: float) -> StateResult:

@@ -6,7 +6,7 @@ imported where it is used.
 
 import sys
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Final, Literal
 
 import msgspec
 import typer
@@ -15,6 +15,7 @@ from aftbed.bench.adaptation import bench_adapt
 from aftbed.bench.cycle import bench_cycle, bench_hops
 from aftbed.bench.recovery import bench_recovery
 from aftbed.bench.resources import bench_launch, bench_memory
+from aftbed.bench.rounds import ROUNDS, text
 from aftbed.cli.options import App, Ftm, Recipe, check_range, print_json
 from aftbed.cli.parsing import PlainGroup
 from aftbed.cli.request_options import RequestSource
@@ -31,6 +32,9 @@ PROGRESS: Final = "  measuring: "
 
 Placement = Annotated[str, typer.Option(help="process, replica or single.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document.")]
+Rounds = Annotated[
+    int, typer.Option(min=1, help=f"Of figure and limit in turn; below {ROUNDS} they are too few to quote.")
+]
 Pin = Annotated[bool, typer.Option(help="Keep each replica's chain on one core.")]
 
 
@@ -44,6 +48,7 @@ def cycle(
         str | None, typer.Option(help="What --app is sent: FILE (CSV, JSON lines) or MODULE:FUNCTION.")
     ] = None,
     pin: Pin = True,
+    rounds: Rounds = ROUNDS,
     json: Json = False,
 ) -> None:
     """Cycle time at the client, alternating with a bare ring of the same number of hops."""
@@ -52,7 +57,9 @@ def cycle(
         count = SENT_FUNCTION if names_function(sent) else None
         source = RequestSource(sent, count=count, count_max=REQUESTS_MAX, expect=None, tolerance=None)
         given = source.of(0)
-    result = bench_cycle(ftm, placement, requests, pin=pin, application=application, given=given)
+    result = bench_cycle(
+        ftm, placement, requests, pin=pin, rounds=rounds, application=application, given=given
+    )
     _print(result, as_json=json)
 
 
@@ -60,11 +67,12 @@ def cycle(
 def recovery(
     ftm: Ftm = "pbr",
     placement: Placement = "process",
-    kills: Annotated[int, typer.Option(min=KILLS_MIN, help="How often the primary is killed.")] = 50,
+    kills: Annotated[int, typer.Option(min=KILLS_MIN, help="How often the primary is killed.")] = 110,
     pin: Pin = True,
+    rounds: Rounds = ROUNDS,
     json: Json = False,
 ) -> None:
-    """From SIGKILL of the primary to the next good reply, by its parts."""
+    """From SIGKILL of the primary to the next good reply, by its parts; beside what the kernel takes."""
     if not replication_of(ftm):
         raise ConfigError(
             f"--ftm {ftm}: one replica does not recover; {' and '.join(DUPLEX)} do, and X+Y of them"
@@ -73,7 +81,7 @@ def recovery(
         raise ConfigError(
             "--placement single: both replicas die with their node; process and replica are allowed"
         )
-    _print(bench_recovery(ftm, placement, kills, pin=pin), as_json=json)
+    _print(bench_recovery(ftm, placement, kills, pin=pin, rounds=rounds), as_json=json)
 
 
 @bench.command()
@@ -82,22 +90,23 @@ def adapt(
     new: Annotated[str, typer.Option("--to", help="The mechanism it is adapted to.")] = "pbr+tr",
     placement: Placement = "process",
     recipe: Recipe = "drained",
-    adaptations: Annotated[int, typer.Option(min=1, help="There; as many lead back.")] = 50,
+    adaptations: Annotated[int, typer.Option(min=1, help="There; as many lead back.")] = 55,
     pin: Pin = True,
+    rounds: Rounds = ROUNDS,
     json: Json = False,
 ) -> None:
     """Adaptations there and back under load: the blackout at the client, and what is lost."""
-    _print(bench_adapt(old, new, placement, recipe, adaptations, pin=pin), as_json=json)
+    _print(bench_adapt(old, new, placement, recipe, adaptations, pin=pin, rounds=rounds), as_json=json)
 
 
 @bench.command()
 def launch(
     ftm: Ftm = "pbr",
     placement: Placement = "process",
-    runs: Annotated[int, typer.Option(min=1)] = 10,
+    runs: Annotated[int, typer.Option(min=1, help="Each is a round with its limit.")] = ROUNDS,
     json: Json = False,
 ) -> None:
-    """From the start of `aftbed run` to the first reply; and the graph alone, from a warm zygote."""
+    """From the start of `aftbed run` to the first reply, the graph alone, and the page of --help."""
     _print(bench_launch(ftm, placement, runs), as_json=json)
 
 
@@ -114,12 +123,14 @@ def campaign(
     sim: Annotated[bool, typer.Option("--sim", help="In the simulator.")] = False,
     experiments: Annotated[int, typer.Option(min=1, help="Each with a crash of the primary.")] = 400,
     jobs: Annotated[int, typer.Option(min=1, help="Processes side by side.")] = 2,
+    rounds: Rounds = ROUNDS,
     json: Json = False,
 ) -> None:
     """Experiments per minute: 100 requests and one crash each, verdict included."""
     from aftbed.bench.campaign import bench_campaign  # noqa: PLC0415 - see above
 
-    _print(bench_campaign(ftm, placement, "sim" if sim else "unix", experiments, jobs), as_json=json)
+    runtime: Literal["unix", "sim"] = "sim" if sim else "unix"
+    _print(bench_campaign(ftm, placement, runtime, experiments, jobs, rounds=rounds), as_json=json)
 
 
 @bench.command()
@@ -130,7 +141,7 @@ def state(
     tells_changes: Annotated[
         bool, typer.Option("--tells-changes", help="The function knows what it has changed.")
     ] = False,
-    rounds: Annotated[int, typer.Option(min=1, help="Of both sizes in turn.")] = 11,
+    rounds: Rounds = ROUNDS,
     json: Json = False,
 ) -> None:
     """The cycle under a large state beside a small one, a page of it changed; the blackout of an update."""
@@ -160,6 +171,7 @@ def hops(
     for pair in (*found.pairs, *found.beside):
         apart = "  (not used: sends more)" if pair in found.beside else ""
         print(f"p50 {pair.p50_ns / 1e3:9.2f} us  {pair.source} -> {pair.sink}{apart}")
+    print("\n".join(text({"machine": found.machine})))
 
 
 @bench.command()
@@ -211,6 +223,35 @@ def every(
 
 
 @bench.command()
+def compare(
+    old: Annotated[Path, typer.Argument(metavar="OLD_VENV", help="A venv with the version of before.")],
+    new: Annotated[Path, typer.Argument(metavar="NEW_VENV", help="A venv with the version of now.")],
+    benches: Annotated[
+        list[str] | None,
+        typer.Option("--bench", help="What follows `aftbed bench`, in quotes; may be given several times."),
+    ] = None,
+    rounds: Annotated[int, typer.Option(min=1, help="Of both in turn; at least 6 for an interval.")] = ROUNDS,
+    max_ratio: Annotated[
+        float | None, typer.Option(help="Exit code 1 if a ratio new / old is above it with 95 % confidence.")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Two installed versions in turn: is the new one slower? Each ratio with its interval."""
+    from aftbed.bench import compare as versions  # noqa: PLC0415 - campaigns, see above
+
+    if max_ratio is not None and not 0 < max_ratio < float("inf"):
+        raise ConfigError(f"--max-ratio {max_ratio:g}: more than 0 is allowed, 1.05 for 5 % slower")
+    given = tuple(benches) if benches else versions.DEFAULT
+    found = versions.bench_compare(old, new, given, _show_progress, rounds=rounds)
+    if json:
+        print_json(found)
+    else:
+        print("\n".join(versions.lines(found)))
+    if max_ratio is not None and versions.above(found, max_ratio):
+        raise typer.Exit(1)
+
+
+@bench.command()
 def paper(
     quick: Annotated[bool, typer.Option("--quick", help="Half a minute: too few samples to quote.")] = False,
     html: Annotated[Path | None, typer.Option(help="Write a page with plots to this file.")] = None,
@@ -243,7 +284,5 @@ def _show_progress(what: str) -> None:
 def _print(document: msgspec.Struct, *, as_json: bool) -> None:
     if as_json:
         print_json(document)
-        return
-    for key, value in msgspec.to_builtins(document).items():
-        parts = value.items() if isinstance(value, dict) else [("", value)]
-        print(f"{key:14} " + "  ".join(f"{name} {part}".strip() for name, part in parts))
+    else:
+        print("\n".join(text(document)))

@@ -118,8 +118,9 @@ def test_what_a_person_reads(home: Home) -> None:
     lines = done.out.splitlines()
     assert lines[0].split() == ["ftm", "pbr"]
     assert [line.split()[0] for line in lines[3:10]] == ["p1", "p10", "p50", "p90", "p99", "p99.9", "max"]
-    shown = [line.partition(" us  ")[2].partition("  (")[0] for line in lines[10:]]
+    shown = [line.partition(" us  ")[2].partition("  (")[0] for line in lines[10:-1]]
     assert [tuple(pair.split(" -> ")) for pair in shown] == PBR_PAIRS + PBR_BESIDE
+    assert lines[-1].split()[0] == "machine"
 
 
 @pytest.mark.process

@@ -26,31 +26,40 @@ from aftbed.bench.numbers import (
 from aftbed.core.errors import ConfigError, HarnessError
 
 TIMES: Final = {"p50": 2.0, "p95": 3.0, "p99": 4.0, "max": 5.0}
+RATIO: Final = {
+    "p50": {"median": 1.234, "q1": 1.111, "q3": 1.456, "all": 1.3},
+    "p99": {"median": 2.0, "q1": 1.9, "q3": 2.5, "all": 2.345},
+    "rounds": 11,
+}
+BESIDE: Final = {"limit": {**TIMES, "p50": 1.0, "name": "the limit"}, "ratio": RATIO}
 DOCUMENTS: Final[dict[str, Document]] = {  # by the first word of a command
-    "cycle": {"cycle_us": TIMES, "ring_us": {"p50": 1.0}, "ratio_p50": 1.234},
+    "cycle": {"cycle_us": TIMES, **BESIDE},
     "hops": {"hop_ns": {"p1": 5, "p50": 9}},
     "recovery": {
         "recovery_ms": TIMES,
-        "death_ms": {"p50": 2.5},
+        **BESIDE,
         "parts_ms": {"detection": TIMES, "fencing": TIMES},
     },
     "adapt": {
         "blackout_ms": TIMES,
-        "back": {"blackout_ms": TIMES},
+        **BESIDE,
+        "back": {"blackout_ms": TIMES, "ratio": RATIO | {"rounds": 7}},
         "requests": {"sent": 100, "lost": 1, "duplicated": 0, "reordered": 0, "wrong": 0},
         "stuck": 2,
     },
     "launch": {
         "launch_ms": {"p50": 700, "max": 800},
         "graph_ms": {"p50": 38, "max": 40},
-        "imports_ms": {"p50": 200},
+        **BESIDE,
+        "help": {"help_ms": {"p50": 150, "max": 160}, **BESIDE},
     },
     "memory": {"pss_mb": 80.0, "others": {"zygote": {"processes": 2, "pss_mb": 20.0}}},
-    "campaign": {"per_minute": 700, "cpu_ms": 230},
+    "campaign": {"per_minute": 700, "cpu_ms": 230, "experiment_ms": 90.5, **BESIDE},
     "state": {
         "cycle_us": TIMES,
         "beside_cycle_us": {"p50": 1.5},
         "ratio_p50": 1.3,
+        **BESIDE,
         "blackout_ms": TIMES,
         "beside_blackout_ms": {"p50": 0.5},
         "blackout_ratio_p50": 4.0,
@@ -82,7 +91,7 @@ def test_each_command_is_run_once() -> None:
 def test_a_quick_run_measures_less() -> None:
     logged: list[str] = []
     found = bench_all(logged.append, quick=True, measure=fake)
-    assert logged[0] == "aftbed bench cycle --ftm pbr --requests 200"
+    assert logged[0] == "aftbed bench cycle --ftm pbr --requests 200 --rounds 2"
     assert found.quick and found.numbers[0].command == "aftbed bench cycle --ftm pbr"
     assert set(QUICK) <= set(DOCUMENTS)
 
@@ -110,9 +119,28 @@ def test_a_cycle_stands_beside_that_of_another_mechanism() -> None:
     assert found.ratios == {"p50": 1.0} and found.met is False
 
 
-def test_a_recovery_stands_beside_the_death_that_the_kernel_reports() -> None:
-    assert line("SIGKILL").ratios == {"p50": 0.8, "p99": 1.6}
+def test_the_ratio_is_that_of_the_document_and_its_p99_is_over_all_rounds() -> None:
+    found = line("SIGKILL")
+    assert found.limit == "the limit" and found.limit_p50 == 1.0
+    assert found.ratios == {"p50": 1.23, "p99": 2.35} and found.met
+    assert (found.quartiles, found.rounds) == ((1.11, 1.46), 11)
+    assert line("and back").rounds == 7
     assert line("its parts").measured == {"detection": 2.0, "fencing": 2.0}
+
+
+def test_a_ratio_of_two_commands_has_no_rounds() -> None:
+    found = line("cycle under `lfr`", "--ftm lfr")
+    assert found.quartiles is None and found.rounds is None
+
+
+def test_a_ratio_to_another_size_is_a_number_of_its_own() -> None:
+    found = line("cycle under `pbr`, 1 MB")
+    assert found.ratios == {"p50": 1.3} and found.limit == "the same with 10 kB" and found.limit_p50 == 1.5
+
+
+def test_a_figure_of_one_value_a_round_stands_beside_its_limit() -> None:
+    found = line("time of one of them")
+    assert found.measured == {"p50": 90.5} and found.ratios == {"p50": 1.23}
 
 
 def test_requests_that_are_lost_miss_the_goal() -> None:
@@ -142,7 +170,7 @@ def test_a_row_of_the_table() -> None:
     assert rows == [f"| memory of the 17 processes (PSS) | 80 MB |  |  | {goal}"]
     rows = [row for row in markdown(measured()) if row.startswith("| start of")]
     assert rows[0].startswith(
-        "| start of a run to a reply | p50 700, max 800 ms | import of its libraries: 200 ms | p50 3.5 |"
+        "| start of a run to a reply | p50 700, max 800 ms | the limit: 1 ms | p50 1.23 (1.11 to 1.46) |"
     )
 
 

@@ -1,6 +1,13 @@
 """What the benches share: interpreters that fail or do not end."""
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import pytest
+from homes import Home
+from liveruns import WAIT_SECONDS_MAX, ended, readable
 
 from aftbed.bench.runs import run_python
 from aftbed.core.errors import HarnessError
@@ -19,3 +26,19 @@ def test_an_interpreter_that_does_not_end_is_ended() -> None:
 
 def test_what_an_interpreter_prints_is_returned() -> None:
     assert run_python(["-c", "print('12')"], 20.0) == b"12\n"
+
+
+@pytest.mark.process
+def test_an_interpreter_dies_with_the_bench(home: Home, tmp_path: Path) -> None:
+    """Whatever kills the bench."""
+    fifo = tmp_path / "fifo"
+    os.mkfifo(fifo)
+    reader = os.open(fifo, os.O_RDONLY | os.O_NONBLOCK)
+    inner = f"import os, select; open({str(fifo)!r}, 'w').write(str(os.getpid())); select.select([], [], [])"
+    outer = f"from aftbed.bench.runs import run_python; run_python(['-c', {inner!r}], 60.0)"
+    with subprocess.Popen([sys.executable, "-c", outer]) as bench:
+        assert readable(reader, WAIT_SECONDS_MAX)
+        pid = int(os.read(reader, 100))
+        bench.kill()
+    os.close(reader)
+    assert ended(pid)
