@@ -177,8 +177,9 @@ def test_a_version_imports_nothing_from_where_the_command_was_started(
     (tmp_path / "aftbed" / "__main__.py").write_text("print('aftbed of the working directory')")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    made("old", "")
+    made("old", "import os; print(json.dumps({'here': os.listdir()}))")
     assert compare.version_of(Path("old")) == "aftbed 0.0.3"
+    assert compare.measured(Path("old"), "launch") == {"here": []}, "its own `python -m aftbed run`, too"
 
 
 # -- what is refused

@@ -109,7 +109,7 @@ def test_a_ring_whose_process_dies_ends(home: Home) -> None:
     def fail() -> bytes:
         os._exit(1)
 
-    with pytest.raises(HarnessError, match="the bare ring: "):
+    with pytest.raises(HarnessError, match=r"the bare ring: (one of its processes died|Broken pipe)"):
         ring_us(
             ring_of(build("pbr", "process")), 64, 7, work=RingWork(lambda: fail, lambda: lambda packet: None)
         )
