@@ -32,6 +32,7 @@ from aftbed.core.yaml_file import read_yaml
 from aftbed.ftm.compose import build, protected_by
 from aftbed.functions.source import located
 from aftbed.runtime.unix import control_client, run_directory
+from aftbed.runtime.unix.trust import versioned
 from aftbed.vehicle.aeb.function import default_application
 
 EXIT_CODES: Final = {"done": 0, "rolled back": 1, "refused": 2}
@@ -122,7 +123,13 @@ def script(
 def _change(wish: Wish, given: ChangeArguments) -> int:
     private = run_directory.find(given.run)
     graph = msgspec.convert(control_client.ask(private, control_client.GraphQuery()), Graph)
-    goal = msgspec.structs.replace(goal_of(wish, graph, given.recipe, found_source), may_fail=given.may_fail)
+    status = control_client.ask(private, control_client.StatusQuery())
+
+    def found_now(wish: Wish) -> str:
+        source = found_source(wish)
+        return versioned(source, Path(str(status["record"]))) if wish.name == APPLICATION else source
+
+    goal = msgspec.structs.replace(goal_of(wish, graph, given.recipe, found_now), may_fail=given.may_fail)
     _refuse_unsuitable(commands.plan_goal(graph, goal).new, wish, force=given.force)
     return _ask(private, goal, as_json=given.json)
 

@@ -46,8 +46,13 @@ class Code:
         """A module, or a file that ends in `.py`, for bricks and functions. Raises ConfigError."""
         return load_module(place)
 
-    def permit(self, source: FunctionSource) -> None:
-        """Called before a function that is no class is loaded. Raises ConfigError."""
+    def function_module(self, source: FunctionSource) -> ModuleType:
+        """The module of a function that is a class. Raises ConfigError."""
+        return self.module(source.place)
+
+    def permit(self, source: FunctionSource) -> FunctionSource:
+        """Called before a function that is no class is loaded; what to load for it. Raises ConfigError."""
+        return source
 
 
 class NoCode(Code):
@@ -56,8 +61,8 @@ class NoCode(Code):
     def module(self, place: str) -> ModuleType:
         raise ConfigError(f"{place}: no code from outside of the package is executed here")
 
-    def permit(self, source: FunctionSource) -> None:
-        self.module(str(source))
+    def permit(self, source: FunctionSource) -> FunctionSource:
+        raise ConfigError(f"{source}: no code from outside of the package is executed here")
 
 
 OWN_CODE: Final = Code()
@@ -69,8 +74,12 @@ def load_class(source: str, code: Code) -> type:
     place, colon, name = source.rpartition(":")
     if not colon or not place or not name:
         raise ConfigError(f"{source!r} names no class (MODULE:CLASS or FILE.py:CLASS)")
+    return _class_in(source, place, name, lambda: code.module(place))
+
+
+def _class_in(source: str, place: str, name: str, load: Callable[[], ModuleType]) -> type:
     try:
-        module = code.module(place)
+        module = load()
     except ConfigError:
         raise
     except Exception as error:  # whatever a stranger's module does
@@ -90,10 +99,10 @@ def load_application(source: str, code: Code) -> Callable[[], Application]:
     """The maker of a protected function. Raises ConfigError if it is none; so may the maker."""
     named = parse_source(source)
     if named.kind is not FunctionKind.CLASS:
-        code.permit(named)
+        named = code.permit(named)
     match named.kind:  # what a run does not use costs it no import
         case FunctionKind.CLASS:
-            return _checked(_application_class(source, code))
+            return _checked(_application_class(named, code))
         case FunctionKind.LIBRARY:
             from aftbed.functions.library import library_function  # noqa: PLC0415
 
@@ -124,8 +133,8 @@ def declared_in(source: str, function: object) -> Characteristics:
     return declared
 
 
-def _application_class(source: str, code: Code) -> type:
-    found = load_class(source, code)
+def _application_class(source: FunctionSource, code: Code) -> type:
+    found = _class_in(str(source), source.place, source.part, lambda: code.function_module(source))
     missing = [n for n in APPLICATION_NAMES if not hasattr(found, n)]
     if missing:
         raise ConfigError(f"{source} is no protected function: it lacks {', '.join(missing)}")

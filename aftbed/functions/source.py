@@ -5,11 +5,15 @@ path/file.py:Class              a class in a file
 path/lib.so                     a C library (`aft.h`)
 path/model.fmu[:ports.yaml]     a co-simulation model, with the map of its ports; `ports.yaml` beside it
 program arguments               a program on stdin and stdout, if there is a blank, or such a file
+
+Behind the text may be a version, `@sha256:` and twelve digits: other content of the same files, for which
+a run has exchanged the function (`runtime.unix.trust`). Without one, it is what the run has loaded first.
 """
 
 import re
 import shlex
 import shutil
+from collections.abc import Mapping
 from enum import Enum
 from pathlib import Path
 from typing import Final
@@ -21,6 +25,7 @@ from aftbed.core.errors import ConfigError
 PORTS_NAME: Final = "ports.yaml"
 FORMS: Final = 'MODULE:CLASS, FILE.py:CLASS, FILE.so, FILE.fmu[:PORTS.yaml] or "PROGRAM ARGUMENTS" is allowed'
 _LIBRARY: Final = re.compile(r"\.so(\.[0-9]+)*$")
+_VERSION: Final = re.compile(r"(?P<text>.*)@sha256:(?P<version>[0-9a-f]{12})", re.S)
 _MODEL: Final = re.compile(r"(?P<model>.*\.fmu)(:(?P<ports>.+))?$")
 
 
@@ -37,9 +42,15 @@ class FunctionSource(msgspec.Struct, frozen=True):
     kind: FunctionKind
     place: str
     part: str = ""
+    version: str = ""
 
     def __str__(self) -> str:
-        return f"{self.place}:{self.part}" if self.part else self.place
+        return _versioned(f"{self.place}:{self.part}" if self.part else self.place, self.version)
+
+    @property
+    def key(self) -> str:
+        """What is loaded as one: the module of a class, else the whole."""
+        return _versioned(self.place, self.version) if self.kind is FunctionKind.CLASS else str(self)
 
     @property
     def words(self) -> list[str]:
@@ -48,6 +59,18 @@ class FunctionSource(msgspec.Struct, frozen=True):
             return shlex.split(self.place)
         except ValueError as error:
             raise ConfigError(f"{self.place}: {str(error).lower()}") from None
+
+    def reading(self, paths: Mapping[str, str]) -> "FunctionSource":
+        """The same from other files: `paths` has the new path by the one of `files`. No class."""
+
+        def other(path: str) -> str:
+            return paths.get(str(Path(path).resolve()), path)
+
+        if self.kind is not FunctionKind.PROGRAM:
+            return msgspec.structs.replace(self, place=other(self.place), part=self.part and other(self.part))
+        first, *rest = self.words
+        first = paths.get(str(Path(shutil.which(first) or first).resolve()), first)
+        return msgspec.structs.replace(self, place=shlex.join([first, *map(other, rest)]))
 
     def files(self) -> list[Path]:
         """The files that are executed or read, but for those of a class: see `runtime.unix.trust`.
@@ -69,6 +92,8 @@ class FunctionSource(msgspec.Struct, frozen=True):
 
 def parse_source(text: str) -> FunctionSource:
     """What `text` names. Nothing is looked up, but whether a single word is a program. Raises ConfigError."""
+    if versioned := _VERSION.fullmatch(text):
+        return msgspec.structs.replace(parse_source(versioned["text"]), version=versioned["version"])
     if not text.strip():
         raise ConfigError(f"{text!r} names no function; {FORMS}")
     if model := _MODEL.match(text):
@@ -82,6 +107,10 @@ def parse_source(text: str) -> FunctionSource:
     if len(text.split()) > 1 or Path(text).is_file() or shutil.which(text):
         return FunctionSource(FunctionKind.PROGRAM, text)
     raise ConfigError(f"{text!r} names no function; {FORMS}")
+
+
+def _versioned(text: str, version: str) -> str:
+    return f"{text}@sha256:{version}" if version else text
 
 
 def is_foreign(text: str) -> bool:
@@ -106,7 +135,7 @@ def located(text: str, folder: Path | None = None) -> str:
     match source.kind:
         case FunctionKind.CLASS:
             place = file(source.place) if source.place.endswith(".py") else source.place
-            return f"{place}:{source.part}"
+            return _versioned(f"{place}:{source.part}", source.version)
         case FunctionKind.PROGRAM:
             first, *rest = source.words
             if "/" in first:
@@ -114,11 +143,11 @@ def located(text: str, folder: Path | None = None) -> str:
             if shutil.which(first) is None:
                 raise ConfigError(f"{text}: no program {first}")
             words = [str((here / word).absolute()) if (here / word).is_file() else word for word in rest]
-            return shlex.join([first, *words])
+            return _versioned(shlex.join([first, *words]), source.version)
         case _:
-            return str(
-                FunctionSource(source.kind, file(source.place), file(source.part) if source.part else "")
-            )
+            place = file(source.place)
+            part = file(source.part) if source.part else ""
+            return str(FunctionSource(source.kind, place, part, source.version))
 
 
 def renamed(text: str) -> str:
@@ -128,7 +157,8 @@ def renamed(text: str) -> str:
     source = parse_source(text)
     if source.kind is FunctionKind.PROGRAM and len(source.words) > 1:
         first, *rest = map(shlex.quote, source.words)
-        return " ".join([f"{first}''" if first.startswith("'") else f"'{first}'", *rest])
+        words = " ".join([f"{first}''" if first.startswith("'") else f"'{first}'", *rest])
+        return _versioned(words, source.version)
     path = Path(source.place)
     if not path.is_absolute():
         return ""

@@ -192,9 +192,15 @@ class FaultAgent:
             handed, hit = fault.action.alter_input(handed, fault.draw)
             if hit is not None:
                 hits.append((fault, hit))
-        effects = brick.step(port, handed, now_ns)  # type: ignore[arg-type]
-        for fault, hit in reversed(hits):  # only now: a brick that refuses the request was not hit
-            self._record(fault, hit)
+        refused = False
+        try:
+            effects = brick.step(port, handed, now_ns)  # type: ignore[arg-type]
+        except PeerError:
+            refused = True
+            raise
+        finally:  # a brick that refuses the request was not hit; one that fails at it was, and its node ends
+            for fault, hit in reversed(hits) if not refused else ():
+                self._record(fault, hit)
         for fault in due:
             effects, hit = fault.action.alter_output(effects, fault.draw)
             if hit is not None:

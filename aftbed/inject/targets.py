@@ -7,17 +7,21 @@ outermost is meant.
 from typing import Final, NamedTuple, Protocol
 
 from aftbed.core.errors import ConfigError, unknown
-from aftbed.core.events import Event, event_named
+from aftbed.core.events import STEP_EVENTS, Event, event_named
 from aftbed.core.graph import STAGED, BrickSpec, Graph
 from aftbed.ftm.compose import EXPRESSIONS, build
-from aftbed.ftm.registry import EMITTERS, server_emits
+from aftbed.ftm.registry import EMITTERS, Emitter, server_emits
 
 PRIMARY, BACKUP = "primary", "backup"
 ROLES: Final = (PRIMARY, BACKUP)
 DEFAULT: Final = PRIMARY  # where a fault does not name its replica
 OTHERS: Final = ("zygote", "zygote.bus", "hub", "vehicle", "player")
-SUPERVISOR: Final = "supervisor"  # emits the events of an adaptation
+SUPERVISOR: Final = "supervisor"  # emits the events of the steps of an adaptation
+ENGINE: Final = "engine"  # emits its other events
 ADAPTATION: Final = tuple(event for event in Event if event.label.startswith("adapt."))
+_EMITTERS: Final = EMITTERS | {
+    event: Emitter(ENGINE, of_backup=False) for event in ADAPTATION if event not in STEP_EVENTS
+}
 
 
 class TargetProcess(Protocol):
@@ -131,15 +135,15 @@ def _nodes(event: str, graph: Graph) -> tuple[str, ...]:
 
 def emitting_node(roles: Roles, event: str) -> str | None:
     """The node that emits `event`, SUPERVISOR, or None where none does."""
-    if event_named(event) in ADAPTATION:
-        return SUPERVISOR if any(b.kind == "engine" for b in roles.graph.bricks) else None
+    if event_named(event) in STEP_EVENTS:
+        return SUPERVISOR if any(b.kind == ENGINE for b in roles.graph.bricks) else None
     brick = emitting_brick(roles, event)
     return None if brick is None else roles.graph.node_of(brick)
 
 
 def emitting_brick(roles: Roles, event: str) -> str | None:
     """The brick that emits `event`; None where none does, or the supervisor."""
-    found = EMITTERS.get(event_named(event))
+    found = _EMITTERS.get(event_named(event))
     if found is None:
         return None
     part, of_backup = found
@@ -165,12 +169,12 @@ def emitting_brick_of(roles: Roles, event: str, replica: str) -> str | None:
 
 
 def emitting_part(event: Event) -> str:
-    return EMITTERS[event][0]
+    return _EMITTERS[event][0]
 
 
 def emits(graph: Graph, event: Event, role: str) -> bool:
     """Whether a brick of the replica in `role` emits `event`."""
-    part, of_backup = EMITTERS[event]
+    part, of_backup = _EMITTERS[event]
     if part == "server":
         return server_emits(graph, event, backs_up=role == BACKUP)
     return (role == BACKUP) is of_backup and any(_is(brick, part) for brick in graph.bricks)

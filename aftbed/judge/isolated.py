@@ -123,8 +123,9 @@ def reference_of(
     sources = tuple(dict.fromkeys(source for source in (first, *(one for _, one in changes)) if source))
     if not sources:
         return reference_run(record.history, succession(record, OWN_CODE))
+    loaded_by = None if record.simulated else record.path
     try:
-        codes = tuple(vetted(source, trust) for source in sources)
+        codes = tuple(vetted(source, trust, loaded_by) for source in sources)
     except ConfigError as error:
         return ReferenceRun((), b"", unknown=str(error))
     match _answer(Execute(first, tuple(changes), tuple(requests_of(record.history))), codes, limits):

@@ -112,12 +112,33 @@ class Assembler:
         def setting(spec: BrickSpec) -> Setting:
             return self._setting(spec, order, leader=replica)
 
+        function = setting(server).application()
+        if server.application and server in order.bricks:
+            _check_understands(server.application, function, trial.requests)
         self_test(
             trial.graph,
             replica,
             lambda spec: self._make(spec, setting(spec)),
             trial.requests,
-            deterministic=setting(server).application().characteristics.deterministic,
+            deterministic=function.characteristics.deterministic,
+        )
+
+
+def _check_understands(source: str, function: Application, requests: tuple[bytes, ...]) -> None:
+    """Raise ConfigError if it refuses all of `requests`: it would answer, and never do anything."""
+    why = ""
+    for request in requests:
+        try:
+            function.execute(request)
+        except PeerError as refusal:
+            why = str(refusal)
+        except FunctionFailedError as error:
+            raise ConfigError(f"self-test: {source}: {error}") from error
+        else:
+            return
+    if requests:
+        raise ConfigError(
+            f"self-test: {source} refuses each of the {len(requests)} requests recorded in this run: {why}"
         )
 
 

@@ -54,7 +54,7 @@ from aftbed.core.script import (
     inverse,
     reversible,
 )
-from aftbed.ftm.compose import REPLICAS, STATEFUL, replication_of
+from aftbed.ftm.compose import REPLICAS, STATEFUL, protected_by, replication_of
 from aftbed.ftm.registry import KINDS
 from aftbed.runtime import control
 from aftbed.runtime.deployment import BESIDE_LEADER, HANG_NS, ChannelKey, Deployment, Keys, key_of, replica_of
@@ -356,7 +356,13 @@ class Execution:
                 self.done.append(step)
                 sent.append((yield from self._stage(step)))
                 yield from self._note(Event.ADAPT_STEP_ACT, self._number)
-        yield from self._deployment.answers(sent, STAGE_SECONDS_MAX)
+        try:
+            yield from self._deployment.answers(sent, STAGE_SECONDS_MAX)
+        except StepFailed as failure:
+            function = protected_by(self.new)
+            if function != protected_by(self.old) and not all(p.alive for p in self._staged.values()):
+                raise StepFailed(f"{failure} while it loaded and tried {function}") from failure
+            raise
         for number in range(1, self._number + 1):
             yield from self._note(Event.ADAPT_STEP_EXIT, number)
         binds = [step for step in flat(self.script.prepare) if isinstance(step, Bind)]
@@ -585,8 +591,14 @@ class Execution:
             if brick in taken.nodes[node]:
                 state = yield from self._capture(giver, brick)
                 if state:
-                    changed = given.brick(brick) != taken.brick(brick)
-                    yield from self._restore(taker, brick, state, migrate=changed)
+                    before, after = given.brick(brick), taken.brick(brick)
+                    try:
+                        yield from self._restore(taker, brick, state, migrate=before != after)
+                    except StepFailed as failure:
+                        if before.application == after.application:
+                            raise
+                        names = (one.application or "the built-in function" for one in (after, before))
+                        raise StepFailed("{} takes no state of {}: {}".format(*names, failure)) from failure
 
     # -- steps of a failover ------------------------------------------------------------------
 

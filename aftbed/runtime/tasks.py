@@ -35,9 +35,13 @@ def run_after_first_yield(task: Task, hook: Task) -> Task:
     wait = next(task, None)
     yield from hook
     while wait is not None:
-        got = yield wait
+        failure = None
         try:
-            wait = task.send(got)
+            got = yield wait
+        except StepFailed as error:
+            failure = error
+        try:
+            wait = task.send(got) if failure is None else task.throw(failure)
         except StopIteration:
             return
 

@@ -276,6 +276,14 @@ def test_a_brick_that_no_replica_has() -> None:
         updated(build("pbr", "process"), "tr.after", "x.py:X")
 
 
+def test_the_function_that_runs_is_no_update() -> None:
+    for function in ("", "x.py:App"):
+        with pytest.raises(
+            ConfigError, match=f"{function} is what runs already, with the same content: nothing"
+        ):
+            updated(build("pbr", "process", application=function), APPLICATION, function)
+
+
 def test_the_function_goes_with_its_server_into_another_mechanism() -> None:
     old = updated(build("pbr", "process"), APPLICATION, "x.py:App")
     new = target(old, "lfr+tr")

@@ -112,6 +112,40 @@ def test_a_function_of_the_user_is_simulated_updated_and_judged(sim: Call, tmp_p
     assert f"  adaptation update app to {tmp_path}/adder2.py:Adder at request 20: done" in out
 
 
+def test_an_update_that_the_function_cannot_follow_is_undone_and_says_why(sim: Call, tmp_path: Path) -> None:
+    """One that refuses all requests would answer them all, and do nothing."""
+    adder = OTHER_FUNCTION.replace("STEP", "1")
+    (tmp_path / "adder.py").write_text(adder)
+    known, first = "from aftbed.core.errors import PeerError\n", "raise PeerError('not mine')"
+    restoring = f"def restore(self, state):\n        if not self.sum: {first}\n        self.sum ="
+    (tmp_path / "other.py").write_text(
+        known + adder.replace("def restore(self, state): self.sum =", restoring)
+    )
+    (tmp_path / "refusing.py").write_text(known + adder.replace("self.sum += ", f"{first}; "))
+    for name, told in (
+        ("other", "rolled back: {0}/other.py:Adder takes no state of {0}/adder.py:Adder: a/server': "),
+        ("refusing", "refused: a/server': self-test: {0}/refusing.py:Adder refuses each of the 16 requests"),
+    ):
+        update = ("--adapt", f"update app to {tmp_path}/{name}.py:Adder at request 20", "--may-fail")
+        code, out, err = sim("--app", tmp_path / "adder.py:Adder", "--count", "40", *update)
+        assert code == 0, out + err
+        assert (
+            told.format(tmp_path) in out
+            and "40 sent, 40 answered, 0 lost, 0 duplicated, 0 late, 0 wrong" in out
+        )
+
+
+def test_a_crash_right_behind_the_commit_of_an_update(sim: Call, tmp_path: Path) -> None:
+    for step in (1, 2):
+        (tmp_path / f"adder{step}.py").write_text(OTHER_FUNCTION.replace("STEP", str(step)))
+    update = ("--adapt", f"update app to {tmp_path}/adder2.py:Adder at request 20", "--may-fail")
+    words = ("--app", tmp_path / "adder1.py:Adder", "--count", "60", "--rate", "300", *update)
+    for role, ftm in (("primary", "pbr"), ("backup", "pbr+tr"), ("engine", "lfr")):
+        code, out, _ = sim(*words, "--ftm", ftm, "--faults", f"crash {role} at adapt.commit")
+        assert code == 0 and f"crash {role} at adapt.commit nth 1: activated" in out, out
+        assert "60 answered, 0 lost, 0 duplicated, 0 late, 0 wrong" in out
+
+
 ROUGH: Final = """
 import struct
 from aftbed.core.application import *

@@ -245,6 +245,32 @@ def test_a_failure_of_the_model_is_no_refusal(make: Make, version: int, fault: s
     assert "integral.fmu: at 0.5 s, in a step of 0.5 s: " in str(caught.value)
 
 
+def test_a_replica_whose_model_answers_nan_is_silent_and_the_other_one_answers(
+    make: Make, tmp_path: Path
+) -> None:
+    """A flipped bit of one request, in one replica, is the fault that makes the model answer so."""
+    make()  # writes both files
+    nan, model = 1 + FAULTS.index("not a number"), str(tmp_path / "integral.fmu")
+    assert nan == 1 << 2
+    found = aftbed.run(
+        model, [request(1.0)] * 20, inject=f"bitflip request bit {14 * 8 + 2} at server.enter nth 10"
+    )
+    assert (found.verdict, found.requests.answered, found.requests.wrong) == ("pass", 20, 0), str(found)
+    (failure,) = found.failures
+    assert failure.startswith("a/server: ") and "output total: found nan" in failure
+    assert len(found.failovers) == 1 and found.faults[0].receipt.value == "activated"
+
+
+def test_a_model_that_answers_nan_in_both_replicas_leaves_the_request_without_a_reply(
+    make: Make, tmp_path: Path
+) -> None:
+    make()
+    sent = [request(1.0)] * 9 + [request(fault=1 + FAULTS.index("not a number"))] + [request(1.0)] * 10
+    found = aftbed.run(str(tmp_path / "integral.fmu"), sent)
+    assert (found.verdict, found.requests.answered, found.requests.lost) == ("fail", 9, 1)
+    assert [one.split(":")[0] for one in found.failures] == ["a/server", "b/server"]
+
+
 def test_a_failure_comes_with_the_log_of_the_model(make: Make) -> None:
     """Formatted as the model wants it, and without what it said before."""
     models = [make(2)(), make(3)()]

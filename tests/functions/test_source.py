@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from aftbed.core.errors import ConfigError
 from aftbed.functions.source import FunctionKind, located, parse_source, renamed
@@ -28,6 +29,27 @@ from aftbed.functions.source import FunctionKind, located, parse_source, renamed
 def test_each_form(text: str, kind: FunctionKind, place: str, part: str) -> None:
     found = parse_source(text)
     assert (found.kind, found.place, found.part) == (kind, place, part)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["package.module:Class", "path/file.py:Class", "path/lib.so", "model.fmu:other.yaml", "awk -f 'a b'"],
+)
+def test_a_version_is_behind_any_form(text: str) -> None:
+    plain, found = parse_source(text), parse_source(f"{text}@sha256:0123456789ab")
+    assert found == replace(plain, version="0123456789ab") and str(found) == f"{text}@sha256:0123456789ab"
+    assert found.key != plain.key and found.key.endswith("@sha256:0123456789ab")
+    assert parse_source(f"{text} @sha256:0").version == ""
+
+
+def test_a_function_is_read_from_other_files(tmp_path: Path) -> None:
+    for name in ("brake.py", "other.py"):
+        (tmp_path / name).touch()
+    paths = {f"{tmp_path}/brake.py": "/kept/brake.py"}
+    found = parse_source(f"sh {tmp_path}/brake.py {tmp_path}/other.py --fast").reading(paths)
+    assert found.words == ["sh", "/kept/brake.py", f"{tmp_path}/other.py", "--fast"]
+    model = parse_source(f"{tmp_path}/m.fmu").reading({f"{tmp_path}/ports.yaml": "/kept/ports.yaml"})
+    assert (model.place, model.part) == (f"{tmp_path}/m.fmu", "/kept/ports.yaml")
 
 
 @pytest.mark.parametrize("text", ["", "  ", "mine", ":Class", "module:", "module:no-name", "no/such/file"])

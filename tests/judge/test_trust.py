@@ -18,6 +18,7 @@ from records import outcomes, whole
 
 from aftbed.core.events import Event
 from aftbed.functions.load import load_module
+from aftbed.functions.source import parse_source
 from aftbed.judge.checks import Evidence
 from aftbed.judge.isolated import declared_by, reference_of, tried_out
 from aftbed.judge.outcome import outcome_of
@@ -25,7 +26,18 @@ from aftbed.judge.record import RunRecord, read_record
 from aftbed.judge.verdict import Verdict, evidence_of, judge
 from aftbed.runtime.unix import linux, trust
 from aftbed.runtime.unix.confined import ProcessLimits
-from aftbed.runtime.unix.trust import NOBODY, OWN_RUN, Trust, known_hashes, note, remember, trusting, vetted
+from aftbed.runtime.unix.trust import (
+    NOBODY,
+    OWN_RUN,
+    Trust,
+    known_hashes,
+    loaded_before,
+    note,
+    remember,
+    trusting,
+    versioned,
+    vetted,
+)
 
 FUNCTION: Final = """\
 from pathlib import Path
@@ -328,6 +340,64 @@ def test_without_replies_nothing_is_called_wrong(tmp_path: Path, planted: Plante
     record = record_naming(tmp_path / "record", planted.source)
     evidence: Evidence = evidence_of(record)
     assert evidence.reference.replies == () and judge(record, evidence).requests.wrong == 0
+
+
+# -- what a run keeps -----------------------------------------------------------------------------
+
+
+def loaded_in(record: Path, planted: Planted) -> None:
+    """A node of the run has loaded it as its function."""
+    source = parse_source(planted.source)
+    record.mkdir(exist_ok=True)
+    note(record, source.place, load_module(source.place), source.key)
+    planted.sentinel.unlink()
+
+
+def test_a_run_loads_by_one_name_always_the_same(tmp_path: Path, planted: Planted) -> None:
+    record, source = tmp_path / "run", parse_source(planted.source)
+    assert versioned(planted.source, record) == planted.source
+    loaded_in(record, planted)
+    before = planted.file.read_bytes()
+    assert versioned(planted.source, record) == planted.source and loaded_before(record, source) is None
+    planted.file.write_text("class Mine: ...\n")
+    kept = loaded_before(record, source)
+    assert kept is not None and Path(kept.kept[str(planted.file)]).read_bytes() == before
+    named = versioned(planted.source, record)
+    assert (
+        named.startswith(f"{planted.source}@sha256:") and loaded_before(record, parse_source(named)) is None
+    )
+    planted.file.write_text("class Mine: pass\n")
+    with pytest.raises(trust.ConfigError, match=f"{named}: was changed meanwhile"):
+        loaded_before(record, parse_source(named))
+    planted.file.write_bytes(before)
+    assert versioned(planted.source, record) == planted.source
+
+
+def test_what_was_too_large_to_be_kept_is_not_replaced_by_something_else(
+    tmp_path: Path, planted: Planted, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(trust, "KEPT_BYTES_MAX", 10)
+    loaded_in(tmp_path / "run", planted)
+    planted.file.write_text("class Mine: ...\n")
+    with pytest.raises(trust.ConfigError, match=r"mine\.py: has other content than what this run has loaded"):
+        loaded_before(tmp_path / "run", parse_source(planted.source))
+
+
+@starts_process
+def test_a_judge_executes_the_copy_of_what_was_changed_since(tmp_path: Path, planted: Planted) -> None:
+    """If this user has run it: a record of a stranger has copies too. Trust in a folder is not for them."""
+    record = record_naming(tmp_path / "record", planted.source)
+    loaded_in(record.path, planted)
+    planted.file.write_text("raise SystemExit('the new one')\n")
+    stranger = verdict_of(record, trusting((planted.folder,)))
+    assert (stranger.verdict, planted.executed) == ("inconclusive", False) and "--trust" in stranger.reasons[
+        0
+    ]
+    assert remember(record.path) == "" and verdict_of(record).verdict == "pass" and planted.executed
+    planted.sentinel.unlink()
+    (copy,) = (record.path / "functions").glob("*/mine.py")
+    copy.write_text(copy.read_text() + "\n")
+    assert "was changed meanwhile" in verdict_of(record).reasons[0] and not planted.executed
 
 
 # -- the ledger of the user -----------------------------------------------------------------------

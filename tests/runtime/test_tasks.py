@@ -7,7 +7,7 @@ from typing import Final
 import pytest
 
 from aftbed.core.errors import StepFailed
-from aftbed.runtime.tasks import EARLY_MAX, STEP_SECONDS_MAX, Key, Task, Tasks, Wait
+from aftbed.runtime.tasks import EARLY_MAX, STEP_SECONDS_MAX, Key, Task, Tasks, Wait, run_after_first_yield
 
 ONE: Final[Key] = ("ack", "a/after", 1)
 TWO: Final[Key] = ("ack", "b/after", 2)
@@ -240,3 +240,26 @@ def test_whoever_is_told_of_an_end_may_start_another_job(tasks: Tasks) -> None:
     assert tasks.names() == ["next"]
     tasks.settle(TWO)
     assert ends == ["", ""]
+
+
+def test_a_failure_reaches_a_task_behind_its_first_wait(tasks: Tasks) -> None:
+    """One that handles it goes on, with what it waits for next."""
+    told: list[str] = []
+    ends: list[str] = []
+
+    def patient() -> Task:
+        try:
+            yield wait(ONE)
+        except StepFailed as failure:
+            told.append(str(failure))
+        yield wait(TWO)
+
+    def hook() -> Task:
+        told.append("hook")
+        yield wait()
+
+    tasks.start("job", run_after_first_yield(patient(), hook()), ends.append)
+    tasks.fail(ONE, "refused")
+    assert told == ["hook", "refused"] and ends == []
+    tasks.settle(TWO)
+    assert ends == [""]

@@ -5,6 +5,11 @@ behind it only if the user has agreed: its files lie under a directory of `--tru
 SHA-256 of a file that this user has run. A run notes what it loads in its record (`note`), and its command
 keeps the hashes in a ledger of this user (`remember`).
 
+A user edits a function while a run goes on, so the run keeps copies in its record of what it has loaded
+(`KEPT_NAME`). By one text it always loads the same: where the file is another one by now, a new backup gets
+the copy, and so does the judge. `update app` to the same text gives the new content a text of its own
+(`versioned`).
+
 Code is found without executing any of it: the import system would execute the packages on the way to a
 module. It is executed from the very bytes that were hashed: neither a file that was exchanged meanwhile nor a
 compiled one beside it is. The working directory is not searched.
@@ -15,6 +20,7 @@ import fcntl
 import importlib
 import json
 import os
+import re
 import stat
 import sys
 import tempfile
@@ -30,13 +36,16 @@ import msgspec
 
 import aftbed
 from aftbed.core.errors import ConfigError
-from aftbed.core.input_file import read_input
+from aftbed.core.input_file import open_input, read_input
 from aftbed.functions.load import Code, SourceLoader
 from aftbed.functions.source import FunctionKind, FunctionSource, parse_source
 
 PACKAGE: Final = Path(aftbed.__file__).resolve().parent
 FILE_BYTES_MAX: Final = 1 << 28  # a program may be as long as an interpreter
 NOTES_NAME: Final = "functions.jsonl"  # in the record: a line for each file of code that was loaded
+KEPT_NAME: Final = "functions"  # in the record: copies of them, each in a directory named by its hash
+KEPT_BYTES_MAX: Final = 64 << 20  # of a file; a larger one is not kept
+VERSION_DIGITS: Final = 12
 NOTES_BYTES_MAX: Final = 10_000_000
 LEDGER_NAME: Final = "functions"  # in the state directory: a hash per line, the latest last
 HASHES_MAX: Final = 1000
@@ -70,13 +79,19 @@ def trusting(folders: Iterable[Path] | None) -> Trust:
 class CodeFile(msgspec.Struct, frozen=True):
     """A file that is executed as `module`; `folders` are those of a package, none of another module.
 
-    Without a `module`: one that is no Python, and is executed as it is.
+    Without a `module`: one that is no Python, and is executed as it is. `kept`: the copy that is executed in
+    the place of `path`, which has other content by now.
     """
 
     module: str
     path: str
     sha256: str
     folders: tuple[str, ...] = ()
+    kept: str = ""
+
+    @property
+    def executed(self) -> Path:
+        return Path(self.kept or self.path)
 
 
 class VettedFiles(msgspec.Struct, frozen=True):
@@ -87,24 +102,30 @@ class VettedFiles(msgspec.Struct, frozen=True):
 
     place: str
     files: tuple[CodeFile, ...]
+    key: str = ""  # `FunctionSource.key`
+
+    @property
+    def kept(self) -> dict[str, str]:
+        """The copies, by the paths in whose place they are executed."""
+        return {file.path: file.kept for file in self.files if file.kept}
 
 
-def vetted(source: str, trust: Trust) -> VettedFiles:
+def vetted(source: str, trust: Trust, record: Path | None = None) -> VettedFiles:
     """The code of a function, or of a brick's class; nothing of it is executed.
 
+    With `record`: what the run of that record has loaded, where it kept it and the files are others by now.
     Raises ConfigError, which names the source, where it is not trusted, or is not there.
     """
     named = parse_source(source)
-    is_class = named.kind is FunctionKind.CLASS
-    place = named.place if is_class else source
-    if is_class and place.partition(".")[0] == PACKAGE.name and not place.endswith(".py"):
-        return VettedFiles(place, ())
+    place = named.place if named.kind is FunctionKind.CLASS else source
+    if _ours(named):
+        return VettedFiles(place, (), named.key)
     try:
-        files = tuple(_files_of(place) if is_class else _opaque_files(named))
+        files = tuple(_files_of(named, record))
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
         raise ConfigError(f"{source} cannot be read: {reason}") from None
-    outside = [one for one in files if not any(Path(one.path).is_relative_to(f) for f in trust.folders)]
+    outside = [one for one in files if not any(one.executed.is_relative_to(f) for f in trust.folders)]
     if outside and not trust.own_run:
         known, why_not = known_hashes()
         strangers = [one for one in outside if one.sha256 not in known]
@@ -115,16 +136,38 @@ def vetted(source: str, trust: Trust) -> VettedFiles:
                 f"{source} is not trusted, so it was not executed: you have not run it before{unknown};"
                 f" --trust {folder} executes it"
             )
-    return VettedFiles(place, files)
+    return VettedFiles(place, files, named.key)
 
 
-def _files_of(place: str) -> Iterator[CodeFile]:
+def _ours(source: FunctionSource) -> bool:
+    """Whether it is a module of this package."""
+    place = source.place
+    is_class = source.kind is FunctionKind.CLASS
+    return is_class and place.partition(".")[0] == PACKAGE.name and not place.endswith(".py")
+
+
+def _files_of(source: FunctionSource, record: Path | None = None) -> Iterator[CodeFile]:
     """Raises OSError, ValueError."""
-    if place.endswith(".py"):
-        path = Path(place).resolve()
-        yield CodeFile(path.stem, str(path), _hash(path))
-        return
-    parts = place.split(".")
+    loaded = _loaded(record).get(source.key, {}) if record is not None else {}
+
+    def file(module: str, path: Path, folders: tuple[str, ...] = ()) -> CodeFile:
+        if record is not None and (before := loaded.get(str(path))) is not None:
+            kept = _kept(record, before, path)
+            if kept.is_file() and not _has(path, before):
+                return CodeFile(module, str(path), before, folders, str(kept))
+        return CodeFile(module, str(path), _hash(path), folders)
+
+    if source.kind is not FunctionKind.CLASS:
+        yield from (file("", path) for path in source.files())
+    elif source.place.endswith(".py"):
+        path = Path(source.place).resolve()
+        yield file(path.stem, path)
+    else:
+        yield from (file(*found) for found in _modules(source.place.split(".")))
+
+
+def _modules(parts: list[str]) -> Iterator[tuple[str, Path, tuple[str, ...]]]:
+    """Name, file and folders of a module and of the packages around it. Raises ValueError."""
     folders: list[str] | None = search_path()
     for number in range(1, len(parts) + 1):
         name = ".".join(parts[:number])
@@ -136,13 +179,7 @@ def _files_of(place: str) -> Iterator[CodeFile]:
             path = Path(spec.origin).resolve()
             if path.suffix != ".py":
                 raise ValueError(f"{path} is no Python file")
-            yield CodeFile(name, str(path), _hash(path), tuple(folders))
-
-
-def _opaque_files(source: FunctionSource) -> Iterator[CodeFile]:
-    """Raises OSError, ValueError."""
-    for path in source.files():
-        yield CodeFile("", str(path), _hash(path))
+            yield name, path, tuple(folders)
 
 
 def _folders_of(spec: ModuleSpec) -> list[str]:
@@ -161,6 +198,13 @@ def _hash(path: Path) -> str:
     return sha256(read_input(path, FILE_BYTES_MAX)).hexdigest()
 
 
+def _has(path: Path, digest: str) -> bool:
+    try:
+        return _hash(path) == digest
+    except OSError:
+        return False
+
+
 # -- loading it, in the process that executes it --------------------------------------------------
 
 
@@ -172,10 +216,13 @@ class _HashedLoader(SourceLoader):
         self._file = file
 
     def source(self) -> bytes:
-        data = read_input(Path(self._file.path), FILE_BYTES_MAX)
+        data = read_input(self._file.executed, FILE_BYTES_MAX)
         if sha256(data).hexdigest() != self._file.sha256:
-            raise ConfigError(f"{self._file.path}: was changed meanwhile")
+            raise ConfigError(f"{self._file.executed}: was changed meanwhile")
         return data
+
+
+_IMPORTED: Final[dict[str, str]] = {}  # the hash of each module that `load` has put into `sys.modules`
 
 
 def load(code: VettedFiles) -> ModuleType:
@@ -185,7 +232,7 @@ def load(code: VettedFiles) -> ModuleType:
     module = None
     for file in code.files:
         module = sys.modules.get(file.module) if not code.place.endswith(".py") else None
-        if module is not None:
+        if module is not None and _IMPORTED.get(file.module, file.sha256) == file.sha256:
             continue
         folders = list(file.folders) or None
         spec = spec_from_file_location(
@@ -195,6 +242,7 @@ def load(code: VettedFiles) -> ModuleType:
         module = module_from_spec(spec)
         if not code.place.endswith(".py"):
             sys.modules[file.module] = module
+            _IMPORTED[file.module] = file.sha256
         spec.loader.exec_module(module)
     assert module is not None
     return module
@@ -203,64 +251,160 @@ def load(code: VettedFiles) -> ModuleType:
 def check_unchanged(code: VettedFiles) -> None:
     """That the files which are no Python have their hashes still. Raises ConfigError."""
     for file in code.files:
-        if not file.module and _hash(Path(file.path)) != file.sha256:
-            raise ConfigError(f"{file.path}: was changed meanwhile")
+        if not file.module and _hash(file.executed) != file.sha256:
+            raise ConfigError(f"{file.executed}: was changed meanwhile")
 
 
 class VettedCode(Code):
     """From the bytes that were hashed; without any file of this package."""
 
     def __init__(self, codes: Iterable[VettedFiles]) -> None:
-        self._codes = {code.place: code for code in codes}
+        self._codes = {code.key or code.place: code for code in codes}
 
     def module(self, place: str) -> ModuleType:
         return load(self._codes[place])
 
-    def permit(self, source: FunctionSource) -> None:
-        check_unchanged(self._codes[str(source)])
+    def function_module(self, source: FunctionSource) -> ModuleType:
+        return load(self._codes[source.key])
+
+    def permit(self, source: FunctionSource) -> FunctionSource:
+        code = self._codes[source.key]
+        check_unchanged(code)
+        return source.reading(code.kept)
 
 
 # -- what runs have loaded ------------------------------------------------------------------------
 
 
-def note(record: Path, place: str, module: ModuleType) -> None:
+def note(record: Path, place: str, module: ModuleType, key: str = "") -> None:
     """Add the files of `module`, which a node has loaded as `place`, to the notes in the record of its run.
 
-    A note that cannot be written is left out: the record can then only be judged with `--trust`.
+    `key`: of a function, whose files are kept too. A note that cannot be written is left out: the record can
+    then only be judged with `--trust`.
     """
     parts = place.split(".")
     loaded = [module]
     if not place.endswith(".py"):
         names = [".".join(parts[:number]) for number in range(1, len(parts))]
         loaded = [*(sys.modules[name] for name in names if name in sys.modules), module]
-    _note(record, place, [Path(file) for one in loaded if (file := getattr(one, "__file__", None))])
+    paths = [Path(file) for one in loaded if (file := getattr(one, "__file__", None))]
+    _note(record, key or place, paths, keep=bool(key))
 
 
 def note_files(record: Path, source: FunctionSource) -> None:
     """The same of a function that is no class, which a node is about to execute."""
     with contextlib.suppress(ConfigError):
-        _note(record, str(source), source.files())
+        _note(record, source.key, source.files(), keep=True)
 
 
-def _note(record: Path, place: str, paths: list[Path]) -> None:
+def _note(record: Path, place: str, paths: list[Path], *, keep: bool) -> None:
     with contextlib.suppress(OSError, ValueError):
-        notes = [{"place": place, "file": str(path), "sha256": _hash(path.resolve())} for path in paths]
+        notes = []
+        for path in (one.resolve() for one in paths):
+            data = read_input(path, FILE_BYTES_MAX)
+            digest = sha256(data).hexdigest()
+            notes.append({"place": place, "file": str(path), "sha256": digest})
+            if keep and len(data) <= KEPT_BYTES_MAX and not _is_python(path):
+                _keep(_kept(record, digest, path), data, path.stat().st_mode)
         with open(record / NOTES_NAME, "ab", buffering=0) as file:
             file.write("".join(json.dumps(one) + "\n" for one in notes).encode())
 
 
+def _is_python(path: Path) -> bool:
+    """Whether it is the interpreter: a user edits the program that it executes."""
+    return path == Path(sys.executable).resolve() or str(path.parent) in ("/bin", "/usr/bin")
+
+
+def _kept(record: Path, digest: str, path: Path) -> Path:
+    return record.resolve() / KEPT_NAME / digest / path.name
+
+
+def _keep(place: Path, data: bytes, mode: int) -> None:
+    """Whole or not at all: nodes keep the same at the same time."""
+    if place.exists():
+        return
+    place.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    beside = place.with_name(f".{os.getpid()}")
+    beside.write_bytes(data)
+    beside.chmod(0o600 | mode & 0o100)
+    beside.replace(place)
+
+
+def _loaded(record: Path) -> dict[str, dict[str, str]]:
+    """What a run has loaded first by each key: the hashes, by file."""
+    found: dict[str, dict[str, str]] = {}
+    for line in _notes(record):
+        with contextlib.suppress(ValueError, LookupError, TypeError):
+            one = json.loads(line)
+            digest = str(one["sha256"])
+            if re.fullmatch(r"[0-9a-f]{64}", digest):  # it is a part of a path
+                found.setdefault(str(one["place"]), {}).setdefault(str(one["file"]), digest)
+    return found
+
+
+def loaded_before(record: Path, source: FunctionSource) -> VettedFiles | None:
+    """What a run that is under way has loaded as `source`, where the files have other content by now.
+
+    None: what is there is to be loaded. Raises ConfigError where it is neither what was loaded before nor
+    kept, and where it is not of the version that `source` names.
+    """
+    if _ours(source):
+        return None
+    before = _loaded(record).get(source.key)
+    if before is None:
+        if source.version and source.version != _version(source):
+            raise ConfigError(f"{source}: was changed meanwhile")
+        return None
+    try:
+        files = tuple(_files_of(source, record))
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{source}: {error}") from None
+    for file in files:
+        if file.sha256 != before.get(file.path, file.sha256):
+            raise ConfigError(
+                f"{file.path}: has other content than what this run has loaded, of which no copy was kept"
+                f" (of at most {KEPT_BYTES_MAX >> 20} MiB)"
+            )
+    code = VettedFiles(source.place, files, source.key)
+    return code if code.kept else None
+
+
+def _version(source: FunctionSource) -> str:
+    """Of the content that is there. Raises ConfigError."""
+    try:
+        hashes = [file.sha256 for file in _files_of(source)]
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{source}: {error}") from None
+    return sha256("".join(hashes).encode()).hexdigest()[:VERSION_DIGITS]
+
+
+def versioned(text: str, record: Path) -> str:
+    """The text by which a run that is under way loads what `text` names now, whatever it has loaded before.
+
+    Raises ConfigError.
+    """
+    source = parse_source(text)
+    before = {} if _ours(source) else _loaded(record).get(source.key, {})
+    if all(_has(Path(path), digest) for path, digest in before.items()):
+        return text
+    return str(msgspec.structs.replace(source, version=_version(source)))
+
+
 def noted(record: Path) -> list[str]:
     """The hashes in the notes of a run, each once."""
-    try:
-        with open(record / NOTES_NAME, "rb") as file:
-            lines = file.read(NOTES_BYTES_MAX).splitlines()
-    except OSError:
-        return []
     found = []
-    for line in lines:
+    for line in _notes(record):
         with contextlib.suppress(ValueError, LookupError, TypeError):
             found.append(str(json.loads(line)["sha256"]))
     return list(dict.fromkeys(one for one in found if len(one) == HASH_DIGITS))
+
+
+def _notes(record: Path) -> list[bytes]:
+    try:
+        with open_input(record / NOTES_NAME) as file:
+            return file.read(NOTES_BYTES_MAX).splitlines()
+    except OSError:
+        return []
 
 
 # -- the ledger of this user ----------------------------------------------------------------------

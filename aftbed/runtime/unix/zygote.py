@@ -214,23 +214,36 @@ def _make_node(line: Line[control.ToNode], order: control.Assign, fds: list[int]
 
 
 class _NotedCode(Code):
-    """Notes in the record of the run what is not of this package."""
+    """Notes in the record of the run what is not of this package, and loads by one name always the same."""
 
     def __init__(self, record: Path) -> None:
         self._record = record
 
     def module(self, place: str) -> ModuleType:
-        module = load_module(place)
-        if place.endswith(".py") or place.partition(".")[0] != "aftbed":
-            from aftbed.runtime.unix import trust  # noqa: PLC0415 - hashlib, in nodes with such code only
+        return self._module(place)
 
-            trust.note(self._record, place, module)
+    def function_module(self, source: FunctionSource) -> ModuleType:
+        return self._module(source.place, source)
+
+    def _module(self, place: str, source: FunctionSource | None = None) -> ModuleType:
+        if not place.endswith(".py") and place.partition(".")[0] == "aftbed":
+            return load_module(place)
+        from aftbed.runtime.unix import trust  # noqa: PLC0415 - hashlib, in nodes with such code only
+
+        if source is not None and (before := trust.loaded_before(self._record, source)) is not None:
+            return trust.load(before)
+        module = load_module(place)
+        trust.note(self._record, place, module, source.key if source is not None else "")
         return module
 
-    def permit(self, source: FunctionSource) -> None:
+    def permit(self, source: FunctionSource) -> FunctionSource:
         from aftbed.runtime.unix import trust  # noqa: PLC0415 - the same
 
+        before = trust.loaded_before(self._record, source)
+        if before is not None:
+            return source.reading(before.kept)
         trust.note_files(self._record, source)
+        return source
 
 
 def _make_device(order: control.Assign, node: UnixNode) -> Device:
