@@ -115,7 +115,8 @@ def updated(graph: Graph, part: str, source: str) -> Graph:
     if graph.ftm == NONE:
         raise ConfigError(f"{NONE} has no engine, so nothing can be updated; any other mechanism has one")
     if part == APPLICATION and source == protected_by(graph):
-        raise ConfigError(f"{source} is what runs already, with the same content: nothing was changed")
+        name = source or "the built-in function"
+        raise ConfigError(f"{name} is what runs already, with the same content: nothing was changed")
     if part == APPLICATION:
         return protecting(graph, source)
     parts = sorted({b.part for b in graph.bricks if b.replica and b.kind != "watchdog"})
