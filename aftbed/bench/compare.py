@@ -129,7 +129,7 @@ def bench_compare(
         return (measure or measured)(venv, bench)
 
     for bench in dict.fromkeys(benches):
-        found = in_turn(rounds, partial(document, new, bench), partial(document, old, bench))
+        found = in_turn(rounds, partial(document, new, bench), partial(document, old, bench), 0)
         machine[bench] = found.machine
         for figure in FIGURES[shlex.split(bench)[0]]:
             of_figure = _changes(bench, figure, found.limits, found.figures)

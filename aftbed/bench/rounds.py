@@ -29,14 +29,16 @@ import msgspec
 
 from aftbed.bench.runs import Percentiles, percentiles
 from aftbed.campaign.statistics import quantile
-from aftbed.core.errors import HarnessError
+from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.runtime.unix import linux
 
 ROUNDS: Final = 11  # fewer are too few to quote
 DIGITS: Final = 3  # of a ratio
+FAILURES_MAX: Final = 3  # of a bench, that are measured again
 
 Figure = TypeVar("Figure")
 Limit = TypeVar("Limit")
+Value = TypeVar("Value")
 
 
 # -- in turn --------------------------------------------------------------------------------------
@@ -51,26 +53,40 @@ class Rounds(NamedTuple, Generic[Figure, Limit]):
 
 
 def in_turn(
-    rounds: int, figure: Callable[[int], Figure], limit: Callable[[int], Limit]
+    rounds: int,
+    figure: Callable[[int], Figure],
+    limit: Callable[[int], Limit],
+    failures_max: int = FAILURES_MAX,
 ) -> Rounds[Figure, Limit]:
     """Measure both `rounds` times, the limit first in round 0, the figure first in round 1, and so on.
 
-    Both get the number of the round.
+    Both get the number of the round. One that fails is measured again, in all at most `failures_max` times: a
+    busy machine may fail it (`runs.tried`). Raises the HarnessError or ConfigError of the next failure.
     """
     watch = MachineWatch()
     figures: list[Figure] = []
     limits: list[Limit] = []
+    failures = 0
+
+    def measure(number: int, what: Callable[[int], Value], into: list[Value]) -> None:
+        nonlocal failures
+        while len(into) == number:
+            try:
+                into.append(what(number))
+            except (HarnessError, ConfigError):
+                failures += 1
+                if failures > failures_max:
+                    raise
+        watch.look()
+
     for number in range(rounds):
         if number % 2 == 0:
-            limits.append(limit(number))
-            watch.look()
-            figures.append(figure(number))
+            measure(number, limit, limits)
+            measure(number, figure, figures)
         else:
-            figures.append(figure(number))
-            watch.look()
-            limits.append(limit(number))
-        watch.look()
-    return Rounds(figures, limits, watch.found())
+            measure(number, figure, figures)
+            measure(number, limit, limits)
+    return Rounds(figures, limits, watch.found(failures))
 
 
 def shares(count: int, rounds: int) -> list[int]:
@@ -191,7 +207,7 @@ class Meanwhile(msgspec.Struct, frozen=True):
     `steal_percent`: of the time of all cores, what the hypervisor gave to others; `busy_percent`: what was
     used, by whatever. `load`: the mean of the last minute before the bench began, so of other work.
     `mhz_min` and `mhz_max`: of any core at the looks between two measurements. None where the machine does
-    not show it.
+    not show it. `failures`: measurements that failed and were repeated.
     """
 
     seconds: float
@@ -201,6 +217,7 @@ class Meanwhile(msgspec.Struct, frozen=True):
     load: float
     mhz_min: float | None
     mhz_max: float | None
+    failures: int = 0
 
 
 class MachineWatch:
@@ -216,7 +233,7 @@ class MachineWatch:
         """Note the frequency of the cores."""
         self._mhz += frequencies_mhz()
 
-    def found(self) -> Meanwhile:
+    def found(self, failures: int = 0) -> Meanwhile:
         """What the machine did up to now."""
         now = _Counters.now()
         seconds = time.monotonic() - self._began_s
@@ -232,6 +249,7 @@ class MachineWatch:
             round(self._load, 2),
             min(self._mhz, default=None),
             max(self._mhz, default=None),
+            failures,
         )
 
 

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from aftbed.bench import rounds as module
 from aftbed.bench.rounds import (
+    FAILURES_MAX,
     BesideLimit,
     InRounds,
     MachineWatch,
@@ -29,7 +30,7 @@ from aftbed.bench.rounds import (
     text,
 )
 from aftbed.bench.runs import Percentiles
-from aftbed.core.errors import HarnessError
+from aftbed.core.errors import ConfigError, HarnessError
 
 MACHINE: Final = Meanwhile(1.5, 0.25, 80.0, 1200.0, 0.5, None, None)
 times = st.lists(st.floats(0.001, 1e6), min_size=1, max_size=30)
@@ -58,6 +59,33 @@ def test_figure_and_limit_alternate_in_short_rounds_and_each_is_first_in_turn() 
     assert order == ["limit 0", "figure 0", "figure 1", "limit 1", "limit 2", "figure 2"]
     assert found.figures == [0, 10, 20] and found.limits == ["0", "1", "2"]
     assert found.machine.seconds >= 0
+
+
+def test_a_measurement_that_fails_is_repeated_and_counted() -> None:
+    """Only that one: a kill that a busy machine did not carry out costs no other round."""
+    order: list[str] = []
+
+    def figure(number: int) -> int:
+        order.append(f"figure {number}")
+        if order.count("figure 1") == 1 and number == 1:
+            raise HarnessError("the machine is too busy")
+        return number
+
+    found = in_turn(2, figure, lambda number: order.append(f"limit {number}"))
+    assert order == ["limit 0", "figure 0", "figure 1", "figure 1", "limit 1"]
+    assert found.figures == [0, 1] and found.machine.failures == 1
+
+
+def test_a_bench_that_fails_again_and_again_ends_with_the_reason() -> None:
+    tries: list[int] = []
+
+    def figure(number: int) -> int:
+        tries.append(number)
+        raise ConfigError("the run ended")
+
+    with pytest.raises(ConfigError, match="the run ended"):
+        in_turn(11, figure, lambda number: number)
+    assert tries == [0] * (FAILURES_MAX + 1)
 
 
 @given(st.integers(1, 10_000), st.integers(1, 50))
@@ -236,7 +264,10 @@ def test_what_a_person_reads() -> None:
         ["help.ratio", ratio],
         ["limit", limit],
         ["ratio", ratio],
-        ["machine", "seconds 1.5  steal_percent 0.25  busy_percent 80.0  switches_per_s 1200.0  load 0.5"],
+        [
+            "machine",
+            "seconds 1.5  steal_percent 0.25  busy_percent 80.0  switches_per_s 1200.0  load 0.5  failures 0",
+        ],
     ]
 
 
@@ -254,4 +285,5 @@ def test_the_keys_of_a_document() -> None:
         "load",
         "mhz_min",
         "mhz_max",
+        "failures",
     }

@@ -210,6 +210,8 @@ def test_the_cycle_of_a_function_is_measured_with_its_requests(library: str, tmp
         "cycle",
         "--requests",
         "100",
+        "--rounds",
+        "2",
         "--app",
         library,
         "--sent",
