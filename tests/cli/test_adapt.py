@@ -183,7 +183,7 @@ def test_an_unsuitable_mechanism_is_refused_unless_forced(
     reason: str,
     instead: str,
 ) -> None:
-    fake.graph = updated(build(running, "process"), APPLICATION, function)
+    fake.graph = build(running, "process", application=function)
     error = refused("adapt", *arguments)
     assert reason in error and f"(consistent: {instead})" in error and "--force" in error
     assert fake.goals == []
