@@ -11,7 +11,7 @@ from liveruns import Done, forked, home
 
 from aftbed.cli.new_function import KINDS, create
 
-pytestmark = [pytest.mark.process, pytest.mark.deep]
+pytestmark = [pytest.mark.process, pytest.mark.deep, pytest.mark.timeout(3600)]
 
 __all__ = ["home"]
 
