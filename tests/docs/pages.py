@@ -7,6 +7,7 @@ A fenced block's first line says what it is, and what a test does with it:
     ```console exact           and every line shown must stand in the output, as far as it is shown
     ```console live            run it against a live run, which the test starts
     ```console norun           do not run it
+    ```console live each       each command with a live run of its own
     ```yaml file=NAME          write it to NAME before what follows is run
     ```diff file=NAME          see `test_contributing`
 """

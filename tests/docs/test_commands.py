@@ -152,12 +152,16 @@ def run_page(page: Path, folder: Path, lives: list[LiveRun]) -> int:
                 count += 1
             if words[0] != "aftbed":
                 continue
+            if "each" in block.words and lives:  # what one command does would meet the next one
+                lives.pop().end()
             if "live" in block.words and not (lives and lives[-1].alive):
                 lives.append(LiveRun(folder))
             check(block, command, aftbed(words[1:], folder, live="live" in block.words))
             count += 1
             if words[1] == "stop":
                 lives.pop().end()
+        if "each" in block.words:
+            lives.pop().end()
     return count
 
 

@@ -73,7 +73,7 @@ def test_every_relative_link_leads_somewhere(page: Path) -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_every_block_is_of_a_known_kind(page: Path) -> None:
-    allowed = {"exact", "live", "norun"}
+    allowed = {"each", "exact", "live", "norun"}
     for block in blocks(page):
         strange = {w for w in block.words if w not in allowed and w.partition("=")[0] not in ("exit", "file")}
         assert not strange, f"{page.name}:{block.number}: {strange}"
