@@ -185,9 +185,9 @@ def test_how_many_bricks_of_a_node_emit_an_event(
 
 @pytest.mark.parametrize("event", [e for e in Event if e.label.startswith("adapt.")])
 def test_the_steps_of_an_adaptation_are_the_supervisors_and_the_rest_is_the_engines(event: Event) -> None:
-    who = SUPERVISOR if event.label.startswith("adapt.step.") else "engine"
+    emitter = SUPERVISOR if event.label.startswith("adapt.step.") else "engine"
     for ftm in EXPRESSIONS:
-        expected = None if ftm == "none" else who  # it has no Engine
+        expected = None if ftm == "none" else emitter  # it has no Engine
         assert emitting_node(Roles(build(ftm, "process"), "a", ""), event.label) == expected
     crash("engine", Trigger(event.label, 3)).check(build("pbr", "process"))
 

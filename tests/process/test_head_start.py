@@ -1,9 +1,11 @@
 """The supervisor of `aftbed run` begins before its command imports anything, and ends with it."""
 
+import contextlib
 import os
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
@@ -70,34 +72,34 @@ def test_a_command_without_a_run_leaves_no_process(words: tuple[str, ...]) -> No
     assert done.returncode == 2 and done.stdout == "" and "Traceback" not in done.stderr
 
 
-@pytest.mark.usefixtures("home")
-def test_the_supervisor_of_a_command_that_is_killed_ends_with_its_zygotes() -> None:
-    """Whenever that is: here, as soon as there is a supervisor."""
-    words = [sys.executable, "-m", "aftbed", "run", "--scenario", "ccrs-20"]
-    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT) as command:
+@contextlib.contextmanager
+def killed(*words: str) -> Iterator[int]:
+    """The pid of the supervisor of a command that is killed behind the block, and leaves nothing."""
+    arguments = [sys.executable, "-m", "aftbed", "run", *words]
+    with subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.STDOUT) as command:
         children = Path(f"/proc/{command.pid}/task/{command.pid}/children")
         try:
             until(children.read_text, "the supervisor")
+            yield int(children.read_text().split()[0])
         finally:
             command.send_signal(signal.SIGKILL)
         command.communicate(timeout=GONE_SECONDS_MAX)  # to the end: no process of it has the output open
+
+
+@pytest.mark.usefixtures("home")
+def test_the_supervisor_of_a_command_that_is_killed_ends_with_its_zygotes() -> None:
+    """Whenever that is: here, as soon as there is a supervisor."""
+    with killed("--scenario", "ccrs-20"):
+        pass
 
 
 @pytest.mark.usefixtures("home")
 def test_a_supervisor_that_was_stopped_ends_with_its_command() -> None:
-    words = [sys.executable, "-m", "aftbed", "run", "--load", "5"]
-    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT) as command:
-        children = Path(f"/proc/{command.pid}/task/{command.pid}/children")
-        try:
-            until(children.read_text, "the supervisor")
-            supervisor = int(children.read_text().split()[0])
-            name = Path(f"/proc/{supervisor}/comm")
-            until(lambda: name.read_text().startswith("aftbed-"), "the supervisor, with its name")
-            os.kill(supervisor, signal.SIGSTOP)
-            until(lambda: linux.state_of(supervisor) == "T", "that it stops")
-        finally:
-            command.send_signal(signal.SIGKILL)
-        command.communicate(timeout=GONE_SECONDS_MAX)  # to the end: no process of it has the output open
+    with killed("--load", "5") as supervisor:
+        name = Path(f"/proc/{supervisor}/comm")
+        until(lambda: name.read_text().startswith("aftbed-"), "the supervisor, with its name")
+        os.kill(supervisor, signal.SIGSTOP)
+        until(lambda: linux.state_of(supervisor) == "T", "that it stops")
 
 
 def test_a_drive_that_looks_like_a_load_has_its_bus_all_the_same(tmp_path: Path) -> None:
