@@ -61,7 +61,11 @@ FIGURES: Final = {  # by the first word of a bench
     "recovery": (ComparedFigure("recovery_ms"),),
     "adapt": (ComparedFigure("blackout_ms"), ComparedFigure("back.blackout_ms")),
     "launch": (ComparedFigure("launch_ms"), ComparedFigure("graph_ms"), ComparedFigure("help.help_ms")),
-    "memory": (ComparedFigure("pss_mb", size=True), ComparedFigure("rss_mb", size=True)),
+    "memory": (
+        ComparedFigure("pss_mb", size=True),
+        ComparedFigure("rss_mb", size=True),
+        ComparedFigure("idle_cpu_percent"),
+    ),
     "campaign": (ComparedFigure("per_minute", rate=True), ComparedFigure("cpu_ms")),
     "state": (ComparedFigure("cycle_us"), ComparedFigure("blackout_ms")),
 }

@@ -152,6 +152,7 @@ LINES: Final = (
     ),
     TableLine("the graph from a warm zygote", LAUNCH, "graph_ms", "ms", goal={"p50": 40}),
     TableLine("memory of the 17 processes (PSS)", "memory --ftm pbr", "pss_mb", "MB", goal={"": 70}),
+    TableLine("CPU of the same, idle", "memory --ftm pbr", "idle_cpu_percent", "% of a core", goal={"": 2}),
     TableLine("beside them (PSS)", "memory --ftm pbr", "others.*.pss_mb", "MB"),
     _rate("experiments a minute on real processes, each a crash in 100 requests", "campaign", 600),
     TableLine("time of one of them, two at a time", "campaign", "experiment_ms", "ms", OWN, OWN_RATIO),

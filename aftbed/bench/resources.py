@@ -53,6 +53,7 @@ RADAR_HZ: Final = 50.0
 IDLE_HZ: Final = 1.0
 WINDOW_PERIODS_MIN: Final = 1.2
 START_SECONDS_MAX: Final = 10.0
+IDLE_SECONDS: Final = 3.0  # of a run that has nothing to do
 SETTLE_SECONDS: Final = 1.5  # of driving before the look, so that the pages that work touches are counted
 ASLEEP_PERCENT: Final = 0.5  # of one core: a node below it does almost nothing
 NO_CRASH: Final = "single"  # the placement in which both replicas die at once
@@ -100,19 +101,23 @@ class MemoryOfOthers(msgspec.Struct):
 
 
 class MemoryResult(msgspec.Struct, frozen=True):
-    """The document of `aftbed bench memory`; `others`: zygotes, spares, hub, vehicle and command."""
+    """The document of `aftbed bench memory`; `others`: zygotes, spares, hub, vehicle and command.
+
+    `idle_cpu_percent` is of one core, of the graph's processes at one request a second.
+    """
 
     ftm: str
     placement: str
     processes: int
     pss_mb: float
     rss_mb: float
+    idle_cpu_percent: float
     others: dict[str, MemoryOfOthers]
     machine: Meanwhile
 
 
 def bench_memory(ftm: str, placement: str) -> MemoryResult:
-    """Of a car's drive, when it has settled. Raises HarnessError."""
+    """Memory of a car's drive, when it has settled; CPU of a run that is idle. Raises HarnessError."""
     watch = MachineWatch()
     options, listener = options_for(ftm=ftm, placement=placement, work=CarRun("free-drive", 1.0, "latch"))
     launched = launch(options, listener)
@@ -133,7 +138,10 @@ def bench_memory(ftm: str, placement: str) -> MemoryResult:
             found.pss_mb = round(found.pss_mb + row.pss_mb, 1)
     pss_mb, rss_mb = sum(row.pss_mb for row in nodes), sum(row.rss_mb for row in nodes)
     sizes = round(pss_mb, 1), round(rss_mb, 1)
-    return MemoryResult(ftm, placement, len(nodes), *sizes, others, watch.found())
+    with endless_run(ftm, placement, IDLE_HZ) as run:
+        wait_until_ready(run.private)
+        idle, _, _ = _usage(run.private, IDLE_SECONDS)
+    return MemoryResult(ftm, placement, len(nodes), *sizes, idle.cpu_percent, others, watch.found())
 
 
 def process_count(ftm: str, placement: str) -> int:

@@ -2,9 +2,9 @@
 
 Layout of a journal file: one header page, then records of 32 bytes, little endian. A record is
 committed by its event code, which is written last; the first record without one ends the journal.
-So a `kill -9` loses at most the record in the making. The header also holds the node's pulse (when
-it was last seen running), the flag by which the runtime announces control mail, and a lock that dies
-with the node.
+So a `kill -9` loses at most the record in the making. The header also holds the node's activity (whether
+its host waits or executes bricks), the flag by which the runtime announces control mail, and a lock that
+dies with the node.
 
 The client keeps a *dialogue* beside it: every request with its bytes, every reply with its bytes, in
 the order in which they happened. It is what G2 and G3 are judged by. Now and then it writes its own state
@@ -27,7 +27,7 @@ from aftbed.core.events import BY_CODE, Event
 
 MAGIC: Final = b"AFTBEDJ1"
 HEADER_BYTES: Final = 4096
-PULSE_OFFSET: Final = 8  # u64, monotonic ns
+ACTIVITY_OFFSET: Final = 8  # u8, even: the host waits, odd: it executes; another value each time
 FLAG_OFFSET: Final = 16  # u8, not 0: control mail waits
 DROPPED_OFFSET: Final = 24  # u32, records that found no room
 LIFELINE_OFFSET: Final = 32  # u32, a futex that the node holds

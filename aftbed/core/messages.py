@@ -239,10 +239,13 @@ class NodeDied(Message, frozen=True, tag=26):
     node: str
 
 
-class Pulses(Message, frozen=True, tag=27):
-    """Host to a Watchdog: when each watched node was last seen running (monotonic ns)."""
+class SeenAlive(Message, frozen=True, tag=27):
+    """Host to a Watchdog: when each watched node was last seen alive (monotonic ns), and how much later than
+    it was planned the host looked.
+    """
 
     seen_ns: dict[str, int]
+    late_ns: int
 
 
 class Situation(Message, frozen=True, tag=28):
@@ -376,7 +379,7 @@ AnyMessage = (  # all that a brick may receive
     | Submit
     | Watch
     | NodeDied
-    | Pulses
+    | SeenAlive
     | Situation
     | Adapt
     | Progress

@@ -19,7 +19,7 @@ from typing import Final
 from aftbed.core.brick import Brick, Effect, Note, Order, Send
 from aftbed.core.errors import PeerError
 from aftbed.core.events import Event
-from aftbed.core.messages import AnyMessage, NodeDied, Pulses, Rebound, Situation, Suspect, Watch
+from aftbed.core.messages import AnyMessage, NodeDied, Rebound, SeenAlive, Situation, Suspect, Watch
 from aftbed.core.script import (
     Attach,
     Bind,
@@ -37,7 +37,6 @@ from aftbed.core.script import (
 )
 from aftbed.ftm.declaration import BrickKind, Emits
 
-PERIOD_NS: Final = 10_000_000
 HANG_DEADLINE_NS: Final = 60_000_000
 LATE_NS_MAX: Final = 10_000_000
 _OPEN: Final = ("sense",)
@@ -46,17 +45,16 @@ _OPEN: Final = ("sense",)
 class Watchdog(Brick):
     """Reports to Recovery that a node of its replica is dead or hangs. One per replica.
 
-    A death comes as a message (the host holds the pidfds). A hang is a node whose pulse is older than
-    `HANG_DEADLINE_NS`. The deadline only counts while this Watchdog itself runs on time: if the pulses, which
-    the host hands in every `PERIOD_NS`, come late, the machine was stalled, and every node gets the whole
-    deadline again. That keeps a busy machine from a false failover. One suspicion per generation is enough.
+    A death comes as a message (the host holds the pidfds). A hang is a node that was not seen alive for
+    `HANG_DEADLINE_NS`. The deadline only counts while this Watchdog itself runs on time: if its host looked
+    late, the machine was stalled, and every node gets the whole deadline again. That keeps a busy machine
+    from a false failover. One suspicion per generation is enough.
     """
 
     def __init__(self) -> None:
         self.replica, self.generation = "", 0
         self.nodes: tuple[str, ...] = ()
         self.suspect: Suspect | None = None
-        self._last_ns = 0
         self._grace_until_ns = 0
 
     def open_ports(self) -> tuple[str, ...]:
@@ -69,26 +67,25 @@ class Watchdog(Brick):
         match msg:
             case Watch():
                 self.replica, self.generation, self.nodes = msg.replica, msg.generation, msg.nodes
-                self.suspect, self._last_ns = None, now_ns
+                self.suspect = None
                 self._grace_until_ns = now_ns + HANG_DEADLINE_NS
                 return []
             case NodeDied():
                 return self._suspect(msg.node, "crash", now_ns) if msg.node in self.nodes else []
-            case Pulses():
+            case SeenAlive():
                 return self._judge(msg, now_ns)
             case Rebound():  # a new Recovery, which knows of no suspicion yet
                 return [Send("wdg2rec", self.suspect)] if self.suspect and msg.bound else []
             case _:
                 raise PeerError(f"{type(msg).__name__} on {port}")
 
-    def _judge(self, pulses: Pulses, now_ns: int) -> list[Effect]:
-        if now_ns - self._last_ns > PERIOD_NS + LATE_NS_MAX:
+    def _judge(self, seen: SeenAlive, now_ns: int) -> list[Effect]:
+        if seen.late_ns > LATE_NS_MAX:
             self._grace_until_ns = now_ns + HANG_DEADLINE_NS
-        self._last_ns = now_ns
         if now_ns < self._grace_until_ns:
             return []
         for node in self.nodes:
-            if now_ns - pulses.seen_ns.get(node, now_ns) > HANG_DEADLINE_NS:
+            if now_ns - seen.seen_ns.get(node, now_ns) >= HANG_DEADLINE_NS:
                 return self._suspect(node, "hang", now_ns)
         return []
 

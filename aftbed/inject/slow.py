@@ -2,7 +2,7 @@
 steps.
 
 Each step of the target's bricks takes a fixed time longer, or as much longer as it would with that share of
-a CPU. The agent in the node delays the steps; the node's pulse goes on, because a slow node does not hang.
+a CPU. The agent in the node delays the steps; the host waits meanwhile, so the node does not hang.
 """
 
 import contextlib

@@ -171,7 +171,7 @@ class Deliver(ControlOrder, frozen=True):
 
 
 class WatchNodes(ControlOrder, frozen=True):
-    """To the host of a Watchdog: watch the pidfds that came along, and the pulses in these journals."""
+    """To the host of a Watchdog: watch the pidfds that came along, and the activity in these journals."""
 
     replica: str
     generation: int

@@ -21,7 +21,6 @@ import msgspec
 from aftbed.core.errors import StepFailed
 from aftbed.core.graph import STAGED, Graph, Link
 from aftbed.ftm.compose import REPLICAS
-from aftbed.ftm.failover import HANG_DEADLINE_NS
 from aftbed.runtime import control
 from aftbed.runtime.interface import BUS, LIGHT, Channel, Process, ProcessKind, Runtime
 from aftbed.runtime.tasks import STEP_SECONDS_MAX, Key, Wait
@@ -122,7 +121,8 @@ class Cores:
 
 WATCHED_KINDS: Final = ("client", "proxy", "watchdog", "recovery", "engine")
 
-HANG_NS: Final = 150_000_000  # where no Watchdog watches: a process with an older pulse hangs
+NUDGE_SECONDS: Final = 0.02  # until a node that has not read its orders is nudged again
+HANG_NS: Final = 150_000_000  # where no Watchdog watches: a process that is not seen alive for so long hangs
 BIRTH_SECONDS_MAX: Final = 10.0  # each makes its journal first, and a disk may be busy
 
 DIGEST_DIGITS: Final = 16
@@ -178,6 +178,7 @@ class Deployment:
         self.epoch, self.leader, self.backup = 1, REPLICAS[0], ""
         self.lost: set[str] = set()  # replicas that an adaptation has left to Recovery
         self._tokens = 0
+        self._nudges_late = False  # a timer runs for that
         self._cores = Cores(cpus)
         self._generations: dict[str, int] = {}
         self.slots: dict[str, Slot] = {}
@@ -239,17 +240,23 @@ class Deployment:
             raise StepFailed(f"{process.name} is gone")
         self.pool.order(process, order, fds)
         process.announce()
+        if process.announced() and not self._nudges_late:
+            self._nudges_late = True
+            self.runtime.loop.after(NUDGE_SECONDS, self._nudge_late)
 
     def _nudge(self, node: str) -> None:
         for brick in self.graph.nodes.get(node, ()):
             for channel in self.channels.into(brick):
                 channel.nudge()
 
-    def nudge_late(self) -> None:
+    def _nudge_late(self) -> None:
         """Nudge again each node that has not read its orders: it may have changed its inputs since."""
-        for node, process in self.nodes.items():
-            if process.alive and process.announced():
-                self._nudge(node)
+        late = [node for node, process in self.nodes.items() if process.alive and process.announced()]
+        for node in late:
+            self._nudge(node)
+        self._nudges_late = bool(late)
+        if late:
+            self.runtime.loop.after(NUDGE_SECONDS, self._nudge_late)
 
     def ask(
         self,
@@ -509,15 +516,9 @@ class Deployment:
         return process is not None and process.alive
 
     def cause_of_loss(self, replica: str) -> str:
-        """What the Watchdog of `replica` saw: a node that is silent, or one that died.
-
-        A lifeline shows a death before the pidfd does, so to check whether all are alive is not enough.
-        """
-        now_ns = self.runtime.loop.now_ns()
+        """What the Watchdog of `replica` saw: a node that died, or else one that hangs."""
         nodes = [self.nodes[node] for node in self.slots[replica].nodes if node in self.nodes]
-        dead = any(not node.alive for node in nodes)
-        silent = any(node.silent(now_ns, HANG_DEADLINE_NS) for node in nodes)
-        return "hang" if silent and not dead else "crash"
+        return "crash" if any(node.dying() for node in nodes) else "hang"
 
     def role_of(self, node: str) -> str:
         """The role that `aftbed ps` shows."""

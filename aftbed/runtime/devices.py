@@ -15,13 +15,14 @@ from typing import Final, Protocol
 import msgspec
 
 from aftbed.core.journal import Entry, EntryKind
-from aftbed.core.messages import NodeDied, Pulses, Reply, Request, Submit
+from aftbed.core.messages import NodeDied, Reply, Request, SeenAlive, Submit
 from aftbed.ftm.client import BACKLOG_MAX, Client
-from aftbed.ftm.failover import PERIOD_NS
 from aftbed.runtime import control
 
 _SENT, _ANSWERED = EntryKind.SENT, EntryKind.ANSWERED
 CATCH_UP: Final = 10  # periods: a load that was held up makes good for no more
+LOOK_NS: Final = 20_000_000  # between two looks of a Watchdog at its replica: a third of its deadline
+LOOK_IDLE_NS: Final = 40_000_000  # while the replica has nothing to do
 
 
 class Device(Protocol):
@@ -40,7 +41,7 @@ class Device(Protocol):
         """Handle `fd`, which is readable."""
         raise AssertionError(f"no descriptor {fd}")
 
-    def take(self, now_ns: int) -> Submit | NodeDied | Pulses | None:
+    def take(self, now_ns: int) -> Submit | NodeDied | SeenAlive | None:
         """The next message for the brick, or None."""
         ...
 
@@ -244,7 +245,7 @@ class CarDevice(Device):
 
 
 class Senses(Protocol):
-    """How a runtime sees deaths and pulses of nodes."""
+    """How a runtime sees deaths of nodes, and whether they are alive."""
 
     def watch(self, order: control.WatchNodes, fds: list[int], died: Callable[[str], None]) -> None:
         """Watch these nodes and no others; `died` may be called for each."""
@@ -260,15 +261,18 @@ class Senses(Protocol):
         """The nodes behind `fd`, which is readable, that have died."""
         raise AssertionError(f"no descriptor {fd}")
 
-    def pulse_ns(self, node: str, now_ns: int) -> int:
-        """When `node` was last seen running. A node that the machine does not let run counts as seen now."""
+    def look(self, now_ns: int) -> tuple[dict[str, int], bool]:
+        """When each node was last seen alive: now, if the machine does not let it run; and whether any of
+        them did something since the last look, or is not alive.
+        """
         ...
 
 
 class Sensor(Device):
-    """The device of a Watchdog: deaths and pulses of the nodes of its replica.
+    """The device of a Watchdog: deaths of the nodes of its replica, and when each was last seen alive.
 
-    A replica whose first node has died is lost: the deaths that follow are ignored.
+    A replica whose first node has died is lost: the deaths that follow are ignored. A replica that has
+    nothing to do is looked at less often, unless one of its nodes is not seen alive.
     """
 
     port = "sense"
@@ -298,18 +302,20 @@ class Sensor(Device):
         self._died += self._senses.died(fd)
         self._alarmed = bool(self._died)
 
-    def take(self, now_ns: int) -> NodeDied | Pulses | None:
+    def take(self, now_ns: int) -> NodeDied | SeenAlive | None:
         """Deaths first."""
         if self._died:
             return NodeDied(self._died.popleft())
         if now_ns < self._next_ns or not self._nodes or self._alarmed:
             return None
-        self._next_ns = now_ns + PERIOD_NS
-        return Pulses({node: self._senses.pulse_ns(node, now_ns) for node in self._nodes})
+        late_ns = now_ns - (self._next_ns or now_ns)
+        seen_ns, busy = self._senses.look(now_ns)
+        self._next_ns = now_ns + (LOOK_NS if busy else LOOK_IDLE_NS)
+        return SeenAlive(seen_ns, late_ns)
 
     def quiet(self) -> None:
         self._senses.forget()
-        self._nodes, self._alarmed = (), False
+        self._nodes, self._alarmed, self._next_ns = (), False, 0
         self._died.clear()
 
     def deadline_ns(self) -> int | None:

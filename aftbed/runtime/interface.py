@@ -125,12 +125,12 @@ class Process(Protocol):
         """Whether it is seen to run no more: stopped, or dead."""
         ...
 
-    def silent(self, now_ns: int, deadline_ns: int) -> bool:
-        """Whether it lives, as far as is known, and its pulse is older than `deadline_ns`."""
+    def dying(self) -> bool:
+        """Whether it is dead, or has begun to die, which `alive` does not show yet."""
         ...
 
     def hangs(self, now_ns: int, deadline_ns: int) -> bool:
-        """Whether its pulse is older than `deadline_ns`, though the machine lets it run."""
+        """Look: whether it was not seen alive for `deadline_ns`, though the machine lets it run."""
         ...
 
     def assigned(self) -> None:

@@ -8,7 +8,7 @@ how time passes and how a node ends is its `NodeIO`: `unix.node_io` over sockets
 1. Orders of the executive come before data (the NodeIO sees to it: it knows when an order has arrived).
 2. Mail between bricks of this node, the oldest whose port is open.
 3. A suspend that was asked for, once no request is inside; a suspended node takes no mail.
-4. What the device has for its brick (requests for the Client, deaths and pulses for the Watchdog).
+4. What the device has for its brick (requests for the Client, what the Watchdog senses).
 5. Mail from other nodes at an open port, then deadlines that have passed.
 
 Mail for a closed port stays in its channel, which outlives this node.

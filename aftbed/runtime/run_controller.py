@@ -179,11 +179,11 @@ class RunController:
             self._loop.after(LOSS_SECONDS, self._look_for_loss)
 
     def look_for_hangs(self) -> None:
-        """What no Watchdog watches and shows no pulse is killed, and so replaced."""
+        """Look at all nodes. One that hangs, and that no Watchdog watches, is killed, and so replaced."""
         now_ns = self._loop.now_ns()
-        for process in list(self._runtime.pool.processes):
-            single = process.kind is ProcessKind.NODE and process.name in self.deployment.singles
-            if single and process.hangs(now_ns, HANG_NS):
+        nodes = [process for process in self._runtime.pool.processes if process.kind is ProcessKind.NODE]
+        for process in [process for process in nodes if process.hangs(now_ns, HANG_NS)]:
+            if process.name in self.deployment.singles:
                 self._runtime.log("hangs", f"{process.name} (pid {process.pid}): killed, to be replaced")
                 process.kill()
 

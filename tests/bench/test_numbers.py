@@ -53,7 +53,11 @@ DOCUMENTS: Final[dict[str, Document]] = {  # by the first word of a command
         **BESIDE,
         "help": {"help_ms": {"p50": 150, "max": 160}, **BESIDE},
     },
-    "memory": {"pss_mb": 80.0, "others": {"zygote": {"processes": 2, "pss_mb": 20.0}}},
+    "memory": {
+        "pss_mb": 80.0,
+        "idle_cpu_percent": 1.5,
+        "others": {"zygote": {"processes": 2, "pss_mb": 20.0}},
+    },
     "campaign": {"per_minute": 700, "cpu_ms": 230, "experiment_ms": 90.5, **BESIDE},
     "state": {
         "cycle_us": TIMES,

@@ -34,10 +34,10 @@ from aftbed.core.messages import (
     HoldAt,
     NodeDied,
     Promotion,
-    Pulses,
     Rebound,
     Reply,
     Request,
+    SeenAlive,
     Situation,
     Submit,
     Suspect,
@@ -361,7 +361,7 @@ def by_hand(name: str, make: Callable[[], Brick], mail: tuple[type, ...], *legal
 
 
 PLAIN: Final = (
-    by_hand("Watchdog", Watchdog, (Watch,), Watch, NodeDied, Pulses, Rebound),
+    by_hand("Watchdog", Watchdog, (Watch,), Watch, NodeDied, SeenAlive, Rebound),
     by_hand("Recovery", Recovery, (), Suspect, Situation, Rebound),
 )
 

@@ -7,15 +7,16 @@ from samples import notes, sends
 
 from aftbed.core.brick import CONTROL, Effect
 from aftbed.core.events import Event
-from aftbed.core.messages import NodeDied, Pulses, Rebound, Suspect, Watch
-from aftbed.ftm.failover import HANG_DEADLINE_NS, LATE_NS_MAX, PERIOD_NS, Watchdog
+from aftbed.core.messages import NodeDied, Rebound, SeenAlive, Suspect, Watch
+from aftbed.ftm.failover import HANG_DEADLINE_NS, LATE_NS_MAX, Watchdog
+from aftbed.runtime.devices import LOOK_NS
 
 NODES: Final = ("a/protocol", "a/server")
 START_NS: Final = 10**12
 
 
 class Watched:
-    """A Watchdog that is handed pulses each period."""
+    """A Watchdog whose host looks at the nodes."""
 
     def __init__(self) -> None:
         self.brick, self.now_ns = Watchdog(), START_NS
@@ -24,17 +25,17 @@ class Watched:
     def watch(self, generation: int) -> None:
         self.brick.step(CONTROL, Watch("a", generation, NODES), self.now_ns)
 
-    def after(self, passed_ns: int, **silent_since_ns: int) -> list[Effect]:
-        """Pulses `passed_ns` later; nodes are fresh except the named ones (`server=...`)."""
+    def after(self, passed_ns: int, late_ns: int = 0, **silent_since_ns: int) -> list[Effect]:
+        """A look `passed_ns` later; all nodes are alive except the named ones (`server=...`)."""
         self.now_ns += passed_ns
         seen = {n: silent_since_ns.get(n.partition("/")[2], self.now_ns) for n in NODES}
-        return self.brick.step("sense", Pulses(seen), self.now_ns)
+        return self.brick.step("sense", SeenAlive(seen, late_ns), self.now_ns)
 
     def on_time(self, passed_ns: int, **silent_since_ns: int) -> list[Effect]:
-        """The same, but with all the pulses between, each on time; what came of them."""
+        """The same, but with all the looks between, each on time; what came of them."""
         effects: list[Effect] = []
-        for _ in range(passed_ns // PERIOD_NS):
-            effects += self.after(PERIOD_NS, **silent_since_ns)
+        for _ in range(passed_ns // LOOK_NS):
+            effects += self.after(LOOK_NS, 0, **silent_since_ns)
         return effects
 
 
@@ -64,42 +65,44 @@ def test_a_node_that_is_silent_past_the_deadline_hangs() -> None:
     watched = Watched()
     watched.on_time(2 * HANG_DEADLINE_NS)
     silent_ns = watched.now_ns
-    assert watched.on_time(HANG_DEADLINE_NS, server=silent_ns) == []
+    assert watched.on_time(HANG_DEADLINE_NS - LOOK_NS, server=silent_ns) == []
+    assert watched.after(LOOK_NS - 1, server=silent_ns) == []
     effects = watched.after(1, server=silent_ns)
     assert [m for _, m in sends(effects)] == [Suspect("a", 1, "a/server", "hang", watched.now_ns)]
 
 
-def test_a_node_with_a_pulse_does_not_hang() -> None:
+def test_a_node_that_is_seen_alive_does_not_hang() -> None:
     assert Watched().on_time(100 * HANG_DEADLINE_NS) == []
 
 
 def test_a_new_generation_has_the_whole_deadline_to_begin() -> None:
     watched = Watched()
-    assert watched.on_time(HANG_DEADLINE_NS - PERIOD_NS, server=0) == []
-    assert len(sends(watched.on_time(PERIOD_NS, server=0))) == 1
+    assert watched.on_time(HANG_DEADLINE_NS - LOOK_NS, server=0) == []
+    assert len(sends(watched.on_time(LOOK_NS, server=0))) == 1
 
 
-def test_pulses_that_come_late_give_everybody_the_whole_deadline_again() -> None:
+def test_a_late_look_gives_all_nodes_the_whole_deadline_again() -> None:
     watched = Watched()
     watched.on_time(2 * HANG_DEADLINE_NS)
     silent_ns = watched.now_ns
-    assert watched.after(10 * HANG_DEADLINE_NS, server=silent_ns) == [], "the machine was stalled"
-    assert watched.on_time(HANG_DEADLINE_NS - PERIOD_NS, server=silent_ns) == []
-    assert len(sends(watched.on_time(PERIOD_NS, server=silent_ns))) == 1
+    late_ns = 10 * HANG_DEADLINE_NS
+    assert watched.after(LOOK_NS + late_ns, late_ns, server=silent_ns) == [], "the machine was stalled"
+    assert watched.on_time(HANG_DEADLINE_NS - LOOK_NS, server=silent_ns) == []
+    assert len(sends(watched.on_time(LOOK_NS, server=silent_ns))) == 1
 
 
 @pytest.mark.parametrize(("late_ns", "alarms"), [(LATE_NS_MAX, 1), (LATE_NS_MAX + 1, 0)])
 def test_how_late_is_late(late_ns: int, alarms: int) -> None:
     watched = Watched()
     watched.on_time(2 * HANG_DEADLINE_NS)
-    effects = watched.after(PERIOD_NS + late_ns, server=watched.now_ns - HANG_DEADLINE_NS)
+    effects = watched.after(LOOK_NS + late_ns, late_ns, server=watched.now_ns - HANG_DEADLINE_NS)
     assert len(sends(effects)) == alarms
 
 
-def test_a_node_whose_pulse_is_not_known_yet_does_not_hang() -> None:
+def test_a_node_that_was_not_looked_at_yet_does_not_hang() -> None:
     watched = Watched()
     watched.on_time(2 * HANG_DEADLINE_NS)
-    assert watched.brick.step("sense", Pulses({}), watched.now_ns) == []
+    assert watched.brick.step("sense", SeenAlive({}, 0), watched.now_ns) == []
 
 
 def test_a_new_recovery_is_told_what_the_old_one_was() -> None:

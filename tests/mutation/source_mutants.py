@@ -232,13 +232,13 @@ MUTANTS: Final = (
         ("tests/sim/test_injectors.py",),
     ),
     SourceMutant(
-        "the pulse goes on although a brick loops",
+        "a node that is stuck in a brick is seen alive",
         "G2",
-        f"{UNIX}/node_io.py",
-        "if at != self._pulse_at or (frame is not None and",
-        "if at != self._pulse_at or (frame is not None or",
+        f"{UNIX}/liveness.py",
+        'self.idle = state == "S" and not activity & 1',
+        'self.idle = state == "S"',
         UNIT,
-        ("tests/runtime/test_pulse.py",),
+        ("tests/runtime/test_liveness.py",),
     ),
     SourceMutant(
         "a write without a reader is given up silently",

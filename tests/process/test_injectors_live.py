@@ -82,7 +82,7 @@ def test_a_slow_node_is_not_a_hung_one(home: Home) -> None:
 def test_a_delay_holds_back_what_is_sent(home: Home, channel: str, placement: str) -> None:
     outcome = ran(home, "pbr", f"delay {channel} by 12ms nth 10", placement=placement)
     took = latencies_ms(outcome)
-    assert 12 < took[10] < 32, "a process that is stuck in a read would wait for its pulse, or for ever"
+    assert 12 < took[10] < 32, "a process that is stuck in a read would wait for ever"
     assert_healed(outcome, 10)
     assert receipts(outcome) == ["activated"]
     assert outcome.verdict.verdict == "pass", outcome.verdict.reasons

@@ -10,10 +10,10 @@ import pytest
 
 from aftbed.core.events import Event
 from aftbed.core.journal import (
+    ACTIVITY_OFFSET,
     ENTRY,
     FLAG_OFFSET,
     HEADER_BYTES,
-    PULSE_OFFSET,
     RECORD,
     EntryKind,
     dropped,
@@ -216,17 +216,17 @@ def test_what_was_written_outlives_a_kill(tmp_path: Path) -> None:
     assert len(list(records(path.read_bytes()))) == 1000
 
 
-def test_the_header_carries_a_pulse_and_a_flag_between_processes(tmp_path: Path) -> None:
+def test_the_header_carries_activity_and_a_flag_between_processes(tmp_path: Path) -> None:
     path = tmp_path / "a.journal"
     journal, header = JournalFile(path, "a"), JournalHeader(path)
-    assert header.pulse_ns() == 0
-    journal.mapping[PULSE_OFFSET : PULSE_OFFSET + 8] = (2**63 + 5).to_bytes(8, "little")
-    assert header.pulse_ns() == 2**63 + 5
+    assert header.activity() == 0
+    journal.mapping[ACTIVITY_OFFSET] = 255
+    assert header.activity() == 255
     assert journal.mapping[FLAG_OFFSET] == 0
     header.announce()
     assert journal.mapping[FLAG_OFFSET] == 1
     journal.write(1, Event.SERVER_EXIT, 1, 0)
-    assert header.pulse_ns() == 2**63 + 5, "records do not touch the header"
+    assert header.activity() == 255, "records do not touch the header"
     header.close()
 
 
@@ -235,7 +235,7 @@ def test_the_header_is_still_seen_after_the_journal_has_grown(tmp_path: Path) ->
     journal, header = JournalFile(path, "a"), JournalHeader(path)
     for number in range(PER_CHUNK + 1):
         journal.write(number, Event.SERVER_EXIT, number, 0)
-    journal.mapping[PULSE_OFFSET] = 7
+    journal.mapping[ACTIVITY_OFFSET] = 7
     header.announce()
-    assert header.pulse_ns() == 7 and journal.mapping[FLAG_OFFSET] == 1
+    assert header.activity() == 7 and journal.mapping[FLAG_OFFSET] == 1
     header.close()

@@ -24,6 +24,7 @@ from aftbed.core.journal import Record
 from aftbed.core.messages import ChannelEnded, Message
 from aftbed.inject.shared_state import SHARED_BYTES
 from aftbed.runtime import control
+from aftbed.runtime.devices import LOOK_NS
 from aftbed.runtime.node import HostedBrick, Node, NodeIO, Recorder, function_failed
 from aftbed.runtime.sim.clock import HOP_QUANTILES_NS, Clock
 
@@ -31,7 +32,6 @@ IDLE_BEFORE_COLD_NS: Final = 20_000_000  # a reader that was idle for so long ha
 COLD_PENALTY_NS: Final = (10_000, 50_000)  # added to its next read: from, to
 QUEUE_MAX: Final = 128  # messages; a socket pair holds about as many small ones
 NEVER: Final = 1 << 62
-PULSE_NS: Final = 20_000_000  # an idle node looks up so often
 WRITE_NS_MAX: Final = 2_000_000_000  # a node that cannot write for so long takes itself for fenced
 STEP_NS: Final = HOP_QUANTILES_NS[len(HOP_QUANTILES_NS) // 2]  # of CPU time
 FULL_NS: Final = 100_000  # between two looks whether a full channel has room
@@ -216,7 +216,7 @@ class SimIO(NodeIO[SimChannel, SimChannel]):
     ) -> None:
         self.name, self._clock, self._records, self._ends = name, clock, records, ends
         self._report, self._on_end, self._cells = report, on_end, cells
-        self.alive, self.frozen_ns, self._pulse_ns = True, 0, 0
+        self.alive, self.frozen_ns, self._seen_ns = True, 0, 0
         self.ran_ns = 0  # when it last did anything
         self._doom: tuple[str, int] | None = None  # a brick, and before which of its effects the node dies
         self._orders: deque[tuple[control.ToNode, tuple[int, ...]]] = deque()
@@ -258,17 +258,17 @@ class SimIO(NodeIO[SimChannel, SimChannel]):
     # -- its life -----------------------------------------------------------------------------
 
     def freeze(self) -> None:
-        """Stop the node wherever it is; its last pulse was some time before."""
+        """Stop the node wherever it is; it was last seen alive some time before."""
         if not self.frozen_ns:
             self.frozen_ns = self._clock.ns
-            self._pulse_ns = self._clock.ns - self._clock.between_ns(0, PULSE_NS)
+            self._seen_ns = self._clock.ns - self._clock.between_ns(0, LOOK_NS)
 
     def thaw(self) -> None:
         self.frozen_ns = 0
         self.run()
 
-    def pulse_ns(self, now_ns: int) -> int:
-        return self._pulse_ns if self.frozen_ns else now_ns
+    def seen_ns(self, now_ns: int) -> int:
+        return self._seen_ns if self.frozen_ns else now_ns
 
     def die_before(self, brick: str, effect: int) -> None:
         """Have the node die before that effect of `brick`, counted from 0."""

@@ -102,14 +102,14 @@ class SimProcess:
     def stopped(self) -> bool:
         return self.dead or self._still or (self.io is not None and bool(self.io.frozen_ns))
 
-    def silent(self, now_ns: int, deadline_ns: int) -> bool:
-        return self.alive and self.pulse_ns(now_ns) < now_ns - deadline_ns
+    def dying(self) -> bool:
+        return not self.alive
 
     def hangs(self, now_ns: int, deadline_ns: int) -> bool:
-        return self.silent(now_ns, deadline_ns)
+        return self.alive and self.seen_ns(now_ns) < now_ns - deadline_ns
 
-    def pulse_ns(self, now_ns: int) -> int:
-        return now_ns if self.io is None else self.io.pulse_ns(now_ns)
+    def seen_ns(self, now_ns: int) -> int:
+        return now_ns if self.io is None else self.io.seen_ns(now_ns)
 
     # -- death --------------------------------------------------------------------------------
 
@@ -202,6 +202,7 @@ class SimSenses(Senses):
     def __init__(self, find: Callable[[int], SimProcess], wake: Callable[[], None]) -> None:
         self._find, self._wake = find, wake
         self._nodes: dict[str, SimProcess] = {}
+        self._seen_ns: dict[str, int] = {}
 
     def watch(self, order: control.WatchNodes, fds: list[int], died: Callable[[str], None]) -> None:
         """Watch these nodes and no others; a node that is dead already is noticed at once."""
@@ -216,10 +217,13 @@ class SimSenses(Senses):
             process.notice(functools.partial(noticed, node))
 
     def forget(self) -> None:
-        self._nodes = {}
+        self._nodes, self._seen_ns = {}, {}
 
-    def pulse_ns(self, node: str, now_ns: int) -> int:
-        return self._nodes[node].pulse_ns(now_ns)
+    def look(self, now_ns: int) -> tuple[dict[str, int], bool]:
+        for name, process in self._nodes.items():
+            if name not in self._seen_ns or process.seen_ns(now_ns) == now_ns:
+                self._seen_ns[name] = now_ns
+        return dict(self._seen_ns), True
 
 
 class SimProcessPool:

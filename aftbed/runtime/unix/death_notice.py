@@ -110,6 +110,7 @@ class LifelineWatcher:
 
     def __init__(self, paths: tuple[str, ...]) -> None:
         self.fd, self._pipe = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
+        self.ended = False  # nothing more comes: the kernel has no lifelines, or no futex_waitv
         self._words = [_Word(Path(path)) for path in paths]
         self._wanted = _thread.allocate_lock()  # held until it is closed
         self._wanted.acquire()
@@ -121,9 +122,11 @@ class LifelineWatcher:
     def died(self) -> bytes:
         """The indices of those that died since the last call."""
         try:
-            return os.read(self.fd, 64)
+            found = os.read(self.fd, 64)
         except BlockingIOError:
             return b""
+        self.ended = not found
+        return found
 
     def close(self) -> None:
         if self._wanted.locked():

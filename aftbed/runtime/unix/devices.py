@@ -12,9 +12,9 @@ from aftbed.ftm.client import Client
 from aftbed.functions.source import is_foreign
 from aftbed.runtime import control
 from aftbed.runtime.devices import CarDevice, CarLink, Device, Load, Senses, resume_client
-from aftbed.runtime.unix import linux
 from aftbed.runtime.unix.death_notice import LifelineWatcher
-from aftbed.runtime.unix.journal_files import DialogueFile, JournalHeader, dialogue_path, last_words
+from aftbed.runtime.unix.journal_files import DialogueFile, dialogue_path, last_words
+from aftbed.runtime.unix.liveness import Liveness
 from aftbed.runtime.unix.options import GATEWAY, LoadRun, ReplayRun, SourceOptions
 from aftbed.runtime.unix.request_store import stored_requests
 from aftbed.vehicle.aeb.function import sample_requests
@@ -23,40 +23,39 @@ from aftbed.vehicle.aeb.messages import encode_fixed, encode_request
 if TYPE_CHECKING:
     from aftbed.vehicle.gateway import BusGateway
 
-STALE_NS: Final = 35_000_000  # a pulse that is older is looked into; it comes every 20 ms
 LOAD_REQUESTS: Final = 512
 
 
 class ProcessSenses(Senses):
-    """The `Senses` of a Watchdog: lifelines and pidfds for deaths, journals for pulses."""
+    """The `Senses` of a Watchdog: lifelines and pidfds for deaths, looks at what is alive for hangs."""
 
     def __init__(self) -> None:
         self._nodes: tuple[str, ...] = ()
         self._pidfds: dict[int, str] = {}
-        self._headers: dict[str, JournalHeader] = {}
-        self._starvation: dict[str, linux.Starvation] = {}
+        self._liveness: dict[str, Liveness] = {}
         self._lifelines: LifelineWatcher | None = None
 
     def watch(self, order: control.WatchNodes, fds: list[int], died: Callable[[str], None]) -> None:
         """Watch these nodes and no others; `fds` are their pidfds. Deaths are read from `fds()`."""
         self._nodes = nodes = order.nodes
         self._pidfds = dict(zip(fds, nodes, strict=True))
-        self._headers = {n: JournalHeader(Path(j)) for n, j in zip(nodes, order.journals, strict=True)}
-        self._starvation = {n: linux.Starvation(pid) for n, pid in zip(nodes, order.pids, strict=True)}
+        watched = zip(nodes, order.pids, order.journals, strict=True)
+        self._liveness = {node: Liveness(pid, Path(journal)) for node, pid, journal in watched}
         self._lifelines = LifelineWatcher(order.journals)
 
     def forget(self) -> None:
         for fd in self._pidfds:
             os.close(fd)
-        for header in self._headers.values():
-            header.close()
+        for liveness in self._liveness.values():
+            liveness.close()
         if self._lifelines is not None:
             self._lifelines.close()
-        self._pidfds, self._headers, self._lifelines = {}, {}, None
+        self._pidfds, self._liveness, self._lifelines = {}, {}, None
 
     def fds(self) -> tuple[int, ...]:
         """One pidfd per watched node, and all lifelines together."""
-        lifelines = (self._lifelines.fd,) if self._lifelines is not None else ()
+        watcher = self._lifelines
+        lifelines = (watcher.fd,) if watcher is not None and not watcher.ended else ()
         return (*lifelines, *self._pidfds)
 
     def died(self, fd: int) -> list[str]:
@@ -65,14 +64,9 @@ class ProcessSenses(Senses):
             return [self._nodes[index] for index in self._lifelines.died()]
         return [self._pidfds[fd]]
 
-    def pulse_ns(self, node: str, now_ns: int) -> int:
-        """The node's pulse; now, where the machine does not let the node run."""
-        pulse_ns, starvation = self._headers[node].pulse_ns(), self._starvation[node]
-        if now_ns - pulse_ns < STALE_NS:
-            starvation.forget()
-        elif starvation.starves(now_ns):
-            return now_ns
-        return pulse_ns
+    def look(self, now_ns: int) -> tuple[dict[str, int], bool]:
+        seen_ns = {node: liveness.seen_ns(now_ns) for node, liveness in self._liveness.items()}
+        return seen_ns, not all(liveness.idle for liveness in self._liveness.values())
 
 
 class BusLink(CarLink):

@@ -178,7 +178,7 @@ class DialogueFile:
 
 
 class JournalHeader:
-    """The header page of another node's journal: its pulse, and the flag that announces control mail."""
+    """The header page of another node's journal: its activity, and the flag that announces control mail."""
 
     def __init__(self, path: Path) -> None:
         descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC)
@@ -187,10 +187,13 @@ class JournalHeader:
         finally:
             os.close(descriptor)
 
-    def pulse_ns(self) -> int:
-        """When the node was last seen running (monotonic ns), 0 if never."""
-        at = layout.PULSE_OFFSET
-        return int.from_bytes(self._mapping[at : at + 8], "little")
+    def activity(self) -> int:
+        """Even: the host of the node waits; odd: it executes bricks. Another value each time, modulo 256."""
+        return self._mapping[layout.ACTIVITY_OFFSET]
+
+    def lifeline(self) -> int:
+        """The futex word that the node holds: see `death_notice`; 0 if it holds none."""
+        return int.from_bytes(self._mapping[layout.LIFELINE_OFFSET : layout.LIFELINE_OFFSET + 4], "little")
 
     def announced(self) -> bool:
         """Whether the node has not yet seen the flag."""

@@ -31,7 +31,6 @@ SYS_PROCESS_MADVISE: Final = 440  # on every architecture but alpha; the C libra
 IOV_MAX: Final = 1024  # areas in one call
 ADOPTION_SECONDS_MAX: Final = 5.0
 FILES_GOOD: Final = 1024  # a supervisor of 37 processes holds 180, more while it adapts
-EXCUSED_NS_MAX: Final = 2_000_000_000  # as long as any step of the runtime may take
 _START: Final = 19  # the field `starttime` of /proc/PID/stat, the state being 0
 SLICE_NS: Final = 500_000  # shorter than the default of some ms, long enough for all that a failover orders
 REUSED_BYTES_MAX: Final = 16 << 20
@@ -229,54 +228,6 @@ def populate(areas: Sequence[Area]) -> None:
             for address, size in some:
                 _libc.madvise(address, size, MADV_POPULATE_WRITE)
     os.close(myself)
-
-
-class Starvation:
-    """Distinguishes a process that hangs from one that the machine does not let run (proc(5)).
-
-    | state                  | its CPU time since it was asked for first | verdict                   |
-    |------------------------|-------------------------------------------|---------------------------|
-    | `T`, `t`, `Z`, `X`     | any                                       | hangs                     |
-    | `R`, runnable          | at most half of the time                  | starves                   |
-    | `R`                    | more                                      | hangs: it loops           |
-    | `D`, waits for a disk  | at most half of the time                  | starves                   |
-    | `S`, asleep            | none: the timer of its pulse did not come | starves: its core stalls  |
-    | `S`                    | some, and for a quarter of the time it    | starves: it gets too      |
-    |                        | was ready to run and not let run          | little, and too late      |
-    | `S`                    | some: the timer comes, and it goes on     | hangs: blocked in a brick |
-
-    No excuse lasts longer than `EXCUSED_NS_MAX`.
-    """
-
-    def __init__(self, pid: int) -> None:
-        self._pid = pid
-        self._since_ns, self._cpu_ns, self._waited_ns = 0, 0, 0
-
-    def forget(self) -> None:
-        """Reset: the process has shown a pulse."""
-        self._since_ns = 0
-
-    def starves(self, now_ns: int) -> bool:
-        """Whether the process, which shows no pulse, is one that the machine does not let run; see the
-        table.
-        """
-        state = state_of(self._pid)
-        try:
-            cpu_ns, waited_ns = map(int, Path(f"/proc/{self._pid}/schedstat").read_text().split()[:2])
-        except (OSError, ValueError, IndexError):
-            return False
-        if self._since_ns == 0:
-            self._since_ns, self._cpu_ns, self._waited_ns = now_ns, cpu_ns, waited_ns
-        ran_ns, passed_ns = cpu_ns - self._cpu_ns, now_ns - self._since_ns
-        if passed_ns > EXCUSED_NS_MAX:
-            return False
-        match state:
-            case "R" | "D":
-                return 2 * ran_ns <= passed_ns
-            case "S":
-                return ran_ns == 0 or 4 * (waited_ns - self._waited_ns) > passed_ns
-            case _:
-                return False
 
 
 def waited_ns(pid: int) -> int:

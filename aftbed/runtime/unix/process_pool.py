@@ -21,7 +21,7 @@ from aftbed.runtime.tasks import Key, Wait
 from aftbed.runtime.unix import linux
 from aftbed.runtime.unix.cleanup import UndoLedger
 from aftbed.runtime.unix.event_loop import EventLoop
-from aftbed.runtime.unix.journal_files import JournalHeader
+from aftbed.runtime.unix.liveness import Liveness
 from aftbed.runtime.unix.transport import Line, decode_report
 
 REAP_SECONDS: Final = 0.01  # a failover does not wait for the reaping of a dead process
@@ -61,16 +61,14 @@ class UnixProcess:
         self.name, self.kind, self.line, self._ledger = name, kind, line, ledger
         self.pid, self.pidfd = 0, -1
         self.journal = ""
-        self.header: JournalHeader | None = None
+        self._liveness: Liveness | None = None  # of a node that has a journal
         self.alive = True
         self.incarnation = 0
         self.bricks: tuple[tuple[str, str], ...] = ()
-        self._starvation: linux.Starvation | None = None
 
     def born(self, pid: int) -> None:
         """The process exists; only this one can reap it, so the pid cannot have been given away."""
         self.pid, self.pidfd = pid, os.pidfd_open(pid)
-        self._starvation = linux.Starvation(pid)
 
     def kill(self) -> bool:
         """SIGKILL; False if it is gone."""
@@ -100,34 +98,27 @@ class UnixProcess:
         """Whether the kernel has it in state `T` (proc(5)), or as a dead one."""
         return linux.state_of(self.pid) in ("T", "X", "Z", "")
 
-    def silent(self, now_ns: int, deadline_ns: int) -> bool:
-        """Whether it lives, as far as is known, and its pulse is older than `deadline_ns`."""
-        pulse_ns = self.header.pulse_ns() if self.alive and self.header is not None else 0
-        return 0 < pulse_ns < now_ns - deadline_ns
+    def dying(self) -> bool:
+        """Whether it is dead, or the kernel has begun to end it, which its pidfd does not show yet."""
+        return not self.alive or (self._liveness is not None and self._liveness.dying())
 
     def hangs(self, now_ns: int, deadline_ns: int) -> bool:
-        """Whether its pulse is older than `deadline_ns`, though the machine lets it run."""
-        if self.header is None or self._starvation is None:
-            return False
-        pulse_ns = self.header.pulse_ns()
-        if pulse_ns == 0 or now_ns - pulse_ns < deadline_ns // 2:
-            self._starvation.forget()
-            return False
-        return not self._starvation.starves(now_ns) and now_ns - pulse_ns > deadline_ns
+        """Whether it was not seen alive for `deadline_ns`, though the machine lets it run. This is a look."""
+        return self._liveness is not None and now_ns - self._liveness.seen_ns(now_ns) > deadline_ns
 
     def assigned(self) -> None:
         """It has acknowledged an Assign, so its journal exists."""
-        if self.header is None and self.journal and Path(self.journal).exists():
-            self.header = JournalHeader(Path(self.journal))
+        if self._liveness is None and self.journal and Path(self.journal).exists():
+            self._liveness = Liveness(self.pid, Path(self.journal))
 
     def announce(self) -> None:
         """Raise the flag: an order waits."""
-        if self.header is not None:
-            self.header.announce()
+        if self._liveness is not None:
+            self._liveness.header.announce()
 
     def announced(self) -> bool:
         """Whether it has yet to see the flag."""
-        return self.header is not None and self.header.announced()
+        return self._liveness is not None and self._liveness.header.announced()
 
     def killed_in_turn(self) -> int:
         """Its place when all are killed: those that act on the death of others first, and the hub last.
@@ -145,9 +136,9 @@ class UnixProcess:
         if self.pidfd >= 0:
             os.close(self.pidfd)
             self.pidfd = -1
-        if self.header is not None:
-            self.header.close()
-            self.header = None
+        if self._liveness is not None:
+            self._liveness.close()
+            self._liveness = None
 
 
 class UnixProcessPool:

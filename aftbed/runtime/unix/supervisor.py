@@ -32,6 +32,7 @@ from aftbed.runtime.unix.cleanup import UndoLedger
 from aftbed.runtime.unix.control_server import ControlServer
 from aftbed.runtime.unix.event_loop import EventLoop
 from aftbed.runtime.unix.journal_files import JournalFile, recorded_requests, stored_records
+from aftbed.runtime.unix.liveness import Starvation
 from aftbed.runtime.unix.options import COMMAND_GONE, LoadRun, RunOptions
 from aftbed.runtime.unix.process_pool import Started, UnixProcess, UnixProcessPool, reap
 from aftbed.runtime.unix.run_directory import HISTORY_NAME
@@ -39,9 +40,9 @@ from aftbed.runtime.unix.transport import Line, MemfdMemory, UnixChannel, decode
 from aftbed.runtime.unix.workload import Workload
 from aftbed.vehicle.condition import Condition
 
-TICK_SECONDS: Final = 0.02
+LOOK_SECONDS: Final = 0.05  # between two looks at all nodes
 LOG_SECONDS: Final = 0.005  # until a line is written: a failover does not wait for that
-LATE_NS_MAX: Final = 40_000_000  # of a tick: beyond it the machine was too busy to judge pulses
+LATE_NS_MAX: Final = 40_000_000  # of a look: beyond it the machine was too busy to judge what hangs
 DRAIN_SECONDS_MAX: Final = 2.0
 DRAIN_SECONDS: Final = 0.005  # between two checks of what is still under way
 LOOKS_MAX: Final = 80  # at states that differ: time for a follower on a busy machine
@@ -131,7 +132,7 @@ class Supervisor:
         self._unwritten: list[bytes] = []  # lines of the log
         self._graph_ms = 0.0
         self._waited_ns: dict[int, int] = {}  # for a CPU until the graph was complete, by pid
-        self._last_tick_ns = self._grace_until_ns = 0
+        self._last_look_ns = self._grace_until_ns = 0
         self._lost = False
         # Of the end: `_reason` is None before it, "" for the good one.
         self._reason: str | None = None
@@ -170,7 +171,7 @@ class Supervisor:
         self._server.listen()
         self._loop.read(self._owner.fileno(), self._on_owner)
         self._loop.tasks.start("launch", self._launch(), self._launched)
-        self._tick()
+        self._look()
         self._loop.run()
         self._tear_down()
 
@@ -198,16 +199,15 @@ class Supervisor:
         self._controller.inform_recovery(failed=False)
         self._server.launched()
 
-    def _tick(self) -> None:
-        """Check the pulses of nodes that no Watchdog watches: one that hangs is killed, and replaced."""
+    def _look(self) -> None:
+        """Look at the nodes: one that no Watchdog watches, and that hangs, is killed, and replaced."""
         now_ns = time.monotonic_ns()
-        if now_ns - self._last_tick_ns > TICK_SECONDS * 1e9 + LATE_NS_MAX:
+        if now_ns - self._last_look_ns > LOOK_SECONDS * 1e9 + LATE_NS_MAX:
             self._grace_until_ns = now_ns + HANG_NS
-        self._last_tick_ns = now_ns
-        self._deployment.nudge_late()
+        self._last_look_ns = now_ns
         if self._graph_ms and now_ns > self._grace_until_ns:  # births have a limit of their own
             self._controller.look_for_hangs()
-        self._loop.after(TICK_SECONDS, self._tick)
+        self._loop.after(LOOK_SECONDS, self._look)
 
     # -- processes ----------------------------------------------------------------------------
 
@@ -349,7 +349,7 @@ class Supervisor:
         Watchdogs and Recovery come first, so that the shutdown triggers no failover; see `killed_in_turn`.
         """
         dying = self.pool.processes
-        starvation = {p.pid: linux.Starvation(p.pid) for p in dying if p.pid}
+        starvation = {p.pid: Starvation(p.pid) for p in dying if p.pid}
         began_ns = time.monotonic_ns()
         for one in starvation.values():
             one.starves(began_ns)  # counts from here
@@ -366,6 +366,8 @@ class Supervisor:
             if late and not any(starvation[p.pid].starves(now_ns) for p in dying):
                 break  # while some die, the rest may become ours to reap: a zygote's children
             time.sleep(0.001)  # no event to wait for: a killed process is a matter of a millisecond
+        for one in starvation.values():
+            one.close()
         return [f"{p.name} ({p.pid})" for p in dying]
 
 

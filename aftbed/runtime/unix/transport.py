@@ -36,7 +36,7 @@ READ_BYTES_MAX: Final = PACKET_BYTES_MAX + 1  # one byte more than is allowed, s
 _WEIGHT: Final = ANNOUNCED * PACKET_BYTES_MAX
 _RIGHTS_BYTES: Final = socket.CMSG_SPACE(4)
 NUDGE: Final = b"\0"
-PULSE_SECONDS: Final = 0.02
+ORDER_SECONDS: Final = 0.02  # a node that is suspended waits so long for an order, and looks around
 WRITE_SECONDS_MAX: Final = 2.0  # a node that cannot write for so long takes itself for fenced
 
 
@@ -169,7 +169,7 @@ class Line(Generic[Incoming]):
 # end behind all of its descriptors: what was sent stays readable, then the channel ends; a later write gets
 # EPIPE.
 
-WRITE_PATIENCE_SECONDS: Final = PULSE_SECONDS
+WRITE_PATIENCE_SECONDS: Final = ORDER_SECONDS
 assert WRITE_PATIENCE_SECONDS < WRITE_SECONDS_MAX
 
 

@@ -32,7 +32,7 @@ from aftbed.runtime.unix.run_directory import BUS_NAME
 from aftbed.vehicle.condition import Condition
 
 ATTACH_SECONDS_MAX: Final = 10.0
-LOAD_POLL_SECONDS: Final = 0.02
+LOAD_POLL_SECONDS: Final = (0.02, 0.25)  # between two questions how far a load has come: at least, at most
 STALL_SECONDS_MAX: Final = 3.0  # a recovery takes milliseconds, a loss is seen after half a second
 CYCLE_EVERY: Final = 10  # telemetry reports, after which the cycle time is shown
 VEHICLE: Final = "vehicle"
@@ -205,7 +205,7 @@ class Workload:
         """The graph is complete: let requests come."""
         if self._is_load:
             yield from self.deployment.ask("client", control.ResumeNode)
-            self._loop.after(LOAD_POLL_SECONDS, self._watch_load)
+            self._poll_load()
             return
         yield from self._until_ready(self._source)
         self._pool.order(self._services[self._source], control.ResumeNode(control.UNANSWERED))
@@ -249,6 +249,13 @@ class Workload:
         if not failure:
             self._report_owner("cycle", json.dumps(self._stats.get("cycle_us")).encode())
 
+    def _poll_load(self) -> None:
+        """Watch the load again when it can be over; now and then, in case nothing moves any more."""
+        work, sent, (pause, longest) = self._options.work, self._stats.get("sent"), LOAD_POLL_SECONDS
+        if isinstance(work, LoadRun) and work.rate_hz and isinstance(sent, int):
+            pause = min(longest, max(pause, (work.count - sent) / work.rate_hz))
+        self._loop.after(pause, self._watch_load)
+
     def _watch_load(self) -> None:
         """Finish when all is answered, or when nothing moves any more: a lost reply would never come."""
 
@@ -263,7 +270,7 @@ class Workload:
                 self._log("stalled", f"no request was sent or answered for {STALL_SECONDS_MAX:g} s")
                 self._finish("")
             else:
-                self._loop.after(LOAD_POLL_SECONDS, self._watch_load)
+                self._poll_load()
 
         self._loop.tasks.start(STATS_TASK, self._ask_stats(), asked)
 

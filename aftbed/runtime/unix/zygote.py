@@ -39,7 +39,7 @@ from aftbed.runtime.unix.journal_files import JournalFile
 from aftbed.runtime.unix.linux import INHERITED_FD, Area
 from aftbed.runtime.unix.node_io import EXIT_ASSERT, UnixIO, UnixNode
 from aftbed.runtime.unix.options import SourceOptions
-from aftbed.runtime.unix.transport import PULSE_SECONDS, Line, decode_order
+from aftbed.runtime.unix.transport import ORDER_SECONDS, Line, decode_order
 from aftbed.vehicle.aeb.function import default_application
 
 
@@ -201,10 +201,9 @@ def _make_node(line: Line[control.ToNode], order: control.Assign, fds: list[int]
         linux.use_short_slices()
     else:
         linux.use_batch_scheduling()
-    linux.set_timeouts(line.sock, PULSE_SECONDS, 2.0)
+    linux.set_timeouts(line.sock, ORDER_SECONDS, 2.0)
     io = UnixIO(line, JournalFile(Path(order.journal), order.node))
     node = Node(order.node, io)
-    io.start_pulse()
     io.lifeline = Lifeline(Path(order.journal))
     if kind == "engine":
         gc.enable()  # a plan leaves cycles behind, and the Engine is not on the request path

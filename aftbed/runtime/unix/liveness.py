@@ -1,0 +1,153 @@
+"""Whether a node is alive, seen from outside: by a Watchdog of its replica, and by the supervisor.
+
+A node that has nothing to do does not have to show that it lives, so it sleeps. Its host writes one byte into
+the header of its journal, the *activity*: even while the host waits for mail or orders, odd while it executes
+bricks, and another value each time (`UnixIO`). A watcher looks at that byte, and asks the kernel where it has
+not changed:
+
+| activity           | state (proc(5))         | the node                                                |
+|--------------------|-------------------------|---------------------------------------------------------|
+| has changed        | any                     | is alive                                                |
+| the same, waits    | `S`, asleep             | is alive                                                |
+| the same, executes | `S`                     | hangs: blocked in a brick; or starves, see `Starvation` |
+| the same           | `R`, `D`                | hangs: it loops; or starves, see `Starvation`           |
+| the same           | `T`, stopped; `Z`, dead | hangs                                                   |
+
+It is counted as hanging from the last look that saw it alive, up to one period before it began to.
+"""
+
+import os
+from pathlib import Path
+from typing import Final
+
+from aftbed.runtime.unix.death_notice import FUTEX_OWNER_DIED
+from aftbed.runtime.unix.journal_files import JournalHeader
+
+EXCUSED_NS_MAX: Final = 2_000_000_000  # as long as any step of the runtime may take
+_STATE_BYTES: Final = 128  # of /proc/PID/stat: the pid, a name of at most 16 bytes, the state
+
+
+class Starvation:
+    """Distinguishes a process that hangs from one that the machine does not let run (proc(5)).
+
+    | state                  | its CPU time since it was first asked for | verdict                   |
+    |------------------------|-------------------------------------------|---------------------------|
+    | `T`, `t`, `Z`, `X`     | any                                       | hangs                     |
+    | `R`, runnable          | at most half of the time                  | starves                   |
+    | `R`                    | more                                      | hangs: it loops           |
+    | `D`, waits for a disk  | at most half of the time                  | starves                   |
+    | `S`, asleep            | for a quarter of the time it was ready to | starves: it gets too      |
+    |                        | run and not let run                       | little, and too late      |
+    | `S`, and a child, as a | as above, of the child                    | starves: it waits for the |
+    | program, starves       |                                           | child                     |
+    | `S`                    | else                                      | hangs: blocked in a brick |
+
+    No excuse lasts longer than `EXCUSED_NS_MAX`.
+    """
+
+    def __init__(self, pid: int) -> None:
+        self._pid = pid
+        self._since_ns, self._cpu_ns, self._waited_ns = 0, 0, 0
+        self._children: list[Starvation] = []
+        self._stat = _open(pid)
+
+    def forget(self) -> None:
+        """Reset: the process has been seen alive."""
+        self._since_ns = 0
+        while self._children:
+            self._children.pop().close()
+
+    def state(self) -> str:
+        """The state letter; `""` of a process that is gone."""
+        if self._stat < 0:
+            return ""
+        try:
+            return os.pread(self._stat, _STATE_BYTES, 0).rpartition(b")")[2][1:2].decode()
+        except ProcessLookupError:
+            return ""
+
+    def starves(self, now_ns: int, state: str = "") -> bool:
+        """Whether the process, which is not seen alive, is one that the machine does not let run.
+
+        The first call begins the comparison: it is False.
+        """
+        state = state or self.state()
+        try:
+            cpu_ns, waited_ns = map(int, Path(f"/proc/{self._pid}/schedstat").read_text().split()[:2])
+        except (OSError, ValueError, IndexError):
+            return False
+        if self._since_ns == 0:
+            self._since_ns, self._cpu_ns, self._waited_ns = now_ns, cpu_ns, waited_ns
+            self._children = [Starvation(child) for child in _children(self._pid)]
+        of_children = [child.starves(now_ns) for child in self._children]
+        ran_ns, passed_ns = cpu_ns - self._cpu_ns, now_ns - self._since_ns
+        if not 0 < passed_ns <= EXCUSED_NS_MAX:
+            return False
+        match state:
+            case "R" | "D":
+                return 2 * ran_ns <= passed_ns
+            case "S":
+                return 4 * (waited_ns - self._waited_ns) > passed_ns or any(of_children)
+            case _:
+                return False
+
+    def close(self) -> None:
+        """Let go of all descriptors."""
+        self.forget()
+        if self._stat >= 0:
+            os.close(self._stat)
+            self._stat = -1
+
+
+class Liveness:
+    """Of one node, in the eyes of one watcher, which looks now and then."""
+
+    def __init__(self, pid: int, journal: Path) -> None:
+        self.header = JournalHeader(journal)
+        self._starvation = Starvation(pid)
+        self._activity, self._seen_ns = -1, 0
+        self.idle = False  # as the last look found it: it waits, and has done nothing since the one before
+
+    def seen_ns(self, now_ns: int) -> int:
+        """Look: when the node was last seen alive. Now, if the machine does not let it run; see the table."""
+        activity = self.header.activity()
+        if activity != self._activity:
+            self._activity, self.idle = activity, False
+            return self._alive(now_ns)
+        state = self._starvation.state()
+        self.idle = state == "S" and not activity & 1
+        if self.idle:
+            return self._alive(now_ns)
+        if self._starvation.starves(now_ns, state):
+            self._seen_ns = now_ns
+        return self._seen_ns
+
+    def _alive(self, now_ns: int) -> int:
+        self._starvation.forget()
+        self._seen_ns = now_ns
+        return now_ns
+
+    def dying(self) -> bool:
+        """Whether it is dead, or the kernel has begun to end it, which a pidfd does not show yet."""
+        return bool(self.header.lifeline() & FUTEX_OWNER_DIED) or self._starvation.state() in ("", "X", "Z")
+
+    def close(self) -> None:
+        """Let go of the journal and the process."""
+        self.header.close()
+        self._starvation.close()
+
+
+def _children(pid: int) -> list[int]:
+    """The processes that the main thread of `pid` has started; none where the kernel does not tell."""
+    try:
+        return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+    except (OSError, ValueError):
+        return []
+
+
+def _open(pid: int) -> int:
+    """A descriptor of /proc/PID/stat, which stays that process's; -1 of one that is gone."""
+    try:
+        return os.open(f"/proc/{pid}/stat", os.O_RDONLY | os.O_CLOEXEC)
+    except OSError:
+        return -1
