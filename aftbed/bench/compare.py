@@ -124,6 +124,9 @@ def bench_compare(
     for bench in benches:
         check(bench)
     versions = [InstalledVersion(str(venv), version_of(venv)) for venv in (old, new)]
+    for bench in benches if measure is None else ():
+        check_options(old, bench)
+        check_options(new, bench)
     changes: list[VersionChange] = []
     left_out: list[str] = []
     machine = {}
@@ -175,6 +178,18 @@ def version_of(venv: Path) -> str:
         raise ConfigError(f"{venv}: no aftbed that works: {_last_line(error)}") from None
     except (HarnessError, OSError) as error:
         raise ConfigError(f"{venv}: no aftbed that works: {error}") from None
+
+
+def check_options(venv: Path, bench: str) -> None:
+    """Raise ConfigError if that version does not know an option of `bench`: before hours are measured."""
+    try:
+        _python_of(venv, ["bench", *shlex.split(bench), "--help"], VERSION_SECONDS_MAX)
+    except CommandFailedError as error:
+        raise ConfigError(
+            f"aftbed bench {bench} of {venv}: exit code {error.code}: {_last_line(error)}"
+        ) from None
+    except (HarnessError, OSError) as error:
+        raise ConfigError(f"aftbed bench {bench} of {venv}: {error}") from None
 
 
 def measured(venv: Path, bench: str) -> Document:

@@ -146,7 +146,7 @@ def test_an_old_version_needs_no_keys_of_today(made: MakeVenv) -> None:
     assert p50.verdict == "slower" and p99.verdict == "no difference shown"
     assert [one.quantile for one in above(found, 1.05)] == ["p50"] and above(found, 1.2) == []
     calls = next(old.glob("lib/python3*/site-packages/aftbed/calls")).read_text().splitlines()
-    assert calls[1:] == ["bench cycle --ftm pbr --json"] * 5
+    assert calls[1:] == ["bench cycle --ftm pbr --json"] * 6, "behind one call that asks for its options"
     assert any(
         "cycle --ftm pbr: cycle_us p50: old 5  new 6  ratio 1.2 (1.2 to 1.2)  rounds 6  slower" in one
         for one in lines(found)
@@ -203,12 +203,15 @@ def test_a_venv_without_aftbed(tmp_path: Path) -> None:
         compare.version_of(tmp_path / "bare")
 
 
-def test_a_bench_that_one_version_refuses_is_named_with_the_reason(made: MakeVenv) -> None:
-    old, new = made("old", FAILS), made("new!", PRINTS.replace("{document}", document(1.0)))
+def test_a_bench_that_one_version_refuses_is_named_before_anything_is_measured(made: MakeVenv) -> None:
+    refuses = f"if '--count' in sys.argv: {FAILS}\n" + PRINTS.replace("{document}", document(1.0))
+    old, new = made("old", refuses), made("new!", PRINTS.replace("{document}", document(1.0)))
+    logged: list[str] = []
     with pytest.raises(
-        ConfigError, match=r"aftbed bench cycle of .*/old: exit code 1: aftbed: error: no such option"
+        ConfigError, match=r"aftbed bench cycle --count 3 of .*/old: exit code 1: aftbed: error: no such opt"
     ):
-        bench_compare(old, new, ("cycle",), lambda _: None, rounds=1)
+        bench_compare(old, new, ("recovery", "cycle --count 3"), logged.append, rounds=1)
+    assert logged == []
 
 
 def test_a_bench_that_runs_into_trouble_is_tried_again(made: MakeVenv) -> None:
