@@ -203,7 +203,7 @@ class Node(Generic[In, Out]):
         self.careful = False  # set by a NodeIO that may have to stop between two effects, without a fault
         self.device: Device | None = None
         self._device_brick: HostedBrick[In, Out] | None = None
-        self._mail: deque[tuple[HostedBrick[In, Out], str, Message]] = deque()  # from brick to brick
+        self.mail: deque[tuple[HostedBrick[In, Out], str, Message]] = deque()  # from brick to brick
         self.suspended = False
         self.suspend_token = 0  # not 0: suspend as soon as no request is inside,
         self._draining = False  # and nothing waits at the open ports
@@ -228,12 +228,12 @@ class Node(Generic[In, Out]):
     def link_inside(self, local: control.Local, epoch: int) -> None:
         """A channel between two bricks of this node; the source gets a Rebound, as for any other."""
         source, sink = self.bricks[local.brick], self.bricks[local.sink]
-        source.outputs[local.port] = lambda message: self._mail.append((sink, local.sink_port, message))
+        source.outputs[local.port] = lambda message: self.mail.append((sink, local.sink_port, message))
         self.step(source, CONTROL, Rebound(local.port, True, epoch))
 
     def post(self, brick: str, port: str, message: Message) -> None:
         """Put `message` into the mail between the bricks of this node."""
-        self._mail.append((self.bricks[brick], port, message))
+        self.mail.append((self.bricks[brick], port, message))
 
     def attach(self, device: Device, brick: str) -> None:
         """Join `device` to `brick`."""
@@ -279,7 +279,7 @@ class Node(Generic[In, Out]):
 
     def turn(self) -> bool:
         """Handle what is first in the order above; False if nothing is left."""
-        if self._mail and self._step_inside():
+        if self.mail and self._step_inside():
             return True
         if self.suspend_token or self.suspended:
             if self.suspend_token and self._is_quiescent():
@@ -293,20 +293,20 @@ class Node(Generic[In, Out]):
         return self._receive()
 
     def _step_inside(self) -> bool:
-        hosted, port, message = self._mail[0]
+        hosted, port, message = self.mail[0]
         if port in hosted.brick.open_ports():  # nearly always
-            self._mail.popleft()
+            self.mail.popleft()
             self.step(hosted, port, message)
             return True
-        for index, (hosted, port, message) in enumerate(self._mail):
+        for index, (hosted, port, message) in enumerate(self.mail):
             if port in hosted.brick.open_ports():
-                del self._mail[index]
+                del self.mail[index]
                 self.step(hosted, port, message)
                 return True
         return False
 
     def _is_quiescent(self) -> bool:
-        if self._mail or not all(hosted.brick.quiescent() for hosted in self.bricks.values()):
+        if self.mail or not all(hosted.brick.quiescent() for hosted in self.bricks.values()):
             return False
         return not (self._draining and self.io.mail_waits())
 

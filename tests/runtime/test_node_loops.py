@@ -40,7 +40,7 @@ from aftbed.runtime.unix.transport import NUDGE, Line, UnixChannel, decode_order
 
 FLIP: Final = model.ArmedFault(7, "brick", 1, ValueFlip(ValuePlace.RESULT, Bit(0)), False)
 OMISSION: Final = model.ArmedFault(8, "brick", 1, ChannelFault(Disturbance.OMISSION, "out"), False)
-KINDS: Final = ("answer", "pass on", "note", "order", "refuse", "nothing")
+KINDS: Final = ("answer", "pass on", "hand in", "hand in twice", "note", "order", "refuse", "nothing")
 ORDERS: Final[dict[str, tuple[control.ToNode, ...]]] = {
     "capture": (control.Capture(1, "brick"),),
     "suspend": (control.SuspendNode(2), control.ResumeNode(3)),
@@ -85,7 +85,12 @@ class Scripted(Brick):
                 return [Note(Event.SERVER_EXIT, number, 5), Send("out", Reply(1, number, 1, b"ab"))]
             case "pass on":
                 assert isinstance(msg, Request)
-                return [Send("out", msg), Note(Event.REPLY_STORED, number), Send("inside", msg)]
+                return [Send("out", msg), Note(Event.REPLY_STORED, number)]
+            case "hand in":
+                return [Send("inner", Request(1, number, b"given"))]
+            case "hand in twice":
+                given = Send("inner", Request(1, number, b"given"))
+                return [given, Note(Event.REPLY_STORED, number), given]
             case "note":
                 notes = [Note(Event.SERVER_ENTER, number), Note(Event.SERVER_EXIT, number)]
                 return [*notes, Send("out", Reply(1, number, 1, b"c"))]
@@ -98,23 +103,53 @@ class Scripted(Brick):
         return repr(self.seen).encode()
 
 
+class Inner(Brick):
+    """Hosted beside it. Sends each request on as it is, but for every third, which it refuses, and itself a
+    word, for which it closes its other port until that has come.
+    """
+
+    def __init__(self) -> None:
+        self.seen, self._awaited = list[str](), False
+
+    def open_ports(self) -> tuple[str, ...]:
+        return ("again",) if self._awaited else ("mail", "again")
+
+    def quiescent(self) -> bool:
+        return not self._awaited
+
+    def step(self, port: str, msg: AnyMessage, now_ns: int) -> list[Effect]:
+        if isinstance(msg, Rebound):
+            return []
+        assert isinstance(msg, Request) and port in self.open_ports()
+        self.seen.append(f"{port} {msg.request_id}")
+        self._awaited = port == "mail" and len(self.seen) % 3 == 1
+        if len(self.seen) % 3 == 0:
+            raise PeerError("every third")
+        again = [Send("again", Request(1, msg.request_id, b"again"))] if self._awaited else []
+        return [Note(Event.BEFORE_EXIT, msg.request_id), Send("out", msg), *again]
+
+
 class Harness:
-    """A node with such a brick, all its ends, and what came out of it."""
+    """A node with both bricks, all its ends, and what came out of it."""
 
     def __init__(self, path: Path) -> None:
-        self._path, self._inside = path, list[AnyMessage]()
+        self._path = path
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._line = Line(ours, decode_report)
         self._journal = JournalFile(path, "node")
         self.io = UnixIO(Line(theirs, decode_order), self._journal)
         self.node: UnixNode = Node("node", self.io)
         self.brick = Scripted(self._order)
-        hosted = self.node.add("brick", self.brick)
-        hosted.outputs["inside"] = self._inside.append  # type: ignore[assignment]
+        self.node.add("brick", self.brick)
+        self.inner = Inner()
+        self.node.add("inner", self.inner)
+        self.node.link_inside(control.Local("brick", "inner", "inner", "mail"), 1)
+        self.node.link_inside(control.Local("inner", "again", "inner", "again"), 1)
         self._ends = [ours, theirs]
         self._writers = {port: self._input(port) for port in ("in", "other")}
         write, self._out = self._pair()
-        self.node.bind_output("brick", "out", os.dup(write.fileno()), 1)
+        for brick in ("brick", "inner"):
+            self.node.bind_output(brick, "out", os.dup(write.fileno()), 1)
         self._out.setblocking(False)
         ours.setblocking(False)
 
@@ -142,7 +177,7 @@ class Harness:
             while True:
                 loop(self.io)
         noted = [(r.event, r.request_id, r.detail, r.brick) for r in records(self._path.read_bytes())]
-        return self._sent(), self._inside, noted, self._reported(), self.brick.seen
+        return self._sent(), self.inner.seen, noted, self._reported(), self.brick.seen
 
     def _sent(self) -> list[bytes]:
         found = []
@@ -165,7 +200,8 @@ class Harness:
     def close(self) -> None:
         for port in self._writers:
             self.node.bind_input("brick", port, None)
-        self.node.bind_output("brick", "out", None, 1)
+        for brick in ("brick", "inner"):
+            self.node.bind_output(brick, "out", None, 1)
         for end in self._ends:
             end.close()
 
@@ -203,7 +239,7 @@ def test_both_loops_do_the_same(mail: list[str]) -> None:
 
 def test_the_fast_loop_is_the_one_that_is_tested() -> None:
     """All mail but the first on either set of open ports, by which the general loop finds out about it."""
-    mail = ["answer", "pass on", "note"] * 3
+    mail = ["answer", "pass on", "note", "hand in"] * 3
     with mock.patch.object(Node, "turn", autospec=True, side_effect=Node.turn) as turn:
         outcome(mail, UnixIO.loop)
     assert turn.call_count == 2

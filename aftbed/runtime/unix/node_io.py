@@ -7,10 +7,11 @@ puts a *nudge*, a packet of one byte, into the node's inputs. A node checks the 
 before it handles the mail: control is served before data. It is also served while the node cannot continue:
 while it is suspended, while a channel has no room, while a fault is being applied.
 
-Two loops. `Node.turn` is the general one. `serve_fast` is the same for a node that hosts one brick without
-deadlines and has nothing to poll, with all look-ups in front of the loop. It is left whenever something else
-than mail on the one open port is to be done: an order, the end of a channel, a large packet, a suspend, or a
-fault (`FaultAgent.active`). tests/runtime/test_node_loops.py drives both with the same mail and compares.
+Two loops. `Node.turn` is the general one. `serve_fast` is the same for a node whose bricks have no deadlines
+and that has nothing to poll, with all look-ups in front of the loop. It is left whenever something else is to
+be done than mail between the bricks, and mail on the one open inlet: an order, the end of a channel, a large
+packet, a suspend, or a fault (`FaultAgent.active`). tests/runtime/test_node_loops.py drives both with the
+same mail and compares.
 
 Around each wait, for mail, orders, room or time, the host changes the activity in the journal's header: a
 byte that is even while it waits, odd while it executes bricks, and another one each time. Watchers look at it
@@ -33,6 +34,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Final, NoReturn
 
 from aftbed.core import messages
@@ -74,6 +76,7 @@ class Inlet:
 
 UnixBrick = HostedBrick[Inlet, int]
 UnixNode = Node[Inlet, int]
+OpenPorts = tuple[str, ...] | tuple[tuple[str, ...], ...]  # of the one brick with inlets, or of each
 
 
 class PollSet:
@@ -89,6 +92,10 @@ class PollSet:
             self.poll.register(fd, select.POLLIN)
 
 
+def _open_ports(bricks: list[UnixBrick]) -> tuple[tuple[str, ...], ...]:
+    return tuple([hosted.brick.open_ports() for hosted in bricks])
+
+
 class UnixIO(NodeIO[Inlet, int]):
     """Of one process of the graph. `serve` never returns."""
 
@@ -99,10 +106,10 @@ class UnixIO(NodeIO[Inlet, int]):
         self.lifeline: Lifeline | None = None  # kept, not used: the kernel reads it when this process dies
         self._announced: Inlet | None = None  # the next packet there is a large one
         self._used_ns = self._owed_ns = 0  # CPU time at the last throttle; what is left to wait
-        self._fast: UnixBrick | None = None  # served by the fast loop
+        self._fast = False  # served by the fast loop
         self._fronts: list[UnixBrick] = []  # bricks with inlets
         self._polls: dict[tuple[tuple[str, ...], ...], PollSet] = {}  # by open ports
-        self._inlets: dict[tuple[str, ...], Inlet] = {}  # of a node with one brick, by its open ports
+        self._inlets: dict[OpenPorts, Inlet] = {}  # by open ports, those where only one inlet is open
 
     def join(self, node: UnixNode) -> None:
         self._node = node
@@ -156,8 +163,8 @@ class UnixIO(NodeIO[Inlet, int]):
                 self._take_announced(self._announced)
                 continue
             turn()
-            if self._fast is not None and self._announced is None:
-                self.serve_fast(self._fast)
+            if self._fast and self._announced is None:
+                self.serve_fast()
 
     def turn(self) -> None:
         """Handle one event, or wait for one, on the general path."""
@@ -166,49 +173,54 @@ class UnixIO(NodeIO[Inlet, int]):
         else:
             self._node.turn()
 
-    def serve_fast(self, hosted: UnixBrick) -> None:
-        """The same as `turn`, with all at hand, for a node that hosts one brick and polls nothing.
+    def serve_fast(self) -> None:
+        """The same as `turn`, with all at hand, for a node that polls nothing.
 
-        Returns for whatever is not mail on the one open port: `turn` handles it.
+        Returns for whatever is neither mail on the one open inlet nor mail between its bricks: `turn` handles
+        it.
         """
-        node, agent, device, inlets, outputs = (
-            self._node,
-            self._node.agent,
-            self._node.device,
-            self._inlets,
-            hosted.outputs,
-        )
-        step, open_ports, journal = hosted.brick.step, hosted.brick.open_ports, self.journal
+        node, agent, device, mail = self._node, self._node.agent, self._node.device, self._node.mail
+        inlets, fronts, journal = self._inlets, self._fronts, self.journal
+        open_ports = fronts[0].brick.open_ports if len(fronts) == 1 else partial(_open_ports, fronts)
         mapping = journal.mapping
         activity = mapping[ACTIVITY_OFFSET]
-        while not (node.suspend_token or node.suspended or agent.active):
-            inlet = inlets.get(open_ports())
-            if inlet is None or (device is not None and node.step_device(device)):
-                return
-            mapping[ACTIVITY_OFFSET] = activity = (activity + 1) & 254
-            raw = _read(inlet.fd, READ_BYTES_MAX)
-            mapping[ACTIVITY_OFFSET] = activity = activity + 1
+        while not (node.suspend_token or node.suspended or agent.active) and self._fronts is fronts:
             at = journal.at
-            if not 2 <= len(raw) < READ_BYTES_MAX or mapping[FLAG_OFFSET] or at > journal.end:
-                self._handle_packet(inlet, raw)
-                return
             try:
-                message = _decode(raw)
+                if mail:
+                    hosted, port, message = mail[0]
+                    if at > journal.end or port not in hosted.brick.open_ports():
+                        return
+                    mail.popleft()
+                    read = None
+                else:
+                    inlet = inlets.get(open_ports())
+                    if inlet is None or (device is not None and node.step_device(device)):
+                        return
+                    mapping[ACTIVITY_OFFSET] = activity = (activity + 1) & 254
+                    raw = _read(inlet.fd, READ_BYTES_MAX)
+                    mapping[ACTIVITY_OFFSET] = activity = activity + 1
+                    if not 2 <= len(raw) < READ_BYTES_MAX or mapping[FLAG_OFFSET] or at > journal.end:
+                        self._handle_packet(inlet, raw)
+                        return
+                    hosted, port, message = inlet.hosted, inlet.port, _decode(raw)
+                    read = message
                 now_ns = _now()
-                effects = step(inlet.port, message, now_ns)
+                effects = hosted.brick.step(port, message, now_ns)  # type: ignore[arg-type]
             except PeerError:
                 self._refuse(getattr(message, "request_id", 0))
                 continue
             except messages.UNREADABLE:
                 self._refuse()
                 continue
+            outputs = hosted.outputs
             for effect in effects:
                 if type(effect) is Send:
                     out = outputs[effect.port]
                     if type(out) is not int:
                         out(effect.message)  # type: ignore[operator]
                         continue
-                    data = raw if effect.message is message else _encode(effect.message)
+                    data = raw if effect.message is read else _encode(effect.message)
                     try:
                         (_write if len(data) <= _LARGE else _put)(out, data)
                     except OSError:
@@ -216,7 +228,9 @@ class UnixIO(NodeIO[Inlet, int]):
                         self._write_hard(hosted, effect.port, out, data)
                         at = journal.at
                 elif type(effect) is Note:
-                    _pack(mapping, at, now_ns, effect.request_id, effect.detail, 0, effect.event.code)
+                    _pack(
+                        mapping, at, now_ns, effect.request_id, effect.detail, hosted.index, effect.event.code
+                    )
                     at += RECORD_BYTES
                 else:
                     journal.at = at
@@ -238,14 +252,14 @@ class UnixIO(NodeIO[Inlet, int]):
         self._polls.clear()
         self._inlets.clear()
         polled = node.timed or (device is not None and device.polled)
-        self._fast = None if polled else node.only
+        self._fast = not polled
 
     def _poll_set(self, others: tuple[int, ...], *, may_block: bool) -> PollSet:
         """What to wait for now; `others` are descriptors beside the inlets.
 
         `may_block`: these are the same every time, and nothing is due at a time.
         """
-        key = tuple([hosted.brick.open_ports() for hosted in self._fronts])
+        key = _open_ports(self._fronts)
         found = self._polls.get(key) if may_block else None
         if found is not None:
             return found
@@ -258,8 +272,8 @@ class UnixIO(NodeIO[Inlet, int]):
         found = PollSet(inlets, others, may_block)
         if may_block:
             self._polls[key] = found
-            if found.single is not None and len(key) == 1:
-                self._inlets[key[0]] = found.single
+            if found.single is not None:
+                self._inlets[key[0] if len(key) == 1 else key] = found.single
         return found
 
     def mail_waits(self) -> bool:

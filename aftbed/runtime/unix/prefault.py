@@ -278,7 +278,7 @@ def _rehearse_mail() -> None:
             scratch.send("pro2bfr", Request(1, request_id, b""))
         scratch.order(control.ResumeNode(request_id))
         scratch.io.turn()  # the order, then the first request
-        scratch.io.serve_fast(scratch.node.bricks["brick"])  # until it meets the nudge
+        scratch.io.serve_fast()  # until it meets the nudge
         assert scratch.io.journal.at == HEADER_BYTES + request_id * RECORD.size, "a rehearsal went wrong"
         scratch.line.recv()
     scratch.close()
