@@ -49,10 +49,12 @@ from aftbed.runtime.unix.launch import launch, options_for
 from aftbed.runtime.unix.options import LoadRun, Work
 
 RUN_SECONDS_MAX: Final = 60.0
+ENDLESS: Final = 10_000_000  # requests: the run goes on until it is stopped, on a machine of any speed
 # commands that start no process
 PLAIN: Final = ("adapt", "check", "ftm", "graph", "inject", "log", "ps", "sim", "status", "stop")
 
 __all__ = [  # what others import from here
+    "ENDLESS",
     "GONE_SECONDS_MAX",
     "LOOK_SECONDS",
     "PATIENCE_SECONDS",
@@ -191,6 +193,11 @@ class Started:
         self._closed = True
         self.launched.remove()
         return Outcome(record, judge(record), self.events)
+
+    def stop(self) -> Outcome:
+        """Have it end when all is answered and nothing is under way, and judge it."""
+        self.launched.stop()
+        return self.finish()
 
     # -- what it does -------------------------------------------------------------------------
 
