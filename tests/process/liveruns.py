@@ -50,6 +50,7 @@ from aftbed.runtime.unix.options import LoadRun, Work
 
 RUN_SECONDS_MAX: Final = 60.0
 ENDLESS: Final = 10_000_000  # requests: the run goes on until it is stopped, on a machine of any speed
+SHORT: Final = Path(__file__).with_name("short.yaml")  # a scenario
 # commands that start no process
 PLAIN: Final = ("adapt", "check", "ftm", "graph", "inject", "log", "ps", "sim", "status", "stop")
 
@@ -58,6 +59,7 @@ __all__ = [  # what others import from here
     "GONE_SECONDS_MAX",
     "LOOK_SECONDS",
     "PATIENCE_SECONDS",
+    "SHORT",
     "WAIT_SECONDS_MAX",
     "Command",
     "Done",

@@ -3,7 +3,7 @@
 import signal
 
 import pytest
-from liveruns import Command, Home, aftbed, under_load, until
+from liveruns import SHORT, Command, Home, aftbed, under_load, until
 from rundirs import new_run
 
 from aftbed.runtime.unix import control_client, run_directory
@@ -15,7 +15,7 @@ LONG = 100_000  # requests: until it is stopped
 
 def test_two_drives_at_once_both_pass(home: Home) -> None:
     fault = "crash primary at checkpoint.sent nth 60"
-    drive = ("--scenario", "ccrs-20", "--pace", "max")
+    drive = ("--scenario", SHORT, "--pace", "max")
     with Command(*drive, "--inject", fault) as first, Command(*drive) as second:
         hit, spared = first.done(), second.done()
     assert hit.code == 0, hit.out + hit.err
