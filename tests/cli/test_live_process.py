@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from liveruns import Command, Home, aftbed, until
+from liveruns import SHORT, Command, Home, aftbed, until
 
 from aftbed.ftm.compose import build
 from aftbed.runtime.unix import control_client, run_directory
@@ -191,7 +191,7 @@ def test_a_run_that_is_stopped_by_another_command_passes(home: Home) -> None:
 def test_check_of_a_record_equals_the_first_verdict(home: Home, tmp_path: Path) -> None:
     record = tmp_path / "record"
     fault = "crash primary at checkpoint.sent nth 60"
-    drive = ("--scenario", "ccrs-20", "--pace", "max", "--inject", fault, "--record", record)
+    drive = ("--scenario", SHORT, "--pace", "max", "--inject", fault, "--record", record)
     first = aftbed("run", *drive, "--json")
     assert first.code == 0, first.out + first.err
     again = aftbed("check", record, "--json")
@@ -203,7 +203,7 @@ def test_check_of_a_record_equals_the_first_verdict(home: Home, tmp_path: Path) 
 
 def test_a_run_without_a_terminal_prints_lines(home: Home) -> None:
     fault = "crash primary at checkpoint.sent nth 60"
-    done = aftbed("run", "--scenario", "ccrs-20", "--pace", "max", "--inject", fault)
+    done = aftbed("run", "--scenario", SHORT, "--pace", "max", "--inject", fault)
     assert done.code == 0, done.err
     for words in ("started: 16 nodes", "km/h", "FULL", "script.done: failover", "stopped", "verdict: pass"):
         assert words in done.out
