@@ -1,6 +1,7 @@
 """The commands of a second terminal against a live run, and the ways in which a run ends."""
 
 import json
+import os
 import re
 import signal
 from collections.abc import Iterator
@@ -161,7 +162,7 @@ def test_an_interrupt_ends_the_run_with_its_verdict(home: Home, sig: signal.Sign
     with Command("--scenario", "free-drive") as command:
         command.started()
         command.wait_until_it_drives()
-        command.popen.send_signal(sig)
+        os.kill(command.pid, sig)
         done = command.done()
         assert done.code == 130, done.out + done.err
         assert "verdict: pass" in done.out
@@ -173,7 +174,7 @@ def test_an_interrupt_of_json_gives_the_document(home: Home) -> None:
     with Command("--load", "100000@200", "--json") as command:
         private = run_directory.root() / until(run_directory.live, "the run")[0]
         until(lambda: control_client.ask(private, control_client.StatusQuery())["backup"], "redundancy")
-        command.popen.send_signal(signal.SIGINT)
+        os.kill(command.pid, signal.SIGINT)
         done = command.done()
     assert done.code == 130, done.out + done.err
     assert done.verdict().requests.lost == 0

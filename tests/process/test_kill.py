@@ -219,8 +219,7 @@ def test_a_killed_command_leaves_nothing_but_its_record(home: Home, tmp_path: Pa
         command.started()
         command.wait_for_line("km/h")
         until(lambda: _frames(record).frames > 100, "frames in the log")
-        command.popen.kill()
-        command.popen.wait()
+        command.kill()
         assert home.seconds_to_clean() < GONE_SECONDS_MAX
     assert_readable_to_the_last_line(record)
     done = aftbed("check", record)
@@ -236,9 +235,9 @@ def test_command_and_supervisor_killed_at_once_leave_nothing_but_the_record(
         command.started()
         until(lambda: _frames(record).frames > 100, "frames in the log")
         supervisor = next(row.pid for row in control_client.processes(only_run()) if row.name == "supervisor")
-        command.popen.kill()
+        os.kill(command.pid, signal.SIGKILL)
         os.kill(supervisor, signal.SIGKILL)
-        command.popen.wait()
+        command.wait()
         assert home.seconds_to_clean() < GONE_SECONDS_MAX
     assert_readable_to_the_last_line(record)
     assert aftbed("check", record).code == 3
@@ -259,8 +258,7 @@ def test_a_killed_command_leaves_nothing_whatever_its_keepers_suffer(
             until(partial(in_state, pid, "T"), "the process to stop")
         for pid in (pid for pid, fate in keepers.items() if fate == "killed"):
             os.kill(pid, signal.SIGKILL)
-        command.popen.kill()
-        command.popen.wait()
+        command.kill()
         if supervisor == warden == "killed":
             until(lambda: not home.processes(), "the end of all processes", GONE_SECONDS_MAX)
             assert aftbed("doctor", "--clean").code == 0
@@ -268,10 +266,10 @@ def test_a_killed_command_leaves_nothing_whatever_its_keepers_suffer(
 
 
 def test_what_does_not_end_in_time_is_named(home: Home) -> None:
-    with under_load(home, 50) as run:
+    with under_load(home, ENDLESS) as run:
         pid = run.pid("zygote")
         with traced(pid):
-            outcome = run.finish()
+            outcome = run.stop()
     assert outcome.verdict.verdict == "fail"
     assert outcome.verdict.reasons == [f"clean_exit: left behind: ['zygote ({pid})']"]
 
