@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 
 import pytest
-from liveruns import Done, Home, Started, aftbed, state_of, under_load, until
+from liveruns import ENDLESS, Done, Home, Started, aftbed, state_of, under_load, until
 from sampling import every, sampled
 
 from aftbed.core.events import Event
@@ -35,8 +35,6 @@ STAGE: Final = 8  # bit 0 of byte 1 of a reply: of the stage
 COUNTER: Final = 8  # bit 0 of byte 1 of a state: of the counter of the frames
 VERSION: Final = 0  # bit 0 of a state: no function takes a state of another version
 WITH_TR: Final = tuple(e for e in EXPRESSIONS if e.endswith("tr"))
-LIVE: Final = 300  # requests of a run that is told something from outside: 1.5 s
-ENDLESS: Final = 100_000  # until it is stopped
 WITHOUT: Final = ("none", "pbr", "lfr")
 
 
@@ -250,8 +248,7 @@ def test_a_live_run_is_hit_from_a_second_command(home: Home) -> None:
         assert done.code == 0, done.err
         assert "bitflip result bit 8 in primary at server.exit nth 5" in done.err
         told = started.wait_for("fault", "activated")
-        control_client.ask(started.private, control_client.StopCommand())
-        outcome = started.finish()
+        outcome = started.stop()
     assert outcome.verdict.requests.wrong == 1 and outcome.verdict.verdict == "fail"
     (fault,) = outcome.verdict.faults
     assert str(told["text"]) == f"{fault.fault}: activated, {fault.detail}"
@@ -287,8 +284,7 @@ def test_what_is_asked_while_a_run_starts_is_done_when_it_has(home: Home) -> Non
         os.kill(zygote, signal.SIGCONT)
         control_client.receive(asked)
         started.wait_for("fault", "activated")
-        control_client.ask(started.private, control_client.StopCommand())
-        outcome = started.finish()
+        outcome = started.stop()
     ((fault, receipt),) = [(fault.fault, fault.receipt.value) for fault in outcome.verdict.faults]
     assert fault.startswith("bitflip") and receipt == "activated", "who has given up is not obeyed"
 
@@ -298,8 +294,7 @@ def test_after_a_while_the_next_execution_is_hit(home: Home) -> None:
         done = aftbed("inject", "bitflip", "result", "--replica", "a", "--bit", "8", "--after", "100ms")
         assert done.code == 0, done.err
         started.wait_for_answers(started.answered() + 75)  # at 200 a second: that is behind the hit
-        control_client.ask(started.private, control_client.StopCommand())
-        outcome = started.finish()
+        outcome = started.stop()
     (fault,) = outcome.verdict.faults
     assert fault.receipt.value == "activated"
     assert fault.fault == "bitflip result bit 8 in a after 100ms"
@@ -320,5 +315,4 @@ def test_what_cannot_be_flipped_is_refused_and_the_run_goes_on(home: Home) -> No
         ):
             done = aftbed("inject", "bitflip", *arguments)
             assert done.code == 2 and words in done.err, done.err
-        run.launched.stop()
-        assert run.finish().verdict.verdict == "pass"
+        assert run.stop().verdict.verdict == "pass"

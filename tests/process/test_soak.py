@@ -11,7 +11,7 @@ from typing import Final
 import msgspec
 import psutil
 import pytest
-from liveruns import LOOK_SECONDS, Home, Started, until
+from liveruns import ENDLESS, LOOK_SECONDS, Home, Started, until
 
 from aftbed.core.messages import Goal
 from aftbed.inject.crash import Crash
@@ -30,7 +30,6 @@ PSS_MB_PER_THOUSAND: Final = 6.0
 PSS_MB_SLACK: Final = 2.0
 RATE_HZ: Final = 200.0
 SETTLE_SECONDS_MAX: Final = 5.0
-ENDLESS: Final = 10_000_000
 
 
 class Size(msgspec.Struct, frozen=True):
