@@ -12,6 +12,7 @@ import msgspec
 import psutil
 import pytest
 from liveruns import ENDLESS, LOOK_SECONDS, Home, Started, until
+from test_adaptations import adapt
 
 from aftbed.core.messages import Goal
 from aftbed.inject.crash import Crash
@@ -94,11 +95,7 @@ def test_many_failovers_leave_no_trace(home: Home, placement: str, count: int) -
 def adapt_back_and_forth(run: Started, count: int) -> None:
     """`count` adaptations: a composition, its end, and so on."""
     for expression in itertools.islice(itertools.cycle(("pbr+tr", "pbr")), count):
-        found = control_client.ask(
-            run.private,
-            control_client.AdaptCommand(Goal(expression=expression)),
-            control_client.ADAPT_SECONDS_MAX,
-        )
+        found = adapt(run, Goal(expression=expression))
         assert (found["outcome"], found["reason"]) == ("done", "")
 
 
