@@ -26,11 +26,12 @@ def test_a_large_state_is_carried(ftm: str, size: int) -> None:
     assert len(found.failovers) == 1
 
 
-def test_ten_megabytes_are_updated_switched_and_taken_over(home: Home) -> None:
+@pytest.mark.parametrize("size", [2_000_000, pytest.param(10_000_000, marks=pytest.mark.deep)])
+def test_megabytes_are_updated_switched_and_taken_over(home: Home, size: int) -> None:
     """Compared by the Server, then told by a function that knows its changes."""
     with Command("--load", f"{ENDLESS}@50") as run:
         run.started()
-        for epoch, function in ((2, "Ballast10000000v1"), (3, "TrackedBallast10000000v2")):
+        for epoch, function in ((2, f"Ballast{size}v1"), (3, f"TrackedBallast{size}v2")):
             adapt("update", "app", "--to", f"aftbed.bench.ballast:{function}")
             adapt("switch", "lfr")
             adapt("switch", "pbr")
