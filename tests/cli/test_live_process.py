@@ -1,13 +1,14 @@
 """The commands of a second terminal against a live run, and the ways in which a run ends."""
 
 import json
+import os
 import re
 import signal
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from liveruns import Command, Home, aftbed, until
+from liveruns import SHORT, Command, Home, aftbed, until
 
 from aftbed.ftm.compose import build
 from aftbed.runtime.unix import control_client, run_directory
@@ -161,7 +162,7 @@ def test_an_interrupt_ends_the_run_with_its_verdict(home: Home, sig: signal.Sign
     with Command("--scenario", "free-drive") as command:
         command.started()
         command.wait_until_it_drives()
-        command.popen.send_signal(sig)
+        os.kill(command.pid, sig)
         done = command.done()
         assert done.code == 130, done.out + done.err
         assert "verdict: pass" in done.out
@@ -173,7 +174,7 @@ def test_an_interrupt_of_json_gives_the_document(home: Home) -> None:
     with Command("--load", "100000@200", "--json") as command:
         private = run_directory.root() / until(run_directory.live, "the run")[0]
         until(lambda: control_client.ask(private, control_client.StatusQuery())["backup"], "redundancy")
-        command.popen.send_signal(signal.SIGINT)
+        os.kill(command.pid, signal.SIGINT)
         done = command.done()
     assert done.code == 130, done.out + done.err
     assert done.verdict().requests.lost == 0
@@ -191,7 +192,7 @@ def test_a_run_that_is_stopped_by_another_command_passes(home: Home) -> None:
 def test_check_of_a_record_equals_the_first_verdict(home: Home, tmp_path: Path) -> None:
     record = tmp_path / "record"
     fault = "crash primary at checkpoint.sent nth 60"
-    drive = ("--scenario", "ccrs-20", "--pace", "max", "--inject", fault, "--record", record)
+    drive = ("--scenario", SHORT, "--pace", "max", "--inject", fault, "--record", record)
     first = aftbed("run", *drive, "--json")
     assert first.code == 0, first.out + first.err
     again = aftbed("check", record, "--json")
@@ -203,7 +204,7 @@ def test_check_of_a_record_equals_the_first_verdict(home: Home, tmp_path: Path) 
 
 def test_a_run_without_a_terminal_prints_lines(home: Home) -> None:
     fault = "crash primary at checkpoint.sent nth 60"
-    done = aftbed("run", "--scenario", "ccrs-20", "--pace", "max", "--inject", fault)
+    done = aftbed("run", "--scenario", SHORT, "--pace", "max", "--inject", fault)
     assert done.code == 0, done.err
     for words in ("started: 16 nodes", "km/h", "FULL", "script.done: failover", "stopped", "verdict: pass"):
         assert words in done.out

@@ -21,8 +21,15 @@ def mark(home: str) -> None:
     os.close(descriptor)
 
 
-def run(words: list[str], environment: Mapping[str, str], folder: Path, out: Path, err: Path) -> None:
-    """Become the command `words`, as an interpreter would. Ends with SystemExit or not at all."""
+def run(
+    words: list[str], environment: Mapping[str, str], folder: Path, out: Path, err: Path, session: bool
+) -> None:
+    """Become the command `words`, as an interpreter would. Ends with SystemExit or not at all.
+
+    `session`: it has one of its own.
+    """
+    if session:
+        os.setsid()
     os.closerange(3, resource.getrlimit(resource.RLIMIT_NOFILE)[0])
     for number, (path, flags) in enumerate(
         ((os.devnull, os.O_RDONLY), (out, os.O_WRONLY | os.O_CREAT), (err, os.O_WRONLY | os.O_CREAT))

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 import pytest
-from liveruns import WAIT_SECONDS_MAX, Command, Done, Home, aftbed, until
+from liveruns import WAIT_SECONDS_MAX, Command, Done, Home, adapted, aftbed, until
 
 pytestmark = pytest.mark.process
 
@@ -42,7 +42,7 @@ def run(home: Home) -> Iterator[Command]:
 
 def done(*arguments: str | Path) -> dict[str, object]:
     """The outcome of an adaptation that must be done."""
-    found = aftbed("adapt", *arguments, "--json")
+    found = adapted(*arguments, "--json")
     assert found.code == 0, found.out + found.err
     outcome: dict[str, object] = json.loads(found.out)
     assert outcome["outcome"] == "done"

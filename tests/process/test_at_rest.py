@@ -8,7 +8,6 @@ from liveruns import Home, Started, until
 from aftbed.core.events import Event
 from aftbed.core.journal import EntryKind
 from aftbed.inject.model import parse
-from aftbed.runtime.unix import control_client
 from aftbed.runtime.unix.options import LoadRun
 from aftbed.runtime.unix.process_pool import UnixProcess
 
@@ -36,8 +35,7 @@ def test_what_is_under_way_when_it_is_stopped_is_answered(home: Home) -> None:
         run.wait_for_answers(1)
         sent = run.entries(EntryKind.SENT)
         until(lambda: run.entries(EntryKind.SENT) > sent, "another request")
-        control_client.ask(run.private, control_client.StopCommand())
-        outcome = run.finish()
+        outcome = run.stop()
     requests = outcome.verdict.requests
     assert outcome.verdict.verdict == "pass", outcome.verdict.reasons
     assert requests.sent == requests.answered > 1

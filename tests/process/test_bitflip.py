@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 
 import pytest
-from liveruns import Done, Home, Started, aftbed, state_of, under_load, until
+from liveruns import ENDLESS, Done, Home, Started, aftbed, state_of, under_load, until
 from sampling import every, sampled
 
 from aftbed.core.events import Event
@@ -27,20 +27,19 @@ from aftbed.runtime.unix.options import LoadRun
 
 pytestmark = pytest.mark.process
 
-DRIVE: Final = ("--scenario", "ccrs-20", "--pace", "max")  # in lockstep: faults are armed before it begins
-COUNT: Final = 244  # requests of it
-HIT: Final = 100  # the request that is hit; TR executes each twice
+COUNT: Final = 100  # requests
+LOAD: Final = ("--load", str(COUNT))  # each follows the reply before it
+HIT: Final = 40  # the request that is hit; TR executes each twice
+DRIVE: Final = ("--scenario", "ccrs-20", "--pace", "max")  # long enough for a new backup, on any machine
 STAGE: Final = 8  # bit 0 of byte 1 of a reply: of the stage
 COUNTER: Final = 8  # bit 0 of byte 1 of a state: of the counter of the frames
 VERSION: Final = 0  # bit 0 of a state: no function takes a state of another version
 WITH_TR: Final = tuple(e for e in EXPRESSIONS if e.endswith("tr"))
-LIVE: Final = 300  # requests of a run that is told something from outside: 1.5 s
-ENDLESS: Final = 100_000  # until it is stopped
 WITHOUT: Final = ("none", "pbr", "lfr")
 
 
 class Ran:
-    """A drive that has ended, by its document and its record."""
+    """A run that has ended, by its document and its record."""
 
     def __init__(self, done: Done, record: RunRecord) -> None:
         self.code, self.record = done.code, record
@@ -56,12 +55,19 @@ class Ran:
         return [(r.node, r.request_id) for r in self.events(Event.FAULT_APPLIED) if r.request_id]
 
 
-def drive(folder: Path, ftm: str, *faults: str, placement: str = "process", seed: int = 0) -> Ran:
-    """A drive under `ftm`, with these faults."""
+def served(
+    folder: Path,
+    ftm: str,
+    *faults: str,
+    placement: str = "process",
+    seed: int = 0,
+    work: tuple[str, ...] = LOAD,
+) -> Ran:
+    """A run under `ftm`, with these faults."""
     path = folder / f"record{len(list(folder.iterdir()))}"
     injected = [word for fault in faults for word in ("--inject", fault)]
     options = ("--placement", placement, "--seed", str(seed), "--record", path, "--json")
-    done = aftbed("run", "--ftm", ftm, *DRIVE, *options, *injected)
+    done = aftbed("run", "--ftm", ftm, *work, *options, *injected)
     assert done.out, done.err
     return Ran(done, read_record(path))
 
@@ -79,7 +85,7 @@ def assert_served(ran: Ran) -> None:
 
 @pytest.mark.parametrize("ftm", every(2, WITHOUT))
 def test_a_flipped_result_reaches_the_client_and_fails(tmp_path: Path, ftm: str) -> None:
-    ran = drive(tmp_path, ftm, f"bitflip result bit {STAGE} at server.exit nth {HIT}")
+    ran = served(tmp_path, ftm, f"bitflip result bit {STAGE} at server.exit nth {HIT}")
     assert ran.code == 1 and ran.verdict.verdict == "fail"
     assert ran.verdict.requests.wrong == 1
     assert ran.verdict.checks["value"] == ran.verdict.checks["one_history"] == "fail"
@@ -90,7 +96,7 @@ def test_a_flipped_result_reaches_the_client_and_fails(tmp_path: Path, ftm: str)
 
 
 def test_a_flipped_state_stays_wrong(tmp_path: Path) -> None:
-    ran = drive(tmp_path, "pbr", f"bitflip state bit {COUNTER} nth {HIT}")
+    ran = served(tmp_path, "pbr", f"bitflip state bit {COUNTER} nth {HIT}")
     assert ran.code == 1
     assert ran.verdict.requests.wrong == COUNT - HIT, "the reply was there before the hit"
     assert f"value: request {HIT + 1}: sdc: counter 11 instead of 10" in ran.verdict.reasons
@@ -98,18 +104,19 @@ def test_a_flipped_state_stays_wrong(tmp_path: Path) -> None:
 
 def test_a_state_that_is_wrong_is_the_backups_too(tmp_path: Path) -> None:
     """The checkpoint carries the flipped bit, so the failover does not heal it."""
-    flip, crash = f"bitflip state bit {COUNTER} nth {HIT}", "crash primary at request.received nth 150"
-    ran = drive(tmp_path, "pbr", flip, crash)
+    flip, crash = f"bitflip state bit {COUNTER} nth {HIT}", "crash primary at request.received nth 70"
+    ran = served(tmp_path, "pbr", flip, crash)
     assert ran.receipts == ["activated", "activated"]
     assert len(ran.verdict.failovers) == 1 and ran.verdict.requests.wrong == COUNT - HIT
 
 
 def test_a_drive_says_what_the_brakes_were_asked_for() -> None:
-    done = aftbed("run", *DRIVE, "--inject", f"bitflip result bit {STAGE} nth {HIT}")
+    hit = 100  # by then it warns
+    done = aftbed("run", *DRIVE, "--inject", f"bitflip result bit {STAGE} nth {hit}")
     assert done.code == 1, done.out + done.err
     assert "1 wrong" in done.out and "verdict: fail" in done.out
-    assert f"because    value: request {HIT}: sdc: stage 0 instead of 1" in done.out
-    assert f"activated, bit {STAGE} of the result of request {HIT} in a/server" in done.out
+    assert f"because    value: request {hit}: sdc: stage 0 instead of 1" in done.out
+    assert f"activated, bit {STAGE} of the result of request {hit} in a/server" in done.out
     assert "  car        stopped " in done.out
 
 
@@ -122,7 +129,7 @@ RUNS: Final = {"first run": 2 * HIT - 1, "second run": 2 * HIT}
 
 @pytest.mark.parametrize(("ftm", "place", "run"), sampled(WITH_TR, PLACES, tuple(RUNS)))
 def test_a_third_run_outvotes_the_one_that_was_hit(tmp_path: Path, ftm: str, place: str, run: str) -> None:
-    ran = drive(tmp_path, ftm, f"bitflip {place} at server.exit nth {RUNS[run]}")
+    ran = served(tmp_path, ftm, f"bitflip {place} at server.exit nth {RUNS[run]}")
     assert ran.code == 0, ran.verdict.reasons
     assert_served(ran)
     assert (ran.verdict.checks["value"], ran.receipts, ran.hits()) == (
@@ -141,8 +148,8 @@ def test_a_third_run_outvotes_the_one_that_was_hit(tmp_path: Path, ftm: str, pla
 def test_bits_of_several_requests_are_outvoted_in_every_placement(
     tmp_path: Path, ftm: str, placement: str
 ) -> None:
-    where = (("result", 50), (f"state bit {COUNTER}", 121), ("result", 302))
-    ran = drive(tmp_path, ftm, *(f"bitflip {place} nth {nth}" for place, nth in where), placement=placement)
+    where = (("result", 20), (f"state bit {COUNTER}", 61), ("result", 142))
+    ran = served(tmp_path, ftm, *(f"bitflip {place} nth {nth}" for place, nth in where), placement=placement)
     assert_served(ran)
     assert ran.receipts == ["activated"] * 3 and ran.verdict.checks["value"] == "pass"
     assert len([r for r in ran.events(Event.VOTE_COMPARED) if r.detail == 3]) == 3
@@ -150,7 +157,7 @@ def test_bits_of_several_requests_are_outvoted_in_every_placement(
 
 def test_what_is_hit_before_the_first_run_is_in_all_of_them(tmp_path: Path) -> None:
     """The limit of TR, and no more is promised: a fault of one execution is what it outvotes."""
-    ran = drive(tmp_path, "tr", f"bitflip state bit {COUNTER} at state.captured nth {HIT}")
+    ran = served(tmp_path, "tr", f"bitflip state bit {COUNTER} at state.captured nth {HIT}")
     assert ran.code == 1 and ran.receipts == ["activated"]
     assert ran.verdict.checks["value"] == "fail"
     assert f"value: request {HIT}: sdc: counter 8 instead of 9" in ran.verdict.reasons
@@ -160,7 +167,7 @@ def test_what_is_hit_before_the_first_run_is_in_all_of_them(tmp_path: Path) -> N
 
 
 def test_a_follower_that_was_hit_has_diverged_and_the_client_has_its_reply(tmp_path: Path) -> None:
-    ran = drive(tmp_path, "lfr", f"bitflip result bit {STAGE} in backup nth {HIT}")
+    ran = served(tmp_path, "lfr", f"bitflip result bit {STAGE} in backup nth {HIT}")
     assert ran.verdict.requests.wrong == 0 and ran.receipts == ["activated"]
     assert ran.hits() == [("b/server", HIT)]
     assert [(r.node, r.request_id) for r in ran.events(Event.FOLLOWER_DIVERGED)] == [("b/after", HIT)]
@@ -170,7 +177,7 @@ def test_a_follower_that_was_hit_has_diverged_and_the_client_has_its_reply(tmp_p
 def test_a_bit_of_the_backup_is_no_concern_of_the_client(tmp_path: Path, ftm: str) -> None:
     executes = ftm.startswith("lfr")
     fault = "result in backup nth" if executes else f"state bit {COUNTER} in b at state.restored nth"
-    ran = drive(tmp_path, ftm, f"bitflip {fault} {HIT}")
+    ran = served(tmp_path, ftm, f"bitflip {fault} {HIT}")
     assert_served(ran)
     assert ran.code == 0, ran.verdict.reasons
     assert [node for node, _ in ran.hits()] == ["b/server"]
@@ -181,14 +188,14 @@ def test_a_bit_of_the_backup_is_no_concern_of_the_client(tmp_path: Path, ftm: st
 
 
 def test_a_bit_beyond_the_end_was_not_flipped_and_proves_nothing(tmp_path: Path) -> None:
-    ran = drive(tmp_path, "pbr", f"bitflip result bit 100000 nth {HIT}")
+    ran = served(tmp_path, "pbr", f"bitflip result bit 100000 nth {HIT}")
     assert ran.code == 3 and ran.receipts == ["not_activated"]
     assert re.fullmatch(rf"there are [0-9]+ bits of the result of request {HIT} in a/server", ran.details[0])
     assert_served(ran)
 
 
 def test_a_state_that_the_function_refuses_was_not_flipped(tmp_path: Path) -> None:
-    ran = drive(tmp_path, "pbr", f"bitflip state bit {VERSION} nth {HIT}")
+    ran = served(tmp_path, "pbr", f"bitflip state bit {VERSION} nth {HIT}")
     assert ran.code == 3 and ran.receipts == ["not_activated"]
     assert ran.details == [f"the function refused bit {VERSION} of the state of request {HIT} in a/server"]
     assert ran.verdict.checks["faults_applied"] == "unknown"
@@ -196,7 +203,9 @@ def test_a_state_that_the_function_refuses_was_not_flipped(tmp_path: Path) -> No
 
 
 def test_a_bit_that_is_not_named_is_drawn_by_the_seed_and_reported(tmp_path: Path) -> None:
-    one, again, other = (drive(tmp_path, "pbr", f"bitflip result nth {HIT}", seed=seed) for seed in (1, 1, 2))
+    one, again, other = (
+        served(tmp_path, "pbr", f"bitflip result nth {HIT}", seed=seed) for seed in (1, 1, 2)
+    )
     assert one.details == again.details and one.details != other.details
     for ran in (one, other):
         assert re.fullmatch(rf"bit [0-9]+ of the result of request {HIT} in a/server", ran.details[0])
@@ -207,15 +216,15 @@ def test_a_bit_that_is_not_named_is_drawn_by_the_seed_and_reported(tmp_path: Pat
 
 def test_each_of_several_strikes_at_its_own_execution(tmp_path: Path) -> None:
     """They wait for the same event in the same node, and were not armed in their order."""
-    ran = drive(tmp_path, "pbr", *(f"bitflip result bit {STAGE} nth {nth}" for nth in (200, 50, 125)))
-    assert ran.hits() == [("a/server", 50), ("a/server", 125), ("a/server", 200)]
+    ran = served(tmp_path, "pbr", *(f"bitflip result bit {STAGE} nth {nth}" for nth in (80, 20, 50)))
+    assert ran.hits() == [("a/server", 20), ("a/server", 50), ("a/server", 80)]
     assert ran.verdict.requests.wrong == 3 and ran.receipts == ["activated"] * 3
 
 
 @pytest.mark.parametrize("placement", ["process", "replica"])
 def test_a_bitflip_follows_the_leader_over_a_failover(tmp_path: Path, placement: str) -> None:
     flip, crash = f"bitflip result bit {STAGE} nth 200", "crash primary at reply.sent nth 80"
-    ran = drive(tmp_path, "pbr", flip, crash, placement=placement)
+    ran = served(tmp_path, "pbr", flip, crash, placement=placement, work=DRIVE)
     assert ran.receipts == ["activated", "activated"] and len(ran.verdict.failovers) == 1
     ((node, request_id),) = ran.hits()
     assert node.startswith("b") and request_id >= 200  # what comes before it has moved is not counted
@@ -223,7 +232,7 @@ def test_a_bitflip_follows_the_leader_over_a_failover(tmp_path: Path, placement:
 
 def test_a_replica_is_hit_whatever_its_role_is_by_then(tmp_path: Path) -> None:
     flip, crash = f"bitflip result bit {STAGE} in a nth 120", "crash primary at reply.sent nth 80"
-    ran = drive(tmp_path, "lfr", flip, crash)
+    ran = served(tmp_path, "lfr", flip, crash, work=DRIVE)
     assert ran.receipts == ["activated", "activated"] and len(ran.verdict.failovers) == 1
     ((node, request_id),) = ran.hits()
     assert node == "a/server" and request_id >= 120, "as a follower, in its next life"
@@ -239,8 +248,7 @@ def test_a_live_run_is_hit_from_a_second_command(home: Home) -> None:
         assert done.code == 0, done.err
         assert "bitflip result bit 8 in primary at server.exit nth 5" in done.err
         told = started.wait_for("fault", "activated")
-        control_client.ask(started.private, control_client.StopCommand())
-        outcome = started.finish()
+        outcome = started.stop()
     assert outcome.verdict.requests.wrong == 1 and outcome.verdict.verdict == "fail"
     (fault,) = outcome.verdict.faults
     assert str(told["text"]) == f"{fault.fault}: activated, {fault.detail}"
@@ -276,8 +284,7 @@ def test_what_is_asked_while_a_run_starts_is_done_when_it_has(home: Home) -> Non
         os.kill(zygote, signal.SIGCONT)
         control_client.receive(asked)
         started.wait_for("fault", "activated")
-        control_client.ask(started.private, control_client.StopCommand())
-        outcome = started.finish()
+        outcome = started.stop()
     ((fault, receipt),) = [(fault.fault, fault.receipt.value) for fault in outcome.verdict.faults]
     assert fault.startswith("bitflip") and receipt == "activated", "who has given up is not obeyed"
 
@@ -287,8 +294,7 @@ def test_after_a_while_the_next_execution_is_hit(home: Home) -> None:
         done = aftbed("inject", "bitflip", "result", "--replica", "a", "--bit", "8", "--after", "100ms")
         assert done.code == 0, done.err
         started.wait_for_answers(started.answered() + 75)  # at 200 a second: that is behind the hit
-        control_client.ask(started.private, control_client.StopCommand())
-        outcome = started.finish()
+        outcome = started.stop()
     (fault,) = outcome.verdict.faults
     assert fault.receipt.value == "activated"
     assert fault.fault == "bitflip result bit 8 in a after 100ms"
@@ -309,5 +315,4 @@ def test_what_cannot_be_flipped_is_refused_and_the_run_goes_on(home: Home) -> No
         ):
             done = aftbed("inject", "bitflip", *arguments)
             assert done.code == 2 and words in done.err, done.err
-        run.launched.stop()
-        assert run.finish().verdict.verdict == "pass"
+        assert run.stop().verdict.verdict == "pass"

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Final
 
 import pytest
-from liveruns import Command, Home, Started, aftbed
+from liveruns import SHORT, Command, Home, Started, aftbed
 
 from aftbed.inject.model import FaultReport
 from aftbed.inject.receipts import ReceiptState
@@ -14,7 +14,7 @@ from aftbed.vehicle.can.candump import read_log
 
 pytestmark = pytest.mark.process
 
-DRIVE: Final = ("--scenario", "ccrs-20", "--pace", "max", "--json")
+DRIVE: Final = ("--scenario", SHORT, "--pace", "max", "--json")
 AEB_REQ_ID: Final = 0x100
 
 
@@ -79,7 +79,7 @@ def test_a_live_run_is_disturbed_from_a_second_command(home: Home) -> None:
         assert done.code == 0, done.err
         assert words in done.err
         started.wait_for("fault", "activated")
-        outcome = started.finish()
+        outcome = started.stop()
     (found,) = outcome.verdict.faults
     assert found.receipt.value == "activated", found
     assert "noticed by brake (" in found.detail, found  # the sign depends on who is late

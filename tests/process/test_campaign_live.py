@@ -29,7 +29,7 @@ faults:
   expect: {"*": [tolerated, degraded]}
 - name: nothing
   expect: {"*": [masked, degraded]}
-stop: {experiments: 6}
+stop: {experiments: 3}
 unknown_max: 1.0
 not_activated_max: 1.0
 """
@@ -44,7 +44,7 @@ stop: {experiments: 1}
 not_activated_max: 1.0
 unknown_max: 1.0
 """
-EXPERIMENTS = 24
+EXPERIMENTS = 12
 SMOKE_SECONDS_MAX = 600.0  # of all its experiments
 
 

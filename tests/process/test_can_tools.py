@@ -3,6 +3,7 @@
 Each is the real tool. Where it is not installed, or the kernel has no CAN, the test is skipped and says so.
 """
 
+import contextlib
 import json
 import os
 import pty
@@ -18,6 +19,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
+import can
 import msgspec
 import pytest
 from liveruns import Home
@@ -25,7 +27,6 @@ from mcap.reader import make_reader
 from tracechecks import problems
 
 from aftbed.interop.logs import READERS, CanLog, LoggedFrame, convert, read_candump, write_candump
-from aftbed.vehicle.can.bus import BusOptions, open_bus
 
 pytestmark = pytest.mark.process
 
@@ -75,12 +76,12 @@ def tool(*words: str) -> str:
 
 @pytest.fixture(scope="module")
 def record(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Of a drive with a crash and an adaptation in it; not in lockstep: by then there is a backup again."""
+    """Of a drive with a crash and an adaptation in it: so late that there is a backup again."""
     folder = tmp_path_factory.mktemp("drive")
     aftbed(
-        folder, "run", "--scenario", "ccrs-20", "--record", "rec", "--mcap", "run.mcap",
-        "--trace", "run.json", "--inject", "crash primary at checkpoint.sent nth 20",
-        "--adapt", "compose pbr+tr at request 120",
+        folder, "run", "--scenario", "ccrs-50", "--pace", "max", "--record", "rec", "--mcap", "run.mcap",
+        "--trace", "run.json", "--inject", "crash primary at checkpoint.sent nth 5",
+        "--adapt", "compose pbr+tr at request 260",
     )  # fmt: skip
     return folder
 
@@ -124,7 +125,7 @@ def test_a_run_leaves_the_files_that_it_was_asked_for(record: Path, home: Home) 
     events = json.loads((record / "run.json").read_text())["traceEvents"]
     assert problems(events) == []
     names = [event["name"] for event in events if event["ph"] in "ib"]
-    assert "crash primary at checkpoint.sent nth 20" in names
+    assert "crash primary at checkpoint.sent nth 5" in names
     assert "adaptation 1" in names
     with (record / "run.mcap").open("rb") as file:
         summary = make_reader(file).get_summary()
@@ -140,16 +141,17 @@ def test_a_run_leaves_the_files_that_it_was_asked_for(record: Path, home: Home) 
 # -- the running bus ------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def port(tmp_path: Path, home: Home) -> Iterator[int]:
+@pytest.fixture(scope="module")
+def port(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
     """Of a bus on which there is traffic."""
     with socket.create_server(("127.0.0.1", 0)) as free:
         number: int = free.getsockname()[1]
-    (tmp_path / "long.yaml").write_text(LONG_DRIVE)
+    folder = tmp_path_factory.mktemp("bus")
+    (folder / "long.yaml").write_text(LONG_DRIVE)
     words = ["run", "--scenario", "long.yaml", "--bus-port", str(number)]
     command = subprocess.Popen(
         [sys.executable, "-m", "aftbed", *words],
-        cwd=tmp_path,
+        cwd=folder,
         stdout=subprocess.PIPE,
         stdin=subprocess.DEVNULL,
     )
@@ -219,30 +221,28 @@ class Attached:
             os.close(self._terminal)
 
 
-def wait_for_traffic(port: int, frames: int) -> None:
-    """Until so many frames have gone over the bus, for all who were on it before."""
-    bus = open_bus(BusOptions(port=port))
-    try:
-        for _ in range(frames):
-            assert bus.recv(SECONDS_MAX) is not None
-    finally:
-        bus.close()
-
-
 def test_python_cans_logger_logs_the_running_bus_in_formats_that_we_read(
     port: int, tmp_path: Path, home: Home
 ) -> None:
-    formats = {"asc": "asc", "blf": "blf", "trc": "trc", "log": "candump"}
+    """One as its program, the others as the program has them."""
+    formats = {"blf": "blf", "trc": "trc", "log": "candump"}
     paths = {name: tmp_path / f"theirs.{ending}" for ending, name in formats.items()}
-    loggers = [Attached("can.logger", port, tmp_path, "-f", str(path)) for path in paths.values()]
+    program = Attached("can.logger", port, tmp_path, "-f", str(tmp_path / "theirs.asc"))
     try:
-        for logger in loggers:
-            logger.wait_for(b"Connected to")
-        wait_for_traffic(port, 200)
+        program.wait_for(b"Connected to")
+        with (
+            can.Bus(interface="socketcand", channel="can0", host="127.0.0.1", port=port) as bus,
+            contextlib.ExitStack() as files,
+        ):
+            loggers = [files.enter_context(can.Logger(path)) for path in paths.values()]
+            for _ in range(200):
+                message = bus.recv(SECONDS_MAX)
+                assert message is not None
+                for logger in loggers:
+                    logger(message)
     finally:
-        for logger in loggers:
-            logger.end()
-    for name, path in paths.items():
+        program.end()
+    for name, path in {"asc": tmp_path / "theirs.asc", **paths}.items():
         found = {frame.can_id for frame in READERS[name](path).frames}
         assert {0x100, 0x110, 0x120, 0x130} <= found, name
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 import pytest
-from liveruns import Home, Started, aftbed, under_load, until
+from liveruns import ENDLESS, Home, Started, aftbed, under_load, until
 
 from aftbed.core.errors import StepFailed
 from aftbed.core.events import Event
@@ -70,15 +70,14 @@ def test_a_live_run_is_given_one_from_a_second_command(home: Home) -> None:
         done = aftbed("inject", "hang", "primary", "--for", "20ms", "--when", "speed>5")
         assert done.code == 0 and "hang primary for 20ms when speed > 5" in done.err, done.err
         run.wait_for("met")
-        control_client.ask(run.private, control_client.StopCommand())
-        (found,) = run.finish().verdict.faults
+        (found,) = run.stop().verdict.faults
     assert found.receipt.value == "activated" and "speed > 5 at " in found.detail
 
 
 def test_a_load_has_no_car(home: Home) -> None:
     done = aftbed("run", "--load", "10", "--inject", "crash primary when ttc < 1")
     assert done.code == 2 and "'when' looks at the car, and a run of --load has none" in done.err
-    with under_load(home, 400):
+    with under_load(home, ENDLESS):
         done = aftbed("inject", "crash", "primary", "--when", "ttc < 1")
         assert done.code == 2 and "a run of --load has none" in done.err
 
@@ -117,7 +116,7 @@ def flipped(run: Started, text: str) -> re.Match[str]:
 
 def test_a_bit_of_a_nodes_memory_is_another_one_and_of_no_other_node(home: Home) -> None:
     """An address that the node does not use: it holds a node's bits for as long as the run lasts."""
-    with under_load(home, 4000, 200.0) as run:
+    with under_load(home, ENDLESS) as run:
         pid, private = run.pid("a/server"), run.private
         owner = process_memory.Owner("a/server", pid, private)
         address = unused(owner)
@@ -130,8 +129,7 @@ def test_a_bit_of_a_nodes_memory_is_another_one_and_of_no_other_node(home: Home)
         assert process_memory.peek(other, address) == before, (
             "forked from the same zygote, and not the same memory"
         )
-        control_client.ask(run.private, control_client.StopCommand())
-        outcome = run.finish()
+        outcome = run.stop()
     assert outcome.verdict.faults[0].receipt.value == "applied"
 
 
@@ -142,17 +140,16 @@ def unused(owner: process_memory.Owner) -> int:
 
 
 def test_a_byte_that_is_drawn_is_one_that_the_process_can_write(home: Home) -> None:
-    with under_load(home, 4000, 200.0) as run:
+    with under_load(home, ENDLESS) as run:
         mapped = process_memory.mappings(run.pid("a/server"))
         found = flipped(run, "bitflip memory in a/server")
         assert any(one.start <= int(found[2], 16) < one.end for one in mapped)
         assert int(found[5], 16) ^ int(found[6], 16) == 1 << int(found[1])
-        run.launched.stop()
-        run.finish()
+        run.stop()
 
 
 def test_what_is_no_memory_of_the_process_is_the_injectors_failure(home: Home) -> None:
-    with under_load(home, 4000, 200.0) as run:
+    with under_load(home, ENDLESS) as run:
         code = next(
             line
             for line in Path(f"/proc/{run.pid('a/server')}/maps").read_text().splitlines()
@@ -164,24 +161,21 @@ def test_what_is_no_memory_of_the_process_is_the_injectors_failure(home: Home) -
         )
         said = str(run.wait_for("fault", "inject_error")["text"])
         assert f"address {first:#x}: in no private memory that a/server (pid" in said
-        run.launched.stop()
-        assert run.finish().verdict.faults[0].receipt.value == "inject_error"
+        assert run.stop().verdict.faults[0].receipt.value == "inject_error"
 
 
 def test_a_process_of_another_run_is_not_struck(home: Home) -> None:
-    with under_load(home, 4000, 200.0) as run:
+    with under_load(home, ENDLESS) as run:
         owner = process_memory.Owner("a/server", run.pid("a/server"), run_directory.root() / "000000")
         with pytest.raises(StepFailed, match=r"a/server \(pid \d+\) is no process of this run"):
             process_memory.flip(owner, None, None, 1)
-        run.launched.stop()
-        run.finish()
+        run.stop()
 
 
 def test_memory_is_struck_from_a_second_command(home: Home) -> None:
-    with under_load(home, 4000, 200.0) as run:
+    with under_load(home, ENDLESS) as run:
         done = aftbed("inject", "bitflip", "backup", "--level", "memory", "--unsafe-memory", "--bit", "0")
         assert done.code == 0 and "bitflip memory bit 0 in backup" in done.err
         until(lambda: any("bit 0 of byte" in str(e["text"]) for e in run.heard()), "the flip")
-        run.launched.stop()
-        (found,) = run.finish().verdict.faults
+        (found,) = run.stop().verdict.faults
     assert found.receipt.value == "applied" and " in b/" in found.detail

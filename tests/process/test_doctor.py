@@ -14,11 +14,11 @@ from typing import Final
 
 import msgspec
 import pytest
-from liveruns import Command, Home, Started, aftbed, ended, only_run, state_of, under_load, until
+from liveruns import ENDLESS, Command, Home, Started, aftbed, ended, only_run, state_of, under_load, until
 from rundirs import new_run
 
 from aftbed.cli.doctor import Diagnosis
-from aftbed.runtime.unix import cleanup, control_client, run_directory
+from aftbed.runtime.unix import cleanup, run_directory
 from aftbed.runtime.unix.cleanup import LeftDirectory, LeftModel
 from aftbed.runtime.unix.options import LoadRun
 from aftbed.runtime.unix.run_directory import Member
@@ -34,7 +34,7 @@ run_directory.mark(Path(sys.argv[1]))
 print("marked", flush=True)
 signal.pause()
 """
-ENDLESS: Final = ("--load", "100000@200")
+LOAD: Final = ("--load", f"{ENDLESS}@200")
 OF_THE_MOMENT: Final = ("CPU steal", "load")  # measured anew by each command
 
 
@@ -77,16 +77,16 @@ def stopped(pid: int) -> None:
 
 
 def test_every_process_of_a_run_is_told_by_its_mark(home: Home) -> None:
-    with under_load(home, 200) as run:
+    with under_load(home, ENDLESS) as run:
         known = {row.pid for row in run.rows()} | {run.launched.warden}
         marked = {m.pid for m in of_run(run.private)}
         assert known <= marked
         assert os.getpid() not in marked, "the command is not to be ended"
-        run.finish()
+        run.stop()
 
 
 def test_nothing_is_left_where_all_is_well(home: Home) -> None:
-    with under_load(home, 10_000) as run:
+    with under_load(home, ENDLESS) as run:
         code, found = doctor()
         assert (code, found.left, found.removed, found.ok) == (0, [], [], True)
         assert doctor("--clean")[1].removed == []
@@ -119,13 +119,13 @@ def test_an_fmu_that_a_dead_process_had_unpacked_is_named_and_removed(
 
 def test_a_run_killed_with_all_its_keepers_leaves_its_directory(home: Home) -> None:
     """Supervisor, warden and command at once: the kernel ends the nodes, the directory is not removed."""
-    with Command(*ENDLESS) as command:
+    with Command(*LOAD) as command:
         command.started()
         run = only_run()
         supervisor, warden = parts(run)
-        for pid in (warden, command.popen.pid, supervisor):  # each cleans up after those behind it
+        for pid in (warden, command.pid, supervisor):  # each cleans up after those behind it
             os.kill(pid, signal.SIGKILL)
-        command.popen.wait()
+        command.wait()
         assert ended(supervisor) and ended(warden)
         code, found = doctor()
         assert code == 1
@@ -141,16 +141,16 @@ def test_a_run_killed_with_all_its_keepers_leaves_its_directory(home: Home) -> N
 
 def test_the_processes_of_a_dead_run_are_named_and_removed_and_a_live_run_goes_on(home: Home) -> None:
     """All keepers were killed, and two processes that they did not know of live on, one of them stopped."""
-    with under_load(home, 100_000) as alive, Command(*ENDLESS) as command, contextlib.ExitStack() as strays:
+    with under_load(home, ENDLESS) as alive, Command(*LOAD) as command, contextlib.ExitStack() as strays:
         until(lambda: len(run_directory.live()) == 2, "two runs")
         command.started()
         run = next(path for path in home.runs() if path != alive.private)
         supervisor, warden = parts(run)
         idle, engine = (strays.enter_context(stray(run, name)) for name in ("stray", "engine"))
         stopped(engine)
-        for pid in (warden, command.popen.pid, supervisor):  # each cleans up after those behind it
+        for pid in (warden, command.pid, supervisor):  # each cleans up after those behind it
             os.kill(pid, signal.SIGKILL)
-        command.popen.wait()
+        command.wait()
         assert ended(supervisor) and ended(warden)
         until(lambda: len(of_run(run)) == 2, "the end of all that the run knew of")
         there = {idle, engine}
@@ -174,8 +174,7 @@ def test_the_processes_of_a_dead_run_are_named_and_removed_and_a_live_run_goes_o
         assert home.runs() == [alive.private]
         assert doctor("--clean")[1].removed == []
         assert alive.status()["leader"] == "a"
-        control_client.ask(alive.private, control_client.StopCommand())
-        outcome = alive.finish()
+        outcome = alive.stop()
         assert outcome.verdict.verdict == "pass"
         assert outcome.told("died") == outcome.told("replaced") == []
 
@@ -195,20 +194,20 @@ def test_a_run_is_alive_from_its_first_moment_to_the_last(home: Home) -> None:
 
 
 def test_a_stopped_command_has_a_live_run(home: Home) -> None:
-    with Command(*ENDLESS) as command:
+    with Command(*LOAD) as command:
         command.started()
         run = only_run()
-        stopped(command.popen.pid)
+        stopped(command.pid)
         os.kill(parts(run)[0], signal.SIGKILL)
         assert doctor("--clean")[1].removed == []
         assert run.exists()
-        command.popen.send_signal(signal.SIGCONT)
+        os.kill(command.pid, signal.SIGCONT)
         assert command.done().code == 3
 
 
 def test_a_run_whose_directory_was_removed_goes_on(home: Home) -> None:
     """Nobody finds it any more, but it is not dead."""
-    with under_load(home, 100_000) as run:
+    with under_load(home, ENDLESS) as run:
         nodes = {row.pid for row in run.rows() if row.node}
         shutil.rmtree(run.private)
         code, found = doctor("--clean")
@@ -218,11 +217,10 @@ def test_a_run_whose_directory_was_removed_goes_on(home: Home) -> None:
 
 def test_a_run_that_is_just_ending_is_given_its_second(home: Home) -> None:
     """Its warden waits for the stopped supervisor before it kills it: what is there meanwhile is not left."""
-    with Command(*ENDLESS) as command:
+    with Command(*LOAD) as command:
         command.started()
         stopped(parts(only_run())[0])
-        command.popen.kill()
-        command.popen.wait()
+        command.kill()
         assert cleanup.find() == []
 
 

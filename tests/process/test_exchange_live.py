@@ -9,7 +9,7 @@ from typing import Final
 
 import psutil
 import pytest
-from liveruns import Command, aftbed, home, until
+from liveruns import Command, adapted, aftbed, home, until
 
 from aftbed.functions.library import HEADER
 from aftbed.runtime.unix import control_client, run_directory
@@ -78,7 +78,7 @@ def library(path: Path, step: int, *options: str) -> str:
 
 def update(source: str, code: int) -> str:
     """What the command says that exchanges the function for `source`, which ends with `code`."""
-    done = aftbed("adapt", "update", "app", "--to", source, "--may-fail")
+    done = adapted("update", "app", "--to", source, "--may-fail")
     assert done.code == code, done.out + done.err
     return done.out + done.err
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 import pytest
-from liveruns import GONE_SECONDS_MAX, Home, until
+from liveruns import GONE_SECONDS_MAX, SHORT, Home, until
 
 from aftbed.runtime.unix import linux
 
@@ -44,7 +44,7 @@ def run(*words: str, folder: Path | None = None) -> subprocess.CompletedProcess[
     return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False, cwd=folder)
 
 
-@pytest.mark.parametrize("words", [("--load", "5"), ("--scenario", "ccrs-20", "--pace", "max")])
+@pytest.mark.parametrize("words", [("--load", "5"), ("--scenario", str(SHORT), "--pace", "max")])
 def test_a_command_forks_its_supervisor_first_and_imports_no_judge_before_the_run(
     words: tuple[str, ...],
 ) -> None:
@@ -103,7 +103,7 @@ def test_a_supervisor_that_was_stopped_ends_with_its_command() -> None:
 
 
 def test_a_drive_that_looks_like_a_load_has_its_bus_all_the_same(tmp_path: Path) -> None:
-    done = run("--scenario", "ccrs-20", "--pace", "max", "--json", "--record", "--load", folder=tmp_path)
+    done = run("--scenario", str(SHORT), "--pace", "max", "--json", "--record", "--load", folder=tmp_path)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "--load" / "bus.log").stat().st_size > 0
 

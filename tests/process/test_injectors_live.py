@@ -4,17 +4,15 @@ from statistics import median
 from typing import Final
 
 import pytest
-from liveruns import Home, Outcome, Started, aftbed, under_load
+from liveruns import ENDLESS, Home, Outcome, Started, aftbed, under_load
 
 from aftbed.core.events import Event
 from aftbed.core.journal import EntryKind
 from aftbed.inject.model import parse
 from aftbed.inject.receipts import fault_and_bits
-from aftbed.runtime.unix import control_client
 from aftbed.runtime.unix.options import LoadRun
 
 pytestmark = pytest.mark.process
-LIVE = 20_000  # requests, 200 a second: a command comes in time on any machine, then it is stopped
 
 COUNT: Final = 80
 RATE_HZ: Final = 200.0
@@ -93,8 +91,7 @@ def test_an_omission_loses_one_reply_and_no_other(home: Home) -> None:
     fault = parse("omission pxy2clt nth 10")
     with Started(home, LoadRun(COUNT, RATE_HZ), faults=(fault,)) as run:
         run.wait_for_answers(COUNT - 1)
-        control_client.ask(run.private, control_client.StopCommand())
-        outcome = run.finish()
+        outcome = run.stop()
     assert set(range(1, COUNT + 1)) - set(latencies_ms(outcome)) == {10}
     assert_healed(outcome, 10)
     assert receipts(outcome) == ["activated"]
@@ -178,20 +175,19 @@ def test_a_live_run_is_struck_from_a_second_command(home: Home) -> None:
         "duplicate pxy2pro in primary nth 1": ("duplicate", "pxy2pro"),
         "reorder pxy2clt by 4ms in primary nth 1": ("reorder", "pxy2clt", "--by", "4ms"),
     }
-    with under_load(home, LIVE) as run:
+    with under_load(home, ENDLESS) as run:
         for fault, arguments in faults.items():
             done = aftbed("inject", *arguments)
             assert done.code == 0 and f": {fault}" in done.err, done.err
         run.wait_for_answers(run.answered() + 100)
-        control_client.ask(run.private, control_client.StopCommand())
-        outcome = run.finish()
+        outcome = run.stop()
     assert [report.fault for report in outcome.verdict.faults] == list(faults)
     assert set(receipts(outcome)) <= {"activated", "applied"}
     assert outcome.verdict.requests.lost == 0
 
 
 def test_what_cannot_be_is_refused(home: Home) -> None:
-    with under_load(home, LIVE) as run:
+    with under_load(home, ENDLESS) as run:
         for arguments, words in (
             (("slow", "hub"), "unknown target 'hub'"),
             (("slow", "primary", "--by", "1s"), "a step can be slower by 500ms at most"),
@@ -203,5 +199,4 @@ def test_what_cannot_be_is_refused(home: Home) -> None:
         ):
             done = aftbed("inject", *arguments)
             assert done.code == 2 and words in done.err, done.err
-        run.launched.stop()
-        assert run.finish().verdict.verdict == "pass"
+        assert run.stop().verdict.verdict == "pass"

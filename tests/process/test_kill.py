@@ -14,6 +14,7 @@ from typing import Final
 
 import pytest
 from liveruns import (
+    ENDLESS,
     GONE_SECONDS_MAX,
     Command,
     Home,
@@ -42,7 +43,6 @@ pytestmark = pytest.mark.process
 NODES: Final = tuple(build("pbr", "process").nodes)
 CHAIN: Final = ("protocol", "before", "proceed", "after", "server")
 OUTSIDE: Final = tuple(n for n in NODES if n.rpartition("/")[2] not in CHAIN)
-REQUESTS: Final = 150
 RATE_HZ: Final = 200.0
 FUTEX_TID_MASK: Final = 0x3FFF_FFFF
 PR_SET_CHILD_SUBREAPER: Final = 36
@@ -55,7 +55,7 @@ def assert_served(outcome: Outcome, failovers: int) -> None:
     """Every promise held, over as many changes of master."""
     assert outcome.verdict.verdict == "pass", (outcome.verdict.reasons, outcome.events)
     requests = outcome.verdict.requests
-    assert requests.sent == requests.answered == outcome.record.options.work.count
+    assert requests.sent == requests.answered > 0
     assert (requests.lost, requests.duplicated, requests.wrong) == (0, 0, 0)
     assert len(outcome.verdict.failovers) == failovers, outcome.events
     assert outcome.record.end is not None
@@ -95,23 +95,34 @@ def traced(pid: int) -> Iterator[None]:
         libc.prctl(PR_SET_CHILD_SUBREAPER, 0)
 
 
+def served_on(run: Started) -> Outcome:
+    """The run, stopped after some more requests have been answered."""
+    run.wait_for_answers(run.answered() + 20)
+    return run.stop()
+
+
 def load_over_a_kill(home: Home, name: str, placement: str = "process") -> Outcome:
-    """A run under load in which the process called `name` is killed."""
-    with under_load(home, REQUESTS, RATE_HZ, placement=placement) as run:
+    """A run under load in which the process called `name` is killed, and replaced."""
+    with under_load(home, ENDLESS, RATE_HZ, placement=placement) as run:
+        seen = len(run.events)
         pid = run.strike(name, signal.SIGKILL)
         assert ended(pid)
-        return run.finish()
+        if name in OUTSIDE:
+            run.wait_for("replaced", f"{name}:", after=seen)
+        else:
+            run.wait_for("script.done", "new backup", after=seen)
+        return served_on(run)
 
 
 def test_there_are_the_seventeen_processes_of_the_paper(home: Home) -> None:
-    with under_load(home, REQUESTS, RATE_HZ) as run:
+    with under_load(home, ENDLESS, RATE_HZ) as run:
         rows = run.rows()
         assert [row.name for row in rows if row.node] == ["supervisor", *NODES]
         assert len({row.pid for row in rows}) == len(rows)
         assert len([row for row in rows if row.node]) == 17
         nodes = {row.name: row.pid for row in rows if row.name in NODES}
         assert {name: holder_of_lifeline(run, name) for name in nodes} == nodes
-        assert_served(run.finish(), failovers=0)
+        assert_served(run.stop(), failovers=0)
 
 
 @pytest.mark.parametrize("part", every(2, CHAIN))
@@ -134,7 +145,6 @@ def test_the_death_of_any_node_of_the_backup_costs_nothing(home: Home, part: str
 def test_the_death_of_a_node_beside_the_replicas_is_no_failover(home: Home, name: str) -> None:
     outcome = load_over_a_kill(home, name)
     assert_served(outcome, failovers=0)
-    assert any(text.startswith(f"{name}:") for text in outcome.told("replaced"))
     assert outcome.told("script") == []
 
 
@@ -144,35 +154,35 @@ def test_the_death_of_a_replica_in_one_node(home: Home, name: str) -> None:
 
 
 def test_the_death_of_the_zygote_is_no_failover(home: Home) -> None:
-    with under_load(home, REQUESTS, RATE_HZ) as run:
+    with under_load(home, ENDLESS, RATE_HZ) as run:
         pid = run.strike("zygote", signal.SIGKILL)
         assert ended(pid)
         run.wait_for("died", "zygote")
         until(lambda: run.pid("zygote") != pid, "a new zygote")
-        assert_served(run.finish(), failovers=0)
+        assert_served(served_on(run), failovers=0)
 
 
 def test_after_the_death_of_the_zygote_a_replica_can_be_replaced(home: Home) -> None:
     """The spares that the dead zygote parked are enough for one; the next ones are the new zygote's."""
-    with under_load(home, 3 * REQUESTS, RATE_HZ) as run:
+    with under_load(home, ENDLESS, RATE_HZ) as run:
         run.strike("zygote", signal.SIGKILL)
         run.wait_for("died", "zygote")
         for _ in range(2):
             seen = len(run.events)
             run.strike(f"{run.status()['leader']}/server", signal.SIGKILL)
             run.wait_for("script.done", "new backup", after=seen)
-        assert_served(run.finish(), failovers=2)
+        assert_served(served_on(run), failovers=2)
 
 
 @pytest.mark.parametrize("name", every(2, ["proxy", "client", "recovery", "b/watchdog", "a/watchdog"]))
 def test_a_node_beside_the_replicas_may_die_again_and_again(home: Home, name: str) -> None:
     """Under many requests each death meets another moment of a request."""
-    with under_load(home, 1500, 1000.0) as run:
+    with under_load(home, ENDLESS, 1000.0) as run:
         for _ in range(5):
             seen = len(run.events)
             run.strike(name, signal.SIGKILL)
             run.wait_for("replaced", name, after=seen)
-        assert_served(run.finish(), failovers=0)
+        assert_served(served_on(run), failovers=0)
 
 
 @pytest.mark.parametrize(("node", "neighbour"), every(7, list(itertools.permutations(OUTSIDE, 2))))
@@ -180,14 +190,14 @@ def test_a_replacement_that_dies_beside_a_stopped_neighbour_is_replaced(
     home: Home, node: str, neighbour: str
 ) -> None:
     """While others are bound to the new process, one of them does not answer; then the new one dies too."""
-    with under_load(home, REQUESTS, RATE_HZ) as run:
+    with under_load(home, ENDLESS, RATE_HZ) as run:
         hang = Fault(Hang(STOPPED_MS), neighbour, Trigger())
         control_client.ask(run.private, control_client.InjectCommand(hang))
         first = run.strike(node, signal.SIGKILL)
         second = until(lambda: next(iter(pids_of(run, node) - {first}), 0), f"a new {node}")
         os.kill(second, signal.SIGKILL)
         until(lambda: pids_of(run, node) - {first, second}, f"another new {node}")
-        assert_served(run.finish(), failovers=0)
+        assert_served(served_on(run), failovers=0)
 
 
 def test_the_death_of_the_supervisor_ends_everything_and_is_inconclusive(home: Home) -> None:
@@ -209,8 +219,7 @@ def test_a_killed_command_leaves_nothing_but_its_record(home: Home, tmp_path: Pa
         command.started()
         command.wait_for_line("km/h")
         until(lambda: _frames(record).frames > 100, "frames in the log")
-        command.popen.kill()
-        command.popen.wait()
+        command.kill()
         assert home.seconds_to_clean() < GONE_SECONDS_MAX
     assert_readable_to_the_last_line(record)
     done = aftbed("check", record)
@@ -226,9 +235,9 @@ def test_command_and_supervisor_killed_at_once_leave_nothing_but_the_record(
         command.started()
         until(lambda: _frames(record).frames > 100, "frames in the log")
         supervisor = next(row.pid for row in control_client.processes(only_run()) if row.name == "supervisor")
-        command.popen.kill()
+        os.kill(command.pid, signal.SIGKILL)
         os.kill(supervisor, signal.SIGKILL)
-        command.popen.wait()
+        command.wait()
         assert home.seconds_to_clean() < GONE_SECONDS_MAX
     assert_readable_to_the_last_line(record)
     assert aftbed("check", record).code == 3
@@ -249,8 +258,7 @@ def test_a_killed_command_leaves_nothing_whatever_its_keepers_suffer(
             until(partial(in_state, pid, "T"), "the process to stop")
         for pid in (pid for pid, fate in keepers.items() if fate == "killed"):
             os.kill(pid, signal.SIGKILL)
-        command.popen.kill()
-        command.popen.wait()
+        command.kill()
         if supervisor == warden == "killed":
             until(lambda: not home.processes(), "the end of all processes", GONE_SECONDS_MAX)
             assert aftbed("doctor", "--clean").code == 0
@@ -258,10 +266,10 @@ def test_a_killed_command_leaves_nothing_whatever_its_keepers_suffer(
 
 
 def test_what_does_not_end_in_time_is_named(home: Home) -> None:
-    with under_load(home, 50) as run:
+    with under_load(home, ENDLESS) as run:
         pid = run.pid("zygote")
         with traced(pid):
-            outcome = run.finish()
+            outcome = run.stop()
     assert outcome.verdict.verdict == "fail"
     assert outcome.verdict.reasons == [f"clean_exit: left behind: ['zygote ({pid})']"]
 

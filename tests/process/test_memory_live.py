@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final
 
 import pytest
-from liveruns import Home, Outcome, Started, aftbed, under_load, until
+from liveruns import ENDLESS, Home, Outcome, Started, aftbed, under_load, until
 
 from aftbed.core.events import Event
 from aftbed.inject.model import parse
@@ -83,7 +83,7 @@ def test_what_is_not_read_any_more_is_latent(home: Home) -> None:
 
 def test_it_is_memory_of_that_process_and_of_no_other(home: Home) -> None:
     """Without a fault there is none; a replica that takes the place of a dead one gets a fresh one."""
-    with under_load(home, 4000, RATE_HZ) as run:
+    with under_load(home, ENDLESS, RATE_HZ) as run:
         assert not held(run)
         control_client.ask(
             run.private, control_client.InjectCommand(parse(f"{FLIP} in a at request.received {NEVER}"))
@@ -101,12 +101,11 @@ def test_it_is_memory_of_that_process_and_of_no_other(home: Home) -> None:
         fresh = cells(run.pid("a/server"))
         assert len(fresh) == 1 and not fresh & old and held(run) == {"a/server": fresh}
         assert cells(run.launched.supervisor) == fresh
-        control_client.ask(run.private, control_client.StopCommand())
-        assert run.finish().verdict.requests.wrong == 0
+        assert run.stop().verdict.requests.wrong == 0
 
 
 def test_a_bit_is_flipped_from_outside(home: Home) -> None:
-    with under_load(home, 8000, RATE_HZ) as run:
+    with under_load(home, ENDLESS, RATE_HZ) as run:
         done = aftbed("inject", "bitflip", "state.ego", "--bit", "52")
         assert done.code == 2 and "unknown field of the state 'ego'; did you mean 'ego_ms'?" in done.err
         done = aftbed("inject", "bitflip", "state.counter", "--bit", "8")
@@ -114,8 +113,7 @@ def test_a_bit_is_flipped_from_outside(home: Home) -> None:
         flip = ("inject", "bitflip", "state.counter", "--bit", "7", "--at", "request.received")
         assert aftbed(*flip).code == 0  # any counter is refused then, whatever it is at this moment
         until(lambda: run.status()["leader"] == "b" and run.redundant(), "a new backup")
-        control_client.ask(run.private, control_client.StopCommand())
-        outcome = run.finish()
+        outcome = run.stop()
     assert receipts(outcome) == ["activated"]
     assert outcome.verdict.verdict == "pass", outcome.verdict.reasons
     assert len(outcome.verdict.failovers) == 1

@@ -12,7 +12,7 @@ from typing import Final
 
 import psutil
 import pytest
-from liveruns import Command, aftbed, home, until
+from liveruns import ENDLESS, Command, aftbed, home, until
 from sampling import every
 
 from aftbed.functions.library import HEADER
@@ -183,13 +183,15 @@ def test_a_function_that_fails_by_itself_is_failed_over_and_told(
 
 
 def test_a_program_that_is_killed_is_failed_over_and_told(program: str) -> None:
-    with Command("--app", program, "--load", "1200@400") as run:
+    with Command("--app", program, "--load", f"{ENDLESS}@400") as run:
         run.wait_for_line("roles: a leads, b backs up")
         until(lambda: len(programs(program)) == 2, "both replicas run their program")
         os.kill(programs(program)[0], signal.SIGKILL)
+        run.wait_for_line("script.done: new backup")
+        assert aftbed("stop").code == 0
         done = run.done()
     assert done.code == 0, done.out + done.err
-    assert "1200 sent, 1200 answered, 0 lost" in done.out
+    assert " 0 lost, 0 duplicated, " in done.out and " 0 wrong" in done.out
     (failure,) = (line for line in done.out.splitlines() if line.startswith("  failed     "))
     assert "sum.py: was killed by SIGKILL" in failure and failure.endswith("nothing is on its stderr")
     assert failure.split()[1] in ("a/server:", "b/server:")

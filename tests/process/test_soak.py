@@ -11,7 +11,8 @@ from typing import Final
 import msgspec
 import psutil
 import pytest
-from liveruns import LOOK_SECONDS, Home, Started, until
+from liveruns import ENDLESS, LOOK_SECONDS, Home, Started, until
+from test_adaptations import adapt
 
 from aftbed.core.messages import Goal
 from aftbed.inject.crash import Crash
@@ -30,7 +31,6 @@ PSS_MB_PER_THOUSAND: Final = 6.0
 PSS_MB_SLACK: Final = 2.0
 RATE_HZ: Final = 200.0
 SETTLE_SECONDS_MAX: Final = 5.0
-ENDLESS: Final = 10_000_000
 
 
 class Size(msgspec.Struct, frozen=True):
@@ -95,11 +95,7 @@ def test_many_failovers_leave_no_trace(home: Home, placement: str, count: int) -
 def adapt_back_and_forth(run: Started, count: int) -> None:
     """`count` adaptations: a composition, its end, and so on."""
     for expression in itertools.islice(itertools.cycle(("pbr+tr", "pbr")), count):
-        found = control_client.ask(
-            run.private,
-            control_client.AdaptCommand(Goal(expression=expression)),
-            control_client.ADAPT_SECONDS_MAX,
-        )
+        found = adapt(run, Goal(expression=expression))
         assert (found["outcome"], found["reason"]) == ("done", "")
 
 

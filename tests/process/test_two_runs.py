@@ -3,7 +3,7 @@
 import signal
 
 import pytest
-from liveruns import Command, Home, aftbed, under_load, until
+from liveruns import ENDLESS, SHORT, Command, Home, aftbed, under_load, until
 from rundirs import new_run
 
 from aftbed.runtime.unix import control_client, run_directory
@@ -15,7 +15,7 @@ LONG = 100_000  # requests: until it is stopped
 
 def test_two_drives_at_once_both_pass(home: Home) -> None:
     fault = "crash primary at checkpoint.sent nth 60"
-    drive = ("--scenario", "ccrs-20", "--pace", "max")
+    drive = ("--scenario", SHORT, "--pace", "max")
     with Command(*drive, "--inject", fault) as first, Command(*drive) as second:
         hit, spared = first.done(), second.done()
     assert hit.code == 0, hit.out + hit.err
@@ -72,8 +72,7 @@ def test_the_directory_of_a_dead_run_is_no_run(home: Home) -> None:
 
 
 def test_the_directory_of_a_run_is_private(home: Home) -> None:
-    with under_load(home, 100) as run:
+    with under_load(home, ENDLESS) as run:
         assert run.private.stat().st_mode & 0o777 == 0o700
         assert run_directory.root().stat().st_mode & 0o777 == 0o700
-        control_client.ask(run.private, control_client.StopCommand())
-        assert run.finish().verdict.verdict == "pass"
+        assert run.stop().verdict.verdict == "pass"

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Final
 
 import pytest
-from liveruns import GONE_SECONDS_MAX, Home, Started, state_of, under_load, until
+from liveruns import ENDLESS, GONE_SECONDS_MAX, Home, Started, state_of, under_load, until
 
 from aftbed.inject.grammar import Trigger
 from aftbed.inject.hang import Hang
@@ -31,7 +31,7 @@ def entries(run: Started) -> list[cleanup.Entry]:
 
 
 def test_a_stop_is_written_before_it_is_done_and_its_undo_behind_it(home: Home) -> None:
-    with under_load(home, 200) as run:
+    with under_load(home, ENDLESS) as run:
         pid = run.pid("engine")
         began_ns = time.monotonic_ns()
         control_client.ask(run.private, hang("engine", 60))
@@ -47,11 +47,11 @@ def test_a_stop_is_written_before_it_is_done_and_its_undo_behind_it(home: Home) 
         # Where a busy machine makes the supervisor late, the warden has undone it before.
         until(lambda: cleanup.Undone(pid, stopped[0].start, "supervisor") in entries(run)[1:], "the undo")
         assert state_of(pid) not in ("T", "")
-        assert run.finish().verdict.verdict == "pass"
+        assert run.stop().verdict.verdict == "pass"
 
 
 def test_what_a_stopped_supervisor_stopped_is_thawed_by_the_warden_in_time(home: Home) -> None:
-    with under_load(home, 300) as run:
+    with under_load(home, ENDLESS) as run:
         pid = run.pid("engine")
         began = time.monotonic()
         control_client.ask(run.private, hang("engine", FOR_MS))
@@ -67,7 +67,7 @@ def test_what_a_stopped_supervisor_stopped_is_thawed_by_the_warden_in_time(home:
         assert run.pid("engine") == pid
         told = (run.launched.record / "events.jsonl").read_text()
         assert f"by the warden: engine ({pid}), stopped" in told
-        assert run.finish().verdict.verdict == "pass"
+        assert run.stop().verdict.verdict == "pass"
 
 
 def test_a_supervisor_that_is_killed_at_once_leaves_no_zygote(home: Home) -> None:

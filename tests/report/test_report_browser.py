@@ -52,7 +52,7 @@ def test_a_message_on_the_console_would_be_seen(tmp_path: Path) -> None:
     assert "seen" in "".join(console)
 
 
-@pytest.mark.parametrize("scheme", ["0", "1"], ids=["dark", "light"])
+@pytest.mark.parametrize("scheme", ["0", pytest.param("1", marks=pytest.mark.deep)], ids=["dark", "light"])
 def test_it_can_be_drawn(ledger: Ledger, tmp_path: Path, scheme: str) -> None:
     picture = tmp_path / "report.png"
     page = html_report(summary_of(ledger), ledger)
