@@ -22,6 +22,8 @@ from aftbed.core.application import (
 )
 from aftbed.core.errors import ConfigError, FunctionFailedError, PeerError
 from aftbed.functions.load import OWN_CODE, characteristics_of, declared_in, load_application
+from aftbed.functions.source import told_of
+from aftbed.judge.exercise import reason_of
 from aftbed.judge.record import RunRecord
 from aftbed.judge.reference import (
     NamedChange,
@@ -169,7 +171,7 @@ def _declared(source: str, task: Describe | TryOut, trust: Trust, limits: Proces
         case Declared() as found:
             return found
         case Failed(reason):
-            raise ConfigError(reason if source in reason else f"{source}: {reason}")
+            raise ConfigError(told_of(source, reason))
         case Replies():
             raise ConfigError(f"{source}: it answered something else")
 
@@ -199,8 +201,7 @@ def work(data: bytes) -> bytes:
     try:
         return msgspec.msgpack.encode(_done(job))
     except BaseException as error:  # noqa: BLE001
-        reason = str(error) if isinstance(error, ConfigError) else f"{type(error).__name__}: {error}"
-        return msgspec.msgpack.encode(Failed(reason[:WORDS_MAX]))
+        return msgspec.msgpack.encode(Failed(reason_of(error)))
 
 
 def _done(job: Job) -> Answer:

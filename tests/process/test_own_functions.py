@@ -196,10 +196,25 @@ def test_a_program_that_is_killed_is_failed_over_and_told(program: str) -> None:
     assert programs(program) == []
 
 
-def test_a_function_that_cannot_begin_is_refused_before_the_start(tmp_path: Path) -> None:
-    (tmp_path / "silent.py").write_text("import sys\nsys.exit('not today')\n")
-    done = aftbed("run", "--app", f"{sys.executable} {tmp_path}/silent.py", "--load", "10")
-    assert done.code == 2 and "not today" in done.err and "exit code 1" in done.err, done.err
+SILENT: Final = """
+import sys
+sys.exit("it began\\n" + "x" * 1000 + "\\nnot today")
+"""
+
+
+@pytest.mark.parametrize("words", [("run", "--load", "10"), ("sim", "--count", "10"), ("app", "check")])
+def test_a_program_that_cannot_begin_is_refused_with_all_that_it_told(
+    words: tuple[str, ...], tmp_path: Path
+) -> None:
+    """Before anything starts."""
+    (tmp_path / "silent.py").write_text(SILENT)
+    app = f"{sys.executable} {tmp_path}/silent.py"
+    named = (app,) if words == ("app", "check") else ("--app", app)
+    done = aftbed(*words, *named)
+    lines = done.err.splitlines()
+    assert (done.code, done.out, len(lines)) == (2, "", 5), done.err
+    assert lines[0] == f"aftbed: error: {app}: ended with exit code 1, asked to describe"
+    assert (lines[2], lines[-1]) == ("it began", "not today")
 
 
 @pytest.mark.deep
