@@ -18,12 +18,13 @@ from aftbed.core.application import (
     Characteristics,
     close,
     difference,
+    fields_of,
     reply_fields_of,
 )
 from aftbed.core.errors import ConfigError, FunctionFailedError, PeerError
 from aftbed.functions.load import OWN_CODE, characteristics_of, declared_in, load_application
 from aftbed.functions.source import told_of
-from aftbed.judge.exercise import reason_of
+from aftbed.judge.exercise import behind, differs, reason_of
 from aftbed.judge.record import RunRecord
 from aftbed.judge.reference import (
     NamedChange,
@@ -224,17 +225,17 @@ def _done(job: Job) -> Answer:
 def _tried(function: Application, requests: Sequence[bytes]) -> str:
     """Have it execute `requests` twice, from one state; how that differs from what it declares, or "".
 
-    Raises FunctionFailedError.
+    Raises FunctionFailedError, also where a capture changes what it captures: no mechanism can use that.
     """
     declared = function.characteristics
-    begun = _did("capture", function.capture)
+    begun = _captured(function, 0)
     replies = _replies(function, requests)
     for number, (request, reply) in enumerate(zip(requests, replies, strict=True), 1):
         if not _did(f"request {number}: acceptable", partial(function.acceptable, request, reply)):
             return f"its assertion does not accept its own reply to request {number}"
     if declared.state_access.kind is AccessKind.NONE:
         return ""
-    ended = _did("capture", function.capture)
+    ended = _captured(function, len(requests))
     _did("restore of what capture gave", lambda: function.restore(begun))
     restored = _did("capture", function.capture)
     replies_again = _replies(function, requests)
@@ -251,6 +252,14 @@ def _tried(function: Application, requests: Sequence[bytes]) -> str:
     if exact and ended != ended_again:
         return f"behind a restored state, {len(requests)} requests lead to another state"
     return ""
+
+
+def _captured(function: Application, number: int) -> bytes:
+    """The state behind so many requests. Raises FunctionFailedError."""
+    state = _did("capture", function.capture)
+    if text := differs(_did("capture", function.capture), state, fields_of(function)):
+        raise FunctionFailedError(f"capture changes the state: the second one of {behind(number)}: {text}")
+    return state
 
 
 def _replies(function: Application, requests: Sequence[bytes]) -> list[bytes]:

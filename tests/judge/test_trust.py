@@ -547,6 +547,20 @@ def test_a_function_that_is_not_as_it_declares_is_told(
 
 
 @starts_process
+@pytest.mark.parametrize(
+    ("counted", "told"),
+    [
+        ("self.count += 1", "the second one of the initial state: byte 0 is 0x32 instead of 0x31"),
+        ("self.count += bool(self.calls)", "of the state behind request 4: byte 0 is 0x36 instead of"),
+    ],
+)
+def test_a_capture_that_changes_the_state_is_told(tmp_path: Path, counted: str, told: str) -> None:
+    change = ("    def capture(self):\n", f"    def capture(self):\n        {counted}\n")
+    with pytest.raises(trust.ConfigError, match=f"mine.py:Mine: capture changes the state: .*{told}"):
+        trial(tmp_path, "pass", change)
+
+
+@starts_process
 def test_a_function_that_cannot_restore_is_told(tmp_path: Path) -> None:
     with pytest.raises(trust.ConfigError, match="restore of what capture gave: PeerError: not mine"):
         trial(tmp_path, "pass", ("self.count = int(state)", "raise PeerError('not mine')"))

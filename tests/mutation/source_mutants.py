@@ -492,6 +492,15 @@ MUTANTS: Final = (
         UNIT,
         ("tests/runtime/test_tasks.py",),
     ),
+    SourceMutant(
+        "a capture that changes the state is not refused before a run",
+        "G3",
+        f"{JUDGE}/isolated.py",
+        "    begun = _captured(function, 0)\n",
+        '    begun = _did("capture", function.capture)\n',
+        UNIT,
+        ("tests/judge/test_trust.py",),
+    ),
 )
 
 
