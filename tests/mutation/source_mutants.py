@@ -501,6 +501,17 @@ MUTANTS: Final = (
         UNIT,
         ("tests/judge/test_trust.py",),
     ),
+    SourceMutant(
+        "a function whose process crashes is not told",
+        "G8",
+        f"{UNIX}/process_pool.py",
+        "any(kind == SERVER for _, kind in process.bricks)",
+        "not process.bricks",
+        PROCESS,
+        (
+            "tests/process/test_own_functions.py::test_a_function_that_fails_by_itself_is_failed_over_and_told",
+        ),
+    ),
 )
 
 
