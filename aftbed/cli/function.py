@@ -3,6 +3,7 @@
 `check` measures what it declares; `header` is for one that is a C library.
 """
 
+import sys
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -56,6 +57,8 @@ def check(
     reasons = {name: "; ".join(mismatches(name, found.characteristics)) for name in EXPRESSIONS}
     if json:
         print_json(_document(source, found, reasons))
+        for one in found.differences:
+            print(f"aftbed: note: {shown(one)}", file=sys.stderr)
     else:
         _show(source, found, reasons)
     if found.wrong:
@@ -98,7 +101,6 @@ def _document(source: str, found: MeasuredFunction, reasons: dict[str, str]) -> 
         "changed_pages": _spread(found.changed_pages),
         "execute_us": {"p50": found.execute_us[0], "p99": found.execute_us[1]},
         "suits": [{"ftm": name, "why_not": why_not} for name, why_not in reasons.items()],
-        "differences": found.differences,
     }
 
 
