@@ -18,7 +18,7 @@ from aftbed.core.application import NONE, Characteristics
 from aftbed.core.errors import shown
 from aftbed.ftm.compose import EXPRESSIONS
 from aftbed.functions.load import OWN_CODE
-from aftbed.functions.request_file import generated, names_function, read_requests
+from aftbed.functions.request_file import located_requests, requests_from
 from aftbed.functions.source import is_foreign, located, parse_source
 from aftbed.judge.measured import MeasuredFunction, StateChange, UnmeasuredError, measure
 from aftbed.vehicle.aeb.function import sample_requests
@@ -77,10 +77,9 @@ def _requests(app: str, source: str | None, count: int | None, seed: int) -> lis
         check_range("--count", count, 1, COUNT_MAX)
     if source is None:
         return sample_requests(seed, count or COUNT, fixed=is_foreign(app))
-    if names_function(source):
-        return generated(source, count or COUNT, seed, OWN_CODE)
-    found = read_requests(Path(source)).requests
-    check_range("--count", len(found) if count is None else count, 1, min(len(found), COUNT_MAX))
+    found = requests_from(located_requests(source), count or COUNT, seed, OWN_CODE).requests
+    if count is not None:
+        check_range("--count", count, 1, len(found))
     return list(found[:count])
 
 

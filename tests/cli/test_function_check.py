@@ -145,7 +145,7 @@ def test_a_program_is_asked_for_the_brake_in_the_fixed_layout(call: Call, tmp_pa
         ((f"{VARIANTS}:Cautious", "--count", "0"), "--count 0: 1 to 100000 are allowed"),
         ((f"{VARIANTS}:Cautious", "--count", "100001"), "--count 100001: 1 to 100000 are allowed"),
         ((f"{VARIANTS}:Cautious", "--seed", "-1"), "--seed -1: 0 to"),
-        ((f"{VARIANTS}:Cautious", "--requests", "none.csv"), "none.csv: cannot be read: No such file"),
+        ((f"{VARIANTS}:Cautious", "--requests", "none.csv"), "none.csv: no such file"),
         ((f"{VARIANTS}:Cautious", "--requests", "{three}", "--count", "4"), "--count 4: 1 to 3 are allowed"),
         ((f"{VARIANTS}:Cautious", "--requests", f"{DECLARING}:none"), "declaring.py has no function none"),
         (("no.such.module:Mine",), "no.such.module:Mine cannot be read: no module no"),
