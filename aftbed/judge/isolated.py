@@ -229,7 +229,9 @@ def _tried(function: Application, requests: Sequence[bytes]) -> str:
     """
     declared = function.characteristics
     begun = _captured(function, 0)
-    replies = _replies(function, requests)
+    replies, refused = _replies(function, requests)
+    if requests and refused == len(requests):
+        return f"it refused each of the first {refused} requests"
     for number, (request, reply) in enumerate(zip(requests, replies, strict=True), 1):
         if not _did(f"request {number}: acceptable", partial(function.acceptable, request, reply)):
             return f"its assertion does not accept its own reply to request {number}"
@@ -238,7 +240,7 @@ def _tried(function: Application, requests: Sequence[bytes]) -> str:
     ended = _captured(function, len(requests))
     _did("restore of what capture gave", lambda: function.restore(begun))
     restored = _did("capture", function.capture)
-    replies_again = _replies(function, requests)
+    replies_again, _ = _replies(function, requests)
     ended_again = _did("capture", function.capture)
     exact = declared.state_access.kind is AccessKind.EXACT
     if exact and restored != begun:
@@ -262,14 +264,20 @@ def _captured(function: Application, number: int) -> bytes:
     return state
 
 
-def _replies(function: Application, requests: Sequence[bytes]) -> list[bytes]:
+def _replies(function: Application, requests: Sequence[bytes]) -> tuple[list[bytes], int]:
+    """Empty for a request that is refused; and how many were."""
+    refused = 0
+
     def reply(request: bytes) -> bytes:
+        nonlocal refused
         try:
             return function.execute(request)
         except PeerError:
+            refused += 1
             return b""
 
-    return [_did(f"request {n}: execute", partial(reply, one)) for n, one in enumerate(requests, 1)]
+    replies = [_did(f"request {n}: execute", partial(reply, one)) for n, one in enumerate(requests, 1)]
+    return replies, refused
 
 
 def _did(what: str, act: Callable[[], T]) -> T:

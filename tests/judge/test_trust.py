@@ -525,6 +525,7 @@ def test_a_function_that_fails_its_first_requests_is_told(tmp_path: Path, body: 
     [
         ("pass", ("", ""), ""),
         ("if request == b'd': raise PeerError('no')", ("", ""), ""),
+        ("raise PeerError('no')", ("", ""), "it refused each of the first 4 requests"),
         ("pass", ("int(state)", "int(state) + 1"), "restore does not give the state back that capture gave"),
         (
             "self.count += self.calls == 7",
