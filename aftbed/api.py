@@ -40,7 +40,7 @@ from aftbed.core.messages import Scheduled
 from aftbed.core.script import RECIPES
 from aftbed.ftm.compose import build, protected_by
 from aftbed.functions.load import OWN_CODE, Code, characteristics_of
-from aftbed.functions.request_file import GivenRequests, check_payload
+from aftbed.functions.request_file import GivenRequests, check_payload, located_requests
 from aftbed.functions.source import located
 from aftbed.inject.model import FaultReport
 from aftbed.judge.asked import AskedAdaptation
@@ -374,13 +374,8 @@ def _file_of(name: str, given: object, folder: Path, standing: contextlib.ExitSt
     if isinstance(given, str | os.PathLike):
         text = os.fspath(given)
         if isinstance(text, str):
-            place, colon, function = text.rpartition(":")
-            is_function = bool(colon) and function.isidentifier() and not (folder / text).exists()
-            if is_function and not place.endswith(".py"):
-                return _File(text, text)
-            path = str((folder / (place if is_function else text)).resolve())
-            path = f"{path}:{function}" if is_function else path
-            return _File(path, path)
+            found = located_requests(text, folder)
+            return _File(found, found)
     if not isinstance(given, Sequence) or not all(isinstance(one, bytes) for one in given):
         raise ConfigError(f"{name}: found {str(given)[:60]!r}, a path or a list of bytes is allowed")
     if not given:

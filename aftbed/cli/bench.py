@@ -18,10 +18,10 @@ from aftbed.bench.resources import bench_launch, bench_memory
 from aftbed.bench.rounds import ROUNDS, text
 from aftbed.cli.options import App, Ftm, Recipe, check_range, print_json
 from aftbed.cli.parsing import PlainGroup
-from aftbed.cli.request_options import RequestSource
 from aftbed.core.errors import ConfigError
 from aftbed.ftm.compose import DUPLEX, replication_of
-from aftbed.functions.request_file import REQUESTS_MAX, names_function
+from aftbed.functions.load import OWN_CODE
+from aftbed.functions.request_file import located_requests, requests_from
 from aftbed.functions.source import located
 
 bench = typer.Typer(cls=PlainGroup)
@@ -54,9 +54,7 @@ def cycle(
     """Cycle time at the client, alternating with a bare ring of the same number of hops."""
     application, given = located(app) if app is not None else "", None
     if sent is not None:
-        count = SENT_FUNCTION if names_function(sent) else None
-        source = RequestSource(sent, count=count, count_max=REQUESTS_MAX, expect=None, tolerance=None)
-        given = source.of(0)
+        given = requests_from(located_requests(sent), SENT_FUNCTION, 0, OWN_CODE)
     result = bench_cycle(
         ftm, placement, requests, pin=pin, rounds=rounds, application=application, given=given
     )

@@ -3,6 +3,7 @@
 `check` measures what it declares; `header` is for one that is a C library.
 """
 
+import sys
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -17,7 +18,7 @@ from aftbed.core.application import NONE, Characteristics
 from aftbed.core.errors import shown
 from aftbed.ftm.compose import EXPRESSIONS
 from aftbed.functions.load import OWN_CODE
-from aftbed.functions.request_file import generated, names_function, read_requests
+from aftbed.functions.request_file import located_requests, requests_from
 from aftbed.functions.source import is_foreign, located, parse_source
 from aftbed.judge.measured import MeasuredFunction, StateChange, UnmeasuredError, measure
 from aftbed.vehicle.aeb.function import sample_requests
@@ -56,6 +57,8 @@ def check(
     reasons = {name: "; ".join(mismatches(name, found.characteristics)) for name in EXPRESSIONS}
     if json:
         print_json(_document(source, found, reasons))
+        for one in found.differences:
+            print(f"aftbed: note: {shown(one)}", file=sys.stderr)
     else:
         _show(source, found, reasons)
     if found.wrong:
@@ -74,10 +77,9 @@ def _requests(app: str, source: str | None, count: int | None, seed: int) -> lis
         check_range("--count", count, 1, COUNT_MAX)
     if source is None:
         return sample_requests(seed, count or COUNT, fixed=is_foreign(app))
-    if names_function(source):
-        return generated(source, count or COUNT, seed, OWN_CODE)
-    found = read_requests(Path(source)).requests
-    check_range("--count", len(found) if count is None else count, 1, min(len(found), COUNT_MAX))
+    found = requests_from(located_requests(source), count or COUNT, seed, OWN_CODE).requests
+    if count is not None:
+        check_range("--count", count, 1, len(found))
     return list(found[:count])
 
 
@@ -98,7 +100,6 @@ def _document(source: str, found: MeasuredFunction, reasons: dict[str, str]) -> 
         "changed_pages": _spread(found.changed_pages),
         "execute_us": {"p50": found.execute_us[0], "p99": found.execute_us[1]},
         "suits": [{"ftm": name, "why_not": why_not} for name, why_not in reasons.items()],
-        "differences": found.differences,
     }
 
 

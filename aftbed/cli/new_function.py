@@ -51,6 +51,7 @@ KINDS: Final = {
             for name in ("function.c", "modelDescription.xml", "ports.yaml", "Makefile")
         },
         first="make",
+        needs="FMPy",
     ),
     "stdio": ProjectKind("python3 function.py", "function.py", {"function.py": "stdio/function.py.tmpl"}),
 }

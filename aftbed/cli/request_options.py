@@ -12,6 +12,7 @@ from aftbed.functions.request_file import (
     ExpectedReplies,
     GivenRequests,
     generated,
+    located_requests,
     names_function,
     read_replies,
     read_requests,
@@ -37,19 +38,17 @@ class RequestSource:
     ) -> None:
         """Raises ConfigError, also where there are not as many expected replies as requests."""
         self._expect, self._tolerance = expect, tolerance
+        self.name = located_requests(source)
         if names_function(source):
             if count is None:
                 raise ConfigError(
                     f"--requests {source}: a function makes as many as are asked for: give --count"
                 )
             check_range("--count", count, 1, min(count_max, REQUESTS_MAX))
-            place, _, name = source.rpartition(":")
-            self.name = f"{Path(place).resolve()}:{name}" if place.endswith(".py") else source
             self.count = count
             self._requests: Callable[[int], tuple[bytes, ...]] = self._generated
         else:
             requests = read_requests(Path(source)).requests
-            self.name = str(Path(source).resolve())
             self.count = len(requests) if count is None else count
             check_range("--count", self.count, 1, count_max)
             self._requests = lambda seed: requests

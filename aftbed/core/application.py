@@ -9,9 +9,10 @@ import re
 import struct
 from collections.abc import Mapping
 from enum import Enum
-from typing import Final, Literal, Protocol, TypeGuard
+from typing import Annotated, Final, Literal, Protocol, TypeGuard
 
 import msgspec
+from msgspec import Meta
 
 from aftbed.core.errors import ConfigError, unknown
 
@@ -74,6 +75,24 @@ def approximate(tolerance: float) -> StateAccess:
     if not (math.isfinite(tolerance) and tolerance > 0):
         raise ConfigError(f"approximate({tolerance:g}): a tolerance is more than 0 and finite")
     return StateAccess(AccessKind.APPROXIMATE, tolerance)
+
+
+class ApproximateAccess(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    approximate: Annotated[float, Meta(gt=0)]
+
+
+WrittenAccess = Literal["exact", "none"] | ApproximateAccess  # as files and programs write it
+
+
+def access_of(written: WrittenAccess) -> StateAccess:
+    """Raises ConfigError."""
+    match written:
+        case "exact":
+            return EXACT
+        case "none":
+            return NONE
+        case ApproximateAccess(tolerance):
+            return approximate(tolerance)
 
 
 class Characteristics(msgspec.Struct, frozen=True):

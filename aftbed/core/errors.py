@@ -7,6 +7,9 @@ failed `assert` is a bug of ours: it ends the node, because fail-silence is the 
 
 import difflib
 from collections.abc import Iterable
+from typing import Final
+
+FUNCTION_FAILED: Final = "the function failed: "  # begins why its node has stopped
 
 
 class AftbedError(Exception):
@@ -35,6 +38,11 @@ class FunctionFailedError(AftbedError):
 
 class HarnessError(AftbedError):
     """The testbed itself is in trouble: the verdict is inconclusive, exit code 3."""
+
+
+def function_failed(why: object) -> str:
+    """Why a node has stopped, in one line, as the judge looks for it in what the processes printed."""
+    return FUNCTION_FAILED + " | ".join(str(why).splitlines())
 
 
 def shown(text: str) -> str:

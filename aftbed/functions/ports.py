@@ -32,9 +32,9 @@ from aftbed.core.application import (
     NONE,
     Characteristics,
     Field,
-    StateAccess,
     Width,
-    approximate,
+    WrittenAccess,
+    access_of,
 )
 from aftbed.core.errors import ConfigError, PeerError
 
@@ -89,17 +89,11 @@ class ReplyField(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max: float | None = None
 
 
-class ApproximateState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A restored state is the captured one within a tolerance."""
-
-    approximate: Annotated[float, Meta(gt=0)]
-
-
 class DeclaredCharacteristics(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """`state_access` None: as the FMU says."""
 
     deterministic: bool = True
-    state_access: Literal["exact", "none"] | ApproximateState | None = None
+    state_access: WrittenAccess | None = None
 
 
 class PortsFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -349,19 +343,12 @@ class _Binding:
 
     def _characteristics(self, has_state: bool) -> Characteristics:
         declared = self._file.characteristics
-        access: StateAccess
-        match declared.state_access:
-            case None:
-                access = EXACT if has_state else NONE
-            case "exact":
-                access = EXACT
-            case "none":
-                access = NONE
-            case ApproximateState(tolerance):
-                try:
-                    access = approximate(tolerance)
-                except ConfigError as error:
-                    raise ConfigError(f"{self._path}: characteristics.state_access: {error}") from None
+        access = EXACT if has_state else NONE
+        if declared.state_access is not None:
+            try:
+                access = access_of(declared.state_access)
+            except ConfigError as error:
+                raise ConfigError(f"{self._path}: characteristics.state_access: {error}") from None
         return Characteristics(deterministic=declared.deterministic, state_access=access)
 
     def _named(self, key: str, name: str, wanted: str, names: Sequence[str]) -> Variable:

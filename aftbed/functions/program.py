@@ -34,20 +34,19 @@ import weakref
 from binascii import unhexlify
 from collections.abc import Callable
 from functools import partial
-from typing import Final, Literal
+from typing import Final
 
 import msgspec
 from msgspec import UNSET, UnsetType
 
 from aftbed.core.application import (
-    EXACT,
-    NONE,
     REPLY_BYTES_MAX,
     STATE_BYTES_MAX,
     AccessKind,
     Application,
     Characteristics,
-    approximate,
+    WrittenAccess,
+    access_of,
 )
 from aftbed.core.errors import ConfigError, FunctionFailedError, PeerError, shown
 
@@ -74,15 +73,11 @@ class ProgramFailedError(FunctionFailedError):
     """The program broke the protocol, or ended: a fault of the replica that hosts it."""
 
 
-class ApproximateAccess(msgspec.Struct, forbid_unknown_fields=True):
-    approximate: float
-
-
 class ProgramDescription(msgspec.Struct, forbid_unknown_fields=True):
     """What a program declares of itself (`Characteristics`), and whether it answers `acceptable`."""
 
     deterministic: bool = True
-    state_access: Literal["exact", "none"] | ApproximateAccess = "exact"
+    state_access: WrittenAccess = "exact"
     acceptable: bool = False
 
 
@@ -198,17 +193,7 @@ class Program:
         described = self._ask("describe", "null")
         assert isinstance(described, ProgramDescription)
         self._asserts = described.acceptable
-        match described.state_access:
-            case "exact":
-                access = EXACT
-            case "none":
-                access = NONE
-            case ApproximateAccess(tolerance):
-                try:
-                    access = approximate(tolerance)
-                except ConfigError as error:
-                    raise self._failed(f"declares {error}") from None
-        return Characteristics(described.deterministic, access)
+        return Characteristics(described.deterministic, access_of(described.state_access))
 
     def close(self) -> None:
         """Kill the program, which cannot be asked from then on."""

@@ -471,7 +471,7 @@ def located_requests(source: str, folder: Path | None = None) -> str:
         if not place.endswith(".py"):
             return source
     path = (here / place).resolve()
-    if not path.is_file():
+    if not path.exists():  # what else is wrong with it, its reader says
         raise ConfigError(f"{source}: {path}: no such file")
     return f"{path}:{name}" if name else str(path)
 

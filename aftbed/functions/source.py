@@ -4,7 +4,7 @@ package.module:Class            a class, found as any module is
 path/file.py:Class              a class in a file
 path/lib.so                     a C library (`aft.h`)
 path/model.fmu[:ports.yaml]     a co-simulation model, with the map of its ports; `ports.yaml` beside it
-program arguments               a program on stdin and stdout, if there is a blank, or such a file
+program arguments               a program on stdin and stdout, if there is a blank or a slash, or such a file
 
 Behind the text may be a version, `@sha256:` and twelve digits: other content of the same files, for which
 a run has exchanged the function (`runtime.unix.trust`). Without one, it is what the run has loaded first.
@@ -104,13 +104,20 @@ def parse_source(text: str) -> FunctionSource:
     place, colon, name = text.rpartition(":")
     if colon and place and name.isidentifier() and (place.endswith(".py") or " " not in place):
         return FunctionSource(FunctionKind.CLASS, place, name)
-    if len(text.split()) > 1 or Path(text).is_file() or shutil.which(text):
+    if len(text.split()) > 1 or "/" in text or Path(text).is_file() or shutil.which(text):
         return FunctionSource(FunctionKind.PROGRAM, text)
     raise ConfigError(f"{text!r} names no function; {FORMS}")
 
 
 def _versioned(text: str, version: str) -> str:
     return f"{text}@sha256:{version}" if version else text
+
+
+def told_of(text: str, reason: str) -> str:
+    """`reason`, with the function that `text` names in front unless it names that itself."""
+    source = parse_source(text)
+    files = (source.place, source.part) if source.kind is FunctionKind.MODEL else (source.place,)
+    return reason if text in reason or reason.startswith(files) else f"{text}: {reason}"
 
 
 def is_foreign(text: str) -> bool:
@@ -141,7 +148,7 @@ def located(text: str, folder: Path | None = None) -> str:
             if "/" in first:
                 first = str((here / first).absolute())
             if shutil.which(first) is None:
-                raise ConfigError(f"{text}: no program {first}")
+                raise ConfigError(f"{text}: {first} is no program that can be executed; {FORMS}")
             words = [str((here / word).absolute()) if (here / word).is_file() else word for word in rest]
             return _versioned(shlex.join([first, *words]), source.version)
         case _:

@@ -140,7 +140,7 @@ class ResumedElsewhere(msgspec.Struct, frozen=True, tag=True):
 
 
 class NoFunction(msgspec.Struct, frozen=True, tag=True):
-    """The source names none: an error of the user."""
+    """The source names none that can be loaded: an error of the user."""
 
     reason: str
 
@@ -216,8 +216,8 @@ def perform(task: Task, source: str, code: Code, tell: Note) -> Answer:
             make = load_application(source, code)
             first = make()
             described = _described(source, first)
-        except ConfigError as error:
-            return NoFunction(str(error))
+        except (ConfigError, FunctionFailedError) as error:
+            return NoFunction(reason_of(error))
         match task:
             case ExecuteAll(requests):
                 return _execute(first, requests, described, call)
@@ -234,7 +234,7 @@ def perform(task: Task, source: str, code: Code, tell: Note) -> Answer:
                     tuple(_resume(make(), at, state, requests, expected, call) for at, state in states)
                 )
     except BaseException as error:  # noqa: BLE001
-        return Unanswered(_words(error), last)
+        return Unanswered(reason_of(error), last)
 
 
 def _described(source: str, function: Application) -> FunctionDescription:
@@ -387,7 +387,7 @@ def _resume(
     except PeerError as error:
         return msgspec.structs.replace(found, failed=f"refused: {error}"[:WORDS_MAX])
     except Exception as error:  # noqa: BLE001 - of a function of the user
-        line, *_ = _words(error).split("\n")
+        line, *_ = reason_of(error).split("\n")
         return msgspec.structs.replace(found, failed=f"failed: {line}")
 
 
@@ -398,8 +398,9 @@ def _reply(function: Application, request: bytes) -> bytes:
         return b""
 
 
-def _words(error: BaseException) -> str:
-    if isinstance(error, FunctionFailedError):
+def reason_of(error: BaseException) -> str:
+    """What went wrong, for an answer. A text that is fit to be shown may have the end of a stderr."""
+    if isinstance(error, ConfigError | FunctionFailedError):
         return str(error)[:LINES_MAX]
     return f"{type(error).__name__}: {error}"[:WORDS_MAX]
 

@@ -18,10 +18,13 @@ from aftbed.core.application import (
     Characteristics,
     close,
     difference,
+    fields_of,
     reply_fields_of,
 )
 from aftbed.core.errors import ConfigError, FunctionFailedError, PeerError
 from aftbed.functions.load import OWN_CODE, characteristics_of, declared_in, load_application
+from aftbed.functions.source import told_of
+from aftbed.judge.exercise import behind, differs, reason_of
 from aftbed.judge.record import RunRecord
 from aftbed.judge.reference import (
     NamedChange,
@@ -169,7 +172,7 @@ def _declared(source: str, task: Describe | TryOut, trust: Trust, limits: Proces
         case Declared() as found:
             return found
         case Failed(reason):
-            raise ConfigError(reason if source in reason else f"{source}: {reason}")
+            raise ConfigError(told_of(source, reason))
         case Replies():
             raise ConfigError(f"{source}: it answered something else")
 
@@ -199,8 +202,7 @@ def work(data: bytes) -> bytes:
     try:
         return msgspec.msgpack.encode(_done(job))
     except BaseException as error:  # noqa: BLE001
-        reason = str(error) if isinstance(error, ConfigError) else f"{type(error).__name__}: {error}"
-        return msgspec.msgpack.encode(Failed(reason[:WORDS_MAX]))
+        return msgspec.msgpack.encode(Failed(reason_of(error)))
 
 
 def _done(job: Job) -> Answer:
@@ -223,20 +225,22 @@ def _done(job: Job) -> Answer:
 def _tried(function: Application, requests: Sequence[bytes]) -> str:
     """Have it execute `requests` twice, from one state; how that differs from what it declares, or "".
 
-    Raises FunctionFailedError.
+    Raises FunctionFailedError, also where a capture changes what it captures: no mechanism can use that.
     """
     declared = function.characteristics
-    begun = _did("capture", function.capture)
-    replies = _replies(function, requests)
+    begun = _captured(function, 0)
+    replies, refused = _replies(function, requests)
+    if requests and refused == len(requests):
+        return f"it refused each of the first {refused} requests"
     for number, (request, reply) in enumerate(zip(requests, replies, strict=True), 1):
         if not _did(f"request {number}: acceptable", partial(function.acceptable, request, reply)):
             return f"its assertion does not accept its own reply to request {number}"
     if declared.state_access.kind is AccessKind.NONE:
         return ""
-    ended = _did("capture", function.capture)
+    ended = _captured(function, len(requests))
     _did("restore of what capture gave", lambda: function.restore(begun))
     restored = _did("capture", function.capture)
-    replies_again = _replies(function, requests)
+    replies_again, _ = _replies(function, requests)
     ended_again = _did("capture", function.capture)
     exact = declared.state_access.kind is AccessKind.EXACT
     if exact and restored != begun:
@@ -252,14 +256,28 @@ def _tried(function: Application, requests: Sequence[bytes]) -> str:
     return ""
 
 
-def _replies(function: Application, requests: Sequence[bytes]) -> list[bytes]:
+def _captured(function: Application, number: int) -> bytes:
+    """The state behind so many requests. Raises FunctionFailedError."""
+    state = _did("capture", function.capture)
+    if text := differs(_did("capture", function.capture), state, fields_of(function)):
+        raise FunctionFailedError(f"capture changes the state: the second one of {behind(number)}: {text}")
+    return state
+
+
+def _replies(function: Application, requests: Sequence[bytes]) -> tuple[list[bytes], int]:
+    """Empty for a request that is refused; and how many were."""
+    refused = 0
+
     def reply(request: bytes) -> bytes:
+        nonlocal refused
         try:
             return function.execute(request)
         except PeerError:
+            refused += 1
             return b""
 
-    return [_did(f"request {n}: execute", partial(reply, one)) for n, one in enumerate(requests, 1)]
+    replies = [_did(f"request {n}: execute", partial(reply, one)) for n, one in enumerate(requests, 1)]
+    return replies, refused
 
 
 def _did(what: str, act: Callable[[], T]) -> T:

@@ -26,6 +26,7 @@ import msgspec
 
 from aftbed.core.application import EXACT, NONE, AccessKind, Characteristics, StateAccess
 from aftbed.core.errors import ConfigError, HarnessError
+from aftbed.functions.source import told_of
 from aftbed.judge.exercise import (
     Answer,
     ExecuteAll,
@@ -204,7 +205,7 @@ def measure(
     def done(task: Task, surroundings: Surroundings) -> Answer:
         found = execute(task, surroundings, seconds)
         if isinstance(found, NoFunction):
-            raise ConfigError(found.reason if source in found.reason else f"{source}: {found.reason}")
+            raise ConfigError(told_of(source, found.reason))
         return found
 
     first = done(ExecuteAll(payloads), usual)
@@ -395,11 +396,6 @@ def _first_reply(replies: tuple[bytes, ...], first: Executed) -> str:
         if text := differs(reply, wanted, first.described.reply_fields):
             return of_reply(number, text)
     return ""
-
-
-def _without_replies(one: Resumed) -> Resumed:
-    """What counts of it where replies differ anyway."""
-    return Resumed(one.at, one.used, one.failed, restored_state=one.restored_state)
 
 
 def _greatest(found: Sequence[Resumed]) -> float:

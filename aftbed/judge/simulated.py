@@ -7,6 +7,7 @@ from typing import Final
 import msgspec
 
 from aftbed.core.application import Application, close
+from aftbed.core.errors import FUNCTION_FAILED
 from aftbed.core.events import Event
 from aftbed.core.script import ScriptKind
 from aftbed.ftm.compose import replication_of
@@ -20,7 +21,6 @@ from aftbed.judge.record import DriveEnd, Excuses, RunEnd, RunRecord
 from aftbed.judge.reference import reference_run, succession
 from aftbed.judge.verdict import Breach, Verdict, Word, broken, judge
 from aftbed.runtime.deployment import replica_of
-from aftbed.runtime.node import FUNCTION_FAILED
 from aftbed.runtime.sim.clock import START_NS
 from aftbed.runtime.sim.world import FUNCTION, Run
 from aftbed.runtime.unix.options import CarRun, LoadRun, RunOptions, Work

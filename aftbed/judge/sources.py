@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from aftbed.adapt.engine import DONE
-from aftbed.core.errors import ConfigError
+from aftbed.core.errors import FUNCTION_FAILED, ConfigError
 from aftbed.core.events import FIRST_FAULT, Event
 from aftbed.core.input_file import open_input
 from aftbed.core.journal import EntryKind, History, Record
@@ -31,7 +31,6 @@ from aftbed.functions.source import is_foreign
 from aftbed.inject.receipts import fault_and_bits
 from aftbed.judge.record import RunEnd, RunRecord
 from aftbed.judge.reference import ReferenceRun
-from aftbed.runtime.node import FUNCTION_FAILED
 from aftbed.runtime.unix import seal
 from aftbed.runtime.unix.devices import load_requests
 from aftbed.runtime.unix.options import LoadRun
@@ -44,7 +43,9 @@ DRAINED: Final = RECIPES[0]
 SINGLE: Final = "single"  # the placement whose only node hosts two Servers
 SERVER: Final = "/server"  # ends the name of its brick
 EFFECTS: Final = (Event.SERVER_EXIT, Event.STATE_RESTORED)
-FAILED: Final = re.compile(rf"^(?P<node>\S+) \(pid \d+\): detected stop: {FUNCTION_FAILED}(?P<why>.*)$")
+OF_A_NODE: Final = re.compile(r"^(?P<node>\S+) \(pid \d+\):")
+FAILED: Final = re.compile(rf"{OF_A_NODE.pattern} (?P<stop>detected stop: )?{FUNCTION_FAILED}(?P<why>.*)$")
+STDERR_LINES_MAX: Final = 3  # of a node that crashed
 TRACEBACK: Final = "Traceback (most recent call last):"
 
 
@@ -202,8 +203,20 @@ def function_failures(record: RunRecord) -> list[str]:
             lines = file.read(PRINTED_BYTES_MAX).decode(errors="replace").splitlines()
     except OSError:
         return []
-    found = (re.search(FAILED, line) for line in lines)
-    return [f"{one['node']}: {one['why']}" for one in found if one]
+    found = ((at, FAILED.match(line)) for at, line in enumerate(lines))
+    return [
+        f"{one['node']}: {one['why']}{_printed_before(lines[:at]) * (not one['stop'])}"
+        for at, one in found
+        if one
+    ]
+
+
+def _printed_before(lines: list[str]) -> str:
+    """What a node may have printed that crashed: the log has it before the crash, without the node's name."""
+    printed: list[str] = []
+    while len(printed) < STDERR_LINES_MAX and lines and not OF_A_NODE.match(lines[-1]):
+        printed.insert(0, lines.pop())
+    return f"; the log has before it: {' | '.join(printed)}" if printed else ""
 
 
 def _of_requests(record: RunRecord) -> Iterator[str]:

@@ -20,7 +20,7 @@ from operator import length_hint
 from typing import Final, Generic, NoReturn, Protocol, TypeVar, assert_never
 
 from aftbed.core.brick import CONTROL, Brick, Effect, Halt, Note, Order, Send
-from aftbed.core.errors import FunctionFailedError, PeerError
+from aftbed.core.errors import PeerError
 from aftbed.core.events import Event
 from aftbed.core.messages import AnyMessage, Message, Rebound, Reply, Watch
 from aftbed.inject.agent import FaultAgent
@@ -645,14 +645,6 @@ class MemoryIO(NodeIO[int, int]):
     def stop_detected(self, brick: str, reason: str) -> NoReturn:
         """Raises Stopped."""
         raise Stopped(brick, reason)
-
-
-FUNCTION_FAILED: Final = "the function failed: "  # begins why its node has stopped
-
-
-def function_failed(error: FunctionFailedError) -> str:
-    """In one line, as the judge looks for it."""
-    return FUNCTION_FAILED + " | ".join(str(error).splitlines())
 
 
 class Stopped(Exception):  # noqa: N818 - what happened, not an error

@@ -227,7 +227,7 @@ def test_a_module_that_calls_a_run_when_it_is_loaded_has_no_endless_run(
         ({"requests": None, "expect": REPLIES}, "expect: these are replies to requests: give them too"),
         ({"requests": []}, "requests: found none, at least one is required"),
         ({"requests": [7]}, "requests: found '[7]', a path or a list of bytes is allowed"),
-        ({"requests": "missing.csv"}, "missing.csv: cannot be read: No such file"),
+        ({"requests": "missing.csv"}, "missing.csv: no such file"),
         ({"requests": [bytes(70_000)]}, "a request of 70000 bytes"),
         ({"expect": REPLIES[:9]}, "9 replies, and 30 requests are sent"),
         ({"app": "missing.py:Sum"}, "missing.py: no such file"),

@@ -43,10 +43,10 @@ def test_a_function_that_is_what_it_declares_as_a_document(call: Call) -> None:
     source = f"{VARIANTS}:NonDeterministic"
     code, out, err = call("check", source, "--json")
     found = json.loads(out)
-    assert (code, err) == (0, "")
+    assert code == 0 and err.startswith("aftbed: note: in another process, the reply to request")
     assert list(found) == [
         "app", "kind", "declared", "measured", "state_bytes", "changed_bytes", "changed_pages", "execute_us",
-        "suits", "differences",
+        "suits",
     ]  # fmt: skip
     assert (found["app"], found["kind"], found["state_bytes"]) == (source, "class", 452)
     assert found["declared"] == {"deterministic": False, "state_access": "exact"}
@@ -62,7 +62,6 @@ def test_a_function_that_is_what_it_declares_as_a_document(call: Call) -> None:
     assert list(suits) == list(EXPRESSIONS)
     assert [name for name, why_not in suits.items() if not why_not] == ["none", "pbr", "assert", "pbr+assert"]
     assert suits["lfr"] == "lfr needs a deterministic function: two replicas execute every request"
-    assert "in another process, the reply to request" in found["differences"][0]
 
 
 @starts_process
@@ -146,7 +145,7 @@ def test_a_program_is_asked_for_the_brake_in_the_fixed_layout(call: Call, tmp_pa
         ((f"{VARIANTS}:Cautious", "--count", "0"), "--count 0: 1 to 100000 are allowed"),
         ((f"{VARIANTS}:Cautious", "--count", "100001"), "--count 100001: 1 to 100000 are allowed"),
         ((f"{VARIANTS}:Cautious", "--seed", "-1"), "--seed -1: 0 to"),
-        ((f"{VARIANTS}:Cautious", "--requests", "none.csv"), "none.csv: cannot be read: No such file"),
+        ((f"{VARIANTS}:Cautious", "--requests", "none.csv"), "none.csv: no such file"),
         ((f"{VARIANTS}:Cautious", "--requests", "{three}", "--count", "4"), "--count 4: 1 to 3 are allowed"),
         ((f"{VARIANTS}:Cautious", "--requests", f"{DECLARING}:none"), "declaring.py has no function none"),
         (("no.such.module:Mine",), "no.such.module:Mine cannot be read: no module no"),

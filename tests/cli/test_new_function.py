@@ -32,6 +32,14 @@ def test_a_new_project_is_listed_with_the_next_command(refused: Callable[..., st
     assert "heater: is there already" in refused("app", "new", "heater")
 
 
+@pytest.mark.parametrize(("kind", "needs"), [("class", "pytest"), ("fmu", "pytest FMPy")])
+def test_what_a_project_needs_is_installed_by_its_ci_and_told(kind: str, needs: str, here: Path) -> None:
+    """aftbed itself brings no FMPy."""
+    folder = create("heater", kind)
+    assert f'vars.AFTBED }}}}" {needs}\n' in (folder / ".github/workflows/test.yml").read_text()
+    assert f"It needs (pip): aftbed {needs}.\n" in (folder / "README.md").read_text()
+
+
 @pytest.mark.parametrize(
     "name", ["", "Heater", "../heater", "a/b", "-a", "1a", "a b", "a.b", "a" * 41, "h\u00e9ater", "a\n"]
 )

@@ -294,7 +294,11 @@ def test_a_program_that_closes_its_output_but_lives_is_a_fault(monkeypatch: pyte
         ),
         (
             '{"id":@,"describe":{"state_access":{"approximate":0}}}',
-            r"declares approximate\(0\): a tolerance is more",
+            r"Expected `float` > 0.0 - at `\$.describe.state_access.approximate`",
+        ),
+        (
+            '{"id":@,"describe":{"state_access":{"approximate":1e999}}}',
+            "Number out of range",
         ),
         ('{"id":@,"describe":{"determinstic":true}}', "unknown field `determinstic`"),
     ],

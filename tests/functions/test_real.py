@@ -1,10 +1,14 @@
 """Functions that others have written, installed by their packages: see `real/README.md`."""
 
+import importlib.util
+import json
 import shutil
 import subprocess
+from collections.abc import Callable
 from itertools import islice
 from pathlib import Path
 from types import ModuleType
+from typing import Final
 
 import pytest
 from liveruns import aftbed, home
@@ -22,6 +26,7 @@ __all__ = ["home"]
 HERE = Path(__file__).parent / "real"
 AEB, SAFETY_DRIVE = HERE / "aeb_decision.py", HERE / "safety_requests.py"
 SUITED = ("pbr", "lfr", "pbr+tr", "lfr+tr")
+CRASH: Final = ("--count", "60", "--inject", "crash primary at reply.sent nth 20")
 
 
 @pytest.fixture(scope="module")
@@ -111,9 +116,83 @@ def test_the_state_that_its_header_does_not_name_is_missed(safety: dict[str, str
     assert [breach.promise for breach in breaches] == ["G3"], breaches
 
 
-# -- real runs ------------------------------------------------------------------------------------
+# -- FMUs of gemseo-fmu ---------------------------------------------------------------------------
 
-CRASH = ("--count", "60", "--inject", "crash primary at reply.sent nth 20")
+SPRINGS: Final = ("MassSpringSubSystem1", "x2", "x1")  # FMI 2, OpenModelica 1.21; an input and an output
+DAMPER: Final = ("Mass_Damper", "f", "y")  # FMI 2, OpenModelica 1.19
+PYTHON: Final = ("FMU3Model", "input", "output")  # FMI 3, PythonFMU3 0.2
+STEPS: Final = "".join(f"{number % 7 / 4}\n" for number in range(60))
+
+
+@pytest.fixture
+def model(tmp_path: Path) -> Callable[..., tuple[str, ...]]:
+    """The options that name a model, with what its map declares beside its ports."""
+    found = importlib.util.find_spec("gemseo_fmu")  # not imported: it asks for what is not needed here
+    if found is None or found.origin is None:
+        pytest.skip("gemseo-fmu is not installed")
+    models = Path(found.origin).parent / "problems" / "fmu_files" / "linux"
+
+    def options(which: tuple[str, str, str], declared: str = "{}") -> tuple[str, ...]:
+        name, given, told = which
+        ports = [
+            f"characteristics: {declared}",
+            "step_s: 0.01",
+            f"request: [{{type: f64, variable: {given}}}]",
+            f"reply: [{{type: f64, variable: {told}}}]",
+        ]
+        (tmp_path / "ports.yaml").write_text("\n".join(ports))
+        (tmp_path / "steps.csv").write_text(f"{given}:f64\n{STEPS}")
+        app = f"{models / name}.fmu:{tmp_path / 'ports.yaml'}"
+        return (app, "--requests", str(tmp_path / "steps.csv"))
+
+    return options
+
+
+@pytest.mark.process
+@pytest.mark.parametrize(
+    ("which", "declared", "access"),
+    [
+        (SPRINGS, "{}", "none"),
+        (SPRINGS, "{state_access: exact}", "exact"),  # it serialises its state, and says that it cannot
+        (PYTHON, "{}", "none"),
+    ],
+)
+def test_the_state_access_of_a_model_is_measured(
+    model: Callable[..., tuple[str, ...]], which: tuple[str, str, str], declared: str, access: str
+) -> None:
+    done = aftbed("app", "check", *model(which, declared), "--json")
+    assert (done.code, done.err) == (0, ""), done.out + done.err
+    measured = json.loads(done.out)["measured"]
+    assert (measured["deterministic"], measured["state_access"]) == (True, access)
+
+
+@pytest.mark.process
+def test_a_model_without_the_state_access_that_its_map_declares_is_refused(
+    model: Callable[..., tuple[str, ...]],
+) -> None:
+    done = aftbed("app", "check", *model(DAMPER, "{state_access: exact}"))
+    assert done.code == 2 and "state_access: found exact, allowed is none" in done.err, done.err
+
+
+@pytest.mark.process
+@pytest.mark.parametrize(
+    ("which", "declared", "ftm"),
+    [
+        (SPRINGS, "{state_access: exact}", "pbr+tr"),
+        (SPRINGS, "{state_access: {approximate: 1.0e-6}}", "pbr"),
+        (DAMPER, "{}", "lfr"),
+        (PYTHON, "{}", "lfr"),
+    ],
+)
+def test_a_model_survives_a_crash_in_a_real_run(
+    model: Callable[..., tuple[str, ...]], which: tuple[str, str, str], declared: str, ftm: str
+) -> None:
+    done = aftbed("run", "--ftm", ftm, "--app", *model(which, declared), *CRASH)
+    assert done.code == 0 and "60 sent, 60 answered, 0 lost" in done.out, done.out + done.err
+    assert "failover   to epoch 2" in done.out and "0 wrong" in done.out
+
+
+# -- real runs ------------------------------------------------------------------------------------
 
 
 @pytest.mark.process

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from aftbed.core.errors import ConfigError
-from aftbed.functions.source import FunctionKind, located, parse_source, renamed
+from aftbed.functions.source import FunctionKind, located, parse_source, renamed, told_of
 
 
 @pytest.mark.parametrize(
@@ -52,7 +52,7 @@ def test_a_function_is_read_from_other_files(tmp_path: Path) -> None:
     assert (model.place, model.part) == (f"{tmp_path}/m.fmu", "/kept/ports.yaml")
 
 
-@pytest.mark.parametrize("text", ["", "  ", "mine", ":Class", "module:", "module:no-name", "no/such/file"])
+@pytest.mark.parametrize("text", ["", "  ", "mine", ":Class", "module:", "module:no-name"])
 def test_what_names_no_function(text: str) -> None:
     with pytest.raises(ConfigError, match=r"names no function; MODULE:CLASS, FILE\.py:CLASS, FILE\.so, "):
         parse_source(text)
@@ -80,15 +80,33 @@ def test_paths_are_made_absolute(tmp_path: Path) -> None:
         ("none.so", "none.so: no such file"),
         ("none.fmu", "none.fmu: no such file"),
         ("brake.fmu", "ports.yaml: no such file"),
-        ("./none --fast", "no program "),
-        ("no-such-program --fast", "no program no-such-program"),
+        ("./none --fast", "none is no program that can be executed; MODULE:CLASS"),
+        ("no-such-program --fast", "no-such-program is no program that can be executed"),
+        ("./brake.c", "brake.c is no program that can be executed"),
+        ("no/such/file", "no/such/file is no program that can be executed"),
         ("sh 'open", "no closing quotation"),
     ],
 )
 def test_what_is_missing_is_named(tmp_path: Path, text: str, missing: str) -> None:
     (tmp_path / "brake.fmu").touch()
+    (tmp_path / "brake.c").touch()
     with pytest.raises(ConfigError, match=missing):
         located(text, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "reason", "told"),
+    [
+        ("/a/b.so", "/a/b.so: lacks aft_init", "/a/b.so: lacks aft_init"),
+        ("/a/b.so", "not today", "/a/b.so: not today"),
+        ("/a/b.py:Brake", "Brake: not today", "/a/b.py:Brake: Brake: not today"),
+        ("/a/b.fmu:/a/p.yaml", "/a/p.yaml: step_s: found -1", "/a/p.yaml: step_s: found -1"),
+        ("/a/b.fmu:/a/p.yaml", "/a/b.fmu: no FMU", "/a/b.fmu: no FMU"),
+        ("/a/b.fmu:/a/p.yaml", "not today", "/a/b.fmu:/a/p.yaml: not today"),
+    ],
+)
+def test_a_reason_names_its_function_once(text: str, reason: str, told: str) -> None:
+    assert told_of(text, reason) == told
 
 
 @pytest.mark.parametrize(

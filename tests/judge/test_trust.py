@@ -525,6 +525,7 @@ def test_a_function_that_fails_its_first_requests_is_told(tmp_path: Path, body: 
     [
         ("pass", ("", ""), ""),
         ("if request == b'd': raise PeerError('no')", ("", ""), ""),
+        ("raise PeerError('no')", ("", ""), "it refused each of the first 4 requests"),
         ("pass", ("int(state)", "int(state) + 1"), "restore does not give the state back that capture gave"),
         (
             "self.count += self.calls == 7",
@@ -544,6 +545,20 @@ def test_a_function_that_is_not_as_it_declares_is_told(
 ) -> None:
     found = trial(tmp_path, body, change)
     assert told in found and bool(told) == bool(found), found
+
+
+@starts_process
+@pytest.mark.parametrize(
+    ("counted", "told"),
+    [
+        ("self.count += 1", "the second one of the initial state: byte 0 is 0x32 instead of 0x31"),
+        ("self.count += bool(self.calls)", "of the state behind request 4: byte 0 is 0x36 instead of"),
+    ],
+)
+def test_a_capture_that_changes_the_state_is_told(tmp_path: Path, counted: str, told: str) -> None:
+    change = ("    def capture(self):\n", f"    def capture(self):\n        {counted}\n")
+    with pytest.raises(trust.ConfigError, match=f"mine.py:Mine: capture changes the state: .*{told}"):
+        trial(tmp_path, "pass", change)
 
 
 @starts_process

@@ -290,6 +290,27 @@ def test_an_error_that_a_flipped_bit_explains_is_no_trouble(path: Path) -> None:
     assert record.verdict().verdict == "pass"
 
 
+def test_a_function_that_failed_is_told_with_what_a_crash_left_on_stderr(path: Path) -> None:
+    record = whole(path)
+    log = (
+        "a warning of another one",
+        "b/server (pid 12): detected stop: the function failed: lib.so: aft_execute returned -1",
+        "too old",
+        "no gains",
+        "gain 3: NaN",
+        "assertion failed",
+        "a/server (pid 13): the function failed: its process was killed by SIGABRT",
+    )
+    (path / "processes.log").write_text("\n".join(log) + "\n")
+    verdict = record.verdict()
+    assert verdict.function_failures == [
+        "b/server: lib.so: aft_execute returned -1",
+        "a/server: its process was killed by SIGABRT;"
+        " the log has before it: no gains | gain 3: NaN | assertion failed",
+    ]
+    assert verdict.verdict == "pass", "it was failed over"
+
+
 # -- value faults
 
 

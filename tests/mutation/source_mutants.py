@@ -492,6 +492,26 @@ MUTANTS: Final = (
         UNIT,
         ("tests/runtime/test_tasks.py",),
     ),
+    SourceMutant(
+        "a capture that changes the state is not refused before a run",
+        "G3",
+        f"{JUDGE}/isolated.py",
+        "    begun = _captured(function, 0)\n",
+        '    begun = _did("capture", function.capture)\n',
+        UNIT,
+        ("tests/judge/test_trust.py",),
+    ),
+    SourceMutant(
+        "a function whose process crashes is not told",
+        "G8",
+        f"{UNIX}/process_pool.py",
+        "any(kind == SERVER for _, kind in process.bricks)",
+        "not process.bricks",
+        PROCESS,
+        (
+            "tests/process/test_own_functions.py::test_a_function_that_fails_by_itself_is_failed_over_and_told",
+        ),
+    ),
 )
 
 

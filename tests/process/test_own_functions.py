@@ -24,6 +24,7 @@ __all__ = ["home"]
 LIBRARY: Final = """
 #include <fcntl.h>
 #include <signal.h>
+#include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 #include "aft.h"
@@ -38,7 +39,10 @@ int aft_execute(void *instance, const uint8_t *request, size_t request_size, uin
     const char *once = getenv("FAIL_ONCE"), *how = getenv("FAIL");
     for (size_t i = 0; i < request_size; i++) state->sum = state->sum * 31 + request[i];
     if (++state->count == 40 && once && open(once, O_CREAT | O_EXCL, 0600) >= 0) {
-        if (*how == 'c') raise(SIGSEGV);
+        if (*how == 'c') {
+            fprintf(stderr, "no gains\\n");
+            raise(SIGSEGV);
+        }
         while (*how == 'h') ;
         *reply_size = 1 << 20;
         return AFT_OK;
@@ -150,7 +154,7 @@ def test_a_crash_loses_nothing(kind: str, ftm: str, event: str, request: pytest.
     every(
         2,
         [
-            ("library", "crash", "] alarm: a: crash"),
+            ("library", "crash", ": its process was killed by SIGSEGV; the log has before it: no gains"),
             ("library", "too much", ": aft_execute: *reply_size is 1048576, at most 61440 is allowed"),
             ("library", "hang", "] alarm: a: hang"),
             ("program", "too much", ": answered to execute: more than 126976 bytes in a line"),
@@ -198,10 +202,25 @@ def test_a_program_that_is_killed_is_failed_over_and_told(program: str) -> None:
     assert programs(program) == []
 
 
-def test_a_function_that_cannot_begin_is_refused_before_the_start(tmp_path: Path) -> None:
-    (tmp_path / "silent.py").write_text("import sys\nsys.exit('not today')\n")
-    done = aftbed("run", "--app", f"{sys.executable} {tmp_path}/silent.py", "--load", "10")
-    assert done.code == 2 and "not today" in done.err and "exit code 1" in done.err, done.err
+SILENT: Final = """
+import sys
+sys.exit("it began\\n" + "x" * 1000 + "\\nnot today")
+"""
+
+
+@pytest.mark.parametrize("words", [("run", "--load", "10"), ("sim", "--count", "10"), ("app", "check")])
+def test_a_program_that_cannot_begin_is_refused_with_all_that_it_told(
+    words: tuple[str, ...], tmp_path: Path
+) -> None:
+    """Before anything starts."""
+    (tmp_path / "silent.py").write_text(SILENT)
+    app = f"{sys.executable} {tmp_path}/silent.py"
+    named = (app,) if words == ("app", "check") else ("--app", app)
+    done = aftbed(*words, *named)
+    lines = done.err.splitlines()
+    assert (done.code, done.out, len(lines)) == (2, "", 5), done.err
+    assert lines[0] == f"aftbed: error: {app}: ended with exit code 1, asked to describe"
+    assert (lines[2], lines[-1]) == ("it began", "not today")
 
 
 @pytest.mark.deep

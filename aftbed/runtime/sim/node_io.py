@@ -17,7 +17,7 @@ from operator import attrgetter
 from typing import Final, NamedTuple, NoReturn
 
 from aftbed.core.brick import Effect, Send
-from aftbed.core.errors import FunctionFailedError
+from aftbed.core.errors import FunctionFailedError, function_failed
 from aftbed.core.events import Event
 from aftbed.core.graph import Link
 from aftbed.core.journal import Record
@@ -25,7 +25,7 @@ from aftbed.core.messages import ChannelEnded, Message
 from aftbed.inject.shared_state import SHARED_BYTES
 from aftbed.runtime import control
 from aftbed.runtime.devices import LOOK_NS
-from aftbed.runtime.node import HostedBrick, Node, NodeIO, Recorder, function_failed
+from aftbed.runtime.node import HostedBrick, Node, NodeIO, Recorder
 from aftbed.runtime.sim.clock import HOP_QUANTILES_NS, Clock
 
 IDLE_BEFORE_COLD_NS: Final = 20_000_000  # a reader that was idle for so long has lost its caches

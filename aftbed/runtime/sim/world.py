@@ -14,7 +14,7 @@ from typing import Final, NoReturn
 import msgspec
 
 from aftbed.core.application import Application
-from aftbed.core.errors import ConfigError, FunctionFailedError, PeerError
+from aftbed.core.errors import FUNCTION_FAILED, ConfigError, FunctionFailedError, PeerError
 from aftbed.core.events import Event
 from aftbed.core.graph import Graph, Link
 from aftbed.core.journal import Entry, EntryKind, History, Record
@@ -37,7 +37,6 @@ from aftbed.runtime.assembly import Assembler, MakeSetting
 from aftbed.runtime.deployment import Hosted, Keys, digest
 from aftbed.runtime.devices import CarDevice, CarLink, Device, Load, Sensor, resume_client
 from aftbed.runtime.interface import DRAW_BITS, Met, ProcessKind
-from aftbed.runtime.node import FUNCTION_FAILED
 from aftbed.runtime.run_controller import RunController, ScriptRun
 from aftbed.runtime.sim.clock import START_NS, Clock
 from aftbed.runtime.sim.node_io import SimChannel, SimIO, SimNode, SimulatedMemory

@@ -39,13 +39,13 @@ from typing import Final, NoReturn
 
 from aftbed.core import messages
 from aftbed.core.brick import Note, Send
-from aftbed.core.errors import FunctionFailedError, PeerError
+from aftbed.core.errors import FunctionFailedError, PeerError, function_failed
 from aftbed.core.events import Event
 from aftbed.core.journal import ACTIVITY_OFFSET, FLAG_OFFSET, RECORD
 from aftbed.core.messages import ChannelEnded, Message
 from aftbed.inject.slow import SLOW_MS_MAX
 from aftbed.runtime import control
-from aftbed.runtime.node import HostedBrick, Node, NodeIO, Recorder, function_failed
+from aftbed.runtime.node import HostedBrick, Node, NodeIO, Recorder
 from aftbed.runtime.unix import transport
 from aftbed.runtime.unix.death_notice import Lifeline
 from aftbed.runtime.unix.journal_files import JournalFile

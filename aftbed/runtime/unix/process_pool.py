@@ -7,6 +7,7 @@ import contextlib
 import os
 import signal
 import socket
+import sys
 from collections import deque
 from collections.abc import Callable, Generator
 from pathlib import Path
@@ -14,7 +15,7 @@ from typing import Final
 
 import msgspec
 
-from aftbed.core.errors import HarnessError, StepFailed
+from aftbed.core.errors import HarnessError, StepFailed, function_failed
 from aftbed.runtime import control, interface
 from aftbed.runtime.interface import ProcessKind
 from aftbed.runtime.tasks import Key, Wait
@@ -29,6 +30,8 @@ SPARE_SECONDS_MAX: Final = 5.0  # a zygote imports first
 DEMAND: Final = 3  # spares that are forked where one is waited for: the next ones are wanted soon
 PARK_BATCH: Final = 8  # spares per order: the first of them start while the next are forked
 WATCHING_KINDS: Final = ("watchdog", "recovery")
+SERVER: Final = "server"  # the kind of brick that hosts the function
+CRASHES: Final = (signal.SIGSEGV, signal.SIGABRT, signal.SIGILL, signal.SIGFPE)
 
 Started = tuple[int, socket.socket]  # a zygote's pid, and our end of its control line
 
@@ -300,9 +303,12 @@ def reap(process: UnixProcess) -> bool:
     """Reap a child if it is dead; False if it is not, or not ours.
 
     Raises HarnessError if its journal found no room: that is a file mapped into memory, so the kernel sends
-    SIGBUS.
+    SIGBUS. The log has the crash of a process that hosts the function, which may be a library.
     """
     code = linux.reap(process.pid)
+    if code is not None and -code in CRASHES and any(kind == SERVER for _, kind in process.bricks):
+        why = f"its process {killed_by(-code, Path(process.journal).parent)}"
+        print(f"{process.name} (pid {process.pid}): {function_failed(why)}", file=sys.stderr, flush=True)
     if code == -signal.SIGBUS and process.journal:
         raise HarnessError(f"{process.name} {killed_by(-code, Path(process.journal).parent)}")
     return code is not None
