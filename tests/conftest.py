@@ -16,6 +16,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 ID_MAX: Final = 60  # characters of a parameter in the name of its test: some are megabytes
+GC_THRESHOLD: Final = 20_000  # new objects; tests make few cycles, and 700 make the collector 4 % of all tests
 _SLOW_IS_FINE = (HealthCheck.too_slow,)
 
 settings.register_profile(
@@ -50,6 +51,7 @@ def pytest_collection_finish() -> None:
     """What is collected lives to the end: the garbage collector need not go over thousands of tests again."""
     gc.collect()
     gc.freeze()
+    gc.set_threshold(GC_THRESHOLD)
 
 
 @pytest.fixture(scope="session", autouse=True)

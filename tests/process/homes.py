@@ -37,6 +37,10 @@ def until(look: Callable[[], Found], what: str, seconds: float = WAIT_SECONDS_MA
     return found
 
 
+def _pids() -> set[int]:
+    return {int(name) for name in os.listdir("/proc") if name.isdigit()}  # noqa: PTH208 - five times faster
+
+
 def _shared_memory() -> set[Path]:
     """What there is but semaphores: a run has none, and no mapping says whose one is (glibc renames it)."""
     return {path for path in SHARED_MEMORY.iterdir() if not path.name.startswith("sem.")}
@@ -48,17 +52,22 @@ class Home:
     def __init__(self) -> None:
         self.path = Path(tempfile.mkdtemp(prefix="aft-", dir="/tmp"))
         self._mark = f"XDG_RUNTIME_DIR={self.path}".encode()
+        self._before = _pids()
         self._shared = _shared_memory()
         self.forks: list[int] = []
 
     def processes(self) -> list[int]:
-        """The pids of what runs in this home, this process aside."""
-        found = [int(p.name) for p in Path("/proc").iterdir() if p.name.isdigit() and self._is_ours(p)]
-        return [pid for pid in found if pid != os.getpid()]
+        """The pids of what runs in this home, this process aside.
 
-    def _is_ours(self, process: Path) -> bool:
+        What ran before the home was made is not looked at: a machine has hundreds of processes. Its pid is
+        not given to another one during a test: Linux gives all others first.
+        """
+        return [pid for pid in _pids() - self._before if self._is_ours(pid)]
+
+    def _is_ours(self, pid: int) -> bool:
+        process = Path(f"/proc/{pid}")
         try:
-            if int(process.name) in self.forks:
+            if pid in self.forks:
                 return (process / "stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
             environment = (process / "environ").read_bytes().split(b"\0")
             if f"XDG_RUNTIME_DIR={FORKED}".encode() in environment:
