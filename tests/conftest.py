@@ -16,7 +16,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 ID_MAX: Final = 60  # characters of a parameter in the name of its test: some are megabytes
-GC_THRESHOLD: Final = 20_000  # new objects; tests make few cycles, and 700 make the collector 4 % of all tests
+GC_THRESHOLD: Final = 20_000  # new objects; tests make few cycles, and with 700 the collector takes 4 %
 _SLOW_IS_FINE = (HealthCheck.too_slow,)
 
 settings.register_profile(
