@@ -37,7 +37,7 @@ from aftbed.core.script import (
 )
 from aftbed.ftm.declaration import BrickKind, Emits
 
-HANG_DEADLINE_NS: Final = 60_000_000
+HANG_DEADLINE_NS: Final = 50_000_000
 LATE_NS_MAX: Final = 10_000_000
 _OPEN: Final = ("sense",)
 

@@ -13,7 +13,7 @@
  * all other calls. A library with one global state sets `*instance` to the address of that state, or to NULL, and
  * can then have one instance at a time; a second one is refused.
  *
- * Calls come from one thread, one after another, each within 60 ms: a replica that answers later is taken for one
+ * Calls come from one thread, one after another, each within 50 ms: a replica that answers later is taken for one
  * that hangs. A crash (SIGSEGV, abort) ends the process that hosts the replica, and the other replica goes on.
  *
  * Memory. Pointers are valid until the call returns. Buffers have no alignment and do not overlap. At most the given

@@ -21,7 +21,7 @@ from aftbed.runtime import control
 
 _SENT, _ANSWERED = EntryKind.SENT, EntryKind.ANSWERED
 CATCH_UP: Final = 10  # periods: a load that was held up makes good for no more
-LOOK_NS: Final = 20_000_000  # between two looks of a Watchdog at its replica: a third of its deadline
+LOOK_NS: Final = 10_000_000  # between two looks of a Watchdog at its replica: a fifth of its deadline
 LOOK_IDLE_NS: Final = 40_000_000  # while the replica has nothing to do
 
 

@@ -121,7 +121,7 @@ def experiment(ftm: str, *faults: str, **more: object) -> Experiment:
         ("pbr", "crash primary at server.exit nth 9", "tolerated"),
         ("pbr", "crash backup at state.restored nth 9", "tolerated"),
         ("pbr", "crash proxy at reply.sent nth 9", "masked"),
-        ("pbr", "hang primary at server.exit nth 13", "tolerated"),
+        ("pbr", "hang primary at server.exit nth 9", "tolerated"),
         ("none", "crash primary at server.exit nth 9", "unavailable"),
         ("none", "bitflip result bit 60 at server.exit nth 9", "sdc"),
         ("pbr", "bitflip result bit 60 at server.exit nth 9", "sdc"),

@@ -21,6 +21,7 @@ import pytest
 from aftbed.core.brick import Brick, Effect
 from aftbed.core.messages import AnyMessage, Rebound, Request, encode
 from aftbed.runtime import control
+from aftbed.runtime.devices import LOOK_NS
 from aftbed.runtime.node import Node
 from aftbed.runtime.unix.devices import ProcessSenses
 from aftbed.runtime.unix.journal_files import JournalFile
@@ -30,7 +31,6 @@ from aftbed.runtime.unix.node_io import UnixIO
 from aftbed.runtime.unix.transport import ORDER_SECONDS, Line, decode_order
 
 SECONDS_MAX: Final = 20.0
-LOOK_NS: Final = 20_000_000
 LOOKS: Final = 4
 LOOP, BLOCK, PASS = b"loop", b"block", b"pass"
 
@@ -164,6 +164,8 @@ def test_a_stopped_node_is_seen_alive_when_it_goes_on(tmp_path: Path) -> None:
         assert all(looks(node))
         os.kill(node.pid, signal.SIGSTOP)
         wait_for(lambda: state_of(node.pid) == "T")
+        now_ns = time.monotonic_ns()
+        assert node.liveness.seen_ns(now_ns) == now_ns - LOOK_NS, "the last look was longer ago"
         assert not any(looks(node))
         os.kill(node.pid, signal.SIGCONT)
         wait_for(lambda: all(looks(node)))

@@ -13,13 +13,15 @@ not changed:
 | the same           | `R`, `D`                | hangs: it loops; or starves, see `Starvation`           |
 | the same           | `T`, stopped; `Z`, dead | hangs                                                   |
 
-It is counted as hanging from the last look that saw it alive, up to one period before it began to.
+It hangs from the last look that saw it alive, but at most `LOOK_NS` before the first one that did not: a
+watcher that looks less often notices a hang later, and not a shorter one.
 """
 
 import os
 from pathlib import Path
 from typing import Final
 
+from aftbed.runtime.devices import LOOK_NS
 from aftbed.runtime.unix.death_notice import FUTEX_OWNER_DIED
 from aftbed.runtime.unix.journal_files import JournalHeader
 
@@ -106,6 +108,7 @@ class Liveness:
         self.header = JournalHeader(journal)
         self._starvation = Starvation(pid)
         self._activity, self._seen_ns = -1, 0
+        self._seen = False  # the last look saw it alive
         self.idle = False  # as the last look found it: it waits, and has done nothing since the one before
 
     def seen_ns(self, now_ns: int) -> int:
@@ -120,11 +123,14 @@ class Liveness:
             return self._alive(now_ns)
         if self._starvation.starves(now_ns, state):
             self._seen_ns = now_ns
+        elif self._seen:
+            self._seen_ns = max(self._seen_ns, now_ns - LOOK_NS)
+        self._seen = False
         return self._seen_ns
 
     def _alive(self, now_ns: int) -> int:
         self._starvation.forget()
-        self._seen_ns = now_ns
+        self._seen_ns, self._seen = now_ns, True
         return now_ns
 
     def dying(self) -> bool:
