@@ -21,9 +21,9 @@ from aftbed.inject.model import Fault, FaultReport, parse
 from aftbed.inject.receipts import fault_and_bits
 from aftbed.inject.targets import PRIMARY
 from aftbed.judge import sources
+from aftbed.judge.bare_server import ReferenceRun
 from aftbed.judge.exercise import differs
 from aftbed.judge.record import Excuses, RunRecord
-from aftbed.judge.reference import ReferenceRun
 from aftbed.runtime.deployment import Hosted, replica_of
 from aftbed.runtime.unix.options import COMMAND_GONE, CarRun, ReplayRun, Work
 from aftbed.vehicle.aeb.messages import AebOutput, decode_reply

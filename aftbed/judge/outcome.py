@@ -15,6 +15,7 @@ from aftbed.core.journal import EntryKind
 from aftbed.ftm.compose import replication_of
 from aftbed.judge import checks
 from aftbed.judge.checks import Evidence, corruptions
+from aftbed.runtime.deployment import digest
 
 OUTCOMES: Final = (  # from the best to the worst
     "masked",
@@ -83,7 +84,7 @@ def outcome_of(evidence: Evidence) -> tuple[str, tuple[str, ...]]:
         states
         and reference.deterministic
         and not (wrong or reference.unknown)
-        and states != {reference.digest}
+        and states != {digest(reference.state)}
     ):
         found["latent"] = "the state of the replicas is not the bare server's"
     word = worst(list(found))

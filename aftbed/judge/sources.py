@@ -29,8 +29,9 @@ from aftbed.core.script import RECIPES
 from aftbed.ftm.compose import build
 from aftbed.functions.source import is_foreign
 from aftbed.inject.receipts import fault_and_bits
+from aftbed.judge.bare_server import ReferenceRun
 from aftbed.judge.record import RunEnd, RunRecord
-from aftbed.judge.reference import ReferenceRun
+from aftbed.runtime.deployment import digest
 from aftbed.runtime.unix import seal
 from aftbed.runtime.unix.devices import load_requests
 from aftbed.runtime.unix.options import LoadRun
@@ -65,7 +66,7 @@ def contradictions(record: RunRecord, reference: ReferenceRun) -> Iterator[str]:
             yield from (
                 f"the state of {replica} at the end is not the bare server's"
                 for replica, state in end.states.items()
-                if state != reference.digest
+                if state != digest(reference.state)
             )
 
 

@@ -9,12 +9,13 @@ import pytest
 from aftbed.campaign.experiment import Experiment, carry_out
 from aftbed.core.events import Event
 from aftbed.core.journal import Entry, EntryKind, History, Record
+from aftbed.judge.bare_server import ReplyRule
 from aftbed.judge.checks import LATE_NS, Evidence
 from aftbed.judge.outcome import OUTCOMES, outcome_of, worst
-from aftbed.judge.reference import ReplyRule, reference_run
+from aftbed.judge.reference import reference_run
 from aftbed.judge.simulated import record_of
 from aftbed.judge.verdict import evidence_of
-from aftbed.runtime.deployment import Hosted
+from aftbed.runtime.deployment import Hosted, digest
 from aftbed.runtime.sim.world import Run, Setup, simulate
 from aftbed.vehicle.aeb.function import default_application
 
@@ -106,7 +107,7 @@ def test_the_worst_wins() -> None:
 
 def test_the_bare_server_ends_in_the_state_of_both_replicas() -> None:
     reference = reference_run(CLEAN.history, default_application())
-    assert {reference.digest} == set(CLEAN.rest.states.values())
+    assert {digest(reference.state)} == set(CLEAN.rest.states.values())
     assert set(CLEAN.rest.states) == {"a", "b"}
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from aftbed.core.application import EXACT, Application, Characteristics, Field, StateAccess, approximate
 from aftbed.core.errors import FunctionFailedError
-from aftbed.judge.reference import Change, ReferenceRun, Succession, executed
+from aftbed.judge.bare_server import Change, ReferenceRun, Succession, executed
 
 REQUESTS: Final = [(number, b"request") for number in range(1, 7)]
 NUMBER: Final = (Field("sum", "f64", 0),)

@@ -331,7 +331,7 @@ def test_versions_of_the_package_are_executed_too(tmp_path: Path) -> None:
     """Those of the package need no trust. A name in it that is no function is a reason, not a traceback."""
     record = record_naming(tmp_path / "record", "aftbed.vehicle.aeb.variants:WithoutStateAccess")
     assert reference_of(record).unknown == ""
-    for source in ("aftbed.judge.reference:Succession", "aftbed.__main__:main", "aftbed.nothing:Mine"):
+    for source in ("aftbed.judge.bare_server:Succession", "aftbed.__main__:main", "aftbed.nothing:Mine"):
         found = reference_of(record_naming(tmp_path / source, source))
         assert source in found.unknown and "cannot be executed again" in found.unknown
 

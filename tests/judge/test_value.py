@@ -11,6 +11,7 @@ from aftbed.core.journal import Entry, EntryKind, History
 from aftbed.inject.grammar import with_flipped
 from aftbed.inject.model import FaultReport
 from aftbed.inject.receipts import ReceiptState
+from aftbed.judge.bare_server import ReferenceRun, ReplyRule
 from aftbed.judge.checks import (
     REASONS_MAX,
     Check,
@@ -20,7 +21,7 @@ from aftbed.judge.checks import (
     wrong_replies,
 )
 from aftbed.judge.record import RunRecord
-from aftbed.judge.reference import ReferenceRun, ReplyRule, reference_run
+from aftbed.judge.reference import reference_run
 from aftbed.runtime.unix.options import LoadRun, RunOptions
 from aftbed.vehicle.aeb.function import default_application, sample_requests
 from aftbed.vehicle.aeb.messages import AebOutput, encode_reply

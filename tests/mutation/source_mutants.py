@@ -495,7 +495,7 @@ MUTANTS: Final = (
     SourceMutant(
         "a capture that changes the state is not refused before a run",
         "G3",
-        f"{JUDGE}/isolated.py",
+        f"{JUDGE}/execution.py",
         "    begun = _captured(function, 0)\n",
         '    begun = _did("capture", function.capture)\n',
         UNIT,

@@ -1,4 +1,4 @@
-"""What the zygotes import, and so every node: each module is memory of all processes of a run."""
+"""What processes import: zygotes, whose modules are memory of all nodes, and the process of a function."""
 
 import subprocess
 import sys
@@ -28,3 +28,13 @@ def test_a_zygote_imports_what_its_processes_need(zygote: str, too: set[str]) ->
     assert not modules & (NOT_IN_A_NODE | too)
     assert not rooms & {"cli", "bench", "report", "interop", "campaign", "search", "judge", "api"}
     assert ("cantools" in modules) == (zygote == "zygote.bus")
+
+
+def test_the_process_of_a_function_imports_what_executes_it() -> None:
+    """Without the reader of records, and the runtime with it, it starts in half the time."""
+    code = "import sys, aftbed.judge.execution; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, check=True)
+    modules = set(done.stdout.split())
+    runtime = {name for name in modules if name.startswith("aftbed.runtime.unix.")}
+    assert runtime == {f"aftbed.runtime.unix.{name}" for name in ("confined", "linux", "trust")}
+    assert "aftbed.judge.record" not in modules and not any("aftbed.inject" in name for name in modules)
