@@ -111,8 +111,8 @@ def carried_out(experiment: Experiment) -> Result:
     return msgspec.json.decode(done.stdout, type=Result)
 
 
-@pytest.mark.parametrize(("function", "outcome"), [("Counter", "tolerated"), ("Hidden", "sdc")])
-def test_app_check_finds_hidden_state_on_real_processes(tmp_path: Path, function: str, outcome: str) -> None:
+@pytest.mark.parametrize(("function", "hides"), [("Counter", False), ("Hidden", True)])
+def test_app_check_finds_hidden_state_on_real_processes(tmp_path: Path, function: str, hides: bool) -> None:
     (tmp_path / "maker.py").write_text(MAKER)
     spec = read_spec("app-check")
     system = replace(
@@ -122,7 +122,10 @@ def test_app_check_finds_hidden_state_on_real_processes(tmp_path: Path, function
     experiment = next(e for e in found.experiments() if e.stratum == "pbr · steady · crash primary")
     assert experiment.runtime == "unix"
     result = carried_out(experiment)
-    assert (result.outcome, result.unexpected) == (outcome, outcome == "sdc"), result.reasons
+    # On a busy machine the crash of the exact one is inconclusive: a late reply is the machine's then.
+    assert (result.outcome == "sdc", result.unexpected, result.activated) == (hides, hides, True), (
+        result.reasons
+    )
     assert result.requests is not None and result.requests.sent == experiment.requests
 
 
