@@ -308,10 +308,10 @@ class Sensor(Device):
             return NodeDied(self._died.popleft())
         if now_ns < self._next_ns or not self._nodes or self._alarmed:
             return None
-        late_ns = now_ns - (self._next_ns or now_ns)
+        planned_ns = self._next_ns or now_ns
         seen_ns, busy = self._senses.look(now_ns)
-        self._next_ns = now_ns + (LOOK_NS if busy else LOOK_IDLE_NS)
-        return SeenAlive(seen_ns, late_ns)
+        self._next_ns = max(planned_ns, now_ns - LOOK_NS) + (LOOK_NS if busy else LOOK_IDLE_NS)
+        return SeenAlive(seen_ns, now_ns - planned_ns)
 
     def quiet(self) -> None:
         self._senses.forget()

@@ -171,6 +171,17 @@ def test_a_stopped_node_is_seen_alive_when_it_goes_on(tmp_path: Path) -> None:
         wait_for(lambda: all(looks(node)))
 
 
+def test_a_stop_is_noticed_by_the_next_look_whatever_the_node_did_before(tmp_path: Path) -> None:
+    with node_process(tmp_path) as node:
+        assert all(looks(node))
+        node.ask(PASS)
+        node.asleep()
+        os.kill(node.pid, signal.SIGSTOP)
+        wait_for(lambda: state_of(node.pid) == "T")
+        now_ns = time.monotonic_ns()
+        assert node.liveness.seen_ns(now_ns) < now_ns
+
+
 def test_a_node_that_works_is_seen_alive_whenever_one_looks(tmp_path: Path) -> None:
     """A look finds it in a brick as often as not: the activity is another one then."""
     with node_process(tmp_path) as node:

@@ -2,16 +2,15 @@
 
 A node that has nothing to do does not have to show that it lives, so it sleeps. Its host writes one byte into
 the header of its journal, the *activity*: even while the host waits for mail or orders, odd while it executes
-bricks, and another value each time (`UnixIO`). A watcher looks at that byte, and asks the kernel where it has
-not changed:
+bricks, and another value each time (`UnixIO`). A watcher looks at that byte, and asks the kernel:
 
 | activity           | state (proc(5))         | the node                                                |
 |--------------------|-------------------------|---------------------------------------------------------|
-| has changed        | any                     | is alive                                                |
+| has changed        | `S`, `R`, `D`           | is alive                                                |
 | the same, waits    | `S`, asleep             | is alive                                                |
 | the same, executes | `S`                     | hangs: blocked in a brick; or starves, see `Starvation` |
 | the same           | `R`, `D`                | hangs: it loops; or starves, see `Starvation`           |
-| the same           | `T`, stopped; `Z`, dead | hangs                                                   |
+| any                | `T`, stopped; `Z`, dead | hangs                                                   |
 
 It hangs from the last look that saw it alive, but at most `LOOK_NS` before the first one that did not: a
 watcher that looks less often notices a hang later, and not a shorter one.
@@ -26,6 +25,7 @@ from aftbed.runtime.unix.death_notice import FUTEX_OWNER_DIED
 from aftbed.runtime.unix.journal_files import JournalHeader
 
 EXCUSED_NS_MAX: Final = 2_000_000_000  # as long as any step of the runtime may take
+RUNNING: Final = ("S", "R", "D")  # neither stopped nor dead
 _STATE_BYTES: Final = 128  # of /proc/PID/stat: the pid, a name of at most 16 bytes, the state
 
 
@@ -113,13 +113,10 @@ class Liveness:
 
     def seen_ns(self, now_ns: int) -> int:
         """Look: when the node was last seen alive. Now, if the machine does not let it run; see the table."""
-        activity = self.header.activity()
-        if activity != self._activity:
-            self._activity, self.idle = activity, False
-            return self._alive(now_ns)
-        state = self._starvation.state()
-        self.idle = state == "S" and not activity & 1
-        if self.idle:
+        before, self._activity = self._activity, self.header.activity()
+        state, waits = self._starvation.state(), not self._activity & 1
+        self.idle = state == "S" and waits and self._activity == before
+        if self.idle or (self._activity != before and state in RUNNING):
             return self._alive(now_ns)
         if self._starvation.starves(now_ns, state):
             self._seen_ns = now_ns
