@@ -89,7 +89,7 @@ def work(data: bytes) -> bytes:
     sys.dont_write_bytecode = True
     try:
         return msgspec.msgpack.encode(_done(job))
-    except BaseException as error:  # noqa: BLE001
+    except BaseException as error:  # noqa: BLE001 - the failure is the answer
         return msgspec.msgpack.encode(Failed(reason_of(error)))
 
 

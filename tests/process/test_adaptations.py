@@ -42,7 +42,7 @@ def trail(mechanisms: tuple[str, ...]) -> list[str]:
 
 
 def adapt(run: Started, goal: Goal) -> dict[str, object]:
-    """What the one who asks hears; asked again where a busy machine gave it no time."""
+    """The answer of the run; asked again where a busy machine gave the adaptation no time."""
     for _ in range(ADAPT_TRIES):
         found = control_client.ask(
             run.private, control_client.AdaptCommand(goal), control_client.ADAPT_SECONDS_MAX
