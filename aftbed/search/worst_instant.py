@@ -280,7 +280,7 @@ Make = Callable[[Iterable[int]], Iterator[Instant]]
 def worst_instant(course: Course, action: FaultAction, target: str) -> Worst | None:
     """Search; None if the fault struck at none of the instants. Raises HarnessError."""
     search, cycles = _Search(course, action, target), course.cycles
-    first, last = span(course)
+    first, last = span(cycles)
 
     def anchored(places: Iterable[int]) -> Iterator[Instant]:
         return (instant for at in places for instant in _events(course, at, (ANCHOR,)))
@@ -292,7 +292,7 @@ def worst_instant(course: Course, action: FaultAction, target: str) -> Worst | N
             if after_ms > 0.0:
                 yield Instant(Trigger(after_ms=after_ms), float(t_ms), Trigger(), t_ms)
 
-    begin = list(anchored(coarse(course, first, last)))
+    begin = list(anchored(coarse(cycles, first, last)))
     at = search.narrow(begin, anchored, FINER_CYCLES, range(first, last + 1))
     search.attempt(list(_events(course, at, course.nths)))
     t_ms = cycles[at].t_ms
@@ -335,7 +335,7 @@ class _Search:
     def __init__(self, course: Course, action: FaultAction, target: str) -> None:
         self._course, self._action, self._target = course, action, target
         # All is over when the fault has ended after the last instant, and what it led to.
-        self._over_ms = course.cycles[span(course)[1]].t_ms + action.lasts_ms + AFTER_MS
+        self._over_ms = course.cycles[span(course.cycles)[1]].t_ms + action.lasts_ms + AFTER_MS
         self.found: dict[Trigger, tuple[Harm, int] | None] = {}
 
     def narrow(self, instants: list[Instant], make: Make, steps: Sequence[int], places: range) -> int:
@@ -364,20 +364,19 @@ class _Search:
         return max(found)[1] if found else otherwise
 
 
-def span(course: Course) -> tuple[int, int]:
+def span(cycles: Sequence[DriveCycle]) -> tuple[int, int]:
     """The first and the last cycle of the search, by index."""
-    cycles = course.cycles
     first = next((at for at, cycle in enumerate(cycles) if cycle.target), 0)
     still = next((at for at, cycle in enumerate(cycles) if at > first and not cycle.moving), None)
-    return first, still or max((at for at in _changes(course) if at > first), default=len(cycles) - 1)
+    return first, still or max((at for at in _changes(cycles) if at > first), default=len(cycles) - 1)
 
 
-def coarse(course: Course, first: int, last: int) -> list[int]:
+def coarse(cycles: Sequence[DriveCycle], first: int, last: int) -> list[int]:
     """Where the search begins: the changes of stage first, since it is there that a delay matters."""
-    changes = [at for at in _changes(course) if first <= at <= last]
+    changes = [at for at in _changes(cycles) if first <= at <= last]
     return list(dict.fromkeys((*changes, *range(first, last + 1, STEP_CYCLES), last)))
 
 
-def _changes(course: Course) -> list[int]:
+def _changes(cycles: Sequence[DriveCycle]) -> list[int]:
     """The cycles that ask for another stage than those before them."""
-    return [at for at, (a, b) in enumerate(pairwise(course.cycles), 1) if a.stage != b.stage]
+    return [at for at, (a, b) in enumerate(pairwise(cycles), 1) if a.stage != b.stage]

@@ -60,7 +60,7 @@ def gaps_at_cycles(course: Course, action: FaultAction, step: int) -> list[float
     """The gap that is left by a fault at each `step`-th cycle of the search, without any clever choice."""
 
     def branches() -> Iterator[Branch]:
-        first, last = span(course)
+        first, last = span(course.cycles)
         for cycle in course.cycles[first + 1 : last + 1 : step]:
             yield Branch(cycle.t_ms - 1.0, Fault(action, "primary", Trigger(ANCHOR)))
 
@@ -71,7 +71,7 @@ def gaps_at_cycles(course: Course, action: FaultAction, step: int) -> list[float
 def assert_none_is_worse(course: Course, worst: Worst, outage_ms: int, step: int) -> None:
     """Than `worst`, of the instants that `gaps_at_cycles` tries."""
     assert worst.struck.result.min_gap_m is not None
-    first, last = span(course)
+    first, last = span(course.cycles)
     assert worst.instants < (last - first) / 2, "it is no search if it tries them all"
     assert worst.struck.result.min_gap_m <= min(gaps_at_cycles(course, Hang(outage_ms), step)) + STEP_M
     assert worst.struck.result.min_gap_m < (course.result.min_gap_m or 0.0) - outage_ms / 1000 * 2.0
@@ -154,9 +154,9 @@ def test_a_fault_that_never_comes_to_its_point_has_not_fired(near: Course) -> No
 
 
 def test_the_search_begins_at_each_change_of_stage_and_leaves_no_gap(near: Course) -> None:
-    first, last = span(near)
+    first, last = span(near.cycles)
     assert near.cycles[first].target and not near.cycles[last].moving
-    begun = coarse(near, first, last)
+    begun = coarse(near.cycles, first, last)
     stages = [near.cycles[at].stage for at in begun[:3]]
     assert stages == [1, 2, 3]
     ordered = sorted(begun)
@@ -166,7 +166,7 @@ def test_the_search_begins_at_each_change_of_stage_and_leaves_no_gap(near: Cours
 
 def test_behind_a_car_that_moves_the_search_ends_with_the_braking() -> None:
     course = course_of(Setup("none", scenario="ccrm-50"))
-    _, last = span(course)
+    _, last = span(course.cycles)
     assert last < len(course.cycles) - 1
     assert (course.cycles[last - 1].stage, course.cycles[last].stage) == (3, 0)
     assert course.cycles[last].moving
@@ -174,7 +174,7 @@ def test_behind_a_car_that_moves_the_search_ends_with_the_braking() -> None:
 
 def test_of_a_drive_without_a_target_all_is_searched() -> None:
     course = course_of(Setup("none", scenario="negative:free-drive-30"))
-    assert span(course) == (0, len(course.cycles) - 1)
+    assert span(course.cycles) == (0, len(course.cycles) - 1)
 
 
 def test_a_copy_that_comes_to_no_end_is_killed_and_told(monkeypatch: pytest.MonkeyPatch) -> None:
