@@ -1,6 +1,7 @@
 """`aftbed scenario`: the drives and the published tables whose rows are drives.
 
-`scenario run` forks the supervisor, as `aftbed run` does: `table` and `import` are modules of their own.
+`scenario run` forks the supervisor, as `aftbed run` does: `table`, `ftti` and `import` are modules of
+their own.
 """
 
 from typing import Annotated, Final
@@ -19,6 +20,10 @@ SUBCOMMANDS: Final[CommandTable] = {
     "table": (
         "scenario_table:table",
         "Drive a whole table on the simulator, without a fault or with one at its worst.",
+    ),
+    "ftti": (
+        "scenario_ftti:ftti",
+        "Measure how long a fault of the function may last before the row is broken.",
     ),
     "import": (
         "scenario_import:import_",

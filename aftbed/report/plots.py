@@ -293,6 +293,46 @@ def _road_picture(
     return found | {"allowed by the table": line}
 
 
+# -- FTTI over speed --------------------------------------------------------------------------------
+
+
+class TimeBand(msgspec.Struct, frozen=True):
+    """What a mechanism takes to handle a fault, ms: from its p50 to its bound, or to its p99."""
+
+    name: str
+    low_ms: float
+    high_ms: float
+
+
+def ftti_plot(title: str, lines: Mapping[str, Points], bands: Sequence[TimeBand]) -> str:
+    """A line for each of `lines`, points (km/h, ms), and the bands below them, as a file of its own.
+
+    There is a line, and none is empty. Where a band reaches a line, the hazard comes before the handling.
+    """
+    assert lines and all(lines.values()), "nothing to draw"
+    legend_px = 40.0 + 18.0 * (len(lines) + len(bands))
+    with _drawing(title, ROAD_PX, legend_px + GROUP_PX) as drawing:
+        axes = drawing.axes(52, legend_px + 34, ROAD_PX - 16, legend_px + GROUP_PX - 44)
+        speeds = [speed for points in lines.values() for speed, _ in points]
+        ends = [end for band in bands for end in (band.low_ms, band.high_ms) if end > 0.0]
+        _scale(axes, "y", "ms", [*(ms for points in lines.values() for _, ms in points), *ends])
+        spare = 5.0 if max(speeds) - min(speeds) < ROAD_SPAN_KMH else 1.0
+        axes.set_xlim(min(speeds) - spare, max(speeds) + spare)
+        axes.set_xlabel("km/h")
+        legend: dict[str, Artist] = {}
+        for number, (name, points) in enumerate(lines.items()):
+            line = drawing.line(axes, points, number)
+            line.set(marker="o", markersize=5)
+            drawing.tip(line, f"{name}: {milliseconds(min(ms for _, ms in points))} ms at least", "line")
+            legend[name] = line
+        for number, band in enumerate(bands, len(lines)):
+            low, high = max(band.low_ms, axes.get_ylim()[0]), max(band.high_ms, axes.get_ylim()[0])
+            colour = LINES[number % len(LINES)][0]
+            legend[f"FHTI of {band.name}"] = axes.axhspan(low, high, color=colour, alpha=0.3)
+        drawing.legend(title, legend)
+        return drawing.svg(standalone=True)
+
+
 # -- matplotlib -----------------------------------------------------------------------------------
 
 
@@ -367,7 +407,7 @@ class _Drawing:
         artist.set_gid(f"tip-{len(self._tips)}")
         self._tips.append((words, css))
 
-    def legend(self, title: str, lines: "Mapping[str, Line2D]") -> None:
+    def legend(self, title: str, lines: "Mapping[str, Artist]") -> None:
         """Title and legend in the upper left corner."""
         place = (52 / self.width, 1 - 6 / self.height)
         self._figure.suptitle(title, x=place[0], y=place[1], ha="left", va="top", size=11, weight="bold")

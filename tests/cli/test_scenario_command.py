@@ -259,3 +259,73 @@ def test_import_overwrites_a_different_file_only_with_force(
     assert mine.read_text() == "mine"
     output("scenario", "import", LEAD_BRAKES, "--force")
     assert mine.read_text() != "mine"
+
+
+EMPTY_ROAD = (
+    "{description: an empty road, duration_s: 1, ego: {speed_kmh: 80}, expect: {outcome: no_braking}}"
+)
+
+
+def test_the_ftti_of_a_scenario_with_the_margin_of_a_mechanism(call: Call, tmp_path: Path) -> None:
+    (tmp_path / "empty.yaml").write_text(EMPTY_ROAD)
+    (tmp_path / "fhti.json").write_text(
+        '{"pbr": {"p50": 0.1, "p99": 0.2, "bound": 0.5}, "lfr": {"p50": 1, "p99": 2}}'
+    )
+    given = (
+        "scenario",
+        "ftti",
+        "empty.yaml",
+        "--jobs",
+        "1",
+        "--fault",
+        "omission,wrong-value",
+        "--fhti",
+        "fhti.json",
+    )
+    code, out, _ = call(*given, "--json")
+    silent, wrong = json.loads(out)["rows"]
+    assert code == 1, "lfr takes longer than 1 ms"
+    keys = "scenario speed_kmh fault ftti_ms closed_form_ms broken_by worst_instant_s mechanisms"
+    assert list(wrong) == keys.split()
+    assert wrong["ftti_ms"] == 1.0 and wrong["mechanisms"]["pbr"]["margin"] == 0.5
+    assert wrong["mechanisms"]["pbr"]["fhti_ms"] == {"p50": 0.1, "p99": 0.2, "bound": 0.5}
+    assert wrong["mechanisms"]["lfr"]["margin"] == -1.0
+    assert silent["ftti_ms"] is None and silent["mechanisms"]["pbr"]["margin"] is None
+    _, out, _ = call(*given, "--plot", "ftti.svg")
+    assert "no FTTI up to 2 s" in out and "-100.0%" in out
+    drawn = (tmp_path / "ftti.svg").read_text()
+    assert "FTTI, wrong-value" in drawn and "FHTI of lfr" in drawn
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        (["ccrs-20", "--fault", "omision"], "unknown fault 'omision'; did you mean 'omission'?"),
+        (["ccrs-20", "--brake-policy", "lock"], "unknown brake policy 'lock'"),
+        (["ccrs-21"], "unknown scenario 'ccrs-21'"),
+        (["ccrs-20", "--plot", "ftti.png"], "--plot ftti.png"),
+        (["ccrs-20", "--fhti", "nowhere.json"], "--fhti nowhere.json: No such file or directory"),
+        (
+            ["ccrs-20", "--fhti", "list.json"],
+            "--fhti list.json: Expected `object`, got `array`; allowed is a JSON object",
+        ),
+        (
+            ["ccrs-20", "--fhti", "odd.json"],
+            "--fhti odd.json: pbr: found p50 3, p99 2, bound 2; allowed is 0 <= p50",
+        ),
+    ],
+)
+def test_what_ftti_refuses(arguments: list[str], reason: str, refused: Output, tmp_path: Path) -> None:
+    (tmp_path / "list.json").write_text("[]")
+    (tmp_path / "odd.json").write_text('{"pbr": {"p50": 3, "p99": 2}}')
+    assert reason in refused("scenario", "ftti", *arguments)
+
+
+def test_a_drive_that_is_broken_without_a_fault_is_refused(refused: Output, tmp_path: Path) -> None:
+    (tmp_path / "near.yaml").write_text(
+        "{description: too near, duration_s: 3, ego: {speed_kmh: 60}, lead: {gap_m: 10, speed_kmh: 0},"
+        " expect: {outcome: stop}}"
+    )
+    assert "near.yaml: is broken without a fault, so has no FTTI: collision" in refused(
+        "scenario", "ftti", "near.yaml", "--jobs", "1"
+    )
