@@ -62,7 +62,7 @@ def test_where_full_braking_cannot_wait_it_is_that_of_the_closed_form(tmp_path: 
 
 
 def test_the_simulator_breaks_the_row_with_more_and_keeps_it_with_less(tmp_path: Path) -> None:
-    name = obstacle(tmp_path, 46, 18.0)
+    name = obstacle(tmp_path, 53, 18.0)
     row = measured(name)
     assert row.ftti_ms is not None and row.worst_instant_s is not None
     course = course_of(Setup("none", scenario=name))
