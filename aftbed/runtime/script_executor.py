@@ -68,7 +68,7 @@ from aftbed.runtime.deployment import (
     replica_of,
 )
 from aftbed.runtime.interface import LIGHT, Channel, Process, ProcessKind, StateFile
-from aftbed.runtime.tasks import Key, Wait, run_after_first_yield
+from aftbed.runtime.tasks import Key, Wait, death_of, run_after_first_yield
 
 Ends = dict[tuple[str, str], int]  # brick, port -> descriptor, or NOWHERE
 PortOrder = tuple[tuple[control.Port, ...], tuple[control.Port, ...], tuple[int, ...]]  # in, out, descriptors
@@ -867,7 +867,7 @@ class Execution:
         for process in living:
             end(process)
         with suppress(StepFailed):
-            yield Wait(frozenset(("died", p.name, p.pid) for p in living), seconds=STEP_SECONDS_MAX)
+            yield Wait(frozenset(death_of(p.pid) for p in living), seconds=STEP_SECONDS_MAX)
 
     def _resume_living(self, bricks: Iterable[str]) -> None:
         """What was suspended goes on, but for a lost replica."""

@@ -51,6 +51,15 @@ MUTANTS: Final = (
         ("tests/ftm/test_pbr.py",),
     ),
     SourceMutant(
+        "a death is waited for by a name that an exchange takes from the process",
+        "G7",
+        f"{RUNTIME}/run_controller.py",
+        "self._loop.tasks.settle(death_of(process.pid))",
+        'process.name.endswith("\'") or self._loop.tasks.settle(death_of(process.pid))',
+        UNIT,
+        ("tests/sim/test_injectors.py",),
+    ),
+    SourceMutant(
         "a page that the end of a state cuts counts as equal",
         "G3",
         f"{FTM}/pages.py",
