@@ -283,6 +283,13 @@ def _epochs(history: History) -> dict[int, _Service]:
     }
 
 
+def served_by(history: History) -> list[tuple[int, str]]:
+    """From when on each replica was the one whose replies were accepted, in the order of time."""
+    firsts = sorted((service.first for service in _epochs(history).values()), key=lambda r: r.t_ns)
+    numbers = [min(max(1, record.detail & 0xFF), len(REPLICAS)) for record in firsts]
+    return [(record.t_ns, REPLICAS[number - 1]) for record, number in zip(firsts, numbers, strict=True)]
+
+
 def _cause(
     strikes: Sequence[Record],
     faults: Sequence[Fault],

@@ -42,10 +42,8 @@ def record_of(run: Run) -> RunRecord:
     named = (given.source, given.expect) if given is not None else ()
     load = LoadRun(setup.count, setup.rate_hz, *named)
     work: Work = CarRun(setup.scenario, None, "") if setup.scenario else load
-    asked = (setup.faults, setup.adaptations)
-    options = RunOptions(
-        "", "", "", setup.ftm, setup.placement, setup.seed, work, *asked, application=setup.application
-    )
+    what = (setup.ftm, setup.placement, setup.seed, work, setup.faults, setup.adaptations)
+    options = RunOptions("", "", "", *what, application=setup.application, ftti_ms=setup.ftti_ms)
     end = RunEnd(
         unfinished=rest.why_not,
         lost=rest.lost,

@@ -14,6 +14,8 @@ FIRST_NS: Final = (100_000, 250_000)  # the first order of its kind runs code th
 ROUSED_NS: Final = (200_000, 450_000)  # the executive sleeps while requests flow
 SLEEPS_AFTER_NS: Final = 5_000_000
 BIRTH_NS: Final = (500_000, 3_000_000)
+IDLE_BEFORE_COLD_NS: Final = 20_000_000  # a reader that was idle for so long has lost its caches
+COLD_PENALTY_NS: Final = (10_000, 50_000)  # added to its next read
 
 # The delay of one hop between two processes, as measured: the `quantiles_ns` of `aftbed bench hops --json`
 # (`aftbed/bench/cycle.py` says what a hop is) for `pbr`, one process per brick, 30 000 samples, on a virtual
