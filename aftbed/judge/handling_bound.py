@@ -19,10 +19,11 @@ another bound.
 In reality the machine stops a process now and then, for longer than any step takes. One such stop of
 `STALL_NS` is allowed for each handling; the harness calls a machine quiet whose wakes are later by no more.
 
-Limits: one fault in a run without adaptations, in a graph with its redundancy, aimed at a replica in the role
-that it begins with; the built-in function, whose execution is part of the hop to it. There is no bound for
-the replacement of Client and Proxy, whose births take what the machine lets them, nor for faults that the
-mechanism does not handle.
+Limits: one fault in a run without adaptations, in a graph with its redundancy, aimed at a replica in the
+role that it begins with; the built-in function, whose execution is part of the hop to it. There is no bound
+where the injector holds a node that serves until it has struck another one (an event of the leader, a crash
+of the backup), for the replacement of Client and Proxy, whose births take what the machine lets them, nor
+for faults that the mechanism does not handle.
 """
 
 import itertools
@@ -41,7 +42,7 @@ from aftbed.inject.crash import Crash
 from aftbed.inject.grammar import ONCE
 from aftbed.inject.hang import Hang
 from aftbed.inject.kind import AnyFault, FaultKind
-from aftbed.inject.targets import BACKUP, PRIMARY
+from aftbed.inject.targets import PRIMARY, Roles, emitting_brick
 from aftbed.inject.value import EXECUTED, ValueFlip, ValuePlace
 from aftbed.runtime.deployment import replica_of
 from aftbed.runtime.devices import LOOK_IDLE_NS, LOOK_NS
@@ -101,11 +102,15 @@ def bound_ms(
 def _of_stop(graph: Graph, fault: AnyFault, period_ns: int) -> int | None:
     """Of a crash or a hang."""
     target, action = fault.target, fault.action
-    if target in SUPPORT:
+    if target in SUPPORT and not fault.event:
         seen_ns = SIGNAL_NS[1] + PIDFD_NS[1]
         return seen_ns + period_ns + request_ns(graph) if isinstance(action, Crash) else None
-    replica = {PRIMARY: LEADER, BACKUP: FOLLOWER}.get(target, replica_of(target))
-    if not replica or not replication_of(graph.ftm) or graph.placement == "single":
+    roles = Roles(graph, LEADER, FOLLOWER)
+    replica = replica_of(target) or roles.replica(target)
+    emitter = emitting_brick(roles, fault.event) if fault.event else None
+    if emitter is not None and replica_of(emitter) != replica:
+        return None
+    if replica not in REPLICAS or not replication_of(graph.ftm) or graph.placement == "single":
         return None
     ends_ns = action.lasts_ms * 1_000_000
     if ends_ns and ends_ns < HANG_DEADLINE_NS - LOOK_NS:

@@ -38,7 +38,7 @@ from aftbed.core.journal import EntryKind, Record
 from aftbed.ftm.compose import REPLICAS
 from aftbed.inject.crash import Crash
 from aftbed.inject.model import Fault, parse
-from aftbed.inject.targets import BACKUP, PRIMARY
+from aftbed.inject.targets import BACKUP, PRIMARY, SUPERVISOR
 from aftbed.judge.checks import (
     HANG_NOTICED_NS,
     REASONS_MAX,
@@ -222,7 +222,9 @@ class _Faults:
     def _found(self) -> Iterator[_Found]:
         strikes: dict[int, Record] = {}
         for record in self._history.events(Event.FAULT_APPLIED):
-            strikes.setdefault(number_of(record), record)
+            first = strikes.setdefault(number_of(record), record)
+            if record.node == SUPERVISOR != first.node:  # before it, a node came to the point, and waited
+                strikes[number_of(record)] = record
         for number, report in enumerate(self._record.faults):
             if report.fired and number in strikes:
                 strike = strikes[number]

@@ -60,6 +60,13 @@ def test_a_reply_that_was_on_its_way_does_not_end_the_handling() -> None:
     assert times(only(tale, CRASH)) == (3.0, 5.0, 8.0, "operational")
 
 
+def test_a_fault_begins_when_the_supervisor_strikes_and_not_when_a_node_came_to_the_point() -> None:
+    tale = struck(struck(Tale().served(1).sent(2)).wait(30), "supervisor.1")
+    tale.note("a/watchdog.1", Event.WATCHDOG_SUSPECT).fenced(1).promoted(2)
+    tale.accepted(2, epoch=2, replica=2).answered(2, epoch=2)
+    assert times(only(tale, CRASH)) == (1.0, 4.0, 5.0, "operational")
+
+
 def test_the_supervisor_detects_the_death_of_a_node_of_no_replica() -> None:
     tale = struck(Tale().served(1), "supervisor.1").note("supervisor.1", Event.NODE_DIED)
     assert times(only(tale.served(2), "crash engine")) == (1.0, 5.0, 6.0, "operational")
