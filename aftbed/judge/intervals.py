@@ -104,6 +104,11 @@ class HandlingIntervals(msgspec.Struct, frozen=True):
     def of_fault(self) -> bool:
         return self.occasion is Occasion.FAULT
 
+    @property
+    def done(self) -> str:
+        """The words before its time."""
+        return "handled after" if self.of_fault else "without service for"
+
     def __str__(self) -> str:
         """For people."""
         if self.latent:
@@ -377,7 +382,7 @@ def check_ftti(evidence: Evidence) -> Check | None:
     limit_ms = record.options.ftti_ms / (pace or 1.0)
     found = intervals(evidence)
     late = [
-        f"{one.fault}: handled after {one.fhti_ms:g} ms, the FTTI is {limit_ms:g}"
+        f"{one.fault}: {one.done} {one.fhti_ms:g} ms, the FTTI is {limit_ms:g}"
         for one in found
         if one.fhti_ms is not None and one.fhti_ms > limit_ms
     ]
