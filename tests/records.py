@@ -77,10 +77,10 @@ class RecordInTheMaking:
             path.write_bytes(header(name.rpartition(".")[0].replace(".", "/")))
         return path
 
-    def note(self, journal: str, event: Event, request_id: int = 0, detail: int = 0) -> None:
+    def note(self, journal: str, event: Event, request_id: int = 0, detail: int = 0, brick: int = 0) -> None:
         self.t_ns += MS
         with self._journal(journal).open("ab") as file:
-            file.write(RECORD.pack(self.t_ns, request_id, detail, 0, event.code))
+            file.write(RECORD.pack(self.t_ns, request_id, detail, brick, event.code))
 
     def request(
         self,

@@ -107,6 +107,7 @@ OWN_RATIO: Final = "ratio"
 LAUNCH: Final = "launch --ftm pbr"
 RECIPE: Final = "adapt --from pbr --to pbr+tr --recipe paper"
 SIM_CAMPAIGN: Final = "campaign --sim --experiments 4000"
+SIMULATOR: Final = "simulator --ftm pbr"
 LINES: Final = (
     _cycle("cycle under `pbr`, a process per brick", "pbr", OWN, p50=1.35),
     _cycle("cycle under `pbr`, a process per replica", "pbr --placement replica", OWN, p50=2.0),
@@ -159,6 +160,14 @@ LINES: Final = (
     TableLine("CPU time of one of them", "campaign", "cpu_ms", "ms"),
     _rate("experiments a minute in the simulator", SIM_CAMPAIGN, 3000),
     TableLine("time of one of them, two at a time", SIM_CAMPAIGN, "experiment_ms", "ms", OWN, OWN_RATIO),
+    TableLine(
+        "requests a second of one core in the simulator",
+        SIMULATOR,
+        "requests_per_s",
+        goal={"": 10_000},
+        more_is_better=True,
+    ),
+    TableLine("CPU time of one of them", SIMULATOR, "request_us", "us", OWN, OWN_RATIO),
 )
 
 

@@ -132,6 +132,20 @@ def campaign(
 
 
 @bench.command()
+def simulator(
+    ftm: Ftm = "pbr",
+    placement: Placement = "process",
+    requests: Annotated[int, typer.Option(min=100, help="Over all rounds.")] = 22_000,
+    rounds: Rounds = ROUNDS,
+    json: Json = False,
+) -> None:
+    """Requests per second of one core in the simulator, beside a bare loop of as many calls."""
+    from aftbed.bench.simulator import bench_simulator  # noqa: PLC0415 - see above
+
+    _print(bench_simulator(ftm, placement, requests, rounds=rounds), as_json=json)
+
+
+@bench.command()
 def state(
     ftm: Ftm = "pbr",
     size: Annotated[int, typer.Option("--bytes", help="Of the state.")] = 1_000_000,

@@ -313,10 +313,10 @@ def _of_journals(record: RunRecord) -> Iterator[str]:
 
 def _adapted_to(record: RunRecord) -> Iterator[str]:
     """The mechanisms to which adaptations led, or would have led."""
-    for one in record.adaptations:
+    for ftm in {name for one in record.adaptations for name in (one.ftm, one.tried_ftm)}:
         with suppress(ConfigError):
-            build(one.ftm, record.options.placement)
-            yield one.ftm
+            build(ftm, record.options.placement)
+            yield ftm
     for asked in record.options.adaptations:
         if asked.goal.expression:
             yield asked.goal.expression

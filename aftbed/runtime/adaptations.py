@@ -53,6 +53,7 @@ class Outcome(msgspec.Struct):
     bricks_total: int = 0
     application: str = ""  # the function that is protected after it, "" for the built-in one
     tried: str = ""  # the function of the new graph, kept or not
+    tried_ftm: str = ""  # the mechanism of the new graph, kept or not
     opened_ns: int = 0  # from when on the new graph served (monotonic), 0 if it never did
     undone_ns: int = 0  # from when on the old one served again
     lost: str = ""  # the replicas that did not serve again, and were left to Recovery, as "a" or "a b"
@@ -316,7 +317,9 @@ class Adaptations:
         outcome.application = protected_by(self._deployment.graph)
         if now.execution is not None:
             outcome.bricks_changed = bricks_changed(now.execution.old, now.execution.new, now.plan.script)
-            outcome.tried, outcome.opened_ns = protected_by(now.execution.new), now.execution.turned_ns
+            new = now.execution.new
+            outcome.tried, outcome.tried_ftm = protected_by(new), new.ftm
+            outcome.opened_ns = now.execution.turned_ns
             outcome.undone_ns, outcome.lost = now.execution.undone_ns, " ".join(sorted(now.execution.lost))
         self._keep(outcome)
         now.answer(outcome)

@@ -59,6 +59,7 @@ DOCUMENTS: Final[dict[str, Document]] = {  # by the first word of a command
         "others": {"zygote": {"processes": 2, "pss_mb": 20.0}},
     },
     "campaign": {"per_minute": 700, "cpu_ms": 230, "experiment_ms": 90.5, **BESIDE},
+    "simulator": {"requests_per_s": 13954, "request_us": TIMES, **BESIDE},
     "state": {
         "cycle_us": TIMES,
         "beside_cycle_us": {"p50": 1.5},

@@ -6,6 +6,7 @@ from typing import Final
 
 import msgspec
 import pytest
+from msgspec.structs import replace
 from records import CRASH, FLIP, RecordInTheMaking, outcomes, whole
 
 from aftbed.core.events import Event
@@ -255,6 +256,28 @@ def test_a_run_without_a_request_is_inconclusive(path: Path) -> None:
     verdict = RecordInTheMaking(path).verdict()
     assert verdict.verdict == "inconclusive" and verdict.launch_ms is None
     assert verdict.checks["one_history"] == verdict.checks["exactly_one_answer"] == "unknown"
+
+
+def restored_by(path: Path, brick: int, tried_ftm: str) -> list[str]:
+    """A process of replica b restores a state as its brick `brick`; the adaptation was rolled back."""
+    record = whole(path)
+    record.options = replace(record.options, placement="replica")
+    record.note("b.2", Event.STATE_RESTORED, 3, brick=brick)
+    undone = {"outcome": "rolled back", "ftm": "pbr", "tried_ftm": tried_ftm}
+    (path / HISTORY_NAME).write_text(outcomes(undone))
+    return [one for one in record.verdict().reasons if "journal b.2" in one]
+
+
+def test_a_staged_process_of_an_adaptation_that_was_rolled_back_has_effects(path: Path) -> None:
+    server = build("pbr+tr", "replica").nodes["b"].index("b/server")
+    assert restored_by(path, server, "pbr+tr") == []
+
+
+@pytest.mark.parametrize(("brick", "tried_ftm"), [(7, "lfr"), (5, "pbr+tr")])
+def test_effects_of_what_is_no_server_are_told(path: Path, brick: int, tried_ftm: str) -> None:
+    assert restored_by(path, brick, tried_ftm) == [
+        "sources_agree: the journal b.2 has effects of what is no server of b"
+    ]
 
 
 NODE_FAILED: Final = """\
