@@ -286,8 +286,12 @@ def _epochs(history: History) -> dict[int, _Service]:
 def served_by(history: History) -> list[tuple[int, str]]:
     """From when on each replica was the one whose replies were accepted, in the order of time."""
     firsts = sorted((service.first for service in _epochs(history).values()), key=lambda r: r.t_ns)
-    numbers = [min(max(1, record.detail & 0xFF), len(REPLICAS)) for record in firsts]
-    return [(record.t_ns, REPLICAS[number - 1]) for record, number in zip(firsts, numbers, strict=True)]
+    return [(record.t_ns, _replica_in(record)) for record in firsts]
+
+
+def _replica_in(record: Record) -> str:
+    """The replica that a fence or a reply is about; "" for a number that none has, in a damaged record."""
+    return dict(enumerate(REPLICAS, 1)).get(record.detail & 0xFF, "")
 
 
 def _cause(
@@ -307,7 +311,7 @@ def _cause(
         number = number_of(strike)
         if fence is None or not (0 <= number < len(faults) and since_ns <= strike.t_ns <= alarm.t_ns):
             return False
-        fault, fenced = faults[number], REPLICAS[(fence.detail & 0xFF) - 1]
+        fault, fenced = faults[number], _replica_in(fence)
         if not fault.action.stops_process or (fault.target != PRIMARY and replica_of(fault.target) != fenced):
             return False
         lasts_ns = fault.action.lasts_ms * 1_000_000
