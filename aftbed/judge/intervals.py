@@ -303,7 +303,7 @@ class _Faults:
 
     def _struck(self, one: _Found) -> str:
         """The replica that was stopped; "" for a node of none."""
-        before = [replica for t_ns, replica in self._served if t_ns <= one.began_ns]
+        before = [replica for t_ns, replica in self._served if replica and t_ns <= one.began_ns]
         leader = before[-1] if before else REPLICAS[0]
         other = next(r for r in REPLICAS if r != leader)
         return {PRIMARY: leader, BACKUP: other}.get(one.fault.target, replica_of(one.fault.target))

@@ -2,13 +2,15 @@
 
 import msgspec
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from tales import Sums, Tale
 
 from aftbed.core.events import FIRST_FAULT, RERUN, Event
 from aftbed.inject.model import FaultReport
 from aftbed.inject.receipts import ReceiptState
 from aftbed.judge.checks import Check, Evidence
-from aftbed.judge.intervals import HandlingIntervals, Occasion, Reaction, check_ftti, intervals
+from aftbed.judge.intervals import BY_MECHANISM, HandlingIntervals, Occasion, Reaction, check_ftti, intervals
 from aftbed.judge.record import RunEnd, RunRecord
 from aftbed.judge.reference import reference_run
 from aftbed.runtime.adaptations import Outcome
@@ -135,6 +137,41 @@ def test_the_blackout_of_an_adaptation_is_an_interval() -> None:
     found = intervals(Evidence(msgspec.structs.replace(given.record, adaptations=(done,)), given.reference))
     assert [(one.fault, one.occasion) for one in found] == [("adapt to lfr", Occasion.ADAPTATION)]
     assert times(found[0]) == (0.0, 27.0, 27.0, "operational")
+
+
+NODES = ("a/server.1", "b/after.1", "a/watchdog.1", "proxy.1", "supervisor.1", "odd.1")
+NOTED = (*BY_MECHANISM, Event.FAULT_APPLIED, Event.NODE_DIED, Event.VOTE_COMPARED, Event.SERVER_ENTER) + (
+    *(Event.REPLICA_FENCED, Event.REPLICA_PROMOTED, Event.REPLY_ACCEPTED, Event.SERVER_EXIT),
+)
+WORDS = (CRASH, FLIP, "hang backup for 20ms", "crash engine", "slow primary by 2ms", "crash b/after")
+
+
+@given(
+    st.lists(
+        st.tuples(st.sampled_from(NODES), st.sampled_from(Event), st.integers(0, 5), st.integers(0, 1027))
+    ),
+    st.lists(st.tuples(st.booleans(), st.integers(0, 5), st.integers(0, 3))),
+    st.lists(st.sampled_from(WORDS), min_size=1, max_size=3),
+)
+def test_any_history_has_intervals_or_none(
+    notes: list[tuple[str, Event, int, int]], entries: list[tuple[bool, int, int]], words: list[str]
+) -> None:
+    """A record may be a stranger's: what it says need not fit together."""
+    tale = Tale()
+    for journal, event, number, detail in notes:
+        tale.note(
+            journal, event, number, detail % 3 + FIRST_FAULT if event is Event.FAULT_APPLIED else detail
+        )
+    for sent, number, epoch in entries:
+        if sent:
+            tale.sent(number)
+        else:
+            tale.answered(number, epoch)
+    given_ = evidence(tale, *words, ftti_ms=10.0)
+    for found in intervals(given_):
+        assert all(ms is None or ms >= 0 for ms in (found.fdti_ms, found.frti_ms, found.fhti_ms))
+        assert (found.fhti_ms is None) is (found.reaction is Reaction.NONE)
+    assert check_ftti(given_) is not None
 
 
 # -- the promise
