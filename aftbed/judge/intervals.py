@@ -87,7 +87,7 @@ class HandlingIntervals(msgspec.Struct, frozen=True):
     """Of one fault, in ms by the clock; None where it is not known, or did not happen.
 
     `bound_ms`: what the FHTI may be at most (`handling_bound`). `latent`: undetected, and a state is wrong.
-    `asked`: a request waited for it, or came after it; without one no reply can end it.
+    `asked`: a request waited for it, or came behind the detection; without one no reply can end it.
     """
 
     fault: str
@@ -259,16 +259,18 @@ class _Faults:
             reaction,
             self._bound_ms(one) if alone else None,
             latent,
-            asked=wrong or ended_ns is not None or self._waits(one),
+            asked=wrong
+            or ended_ns is not None
+            or self._waits(one.began_ns if detected_ns is None else detected_ns),
         )
 
     @cached_property
     def _ends_latent(self) -> bool:
         return outcome_of(self._evidence)[0] == LATENT
 
-    def _waits(self, one: _Found) -> bool:
-        """Whether a request came after the fault, or one from before it was never answered."""
-        return self._replies.asked_since(one.began_ns) or bool(self._unanswered)
+    def _waits(self, from_ns: int) -> bool:
+        """Whether a request came from then on, or one from before was never answered."""
+        return self._replies.asked_since(from_ns) or bool(self._unanswered)
 
     @cached_property
     def _unanswered(self) -> set[int]:

@@ -200,6 +200,12 @@ def test_without_a_request_behind_the_fault_nothing_is_known() -> None:
     assert found == Check("unknown", ("crash primary: no request came after it",))
 
 
+def test_a_death_that_is_seen_when_all_was_answered_is_not_known_to_be_unhandled() -> None:
+    tale = struck(Tale().served(1), "supervisor.1").served(2).note("supervisor.1", Event.NODE_DIED)
+    found = check_ftti(evidence(tale, "crash engine", ftti_ms=100))
+    assert found == Check("unknown", ("crash engine: no request came after it",))
+
+
 def test_a_fault_without_a_time_is_not_taken_for_handled() -> None:
     found = check_ftti(evidence(Tale().served(1), "omission bus RADAR_TRACK", ftti_ms=100))
     assert found is not None and found.finding == "unknown"
