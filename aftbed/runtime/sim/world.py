@@ -89,6 +89,7 @@ class Setup(msgspec.Struct, frozen=True):
     application: str = ""
     given: GivenRequests | None = None
     page_bytes: int = PAGE_BYTES
+    ftti_ms: float = 0.0  # that the judge holds against each fault; 0: none
 
 
 class Rest(msgspec.Struct, frozen=True):
