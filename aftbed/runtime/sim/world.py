@@ -316,6 +316,9 @@ class World:
         self.pool.cells.append(cell)
         return cell
 
+    def state_file(self) -> None:
+        """An answer holds any state."""
+
     def device(self, kind: str, incarnation: int) -> tuple[str, bytes]:
         return {"watchdog": "sensor", "client": "source"}.get(kind, ""), b""
 
