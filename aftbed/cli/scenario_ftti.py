@@ -51,7 +51,9 @@ class FttiArguments(msgspec.Struct, frozen=True):
     ] = "latch"
     fhti: Annotated[
         Path | None,
-        typer.Option(help='FHTI of mechanisms in ms: {"pbr": {"p50": 1.9, "p99": 3.6, "bound": 12.5}}.'),
+        typer.Option(
+            help='Directory of a campaign, or FHTI in ms: {"pbr": {"p50": 1.9, "p99": 3.6, "bound": 12.5}}.'
+        ),
     ] = None
     seed: Seed = 0
     jobs: Annotated[int | None, typer.Option(help="Processes that simulate; one per CPU if left out.")] = None
@@ -65,7 +67,7 @@ def ftti(given: FttiArguments) -> int:
 
     Exit code: 0 measured, 1 a mechanism of --fhti does not handle a fault in time, 2 usage, 130 interrupted.
     """
-    todo, figures = _searches(given), read_fhti(given.fhti) if given.fhti is not None else {}
+    todo, figures = _searches(given), _fhti(given.fhti)
     rows: list[FttiRow] = []
     try:
         with (
@@ -109,6 +111,21 @@ def _searches(given: FttiArguments) -> list[FttiSearch]:
     ]
 
 
+def _fhti(path: Path | None) -> dict[str, Fhti]:
+    """By mechanism: what a campaign has measured, or what a file says. Raises ConfigError."""
+    if path is None:
+        return {}
+    if not path.is_dir():
+        return read_fhti(path)
+    from aftbed.campaign import ledger  # noqa: PLC0415
+    from aftbed.campaign.summary import fhti_figures  # noqa: PLC0415 - scipy
+
+    found = fhti_figures(ledger.read(path / ledger.NAME).results)
+    if not found:
+        raise ConfigError(f"--fhti {path}: no fault was handled in this campaign; another one is needed")
+    return {name: Fhti(round(of.p50, 3), round(of.p99, 3), of.bound) for name, of in found.items()}
+
+
 def _plot(path: Path, policy: str, rows: Sequence[FttiRow], figures: dict[str, Fhti]) -> None:
     lines: dict[str, list[tuple[float, float]]] = {}
     for row in sorted(rows, key=lambda row: row.speed_kmh):
@@ -129,7 +146,7 @@ def _plot(path: Path, policy: str, rows: Sequence[FttiRow], figures: dict[str, F
 
 
 def _print(rows: Sequence[FttiRow], figures: dict[str, Fhti]) -> None:
-    heads = (*HEADS, *(f"margin {name}" for name in figures), "broken by")
+    heads = (*HEADS, *(("least margin",) if figures else ()), "broken by")
     grid = rich.table.Table(box=None, pad_edge=False, padding=(0, 3, 0, 0), header_style="")
     for at, head in enumerate(heads):
         grid.add_column(head, no_wrap=True, justify="left" if at in (0, 2, len(heads) - 1) else "right")
@@ -145,6 +162,8 @@ def _cells(row: FttiRow) -> list[str]:
     def figure(value: float | None, form: str, unit: str) -> str:
         return "-" if value is None else f"{value:{form}}{unit}"
 
+    known = [(of.margin, name) for name, of in row.mechanisms.items() if of.margin is not None]
+    least = [f"{min(known)[0]:.1%} {min(known)[1]}" if known else "-"] if row.mechanisms else []
     return [
         row.scenario,
         f"{row.speed_kmh:g}",
@@ -152,6 +171,6 @@ def _cells(row: FttiRow) -> list[str]:
         figure(row.ftti_ms, ".0f", " ms"),
         figure(row.closed_form_ms, ".0f", " ms"),
         figure(row.worst_instant_s, ".2f", " s"),
-        *(figure(of.margin, ".1%", "") for of in row.mechanisms.values()),
+        *least,
         row.broken_by or f"no FTTI up to {FTTI_MAX_MS // 1000} s",
     ]

@@ -329,3 +329,22 @@ def test_a_drive_that_is_broken_without_a_fault_is_refused(refused: Output, tmp_
     assert "near.yaml: is broken without a fault, so has no FTTI: collision" in refused(
         "scenario", "ftti", "near.yaml", "--jobs", "1"
     )
+
+
+def test_the_margin_is_that_of_a_campaign(call: Call, output: Output, tmp_path: Path) -> None:
+    (tmp_path / "empty.yaml").write_text(EMPTY_ROAD)
+    (tmp_path / "small.yaml").write_text(
+        "{campaign: small, about: A crash., seed: 1, system: {runtime: sim, requests: 40}, mechanisms: [pbr],"
+        " faults: [{name: crash, fault: 'crash primary at server.exit nth {nth}', draw: {nth: [5, 30]},"
+        " expect: {'*': [masked, tolerated]}}], stop: {experiments: 20},"
+        " gates: [{metric: unexpected, max: 0.9}]}"
+    )
+    output("campaign", "run", "small.yaml", "--out", "small", "--jobs", "1")
+    _, out, _ = call(
+        "scenario", "ftti", "empty.yaml", "--jobs", "1", "--fault", "wrong-value", "--fhti", "small", "--json"
+    )
+    (row,) = json.loads(out)["rows"]
+    pbr = row["mechanisms"]["pbr"]
+    handled_ms = pbr["fhti_ms"]["bound"] or pbr["fhti_ms"]["p99"]
+    assert 0.0 < pbr["fhti_ms"]["p50"] <= pbr["fhti_ms"]["p99"]
+    assert pbr["margin"] == pytest.approx(1.0 - handled_ms / row["ftti_ms"], abs=1e-4)
