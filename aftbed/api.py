@@ -45,6 +45,7 @@ from aftbed.functions.source import located
 from aftbed.inject.model import FaultReport
 from aftbed.judge.asked import AskedAdaptation
 from aftbed.judge.checks import Failover, Requests
+from aftbed.judge.intervals import HandlingIntervals
 from aftbed.judge.simulated import evidence_of_run, verdict_of
 from aftbed.judge.verdict import Verdict, Word
 from aftbed.runtime.sim.world import Setup, simulate
@@ -76,6 +77,7 @@ class RunReport(msgspec.Struct, frozen=True):
     reasons: tuple[str, ...]  # why it is no pass
     requests: Requests
     failovers: tuple[Failover, ...]
+    intervals: tuple[HandlingIntervals, ...]  # how long each fault took to be handled
     adaptations: tuple[AskedAdaptation, ...]
     faults: tuple[FaultReport, ...]
     failures: tuple[str, ...]  # why nodes stopped whose function ended, or broke its contract
@@ -556,6 +558,7 @@ def _reported(found: Verdict, wanted: _Wanted, runtime: str) -> RunReport:
         reasons=reasons,
         requests=requests,
         failovers=tuple(found.failovers),
+        intervals=tuple(found.intervals),
         adaptations=tuple(found.adaptations),
         faults=tuple(found.faults),
         failures=tuple(found.function_failures),

@@ -293,7 +293,8 @@ def _drained(change: _Change) -> tuple[list[Step], list[Step]]:
             for s in _servers(new)
             if s.replica != change.leader and s.name in change.old_bricks
         ]
-    commit += [Migrate(node) for node in change.exchanged if change.stateful(node)]
+    if migrations := tuple(Migrate(node) for node in change.exchanged if change.stateful(node)):
+        commit.append(Together(migrations))
     for replica in change.born():
         commit += [Transfer(f"{change.leader}/{part}", f"{replica}/{part}") for part in STATEFUL]
     moved = [

@@ -64,7 +64,7 @@ from aftbed.core.errors import HarnessError
 from aftbed.core.events import Event
 from aftbed.core.graph import Graph
 from aftbed.core.messages import PACKET_BYTES_MAX
-from aftbed.ftm.compose import NONE, build, chain
+from aftbed.ftm.compose import build, path
 from aftbed.ftm.registry import BRICKS
 from aftbed.functions.request_file import GivenRequests
 from aftbed.functions.source import is_foreign
@@ -79,23 +79,6 @@ TURN_SECONDS_MAX: Final = 10.0  # of the ring
 assert READ_BYTES_MAX <= PACKET_BYTES_MAX
 
 # -- cycle ------------------------------------------------------------------------------------------
-
-
-def path(graph: Graph) -> list[str]:
-    """The bricks that a request and its reply pass, in order; what goes to the backup is left out."""
-    if graph.ftm == NONE:
-        return ["client", "proxy", "a/server", "proxy", "client"]
-    found = ["client", "proxy"]
-    for name in chain(graph, "a")[:-1]:
-        found += [name, *["a/server", name] * BRICKS[graph.brick(name).kind].asks_server]
-        if name.endswith("after"):
-            found.append(f"{name.removesuffix('after')}protocol")
-    return [*found, "proxy", "client"]
-
-
-def hops(graph: Graph) -> int:
-    """The number of channels between processes that a request and its reply pass."""
-    return sum(a != b for a, b in itertools.pairwise(graph.node_of(name) for name in path(graph)))
 
 
 class CycleResult(InRounds, frozen=True):

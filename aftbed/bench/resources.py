@@ -44,7 +44,7 @@ from aftbed.campaign.statistics import quantile
 from aftbed.core.errors import HarnessError
 from aftbed.core.journal import EntryKind
 from aftbed.judge.record import read_record
-from aftbed.runtime.unix import control_client
+from aftbed.runtime.unix import control_client, linux
 from aftbed.runtime.unix.control_client import ProcessRow, measured
 from aftbed.runtime.unix.launch import launch, options_for
 from aftbed.runtime.unix.options import CarRun
@@ -54,6 +54,8 @@ IDLE_HZ: Final = 1.0
 WINDOW_PERIODS_MIN: Final = 1.2
 START_SECONDS_MAX: Final = 10.0
 IDLE_SECONDS: Final = 3.0  # of a run that has nothing to do
+REST_SECONDS_MAX: Final = 10.0  # until its spares have been forked
+LOOK_SECONDS: Final = 0.1  # between two looks whether they have
 SETTLE_SECONDS: Final = 1.5  # of driving before the look, so that the pages that work touches are counted
 ASLEEP_PERCENT: Final = 0.5  # of one core: a node below it does almost nothing
 NO_CRASH: Final = "single"  # the placement in which both replicas die at once
@@ -140,8 +142,25 @@ def bench_memory(ftm: str, placement: str) -> MemoryResult:
     sizes = round(pss_mb, 1), round(rss_mb, 1)
     with endless_run(ftm, placement, IDLE_HZ) as run:
         wait_until_ready(run.private)
+        wait_until_at_rest(run.private)
         idle, _, _ = _usage(run.private, IDLE_SECONDS)
     return MemoryResult(ftm, placement, len(nodes), *sizes, idle.cpu_percent, others, watch.found())
+
+
+def wait_until_at_rest(private: Path) -> None:
+    """Until the zygotes and spares of a load sleep, and have not run since the look before.
+
+    Spares are still forked when the graph serves. Raises HarnessError if they do not come to rest.
+    """
+    limit_s, before = time.monotonic() + REST_SECONDS_MAX, None
+    while time.monotonic() < limit_s:
+        rows = [row for row in control_client.processes(private) if not row.node]
+        asleep, used_ns = all(linux.state_of(row.pid) == "S" for row in rows), _cpu_ns(rows)
+        if asleep and used_ns == before:
+            return
+        before = used_ns
+        time.sleep(LOOK_SECONDS)
+    raise HarnessError(f"zygotes and spares were not at rest within {REST_SECONDS_MAX:g} s")
 
 
 def process_count(ftm: str, placement: str) -> int:

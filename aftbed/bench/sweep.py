@@ -28,7 +28,7 @@ import msgspec
 from aftbed.adapt.planner import APPLICATION
 from aftbed.bench import ballast
 from aftbed.bench.adaptation import adapted
-from aftbed.bench.cycle import RING_BYTES, RingWork, path, ring_of, ring_p50_us, ring_us
+from aftbed.bench.cycle import RING_BYTES, RingWork, ring_of, ring_p50_us, ring_us
 from aftbed.bench.rounds import ROUNDS, InRounds, beside_limit, in_turn
 from aftbed.bench.runs import (
     PAUSE_SECONDS,
@@ -42,7 +42,7 @@ from aftbed.campaign.statistics import quantile
 from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.core.events import Event
 from aftbed.core.messages import PACKET_BYTES_MAX, Goal
-from aftbed.ftm.compose import build
+from aftbed.ftm.compose import build, path
 from aftbed.ftm.pages import PAGE_BYTES
 from aftbed.ftm.registry import BRICKS
 

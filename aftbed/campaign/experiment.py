@@ -21,12 +21,15 @@ from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.core.graph import Graph
 from aftbed.core.messages import Scheduled
 from aftbed.core.script import RECIPES
+from aftbed.core.units import duration
 from aftbed.ftm.compose import build
 from aftbed.functions.load import NO_CODE, OWN_CODE, Code
 from aftbed.functions.request_file import GivenRequests, names_function, requests_from
 from aftbed.inject.model import Fault, FaultReport, parse
 from aftbed.judge.asked import WITHOUT_END
 from aftbed.judge.checks import Evidence, Requests
+from aftbed.judge.handling_bound import STALL_NS
+from aftbed.judge.intervals import FTTI, HandlingIntervals, starved
 from aftbed.judge.outcome import FAILED, OUTCOMES, UNKNOWN, outcome_of, worst
 from aftbed.judge.record import RunEnd, RunRecord, read_record
 from aftbed.judge.simulated import evidence_of_run
@@ -66,6 +69,7 @@ class Experiment(msgspec.Struct, frozen=True):
     budget_ms: float | None = None  # for a recovery
     app: str = ""  # the protected function, the built-in one if left out
     request_file: str = ""  # where the requests come from: see `spec.System`
+    ftti_ms: float = 0.0  # 0: none
 
     def command(self) -> str:
         """The command that repeats it by hand, and shows it in full."""
@@ -84,7 +88,8 @@ class Experiment(msgspec.Struct, frozen=True):
             words += ["--faults" if simulated else "--inject", shlex.quote(text)]
         for text in self.adaptations:
             words += ["--adapt", shlex.quote(text)]
-        return " ".join([*words, *(["--recipe", self.recipe] if self.recipe == "paper" else [])])
+        words += ["--recipe", self.recipe] if self.recipe == "paper" else []
+        return " ".join([*words, *(["--ftti", duration(self.ftti_ms)] if self.ftti_ms else [])])
 
 
 class Result(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -112,8 +117,37 @@ class Result(msgspec.Struct, frozen=True, omit_defaults=True):
     impact_kmh: float | None = None
     gap_m: float | None = None
     golden_gap_m: float | None = None  # of the same drive without a fault
+    intervals: tuple[HandlingIntervals, ...] = ()
     noisy: bool = False  # the machine was too busy for its times to mean anything
+    starved_ms: float = 0.0  # how long the node that waited longest was ready to run and had no CPU
     seconds: float = 0.0
+
+    @property
+    def fdti_ms(self) -> float | None:
+        """The longest one of its faults, as the next two."""
+        return _longest(one.fdti_ms for one in self.intervals if one.of_fault)
+
+    @property
+    def frti_ms(self) -> float | None:
+        return _longest(one.frti_ms for one in self.intervals if one.of_fault)
+
+    @property
+    def fhti_ms(self) -> float | None:
+        return _longest(one.fhti_ms for one in self.intervals if one.of_fault)
+
+    @property
+    def of_bound(self) -> float | None:
+        """The greatest FHTI as a share of its bound; None without a bound."""
+        return _longest(
+            one.fhti_ms / one.bound_ms
+            for one in self.intervals
+            if one.fhti_ms is not None and one.bound_ms is not None
+        )
+
+    @property
+    def detected(self) -> bool:
+        """Whether one of its faults was."""
+        return any(one.fdti_ms is not None for one in self.intervals if one.of_fault)
 
 
 def failed(result: Result) -> bool:
@@ -133,8 +167,6 @@ SLEEP_SECONDS: Final = 0.001
 SLEEPS: Final = 5
 FACTOR: Final = 10.0
 LATE_MS_MIN: Final = 5.0  # a recovery takes about as long on a bad day: less is no excuse
-STARVED_MS_MIN: Final = 20.0  # in a run,
-STARVED_PART: Final = 0.05  # and more than so much of it
 
 
 def lateness_ms() -> float:
@@ -158,11 +190,6 @@ class Probe:
         return lateness_ms() > max(LATE_MS_MIN, FACTOR * self.quiet_ms)
 
 
-def starved(starved_ms: float, seconds: float) -> bool:
-    """Whether a node had to wait for a CPU for so long that the times of a run of `seconds` mean nothing."""
-    return starved_ms > max(STARVED_MS_MIN, STARVED_PART * seconds * 1e3)
-
-
 # -- one experiment -------------------------------------------------------------------------------
 #
 # Trouble of the harness (a run that does not start, a supervisor that dies) is `harness_error`, a history
@@ -172,8 +199,13 @@ def starved(starved_ms: float, seconds: float) -> bool:
 REASONS_MAX: Final = 3
 REASON_MAX: Final = 300  # characters
 TIMED: Final = ("degraded", "hang")  # classes that a slow machine alone can bring about
-ON_ACTIVATION: Final = {"faults_applied", "adaptations_done"}  # an experiment says that by `activated`
-UNEXCUSED: Final = ("one_master", "whole_graph", "clean_exit")  # checks that hold whatever the faults are
+ON_ACTIVATION: Final = {"faults_applied", "adaptations_done", FTTI}  # the result says these in other ways
+UNEXCUSED: Final = (
+    "one_master",
+    "whole_graph",
+    "clean_exit",
+    FTTI,
+)  # checks that hold whatever the faults are
 RUN_SECONDS_MAX: Final = 60.0
 REQUESTS_PER_SECOND_MIN: Final = 100.0  # of a closed loop on a busy machine
 
@@ -232,6 +264,7 @@ def setup_of(experiment: Experiment, code: Code = NO_CODE) -> Setup:
         scenario=experiment.scenario,
         application=experiment.app,
         given=_given(experiment, code),
+        ftti_ms=experiment.ftti_ms,
     )
 
 
@@ -270,8 +303,15 @@ def _real(experiment: Experiment, standing: ExitStack) -> Result:
         outcome, reasons = "inconclusive", tuple(verdict.reasons)
     result = _result(experiment, evidence, verdict, outcome, reasons)
     end = evidence.record.end or RunEnd()
-    noisy = noisy or starved(end.starved_ms, end.seconds or 0.0) or _probe().noisy()
+    noisy = noisy or starved(end.starved_ms, end.seconds or 0.0) or _excused(result, end.starved_ms)
+    noisy = noisy or _probe().noisy()
+    result = msgspec.structs.replace(result, starved_ms=end.starved_ms)
     return without_times(result) if noisy else result
+
+
+def _excused(result: Result, starved_ms: float) -> bool:
+    """Whether a fault was handled later than its bound, which is that of a machine with shorter waits."""
+    return result.of_bound is not None and result.of_bound > 1 and starved_ms > STALL_NS / 1e6
 
 
 def _recorded(experiment: Experiment, standing: ExitStack) -> RunRecord:
@@ -288,6 +328,7 @@ def _recorded(experiment: Experiment, standing: ExitStack) -> RunRecord:
         faults=faults,
         adaptations=changes,
         application=experiment.app,
+        ftti_ms=experiment.ftti_ms,
     )
     warm_up(BUS if experiment.scenario else LIGHT)
     launched = launch(options, listener, given)
@@ -314,9 +355,12 @@ def without_times(result: Result) -> Result:
     reasons = ("the machine was too busy for times to mean anything", *result.reasons)
     false_alarm = result.outcome == "tolerated" and result.unexpected
     outcome = "inconclusive" if result.outcome in TIMED or false_alarm else result.outcome
+    untimed = {"fdti_ms": None, "frti_ms": None, "fhti_ms": None}
     return msgspec.structs.replace(
         result,
         noisy=True,
+        broken=tuple(reason for reason in result.broken if reason.partition(":")[0] != FTTI),
+        intervals=tuple(msgspec.structs.replace(one, **untimed) for one in result.intervals),
         outcome=outcome,
         unexpected=result.unexpected and outcome == result.outcome,
         reasons=reasons if outcome != result.outcome else result.reasons,
@@ -364,6 +408,7 @@ def _result(
         impact_kmh=vehicle.impact_speed_kmh if vehicle is not None else None,
         gap_m=vehicle.stop_gap_m if vehicle is not None else None,
         golden_gap_m=golden.stop_gap_m if golden is not None else None,
+        intervals=tuple(verdict.intervals),
     )
 
 

@@ -111,6 +111,7 @@ class CampaignPlan(msgspec.Struct, frozen=True):
             spec.recovery_budget_ms,
             spec.system.app,
             spec.system.request_file,
+            spec.ftti_ms,
         )
 
 

@@ -46,6 +46,7 @@ from aftbed.ftm.compose import EXPRESSIONS
 from aftbed.functions.request_file import located_requests
 from aftbed.functions.source import located
 from aftbed.judge.outcome import OUTCOMES
+from aftbed.runtime.unix.options import CarRun, LoadRun, ftti_ms_of
 from aftbed.vehicle.scenarios.library import load_scenario
 
 SHIPPED: Final = Path(__file__).resolve().parent.parent / "campaigns"
@@ -54,6 +55,7 @@ SUITABLE: Final = "suitable"
 MECHANISM_PLACE: Final = "{mechanism}"  # in an adaptation: each other one
 APP_PLACE: Final = "{app}"
 EXPERIMENTS_MAX: Final = 1_000_000
+FHTI_MARGIN: Final = "fhti_margin"  # 1 - FHTI / FTTI
 METRICS: Final = (
     *OUTCOMES,
     "failed",
@@ -68,6 +70,14 @@ METRICS: Final = (
     "blackout_ms_p99",
     "adapt_blackout_ms_p50",
     "adapt_blackout_ms_p99",
+    "fdti_ms_p50",
+    "fdti_ms_p99",
+    "frti_ms_p50",
+    "frti_ms_p99",
+    "fhti_ms_p50",
+    "fhti_ms_p99",
+    "coverage",  # diagnostic: detected or tolerated, of the faults that were activated
+    FHTI_MARGIN,
 )
 
 Value = str | int | float
@@ -173,8 +183,16 @@ class Spec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     gates: tuple[Gate, ...] = ()
     confidence: Annotated[float, Meta(gt=0.5, lt=1)] = 0.95
     recovery_budget_ms: Annotated[float, Meta(gt=0)] | None = None  # longer is `degraded`
+    ftti: str = ""  # as 100ms, of bus time: a fault that is handled later breaks a promise
     not_activated_max: Annotated[float, Meta(ge=0, le=1)] = 0.3  # two gates that are always there (G8)
     unknown_max: Annotated[float, Meta(ge=0, le=1)] = 0.3
+
+    @property
+    def ftti_ms(self) -> float:
+        """0: none. Raises ConfigError, also if it is shorter than a cycle."""
+        system = self.system
+        work = CarRun(system.scenario, None, "") if system.scenario else LoadRun(1, system.rate_hz)
+        return ftti_ms_of("ftti", self.ftti, work) if self.ftti else 0.0
 
 
 def read_spec(name: str) -> Spec:
@@ -233,8 +251,11 @@ def check(spec: Spec) -> None:
         ):
             raise ConfigError(f"{where}.name: {MECHANISM_PLACE} stands in adapt, so it has to in the name")
         _each_known(f"{where}.recipe", (adaptation.recipe,), RECIPES)
+    ftti_ms = spec.ftti_ms
     for number, gate in enumerate(spec.gates):
         _check_gate(f"gates[{number}]", gate)
+        if gate.metric == FHTI_MARGIN and not ftti_ms:
+            raise ConfigError(f"gates[{number}].metric: {FHTI_MARGIN} is of an FTTI: add ftti, as 100ms")
 
 
 def mechanisms_of(spec: Spec) -> tuple[str, ...]:

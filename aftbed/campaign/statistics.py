@@ -120,6 +120,15 @@ def quantile_interval(values: Sequence[float], q: float, confidence: float = CON
     return Interval(ordered[below - 1], ordered[above])
 
 
+def quantile_bound(values: Sequence[float], q: float, confidence: float = CONFIDENCE) -> float | None:
+    """The value that the q-quantile does not exceed, with `confidence` on this one side.
+
+    None: there are too few values. Of 299 the greatest bounds the p99 at 95 %.
+    """
+    found = quantile_interval(values, q, 2 * confidence - 1)
+    return None if found is None else found.high
+
+
 def quantile_needs(q: float, confidence: float = CONFIDENCE) -> int:
     """The smallest number of values of which `quantile_interval` is not None."""
     if not 0 < q < 1:

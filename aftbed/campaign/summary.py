@@ -9,7 +9,7 @@ what no fault excuses.
 
 import fnmatch
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Final, Literal
 
 import msgspec
@@ -17,7 +17,7 @@ import msgspec
 from aftbed.campaign.experiment import Result, failed
 from aftbed.campaign.ledger import Ledger
 from aftbed.campaign.plan import population, strata_of
-from aftbed.campaign.spec import ANY, Gate, Spec
+from aftbed.campaign.spec import ANY, FHTI_MARGIN, Gate, Spec
 from aftbed.campaign.statistics import (
     FailureCount,
     Interval,
@@ -25,16 +25,21 @@ from aftbed.campaign.statistics import (
     look_confidence,
     proportion,
     quantile,
+    quantile_bound,
     quantile_interval,
     quantile_needs,
 )
 from aftbed.campaign.weaknesses import Weakness, weaknesses
-from aftbed.judge.outcome import OUTCOMES, UNKNOWN
+from aftbed.judge.intervals import HandlingIntervals, Reaction
+from aftbed.judge.outcome import LATENT, OUTCOMES, UNKNOWN
 
 Word = Literal["pass", "fail"]
 NOT_ACTIVATED: Final = "not_activated"
 NOT_ALL: Final = "not all"  # of the faults of a stratum may miss
 BROKEN: Final = "broken"
+COVERAGE: Final = "coverage"
+COVERED: Final = ("masked", "tolerated", "degraded", "detected_stop")  # the client got what was promised
+FHTI_BOUND: Final = "fhti_bound"
 QUANTILES: Final = {"p50": 0.5, "p99": 0.99}
 SHARES: Final[dict[str, Callable[[Result], bool]]] = {
     "unexpected": lambda r: r.unexpected,
@@ -43,17 +48,24 @@ SHARES: Final[dict[str, Callable[[Result], bool]]] = {
     NOT_ACTIVATED: lambda r: not r.activated,
     BROKEN: lambda r: bool(r.broken),
     "collision": lambda r: bool(r.collision),
+    COVERAGE: lambda r: r.detected or r.outcome in COVERED,
     **{name: (lambda r, name=name: r.outcome == name) for name in OUTCOMES},  # type: ignore[misc]
 }
 
 OF: Final[dict[str, Callable[[Result], bool]]] = {  # which experiments a share is a share of, where not all
     "unexpected": lambda r: r.activated and r.outcome not in UNKNOWN,
     NOT_ACTIVATED: lambda r: bool(r.experiment.faults),
+    COVERAGE: lambda r: (
+        bool(r.experiment.faults) and r.activated and not r.noisy and r.outcome not in UNKNOWN
+    ),
 }
 
 
 class TimeSummary(msgspec.Struct, frozen=True):
-    """Milliseconds; `p99_interval` is None where there are too few values to bound it."""
+    """Milliseconds; `p99_interval` is None where there are too few values to bound it.
+
+    `p99_bound`: what the p99 does not exceed, with the confidence of the campaign on this one side.
+    """
 
     count: int
     p50: float
@@ -61,6 +73,45 @@ class TimeSummary(msgspec.Struct, frozen=True):
     max: float
     p50_interval: Interval | None
     p99_interval: Interval | None
+    p99_bound: float | None = None
+
+
+class Coverage(msgspec.Struct, frozen=True):
+    """Diagnostic coverage: of the `activated` experiments that are known, the share that was covered.
+
+    Covered is what was `detected`, and what was `tolerated` without being detected. `latent`: undetected, and
+    a state is wrong behind right replies. All others are `uncovered`: the client got less than was promised.
+    """
+
+    activated: int
+    detected: int
+    tolerated: int
+    latent: int
+    uncovered: int
+    interval: Interval
+
+
+class Handling(msgspec.Struct, frozen=True):
+    """How the faults of a stratum were handled. `reactions`: how many faults by each of them.
+
+    `bound_ms`: the greatest bound of an FHTI; `of_bound`: the greatest FHTI as a share of its own bound.
+    """
+
+    fdti_ms: TimeSummary | None
+    frti_ms: TimeSummary | None
+    fhti_ms: TimeSummary | None
+    reactions: dict[str, int]
+    coverage: Coverage | None
+    bound_ms: float | None
+    of_bound: float | None
+
+
+class FhtiFigures(msgspec.Struct, frozen=True):
+    """Of one mechanism, in ms; `bound` None: there is none."""
+
+    p50: float
+    p99: float
+    bound: float | None
 
 
 class StratumSummary(msgspec.Struct, frozen=True):
@@ -79,6 +130,7 @@ class StratumSummary(msgspec.Struct, frozen=True):
     recovery_ms: TimeSummary | None
     blackout_ms: TimeSummary | None
     adapt_blackout_ms: TimeSummary | None
+    handling: Handling | None = None  # None where no fault was handled
 
 
 class GateResult(msgspec.Struct, frozen=True):
@@ -125,7 +177,7 @@ def summarise(ledger: Ledger, planned: int, seconds: float) -> Summary:
         if name not in missable or any(result.activated for result in group)
     }
     always = tuple(judged(gate, struck, confidence) for gate in _always(spec))
-    gates = (*asked, *always, _unexcused(results), *_vacuous(spec, struck))
+    gates = (*asked, *always, _unexcused(results), *_within_bound(results), *_vacuous(spec, struck))
     sizes = {stratum.name: population(stratum.fault) for stratum in strata_of(spec)}
     broken = not results or any(g.word == "fail" for g in gates)
     return Summary(
@@ -167,7 +219,52 @@ def _stratum(name: str, group: list[Result], size: int, confidence: float) -> St
         times([r.recovery_ms for r in group], confidence),
         times([r.blackout_ms for r in group], confidence),
         times([r.adapt_blackout_ms for r in group], confidence),
+        handling(group, confidence),
     )
+
+
+def handling(group: Sequence[Result], confidence: float) -> Handling | None:
+    """None of experiments without a fault that has intervals."""
+    found = [one for r in group for one in r.intervals if one.of_fault]
+    if not found:
+        return None
+    return Handling(
+        times([one.fdti_ms for one in found], confidence),
+        times([one.frti_ms for one in found], confidence),
+        times([one.fhti_ms for one in found], confidence),
+        {reaction.value: sum(one.reaction is reaction for one in found) for reaction in Reaction},
+        coverage(group, confidence),
+        max((one.bound_ms for one in found if one.bound_ms is not None), default=None),
+        max((r.of_bound for r in group if r.of_bound is not None), default=None),
+    )
+
+
+def coverage(group: Iterable[Result], confidence: float) -> Coverage | None:
+    """None where no fault was activated, or nothing is known."""
+    known = list(filter(OF[COVERAGE], group))
+    if not known:
+        return None
+    undetected = [r for r in known if not r.detected]
+    tolerated = sum(r.outcome in COVERED for r in undetected)
+    latent = sum(r.outcome == LATENT for r in undetected)
+    detected = len(known) - len(undetected)
+    interval = proportion(detected + tolerated, len(known), confidence)
+    uncovered = len(undetected) - tolerated - latent
+    return Coverage(len(known), detected, tolerated, latent, uncovered, interval)
+
+
+def fhti_figures(results: Iterable[Result]) -> dict[str, FhtiFigures]:
+    """By mechanism, of all faults that were handled."""
+    groups: dict[str, list[HandlingIntervals]] = {}
+    for result in results:
+        groups.setdefault(result.experiment.ftm, []).extend(one for one in result.intervals if one.of_fault)
+    found = {}
+    for ftm, group in groups.items():
+        times_ms = [one.fhti_ms for one in group if one.fhti_ms is not None]
+        bound = max((one.bound_ms for one in group if one.bound_ms is not None), default=None)
+        if times_ms:
+            found[ftm] = FhtiFigures(quantile(times_ms, 0.5), quantile(times_ms, 0.99), bound)
+    return found
 
 
 def times(values: Iterable[float | None], confidence: float) -> TimeSummary | None:
@@ -182,6 +279,7 @@ def times(values: Iterable[float | None], confidence: float) -> TimeSummary | No
         found[-1],
         quantile_interval(found, 0.5, confidence),
         quantile_interval(found, 0.99, confidence),
+        quantile_bound(found, 0.99, confidence),
     )
 
 
@@ -201,6 +299,8 @@ def judged(gate: Gate, groups: dict[str, list[Result]], confidence: float) -> Ga
         reason = f"no stratum is called {gate.strata!r}"
         return GateResult(gate.metric, gate.strata, limit, None, None, "fail", reason)
     interval: Interval | None
+    if gate.metric == FHTI_MARGIN:
+        return _margin(gate, limit, group, confidence)
     if gate.metric in SHARES:
         of = OF.get(gate.metric)
         group = list(filter(of, group)) if of is not None else group
@@ -224,6 +324,56 @@ def judged(gate: Gate, groups: dict[str, list[Result]], confidence: float) -> Ga
     if not kept and gate.metric == "unknown":
         reason += next((f"; experiment {r.experiment.id}: {r.reasons[0]}" for r in group if _untold(r)), "")
     return GateResult(gate.metric, gate.strata, limit, value, bound, "pass" if kept else "fail", reason)
+
+
+def _margin(gate: Gate, limit: str, group: list[Result], confidence: float) -> GateResult:
+    """Of the longest handling, and judged by the upper bound of the p99 where there are enough values.
+
+    Each adaptation counts as well: for its blackout nothing is answered. A fault that was not handled leaves
+    no margin.
+    """
+    found = [(r, one) for r in group for one in r.intervals]
+    values = [one.fhti_ms for _, one in found if one.fhti_ms is not None]
+    unhandled = [
+        (r, one)
+        for r, one in found
+        if one.fhti_ms is None and one.asked and not (one.latent or r.noisy or r.outcome in UNKNOWN)
+    ]
+    if unhandled or not values:
+        reason = "no fault was handled"
+        if unhandled:
+            result, one = unhandled[0]
+            reason = f"experiment {result.experiment.id}: {one.fault}: never handled"
+        return GateResult(gate.metric, gate.strata, limit, None, None, "fail", reason)
+    ftti_ms = min(r.experiment.ftti_ms for r in group)
+    bound_ms = quantile_bound(values, 0.99, confidence)
+    judged_ms = max(values) if bound_ms is None else bound_ms
+    margin, judged_by = 1 - max(values) / ftti_ms, 1 - judged_ms / ftti_ms
+    kept = judged_by <= gate.max if gate.max is not None else judged_by >= (gate.min or 0.0)
+    which = "the longest" if bound_ms is None else f"the p99 is below, at {confidence:.1%}:"
+    reason = "" if kept else f"{which} {judged_ms:.4g} ms of {ftti_ms:g} ms"
+    return GateResult(gate.metric, gate.strata, limit, margin, judged_by, "pass" if kept else "fail", reason)
+
+
+def _within_bound(results: Iterable[Result]) -> Iterator[GateResult]:
+    """A fault that was handled later than can be: the bound or the code is wrong.
+
+    Noisy experiments have no times.
+    """
+    shares = [(r.of_bound, r) for r in results if r.of_bound is not None]
+    if not shares:
+        return
+    most, worst = max(shares, key=lambda pair: pair[0])
+    word: Word = "fail" if most > 1 else "pass"
+    reason = ""
+    if most > 1:
+        late = max(
+            (one for one in worst.intervals if one.bound_ms and one.fhti_ms),
+            key=lambda one: (one.fhti_ms or 0.0) / (one.bound_ms or 1.0),
+        )
+        words = f"{late.fault}: handled after {late.fhti_ms:g} ms, the bound is {late.bound_ms:g}"
+        reason = f"experiment {worst.experiment.id}: {words}"
+    yield GateResult(FHTI_BOUND, ANY, "at most 1", most, None, word, reason)
 
 
 def _untold(result: Result) -> bool:

@@ -23,6 +23,7 @@ from aftbed.campaign.plan import plan as plan_of
 from aftbed.campaign.spec import EXPERIMENTS_MAX, Spec, check, read_spec, shipped
 from aftbed.cli.options import (
     App,
+    Ftti,
     Json,
     Requests,
     TrustedFolders,
@@ -89,6 +90,7 @@ class CampaignArguments(msgspec.Struct, frozen=True, kw_only=True):
     count: Annotated[
         int | None, typer.Option(help="Requests of an experiment; overrides that of the file.")
     ] = None
+    ftti: Ftti = None
     json: Json = False
 
 
@@ -117,6 +119,8 @@ def planned(given: CampaignArguments, trust: Trust = NOBODY) -> CampaignPlan:
     if given.count is not None:
         check_range("--count", given.count, 1, REQUESTS_MAX)
         spec = replace(spec, system=replace(spec.system, requests=given.count))
+    if given.ftti is not None:
+        spec = replace(spec, ftti=given.ftti)
     try:
         check(spec)
         return plan_of(spec, trust)

@@ -35,6 +35,9 @@ Expect = Annotated[
 Tolerance = Annotated[
     float | None, typer.Option(help="With --expect FILE.csv: by how much numbers of f32 and f64 may differ.")
 ]
+Ftti = Annotated[
+    str | None, typer.Option(help="Fault tolerant time interval, as 100ms: a fault handled later fails.")
+]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else.")]
 Ftm = Annotated[str, typer.Option(help="none, pbr, lfr, tr, pbr+tr, ...: aftbed ftm list.")]
 Seed = Annotated[int, typer.Option(help="Seed of all random numbers.")]

@@ -22,6 +22,7 @@ from aftbed.cli.options import (
     App,
     Expect,
     Ftm,
+    Ftti,
     Json,
     Requests,
     Tolerance,
@@ -40,7 +41,7 @@ from aftbed.inject.memory import refuse_unsafe
 from aftbed.inject.model import Fault, parse
 from aftbed.runtime.control import Report
 from aftbed.runtime.unix.launch import Launched, launch, options_for
-from aftbed.runtime.unix.options import CarRun, LoadRun, PolicyOptions, ReplayRun, Work
+from aftbed.runtime.unix.options import CarRun, LoadRun, PolicyOptions, ReplayRun, Work, ftti_ms_of
 
 if TYPE_CHECKING:
     from aftbed.cli.request_options import RequestSource
@@ -108,6 +109,7 @@ class RunArguments(msgspec.Struct, frozen=True):
     ] = None
     expect: Expect = None
     tolerance: Tolerance = None
+    ftti: Ftti = None
     bus_port: Annotated[int, typer.Option(help="TCP port of the bus on 127.0.0.1; 0 is any free one.")] = 0
     bus_open: Annotated[
         bool,
@@ -151,6 +153,7 @@ def execute(given: RunArguments) -> int:
     check_seed(given.seed)
     source = _requests(given)
     work = _work(given) if source is None else _sent(source, given)
+    ftti_ms = ftti_ms_of("--ftti", given.ftti, work) if given.ftti is not None else 0.0
     requests = source.of(given.seed) if source is not None else None
     if application:
         _refuse_unsuitable(application, graph.ftm, requests, force=given.force)
@@ -169,6 +172,7 @@ def execute(given: RunArguments) -> int:
         bus_port=given.bus_port,
         bus_open=given.bus_open,
         application=application,
+        ftti_ms=ftti_ms,
     )
     launched = launch(options, listener, requests)
     try:

@@ -26,6 +26,7 @@ from aftbed.cli.options import (
     SEED_MAX,
     App,
     Expect,
+    Ftti,
     Json,
     Requests,
     Tolerance,
@@ -41,6 +42,7 @@ from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.graph import Graph
 from aftbed.core.messages import Goal, Scheduled
 from aftbed.core.script import RECIPES
+from aftbed.core.units import duration
 from aftbed.ftm.compose import build
 from aftbed.functions.load import OWN_CODE
 from aftbed.functions.source import located
@@ -55,6 +57,7 @@ from aftbed.runtime.sim.clock import START_NS
 from aftbed.runtime.sim.trace import traced
 from aftbed.runtime.sim.world import Run, Setup
 from aftbed.runtime.sim.world import check as check_fault
+from aftbed.runtime.unix.options import CarRun, LoadRun, ftti_ms_of
 from aftbed.runtime.unix.trust import trusting
 from aftbed.runtime.unix.worker_pool import SECONDS_MAX, Alone, each, once, own_seconds_max
 from aftbed.search.agreement import SEEDS, RecoveryRange, against
@@ -118,6 +121,7 @@ class SimArguments(msgspec.Struct, frozen=True):
     may_fail: Annotated[
         bool, typer.Option("--may-fail", help="A run may pass even if an --adapt was not done.")
     ] = False
+    ftti: Ftti = None
     page_bytes: Annotated[
         int | None,
         typer.Option(
@@ -228,6 +232,9 @@ def _setup_maker(given: SimArguments) -> MakeSetup:
         page_bytes=_page_bytes(given),
         application=application,
     )
+    if given.ftti is not None:
+        work = CarRun(setup.scenario, None, "") if setup.scenario else LoadRun(setup.count, setup.rate_hz)
+        setup = replace(setup, ftti_ms=ftti_ms_of("--ftti", given.ftti, work))
     check_setup(setup)
     return lambda seed: replace(setup, seed=seed, given=source.of(seed) if source is not None else None)
 
@@ -342,6 +349,7 @@ def described(setup: Setup) -> str:
     parts += [setup.application] if setup.application else []
     parts += [f"{doom.brick} dies before its effect {doom.effect}" for doom in setup.dooms]
     parts += [*map(str, setup.faults), *map(_adaptation_words, setup.adaptations)]
+    parts += [f"FTTI {duration(setup.ftti_ms)}"] if setup.ftti_ms else []
     parts += [f"pages of {setup.page_bytes} bytes"] if setup.page_bytes != DEFAULT.page_bytes else []
     return "; ".join(parts)
 
@@ -377,6 +385,7 @@ def repeating(setup: Setup, *, swarm: bool = False) -> str:
         expect=requests.expect or None if requests is not None else None,
         tolerance=requests.tolerance if requests is not None else None,
         scenario=setup.scenario or None,
+        ftti=duration(setup.ftti_ms) if setup.ftti_ms else None,
         page_bytes=setup.page_bytes if setup.page_bytes != DEFAULT.page_bytes else None,
         faults=tuple(map(str, setup.faults)),
         adaptations=tuple(map(_adaptation_words, setup.adaptations)),
@@ -410,6 +419,7 @@ def _command(given: SimArguments) -> str:
         ("--scenario", given.scenario),
         ("--count", None if given.count is None else str(given.count)),
         ("--rate", None if given.rate is None else _number(given.rate)),
+        ("--ftti", given.ftti),
         ("--page-bytes", None if given.page_bytes is None else str(given.page_bytes)),
         ("--requests", given.requests),
         ("--expect", given.expect),
@@ -518,6 +528,7 @@ class _DoneRun(NamedTuple):
             "outcome": self.outcome,
             "requests": self.verdict.requests,
             "failovers": self.verdict.failovers,
+            "intervals": self.verdict.intervals,
             "adaptations": self.verdict.adaptations,
             "ftm_at_end": self.verdict.ftm_at_end,
             "faults": self.run.faults,

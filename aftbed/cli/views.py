@@ -157,6 +157,9 @@ def show_verdict(verdict: "Verdict", *, as_json: bool) -> None:
             f" promoted {_ms(f.promoted_ms)}, next good reply {_ms(f.recovered_ms)},"
             f" blackout {_ms(f.blackout_ms)}"
         )
+    for handled in verdict.intervals:
+        if handled.of_fault:
+            print(shown(f"  handled    {handled}"))
     for one in verdict.adaptations:
         took = f", blackout {_ms(one.blackout_ms)}, total {_ms(one.total_ms)}" if one.total_ms else ""
         print(shown(f"  adaptation {one}{took}"))

@@ -451,7 +451,7 @@ def inverse(
     drained: list[str] = []  # nodes
     if Resume(first) in steps:
         moved = [s.node for s in steps if isinstance(s, Migrate) and s.node in reached.replaced]
-        back += [Suspend(first), *(Drain(brick) for brick in drains), *(Migrate(node) for node in moved)]
+        back += [Suspend(first), *(Drain(brick) for brick in drains), *_at_once(map(Migrate, moved))]
         drained = [reached.graph.node_of(brick) for brick in drains]
     back += _at_once(Retire(node) for node in reached.staged)
     rebound = _links_back(graph, reached)

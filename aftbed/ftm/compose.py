@@ -10,6 +10,7 @@ the place of the ROS master.
 """
 
 import contextlib
+import itertools
 from typing import Final
 
 import msgspec
@@ -17,7 +18,7 @@ import msgspec
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.graph import PLACEMENTS, BrickSpec, Graph, Link
 from aftbed.ftm.declaration import FaultClass
-from aftbed.ftm.registry import KINDS, MECHANISMS, REPLY_CHECKERS
+from aftbed.ftm.registry import BRICKS, KINDS, MECHANISMS, REPLY_CHECKERS
 
 REPLICAS: Final = ("a", "b")
 NONE: Final = "none"
@@ -82,6 +83,23 @@ def chain(graph: Graph, replica: str) -> tuple[str, ...]:
 
     visit(f"{replica}/protocol")
     return (*found, *sorted(ahead), *(bricks & {server}))
+
+
+def path(graph: Graph, replica: str = REPLICAS[0]) -> list[str]:
+    """The bricks that a request and its reply pass, in order; what goes to the backup is left out."""
+    if graph.ftm == NONE:
+        return ["client", "proxy", f"{replica}/server", "proxy", "client"]
+    found = ["client", "proxy"]
+    for name in chain(graph, replica)[:-1]:
+        found += [name, *[f"{replica}/server", name] * BRICKS[graph.brick(name).kind].asks_server]
+        if name.endswith("after"):
+            found.append(f"{name.removesuffix('after')}protocol")
+    return [*found, "proxy", "client"]
+
+
+def hops(graph: Graph) -> int:
+    """The number of channels between processes that a request and its reply pass."""
+    return sum(a != b for a, b in itertools.pairwise(graph.node_of(name) for name in path(graph)))
 
 
 EXPRESSIONS: Final = _expressions()

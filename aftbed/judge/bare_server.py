@@ -137,7 +137,7 @@ class ReferenceRun(msgspec.Struct, frozen=True):
 
     def rule(self, number: int) -> ReplyRule:
         """By which the reply to request `number` is compared."""
-        return next(rule for rule in reversed(self.rules) if rule.first <= number)
+        return next((rule for rule in reversed(self.rules) if rule.first <= number), self.rules[0])
 
     def is_wrong(self, number: int, reply: bytes, expected: bytes) -> bool:
         """Whether `reply` cannot be taken for the one that is expected to request `number`."""

@@ -201,21 +201,43 @@ def requests(history: History, reference: ReferenceRun, late_ns: int = LATE_NS) 
     )
 
 
-def failovers(history: History, faults: Sequence[FaultReport] = ()) -> list[Failover]:
-    """Each change of master, in order. `faults` are those of the run, in the order of their numbers."""
-    epochs = _epochs(history)
+class MasterChange(NamedTuple):
+    """What the record has of one change of master. `strike`: of the fault that ended the last one."""
+
+    epoch: int
+    strike: Record | None
+    alarm: Record | None
+    fence: Record | None
+    promoted: Record
+
+    @property
+    def fault_number(self) -> int:
+        """Which of the run's faults ended the last master, from 0 on; -1: none is known to."""
+        return -1 if self.strike is None else number_of(self.strike)
+
+
+def master_changes(history: History, faults: Sequence[FaultReport] = ()) -> list[MasterChange]:
+    """Each one, in order. `faults` are those of the run, in the order of their numbers."""
     fences, alarms = history.events(Event.REPLICA_FENCED), history.events(Event.WATCHDOG_SUSPECT)
     strikes = history.events(Event.FAULT_APPLIED)
     actions = [parse(report.fault) for report in faults]
     found, since_ns = [], 0
     for promoted in history.events(Event.REPLICA_PROMOTED):
-        epoch = promoted.detail
         fence = _last_before(fences, promoted.t_ns)
         alarm = _last_before(alarms, (fence or promoted).t_ns)
-        first = alarm or fence or promoted
-        fault = _cause(strikes, actions, since_ns, first, fence)
+        strike = _cause(strikes, actions, since_ns, alarm or fence or promoted, fence)
+        found.append(MasterChange(promoted.detail, strike, alarm, fence, promoted))
         since_ns = promoted.t_ns
-        start_ns = (fault or first).t_ns
+    return found
+
+
+def failovers(history: History, faults: Sequence[FaultReport] = ()) -> list[Failover]:
+    """Each change of master, in order. `faults` are those of the run, in the order of their numbers."""
+    epochs = _epochs(history)
+    found = []
+    for change in master_changes(history, faults):
+        epoch, fault, alarm, fence, promoted = change
+        start_ns = (fault or alarm or fence or promoted).t_ns
         service = epochs.get(epoch)
         reply = service.first if service is not None else None
         blackout_ms = None
@@ -229,7 +251,7 @@ def failovers(history: History, faults: Sequence[FaultReport] = ()) -> list[Fail
         )
         cause = "fault" if fault else "alarm" if alarm else "unknown"
         times_ms = (detected_ms, fenced_ms, promoted_ms, recovered_ms, blackout_ms)
-        words = "" if fault is None else faults[_number_of(fault)].fault
+        words = "" if fault is None else faults[change.fault_number].fault
         found.append(Failover(epoch, cause, *times_ms, fault=words))
     return found
 
@@ -261,6 +283,17 @@ def _epochs(history: History) -> dict[int, _Service]:
     }
 
 
+def served_by(history: History) -> list[tuple[int, str]]:
+    """From when on each replica was the one whose replies were accepted, in the order of time."""
+    firsts = sorted((service.first for service in _epochs(history).values()), key=lambda r: r.t_ns)
+    return [(record.t_ns, _replica_in(record)) for record in firsts]
+
+
+def _replica_in(record: Record) -> str:
+    """The replica that a fence or a reply is about; "" for a number that none has, in a damaged record."""
+    return dict(enumerate(REPLICAS, 1)).get(record.detail & 0xFF, "")
+
+
 def _cause(
     strikes: Sequence[Record],
     faults: Sequence[Fault],
@@ -275,10 +308,10 @@ def _cause(
     """
 
     def ended_it(strike: Record) -> bool:
-        number = _number_of(strike)
+        number = number_of(strike)
         if fence is None or not (0 <= number < len(faults) and since_ns <= strike.t_ns <= alarm.t_ns):
             return False
-        fault, fenced = faults[number], REPLICAS[(fence.detail & 0xFF) - 1]
+        fault, fenced = faults[number], _replica_in(fence)
         if not fault.action.stops_process or (fault.target != PRIMARY and replica_of(fault.target) != fenced):
             return False
         lasts_ns = fault.action.lasts_ms * 1_000_000
@@ -287,7 +320,7 @@ def _cause(
     return _last_before(filter(ended_it, strikes), alarm.t_ns)
 
 
-def _number_of(strike: Record) -> int:
+def number_of(strike: Record) -> int:
     """Which of the run's faults has struck, from 0 on."""
     return fault_and_bits(strike.detail)[0] - FIRST_FAULT
 

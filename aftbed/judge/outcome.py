@@ -17,9 +17,10 @@ from aftbed.judge import checks
 from aftbed.judge.checks import Evidence, corruptions
 from aftbed.runtime.deployment import digest
 
+LATENT: Final = "latent"  # a wrong state behind right replies
 OUTCOMES: Final = (  # from the best to the worst
     "masked",
-    "latent",  # a wrong state behind right replies
+    LATENT,
     "tolerated",
     "degraded",  # late replies, a recovery over its budget, or no redundancy at the end
     "detected_stop",
@@ -79,13 +80,13 @@ def outcome_of(evidence: Evidence) -> tuple[str, tuple[str, ...]]:
         found["tolerated"] = f"the mechanism acted: {', '.join(acted)}"
     states = set(record.end.states.values()) if record.end is not None and not reference.tolerance else set()
     if history.events(Event.FOLLOWER_DIVERGED) or len(states) > 1:
-        found["latent"] = "the replicas differ"
+        found[LATENT] = "the replicas differ"
     elif (
         states
         and reference.deterministic
         and not (wrong or reference.unknown)
         and states != {digest(reference.state)}
     ):
-        found["latent"] = "the state of the replicas is not the bare server's"
+        found[LATENT] = "the state of the replicas is not the bare server's"
     word = worst(list(found))
     return word, tuple(found[name] for name in sorted(found, key=OUTCOMES.index, reverse=True))

@@ -17,6 +17,7 @@ from aftbed.inject.hang import Hang
 from aftbed.inject.slow import Slow
 from aftbed.judge.asked import not_happened
 from aftbed.judge.checks import Evidence
+from aftbed.judge.intervals import FTTI, check_ftti
 from aftbed.judge.record import DriveEnd, Excuses, RunEnd, RunRecord
 from aftbed.judge.reference import reference_run, succession
 from aftbed.judge.verdict import Breach, Verdict, Word, broken, judge
@@ -42,10 +43,8 @@ def record_of(run: Run) -> RunRecord:
     named = (given.source, given.expect) if given is not None else ()
     load = LoadRun(setup.count, setup.rate_hz, *named)
     work: Work = CarRun(setup.scenario, None, "") if setup.scenario else load
-    asked = (setup.faults, setup.adaptations)
-    options = RunOptions(
-        "", "", "", setup.ftm, setup.placement, setup.seed, work, *asked, application=setup.application
-    )
+    what = (setup.ftm, setup.placement, setup.seed, work, setup.faults, setup.adaptations)
+    options = RunOptions("", "", "", *what, application=setup.application, ftti_ms=setup.ftti_ms)
     end = RunEnd(
         unfinished=rest.why_not,
         lost=rest.lost,
@@ -132,6 +131,8 @@ def verdict_of(run: Run, evidence: Evidence) -> Verdict:
     found = (*broken(evidence), *needless_stops(run))
     missed = not_happened(evidence.record)
     missed += [evidence.reference.unknown] if evidence.reference.unknown else []
+    ftti = check_ftti(evidence)
+    missed += [f"{FTTI}: {reason}" for reason in ftti.reasons] if ftti and ftti.finding == "unknown" else []
     word: Word = "fail" if found else "inconclusive" if missed else "pass"
     reasons = [*map(str, found), *missed]
     return msgspec.structs.replace(judge(evidence.record, evidence), verdict=word, reasons=reasons)

@@ -14,6 +14,7 @@ from aftbed.judge import checks
 from aftbed.judge.asked import CHECKS as ASKED_CHECKS
 from aftbed.judge.asked import AskedAdaptation, adaptations, check_asked
 from aftbed.judge.checks import Check, Checker, Evidence, Failover, Requests
+from aftbed.judge.intervals import FTTI, HandlingIntervals, check_ftti, intervals
 from aftbed.judge.isolated import reference_of
 from aftbed.judge.record import RunRecord
 from aftbed.judge.sources import function_failures
@@ -43,6 +44,7 @@ CHECKERS: Final = (  # a new check is one line here; its name is its key in ever
     Checker("at_rest", "", checks.check_at_rest),
     Checker("assertions", "", checks.check_assertions),
     Checker(checks.VEHICLE, "", checks.check_vehicle),
+    Checker(FTTI, "", check_ftti),
 )
 
 
@@ -64,6 +66,7 @@ class Verdict(msgspec.Struct, frozen=True):
     requests: Requests
     vehicle: VehicleResult | None
     failovers: list[Failover]
+    intervals: list[HandlingIntervals]
     adaptations: list[AskedAdaptation]
     ftm_at_end: str  # "" where the supervisor did not live to report it
     checks: dict[str, str]
@@ -128,6 +131,7 @@ def judge(record: RunRecord, evidence: Evidence | None = None) -> Verdict:
         requests=checks.requests(history, evidence.reference, checks.late_after_ns(options.work)),
         vehicle=record.vehicle,
         failovers=checks.failovers(history, record.faults),
+        intervals=intervals(evidence),
         adaptations=adaptations(record),
         ftm_at_end=record.end.hosted.ftm if record.end is not None and record.end.hosted is not None else "",
         checks={name: check.finding for name, check in found.items()},

@@ -27,8 +27,8 @@ from aftbed.judge.outcome import OUTCOMES, UNKNOWN
 from aftbed.report import plots
 from aftbed.report.plots import Limit, milliseconds
 from aftbed.report.sequence import SpaceTime, space_time
+from aftbed.report.terminal import p99_bound, remedy
 from aftbed.report.terminal import places as places_text
-from aftbed.report.terminal import remedy
 from aftbed.report.worst import by_badness, rerun, slowness_ms
 
 TEMPLATES: Final = Path(__file__).resolve().parent / "templates"
@@ -39,6 +39,7 @@ METRICS: Final = {
     "recovery_ms": ("Recovery", "from the fault to the first good reply of the new master"),
     "blackout_ms": ("Blackout of a failover", "while a request waited and no replica could answer it"),
     "adapt_blackout_ms": ("Blackout of an adaptation", "while an adaptation kept the client waiting"),
+    "fhti_ms": ("FHTI", "from the fault to the next good reply, or to the detected stop"),
 }
 MEANINGS: Final = {
     "masked": "the client could not notice the fault",
@@ -93,6 +94,8 @@ def html_report(summary: Summary, ledger: Ledger, *, drawn: int = DRAWN_MAX) -> 
         failed_gates=sum(gate.word == "fail" for gate in summary.gates),
         unexpected=sum(stratum.unexpected for stratum in summary.strata),
         confidence=confidence_of(spec),
+        handled=[(stratum.name, stratum.handling) for stratum in summary.strata if stratum.handling],
+        p99_bound=p99_bound,
         environment=ledger.head.environment,
     )
 
@@ -267,6 +270,8 @@ def _limits(metric: str, spec: Spec, strata: Iterable[str]) -> Iterator[Limit]:
     names = list(strata)
     if metric == "recovery_ms" and spec.recovery_budget_ms is not None:
         yield Limit(f"budget {spec.recovery_budget_ms:g} ms", spec.recovery_budget_ms)
+    if metric == "fhti_ms" and spec.ftti:
+        yield Limit(f"FTTI {spec.ftti}", spec.ftti_ms)
     for gate in spec.gates:
         of, _, which = gate.metric.rpartition("_")
         if of == metric and any(fnmatch(name, gate.strata) for name in names):

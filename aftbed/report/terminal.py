@@ -15,7 +15,15 @@ from typing import TYPE_CHECKING, Final, Self
 
 from aftbed.campaign.experiment import Result
 from aftbed.campaign.statistics import Interval
-from aftbed.campaign.summary import NOT_ALL, GateResult, StratumSummary, Summary, TimeSummary
+from aftbed.campaign.summary import (
+    NOT_ALL,
+    Coverage,
+    GateResult,
+    Handling,
+    StratumSummary,
+    Summary,
+    TimeSummary,
+)
 from aftbed.campaign.weaknesses import SeenPlace, Weakness
 from aftbed.core.errors import shown
 from aftbed.judge.outcome import OUTCOMES
@@ -47,6 +55,8 @@ def summary_lines(summary: Summary) -> list[str]:
     """Strata and gates as tables, the verdict last."""
     lines = [_head(summary), *_really(summary)]
     lines += ["", *_aligned([_STRATUM, *map(_stratum, summary.strata)])] if summary.strata else []
+    handled = [_handled(one.name, one.handling) for one in summary.strata if one.handling is not None]
+    lines += ["", *_aligned([_HANDLED, *handled])] if handled else []
     vacuous = [gate for gate in summary.gates if gate.value == 1.0 and gate.limit == NOT_ALL]
     left_out = vacuous[PLACES_MAX:]
     gates = [gate for gate in summary.gates if gate not in left_out]
@@ -57,6 +67,10 @@ def summary_lines(summary: Summary) -> list[str]:
 
 
 _STRATUM: Final = ("stratum", "runs", "outcomes", "unexpected", "recovery p50, p99")
+_HANDLED: Final = (
+    *("handling of faults", "FDTI p50, p99", "FRTI p50, p99", "FHTI p50, p99, max", "p99 at most"),
+    *("max / bound", "coverage", "reactions"),
+)
 _GATE: Final = ("gate", "metric", "strata", "allowed", "measured", "judged by", "because")
 
 
@@ -99,6 +113,33 @@ def _share(interval: Interval) -> str:
 
 def _times(times: TimeSummary | None) -> str:
     return "-" if times is None else f"{times.p50:.3g}, {times.p99:.3g} ms"
+
+
+def _handled(name: str, found: Handling) -> tuple[str, ...]:
+    times = found.fhti_ms
+    longest = "" if times is None else f", {times.max:.3g}"
+    covered = found.coverage
+    return (
+        name,
+        _times(found.fdti_ms),
+        _times(found.frti_ms),
+        "-" if times is None else f"{times.p50:.3g}, {times.p99:.3g}{longest} ms",
+        p99_bound(times),
+        "-" if found.of_bound is None else f"{found.of_bound:.2f} of {found.bound_ms:.4g} ms",
+        "-" if covered is None else f"{_share(covered.interval)}{_latent(covered)}",
+        _outcomes({reaction: count for reaction, count in found.reactions.items() if count}),
+    )
+
+
+def p99_bound(times: TimeSummary | None) -> str:
+    """What the p99 does not exceed, or of how few values nothing is known."""
+    if times is None:
+        return "-"
+    return f"not known of {times.count}" if times.p99_bound is None else f"{times.p99_bound:.3g} ms"
+
+
+def _latent(found: Coverage) -> str:
+    return f", {found.latent} latent" if found.latent else ""
 
 
 def _gate(gate: GateResult) -> tuple[str, ...]:

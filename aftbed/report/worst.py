@@ -41,7 +41,7 @@ def by_badness(results: Iterable[Result]) -> list[Result]:
 
 def slowness_ms(result: Result) -> float:
     """The longest of its times."""
-    times = (result.recovery_ms, result.blackout_ms, result.adapt_blackout_ms)
+    times = (result.recovery_ms, result.blackout_ms, result.adapt_blackout_ms, result.fhti_ms)
     return max((t for t in times if t is not None), default=0.0)
 
 

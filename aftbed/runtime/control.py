@@ -149,14 +149,17 @@ class ResumeNode(ControlOrder, frozen=True):
 
 
 class Capture(ControlOrder, frozen=True):
-    """Answer with the state of `brick`."""
+    """Answer with the state of `brick`, or put it into the file that came along, if it is large."""
 
     brick: str
     look: bool = False  # at what is there; it is not going to be used
 
 
 class Restore(ControlOrder, frozen=True):
-    """Take over `state`; `migrate`: of a brick of another class, or with another function, perhaps."""
+    """Take over `state`, or what is in the file that came along.
+
+    `migrate`: of a brick of another class, or with another function, perhaps.
+    """
 
     brick: str
     state: bytes

@@ -31,7 +31,7 @@ from aftbed.inject.targets import Roles, TargetProcess
 from aftbed.runtime import control
 from aftbed.runtime.deployment import Deployment, Keys
 from aftbed.runtime.interface import Met, Process, SharedMemory
-from aftbed.runtime.tasks import Key, Wait
+from aftbed.runtime.tasks import Key, Wait, death_of
 
 
 class NoHost(StepFailed):
@@ -288,8 +288,7 @@ class FaultController:
         self._runtime.journal.write(self._loop.now_ns(), Event.FAULT_APPLIED, 0, injection.number)
 
     def until_dead(self, processes: Iterable[TargetProcess]) -> Steps[None]:
-        dead: set[Key] = {("died", p.name, p.pid) for p in processes}
-        yield Wait(frozenset(dead))
+        yield Wait(frozenset(death_of(p.pid) for p in processes))
 
     def slow_down(self, process: TargetProcess, number: int, by_ns: int, share: float) -> tuple[Key, str]:
         return self._deployment.order(

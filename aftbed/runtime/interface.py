@@ -83,6 +83,22 @@ class SharedMemory(Protocol):
         ...
 
 
+class StateFile(Protocol):
+    """Where a node puts a state that is too large for its answer; the next node reads it from there."""
+
+    def fileno(self) -> int:
+        """The number that travels with an order."""
+        ...
+
+    def used(self) -> bool:
+        """Whether a node has put a state there."""
+        ...
+
+    def close(self) -> None:
+        """Let go of it."""
+        ...
+
+
 class ProcessKind(Enum):
     """What a process of a run is used for."""
 
@@ -237,6 +253,10 @@ class Runtime(Protocol):
 
     def shared_memory(self) -> SharedMemory:
         """A fresh one, all zero."""
+        ...
+
+    def state_file(self) -> StateFile | None:
+        """A fresh one; None where an answer holds any state."""
         ...
 
     def device(self, kind: str, incarnation: int) -> tuple[str, bytes]:

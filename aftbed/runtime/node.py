@@ -88,6 +88,17 @@ class NodeIO(Protocol[In, Out]):
         """The shared memory that came with an order as `number`."""
         raise AssertionError(f"no memory {number}")
 
+    def put_state(self, number: int, state: bytes) -> bytes:
+        """Put `state` into the file that came with an order, if it is too large for the answer to hold it.
+
+        The data of the answer.
+        """
+        raise AssertionError(f"no file {number}")
+
+    def state_in(self, number: int) -> bytes:
+        """The state in the file that came with an order. Raises PeerError."""
+        raise AssertionError(f"no file {number}")
+
     # -- channels
 
     def open_input(self, hosted: HostedBrick[In, Out], port: str, number: int) -> In:
@@ -560,11 +571,12 @@ class Node(Generic[In, Out]):
                 self.suspended, self.suspend_token = False, 0
             case control.Capture(_, brick, looks):
                 found = self.bricks[brick].brick
-                return look(found) if looks else found.capture()
+                captured = look(found) if looks else found.capture()
+                return self.io.put_state(fds.pop(), captured) if fds else captured
             case control.Restore(_, brick, state, migrate):
                 taker = self.bricks[brick].brick
                 take = getattr(taker, "migrate", taker.restore) if migrate else taker.restore
-                take(state)
+                take(self.io.state_in(fds.pop()) if fds else state)
             case control.Deliver(_, brick, message):
                 self.step(self.bricks[brick], CONTROL, message)
             case control.WatchNodes(_, replica, generation, nodes):

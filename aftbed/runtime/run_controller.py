@@ -22,6 +22,7 @@ from aftbed.runtime.deployment import HANG_NS, Deployment
 from aftbed.runtime.fault_controller import FaultController
 from aftbed.runtime.interface import LIGHT, Process, ProcessKind, Runtime
 from aftbed.runtime.script_executor import ScriptExecutor
+from aftbed.runtime.tasks import death_of
 
 RETRY_SECONDS: Final = 0.002
 AGAIN_SECONDS: Final = 0.02
@@ -164,7 +165,7 @@ class RunController:
     def on_death(self, process: Process) -> None:
         """A process is dead; that was intended only if its kind is `killed`."""
         self._runtime.journal.write(self._loop.now_ns(), Event.NODE_DIED, 0, process.pid)
-        self._loop.tasks.settle(("died", process.name, process.pid))
+        self._loop.tasks.settle(death_of(process.pid))
         if process.kind is ProcessKind.KILLED or self.ending:
             return
         self._runtime.log("died", f"{process.name} (pid {process.pid})")

@@ -67,8 +67,8 @@ from aftbed.runtime.deployment import (
     key_of,
     replica_of,
 )
-from aftbed.runtime.interface import LIGHT, Channel, Process, ProcessKind
-from aftbed.runtime.tasks import Key, Wait, run_after_first_yield
+from aftbed.runtime.interface import LIGHT, Channel, Process, ProcessKind, StateFile
+from aftbed.runtime.tasks import Key, Wait, death_of, run_after_first_yield
 
 Ends = dict[tuple[str, str], int]  # brick, port -> descriptor, or NOWHERE
 PortOrder = tuple[tuple[control.Port, ...], tuple[control.Port, ...], tuple[int, ...]]  # in, out, descriptors
@@ -105,6 +105,7 @@ class PortChanges:
         return ports(self.inputs), ports(self.outputs), tuple(fds)
 
 
+Move = tuple[str, Process, Process, StateFile | None]  # a brick, which gives its state, which takes it
 Changes = dict[int, PortChanges]  # by the identity of the process
 Present = tuple[list[Process], list[Channel]]
 
@@ -241,6 +242,15 @@ class Rebinding:
         return self._deployment.order(
             change.process, lambda token: control.Rewire(token, inputs, outputs, epoch, suspend), fds
         )
+
+
+def _descriptors(file: StateFile | None) -> tuple[int, ...]:
+    return () if file is None else (file.fileno(),)
+
+
+def _migrated(step: Step) -> list[str]:
+    """The nodes whose state `step` moves."""
+    return [one.node for one in flat((step,)) if isinstance(one, Migrate)]
 
 
 def _of(changes: Changes, process: Process) -> PortChanges:
@@ -491,7 +501,7 @@ class Execution:
 
         Done when requests have been let on, so that the client does not wait for it.
         """
-        migrated = [step.node for step in flat(self.done) if isinstance(step, Migrate)]
+        migrated = [node for step in self.done for node in _migrated(step)]
         for node, brick in [(n, b) for n in migrated for b in self.old.nodes[n] if b in self.new.nodes[n]]:
             before, after = self.old.brick(brick), self.new.brick(brick)
             if (before.source, before.application) == (after.source, after.application):
@@ -535,8 +545,8 @@ class Execution:
                 yield from self._transfer(source, sink)
             case Align(source, sink):
                 self._align(source, sink)
-            case Migrate(node):
-                yield from self._migrate(self.old, self.new, node, self._staged)
+            case Migrate() | Together((Migrate(), *_)):
+                yield from self._migrate(self.old, self.new, _migrated(step), self._staged)
             case Bind() | Unbind() | Exchange():
                 yield from self._rebind((step,))
             case Together(steps) if len(resumes) == len(steps):
@@ -610,21 +620,49 @@ class Execution:
             if blake2b(wanted).digest() != blake2b(found).digest():
                 yield from self._restore(process, sink, wanted)
 
-    def _migrate(self, given: Graph, taken: Graph, node: str, takers: dict[str, Process]) -> Keys:
-        """The state of every brick that `node` has in both graphs. One that has no state needs no taker."""
-        giver, taker = self._deployment.process(node), takers[node]
-        for brick in given.nodes[node]:
-            if brick in taken.nodes[node]:
-                state = yield from self._capture(giver, brick)
-                if state:
-                    before, after = given.brick(brick), taken.brick(brick)
-                    try:
-                        yield from self._restore(taker, brick, state, migrate=before != after)
-                    except StepFailed as failure:
-                        if before.application == after.application:
-                            raise
-                        names = (one.application or "the built-in function" for one in (after, before))
-                        raise StepFailed("{} takes no state of {}: {}".format(*names, failure)) from failure
+    def _migrate(self, given: Graph, taken: Graph, nodes: Iterable[str], takers: dict[str, Process]) -> Keys:
+        """The state of every brick that a node has in both graphs. One that has no state needs no taker.
+
+        All are asked at once, and each state goes on as soon as it is there.
+        """
+        moves = [
+            (brick, self._deployment.process(node), takers[node], self._runtime.state_file())
+            for node in nodes
+            for brick in given.nodes[node]
+            if brick in taken.nodes[node]
+        ]
+        try:
+            yield from self._moved(given, taken, moves)
+        finally:
+            for *_, file in moves:
+                if file is not None:
+                    file.close()
+
+    def _moved(self, given: Graph, taken: Graph, moves: Sequence[Move]) -> Keys:
+        order = self._deployment.order
+        asked = [
+            order(giver, partial(control.Capture, brick=brick), _descriptors(file))
+            for brick, giver, _, file in moves
+        ]
+        involved = frozenset(name for _, name in asked)
+        restored: list[tuple[str, Sent]] = []
+        for (brick, _, taker, file), (key, _) in zip(moves, asked, strict=True):
+            state = (yield Wait(frozenset({key}), involved, STEP_SECONDS_MAX))[key]
+            in_file = file is not None and file.used()
+            if state or in_file:
+                migrate = given.brick(brick) != taken.brick(brick)
+                restore = partial(control.Restore, brick=brick, state=state, migrate=migrate)
+                restored.append((brick, order(taker, restore, _descriptors(file) if in_file else ())))
+        involved = frozenset(name for _, (_, name) in restored)
+        for brick, (key, _) in restored:
+            before, after = given.brick(brick), taken.brick(brick)
+            try:
+                yield Wait(frozenset({key}), involved, STEP_SECONDS_MAX)
+            except StepFailed as failure:
+                if before.application == after.application:
+                    raise
+                names = (one.application or "the built-in function" for one in (after, before))
+                raise StepFailed("{} takes no state of {}: {}".format(*names, failure)) from failure
 
     # -- steps of a failover ------------------------------------------------------------------
 
@@ -784,8 +822,11 @@ class Execution:
                 yield from self._unless_lost(brick, self._suspend(brick, drain=False))
             case Drain(brick):
                 yield from self._unless_lost(brick, self._suspend(brick, drain=True))
-            case Migrate(node):
-                yield from self._unless_lost(node, self._migrate(self.new, self.old, node, self._replaced))
+            case Together((Migrate(), *_)):
+                for node in _migrated(step):
+                    yield from self._unless_lost(
+                        node, self._migrate(self.new, self.old, [node], self._replaced)
+                    )
             case Kill(replica):
                 self._kill(replica)
             case Together(steps) if isinstance(steps[0], Retire):
@@ -844,7 +885,7 @@ class Execution:
         for process in living:
             end(process)
         with suppress(StepFailed):
-            yield Wait(frozenset(("died", p.name, p.pid) for p in living), seconds=STEP_SECONDS_MAX)
+            yield Wait(frozenset(death_of(p.pid) for p in living), seconds=STEP_SECONDS_MAX)
 
     def _resume_living(self, bricks: Iterable[str]) -> None:
         """What was suspended goes on, but for a lost replica."""
@@ -863,6 +904,4 @@ def end(process: Process) -> None:
 
 def _rebinds(step: Step) -> bool:
     """Whether `step` is about channels and places."""
-    if isinstance(step, Together):
-        return not all(isinstance(inner, Resume) for inner in step.steps)
-    return isinstance(step, Bind | Unbind | Exchange)
+    return all(isinstance(one, Bind | Unbind | Exchange) for one in flat((step,)))

@@ -19,6 +19,11 @@ STATS_TASK: Final = "stats"
 Key = tuple[str, str, int]
 
 
+def death_of(pid: int) -> Key:
+    """The death of a process, whose name may change while it is waited for: an adaptation exchanges it."""
+    return ("died", f"pid {pid}", pid)
+
+
 class Wait(msgspec.Struct, frozen=True):
     """`involved`: names of processes whose death fails the step."""
 

@@ -7,11 +7,11 @@ from homes import Home
 
 from aftbed.bench.ballast import SIZE_BYTES_MAX
 from aftbed.bench.campaign import forks_ms, requests_ms
-from aftbed.bench.cycle import RingShape, RingWork, hops, ring_of, ring_us
+from aftbed.bench.cycle import RingShape, RingWork, ring_of, ring_us
 from aftbed.bench.recovery import DEATHS_MIN, deaths_ms
 from aftbed.bench.sweep import captured_bytes, state_work
 from aftbed.core.errors import HarnessError
-from aftbed.ftm.compose import EXPRESSIONS, build
+from aftbed.ftm.compose import EXPRESSIONS, build, hops
 from aftbed.ftm.pages import PAGE_BYTES
 
 # -- its shape

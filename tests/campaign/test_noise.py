@@ -3,7 +3,8 @@
 import pytest
 from campaigns import result
 
-from aftbed.campaign.experiment import STARVED_MS_MIN, Probe, starved, without_times
+from aftbed.campaign.experiment import Probe, without_times
+from aftbed.judge.intervals import STARVED_MS_MIN, starved
 
 
 @pytest.mark.parametrize(

@@ -57,6 +57,10 @@ def all_words(error: str, *words: str) -> bool:
     [
         (("--scenario", "ccrs50"), ("unknown scenario 'ccrs50'", "did you mean 'ccrs-50'", "free-drive")),
         (("--scenario", ""), ("unknown scenario ''", "ccrs-50")),
+        (("--ftti", "19ms"), ("--ftti 19ms: shorter than a cycle of 20ms",)),
+        (("--load", "10@100", "--ftti", "9ms"), ("--ftti 9ms: shorter than a cycle of 10ms",)),
+        (("--ftti", "100"), ("--ftti '100': a positive number with its unit is allowed",)),
+        (("--ftti", "0ms"), ("--ftti '0ms': a positive number",)),
         (("--scenario", "absent.yaml"), ("absent.yaml", "No such file")),
         (("--scenario", "/"), ("/", "directory")),
         (("--ftm", "pbrr"), ("unknown FTM 'pbrr'", "did you mean 'pbr'", "none")),

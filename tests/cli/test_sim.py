@@ -65,6 +65,27 @@ def test_one_run_is_printed_between_its_seeds(sim: Call) -> None:
     assert lines[-2] == "verdict: pass"
 
 
+def test_a_fault_that_is_handled_later_than_the_ftti_fails(sim: Call) -> None:
+    crash = ("--count", "20", "--faults", "crash primary at server.exit nth 3")
+    code, out, _ = sim(*crash, "--ftti", "10ms")
+    (line,) = [line for line in out.splitlines() if line.startswith("  handled    ")]
+    assert code == 0 and re.search(
+        r": operational, FHTI 0\.\d+ ms, at most 2\.936 \(FDTI 0\.\d+, FRTI 0", line
+    )
+    code, out, _ = sim(*crash, "--ftti", "0.1ms")
+    assert code == 1 and "the FTTI is 0.1" in out
+    code, out, _ = sim(*crash, "--ftti", "0.1ms", "--json")
+    found = json.loads(out)
+    (interval,) = found["intervals"]
+    assert (found["verdict"], interval["reaction"], interval["latent"]) == ("fail", "operational", False)
+    assert interval["fdti_ms"] + interval["frti_ms"] == pytest.approx(interval["fhti_ms"], abs=0.002)
+
+
+def test_without_a_request_behind_the_fault_an_ftti_is_not_known(sim: Call) -> None:
+    code, out, _ = sim("--count", "20", "--faults", "crash primary after 60ms", "--ftti", "10ms")
+    assert code == 3 and "ftti: crash primary after 60ms: no request came after it" in out
+
+
 def test_the_same_seed_prints_the_same(sim: Call) -> None:
     arguments = ("--seed", "3", "--count", "20", "--rate", "900", "--faults", "crash backup after 4ms")
     first, second = (re.sub(r" in [0-9.]+ ms", "", sim(*arguments)[1]) for _ in range(2))

@@ -154,7 +154,7 @@ def test_its_hops_are_known_to_the_bench(project: Path) -> None:
     done = python(
         project,
         "-c",
-        "from aftbed.bench.cycle import hops\nfrom aftbed.ftm.compose import build\n"
+        "from aftbed.ftm.compose import build, hops\n"
         "assert hops(build('pbr+limit', 'process')) == hops(build('pbr', 'process')) + 4\n",
     )
     assert done.returncode == 0, done.stderr

@@ -10,6 +10,7 @@ from faultrun import FIRST, Run, run
 from aftbed.core.errors import StepFailed
 from aftbed.core.events import Event
 from aftbed.runtime import control
+from aftbed.runtime.tasks import death_of
 
 __all__ = ["run"]  # a fixture
 
@@ -129,7 +130,7 @@ def test_at_a_step_of_an_adaptation_the_target_is_dead_before_it_goes_on(run: Ru
     victims = run.deployment.slots["b"].nodes
     assert all(map(run.deployment.lives, victims))
     (wait,) = run.do(run.faults.at(Event.ADAPT_STEP_ENTER))
-    assert wait.keys == {("died", name, run.deployment.nodes[name].pid) for name in victims}
+    assert wait.keys == {death_of(run.deployment.nodes[name].pid) for name in victims}
     assert not any(map(run.deployment.lives, victims))
     assert run.reports() == [(str(fault), "activated", "")]
     assert run.do(run.faults.at(Event.ADAPT_STEP_ENTER)) == [], "once"

@@ -155,6 +155,18 @@ def test_a_fault_of_an_earlier_mastership_is_not_the_cause() -> None:
     assert [f.cause for f in checks.failovers(tale.history(), [CRASH])] == ["fault", "alarm"]
 
 
+def test_a_fence_of_a_replica_that_there_is_not_has_no_cause() -> None:
+    tale = Tale().served(1).note("a/server.1", Event.FAULT_APPLIED, detail=FIRST_FAULT)
+    tale.note("a/watchdog.1", Event.WATCHDOG_SUSPECT).fenced(9).promoted(2)
+    crash = FaultReport("crash a", ReceiptState.ACTIVATED)
+    assert [f.cause for f in checks.failovers(tale.history(), [crash])] == ["alarm"]
+
+
+def test_a_reply_to_request_0_is_compared() -> None:
+    tale = Tale().sent(0).answered(0, payload=b"").answered(0, payload=b"")
+    assert account_of(tale.history()).wrong == 1
+
+
 def test_each_failover_is_told_in_order() -> None:
     tale = a_failover(fault=True).fenced(2).promoted(3).served(3, epoch=3, replica=1)
     assert [f.epoch for f in checks.failovers(tale.history())] == [2, 3]

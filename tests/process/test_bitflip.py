@@ -20,6 +20,7 @@ from aftbed.core.graph import PLACEMENTS
 from aftbed.core.journal import Record
 from aftbed.ftm.compose import EXPRESSIONS, replication_of
 from aftbed.inject.model import parse
+from aftbed.judge.intervals import Reaction
 from aftbed.judge.record import RunRecord, read_record
 from aftbed.judge.verdict import Verdict
 from aftbed.runtime.unix import control_client, run_directory
@@ -93,6 +94,7 @@ def test_a_flipped_result_reaches_the_client_and_fails(tmp_path: Path, ftm: str)
     assert ran.receipts == ["activated"]
     assert ran.details == [f"bit {STAGE} of the result of request {HIT} in a/server"]
     assert ran.hits() == [("a/server", HIT)]
+    assert [(one.reaction, one.fhti_ms) for one in ran.verdict.intervals] == [(Reaction.NONE, None)]
 
 
 def test_a_flipped_state_stays_wrong(tmp_path: Path) -> None:

@@ -11,7 +11,10 @@ from liveruns import SHORT, aftbed
 from requestpath import REQUEST_PATH
 from sampling import every
 
+from aftbed.ftm.failover import HANG_DEADLINE_NS
+from aftbed.judge.intervals import Reaction
 from aftbed.judge.verdict import Verdict
+from aftbed.runtime.devices import LOOK_NS
 
 pytestmark = pytest.mark.process
 
@@ -106,7 +109,12 @@ def test_a_crash_during_the_failover_is_masked_too(fault: str, failovers: int) -
 
 
 def test_a_replica_that_hangs_is_replaced() -> None:
-    assert_masked(drive("hang primary at server.enter nth 60"), failovers=1)
+    verdict = drive("hang primary at server.enter nth 60")
+    assert_masked(verdict, failovers=1)
+    (found,) = verdict.intervals
+    assert found.reaction is Reaction.OPERATIONAL and found.fdti_ms is not None and found.frti_ms is not None
+    assert found.fdti_ms >= (HANG_DEADLINE_NS - LOOK_NS) / 1e6 and found.frti_ms > 0
+    assert found.fhti_ms == pytest.approx(found.fdti_ms + found.frti_ms, abs=0.002)
 
 
 def test_without_a_mechanism_a_crash_is_not_masked() -> None:

@@ -108,9 +108,18 @@ def test_every_kind_of_time_and_fault_has_its_plot(page: Page) -> None:
             f"Blackout of an adaptation, {fault}: share of runs over time in ms"
             for fault in ("crash primary", "hang primary", "bitflip result", "nothing")
         ),
+        *(
+            f"FHTI, {fault}: share of runs over time in ms"
+            for fault in ("hang primary", "crash primary", "bitflip result")  # `none` handles no crash
+        ),
     ]
     said = "".join(page.text)
     assert said.count("budget 4 ms") == 2 and said.count("gate: p50 at most 3 ms") == 1
+
+
+def test_the_handling_of_faults_has_its_table(page: Page) -> None:
+    said = "".join(page.text)
+    assert "Handling of faults" in said and "not known of 3" in said and "3 detected, 0 tolerated" in said
 
 
 def test_the_worst_runs_are_drawn_with_the_command_that_repeats_them(page: Page, ledger: Ledger) -> None:

@@ -23,7 +23,7 @@ def test_it_loads_in_silence_with_all_in_its_place(ledger: Ledger, tmp_path: Pat
     dom, console = in_browser(tmp_path, page, width=width)
     assert console == []
     assert "<title>measured 0 0 0 1 0</title>" in dom
-    assert dom.count('class="spacetime"') == DRAWN_MAX and dom.count('class="plot"') == 8
+    assert dom.count('class="spacetime"') == DRAWN_MAX and dom.count('class="plot"') == 11
 
 
 def test_long_names_are_broken_and_make_no_page_or_column_wider(ledger: Ledger, tmp_path: Path) -> None:

@@ -23,12 +23,23 @@ def test_the_lines_name_strata_gates_and_last_the_verdict(ledger: Ledger) -> Non
     assert lines[0] == f"campaign mixed, seed 7: {len(ledger.results)} experiments in 2.5 s"
     assert lines[-1] == "gate: fail"
     for stratum in summary.strata:
-        (line,) = [line for line in lines if line.startswith(f"{stratum.name}  ")]
+        line, *of_handling = [line for line in lines if line.startswith(f"{stratum.name}  ")]
         assert ", ".join(f"{name} {count}" for name, count in stratum.outcomes.items()) in line
+        assert bool(of_handling) is (stratum.handling is not None)
     for gate in summary.gates:
         assert any(
             line.startswith(gate.word) and gate.metric in line and gate.limit in line for line in lines
         )
+
+
+def test_the_handling_of_faults_has_its_times_its_bound_and_its_coverage(ledger: Ledger) -> None:
+    lines = summary_lines(summary_of(ledger))
+    head = next(line for line in lines if line.startswith("handling of faults "))
+    rows = lines[lines.index(head) + 1 : lines.index("", lines.index(head))]
+    crash = next(row for row in rows if row.startswith("lfr · steady · crash primary "))
+    assert "not known of 3" in crash and " of 2.936 ms " in crash and crash.endswith("operational 3")
+    wrong = next(row for row in rows if row.startswith("lfr · steady · bitflip result "))
+    assert wrong.endswith("none 3")
 
 
 def test_columns_are_aligned(ledger: Ledger) -> None:

@@ -79,3 +79,15 @@ def test_a_descriptor_that_is_no_file_is_refused_and_closed(pair: Pair) -> None:
         with pytest.raises(PeerError, match="at most 67108864 are allowed"):
             take(sink.fileno())
     assert len(list(Path("/proc/self/fd").iterdir())) == before
+
+
+@pytest.mark.parametrize("size", [0, 1, PACKET_BYTES_MAX, PACKET_BYTES_MAX + 1, 300_000])
+def test_a_state_is_in_the_answer_or_in_the_file_that_came_with_the_order(size: int) -> None:
+    before = len(list(Path("/proc/self/fd").iterdir()))
+    state, file = os.urandom(size), transport.MemfdState()
+    answered = transport.put_state(os.dup(file.fileno()), state)
+    assert file.used() == (size > PACKET_BYTES_MAX)
+    found = transport.read_file(os.dup(file.fileno())) if file.used() else answered
+    assert found == state and not (answered and file.used())
+    file.close()
+    assert len(list(Path("/proc/self/fd").iterdir())) == before

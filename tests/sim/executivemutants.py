@@ -61,14 +61,15 @@ def _of(part: str) -> Callable[..., bool]:
 
 
 def _is(*verbs: type) -> Callable[..., bool]:
-    return lambda self, verb: isinstance(verb, verbs)
+    return lambda self, verb: any(isinstance(one, verbs) for one in script.flat((verb,)))
 
 
 def _log_left_behind(right: Callable[..., object]) -> object:
-    def migrate(self: Execution, given: Graph, taken: Graph, node: str, takers: dict[str, Process]) -> object:
-        others = tuple(b for b in given.nodes[node] if not b.endswith("/protocol"))
-        thinner = replace(given, nodes=given.nodes | {node: others})
-        return right(self, thinner, taken, node, takers)
+    def migrate(
+        self: Execution, given: Graph, taken: Graph, nodes: list[str], takers: dict[str, Process]
+    ) -> object:
+        others = {n: tuple(b for b in given.nodes[n] if not b.endswith("/protocol")) for n in nodes}
+        return right(self, replace(given, nodes=given.nodes | others), taken, nodes, takers)
 
     return migrate
 
@@ -87,7 +88,9 @@ def _without(kind: type) -> Callable[..., object]:
     """The inverse of what was done, less the steps of that type."""
 
     def make(right: Callable[..., list[script.Step]]) -> object:
-        return lambda *args: [step for step in right(*args) if not isinstance(step, kind)]
+        return lambda *args: [
+            step for step in right(*args) if not any(isinstance(one, kind) for one in script.flat((step,)))
+        ]
 
     return make
 
@@ -294,7 +297,7 @@ EXECUTIVE: Final = (
         "ScriptExecutor goes back to the bricks of before, and leaves them the state of before",
         wrapped(script_executor, "inverse", _without(script.Migrate)),
         ADAPT,
-        adapts("pbr", "pbr+tr", "a", placement="replica", when=BEHIND),
+        adapts("pbr", "pbr+tr", "a", placement="replica", when=BEHIND, seeds=4),
         "G3",
     ),
     Mutant(
@@ -302,7 +305,7 @@ EXECUTIVE: Final = (
         "ScriptExecutor goes back as if no request had passed, where a commit fails after it let them on",
         wrapped(Execution, "_resume", _unnoticed),
         ADAPT,
-        adapts("pbr", "pbr+tr", "a", placement="replica", when=BEHIND),
+        adapts("pbr", "pbr+tr", "a", placement="replica", when=BEHIND, seeds=4),
         "G3",
     ),
     Mutant(

@@ -2,7 +2,7 @@
 
 import itertools
 
-from aftbed.runtime.sim.clock import HOP_QUANTILES_NS
+from aftbed.runtime.latencies import HOP_QUANTILES_NS
 
 
 def test_there_is_a_value_for_each_step_of_a_128th() -> None:

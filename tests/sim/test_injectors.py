@@ -8,15 +8,18 @@ from itertools import pairwise
 from typing import Final
 
 import pytest
+from planting import adapted, crash_after
 
 from aftbed.core.events import Event
 from aftbed.core.journal import EntryKind
 from aftbed.core.messages import Goal, Scheduled
 from aftbed.inject.model import parse
-from aftbed.inject.receipts import fault_and_bits
+from aftbed.inject.receipts import ReceiptState, fault_and_bits
 from aftbed.judge.checks import corruptions
 from aftbed.judge.reference import reference_run
-from aftbed.runtime.sim.world import Run, Setup, World, graph_of
+from aftbed.judge.simulated import breaches
+from aftbed.runtime.sim import processes
+from aftbed.runtime.sim.world import Run, Setup, World, graph_of, simulate
 from aftbed.vehicle.aeb.function import default_application
 
 COUNT: Final = 40
@@ -400,3 +403,14 @@ def test_a_fault_strikes_while_an_adaptation_is_observed() -> None:
     assert first and struck.t_ns == second[-1].t_ns
     assert 0 <= len(first) + len(second) - nth <= 1
     assert [o.outcome for o in run.adaptations] == ["rolled back"]
+
+
+@pytest.mark.parametrize("after_ms", [13.0, 31.0, 40.0])
+def test_a_death_that_is_seen_late_is_that_of_a_process_that_was_exchanged_meanwhile(
+    monkeypatch: pytest.MonkeyPatch, after_ms: float
+) -> None:
+    """An exchange gives a process another name; its death is waited for by its pid."""
+    monkeypatch.setattr(processes, "PIDFD_NS", (5_000_000, 5_000_001))
+    run = simulate(adapted("pbr", "lfr", crash_after("primary", after_ms), placement="replica"))
+    assert [fault.receipt for fault in run.faults] == [ReceiptState.ACTIVATED]
+    assert breaches(run) == ()

@@ -25,11 +25,10 @@ from aftbed.core.messages import ChannelEnded, Message
 from aftbed.inject.shared_state import SHARED_BYTES
 from aftbed.runtime import control
 from aftbed.runtime.devices import LOOK_NS
+from aftbed.runtime.latencies import COLD_PENALTY_NS, HOP_QUANTILES_NS, IDLE_BEFORE_COLD_NS
 from aftbed.runtime.node import HostedBrick, Node, NodeIO, Recorder
-from aftbed.runtime.sim.clock import HOP_QUANTILES_NS, Clock
+from aftbed.runtime.sim.clock import Clock
 
-IDLE_BEFORE_COLD_NS: Final = 20_000_000  # a reader that was idle for so long has lost its caches
-COLD_PENALTY_NS: Final = (10_000, 50_000)  # added to its next read: from, to
 QUEUE_MAX: Final = 128  # messages; a socket pair holds about as many small ones
 NEVER: Final = 1 << 62
 WRITE_NS_MAX: Final = 2_000_000_000  # a node that cannot write for so long takes itself for fenced

@@ -8,7 +8,6 @@ lifeline (the Watchdog), later by the executive, as on Linux: 0.1 to 0.3 ms, and
 import functools
 from collections import deque
 from collections.abc import Callable, Generator
-from typing import Final
 
 from aftbed.core.errors import ConfigError, FunctionFailedError, StepFailed
 from aftbed.core.journal import Record
@@ -16,19 +15,20 @@ from aftbed.runtime import control, interface
 from aftbed.runtime.assembly import Assembler
 from aftbed.runtime.devices import Device, Senses
 from aftbed.runtime.interface import ProcessKind
+from aftbed.runtime.latencies import (
+    BIRTH_NS,
+    FIRST_NS,
+    LIFELINE_NS,
+    LINE_NS,
+    PIDFD_NS,
+    ROUSED_NS,
+    SIGNAL_NS,
+    SLEEPS_AFTER_NS,
+)
 from aftbed.runtime.node import Node
 from aftbed.runtime.sim.clock import Clock
 from aftbed.runtime.sim.node_io import SimChannel, SimIO, SimNode, SimulatedMemory
 from aftbed.runtime.tasks import Key, Wait
-
-SIGNAL_NS: Final = (5_000, 60_000)
-LIFELINE_NS: Final = (100_000, 300_000)
-PIDFD_NS: Final = (500_000, 800_000)
-LINE_NS: Final = (15_000, 60_000)  # an order, or an answer
-FIRST_NS: Final = (100_000, 250_000)  # the first order of its kind runs code that no cache holds
-ROUSED_NS: Final = (200_000, 450_000)  # the executive sleeps while requests flow
-SLEEPS_AFTER_NS: Final = 5_000_000
-BIRTH_NS: Final = (500_000, 3_000_000)
 
 MakeDevice = Callable[[control.Assign, SimIO], Device]
 

@@ -89,6 +89,7 @@ class Setup(msgspec.Struct, frozen=True):
     application: str = ""
     given: GivenRequests | None = None
     page_bytes: int = PAGE_BYTES
+    ftti_ms: float = 0.0  # that the judge holds against each fault; 0: none
 
 
 class Rest(msgspec.Struct, frozen=True):
@@ -315,6 +316,9 @@ class World:
         cell = SimulatedMemory(len(self.pool.cells))
         self.pool.cells.append(cell)
         return cell
+
+    def state_file(self) -> None:
+        """An answer holds any state."""
 
     def device(self, kind: str, incarnation: int) -> tuple[str, bytes]:
         return {"watchdog": "sensor", "client": "source"}.get(kind, ""), b""

@@ -316,6 +316,7 @@ def options_for(
     bus_port: int = 0,
     bus_open: bool = False,
     application: str = "",
+    ftti_ms: float = 0.0,
 ) -> tuple[RunOptions, socket.socket | None]:
     """What a run needs; where there is a bus, its socket too. Raises ConfigError, leaving nothing."""
     faults = tuple(with_names_resolved(fault, work) for fault in faults)
@@ -346,6 +347,7 @@ def options_for(
         bus_open=bus_open,
         application=application,
         drive=drive,
+        ftti_ms=ftti_ms,
     )
     return options, listener
 

@@ -129,6 +129,14 @@ class UnixIO(NodeIO[Inlet, int]):
         """The memory behind that descriptor, which is closed."""
         return transport.map_memory(number)
 
+    def put_state(self, number: int, state: bytes) -> bytes:
+        """Into a memfd, which is closed."""
+        return transport.put_state(number, state)
+
+    def state_in(self, number: int) -> bytes:
+        """The content of a memfd, which is closed."""
+        return transport.read_file(number)
+
     # -- activity -----------------------------------------------------------------------------
 
     def _begin_wait(self) -> None:

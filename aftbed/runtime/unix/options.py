@@ -7,6 +7,7 @@ import msgspec
 
 from aftbed.core.errors import ConfigError
 from aftbed.core.messages import Scheduled
+from aftbed.core.units import duration, milliseconds
 from aftbed.inject.bus import BusFault
 from aftbed.inject.model import Fault
 from aftbed.vehicle.can.bus_model import NODES
@@ -66,7 +67,8 @@ class RunOptions(msgspec.Struct, frozen=True):
 
     `bus_open`: other users may attach to the bus, and the verdict stands whatever strangers send.
     `application`: the protected function that the run begins with, "" for the built-in one. `drive`: the
-    scenario of a CarRun as MessagePack, read once for all processes.
+    scenario of a CarRun as MessagePack, read once for all processes. `ftti_ms`: of bus time, the fault
+    tolerant time interval that the verdict holds against each fault; 0: none.
     """
 
     run: str
@@ -85,6 +87,7 @@ class RunOptions(msgspec.Struct, frozen=True):
     bus_open: bool = False
     application: str = ""
     drive: bytes = b""
+    ftti_ms: float = 0.0
 
 
 class SourceOptions(msgspec.Struct, frozen=True):
@@ -102,6 +105,30 @@ class SourceOptions(msgspec.Struct, frozen=True):
     incarnation: int = 1
     application: str = ""
     drive: bytes = b""
+
+
+def cycle_ms_of(work: Work) -> float:
+    """Between two requests, of a car in bus time; 0: each follows the reply before it, or as a log has it."""
+    match work:
+        case LoadRun(_, rate_hz):
+            return 1e3 / rate_hz if rate_hz else 0.0
+        case CarRun():
+            from aftbed.vehicle.can.dbc_file import own_dbc  # noqa: PLC0415 - as below
+
+            return own_dbc().cycle_us("RADAR_TRACK") / 1e3
+        case ReplayRun():
+            return 0.0
+
+
+def ftti_ms_of(what: str, text: str, work: Work) -> float:
+    """A fault tolerant time interval, as `100ms`. Raises ConfigError, also if it is shorter than a cycle."""
+    ftti_ms, cycle_ms = milliseconds(what, text), cycle_ms_of(work)
+    if ftti_ms < cycle_ms:
+        raise ConfigError(
+            f"{what} {text}: shorter than a cycle of {duration(cycle_ms)}: no fault can be handled before the"
+            " next request"
+        )
+    return ftti_ms
 
 
 def with_names_resolved(fault: Fault, work: Work) -> Fault:

@@ -36,7 +36,7 @@ from aftbed.runtime.unix.liveness import Starvation
 from aftbed.runtime.unix.options import COMMAND_GONE, LoadRun, RunOptions
 from aftbed.runtime.unix.process_pool import Started, UnixProcess, UnixProcessPool, reap
 from aftbed.runtime.unix.run_directory import HISTORY_NAME
-from aftbed.runtime.unix.transport import Line, MemfdMemory, UnixChannel, decode_order
+from aftbed.runtime.unix.transport import Line, MemfdMemory, MemfdState, UnixChannel, decode_order
 from aftbed.runtime.unix.workload import Workload
 from aftbed.vehicle.condition import Condition
 
@@ -71,6 +71,10 @@ class UnixRuntime:
     def shared_memory(self) -> MemfdMemory:
         """A fresh memfd."""
         return MemfdMemory()
+
+    def state_file(self) -> MemfdState:
+        """A fresh memfd."""
+        return MemfdState()
 
     def journal_of(self, node: str, incarnation: int) -> str:
         """A file for each incarnation of a node."""

@@ -37,6 +37,7 @@ _WEIGHT: Final = ANNOUNCED * PACKET_BYTES_MAX
 _RIGHTS_BYTES: Final = socket.CMSG_SPACE(4)
 NUDGE: Final = b"\0"
 ORDER_SECONDS: Final = 0.02  # a node that is suspended waits so long for an order, and looks around
+STATE_NAME: Final = "aftbed-state"  # as /proc/PID/fd shows it
 WRITE_SECONDS_MAX: Final = 2.0  # a node that cannot write for so long takes itself for fenced
 
 
@@ -61,11 +62,15 @@ def take(descriptor: int) -> bytes:
 def send_in_file(sock: socket.socket, data: bytes, beside: bytes = ANNOUNCED) -> None:
     """`data` as a memfd, in a packet of `beside`. Raises OSError as sendmsg(2) does."""
     assert len(data) <= STATE_BYTES_MAX, f"{len(data)} bytes"
-    with open(os.memfd_create("aftbed-state"), "wb", buffering=0) as file:
-        left = memoryview(data)
-        while left:
-            left = left[file.write(left) :]
+    with open(os.memfd_create(STATE_NAME), "wb", buffering=0) as file:
+        _write_whole(file.fileno(), data)
         sock.sendmsg([beside], [(socket.SOL_SOCKET, socket.SCM_RIGHTS, array.array("i", [file.fileno()]))])
+
+
+def _write_whole(descriptor: int, data: bytes) -> None:
+    left = memoryview(data)
+    while left:
+        left = left[os.write(descriptor, left) :]
 
 
 def read_file(descriptor: int) -> bytes:
@@ -161,6 +166,43 @@ class Line(Generic[Incoming]):
         """Close the socket."""
         with contextlib.suppress(OSError):
             self.sock.close()
+
+
+# -- states ---------------------------------------------------------------------------------------
+
+
+class MemfdState:
+    """A state that goes from node to node by way of the supervisor, which does not read it.
+
+    See `runtime.interface.StateFile`.
+    """
+
+    def __init__(self) -> None:
+        self._descriptor = os.memfd_create(STATE_NAME, os.MFD_CLOEXEC)
+
+    def fileno(self) -> int:
+        """The descriptor that is passed to both nodes."""
+        return self._descriptor
+
+    def used(self) -> bool:
+        """Whether something was written."""
+        return os.fstat(self._descriptor).st_size > 0
+
+    def close(self) -> None:
+        """A node keeps its own descriptor until it has read the state."""
+        os.close(self._descriptor)
+
+
+def put_state(descriptor: int, state: bytes) -> bytes:
+    """What an answer holds of `state`: all of a small one, nothing of one that is in the file now, closed."""
+    try:
+        if len(state) <= PACKET_BYTES_MAX:
+            return state
+        assert len(state) <= STATE_BYTES_MAX, f"{len(state)} bytes"
+        _write_whole(descriptor, state)
+        return b""
+    finally:
+        os.close(descriptor)
 
 
 # -- channels -------------------------------------------------------------------------------------

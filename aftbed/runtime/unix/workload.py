@@ -32,7 +32,7 @@ from aftbed.runtime.unix.run_directory import BUS_NAME
 from aftbed.vehicle.condition import Condition
 
 ATTACH_SECONDS_MAX: Final = 10.0
-LOAD_POLL_SECONDS: Final = (0.02, 0.25)  # between two questions how far a load has come: at least, at most
+LOAD_POLL_SECONDS: Final = (0.02, 0.5)  # between two questions how far a load has come: at least, at most
 STALL_SECONDS_MAX: Final = 3.0  # a recovery takes milliseconds, a loss is seen after half a second
 CYCLE_EVERY: Final = 10  # telemetry reports, after which the cycle time is shown
 VEHICLE: Final = "vehicle"

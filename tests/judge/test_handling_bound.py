@@ -1,0 +1,108 @@
+"""The bound of a fault's handling: above all that is simulated, near to it, and made of the scripts."""
+
+from collections import defaultdict
+
+import pytest
+
+from aftbed.core.script import Suspend
+from aftbed.ftm.compose import DUPLEX_EXPRESSIONS, EXPRESSIONS
+from aftbed.inject.channel import ChannelFault
+from aftbed.inject.crash import Crash
+from aftbed.inject.hang import Hang
+from aftbed.inject.model import parse
+from aftbed.inject.value import ValueFlip
+from aftbed.judge import handling_bound
+from aftbed.judge.handling_bound import STALL_NS, bound_ms, fhti_bound
+from aftbed.judge.intervals import intervals
+from aftbed.judge.simulated import evidence_of_run
+from aftbed.runtime.sim.world import Setup, simulate
+
+SEEDS = 5
+NEAR = {  # the least share of its bound that the worst of a few seeds comes to
+    "crash primary after {ms}ms": 0.2,
+    "hang primary after {ms}ms": 0.7,
+    "hang primary for 20ms after {ms}ms": 0.8,
+    "crash backup after {ms}ms": 0.05,
+    "hang backup after {ms}ms": 0.7,
+    "crash recovery after {ms}ms": 0.3,
+    "bitflip result nth {nth}": 0.05,
+}
+
+
+@pytest.mark.parametrize("ftm", ["pbr", "lfr+tr"])
+def test_what_is_simulated_stays_below_the_bound_and_near_to_it(ftm: str) -> None:
+    worst: dict[str, float] = defaultdict(float)
+    for words in NEAR:
+        for seed in range(SEEDS):
+            fault = parse(words.format(ms=2 + seed, nth=5 + seed))
+            rate_hz = 500 if "hang" in words else 0
+            run = simulate(Setup(ftm, "process", seed, 50, rate_hz, (fault,)))
+            (found,) = intervals(evidence_of_run(run))
+            if found.bound_ms is None or found.fhti_ms is None:
+                continue
+            assert found.fhti_ms <= found.bound_ms, (str(fault), seed)
+            worst[words] = max(worst[words], found.fhti_ms / found.bound_ms)
+    assert len(worst) >= 5
+    assert {words: share for words, share in worst.items() if share < NEAR[words]} == {}
+
+
+def test_which_faults_of_a_leader_have_a_bound() -> None:
+    of_crash = {ftm for ftm in EXPRESSIONS if fhti_bound(ftm, Crash) is not None}
+    assert of_crash == set(DUPLEX_EXPRESSIONS) == {ftm for ftm in EXPRESSIONS if fhti_bound(ftm, Hang)}
+    of_value = {ftm for ftm in EXPRESSIONS if fhti_bound(ftm, ValueFlip) is not None}
+    assert of_value == {"tr", "pbr+tr", "lfr+tr", "assert+tr", "pbr+assert", "lfr+assert"}
+    assert all(fhti_bound(ftm, ChannelFault) is None for ftm in EXPRESSIONS)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "crash proxy",  # its replacement is born
+        "hang recovery",
+        "bitflip result permanent",  # the same in all trials
+        "bitflip result at server.exit nth 3 in b",
+        "crash backup at server.exit",  # the leader waits for the injector
+        "slow primary by 2ms",
+        "omission aft2aft",
+    ],
+)
+def test_other_faults_have_none(words: str) -> None:
+    assert bound_ms("pbr", "process", parse(words)) is None
+
+
+def test_no_replica_is_left_where_one_process_has_both() -> None:
+    assert bound_ms("pbr", "single", parse("crash primary")) is None
+
+
+def test_the_bound_has_the_wait_for_the_next_request() -> None:
+    crash, hang = parse("crash primary"), parse("hang primary")
+    waits = {ms: bound_ms("pbr", "process", crash, period_ms=ms, simulated=True) for ms in (0.0, 2.0)}
+    assert waits[2.0] == pytest.approx((waits[0.0] or 0) + 2)
+    idle, busy = (bound_ms("pbr", "process", hang, period_ms=ms) for ms in (20.0, 10.0))
+    assert idle == pytest.approx((busy or 0) + 10 + 30), "a Watchdog looks less often at an idle replica"
+
+
+def test_on_real_processes_one_stop_of_the_machine_is_allowed() -> None:
+    crash = parse("crash primary")
+    real = bound_ms("pbr", "process", crash)
+    assert real == pytest.approx((bound_ms("pbr", "process", crash, simulated=True) or 0) + STALL_NS / 1e6)
+
+
+def test_a_step_more_in_the_script_of_a_failover_is_in_the_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+    before = fhti_bound("pbr", Crash)
+    declared = handling_bound.failover
+
+    def longer(dead: str, backup: str, epoch: int) -> handling_bound.Script:
+        script = declared(dead, backup, epoch)
+        fence, promote, *rest = script.commit
+        return handling_bound.Script(
+            script.purpose, dead, (), (fence, promote, promote, *rest), kind=script.kind
+        )
+
+    monkeypatch.setattr(handling_bound, "failover", longer)
+    assert fhti_bound("pbr", Crash) == pytest.approx((before or 0) + handling_bound.ORDER_NS / 1e6)
+    unknown = declared("a", "b", 2)
+    with pytest.raises(AssertionError, match="Suspend in a failover"):
+        handling_bound._fence_ns(
+            handling_bound.Script("", "", (), (Suspend("a/protocol"), *unknown.commit), kind=unknown.kind)
+        )
