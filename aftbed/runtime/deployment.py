@@ -273,14 +273,17 @@ class Deployment:
         got = yield Wait(frozenset({key}), frozenset({name}), seconds)
         return got[key]
 
-    def answers(self, sent: Iterable[Sent], seconds: float = STEP_SECONDS_MAX) -> Keys:
+    def answers(
+        self, sent: Iterable[Sent], seconds: float = STEP_SECONDS_MAX
+    ) -> Generator[Wait, dict[Key, bytes], dict[Key, bytes]]:
         """Wait for the answers to several orders. Raises StepFailed, also if a node has died before."""
         pairs = list(sent)
         for _, name in pairs:
             if name in self.nodes and not self.lives(name):
                 raise StepFailed(f"{name} died")
-        if pairs:
-            yield Wait(frozenset(k for k, _ in pairs), frozenset(n for _, n in pairs), seconds)
+        if not pairs:
+            return {}
+        return (yield Wait(frozenset(k for k, _ in pairs), frozenset(n for _, n in pairs), seconds))
 
     # -- processes ----------------------------------------------------------------------------
 

@@ -17,7 +17,7 @@ from collections.abc import Callable, Container, Generator, Iterable, Mapping, S
 from contextlib import suppress
 from functools import cached_property, partial
 from hashlib import blake2b
-from typing import Final, assert_never
+from typing import Final, NamedTuple, assert_never
 
 from aftbed.adapt.planner import drains
 from aftbed.adapt.script_check import problems
@@ -267,6 +267,14 @@ FIRST_REPLY_SECONDS: Final = 0.001
 Observe = Callable[[Event, int], Keys]  # called before and after each step of an adaptation, with its number
 
 
+class _Alignment(NamedTuple):
+    """Two states that are asked for: of the leader, and of `sink` in `process`, which is to be the same."""
+
+    asked: list[Sent]
+    process: Process
+    sink: str
+
+
 class ScriptExecutor:
     """Carries out scripts, one at a time."""
 
@@ -357,6 +365,7 @@ class Execution:
         self._rebinding = Rebinding(deployment, self.old if adapts else None, self.new, self._staged)
         self._promoting: Wait | None = None  # Attach waits for it
         self._last_replies: Channel | None = None  # from a fenced leader to the Proxy
+        self._aligning: _Alignment | None = None  # asked; the rebinding behind it waits for it
         self._number = 0  # of the step under way
         self._one_way = False  # what is replaced cannot go on from the state of what is new
         self.committed = False  # the new graph is the one that runs
@@ -403,6 +412,8 @@ class Execution:
         self.closed_ns = self._runtime.loop.now_ns()
         try:
             for step in self.script.commit:
+                if not _rebinds(step):
+                    yield from self._finish_aligning()
                 yield from self._enter()
                 act = self._note(Event.ADAPT_STEP_ACT, self._number)
                 yield from run_after_first_yield(self.do(step), act)
@@ -533,7 +544,7 @@ class Execution:
             case Transfer(source, sink):
                 yield from self._transfer(source, sink)
             case Align(source, sink):
-                yield from self._align(source, sink)
+                self._align(source, sink)
             case Migrate() | Together((Migrate(), *_)):
                 yield from self._migrate(self.old, self.new, _migrated(step), self._staged)
             case Bind() | Unbind() | Exchange():
@@ -592,16 +603,22 @@ class Execution:
         state = yield from self._capture(self._rebinding.host(source), source)
         yield from self._restore(self._rebinding.host(sink), sink, state)
 
-    def _align(self, source: str, sink: str) -> Keys:
-        """Both are asked at once."""
-        deployment, host = self._deployment, self._rebinding.host
-        sent = [
-            deployment.order(host(brick), partial(control.Capture, brick=brick)) for brick in (source, sink)
+    def _align(self, source: str, sink: str) -> None:
+        """Ask both, and go on: a step that rebinds is carried out meanwhile, any other one waits for it."""
+        host = self._rebinding.host
+        asked = [
+            self._deployment.order(host(brick), partial(control.Capture, brick=brick))
+            for brick in (source, sink)
         ]
-        got = yield Wait(frozenset(k for k, _ in sent), frozenset(n for _, n in sent), STEP_SECONDS_MAX)
-        states = [got[key] for key, _ in sent]
-        if blake2b(states[0]).digest() != blake2b(states[1]).digest():
-            yield from self._restore(host(sink), sink, states[0])
+        self._aligning = _Alignment(asked, host(sink), sink)
+
+    def _finish_aligning(self) -> Keys:
+        if self._aligning is not None:
+            (asked, process, sink), self._aligning = self._aligning, None
+            got = yield from self._deployment.answers(asked, STEP_SECONDS_MAX)
+            wanted, found = (got[key] for key, _ in asked)
+            if blake2b(wanted).digest() != blake2b(found).digest():
+                yield from self._restore(process, sink, wanted)
 
     def _migrate(self, given: Graph, taken: Graph, nodes: Iterable[str], takers: dict[str, Process]) -> Keys:
         """The state of every brick that a node has in both graphs. One that has no state needs no taker.
@@ -735,6 +752,7 @@ class Execution:
         if self.script.kind is not ScriptKind.ADAPTATION:
             self._note_backup(steps)
         yield from self._rebinding.send(self._rebinding.changes(steps, committing=True), STEP_SECONDS_MAX)
+        yield from self._finish_aligning()
         for step in steps:
             if isinstance(step, Exchange):
                 self._put_beside(step.node, self._replaced)

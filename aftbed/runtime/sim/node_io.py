@@ -357,6 +357,7 @@ class SimIO(NodeIO[SimChannel, SimChannel]):
         if only is None:
             return self._read_any() or node.wake_due(self._clock.ns)
         now_ns, open_ports, inputs = self._clock.ns, only.brick.open_ports, only.inputs
+        drained = False
         while not (self._orders or self._held_up):
             ports = open_ports()
             if len(ports) != 1:
@@ -365,10 +366,11 @@ class SimIO(NodeIO[SimChannel, SimChannel]):
             channel = inputs.get(port)
             if channel is not None and channel.mail and channel.mail[0][0] <= now_ns:
                 node.step(only, port, channel.take())
+                drained = node.suspend_token != 0  # the last one: the next turn suspends
             elif channel is not None and channel.ended and channel.over():
                 self._handle_end(only, port)
             else:
-                return only.timed and node.wake_due(now_ns)
+                return drained or (only.timed and node.wake_due(now_ns))
         return True
 
     def _read_any(self) -> bool:

@@ -1,0 +1,33 @@
+"""A switch while the follower is behind: its requests are worked off before anything is exchanged."""
+
+from typing import Final
+
+import pytest
+
+from aftbed.core.messages import Goal
+from aftbed.inject.grammar import Trigger
+from aftbed.inject.hang import Hang
+from aftbed.inject.model import Fault
+from aftbed.judge.simulated import breaches
+from aftbed.runtime.sim.world import Run, Setup, World
+
+MS: Final = 1_000_000
+STOPPED_MS: Final = 20  # longer than the preparation, shorter than a drain may take
+
+
+def switched(node: str) -> Run:
+    """From LFR to PBR; `node` of the follower is stopped until after the order to drain it."""
+    world = World(Setup("lfr", "process", 0, 60, 1000.0))
+    world.start()
+    world.advance(world.loop.ns + 5 * MS)
+    world.adapt(Goal(expression="pbr"))
+    world.inject(Fault(Hang(STOPPED_MS), node, Trigger()))
+    world.end()
+    return world.outcome()
+
+
+@pytest.mark.parametrize("node", ["b/before", "b/proceed", "b/after"])
+def test_a_follower_that_was_stopped_works_off_its_requests_and_is_switched(node: str) -> None:
+    run = switched(node)
+    assert [a.outcome for a in run.adaptations] == ["done"]
+    assert breaches(run) == ()
