@@ -652,7 +652,9 @@ class Execution:
             if state or in_file:
                 migrate = given.brick(brick) != taken.brick(brick)
                 restore = partial(control.Restore, brick=brick, state=state, migrate=migrate)
-                restored.append((brick, order(taker, restore, _descriptors(file) if in_file else ())))
+                sent = order(taker, restore, _descriptors(file) if in_file else ())
+                restored.append((brick, sent))
+                involved |= {sent[1]}
         involved = frozenset(name for _, (_, name) in restored)
         for brick, (key, _) in restored:
             before, after = given.brick(brick), taken.brick(brick)
