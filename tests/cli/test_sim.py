@@ -275,7 +275,7 @@ def test_a_program_brakes_a_car(sim: Call, tmp_path: Path) -> None:
     (tmp_path / "brake.py").write_text(BRAKE)
     app = f"{sys.executable} -I -S {tmp_path}/brake.py"
     crash = ("--faults", "crash primary when ttc < 1.5")
-    code, out, _ = sim("--app", app, "--ftm", "pbr", "--scenario", "ccrs-50", *crash)
+    code, out, _ = sim("--app", app, "--ftm", "pbr", "--scenario", "ccrs-20", *crash)
     assert code == 0 and re.search(r"^  car +stopped", out, re.MULTILINE), out
     assert "  failover   to epoch 2" in out
 
