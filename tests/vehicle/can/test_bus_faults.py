@@ -210,6 +210,9 @@ def test_a_paced_drive_meets_its_condition_and_heals(tmp_path: Path) -> None:
     carried_us = [frame.t_us for frame in drive.of(AEB_REQ)]
     assert not [t for t in carried_us if struck.first_us <= t < struck.first_us + 100_000]
     assert carried_us[-1] >= struck.first_us + 100_000, "healed"
+    times = struck.times
+    assert times is not None and times.noticed_us is not None and times.good_us is not None
+    assert struck.first_us < times.noticed_us < struck.first_us + 100_000 <= times.good_us
     assert not drive.result.collision
 
 
@@ -320,7 +323,7 @@ def test_the_hub_reports_what_becomes_of_a_fault(hub: RunningHub) -> None:
         arm(hub, "omission bus RADAR_TRACK nth 2")
         for _ in range(3):
             radar.send(0x130)
-        gateway.write("< aftbed noticed 130 lost >")
+        gateway.write("< aftbed noticed 130 lost 60000 >")
         gateway.fence()
     hub.stop()
     assert hub.link.receipts == ["armed", "applied", "activated"]
@@ -378,6 +381,7 @@ def test_await_is_answered_when_the_frames_have_been_carried(tmp_path: Path) -> 
         "< aftbed met x >",
         "< aftbed met 7 2000 123 >",
         "< aftbed noticed 130 >",
+        "< aftbed noticed 130 lost >",
         "< aftbed unasked 1 >",
         "< aftbed sing >",
     ],
