@@ -218,7 +218,8 @@ class BrakeEcu:
 
     def _object(self, word: str, t_us: int) -> None:
         """To the requests that come, or do not."""
-        self._objected, self._good_again = True, False
+        self._objected = True
+        self._good_again = self._good_again and word != FALLBACK
         self.noticed.append(Notice(self._aeb_req_id, word, t_us))
 
     def _choose(self, plant: Plant, request: dict[str, float]) -> Fallback:

@@ -14,6 +14,7 @@ from disturbed import FIRST_NUMBER, Disturbed, fault, real, virtual
 from puredrive import CODEC
 from sampling import every
 
+from aftbed.inject.receipts import BusTimes
 from aftbed.vehicle.can.bus import HubLine, open_bus
 from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.can.hub import HubOptions
@@ -146,6 +147,11 @@ def test_the_brake_ecu_refuses_a_stuck_counter_and_falls_back() -> None:
     assert drive.struck[0].noticed == "brake (repeated)"
     assert fallbacks(drive) > {0}
     assert not drive.result.collision
+
+
+def test_a_request_that_is_followed_ends_the_handling_though_its_duplicate_is_refused() -> None:
+    drive = virtual("duplicate bus AEB_REQ after 1s for 500ms")
+    assert drive.struck[0].times == BusTimes(1_000_000, 1_000_000, 1_020_000)
 
 
 def test_a_request_that_is_held_back_too_long_is_bridged_and_then_followed_again(sound: Disturbed) -> None:
