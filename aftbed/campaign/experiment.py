@@ -17,6 +17,7 @@ import msgspec
 from msgspec import Meta
 
 from aftbed.adapt.commands import read, scheduled
+from aftbed.campaign.states import RunState, states_of
 from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.core.graph import Graph
 from aftbed.core.messages import Scheduled
@@ -118,6 +119,7 @@ class Result(msgspec.Struct, frozen=True, omit_defaults=True):
     gap_m: float | None = None
     golden_gap_m: float | None = None  # of the same drive without a fault
     intervals: tuple[HandlingIntervals, ...] = ()
+    states: tuple[RunState, ...] = ()  # that it was in
     noisy: bool = False  # the machine was too busy for its times to mean anything
     starved_ms: float = 0.0  # how long the node that waited longest was ready to run and had no CPU
     seconds: float = 0.0
@@ -409,6 +411,7 @@ def _result(
         gap_m=vehicle.stop_gap_m if vehicle is not None else None,
         golden_gap_m=golden.stop_gap_m if golden is not None else None,
         intervals=tuple(verdict.intervals),
+        states=states_of(record.history),
     )
 
 

@@ -38,6 +38,7 @@ import msgspec
 from msgspec import Meta
 
 from aftbed.campaign.experiment import RATE_HZ_MAX, REQUESTS_MAX
+from aftbed.campaign.states import RunState
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.graph import PLACEMENTS
 from aftbed.core.requirements import check_requirements
@@ -184,6 +185,7 @@ class Spec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     gates: tuple[Gate, ...] = ()
     confidence: Annotated[float, Meta(gt=0.5, lt=1)] = 0.95
     recovery_budget_ms: Annotated[float, Meta(gt=0)] | None = None  # longer is `degraded`
+    sometimes: tuple[str, ...] = ()  # each a `RunState` that at least one experiment must have been in
     verifies: tuple[str, ...] = ()  # requirements, beside those of the scenario
     ftti: str = ""  # as 100ms, of bus time: a fault that is handled later breaks a promise
     not_activated_max: Annotated[float, Meta(ge=0, le=1)] = 0.3  # two gates that are always there (G8)
@@ -236,6 +238,7 @@ def check(spec: Spec) -> None:
         _each_known("mechanisms", spec.mechanisms, (*EXPRESSIONS, SUITABLE))
         if SUITABLE in spec.mechanisms:
             raise ConfigError(f"mechanisms: {SUITABLE!r} stands alone: they are all that suit the function")
+    _each_known("sometimes", spec.sometimes, tuple(state.value for state in RunState))
     check_requirements("verifies", spec.verifies)
     _each_known("system.placements", spec.system.placements, PLACEMENTS)
     if not spec.system.placements:

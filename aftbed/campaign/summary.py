@@ -18,6 +18,7 @@ from aftbed.campaign.experiment import Result, failed
 from aftbed.campaign.ledger import Ledger
 from aftbed.campaign.plan import population, strata_of
 from aftbed.campaign.spec import ANY, FHTI_MARGIN, Gate, Spec
+from aftbed.campaign.states import RunState
 from aftbed.campaign.statistics import (
     FailureCount,
     Interval,
@@ -40,6 +41,7 @@ BROKEN: Final = "broken"
 COVERAGE: Final = "coverage"
 COVERED: Final = ("masked", "tolerated", "degraded", "detected_stop")  # the client got what was promised
 FHTI_BOUND: Final = "fhti_bound"
+SOMETIMES: Final = "sometimes"
 QUANTILES: Final = {"p50": 0.5, "p99": 0.99}
 SHARES: Final[dict[str, Callable[[Result], bool]]] = {
     "unexpected": lambda r: r.unexpected,
@@ -177,7 +179,14 @@ def summarise(ledger: Ledger, planned: int, seconds: float) -> Summary:
         if name not in missable or any(result.activated for result in group)
     }
     always = tuple(judged(gate, struck, confidence) for gate in _always(spec))
-    gates = (*asked, *always, _unexcused(results), *_within_bound(results), *_vacuous(spec, struck))
+    gates = (
+        *asked,
+        *always,
+        _unexcused(results),
+        *_within_bound(results),
+        *_sometimes(spec, results),
+        *_vacuous(spec, struck),
+    )
     sizes = {stratum.name: population(stratum.fault) for stratum in strata_of(spec)}
     broken = not results or any(g.word == "fail" for g in gates)
     return Summary(
@@ -374,6 +383,15 @@ def _within_bound(results: Iterable[Result]) -> Iterator[GateResult]:
         words = f"{late.fault}: handled after {late.fhti_ms:g} ms, the bound is {late.bound_ms:g}"
         reason = f"experiment {worst.experiment.id}: {words}"
     yield GateResult(FHTI_BOUND, ANY, "at most 1", most, None, word, reason)
+
+
+def _sometimes(spec: Spec, results: Sequence[Result]) -> Iterator[GateResult]:
+    """A state that the campaign is about, and that no experiment was in."""
+    for state in dict.fromkeys(map(RunState, spec.sometimes)):
+        count = sum(state in result.states for result in results)
+        reason = "" if count else f"none of {len(results)} experiments was in it: nothing is shown of it"
+        word: Word = "pass" if count else "fail"
+        yield GateResult(SOMETIMES, ANY, f"{state.value}: in at least one", float(count), None, word, reason)
 
 
 def _untold(result: Result) -> bool:

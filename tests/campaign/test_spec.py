@@ -29,6 +29,11 @@ def refusal(folder: Path, text: str) -> str:
             r"verifies\[1\]: found 'SG 2', allowed is an identifier such as SG-1 or FSR-3.2: a letter or a",
         ),
         ("seed: 3", 'verifies: ["SG\\x01"]', r"verifies\[0\]: found 'SG\\x01', allowed is an identifier"),
+        (
+            "seed: 3",
+            "sometimes: [fail over]",
+            r"sometimes: unknown name 'fail over'; did you mean 'failover'",
+        ),
         ("seed: 3", "verifies: [SG-1, SG-1]", r"verifies\[1\]: SG-1 stands twice"),
         ("seed: 3", "seed: -1", r"line 3: seed: found -1, allowed is a whole number at least 0"),
         ("requests: 30", "requests: 30 Hz", r"line 4: system.requests: found '30 Hz', allowed is a whole"),

@@ -1,0 +1,77 @@
+"""States that a campaign can ask to have been in: `sometimes: [failover in an adaptation, vote differs]`.
+
+A campaign that never came to what it is about has shown nothing of it, however many experiments passed. So a
+state that no experiment was in fails the campaign. Each state is read off the events of a run.
+"""
+
+from collections.abc import Callable, Iterator
+from enum import StrEnum
+from typing import Final
+
+from aftbed.core.events import Event
+from aftbed.core.journal import History
+from aftbed.judge.intervals import AGREED
+
+
+class RunState(StrEnum):
+    """What a run can have been in."""
+
+    FAILOVER = "failover"
+    IN_ADAPTATION = "failover in an adaptation"
+    ROLLED_BACK = "adaptation rolled back"
+    NEW_BACKUP = "new backup"
+    VOTE_DIFFERS = "vote differs"
+    DIVERGENCE = "divergence noticed"
+    DETECTED_STOP = "detected stop"
+    FROM_LOG = "reply from the log"
+    REPLY_REFUSED = "reply refused"
+
+
+def states_of(history: History) -> tuple[RunState, ...]:
+    """Those that the run was in, in the order of their declaration."""
+    return tuple(state for state, was_in in _STATES.items() if was_in(history))
+
+
+def _happened(event: Event) -> Callable[[History], bool]:
+    return lambda history: any(_of(history, event))
+
+
+def _of(history: History, event: Event) -> Iterator[object]:
+    for journal in history.journals:
+        yield from history.events_of(journal, event)
+
+
+def _vote_differs(history: History) -> bool:
+    return any(
+        record.detail != AGREED
+        for journal in history.journals
+        for record in history.events_of(journal, Event.VOTE_COMPARED)
+    )
+
+
+def _in_adaptation(history: History) -> bool:
+    """A replica was suspected after an adaptation had been planned, and before it was kept or undone."""
+    under_way = False
+    for record in history.events(
+        Event.ADAPT_PLAN, Event.ADAPT_COMMIT, Event.ADAPT_ROLLBACK, Event.WATCHDOG_SUSPECT
+    ):
+        if record.event is Event.WATCHDOG_SUSPECT:
+            if under_way:
+                return True
+        else:
+            under_way = record.event is Event.ADAPT_PLAN
+    return False
+
+
+_STATES: Final[dict[RunState, Callable[[History], bool]]] = {
+    RunState.FAILOVER: _happened(Event.REPLICA_PROMOTED),
+    RunState.IN_ADAPTATION: _in_adaptation,
+    RunState.ROLLED_BACK: _happened(Event.ADAPT_ROLLBACK),
+    RunState.NEW_BACKUP: _happened(Event.BACKUP_READY),
+    RunState.VOTE_DIFFERS: _vote_differs,
+    RunState.DIVERGENCE: _happened(Event.FOLLOWER_DIVERGED),
+    RunState.DETECTED_STOP: _happened(Event.DETECTED_STOP),
+    RunState.FROM_LOG: _happened(Event.DEDUPE_HIT),
+    RunState.REPLY_REFUSED: _happened(Event.REPLY_REFUSED),
+}
+assert list(_STATES) == list(RunState)
