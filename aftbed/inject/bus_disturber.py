@@ -21,8 +21,9 @@ millisecond, which stands for the three or four that 500 kbit/s would allow, so 
 keep up.
 
 *Detection.* A receiver that finds something wrong with a frame, or misses one, reports it beside the bus, by
-the identifier (`noticed`). A receiver that takes a struck frame in (`reached`) without a report has believed
-it. A brake ECU in its fallback counts as having noticed any fault.
+the identifier (`noticed`), and again when it uses these frames again. A receiver that takes a struck frame in
+(`reached`) without a report has believed it. A brake ECU in its fallback counts as having noticed any fault.
+A fault is handled when each receiver that has objected uses the frames again (`BusTimes`).
 """
 
 from random import Random
@@ -46,8 +47,8 @@ from aftbed.inject.bus import (
     StuckCounter,
 )
 from aftbed.inject.grammar import Chance, Every, Lasting, Permanent, Transient, with_flipped
-from aftbed.inject.receipts import BusReport
-from aftbed.vehicle.can.bus_model import FALLBACK, CarriedFrame
+from aftbed.inject.receipts import BusReport, BusTimes
+from aftbed.vehicle.can.bus_model import FALLBACK, GOOD_AGAIN, CarriedFrame, Notice
 from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.condition import Condition
 
@@ -56,6 +57,7 @@ FLOOD_US: Final = 1000
 FLOOD_ID: Final = 0
 FLOOD_FRAMES_MAX: Final = 100  # in one release: a bus that was away for long does not make up for it
 COUNTER_MASK: Final = 0x0F
+AS_SENT: Final = (Delay, Duplicate, Reorder)  # the content is right; only when it comes is wrong
 
 
 class _ArmedBusFault:
@@ -78,6 +80,11 @@ class _ArmedBusFault:
         self.frames = self.first_us = self.first_id = 0
         self.ids: set[int] = set()
         self.noticed = self.believed = ""
+        self.taken_us: int | None = None  # a receiver took a struck frame in, when first
+        self.noticed_us: int | None = None
+        self.good_us: int | None = None
+        self.fallback_us: int | None = None
+        self._objections: set[tuple[str, int]] = set()  # of a node to the frames of an identifier
 
     @property
     def on_nodes(self) -> bool:
@@ -135,6 +142,38 @@ class _ArmedBusFault:
         self.frames += 1
         self.ids.add(frame.can_id)
 
+    def reached(self, node: str, t_us: int) -> None:
+        """`node` has taken in a frame that it has struck."""
+        if not self.believed:
+            self.believed, self.taken_us = node, t_us
+
+    def was_noticed(self, node: str, notice: Notice) -> None:
+        """Once it has struck."""
+        word, t_us, by = notice.word, notice.t_us, (node, notice.can_id)
+        if t_us < self.first_us:
+            return
+        if word == GOOD_AGAIN:
+            if by in self._objections:
+                self._objections.remove(by)
+                if not self._objections and self.good_us is None:
+                    self.good_us = t_us
+            return
+        if word != FALLBACK and notice.can_id not in self.ids:
+            return
+        self._objections.add(by)
+        if not self.noticed:
+            self.noticed, self.noticed_us = f"{node} ({word})", t_us
+        if word == FALLBACK and self.good_us is None:
+            self.fallback_us = t_us  # the last: the brakes bridge a gap before they give up
+
+    def times(self) -> BusTimes | None:
+        if not self.frames:
+            return None
+        if self.noticed:
+            return BusTimes(self.first_us, self.noticed_us, self.good_us, self.fallback_us)
+        taken_us = self.taken_us if isinstance(self.fault.effect, AS_SENT) else None
+        return BusTimes(self.first_us, None, taken_us, None, believed=bool(self.believed))
+
     def report(self) -> BusReport:
         return BusReport(
             self.number,
@@ -145,6 +184,7 @@ class _ArmedBusFault:
             self.believed,
             began=self.on_nodes and self.since_us is not None,
             waits=self.opens_us is None,
+            times=self.times(),
         )
 
 
@@ -243,17 +283,16 @@ class Disturber:
 
     # -- detection --------------------------------------------------------------------------------
 
-    def noticed(self, node: str, can_id: int, word: str) -> None:
-        """`node` reports something wrong with the frames of `can_id`."""
+    def noticed(self, node: str, notice: Notice) -> None:
+        """`node` reports something wrong with frames, or that it uses them again."""
         for armed in self._armed.values():
-            if armed.frames and not armed.noticed and (can_id in armed.ids or word == FALLBACK):
-                armed.noticed = f"{node} ({word})"
+            if armed.frames:
+                armed.was_noticed(node, notice)
 
-    def reached(self, by: tuple[int, ...], node: str) -> None:
+    def reached(self, by: tuple[int, ...], node: str, t_us: int) -> None:
         """`node` has taken in a frame that these faults have struck."""
         for number in by:
-            armed = self._armed[number]
-            armed.believed = armed.believed or node
+            self._armed[number].reached(node, t_us)
 
     # -- acts -------------------------------------------------------------------------------------
 

@@ -20,7 +20,7 @@ from aftbed.inject.grammar import ONCE, Persistence, Trigger
 from aftbed.inject.hang import Hang
 from aftbed.inject.kind import AnyFault, FaultKind
 from aftbed.inject.memory import MemoryFlip
-from aftbed.inject.receipts import ReceiptState
+from aftbed.inject.receipts import BusTimes, ReceiptState
 from aftbed.inject.slow import Slow
 from aftbed.inject.state import StateFlip
 from aftbed.inject.value import ValueFlip
@@ -75,6 +75,7 @@ class FaultReport(msgspec.Struct, frozen=True, omit_defaults=True):
     receipt: ReceiptState
     detail: str = ""
     live: bool = False  # it was asked for while the run ran
+    bus: BusTimes | None = None  # of a fault of the bus that struck
 
     @property
     def fired(self) -> bool:

@@ -40,11 +40,27 @@ class ReceiptState(Enum):
         return self in (ReceiptState.APPLIED, ReceiptState.ACTIVATED)
 
 
+class BusTimes(msgspec.Struct, frozen=True):
+    """When a fault of the bus was handled, in bus time; None: never.
+
+    `noticed_us`: a receiver refused a struck frame, or missed it. `good_us`: every receiver that had objected
+    used the frames again; if none has, a receiver took in a frame that came late. `fallback_us`: the last
+    fallback of the brake ECU before that. `believed`: a receiver took in a struck frame, and none noticed.
+    """
+
+    struck_us: int
+    noticed_us: int | None = None
+    good_us: int | None = None
+    fallback_us: int | None = None
+    believed: bool = False
+
+
 class Receipt(msgspec.Struct, frozen=True):
-    """`detail` says more, for people, where there is more to say."""
+    """`detail` says more, for people, where there is more to say. `bus`: of a fault of it that struck."""
 
     state: ReceiptState = ReceiptState.ARMED
     detail: str = ""
+    bus: BusTimes | None = None
 
 
 def record_detail(number: int, bits: int = 0) -> int:
@@ -82,6 +98,7 @@ class BusReport(msgspec.Struct, frozen=True):
     began: bool = False  # an act on nodes took hold, whatever frames there were
     error: str = ""
     waits: bool = False  # for its condition, which has not held yet
+    times: BusTimes | None = None
 
     @property
     def receipt(self) -> Receipt:
@@ -91,7 +108,8 @@ class BusReport(msgspec.Struct, frozen=True):
         if not self.frames and not self.began:
             return Receipt()
         seen = self.noticed or self.believed
-        return Receipt(ReceiptState.ACTIVATED if seen else ReceiptState.APPLIED, self._detail())
+        state = ReceiptState.ACTIVATED if seen else ReceiptState.APPLIED
+        return Receipt(state, self._detail(), self.times)
 
     def _detail(self) -> str:
         if not self.frames:

@@ -94,8 +94,8 @@ class RunInjection(Injection):
         elif self.met is not None:
             held = f"{self.fault.trigger.when} at {self.met.t_us / 1e6:.6f} s"
             held += f", {self._lag_ns / 1e6:.2f} ms before" if self._lag_ns else ""
-            found = Receipt(found.state, "; ".join(filter(None, (found.detail, held))))
-        return FaultReport(str(self.fault), found.state, found.detail, self.live)
+            found = Receipt(found.state, "; ".join(filter(None, (found.detail, held))), found.bus)
+        return FaultReport(str(self.fault), found.state, found.detail, self.live, found.bus)
 
 
 class FaultController:

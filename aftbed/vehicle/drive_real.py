@@ -123,8 +123,8 @@ class _Drive:
                 schedule.wait_until(body.plant.t_us, self._stop)
                 self._exchange()
             body.step(report)
-            for can_id, word in body.noticed():
-                self._buses.brake.notice(can_id, word)
+            for notice in body.noticed():
+                self._buses.brake.notice(notice)
         report(body.telemetry())
         return DriveReport(
             result=body.result(),

@@ -69,8 +69,8 @@ class VirtualBus(BusModel[BusNode]):
             if payload is not None:
                 self.requests.append(payload)
             if self.disturber is not None:
-                for can_id, word in self.gateway.noticed():
-                    self.disturber.noticed(GATEWAY, can_id, word)
+                for notice in self.gateway.noticed():
+                    self.disturber.noticed(GATEWAY, notice)
 
     def receive_until(self, t_us: int) -> None:
         """The brake ECU takes what has arrived at `t_us` or before."""
@@ -231,6 +231,6 @@ class VirtualCar:
         self._bus.receive_until(self._body.plant.t_us)
         self._body.step()
         if self._bus.disturber is not None:
-            for can_id, word in self._body.noticed():
-                self._bus.noticed(BRAKE, can_id, word)
+            for notice in self._body.noticed():
+                self._bus.noticed(BRAKE, notice)
         self._end = self._body.ended()

@@ -37,7 +37,7 @@ from typing import Final, Literal
 import msgspec
 
 from aftbed.vehicle.aeb.messages import STAGE_FULL, STAGE_WARN
-from aftbed.vehicle.can.bus_model import FALLBACK
+from aftbed.vehicle.can.bus_model import FALLBACK, GOOD_AGAIN, Notice
 from aftbed.vehicle.can.dbc_file import Codec
 from aftbed.vehicle.can.e2e import P11, ChannelState, FrameStatus, Receiver, Supervision
 from aftbed.vehicle.can.frame import Frame
@@ -151,7 +151,8 @@ class BrakeEcu:
         self.fallback = Fallback.NONE
         self.accepted = 0
         self.refused = 0
-        self.noticed: deque[tuple[int, str]] = deque(maxlen=NOTICED_MAX)  # identifier of a frame, its defect
+        self.noticed: deque[Notice] = deque(maxlen=NOTICED_MAX)
+        self._objected = self._good_again = False
         self._codec = codec
         self._policy = policy
         self._aeb_req_id = codec.can_id("AEB_REQ")
@@ -171,11 +172,12 @@ class BrakeEcu:
         first = self._receiver.state is ChannelState.NODATA
         status = self._receiver.check(frame.data, frame.t_us)
         if status is not FrameStatus.OK and not (first and status is FrameStatus.WRONGSEQUENCE):
-            self.noticed.append((frame.can_id, status.name.lower()))
+            self._object(status.name.lower(), frame.t_us)
         if not self._receiver.usable(status):
             self.refused += 1
             return
         self.accepted += 1
+        self._good_again = self._objected
         self._request, self._request_us = self._codec.decode("AEB_REQ", frame.data), frame.t_us
 
     def demand_ms2(self, plant: Plant) -> float:
@@ -185,7 +187,10 @@ class BrakeEcu:
         self._receiver.poll(plant.t_us)
         before, self.fallback = self.fallback, self._choose(plant, self._request)
         if self.fallback is not before and self.fallback is not Fallback.NONE:
-            self.noticed.append((self._aeb_req_id, FALLBACK))
+            self._object(FALLBACK, plant.t_us)
+        elif self._good_again and self.fallback is Fallback.NONE:  # after a latch, only when that ends
+            self._objected = self._good_again = False
+            self.noticed.append(Notice(self._aeb_req_id, GOOD_AGAIN, plant.t_us))
         if self.fallback is Fallback.RELEASE:
             self.stage, self._demand_ms2 = 0, 0.0
         elif self.fallback is not Fallback.LATCH:  # a latch keeps the stage and demand that it began with
@@ -210,6 +215,12 @@ class BrakeEcu:
             "ACCELERATION": max(-20.0, min(20.0, plant.acceleration_ms2)),
         }
         return [self._status.frame(t_us, status), self._ego.frame(t_us, ego)]
+
+    def _object(self, word: str, t_us: int) -> None:
+        """To the requests that come, or do not."""
+        self._objected = True
+        self._good_again = self._good_again and word != FALLBACK
+        self.noticed.append(Notice(self._aeb_req_id, word, t_us))
 
     def _choose(self, plant: Plant, request: dict[str, float]) -> Fallback:
         """Fresh request, bridge, or policy."""
@@ -264,8 +275,8 @@ class CarBody:
         """A frame has come to the brake ECU, which takes it as of this step."""
         self._brake.on_frame(Frame(self.plant.t_us, frame.can_id, frame.data))
 
-    def noticed(self) -> list[tuple[int, str]]:
-        """The defects that the brake ECU has found since the last call: identifier of the frame, and what."""
+    def noticed(self) -> list[Notice]:
+        """What the brake ECU has found since the last call."""
         found = list(self._brake.noticed)
         self._brake.noticed.clear()
         return found

@@ -32,6 +32,7 @@ from aftbed.vehicle.aeb.messages import (
     decode_reply,
     encode_request,
 )
+from aftbed.vehicle.can.bus_model import GOOD_AGAIN, Notice
 from aftbed.vehicle.can.dbc_file import Codec
 from aftbed.vehicle.can.e2e import P11, ChannelState, FrameStatus, Receiver, Supervision
 from aftbed.vehicle.can.frame import Frame
@@ -73,7 +74,7 @@ class BusGateway(ABC):
         self.answered = 0
         self.replies_refused = 0
         self._codec = codec
-        self._noticed: deque[tuple[int, str]] = deque(maxlen=NOTICED_MAX)
+        self._noticed: deque[Notice] = deque(maxlen=NOTICED_MAX)
         self._bus_us = 0  # of the latest frame
         self._aeb_req_id = codec.can_id("AEB_REQ")
         self._protection = P11(codec.data_id("AEB_REQ"))
@@ -90,8 +91,8 @@ class BusGateway(ABC):
         self._bus_us = max(self._bus_us, frame.t_us)
         return self._request_of(frame)
 
-    def noticed(self) -> list[tuple[int, str]]:
-        """The defects of frames since the last call: their identifier, and what was wrong."""
+    def noticed(self) -> list[Notice]:
+        """What was found since the last call."""
         if not self._noticed:
             return []
         found = list(self._noticed)
@@ -152,6 +153,7 @@ class Gateway(BusGateway):
         self._ego_id, self._ego = codec.can_id("EGO_STATE"), _receiver(codec, "EGO_STATE")
         self.request_id, self._track = codec.can_id("RADAR_TRACK"), _receiver(codec, "RADAR_TRACK")
         self.uses = (self._ego_id, self.request_id)
+        self._objected: set[int] = set()  # identifiers of frames with which something was wrong
         self._t_us = 0
         self._ego_us = 0
         self._ego_speed_ms: float | None = None  # the last one accepted
@@ -169,6 +171,7 @@ class Gateway(BusGateway):
             return self._on_track(frame)
         if self._accepts(self._ego, frame):
             self.counts.accepted += 1
+            self._use(frame)
             signals = self._codec.decode("EGO_STATE", frame.data)
             self._ego_speed_ms = signals["SPEED"] if signals["SPEED_VALID"] else None
             self._ego_us = frame.t_us
@@ -183,7 +186,7 @@ class Gateway(BusGateway):
         self._request_us = t_us
         speed_ms = self._ego_speed_ms
         if speed_ms is None or t_us - self._ego_us > self._ego.supervision.timeout_us:
-            self._noticed.append((self._ego_id, "timeout"))
+            self._object(Notice(self._ego_id, "timeout", t_us))
             speed_ms = None
         return self.encode(
             AebInput(t_us // 1000, speed_ms or 0.0, speed_ms is not None, targets is not None, targets or ())
@@ -198,9 +201,10 @@ class Gateway(BusGateway):
         target = target_of(slot, signals["RANGE"], signals["RELATIVE_SPEED"], new)
         if signals["VALID"] and target is None:
             self.counts.refuse("range")
-            self._noticed.append((frame.can_id, "range"))
+            self._object(Notice(frame.can_id, "range", frame.t_us))
             return None
         self.counts.accepted += 1
+        self._use(frame)
         in_path = signals["VALID"] and abs(signals["LATERAL_OFFSET"]) <= LANE_HALF_M
         return (target,) if target is not None and in_path else ()
 
@@ -212,12 +216,22 @@ class Gateway(BusGateway):
         reason = receiver.refusal(frame.data, status)
         if reason is None:
             if status is FrameStatus.OK_SOMELOST:
-                self._noticed.append((frame.can_id, "lost"))
+                self._object(Notice(frame.can_id, "lost", frame.t_us))
             return True
         self.counts.refuse(reason)
         if not first or status is not FrameStatus.WRONGSEQUENCE:  # which is all that a first frame can be
-            self._noticed.append((frame.can_id, reason))
+            self._object(Notice(frame.can_id, reason, frame.t_us))
         return False
+
+    def _object(self, notice: Notice) -> None:
+        self._objected.add(notice.can_id)
+        self._noticed.append(notice)
+
+    def _use(self, frame: Frame) -> None:
+        """The content of `frame` is used."""
+        if frame.can_id in self._objected:
+            self._objected.remove(frame.can_id)
+            self._noticed.append(Notice(frame.can_id, GOOD_AGAIN, frame.t_us))
 
 
 def _receiver(codec: Codec, name: str) -> Receiver:

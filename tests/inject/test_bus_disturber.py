@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from aftbed.core.errors import ConfigError
 from aftbed.inject.bus import BusFault, read_bus_fault
 from aftbed.inject.bus_disturber import FLOOD_ID, REORDER_US_MAX, Disturber
-from aftbed.inject.receipts import BusReport
-from aftbed.vehicle.can.bus_model import CarriedFrame
+from aftbed.inject.receipts import BusReport, BusTimes
+from aftbed.vehicle.can.bus_model import FALLBACK, GOOD_AGAIN, CarriedFrame, Notice
 from aftbed.vehicle.can.dbc_file import load_dbc
 from aftbed.vehicle.can.e2e import intact, protect
 from aftbed.vehicle.can.frame import Frame
@@ -234,14 +234,14 @@ def test_two_faults_strike_one_behind_the_other() -> None:
 
 def test_who_notices_makes_it_activated() -> None:
     disturber = armed("omission bus RADAR_TRACK nth 2", "omission bus AEB_REQ nth 9")
-    disturber.noticed("gateway", TRACK, "lost")
+    disturber.noticed("gateway", Notice(TRACK, "lost", 60_000))
     assert [s.receipt.state.value for s in disturber.reports()] == ["armed", "armed"], (
         "it was not because of the fault"
     )
     passed(disturber, 3)
-    disturber.noticed("gateway", EGO, "lost")
+    disturber.noticed("gateway", Notice(EGO, "lost", 60_000))
     assert disturber.reports()[0].receipt.state.value == "applied"
-    disturber.noticed("gateway", TRACK, "lost")
+    disturber.noticed("gateway", Notice(TRACK, "lost", 60_000))
     first, second = disturber.reports()
     assert (first.receipt.state.value, second.receipt.state.value) == ("activated", "armed")
     assert first.receipt.detail == "1 frame, at 0.020000 s, id 130; noticed by gateway (lost)"
@@ -250,14 +250,14 @@ def test_who_notices_makes_it_activated() -> None:
 def test_a_fallback_has_noticed_whatever_there_was() -> None:
     disturber = armed("omission bus RADAR_TRACK")
     passed(disturber, 1)
-    disturber.noticed("brake", AEB_REQ, "fallback")
+    disturber.noticed("brake", Notice(AEB_REQ, "fallback", 30_000))
     assert disturber.reports()[0].receipt.state.value == "activated"
 
 
 def test_who_takes_a_struck_frame_in_has_believed_it() -> None:
     disturber = armed("corrupt bus RADAR_TRACK bit 40 crc good")
     (sent,) = disturber.carry(track(0), "radar")
-    disturber.reached(sent.by, "gateway")
+    disturber.reached(sent.by, "gateway", 0)
     assert disturber.reports()[0].receipt.detail == "1 frame, at 0.000000 s, id 130; believed by gateway"
 
 
@@ -343,3 +343,53 @@ def test_an_aim_is_no_part_of_the_words() -> None:
     assert fault.targets is not None
     assert {mark.can_id for mark in fault.targets} == {TRACK, CODEC.can_id("RADAR_STATUS")}
     assert str(fault) == "omission bus from radar nth 5"
+
+
+# -- how long it took
+
+
+def times(disturber: Disturber) -> BusTimes:
+    found = disturber.reports()[0].receipt.bus
+    assert found is not None
+    return found
+
+
+def struck_at_20ms(words: str = "omission bus RADAR_TRACK nth 2") -> Disturber:
+    disturber = armed(words)
+    passed(disturber, 3)
+    return disturber
+
+
+def test_it_is_handled_when_all_that_objected_use_the_frames_again() -> None:
+    disturber = struck_at_20ms()
+    assert times(disturber) == BusTimes(20_000)
+    disturber.noticed("gateway", Notice(TRACK, "lost", 40_000))
+    disturber.noticed("brake", Notice(AEB_REQ, FALLBACK, 50_000))
+    disturber.noticed("gateway", Notice(TRACK, GOOD_AGAIN, 60_000))
+    assert times(disturber) == BusTimes(20_000, 40_000, None, 50_000)
+    disturber.noticed("brake", Notice(AEB_REQ, GOOD_AGAIN, 80_000))
+    disturber.noticed("brake", Notice(AEB_REQ, FALLBACK, 90_000))  # for another reason
+    disturber.noticed("brake", Notice(AEB_REQ, GOOD_AGAIN, 95_000))
+    assert times(disturber) == BusTimes(20_000, 40_000, 80_000, 50_000)
+
+
+def test_frames_that_are_good_again_after_another_defect_end_nothing() -> None:
+    disturber = struck_at_20ms()
+    disturber.noticed("gateway", Notice(EGO, "lost", 30_000))
+    disturber.noticed("gateway", Notice(EGO, GOOD_AGAIN, 40_000))
+    disturber.noticed("gateway", Notice(TRACK, GOOD_AGAIN, 40_000))  # it had objected before
+    assert times(disturber) == BusTimes(20_000)
+
+
+def test_what_was_wrong_before_the_fault_is_not_its_work() -> None:
+    disturber = struck_at_20ms()
+    disturber.noticed("gateway", Notice(TRACK, "lost", 19_000))
+    assert times(disturber) == BusTimes(20_000)
+
+
+def test_what_comes_late_and_right_is_handled_when_it_comes() -> None:
+    for words, good_us in (("delay bus RADAR_TRACK by 9ms", 9_000), ("corrupt bus RADAR_TRACK bit 40", None)):
+        disturber = armed(words)
+        (sent,) = disturber.carry(track(0), "radar") or disturber.release(9_000)
+        disturber.reached(sent.by, "gateway", sent.frame.t_us)
+        assert times(disturber) == BusTimes(0, good_us=good_us, believed=True), words

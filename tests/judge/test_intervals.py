@@ -8,23 +8,31 @@ from tales import Sums, Tale
 
 from aftbed.core.events import FIRST_FAULT, RERUN, Event
 from aftbed.inject.model import FaultReport
-from aftbed.inject.receipts import ReceiptState
+from aftbed.inject.receipts import BusTimes, ReceiptState
 from aftbed.judge.checks import Check, Evidence
 from aftbed.judge.intervals import BY_MECHANISM, HandlingIntervals, Occasion, Reaction, check_ftti, intervals
 from aftbed.judge.record import RunEnd, RunRecord
 from aftbed.judge.reference import reference_run
 from aftbed.runtime.adaptations import Outcome
-from aftbed.runtime.unix.options import LoadRun, RunOptions
+from aftbed.runtime.unix.options import CarRun, LoadRun, RunOptions
 
 CRASH = "crash primary"
 FLIP = "bitflip result in primary at server.exit"
 
 
+OMISSION = "omission bus RADAR_TRACK"
+
+
 def evidence(
-    tale: Tale, *faults: str, ftm: str = "pbr", ftti_ms: float = 0.0, starved_ms: float = 0.0
+    tale: Tale,
+    *faults: str,
+    bus: BusTimes | None = None,
+    ftm: str = "pbr",
+    ftti_ms: float = 0.0,
+    starved_ms: float = 0.0,
 ) -> Evidence:
     options = RunOptions("", "", "", ftm, "process", 0, LoadRun(3, 0.0), ftti_ms=ftti_ms)
-    reports = tuple(FaultReport(words, ReceiptState.ACTIVATED) for words in faults)
+    reports = tuple(FaultReport(words, ReceiptState.ACTIVATED, bus=bus) for words in faults)
     end = RunEnd(leader="a", seconds=0.1, starved_ms=starved_ms)
     record = RunRecord(options, tale.history(), end, reports)
     return Evidence(record, reference_run(record.history, Sums()))
@@ -207,8 +215,45 @@ def test_a_death_that_is_seen_when_all_was_answered_is_not_known_to_be_unhandled
 
 
 def test_a_fault_without_a_time_is_not_taken_for_handled() -> None:
-    found = check_ftti(evidence(Tale().served(1), "omission bus RADAR_TRACK", ftti_ms=100))
+    found = check_ftti(evidence(Tale().served(1), OMISSION, ftti_ms=100))
     assert found is not None and found.finding == "unknown"
+
+
+@pytest.mark.parametrize(
+    ("bus", "expected", "word"),
+    [
+        (BusTimes(100, 10_100, 50_100), (10.0, 40.0, 50.0, "operational"), "pass"),
+        (BusTimes(100, 10_100, 50_200), (10.0, 40.1, 50.1, "operational"), "fail"),
+        (BusTimes(100, 10_100, 50_100, 30_100), (10.0, 40.0, 50.0, "operational"), "pass"),
+        (BusTimes(100, 10_100, None, 30_100), (10.0, 20.0, 30.0, "safe"), "pass"),
+        (BusTimes(100, 10_100), (10.0, None, None, "none"), "fail"),
+        (BusTimes(100, None, 3_100, believed=True), (None, None, 3.0, "operational"), "pass"),
+        (BusTimes(100, believed=True), (None, None, None, "none"), "fail"),
+        (BusTimes(100), (None, None, None, "none"), "unknown"),
+    ],
+)
+def test_a_fault_of_the_bus_has_its_intervals_in_bus_time(
+    bus: BusTimes, expected: tuple[float | None, float | None, float | None, str], word: str
+) -> None:
+    told = evidence(Tale().served(1), OMISSION, bus=bus, ftti_ms=50)
+    (found,) = intervals(told)
+    assert (times(found), found.in_bus_time) == (expected, True)
+    check = check_ftti(told)
+    assert check is not None and check.finding == word
+
+
+def test_what_no_receiver_noticed_is_said_to_be_that() -> None:
+    told = evidence(Tale().served(1), OMISSION, bus=BusTimes(100), ftti_ms=50)
+    assert str(intervals(told)[0]) == f"{OMISSION}: none: no receiver noticed it"
+    assert check_ftti(told) == Check("unknown", (f"{OMISSION}: no receiver noticed it",))
+
+
+def test_the_ftti_of_the_bus_is_not_divided_by_the_pace() -> None:
+    told = evidence(Tale().served(1), OMISSION, bus=BusTimes(0, 0, 50_000), ftti_ms=50)
+    record = told.record
+    paced = msgspec.structs.replace(record.options, work=CarRun("ccrs-50", 4.0, "latch"))
+    told = Evidence(msgspec.structs.replace(record, options=paced), told.reference)
+    assert check_ftti(told) == Check("pass")
 
 
 def test_without_an_ftti_there_is_no_promise() -> None:

@@ -8,7 +8,8 @@ import pytest
 from liveruns import SHORT, Command, Home, Started, aftbed
 
 from aftbed.inject.model import FaultReport
-from aftbed.inject.receipts import ReceiptState
+from aftbed.inject.receipts import BusTimes, ReceiptState
+from aftbed.judge.intervals import Reaction
 from aftbed.runtime.unix.options import CarRun
 from aftbed.vehicle.can.candump import read_log
 
@@ -23,11 +24,15 @@ def test_a_drive_is_disturbed_and_the_receipt_says_how(tmp_path: Path) -> None:
     words, logs = "corrupt bus RADAR_TRACK bit 21 nth 50", []
     for number in range(2):
         record = tmp_path / str(number)
-        done = aftbed("run", *DRIVE, "--inject", words, "--record", record)
+        done = aftbed("run", *DRIVE, "--inject", words, "--ftti", "30ms", "--record", record)
         assert done.code == 0, done.out + done.err
         detail = "1 frame, at 0.980000 s, id 130; noticed by gateway (checksum)"
-        expected = FaultReport(words, ReceiptState.ACTIVATED, detail)
-        assert done.verdict().faults == [expected]
+        times = BusTimes(980_000, 980_000, 1_000_000)
+        verdict = done.verdict()
+        assert verdict.faults == [FaultReport(words, ReceiptState.ACTIVATED, detail, bus=times)]
+        (found,) = verdict.intervals
+        assert (found.fdti_ms, found.fhti_ms, found.reaction) == (0.0, 20.0, Reaction.OPERATIONAL)
+        assert verdict.checks["ftti"] == "pass"
         logs.append([line for line in (record / "bus.log").read_text().splitlines() if " 70" not in line])
     assert logs[0] == logs[1] and logs[0]
 

@@ -6,7 +6,9 @@ import pytest
 from sampling import sampled
 
 from aftbed.inject.model import FaultReport, parse
-from aftbed.inject.receipts import ReceiptState
+from aftbed.inject.receipts import BusTimes, ReceiptState
+from aftbed.judge.intervals import intervals
+from aftbed.judge.simulated import evidence_of_run
 from aftbed.runtime.sim.world import Run, Setup, World, simulate
 
 DRIVE: Final = "ccrs-20"
@@ -16,29 +18,52 @@ def drive(*faults: str, ftm: str = "pbr", seed: int = 1) -> Run:
     return simulate(Setup(ftm=ftm, seed=seed, scenario=DRIVE, faults=tuple(map(parse, faults))))
 
 
-STRUCK: Final = (  # a fault, and its receipt
+STRUCK: Final = (  # a fault, its receipt, and its times
     (
         "corrupt bus RADAR_TRACK bit 21 nth 50",
         "1 frame, at 0.980000 s, id 130; noticed by gateway (checksum)",
+        BusTimes(980_000, 980_000, 1_000_000),
     ),
     (
         "stuck-counter bus RADAR_TRACK nth 50",
         "1 frame, at 0.980000 s, id 130; noticed by gateway (repeated)",
+        BusTimes(980_000, 980_000, 1_000_000),
     ),
     (
         "corrupt bus RADAR_TRACK signal LATERAL_OFFSET=9 crc good nth 50",
         "1 frame, at 0.980000 s, id 130; believed by gateway",
+        BusTimes(980_000, believed=True),
     ),
 )
 
 
 @pytest.mark.parametrize(("struck", "ftm"), sampled(STRUCK, ("none", "pbr", "lfr+tr")))
-def test_a_frame_is_struck_and_who_noticed_is_said(struck: tuple[str, str], ftm: str) -> None:
-    words, noticed = struck
+def test_a_frame_is_struck_and_who_noticed_is_said(struck: tuple[str, str, BusTimes], ftm: str) -> None:
+    words, noticed, times = struck
     run = drive(words, ftm=ftm)
-    assert run.faults == (FaultReport(words, ReceiptState.ACTIVATED, noticed),)
+    assert run.faults == (FaultReport(words, ReceiptState.ACTIVATED, noticed, bus=times),)
     assert run.rest.why_not == ()
     assert run.vehicle is not None and not run.vehicle.collision
+
+
+HANDLED: Final = (  # a fault, its FDTI, FRTI and FHTI, and the reaction
+    ("omission bus RADAR_TRACK nth 50", 12.0, 9.0, 21.0, "operational"),  # the brakes miss the reply first
+    ("omission bus EGO_STATE nth 50", 10.0, 0.0, 10.0, "operational"),  # by the counter of the next one
+    ("corrupt bus EGO_STATE bit 20 nth 50", 0.0, 10.0, 10.0, "operational"),
+    ("masquerade bus RADAR_TRACK as EGO_STATE nth 50", 0.0, 20.0, 20.0, "operational"),
+    ("delay bus EGO_STATE by 3ms nth 50", None, None, 3.0, "operational"),  # late, and right
+    ("corrupt bus RADAR_TRACK signal LATERAL_OFFSET=9 crc good nth 50", None, None, None, "none"),
+    ("corrupt bus BRAKE_STATUS bit 40 nth 50", None, None, None, "none"),  # of no use to any receiver
+    ("bus-off gateway after 1000ms permanent", 12.0, 30.0, 42.0, "safe"),  # the brakes hold for 60 ms
+    ("babbling radar after 1000ms for 30ms", 12.0, 19.0, 31.0, "operational"),
+)
+
+
+@pytest.mark.parametrize("expected", HANDLED, ids=lambda row: row[0])
+def test_how_long_a_fault_of_the_bus_takes(expected: tuple[str, float, float, float, str]) -> None:
+    (found,) = intervals(evidence_of_run(drive(expected[0], ftm="none")))
+    assert found.in_bus_time
+    assert (found.fault, found.fdti_ms, found.frti_ms, found.fhti_ms, found.reaction.value) == expected
 
 
 def test_the_same_seed_is_the_same_run() -> None:

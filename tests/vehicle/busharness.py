@@ -322,8 +322,8 @@ class FunctionGateway:
                 bus.send(answer)
         elif self._named and frame.can_id == self.gateway.request_id:
             bus.unasked(frame.can_id)
-        for can_id, word in self.gateway.noticed() if self._named else ():
-            bus.notice(can_id, word)
+        for notice in self.gateway.noticed() if self._named else ():
+            bus.notice(notice)
 
 
 def brake_late(track: dict[str, float]) -> tuple[int, float]:

@@ -3,6 +3,7 @@
 import pytest
 from puredrive import CODEC
 
+from aftbed.vehicle.can.bus_model import FALLBACK, GOOD_AGAIN, Notice
 from aftbed.vehicle.can.e2e import protect
 from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.ecus import BrakeEcu, BrakePolicy, Fallback, RadarEcu, Sender
@@ -112,6 +113,17 @@ def test_a_full_request_ends_a_latch_and_rules_again() -> None:
     assert bench.requests(FULL, 2) == 9.0
     assert bench.brake.fallback is Fallback.NONE
     assert bench.requests(NONE, 1) == 0.0
+
+
+def test_requests_are_good_again_when_the_brakes_follow_them() -> None:
+    bench = Bench()
+    bench.requests(FULL, 5)
+    assert bench.run(200) == 9.0
+    bench.requests(NONE, 10)  # taken in, but the latch rules
+    words = [notice.word for notice in bench.brake.noticed]
+    assert words == [FALLBACK, FALLBACK, "wrongsequence"]
+    assert bench.requests(FULL, 1) == 9.0
+    assert bench.brake.noticed[-1] == Notice(0x100, GOOD_AGAIN, bench.plant.t_us - 20_000)
 
 
 def test_no_latch_where_full_braking_was_only_asked_for_at_standstill() -> None:

@@ -89,8 +89,8 @@ class BusLink(CarLink):
                 yield payload
             elif frame.can_id == self._gateway.request_id:
                 self._bus.unasked(frame.can_id)
-        for can_id, word in self._gateway.noticed():
-            self._bus.notice(can_id, word)
+        for notice in self._gateway.noticed():
+            self._bus.notice(notice)
 
     def deliver(self, reply: Reply, now_ns: int) -> None:
         for frame in self._gateway.on_reply(reply.payload, reply.replica, reply.epoch):

@@ -34,6 +34,7 @@ from typing import Final, cast
 import msgspec
 
 from aftbed.core.errors import ConfigError, HarnessError
+from aftbed.vehicle.can.bus_model import Notice
 from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.can.python_can import can
 from aftbed.vehicle.condition import Condition, Quantity
@@ -118,9 +119,9 @@ class Bus:
         """Set the virtual time of the hub, for the frames that this node sends from here on."""
         self._socket.sendall(f"< aftbed time {t_us} >".encode("ascii"))
 
-    def notice(self, can_id: int, word: str) -> None:
-        """Report beside the bus what is wrong with these frames."""
-        self._send_beside(f"noticed {can_id:03X} {word}")
+    def notice(self, notice: Notice) -> None:
+        """Report beside the bus what is wrong with frames, or that they are used again."""
+        self._send_beside(f"noticed {notice.can_id:03X} {notice.word} {notice.t_us}")
 
     def unasked(self, can_id: int) -> None:
         """Report beside the bus that no request was made of a frame of which one is expected."""

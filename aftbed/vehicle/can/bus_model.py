@@ -22,7 +22,7 @@ knows whether it holds: it is asked for `conditions`, and reports the first mome
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Sequence
-from typing import Final, Generic, Protocol, TypeVar
+from typing import Final, Generic, NamedTuple, Protocol, TypeVar
 
 import msgspec
 
@@ -31,6 +31,15 @@ from aftbed.vehicle.condition import Condition
 
 NODES: Final = ("radar", "brake", "gateway")  # of a car's bus
 FALLBACK: Final = "fallback"  # reported by the brake ECU when its requests are missing
+GOOD_AGAIN: Final = "good_again"  # reported by a node that uses these frames again
+
+
+class Notice(NamedTuple):
+    """What a node has found wrong with the frames of `can_id`, or that they are `GOOD_AGAIN`; in bus time."""
+
+    can_id: int
+    word: str
+    t_us: int
 
 
 class CarriedFrame(msgspec.Struct, frozen=True):
@@ -60,12 +69,12 @@ class BusDisturber(Protocol):
         """Whether `node` receives nothing from `sender` now."""
         ...
 
-    def reached(self, by: tuple[int, ...], node: str) -> None:
+    def reached(self, by: tuple[int, ...], node: str, t_us: int) -> None:
         """A frame that these faults have changed has come to `node`, which evaluates it."""
         ...
 
-    def noticed(self, node: str, can_id: int, word: str) -> None:
-        """`node` reports what is wrong with the frames of `can_id`."""
+    def noticed(self, node: str, notice: Notice) -> None:
+        """`node` reports what is wrong with frames, or that it uses them again."""
         ...
 
     def conditions(self) -> Sequence[tuple[int, Condition]]:
@@ -222,7 +231,7 @@ class BusModel(ABC, Generic[Node]):
             ]
             users = [node for node in receivers if frame.can_id in node.uses]
             for user in users:
-                disturber.reached(one.by, user.name)
+                disturber.reached(one.by, user.name, frame.t_us)
             changes[frame.can_id] = changes.get(frame.can_id, 0) + len(users)
             deliveries.append((frame, sender, receivers))
         for can_id, change in changes.items():
@@ -242,10 +251,10 @@ class BusModel(ABC, Generic[Node]):
                 self._announced.add(number)
                 self.condition_added(number, condition)
 
-    def noticed(self, node: str, can_id: int, word: str) -> None:
-        """`node` reports what is wrong with the frames of `can_id`."""
+    def noticed(self, node: str, notice: Notice) -> None:
+        """`node` reports what is wrong with frames, or that it uses them again."""
         if self.disturber is not None:
-            self.disturber.noticed(node, can_id, word)
+            self.disturber.noticed(node, notice)
             self._update_faults(self.disturber)
 
     def _update_faults(self, disturber: BusDisturber) -> None:

@@ -31,7 +31,7 @@ an error element, and put out.
 be cut off by a fault, and its reports count.
 
     < < aftbed node radar 100 >        the client's name, and the identifiers that it uses
-    < < aftbed noticed 100 sequence >  what is wrong with these frames
+    < < aftbed noticed 100 sequence 20000 >  what is wrong with these frames, and when; or `good_again`
     < < aftbed unasked 130 >           the gateway makes no request of a frame of which one is expected
     < < aftbed time 20000 >            > < ok >  the virtual time; with faults, when one is due: < ok 31000 >
     < < aftbed await radar 12 >        > < ok >  when twelve frames of the radar have been carried
@@ -84,7 +84,7 @@ import msgspec
 
 from aftbed.core.errors import AftbedError, ConfigError, HarnessError, PeerError
 from aftbed.core.units import number
-from aftbed.vehicle.can.bus_model import BusModel, BusNode
+from aftbed.vehicle.can.bus_model import BusModel, BusNode, Notice
 from aftbed.vehicle.can.candump import log_line
 from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.condition import Condition
@@ -113,7 +113,7 @@ _OURS: Final = {  # elements of aftbed's nodes
         b"plant": rb"",
         b"met": rb"([0-9]{1,12}) ([0-9]{1,16}) ([0-9]{1,20}) ",
         b"unasked": rb"([0-9A-F]{3}) ",
-        b"noticed": rb"([0-9A-F]{3}) ([a-z_]{1,32}) ",
+        b"noticed": rb"([0-9A-F]{3}) ([a-z_]{1,32}) ([0-9]{1,16}) ",
     }.items()
 }
 _SOCK_DIAG: Final = 4  # linux/netlink.h, linux/sock_diag.h, linux/inet_diag.h
@@ -514,8 +514,11 @@ class Hub(BusModel[HubConnection]):
             case b"unasked", [can_id]:
                 if self.disturber is not None:
                     self.receipts_changed(int(can_id, 16), -1)
-            case b"noticed", [can_id, reason]:
-                self.noticed(client.name, int(can_id, 16), reason)
+            case b"noticed", [can_id, reason, t_us]:
+                since_us = (
+                    int(t_us) if self._options.lockstep else self.now_us()
+                )  # the car's zero is another one
+                self.noticed(client.name, Notice(int(can_id, 16), reason, since_us))
             case _:
                 raise PeerError("unknown command, or not now")
 

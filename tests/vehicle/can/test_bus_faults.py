@@ -14,6 +14,7 @@ from disturbed import FIRST_NUMBER, Disturbed, fault, real, virtual
 from puredrive import CODEC
 from sampling import every
 
+from aftbed.inject.receipts import BusTimes
 from aftbed.vehicle.can.bus import HubLine, open_bus
 from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.can.hub import HubOptions
@@ -148,6 +149,11 @@ def test_the_brake_ecu_refuses_a_stuck_counter_and_falls_back() -> None:
     assert not drive.result.collision
 
 
+def test_a_request_that_is_followed_ends_the_handling_though_its_duplicate_is_refused() -> None:
+    drive = virtual("duplicate bus AEB_REQ after 1s for 500ms")
+    assert drive.struck[0].times == BusTimes(1_000_000, 1_000_000, 1_020_000)
+
+
 def test_a_request_that_is_held_back_too_long_is_bridged_and_then_followed_again(sound: Disturbed) -> None:
     drive = virtual("omission bus AEB_REQ after 1s for 200ms")
     assert fallbacks(drive) > {0} == fallbacks(sound)
@@ -210,6 +216,9 @@ def test_a_paced_drive_meets_its_condition_and_heals(tmp_path: Path) -> None:
     carried_us = [frame.t_us for frame in drive.of(AEB_REQ)]
     assert not [t for t in carried_us if struck.first_us <= t < struck.first_us + 100_000]
     assert carried_us[-1] >= struck.first_us + 100_000, "healed"
+    times = struck.times
+    assert times is not None and times.noticed_us is not None and times.good_us is not None
+    assert struck.first_us < times.noticed_us < struck.first_us + 100_000 <= times.good_us
     assert not drive.result.collision
 
 
@@ -320,7 +329,7 @@ def test_the_hub_reports_what_becomes_of_a_fault(hub: RunningHub) -> None:
         arm(hub, "omission bus RADAR_TRACK nth 2")
         for _ in range(3):
             radar.send(0x130)
-        gateway.write("< aftbed noticed 130 lost >")
+        gateway.write("< aftbed noticed 130 lost 60000 >")
         gateway.fence()
     hub.stop()
     assert hub.link.receipts == ["armed", "applied", "activated"]
@@ -378,6 +387,7 @@ def test_await_is_answered_when_the_frames_have_been_carried(tmp_path: Path) -> 
         "< aftbed met x >",
         "< aftbed met 7 2000 123 >",
         "< aftbed noticed 130 >",
+        "< aftbed noticed 130 lost >",
         "< aftbed unasked 1 >",
         "< aftbed sing >",
     ],

@@ -280,7 +280,16 @@ def test_an_element_over_its_limit_ends_the_connection(hub: RunningHub) -> None:
     assert hub.stop().oversized == 1
 
 
-ORDERS = ("time 9", "node x 100", "node x", "await x 1", "plant", "met 1 2 3", "unasked 100", "noticed 100 x")
+ORDERS = (
+    "time 9",
+    "node x 100",
+    "node x",
+    "await x 1",
+    "plant",
+    "met 1 2 3",
+    "unasked 100",
+    "noticed 100 x 5",
+)
 ELEMENTS = (
     *("< send 100 1 1 >", "< send 100 ", " >", "<", ">", "< echo >", "< rawmode >", "< open can0 >"),
     *(f"< open can0 {secret} >" for secret in (SECRET, SECRET[1:], SECRET.upper())),

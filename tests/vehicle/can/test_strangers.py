@@ -40,7 +40,7 @@ RESET: Final = struct.pack("ii", 1, 0)  # linger for no time: close by a reset
 OPEN_TO_ALL: Final = HubOptions(open_to_all=True)
 OURS: Final = (
     *("time 5", "node radar 130", "await radar 1", "plant", "met 7 2000 123", "unasked 130"),
-    *("noticed 130 lost", "sing", ""),
+    *("noticed 130 lost 5", "sing", ""),
 )
 
 
