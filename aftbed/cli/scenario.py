@@ -23,7 +23,7 @@ SUBCOMMANDS: Final[CommandTable] = {
     ),
     "ftti": (
         "scenario_ftti:ftti",
-        "Measure how long a fault of the function may last before the row is broken.",
+        "Measure how long a fault of the function may last before the row is broken, at the worst instant.",
     ),
     "import": (
         "scenario_import:import_",
