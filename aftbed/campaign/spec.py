@@ -40,6 +40,7 @@ from msgspec import Meta
 from aftbed.campaign.experiment import RATE_HZ_MAX, REQUESTS_MAX
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.graph import PLACEMENTS
+from aftbed.core.requirements import check_requirements
 from aftbed.core.script import RECIPES
 from aftbed.core.yaml_file import read_yaml
 from aftbed.ftm.compose import EXPRESSIONS
@@ -183,9 +184,16 @@ class Spec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     gates: tuple[Gate, ...] = ()
     confidence: Annotated[float, Meta(gt=0.5, lt=1)] = 0.95
     recovery_budget_ms: Annotated[float, Meta(gt=0)] | None = None  # longer is `degraded`
+    verifies: tuple[str, ...] = ()  # requirements, beside those of the scenario
     ftti: str = ""  # as 100ms, of bus time: a fault that is handled later breaks a promise
     not_activated_max: Annotated[float, Meta(ge=0, le=1)] = 0.3  # two gates that are always there (G8)
     unknown_max: Annotated[float, Meta(ge=0, le=1)] = 0.3
+
+    @property
+    def requirements(self) -> tuple[str, ...]:
+        """Which ones the campaign verifies."""
+        of_scenario = load_scenario(self.system.scenario).verifies if self.system.scenario else ()
+        return tuple(dict.fromkeys((*self.verifies, *of_scenario)))
 
     @property
     def ftti_ms(self) -> float:
@@ -228,6 +236,7 @@ def check(spec: Spec) -> None:
         _each_known("mechanisms", spec.mechanisms, (*EXPRESSIONS, SUITABLE))
         if SUITABLE in spec.mechanisms:
             raise ConfigError(f"mechanisms: {SUITABLE!r} stands alone: they are all that suit the function")
+    check_requirements("verifies", spec.verifies)
     _each_known("system.placements", spec.system.placements, PLACEMENTS)
     if not spec.system.placements:
         raise ConfigError("system.placements: found none, allowed is at least one of them")

@@ -44,6 +44,7 @@ from datetime import UTC, datetime
 from enum import Enum
 from importlib.util import find_spec
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Final
 
 import msgspec
@@ -488,7 +489,8 @@ def read_mf4(path: Path) -> CanLog:
         raise ConfigError(f"{path}: not an MF4: it does not begin with MDF")
     _require_asammdf()
     try:
-        answer = ask(__name__, str(path.absolute()).encode(), MF4_LIMITS)
+        with TemporaryDirectory(prefix="aftbed-mf4-") as folder:  # asammdf leaves a file there
+            answer = ask(__name__, str(path.absolute()).encode(), MF4_LIMITS, {"TMPDIR": folder})
         found = msgspec.msgpack.decode(answer, type=CanLog | str)
     except JobFailedError as error:
         raise ConfigError(MF4_UNREADABLE.format(path=path, why=f"its reader {error}")) from None

@@ -11,7 +11,8 @@ A gate fails as it does in the summary. So a campaign that fails has a failed te
 passes without unexpected outcomes has none.
 
 The schema is `junit-10.xsd` of the Jenkins xUnit plugin, which pytest keeps to as well, in the part that the
-older `jenkins-junit.xsd` allows too. XML 1.0 has no control characters: they become U+FFFD.
+older `jenkins-junit.xsd` allows too. But where a campaign verifies requirements, a test case has properties:
+tools that trace requirements read them there. XML 1.0 has no control characters: they become U+FFFD.
 """
 
 import io
@@ -21,11 +22,12 @@ from fnmatch import fnmatch
 from typing import Final
 from xml.etree import ElementTree
 
-from junitparser import Failure, JUnitXml, TestCase, TestSuite
+from junitparser import Failure, JUnitXml, Properties, Property, TestCase, TestSuite
 
 from aftbed.campaign.experiment import Result
 from aftbed.campaign.ledger import Ledger
-from aftbed.campaign.summary import NOT_ALL, GateResult, StratumSummary, Summary
+from aftbed.campaign.statistics import proportion
+from aftbed.campaign.summary import NOT_ALL, GateResult, StratumSummary, Summary, confidence_of
 from aftbed.report.worst import worst_of
 
 UNEXPECTED: Final = "unexpected"
@@ -42,11 +44,13 @@ def junit_xml(summary: Summary, ledger: Ledger) -> str:
     for name, value in _properties(summary, ledger).items():
         suite.add_property(name, _readable(value))
     group = f"aftbed.{summary.campaign}"
+    verifies = ledger.head.spec.requirements
     cases = []
     for stratum in summary.strata:
         results = groups[stratum.name]
         seconds = sum(result.seconds for result in results)
-        cases.append(_case(group, stratum.name, seconds, _why(stratum, summary.gates, results)))
+        evidence = _evidence(stratum, ledger, results, verifies) if verifies else None
+        cases.append(_case(group, stratum.name, seconds, _why(stratum, summary.gates, results), evidence))
     for gate in summary.gates:
         why = (GATE, _gate_text(gate, groups)) if gate.word == "fail" else None
         cases.append(_case(f"{group}.gates", _gate_name(gate), 0.0, why))
@@ -63,8 +67,47 @@ def junit_xml(summary: Summary, ledger: Ledger) -> str:
     return f"<?xml version='1.0' encoding='utf-8'?>\n{ElementTree.tostring(root, encoding='unicode')}\n"
 
 
-def _case(group: str, name: str, seconds: float, why: tuple[str, str] | None) -> TestCase:
+def _evidence(
+    stratum: StratumSummary, ledger: Ledger, results: list[Result], verifies: tuple[str, ...]
+) -> Properties:
+    """What a stratum says about the requirements: tools read the properties of a test case, not of its suite.
+
+    `bound`: of the share of experiments that failed, with the confidence of the campaign. Of fault handling
+    times, in ms: the longest, and the p99 at most, where that is known.
+    """
+    spec = ledger.head.spec
+    confidence = confidence_of(spec)
+    fhti = stratum.handling.fhti_ms if stratum.handling is not None else None
+    found = {
+        "verifies": ",".join(verifies),
+        "n": str(stratum.experiments),
+        "failed": str(stratum.failed),
+        "bound": f"{proportion(stratum.failed, stratum.experiments, confidence).high:.4g}",
+        "confidence": f"{confidence:g}",
+        "ftti_ms": f"{spec.ftti_ms:g}" if spec.ftti else "",
+        "fhti_ms": f"{fhti.max:g}" if fhti is not None else "",
+        "fhti_p99_bound_ms": f"{fhti.p99_bound:g}" if fhti is not None and fhti.p99_bound is not None else "",
+        "seed": str(spec.seed),
+        "command": worst_of(results).experiment.command(),
+        "code": ledger.head.code,
+    }
+    properties = Properties()  # type: ignore[no-untyped-call]
+    for name, value in found.items():
+        if value:
+            properties.add_property(Property(name, _readable(value)))
+    return properties
+
+
+def _case(
+    group: str,
+    name: str,
+    seconds: float,
+    why: tuple[str, str] | None,
+    evidence: Properties | None = None,
+) -> TestCase:
     case = TestCase(_readable(name), _readable(group), round(seconds, 3))
+    if evidence is not None:
+        case.append(evidence)  # type: ignore[no-untyped-call]
     if why is not None:
         kind, text = why
         failure = Failure(_readable(text.partition("\n")[0]), kind)

@@ -28,8 +28,8 @@ closes:
 
 u is the impact that the row allows. And a warning may come late by what it lasts without a fault, less what
 the row asks for. The form is given where the gap closes at a constant speed and no driver brakes; not for
-`wrong-value`, which can also end a braking. It holds if the fault ends so late that the function goes to full
-braking at once. A fault within a long partial braking can be worse: the brakes release in the meantime.
+`wrong-value`, which can also end a braking. It is the form of a braking that begins late, so it is not given
+where a fault behind the first demand is worse: within a partial braking the brakes are released.
 Replies are lost in whole cycles of 20 ms: so far the FTTI of `omission` and `stuck` can be below it.
 
 Limits: a search and no proof. To break a row is taken to need one length, beyond which every fault breaks it.
@@ -143,12 +143,13 @@ def ftti(todo: FttiSearch) -> FttiRow:
     attempt(coarse(cycles, first, last))
     for step in FINER_CYCLES:
         attempt([at for at in (worst - step, worst + step) if worst >= 0 and first <= at <= last])
+    begun = next((at for at, cycle in enumerate(cycles) if cycle.stage >= STAGE_PARTIAL), len(cycles))
     return FttiRow(
         scenario=todo.scenario,
         speed_kmh=round(road.scenario.plant.speed_ms * KMH_PER_MS, 3),
         fault=todo.fault,
         ftti_ms=float(shortest_ms) if why else None,
-        closed_form_ms=road.closed_form_ms(free, cycles),
+        closed_form_ms=road.closed_form_ms(free, cycles) if worst <= begun else None,
         broken_by=why or None,
         worst_instant_s=cycles[worst].t_ms / 1000 if why else None,
     )

@@ -23,6 +23,13 @@ def refusal(folder: Path, text: str) -> str:
     ("old", "new", "said"),
     [
         ("seed: 3", "sed: 3", r"try.yaml: line 3: unknown key 'sed'; did you mean 'seed'\?"),
+        (
+            "seed: 3",
+            'verifies: [SG-1, "SG 2"]',
+            r"verifies\[1\]: found 'SG 2', allowed is an identifier such as SG-1 or FSR-3.2: a letter or a",
+        ),
+        ("seed: 3", 'verifies: ["SG\\x01"]', r"verifies\[0\]: found 'SG\\x01', allowed is an identifier"),
+        ("seed: 3", "verifies: [SG-1, SG-1]", r"verifies\[1\]: SG-1 stands twice"),
         ("seed: 3", "seed: -1", r"line 3: seed: found -1, allowed is a whole number at least 0"),
         ("requests: 30", "requests: 30 Hz", r"line 4: system.requests: found '30 Hz', allowed is a whole"),
         ("runtime: sim", "runtime: ros", r"line 4: system.runtime: found 'ros', allowed is one of"),
@@ -92,6 +99,16 @@ def test_a_shipped_campaign_can_be_run(name: str) -> None:
     spec = read_spec(name)
     assert spec.campaign == name and spec.about
     assert plan(spec).size > 0
+
+
+def test_requirements_are_those_of_the_campaign_and_of_its_scenario(tmp_path: Path) -> None:
+    scenario = tmp_path / "road.yaml"
+    scenario.write_text(
+        "{description: empty, duration_s: 1, ego: {speed_kmh: 50}, expect: {outcome: no_braking},"
+        " verifies: [SG-2, SG-1]}"
+    )
+    text = CRASHES.replace("system: {", f"verifies: [SG-1, FSR-3.2]\nsystem: {{scenario: {scenario}, ")
+    assert planned(tmp_path, text).spec.requirements == ("SG-1", "FSR-3.2", "SG-2")
 
 
 def test_the_schema_knows_every_key() -> None:

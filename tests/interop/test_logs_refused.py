@@ -4,6 +4,7 @@ import re
 import resource
 import struct
 import sys
+import tempfile
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -193,14 +194,27 @@ def test_a_blf_object_of_length_0_is_refused(size: int, head: int, tmp_path: Pat
         READERS["blf"](path)
 
 
+@pytest.fixture
+def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where programs that are asked put their temporary files."""
+    folder = tmp_path / "temporary"
+    folder.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(folder))
+    monkeypatch.setenv("TMPDIR", str(folder))
+    return folder
+
+
 @pytest.mark.parametrize("packed", [b"\0\0", pytest.param(b"x\x9c\xff", marks=pytest.mark.deep)])
-def test_an_mf4_whose_blocks_cannot_be_unpacked_is_malformed(packed: bytes, tmp_path: Path) -> None:
+def test_an_mf4_whose_blocks_cannot_be_unpacked_is_malformed_and_leaves_no_file(
+    packed: bytes, tmp_path: Path, temporary: Path
+) -> None:
     WRITERS["mf4"](CanLog(FRAMES), tmp_path / "whole.mf4")
     whole = bytearray((tmp_path / "whole.mf4").read_bytes())
     data = whole.index(b"##DZ") + 48  # behind the head of a block of packed data (ASAM MDF 4.1, DZBLOCK)
     whole[data : data + len(packed)] = packed
     with pytest.raises(ConfigError, match=r"a.mf4: not an MF4 that can be read: torn or malformed: "):
         READERS["mf4"](made(tmp_path / "a.mf4", bytes(whole)))
+    assert list(temporary.iterdir()) == []
 
 
 def test_an_mf4_reader_that_exceeds_its_deadline_is_killed(

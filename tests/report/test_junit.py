@@ -6,6 +6,7 @@ from xml.etree import ElementTree
 
 import msgspec
 from campaigns import result
+from junitparser import JUnitXml, Properties
 from reported import HOSTILE, hostile, named, summary_of, with_results
 
 from aftbed.campaign.experiment import Result
@@ -22,7 +23,11 @@ SCHEMA: Final = {  # what junit-10.xsd and jenkins-junit.xsd both allow: attribu
     ),
     "properties": ((), (), ("property",)),
     "property": (("name", "value"), (), ()),
-    "testcase": (("name",), ("classname", "time"), ("skipped", "failure", "system-out", "system-err")),
+    "testcase": (
+        ("name",),
+        ("classname", "time"),
+        ("properties", "skipped", "failure", "system-out", "system-err"),
+    ),
     "failure": ((), ("type", "message"), ()),
 }
 
@@ -74,6 +79,36 @@ def test_properties_say_what_was_run(ledger: Ledger) -> None:
     assert found["seed"] == "7" and found["code"] == ledger.head.code and found["gate"] == summary.gate
     assert found["experiments"] == str(len(ledger.results))
     assert {f"outcome.{name}": str(n) for name, n in summary.outcomes.items()}.items() <= found.items()
+
+
+def test_a_stratum_has_its_evidence_for_the_requirements_that_the_campaign_verifies(ledger: Ledger) -> None:
+    assert next(suite_of(ledger).iter("testcase")).find("properties") is None, "no requirement is named"
+    verifying = msgspec.structs.replace(ledger.head.spec, verifies=("SG-1", "FSR-3.2"), ftti="100ms")
+    head = msgspec.structs.replace(ledger.head, spec=verifying)
+    cases = list(suite_of(msgspec.structs.replace(ledger, head=head)).iter("testcase"))
+    by_name = {
+        case.get("name"): {p.get("name"): p.get("value") for p in case.iter("property")} for case in cases
+    }
+    found = by_name["pbr · steady · crash primary"]
+    (stratum,) = (one for one in summary_of(ledger).strata if one.name == "pbr · steady · crash primary")
+    assert stratum.handling is not None and stratum.handling.fhti_ms is not None
+    assert (found["verifies"], found["n"], found["failed"]) == ("SG-1,FSR-3.2", str(stratum.experiments), "0")
+    assert 0.0 < float(found["bound"] or 0) < 1.0, "few experiments prove little"
+    assert (found["ftti_ms"], found["fhti_ms"]) == ("100", f"{stratum.handling.fhti_ms.max:g}")
+    assert found["seed"] == "7" and found["code"] == ledger.head.code
+    assert (found["command"] or "").startswith("aftbed sim --ftm pbr")
+    assert by_name[cases[-1].get("name")] == {}, "a gate is no evidence of its own"
+
+
+def test_junitparser_reads_the_properties_of_a_test_case(ledger: Ledger, tmp_path: Path) -> None:
+    head = msgspec.structs.replace(
+        ledger.head, spec=msgspec.structs.replace(ledger.head.spec, verifies=("SG-1",))
+    )
+    path = tmp_path / "junit.xml"
+    path.write_text(junit_xml(summary_of(ledger), msgspec.structs.replace(ledger, head=head)))
+    (suite,) = JUnitXml.fromfile(str(path))
+    properties = next(iter(suite)).child(Properties)
+    assert {p.name: p.value for p in properties}["verifies"] == "SG-1"
 
 
 def test_a_failure_says_why_and_how_to_repeat_the_worst(ledger: Ledger) -> None:

@@ -51,6 +51,13 @@ def test_it_is_within_a_tenth_of_the_closed_form(name: str, fault: FunctionFault
     assert row.closed_form_ms is not None and row.ftti_ms == pytest.approx(row.closed_form_ms, rel=0.1)
 
 
+@pytest.mark.deep
+def test_there_is_no_closed_form_where_a_fault_within_the_partial_braking_is_worse() -> None:
+    row = measured("ncap:ccrs-40", FunctionFault.HANG)
+    assert row.worst_instant_s == 3.0, "the first demand is at 2.56 s"
+    assert row.ftti_ms is not None and row.closed_form_ms is None
+
+
 def test_from_one_gap_it_never_grows_with_speed(tmp_path: Path) -> None:
     found = [measured(obstacle(tmp_path, speed_kmh, 18.0)).ftti_ms or math.inf for speed_kmh in (46, 53)]
     assert found[1] < found[0] < math.inf

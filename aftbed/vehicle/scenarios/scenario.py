@@ -9,6 +9,7 @@ import msgspec
 from msgspec import Meta
 
 from aftbed.core.errors import ConfigError
+from aftbed.core.requirements import check_requirements
 from aftbed.vehicle.plant import (
     DEAD_TIME_MS,
     KMH_PER_MS,
@@ -47,6 +48,7 @@ class Scenario(msgspec.Struct, frozen=True):
     duration_ms: int
     plant: PlantSetup
     expect: Expectation
+    verifies: tuple[str, ...] = ()  # requirements
 
 
 class EgoKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -102,6 +104,7 @@ class ScenarioKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     road: RoadKeys = RoadKeys()
     brakes: BrakesKeys = BrakesKeys()
     driver: DriverKeys | None = None
+    verifies: tuple[str, ...] = ()
 
 
 def scenario_of(name: str, where: str, keys: ScenarioKeys) -> Scenario:
@@ -116,7 +119,11 @@ def scenario_of(name: str, where: str, keys: ScenarioKeys) -> Scenario:
         ),
         driver=Driver(_ms(driver.reaction_s), driver.deceleration_ms2) if driver else None,
     )
-    return Scenario(name, keys.description, _ms(keys.duration_s), setup, keys.expect)
+    try:
+        check_requirements("verifies", keys.verifies)
+    except ConfigError as error:
+        raise ConfigError(f"{where}: {error}") from None
+    return Scenario(name, keys.description, _ms(keys.duration_s), setup, keys.expect, keys.verifies)
 
 
 def _ms(duration_s: float) -> int:
