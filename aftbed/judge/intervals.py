@@ -18,8 +18,9 @@ neither is known: replies are wrong or missing, or a state is wrong behind right
 An adaptation is no fault, but the car cannot tell: for the length of its blackout the function does not
 answer. So it is listed too, as a reaction that needs no detection, and the FTTI holds for it as well.
 
-Times are by the clock. In lockstep the bus waits for the function meanwhile. Limits: a fault of the bus has
-none, since a bus has its own time; in a run of many faults a detection is the first behind the fault.
+Times are by the clock. In lockstep the bus waits for the function meanwhile. Limits: a fault of the bus
+or of the radar has none, since they have their own time; in a run of many faults a detection is the first
+behind the fault.
 """
 
 import itertools
