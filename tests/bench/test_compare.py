@@ -250,10 +250,13 @@ def test_what_is_no_bench_is_refused_before_anything_is_measured(
 
 
 def test_the_exit_code_says_whether_the_new_version_is_above_the_ratio(
-    made: MakeVenv,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    old, new = (
-        made(name, PRINTS.replace("{document}", document(p50))) for name, p50 in (("old", 5.0), ("new!", 6.0))
+    old, new = tmp_path / "old", tmp_path / "new"
+    monkeypatch.setattr(compare, "version_of", lambda venv: f"aftbed of {venv.name}")
+    monkeypatch.setattr(compare, "check_options", lambda *_: None)
+    monkeypatch.setattr(
+        compare, "measured", lambda venv, _: json.loads(document(6.0 if venv == new else 5.0))
     )
     words = ["bench", "compare", str(old), str(new), "--bench", "cycle", "--max-ratio"]
     above_it = called(*words, "1.05", "--rounds", "6")

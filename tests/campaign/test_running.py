@@ -48,9 +48,9 @@ def test_better_than_expected_is_unexpected_too(tmp_path: Path) -> None:
 
 
 def test_a_stratum_that_is_known_well_enough_is_left(tmp_path: Path) -> None:
-    stop = "stop: {experiments: 40, looks: 4, half_width: 0.1}"
+    stop = "stop: {experiments: 20, looks: 4, half_width: 0.15}"
     found = ran(planned(tmp_path, CRASHES.replace("stop: {experiments: 4}", stop)), tmp_path / "out")
-    assert len(found.results) == 5 * 30, "0 of 30 are narrow enough, 0 of 20 are not"
+    assert len(found.results) == 5 * 15, "0 of 15 are narrow enough, 0 of 10 are not"
 
 
 def test_a_shard_cannot_stop_by_what_it_does_not_see(tmp_path: Path) -> None:

@@ -8,6 +8,9 @@ import pytest
 from fakerun import Call, Output
 
 from aftbed.cli.scenario_table import TableArguments, table_drive
+from aftbed.inject.grammar import Trigger
+from aftbed.inject.model import Fault, FaultAction
+from aftbed.search.worst_instant import ANCHOR, Course, Worst, strike
 from aftbed.vehicle.scenarios.library import load_scenario, scenario_names
 from aftbed.vehicle.scenarios.tables import table_names
 
@@ -90,7 +93,15 @@ def test_a_fault_that_never_strikes_is_exit_code_3(table: Call) -> None:
     assert out.rstrip().split("\n")[-1].startswith("0 of 1 rows pass; the fault never struck in 1")
 
 
-def test_outages_have_lines_of_their_own_and_are_plotted(table: Call, tmp_path: Path) -> None:
+def one_instant(course: Course, action: FaultAction, target: str) -> Worst:
+    """Instead of a search for the worst one."""
+    return Worst(strike(course, Fault(action, target, Trigger(ANCHOR, 100))), 1)
+
+
+def test_outages_have_lines_of_their_own_and_are_plotted(
+    table: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("aftbed.search.road_table.worst_instant", one_instant)
     plot = tmp_path / "road.svg"
     arguments = ("ncap", "--group", "ccrb-12m-6", "--ftm", "none", "--outage", "2s", "--plot", plot)
     code, out, _ = table(*arguments)

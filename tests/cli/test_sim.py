@@ -159,12 +159,12 @@ def test_an_update_that_the_function_cannot_follow_is_undone_and_says_why(sim: C
 def test_a_crash_right_behind_the_commit_of_an_update(sim: Call, tmp_path: Path) -> None:
     for step in (1, 2):
         (tmp_path / f"adder{step}.py").write_text(OTHER_FUNCTION.replace("STEP", str(step)))
-    update = ("--adapt", f"update app to {tmp_path}/adder2.py:Adder at request 20", "--may-fail")
-    words = ("--app", tmp_path / "adder1.py:Adder", "--count", "60", "--rate", "300", *update)
+    update = ("--adapt", f"update app to {tmp_path}/adder2.py:Adder at request 10", "--may-fail")
+    words = ("--app", tmp_path / "adder1.py:Adder", "--count", "30", "--rate", "300", *update)
     for role, ftm in (("primary", "pbr"), ("backup", "pbr+tr"), ("engine", "lfr")):
         code, out, _ = sim(*words, "--ftm", ftm, "--faults", f"crash {role} at adapt.commit")
         assert code == 0 and f"crash {role} at adapt.commit nth 1: activated" in out, out
-        assert "60 answered, 0 lost, 0 duplicated, 0 late, 0 wrong" in out
+        assert "30 answered, 0 lost, 0 duplicated, 0 late, 0 wrong" in out
 
 
 ROUGH: Final = """
@@ -192,7 +192,7 @@ def test_replies_are_compared_within_what_the_function_declares(
     """Its state keeps seven digits."""
     (tmp_path / "rough.py").write_text(ROUGH.replace("ACCESS", access))
     app, crash = f"{tmp_path}/rough.py:Mean", ("--faults", "crash primary at server.exit nth 9")
-    document = json.loads(sim("--app", app, "--ftm", "pbr", "--count", "40", *crash, "--json")[1])
+    document = json.loads(sim("--app", app, "--ftm", "pbr", "--count", "12", *crash, "--json")[1])
     assert document["verdict"] == found, document["breaches"]
     assert all(one.startswith("one_history (G3): request ") for one in document["breaches"])
 
@@ -275,7 +275,7 @@ def test_a_program_brakes_a_car(sim: Call, tmp_path: Path) -> None:
     (tmp_path / "brake.py").write_text(BRAKE)
     app = f"{sys.executable} -I -S {tmp_path}/brake.py"
     crash = ("--faults", "crash primary when ttc < 1.5")
-    code, out, _ = sim("--app", app, "--ftm", "pbr", "--scenario", "ccrs-50", *crash)
+    code, out, _ = sim("--app", app, "--ftm", "pbr", "--scenario", "ccrs-20", *crash)
     assert code == 0 and re.search(r"^  car +stopped", out, re.MULTILINE), out
     assert "  failover   to epoch 2" in out
 
@@ -284,7 +284,7 @@ def test_what_a_function_says_wrong_after_a_failover_is_found(sim: Call, tmp_pat
     forgetful = OTHER_FUNCTION.replace("STEP", "1").replace("self.sum = int(state)", "pass")
     (tmp_path / "adder.py").write_text(forgetful)
     app = ("--app", tmp_path / "adder.py:Adder")
-    code, out, _ = sim(*app, "--count", "40", "--faults", "crash primary at server.exit nth 9")
+    code, out, _ = sim(*app, "--count", "12", "--faults", "crash primary at server.exit nth 9")
     assert code == 1 and "one_history fail" in out
     again = next(line for line in out.splitlines() if line.startswith("  repeat "))
     assert f"--app {tmp_path}/adder.py:Adder" in again
@@ -402,7 +402,7 @@ def test_an_exception_in_the_executive_is_a_failure(sim: Call, monkeypatch: pyte
 
 
 def test_every_setup_of_a_swarm_has_a_command() -> None:
-    for setup in map(drawn, range(300)):
+    for setup in map(drawn, range(100)):
         assert repeating(setup).startswith(f"aftbed sim --seed {setup.seed} --ftm {setup.ftm} "), setup
 
 
@@ -453,10 +453,10 @@ def test_of_many_broken_runs_the_first_are_shrunk(sim: Call) -> None:
 
 
 def test_two_processes_find_the_same_as_one_in_the_same_order() -> None:
-    setups = [Setup("lfr", seed=seed, count=1 + seed % 3) for seed in range(40)]
+    setups = [Setup("lfr", seed=seed, count=1 + seed % 3) for seed in range(16)]
     alone, together = (list(each(tried, setups, jobs)) for jobs in (1, 2))
     assert alone == together
-    assert [(number, setup.seed) for number, setup, _ in alone] == [(n, n) for n in range(40)]
+    assert [(number, setup.seed) for number, setup, _ in alone] == [(n, n) for n in range(16)]
 
 
 def test_endless_setups_are_simulated_as_results_are_read() -> None:
@@ -478,12 +478,12 @@ def test_a_swarm_is_drawn_from_the_seed(sim: Call) -> None:
 
 
 def test_a_swarm_counts_what_it_drew_beside_what_happened(sim: Call) -> None:
-    code, out, _ = sim("--swarm", "--seeds", "0..9")
+    code, out, _ = sim("--swarm", "--seeds", "0..4")
     assert code == 0
     assert re.search(r"^faults: [0-9]+ drawn to happen: [0-9]+ activated", out, re.MULTILINE)
     assert re.search(r"^adaptations: [0-9]+ drawn to happen: [0-9]+ done", out, re.MULTILINE)
-    found = json.loads(sim("--swarm", "--seeds", "0..9", "--json")[1])
-    setups = [drawn(seed) for seed in range(10)]
+    found = json.loads(sim("--swarm", "--seeds", "0..4", "--json")[1])
+    setups = [drawn(seed) for seed in range(5)]
     assert sum(group["total"] for group in found["faults"].values()) == sum(len(s.faults) for s in setups)
     adaptations = sum(group["total"] for group in found["adaptations"].values())
     assert adaptations == sum(len(s.adaptations) for s in setups)

@@ -94,7 +94,14 @@ def set_zone(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str], None]]
     time.tzset()
 
 
-@pytest.mark.parametrize(("name", "zone", "t_us"), sampled(FORMATS, ZONES, DATES_US))
+@pytest.mark.parametrize(
+    ("name", "zone", "t_us"),
+    [
+        *sampled([name for name in FORMATS if name != "mf4"], ZONES, DATES_US),
+        pytest.param("mf4", ZONES[1], DATES_US[1], marks=pytest.mark.process),  # as above
+        *(pytest.param("mf4", ZONES[n], DATES_US[n], marks=pytest.mark.deep) for n in (0, 2)),
+    ],
+)
 def test_a_log_of_any_zone_comes_back(
     name: str, t_us: int, zone: str, tmp_path: Path, set_zone: Callable[[str], None]
 ) -> None:

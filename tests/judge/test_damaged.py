@@ -5,6 +5,7 @@ record means the same: see `meaning`.
 """
 
 import shutil
+from functools import cache
 from pathlib import Path
 from typing import Final
 
@@ -49,6 +50,12 @@ def places(copy: Path) -> list[tuple[Path, int]]:
     ]
 
 
+@cache
+def meaning_of(record: Path) -> object:
+    """Of one that nothing changes."""
+    return meaning(read_record(record))
+
+
 def passes_with_another_meaning(record: Path, original: Path) -> bool:
     try:
         found = read_record(record)
@@ -56,7 +63,7 @@ def passes_with_another_meaning(record: Path, original: Path) -> bool:
             return False
     except ConfigError:
         return False
-    return meaning(found) != meaning(read_record(original))
+    return meaning(found) != meaning_of(original)
 
 
 def flipped(data: bytes, at: int, bit: int) -> bytes:
@@ -141,7 +148,8 @@ def test_no_file_is_missing_cut_or_exchanged_without_a_word(copy: Path, whole: P
     other = write_run(tmp_path / "other", setup(SEED + 1))
     for path in files(copy):
         before, exchanged = path.read_bytes(), other / path.relative_to(copy)
-        changes = [None, before[: len(before) // 2], before[:HEADER_BYTES]]
+        changes = [None, before[: len(before) // 2]]
+        changes += [before[:HEADER_BYTES]] if len(before) > HEADER_BYTES else []
         changes += [exchanged.read_bytes()] if exchanged.exists() else []
         for change in changes:
             if change is None:

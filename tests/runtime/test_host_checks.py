@@ -21,6 +21,7 @@ def limits() -> Iterator[None]:
 @pytest.fixture(autouse=True)
 def runtime(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setattr(doctor, "STEAL_SECONDS", 0.01)
     return tmp_path
 
 

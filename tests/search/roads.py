@@ -22,11 +22,16 @@ expect: {outcome: stop}
 """
 
 
-def near_course(folder: Path, ftm: str) -> Course:
-    """A drive with a warning, partial and full braking, without a fault."""
+def near(folder: Path) -> str:
+    """The path of a scenario with a warning, partial and full braking."""
     path = folder / "near.yaml"
     path.write_text(NEAR)
-    return course_of(Setup(ftm, scenario=str(path)))
+    return str(path)
+
+
+def near_course(folder: Path, ftm: str) -> Course:
+    """It, driven without a fault."""
+    return course_of(Setup(ftm, scenario=near(folder)))
 
 
 def sudden(folder: Path, speed_kmh: float, gap_m: float) -> str:

@@ -74,9 +74,9 @@ def test_a_drive_that_ends_in_an_impact_anyway_only_gets_faster() -> None:
 @pytest.mark.parametrize(
     ("speed_kmh", "gap_m", "outage_ms"),
     [
-        (50, 15.5, 100),
+        (30, 7.5, 300),
+        pytest.param(50, 15.5, 100, marks=pytest.mark.deep),
         pytest.param(70, 25.93, 20, marks=pytest.mark.deep),
-        pytest.param(30, 7.5, 300, marks=pytest.mark.deep),
     ],
 )
 def test_where_full_braking_cannot_wait_the_worst_outage_is_that_of_the_closed_form(

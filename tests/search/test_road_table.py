@@ -1,9 +1,11 @@
 """Tables of the road: rows are judged as the table says, outages stand beside mechanisms."""
 
+from pathlib import Path
 from typing import Final
 
 import pytest
 from msgspec.structs import replace
+from roads import near
 
 from aftbed.inject.crash import Crash
 from aftbed.inject.grammar import Trigger
@@ -84,12 +86,13 @@ def test_a_row_passes_under_a_crash_at_the_worst_instant_as_without_it() -> None
     )
 
 
-def test_an_outage_that_fails_a_row_says_that_it_must() -> None:
-    found = row(R152["r152:m1-20"], outage(1000))
+def test_an_outage_that_fails_a_row_says_that_it_must(tmp_path: Path) -> None:
+    case = replace(R152["r152:m1-20"], name=near(tmp_path))
+    found = row(case, outage(1000))
     assert not found.passed
     assert found.because[0] == f"impact at {found.impact_kmh:.1f} km/h, allowed is none"
     assert found.closed_form_kmh is not None and 0.0 < found.impact_kmh <= found.closed_form_kmh
-    left_m = row(R152["r152:m1-20"], BARE).min_gap_m
+    left_m = row(case, BARE).min_gap_m
     assert found.must_fail == f"1000 ms take 5.56 m of the braking distance; {left_m:.2f} m were left"
     assert "--pace real" in found.repeat[1], "in lockstep the drive would wait for the function"
 

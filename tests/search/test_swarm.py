@@ -30,8 +30,8 @@ from aftbed.search.explore import STEPS, steps_of
 from aftbed.search.swarm import attempt_drawn, contradictions, drawn, experiments, intended
 from aftbed.search.tally import ACTIVATED_MIN, DONE_MIN, AdaptationEnd, Intent, Tally, happened_in
 
-DRAWN = 3_000
-RUN = range(100)
+DRAWN = 1_000
+RUN = range(40, 80)  # of the many that `aftbed sim --swarm` tries
 STEP_LABELS = {event.label for event in STEPS}
 
 
@@ -148,7 +148,7 @@ def test_what_cannot_happen_is_drawn_rarely() -> None:
     adaptations = Counter(intent for one in meant for intent in one.adaptations)
     assert faults[Intent.NEVER] / faults.total() == pytest.approx(swarm.NEVER_PART, abs=0.02)
     assert adaptations[Intent.NEVER] / adaptations.total() == pytest.approx(swarm.NEVER_PART, abs=0.02)
-    assert adaptations[Intent.STRUCK] > 100
+    assert adaptations[Intent.STRUCK] > DRAWN / 30
     never = [
         f
         for s, m in zip(many(), meant, strict=True)

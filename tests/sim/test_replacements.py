@@ -73,8 +73,9 @@ def neighbours(placement: str, node: str) -> Iterator[str]:
 
 @pytest.mark.parametrize("placement", PLACEMENTS)
 def test_a_replacement_that_dies_is_replaced(placement: str) -> None:
-    """One step of each pair."""
+    """One step of each pair, or of each third one where there are many."""
     pairs = [(node, other) for node in SINGLES for other in neighbours(placement, node)]
+    pairs = pairs[:: 1 if placement == "replica" else 3]
     killed = [
         kill_replacement(placement, node, other, number * 37 % SPREAD)
         for number, (node, other) in enumerate(pairs)

@@ -119,7 +119,7 @@ def real_drive(log: Path, scenario: str, policy: BrakePolicy, seed: int) -> Driv
 
 @pytest.mark.parametrize(
     ("scenario", "policy", "seed"),
-    [("ccrs-50", "latch", 0), ("ccrb-50-12m", "hold", 7), ("ccrm-50", "release", 3)],
+    every(3, [("ccrb-50-12m", "hold", 7), ("ccrs-50", "latch", 0), ("ccrm-50", "release", 3)]),
 )
 def test_with_replies_at_once_it_is_the_lockstep_drive_frame_by_frame(
     scenario: str, policy: BrakePolicy, seed: int, tmp_path: Path
@@ -226,7 +226,7 @@ def gaps_m(drives: list[Drive]) -> list[float]:
 
 
 def test_the_later_the_replies_the_smaller_the_gap_until_it_is_none() -> None:
-    drives = [drive(when=after(delay_ms * MS)) for delay_ms in (100, 150, 200, 300, 500, 1000, 2000)]
+    drives = [drive(when=after(delay_ms * MS)) for delay_ms in (100, 200, 500, 2000)]
     found_m = gaps_m(drives)
     assert all(later_m < sooner_m for sooner_m, later_m in pairwise(found_m))
     assert [one.car.end for one in (drives[0], drives[-1])] == ["standstill", "collision"]
@@ -234,14 +234,14 @@ def test_the_later_the_replies_the_smaller_the_gap_until_it_is_none() -> None:
 
 def test_a_short_delay_is_made_up_for() -> None:
     """The loop is closed: where partial braking is late, the function asks for full braking sooner."""
-    prompt_m, *late_m = gaps_m([drive(when=after(delay_ms * MS)) for delay_ms in (0, 1, 10, 20, 50, 80)])
+    prompt_m, *late_m = gaps_m([drive(when=after(delay_ms * MS)) for delay_ms in (0, 1, 20, 80)])
     assert late_m == pytest.approx([prompt_m] * len(late_m), abs=0.5)
 
 
 @pytest.mark.parametrize("seed", every(3, range(3)))
 def test_the_longer_an_outage_the_smaller_the_gap_until_it_is_none(seed: int) -> None:
     """Before full braking: one that comes earlier can be made up for, one that comes later is bridged."""
-    lengths_ms = (0, 60, 100, 200, 300, 400, 600, 800, 1000, 1200, 5000)
+    lengths_ms = (0, 60, 200, 400, 800, 5000)
     drives = [drive(when=outage(BRAKING_MS, length_ms), seed=seed) for length_ms in lengths_ms]
     found_m = gaps_m(drives)
     assert all(longer_m < shorter_m for shorter_m, longer_m in pairwise(found_m))

@@ -177,12 +177,12 @@ def test_a_longer_silence_of_the_function_never_lowers_the_impact_speed(name: st
         driven = drive(scenario.plant, scenario.duration_ms, seed=3, policy="release", bus=bus)
         return impact_kmh(driven.result)
 
-    impacts_kmh = [silent(for_ms) for for_ms in (0, 300, 600, 900, 1200, 1500)]
+    impacts_kmh = [silent(for_ms) for for_ms in (0, 500, 1000, 1500)]
     assert impacts_kmh[0] == 0.0 < impacts_kmh[-1]
     assert impacts_kmh == sorted(impacts_kmh)
 
 
-@settings(max_examples=settings.default.max_examples // 5)
+@settings(max_examples=settings.default.max_examples // 8)
 @given(st.floats(10.0, 60.0), st.floats(0.55, 0.9), st.floats(0.0, 0.3), st.integers(0, 1000))
 def test_more_friction_never_raises_the_impact_speed_of_the_function(
     speed_kmh: float, friction: float, more: float, seed: int

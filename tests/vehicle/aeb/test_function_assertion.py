@@ -95,7 +95,7 @@ def test_flipped_bits_are_noticed_as_often_as_is_said_and_always_in_the_demand()
     noticed = {threat: Counter[bool]() for threat in (False, True)}
     for seed in range(5):
         function = AebFunction()
-        for request in sample_requests(seed, 1500)[::7]:
+        for request in sample_requests(seed, 1500)[::21]:
             reply = function.execute(request)
             output = decode_reply(reply)
             for bit in range(8 * len(reply)):
