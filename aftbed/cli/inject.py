@@ -16,6 +16,7 @@ from aftbed.core.errors import ConfigError, unknown
 from aftbed.inject.bus import read_bus_fault
 from aftbed.inject.memory import refuse_unsafe
 from aftbed.inject.model import Fault, on_bus, read
+from aftbed.inject.radar import EFFECTS, RADAR
 from aftbed.inject.value import MEMORY
 from aftbed.runtime.unix import control_client, run_directory
 from aftbed.runtime.unix.options import Work, with_names_resolved
@@ -26,7 +27,10 @@ LEVELS: Final = ("value", MEMORY)
 DRAWN: Final = "drawn"  # in the place of a byte's number: the seed chooses the byte
 # The word of a fault for each option, in the order in which they are sent.
 WORDS: Final = {
+    "range": "range",
+    "speed": "speed",
     "by": "by",
+    "angle": "angle",
     "share": "share",
     "duration": "for",
     "bit": "bit",
@@ -187,6 +191,35 @@ def bus(
 ) -> None:
     """Disturb frames on the CAN bus, or disconnect nodes from it."""
     _arm(run, on_bus(read_bus_fault(words)))
+
+
+class RadarArguments(msgspec.Struct, frozen=True, kw_only=True):
+    """The options of a fault of the radar, which may be given as words as well: `for 200ms`."""
+
+    words: Annotated[
+        tuple[str, ...],
+        typer.Argument(help=f"{', '.join(EFFECTS)}; then any of its words, as in `run --inject`."),
+    ]
+    range: Annotated[str | None, typer.Option(help="In m: where the ghost is; how far it sees.")] = None
+    speed: Annotated[str | None, typer.Option(help="In m/s: at which the ghost closes.")] = None
+    by: Annotated[str | None, typer.Option(help="bias: in m, as -5; drift: in m/s; latency: as 100ms.")] = (
+        None
+    )
+    angle: Annotated[str | None, typer.Option(help="In degrees: the whole field of view.")] = None
+    duration: Annotated[str | None, typer.Option("--for", help="How long; for good if left out.")] = None
+    after: After = None
+    when: When = None
+    permanent: Permanent = False
+    every: Every = None
+    chance: Chance = None
+    run: Run = None
+
+
+@inject.command()
+@takes(RadarArguments)
+def radar(given: RadarArguments) -> None:
+    """Make the car's radar report what is not so: docs/faults.md."""
+    _arm(given.run, read([RADAR, *given.words, *_words(given)]))
 
 
 # -- options to words, words to the run -----------------------------------------------------------

@@ -314,10 +314,10 @@ class BusFault(FaultKind, frozen=True, tag="bus"):
     # -- in the run
 
     def act(self, injection: Injection, run: RunControl) -> Steps[None]:
-        yield from run.disturb_bus(injection)
+        yield from run.disturb(injection)
 
     def receipt(self, injection: Injection, run: RunControl) -> Receipt:
-        report = run.bus_report(injection)
+        report = run.disturbance(injection)
         if report is None:
             return injection.receipt
         injection.unmet = self.opening.when if report.waits else None

@@ -19,10 +19,10 @@ where the bit already has that value, nothing changes.
     permanent                  at each occurrence from the first strike on
     intermittent every 7       at each 7th occurrence from the first strike on
     intermittent p 0.1         at each occurrence with that chance, by the seed of the run
-    for 500ms                  at each occurrence for that long, counted from the first strike (bus only)
+    for 500ms                  at each occurrence for that long (bus and radar only)
 
 The kind of fault says what an occurrence is: a frame on the bus, a message on a channel, a value in hand.
-Only the bus counts `for`, because only the bus has a time of its own.
+Only bus and radar count `for`, because only they have a time of their own.
 """
 
 import math

@@ -26,7 +26,7 @@ from aftbed.core.journal import Record
 from aftbed.core.messages import Message
 from aftbed.inject import targets
 from aftbed.inject.grammar import ONCE, FaultWords, Persistence, Trigger, read_persistence, read_trigger
-from aftbed.inject.receipts import BusReport, Receipt, ReceiptState
+from aftbed.inject.receipts import BusReport, RadarReport, Receipt, ReceiptState
 from aftbed.inject.shared_state import SharedState, StateHit
 from aftbed.inject.targets import TargetProcess
 from aftbed.vehicle.condition import Condition
@@ -127,12 +127,12 @@ class RunControl(Protocol):
         """Flip a bit of its memory; which it was, in words. Raises StepFailed."""
         ...
 
-    def disturb_bus(self, injection: Injection) -> Steps[None]:
-        """Arm it on the bus. Raises StepFailed where there is no bus."""
+    def disturb(self, injection: Injection) -> Steps[None]:
+        """Arm it on the bus or in the radar. Raises StepFailed where there is none."""
         ...
 
-    def bus_report(self, injection: Injection) -> BusReport | None:
-        """The latest that is known."""
+    def disturbance(self, injection: Injection) -> BusReport | RadarReport | None:
+        """The latest that bus or radar has reported."""
         ...
 
     def records_about(self, injection: Injection) -> list[Record]:
@@ -170,6 +170,7 @@ class FaultKind(msgspec.Struct, frozen=True):
     unsafe: ClassVar[bool] = False  # it strikes whatever is there; the user has to agree to it
     simulated: ClassVar[bool] = True
     needs_bus: ClassVar[bool] = False
+    needs_car: ClassVar[bool] = False  # which has a bus, too
     repeats: ClassVar[bool] = False  # it can be permanent or intermittent
     counts_messages: ClassVar[bool] = False  # it waits for messages on a channel, not for an event
     acts_in_node: ClassVar[bool] = False  # the agent of the node does all of it

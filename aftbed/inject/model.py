@@ -2,7 +2,7 @@
 
     crash primary at checkpoint.sent nth 100            hang backup for 50ms after 200ms
     delay aft2aft by 5ms in b permanent                 bitflip state.ego_ms bit 52 when ttc < 1.2
-    corrupt bus RADAR_TRACK bit 21 crc good for 500ms
+    corrupt bus RADAR_TRACK bit 21 crc good for 500ms    radar ghost range 30 speed 10 for 200ms
 
 `FaultAction` registers the kinds, one line each; each has its grammar at the top of its file.
 """
@@ -20,6 +20,7 @@ from aftbed.inject.grammar import ONCE, Persistence, Trigger
 from aftbed.inject.hang import Hang
 from aftbed.inject.kind import AnyFault, FaultKind
 from aftbed.inject.memory import MemoryFlip
+from aftbed.inject.radar import EFFECTS, RADAR, RadarFault
 from aftbed.inject.receipts import BusTimes, ReceiptState
 from aftbed.inject.slow import Slow
 from aftbed.inject.state import StateFlip
@@ -27,6 +28,7 @@ from aftbed.inject.value import ValueFlip
 
 FaultAction = (  # the registry: the first kind that claims the words of a fault reads them
     BusFault  # before the channels, which share some of its words
+    | RadarFault
     | Crash
     | Hang
     | Slow
@@ -40,7 +42,8 @@ NAMES: Final = tuple(dict.fromkeys(name for kind in KINDS for name in kind.NAMES
 GRAMMAR: Final = (
     "crash|hang|slow TARGET [by 2ms | share 25%] [for 50ms] [at EVENT [nth N] | after 200ms],"
     " omission|delay|duplicate|reorder CHANNEL [by 20ms] [in primary|backup|a|b] [nth N | after 200ms],"
-    " or bitflip PLACE|state.FIELD|memory [bit K] [in primary|backup|a|b] [at EVENT] [nth N] | [after 200ms],"
+    " bitflip PLACE|state.FIELD|memory [bit K] [in primary|backup|a|b] [at EVENT] [nth N] | [after 200ms],"
+    f" or {RADAR} {'|'.join(EFFECTS)} [range 30] [speed 10] [by -5] [angle 20] [for 200ms] [after 200ms],"
     " each with [when ttc < 1.2] in place of after"
 )
 

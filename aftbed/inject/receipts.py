@@ -83,6 +83,14 @@ def more_times(times: int) -> str:
     return f", and {times - 1} more times" if times > 1 else ""
 
 
+class RadarReport(msgspec.Struct, frozen=True):
+    """What the radar reports of a fault. `waits`: for its condition, which has not held yet."""
+
+    number: int
+    receipt: Receipt
+    waits: bool = False
+
+
 class BusReport(msgspec.Struct, frozen=True):
     """What the bus reports of a fault: how many frames it struck, the first, which node noticed it, and how.
 

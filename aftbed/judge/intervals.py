@@ -24,6 +24,8 @@ detection is the first behind the fault.
 Those of a fault of the bus are in bus time. It is detected when a receiver refuses a frame, or misses one;
 handled when all that objected use these frames again. If they never do, the fallback of the brakes is safe.
 A frame that is late, and right, is handled when it is taken in; a wrong one that is believed never is.
+
+A fault of the radar has none: its frames are well-formed, and nothing refuses them.
 """
 
 import itertools

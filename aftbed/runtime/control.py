@@ -26,6 +26,7 @@ from aftbed.core.messages import (
 from aftbed.core.script import Phase, Script
 from aftbed.inject.bus import BusFault
 from aftbed.inject.model import ArmedFault
+from aftbed.inject.radar import RadarFault
 from aftbed.vehicle.condition import Condition
 
 WHOLE: Final = 1.0  # of a CPU
@@ -221,6 +222,13 @@ class DisturbBus(ControlOrder, frozen=True):
     draw: int
 
 
+class DisturbRadar(ControlOrder, frozen=True):
+    """To the vehicle: arm this fault of its radar; `token` is its number, `draw` seeds its chance."""
+
+    fault: RadarFault
+    draw: int
+
+
 class WatchCar(ControlOrder, frozen=True):
     """To the hub: report when `condition` holds; `token` is the number of the fault. An Ack has to follow."""
 
@@ -275,18 +283,21 @@ class Fired(msgspec.Struct, frozen=True, tag=True):
     fault: int
 
 
-# Kinds of reports of the hub's process about faults of the bus and conditions of the car.
+# Kinds of reports: of the hub about faults of the bus and conditions of the car; of the vehicle about those
+# of its radar.
 HUB: Final = "hub"
 BUS_FAULT_ARMED: Final = "disturbed"
 BUS_FAULTS_CHANGED: Final = "struck"  # the receipts that are new
 BUS_FAULTS_ASKED: Final = "struck.all"  # the receipts of all, as asked
 CONDITION_WATCHED: Final = "watched"
 CONDITION_MET: Final = "met"
+RADAR_FAULT_ARMED: Final = "radar.disturbed"
+RADAR_FAULTS_CHANGED: Final = "radar.struck"
 BUS_COUNTS: Final = "counts"
 BUS_STRANGER: Final = "stranger"
 BUS_REPORTS: Final = (
     *(BUS_FAULT_ARMED, BUS_FAULTS_CHANGED, BUS_FAULTS_ASKED, CONDITION_WATCHED, CONDITION_MET),
-    *(BUS_COUNTS, BUS_STRANGER),
+    *(RADAR_FAULT_ARMED, RADAR_FAULTS_CHANGED, BUS_COUNTS, BUS_STRANGER),
 )
 
 
@@ -299,7 +310,7 @@ class Report(msgspec.Struct, frozen=True, tag=True):
 
 ToNode = (
     Park | JoinRun | Assign | Serve | BindInput | BindOutput | Follow | Rewire | SuspendNode | ResumeNode
-    | Capture | Restore | Deliver | WatchNodes | Arm | SlowDown | ShareState | DisturbBus | WatchCar | Stop
-    | StopRequests | Stats | Ack
+    | Capture | Restore | Deliver | WatchNodes | Arm | SlowDown | ShareState | DisturbBus
+    | DisturbRadar | WatchCar | Stop | StopRequests | Stats | Ack
 )  # fmt: skip
 FromNode = Hello | Ack | BrickReport | Ordered | Fired | Report

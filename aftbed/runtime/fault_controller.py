@@ -25,7 +25,7 @@ from aftbed.core.journal import Record
 from aftbed.inject import targets
 from aftbed.inject.kind import Injection, Steps
 from aftbed.inject.model import ArmedFault, Fault, FaultReport
-from aftbed.inject.receipts import BusReport, Receipt, ReceiptState, records_about
+from aftbed.inject.receipts import BusReport, RadarReport, Receipt, ReceiptState, records_about
 from aftbed.inject.shared_state import SharedState, StateLayout
 from aftbed.inject.targets import Roles, TargetProcess
 from aftbed.runtime import control
@@ -301,11 +301,11 @@ class FaultController:
     def flip_memory(self, process: TargetProcess, bit: int | None, address: int | None, draw: int) -> str:
         return self._runtime.flip_memory(cast("Process", process), bit, address, draw)
 
-    def disturb_bus(self, injection: Injection) -> Steps[None]:
+    def disturb(self, injection: Injection) -> Steps[None]:
         yield from self._runtime.disturb(injection.number, injection.fault.action, injection.draw)
 
-    def bus_report(self, injection: Injection) -> BusReport | None:
-        return self._runtime.bus_fault(injection.number)
+    def disturbance(self, injection: Injection) -> BusReport | RadarReport | None:
+        return self._runtime.disturbance(injection.number)
 
     def records_about(self, injection: Injection) -> list[Record]:
         """Of its hosts and of what it struck."""

@@ -13,7 +13,7 @@ from aftbed.core.events import Event
 from aftbed.core.graph import Link
 from aftbed.core.journal import Record
 from aftbed.inject.kind import FaultKind
-from aftbed.inject.receipts import BusReport
+from aftbed.inject.receipts import BusReport, RadarReport
 from aftbed.runtime.control import ToNode
 from aftbed.runtime.tasks import Key, Tasks, Wait
 from aftbed.vehicle.condition import Condition
@@ -280,7 +280,10 @@ class Runtime(Protocol):
         ...
 
     def disturb(self, number: int, fault: FaultKind, draw: int) -> Generator[Wait, dict[Key, bytes], None]:
-        """Arm a fault of the bus; it is armed when this ends. Raises StepFailed where there is no bus."""
+        """Arm a fault of the bus or of the radar; it is armed when this ends.
+
+        Raises StepFailed where there is no bus, or no radar.
+        """
         ...
 
     def watch(
@@ -299,7 +302,7 @@ class Runtime(Protocol):
         """
         ...
 
-    def bus_fault(self, number: int) -> BusReport | None:
+    def disturbance(self, number: int) -> BusReport | RadarReport | None:
         """What has become of it, as far as is known."""
         ...
 

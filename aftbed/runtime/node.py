@@ -607,6 +607,7 @@ class Node(Generic[In, Out]):
                 | control.Assign()
                 | control.Serve()
                 | control.DisturbBus()
+                | control.DisturbRadar()
                 | control.WatchCar()
                 | control.Stop()
                 | control.Ack()

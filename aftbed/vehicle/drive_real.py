@@ -33,6 +33,7 @@ from aftbed.vehicle.can.dbc_file import Codec
 from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.ecus import BrakePolicy, CarBody, End
 from aftbed.vehicle.plant import Telemetry, VehicleResult
+from aftbed.vehicle.radar import RadarDisturber
 from aftbed.vehicle.scenarios.scenario import Scenario
 
 RADAR, BRAKE, _ = NODES
@@ -85,13 +86,15 @@ def drive(
     *,
     report: Callable[[Telemetry], None],
     stop: Callable[[], bool],
+    radar: RadarDisturber | None = None,
 ) -> DriveReport:
     """Drive `scenario` to its end, or until `stop()`, which is asked at every step.
 
-    `report` is called each 50 ms of bus time and at the end. Raises HarnessError when the bus fails.
+    `report` is called each 50 ms of bus time and at the end. `radar` has the faults of the radar: they may be
+    armed while `stop` is called. Raises HarnessError when the bus fails.
     """
     buses.line.request_conditions()  # those of faults that were armed since the car has attached, too
-    return _Drive(scenario, codec, buses, options, stop).run(report)
+    return _Drive(scenario, codec, buses, options, stop, radar).run(report)
 
 
 class _Drive:
@@ -102,9 +105,11 @@ class _Drive:
         buses: CarBuses,
         options: DriveOptions,
         stop: Callable[[], bool],
+        radar: RadarDisturber | None,
     ) -> None:
         self._buses = buses
         self._body = CarBody(scenario, codec, options.brake_policy, options.seed)
+        self._body.radar.disturber = radar
         self._schedule = None if options.pace is None else Schedule(options.pace)
         self._stop = stop
         self._track_id = codec.can_id("RADAR_TRACK")
@@ -153,7 +158,7 @@ class _Drive:
         """Report to the hub which conditions hold now."""
         line, t_us = self._buses.line, self._body.plant.t_us
         for number, condition in list(line.conditions.items()):
-            if self._body.holds(condition):
+            if self._body.plant.holds(condition):
                 if self._schedule is None:
                     line.set_time(t_us)
                 line.met(number, t_us)

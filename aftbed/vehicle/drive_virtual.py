@@ -18,7 +18,8 @@ How often `advance` is called makes no difference: the plant is moved when it is
 caller has one event for each radar cycle and not twenty.
 
 *Faults of the bus* (`disturb`) act between sender and receivers, as in the hub. A frame that is held back
-comes in the step that finds it due, like everything on this bus.
+comes in the step that finds it due, like everything on this bus. Those of the radar (`disturb_radar`) act in
+its ECU.
 
 Limits: except for its faults the bus is ideal. It takes no time, loses nothing, and has no other node on it.
 """
@@ -34,6 +35,7 @@ from aftbed.vehicle.condition import Condition
 from aftbed.vehicle.ecus import BrakePolicy, CarBody, End
 from aftbed.vehicle.gateway import Gateway, GatewayCounts
 from aftbed.vehicle.plant import STEP_US, VehicleResult
+from aftbed.vehicle.radar import RadarDisturber
 from aftbed.vehicle.scenarios.scenario import Scenario
 
 RADAR, BRAKE, GATEWAY = NODES
@@ -192,6 +194,10 @@ class VirtualCar:
         self._bus.gateway.noticed()  # what it has noticed before, no fault has caused
         self._bus.disturb(disturber)
 
+    def disturb_radar(self, disturber: RadarDisturber) -> None:
+        """A fault of the radar was armed in `disturber`, the only one of this car, after `before`."""
+        self._body.radar.disturber = disturber
+
     # -- steps ----------------------------------------------------------------------------------
 
     def _set_now(self, now_ns: int) -> None:
@@ -213,7 +219,7 @@ class VirtualCar:
         bus.receive_until(t_us - 1)
         if bus.disturbed or bus.watched:
             for number, condition in bus.conditions():
-                if body.holds(condition) and bus.met(number, t_us):
+                if body.plant.holds(condition) and bus.met(number, t_us):
                     self._holds += 1
                     self._on_met.pop(number)(t_us)
             if self._holds:

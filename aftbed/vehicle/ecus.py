@@ -41,19 +41,17 @@ from aftbed.vehicle.can.bus_model import FALLBACK, GOOD_AGAIN, Notice
 from aftbed.vehicle.can.dbc_file import Codec
 from aftbed.vehicle.can.e2e import P11, ChannelState, FrameStatus, Receiver, Supervision
 from aftbed.vehicle.can.frame import Frame
-from aftbed.vehicle.condition import Condition
 from aftbed.vehicle.plant import STEP_US, Plant, Telemetry, VehicleResult
+from aftbed.vehicle.radar import RANGE_MAX_M, SPEED_MAX_MS, TRACK_ID, RadarDisturber, Target
 from aftbed.vehicle.scenarios.scenario import Scenario
 
 BrakePolicy = Literal["hold", "release", "latch"]
 BRAKE_POLICIES: Final[tuple[BrakePolicy, ...]] = ("hold", "release", "latch")
 
-RANGE_MAX_M: Final = 150.0
 RANGE_NOISE_M: Final = 0.1  # half width of the noise, as for the two below
 SPEED_NOISE_MS: Final = 0.1
 LATERAL_NOISE_M: Final = 0.1
 RADAR_STATUS_OFFSET_US: Final = 5000
-TRACK_ID: Final = 0
 
 HOLD_US: Final = 60_000
 LATE_US: Final = 30_000  # one cycle and a half: from here on a request is missing
@@ -105,41 +103,57 @@ class RadarEcu:
         self.track = Sender(codec, "RADAR_TRACK")
         self._status = Sender(codec, "RADAR_STATUS", RADAR_STATUS_OFFSET_US)
         self._random = Random(seed)
-        self._seen = False
+        self._track_id: int | None = None  # of the target in the last track; None: there was none
         self._cycle = 0
+        self.disturber: RadarDisturber | None = None  # from the first fault on
 
     def frames(self, plant: Plant) -> list[Frame]:
         """The frames due at `plant.t_us`. To be called once for each plant step."""
+        if self.disturber is not None:
+            self.disturber.step(plant.t_us, _target(plant), plant.holds)
         if self.track.due(plant.t_us):
             self._cycle += 1
             return [self.track.frame(plant.t_us, self._measure(plant))]
         if self._status.due(plant.t_us):
-            status = {"STATE": 1, "TRACKS": int(self._seen), "CYCLE": self._cycle % 0x10000}
+            status = {"STATE": 1, "TRACKS": int(self._track_id is not None), "CYCLE": self._cycle % 0x10000}
             return [self._status.frame(plant.t_us, status)]
         return []
 
     def _measure(self, plant: Plant) -> dict[str, float]:
         """The signals of RADAR_TRACK; all 0 if there is no target."""
         noise = [self._noise(width) for width in (RANGE_NOISE_M, SPEED_NOISE_MS, LATERAL_NOISE_M)]
-        seen = plant.gap_m is not None and plant.gap_m <= RANGE_MAX_M
-        new, self._seen = seen and not self._seen, seen
+        target = _target(plant)
+        if self.disturber is not None:
+            target = _in_range(self.disturber.reported(plant.t_us, target))
+        before, self._track_id = self._track_id, None if target is None else target.track_id
         range_m = relative_ms = lateral_m = 0.0
-        if plant.gap_m is not None and seen:
-            range_m = max(0.0, plant.gap_m + noise[0])
-            relative_ms = plant.lead_speed_ms - plant.speed_ms + noise[1]
-            lateral_m = plant.lateral_m + noise[2]
+        if target is not None:
+            range_m = max(0.0, target.range_m + noise[0])
+            relative_ms = target.relative_ms + noise[1]
+            lateral_m = target.lateral_m + noise[2]
         return {
-            "VALID": int(seen),
-            "NEW_TRACK": int(new),
-            "TRACK_ID": TRACK_ID,
+            "VALID": int(target is not None),
+            "NEW_TRACK": int(self._track_id not in (None, before)),
+            "TRACK_ID": TRACK_ID if target is None else target.track_id,
             "RANGE": range_m,
-            "RELATIVE_SPEED": max(-100.0, min(100.0, relative_ms)),
+            "RELATIVE_SPEED": max(-SPEED_MAX_MS, min(SPEED_MAX_MS, relative_ms)),
             "LATERAL_OFFSET": max(-10.0, min(10.0, lateral_m)),
         }
 
     def _noise(self, half_width: float) -> float:
         """Bell-shaped and bounded: four uniforms, and none of a platform's own log or cos."""
         return half_width * (sum(self._random.random() for _ in range(4)) - 2.0) / 2.0
+
+
+def _target(plant: Plant) -> Target | None:
+    """What the radar sees."""
+    if plant.gap_m is None:
+        return None
+    return _in_range(Target(plant.gap_m, plant.lead_speed_ms - plant.speed_ms, plant.lateral_m))
+
+
+def _in_range(target: Target | None) -> Target | None:
+    return None if target is None or target.range_m > RANGE_MAX_M else target
 
 
 class BrakeEcu:
@@ -273,16 +287,16 @@ class CarBody:
 
     def receive(self, frame: Frame) -> None:
         """A frame has come to the brake ECU, which takes it as of this step."""
+        accepted = self._brake.accepted
         self._brake.on_frame(Frame(self.plant.t_us, frame.can_id, frame.data))
+        if self.radar.disturber is not None and self._brake.accepted > accepted:
+            self.radar.disturber.answered()
 
     def noticed(self) -> list[Notice]:
         """What the brake ECU has found since the last call."""
         found = list(self._brake.noticed)
         self._brake.noticed.clear()
         return found
-
-    def holds(self, condition: Condition) -> bool:
-        return condition.holds(self.plant.ttc_s(), self.plant.gap_m, self.plant.speed_ms)
 
     def step(self, report: Callable[[Telemetry], None] | None = None) -> None:
         """Advance by 1 ms. `report` is called each 50 ms, after the brake ECU has decided."""

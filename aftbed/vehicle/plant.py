@@ -23,6 +23,8 @@ from typing import Final
 
 import msgspec
 
+from aftbed.vehicle.condition import Condition
+
 
 class VehicleResult(msgspec.Struct, frozen=True):
     """A whole drive. `min_gap_m` and `stop_gap_m` are None without a target or without a stop.
@@ -170,6 +172,9 @@ class Plant:
         """Seconds to contact at the present speeds; None if the gap is not closing."""
         closing_ms = self.speed_ms - self.lead_speed_ms
         return None if self.gap_m is None or closing_ms <= 0.0 else self.gap_m / closing_ms
+
+    def holds(self, condition: Condition) -> bool:
+        return condition.holds(self.ttc_s(), self.gap_m, self.speed_ms)
 
     def result(self) -> VehicleResult:
         impact_ms = self._impact_speed_ms

@@ -79,6 +79,16 @@ def drive(fake: FakeRun, tmp_path: Path) -> FakeRun:
             "bitflip memory bit 3 address 0x7f00 in b",
         ),
         (("bus", "omission bus RADAR_TRACK for 200ms"), "omission bus RADAR_TRACK for 200ms"),
+        (
+            ("radar", "ghost", "--range", "30", "--speed", "10", "for", "200ms"),
+            "radar ghost range 30 speed 10 for 200ms",
+        ),
+        (("radar", "bias", "--by", "-5", "--when", "ttc<2"), "radar bias by -5 when ttc < 2 permanent"),
+        (
+            ("radar", "fov", "--angle", "20", "--after", "1s", "--for", "2s"),
+            "radar fov range 150 angle 20 after 1000ms for 2000ms",
+        ),
+        (("radar", "missed", "--chance", "0.1"), "radar missed intermittent p 0.1"),
     ],
 )
 def test_the_options_of_a_fault_are_its_words(
@@ -104,6 +114,9 @@ def test_the_options_of_a_fault_are_its_words(
         ),
         (("bitflip", "primary", "--level", "disk"), "unknown level of a bitflip 'disk'"),
         (("bus", "omission bus RADAR_TRAK"), "RADAR_TRAK"),
+        (("radar", "ghost", "--range", "400"), "range '400': a number above 0 and up to 150 m"),
+        (("radar", "ghost", "--range", "30", "--for", "-5ms"), "duration '-5ms': a positive number"),
+        (("radar", "missed", "--by", "3"), "unknown word in fault 'radar missed by 3': 'by'"),
     ],
 )
 def test_wrong_options_are_refused(

@@ -4,6 +4,7 @@ from hypothesis import strategies as st
 
 from aftbed.core.events import Event
 from aftbed.core.units import DURATION_MS_MAX
+from aftbed.inject.bus import Opening
 from aftbed.inject.channel import HOLDING, ChannelFault, Disturbance
 from aftbed.inject.crash import Crash
 from aftbed.inject.grammar import (
@@ -16,6 +17,7 @@ from aftbed.inject.grammar import (
     Byte,
     Chance,
     Every,
+    Lasting,
     Permanent,
     StuckBit,
     Trigger,
@@ -23,10 +25,25 @@ from aftbed.inject.grammar import (
 from aftbed.inject.hang import FOREVER_MS, Hang
 from aftbed.inject.memory import MemoryFlip
 from aftbed.inject.model import Fault
+from aftbed.inject.radar import (
+    ANGLE_MAX_DEG,
+    BIAS_MAX_M,
+    DRIFT_MAX_MS,
+    LATENCY_MS_MAX,
+    RADAR,
+    Bias,
+    Drift,
+    FieldOfView,
+    Ghost,
+    Latency,
+    Missed,
+    RadarFault,
+)
 from aftbed.inject.slow import SHARE_MAX, SHARE_MIN, SLOW_MS_MAX, Slow
 from aftbed.inject.state import StateFlip
 from aftbed.inject.value import ValueFlip, ValuePlace
 from aftbed.vehicle.condition import QUANTITIES, Condition
+from aftbed.vehicle.radar import RANGE_MAX_M, SPEED_MAX_MS
 
 durations = st.integers(1, DURATION_MS_MAX)
 after = st.builds(Trigger, after_ms=durations)
@@ -67,6 +84,29 @@ disturbances = st.one_of(
         ChannelFault, st.sampled_from([how for how in Disturbance if how not in HOLDING]), st.just("aft2pro")
     ),
 )
+
+
+def _millionths(least: float, most: float) -> st.SearchStrategy[float]:
+    """With no more decimals than are written."""
+    return st.integers(round(least * 1e6), round(most * 1e6)).map(lambda count: count / 1e6)
+
+
+ranges = _millionths(1e-6, RANGE_MAX_M)
+insufficiencies = st.one_of(
+    st.just(Missed()),
+    st.builds(Ghost, ranges, _millionths(-SPEED_MAX_MS, SPEED_MAX_MS)),
+    st.builds(Bias, _millionths(1e-6, BIAS_MAX_M) | _millionths(-BIAS_MAX_M, -1e-6)),
+    st.builds(Drift, _millionths(1e-6, DRIFT_MAX_MS) | _millionths(-DRIFT_MAX_MS, -1e-6)),
+    st.builds(Latency, st.integers(1, LATENCY_MS_MAX)),
+    st.builds(FieldOfView, ranges, _millionths(1e-6, ANGLE_MAX_DEG)),
+)
+openings = st.builds(Opening, st.just(0) | st.integers(1, 10**9)) | st.builds(Opening, when=conditions)
+radar_faults = st.builds(
+    RadarFault,
+    insufficiencies,
+    openings,
+    persistences.filter(lambda found: found != ONCE) | st.builds(Lasting, st.integers(1, 10**9)),
+)
 fields = st.from_regex(r"[A-Za-z0-9_]{1,20}(\.[A-Za-z0-9_]{1,20})?", fullmatch=True)
 replicas = st.sampled_from(("primary", "backup", "a", "b"))
 faults = st.one_of(
@@ -106,4 +146,5 @@ faults = st.one_of(
         Fault, st.builds(ValueFlip, st.sampled_from(ValuePlace), patterns), replicas, triggers, persistences
     ),
     st.builds(Fault, st.builds(StateFlip, fields, patterns), replicas, triggers),
+    st.builds(Fault, radar_faults, st.just(RADAR)),
 )

@@ -1,4 +1,4 @@
-"""Faults of the bus in whole runs: armed before the drive or from a second command, with their receipts."""
+"""Faults of the bus and the radar in whole runs, armed before the drive or from a second command."""
 
 import re
 from pathlib import Path
@@ -91,6 +91,33 @@ def test_a_live_run_is_disturbed_from_a_second_command(home: Home) -> None:
     assert outcome.verdict.verdict == "pass"
 
 
+def test_the_radar_sees_a_ghost_and_the_receipt_says_how_often() -> None:
+    words = "radar ghost range 1.5 speed 2 after 1s for 200ms"
+    done = aftbed("run", *DRIVE, "--inject", words)
+    (found,) = done.verdict().faults
+    detail = "10 tracks, the first at 1.000000 s; answered"
+    assert (found.receipt.value, found.detail) == ("activated", detail), done.out + done.err
+
+
+def test_a_radar_with_nothing_to_change_proves_nothing() -> None:
+    done = aftbed("run", *DRIVE, "--inject", "radar fov range 150", "--inject", "radar missed after 1000s")
+    assert done.code == 3, done.out
+    assert [fault.receipt.value for fault in done.verdict().faults] == ["not_activated", "armed"]
+
+
+def test_a_live_car_misses_its_target_for_a_second_command(home: Home) -> None:
+    with Started(home, CarRun("ccrs-50", 1.0, "latch")) as started:
+        started.wait_for("started")
+        done = aftbed("inject", "radar", "missed", "for", "200ms")
+        assert done.code == 0, done.err
+        assert "radar missed for 200ms" in done.err
+        started.wait_for("fault", "activated")
+        outcome = started.stop()
+    (found,) = outcome.verdict.faults
+    assert (found.receipt.value, found.live) == ("activated", True)
+    assert found.detail.endswith("; answered")
+
+
 def test_a_load_has_no_bus() -> None:
     done = aftbed("run", "--load", "10", "--inject", "omission bus AEB_REQ")
     assert done.code == 2 and "a run of --load has no bus" in done.err
@@ -98,5 +125,7 @@ def test_a_load_has_no_bus() -> None:
         command.started()
         live = aftbed("inject", "bus", "omission bus AEB_REQ")
         assert live.code == 2 and "a run of --load has no bus" in live.err
+        blind = aftbed("inject", "radar", "missed")
+        assert blind.code == 2 and "a run of --load has no radar; --scenario has one" in blind.err
         assert aftbed("stop").code == 0
         assert command.done().code == 0

@@ -21,7 +21,8 @@ from aftbed.inject.bus import BusFault, read_bus_fault
 from aftbed.inject.crash import Crash
 from aftbed.inject.grammar import Trigger
 from aftbed.inject.hang import Hang
-from aftbed.inject.model import Fault
+from aftbed.inject.model import Fault, parse
+from aftbed.inject.radar import RadarFault
 from aftbed.runtime import control
 from aftbed.runtime.unix.transport import FDS_MAX, STATE_BYTES_MAX, Line, decode_order, decode_report
 from aftbed.vehicle.condition import Condition
@@ -53,6 +54,8 @@ def any_of(kind: Any) -> st.SearchStrategy[Any]:
         )
     if kind is BusFault:  # its parts do not go with each other at will
         return st.sampled_from(BUS_FAULTS)
+    if kind is RadarFault:
+        return st.sampled_from(RADAR_FAULTS)
     if kind is Fault:
         return st.builds(Fault, st.sampled_from((Crash(), Hang())), st.text(max_size=9), any_of(Trigger))
     if kind is Trigger:  # after a time, or on a condition
@@ -86,6 +89,20 @@ BUS_FAULTS: Final = tuple(
             "reorder bus A intermittent p 0.25",
         ),
     )
+)
+
+
+RADAR_FAULTS: Final = tuple(
+    fault.action
+    for fault in map(
+        parse,
+        (
+            "radar ghost range 30 speed -2.5 when ttc < 1.2 for 3ms",
+            "radar fov range 40 angle 20 after 2s",
+            "radar latency by 100ms intermittent p 0.25",
+        ),
+    )
+    if isinstance(fault.action, RadarFault)
 )
 
 

@@ -1,4 +1,4 @@
-"""Faults of the bus in simulated runs: the same words, the same receipts, under every mechanism."""
+"""Faults of the bus and the radar in simulated runs: the same words and receipts, under every mechanism."""
 
 from typing import Final
 
@@ -86,6 +86,36 @@ def test_a_bus_that_is_cut_for_a_while_leaves_a_run_that_comes_to_rest() -> None
     run = drive("bus-off gateway after 1s for 300ms", "partition radar|gateway after 2s for 300ms")
     assert [fault.receipt.value for fault in run.faults] == ["activated", "activated"]
     assert run.rest.why_not == () and run.vehicle is not None and not run.vehicle.collision
+
+
+@pytest.mark.parametrize("ftm", ["none", "lfr+tr"])
+def test_a_missed_target_is_a_wrong_input_that_no_mechanism_corrects(ftm: str) -> None:
+    run = drive("radar missed when ttc < 2", ftm=ftm)
+    (fault,) = run.faults
+    assert fault.receipt is ReceiptState.ACTIVATED
+    assert fault.detail.endswith("s; answered")
+    assert run.vehicle is not None and run.vehicle.collision
+    assert run.rest.why_not == ()
+
+
+def test_a_fault_of_the_radar_that_changes_nothing_is_not_activated() -> None:
+    (fault,) = drive("radar ghost range 149 speed -50 for 500ms").faults
+    assert fault.receipt is ReceiptState.NOT_ACTIVATED and fault.detail == "it changed none of 25 tracks"
+
+
+def test_a_radar_that_waits_in_vain_says_for_what() -> None:
+    (fault,) = drive("radar missed when gap > 1000").faults
+    assert (fault.receipt, fault.detail) == (ReceiptState.NOT_ACTIVATED, "gap > 1000 never held")
+
+
+def test_a_live_run_gets_a_ghost() -> None:
+    world = World(Setup(seed=1, scenario=DRIVE))
+    world.start()
+    world.advance(world.loop.ns + 1_000_000_000)
+    world.inject(parse("radar ghost range 3 speed 1 for 100ms"))
+    world.end()
+    (fault,) = world.outcome().faults
+    assert fault.receipt.value == "activated" and fault.detail.startswith("5 tracks, the first at 1.0")
 
 
 def test_a_live_run_is_disturbed() -> None:

@@ -11,7 +11,9 @@ from puredrive import CODEC
 
 from aftbed.inject.bus import BusFault, read_bus_fault
 from aftbed.inject.bus_disturber import Disturber
-from aftbed.inject.receipts import BusReport
+from aftbed.inject.model import parse
+from aftbed.inject.radar import RadarFault, RadarFaults
+from aftbed.inject.receipts import BusReport, RadarReport
 from aftbed.vehicle.aeb.function import default_application
 from aftbed.vehicle.can.candump import read_log
 from aftbed.vehicle.can.frame import Frame
@@ -29,6 +31,14 @@ def fault(words: str) -> BusFault:
     return read_bus_fault(words).resolved([CODEC])
 
 
+def radar_faults(*words: str) -> RadarFaults:
+    faults = RadarFaults()
+    for number, action in enumerate((parse(text).action for text in words), FIRST_NUMBER):
+        assert isinstance(action, RadarFault)
+        faults.arm(number, action, SEED)
+    return faults
+
+
 class Disturbed(msgspec.Struct):
     """A drive that came to its end."""
 
@@ -37,6 +47,7 @@ class Disturbed(msgspec.Struct):
     struck: list[BusReport]
     refused: dict[str, int]
     report: DriveReport | None = None
+    radar: list[RadarReport] = msgspec.field(default_factory=list)
 
     def of(self, can_id: int) -> list[Frame]:
         """The frames of one identifier, as they were on the bus."""
@@ -53,10 +64,14 @@ def arm(hub: RunningHub, faults: tuple[str, ...]) -> None:
 
 
 def real(
-    log: Path, *faults: str, pace: float | None = None, then: Callable[[RunningHub, int], None] | None = None
+    log: Path,
+    *faults: str,
+    pace: float | None = None,
+    then: Callable[[RunningHub, int], None] | None = None,
+    radar: tuple[str, ...] = (),
 ) -> Disturbed:
     """Over a hub on 127.0.0.1. `then` is called with the hub and the time, each 50 ms of bus time."""
-    lockstep = pace is None
+    lockstep, of_radar = pace is None, radar_faults(*radar)
     with (
         running_hub(log, HubOptions(lockstep=lockstep, pace=pace or 1.0)) as hub,
         FunctionGateway(hub.options, CODEC, named=True) as gateway,
@@ -70,15 +85,18 @@ def real(
             DriveOptions(pace=pace, seed=SEED),
             report=lambda telemetry: then(hub, telemetry.t_ms) if then is not None else None,
             stop=lambda: False,
+            radar=of_radar,
         )
         struck = hub.struck()
         gateway.rest()
         refused = dict(gateway.gateway.counts.refused)
     frames = [entry.frame for entry in read_log(log)[0]]
-    return Disturbed(frames, report.result, struck, refused, report)
+    return Disturbed(frames, report.result, struck, refused, report, of_radar.reports())
 
 
-def virtual(*faults: str, late_ns: int = 0, tick_ns: int | None = None) -> Disturbed:
+def virtual(
+    *faults: str, late_ns: int = 0, tick_ns: int | None = None, radar: tuple[str, ...] = ()
+) -> Disturbed:
     """In virtual time; each reply comes that late. `tick_ns` advances the car that often as well."""
     frames: list[Frame] = []
     car = VirtualCar(load_scenario("ccrs-50"), seed=SEED, codec=CODEC, on_frame=frames.append)
@@ -86,6 +104,10 @@ def virtual(*faults: str, late_ns: int = 0, tick_ns: int | None = None) -> Distu
     for number, words in enumerate(faults, FIRST_NUMBER):
         disturber.arm(number, fault(words), SEED, car.before(0))
         car.disturb(disturber)
+    of_radar = radar_faults(*radar)
+    if radar:
+        car.before(0)
+        car.disturb_radar(of_radar)
     function, now_ns = default_application(), 0
     replies: deque[tuple[int, bytes]] = deque()
     while (due_ns := car.due_ns()) is not None:
@@ -99,4 +121,5 @@ def virtual(*faults: str, late_ns: int = 0, tick_ns: int | None = None) -> Distu
                 replies.append((now_ns + late_ns, reply))
             else:
                 car.deliver(reply, now_ns)
-    return Disturbed(frames, car.result(), disturber.reports(), dict(car.counts.refused))
+    refused = dict(car.counts.refused)
+    return Disturbed(frames, car.result(), disturber.reports(), refused, radar=of_radar.reports())

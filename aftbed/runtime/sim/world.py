@@ -29,7 +29,8 @@ from aftbed.inject.bus import BusFault
 from aftbed.inject.bus_disturber import Disturber
 from aftbed.inject.kind import FaultKind
 from aftbed.inject.model import Fault, FaultReport
-from aftbed.inject.receipts import BusReport
+from aftbed.inject.radar import RadarFault, RadarFaults
+from aftbed.inject.receipts import BusReport, RadarReport
 from aftbed.inject.shared_state import look
 from aftbed.runtime import control
 from aftbed.runtime.adaptations import Outcome
@@ -141,6 +142,8 @@ def check(fault: Fault, scenario: str) -> None:
         raise ConfigError(f"{fault}: simulated processes have no memory of their own; use real ones")
     if scenario:
         return
+    if fault.action.needs_car:
+        raise ConfigError(f"{fault}: without a scenario there is no radar")
     if fault.action.needs_bus:
         raise ConfigError(f"{fault}: without a scenario there is no bus")
     if fault.trigger.when is not None:
@@ -169,6 +172,7 @@ class Drive(CarLink):
         scenario = load_scenario(setup.scenario)
         self._car = VirtualCar(scenario, seed=setup.seed, codec=own_dbc(), encode=encode)
         self._faults = Disturber()  # of its bus
+        self._radar_faults = RadarFaults()
         self._began_ns = 0
         self._wake: Callable[[], None] = lambda: None
         self._under_way = self._stepping = False
@@ -216,16 +220,21 @@ class Drive(CarLink):
         return self._car.t_us
 
     def disturb(self, number: int, fault: FaultKind, draw: int) -> None:
-        """Arm `fault` in the car's bus. Raises ConfigError where it names what does not exist."""
+        """Arm `fault` in the car's bus or radar. Raises ConfigError where it names what does not exist."""
+        now_us = self._car.before(self._t_ns() if self._under_way else 0)
+        if isinstance(fault, RadarFault):
+            self._radar_faults.arm(number, fault, draw)
+            self._car.disturb_radar(self._radar_faults)
+            return
         assert isinstance(fault, BusFault), fault
         fault = fault if fault.targets is not None else fault.resolved([own_dbc()])
-        now_us = self._car.before(self._t_ns() if self._under_way else 0)
         self._faults.arm(number, fault, draw, now_us)
         self._car.disturb(self._faults)
 
-    def report(self, number: int) -> BusReport | None:
-        """What has become of a fault of the car's bus."""
-        return next((one for one in self._faults.reports() if one.number == number), None)
+    def report(self, number: int) -> BusReport | RadarReport | None:
+        """What has become of a fault of the car's bus or radar."""
+        reports: list[BusReport | RadarReport] = [*self._faults.reports(), *self._radar_faults.reports()]
+        return next((one for one in reports if one.number == number), None)
 
     def watch(self, number: int, condition: Condition, met: Callable[[Met], None]) -> None:
 
@@ -349,7 +358,7 @@ class World:
         """Never called: see `check`."""
         raise AssertionError(f"{process} has no memory")
 
-    def bus_fault(self, number: int) -> BusReport | None:
+    def disturbance(self, number: int) -> BusReport | RadarReport | None:
         return self._drive.report(number) if self._drive is not None else None
 
     def pin(self, pid: int, cpu: int) -> None:

@@ -121,25 +121,64 @@ def _serve_hub(line: Line[control.ToNode], order: control.Serve, fds: list[int])
 # -- the vehicle and the player -------------------------------------------------------------------
 
 
-def _wait_for_go(line: Line[control.ToNode]) -> bool:
-    """Attached: wait for Resume; False if it is a Stop, or the end."""
-    _report(line, "ready")
-    got = line.recv()
-    return got is not None and isinstance(got[0], control.ResumeNode)
+class _Orders:
+    """What the supervisor orders a source to do; and the faults of the radar, where it is a vehicle."""
 
+    def __init__(self, line: Line[control.ToNode]) -> None:
+        from aftbed.inject.radar import RadarFaults  # noqa: PLC0415
 
-def _stopper(line: Line[control.ToNode]) -> Callable[[], bool]:
-    """A function that is true once the supervisor has sent Stop, or is gone."""
-    poll = select.poll()
-    poll.register(line.fileno(), select.POLLIN)
-    stopped = False
+        self.faults = RadarFaults()
+        self._line = line
+        self._poll = select.poll()
+        self._poll.register(line.fileno(), select.POLLIN)
+        self._armed = self._stopped = False
+        self._reported: dict[int, ReceiptState] = {}  # by the number of the fault
 
-    def stop() -> bool:
-        nonlocal stopped
-        stopped = stopped or bool(poll.poll(0))
-        return stopped
+    def until_go(self) -> bool:
+        """Attached: wait for Resume; False if it is a Stop, or the end."""
+        _report(self._line, "ready")
+        while not self._stopped:
+            if self._next():
+                return True
+        return False
 
-    return stop
+    def stop(self) -> bool:
+        """Whether the drive has to end; called in each step."""
+        while not self._stopped and self._poll.poll(0):
+            self._next()
+        if self._armed:
+            self.report_faults(lambda state: state.fired)
+        return self._stopped
+
+    def report_faults(self, worth: Callable[[ReceiptState], bool]) -> None:
+        """Report the faults whose receipt has another state than before, one that is `worth` it."""
+        news = [
+            one
+            for one in self.faults.reports()
+            if worth(one.receipt.state) and self._reported.get(one.number) is not one.receipt.state
+        ]
+        if news:
+            self._reported |= {one.number: one.receipt.state for one in news}
+            _report(self._line, control.RADAR_FAULTS_CHANGED, msgspec.msgpack.encode(news))
+
+    def end(self) -> None:
+        """Report what became of all faults."""
+        self._reported.clear()
+        self.report_faults(lambda state: True)
+
+    def _next(self) -> bool:
+        """Carry out the next order; True if it is Resume."""
+        got = self._line.recv()
+        match got[0] if got is not None else None:
+            case control.ResumeNode():
+                return True
+            case control.DisturbRadar(number, fault, draw):
+                self.faults.arm(number, fault, draw)
+                self._armed = True
+                _report(self._line, control.RADAR_FAULT_ARMED, str(number).encode())
+            case _:
+                self._stopped = True
+        return False
 
 
 def _drive(line: Line[control.ToNode], source: SourceOptions) -> None:
@@ -155,15 +194,18 @@ def _drive(line: Line[control.ToNode], source: SourceOptions) -> None:
     options = msgspec.convert(given, DriveOptions)
     follows = (codec.can_id("AEB_REQ"),)
     buses = CarBuses(BusOptions(port=source.port, secret=source.secret), follows)
-    if _wait_for_go(line):
+    orders = _Orders(line)
+    if orders.until_go():
         result = drive(
             scenario,
             codec,
             buses,
             options,
             report=lambda telemetry: _report(line, "telemetry", msgspec.msgpack.encode(telemetry)),
-            stop=_stopper(line),
+            stop=orders.stop,
+            radar=orders.faults,
         )
+        orders.end()
         _report(line, "result", msgspec.json.encode(result))
 
 
@@ -180,14 +222,15 @@ def _play(line: Line[control.ToNode], source: SourceOptions) -> None:
     gateway = MappedGateway(own_dbc(), Path(work.dbc), find_map(work.map))
     frames, counts = read_log(Path(work.log))
     bus = open_bus(BusOptions(port=source.port, secret=source.secret, node=PLAYER))
-    if _wait_for_go(line):
+    orders = _Orders(line)
+    if orders.until_go():
         result = play(
             frames,
             own_dbc(),
             bus,
             work.pace,
             ends_cycle=lambda frame: gateway.on_frame(frame) is not None,
-            stop=_stopper(line),
+            stop=orders.stop,
         )
         report = {"played": result, "log": counts, "gateway": gateway.counts}
         _report(line, "result", msgspec.json.encode(report))

@@ -140,6 +140,9 @@ def with_names_resolved(fault: Fault, work: Work) -> Fault:
         source = work.option if isinstance(work, LoadRun) else "--replay"
         raise ConfigError(f"{fault}: 'when' looks at the car, and a run of {source} has none")
     action = fault.action
+    if action.needs_car and not isinstance(work, CarRun):
+        source = work.option if isinstance(work, LoadRun) else "--replay"
+        raise ConfigError(f"{fault}: a run of {source} has no radar; --scenario has one")
     if not isinstance(action, BusFault):
         return fault
     if isinstance(work, LoadRun):

@@ -21,7 +21,7 @@ from aftbed.core.graph import Link
 from aftbed.core.journal import Record
 from aftbed.ftm.compose import build
 from aftbed.inject.kind import FaultKind
-from aftbed.inject.receipts import BusReport
+from aftbed.inject.receipts import BusReport, RadarReport
 from aftbed.runtime import control
 from aftbed.runtime.deployment import HANG_NS, Keys
 from aftbed.runtime.interface import BUS, DRAW_BITS, LIGHT, Met, Process, ProcessKind
@@ -96,15 +96,15 @@ class UnixRuntime:
         return Random(f"{self._options.seed}/{number}").getrandbits(DRAW_BITS)
 
     def disturb(self, number: int, fault: FaultKind, draw: int) -> Keys:
-        """By the hub."""
+        """By the hub, or by the vehicle."""
         return self._bus.disturb(number, fault, draw)
 
     def watch(self, number: int, condition: Condition, met: Callable[[Met], None]) -> Keys:
         """By the car, through the hub."""
         return self._bus.watch(number, condition, met)
 
-    def bus_fault(self, number: int) -> BusReport | None:
-        """The hub's latest report."""
+    def disturbance(self, number: int) -> BusReport | RadarReport | None:
+        """The latest report of hub or vehicle."""
         return self._bus.report(number)
 
     def flip_memory(self, process: Process, bit: int | None, address: int | None, draw: int) -> str:

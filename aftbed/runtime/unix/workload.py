@@ -11,7 +11,7 @@ import os
 import secrets
 import socket
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -20,7 +20,8 @@ import msgspec
 from aftbed.core.errors import StepFailed
 from aftbed.inject.bus import BusFault
 from aftbed.inject.kind import FaultKind
-from aftbed.inject.receipts import BusReport, ReceiptState
+from aftbed.inject.radar import RadarFault
+from aftbed.inject.receipts import BusReport, RadarReport, ReceiptState
 from aftbed.runtime import control
 from aftbed.runtime.deployment import Deployment, Keys
 from aftbed.runtime.interface import BUS, LIGHT, Met, ProcessKind
@@ -39,21 +40,32 @@ VEHICLE: Final = "vehicle"
 SECRET_BYTES: Final = 16
 
 
-class BusFaults:
-    """Faults of the bus and conditions of the car. `settle` ends the wait of tasks for the hub."""
+class CarFaults:
+    """Faults of the bus and of the radar, and conditions of the car.
+
+    `settle` ends the wait of tasks for hub and vehicle.
+    """
 
     def __init__(
         self, pool: UnixProcessPool, settle: Callable[[Key], None], log: Callable[[str, str], None]
     ) -> None:
         self._pool, self._settle, self._log = pool, settle, log
         self.hub: UnixProcess | None = None
-        self._faults: dict[int, BusFault] = {}
-        self._reports: dict[int, BusReport] = {}
+        self.vehicle: UnixProcess | None = None
+        self._faults: dict[int, BusFault | RadarFault] = {}
+        self._reports: dict[int, BusReport | RadarReport] = {}
         self._on_met: dict[int, Callable[[Met], None]] = {}
         self.counts: object = None  # what happened on the bus, as last asked for
 
     def disturb(self, number: int, fault: FaultKind, draw: int) -> Keys:
-        """Return when the hub has armed the fault. Raises StepFailed."""
+        """Return when the hub, or the vehicle, has armed the fault. Raises StepFailed."""
+        if isinstance(fault, RadarFault):
+            if self.vehicle is None or not self.vehicle.alive:
+                raise StepFailed(f"{fault.name}: this run has no car, or its drive has ended")
+            self._faults[number] = fault
+            self._pool.order(self.vehicle, control.DisturbRadar(number, fault, draw))
+            yield Wait(frozenset({(control.RADAR_FAULT_ARMED, VEHICLE, number)}), frozenset({VEHICLE}))
+            return
         assert isinstance(fault, BusFault), fault
         if self.hub is None or not self.hub.alive:
             raise StepFailed(f"{fault}: this run has no bus")
@@ -79,7 +91,10 @@ class BusFaults:
                 yield Wait(frozenset({(control.BUS_FAULTS_ASKED, control.HUB, 0)}), frozenset({control.HUB}))
 
     def on_report(self, kind: str, data: bytes) -> None:
-        """A report of the hub."""
+        """A report of the hub, or of the vehicle about its radar."""
+        if kind == control.RADAR_FAULT_ARMED:
+            self._settle((kind, VEHICLE, int(data)))
+            return
         if kind in (control.BUS_FAULT_ARMED, control.CONDITION_WATCHED):
             self._settle((kind, control.HUB, int(data)))
             return
@@ -95,7 +110,12 @@ class BusFaults:
             if on_met is not None and hub is not None:
                 on_met(Met(t_us, since_ns, lambda: self._pool.order(hub, control.Ack(number))))
             return
-        for report in msgspec.msgpack.decode(data, type=list[BusReport]):
+        reports: Sequence[BusReport | RadarReport] = (
+            msgspec.msgpack.decode(data, type=list[RadarReport])
+            if kind == control.RADAR_FAULTS_CHANGED
+            else msgspec.msgpack.decode(data, type=list[BusReport])
+        )
+        for report in reports:
             number, found = report.number, report.receipt
             before = self._reports[number].receipt.state if number in self._reports else ReceiptState.ARMED
             self._reports[number] = report
@@ -104,7 +124,7 @@ class BusFaults:
         if kind == control.BUS_FAULTS_ASKED:
             self._settle((control.BUS_FAULTS_ASKED, control.HUB, 0))
 
-    def report(self, number: int) -> BusReport | None:
+    def report(self, number: int) -> BusReport | RadarReport | None:
         """The latest report on a fault."""
         return self._reports.get(number)
 
@@ -130,7 +150,7 @@ class Workload:
         self._source = VEHICLE if isinstance(options.work, CarRun) else PLAYER  # of a run with a bus
         self._services: dict[str, UnixProcess] = {}
         self._ready: set[str] = set()  # names of services
-        self.bus = BusFaults(pool, loop.tasks.settle, log)
+        self.bus = CarFaults(pool, loop.tasks.settle, log)
         self._result: object = None
         self._stats: dict[str, object] = {}
         self.telemetry: dict[str, object] | None = None
@@ -200,6 +220,7 @@ class Workload:
                 options.work, options.seed, options.port, self._secret, drive=options.drive
             )
             yield from self._assign(BUS, self._source, msgspec.msgpack.encode(source), ())
+            self.bus.vehicle = self._services.get(VEHICLE)
 
     def start(self) -> Keys:
         """The graph is complete: let requests come."""
