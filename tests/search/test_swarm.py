@@ -31,7 +31,7 @@ from aftbed.search.swarm import attempt_drawn, contradictions, drawn, experiment
 from aftbed.search.tally import ACTIVATED_MIN, DONE_MIN, AdaptationEnd, Intent, Tally, happened_in
 
 DRAWN = 1_000
-RUN = range(40, 80)  # of the many that `aftbed sim --swarm` tries
+RUN = range(100)
 STEP_LABELS = {event.label for event in STEPS}
 
 
