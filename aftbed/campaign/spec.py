@@ -188,6 +188,7 @@ class Spec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sometimes: tuple[str, ...] = ()  # each a `RunState` that at least one experiment must have been in
     verifies: tuple[str, ...] = ()  # requirements, beside those of the scenario
     ftti: str = ""  # as 100ms, of bus time: a fault that is handled later breaks a promise
+    bounded: bool = False  # an FHTI above its bound fails the campaign on real processes, too
     not_activated_max: Annotated[float, Meta(ge=0, le=1)] = 0.3  # two gates that are always there (G8)
     unknown_max: Annotated[float, Meta(ge=0, le=1)] = 0.3
 

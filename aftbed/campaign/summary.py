@@ -183,7 +183,7 @@ def summarise(ledger: Ledger, planned: int, seconds: float) -> Summary:
         *asked,
         *always,
         _unexcused(results),
-        *_within_bound(results),
+        *_within_bound(spec, results),
         *_sometimes(spec, results),
         *_vacuous(spec, struck),
     )
@@ -364,16 +364,18 @@ def _margin(gate: Gate, limit: str, group: list[Result], confidence: float) -> G
     return GateResult(gate.metric, gate.strata, limit, margin, judged_by, "pass" if kept else "fail", reason)
 
 
-def _within_bound(results: Iterable[Result]) -> Iterator[GateResult]:
-    """A fault that was handled later than can be: the bound or the code is wrong.
+def _within_bound(spec: Spec, results: Iterable[Result]) -> Iterator[GateResult]:
+    """A fault that was handled later than can be: the bound or the code is wrong, or the machine stood still.
 
-    Noisy experiments have no times.
+    Noisy experiments have no times. A machine that others use, too, keeps no deadline, and not each of its
+    stops is seen. So on real processes the gate fails a campaign that asks for it by `bounded`.
     """
     shares = [(r.of_bound, r) for r in results if r.of_bound is not None]
     if not shares:
         return
     most, worst = max(shares, key=lambda pair: pair[0])
-    word: Word = "fail" if most > 1 else "pass"
+    strict = spec.bounded or spec.system.runtime == "sim"
+    word: Word = "fail" if most > 1 and strict else "pass"
     reason = ""
     if most > 1:
         late = max(
@@ -381,7 +383,7 @@ def _within_bound(results: Iterable[Result]) -> Iterator[GateResult]:
             key=lambda one: (one.fhti_ms or 0.0) / (one.bound_ms or 1.0),
         )
         words = f"{late.fault}: handled after {late.fhti_ms:g} ms, the bound is {late.bound_ms:g}"
-        reason = f"experiment {worst.experiment.id}: {words}"
+        reason = f"experiment {worst.experiment.id}: {words}" + ("" if strict else "; judged with `bounded`")
     yield GateResult(FHTI_BOUND, ANY, "at most 1", most, None, word, reason)
 
 

@@ -49,8 +49,8 @@ def one(index: int = 0, *intervals: HandlingIntervals, outcome: str = "tolerated
     return msgspec.structs.replace(found, experiment=experiment)
 
 
-def judged(folder: Path, results: list[Result], *gates: Gate) -> Summary:
-    head = head_of(planned(folder, FTTI))
+def judged(folder: Path, results: list[Result], *gates: Gate, text: str = FTTI) -> Summary:
+    head = head_of(planned(folder, text))
     head = msgspec.structs.replace(head, spec=msgspec.structs.replace(head.spec, gates=gates))
     return summarise(Ledger(folder, head, tuple(results)), len(results), 1.0)
 
@@ -140,6 +140,16 @@ def test_a_handling_beyond_its_bound_fails_the_campaign(tmp_path: Path) -> None:
         "experiment 0000000000000014: crash primary: handled after 8.5 ms, the bound is 8"
     )
     assert judged(tmp_path, [*within, without_times(beyond)]).gate == "pass"
+
+
+def test_on_real_processes_a_bound_fails_a_campaign_that_asks_for_it(tmp_path: Path) -> None:
+    results = [*(one(n, handled(8.0)) for n in range(20)), one(20, handled(8.5))]
+    real = FTTI.replace("runtime: sim", "runtime: unix")
+    assert real != FTTI
+    found = judged(tmp_path, results, text=real)
+    assert (found.gate, gate(found, "fhti_bound").value) == ("pass", 8.5 / 8.0)
+    assert gate(found, "fhti_bound").reason.endswith("the bound is 8; judged with `bounded`")
+    assert judged(tmp_path, results, text=f"bounded: true\n{real}").gate == "fail"
 
 
 def test_on_a_busy_machine_late_handling_breaks_nothing() -> None:
