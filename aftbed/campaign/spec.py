@@ -186,17 +186,11 @@ class Spec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     confidence: Annotated[float, Meta(gt=0.5, lt=1)] = 0.95
     recovery_budget_ms: Annotated[float, Meta(gt=0)] | None = None  # longer is `degraded`
     sometimes: tuple[str, ...] = ()  # each a `RunState` that at least one experiment must have been in
-    verifies: tuple[str, ...] = ()  # requirements, beside those of the scenario
+    verifies: tuple[str, ...] = ()  # requirements; as it is read, those of the scenario too
     ftti: str = ""  # as 100ms, of bus time: a fault that is handled later breaks a promise
     bounded: bool = False  # an FHTI above its bound fails the campaign on real processes, too
     not_activated_max: Annotated[float, Meta(ge=0, le=1)] = 0.3  # two gates that are always there (G8)
     unknown_max: Annotated[float, Meta(ge=0, le=1)] = 0.3
-
-    @property
-    def requirements(self) -> tuple[str, ...]:
-        """Which ones the campaign verifies."""
-        of_scenario = load_scenario(self.system.scenario).verifies if self.system.scenario else ()
-        return tuple(dict.fromkeys((*self.verifies, *of_scenario)))
 
     @property
     def ftti_ms(self) -> float:
@@ -223,6 +217,9 @@ def read_spec(name: str) -> Spec:
             system = msgspec.structs.replace(spec.system, request_file=source)
             spec = msgspec.structs.replace(spec, system=system)
         check(spec)
+        if spec.system.scenario:  # here, since records are reported where the scenario's file is not
+            verifies = dict.fromkeys((*spec.verifies, *load_scenario(spec.system.scenario).verifies))
+            spec = msgspec.structs.replace(spec, verifies=tuple(verifies))
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error
     return spec

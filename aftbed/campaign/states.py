@@ -4,7 +4,7 @@ A campaign that never came to what it is about has shown nothing of it, however 
 state that no experiment was in fails the campaign. Each state is read off the events of a run.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from enum import StrEnum
 from typing import Final
 
@@ -33,20 +33,11 @@ def states_of(history: History) -> tuple[RunState, ...]:
 
 
 def _happened(event: Event) -> Callable[[History], bool]:
-    return lambda history: any(_of(history, event))
-
-
-def _of(history: History, event: Event) -> Iterator[object]:
-    for journal in history.journals:
-        yield from history.events_of(journal, event)
+    return lambda history: bool(history.events(event))
 
 
 def _vote_differs(history: History) -> bool:
-    return any(
-        record.detail != AGREED
-        for journal in history.journals
-        for record in history.events_of(journal, Event.VOTE_COMPARED)
-    )
+    return any(vote.detail != AGREED for vote in history.events(Event.VOTE_COMPARED))
 
 
 def _in_adaptation(history: History) -> bool:

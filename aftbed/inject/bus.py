@@ -31,7 +31,7 @@ from aftbed.core.graph import Graph
 from aftbed.core.units import duration, milliseconds, number
 from aftbed.inject import grammar
 from aftbed.inject.grammar import NUMBER, ONCE, Chance, Every, Lasting, Permanent, Transient, Trigger, whole
-from aftbed.inject.kind import AnyFault, FaultKind, Injection, RunControl, Steps
+from aftbed.inject.kind import AnyFault, FaultKind, Injection, RunControl, Steps, receipt_of_car
 from aftbed.inject.receipts import Receipt
 from aftbed.vehicle.can.bus_model import NODES
 from aftbed.vehicle.condition import Condition
@@ -317,11 +317,7 @@ class BusFault(FaultKind, frozen=True, tag="bus"):
         yield from run.disturb(injection)
 
     def receipt(self, injection: Injection, run: RunControl) -> Receipt:
-        report = run.disturbance(injection)
-        if report is None:
-            return injection.receipt
-        injection.unmet = self.opening.when if report.waits else None
-        return report.receipt
+        return receipt_of_car(injection, run, self.opening.when)
 
 
 # -- names ----------------------------------------------------------------------------------------

@@ -292,3 +292,12 @@ def strike(injection: Injection, run: RunControl) -> Sequence[TargetProcess]:
         injection.receipt = Receipt(ReceiptState.NOT_ACTIVATED, "no process to hit")
         run.log(injection)
     return found
+
+
+def receipt_of_car(injection: Injection, run: RunControl, when: Condition | None) -> Receipt:
+    """Of a fault that bus or radar has armed: what they have reported. `when`: what it waits for first."""
+    report = run.disturbance(injection)
+    if report is None:
+        return injection.receipt
+    injection.unmet = when if report.waits else None
+    return report.receipt

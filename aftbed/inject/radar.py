@@ -47,7 +47,7 @@ from aftbed.inject.grammar import (
     read_persistence,
     read_trigger,
 )
-from aftbed.inject.kind import AnyFault, FaultKind, Injection, RunControl, Steps
+from aftbed.inject.kind import AnyFault, FaultKind, Injection, RunControl, Steps, receipt_of_car
 from aftbed.inject.receipts import RadarReport, Receipt, ReceiptState
 from aftbed.vehicle.condition import Condition
 from aftbed.vehicle.radar import RANGE_MAX_M, SPEED_MAX_MS, Target
@@ -65,7 +65,11 @@ WHEN_KEYS: Final = ("after", "when", FOR, INTERMITTENT, PERMANENT)
 
 
 class Insufficiency(msgspec.Struct, frozen=True, tag=True):
-    """Base of what a radar can do wrong. As text: the words behind the name."""
+    """Base of what a radar can do wrong. As text: the words behind the name.
+
+    Each has `reported(target, open_us)`: what the radar reports in place of `target`, so long after the fault
+    has begun.
+    """
 
     NAME: ClassVar[str] = ""
     KEYS: ClassVar[tuple[str, ...]] = ()
@@ -79,10 +83,6 @@ class Insufficiency(msgspec.Struct, frozen=True, tag=True):
     def delay_ms(self) -> int:
         """How old the target is that `reported` is given."""
         return 0
-
-    def reported(self, target: Target | None, open_us: int) -> Target | None:
-        """What the radar reports in place of `target`, so long after the fault has begun."""
-        raise NotImplementedError
 
     def __str__(self) -> str:
         return ""
@@ -296,11 +296,7 @@ class RadarFault(FaultKind, frozen=True, tag="radar"):
         yield from run.disturb(injection)
 
     def receipt(self, injection: Injection, run: RunControl) -> Receipt:
-        report = run.disturbance(injection)
-        if report is None:
-            return injection.receipt
-        injection.unmet = self.opening.when if report.waits else None
-        return report.receipt
+        return receipt_of_car(injection, run, self.opening.when)
 
 
 def _persistence(words: FaultWords) -> RadarPersistence:

@@ -58,9 +58,7 @@ from aftbed.runtime.latencies import (
 )
 
 STALL_NS: Final = 5_000_000  # of a quiet machine, once: a process that could run does not
-HOP_NS: Final = (
-    HOP_QUANTILES_NS[-2] + COLD_PENALTY_NS[1]
-)  # to an idle brick; the last is the machine's  # to a brick that was idle; the last is the machine's
+HOP_NS: Final = HOP_QUANTILES_NS[-2] + COLD_PENALTY_NS[1]  # to an idle brick; the last is the machine's
 ORDER_NS: Final = LINE_NS[1] + FIRST_NS[1]  # from the supervisor to a process
 REPORT_NS: Final = LINE_NS[1] + ROUSED_NS[1]  # from a process to the supervisor, which sleeps
 SUPPORT: Final = ("recovery", "engine", *(f"{replica}/watchdog" for replica in REPLICAS))  # none serves

@@ -44,12 +44,11 @@ def junit_xml(summary: Summary, ledger: Ledger) -> str:
     for name, value in _properties(summary, ledger).items():
         suite.add_property(name, _readable(value))
     group = f"aftbed.{summary.campaign}"
-    verifies = ledger.head.spec.requirements
     cases = []
     for stratum in summary.strata:
         results = groups[stratum.name]
         seconds = sum(result.seconds for result in results)
-        evidence = _evidence(stratum, ledger, results, verifies) if verifies else None
+        evidence = _evidence(stratum, ledger, results) if ledger.head.spec.verifies else None
         cases.append(_case(group, stratum.name, seconds, _why(stratum, summary.gates, results), evidence))
     for gate in summary.gates:
         why = (GATE, _gate_text(gate, groups)) if gate.word == "fail" else None
@@ -67,9 +66,7 @@ def junit_xml(summary: Summary, ledger: Ledger) -> str:
     return f"<?xml version='1.0' encoding='utf-8'?>\n{ElementTree.tostring(root, encoding='unicode')}\n"
 
 
-def _evidence(
-    stratum: StratumSummary, ledger: Ledger, results: list[Result], verifies: tuple[str, ...]
-) -> Properties:
+def _evidence(stratum: StratumSummary, ledger: Ledger, results: list[Result]) -> Properties:
     """What a stratum says about the requirements: tools read the properties of a test case, not of its suite.
 
     `bound`: of the share of experiments that failed, with the confidence of the campaign. Of fault handling
@@ -79,7 +76,7 @@ def _evidence(
     confidence = confidence_of(spec)
     fhti = stratum.handling.fhti_ms if stratum.handling is not None else None
     found = {
-        "verifies": ",".join(verifies),
+        "verifies": ",".join(spec.verifies),
         "n": str(stratum.experiments),
         "failed": str(stratum.failed),
         "bound": f"{proportion(stratum.failed, stratum.experiments, confidence).high:.4g}",

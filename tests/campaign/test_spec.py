@@ -113,7 +113,7 @@ def test_requirements_are_those_of_the_campaign_and_of_its_scenario(tmp_path: Pa
         " verifies: [SG-2, SG-1]}"
     )
     text = CRASHES.replace("system: {", f"verifies: [SG-1, FSR-3.2]\nsystem: {{scenario: {scenario}, ")
-    assert planned(tmp_path, text).spec.requirements == ("SG-1", "FSR-3.2", "SG-2")
+    assert planned(tmp_path, text).spec.verifies == ("SG-1", "FSR-3.2", "SG-2")
 
 
 def test_the_schema_knows_every_key() -> None:

@@ -45,7 +45,11 @@ pytestmark = pytest.mark.process
 def private(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """Live runs of this test only: its own place for their sockets, whose path has to be short."""
     path = Path(tempfile.mkdtemp(prefix="aft-", dir="/tmp"))
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(path))
+    for name in (
+        "XDG_RUNTIME_DIR",
+        "TMPDIR",
+    ):  # with what others of this user have left, doctor is not content
+        monkeypatch.setenv(name, str(path))
     yield path
     left = list((path / "aftbed").iterdir()) if (path / "aftbed").exists() else []
     shutil.rmtree(path)

@@ -50,6 +50,7 @@ from aftbed.runtime.unix.options import LoadRun, Work
 RUN_SECONDS_MAX: Final = 60.0
 NO_TIME: Final = "no answer within"  # why an adaptation was not done that had no CPU
 ADAPT_TRIES: Final = 5
+SHOWN_BYTES: Final = 3000  # of the output of a run, where a test fails
 ENDLESS: Final = 10_000_000  # requests: the run goes on until it is stopped, on a machine of any speed
 SHORT: Final = Path(__file__).with_name("short.yaml")  # a scenario
 # commands that start no process
@@ -386,6 +387,10 @@ class Command:
     def __exit__(self, *_: object) -> None:
         self.kill()
         self._process.close()
+        with contextlib.suppress(BlockingIOError):
+            while got := os.read(self._out, 65536):
+                self._text += got
+        print(self._text[-SHOWN_BYTES:].decode(errors="replace"))  # pytest shows it where a test fails
         os.close(self._out)
         self._place.cleanup()
 

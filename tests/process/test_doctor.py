@@ -85,6 +85,12 @@ def test_every_process_of_a_run_is_told_by_its_mark(home: Home) -> None:
         run.stop()
 
 
+@pytest.fixture(autouse=True)
+def models(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What other tests of this user leave of an FMU, whose process they kill, is not looked at here."""
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+
+
 def test_nothing_is_left_where_all_is_well(home: Home) -> None:
     with under_load(home, ENDLESS) as run:
         code, found = doctor()
@@ -93,11 +99,8 @@ def test_nothing_is_left_where_all_is_well(home: Home) -> None:
         assert run.status()["leader"] == "a"
 
 
-def test_an_fmu_that_a_dead_process_had_unpacked_is_named_and_removed(
-    home: Home, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_fmu_that_a_dead_process_had_unpacked_is_named_and_removed(home: Home, tmp_path: Path) -> None:
     """One that is in use has a lock, and stays."""
-    monkeypatch.setenv("TMPDIR", str(tmp_path))
     above = tmp_path / f"aftbed-fmu-{os.getuid()}"
     dead, used = above / "unpacked-dead", above / "unpacked-used"
     for folder in (dead, used):

@@ -515,10 +515,9 @@ class Hub(BusModel[HubConnection]):
                 if self.disturber is not None:
                     self.receipts_changed(int(can_id, 16), -1)
             case b"noticed", [can_id, reason, t_us]:
-                since_us = (
-                    int(t_us) if self._options.lockstep else self.now_us()
-                )  # the car's zero is another one
-                self.noticed(client.name, Notice(int(can_id, 16), reason, since_us))
+                # Out of lockstep the drive of the car has another zero of time than the hub.
+                noticed_us = int(t_us) if self._options.lockstep else self.now_us()
+                self.noticed(client.name, Notice(int(can_id, 16), reason, noticed_us))
             case _:
                 raise PeerError("unknown command, or not now")
 
