@@ -64,10 +64,10 @@ class _SupervisorLink:
         self._reported: dict[int, ReceiptState] = {}  # by the number of the fault
 
     def attend(self, hub: Hub) -> bool:
-        """Carry out the next order; False when the line has ended."""
+        """Carry out the next order; False when it is a Stop, or the line has ended."""
         got = self._line.recv()
         match got[0] if got is not None else None:
-            case None:
+            case None | control.Stop():
                 return False
             case control.DisturbBus(number, fault, draw):
                 from aftbed.inject.bus_disturber import Disturber  # noqa: PLC0415 - few runs need it

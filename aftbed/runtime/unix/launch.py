@@ -12,7 +12,6 @@ command keeps them, of this run or of a later one: else one run would end only a
 import contextlib
 import os
 import resource
-import select
 import shutil
 import signal
 import socket
@@ -37,6 +36,7 @@ from aftbed.runtime.unix.process_pool import killed_by
 from aftbed.runtime.unix.request_store import write_given
 from aftbed.runtime.unix.supervisor_process import GO, RUN, be_supervisor
 from aftbed.runtime.unix.transport import Line, decode_report
+from aftbed.vehicle.can.bus_model import HOST
 
 if TYPE_CHECKING:
     from aftbed.functions.request_file import GivenRequests
@@ -74,7 +74,7 @@ def bind_hub(port: int) -> socket.socket:
     sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
-        sock.bind(("127.0.0.1", port))
+        sock.bind((HOST, port))
         sock.listen(BACKLOG)
     except OSError as error:
         sock.close()
@@ -224,9 +224,9 @@ class Launched:
             return
         self._waited = True
         self.line.close()
-        if not _ends(self._pidfd, END_SECONDS_MAX):
+        if not linux.ends(self._pidfd, END_SECONDS_MAX):
             linux.kill(self._pidfd, signal.SIGKILL)
-            _ends(self._pidfd, KILL_SECONDS_MAX)
+            linux.ends(self._pidfd, KILL_SECONDS_MAX)
         code = os.waitstatus_to_exitcode(os.waitpid(self.supervisor, 0)[1])
         if code < 0 and not self.trouble:
             self.trouble = f"the supervisor {killed_by(-code, self.record)}"
@@ -246,7 +246,7 @@ class Launched:
         life, self._life = self._life, []
         for fd in life:
             os.close(fd)
-        if not _ends(self._warden_pidfd, KILL_SECONDS_MAX):
+        if not linux.ends(self._warden_pidfd, KILL_SECONDS_MAX):
             linux.kill(self._warden_pidfd, signal.SIGKILL)  # a stopped warden would never end
         os.waitpid(self.warden, 0)
         _LAUNCHED.discard(self._reference)
@@ -273,12 +273,6 @@ def _disown_all() -> None:
 
 
 os.register_at_fork(after_in_child=_disown_all)
-
-
-def _ends(pidfd: int, seconds: float) -> bool:
-    poll = select.poll()
-    poll.register(pidfd, select.POLLIN)
-    return bool(poll.poll(seconds * 1e3))
 
 
 def launch(

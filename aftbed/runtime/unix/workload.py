@@ -202,6 +202,7 @@ class Workload:
         hub = {
             "secret": self._secret,
             "open_to_all": options.bus_open,
+            "beacon": f"aftbed run {options.run}",
             "lockstep": work.pace is None,
             "pace": work.pace or 1.0,
             "origin_ns": time.monotonic_ns(),

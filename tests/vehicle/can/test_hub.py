@@ -359,7 +359,7 @@ def test_a_slow_reader_is_put_out_and_the_others_do_not_notice(tmp_path: Path) -
 def test_the_end_of_the_life_descriptor_ends_the_hub(hub: RunningHub) -> None:
     with RawClient(hub.port) as a:
         hub.stop()
-        assert a.read() == ""
+        assert a.read().endswith("the run has ended >") and a.read() == ""
 
 
 def test_what_was_sent_before_the_end_is_recorded(hub: RunningHub) -> None:
