@@ -92,7 +92,12 @@ class RunArguments(msgspec.Struct, frozen=True):
     record: Annotated[str | None, typer.Option(help="Keep the record of the run in this new directory.")] = (
         None
     )
-    replay: Annotated[str | None, typer.Option(help="A candump log to replay instead of a drive.")] = None
+    replay: Annotated[
+        str | None, typer.Option(help="A log to replay instead of a drive: candump, ASC, BLF, TRC, MF4, CSV.")
+    ] = None
+    skip_bad: Annotated[
+        bool, typer.Option("--skip-bad", help="Leave out what cannot be read of --replay, and count it.")
+    ] = False
     dbc: Annotated[str | None, typer.Option(help="The DBC of the replayed log.")] = None
     map_file: Annotated[str | None, typer.Option("--map", help="What the log's signals mean.")] = None
     load: Annotated[
@@ -127,7 +132,8 @@ class RunArguments(msgspec.Struct, frozen=True):
 
 
 DEFAULTS: Final = RunArguments()
-OTHER_SOURCES: Final = ("load", "replay", "dbc", "map_file", "scenario", "pace", "brake_policy")
+OF_A_REPLAY: Final = ("dbc", "map_file", "skip_bad")
+OTHER_SOURCES: Final = ("load", "replay", *OF_A_REPLAY, "scenario", "pace", "brake_policy")
 OF_THE_BUS: Final = ("bus_port", "bus_open")
 
 
@@ -155,6 +161,7 @@ def execute(given: RunArguments) -> int:
     work = _work(given) if source is None else _sent(source, given)
     ftti_ms = ftti_ms_of("--ftti", given.ftti, work) if given.ftti is not None else 0.0
     requests = source.of(given.seed) if source is not None else None
+    log = _log(given)
     if application:
         _refuse_unsuitable(application, graph.ftm, requests, force=given.force)
     check_range("--bus-port", given.bus_port, 0, 65535)
@@ -174,7 +181,8 @@ def execute(given: RunArguments) -> int:
         application=application,
         ftti_ms=ftti_ms,
     )
-    launched = launch(options, listener, requests)
+    launched = launch(options, listener, requests, log)
+    del log  # it may be large, and the run has it
     try:
         closed = make_loop(launched) if make_loop is not None else None
         interrupted = _follow(launched, open_view(options, quiet=given.json), closed)
@@ -254,8 +262,7 @@ def _work(given: RunArguments) -> Work:
     pace = _pace(given.pace)
     if given.replay is not None:
         return _replay(given.replay, given.dbc, given.map_file, pace)
-    if given.dbc is not None or given.map_file is not None:
-        raise ConfigError("--dbc and --map say what a replayed log means: give --replay LOG too")
+    _refuse(given, OF_A_REPLAY, "only with --replay LOG: leave out")
     if given.brake_policy not in POLICIES:
         raise unknown("brake policy", given.brake_policy, POLICIES)
     scenario = given.scenario
@@ -267,7 +274,6 @@ def _work(given: RunArguments) -> Work:
 def _replay(log: str, dbc_name: str | None, map_name: str | None, pace: float | None) -> ReplayRun:
     if dbc_name is None or map_name is None:
         raise ConfigError("--replay LOG needs --dbc FILE and --map FILE, which say what its frames mean")
-    from aftbed.vehicle.can.candump import read_log  # noqa: PLC0415 - only with --replay
     from aftbed.vehicle.replay.map_file import (  # noqa: PLC0415 - only with --replay
         bind,
         find_dbc,
@@ -276,8 +282,16 @@ def _replay(log: str, dbc_name: str | None, map_name: str | None, pace: float | 
 
     dbc, map_path = find_dbc(dbc_name), find_map(map_name)
     bind(map_path, dbc)
-    read_log(Path(log))
     return ReplayRun(str(Path(log).resolve()), str(dbc.resolve()), str(map_path), pace)
+
+
+def _log(given: RunArguments) -> bytes | None:
+    """The log of `--replay`, as the player takes it; None without one."""
+    if given.replay is None:
+        return None
+    from aftbed.interop.logs import read_for_replay  # noqa: PLC0415 - only with --replay
+
+    return msgspec.msgpack.encode(read_for_replay(Path(given.replay), skip_bad=given.skip_bad))
 
 
 def _pace(text: str) -> float | None:

@@ -1,4 +1,4 @@
-"""Reads logs of a CAN bus: candump, ASC, BLF, TRC, MF4 and CSV; writes them, and their signals as CSV.
+"""Reads logs of a CAN bus, to replay or convert them: candump, ASC, BLF, TRC, MF4, CSV. Writes them, too.
 
 ASC, BLF, TRC and MF4 are read by python-can's readers; ASC, BLF and TRC are written by its writers. This
 module adds what python-can loses, as the tests show:
@@ -60,9 +60,10 @@ from aftbed.interop.files import write_whole
 from aftbed.runtime.unix.confined import JobFailedError, ProcessLimits, ask, serve
 from aftbed.vehicle.can.candump import LINE_SHOWN_CHARACTERS_MAX, LOG_BYTES_MAX, Refusal
 from aftbed.vehicle.can.dbc_file import Codec, load_dbc
-from aftbed.vehicle.can.frame import CAN_ID_MAX, DATA_LENGTH_MAX
+from aftbed.vehicle.can.frame import CAN_ID_MAX, DATA_LENGTH_MAX, Frame
 from aftbed.vehicle.can.python_can import can, with_asammdf
 from aftbed.vehicle.replay.map_file import find_dbc
+from aftbed.vehicle.replay.player import LogReport, PlayedLog
 
 EXTENDED_ID_MAX: Final = 0x1FFFFFFF
 TIME_US_MAX: Final = 2**32 * 1_000_000 - 1  # in 2106
@@ -899,6 +900,42 @@ def _decode(log: CanLog, codec: Codec) -> tuple[CanLog, list[tuple[LoggedFrame, 
             reasons[OTHER_LENGTH] += 1
     kept = msgspec.structs.replace(log, frames=tuple(frame for frame, _, _ in found), left_out=dict(reasons))
     return kept, found
+
+
+# -- replay -----------------------------------------------------------------------------------------
+
+
+EXTENDED: Final = "29-bit identifier"
+
+
+def read_for_replay(path: Path, *, skip_bad: bool = False) -> PlayedLog:
+    """The frames of the log at `path` that the bus carries. A name whose ending says no format is a candump.
+
+    Times of a log with several interfaces may go back by a little. A frame that is earlier than the one
+    before it is left out, because bus time never runs backwards. Raises ConfigError.
+    """
+    name = ENDINGS.get(path.suffix.lower(), "candump")
+    log = read_log(path, name, skip_bad=skip_bad)
+    left_out = Counter(log.left_out)
+    frames: list[Frame] = []
+    last_us = 0
+    for logged in log.frames:
+        if logged.kind is not FrameKind.DATA:
+            left_out[logged.kind.value] += 1
+        elif logged.fd is not None:
+            left_out[FD] += 1
+        elif logged.extended:
+            left_out[EXTENDED] += 1
+        elif logged.t_us < last_us:
+            left_out[str(Refusal.TIME)] += 1
+        else:
+            last_us = logged.t_us
+            frames.append(Frame(logged.t_us, logged.can_id, logged.data))
+    if not frames:
+        why = "; ".join(f"{count} times {reason}" for reason, count in left_out.items())
+        raise ConfigError(f"{path}: no frame in it that the bus carries, read as {name} ({why})")
+    report = LogReport(name, len(frames), dict(left_out), log.skipped, log.first_skipped)
+    return PlayedLog(tuple(frames), report)
 
 
 # -- conversion -----------------------------------------------------------------------------------

@@ -6,7 +6,16 @@ from typing import Final
 import pytest
 
 from aftbed.core.errors import ConfigError
-from aftbed.interop.logs import READERS, WRITERS, FdFlags, FrameKind, LoggedFrame, convert
+from aftbed.interop.logs import (
+    READERS,
+    WRITERS,
+    FdFlags,
+    FrameKind,
+    LoggedFrame,
+    convert,
+    read_for_replay,
+)
+from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.can.python_can import can
 
 ASC_HEAD: Final = "date Thu Jan 01 00:00:00.0 1970\nbase hex  timestamps absolute\ninternal events logged\n"
@@ -148,6 +157,18 @@ def test_an_asc_has_fd_frames_without_data(tmp_path: Path) -> None:
     line = " 0.1 CANFD   1 Rx 123 1 0 0 0 0 0 303000 0 0 0 0 0\n"
     (frame,) = READERS["asc"](made(tmp_path / "a.asc", ASC_HEAD + line)).frames
     assert frame == LoggedFrame(100_000, "can0", 0x123, fd=FdFlags(True))
+
+
+# -- a replay
+
+
+def test_a_replay_has_the_same_frames_from_every_format(tmp_path: Path) -> None:
+    log = made(tmp_path / "a", "(0000000001.100000) can0 123#01\n(0000000001.200000) can1 7FF#\n")
+    found = read_for_replay(log).frames
+    assert found == (Frame(1_100_000, 0x123, b"\1"), Frame(1_200_000, 0x7FF, b""))
+    for name in sorted(WRITERS.keys() - {"mf4"}):
+        convert(log, tmp_path / f"a.{name}", "candump", name)
+        assert read_for_replay(tmp_path / f"a.{name}").frames == found
 
 
 # -- what cannot be read is skipped

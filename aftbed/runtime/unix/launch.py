@@ -18,6 +18,7 @@ import socket
 import time
 import weakref
 from collections.abc import Iterator
+from io import FileIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NoReturn
 
@@ -104,7 +105,11 @@ class Launched:
     """
 
     def __init__(
-        self, options: RunOptions, listener: socket.socket | None, given: "GivenRequests | None" = None
+        self,
+        options: RunOptions,
+        listener: socket.socket | None,
+        given: "GivenRequests | None" = None,
+        log: bytes | None = None,
     ) -> None:
         self.options = options
         self.private, self.record = Path(options.private), Path(options.record)
@@ -117,7 +122,7 @@ class Launched:
         start = head_start.taken() or _fork_supervisor(listener)
         self.supervisor, self.line = start.pid, Line(start.line, decode_report)
         try:
-            self._fork_warden(listener)
+            self._fork_warden(listener, log)
         except OSError:
             start.end()
             raise
@@ -125,13 +130,13 @@ class Launched:
 
     # -- start --------------------------------------------------------------------------------
 
-    def _fork_warden(self, listener: socket.socket | None) -> None:
+    def _fork_warden(self, listener: socket.socket | None, log: bytes | None) -> None:
         """Tell the supervisor what to run, and fork the warden. Each has its ends of two pipes."""
         command_end, command_life = os.pipe()
         supervisor_end, supervisor_life = os.pipe()
         waker = os.eventfd(0)
         self._pidfd = os.pidfd_open(self.supervisor)
-        self._hand_over(supervisor_life, waker, *([listener.fileno()] if listener is not None else []))
+        self._hand_over((supervisor_life, waker), listener, log)
         os.close(supervisor_life)
         self.warden = os.fork()
         if self.warden == 0:
@@ -160,18 +165,22 @@ class Launched:
         self._reference = weakref.ref(self, _LAUNCHED.discard)
         _LAUNCHED.add(self._reference)
 
-    def _hand_over(self, *fds: int) -> None:
+    def _hand_over(self, fds: tuple[int, int], listener: socket.socket | None, log: bytes | None) -> None:
         """Send the options to the supervisor, as a file, and descriptors. Raises OSError."""
-        with open(os.memfd_create("aftbed-options"), "wb", buffering=0) as file:
-            left = memoryview(_encode(self.options))
-            while left:
-                left = left[file.write(left) :]
-            socket.send_fds(self.line.sock, [RUN], [file.fileno(), *fds])
+        with contextlib.ExitStack() as files:
+            of_options = files.enter_context(_memfd("options", _encode(self.options)))
+            found = [of_options.fileno(), *fds]
+            if listener is not None:
+                found.append(listener.fileno())
+            if log is not None:
+                assert listener is not None, "a log without a bus"
+                found.append(files.enter_context(_memfd("log", log)).fileno())
+            socket.send_fds(self.line.sock, [RUN], found)
 
     def _make_directories(self, given: "GivenRequests | None") -> None:
         """Make the private directory and the record, with what was asked for in it, and send *go*."""
         about = {"version": __version__, "started_ns": self.started_ns, **msgspec.to_builtins(self.options)}
-        for key in ("listener", "private", "drive"):
+        for key in ("listener", "log", "private", "drive"):
             about.pop(key)
         about["load"] = isinstance(self.options.work, LoadRun)
         about["kept"] = self._kept
@@ -275,15 +284,28 @@ def _disown_all() -> None:
 os.register_at_fork(after_in_child=_disown_all)
 
 
+def _memfd(name: str, content: bytes) -> FileIO:
+    """A file in memory, to be read from its beginning. Raises OSError."""
+    file = FileIO(os.memfd_create(f"aftbed-{name}"), "r+")
+    left = memoryview(content)
+    while left:
+        left = left[file.write(left) :]
+    file.seek(0)
+    return file
+
+
 def launch(
-    options: RunOptions, listener: socket.socket | None, given: "GivenRequests | None" = None
+    options: RunOptions,
+    listener: socket.socket | None,
+    given: "GivenRequests | None" = None,
+    log: bytes | None = None,
 ) -> Launched:
-    """Start a run, of the requests `given` where its work names some; see `Launched`.
+    """Start a run, of the requests `given` or the PlayedLog `log` where its work is one; see `Launched`.
 
     Raises ConfigError, leaving nothing, where it cannot be started.
     """
     try:
-        return Launched(options, listener, given)
+        return Launched(options, listener, given, log)
     except BaseException as error:
         record = Path(options.record)
         if record.parent != Path(options.private):

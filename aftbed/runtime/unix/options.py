@@ -43,7 +43,7 @@ class CarRun(msgspec.Struct, frozen=True, tag=True):
 
 
 class ReplayRun(msgspec.Struct, frozen=True, tag=True):
-    """A candump log through the bus."""
+    """A log through the bus: the file `log`. Its frames come with the run, since the command has read it."""
 
     log: str
     dbc: str
@@ -63,7 +63,8 @@ class PolicyOptions(msgspec.Struct, frozen=True):
 
 
 class RunOptions(msgspec.Struct, frozen=True):
-    """`private` and `record` are directories, made by the launch; `listener` is the hub's bound socket.
+    """`private` and `record` are directories, made by the launch; `listener` is the hub's bound socket, and
+    `log` a memfd with the `PlayedLog` of a ReplayRun.
 
     `bus_open`: other users may attach to the bus, and the verdict stands whatever strangers send.
     `application`: the protected function that the run begins with, "" for the built-in one. `drive`: the
@@ -83,6 +84,7 @@ class RunOptions(msgspec.Struct, frozen=True):
     policy: PolicyOptions | None = None
     pin: bool = True
     listener: int = -1
+    log: int = -1
     port: int = 0
     bus_open: bool = False
     application: str = ""

@@ -220,7 +220,10 @@ class Workload:
             source = SourceOptions(
                 options.work, options.seed, options.port, self._secret, drive=options.drive
             )
-            yield from self._assign(BUS, self._source, msgspec.msgpack.encode(source), ())
+            fds = (options.log,) if options.log >= 0 else ()
+            yield from self._assign(BUS, self._source, msgspec.msgpack.encode(source), fds)
+            for fd in fds:
+                os.close(fd)
             self.bus.vehicle = self._services.get(VEHICLE)
 
     def start(self) -> Keys:

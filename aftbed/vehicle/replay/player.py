@@ -1,9 +1,9 @@
-"""Replay: a candump log onto the bus, in the place of the car.
+"""Replay: the frames of a log onto the bus, in the place of the car.
 
-The frames of all interfaces of the log go to the one bus, in the order of the log. Bus time starts at
-0 with the first of them and then follows the log's stamps: on the wall clock when paced, or as the
-virtual time of the hub in lockstep (`pace` None). All goes through one connection, so the hub takes
-times and frames in the order in which they are sent.
+The frames of all interfaces of the log go to the one bus, in the order of the log; which of them the bus can
+carry was found out before (`PlayedLog`). Bus time starts at 0 with the first of them and then follows the
+log's stamps: on the wall clock when paced, or as the virtual time of the hub in lockstep (`pace` None). All
+goes through one connection, so the hub takes times and frames in the order in which they are sent.
 
 Only the caller knows which frame ends a radar cycle and so makes a request: most simply by a second gateway
 that gets the same frames and decides as the first does. In lockstep time stands still after such a frame
@@ -17,9 +17,28 @@ import msgspec
 from aftbed.core.errors import PeerError
 from aftbed.vehicle.aeb.messages import STAGE_PARTIAL
 from aftbed.vehicle.can.bus import AnswerWatch, Bus, Schedule
-from aftbed.vehicle.can.candump import LogFrame
 from aftbed.vehicle.can.dbc_file import Codec
 from aftbed.vehicle.can.frame import Frame
+
+
+class LogReport(msgspec.Struct, frozen=True):
+    """What a log held: the frames to play, and those left out, by reason.
+
+    `skipped`: parts of the file that could not be read, the first of them where and why.
+    """
+
+    format: str
+    frames: int
+    left_out: dict[str, int]
+    skipped: int
+    first_skipped: str
+
+
+class PlayedLog(msgspec.Struct, frozen=True):
+    """Frames to play, in the order of time, by the clock of their log."""
+
+    frames: tuple[Frame, ...]
+    report: LogReport
 
 
 class PlayReport(msgspec.Struct):
@@ -46,7 +65,7 @@ class PlayReport(msgspec.Struct):
 
 
 def play(
-    log: Sequence[LogFrame],
+    log: Sequence[Frame],
     codec: Codec,
     bus: Bus,
     pace: float | None,
@@ -72,7 +91,7 @@ class _Player:
         self._answer_id = codec.can_id("AEB_REQ")
         self._watch = AnswerWatch(bus, self._answer_id, self._receive)
 
-    def run(self, log: Sequence[LogFrame], ends_cycle: Callable[[Frame], bool]) -> PlayReport:
+    def run(self, log: Sequence[Frame], ends_cycle: Callable[[Frame], bool]) -> PlayReport:
         report, schedule = self._report, self._schedule
         report.complete = self._play(log, ends_cycle)
         if report.complete and schedule is not None:
@@ -82,11 +101,11 @@ class _Player:
         report.lag_ms_max = 0.0 if schedule is None else schedule.lag_ms_max
         return report
 
-    def _play(self, log: Sequence[LogFrame], ends_cycle: Callable[[Frame], bool]) -> bool:
+    def _play(self, log: Sequence[Frame], ends_cycle: Callable[[Frame], bool]) -> bool:
         """True if the whole log was sent."""
-        start_us, last_us = log[0].frame.t_us if log else 0, -1
-        for entry in log:
-            frame = Frame(entry.frame.t_us - start_us, entry.frame.can_id, entry.frame.data)
+        start_us, last_us = log[0].t_us if log else 0, -1
+        for logged in log:
+            frame = Frame(logged.t_us - start_us, logged.can_id, logged.data)
             if self._schedule is not None:
                 self._schedule.wait_until(frame.t_us, self._stop)
             elif frame.t_us != last_us:

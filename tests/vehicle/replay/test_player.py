@@ -9,7 +9,7 @@ from busharness import TestGateway, running_hub
 
 from aftbed.vehicle.can import bus as bus_module
 from aftbed.vehicle.can.bus import open_bus
-from aftbed.vehicle.can.candump import LogFrame, read_log
+from aftbed.vehicle.can.candump import read_log
 from aftbed.vehicle.can.dbc_file import Codec, load_dbc
 from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.can.hub import HubOptions
@@ -28,13 +28,13 @@ def never() -> bool:
     return False
 
 
-def log_of(cycles: int, cycle_us: int = 50_000) -> list[LogFrame]:
-    """Radar on can1, three frames in a batch, and the speed on can0 between two batches."""
+def log_of(cycles: int, cycle_us: int = 50_000) -> list[Frame]:
+    """Three frames of the radar in a batch, and the speed between two batches."""
     entries = []
     for n in range(cycles):
         t_us, data = START_US + n * cycle_us, n.to_bytes(2, "big")
-        entries += [LogFrame("can1", Frame(t_us, can_id, data)) for can_id in (0x210, 0x211, CYCLE_END_ID)]
-        entries.append(LogFrame("can0", Frame(t_us + cycle_us // 2, 0x0B4, data)))
+        entries += [Frame(t_us, can_id, data) for can_id in (0x210, 0x211, CYCLE_END_ID)]
+        entries.append(Frame(t_us + cycle_us // 2, 0x0B4, data))
     return entries
 
 
@@ -52,7 +52,7 @@ class Stop:
 def run(
     log: Path,
     codec: Codec,
-    entries: list[LogFrame],
+    entries: list[Frame],
     pace: float | None,
     answers: list[tuple[int, float] | None],
     stop: Stop | None = None,
@@ -86,9 +86,7 @@ def test_lockstep_follows_the_stamps_and_waits_for_each_answer(tmp_path: Path, c
     assert logs[0].read_bytes() == logs[1].read_bytes()
     played = [entry.frame for entry in read_log(logs[0])[0]]
     relayed = [frame for frame in played if frame.can_id not in (0x100, 0x701)]
-    assert relayed == [
-        Frame(entry.frame.t_us - START_US, entry.frame.can_id, entry.frame.data) for entry in entries
-    ]
+    assert relayed == [Frame(entry.t_us - START_US, entry.can_id, entry.data) for entry in entries]
     for before, frame in pairwise(played):
         if frame.can_id == 0x100:  # at the time of the frame that it answers
             assert before.t_us == frame.t_us
