@@ -35,6 +35,7 @@ from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.graph import Graph
 from aftbed.core.messages import Scheduled
 from aftbed.core.script import RECIPES
+from aftbed.core.units import whole_milliseconds
 from aftbed.ftm.compose import build
 from aftbed.functions.source import located
 from aftbed.inject.memory import refuse_unsafe
@@ -100,6 +101,13 @@ class RunArguments(msgspec.Struct, frozen=True):
     ] = False
     dbc: Annotated[str | None, typer.Option(help="The DBC of the replayed log.")] = None
     map_file: Annotated[str | None, typer.Option("--map", help="What the log's signals mean.")] = None
+    loop: Annotated[bool, typer.Option("--loop", help="Begin the log of --replay again behind its end.")] = (
+        False
+    )
+    duration: Annotated[
+        str | None,
+        typer.Option(help="End after so long, of bus time, e.g. 90s; else as scenario or log say."),
+    ] = None
     load: Annotated[
         str | None, typer.Option(help="COUNT[@RATE]: synthetic requests (per second) instead of a drive.")
     ] = None
@@ -132,9 +140,9 @@ class RunArguments(msgspec.Struct, frozen=True):
 
 
 DEFAULTS: Final = RunArguments()
-OF_A_REPLAY: Final = ("dbc", "map_file", "skip_bad")
+OF_A_REPLAY: Final = ("dbc", "map_file", "skip_bad", "loop")
 OTHER_SOURCES: Final = ("load", "replay", *OF_A_REPLAY, "scenario", "pace", "brake_policy")
-OF_THE_BUS: Final = ("bus_port", "bus_open")
+OF_THE_BUS: Final = ("bus_port", "bus_open", "duration")
 
 
 @takes(RunArguments)
@@ -258,20 +266,27 @@ def _work(given: RunArguments) -> Work:
     if given.load is not None:
         if given.bus_open:
             raise ConfigError("--bus-open: a run of --load has no bus")
+        if given.duration is not None:
+            raise ConfigError("--duration: a run of --load ends with its last request; COUNT says how many")
         return _load(given.load)
     pace = _pace(given.pace)
+    duration_ms = whole_milliseconds("--duration", given.duration) if given.duration is not None else None
     if given.replay is not None:
-        return _replay(given.replay, given.dbc, given.map_file, pace)
+        if given.loop and pace is None and duration_ms is None:
+            raise ConfigError("--loop with --pace max would fill the disk: give --duration too")
+        files = _replay_files(given.replay, given.dbc, given.map_file)
+        return ReplayRun(*files, pace, given.loop, duration_ms)
     _refuse(given, OF_A_REPLAY, "only with --replay LOG: leave out")
     if given.brake_policy not in POLICIES:
         raise unknown("brake policy", given.brake_policy, POLICIES)
     scenario = given.scenario
     if scenario.endswith((".yaml", ".yml")):
         scenario = str(Path(scenario).resolve())
-    return CarRun(scenario, pace, given.brake_policy)
+    return CarRun(scenario, pace, given.brake_policy, duration_ms)
 
 
-def _replay(log: str, dbc_name: str | None, map_name: str | None, pace: float | None) -> ReplayRun:
+def _replay_files(log: str, dbc_name: str | None, map_name: str | None) -> tuple[str, str, str]:
+    """Log, DBC and map, as a ReplayRun has them. Raises ConfigError."""
     if dbc_name is None or map_name is None:
         raise ConfigError("--replay LOG needs --dbc FILE and --map FILE, which say what its frames mean")
     from aftbed.vehicle.replay.map_file import (  # noqa: PLC0415 - only with --replay
@@ -282,7 +297,7 @@ def _replay(log: str, dbc_name: str | None, map_name: str | None, pace: float | 
 
     dbc, map_path = find_dbc(dbc_name), find_map(map_name)
     bind(map_path, dbc)
-    return ReplayRun(str(Path(log).resolve()), str(dbc.resolve()), str(map_path), pace)
+    return str(Path(log).resolve()), str(dbc.resolve()), str(map_path)
 
 
 def _log(given: RunArguments) -> bytes | None:

@@ -233,6 +233,8 @@ def _play(line: Line[control.ToNode], source: SourceOptions, log: int) -> None:
             work.pace,
             ends_cycle=lambda frame: gateway.on_frame(frame) is not None,
             stop=orders.stop,
+            pause_us=gateway.cycle_ms * 1000 if work.loop else None,
+            until_us=work.duration_ms * 1000 if work.duration_ms is not None else None,
         )
         report = {"played": result, "log": played.report, "gateway": gateway.counts}
         _report(line, "result", msgspec.json.encode(report))

@@ -336,7 +336,7 @@ def options_for(
 ) -> tuple[RunOptions, socket.socket | None]:
     """What a run needs; where there is a bus, its socket too. Raises ConfigError, leaving nothing."""
     faults = tuple(with_names_resolved(fault, work) for fault in faults)
-    drive = _drive(work.scenario) if isinstance(work, CarRun) else b""
+    drive = _drive(work) if isinstance(work, CarRun) else b""
     ensure_limits()
     listener = None if isinstance(work, LoadRun) else bind_hub(bus_port)
     try:
@@ -368,8 +368,11 @@ def options_for(
     return options, listener
 
 
-def _drive(scenario: str) -> bytes:
+def _drive(work: CarRun) -> bytes:
     """The scenario as MessagePack. Raises ConfigError."""
     from aftbed.vehicle.scenarios.library import load_scenario  # noqa: PLC0415 - only for a drive: PyYAML
 
-    return _encode(load_scenario(scenario))
+    scenario = load_scenario(work.scenario)
+    if work.duration_ms is not None:
+        scenario = msgspec.structs.replace(scenario, duration_ms=work.duration_ms)
+    return _encode(scenario)

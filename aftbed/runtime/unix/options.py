@@ -35,20 +35,26 @@ class LoadRun(msgspec.Struct, frozen=True, tag=True):
 
 
 class CarRun(msgspec.Struct, frozen=True, tag=True):
-    """A drive; `pace` None is lockstep."""
+    """A drive; `pace` None is lockstep. `duration_ms`: how long it may last, else as its scenario says."""
 
     scenario: str
     pace: float | None
     brake_policy: str
+    duration_ms: int | None = None
 
 
 class ReplayRun(msgspec.Struct, frozen=True, tag=True):
-    """A log through the bus: the file `log`. Its frames come with the run, since the command has read it."""
+    """A log through the bus: the file `log`. Its frames come with the run, since the command has read it.
+
+    `loop`: behind its end it begins again. It ends after `duration_ms` at the latest, of bus time.
+    """
 
     log: str
     dbc: str
     map: str
     pace: float | None
+    loop: bool = False
+    duration_ms: int | None = None
 
 
 Work = LoadRun | CarRun | ReplayRun

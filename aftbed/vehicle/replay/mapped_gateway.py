@@ -90,6 +90,7 @@ class MappedGateway(BusGateway):
         self._receivers = {
             rule.can_id: Receiver(rule.watch) for rule in self._bound.rules.values() if rule.watch is not None
         }
+        self.cycle_ms = self._bound.map.cycle_ms
         self._book = SlotBook() if self._bound.allots else None
         self._t_us = 0
         self._counters: dict[int, int] = {}

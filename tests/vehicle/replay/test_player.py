@@ -56,6 +56,8 @@ def run(
     pace: float | None,
     answers: list[tuple[int, float] | None],
     stop: Stop | None = None,
+    pause_us: int | None = None,
+    until_us: int | None = None,
 ) -> PlayReport:
     """Play `entries` to a gateway that gives `answers` in turn, the last one for good."""
     with running_hub(log, HubOptions(lockstep=pace is None, pace=pace or 1.0)) as hub:
@@ -71,6 +73,8 @@ def run(
                     pace,
                     ends_cycle=lambda frame: frame.can_id == CYCLE_END_ID,
                     stop=stop or never,
+                    pause_us=pause_us,
+                    until_us=until_us,
                 )
             finally:
                 bus.close()
@@ -126,5 +130,24 @@ def test_play_can_be_stopped(pace: float | None, tmp_path: Path, codec: Codec) -
     assert report.sent < 40
 
 
-def test_an_empty_log_is_played(tmp_path: Path, codec: Codec) -> None:
-    assert run(tmp_path / "bus.log", codec, [], None, [(0, 0.0)]) == PlayReport(complete=True)
+def test_a_log_is_played_again_and_again_until_its_time_is_over(tmp_path: Path, codec: Codec) -> None:
+    """Two cycles, of which the last frame comes 75 ms after the first, and a pause of 25 ms."""
+    given: dict[str, int] = {"pause_us": 25_000, "until_us": 250_001}
+    report = run(tmp_path / "bus.log", codec, log_of(2), None, [(0, 0.0)], **given)
+    assert (report.sent, report.cycles, report.answers, report.complete) == (8 + 8 + 7, 6, 6, True)
+    times_us = [e.frame.t_us for e in read_log(tmp_path / "bus.log")[0] if e.frame.can_id == CYCLE_END_ID]
+    assert times_us == [0, 50_000, 100_000, 150_000, 200_000, 250_000]
+
+
+@pytest.mark.parametrize(("until_us", "sent"), [(0, 0), (1, 3), (25_001, 4), (10_000_000, 8)])
+def test_a_log_is_played_until_its_time_is_over_or_it_ends(
+    until_us: int, sent: int, tmp_path: Path, codec: Codec
+) -> None:
+    report = run(tmp_path / "bus.log", codec, log_of(2), None, [(0, 0.0)], until_us=until_us)
+    assert (report.sent, report.complete) == (sent, True)
+
+
+@pytest.mark.parametrize("pause_us", [None, 1000])
+def test_an_empty_log_is_played(pause_us: int | None, tmp_path: Path, codec: Codec) -> None:
+    played = run(tmp_path / "bus.log", codec, [], None, [(0, 0.0)], pause_us=pause_us)
+    assert played == PlayReport(complete=True)
