@@ -337,8 +337,6 @@ class Hub(BusModel[HubConnection]):
         for client in list(self._clients.values()):
             self._drop(client)
         self._epoll.close()
-        if self._beacon is not None:
-            self._beacon.close()
 
     def go_on(self, fault_number: int) -> None:
         """All actions at the condition of that fault are done: answer the car that waits for it."""
@@ -721,17 +719,14 @@ class _Beacon:
             f'<Bus name="{options.channel}"/>\n'
             "</CANBeacon>"
         ).encode("ascii")
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
 
     def send_if_due(self) -> None:
         now_s = time.monotonic()
         if now_s >= self.due_s:
             self.due_s = now_s + BEACON_PERIOD_S
-            with suppress(OSError):
-                self._socket.sendto(self._text, BEACON)
-
-    def close(self) -> None:
-        self._socket.close()
+            kind = socket.SOCK_DGRAM | socket.SOCK_NONBLOCK
+            with suppress(OSError), socket.socket(socket.AF_INET, kind) as sock:
+                sock.sendto(self._text, BEACON)
 
 
 def _is_stranger(client: HubConnection) -> bool:
