@@ -58,13 +58,15 @@ import msgspec
 from aftbed.core.errors import ConfigError, PeerError, spreadsheet_text, unknown
 from aftbed.interop.files import write_whole
 from aftbed.runtime.unix.confined import JobFailedError, ProcessLimits, ask, serve
-from aftbed.vehicle.can.candump import LINE_SHOWN_CHARACTERS_MAX, LOG_BYTES_MAX, Refusal
+from aftbed.vehicle.can.candump import Refusal
 from aftbed.vehicle.can.dbc_file import Codec, load_dbc
 from aftbed.vehicle.can.frame import CAN_ID_MAX, DATA_LENGTH_MAX, Frame
 from aftbed.vehicle.can.python_can import can, with_asammdf
 from aftbed.vehicle.replay.map_file import find_dbc
 from aftbed.vehicle.replay.player import LogReport, PlayedLog
 
+LOG_BYTES_MAX: Final = 256 * 1024 * 1024
+LINE_SHOWN_CHARACTERS_MAX: Final = 60
 EXTENDED_ID_MAX: Final = 0x1FFFFFFF
 TIME_US_MAX: Final = 2**32 * 1_000_000 - 1  # in 2106
 DATED_US_MIN: Final = 631_152_000 * 1_000_000  # 1990

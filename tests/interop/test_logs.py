@@ -8,6 +8,7 @@ from typing import Final
 
 import msgspec
 import pytest
+from buslog import read_log
 from hypothesis import HealthCheck, assume, given, settings
 from loggedframes import LOGS, NOW_US
 from sampling import sampled
@@ -24,7 +25,6 @@ from aftbed.interop.logs import (
     channels_of,
     convert,
 )
-from aftbed.vehicle.can.candump import read_log
 from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.can.python_can import with_asammdf
 

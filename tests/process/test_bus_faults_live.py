@@ -5,13 +5,13 @@ from pathlib import Path
 from typing import Final
 
 import pytest
+from buslog import read_log
 from liveruns import SHORT, Command, Home, Started, aftbed
 
 from aftbed.inject.model import FaultReport
 from aftbed.inject.receipts import BusTimes, ReceiptState
 from aftbed.judge.intervals import Reaction
 from aftbed.runtime.unix.options import CarRun
-from aftbed.vehicle.can.candump import read_log
 
 pytestmark = pytest.mark.process
 

@@ -11,12 +11,13 @@ from pathlib import Path
 import can
 import pytest
 from busharness import DEADLINE_S, SECRET, RawClient, RunningHub, hub_process, running_hub
+from buslog import read_log
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aftbed.core.errors import ConfigError, PeerError
 from aftbed.vehicle.can.bus_model import frame_bits
-from aftbed.vehicle.can.candump import LogCounts, Refusal, parse_lines, read_log
+from aftbed.vehicle.can.candump import LogCounts, Refusal, parse_lines
 from aftbed.vehicle.can.hub import ELEMENT_BYTES_MAX, HubOptions, parse_send
 
 LOCKSTEP = HubOptions(lockstep=True)

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 from busharness import TestGateway, running_hub
+from buslog import read_log
 
 from aftbed.vehicle.can import bus as bus_module
 from aftbed.vehicle.can.bus import open_bus
-from aftbed.vehicle.can.candump import read_log
 from aftbed.vehicle.can.dbc_file import Codec, load_dbc
 from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.can.hub import HubOptions
