@@ -11,7 +11,7 @@ from typing import Final
 
 import pytest
 from busharness import DEADLINE_S, RawClient
-from liveruns import SHORT, Home, Started, until
+from liveruns import Home, Started, until
 
 from aftbed.runtime.unix.options import CarRun
 from aftbed.runtime.unix.run_directory import members
@@ -104,7 +104,7 @@ def beacons() -> Iterator[socket.socket]:
 
 def test_a_stranger_finds_the_run_and_cannot_be_its_car(home: Home) -> None:
     """And it is told when the run ends. Other runs on this machine have beacons, too."""
-    with Started(home, CarRun(str(SHORT), 1.0, "latch")) as run, beacons() as ear:
+    with beacons() as ear, Started(home, CarRun("free-drive", 1.0, "latch", 60_000)) as run:
         port = run.launched.options.port
         ear.settimeout(DEADLINE_S)
         while f"<URL>can://127.0.0.1:{port}</URL>".encode() not in (beacon := ear.recv(1024)):
@@ -113,12 +113,14 @@ def test_a_stranger_finds_the_run_and_cannot_be_its_car(home: Home) -> None:
         run.wait_for("started")
         with RawClient(port) as stranger:
             stranger.write("< aftbed plant >")
+            while "only the nodes of the run may do this" not in stranger.read():
+                pass
+            run.launched.stop()
             outcome = run.finish()
-            said = []
-            while element := stranger.read():
-                said.append(element)
-    assert any("only the nodes of the run may do this" in element for element in said)
-    assert said[-1].endswith("the run has ended >")
+            last = element = stranger.read()
+            while element:
+                last, element = element, stranger.read()
+    assert last.endswith("the run has ended >")
     assert outcome.verdict.verdict == "pass", outcome.verdict.reasons
     (found,) = outcome.verdict.strangers
     assert (found.connections, found.refused, found.commands_refused, found.frames) == (1, 1, 1, 0)
