@@ -492,11 +492,8 @@ def _trc_fd_line(message: can.Message, number: int, start_s: float) -> str:
     kind = TRC_FD_KINDS[message.bitrate_switch, message.error_state_indicator]
     time_ms, channel = (message.timestamp - start_s) * 1000, cast("int", message.channel) + 1
     can_id = f"{message.arbitration_id:0{7 if message.is_extended_id else 4}X}"
-    to, code, data = (
-        "Rx" if message.is_rx else "Tx",
-        can.util.len2dlc(len(message.data)),
-        message.data.hex(" ").upper(),
-    )
+    to = "Rx" if message.is_rx else "Tx"
+    code, data = can.util.len2dlc(len(message.data)), message.data.hex(" ").upper()
     return f"{number:>7} {time_ms:13.3f} {kind} {channel:>2} {can_id:>8} {to:>2} -  {code:<4} {data}"
 
 
@@ -737,8 +734,9 @@ def _require_asammdf() -> None:
 
 def _frame_of_python_can(row: Mapping[str, str]) -> LoggedFrame:
     is_error, is_remote = row["error"] == "1", row["remote"] == "1"
-    length = min(int(row["dlc"]), DATA_LENGTH_MAX)
     data = b64decode(row["data"], validate=True)
+    is_fd = len(data) > DATA_LENGTH_MAX
+    length = int(row["dlc"]) if is_fd else min(int(row["dlc"]), DATA_LENGTH_MAX)
     if not is_error and not is_remote and len(data) != length:
         raise PeerError(f"a frame of {row['dlc']} bytes with {len(data)}")
     return LoggedFrame(
@@ -749,6 +747,7 @@ def _frame_of_python_can(row: Mapping[str, str]) -> LoggedFrame:
         extended=is_error or row["extended"] == "1",
         kind=FrameKind.ERROR if is_error else FrameKind.REMOTE if is_remote else FrameKind.DATA,
         length=length if is_remote else 0,
+        fd=FdFlags() if is_fd else None,
     )
 
 

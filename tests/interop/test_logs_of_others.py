@@ -79,9 +79,11 @@ def test_the_csv_of_python_cans_logger_is_read(tmp_path: Path) -> None:
     with can.Logger(tmp_path / "theirs.csv") as logger:
         logger(can.Message(1.5, 0x7FF, False, data=b"ab"))
         logger(can.Message(2.5, 0x12345, True, is_remote_frame=True, dlc=4))
+        logger(can.Message(3.5, 0x1, False, is_fd=True, data=bytes(12)))
     assert READERS["csv"](tmp_path / "theirs.csv").frames == (
         LoggedFrame(1_500_000, "can0", 0x7FF, b"ab"),
         LoggedFrame(2_500_000, "can0", 0x12345, extended=True, kind=FrameKind.REMOTE, length=4),
+        LoggedFrame(3_500_000, "can0", 0x1, bytes(12), fd=FdFlags()),
     )
 
 
