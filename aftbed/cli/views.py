@@ -171,6 +171,8 @@ def show_verdict(verdict: "Verdict", *, as_json: bool) -> None:
         print(f"  bus        {_stranger_line(stranger)}")
     for fault in verdict.faults:
         print(shown(f"  fault      {fault.fault}: {fault.receipt.value}"))
+    if verdict.verifies:
+        print(f"  verifies   {', '.join(verdict.verifies)}")
     print("  checks     " + ", ".join(f"{name} {found}" for name, found in verdict.checks.items()))
     for reason in verdict.reasons:
         print(shown(f"  because    {reason}"))
