@@ -411,7 +411,7 @@ def _result(
         gap_m=vehicle.stop_gap_m if vehicle is not None else None,
         golden_gap_m=golden.stop_gap_m if golden is not None else None,
         intervals=tuple(verdict.intervals),
-        states=states_of(record.history),
+        states=states_of(record),
     )
 
 

@@ -218,6 +218,8 @@ def _show_vehicle(verdict: "Verdict") -> None:
     else:
         gap = "" if car.min_gap_m is None else f", gap {car.min_gap_m:.2f} m at least"
         print(f"  car        {'braked' if car.braked else 'never braked'}{gap}")
+    if car is not None and car.fallback_s is not None:
+        print(f"  brakes     first without a fresh request after {car.fallback_s:.2f} s")
 
 
 def _ms(value: float | None) -> str:
