@@ -28,6 +28,7 @@ from aftbed.cli.options import (
     Expect,
     Ftm,
     Ftti,
+    Html,
     Json,
     Junit,
     Requests,
@@ -138,6 +139,7 @@ class RunArguments(msgspec.Struct, frozen=True):
     mcap: Annotated[Path | None, typer.Option(help="Write the run to this file, for Foxglove.")] = None
     trace: Annotated[Path | None, typer.Option(help="Write its nodes to this file, for Perfetto.")] = None
     junit: Junit = None
+    html: Html = None
     json: Json = False
 
 
@@ -175,6 +177,7 @@ def execute(given: RunArguments) -> int:
     check_range("--bus-port", given.bus_port, 0, 65535)
     verifies = requirements(given.verifies)
     check_file("--junit", given.junit)
+    check_file("--html", given.html)
     write_files = _files(given)
     page = _page(given)
     options, listener = options_for(
@@ -201,7 +204,7 @@ def execute(given: RunArguments) -> int:
         with page(launched.private):
             interrupted = _follow(launched, open_view(options, quiet=given.json), closed)
         launched.wait()
-        from aftbed.cli.check import judge_and_show, write_junit  # noqa: PLC0415 - after the launch
+        from aftbed.cli.check import judge_and_show, write_html, write_junit  # noqa: PLC0415 - after the launch
         from aftbed.judge.verdict import EXIT_CODES, EXIT_INTERRUPTED  # noqa: PLC0415 - after the launch
         from aftbed.runtime.unix.trust import OWN_RUN, remember  # noqa: PLC0415 - after the launch
 
@@ -215,6 +218,9 @@ def execute(given: RunArguments) -> int:
             _show_log(launched.record / "processes.log")
         writers = [partial(write_files, launched.record)] if write_files is not None else []
         writers += [partial(write_junit, given.junit, verdict)] if given.junit is not None else []
+        writers += (
+            [partial(write_html, given.html, launched.record, verdict)] if given.html is not None else []
+        )
         unwritten = [write for write in writers if not _written(write, as_json=given.json)]
     finally:
         launched.remove()
