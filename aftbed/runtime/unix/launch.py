@@ -31,6 +31,7 @@ from aftbed.inject.model import Fault
 from aftbed.runtime import control
 from aftbed.runtime.unix import head_start, linux, run_directory, seal
 from aftbed.runtime.unix.cleanup import watch
+from aftbed.runtime.unix.code_version import code_version
 from aftbed.runtime.unix.journal_files import CHUNK_BYTES, trim
 from aftbed.runtime.unix.options import CarRun, LoadRun, PolicyOptions, RunOptions, Work, with_names_resolved
 from aftbed.runtime.unix.process_pool import killed_by
@@ -41,6 +42,7 @@ from aftbed.vehicle.can.bus_model import HOST
 
 if TYPE_CHECKING:
     from aftbed.functions.request_file import GivenRequests
+    from aftbed.vehicle.scenarios.scenario import Scenario
 
 END_SECONDS_MAX: Final = 8.0
 KILL_SECONDS_MAX: Final = 1.0
@@ -333,10 +335,17 @@ def options_for(
     bus_open: bool = False,
     application: str = "",
     ftti_ms: float = 0.0,
+    verifies: tuple[str, ...] = (),
+    command: str = "",
+    evidence: bool = False,
 ) -> tuple[RunOptions, socket.socket | None]:
-    """What a run needs; where there is a bus, its socket too. Raises ConfigError, leaving nothing."""
+    """What a run needs; where there is a bus, its socket too. Raises ConfigError, leaving nothing.
+
+    `evidence`: the options say which code this is, also of a run that verifies nothing and is not kept.
+    """
     faults = tuple(with_names_resolved(fault, work) for fault in faults)
-    drive = _drive(work) if isinstance(work, CarRun) else b""
+    drive = _scenario(work) if isinstance(work, CarRun) else None
+    verifies = tuple(dict.fromkeys((*verifies, *(drive.verifies if drive is not None else ()))))
     ensure_limits()
     listener = None if isinstance(work, LoadRun) else bind_hub(bus_port)
     try:
@@ -362,17 +371,20 @@ def options_for(
         port=listener.getsockname()[1] if listener is not None else 0,
         bus_open=bus_open,
         application=application,
-        drive=drive,
+        drive=_encode(drive) if drive is not None else b"",
         ftti_ms=ftti_ms,
+        verifies=verifies,
+        command=command,
+        code=code_version() if evidence or verifies or record is not None else "",
     )
     return options, listener
 
 
-def _drive(work: CarRun) -> bytes:
-    """The scenario as MessagePack. Raises ConfigError."""
+def _scenario(work: CarRun) -> "Scenario":
+    """That of `work`, as it is driven. With another duration it verifies nothing. Raises ConfigError."""
     from aftbed.vehicle.scenarios.library import load_scenario  # noqa: PLC0415 - only for a drive: PyYAML
 
     scenario = load_scenario(work.scenario)
-    if work.duration_ms is not None:
-        scenario = msgspec.structs.replace(scenario, duration_ms=work.duration_ms)
-    return _encode(scenario)
+    if work.duration_ms is None:
+        return scenario
+    return msgspec.structs.replace(scenario, duration_ms=work.duration_ms, verifies=())
