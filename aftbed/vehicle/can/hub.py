@@ -91,7 +91,7 @@ from aftbed.core.errors import AftbedError, ConfigError, HarnessError, PeerError
 from aftbed.core.units import number
 from aftbed.vehicle.can.bus_model import CHANNEL, HOST, BusModel, BusNode, Notice
 from aftbed.vehicle.can.candump import log_line
-from aftbed.vehicle.can.frame import Frame
+from aftbed.vehicle.can.frame import DATA_LENGTH_MAX, Frame
 from aftbed.vehicle.condition import Condition
 
 EVENTS_MAX: Final = 32  # in one round; the rest comes in the next
@@ -110,7 +110,9 @@ BEACON_PERIOD_S: Final = 1.0  # python-can listens for 3.1 s
 OUTPUT_BYTES_MAX: Final = 256 * 1024
 FRAMES_QUEUED_MAX: Final = 256  # of one client
 
-_SEND: Final = re.compile(rb"< send ([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8}) ([0-9]) ((?:[0-9A-Fa-f]{1,2} ){0,8}) ?")
+_SEND: Final = re.compile(
+    rb"< send ([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8}) ([0-9A-Fa-f]) ((?:[0-9A-Fa-f]{1,2} ){0,8}) ?"
+)
 _OURS: Final = {  # elements of aftbed's nodes
     word: re.compile(rb"< aftbed %b %b" % (word, arguments))
     for word, arguments in {
@@ -790,12 +792,13 @@ def parse_send(element: bytes, t_us: int) -> Frame:
     match = _SEND.fullmatch(element)
     if match is None:
         raise PeerError("malformed send")
-    identifier, length, text = match.groups()
+    identifier, code, text = match.groups()
     if len(identifier) != 3:
         raise PeerError("29-bit identifiers are not carried")
     data = bytes([int(byte, 16) for byte in text.split()])
-    if len(data) != int(length):
-        raise PeerError(f"length {int(length)} but {len(data)} bytes")
+    length = min(int(code, 16), DATA_LENGTH_MAX)  # codes 9 to 15 mean 8 bytes (ISO 11898-1)
+    if len(data) != length:
+        raise PeerError(f"length {length} but {len(data)} bytes")
     return Frame(t_us, int(identifier, 16), data)
 
 

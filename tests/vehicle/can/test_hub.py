@@ -44,6 +44,15 @@ def test_a_frame_goes_to_all_but_its_sender(hub: RunningHub) -> None:
     assert hub.stop().frames == 1
 
 
+@pytest.mark.parametrize("code", [8, 9, 15])
+def test_a_tool_may_send_a_length_code_above_8_which_means_8_bytes(hub: RunningHub, code: int) -> None:
+    """As python-can does with a frame of such a log (ISO 11898-1)."""
+    with RawClient(hub.port) as b, attach(hub.port) as tool:
+        tool.send(can.Message(arbitration_id=0x130, is_extended_id=False, data=bytes(range(8)), dlc=code))
+        assert b.read().split()[4] == "0001020304050607"
+    assert hub.stop().refused == 0
+
+
 def test_the_log_has_what_was_relayed(hub: RunningHub) -> None:
     with RawClient(hub.port) as a, RawClient(hub.port) as b:
         a.write("< send 130 0  >< send 7FF 1 5 >")
@@ -229,6 +238,8 @@ def test_options_on_which_no_time_would_pass(options: dict[str, float]) -> None:
         "< send 130 2 1 >",
         "< send 130 1 1 2 >",
         "< send 130 9 1 2 3 4 5 6 7 8 9 >",
+        "< send 130 F 1 2 3 4 5 6 7 >",
+        "< send 130 10 1 2 3 4 5 6 7 8 >",
         "< send 130 1 123 >",
         "< send 130 1 -1 >",
         "< send 130 1 0x1 >",
