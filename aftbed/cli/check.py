@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from aftbed.cli.options import Json, Junit, TrustedFolders, check_file
+from aftbed.cli.options import Html, Json, Junit, TrustedFolders, check_file
 from aftbed.cli.views import show_verdict
 from aftbed.judge.record import read_record
 from aftbed.judge.verdict import EXIT_CODES, Verdict, evidence_of, judge
@@ -16,12 +16,15 @@ def check(
     record: Annotated[Path, typer.Argument(help="The directory of --record.")],
     trust: TrustedFolders = None,
     junit: Junit = None,
+    html: Html = None,
     json: Json = False,
 ) -> None:
     """Judge a recorded run again."""
     check_file("--junit", junit)
+    check_file("--html", html)
     verdict = judge_and_show(record, trusting(trust), as_json=json)
     lines = write_junit(junit, verdict) if junit is not None else []
+    lines += write_html(html, record, verdict) if html is not None else []
     if lines and not json:
         print("\n".join(lines))
     raise typer.Exit(EXIT_CODES[verdict.verdict])
@@ -42,3 +45,13 @@ def write_junit(sink: Path, verdict: Verdict) -> list[str]:
 
     write_text_whole(sink, junit_of_run(verdict))
     return [f"{sink}: 1 test case"]
+
+
+def write_html(sink: Path, record: Path, verdict: Verdict) -> list[str]:
+    """Write the report of the run as a page; what to tell the user. Raises ConfigError."""
+    from aftbed.interop.files import write_text_whole  # noqa: PLC0415 - only with --html
+    from aftbed.report.run_page import run_page  # noqa: PLC0415 - the same: jinja2, matplotlib
+
+    page = run_page(read_record(record), verdict)
+    write_text_whole(sink, page)
+    return [f"{sink}: {len(page.encode()) / 1e3:.0f} kB"]

@@ -39,6 +39,7 @@ Tolerance = Annotated[
 Ftti = Annotated[
     str | None, typer.Option(help="Fault tolerant time interval, as 100ms: a fault handled later fails.")
 ]
+Html = Annotated[Path | None, typer.Option(help="Write a report of the run as one page to this file.")]
 Junit = Annotated[Path | None, typer.Option(help="Write the verdict to this file, as JUnit XML.")]
 VERIFIES: Final = "--verifies"
 VERIFIES_HELP: Final = "A requirement, as SG-1, that the run verifies; may be given several times."
