@@ -82,13 +82,18 @@ class ArmedFault(msgspec.Struct, frozen=True):
 
 
 class FaultReport(msgspec.Struct, frozen=True, omit_defaults=True):
-    """A fault of a run in its words, with its receipt, as it stands in records and documents."""
+    """A fault of a run in its words, with its receipt, as it stands in records and documents.
+
+    `number`: which of the run's faults, from 0 on, as the journals count them. Those of live faults that were
+    refused are missing: these have no report.
+    """
 
     fault: str
     receipt: ReceiptState
     detail: str = ""
     live: bool = False  # it was asked for while the run ran
     bus: BusTimes | None = None  # of a fault of the bus that struck
+    number: int = 0
 
     @property
     def fired(self) -> bool:
