@@ -133,6 +133,24 @@ def test_a_detection_behind_the_next_fault_is_not_of_this_one() -> None:
     assert (first.bound_ms, second.bound_ms) == (None, None), "a bound is for one fault alone"
 
 
+@pytest.mark.parametrize(
+    ("other", "bus"),
+    [
+        (OMISSION, BusTimes(100, 10_100, 50_100)),
+        ("radar missed for 100ms", None),
+        ("bitflip result nth 70", None),  # struck as well, and no journal says when
+    ],
+)
+def test_a_crash_beside_another_fault_has_no_bound(other: str, bus: BusTimes | None) -> None:
+    told = evidence(a_crash(), CRASH)
+    reports = (*told.record.faults, FaultReport(other, ReceiptState.ACTIVATED, bus=bus))
+    beside = Evidence(msgspec.structs.replace(told.record, faults=reports), told.reference)
+    assert [one.bound_ms for one in intervals(beside)] == [None] * (2 if bus else 1)
+    armed = (*told.record.faults, FaultReport(other, ReceiptState.NOT_ACTIVATED))
+    beside = Evidence(msgspec.structs.replace(told.record, faults=armed), told.reference)
+    assert intervals(beside)[0].bound_ms is not None, "one that did not strike disturbs nothing"
+
+
 def test_a_fault_that_did_not_strike_has_no_intervals() -> None:
     given = evidence(Tale().served(1), CRASH)
     reports = (FaultReport(CRASH, ReceiptState.ARMED),)
