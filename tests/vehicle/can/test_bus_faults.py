@@ -237,6 +237,31 @@ def test_a_fault_is_armed_and_forgotten_while_the_car_drives(tmp_path: Path) -> 
     assert drive.report is not None and drive.report.missing_answers == 0
 
 
+@pytest.mark.parametrize("pace", [1.0, 4.0])
+def test_a_paced_notice_is_of_the_time_at_which_the_node_noticed(tmp_path: Path, pace: float) -> None:
+    """By the clock: not of when the hub hears of it, nor by the time of the drive, which has another zero."""
+    origin_ns = time.monotonic_ns()
+    with (
+        running_hub(tmp_path / "bus.log", HubOptions(pace=pace, origin_ns=origin_ns)) as hub,
+        Node(hub.port, "radar") as radar,
+        Node(hub.port, "brake", 0x100) as brake,
+    ):
+        arm(hub, "omission bus RADAR_TRACK")
+        before_ns = time.monotonic_ns()
+        radar.send(0x130)
+        radar.fence()
+        after_ns = time.monotonic_ns()
+        for word, clock_ns in (("fallback", before_ns), ("fallback", after_ns), ("good_again", 10**19)):
+            brake.write(f"< aftbed noticed 100 {word} 5000 {clock_ns} >")
+        brake.fence()
+        heard_ns = time.monotonic_ns()
+        (struck,) = hub.struck()
+    times = struck.times
+    assert times is not None and times.good_us is not None
+    assert times.noticed_us == int((after_ns - origin_ns) // 1000 * pace), "the first one was not its work"
+    assert times.noticed_us < times.good_us <= (heard_ns - origin_ns) / 1000 * pace, "not in the future"
+
+
 # -- the hub itself
 
 
@@ -329,7 +354,7 @@ def test_the_hub_reports_what_becomes_of_a_fault(hub: RunningHub) -> None:
         arm(hub, "omission bus RADAR_TRACK nth 2")
         for _ in range(3):
             radar.send(0x130)
-        gateway.write("< aftbed noticed 130 lost 60000 >")
+        gateway.write(f"< aftbed noticed 130 lost 60000 {time.monotonic_ns()} >")
         gateway.fence()
     hub.stop()
     assert hub.link.receipts == ["armed", "applied", "activated"]
@@ -388,6 +413,7 @@ def test_await_is_answered_when_the_frames_have_been_carried(tmp_path: Path) -> 
         "< aftbed met 7 2000 123 >",
         "< aftbed noticed 130 >",
         "< aftbed noticed 130 lost >",
+        "< aftbed noticed 130 lost 60000 >",
         "< aftbed unasked 1 >",
         "< aftbed sing >",
     ],
