@@ -112,6 +112,13 @@ def test_a_wrong_reply_is_no_reaction() -> None:
     assert times(found) == (None, None, None, "none") and found.asked
 
 
+def test_a_right_reply_behind_a_wrong_one_does_not_make_up_for_it() -> None:
+    tale = struck(Tale().served(1).sent(2), request_id=2).executed(2)
+    tale.bare.execute(b"request 2")  # the next reply is right
+    tale.accepted(2).answered(2, payload=b"00000000").served(3)
+    assert times(only(tale, FLIP)) == (None, None, None, "none")
+
+
 def test_a_detected_stop_without_a_reply_behind_it_is_safe() -> None:
     tale = struck(Tale().served(1).sent(2), request_id=2).note("a/tr.after.1", Event.DETECTED_STOP, 2)
     assert times(only(tale, FLIP, "tr")) == (1.0, 0.0, 1.0, "safe")

@@ -1,0 +1,34 @@
+"""Identifiers of requirements: what goes into XML, and is not split at a comma."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from aftbed.core.errors import ConfigError
+from aftbed.core.requirements import check_requirements
+
+
+@pytest.mark.parametrize("name", ["SG-1", "FSR-3.2", "a", "ISO:26262/3+5_b", "x" * 64])
+def test_an_identifier(name: str) -> None:
+    check_requirements("verifies", ["other", name])
+
+
+@pytest.mark.parametrize("name", ["", "SG 1", "SG-1,SG-2", "SG-1\n", "SG\x01", "-1", "x" * 65, "§1"])
+def test_what_is_none(name: str) -> None:
+    with pytest.raises(ConfigError, match=r"verifies\[1\]: found .* allowed is an identifier such as SG-1"):
+        check_requirements("verifies", ["SG-1", name])
+
+
+def test_one_that_stands_twice() -> None:
+    with pytest.raises(ConfigError, match=r"verifies\[2\]: SG-1 stands twice"):
+        check_requirements("verifies", ["SG-1", "SG-2", "SG-1"])
+
+
+@given(st.lists(st.text(max_size=70), max_size=5))
+def test_what_is_let_through_is_split_at_commas_into_itself(names: list[str]) -> None:
+    try:
+        check_requirements("verifies", names)
+    except ConfigError:
+        return
+    assert not names or ",".join(names).split(",") == names
+    assert all(name.isascii() and name.isprintable() for name in names)
