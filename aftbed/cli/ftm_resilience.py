@@ -11,7 +11,7 @@ from typing import Annotated, Final
 import msgspec
 import typer
 
-from aftbed.adapt.resilience import Counts, NeededAdaptation, Resilience, mechanisms_of, resilience
+from aftbed.adapt.resilience import Addition, Counts, NeededAdaptation, Resilience, mechanisms_of, resilience
 from aftbed.bench.adaptation import AdaptationTime, Pair, bench_pairs, read_times
 from aftbed.cli.ftm import TableOption, table_of
 from aftbed.cli.options import Json, check_range, print_json, takes
@@ -20,7 +20,7 @@ from aftbed.ftm.registry import MECHANISMS
 
 ADAPTATIONS: Final = 3  # of each kind
 ADAPTATIONS_MAX: Final = 1000
-SHOWN: Final = 5  # additions
+SHOWN: Final = 5  # additions that do not exist
 
 
 class TimedAdaptation(NeededAdaptation, frozen=True, kw_only=True):
@@ -164,7 +164,9 @@ def _print(found: Resilience, timed: list[TimedAdaptation], mean: AdaptationMean
         print()
     if found.additions:
         print(ADDITION("ONE MECHANISM MORE", "ANSWERS", "ANSWERED"))
-        for more in found.additions[:SHOWN]:
+        shipped = [one for one in found.additions if one.addition is Addition.AS_SHIPPED]
+        less = [one for one in found.additions if one.addition is not Addition.AS_SHIPPED]
+        for more in (*shipped, *less[:SHOWN]):
             print(ADDITION(more.words, more.answers, _percent(more.answered)))
         print()
     print(_verdict(found.total))

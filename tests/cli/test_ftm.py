@@ -257,6 +257,10 @@ def test_the_resilience_of_a_set(call: Call) -> None:
     assert next(line for line in lines if line.startswith("pbr+tr      tr ")).split()[3:] == ["-", "-", "-"]
     assert lines[-1].startswith("answered    ") and "that break what runs" in lines[-1]
     assert "measuring" not in out and "without service" not in out
+    more = [
+        line.split("  ")[0] for line in lines[lines.index("") :] if line.startswith(("assert ", "one like"))
+    ]
+    assert more[0] == "assert" and len(more) == 6, "what is shipped stands first, then the best five"
 
 
 def test_a_set_that_never_adapts(call: Call) -> None:

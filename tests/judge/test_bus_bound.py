@@ -41,6 +41,7 @@ ROWS: Final = [
 ]
 
 
+@pytest.mark.simulation
 @pytest.mark.parametrize(("words", "bounded"), every(4, ROWS))
 def test_what_is_simulated_stays_below_the_bound_and_near_to_it(words: str, bounded: bool) -> None:
     (found,) = intervals(
