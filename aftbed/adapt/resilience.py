@@ -99,20 +99,31 @@ Situation = tuple[int, ...]  # the number of the value on each axis
 
 
 class Addition(Enum):
-    """An assumption less."""
+    """What is added to a set: a mechanism as it is shipped, or one like it with an assumption less."""
 
-    AS_SHIPPED = "as it is shipped"
-    TOLERATES = "also tolerates"
-    DETERMINISM = "needs no determinism"
-    STATE_ACCESS = "needs no state access"
-    EXACT_STATE = "needs no exact state access"
-    CPUS = "needs 1 CPU"
-    CPU_LOAD = "takes less CPU"
-    BANDWIDTH = "takes less bandwidth"
+    AS_SHIPPED = "as_shipped"
+    TOLERATES = "tolerates"
+    DETERMINISM = "no_determinism"
+    STATE_ACCESS = "no_state_access"
+    EXACT_STATE = "no_exact_state"
+    CPUS = "one_cpu"
+    CPU_LOAD = "less_cpu_load"
+    BANDWIDTH = "less_bandwidth"
+
+
+WORDS: Final[dict[Addition, str]] = {
+    Addition.TOLERATES: "also tolerates",
+    Addition.DETERMINISM: "needs no determinism",
+    Addition.STATE_ACCESS: "needs no state access",
+    Addition.EXACT_STATE: "needs no exact state access",
+    Addition.CPUS: "needs 1 CPU",
+    Addition.CPU_LOAD: "takes less CPU",
+    Addition.BANDWIDTH: "takes less bandwidth",
+}
 
 
 class Candidate(msgspec.Struct, frozen=True):
-    """A mechanism that may be added to a set: `row` is what it tolerates and needs."""
+    """A mechanism that may be added to a set. `row`: what it tolerates and needs; `detail`: which fault more."""
 
     mechanism: str
     addition: Addition
@@ -122,7 +133,7 @@ class Candidate(msgspec.Struct, frozen=True):
     def __str__(self) -> str:
         if self.addition is Addition.AS_SHIPPED:
             return self.mechanism
-        return f"one like {self.mechanism} that {self.addition.value} {self.detail}".rstrip()
+        return f"one like {self.mechanism} that {WORDS[self.addition]} {self.detail}".rstrip()
 
 
 class Counts(msgspec.Struct, frozen=True):
