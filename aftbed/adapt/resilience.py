@@ -123,7 +123,7 @@ WORDS: Final[dict[Addition, str]] = {
 
 
 class Candidate(msgspec.Struct, frozen=True):
-    """A mechanism that may be added to a set. `row`: what it tolerates and needs; `detail`: which fault more."""
+    """A mechanism that may be added. `row`: what it tolerates and needs; `detail`: which fault more."""
 
     mechanism: str
     addition: Addition
@@ -366,57 +366,70 @@ class _Change(NamedTuple):
         return (*situation[: self.axis], self.new, *situation[self.axis + 1 :])
 
 
+class _Tally:
+    """Counts all changes from all states of a set that has `ftms`, the first ones of `options`."""
+
+    def __init__(self, ftms: Sequence[str], options: Sequence[_Option], along: Sequence[Axis]) -> None:
+        self.states = 0
+        self.answers: Counter[tuple[_Change, ChangeAnswer]] = Counter()
+        self.needed: Counter[tuple[str, str]] = Counter()  # adaptations
+        self.unanswered: Counter[int] = Counter()  # by the options, as bits, that would be an answer
+        self._ftms = ftms
+        self._own = (1 << len(ftms)) - 1
+        self._stateless = [  # by what runs: the options to which no state has to be handed over
+            sum((not hands_over(old, option.expression)) << at for at, option in enumerate(options))
+            for old in ftms
+        ]
+        suits = _Suits(options, along)
+        self.situations = list(product(*(range(len(axis.values)) for axis in along)))
+        self._suited = {situation: suits(situation) for situation in self.situations}
+        self._gives_state = {situation: _gives_state(situation, along) for situation in self.situations}
+        for before in self.situations:
+            running = [at for at in range(len(ftms)) if self._suited[before] >> at & 1]
+            self.states += len(running)
+            for change in _changes(before, along) if running else ():
+                for at in running:
+                    self._count(at, before, change)
+
+    def _count(self, at: int, before: Situation, change: _Change) -> None:
+        """`at`: the number of what runs."""
+        then = change.of(before)
+        open_to = self._suited[then]
+        if not (self._gives_state[before] or self._gives_state[then]):
+            open_to &= self._stateless[at]
+        if self._suited[then] >> at & 1:
+            self.answers[change, ChangeAnswer.STAYS] += 1
+        elif open_to & self._own:
+            self.answers[change, ChangeAnswer.ADAPTS] += 1
+            cheapest = (open_to & -open_to).bit_length() - 1
+            self.needed[self._ftms[at], self._ftms[cheapest]] += 1
+        else:
+            self.answers[change, ChangeAnswer.NOTHING] += 1
+            self.unanswered[open_to] += 1
+
+
 def resilience(mechanisms: Sequence[str], table: SuitabilityTable = TABLE) -> Resilience:
     """Of a set of mechanisms: all changes from all its states."""
     along = axes(table)
     ftms = sorted(expressions_of(mechanisms), key=lambda expression: cost(expression, table))
-    own = (1 << len(ftms)) - 1  # the bits of what the set has, the cheapest first
     options = [_Option(name, table) for name in ftms]
-    of_candidate: list[tuple[Candidate, int]] = []
+    of_candidate: list[tuple[Candidate, int]] = []  # with the bits of its options
     for candidate in candidates(mechanisms, table):
         added = _with(candidate, mechanisms, table)
         of_candidate.append((candidate, ((1 << len(added)) - 1) << len(options)))
         options += added
-    suits = _Suits(options, along)
-    situations = list(product(*(range(len(axis.values)) for axis in along)))
-    suited = {situation: suits(situation) for situation in situations}
-    gives_state = {situation: _gives_state(situation, along) for situation in situations}
-    stateless = [
-        sum((not hands_over(old, option.expression)) << at for at, option in enumerate(options))
-        for old in ftms
-    ]
-    answers: Counter[tuple[_Change, ChangeAnswer]] = Counter()
-    needed: Counter[tuple[str, str]] = Counter()
-    unanswered: Counter[int] = Counter()  # by the options that would be an answer
-    states = 0
-    for before in situations:
-        running = [at for at in range(len(ftms)) if suited[before] >> at & 1]
-        states += len(running)
-        for change in _changes(before, along) if running else ():
-            then = change.of(before)
-            for at in running:
-                open_to = suited[then]
-                if not (gives_state[before] or gives_state[then]):
-                    open_to &= stateless[at]
-                if suited[then] >> at & 1:
-                    answers[change, ChangeAnswer.STAYS] += 1
-                elif open_to & own:
-                    answers[change, ChangeAnswer.ADAPTS] += 1
-                    cheapest = (open_to & -open_to).bit_length() - 1
-                    needed[ftms[at], ftms[cheapest]] += 1
-                else:
-                    answers[change, ChangeAnswer.NOTHING] += 1
-                    unanswered[open_to] += 1
+    tally = _Tally(ftms, options, along)
+    answers = tally.answers
     return Resilience(
         tuple(mechanisms),
         tuple(ftms),
-        len(situations),
-        states,
+        len(tally.situations),
+        tally.states,
         _counts((answer, count) for (_, answer), count in answers.items()),
         tuple(_of_kind(kind, answers, along) for kind in AssumptionKind),
         tuple(_rows(answers, along)),
-        tuple(NeededAdaptation(*pair, count) for pair, count in needed.most_common()),
-        tuple(_more(of_candidate, unanswered, answers.total())),
+        tuple(NeededAdaptation(*pair, count) for pair, count in tally.needed.most_common()),
+        tuple(_more(of_candidate, tally.unanswered, answers.total())),
     )
 
 
