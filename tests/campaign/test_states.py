@@ -45,7 +45,7 @@ def test_the_states_of_a_run_are_read_off_its_record(setup: Setup, states: set[s
 def test_a_failover_behind_an_adaptation_is_not_in_it() -> None:
     crash = parse("crash primary at server.exit nth 150")
     run = simulate(Setup("pbr", count=200, rate_hz=500, adaptations=(TO_TR,), faults=(crash,)))
-    found = states_of(run.history)
+    found = states_of(record_of(run))
     assert RunState.FAILOVER in found and RunState.IN_ADAPTATION not in found
 
 
