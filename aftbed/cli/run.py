@@ -45,7 +45,7 @@ from aftbed.core.graph import Graph
 from aftbed.core.messages import Scheduled
 from aftbed.core.script import RECIPES
 from aftbed.core.units import whole_milliseconds
-from aftbed.ftm.compose import build
+from aftbed.ftm.compose import build, canonical
 from aftbed.functions.source import located
 from aftbed.inject.memory import refuse_unsafe
 from aftbed.inject.model import Fault, parse
@@ -196,7 +196,7 @@ def execute(given: RunArguments) -> int:
     write_files = _files(given)
     page = _page(given)
     options, listener = options_for(
-        ftm=given.ftm,
+        ftm=graph.ftm,
         placement=given.placement,
         work=work,
         seed=given.seed,
@@ -282,7 +282,7 @@ def _closed_loop(given: RunArguments) -> "Callable[[Launched], ClosedLoop] | Non
         return None
     from aftbed.runtime.unix.closed_loop import ClosedLoop, asked_for  # noqa: PLC0415 - only with --policy
 
-    policy = asked_for(given.policy, given.approve, given.ftm, as_json=given.json)
+    policy = asked_for(given.policy, given.approve, canonical(given.ftm), as_json=given.json)
     if policy is None:
         return None
     from aftbed.cli.adapt import declared_in_time  # noqa: PLC0415 - the same
@@ -294,6 +294,9 @@ def _work(given: RunArguments) -> Work:
     if given.replay is not None and given.load is not None:
         raise ConfigError("--replay and --load: one of them is allowed")
     if given.load is not None:
+        _refuse(
+            given, ("scenario", "pace", "brake_policy", *OF_A_REPLAY), "--load: there is no car: leave out"
+        )
         if given.bus_open:
             raise ConfigError("--bus-open: a run of --load has no bus")
         if given.duration is not None:
@@ -302,6 +305,7 @@ def _work(given: RunArguments) -> Work:
     pace = _pace(given.pace)
     duration_ms = whole_milliseconds("--duration", given.duration) if given.duration is not None else None
     if given.replay is not None:
+        _refuse(given, ("scenario", "brake_policy"), "--replay: there is no car: leave out")
         if given.loop and pace is None and duration_ms is None:
             raise ConfigError("--loop with --pace max would fill the disk: give --duration too")
         files = _replay_files(given.replay, given.dbc, given.map_file)
