@@ -17,6 +17,8 @@ FAULTS: Final = {
     "crash of the backup": "crash backup",
     "crash of Recovery": "crash recovery",
     "wrong value": "bitflip result",
+    "skipped step": "omission prd2srv",
+    "doubled step": "duplicate prd2srv",
 }
 
 
