@@ -47,7 +47,7 @@ app = typer.Typer(
 
 def _version(wanted: bool) -> None:
     if wanted:
-        from aftbed.campaign.plan import code_version  # noqa: PLC0415 - only for --version
+        from aftbed.runtime.unix.code_version import code_version  # noqa: PLC0415 - only for --version
 
         typer.echo(f"aftbed {code_version()}")
         raise typer.Exit

@@ -8,10 +8,12 @@ imported where it is used, and what judges is imported after the run.
 import contextlib
 import json
 import os
+import shlex
 import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
@@ -20,15 +22,21 @@ import typer
 
 from aftbed.cli.options import (
     RATE_HZ_MAX,
+    VERIFIES,
+    VERIFIES_HELP,
     App,
     Expect,
     Ftm,
     Ftti,
+    Html,
     Json,
+    Junit,
     Requests,
     Tolerance,
+    check_file,
     check_range,
     check_seed,
+    requirements,
     takes,
 )
 from aftbed.cli.views import RunView, open_view
@@ -36,7 +44,7 @@ from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.graph import Graph
 from aftbed.core.messages import Scheduled
 from aftbed.core.script import RECIPES
-from aftbed.ftm.compose import build
+from aftbed.ftm.compose import build, canonical
 from aftbed.functions.source import located
 from aftbed.inject.memory import refuse_unsafe
 from aftbed.inject.model import Fault, parse
@@ -111,6 +119,7 @@ class RunArguments(msgspec.Struct, frozen=True):
     expect: Expect = None
     tolerance: Tolerance = None
     ftti: Ftti = None
+    verifies: Annotated[tuple[str, ...], typer.Option(VERIFIES, help=VERIFIES_HELP)] = ()
     bus_port: Annotated[int, typer.Option(help="TCP port of the bus on 127.0.0.1; 0 is any free one.")] = 0
     bus_open: Annotated[
         bool,
@@ -129,6 +138,8 @@ class RunArguments(msgspec.Struct, frozen=True):
     open_page: Annotated[bool, typer.Option("--open", help="With --web: open it in the browser.")] = False
     mcap: Annotated[Path | None, typer.Option(help="Write the run to this file, for Foxglove.")] = None
     trace: Annotated[Path | None, typer.Option(help="Write its nodes to this file, for Perfetto.")] = None
+    junit: Junit = None
+    html: Html = None
     json: Json = False
 
 
@@ -164,10 +175,13 @@ def execute(given: RunArguments) -> int:
     if application:
         _refuse_unsuitable(application, graph.ftm, requests, force=given.force)
     check_range("--bus-port", given.bus_port, 0, 65535)
+    verifies = requirements(given.verifies)
+    check_file("--junit", given.junit)
+    check_file("--html", given.html)
     write_files = _files(given)
     page = _page(given)
     options, listener = options_for(
-        ftm=given.ftm,
+        ftm=graph.ftm,
         placement=given.placement,
         work=work,
         seed=given.seed,
@@ -180,6 +194,9 @@ def execute(given: RunArguments) -> int:
         bus_open=given.bus_open,
         application=application,
         ftti_ms=ftti_ms,
+        verifies=verifies,
+        command=shlex.join(("aftbed", *sys.argv[1:])),
+        evidence=given.junit is not None,
     )
     launched = launch(options, listener, requests)
     try:
@@ -187,7 +204,7 @@ def execute(given: RunArguments) -> int:
         with page(launched.private):
             interrupted = _follow(launched, open_view(options, quiet=given.json), closed)
         launched.wait()
-        from aftbed.cli.check import judge_and_show  # noqa: PLC0415 - after the launch
+        from aftbed.cli.check import judge_and_show, write_html, write_junit  # noqa: PLC0415 - after the launch
         from aftbed.judge.verdict import EXIT_CODES, EXIT_INTERRUPTED  # noqa: PLC0415 - after the launch
         from aftbed.runtime.unix.trust import OWN_RUN, remember  # noqa: PLC0415 - after the launch
 
@@ -199,11 +216,16 @@ def execute(given: RunArguments) -> int:
             print(f"aftbed: trouble: {launched.trouble}", file=sys.stderr)
         elif verdict.verdict == "inconclusive" and not given.json:
             _show_log(launched.record / "processes.log")
-        written = write_files is None or _write(write_files, launched.record, as_json=given.json)
+        writers = [partial(write_files, launched.record)] if write_files is not None else []
+        writers += [partial(write_junit, given.junit, verdict)] if given.junit is not None else []
+        writers += (
+            [partial(write_html, given.html, launched.record, verdict)] if given.html is not None else []
+        )
+        unwritten = [write for write in writers if not _written(write, as_json=given.json)]
     finally:
         launched.remove()
     code = EXIT_CODES[verdict.verdict]
-    return EXIT_INTERRUPTED if interrupted else code or (0 if written else EXIT_CODES["inconclusive"])
+    return EXIT_INTERRUPTED if interrupted else code or (EXIT_CODES["inconclusive"] if unwritten else 0)
 
 
 # -- what the options mean ------------------------------------------------------------------------
@@ -244,7 +266,7 @@ def _closed_loop(given: RunArguments) -> "Callable[[Launched], ClosedLoop] | Non
         return None
     from aftbed.runtime.unix.closed_loop import ClosedLoop, asked_for  # noqa: PLC0415 - only with --policy
 
-    policy = asked_for(given.policy, given.approve, given.ftm, as_json=given.json)
+    policy = asked_for(given.policy, given.approve, canonical(given.ftm), as_json=given.json)
     if policy is None:
         return None
     from aftbed.cli.adapt import declared_in_time  # noqa: PLC0415 - the same
@@ -256,6 +278,7 @@ def _work(given: RunArguments) -> Work:
     if given.replay is not None and given.load is not None:
         raise ConfigError("--replay and --load: one of them is allowed")
     if given.load is not None:
+        _refuse(given, ("scenario", "pace", "brake_policy"), "--load: there is no car: leave out")
         if given.bus_open:
             raise ConfigError("--bus-open: a run of --load has no bus")
         return _load(given.load)
@@ -435,10 +458,10 @@ def _files(given: RunArguments) -> Callable[[Path], list[str]] | None:
     return lambda record: export(read_record(record), files)
 
 
-def _write(write_files: Callable[[Path], list[str]], record: Path, *, as_json: bool) -> bool:
+def _written(write: Callable[[], list[str]], *, as_json: bool) -> bool:
     """False if a file could not be written. The verdict is printed all the same."""
     try:
-        lines = write_files(record)
+        lines = write()
     except ConfigError as error:
         print(f"aftbed: trouble: {error}", file=sys.stderr)
         return False

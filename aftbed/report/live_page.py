@@ -102,7 +102,7 @@ class GrowingFile:
         return whole
 
 
-class Watcher:
+class RunWatcher:
     """Looks at the run for all pages at once."""
 
     def __init__(self, private: Path) -> None:
@@ -190,12 +190,12 @@ class PageServer(ThreadingHTTPServer):
     daemon_threads = True
 
     def __init__(self, listener: socket.socket, private: Path, token: str) -> None:
-        super().__init__(listener.getsockname(), Handler, bind_and_activate=False)
+        super().__init__(listener.getsockname(), PageRequest, bind_and_activate=False)
         self.socket.close()
         self.socket = listener
         self.private, self.token = private, token
         self.port = int(listener.getsockname()[1])
-        self.watcher = Watcher(private)
+        self.watcher = RunWatcher(private)
         self.commands = threading.Semaphore(COMMANDS_MAX)
         self._room = threading.Semaphore(CONNECTIONS_MAX)
 
@@ -222,7 +222,7 @@ class PageServer(ThreadingHTTPServer):
         self.shutdown()
         self.server_close()
 
-    def refusal(self, handler: "Handler") -> str:
+    def refusal(self, handler: "PageRequest") -> str:
         """Why a request is refused; "" if it is not."""
         uid = user_behind(handler.connection)
         if uid != os.getuid():
@@ -240,7 +240,7 @@ class PageServer(ThreadingHTTPServer):
         return ""
 
 
-class Handler(BaseHTTPRequestHandler):
+class PageRequest(BaseHTTPRequestHandler):
     """One request of a browser."""
 
     server: PageServer
