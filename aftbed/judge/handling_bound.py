@@ -177,7 +177,7 @@ def _supervised(graph: Graph) -> list[str]:
     """The bricks of the leader between which steps are supervised, in the order of a request; [] for none,
     and where no other replica can take over.
     """
-    if not replication_of(graph.ftm) or graph.placement == "single":
+    if graph.placement == "single" or not replication_of(graph.ftm):
         return []
     way = path(graph, LEADER)
     ends = [way.index(b.name) for b in graph.bricks if b.replica == LEADER and b.kind in SUPERVISION]
