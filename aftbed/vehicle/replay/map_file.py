@@ -3,7 +3,7 @@
 A map is YAML; `MapFile` is its shape, key by key. It names messages and signals of a DBC, the unit of each
 quantity, the length of each message, and the rules for its checksum and counter:
 
-    strict         false: the DBC may contradict itself where the map does not look (see `dbc_file`)
+    strict         false: messages of the DBC that contradict themselves are taken (see `dbc_file`)
     cycle_end      the message that ends a radar cycle; its arrival makes the request
     ego.speed      the ego's own speed
     tracks         the radar's targets: one message for each slot, `name` with {n} (or {n:02}, with zeros in
