@@ -94,7 +94,8 @@ class Codec:
         if what:
             return f"line {_line_of(self._text, name)}: message {name} {what}"
         if self._strict and (contradiction := _contradiction(message)) is not None:
-            return f"{_explain(contradiction, self._text)} (a map with `strict: false` takes it as it is)"
+            line = _line(contradiction, self._text)
+            return f"line {line}: {contradiction} (a map with `strict: false` takes it as it is)"
         return None
 
     def left_out(self) -> str:

@@ -143,10 +143,10 @@ def test_a_bad_dbc_is_refused_with_the_reason_and_the_line(tmp_path: Path, text:
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        (OUTSIDE, f"line 6: not a DBC that can be read: The signal B does not fit in message X.{WAY_OUT}"),
+        (OUTSIDE, f"line 6: The signal B does not fit in message X.{WAY_OUT}"),
         (
             OVERLAP,
-            f"line 4: not a DBC that can be read: The signals B and A are overlapping in message X.{WAY_OUT}",
+            f"line 4: The signals B and A are overlapping in message X.{WAY_OUT}",
         ),
         ("BU_: X\nBO_ 1 X: 64 V\n", "line 2: message X has 64 bytes, allowed is 0 to 8"),
         ("BU_: X\nBO_ 1 X: -8 V\n", "line 2: message X has -8 bytes, allowed is 0 to 8"),

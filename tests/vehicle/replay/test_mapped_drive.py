@@ -21,11 +21,17 @@ from aftbed.vehicle.replay.mapped_gateway import MappedGateway
         ("T{n}", ["T8", "T9", "T10"]),
         ("T{n:02}", ["T08", "T09", "T10"]),
         ("{n:03}T{n}", ["008T8", "009T9", "010T10"]),
+        ("T{n:x}", ["T8", "T9", "Ta"]),
+        ("T{n:03X}", ["T008", "T009", "T00A"]),
         ("T{n:2}", ["T{n:2}"] * 3),
     ],
 )
 def test_names_with_numbers(name: str, names: list[str]) -> None:
     assert Messages(name, 8, 10).names() == names
+
+
+def test_numbers_may_be_large_and_go_in_steps() -> None:
+    assert Messages("M_{n:X}hex", 0x319, 0x320, 3).names() == ["M_319hex", "M_31Chex", "M_31Fhex"]
 
 
 def test_an_unknown_map_comes_with_the_nearest() -> None:

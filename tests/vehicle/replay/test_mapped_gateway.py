@@ -222,7 +222,13 @@ def test_raw_signals_count_bits_as_a_dbc_does(raw: RawSignal, value: float) -> N
         ("cycle_ms: 50\n", "", "key 'cycle_ms' is missing"),
         ("cycle_ms", "cycle_s", "unknown key 'cycle_s'; did you mean 'cycle_ms'"),
         ("cycle_end: END", "cycle_end: ENDE", "cycle_end: unknown mapped message 'ENDE'; did you mean 'END'"),
-        ("unit: km/h", "unit: mph", "ego.speed.unit: found 'mph', allowed is one of km/h, m/s"),
+        ("unit: km/h", "unit: knots", "ego.speed.unit: found knots, allowed is a speed, in m/s, km/h, mph"),
+        ("unit: km/h", "unit: m", "ego.speed.unit: found m, allowed is a speed, in m/s, km/h, mph"),
+        (
+            "unit: km/h",
+            "scale: 1",
+            "ego.speed.unit: found none, allowed is a speed, in m/s, km/h, mph, as raw",
+        ),
         ("RANGE, unit: m}", "RANGE, unit: cm}", "tracks.range.unit: found cm, allowed is m, as RANGE has"),
         (
             "signal: RANGE",
@@ -308,7 +314,11 @@ def test_a_map_that_does_not_fit_is_refused(make: Make, old: str, new: str, reas
             "  angle: {signal: SIDE, unit: deg}",
             "tracks: found lateral_offset and angle, allowed is exactly one of them",
         ),
-        ("lateral_offset: {signal: SIDE, unit: m}", "angle: {signal: SIDE, unit: m}", "one of deg, rad"),
+        (
+            "lateral_offset: {signal: SIDE, unit: m}",
+            "angle: {signal: SIDE, unit: m}",
+            "found m, allowed is an angle, in deg, rad, mrad",
+        ),
         (
             "lateral_offset: {signal: SIDE, unit: m}",
             "angle: {signal: SIDE, unit: deg}",
