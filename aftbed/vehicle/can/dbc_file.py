@@ -30,6 +30,8 @@ from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, cast
 
+import msgspec
+
 from aftbed.core.errors import ConfigError, PeerError, unknown
 from aftbed.vehicle.can.frame import DATA_LENGTH_MAX
 
@@ -54,6 +56,22 @@ _CANDIDATES: Final = (
     _PACKAGE / "dbc" / "aftbed.dbc",  # in a wheel
     _PACKAGE.parent / "dbc" / "aftbed.dbc",  # in a checkout
 )
+
+
+class SignalPlace(msgspec.Struct, frozen=True):
+    """A signal as the file has it. `choices`: the names of its values."""
+
+    name: str
+    start_bit: int
+    length_bits: int
+    little_endian: bool
+    signed: bool
+    scale: float
+    offset: float
+    high: float | None
+    unit: str
+    whole: bool
+    choices: tuple[tuple[int, str], ...]
 
 
 class Codec:
@@ -105,10 +123,35 @@ class Codec:
     def signal_names(self, name: str) -> list[str]:
         return [signal.name for signal in self._message(name).signals]
 
+    def signals(self, name: str) -> list[SignalPlace]:
+        """All signals that lie in the message, in their order."""
+        return [
+            SignalPlace(
+                one.name,
+                one.start,
+                one.length,
+                one.byte_order == "little_endian",
+                one.is_signed,
+                float(one.scale),
+                float(one.offset),
+                None if one.maximum is None else float(one.maximum),
+                one.unit or "",
+                self.whole(name, one.name),
+                tuple((value, str(choice)) for value, choice in (one.choices or {}).items()),
+            )
+            for one in self._message(name).signals
+            if one.name not in self.misfits(name) and not one.is_float
+        ]
+
     def misfits(self, name: str) -> frozenset[str]:
         """The signals of message `name` that lie outside of it; none where the DBC is read strictly."""
         self._message(name)
         return self._misfits.get(name, frozenset())
+
+    def contradicts(self, name: str) -> bool:
+        """True if its signals overlap, or lie outside of it, and it is taken all the same."""
+        self._message(name)
+        return name in self._pieces
 
     def can_id(self, name: str) -> int:
         return self._message(name).frame_id
@@ -278,12 +321,11 @@ def load_dbc(path: Path | None = None, *, strict: bool = True) -> Codec:
     try:
         messages = _read_by_cantools(text)
     except _cantools_errors() as error:
-        reason = _explain(error, text)
         found = _read_by_canmatrix(text)
         if found is None or not found[0]:
-            raise ConfigError(f"{chosen}: {reason}") from error
+            raise ConfigError(f"{chosen}: {_explain(error, text, 'not a DBC that can be read')}") from error
         messages, left_out = found
-        notes = (f"{reason}; read by canmatrix", *left_out)
+        notes = (_explain(error, text, "read by canmatrix, as cantools refuses it"), *left_out)
     if not messages:
         raise ConfigError(f"{chosen}: holds no message")
     return Codec(messages, chosen, text, strict=strict, notes=notes)
@@ -440,15 +482,15 @@ def _number(value: object) -> float:
     return int(number) if number.is_integer() else number
 
 
-def _explain(error: Exception, text: str) -> str:
-    """cantools' reason in one line, with the line of the file where cantools does not give it."""
+def _explain(error: Exception, text: str, what: str) -> str:
+    """`what` and cantools' reason in one line, with the line of the file where cantools does not give it."""
     reason = " ".join(str(error).split())
     if isinstance(error, KeyError):
         reason = f"{reason} is not defined"
     elif isinstance(error, LookupError | AttributeError | TypeError):
         reason = f"cantools gives up: {reason}"
     line = 0 if " at line " in reason else _line(error, text)
-    return f"{f'line {line}: ' if line else ''}not a DBC that can be read: {reason}"
+    return f"{f'line {line}: ' if line else ''}{what}: {reason}"
 
 
 def _line(error: Exception, text: str) -> int:

@@ -308,6 +308,19 @@ def find_dbc(name_or_path: str) -> Path:
     return path if is_path else _shipped("DBC", name_or_path, ".dbc")
 
 
+def shipped_maps() -> list[str]:
+    return sorted(path.stem for path in SHIPPED.glob("*.yaml"))
+
+
+def shipped_dbcs() -> list[str]:
+    return sorted(path.stem for path in SHIPPED.glob("*.dbc"))
+
+
+def read_map(path: Path) -> MapFile:
+    """Raises ConfigError naming file, key, what was found and what is allowed."""
+    return read_yaml(path, MapFile)
+
+
 def _shipped(what: str, name: str, ending: str) -> Path:
     names = sorted(path.stem for path in SHIPPED.glob(f"*{ending}"))
     if name not in names:
@@ -323,7 +336,12 @@ def load_mapped(path: Path, dbc: Path) -> Codec:
 def bind(path: Path, dbc: Path) -> BoundMap:
     """Read the map at `path` and check all of it against the DBC. Raises ConfigError."""
     file = read_yaml(path, MapFile)
-    return _Binding(path, load_dbc(dbc, strict=file.strict), file).bound()
+    return bind_file(file, path, load_dbc(dbc, strict=file.strict))
+
+
+def bind_file(file: MapFile, path: Path, codec: Codec) -> BoundMap:
+    """Check a map that was read, or is going to be written, at `path`. Raises ConfigError."""
+    return _Binding(path, codec, file).bound()
 
 
 Source = EgoMap | TrackMap | OtherMap

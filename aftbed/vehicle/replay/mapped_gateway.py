@@ -14,7 +14,6 @@ announcement, and makes its request out of what came.
 
 from collections.abc import Mapping
 from math import cos, isfinite, sin
-from pathlib import Path
 from typing import Final
 
 import msgspec
@@ -31,7 +30,7 @@ from aftbed.vehicle.can.dbc_file import Codec
 from aftbed.vehicle.can.e2e import Receiver
 from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.gateway import BusGateway, target_of
-from aftbed.vehicle.replay.map_file import FrameRule, TrackReading, bind
+from aftbed.vehicle.replay.map_file import BoundMap, FrameRule, TrackReading
 
 FRESH_CYCLES: Final = 1.5  # a log's time stamps come in batches, so a cycle may look longer than it was
 
@@ -79,14 +78,11 @@ class SeenTrack(msgspec.Struct, frozen=True):
 
 
 class MappedGateway(BusGateway):
-    """Reads frames by a user's DBC and map; `codec` is aftbed's own, for what it sends."""
+    """Reads frames by a user's map and DBC; `codec` is aftbed's own, for what it sends."""
 
-    def __init__(
-        self, codec: Codec, dbc: Path, map_file: Path, encode: EncodeRequest = encode_request
-    ) -> None:
-        """Raises ConfigError if the DBC does not parse, or the map does not fit it."""
+    def __init__(self, codec: Codec, bound: BoundMap, encode: EncodeRequest = encode_request) -> None:
         super().__init__(codec, encode)
-        self._bound = bind(map_file, dbc)
+        self._bound = bound
         self._receivers = {
             rule.can_id: Receiver(rule.watch) for rule in self._bound.rules.values() if rule.watch is not None
         }
@@ -97,11 +93,6 @@ class MappedGateway(BusGateway):
         self._announced = 0  # by the last announcement
         self._awaited = 0  # so many objects make the cycle whole; 0 is none that is open
         self._ego: tuple[int, float] | None = None  # bus time and speed, last accepted
-
-    @property
-    def problems(self) -> tuple[str, ...]:
-        """What a person should look at in the map and its DBC."""
-        return self._bound.problems
 
     def _request_of(self, frame: Frame) -> bytes | None:
         rule = self._bound.rules.get(frame.can_id)

@@ -190,7 +190,7 @@ def test_what_cantools_refuses_is_read_by_canmatrix(tmp_path: Path, tail: str) -
     codec = load_dbc(saved(tmp_path, GOOD_MESSAGE + tail))
     assert codec.decode("X", bytes([0xFE, *bytes(7)])) == {"A": 0.0}
     assert (codec.can_id("X"), codec.unit("X", "A"), codec.signal_names("X")) == (1, "m", ["A"])
-    assert "read by canmatrix" in codec.notes[0]
+    assert "read by canmatrix, as cantools refuses it: " in codec.notes[0]
     with pytest.raises(ConfigError, match=r"unknown message 'Z'.*read by canmatrix"):
         codec.can_id("Z")
 

@@ -8,6 +8,7 @@ from puredrive import CODEC
 from aftbed.core.errors import ConfigError
 from aftbed.vehicle.aeb.messages import AebInput, decode_request
 from aftbed.vehicle.can.frame import Frame
+from aftbed.vehicle.replay.map_file import bind
 from aftbed.vehicle.replay.mapped_gateway import MappedGateway
 from aftbed.vehicle.replay.units import Dimension, unit_names, unit_of
 
@@ -64,7 +65,7 @@ def make(tmp_path_factory: pytest.TempPathFactory) -> Make:
             assert old in found
             found = found.replace(old, new)
         (folder / "radar.yaml").write_text(found)
-        return MappedGateway(CODEC, folder / "radar.dbc", folder / "radar.yaml")
+        return MappedGateway(CODEC, bind(folder / "radar.yaml", folder / "radar.dbc"))
 
     return build
 
@@ -222,7 +223,7 @@ def test_what_the_dbc_does_not_have_is_refused(
 def test_a_unit_that_is_not_known_is_a_problem_where_the_map_has_one(make: Make) -> None:
     gateway = make("[T1, T2]", ("SPEED}", "SPEED, unit: kph}"), speed="speed")
     assert cycle(gateway).ego_speed_ms == pytest.approx(100 / 3.6, abs=0.001)
-    assert gateway.problems == (
+    assert gateway._bound.problems == (
         "ego.speed.unit: EGO_SPEED has the unit 'speed' in the DBC, which aftbed does not know;"
         " km/h is taken",
         "tracks.relative_speed.unit: SPEED has the unit 'speed' in the DBC, which aftbed does not know;"

@@ -11,7 +11,7 @@ from aftbed.vehicle.aeb.function import AebFunction
 from aftbed.vehicle.aeb.messages import decode_reply, decode_request
 from aftbed.vehicle.can.candump import read_log
 from aftbed.vehicle.can.frame import Frame
-from aftbed.vehicle.replay.map_file import Messages, find_map
+from aftbed.vehicle.replay.map_file import Messages, bind, find_map
 from aftbed.vehicle.replay.mapped_gateway import MappedGateway
 
 
@@ -52,7 +52,7 @@ class TestRealDrive:
         return [Frame(entry.frame.t_us - start_us, entry.frame.can_id, entry.frame.data) for entry in log]
 
     def test_all_frames_are_accepted_and_the_function_never_even_warns(self) -> None:
-        gateway, function = MappedGateway(CODEC, TOYOTA_DBC, find_map("toyota")), AebFunction()
+        gateway, function = MappedGateway(CODEC, bind(find_map("toyota"), TOYOTA_DBC)), AebFunction()
         requests = [made for frame in self.frames() if (made := gateway.on_frame(frame)) is not None]
         assert (gateway.counts.accepted, gateway.counts.refused) == (6920, {})
         assert len(requests) == 200
@@ -64,7 +64,7 @@ class TestRealDrive:
         assert {decode_reply(function.execute(request)).stage for request in requests} == {0}
 
     def test_damaged_frames_are_refused_one_by_one_and_nothing_else_is(self) -> None:
-        gateway = MappedGateway(CODEC, TOYOTA_DBC, find_map("toyota"))
+        gateway = MappedGateway(CODEC, bind(find_map("toyota"), TOYOTA_DBC))
         damaged = 0
         for number, frame in enumerate(self.frames()):
             flip = 0x40 if number % 10 == 3 else 0

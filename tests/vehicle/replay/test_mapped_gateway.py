@@ -10,7 +10,7 @@ from puredrive import CODEC
 from aftbed.core.errors import ConfigError
 from aftbed.vehicle.aeb.messages import AebInput, AebTarget, decode_request
 from aftbed.vehicle.can.frame import Frame
-from aftbed.vehicle.replay.map_file import RawSignal
+from aftbed.vehicle.replay.map_file import RawSignal, bind
 from aftbed.vehicle.replay.mapped_gateway import MappedGateway, toyota_checksum
 
 DBC = """
@@ -67,7 +67,7 @@ def make(tmp_path_factory: pytest.TempPathFactory) -> Make:
         assert dbc[0] in DBC
         (folder / "radar.dbc").write_text(DBC.replace(*dbc, 1))
         (folder / "radar.yaml").write_text(MAP.replace(old, new, 1) if old else MAP)
-        return MappedGateway(CODEC, folder / "radar.dbc", folder / "radar.yaml")
+        return MappedGateway(CODEC, bind(folder / "radar.yaml", folder / "radar.dbc"))
 
     return build
 
