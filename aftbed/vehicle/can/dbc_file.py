@@ -43,13 +43,18 @@ if TYPE_CHECKING:
 DBC_BYTES_MAX: Final = 16_000_000  # the largest real ones known to us have two; a log given by mistake more
 SIZE_MAX: Final = 0xFFFF  # of a message's bytes, a signal's bits and place, a range of multiplexer values
 DIGITS_MAX: Final = 18
-SIGNAL_LINE_CHARACTERS_MAX: Final = 300  # up to the unit; receivers follow, which nobody asks for
+LINE_CHARACTERS_MAX: Final = 300  # of a signal up to its unit; receivers follow, which nobody asks for
 _SIZES: Final = re.compile(
     r"\bBO_\s+\d+\s+\w+\s*:\s*(\d+)|\bSG_\s+\w+(?:\s+\w+)?\s*:\s*(-?\d+)\s*\|\s*(\d+)", re.ASCII
 )
 _MULTIPLEXED: Final = re.compile(r"\bSG_MUL_VAL_\s[^;]*")
 _RANGE: Final = re.compile(r"(\d+)\s*-\s*(\d+)", re.ASCII)
-_NAME: Final = re.compile(r"\w[\w.-]*")  # of a message or a signal; canmatrix takes whatever has no space
+_NAME: Final = re.compile(
+    r"\w[\w .()/&-]*"
+)  # of a message or a signal; canmatrix takes whatever stands there
+_ESSENTIAL: Final = re.compile(
+    r"(BO_|SG_|SG_MUL_VAL_|SIG_VALTYPE_) |BA_ +\"System(Message|Signal)LongSymbol\" "
+)
 _UNREAD: Final = re.compile(r"error with line no: (\d+)")  # what canmatrix prints
 _PACKAGE: Final = Path(__file__).resolve().parents[2]
 _CANDIDATES: Final = (
@@ -386,14 +391,14 @@ def _read_by_canmatrix(text: str) -> tuple[list[Message], list[str]] | None:
     read = _canmatrix_of(lines)
     if read is not None and (bad := [number for number in read[1] if lines[number].startswith("BO_")]):
         for number in bad:
-            left_out.append(f"line {number + 1}: left out, not a message that can be read")
+            left_out.append(f"line {number + 1}: message left out, cannot be read")
             end = next((n for n in range(number + 1, len(lines)) if lines[n].startswith("BO_")), len(lines))
             lines[number:end] = [""] * (end - number)
         read = _canmatrix_of(lines)
     if read is None:
         return None
     matrix, unread = read
-    left_out += [f"line {number + 1}: left out, not a signal that can be read" for number in unread]
+    left_out += [f"line {number + 1}: left out, cannot be read" for number in unread]
     messages = []
     for frame in matrix.frames:
         if not all(_NAME.fullmatch(one.name) for one in (frame, *frame.signals)):
@@ -407,7 +412,7 @@ def _read_by_canmatrix(text: str) -> tuple[list[Message], list[str]] | None:
 
 
 def _essential(text: str) -> list[str]:
-    """The lines of `text` that say what messages and signals there are; the others are empty.
+    """The lines of `text` that say what messages and signals there are, long names too; others are empty.
 
     Signals are cut behind their unit: canmatrix takes long for a long line that it cannot read.
     """
@@ -419,8 +424,7 @@ def _essential(text: str) -> list[str]:
             words = ""
         elif words.startswith("CM_"):
             in_comment = '"' in words and not words.endswith(";")
-        essential = words.startswith(("BO_ ", "SG_ ", "SG_MUL_VAL_ ", "SIG_VALTYPE_ "))
-        kept.append(words[:SIGNAL_LINE_CHARACTERS_MAX] if essential else "")
+        kept.append(words[:LINE_CHARACTERS_MAX] if _ESSENTIAL.match(words) else "")
     return kept
 
 

@@ -200,8 +200,8 @@ def test_what_was_left_out_is_named_with_its_line(tmp_path: Path) -> None:
     codec = load_dbc(saved(tmp_path, text))
     assert codec.names() == ["X", "Z"]
     assert codec.notes[1:] == (
-        "line 4: left out, not a message that can be read",
-        "line 7: left out, not a signal that can be read",
+        "line 4: message left out, cannot be read",
+        "line 7: left out, cannot be read",
     )
 
 
@@ -216,6 +216,12 @@ BO_ 2147484000 WIDE: 4 W
  SG_ D m1 : 8|8@1+ (1,0) [0|255] "" V
  SG_ E m2 : 8|8@1+ (2,0) [0|255] "" V
 SIG_VALTYPE_ 1 C : 1;
+BA_DEF_ SG_ "SystemSignalLongSymbol" STRING ;
+BA_DEF_ BO_ "SystemMessageLongSymbol" STRING ;
+BA_DEF_DEF_ "SystemSignalLongSymbol" "";
+BA_DEF_DEF_ "SystemMessageLongSymbol" "";
+BA_ "SystemSignalLongSymbol" SG_ 1 A "A_NAME_OF_MORE_THAN_32_CHARACTERS_OF_A_SIGNAL";
+BA_ "SystemMessageLongSymbol" BO_ 1 "A_NAME_OF_MORE_THAN_32_CHARACTERS_OF_A_MESSAGE";
 """
 
 
@@ -228,10 +234,12 @@ def test_both_readers_read_the_same(data: bytes) -> None:
             load_dbc(saved(path, READERS_AGREE + 'VAL_ 1 Z 1 "a";\n')),
         )
     assert (first.notes == ()) is (second.notes != ())
-    assert str(first.decode("X", data)) == str(second.decode("X", data))  # nan is not nan
+    name = "A_NAME_OF_MORE_THAN_32_CHARACTERS_OF_A_MESSAGE"
+    assert str(first.decode(name, data)) == str(second.decode(name, data))  # nan is not nan
+    assert "A_NAME_OF_MORE_THAN_32_CHARACTERS_OF_A_SIGNAL" in first.signal_names(name)
     for codec in (first, second):
         assert (codec.can_id("WIDE"), codec.extended("WIDE"), codec.multiplexed("WIDE")) == (352, True, True)
-        assert (codec.senders(), codec.whole("X", "B")) == (["v", "w"], False)
+        assert (codec.senders(), codec.whole(name, "B")) == (["v", "w"], False)
     chosen = bytes([1 + data[0] % 2]) + data[1:4]
     assert first.decode("WIDE", chosen) == second.decode("WIDE", chosen)
 
