@@ -128,6 +128,15 @@ def test_a_map_that_makes_nothing_of_the_log_ends_with_1(folder: Path, call: Cal
     )
 
 
+def test_cycles_without_ego_speed_or_targets_end_with_1(folder: Path, call: Call) -> None:
+    Path("empty.log").write_text("(0000000100.000000) can0 53F#0000000000000000\n")
+    code, out, _ = call("map", "check", "esr-like", "--log", "empty.log")
+    assert (code, out.splitlines()[-2:]) == (
+        1,
+        ["  no cycle knows the ego's speed", "  no cycle has a target in our path"],
+    )
+
+
 def test_a_proposal_that_is_not_whole_ends_with_1(folder: Path, call: Call) -> None:
     Path("radar.dbc").write_text(DBC.replace('"KPH"', '"%"'))
     code, out, _ = call("map", "new", "--dbc", "radar.dbc")

@@ -31,6 +31,7 @@ from aftbed.vehicle.replay.map_file import MESSAGES_MAX, BoundMap, MapFile, bind
 from aftbed.vehicle.replay.mapped_gateway import toyota_checksum
 from aftbed.vehicle.replay.units import Dimension, unit_of
 
+FRAMES_MAX: Final = 200_000  # of the log, from its beginning: some minutes of a bus, and seconds of work
 CYCLE_MS_GUESSED: Final = 50
 STATUS_BITS_MAX: Final = 4
 RANGES_MOVING: Final = 3  # different values of a distance that something real comes to at least
@@ -275,7 +276,7 @@ class _Proposing:
         self._codecs = codecs
         self._codec = codecs[0]
         self._by_id: dict[int, list[Frame]] = {}
-        for frame in frames:
+        for frame in frames[:FRAMES_MAX]:
             self._by_id.setdefault(frame.can_id, []).append(frame)
         self._problems = dict.fromkeys(note for codec in codecs for note in codec.notes)
 
@@ -290,6 +291,11 @@ class _Proposing:
         tracks |= self._quantities(group, rows, numbers)
         if "valid" in group.roles:
             tracks["valid"] = self._valid(group, rows, numbers)
+        elif group.roles["range"].offset == 0:
+            tracks["valid"] = self._name(group, "range", numbers)
+            self._note(
+                "tracks.valid: no signal says which targets are valid; all with another range than 0 are"
+            )
         else:
             self._note("tracks.valid: no signal says which targets are valid, so all are")
         if "new" in group.roles:

@@ -23,7 +23,16 @@ from aftbed.vehicle.aeb.function import AebFunction
 from aftbed.vehicle.aeb.messages import STAGE_FULL, AebOutput, decode_reply
 from aftbed.vehicle.can.dbc_file import Codec, load_dbc
 from aftbed.vehicle.can.frame import Frame
-from aftbed.vehicle.replay.map_file import BoundMap, MapFile, bind, find_dbc, find_map, numbered, shipped_maps
+from aftbed.vehicle.replay.map_file import (
+    BoundMap,
+    MapFile,
+    Messages,
+    bind,
+    find_dbc,
+    find_map,
+    numbered,
+    shipped_maps,
+)
 from aftbed.vehicle.replay.map_proposal import MapProposal, name_pattern, propose, words_of
 from aftbed.vehicle.replay.map_trial import try_out
 from aftbed.vehicle.replay.mapped_gateway import MappedGateway
@@ -167,6 +176,14 @@ def test_objects_that_are_announced_are_found() -> None:
     assert any(output.stage == STAGE_FULL for _, output in braking(mapped, log))
 
 
+def test_where_nothing_says_what_is_valid_a_range_of_0_is_no_target(tmp_path: Path) -> None:
+    (dbc,) = saved("esr", tmp_path)
+    log = foreign_drive("esr", APPROACH, 0.2, dbc)
+    dbc.write_text(dbc.read_text().replace("CAN_TX_TRACK_STATUS", "CAN_TX_TRACK_X"))
+    decoded = try_out(bound(proposed([dbc], log)), log)
+    assert (decoded.targets, decoded.range_m) == (3, (55.0, 140.4))
+
+
 def test_the_shipped_maps_with_their_dbcs_are_proposed_again() -> None:
     """For the radar of the ESR's kind, whose ego speed no DBC has, all but that."""
     proposal = proposed([find_dbc("esr-like")], drive("esr-like", APPROACH, 0.5))
@@ -211,6 +228,31 @@ def test_how_the_range_changes_shows_unit_and_sign_of_the_speed(
     decoded = try_out(bound(proposal), log)
     assert decoded.relative_speed_ms == (pytest.approx(-5.0, abs=0.02),) * 2
     assert decoded.problems() == []
+
+
+def test_a_message_that_does_not_always_come_ends_no_cycle(tmp_path: Path) -> None:
+    paths = saved("ford", tmp_path)
+    log = foreign_drive("ford", APPROACH, 1.0, paths[0])
+    once, pause = range(250_000, 300_000), range(300_000, 400_000)
+    sparse = [
+        one
+        for one in log
+        if (one.can_id < 0x150 or one.can_id == 1045 or one.t_us in once) and one.t_us not in pause
+    ]
+    mapped = bound(proposed(paths, sparse)).map
+    assert (mapped.cycle_end, mapped.cycle_ms) == ("MRR_Detection_048", 50)
+    assert mapped.tracks.messages == Messages("MRR_Detection_{n:03}", 1, 64)
+
+
+def test_of_two_radars_the_one_whose_ranges_move_is_taken(tmp_path: Path) -> None:
+    """The other one has units, and so the better names."""
+    still = {0x600 + n: (f"STILL_{n}", n) for n in range(8)}
+    paths = saved("hyundai", tmp_path)
+    paths[0].write_text(paths[0].read_text() + messages(TESLA, still))
+    log = list(foreign_drive("hyundai", APPROACH, 0.5, paths[0]))
+    again = [Frame(t_us, can_id, bytes(8)) for t_us in range(0, 500_000, 50_000) for can_id in still]
+    assert bound(proposed(paths, log + again)).map.tracks.range.signal == "LONG_DIST"
+    assert yaml.safe_load(proposed(paths).text())["tracks"]["range"]["signal"] == "LongDist"
 
 
 def test_a_message_that_contradicts_itself_makes_the_map_say_so(tmp_path: Path) -> None:
