@@ -256,12 +256,12 @@ def test_of_two_radars_the_one_whose_ranges_move_is_taken(tmp_path: Path) -> Non
 
 
 def test_a_message_that_contradicts_itself_makes_the_map_say_so(tmp_path: Path) -> None:
-    paths = saved("esr", tmp_path)
-    text = paths[0].read_text()
-    paths[0].write_text(text.replace("CAN_TX_TRACK_WIDTH : 37|4@0+", "CAN_TX_TRACK_WIDTH : 38|4@0+"))
-    proposal = proposed(paths, foreign_drive("esr", APPROACH, 0.25, paths[0]))
+    paths = saved("hyundai", tmp_path)
+    log = foreign_drive("hyundai", APPROACH, 0.25, paths[0])
+    paths[0].write_text(paths[0].read_text().replace("UNKNOWN_1 : 7|8@0-", "UNKNOWN_1 : 12|8@0-"))
+    proposal = proposed(paths, log)
     assert "strict: signals of messages that are used overlap, or lie outside" in proposal.problems
-    file = tmp_path / "esr.yaml"
+    file = tmp_path / "map.yaml"
     file.write_text(proposal.text())
     assert bind(file, paths[0]).map.strict is False
     file.write_text(proposal.text().replace("strict: false", "strict: true"))
@@ -356,8 +356,8 @@ def test_any_frames_make_a_proposal(data: st.DataObject) -> None:
 @cache
 def _shared() -> tuple[list[Codec], list[int]]:
     with tempfile.TemporaryDirectory() as folder:
-        codecs = [load_dbc(path, strict=False) for path in saved("ford", Path(folder))]
-    return codecs, [1045, 0x120, 0x121, 0x15F, 0x7FF]
+        codecs = [load_dbc(path, strict=False) for path in saved("hyundai", Path(folder))]
+    return codecs, [902, 0x500, 0x501, 0x51F, 0x7FF]
 
 
 # -- real processes -------------------------------------------------------------------------------
