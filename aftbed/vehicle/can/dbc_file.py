@@ -418,7 +418,7 @@ def _essential(text: str) -> list[str]:
     """
     kept, in_comment = [], False
     for line in text.split("\n"):
-        words = line.strip()
+        words = " ".join(line.split())  # of many spaces in a row, too
         if in_comment:
             in_comment = not words.endswith(";")
             words = ""

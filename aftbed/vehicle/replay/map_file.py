@@ -21,7 +21,8 @@ the data (`raw`), in the DBC's own way of counting bits. A target's place beside
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Final, Literal
 
@@ -51,6 +52,7 @@ Length = Annotated[int, Meta(ge=1, le=8)]
 DataId = Annotated[int, Meta(ge=0, le=DATA_ID_MAX)]
 
 MESSAGES_MAX: Final = 256  # under one key
+NAMES_SHOWN_MAX: Final = 10  # of the DBC, where one that the map has is not there
 NUMBER_MAX: Final = 65535
 _NUMBER: Final = re.compile(r"\{n(?::(?:0([1-9]))?([xX])?)?\}")
 
@@ -590,15 +592,20 @@ class _Binding:
 
     def _check_message(self, key: str, name: str) -> None:
         if name not in self._codec.names():
-            reason = unknown("message", name, self._codec.names())
-            raise ConfigError(f"{self._path}: {key}: {reason}, by {self._codec.path}{self._codec.left_out()}")
+            raise self._unknown(key, "message", name, self._codec.names())
 
     def _check_signal(self, key: str, name: str, signal: str) -> None:
         if signal not in self._codec.signal_names(name):
-            reason = unknown(f"signal of {name}", signal, self._codec.signal_names(name))
-            raise ConfigError(f"{self._path}: {key}: {reason}, by {self._codec.path}{self._codec.left_out()}")
+            raise self._unknown(key, f"signal of {name}", signal, self._codec.signal_names(name))
         if signal in self._codec.misfits(name):
             raise self._error(key, f"{signal}, which does not lie in {name}", "a signal that does")
+
+    def _unknown(self, key: str, what: str, found: str, names: Sequence[str]) -> ConfigError:
+        """Names the nearest of many: on a DBC of another radar, all are of no help."""
+        near = get_close_matches(found, names, n=NAMES_SHOWN_MAX, cutoff=0.0)
+        more = f" and {len(names) - len(near)} more" if len(names) > len(near) else ""
+        reason = f"{unknown(what, found, near)}{more}, by {self._codec.path}{self._codec.left_out()}"
+        return ConfigError(f"{self._path}: {key}: {reason}")
 
     def _check_whole(self, key: str, name: str, signal: str) -> None:
         self._check_signal(key, name, signal)

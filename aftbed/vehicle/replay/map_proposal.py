@@ -27,7 +27,7 @@ from aftbed.core.errors import ConfigError, shown
 from aftbed.vehicle.aeb.messages import SPEED_MAX_MS
 from aftbed.vehicle.can.dbc_file import Codec, SignalPlace
 from aftbed.vehicle.can.frame import Frame
-from aftbed.vehicle.replay.map_file import MESSAGES_MAX, BoundMap, MapFile, bind_file, numbered
+from aftbed.vehicle.replay.map_file import MESSAGES_MAX, NUMBER_MAX, BoundMap, MapFile, bind_file, numbered
 from aftbed.vehicle.replay.mapped_gateway import toyota_checksum
 from aftbed.vehicle.replay.units import Dimension, unit_of
 
@@ -240,6 +240,8 @@ def name_pattern(names: Sequence[str]) -> tuple[str, range] | None:
             continue
         head, middles, tail = found
         numbers = [int(middle, base) for middle in middles]
+        if max(numbers) > NUMBER_MAX:
+            continue
         steps = {after - before for before, after in pairwise(numbers)}
         if len(steps) != 1 or min(steps) < 1:
             continue
@@ -330,10 +332,10 @@ class _Proposing:
         if "ego" not in plain:
             return proposal
         path = Path("the proposed map")
-        file = msgspec.convert(yaml.safe_load(proposal.text()), MapFile)
         try:
+            file = msgspec.convert(yaml.safe_load(proposal.text()), MapFile)
             bound = bind_file(file, path, self._codec)
-        except ConfigError as error:
+        except (ConfigError, msgspec.ValidationError) as error:  # a signal beyond what a map may have
             return msgspec.structs.replace(proposal, problems=(*proposal.problems, str(error)))
         return msgspec.structs.replace(proposal, bound=bound)
 

@@ -278,6 +278,14 @@ def test_a_dbc_without_a_radar_makes_no_map(tmp_path: Path) -> None:
     )
 
 
+def test_what_no_map_may_have_is_among_the_problems(tmp_path: Path) -> None:
+    paths = saved("tesla", tmp_path)
+    paths[1].write_text('BU_: X\nBO_ 341 ESP_B: 8 X\n SG_ VehicleSpeed : 0|40@1+ (0.01,0) [0|0] "kph" X\n')
+    proposal = proposed(paths)
+    assert proposal.bound is None
+    assert "length_bits" in proposal.problems[-1]
+
+
 def test_a_log_of_another_radar_is_named(tmp_path: Path) -> None:
     paths = saved("esr", tmp_path)
     proposal = proposed(paths, [Frame(0, 0x001, b"\0")])
@@ -321,6 +329,7 @@ def test_words_of_a_name(name: str, words: set[str]) -> None:
         (["LEFT", "RIGHT"], None),
         (["T1", "T2", "T4"], None),
         (["T1", "T02"], None),
+        (["T65536", "T65537"], None),
         (["T2", "T1"], None),
     ],
 )

@@ -8,7 +8,7 @@ from puredrive import CODEC
 from aftbed.core.errors import ConfigError
 from aftbed.vehicle.aeb.messages import AebInput, decode_request
 from aftbed.vehicle.can.frame import Frame
-from aftbed.vehicle.replay.map_file import bind
+from aftbed.vehicle.replay.map_file import bind, find_dbc, find_map
 from aftbed.vehicle.replay.mapped_gateway import MappedGateway
 from aftbed.vehicle.replay.units import Dimension, unit_names, unit_of
 
@@ -238,3 +238,12 @@ def test_every_name_of_a_unit_spells_it() -> None:
             assert unit is not None
             assert (unit.name, unit.dimension) == (name, dimension)
     assert unit_of("") is unit_of("%") is unit_of("m/s^2") is unit_of("deg/s") is None
+
+
+def test_of_the_names_of_another_radar_the_nearest_are_shown() -> None:
+    with pytest.raises(ConfigError) as error:
+        bind(find_map("toyota-tss2"), find_dbc("esr-like"))
+    found = str(error.value)
+    assert "tracks.messages.name: unknown message 'TRACK_A_0' (one of: ESR_Track" in found
+    assert found.count("ESR_Track") == 10
+    assert " and 54 more, by " in found
