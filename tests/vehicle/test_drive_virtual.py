@@ -254,7 +254,9 @@ def test_without_answers_the_brake_policy_decides() -> None:
     latched, released = (
         drive(when=outage(FULL_BRAKING_MS, 60_000), policy=policy) for policy in ("latch", "release")
     )
-    assert latched.result == drive().result  # full braking goes on to standstill
+    found, sound = latched.result, drive().result
+    assert found.fallback_s == released.result.fallback_s == (FULL_BRAKING_MS + 11) / 1e3, "1.5 cycles after"
+    assert msgspec.structs.replace(found, fallback_s=None) == sound  # full braking goes on to standstill
     assert released.result.collision
 
 
