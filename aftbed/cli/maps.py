@@ -184,8 +184,9 @@ def _print_report(bound: BoundMap | None, decoded: Decoded | None, problems: Seq
 def _report(bound: BoundMap | None, decoded: Decoded | None, problems: Sequence[str]) -> Iterator[str]:
     lines = [] if bound is None else _map_lines(bound)
     lines += [] if decoded is None else _log_lines(decoded)
+    width = max((len(head) for head, _ in lines), default=0)
     for head, text in lines:
-        yield shown(f"  {head:<9}{text}")
+        yield shown(f"  {head:<{width}}  {text}")
     if problems:
         yield "to be looked at"
         yield from (shown(f"  {' '.join(problem.split())}") for problem in problems)
