@@ -33,6 +33,7 @@ from aftbed.vehicle.replay.units import Dimension, unit_of
 
 FRAMES_MAX: Final = 200_000  # of the log, from its beginning: some minutes of a bus, and seconds of work
 CYCLE_MS_GUESSED: Final = 50
+NEAR_IDS: Final = 16  # a radar's other messages have ids so near those of its tracks
 STATUS_BITS_MAX: Final = 4
 RANGES_MOVING: Final = 3  # different values of a distance that something real comes to at least
 PAIR_MS_MAX: Final = 300  # two frames of one target
@@ -305,18 +306,19 @@ class _Proposing:
         plain: dict[str, object] = {
             "description": f"{self._codec.path.stem}, proposed by its names and units"
         }
-        others: dict[str, object] = {}
+        count = None
         if "slot" in group.roles:
             tracks["slot"] = group.roles["slot"].name
-            if (count := self._count(group)) is not None:
-                message, signal = count
-                tracks["count"] = {"message": message, "signal": signal}
-                length = self._codec.length(message)
-                others = {"others": [{"messages": {"name": message}, "length": length}]}
-                plain["cycle_ms"] = self._cycle_ms(message)
-        if not others:
+            count = self._count(group)
+        if count is not None:
+            end, signal = count
+            tracks["count"] = {"message": end, "signal": signal}
+        else:
             end = self._cycle_end(group)
-            plain |= {"cycle_ms": self._cycle_ms(end), "cycle_end": end}
+            plain["cycle_end"] = end
+        plain["cycle_ms"] = self._cycle_ms(end)
+        other = {"messages": {"name": end}, "length": self._codec.length(end)}
+        others: dict[str, object] = {} if end in group.names else {"others": [other]}
         ego = self._ego(group)
         if ego is not None:
             plain["ego"] = ego
@@ -560,18 +562,25 @@ class _Proposing:
         return None
 
     def _cycle_end(self, group: _Group) -> str:
-        """By the log the message before the longest gaps, of those that come in each cycle; else the last."""
-        names = {self._codec.can_id(name): name for name in group.names}
-        frames = sorted((f for can_id in names for f in self._by_id.get(can_id, ())), key=lambda f: f.t_us)
+        """By the log the message before the longest gaps, of those that come in each cycle; else the last.
+
+        Beside the tracks it may be a message with an id near theirs that comes as often: of a radar that
+        sends its tracks in two halves, the first one is not the end.
+        """
+        ids = [self._codec.can_id(name) for name in group.names]
+        near = range(min(ids) - NEAR_IDS, max(ids) + NEAR_IDS + 1)
+        names = {self._codec.can_id(name): name for name in self._usable(self._codec)}
+        most = max((len(self._by_id.get(can_id, ())) for can_id in ids), default=0)
+        sent = {one: self._by_id[one] for one in names if one in near and one in self._by_id}
+        often = {one: frames for one, frames in sent.items() if 9 * most <= 10 * len(frames) <= 11 * most}
+        frames = sorted((frame for found in often.values() for frame in found), key=lambda frame: frame.t_us)
         gaps: dict[int, list[int]] = {}
         for before, after in pairwise(frames):
             gaps.setdefault(before.can_id, []).append(after.t_us - before.t_us)
-        most = max(map(len, gaps.values()), default=0)
-        always = {can_id: median(found) for can_id, found in gaps.items() if 10 * len(found) >= 9 * most}
-        if not always:
+        if not gaps:
             self._note(f"cycle_end: {group.names[-1]} is taken, as no log shows which message comes last")
             return group.names[-1]
-        return names[max(always, key=lambda can_id: (always[can_id], can_id))]
+        return names[max(gaps, key=lambda can_id: (median(gaps[can_id]), can_id))]
 
     def _cycle_ms(self, name: str) -> int:
         times = [frame.t_us for frame in self._seen(self._codec, name)]

@@ -147,6 +147,8 @@ def test_a_log_shows_the_counter_and_the_checksum() -> None:
     tracks = found["tracks"]
     assert isinstance(tracks, dict)
     assert (tracks["checksum"], tracks["counter"]) == ("toyota", {"signal": "COUNTER", "modulo": 256})
+    assert found["cycle_end"] == "TRACK_B_15"
+    assert found["others"] == [{"messages": {"name": "TRACK_B_15"}, "length": 8}]
     assert "ego" not in found
     assert problems == (
         "ego: no message that is in the log has the ego's speed; give its DBC with another --dbc",

@@ -10,8 +10,11 @@ from aftbed.core.errors import ConfigError
 from aftbed.vehicle.aeb.function import AebFunction
 from aftbed.vehicle.aeb.messages import decode_reply, decode_request
 from aftbed.vehicle.can.candump import read_log
+from aftbed.vehicle.can.dbc_file import load_dbc
 from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.replay.map_file import Messages, bind, find_map
+from aftbed.vehicle.replay.map_proposal import propose
+from aftbed.vehicle.replay.map_trial import try_out
 from aftbed.vehicle.replay.mapped_gateway import MappedGateway
 
 
@@ -62,6 +65,25 @@ class TestRealDrive:
         nearest_m = min(target.range_m for cycle in cycles for target in cycle.targets)
         assert 25.0 < nearest_m < 30.0
         assert {decode_reply(function.execute(request)).stage for request in requests} == {0}
+
+    def test_what_is_proposed_from_it_decodes_what_the_shipped_map_does(self, tmp_path: Path) -> None:
+        (tmp_path / "car.dbc").write_text(
+            'BU_: X\nBO_ 180 SPEED: 8 X\n SG_ SPEED : 47|16@0+ (0.01,0) [0|250] "km/h" X\n'
+        )
+        codecs = [load_dbc(path, strict=False) for path in (TOYOTA_DBC, tmp_path / "car.dbc")]
+        proposal = propose(codecs, self.frames())
+        assert (proposal.bound is not None, proposal.problems) == (True, ())
+        assert proposal.bound is not None
+        found = try_out(proposal.bound, self.frames())
+        by_hand = try_out(bind(find_map("toyota"), TOYOTA_DBC), self.frames())
+        assert (found.refused, found.problems()) == ({}, [])
+        assert (found.cycles, found.with_ego, found.with_targets) == (200, 200, 200)
+        assert (found.targets, found.range_m, found.ego_kmh, found.shown) == (
+            by_hand.targets,
+            by_hand.range_m,
+            by_hand.ego_kmh,
+            by_hand.shown,
+        )
 
     def test_damaged_frames_are_refused_one_by_one_and_nothing_else_is(self) -> None:
         gateway = MappedGateway(CODEC, bind(find_map("toyota"), TOYOTA_DBC))
