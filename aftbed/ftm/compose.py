@@ -29,10 +29,11 @@ ONWARD: Final = ("pro2bfr", "bfr2prd", "prd2aft", "pro2pxy")  # the way of a req
 
 
 def parse(expression: str) -> tuple[str, ...]:
-    """The names of the mechanisms in `expression`, the outermost first; () for `none`.
+    """The names of the mechanisms in `expression`, the outermost first; () for `none`. `PBR` is `pbr`.
 
     Raises ConfigError on an unknown name and on an order that makes no sense.
     """
+    expression = expression.lower()
     if expression == NONE:
         return ()
     names = tuple(expression.split("+"))
@@ -51,6 +52,11 @@ def parse(expression: str) -> tuple[str, ...]:
         if name in names[:index]:
             raise ConfigError(f"{expression}: {name} within {name} adds nothing")
     return names
+
+
+def canonical(expression: str) -> str:
+    """The expression as it is named everywhere. Raises ConfigError as `parse` does."""
+    return "+".join(parse(expression)) or NONE
 
 
 def _expressions() -> tuple[str, ...]:

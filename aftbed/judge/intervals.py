@@ -234,8 +234,8 @@ class _Faults:
         found = sorted(self._found(), key=lambda one: one.began_ns)
         alone = len(found) == 1 and not self._record.adaptations and self._record.options.policy is None
         by_number = {
-            number: _of_bus(report, report.bus)
-            for number, report in enumerate(self._record.faults)
+            report.number: _of_bus(report, report.bus)
+            for report in self._record.faults
             if report.fired and report.bus is not None
         }
         for one, following in itertools.zip_longest(found, found[1:]):
@@ -249,10 +249,11 @@ class _Faults:
             first = strikes.setdefault(number_of(record), record)
             if record.node == SUPERVISOR != first.node:  # before it, a node came to the point, and waited
                 strikes[number_of(record)] = record
-        for number, report in enumerate(self._record.faults):
-            if report.fired and number in strikes:
-                strike = strikes[number]
-                yield _Found(number, report.fault, parse(report.fault), strike.t_ns, strike.request_id)
+        for report in self._record.faults:
+            if report.fired and report.number in strikes:
+                strike = strikes[report.number]
+                words = report.fault
+                yield _Found(report.number, words, parse(words), strike.t_ns, strike.request_id)
 
     def _of(self, one: _Found, next_ns: int, *, alone: bool) -> HandlingIntervals:
         """`next_ns`: when the next fault struck, 0 for never."""

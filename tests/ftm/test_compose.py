@@ -13,7 +13,7 @@ from requestpath import REQUEST_PATH
 from aftbed.core.brick import Brick
 from aftbed.core.errors import ConfigError
 from aftbed.core.graph import PLACEMENTS, BrickSpec, Graph, Kind, Link
-from aftbed.ftm.compose import EXPRESSIONS, build, chain, parse, replication_of
+from aftbed.ftm.compose import EXPRESSIONS, build, canonical, chain, parse, replication_of
 from aftbed.ftm.registry import EMITTERS, KINDS, MECHANISMS, Setting, make
 
 CHANNELS: Final = frozenset(  # the paper's names
@@ -90,6 +90,12 @@ def test_the_expressions_are_all_of_one_and_two_mechanisms_that_make_sense() -> 
         "lfr+assert",
         "assert+tr",
     )
+
+
+@pytest.mark.parametrize(("typed", "meant"), [("PBR", "pbr"), ("Lfr+TR", "lfr+tr"), ("NONE", "none")])
+def test_capitals_are_no_other_name(typed: str, meant: str) -> None:
+    assert canonical(typed) == meant
+    assert build(typed, "process") == build(meant, "process")
 
 
 @pytest.mark.parametrize(

@@ -32,7 +32,10 @@ def evidence(
     starved_ms: float = 0.0,
 ) -> Evidence:
     options = RunOptions("", "", "", ftm, "process", 0, LoadRun(3, 0.0), ftti_ms=ftti_ms)
-    reports = tuple(FaultReport(words, ReceiptState.ACTIVATED, bus=bus) for words in faults)
+    reports = tuple(
+        FaultReport(words, ReceiptState.ACTIVATED, bus=bus, number=number)
+        for number, words in enumerate(faults)
+    )
     end = RunEnd(leader="a", seconds=0.1, starved_ms=starved_ms)
     record = RunRecord(options, tale.history(), end, reports)
     return Evidence(record, reference_run(record.history, Sums()))
