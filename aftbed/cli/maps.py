@@ -103,7 +103,7 @@ def check(
 def new(
     dbc: Annotated[
         list[str] | None,
-        typer.Option(help="The radar's DBC, by name or a file; another one may follow for the ego's speed."),
+        typer.Option(help="The radar's DBC, by name or a file; once more for one with the ego's speed."),
     ] = None,
     log: Log = None,
     out: Annotated[
@@ -129,7 +129,9 @@ def new(
         _write(out, proposal)
     written = out if proposal.map is not None else None
     if json:
-        head = {"map": proposal.text() if proposal.map is not None else None, "written": written}
+        text = proposal.text() if proposal.map is not None else None
+        used = str(proposal.bound.codec.path) if proposal.bound is not None else None
+        head = {"map": text, "written": str(written) if written is not None else None, "dbc": used}
         print_json(head | _document(proposal.bound, decoded, [*proposal.problems, *found]))
     elif written is not None or proposal.map is None:
         print(f"{written}: written" if written is not None else "no map")
@@ -204,6 +206,7 @@ def _map_lines(bound: BoundMap) -> list[tuple[str, str]]:
     end = f"ends with {ends[bound.cycle_end_id]}" if bound.cycle_end_id is not None else "announced"
     ego = bound.rules[bound.ego_id]
     return [
+        ("dbc", bound.codec.path.name),
         ("tracks", f"{len(tracks)} message{'s' if len(tracks) > 1 else ''}, {names}, {place}"),
         ("values", ", ".join(_value(key, reading) for key, reading in _readings(bound))),
         ("ego", f"{ego.name or f'{ego.can_id:#05x}'}: {_value('speed', bound.ego_speed)}"),

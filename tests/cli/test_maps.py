@@ -65,6 +65,7 @@ def test_a_proposed_map_is_written_and_shows_what_it_decodes(folder: Path, outpu
     found = output("map", "new", "--dbc", "radar.dbc", "--log", "drive.log", "--out", "map.yaml")
     assert found == (
         "map.yaml: written\n"
+        "  dbc     radar.dbc\n"
         "  tracks  2 messages, OBJ_0 to OBJ_1, Cartesian\n"
         "  values  range LongDist, relative_speed RelSpeed, lateral_offset LatDist\n"
         "  ego     EGO: speed VehicleSpeed\n"
@@ -82,7 +83,7 @@ def test_a_proposed_map_is_written_and_shows_what_it_decodes(folder: Path, outpu
         "  tracks.valid: Status has 4 values; taken for valid: 2 (seen with a distance in the log)\n"
     )
     checked = output("map", "check", "./map.yaml", "--dbc", "radar.dbc", "--log", "drive.log")
-    assert checked.splitlines()[1:14] == found.splitlines()[1:14]
+    assert checked.splitlines()[1:15] == found.splitlines()[1:15]
 
 
 def test_what_is_printed_without_out_is_a_map(folder: Path, output: Output) -> None:
@@ -108,12 +109,21 @@ def test_what_is_printed_without_out_is_a_map(folder: Path, output: Output) -> N
 
 def test_the_document_of_a_proposal(folder: Path, output: Output) -> None:
     found = json.loads(output("map", "new", "--dbc", "radar.dbc", "--log", "drive.log", "--json"))
-    assert found["written"] is None
+    assert (found["written"], found["dbc"]) == (None, "radar.dbc")
     assert "messages: {name: 'OBJ_{n}', first: 0, last: 1}" in found["map"]
     assert (found["tracks"], len(found["messages"]), found["decoded"]["cycles"]) == (2, 3, 10)
     assert found["problems"] == [
         "tracks.valid: Status has 4 values; taken for valid: 2 (seen with a distance in the log)"
     ]
+
+
+def test_the_document_of_a_map_that_is_written(folder: Path, output: Output) -> None:
+    found = json.loads(output("map", "new", "--dbc", "radar.dbc", "--out", "map.yaml", "--json"))
+    assert (found["written"], found["map"], found["decoded"]) == (
+        "map.yaml",
+        Path("map.yaml").read_text(),
+        None,
+    )
 
 
 def test_a_map_that_makes_nothing_of_the_log_ends_with_1(folder: Path, call: Call) -> None:

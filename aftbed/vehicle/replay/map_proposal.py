@@ -118,8 +118,18 @@ _Dumper.add_representer(
 
 
 def propose(codecs: Sequence[Codec], frames: Sequence[Frame] = ()) -> MapProposal:
-    """A map for the first of the DBCs, not read strictly; the ego's speed may be in another of them."""
-    return _Proposing(codecs, frames).proposal()
+    """A map for the first of the DBCs, not read strictly, that has a radar.
+
+    The ego's speed may be in another of them.
+    """
+    first = None
+    for codec in codecs:
+        proposal = _Proposing([codec, *(other for other in codecs if other is not codec)], frames).proposal()
+        if proposal.map is not None:
+            return proposal
+        first = first or proposal
+    assert first is not None
+    return first
 
 
 # -- signals by their words -----------------------------------------------------------------------

@@ -133,6 +133,12 @@ def test_the_ego_speed_comes_from_a_dbc_of_its_own() -> None:
     }
 
 
+def test_the_dbcs_may_come_in_any_order(tmp_path: Path) -> None:
+    paths = saved("tesla", tmp_path)
+    assert proposed(paths[::-1]).map == proposed(paths).map
+    assert bound(proposed(paths[::-1])).codec.path == paths[0]
+
+
 def test_signals_with_the_number_of_their_message() -> None:
     tracks = plain("ford")[0]["tracks"]
     assert isinstance(tracks, dict)
