@@ -43,6 +43,7 @@ FAULTS: Final[dict[FaultClass, str]] = {
     "value": "value faults",
     "implausible": "implausible value faults",
 }
+PART_OF: Final[dict[FaultClass, FaultClass]] = {"implausible": "value"}  # a class of faults within another
 LEVELS: Final[tuple[Level, ...]] = ("none", "low", "high")
 TAKES: Final[dict[Level, str]] = {"none": "no", "low": "little", "high": "much"}
 
@@ -212,18 +213,16 @@ def consistent(
     resources: Resources,
     table: SuitabilityTable = TABLE,
 ) -> list[str]:
-    """The consistent expressions, the cheapest first; [] is "no consistent FTM".
-
-    Cheap is little of, in this order: CPUs, CPU load, bandwidth; the last two summed over the parts.
-    """
-
-    def cost(expression: str) -> tuple[int, int, int]:
-        rows = [table.rows[name] for name in parse(expression)]
-        cpu_load = sum(LEVELS.index(row.cpu_load) for row in rows)
-        return demand(expression, table).cpus, cpu_load, sum(LEVELS.index(row.bandwidth) for row in rows)
-
+    """The consistent expressions, the cheapest first; [] is "no consistent FTM"."""
     found = [e for e in EXPRESSIONS if not problems(e, faults, characteristics, resources, table)]
-    return sorted(found, key=cost)
+    return sorted(found, key=lambda expression: cost(expression, table))
+
+
+def cost(expression: str, table: SuitabilityTable = TABLE) -> tuple[int, int, int]:
+    """To sort by: CPUs, CPU load, bandwidth; the last two summed over the parts."""
+    rows = [table.rows[name] for name in parse(expression)]
+    cpu_load = sum(LEVELS.index(row.cpu_load) for row in rows)
+    return demand(expression, table).cpus, cpu_load, sum(LEVELS.index(row.bandwidth) for row in rows)
 
 
 def remarks(expression: str, characteristics: Characteristics) -> list[str]:

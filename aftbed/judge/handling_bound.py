@@ -19,11 +19,11 @@ another bound.
 In reality the machine stops a process now and then, for longer than any step takes. One such stop of
 `STALL_NS` is allowed for each handling; the harness calls a machine quiet whose wakes are later by no more.
 
-Limits: one fault in a run without adaptations, in a graph with its redundancy, aimed at a replica in the
-role that it begins with; the built-in function, whose execution is part of the hop to it. There is no bound
-where the injector holds a node that serves until it has struck another one (an event of the leader, a crash
-of the backup), for the replacement of Client and Proxy, whose births take what the machine lets them, nor
-for faults that the mechanism does not handle.
+Limits: one fault of any kind in a run without adaptations, in a graph with its redundancy, aimed at a replica
+in the role that it begins with; the built-in function, whose execution is part of the hop to it. There is no
+bound where the injector holds a node that serves until it has struck another one (an event of the leader, a
+crash of the backup), for the replacement of Client and Proxy, whose births take what the machine lets them,
+nor for faults that the mechanism does not handle. A fault of the bus has a bound of its own (`bus_bound`).
 """
 
 import itertools

@@ -59,7 +59,6 @@ def test_which_faults_of_a_leader_have_a_bound() -> None:
     [
         "crash proxy",  # its replacement is born
         "hang recovery",
-        "bitflip result permanent",  # the same in all trials
         "bitflip result at server.exit nth 3 in b",
         "crash backup at server.exit",  # the leader waits for the injector
         "slow primary by 2ms",
@@ -68,6 +67,12 @@ def test_which_faults_of_a_leader_have_a_bound() -> None:
 )
 def test_other_faults_have_none(words: str) -> None:
     assert bound_ms("pbr", "process", parse(words)) is None
+
+
+def test_a_wrong_value_that_is_the_same_in_all_trials_has_none() -> None:
+    once, lasting = parse("bitflip result"), parse("bitflip result permanent")
+    assert bound_ms("pbr+tr", "process", once) is not None
+    assert bound_ms("pbr+tr", "process", lasting) is None
 
 
 def test_no_replica_is_left_where_one_process_has_both() -> None:
