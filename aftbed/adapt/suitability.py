@@ -15,7 +15,7 @@ An expression follows from its parts, and has no row of its own:
 
 There are two classes of value faults. `value` is any wrong reply or state of one execution; a mechanism
 that compares executions covers it. `implausible` is the part of it that the function's own assertion
-refuses; that is all that an assertion covers.
+refuses; that is all that an assertion covers. `flow`: a step is skipped, done twice, or late.
 
 State access where a backup executes every request: normal service needs none. A *new* backup needs it:
 without, the survivor of a failover stays alone. That is no reason to refuse the mechanism; `remarks` says
@@ -42,6 +42,7 @@ FAULTS: Final[dict[FaultClass, str]] = {
     "crash": "crashes",
     "value": "value faults",
     "implausible": "implausible value faults",
+    "flow": "flow faults",
 }
 PART_OF: Final[dict[FaultClass, FaultClass]] = {"implausible": "value"}  # a class of faults within another
 LEVELS: Final[tuple[Level, ...]] = ("none", "low", "high")
@@ -54,6 +55,7 @@ class FaultModel(msgspec.Struct, frozen=True):
     crash: bool = True
     value: bool = False
     implausible: bool = False
+    flow: bool = False
 
     def asked(self) -> tuple[FaultClass, ...]:
         return tuple(fault for fault in FAULTS if getattr(self, fault))

@@ -12,6 +12,7 @@ import psutil
 import typer
 
 from aftbed.adapt.suitability import (
+    FAULTS,
     TABLE,
     Demand,
     Resources,
@@ -109,7 +110,7 @@ def check(
         str | None, typer.Option("--ftm", help="The FTM to judge; all of them if left out.")
     ] = None,
     faults: Annotated[
-        str, typer.Option(help="To be tolerated: crash, value, implausible, separated by commas; or none.")
+        str, typer.Option(help=f"To be tolerated: {', '.join(FAULTS)}, separated by commas; or none.")
     ] = "crash",
     app: Annotated[
         str | None, typer.Option(help="The protected function, as MODULE:CLASS or FILE.py:CLASS.")

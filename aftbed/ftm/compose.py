@@ -60,12 +60,14 @@ def canonical(expression: str) -> str:
 
 
 def _expressions() -> tuple[str, ...]:
-    """Every expression of one or two mechanisms that makes sense, `none` first."""
+    """Every expression of one or two mechanisms that makes sense and is listed, `none` first."""
     found = [NONE, *DUPLEX, *SIMPLEX]
-    for pair in (f"{outer}+{inner}" for outer in MECHANISMS for inner in SIMPLEX):
-        with contextlib.suppress(ConfigError):
-            parse(pair)
-            found.append(pair)
+    for outer, inner in itertools.product(MECHANISMS, SIMPLEX):
+        pair = f"{outer}+{inner}"
+        if outer in DUPLEX or (MECHANISMS[outer].combined and MECHANISMS[inner].combined):
+            with contextlib.suppress(ConfigError):
+                parse(pair)
+                found.append(pair)
     return tuple(found)
 
 
@@ -117,6 +119,11 @@ DUPLEX_EXPRESSIONS: Final = tuple(  # each mechanism that replicates, alone and 
 def tolerates(expression: str, fault: FaultClass) -> bool:
     """Whether a mechanism in `expression` tolerates `fault` by itself."""
     return any(fault in MECHANISMS[name].suitability.tolerates for name in parse(expression))
+
+
+def detects(expression: str, fault: FaultClass) -> bool:
+    """Whether a mechanism in `expression` stops its replica at `fault`."""
+    return any(fault in MECHANISMS[name].suitability.detects for name in parse(expression))
 
 
 def replication_of(expression: str) -> tuple[tuple[str, str], ...]:

@@ -226,7 +226,7 @@ def test_a_dbc_that_is_not_there(refused: Output, replay: Replay) -> None:
     ("old", "new", "words"),
     [
         ("cycle_ms", "cycle_s", ("cycle_s",)),
-        ("unit: m}", "unit: km}", ("range.unit", "'km'", "cm, m")),
+        ("unit: m}", "unit: km}", ("range.unit", "km", "m, cm")),
         ("unit: m/s", "unit: mph", ("unit",)),
         ("modulo: 256", "modulo: -1", ("modulo",)),
         ("checksum: toyota", "checksum: honda", ("checksum",)),

@@ -101,6 +101,7 @@ def test_an_expression_is_shown_with_all_its_bricks_and_channels(call: Call, exp
             ("crash, value, implausible", "tr needs state access", "before, tr.protocol, tr."),
         ),
         ("tr", ("1 CPU, high CPU load, no bandwidth", "11, one per brick")),
+        ("pbr+sup", ("tolerates  crash, flow", "23, one per brick", "sup.before")),
         ("assert", ("tolerates  nothing", "detects    implausible", "nothing of the function")),
         ("lfr+assert+tr", ("29, one per brick",)),
     ],
@@ -121,7 +122,7 @@ def test_the_requirements_of_an_expression_are_shown(
     ("arguments", "code", "last"),
     [
         (("--ftm", "pbr"), 0, "pbr is consistent"),
-        ((), 0, "consistent: pbr, lfr, pbr+assert, lfr+assert, pbr+tr, lfr+tr"),
+        ((), 0, "consistent: pbr, lfr, pbr+assert, pbr+sup, lfr+assert, lfr+sup, pbr+tr"),
         (("--faults", "crash,value"), 0, "consistent: pbr+tr, lfr+tr"),
         (
             ("--ftm", "pbr", "--app", f"{VARIANTS}:WithoutStateAccess"),
@@ -194,7 +195,7 @@ def test_the_answer_as_a_document(call: Call) -> None:
         "consistent": False,
         "problems": ["lfr needs a deterministic function: two replicas execute every request"],
         "remarks": [],
-        "consistent_ftms": ["pbr", "pbr+assert"],
+        "consistent_ftms": ["pbr", "pbr+assert", "pbr+sup"],
         "faults": ["crash"],
         "app": f"{VARIANTS}:NonDeterministic",
         "characteristics": {"deterministic": False, "state_access": "exact", "tolerance": 0.0},

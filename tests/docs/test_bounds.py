@@ -21,6 +21,8 @@ FAULTS: Final = {
     "crash of the backup": "crash backup",
     "crash of Recovery": "crash recovery",
     "wrong value": "bitflip result",
+    "skipped step": "omission prd2srv",
+    "doubled step": "duplicate prd2srv",
 }
 SETS: Final = (("pbr",), ("pbr", "lfr"), ("pbr", "lfr", "tr"), tuple(MECHANISMS))
 

@@ -39,6 +39,7 @@ def changed(**fields: object) -> Graph:
         ("tr", "process", 10),
         ("assert", "process", 10),
         ("assert+tr", "process", 13),
+        ("pbr+sup", "process", 22),
         ("pbr+assert+tr", "process", 28),
         ("pbr", "replica", 8),
         ("pbr+tr", "replica", 8),
@@ -84,10 +85,13 @@ def test_the_expressions_are_all_of_one_and_two_mechanisms_that_make_sense() -> 
         "lfr",
         "tr",
         "assert",
+        "sup",
         "pbr+tr",
         "pbr+assert",
+        "pbr+sup",
         "lfr+tr",
         "lfr+assert",
+        "lfr+sup",
         "assert+tr",
     )
 
@@ -101,7 +105,7 @@ def test_capitals_are_no_other_name(typed: str, meant: str) -> None:
 @pytest.mark.parametrize(
     ("expression", "message"),
     [
-        ("prb", "unknown FTM 'prb'; did you mean 'pbr'? (one of: assert, lfr, none, pbr, tr)"),
+        ("prb", "unknown FTM 'prb'; did you mean 'pbr'? (one of: assert, lfr, none, pbr, sup, tr)"),
         ("", "unknown FTM '' (one of: "),
         ("pbr+", "unknown FTM '' (one of: "),
         ("pbr + tr", "unknown FTM 'pbr '; did you mean 'pbr'?"),

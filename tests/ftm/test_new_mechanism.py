@@ -28,7 +28,7 @@ REGISTRATION: Final = (
         "from aftbed.ftm.lfr import LFR\n",
         "from aftbed.ftm.lfr import LFR\nfrom aftbed.ftm.limit import LIMIT\n",
     ),
-    ("(PBR, LFR, TR, ASSERT)", "(PBR, LFR, TR, ASSERT, LIMIT)"),
+    ("(PBR, LFR, TR, ASSERT, SUP)", "(PBR, LFR, TR, ASSERT, SUP, LIMIT)"),
 )
 
 

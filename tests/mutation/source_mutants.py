@@ -660,7 +660,7 @@ MUTANTS: Final = (
         "the bound has no stop of the machine",
         "G8",
         f"{JUDGE}/handling_bound.py",
-        "(found + (0 if simulated else STALL_NS)) / 1e6",
+        "(found + stall_ns) / 1e6",
         "found / 1e6",
         UNIT,
         ("tests/judge/test_handling_bound.py::test_on_real_processes_one_stop_of_the_machine_is_allowed",),

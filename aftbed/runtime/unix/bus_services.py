@@ -214,13 +214,14 @@ def _drive(line: Line[control.ToNode], source: SourceOptions) -> None:
 def _play(line: Line[control.ToNode], source: SourceOptions, log: int) -> None:
     from aftbed.vehicle.can.bus import BusOptions, open_bus  # noqa: PLC0415
     from aftbed.vehicle.can.dbc_file import own_dbc  # noqa: PLC0415
-    from aftbed.vehicle.replay.map_file import find_map  # noqa: PLC0415
+    from aftbed.vehicle.replay.map_file import bind, find_map  # noqa: PLC0415
     from aftbed.vehicle.replay.mapped_gateway import MappedGateway  # noqa: PLC0415
     from aftbed.vehicle.replay.player import PlayedLog, play  # noqa: PLC0415
 
     work = source.work
     assert isinstance(work, ReplayRun), work
-    gateway = MappedGateway(own_dbc(), Path(work.dbc), find_map(work.map))
+    bound = bind(find_map(work.map), Path(work.dbc))
+    gateway = MappedGateway(own_dbc(), bound)
     with open(log, "rb") as file:
         played = msgspec.msgpack.decode(file.read(), type=PlayedLog)
     bus = open_bus(BusOptions(port=source.port, secret=source.secret, node=PLAYER))
@@ -233,7 +234,7 @@ def _play(line: Line[control.ToNode], source: SourceOptions, log: int) -> None:
             work.pace,
             ends_cycle=lambda frame: gateway.on_frame(frame) is not None,
             stop=orders.stop,
-            pause_us=gateway.cycle_ms * 1000 if work.loop else None,
+            pause_us=bound.map.cycle_ms * 1000 if work.loop else None,
             until_us=work.duration_ms * 1000 if work.duration_ms is not None else None,
         )
         report = {"played": result, "log": played.report, "gateway": gateway.counts}
