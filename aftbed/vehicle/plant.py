@@ -70,11 +70,12 @@ IN_THE_WAY_M: Final = 1.8  # from middle to middle: two cars of this width, side
 
 
 class LeadBraking(msgspec.Struct, frozen=True):
-    """The car ahead brakes from `after_ms` on, reaching `deceleration_ms2` after `ramp_ms`."""
+    """The car ahead brakes to `final_ms` from `after_ms` on, reaching `deceleration_ms2` after `ramp_ms`."""
 
     after_ms: int
     deceleration_ms2: float
     ramp_ms: int = 0
+    final_ms: float = 0.0  # at most its speed at the start
 
 
 class CutIn(msgspec.Struct, frozen=True):
@@ -216,13 +217,13 @@ class Plant:
                 self.lateral_m = 0.0
             elif left_ms < lead.cut_in.over_ms:
                 self.lateral_m = lead.lateral_m * (left_ms / lead.cut_in.over_ms)
-        deceleration_ms2 = 0.0
+        deceleration_ms2 = final_ms = 0.0
         if lead.braking is not None and (since_ms := t_ms - lead.braking.after_ms) > 0.0:
-            deceleration_ms2 = lead.braking.deceleration_ms2
+            deceleration_ms2, final_ms = lead.braking.deceleration_ms2, lead.braking.final_ms
             if since_ms < lead.braking.ramp_ms:
                 deceleration_ms2 = deceleration_ms2 * since_ms / lead.braking.ramp_ms
         before_ms = self.lead_speed_ms
-        self.lead_speed_ms = max(0.0, before_ms - deceleration_ms2 * self._step_s)
+        self.lead_speed_ms = max(final_ms, before_ms - deceleration_ms2 * self._step_s)
         return (before_ms + self.lead_speed_ms) / 2.0 * self._step_s
 
     def _move_gap(self, before_m: float, change_m: float, closing_before_ms: float) -> None:

@@ -220,7 +220,8 @@ def test_one_document_for_many_variations(output: Output, tmp_path: Path) -> Non
     out = output("scenario", "import", LEAD_BRAKES, "--variations", VALUES, "--out", "made", "--json")
     found = json.loads(out)
     assert set(found) == {
-        *("file", "version", "description", "sets", "scenarios", "taken", "ignored"),
+        *("file", "scenario_file", "version", "description", "sets", "scenarios", "left_out"),
+        *("taken", "ignored"),
     }
     assert found["sets"] == len(found["scenarios"]) == 6
     assert found["scenarios"][0] == {
@@ -234,9 +235,9 @@ def test_one_document_for_many_variations(output: Output, tmp_path: Path) -> Non
 
 
 def test_an_entry_of_a_catalog_is_printed_with_its_file(output: Output) -> None:
-    out = output("scenario", "import", SLOW_LEAD, "--ego", "Host", "--replace-controller", "--duration", "9")
+    out = output("scenario", "import", SLOW_LEAD, "--ego", "Host", "--duration", "9")
     assert f"({FOLDER / 'catalogs' / 'cars.xosc'})" in out
-    assert "replaced by aftbed's function, as asked for" in out
+    assert "ObjectController           aftbed's function takes its place" in out
     assert load_scenario("./slow_lead.yaml").duration_ms == 9000
 
 
@@ -244,13 +245,19 @@ def test_an_entry_of_a_catalog_is_printed_with_its_file(output: Output) -> None:
     ("arguments", "reason"),
     [
         ([SLOW_LEAD], "which vehicle is the ego? --ego NAME says it (one of: Host, Target)"),
-        ([SLOW_LEAD, "--ego", "Host"], "  line 66: ActivateControllerAction: controllers: "),
+        ([SLOW_LEAD, "--ego", "Target"], "  line 66: ActivateControllerAction: controllers: "),
+        ([LEAD_BRAKES, "--pick", "Gap=12"], "--pick: "),
+        ([VALUES, "--pick", "Gap"], "--pick: found 'Gap', allowed is NAME=VALUE"),
+        ([VALUES, "--pick", "Gab=12"], "--pick: unknown varied parameter 'Gab'; did you mean 'Gap'?"),
+        ([VALUES, "--pick", "Gap=13"], "--pick: Gap is never 13 (one of: 12, 40)"),
+        ([VALUES, "--variations", VALUES], "a distribution, and --variations gives another one"),
+        ([FOLDER, "--variations", VALUES], "--variations: is for one file"),
+        ([FOLDER, "--pick", "Gap=12"], "--pick: is for one file"),
         ([LEAD_BRAKES, "--ego", "Bert"], "--ego: unknown vehicle 'Bert' (one of: Ego, Lead)"),
         ([LEAD_BRAKES, "--expect", "crash"], "--expect: unknown outcome 'crash'"),
         ([LEAD_BRAKES, "--duration", "0"], "--duration: found 0, allowed is more than 0 and at most 3600"),
         ([LEAD_BRAKES, "--variations", LEAD_BRAKES], "no ParameterValueDistribution in it"),
         ([LEAD_BRAKES, "--out", LEAD_BRAKES], "cannot be written: "),
-        ([VALUES], "a distribution: import lead_brakes.xosc with --variations"),
         (["nowhere.xosc"], "nowhere.xosc: cannot be read: No such file or directory"),
     ],
 )

@@ -75,7 +75,7 @@ def import_bytes(folder: Path, name: str, data: bytes) -> None:
     """Import a changed file; what it becomes can be read as a scenario."""
     source, wanted = (LEAD_BRAKES, ImportOptions(expect="stop"))
     if name == SLOW_LEAD.name:
-        source, wanted = SLOW_LEAD, ImportOptions(ego="Host", replace_controller=True)
+        source, wanted = SLOW_LEAD, ImportOptions(ego="Host")
     path = folder / name
     path.write_bytes(data)
     try:
@@ -218,10 +218,24 @@ def test_paths_that_are_none(tmp_path: Path) -> None:
         ("cos(0) + sin(0) + tan(0) + acos(1) + asin(0) + atan(0)", 1),
         (".5e1 + 5. + 1E0", 11),
         ("$a*$a", 100),
+        ("180*2*pi/180", 2 * math.pi),
     ],
 )
 def test_arithmetic(text: str, value: float) -> None:
     assert evaluate(text, {"a": "10", "ramp_p_0": "3"}) == pytest.approx(value)
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("not $no", True),
+        ("$no or not $no and true", True),
+        ("not ($no or true)", False),
+        ("false", False),
+    ],
+)
+def test_truth(text: str, value: bool) -> None:
+    assert evaluate(text, {"no": "false"}) is value
 
 
 @pytest.mark.parametrize(
@@ -233,8 +247,13 @@ def test_arithmetic(text: str, value: float) -> None:
         ("[1]", "allowed are numbers"),
         ("'1'", "allowed are numbers"),
         ("1 if 1 else 2", "IfExp is no arithmetic"),
-        ("1 and 2", "BoolOp is no arithmetic"),
-        ("not 1", "UnaryOp is no arithmetic"),
+        ("1 and 2", "and takes true or false, found 1"),
+        ("true or $a", "or takes true or false, found 10"),
+        ("not 1", "not takes true or false, found 1"),
+        ("~1", "allowed are numbers"),
+        ("true + 1", "found true, allowed is a number"),
+        ("max($yes, 1)", "found true, allowed is a number"),
+        ("pie", "the name 'pie'"),
         ("1, 2", "Tuple is no arithmetic"),
         ("True", "Constant is no arithmetic"),
         ("max(*(1, 2))", "Starred is no arithmetic"),
@@ -264,27 +283,51 @@ def test_arithmetic(text: str, value: float) -> None:
         ("(1", "not understood as arithmetic"),
         ("", "not understood as arithmetic"),
         ("1 2", "not understood as arithmetic"),
-        ("(" * 100 + "1" + ")" * 100, "201 characters, allowed are 200"),
+        ("(" * 500 + "1" + ")" * 500, "1001 characters, allowed are 1000"),
         ("\n1", "allowed are numbers"),
         ("é0", "allowed are numbers"),
     ],
 )
 def test_an_expression_that_is_no_arithmetic_is_refused(text: str, reason: str) -> None:
     with pytest.raises(ConfigError) as error:
-        evaluate(text, {"a": "10", "text": "fast"})
+        evaluate(text, {"a": "10", "text": "fast", "yes": "true"})
     assert reason in str(error.value)
 
 
 WORDS = st.sampled_from(
-    ["1", "0", "2.5", "1e300", "$a", "$b", "+", "-", "*", "/", "%", "(", ")", ",", "**", " ", "if", "lambda"]
+    [
+        "1",
+        "0",
+        "pi",
+        "true",
+        " and ",
+        " or ",
+        "2.5",
+        "1e300",
+        "$a",
+        "$b",
+        "+",
+        "-",
+        "*",
+        "/",
+        "%",
+        "(",
+        ")",
+        ",",
+        "**",
+        " ",
+        "if",
+        "lambda",
+    ]
     + ["not", "in", ":=", "await", "print", "é", "\x00", *FUNCTIONS]
 )
 
 
 @given(st.text(max_size=EXPRESSION_CHARACTERS_MAX + 1) | st.lists(WORDS, max_size=60).map("".join))
-@example("-" * 199 + "1")
-@example("(" * 99 + "1" + ")" * 99)
-@example("1" * 200)
+@example("-" * 999 + "1")
+@example("not " * 249 + "true")
+@example("(" * 499 + "1" + ")" * 499)
+@example("1" * 1_000)
 def test_any_expression_is_a_finite_number_or_refused(text: str) -> None:
     try:
         found = evaluate(text, {"a": "1.5"})

@@ -61,6 +61,7 @@ class BrakingKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     after_s: Duration
     deceleration_ms2: Deceleration
     ramp_s: Duration = 1.0
+    to_kmh: Speed = 0.0
 
 
 class CutInKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -151,12 +152,18 @@ def _lead(where: str, keys: LeadKeys, ego_kmh: float) -> LeadCar:
     return LeadCar(
         gap_m=gap_m,
         speed_ms=keys.speed_kmh / KMH_PER_MS,
-        braking=LeadBraking(_ms(braking.after_s), braking.deceleration_ms2, _ms(braking.ramp_s))
-        if braking
-        else None,
+        braking=_braking(where, braking, keys.speed_kmh) if braking else None,
         lateral_m=keys.lateral_m,
         cut_in=CutIn(_ms(cut_in.after_s), max(1, _ms(cut_in.over_s))) if cut_in else None,
     )
+
+
+def _braking(where: str, keys: BrakingKeys, lead_kmh: float) -> LeadBraking:
+    if keys.to_kmh > 0.0 and keys.to_kmh >= lead_kmh:
+        allowed = f"allowed is less than lead.speed_kmh, {lead_kmh:g}"
+        raise ConfigError(f"{where}: lead.braking.to_kmh: found {keys.to_kmh:g}, {allowed}")
+    ramp_ms, final_ms = _ms(keys.ramp_s), keys.to_kmh / KMH_PER_MS
+    return LeadBraking(_ms(keys.after_s), keys.deceleration_ms2, ramp_ms, final_ms)
 
 
 def broken_expectations(scenario: Scenario, result: VehicleResult) -> list[str]:

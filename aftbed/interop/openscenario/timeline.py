@@ -1,0 +1,501 @@
+"""When the events of a storyboard begin and end: seconds from the start, in closed form.
+
+Until the car ahead brakes both cars keep their speed, so each supported condition compares its limit with a
+constant or with a linear function of the time t, and holds over a `Span` of time:
+
+    SimulationTimeCondition                    t
+    TraveledDistanceCondition                  v t
+    RelativeDistanceCondition                  d - (ve - vl) t
+    TimeHeadwayCondition of the ego           (d - (ve - vl) t) / ve
+    TimeToCollisionCondition                  (d - (ve - vl) t) / (ve - vl)
+    Speed-, RelativeSpeed-, AccelerationCondition       the speeds, their difference, 0
+    StandStillCondition                        a car that stands, or has braked to standstill
+    ParameterCondition                         the value of the parameter
+    VariableCondition                          the value before, and after, the events that set it
+    StoryboardElementStateCondition            the begin, or the end, of an event, maneuver, act or story
+    CollisionCondition, EndOfRoadCondition, OffroadCondition    never: a drive ends on contact
+
+`d` is the gap between the bumpers, or the distance of the reference points without `freespace`. A trigger is
+met when all conditions of one of its groups hold. An empty or missing trigger is met at once.
+
+Limits: if the function brakes the ego before the computed time of a distance, a headway or a speed, the
+condition would be met later than computed, or never, or at all: such a moment `assumes_speeds`.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+import msgspec
+
+from aftbed.interop.openscenario.document import Cause, Element
+from aftbed.interop.openscenario.expression import RULES, Values, obeys
+
+TRIGGER_UNKNOWN: Final = "a trigger whose moment does not follow from the start"
+NEVER_S: Final = math.inf
+_SHAPES: Final = ("linear", "step", "cubic", "sinusoidal")
+_DIMENSIONS: Final = ("rate", "time", "distance")
+_EDGES: Final = ("rising", "falling", "risingOrFalling", "none")
+_UPWARD: Final = ("greaterThan", "greaterOrEqual")
+_DOWNWARD: Final = ("lessThan", "lessOrEqual")
+_BY_VALUE: Final = (
+    "SimulationTimeCondition", "ParameterCondition", "VariableCondition", "StoryboardElementStateCondition",
+)  # fmt: skip
+_NEVER_IN_A_DRIVE: Final = ("CollisionCondition", "EndOfRoadCondition", "OffroadCondition")
+_BY_ENTITY: Final = (
+    "RelativeDistanceCondition", "TimeHeadwayCondition", "TimeToCollisionCondition",
+    "TraveledDistanceCondition", "SpeedCondition", "RelativeSpeedCondition", "AccelerationCondition",
+    "StandStillCondition", *_NEVER_IN_A_DRIVE,
+)  # fmt: skip
+_ELEMENTS: Final = ("story", "act", "maneuverGroup", "maneuver", "event", "action")
+_BEGUN: Final = ("startTransition", "runningState")
+_ENDED: Final = ("endTransition", "completeState")
+_STATES: Final = (*_BEGUN, *_ENDED, "standbyState", "stopTransition", "skipTransition")
+
+
+class SpeedChange(msgspec.Struct, frozen=True):
+    """A car changes its speed linearly: downwards to `final_ms` at `deceleration_ms2`."""
+
+    deceleration_ms2: float
+    final_ms: float
+    lasts_s: float
+
+
+class Braking(msgspec.Struct, frozen=True):
+    """The car ahead brakes from `after_s` on."""
+
+    after_s: float
+    change: SpeedChange
+
+    @property
+    def end_s(self) -> float:
+        return self.after_s + self.change.lasts_s
+
+
+class Motion(msgspec.Struct, frozen=True):
+    """Both cars until one of them brakes: names, speeds, and their distance at the start.
+
+    On an empty road `lead` is "". `braking`: what the car ahead does later, as far as it is known already.
+    """
+
+    ego: str
+    ego_ms: float
+    lead: str = ""
+    lead_ms: float = 0.0
+    gap_m: float = 0.0
+    distance_m: float = 0.0
+    braking: Braking | None = None
+
+
+class StoryEvent(NamedTuple):
+    """An event of the story, with the elements that contain it, the names of its actors and its actions."""
+
+    story: Element
+    act: Element
+    group: Element
+    maneuver: Element
+    event: Element
+    actors: tuple[str, ...]
+    actions: tuple[Element, ...]
+
+
+class Moment(msgspec.Struct, frozen=True):
+    """When something happens, by which condition, and whether both cars have to keep their speed for it."""
+
+    at_s: float
+    condition: Element | None = None
+    assumes_speeds: bool = False
+
+    @property
+    def never(self) -> bool:
+        """Whether it never happens, whatever the function does."""
+        return self.at_s == NEVER_S and not self.assumes_speeds
+
+
+class Span(msgspec.Struct, frozen=True):
+    """A condition holds from `from_s` until before `until_s`."""
+
+    from_s: float
+    until_s: float
+    assumes_speeds: bool = False
+
+
+_ALWAYS: Final = Span(-math.inf, math.inf)
+_NEVER: Final = Span(NEVER_S, NEVER_S)
+_NOT_BEFORE_BRAKING: Final = Span(NEVER_S, NEVER_S, assumes_speeds=True)
+
+
+def never_met(trigger: Element | None) -> bool:
+    """Whether the parameters alone say that a trigger is never met."""
+    groups = [one for one in trigger.children if one.tag == "ConditionGroup"] if trigger else []
+    return bool(groups) and all(
+        any(
+            one.parameter is not None
+            and not obeys(one.parameter, one.attributes.get("rule", ""), one.attributes.get("value", ""))
+            for one in group.walk()
+            if one.tag == "ParameterCondition" and one.attributes.get("rule") in RULES
+        )
+        for group in groups
+    )
+
+
+def speed_change(action: Element, from_ms: float, ego_ms: float) -> SpeedChange:
+    """What the SpeedAction `action` makes of the speed of the car ahead."""
+    dynamics = action.one("SpeedActionDynamics")
+    if dynamics.choice("dynamicsShape", _SHAPES) != "linear":
+        raise dynamics.wrong("dynamicsShape", "linear", Cause.SPEED)
+    dynamics.choice("followingMode", ("position",), "position")
+    final_ms = target_speed_ms(action, ego_ms)
+    if final_ms < 0.0:
+        raise action.error(f"{final_ms:g} m/s, allowed is 0 or more")
+    if final_ms >= from_ms:
+        reason = "the car ahead stands already" if from_ms == 0.0 else "the car ahead speeds up"
+        raise action.error(f"{reason}: allowed is braking", Cause.SPEED)
+    value = abs(dynamics.number("value"))  # some files write a rate as -6
+    dimension = dynamics.choice("dynamicsDimension", _DIMENSIONS)
+    if value == 0.0:
+        raise dynamics.wrong("value", "more than 0", Cause.SPEED)
+    match dimension:
+        case "rate":
+            found = value
+        case "time":
+            found = (from_ms - final_ms) / value
+        case _:
+            found = (from_ms * from_ms - final_ms * final_ms) / (2.0 * value)
+    if not 0.01 <= found <= 12.0:
+        raise dynamics.error(f"a deceleration of {found:g} m/s2, allowed is 0.01 to 12", Cause.SPEED)
+    return SpeedChange(found, final_ms, (from_ms - final_ms) / found)
+
+
+def target_speed_ms(action: Element, other_ms: float) -> float:
+    """The speed to which a SpeedAction leads; a relative one is to a car that keeps `other_ms`."""
+    target = action.one("SpeedActionTarget").one("AbsoluteTargetSpeed", "RelativeTargetSpeed")
+    value = target.number("value")
+    if target.tag == "AbsoluteTargetSpeed":
+        return value
+    target.word("entityRef")
+    if target.flag("continuous"):
+        raise target.wrong("continuous", "false", Cause.SPEED)
+    delta = target.choice("speedTargetValueType", ("delta", "factor")) == "delta"
+    return other_ms + value if delta else other_ms * value
+
+
+class Timeline:
+    """The moments of the `events` of one storyboard, for cars that move as `motion` says.
+
+    `variables` are the values that the variables of the file have at the start.
+    """
+
+    def __init__(
+        self, acts: Sequence[Element], events: Sequence[StoryEvent], variables: Values, motion: Motion
+    ) -> None:
+        self.motion = motion
+        self.acts = acts
+        self.events = events
+        self._variables = variables
+        self._asking: list[Element] = []  # the events and acts whose moment is being computed
+
+    def with_motion(self, motion: Motion) -> "Timeline":
+        """The same story, for cars that move in another way."""
+        return Timeline(self.acts, self.events, self._variables, motion)
+
+    # -- acts and events
+
+    def begin(self, event: StoryEvent) -> Moment:
+        """When an event begins."""
+        act = self._begin_of_act(event.act)
+        if act.at_s == NEVER_S:
+            return act
+        self._ask(event.event)
+        found = self.trigger(event.event.maybe("StartTrigger"), act.at_s)
+        self._asking.pop()
+        return msgspec.structs.replace(found, assumes_speeds=found.assumes_speeds or act.assumes_speeds)
+
+    def trigger(self, trigger: Element | None, begin_s: float) -> Moment:
+        """When `trigger`, evaluated from `begin_s` on, is met for the first time."""
+        groups = trigger.every("ConditionGroup") if trigger else []
+        moments = [self.group(group, begin_s) for group in groups if group.children]
+        return _first(moments) if moments else Moment(begin_s)
+
+    def group(self, group: Element, begin_s: float) -> Moment:
+        """When all conditions of a group, evaluated from `begin_s` on, hold for the first time."""
+        found = [(one, *self._span(one)) for one in group.every("Condition")]
+        if any(span == _NEVER for _, _, span in found):
+            return Moment(NEVER_S)
+        assumes = any(span.assumes_speeds for _, _, span in found)
+        spans = [_delayed(condition, span, begin_s) for condition, _, span in found]
+        at_s = max([begin_s, *(span.from_s for span in spans)])
+        last = max(range(len(found)), key=lambda i: spans[i].from_s, default=0)
+        if at_s >= min((span.until_s for span in spans), default=NEVER_S):
+            at_s = NEVER_S
+        by = found[last][1] if found else None
+        return Moment(at_s, by, assumes)
+
+    def _begin_of_act(self, act: Element) -> Moment:
+        self._ask(act)
+        found = self.trigger(act.maybe("StartTrigger"), 0.0)
+        self._asking.pop()
+        return found
+
+    def _end(self, event: StoryEvent) -> Moment:
+        """When an event ends: that of the car ahead which brakes, when it has its speed; others at once."""
+        begin = self.begin(event)
+        speeds = [one for action in event.actions for one in action.walk() if one.tag == "SpeedAction"]
+        if not speeds or begin.at_s == NEVER_S:
+            return begin
+        if self.motion.lead not in event.actors:
+            return Moment(NEVER_S, assumes_speeds=True)  # the function moves the ego
+        change = speed_change(speeds[0], self.motion.lead_ms, self.motion.ego_ms)
+        return msgspec.structs.replace(begin, at_s=begin.at_s + change.lasts_s)
+
+    def _ask(self, element: Element) -> None:
+        if any(one is element for one in self._asking):
+            raise element.error("waits for itself", Cause.TRIGGER)
+        self._asking.append(element)
+
+    # -- conditions
+
+    def _span(self, condition: Element) -> tuple[Element, Span]:
+        """The element that says what is compared, and when the condition holds."""
+        kind = condition.one("ByValueCondition", "ByEntityCondition")
+        if kind.tag == "ByValueCondition":
+            by = _known(kind, kind, _BY_VALUE)
+            match by.tag:
+                case "SimulationTimeCondition":
+                    return by, _crossing(0.0, 1.0, by)
+                case "ParameterCondition":
+                    by.word("parameterRef")
+                    assert by.parameter is not None, "set by substituted()"
+                    return by, _constant(by.parameter, by)
+                case "VariableCondition":
+                    return by, self._variable(by)
+                case _:
+                    return by, self._state(by)
+        entities = kind.one("TriggeringEntities")
+        every = entities.choice("triggeringEntitiesRule", ("any", "all")) == "all"
+        names = [one.word("entityRef") for one in entities.every("EntityRef")]
+        by = _known(kind, kind.one("EntityCondition"), _BY_ENTITY)
+        spans = [self._of_entity(by, name) for name in names]
+        if not spans:
+            raise entities.error("no EntityRef in it")
+        assumes = any(span.assumes_speeds for span in spans)
+        pick, other = (max, min) if every else (min, max)
+        return by, Span(pick(one.from_s for one in spans), other(one.until_s for one in spans), assumes)
+
+    def _of_entity(self, by: Element, name: str) -> Span:
+        motion = self.motion
+        if by.tag in _NEVER_IN_A_DRIVE:
+            for element in by.walk():
+                element.visited = True
+                for attribute in element.attributes:
+                    element.word(attribute)
+            return _NEVER
+        if name not in (motion.ego, motion.lead):
+            raise by.error(
+                f"of {name!r}: a moment that follows from neither the ego nor the car ahead", Cause.TRIGGER
+            )
+        is_ego = name == motion.ego
+        speed_ms = motion.ego_ms if is_ego else motion.lead_ms
+        match by.tag:
+            case "TraveledDistanceCondition":
+                return _crossing(0.0, speed_ms, by, "greaterOrEqual", assumes=True)
+            case "SpeedCondition":
+                by.choice("direction", ("longitudinal",), "longitudinal")
+                return self._speed(by, speed_ms, is_ego)
+            case "AccelerationCondition":
+                by.choice("direction", ("longitudinal",), "longitudinal")
+                return _crossing(0.0, 0.0, by, assumes=True)
+            case "StandStillCondition":
+                return self._standstill(by, speed_ms, is_ego)
+            case "RelativeSpeedCondition":
+                by.choice("direction", ("longitudinal",), "longitudinal")
+                other_ms = self._other(by, is_ego)
+                return _crossing(speed_ms - other_ms, 0.0, by, assumes=True)
+            case _:
+                return self._distance(by, is_ego)
+
+    def _other(self, by: Element, is_ego: bool) -> float:
+        """Check that `by` compares with the other car; its speed."""
+        motion = self.motion
+        other = motion.lead if is_ego else motion.ego
+        if (found := by.word("entityRef")) != other or not other:
+            reason = f"to {found!r}: a moment that follows from neither the ego nor the car ahead"
+            raise by.error(reason, Cause.TRIGGER)
+        return motion.lead_ms if is_ego else motion.ego_ms
+
+    def _speed(self, by: Element, speed_ms: float, is_ego: bool) -> Span:
+        braking = self.motion.braking
+        if is_ego or braking is None:
+            return _crossing(speed_ms, 0.0, by, assumes=is_ego)
+        falling = _crossing(
+            speed_ms + braking.change.deceleration_ms2 * braking.after_s, -braking.change.deceleration_ms2, by
+        )
+        if braking.after_s <= falling.from_s <= braking.end_s:
+            return falling
+        return _crossing(speed_ms, 0.0, by)
+
+    def _standstill(self, by: Element, speed_ms: float, is_ego: bool) -> Span:
+        duration_s, braking = by.number("duration"), self.motion.braking
+        if speed_ms == 0.0:
+            return Span(duration_s, math.inf, assumes_speeds=is_ego)
+        if is_ego:
+            return _NOT_BEFORE_BRAKING
+        if braking is None or braking.change.final_ms > 0.0:
+            return _NEVER
+        return Span(braking.end_s + duration_s, math.inf)
+
+    def _distance(self, by: Element, is_ego: bool) -> Span:
+        """Conditions on the distance of the two cars, along the lane."""
+        motion = self.motion
+        holder = by
+        if by.tag == "TimeToCollisionCondition":
+            target = by.one("TimeToCollisionConditionTarget")
+            if (holder := target.maybe("EntityRef") or target) is target:
+                raise target.error(TRIGGER_UNKNOWN, Cause.TRIGGER)
+        self._other(holder, is_ego)
+        along = ("longitudinal", "euclidianDistance", "cartesianDistance")
+        if by.word("relativeDistanceType", "longitudinal") not in along:
+            raise by.wrong("relativeDistanceType", " or ".join(along), Cause.TRIGGER)
+        by.choice("coordinateSystem", ("entity", "lane", "road", "world", "trajectory"), "entity")
+        by.word("routingAlgorithm", "")  # all one on a straight road
+        if by.has("alongRoute"):
+            by.flag("alongRoute")
+        start_m = motion.gap_m if by.flag("freespace") else motion.distance_m
+        closing_ms = motion.ego_ms - motion.lead_ms
+        match by.tag:
+            case "RelativeDistanceCondition":
+                return _crossing(start_m, -closing_ms, by, assumes=True)
+            case "TimeHeadwayCondition":
+                if not is_ego or motion.ego_ms == 0.0:
+                    reason = f"allowed is the headway of {motion.ego!r}, which moves, to the car ahead"
+                    raise by.error(reason, Cause.TRIGGER)
+                return _crossing(start_m / motion.ego_ms, -closing_ms / motion.ego_ms, by, assumes=True)
+            case _:
+                if closing_ms <= 0.0:  # the gap does not close
+                    by.number("value"), by.choice("rule", (*_UPWARD, *_DOWNWARD))
+                    return _NOT_BEFORE_BRAKING
+                return _crossing(start_m / closing_ms, -1.0, by, assumes=True)
+
+    # -- what the story itself does
+
+    def _variable(self, by: Element) -> Span:
+        name, rule, limit = by.word("variableRef"), by.choice("rule", RULES), by.word("value")
+        if name not in self._variables:
+            raise by.error(f"variableRef: {name!r} is not declared")
+        held = obeys(self._variables[name], rule, limit)
+        settings = [
+            (event, action.one("SetAction", "ModifyAction"))
+            for event in self.events
+            for kind in event.actions
+            for action in kind.walk()
+            if action.tag == "VariableAction" and action.attributes.get("variableRef") == name
+        ]
+        for _, setting in settings:
+            if setting.tag == "ModifyAction":
+                raise setting.error(TRIGGER_UNKNOWN, Cause.TRIGGER)
+        changes = [
+            self.begin(event) for event, one in settings if obeys(one.word("value"), rule, limit) != held
+        ]
+        if not changes:
+            return _ALWAYS if held else _NEVER
+        first = _first(changes)
+        if held:
+            return Span(-math.inf, first.at_s, first.assumes_speeds)
+        return Span(first.at_s, math.inf, first.assumes_speeds)
+
+    def _state(self, by: Element) -> Span:
+        kind, name = by.choice("storyboardElementType", _ELEMENTS), by.word("storyboardElementRef")
+        state = by.choice("state", _STATES)
+        name = name.rpartition("::")[2]
+        events = [event for event in self.events if name in _names(event, kind)]
+        acts = [act for act in self.acts if kind == "act" and act.attributes.get("name") == name]
+        if not events and not acts:
+            raise by.error(f"storyboardElementRef: found {name!r}, no {kind} has this name")
+        if state in ("stopTransition", "skipTransition"):
+            return _NOT_BEFORE_BRAKING
+        if kind in ("event", "action") and state not in _ENDED:
+            begins = [
+                self._begin_of_act(one.act) if state == "standbyState" else self.begin(one) for one in events
+            ]
+        elif kind == "story" and state not in _ENDED:
+            begins = [Moment(0.0)]
+        elif state not in _ENDED:
+            begins = [self._begin_of_act(act) for act in (*acts, *(one.act for one in events))]
+        else:
+            ends = [self._begin_of_act(act) for act in acts] + [self._end(one) for one in events]
+            last = max(ends, key=lambda one: one.at_s)
+            return Span(last.at_s, math.inf, any(one.assumes_speeds for one in ends))
+        first = _first(begins)
+        return Span(first.at_s, math.inf, first.assumes_speeds)
+
+
+def _first(moments: Sequence[Moment]) -> Moment:
+    """The first of several moments; it assumes the speeds if another one may come before it that does."""
+    first = min(moments, key=lambda one: one.at_s)
+    assumes = any(one.assumes_speeds for one in moments)
+    return msgspec.structs.replace(first, assumes_speeds=assumes)
+
+
+def _names(event: StoryEvent, kind: str) -> list[str | None]:
+    """The names by which a condition may mean `event`, or an element of this kind around it or in it."""
+    match kind:
+        case "story":
+            elements = [event.story]
+        case "act":
+            elements = [event.act]
+        case "maneuverGroup":
+            elements = [event.group]
+        case "maneuver":
+            elements = [event.maneuver]
+        case "event":
+            elements = [event.event]
+        case _:
+            elements = [one for one in event.event.children if one.tag == "Action"]
+    return [one.attributes.get("name") for one in elements]
+
+
+def _known(kind: Element, holder: Element, tags: tuple[str, ...]) -> Element:
+    for child in (*holder.children, *kind.children):
+        if child.tag not in (*tags, "TriggeringEntities", "EntityCondition"):
+            raise child.error(TRIGGER_UNKNOWN, Cause.TRIGGER)
+    return holder.one(*tags)
+
+
+def _delayed(condition: Element, span: Span, begin_s: float) -> Span:
+    """From when to when a condition of a trigger counts, which is evaluated from `begin_s` on."""
+    edge = condition.choice("conditionEdge", _EDGES, "none")
+    delay_s = condition.number("delay", 0.0)
+    if delay_s < 0.0:
+        raise condition.wrong("delay", "0 or more")
+    from_s, until_s = max(span.from_s, begin_s), span.until_s
+    if edge in ("falling", "risingOrFalling"):
+        rises = edge == "risingOrFalling" and begin_s <= span.from_s < NEVER_S
+        at_s = span.from_s if rises else span.until_s if span.from_s < NEVER_S else NEVER_S
+        from_s, until_s = at_s if at_s >= begin_s else NEVER_S, math.inf
+    elif edge == "rising" and span.from_s < begin_s:
+        late = f"met before it is looked at, at {begin_s:g} s"
+        raise condition.error(f"{late}: with conditionEdge 'rising' it never triggers", Cause.TRIGGER)
+    return Span(from_s + delay_s, until_s + delay_s)
+
+
+def _constant(value: str, by: Element) -> Span:
+    return _ALWAYS if obeys(value, by.choice("rule", RULES), by.word("value")) else _NEVER
+
+
+def _crossing(
+    start: float, slope: float, by: Element, rule: str | None = None, *, assumes: bool = False
+) -> Span:
+    """When `start + slope t` is to the value of the condition `by` as its rule says."""
+    limit = by.number("value")
+    if rule is None:
+        rule = by.choice("rule", (*_UPWARD, *_DOWNWARD))
+    sign = 1.0 if rule in _UPWARD else -1.0
+    missing, rise = sign * (limit - start), sign * slope
+    if rise == 0.0:
+        holds = missing < 0.0 or (missing == 0.0 and rule.endswith("OrEqual"))
+        found = _ALWAYS if holds else _NEVER
+        return msgspec.structs.replace(found, assumes_speeds=assumes)
+    at_s = missing / rise
+    if rise > 0.0:
+        return Span(at_s, math.inf, assumes)
+    return Span(-math.inf, at_s, assumes)
