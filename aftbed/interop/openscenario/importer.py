@@ -21,6 +21,7 @@ against hostile XML would amount to refusing a DOCTYPE, which expat can do.
 
 import json
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -47,6 +48,7 @@ from aftbed.interop.openscenario.expression import (
 )
 from aftbed.interop.openscenario.placing import check_road, read_cars
 from aftbed.interop.openscenario.storyboard import ImportedDrive, StoryboardReader, UsedElement, set_aside
+from aftbed.interop.openscenario.timeline import Slow
 from aftbed.vehicle.plant import KMH_PER_MS
 from aftbed.vehicle.scenarios.scenario import ScenarioKeys, scenario_of
 
@@ -297,6 +299,8 @@ def _scenario_file(name: str, drive: ImportedDrive, description: str, expect: st
             if braking.change.final_ms:
                 lead["braking"]["to_kmh"] = _round(braking.change.final_ms * KMH_PER_MS)
         keys["lead"] = lead
+    if drive.slow_ends:
+        keys["ends"] = _ends(drive.slow_ends)
     keys["road"] = {"friction": drive.friction}
     keys["expect"] = {"outcome": expect}
     try:
@@ -305,6 +309,19 @@ def _scenario_file(name: str, drive: ImportedDrive, description: str, expect: st
         reason = f"the scenario would be out of range: {error}"
         raise RefusedError(f"{path}: {reason}", str(path), 0, reason, Cause.RANGE) from error
     return "".join(f"{key}: {_yaml(value)}\n" for key, value in keys.items())
+
+
+def _ends(slow_ends: Sequence[Slow]) -> dict[str, object]:
+    """Of several ends the slowest and the latest: the drive is not shorter than the file's."""
+    ends: dict[str, object] = {}
+    for key, speeds_ms in (
+        ("below_kmh", [one.below_ms for one in slow_ends if one.below_ms is not None]),
+        ("below_lead_kmh", [one.below_lead_ms for one in slow_ends if one.below_lead_ms is not None]),
+    ):
+        if speeds_ms:
+            ends[key] = _round((max if key == "below_lead_kmh" else min)(speeds_ms) * KMH_PER_MS)
+    ends["after_s"] = _round(max(one.after_s for one in slow_ends))
+    return ends
 
 
 def _round(value: float) -> float:

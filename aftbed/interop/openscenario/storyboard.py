@@ -36,6 +36,7 @@ from aftbed.interop.openscenario.timeline import (
     Braking,
     Moment,
     Motion,
+    Slow,
     StoryEvent,
     Timeline,
     never_met,
@@ -84,6 +85,7 @@ class ImportedDrive(msgspec.Struct, frozen=True):
     lead: LeadDrive | None
     friction: float
     duration_s: float
+    slow_ends: tuple[Slow, ...]
     taken: tuple[UsedElement, ...]
 
 
@@ -145,6 +147,7 @@ class StoryboardReader:
         self._places: dict[str, Element] = {}
         self._speeds: dict[str, Element] = {}
         self._gaps: dict[str, Element] = {}
+        self._slow_ends: list[Slow] = []
         self._taken: list[UsedElement] = []
 
     def read(self) -> ImportedDrive:
@@ -175,8 +178,15 @@ class StoryboardReader:
             braking = None
         if lead is not None:
             drive = LeadDrive(motion.lead, motion.gap_m, lead[1].lateral_m, motion.lead_ms, braking)
-        taken = tuple(self._taken)
-        return ImportedDrive(self._ego.name, motion.ego_ms, drive, self._friction, duration_s, taken)
+        return ImportedDrive(
+            ego=self._ego.name,
+            speed_ms=motion.ego_ms,
+            lead=drive,
+            friction=self._friction,
+            duration_s=duration_s,
+            slow_ends=tuple(self._slow_ends),
+            taken=tuple(self._taken),
+        )
 
     def _take(self, element: Element, meaning: str) -> None:
         self._taken.append(UsedElement(element.path, element.line, element.tag, meaning))
@@ -422,7 +432,12 @@ class StoryboardReader:
         earliest_s = motion.braking.end_s + AFTER_BRAKING_S if motion.braking else 0.0
         for group in stop.every("ConditionGroup") if stop else []:
             found = self._stop_of(group, timeline)
-            if found.at_s == NEVER_S:
+            if found.slow is not None and motion.lead:
+                self._slow_ends.append(found.slow)
+                self._take(
+                    group, f"the drive ends {found.slow.after_s:g} s after {_words(found.slow, motion)}"
+                )
+            elif found.at_s == NEVER_S:
                 group.ignored = "not met before the function has braked: the drive ends by itself"
             elif found.assumes_speeds and motion.lead:
                 earliest_s = max(earliest_s, found.at_s)
@@ -447,6 +462,13 @@ class StoryboardReader:
                 raise
             reason = "ends the drive at a moment that is not known; --duration says it"
             raise group.children[0].error(f"{reason} ({error.reason})", Cause.TRIGGER) from error
+
+
+def _words(slow: Slow, motion: Motion) -> str:
+    if slow.below_ms is not None:
+        return f"{motion.ego} is slower than {slow.below_ms * KMH_PER_MS:g} km/h"
+    by = f" by {slow.below_lead_ms * KMH_PER_MS:g} km/h" if slow.below_lead_ms else ""
+    return f"{motion.ego} is slower than {motion.lead}{by}"
 
 
 def idle(holder: Element) -> bool:

@@ -99,12 +99,24 @@ class StoryEvent(NamedTuple):
     actions: tuple[Element, ...]
 
 
+class Slow(msgspec.Struct, frozen=True):
+    """The ego is slower than `below_ms`, or by `below_lead_ms` slower than the car ahead, for `after_s`."""
+
+    below_ms: float | None = None
+    below_lead_ms: float | None = None
+    after_s: float = 0.0
+
+
 class Moment(msgspec.Struct, frozen=True):
-    """When something happens, by which condition, and whether both cars have to keep their speed for it."""
+    """When something happens, by which condition, and whether both cars have to keep their speed for it.
+
+    `slow`: it happens when the function has braked the ego so far.
+    """
 
     at_s: float
     condition: Element | None = None
     assumes_speeds: bool = False
+    slow: Slow | None = None
 
     @property
     def never(self) -> bool:
@@ -118,6 +130,7 @@ class Span(msgspec.Struct, frozen=True):
     from_s: float
     until_s: float
     assumes_speeds: bool = False
+    slow: Slow | None = None
 
 
 _ALWAYS: Final = Span(-math.inf, math.inf)
@@ -229,7 +242,7 @@ class Timeline:
         if at_s >= min((span.until_s for span in spans), default=NEVER_S):
             at_s = NEVER_S
         by = found[last][1] if found else None
-        return Moment(at_s, by, assumes)
+        return Moment(at_s, by, assumes, _slow(found, spans))
 
     def _begin_of_act(self, act: Element) -> Moment:
         self._ask(act)
@@ -278,6 +291,8 @@ class Timeline:
         spans = [self._of_entity(by, name) for name in names]
         if not spans:
             raise entities.error("no EntityRef in it")
+        if len(spans) == 1:
+            return by, spans[0]
         assumes = any(span.assumes_speeds for span in spans)
         pick, other = (max, min) if every else (min, max)
         return by, Span(pick(one.from_s for one in spans), other(one.until_s for one in spans), assumes)
@@ -310,7 +325,9 @@ class Timeline:
             case "RelativeSpeedCondition":
                 by.choice("direction", ("longitudinal",), "longitudinal")
                 other_ms = self._other(by, is_ego)
-                return _crossing(speed_ms - other_ms, 0.0, by, assumes=True)
+                span = _crossing(speed_ms - other_ms, 0.0, by, assumes=True)
+                slower_ms = by.number("value") * (-1.0 if is_ego else 1.0)
+                return _slowed(span, by, Slow(below_lead_ms=slower_ms), slower_ms >= 0.0, upward=not is_ego)
             case _:
                 return self._distance(by, is_ego)
 
@@ -325,8 +342,11 @@ class Timeline:
 
     def _speed(self, by: Element, speed_ms: float, is_ego: bool) -> Span:
         braking = self.motion.braking
-        if is_ego or braking is None:
-            return _crossing(speed_ms, 0.0, by, assumes=is_ego)
+        if is_ego:
+            slow = Slow(below_ms=by.number("value"))
+            return _slowed(_crossing(speed_ms, 0.0, by, assumes=True), by, slow, by.number("value") > 0.0)
+        if braking is None:
+            return _crossing(speed_ms, 0.0, by)
         falling = _crossing(
             speed_ms + braking.change.deceleration_ms2 * braking.after_s, -braking.change.deceleration_ms2, by
         )
@@ -476,6 +496,26 @@ def _delayed(condition: Element, span: Span, begin_s: float) -> Span:
         late = f"met before it is looked at, at {begin_s:g} s"
         raise condition.error(f"{late}: with conditionEdge 'rising' it never triggers", Cause.TRIGGER)
     return Span(from_s + delay_s, until_s + delay_s)
+
+
+def _slowed(span: Span, by: Element, slow: Slow, possible: bool, *, upward: bool = False) -> Span:
+    """The span, with `slow` if the condition `by` waits for the ego to become slower."""
+    if span.from_s < NEVER_S or not possible or (by.attributes.get("rule") in _UPWARD) != upward:
+        return span
+    return msgspec.structs.replace(span, slow=slow)
+
+
+def _slow(found: Sequence[tuple[Element, Element, Span]], delayed: Sequence[Span]) -> Slow | None:
+    """How slow the ego is when all conditions of a group hold, if nothing else is needed for it."""
+    slows = [(condition, span.slow) for condition, _, span in found if span.slow is not None]
+    if len(slows) != 1:
+        return None
+    condition, slow = slows[0]
+    after_s = condition.number("delay", 0.0)
+    others = [late for (_, _, span), late in zip(found, delayed, strict=True) if span.slow is None]
+    if any(one.from_s > after_s or one.until_s < NEVER_S for one in others):
+        return None
+    return msgspec.structs.replace(slow, after_s=after_s)
 
 
 def _constant(value: str, by: Element) -> Span:

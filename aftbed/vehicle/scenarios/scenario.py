@@ -40,6 +40,14 @@ class Expectation(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     stop_gap_m_min: Distance = 0.0
 
 
+class SlowEnd(msgspec.Struct, frozen=True):
+    """A drive is over `after_ms` after the ego has become slower than one of the two, m/s."""
+
+    after_ms: int
+    below_ms: float | None = None
+    below_lead_ms: float | None = None  # this much less than the car ahead
+
+
 class Scenario(msgspec.Struct, frozen=True):
     """A drive, ready for `Plant(scenario.plant)`; it ends at `duration_ms` at the latest."""
 
@@ -49,6 +57,7 @@ class Scenario(msgspec.Struct, frozen=True):
     plant: PlantSetup
     expect: Expectation
     verifies: tuple[str, ...] = ()  # requirements
+    slow_end: SlowEnd | None = None
 
 
 class EgoKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -96,6 +105,14 @@ class DriverKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     deceleration_ms2: Deceleration
 
 
+class EndsKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """As in Euro NCAP's tests, which are over when the car has become slower than the one ahead."""
+
+    below_kmh: Speed | None = None
+    below_lead_kmh: Speed | None = None
+    after_s: Duration = 1.0
+
+
 class ScenarioKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     description: str
     duration_s: Annotated[float, Meta(gt=0, le=3600)]
@@ -105,6 +122,7 @@ class ScenarioKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     road: RoadKeys = RoadKeys()
     brakes: BrakesKeys = BrakesKeys()
     driver: DriverKeys | None = None
+    ends: EndsKeys | None = None
     verifies: tuple[str, ...] = ()
 
 
@@ -124,7 +142,8 @@ def scenario_of(name: str, where: str, keys: ScenarioKeys) -> Scenario:
         check_requirements("verifies", keys.verifies)
     except ConfigError as error:
         raise ConfigError(f"{where}: {error}") from None
-    return Scenario(name, keys.description, _ms(keys.duration_s), setup, keys.expect, keys.verifies)
+    ends = _slow_end(where, keys) if keys.ends else None
+    return Scenario(name, keys.description, _ms(keys.duration_s), setup, keys.expect, keys.verifies, ends)
 
 
 def _ms(duration_s: float) -> int:
@@ -156,6 +175,22 @@ def _lead(where: str, keys: LeadKeys, ego_kmh: float) -> LeadCar:
         lateral_m=keys.lateral_m,
         cut_in=CutIn(_ms(cut_in.after_s), max(1, _ms(cut_in.over_s))) if cut_in else None,
     )
+
+
+def _slow_end(where: str, keys: ScenarioKeys) -> SlowEnd:
+    ends = keys.ends
+    assert ends is not None
+    if ends.below_kmh is None and ends.below_lead_kmh is None:
+        raise ConfigError(f"{where}: ends: found none of them, allowed is below_kmh, below_lead_kmh or both")
+    if ends.below_kmh is not None and ends.below_kmh > keys.ego.speed_kmh:
+        allowed = f"allowed is at most ego.speed_kmh, {keys.ego.speed_kmh:g}"
+        raise ConfigError(f"{where}: ends.below_kmh: found {ends.below_kmh:g}, {allowed}")
+    if ends.below_lead_kmh is not None and keys.lead is None:
+        raise ConfigError(f"{where}: ends.below_lead_kmh: found without lead, allowed is below_kmh")
+    below_ms, below_lead_ms = (
+        None if kmh is None else kmh / KMH_PER_MS for kmh in (ends.below_kmh, ends.below_lead_kmh)
+    )
+    return SlowEnd(_ms(ends.after_s), below_ms, below_lead_ms)
 
 
 def _braking(where: str, keys: BrakingKeys, lead_kmh: float) -> LeadBraking:
