@@ -1,6 +1,7 @@
 """`aftbed scenario`: list, show, tables with their exit codes and documents, import, and what is refused."""
 
 import json
+import shutil
 from functools import partial
 from pathlib import Path
 
@@ -277,6 +278,66 @@ def test_import_overwrites_a_different_file_only_with_force(
     assert mine.read_text() == "mine"
     output("scenario", "import", LEAD_BRAKES, "--force")
     assert mine.read_text() != "mine"
+
+
+# -- import of a folder
+
+
+def test_a_folder_is_imported_with_a_line_for_each_file(output: Output, tmp_path: Path) -> None:
+    shutil.copytree(FOLDER, tmp_path / "found")
+    (tmp_path / "found" / "broken.xosc").write_text("<OpenSCENARIO>")
+    out = output("scenario", "import", tmp_path / "found").splitlines()
+    assert out == [
+        "refused   broken.xosc: line 1: not XML: no element found",
+        "refused   catalogs/cars.xosc: line 4: Catalog: a catalog: read where an entry of it is needed",
+        "accepted  lead_brakes.xosc: 1 scenario",
+        "accepted  lead_brakes_values.xosc: 6 scenarios",
+        "refused   slow_lead.xosc: line 16: Entities: which vehicle is the ego? --ego NAME says it"
+        " (one of: Host, Target)",
+        "5 files: 2 accepted, 7 scenarios; 3 refused",
+        "     1  not a readable XML file",
+        "     1  a catalog, no scenario: read where an entry of it is needed",
+        "     1  a mistake in the file, or an element that is not of the standard",
+        "nothing is written: --out DIR says where to",
+    ]
+    assert not list(tmp_path.glob("**/*.yaml"))
+    document = json.loads(output("scenario", "import", tmp_path / "found", "--out", "made", "--json"))
+    assert (document["accepted"], document["refused"]) == (2, 3)
+    assert document["causes"] == {"unreadable": 1, "catalog": 1, "mistake": 1}
+    assert document["files"][0] == {
+        "file": "broken.xosc",
+        "accepted": False,
+        "reason": "not XML: no element found",
+        "line": 1,
+        "cause": "unreadable",
+        "scenarios": [],
+        "left_out": [],
+    }
+    written = [one for file in document["files"] for one in file["scenarios"]]
+    assert all(load_scenario(f"./{one['path']}") for one in written)
+    assert written[1] == {
+        "name": "lead_brakes_values-Gap-12-Deceleration-2",
+        "path": "made/lead_brakes_values-Gap-12-Deceleration-2.yaml",
+        "parameters": {"Gap": "12", "Deceleration": "2"},
+    }
+
+
+def test_a_folder_of_500_broken_files_is_refused_file_by_file(call: Call, tmp_path: Path) -> None:
+    folder = tmp_path / "broken"
+    folder.mkdir()
+    whole = LEAD_BRAKES.read_text()
+    for number in range(500):
+        (folder / f"{number:03}.xosc").write_text(whole[: 30 + number * (len(whole) - 40) // 500])
+    code, out, _ = call("scenario", "import", folder, "--json")
+    document = json.loads(out)
+    assert (code, document["accepted"], document["refused"]) == (2, 0, 500)
+    assert {file["cause"] for file in document["files"]} == {"unreadable"}
+    assert all(file["line"] and file["reason"] for file in document["files"])
+
+
+def test_a_folder_without_files_is_refused(refused: Output, tmp_path: Path) -> None:
+    (tmp_path / "nothing").mkdir()
+    assert "no .xosc file in it, or in a folder of it" in refused("scenario", "import", tmp_path / "nothing")
 
 
 EMPTY_ROAD = (

@@ -92,6 +92,13 @@ def test_a_lead_brakes_with_its_ramp_and_stops() -> None:
     assert run(plant, 2000, 0.0).lead_speed_ms == 0.0
 
 
+def test_a_lead_that_brakes_to_a_speed_keeps_it() -> None:
+    plant = Plant(PlantSetup(10.0, LeadCar(50.0, 12.0, LeadBraking(1000, 6.0, final_ms=3.0))))
+    assert run(plant, 2000, 0.0).lead_speed_ms == pytest.approx(12.0 - 6.0, abs=0.01)
+    assert run(plant, 1000, 0.0).lead_speed_ms == 3.0
+    assert run(plant, 2000, 0.0).lead_speed_ms == 3.0
+
+
 def test_a_jerk_limit_makes_the_brakes_slower() -> None:
     free, limited = (
         run(Plant(PlantSetup(20.0, brakes=Brakes(jerk_max_ms3=j))), 200, 9.0) for j in (None, 20.0)

@@ -1,0 +1,568 @@
+"""Files as they are found: Euro NCAP's, ALKS', esmini's. Each becomes the drive that it means."""
+
+import os
+from pathlib import Path
+
+import pytest
+import xoscbuilder as osc
+from xoscfiles import imported, refused
+
+from aftbed.interop.openscenario.document import Cause, RefusedError
+from aftbed.interop.openscenario.importer import ImportedFile, ImportOptions, import_scenario, write
+from aftbed.interop.openscenario.storyboard import ImportedDrive, LeadDrive
+from aftbed.runtime.sim.world import Setup, simulate
+from aftbed.vehicle.plant import Plant
+from aftbed.vehicle.scenarios.library import load_scenario
+
+_SHARED = os.environ.get("AFTBED_SHARED")
+DATA = (Path(_SHARED) if _SHARED else Path(__file__).resolve().parents[3] / "shared") / "data"
+NCAP = DATA / "osc" / "OpenSCENARIO" / "NCAP" / "AEB_C2C_2023" / "Variations"
+WORLDS = (
+    '<Environment name="Sunny"><Weather><Sun azimuth="${172*pi/180}" elevation="1"/></Weather>'
+    '</Environment><Environment name="Wet"><RoadCondition frictionScaleFactor="0.5"/></Environment>'
+)
+LOG_AND_SET = (
+    '<Maneuver name="LogAndSet"><ParameterDeclarations>'
+    '<ParameterDeclaration name="hit" parameterType="string" value="VRU"/>'
+    '<ParameterDeclaration name="egoSpeed" parameterType="double" value="0"/></ParameterDeclarations>'
+    + osc.event(
+        "AtCollision",
+        '<VariableAction variableRef="collided"><SetAction value="true"/></VariableAction>',
+        osc.by_entity('<CollisionCondition><EntityRef entityRef="$hit"/></CollisionCondition>'),
+        kind="GlobalAction",
+    )
+    + osc.event(
+        "AtSpeed",
+        '<VariableAction variableRef="reached"><SetAction value="$egoSpeed"/></VariableAction>',
+        osc.by_entity('<SpeedCondition value="${$egoSpeed*0.98}" rule="greaterThan"/>'),
+        kind="GlobalAction",
+    )
+    + "</Maneuver>"
+)
+VARIABLES = (
+    '<VariableDeclaration name="collided" variableType="boolean" value="false"/>'
+    '<VariableDeclaration name="reached" variableType="double" value="0.0"/>'
+)
+SETS_VARIABLES = osc.group(
+    None,
+    '<CatalogReference catalogName="maneuvers" entryName="LogAndSet"><ParameterAssignments>'
+    '<ParameterAssignment parameterRef="hit" value="Lead"/>'
+    '<ParameterAssignment parameterRef="egoSpeed" value="${$Ego_kph/3.6}"/>'
+    "</ParameterAssignments></CatalogReference>",
+)
+REACHED = osc.by_value('<VariableCondition variableRef="reached" rule="greaterThan" value="0"/>', delay=1)
+COLLIDED = osc.by_value('<VariableCondition variableRef="collided" rule="equalTo" value="true"/>', delay=1)
+STANDS = osc.by_entity('<StandStillCondition duration="0.1"/>', delay=1)
+IS_BRAKING = osc.by_value('<ParameterCondition parameterRef="Brakes" rule="equalTo" value="true"/>')
+TELEPORTED = osc.by_value(
+    '<StoryboardElementStateCondition storyboardElementType="maneuver" storyboardElementRef="Teleport"'
+    ' state="completeState"/>',
+    delay="$Delay",
+)
+PARAMETERS = {
+    "Ego_kph": "20",
+    "Lead_kph": "0",
+    "Final_kph": "0",
+    "Rate": "2",
+    "Headway": "12",
+    "Delay": "3",
+    "Overlap": "100",
+    "Brakes": "false",
+}
+
+
+def rear_test(
+    folder: Path, slow: str = '<SpeedCondition value="${$Lead_kph/3.6*0.8}" rule="lessThan"/>'
+) -> Path:
+    """A file in the form of Euro NCAP's rear tests: one base for standing, moving and braking targets."""
+    osc.write_catalogs(folder, maneuvers=LOG_AND_SET, worlds=WORLDS)
+    path = folder / "rear.xosc"
+    place = 'entityRef="Ego" dLane="0" offset="${($Overlap-100)*0.0171}" ds="${5*$Ego_kph/3.6}"'
+    behind = f"<RelativeLanePosition {place}/>"
+    jumps = osc.maneuver("Teleport", osc.event("Jump", osc.keeps('distance="$Headway"')))
+    slows = osc.maneuver("Brake", osc.event("Slow", osc.brakes("$Rate", "${$Final_kph/3.6}"), TELEPORTED))
+    story = osc.act("Variables", SETS_VARIABLES)
+    story += osc.act(
+        "Braking", osc.group("Lead", jumps, slows), start=osc.trigger("StartTrigger", [IS_BRAKING])
+    )
+    stop = osc.trigger("StopTrigger", [COLLIDED], [REACHED, STANDS], [REACHED, osc.by_entity(slow, delay=1)])
+    path.write_text(
+        osc.scenario(
+            init={
+                "Ego": [osc.placed(osc.lane(50)), osc.speed("${$Ego_kph/3.6}")],
+                "Lead": [osc.placed(behind), osc.speed("${$Lead_kph/3.6}")],
+            },
+            story=story,
+            stop=stop,
+            parameters=PARAMETERS,
+            variables=VARIABLES,
+            world=(
+                '<GlobalAction><EnvironmentAction><CatalogReference catalogName="worlds" entryName="Sunny"/>'
+                "</EnvironmentAction></GlobalAction>"
+            ),
+        )
+    )
+    return path
+
+
+def varied(folder: Path, **values: str) -> ImportedDrive:
+    """The only variation of the rear test with these values."""
+    path = folder / "varied.xosc"
+    path.write_text(osc.distribution("rear.xosc", **{name: [value] for name, value in values.items()}))
+    (variation,) = imported(path).variations
+    return variation.drive
+
+
+def lead_of(drive: ImportedDrive) -> LeadDrive:
+    assert drive.lead is not None
+    return drive.lead
+
+
+# -- Euro NCAP
+
+
+def test_a_standing_target(tmp_path: Path) -> None:
+    (found,) = imported(rear_test(tmp_path)).variations
+    lead = lead_of(found.drive)
+    assert lead.gap_m == pytest.approx(5 * 20 / 3.6 - osc.EGO_FRONT_M - osc.LEAD_REAR_M)
+    assert (lead.speed_ms, lead.lateral_m, lead.braking) == (0.0, 0.0, None)
+    assert found.drive.slow_ends == ()
+    assert found.drive.duration_s == 30
+
+
+def test_a_moving_target_ends_the_drive_when_the_car_is_slower(tmp_path: Path) -> None:
+    rear_test(tmp_path)
+    drive = varied(tmp_path, Ego_kph="50", Lead_kph="20")
+    assert lead_of(drive).speed_ms == pytest.approx(20 / 3.6)
+    (end,) = drive.slow_ends
+    assert (end.below_ms, end.after_s) == (pytest.approx(16 / 3.6), 1.0)
+
+
+def test_a_braking_target_jumps_to_its_headway_and_rolls_on(tmp_path: Path) -> None:
+    rear_test(tmp_path)
+    drive = varied(
+        tmp_path, Ego_kph="50", Lead_kph="50", Final_kph="2", Brakes="true", Headway="40", Rate="6"
+    )
+    lead = lead_of(drive)
+    assert lead.gap_m == pytest.approx(40)
+    assert lead.braking is not None
+    assert lead.braking.after_s == 3.0
+    assert lead.braking.change.deceleration_ms2 == 6.0
+    assert lead.braking.change.final_ms == pytest.approx(2 / 3.6)
+
+
+def test_the_end_relative_to_the_target(tmp_path: Path) -> None:
+    rear_test(tmp_path, '<RelativeSpeedCondition entityRef="Lead" value="-1" rule="lessThan"/>')
+    drive = varied(tmp_path, Ego_kph="50", Lead_kph="50", Brakes="true")
+    (end,) = drive.slow_ends
+    assert (end.below_ms, end.below_lead_ms) == (None, 1.0)
+
+
+@pytest.mark.parametrize(("overlap", "lateral_m"), [("100", 0.0), ("50", -0.855), ("-50", -2.565)])
+def test_an_overlap_is_an_offset(overlap: str, lateral_m: float, tmp_path: Path) -> None:
+    rear_test(tmp_path)
+    drive = varied(tmp_path, Ego_kph="50", Overlap=overlap)
+    if abs(lateral_m) < 1.8:
+        assert lead_of(drive).lateral_m == pytest.approx(lateral_m)
+    else:
+        assert drive.lead is None, "beside the ego's line"
+
+
+def test_a_wet_road_of_a_catalog(tmp_path: Path) -> None:
+    path = rear_test(tmp_path)
+    path.write_text(path.read_text().replace('entryName="Sunny"', 'entryName="Wet"'))
+    assert imported(path).variations[0].drive.friction == 0.45
+
+
+@pytest.mark.parametrize(
+    ("row", "values"),
+    [
+        ("ncap:ccrs-50", {"Ego_kph": "50"}),
+        ("ncap:ccrm-80", {"Ego_kph": "80", "Lead_kph": "20"}),
+        (
+            "ncap:ccrb-12m-6-50",
+            {"Ego_kph": "50", "Lead_kph": "50", "Final_kph": "2", "Brakes": "true", "Rate": "6"},
+        ),
+    ],
+)
+def test_the_impact_is_that_of_the_row_of_our_table(row: str, values: dict[str, str], tmp_path: Path) -> None:
+    """Within 0.5 km/h, with the function and without it."""
+    rear_test(tmp_path)
+    path = tmp_path / "varied.xosc"
+    path.write_text(osc.distribution("rear.xosc", **{name: [value] for name, value in values.items()}))
+    (written,) = write(imported(path), tmp_path, force=True)
+    impacts, unbraked = zip(*(_impacts(name) for name in (row, str(written))), strict=True)
+    assert impacts[1] == pytest.approx(impacts[0], abs=0.5)
+    assert unbraked[1] == pytest.approx(unbraked[0], abs=0.5)
+    assert unbraked[0] > 10.0
+
+
+def _impacts(name: str) -> tuple[float, float]:
+    """The speeds at impact, km/h, of the drive and of a car that does not brake."""
+    result = simulate(Setup("none", seed=1, scenario=name)).vehicle
+    assert result is not None
+    plant = Plant(load_scenario(name).plant)
+    while not plant.collided:
+        plant.step(0.0)
+    return result.impact_speed_kmh or 0.0, plant.result().impact_speed_kmh or 0.0
+
+
+@pytest.mark.skipif(not NCAP.is_dir(), reason="the files of others are not at hand")
+def test_the_real_files_of_euro_ncap() -> None:
+    counts = {}
+    for path in sorted(NCAP.glob("*CCR*.xosc")):
+        found = imported(path)
+        assert not found.left_out
+        counts[path.stem] = len(found.variations)
+    assert sorted(counts.values()) == [1, 1, 1, 4, 30, 45, 55]
+
+
+# -- ALKS
+
+
+ALKS_CONTROLLER = (
+    "<ObjectController>"
+    '<CatalogReference catalogName="ControllerCatalog" entryName="ALKS"/></ObjectController>'
+)
+ACTIVATES = osc.act(
+    "Activate",
+    osc.group(
+        "Ego",
+        osc.maneuver(
+            "Activate",
+            osc.event(
+                "Activate",
+                "<ControllerAction>"
+                '<ActivateControllerAction lateral="true" longitudinal="true"/></ControllerAction>',
+                osc.after(10000),
+            ),
+        ),
+    ),
+    start=osc.trigger("StartTrigger", [osc.after(0)]),
+)
+
+
+def test_free_driving_needs_no_catalog_and_no_straight_road(tmp_path: Path) -> None:
+    (tmp_path / "road.xodr").write_text(osc.road('<arc curvature="0.01"/>'))
+    path = tmp_path / "free.xosc"
+    path.write_text(
+        osc.scenario(
+            init={"Ego": [osc.placed(osc.lane(5, lane_id="-4")), osc.speed(16.67)]},
+            story=ACTIVATES,
+            stop=osc.trigger("StopTrigger", [osc.after(300)]),
+            objects=ALKS_CONTROLLER,
+        )
+    )
+    (found,) = imported(path).variations
+    assert found.drive.lead is None
+    assert found.drive.duration_s == 300
+
+
+def test_a_fully_blocking_target_on_each_road_that_is_straight(tmp_path: Path) -> None:
+    osc.write_catalogs(tmp_path)
+    (tmp_path / "straight.xodr").write_text(osc.road("<line/>"))
+    (tmp_path / "bend.xodr").write_text(osc.road('<arc curvature="0.004"/>'))
+    parameters = {"Road": "straight.xodr", "Kph": "60", "Catalog": "people", "Model": "walker", "S": "500"}
+    (tmp_path / "blocking.xosc").write_text(
+        osc.scenario(
+            init={
+                "Ego": [osc.placed(osc.lane(5)), osc.speed("${$Kph / 3.6}")],
+                "Lead": [osc.placed(osc.lane("$S"))],
+            },
+            entries={"Lead": ("$Catalog", "$Model")},
+            story=ACTIVATES,
+            stop=osc.trigger("StopTrigger", [osc.after("${($S / ($Kph / 3.6)) + 10.0}")]),
+            parameters=parameters,
+            objects=ALKS_CONTROLLER,
+        )
+    )
+    path = tmp_path / "all.xosc"
+    path.write_text(osc.distribution("blocking.xosc", Road=["bend.xodr", "straight.xodr"], Kph=["30", "60"]))
+    found = imported(path)
+    assert [one.name for one in found.variations] == [
+        "all-Road-straight.xodr-Kph-30",
+        "all-Road-straight.xodr-Kph-60",
+    ]
+    assert [(one.parameters["Kph"], one.reason) for one in found.left_out] == [
+        ("30", "arc: a curve; the road has to be straight"),
+        ("60", "arc: a curve; the road has to be straight"),
+    ]
+    drive = found.variations[1].drive
+    assert lead_of(drive).gap_m == pytest.approx(495 - osc.EGO_FRONT_M - (0.2 - 0.1))
+    assert drive.duration_s == pytest.approx(500 / (60 / 3.6) + 10)
+
+
+def test_a_lead_that_starts_a_time_ahead_and_a_drive_that_ends_after_it_stands(tmp_path: Path) -> None:
+    osc.write_catalogs(tmp_path)
+    path = tmp_path / "follow.xosc"
+    ended = (
+        '<StoryboardElementStateCondition storyboardElementType="action" storyboardElementRef="BrakeAction"'
+        ' state="completeState"/>'
+    )
+    place = '<RelativeLanePosition entityRef="Ego" dLane="0" ds="38"/>'
+    brake = osc.event("Brake", osc.brakes(5), osc.after(10))
+    path.write_text(
+        osc.scenario(
+            init={
+                "Ego": [osc.placed(osc.lane(5)), osc.speed(15)],
+                "Lead": [osc.placed(place), osc.speed(15), osc.keeps('timeGap="2"')],
+            },
+            story=ACTIVATES + osc.act("Act", osc.group("Lead", osc.maneuver("Brake", brake))),
+            stop=osc.trigger("StopTrigger", [osc.by_value(ended, delay=10, edge="rising")]),
+        )
+    )
+    (found,) = imported(path).variations
+    assert lead_of(found.drive).gap_m == pytest.approx(30)
+    assert found.drive.duration_s == pytest.approx(10 + 15 / 5 + 10)
+
+
+# -- esmini
+
+
+def test_what_brakes_the_ego_is_replaced_by_the_function(tmp_path: Path) -> None:
+    osc.write_catalogs(tmp_path)
+    path = tmp_path / "slow.xosc"
+    ttc = (
+        '<TimeToCollisionCondition value="2.7" freespace="false" alongRoute="true" rule="lessThan">'
+        '<TimeToCollisionConditionTarget><EntityRef entityRef="Lead"/></TimeToCollisionConditionTarget>'
+        "</TimeToCollisionCondition>"
+    )
+    brake = osc.event("Brake", osc.brakes(-6), osc.by_entity(ttc, edge="rising"))
+    slower = osc.by_entity('<RelativeSpeedCondition rule="lessThan" value="0" entityRef="Lead"/>', delay=4)
+    path.write_text(
+        osc.scenario(
+            init={
+                "Ego": [osc.placed(osc.lane(50)), osc.speed(30)],
+                "Lead": [osc.placed(osc.lane(200)), osc.speed(1)],
+            },
+            story=osc.act(
+                "Act",
+                osc.group("Ego", osc.maneuver("Brake", brake)),
+                start=osc.trigger("StartTrigger", [osc.after(0)]),
+            ),
+            stop=osc.trigger("StopTrigger", [slower]),
+        )
+    )
+    found = imported(path)
+    assert ("LongitudinalAction", "aftbed's function takes its place") in [
+        (one.element, one.reason) for one in found.ignored
+    ]
+    (end,) = found.variations[0].drive.slow_ends
+    assert (end.below_lead_ms, end.after_s) == (0.0, 4.0)
+
+
+def test_cars_that_are_not_in_the_way_do_not_matter(tmp_path: Path) -> None:
+    osc.write_catalogs(tmp_path)
+    path = tmp_path / "many.xosc"
+    init = {
+        "Ego": [osc.placed(osc.lane(50)), osc.speed(20)],
+        "Behind": [osc.placed(osc.lane(20)), osc.speed(20)],
+        "Left": [osc.placed(osc.lane(80, lane_id="-2")), osc.speed(25)],
+        "Lead": [osc.placed(osc.lane(100)), osc.speed(10)],
+    }
+    entries = dict.fromkeys(("Behind", "Left", "Second"), ("cars", "target"))
+    path.write_text(osc.scenario(init=init, entries=entries))
+    found = imported(path)
+    assert lead_of(found.variations[0].drive).name == "Lead"
+    reasons = {one.reason for one in found.ignored}
+    assert "Behind does not matter: it is behind the ego" in reasons
+    assert "Left does not matter: it is in another lane than the ego" in reasons
+    init["Second"] = [osc.placed(osc.lane(150)), osc.speed(10)]
+    path.write_text(osc.scenario(init=init, entries=entries))
+    assert "'Lead' and 'Second' are both in the ego's lane" in refused(path)
+
+
+# -- what can never start, and what a condition makes of it
+
+
+def braking_file(
+    folder: Path, *conditions: str, start: str = "", variables: str = "", story: str = ""
+) -> Path:
+    """The lead drives at 10 m/s, as the ego does, and brakes on these conditions."""
+    osc.write_catalogs(folder)
+    path = folder / "brakes.xosc"
+    brake = osc.event("Brake", osc.brakes(5), *conditions)
+    path.write_text(
+        osc.scenario(
+            init={
+                "Ego": [osc.placed(osc.lane(0)), osc.speed(10)],
+                "Lead": [osc.placed(osc.lane(50)), osc.speed(10)],
+            },
+            story=osc.act("Act", osc.group("Lead", osc.maneuver("Brake", brake)), start=start) + story,
+            parameters={"Brakes": "false"},
+            variables=variables,
+        )
+    )
+    return path
+
+
+def after_s(path: Path) -> float | None:
+    braking = lead_of(imported(path).variations[0].drive).braking
+    return braking.after_s if braking else None
+
+
+def test_an_act_that_can_never_start_may_hold_anything(tmp_path: Path) -> None:
+    never = osc.trigger("StartTrigger", [IS_BRAKING, osc.after(1)])
+    lateral = osc.event("Swerve", "<LateralAction><LaneChangeAction/></LateralAction>")
+    path = braking_file(
+        tmp_path,
+        osc.after(2),
+        story=osc.act("Never", osc.group("Lead", osc.maneuver("Swerve", lateral)), start=never),
+    )
+    assert after_s(path) == 2.0
+    path.write_text(
+        path.read_text().replace(
+            'name="Brakes" parameterType="string" value="false"',
+            'name="Brakes" parameterType="string" value="true"',
+        )
+    )
+    with pytest.raises(RefusedError) as error:
+        imported(path)
+    assert error.value.cause is Cause.LATERAL
+
+
+def sets(name: str, value: str, at_s: float) -> str:
+    """An act that sets a variable."""
+    setting = f'<VariableAction variableRef="{name}"><SetAction value="{value}"/></VariableAction>'
+    one = osc.event(f"Set{name}{value}", setting, osc.after(at_s), kind="GlobalAction")
+    return osc.act("Sets", osc.group(None, osc.maneuver("Sets", one)))
+
+
+def time_below(seconds: float) -> str:
+    return osc.by_value(f'<SimulationTimeCondition value="{seconds}" rule="lessThan"/>')
+
+
+IS_GO = osc.by_value('<VariableCondition variableRef="go" rule="equalTo" value="1"/>')
+GO = '<VariableDeclaration name="go" variableType="int" value="0"/>'
+
+
+@pytest.mark.parametrize(
+    ("conditions", "story", "expected_s"),
+    [
+        ([osc.after(2), osc.after(5)], "", 5.0),  # all of a group
+        ([osc.after(2), time_below(3)], "", 2.0),
+        ([osc.after(4), time_below(3)], "", None),
+        ([osc.by_value('<SimulationTimeCondition value="3" rule="lessThan"/>', edge="falling")], "", 3.0),
+        (
+            [osc.by_value('<SimulationTimeCondition value="3" rule="greaterThan"/>', edge="risingOrFalling")],
+            "",
+            3.0,
+        ),
+        ([osc.by_value('<SimulationTimeCondition value="3" rule="greaterThan"/>', edge="falling")], "", None),
+        ([IS_GO], sets("go", "1", 7), 7.0),
+        ([IS_GO], sets("go", "2", 7), None),
+        ([IS_GO], "", None),
+        ([osc.by_entity('<SpeedCondition value="5" rule="greaterThan"/>', "Lead")], "", 0.0),
+        ([osc.by_entity('<StandStillCondition duration="1"/>', "Lead")], "", None),
+        ([osc.by_entity('<CollisionCondition><EntityRef entityRef="Lead"/></CollisionCondition>')], "", None),
+        ([osc.by_entity('<AccelerationCondition value="-1" rule="greaterThan"/>')], "", 0.0),
+    ],
+)
+def test_when_conditions_are_met(
+    conditions: list[str], story: str, expected_s: float | None, tmp_path: Path
+) -> None:
+    path = braking_file(tmp_path, *conditions, variables=GO, story=story)
+    assert after_s(path) == expected_s
+
+
+@pytest.mark.parametrize(
+    ("condition", "reason"),
+    [
+        (
+            osc.by_value('<VariableCondition variableRef="stop" rule="equalTo" value="1"/>'),
+            "variableRef: 'stop' is not declared",
+        ),
+        (
+            osc.by_value(
+                '<StoryboardElementStateCondition storyboardElementType="event" storyboardElementRef="Brak"'
+                ' state="completeState"/>'
+            ),
+            "storyboardElementRef: found 'Brak', no event has this name",
+        ),
+        (
+            osc.by_value(
+                '<StoryboardElementStateCondition storyboardElementType="event" storyboardElementRef="Brake"'
+                ' state="completeState"/>'
+            ),
+            "Event: waits for itself",
+        ),
+        (osc.by_value("<UserDefinedValueCondition/>"), "UserDefinedValueCondition: a trigger whose moment"),
+        (
+            osc.by_entity('<StandStillCondition duration="1"/>'),
+            "StandStillCondition: never met while both cars keep their speed",
+        ),
+    ],
+)
+def test_a_moment_that_is_not_known_is_refused(condition: str, reason: str, tmp_path: Path) -> None:
+    assert reason in refused(braking_file(tmp_path, condition, variables=GO))
+
+
+def test_a_braking_after_the_end_of_the_drive_is_left_out(tmp_path: Path) -> None:
+    path = braking_file(tmp_path, osc.after(20))
+    found = import_scenario(path, None, ImportOptions(duration_s=10))
+    assert lead_of(found.variations[0].drive).braking is None
+    meanings = [one.meaning for one in found.taken]
+    assert "Lead would brake at 20 s: the drive has ended by then" in meanings
+
+
+def test_a_drive_without_an_end_lasts_until_the_lead_has_braked(tmp_path: Path) -> None:
+    assert drive_of(braking_file(tmp_path, osc.after(40))).duration_s == 40 + 10 / 5 + 10
+
+
+def drive_of(path: Path) -> ImportedDrive:
+    (found,) = imported(path).variations
+    return found.drive
+
+
+# -- catalogs
+
+
+def test_a_broken_catalog_beside_the_one_that_is_needed(tmp_path: Path) -> None:
+    path = braking_file(tmp_path, osc.after(2))
+    (tmp_path / "cars" / "another.xosc").write_text("<OpenSCENARIO>")
+    assert after_s(path) == 2.0
+    (tmp_path / "cars" / "cars.xosc").unlink()
+    assert f"{tmp_path / 'cars' / 'another.xosc'}: line 1: not XML" in refused(path)
+
+
+def test_a_trailer_is_refused_where_there_is_one(tmp_path: Path) -> None:
+    path = braking_file(tmp_path, osc.after(2))
+    cars = tmp_path / "cars" / "cars.xosc"
+    cars.write_text(
+        cars.read_text().replace('<TrailerRef entityRef=""/>', '<TrailerRef entityRef="caravan"/>')
+    )
+    assert "Trailer: a trailer; one car ahead is all there is" in refused(path)
+
+
+def test_the_cars_would_touch_where_those_of_a_drive_do_not(tmp_path: Path) -> None:
+    osc.write_catalogs(tmp_path)
+    path = tmp_path / "moped.xosc"
+    init = {
+        "Ego": [osc.placed(osc.lane(0)), osc.speed(10)],
+        "Lead": [osc.placed(osc.lane(50, offset=1.5)), osc.speed(5)],
+    }
+    path.write_text(osc.scenario(init=init, entries={"Lead": ("cars", "moped")}))
+    assert "found 1.5 m beside the line of 'Ego', where these cars touch below 1.3 m" in refused(path)
+
+
+# -- variations
+
+
+def test_some_of_the_variations(tmp_path: Path) -> None:
+    rear_test(tmp_path)
+    path = tmp_path / "varied.xosc"
+    path.write_text(osc.distribution("rear.xosc", Ego_kph=["10", "20", "30"], Overlap=["100", "75"]))
+    found = _picked(path, ("Ego_kph", "20.0"), ("Ego_kph", "30"), ("Overlap", "75"))
+    assert [one.name for one in found.variations] == ["varied-Ego_kph-20", "varied-Ego_kph-30"]
+
+
+def _picked(path: Path, *pick: tuple[str, str]) -> ImportedFile:
+    return import_scenario(path, None, ImportOptions(pick=pick))
+
+
+def test_a_distribution_without_its_file(tmp_path: Path) -> None:
+    path = tmp_path / "varied.xosc"
+    path.write_text(osc.distribution("../rear.xosc", Ego_kph=["10"]))
+    with pytest.raises(RefusedError, match=r"ScenarioFile: filepath: '.*rear\.xosc' is not there") as error:
+        imported(path)
+    assert error.value.cause is Cause.MISSING
