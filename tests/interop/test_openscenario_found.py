@@ -287,6 +287,56 @@ def test_cars_that_are_not_in_the_way_do_not_matter(tmp_path: Path) -> None:
     assert "'Lead' and 'Second' are both in the ego's lane" in refused(path)
 
 
+# -- the examples of the standard
+
+
+def test_the_end_of_a_traffic_jam_with_drivers_that_nothing_activates(tmp_path: Path) -> None:
+    osc.write_catalogs(tmp_path)
+    path = tmp_path / "jam.xosc"
+    brakes = {
+        name: osc.event(
+            "Event", osc.brakes(5, 10), osc.by_entity(f'<TraveledDistanceCondition value="{m}"/>', name)
+        )
+        for name, m in (("Beside", 100), ("Lead", 200))
+    }
+    driver = '<ObjectController><Controller name="driver"/></ObjectController>'
+    text = osc.scenario(
+        init={
+            "Ego": [osc.speed(27.778), osc.placed(osc.lane(1000, lane_id="-3"))],
+            "Beside": [
+                osc.speed(20),
+                osc.placed('<RelativeLanePosition entityRef="Ego" dLane="1" ds="200" offset="0"/>'),
+            ],
+            "Lead": [
+                osc.speed(20),
+                osc.placed('<RelativeLanePosition entityRef="Ego" dLane="0" ds="150" offset="0"/>'),
+            ],
+        },
+        entries={"Beside": ("cars", "target")},
+        story="".join(
+            osc.act(
+                name,
+                osc.group(name, osc.maneuver("Maneuver", event)),
+                start=osc.trigger("StartTrigger", [osc.after(0)]),
+            )
+            for name, event in brakes.items()
+        ),
+        stop="<StopTrigger/>",
+    )
+    path.write_text(text.replace("</ScenarioObject>", f"{driver}</ScenarioObject>"))
+    (found,) = imported(path).variations
+    lead = lead_of(found.drive)
+    assert lead.name == "Lead"
+    assert lead.braking is not None
+    assert (lead.braking.after_s, lead.braking.change.final_ms) == (10.0, 10.0)
+    activates = osc.event("On", "<ActivateControllerAction/>", osc.after(1))
+    controls = osc.act("On", osc.group("Lead", osc.maneuver("On", activates)))
+    path.write_text(path.read_text().replace("</Story>", f"{controls}</Story>"))
+    with pytest.raises(RefusedError) as error:
+        imported(path)
+    assert error.value.cause is Cause.CONTROLLER
+
+
 # -- what can never start, and what a condition makes of it
 
 

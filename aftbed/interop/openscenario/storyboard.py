@@ -8,6 +8,7 @@ The friction is OpenSCENARIO's `frictionScaleFactor` times the nominal 0.9 of af
 says when an event begins. Ignored, and printed with the reason, is
 
     what brakes the ego after its start, and its controllers: aftbed's function takes their place
+    a controller of another car that nothing activates
     a car that is behind the ego, in another lane, or so far beside that it is not in the way
     an act or event that cannot start: by the parameters of the file, or for its condition
     what sets variables: it is looked at where a condition names the variable
@@ -122,6 +123,9 @@ def set_aside(root: Element, ego: str, catalogs: Catalogs, duration_s: float | N
             element.ignored = "looked at where a condition names the variable"
         elif element.attributes.get(_NAMED_BY.get(element.tag, "")) == ego:
             _replace_controllers(element)
+        elif element.tag == "ScenarioObject" and not _is_controlled(element, storyboard):
+            for controller in [one for one in element.children if one.tag == "ObjectController"]:
+                controller.ignored = "nothing activates it"
     stop = _child(storyboard, "StopTrigger")
     if duration_s is not None and stop is not None:
         stop.ignored = "the length of the drive was asked for"
@@ -575,6 +579,18 @@ def _actors(group: Element) -> tuple[str, ...]:
     """The names of those that the events of a ManeuverGroup move."""
     actors = _child(group, "Actors")
     return tuple(one.attributes.get("entityRef", "") for one in actors.children) if actors else ()
+
+
+def _is_controlled(thing: Element, storyboard: Element) -> bool:
+    """Whether the story, or Init, does something with a controller of an entity."""
+    name = thing.attributes.get("name", "")
+    return any(
+        action.tag in ("ControllerAction", "ActivateControllerAction")
+        for holder in storyboard.walk()
+        if (holder.tag == "Private" and holder.attributes.get("entityRef") == name)
+        or (holder.tag == "ManeuverGroup" and name in _actors(holder))
+        for action in holder.walk()
+    )
 
 
 def _replace_controllers(element: Element) -> None:

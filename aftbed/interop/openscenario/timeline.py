@@ -313,7 +313,7 @@ class Timeline:
         speed_ms = motion.ego_ms if is_ego else motion.lead_ms
         match by.tag:
             case "TraveledDistanceCondition":
-                return _crossing(0.0, speed_ms, by, "greaterOrEqual", assumes=True)
+                return _crossing(0.0, speed_ms, by, "greaterOrEqual", assumes=is_ego)
             case "SpeedCondition":
                 by.choice("direction", ("longitudinal",), "longitudinal")
                 return self._speed(by, speed_ms, is_ego)
