@@ -12,8 +12,9 @@ from aftbed.interop.openscenario.document import Cause, RefusedError
 from aftbed.interop.openscenario.importer import ImportedFile, ImportOptions, import_scenario, write
 from aftbed.interop.openscenario.storyboard import ImportedDrive, LeadDrive
 from aftbed.runtime.sim.world import Setup, simulate
-from aftbed.vehicle.plant import Plant
+from aftbed.vehicle.plant import LeadBraking, LeadCar, Plant
 from aftbed.vehicle.scenarios.library import load_scenario
+from aftbed.vehicle.scenarios.scenario import SlowEnd
 
 _SHARED = os.environ.get("AFTBED_SHARED")
 DATA = (Path(_SHARED) if _SHARED else Path(__file__).resolve().parents[3] / "shared") / "data"
@@ -81,6 +82,19 @@ def test_an_overlap_is_an_offset(overlap: str, lateral_m: float, tmp_path: Path)
         assert lead_of(drive).lateral_m == pytest.approx(lateral_m)
     else:
         assert drive.lead is None, "beside the ego's line"
+
+
+def test_offset_final_speed_and_end_are_in_the_scenario(tmp_path: Path) -> None:
+    rear_test(tmp_path)
+    path = tmp_path / "varied.xosc"
+    values = {"Ego_kph": "50", "Lead_kph": "50", "Final_kph": "2", "Brakes": "true", "Overlap": "50"}
+    path.write_text(osc.distribution("rear.xosc", **{name: [value] for name, value in values.items()}))
+    (written,) = write(imported(path), tmp_path, force=True)
+    scenario = load_scenario(str(written))
+    assert scenario.plant.lead == LeadCar(
+        12.0, pytest.approx(50 / 3.6), LeadBraking(3000, 2.0, 0, pytest.approx(2 / 3.6)), -0.855
+    )
+    assert scenario.slow_end == SlowEnd(1000, pytest.approx(40 / 3.6))
 
 
 def test_a_wet_road_of_a_catalog(tmp_path: Path) -> None:
@@ -417,6 +431,7 @@ GO = '<VariableDeclaration name="go" variableType="int" value="0"/>'
         ([IS_GO], sets("go", "1", 7), 7.0),
         ([IS_GO], sets("go", "2", 7), None),
         ([IS_GO], "", None),
+        ([IS_GO, osc.by_entity('<StandStillCondition duration="1"/>')], "", None),
         ([osc.by_entity('<SpeedCondition value="5" rule="greaterThan"/>', "Lead")], "", 0.0),
         ([osc.by_entity('<StandStillCondition duration="1"/>', "Lead")], "", None),
         ([osc.by_entity('<CollisionCondition><EntityRef entityRef="Lead"/></CollisionCondition>')], "", None),
