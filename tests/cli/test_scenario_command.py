@@ -335,6 +335,18 @@ def test_a_folder_of_500_broken_files_is_refused_file_by_file(call: Call, tmp_pa
     assert all(file["line"] and file["reason"] for file in document["files"])
 
 
+def test_show_says_how_a_drive_ends_and_how_far_the_car_ahead_brakes(output: Output, tmp_path: Path) -> None:
+    text = (
+        "{description: x, duration_s: 20, ego: {speed_kmh: 50}, expect: {outcome: no_collision},"
+        " lead: {gap_m: 12, speed_kmh: 50, braking: {after_s: 3, deceleration_ms2: 6, to_kmh: 2}},"
+        " ends: {below_kmh: 40, below_lead_kmh: 0, after_s: 2}}"
+    )
+    (tmp_path / "mine.yaml").write_text(text)
+    out = output("scenario", "show", "mine.yaml")
+    assert "brakes at 6 m/s2 to 2 km/h after 3 s" in out
+    assert "20 s at most, until 2 s after the car is slower than 40 km/h or slower than the car ahead" in out
+
+
 def test_a_folder_without_files_is_refused(refused: Output, tmp_path: Path) -> None:
     (tmp_path / "nothing").mkdir()
     assert "no .xosc file in it, or in a folder of it" in refused("scenario", "import", tmp_path / "nothing")
