@@ -494,6 +494,23 @@ def drive_of(path: Path) -> ImportedDrive:
     return found.drive
 
 
+def test_what_moves_no_car_that_matters_is_ignored(tmp_path: Path) -> None:
+    """A car that keeps its speed, that is seen, and signals."""
+    keeps = osc.maneuver("Keep", osc.event("Keep", osc.speed(10), osc.after(1)))
+    shown = '<VisibilityAction graphics="false" sensors="true" traffic="false"/>'
+    story = osc.act("Keep", osc.group("Lead", keeps, osc.maneuver("Show", osc.event("Show", shown))))
+    path = braking_file(tmp_path, osc.after(2), story=story)
+    signals = '<TrafficSignals><TrafficSignalController name="lights"/></TrafficSignals></RoadNetwork>'
+    path.write_text(path.read_text().replace("</RoadNetwork>", signals))
+    assert after_s(path) == 2.0
+    ignored = {one.element: one.reason for one in imported(path).ignored}
+    assert ignored["SpeedAction"] == "it is the speed that the car has"
+    assert ignored["VisibilityAction"] == "the radar sees the car"
+    assert ignored["TrafficSignals"] == "the function brakes for cars, not for signals"
+    path.write_text(path.read_text().replace('sensors="true"', 'sensors="false"'))
+    assert "VisibilityAction: a car that sensors do not see" in refused(path)
+
+
 # -- catalogs
 
 

@@ -293,7 +293,6 @@ REFUSED: Final[Mapping[str, tuple[Cause, str]]] = _by_tag(
         (Cause.ROAD_USERS, "one car ahead is all there is: no other road users or objects"): (
             "ExternalObjectReference EntitySelection TrailerAction EntityAction TrafficAction"
         ),
-        (Cause.ROAD_USERS, "traffic signals"): "TrafficSignalController InfrastructureAction",
         (
             Cause.CONTROLLER,
             "controllers: the storyboard moves the car ahead, and the function brakes the ego",
@@ -313,6 +312,7 @@ IGNORED: Final[Mapping[str, str]] = _by_tag(
         "for pictures": "SceneGraphFile UsedArea AppearanceAction",
         "aftbed has its own model of the car and its brakes": "Performance Axles TrailerHitch TrailerCoupler",
         "the radar sees through any weather, and the air stands still": "TimeOfDay Weather",
+        "the function brakes for cars, not for signals": "TrafficSignals InfrastructureAction",
         "nothing here depends on a monitor": "MonitorDeclarations SetMonitorAction",
     }
 )

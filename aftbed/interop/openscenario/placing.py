@@ -262,9 +262,6 @@ def check_road(root: Element, empty: bool) -> None:
     network = root.maybe("RoadNetwork")
     if network is None:
         return
-    signals = network.maybe("TrafficSignals")
-    if signals is not None and not signals.children:
-        signals.ignored = "there are none"
     logic = network.maybe("LogicFile")
     if logic is None:
         return

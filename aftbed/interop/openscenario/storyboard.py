@@ -121,6 +121,8 @@ def set_aside(root: Element, ego: str, catalogs: Catalogs, duration_s: float | N
                 element.ignored = IGNORED["Weather"]
         elif element.tag == "VariableAction":
             element.ignored = "looked at where a condition names the variable"
+        elif element.tag == "VisibilityAction" and element.attributes.get("sensors") in ("true", "1"):
+            element.ignored = "the radar sees the car"
         elif element.attributes.get(_NAMED_BY.get(element.tag, "")) == ego:
             _replace_controllers(element)
         elif element.tag == "ScenarioObject" and not _is_controlled(element, storyboard):
@@ -331,7 +333,11 @@ class StoryboardReader:
         timeline = timeline.with_motion(motion)
         changes = [one for one in moves if one.action.tag == "SpeedAction"]
         begins = [(one, self._begin(one.event, timeline)) for one in changes]
-        begun = [(*one, begin) for one, begin in begins if begin is not None]
+        begun = [
+            (*one, begin)
+            for one, begin in begins
+            if begin is not None and not _keeps_speed(one.action, timeline.motion)
+        ]
         _ignore_quiet(timeline, [one.event for one in moves], [event for event, _, _ in begun])
         if len(begun) > 1:
             reason = "a second action that moves a car; the car ahead brakes once"
@@ -554,6 +560,15 @@ def _with_gap(motion: Motion, name: str, action: Element) -> Motion:
     return msgspec.structs.replace(
         motion, gap_m=motion.gap_m + change_m, distance_m=motion.distance_m + change_m
     )
+
+
+def _keeps_speed(action: Element, motion: Motion) -> bool:
+    """Whether a SpeedAction leads to the speed that the car ahead has; it is marked as ignored then."""
+    kept = action.one("SpeedActionTarget").maybe("AbsoluteTargetSpeed") is not None
+    if not kept or target_speed_ms(action, motion.ego_ms) != motion.lead_ms:
+        return False
+    action.ignored = "it is the speed that the car has"
+    return True
 
 
 def _check_act_stop(act: Element, braking: Braking, timeline: Timeline) -> None:

@@ -30,6 +30,7 @@ import msgspec
 
 from aftbed.interop.openscenario.document import Cause, Element
 from aftbed.interop.openscenario.expression import RULES, Values, obeys
+from aftbed.vehicle.plant import KMH_PER_MS
 
 TRIGGER_UNKNOWN: Final = "a trigger whose moment does not follow from the start"
 NEVER_S: Final = math.inf
@@ -162,8 +163,8 @@ def speed_change(action: Element, from_ms: float, ego_ms: float) -> SpeedChange:
     if final_ms < 0.0:
         raise action.error(f"{final_ms:g} m/s, allowed is 0 or more")
     if final_ms >= from_ms:
-        reason = "the car ahead stands already" if from_ms == 0.0 else "the car ahead speeds up"
-        raise action.error(f"{reason}: allowed is braking", Cause.SPEED)
+        reason = f"the car ahead speeds up to {final_ms * KMH_PER_MS:g} km/h, allowed is braking"
+        raise action.error(reason, Cause.SPEED)
     value = abs(dynamics.number("value"))  # some files write a rate as -6
     dimension = dynamics.choice("dynamicsDimension", _DIMENSIONS)
     if value == 0.0:
