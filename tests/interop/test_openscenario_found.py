@@ -489,6 +489,29 @@ def test_a_drive_without_an_end_lasts_until_the_lead_has_braked(tmp_path: Path) 
     assert drive_of(braking_file(tmp_path, osc.after(40))).duration_s == 40 + 10 / 5 + 10
 
 
+@pytest.mark.parametrize(
+    ("limit_m", "final_ms", "lasts_s"),
+    [
+        (15, 0, 1.5),  # it drives at 10 m/s and brakes at 5 m/s2 after 2 s
+        (27.5, 0, 3.0),
+        (40, 0, 30.0),  # never: it stands after 30 m
+        (27.5 + 10, 5, 3.0 + 2.0),
+    ],
+)
+def test_what_a_car_travels_that_brakes(
+    limit_m: float, final_ms: float, lasts_s: float, tmp_path: Path
+) -> None:
+    path = braking_file(tmp_path, osc.after(2))
+    stop = osc.trigger(
+        "StopTrigger", [osc.by_entity(f'<TraveledDistanceCondition value="{limit_m}"/>', "Lead")]
+    )
+    text = path.read_text().replace(
+        '<AbsoluteTargetSpeed value="0"/>', f'<AbsoluteTargetSpeed value="{final_ms}"/>'
+    )
+    path.write_text(text.replace("</Storyboard>", f"{stop}</Storyboard>"))
+    assert drive_of(path).duration_s == pytest.approx(lasts_s)
+
+
 def drive_of(path: Path) -> ImportedDrive:
     (found,) = imported(path).variations
     return found.drive

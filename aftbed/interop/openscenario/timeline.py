@@ -4,7 +4,7 @@ Until the car ahead brakes both cars keep their speed, so each supported conditi
 constant or with a linear function of the time t, and holds over a `Span` of time:
 
     SimulationTimeCondition                    t
-    TraveledDistanceCondition                  v t
+    TraveledDistanceCondition                  v t, and of the car ahead what it travels while it brakes
     RelativeDistanceCondition                  d - (ve - vl) t
     TimeHeadwayCondition of the ego           (d - (ve - vl) t) / ve
     TimeToCollisionCondition                  (d - (ve - vl) t) / (ve - vl)
@@ -314,7 +314,7 @@ class Timeline:
         speed_ms = motion.ego_ms if is_ego else motion.lead_ms
         match by.tag:
             case "TraveledDistanceCondition":
-                return _crossing(0.0, speed_ms, by, "greaterOrEqual", assumes=is_ego)
+                return self._travelled(by, speed_ms, is_ego)
             case "SpeedCondition":
                 by.choice("direction", ("longitudinal",), "longitudinal")
                 return self._speed(by, speed_ms, is_ego)
@@ -354,6 +354,21 @@ class Timeline:
         if braking.after_s <= falling.from_s <= braking.end_s:
             return falling
         return _crossing(speed_ms, 0.0, by)
+
+    def _travelled(self, by: Element, speed_ms: float, is_ego: bool) -> Span:
+        found = _crossing(0.0, speed_ms, by, "greaterOrEqual", assumes=is_ego)
+        braking = self.motion.braking
+        if is_ego or braking is None or found.from_s <= braking.after_s:
+            return found
+        left_m, change = by.number("value") - speed_ms * braking.after_s, braking.change
+        braking_m = (speed_ms + change.final_ms) / 2.0 * change.lasts_s
+        if left_m <= braking_m:
+            root = speed_ms * speed_ms - 2.0 * change.deceleration_ms2 * left_m
+            lasts_s = (speed_ms - math.sqrt(max(0.0, root))) / change.deceleration_ms2
+            return Span(braking.after_s + lasts_s, math.inf)
+        if change.final_ms == 0.0:
+            return _NEVER
+        return Span(braking.end_s + (left_m - braking_m) / change.final_ms, math.inf)
 
     def _standstill(self, by: Element, speed_ms: float, is_ego: bool) -> Span:
         duration_s, braking = by.number("duration"), self.motion.braking
