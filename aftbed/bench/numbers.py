@@ -22,8 +22,8 @@ import msgspec
 from aftbed.bench.rounds import Ratio
 from aftbed.bench.runs import Log, run_python, tried
 from aftbed.campaign.ledger import Environment, here
-from aftbed.campaign.plan import code_version
 from aftbed.core.errors import ConfigError
+from aftbed.runtime.unix.code_version import code_version
 
 COMMAND_SECONDS_MAX: Final = 1200.0
 BEGIN, END = "<!-- numbers: begin -->", "<!-- numbers: end -->"  # of the table in a page

@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from aftbed.campaign.experiment import Experiment, Result, carry_out
-from aftbed.campaign.plan import code_version
 from aftbed.core.errors import ConfigError, HarnessError
 from aftbed.runtime.unix import linux
+from aftbed.runtime.unix.code_version import code_version
 
 if TYPE_CHECKING:
     from distributed import Client, Future

@@ -44,6 +44,8 @@ from aftbed.runtime.unix.supervisor_process import warm_up
 from aftbed.runtime.unix.trust import OWN_RUN, Trust, remember, vetted
 from aftbed.search.shrink import shrink
 from aftbed.vehicle.plant import VehicleResult
+from aftbed.vehicle.scenarios.library import load_scenario
+from aftbed.vehicle.scenarios.scenario import Scenario, broken_expectations
 
 REQUESTS_MAX: Final = 1_000_000  # of one experiment
 RATE_HZ_MAX: Final = 100_000
@@ -384,9 +386,10 @@ def _result(
         outcome = worst([outcome, "degraded"])
         reasons = (f"recovery took {recovery_ms:g} ms, {experiment.budget_ms:g} are allowed", *reasons)
     golden = golden_drive(experiment.scenario, experiment.seed) if vehicle is not None else None
-    if vehicle is not None and golden is not None and vehicle.collision and not golden.collision:
-        outcome = worst([outcome, "unavailable"])
-        reasons = (f"the car hit something at {vehicle.impact_speed_kmh} km/h", *reasons)
+    if vehicle is not None and golden is not None:
+        forbidden = forbidden_by(load_scenario(experiment.scenario), vehicle, golden)
+        outcome = worst([outcome, "unavailable"]) if forbidden else outcome
+        reasons = (*forbidden, *reasons)
     ended = all(one.outcome not in WITHOUT_END for one in verdict.adaptations)
     activated = all(f.fired for f in faults) and ended
     failed = {name for name, word in verdict.checks.items() if word == "fail" and name in UNEXCUSED}
@@ -411,7 +414,15 @@ def _result(
         gap_m=vehicle.stop_gap_m if vehicle is not None else None,
         golden_gap_m=golden.stop_gap_m if golden is not None else None,
         intervals=tuple(verdict.intervals),
-        states=states_of(record.history),
+        states=states_of(record),
+    )
+
+
+def forbidden_by(scenario: Scenario, found: VehicleResult, golden: VehicleResult) -> list[str]:
+    """What the car did that its scenario forbids, and that the golden drive did not."""
+    newly_hit = found.collision and not golden.collision
+    return (
+        broken_expectations(scenario, found) if newly_hit or not broken_expectations(scenario, golden) else []
     )
 
 

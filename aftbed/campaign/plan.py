@@ -15,14 +15,12 @@ import math
 import re
 from collections.abc import Iterator
 from fnmatch import fnmatchcase
-from functools import lru_cache
 from pathlib import Path
 from random import Random
 from typing import Final
 
 import msgspec
 
-import aftbed
 from aftbed.adapt.commands import read, scheduled
 from aftbed.adapt.suitability import remarks, unsuitable
 from aftbed.campaign.experiment import Experiment, faults_of
@@ -44,6 +42,7 @@ from aftbed.functions.source import renamed
 from aftbed.inject.memory import refuse_unsafe
 from aftbed.inject.model import parse
 from aftbed.judge.isolated import declared_by
+from aftbed.runtime.unix.code_version import code_version
 from aftbed.runtime.unix.trust import NOBODY, OWN_RUN, Trust, vetted
 from aftbed.vehicle.aeb.function import default_application
 
@@ -151,15 +150,6 @@ def _content(spec: Spec) -> bytes:
     if system.request_file and not functions[1]:
         found.update(msgspec.msgpack.encode(read_requests(Path(system.request_file)).requests))
     return found.digest()
-
-
-@lru_cache(maxsize=1)
-def code_version() -> str:
-    """The version of the package, and a digest of its code: a changed line makes it another one."""
-    home, digest = Path(aftbed.__file__).parent, hashlib.sha256()
-    for path in sorted(home.rglob("*.py")):
-        digest.update(path.relative_to(home).as_posix().encode() + path.read_bytes())
-    return f"{aftbed.__version__}+{digest.hexdigest()[:8]}"
 
 
 def strata_of(spec: Spec) -> Iterator[Stratum]:

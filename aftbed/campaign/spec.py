@@ -38,7 +38,7 @@ import msgspec
 from msgspec import Meta
 
 from aftbed.campaign.experiment import RATE_HZ_MAX, REQUESTS_MAX
-from aftbed.campaign.states import RunState
+from aftbed.campaign.states import OF_A_CAR, RunState
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.graph import PLACEMENTS
 from aftbed.core.requirements import check_requirements
@@ -237,6 +237,8 @@ def check(spec: Spec) -> None:
         if SUITABLE in spec.mechanisms:
             raise ConfigError(f"mechanisms: {SUITABLE!r} stands alone: they are all that suit the function")
     _each_known("sometimes", spec.sometimes, tuple(state.value for state in RunState))
+    if not spec.system.scenario and (of_a_car := [name for name in OF_A_CAR if name in spec.sometimes]):
+        raise ConfigError(f"sometimes: {of_a_car[0]}: no experiment has a car: add system.scenario")
     check_requirements("verifies", spec.verifies)
     _each_known("system.placements", spec.system.placements, PLACEMENTS)
     if not spec.system.placements:

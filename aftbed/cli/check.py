@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from aftbed.cli.options import Json, TrustedFolders
+from aftbed.cli.options import Html, Json, Junit, TrustedFolders, check_file
 from aftbed.cli.views import show_verdict
 from aftbed.judge.record import read_record
 from aftbed.judge.verdict import EXIT_CODES, Verdict, evidence_of, judge
@@ -15,10 +15,18 @@ from aftbed.runtime.unix.trust import Trust, trusting
 def check(
     record: Annotated[Path, typer.Argument(help="The directory of --record.")],
     trust: TrustedFolders = None,
+    junit: Junit = None,
+    html: Html = None,
     json: Json = False,
 ) -> None:
     """Judge a recorded run again."""
+    check_file("--junit", junit)
+    check_file("--html", html)
     verdict = judge_and_show(record, trusting(trust), as_json=json)
+    lines = write_junit(junit, verdict) if junit is not None else []
+    lines += write_html(html, record, verdict) if html is not None else []
+    if lines and not json:
+        print("\n".join(lines))
     raise typer.Exit(EXIT_CODES[verdict.verdict])
 
 
@@ -28,3 +36,22 @@ def judge_and_show(record: Path, trust: Trust, *, as_json: bool) -> Verdict:
     verdict = judge(found, evidence_of(found, trust=trust))
     show_verdict(verdict, as_json=as_json)
     return verdict
+
+
+def write_junit(sink: Path, verdict: Verdict) -> list[str]:
+    """Write the verdict as JUnit XML; what to tell the user. Raises ConfigError."""
+    from aftbed.interop.files import write_text_whole  # noqa: PLC0415 - only with --junit
+    from aftbed.report.junit import junit_of_run  # noqa: PLC0415 - the same: scipy
+
+    write_text_whole(sink, junit_of_run(verdict))
+    return [f"{sink}: 1 test case"]
+
+
+def write_html(sink: Path, record: Path, verdict: Verdict) -> list[str]:
+    """Write the report of the run as a page; what to tell the user. Raises ConfigError."""
+    from aftbed.interop.files import write_text_whole  # noqa: PLC0415 - only with --html
+    from aftbed.report.run_page import run_page  # noqa: PLC0415 - the same: jinja2, matplotlib
+
+    page = run_page(read_record(record), verdict)
+    write_text_whole(sink, page)
+    return [f"{sink}: {len(page.encode()) / 1e3:.0f} kB"]

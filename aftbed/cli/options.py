@@ -13,6 +13,7 @@ import msgspec
 import typer
 
 from aftbed.core.errors import ConfigError
+from aftbed.core.requirements import check_requirements
 
 SEED_MAX: Final = 2**63 - 1
 RATE_HZ_MAX: Final = 100_000.0
@@ -38,6 +39,10 @@ Tolerance = Annotated[
 Ftti = Annotated[
     str | None, typer.Option(help="Fault tolerant time interval, as 100ms: a fault handled later fails.")
 ]
+Html = Annotated[Path | None, typer.Option(help="Write a report of the run as one page to this file.")]
+Junit = Annotated[Path | None, typer.Option(help="Write the verdict to this file, as JUnit XML.")]
+VERIFIES: Final = "--verifies"
+VERIFIES_HELP: Final = "A requirement, as SG-1, that the run verifies; may be given several times."
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else.")]
 Ftm = Annotated[str, typer.Option(help="none, pbr, lfr, tr, pbr+tr, ...: aftbed ftm list.")]
 Seed = Annotated[int, typer.Option(help="Seed of all random numbers.")]
@@ -95,6 +100,13 @@ def _parameter(field: msgspec.structs.FieldInfo) -> inspect.Parameter:
 def separated(given: tuple[str, ...]) -> tuple[str, ...]:
     """The values of an option that takes several, separated by commas or given one by one."""
     return tuple(name for text in given for name in text.split(","))
+
+
+def requirements(given: tuple[str, ...]) -> tuple[str, ...]:
+    """Of `--verifies`. Raises ConfigError."""
+    names = separated(given)
+    check_requirements(VERIFIES, names)
+    return names
 
 
 def check_range(option: str, value: int, least: int, most: int) -> None:

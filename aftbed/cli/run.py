@@ -5,12 +5,15 @@ options: a module that is imported before the launch delays the first reply. Wha
 imported where it is used, and what judges is imported after the run.
 """
 
+import contextlib
 import json
 import os
+import shlex
 import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
@@ -19,15 +22,21 @@ import typer
 
 from aftbed.cli.options import (
     RATE_HZ_MAX,
+    VERIFIES,
+    VERIFIES_HELP,
     App,
     Expect,
     Ftm,
     Ftti,
+    Html,
     Json,
+    Junit,
     Requests,
     Tolerance,
+    check_file,
     check_range,
     check_seed,
+    requirements,
     takes,
 )
 from aftbed.cli.views import RunView, open_view
@@ -110,6 +119,7 @@ class RunArguments(msgspec.Struct, frozen=True):
     expect: Expect = None
     tolerance: Tolerance = None
     ftti: Ftti = None
+    verifies: Annotated[tuple[str, ...], typer.Option(VERIFIES, help=VERIFIES_HELP)] = ()
     bus_port: Annotated[int, typer.Option(help="TCP port of the bus on 127.0.0.1; 0 is any free one.")] = 0
     bus_open: Annotated[
         bool,
@@ -121,8 +131,15 @@ class RunArguments(msgspec.Struct, frozen=True):
     unsafe_memory: Annotated[
         bool, typer.Option("--unsafe-memory", help='Allow --inject "bitflip memory ...".')
     ] = False
+    web: Annotated[
+        bool, typer.Option("--web", help="Serve a page of the run on 127.0.0.1, to watch and to steer it.")
+    ] = False
+    port: Annotated[int, typer.Option(help="With --web: its TCP port; 0 is any free one.")] = 0
+    open_page: Annotated[bool, typer.Option("--open", help="With --web: open it in the browser.")] = False
     mcap: Annotated[Path | None, typer.Option(help="Write the run to this file, for Foxglove.")] = None
     trace: Annotated[Path | None, typer.Option(help="Write its nodes to this file, for Perfetto.")] = None
+    junit: Junit = None
+    html: Html = None
     json: Json = False
 
 
@@ -158,7 +175,11 @@ def execute(given: RunArguments) -> int:
     if application:
         _refuse_unsuitable(application, graph.ftm, requests, force=given.force)
     check_range("--bus-port", given.bus_port, 0, 65535)
+    verifies = requirements(given.verifies)
+    check_file("--junit", given.junit)
+    check_file("--html", given.html)
     write_files = _files(given)
+    page = _page(given)
     options, listener = options_for(
         ftm=given.ftm,
         placement=given.placement,
@@ -173,13 +194,17 @@ def execute(given: RunArguments) -> int:
         bus_open=given.bus_open,
         application=application,
         ftti_ms=ftti_ms,
+        verifies=verifies,
+        command=shlex.join(("aftbed", *sys.argv[1:])),
+        evidence=given.junit is not None,
     )
     launched = launch(options, listener, requests)
     try:
         closed = make_loop(launched) if make_loop is not None else None
-        interrupted = _follow(launched, open_view(options, quiet=given.json), closed)
+        with page(launched.private):
+            interrupted = _follow(launched, open_view(options, quiet=given.json), closed)
         launched.wait()
-        from aftbed.cli.check import judge_and_show  # noqa: PLC0415 - after the launch
+        from aftbed.cli.check import judge_and_show, write_html, write_junit  # noqa: PLC0415 - after the launch
         from aftbed.judge.verdict import EXIT_CODES, EXIT_INTERRUPTED  # noqa: PLC0415 - after the launch
         from aftbed.runtime.unix.trust import OWN_RUN, remember  # noqa: PLC0415 - after the launch
 
@@ -191,11 +216,16 @@ def execute(given: RunArguments) -> int:
             print(f"aftbed: trouble: {launched.trouble}", file=sys.stderr)
         elif verdict.verdict == "inconclusive" and not given.json:
             _show_log(launched.record / "processes.log")
-        written = write_files is None or _write(write_files, launched.record, as_json=given.json)
+        writers = [partial(write_files, launched.record)] if write_files is not None else []
+        writers += [partial(write_junit, given.junit, verdict)] if given.junit is not None else []
+        writers += (
+            [partial(write_html, given.html, launched.record, verdict)] if given.html is not None else []
+        )
+        unwritten = [write for write in writers if not _written(write, as_json=given.json)]
     finally:
         launched.remove()
     code = EXIT_CODES[verdict.verdict]
-    return EXIT_INTERRUPTED if interrupted else code or (0 if written else EXIT_CODES["inconclusive"])
+    return EXIT_INTERRUPTED if interrupted else code or (EXIT_CODES["inconclusive"] if unwritten else 0)
 
 
 # -- what the options mean ------------------------------------------------------------------------
@@ -332,7 +362,7 @@ def _refuse(given: RunArguments, names: tuple[str, ...], why: str) -> None:
     """Raise ConfigError if one of these options has another value than by default."""
     used = [name for name in names if getattr(given, name) != getattr(DEFAULTS, name)]
     if used:
-        options = (f"--{name.removesuffix('_file').replace('_', '-')}" for name in used)
+        options = (f"--{name.removesuffix('_file').removesuffix('_page').replace('_', '-')}" for name in used)
         raise ConfigError(f"{why} {', '.join(options)}")
 
 
@@ -342,6 +372,24 @@ def _sent(source: "RequestSource", given: RunArguments) -> LoadRun:
         raise ConfigError(f"--rate {rate_hz}: 0 to {RATE_HZ_MAX:.0f} a second are allowed")
     expect = str(Path(given.expect).resolve()) if given.expect is not None else ""
     return LoadRun(source.count, rate_hz, source.name, expect)
+
+
+def _page(given: RunArguments) -> Callable[[Path], AbstractContextManager[None]]:
+    """What serves the page of the run in a private directory; nothing without `--web`."""
+    if not given.web:
+        _refuse(given, ("port", "open_page"), "only with --web: leave out")
+        return lambda private: contextlib.nullcontext()
+    check_range("--port", given.port, 0, 65535)
+    from aftbed.report import live_page  # noqa: PLC0415 - only with --web
+
+    listener, token = live_page.listen(given.port), live_page.new_token()
+    shown = live_page.address(listener, token)
+    print(f"page: {shown}", file=sys.stderr, flush=True)
+    if given.open_page:
+        import webbrowser  # noqa: PLC0415 - only with --open
+
+        webbrowser.open(shown)
+    return lambda private: live_page.beside(listener, private, token)
 
 
 # -- while it runs --------------------------------------------------------------------------------
@@ -409,10 +457,10 @@ def _files(given: RunArguments) -> Callable[[Path], list[str]] | None:
     return lambda record: export(read_record(record), files)
 
 
-def _write(write_files: Callable[[Path], list[str]], record: Path, *, as_json: bool) -> bool:
+def _written(write: Callable[[], list[str]], *, as_json: bool) -> bool:
     """False if a file could not be written. The verdict is printed all the same."""
     try:
-        lines = write_files(record)
+        lines = write()
     except ConfigError as error:
         print(f"aftbed: trouble: {error}", file=sys.stderr)
         return False

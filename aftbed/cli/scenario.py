@@ -9,7 +9,7 @@ from typing import Annotated, Final
 import typer
 
 from aftbed.cli.lazy import CommandTable, group_of
-from aftbed.cli.options import Ftm, Json, Seed, print_json
+from aftbed.cli.options import VERIFIES, VERIFIES_HELP, Ftm, Json, Junit, Seed, print_json
 from aftbed.cli.run import Pace, Placement, RunArguments, execute
 from aftbed.vehicle.plant import KMH_PER_MS, LeadCar
 from aftbed.vehicle.scenarios import tables
@@ -153,6 +153,8 @@ def run(
     faults: Annotated[
         list[str] | None, typer.Option("--inject", help='E.g. "crash primary at server.enter nth 100".')
     ] = None,
+    verifies: Annotated[list[str] | None, typer.Option(VERIFIES, help=VERIFIES_HELP)] = None,
+    junit: Junit = None,
     json: Json = False,
 ) -> None:
     """Drive it on real processes: `aftbed run --scenario NAME`, which has more options.
@@ -162,7 +164,15 @@ def run(
     raise typer.Exit(
         execute(
             RunArguments(
-                ftm, name, placement=placement, pace=pace, seed=seed, faults=tuple(faults or ()), json=json
+                ftm,
+                name,
+                placement=placement,
+                pace=pace,
+                seed=seed,
+                faults=tuple(faults or ()),
+                verifies=tuple(verifies or ()),
+                junit=junit,
+                json=json,
             )
         )
     )

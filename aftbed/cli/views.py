@@ -171,6 +171,8 @@ def show_verdict(verdict: "Verdict", *, as_json: bool) -> None:
         print(f"  bus        {_stranger_line(stranger)}")
     for fault in verdict.faults:
         print(shown(f"  fault      {fault.fault}: {fault.receipt.value}"))
+    if verdict.verifies:
+        print(f"  verifies   {', '.join(verdict.verifies)}")
     print("  checks     " + ", ".join(f"{name} {found}" for name, found in verdict.checks.items()))
     for reason in verdict.reasons:
         print(shown(f"  because    {reason}"))
@@ -216,6 +218,8 @@ def _show_vehicle(verdict: "Verdict") -> None:
     else:
         gap = "" if car.min_gap_m is None else f", gap {car.min_gap_m:.2f} m at least"
         print(f"  car        {'braked' if car.braked else 'never braked'}{gap}")
+    if car is not None and car.fallback_s is not None:
+        print(f"  brakes     first without a fresh request after {car.fallback_s:.2f} s")
 
 
 def _ms(value: float | None) -> str:

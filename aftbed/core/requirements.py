@@ -1,4 +1,4 @@
-"""Identifiers of the requirements that a scenario or a campaign verifies: `verifies: [SG-1, FSR-3.2]`.
+"""Identifiers of the requirements that a scenario, a campaign or a run verifies: `verifies: [SG-1, FSR-3.2]`.
 
 They go where safety cases live: into the properties of JUnit XML. So they hold no character that XML forbids,
 and no comma, at which tools split them.

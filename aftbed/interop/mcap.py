@@ -19,7 +19,6 @@ All times are on one axis, see `judge.timeline`; `run_ms` is the time of the pro
 unknown is left out of its message, because a plot has no null. The extra `mcap` brings the library.
 """
 
-import io
 from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
@@ -28,8 +27,7 @@ from typing import Annotated, Final, NamedTuple
 import msgspec
 from msgspec import UNSET, Meta, UnsetType
 
-from aftbed.core.errors import ConfigError, PeerError
-from aftbed.core.input_file import read_input
+from aftbed.core.errors import ConfigError
 from aftbed.judge.record import RunRecord
 from aftbed.judge.timeline import (
     Category,
@@ -43,11 +41,9 @@ from aftbed.judge.timeline import (
 from aftbed.runtime.unix.options import CarRun, ReplayRun
 from aftbed.runtime.unix.run_directory import BUS_NAME
 from aftbed.vehicle.aeb.messages import AebInput
-from aftbed.vehicle.can.candump import LogCounts, parse_lines
 from aftbed.vehicle.can.dbc_file import Codec, load_dbc
-from aftbed.vehicle.can.e2e import intact
+from aftbed.vehicle.can.decoded_log import decoded_log
 
-BUS_LOG_BYTES_MAX: Final = 2 << 30
 STAGES: Final = ("NONE", "WARN", "PARTIAL", "FULL")
 FALLBACKS: Final = ("NONE", "HOLD", "RELEASE", "LATCH")
 INFORMATION, WARNING = 2, 3  # levels of `/log`
@@ -247,41 +243,19 @@ def messages_of(run: RunRecord) -> Iterator[TimedMessage]:
 
 
 def _bus(path: Path, codec: Codec, *, own: bool) -> Iterator[TimedMessage]:
-    """The frames in complete lines of the log. On a bus of other ECUs only the gateway's are decoded."""
-    readable = codec.names() if own else codec.sent_by("gateway")
-    names = {codec.can_id(name): name for name in readable}
-    data_ids = {name: _data_id(codec, name) for name in readable}
+    """The frames of the log, and what those say that are whole."""
     ego_ms: float | None = None
-    try:
-        content = read_input(path, BUS_LOG_BYTES_MAX)
-    except FileNotFoundError:  # a run that ended early has no log
-        content = b""
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}") from None
-    for logged in parse_lines(io.BytesIO(content), LogCounts()):
-        t_ns, can_id, data = logged.frame.t_us * 1000, logged.frame.can_id, logged.frame.data
-        name = names.get(can_id)
-        data_id = data_ids[name] if name is not None else None
-        whole = UNSET if data_id is None else intact(data, data_id)
-        shown = UNSET if name is None else name
-        frame = CanFrame(can_id, logged.interface, len(data), data.hex().upper(), shown, whole)
-        yield TimedMessage(t_ns, "/can", frame)
-        if name is None or whole is not True:
-            continue
-        try:
-            signals = codec.decode(name, data)
-        except PeerError:
+    for one in decoded_log(path, codec, own=own):
+        frame, name = one.frame, one.name
+        shown, whole = UNSET if name is None else name, UNSET if one.whole is None else one.whole
+        data = frame.data.hex().upper()
+        can = CanFrame(frame.can_id, one.interface, len(frame.data), data, shown, whole)
+        yield TimedMessage(one.t_ns, "/can", can)
+        if name is None or (signals := one.signals) is None:
             continue
         if name == "EGO_STATE":
             ego_ms = signals["SPEED"] if signals["SPEED_VALID"] else None
-        yield from _decoded(t_ns, name, signals, ego_ms)
-
-
-def _data_id(codec: Codec, name: str) -> int | None:
-    try:
-        return codec.data_id(name)
-    except ConfigError:
-        return None
+        yield from _decoded(one.t_ns, name, signals, ego_ms)
 
 
 def _decoded(t_ns: int, name: str, signals: dict[str, float], ego_ms: float | None) -> Iterator[TimedMessage]:

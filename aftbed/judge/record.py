@@ -18,6 +18,7 @@ from aftbed.adapt.engine import DONE
 from aftbed.core.errors import ConfigError, PeerError
 from aftbed.core.input_file import open_input, read_input
 from aftbed.core.journal import Entry, EntryKind, History, Stored
+from aftbed.core.requirements import check_requirements
 from aftbed.functions.request_file import ExpectedReplies
 from aftbed.inject.model import FaultReport
 from aftbed.inject.receipts import ReceiptState
@@ -165,6 +166,7 @@ def read_record(path: Path, *, in_memory: bool = False) -> RunRecord:
     given = {key: value for key, value in about.items() if key not in BESIDE_OPTIONS}
     what = f"{path / 'run.json'}: not the options of a run"
     options = _exactly(given | {"private": "", "listener": -1}, RunOptions, what)
+    check_requirements(f"{path / 'run.json'}: verifies", options.verifies)
     try:
         started = msgspec.convert(about.get("started_ns"), int)
     except msgspec.ValidationError as error:

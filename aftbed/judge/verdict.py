@@ -79,6 +79,10 @@ class Verdict(msgspec.Struct, frozen=True):
     replay: dict[str, object] | None
     seconds: float | None
     launch_ms: float | None
+    verifies: tuple[str, ...]  # requirements
+    ftti_ms: float | None
+    command: str  # of the run, "" if another program launched it
+    code: str  # the version that ran, "" where it is not known
     policy: PolicyReport | msgspec.UnsetType | None = msgspec.UNSET  # only under a policy, as `proposals`
     proposals: list[Proposed] | msgspec.UnsetType = msgspec.UNSET
 
@@ -146,6 +150,10 @@ def judge(record: RunRecord, evidence: Evidence | None = None) -> Verdict:
         launch_ms=(
             None if record.simulated or began_ns is None else round((began_ns - record.started_ns) / 1e6, 3)
         ),
+        verifies=options.verifies,
+        ftti_ms=options.ftti_ms or None,
+        command=options.command,
+        code=options.code,
         policy=record.policy if followed else msgspec.UNSET,
         proposals=list(record.proposals) if followed else msgspec.UNSET,
     )

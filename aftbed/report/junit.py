@@ -1,4 +1,4 @@
-"""JUnit XML: what a CI shows of a campaign without knowing what a campaign is.
+"""JUnit XML: what a CI shows of a campaign, or of a run, without knowing what these are.
 
 A test suite is the campaign; a test case is a stratum, or a gate. A failure has its reason as text, and ends
 with the command that repeats the worst experiment, so that it stands in the log of a build.
@@ -10,9 +10,14 @@ A stratum fails if
 A gate fails as it does in the summary. So a campaign that fails has a failed test case, and a campaign that
 passes without unexpected outcomes has none.
 
+A run is one test case, and not one for each check: a requirement is verified by all of them together, tools
+count test cases, and which checks there are depends on what was run. A broken promise is a failure, whose
+type is the check; an inconclusive run is an error, and no evidence.
+
 The schema is `junit-10.xsd` of the Jenkins xUnit plugin, which pytest keeps to as well, in the part that the
-older `jenkins-junit.xsd` allows too. But where a campaign verifies requirements, a test case has properties:
-tools that trace requirements read them there. XML 1.0 has no control characters: they become U+FFFD.
+older `jenkins-junit.xsd` allows too. But where a campaign or a run verifies requirements, a test case has
+properties: tools that trace requirements read them there. XML 1.0 has no control characters: they become
+U+FFFD.
 """
 
 import io
@@ -22,16 +27,19 @@ from fnmatch import fnmatch
 from typing import Final
 from xml.etree import ElementTree
 
-from junitparser import Failure, JUnitXml, Properties, Property, TestCase, TestSuite
+from junitparser import Error, Failure, JUnitXml, Properties, Property, TestCase, TestSuite
 
 from aftbed.campaign.experiment import Result
 from aftbed.campaign.ledger import Ledger
-from aftbed.campaign.statistics import proportion
+from aftbed.campaign.plan import JOINED
+from aftbed.campaign.statistics import CONFIDENCE, proportion
 from aftbed.campaign.summary import NOT_ALL, GateResult, StratumSummary, Summary, confidence_of
+from aftbed.judge.verdict import Verdict
 from aftbed.report.worst import worst_of
 
 UNEXPECTED: Final = "unexpected"
 GATE: Final = "gate"
+NAMED_MAX: Final = 6  # parts of the name of a run: what was driven, the mechanism, faults, adaptations
 _NO_XML: Final = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
@@ -55,7 +63,41 @@ def junit_xml(summary: Summary, ledger: Ledger) -> str:
         cases.append(_case(f"{group}.gates", _gate_name(gate), 0.0, why))
     suite.add_testcases(cases)  # counts them
     suite.time = round(summary.seconds, 3)
-    document = JUnitXml("aftbed campaign")
+    return _document("aftbed campaign", suite)
+
+
+def junit_of_run(verdict: Verdict) -> str:
+    """The document of a single run."""
+    suite = TestSuite("run")
+    about = {
+        **{name: getattr(verdict, name) for name in ("run", "ftm", "placement", "scenario", "app", "code")},
+        "seed": str(verdict.seed),
+        "verdict": verdict.verdict,
+        **{f"check.{name}": finding for name, finding in verdict.checks.items()},
+    }
+    for name, value in about.items():
+        if value:
+            suite.add_property(name, _readable(value))
+    faults = [report.fault for report in verdict.faults]
+    what = [verdict.scenario, verdict.ftm, *faults, *(one.asked for one in verdict.adaptations)]
+    more = [f"{len(what) - NAMED_MAX} more"] if len(what) > NAMED_MAX else []
+    evidence = _evidence_of_run(verdict) if verdict.verifies else None
+    seconds = verdict.seconds or 0.0
+    case = _case("aftbed.run", JOINED.join((*what[:NAMED_MAX], *more)), seconds, None, evidence)
+    text = "\n".join((*verdict.reasons, *([verdict.command] if verdict.command else [])))
+    if verdict.verdict == "fail":
+        check = next(name for name, finding in verdict.checks.items() if finding == "fail")
+        message = next((reason for reason in verdict.reasons if reason.startswith(f"{check}:")), check)
+        case.result = [_result(Failure, check, message, text)]
+    elif verdict.verdict == "inconclusive":
+        case.result = [_result(Error, verdict.verdict, next(iter(verdict.reasons), ""), text)]
+    suite.add_testcases([case])
+    suite.time = round(seconds, 3)
+    return _document("aftbed run", suite)
+
+
+def _document(name: str, suite: TestSuite) -> str:
+    document = JUnitXml(name)
     document.add_testsuite(suite)
     document.tests, document.failures, document.errors = suite.tests, suite.failures, suite.errors
     document.time = suite.time  # its other count, `skipped`, is none of the schema's
@@ -88,6 +130,30 @@ def _evidence(stratum: StratumSummary, ledger: Ledger, results: list[Result]) ->
         "command": worst_of(results).experiment.command(),
         "code": ledger.head.code,
     }
+    return _properties_of(found)
+
+
+def _evidence_of_run(verdict: Verdict) -> Properties:
+    """What one run says about its requirements: little, as its bound tells, and nothing if inconclusive."""
+    known, bad = int(verdict.verdict != "inconclusive"), int(verdict.verdict == "fail")
+    times = [one.fhti_ms for one in verdict.intervals if one.of_fault and one.fhti_ms is not None]
+    found = {
+        "verifies": ",".join(verdict.verifies),
+        "n": str(known),
+        "failed": str(bad),
+        "bound": f"{proportion(bad, known).high:.4g}",
+        "confidence": f"{CONFIDENCE:g}",
+        "ftti_ms": f"{verdict.ftti_ms:g}" if verdict.ftti_ms else "",
+        "fhti_ms": f"{max(times):g}" if times else "",
+        "seed": str(verdict.seed),
+        "command": verdict.command,
+        "code": verdict.code,
+    }
+    return _properties_of(found)
+
+
+def _properties_of(found: Mapping[str, str]) -> Properties:
+    """Without those that are empty."""
     properties = Properties()  # type: ignore[no-untyped-call]
     for name, value in found.items():
         if value:
@@ -107,10 +173,14 @@ def _case(
         case.append(evidence)  # type: ignore[no-untyped-call]
     if why is not None:
         kind, text = why
-        failure = Failure(_readable(text.partition("\n")[0]), kind)
-        failure.text = _readable(text)
-        case.result = [failure]
+        case.result = [_result(Failure, kind, text.partition("\n")[0], text)]
     return case
+
+
+def _result(made: type[Failure] | type[Error], kind: str, message: str, text: str) -> Failure | Error:
+    result = made(_readable(message), kind)
+    result.text = _readable(text)
+    return result
 
 
 def _properties(summary: Summary, ledger: Ledger) -> dict[str, str]:

@@ -217,6 +217,32 @@ def curves(
         return drawing.svg()
 
 
+def over_time(
+    title: str, lines: Mapping[str, Points], y_name: str, marks: Sequence[tuple[float, str]] = ()
+) -> str:
+    """A line for each of `lines` that has points (s, y), and an upright line at each of `marks` (s, name)."""
+    drawn = {name: points for name, points in lines.items() if points}
+    assert drawn, "nothing to draw"
+    with _drawing(title, WIDTH, HEIGHT) as drawing:
+        axes = drawing.axes(LEFT, TOP, WIDTH - RIGHT, HEIGHT - BOTTOM)
+        ends = [x for points in drawn.values() for x in (points[0][0], points[-1][0])]
+        axes.set_xlim(min(ends), max(*ends, min(ends) + LEAST_MS))
+        axes.set_xlabel("s")
+        top = max(y for points in drawn.values() for _, y in points)
+        axes.set_ylim(
+            min(0.0, *(y for points in drawn.values() for _, y in points)), max(1.08 * top, LEAST_MS)
+        )
+        axes.set_title(y_name, loc="left", fontsize=11, color=MUTED)
+        for style, (name, points) in enumerate(drawn.items()):
+            line = drawing.line(axes, points, style)
+            drawing.tip(line, f"{name}: {points[0][1]:.3g} to {points[-1][1]:.3g} {y_name}", "line")
+        for x, name in marks:
+            drawing.tip(
+                axes.axvline(x, color=BAD, linewidth=1.5, linestyle=DOTTED), f"{x:.3f} s: {name}", "line"
+            )
+        return drawing.svg()
+
+
 def ranges(title: str, rows: Sequence[TimeRange]) -> str:
     """A bar for each range of each row, the paper's above ours."""
     assert rows, "nothing to draw"

@@ -20,15 +20,25 @@ have the same width. Bricks that share a node exchange no messages: their diagra
 
 import math
 import re
-from collections.abc import Iterable, Iterator, Sequence
-from typing import Final, NamedTuple, assert_never
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Final, NamedTuple, Self, assert_never
 
 import msgspec
 
 from aftbed.core.events import REQUEST_EVENTS, STEP_EVENTS, Event, Weight
 from aftbed.core.journal import Entry, Record
 from aftbed.ftm.compose import build
-from aftbed.judge.timeline import describe
+from aftbed.inject.model import FaultReport
+from aftbed.judge.record import RunRecord
+from aftbed.judge.timeline import (
+    ACROSS,
+    between_processes,
+    describe,
+    links_of,
+    logged_events,
+    node_journals,
+    steps_of,
+)
 from aftbed.judge.verdict import Breach
 from aftbed.runtime.sim.trace import STRUCK, Happening, LoggedLine, Sent, Trace, brief, digest, milliseconds
 
@@ -37,6 +47,10 @@ LAST: Final = 40  # lines of a listing; arrows and notes of a Mermaid diagram
 BEFORE, AFTER = 14, 30  # entries around a turning point in a space-time diagram
 KEPT_MAX: Final = 330  # entries of a space-time diagram
 
+BACK: Final = frozenset(
+    {"aft2pro", "pro2pxy", "pxy2clt", "srv2prd", "srv2aft", "srv2bfr"}
+)  # towards the client
+ACROSS_PORTS: Final = frozenset(ACROSS.values())
 _LABELLED: Final = ("roles", "adapted", "script.done")  # lines of the executive with a label in the diagram
 _FAULTS: Final = (Event.FAULT_APPLIED, Event.DETECTED_STOP, Event.FOLLOWER_DIVERGED)  # drawn as faults
 _REQUEST: Final = re.compile(r"\brequest (\d+)")
@@ -63,20 +77,38 @@ class _View(NamedTuple):
     room_px: float = 0.0
 
 
-class _Views:
-    """The entries of one trace, as they are shown."""
+class Passed(NamedTuple):
+    """Something went from one node to another over `channel`: that much a record has of a message."""
 
-    def __init__(self, trace: Trace) -> None:
+    t_ns: int
+    source: str
+    sink: str
+    channel: str
+
+
+_Shown = Happening | Passed
+
+
+class _Views:
+    """The entries of one run, as they are shown. `hosts`: by brick, the node that hosts it."""
+
+    def __init__(self, hosts: Mapping[str, str], faults: Sequence[FaultReport]) -> None:
+        self._hosts, self._faults = hosts, faults
+
+    @classmethod
+    def of(cls, trace: Trace) -> Self:
         setup = trace.run.setup
         later = [adaptation.ftm for adaptation in trace.run.adaptations]
         graphs = [trace.run.rest.graph, *(build(ftm, setup.placement) for ftm in (*later, setup.ftm))]
-        self._hosts = {b: node for graph in graphs for node, bricks in graph.nodes.items() for b in bricks}
-        self._faults = trace.run.faults
+        hosts = {b: node for graph in graphs for node, bricks in graph.nodes.items() for b in bricks}
+        return cls(hosts, trace.run.faults)
 
-    def nodes(self, one: Happening) -> tuple[str, ...]:
+    def nodes(self, one: _Shown) -> tuple[str, ...]:
         match one:
             case Sent():
                 return self._hosts.get(one.source, one.source), self._hosts.get(one.sink, one.sink)
+            case Passed():
+                return one.source, one.sink
             case Record():
                 return (one.node,)
             case LoggedLine(event=event, text=text):
@@ -84,7 +116,7 @@ class _Views:
             case _:
                 return ()
 
-    def __call__(self, one: Happening) -> _View:
+    def __call__(self, one: _Shown) -> _View:
         nodes = self.nodes(one)
         match one:
             case Sent():
@@ -93,6 +125,13 @@ class _Views:
                 text = f"{nodes[0]} to {nodes[1]}: {one.port} {message}"
                 css = one.message.TRAFFIC.value
                 return _View(nodes, columns, f"{one.port} {message}", "arrows", css, text, room_px=16)
+            case Passed():
+                columns = one.source, f"{one.channel} ->", one.sink
+                text = f"{one.source} to {one.sink}: {one.channel}"
+                css = (
+                    "reply" if one.channel in BACK else "state" if one.channel in ACROSS_PORTS else "request"
+                )
+                return _View(nodes, columns, one.channel, "arrows", css, text, room_px=16)
             case Record(event=event):
                 return self._of_record(one, event)
             case LoggedLine(event=event, text=text):
@@ -121,12 +160,12 @@ class _Views:
         return _View((one.node,), columns, full, shape, css, text, is_turn(one), 9)
 
 
-def is_turn(one: Happening) -> bool:
+def is_turn(one: _Shown) -> bool:
     turns = isinstance(one, Record) and one.event.weight is Weight.TURNING_POINT
     return turns or _is_strike(one)
 
 
-def _is_strike(one: Happening) -> bool:
+def _is_strike(one: _Shown) -> bool:
     return isinstance(one, LoggedLine) and one.event == STRUCK
 
 
@@ -139,10 +178,10 @@ def _ms(t_ns: int) -> str:
 
 def listing(trace: Trace, broken: Sequence[Breach] = (), last: int = LAST) -> str:
     """The last lines before the first of `broken` (without one: of the run), with virtual time in ms."""
-    return _lines(_Views(trace), _until(trace.happened, broken)[-last:], broken)
+    return _lines(_Views.of(trace), _until(trace.happened, broken)[-last:], broken)
 
 
-def _lines(views: _Views, shown: Iterable[Happening], broken: Sequence[Breach] = ()) -> str:
+def _lines(views: _Views, shown: Iterable[_Shown], broken: Sequence[Breach] = ()) -> str:
     rows = [(_ms(one.t_ns), *views(one).columns) for one in shown]
     widths = [max((len(row[at]) for row in rows), default=0) for at in range(3)]
     found = [
@@ -166,7 +205,7 @@ def _until(happened: Sequence[Happening], broken: Sequence[Breach]) -> Sequence[
 
 def mermaid(trace: Trace, broken: Sequence[Breach] = (), last: int = LAST) -> str:
     """The same in Mermaid: nodes are participants, faults and lines of the executive are notes."""
-    views = _Views(trace)
+    views = _Views.of(trace)
     shown = [(one.t_ns, view) for one in _until(trace.happened, broken) if (view := views(one)).note][-last:]
     names = dict.fromkeys(name for _, view in shown for name in view.nodes if name != EXECUTIVE)
     aliases = {name: f"p{number}" for number, name in enumerate(names or (EXECUTIVE,))}
@@ -240,7 +279,7 @@ class _Place(NamedTuple):
     """An entry at `x`, the number of entries left out before it, and their duration."""
 
     x: float
-    one: Happening
+    one: _Shown
     view: _View
     skipped: int
     skipped_ns: int
@@ -248,7 +287,35 @@ class _Place(NamedTuple):
 
 def space_time(trace: Trace) -> SpaceTime:
     """Lay out the turning points of a run, and the entries around them."""
-    happened, views = trace.happened, _Views(trace)
+    return _space_time(trace.happened, _Views.of(trace))
+
+
+def space_time_of(record: RunRecord) -> SpaceTime:
+    """The same of a run of real processes.
+
+    Its record has no messages: an arrow is where the next event on the path of a request was in another node.
+    """
+    steps = steps_of(record)
+    passed = [
+        Passed(step_before.t_ns, step_before.node, step.node, link.channel)
+        for link in between_processes(steps, links_of(steps))
+        for step_before, step in [(steps[link.cause], steps[link.effect])]
+    ]
+    found: list[Record | Passed | LoggedLine] = [*passed]
+    found += (one for _, _, records in node_journals(record) for one in records)
+    found += (LoggedLine(*line) for line in logged_events(record))
+    happened = [_since(one, record.started_ns) for one in found]
+    return _space_time(sorted(happened, key=lambda one: one.t_ns), _Views({}, record.faults))
+
+
+def _since(one: Record | Passed | LoggedLine, started_ns: int) -> Record | Passed | LoggedLine:
+    """With the time since the start of the run."""
+    if isinstance(one, Passed):
+        return one._replace(t_ns=one.t_ns - started_ns)
+    return msgspec.structs.replace(one, t_ns=one.t_ns - started_ns)
+
+
+def _space_time(happened: Sequence[_Shown], views: _Views) -> SpaceTime:
     kept: set[int] = set()
     for turn in [at for at, one in enumerate(happened) if is_turn(one)] or [len(happened) - 1]:
         around = range(max(0, turn - BEFORE), min(len(happened), turn + AFTER + 1))

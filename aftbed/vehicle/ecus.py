@@ -269,6 +269,7 @@ class CarBody:
         self._brake = BrakeEcu(codec, policy)
         self._still_us = 0
         self._demand_max_ms2 = 0.0
+        self._fallback_us: int | None = None
         self._warned_us: int | None = None
         self._braked_us: int | None = None  # by the function
 
@@ -306,6 +307,8 @@ class CarBody:
         """Advance by 1 ms. `report` is called each 50 ms, after the brake ECU has decided."""
         plant, brake = self.plant, self._brake
         demand_ms2 = brake.demand_ms2(plant)
+        if self._fallback_us is None and brake.fallback is not Fallback.NONE:
+            self._fallback_us = plant.t_us
         if report is not None and plant.t_us % TELEMETRY_US == 0:
             report(self.telemetry())
         if self._warned_us is None and brake.stage >= STAGE_WARN:
@@ -347,5 +350,8 @@ class CarBody:
         if self._braked_us is not None and self._warned_us is not None:
             warning_s = (self._braked_us - self._warned_us) / 1e6
         return msgspec.structs.replace(
-            self.plant.result(), warning_s=warning_s, demand_max_ms2=self._demand_max_ms2
+            self.plant.result(),
+            warning_s=warning_s,
+            demand_max_ms2=self._demand_max_ms2,
+            fallback_s=None if self._fallback_us is None else self._fallback_us / 1e6,
         )

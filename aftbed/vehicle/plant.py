@@ -12,7 +12,7 @@ from there on the road is empty. Gaps count only while the car ahead is in our w
 doubles: the same drive on every machine, bit for bit.
 
 The plant is the only source of `VehicleResult` and `Telemetry`: nothing in them comes off the bus, so a
-frame fault cannot make a collision look like a stop. Warning and demand in them are those of the
+frame fault cannot make a collision look like a stop. Warning, demand and fallback in them are those of the
 brake ECU, from the frames that it accepted.
 
 Limits: the ego keeps its lane; one target, no road gradient, no load transfer, no ABS dynamics.
@@ -31,8 +31,9 @@ class VehicleResult(msgspec.Struct, frozen=True):
 
     `warning_s` is the time from the first warning to the function's first demand for braking, however small:
     UN R152 calls every such demand emergency braking. 0.0 if the two came together, None without braking.
-    `demand_max_ms2` is the greatest demand. `braked` is true also when the driver has braked after the
-    warning.
+    `demand_max_ms2` is the greatest demand. `fallback_s` is when the brakes first had no fresh request to
+    follow, in bus time since the start; None if they always had one. `braked` is true also when the driver
+    has braked after the warning.
     """
 
     collision: bool
@@ -43,6 +44,7 @@ class VehicleResult(msgspec.Struct, frozen=True):
     braked: bool
     warning_s: float | None = None
     demand_max_ms2: float = 0.0
+    fallback_s: float | None = None
 
 
 class Telemetry(msgspec.Struct, frozen=True):

@@ -34,6 +34,11 @@ def refusal(folder: Path, text: str) -> str:
             "sometimes: [fail over]",
             r"sometimes: unknown name 'fail over'; did you mean 'failover'",
         ),
+        (
+            "seed: 3",
+            "sometimes: [failover, fallback of the brakes]",
+            r"sometimes: fallback of the brakes: no experiment has a car: add system.scenario",
+        ),
         ("seed: 3", "verifies: [SG-1, SG-1]", r"verifies\[1\]: SG-1 stands twice"),
         ("seed: 3", "seed: -1", r"line 3: seed: found -1, allowed is a whole number at least 0"),
         ("requests: 30", "requests: 30 Hz", r"line 4: system.requests: found '30 Hz', allowed is a whole"),

@@ -12,8 +12,10 @@ from aftbed.campaign.states import RunState, states_of
 from aftbed.campaign.summary import SOMETIMES, summarise
 from aftbed.core.messages import Goal, Scheduled
 from aftbed.inject.model import parse
+from aftbed.judge.simulated import record_of
 from aftbed.runtime.sim.world import Setup, simulate
 
+SILENCE = "omission bus AEB_REQ after 1s for 100ms"
 TO_TR = Scheduled(Goal(expression="pbr+tr"), at_request=20)
 
 
@@ -29,11 +31,13 @@ TO_TR = Scheduled(Goal(expression="pbr+tr"), at_request=20)
             Setup("pbr", adaptations=(TO_TR,), faults=(parse("crash primary at adapt.step.act nth 9"),)),
             {"failover", "new backup", "failover in an adaptation", "adaptation rolled back"},
         ),
+        (Setup("pbr", scenario="ccrs-20", faults=(parse(SILENCE),)), {"fallback of the brakes"}),
+        (Setup("pbr", scenario="ccrs-20"), set()),
     ],
-    ids=["none", "crash", "vote", "divergence", "adaptation", "crash in an adaptation"],
+    ids=["none", "crash", "vote", "divergence", "adaptation", "crash in an adaptation", "brakes", "drive"],
 )
-def test_the_states_of_a_run_are_read_off_its_events(setup: Setup, states: set[str]) -> None:
-    found = set(map(str, states_of(simulate(msgspec.structs.replace(setup, count=60)).history)))
+def test_the_states_of_a_run_are_read_off_its_record(setup: Setup, states: set[str]) -> None:
+    found = set(map(str, states_of(record_of(simulate(msgspec.structs.replace(setup, count=60))))))
     assert states <= found
     assert bool(found) == bool(states), "nothing happened"
 

@@ -11,7 +11,7 @@ from liveruns import Done, Home
 from liveruns import forked as aftbed
 from test_bad_input import DBC, MAP
 
-from aftbed.campaign.plan import code_version
+from aftbed.runtime.unix.code_version import code_version
 
 pytestmark = pytest.mark.process
 

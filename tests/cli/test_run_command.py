@@ -95,6 +95,24 @@ def test_the_adaptations_of_a_run_are_among_its_options(home: Home, monkeypatch:
 
 
 @pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--verifies", "SG 1"), "--verifies[0]: found 'SG 1', allowed is an identifier such as SG-1"),
+        (("--verifies", "SG-1,SG\x012"), "--verifies[1]: found 'SG\\x012', allowed is an identifier"),
+        (("--verifies", "SG-1", "--verifies", "SG-1"), "--verifies[1]: SG-1 stands twice"),
+        (("--verifies", ""), "--verifies[0]: found ''"),
+        (("--junit", "absent/j.xml"), "--junit absent/j.xml: a file in a directory that exists is allowed"),
+        (("--junit", "/"), "--junit /: a file"),
+    ],
+)
+def test_what_is_no_requirement_or_no_file_starts_nothing(
+    refused: Output, arguments: tuple[str, ...], words: str
+) -> None:
+    assert words in refused("run", "--load", "10", *arguments)
+    assert words in refused("scenario", "run", "ccrs-20", *arguments)
+
+
+@pytest.mark.parametrize(
     ("text", "words"),
     [
         ("dwell_s: 5\nrules: []\n", "rules: found 0"),

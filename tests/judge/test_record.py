@@ -3,6 +3,7 @@
 import re
 from pathlib import Path
 
+import msgspec
 import pytest
 from records import CAR, whole
 
@@ -55,6 +56,23 @@ def test_what_a_full_dialogue_has_not_seen_is_not_asked_of_a_long_record(
     )
     monkeypatch.setattr(judged, "IN_MEMORY_MAX", 0)
     assert judge(read_record(path)) == short
+
+
+def test_what_a_run_verifies_is_in_its_verdict_again(path: Path) -> None:
+    record = whole(path)
+    record.options = msgspec.structs.replace(
+        record.options, verifies=("SG-1",), ftti_ms=60.0, command="aftbed run", code="0.1.0+0badc0de"
+    )
+    verdict = record.verdict()
+    assert (verdict.verifies, verdict.ftti_ms) == (("SG-1",), 60.0)
+    assert (verdict.command, verdict.code) == ("aftbed run", "0.1.0+0badc0de")
+
+
+def test_a_requirement_that_is_none_is_refused_in_a_record(path: Path) -> None:
+    record = whole(path)
+    record.options = msgspec.structs.replace(record.options, verifies=("SG-1", "SG\x012"))
+    with pytest.raises(ConfigError, match=r"run\.json: verifies\[1\]: found 'SG\\x012', allowed is an id"):
+        record.verdict()
 
 
 def test_a_directory_that_is_no_record(tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ from finders import IN_MEMORY
 from source_mutants import MUTANTS, Finder, SourceMutant, planted
 
 from aftbed.campaign.ledger import here
-from aftbed.campaign.plan import code_version
+from aftbed.runtime.unix.code_version import code_version
 
 ROOT: Final = Path(__file__).parents[2]
 COPIED: Final = ("aftbed", "dbc", "docs", "tests", "pyproject.toml", "README.md", "CHANGELOG.md", "Makefile")

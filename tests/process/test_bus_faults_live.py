@@ -7,9 +7,11 @@ from typing import Final
 import pytest
 from liveruns import SHORT, Command, Home, Started, aftbed
 
+from aftbed.campaign.states import RunState, states_of
 from aftbed.inject.model import FaultReport
 from aftbed.inject.receipts import BusTimes, ReceiptState
 from aftbed.judge.intervals import Reaction
+from aftbed.judge.record import read_record
 from aftbed.runtime.unix.options import CarRun
 from aftbed.vehicle.can.candump import read_log
 
@@ -45,11 +47,16 @@ def test_the_end_counts_all_that_was_struck() -> None:
     )
 
 
-def test_a_silence_is_noticed_by_a_brake_that_falls_back() -> None:
-    done = aftbed("run", *DRIVE, "--inject", "omission bus AEB_REQ after 1s for 100ms")
+def test_a_silence_is_noticed_by_a_brake_that_falls_back(tmp_path: Path) -> None:
+    """The result says when, and the state of the run is that of the simulated one."""
+    words, record = "omission bus AEB_REQ after 1s for 100ms", tmp_path / "record"
+    done = aftbed("run", *DRIVE, "--inject", words, "--record", record)
     (found,) = done.verdict().faults
     detail = "5 frames, the first at 1.000000 s, id 100; noticed by brake (fallback)"
     assert (found.receipt.value, found.detail) == ("activated", detail)
+    car = done.verdict().vehicle
+    assert car is not None and car.fallback_s == 1.011, "a cycle and a half after the last request"
+    assert states_of(read_record(record)) == (RunState.FALLBACK,)
 
 
 def test_a_fault_on_a_condition_in_real_time(tmp_path: Path) -> None:

@@ -7,11 +7,13 @@ from tempfile import TemporaryDirectory
 from typing import Final
 
 import pytest
+from junitparser import JUnitXml, Properties
 from liveruns import SHORT, Done, aftbed
 from sampling import sampled
 
 from aftbed.core.journal import EntryKind
 from aftbed.judge.record import read_record
+from aftbed.runtime.unix.code_version import code_version
 from aftbed.vehicle.aeb.messages import decode_reply
 from aftbed.vehicle.scenarios.library import scenario_names
 
@@ -55,6 +57,24 @@ def test_every_scenario_comes_to_what_it_expects(scenario: str, mechanism: str) 
     assert verdict.vehicle is not None
     assert verdict.requests.answered == verdict.requests.sent > 0
     assert verdict.vehicle.braked is (scenario != "free-drive")
+
+
+def test_what_a_drive_verifies_is_written_by_the_run_and_by_check(tmp_path: Path) -> None:
+    """The requirements of the command, and those of the scenario."""
+    scenario, record = tmp_path / "verifying.yaml", tmp_path / "record"
+    scenario.write_text(f"{SHORT.read_text()}verifies: [SG-2, SG-1]\n")
+    first, again = tmp_path / "first.xml", tmp_path / "again.xml"
+    options = ("--pace", "max", "--verifies", "SG-1,FSR-3.2", "--junit", first, "--record", record)
+    verdict = passed("--scenario", scenario, *options).verdict()
+    assert verdict.verifies == ("SG-1", "FSR-3.2", "SG-2") and verdict.code == code_version()
+    assert verdict.command.startswith("aftbed run --json --scenario ") and "--verifies" in verdict.command
+    (suite,) = JUnitXml.fromfile(str(first))
+    (case,) = suite
+    found = {one.name: one.value for one in case.child(Properties)}
+    assert (found["verifies"], found["n"], found["failed"]) == ("SG-1,FSR-3.2,SG-2", "1", "0")
+    assert (found["command"], found["code"]) == (verdict.command, verdict.code)
+    assert aftbed("check", record, "--junit", again).code == 0
+    assert again.read_text() == first.read_text()
 
 
 def test_a_drive_in_real_time_passes() -> None:

@@ -240,8 +240,10 @@ def test_the_templates_are_part_of_the_package() -> None:
 
     folder = Path(package.__file__).parent / "templates"
     assert {path.name for path in folder.iterdir()} == {
-        "report.html.j2",
+        "live.html",
         "report.css",
+        "report.html.j2",
+        "run.html.j2",
         "spacetime.html.j2",
         "swatch.html.j2",
     }

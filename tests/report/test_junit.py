@@ -7,12 +7,14 @@ from xml.etree import ElementTree
 import msgspec
 from campaigns import result
 from junitparser import JUnitXml, Properties
+from records import CRASH, RecordInTheMaking, whole
 from reported import HOSTILE, hostile, named, summary_of, with_results
 
 from aftbed.campaign.experiment import Result
 from aftbed.campaign.ledger import Ledger
 from aftbed.campaign.spec import Gate
-from aftbed.report.junit import junit_xml
+from aftbed.judge.verdict import Verdict
+from aftbed.report.junit import NAMED_MAX, junit_of_run, junit_xml
 
 SCHEMA: Final = {  # what junit-10.xsd and jenkins-junit.xsd both allow: attributes needed, allowed; children
     "testsuites": ((), ("name", "time", "tests", "failures", "errors"), ("testsuite",)),
@@ -26,8 +28,9 @@ SCHEMA: Final = {  # what junit-10.xsd and jenkins-junit.xsd both allow: attribu
     "testcase": (
         ("name",),
         ("classname", "time"),
-        ("properties", "skipped", "failure", "system-out", "system-err"),
+        ("properties", "skipped", "error", "failure", "system-out", "system-err"),
     ),
+    "error": ((), ("type", "message"), ()),
     "failure": ((), ("type", "message"), ()),
 }
 
@@ -159,3 +162,83 @@ def test_it_says_its_encoding(ledger: Ledger, tmp_path: Path) -> None:
     path = tmp_path / "junit.xml"
     path.write_text(junit_xml(summary_of(ledger), ledger), encoding="utf-8")
     assert "pbr · steady · crash primary" in [c.get("name") for c in ElementTree.parse(path).iter("testcase")]
+
+
+# -- of a single run
+
+
+def case_of(verdict: Verdict) -> tuple[ElementTree.Element, dict[str, str]]:
+    """Its only test case, and the properties of it."""
+    root = ElementTree.fromstring(junit_of_run(verdict))
+    keeps_to_the_schema(root)
+    (case,) = root.iter("testcase")
+    return case, {p.get("name", ""): p.get("value", "") for p in case.iter("property")}
+
+
+def verifying(record: RecordInTheMaking, *, command: str = "aftbed run") -> RecordInTheMaking:
+    record.options = msgspec.structs.replace(
+        record.options, verifies=("SG-1", "FSR-3.2"), ftti_ms=100.0, command=command, code="0.1.0+0badc0de"
+    )
+    return record
+
+
+def test_a_run_is_one_test_case_with_its_evidence(tmp_path: Path) -> None:
+    record = verifying(whole(tmp_path / "record", faults=(CRASH,)), command="aftbed run --seed 7")
+    record.failover()
+    record.request(epoch=2, replica=2)
+    verdict = record.verdict()
+    case, found = case_of(verdict)
+    assert (case.get("name"), list(case)) == (f"load · pbr · {CRASH}", [case.find("properties")])
+    (handled,) = (one.fhti_ms for one in verdict.intervals if one.of_fault)
+    assert handled is not None
+    assert found == {
+        "verifies": "SG-1,FSR-3.2",
+        "n": "1",
+        "failed": "0",
+        "bound": "0.975",
+        "confidence": "0.95",
+        "ftti_ms": "100",
+        "fhti_ms": f"{handled:g}",
+        "seed": "7",
+        "command": "aftbed run --seed 7",
+        "code": "0.1.0+0badc0de",
+    }
+
+
+def test_a_run_that_broke_a_promise_is_a_failure_of_that_check(tmp_path: Path) -> None:
+    record = verifying(whole(tmp_path / "record"), command="aftbed run --seed 7 --verifies SG-1")
+    record.request(answers=0)
+    case, found = case_of(record.verdict())
+    failure = case.find("failure")
+    assert failure is not None and failure.get("type") == "exactly_one_answer"
+    assert failure.get("message") == "exactly_one_answer: request 4: 0 replies"
+    assert (failure.text or "").splitlines()[-1] == "aftbed run --seed 7 --verifies SG-1"
+    assert (found["n"], found["failed"], found["bound"]) == ("1", "1", "1")
+
+
+def test_an_inconclusive_run_is_an_error_and_no_evidence(tmp_path: Path) -> None:
+    record = verifying(whole(tmp_path / "record"))
+    record.end = None
+    case, found = case_of(record.verdict())
+    error = case.find("error")
+    assert error is not None and error.get("type") == "inconclusive" and case.find("failure") is None
+    assert (found["n"], found["failed"], found["bound"]) == ("0", "0", "1")
+
+
+def test_a_run_that_verifies_nothing_has_no_properties_of_its_case(tmp_path: Path) -> None:
+    case, found = case_of(whole(tmp_path / "record").verdict())
+    assert (list(case), found) == ([], {})
+
+
+def test_the_texts_of_a_run_are_text(tmp_path: Path) -> None:
+    record = verifying(whole(tmp_path / "record"), command=HOSTILE)
+    verdict = msgspec.structs.replace(record.verdict(), scenario=HOSTILE)
+    case, found = case_of(verdict)
+    assert found["command"] == HOSTILE.replace("\x01", "\ufffd")
+    assert (case.get("name") or "").startswith(HOSTILE.replace("\x01", "\ufffd"))
+
+
+def test_the_name_of_a_run_with_many_faults_is_cut(tmp_path: Path) -> None:
+    verdict = whole(tmp_path / "record", faults=(CRASH,) * 100).verdict()
+    case, _ = case_of(verdict)
+    assert (case.get("name") or "").endswith(f" · {102 - NAMED_MAX} more")

@@ -31,6 +31,7 @@ from aftbed.inject.model import Fault
 from aftbed.runtime import control
 from aftbed.runtime.unix import head_start, linux, run_directory, seal
 from aftbed.runtime.unix.cleanup import watch
+from aftbed.runtime.unix.code_version import code_version
 from aftbed.runtime.unix.journal_files import CHUNK_BYTES, trim
 from aftbed.runtime.unix.options import CarRun, LoadRun, PolicyOptions, RunOptions, Work, with_names_resolved
 from aftbed.runtime.unix.process_pool import killed_by
@@ -40,6 +41,7 @@ from aftbed.runtime.unix.transport import Line, decode_report
 
 if TYPE_CHECKING:
     from aftbed.functions.request_file import GivenRequests
+    from aftbed.vehicle.scenarios.scenario import Scenario
 
 END_SECONDS_MAX: Final = 8.0
 KILL_SECONDS_MAX: Final = 1.0
@@ -317,10 +319,17 @@ def options_for(
     bus_open: bool = False,
     application: str = "",
     ftti_ms: float = 0.0,
+    verifies: tuple[str, ...] = (),
+    command: str = "",
+    evidence: bool = False,
 ) -> tuple[RunOptions, socket.socket | None]:
-    """What a run needs; where there is a bus, its socket too. Raises ConfigError, leaving nothing."""
+    """What a run needs; where there is a bus, its socket too. Raises ConfigError, leaving nothing.
+
+    `evidence`: the options say which code this is, also of a run that verifies nothing and is not kept.
+    """
     faults = tuple(with_names_resolved(fault, work) for fault in faults)
-    drive = _drive(work.scenario) if isinstance(work, CarRun) else b""
+    drive = _scenario(work.scenario) if isinstance(work, CarRun) else None
+    verifies = tuple(dict.fromkeys((*verifies, *(drive.verifies if drive is not None else ()))))
     ensure_limits()
     listener = None if isinstance(work, LoadRun) else bind_hub(bus_port)
     try:
@@ -346,14 +355,17 @@ def options_for(
         port=listener.getsockname()[1] if listener is not None else 0,
         bus_open=bus_open,
         application=application,
-        drive=drive,
+        drive=_encode(drive) if drive is not None else b"",
         ftti_ms=ftti_ms,
+        verifies=verifies,
+        command=command,
+        code=code_version() if evidence or verifies or record is not None else "",
     )
     return options, listener
 
 
-def _drive(scenario: str) -> bytes:
-    """The scenario as MessagePack. Raises ConfigError."""
+def _scenario(name: str) -> "Scenario":
+    """Raises ConfigError."""
     from aftbed.vehicle.scenarios.library import load_scenario  # noqa: PLC0415 - only for a drive: PyYAML
 
-    return _encode(load_scenario(scenario))
+    return load_scenario(name)

@@ -68,7 +68,9 @@ class RunOptions(msgspec.Struct, frozen=True):
     `bus_open`: other users may attach to the bus, and the verdict stands whatever strangers send.
     `application`: the protected function that the run begins with, "" for the built-in one. `drive`: the
     scenario of a CarRun as MessagePack, read once for all processes. `ftti_ms`: of bus time, the fault
-    tolerant time interval that the verdict holds against each fault; 0: none.
+    tolerant time interval that the verdict holds against each fault; 0: none. `verifies`: requirements, of
+    the command and of the scenario. `command`: as it was typed, "" if another program launched the run.
+    `code`: the version of the code, "" where the run is neither kept nor evidence of a requirement.
     """
 
     run: str
@@ -88,6 +90,9 @@ class RunOptions(msgspec.Struct, frozen=True):
     application: str = ""
     drive: bytes = b""
     ftti_ms: float = 0.0
+    verifies: tuple[str, ...] = ()
+    command: str = ""
+    code: str = ""
 
 
 class SourceOptions(msgspec.Struct, frozen=True):

@@ -84,6 +84,7 @@ def test_an_empty_road_has_neither() -> None:
     result = simulate(Setup("none", scenario="free-drive")).vehicle
     assert result is not None
     assert (result.warning_s, result.demand_max_ms2, result.braked) == (None, 0.0, False)
+    assert result.fallback_s is None, "a request came in every cycle"
 
 
 def test_a_driver_brakes_when_warned_and_not_before() -> None:
