@@ -25,7 +25,7 @@ bus, paced or in lockstep, the other inside one process. A step is, in both:
     step                         the brakes follow what was received, and the plant moves by 1 ms
 
 A frame arrives, for an ECU, in the step that finds it. The drive ends one second after the car has come to
-stand and stayed there, on contact, or at the end of the scenario.
+stand and stayed there, on contact, when it is as slow as the scenario says, or at the end of the scenario.
 """
 
 from collections import deque

@@ -48,7 +48,7 @@ from aftbed.interop.openscenario.expression import (
 )
 from aftbed.interop.openscenario.placing import check_road, read_cars
 from aftbed.interop.openscenario.storyboard import ImportedDrive, StoryboardReader, UsedElement, set_aside
-from aftbed.interop.openscenario.timeline import Slow
+from aftbed.interop.openscenario.timeline import SlowedEgo
 from aftbed.vehicle.plant import KMH_PER_MS
 from aftbed.vehicle.scenarios.scenario import ScenarioKeys, scenario_of
 
@@ -311,7 +311,7 @@ def _scenario_file(name: str, drive: ImportedDrive, description: str, expect: st
     return "".join(f"{key}: {_yaml(value)}\n" for key, value in keys.items())
 
 
-def _ends(slow_ends: Sequence[Slow]) -> dict[str, object]:
+def _ends(slow_ends: Sequence[SlowedEgo]) -> dict[str, object]:
     """Of several ends the slowest and the latest: the drive is not shorter than the file's."""
     ends: dict[str, object] = {}
     for key, speeds_ms in (

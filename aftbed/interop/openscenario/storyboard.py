@@ -37,7 +37,7 @@ from aftbed.interop.openscenario.timeline import (
     Braking,
     Moment,
     Motion,
-    Slow,
+    SlowedEgo,
     StoryEvent,
     Timeline,
     never_met,
@@ -86,7 +86,7 @@ class ImportedDrive(msgspec.Struct, frozen=True):
     lead: LeadDrive | None
     friction: float
     duration_s: float
-    slow_ends: tuple[Slow, ...]
+    slow_ends: tuple[SlowedEgo, ...]
     taken: tuple[UsedElement, ...]
 
 
@@ -153,7 +153,7 @@ class StoryboardReader:
         self._places: dict[str, Element] = {}
         self._speeds: dict[str, Element] = {}
         self._gaps: dict[str, Element] = {}
-        self._slow_ends: list[Slow] = []
+        self._slow_ends: list[SlowedEgo] = []
         self._taken: list[UsedElement] = []
 
     def read(self) -> ImportedDrive:
@@ -474,7 +474,7 @@ class StoryboardReader:
             raise group.children[0].error(f"{reason} ({error.reason})", Cause.TRIGGER) from error
 
 
-def _words(slow: Slow, motion: Motion) -> str:
+def _words(slow: SlowedEgo, motion: Motion) -> str:
     if slow.below_ms is not None:
         return f"{motion.ego} is slower than {slow.below_ms * KMH_PER_MS:g} km/h"
     by = f" by {slow.below_lead_ms * KMH_PER_MS:g} km/h" if slow.below_lead_ms else ""

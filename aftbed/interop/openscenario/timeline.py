@@ -100,7 +100,7 @@ class StoryEvent(NamedTuple):
     actions: tuple[Element, ...]
 
 
-class Slow(msgspec.Struct, frozen=True):
+class SlowedEgo(msgspec.Struct, frozen=True):
     """The ego is slower than `below_ms`, or by `below_lead_ms` slower than the car ahead, for `after_s`."""
 
     below_ms: float | None = None
@@ -117,7 +117,7 @@ class Moment(msgspec.Struct, frozen=True):
     at_s: float
     condition: Element | None = None
     assumes_speeds: bool = False
-    slow: Slow | None = None
+    slow: SlowedEgo | None = None
 
     @property
     def never(self) -> bool:
@@ -131,7 +131,7 @@ class Span(msgspec.Struct, frozen=True):
     from_s: float
     until_s: float
     assumes_speeds: bool = False
-    slow: Slow | None = None
+    slow: SlowedEgo | None = None
 
 
 _ALWAYS: Final = Span(-math.inf, math.inf)
@@ -328,7 +328,9 @@ class Timeline:
                 other_ms = self._other(by, is_ego)
                 span = _crossing(speed_ms - other_ms, 0.0, by, assumes=True)
                 slower_ms = by.number("value") * (-1.0 if is_ego else 1.0)
-                return _slowed(span, by, Slow(below_lead_ms=slower_ms), slower_ms >= 0.0, upward=not is_ego)
+                return _slowed(
+                    span, by, SlowedEgo(below_lead_ms=slower_ms), slower_ms >= 0.0, upward=not is_ego
+                )
             case _:
                 return self._distance(by, is_ego)
 
@@ -344,7 +346,7 @@ class Timeline:
     def _speed(self, by: Element, speed_ms: float, is_ego: bool) -> Span:
         braking = self.motion.braking
         if is_ego:
-            slow = Slow(below_ms=by.number("value"))
+            slow = SlowedEgo(below_ms=by.number("value"))
             return _slowed(_crossing(speed_ms, 0.0, by, assumes=True), by, slow, by.number("value") > 0.0)
         if braking is None:
             return _crossing(speed_ms, 0.0, by)
@@ -514,14 +516,14 @@ def _delayed(condition: Element, span: Span, begin_s: float) -> Span:
     return Span(from_s + delay_s, until_s + delay_s)
 
 
-def _slowed(span: Span, by: Element, slow: Slow, possible: bool, *, upward: bool = False) -> Span:
+def _slowed(span: Span, by: Element, slow: SlowedEgo, possible: bool, *, upward: bool = False) -> Span:
     """The span, with `slow` if the condition `by` waits for the ego to become slower."""
     if span.from_s < NEVER_S or not possible or (by.attributes.get("rule") in _UPWARD) != upward:
         return span
     return msgspec.structs.replace(span, slow=slow)
 
 
-def _slow(found: Sequence[tuple[Element, Element, Span]], delayed: Sequence[Span]) -> Slow | None:
+def _slow(found: Sequence[tuple[Element, Element, Span]], delayed: Sequence[Span]) -> SlowedEgo | None:
     """How slow the ego is when all conditions of a group hold, if nothing else is needed for it."""
     slows = [(condition, span.slow) for condition, _, span in found if span.slow is not None]
     if len(slows) != 1:
