@@ -411,6 +411,10 @@ def time_below(seconds: float) -> str:
     return osc.by_value(f'<SimulationTimeCondition value="{seconds}" rule="lessThan"/>')
 
 
+def rises_at(seconds: float) -> str:
+    return osc.by_value(f'<SimulationTimeCondition value="{seconds}" rule="greaterThan"/>', edge="rising")
+
+
 IS_GO = osc.by_value('<VariableCondition variableRef="go" rule="equalTo" value="1"/>')
 GO = '<VariableDeclaration name="go" variableType="int" value="0"/>'
 
@@ -420,6 +424,8 @@ GO = '<VariableDeclaration name="go" variableType="int" value="0"/>'
     [
         ([osc.after(2), osc.after(5)], "", 5.0),  # all of a group
         ([osc.after(2), time_below(3)], "", 2.0),
+        ([osc.after(2), rises_at(5)], "", 5.0),
+        ([osc.after(5), rises_at(2)], "", None),  # an edge is over when the rest of the group holds
         ([osc.after(4), time_below(3)], "", None),
         ([osc.by_value('<SimulationTimeCondition value="3" rule="lessThan"/>', edge="falling")], "", 3.0),
         (
@@ -443,6 +449,12 @@ def test_when_conditions_are_met(
 ) -> None:
     path = braking_file(tmp_path, *conditions, variables=GO, story=story)
     assert after_s(path) == expected_s
+
+
+def test_a_condition_that_has_ceased_to_hold_when_its_act_begins(tmp_path: Path) -> None:
+    start = osc.trigger("StartTrigger", [osc.after(5)])
+    assert after_s(braking_file(tmp_path, time_below(3), start=start)) is None
+    assert after_s(braking_file(tmp_path, time_below(6), start=start)) == 5.0
 
 
 @pytest.mark.parametrize(

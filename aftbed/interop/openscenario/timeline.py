@@ -16,7 +16,8 @@ constant or with a linear function of the time t, and holds over a `Span` of tim
     CollisionCondition, EndOfRoadCondition, OffroadCondition    never: a drive ends on contact
 
 `d` is the gap between the bumpers, or the distance of the reference points without `freespace`. A trigger is
-met when all conditions of one of its groups hold. An empty or missing trigger is met at once.
+met when all conditions of one of its groups hold; one with an edge holds at its instant only. An empty or
+missing trigger is met at once.
 
 Limits: if the function brakes the ego before the computed time of a distance, a headway or a speed, the
 condition would be met later than computed, or never, or at all: such a moment `assumes_speeds`.
@@ -509,11 +510,14 @@ def _delayed(condition: Element, span: Span, begin_s: float) -> Span:
     if edge in ("falling", "risingOrFalling"):
         rises = edge == "risingOrFalling" and begin_s <= span.from_s < NEVER_S
         at_s = span.from_s if rises else span.until_s if span.from_s < NEVER_S else NEVER_S
-        from_s, until_s = at_s if at_s >= begin_s else NEVER_S, math.inf
+        from_s = at_s if at_s >= begin_s else NEVER_S
     elif edge == "rising" and span.from_s < begin_s:
         late = f"met before it is looked at, at {begin_s:g} s"
         raise condition.error(f"{late}: with conditionEdge 'rising' it never triggers", Cause.TRIGGER)
-    return Span(from_s + delay_s, until_s + delay_s)
+    from_s += delay_s
+    if edge != "none":  # it holds at the instant of the edge only
+        return Span(from_s, math.nextafter(from_s, math.inf))
+    return Span(from_s, until_s + delay_s)
 
 
 def _slowed(span: Span, by: Element, slow: SlowedEgo, possible: bool, *, upward: bool = False) -> Span:
