@@ -103,6 +103,9 @@ def _ahead(lead: LeadCar | None) -> str:
         final_kmh = lead.braking.final_ms * KMH_PER_MS
         final = f" to {final_kmh:g} km/h" if final_kmh else ""
         words.append(f"brakes at {lead.braking.deceleration_ms2:g} m/s2{final} after {after_s:g} s")
+    for one in lead.speeds:
+        change = f"goes to {one.final_ms * KMH_PER_MS:.1f} km/h at {one.rate_ms2:g} m/s2"
+        words.append(f"{change} after {one.after_ms / 1000:g} s")
     if lead.cut_in is not None:
         words.append(f"cuts in after {lead.cut_in.after_ms / 1000:g} s")
     elif lead.lateral_m:

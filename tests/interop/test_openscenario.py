@@ -133,7 +133,7 @@ def test_each_dimension_of_a_change_of_speed(dynamics: str, deceleration_ms2: fl
     lead = only_drive(imported(path)).lead
     assert lead is not None
     assert lead.braking is not None
-    assert lead.braking.change.deceleration_ms2 == pytest.approx(deceleration_ms2)
+    assert lead.braking.rate_ms2 == pytest.approx(deceleration_ms2)
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from aftbed.interop.openscenario.document import Cause, RefusedError
 from aftbed.interop.openscenario.importer import ImportedFile, ImportOptions, import_scenario, write
 from aftbed.interop.openscenario.storyboard import ImportedDrive, LeadDrive
 from aftbed.runtime.sim.world import Setup, simulate
-from aftbed.vehicle.plant import LeadBraking, LeadCar, Plant
+from aftbed.vehicle.plant import LeadBraking, LeadCar, LeadSpeed, Plant
 from aftbed.vehicle.scenarios.library import load_scenario
 from aftbed.vehicle.scenarios.scenario import SlowEnd
 
@@ -63,8 +63,8 @@ def test_a_braking_target_jumps_to_its_headway_and_rolls_on(tmp_path: Path) -> N
     assert lead.gap_m == pytest.approx(40)
     assert lead.braking is not None
     assert lead.braking.after_s == 3.0
-    assert lead.braking.change.deceleration_ms2 == 6.0
-    assert lead.braking.change.final_ms == pytest.approx(2 / 3.6)
+    assert lead.braking.rate_ms2 == 6.0
+    assert lead.braking.final_ms == pytest.approx(2 / 3.6)
 
 
 def test_the_end_relative_to_the_target(tmp_path: Path) -> None:
@@ -342,7 +342,7 @@ def test_the_end_of_a_traffic_jam_with_drivers_that_nothing_activates(tmp_path: 
     lead = lead_of(found.drive)
     assert lead.name == "Lead"
     assert lead.braking is not None
-    assert (lead.braking.after_s, lead.braking.change.final_ms) == (10.0, 10.0)
+    assert (lead.braking.after_s, lead.braking.final_ms) == (10.0, 10.0)
     activates = osc.event("On", "<ActivateControllerAction/>", osc.after(1))
     controls = osc.act("On", osc.group("Lead", osc.maneuver("On", activates)))
     path.write_text(path.read_text().replace("</Story>", f"{controls}</Story>"))
@@ -494,7 +494,7 @@ def test_a_braking_after_the_end_of_the_drive_is_left_out(tmp_path: Path) -> Non
     found = import_scenario(path, None, ImportOptions(duration_s=10))
     assert lead_of(found.variations[0].drive).braking is None
     meanings = [one.meaning for one in found.taken]
-    assert "Lead would brake at 20 s: the drive has ended by then" in meanings
+    assert "Lead would change its speed at 20 s: the drive has ended by then" in meanings
 
 
 def test_a_drive_without_an_end_lasts_until_the_lead_has_braked(tmp_path: Path) -> None:
@@ -544,6 +544,95 @@ def test_what_moves_no_car_that_matters_is_ignored(tmp_path: Path) -> None:
     assert ignored["TrafficSignals"] == "the function brakes for cars, not for signals"
     path.write_text(path.read_text().replace('sensors="true"', 'sensors="false"'))
     assert "VisibilityAction: a car that sensors do not see" in refused(path)
+
+
+# -- more than one change of speed
+
+
+def ended(name: str, delay: float = 0) -> str:
+    condition = (
+        f'<StoryboardElementStateCondition storyboardElementType="event" storyboardElementRef="{name}"'
+        ' state="endTransition"/>'
+    )
+    return osc.by_value(condition, delay=delay)
+
+
+def changing(folder: Path, *events: str, lead_ms: float = 10) -> Path:
+    """The ego drives at 20 m/s, the lead 100 m ahead with these events."""
+    osc.write_catalogs(folder)
+    path = folder / "changing.xosc"
+    path.write_text(
+        osc.scenario(
+            init={
+                "Ego": [osc.placed(osc.lane(0)), osc.speed(20)],
+                "Lead": [osc.placed(osc.lane(100)), osc.speed(lead_ms)],
+            },
+            story=osc.act("Act", osc.group("Lead", osc.maneuver("Vary", *events))),
+        )
+    )
+    return path
+
+
+def changes_of(path: Path) -> list[tuple[float, float, float]]:
+    return [(one.after_s, one.final_ms, one.rate_ms2) for one in lead_of(drive_of(path)).changes]
+
+
+def test_a_lead_that_speeds_up_and_slows_down_again(tmp_path: Path) -> None:
+    """As in ALKS 4.3_1: the second change begins some time after the first one has ended."""
+    up = osc.event("Up", osc.brakes(2, 20), osc.after(10))
+    down = osc.event("Down", osc.brakes(4, 8), ended("Up", delay=5))
+    path = changing(tmp_path, down, up)
+    assert changes_of(path) == [(10.0, 20.0, 2.0), (20.0, 8.0, 4.0)]
+    assert drive_of(path).duration_s == 20 + 12 / 4 + 10
+    (written,) = write(imported(path), tmp_path, force=True)
+    lead = load_scenario(str(written)).plant.lead
+    assert lead is not None
+    assert lead.braking is None
+    assert lead.speeds == (LeadSpeed(10_000, 20.0, 2.0), LeadSpeed(20_000, 8.0, 4.0))
+
+
+def test_a_target_that_sets_off_when_the_ego_comes_near(tmp_path: Path) -> None:
+    distance = 'relativeDistanceType="longitudinal" freespace="false" value="40" rule="lessOrEqual"'
+    near = osc.by_entity(f'<RelativeDistanceCondition entityRef="Lead" {distance}/>', edge="rising")
+    set_off = osc.event("Go", osc.speed(4, 'dynamicsShape="linear" value="2" dynamicsDimension="time"'), near)
+    assert changes_of(changing(tmp_path, set_off, lead_ms=0)) == [(3.0, 4.0, 2.0)]
+
+
+def test_a_change_that_comes_before_the_one_before_it_is_done(tmp_path: Path) -> None:
+    slow, fast = (
+        osc.event("Slow", osc.brakes(2), osc.after(1)),
+        osc.event("Fast", osc.brakes(2, 9), osc.after(3)),
+    )
+    path = changing(tmp_path, slow, fast)
+    assert changes_of(path) == [(1.0, 0.0, 2.0), (3.0, 9.0, 2.0)]
+    stands = osc.by_entity('<SpeedCondition value="8" rule="lessThan"/>', "Lead")
+    stop = osc.trigger("StopTrigger", [stands])
+    path.write_text(path.read_text().replace("</Storyboard>", f"{stop}</Storyboard>"))
+    assert drive_of(path).duration_s == 2.0, "from 10 m/s, at 2 m/s2 from 1 s on"
+    path.write_text(path.read_text().replace('value="8" rule="lessThan"', 'value="7" rule="greaterThan"'))
+    assert "ends the drive at its start" in refused(path)
+
+
+def test_what_it_travels_over_several_changes(tmp_path: Path) -> None:
+    up = osc.event("Up", osc.brakes(5, 20), osc.after(2))
+    path = changing(tmp_path, up)
+    stop = osc.trigger(
+        "StopTrigger", [osc.by_entity('<TraveledDistanceCondition value="90"/>', "Lead")]
+    )  # 20 m, and 30 m in 2 s, and 40 m in 2 s
+    path.write_text(path.read_text().replace("</Storyboard>", f"{stop}</Storyboard>"))
+    assert drive_of(path).duration_s == pytest.approx(6.0)
+
+
+def test_a_second_change_that_depends_on_how_the_cars_move_is_refused(tmp_path: Path) -> None:
+    ttc = '<TimeHeadwayCondition entityRef="Lead" freespace="true" rule="lessThan" value="1.5"/>'
+    path = changing(
+        tmp_path,
+        osc.event("Up", osc.brakes(2, 12), osc.after(1)),
+        osc.event("Down", osc.brakes(2), osc.by_entity(ttc)),
+    )
+    assert "TimeHeadwayCondition: depends on how the cars move, after another change of speed" in refused(
+        path
+    )
 
 
 # -- catalogs

@@ -2,7 +2,16 @@
 
 import pytest
 
-from aftbed.vehicle.plant import GRAVITY_MS2, Brakes, CutIn, LeadBraking, LeadCar, Plant, PlantSetup
+from aftbed.vehicle.plant import (
+    GRAVITY_MS2,
+    Brakes,
+    CutIn,
+    LeadBraking,
+    LeadCar,
+    LeadSpeed,
+    Plant,
+    PlantSetup,
+)
 
 
 def run(plant: Plant, steps: int, demand_ms2: float) -> Plant:
@@ -97,6 +106,16 @@ def test_a_lead_that_brakes_to_a_speed_keeps_it() -> None:
     assert run(plant, 2000, 0.0).lead_speed_ms == pytest.approx(12.0 - 6.0, abs=0.01)
     assert run(plant, 1000, 0.0).lead_speed_ms == 3.0
     assert run(plant, 2000, 0.0).lead_speed_ms == 3.0
+
+
+def test_a_lead_goes_from_speed_to_speed() -> None:
+    """Up, and down again before it is there."""
+    speeds = (LeadSpeed(1000, 14.0, 2.0), LeadSpeed(2000, 6.0, 4.0))
+    plant = Plant(PlantSetup(10.0, LeadCar(50.0, 10.0, speeds=speeds)))
+    assert run(plant, 1000, 0.0).lead_speed_ms == 10.0
+    assert run(plant, 1000, 0.0).lead_speed_ms == pytest.approx(12.0, abs=0.01)
+    assert run(plant, 1000, 0.0).lead_speed_ms == pytest.approx(8.0, abs=0.01)
+    assert run(plant, 2000, 0.0).lead_speed_ms == 6.0
 
 
 def test_a_jerk_limit_makes_the_brakes_slower() -> None:

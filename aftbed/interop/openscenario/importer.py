@@ -293,11 +293,20 @@ def _scenario_file(name: str, drive: ImportedDrive, description: str, expect: st
         if (braking := drive.lead.braking) is not None:
             lead["braking"] = {
                 "after_s": _round(braking.after_s),
-                "deceleration_ms2": _round(braking.change.deceleration_ms2),
+                "deceleration_ms2": _round(braking.rate_ms2),
                 "ramp_s": 0.0,  # a linear SpeedAction has its full rate from its start
             }
-            if braking.change.final_ms:
-                lead["braking"]["to_kmh"] = _round(braking.change.final_ms * KMH_PER_MS)
+            if braking.final_ms:
+                lead["braking"]["to_kmh"] = _round(braking.final_ms * KMH_PER_MS)
+        elif drive.lead.changes:
+            lead["speeds"] = [
+                {
+                    "after_s": _round(one.after_s),
+                    "to_kmh": _round(one.final_ms * KMH_PER_MS),
+                    "rate_ms2": _round(one.rate_ms2),
+                }
+                for one in drive.lead.changes
+            ]
         keys["lead"] = lead
     if drive.slow_ends:
         keys["ends"] = _ends(drive.slow_ends)
@@ -334,6 +343,8 @@ def _yaml(value: object) -> str:
     match value:
         case dict():
             return "{" + ", ".join(f"{key}: {_yaml(inner)}" for key, inner in value.items()) + "}"
+        case list():
+            return "[" + ", ".join(map(_yaml, value)) + "]"
         case float():
             return f"{value:.6f}".rstrip("0").rstrip(".")
         case _:

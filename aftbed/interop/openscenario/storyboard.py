@@ -1,7 +1,7 @@
 """Reads a storyboard as one drive: where the cars start, when the car ahead brakes, when the drive ends.
 
     Init     a place and a speed for each car; the friction of the road
-    Story    at most one event: the car ahead brakes, at a time that is known beforehand
+    Story    the car ahead changes its speed, at times that are known beforehand
     Stop     when the drive ends
 
 The friction is OpenSCENARIO's `frictionScaleFactor` times the nominal 0.9 of aftbed's scenarios. `timeline`
@@ -34,10 +34,10 @@ from aftbed.interop.openscenario.document import IGNORED, Cause, Element, Refuse
 from aftbed.interop.openscenario.placing import CarShape, RelativePlace, relative_place
 from aftbed.interop.openscenario.timeline import (
     NEVER_S,
-    Braking,
     Moment,
     Motion,
     SlowedEgo,
+    SpeedChange,
     StoryEvent,
     Timeline,
     never_met,
@@ -49,7 +49,7 @@ from aftbed.vehicle.plant import KMH_PER_MS
 FRICTION_NOMINAL: Final = 0.9
 DURATION_S_DEFAULT: Final = 30.0
 AFTER_BRAKING_S: Final = (
-    10.0  # the least that a drive without a stop trigger lasts after the car ahead brakes
+    10.0  # the least that a drive without a stop trigger lasts after the last change of speed
 )
 NEVER_STARTS: Final = "the parameters say that it never starts"
 REPLACED: Final = "aftbed's function takes its place"
@@ -69,13 +69,19 @@ class UsedElement(msgspec.Struct, frozen=True):
 
 
 class LeadDrive(msgspec.Struct, frozen=True):
-    """The car ahead: gap from bumper to bumper, offset to the left, speed at the start, and how it brakes."""
+    """The car ahead: gap from bumper to bumper, offset to the left, speed at the start, and its changes."""
 
     name: str
     gap_m: float
     lateral_m: float
     speed_ms: float
-    braking: Braking | None
+    changes: tuple[SpeedChange, ...]
+
+    @property
+    def braking(self) -> SpeedChange | None:
+        """The change of speed, if there is one, and it is downwards."""
+        once = len(self.changes) == 1 and self.changes[0].final_ms < self.changes[0].from_ms
+        return self.changes[0] if once else None
 
 
 class ImportedDrive(msgspec.Struct, frozen=True):
@@ -177,13 +183,12 @@ class StoryboardReader:
         timeline = self._read_moves(timeline)
         duration_s = self._read_stop(storyboard, timeline)
         motion, drive = timeline.motion, None
-        braking = motion.braking
-        if braking and braking.after_s >= duration_s:
-            late = f"{motion.lead} would brake at {braking.after_s:g} s: the drive has ended by then"
-            self._take(storyboard, late)
-            braking = None
+        changes = tuple(one for one in motion.changes if one.after_s < duration_s)
+        for late in motion.changes[len(changes) :]:
+            words = f"would change its speed at {late.after_s:g} s: the drive has ended by then"
+            self._take(storyboard, f"{motion.lead} {words}")
         if lead is not None:
-            drive = LeadDrive(motion.lead, motion.gap_m, lead[1].lateral_m, motion.lead_ms, braking)
+            drive = LeadDrive(motion.lead, motion.gap_m, lead[1].lateral_m, motion.lead_ms, changes)
         return ImportedDrive(
             ego=self._ego.name,
             speed_ms=motion.ego_ms,
@@ -321,7 +326,10 @@ class StoryboardReader:
         motion = timeline.motion
         moves = [_Move(event, action) for event in timeline.events for action in self._moving(event, motion)]
         for event, action in [one for one in moves if one.action.tag == "LongitudinalDistanceAction"]:
-            if (begin := self._begin(event, timeline)) is None:
+            self._check(event, motion, [one.event for one in moves])
+            begin = timeline.begin(event)
+            if begin.at_s == NEVER_S:
+                self._drop([(begin, _Move(event, action))])
                 continue
             if begin.at_s > 0.0:
                 raise action.error(f"a car that jumps, at {begin.at_s:g} s; only at the start", Cause.SPEED)
@@ -330,23 +338,48 @@ class StoryboardReader:
         if motion.lead and motion.gap_m <= 0.0:
             where = self._places[motion.lead]
             raise where.error(f"{motion.lead!r} is {motion.gap_m:g} m ahead of the ego, bumper to bumper")
-        timeline = timeline.with_motion(motion)
-        changes = [one for one in moves if one.action.tag == "SpeedAction"]
-        begins = [(one, self._begin(one.event, timeline)) for one in changes]
-        begun = [
-            (*one, begin)
-            for one, begin in begins
-            if begin is not None and not _keeps_speed(one.action, timeline.motion)
-        ]
-        _ignore_quiet(timeline, [one.event for one in moves], [event for event, _, _ in begun])
-        if len(begun) > 1:
-            reason = "a second action that moves a car; the car ahead brakes once"
-            raise begun[1][1].error(reason, Cause.SPEED)
-        return self._brake(*begun[0], timeline) if begun else timeline
+        timeline = self._read_changes(
+            timeline.with_motion(motion), [one for one in moves if one.action.tag == "SpeedAction"]
+        )
+        _ignore_quiet(timeline, [one.event for one in moves])
+        return timeline
 
-    def _brake(self, event: StoryEvent, action: Element, begin: Moment, timeline: Timeline) -> Timeline:
-        """The timeline with the car ahead braking."""
-        motion, begin_s = timeline.motion, 0.0
+    def _read_changes(self, timeline: Timeline, waiting: list[_Move]) -> Timeline:
+        """The timeline with the changes of speed of the car ahead, one after the other."""
+        done: list[_Move] = []
+        while waiting:
+            begins = [(self._check_move(one, timeline, waiting + done), one) for one in waiting]
+            begin, move = min(begins, key=lambda one: one[0].at_s)
+            if begin.at_s == NEVER_S:
+                self._drop(begins)
+                break
+            if begin.moving and timeline.motion.changes:
+                where = begin.condition or move.event.event
+                reason = "depends on how the cars move, after another change of speed"
+                raise where.error(reason, Cause.TRIGGER)
+            timeline = self._change_speed(move, begin, timeline)
+            waiting = [one for one in waiting if one is not move]
+            done.append(move)
+        for event, _ in done:
+            _check_act_stop(event, timeline)
+        return timeline
+
+    def _drop(self, begins: list[tuple[Moment, _Move]]) -> None:
+        """Mark events that never begin as ignored; refuse those of which it is not known."""
+        for begin, (event, _) in begins:
+            if not begin.never:
+                where = begin.condition or event.event
+                raise where.error("never met while both cars keep their speed", Cause.TRIGGER)
+            event.event.ignored = "its trigger is never met"
+
+    def _change_speed(self, move: _Move, begin: Moment, timeline: Timeline) -> Timeline:
+        """The timeline with one more change of the speed of the car ahead."""
+        (event, action), motion, begin_s = move, timeline.motion, 0.0
+        from_ms = motion.lead_speed_ms(begin.at_s)
+        relative = action.one("SpeedActionTarget").maybe("RelativeTargetSpeed") is not None
+        if not relative and target_speed_ms(action, motion.ego_ms) == from_ms:
+            action.ignored = "it is the speed that the car has"
+            return timeline.with_end(event, begin.at_s)
         for element in (event.act, event.event):
             if (trigger := element.maybe("StartTrigger")) is not None:
                 met = timeline.trigger(trigger, begin_s)
@@ -355,26 +388,19 @@ class StoryboardReader:
                 words = f"met at {met.at_s:g} s{kept}"
                 where = met.condition or trigger
                 self._take(where, words if met.condition else f"has no condition: {words}")
-        change = speed_change(action, motion.lead_ms, motion.ego_ms)
-        braking = Braking(begin.at_s, change)
+        change = speed_change(action, begin.at_s, from_ms, motion.ego_ms)
+        how = "brakes" if change.final_ms < from_ms else "speeds up"
         final = f" to {change.final_ms * KMH_PER_MS:g} km/h" if change.final_ms else ""
-        how = f"brakes at {change.deceleration_ms2:g} m/s2{final} from {begin.at_s:g} s on"
-        self._take(action, f"{motion.lead} {how}")
-        timeline = timeline.with_motion(msgspec.structs.replace(motion, braking=braking))
-        _check_act_stop(event.act, braking, timeline)
-        return timeline
+        kept = ", if the ego has its speed then" if relative else ""
+        self._take(
+            action, f"{motion.lead} {how} at {change.rate_ms2:g} m/s2{final} from {begin.at_s:g} s on{kept}"
+        )
+        return timeline.with_change(event, change)
 
-    def _begin(self, event: StoryEvent, timeline: Timeline) -> Moment | None:
-        """When an event that moves the car ahead begins; None if it never does, and is ignored."""
-        self._check(event, timeline.motion)
-        begin = timeline.begin(event)
-        if begin.never:
-            event.event.ignored = "its trigger is never met"
-            return None
-        if begin.at_s == NEVER_S:
-            where = begin.condition or event.event
-            raise where.error("never met while both cars keep their speed", Cause.TRIGGER)
-        return begin
+    def _check_move(self, move: _Move, timeline: Timeline, moves: list[_Move]) -> Moment:
+        """When an event that changes the speed begins; it moves nothing else, and happens once."""
+        self._check(move.event, timeline.motion, [one.event for one in moves])
+        return timeline.begin(move.event)
 
     def _moving(self, event: StoryEvent, motion: Motion) -> Iterator[Element]:
         """The actions of an event that move the car ahead. Those that move another car are ignored."""
@@ -409,7 +435,7 @@ class StoryboardReader:
                 )
                 raise action.error(f"{reason} until the function brakes", Cause.SPEED)
 
-    def _check(self, event: StoryEvent, motion: Motion) -> None:
+    def _check(self, event: StoryEvent, motion: Motion, moving: list[StoryEvent]) -> None:
         """Check that an event that moves the car ahead moves nothing else, and happens once."""
         actors = event.group.one("Actors")
         if actors.flag("selectTriggeringEntities", False):
@@ -427,7 +453,7 @@ class StoryboardReader:
             raise event.event.wrong("priority", allowed, Cause.TRIGGER)
         for other in event.maneuver.every("Event"):
             stops = other.attributes.get("priority") in ("override", "overwrite")
-            if stops and other is not event.event and other.ignored is None:
+            if stops and other.ignored is None and not any(one.event is other for one in moving):
                 allowed = "parallel: it may stop the event that moves the car"
                 raise other.wrong("priority", allowed, Cause.TRIGGER)
 
@@ -439,7 +465,7 @@ class StoryboardReader:
             return self._duration_s
         motion = timeline.motion
         ends_s: list[float] = []
-        earliest_s = motion.braking.end_s + AFTER_BRAKING_S if motion.braking else 0.0
+        earliest_s = motion.changes[-1].end_s + AFTER_BRAKING_S if motion.changes else 0.0
         for group in stop.every("ConditionGroup") if stop else []:
             found = self._stop_of(group, timeline)
             if found.slow is not None and motion.lead:
@@ -512,10 +538,10 @@ def _events(story: Element, act: Element, group: Element, maneuver: Element) -> 
         yield StoryEvent(story, act, group, maneuver, event, _actors(group), tuple(kinds))
 
 
-def _ignore_quiet(timeline: Timeline, moving: list[StoryEvent], changing: list[StoryEvent]) -> None:
-    """Mark the triggers and actors of what moves no car, and the ends of acts that change no speed."""
+def _ignore_quiet(timeline: Timeline, moving: list[StoryEvent]) -> None:
+    """Mark the triggers and actors of what moves no car, and the ends of acts in which no speed changes."""
     for act in timeline.acts:
-        if not any(event.act is act for event in changing):
+        if not any(event.act is act and timeline.changes_speed(event) for event in moving):
             _ignore_below(act, "StopTrigger")
         if not any(event.act is act for event in moving):
             _ignore_below(act, "StartTrigger")
@@ -562,25 +588,16 @@ def _with_gap(motion: Motion, name: str, action: Element) -> Motion:
     )
 
 
-def _keeps_speed(action: Element, motion: Motion) -> bool:
-    """Whether a SpeedAction leads to the speed that the car ahead has; it is marked as ignored then."""
-    kept = action.one("SpeedActionTarget").maybe("AbsoluteTargetSpeed") is not None
-    if not kept or target_speed_ms(action, motion.ego_ms) != motion.lead_ms:
-        return False
-    action.ignored = "it is the speed that the car has"
-    return True
-
-
-def _check_act_stop(act: Element, braking: Braking, timeline: Timeline) -> None:
-    """Check that nothing stops the act while the car ahead brakes."""
-    stop = act.maybe("StopTrigger")
+def _check_act_stop(event: StoryEvent, timeline: Timeline) -> None:
+    """Check that nothing stops the act of an event while the car ahead changes its speed."""
+    stop, end_s = event.act.maybe("StopTrigger"), timeline.end_s(event)
     if stop is None or not stop.children:
         return
     found = timeline.trigger(stop, 0.0)
-    if found.at_s < braking.end_s or (found.at_s == NEVER_S and not found.never):
-        reason = f"may stop the act before the car ahead has braked, at {braking.end_s:g} s"
+    if found.at_s < end_s or (found.at_s == NEVER_S and not found.never):
+        reason = f"may stop the act before the car ahead has its speed, at {end_s:g} s"
         raise stop.error(reason, Cause.TRIGGER)
-    stop.ignored = "what it waits for comes after the braking, or does not come"
+    stop.ignored = "what it waits for comes after the change of speed, or does not come"
 
 
 # -- what does not matter

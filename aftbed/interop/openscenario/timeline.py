@@ -1,7 +1,7 @@
 """When the events of a storyboard begin and end: seconds from the start, in closed form.
 
-Until the car ahead brakes both cars keep their speed, so each supported condition compares its limit with a
-constant or with a linear function of the time t, and holds over a `Span` of time:
+Until the car ahead changes its speed both cars keep theirs, so each supported condition compares its limit
+with a constant or with a linear function of the time t, and holds over a `Span` of time:
 
     SimulationTimeCondition                    t
     TraveledDistanceCondition                  v t, and of the car ahead what it travels while it brakes
@@ -24,14 +24,13 @@ condition would be met later than computed, or never, or at all: such a moment `
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final, NamedTuple
 
 import msgspec
 
 from aftbed.interop.openscenario.document import Cause, Element
 from aftbed.interop.openscenario.expression import RULES, Values, obeys
-from aftbed.vehicle.plant import KMH_PER_MS
 
 TRIGGER_UNKNOWN: Final = "a trigger whose moment does not follow from the start"
 NEVER_S: Final = math.inf
@@ -56,28 +55,36 @@ _STATES: Final = (*_BEGUN, *_ENDED, "standbyState", "stopTransition", "skipTrans
 
 
 class SpeedChange(msgspec.Struct, frozen=True):
-    """A car changes its speed linearly: downwards to `final_ms` at `deceleration_ms2`."""
-
-    deceleration_ms2: float
-    final_ms: float
-    lasts_s: float
-
-
-class Braking(msgspec.Struct, frozen=True):
-    """The car ahead brakes from `after_s` on."""
+    """The car ahead goes linearly from `from_ms` to `final_ms`, beginning at `after_s`."""
 
     after_s: float
-    change: SpeedChange
+    from_ms: float
+    final_ms: float
+    rate_ms2: float
 
     @property
     def end_s(self) -> float:
-        return self.after_s + self.change.lasts_s
+        return self.after_s + abs(self.final_ms - self.from_ms) / self.rate_ms2
+
+
+class Stretch(NamedTuple):
+    """The car ahead has `speed_ms` at `from_s`, and changes it by `slope_ms2` until `until_s`."""
+
+    from_s: float
+    until_s: float
+    speed_ms: float
+    slope_ms2: float
+
+    def at(self, at_s: float) -> float:
+        """The speed at a time of the stretch."""
+        return self.speed_ms + (self.slope_ms2 * (at_s - self.from_s) if self.slope_ms2 else 0.0)
 
 
 class Motion(msgspec.Struct, frozen=True):
     """Both cars until one of them brakes: names, speeds, and their distance at the start.
 
-    On an empty road `lead` is "". `braking`: what the car ahead does later, as far as it is known already.
+    On an empty road `lead` is "". `changes`: what the car ahead does later, as far as it is known already. A
+    change lasts until it is done, or the next one begins.
     """
 
     ego: str
@@ -86,7 +93,25 @@ class Motion(msgspec.Struct, frozen=True):
     lead_ms: float = 0.0
     gap_m: float = 0.0
     distance_m: float = 0.0
-    braking: Braking | None = None
+    changes: tuple[SpeedChange, ...] = ()
+
+    def stretches(self) -> list[Stretch]:
+        """The speed of the car ahead over time, from the start on."""
+        found: list[Stretch] = []
+        from_s, speed_ms = 0.0, self.lead_ms
+        for number, change in enumerate(self.changes):
+            next_s = self.changes[number + 1].after_s if number + 1 < len(self.changes) else math.inf
+            end_s = min(change.end_s, next_s)
+            slope_ms2 = math.copysign(change.rate_ms2, change.final_ms - change.from_ms)
+            found.append(Stretch(from_s, change.after_s, speed_ms, 0.0))
+            found.append(Stretch(change.after_s, end_s, change.from_ms, slope_ms2))
+            from_s = end_s
+            speed_ms = change.final_ms if end_s == change.end_s else found[-1].at(end_s)
+        return [*found, Stretch(from_s, math.inf, speed_ms, 0.0)]
+
+    def lead_speed_ms(self, at_s: float) -> float:
+        """The speed of the car ahead at a time."""
+        return [one for one in self.stretches() if one.from_s <= at_s][-1].at(at_s)
 
 
 class StoryEvent(NamedTuple):
@@ -112,13 +137,14 @@ class SlowedEgo(msgspec.Struct, frozen=True):
 class Moment(msgspec.Struct, frozen=True):
     """When something happens, by which condition, and whether both cars have to keep their speed for it.
 
-    `slow`: it happens when the function has braked the ego so far.
+    `slow`: it happens when the function has braked the ego so far. `moving`: it depends on how the cars move.
     """
 
     at_s: float
     condition: Element | None = None
     assumes_speeds: bool = False
     slow: SlowedEgo | None = None
+    moving: bool = False
 
     @property
     def never(self) -> bool:
@@ -154,18 +180,15 @@ def never_met(trigger: Element | None) -> bool:
     )
 
 
-def speed_change(action: Element, from_ms: float, ego_ms: float) -> SpeedChange:
-    """What the SpeedAction `action` makes of the speed of the car ahead."""
+def speed_change(action: Element, after_s: float, from_ms: float, ego_ms: float) -> SpeedChange:
+    """What the SpeedAction `action`, which begins at `after_s`, makes of the speed of the car ahead."""
     dynamics = action.one("SpeedActionDynamics")
     if dynamics.choice("dynamicsShape", _SHAPES) != "linear":
         raise dynamics.wrong("dynamicsShape", "linear", Cause.SPEED)
     dynamics.choice("followingMode", ("position",), "position")
     final_ms = target_speed_ms(action, ego_ms)
     if final_ms < 0.0:
-        raise action.error(f"{final_ms:g} m/s, allowed is 0 or more")
-    if final_ms >= from_ms:
-        reason = f"the car ahead speeds up to {final_ms * KMH_PER_MS:g} km/h, allowed is braking"
-        raise action.error(reason, Cause.SPEED)
+        raise action.error(f"{final_ms:g} m/s, allowed is 0 or more", Cause.SPEED)
     value = abs(dynamics.number("value"))  # some files write a rate as -6
     dimension = dynamics.choice("dynamicsDimension", _DIMENSIONS)
     if value == 0.0:
@@ -174,12 +197,13 @@ def speed_change(action: Element, from_ms: float, ego_ms: float) -> SpeedChange:
         case "rate":
             found = value
         case "time":
-            found = (from_ms - final_ms) / value
+            found = abs(from_ms - final_ms) / value
         case _:
-            found = (from_ms * from_ms - final_ms * final_ms) / (2.0 * value)
+            found = abs(from_ms * from_ms - final_ms * final_ms) / (2.0 * value)
     if not 0.01 <= found <= 12.0:
-        raise dynamics.error(f"a deceleration of {found:g} m/s2, allowed is 0.01 to 12", Cause.SPEED)
-    return SpeedChange(found, final_ms, (from_ms - final_ms) / found)
+        what = "a deceleration" if final_ms < from_ms else "an acceleration"
+        raise dynamics.error(f"{what} of {found:g} m/s2, allowed is 0.01 to 12", Cause.SPEED)
+    return SpeedChange(after_s, from_ms, final_ms, found)
 
 
 def target_speed_ms(action: Element, other_ms: float) -> float:
@@ -202,17 +226,41 @@ class Timeline:
     """
 
     def __init__(
-        self, acts: Sequence[Element], events: Sequence[StoryEvent], variables: Values, motion: Motion
+        self,
+        acts: Sequence[Element],
+        events: Sequence[StoryEvent],
+        variables: Values,
+        motion: Motion,
+        ends_s: Mapping[int, float] | None = None,
     ) -> None:
         self.motion = motion
         self.acts = acts
         self.events = events
         self._variables = variables
+        self._ends_s = ends_s or {}  # of the events that change the speed of the car ahead, by their id
         self._asking: list[Element] = []  # the events and acts whose moment is being computed
 
     def with_motion(self, motion: Motion) -> "Timeline":
         """The same story, for cars that move in another way."""
-        return Timeline(self.acts, self.events, self._variables, motion)
+        return Timeline(self.acts, self.events, self._variables, motion, self._ends_s)
+
+    def with_change(self, event: StoryEvent, change: SpeedChange) -> "Timeline":
+        """The same story, in which `event` changes the speed of the car ahead."""
+        motion = msgspec.structs.replace(self.motion, changes=(*self.motion.changes, change))
+        return self.with_motion(motion).with_end(event, change.end_s)
+
+    def with_end(self, event: StoryEvent, end_s: float) -> "Timeline":
+        """The same story, in which it is known when `event` ends."""
+        ends_s = {**self._ends_s, id(event.event): end_s}
+        return Timeline(self.acts, self.events, self._variables, self.motion, ends_s)
+
+    def changes_speed(self, event: StoryEvent) -> bool:
+        """Whether the event is known to change the speed of the car ahead, or to keep it."""
+        return id(event.event) in self._ends_s
+
+    def end_s(self, event: StoryEvent) -> float:
+        """When an event that changes the speed of the car ahead is done."""
+        return self._ends_s[id(event.event)]
 
     # -- acts and events
 
@@ -224,7 +272,8 @@ class Timeline:
         self._ask(event.event)
         found = self.trigger(event.event.maybe("StartTrigger"), act.at_s)
         self._asking.pop()
-        return msgspec.structs.replace(found, assumes_speeds=found.assumes_speeds or act.assumes_speeds)
+        assumes, moving = found.assumes_speeds or act.assumes_speeds, found.moving or act.moving
+        return msgspec.structs.replace(found, assumes_speeds=assumes, moving=moving)
 
     def trigger(self, trigger: Element | None, begin_s: float) -> Moment:
         """When `trigger`, evaluated from `begin_s` on, is met for the first time."""
@@ -244,7 +293,8 @@ class Timeline:
         if at_s >= min((span.until_s for span in spans), default=NEVER_S):
             at_s = NEVER_S
         by = found[last][1] if found else None
-        return Moment(at_s, by, assumes, _slow(found, spans))
+        moving = any(one.maybe("ByEntityCondition") is not None for one, _, _ in found)
+        return Moment(at_s, by, assumes, _slow(found, spans), moving)
 
     def _begin_of_act(self, act: Element) -> Moment:
         self._ask(act)
@@ -258,10 +308,10 @@ class Timeline:
         speeds = [one for action in event.actions for one in action.walk() if one.tag == "SpeedAction"]
         if not speeds or begin.at_s == NEVER_S:
             return begin
-        if self.motion.lead not in event.actors:
-            return Moment(NEVER_S, assumes_speeds=True)  # the function moves the ego
-        change = speed_change(speeds[0], self.motion.lead_ms, self.motion.ego_ms)
-        return msgspec.structs.replace(begin, at_s=begin.at_s + change.lasts_s)
+        end_s = self._ends_s.get(id(event.event))
+        if end_s is None:  # the function moves the ego, or the change has not been looked at yet
+            return Moment(NEVER_S, assumes_speeds=True)
+        return msgspec.structs.replace(begin, at_s=end_s)
 
     def _ask(self, element: Element) -> None:
         if any(one is element for one in self._asking):
@@ -345,43 +395,45 @@ class Timeline:
         return motion.lead_ms if is_ego else motion.ego_ms
 
     def _speed(self, by: Element, speed_ms: float, is_ego: bool) -> Span:
-        braking = self.motion.braking
         if is_ego:
             slow = SlowedEgo(below_ms=by.number("value"))
             return _slowed(_crossing(speed_ms, 0.0, by, assumes=True), by, slow, by.number("value") > 0.0)
-        if braking is None:
-            return _crossing(speed_ms, 0.0, by)
-        falling = _crossing(
-            speed_ms + braking.change.deceleration_ms2 * braking.after_s, -braking.change.deceleration_ms2, by
-        )
-        if braking.after_s <= falling.from_s <= braking.end_s:
-            return falling
-        return _crossing(speed_ms, 0.0, by)
+        return self._over_stretches(by)
+
+    def _over_stretches(self, by: Element) -> Span:
+        """When the speed of the car ahead is for the first time as `by` says."""
+        held: Span | None = None
+        for one in (stretch for stretch in self.motion.stretches() if stretch.from_s < stretch.until_s):
+            span = _crossing(one.speed_ms - one.slope_ms2 * one.from_s, one.slope_ms2, by)
+            from_s, until_s = max(span.from_s, one.from_s), min(span.until_s, one.until_s)
+            if from_s < until_s:
+                begin_s = held.from_s if held else from_s if from_s > 0.0 else -math.inf
+                held = Span(begin_s, until_s)
+            if held is not None and (from_s >= until_s or until_s < one.until_s):
+                break
+        return held or _NEVER
 
     def _travelled(self, by: Element, speed_ms: float, is_ego: bool) -> Span:
-        found = _crossing(0.0, speed_ms, by, "greaterOrEqual", assumes=is_ego)
-        braking = self.motion.braking
-        if is_ego or braking is None or found.from_s <= braking.after_s:
-            return found
-        left_m, change = by.number("value") - speed_ms * braking.after_s, braking.change
-        braking_m = (speed_ms + change.final_ms) / 2.0 * change.lasts_s
-        if left_m <= braking_m:
-            root = speed_ms * speed_ms - 2.0 * change.deceleration_ms2 * left_m
-            lasts_s = (speed_ms - math.sqrt(max(0.0, root))) / change.deceleration_ms2
-            return Span(braking.after_s + lasts_s, math.inf)
-        if change.final_ms == 0.0:
-            return _NEVER
-        return Span(braking.end_s + (left_m - braking_m) / change.final_ms, math.inf)
+        if is_ego:
+            return _crossing(0.0, speed_ms, by, "greaterOrEqual", assumes=True)
+        left_m = by.number("value")
+        for one in self.motion.stretches():
+            lasts_s = _time_for(left_m, one)
+            if lasts_s is not None and lasts_s <= one.until_s - one.from_s:
+                return Span(one.from_s + lasts_s, math.inf)
+            lasts_s = one.until_s - one.from_s
+            if lasts_s < math.inf:
+                left_m -= (one.speed_ms + one.slope_ms2 * lasts_s / 2.0) * lasts_s
+        return _NEVER
 
     def _standstill(self, by: Element, speed_ms: float, is_ego: bool) -> Span:
-        duration_s, braking = by.number("duration"), self.motion.braking
-        if speed_ms == 0.0:
-            return Span(duration_s, math.inf, assumes_speeds=is_ego)
+        duration_s = by.number("duration")
         if is_ego:
-            return _NOT_BEFORE_BRAKING
-        if braking is None or braking.change.final_ms > 0.0:
-            return _NEVER
-        return Span(braking.end_s + duration_s, math.inf)
+            return Span(duration_s, math.inf, assumes_speeds=True) if speed_ms == 0.0 else _NOT_BEFORE_BRAKING
+        for one in self.motion.stretches():
+            if one.speed_ms == one.slope_ms2 == 0.0 and one.until_s - one.from_s > duration_s:
+                return Span(one.from_s + duration_s, one.until_s)
+        return _NEVER
 
     def _distance(self, by: Element, is_ego: bool) -> Span:
         """Conditions on the distance of the two cars, along the lane."""
@@ -471,8 +523,8 @@ class Timeline:
 def _first(moments: Sequence[Moment]) -> Moment:
     """The first of several moments; it assumes the speeds if another one may come before it that does."""
     first = min(moments, key=lambda one: one.at_s)
-    assumes = any(one.assumes_speeds for one in moments)
-    return msgspec.structs.replace(first, assumes_speeds=assumes)
+    assumes, moving = any(one.assumes_speeds for one in moments), any(one.moving for one in moments)
+    return msgspec.structs.replace(first, assumes_speeds=assumes, moving=moving)
 
 
 def _names(event: StoryEvent, kind: str) -> list[str | None]:
@@ -498,6 +550,16 @@ def _known(kind: Element, holder: Element, tags: tuple[str, ...]) -> Element:
         if child.tag not in (*tags, "TriggeringEntities", "EntityCondition"):
             raise child.error(TRIGGER_UNKNOWN, Cause.TRIGGER)
     return holder.one(*tags)
+
+
+def _time_for(distance_m: float, one: Stretch) -> float | None:
+    """How long a car in this stretch needs for a distance; None if it does not get there."""
+    if distance_m <= 0.0:
+        return 0.0
+    if one.slope_ms2 == 0.0:
+        return distance_m / one.speed_ms if one.speed_ms > 0.0 else None
+    root = one.speed_ms * one.speed_ms + 2.0 * one.slope_ms2 * distance_m
+    return (math.sqrt(root) - one.speed_ms) / one.slope_ms2 if root >= 0.0 else None
 
 
 def _delayed(condition: Element, span: Span, begin_s: float) -> Span:

@@ -19,6 +19,7 @@ from aftbed.vehicle.plant import (
     Driver,
     LeadBraking,
     LeadCar,
+    LeadSpeed,
     PlantSetup,
     VehicleResult,
 )
@@ -73,6 +74,12 @@ class BrakingKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     to_kmh: Speed = 0.0
 
 
+class LeadSpeedKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    after_s: Duration
+    to_kmh: Speed
+    rate_ms2: Annotated[float, Meta(gt=0, le=12)]
+
+
 class CutInKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     after_s: Duration
     over_s: Annotated[float, Meta(gt=0, le=60)]
@@ -85,6 +92,7 @@ class LeadKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     gap_m: Distance | None = None
     ttc_s: Annotated[float, Meta(gt=0, le=60)] | None = None
     braking: BrakingKeys | None = None
+    speeds: tuple[LeadSpeedKeys, ...] = ()
     lateral_m: Annotated[float, Meta(ge=-10, le=10)] = 0.0
     cut_in: CutInKeys | None = None
 
@@ -166,6 +174,11 @@ def _lead(where: str, keys: LeadKeys, ego_kmh: float) -> LeadCar:
         if gap_m == 0.0:  # a collision before the start
             raise ConfigError(f"{where}: lead.gap_m: found 0, allowed is more than 0")
     braking, cut_in = keys.braking, keys.cut_in
+    if braking and keys.speeds:
+        raise ConfigError(f"{where}: lead: found both, allowed is one of braking, speeds")
+    times_s = [change.after_s for change in keys.speeds]
+    if times_s != sorted(set(times_s)):
+        raise ConfigError(f"{where}: lead.speeds: found {times_s}, allowed is one after the other")
     if cut_in and keys.lateral_m == 0.0:
         raise ConfigError(f"{where}: lead.cut_in: found without lateral_m, allowed is a car beside our lane")
     return LeadCar(
@@ -174,6 +187,9 @@ def _lead(where: str, keys: LeadKeys, ego_kmh: float) -> LeadCar:
         braking=_braking(where, braking, keys.speed_kmh) if braking else None,
         lateral_m=keys.lateral_m,
         cut_in=CutIn(_ms(cut_in.after_s), max(1, _ms(cut_in.over_s))) if cut_in else None,
+        speeds=tuple(
+            LeadSpeed(_ms(one.after_s), one.to_kmh / KMH_PER_MS, one.rate_ms2) for one in keys.speeds
+        ),
     )
 
 

@@ -12,7 +12,16 @@ from aftbed.core.errors import ConfigError
 from aftbed.vehicle.aeb.messages import STAGE_FULL, STAGE_NONE, STAGE_WARN
 from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.ecus import Fallback
-from aftbed.vehicle.plant import Brakes, CutIn, Driver, LeadBraking, LeadCar, PlantSetup, VehicleResult
+from aftbed.vehicle.plant import (
+    Brakes,
+    CutIn,
+    Driver,
+    LeadBraking,
+    LeadCar,
+    LeadSpeed,
+    PlantSetup,
+    VehicleResult,
+)
 from aftbed.vehicle.scenarios.library import load_scenario, scenario_names
 from aftbed.vehicle.scenarios.scenario import SlowEnd, broken_expectations
 
@@ -199,6 +208,21 @@ def test_a_lead_may_brake_to_a_speed_and_a_drive_end_at_one(tmp_path: Path) -> N
     assert scenario.plant.lead is not None
     assert scenario.plant.lead.braking == LeadBraking(1000, 6.0, 500, 1.0)
     assert scenario.slow_end == SlowEnd(1000, 5.0, 1.0)
+
+
+SPEEDS = "speeds: [{after_s: 1, to_kmh: 36, rate_ms2: 2}, {after_s: 3, to_kmh: 0, rate_ms2: 4}]"
+
+
+def test_a_lead_may_change_its_speed_more_than_once(tmp_path: Path) -> None:
+    braking = GOOD[GOOD.index("braking:") : GOOD.index("}", GOOD.index("braking:")) + 1]
+    scenario = load_scenario(write(tmp_path, GOOD.replace(braking, SPEEDS)))
+    assert scenario.plant.lead is not None
+    assert scenario.plant.lead.speeds == (LeadSpeed(1000, 10.0, 2.0), LeadSpeed(3000, 0.0, 4.0))
+    with pytest.raises(ConfigError, match="lead: found both, allowed is one of braking, speeds"):
+        load_scenario(write(tmp_path, GOOD.replace(braking, f"{braking}, {SPEEDS}")))
+    backwards = SPEEDS.replace("after_s: 3", "after_s: 1")
+    with pytest.raises(ConfigError, match=r"lead\.speeds: found \[1\.0, 1\.0\], allowed is one after"):
+        load_scenario(write(tmp_path, GOOD.replace(braking, backwards)))
 
 
 @pytest.mark.parametrize(
