@@ -11,7 +11,8 @@ from aftbed.core.journal import DROPPED_OFFSET, RECORD, EntryKind, header
 from aftbed.ftm.compose import build
 from aftbed.inject.crash import Crash
 from aftbed.inject.grammar import Bit, Trigger, with_flipped
-from aftbed.inject.model import Fault
+from aftbed.inject.model import Fault, FaultReport
+from aftbed.inject.receipts import ReceiptState
 from aftbed.inject.value import ValueFlip, ValuePlace
 from aftbed.judge.record import read_record
 from aftbed.judge.verdict import Verdict, judge
@@ -45,7 +46,8 @@ class RecordInTheMaking:
         self.path = path
         self.work = work or LoadRun(3, 0.0)
         self.options = RunOptions("abc123", "/gone", str(path), "pbr", "process", 7, self.work, faults)
-        receipts = [{"fault": str(f), "receipt": "applied"} for f in faults]
+        reports = (FaultReport(str(f), ReceiptState.APPLIED, number=n) for n, f in enumerate(faults))
+        receipts = list(map(msgspec.to_builtins, reports))
         lives = [[b.name, b.kind] for b in build("pbr", "process").bricks]
         hosted = {"ftm": "pbr", "placement": "process", "leader": "a", "backup": "b", "bricks": lives}
         self.end: dict[str, object] | None = {

@@ -29,7 +29,7 @@ from aftbed.core.graph import Graph
 from aftbed.core.messages import Goal, Scheduled
 from aftbed.core.script import RECIPES, after
 from aftbed.core.units import milliseconds
-from aftbed.ftm.compose import DUPLEX, SIMPLEX, parse
+from aftbed.ftm.compose import DUPLEX, SIMPLEX, canonical, parse
 from aftbed.ftm.registry import KINDS
 
 VERBS: Final = ("to", "switch", "compose", "decompose", "update")
@@ -106,7 +106,7 @@ def goal(wish: Wish, running: str, recipe: str = RECIPES[0]) -> Goal:
     new = parse(wish.name)
     if wish.verb != "to" and new and old:  # what begins or ends at `none` is refused by the plan, with a word
         _check_verb(wish, running, old, new)
-    return Goal(expression=wish.name, recipe=recipe)
+    return Goal(expression=canonical(wish.name), recipe=recipe)
 
 
 def _check_verb(wish: Wish, running: str, old: tuple[str, ...], new: tuple[str, ...]) -> None:

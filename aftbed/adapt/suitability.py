@@ -15,7 +15,7 @@ An expression follows from its parts, and has no row of its own:
 
 There are two classes of value faults. `value` is any wrong reply or state of one execution; a mechanism
 that compares executions covers it. `implausible` is the part of it that the function's own assertion
-refuses; that is all that an assertion covers.
+refuses; that is all that an assertion covers. `flow`: a step is skipped, done twice, or late.
 
 State access where a backup executes every request: normal service needs none. A *new* backup needs it:
 without, the survivor of a failover stays alone. That is no reason to refuse the mechanism; `remarks` says
@@ -42,7 +42,9 @@ FAULTS: Final[dict[FaultClass, str]] = {
     "crash": "crashes",
     "value": "value faults",
     "implausible": "implausible value faults",
+    "flow": "flow faults",
 }
+PART_OF: Final[dict[FaultClass, FaultClass]] = {"implausible": "value"}  # a class of faults within another
 LEVELS: Final[tuple[Level, ...]] = ("none", "low", "high")
 TAKES: Final[dict[Level, str]] = {"none": "no", "low": "little", "high": "much"}
 
@@ -53,6 +55,7 @@ class FaultModel(msgspec.Struct, frozen=True):
     crash: bool = True
     value: bool = False
     implausible: bool = False
+    flow: bool = False
 
     def asked(self) -> tuple[FaultClass, ...]:
         return tuple(fault for fault in FAULTS if getattr(self, fault))
@@ -212,18 +215,16 @@ def consistent(
     resources: Resources,
     table: SuitabilityTable = TABLE,
 ) -> list[str]:
-    """The consistent expressions, the cheapest first; [] is "no consistent FTM".
-
-    Cheap is little of, in this order: CPUs, CPU load, bandwidth; the last two summed over the parts.
-    """
-
-    def cost(expression: str) -> tuple[int, int, int]:
-        rows = [table.rows[name] for name in parse(expression)]
-        cpu_load = sum(LEVELS.index(row.cpu_load) for row in rows)
-        return demand(expression, table).cpus, cpu_load, sum(LEVELS.index(row.bandwidth) for row in rows)
-
+    """The consistent expressions, the cheapest first; [] is "no consistent FTM"."""
     found = [e for e in EXPRESSIONS if not problems(e, faults, characteristics, resources, table)]
-    return sorted(found, key=cost)
+    return sorted(found, key=lambda expression: cost(expression, table))
+
+
+def cost(expression: str, table: SuitabilityTable = TABLE) -> tuple[int, int, int]:
+    """To sort by: CPUs, CPU load, bandwidth; the last two summed over the parts."""
+    rows = [table.rows[name] for name in parse(expression)]
+    cpu_load = sum(LEVELS.index(row.cpu_load) for row in rows)
+    return demand(expression, table).cpus, cpu_load, sum(LEVELS.index(row.bandwidth) for row in rows)
 
 
 def remarks(expression: str, characteristics: Characteristics) -> list[str]:

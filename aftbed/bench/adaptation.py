@@ -13,28 +13,35 @@ each of its adaptations has a run of its own; those that never answer again are 
 """
 
 import itertools
+import math
 import time
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Annotated, Final, NamedTuple
 
 import msgspec
+from msgspec import Meta
 
 from aftbed.bench.cycle import RING_BYTES, ring_of, ring_us
 from aftbed.bench.recovery import DEATH, deaths_ms
 from aftbed.bench.rounds import ROUNDS, BesideLimit, Meanwhile, beside_limit, in_turn, shares
 from aftbed.bench.runs import (
     PAUSE_SECONDS,
+    Log,
     Percentiles,
     endless_run,
     latencies_us,
     percentiles,
+    tried,
     wait_until_ready,
 )
-from aftbed.core.errors import HarnessError
+from aftbed.core.errors import ConfigError, HarnessError
+from aftbed.core.graph import PLACEMENTS
+from aftbed.core.input_file import read_input
 from aftbed.core.journal import EntryKind
 from aftbed.core.messages import Goal
 from aftbed.core.script import RECIPES
-from aftbed.ftm.compose import build
+from aftbed.ftm.compose import build, parse
 from aftbed.judge import checks
 from aftbed.judge.isolated import reference_of
 from aftbed.judge.record import RunRecord
@@ -43,6 +50,7 @@ from aftbed.vehicle.aeb.function import default_application
 
 RATE_HZ: Final = 200.0
 RING_COUNT: Final = 500
+RESULT_BYTES_MAX: Final = 1_000_000
 
 Outcomes = list[dict[str, object]]
 
@@ -189,3 +197,108 @@ def adapted(private: Path, goal: Goal) -> dict[str, object]:
     if outcome["outcome"] != "done":
         raise HarnessError(f"an adaptation of the bench ended {outcome['outcome']}: {outcome['reason']}")
     return outcome
+
+
+# -- of many pairs --------------------------------------------------------------------------------
+
+
+class AdaptationTime(msgspec.Struct, frozen=True):
+    """Medians of so many adaptations from one mechanism to another: without service, and to the end."""
+
+    blackout_ms: float
+    total_ms: float
+    adaptations: int
+
+
+Pair = tuple[str, str]
+
+
+def bench_pairs(pairs: Sequence[Pair], count: int, log: Log) -> dict[Pair, AdaptationTime]:
+    """Each adaptation of `pairs` at least `count` times, under load, in one run. Raises HarnessError."""
+    if not pairs:
+        return {}
+    found = tried(f"{len(pairs)} adaptations, {count} times each", lambda: _walk(pairs, count, log), log)
+    return {pair: _time(found[pair]) for pair in pairs}
+
+
+def _walk(pairs: Sequence[Pair], count: int, log: Log) -> dict[Pair, Outcomes]:
+    """From one to the next; where none begins at what runs, there is an adaptation between them."""
+    found: dict[Pair, Outcomes] = {}
+    with endless_run(pairs[0][0], PLACEMENTS[0], RATE_HZ) as run:
+        wait_until_ready(run.private)
+        running = pairs[0][0]
+
+        def adapt(new: str) -> None:
+            nonlocal running
+            found.setdefault((running, new), []).append(adapted(run.private, Goal(expression=new)))
+            running = new
+            time.sleep(PAUSE_SECONDS)
+
+        for number in range(count):
+            log(f"adaptations, {number + 1} of {count}")
+            left = [pair for pair in pairs if len(found.get(pair, ())) <= number]
+            while left:
+                old, new = next((pair for pair in left if pair[0] == running), left[0])
+                if running != old:
+                    adapt(old)
+                adapt(new)
+                left = [pair for pair in left if len(found.get(pair, ())) <= number]
+    return found
+
+
+def _time(outcomes: Outcomes) -> AdaptationTime:
+    blackout_ms, total_ms = (
+        percentiles([float(str(outcome[name])) for outcome in outcomes]).p50
+        for name in ("blackout_ms", "total_ms")
+    )
+    return AdaptationTime(blackout_ms, total_ms, len(outcomes))
+
+
+class _Median(msgspec.Struct, frozen=True):
+    p50: Annotated[float, Meta(ge=0)]
+
+
+class _OneWay(msgspec.Struct, frozen=True):
+    """What is read of the times of one direction."""
+
+    blackout_ms: _Median
+    total_ms: _Median
+
+
+class _ResultFile(_OneWay, frozen=True, kw_only=True):
+    """What is read of the document of `aftbed bench adapt`."""
+
+    old: str = msgspec.field(name="from")
+    new: str = msgspec.field(name="to")
+    recipe: str
+    placement: str
+    adaptations: Annotated[int, Meta(ge=1)]
+    back: _OneWay | None = None
+
+
+def read_times(path: Path) -> dict[Pair, AdaptationTime]:
+    """Of a file with the document of `aftbed bench adapt --json`: there, and back. Raises ConfigError."""
+    try:
+        found = msgspec.json.decode(read_input(path, RESULT_BYTES_MAX), type=_ResultFile)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise ConfigError(
+            f"{path}: {error}; allowed is a file with the document of `aftbed bench adapt --json`"
+        ) from None
+    where = f"{path}: from {found.old} to {found.new}"
+    for name in (found.old, found.new):
+        try:
+            parse(name)
+        except ConfigError as error:
+            raise ConfigError(f"{where}: {error}") from None
+    if (found.recipe, found.placement) != (RECIPES[0], PLACEMENTS[0]):
+        raise ConfigError(
+            f"{where}: found recipe {found.recipe}, placement {found.placement};"
+            f" allowed are {RECIPES[0]} and {PLACEMENTS[0]}"
+        )
+    ways: list[tuple[Pair, _OneWay]] = [((found.old, found.new), found)]
+    if found.back is not None:
+        ways.append(((found.new, found.old), found.back))
+    each = math.ceil(found.adaptations / len(ways))
+    return {pair: AdaptationTime(one.blackout_ms.p50, one.total_ms.p50, each) for pair, one in ways}

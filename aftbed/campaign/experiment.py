@@ -23,7 +23,7 @@ from aftbed.core.graph import Graph
 from aftbed.core.messages import Scheduled
 from aftbed.core.script import RECIPES
 from aftbed.core.units import duration
-from aftbed.ftm.compose import build
+from aftbed.ftm.compose import build, detects
 from aftbed.functions.load import NO_CODE, OWN_CODE, Code
 from aftbed.functions.request_file import GivenRequests, names_function, requests_from
 from aftbed.inject.model import Fault, FaultReport, parse
@@ -357,7 +357,8 @@ def _probe() -> Probe:
 def without_times(result: Result) -> Result:
     """What is known of a run on a machine that was too busy."""
     reasons = ("the machine was too busy for times to mean anything", *result.reasons)
-    false_alarm = result.outcome == "tolerated" and result.unexpected
+    timed_stop = result.outcome == "detected_stop" and detects(result.experiment.ftm, "flow")
+    false_alarm = result.unexpected and (result.outcome == "tolerated" or timed_stop)
     outcome = "inconclusive" if result.outcome in TIMED or false_alarm else result.outcome
     untimed = {"fdti_ms": None, "frti_ms": None, "fhti_ms": None}
     return msgspec.structs.replace(

@@ -27,6 +27,7 @@ COMMANDS: Final[CommandTable] = {
         "Many experiments from one file, judged with statistics, ended by a gate.",
     ),
     "log": ("log:log", "Convert a log of the bus or the record of a run for other tools."),
+    "map": ("maps:maps", "Maps of other radars: check one, propose one for a DBC and a log."),
     "scenario": (
         "scenario:scenario",
         "Drives and published tables: what must stop, and what still does under faults.",

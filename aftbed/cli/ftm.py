@@ -12,6 +12,7 @@ import psutil
 import typer
 
 from aftbed.adapt.suitability import (
+    FAULTS,
     TABLE,
     Demand,
     Resources,
@@ -24,8 +25,8 @@ from aftbed.adapt.suitability import (
     remarks,
     table_from,
 )
+from aftbed.cli.lazy import CommandTable, group_of
 from aftbed.cli.options import Json, check_range, print_blocks, print_json
-from aftbed.cli.parsing import PlainGroup
 from aftbed.core.application import NONE
 from aftbed.core.errors import ConfigError
 from aftbed.core.graph import Graph
@@ -36,7 +37,13 @@ from aftbed.judge.isolated import declared_by
 from aftbed.runtime.unix.trust import OWN_RUN
 from aftbed.vehicle.aeb.function import default_application
 
-ftm = typer.Typer(cls=PlainGroup)
+SUBCOMMANDS: Final[CommandTable] = {
+    "resilience": (
+        "ftm_resilience:resilience_",
+        "Which changes of FT, A and R a set of mechanisms answers: by staying, by an adaptation, by nothing.",
+    ),
+}
+ftm = typer.Typer(cls=group_of(SUBCOMMANDS))
 EXIT_INCONSISTENT: Final = 1
 CPUS_MAX: Final = 1024
 BANDWIDTH_KBIT_S_MAX: Final = 1e9
@@ -49,10 +56,15 @@ TableOption = Annotated[
 ]
 
 
+def table_of(path: str | None) -> SuitabilityTable:
+    """What `--table` means. Raises ConfigError."""
+    return TABLE if path is None else table_from(read_yaml(Path(path), TableFile), path)
+
+
 @ftm.command("list")
 def list_(table: TableOption = None, json: Json = False) -> None:
     """Every FTM expression: what it tolerates and needs, and how many processes it takes."""
-    rules = _table(table)
+    rules = table_of(table)
     found = [(demand(name, rules), build(name, "process")) for name in EXPRESSIONS]
     if json:
         print_json([_summary(*one) for one in found])
@@ -73,7 +85,7 @@ def show(
     json: Json = False,
 ) -> None:
     """One FTM expression: what it tolerates and needs, its bricks and its channels."""
-    wanted, graph = demand(expr, _table(table)), build(expr, "process")
+    wanted, graph = demand(expr, table_of(table)), build(expr, "process")
     if json:
         bricks = [{"name": brick.name, "kind": brick.kind} for brick in graph.bricks]
         channels = [{"name": k.name, "source": k.source, "sink": k.sink} for k in graph.links]
@@ -98,7 +110,7 @@ def check(
         str | None, typer.Option("--ftm", help="The FTM to judge; all of them if left out.")
     ] = None,
     faults: Annotated[
-        str, typer.Option(help="To be tolerated: crash, value, implausible, separated by commas; or none.")
+        str, typer.Option(help=f"To be tolerated: {', '.join(FAULTS)}, separated by commas; or none.")
     ] = "crash",
     app: Annotated[
         str | None, typer.Option(help="The protected function, as MODULE:CLASS or FILE.py:CLASS.")
@@ -115,7 +127,7 @@ def check(
 
     Exit code: 0 consistent, 1 not consistent, 2 usage.
     """
-    model, rules = fault_model(faults), _table(table)
+    model, rules = fault_model(faults), table_of(table)
     built_in = default_application().characteristics
     declared = built_in if app is None else declared_by(located(app), OWN_RUN)
     resources = _resources(cpus, cpu_load, bandwidth)
@@ -147,10 +159,6 @@ def check(
             print(f"{expression} is not consistent; {would_do}" if found else f"{expression} is consistent")
     if not suits:
         raise typer.Exit(EXIT_INCONSISTENT)
-
-
-def _table(path: str | None) -> SuitabilityTable:
-    return TABLE if path is None else table_from(read_yaml(Path(path), TableFile), path)
 
 
 def _resources(cpus: int | None, cpu_load: float | None, bandwidth: float | None) -> Resources:

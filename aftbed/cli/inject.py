@@ -4,7 +4,7 @@ import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Any, Final
 
 import msgspec
 import typer
@@ -15,13 +15,22 @@ from aftbed.cli.parsing import PlainGroup
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.inject.bus import read_bus_fault
 from aftbed.inject.memory import refuse_unsafe
-from aftbed.inject.model import Fault, on_bus, read
+from aftbed.inject.model import Fault, on_bus, parse, read
 from aftbed.inject.radar import EFFECTS, RADAR
 from aftbed.inject.value import MEMORY
 from aftbed.runtime.unix import control_client, run_directory
 from aftbed.runtime.unix.options import Work, with_names_resolved
 
-inject = typer.Typer(cls=PlainGroup)
+
+class InjectGroup(PlainGroup):
+    """Takes the words of a fault as one argument too, as `run --inject` does."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        whole = args and " " in args[0]
+        return super().parse_args(ctx, ["fault", *args] if whole else args)
+
+
+inject = typer.Typer(cls=InjectGroup)
 
 LEVELS: Final = ("value", MEMORY)
 DRAWN: Final = "drawn"  # in the place of a byte's number: the seed chooses the byte
@@ -182,6 +191,21 @@ def bitflip(given: BitflipArguments) -> None:
         what, given = MEMORY, replace(given, replica=given.place)
     byte = [] if given.byte is None else ["byte"] if given.byte == DRAWN else ["byte", given.byte]
     _arm(given.run, read(["bitflip", what, *_words(given, byte)]))
+
+
+@inject.command()
+def fault(
+    words: Annotated[str, typer.Argument(help='E.g. "crash primary at server.exit nth 3".')],
+    unsafe_memory: Annotated[
+        bool, typer.Option("--unsafe-memory", help='Allow "bitflip memory ...".')
+    ] = False,
+    run: Run = None,
+) -> None:
+    """Any fault in the words of `run --inject`; the word `fault` itself may be left out."""
+    found = parse(words)
+    if found.action.unsafe:
+        refuse_unsafe(str(found), agreed=unsafe_memory)
+    _arm(run, found)
 
 
 @inject.command()

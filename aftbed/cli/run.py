@@ -44,7 +44,7 @@ from aftbed.core.errors import ConfigError, unknown
 from aftbed.core.graph import Graph
 from aftbed.core.messages import Scheduled
 from aftbed.core.script import RECIPES
-from aftbed.ftm.compose import build
+from aftbed.ftm.compose import build, canonical
 from aftbed.functions.source import located
 from aftbed.inject.memory import refuse_unsafe
 from aftbed.inject.model import Fault, parse
@@ -181,7 +181,7 @@ def execute(given: RunArguments) -> int:
     write_files = _files(given)
     page = _page(given)
     options, listener = options_for(
-        ftm=given.ftm,
+        ftm=graph.ftm,
         placement=given.placement,
         work=work,
         seed=given.seed,
@@ -266,7 +266,7 @@ def _closed_loop(given: RunArguments) -> "Callable[[Launched], ClosedLoop] | Non
         return None
     from aftbed.runtime.unix.closed_loop import ClosedLoop, asked_for  # noqa: PLC0415 - only with --policy
 
-    policy = asked_for(given.policy, given.approve, given.ftm, as_json=given.json)
+    policy = asked_for(given.policy, given.approve, canonical(given.ftm), as_json=given.json)
     if policy is None:
         return None
     from aftbed.cli.adapt import declared_in_time  # noqa: PLC0415 - the same
@@ -278,6 +278,7 @@ def _work(given: RunArguments) -> Work:
     if given.replay is not None and given.load is not None:
         raise ConfigError("--replay and --load: one of them is allowed")
     if given.load is not None:
+        _refuse(given, ("scenario", "pace", "brake_policy"), "--load: there is no car: leave out")
         if given.bus_open:
             raise ConfigError("--bus-open: a run of --load has no bus")
         return _load(given.load)

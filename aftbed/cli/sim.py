@@ -107,7 +107,8 @@ class SimArguments(msgspec.Struct, frozen=True):
         str | None, typer.Option(help="A car makes the requests: a scenario, or a YAML file.")
     ] = None
     faults: Annotated[
-        tuple[str, ...], typer.Option("--faults", help='E.g. "crash primary at server.exit nth 3".')
+        tuple[str, ...],
+        typer.Option("--inject", "--faults", help='E.g. "crash primary at server.exit nth 3".'),
     ] = ()
     adaptations: Annotated[
         tuple[str, ...], typer.Option("--adapt", help='E.g. "to lfr+tr at request 20".')

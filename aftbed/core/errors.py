@@ -6,7 +6,7 @@ failed `assert` is a bug of ours: it ends the node, because fail-silence is the 
 """
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Final
 
 FUNCTION_FAILED: Final = "the function failed: "  # begins why its node has stopped
@@ -62,9 +62,15 @@ def spreadsheet_text(text: str) -> str:
     return f"'{text}" if text.startswith(("=", "+", "-", "@", "\t")) else text
 
 
-def unknown(what: str, found: str, allowed: Iterable[str]) -> ConfigError:
-    """A `ConfigError` that names what was found, the nearest name that exists, and all allowed."""
+def unknown(
+    what: str, found: str, allowed: Iterable[str], synonyms: Mapping[str, str] | None = None
+) -> ConfigError:
+    """A `ConfigError` that names what was found, the nearest name that exists, and all allowed.
+
+    `synonyms`: what words mean that others use for the same.
+    """
     names = sorted(allowed)
-    near = difflib.get_close_matches(found, names, n=1, cutoff=0.5)
+    meant = (synonyms or {}).get(found)
+    near = [meant] if meant in names else difflib.get_close_matches(found, names, n=1, cutoff=0.5)
     hint = f"; did you mean {near[0]!r}?" if near else ""
     return ConfigError(f"unknown {what} {found!r}{hint} (one of: {', '.join(names)})")

@@ -29,10 +29,11 @@ ONWARD: Final = ("pro2bfr", "bfr2prd", "prd2aft", "pro2pxy")  # the way of a req
 
 
 def parse(expression: str) -> tuple[str, ...]:
-    """The names of the mechanisms in `expression`, the outermost first; () for `none`.
+    """The names of the mechanisms in `expression`, the outermost first; () for `none`. `PBR` is `pbr`.
 
     Raises ConfigError on an unknown name and on an order that makes no sense.
     """
+    expression = expression.lower()
     if expression == NONE:
         return ()
     names = tuple(expression.split("+"))
@@ -53,13 +54,20 @@ def parse(expression: str) -> tuple[str, ...]:
     return names
 
 
+def canonical(expression: str) -> str:
+    """The expression as it is named everywhere. Raises ConfigError as `parse` does."""
+    return "+".join(parse(expression)) or NONE
+
+
 def _expressions() -> tuple[str, ...]:
-    """Every expression of one or two mechanisms that makes sense, `none` first."""
+    """Every expression of one or two mechanisms that makes sense and is listed, `none` first."""
     found = [NONE, *DUPLEX, *SIMPLEX]
-    for pair in (f"{outer}+{inner}" for outer in MECHANISMS for inner in SIMPLEX):
-        with contextlib.suppress(ConfigError):
-            parse(pair)
-            found.append(pair)
+    for outer, inner in itertools.product(MECHANISMS, SIMPLEX):
+        pair = f"{outer}+{inner}"
+        if outer in DUPLEX or (MECHANISMS[outer].combined and MECHANISMS[inner].combined):
+            with contextlib.suppress(ConfigError):
+                parse(pair)
+                found.append(pair)
     return tuple(found)
 
 
@@ -111,6 +119,11 @@ DUPLEX_EXPRESSIONS: Final = tuple(  # each mechanism that replicates, alone and 
 def tolerates(expression: str, fault: FaultClass) -> bool:
     """Whether a mechanism in `expression` tolerates `fault` by itself."""
     return any(fault in MECHANISMS[name].suitability.tolerates for name in parse(expression))
+
+
+def detects(expression: str, fault: FaultClass) -> bool:
+    """Whether a mechanism in `expression` stops its replica at `fault`."""
+    return any(fault in MECHANISMS[name].suitability.detects for name in parse(expression))
 
 
 def replication_of(expression: str) -> tuple[tuple[str, str], ...]:

@@ -17,7 +17,7 @@ from aftbed.core.events import Event
 from aftbed.core.graph import Kind
 from aftbed.ftm.pages import PAGE_BYTES
 
-FaultClass = Literal["crash", "value", "implausible"]
+FaultClass = Literal["crash", "value", "implausible", "flow"]
 Level = Literal["none", "low", "high"]
 
 
@@ -88,6 +88,8 @@ class Mechanism(msgspec.Struct, frozen=True, kw_only=True):
 
     `links`: those of this mechanism only, from part to part through a port that both ends call the same.
     `replication`: parts and ports by which a leader sends to its backup; none: one replica.
+    `combined`: it is listed with each other mechanism that makes sense; else only inside of those that
+    replicate, which keeps the list of all expressions short.
     `innermost`: its Proceed is part of what it does, so no other mechanism can take that place.
     `adaptations_explored`: `explore adapt` makes all adaptations from and to it, without being told to.
     """
@@ -100,4 +102,5 @@ class Mechanism(msgspec.Struct, frozen=True, kw_only=True):
     replication: tuple[tuple[str, str], ...] = ()
     innermost: bool = False
     suitability: Suitability
+    combined: bool = True
     adaptations_explored: bool = True

@@ -13,11 +13,12 @@ from aftbed.ftm.failover import RECOVERY, WATCHDOG
 from aftbed.ftm.lfr import LFR
 from aftbed.ftm.pbr import PBR
 from aftbed.ftm.server import BARE_SERVER, SERVER
+from aftbed.ftm.supervision import SUP
 from aftbed.ftm.tr import TR
 
 __all__ = ["EMITTERS", "KINDS", "MECHANISMS", "Setting", "make"]
 
-MECHANISMS: Final[dict[str, Mechanism]] = {one.name: one for one in (PBR, LFR, TR, ASSERT)}
+MECHANISMS: Final[dict[str, Mechanism]] = {one.name: one for one in (PBR, LFR, TR, ASSERT, SUP)}
 
 BRICKS: Final[dict[str, BrickKind]] = {
     kind.name: kind

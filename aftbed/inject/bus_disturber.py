@@ -85,6 +85,7 @@ class _ArmedBusFault:
         self.good_us: int | None = None
         self.fallback_us: int | None = None
         self._objections: set[tuple[str, int]] = set()  # of a node to the frames of an identifier
+        self._used_us = 0  # when a node that had objected used the frames again, the latest
 
     @property
     def on_nodes(self) -> bool:
@@ -148,21 +149,24 @@ class _ArmedBusFault:
             self.believed, self.taken_us = node, t_us
 
     def was_noticed(self, node: str, notice: Notice) -> None:
-        """Once it has struck."""
+        """Once it has struck. Each node has a connection of its own, so a report may be heard late."""
         word, t_us, by = notice.word, notice.t_us, (node, notice.can_id)
         if t_us < self.first_us:
             return
         if word == GOOD_AGAIN:
             if by in self._objections:
                 self._objections.remove(by)
+                self._used_us = max(self._used_us, t_us)
                 if not self._objections and self.good_us is None:
-                    self.good_us = t_us
+                    self.good_us = self._used_us
             return
         if word != FALLBACK and notice.can_id not in self.ids:
             return
         self._objections.add(by)
-        if not self.noticed:
+        if self.noticed_us is None or t_us < self.noticed_us:
             self.noticed, self.noticed_us = f"{node} ({word})", t_us
+        if self.good_us is not None and t_us < self.good_us:
+            self.good_us = None
         if word == FALLBACK and self.good_us is None:
             self.fallback_us = t_us  # the last: the brakes bridge a gap before they give up
 

@@ -42,6 +42,7 @@ PERMANENT, INTERMITTENT, BYTE = "permanent", "intermittent", "byte"
 WHEN_KEYS: Final = ("at", "nth", "after", "when")
 REPEAT_KEYS: Final = (PERMANENT, INTERMITTENT)
 _VALUE_WORDS: Final = {INTERMITTENT: 2, "when": 3}  # of all other keys the value is one word
+_TIME: Final = re.compile(r"[0-9.]+(us|ms|s)")
 _WHOLE: Final = re.compile(r"[0-9]{1,12}")
 
 
@@ -65,6 +66,10 @@ class FaultWords:
             count = 0 if alone else _VALUE_WORDS.get(key, 1)
             if len(rest) < count:
                 raise ConfigError(f"fault {self.text!r}: {key!r} lacks its value")
+            if key == "at" and _TIME.fullmatch(rest[0]):
+                raise ConfigError(
+                    f"fault {self.text!r}: 'at' is followed by an event, 'after {rest[0]}' by a time"
+                )
             self._values[key] = " ".join(rest.pop(0) for _ in range(count))
 
     def __contains__(self, key: str) -> bool:

@@ -39,6 +39,16 @@ FaultAction = (  # the registry: the first kind that claims the words of a fault
 )
 KINDS: Final[tuple[type[FaultKind], ...]] = get_args(FaultAction)
 NAMES: Final = tuple(dict.fromkeys(name for kind in KINDS for name in kind.NAMES))
+SAME_ROLES: Final = {"leader": "primary", "follower": "backup"}
+SYNONYMS: Final = {  # of names of faults
+    **dict.fromkeys(("kill", "sigkill", "die", "abort"), "crash"),
+    **dict.fromkeys(("freeze", "stop", "sigstop", "pause"), "hang"),
+    **dict.fromkeys(("drop", "lose", "loss"), "omission"),
+    **dict.fromkeys(("flip", "seu", "bit-flip"), "bitflip"),
+    **dict.fromkeys(("late", "latency", "lag"), "delay"),
+    **dict.fromkeys(("repeat", "double"), "duplicate"),
+    **dict.fromkeys(("swap", "shuffle"), "reorder"),
+}
 GRAMMAR: Final = (
     "crash|hang|slow TARGET [by 2ms | share 25%] [for 50ms] [at EVENT [nth N] | after 200ms],"
     " omission|delay|duplicate|reorder CHANNEL [by 20ms] [in primary|backup|a|b] [nth N | after 200ms],"
@@ -72,13 +82,18 @@ class ArmedFault(msgspec.Struct, frozen=True):
 
 
 class FaultReport(msgspec.Struct, frozen=True, omit_defaults=True):
-    """A fault of a run in its words, with its receipt, as it stands in records and documents."""
+    """A fault of a run in its words, with its receipt, as it stands in records and documents.
+
+    `number`: which of the run's faults, from 0 on, as the journals count them. Those of live faults that were
+    refused are missing: these have no report.
+    """
 
     fault: str
     receipt: ReceiptState
     detail: str = ""
     live: bool = False  # it was asked for while the run ran
     bus: BusTimes | None = None  # of a fault of the bus that struck
+    number: int = 0
 
     @property
     def fired(self) -> bool:
@@ -99,11 +114,15 @@ def parse(text: str) -> Fault:
 
 
 def read(words: Sequence[str]) -> Fault:
-    """The same of words that are separate already: one of them may have spaces."""
+    """The same of words that are separate already: one of them may have spaces.
+
+    `leader` and `follower` mean `primary` and `backup`, whatever mechanism runs.
+    """
+    words = [SAME_ROLES.get(word, word) for word in words]
     for kind in KINDS:
         if kind.claims(words):
             found = kind.read(words)
             return Fault(cast("FaultAction", found.action), found.target, found.trigger, found.persistence)
     if len(words) < 2:
         raise ConfigError(f"fault {' '.join(words)!r}: expected {GRAMMAR}")
-    raise unknown("fault", words[0], NAMES)
+    raise unknown("fault", words[0], NAMES, SYNONYMS)

@@ -583,8 +583,8 @@ def write_csv(log: CanLog, codec: Codec, path: Path) -> CanLog:
 
     columns = [
         column(interface, name, signal)
-        for name in codec.names()
-        for interface in interfaces.get(name, ())
+        for name in sorted(interfaces)
+        for interface in interfaces[name]
         for signal in codec.signal_names(name)
         if signal not in codec.misfits(name)
     ]
@@ -605,7 +605,8 @@ def _shown(value: float) -> str:
 
 def _decode(log: CanLog, codec: Codec) -> tuple[CanLog, list[tuple[LoggedFrame, str, dict[str, float]]]]:
     """The decodable frames, and each with its message's name and signals."""
-    names = {(codec.can_id(name), codec.can_id(name) > CAN_ID_MAX): name for name in codec.names()}
+    usable = [name for name in codec.names() if codec.flaw(name) is None]
+    names = {(codec.can_id(name), codec.extended(name)): name for name in usable}
     data = without(log, FrameKind.REMOTE, FrameKind.ERROR)
     reasons = Counter(data.left_out)
     found = []

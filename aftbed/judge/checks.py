@@ -217,10 +217,10 @@ class MasterChange(NamedTuple):
 
 
 def master_changes(history: History, faults: Sequence[FaultReport] = ()) -> list[MasterChange]:
-    """Each one, in order. `faults` are those of the run, in the order of their numbers."""
+    """Each one, in order. `faults` are those of the run."""
     fences, alarms = history.events(Event.REPLICA_FENCED), history.events(Event.WATCHDOG_SUSPECT)
     strikes = history.events(Event.FAULT_APPLIED)
-    actions = [parse(report.fault) for report in faults]
+    actions = {report.number: parse(report.fault) for report in faults}
     found, since_ns = [], 0
     for promoted in history.events(Event.REPLICA_PROMOTED):
         fence = _last_before(fences, promoted.t_ns)
@@ -232,7 +232,8 @@ def master_changes(history: History, faults: Sequence[FaultReport] = ()) -> list
 
 
 def failovers(history: History, faults: Sequence[FaultReport] = ()) -> list[Failover]:
-    """Each change of master, in order. `faults` are those of the run, in the order of their numbers."""
+    """Each change of master, in order. `faults` are those of the run."""
+    words = {report.number: report.fault for report in faults}
     epochs = _epochs(history)
     found = []
     for change in master_changes(history, faults):
@@ -251,8 +252,7 @@ def failovers(history: History, faults: Sequence[FaultReport] = ()) -> list[Fail
         )
         cause = "fault" if fault else "alarm" if alarm else "unknown"
         times_ms = (detected_ms, fenced_ms, promoted_ms, recovered_ms, blackout_ms)
-        words = "" if fault is None else faults[change.fault_number].fault
-        found.append(Failover(epoch, cause, *times_ms, fault=words))
+        found.append(Failover(epoch, cause, *times_ms, fault=words.get(change.fault_number, "")))
     return found
 
 
@@ -296,7 +296,7 @@ def _replica_in(record: Record) -> str:
 
 def _cause(
     strikes: Sequence[Record],
-    faults: Sequence[Fault],
+    faults: Mapping[int, Fault],
     since_ns: int,
     alarm: Record,
     fence: Record | None,
@@ -308,10 +308,10 @@ def _cause(
     """
 
     def ended_it(strike: Record) -> bool:
-        number = number_of(strike)
-        if fence is None or not (0 <= number < len(faults) and since_ns <= strike.t_ns <= alarm.t_ns):
+        fault = faults.get(number_of(strike))
+        if fence is None or fault is None or not since_ns <= strike.t_ns <= alarm.t_ns:
             return False
-        fault, fenced = faults[number], _replica_in(fence)
+        fenced = _replica_in(fence)
         if not fault.action.stops_process or (fault.target != PRIMARY and replica_of(fault.target) != fenced):
             return False
         lasts_ns = fault.action.lasts_ms * 1_000_000

@@ -15,15 +15,17 @@ another bound.
 | crash of a Watchdog, Recovery, the Engine | the notice of the death at the supervisor | a whole request |
 | value that is outvoted | within the request | the rest of the request, and one execution more |
 | value that stops the replica | within the request | as of a crash |
+| supervised step that is skipped | the deadline of the supervision | as of a crash |
+| supervised step that is done twice | the reply to the next request | as of a crash |
 
 In reality the machine stops a process now and then, for longer than any step takes. One such stop of
 `STALL_NS` is allowed for each handling; the harness calls a machine quiet whose wakes are later by no more.
 
-Limits: one fault in a run without adaptations, in a graph with its redundancy, aimed at a replica in the
-role that it begins with; the built-in function, whose execution is part of the hop to it. There is no bound
-where the injector holds a node that serves until it has struck another one (an event of the leader, a crash
-of the backup), for the replacement of Client and Proxy, whose births take what the machine lets them, nor
-for faults that the mechanism does not handle.
+Limits: one fault of any kind in a run without adaptations, in a graph with its redundancy, aimed at a replica
+in the role that it begins with; the built-in function, whose execution is part of the hop to it. There is no
+bound where the injector holds a node that serves until it has struck another one (an event of the leader, a
+crash of the backup), for the replacement of Client and Proxy, whose births take what the machine lets them,
+nor for faults that the mechanism does not handle. A fault of the bus has a bound of its own (`bus_bound`).
 """
 
 import itertools
@@ -38,11 +40,13 @@ from aftbed.core.script import Script
 from aftbed.ftm.compose import REPLICAS, build, parse, path, replication_of
 from aftbed.ftm.failover import HANG_DEADLINE_NS, failover
 from aftbed.ftm.registry import MECHANISMS
+from aftbed.ftm.supervision import DEADLINE_NS, SUP
+from aftbed.inject.channel import ChannelFault, Disturbance
 from aftbed.inject.crash import Crash
 from aftbed.inject.grammar import ONCE
 from aftbed.inject.hang import Hang
 from aftbed.inject.kind import AnyFault, FaultKind
-from aftbed.inject.targets import PRIMARY, Roles, emitting_brick
+from aftbed.inject.targets import PRIMARY, Roles, emitting_brick, sender
 from aftbed.inject.value import EXECUTED, ValueFlip, ValuePlace
 from aftbed.runtime.deployment import replica_of
 from aftbed.runtime.devices import LOOK_IDLE_NS, LOOK_NS
@@ -64,6 +68,8 @@ REPORT_NS: Final = LINE_NS[1] + ROUSED_NS[1]  # from a process to the supervisor
 SUPPORT: Final = ("recovery", "engine", *(f"{replica}/watchdog" for replica in REPLICAS))  # none serves
 LEADER, FOLLOWER = REPLICAS
 TRIAL: Final = "tr.after"  # asks for one execution more
+SUPERVISION: Final = (SUP.before.name, SUP.after.name)
+WAKE_NS: Final = 1_000_000  # a host that polls wakes a brick at the next whole millisecond
 
 
 def fhti_bound(ftm: str, kind: type[FaultKind], placement: str = "process") -> float | None:
@@ -84,21 +90,24 @@ def bound_ms(
     None: the mechanism does not handle it, or there is no bound for it.
     """
     graph = build(ftm, placement)
+    stall_ns = 0 if simulated else STALL_NS
     match fault.action:
         case Crash() | Hang():
-            found = _of_stop(graph, fault, round(period_ms * 1e6))
+            found = _of_stop(graph, fault, round(period_ms * 1e6), stall_ns)
         case ValueFlip(place) if place in EXECUTED and fault.event == Event.SERVER_EXIT.label:
             found = _of_value(graph, fault)
+        case ChannelFault(how, channel) if fault.persistence == ONCE:
+            found = _of_step(graph, how, channel, fault.target, round(period_ms * 1e6))
         case _:
             found = None
-    return None if found is None else (found + (0 if simulated else STALL_NS)) / 1e6
+    return None if found is None else (found + stall_ns) / 1e6
 
 
 # -- faults that stop a process -------------------------------------------------------------------
 
 
-def _of_stop(graph: Graph, fault: AnyFault, period_ns: int) -> int | None:
-    """Of a crash or a hang."""
+def _of_stop(graph: Graph, fault: AnyFault, period_ns: int, stall_ns: int) -> int | None:
+    """Of a crash or a hang; a stop of the machine may make a hang longer."""
     target, action = fault.target, fault.action
     if target in SUPPORT and not fault.event:
         seen_ns = SIGNAL_NS[1] + PIDFD_NS[1]
@@ -111,8 +120,10 @@ def _of_stop(graph: Graph, fault: AnyFault, period_ns: int) -> int | None:
     if replica not in REPLICAS or not replication_of(graph.ftm) or graph.placement == "single":
         return None
     ends_ns = action.lasts_ms * 1_000_000
-    if ends_ns and ends_ns < HANG_DEADLINE_NS - LOOK_NS:
-        return ends_ns + period_ns + request_ns(graph)  # nothing sees it
+    if ends_ns and ends_ns < HANG_DEADLINE_NS - LOOK_NS:  # no Watchdog sees it
+        noticed = _supervised(graph) and ends_ns + stall_ns >= DEADLINE_NS
+        stop_ns = detection_ns(Crash()) + failover_ns(graph) if noticed else 0
+        return ends_ns + stop_ns + period_ns + request_ns(graph)
     reaction_ns = failover_ns(graph) if replica == LEADER else _fence_ns(failover(FOLLOWER, LEADER, 0))
     return detection_ns(action, period_ns) + reaction_ns + period_ns + request_ns(graph)
 
@@ -157,6 +168,37 @@ def _orders(step: script.Step) -> int:
             return 1
         case _:
             raise AssertionError(f"{type(step).__name__} in a failover: how long does it take?")
+
+
+# -- faults that supervision sees -----------------------------------------------------------------
+
+
+def _supervised(graph: Graph) -> list[str]:
+    """The bricks of the leader between which steps are supervised, in the order of a request; [] for none,
+    and where no other replica can take over.
+    """
+    if graph.placement == "single" or not replication_of(graph.ftm):
+        return []
+    way = path(graph, LEADER)
+    ends = [way.index(b.name) for b in graph.bricks if b.replica == LEADER and b.kind in SUPERVISION]
+    return way[min(ends) : max(ends) + 1] if ends else []
+
+
+def _of_step(graph: Graph, how: Disturbance, channel: str, target: str, period_ns: int) -> int | None:
+    """Of a message that is lost or doubled between two supervised bricks."""
+    roles, inside = Roles(graph, LEADER, FOLLOWER), _supervised(graph)
+    source = sender(roles, channel, LEADER)
+    sinks = [link.sink for link in graph.links if (link.source, link.name) == (source, channel)]
+    if roles.replica(target) != LEADER or not {source, *sinks} <= {*inside}:
+        return None
+    replaced_ns = detection_ns(Crash()) + failover_ns(graph) + request_ns(graph)
+    match how:
+        case Disturbance.OMISSION:
+            return HOP_NS + DEADLINE_NS + WAKE_NS + replaced_ns
+        case Disturbance.DUPLICATE:
+            return request_ns(graph) + period_ns + request_ns(graph) + replaced_ns
+        case _:
+            return None
 
 
 # -- faults of a value ----------------------------------------------------------------------------

@@ -41,7 +41,8 @@ import msgspec
 
 from aftbed.core.events import RERUN, Event
 from aftbed.core.journal import EntryKind, Record
-from aftbed.ftm.compose import REPLICAS
+from aftbed.ftm.compose import REPLICAS, build
+from aftbed.inject.bus import BusFault
 from aftbed.inject.crash import Crash
 from aftbed.inject.model import Fault, FaultReport, parse
 from aftbed.inject.receipts import BusTimes
@@ -232,10 +233,12 @@ class _Faults:
 
     def intervals(self) -> Iterator[HandlingIntervals]:
         found = sorted(self._found(), key=lambda one: one.began_ns)
-        alone = len(found) == 1 and not self._record.adaptations and self._record.options.policy is None
+        alone = self._alone
         by_number = {
-            number: _of_bus(report, report.bus)
-            for number, report in enumerate(self._record.faults)
+            report.number: _of_bus(
+                report, report.bus, self._bus_bound_ms(report, report.bus) if alone else None
+            )
+            for report in self._record.faults
             if report.fired and report.bus is not None
         }
         for one, following in itertools.zip_longest(found, found[1:]):
@@ -243,16 +246,23 @@ class _Faults:
             by_number[one.number] = self._of(one, next_ns, alone=alone)
         yield from (by_number[number] for number in sorted(by_number))
 
+    @property
+    def _alone(self) -> bool:
+        """Whether one fault, of whatever kind, was all: only then there is a bound."""
+        fired = sum(report.fired for report in self._record.faults)
+        return fired == 1 and not self._record.adaptations and self._record.options.policy is None
+
     def _found(self) -> Iterator[_Found]:
         strikes: dict[int, Record] = {}
         for record in self._history.events(Event.FAULT_APPLIED):
             first = strikes.setdefault(number_of(record), record)
             if record.node == SUPERVISOR != first.node:  # before it, a node came to the point, and waited
                 strikes[number_of(record)] = record
-        for number, report in enumerate(self._record.faults):
-            if report.fired and number in strikes:
-                strike = strikes[number]
-                yield _Found(number, report.fault, parse(report.fault), strike.t_ns, strike.request_id)
+        for report in self._record.faults:
+            if report.fired and report.number in strikes:
+                strike = strikes[report.number]
+                words = report.fault
+                yield _Found(report.number, words, parse(words), strike.t_ns, strike.request_id)
 
     def _of(self, one: _Found, next_ns: int, *, alone: bool) -> HandlingIntervals:
         """`next_ns`: when the next fault struck, 0 for never."""
@@ -366,8 +376,19 @@ class _Faults:
         found = bound_ms(options.ftm, options.placement, one.fault, period_ms=period_ms, simulated=simulated)
         return None if found is None else round(found, 3)
 
+    def _bus_bound_ms(self, report: FaultReport, times: BusTimes) -> float | None:
+        options = self._record.options
+        action = parse(report.fault).action
+        in_lockstep = isinstance(options.work, CarRun) and options.work.pace is None
+        if options.application or not in_lockstep or not isinstance(action, BusFault):
+            return None
+        from aftbed.judge.bus_bound import bus_bound_ms  # noqa: PLC0415 - cantools
 
-def _of_bus(report: FaultReport, times: BusTimes) -> HandlingIntervals:
+        graph = build(options.ftm, options.placement)
+        return bus_bound_ms(action, times.struck_us, graph, simulated=self._record.simulated)
+
+
+def _of_bus(report: FaultReport, times: BusTimes, bound_ms: float | None) -> HandlingIntervals:
     ended_us, reaction = times.good_us, Reaction.OPERATIONAL
     if ended_us is None:
         ended_us = times.fallback_us
@@ -378,6 +399,7 @@ def _of_bus(report: FaultReport, times: BusTimes) -> HandlingIntervals:
         _ms(times.noticed_us, ended_us, 1e3),
         _ms(times.struck_us, ended_us, 1e3),
         reaction,
+        bound_ms,
         asked=times.believed or times.noticed_us is not None,
         in_bus_time=True,
     )

@@ -176,7 +176,10 @@ def read_record(path: Path, *, in_memory: bool = False) -> RunRecord:
     faults = (
         end.faults
         if end is not None
-        else tuple(FaultReport(str(fault), ReceiptState.UNKNOWN) for fault in options.faults)
+        else tuple(
+            FaultReport(str(fault), ReceiptState.UNKNOWN, number=number)
+            for number, fault in enumerate(options.faults)
+        )
     )
     work = options.work
     return RunRecord(

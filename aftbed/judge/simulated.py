@@ -10,7 +10,7 @@ from aftbed.core.application import Application, close
 from aftbed.core.errors import FUNCTION_FAILED
 from aftbed.core.events import Event
 from aftbed.core.script import ScriptKind
-from aftbed.ftm.compose import replication_of
+from aftbed.ftm.compose import detects, replication_of
 from aftbed.functions.load import NO_CODE, Code
 from aftbed.inject.crash import Crash
 from aftbed.inject.hang import Hang
@@ -119,8 +119,10 @@ def breaches(
 
 
 def needless_stops(run: Run) -> tuple[Breach, ...]:
-    """A brick that stopped itself, though nothing that it was given can have been altered."""
-    if not all(isinstance(fault.action, HARMLESS) for fault in run.setup.faults):
+    """A brick that stopped itself, though nothing that it was given can have been altered, or was late."""
+    hosted = (run.setup.ftm, *(a.goal.expression for a in run.setup.adaptations if a.goal.expression))
+    harmless = () if any(detects(ftm, "flow") for ftm in hosted) else HARMLESS  # each of them delays a step
+    if not all(isinstance(fault.action, harmless) for fault in run.setup.faults):
         return ()
     stops = run.history.events(Event.DETECTED_STOP)
     return tuple(Breach("needless_stop", f"{r.node} stopped at request {r.request_id}") for r in stops)

@@ -342,8 +342,10 @@ def _of_faults(record: RunRecord) -> Iterator[str]:
     if told != [str(fault) for fault in record.options.faults]:
         yield f"the receipts are not those of the faults that were asked for with the run: {told}"
     numbers = {fault_and_bits(r.detail)[0] - FIRST_FAULT for r in record.history.events(Event.FAULT_APPLIED)}
-    struck = [number for number in numbers if number >= len(record.faults)]
-    if struck:
+    counted = Counter(report.number for report in record.faults)
+    if twice := [number for number, count in counted.items() if count > 1]:
+        yield f"two receipts have the number of one fault: number {min(twice) + 1}"
+    if struck := numbers - counted.keys():
         yield f"a fault has struck, and there is no receipt: number {min(struck) + 1}"
 
 

@@ -97,8 +97,8 @@ def category_of(one: Record) -> Category:
 def describe(one: Record, faults: Sequence[FaultReport]) -> str:
     """A record in words: an applied fault in those of its user; others by event, request and step."""
     if one.event is Event.FAULT_APPLIED:
-        at = fault_and_bits(one.detail)[0] - FIRST_FAULT
-        return faults[at].fault if 0 <= at < len(faults) else "a fault"
+        number = fault_and_bits(one.detail)[0] - FIRST_FAULT
+        return next((report.fault for report in faults if report.number == number), "a fault")
     if one.event is Event.NODE_DIED:
         return f"{one.event}: process {one.detail}"
     words = [str(one.event), *([f"#{one.request_id}"] if one.request_id else [])]

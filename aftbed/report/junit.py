@@ -29,11 +29,12 @@ from xml.etree import ElementTree
 
 from junitparser import Error, Failure, JUnitXml, Properties, Property, TestCase, TestSuite
 
-from aftbed.campaign.experiment import Result
+from aftbed.campaign.experiment import Result, failed
 from aftbed.campaign.ledger import Ledger
 from aftbed.campaign.plan import JOINED
 from aftbed.campaign.statistics import CONFIDENCE, proportion
 from aftbed.campaign.summary import NOT_ALL, GateResult, StratumSummary, Summary, confidence_of
+from aftbed.judge.outcome import UNKNOWN
 from aftbed.judge.verdict import Verdict
 from aftbed.report.worst import worst_of
 
@@ -111,17 +112,20 @@ def _document(name: str, suite: TestSuite) -> str:
 def _evidence(stratum: StratumSummary, ledger: Ledger, results: list[Result]) -> Properties:
     """What a stratum says about the requirements: tools read the properties of a test case, not of its suite.
 
-    `bound`: of the share of experiments that failed, with the confidence of the campaign. Of fault handling
-    times, in ms: the longest, and the p99 at most, where that is known.
+    An experiment of which nothing is known, or whose faults did not strike, is no evidence. `bound`: of the
+    share of experiments that failed, with the confidence of the campaign. Of fault handling times, in ms: the
+    longest, and the p99 at most, where that is known.
     """
     spec = ledger.head.spec
+    told = [r for r in results if failed(r) or (r.activated and r.outcome not in UNKNOWN)]
+    bad = sum(map(failed, told))
     confidence = confidence_of(spec)
     fhti = stratum.handling.fhti_ms if stratum.handling is not None else None
     found = {
         "verifies": ",".join(spec.verifies),
-        "n": str(stratum.experiments),
-        "failed": str(stratum.failed),
-        "bound": f"{proportion(stratum.failed, stratum.experiments, confidence).high:.4g}",
+        "n": str(len(told)),
+        "failed": str(bad),
+        "bound": f"{proportion(bad, len(told), confidence).high:.4g}",
         "confidence": f"{confidence:g}",
         "ftti_ms": f"{spec.ftti_ms:g}" if spec.ftti else "",
         "fhti_ms": f"{fhti.max:g}" if fhti is not None else "",

@@ -95,7 +95,8 @@ class RunInjection(Injection):
             held = f"{self.fault.trigger.when} at {self.met.t_us / 1e6:.6f} s"
             held += f", {self._lag_ns / 1e6:.2f} ms before" if self._lag_ns else ""
             found = Receipt(found.state, "; ".join(filter(None, (found.detail, held))), found.bus)
-        return FaultReport(str(self.fault), found.state, found.detail, self.live, found.bus)
+        number = self.number - FIRST_FAULT
+        return FaultReport(str(self.fault), found.state, found.detail, self.live, found.bus, number)
 
 
 class FaultController:
@@ -113,27 +114,32 @@ class FaultController:
     def arm(self, fault: Fault, *, live: bool = False) -> Keys:
         """Apply `fault` now, later, or have it wait for its event. If `live`, it came while the run ran.
 
-        Raises StepFailed; NoHost is a refusal: nothing has been armed, and the run is not judged by it.
+        Raises StepFailed; NoHost is a refusal: nothing has been armed, and no run is judged by a live one.
         """
         number = next(self._numbers)
         injection = RunInjection(number, fault, self._runtime.draw(number), live=live)
         self._injections.append(injection)
         self._log("armed", str(fault))
-        if fault.action.shares_state:
-            yield from self._share_early(injection)
-        if fault.trigger.when is not None:
-            yield from self._runtime.watch(number, fault.trigger.when, lambda met: self._met(injection, met))
-            return
-        if fault.trigger.after_ms and not fault.trigger.event:
-            after_s = fault.trigger.after_ms / 1e3
-            self._loop.after(after_s, lambda: self._run(injection, self._begin(injection)))
-            return
         try:
-            yield from self._begin(injection)
+            yield from self._arm(injection)
         except NoHost as refusal:
-            self._injections.remove(injection)
+            if live:  # the user knows; of one that came with the run, the receipt says why
+                self._injections.remove(injection)
             self._log("refused", str(refusal))
             raise
+
+    def _arm(self, injection: RunInjection) -> Keys:
+        fault, trigger = injection.fault, injection.fault.trigger
+        if fault.action.shares_state:
+            yield from self._share_early(injection)
+        if trigger.when is not None:
+            yield from self._runtime.watch(
+                injection.number, trigger.when, lambda met: self._met(injection, met)
+            )
+        elif trigger.after_ms and not trigger.event:
+            self._loop.after(trigger.after_ms / 1e3, lambda: self._run(injection, self._begin(injection)))
+        else:
+            yield from self._begin(injection)
 
     def _run(
         self, injection: RunInjection, steps: Keys, on_end: Callable[[str], None] = lambda failure: None

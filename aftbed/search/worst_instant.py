@@ -239,7 +239,7 @@ def _decided(world: World, fault: Fault, last_ns: int) -> BranchOutcome:
         result = found.vehicle
         assert result is not None, "a course has a car"
         if result.collision or result.stop_gap_m is not None or until_ns > last_ns:
-            return BranchOutcome(result, all(fault.fired for fault in found.faults))
+            return BranchOutcome(result, any(fault.fired for fault in found.faults))
 
 
 # -- the search -----------------------------------------------------------------------------------

@@ -44,10 +44,11 @@ AMPLE: Final = Resources(cpus=2, cpu_load=0.0)
 CRASH: Final = FaultModel(crash=True)
 VALUE: Final = FaultModel(crash=False, value=True)
 IMPLAUSIBLE: Final = FaultModel(crash=False, implausible=True)
+FLOW: Final = FaultModel(crash=False, flow=True)
 NOTHING: Final = FaultModel(crash=False)
 
 expressions = st.sampled_from(EXPRESSIONS)
-models = st.builds(FaultModel, st.booleans(), st.booleans(), st.booleans())
+models = st.builds(FaultModel, st.booleans(), st.booleans(), st.booleans(), st.booleans())
 functions = st.builds(Characteristics, st.booleans(), st.sampled_from([EXACT, NONE, approximate(1e-3)]))
 machines = st.builds(
     Resources,
@@ -72,10 +73,13 @@ def test_every_mechanism_has_its_row() -> None:
         ("lfr", ("crash",), True, False, 2, "high", "low"),
         ("tr", ("value", "implausible"), True, True, 1, "high", "none"),
         ("assert", (), False, False, 1, "low", "none"),
+        ("sup", (), False, False, 1, "low", "none"),
         ("pbr+tr", ("crash", "value", "implausible"), True, True, 2, "high", "high"),
         ("lfr+tr", ("crash", "value", "implausible"), True, True, 2, "high", "low"),
         ("pbr+assert", ("crash", "implausible"), False, True, 2, "low", "high"),
         ("lfr+assert", ("crash", "implausible"), True, False, 2, "high", "low"),
+        ("pbr+sup", ("crash", "flow"), False, True, 2, "low", "high"),
+        ("pbr+sup+tr", ("crash", "value", "implausible", "flow"), True, True, 2, "high", "high"),
         ("assert+tr", ("value", "implausible"), True, True, 1, "high", "none"),
         ("lfr+assert+tr", ("crash", "value", "implausible"), True, True, 2, "high", "low"),
     ],
@@ -166,6 +170,7 @@ def test_an_assumption_on_the_function_is_named(
             FaultModel(True, True, True),
             ["pbr+assert does not tolerate value faults (it tolerates crash, implausible)"],
         ),
+        ("pbr+tr", FLOW, ["pbr+tr does not tolerate flow faults (it tolerates crash, value, implausible)"]),
         (
             "assert",
             IMPLAUSIBLE,
@@ -221,9 +226,9 @@ def test_an_expression_that_is_none_is_refused() -> None:
 @pytest.mark.parametrize(
     ("faults", "function", "found"),
     [
-        (CRASH, OPEN, ["pbr", "lfr", "pbr+assert", "lfr+assert", "pbr+tr", "lfr+tr"]),
-        (CRASH, CLOSED, ["lfr", "lfr+assert"]),
-        (CRASH, RANDOM, ["pbr", "pbr+assert"]),
+        (CRASH, OPEN, ["pbr", "lfr", "pbr+assert", "pbr+sup", "lfr+assert", "lfr+sup", "pbr+tr", "lfr+tr"]),
+        (CRASH, CLOSED, ["lfr", "lfr+assert", "lfr+sup"]),
+        (CRASH, RANDOM, ["pbr", "pbr+assert", "pbr+sup"]),
         (CRASH, NEITHER, []),
         (VALUE, OPEN, ["tr", "assert+tr", "pbr+tr", "lfr+tr"]),
         (VALUE, RANDOM, []),
@@ -231,7 +236,9 @@ def test_an_expression_that_is_none_is_refused() -> None:
         (FaultModel(True, True), CLOSED, []),
         (FaultModel(True, False, True), CLOSED, ["lfr+assert"]),
         (FaultModel(True, False, True), RANDOM, ["pbr+assert"]),
-        (NOTHING, NEITHER, ["none", "assert"]),
+        (FLOW, OPEN, ["pbr+sup", "lfr+sup"]),
+        (FLOW, RANDOM, ["pbr+sup"]),
+        (NOTHING, NEITHER, ["none", "assert", "sup"]),
     ],
 )
 def test_the_expressions_that_would_do_the_cheapest_first(
@@ -288,6 +295,7 @@ def test_a_follower_that_cannot_be_renewed_is_remarked(expression: str, function
         ("none", NOTHING),
         ("value,crash", FaultModel(True, True)),
         ("implausible", IMPLAUSIBLE),
+        ("flow", FLOW),
     ],
 )
 def test_a_fault_model_in_words(text: str, found: FaultModel) -> None:
@@ -296,7 +304,7 @@ def test_a_fault_model_in_words(text: str, found: FaultModel) -> None:
 
 @pytest.mark.parametrize("text", ["valeu", "crash,valeu", "", "crash,", "crash value", "none,crash"])
 def test_words_that_are_no_fault_model(text: str) -> None:
-    with pytest.raises(ConfigError, match=r"unknown fault .*one of: crash, implausible, none, value"):
+    with pytest.raises(ConfigError, match=r"unknown fault .*one of: crash, flow, implausible, none, value"):
         fault_model(text)
 
 

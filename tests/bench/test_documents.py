@@ -4,11 +4,12 @@ Today's keys of each document are kept: `aftbed bench compare` reads them in eve
 """
 
 import json
+from pathlib import Path
 from typing import Any, Final
 
 import msgspec
 import pytest
-from liveruns import Home, aftbed
+from liveruns import Home, aftbed, forked
 
 from aftbed.bench.rounds import Meanwhile, MeasuredLimit, Ratio
 
@@ -58,13 +59,29 @@ def test_a_recovery(home: Home) -> None:
     assert found["death_ms"]["p50"] == found["limit"]["p50"]
 
 
-def test_an_adaptation(home: Home) -> None:
+def test_an_adaptation(home: Home, tmp_path: Path) -> None:
     found = document("adapt", "--adaptations", "1")
+    (tmp_path / "times.json").write_text(json.dumps(found))
     for one in (found, found["back"]):
         check_beside(one, DEATH, 1)
         assert set(one["prepare_ms"]) == set(one["blackout_ms"]) == set(one["total_ms"]) == QUANTILES
     assert (found["adaptations"], found["from"], found["to"]) == (2, "pbr", "pbr+tr")
     assert found["requests"]["lost"] == 0 and found["stuck"] == 0 and set(found["ring_us"]) == QUANTILES
+    check_times_of_a_set(tmp_path / "times.json", found)
+
+
+def check_times_of_a_set(path: Path, document: dict[str, Any]) -> None:
+    """What the document has is taken from it, and the rest is measured."""
+    done = forked(
+        "ftm", "resilience", "--set", "pbr,tr", "--adaptations", "1", "--times", str(path), "--json"
+    )
+    assert done.code == 0, done.err
+    found = {(one["from"], one["to"]): one for one in json.loads(done.out)["adaptations"]}
+    assert found["pbr", "pbr+tr"]["blackout_ms"] == document["blackout_ms"]["p50"]
+    sources = {pair: one["source"] for pair, one in found.items()}
+    assert sources["pbr", "pbr+tr"] == sources["pbr+tr", "pbr"] == str(path)
+    assert sources["pbr+tr", "tr"] == sources["tr", "pbr"] == sources["pbr", "tr"] == "measured"
+    assert all(0 < one["blackout_ms"] < one["total_ms"] and one["of"] >= 1 for one in found.values())
 
 
 @pytest.mark.deep

@@ -2,6 +2,7 @@
 
 import pytest
 from campaigns import result
+from msgspec.structs import replace
 
 from aftbed.campaign.experiment import Probe, without_times
 from aftbed.judge.intervals import STARVED_MS_MIN, starved
@@ -41,6 +42,22 @@ def test_what_a_slow_machine_can_bring_about_is_inconclusive(
     assert (found.outcome, found.noisy) == (after, True)
     assert found.unexpected is (unexpected and after == outcome)
     assert (found.recovery_ms, found.blackout_ms) == (None, None)
+
+
+@pytest.mark.parametrize(
+    ("ftm", "unexpected", "after"),
+    [
+        ("pbr+sup", True, "inconclusive"),  # its deadline passed
+        ("pbr+sup", False, "detected_stop"),
+        ("pbr+assert", True, "detected_stop"),
+    ],
+)
+def test_supervision_may_take_a_busy_machine_for_a_slow_replica(
+    ftm: str, unexpected: bool, after: str
+) -> None:
+    found = result("detected_stop", unexpected=unexpected)
+    found = replace(found, experiment=replace(found.experiment, ftm=ftm))
+    assert without_times(found).outcome == after
 
 
 def test_a_probe_is_calibrated_by_the_machine_it_runs_on() -> None:

@@ -42,6 +42,13 @@ def test_the_states_of_a_run_are_read_off_its_record(setup: Setup, states: set[s
     assert bool(found) == bool(states), "nothing happened"
 
 
+def test_a_failover_behind_an_adaptation_is_not_in_it() -> None:
+    crash = parse("crash primary at server.exit nth 150")
+    run = simulate(Setup("pbr", count=200, rate_hz=500, adaptations=(TO_TR,), faults=(crash,)))
+    found = states_of(record_of(run))
+    assert RunState.FAILOVER in found and RunState.IN_ADAPTATION not in found
+
+
 def test_a_state_that_no_experiment_was_in_fails_the_campaign(tmp_path: Path) -> None:
     text = CRASHES.replace("system:", "sometimes: [failover, vote differs]\nsystem:")
     found = planned(tmp_path, text)

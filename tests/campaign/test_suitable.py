@@ -55,6 +55,9 @@ def requests(seed):
         yield chance.randbytes(4)
 """
 
+ALL = "none pbr lfr tr assert sup pbr+tr pbr+assert pbr+sup lfr+tr lfr+assert lfr+sup assert+tr"
+APPROXIMATE = "none pbr lfr assert sup pbr+assert pbr+sup lfr+assert lfr+sup"
+
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
@@ -74,10 +77,10 @@ def strata(spec: Spec) -> list[str]:
 @pytest.mark.parametrize(
     ("declared", "mechanisms"),
     [
-        (Characteristics(), "none pbr lfr tr assert pbr+tr pbr+assert lfr+tr lfr+assert assert+tr"),
-        (Characteristics(deterministic=False), "none pbr assert pbr+assert"),
-        (Characteristics(state_access=NONE), "none lfr assert lfr+assert"),
-        (Characteristics(state_access=approximate(0.1)), "none pbr lfr assert pbr+assert lfr+assert"),
+        (Characteristics(), ALL),
+        (Characteristics(deterministic=False), "none pbr assert sup pbr+assert pbr+sup"),
+        (Characteristics(state_access=NONE), "none lfr assert sup lfr+assert lfr+sup"),
+        (Characteristics(state_access=approximate(0.1)), APPROXIMATE),
     ],
     ids=str,
 )
@@ -90,7 +93,7 @@ def test_the_mechanisms_are_those_that_suit(folder: Path, declared: Characterist
 def test_an_entry_is_left_out_where_a_mechanism_does_not_know_its_words(folder: Path) -> None:
     names = strata(suited(read(folder), Characteristics()))
     assert [name for name in names if "checkpoint" in name] == [
-        f"{ftm} · steady · crash at a checkpoint" for ftm in ("pbr", "pbr+tr", "pbr+assert")
+        f"{ftm} · steady · crash at a checkpoint" for ftm in ("pbr", "pbr+tr", "pbr+assert", "pbr+sup")
     ]
     assert "none · steady · wrong" in names and "none · steady · crash" not in names
 
@@ -103,8 +106,8 @@ def test_words_that_no_mechanism_knows_are_refused(folder: Path) -> None:
 def test_a_mechanism_stands_for_each_other_one_that_can_be_reached(folder: Path) -> None:
     names = strata(suited(read(folder), Characteristics()))
     pairs = {(name.split()[0], name.split(" · ")[1].split()[1]) for name in names if " · to " in name}
-    begun = {"pbr", "lfr", "tr", "assert", "pbr+tr", "pbr+assert"}
-    ends = {"pbr", "lfr", "tr", "assert", "pbr+tr", "pbr+assert", "lfr+tr", "lfr+assert", "assert+tr"}
+    begun = {"pbr", "lfr", "tr", "assert", "pbr+tr", "pbr+assert", "pbr+sup"}
+    ends = {*ALL.split()} - {"none"}
     assert {pair for pair in pairs if pair[1] != "itself"} == {
         (one, other) for one in begun for other in ends if one != other
     }

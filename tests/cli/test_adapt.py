@@ -159,18 +159,18 @@ def test_the_recipe_of_the_paper_needs_placement_process(fake: FakeRun, refused:
 @pytest.mark.parametrize(
     ("running", "function", "arguments", "reason", "instead"),
     [
-        ("pbr", "", ("update", "app", "--to", CLOSED), "pbr needs state access", "lfr, lfr+assert"),
+        ("pbr", "", ("update", "app", "--to", CLOSED), "pbr needs state access", "lfr, lfr+assert, lfr+sup"),
         (
             "lfr",
             "",
             ("update", "app", "--to", RANDOM),
             "lfr needs a deterministic function",
-            "pbr, pbr+assert",
+            "pbr, pbr+assert, pbr+sup",
         ),
-        ("lfr", CLOSED, ("to", "pbr"), "pbr needs state access", "lfr, lfr+assert"),
-        ("lfr", CLOSED, ("switch", "pbr+assert"), "pbr needs state access", "lfr, lfr+assert"),
-        ("lfr", CLOSED, ("compose", "lfr+tr"), "tr needs state access", "lfr, lfr+assert"),
-        ("pbr", RANDOM, ("to", "lfr"), "lfr needs a deterministic function", "pbr, pbr+assert"),
+        ("lfr", CLOSED, ("to", "pbr"), "pbr needs state access", "lfr, lfr+assert, lfr+sup"),
+        ("lfr", CLOSED, ("switch", "pbr+assert"), "pbr needs state access", "lfr, lfr+assert, lfr+sup"),
+        ("lfr", CLOSED, ("compose", "lfr+tr"), "tr needs state access", "lfr, lfr+assert, lfr+sup"),
+        ("pbr", RANDOM, ("to", "lfr"), "lfr needs a deterministic function", "pbr, pbr+assert, pbr+sup"),
     ],
 )
 def test_an_unsuitable_mechanism_is_refused_unless_forced(

@@ -160,7 +160,7 @@ def test_the_shipped_campaigns_are_listed(output: Output) -> None:
     names = [line.split()[0] for line in output("campaign", "list").splitlines()]
     assert names == [
         *("adaptation", "app-check", "assumptions", "bitflip", "bus", "certify"),
-        *("ci-smoke", "crash", "fhti", "paper-recipe"),
+        *("ci-smoke", "crash", "fhti", "paper-recipe", "radar", "radar-ghost", "supervision"),
     ]
 
 

@@ -123,6 +123,7 @@ def yaml_readers(file: str) -> list[tuple[str, ...]]:
         ("run", "--policy", file),
         ("adapt", "script", file),
         ("ftm", "list", "--table", file),
+        ("map", "check", f"./{file}", "--dbc", "esr-like"),
     ]
 
 

@@ -4,14 +4,20 @@ The command is called inside this process; see `test_bad_input`.
 """
 
 import json
+import tempfile
 from functools import partial
 from pathlib import Path
 from typing import Final
 
+import msgspec
 import psutil
 import pytest
 from fakerun import Call
+from hypothesis import given
+from hypothesis import strategies as st
 
+from aftbed.bench.adaptation import read_times
+from aftbed.core.errors import ConfigError
 from aftbed.ftm.compose import EXPRESSIONS, build
 
 VARIANTS: Final = "aftbed.vehicle.aeb.variants"
@@ -95,6 +101,7 @@ def test_an_expression_is_shown_with_all_its_bricks_and_channels(call: Call, exp
             ("crash, value, implausible", "tr needs state access", "before, tr.protocol, tr."),
         ),
         ("tr", ("1 CPU, high CPU load, no bandwidth", "11, one per brick")),
+        ("pbr+sup", ("tolerates  crash, flow", "23, one per brick", "sup.before")),
         ("assert", ("tolerates  nothing", "detects    implausible", "nothing of the function")),
         ("lfr+assert+tr", ("29, one per brick",)),
     ],
@@ -115,7 +122,7 @@ def test_the_requirements_of_an_expression_are_shown(
     ("arguments", "code", "last"),
     [
         (("--ftm", "pbr"), 0, "pbr is consistent"),
-        ((), 0, "consistent: pbr, lfr, pbr+assert, lfr+assert, pbr+tr, lfr+tr"),
+        ((), 0, "consistent: pbr, lfr, pbr+assert, pbr+sup, lfr+assert, lfr+sup, pbr+tr"),
         (("--faults", "crash,value"), 0, "consistent: pbr+tr, lfr+tr"),
         (
             ("--ftm", "pbr", "--app", f"{VARIANTS}:WithoutStateAccess"),
@@ -188,7 +195,7 @@ def test_the_answer_as_a_document(call: Call) -> None:
         "consistent": False,
         "problems": ["lfr needs a deterministic function: two replicas execute every request"],
         "remarks": [],
-        "consistent_ftms": ["pbr", "pbr+assert"],
+        "consistent_ftms": ["pbr", "pbr+assert", "pbr+sup"],
         "faults": ["crash"],
         "app": f"{VARIANTS}:NonDeterministic",
         "characteristics": {"deterministic": False, "state_access": "exact", "tolerance": 0.0},
@@ -227,6 +234,117 @@ def test_a_table_of_the_user_replaces_rows(call: Call, tmp_path: Path) -> None:
     assert "crash, value" in call("list", "--table", str(path))[1].splitlines()[2]
 
 
+# -- resilience
+
+TIMES: Final = {
+    "from": "pbr",
+    "to": "lfr",
+    "recipe": "drained",
+    "placement": "process",
+    "adaptations": 7,
+    "blackout_ms": {"p50": 2.5},
+    "total_ms": {"p50": 120.0},
+    "back": {"blackout_ms": {"p50": 1.5}, "total_ms": {"p50": 110.0}},
+}
+
+
+def test_the_resilience_of_a_set(call: Call) -> None:
+    code, out, _ = call("resilience", "--set", "tr,pbr", "--adaptations", "0")
+    lines = out.splitlines()
+    assert code == 0
+    assert lines[:2] == ["set         pbr, tr", "can run     tr, pbr, pbr+tr"]
+    lost = next(line for line in lines if line.startswith("A     state access  exact") and " no " in line)
+    assert lost.split()[-1] == "0.0%", "both need the state"
+    assert next(line for line in lines if line.startswith("pbr+tr      tr ")).split()[3:] == ["-", "-", "-"]
+    assert lines[-1].startswith("answered    ") and "that break what runs" in lines[-1]
+    assert "measuring" not in out and "without service" not in out
+    more = [
+        line.split("  ")[0] for line in lines[lines.index("") :] if line.startswith(("assert ", "one like"))
+    ]
+    assert more[0] == "assert" and len(more) == 6, "what is shipped stands first, then the best five"
+
+
+def test_a_set_that_never_adapts(call: Call) -> None:
+    code, out, _ = call("resilience", "--set", "pbr")
+    assert code == 0, "nothing is measured"
+    assert "ADAPT FROM" not in out and out.splitlines()[-1].startswith("answered    ")
+
+
+def test_the_resilience_as_a_document(call: Call, tmp_path: Path) -> None:
+    path = tmp_path / "times.json"
+    path.write_text(json.dumps(TIMES))
+    arguments = ("resilience", "--set", "pbr,lfr", "--adaptations", "0", "--times", str(path), "--json")
+    code, out, _ = call(*arguments)
+    found = json.loads(out)
+    assert code == 0
+    keys = "mechanisms ftms situations states total kinds changes adaptations additions adaptation_mean"
+    assert set(found) == set(keys.split())
+    assert (found["mechanisms"], found["ftms"]) == (["pbr", "lfr"], ["pbr", "lfr"])
+    assert [one["kind"] for one in found["kinds"]] == ["FT", "A", "R"]
+    assert set(found["changes"][0]) == {"kind", "axis", "from", "to", "counts"}
+    there, back = sorted(found["adaptations"], key=lambda one: one["from"], reverse=True)
+    assert {**there, "changes": 0} == {
+        "from": "pbr",
+        "to": "lfr",
+        "changes": 0,
+        "blackout_ms": 2.5,
+        "total_ms": 120.0,
+        "of": 4,
+        "source": str(path),
+    }
+    mean_ms = (2.5 * there["changes"] + 1.5 * back["changes"]) / (there["changes"] + back["changes"])
+    assert found["adaptation_mean"]["blackout_ms"] == pytest.approx(mean_ms, abs=1e-3)
+    assert found["adaptation_mean"]["changes"] == found["total"]["adapts"]
+    assert {one["addition"] for one in found["additions"]} >= {"as_shipped", "tolerates", "less_bandwidth"}
+
+
+def test_the_way_back_of_a_result_is_left_out_where_there_is_none(call: Call, tmp_path: Path) -> None:
+    path = tmp_path / "times.json"
+    path.write_text(json.dumps({name: value for name, value in TIMES.items() if name != "back"}))
+    _, out, _ = call("resilience", "--set", "pbr,lfr", "--adaptations", "0", "--times", str(path), "--json")
+    found = json.loads(out)["adaptations"]
+    assert sorted((one["from"], one["source"]) for one in found if one["source"]) == [("pbr", str(path))]
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("{", ("times.json: Input data was truncated", "aftbed bench adapt --json")),
+        ("[]", ("Expected `object`, got `array`", "aftbed bench adapt --json")),
+        (json.dumps(TIMES | {"total_ms": {"p50": -1}}), (">= 0.0", "$.total_ms.p50")),
+        (json.dumps(TIMES | {"to": "lfrr"}), ("from pbr to lfrr", "did you mean 'lfr'")),
+        (json.dumps(TIMES | {"recipe": "paper"}), ("found recipe paper", "allowed are drained and process")),
+        (
+            json.dumps(TIMES | {"placement": "single"}),
+            ("placement single", "allowed are drained and process"),
+        ),
+        (
+            json.dumps(TIMES | {"to": "lfr+tr"}),
+            ("found pbr to lfr+tr and lfr+tr to pbr", "this set adapts", "pbr to lfr"),
+        ),
+    ],
+)
+def test_times_that_are_none(call: Call, tmp_path: Path, content: str, words: tuple[str, ...]) -> None:
+    path = tmp_path / "times.json"
+    path.write_text(content)
+    code, out, err = call("resilience", "--set", "pbr,lfr", "--times", str(path))
+    assert (code, out) == (2, "")
+    assert err.startswith(f"aftbed: error: --times {path}: ")
+    assert [word for word in words if word not in err] == []
+
+
+@given(
+    st.binary(max_size=300)
+    | st.dictionaries(st.sampled_from([*TIMES, "x"]), st.text()).map(msgspec.json.encode)
+)
+def test_whatever_stands_in_a_file_of_times_is_read_or_refused(data: bytes) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "times.json"
+        path.write_bytes(data)
+        with pytest.raises(ConfigError, match=r"times\.json: "):
+            read_times(path)
+
+
 # -- bad input
 
 
@@ -248,6 +366,12 @@ def test_a_table_of_the_user_replaces_rows(call: Call, tmp_path: Path) -> None:
         (("check", "--cpu-load", "nan"), ("--cpu-load nan",)),
         (("check", "--bandwidth", "-1"), ("--bandwidth -1", "kbit/s")),
         (("check", "--bandwidth", "inf"), ("--bandwidth inf",)),
+        (("resilience", "--set", ""), ("--set ''", "a set without a mechanism answers nothing")),
+        (("resilience", "--set", "pbr,lfrr"), ("--set 'pbr,lfrr'", "unknown mechanism 'lfrr'", "'lfr'")),
+        (("resilience", "--set", "pbr+tr"), ("pbr+tr is a composition", "pbr,tr is allowed")),
+        (("resilience", "--adaptations", "-1"), ("--adaptations -1", "0 to 1000")),
+        (("resilience", "--times", "gone.json"), ("--times gone.json", "No such file")),
+        (("resilience", "--table", "gone.yaml"), ("gone.yaml", "No such file")),
         (("list", "--table", "gone.yaml"), ("gone.yaml", "No such file")),
     ],
 )

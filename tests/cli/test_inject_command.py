@@ -22,6 +22,10 @@ def drive(fake: FakeRun, tmp_path: Path) -> FakeRun:
     ("arguments", "fault"),
     [
         (("crash", "primary"), "crash primary"),
+        (("crash", "leader"), "crash primary"),
+        (("hang", "follower", "--for", "50ms"), "hang backup for 50ms"),
+        (("crash leader at server.exit nth 3",), "crash primary at server.exit nth 3"),
+        (("fault", "omission aft2aft in follower nth 5"), "omission aft2aft in backup nth 5"),
         (
             ("crash", "primary", "--at", "checkpoint.sent", "--nth", "3"),
             "crash primary at checkpoint.sent nth 3",

@@ -13,7 +13,7 @@ from requestpath import REQUEST_PATH
 from aftbed.core.brick import Brick
 from aftbed.core.errors import ConfigError
 from aftbed.core.graph import PLACEMENTS, BrickSpec, Graph, Kind, Link
-from aftbed.ftm.compose import EXPRESSIONS, build, chain, parse, replication_of
+from aftbed.ftm.compose import EXPRESSIONS, build, canonical, chain, parse, replication_of
 from aftbed.ftm.registry import EMITTERS, KINDS, MECHANISMS, Setting, make
 
 CHANNELS: Final = frozenset(  # the paper's names
@@ -39,6 +39,7 @@ def changed(**fields: object) -> Graph:
         ("tr", "process", 10),
         ("assert", "process", 10),
         ("assert+tr", "process", 13),
+        ("pbr+sup", "process", 22),
         ("pbr+assert+tr", "process", 28),
         ("pbr", "replica", 8),
         ("pbr+tr", "replica", 8),
@@ -84,18 +85,27 @@ def test_the_expressions_are_all_of_one_and_two_mechanisms_that_make_sense() -> 
         "lfr",
         "tr",
         "assert",
+        "sup",
         "pbr+tr",
         "pbr+assert",
+        "pbr+sup",
         "lfr+tr",
         "lfr+assert",
+        "lfr+sup",
         "assert+tr",
     )
+
+
+@pytest.mark.parametrize(("typed", "meant"), [("PBR", "pbr"), ("Lfr+TR", "lfr+tr"), ("NONE", "none")])
+def test_capitals_are_no_other_name(typed: str, meant: str) -> None:
+    assert canonical(typed) == meant
+    assert build(typed, "process") == build(meant, "process")
 
 
 @pytest.mark.parametrize(
     ("expression", "message"),
     [
-        ("prb", "unknown FTM 'prb'; did you mean 'pbr'? (one of: assert, lfr, none, pbr, tr)"),
+        ("prb", "unknown FTM 'prb'; did you mean 'pbr'? (one of: assert, lfr, none, pbr, sup, tr)"),
         ("", "unknown FTM '' (one of: "),
         ("pbr+", "unknown FTM '' (one of: "),
         ("pbr + tr", "unknown FTM 'pbr '; did you mean 'pbr'?"),

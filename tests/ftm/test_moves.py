@@ -55,12 +55,13 @@ from aftbed.ftm.lfr import LfrAfter, LfrBefore
 from aftbed.ftm.pbr import PbrAfter
 from aftbed.ftm.registry import KINDS, Setting, make
 from aftbed.ftm.server import STATE_AFTER, STATE_BEFORE, STATE_BEFORE_AND_AFTER, Server
+from aftbed.ftm.supervision import SupAfter, SupBefore
 from aftbed.ftm.tr import TrAfter, TrBefore, TrProceed
 
 Mail = tuple[tuple[str, type | AnyMessage], ...]
 MACHINES: Final = (
     *(Client, Protocol, InnerProtocol, Proxy, PassBefore, Compute, Server, PbrAfter, LfrBefore, LfrAfter),
-    *(TrBefore, TrProceed, TrAfter, AssertBefore, AssertAfter),
+    *(TrBefore, TrProceed, TrAfter, AssertBefore, AssertAfter, SupBefore, SupAfter),
 )
 OTHER: Final = Tried(1, 1, 1, b"this", STATE)  # differs from TRIED
 DIFFERING: Final = Trials(1, 1, (TRIED, OTHER))
@@ -110,6 +111,10 @@ def server() -> Machine:
 
 def assert_after() -> Machine:
     return AssertAfter(lambda request, reply: True)
+
+
+def sup_after() -> Machine:
+    return SupAfter(1, leads=True)
 
 
 def bound(*ports: str) -> Mail:
@@ -188,6 +193,10 @@ CASES: Final = (
     Case(AssertBefore),
     Case(assert_after),
     Case(assert_after, (("prd2aft", Reply),)),
+    Case(SupBefore),
+    Case(sup_after),
+    Case(sup_after, (("prd2aft", Reply),)),
+    Case(sup_after, (("bfr2aft", Request),)),
 )
 
 

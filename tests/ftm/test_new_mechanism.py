@@ -28,7 +28,7 @@ REGISTRATION: Final = (
         "from aftbed.ftm.lfr import LFR\n",
         "from aftbed.ftm.lfr import LFR\nfrom aftbed.ftm.limit import LIMIT\n",
     ),
-    ("(PBR, LFR, TR, ASSERT)", "(PBR, LFR, TR, ASSERT, LIMIT)"),
+    ("(PBR, LFR, TR, ASSERT, SUP)", "(PBR, LFR, TR, ASSERT, SUP, LIMIT)"),
 )
 
 
@@ -120,8 +120,10 @@ def test_it_composes(project: Path) -> None:
 
 
 def test_the_suitability_table_has_it(project: Path) -> None:
-    printed, codes = run_each(project, "ftm list", "ftm check --ftm limit --faults implausible")
-    assert codes == [0, 1]
+    resilience = "ftm resilience --set pbr --adaptations 0 --json"
+    printed, codes = run_each(project, "ftm list", "ftm check --ftm limit --faults implausible", resilience)
+    assert codes == [0, 1, 0]
+    assert '"words":"one like limit that also tolerates value"' in printed
     listed = printed.partition("exit code")[0]
     assert all(name in listed for name in ("limit", "pbr+limit", "lfr+limit", "limit+tr"))
     assert "limit detects implausible value faults and can only stop" in printed

@@ -139,9 +139,9 @@ class Run:
         except StopIteration:
             return waits
 
-    def arm(self, text: str) -> Fault:
+    def arm(self, text: str, *, live: bool = False) -> Fault:
         fault = parse(text)
-        self.do(self.faults.arm(fault))
+        self.do(self.faults.arm(fault, live=live))
         return fault
 
     def reports(self) -> list[tuple[str, str, str]]:

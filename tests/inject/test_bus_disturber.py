@@ -373,6 +373,18 @@ def test_it_is_handled_when_all_that_objected_use_the_frames_again() -> None:
     assert times(disturber) == BusTimes(20_000, 40_000, 80_000, 50_000)
 
 
+def test_what_one_node_reports_may_be_heard_behind_what_another_one_reports_later() -> None:
+    disturber = struck_at_20ms()
+    disturber.noticed("gateway", Notice(TRACK, "lost", 40_000))
+    disturber.noticed("gateway", Notice(TRACK, GOOD_AGAIN, 60_000))
+    assert times(disturber) == BusTimes(20_000, 40_000, 60_000)
+    disturber.noticed("brake", Notice(AEB_REQ, FALLBACK, 31_000))
+    assert times(disturber) == BusTimes(20_000, 31_000, None, 31_000)
+    assert disturber.reports()[0].noticed == "brake (fallback)"
+    disturber.noticed("brake", Notice(AEB_REQ, GOOD_AGAIN, 55_000))
+    assert times(disturber) == BusTimes(20_000, 31_000, 60_000, 31_000), "the last one to use them again"
+
+
 def test_frames_that_are_good_again_after_another_defect_end_nothing() -> None:
     disturber = struck_at_20ms()
     disturber.noticed("gateway", Notice(EGO, "lost", 30_000))

@@ -47,13 +47,18 @@ def test_a_bitflip_without_an_event_waits_for_the_next_execution(run: Run) -> No
     assert isinstance(order, control.Arm) and order.event == "server.exit" and run.last_armed()[1].nth == 1
 
 
-def test_a_fault_that_nobody_can_wait_for_is_refused_and_stays_so(run: Run) -> None:
+@pytest.mark.parametrize("live", [False, True])
+def test_a_fault_that_nobody_can_wait_for_is_refused_and_stays_so(run: Run, *, live: bool) -> None:
+    """One that came with the run has a receipt; of a live one, the command that asked is told."""
     run.deployment.backup = ""
     with pytest.raises(StepFailed, match=r"no process emits checkpoint\.applied now"):
-        run.arm("crash backup at checkpoint.applied")
+        run.arm("crash backup at checkpoint.applied", live=live)
     run.deployment.backup = "b"
     run.do(run.faults.rearm())
-    assert run.deployment.told == [] and run.reports() == []
+    assert run.deployment.told == []
+    assert [(words, receipt) for words, receipt, _ in run.reports()] == (
+        [] if live else [("crash backup at checkpoint.applied nth 1", "not_activated")]
+    )
 
 
 def test_the_bit_that_is_not_named_hangs_on_the_seed_and_on_the_fault(tmp_path: Path) -> None:

@@ -223,6 +223,13 @@ def test_a_fault_that_never_began_is_armed() -> None:
     assert not report.waits
 
 
+def test_a_fault_begins_so_long_after_it_was_armed() -> None:
+    radar = Radar()
+    radar.run(still(100))
+    radar.arm("radar missed after 30ms")
+    assert radar.run(still(41)) == {100: CAR, 120: CAR, 140: None}
+
+
 def test_a_condition_that_never_held_is_waited_for() -> None:
     radar = Radar("radar missed when gap < 30")
     assert radar.run(still(41), gap_m=40.0) == {0: CAR, 20: CAR, 40: CAR}

@@ -101,3 +101,16 @@ def test_a_log_without_any_message_of_the_dbc_is_an_error(tmp_path: Path) -> Non
     with pytest.raises(ConfigError, match=r"aftbed.dbc: describes none of the 1 frames"):
         convert(tmp_path / "bus.log", tmp_path / "bus.csv")
     assert not (tmp_path / "bus.csv").exists()
+
+
+def test_messages_that_cannot_be_used_are_left_out_and_nothing_else_is(tmp_path: Path) -> None:
+    """Of CAN FD, or twice under one name; the file has values of no signal, so cantools refuses it."""
+    path = tmp_path / "car.dbc"
+    path.write_text(
+        'BU_: X\nBO_ 1 FD: 64 X\n SG_ A : 0|8@1+ (1,0) [0|1] "" X\nBO_ 2 TWICE: 1 X\nBO_ 3 TWICE: 1 X\n'
+        'BO_ 288 SPEED: 8 X\n SG_ SPEED : 0|16@1+ (0.01,0) [0|100] "m/s" X\nVAL_ 7 SPEED 1 "one";\n'
+    )
+    frames = [LoggedFrame(n, "can0", can_id, bytes([9] * 8)) for n, can_id in enumerate((1, 2, 288))]
+    rows, head = table(tmp_path, *frames, dbc=path)
+    assert head == "time,SPEED.SPEED"
+    assert rows == [{"time": "0.000002", "SPEED.SPEED": "23.13"}]

@@ -29,7 +29,14 @@ NEAR = {  # the least share of its bound that the worst of a few seeds comes to
 }
 
 
-@pytest.mark.parametrize("ftm", ["pbr", "lfr+tr"])
+OF_HANG = ("pbr", "pbr+sup")
+SUPERVISED = {
+    "omission {channel} nth {nth}": 0.8,
+    "duplicate {channel} nth {nth}": 0.05,
+}
+
+
+@pytest.mark.parametrize("ftm", ["pbr", "lfr+tr", "pbr+sup"])
 def test_what_is_simulated_stays_below_the_bound_and_near_to_it(ftm: str) -> None:
     worst: dict[str, float] = defaultdict(float)
     for words in NEAR:
@@ -46,6 +53,37 @@ def test_what_is_simulated_stays_below_the_bound_and_near_to_it(ftm: str) -> Non
     assert {words: share for words, share in worst.items() if share < NEAR[words]} == {}
 
 
+@pytest.mark.parametrize("ftm", ["pbr+sup", "lfr+sup", "pbr+sup+tr"])
+def test_so_is_what_supervision_sees(ftm: str) -> None:
+    worst: dict[str, float] = defaultdict(float)
+    for words in SUPERVISED:
+        for seed, channel in enumerate(("prd2srv", "srv2prd", "bfr2aft")):
+            fault = parse(words.format(nth=5 + seed, channel=channel))
+            run = simulate(Setup(ftm, "process", seed, 50, 500, (fault,)))
+            (found,) = intervals(evidence_of_run(run))
+            if found.fdti_ms is None:  # TR takes no notice of a second trial, and of a third
+                assert ftm.endswith("tr") and "duplicate" in words
+                continue
+            assert found.bound_ms is not None and found.fhti_ms is not None
+            assert found.fhti_ms <= found.bound_ms, (str(fault), seed)
+            worst[words] = max(worst[words], found.fhti_ms / found.bound_ms)
+    assert worst.keys() == SUPERVISED.keys()
+    assert {words: share for words, share in worst.items() if share < SUPERVISED[words]} == {}
+
+
+def test_what_supervision_sees_has_a_bound_under_it_alone() -> None:
+    for words in ("omission prd2srv", "duplicate srv2prd"):
+        found = {ftm for ftm in EXPRESSIONS if bound_ms(ftm, "process", parse(words)) is not None}
+        assert found == {"pbr+sup", "lfr+sup"}, words
+
+
+def test_a_hang_that_is_longer_than_its_deadline_ends_in_a_failover() -> None:
+    short, long = (parse(f"hang primary for {ms}ms") for ms in (19, 30))
+    plain, supervised = ([bound_ms(ftm, "process", one) or 0 for one in (short, long)] for ftm in OF_HANG)
+    assert plain[1] - plain[0] == pytest.approx(11)
+    assert supervised[1] - supervised[0] == pytest.approx(11 + 1.85, abs=0.01), "a failover more"
+
+
 def test_which_faults_of_a_leader_have_a_bound() -> None:
     of_crash = {ftm for ftm in EXPRESSIONS if fhti_bound(ftm, Crash) is not None}
     assert of_crash == set(DUPLEX_EXPRESSIONS) == {ftm for ftm in EXPRESSIONS if fhti_bound(ftm, Hang)}
@@ -59,15 +97,36 @@ def test_which_faults_of_a_leader_have_a_bound() -> None:
     [
         "crash proxy",  # its replacement is born
         "hang recovery",
-        "bitflip result permanent",  # the same in all trials
         "bitflip result at server.exit nth 3 in b",
         "crash backup at server.exit",  # the leader waits for the injector
-        "slow primary by 2ms",
+        "slow primary by 20ms",
         "omission aft2aft",
     ],
 )
 def test_other_faults_have_none(words: str) -> None:
     assert bound_ms("pbr", "process", parse(words)) is None
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "slow primary by 20ms",  # where in a request it begins decides when it is late
+        "omission pro2bfr",  # outside of what is supervised
+        "omission srv2aft",  # from inside to outside
+        "duplicate bfr2prd",
+        "omission prd2srv permanent",
+        "delay prd2srv by 5ms",
+        "omission prd2srv in backup",
+    ],
+)
+def test_nor_have_these_under_supervision(words: str) -> None:
+    assert bound_ms("pbr+sup", "process", parse(words)) is None
+
+
+def test_a_wrong_value_that_is_the_same_in_all_trials_has_none() -> None:
+    once, lasting = parse("bitflip result"), parse("bitflip result permanent")
+    assert bound_ms("pbr+tr", "process", once) is not None
+    assert bound_ms("pbr+tr", "process", lasting) is None
 
 
 def test_no_replica_is_left_where_one_process_has_both() -> None:

@@ -32,7 +32,10 @@ def evidence(
     starved_ms: float = 0.0,
 ) -> Evidence:
     options = RunOptions("", "", "", ftm, "process", 0, LoadRun(3, 0.0), ftti_ms=ftti_ms)
-    reports = tuple(FaultReport(words, ReceiptState.ACTIVATED, bus=bus) for words in faults)
+    reports = tuple(
+        FaultReport(words, ReceiptState.ACTIVATED, bus=bus, number=number)
+        for number, words in enumerate(faults)
+    )
     end = RunEnd(leader="a", seconds=0.1, starved_ms=starved_ms)
     record = RunRecord(options, tale.history(), end, reports)
     return Evidence(record, reference_run(record.history, Sums()))
@@ -112,6 +115,13 @@ def test_a_wrong_reply_is_no_reaction() -> None:
     assert times(found) == (None, None, None, "none") and found.asked
 
 
+def test_a_right_reply_behind_a_wrong_one_does_not_make_up_for_it() -> None:
+    tale = struck(Tale().served(1).sent(2), request_id=2).executed(2)
+    tale.bare.execute(b"request 2")  # the next reply is right
+    tale.accepted(2).answered(2, payload=b"00000000").served(3)
+    assert times(only(tale, FLIP)) == (None, None, None, "none")
+
+
 def test_a_detected_stop_without_a_reply_behind_it_is_safe() -> None:
     tale = struck(Tale().served(1).sent(2), request_id=2).note("a/tr.after.1", Event.DETECTED_STOP, 2)
     assert times(only(tale, FLIP, "tr")) == (1.0, 0.0, 1.0, "safe")
@@ -131,6 +141,24 @@ def test_a_detection_behind_the_next_fault_is_not_of_this_one() -> None:
     first, second = intervals(evidence(tale.served(3), FLIP, FLIP))
     assert (first.fdti_ms, second.fdti_ms) == (None, 1.0)
     assert (first.bound_ms, second.bound_ms) == (None, None), "a bound is for one fault alone"
+
+
+@pytest.mark.parametrize(
+    ("other", "bus"),
+    [
+        (OMISSION, BusTimes(100, 10_100, 50_100)),
+        ("radar missed for 100ms", None),
+        ("bitflip result nth 70", None),  # struck as well, and no journal says when
+    ],
+)
+def test_a_crash_beside_another_fault_has_no_bound(other: str, bus: BusTimes | None) -> None:
+    told = evidence(a_crash(), CRASH)
+    reports = (*told.record.faults, FaultReport(other, ReceiptState.ACTIVATED, bus=bus, number=1))
+    beside = Evidence(msgspec.structs.replace(told.record, faults=reports), told.reference)
+    assert [one.bound_ms for one in intervals(beside)] == [None] * (2 if bus else 1)
+    armed = (*told.record.faults, FaultReport(other, ReceiptState.NOT_ACTIVATED, number=1))
+    beside = Evidence(msgspec.structs.replace(told.record, faults=armed), told.reference)
+    assert intervals(beside)[0].bound_ms is not None, "one that did not strike disturbs nothing"
 
 
 def test_a_fault_that_did_not_strike_has_no_intervals() -> None:

@@ -124,7 +124,7 @@ def test_a_fault_is_described_in_the_words_of_its_user(tmp_path: Path) -> None:
     assert describe(applied, record.faults) == str(CRASH)
     injected_later = msgspec.structs.replace(applied, detail=FIRST_FAULT + 1)
     assert describe(injected_later, record.faults) == "a fault"
-    hang = msgspec.structs.replace(record.faults[0], fault="hang backup")
+    hang = msgspec.structs.replace(record.faults[0], fault="hang backup", number=1)
     record = msgspec.structs.replace(record, faults=(*record.faults, hang))
     assert describe(injected_later, record.faults) == "hang backup"
 

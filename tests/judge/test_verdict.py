@@ -9,7 +9,7 @@ import pytest
 from msgspec.structs import replace
 from records import CRASH, FLIP, RecordInTheMaking, outcomes, whole
 
-from aftbed.core.events import Event
+from aftbed.core.events import FIRST_FAULT, Event
 from aftbed.ftm.compose import build
 from aftbed.inject.model import FaultReport
 from aftbed.inject.receipts import ReceiptState
@@ -394,3 +394,18 @@ def test_a_verdict_is_one_json_document(path: Path) -> None:
     document = json.loads(msgspec.json.encode(verdict))
     assert document["verdict"] == "pass" and document["checks"]["one_master"] == "pass"
     assert {"requests", "vehicle", "failovers", "checks", "run", "seed", "ftm", "scenario"} <= set(document)
+
+
+def test_a_fault_has_the_number_that_the_journals_have(path: Path) -> None:
+    """The first fault of the run, a live one, was refused: it has no receipt."""
+    record = whole(path)
+    record.note("a.after.1", Event.FAULT_APPLIED, detail=FIRST_FAULT + 1)
+    assert record.end is not None
+    crash = {"fault": str(CRASH), "receipt": "applied", "live": True, "number": 1}
+    record.end["faults"] = [crash]
+    assert record.verdict().verdict == "pass"
+    record.end["faults"] = [{key: value for key, value in crash.items() if key != "number"}]
+    assert "sources_agree: a fault has struck, and there is no receipt: number 2" in record.verdict().reasons
+    record.end["faults"] = [crash, crash]
+    twice = "sources_agree: two receipts have the number of one fault: number 2"
+    assert twice in record.verdict().reasons

@@ -49,7 +49,8 @@ def test_in_lockstep_faults_begin_at_the_very_steps_of_the_simulator() -> None:
     assert delayed.detail == "a message of client about request 76; ttc < 2.5 at 1.500000 s"
     assert slowed.detail == "ttc < 2.2 at 1.800000 s"
     assert crashed.detail == "ttc < 1.995 at 2.005000 s" and crashed.receipt.value == "activated"
-    assert never == FaultReport(NEVER, ReceiptState.NOT_ACTIVATED, "gap < 0.1 never held")
+    unmet = "gap < 0.1 never held"
+    assert never == FaultReport(NEVER, ReceiptState.NOT_ACTIVATED, unmet, number=3)
 
 
 def test_in_real_time_the_car_drives_on_and_the_receipt_says_how_far_behind_the_effect_was(

@@ -4,7 +4,7 @@ from statistics import median
 from typing import Final
 
 import pytest
-from liveruns import ENDLESS, Home, Outcome, Started, aftbed, under_load
+from liveruns import ENDLESS, Home, Outcome, Started, adapted, aftbed, under_load
 
 from aftbed.core.events import Event
 from aftbed.core.journal import EntryKind
@@ -14,6 +14,7 @@ from aftbed.runtime.unix.options import LoadRun
 
 pytestmark = pytest.mark.process
 
+CAUTIOUS: Final = "aftbed.vehicle.aeb.variants:Cautious"
 COUNT: Final = 80
 RATE_HZ: Final = 200.0
 BEHIND: Final = 60  # requests: each fault here is over by then
@@ -200,3 +201,18 @@ def test_what_cannot_be_is_refused(home: Home) -> None:
             done = aftbed("inject", *arguments)
             assert done.code == 2 and words in done.err, done.err
         assert run.stop().verdict.verdict == "pass"
+
+
+def test_a_live_fault_that_the_function_refuses_is_none_of_the_run(home: Home) -> None:
+    """Only the node knows its fields. The refused fault had a number; the next fault is told by its own."""
+    with under_load(home, ENDLESS) as run:
+        done = adapted("update", "app", "--to", CAUTIOUS)
+        assert done.code == 0, done.err
+        done = aftbed("inject", "bitflip", "state.speed_limit")
+        assert done.code == 2 and "speed_limit" in done.err, done.err
+        assert aftbed("inject", "crash", "primary").code == 0
+        run.wait_for("script.done", "new backup")
+        verdict = run.stop().verdict
+    assert (verdict.verdict, [fault.fault for fault in verdict.faults]) == ("pass", ["crash primary"])
+    assert [found.fault for found in verdict.failovers] == ["crash primary"]
+    assert [found.fault for found in verdict.intervals if found.of_fault] == ["crash primary"]

@@ -103,6 +103,21 @@ def test_a_stratum_has_its_evidence_for_the_requirements_that_the_campaign_verif
     assert by_name[cases[-1].get("name")] == {}, "a gate is no evidence of its own"
 
 
+def test_what_nothing_is_known_of_is_no_evidence(ledger: Ledger) -> None:
+    """Neither an experiment of an unknown outcome nor one whose fault did not strike."""
+    head = msgspec.structs.replace(
+        ledger.head, spec=msgspec.structs.replace(ledger.head.spec, verifies=("SG-1",))
+    )
+    group = [
+        *some("tolerated", "inconclusive", "harness_error", "unavailable"),
+        *some("tolerated", activated=False),
+    ]
+    suite = suite_of(with_results(msgspec.structs.replace(ledger, head=head), *group))
+    (case,) = (case for case in suite.iter("testcase") if case.get("name") == "pbr · crash")
+    found = {p.get("name"): p.get("value") for p in case.iter("property")}
+    assert (found["n"], found["failed"]) == ("2", "1")
+
+
 def test_junitparser_reads_the_properties_of_a_test_case(ledger: Ledger, tmp_path: Path) -> None:
     head = msgspec.structs.replace(
         ledger.head, spec=msgspec.structs.replace(ledger.head.spec, verifies=("SG-1",))

@@ -156,8 +156,8 @@ def test_the_only_run_is_found_by_itself(runtime: Path, listeners: list[socket.s
 def test_no_run_is_alive(runtime: Path) -> None:
     with pytest.raises(ConfigError, match="no run is alive; start one with `aftbed run`"):
         run_directory.find(None)
-    with pytest.raises(ConfigError, match=r"--run abc: no such run is alive \(alive: none\)"):
-        run_directory.find("abc")
+    with pytest.raises(ConfigError, match=r"--run xyz: no such run is alive \(alive: none\)"):
+        run_directory.find("xyz")
 
 
 def test_several_runs_are_alive(runtime: Path, listeners: list[socket.socket]) -> None:
@@ -165,9 +165,25 @@ def test_several_runs_are_alive(runtime: Path, listeners: list[socket.socket]) -
     with pytest.raises(ConfigError, match=r"2 runs are alive: name one with --run \(alive: ") as caught:
         run_directory.find(None)
     assert all(name in str(caught.value) for name in names)
-    with pytest.raises(ConfigError, match="--run abc: no such run is alive") as caught:
-        run_directory.find("abc")
+    with pytest.raises(ConfigError, match="--run xyz: no such run is alive") as caught:
+        run_directory.find("xyz")
     assert all(name in str(caught.value) for name in names)
+
+
+def test_an_id_may_be_shortened_as_long_as_it_means_one_run(
+    runtime: Path, listeners: list[socket.socket]
+) -> None:
+    one, other = alive(listeners), alive(listeners)
+    same = os.path.commonprefix([one.name, other.name])  # noqa: RUF071 - of the digits of two ids
+    for run in (one, other):
+        assert run_directory.find(run.name[: len(same) + 1]) == run
+    names = {one.name, other.name}
+    while not same:  # until two of them begin with the same digit
+        names.add(alive(listeners).name)
+        same = next((name[:1] for name in names if sum(n[0] == name[0] for n in names) > 1), "")
+    with pytest.raises(ConfigError, match=rf"--run {same}: \d+ runs begin so: ") as caught:
+        run_directory.find(same)
+    assert all(name in str(caught.value) for name in names if name.startswith(same))
 
 
 def test_a_dead_run_is_no_run(runtime: Path, listeners: list[socket.socket]) -> None:

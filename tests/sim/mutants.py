@@ -61,7 +61,9 @@ from aftbed.ftm.lfr import LfrAfter, LfrBefore, LfrBeforeState
 from aftbed.ftm.pages import CheckpointBase
 from aftbed.ftm.pbr import PbrAfter, PbrAfterState
 from aftbed.ftm.server import Server
+from aftbed.ftm.supervision import ReplyComes, SupAfter, SupBefore
 from aftbed.ftm.tr import TrAfter, Vote
+from aftbed.inject.model import parse
 from aftbed.inject.value import ValuePlace
 from aftbed.runtime.sim.world import Setup
 from aftbed.search.explore import ADAPT_RATE_HZ, PAGE_BYTES
@@ -183,6 +185,11 @@ def _flips(ftm: str, place: ValuePlace, *bits: int) -> list[Setup]:
     return [
         Setup(ftm, count=6, faults=(flip(place, bit, "server.exit", nth),)) for bit in bits for nth in (3, 4)
     ]
+
+
+def _disturbed(words: str) -> list[Setup]:
+    """A step is skipped or doubled in the leader."""
+    return [Setup(ftm, count=8, faults=(parse(words),)) for ftm in ("pbr+sup", "lfr+sup")]
 
 
 MECHANISMS: Final = (
@@ -408,6 +415,30 @@ MECHANISMS: Final = (
         OWN,
         lambda: _flips("pbr+assert", ValuePlace.RESULT, 0, 1, 2),
         "G4",
+    ),
+    Mutant(
+        "no deadline",
+        "SupAfter is never woken, however long a request is inside",
+        instead(SupAfter, "deadline_ns", lambda self: None),
+        OWN,
+        lambda: _disturbed("omission prd2srv nth 4"),
+        "G2",
+    ),
+    Mutant(
+        "any reply is in order",
+        "SupAfter lets the reply to another request pass",
+        instead(SupAfter, "how", lambda self, msg: ReplyComes.IN_ORDER),
+        OWN,
+        lambda: _disturbed("duplicate srv2prd nth 4"),
+        "G2",
+    ),
+    Mutant(
+        "any request is the next one",
+        "SupBefore has a request executed that was executed before",
+        instead(SupBefore, "is_next", lambda self, msg: True),
+        OWN,
+        lambda: _disturbed("duplicate bfr2prd nth 4"),
+        "G1",
     ),
     Mutant(
         "deaths not told",

@@ -30,7 +30,7 @@ from aftbed.runtime.sim.processes import SimProcess
 
 GOLDEN: Final = Path(__file__).parents[1] / "golden"
 ARMED_NS: Final = 1_000_000  # a fault is in its place long before
-MECHANISMS: Final = ("pbr", "lfr", "tr", "pbr_tr", "lfr_tr", "pbr_assert", "lfr_assert")
+MECHANISMS: Final = ("pbr", "lfr", "tr", "pbr_tr", "lfr_tr", "pbr_assert", "lfr_assert", "pbr_sup")
 WAYS: Final = (
     ("pbr", "lfr"),
     ("lfr", "pbr"),
@@ -129,6 +129,7 @@ def test_the_dialogues_are_there() -> None:
     assert all(any(n.startswith(f"{m}_crash") for n in names) for m in MECHANISMS)
     assert names >= {f"{old}_to_{new}" for old, new in WAYS}
     assert names >= {"tr_corrected", "tr_no_majority", "pbr_assert_refused", "lfr_divergence", "none_normal"}
+    assert names >= {"pbr_sup_skipped", "pbr_sup_doubled", "pbr_sup_slow", "lfr_sup_doubled"}
 
 
 def test_no_dialogue_hangs_on_chance() -> None:

@@ -19,6 +19,8 @@ from aftbed.core.events import Event
 from aftbed.core.journal import EntryKind, Record
 from aftbed.core.messages import Message, Notification, Suspect, TakeOver, Trial, Trials
 from aftbed.core.script import Phase
+from aftbed.inject.channel import ChannelFault
+from aftbed.inject.model import Fault
 from aftbed.inject.receipts import fault_and_bits
 from aftbed.runtime import control
 from aftbed.runtime.sim.clock import Clock
@@ -35,7 +37,7 @@ SAID: Final = {  # events that no message shows
     Event.REPLY_REFUSED: "refuses a reply to {}",
     Event.FOLLOWER_DIVERGED: "has another reply to {}",
     Event.VOTE_COMPARED: "votes on {}: {}",
-    Event.DETECTED_STOP: "finds no reply to {} that can be right, and stops",
+    Event.DETECTED_STOP: "gives no reply to {}, and stops",
     Event.REPLICA_PROMOTED: "leads, epoch {1}",
     Event.BACKUP_READY: "redundancy is back",
     Event.PEER_REFUSED: "refuses what it is told about {}",
@@ -141,6 +143,11 @@ class Whiteboard(World):
         """Another line."""
         self.said.append(f"{who:<17} {what}")
 
+    def inject(self, fault: Fault) -> None:
+        """Arm it; its words are those of its strike."""
+        self._armed = fault
+        super().inject(fault)
+
     def log(self, event: str, text: str) -> None:
         """For the outcome; and some of it is said."""
         super().log(event, text)
@@ -159,7 +166,9 @@ class Whiteboard(World):
     def _noted(self, record: Record) -> None:
         if record.event is Event.FAULT_APPLIED:
             bit = fault_and_bits(record.detail)[1]
-            if record.request_id:  # who strikes itself is seen to die
+            if record.request_id and isinstance(self._armed.action, ChannelFault):
+                self.say(record.node, f"is struck by {self._armed}")
+            elif record.request_id:  # who strikes itself is seen to die
                 self.say(record.node, f"bit {bit} flips in what it makes of {record.request_id}")
         elif record.event is Event.VOTE_COMPARED:
             self.say(record.node, f"votes on {record.request_id}: {VOTES[record.detail]}")

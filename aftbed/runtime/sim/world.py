@@ -469,7 +469,8 @@ class World:
         """Arm another fault now. Raises ConfigError where there is no such fault."""
         check(fault, self.setup.scenario)
         fault.check(self.controller.deployment.graph)
-        self.loop.tasks.start("inject", self.controller.faults.arm(fault), lambda failure: None)
+        armed = self.controller.faults.arm(fault, live=True)
+        self.loop.tasks.start("inject", armed, lambda failure: None)
         self.loop.watch_jobs()
 
     def adapt(self, goal: Goal) -> None:

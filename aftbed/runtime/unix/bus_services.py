@@ -213,13 +213,13 @@ def _play(line: Line[control.ToNode], source: SourceOptions) -> None:
     from aftbed.vehicle.can.bus import BusOptions, open_bus  # noqa: PLC0415
     from aftbed.vehicle.can.candump import read_log  # noqa: PLC0415
     from aftbed.vehicle.can.dbc_file import own_dbc  # noqa: PLC0415
-    from aftbed.vehicle.replay.map_file import find_map  # noqa: PLC0415
+    from aftbed.vehicle.replay.map_file import bind, find_map  # noqa: PLC0415
     from aftbed.vehicle.replay.mapped_gateway import MappedGateway  # noqa: PLC0415
     from aftbed.vehicle.replay.player import play  # noqa: PLC0415
 
     work = source.work
     assert isinstance(work, ReplayRun), work
-    gateway = MappedGateway(own_dbc(), Path(work.dbc), find_map(work.map))
+    gateway = MappedGateway(own_dbc(), bind(find_map(work.map), Path(work.dbc)))
     frames, counts = read_log(Path(work.log))
     bus = open_bus(BusOptions(port=source.port, secret=source.secret, node=PLAYER))
     orders = _Orders(line)

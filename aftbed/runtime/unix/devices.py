@@ -133,10 +133,10 @@ def make_source(client: Client, options: SourceOptions) -> Device:
     gateway: BusGateway
     encode = encode_fixed if is_foreign(options.application) else encode_request
     if isinstance(work, ReplayRun):
-        from aftbed.vehicle.replay.map_file import find_map  # noqa: PLC0415
+        from aftbed.vehicle.replay.map_file import bind, find_map  # noqa: PLC0415
         from aftbed.vehicle.replay.mapped_gateway import MappedGateway  # noqa: PLC0415
 
-        gateway = MappedGateway(own_dbc(), Path(work.dbc), find_map(work.map), encode)
+        gateway = MappedGateway(own_dbc(), bind(find_map(work.map), Path(work.dbc)), encode)
     else:
         gateway = Gateway(own_dbc(), encode)
     return CarDevice(client, dialogue, BusLink(gateway, options.port, options.secret))

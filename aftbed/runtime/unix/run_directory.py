@@ -212,10 +212,17 @@ def live() -> list[str]:
 
 
 def find(run: str | None) -> Path:
-    """The private directory of run `run`, or of the only one alive. Raises ConfigError."""
+    """The private directory of run `run`, or of the only one alive. Raises ConfigError.
+
+    An id may be shortened as long as it means one run.
+    """
     alive = live()
     known = ", ".join(alive) or "none"
-    if run is not None and run not in alive:
+    meant = [name for name in alive if run and name.startswith(run)]
+    if len(meant) > 1:
+        raise ConfigError(f"--run {run}: {len(meant)} runs begin so: {', '.join(meant)}")
+    run = meant[0] if meant else run
+    if run is not None and not meant:
         raise ConfigError(f"--run {run}: no such run is alive (alive: {known})")
     if run is None and not alive:
         raise ConfigError("no run is alive; start one with `aftbed run`")

@@ -120,8 +120,9 @@ class Bus:
         self._socket.sendall(f"< aftbed time {t_us} >".encode("ascii"))
 
     def notice(self, notice: Notice) -> None:
-        """Report beside the bus what is wrong with frames, or that they are used again."""
-        self._send_beside(f"noticed {notice.can_id:03X} {notice.word} {notice.t_us}")
+        """Report beside the bus what is wrong with frames, or that they are used again, as of now."""
+        now_ns = time.monotonic_ns()
+        self._send_beside(f"noticed {notice.can_id:03X} {notice.word} {notice.t_us} {now_ns}")
 
     def unasked(self, can_id: int) -> None:
         """Report beside the bus that no request was made of a frame of which one is expected."""

@@ -31,7 +31,8 @@ an error element, and put out.
 be cut off by a fault, and its reports count.
 
     < < aftbed node radar 100 >        the client's name, and the identifiers that it uses
-    < < aftbed noticed 100 sequence 20000 >  what is wrong with these frames, and when; or `good_again`
+    < < aftbed noticed 100 lost 20000 5678 >   what is wrong with these frames, or `good_again`: at 20000 us
+                                       by the node's own bus time, 5678 ns by the clock
     < < aftbed unasked 130 >           the gateway makes no request of a frame of which one is expected
     < < aftbed time 20000 >            > < ok >  the virtual time; with faults, when one is due: < ok 31000 >
     < < aftbed await radar 12 >        > < ok >  when twelve frames of the radar have been carried
@@ -113,7 +114,7 @@ _OURS: Final = {  # elements of aftbed's nodes
         b"plant": rb"",
         b"met": rb"([0-9]{1,12}) ([0-9]{1,16}) ([0-9]{1,20}) ",
         b"unasked": rb"([0-9A-F]{3}) ",
-        b"noticed": rb"([0-9A-F]{3}) ([a-z_]{1,32}) ([0-9]{1,16}) ",
+        b"noticed": rb"([0-9A-F]{3}) ([a-z_]{1,32}) ([0-9]{1,16}) ([0-9]{1,20}) ",
     }.items()
 }
 _SOCK_DIAG: Final = 4  # linux/netlink.h, linux/sock_diag.h, linux/inet_diag.h
@@ -335,7 +336,11 @@ class Hub(BusModel[HubConnection]):
     def now_us(self) -> int:
         if self._options.lockstep:
             return self._virtual_us
-        elapsed_us = (time.monotonic_ns() - self._origin_ns) // 1000
+        return self._us_of(time.monotonic_ns())
+
+    def _us_of(self, clock_ns: int) -> int:
+        """Bus time out of lockstep."""
+        elapsed_us = (clock_ns - self._origin_ns) // 1000
         return elapsed_us if self._options.pace == 1.0 else int(elapsed_us * self._options.pace)
 
     def _wait(self) -> list[tuple[int, int]]:
@@ -514,9 +519,10 @@ class Hub(BusModel[HubConnection]):
             case b"unasked", [can_id]:
                 if self.disturber is not None:
                     self.receipts_changed(int(can_id, 16), -1)
-            case b"noticed", [can_id, reason, t_us]:
-                # Out of lockstep the drive of the car has another zero of time than the hub.
-                noticed_us = int(t_us) if self._options.lockstep else self.now_us()
+            case b"noticed", [can_id, reason, t_us, since_ns]:
+                # Out of lockstep the car has another zero of time than the hub: the clock is common to both.
+                in_lockstep = self._options.lockstep
+                noticed_us = int(t_us) if in_lockstep else min(self._us_of(int(since_ns)), self.now_us())
                 self.noticed(client.name, Notice(int(can_id, 16), reason, noticed_us))
             case _:
                 raise PeerError("unknown command, or not now")

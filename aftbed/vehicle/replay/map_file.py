@@ -3,24 +3,26 @@
 A map is YAML; `MapFile` is its shape, key by key. It names messages and signals of a DBC, the unit of each
 quantity, the length of each message, and the rules for its checksum and counter:
 
-    strict         false: the DBC may contradict itself where the map does not look (see `dbc_file`)
+    strict         false: messages of the DBC that contradict themselves are taken (see `dbc_file`)
     cycle_end      the message that ends a radar cycle; its arrival makes the request
     ego.speed      the ego's own speed
-    tracks         the radar's targets: one message for each slot, `name` with {n} (or {n:02}, with zeros in
-                   front) from `first` to `last`; or one message for all, with the number of the object in
-                   the signal `slot`, and, where the radar announces how many will come, `count`
+    tracks         the radar's targets: one message for each slot, by a list of names, or by a `name` with {n}
+                   (or {n:02}, with zeros in front, {n:x} or {n:X}, hexadecimal) from `first` to `last`; or
+                   one message for all, with the number of the object in the signal `slot`, and, where the
+                   radar announces how many will come, `count`
     others         messages that are judged and counted, but not used
 
-A quantity that the DBC does not have may be given by its place in the data (`raw`), in the DBC's own way of
-counting bits. A target's place beside our path is its `lateral_offset`, or follows from its `angle`.
+{n} may also stand in the names of signals. A quantity that the DBC does not have may be given by its place in
+the data (`raw`), in the DBC's own way of counting bits. A target's place beside our path is its
+`lateral_offset`, or follows from its `angle`.
 
 `bind` checks the whole map against the DBC, so a map that binds cannot fail later: the result has one
-`FrameRule` per CAN id.
+`FrameRule` per CAN id, in which all names are those of the DBC.
 """
 
 import re
-from collections.abc import Mapping
-from math import radians
+from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Final, Literal
 
@@ -43,20 +45,16 @@ from aftbed.vehicle.can.e2e import (
     Supervision,
 )
 from aftbed.vehicle.can.frame import CAN_ID_MAX
+from aftbed.vehicle.replay.units import Dimension, Unit, unit_names, unit_of
 
 Sum = Literal["toyota", "none"]
 Length = Annotated[int, Meta(ge=1, le=8)]
 DataId = Annotated[int, Meta(ge=0, le=DATA_ID_MAX)]
 
-TO_SI: Final[Mapping[str, float]] = {
-    "m": 1.0,
-    "cm": 0.01,
-    "m/s": 1.0,
-    "km/h": 1 / 3.6,
-    "deg": radians(1.0),
-    "rad": 1.0,
-}
-_NUMBER: Final = re.compile(r"\{n(?::0([1-9]))?\}")
+MESSAGES_MAX: Final = 256  # under one key
+NAMES_SHOWN_MAX: Final = 10  # of the DBC, where one that the map has is not there
+NUMBER_MAX: Final = 65535
+_NUMBER: Final = re.compile(r"\{n(?::(?:0([1-9]))?([xX])?)?\}")
 
 
 class RawSignal(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -88,36 +86,15 @@ class RawSignal(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class MappedQuantity(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A quantity: a signal of the DBC, or raw."""
+    """A quantity: a signal of the DBC, or raw; its value is multiplied by `scale`.
 
-    unit: str
+    Without `unit` it is in the unit that the DBC has.
+    """
+
+    unit: str | None = None
     signal: str | None = None
     raw: RawSignal | None = None
-
-    def si(self, signals: Mapping[str, float], data: bytes) -> float:
-        """Its value in a message, in metres, metres per second, or radians."""
-        if self.raw is not None:
-            return self.raw.read(data) * TO_SI[self.unit]
-        assert self.signal is not None
-        return signals[self.signal] * TO_SI[self.unit]
-
-
-class Speed(MappedQuantity, frozen=True):
-    """A speed."""
-
-    unit: Literal["m/s", "km/h"]
-
-
-class Distance(MappedQuantity, frozen=True):
-    """A distance."""
-
-    unit: Literal["m", "cm"]
-
-
-class Angle(MappedQuantity, frozen=True):
-    """An angle from straight ahead, to either side."""
-
-    unit: Literal["deg", "rad"]
+    scale: Annotated[float, Meta(ge=-1e6, le=1e6)] = 1.0
 
 
 class Counter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -153,14 +130,27 @@ class Messages(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One message, or those whose names have the numbers `first` to `last` in the place of {n}."""
 
     name: str
-    first: Annotated[int, Meta(ge=0, le=255)] = 0
-    last: Annotated[int, Meta(ge=0, le=255)] = 0
+    first: Annotated[int, Meta(ge=0, le=NUMBER_MAX)] = 0
+    last: Annotated[int, Meta(ge=0, le=NUMBER_MAX)] = 0
+    step: Annotated[int, Meta(ge=1, le=NUMBER_MAX)] = 1
+
+    def numbers(self) -> range:
+        return range(self.first, self.last + 1, self.step)
 
     def names(self) -> list[str]:
-        return [
-            _NUMBER.sub(lambda found, number=number: f"{number:0{found[1] or 0}}", self.name)  # type: ignore[misc]
-            for number in range(self.first, self.last + 1)
-        ]
+        return [numbered(self.name, number) for number in self.numbers()]
+
+
+Names = Annotated[tuple[str, ...], Meta(min_length=1, max_length=MESSAGES_MAX)]
+
+
+def numbered(name: str, number: int) -> str:
+    """`name` with the number in the place of {n}."""
+
+    def shown(found: re.Match[str]) -> str:
+        return f"{number:0{found[1] or 0}{found[2] or 'd'}}"
+
+    return _NUMBER.sub(shown, name)
 
 
 class Flag(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -181,7 +171,7 @@ class EgoMap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The message with the ego speed: by `message` in the DBC, or by `can_id`. Unknown after `timeout_ms`."""
 
     length: Length
-    speed: Speed
+    speed: MappedQuantity
     message: str | None = None
     can_id: Annotated[int, Meta(ge=0, le=CAN_ID_MAX)] | None = None
     checksum: Checksum = "none"
@@ -192,12 +182,12 @@ class EgoMap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class TrackMap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The radar's targets. `valid`, `new`: signals that are 1 for yes, or flags; without `valid` all are."""
 
-    messages: Messages
+    messages: Messages | Names
     length: Length
-    range: Distance
-    relative_speed: Speed
-    lateral_offset: Distance | None = None
-    angle: Angle | None = None
+    range: MappedQuantity
+    relative_speed: MappedQuantity
+    lateral_offset: MappedQuantity | None = None
+    angle: MappedQuantity | None = None
     slot: str | None = None
     count: ObjectCount | None = None
     valid: str | Flag | None = None
@@ -209,7 +199,7 @@ class TrackMap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class OtherMap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Messages of the radar that are not needed, or only for the number of objects."""
 
-    messages: Messages
+    messages: Messages | Names
     length: Length
     checksum: Checksum = "none"
     counter: Counter | None = None
@@ -230,11 +220,53 @@ SHIPPED: Final = Path(__file__).resolve().parent / "maps"  # maps, and the DBCs 
 E2E_TIMEOUT_CYCLES: Final = 6  # as on our own bus
 
 
+class Reading(msgspec.Struct, frozen=True):
+    """Where a quantity is: in the signal, or else raw. `factor` makes metres, m/s or radians of its value."""
+
+    signal: str | None
+    raw: RawSignal | None
+    factor: float
+
+    def si(self, signals: Mapping[str, float], data: bytes) -> float:
+        """Its value in a message that is long enough."""
+        if self.raw is not None:
+            return self.raw.read(data) * self.factor
+        assert self.signal is not None
+        return signals[self.signal] * self.factor
+
+
+class FlagReading(msgspec.Struct, frozen=True):
+    """Yes, if the signal has one of the values; without values, if it is not 0."""
+
+    signal: str
+    values: tuple[int, ...] | None
+
+    def is_set(self, signals: Mapping[str, float]) -> bool:
+        value = signals[self.signal]
+        return bool(value) if self.values is None else int(value) in self.values
+
+
+class TrackReading(msgspec.Struct, frozen=True):
+    """Where a message has its target. One of `lateral_offset` and `angle` is None.
+
+    `number`: which of the tracks' messages it is; `slot`: the signal with the number of the object instead.
+    """
+
+    number: int
+    range: Reading
+    relative_speed: Reading
+    lateral_offset: Reading | None
+    angle: Reading | None
+    slot: str | None
+    valid: FlagReading | None
+    new: FlagReading | None
+
+
 class FrameRule(msgspec.Struct, frozen=True):
-    """How to judge the frames of one CAN id.
+    """How to judge the frames of one CAN id, and what they hold.
 
     `name` None: not in the DBC. `watch`: by E2E, and then there is neither checksum nor counter beside it.
-    `slot`: which of the tracks' messages it is; None: not a track.
+    `track` None: not a track.
     """
 
     can_id: int
@@ -243,7 +275,7 @@ class FrameRule(msgspec.Struct, frozen=True):
     checksum: Sum
     counter: Counter | None
     watch: Supervision | None
-    slot: int | None = None
+    track: TrackReading | None = None
 
 
 class BoundMap(msgspec.Struct, frozen=True):
@@ -251,16 +283,18 @@ class BoundMap(msgspec.Struct, frozen=True):
 
     A radar cycle ends with a frame of `cycle_end_id`, or else with the last of the objects that a frame of
     `count_id` has announced: one of the two is None. `allots`: the objects are more than slots, or have
-    numbers of their own.
+    numbers of their own. `problems`: what a person should look at.
     """
 
     map: MapFile
     codec: Codec
     rules: dict[int, FrameRule]
     ego_id: int
+    ego_speed: Reading
     cycle_end_id: int | None
     count_id: int | None
     allots: bool
+    problems: tuple[str, ...]
 
 
 def find_map(name_or_path: str) -> Path:
@@ -274,6 +308,19 @@ def find_dbc(name_or_path: str) -> Path:
     path = Path(name_or_path)
     is_path = "/" in name_or_path or "." in name_or_path or path.is_file()
     return path if is_path else _shipped("DBC", name_or_path, ".dbc")
+
+
+def shipped_maps() -> list[str]:
+    return sorted(path.stem for path in SHIPPED.glob("*.yaml"))
+
+
+def shipped_dbcs() -> list[str]:
+    return sorted(path.stem for path in SHIPPED.glob("*.dbc"))
+
+
+def read_map(path: Path) -> MapFile:
+    """Raises ConfigError naming file, key, what was found and what is allowed."""
+    return read_yaml(path, MapFile)
 
 
 def _shipped(what: str, name: str, ending: str) -> Path:
@@ -291,7 +338,12 @@ def load_mapped(path: Path, dbc: Path) -> Codec:
 def bind(path: Path, dbc: Path) -> BoundMap:
     """Read the map at `path` and check all of it against the DBC. Raises ConfigError."""
     file = read_yaml(path, MapFile)
-    return _Binding(path, load_dbc(dbc, strict=file.strict), file).bound()
+    return bind_file(file, path, load_dbc(dbc, strict=file.strict))
+
+
+def bind_file(file: MapFile, path: Path, codec: Codec) -> BoundMap:
+    """Check a map that was read, or is going to be written, at `path`. Raises ConfigError."""
+    return _Binding(path, codec, file).bound()
 
 
 Source = EgoMap | TrackMap | OtherMap
@@ -305,90 +357,125 @@ class _Binding:
         self._codec = codec
         self._file = file
         self._rules: dict[int, FrameRule] = {}
+        self._problems: dict[str, None] = dict.fromkeys(codec.notes)  # each once, in order
 
     def bound(self) -> BoundMap:
         file, tracks = self._file, self._file.tracks
-        ego = self._bind_ego(file.ego)
-        self._bind_tracks(tracks)
+        ego, ego_speed = self._bind_ego(file.ego)
+        names = self._bind_tracks(tracks)
         for index, other in enumerate(file.others):
-            names = self._names(f"others[{index}].messages", other.messages)
-            for number, name in enumerate(names):
-                self._add(f"others[{index}]", other, name, number, len(names))
+            messages = self._messages(f"others[{index}].messages", other.messages)
+            for place, (number, name) in enumerate(messages):
+                self._add(f"others[{index}]", other, name, number, place, len(messages))
         self._check_one("cycle_end", "cycle_end and tracks.count", file.cycle_end, tracks.count)
         end = None if file.cycle_end is None else self._mapped("cycle_end", file.cycle_end)
         count = None
         if tracks.count is not None:
             count = self._mapped("tracks.count.message", tracks.count.message)
             self._check_whole("tracks.count.signal", tracks.count.message, tracks.count.signal)
-        allots = tracks.slot is not None or len(tracks.messages.names()) > SLOTS
-        return BoundMap(file, self._codec, self._rules, ego, end, count, allots)
+        allots = tracks.slot is not None or len(names) > SLOTS
+        problems = tuple(self._problems)
+        return BoundMap(file, self._codec, self._rules, ego, ego_speed, end, count, allots, problems)
 
-    def _bind_ego(self, ego: EgoMap) -> int:
+    def _bind_ego(self, ego: EgoMap) -> tuple[int, Reading]:
         self._check_one("ego", "message and can_id", ego.message, ego.can_id)
         if ego.message is not None:
             self._check_message("ego.message", ego.message)
-            can_id = self._add("ego", ego, ego.message, 0, 1)
+            can_id = self._add("ego", ego, ego.message, 0, 0, 1)
         else:
             assert ego.can_id is not None
             can_id = ego.can_id
             if ego.counter is not None:
                 raise self._error("ego.counter", "a signal", "none, as ego is given by can_id")
-            self._rules[can_id] = self._rule("ego", ego, can_id, None, 0, 1)
-        self._check_quantity("ego.speed", ego.speed, ego.message, ego.length)
-        return can_id
+            self._rules[can_id] = self._rule("ego", ego, can_id, None, None, 0, 1)
+        return can_id, self._reading("ego.speed", Dimension.SPEED, ego.speed, ego.message, 0, ego.length)
 
-    def _bind_tracks(self, tracks: TrackMap) -> None:
-        names = self._names("tracks.messages", tracks.messages)
-        if tracks.slot is not None and len(names) > 1:
-            raise self._error("tracks.slot", f"a signal, for {len(names)} messages", "one for one message")
+    def _bind_tracks(self, tracks: TrackMap) -> list[str]:
+        messages = self._messages("tracks.messages", tracks.messages)
+        if tracks.slot is not None and len(messages) > 1:
+            raise self._error("tracks.slot", f"a signal, for {len(messages)} messages", "one for one message")
         if tracks.count is not None and tracks.slot is None:
             raise self._error("tracks.count", "count without slot", "both, or neither")
         self._check_one("tracks", "lateral_offset and angle", tracks.lateral_offset, tracks.angle)
-        for number, name in enumerate(names):
-            self._add("tracks", tracks, name, number, len(names))
-            quantities: tuple[tuple[str, MappedQuantity | None], ...] = (
-                ("range", tracks.range),
-                ("relative_speed", tracks.relative_speed),
-                ("lateral_offset", tracks.lateral_offset),
-                ("angle", tracks.angle),
-            )
-            for key, quantity in quantities:
-                if quantity is not None:
-                    self._check_quantity(f"tracks.{key}", quantity, name, tracks.length)
-            if tracks.slot is not None:
-                self._check_whole("tracks.slot", name, tracks.slot)
-            for key, flag in (("tracks.valid", tracks.valid), ("tracks.new", tracks.new)):
-                if isinstance(flag, Flag):
-                    self._check_whole(f"{key}.signal", name, flag.signal)
-                elif flag is not None:
-                    self._check_signal(key, name, flag)
+        for place, (number, name) in enumerate(messages):
+            can_id = self._add("tracks", tracks, name, number, place, len(messages))
+            track = self._track(tracks, name, number, place)
+            self._rules[can_id] = msgspec.structs.replace(self._rules[can_id], track=track)
+        return [name for _, name in messages]
+
+    def _track(self, tracks: TrackMap, name: str, number: int, place: int) -> TrackReading:
+        def reading(key: str, dimension: Dimension, quantity: MappedQuantity | None) -> Reading | None:
+            if quantity is None:
+                return None
+            return self._reading(f"tracks.{key}", dimension, quantity, name, number, tracks.length)
+
+        def flag(key: str, given: str | Flag | None) -> FlagReading | None:
+            if given is None:
+                return None
+            if isinstance(given, Flag):
+                signal = numbered(given.signal, number)
+                self._check_whole(f"tracks.{key}.signal", name, signal)
+                return FlagReading(signal, given.values)
+            self._check_signal(f"tracks.{key}", name, numbered(given, number))
+            return FlagReading(numbered(given, number), None)
+
+        along = reading("range", Dimension.DISTANCE, tracks.range)
+        speed = reading("relative_speed", Dimension.SPEED, tracks.relative_speed)
+        assert along is not None
+        assert speed is not None
+        slot = None if tracks.slot is None else numbered(tracks.slot, number)
+        if slot is not None:
+            self._check_whole("tracks.slot", name, slot)
+        return TrackReading(
+            place,
+            along,
+            speed,
+            reading("lateral_offset", Dimension.DISTANCE, tracks.lateral_offset),
+            reading("angle", Dimension.ANGLE, tracks.angle),
+            slot,
+            flag("valid", tracks.valid),
+            flag("new", tracks.new),
+        )
 
     # -- rules
 
-    def _add(self, key: str, given: Source, name: str, number: int, of: int) -> int:
-        """Make the rule of one message of the DBC, `number` of as many with the same; its id."""
+    def _add(self, key: str, given: Source, name: str, number: int, place: int, of: int) -> int:
+        """Make the rule of one message of the DBC, the one at `place` of as many with the same; its id.
+
+        `number` stands for {n}.
+        """
         can_id, length = self._codec.can_id(name), self._codec.length(name)
+        if self._codec.extended(name):
+            raise self._error(key, f"{name} ({can_id:#x}, of 29 bits)", "an id of 11 bits")
         if given.length != length:
             raise self._error(f"{key}.length", str(given.length), f"{length}, as {name} has in the DBC")
         if can_id in self._rules:
             raise self._error(key, f"{name} ({can_id:#05x}) mapped twice", "once")
         if self._codec.multiplexed(name):
             raise self._error(key, f"{name}, which is multiplexed", "a message with the same signals always")
-        if given.counter is not None:
-            self._check_whole(f"{key}.counter.signal", name, given.counter.signal)
-        self._rules[can_id] = self._rule(key, given, can_id, name, number, of)
+        counter = given.counter
+        if counter is not None:
+            counter = Counter(numbered(counter.signal, number), counter.modulo)
+            self._check_whole(f"{key}.counter.signal", name, counter.signal)
+        self._rules[can_id] = self._rule(key, given, can_id, name, counter, place, of)
         return can_id
 
     def _rule(
-        self, key: str, given: Source, can_id: int, name: str | None, number: int, of: int
+        self,
+        key: str,
+        given: Source,
+        can_id: int,
+        name: str | None,
+        counter: Counter | None,
+        place: int,
+        of: int,
     ) -> FrameRule:
-        slot = number if isinstance(given, TrackMap) else None
         if not isinstance(given.checksum, E2EMap):
-            return FrameRule(can_id, name, given.length, given.checksum, given.counter, None, slot)
+            return FrameRule(can_id, name, given.length, given.checksum, counter, None)
         if given.counter is not None:
             raise self._error(f"{key}.counter", "a signal", f"none, as {given.checksum.profile} has its own")
-        watch = self._watch(f"{key}.checksum", given.checksum, given.length, number, of)
-        return FrameRule(can_id, name, given.length, "none", None, watch, slot)
+        watch = self._watch(f"{key}.checksum", given.checksum, given.length, place, of)
+        return FrameRule(can_id, name, given.length, "none", None, watch)
 
     def _watch(self, key: str, given: E2EMap, length: int, number: int, of: int) -> Supervision:
         """The supervision of one message by E2E."""
@@ -440,39 +527,85 @@ class _Binding:
 
     # -- names and places
 
-    def _names(self, key: str, messages: Messages) -> list[str]:
+    def _messages(self, key: str, messages: Messages | tuple[str, ...]) -> list[tuple[int, str]]:
+        """The number for {n} and the name of each; of a list, the place in it."""
+        if not isinstance(messages, Messages):
+            for name in messages:
+                self._check_message(key, name)
+            return list(enumerate(messages))
         if messages.last < messages.first:
             raise self._error(f"{key}.last", str(messages.last), f"{messages.first} (first) or more")
-        for name in messages.names():
+        if len(messages.numbers()) > MESSAGES_MAX:
+            raise self._error(key, f"{len(messages.numbers())} messages", f"at most {MESSAGES_MAX}")
+        found = [(number, numbered(messages.name, number)) for number in messages.numbers()]
+        for _, name in found:
             self._check_message(f"{key}.name", name)
-        return messages.names()
+        return found
 
-    def _check_quantity(self, key: str, quantity: MappedQuantity, name: str | None, length: int) -> None:
+    def _reading(
+        self,
+        key: str,
+        dimension: Dimension,
+        quantity: MappedQuantity,
+        name: str | None,
+        number: int,
+        length: int,
+    ) -> Reading:
         self._check_one(key, "signal and raw", quantity.signal, quantity.raw)
         if quantity.raw is not None:
             end_bit = quantity.raw.first_bit() + quantity.raw.length_bits
             if end_bit > 8 * length:
                 raise self._error(f"{key}.raw", f"{end_bit} bits", f"at most {8 * length}, by the length")
-            return
+            unit = self._unit(key, dimension, quantity.unit, None, "")
+            return Reading(None, quantity.raw, unit.si * quantity.scale)
         assert quantity.signal is not None
+        signal = numbered(quantity.signal, number)
         if name is None:
-            raise self._error(f"{key}.signal", quantity.signal, "raw, as the message is given by can_id")
-        self._check_signal(f"{key}.signal", name, quantity.signal)
-        unit = self._codec.unit(name, quantity.signal)
-        if unit not in ("", quantity.unit):
-            raise self._error(f"{key}.unit", quantity.unit, f"{unit}, as {quantity.signal} has in the DBC")
+            raise self._error(f"{key}.signal", signal, "raw, as the message is given by can_id")
+        self._check_signal(f"{key}.signal", name, signal)
+        unit = self._unit(key, dimension, quantity.unit, signal, self._codec.unit(name, signal))
+        return Reading(signal, None, unit.si * quantity.scale)
+
+    def _unit(
+        self, key: str, dimension: Dimension, given: str | None, signal: str | None, in_dbc: str
+    ) -> Unit:
+        """The unit of a quantity: that of the map, which must agree with the DBC's, or else the DBC's."""
+        key, allowed = f"{key}.unit", f"{dimension}, in {', '.join(unit_names(dimension))}"
+        known = unit_of(in_dbc)
+        if given is None:
+            if known is None:
+                unit = f"the unit {in_dbc!r}" if in_dbc.strip() else "no unit"
+                has = "raw has none" if signal is None else f"{signal} has {unit} in the DBC"
+                raise self._error(key, "none", f"{allowed}, as {has}")
+            if known.dimension is not dimension:
+                raise self._error(key, f"{in_dbc}, as {signal} has in the DBC", allowed)
+            return known
+        unit_given = unit_of(given)
+        if unit_given is None or unit_given.dimension is not dimension:
+            raise self._error(key, given, allowed)
+        if known is not None and known != unit_given:
+            raise self._error(key, given, f"{in_dbc}, as {signal} has in the DBC")
+        if known is None and in_dbc.strip():
+            odd = f"{signal} has the unit {in_dbc!r} in the DBC, which aftbed does not know"
+            self._problems[f"{key}: {odd}; {unit_given.name} is taken"] = None
+        return unit_given
 
     def _check_message(self, key: str, name: str) -> None:
         if name not in self._codec.names():
-            reason = unknown("message", name, self._codec.names())
-            raise ConfigError(f"{self._path}: {key}: {reason}, by {self._codec.path}")
+            raise self._unknown(key, "message", name, self._codec.names())
 
     def _check_signal(self, key: str, name: str, signal: str) -> None:
         if signal not in self._codec.signal_names(name):
-            reason = unknown(f"signal of {name}", signal, self._codec.signal_names(name))
-            raise ConfigError(f"{self._path}: {key}: {reason}, by {self._codec.path}")
+            raise self._unknown(key, f"signal of {name}", signal, self._codec.signal_names(name))
         if signal in self._codec.misfits(name):
             raise self._error(key, f"{signal}, which does not lie in {name}", "a signal that does")
+
+    def _unknown(self, key: str, what: str, found: str, names: Sequence[str]) -> ConfigError:
+        """Names the nearest of many: on a DBC of another radar, all are of no help."""
+        near = get_close_matches(found, names, n=NAMES_SHOWN_MAX, cutoff=0.0)
+        more = f" and {len(names) - len(near)} more" if len(names) > len(near) else ""
+        reason = f"{unknown(what, found, near)}{more}, by {self._codec.path}{self._codec.left_out()}"
+        return ConfigError(f"{self._path}: {key}: {reason}")
 
     def _check_whole(self, key: str, name: str, signal: str) -> None:
         self._check_signal(key, name, signal)

@@ -14,7 +14,6 @@ announcement, and makes its request out of what came.
 
 from collections.abc import Mapping
 from math import cos, isfinite, sin
-from pathlib import Path
 from typing import Final
 
 import msgspec
@@ -31,7 +30,7 @@ from aftbed.vehicle.can.dbc_file import Codec
 from aftbed.vehicle.can.e2e import Receiver
 from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.gateway import BusGateway, target_of
-from aftbed.vehicle.replay.map_file import Flag, FrameRule, bind
+from aftbed.vehicle.replay.map_file import BoundMap, FrameRule, TrackReading
 
 FRESH_CYCLES: Final = 1.5  # a log's time stamps come in batches, so a cycle may look longer than it was
 
@@ -79,14 +78,11 @@ class SeenTrack(msgspec.Struct, frozen=True):
 
 
 class MappedGateway(BusGateway):
-    """Reads frames by a user's DBC and map; `codec` is aftbed's own, for what it sends."""
+    """Reads frames by a user's map and DBC; `codec` is aftbed's own, for what it sends."""
 
-    def __init__(
-        self, codec: Codec, dbc: Path, map_file: Path, encode: EncodeRequest = encode_request
-    ) -> None:
-        """Raises ConfigError if the DBC does not parse, or the map does not fit it."""
+    def __init__(self, codec: Codec, bound: BoundMap, encode: EncodeRequest = encode_request) -> None:
         super().__init__(codec, encode)
-        self._bound = bind(map_file, dbc)
+        self._bound = bound
         self._receivers = {
             rule.can_id: Receiver(rule.watch) for rule in self._bound.rules.values() if rule.watch is not None
         }
@@ -113,7 +109,7 @@ class MappedGateway(BusGateway):
             return self._request(frame.t_us)
         if frame.can_id == self._bound.count_id:
             return self._announce(frame.t_us)
-        if rule.slot is not None and 0 < self._awaited <= len(self._tracks):
+        if rule.track is not None and 0 < self._awaited <= len(self._tracks):
             self._awaited = 0
             return self._request(frame.t_us)
         return None
@@ -145,32 +141,30 @@ class MappedGateway(BusGateway):
     def _take(self, frame: Frame, rule: FrameRule, signals: dict[str, float]) -> bool:
         """Keep a track or the ego speed. False, and nothing kept, if a value is beyond any sensor."""
         if frame.can_id == self._bound.ego_id:
-            speed_ms = self._bound.map.ego.speed.si(signals, frame.data)
+            speed_ms = self._bound.ego_speed.si(signals, frame.data)
             if not 0.0 <= speed_ms <= SPEED_MAX_MS:
                 return False
             self._ego = (frame.t_us, speed_ms)
         count = self._bound.map.tracks.count
         if count is not None and frame.can_id == self._bound.count_id:
             self._announced = int(signals[count.signal])
-        return rule.slot is None or self._take_track(frame, rule.slot, signals)
+        return rule.track is None or self._take_track(frame, rule.track, signals)
 
-    def _take_track(self, frame: Frame, number: int, signals: dict[str, float]) -> bool:
-        """Keep a track: that of the object that the frame names, or else of the message with this number."""
-        tracks = self._bound.map.tracks
-        if tracks.slot is not None:
-            number = int(signals[tracks.slot])
+    def _take_track(self, frame: Frame, track: TrackReading, signals: dict[str, float]) -> bool:
+        """Keep a track: that of the object that the frame names, or else of its message."""
+        number = track.number if track.slot is None else int(signals[track.slot])
         target = None
-        if tracks.valid is None or _is_set(tracks.valid, signals):
-            new = tracks.new is not None and _is_set(tracks.new, signals)
-            ahead_m = tracks.range.si(signals, frame.data)
-            if tracks.angle is None:
-                assert tracks.lateral_offset is not None
-                beside_m = tracks.lateral_offset.si(signals, frame.data)
-            elif isfinite(angle := tracks.angle.si(signals, frame.data)):
+        if track.valid is None or track.valid.is_set(signals):
+            new = track.new is not None and track.new.is_set(signals)
+            ahead_m = track.range.si(signals, frame.data)
+            if track.angle is None:
+                assert track.lateral_offset is not None
+                beside_m = track.lateral_offset.si(signals, frame.data)
+            elif isfinite(angle := track.angle.si(signals, frame.data)):
                 ahead_m, beside_m = ahead_m * cos(angle), ahead_m * sin(angle)
             else:
                 return False
-            target = target_of(0, ahead_m, tracks.relative_speed.si(signals, frame.data), new)
+            target = target_of(0, ahead_m, track.relative_speed.si(signals, frame.data), new)
             if target is None or not isfinite(beside_m):
                 return False
             if abs(beside_m) > self._bound.map.lane_half_width_m:
@@ -198,9 +192,3 @@ class MappedGateway(BusGateway):
         known = self._ego is not None and t_us - self._ego[0] <= self._bound.map.ego.timeout_ms * 1000
         speed_ms = self._ego[1] if self._ego is not None and known else 0.0
         return self.encode(AebInput(t_us // 1000, speed_ms, known, bool(fresh) or empty, targets))
-
-
-def _is_set(flag: str | Flag, signals: dict[str, float]) -> bool:
-    if isinstance(flag, Flag):
-        return int(signals[flag.signal]) in flag.values
-    return bool(signals[flag])

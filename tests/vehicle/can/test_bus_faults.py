@@ -25,6 +25,8 @@ TRACK, AEB_REQ, EGO, STATUS = (
     CODEC.can_id(name) for name in ("RADAR_TRACK", "AEB_REQ", "EGO_STATE", "BRAKE_STATUS")
 )
 HEARTBEAT = CODEC.can_id("FTM_HEARTBEAT_1")  # comes by its own time
+TRIES = 6  # of a paced drive
+LAG_MS_MAX = 10.0  # of the clock: 40 ms of the bus at pace 4
 FIRST = {"sequence": 2}  # what every gateway refuses: the first frame of each of its two
 
 
@@ -206,9 +208,13 @@ def test_how_often_a_disturbed_car_is_advanced_makes_no_difference(words: str) -
 def test_a_paced_drive_meets_its_condition_and_heals(tmp_path: Path) -> None:
     """The car reports its condition to the hub: the fault begins no sooner, holds for its time, and heals.
 
-    How much later it begins is a matter of the machine's load; in lockstep it is exact, see above.
+    How much later it begins is a matter of the machine's load; in lockstep it is exact, see above. A car that
+    lags makes up for it: it may be at its end before 100 ms of the hub's time are over, so it drives again.
     """
-    drive = real(tmp_path / "bus.log", "omission bus AEB_REQ when ttc < 2.5 for 100ms", pace=4.0)
+    for _ in range(TRIES):
+        drive = real(tmp_path / "bus.log", "omission bus AEB_REQ when ttc < 2.5 for 100ms", pace=4.0)
+        if drive.report is not None and drive.report.lag_ms_max < LAG_MS_MAX:
+            break
     (struck,) = drive.struck
     gap = virtual("omission bus AEB_REQ when ttc < 2.5 for 100ms").struck[0]
     assert gap.first_us - 10_000 <= struck.first_us
@@ -235,6 +241,31 @@ def test_a_fault_is_armed_and_forgotten_while_the_car_drives(tmp_path: Path) -> 
     assert [t for t in times_us if t >= 1_000_000] == list(range(1_020_000, times_us[-1] + 1, 20_000))
     assert drive.struck[0].frames == 25
     assert drive.report is not None and drive.report.missing_answers == 0
+
+
+@pytest.mark.parametrize("pace", [1.0, 4.0])
+def test_a_paced_notice_is_of_the_time_at_which_the_node_noticed(tmp_path: Path, pace: float) -> None:
+    """By the clock: not of when the hub hears of it, nor by the time of the drive, which has another zero."""
+    origin_ns = time.monotonic_ns()
+    with (
+        running_hub(tmp_path / "bus.log", HubOptions(pace=pace, origin_ns=origin_ns)) as hub,
+        Node(hub.port, "radar") as radar,
+        Node(hub.port, "brake", 0x100) as brake,
+    ):
+        arm(hub, "omission bus RADAR_TRACK")
+        before_ns = time.monotonic_ns()
+        radar.send(0x130)
+        radar.fence()
+        after_ns = time.monotonic_ns()
+        for word, clock_ns in (("fallback", before_ns), ("fallback", after_ns), ("good_again", 10**19)):
+            brake.write(f"< aftbed noticed 100 {word} 5000 {clock_ns} >")
+        brake.fence()
+        heard_ns = time.monotonic_ns()
+        (struck,) = hub.struck()
+    times = struck.times
+    assert times is not None and times.good_us is not None
+    assert times.noticed_us == int((after_ns - origin_ns) // 1000 * pace), "the first one was not its work"
+    assert times.noticed_us < times.good_us <= (heard_ns - origin_ns) / 1000 * pace, "not in the future"
 
 
 # -- the hub itself
@@ -329,7 +360,7 @@ def test_the_hub_reports_what_becomes_of_a_fault(hub: RunningHub) -> None:
         arm(hub, "omission bus RADAR_TRACK nth 2")
         for _ in range(3):
             radar.send(0x130)
-        gateway.write("< aftbed noticed 130 lost 60000 >")
+        gateway.write(f"< aftbed noticed 130 lost 60000 {time.monotonic_ns()} >")
         gateway.fence()
     hub.stop()
     assert hub.link.receipts == ["armed", "applied", "activated"]
@@ -388,6 +419,7 @@ def test_await_is_answered_when_the_frames_have_been_carried(tmp_path: Path) -> 
         "< aftbed met 7 2000 123 >",
         "< aftbed noticed 130 >",
         "< aftbed noticed 130 lost >",
+        "< aftbed noticed 130 lost 60000 >",
         "< aftbed unasked 1 >",
         "< aftbed sing >",
     ],

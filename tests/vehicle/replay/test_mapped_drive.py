@@ -10,8 +10,11 @@ from aftbed.core.errors import ConfigError
 from aftbed.vehicle.aeb.function import AebFunction
 from aftbed.vehicle.aeb.messages import decode_reply, decode_request
 from aftbed.vehicle.can.candump import read_log
+from aftbed.vehicle.can.dbc_file import load_dbc
 from aftbed.vehicle.can.frame import Frame
-from aftbed.vehicle.replay.map_file import Messages, find_map
+from aftbed.vehicle.replay.map_file import Messages, bind, find_map
+from aftbed.vehicle.replay.map_proposal import propose
+from aftbed.vehicle.replay.map_trial import try_out
 from aftbed.vehicle.replay.mapped_gateway import MappedGateway
 
 
@@ -21,11 +24,17 @@ from aftbed.vehicle.replay.mapped_gateway import MappedGateway
         ("T{n}", ["T8", "T9", "T10"]),
         ("T{n:02}", ["T08", "T09", "T10"]),
         ("{n:03}T{n}", ["008T8", "009T9", "010T10"]),
+        ("T{n:x}", ["T8", "T9", "Ta"]),
+        ("T{n:03X}", ["T008", "T009", "T00A"]),
         ("T{n:2}", ["T{n:2}"] * 3),
     ],
 )
 def test_names_with_numbers(name: str, names: list[str]) -> None:
     assert Messages(name, 8, 10).names() == names
+
+
+def test_numbers_may_be_large_and_go_in_steps() -> None:
+    assert Messages("M_{n:X}hex", 0x319, 0x320, 3).names() == ["M_319hex", "M_31Chex", "M_31Fhex"]
 
 
 def test_an_unknown_map_comes_with_the_nearest() -> None:
@@ -46,7 +55,7 @@ class TestRealDrive:
         return [Frame(entry.frame.t_us - start_us, entry.frame.can_id, entry.frame.data) for entry in log]
 
     def test_all_frames_are_accepted_and_the_function_never_even_warns(self) -> None:
-        gateway, function = MappedGateway(CODEC, TOYOTA_DBC, find_map("toyota")), AebFunction()
+        gateway, function = MappedGateway(CODEC, bind(find_map("toyota"), TOYOTA_DBC)), AebFunction()
         requests = [made for frame in self.frames() if (made := gateway.on_frame(frame)) is not None]
         assert (gateway.counts.accepted, gateway.counts.refused) == (6920, {})
         assert len(requests) == 200
@@ -57,8 +66,27 @@ class TestRealDrive:
         assert 25.0 < nearest_m < 30.0
         assert {decode_reply(function.execute(request)).stage for request in requests} == {0}
 
+    def test_what_is_proposed_from_it_decodes_what_the_shipped_map_does(self, tmp_path: Path) -> None:
+        (tmp_path / "car.dbc").write_text(
+            'BU_: X\nBO_ 180 SPEED: 8 X\n SG_ SPEED : 47|16@0+ (0.01,0) [0|250] "km/h" X\n'
+        )
+        codecs = [load_dbc(path, strict=False) for path in (TOYOTA_DBC, tmp_path / "car.dbc")]
+        proposal = propose(codecs, self.frames())
+        assert (proposal.bound is not None, proposal.problems) == (True, ())
+        assert proposal.bound is not None
+        found = try_out(proposal.bound, self.frames())
+        by_hand = try_out(bind(find_map("toyota"), TOYOTA_DBC), self.frames())
+        assert (found.refused, found.problems()) == ({}, [])
+        assert (found.cycles, found.with_ego, found.with_targets) == (200, 200, 200)
+        assert (found.targets, found.range_m, found.ego_kmh, found.shown) == (
+            by_hand.targets,
+            by_hand.range_m,
+            by_hand.ego_kmh,
+            by_hand.shown,
+        )
+
     def test_damaged_frames_are_refused_one_by_one_and_nothing_else_is(self) -> None:
-        gateway = MappedGateway(CODEC, TOYOTA_DBC, find_map("toyota"))
+        gateway = MappedGateway(CODEC, bind(find_map("toyota"), TOYOTA_DBC))
         damaged = 0
         for number, frame in enumerate(self.frames()):
             flip = 0x40 if number % 10 == 3 else 0

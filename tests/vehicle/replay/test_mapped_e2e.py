@@ -9,6 +9,7 @@ from aftbed.core.errors import ConfigError
 from aftbed.vehicle.aeb.messages import decode_request
 from aftbed.vehicle.can.e2e import P01, P02, P05, P11, Profile
 from aftbed.vehicle.can.frame import Frame
+from aftbed.vehicle.replay.map_file import bind
 from aftbed.vehicle.replay.mapped_gateway import MappedGateway
 
 Make = Callable[..., MappedGateway]
@@ -69,7 +70,7 @@ def make_e2e(tmp_path_factory: pytest.TempPathFactory) -> Make:
         assert old in E2E_MAP
         (folder / "radar.dbc").write_text(E2E_DBC)
         (folder / "radar.yaml").write_text(E2E_MAP.replace(old, new, 1) if old else E2E_MAP)
-        return MappedGateway(CODEC, folder / "radar.dbc", folder / "radar.yaml")
+        return MappedGateway(CODEC, bind(folder / "radar.yaml", folder / "radar.dbc"))
 
     return build
 

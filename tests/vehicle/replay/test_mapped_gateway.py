@@ -10,7 +10,7 @@ from puredrive import CODEC
 from aftbed.core.errors import ConfigError
 from aftbed.vehicle.aeb.messages import AebInput, AebTarget, decode_request
 from aftbed.vehicle.can.frame import Frame
-from aftbed.vehicle.replay.map_file import RawSignal
+from aftbed.vehicle.replay.map_file import RawSignal, bind
 from aftbed.vehicle.replay.mapped_gateway import MappedGateway, toyota_checksum
 
 DBC = """
@@ -67,7 +67,7 @@ def make(tmp_path_factory: pytest.TempPathFactory) -> Make:
         assert dbc[0] in DBC
         (folder / "radar.dbc").write_text(DBC.replace(*dbc, 1))
         (folder / "radar.yaml").write_text(MAP.replace(old, new, 1) if old else MAP)
-        return MappedGateway(CODEC, folder / "radar.dbc", folder / "radar.yaml")
+        return MappedGateway(CODEC, bind(folder / "radar.yaml", folder / "radar.dbc"))
 
     return build
 
@@ -222,7 +222,13 @@ def test_raw_signals_count_bits_as_a_dbc_does(raw: RawSignal, value: float) -> N
         ("cycle_ms: 50\n", "", "key 'cycle_ms' is missing"),
         ("cycle_ms", "cycle_s", "unknown key 'cycle_s'; did you mean 'cycle_ms'"),
         ("cycle_end: END", "cycle_end: ENDE", "cycle_end: unknown mapped message 'ENDE'; did you mean 'END'"),
-        ("unit: km/h", "unit: mph", "ego.speed.unit: found 'mph', allowed is one of km/h, m/s"),
+        ("unit: km/h", "unit: knots", "ego.speed.unit: found knots, allowed is a speed, in m/s, km/h, mph"),
+        ("unit: km/h", "unit: m", "ego.speed.unit: found m, allowed is a speed, in m/s, km/h, mph"),
+        (
+            "unit: km/h",
+            "scale: 1",
+            "ego.speed.unit: found none, allowed is a speed, in m/s, km/h, mph, as raw",
+        ),
         ("RANGE, unit: m}", "RANGE, unit: cm}", "tracks.range.unit: found cm, allowed is m, as RANGE has"),
         (
             "signal: RANGE",
@@ -308,7 +314,11 @@ def test_a_map_that_does_not_fit_is_refused(make: Make, old: str, new: str, reas
             "  angle: {signal: SIDE, unit: deg}",
             "tracks: found lateral_offset and angle, allowed is exactly one of them",
         ),
-        ("lateral_offset: {signal: SIDE, unit: m}", "angle: {signal: SIDE, unit: m}", "one of deg, rad"),
+        (
+            "lateral_offset: {signal: SIDE, unit: m}",
+            "angle: {signal: SIDE, unit: m}",
+            "found m, allowed is an angle, in deg, rad, mrad",
+        ),
         (
             "lateral_offset: {signal: SIDE, unit: m}",
             "angle: {signal: SIDE, unit: deg}",

@@ -28,14 +28,14 @@ from aftbed.vehicle.aeb.messages import (
 )
 from aftbed.vehicle.can.candump import read_log
 from aftbed.vehicle.can.frame import Frame
-from aftbed.vehicle.replay.map_file import find_dbc, find_map
+from aftbed.vehicle.replay.map_file import bind, find_dbc, find_map
 from aftbed.vehicle.replay.mapped_gateway import MappedGateway
 
 APPROACH = (STANDING, *FAR)
 
 
 def gateway_of(radar: str) -> MappedGateway:
-    return MappedGateway(CODEC, find_dbc(radar), find_map(radar))
+    return MappedGateway(CODEC, bind(find_map(radar), find_dbc(radar)))
 
 
 def cycles(gateway: MappedGateway, frames: Sequence[Frame]) -> list[AebInput]:

@@ -8,7 +8,7 @@ from aftbed.vehicle.aeb.function import AebFunction
 from aftbed.vehicle.aeb.messages import STAGE_FULL, STAGE_NONE, STAGE_WARN, AebOutput, decode_reply
 from aftbed.vehicle.can.candump import LogFrame
 from aftbed.vehicle.can.frame import Frame
-from aftbed.vehicle.replay.map_file import find_map
+from aftbed.vehicle.replay.map_file import bind, find_map
 from aftbed.vehicle.replay.mapped_gateway import MappedGateway
 
 pytestmark = pytest.mark.skipif(not TOYOTA_LOG.is_file(), reason=WHY_NOT)
@@ -18,7 +18,7 @@ LANE_M = 3.6
 
 def decisions(log: list[LogFrame]) -> list[AebOutput]:
     """What the function asks for over the log; each frame must be believed."""
-    gateway, function = MappedGateway(CODEC, TOYOTA_DBC, find_map("toyota")), AebFunction()
+    gateway, function = MappedGateway(CODEC, bind(find_map("toyota"), TOYOTA_DBC)), AebFunction()
     start_us = log[0].frame.t_us
     replies = []
     for entry in log:
