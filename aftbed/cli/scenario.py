@@ -74,7 +74,7 @@ def show(name: Name, json: Json = False) -> None:
         ("ego", f"{drive.plant.speed_ms * KMH_PER_MS:.1f} km/h"),
         ("ahead", _ahead(drive.plant.lead)),
         ("road", f"friction {drive.plant.friction:g}"),
-        ("lasts", f"{drive.duration_ms / 1000:g} s at most"),
+        ("lasts", _lasts(drive)),
         ("expected", _expected(drive)),
     ]
     if case is not None:
@@ -100,11 +100,28 @@ def _ahead(lead: LeadCar | None) -> str:
     words = [f"a car {lead.gap_m:.1f} m ahead at {lead.speed_ms * KMH_PER_MS:.1f} km/h"]
     if lead.braking is not None:
         after_s = lead.braking.after_ms / 1000
-        words.append(f"brakes at {lead.braking.deceleration_ms2:g} m/s2 after {after_s:g} s")
+        final_kmh = lead.braking.final_ms * KMH_PER_MS
+        final = f" to {final_kmh:g} km/h" if final_kmh else ""
+        words.append(f"brakes at {lead.braking.deceleration_ms2:g} m/s2{final} after {after_s:g} s")
+    for one in lead.speeds:
+        change = f"goes to {one.final_ms * KMH_PER_MS:.1f} km/h at {one.rate_ms2:g} m/s2"
+        words.append(f"{change} after {one.after_ms / 1000:g} s")
     if lead.cut_in is not None:
         words.append(f"cuts in after {lead.cut_in.after_ms / 1000:g} s")
     elif lead.lateral_m:
         words.append(f"{abs(lead.lateral_m):g} m beside our lane's middle")
+    return ", ".join(words)
+
+
+def _lasts(scenario: Scenario) -> str:
+    words, end = [f"{scenario.duration_ms / 1000:g} s at most"], scenario.slow_end
+    if end is not None:
+        if end.below_ms is not None:
+            words.append(f"slower than {end.below_ms * KMH_PER_MS:g} km/h")
+        if end.below_lead_ms is not None:
+            by = f"{end.below_lead_ms * KMH_PER_MS:g} km/h " if end.below_lead_ms else ""
+            words.append(f"{by}slower than the car ahead")
+        words[1:] = [f"until {end.after_ms / 1000:g} s after the car is {' or '.join(words[1:])}"]
     return ", ".join(words)
 
 

@@ -151,16 +151,20 @@ def _replay(record: RunRecord) -> list[str] | None:
 
 
 def _drive(record: RunRecord) -> list[str] | None:
-    """A drive ends at a standstill, in a collision, or when it has lasted as long as it may."""
+    """A drive ends at a standstill or a collision, when it is as slow as its scenario says, or when it has lasted
+    as long as it may.
+    """
     work, drive = record.options.work, record.drive
     if not isinstance(work, CarRun) or not _ended_by_itself(record) or drive is None:
         return None  # without a drive the car did not report: `vehicle` tells
-    lasted_s = drive.t_us / 1e6
+    lasted_s, scenario = drive.t_us / 1e6, load_scenario(work.scenario)
     match drive.end:
         case "stopped" | None:
             return [f"the drive was stopped after {lasted_s:g} s, which was not asked for"]
+        case "slow" if scenario.slow_end is None:
+            return [f"the drive ended after {lasted_s:g} s because the car was slow, which was not asked for"]
         case "duration":
-            lasts_s = (work.duration_ms or load_scenario(work.scenario).duration_ms) / 1e3
+            lasts_s = (work.duration_ms or scenario.duration_ms) / 1e3
             return [f"the drive ended after {lasted_s:g} of {lasts_s:g} s"] if lasted_s < lasts_s else []
     return []
 

@@ -210,7 +210,7 @@ SLACK_MS: Final = 2.0
 def closing_speed_ms(scenario: Scenario) -> float | None:
     """How fast the gap closes before the car brakes; None where it does not, or the car ahead brakes."""
     lead = scenario.plant.lead
-    if lead is None or lead.braking is not None:
+    if lead is None or lead.braking is not None or lead.speeds:
         return None
     closing_ms = scenario.plant.speed_ms - lead.speed_ms
     return closing_ms if closing_ms > 0.0 else None

@@ -25,7 +25,7 @@ bus, paced or in lockstep, the other inside one process. A step is, in both:
     step                         the brakes follow what was received, and the plant moves by 1 ms
 
 A frame arrives, for an ECU, in the step that finds it. The drive ends one second after the car has come to
-stand and stayed there, on contact, or at the end of the scenario.
+stand and stayed there, on contact, when it is as slow as the scenario says, or at the end of the scenario.
 """
 
 from collections import deque
@@ -43,7 +43,7 @@ from aftbed.vehicle.can.e2e import P11, ChannelState, FrameStatus, Receiver, Sup
 from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.plant import STEP_US, Plant, Telemetry, VehicleResult
 from aftbed.vehicle.radar import RANGE_MAX_M, SPEED_MAX_MS, TRACK_ID, RadarDisturber, Target
-from aftbed.vehicle.scenarios.scenario import Scenario
+from aftbed.vehicle.scenarios.scenario import Scenario, SlowEnd
 
 BrakePolicy = Literal["hold", "release", "latch"]
 BRAKE_POLICIES: Final[tuple[BrakePolicy, ...]] = ("hold", "release", "latch")
@@ -254,7 +254,7 @@ class BrakeEcu:
 STANDSTILL_US: Final = 1_000_000  # the brakes' dead time and lag are ten times shorter
 TELEMETRY_US: Final = 50_000
 
-End = Literal["standstill", "collision", "duration", "stopped"]
+End = Literal["standstill", "slow", "collision", "duration", "stopped"]
 
 
 class CarBody:
@@ -262,6 +262,8 @@ class CarBody:
 
     def __init__(self, scenario: Scenario, codec: Codec, policy: BrakePolicy, seed: int) -> None:
         self.duration_us = scenario.duration_ms * 1000
+        self._slow_end = scenario.slow_end
+        self._slow_us: int | None = None  # when `_slow_end` ends the drive
         self.plant = Plant(scenario.plant)
         self.radar = RadarEcu(codec, seed)
         self._brake = BrakeEcu(codec, policy)
@@ -277,6 +279,8 @@ class CarBody:
             return "collision"
         if self._still_us >= STANDSTILL_US:
             return "standstill"
+        if self._slow_us is not None and self.plant.t_us >= self._slow_us:
+            return "slow"
         return "duration" if self.plant.t_us >= self.duration_us else None
 
     def brake_frames(self) -> list[Frame]:
@@ -318,6 +322,14 @@ class CarBody:
             demand_ms2 = max(demand_ms2, driver.deceleration_ms2)
         plant.step(demand_ms2)
         self._still_us = self._still_us + STEP_US if plant.stopped() else 0
+        if self._slow_end is not None and self._slow_us is None and self._is_slow(self._slow_end):
+            self._slow_us = plant.t_us + self._slow_end.after_ms * 1000
+
+    def _is_slow(self, end: SlowEnd) -> bool:
+        speed_ms = self.plant.speed_ms
+        if end.below_ms is not None and speed_ms < end.below_ms:
+            return True
+        return end.below_lead_ms is not None and speed_ms < self.plant.lead_speed_ms - end.below_lead_ms
 
     def telemetry(self) -> Telemetry:
         plant, brake = self.plant, self._brake

@@ -3,8 +3,8 @@
 The ego's brakes do nothing for a dead time, then approach the demand as a first-order lag. They give no
 more than their own limit, and no tyre gives more than friction times gravity. The driver holds the speed
 until the first demand, then releases the accelerator for good: drag and rolling resistance act from there
-on. The car ahead stands, drives at constant speed, or brakes with a linear ramp. It is in our lane, or
-beside it, or comes into it from the side.
+on. The car ahead stands, drives at constant speed, brakes with a linear ramp, or goes from one speed
+to another. It is in our lane, or beside it, or comes into it from the side.
 
 Contact is interpolated inside the step in which the gap closes, so the impact speed does not depend on
 the step. After contact the drive is over and nothing moves any more. A car beside us is passed, not hit:
@@ -72,11 +72,20 @@ IN_THE_WAY_M: Final = 1.8  # from middle to middle: two cars of this width, side
 
 
 class LeadBraking(msgspec.Struct, frozen=True):
-    """The car ahead brakes from `after_ms` on, reaching `deceleration_ms2` after `ramp_ms`."""
+    """The car ahead brakes to `final_ms` from `after_ms` on, reaching `deceleration_ms2` after `ramp_ms`."""
 
     after_ms: int
     deceleration_ms2: float
     ramp_ms: int = 0
+    final_ms: float = 0.0  # at most its speed at the start
+
+
+class LeadSpeed(msgspec.Struct, frozen=True):
+    """The car ahead goes to `final_ms` at `rate_ms2`, up or down, from `after_ms` on."""
+
+    after_ms: int
+    final_ms: float
+    rate_ms2: float
 
 
 class CutIn(msgspec.Struct, frozen=True):
@@ -87,13 +96,17 @@ class CutIn(msgspec.Struct, frozen=True):
 
 
 class LeadCar(msgspec.Struct, frozen=True):
-    """The car ahead at the start of the drive; `lateral_m` is to the left of the middle of our lane."""
+    """The car ahead at the start of the drive; `lateral_m` is to the left of the middle of our lane.
+
+    `speeds` are in the order of their times, instead of a `braking`; each lasts until the next begins.
+    """
 
     gap_m: float
     speed_ms: float = 0.0
     braking: LeadBraking | None = None
     lateral_m: float = 0.0
     cut_in: CutIn | None = None
+    speeds: tuple[LeadSpeed, ...] = ()
 
 
 class Brakes(msgspec.Struct, frozen=True):
@@ -218,14 +231,26 @@ class Plant:
                 self.lateral_m = 0.0
             elif left_ms < lead.cut_in.over_ms:
                 self.lateral_m = lead.lateral_m * (left_ms / lead.cut_in.over_ms)
-        deceleration_ms2 = 0.0
+        deceleration_ms2 = final_ms = 0.0
         if lead.braking is not None and (since_ms := t_ms - lead.braking.after_ms) > 0.0:
-            deceleration_ms2 = lead.braking.deceleration_ms2
+            deceleration_ms2, final_ms = lead.braking.deceleration_ms2, lead.braking.final_ms
             if since_ms < lead.braking.ramp_ms:
                 deceleration_ms2 = deceleration_ms2 * since_ms / lead.braking.ramp_ms
         before_ms = self.lead_speed_ms
-        self.lead_speed_ms = max(0.0, before_ms - deceleration_ms2 * self._step_s)
+        self.lead_speed_ms = max(final_ms, before_ms - deceleration_ms2 * self._step_s)
+        if lead.speeds:
+            self._change_lead_speed(lead.speeds, t_ms)
         return (before_ms + self.lead_speed_ms) / 2.0 * self._step_s
+
+    def _change_lead_speed(self, speeds: tuple[LeadSpeed, ...], t_ms: float) -> None:
+        """Bring the car ahead closer to the speed of the last change that has begun."""
+        begun = [change for change in speeds if t_ms > change.after_ms]
+        if begun:
+            final_ms, step_ms = begun[-1].final_ms, begun[-1].rate_ms2 * self._step_s
+            if self.lead_speed_ms < final_ms:
+                self.lead_speed_ms = min(final_ms, self.lead_speed_ms + step_ms)
+            else:
+                self.lead_speed_ms = max(final_ms, self.lead_speed_ms - step_ms)
 
     def _move_gap(self, before_m: float, change_m: float, closing_before_ms: float) -> None:
         """Change the gap; find contact inside the step."""

@@ -1,6 +1,7 @@
 """`aftbed scenario`: list, show, tables with their exit codes and documents, import, and what is refused."""
 
 import json
+import shutil
 from functools import partial
 from pathlib import Path
 
@@ -222,7 +223,8 @@ def test_one_document_for_many_variations(output: Output, tmp_path: Path) -> Non
     out = output("scenario", "import", LEAD_BRAKES, "--variations", VALUES, "--out", "made", "--json")
     found = json.loads(out)
     assert set(found) == {
-        *("file", "version", "description", "sets", "scenarios", "taken", "ignored"),
+        *("file", "scenario_file", "version", "description", "sets", "scenarios", "left_out"),
+        *("taken", "ignored"),
     }
     assert found["sets"] == len(found["scenarios"]) == 6
     assert found["scenarios"][0] == {
@@ -236,9 +238,9 @@ def test_one_document_for_many_variations(output: Output, tmp_path: Path) -> Non
 
 
 def test_an_entry_of_a_catalog_is_printed_with_its_file(output: Output) -> None:
-    out = output("scenario", "import", SLOW_LEAD, "--ego", "Host", "--replace-controller", "--duration", "9")
+    out = output("scenario", "import", SLOW_LEAD, "--ego", "Host", "--duration", "9")
     assert f"({FOLDER / 'catalogs' / 'cars.xosc'})" in out
-    assert "replaced by aftbed's function, as asked for" in out
+    assert "ObjectController           aftbed's function takes its place" in out
     assert load_scenario("./slow_lead.yaml").duration_ms == 9000
 
 
@@ -246,13 +248,19 @@ def test_an_entry_of_a_catalog_is_printed_with_its_file(output: Output) -> None:
     ("arguments", "reason"),
     [
         ([SLOW_LEAD], "which vehicle is the ego? --ego NAME says it (one of: Host, Target)"),
-        ([SLOW_LEAD, "--ego", "Host"], "  line 66: ActivateControllerAction: controllers: "),
+        ([SLOW_LEAD, "--ego", "Target"], "  line 66: ActivateControllerAction: controllers: "),
+        ([LEAD_BRAKES, "--pick", "Gap=12"], "--pick: "),
+        ([VALUES, "--pick", "Gap"], "--pick: found 'Gap', allowed is NAME=VALUE"),
+        ([VALUES, "--pick", "Gab=12"], "--pick: unknown varied parameter 'Gab'; did you mean 'Gap'?"),
+        ([VALUES, "--pick", "Gap=13"], "--pick: Gap is never 13 (one of: 12, 40)"),
+        ([VALUES, "--variations", VALUES], "a distribution, and --variations gives another one"),
+        ([FOLDER, "--variations", VALUES], "--variations: is for one file"),
+        ([FOLDER, "--pick", "Gap=12"], "--pick: is for one file"),
         ([LEAD_BRAKES, "--ego", "Bert"], "--ego: unknown vehicle 'Bert' (one of: Ego, Lead)"),
         ([LEAD_BRAKES, "--expect", "crash"], "--expect: unknown outcome 'crash'"),
         ([LEAD_BRAKES, "--duration", "0"], "--duration: found 0, allowed is more than 0 and at most 3600"),
         ([LEAD_BRAKES, "--variations", LEAD_BRAKES], "no ParameterValueDistribution in it"),
         ([LEAD_BRAKES, "--out", LEAD_BRAKES], "cannot be written: "),
-        ([VALUES], "a distribution: import lead_brakes.xosc with --variations"),
         (["nowhere.xosc"], "nowhere.xosc: cannot be read: No such file or directory"),
     ],
 )
@@ -272,6 +280,78 @@ def test_import_overwrites_a_different_file_only_with_force(
     assert mine.read_text() == "mine"
     output("scenario", "import", LEAD_BRAKES, "--force")
     assert mine.read_text() != "mine"
+
+
+# -- import of a folder
+
+
+def test_a_folder_is_imported_with_a_line_for_each_file(output: Output, tmp_path: Path) -> None:
+    shutil.copytree(FOLDER, tmp_path / "found")
+    (tmp_path / "found" / "broken.xosc").write_text("<OpenSCENARIO>")
+    out = output("scenario", "import", tmp_path / "found").splitlines()
+    assert out == [
+        "refused   broken.xosc: line 1: not XML: no element found",
+        "refused   catalogs/cars.xosc: line 4: Catalog: a catalog: read where an entry of it is needed",
+        "accepted  lead_brakes.xosc: 1 scenario",
+        "accepted  lead_brakes_values.xosc: 6 scenarios",
+        "refused   slow_lead.xosc: line 16: Entities: which vehicle is the ego? --ego NAME says it"
+        " (one of: Host, Target)",
+        "5 files: 2 accepted, 7 scenarios; 3 refused",
+        "     1  not a readable XML file",
+        "     1  a catalog, no scenario: read where an entry of it is needed",
+        "     1  a mistake in the file, or an element that is not of the standard",
+        "nothing is written: --out DIR says where to",
+    ]
+    assert not list(tmp_path.glob("**/*.yaml"))
+    document = json.loads(output("scenario", "import", tmp_path / "found", "--out", "made", "--json"))
+    assert (document["accepted"], document["refused"]) == (2, 3)
+    assert document["causes"] == {"unreadable": 1, "catalog": 1, "mistake": 1}
+    assert document["files"][0] == {
+        "file": "broken.xosc",
+        "accepted": False,
+        "reason": "not XML: no element found",
+        "line": 1,
+        "cause": "unreadable",
+        "scenarios": [],
+        "left_out": [],
+    }
+    written = [one for file in document["files"] for one in file["scenarios"]]
+    assert all(load_scenario(f"./{one['path']}") for one in written)
+    assert written[1] == {
+        "name": "lead_brakes_values-Gap-12-Deceleration-2",
+        "path": "made/lead_brakes_values-Gap-12-Deceleration-2.yaml",
+        "parameters": {"Gap": "12", "Deceleration": "2"},
+    }
+
+
+def test_a_folder_of_500_broken_files_is_refused_file_by_file(call: Call, tmp_path: Path) -> None:
+    folder = tmp_path / "broken"
+    folder.mkdir()
+    whole = LEAD_BRAKES.read_text()
+    for number in range(500):
+        (folder / f"{number:03}.xosc").write_text(whole[: 30 + number * (len(whole) - 40) // 500])
+    code, out, _ = call("scenario", "import", folder, "--json")
+    document = json.loads(out)
+    assert (code, document["accepted"], document["refused"]) == (2, 0, 500)
+    assert {file["cause"] for file in document["files"]} == {"unreadable"}
+    assert all(file["line"] and file["reason"] for file in document["files"])
+
+
+def test_show_says_how_a_drive_ends_and_how_far_the_car_ahead_brakes(output: Output, tmp_path: Path) -> None:
+    text = (
+        "{description: x, duration_s: 20, ego: {speed_kmh: 50}, expect: {outcome: no_collision},"
+        " lead: {gap_m: 12, speed_kmh: 50, braking: {after_s: 3, deceleration_ms2: 6, to_kmh: 2}},"
+        " ends: {below_kmh: 40, below_lead_kmh: 0, after_s: 2}}"
+    )
+    (tmp_path / "mine.yaml").write_text(text)
+    out = output("scenario", "show", "mine.yaml")
+    assert "brakes at 6 m/s2 to 2 km/h after 3 s" in out
+    assert "20 s at most, until 2 s after the car is slower than 40 km/h or slower than the car ahead" in out
+
+
+def test_a_folder_without_files_is_refused(refused: Output, tmp_path: Path) -> None:
+    (tmp_path / "nothing").mkdir()
+    assert "no .xosc file in it, or in a folder of it" in refused("scenario", "import", tmp_path / "nothing")
 
 
 EMPTY_ROAD = (

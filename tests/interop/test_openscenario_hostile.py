@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
+from reartest import rear_test
 from xoscfiles import LEAD_BRAKES, SLOW_LEAD, VALUES, imported
 
 from aftbed.core.errors import ConfigError
@@ -17,6 +18,7 @@ from aftbed.interop.openscenario.expression import EXPRESSION_CHARACTERS_MAX, FU
 from aftbed.interop.openscenario.importer import ImportOptions, import_scenario
 from aftbed.vehicle.scenarios.scenario import ScenarioKeys
 
+REAR, ORIGINAL = "rear.xosc", "rear-original.xml"
 LAUGHS = """<?xml version="1.0"?>
 <!DOCTYPE lolz [<!ENTITY lol "lol"><!ENTITY lol2 "&lol;&lol;&lol;&lol;&lol;&lol;&lol;&lol;&lol;">]>
 <OpenSCENARIO>&lol2;</OpenSCENARIO>"""
@@ -73,14 +75,14 @@ def test_any_bytes(data: bytes) -> None:
 
 def import_bytes(folder: Path, name: str, data: bytes) -> None:
     """Import a changed file; what it becomes can be read as a scenario."""
-    source, wanted = (LEAD_BRAKES, ImportOptions(expect="stop"))
+    wanted = ImportOptions(expect="stop")
     if name == SLOW_LEAD.name:
-        source, wanted = SLOW_LEAD, ImportOptions(ego="Host", replace_controller=True)
+        wanted = ImportOptions(ego="Host")
     path = folder / name
     path.write_bytes(data)
     try:
         if name == VALUES.name:
-            found = import_scenario(source, path, wanted)
+            found = import_scenario(LEAD_BRAKES, path, wanted)
         else:
             found = import_scenario(path, None, wanted)
     except ConfigError as error:
@@ -96,10 +98,18 @@ def import_bytes(folder: Path, name: str, data: bytes) -> None:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     made = tmp_path_factory.mktemp("hostile")
     (made / "catalogs").symlink_to(SLOW_LEAD.parent / "catalogs")
+    (made / ORIGINAL).write_text(rear_test(made).read_text().replace("><", ">\n<"))
     return made
 
 
-SOURCES = st.sampled_from([LEAD_BRAKES, SLOW_LEAD, VALUES])
+SOURCES = st.sampled_from([LEAD_BRAKES.name, SLOW_LEAD.name, VALUES.name, REAR])
+
+
+def content(folder: Path, name: str) -> bytes:
+    """The bytes of a source before it is changed."""
+    return (folder / ORIGINAL if name == REAR else LEAD_BRAKES.parent / name).read_bytes()
+
+
 ODD = [
     "",
     "0",
@@ -134,8 +144,8 @@ ATTRIBUTE = re.compile(r'"([^"<]*)"')
 
 
 @given(SOURCES, st.data())
-def test_any_attribute_may_be_anything(folder: Path, source: Path, data: st.DataObject) -> None:
-    text = source.read_text()
+def test_any_attribute_may_be_anything(folder: Path, source: str, data: st.DataObject) -> None:
+    text = content(folder, source).decode()
     places = list(ATTRIBUTE.finditer(text))[3:]  # behind what XML says of itself
     for _ in range(data.draw(st.integers(1, 3))):
         place = data.draw(st.sampled_from(places))
@@ -143,7 +153,7 @@ def test_any_attribute_may_be_anything(folder: Path, source: Path, data: st.Data
         text = (
             text.replace(place[0], f'"{value}"', 1) if data.draw(st.booleans()) else _at(text, place, value)
         )
-    import_bytes(folder, source.name, text.encode())
+    import_bytes(folder, source, text.encode())
 
 
 def _at(text: str, place: re.Match[str], value: str) -> str:
@@ -152,9 +162,9 @@ def _at(text: str, place: re.Match[str], value: str) -> str:
 
 @given(SOURCES, st.data())
 def test_any_element_may_be_missing_doubled_or_elsewhere(
-    folder: Path, source: Path, data: st.DataObject
+    folder: Path, source: str, data: st.DataObject
 ) -> None:
-    lines = source.read_text().splitlines()
+    lines = content(folder, source).decode().splitlines()
     for _ in range(data.draw(st.integers(1, 3))):
         first = data.draw(st.integers(2, len(lines) - 2))
         block = _block(lines, first)
@@ -169,7 +179,7 @@ def test_any_element_may_be_missing_doubled_or_elsewhere(
                 lines = rest[:place] + [lines[i] for i in block] + rest[place:]
         if len(lines) < 6:
             break
-    import_bytes(folder, source.name, "\n".join(lines).encode())
+    import_bytes(folder, source, "\n".join(lines).encode())
 
 
 def _block(lines: list[str], first: int) -> range:
@@ -185,12 +195,12 @@ def _block(lines: list[str], first: int) -> range:
 
 
 @given(SOURCES, st.data())
-def test_any_bytes_in_a_file(folder: Path, source: Path, data: st.DataObject) -> None:
-    content = bytearray(source.read_bytes())
+def test_any_bytes_in_a_file(folder: Path, source: str, data: st.DataObject) -> None:
+    changed = bytearray(content(folder, source))
     for _ in range(data.draw(st.integers(1, 5))):
-        place = data.draw(st.integers(0, len(content) - 1))
-        content[place : place + data.draw(st.integers(0, 3))] = data.draw(st.binary(max_size=4))
-    import_bytes(folder, source.name, bytes(content))
+        place = data.draw(st.integers(0, len(changed) - 1))
+        changed[place : place + data.draw(st.integers(0, 3))] = data.draw(st.binary(max_size=4))
+    import_bytes(folder, source, bytes(changed))
 
 
 def test_paths_that_are_none(tmp_path: Path) -> None:
@@ -218,10 +228,24 @@ def test_paths_that_are_none(tmp_path: Path) -> None:
         ("cos(0) + sin(0) + tan(0) + acos(1) + asin(0) + atan(0)", 1),
         (".5e1 + 5. + 1E0", 11),
         ("$a*$a", 100),
+        ("180*2*pi/180", 2 * math.pi),
     ],
 )
 def test_arithmetic(text: str, value: float) -> None:
     assert evaluate(text, {"a": "10", "ramp_p_0": "3"}) == pytest.approx(value)
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("not $no", True),
+        ("$no or not $no and true", True),
+        ("not ($no or true)", False),
+        ("false", False),
+    ],
+)
+def test_truth(text: str, value: bool) -> None:
+    assert evaluate(text, {"no": "false"}) is value
 
 
 @pytest.mark.parametrize(
@@ -233,8 +257,13 @@ def test_arithmetic(text: str, value: float) -> None:
         ("[1]", "allowed are numbers"),
         ("'1'", "allowed are numbers"),
         ("1 if 1 else 2", "IfExp is no arithmetic"),
-        ("1 and 2", "BoolOp is no arithmetic"),
-        ("not 1", "UnaryOp is no arithmetic"),
+        ("1 and 2", "and takes true or false, found 1"),
+        ("true or $a", "or takes true or false, found 10"),
+        ("not 1", "not takes true or false, found 1"),
+        ("~1", "allowed are numbers"),
+        ("true + 1", "found true, allowed is a number"),
+        ("max($yes, 1)", "found true, allowed is a number"),
+        ("pie", "the name 'pie'"),
         ("1, 2", "Tuple is no arithmetic"),
         ("True", "Constant is no arithmetic"),
         ("max(*(1, 2))", "Starred is no arithmetic"),
@@ -264,27 +293,51 @@ def test_arithmetic(text: str, value: float) -> None:
         ("(1", "not understood as arithmetic"),
         ("", "not understood as arithmetic"),
         ("1 2", "not understood as arithmetic"),
-        ("(" * 100 + "1" + ")" * 100, "201 characters, allowed are 200"),
+        ("(" * 500 + "1" + ")" * 500, "1001 characters, allowed are 1000"),
         ("\n1", "allowed are numbers"),
         ("é0", "allowed are numbers"),
     ],
 )
 def test_an_expression_that_is_no_arithmetic_is_refused(text: str, reason: str) -> None:
     with pytest.raises(ConfigError) as error:
-        evaluate(text, {"a": "10", "text": "fast"})
+        evaluate(text, {"a": "10", "text": "fast", "yes": "true"})
     assert reason in str(error.value)
 
 
 WORDS = st.sampled_from(
-    ["1", "0", "2.5", "1e300", "$a", "$b", "+", "-", "*", "/", "%", "(", ")", ",", "**", " ", "if", "lambda"]
+    [
+        "1",
+        "0",
+        "pi",
+        "true",
+        " and ",
+        " or ",
+        "2.5",
+        "1e300",
+        "$a",
+        "$b",
+        "+",
+        "-",
+        "*",
+        "/",
+        "%",
+        "(",
+        ")",
+        ",",
+        "**",
+        " ",
+        "if",
+        "lambda",
+    ]
     + ["not", "in", ":=", "await", "print", "é", "\x00", *FUNCTIONS]
 )
 
 
 @given(st.text(max_size=EXPRESSION_CHARACTERS_MAX + 1) | st.lists(WORDS, max_size=60).map("".join))
-@example("-" * 199 + "1")
-@example("(" * 99 + "1" + ")" * 99)
-@example("1" * 200)
+@example("-" * 999 + "1")
+@example("not " * 249 + "true")
+@example("(" * 499 + "1" + ")" * 499)
+@example("1" * 1_000)
 def test_any_expression_is_a_finite_number_or_refused(text: str) -> None:
     try:
         found = evaluate(text, {"a": "1.5"})

@@ -12,8 +12,6 @@ from xoscfiles import (
     PLACE,
     RATE,
     SLOW_LEAD,
-    STOP_12_S,
-    VALUES,
     changed,
     entity_condition,
     imported,
@@ -42,29 +40,41 @@ from aftbed.interop.openscenario.importer import ImportedFile, ImportOptions, im
         ([(RATE, RATE.replace("$Deceleration", "20"))], "a deceleration of 20 m/s2, allowed is 0.01 to 12"),
         ([(RATE, RATE.replace("$Deceleration", "0"))], "value: found '0', allowed is more than 0"),
         (
-            [('<AbsoluteTargetSpeed value="0"/>', '<AbsoluteTargetSpeed value="3"/>')],
-            "brakes to a standstill",
+            [
+                (
+                    '<EntityRef entityRef="$Owner"/>',
+                    '<EntityRef entityRef="$Owner"/><EntityRef entityRef="Ego"/>',
+                )
+            ],
+            "found 'Lead', 'Ego'; allowed is the car ahead, 'Lead'",
         ),
-        ([('<EntityRef entityRef="$Owner"/>', '<EntityRef entityRef="Ego"/>')], "found 'Ego'; only the car"),
-        ([(LEAD_SPEED, '<AbsoluteTargetSpeed value="0"/> ')], "the car ahead stands already"),
+        (
+            [
+                ('<EntityRef entityRef="$Owner"/>', '<EntityRef entityRef="Ego"/>'),
+                ('<AbsoluteTargetSpeed value="0"/>', '<AbsoluteTargetSpeed value="20"/>'),
+            ],
+            "the ego speeds up to 72 km/h; it keeps its speed of the start until the function brakes",
+        ),
+        ([('<EntityRef entityRef="$Owner"/>', "")], "Actors: no car in it that the action could move"),
+        ([('<EntityRef entityRef="$Owner"/>', '<EntityRef entityRef="Nobody"/>')], "unknown car 'Nobody'"),
         ([(LEAD_SPEED, '<AbsoluteTargetSpeed value="-1"/>')], "-1 m/s, allowed is 0 or more"),
         ([(LEAD_SPEED, '<AbsoluteTargetSpeed value="fast"/>')], "value: found 'fast', allowed is a number"),
         ([(LEAD_SPEED, '<AbsoluteTargetSpeed value="$Fast"/>')], "value: unknown parameter 'Fast'"),
         ([(LEAD_SPEED, '<AbsoluteTargetSpeed value="${1 / 0}"/>')], "'${1 / 0}': division by zero"),
-        ([(PLACE, PLACE.replace('dLane="0"', 'dLane="1"'))], "dLane: found '1', allowed is 0"),
+        ([(PLACE, PLACE.replace('dLane="0"', 'dLane="0.5"'))], "dLane: found '0.5', allowed is a whole"),
         (
-            [(PLACE, '<LanePosition roadId="1" laneId="-2" s="50"/>')],
-            "found lane -2 of road 1, allowed is lane -1",
+            [(PLACE, '<LanePosition roadId="2" laneId="-1" s="50"/>')],
+            "found a lane of road 2, allowed is a lane of road 1",
         ),
         (
             [(PLACE, '<LanePosition roadId="1" laneId="1" s="50"/>')],
             "laneId: found '1', allowed is a lane that",
         ),
         (
-            [(PLACE, '<LanePosition roadId="1" laneId="-1" offset="0.5" s="50"/>')],
-            "0.5 m beside the line of 'Ego'",
+            [(PLACE, '<LanePosition roadId="1" laneId="-1" offset="-1.82" s="50"/>')],
+            "found -1.82 m beside the line of 'Ego', where these cars touch below 1.85 m",
         ),
-        ([(PLACE, '<LanePosition roadId="1" laneId="-1" s="5"/>')], "'Lead' is -19.65 m ahead of the ego"),
+        ([(PLACE, '<LanePosition roadId="1" laneId="-1" s="22"/>')], "'Lead' is -2.65 m ahead of the ego"),
         ([(PLACE, PLACE.replace("Ego", "Lead"))], "entityRef: unknown car 'Lead'"),
         (
             [(EGO_PLACE, '<RelativeLanePosition entityRef="Lead" dLane="0" ds="-30"/>')],
@@ -72,7 +82,7 @@ from aftbed.interop.openscenario.importer import ImportedFile, ImportOptions, im
         ),
         (
             [(PLACE, PLACE[:-2] + '><Orientation h="3.14"/></RelativeLanePosition>')],
-            "h: found '3.14', allowed is 0",
+            "Position: heads elsewhere than 'Ego'; the road is straight",
         ),
         (
             [
@@ -83,7 +93,6 @@ from aftbed.interop.openscenario.importer import ImportedFile, ImportOptions, im
             ],
             "ManeuverGroup: maximumExecutionCount: found '2', allowed is 1",
         ),
-        ([('conditionEdge="rising"', 'conditionEdge="falling"')], "unknown value 'falling'"),
         (
             [
                 (
@@ -91,7 +100,7 @@ from aftbed.interop.openscenario.importer import ImportedFile, ImportOptions, im
                     '<Condition conditionEdge="none" delay="0" name="x"/><Condition name="y"',
                 )
             ],
-            "a second condition; a trigger may have one",
+            "Condition: found nothing, allowed is ByValueCondition or ByEntityCondition",
         ),
         (
             [('value="0" rule="greaterThan"', 'value="4" rule="greaterThan"')],
@@ -99,7 +108,15 @@ from aftbed.interop.openscenario.importer import ImportedFile, ImportOptions, im
         ),
         (
             [entity_condition('<SpeedCondition rule="lessThan" value="1"/>')],
-            "SpeedCondition: a trigger whose moment",
+            "SpeedCondition: never met while both cars keep their speed",
+        ),
+        (
+            [entity_condition('<ReachPositionCondition tolerance="1"/>')],
+            "ReachPositionCondition: a trigger whose moment does not follow from the start",
+        ),
+        (
+            [entity_condition('<SpeedCondition rule="lessThan" value="1"/>', "Other")],
+            "SpeedCondition: of 'Other': a moment that follows from neither the ego nor the car ahead",
         ),
         (
             [
@@ -122,11 +139,7 @@ from aftbed.interop.openscenario.importer import ImportedFile, ImportOptions, im
                     "</ByValueCondition></Condition></ConditionGroup></StopTrigger>",
                 )
             ],
-            "may stop the act before the car ahead stands, at 3.31481 s",
-        ),
-        (
-            [(STOP_12_S, '<SimulationTimeCondition value="1" rule="greaterThan"/>')],
-            "braking begins at 1 s, the drive ends at 1 s",
+            "may stop the act before the car ahead has its speed, at 3.31481 s",
         ),
         (
             [('<Event name="lights" priority="parallel">', '<Event name="lights" priority="override">')],
@@ -215,14 +228,12 @@ def test_assumptions_are_printed(tmp_path: Path) -> None:
     assert "the drive ends at 30 s: no StopTrigger says when" in meanings
 
 
-def test_a_controller_on_the_ego_is_refused_unless_the_function_replaces_it() -> None:
-    with pytest.raises(ConfigError, match="line 23: ObjectController: controllers"):
-        imported(SLOW_LEAD, ego="Host")
-    found = import_scenario(SLOW_LEAD, None, ImportOptions(ego="Host", replace_controller=True))
-    replaced = [one.element for one in found.ignored if "replaced" in one.reason]
+def test_the_function_takes_the_place_of_a_controller_of_the_ego_only() -> None:
+    found = import_scenario(SLOW_LEAD, None, ImportOptions(ego="Host"))
+    replaced = [one.element for one in found.ignored if "takes its place" in one.reason]
     assert replaced == ["ObjectController", "ActivateControllerAction"]
     with pytest.raises(ConfigError, match="line 23: ObjectController: controllers"):
-        import_scenario(SLOW_LEAD, None, ImportOptions(ego="Target", replace_controller=True))
+        import_scenario(SLOW_LEAD, None, ImportOptions(ego="Target"))
 
 
 @pytest.mark.parametrize(
@@ -249,7 +260,7 @@ def test_a_vehicle_that_no_catalog_has(old: str, new: str, reason: str, tmp_path
     (tmp_path / "catalogs").symlink_to(SLOW_LEAD.parent / "catalogs")
     path = changed(tmp_path, (old, new), source=SLOW_LEAD)
     with pytest.raises(ConfigError) as error:
-        import_scenario(path, None, ImportOptions(ego="Host", replace_controller=True))
+        import_scenario(path, None, ImportOptions(ego="Host"))
     assert reason in str(error.value)
 
 
@@ -289,14 +300,6 @@ def test_a_road_that_is_known_to_bend_or_climb_is_refused(
         assert logic.reason == "nothing but its being straight and level was looked at"
     else:
         assert reason in refused(path)
-
-
-def test_a_distribution_is_no_scenario() -> None:
-    found = refused(VALUES)
-    assert (
-        "line 4: ParameterValueDistribution: a distribution: import lead_brakes.xosc with --variations"
-        in found
-    )
 
 
 def test_wishes_that_cannot_be_met() -> None:

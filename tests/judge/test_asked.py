@@ -169,6 +169,10 @@ NOT_HAPPENED: Final[
         ),
         (lambda path: driven(path, "duration", 1_500_000), "the drive ended after 1.5 of 9 s"),
         (
+            lambda path: driven(path, "slow", 1_500_000),
+            "the drive ended after 1.5 s because the car was slow, which was not asked for",
+        ),
+        (
             lambda _: judge(unfinished()),
             "the drive was stopped after 2 s, which was not asked for",
         ),

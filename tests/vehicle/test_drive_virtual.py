@@ -31,12 +31,12 @@ from aftbed.vehicle.drive_virtual import VirtualCar
 from aftbed.vehicle.ecus import BrakePolicy
 from aftbed.vehicle.plant import VehicleResult
 from aftbed.vehicle.scenarios.library import load_scenario, scenario_names
-from aftbed.vehicle.scenarios.scenario import broken_expectations
+from aftbed.vehicle.scenarios.scenario import Scenario, SlowEnd, broken_expectations
 
 pytestmark = pytest.mark.simulation
 
 MS = 1_000_000  # nanoseconds
-AEB_REQ = 0x100
+AEB_REQ, EGO_STATE = 0x100, 0x120
 BRAKING_MS = 2900  # in ccrs-50 partial braking is being asked for, and in 60 ms full braking will be
 FULL_BRAKING_MS = 3000  # now it is
 
@@ -72,7 +72,7 @@ class Drive(msgspec.Struct):
 
 
 def drive(
-    scenario: str = "ccrs-50",
+    scenario: str | Scenario = "ccrs-50",
     when: When = at_once,
     *,
     policy: BrakePolicy = "latch",
@@ -82,7 +82,11 @@ def drive(
     """Drive before the bare function. `tick_ns` advances the car that often as well."""
     frames: list[Frame] = []
     car = VirtualCar(
-        load_scenario(scenario), brake_policy=policy, seed=seed, codec=CODEC, on_frame=frames.append
+        load_scenario(scenario) if isinstance(scenario, str) else scenario,
+        brake_policy=policy,
+        seed=seed,
+        codec=CODEC,
+        on_frame=frames.append,
     )
     done = Drive(car, frames)
     function = default_application()
@@ -214,6 +218,27 @@ def test_a_scenario_may_end_between_two_cycles() -> None:
     assert car.due_ns() == 30 * MS
     assert car.advance(40 * MS) == []
     assert (car.end, car.t_us, car.due_ns()) == ("duration", 30_000, None)
+
+
+@pytest.mark.parametrize(
+    ("end", "speed_kmh"),
+    [(SlowEnd(0, below_ms=30 / 3.6), 30), (SlowEnd(0, below_lead_ms=1.0), 20 - 3.6)],
+)
+def test_a_drive_ends_when_the_car_is_as_slow_as_its_scenario_says(end: SlowEnd, speed_kmh: float) -> None:
+    """At once, and so long after it."""
+    scenario = msgspec.structs.replace(load_scenario("ccrm-50"), slow_end=end)
+    ended_us = []
+    for after_ms in (0, 500):
+        slow_end = msgspec.structs.replace(end, after_ms=after_ms)
+        done = drive(msgspec.structs.replace(scenario, slow_end=slow_end))
+        assert done.car.end == "slow"
+        assert done.result.braked
+        ended_us.append(done.car.t_us)
+        if after_ms == 0:
+            state = next(frame for frame in reversed(done.frames) if frame.can_id == EGO_STATE)
+            found_ms = CODEC.decode("EGO_STATE", state.data)["SPEED"]
+            assert found_ms * 3.6 == pytest.approx(speed_kmh, abs=0.5)
+    assert ended_us[1] - ended_us[0] == 500_000
 
 
 # -- replies that are late, lost or wrong --------------------------------------------------------

@@ -2,7 +2,16 @@
 
 import pytest
 
-from aftbed.vehicle.plant import GRAVITY_MS2, Brakes, CutIn, LeadBraking, LeadCar, Plant, PlantSetup
+from aftbed.vehicle.plant import (
+    GRAVITY_MS2,
+    Brakes,
+    CutIn,
+    LeadBraking,
+    LeadCar,
+    LeadSpeed,
+    Plant,
+    PlantSetup,
+)
 
 
 def run(plant: Plant, steps: int, demand_ms2: float) -> Plant:
@@ -90,6 +99,23 @@ def test_a_lead_brakes_with_its_ramp_and_stops() -> None:
     assert run(plant, 500, 0.0).lead_speed_ms == pytest.approx(12.0 - 6.0 * 0.5 / 2, abs=0.01)
     assert run(plant, 1000, 0.0).lead_speed_ms == pytest.approx(12.0 - 1.5 - 6.0, abs=0.01)
     assert run(plant, 2000, 0.0).lead_speed_ms == 0.0
+
+
+def test_a_lead_that_brakes_to_a_speed_keeps_it() -> None:
+    plant = Plant(PlantSetup(10.0, LeadCar(50.0, 12.0, LeadBraking(1000, 6.0, final_ms=3.0))))
+    assert run(plant, 2000, 0.0).lead_speed_ms == pytest.approx(12.0 - 6.0, abs=0.01)
+    assert run(plant, 1000, 0.0).lead_speed_ms == 3.0
+    assert run(plant, 2000, 0.0).lead_speed_ms == 3.0
+
+
+def test_a_lead_goes_from_speed_to_speed() -> None:
+    """Up, and down again before it is there."""
+    speeds = (LeadSpeed(1000, 14.0, 2.0), LeadSpeed(2000, 6.0, 4.0))
+    plant = Plant(PlantSetup(10.0, LeadCar(50.0, 10.0, speeds=speeds)))
+    assert run(plant, 1000, 0.0).lead_speed_ms == 10.0
+    assert run(plant, 1000, 0.0).lead_speed_ms == pytest.approx(12.0, abs=0.01)
+    assert run(plant, 1000, 0.0).lead_speed_ms == pytest.approx(8.0, abs=0.01)
+    assert run(plant, 2000, 0.0).lead_speed_ms == 6.0
 
 
 def test_a_jerk_limit_makes_the_brakes_slower() -> None:

@@ -14,13 +14,14 @@ dropped silently. Each element is
     refused   it could; the import fails with its line and the reason (`REFUSED`)
 
 An element that is in neither table and was not read is refused as well: it is new in a later version of the
-standard, or a mistake in the file.
+standard, or a mistake in the file. Each refusal has a `Cause`, by which the files of a folder are counted.
 """
 
 import math
 from collections.abc import Iterator, Mapping
+from enum import Enum
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeVar
 from xml.parsers import expat
 
 import msgspec
@@ -34,11 +35,60 @@ SHOWN_CHARACTERS_MAX: Final = 60
 _FLAGS: Final = {"true": True, "1": True, "false": False, "0": False}
 
 
+# -- errors
+
+
+class Cause(Enum):
+    """What kind of thing a file is refused for. Of several, the first in this order is the file's."""
+
+    UNREADABLE = "unreadable"
+    CATALOG = "catalog"
+    VERSION = "version"
+    LATERAL = "lateral"
+    ROAD = "road"
+    ROAD_USERS = "road_users"
+    SIMULATOR = "simulator"
+    CONTROLLER = "controller"
+    SPEED = "speed"
+    TRIGGER = "trigger"
+    RANGE = "range"
+    MISSING = "missing"
+    MISTAKE = "mistake"
+
+
+CAUSES: Final[Mapping[Cause, str]] = {
+    Cause.UNREADABLE: "not a readable XML file",
+    Cause.CATALOG: "a catalog, no scenario: read where an entry of it is needed",
+    Cause.VERSION: "not OpenSCENARIO XML 1.0 to 1.3",
+    Cause.LATERAL: "lateral motion, or a car that heads elsewhere than the ego",
+    Cause.ROAD: "a road that bends or climbs, or places on different roads",
+    Cause.ROAD_USERS: "road users besides the ego and one ahead",
+    Cause.SIMULATOR: "something that only one simulator knows",
+    Cause.CONTROLLER: "a controller that moves another car than the ego",
+    Cause.SPEED: "a change of speed that a scenario cannot express",
+    Cause.TRIGGER: "a moment that does not follow from the start",
+    Cause.RANGE: "a value out of the range of a scenario",
+    Cause.MISSING: "a file that is needed and is not there",
+    Cause.MISTAKE: "a mistake in the file, or an element that is not of the standard",
+}
+
+
+class RefusedError(ConfigError):
+    """What a file is refused for: `reason` without its place, and `line` of `path`, 0 for no line."""
+
+    def __init__(self, text: str, path: str, line: int, reason: str, cause: Cause) -> None:
+        super().__init__(text)
+        self.path = path
+        self.line = line
+        self.reason = reason
+        self.cause = cause
+
+
 class Element:
     """An element of the file `path` that starts in `line`. `text` is its character data, stripped.
 
     `visited`: it was read, but perhaps not its attributes and children. `ignored`: why it cannot, with all
-    below it, change the drive.
+    below it, change the drive. `parameter`: the value of the parameter that a ParameterCondition compares.
     """
 
     def __init__(self, path: str, line: int, tag: str, attributes: dict[str, str]) -> None:
@@ -49,19 +99,22 @@ class Element:
         self.children: list[Element] = []
         self.text = ""
         self.ignored: str | None = None
+        self.parameter: str | None = None
         self.visited = False
         self._read: set[str] = set()
 
-    def error(self, reason: str) -> ConfigError:
+    def error(self, reason: str, cause: Cause = Cause.MISTAKE) -> RefusedError:
         """An error at this element; the message has file, line and tag."""
-        return ConfigError(f"{self.path}: line {self.line}: {self.tag}: {reason}")
+        reason = f"{self.tag}: {reason}"
+        text = f"{self.path}: line {self.line}: {reason}"
+        return RefusedError(text, self.path, self.line, reason, cause)
 
-    def wrong(self, name: str, allowed: str) -> ConfigError:
+    def wrong(self, name: str, allowed: str, cause: Cause = Cause.MISTAKE) -> RefusedError:
         """An error about the value of the attribute `name`."""
         found = self.attributes.get(name)
         shown = "nothing" if found is None else repr(found[:SHOWN_CHARACTERS_MAX])
         more = "..." if found is not None and len(found) > SHOWN_CHARACTERS_MAX else ""
-        return self.error(f"{name}: found {shown}{more}, allowed is {allowed}")
+        return self.error(f"{name}: found {shown}{more}, allowed is {allowed}", cause)
 
     # -- attributes
 
@@ -155,23 +208,29 @@ def read_tree(path: Path) -> Element:
         with path.open("rb") as file:
             data = file.read(FILE_BYTES_MAX + 1)
     except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
+        raise _unreadable(str(path), 0, f"cannot be read: {error.strerror}") from error
     return parse_tree(data, str(path))
 
 
 def parse_tree(data: bytes, name: str) -> Element:
     """The root of the XML document `data`. Raises ConfigError, which calls it `name`."""
     if len(data) > FILE_BYTES_MAX:
-        raise ConfigError(f"{name}: more than the {FILE_BYTES_MAX} bytes that are allowed")
+        raise _unreadable(name, 0, f"more than the {FILE_BYTES_MAX} bytes that are allowed")
     builder = _Builder(name)
     try:
         builder.parser.Parse(data, True)
     except expat.ExpatError as error:
-        raise ConfigError(f"{name}: line {error.lineno}: not XML: {expat.ErrorString(error.code)}") from error
+        reason = f"not XML: {expat.ErrorString(error.code)}"
+        raise _unreadable(name, error.lineno, reason) from error
     except (LookupError, ValueError) as error:  # the encoding that the file claims to have
-        raise ConfigError(f"{name}: line 1: not XML: {error}") from error
+        raise _unreadable(name, 1, f"not XML: {error}") from error
     assert builder.root is not None, "expat refuses a document without an element"
     return builder.root
+
+
+def _unreadable(name: str, line: int, reason: str) -> RefusedError:
+    place = f"{name}: line {line}" if line else name
+    return RefusedError(f"{place}: {reason}", name, line, reason, Cause.UNREADABLE)
 
 
 class _Builder:
@@ -194,9 +253,9 @@ class _Builder:
         element = Element(self._name, line, tag[:SHOWN_CHARACTERS_MAX], attributes)
         self._elements += 1
         if self._elements > ELEMENTS_MAX:
-            raise element.error(f"more than the {ELEMENTS_MAX} elements that are allowed")
+            raise element.error(f"more than the {ELEMENTS_MAX} elements that are allowed", Cause.UNREADABLE)
         if len(self._open) >= DEPTH_MAX:
-            raise element.error(f"deeper than the {DEPTH_MAX} levels that are allowed")
+            raise element.error(f"deeper than the {DEPTH_MAX} levels that are allowed", Cause.UNREADABLE)
         if self._open:
             self._open[-1].children.append(element)
         else:
@@ -208,49 +267,42 @@ class _Builder:
 
     def _doctype(self, *_arguments: object) -> None:
         line = self.parser.CurrentLineNumber
-        raise ConfigError(f"{self._name}: line {line}: DOCTYPE: not allowed, it may define entities")
+        raise _unreadable(self._name, line, "DOCTYPE: not allowed, it may define entities")
 
 
 # -- the account of unused elements
 
 
 REFUSED_SHOWN_MAX: Final = 20
-TRIGGER_UNKNOWN: Final = "a trigger whose moment does not follow from the start"
+UNEXPECTED: Final = "not expected here"
 
 
-def _by_tag(tags_by_reason: Mapping[str, str]) -> dict[str, str]:
+_Reason = TypeVar("_Reason")
+
+
+def _by_tag(tags_by_reason: Mapping[_Reason, str]) -> dict[str, _Reason]:
     return {tag: reason for reason, tags in tags_by_reason.items() for tag in tags.split()}
 
 
-REFUSED: Final[Mapping[str, str]] = _by_tag(
+REFUSED: Final[Mapping[str, tuple[Cause, str]]] = _by_tag(
     {
-        "lateral motion; the cars keep to one lane of a straight road": "LateralAction",
-        "routes, trajectories and places off the straight road": (
+        (Cause.LATERAL, "lateral motion; the cars keep to one lane of a straight road"): "LateralAction",
+        (Cause.LATERAL, "routes, trajectories and places off the straight road"): (
             "RoutingAction GeoPosition RoutePosition TrajectoryPosition"
         ),
-        "one car ahead is all there is: no other road users or objects": (
-            "Pedestrian MiscObject ExternalObjectReference EntitySelection Trailer TrailerAction "
-            "EntityAction TrafficAction"
+        (Cause.ROAD_USERS, "one car ahead is all there is: no other road users or objects"): (
+            "ExternalObjectReference EntitySelection TrailerAction EntityAction TrafficAction"
         ),
-        "traffic signals": (
-            "TrafficSignalController InfrastructureAction TrafficSignalCondition "
-            "TrafficSignalControllerCondition"
+        (
+            Cause.CONTROLLER,
+            "controllers: the storyboard moves the car ahead, and the function brakes the ego",
+        ): ("ObjectController ControllerAction ActivateControllerAction"),
+        (Cause.SPEED, "the speed of the car ahead changes by a SpeedAction only"): (
+            "SpeedProfileAction SynchronizeAction"
         ),
-        "controllers: the storyboard moves the car ahead, and the function brakes the ego": (
-            "ObjectController ControllerAction ActivateControllerAction"
-        ),
-        "the speed of the car ahead changes by a SpeedAction to 0 only": (
-            "LongitudinalDistanceAction SpeedProfileAction SynchronizeAction"
-        ),
-        "a car that sensors do not see": "VisibilityAction",
-        "commands that only one simulator knows": "UserDefinedAction",
-        "values that change while the scenario runs": "ParameterAction VariableAction",
-        TRIGGER_UNKNOWN: (
-            "ParameterCondition VariableCondition UserDefinedValueCondition TimeOfDayCondition "
-            "AccelerationCondition AngleCondition RelativeAngleCondition DistanceCondition SpeedCondition "
-            "EndOfRoadCondition OffroadCondition ReachPositionCondition RelativeClearanceCondition "
-            "RelativeSpeedCondition"
-        ),
+        (Cause.SIMULATOR, "a car that sensors do not see"): "VisibilityAction",
+        (Cause.SIMULATOR, "commands that only one simulator knows"): "UserDefinedAction",
+        (Cause.TRIGGER, "values that change while the scenario runs"): "ParameterAction",
     }
 )
 IGNORED: Final[Mapping[str, str]] = _by_tag(
@@ -260,11 +312,10 @@ IGNORED: Final[Mapping[str, str]] = _by_tag(
         "for pictures": "SceneGraphFile UsedArea AppearanceAction",
         "aftbed has its own model of the car and its brakes": "Performance Axles TrailerHitch TrailerCoupler",
         "the radar sees through any weather, and the air stands still": "TimeOfDay Weather",
-        "nothing here depends on a variable": "VariableDeclarations",
+        "the function brakes for cars, not for signals": "TrafficSignals InfrastructureAction",
         "nothing here depends on a monitor": "MonitorDeclarations SetMonitorAction",
     }
 )
-CONTROLLERS: Final = ("ObjectController", "ControllerAction", "ActivateControllerAction")
 LABELS: Final = frozenset(("name", "description", "author", "date", "model3d"))  # without any effect
 
 
@@ -285,14 +336,14 @@ def refuse(root: Element) -> None:
 def account(root: Element) -> list[IgnoredElement]:
     """The ignored elements. Raises ConfigError with all that is unread and may have an effect."""
     ignored: list[IgnoredElement] = []
-    refused: list[tuple[Element, str]] = []
+    refused: list[tuple[Element, tuple[Cause, str]]] = []
     root.visited = True
     _account(root, ignored, refused)
     _raise(root, refused)
     return ignored
 
 
-def _refused(element: Element) -> Iterator[tuple[Element, str]]:
+def _refused(element: Element) -> Iterator[tuple[Element, tuple[Cause, str]]]:
     if element.ignored is not None or element.tag in IGNORED:
         return
     if element.tag in REFUSED:
@@ -302,27 +353,36 @@ def _refused(element: Element) -> Iterator[tuple[Element, str]]:
         yield from _refused(child)
 
 
-def _account(element: Element, ignored: list[IgnoredElement], refused: list[tuple[Element, str]]) -> None:
+def _account(
+    element: Element, ignored: list[IgnoredElement], refused: list[tuple[Element, tuple[Cause, str]]]
+) -> None:
     reason = element.ignored if element.visited else element.ignored or IGNORED.get(element.tag)
     if reason is not None:
         ignored.append(IgnoredElement(element.path, element.line, element.tag, reason))
         return
     if not element.visited:
-        refused.append((element, REFUSED.get(element.tag, "not expected here")))
+        refused.append((element, REFUSED.get(element.tag, (Cause.MISTAKE, UNEXPECTED))))
         return
     strange = element.unread_attributes()
-    refused += [(element, f"attribute {name!r} is not expected here") for name in strange]
+    refused += [(element, (Cause.MISTAKE, f"attribute {name!r} is not expected here")) for name in strange]
     if element.text:
-        refused.append((element, "text is not expected here"))
+        refused.append((element, (Cause.MISTAKE, "text is not expected here")))
     for child in element.children:
         _account(child, ignored, refused)
 
 
-def _raise(root: Element, refused: list[tuple[Element, str]]) -> None:
+def _raise(root: Element, refused: list[tuple[Element, tuple[Cause, str]]]) -> None:
+    """Raise all of `refused` in one error; its line, reason and cause are those of the weightiest."""
     if not refused:
         return
-    lines = [f"  line {one.line}: {one.tag}: {reason}" for one, reason in refused]
+    lines = [
+        f"  {'' if one.path == root.path else f'{one.path}: '}line {one.line}: {one.tag}: {reason}"
+        for one, (_, reason) in refused
+    ]
     more = len(lines) - REFUSED_SHOWN_MAX
     shown = lines[:REFUSED_SHOWN_MAX] + ([f"  and {more} more"] if more > 0 else [])
     count = "1 element is" if len(lines) == 1 else f"{len(lines)} elements are"
-    raise ConfigError("\n".join([f"{root.path}: {count} not supported", *shown]))
+    text = "\n".join([f"{root.path}: {count} not supported", *shown])
+    order = list(Cause)
+    first, (cause, reason) = min(refused, key=lambda one: order.index(one[1][0]))
+    raise RefusedError(text, first.path, first.line, f"{first.tag}: {reason}", cause)

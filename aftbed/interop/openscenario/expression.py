@@ -1,18 +1,18 @@
 """Parameters of OpenSCENARIO files: their values, arithmetic over them, and the variations of a distribution.
 
-**Expressions**, `${$EgoSpeed / 3.6}` or `${max($Gap - 2, 0) * 1.5}`. The standard (ASAM OpenSCENARIO XML 1.3,
-9.2) has + - * / %, parentheses, and the functions below. `ast` parses the text and `evaluate` walks the tree
-over a closed list of nodes: everything else of Python (a name, an attribute, another call, `**`, a string, a
-lambda) is refused by its name. Nothing is evaluated by Python itself. Before parsing, the text may contain
-only numbers in XML notation, names, operators and parentheses, and its length is limited. Numbers only: the
-standard's booleans (`and`, `or`, `not`) are refused. Angles are in radians.
+**Expressions**, `${$EgoSpeed / 3.6}` or `${max($Gap - 2, 0) * 1.5}` or `${not $Braking}`. The standard (ASAM
+OpenSCENARIO XML 1.3, 9.2) has + - * / % and parentheses, `and`, `or`, `not`, `true`, `false`, `pi`, and the
+functions below. `ast` parses the text and `evaluate` walks the tree over a closed list of nodes: everything
+else of Python (another name, an attribute, another call, `**`, a string, a lambda) is refused by its name.
+Nothing is evaluated by Python itself. Before parsing, the text may contain only numbers in XML notation,
+names, operators and parentheses, and its length is limited. Angles are in radians.
 
 **Parameters.** `substituted` makes a new tree without any `$name` or `${expression}`, so the rest of the
-importer does not deal with parameters. The scope of a parameter is the element that holds its
-`ParameterDeclarations` (the file, a story, a maneuver, a vehicle, an environment); the innermost declaration
-wins. A variation gives other values to the parameters of the file; their types and constraints are checked in
-the same way. A name may be declared with a leading `$`, as files of OpenSCENARIO 1.0 do. A `$` that starts no
-name (`costs $5`) is an ordinary character.
+importer does not deal with parameters; a ParameterCondition gets the value that it compares. The scope of a
+parameter is the element that holds its `ParameterDeclarations` (the file, a story, a maneuver, a vehicle, an
+environment); the innermost declaration wins. A variation gives other values to the parameters of the file;
+their types and constraints are checked in the same way. A name may be declared with a leading `$`, as files
+of OpenSCENARIO 1.0 do. A `$` that starts no name (`costs $5`) is an ordinary character.
 
 **Variations.** A parameter value distribution gives one scenario file many sets of values. Deterministic
 distributions are combined: each value of one with each of the others, the last one changing fastest (9.3):
@@ -34,14 +34,14 @@ import math
 import operator
 import random
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import PurePosixPath
 from typing import Final
 
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.interop.openscenario.document import SHOWN_CHARACTERS_MAX, Element, finite
 
-EXPRESSION_CHARACTERS_MAX: Final = 200
+EXPRESSION_CHARACTERS_MAX: Final = 1_000
 VARIATIONS_MAX: Final = 1_000
 NAME_CHARACTERS_MAX: Final = 100
 _DRAWS_MAX: Final = 1_000  # tries to draw a normal value within its range
@@ -99,9 +99,10 @@ _UNARY: Final[Mapping[str, Callable[[float], float]]] = {
 }
 _BINARY: Final[Mapping[str, Callable[[float, float], float]]] = {"max": max, "min": min, "pow": math.pow}
 FUNCTIONS: Final = (*_UNARY, *_BINARY)
+_CONSTANTS: Final[Mapping[str, float | bool]] = {"pi": math.pi, "true": True, "false": False}
 
 
-def evaluate(text: str, values: Values) -> float:
+def evaluate(text: str, values: Values) -> float | bool:
     """The value of the text between `${` and `}`. Raises ConfigError with the reason, but without a place."""
     if len(text) > EXPRESSION_CHARACTERS_MAX:
         raise ConfigError(f"{len(text)} characters, allowed are {EXPRESSION_CHARACTERS_MAX}")
@@ -123,24 +124,45 @@ def evaluate(text: str, values: Values) -> float:
     return found
 
 
-def _value(node: ast.expr, values: Values) -> float:
+def _value(node: ast.expr, values: Values) -> float | bool:
     match node:
         case ast.Constant(value=int() | float() as value) if not isinstance(value, bool):
             return float(value)
         case ast.Name(id=name) if name.startswith(_PLACEHOLDER):
-            return _number(name.removeprefix(_PLACEHOLDER), values)
+            return _parameter_value(name.removeprefix(_PLACEHOLDER), values)
+        case ast.Name(id=name) if name in _CONSTANTS:
+            return _CONSTANTS[name]
         case ast.Name(id=name):
             raise ConfigError(f"the name {name!r}: a parameter is written ${name}")
+        case ast.UnaryOp(op=ast.Not(), operand=operand):
+            return not _truth("not", operand, values)
+        case ast.BoolOp(op=operation, values=operands):
+            word, combine = ("and", all) if isinstance(operation, ast.And) else ("or", any)
+            return combine([_truth(word, operand, values) for operand in operands])
         case ast.UnaryOp(op=sign, operand=operand) if type(sign) in _SIGNS:
-            return _SIGNS[type(sign)](_value(operand, values))
+            return _SIGNS[type(sign)](_number(operand, values))
         case ast.BinOp(left=left, op=operation, right=right):
             if type(operation) not in _OPERATORS:
                 raise ConfigError(f"the operator {type(operation).__name__} is none of + - * / %")
-            return _OPERATORS[type(operation)](_value(left, values), _value(right, values))
+            return _OPERATORS[type(operation)](_number(left, values), _number(right, values))
         case ast.Call(func=ast.Name(id=name), args=arguments, keywords=[]):
-            return _call(name, [_value(argument, values) for argument in arguments])
+            return _call(name, [_number(argument, values) for argument in arguments])
         case _:
             raise ConfigError(f"{type(node).__name__} is no arithmetic")
+
+
+def _number(node: ast.expr, values: Values) -> float:
+    found = _value(node, values)
+    if isinstance(found, bool):
+        raise ConfigError(f"found {str(found).lower()}, allowed is a number")
+    return found
+
+
+def _truth(word: str, node: ast.expr, values: Values) -> bool:
+    found = _value(node, values)
+    if not isinstance(found, bool):
+        raise ConfigError(f"{word} takes true or false, found {found:g}")
+    return found
 
 
 def _call(name: str, arguments: list[float]) -> float:
@@ -154,9 +176,11 @@ def _call(name: str, arguments: list[float]) -> float:
     raise ConfigError(f"{name} takes {1 if name in _UNARY else 2} arguments, found {len(arguments)}")
 
 
-def _number(name: str, values: Values) -> float:
+def _parameter_value(name: str, values: Values) -> float | bool:
     if name not in values:
         raise unknown("parameter", name, values)
+    if values[name] in ("true", "false"):
+        return values[name] == "true"
     found = finite(values[name])
     if found is None:
         raise ConfigError(f"${name} is {values[name]!r}, allowed is a number")
@@ -167,7 +191,7 @@ def _number(name: str, values: Values) -> float:
 
 _INTEGERS: Final = ("integer", "int", "unsignedInt", "unsignedShort")
 _TYPES: Final = ("double", *_INTEGERS, "boolean", "string", "dateTime")
-_RULES: Final[Mapping[str, Callable[[float, float], bool]]] = {
+_COMPARISONS: Final[Mapping[str, Callable[[float, float], bool]]] = {
     "equalTo": operator.eq,
     "greaterThan": operator.gt,
     "lessThan": operator.lt,
@@ -175,6 +199,7 @@ _RULES: Final[Mapping[str, Callable[[float, float], bool]]] = {
     "lessOrEqual": operator.le,
     "notEqualTo": operator.ne,
 }
+RULES: Final = tuple(_COMPARISONS)
 
 
 def declared(root: Element) -> list[str]:
@@ -195,6 +220,8 @@ def substituted(element: Element, variation: Values, outer: Values | None = None
             values = _declared_values(group, values, variation)
     copy = Element(element.path, element.line, element.tag, {})
     copy.text = element.text
+    if element.tag == "ParameterCondition":
+        copy.parameter = _value_of(element, "parameterRef", outer)
     copy.attributes = {name: _replaced(element, name, outer) for name in element.attributes}
     copy.children = [
         substituted(child, {}, values) for child in element.children if child.tag != "ParameterDeclarations"
@@ -252,44 +279,55 @@ def _holds(group: Element, value: str, values: Values) -> bool:
         if constraint.tag != "ValueConstraint":
             raise constraint.error("allowed is ValueConstraint")
     return all(
-        _obeys(value, one.choice("rule", tuple(_RULES)), _replaced(one, "value", values))
-        for one in group.children
+        obeys(value, one.choice("rule", RULES), _replaced(one, "value", values)) for one in group.children
     )
 
 
-def _obeys(value: str, rule: str, limit: str) -> bool:
-    """Numbers are compared as numbers; texts can only be equal or not."""
+def obeys(value: str, rule: str, limit: str) -> bool:
+    """Whether `value` is to `limit` as `rule` says: as numbers, or as texts, which are equal or not."""
     left, right = finite(value), finite(limit)
     if left is None or right is None:
         return value == limit if rule == "equalTo" else rule == "notEqualTo" and value != limit
-    return _RULES[rule](left, right)
+    return _COMPARISONS[rule](left, right)
 
 
 def _replaced(element: Element, name: str, values: Values) -> str:
     text = element.word(name)
-    if reference := _PARAMETER.fullmatch(text):
-        if reference[1] not in values:
-            raise element.error(f"{name}: {unknown('parameter', reference[1], values)}")
-        return values[reference[1]]
+    if _PARAMETER.fullmatch(text):
+        return _value_of(element, name, values)
     if expression := _EXPRESSION.fullmatch(text):
         try:
-            return repr(evaluate(expression[1], values))
+            found = evaluate(expression[1], values)
         except ConfigError as error:
             raise element.error(f"{name}: {text[:SHOWN_CHARACTERS_MAX]!r}: {error}") from error
+        return str(found).lower() if isinstance(found, bool) else repr(found)
     return text
+
+
+def _value_of(element: Element, attribute: str, values: Values) -> str:
+    """The value of the parameter that an attribute names, with or without a $."""
+    name = _parameter(element, attribute)
+    if name not in values:
+        raise element.error(f"{attribute}: {unknown('parameter', name, values)}")
+    return values[name]
 
 
 # -- variations
 
 
-def variations_of(root: Element, scenario: str, parameters: list[str], seed: int) -> list[Values]:
-    """The sets of values that the distribution `root` gives to the `parameters` of the file `scenario`."""
+def variations_of(
+    root: Element, scenario: str, parameters: list[str], seed: int, pick: Sequence[tuple[str, str]] = ()
+) -> list[Values]:
+    """The sets of values that the distribution `root` gives to the `parameters` of the file `scenario`.
+
+    `pick` has names with values: of each parameter named, only the values that are in it.
+    """
     definition = root.one("ParameterValueDistribution")
     file = definition.one("ScenarioFile")
     if PurePosixPath(file.word("filepath").replace("\\", "/")).name != scenario:
         raise file.wrong("filepath", f"a path to {scenario}")
     kind = definition.one("Deterministic", "Stochastic")
-    found = _deterministic(kind) if kind.tag == "Deterministic" else _stochastic(kind, seed)
+    found = _deterministic(kind, pick) if kind.tag == "Deterministic" else _stochastic(kind, seed, pick)
     for name in found[0]:
         if name not in parameters:
             raise kind.error(str(unknown(f"parameter of {scenario}", name, parameters)))
@@ -305,7 +343,32 @@ def variation_name(stem: str, values: Values) -> str:
     return f"{name[: NAME_CHARACTERS_MAX - 9]}-{hashlib.blake2b(full.encode(), digest_size=4).hexdigest()}"
 
 
-def _deterministic(kind: Element) -> list[Values]:
+def _picked(kind: Element, axes: list[list[dict[str, str]]], pick: Sequence[tuple[str, str]]) -> None:
+    """Keep of each axis the sets that `pick` takes. Raises ConfigError if it takes none."""
+    names = sorted({name for axis in axes for values in axis for name in values})
+    for name in dict.fromkeys(name for name, _ in pick):
+        if name not in names:
+            raise ConfigError(f"--pick: {unknown('varied parameter', name, names)}")
+        wanted = [value for one, value in pick if one == name]
+        for axis in axes:
+            if not any(name in values for values in axis):
+                continue
+            there = [values.get(name, "") for values in axis]
+            axis[:] = [one for one in axis if any(_is_value(one.get(name, ""), value) for value in wanted)]
+            if not axis:
+                values = ", ".join(dict.fromkeys(there))
+                raise ConfigError(f"--pick: {name} is never {' or '.join(wanted)} (one of: {values})")
+    if math.prod(len(axis) for axis in axes) > VARIATIONS_MAX:
+        count = math.prod(len(axis) for axis in axes)
+        raise kind.error(f"{count} variations, allowed are {VARIATIONS_MAX}; --pick NAME=VALUE takes some")
+
+
+def _is_value(value: str, wanted: str) -> bool:
+    left, right = finite(value), finite(wanted)
+    return value == wanted if left is None or right is None else left == right
+
+
+def _deterministic(kind: Element, pick: Sequence[tuple[str, str]]) -> list[Values]:
     axes: list[list[dict[str, str]]] = []
     for one in kind.every(
         "DeterministicSingleParameterDistribution", "DeterministicMultiParameterDistribution"
@@ -318,9 +381,7 @@ def _deterministic(kind: Element) -> list[Values]:
             axes.append([_assigned(group) for group in sets])
     if not axes or not all(axes):
         raise kind.error("no distribution, or one without values")
-    count = math.prod(len(axis) for axis in axes)
-    if count > VARIATIONS_MAX:
-        raise kind.error(f"{count} variations, allowed are {VARIATIONS_MAX}")
+    _picked(kind, axes, pick)
     names = [{name for values in axis for name in values} for axis in axes]
     for first, second in itertools.combinations(names, 2):
         if twice := sorted(first & second):
@@ -372,7 +433,7 @@ def _decimal(value: float) -> str:
     return str(int(rounded)) if rounded == int(rounded) else repr(rounded)
 
 
-def _stochastic(kind: Element, seed: int) -> list[Values]:
+def _stochastic(kind: Element, seed: int, pick: Sequence[tuple[str, str]]) -> list[Values]:
     runs = kind.number("numberOfTestRuns")
     if not 1 <= runs <= VARIATIONS_MAX or runs != int(runs):
         raise kind.wrong("numberOfTestRuns", f"a whole number, 1 to {VARIATIONS_MAX}")
@@ -383,10 +444,12 @@ def _stochastic(kind: Element, seed: int) -> list[Values]:
     names = [_parameter(one, "parameterName") for one in distributions]
     if len(set(names)) < len(names):
         raise kind.error("a parameter stands in two distributions")
-    return [
+    drawn = [
         {name: _draw(one, chance) for name, one in zip(names, distributions, strict=True)}
         for _ in range(int(runs))
     ]
+    _picked(kind, [drawn], pick)
+    return list(drawn)
 
 
 def _draw(one: Element, chance: random.Random) -> str:

@@ -1,15 +1,18 @@
 """Imports OpenSCENARIO XML 1.0 to 1.3 as scenarios of aftbed: one car behind another on a straight road.
 
-`document` has the tree with line numbers and the account of unused elements, `expression` the parameters,
-`placing` the cars and the road, `storyboard` the drive. An import runs in this order:
+`document` has the tree with line numbers and the account of unused elements, `expression` the parameters and
+variations, `catalog` the entries of catalogs, `placing` the cars and the road, `timeline` the moments of the
+story, `storyboard` the drive; `folder` imports all files of a folder. An import runs in this order:
 
-    1. elements that are refused for their tag: all of them, with line and reason, in one error
-    2. elements that are read, with their meaning for the drive
-    3. elements that were not read: ignored (printed with the reason), or refused
+    1. elements that cannot matter in any drive are marked (`set_aside`)
+    2. elements that are refused for their tag: all of them, with line and reason, in one error
+    3. elements that are read, with their meaning for the drive
+    4. elements that were not read: ignored (printed with the reason), or refused
 
-No file is written before every variation has been converted, and each scenario has been read back in the way
-in which `aftbed run` reads it. The file does not contain the expected outcome of the drive; the caller gives
-it.
+A distribution gives one drive for each set of values. Sets that no scenario can express are left out, with
+the reason; if that are all, the file is refused. No file is written before every variation has been
+converted, and each scenario has been read back in the way in which `aftbed run` reads it. The file does not
+contain the expected outcome of the drive; the caller gives it.
 
 No library reads the files. The well-kept one, scenariogeneration, is made to write them: its objects have no
 line numbers, and it skips elements that it does not know; here both matter. The protection of defusedxml
@@ -17,17 +20,21 @@ against hostile XML would amount to refusing a DOCTYPE, which expat can do.
 """
 
 import json
+import os
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import msgspec
 
 from aftbed.core.errors import ConfigError, unknown
 from aftbed.interop.files import write_text_whole
+from aftbed.interop.openscenario.catalog import Catalogs
 from aftbed.interop.openscenario.document import (
-    CONTROLLERS,
+    Cause,
     Element,
     IgnoredElement,
+    RefusedError,
     account,
     read_tree,
     refuse,
@@ -40,25 +47,30 @@ from aftbed.interop.openscenario.expression import (
     variations_of,
 )
 from aftbed.interop.openscenario.placing import check_road, read_cars
-from aftbed.interop.openscenario.storyboard import ImportedDrive, StoryboardReader, UsedElement
+from aftbed.interop.openscenario.storyboard import ImportedDrive, StoryboardReader, UsedElement, set_aside
+from aftbed.interop.openscenario.timeline import SlowedEgo
 from aftbed.vehicle.plant import KMH_PER_MS
 from aftbed.vehicle.scenarios.scenario import ScenarioKeys, scenario_of
 
 EXPECTATIONS: Final = ("stop", "no_collision", "no_braking")
 VERSIONS: Final = ("1.0", "1.1", "1.2", "1.3")
+EGOS: Final = ("ego", "ego_vehicle", "egovehicle", "hero", "vut")  # in small letters; hero is CARLA's
 DESCRIPTION_CHARACTERS_MAX: Final = 200
 DURATION_S_MAX: Final = 3600.0
-CARS_MAX: Final = 2
+_FOR_ALL: Final = (Cause.UNREADABLE, Cause.CATALOG, Cause.VERSION, Cause.MISSING, Cause.MISTAKE)
 _ROOTS: Final = ("OpenSCENARIO", "OpenScenario")
 
 
 class ImportOptions(msgspec.Struct, frozen=True):
-    """What the caller adds to the file. None for `ego`: the car called Ego; for `duration_s`: the file's."""
+    """What the caller adds to the file. None for `ego`: the car called Ego; for `duration_s`: the file's.
+
+    `pick`: of the variations, only those in which a parameter has one of the values that are given for it.
+    """
 
     ego: str | None = None
     expect: str = "no_collision"
     duration_s: float | None = None
-    replace_controller: bool = False
+    pick: tuple[tuple[str, str], ...] = ()
     seed: int = 0
 
 
@@ -71,46 +83,114 @@ class ScenarioVariation(msgspec.Struct, frozen=True):
     text: str
 
 
+class LeftOut(msgspec.Struct, frozen=True):
+    """A set of values that no scenario can express, and why."""
+
+    parameters: Values
+    line: int
+    reason: str
+
+
 class ImportedFile(msgspec.Struct, frozen=True):
     """The result of an import. `taken` and `ignored` are those of the first variation.
 
-    `sets` counts the sets of values. Equal sets, as random draws may give, are one variation.
+    `path` is the file that was asked for, `scenario` the one with the storyboard. `sets` counts the sets of
+    values. Equal sets, as random draws may give, are one variation.
     """
 
     path: str
+    scenario: str
     version: str
     description: str
     sets: int
     variations: tuple[ScenarioVariation, ...]
+    left_out: tuple[LeftOut, ...]
     taken: tuple[UsedElement, ...]
     ignored: tuple[IgnoredElement, ...]
 
 
-def import_scenario(path: Path, distribution: Path | None, options: ImportOptions) -> ImportedFile:
-    """The scenarios that the file at `path` describes. Raises ConfigError naming file, line and element."""
+def import_scenario(
+    path: Path, distribution: Path | None, options: ImportOptions, catalogs: Catalogs | None = None
+) -> ImportedFile:
+    """The scenarios that the file at `path` describes. Raises ConfigError naming file, line and element.
+
+    If `path` is a distribution, they are those of the file that it varies. Imports that share `catalogs` read
+    each catalog once.
+    """
+    check_options(options)
+    root, stem, scenario = read_tree(path), path.stem, path
+    description = _description(root)
+    if (varied := _varied_file(root)) is not None:
+        if distribution is not None:
+            raise varied.error("a distribution, and --variations gives another one")
+        filepath = varied.word("filepath").replace("\\", "/")
+        distribution, scenario = path, Path(os.path.normpath(path.parent / filepath))
+        if "\0" in filepath or not scenario.is_file():
+            raise varied.error(f"filepath: {str(scenario)!r} is not there", Cause.MISSING)
+        root = read_tree(scenario)
+    version = _check_root(root)
+    sets: list[Values] = [{}]
+    if distribution is not None:
+        sets = _read_distribution(distribution, scenario, declared(root), options)
+    elif options.pick:
+        raise ConfigError(f"--pick: {path} has no variations; a distribution gives them")
+    found: dict[str, ScenarioVariation] = {}
+    left_out: list[LeftOut] = []
+    first_error: RefusedError | None = None
+    ignored: list[tuple[IgnoredElement, ...]] = []
+    catalogs = catalogs or Catalogs()
+    for values in sets:
+        shown = values if stem == scenario.stem else _varying(values, sets)
+        try:
+            drive, unused = _read(substituted(root, values), options, catalogs)
+            name = variation_name(stem, shown)
+            text = _scenario_file(name, drive, description, options.expect, scenario)
+        except RefusedError as error:
+            refused = _with_values(error, _varying(values, sets) or shown)
+            if error.cause in _FOR_ALL:
+                raise refused from error
+            first_error = first_error or refused
+            left_out.append(LeftOut(values, error.line, error.reason))
+            continue
+        found[name] = ScenarioVariation(name, values, drive, text)
+        ignored.append(unused)
+    if not found:
+        assert first_error is not None, "a file has at least one set of values"
+        raise first_error
+    variations = tuple(found.values())
+    return ImportedFile(
+        path=str(path),
+        scenario=str(scenario),
+        version=version,
+        description=description,
+        sets=len(sets),
+        variations=variations,
+        left_out=tuple(left_out),
+        taken=variations[0].drive.taken,
+        ignored=ignored[0],
+    )
+
+
+def check_options(options: ImportOptions) -> None:
+    """Raise ConfigError for an option that is wrong whatever the file is."""
     if options.expect not in EXPECTATIONS:
         raise ConfigError(f"--expect: {unknown('outcome', options.expect, EXPECTATIONS)}")
     if options.duration_s is not None and not 0.0 < options.duration_s <= DURATION_S_MAX:
         allowed = f"allowed is more than 0 and at most {DURATION_S_MAX:g}"
         raise ConfigError(f"--duration: found {options.duration_s:g}, {allowed}")
-    root = read_tree(path)
-    version = _check_root(root)
-    sets: list[Values] = [{}]
-    if distribution is not None:
-        sets = _read_distribution(distribution, path, declared(root), options.seed)
-    found: dict[str, ScenarioVariation] = {}
-    accounts: list[tuple[tuple[UsedElement, ...], tuple[IgnoredElement, ...]]] = []
-    for values in sets:
-        name = variation_name(path.stem, values)
-        try:
-            drive, ignored, description = _read(substituted(root, values), options)
-            text = _scenario_file(name, drive, description, options.expect)
-        except ConfigError as error:
-            shown = ", ".join(f"{name} = {value}" for name, value in values.items())
-            raise (ConfigError(f"{error}\n  with {shown}") if values else error) from error
-        found[name] = ScenarioVariation(name, values, drive, text)
-        accounts.append((drive.taken, ignored))
-    return ImportedFile(str(path), version, description, len(sets), tuple(found.values()), *accounts[0])
+
+
+def _varying(values: Values, sets: list[Values]) -> Values:
+    """The values that are not the same in all sets."""
+    return {name: value for name, value in values.items() if any(one[name] != value for one in sets)}
+
+
+def _with_values(error: RefusedError, values: Values) -> RefusedError:
+    """The same error, with the values of the parameters for which it was found."""
+    if not values:
+        return error
+    shown = ", ".join(f"{name} = {value}" for name, value in values.items())
+    return RefusedError(f"{error}\n  with {shown}", error.path, error.line, error.reason, error.cause)
 
 
 def write(imported: ImportedFile, folder: Path, *, force: bool) -> list[Path]:
@@ -128,6 +208,11 @@ def write(imported: ImportedFile, folder: Path, *, force: bool) -> list[Path]:
     return paths
 
 
+def _description(root: Element) -> str:
+    headers = [one for one in root.children if one.tag == "FileHeader"]
+    return (headers[0].attributes.get("description") if headers else "") or root.path
+
+
 def _read_version(header: Element) -> str:
     return f"{header.word('revMajor')}.{header.word('revMinor')}"
 
@@ -135,46 +220,49 @@ def _read_version(header: Element) -> str:
 def _check_root(root: Element) -> str:
     """Check root and header; the version of OpenSCENARIO."""
     if root.tag not in _ROOTS:
-        raise root.error(f"allowed is {_ROOTS[0]}")
+        raise root.error(f"allowed is {_ROOTS[0]}", Cause.VERSION)
     header = root.one("FileHeader")
     version = _read_version(header)
     if version not in VERSIONS:
-        raise header.error(f"OpenSCENARIO {version[:20]}, allowed are {', '.join(VERSIONS)}")
+        reason = f"OpenSCENARIO {version[:20]}, allowed are {', '.join(VERSIONS)}"
+        raise header.error(reason, Cause.VERSION)
     for child in root.children:
+        if child.tag == "Catalog":
+            raise child.error("a catalog: read where an entry of it is needed", Cause.CATALOG)
         if child.tag == "ParameterValueDistribution":
-            files = [
-                one.attributes.get("filepath", "") for one in child.children if one.tag == "ScenarioFile"
-            ]
-            other = files[0] if files else "FILE.xosc"
-            raise child.error(f"a distribution: import {other} with --variations {root.path}")
+            raise child.error("a distribution of a distribution")
     return version
 
 
-def _read_distribution(path: Path, scenario: Path, parameters: list[str], seed: int) -> list[Values]:
+def _varied_file(root: Element) -> Element | None:
+    """The element of a distribution that names the file that it varies; None if `root` is none."""
+    distributions = [one for one in root.children if one.tag == "ParameterValueDistribution"]
+    return distributions[0].one("ScenarioFile") if distributions else None
+
+
+def _read_distribution(
+    path: Path, scenario: Path, parameters: list[str], options: ImportOptions
+) -> list[Values]:
     root = read_tree(path)
-    if not any(child.tag == "ParameterValueDistribution" for child in root.children):
+    if _varied_file(root) is None:
         raise ConfigError(f"{root.path}: no ParameterValueDistribution in it")
     _read_version(root.one("FileHeader"))
-    found = variations_of(root, scenario.name, parameters, seed)
+    found = variations_of(root, scenario.name, parameters, options.seed, options.pick)
     account(root)
     return found
 
 
-def _read(root: Element, options: ImportOptions) -> tuple[ImportedDrive, tuple[IgnoredElement, ...], str]:
-    header = root.one("FileHeader")
-    _read_version(header)
-    description = header.word("description", "") or root.path
+def _read(
+    root: Element, options: ImportOptions, catalogs: Catalogs
+) -> tuple[ImportedDrive, tuple[IgnoredElement, ...]]:
+    _read_version(root.one("FileHeader"))
     ego = _find_ego(root, options.ego)
-    _set_aside(root, ego, options)
+    set_aside(root, ego, catalogs, options.duration_s)
     refuse(root)
-    cars, entries = read_cars(root)
-    if len(cars) > CARS_MAX:
-        raise root.one("Entities").error(
-            f"{len(cars)} vehicles, allowed are {CARS_MAX}: the ego and one ahead"
-        )
-    drive = StoryboardReader(cars, ego, options.duration_s).read(root.one("Storyboard"))
-    check_road(root)
-    return drive, tuple(one for tree in (root, *entries) for one in account(tree)), description
+    cars, entries = read_cars(root, catalogs)
+    drive = StoryboardReader(root, cars, ego, options.duration_s).read()
+    check_road(root, empty=drive.lead is None)
+    return drive, tuple(one for tree in (root, *entries) for one in account(tree))
 
 
 def _find_ego(root: Element, asked: str | None) -> str:
@@ -182,28 +270,14 @@ def _find_ego(root: Element, asked: str | None) -> str:
     names = [thing.word("name") for thing in things]
     if asked is not None and asked not in names:
         raise ConfigError(f"--ego: {unknown('vehicle', asked, names)}")
-    egos = [name for name in names if name == asked or (asked is None and name.lower() == "ego")]
+    egos = [name for name in names if name == asked or (asked is None and name.lower() in EGOS)]
     if len(egos) != 1:
         shown = ", ".join(names) or "none"
         raise root.one("Entities").error(f"which vehicle is the ego? --ego NAME says it (one of: {shown})")
     return egos[0]
 
 
-def _set_aside(root: Element, ego: str, options: ImportOptions) -> None:
-    """Mark the elements that `options` replaces as ignored."""
-    for element in root.walk():
-        of_ego = ego in (element.attributes.get("entityRef"), element.attributes.get("name"))
-        if options.replace_controller and of_ego and element.tag in ("Private", "ScenarioObject"):
-            for inner in element.walk():
-                if inner.tag in CONTROLLERS:
-                    inner.ignored = "replaced by aftbed's function, as asked for"
-        if options.duration_s is not None and element.tag == "Storyboard":
-            for child in element.children:
-                if child.tag == "StopTrigger":
-                    child.ignored = "the length of the drive was asked for"
-
-
-def _scenario_file(name: str, drive: ImportedDrive, description: str, expect: str) -> str:
+def _scenario_file(name: str, drive: ImportedDrive, description: str, expect: str, path: Path) -> str:
     """The text of the scenario file. Its keys are in the order in which docs/scenarios.md describes them."""
     printable = "".join(one if one.isprintable() else " " for one in description)
     keys: dict[str, object] = {
@@ -212,22 +286,51 @@ def _scenario_file(name: str, drive: ImportedDrive, description: str, expect: st
         "ego": {"speed_kmh": _round(drive.speed_ms * KMH_PER_MS)},
     }
     if drive.lead is not None:
-        lead: dict[str, object] = {"gap_m": _round(drive.lead.gap_m)}
+        lead: dict[str, Any] = {"gap_m": _round(drive.lead.gap_m)}
         lead["speed_kmh"] = _round(drive.lead.speed_ms * KMH_PER_MS)
+        if drive.lead.lateral_m:
+            lead["lateral_m"] = _round(drive.lead.lateral_m)
         if (braking := drive.lead.braking) is not None:
             lead["braking"] = {
                 "after_s": _round(braking.after_s),
-                "deceleration_ms2": _round(braking.deceleration_ms2),
+                "deceleration_ms2": _round(braking.rate_ms2),
                 "ramp_s": 0.0,  # a linear SpeedAction has its full rate from its start
             }
+            if braking.final_ms:
+                lead["braking"]["to_kmh"] = _round(braking.final_ms * KMH_PER_MS)
+        elif drive.lead.changes:
+            lead["speeds"] = [
+                {
+                    "after_s": _round(one.after_s),
+                    "to_kmh": _round(one.final_ms * KMH_PER_MS),
+                    "rate_ms2": _round(one.rate_ms2),
+                }
+                for one in drive.lead.changes
+            ]
         keys["lead"] = lead
+    if drive.slow_ends:
+        keys["ends"] = _ends(drive.slow_ends)
     keys["road"] = {"friction": drive.friction}
     keys["expect"] = {"outcome": expect}
     try:
         scenario_of(name, name, msgspec.convert(keys, ScenarioKeys))
     except msgspec.ValidationError as error:
-        raise ConfigError(f"the scenario would be out of range: {error}") from error
+        reason = f"the scenario would be out of range: {error}"
+        raise RefusedError(f"{path}: {reason}", str(path), 0, reason, Cause.RANGE) from error
     return "".join(f"{key}: {_yaml(value)}\n" for key, value in keys.items())
+
+
+def _ends(slow_ends: Sequence[SlowedEgo]) -> dict[str, object]:
+    """Of several ends the slowest and the latest: the drive is not shorter than the file's."""
+    ends: dict[str, object] = {}
+    for key, speeds_ms in (
+        ("below_kmh", [one.below_ms for one in slow_ends if one.below_ms is not None]),
+        ("below_lead_kmh", [one.below_lead_ms for one in slow_ends if one.below_lead_ms is not None]),
+    ):
+        if speeds_ms:
+            ends[key] = _round((max if key == "below_lead_kmh" else min)(speeds_ms) * KMH_PER_MS)
+    ends["after_s"] = _round(max(one.after_s for one in slow_ends))
+    return ends
 
 
 def _round(value: float) -> float:
@@ -240,6 +343,8 @@ def _yaml(value: object) -> str:
     match value:
         case dict():
             return "{" + ", ".join(f"{key}: {_yaml(inner)}" for key, inner in value.items()) + "}"
+        case list():
+            return "[" + ", ".join(map(_yaml, value)) + "]"
         case float():
             return f"{value:.6f}".rstrip("0").rstrip(".")
         case _:

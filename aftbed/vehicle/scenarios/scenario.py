@@ -19,6 +19,7 @@ from aftbed.vehicle.plant import (
     Driver,
     LeadBraking,
     LeadCar,
+    LeadSpeed,
     PlantSetup,
     VehicleResult,
 )
@@ -40,6 +41,14 @@ class Expectation(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     stop_gap_m_min: Distance = 0.0
 
 
+class SlowEnd(msgspec.Struct, frozen=True):
+    """A drive is over `after_ms` after the ego has become slower than one of the two, m/s."""
+
+    after_ms: int
+    below_ms: float | None = None
+    below_lead_ms: float | None = None  # this much less than the car ahead
+
+
 class Scenario(msgspec.Struct, frozen=True):
     """A drive, ready for `Plant(scenario.plant)`; it ends at `duration_ms` at the latest."""
 
@@ -49,6 +58,7 @@ class Scenario(msgspec.Struct, frozen=True):
     plant: PlantSetup
     expect: Expectation
     verifies: tuple[str, ...] = ()  # requirements
+    slow_end: SlowEnd | None = None
 
 
 class EgoKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -61,6 +71,13 @@ class BrakingKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     after_s: Duration
     deceleration_ms2: Deceleration
     ramp_s: Duration = 1.0
+    to_kmh: Speed = 0.0
+
+
+class LeadSpeedKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    after_s: Duration
+    to_kmh: Speed
+    rate_ms2: Annotated[float, Meta(gt=0, le=12)]
 
 
 class CutInKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -75,6 +92,7 @@ class LeadKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     gap_m: Distance | None = None
     ttc_s: Annotated[float, Meta(gt=0, le=60)] | None = None
     braking: BrakingKeys | None = None
+    speeds: tuple[LeadSpeedKeys, ...] = ()
     lateral_m: Annotated[float, Meta(ge=-10, le=10)] = 0.0
     cut_in: CutInKeys | None = None
 
@@ -95,6 +113,14 @@ class DriverKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     deceleration_ms2: Deceleration
 
 
+class EndsKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """As in Euro NCAP's tests, which are over when the car has become slower than the one ahead."""
+
+    below_kmh: Speed | None = None
+    below_lead_kmh: Speed | None = None
+    after_s: Duration = 1.0
+
+
 class ScenarioKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     description: str
     duration_s: Annotated[float, Meta(gt=0, le=3600)]
@@ -104,6 +130,7 @@ class ScenarioKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     road: RoadKeys = RoadKeys()
     brakes: BrakesKeys = BrakesKeys()
     driver: DriverKeys | None = None
+    ends: EndsKeys | None = None
     verifies: tuple[str, ...] = ()
 
 
@@ -123,7 +150,8 @@ def scenario_of(name: str, where: str, keys: ScenarioKeys) -> Scenario:
         check_requirements("verifies", keys.verifies)
     except ConfigError as error:
         raise ConfigError(f"{where}: {error}") from None
-    return Scenario(name, keys.description, _ms(keys.duration_s), setup, keys.expect, keys.verifies)
+    ends = _slow_end(where, keys) if keys.ends else None
+    return Scenario(name, keys.description, _ms(keys.duration_s), setup, keys.expect, keys.verifies, ends)
 
 
 def _ms(duration_s: float) -> int:
@@ -146,17 +174,47 @@ def _lead(where: str, keys: LeadKeys, ego_kmh: float) -> LeadCar:
         if gap_m == 0.0:  # a collision before the start
             raise ConfigError(f"{where}: lead.gap_m: found 0, allowed is more than 0")
     braking, cut_in = keys.braking, keys.cut_in
+    if braking and keys.speeds:
+        raise ConfigError(f"{where}: lead: found both, allowed is one of braking, speeds")
+    times_s = [change.after_s for change in keys.speeds]
+    if times_s != sorted(set(times_s)):
+        raise ConfigError(f"{where}: lead.speeds: found {times_s}, allowed is one after the other")
     if cut_in and keys.lateral_m == 0.0:
         raise ConfigError(f"{where}: lead.cut_in: found without lateral_m, allowed is a car beside our lane")
     return LeadCar(
         gap_m=gap_m,
         speed_ms=keys.speed_kmh / KMH_PER_MS,
-        braking=LeadBraking(_ms(braking.after_s), braking.deceleration_ms2, _ms(braking.ramp_s))
-        if braking
-        else None,
+        braking=_braking(where, braking, keys.speed_kmh) if braking else None,
         lateral_m=keys.lateral_m,
         cut_in=CutIn(_ms(cut_in.after_s), max(1, _ms(cut_in.over_s))) if cut_in else None,
+        speeds=tuple(
+            LeadSpeed(_ms(one.after_s), one.to_kmh / KMH_PER_MS, one.rate_ms2) for one in keys.speeds
+        ),
     )
+
+
+def _slow_end(where: str, keys: ScenarioKeys) -> SlowEnd:
+    ends = keys.ends
+    assert ends is not None
+    if ends.below_kmh is None and ends.below_lead_kmh is None:
+        raise ConfigError(f"{where}: ends: found none of them, allowed is below_kmh, below_lead_kmh or both")
+    if ends.below_kmh is not None and ends.below_kmh > keys.ego.speed_kmh:
+        allowed = f"allowed is at most ego.speed_kmh, {keys.ego.speed_kmh:g}"
+        raise ConfigError(f"{where}: ends.below_kmh: found {ends.below_kmh:g}, {allowed}")
+    if ends.below_lead_kmh is not None and keys.lead is None:
+        raise ConfigError(f"{where}: ends.below_lead_kmh: found without lead, allowed is below_kmh")
+    below_ms, below_lead_ms = (
+        None if kmh is None else kmh / KMH_PER_MS for kmh in (ends.below_kmh, ends.below_lead_kmh)
+    )
+    return SlowEnd(_ms(ends.after_s), below_ms, below_lead_ms)
+
+
+def _braking(where: str, keys: BrakingKeys, lead_kmh: float) -> LeadBraking:
+    if keys.to_kmh > 0.0 and keys.to_kmh >= lead_kmh:
+        allowed = f"allowed is less than lead.speed_kmh, {lead_kmh:g}"
+        raise ConfigError(f"{where}: lead.braking.to_kmh: found {keys.to_kmh:g}, {allowed}")
+    ramp_ms, final_ms = _ms(keys.ramp_s), keys.to_kmh / KMH_PER_MS
+    return LeadBraking(_ms(keys.after_s), keys.deceleration_ms2, ramp_ms, final_ms)
 
 
 def broken_expectations(scenario: Scenario, result: VehicleResult) -> list[str]:

@@ -12,9 +12,18 @@ from aftbed.core.errors import ConfigError
 from aftbed.vehicle.aeb.messages import STAGE_FULL, STAGE_NONE, STAGE_WARN
 from aftbed.vehicle.can.frame import Frame
 from aftbed.vehicle.ecus import Fallback
-from aftbed.vehicle.plant import Brakes, CutIn, Driver, LeadBraking, LeadCar, PlantSetup, VehicleResult
+from aftbed.vehicle.plant import (
+    Brakes,
+    CutIn,
+    Driver,
+    LeadBraking,
+    LeadCar,
+    LeadSpeed,
+    PlantSetup,
+    VehicleResult,
+)
 from aftbed.vehicle.scenarios.library import load_scenario, scenario_names
-from aftbed.vehicle.scenarios.scenario import broken_expectations
+from aftbed.vehicle.scenarios.scenario import SlowEnd, broken_expectations
 
 NAMES = ["ccrb-50-12m", "ccrb-50-40m", "ccrm-50", "ccrs-20", "ccrs-42", "ccrs-50", "free-drive"]
 
@@ -193,6 +202,49 @@ def test_brakes_and_the_way_into_the_lane_are_settable(tmp_path: Path) -> None:
     assert (scenario.plant.lead.lateral_m, scenario.plant.lead.cut_in) == (-3.5, CutIn(1000, 2000))
 
 
+def test_a_lead_may_brake_to_a_speed_and_a_drive_end_at_one(tmp_path: Path) -> None:
+    text = GOOD.replace("ramp_s: 0.5", "ramp_s: 0.5, to_kmh: 3.6")
+    scenario = load_scenario(write(tmp_path, f"{text}ends: {{below_kmh: 18, below_lead_kmh: 3.6}}\n"))
+    assert scenario.plant.lead is not None
+    assert scenario.plant.lead.braking == LeadBraking(1000, 6.0, 500, 1.0)
+    assert scenario.slow_end == SlowEnd(1000, 5.0, 1.0)
+
+
+SPEEDS = "speeds: [{after_s: 1, to_kmh: 36, rate_ms2: 2}, {after_s: 3, to_kmh: 0, rate_ms2: 4}]"
+
+
+def test_a_lead_may_change_its_speed_more_than_once(tmp_path: Path) -> None:
+    braking = GOOD[GOOD.index("braking:") : GOOD.index("}", GOOD.index("braking:")) + 1]
+    scenario = load_scenario(write(tmp_path, GOOD.replace(braking, SPEEDS)))
+    assert scenario.plant.lead is not None
+    assert scenario.plant.lead.speeds == (LeadSpeed(1000, 10.0, 2.0), LeadSpeed(3000, 0.0, 4.0))
+    with pytest.raises(ConfigError, match="lead: found both, allowed is one of braking, speeds"):
+        load_scenario(write(tmp_path, GOOD.replace(braking, f"{braking}, {SPEEDS}")))
+    backwards = SPEEDS.replace("after_s: 3", "after_s: 1")
+    with pytest.raises(ConfigError, match=r"lead\.speeds: found \[1\.0, 1\.0\], allowed is one after"):
+        load_scenario(write(tmp_path, GOOD.replace(braking, backwards)))
+
+
+@pytest.mark.parametrize(
+    ("ends", "reason"),
+    [
+        ("{after_s: 1}", "ends: found none of them, allowed is below_kmh, below_lead_kmh or both"),
+        ("{below_kmh: 37}", "ends.below_kmh: found 37, allowed is at most ego.speed_kmh, 36"),
+        ("{below_kmh: 201}", "ends.below_kmh: found 201, allowed is a number at least 0 and at most 200"),
+    ],
+)
+def test_an_end_that_cannot_be_is_refused(ends: str, reason: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError) as error:
+        load_scenario(write(tmp_path, f"{GOOD}ends: {ends}\n"))
+    assert reason in str(error.value)
+
+
+def test_an_end_below_a_car_that_is_not_there_is_refused(tmp_path: Path) -> None:
+    text = "".join(line for line in GOOD.splitlines(keepends=True) if not line.startswith("lead"))
+    with pytest.raises(ConfigError, match=r"ends\.below_lead_kmh: found without lead"):
+        load_scenario(write(tmp_path, f"{text}ends: {{below_lead_kmh: 1}}\n"))
+
+
 def test_a_gap_may_be_given_as_time_to_collision(tmp_path: Path) -> None:
     scenario = load_scenario(write(tmp_path, GOOD.replace("gap_m: 40", "ttc_s: 4")))
     assert scenario.plant.lead is not None
@@ -221,6 +273,11 @@ def test_a_gap_may_be_given_as_time_to_collision(tmp_path: Path) -> None:
         ("gap_m: 40", "gap_m: 40, ttc_s: 4", "lead: found both, allowed is one of gap_m, ttc_s"),
         ("gap_m: 40, ", "", "lead: found none of them, allowed is one of gap_m, ttc_s"),
         ("gap_m: 40, speed_kmh: 18", "ttc_s: 4, speed_kmh: 36", "lead.ttc_s: found 4.0, allowed is gap_m"),
+        (
+            "ramp_s: 0.5",
+            "to_kmh: 18",
+            "lead.braking.to_kmh: found 18, allowed is less than lead.speed_kmh, 18",
+        ),
         ("after_s: 1", "after: 1", "lead.braking: unknown key 'after'; did you mean 'after_s'"),
         ("outcome: impact", "outcome: crash", "expect.outcome: found 'crash', allowed is one of impact, no_"),
         (
