@@ -22,6 +22,7 @@ divides it among them.
 """
 
 import math
+import re
 from collections.abc import Sequence
 from random import Random
 from typing import Final
@@ -86,21 +87,27 @@ def paired_quantile_shift(
 
 # -- Two campaigns of one plan, experiment by experiment --------------------------------------------
 #
-# They are paired by what was to be run (stratum, number, seed, faults), whatever the code was. A stratum is
-# *worse* if significantly more of its pairs fail only in the new campaign, or if the interval of the shift
-# of its p99 recovery lies above 0, and above `SHIFT_MS_MIN`.
+# They are paired by what was to be run (stratum, number, seed, faults), whatever the code was, and wherever
+# the files of a function, of requests or of a scenario lay. A stratum is *worse* if significantly more of its
+# pairs fail only in the new campaign, or if the interval of the shift of its p99 recovery lies above 0, and
+# above `SHIFT_MS_MIN`.
 
 
 SHIFT_MS_MIN: Final = 0.1  # less is of no consequence, however certain
 Q: Final = 0.99
 SEED: Final = 1
+_FOLDERS: Final = re.compile(r"[^\s'\"]*/")
 
 
 class Change(msgspec.Struct, frozen=True):
-    """`p` of McNemar's test over the pairs of which only one failed; `shift_ms` of the p99 recovery."""
+    """`p` of McNemar's test over the pairs of which only one failed; `shift_ms` of the p99 recovery.
+
+    `other_outcome`: how many pairs came to two classes of outcome, whether one failed or not.
+    """
 
     stratum: str
     pairs: int
+    other_outcome: int
     only_base: int
     only_new: int
     p: float
@@ -109,13 +116,19 @@ class Change(msgspec.Struct, frozen=True):
 
 
 class Comparison(msgspec.Struct, frozen=True):
-    """`unpaired`: experiments that only one of the two has."""
+    """`unpaired`: experiments that only one of the two has; `missing`: those of the base."""
 
     base: str
     new: str
     unpaired: int
+    missing: int
     changes: tuple[Change, ...]
     worse: bool
+
+    @property
+    def same_outcomes(self) -> bool:
+        """Whether each experiment of the base was run again, and came to the same class."""
+        return not self.missing and not any(change.other_outcome for change in self.changes)
 
 
 def compare(base: Ledger, new: Ledger) -> Comparison:
@@ -130,15 +143,25 @@ def compare(base: Ledger, new: Ledger) -> Comparison:
     for key in common:
         pairs[before[key].experiment.stratum].append((before[key], after[key]))
     changes = tuple(_change(name, found, confidence) for name, found in pairs.items())
-    unpaired = len(before) + len(after) - 2 * len(common)
+    missing = len(before) - len(common)
+    unpaired = missing + len(after) - len(common)
     codes = (base.head.code, new.head.code)
-    return Comparison(*codes, unpaired, changes, any(change.worse for change in changes))
+    return Comparison(*codes, unpaired, missing, changes, any(change.worse for change in changes))
 
 
 def _keyed(ledger: Ledger) -> dict[bytes, Result]:
     found = {}
     for result in ledger.results:
-        same = msgspec.structs.replace(result.experiment, id="", expected=())
+        experiment = result.experiment
+        same = msgspec.structs.replace(
+            experiment,
+            id="",
+            expected=(),
+            app=_FOLDERS.sub("", experiment.app),
+            request_file=_FOLDERS.sub("", experiment.request_file),
+            scenario=_FOLDERS.sub("", experiment.scenario),
+            adaptations=tuple(_FOLDERS.sub("", text) for text in experiment.adaptations),
+        )
         found[msgspec.json.encode(same)] = result
     return found
 
@@ -157,4 +180,5 @@ def _change(stratum: str, pairs: list[tuple[Result, Result]], confidence: float)
         chance = Random(f"{SEED}/{stratum}")
         shift = paired_quantile_shift([t for t, _ in timed], [t for _, t in timed], Q, chance, confidence)
     worse = (only_new > only_base and p < 1 - confidence) or (shift is not None and shift.low > SHIFT_MS_MIN)
-    return Change(stratum, len(pairs), only_base, only_new, p, shift, worse)
+    other = sum(b.outcome != n.outcome for b, n in pairs)
+    return Change(stratum, len(pairs), other, only_base, only_new, p, shift, worse)

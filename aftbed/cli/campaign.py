@@ -322,7 +322,14 @@ def merge(
 
 
 @campaign.command()
-def compare(base: Folder, new: Folder, json: Json = False) -> None:
+def compare(
+    base: Folder,
+    new: Folder,
+    outcomes: Annotated[
+        bool, typer.Option("--outcomes", help="Fail where an experiment has another outcome, or is missing.")
+    ] = False,
+    json: Json = False,
+) -> None:
     """What differs between two campaigns of the same plan, experiment by experiment.
 
     Exit code: 0 no stratum has become worse, 1 one has, 2 usage.
@@ -334,7 +341,8 @@ def compare(base: Folder, new: Folder, json: Json = False) -> None:
         shift = "p99 recovery: too few to tell"
         if change.shift_ms is not None:
             shift = f"p99 recovery {change.shift_ms.low:+.3f} to {change.shift_ms.high:+.3f} ms"
-        differ = f"{change.only_base} failed only before, {change.only_new} only now (p {change.p:.3g})"
+        differ = f"{change.other_outcome} with another outcome"
+        differ += f", {change.only_base} failed only before, {change.only_new} only now (p {change.p:.3g})"
         word = "worse" if change.worse else "same or better"
         return f"  {change.stratum:<{width}}  {change.pairs:>5} pairs: {differ}; {shift}: {word}"
 
@@ -345,7 +353,7 @@ def compare(base: Folder, new: Folder, json: Json = False) -> None:
         head = f"base {found.base}, new {found.new}; {found.unpaired} experiments without their pair"
         width = max((len(change.stratum) for change in found.changes), default=0)
         print(shown("\n".join((head, *map(line, found.changes)))))
-    raise typer.Exit(1 if found.worse else 0)
+    raise typer.Exit(1 if found.worse or (outcomes and not found.same_outcomes) else 0)
 
 
 @campaign.command()

@@ -134,13 +134,31 @@ def test_two_campaigns_are_compared(spec: Path, ran: Ran, output: Output, call: 
     ran("base")
     same = json.loads(output("campaign", "compare", "base", "base", "--json"))
     assert not same["worse"] and [c["pairs"] for c in same["changes"]] == [12, 12]
+    output("campaign", "compare", "base", "base", "--outcomes")
     records = spec.parent / "base" / "records.jsonl"
     worse = records.read_text().replace('"outcome":"tolerated"', '"outcome":"sdc"')
     (spec.parent / "new").mkdir()
     (spec.parent / "new" / "records.jsonl").write_text(worse)
     code, out, _ = call("campaign", "compare", "base", "new")
     assert code == 1
-    assert re.search(r"pbr · crash +12 pairs: 0 failed only before, 12 only now .*: worse", out), out
+    assert re.search(
+        r"12 pairs: 12 with another outcome, 0 failed only before, 12 only now .*: worse", out
+    ), out
+
+
+def test_an_outcome_that_is_another_one_or_missing_fails_a_comparison_of_outcomes(
+    spec: Path, ran: Ran, call: Call
+) -> None:
+    ran("base")
+    head, *results = (spec.parent / "base" / "records.jsonl").read_text().splitlines(keepends=True)
+    better = [line.replace('"outcome":"tolerated"', '"outcome":"masked"') for line in results[:1]]
+    for name, lines in {"better": better + results[1:], "fewer": results[1:], "same": results}.items():
+        (spec.parent / name).mkdir()
+        (spec.parent / name / "records.jsonl").write_text("".join([head, *lines]))
+    for new, code in {"better": 1, "fewer": 1, "same": 0}.items():
+        assert call("campaign", "compare", "base", new)[0] == 0, "no stratum is worse"
+        assert call("campaign", "compare", "base", new, "--outcomes")[0] == code, new
+    assert call("campaign", "compare", "fewer", "base", "--outcomes")[0] == 0, "more is not less"
 
 
 @pytest.mark.parametrize("name", ["out.csv", "out.parquet"])
