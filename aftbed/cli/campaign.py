@@ -14,7 +14,7 @@ from typing import Annotated, Final
 
 import msgspec
 import typer
-from msgspec.structs import replace
+from msgspec.structs import asdict, replace
 
 from aftbed.campaign import ledger, runner
 from aftbed.campaign.experiment import REQUESTS_MAX, Result, carry_out, refuse_untrusted, smallest
@@ -27,6 +27,7 @@ from aftbed.cli.options import (
     Json,
     Requests,
     TrustedFolders,
+    check_file,
     check_range,
     jobs_of,
     print_json,
@@ -46,15 +47,12 @@ RUNTIMES: Final = ("unix", "sim")
 EXECUTORS: Final = ("local", "dask")
 SECONDS_EACH: Final = {"unix": 0.35, "sim": 0.01}  # of an experiment on one core: for the estimate of `plan`
 EXIT_CODES: Final = {"pass": 0, "fail": 1}
-SUMMARY: Final = "summary.json"
-JUNIT: Final = "junit.xml"
-HTML: Final = "report.html"
-MARKDOWN: Final = "summary.md"  # of a campaign with a function of the user
 _SHARD: Final = re.compile(r"([0-9]{1,6})/([0-9]{1,6})")
 
 campaign = typer.Typer(cls=PlainGroup)
 
 Folder = Annotated[Path, typer.Argument(help="The directory of a campaign (its --out).")]
+BundleFile = Annotated[Path, typer.Argument(metavar="BUNDLE", help="A file of aftbed campaign bundle.")]
 ExperimentName = Annotated[str, typer.Argument(help="Id of the experiment, its beginning, or its number.")]
 
 
@@ -250,25 +248,15 @@ def _ledger(folder: Path) -> ledger.Ledger:
 def _judge(folder: Path, size: int, seconds: float, *, as_json: bool) -> int:
     """Summarise the ledger, of a campaign of `size` experiments, and write the reports; the exit code."""
     from aftbed.campaign.summary import summarise  # noqa: PLC0415
-    from aftbed.report.html import html_report  # noqa: PLC0415 - scipy
-    from aftbed.report.junit import junit_xml  # noqa: PLC0415
-    from aftbed.report.markdown import markdown_summary  # noqa: PLC0415
+    from aftbed.report.documents import documents  # noqa: PLC0415 - scipy
     from aftbed.report.terminal import summary_lines  # noqa: PLC0415
 
     records = _ledger(folder)
     summary = summarise(records, size, seconds)
-    document = msgspec.json.encode(summary)
-    reports = {
-        SUMMARY: msgspec.json.format(document).decode(),
-        JUNIT: junit_xml(summary, records),
-        HTML: html_report(summary, records),
-    }
-    if records.head.spec.system.app:
-        reports[MARKDOWN] = markdown_summary(summary, records.head.spec.system.app)
-    for name, text in reports.items():
+    for name, text in documents(summary, records).items():
         write_text_whole(folder / name, text)
     if as_json:
-        print(document.decode())
+        print(msgspec.json.encode(summary).decode())
     else:
         print("\n".join(summary_lines(summary)))
         print(f"records and reports: {folder}")
@@ -362,6 +350,48 @@ def assumptions(folder: Folder, trust: TrustedFolders = None) -> None:
     from aftbed.campaign.assumptions import markdown  # noqa: PLC0415 - scipy
 
     print(shown(markdown(_ledger(folder), trusting(trust))), end="")
+
+
+# -- evidence that can be filed -------------------------------------------------------------------
+
+
+@campaign.command()
+def bundle(
+    folders: Annotated[list[Path], typer.Argument(help="The directories of campaigns.")],
+    out: Annotated[Path, typer.Option(help="A file: .zip.")],
+    trust: TrustedFolders = None,
+    json: Json = False,
+) -> None:
+    """All that campaigns are evidence by, as an archive that can be verified and run again."""
+    from aftbed.report.bundle import SUMS, archive_of, entries, sha256  # noqa: PLC0415 - scipy
+
+    check_file("--out", out, ".zip")
+    made = entries([_ledger(folder) for folder in folders], trusting(trust))
+    data = archive_of(made)
+    write_whole(out, lambda path: path.write_bytes(data))
+    files = {name: sha256(entry.data) for name, entry in made.items() if name != SUMS}
+    if json:
+        print_json({"bundle": out.name, "sha256": sha256(data), "files": files})
+    else:
+        print(shown(f"{out}: {len(files)} files, sha256 {sha256(data)}"))
+
+
+@campaign.command()
+def verify(file: BundleFile, json: Json = False) -> None:
+    """Whether each file of a bundle fits its hash. Nothing is unpacked.
+
+    Exit code: 0 all fit, 1 one does not, 2 no bundle.
+    """
+    from aftbed.report.bundle import verified  # noqa: PLC0415 - scipy
+
+    found = verified(file)
+    if json:
+        print_json({"bundle": file.name} | asdict(found))
+    else:
+        lines = [f"{file}: {len(found.files)} files, sha256 {found.sha256}"]
+        lines += [f"{one.path}: {one.why}" for one in found.misfits] or ["all fit"]
+        print(shown("\n".join(lines)))
+    raise typer.Exit(1 if found.misfits else 0)
 
 
 # -- one experiment -------------------------------------------------------------------------------

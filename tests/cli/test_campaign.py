@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -207,3 +208,28 @@ def test_bad_input_is_refused_and_nothing_is_run(
     monkeypatch.chdir(tmp_path)
     assert message in refused("campaign", *arguments)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_bundle_is_made_and_verified(spec: Path, ran: Ran, output: Output, call: Call) -> None:
+    ran("out")
+    made = json.loads(output("campaign", "bundle", "out", "--out", "e.zip", "--json"))
+    found = json.loads(output("campaign", "verify", "e.zip", "--json"))
+    assert found == made | {"misfits": []}
+    assert output("campaign", "verify", "e.zip").endswith("\nall fit\n")
+    with zipfile.ZipFile(spec.parent / "e.zip", "a") as archive:
+        archive.writestr("late.txt", "put in later")
+    code, out, _ = call("campaign", "verify", "e.zip")
+    assert code == 1 and out.endswith("\nlate.txt: it is not in SHA256SUMS\n"), out
+
+
+def test_what_cannot_be_bundled_or_is_no_bundle_is_usage(spec: Path, ran: Ran, call: Call) -> None:
+    ran("out")
+    for arguments, why in {
+        ("bundle", "out", "--out", "e.tar"): "--out e.tar: a file .zip in a directory that exists is allowed",
+        ("bundle", "gone", "--out", "e.zip"): "is this the directory of a campaign?",
+        ("verify", "try.yaml"): "try.yaml: found no zip archive, as a bundle is, or a broken one",
+        ("verify", "gone.zip"): "gone.zip: cannot be read: No such file or directory",
+    }.items():
+        code, _, err = call("campaign", *arguments)
+        assert code == 2 and why in err, err
+    assert not (spec.parent / "e.zip").exists()

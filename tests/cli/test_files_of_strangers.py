@@ -18,9 +18,9 @@ from records import outcomes, whole
 from sampling import sampled
 
 from aftbed.campaign.ledger import NAME
-from aftbed.cli.campaign import HTML, JUNIT, MARKDOWN, SUMMARY
 from aftbed.core.events import Event
 from aftbed.interop.openscenario import importer
+from aftbed.report.documents import HTML, JUNIT, MARKDOWN, SUMMARY
 
 INTEROP: Final = Path(importer.__file__).resolve().parents[3] / "tests" / "interop" / "xosc"
 SENTINEL: Final = "EXECUTED"
