@@ -394,6 +394,37 @@ def verify(file: BundleFile, json: Json = False) -> None:
     raise typer.Exit(1 if found.misfits else 0)
 
 
+@campaign.command()
+def argument(
+    file: BundleFile,
+    plot: Annotated[Path | None, typer.Option(help="Draw it to this SVG file.")] = None,
+    json: Json = False,
+) -> None:
+    """A safety argument from a bundle, in GSN: promises, mechanisms, what was measured, and its hash.
+
+    Exit code: 0 no goal failed, 1 one did, or a file does not fit its hash, 2 usage.
+    """
+    from aftbed.report.argument import GoalStatus, argument_lines, argument_of  # noqa: PLC0415 - scipy
+    from aftbed.report.bundle import campaigns_in, verified  # noqa: PLC0415
+
+    check_file("--plot", plot, ".svg")
+    checked = verified(file)
+    if checked.misfits:
+        for one in checked.misfits:
+            print(shown(f"aftbed: {file}: {one.path}: {one.why}"), file=sys.stderr)
+        raise typer.Exit(1)
+    found = argument_of(file.name, checked, campaigns_in(file))
+    if plot is not None:
+        from aftbed.report.gsn import gsn_svg  # noqa: PLC0415
+
+        write_text_whole(plot, gsn_svg(found))
+    if json:
+        print_json(found)
+    else:
+        print(shown("\n".join(argument_lines(found))))
+    raise typer.Exit(1 if any(goal.status is GoalStatus.FAILED for goal in found.goals) else 0)
+
+
 # -- one experiment -------------------------------------------------------------------------------
 
 

@@ -466,3 +466,31 @@ def _stated(path: Path, data: bytes) -> dict[str, str]:
             raise ConfigError(f"{path}: {SUMS}: line {number}: {line[:80]!r} {why}")
         found[match[2]] = match[1]
     return found
+
+
+class FiledCampaign(msgspec.Struct, frozen=True):
+    """A campaign of a bundle: its ledger, by its name in the bundle, and its environment."""
+
+    entry: str
+    ledger: Ledger
+    environment: CampaignEnvironment
+
+
+def campaigns_in(path: Path) -> list[FiledCampaign]:
+    """The campaigns of a bundle, by name. Raises ConfigError, also if there is none."""
+    found = []
+    with opened_archive(path, "a bundle", LIMITS) as (_, archive):
+        names = sorted(name for name in archive.namelist() if name.count("/") == 1)
+        for name in (name for name in names if name.endswith(f"/{ledgers.NAME}")):
+            records = ledgers.read(path / name, archive.read(name))
+            about = name.replace(ledgers.NAME, ENVIRONMENT)
+            if about not in names:
+                raise ConfigError(f"{path}: {about} is missing")
+            try:
+                environment = msgspec.json.decode(archive.read(about), type=CampaignEnvironment)
+            except msgspec.DecodeError as error:
+                raise ConfigError(f"{path}: {about}: {error}") from None
+            found.append(FiledCampaign(name, records, environment))
+    if not found:
+        raise ConfigError(f"{path}: it has no campaign: {ledgers.NAME} is missing")
+    return found

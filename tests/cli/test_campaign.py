@@ -1,5 +1,6 @@
 """`aftbed campaign`, in the simulator: from a campaign file to reports and a gate."""
 
+import hashlib
 import json
 import re
 import shutil
@@ -233,3 +234,30 @@ def test_what_cannot_be_bundled_or_is_no_bundle_is_usage(spec: Path, ran: Ran, c
         code, _, err = call("campaign", *arguments)
         assert code == 2 and why in err, err
     assert not (spec.parent / "e.zip").exists()
+
+
+def test_an_argument_is_made_of_a_bundle(spec: Path, ran: Ran, output: Output, call: Call) -> None:
+    ran("out")
+    output("campaign", "bundle", "out", "--out", "e.zip")
+    found = json.loads(output("campaign", "argument", "e.zip", "--plot", "a.svg", "--json"))
+    (solution,) = [node for node in found["nodes"] if node["kind"] == "solution"]
+    with zipfile.ZipFile(spec.parent / "e.zip") as archive:
+        records = archive.read(solution["entry"])
+    assert hashlib.sha256(records).hexdigest() == solution["sha256"]
+    assert (spec.parent / "a.svg").read_text().startswith("<svg")
+    assert "\nG1 supported: " in output("campaign", "argument", "e.zip")
+    assert call("campaign", "argument", "e.zip", "--plot", "a.png")[0] == 2
+    with zipfile.ZipFile(spec.parent / "e.zip", "a") as archive:
+        archive.writestr("late.txt", "put in later")
+    code, out, err = call("campaign", "argument", "e.zip", "--plot", "b.svg")
+    assert (code, out) == (1, "") and "late.txt: it is not in SHA256SUMS" in err
+    assert not (spec.parent / "b.svg").exists()
+
+
+def test_a_goal_that_failed_is_exit_code_1(spec: Path, ran: Ran, output: Output, call: Call) -> None:
+    ran("out")
+    records = spec.parent / "out" / "records.jsonl"
+    records.write_text(records.read_text().replace('"outcome":"tolerated"', '"outcome":"sdc"', 1))
+    output("campaign", "bundle", "out", "--out", "e.zip")
+    code, out, _ = call("campaign", "argument", "e.zip")
+    assert code == 1 and "\nG3 failed: " in out and "  pbr failed: try: 1 of 12 experiments broke it" in out
