@@ -182,7 +182,6 @@ class _Picture:
         top, middles = self._y, []
         for sub in self._found.below(strategy.id):
             middles.append(self._row(sub))
-        self._y = max(self._y, top + whole + GAP_Y)
         middle = max((middles[0] + middles[-1]) / 2, top + height / 2)
         y = middle - height / 2
         corners = ((SLANT_PX, 0), (STRATEGY_PX, 0), (STRATEGY_PX - SLANT_PX, height), (0, height))

@@ -278,18 +278,24 @@ document.title = ["measured", over, out, shapes.length > 20].join(" ");
 </script>"""
 
 
+def overlaps(folder: Path, *found: FiledCampaign) -> str:
+    """How many shapes or texts overlap, and how many texts stick out, as a browser lays them out."""
+    bundle = Bundle(HASH, dict.fromkeys((one.entry for one in found), HASH), ())
+    picture = gsn_svg(argument_of("e.zip", bundle, found))
+    page = f"<!DOCTYPE html><meta charset='utf-8'><body style='margin:0'>{picture}{MEASURE}</body>"
+    dom, console = in_browser(folder, page)
+    assert console == []
+    return dom.partition("<title>measured")[2].partition("</title>")[0]
+
+
 @needs_browser
 @pytest.mark.process
 def test_nothing_overlaps_and_no_text_is_cut_off(good: Ledger, tmp_path: Path) -> None:
     """With names that are short, long, and markup."""
     spec = msgspec.structs.replace(good.head.spec, verifies=tuple(f"SG-{n}" for n in range(60)))
-    head = msgspec.structs.replace(good.head, spec=spec)
-    other = msgspec.structs.replace(good, head=head)
+    other = msgspec.structs.replace(good, head=msgspec.structs.replace(good.head, spec=spec))
     why = f"{HOSTILE} {'long' * 90}"
     long = filed(changed(other, "pbr · crash", outcome="sdc", reasons=(why,)), f"{'try-' * 14}/records.jsonl")
-    found = [filed(good), long]
-    bundle = Bundle(HASH, dict.fromkeys((one.entry for one in found), HASH), ())
-    picture = gsn_svg(argument_of("e.zip", bundle, found))
-    page = f"<!DOCTYPE html><meta charset='utf-8'><body style='margin:0'>{picture}{MEASURE}</body>"
-    dom, console = in_browser(tmp_path, page)
-    assert console == [] and "<title>measured 0 0 true</title>" in dom
+    assert overlaps(tmp_path, filed(good), long) == " 0 0 true"
+    few = [result for result in good.results if result.experiment.stratum == "pbr · crash"]
+    assert overlaps(tmp_path, filed(with_results(good, *few))) == " 0 0 true", "rows as low as can be"

@@ -111,7 +111,13 @@ def test_no_path_and_no_name_of_the_user_is_in_it(made: dict[str, BundledFile], 
 
 
 def test_equal_records_give_equal_bytes(made: dict[str, BundledFile], crashes: Ledger) -> None:
-    assert archive_of(entries([crashes], NOBODY)) == archive_of(made)
+    again = archive_of(entries([crashes], NOBODY))
+    assert again == archive_of(made)
+    with zipfile.ZipFile(io.BytesIO(again)) as archive:
+        assert archive.namelist() == sorted(made)
+        assert {one.date_time for one in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
+        modes = {one.filename: one.external_attr >> 16 for one in archive.infolist()}
+    assert modes["rerun.sh"] & 0o111 and not modes["README.md"] & 0o111
 
 
 def test_two_campaigns_of_one_name_are_both_in_it(crashes: Ledger) -> None:
