@@ -56,6 +56,11 @@ def mcnemar(only_base: int, only_new: int) -> float:
     return min(1.0, 2 * float(special.bdtr(min(only_base, only_new), differing, 0.5)))
 
 
+def resamples_least(confidence: float) -> int:
+    """How many resamples it takes until enough of them lie beyond each bound."""
+    return math.ceil(BEYOND_MIN / tail(confidence) - 1e-6)  # 100 at 0.9, whose tail is 0.0499...
+
+
 def paired_quantile_shift(
     base: Sequence[float],
     new: Sequence[float],
@@ -70,8 +75,7 @@ def paired_quantile_shift(
     """
     assert len(base) == len(new) <= PAIRS_MAX, f"{len(base)} and {len(new)} are no pairs"
     beyond, pairs = tail(confidence), len(base)
-    least = math.ceil(BEYOND_MIN / beyond - 1e-6)  # 100 at 0.9, whose tail is 0.0499...
-    if resamples < least:
+    if resamples < (least := resamples_least(confidence)):
         raise ConfigError(f"resamples {resamples}: at least {least} are allowed at confidence {confidence:g}")
     if pairs < quantile_needs(q, confidence):
         return None
@@ -177,8 +181,9 @@ def _change(stratum: str, pairs: list[tuple[Result, Result]], confidence: float)
     ]
     shift = None
     if timed:
-        chance = Random(f"{SEED}/{stratum}")
-        shift = paired_quantile_shift([t for t, _ in timed], [t for _, t in timed], Q, chance, confidence)
+        chance, before, after = Random(f"{SEED}/{stratum}"), [t for t, _ in timed], [t for _, t in timed]
+        resamples = max(RESAMPLES, resamples_least(confidence))  # many strata share the confidence
+        shift = paired_quantile_shift(before, after, Q, chance, confidence, resamples)
     worse = (only_new > only_base and p < 1 - confidence) or (shift is not None and shift.low > SHIFT_MS_MIN)
     other = sum(b.outcome != n.outcome for b, n in pairs)
     return Change(stratum, len(pairs), other, only_base, only_new, p, shift, worse)

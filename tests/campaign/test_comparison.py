@@ -154,3 +154,12 @@ def test_experiments_are_a_pair_wherever_the_files_of_their_function_lie(tmp_pat
 
     found = compare(in_folder("/a"), in_folder("/b/c"))
     assert found.unpaired == 0 and found.same_outcomes
+
+
+def test_a_campaign_of_many_strata_is_compared(tmp_path: Path) -> None:
+    """Each stratum has a part of the confidence, and so the more resamples."""
+    results = tuple(
+        result(stratum=f"pbr · {n % 40}", index=n, recovery_ms=2.0 + n % 3) for n in range(40 * 3)
+    )
+    found = Ledger(tmp_path, head_of(planned(tmp_path)), results)
+    assert [change.pairs for change in compare(found, found).changes] == [3] * 40
