@@ -42,6 +42,7 @@ from aftbed.campaign.statistics import (
     tail,
 )
 from aftbed.core.errors import ConfigError
+from aftbed.judge.outcome import UNKNOWN
 
 BITS: Final = 32  # of chance for each draw; with at most PAIRS_MAX pairs no pair is favoured by over 0.1 %
 PAIRS_MAX: Final = 1 << 22
@@ -106,12 +107,14 @@ _FOLDERS: Final = re.compile(r"[^\s'\"]*/")
 class Change(msgspec.Struct, frozen=True):
     """`p` of McNemar's test over the pairs of which only one failed; `shift_ms` of the p99 recovery.
 
-    `other_outcome`: how many pairs came to two classes of outcome, whether one failed or not.
+    `other_outcome`: how many pairs came to two classes of outcome, whether one failed or not; `unknown`: of
+    these, how many of whose experiments one is inconclusive, or had trouble with the harness.
     """
 
     stratum: str
     pairs: int
     other_outcome: int
+    unknown: int
     only_base: int
     only_new: int
     p: float
@@ -185,5 +188,6 @@ def _change(stratum: str, pairs: list[tuple[Result, Result]], confidence: float)
         resamples = max(RESAMPLES, resamples_least(confidence))  # many strata share the confidence
         shift = paired_quantile_shift(before, after, Q, chance, confidence, resamples)
     worse = (only_new > only_base and p < 1 - confidence) or (shift is not None and shift.low > SHIFT_MS_MIN)
-    other = sum(b.outcome != n.outcome for b, n in pairs)
-    return Change(stratum, len(pairs), other, only_base, only_new, p, shift, worse)
+    other = [{b.outcome, n.outcome} for b, n in pairs if b.outcome != n.outcome]
+    unknown = sum(not outcomes.isdisjoint(UNKNOWN) for outcomes in other)
+    return Change(stratum, len(pairs), len(other), unknown, only_base, only_new, p, shift, worse)

@@ -330,6 +330,7 @@ def compare(
         if change.shift_ms is not None:
             shift = f"p99 recovery {change.shift_ms.low:+.3f} to {change.shift_ms.high:+.3f} ms"
         differ = f"{change.other_outcome} with another outcome"
+        differ += f" ({change.unknown} unknown)" if change.unknown else ""
         differ += f", {change.only_base} failed only before, {change.only_new} only now (p {change.p:.3g})"
         word = "worse" if change.worse else "same or better"
         return f"  {change.stratum:<{width}}  {change.pairs:>5} pairs: {differ}; {shift}: {word}"

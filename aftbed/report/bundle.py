@@ -337,7 +337,7 @@ SCRIPT: Final = """\
 #     sh rerun.sh [DIRECTORY]     the new records go there: a new directory, `again` if left out
 #
 # AFTBED is the command, `aftbed` if it is not set.
-# Exit code: 0 the outcomes are the same, 1 they are not, 2 usage, else that of the command that failed.
+# Exit code: 0 all came out as in the bundle, 1 they did not, 2 usage, else that of a command that failed.
 set -u
 aftbed=${AFTBED:-aftbed}
 out=${1:-again}
@@ -351,28 +351,29 @@ sha256sum -c SHA256SUMS >/dev/null || exit 1
 mkdir -p -- "$out" || exit 2
 result=0
 
-# again NAME EXIT [OPTION]: run campaign NAME, whose gates came to EXIT; compare it with these options.
+# again NAME EXIT WORDS [OPTION]: run campaign NAME, whose gates came to EXIT, and compare it with these
+# options; WORDS are what it comes to if all is well.
 again() {
-  name=$1 before=$2
-  shift 2
+  name=$1 before=$2 words=$3
+  shift 3
   echo "== $name"
   $aftbed campaign run "$name.yaml" --out "$out/$name"
   code=$?
   [ "$code" -le 1 ] || exit "$code"
   if [ "$code" -ne "$before" ]; then
-    echo "rerun.sh: $name: the gates came to exit code $code, in the bundle to $before" >&2
+    words="the gates came to exit code $code, in the bundle to $before"
     result=1
   fi
   $aftbed campaign compare "$name" "$out/$name" "$@"
   code=$?
   [ "$code" -le 1 ] || exit "$code"
-  [ "$code" -eq 0 ] || result=1
+  if [ "$code" -ne 0 ]; then
+    words="other outcomes"
+    result=1
+  fi
+  echo "rerun.sh: $name: $words"
 }
 
-"""
-LAST_LINES: Final = """
-if [ "$result" -eq 0 ]; then echo "same outcomes"; else echo "other outcomes"; fi
-exit "$result"
 """
 
 
@@ -380,9 +381,9 @@ def _script(campaigns: Mapping[str, Summary], runtimes: Mapping[str, str]) -> st
     """A simulated campaign comes to the same outcomes; of a real one, no stratum may be worse."""
     calls = ""
     for name, summary in campaigns.items():
-        options = " --outcomes" if runtimes[name] == "sim" else ""
-        calls += f"again {name} {0 if summary.gate == 'pass' else 1}{options}\n"
-    return f"{SCRIPT}{calls}{LAST_LINES}"
+        words = "'same outcomes' --outcomes" if runtimes[name] == "sim" else "'no stratum is worse'"
+        calls += f"again {name} {0 if summary.gate == 'pass' else 1} {words}\n"
+    return f'{SCRIPT}{calls}exit "$result"\n'
 
 
 def _readme(runtimes: Mapping[str, str], *, carried: bool) -> str:

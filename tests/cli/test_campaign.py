@@ -160,6 +160,9 @@ def test_an_outcome_that_is_another_one_or_missing_fails_a_comparison_of_outcome
     for new, code in {"better": 1, "fewer": 1, "same": 0}.items():
         assert call("campaign", "compare", "base", new)[0] == 0, "no stratum is worse"
         assert call("campaign", "compare", "base", new, "--outcomes")[0] == code, new
+    unknown = lines[0].replace('"outcome":"tolerated"', '"outcome":"inconclusive"')
+    (spec.parent / "better" / "records.jsonl").write_text("".join([head, unknown, *lines[1:]]))
+    assert "1 with another outcome (1 unknown)" in call("campaign", "compare", "base", "better")[1]
     assert call("campaign", "compare", "fewer", "base", "--outcomes")[0] == 0, "more is not less"
 
 

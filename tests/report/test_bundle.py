@@ -256,7 +256,9 @@ def test_it_is_unpacked_elsewhere_verified_and_run_again_to_the_same_outcomes(
     checked = command_line.called("sha256sum", "-c", SUMS, folder=tmp_path / "there")
     assert checked.returncode == 0, checked.stderr
     again = command_line.called("sh", "there/rerun.sh", "new", folder=tmp_path)
-    assert again.returncode == 0 and again.stdout.endswith("\nsame outcomes\n"), again.stdout + again.stderr
+    told = [line for line in again.stdout.splitlines() if line.startswith("rerun.sh: ")]
+    assert told == ["rerun.sh: try: same outcomes", "rerun.sh: mine: same outcomes"], again.stderr
+    assert again.returncode == 0
     assert (tmp_path / "new" / "mine" / "report.html").is_file(), "the new records are where they are wanted"
 
     (tmp_path / "there" / LEDGER_TRY).write_bytes(b"")
@@ -275,5 +277,7 @@ def test_a_bundle_that_claims_other_outcomes_is_found_out(
     with zipfile.ZipFile(written(tmp_path, made)) as archive:
         archive.extractall(tmp_path / "there")
     differs = command_line.called("sh", "there/rerun.sh", folder=tmp_path)
-    assert differs.returncode == 1 and differs.stdout.endswith("\nother outcomes\n"), differs.stderr
+    assert differs.returncode == 1 and differs.stdout.endswith("\nrerun.sh: try: other outcomes\n"), (
+        differs.stderr
+    )
     assert "1 with another outcome" in differs.stdout
