@@ -27,6 +27,7 @@ from aftbed.core.input_file import read_input
 
 CPUINFO = Path("/proc/cpuinfo")
 NAME: Final = "records.jsonl"
+RECORDS: Final = "runs"  # beside it: the records of real runs that were broken or unexpected, by their ids
 LINE_BYTES_MAX: Final = 1_000_000
 LEDGER_BYTES_MAX: Final = 4 << 30
 OWN: Final = {"digest": "spec", "code": "version of the code", "shard": "shard", "shards": "number of shards"}

@@ -4,6 +4,7 @@ Statistics and reports need scipy and Jinja2 (0.4 s, 30 MB), so they are importe
 """
 
 import re
+import shutil
 import sys
 import time
 from contextlib import closing
@@ -306,6 +307,12 @@ def merge(
     ledger.begin(path, merged.head)
     with open(ledger.opened(path), "wb") as file:
         file.writelines(msgspec.json.encode(result) + b"\n" for result in merged.results)
+    for records in (folder / ledger.RECORDS for folder in folders):
+        try:
+            if records.is_dir():
+                shutil.copytree(records, out / ledger.RECORDS, symlinks=True, dirs_exist_ok=True)
+        except OSError as error:  # of copytree, a list of what could not be copied
+            raise ConfigError(f"{records}: cannot be copied to {out}: {error}") from None
     raise typer.Exit(_report(out, as_json=json))
 
 

@@ -8,7 +8,8 @@
     NAME/records.jsonl        the ledger
     NAME/summary.json, junit.xml, report.html
     NAME/environment.json     on what it was run; what its functions declare
-    NAME/worst/ID/            of the worst runs: the result, and what happened in it, simulated once more
+    NAME/worst/ID/            of the worst runs: the result; what happened in it, simulated once more; the
+                              record of a real run that was broken or unexpected
     files/N/...               files of the user that the campaigns name
 
 Equal records give equal bytes: names are sorted, times are fixed, and what is said of time and machine is
@@ -21,6 +22,7 @@ the files of a function import or load is not in it.
 
 import hashlib
 import io
+import os
 import re
 import shlex
 import stat
@@ -48,6 +50,7 @@ from aftbed.judge.isolated import declared_by
 from aftbed.report.documents import documents
 from aftbed.report.worst import by_badness, rerun
 from aftbed.runtime.sim import trace
+from aftbed.runtime.unix import seal
 from aftbed.runtime.unix.trust import Trust, vetted
 from aftbed.vehicle.aeb.function import default_application
 from aftbed.vehicle.scenarios.library import names_file
@@ -114,7 +117,8 @@ def entries(found: Sequence[Ledger], trust: Trust) -> dict[str, BundledFile]:
         made[f"{name}/{ledgers.NAME}"] = BundledFile(_lines([portable.head, *portable.results]))
         made |= {f"{name}/{file}": _text(text) for file, text in documents(summary, portable).items()}
         made[f"{name}/{ENVIRONMENT}"] = BundledFile(_json(_environment(one, portable.head, files, trust)))
-        made |= {f"{name}/worst/{file}": entry for file, entry in _worst(portable.results)}
+        kept = _kept(one, portable, files)
+        made |= {f"{name}/worst/{file}": entry for file, entry in _worst(portable.results, kept)}
     runtimes = {name: one.head.spec.system.runtime for name, one in zip(campaigns, found, strict=True)}
     made["rerun.sh"] = BundledFile(_script(campaigns, runtimes).encode(), executable=True)
     made["README.md"] = _text(_readme(runtimes, carried=bool(files.places)))
@@ -182,9 +186,16 @@ def _functions(found: Ledger) -> list[str]:
     return list(dict.fromkeys([spec.system.app, *(wish.source for wish in wishes if wish.source)]))
 
 
-def _worst(results: Iterable[Result]) -> Iterator[tuple[str, BundledFile]]:
-    """A ledger keeps no messages, so what happened in a run is that of its simulation with the same seed."""
-    for result in by_badness(results)[:WORST_MAX]:
+def _worst(
+    results: Sequence[Result], kept: Mapping[str, dict[str, bytes]]
+) -> Iterator[tuple[str, BundledFile]]:
+    """A ledger keeps no messages, so what happened in a run is that of its simulation with the same seed.
+
+    `kept`: the records of real runs, by the ids of their experiments.
+    """
+    worst = by_badness(results)[:WORST_MAX]
+    worst += [result for result in results if result.experiment.id in kept and result not in worst]
+    for result in worst:
         name = result.experiment.id
         yield f"{name}/result.json", BundledFile(_json(result))
         again, command = rerun(result.experiment), result.experiment.command()
@@ -194,6 +205,29 @@ def _worst(results: Iterable[Result]) -> Iterator[tuple[str, BundledFile]]:
             words = f"simulated again: {again.outcome}; recorded: {result.outcome}\n{command}\n"
             words += "".join(f"{line}\n" for line in trace.lines(again.trace))
         yield f"{name}/trace.txt", _text(words)
+        for file, data in kept.get(name, {}).items():
+            yield f"{name}/record/{file}", BundledFile(data)
+
+
+def _kept(found: Ledger, portable: Ledger, files: "_UserFiles") -> dict[str, dict[str, bytes]]:
+    """The records that the campaign has kept, each file by its name, those as they were sealed.
+
+    A record that names files of the user is left out: it cannot be changed without its seal.
+    """
+    records: dict[str, dict[str, bytes]] = {}
+    private = [f"{Path.home()}/".encode(), *map(os.fsencode, files.places)]
+    for result in portable.results:
+        folder = found.path.parent / ledgers.RECORDS / result.experiment.id
+        if folder.is_symlink() or not seal.sealed(folder) or any(seal.changes(folder)):
+            continue
+        paths = [path for path in sorted(folder.rglob("*")) if path.is_file() and not path.is_symlink()]
+        try:
+            record = {str(path.relative_to(folder)): read_input(path, FILE_BYTES_MAX) for path in paths}
+        except OSError:
+            continue
+        if not any(word in data for data in record.values() for word in private):
+            records[result.experiment.id] = record
+    return records
 
 
 # -- paths ----------------------------------------------------------------------------------------
@@ -400,7 +434,8 @@ def _readme(runtimes: Mapping[str, str], *, carried: bool) -> str:
 {rows}
 Of each: the campaign file with every key; `plan.jsonl`, the experiments; `records.jsonl`, the ledger;
 `summary.json`, `junit.xml` and `report.html`, what they come to; `environment.json`, on what it was run;
-`worst/`, the runs to look at first, each with what happened in it, simulated once more with the same seed.
+`worst/`, the runs to look at first: what happened in each, simulated once more with the same seed, and the
+record of a real one that was broken or unexpected (`aftbed check`).
 Of absolute paths only the name is kept.
 
 {files}- Verify the files: `sha256sum -c SHA256SUMS`, or `aftbed campaign verify` of the archive.

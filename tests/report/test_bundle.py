@@ -22,6 +22,7 @@ from aftbed.campaign.plan import plan
 from aftbed.campaign.spec import read_spec
 from aftbed.core.errors import ConfigError
 from aftbed.report.bundle import SUMS, BundledFile, archive_of, entries, sha256, verified
+from aftbed.runtime.unix import seal
 from aftbed.runtime.unix.trust import NOBODY, trusting
 
 HOME: Final = str(Path.home())
@@ -145,6 +146,34 @@ def test_a_shard_alone_is_refused(crashes: Ledger) -> None:
     shard = msgspec.structs.replace(crashes, head=msgspec.structs.replace(crashes.head, shard=2, shards=3))
     with pytest.raises(ConfigError, match="shard 2 of 3: `aftbed campaign merge` makes one"):
         entries([shard], NOBODY)
+
+
+@pytest.mark.parametrize(
+    "damage", ["none", "changed", "unsealed", "names the home", "a link", "a link in it"]
+)
+def test_the_record_of_a_run_that_went_wrong_is_in_it_as_it_was_sealed(
+    crashes: Ledger, tmp_path: Path, damage: str
+) -> None:
+    """A stranger's directory gives no file but what lies in it."""
+    found = msgspec.structs.replace(crashes, path=tmp_path / ledgers.NAME)
+    name = crashes.results[-1].experiment.id
+    record = tmp_path / ledgers.RECORDS / name
+    record.mkdir(parents=True)
+    (record / "run.json").write_text(f'"{HOME}/a"' if damage == "names the home" else '"/run/user/1"')
+    (tmp_path / "secret").write_text("secret")
+    if damage == "a link in it":
+        (record / "linked").symlink_to(tmp_path / "secret")
+    if damage != "unsealed":
+        seal.write(record)
+    if damage == "changed":
+        (record / "run.json").write_text("{}")
+    if damage == "a link":
+        record.rename(tmp_path / "elsewhere")
+        record.symlink_to(tmp_path / "elsewhere")
+    made = entries([found], NOBODY)
+    files = {path.rpartition("/")[2] for path in made if path.startswith(f"try/worst/{name}/record/")}
+    assert files == ({"run.json", "seal.json"} if damage == "none" else set())
+    assert not [path for path, file in made.items() if file.data == b"secret"]
 
 
 # -- functions of the user ------------------------------------------------------------------------
