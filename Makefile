@@ -9,11 +9,14 @@ PLAIN    := $(VENV)/.installed-plain
 EDITABLE := $(VENV)/.installed-editable
 SOURCES  := pyproject.toml README.md $(shell find aftbed dbc -type f -not -name '*.pyc')
 
-# The tests without real runs take every core. Of real runs, each has a core for either replica: two at a time
+# The tests without real runs take every core: those of one thing each, which are run while one edits, then whole
+# commands, searches and drives. Of real runs, each has a core for either replica: two at a time
 # are as many as two cores bear without false alarms. A file stays together, for the runs that its tests share;
 # each page of the docs is a unit of its own. They are taken in the order of collection, the small files last.
-# Only files with real runs are read.
-FAST := -n auto --dist worksteal -m "not process and not deep"
+# Only files that have tests of their kind are read.
+FAST := -n auto --dist worksteal -m "not simulation and not process and not deep"
+SIMULATION := -n auto --dist worksteal -m "simulation and not process and not deep" \
+  $(sort $(shell grep -rl --include='test_*.py' mark.simulation tests))
 REAL := -n 2 --dist loadgroup --no-loadscope-reorder -m "process and not deep" \
   $(sort $(shell grep -rl --include='test_*.py' mark.process tests))
 
@@ -22,26 +25,27 @@ FAULT := crash primary at checkpoint.sent nth 100
 # Hundreds of interpreters start in the tests; without bytecode each would compile all that it imports.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help demo test lint fast process deep mutants bench soak
+.PHONY: help demo test lint fast simulation process deep mutants bench soak
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
 
 help:
-	@echo "make demo     install into $(VENV), drive a car whose server's primary is killed on the way"
-	@echo "make test     install with the tools of the tests, then lint, fast and process"
-	@echo "make lint     ruff check, ruff format --check, mypy"
-	@echo "make fast     the tests without real runs"
-	@echo "make process  the tests that start real runs: a sample of their combinations"
-	@echo "make deep     the exhaustive tests, and thousands of examples of every property: hours"
-	@echo "make mutants  plant bugs one by one, see what notices them, write docs/assumptions.md (ONLY=words: some, print)"
-	@echo "make soak     one run of 30 minutes with a crash every 2 s, an adaptation every 5 s: does anything grow?"
-	@echo "make bench    every figure of docs/numbers.md, written into its table: ten minutes (OLD=VENV: then compare with it)"
+	@echo "make demo        install into $(VENV), drive a car whose server's primary is killed on the way"
+	@echo "make test        install with the tools of the tests, then lint, fast, simulation and process"
+	@echo "make lint        ruff check, ruff format --check, mypy"
+	@echo "make fast        the tests of one thing each, a minute: while one edits"
+	@echo "make simulation  the tests that simulate many runs or drives: whole commands, searches, planted bugs"
+	@echo "make process     the tests that start real runs: a sample of their combinations"
+	@echo "make deep        the exhaustive tests, and thousands of examples of every property: hours"
+	@echo "make mutants     plant bugs one by one, see what notices them, write docs/assumptions.md (ONLY=words: some, print)"
+	@echo "make soak        one run of 30 minutes with a crash every 2 s, an adaptation every 5 s: does anything grow?"
+	@echo "make bench       every figure of docs/numbers.md, written into its table: ten minutes (OLD=VENV: then compare with it)"
 
 # Where the tests are installed, the package is too: then the demo needs nothing more.
 demo: $(if $(wildcard $(EDITABLE)),$(EDITABLE),$(PLAIN))
 	$(BIN)/aftbed run --ftm pbr --scenario ccrs-50 --pace real --inject "$(FAULT)"
 
-test: lint fast process
+test: lint fast simulation process
 
 lint: $(EDITABLE)
 	$(BIN)/ruff check .
@@ -50,6 +54,9 @@ lint: $(EDITABLE)
 
 fast: $(EDITABLE)
 	$(BIN)/python -m pytest $(FAST)
+
+simulation: $(EDITABLE)
+	$(BIN)/python -m pytest $(SIMULATION)
 
 process: $(EDITABLE)
 	$(BIN)/python -m pytest $(REAL)

@@ -12,6 +12,7 @@ COMMANDS: Final[CommandTable] = {
     "status": ("live:status", "Show the state of a live run."),
     "ps": ("live:ps", "The processes of a live run: name, role, pid, CPU, memory (PSS)."),
     "graph": ("live:graph", "The bricks, their channels and their nodes."),
+    "web": ("web:web", "The page of a live run in a browser, to watch and to steer it."),
     "stop": ("live:stop", "End a live run; its command prints the verdict so far."),
     "doctor": ("doctor:doctor", "What this machine lacks, and what dead runs left behind."),
     "sim": ("sim:sim", "Simulate runs in virtual time; the same seed gives the same run."),

@@ -5,6 +5,7 @@ options: a module that is imported before the launch delays the first reply. Wha
 imported where it is used, and what judges is imported after the run.
 """
 
+import contextlib
 import json
 import os
 import signal
@@ -121,6 +122,11 @@ class RunArguments(msgspec.Struct, frozen=True):
     unsafe_memory: Annotated[
         bool, typer.Option("--unsafe-memory", help='Allow --inject "bitflip memory ...".')
     ] = False
+    web: Annotated[
+        bool, typer.Option("--web", help="Serve a page of the run on 127.0.0.1, to watch and to steer it.")
+    ] = False
+    port: Annotated[int, typer.Option(help="With --web: its TCP port; 0 is any free one.")] = 0
+    open_page: Annotated[bool, typer.Option("--open", help="With --web: open it in the browser.")] = False
     mcap: Annotated[Path | None, typer.Option(help="Write the run to this file, for Foxglove.")] = None
     trace: Annotated[Path | None, typer.Option(help="Write its nodes to this file, for Perfetto.")] = None
     json: Json = False
@@ -159,6 +165,7 @@ def execute(given: RunArguments) -> int:
         _refuse_unsuitable(application, graph.ftm, requests, force=given.force)
     check_range("--bus-port", given.bus_port, 0, 65535)
     write_files = _files(given)
+    page = _page(given)
     options, listener = options_for(
         ftm=given.ftm,
         placement=given.placement,
@@ -177,7 +184,8 @@ def execute(given: RunArguments) -> int:
     launched = launch(options, listener, requests)
     try:
         closed = make_loop(launched) if make_loop is not None else None
-        interrupted = _follow(launched, open_view(options, quiet=given.json), closed)
+        with page(launched.private):
+            interrupted = _follow(launched, open_view(options, quiet=given.json), closed)
         launched.wait()
         from aftbed.cli.check import judge_and_show  # noqa: PLC0415 - after the launch
         from aftbed.judge.verdict import EXIT_CODES, EXIT_INTERRUPTED  # noqa: PLC0415 - after the launch
@@ -332,7 +340,7 @@ def _refuse(given: RunArguments, names: tuple[str, ...], why: str) -> None:
     """Raise ConfigError if one of these options has another value than by default."""
     used = [name for name in names if getattr(given, name) != getattr(DEFAULTS, name)]
     if used:
-        options = (f"--{name.removesuffix('_file').replace('_', '-')}" for name in used)
+        options = (f"--{name.removesuffix('_file').removesuffix('_page').replace('_', '-')}" for name in used)
         raise ConfigError(f"{why} {', '.join(options)}")
 
 
@@ -342,6 +350,24 @@ def _sent(source: "RequestSource", given: RunArguments) -> LoadRun:
         raise ConfigError(f"--rate {rate_hz}: 0 to {RATE_HZ_MAX:.0f} a second are allowed")
     expect = str(Path(given.expect).resolve()) if given.expect is not None else ""
     return LoadRun(source.count, rate_hz, source.name, expect)
+
+
+def _page(given: RunArguments) -> Callable[[Path], AbstractContextManager[None]]:
+    """What serves the page of the run in a private directory; nothing without `--web`."""
+    if not given.web:
+        _refuse(given, ("port", "open_page"), "only with --web: leave out")
+        return lambda private: contextlib.nullcontext()
+    check_range("--port", given.port, 0, 65535)
+    from aftbed.report import live_page  # noqa: PLC0415 - only with --web
+
+    listener, token = live_page.listen(given.port), live_page.new_token()
+    shown = live_page.address(listener, token)
+    print(f"page: {shown}", file=sys.stderr, flush=True)
+    if given.open_page:
+        import webbrowser  # noqa: PLC0415 - only with --open
+
+        webbrowser.open(shown)
+    return lambda private: live_page.beside(listener, private, token)
 
 
 # -- while it runs --------------------------------------------------------------------------------

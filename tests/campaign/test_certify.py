@@ -10,6 +10,8 @@ from strangers import FATAL
 from aftbed.campaign.summary import Summary
 from aftbed.campaign.weaknesses import Weakness, weaknesses
 
+pytestmark = pytest.mark.simulation
+
 FEW = ("none", "pbr", "pbr+tr")
 FAULTS = ("nothing", "crash primary", "wrong reply", "wrong state")
 

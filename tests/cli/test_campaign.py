@@ -12,6 +12,8 @@ import pytest
 from fakerun import Call, Output
 from liveruns import called
 
+pytestmark = pytest.mark.simulation
+
 SPEC = """
 campaign: try
 seed: 3

@@ -16,6 +16,8 @@ from aftbed.judge.verdict import Breach
 from aftbed.runtime.sim.world import Setup
 from aftbed.search.explore import EXPLORERS, PLACEMENTS, selected
 
+pytestmark = pytest.mark.simulation
+
 ORDER: Final = ("order", "--ftm", "lfr", "--placement", "replica")
 SMALL: Final = ("crash", "--ftm", "lfr", "--placement", "replica", "--requests", "1")
 

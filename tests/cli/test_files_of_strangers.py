@@ -22,6 +22,8 @@ from aftbed.core.events import Event
 from aftbed.interop.openscenario import importer
 from aftbed.report.documents import HTML, JUNIT, MARKDOWN, SUMMARY
 
+pytestmark = pytest.mark.simulation
+
 INTEROP: Final = Path(importer.__file__).resolve().parents[3] / "tests" / "interop" / "xosc"
 SENTINEL: Final = "EXECUTED"
 EVIL_MODULES: Final = (

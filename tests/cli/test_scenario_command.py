@@ -14,6 +14,8 @@ from aftbed.search.worst_instant import ANCHOR, Course, Worst, strike
 from aftbed.vehicle.scenarios.library import load_scenario, scenario_names
 from aftbed.vehicle.scenarios.tables import table_names
 
+pytestmark = pytest.mark.simulation
+
 FOLDER = Path(__file__).resolve().parents[1] / "interop" / "xosc"
 LEAD_BRAKES = FOLDER / "lead_brakes.xosc"
 VALUES = FOLDER / "lead_brakes_values.xosc"

@@ -27,6 +27,8 @@ from aftbed.search.agreement import Agreement, RecoveryRange, apart
 from aftbed.search.explore import tried
 from aftbed.search.swarm import drawn
 
+pytestmark = pytest.mark.simulation
+
 UNREPEATABLE: Final = "aftbed.vehicle.aeb.variants:NonDeterministic"
 FLIP: Final = ("--ftm", "pbr", "--count", "10", "--faults", "bitflip result bit 60 nth 3")  # no TR: sdc
 

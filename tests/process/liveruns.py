@@ -435,6 +435,14 @@ class Command:
         self.wait_for_line("started: ")
         return line.split()[1].rstrip(":")
 
+    def wait_for_error_line(self, words: str) -> str:
+        """The first line that has `words` of what it writes to standard error."""
+
+        def found() -> list[str]:
+            return [line for line in self._error_text().splitlines(keepends=True) if words in line]
+
+        return until(lambda: found() and found()[0].endswith("\n") and found()[0], words).rstrip()
+
     def _error_text(self) -> str:
         return self._errors.read_text() if self._errors.exists() else ""
 

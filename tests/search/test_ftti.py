@@ -19,6 +19,8 @@ from aftbed.search.ftti import Fhti, FttiRow, FttiSearch, FunctionFault, ftti, m
 from aftbed.search.worst_instant import ANCHOR, course_of, impact_kmh, strike
 from aftbed.vehicle.ecus import BrakePolicy
 
+pytestmark = pytest.mark.simulation
+
 OBSTACLE: Final = """
 description: a car that stands {gap_m} m ahead when the radar begins
 duration_s: 6

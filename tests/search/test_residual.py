@@ -15,6 +15,8 @@ from aftbed.search.worst_instant import impact_kmh, worst_instant
 from aftbed.vehicle.plant import KMH_PER_MS, LeadCar, Plant, PlantSetup, VehicleResult
 from aftbed.vehicle.scenarios.library import load_scenario
 
+pytestmark = pytest.mark.simulation
+
 FULL_MS2: Final = 9.0
 PLANT_KMH: Final = 0.15  # drag makes the deceleration differ by 1 % along the way
 FUNCTION_KMH: Final = 0.1

@@ -15,6 +15,8 @@ from aftbed.runtime.sim.world import Setup, simulate
 from aftbed.search.road_table import PRIMARY, DrivenRow, RoadDrive, RoadLine, drive, driven, drives, outage
 from aftbed.vehicle.scenarios.tables import Case, cases
 
+pytestmark = pytest.mark.simulation
+
 BARE: Final = RoadLine("none", "none")
 LOST_M_MAX: Final = 0.05
 R152: Final = {case.name: case for case in cases("r152")}

@@ -24,6 +24,8 @@ from aftbed.runtime.sim.world import Doom, Setup, World
 from aftbed.search.shrink import shrink
 from aftbed.search.swarm import experiments
 
+pytestmark = pytest.mark.simulation
+
 Broken = Callable[[Setup], tuple[Breach, ...]]
 
 CRASH = Fault(Crash(), "a/after", Trigger("server.exit", 30))

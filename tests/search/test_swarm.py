@@ -30,6 +30,8 @@ from aftbed.search.explore import STEPS, steps_of
 from aftbed.search.swarm import attempt_drawn, contradictions, drawn, experiments, intended
 from aftbed.search.tally import ACTIVATED_MIN, DONE_MIN, AdaptationEnd, Intent, Tally, happened_in
 
+pytestmark = pytest.mark.simulation
+
 DRAWN = 1_000
 RUN = range(100)
 STEP_LABELS = {event.label for event in STEPS}

@@ -33,6 +33,8 @@ from aftbed.search.worst_instant import (
     worst_instant,
 )
 
+pytestmark = pytest.mark.simulation
+
 NO_LOSS_M: Final = 0.05  # what a failover may take of the gap
 STEP_M: Final = 0.02  # a step of the brakes, at the speeds of these drives
 

@@ -19,9 +19,11 @@ from aftbed.judge.simulated import breaches
 from aftbed.judge.verdict import Breach
 from aftbed.runtime.sim.world import Setup, simulate
 
+pytestmark = pytest.mark.simulation
+
 MUTANTS: Final = (*MECHANISMS, *EXECUTIVE)
 MUTANTS_MIN: Final = 24
-RUNS_MAX: Final = 40  # that a bug may take in the fast tier
+RUNS_MAX: Final = 40  # that a bug may take here
 
 
 @lru_cache(maxsize=1024)

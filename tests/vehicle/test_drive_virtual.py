@@ -33,6 +33,8 @@ from aftbed.vehicle.plant import VehicleResult
 from aftbed.vehicle.scenarios.library import load_scenario, scenario_names
 from aftbed.vehicle.scenarios.scenario import broken_expectations
 
+pytestmark = pytest.mark.simulation
+
 MS = 1_000_000  # nanoseconds
 AEB_REQ = 0x100
 BRAKING_MS = 2900  # in ccrs-50 partial braking is being asked for, and in 60 ms full braking will be

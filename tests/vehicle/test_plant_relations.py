@@ -25,6 +25,8 @@ from aftbed.vehicle.plant import (
 )
 from aftbed.vehicle.scenarios.library import load_scenario
 
+pytestmark = pytest.mark.simulation
+
 DRIVE_MS = 15_000
 STEP_ERROR_M = 0.03  # of the place where the ego stands, or would stand at full grip
 

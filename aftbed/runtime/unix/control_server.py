@@ -164,6 +164,7 @@ class ControlServer:
             "record": self._options.record,
             "port": self._options.port,
             "vehicle": self._work.telemetry,
+            "cycle_us": self._work.cycle_us,
         }
 
     def _processes(self) -> list[ProcessRow]:

@@ -154,6 +154,7 @@ class Workload:
         self._result: object = None
         self._stats: dict[str, object] = {}
         self.telemetry: dict[str, object] | None = None
+        self.cycle_us: float | None = None  # at the client, from request to reply; the latest that is known
         self.ended, self.awaits_replies = False, True
         self._stalled = False
         self._telemetries = 0
@@ -268,7 +269,9 @@ class Workload:
 
     def _report_cycle(self, failure: str) -> None:
         if not failure:
-            self._report_owner("cycle", json.dumps(self._stats.get("cycle_us")).encode())
+            cycle_us = self._stats.get("cycle_us")
+            self.cycle_us = cycle_us if isinstance(cycle_us, float | int) else None
+            self._report_owner("cycle", json.dumps(self.cycle_us).encode())
 
     def _poll_load(self) -> None:
         """Watch the load again when it can be over; now and then, in case nothing moves any more."""

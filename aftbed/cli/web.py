@@ -1,0 +1,29 @@
+"""`aftbed web`: the page of a live run, to watch and to steer it."""
+
+import webbrowser
+from typing import Annotated
+
+import typer
+
+from aftbed.cli.options import Run, check_range
+from aftbed.report import live_page
+from aftbed.runtime.unix import run_directory
+
+Port = Annotated[int, typer.Option(help="TCP port of the page on 127.0.0.1; 0 is any free one.")]
+Open = Annotated[bool, typer.Option("--open", help="Open the page in the browser.")]
+
+
+def web(run: Run = None, port: Port = 0, open_it: Open = False) -> None:
+    """The page of a live run in a browser, to watch and to steer it.
+
+    It is served on 127.0.0.1 until the run ends, to this user alone.
+    """
+    check_range("--port", port, 0, 65535)
+    private = run_directory.find(run)
+    listener, token = live_page.listen(port), live_page.new_token()
+    shown = live_page.address(listener, token)
+    print(f"run {private.name}: {shown}", flush=True)
+    if open_it:
+        webbrowser.open(shown)
+    live_page.serve(listener, private, token)
+    print(f"run {private.name} has ended")
