@@ -6,9 +6,9 @@ an entry of the bundle, with its hash. The records are judged again: nothing is 
 beside them.
 
 A goal is *supported* only if experiments are evidence for it: their faults happened, something is known of
-them, all of them kept the promise, and each gate on their strata passes. One experiment that broke it, or a
-gate that does not pass, and it *failed*. Where there is no evidence, or none that could have failed, it is
-*undeveloped*.
+them, all of them kept the promise, and each gate on their strata passes. With one experiment that broke it,
+it *failed*. Where there is no evidence, or a gate does not pass, so that too little is known or nothing could
+have failed, it is *undeveloped*.
 
 Faults that the mechanism does not claim to tolerate, by what it and the function declare
 (`campaign.assumptions`), are no evidence for or against it, and are counted as `outside`; where a campaign
@@ -134,6 +134,11 @@ class Argument(msgspec.Struct, frozen=True):
     def below(self, name: str, kind: LinkKind = LinkKind.SUPPORTED_BY) -> list[GsnNode]:
         """What supports the node, or is its context."""
         return [self.node(link.target) for link in self.links if (link.source, link.kind) == (name, kind)]
+
+    @property
+    def holds(self) -> bool:
+        """Whether each campaign supports what it is evidence for."""
+        return all(node.status is GoalStatus.SUPPORTED for node in self.nodes if node.figures is not None)
 
     @property
     def goals(self) -> list[GsnNode]:
@@ -281,12 +286,8 @@ class _Judged:
             because = next(iter((*first.broken, *first.reasons)), first.outcome)
             return _Evidence(GoalStatus.FAILED, f"experiment {first.experiment.id}: {because}", figures)
         strata = {r.experiment.stratum for r in inside}
-        for gate in self.failed_gates(strata):
-            vacuous = gate.metric in VACUOUS
-            status = GoalStatus.UNDEVELOPED if vacuous else GoalStatus.FAILED
-            return _Evidence(
-                status, f"gate {gate.metric} {gate.limit} in {gate.strata}: {gate.reason}", figures
-            )
+        if failed := self._failed_gates(strata):
+            return _Evidence(GoalStatus.UNDEVELOPED, _gate(failed[0]), figures)
         if not known:
             why = "none of the faults happened, or nothing is known of them"
             return _Evidence(GoalStatus.UNDEVELOPED, why, figures)
@@ -299,22 +300,20 @@ class _Judged:
             return None
         figures = self._figures(sum(map(HONEST.is_broken, group)), len(group), 0)
         strata = {r.experiment.stratum for r in group}
-        failed = [gate for gate in self.failed_gates(strata) if gate.metric in VACUOUS]
+        failed = [gate for gate in self._failed_gates(strata) if gate.metric in VACUOUS]
         if failed:
-            why = f"gate {failed[0].metric} {failed[0].limit} in {failed[0].strata}: {failed[0].reason}"
-            return _Evidence(GoalStatus.FAILED, why, figures)
+            return _Evidence(GoalStatus.FAILED, _gate(failed[0]), figures)
         return _Evidence(GoalStatus.SUPPORTED, "", figures)
 
-    def failed_gates(self, strata: Iterable[str]) -> list[GateResult]:
-        """Those that judge one of these strata; a gate that is vacuous last."""
+    def _failed_gates(self, strata: Iterable[str]) -> list[GateResult]:
+        """Those that judge one of these strata."""
         names = list(strata)
-        found = [
+        return [
             gate
             for gate in self.summary.gates
             if gate.word == "fail"
             and any(name == gate.strata or fnmatch(name, gate.strata) for name in names)
         ]
-        return sorted(found, key=lambda gate: gate.metric in VACUOUS)
 
     def _figures(self, broken: int, of: int, outside: int) -> Figures:
         at_most = proportion(broken, of, self.confidence).high
@@ -332,6 +331,10 @@ class _Judged:
             return assumed_wrongly(result, self._declared)
         except ConfigError as error:
             return str(error)
+
+
+def _gate(gate: GateResult) -> str:
+    return f"gate {gate.metric} {gate.limit} in {gate.strata}: {gate.reason}"
 
 
 def _unclassed(result: Result) -> str:

@@ -194,12 +194,13 @@ def test_a_worse_outcome_that_may_hide_a_doubled_effect_is_no_evidence_that_ther
     assert figures is not None and figures.experiments == 2
 
 
-def test_a_gate_that_fails_fails_what_it_judges(good: Ledger) -> None:
+def test_evidence_whose_gate_does_not_pass_supports_nothing(good: Ledger) -> None:
     gates = planned_gates(good, "{metric: failed, max: 0.1, strata: 'pbr ·*'}")
     found = argued(gates)
     (pbr, tr) = (found.node(f"G1.{ftm}.try") for ftm in ("pbr", "pbr+tr"))
-    assert pbr.status is FAILED and pbr.why.startswith("gate failed at most 0.1 in pbr ·*: ")
-    assert tr.status is SUPPORTED and found.node("G1").status is FAILED
+    assert pbr.status is UNDEVELOPED and pbr.why.startswith("gate failed at most 0.1 in pbr ·*: ")
+    assert tr.status is SUPPORTED and found.node("G1").status is UNDEVELOPED
+    assert argued(good).holds and not found.holds
 
 
 def planned_gates(ledger: Ledger, gate: str) -> Ledger:
