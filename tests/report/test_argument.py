@@ -24,6 +24,8 @@ from aftbed.report.argument import (
 from aftbed.report.bundle import Bundle, CampaignEnvironment, FiledCampaign
 from aftbed.report.gsn import gsn_svg, text_px, wrapped
 
+pytestmark = pytest.mark.simulation
+
 CAMPAIGN: Final = """
 campaign: try
 seed: 2

@@ -25,6 +25,8 @@ from aftbed.report.bundle import SUMS, BundledFile, archive_of, entries, sha256,
 from aftbed.runtime.unix import seal
 from aftbed.runtime.unix.trust import NOBODY, trusting
 
+pytestmark = pytest.mark.simulation
+
 HOME: Final = str(Path.home())
 LEDGER_TRY: Final = "try/records.jsonl"
 MINE: Final = """
